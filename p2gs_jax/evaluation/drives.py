@@ -41,16 +41,10 @@ AGREES, FAR = 0.05, 1e5
 
 
 class DriveScores:
-    """Collects rendered views, and judges them together.
+    """Collects rendered views of a drive, and judges them together.
 
-    Args:
-        scene: a drive.
-        store: photographs.
-        render: of a camera, with depth.
-        arrays: keeps what all views need to the end; None: memory does.
-
-    Attributes:
-        unexplained: after `summary`: what no static scene explains, by row of the view.
+    `arrays` keeps what all views need to the end; None: memory does. After `summary`, `unexplained`
+    has what no static scene explains, by row of the view.
     """
 
     def __init__(
@@ -226,10 +220,7 @@ def shifted(
 ) -> Float32[np.ndarray, "4 4"]:
     """Return a world-to-camera matrix moved to the left, looking the same way.
 
-    Args:
-        viewmat: world-to-camera.
-        left: direction in the world, of length 1.
-        metres: how far; negative: to the right.
+    `left` is a direction in the world, of length 1; negative metres are to the right.
     """
     out = np.asarray(viewmat, np.float64).copy()
     out[:3, 3] -= out[:3, :3] @ (metres * np.asarray(left, np.float64))

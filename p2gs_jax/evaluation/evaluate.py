@@ -148,8 +148,7 @@ def evaluate(
         render: from `make_renderer`, where it knows which Gaussians belong to moving objects.
         reference: view row -> photograph under the common exposure, or None where there is none.
         radiance: view row -> true linear radiance at the size of the photographs, or None.
-        lpips_weights: adds `lpips` wherever a view is compared with a photograph; None leaves it
-            out.
+        lpips_weights: adds `lpips` wherever a view is compared with a photograph.
         on_view: receives every rendered view.
         on_progress: views done, views in all.
 
@@ -335,12 +334,8 @@ def _against_reference(
     """Score all views against photographs of one common exposure.
 
     Those are taken to be what no camera in particular sees: without vignetting, and of mean white
-    balance.
-
-    Args:
-        views: row of each; linear radiance, reference photograph and mask, kept; over a background
-            also the opacity.
-        judge: how all are shown, and by which scores they are judged.
+    balance. Views have their row; radiance, reference photograph and mask, kept; over a background
+    also the opacity.
     """
     shown, mean = judge.usual(None), judge.mean
 

@@ -56,12 +56,9 @@ class MeteredViews:
     def fit(
         self, exposures: Float[np.ndarray, " v"], gamma: float, tone: PhotometryConfig
     ) -> Metering:
-        """Return the rule that explains the exposures of the training views, in their order.
+        """Return the rule that explains the exposures of the training views, in the order added.
 
-        Args:
-            exposures: of the training views, in the order in which they were added.
-            gamma: of new views.
-            tone: tone curve.
+        `gamma` is that of new views.
         """
         logs = np.log(np.asarray(exposures, np.float64))
         return fit_metering(self._names, self._readings, logs, white_level(gamma, tone))
@@ -71,9 +68,7 @@ class MeteredViews:
     ) -> dict[int, dict[str, Any]]:
         """Return scores of every held-out view by its row; none where the rule is a constant.
 
-        Args:
-            metering: from `fit`.
-            score: (row, linear, exposure, photograph, mask, alpha) -> scores by name.
+        `score` is called with (row, linear, exposure, photograph, mask, alpha).
         """
         if not metering.rule.meters:
             return {}

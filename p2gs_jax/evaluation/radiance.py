@@ -102,9 +102,7 @@ def mu_law_psnr(
 class RadianceScores:
     """Collects views, then scores them under one common alignment.
 
-    Attributes:
-        arrays: keeps the images.
-        views: (name, split, recovered, truth, mask) of each view.
+    `views` has (name, split, recovered, truth, mask) of each view.
     """
 
     arrays: ArrayStore = field(default_factory=ArrayStore)
@@ -118,15 +116,11 @@ class RadianceScores:
         self.views.append((name, split, linear, truth, self.arrays.put(np.asarray(mask) > 0.5)))
 
     def summary(self, brightest: float) -> dict:
-        """Return means over all, training and held-out views.
+        """Return means over all, training and held-out views, and the alignment.
 
-        Args:
-            brightest: recovered radiance from which on at least half of the training photographs
-                are saturated: pixels above it are left out of the stops.
-
-        Returns:
-            `stops_median` and `stops_rms` after one common scale, `stops_rms_power` after scale
-            and power, `pu21_psnr`, `pu21_ssim`, `delta_e_itp`, `mu_law_psnr`; and the alignment.
+        From `brightest` on, recovered radiance, at least half of the training photographs are
+        saturated: pixels above it are left out of the stops. `stops_median` and `stops_rms` are
+        after one common scale, `stops_rms_power` after scale and power.
         """
         if not self.views:
             return {}

@@ -129,9 +129,7 @@ def is_drive(scene: Scene) -> bool:
 def parts_of(mask: Float32[np.ndarray, "h w"], moving: Bool[np.ndarray, "h w"]) -> Masks:
     """Return masks by name, without those that have too few pixels.
 
-    Args:
-        mask: 1 = use.
-        moving: covered by the boxes of what moves.
+    `moving` is covered by the boxes of what moves.
     """
     masks = {"whole": mask, "static": mask * ~moving, "moving": mask * moving}
     return {k: m.astype(np.float32) for k, m in masks.items() if m.sum() >= FEWEST_PIXELS}

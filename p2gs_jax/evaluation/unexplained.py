@@ -127,9 +127,7 @@ def shares_by_view(scene: Scene, found: Mapping[int, Unexplained]) -> dict:
 class Residuals:
     """Collects renders of training views, and finds what no static scene explains in them.
 
-    Args:
-        views: of the scene.
-        arrays: keeps what all views need to the end; None: memory does.
+    `arrays` keeps what all views need to the end; None: memory does.
     """
 
     def __init__(self, views: Sequence[View], arrays: ArrayStore | None = None):

@@ -51,17 +51,14 @@ def eotf(encoded: Values, curve: str) -> Values:
 
 def camera_row(name: str, cfg: PhotometryConfig) -> int | None:
     """Return the row of a camera in `cfg.cameras`: -1 if it is not there, None if nothing is."""
-    if not cfg.cameras:
-        return None
-    rows = [i for i, camera in enumerate(cfg.cameras) if camera.name == name]
-    return rows[0] if rows else UNKNOWN
+    rows = camera_rows((name,), cfg)
+    return None if rows is None else rows[0]
 
 
 def camera_rows(names: Sequence[str], cfg: PhotometryConfig) -> tuple[int, ...] | None:
-    """Return the row of each camera in `cfg.cameras`; None if nothing is there."""
-    if not cfg.cameras:
-        return None
-    return tuple(UNKNOWN if (row := camera_row(n, cfg)) is None else row for n in names)
+    """Return the row of each camera in `cfg.cameras`: likewise."""
+    known = [camera.name for camera in cfg.cameras]
+    return tuple(known.index(n) if n in known else UNKNOWN for n in names) if known else None
 
 
 def darkens(cfg: PhotometryConfig) -> bool:

@@ -85,15 +85,9 @@ def identity(views: int) -> Luminance:
     # Drawn once for all fits: a network of zeros would never learn.
     weights = generator(0, Stream.NETWORK).normal(0, STATISTICS**-0.5, (STATISTICS, HIDDEN))
     outputs = ENTRIES + 3
-    return Luminance(
-        on_device(np.linspace(0.0, 1.0, ENTRIES)),
-        on_device(weights),
-        on_device(np.zeros(HIDDEN)),
-        on_device(np.zeros((HIDDEN, outputs))),
-        on_device(np.zeros(outputs)),
-        on_device(np.zeros((views, AXES))),
-        on_device(np.zeros((views, STATISTICS))),
-    )
+    shapes = (HIDDEN, (HIDDEN, outputs), outputs, (views, AXES), (views, STATISTICS))
+    zeros = map(np.zeros, shapes)
+    return Luminance(*map(on_device, (np.linspace(0.0, 1.0, ENTRIES), weights, *zeros)))
 
 
 def axes_of(raw: Float[Array, " 5"]) -> Float[Array, "3 3"]:

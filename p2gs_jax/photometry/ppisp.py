@@ -88,16 +88,12 @@ class Ppisp(eqx.Module):
 
 def identity(cameras: Sequence[str]) -> Ppisp:
     """Return parameters that change nothing but to clip at 1; `cameras` is of every view."""
-    names = tuple(sorted(set(cameras)))
-    views = len(cameras)
-    return Ppisp(
-        on_device(np.zeros(views)),
-        on_device(np.zeros((views, 2 * len(SOURCES)))),
-        on_device(np.tile(identity_response(), (len(names), 3, 1))),
-        on_device(np.zeros((len(names), 3, COEFFICIENTS))),
-        names,
-        tuple(names.index(camera) for camera in cameras),
-    )
+    names, views = tuple(sorted(set(cameras))), len(cameras)
+    responses = np.tile(identity_response(), (len(names), 3, 1))
+    vignettings = np.zeros((len(names), 3, COEFFICIENTS))
+    learned = (np.zeros(views), np.zeros((views, 2 * len(SOURCES))), responses, vignettings)
+    rows = tuple(names.index(camera) for camera in cameras)
+    return Ppisp(*map(on_device, learned), names=names, cameras=rows)
 
 
 def applied(linear: Float[Array, "*p 3"], view: OneView) -> Float[Array, "*p 3"]:

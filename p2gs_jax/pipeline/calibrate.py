@@ -155,14 +155,9 @@ def calibrate_run(
 ) -> Calibration:
     """Solve the photometry of a finished run's training views anew, through its rendered depth.
 
-    Args:
-        run_dir: the run folder; it is not changed.
-        out: folder for the results; created.
-        cfg: its photometry says what to choose from and what is known; default `robust`. The run's
-            own choice is not used.
-        scene: see `load_run`.
-        compare_with: see `calibrate`.
-        reporter: receives progress.
+    The run is not changed. The photometry of `cfg` (default `robust`) says what to choose from and
+    what is known; the run's own choice is not used. `scene` is as for `load_run`, the others as for
+    `calibrate`.
 
     Raises:
         UserError: see `load_run`; the photographs are gone, the fit is opaque nowhere, or its views
@@ -271,15 +266,9 @@ def calibrate_stack(
     """Solve exposures and the common response of a stack: one fixed viewpoint, no poses needed.
 
     Without known exposures, their logarithms are found up to a factor: exposures and response
-    can be stretched together (the power gauge), which the standard curves' mid tones settle.
-
-    Args:
-        folder: photographs of one viewpoint.
-        out: folder for the results; None: nothing is written.
-        cfg: its photometry names known exposures, with which the response is then solved, and its
-            seed draws the sampled positions; default `robust`.
-        compare_with: stated exposures to report beside the recovered ones; default EXIF.
-        reporter: receives progress.
+    can be stretched together (the power gauge), which the standard curves' mid tones settle. The
+    photometry of `cfg` (default `robust`) names known exposures, and its seed draws the sampled
+    positions. Without `out` nothing is written; see `calibrate`.
 
     Raises:
         UserError: see `read_stack` and `read_known_exposures`.

@@ -57,16 +57,9 @@ def calibrate_of(
 
     Exposures come from the scene's tracks, or, where it has none, through the model's depth.
     Places, shapes and number of the Gaussians stay; colours and opacities are fitted under the
-    exposures found. `out` becomes a run folder that has the files of a calibration as well.
-
-    Args:
-        scene_dir: see `fit`; the views that it holds out judge the result.
-        out: created; it must hold no run.
-        cfg: options (data, photometry, loss, rendering); default `robust`.
-        model: display colours, in the coordinates of the scene's poses.
-        steps: of refitting colours and opacities, one view each.
-        compare_with: see `calibrate`.
-        reporter: receives progress.
+    exposures found, in `steps` of one view each. `out` becomes a run folder that has the files of a
+    calibration as well. The `model` has display colours, in the coordinates of the scene's poses;
+    the views that the scene holds out judge the result. See `calibrate`.
 
     Raises:
         UserError: something the user can mend.

@@ -73,52 +73,42 @@ def solve_exposures(
         dense: observations are wanted even where the fit starts from no exposures.
         kept: what the checkpoints of a run that is resumed remember: its model and curve stay.
     """
-    observations, selection, notes = _solve(
-        scene, still, cfg, reporter or Silent(), on_chosen, dense=dense, kept=kept
-    )
+    found, notes = _sampled(scene, still, cfg, reporter or Silent(), dense=dense)
+    selection, under = None, cfg if kept is None else kept.resolve(cfg)
+    if found is not None and len(found.points) and cfg.photometry.start == "tracks":
+        (reporter or Silent()).stage("Photometric bundle adjustment")
+        selection = calibrate_observations(found, options_of(under, scene), on_chosen)
+        if kept is not None:
+            selection = dataclasses.replace(selection, reasons=kept.reasons)
+        notes += [*selection.reasons, *selection.solution.warnings]
     decisions = decide(cfg, selection, kept=kept)
     resolved = decisions.resolve(cfg)
     solution = None if selection is None else selection.solution
     taken_by = [view.camera for view in scene.training_views]
     photometry = initial_photometry(solution, taken_by, resolved)
-    return Exposures(photometry, decisions, observations, selection, notes=tuple(notes))
+    return Exposures(photometry, decisions, found, selection, notes=tuple(notes))
 
 
-def _solve(
-    scene: Scene,
-    store: ImageStore,
-    cfg: FitConfig,
-    reporter: Reporter,
-    on_chosen: OnChosen,
-    *,
-    dense: bool,
-    kept: Decisions | None,
-) -> tuple[Observations | None, Selection | None, list[str]]:
-    from_tracks = cfg.photometry.start == "tracks"
+def _sampled(
+    scene: Scene, still: ImageStore, cfg: FitConfig, reporter: Reporter, *, dense: bool
+) -> tuple[Observations | None, list[str]]:
+    """Return colours of shared points, where they are wanted, and what the user should know."""
+    from_tracks, notes = cfg.photometry.start == "tracks", []
     if not (has_tracks(scene) or from_tracks or dense):
-        return None, None, []
-    notes = []
+        return None, []
     if scene.random_seeds:
-        notes = ["Seeds at random show nothing twice: exposures start at 1 and are learned."]
-        return None, None, notes if from_tracks else []
+        note = "Seeds at random show nothing twice: exposures start at 1 and are learned."
+        return None, [note] if from_tracks else []
     if not has_tracks(scene):
         notes.append("No tracks: seed points are projected into the views instead.")
-    tracks = surface_colors(
-        scene, store, cfg.train.seed, lambda i, n: reporter.stage("Sampling colours", i, n)
+    found = surface_colors(
+        scene, still, cfg.train.seed, lambda i, n: reporter.stage("Sampling colours", i, n)
     )
-    if not from_tracks:
-        return tracks, None, notes
-    if not len(tracks.points):
+    if from_tracks and not len(found.points):
         notes.append(
             "No point is seen twice: exposures start at 1 and are learned from the first step."
         )
-        return tracks, None, notes
-    reporter.stage("Photometric bundle adjustment")
-    under = cfg if kept is None else kept.resolve(cfg)
-    selection = calibrate_observations(tracks, options_of(under, scene), on_chosen)
-    if kept is not None:
-        selection = dataclasses.replace(selection, reasons=kept.reasons)
-    return tracks, selection, [*notes, *selection.reasons, *selection.solution.warnings]
+    return found, notes
 
 
 def decide(
@@ -126,10 +116,8 @@ def decide(
 ) -> Decisions:
     """Return what the photographs decided.
 
-    Args:
-        cfg: as asked.
-        selection: what the bundle adjustment chose and solved, or None.
-        kept: from the checkpoints of a run that is resumed: what its cameras do stays to the digit.
+    Where the checkpoints of a run that is resumed are `kept`, what its cameras do stays to the
+    digit.
     """
     decided = Decisions.as_asked(cfg)
     if selection is None:
@@ -152,12 +140,7 @@ def decide(
 
 
 def likely(cfg: FitConfig, kept: Decisions | None) -> Decisions | None:
-    """Return what most scenes decide, to compile for it beforehand; None: who knows.
-
-    Args:
-        cfg: as asked.
-        kept: from the checkpoints of a run that is resumed, or None.
-    """
+    """Return what most scenes decide, to compile for it beforehand; None: who knows."""
     p, relative = cfg.photometry, cfg.loss.relative_exposure
     if p.known is not None or relative.weight is not None or cfg.densify.method != "mcmc":
         return None

@@ -149,11 +149,8 @@ def _read(paths: Paths, cfg: FitConfig, reporter: Reporter, clock: Stopwatch) ->
 class Optimiser:
     """Compiles and runs the steps of a fit; as a context manager it ends the compilers.
 
-    Args:
-        folder: of the run: where the log and checkpoints go.
-        reporter: receives progress.
-        mesh: the devices of a step of several views; None: the default one.
-        own: what the caller of `fit` brought.
+    The log and checkpoints go into `folder`; `mesh` has the devices of a step of several views, and
+    `own` what the caller of `fit` brought.
     """
 
     def __init__(
@@ -191,11 +188,8 @@ class Optimiser:
     ) -> TrainResult:
         """Run the optimisation, from the start or from the newest checkpoint.
 
-        Args:
-            start: from `prepare`; what the steps have to say is noted in it as well.
-            resume: continue from the newest checkpoint.
-            spent_s: seconds of the budget that are already gone.
-            reserve_s: seconds of the budget to keep for evaluation and files.
+        What the steps have to say is noted in `start` as well. Of the budget, `spent_s` seconds are
+        gone and `reserve_s` are kept for evaluation and files.
         """
         alive = np.ones(start.params.gaussians.capacity, bool)
         params, owner = self._own.among(start.params), start.owner

@@ -30,12 +30,7 @@ def saved_steps(folder: Path) -> list[int]:
 
 
 class CheckpointStore:
-    """The checkpoints of one run.
-
-    Args:
-        folder: where they lie; one run writes to it at a time.
-        keep: how many.
-    """
+    """The last few checkpoints of one run; one run writes to their folder at a time."""
 
     def __init__(self, folder: Path, keep: int = 2):
         self.folder, self.keep = Path(folder), keep
@@ -93,9 +88,7 @@ class CheckpointStore:
     def restore(self, step: int, like: Tree) -> tuple[Tree, dict]:
         """Return the tree of a checkpoint, bit for bit in numpy arrays, and its plain values.
 
-        Args:
-            step: which.
-            like: arrays or shapes, in the structure that was saved.
+        `like` has arrays or shapes, in the structure that was saved.
 
         Raises:
             UserError: it cannot be read, or holds other leaves, shapes or types than `like`.
@@ -108,9 +101,8 @@ class CheckpointStore:
     ) -> tuple[Tree, dict] | None:
         """Return the newest readable checkpoint and its values, or None where there is none.
 
-        Args:
-            like: from the saved values to arrays or shapes of the structure that was saved.
-            on_message: told about checkpoints that could not be read.
+        `like` is called with the saved values, and returns what `restore` wants; `on_message` is
+        told about checkpoints that could not be read.
 
         Raises:
             UserError: there are checkpoints and none can be read.

@@ -26,11 +26,7 @@ _FROM_RUN = "_from_run"
 
 
 class RunFolder:
-    """The paths of a run folder; docs/files.md says what each file holds.
-
-    Args:
-        root: the folder itself.
-    """
+    """The paths of a run folder; docs/files.md says what each file holds."""
 
     def __init__(self, root: Path):
         self.root = root
@@ -86,12 +82,7 @@ def find(saved: Mapping[str, Any], key: str, folder: Path) -> Path | None:
 
 
 class RunLock:
-    """The lock of a folder while it is held.
-
-    Args:
-        folder: the locked folder.
-        handle: descriptor of the locked file, or None where the file system knows no locks.
-    """
+    """The lock of a folder while it is held; no handle: the file system knows no locks."""
 
     def __init__(self, folder: Path, handle: int | None):
         self.folder, self._handle = folder, handle

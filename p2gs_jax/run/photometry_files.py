@@ -179,14 +179,8 @@ def write_fitted(
 ) -> None:
     """Write `photometry.json` of a finished fit.
 
-    Args:
-        path: of the file.
-        params: what was fitted.
-        scene: its views.
-        cfg: what the fit computed under.
-        fitted: exposures solved for held-out views, by row.
-        unknown: names of photographs that tell no exposure.
-        solution: what the fit started from, or None; its errors and counts are passed on.
+    Exposures that were `fitted` to held-out views are by row; `unknown` names photographs that tell
+    no exposure; errors and counts of the `solution` that the fit started from are passed on.
     """
     p, mean = cfg.photometry, dataclasses.asdict(mean_parameters(params.photometry))
     gauge = (

@@ -116,9 +116,8 @@ class Run:
     def with_moved(self, name: str, offset: Sequence[float]) -> Run:
         """Return the run with one object elsewhere, at all times.
 
-        Args:
-            name: of its track (`Scene.objects`), or how that begins.
-            offset: forward, left and up in the frame of its box, scene units.
+        The object is named by its track (`Scene.objects`), or how that begins; the offset is
+        forward, left and up in the frame of its box, scene units.
 
         Raises:
             UserError: nothing moves, or no object has this name.
@@ -256,11 +255,8 @@ class Run:
 def load_run(folder: str | Path, scene: str | Path | None = None) -> Run:
     """Read parameters, configuration and cameras of a finished run.
 
-    Photographs are read when they are asked for; all else works without them.
-
-    Args:
-        folder: the run folder.
-        scene: where its scene lies now; None looks where it was, also relative to the run.
+    Photographs are read when they are asked for; all else works without them. `scene` says where
+    the scene lies now; None looks where it was, also relative to the run.
 
     Raises:
         UserError: the folder is not a run, is unfinished or damaged, or was made by a version that

@@ -60,20 +60,17 @@ def write_street(
 
     Args:
         out: the folder to make; it must not exist, or be empty.
-        frames: photographs of each of the three cameras.
+        frames: photographs of each of the three cameras, `step` m apart.
         width: pixels (paper: 1920), as is the height (1300).
         iso_std: spread of the ISO (paper: 2 and 4); 0 writes ISO-Const. `sensor` replaces it.
         seed: of the town, the ISO and the points.
         supersample: samples a pixel along each axis.
-        step: metres between frames.
         points: seed points to sample; those seen once are dropped.
         hold_out: no points are sampled in every n-th frame, as they may be held out; 0: in all.
         sensor: what the cameras do to the light.
-        layout: `town` adds an underpass and draws the sun's place from the seed; `long` is as many
-            streets one behind another as the drive is long.
+        layout: `town` adds an underpass and draws the sun; `long` is as many streets as it takes.
 
-    Raises:
-        UserError: a parameter is impossible, or `out` is in the way.
+    UserError: a parameter is impossible, or `out` is in the way.
     """
     out, sensor = Path(out), sensor or Sensor(iso_std=iso_std)
     asked = {
@@ -87,19 +84,10 @@ def write_street(
     shots = draw_shots(sensor, frames, len(MOUNTS), seed)
     with atomic_folder(out) as temporary:
         report(f"rendering {len(views.names)} views of a street with {town.size} solids")
-        photographs, depths = [], []
-        for row, (linear, depth) in enumerate(_render_all(town, views, supersample)):
-            shot = _photographed(linear, shots, sensor, row, seed)
-            reference = photograph(linear, 1.0, Sensor(curve=sensor.curve))
-            _write_view(temporary, views.names[row], shot, reference, linear, depth)
-            photographs.append(shot)
-            depths.append(depth)
-            if (row + 1) % 10 == 0:
-                report(f"rendered {row + 1} of {len(views.names)} views")
-        sampled = np.ones(frames, bool)
-        if hold_out and frames > 1:
-            sampled[::hold_out] = False
-        xyz, rgb = sample_seeds(views, photographs, depths, sampled[frame], points, seed)
+        rendered = _render_all(town, views, supersample)
+        photographs, depths = _photograph(temporary, views, rendered, shots, sensor, seed, report)
+        held = (frame % hold_out == 0) if hold_out and frames > 1 else np.zeros(len(frame), bool)
+        xyz, rgb = sample_seeds(views, photographs, depths, ~held, points, seed)
         observed = write_seeds(temporary / "sparse" / "0", views, xyz, rgb, depths)
         write_true_exposures(temporary, views.names, views.cameras, shots)
         card = {
@@ -110,8 +98,7 @@ def write_street(
         }
         (temporary / "dataset.json").write_text(json.dumps(card, indent=2) + "\n")
         _require_free(out)
-    counts = f"{observed['points']} points, {observed['observations']} observations"
-    report(f"wrote {out}: {len(views.names)} photographs, {counts}")
+    report(f"wrote {out}: {len(views.names)} photographs, {observed['points']} points")
     return out
 
 
@@ -127,9 +114,27 @@ def _views(frames: int, width: int, height: int, step: float):
     return DriveViews(names, cameras, viewmats, intrinsics(width, height), width, height), frame
 
 
-def _photographed(linear: np.ndarray, shots: Shots, sensor: Sensor, row: int, seed: int):
-    rng, own = generator(seed, SceneStream.PHOTOGRAPH, row), shots.sensor(sensor, row)
-    return photograph(linear, shots.exposures[row], own, balance=shots.balance[row], rng=rng)
+def _photograph(
+    root: Path,
+    views: DriveViews,
+    rendered: Iterator[tuple[np.ndarray, np.ndarray]],
+    shots: Shots,
+    sensor: Sensor,
+    seed: int,
+    report: Callable[[str], None],
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Write all views; return photographs and depths."""
+    photographs, depths = [], []
+    for row, (linear, depth) in enumerate(rendered):
+        rng, own = generator(seed, SceneStream.PHOTOGRAPH, row), shots.sensor(sensor, row)
+        shot = photograph(linear, shots.exposures[row], own, balance=shots.balance[row], rng=rng)
+        reference = photograph(linear, 1.0, Sensor(curve=sensor.curve))
+        _write_view(root, views.names[row], shot, reference, linear, depth)
+        photographs.append(shot)
+        depths.append(depth)
+        if (row + 1) % 10 == 0:
+            report(f"rendered {row + 1} of {len(views.names)} views")
+    return photographs, depths
 
 
 def _check(out: Path, asked: dict[str, Any]) -> None:

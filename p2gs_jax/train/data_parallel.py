@@ -39,7 +39,7 @@ from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.train import image_gradient
 from p2gs_jax.train.image_gradient import ImageGradient, Listed, differentiable
 from p2gs_jax.train.optimizer import learning_rates, means_rate
-from p2gs_jax.train.state import Fault, FitState
+from p2gs_jax.train.state import FitState
 from p2gs_jax.train.step import Step, static_sizes
 from p2gs_jax.train.update import StepReport, is_healthy, settled, update_listed
 from p2gs_jax.types import Gaussians
@@ -104,28 +104,14 @@ def mesh_of(cfg: FitConfig, devices: Count = 1) -> Mesh | None:
     return default_mesh(count)
 
 
-@dataclasses.dataclass(frozen=True)
-class Spread:
-    """How a state lies on the devices of a fit: whole on each of `mesh`, or, None, on one."""
+def spread(state: FitState, mesh: Mesh | None) -> FitState:
+    """Return a state as steps take it: whole on each of the devices; None: where it is."""
+    return state if mesh is None else placed(state, mesh, EVERYWHERE)
 
-    mesh: Mesh | None
 
-    def spread(self, state: FitState) -> FitState:
-        """Return a state as steps take it."""
-        return state if self.mesh is None else placed(state, self.mesh, EVERYWHERE)
-
-    def whole(self, state: FitState) -> FitState:
-        """Return a state of steps on the default device, for what looks at all Gaussians."""
-        if self.mesh is None:
-            return state
-        return jax.tree.map(lambda a: jnp.asarray(np.asarray(a)), state)
-
-    def healed(self, state: FitState) -> FitState:
-        """Return a state of steps without its fault."""
-        fault = Fault.none()
-        if self.mesh is not None:
-            fault = placed(fault, self.mesh, EVERYWHERE)
-        return dataclasses.replace(state, fault=fault)
+def whole(state: FitState, mesh: Mesh | None) -> FitState:
+    """Return a state of steps on the default device, for what looks at all Gaussians."""
+    return state if mesh is None else jax.tree.map(lambda a: jnp.asarray(np.asarray(a)), state)
 
 
 def placed(tree: Any, mesh: Mesh, spec: P) -> Any:
@@ -336,7 +322,7 @@ def _compiled(name: str, *, mesh: Mesh, **static: Any) -> Any:
 class ParallelStep(Step):
     """The step of several views; `train.batch` is a multiple of the devices.
 
-    Batches and partners come stacked, states spread (`Spread`).
+    Batches and partners come stacked, states by `spread`.
     """
 
     mesh: Mesh = dataclasses.field(default_factory=default_mesh)

@@ -30,7 +30,7 @@ from p2gs_jax.gaussians.population import STEP_SECONDS_PER_PIXEL, Coverage
 from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.train import room, schedule, strategies
-from p2gs_jax.train.data_parallel import ParallelStep, Spread, default_mesh
+from p2gs_jax.train.data_parallel import ParallelStep, default_mesh, spread, whole
 from p2gs_jax.train.exposure_loss import ColorPairs
 from p2gs_jax.train.inputs import Inputs, TrainingViews, controls_at, inputs_at
 from p2gs_jax.train.optimizer import make_optimizer
@@ -42,6 +42,7 @@ from p2gs_jax.train.state import (
     FitState,
     HostState,
     alive_in,
+    healed,
     initial_state,
 )
 from p2gs_jax.train.step import Key, Step, StepPrograms
@@ -112,7 +113,7 @@ class Trainer:
         noise = getattr(self.densification, "noise", None)
         given = (cfg, self.optimizer, self.extent, noise, self.terms or {})
         self.step = Step(*given) if mesh is None else ParallelStep(*given, mesh)
-        self.spread = Spread(mesh)
+        self.devices = mesh
 
     def run(
         self,
@@ -124,15 +125,11 @@ class Trainer:
         spent_s: float = 0.0,
         finish_s: float = 0.0,
     ) -> TrainResult:
-        """Optimise until the run is complete.
+        """Optimise until the run is complete, from initial parameters or the newest checkpoint.
 
-        Args:
-            params: initial parameters.
-            alive: which Gaussians exist.
-            owner: the moving object that each belongs to, or None.
-            resume: continue from the newest checkpoint, if there is one.
-            spent_s: seconds of a time budget that are gone.
-            finish_s: seconds of it to leave for what follows, on an unloaded machine.
+        `alive` says which Gaussians exist, `owner` which moving object each belongs to. `spent_s`
+        are the seconds of a time budget that are gone, `finish_s` those to leave for what follows,
+        on an unloaded machine.
 
         Raises:
             DivergenceError: a loss term or gradient is not finite.
@@ -158,11 +155,11 @@ class Trainer:
         )
         population = state.population
         self._allocate(state.params.gaussians, population.alive, population.owner, host)
-        state = self.spread.spread(state)
+        state = spread(state, self.devices)
         self._expect(state, host)
         with interrupts.held() as self.asked:
             state = self._loop(state, host, clock)
-            state = self.spread.whole(state)
+            state = whole(state, self.devices)
             self._save(state, host)
         return TrainResult(
             state,
@@ -211,7 +208,7 @@ class Trainer:
             asked = self.asked.arrived
             if asked is not None or host.elapsed_s - saved > pause:
                 begun = host.elapsed_s
-                self._save(self.spread.whole(state), host)
+                self._save(whole(state, self.devices), host)
                 clock.tick(host)
                 saved = host.elapsed_s
                 pause = pause_between(every_s, saved - begun)
@@ -256,7 +253,7 @@ class Trainer:
             needed, visible = int(state.fault.needed), int(state.fault.visible)
             host.rooms = room.grown(host.rooms, sizes[taken], needed, visible)
             host.overflows += 1
-            state = self.spread.healed(state)
+            state = healed(state)
         elif done:
             pace, known = seconds / done, host.step_s > 0
             host.step_s = (1 - PACE_SHARE) * host.step_s + PACE_SHARE * pace if known else pace
@@ -302,14 +299,14 @@ class Trainer:
             host.densified_at = host.progress
             state = strategies.densified(
                 self.densification,
-                self.spread.whole(state),
+                whole(state, self.devices),
                 host,
                 self.cfg,
                 self.extent,
                 self.slots.limit,
                 self.on_message,
             )
-            return self.spread.spread(state)
+            return spread(state, self.devices)
 
     def _save(self, state: FitState, host: HostState) -> None:
         with self.stopwatch("checkpoints"):

@@ -29,9 +29,9 @@ from p2gs_jax.train.room import room_for
 from p2gs_jax.train.state import (
     FAULT_NONFINITE,
     FAULT_OVERFLOW,
-    Fault,
     FitState,
     HostState,
+    healed,
     initial_state,
 )
 from p2gs_jax.train.step import Step
@@ -94,10 +94,10 @@ class TrainingStep:
         mask: Bool[Array, "h w"] | None = None,
         progress: float = 0.0,
     ) -> tuple[FitState, StepReport]:
-        """Return the state after a step of one view, and what the step reports.
+        """Return the state after a step of one view, and its report; the state is donated.
 
         Args:
-            state: before; donated.
+            state: before.
             camera: of the view.
             photograph: display values in [0, 1], or integers of which the largest is 1.
             view: row in `Photometry`.
@@ -136,7 +136,7 @@ class TrainingStep:
                 return state, report
             needed = int(state.fault.needed), int(state.fault.visible)
             self._rooms[size] = self._rooms[size].grown(*needed)
-            state = dataclasses.replace(state, fault=Fault.none())
+            state = healed(state)
 
     def densify(self, state: FitState, progress: float) -> FitState:
         """Return the state with the population that the strategy gives; the state is donated."""

@@ -112,16 +112,10 @@ def replanned(per_step: float, progress: float, left_s: float, step_s: float) ->
 class RunClock:
     """The clock of one session, and the deadline of the run that it continues.
 
-    Args:
-        cfg: the budget.
-        host: seconds of earlier sessions.
-        spent_s: seconds of the budget that were gone before the run.
-        finish_s: seconds of it to leave for what follows, on an unloaded machine.
-        full_step_s: seconds of a step at full size there.
-        now: seconds on a clock that never goes back.
-
-    Attributes:
-        deadline_s: seconds into the run at which optimisation must end; None without a budget.
+    Of a budget `spent_s` seconds were gone before the run, and `finish_s` are left for what
+    follows, on an unloaded machine, where a step at full size takes `full_step_s`. `now` gives
+    seconds on a clock that never goes back. `deadline_s` are the seconds into the run at which
+    optimisation must end; None without a budget.
     """
 
     def __init__(

@@ -115,6 +115,11 @@ def grow_state(state: FitState, capacity: int) -> FitState:
     )
 
 
+def healed(state: FitState) -> FitState:
+    """Return the state without its fault, which lies where it lay."""
+    return dataclasses.replace(state, fault=jax.tree.map(jnp.zeros_like, state.fault))
+
+
 def replace_gaussians(
     state: FitState, gaussians: Gaussians, population: Population, opt_state: OptState
 ) -> FitState:

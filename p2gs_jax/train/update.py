@@ -104,19 +104,10 @@ def advance(
 ) -> tuple[FitState, StepReport]:
     """Move the listed Gaussians, photometry and corrections by one step; the state is donated.
 
-    Args:
-        state: before the step.
-        ids: of the listed Gaussians, from `show`.
-        count: how many the views may show.
-        gradient: of the images' loss.
-        frusta: the views.
-        controls: of the schedule.
-        cfg: rendering, rates, the gauge of the exposures.
-        optimizer: from `make_optimizer`.
-        extent: scene extent, scene units.
-        noise: scale of the exploration noise on the means; None adds none, and sums statistics
-            for densification instead.
-        degree: highest spherical-harmonics degree that moves.
+    `ids` are those of the listed Gaussians and `count` is how many the `frusta` may show, both from
+    `show`. `extent` is the scene's, scene units; `degree` the highest spherical-harmonics degree
+    that moves; `noise` the scale of the exploration noise on the means: None adds none, and sums
+    statistics for densification instead.
     """
     gaussians, population = state.params.gaussians, state.population
     n, bands = gaussians.capacity, coefficient_count(degree)
@@ -170,20 +161,16 @@ def update_listed(
     noise: Callable[..., Float[Array, "b 3"]] | None,
     owner: Int[Array, " n"] | None = None,
 ) -> Updated:
-    """Move the listed Gaussians by one step.
+    """Move the listed Gaussians by one step; nothing is written unless the step is `healthy`.
 
     Args:
         gaussians: the scene.
         moments: Adam's, of all of them.
         alive: slots in use.
-        ids: from `compact`, whole blocks.
-        count: how many are listed.
-        healthy: otherwise nothing is written.
+        ids: from `compact`, whole blocks, of which `count` are listed.
         bands: spherical-harmonics coefficients that are looked at and moved.
         seen: (Gaussians, alive, owner) of a block -> what the image is made of, per Gaussian.
         v_seen: gradient of the loss to that, for the whole list.
-        adam: by row.
-        rates: learning rates.
         noise: (number of a block, ids, Gaussians, alive) -> what to add to their means, or None.
         owner: the moving object that each Gaussian belongs to, or None.
     """

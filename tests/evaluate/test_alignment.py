@@ -30,32 +30,25 @@ def test_exposure_error_ignores_scale_and_reports_power():
         exposure_error(np.array([1.0, 0.0]), e[:2])
 
 
-@pytest.mark.parametrize("true", [0.05, 0.4, 1.0, 3.0, 20.0])
+def light(seed=0):
+    rng = np.random.default_rng(seed)
+    return jnp.asarray(np.exp2(rng.normal(-3, 2, (20, 30, 3))), jnp.float32)
+
+
+@pytest.mark.parametrize("true", [2.0**-9, 0.05, 0.4, 3.0, 20.0, 2.0**9])
 @pytest.mark.parametrize("curve", ["srgb", "power"])
 def test_fit_exposure_finds_the_exposure(true, curve):
-    cfg = PhotometryConfig(curve=curve)
-    rng = np.random.default_rng(0)
-    linear = jnp.asarray(np.exp2(rng.normal(-3, 2, (20, 30, 3))), jnp.float32)
-    photo = display(formation(linear, Capture(jnp.float32(true), jnp.float32(2.2)), cfg))
-    found = fit_exposure(linear, photo, jnp.ones((20, 30)), USUAL, cfg)
+    """Also where the photograph is far darker or brighter than what is shown."""
+    cfg, linear = PhotometryConfig(curve=curve), light()
+    photo = display(formation(linear, USUAL, cfg))
+    found = fit_exposure(linear / true, photo, jnp.ones((20, 30)), USUAL, cfg)
     assert float(found) == pytest.approx(true, rel=2e-3)
-
-
-@pytest.mark.parametrize("stops", [-9.0, 6.6, 9.0])
-def test_fit_exposure_reaches_photographs_far_darker_and_brighter(stops):
-    cfg = PhotometryConfig(curve="srgb")
-    rng = np.random.default_rng(0)
-    shown = jnp.asarray(np.exp2(rng.normal(-3, 2, (20, 30, 3))), jnp.float32)
-    photo = display(formation(shown, USUAL, cfg))
-    found = fit_exposure(shown / 2**stops, photo, jnp.ones((20, 30)), USUAL, cfg)
-    assert np.log2(found) == pytest.approx(stops, abs=3e-3)
 
 
 @pytest.mark.parametrize(("true", "gamma"), [(0.3, 1.7), (1.0, 3.1), (4.0, 2.4)])
 def test_exposure_and_gamma_are_found_together(true, gamma):
     cfg = PhotometryConfig()
-    rng = np.random.default_rng(0)
-    linear = jnp.asarray(np.exp2(rng.normal(-3, 2, (20, 30, 3))), jnp.float32)
+    linear = light()
     photo = display(formation(linear, Capture(jnp.float32(true), jnp.float32(gamma)), cfg))
     mask = jnp.ones((20, 30)).at[:4].set(0.0)
     photo = photo.at[:4].set(1.0)
@@ -71,8 +64,7 @@ def test_exposure_and_gamma_are_found_together(true, gamma):
 @pytest.mark.parametrize("before", [None, (0.1, 0.0, -0.1)])
 def test_white_balance_is_found_with_the_exposure(gamma, before):
     cfg = PhotometryConfig()
-    rng = np.random.default_rng(0)
-    linear = jnp.asarray(np.exp2(rng.normal(-3, 2, (20, 30, 3))), jnp.float32)
+    linear = light()
     balance = np.array([0.3, -0.1, -0.2], np.float32)
     true = Capture(jnp.float32(1.4), jnp.float32(gamma or 2.2), jnp.asarray(balance))
     photo, mask = display(formation(linear, true, cfg)), jnp.ones((20, 30))

@@ -1,5 +1,6 @@
 """What is written can be read back, by us and by others, or is not there at all."""
 
+import json
 import os
 
 import cv2
@@ -13,37 +14,26 @@ from p2gs_jax.run.photometry_files import read_photometry, write_photometry
 from p2gs_jax.run.plots import _lines, _shorten, write_summary
 
 
-def test_atomic_write_leaves_the_old_file_on_failure(tmp_path):
-    path = tmp_path / "a.json"
-    write_json(path, {"x": 1})
-
-    def fail():
-        with atomic_write(path) as temporary:
-            temporary.write_text("half")
-            raise RuntimeError
-
-    with pytest.raises(RuntimeError):
-        fail()
-    assert '"x": 1' in path.read_text()
-    assert os.listdir(tmp_path) == ["a.json"]
-
-
-def test_atomic_folder_replaces_the_old_one_only_when_whole(tmp_path):
+def test_a_failure_leaves_the_old_file_or_folder_and_success_replaces_it(tmp_path):
+    write_json(tmp_path / "a.json", {"x": 1})
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "old").write_text("old")
 
-    def fail():
-        with atomic_folder(tmp_path / "out") as folder:
-            (folder / "new").write_text("half")
+    def half(opened, name=""):
+        with opened as temporary:
+            (temporary / name if name else temporary).write_text("half")
             raise RuntimeError
 
     with pytest.raises(RuntimeError):
-        fail()
-    assert os.listdir(tmp_path) == ["out"]
+        half(atomic_write(tmp_path / "a.json"))
+    with pytest.raises(RuntimeError):
+        half(atomic_folder(tmp_path / "out"), "new")
+    assert '"x": 1' in (tmp_path / "a.json").read_text()
+    assert sorted(os.listdir(tmp_path)) == ["a.json", "out"]
     assert os.listdir(tmp_path / "out") == ["old"]
     with atomic_folder(tmp_path / "out") as folder:
         (folder / "new").write_text("whole")
-    assert os.listdir(tmp_path) == ["out"]
+    assert sorted(os.listdir(tmp_path)) == ["a.json", "out"]
     assert os.listdir(tmp_path / "out") == ["new"]
 
 
@@ -77,40 +67,31 @@ def test_a_whole_line_without_its_newline_is_kept_and_a_broken_one_is_named(tmp_
         read_jsonl(path)
 
 
-def test_photometry_round_trip(tmp_path):
-    view = {
-        "image": "a.png",
-        "camera": "0",
-        "exposure": None,
-        "exposure_ev": None,
-        "gamma": None,
-        "exif_ev": 1.5,
-        "split": "test",
-        "exposure_fitted": 1.2,
-    }
-    path = tmp_path / "photometry.json"
-    write_photometry(path, model="m", curve={}, gauge="g", mean={}, views=[view])
-    assert read_photometry(path)["views"][0] == view
-    path.write_text("{}")
-    with pytest.raises(UserError, match="incomplete"):
-        read_photometry(path)
+VIEW = {"image": "a.png", "camera": "0", "split": "test", "exif_ev": 1.5, "exposure_fitted": 1.2}
+VIEW |= dict.fromkeys(("exposure", "exposure_ev", "gamma"))
 
 
-def test_photometry_of_incomplete_views(tmp_path):
-    path = tmp_path / "photometry.json"
+def test_photometry_comes_back_and_incomplete_views_are_refused(tmp_path):
+    path, common = tmp_path / "photometry.json", {"model": "m", "gauge": "g"}
     with pytest.raises(ValueError, match=r"view 0: .*gamma"):
-        write_photometry(path, model="m", curve={}, gauge="g", mean={}, views=[{"image": "a"}])
+        write_photometry(path, **common, curve={}, mean={}, views=[{"image": "a"}])
     assert not path.exists()
-    path.write_text(
-        '{"version": 2, "model": 1, "curve": 1, "gauge": 1, "mean": 1, "cameras": 1, "views": [3]}'
-    )
-    with pytest.raises(UserError, match="view 0: not an object"):
-        read_photometry(path)
+    write_photometry(path, **common, curve={}, mean={}, views=[VIEW])
+    assert read_photometry(path)["views"][0] == VIEW
+    whole = json.loads(path.read_text())
+    for content, words in (({}, "incomplete"), (whole | {"views": [3]}, "view 0: not an object")):
+        path.write_text(json.dumps(content))
+        with pytest.raises(UserError, match=words):
+            read_photometry(path)
 
 
-@pytest.mark.parametrize("columns", [1, 5])
-def test_summary_is_written_with_gaps_in_exif_and_long_names(tmp_path, columns):
-    images = [np.full((24, 32, 3), 0.5, np.float32)] * columns
+LONG = ["a/very/long/folder/" * 5 + "0001.jpg (test)"] * 5
+HOSTILE = ["\x1b[31mred.png", r"$\nothing$.png", "写真.png"]
+
+
+@pytest.mark.parametrize("names", [LONG[:1], LONG, HOSTILE], ids=["one", "long", "hostile"])
+def test_a_summary_is_written_in_silence_with_gaps_in_exif_and_odd_names(tmp_path, recwarn, names):
+    images = [np.full((24, 32, 3), 0.5, np.float32)] * len(names)
     exif = np.arange(9.0)
     exif[[1, 4, 7, 8]] = np.nan
     write_summary(
@@ -118,27 +99,13 @@ def test_summary_is_written_with_gaps_in_exif_and_long_names(tmp_path, columns):
         photographs=images,
         rendered=images,
         linear_tonemapped=images,
-        names=["a/very/long/folder/" * 5 + "0001.jpg (test)"] * columns,
+        names=names,
         exposures_ev=np.linspace(-1, 1, 9),
-        cameras=["left", "mid", "right"] * 3,
+        cameras=[r"$\nothing$", "\x1b[31m", "写"] * 3,
         true_ev=np.full(9, np.nan),
         exif_ev=exif,
     )
     assert cv2.imread(str(tmp_path / "s.png")).shape[1] > 600
-
-
-def test_a_summary_of_hostile_names_is_written_in_silence(tmp_path, recwarn):
-    images = [np.full((24, 32, 3), 0.5, np.float32)] * 3
-    write_summary(
-        tmp_path / "s.png",
-        photographs=images,
-        rendered=images,
-        linear_tonemapped=images,
-        names=["\x1b[31mred.png", r"$\nothing$.png", "写真.png"],
-        exposures_ev=np.zeros(3),
-        cameras=[r"$\nothing$", "\x1b[31m", "写"],
-    )
-    assert (tmp_path / "s.png").stat().st_size > 0
     assert not [str(w.message) for w in recwarn]
 
 

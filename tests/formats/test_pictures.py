@@ -80,41 +80,25 @@ def test_exr_holds_radiance_exposure_and_depth(tmp_path):
         np.testing.assert_allclose(file.channels()["Z"].pixels, 8.0)
 
 
-def test_world_to_ndc_puts_points_where_the_camera_sees_them(tmp_path):
+def test_points_lie_in_the_header_s_cameras_where_the_camera_sees_them(tmp_path):
     header, cam = written(tmp_path / "a.exr"), camera()
     viewmat, K = np.asarray(cam.viewmat, float), np.asarray(cam.K, float)
-    for local in ([0.3, -0.2, 2.0], [-1.0, 0.8, 5.0], [0.0, 0.0, 1.0]):
-        world = viewmat[:3, :3].T @ (np.array(local) - viewmat[:3, 3])
+    # The principal point is 41 pixels from the left and 37 from the top: y points down.
+    for local in ([0.3, -0.2, 2.0], [-1.0, 0.8, 5.0], [0.0, 0.0, 3.0]):
+        world = np.append(viewmat[:3, :3].T @ (np.array(local) - viewmat[:3, 3]), 1.0)
         u, v, w = K @ local
         # Imath: a row vector times the matrix, divided by its last component.
-        x, y, _, weight = np.append(world, 1.0) @ header["worldToNDC"].astype(float)
-        np.testing.assert_allclose(
-            [x / weight, y / weight], [u / w / WIDTH, v / w / HEIGHT], atol=1e-5
-        )
-    # The principal point is 41 pixels from the left and 37 from the top: y points down.
-    centre = viewmat[:3, :3].T @ (np.array([0, 0, 3.0]) - viewmat[:3, 3])
-    x, y, _, weight = np.append(centre, 1.0) @ header["worldToNDC"].astype(float)
-    np.testing.assert_allclose([x / weight, y / weight], [41 / 90, 37 / 70], atol=1e-5)
-
-
-def test_world_to_camera_is_left_handed_with_y_up(tmp_path):
-    header, viewmat = written(tmp_path / "a.exr"), np.asarray(camera().viewmat, float)
-    matrix = header["worldToCamera"].astype(float)
-    right_down_forward = np.array([0.3, 0.2, 2.0])
-    world = viewmat[:3, :3].T @ (right_down_forward - viewmat[:3, 3])
-    np.testing.assert_allclose(np.append(world, 1.0) @ matrix, [0.3, -0.2, 2.0, 1.0], atol=1e-5)
-    assert np.linalg.det(matrix[:3, :3]) == pytest.approx(-1.0)
+        x, y, _, weight = world @ header["worldToNDC"].astype(float)
+        seen = [x / weight * WIDTH, y / weight * HEIGHT]
+        np.testing.assert_allclose(seen, [u / w, v / w], atol=1e-3)
+        left_handed = world @ header["worldToCamera"].astype(float)
+        np.testing.assert_allclose(left_handed, [local[0], -local[1], local[2], 1.0], atol=1e-5)
     np.testing.assert_allclose(header["p2gsViewmat"], viewmat, atol=1e-6)
     np.testing.assert_allclose(header["p2gsIntrinsics"], camera().K)
-
-
-def test_the_screen_window_bounds_the_image_at_distance_1(tmp_path):
-    header = written(tmp_path / "a.exr")
+    # The screen window bounds the image at distance 1; there is more of it above the axis.
     width, (x, y) = header["screenWindowWidth"], header["screenWindowCenter"]
-    left, right = x - width / 2, x + width / 2
-    assert left == pytest.approx(-41 / 80)
-    assert right == pytest.approx((90 - 41) / 80)
-    assert y == pytest.approx((37 - (70 - 37)) / 2 / 84), "there is more image above the axis"
+    np.testing.assert_allclose([x - width / 2, x + width / 2], [-41 / 80, (90 - 41) / 80])
+    assert y == pytest.approx((37 - (70 - 37)) / 2 / 84)
 
 
 STANDARD = {
@@ -167,9 +151,6 @@ def test_exr_switches_to_float_where_half_ends(tmp_path, value, pixel):
     np.testing.assert_array_equal(read_exr(tmp_path / "a.exr")[0], linear)
     write_exr(tmp_path / "b.exr", linear / 7, half=False)
     np.testing.assert_array_equal(read_exr(tmp_path / "b.exr")[0], linear / 7)
-
-
-def test_broken_exr(tmp_path):
     (tmp_path / "x.exr").write_bytes(b"no")
     with pytest.raises(UserError, match=r"x\.exr"):
         read_exr(tmp_path / "x.exr")
@@ -186,34 +167,20 @@ def grey(values):
     return np.repeat(np.asarray(values, np.float32)[None, :, None], 3, axis=-1)
 
 
-def test_a_stop_is_a_factor_of_two():
-    linear = grey([0.5, 1, 2, 4])
-    np.testing.assert_allclose(stops(linear, middle=1.0)[0], [-1, 0, 1, 2], atol=1e-5)
+def test_colours_step_at_whole_stops_grow_lighter_and_end():
+    np.testing.assert_allclose(stops(grey([0.5, 1, 2, 4]), middle=1.0)[0], [-1, 0, 1, 2], atol=1e-5)
     np.testing.assert_allclose(luminance(np.array([0.0, 1, 0])), 0.7152)
+    levels = [0, 2.0**-20, 2.0**-5.5, 1.0, 1.9, 2.1, 30, 2.0**5.5, 1e30]
+    shown = luminance(false_color(grey(levels), middle=1.0)[0])
+    rises = np.diff(shown) > 0
+    assert rises.tolist() == [False, False, True, False, True, True, True, False]
 
 
-def test_colours_step_at_whole_stops_and_grow_lighter():
-    shown = false_color(grey([1.0, 1.9, 2.1, 30]), middle=1.0)[0]
-    np.testing.assert_array_equal(shown[0], shown[1])
-    lightness = luminance(shown)
-    assert lightness[1] < lightness[2] < lightness[3]
-
-
-def test_values_beyond_the_limits_take_the_ends():
-    shown = false_color(grey([0, 2.0**-20, 2.0**-5.5, 2.0**5.5, 1e30]), middle=1.0)[0]
-    np.testing.assert_array_equal(shown[0], shown[1])
-    np.testing.assert_array_equal(shown[1], shown[2])
-    np.testing.assert_array_equal(shown[3], shown[4])
-
-
-def test_clipping_follows_eight_bits():
+def test_what_clips_in_eight_bits_is_striped_and_nothing_else():
     ldr = np.array([[[0, 0, 0], [0, 0, 0.01], [0.5, 0.5, 0.999], [1, 0.2, 0.2]]])
     over, under = clipping(ldr)
     assert over.tolist() == [[False, False, True, True]]
     assert under.tolist() == [[True, False, False, False]]
-
-
-def test_overlay_stripes_only_what_is_clipped():
     ldr = np.full((24, 36, 3), 0.5, np.float32)
     ldr[:, :12], ldr[:, 24:] = 1, 0
     shown = clipping_overlay(ldr)
@@ -241,25 +208,16 @@ def frames_of(path):
         return frames, stream.codec_context, float(stream.average_rate or 0)
 
 
-def patches(colours, size=(64, 48)):
-    width, height = size
-    out = np.zeros((height, width, 3), np.float32)
-    for k, c in enumerate(colours):
-        out[:, k * width // len(colours) : (k + 1) * width // len(colours)] = c
-    return out
-
-
 def test_frames_keep_their_number_order_and_colours(tmp_path):
-    colours = np.array([[1, 0, 0], [0, 0.5, 0], [0.2, 0.2, 0.9], [0.5, 0.5, 0.5]])
+    colours = np.array([[1, 0, 0], [0, 0.5, 0], [0.2, 0.2, 0.9], [0.5, 0.5, 0.5]], np.float32)
     with open_video(tmp_path / "v.mp4", 64, 48, 30) as add:
         for k in range(5):
-            add(patches(np.roll(colours, k, axis=0)))
+            add(np.tile(np.repeat(np.roll(colours, k, axis=0), 16, axis=0), (48, 1, 1)))
     frames, context, rate = frames_of(tmp_path / "v.mp4")
     assert len(frames) == 5
     assert (context.name, rate) == ("h264", 30)
     for k, frame in enumerate(frames):
-        got = frame[24, 8::16] / 255
-        np.testing.assert_allclose(got, np.roll(colours, k, axis=0), atol=0.03)
+        np.testing.assert_allclose(frame[24, 8::16] / 255, np.roll(colours, k, axis=0), atol=0.03)
 
 
 def test_odd_sizes_are_cut_and_smaller_frames_centred(tmp_path):
@@ -288,8 +246,5 @@ def test_a_failure_leaves_what_was_there(tmp_path, before):
     with pytest.raises(RuntimeError, match="no light"):
         fail()
     assert [p.read_bytes() for p in tmp_path.iterdir()] == ([] if before is None else [before])
-
-
-def test_a_tiny_video_is_refused(tmp_path):
     with pytest.raises(UserError, match="too few"), open_video(tmp_path / "v.mp4", 64, 9, 24):
         pass

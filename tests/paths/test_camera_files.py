@@ -44,6 +44,7 @@ def test_names_are_numbers_where_there_are_none(tmp_path):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
+        *(({key: ...}, f"no {key}" if key in "Kviewmat" else key) for key in list(GOOD)),
         ({"viewmat": None}, "viewmat"),
         ({"viewmat": [[1, 2], [3, 4]]}, "viewmat"),
         ({"viewmat": (2 * np.eye(4)).tolist()}, "viewmat"),
@@ -65,19 +66,13 @@ def test_names_are_numbers_where_there_are_none(tmp_path):
     ],
 )
 def test_errors_name_the_entry_and_the_field(tmp_path, change, words):
-    path = save(tmp_path / "c.json", [GOOD, {k: v for k, v in {**GOOD, **change}.items()}])
+    entry = {k: v for k, v in {**GOOD, **change}.items() if v is not ...}
+    path = save(tmp_path / "c.json", [GOOD, entry])
     with pytest.raises(UserError) as error:
         read_cameras(path)
     assert "camera 1" in str(error.value)
     assert words in str(error.value)
     assert str(path) in str(error.value)
-
-
-@pytest.mark.parametrize("key", ["viewmat", "K", "width", "height"])
-def test_a_missing_field_is_named(tmp_path, key):
-    entry = {k: v for k, v in GOOD.items() if k != key}
-    with pytest.raises(UserError, match=key):
-        read_cameras(save(tmp_path / "c.json", [entry]))
 
 
 @pytest.mark.parametrize("content", ["", "{", "3", "[]", "{}", "[3]", '{"camera_path": 3}'])

@@ -39,25 +39,19 @@ def rig_of(views):
     return find_rig(view_shots(views), views)
 
 
-def test_steps_are_found_by_name_and_cameras_are_placed_on_the_rig():
-    views = photographs()
-    rig = rig_of(views)
+def test_steps_are_found_by_name_and_cameras_sit_on_a_level_rig_about_its_middle():
+    rig = rig_of(photographs())
     assert [s.name for s in rig.steps] == [f"{k:06d}" for k in range(4)]
     for step in rig.steps:
         assert sorted(step.shots) == sorted(MOUNTS)
         for camera, found in step.shots.items():
-            np.testing.assert_allclose(
-                rig.mounts[camera].viewmat @ inverse(step.pose), found.viewmat, atol=1e-6
-            )
-
-
-def test_the_rig_is_centred_and_level():
-    rig = rig_of(photographs())
+            placed = rig.mounts[camera].viewmat @ inverse(step.pose)
+            np.testing.assert_allclose(placed, found.viewmat, atol=1e-6)
     centers = np.stack([inverse(s.viewmat)[:3, 3] for s in rig.mounts.values()])
     np.testing.assert_allclose(centers.mean(0), 0, atol=1e-9)
-    step = rig.steps[0]
-    np.testing.assert_allclose(step.pose[:3, 1], [0, 1, 0], atol=0.02)  # down stays down
-    assert np.rad2deg(np.arccos(step.pose[2, 2])) < 2  # forward stays forward
+    pose = rig.steps[0].pose
+    np.testing.assert_allclose(pose[:3, 1], [0, 1, 0], atol=0.02)  # down stays down
+    assert np.rad2deg(np.arccos(pose[2, 2])) < 2  # forward stays forward
 
 
 def test_missing_photographs_do_not_move_the_rig():

@@ -68,18 +68,18 @@ def test_castle_says_that_exif_and_pixels_disagree(shared_data, tmp_path):
     assert any("disagrees with the pixels" in m for m in result.messages)
 
 
-def test_wrong_input(run_command, tmp_path):
-    code, text = run_command("calibrate", tmp_path / "nowhere", "--out", tmp_path / "o")
+@pytest.mark.parametrize(
+    ("scene", "options", "said"),
+    [
+        ("nowhere", (), "nowhere"),
+        (".", ("--known-deviation-ev", "1"), "--known-exposures"),
+        (".", ("--static",), "a stack needs two"),
+    ],
+)
+def test_wrong_input(run_command, tmp_path, scene, options, said):
+    code, text = run_command("calibrate", tmp_path / scene, "--out", tmp_path / "o", *options)
     assert code == 2
-    assert "nowhere" in text
-    code, text = run_command(
-        "calibrate", tmp_path, "--out", tmp_path / "o", "--known-deviation-ev", "1"
-    )
-    assert code == 2
-    assert "--known-exposures" in text
-    code, text = run_command("calibrate", tmp_path, "--out", tmp_path / "o", "--static")
-    assert code == 2
-    assert "a stack needs two" in text
+    assert said in text
 
 
 @pytest.mark.slow

@@ -6,10 +6,9 @@ import shutil
 
 import numpy as np
 import pytest
-from moving_box import FRAMES, INTERVAL, SIZE, drive_format, pose_at, write_photographs
+from moving_box import SIZE, drive_format, pose_at, write_photographs
 
 from p2gs_jax import FitConfig, UserError, fit, load_run, make_camera, with_fields
-from p2gs_jax.cli import main as cli
 from p2gs_jax.core.atomic import read_jsonl
 from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.formats.ply import read_ply
@@ -19,15 +18,6 @@ from p2gs_jax.run.checkpoint import saved_steps
 from p2gs_jax.run.scene_file import read_objects
 from p2gs_jax.scene import drives
 from p2gs_jax.scene.drives.objects import object_mask
-from p2gs_jax.types import Camera
-
-
-def main(argv: list[str]) -> int:
-    """Run a command and return its exit code."""
-    with pytest.raises(SystemExit) as end:
-        cli(argv)
-    return end.value.code
-
 
 SHORT = with_fields(
     FitConfig(),
@@ -157,53 +147,43 @@ def test_one_s_own_camera_needs_a_time(run):
     assert np.abs(np.asarray(run.render(camera, 0.3).linear) - without).max() > 0.1
 
 
-def test_the_command_renders_what_moves(run, tmp_path):
-    base = ("render", str(run.folder), "--split", "test", "--camera", "cam0")
+def test_the_command_renders_what_moves(run, tmp_path, run_command):
+    base = ("render", run.folder, "--split", "test", "--camera", "cam0")
     options = {
         "all": (),
         "without": ("--without-objects",),
         "only": ("--only-objects",),
         "moved": ("--move-object", "box-1", "-0.5", "0", "0"),
         "drive": ("--path", "drive", "--frames", "3"),
+        # The cameras of a path can be rendered again, as they were.
+        "again": ("--path", tmp_path / "drive" / "cameras.json"),
+        "wide": ("--panorama", "--path", "drive", "--frames", "2", "--width", "120"),
     }
-    written = {}
+    options["bare"] = (*options["wide"], "--without-objects")
+    contents = {}
     for name, extra in options.items():
-        out = tmp_path / name
-        assert main([*base, *extra, "--out", str(out)]) == 0
-        written[name] = sorted(out.rglob("*.exr"))
-        assert written[name]
-    contents = {name: [p.read_bytes() for p in paths] for name, paths in written.items()}
+        words = base if name in ("all", "without", "only", "moved", "drive") else base[:2]
+        code, said = run_command(*words, *extra, "--out", tmp_path / name)
+        assert code == 0, said
+        contents[name] = [p.read_bytes() for p in sorted((tmp_path / name).rglob("*.exr"))]
+        assert contents[name]
     assert len({contents[name][0] for name in ("all", "without", "only", "moved")}) == 4
+    assert contents["again"] == contents["drive"]
+    assert contents["wide"][0] != contents["bare"][0]
     shots = json.loads((tmp_path / "drive" / "cameras.json").read_text())
     assert [s["time"] for s in shots] == sorted(s["time"] for s in shots)
     assert shots[0]["time"] == 0.0
-    # The cameras of a path can be rendered again, as they were.
-    again = tmp_path / "again"
-    path = str(tmp_path / "drive" / "cameras.json")
-    assert main(["render", str(run.folder), "--path", path, "--out", str(again)]) == 0
-    assert [p.read_bytes() for p in sorted(again.rglob("*.exr"))] == contents["drive"]
-    both = ("--without-objects", "--only-objects")
-    assert main([*base, *both, "--out", str(tmp_path / "x")]) == 2
-    nowhere = ("--move-object", "box-1", "nan", "0", "0")
-    assert main([*base, *nowhere, "--out", str(tmp_path / "x")]) == 2
+    for wrong in (
+        ("--without-objects", "--only-objects"),
+        ("--move-object", "box-1", "nan", "0", "0"),
+    ):
+        assert run_command(*base, *wrong, "--out", tmp_path / "x")[0] == 2
 
 
-def test_panoramas_show_what_moves(run, tmp_path):
-    out = tmp_path / "wide"
-    options = ("--panorama", "--path", "drive", "--frames", "2", "--width", "120")
-    assert main(["render", str(run.folder), *options, "--out", str(out)]) == 0
-    other = tmp_path / "without"
-    assert (
-        main(["render", str(run.folder), *options, "--without-objects", "--out", str(other)]) == 0
-    )
-    a, b = (sorted(place.glob("*.exr"))[0].read_bytes() for place in (out, other))
-    assert a != b
-
-
-def test_exports_hold_the_middle_of_the_drive(run, tmp_path):
-    command = ("export", str(run.folder), "--format", "linear-ply", "--out")
-    assert main([*command, str(tmp_path / "all")]) == 0
-    assert main([*command, str(tmp_path / "still"), "--without-objects"]) == 0
+def test_exports_hold_the_middle_of_the_drive(run, tmp_path, run_command):
+    command = ("export", run.folder, "--format", "linear-ply", "--out")
+    assert run_command(*command, tmp_path / "all")[0] == 0
+    assert run_command(*command, tmp_path / "still", "--without-objects")[0] == 0
     everything = read_ply(tmp_path / "all" / "linear.ply")
     still = read_ply(tmp_path / "still" / "linear.ply")
     assert everything.capacity == run.params.gaussians.capacity
@@ -216,11 +196,11 @@ def test_exports_hold_the_middle_of_the_drive(run, tmp_path):
     np.testing.assert_allclose(shown.means, everything.means, atol=1e-5)
 
 
-def test_scores_can_be_computed_again(run, tmp_path):
+def test_scores_can_be_computed_again(run, tmp_path, run_command):
     before = json.loads((run.folder / "metrics.json").read_text())
     again = tmp_path / "run"
     shutil.copytree(run.folder, again)
-    assert main(["eval", str(again)]) == 0
+    assert run_command("eval", again)[0] == 0
     after = json.loads((again / "metrics.json").read_text())
     for part in (lambda m: m["train"], lambda m: m["test"]["exposure_fitted"]):
         assert part(after)["moving"]["psnr"] == pytest.approx(
@@ -280,30 +260,20 @@ def test_broken_or_foreign_owners_are_said(run, tmp_path):
 @pytest.mark.slow
 def test_rigid_beats_mask_inside_the_box_and_equals_it_elsewhere(folder, tmp_path):
     # With 3,000 the box's 700 are missing elsewhere, which costs .7 of 44 dB.
-    enough = {"densify.max_gaussians": 6000}
-    longer = {"train.steps": 400, "train.log_every": 10, "render.sh_degree": 0, **enough}
-    errors = {}
+    longer = {"train.steps": 400, "train.log_every": 10, "densify.max_gaussians": 6000}
+    inside, outside = {}, {}
     for method in ("rigid", "mask", "off"):
         cfg = with_fields(SHORT, {**longer, "dynamics.method": method})
-        done = load_run(fit(folder, tmp_path / method, cfg).run_dir)
-        errors[method] = _errors(done)
-    inside, outside = ({m: e[part] for m, e in errors.items()} for part in (0, 1))
-    assert inside["rigid"] > inside["mask"] + 10
-    assert inside["rigid"] > inside["off"] + 10
+        done, errors = load_run(fit(folder, tmp_path / method, cfg).run_dir), ([], [])
+        for index in done.scene.test_indices:
+            camera, view = done.camera(index), done.scene.views[index]
+            shown = develop(done.render(camera).linear, done.own_display(index))
+            squared = ((np.clip(shown, 0, 1) - done.photograph(index)) ** 2).mean(-1)
+            size = (camera.width, camera.height)
+            errors[0].append(squared[object_mask(view, done.scene.objects, *size, 0.0)])
+            errors[1].append(squared[~object_mask(view, done.scene.objects, *size, 0.3)])
+        inside[method], outside[method] = (
+            -10 * np.log10(np.concatenate(part).mean()) for part in errors
+        )
+    assert inside["rigid"] > max(inside["mask"], inside["off"]) + 10
     assert outside["rigid"] > max(outside["mask"], outside["off"]) - 0.5
-
-
-def _errors(run) -> tuple[float, float]:
-    """Return PSNR of the held-out views inside the box, and away from it."""
-    inside, outside = [], []
-    for index in run.scene.test_indices:
-        camera: Camera = run.camera(index)
-        photograph = run.photograph(index)
-        shown = np.clip(develop(run.render(camera).linear, run.own_display(index)), 0, 1)
-        squared = ((np.asarray(shown) - photograph) ** 2).mean(-1)
-        view = run.scene.views[index]
-        size = (camera.width, camera.height)
-        inside.append(squared[object_mask(view, run.scene.objects, *size, 0.0)])
-        outside.append(squared[~object_mask(view, run.scene.objects, *size, 0.3)])
-    assert FRAMES * INTERVAL > 1
-    return tuple(float(-10 * np.log10(np.concatenate(e).mean())) for e in (inside, outside))

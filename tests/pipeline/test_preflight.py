@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import shutil
+from collections import Counter
 from types import SimpleNamespace
 
 import cv2
@@ -10,16 +12,19 @@ import pytest
 from tiny_scene import make_scene
 
 import p2gs_jax
-from p2gs_jax.cli import main
 from p2gs_jax.config import FitConfig
+from p2gs_jax.core.progress import Silent
 from p2gs_jax.errors import DivergenceError, UserError
 from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.pipeline import fit as pipeline
 from p2gs_jax.pipeline.exposures import kept_choice
 from p2gs_jax.pipeline.preflight import Paths, check_run_dir, check_sizes, preflight
+from p2gs_jax.pipeline.prepare import load, prepare
+from p2gs_jax.presets import from_dict
 from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import KEY, Decisions
 from p2gs_jax.run.folder import RunFolder
+from p2gs_jax.scene.pixels import store as held
 from p2gs_jax.types import View
 
 
@@ -37,15 +42,13 @@ def scene(tmp_path_factory):
         (("--known-exposures", "exif"), "carries exposure time"),
     ],
 )
-def test_a_refused_option_does_not_lock_the_folder(tmp_path, scene, capsys, options, said):
+def test_a_refused_option_does_not_lock_the_folder(tmp_path, scene, run_command, options, said):
     known = tmp_path / "known.csv"
     known.write_text("image,exposure\nelsewhere.png,1\n")
     run = tmp_path / "run"
     given = [str(known) if o == "KNOWN" else o for o in options]
-    with pytest.raises(SystemExit) as stop:
-        main(["fit", str(scene), "--out", str(run), *given])
-    assert stop.value.code == 2
-    text = capsys.readouterr().err
+    code, text = run_command("fit", scene, "--out", run, *given)
+    assert code == 2
     assert said in text
     assert "To fix it" in text
     assert not (run / "config.json").exists()
@@ -124,9 +127,6 @@ def test_a_resumed_run_keeps_the_model_and_curve_of_its_checkpoints(tmp_path, sc
 
 
 def test_the_saved_choice_is_solved_and_its_reasons_repeated(tmp_path, scene):
-    from p2gs_jax.core.progress import Silent
-    from p2gs_jax.pipeline.prepare import load, prepare
-
     cfg = with_fields(FitConfig(), {"init.shell": "off", "init.dense": "off"})
     loaded = load(scene, tmp_path, cfg, Silent())
     first = prepare(loaded, cfg, Silent())
@@ -174,16 +174,54 @@ def test_the_config_of_a_run_is_what_the_user_gave(finished_run):
     assert saved["photometry"]["model"] == FitConfig().photometry.model
 
 
-def test_masks_that_hide_everything_are_refused(tmp_path, capsys):
+def test_masks_that_hide_everything_are_refused(tmp_path, run_command):
     made = make_scene(tmp_path / "scene", views=4, points=60)
     (made / "masks").mkdir()
     for image in (made / "images").iterdir():
         height, width = cv2.imread(str(image)).shape[:2]
         cv2.imwrite(str(made / "masks" / image.name), np.zeros((height, width), np.uint8))
-    with pytest.raises(SystemExit) as stop:
-        main(["fit", str(made), "--out", str(tmp_path / "run")])
-    assert stop.value.code == 2
-    said = capsys.readouterr().err
+    code, said = run_command("fit", made, "--out", tmp_path / "run")
+    assert code == 2
     assert "the masks hide every pixel of all" in said
     assert "invert them" in said
     assert not (tmp_path / "run" / "config.json").exists()
+
+
+FIT = (
+    *("--steps", "60", "--train.coarse-to-fine", "--test-every", "3"),
+    *("--densify.max-gaussians", "400", "--render.sh-degree", "1", "--init.shell", "off"),
+)
+
+
+def test_a_fit_from_files_is_the_same(finished_run, tmp_path, run_command, monkeypatch):
+    """As that of `finished_run`, but for its memory; every photograph is decoded once a level."""
+    decoded = Counter()
+    plain = held.decode
+
+    def counted(view, sizes):
+        decoded.update((view.name, size) for size in sizes)
+        return plain(view, sizes)
+
+    monkeypatch.setattr(held, "decode", counted)
+    run, scene = tmp_path / "run", finished_run.parent / "scene"
+    code, said = run_command("fit", scene, "--out", run, *FIT, "--data.cache-mb", "0")
+    assert code == 0, said
+    assert (run / "radiance.ply").read_bytes() == (finished_run / "radiance.ply").read_bytes()
+    assert set(decoded.values()) == {1}
+    assert not (run / "cache" / "pixels").exists()
+
+
+def test_a_full_disk_is_exit_2_before_anything_is_fitted(
+    finished_run, tmp_path, run_command, monkeypatch
+):
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=0))
+    run, scene = tmp_path / "run", finished_run.parent / "scene"
+    code, said = run_command("fit", scene, "--out", run, *FIT, "--data.cache-mb", "0")
+    assert code == 2
+    assert "--data.cache-mb" in said
+    assert not (run / "config.json").exists()
+
+
+def test_a_run_may_go_on_with_other_memory(finished_run):
+    cfg = from_dict(json.loads((finished_run / "config.json").read_text())["fit"])
+    check_run_dir(finished_run, True, with_fields(cfg, {"data.cache_mb": 17}))

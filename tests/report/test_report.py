@@ -121,13 +121,10 @@ def test_seams_are_shown_with_their_numbers(full_page, run):
         assert np.median(picture) == pytest.approx(level, abs=1)
 
 
-def test_without_rendering_the_rest_is_there(run, tmp_path):
+def test_without_rendering_or_the_scene_the_rest_is_there(run, tmp_path):
     text = write_report(run, tmp_path / "quick.html", render=False).read_text()
     assert headings(text) == HEADINGS
     assert "without rendering" in words_of(text)
-
-
-def test_a_scene_that_has_moved_is_reported(run, tmp_path):
     moved = copy_run(run, tmp_path / "run")
     edit(moved / "config.json", lambda c: c.update(scene=str(tmp_path / "gone")))
     text = write_report(moved).read_text()
@@ -226,33 +223,39 @@ def test_changes_of_resolution_and_freezing_are_marked(run):
     assert "exposures move from step 600" in text
 
 
-def test_two_cameras_get_a_panel_each_and_many_share_one(run):
+@pytest.mark.parametrize(
+    ("camera_of", "shown", "hidden"),
+    [
+        (
+            lambda i: "left" if i < 3 else "right",
+            ("camera left", "camera right"),
+            "all photographs",
+        ),
+        (str, ("all photographs",), "camera 0"),
+    ],
+)
+def test_two_cameras_get_a_panel_each_and_many_share_one(run, camera_of, shown, hidden):
     files = read_run(run)
     for i, view in enumerate(files.views):
-        view["camera"] = "left" if i < 3 else "right"
+        view["camera"] = camera_of(i)
     text = words(files)
-    assert "camera left" in text
-    assert "camera right" in text
-    for i, view in enumerate(files.views):
-        view["camera"] = str(i)
-    text = words(files)
-    assert "all photographs" in text
-    assert "camera 0" not in text
+    assert all(words in text for words in shown)
+    assert hidden not in text
 
 
-def test_gammas_are_drawn_where_they_are_modelled(run):
+@pytest.mark.parametrize(
+    ("model", "gammas", "shown"),
+    [
+        ("view_exposure_gamma", (2.0, 2.3), ("turns the tone curve", "γ 2.00", "γ 2.30")),
+        ("view_exposure", (2.2, 2.2), ("Gamma was not modelled",)),
+    ],
+)
+def test_gammas_are_drawn_where_they_are_modelled(run, model, gammas, shown):
     files = read_run(run)
-    files.photometry["model"] = "view_exposure_gamma"
-    for i, view in enumerate(files.train):
-        view.update(gamma=2.0 + 0.1 * i, gamma_error=0.02)
-    text = words(files)
-    assert "Gamma turns the tone curve about mid-grey" in text
-    assert "γ 2.00" in text
-    assert "γ 2.30" in text
-    files.photometry["model"] = "view_exposure"
-    for view in files.train:
-        view.update(gamma=2.2)
-    assert "Gamma was not modelled" in words(files)
+    files.photometry["model"] = model
+    for view, gamma in zip(files.train, np.linspace(*gammas, len(files.train)), strict=True):
+        view.update(gamma=float(gamma), gamma_error=0.02)
+    assert all(word in words(files) for word in shown)
 
 
 @pytest.mark.parametrize("name", ["page.pdf", "page", "folder.html", "file/page.html"])
@@ -262,9 +265,6 @@ def test_where_no_page_can_be_written(run, tmp_path, run_command, name):
     code, printed = run_command("report", run, "--no-render", "--out", tmp_path / name)
     assert code == 2
     assert name in printed.replace("\n", "")
-
-
-def test_not_a_run_folder(tmp_path, run_command):
     code, printed = run_command("report", tmp_path)
     assert code == 2
     assert "config.json is missing" in printed

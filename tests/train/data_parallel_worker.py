@@ -15,11 +15,11 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.render import xla_cpu
 from p2gs_jax.render.capacity import Room
-from p2gs_jax.train.data_parallel import ParallelStep, Spread, default_mesh
+from p2gs_jax.train.data_parallel import ParallelStep, default_mesh, spread, whole
 from p2gs_jax.train.exposure_loss import Partner
 from p2gs_jax.train.inputs import stacked
 from p2gs_jax.train.optimizer import make_optimizer
-from p2gs_jax.train.state import initial_state
+from p2gs_jax.train.state import healed, initial_state
 from p2gs_jax.train.step import PROGRAMS, Step
 from p2gs_jax.train.update import Controls
 from p2gs_jax.types import Batch, Camera, Gaussians, Params, Photometry
@@ -99,8 +99,8 @@ def on_devices(count: int) -> dict:
     """A step without room, then two with it: losses, fault, moments and parameters."""
     cfg = config(VIEWS)
     optimizer, mesh = make_optimizer(cfg), default_mesh(count)
-    step, spread = ParallelStep(cfg, optimizer, EXTENT, cfg.densify.noise, mesh=mesh), Spread(mesh)
-    state = spread.spread(initial_state(start(), alive(), optimizer))
+    step = ParallelStep(cfg, optimizer, EXTENT, cfg.densify.noise, mesh=mesh)
+    state = spread(initial_state(start(), alive(), optimizer), mesh)
     inputs = (*map(stacked, zip(*map(view, range(VIEWS)), strict=True)), CONTROLS)
 
     def taken(state, room):
@@ -115,13 +115,13 @@ def on_devices(count: int) -> dict:
         found["fault"] = {k: int(getattr(state.fault, k)) for k in ("kind", "needed")}
         found["stopped at"] = int(state.step)
         found["moved"] = distance(before, state.params)
-        state = spread.healed(state)
+        state = healed(state)
     run = taken(state, ROOM)
     for _ in range(2):
         state, report = run(state, *inputs)
         losses.append(float(report.loss))
-        first = first or jax.tree.map(np.asarray, first_moments(spread.whole(state)))
-    state = spread.whole(state)
+        first = first or jax.tree.map(np.asarray, first_moments(whole(state, mesh)))
+    state = whole(state, mesh)
     params = jax.tree.map(np.asarray, state.params)
     return found | {"losses": losses, "moments": first, "params": params, "step": int(state.step)}
 

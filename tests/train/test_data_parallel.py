@@ -6,14 +6,12 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.train.data_parallel import mesh_of, with_a_view_each
-from p2gs_jax.train.inputs import batches_of, stacked
 from p2gs_jax.train.state import FAULT_OVERFLOW
 
 HERE = Path(__file__).parent
@@ -51,26 +49,6 @@ def test_a_view_that_finds_no_room_stops_all_devices_until_there_is_some(found):
     assert made["fault"]["needed"] > 64
     assert made["moved"] == 0
     assert made["stopped at"] == 0
-
-
-def test_every_view_of_an_epoch_is_in_a_batch_of_its_own_size():
-    order = np.random.default_rng(0).permutation(11)
-    kinds = ["wide" if view < 7 else "tall" for view in range(11)]
-    batches = batches_of(order, kinds, 3)
-    assert len(batches) == 3 + 2
-    assert {view for batch in batches for view in batch} == set(range(11))
-    assert all(len(batch) == 3 and len({kinds[v] for v in batch}) == 1 for batch in batches)
-    assert all(len(set(batch)) == 3 for batch in batches)
-
-
-def test_a_size_with_fewer_views_than_a_batch_repeats_them():
-    assert batches_of(np.array([1, 0]), ["a", "a"], 4) == [(1, 0, 1, 0)]
-
-
-def test_pixels_of_8_and_16_bits_become_one_type_of_the_same_values():
-    fine = stacked([np.array([0, 255], np.uint8), np.array([7, 65535], np.uint16)])
-    assert fine.dtype == np.uint16
-    assert fine.tolist() == [[0, 65535], [7, 65535]]
 
 
 def test_one_view_on_one_device_needs_no_mesh():

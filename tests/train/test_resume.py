@@ -14,6 +14,7 @@ from tiny_scene import make_scene
 from p2gs_jax.cli import main
 
 STEPS = 120
+ENVIRONMENT = os.environ | {"JAX_PLATFORMS": "cpu"}
 
 
 def options(scene, run, *extra):
@@ -29,10 +30,6 @@ def command(scene, run, *extra):
     return [sys.executable, "-m", "p2gs_jax.cli", *options(scene, run, *extra)]
 
 
-def environment():
-    return os.environ | {"JAX_PLATFORMS": "cpu"}
-
-
 def content(run):
     log = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
     timeless = [
@@ -41,72 +38,47 @@ def content(run):
     return timeless, (run / "radiance.ply").read_bytes(), (run / "photometry.json").read_text()
 
 
+def begun(command, log):
+    """Begin a fit and wait until it has taken steps of its own."""
+    process = subprocess.Popen(
+        command, env=ENVIRONMENT, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
+    )
+    before = log.read_text().count("\n") if log.exists() else 0
+    while process.poll() is None and not (log.exists() and log.read_text().count("\n") > before):
+        time.sleep(0.01)
+    return process
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["mcmc", "adaptive"])
-def test_killed_three_times_and_resumed(tmp_path, method):
+@pytest.mark.parametrize(
+    ("method", "number"),
+    [("mcmc", signal.SIGKILL), ("adaptive", signal.SIGKILL), ("mcmc", signal.SIGTERM)],
+)
+def test_stopped_and_resumed(tmp_path, method, number):
+    """Killed three times at random moments, or asked by a batch system to end."""
     scene = make_scene(tmp_path / "scene")
-    chosen = ("--densify.method", method)
-    whole, killed = tmp_path / "whole", tmp_path / "killed"
-    subprocess.run(command(scene, whole, *chosen), check=True, env=environment())
-    rng = random.Random(0)
-    kills = 0
-    resume: tuple[str, ...] = ()
-    while kills < 3:
-        process = subprocess.Popen(
-            command(scene, killed, *chosen, *resume),
-            env=environment(),
-            stderr=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-        )
-        # Wait until this session has taken steps of its own, then strike at a random moment.
-        log = killed / "log.jsonl"
-        before = log.read_text().count("\n") if log.exists() else 0
-        while process.poll() is None:
-            if log.exists() and log.read_text().count("\n") > before:
-                break
-            time.sleep(0.01)
-        time.sleep(rng.uniform(0, 0.15))
+    asked = number == signal.SIGTERM
+    every = ("--train.checkpoint-every-s", "1000") if asked else ()
+    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+    chosen = ("--densify.method", method, *every)
+    subprocess.run(command(scene, whole, *chosen), check=True, env=ENVIRONMENT)
+    rng, stops, resume = random.Random(0), 0, ()
+    while stops < (1 if asked else 3):
+        process = begun(command(scene, stopped, *chosen, *resume), stopped / "log.jsonl")
+        time.sleep(0 if asked else rng.uniform(0, 0.15))
         if process.poll() is not None:
             break
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-        kills += 1
-        resume = ("--resume",)
-    assert kills >= 2, "the run ended before it could be killed"
-    final = subprocess.run(
-        command(scene, killed, *chosen, "--resume"),
-        env=environment(),
-        capture_output=True,
-        text=True,
-    )
-    assert final.returncode == 0, final.stderr
-    assert "Resuming" in final.stderr
-    for a, b in zip(content(whole), content(killed), strict=True):
-        assert a == b
-
-
-@pytest.mark.slow
-def test_asked_to_end_and_resumed(tmp_path):
-    """SIGTERM of a batch system: a checkpoint, and nothing is lost."""
-    scene = make_scene(tmp_path / "scene")
-    rarely = ("--train.checkpoint-every-s", "1000")
-    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
-    subprocess.run(command(scene, whole, *rarely), check=True, env=environment())
-    with subprocess.Popen(
-        command(scene, stopped, *rarely), env=environment(), stderr=subprocess.PIPE, text=True
-    ) as process:
-        log = stopped / "log.jsonl"
-        while not log.exists() or log.read_text().count("\n") < 2:
-            assert process.poll() is None, process.stderr.read()
-            time.sleep(0.005)
-        process.send_signal(signal.SIGTERM)
+        process.send_signal(number)
         _, said = process.communicate()
-    assert process.returncode == 128 + signal.SIGTERM
-    assert "SIGTERM: the run stops after step" in said
-    assert "Traceback" not in said
+        if asked:
+            assert process.returncode == 128 + number
+            assert "SIGTERM: the run stops after step" in said
+            assert "Traceback" not in said
+        stops, resume = stops + 1, ("--resume",)
+    assert stops >= (1 if asked else 2), "the run ended before it could be stopped"
     final = subprocess.run(
-        command(scene, stopped, *rarely, "--resume"),
-        env=environment(),
+        command(scene, stopped, *chosen, "--resume"),
+        env=ENVIRONMENT,
         capture_output=True,
         text=True,
     )

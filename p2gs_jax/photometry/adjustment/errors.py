@@ -91,7 +91,10 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
             shared = deviation * _shared_scores(fit.model, fit.theta, fit.at, labels)
             each = sp.csr_array(sp.vstack([each, shared]))
     seen = rows.weight.any(1)
-    few = _small_sample(clusters[seen], rows.layout.views[seen], rows.layout.view_count)
+    # A view's exposure is the mean of its clusters, and takes one of them away.
+    pairs = np.unique(np.stack([rows.layout.views[seen], clusters[seen]]), axis=1)[0]
+    count = np.maximum(np.bincount(pairs, minlength=rows.layout.view_count), 2)
+    few = np.sqrt(count / (count - 1))
     bread = fit.normal * fit.at.curvature + system.priors.normal
     gauges = np.sqrt(gauge_strength(bread, system.unknowns)) * system.anchors.rows
     if not is_small(system.basis.shape[1]):  # pyright: ignore
@@ -158,13 +161,6 @@ def side_by_side(observations: Observations, row: Labels) -> Labels:
     label = np.zeros(int(row.max()) + 1, int)
     label[row[first]] = regions(observations.positions[first], observations.views[first], REGION)
     return label[row]
-
-
-def _small_sample(clusters: Labels, views: Labels, view_count: int) -> np.ndarray:
-    """Return the factors on errors of a view, whose mean takes one of its few clusters away."""
-    pairs = np.unique(np.stack([views, clusters]), axis=1)[0]
-    count = np.bincount(pairs, minlength=view_count)
-    return np.sqrt(np.maximum(count, 2) / (np.maximum(count, 2) - 1))
 
 
 def _shared_deviation(model: Forward, at: Weighted, labels: Labels) -> float:

@@ -19,7 +19,6 @@ from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.sources.sampling import PROJECTED_UNCERTAINTY, point_colors
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.render.warp import project_points, surface_depth, unproject, visible
-from p2gs_jax.render.warp import project_points as warped_points
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.scene.visibility import unoccluded
 from p2gs_jax.types import Gaussians, Scene
@@ -31,15 +30,11 @@ RENDERED_POINTS, RENDERED_PER_POINT = 40_000, 8
 OPAQUE = 0.98
 
 # Called with the number of views done, and of views in all.
-OnView = Callable[[int, int], None]
-
-
-def _quiet(done: int, count: int) -> None:
-    pass
+OnView = Callable[[int, int], object] | None
 
 
 def surface_colors(
-    scene: Scene, store: ImageStore, seed: int, on_view: OnView = _quiet
+    scene: Scene, store: ImageStore, seed: int, on_view: OnView = None
 ) -> Observations:
     """Return colours of shared points: at the tracks, or of projected points where there are none.
 
@@ -55,7 +50,7 @@ def has_tracks(scene: Scene) -> bool:
     return scene.tracks is not None and len(scene.tracks.xy) > 0
 
 
-def track_colors(scene: Scene, store: ImageStore, on_view: OnView = _quiet) -> Observations:
+def track_colors(scene: Scene, store: ImageStore, on_view: OnView = None) -> Observations:
     """Sample every track in every training view, at its training resolution."""
     assert scene.tracks is not None
     order = np.argsort(scene.tracks.view_indices, kind="stable")
@@ -67,7 +62,7 @@ def track_colors(scene: Scene, store: ImageStore, on_view: OnView = _quiet) -> O
 
 
 def projected_colors(
-    scene: Scene, store: ImageStore, seed: int = 0, on_view: OnView = _quiet
+    scene: Scene, store: ImageStore, seed: int = 0, on_view: OnView = None
 ) -> Observations:
     """Sample a scene's points (LiDAR or others) in every training view that sees them.
 
@@ -95,7 +90,7 @@ def rendered_colors(
     store: ImageStore,
     cfg: RenderConfig,
     seed: int = 0,
-    on_view: OnView = _quiet,
+    on_view: OnView = None,
 ) -> Observations:
     """Warp pixels of each training view into the others through rendered depth.
 
@@ -113,17 +108,18 @@ def rendered_colors(
         depths.append(depth)
         pick = rng.permutation(np.flatnonzero(np.asarray(depth) > 0))[:each]
         points.append(np.asarray(unproject(depth, camera)).reshape(-1, 3)[pick])
-        on_view(done + 1, len(cameras))
+        if on_view is not None:
+            on_view(done + 1, len(cameras))
     world = np.concatenate(points)
     where, seen = [], []
     for index, camera, depth in zip(scene.train_indices, cameras, depths, strict=True):
         view = scene.views[index]
-        xy, z = warped_points(jnp.asarray(world), camera)
+        xy, z = project_points(jnp.asarray(world), camera)
         seen.append(np.asarray(visible(xy, z, depth)))
         where.append(np.asarray(xy) * [view.width / camera.width, view.height / camera.height])
     kept = thinned(np.stack(seen), rng, RENDERED_PER_POINT)
     warped = dataclasses.replace(scene, points=world)
-    return _sampled_where_seen(warped, store, np.arange(len(world)), where, kept, _quiet)
+    return _sampled_where_seen(warped, store, np.arange(len(world)), where, kept, None)
 
 
 def _sampled_where_seen(

@@ -117,7 +117,7 @@ def point_colors(
     xy: list[Float[np.ndarray, "o 2"]],
     *,
     uncertainty: float = 1.0,
-    on_view: Callable[[int, int], None] = lambda i, n: None,
+    on_view: Callable[[int, int], object] | None = None,
 ) -> Observations:
     """Sample points in training views, all at the scale of the coarsest view that is used.
 
@@ -146,7 +146,8 @@ def point_colors(
             at_places = places(at, width, height).astype(np.float32)
             labels = np.full(len(at), row), mine[good]
             parts.append((*labels, *shown, surroundings(ldr, at), at_places))
-        on_view(row + 1, len(scene.train_indices))
+        if on_view is not None:
+            on_view(row + 1, len(scene.train_indices))
     views, seen, colors, spread, brightest, around, positions = (
         np.concatenate(part) for part in zip(*parts, strict=True)
     )

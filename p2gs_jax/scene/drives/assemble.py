@@ -49,15 +49,12 @@ def assemble(
     Seed points have no colours yet; there are no feature tracks.
 
     Args:
-        recording: from a reader.
         cfg: cameras and frames, and whether photographs may be missing.
         work_dir: embedded photographs are written below it; None: below the user's cache folder.
-        report: receives progress.
         write_embedded: False only names the files of embedded photographs: they cannot be read.
 
     Raises:
-        UserError: a camera or frame is not there, a camera's name is a path, photographs are
-            missing, a sweep is broken.
+        UserError: a camera, frame or photograph is not there, a name a path, a sweep broken.
     """
     cameras = {c.name: c for c in recording.cameras}
     for name in cameras:
@@ -65,10 +62,9 @@ def assemble(
         require_plain(name, recording.root)
     names = chosen_cameras(cfg.cameras, list(cameras))
     photographs, notes = _chosen_photographs(recording, names, cfg)
-    masks: dict[str, Bool[np.ndarray, "h w"]] = {}
+    masks, mask_notes = {}, []
     if cfg.own_car:
         masks, mask_notes = find_ego_masks(recording, names, work_dir, report)
-        notes += mask_notes
     middle = np.mean([p.pose[:3, 3] for p in photographs], axis=0)
     origin = np.rint(middle) if np.abs(middle).max() > FARTHEST_ORIGIN else np.zeros(3)
     folder = _embedded_folder(recording.root, work_dir)
@@ -78,12 +74,11 @@ def assemble(
     ]
     things = recording.objects
     objects = tuple(dataclasses.replace(o, poses=_moved(o.poses, origin)) for o in things)
-    lidar, points = None, np.zeros((0, 3), np.float32)
+    lidar, lidar_notes = None, ["Laser measurements are not used (--data.no-lidar)."]
     if cfg.lidar:
         lidar, lidar_notes = _read_sweeps(recording, photographs, objects, origin, report)
-        notes += lidar_notes
-    else:
-        notes.append("Laser measurements are not used (--data.no-lidar).")
+    notes += [*mask_notes, *lidar_notes]
+    points = np.zeros((0, 3), np.float32)
     if lidar is not None:
         points, angle = seeds(lidar, np.stack([p.pose[:3, 3] - origin for p in photographs]))
         notes.append(

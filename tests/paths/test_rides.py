@@ -1,0 +1,165 @@
+"""Drives pass through their poses smoothly; orbits go around what the cameras look at."""
+
+import numpy as np
+import pytest
+from cameras import shot, turned, view
+
+from p2gs_jax.errors import UserError
+from p2gs_jax.paths.drive import PosePath, drive
+from p2gs_jax.paths.orbit import find_orbit, look_at, orbit
+from p2gs_jax.paths.shots import Shot, of_camera, view_shots
+from p2gs_jax.scene.rigid import inverse, up_direction
+
+UP = np.array([0.0, -1, 0])
+FOCUS = np.array([3.0, -1, 7])
+NO_POINTS = np.zeros((0, 3))
+
+
+def test_a_path_passes_through_every_pose_without_a_kink():
+    rng = np.random.default_rng(0)
+    centers, yaws = np.cumsum(rng.uniform(0.1, 2.0, (7, 3)), 0), np.cumsum(rng.uniform(-25, 25, 7))
+    poses = [turned(y, c, pitch=y / 3) for y, c in zip(yaws, centers, strict=True)]
+    path = PosePath(inverse(np.stack(poses)))
+    np.testing.assert_allclose(path(path.times), inverse(np.stack(poses)), atol=1e-9)
+    assert path.times[0] == 0
+    assert np.mean(np.diff(path.times)) == pytest.approx(1)
+
+    def change(h):
+        """Largest change of velocity over h, anywhere."""
+        at = np.linspace(h, path.times[-1] - h, 3000)
+        return np.abs(path(at + h) - 2 * path(at) + path(at - h)).max() / h
+
+    # Of a kink the change of velocity stays as h goes to 0; of a smooth path it goes with h.
+    assert change(1e-3) < 0.2 * change(1e-2)
+
+
+def test_equal_distances_and_turns_take_equal_times_and_a_stop_takes_little():
+    poses = np.stack([inverse(turned(0, (x, 0, 0))) for x in (0, 1, 2, 2, 3)])
+    gaps = np.diff(PosePath(poses).times)
+    np.testing.assert_allclose(gaps[[1, 3]], gaps[0])
+    assert 0 < gaps[2] < 0.25 * gaps[0]
+    path = PosePath(np.stack([inverse(turned(yaw)) for yaw in (0, 30, 60)]))
+    np.testing.assert_allclose(np.diff(path.times), 1)
+    forward = path(np.array([0.5]))[0, :3, 2]
+    assert np.rad2deg(np.arctan2(forward[0], forward[2])) == pytest.approx(15, abs=3)
+
+
+def test_a_drive_has_the_frames_asked_for_and_the_commonest_lens():
+    knots = [shot(turned(0, (0, 0, z)), width=64) for z in range(3)]
+    knots[1] = shot(knots[1].viewmat, width=32)
+    frames = drive(knots, 9)
+    assert [f.name for f in frames] == [f"{k:05d}" for k in range(9)]
+    assert {f.width for f in frames} == {64}
+    np.testing.assert_allclose([inverse(f.viewmat)[2, 3] for f in frames], np.linspace(0, 2, 9))
+    assert len(drive(knots)) == 17
+    assert frames[0].exposure_ev is None
+    with pytest.raises(UserError, match="two views"):
+        drive(knots[:1])
+
+
+def test_exposures_are_interpolated_in_stops_where_all_knots_have_them():
+    values = ((0, -2.0, 1.0), (1, 0.0, 4.0))
+    knots = [shot(turned(0, (0, 0, z)), exposure_ev=ev, gamma=g) for z, ev, g in values]
+    frames = drive(knots, 3)
+    assert [f.exposure_ev for f in frames] == [-2, -1, 0]
+    assert [f.gamma for f in frames] == pytest.approx([1, 2, 4])
+    without = drive([knots[0], shot(knots[1].viewmat)], 3)
+    assert all(f.exposure_ev is None and f.gamma is None for f in without)
+
+
+def test_the_camera_with_the_most_views_is_the_default():
+    names = ("a/1.png", "b/2.png", "b/1.png", "c/0.png", "c/3.png")
+    views = [view(name, np.eye(4)) for name in names]
+    shots = view_shots(views)
+    assert [s.name for s in of_camera(shots, views, None)] == ["b/1", "b/2"]
+    assert [s.view for s in of_camera(shots, views, "a")] == [0]
+    with pytest.raises(UserError, match="a, b, c"):
+        of_camera(shots, views, "front")
+
+
+def test_a_resized_shot_sees_the_same():
+    s = Shot("0", np.eye(4), np.array([[50, 0, 30], [0, 60, 20], [0, 0, 1.0]]), 64, 49)
+    half = s.resized(32)
+    assert (half.width, half.height) == (32, 24)
+    np.testing.assert_allclose(half.K[0], s.K[0] / 2)
+    np.testing.assert_allclose(half.K[1] / half.height, s.K[1] / s.height)
+
+
+def around(azimuths, elevation=30.0, aside=0.0):
+    """Return shots that look at FOCUS, or at a point aside of it, from azimuths in degrees."""
+    out, e = [], np.deg2rad(elevation)
+    for a in np.deg2rad(azimuths):
+        offset = np.array([np.cos(e) * np.sin(a), -np.sin(e), np.cos(e) * np.cos(a)])
+        target = FOCUS + aside * np.array([np.cos(a), 0, -np.sin(a)])
+        out.append(shot(look_at(FOCUS + 5 * offset, target, UP)))
+    return out
+
+
+def seen_from(focus, shots):
+    away = np.stack([inverse(s.viewmat)[:3, 3] for s in shots]) - focus
+    return np.linalg.norm(away, axis=1), np.rad2deg(np.arctan2(away[:, 0], away[:, 2]))
+
+
+def test_a_circle_around_what_all_cameras_look_at_upright():
+    cameras = around(np.arange(0, 360, 30))
+    circle = find_orbit(cameras, cameras, NO_POINTS)
+    np.testing.assert_allclose(circle.focus, FOCUS, atol=1e-9)
+    assert "full circle" in circle.description().lower()
+    shots = orbit(circle, cameras, 36)
+    radius, azimuth = seen_from(FOCUS, shots)
+    np.testing.assert_allclose(radius, 5)
+    steps = (np.diff(azimuth) + 180) % 360 - 180
+    np.testing.assert_allclose(np.abs(steps), 10)
+    for s in shots[::6]:
+        local = s.viewmat[:3, :3] @ FOCUS + s.viewmat[:3, 3]
+        np.testing.assert_allclose(local, [0, 0, 5], atol=1e-9)
+        assert s.viewmat[0, :3] @ UP == pytest.approx(0, abs=1e-9)
+        assert s.viewmat[1, :3] @ UP < 0
+        assert inverse(s.viewmat)[1, 3] == pytest.approx(FOCUS[1] - 5 * np.sin(np.deg2rad(30)))
+
+
+def test_cameras_on_one_side_give_an_arc_over_what_they_cover():
+    cameras = around(np.arange(150, 251, 10))
+    circle = find_orbit(cameras, cameras, NO_POINTS)
+    _, azimuth = seen_from(FOCUS, orbit(circle, cameras, 40))
+    assert (azimuth % 360).min() == pytest.approx(150)
+    assert (azimuth % 360).max() == pytest.approx(250)
+    assert "50 degrees" in circle.description()
+
+
+def test_axes_that_miss_each_other_a_little_still_meet():
+    rng = np.random.default_rng(0)
+    cameras = [c for k in range(12) for c in around([30 * k], aside=rng.normal(0, 0.2))]
+    assert np.linalg.norm(find_orbit(cameras, cameras, NO_POINTS).focus - FOCUS) < 0.3
+
+
+@pytest.mark.parametrize("yaws", [(0,), (-45, 0, 45)])
+def test_a_vehicle_sways_about_its_middle_view(yaws):
+    rig = {y: [shot(turned(y, (0, 0, z))) for z in range(9)] for y in yaws}
+    points = np.array([[0.1, 0, 24.0], [-0.2, 0, 14], [0, 0, 34], [0, 0, -50]])
+    circle = find_orbit([s for shots in rig.values() for s in shots], rig[0], points)
+    assert not circle.met
+    np.testing.assert_allclose(circle.focus, [0, 0, 24], atol=1e-6)
+    shots = orbit(circle, rig[0], 8)
+    np.testing.assert_allclose(inverse(shots[0].viewmat)[:3, 3], [0, 0, 4], atol=1e-6)
+    radius, _ = seen_from(circle.focus, shots)
+    np.testing.assert_allclose(radius, 20)
+    aside = [inverse(s.viewmat)[0, 3] for s in shots]
+    assert max(aside) == pytest.approx(20 * np.sin(np.deg2rad(10)), rel=1e-6)
+    assert min(aside) == pytest.approx(-max(aside))
+    assert "no common point" in circle.description()
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_odd_cameras_still_give_an_orbit(count):
+    ahead = [shot(turned(0, (0, 0, z))) for z in range(count)]
+    for cameras in (ahead, around([0, 90, 180, 270], elevation=89.99)):
+        circle = find_orbit(cameras, cameras, NO_POINTS)
+        assert all(np.isfinite(s.viewmat).all() for s in orbit(circle, cameras, 9))
+
+
+def test_up_is_not_disturbed_by_pitch():
+    pitched = np.stack([turned(yaw, pitch=-20) for yaw in (-45, 0, 45)])
+    np.testing.assert_allclose(up_direction(pitched), UP, atol=1e-9)
+    one_way = np.stack([turned(0, pitch=-20), turned(1, pitch=-20)])
+    assert np.rad2deg(np.arccos(up_direction(one_way) @ UP)) == pytest.approx(20, abs=1)
