@@ -60,6 +60,7 @@ def oracle():
         ((16, 8), None),
         ((16, 16), None),
         pytest.param((8, 8), None, marks=pytest.mark.slow),
+        pytest.param((32, 4), None, marks=pytest.mark.slow),
     ],
 )
 def test_values_and_gradients_match_oracle(oracle, tile, stop, implementation):
@@ -120,13 +121,6 @@ def shown():
     """A small street and its image."""
     g, cam = street(n=300)
     return g, cam, render(g, cam).linear
-
-
-@pytest.mark.parametrize("tile", [(16, 16), (32, 4)])
-def test_tile_size_does_not_change_the_image(shown, tile):
-    g, cam, image = shown
-    other = render(g, cam, dataclasses.replace(CFG, tile=tile)).linear
-    np.testing.assert_allclose(image, other, atol=(2e-5 + CFG.stop_error) * float(image.max()))
 
 
 def test_the_order_of_gaussians_does_not_matter(shown):
