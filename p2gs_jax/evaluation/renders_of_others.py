@@ -150,7 +150,10 @@ def find_renders(folder: str | Path, scene: Scene) -> OtherRenders:
         found = next(filter(None, by_name), None)
         if found is not None:
             return found
-        numbered = _of_trainers(folder) or _of_numbers(folder)
+        bare = _numbers(folder)
+        numbered = _of_trainers(folder)
+        if numbered is None and bare:
+            numbered = ("numbered pictures", bare, False)
     if numbered is None:
         raise UserError(
             f"{folder} holds no render of a held-out view (for example "
@@ -255,11 +258,6 @@ def _of_trainers(folder: Path) -> _Numbered | None:
             last = max(found)
             return layout.format(last), [path for _, path in sorted(found[last])], beside
     return None
-
-
-def _of_numbers(folder: Path) -> _Numbered | None:
-    files = _numbers(folder)
-    return ("numbered pictures", files, False) if files else None
 
 
 def _numbers(folder: Path) -> list[Path]:

@@ -163,7 +163,7 @@ def radiance_of(
     """Return the radiance that a photograph shows: what was done to light undone, on the host.
 
     Loose pixels of an image need their `positions` where vignetting counts
-    (photometry/cameras.py:places).
+    (photometry/formation.py:places).
     """
     ldr = np.asarray(ldr, np.float32)
     return inverse_formation(ldr, transform.capture, transform.formation, positions)
@@ -181,16 +181,6 @@ def _informative(ldr: Float[np.ndarray, "h w 3"], cfg: LossConfig) -> Bool[np.nd
 
 def _apart(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.median(np.abs(a - b)))
-
-
-def redeveloped(
-    ldr: Float[np.ndarray, "... 3"], own: DisplayTransform, common: DisplayTransform
-) -> Float32[np.ndarray, "... 3"]:
-    """Return a photograph, taken back to radiance and developed with the common display transform.
-
-    Saturated pixels stay at the value of its white.
-    """
-    return develop(radiance_of(ldr, own), common)
 
 
 class SeamPicture(NamedTuple):
@@ -225,7 +215,8 @@ def seam_picture(
         size = jnp.array([photograph.camera.width, photograph.camera.height])
         inside = np.asarray((z > 1e-6) & jnp.all((xy >= 0) & (xy < size), axis=-1))
         ldr = np.asarray(sample_bilinear(jnp.asarray(photograph.ldr), xy))
-        alike = redeveloped(ldr, photograph.transform, common)
+        # Saturated pixels stay at the value of its white.
+        alike = develop(radiance_of(ldr, photograph.transform), common)
         reached.append(inside)
         before.append(np.where(inside[..., None], ldr, BLANK))
         after.append(np.where(inside[..., None], alike, BLANK))

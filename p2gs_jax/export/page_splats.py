@@ -50,14 +50,8 @@ class TruePicture:
 class PageError:
     """Differences from the run's pictures of some views, each at its own exposure.
 
-    Attributes:
-        views: how many were compared.
-        psnr_median: of developed pictures, dB.
-        psnr_worst: of the worst view, dB.
-        worst_view: its name.
-        stops_median: of |log2| of the ratio of luminances, over pixels that are not black.
-        stops_p99: 99th percentile of it.
-        stops_max: largest.
+    PSNR (dB) is of developed pictures; stops are |log2| of the ratio of luminances, over pixels
+    that are not black: median, 99th percentile, largest.
     """
 
     views: int
@@ -71,14 +65,14 @@ class PageError:
 
 @dataclass(frozen=True)
 class PageSplats:
-    """The Gaussians of a page.
+    """The Gaussians of a page, with their error against the run.
 
     Attributes:
-        packed: as it holds them.
+        packed: as the page holds them.
         error: against the run.
-        of: how many the run has.
+        of: how many Gaussians the run has.
         degree: of the run's harmonics.
-        unseen: of the run's, never drawn by any renderer with our rules; nothing is lost with them.
+        unseen: Gaussians that no renderer with our rules ever draws; nothing is lost with them.
     """
 
     packed: Packed

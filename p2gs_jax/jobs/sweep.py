@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from p2gs_jax.core.runtime import tune_process, use_compile_cache
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.alignment import exposure_error
+from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.jobs.engines import LOCAL, check_engine, open_engine
 from p2gs_jax.jobs.job import Job, JobState, read_reason, slug
 from p2gs_jax.jobs.run import Runner, run_jobs
@@ -89,37 +89,23 @@ def sweep(
     _check(configs, seeds, max_parallel)
     check_engine(engine)
     out.mkdir(parents=True, exist_ok=True)
-    truth = None if reference is None else Path(reference)
-    jobs: list[Job] = []
-    rows: list[dict[str, Any]] = []
-    for name, cfg in configs.items():
-        for seed in seeds:
-            seeded = dataclasses.replace(cfg, train=dataclasses.replace(cfg.train, seed=seed))
-            folder = out / slug(name) / f"seed_{seed}"
-            check_run_dir(folder, True, seeded)
-            jobs.append(fit_job(f"{name}, seed {seed}", scene, folder, seeded, truth))
-            rows.append({"name": name, "seed": seed, "run": str(folder), "status": "waiting"})
+    jobs, rows = _planned(scene, out, configs, seeds, reference)
 
     def tell(number: int, state: JobState | None) -> None:
         """Note what became of a run; None: it was there before."""
         row = rows[number]
         row.update(_outcome(jobs[number].folder, scene, state))
-        if row["status"] == "done":
-            took = 0.0 if state is None else state.seconds
-            text = "kept" if state is None else f"{row.get('seconds', took):.0f} s"
-        else:
-            text = f"{row['status']}: {row['reason']}"
+        took = "kept" if state is None else f"{row.get('seconds', state.seconds):.0f} s"
+        text = took if row["status"] == "done" else f"{row['status']}: {row['reason']}"
         report(f"[{number + 1}/{len(jobs)}] {jobs[number].name}: {text}")
         write_json(out / TABLE, rows)
         write_text(out / TABLE_TEXT, to_markdown(rows))
 
     with locked(out):
-        left = []
-        for number, job in enumerate(jobs):
-            if (job.folder / "metrics.json").exists():
-                tell(number, None)
-            else:
-                left.append(number)
+        done = [number for number, job in enumerate(jobs) if _metrics(job.folder).exists()]
+        for number in done:
+            tell(number, None)
+        left = [number for number in range(len(jobs)) if number not in done]
         if left:
             with open_engine(engine, max_parallel, out / JOBS) as workers:
                 run_jobs(
@@ -131,6 +117,30 @@ def sweep(
                     run=run,
                 )
     return SweepResult(rows, out)
+
+
+def _planned(
+    scene: Path,
+    out: Path,
+    configs: Mapping[str, FitConfig],
+    seeds: Sequence[int],
+    reference: str | Path | None,
+) -> tuple[list[Job], list[dict[str, Any]]]:
+    """Return the jobs of all configurations and seeds, and the beginning of their rows."""
+    jobs, rows = [], []
+    truth = None if reference is None else Path(reference)
+    for name, cfg in configs.items():
+        for seed in seeds:
+            seeded = with_fields(cfg, {"train.seed": seed})
+            folder = out / slug(name) / f"seed_{seed}"
+            check_run_dir(folder, True, seeded)
+            jobs.append(fit_job(f"{name}, seed {seed}", scene, folder, seeded, truth))
+            rows.append({"name": name, "seed": seed, "run": str(folder), "status": "waiting"})
+    return jobs, rows
+
+
+def _metrics(run: Path) -> Path:
+    return RunFolder(run).metrics
 
 
 def _check(configs: Mapping[str, FitConfig], seeds: Sequence[int], max_parallel: int) -> None:
@@ -184,7 +194,7 @@ def _outcome(run: Path, scene: Path, state: JobState | None) -> dict[str, Any]:
     """Return the status of a run that has ended, with its columns or the reason."""
     if state is not None and state.status == "stopped":
         return {"status": "interrupted", "reason": "the same sweep continues it"}
-    if not (run / "metrics.json").exists():
+    if not _metrics(run).exists():
         return {"status": "failed", "reason": (state and state.reason) or read_reason(run)}
     try:
         return {"status": "done", **read_row(run, scene)}
@@ -250,7 +260,7 @@ def read_row(run: Path, scene: Path) -> dict[str, Any]:
     Args:
         scene: where `truth/exposures.csv` may lie.
     """
-    metrics = parse_json((run / "metrics.json").read_text(encoding="utf-8"))
+    metrics = parse_json(_metrics(run).read_text(encoding="utf-8"))
     row: dict[str, Any] = {}
     for column in COLUMNS:
         value = metrics

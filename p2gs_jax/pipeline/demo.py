@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -48,35 +49,26 @@ def run_demo(
         UserError: `out` holds something that the demo did not make.
     """
     street, run_dir = out / "street", out / "run"
-    wanted = {"frames": frames, "width": width, "iso_std": iso_std, "seed": seed}
     marker = out / "demo.json"
     if out.exists() and any(out.iterdir()) and not marker.exists():
         raise UserError(f"{out} holds other files.", fix="name another folder with --out")
     out.mkdir(parents=True, exist_ok=True)
     for folder in (street, run_dir):
         shutil.rmtree(folder, ignore_errors=True)
-    write_json(marker, wanted)
+    made: dict[str, Any] = {"frames": frames, "width": width, "iso_std": iso_std, "seed": seed}
+    write_json(marker, made)
     height = image_height(width, multiple=4)
     reporter.stage("Making the street")
-    write_street(street, frames=frames, width=width, height=height, iso_std=iso_std, seed=seed)
+    write_street(street, height=height, **made)
     reporter.message(f"Made a street: 3 cameras, {frames} frames each, {width}x{height}.")
-    truth = read_true_exposures(street)
-    result = fit(
-        street,
-        run_dir,
-        cfg,
-        reference=street / "reference",
-        reporter=reporter,
-        true_exposures=truth,
-    )
-    names = [result.scene.views[i].name for i in result.scene.train_indices]
+    truth, reference = read_true_exposures(street), street / "reference"
+    result = fit(street, run_dir, cfg, reference=reference, reporter=reporter, true_exposures=truth)
+    names = [view.name for view in result.scene.training_views]
     true = np.array([truth[n] for n in names])
     found = np.asarray(result.params.photometry.exposures, np.float64)
     error = exposure_error(found, true)
-    a, b = np.log2(found), np.log2(true)
-    rows = [
-        (n, float(y), float(x)) for n, x, y in zip(names, a - a.mean(), b - b.mean(), strict=True)
-    ]
+    recovered, given = (np.log2(e) - np.log2(e).mean() for e in (found, true))
+    rows = list(zip(names, given.tolist(), recovered.tolist(), strict=True))
     result.metrics["exposures"] = dict(error)
     write_json(run_dir / "metrics.json", result.metrics)
     return DemoResult(rows, error, result.metrics, run_dir)

@@ -315,23 +315,21 @@ def _photometry(
     saved: PhotometryFile, scene: Scene, cfg: FitConfig, files: RunFolder
 ) -> Photometry:
     """Return exposures, gammas and white balances of the training views."""
-    views = {v["image"]: v for v in saved["views"]}
-    train = [views.get(view.name) for view in scene.training_views]
-    if any(v is None or v["exposure"] is None for v in train):
+    by_name = {v["image"]: v for v in saved["views"] if v["exposure"] is not None}
+    train = [by_name[v.name] for v in scene.training_views if v.name in by_name]
+    if len(train) < len(scene.train_indices):
         raise UserError(
             f"{files.photometry} does not belong to the scene {scene.root}: its training views "
             "differ.",
             fix="restore the scene folder as it was during the fit",
         )
-    exposures = np.array([v["exposure"] for v in train if v is not None])
-    gammas = np.array([v["gamma"] for v in train if v is not None])
-    if cfg.photometry.parameterization == "log":
+    exposures, gammas = (np.array([v[name] for v in train]) for name in ("exposure", "gamma"))
+    p, balances = cfg.photometry, None
+    if p.parameterization == "log":
         exposures, gammas = np.log(exposures), np.log(gammas / GAMMA_SRGB)
-    p = cfg.photometry
-    balances = None
     if p.white_balance is not None:
-        factors = [v.get("white_balance") for v in train if v is not None]
-        if any(each is None for each in factors):
+        factors = [v.get("white_balance") for v in train]
+        if None in factors:
             raise UserError(f"{files.photometry} lacks the white balance of a view.", fix=AGAIN)
         balances = on_device(np.log(np.array(factors, float)))
     rows = camera_rows([view.camera for view in scene.training_views], p)

@@ -52,34 +52,26 @@ def file_fingerprints(paths: Sequence[Path]) -> list[tuple[str, int, int]]:
     return [(str(path.resolve()), stat.st_size, stat.st_mtime_ns) for path, stat in stats]
 
 
-class StageProgress:
-    """Reports now and then how far a stage of `total` units is; the first message comes at once."""
+def stage_progress(
+    report: Report, stage: str, total: int, unit: str, clock: Callable[[], float] = time.monotonic
+) -> Callable[[int], None]:
+    """Begin a stage, such as "matching" 100 "image pairs"; return what reports how many are done.
 
-    def __init__(
-        self,
-        report: Report,
-        stage: str,
-        total: int,
-        unit: str,
-        clock: Callable[[], float] = time.monotonic,
-    ):
-        """Begin the stage, such as "matching", of so many units, such as "image pairs"."""
-        self._report, self._stage, self._total, self._unit = report, stage, total, unit
-        self._clock = clock
-        self._begin = self._last = clock()
-        if total:
-            report(f"{stage}: {total} {unit}")
+    The first message comes at once, others now and then.
+    """
+    begin = last = clock()
+    if total:
+        report(f"{stage}: {total} {unit}")
 
-    def __call__(self, done: int) -> None:
-        """Report how many are done, unless a message came just before."""
-        now = self._clock()
-        if now - self._last < EVERY_S or not 0 < done < self._total:
+    def progress(done: int) -> None:
+        nonlocal last
+        now = clock()
+        if now - last < EVERY_S or not 0 < done < total:
             return
-        self._last = now
-        left = round((now - self._begin) / done * max(self._total - done, 0))
-        minutes, seconds = divmod(left, 60)
+        last = now
+        minutes, seconds = divmod(round((now - begin) / done * max(total - done, 0)), 60)
         hours, minutes = divmod(minutes, 60)
-        clock = f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
-        self._report(
-            f"{self._stage}: {done} of {self._total} {self._unit}, about {clock} left at this pace"
-        )
+        left = f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
+        report(f"{stage}: {done} of {total} {unit}, about {left} left at this pace")
+
+    return progress

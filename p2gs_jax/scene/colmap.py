@@ -1,9 +1,9 @@
 """A COLMAP model, binary or text, and its photographs as a Scene.
 
-Why not `pycolmap.Reconstruction`: version 4.2.1 accepts a truncated `cameras.bin` without an error
-and never returns from a truncated `points3D.bin`. Here every count is checked against the size of
-the file. Newer models' `rigs.bin` and `frames.bin` are not needed: `images.bin` still holds every
-registered image with its own pose. Format: https://colmap.github.io/format.html
+Why not `pycolmap.Reconstruction`: version 4.2.1 accepts a truncated `cameras.bin` and never returns
+from a truncated `points3D.bin`. Here every count is checked against the size of the file. Newer
+models' `rigs.bin` and `frames.bin` are not needed: `images.bin` still holds every registered image
+with its own pose. Format: https://colmap.github.io/format.html
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import struct
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
@@ -28,6 +29,7 @@ _FIX = "export the model again from COLMAP"
 _FIX_FILES = "copy the model again from where it was made, or export it again from COLMAP"
 _LARGEST_ID = 2**63 - 1
 _STEMS = ("cameras", "images", "points3D")
+_POINT = np.dtype([("id", np.int64), ("xyz", np.float64, 3), ("rgb", np.uint8, 3)])
 _KEYPOINT = np.dtype([("xy", "<f8", 2), ("id", "<i8")])
 # Number of parameters and of focal lengths among them, in the order of COLMAP's model ids; 0: the
 # model is not supported.
@@ -83,10 +85,10 @@ def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
         viewmat = _viewmat(image, model.file("images"))
         views.append(View(image.name, path, name, viewmat, K, width, height, distortion))
     if resized:
-        notes.append(
-            f"{len(resized)} images have another size than their camera (the first: {resized[0]}): "
-            "intrinsics were rescaled"
+        note = (
+            f"{len(resized)} images have another size than their camera (the first: {resized[0]})"
         )
+        notes.append(f"{note}: intrinsics were rescaled")
     others = sorted(p.name for p in folder.parent.iterdir() if p != folder and is_model(p))
     if folder.name == "0" and others:
         notes.append(f"used the model {folder}; beside it lie {', '.join(others)}, not used")
@@ -97,9 +99,8 @@ def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
 def tracks_of(model: Model, views: Sequence[View]) -> Tracks | None:
     """Return every observation of the model's points, in undistorted pixels of the views.
 
-    Views are matched by name, and keypoints rescaled from the resolution of the model's cameras.
-    Observations of points that the model does not have (some tools thin points3D without touching
-    the images file) and of images that are not among the views are left out.
+    Views are matched by name, and keypoints rescaled to their size. Observations of points that the
+    model lacks (some tools thin points3D alone) and of other images are left out.
     """
     if len(model.point_ids) == 0:
         return None
@@ -219,10 +220,9 @@ class ImageRecord(NamedTuple):
 
 
 class Model(NamedTuple):
-    """A COLMAP model as files of the suffix `kind` state it.
+    """A COLMAP model: cameras by id, images in the file's order, ascending `point_ids`.
 
-    Cameras are by id, images in the file's order, `point_ids` ascending; `xyz` are scene units,
-    `rgb` display-encoded.
+    `xyz` are scene units, `rgb` display-encoded, `kind` is the suffix of the files.
     """
 
     folder: Path
@@ -259,10 +259,10 @@ def read_model(folder: Path) -> Model:
     text = (_text_cameras, _text_images, _text_points)
     binary = (_binary_cameras, _binary_images, _binary_points)
     cameras, images, points = binary if ext == "bin" else text
-    ids, xyz, rgb = points(paths[2])
-    order = np.argsort(ids, kind="stable")
-    known, taken = cameras(paths[0]), tuple(images(paths[1]))
-    return Model(folder, ext, known, taken, ids[order], xyz[order], rgb[order])
+    rows = np.fromiter(((n, tuple(xyz), tuple(rgb)) for n, xyz, rgb in points(paths[2])), _POINT)
+    rows = rows[np.argsort(rows["id"], kind="stable")]
+    ids, xyz, rgb = (np.ascontiguousarray(rows[name]) for name in ("id", "xyz", "rgb"))
+    return Model(folder, ext, cameras(paths[0]), tuple(images(paths[1])), ids, xyz, rgb)
 
 
 class _Cursor:
@@ -327,28 +327,31 @@ def _binary_images(path: Path) -> Iterator[ImageRecord]:
         yield _image(name, camera_id, pose, keypoints["xy"], keypoints["id"])
 
 
-def _binary_points(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _binary_points(path: Path) -> Iterator[tuple]:
     cursor = _Cursor(path)
-    n = cursor.count(51)
-    ids, xyz, rgb = np.empty(n, np.int64), np.empty((n, 3)), np.empty((n, 3), np.uint8)
-    for i in range(n):
-        ids[i], *rest = cursor.unpack("<q3d3Bd")
-        xyz[i], rgb[i] = rest[:3], rest[3:6]
+    for _ in range(cursor.count(51)):
+        point_id, *rest = cursor.unpack("<q3d3Bd")
         cursor.skip(8 * cursor.count(8))  # tracks: the images file has them too
-    return ids, xyz, rgb
+        yield point_id, rest[:3], rest[3:6]
+
+
+@contextmanager
+def _parsing(path: Path, line: int) -> Iterator[None]:
+    try:
+        yield
+    except ValueError as error:
+        raise broken(path, f"is malformed in line {line}: {error}", _FIX_FILES) from None
 
 
 def _text_cameras(path: Path) -> dict[int, CameraRecord]:
     cameras = {}
     for number, line in _text_lines(path):
-        try:
+        with _parsing(path, number):
             camera_id, model, width, height, *params = line.split()
             values = tuple(map(float, params))
             cameras[int(camera_id)] = CameraRecord(model, int(width), int(height), values)
-        except ValueError as error:
-            raise _malformed(path, number, error) from None
-        if _MODELS.get(model, (len(values),))[0] != len(values):
-            raise _malformed(path, number, f"{len(values)} parameters for the model {model}")
+            if _MODELS.get(model, (len(values),))[0] != len(values):
+                raise ValueError(f"{len(values)} parameters for the model {model}")
     return cameras
 
 
@@ -357,38 +360,30 @@ def _text_images(path: Path) -> Iterator[ImageRecord]:
     for number, line in lines:
         if not line:
             continue
-        try:
+        with _parsing(path, number):
             _, *pose, camera_id, name = line.split(maxsplit=9)
             values = [float(value) for value in pose]
             if len(values) != 7:
                 raise ValueError("an image line needs 10 fields")
-            # An image without keypoints has an empty second line, which editors may have cut.
-            number, line = next(lines, (number, ""))
+        # An image without keypoints has an empty second line, which editors may have cut.
+        number, line = next(lines, (number, ""))
+        with _parsing(path, number):
             keypoints = np.array(line.split(), np.float64).reshape(-1, 3)
             record = _image(name, int(camera_id), values, keypoints[:, :2], keypoints[:, 2])
-        except ValueError as error:
-            raise _malformed(path, number, error) from None
         yield record
 
 
-def _text_points(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    ids: list[int] = []
-    xyz: list[list[float]] = []
-    rgb: list[list[int]] = []
+def _text_points(path: Path) -> Iterator[tuple]:
     for number, line in _text_lines(path):
-        fields = line.split(maxsplit=8)
-        try:
+        with _parsing(path, number):
+            fields = line.split(maxsplit=8)
             if len(fields) < 8:
                 raise ValueError("a point line needs at least 8 fields")
-            ids.append(int(fields[0]))
-            if abs(ids[-1]) > _LARGEST_ID:
-                raise ValueError(f"{ids[-1]} is not a valid id of a point")
-            xyz.append([float(value) for value in fields[1:4]])
-            rgb.append([int(value) & 255 for value in fields[4:7]])
-        except ValueError as error:
-            raise _malformed(path, number, error) from None
-    colors = np.array(rgb, np.uint8).reshape(-1, 3)
-    return np.array(ids, np.int64), np.array(xyz, np.float64).reshape(-1, 3), colors
+            if abs(int(fields[0])) > _LARGEST_ID:
+                raise ValueError(f"{fields[0]} is not a valid id of a point")
+            color = [int(value) & 255 for value in fields[4:7]]
+            row = int(fields[0]), [float(value) for value in fields[1:4]], color
+        yield row
 
 
 def _text_lines(path: Path, *, blank: bool = False) -> Iterator[tuple[int, str]]:
@@ -406,10 +401,6 @@ def _image(
     tracked, (qvec, tvec) = ids >= 0, np.split(np.array(pose), [4])
     xy, ids = np.asarray(xy[tracked], np.float64), ids[tracked].astype(np.int64)
     return ImageRecord(name.replace("\\", "/"), camera_id, qvec, tvec, xy, ids)
-
-
-def _malformed(path: Path, line: int, what: object) -> UserError:
-    return broken(path, f"is malformed in line {line}: {what}", _FIX_FILES)
 
 
 def _unsupported(path: Path, model: str) -> UserError:

@@ -45,10 +45,7 @@ def check_source(source: str | None) -> None:
 
 
 def stated_ev(source: str | None, views: list[View]) -> Float[np.ndarray, " v"]:
-    """Return stated exposures in stops, up to a constant; NaN where nothing is stated.
-
-    A source of None takes EXIF where there is any. Raises UserError: as `read_known_exposures`.
-    """
+    """Return stated exposures in stops, up to a constant, from a source or, if None, from EXIF."""
     if source is None:
         return _exif_ev(views)
     return read_known_exposures(source, views) / LN2

@@ -88,8 +88,7 @@ def image_folder(root: Path, cfg: DataConfig) -> Path | None:
 def image_size(path: Path) -> tuple[int, int]:
     """Return (width, height) as stored, before any EXIF rotation.
 
-    Raises UserError: the file is not an image, or is too large; its name is not UTF-8; or a package
-    that opens it is missing.
+    Raises UserError: it is not an image, or too large; its name is not UTF-8; a package is missing.
     """
     try:
         str(path).encode()  # no other name can be written into the files of a run

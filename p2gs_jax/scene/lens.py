@@ -84,7 +84,7 @@ def undistortion_maps(
     """Return where each undistorted pixel lies in the photograph, for `cv2.remap`.
 
     Positions are in OpenCV's convention (pixel centres at integers), -10 where the lens model is
-    not monotonic any more. K, with centres at +0.5, is that of the photograph and of the result.
+    not monotonic any more. K has centres at +0.5.
     """
     shifted = np.asarray(K, np.float64).copy()
     shifted[:2, 2] -= 0.5

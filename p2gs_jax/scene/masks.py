@@ -23,10 +23,7 @@ _OPAQUE = frozenset({".jpg", ".jpeg", ".ppm"})
 
 
 def attach_masks(views: tuple[View, ...]) -> tuple[tuple[View, ...], list[str]]:
-    """Find masks in `masks/` beside the image folder or in it, where a reader named none.
-
-    Returns the views with them, and a note about those that have none.
-    """
+    """Return views with masks in `masks/` beside the image folder or in it, and a note."""
     masked = tuple(
         view if view.mask_path else dataclasses.replace(view, mask_path=mask_of(view))
         for view in views

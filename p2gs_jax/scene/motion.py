@@ -1,10 +1,9 @@
 """Which frames of a video become photographs: sharp ones, each from a new place.
 
-Corners are followed from frame to frame. Parallax is what remains of their motion after the
-rotation that explains it best: turning on the spot shows nothing new of depth. A frame is due once
-the camera has come far enough since the last chosen one, and the sharpest of those about then is
-chosen. So neither the frame rate nor how fast somebody walked matters, and a camera that rests
-gives one photograph.
+Corners are followed from frame to frame. Parallax is what the best rotation leaves of their motion:
+turning on the spot shows nothing new of depth. A frame is due once the camera has come far enough
+since the last chosen one; the sharpest of those about then is chosen. So frame rate and speed do
+not matter, and a camera that rests gives one photograph.
 """
 
 from __future__ import annotations

@@ -172,11 +172,10 @@ def up_of_drive(viewmats: Float[np.ndarray, "n 4 4"], cameras: Sequence[str]) ->
 def headings(
     centers: Float[np.ndarray, "n 3"], up: Vector3, otherwise: Vector3
 ) -> Float[np.ndarray, "n 3"]:
-    """Return the level direction in which a camera drives at each of its places, of length 1.
+    """Return the level direction, of length 1, in which a camera drives at each of its places.
 
     It is taken over at least `HEADING_WAY` where the way is so long: at a stop poses jitter.
-    Centers are in the order of time, `up` has length 1, and a camera that goes nowhere drives
-    `otherwise`.
+    Centers are in the order of time; a camera that goes nowhere drives `otherwise`.
     """
     level = centers - np.outer(centers @ up, up)
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(level, axis=0), axis=1))])

@@ -2,7 +2,7 @@
 
 3DGS begins NeRF's synthetic scenes with 100,000 points in a cube that is known to hold them. Here
 the volume follows from the cameras: the pixels of all training views between the nearest and the
-farthest depth, as far as at least half as many views as possible see it.
+farthest depth, as far as half as many views as possible see it.
 """
 
 from __future__ import annotations

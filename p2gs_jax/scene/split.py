@@ -138,8 +138,8 @@ def lists_beside(*folders: Path) -> SplitLists | None:
 def split_as_listed(scene: Scene, lists: SplitLists, *, allow_missing: bool = False) -> Scene:
     """Return a scene whose views are split as lists say; what is in none of them is left out.
 
-    Names that no photograph has are an error unless `allow_missing`. Raises UserError: a name
-    belongs to no photograph, or to several; it is in two lists; or nothing is left to train on.
+    Raises UserError: a name belongs to no photograph (unless `allow_missing`) or to several, or is
+    in two lists; or nothing is left to train on.
     """
     views, where, name, notes = scene.views, lists.where, lists.where.name, []
     rows_of = _rows_by_name(views)

@@ -42,13 +42,8 @@ _CORNERS = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1], [1, 1]]) / 2
 class SurveyedCamera:
     """One physical camera, or photographs of one size where nothing else is known.
 
-    Attributes:
-        size: width and height, pixels.
-        focal: length in pixels.
-        across: angle of view from side to side, degrees.
-        lens: the model that distorts; empty: none does.
-        own_car: share of the picture that shows the car itself.
-        ev: least and largest log2(time ISO / N^2) of EXIF, stops.
+    Sizes and focal lengths are pixels, `across` the angle of view in degrees, `own_car` the share
+    of the picture that shows the car itself, `ev` the range of log2(time ISO / N^2), stops.
     """
 
     name: str
@@ -67,11 +62,9 @@ class Survey:
 
     Attributes:
         format: as `DataConfig.format` names it.
-        frames: moments in a drive, or None where views have none.
-        seconds: from the first photograph to the last.
+        frames: moments in a drive; `seconds` are from the first photograph to the last.
         way: length of the way of the camera with the most photographs, scene units.
         missing: photographs that the cameras lack in these frames.
-        sweeps: sweeps of laser scanners.
         lacks: what a drive may have and this scene lacks, in words.
     """
 

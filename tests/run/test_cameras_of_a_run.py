@@ -66,27 +66,27 @@ def test_a_run_is_read_back_with_its_cameras(camera_run):
     assert run.common_display().vignetting == ()
 
 
-def test_a_file_of_another_version_is_refused(finished_run, tmp_path):
-    folder = tmp_path / "run"
-    shutil.copytree(finished_run, folder)
-    path = folder / "photometry.json"
-    saved = json.loads(path.read_text())
-    assert saved["cameras"] == []
-    assert read_photometry(path) == saved
-    path.write_text(json.dumps({**saved, "version": 3}))
-    with pytest.raises(UserError, match="version is 3"):
-        load_run(folder)
-
-
-def test_a_missing_white_balance_is_said(camera_run, tmp_path):
-    folder = tmp_path / "run"
-    shutil.copytree(camera_run, folder)
-    path = folder / "photometry.json"
-    saved = json.loads(path.read_text())
+def _without_balance(saved):
     train = [view for view in saved["views"] if view["split"] == "train"]
     train[1]["white_balance"] = None
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda saved: saved.update(version=3), "version is 3"),
+        (lambda saved: saved.pop("cameras"), "cameras missing"),
+        (_without_balance, "lacks the white balance"),
+    ],
+)
+def test_a_file_that_does_not_fit_is_refused(camera_run, tmp_path, change, said):
+    folder = shutil.copytree(camera_run, tmp_path / "run")
+    path = folder / "photometry.json"
+    saved = json.loads(path.read_text())
+    assert read_photometry(path) == saved
+    change(saved)
     path.write_text(json.dumps(saved))
-    with pytest.raises(UserError, match="lacks the white balance"):
+    with pytest.raises(UserError, match=said):
         load_run(folder)
 
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scene.helpers import make_view, write_image, write_tiny_model
+from scene.helpers import write_image, write_tiny_model
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.scene import ImageStore, load_scene
+from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.lens import (
     _fold_radius,
     intrinsics,
@@ -130,25 +130,6 @@ def test_pixels_beyond_a_rational_fold_are_masked():
     outside = np.hypot(x[None], y[:, None]) >= _fold_radius(lens)
     assert 0.1 < outside.mean() < 0.9
     assert ((map_x == -10) == outside).mean() > 0.999
-
-
-def test_a_fisheye_photograph_is_undistorted(tmp_path):
-    """Stripes painted in undistorted coordinates, photographed through a fisheye, come back."""
-    lens = Distortion((0.04, -0.01, 0.0, 0.0), "fisheye")
-    small = intrinsics(80.0, 80.0, 80.0, 60.0)
-    ys, xs = np.mgrid[:120, :160] + 0.5
-    straight = undistort_points(np.stack([xs.ravel(), ys.ravel()], 1), small, lens)
-    x, y = np.where(np.isfinite(straight), straight, 0.0).reshape(120, 160, 2).transpose(2, 0, 1)
-
-    def paint(x, y):
-        return np.stack([128 + 100 * np.sin(x / 9), 128 + 100 * np.cos(y / 7), 128 + 0 * x], -1)
-
-    image = np.rint(paint(x, y)).astype(np.uint8)[..., ::-1]
-    view = make_view(tmp_path / "a.png", image, f=80.0, distortion=lens)
-    ldr, valid = ImageStore((view,), DataConfig()).get(0, 1)
-    inside = valid > 0.5
-    assert inside.mean() > 0.5
-    np.testing.assert_allclose(ldr[inside], paint(xs, ys)[inside] / 255, atol=0.03)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from scene.helpers import refused, reprojection_errors, write_image
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene import load_scene
-from p2gs_jax.scene.cache import StageProgress, cached_folder
+from p2gs_jax.scene.cache import cached_folder, stage_progress
 from p2gs_jax.scene.sfm.features import (
     kept_features,
     match_kept,
@@ -152,7 +152,7 @@ def test_a_mapper_that_is_not_there_is_named(monkeypatch, folder, tmp_path):
 
 def test_progress_tells_what_is_left():
     now, said = [0.0], []
-    progress = StageProgress(said.append, "matching", 100, "pairs", clock=lambda: now[0])
+    progress = stage_progress(said.append, "matching", 100, "pairs", clock=lambda: now[0])
     for seconds, done in ((1, 5), (20, 25), (21, 26), (3600, 50), (3700, 100)):
         now[0] = seconds
         progress(done)
@@ -162,7 +162,7 @@ def test_progress_tells_what_is_left():
         "matching: 50 of 100 pairs, about 1:00:00 left at this pace",
     ]
     said.clear()
-    StageProgress(said.append, "matching", 0, "pairs")
+    stage_progress(said.append, "matching", 0, "pairs")
     assert said == []
 
 

@@ -63,15 +63,6 @@ def test_fox(shared_data):
     assert all(v.viewmat[2, 3] > 0 for v in scene.views)
 
 
-def test_fox_with_missing_frames(shared_data):
-    path = shared_data("nerf_fox") / "transforms_with_missing.json"
-    with refused("17 of the 67 images", "--allow-missing"):
-        find_scene(path, CFG)
-    scene = find_scene(path, DataConfig(allow_missing=True))
-    assert len(scene.views) == 50
-    assert "17 of the 67" in scene.notes[0]
-
-
 def test_camera_angle_and_absent_extension(tmp_path):
     data = {"camera_angle_x": 2 * np.arctan(0.5), "frames": frames("./images/a", "images/b")}
     scene = find_scene(write(tmp_path, data), CFG)
@@ -206,13 +197,6 @@ def test_two_photographs_are_triangulated(tmp_path):
     assert np.median(scene.points[:, 2]) == pytest.approx(focal * baseline / shift, rel=0.02)
 
 
-@pytest.mark.slow
-def test_fox_triangulation(shared_data):
-    scene = load_scene(shared_data("nerf_fox"), CFG)
-    assert np.median(reprojection_errors(scene)) < 1.0
-    assert len(scene.points) > 3000
-
-
 def test_one_blank_view_cannot_be_triangulated(tmp_path):
     write(tmp_path, {"fl_x": 50, "frames": frames("images/a.png")})
     with refused("no point could be triangulated"):
@@ -305,17 +289,6 @@ def test_lego(shared_data):
         centre = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
         assert np.linalg.norm(centre) == pytest.approx(4.0311, abs=1e-3)
         assert view.viewmat[2, 3] == pytest.approx(4.0311, abs=1e-3)
-
-
-@pytest.mark.slow
-def test_seeds_of_lego_lie_on_it_and_come_from_training_views(shared_data):
-    scene = load_scene(shared_data("nerf_synthetic_lego"), CFG)
-    assert len(scene.points) > 3000
-    assert not scene.random_seeds
-    assert np.median(reprojection_errors(scene)) < 1.0
-    assert (np.abs(scene.points) < 1.3).all(1).mean() > 0.97
-    used = {scene.views[row].split for row in np.unique(scene.tracks.view_indices)}
-    assert used == {"train"}
 
 
 def test_val_takes_the_place_of_test_only_where_there_is_none(tmp_path):
@@ -415,13 +388,6 @@ def test_missing_frames_may_be_skipped(tmp_path):
     scene = find_scene(tmp_path, DataConfig(allow_missing=True))
     assert len(scene.test_indices) == 2
     assert "1 of the 3 images" in scene.notes[0]
-
-
-def test_a_smaller_copy_keeps_its_lens(tmp_path):
-    write_rgba(write_blender(tmp_path) / "train" / "r_3.png", size=(20, 15))
-    views = {view.name: view for view in find_scene(tmp_path, CFG).views}
-    small, large = views["train/r_3.png"], views["train/r_2.png"]
-    assert np.allclose(2 * small.K[:2], large.K[:2])
 
 
 # ------------------------------------------------------------------ LLFF

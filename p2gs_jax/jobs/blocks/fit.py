@@ -199,20 +199,7 @@ class _Blocks:
         params = centred(Params(gaussians, photometry), cfg)
         self._tell(seams)
         self.lock.require()
-        account = Account(
-            counts={
-                "gaussians": gaussians.capacity,
-                "seed_points": len(scene.points),
-                "train_views": len(scene.train_indices),
-                "test_views": len(scene.test_indices),
-                "steps": sum(self._of_block(k)["counts"]["steps"] for k in range(len(counts))),
-                "blocks": len(counts),
-            },
-            seconds={**self.clock.seconds, "total_until_evaluation": time.monotonic() - begin},
-            compiler=self.compiler,
-            selection=solved.selection,
-            notes=[*solved.scene.notes, *solved.notes],
-        )
+        account = self._account(scene, solved, gaussians.capacity, time.monotonic() - begin)
         metrics = finish(
             params,
             solved.scene,
@@ -237,6 +224,23 @@ class _Blocks:
             self.paths.run,
             solved.selection,
             solved.shared.decisions,
+        )
+
+    def _account(self, scene: Scene, solved: Solved, gaussians: int, seconds: float) -> Account:
+        blocks = range(len(self.cut.blocks))
+        return Account(
+            counts={
+                "gaussians": gaussians,
+                "seed_points": len(scene.points),
+                "train_views": len(scene.train_indices),
+                "test_views": len(scene.test_indices),
+                "steps": sum(self._of_block(k)["counts"]["steps"] for k in blocks),
+                "blocks": len(blocks),
+            },
+            seconds={**self.clock.seconds, "total_until_evaluation": seconds},
+            compiler=self.compiler,
+            selection=solved.selection,
+            notes=[*solved.scene.notes, *solved.notes],
         )
 
     def _solve(self, scene: Scene) -> Solved:

@@ -1,7 +1,6 @@
 """Photographs as cameras write them, made into files that everything behind can read.
 
 PNG, JPEG and TIFF are decoded as they are; a colour profile is applied then (`icc`). HEIC, camera
-raw and files of linear light are written once, as PNG, into the run's cache (`convert`): structure
-from motion reads nothing else, and they are slow to decode. Known light is encoded as sRGB in 16
-bits, so that photometry knows its response; other photographs stay at 8 bits in memory.
+raw and files of linear light are written once, as PNG, into the run's cache (`convert`). Known
+light is encoded as sRGB in 16 bits, so that photometry knows its response.
 """

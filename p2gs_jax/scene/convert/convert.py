@@ -65,12 +65,10 @@ _NO_ROOM = "make room on that disk, or name another --out"
 
 @dataclass(frozen=True)
 class Converted:
-    """Photographs in a folder that structure from motion can read.
+    """Photographs in a folder that structure from motion can read, sorted.
 
-    Attributes:
-        paths: the files in `folder`, sorted.
-        originals: the user's files, by path relative to `folder`.
-        known: why the response of them all is known, or None.
+    `originals` are the user's files, by path relative to `folder`; `known` is why the response of
+    all photographs is known, or None.
     """
 
     folder: Path

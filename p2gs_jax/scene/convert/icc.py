@@ -98,10 +98,8 @@ def to_srgb_matrix(primaries: Primaries) -> Float[np.ndarray, "3 3"]:
 class Profile:
     """A colour space of photographs other than sRGB.
 
-    Attributes:
-        decode: light of `_ENTRIES` evenly spaced values from 0 to 1 by channel; None: the profile
-            is made of tables, which are not applied here.
-        matrix: from that light to linear sRGB.
+    `decode` is the light of `_ENTRIES` evenly spaced values from 0 to 1 by channel, and `matrix`
+    leads from it to linear sRGB; a profile made of tables has neither.
     """
 
     name: str
@@ -148,10 +146,9 @@ def read_profile(data: bytes) -> Profile | None:
 
 
 def to_srgb(pixels: UInt[np.ndarray, "h w 3"], profile: Profile) -> UInt[np.ndarray, "h w 3"]:
-    """Return RGB colours in sRGB as 16 bits, since 8 would be rounded twice.
+    """Return RGB colours in sRGB as 16 bits; a profile made of tables leaves them alone.
 
-    A profile made of tables leaves them alone. What sRGB cannot show is clipped: such channels
-    count as black or saturated, as if the camera had written sRGB.
+    What sRGB cannot show is clipped, as if the camera had written sRGB.
     """
     if profile.decode is None or profile.matrix is None:
         return pixels

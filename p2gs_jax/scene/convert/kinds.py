@@ -36,15 +36,10 @@ _START_OF_SCAN = 0xDA
 
 @dataclass(frozen=True)
 class Picture:
-    """A decoded photograph, of display values (`codes`) or of light.
+    """A decoded photograph, of display values (`codes`, `profile`) or of light.
 
-    Attributes:
-        codes: unsigned integers of which the largest is 1: R G B, perhaps with alpha behind, or one
-            channel.
-        light: linear, in the primaries of sRGB.
-        alpha: opacity beside `light`.
-        profile: ICC profile of `codes`.
-        invalid: number of pixels that are not a number; they count as black.
+    Codes are unsigned integers of which the largest is 1: R G B, perhaps with alpha behind, or one
+    channel. Light is linear in the primaries of sRGB; `invalid` pixels, not numbers, are black.
     """
 
     codes: UInt[np.ndarray, "h w c"] | None = None

@@ -1,9 +1,8 @@
 """Files of linear light: camera raw, OpenEXR, and TIFF of floats.
 
-Raw goes through LibRaw: the black level is subtracted, white becomes 1, the colour filter is
-interpolated, and the camera's matrix leads to sRGB's primaries. A camera's automatic white balance
-differs between photographs, but a sensor does not: all photographs of one camera model are
-converted with the same factors, and what the camera chose for each is recorded.
+LibRaw subtracts the black level of raw, makes white 1, interpolates the colour filter, and goes to
+sRGB's primaries with the camera's matrix. A camera's automatic white balance differs between
+photographs, but a sensor does not: all photographs of one camera model get the same factors.
 """
 
 from __future__ import annotations
@@ -38,7 +37,6 @@ class RawFacts:
 
     Attributes:
         size: width and height in pixels, as the sensor lies.
-        camera: make and model, as far as they are known; photographs of one share white balance.
         balance: factors on red, green and blue that the camera chose, green 1; None: not recorded.
         black: levels that are subtracted, by colour of the filter; `white` becomes 1.
         matrix: whether the camera's colours are known; otherwise its primaries are kept.

@@ -1,9 +1,8 @@
 """Decoded photographs in files that are mapped into memory: the system drops and reads pages.
 
-There is a folder for every size and a file for every photograph, a record of NumPy's, named by all
-that its pixels depend on: what another photograph, mask or lens left behind is never read.
-Processes fill the files before they are asked for. They run this module: `multiprocessing` would
-run the caller's script again, which then needs a guard, or fork a process in which JAX has threads.
+A folder for every size holds a record of NumPy's for every photograph, named by all that its pixels
+depend on. Processes fill the files before they are asked for. They run this module:
+`multiprocessing` would run the caller's script again, or fork a process in which JAX has threads.
 """
 
 from __future__ import annotations
@@ -151,14 +150,10 @@ def _fingerprint(path: Path) -> tuple[str, int, int]:
 def decode_ahead(
     views: Sequence[View], files: PixelFiles, keys: Sequence[Sequence[Key]]
 ) -> list[subprocess.Popen[bytes]]:
-    """Start processes that decode into files, in order, what they lack; none for a few photographs.
+    """Start processes that decode what the files lack; none for a few photographs.
 
-    What a process cannot decode is left to the caller that asks for it, and that gets the error.
-
-    Args:
-        views: all views of the scene.
-        files: where the photographs go.
-        keys: for every view the sizes that will be asked for.
+    `keys` are for every view the sizes that will be asked for. What a process cannot decode is left
+    to the caller that asks for it, and that gets the error.
     """
     jobs = []
     for view, sizes in zip(views, keys, strict=True):

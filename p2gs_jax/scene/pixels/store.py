@@ -52,12 +52,8 @@ class ImageStore:
 
     Decoded images are kept up to `cfg.cache_mb`, the rest in files where there is a folder for
     them. All methods may be called from any thread; an `index` is the row of a view, a `shrink` the
-    factor of `size_at`.
-
-    Attributes:
-        backdrop: display values of the background that photographs with alpha are shown over; None:
-            they are shown over none.
-        random_backdrop: training draws another one for every step.
+    factor of `size_at`. Photographs with alpha are shown over the display values of `backdrop`, if
+    any; with `random_backdrop` training draws another one for every step.
     """
 
     def __init__(
@@ -93,10 +89,7 @@ class ImageStore:
         self._leave_out(objects, MARGIN)
 
     def leaving_out(self, objects: Sequence[TrackedObject], margin: float = MARGIN) -> ImageStore:
-        """Return a store of the same photographs that leaves out pixels in other boxes.
-
-        These are the boxes of the objects that move, widened by `margin` scene units to every side.
-        """
+        """Return a store of the same photographs without the boxes of other objects that move."""
         other = copy.copy(self)
         other._leave_out(objects, margin)
         return other

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from p2gs_jax.config import Matching
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.cache import Report, StageProgress, file_fingerprints
+from p2gs_jax.scene.cache import Report, file_fingerprints, stage_progress
 from p2gs_jax.scene.colmap import subfolder
 from p2gs_jax.scene.rigid import camera_centers
 
@@ -137,7 +137,7 @@ def kept_features(
     new = [name for name in names if name not in known]
     if len(new) < len(names):
         report(f"features of {len(names) - len(new)} images are kept from an earlier run")
-    progress, done = StageProgress(report, "detecting features", len(new), "images"), 0
+    progress, done = stage_progress(report, "detecting features", len(new), "images"), 0
     for group in groups.values():
         wanted = [name for name in group if name not in known]
         for start in range(0, len(wanted), IMAGES_AT_ONCE):
@@ -163,7 +163,7 @@ def match_kept(
     left = _unmatched(database, wanted)
     if len(left) < len(wanted):
         report(f"matches of {len(wanted) - len(left)} image pairs are kept from an earlier run")
-    progress = StageProgress(report, "matching", len(left), "image pairs")
+    progress = stage_progress(report, "matching", len(left), "image pairs")
     for start in range(0, len(left), PAIRS_AT_ONCE):
         match(database, left[start : start + PAIRS_AT_ONCE])
         progress(start + PAIRS_AT_ONCE)
@@ -215,9 +215,8 @@ def pairs_by_name(names: Sequence[str], matching: Matching = "auto") -> list[Pai
 
     Sequences, one a top folder: each image meets the next 10 and those 16, 32, ... 512 later; where
     a sequence is asked for, every fifth also meets every other fifth, for who comes back to a
-    place; images of different folders meet at the same place in the sequence and next to it
-    (COLMAP's sequential matching would never match `left/` with `right/`). `auto` takes long lists
-    for sequences.
+    place; images of different folders meet at the same place in the sequence and next to it. `auto`
+    takes long lists for sequences.
     """
     if matching == "all" or (matching == "auto" and len(names) <= EXHAUSTIVE_LIMIT):
         return None

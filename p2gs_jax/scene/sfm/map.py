@@ -16,7 +16,7 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.errors import UserError, broken
-from p2gs_jax.scene.cache import Report, StageProgress, cached_folder, file_fingerprints
+from p2gs_jax.scene.cache import Report, cached_folder, file_fingerprints, stage_progress
 from p2gs_jax.scene.colmap import load_colmap, subfolder
 from p2gs_jax.scene.convert.headers import read_exif_camera
 from p2gs_jax.scene.files import image_size
@@ -50,10 +50,9 @@ def load_images(
 ) -> Scene:
     """Run COLMAP's structure from motion on the photographs in a folder; read the largest model.
 
-    `work_dir` keeps it under `sfm/`, reused while names, sizes and modification times of the
-    photographs stay the same, and features and matches under `features/`, which serve more
-    photographs or another mapper. Raises UserError: fewer than two photographs, one of them is not
-    an image, none registered, or pycolmap lacks the mapper.
+    `work_dir` keeps it under `sfm/` while the photographs stay the same, and features and matches
+    under `features/`, which serve more photographs or another mapper. Raises UserError: fewer than
+    two photographs, one of them is not an image, none registered, or pycolmap lacks the mapper.
     """
     names = [path.relative_to(image_folder).as_posix() for path in paths]
     if len(paths) < 2:
@@ -127,7 +126,7 @@ def _build(
 def _map(
     database: Path, image_folder: Path, output: Path, count: int, report: Report
 ) -> list[pycolmap.Reconstruction]:
-    registered, progress = 2, StageProgress(report, "mapping", count, "images")
+    registered, progress = 2, stage_progress(report, "mapping", count, "images")
 
     def on_next_image() -> None:
         nonlocal registered

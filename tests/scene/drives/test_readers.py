@@ -16,7 +16,7 @@ from scene.drives import (
     writers_pandaset,
     writers_waymo,
 )
-from scene.drives.writers import HEIGHT, WIDTH, cut
+from scene.drives.writers import HEIGHT, WIDTH, K, cut
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
@@ -40,7 +40,7 @@ def test_a_drive_is_recognised_and_every_photograph_has_its_own_time_and_pose(ke
         np.testing.assert_allclose(found[key].pose, pose, atol=5e-3)
     assert {c.name for c in recording.cameras} == {camera for camera, _ in found}
     for camera in recording.cameras:
-        fx, fy, cx, cy = made.K
+        fx, fy, cx, cy = K
         np.testing.assert_allclose(camera.K, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], atol=1e-9)
         assert (camera.width, camera.height) == (WIDTH, HEIGHT)
 

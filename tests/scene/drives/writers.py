@@ -11,38 +11,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 WIDTH, HEIGHT = 64, 48
+# Of every camera: fx, fy, cx, cy with pixel centres at +0.5.
+K = (50, 51, 32, 24)
 # OpenCV's axes (x right, y down, z forward) in those of cars (x forward, y left, z up).
 FORWARD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 # Boxes about the scanner, in axes x forward, y left: one ahead, one to the right.
 AHEAD, RIGHT = (12.0, 0.0), (0.0, -8.0)
-
-
-class Made(NamedTuple):
-    """A drive, and the truth of what a reader should find in it.
-
-    Attributes:
-        root: of the drive.
-        K: fx, fy, cx, cy with pixel centres at +0.5.
-        photographs: time and camera to world, by camera and frame.
-        sweeps: times of sweeps.
-        error: distances of a frame's points from what they were measured on, metres.
-        count: points of a sweep.
-        boxes: times and box to world of "ahead", "right" and, where there is one, "parked".
-        tables: files without which the drive is not read, below `root` or beside it.
-        optional: tables that may be gone.
-        scans: files of sweeps.
-    """
-
-    root: Path
-    K: tuple[float, float, float, float]
-    photographs: dict[tuple[str, int], tuple[float, np.ndarray]]
-    sweeps: list[float]
-    error: Callable[[np.ndarray], np.ndarray]
-    count: int
-    boxes: dict[str, tuple[np.ndarray, np.ndarray]]
-    tables: list[Path]
-    optional: list[Path]
-    scans: list[Path]
 
 
 def matrix(turn: Rotation, position) -> np.ndarray:
@@ -114,3 +88,45 @@ def cut(path: Path) -> None:
     """Leave the first half of a file."""
     held = path.read_bytes()
     path.write_bytes(held[: len(held) // 2])
+
+
+class Made(NamedTuple):
+    """A drive, and the truth of what a reader should find in it.
+
+    Attributes:
+        photographs: time and camera to world, by camera and frame.
+        sweeps: times of sweeps.
+        boxes: times and box to world of "ahead" and "right"; a third one is "parked".
+        tables: files without which the drive is not read, below `root`.
+        optional: tables that may be gone.
+        scans: files of sweeps.
+        error: distances of points from what they were measured on, metres.
+        count: points of a sweep.
+    """
+
+    root: Path
+    photographs: dict[tuple[str, int], tuple[float, np.ndarray]]
+    sweeps: list[float]
+    boxes: dict[str, tuple[np.ndarray, np.ndarray]]
+    tables: list[Path]
+    optional: list[Path]
+    scans: list[Path] = []  # noqa: RUF012
+    error: Callable[[np.ndarray], np.ndarray] = off_landmarks
+    count: int = 50
+
+
+def shots(azimuths: dict[str, float], lag: dict[str, float], ats, clock: float = 0.0) -> dict:
+    """Return the truth of photographs at times; each camera is triggered after its own lag."""
+    return {
+        (name, k): (clock + at + lag[name], car_at(at + lag[name]) @ mounted(azimuths[name]))
+        for name in lag
+        for k, at in enumerate(ats)
+    }
+
+
+def tracks(ats, late: dict[str, float], box_at: Callable, clock: float = 0.0) -> dict:
+    """Return the truth of boxes at times, which the scanner passes so much later."""
+    return {
+        name: (clock + ats + late[name], np.array([box_at(at, place) for at in ats]))
+        for name, place in (("ahead", AHEAD), ("right", RIGHT))
+    }

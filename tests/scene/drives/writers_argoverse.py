@@ -88,20 +88,11 @@ def write(log: Path, frames=3) -> w.Made:
         )
     write_boxes(log, frames)
     ats = 0.1 * np.arange(frames)
-    shots = {(name, k): 0.05 * k + lag for name, lag in LAG.items() for k in range(2 * frames)}
     return w.Made(
         root=log,
-        K=(50, 51, 32, 24),
-        photographs={
-            (name, k): (t + BEFORE, w.car_at(t) @ mounts[name]) for (name, k), t in shots.items()
-        },
+        photographs=w.shots(CAMERAS, LAG, 0.05 * np.arange(2 * frames), BEFORE),
         sweeps=list(ats + BEFORE),
-        error=w.off_landmarks,
-        count=50,
-        boxes={
-            name: (ats + BEFORE, np.array([w.car_at(at) @ box(place) for at in ats]))
-            for name, place in (("ahead", w.AHEAD), ("right", w.RIGHT))
-        },
+        boxes=w.tracks(ats, {"ahead": 0, "right": 0}, lambda t, p: w.car_at(t) @ box(p), BEFORE),
         tables=[POSES, INTRINSICS, EXTRINSICS],
         optional=[BOXES],
         scans=sorted(p.relative_to(log) for p in log.glob("sensors/lidar/*")),

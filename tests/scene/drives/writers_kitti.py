@@ -151,8 +151,7 @@ def write(root: Path, frames=3) -> w.Made:
     w.write_bytes(date / "calib_imu_to_velo.txt", rigid(IMU_TO_VELO))
     ats = 0.1 * np.arange(frames)
     forward = ats + SCANNED
-    late = {"oxts": 0.0, "velodyne_points": SCANNED, **LAG}
-    for name, lag in late.items():
+    for name, lag in {"oxts": 0.0, "velodyne_points": SCANNED, **LAG}.items():
         write_stamps(drive / name / "timestamps.txt", ats + lag)
     write_stamps(drive / "velodyne_points/timestamps_start.txt", forward - TURN / 2)
     write_stamps(drive / "velodyne_points/timestamps_end.txt", forward + TURN / 2)
@@ -172,10 +171,13 @@ def write(root: Path, frames=3) -> w.Made:
     names = ("ahead", "right", "parked")
     boxes = tracklets(*(tracklet(n, 0, r) for n, r in zip(names, items, strict=True)))
     w.write_bytes(date / BOXES, boxes)
-    passed = {"ahead": forward, "right": forward + 0.25 * TURN}
+    late = {"ahead": 0, "right": 0.25 * TURN}
+
+    def box_at(time, place):
+        return scanner(time + late["right"] * (place == w.RIGHT)) @ box(place)
+
     return w.Made(
         root=date,
-        K=(50, 51, 32, 24),
         photographs={
             (name, k): (BEGIN + at + lag, camera(name, at + lag))
             for name, lag in LAG.items()
@@ -183,11 +185,7 @@ def write(root: Path, frames=3) -> w.Made:
         },
         sweeps=list(BEGIN + forward),
         error=off_places,
-        count=50,
-        boxes={
-            name: (BEGIN + passed[name], np.array([scanner(t) @ box(place) for t in passed[name]]))
-            for name, place in (("ahead", w.AHEAD), ("right", w.RIGHT))
-        },
+        boxes=w.tracks(forward, late, box_at, BEGIN),
         tables=[Path(f"calib_{name}.txt") for name in ("cam_to_cam", "velo_to_cam", "imu_to_velo")]
         + [Path(DRIVE) / folder / "timestamps.txt" for folder in ("oxts", "image_03")],
         optional=[BOXES],

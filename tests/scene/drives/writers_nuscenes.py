@@ -115,19 +115,9 @@ def write(root: Path, frames=3, scenes=("scene-0001",), version=TABLES) -> w.Mad
     late = {"ahead": -0.75 * TURN, "right": -0.5 * TURN}
     return w.Made(
         root=root,
-        K=(50, 51, 32, 24),
-        photographs={
-            (c, k): (at + LAG[c], w.car_at(at + LAG[c]) @ w.mounted(CAMERAS[c]))
-            for c in CAMERAS
-            for k, at in enumerate(ats)
-        },
+        photographs=w.shots(CAMERAS, LAG, ats),
         sweeps=[t for at in ats for t in (at - TURN, at)],
-        error=w.off_landmarks,
-        count=50,
-        boxes={
-            "ahead": (ats + late["ahead"], np.array([beside(at, w.AHEAD) for at in ats])),
-            "right": (ats + late["right"], np.array([beside(at, w.RIGHT) for at in ats])),
-        },
+        boxes=w.tracks(ats, late, beside),
         tables=[version / f"{name}.json" for name in ("scene", "sample", "ego_pose", "sensor")]
         + [version / "calibrated_sensor.json"],
         optional=[version / "sample_annotation.json"],

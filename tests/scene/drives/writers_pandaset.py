@@ -99,19 +99,9 @@ def write(folder: Path, frames=3) -> w.Made:
     late = {"ahead": -0.5 * TURN, "right": -0.25 * TURN}
     return w.Made(
         root=folder,
-        K=(50, 51, 32, 24),
-        photographs={
-            (c, k): (BEGIN + at + LAG[c], w.car_at(at + LAG[c]) @ w.mounted(CAMERAS[c]))
-            for c in CAMERAS
-            for k, at in enumerate(ats)
-        },
+        photographs=w.shots(CAMERAS, LAG, ats, BEGIN),
         sweeps=list(BEGIN + ats),
-        error=w.off_landmarks,
-        count=50,
-        boxes={
-            name: (BEGIN + ats + late[name], np.array([beside(at, place) for at in ats]))
-            for name, place in (("ahead", w.AHEAD), ("right", w.RIGHT))
-        },
+        boxes=w.tracks(ats, late, beside, BEGIN),
         tables=[FRONT / f"{name}.json" for name in ("poses", "timestamps")]
         + [Path("lidar/poses.json"), Path("lidar/timestamps.json")],
         optional=[CUBOIDS / "01.pkl.gz"],

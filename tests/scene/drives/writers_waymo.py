@@ -199,22 +199,17 @@ def write(root: Path, frames=3, segment=SEGMENT) -> w.Made:
     write_lidar(root, frames, segment)
     opencv = w.matrix(Rotation.from_matrix(w.FORWARD), [0, 0, 0])
     middles = {(c, k): 0.1 * k + 0.05 - 0.002 * c for c in NAMES for k in range(frames)}
-    begins = TURN * np.arange(frames)
+    begins, late = TURN * np.arange(frames), {"ahead": 0.5 * TURN, "right": 0.75 * TURN}
     components = ("camera_image", "camera_calibration", "lidar_calibration")
     return w.Made(
         root=root,
-        K=(50, 51, 32, 24),
         photographs={
             (NAMES[c], k): (t, w.car_at(t) @ mount(c) @ opencv) for (c, k), t in middles.items()
         },
         sweeps=list(begins + TURN / 2),
         error=off_walls,
         count=WIDE * len(BEAMS) - 5 + NARROW * 6,
-        boxes={
-            name: (begins + share * TURN, np.array([car @ box(place) for car in cars]))
-            for name, place, share in (("ahead", w.AHEAD, 0.5), ("right", w.RIGHT, 0.75))
-        },
+        boxes=w.tracks(begins, late, lambda t, p: w.car_at(t + MIDDLE) @ box(p)),
         tables=[file(component, segment) for component in components],
         optional=[file(c, segment) for c in ("vehicle_pose", "lidar_box", "lidar", "lidar_pose")],
-        scans=[],
     )

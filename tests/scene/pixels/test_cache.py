@@ -99,12 +99,14 @@ def test_what_is_held_stays_below_the_bound(tmp_path):
     assert store.decodings == 64
 
 
-def test_a_set_that_fits_writes_nothing_and_clears_what_an_earlier_start_wrote(tmp_path, kinds):
-    folder = tmp_path / "pixels"
+def test_a_set_that_fits_clears_what_an_earlier_start_wrote(tmp_path, kinds, started):
     stored(in_files(tmp_path, kinds), len(kinds), 1)
-    assert any(folder.rglob("*.px"))
-    stored(in_files(tmp_path, kinds, DataConfig()), len(kinds), 1)
-    assert not folder.exists()
+    assert any((tmp_path / "pixels").rglob("*.px"))
+    store = in_files(tmp_path, kinds, DataConfig())
+    store.expect(SHRINKS)
+    stored(store, len(kinds), 1)
+    assert not started
+    assert not (tmp_path / "pixels").exists()
 
 
 def _photograph(view, folder):
@@ -237,11 +239,3 @@ def test_processes_end_with_the_store(tmp_path, views, started, end):
         store.close()
     del store
     assert all(p.poll() is not None for p in started)
-
-
-def test_a_set_that_memory_holds_starts_none(tmp_path, views, started):
-    store = in_files(tmp_path, views, DataConfig())
-    store.expect(SHRINKS)
-    assert not started
-    same(store, views)
-    store.close()

@@ -92,17 +92,6 @@ def test_undistortion_puts_pixels_where_the_pinhole_expects_them(tmp_path, k1):
         assert 0.5 < inside.mean() < 1.0  # corners lie outside the photograph
 
 
-def test_folded_lens_is_masked(tmp_path):
-    image = np.full((200, 200), 128, np.uint8)
-    view = make_view(tmp_path / "a.png", image, distortion=Distortion((-0.3, 0, 0, 0)))
-    _, mask = store_of(view).get(0)
-    y, x = np.mgrid[:200, :200] + 0.5
-    radius = np.hypot(x - 100, y - 100) / 60
-    fold = 1 / np.sqrt(0.9)
-    assert mask[radius > fold + 0.05].max() == 0.0
-    assert mask[radius < fold - 0.05].min() == 1.0
-
-
 def test_undistortion_agrees_with_colmap(shared_data):
     """COLMAP's own undistorted sceaux has the same K, moved by whole pixels: compare rasters."""
     names = ("sceaux_castle", "sceaux_castle/undistorted")

@@ -358,20 +358,6 @@ def test_a_model_of_exr_photographs(tmp_path: Path) -> None:
     assert again.views[0].image_path == scene.views[0].image_path
 
 
-def test_a_model_of_heic_photographs(tmp_path: Path) -> None:
-    root = tmp_path / "scene"
-    renamed(root, ".HEIC")
-    for k in range(2):
-        pixels = np.full((30, 40, 3), 90 + k, np.uint8)
-        save_heic(root / "images" / f"im {k}.HEIC", pixels, exif=settings().tobytes())
-    scene = load_scene(root, CFG, tmp_path / "work")
-    assert scene.known_response is None
-    assert scene.views[0].exif_ev is not None
-    pixels, _ = ImageStore(scene.views, CFG).stored(1)
-    assert pixels.dtype == np.uint8
-    assert np.abs(pixels.astype(int) - 91).max() <= 2
-
-
 def test_names_paths_and_masks_are_the_users_own(tmp_path: Path) -> None:
     """Structure from motion of photographs alone sees the converted files."""
     root = tmp_path / "scene"
@@ -397,12 +383,3 @@ def test_names_paths_and_masks_are_the_users_own(tmp_path: Path) -> None:
     raw = survey(folder, dataclasses.replace(CFG, images=".")).cameras[0]
     assert raw.size == (96, 64)
     assert raw.ev is not None
-
-
-def test_a_mixed_grey_and_colour_scene(tmp_path: Path) -> None:
-    write_tiny_model(tmp_path)
-    cv2.imwrite(str(tmp_path / "images" / "im 1.png"), np.full((30, 40, 3), (10, 20, 30), np.uint8))
-    store = ImageStore(load_scene(tmp_path, CFG, tmp_path / "work").views, CFG)
-    assert (store.stored(0)[0] == 100).all()
-    assert (store.stored(1)[0] == (30, 20, 10)).all()
-    assert not (tmp_path / "work").exists()
