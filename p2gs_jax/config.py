@@ -452,8 +452,8 @@ class TrainConfig:
     """Views of an update. With B of them all learning rates take the root of B (as Grendel-GS); on
     several devices, B is shared out among them (docs/scaling.md)."""
     budget_s: float | None = None
-    """Wall-clock seconds for the whole run; the number of steps then follows from the measured
-    step time."""
+    """Wall-clock limit for the whole run, seconds (as an option also 20m or 1h30m); the number of
+    steps then follows from the measured step time."""
     seed: int = 0
     """Seeds every random choice."""
     coarse_to_fine: tuple[float, ...] = (0.25, 0.5)

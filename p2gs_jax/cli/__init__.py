@@ -52,7 +52,8 @@ def main(argv: list[str] | None = None) -> None:
         code = _missing(error, argv)
     except (OSError, MemoryError, RuntimeError) as error:
         if ran_out(error):
-            code = _out_of_memory(error)
+            fix = "end other programs, or ask for less: smaller pictures, fewer Gaussians"
+            code = _complain(UserError(f"memory ran out ({error}).", fix=fix))
         elif isinstance(error, OSError):
             code = _from_the_system(error)
         else:
@@ -86,11 +87,6 @@ def _missing(error: ImportError, argv: list[str]) -> int:
         return Doctor(json="--json" in argv).execute()
     fix = "`p2gs-jax doctor` says what is missing for what"
     return _complain(UserError(f"a library cannot be imported: {error}.", fix=fix))
-
-
-def _out_of_memory(error: Exception) -> int:
-    fix = "end other programs, or ask for less: smaller pictures, fewer Gaussians"
-    return _complain(UserError(f"memory ran out ({error}).", fix=fix))
 
 
 def _from_the_system(error: OSError) -> int:

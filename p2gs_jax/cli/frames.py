@@ -52,11 +52,8 @@ def frames_of(
 ) -> Job:
     """Return what to render.
 
-    Args:
-        options: checked.
-        renderer: of the run.
-        given: cameras from a file, in place of the scene's.
-        say: tells the user something while frames are rendered.
+    Cameras that are `given` by a file come in place of the scene's; `say` tells the user something
+    while frames are rendered.
 
     Raises:
         UserError: the scene has no such views.

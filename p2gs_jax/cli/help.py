@@ -53,8 +53,7 @@ DURATION = PrimitiveConstructorSpec(
 def registry(brief: bool) -> ConstructorRegistry:
     """Return the rules by which tyro reads our option classes.
 
-    Args:
-        brief: of the configuration, show nothing but the fields that have short names.
+    In `brief` help, nothing of the configuration is shown but the fields that have short names.
     """
     rules = ConstructorRegistry()
     short: dict[str, str] = {}  # names by field, of the command that is being read
@@ -83,33 +82,30 @@ def registry(brief: bool) -> ConstructorRegistry:
 def _number_rule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
     """Return the parser of a number, a few words, or None, with plain error messages."""
     kinds = set(get_args(info.type)) if _is_union(info.type) else {info.type}
-    optional = NoneType in kinds
-    known = {word for k in kinds if get_origin(k) is Literal for word in get_args(k)}
-    kinds = {k for k in kinds if get_origin(k) is not Literal} - {NoneType}
-    if kinds not in ({int}, {float}) or not all(isinstance(word, str) for word in known):
+    words = [word for k in kinds if get_origin(k) is Literal for word in get_args(k)]
+    numbers = {k for k in kinds if get_origin(k) is not Literal} - {NoneType}
+    if numbers not in ({int}, {float}) or not all(isinstance(word, str) for word in words):
         return None
-    (kind,) = kinds
+    (kind,) = numbers
+    known: dict[str, Any] = {word: word for word in sorted(words)}
+    values = known | ({"None": None} if NoneType in kinds else {})
 
-    def read(words: list[str]) -> int | float | str | None:
-        if optional and words[0] == "None":
-            return None
-        if words[0] in known:
-            return words[0]
+    def read(given: list[str]) -> Any:
+        if given[0] in values:
+            return values[given[0]]
         try:
-            return kind(words[0])
+            return kind(given[0])
         except ValueError:
             what = "whole number" if kind is int else "number"
-            other = f", and not {' or '.join(sorted(known))}" if known else ""
-            raise ValueError(f"{words[0]!r} is not a {what}{other}") from None
+            other = f", and not {' or '.join(known)}" if known else ""
+            raise ValueError(f"{given[0]!r} is not a {what}{other}") from None
 
     def fits(value: Any) -> bool:
-        if isinstance(value, str):
-            return value in known
-        return value is None if not isinstance(value, kind) else not isinstance(value, bool)
+        return value in values.values() or type(value) is kind
 
     return PrimitiveConstructorSpec(
         nargs=1,
-        metavar="|".join([*sorted(known), PLACEHOLDERS[kind]]),
+        metavar="|".join([*known, PLACEHOLDERS[kind]]),
         instance_from_str=read,
         is_instance=fits,
         str_from_instance=lambda value: [str(value)],
@@ -139,14 +135,9 @@ def _fields(kind: type, default: Any, short: Mapping[str, str]) -> Iterator[Stru
 def _field(
     kind: type, name: str, parent: Any, short: str | None, *, brief: bool = True
 ) -> StructFieldSpec:
-    """Return the rule of one option.
+    """Return the rule of the option of a field, whose class has the default `parent`.
 
-    Args:
-        kind: the class of options.
-        name: of its field.
-        parent: the default of the class.
-        short: the field's short name, if it has one.
-        brief: the short name is the only one.
+    In `brief` help a short name is the only one.
     """
     hint, default = _hints(kind)[name], _default(kind, name, parent)
     extras = (*_settings(kind, name, hint, default, brief and short is not None), *_extras(hint))
@@ -259,12 +250,7 @@ def _field_docs(kind: type) -> dict[str, str]:
 
 
 def overview(commands: Mapping[str, type], groups: Mapping[str, tuple[str, ...]]) -> str:
-    """Return what `p2gs-jax --help` prints.
-
-    Args:
-        commands: option classes by name.
-        groups: names of all commands under their headings.
-    """
+    """Return what `p2gs-jax --help` prints of commands, whose names stand under headings."""
     indent = 2 + 2 + max(map(len, commands))
     about = (
         "One linear HDR radiance field, and an exposure and a gamma for every view, from ordinary "
@@ -292,12 +278,9 @@ def first_paragraph(kind: type) -> str:
 
 
 def with_prose(text: str, kind: type, name: str) -> str:
-    """Return tyro's help with the docstring's prose above the options and its examples below.
+    """Return tyro's help, described by `ABOUT`, with a docstring's prose above and examples below.
 
-    Args:
-        text: tyro's help, with `ABOUT` as the description.
-        kind: the option class.
-        name: of the command, if options were left out: how to list them is added.
+    The name is that of a command whose options were left out: how to list them is added.
     """
     found = _paragraphs(kind)
     examples = [p for p in found if p.startswith(EXAMPLE)]

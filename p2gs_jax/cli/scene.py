@@ -61,7 +61,9 @@ class Survey:
         console = stdout()
         console.print(_head(found), soft_wrap=True)
         console.print(_cameras(found))
-        for line in (*_measurements(found), *_remarks(found)):
+        lacks = [f"It has no {', no '.join(found.lacks)}."] if found.lacks else []
+        notes = () if found.scene is None else found.scene.notes
+        for line in (*_measurements(found), *lacks, *notes):
             console.print(line, soft_wrap=True)
         if out is not None:
             console.print(f"From above: {out}", soft_wrap=True)
@@ -135,8 +137,3 @@ def _measurements(found: surveys.Survey) -> list[str]:
             + (f", and {rest} more." if rest else ".")
         )
     return lines
-
-
-def _remarks(found: surveys.Survey) -> list[str]:
-    lines = [f"It has no {', no '.join(found.lacks)}."] if found.lacks else []
-    return lines if found.scene is None else [*lines, *found.scene.notes]

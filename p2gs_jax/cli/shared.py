@@ -77,12 +77,7 @@ def check(condition: bool, text: str, *, fix: str | None = None) -> None:
 
 
 def check_option_names(command: str, argv: Sequence[str], options: Collection[str]) -> None:
-    """Reject options of other programs, and name ours.
-
-    Args:
-        command: name of the command.
-        argv: its arguments.
-        options: names of the command's own options, such as `--max-width`.
+    """Reject options of other programs that are not in `options`, the command's own; name ours.
 
     Raises:
         UserError: there is an option of another program.

@@ -44,7 +44,7 @@ def stdout() -> Console:
 
 def make_table(
     columns: Sequence[str],
-    rows: Iterable[Sequence[str | Text]],
+    rows: Iterable[Sequence[str]],
     title: str | None = None,
     *,
     plain: bool = False,
@@ -54,7 +54,7 @@ def make_table(
     for name in columns:
         out.add_column(Text(name), justify="left" if name in WORDS else "right")
     for row in rows:
-        out.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))
+        out.add_row(*map(Text, row))
     return out
 
 
@@ -217,15 +217,7 @@ def _balance_column(s: PhotometricSolution) -> dict[str, list[str]]:
 def print_against(
     against: dict[str, Any], run: Path, metrics: dict[str, Any], remarks: Iterable[str], path: Path
 ) -> None:
-    """Print the scores of other programs beside those of a run.
-
-    Args:
-        against: what `against.json` holds.
-        run: the run folder.
-        metrics: of the run, as `metrics.json`.
-        remarks: on the renders that were found.
-        path: of `against.json`.
-    """
+    """Print the scores of other programs, as against.json (`path`) has them, beside a run's."""
     protocols = {
         "averaged": "mean parameters",
         "as_rendered": "as rendered",

@@ -8,7 +8,7 @@ where that is more than an exposure; `metered` takes the exposure that the rule 
 that explains the training exposures, where there is one (photometry/metering.py); against
 reference photographs of one common exposure, `scale_aligned` solves one scalar for all of them.
 Vignetting and responses are the camera's in all. Where photographs have alpha, they and the renders
-are put over the same background (photometry/matte.py).
+are put over the same background (photometry/formation.py).
 """
 
 from __future__ import annotations

@@ -163,7 +163,7 @@ def radiance_of(
     """Return the radiance that a photograph shows: what was done to light undone, on the host.
 
     Loose pixels of an image need their `positions` where vignetting counts
-    (photometry/cameras.py:places).
+    (photometry/formation.py:places).
     """
     ldr = np.asarray(ldr, np.float32)
     return inverse_formation(ldr, transform.capture, transform.formation, positions)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -49,7 +48,7 @@ from p2gs_jax.render.project import at_time
 from p2gs_jax.run.photometry_files import write_appearance
 from p2gs_jax.run.read import Run
 from p2gs_jax.scene.convert.headers import read_exif_settings
-from p2gs_jax.scene.pixels.store import ImageStore, camera_of
+from p2gs_jax.scene.pixels.store import camera_of
 from p2gs_jax.types import Gaussians
 
 # What each format writes into the folder.
@@ -71,26 +70,15 @@ STEPS = 240
 MEASURED = 60
 
 
-@dataclass(frozen=True)
-class _Writer:
-    """Writer and reader of a format with display colours.
-
-    Attributes:
-        write: the file, of these Gaussians.
-        read: what a program reads; None: the numbers are those that were written.
-        degree: of the harmonics that the format holds.
-    """
-
-    write: Callable[[Path, Gaussians], int]
-    read: Callable[[Path], Gaussians] | None = None
-    degree: int = MAX_DEGREE
-
-
-WRITERS = {
-    "splat": _Writer(write_splat, read_splat, 0),
-    "spz": _Writer(write_spz, read_spz),
-    "compressed-ply": _Writer(write_compressed_ply, read_compressed_ply),
-    "gltf": _Writer(write_gltf),
+# Of formats with display colours: writer; reader, where what programs read differs from what was
+# written; and degree of the harmonics that the format holds.
+WRITERS: dict[str, tuple[Callable, Callable | None, int]] = {
+    "splat": (write_splat, read_splat, 0),
+    "spz": (write_spz, read_spz, MAX_DEGREE),
+    "compressed-ply": (write_compressed_ply, read_compressed_ply, MAX_DEGREE),
+    "gltf": (write_gltf, None, MAX_DEGREE),
+    "display-ply": (write_ply, None, MAX_DEGREE),
+    "usd": (write_usd, None, MAX_DEGREE),
 }
 
 
@@ -124,7 +112,7 @@ def convert(
         bake_steps: of their refinement; None: enough.
         page_mb: largest size of the page, millions of bytes.
         page_photographs: how many photographs the page embeds.
-        overwrite: replace what is there.
+        overwrite: replace what exists.
         reporter: receives progress.
 
     Raises:
@@ -240,16 +228,8 @@ class DisplayFiles:
         steps: int | None,
         reporter: Reporter,
     ):
-        """Render the true pictures that colours are refined against.
-
-        Args:
-            fitted: the run.
-            transform: from radiance to display values.
-            steps: of refinement; None: enough.
-            reporter: receives progress.
-        """
+        """Render the true pictures that `steps` (None: enough) of refinement aim at."""
         self.fitted, self.transform, self.reporter = fitted, transform, reporter
-        self.store = fitted.store
         self.errors: dict[int, dict] = {}
         self.gaussians, scene = at_time(fitted.as_of(), None), fitted.scene
         self.steps = max(STEPS, len(scene.train_indices)) if steps is None else steps
@@ -262,55 +242,37 @@ class DisplayFiles:
             self.targets[index] = true_target(
                 scene.views[index].name,
                 self.gaussians,
-                camera_of(self.store, index),
+                camera_of(fitted.store, index),
                 transform,
                 render,
             )
             reporter.stage("Rendering true pictures", done + 1, len(rows))
 
     def write(self, name: str, path: Path, sidecar: Path) -> str:
-        """Write one format and its JSON; return sentences about it.
-
-        Args:
-            name: of the format.
-            path: the file.
-            sidecar: what says how it was made and how far it is from the truth.
-        """
+        """Write a format, and the JSON that says how far it is from the truth; return sentences."""
         begin = time.monotonic()
+        write, read, degree = WRITERS[name]
+        shown, more = self._bake(degree), ()
+        error = self._error_of_baked(degree) if read is None else {}
         if name == "display-ply":
-            shown = self._bake(MAX_DEGREE)
-            error = self._error_of_baked(MAX_DEGREE)
-            comments = [
-                *display_comments(self.transform),
-                *(f"p2gs-jax: {t}" for t in _sentences(error)),
-            ]
-            write_ply(path, shown, comments)
+            notes = [f"p2gs-jax: {sentence}" for sentence in _sentences(error)]
+            more = ([*display_comments(self.transform), *notes],)
         elif name == "usd":
-            shown = self._bake(MAX_DEGREE)
-            write_usd(path, shown, named_cameras(self.fitted, self.store))
-            error = self._error_of_baked(MAX_DEGREE)
-        else:
-            writer = WRITERS[name]
-            shown = self._bake(writer.degree)
-            writer.write(path, shown)
-            if writer.read is None:
-                error = self._error_of_baked(writer.degree)
-            else:
-                error = self._error(writer.read(path))
+            more = (named_cameras(self.fitted),)
+        write(path, shown, *more)
+        if read is not None:
+            error = self._error(read(path))
+        mean, balance = self.fitted.mean.exposure_geometric, self.transform.white_balance
         write_json(
             sidecar,
             {
                 "file": path.name,
                 "gaussians": self.gaussians.capacity,
                 "exposure": self.transform.exposure,
-                "exposure_ev_from_mean": float(
-                    np.log2(self.transform.exposure / self.fitted.mean.exposure_geometric)
-                ),
+                "exposure_ev_from_mean": float(np.log2(self.transform.exposure / mean)),
                 "gamma": self.transform.gamma,
                 "curve": self.transform.formation.curve,
-                "white_balance": None
-                if self.transform.white_balance is None
-                else np.exp(self.transform.white_balance).tolist(),
+                "white_balance": None if balance is None else np.exp(balance).tolist(),
                 "bake_steps": self.steps,
                 "seconds": time.monotonic() - begin,
                 "baking_error": error,
@@ -353,13 +315,10 @@ class DisplayFiles:
         }
 
 
-def named_cameras(fitted: Run, store: ImageStore) -> list[NamedCamera]:
+def named_cameras(fitted: Run) -> list[NamedCamera]:
     """Return the cameras of all photographs at the size of the fit."""
-    found = (store.camera(index) for index in range(len(fitted.scene.views)))
-    return [
-        NamedCamera(view.name, viewmat, K, width, height)
-        for view, (viewmat, K, width, height) in zip(fitted.scene.views, found, strict=True)
-    ]
+    views = enumerate(fitted.scene.views)
+    return [NamedCamera(view.name, *fitted.store.camera(index)) for index, view in views]
 
 
 def _spread(rows: Sequence[int]) -> list[int]:

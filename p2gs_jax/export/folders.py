@@ -43,15 +43,9 @@ def write_colmap_folder(
 ) -> None:
     """Write `sparse/0`, `images`, `exposures.csv`, and `masks` where a view has any.
 
-    Args:
-        folder: replaced once the new one is whole.
-        scene: views, points and tracks.
-        store: photographs and cameras at the size of the fit.
-        photometry: exposures of the views.
-        on_view: receives photographs written, views in all.
-
-    Raises:
-        UserError: a photograph cannot be read, or not be written under its name.
+    The folder is replaced once the new one is whole. The store has cameras at the size of the fit;
+    `on_view` receives how many photographs are written, and of how many. A UserError says that a
+    photograph cannot be read, or not be written under its name.
     """
     with atomic_folder(folder) as temporary:
         _write_model(temporary / "sparse" / "0", scene, store)

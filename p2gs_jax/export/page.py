@@ -102,10 +102,7 @@ def write_page(
 def page_text(title: str, known: Mapping[str, Any], data: bytes) -> str:
     """Return the page.
 
-    Args:
-        title: of the window; text.
-        known: what it reads besides the Gaussians, plain values or arrays.
-        data: the Gaussians, packed (formats/packed.py).
+    `known` is what it reads besides the packed Gaussians (formats/packed.py).
     """
     script = '(() => {\n"use strict";\n' + "\n".join(map(_source, SCRIPTS)) + "})();\n"
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()

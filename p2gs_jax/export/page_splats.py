@@ -19,7 +19,7 @@ from p2gs_jax.formats.packed import Packed, pack, unpack
 from p2gs_jax.gaussians.posed import chosen
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render import render_linear
-from p2gs_jax.render.capacity import RenderView, TileCapacity, count_needed, until_it_fits
+from p2gs_jax.render.capacity import PICTURES, RenderView, bucket, count_needed, until_it_fits
 from p2gs_jax.render.harmonics import C0, coefficient_count, degree_of
 from p2gs_jax.render.tiles import smallest_cutoff
 from p2gs_jax.render.xla_cpu import compiler_options
@@ -50,14 +50,8 @@ class TruePicture:
 class PageError:
     """Differences from the run's pictures of some views, each at its own exposure.
 
-    Attributes:
-        views: how many were compared.
-        psnr_median: of developed pictures, dB.
-        psnr_worst: of the worst view, dB.
-        worst_view: its name.
-        stops_median: of |log2| of the ratio of luminances, over pixels that are not black.
-        stops_p99: 99th percentile of it.
-        stops_max: largest.
+    PSNR (dB) is of developed pictures; stops are |log2| of the ratio of luminances, over pixels
+    that are not black: median, 99th percentile, largest.
     """
 
     views: int
@@ -71,14 +65,14 @@ class PageError:
 
 @dataclass(frozen=True)
 class PageSplats:
-    """The Gaussians of a page.
+    """The Gaussians of a page, with their error against the run.
 
     Attributes:
-        packed: as it holds them.
+        packed: as the page holds them.
         error: against the run.
-        of: how many the run has.
+        of: how many Gaussians the run has.
         degree: of the run's harmonics.
-        unseen: of the run's, never drawn by any renderer with our rules; nothing is lost with them.
+        unseen: Gaussians that no renderer with our rules ever draws; nothing is lost with them.
     """
 
     packed: Packed
@@ -173,7 +167,7 @@ def weights(
     alive = on_device(np.ones(gaussians.capacity), bool)
     sh = on_device(np.zeros((gaussians.capacity, 1, 3)))
     needed = max(int(count_needed(gaussians, alive, camera, cfg=plain)) for camera in cameras)
-    capacity, total = TileCapacity.allocate(needed), np.zeros(gaussians.capacity)
+    capacity, total = bucket(needed, PICTURES.first), np.zeros(gaussians.capacity)
 
     @functools.partial(jax.jit, static_argnames="capacity", compiler_options=compiler_options())
     def gradient(g: Gaussians, camera: Camera, *, capacity: int) -> tuple[Array, Array, Array]:

@@ -37,15 +37,9 @@ def write_exr(
 ) -> None:
     """Write linear radiance, without exposure applied; docs/exports.md lists the header.
 
-    Args:
-        path: the file.
-        linear: radiance.
-        half: 16-bit floats, unless a value would overflow; then 32-bit.
-        depth: alpha-weighted depth, written as expected depth in channel Z.
-        alpha: opacity, channel A.
-        taken: the display transform of the header.
-        camera: of the header.
-        shot: EXIF settings of the header.
+    16-bit floats are used (`half`) unless a value would overflow. Depth is alpha-weighted, and
+    written as expected depth in channel Z; `alpha` is channel A. `taken`, `camera` and `shot` are
+    the display transform, the camera and the EXIF settings of the header.
     """
     linear = np.asarray(linear, np.float32)
     small = half and bool(np.all(np.abs(linear) <= HALF_MAX))
@@ -62,7 +56,9 @@ def write_exr(
     if camera is not None:
         header |= camera_attributes(camera)
     if shot is not None:
-        header |= _shot_attributes(shot)
+        numbers = {"expTime": shot.time, "aperture": shot.aperture, "isoSpeed": shot.iso}
+        exif = numbers | {"capDate": shot.taken}
+        header |= {name: value for name, value in exif.items() if value is not None}
     channels = {c: np.ascontiguousarray(linear[..., i].astype(pixel)) for i, c in enumerate("RGB")}
     if alpha is not None:
         channels["A"] = np.ascontiguousarray(np.asarray(alpha).astype(pixel))
@@ -112,11 +108,6 @@ def _display_attributes(taken: DisplayTransform) -> dict:
     for name, row in zip(("Red", "Green", "Blue"), rows, strict=False):
         out[f"p2gsVignetting{name}"] = tuple(row)
     return out
-
-
-def _shot_attributes(shot: ExifSettings) -> dict:
-    named = {"expTime": shot.time, "aperture": shot.aperture, "isoSpeed": shot.iso}
-    return {k: v for k, v in (named | {"capDate": shot.taken}).items() if v is not None}
 
 
 def read_exr(path: Path) -> tuple[Float32[np.ndarray, "h w 3"], dict]:

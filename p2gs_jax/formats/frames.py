@@ -34,9 +34,9 @@ class OutputFrame:
         alpha: opacity.
         ldr: display values in [0, 1].
         transform: from `linear` to `ldr`.
-        depth: alpha-weighted, or None.
-        camera: the pinhole, or None for other images.
-        photograph: taken from there, display values, or None.
+        depth: alpha-weighted.
+        camera: of a pinhole image.
+        photograph: display values of what was photographed there.
     """
 
     name: str

@@ -36,15 +36,8 @@ class Cylinder:
     """A camera with a cylindrical image: azimuth across, height on the unit cylinder down.
 
     Column u, row v of the image look along (sin a, h, cos a) in the camera, with a = left + u /
-    focal and h = top + v / focal; pixel centres are at +0.5.
-
-    Attributes:
-        viewmat: world-to-camera; x right, y down along the axis, z towards azimuth 0.
-        focal: pixels per radian, and per unit of height.
-        left: azimuth of the left edge, radians, positive to the right.
-        top: height of the upper edge, positive down.
-        width: pixels.
-        height: pixels.
+    focal (radians) and h = top + v / focal; pixel centres are at +0.5. `viewmat` is
+    world-to-camera; x right, y down along the axis, z towards azimuth 0.
     """
 
     viewmat: Pose
@@ -129,16 +122,10 @@ def stitch(
 ) -> Stitched:
     """Reproject images to a cylinder: every pixel from the one camera that sees it most centrally.
 
-    Nothing is blended, so that differences show. Images have at most 4 channels; a ValueError says
-    that one has another size than its camera.
-
-    Args:
-        images: of the shots.
-        shots: their cameras.
-        cylinder: of the result.
-        nearness: 1 / distance from the cylinder's axis; None reprojects at infinity, which is
-            exact for cameras with a common centre.
-        masks: 1 = use, 0 = ignore.
+    Nothing is blended, so that differences show. Images have at most 4 channels; masks are 1 where
+    an image is used. `nearness` is 1 / distance from the cylinder's axis; None reprojects at
+    infinity, which is exact for cameras with a common centre. A ValueError says that an image has
+    another size than its camera.
     """
     rays = cylinder.rays()
     origin = camera_centers(cylinder.viewmat[None])[0]

@@ -44,14 +44,11 @@ class TimeStep:
 
 @dataclass(frozen=True)
 class Rig:
-    """Cameras with fixed places on a rig, over time.
+    """Cameras with fixed places on a rig, and its steps in the order of their names.
 
     The rig's origin is the mean of the cameras' centres; its axes are x right, y down and z
-    forward, level as its cameras are.
-
-    Attributes:
-        mounts: by camera, its shot as seen from the rig: `viewmat` is rig-to-camera.
-        steps: in order of their names.
+    forward, level as its cameras are. A mount is the shot of a camera as seen from the rig: its
+    `viewmat` is rig-to-camera.
     """
 
     mounts: dict[str, Shot]

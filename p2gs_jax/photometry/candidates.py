@@ -109,7 +109,11 @@ class Comparison:
             if choice not in self._predicted:
                 predicted = _predict(self.problem, fit, response, self._where, scale)
                 self._predicted[choice] = predicted
-        density = {k: _mean(p.densities) for k, p in self._predicted.items()}
+        # Where nothing is known, no solution predicts anything.
+        density = {
+            k: -np.inf if np.isnan(p.densities).all() else float(np.nanmean(p.densities))
+            for k, p in self._predicted.items()
+        }
         best = self._predicted[max(density, key=lambda k: density[k])]
         return [self._candidate(k, density[k], p, best) for k, p in self._predicted.items()]
 
@@ -132,11 +136,6 @@ class Comparison:
             max(of_views, of_regions),
             _largest_difference(best.errors - found.errors, self._views),
         )
-
-
-def _mean(densities: Densities) -> float:
-    """Return the mean of what is known; where nothing is, no solution predicts anything."""
-    return -np.inf if np.isnan(densities).all() else float(np.nanmean(densities))
 
 
 def _predict(

@@ -112,7 +112,14 @@ def spans(axes: Float[Array, "3 3"]) -> tuple[Float[Array, " 3"], Float[Array, "
 
 def enhanced(ldr: Float[Array, "*p 3"], view: Curves) -> Float[Array, "*p 3"]:
     """Return the enhanced display values that a photograph stands for."""
-    return _along_axes(ldr, view.axes, lambda t: _looked_up(t, view.curve))
+
+    def looked_up(t: Float[Array, "*p"]) -> Float[Array, "*p"]:
+        at = jnp.clip(t, 0.0, 1.0) * (view.curve.shape[0] - 1)
+        below = jnp.clip(jnp.floor(at), 0, view.curve.shape[0] - 2).astype(jnp.int32)
+        share = at - below
+        return (1 - share) * view.curve[below] + share * view.curve[below + 1]
+
+    return _along_axes(ldr, view.axes, looked_up)
 
 
 def as_photographed(ldr: Float[Array, "*p 3"], view: Curves) -> Float[Array, "*p 3"]:
@@ -133,14 +140,6 @@ def _along_axes(ldr, axes, change):
     low, high = spans(axes)
     along = (ldr @ axes.T - low) / (high - low)
     return (change(along) * (high - low) + low) @ axes
-
-
-def _looked_up(t: Float[Array, "*p"], curve: Float[Array, " k"]) -> Float[Array, "*p"]:
-    count = curve.shape[0]
-    at = jnp.clip(t, 0.0, 1.0) * (count - 1)
-    below = jnp.clip(jnp.floor(at), 0, count - 2).astype(jnp.int32)
-    share = at - below
-    return (1 - share) * curve[below] + share * curve[below + 1]
 
 
 def pseudo_curve(shape: Float[Array, " 3"]) -> Float[Array, " k"]:

@@ -214,7 +214,11 @@ def fit_metering(
     simple = next(pair for pair in tried if pair[0].slopes == (1.0,))
     if WORTH_A_NUMBER * simple[0].left_out_ev < best.left_out_ev:
         best, errors = simple
-    rule = best if _explains(best, errors, constant, alone) else constant
+    gain = alone - errors
+    clear = gain.mean() > 2 * gain.std(ddof=1) / np.sqrt(len(gain))
+    varies = constant.left_out_ev >= NEGLIGIBLE_EV
+    explains = varies and best.left_out_ev <= EXPLAINS * constant.left_out_ev and clear
+    rule = best if explains else constant
     candidates = sorted([constant, *(r for r, _ in tried)], key=lambda r: r.left_out_ev)
     return Metering(rule, tuple(candidates), white, tuple(names), table)
 
@@ -249,14 +253,6 @@ def _fitted(
         errors.append(np.mean(left[fold] ** 2))
     rms = (float(np.sqrt(np.mean(r**2))) / LN2 for r in (residual, left))
     return Rule(meters, tuple(map(float, taken)), offset, *rms), np.array(errors)
-
-
-def _explains(best: Rule, errors: np.ndarray, constant: Rule, alone: np.ndarray) -> bool:
-    """Return whether a rule predicts clearly better than a constant."""
-    if constant.left_out_ev < NEGLIGIBLE_EV or best.left_out_ev > EXPLAINS * constant.left_out_ev:
-        return False
-    gain = alone - errors
-    return bool(gain.mean() > 2 * gain.std(ddof=1) / np.sqrt(len(gain)))
 
 
 def adapted(log_exposures: Float[np.ndarray, " f"], frames: float) -> Float[np.ndarray, " f"]:

@@ -128,12 +128,13 @@ class Scope(NamedTuple):
     def allows(self, choice: Choice) -> bool:
         """Return whether a choice differs from simpler ones and can be solved."""
         by = choice.curve.splines
-        if self.known and choice.curve != Curve():
-            return False
-        told = by is None or self.curves
-        several = by != "camera" or self.cameras > 1
-        seen = choice.form.vignetting is None or self.places
-        return told and several and seen and possible(choice.form, self.cameras)
+        return (
+            (choice.curve == Curve() or not self.known)
+            and (by is None or self.curves)
+            and (by != "camera" or self.cameras > 1)
+            and (choice.form.vignetting is None or self.places)
+            and possible(choice.form, self.cameras)
+        )
 
 
 def neighbours(choice: Choice, scope: Scope) -> list[Choice]:

@@ -240,15 +240,10 @@ def _flare(
 
 
 def neighbourhood_warnings(
-    observations: Observations,
-    residual_ev: PerChannel,
-    usable: PerChannel | Bool[np.ndarray, "o 3"],
-    names: Sequence[str],
+    observations: Observations, residual_ev: PerChannel, usable: Bool[np.ndarray, "o 3"]
 ) -> list[str]:
-    """Return a sentence for every kind of dependence that is clear in some photographs.
-
-    Arguments are those of `neighbourhood`, and the names of all views: their rows if empty.
-    """
+    """Return a sentence for every kind of dependence that is clear in some photographs."""
+    names = observations.names
     found = neighbourhood(observations, residual_ev, np.asarray(usable, float))
     out = []
     for kind, (chance, least, words) in KINDS.items():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -138,9 +138,6 @@ def _same_scene(first: RunFiles, other: RunFiles) -> bool:
 
 
 def _scores(runs: Sequence[RunFiles], same: bool) -> list[TableRow]:
-    def words(name: str, of: Callable[[RunFiles], str]) -> TableRow:
-        return TableRow(name, tuple(of(run) for run in runs))
-
     def numbers(name: str, values: Sequence[float | None], key: str) -> list[TableRow]:
         """Return a line, or none where no run has the number."""
         known = [v for v in values if v is not None]
@@ -152,25 +149,18 @@ def _scores(runs: Sequence[RunFiles], same: bool) -> list[TableRow]:
             best = frozenset(i for i, cell in enumerate(cells) if cell == goal)
         return [TableRow(name, cells, best)] if known else []
 
+    models = [run.photometry["model"] if run.photometry else "" for run in runs]
+    curves = [run.photometry["curve"].get("name", "") if run.photometry else "" for run in runs]
     rows = [
-        words("preset", lambda run: run.preset),
-        words("model", _model),
-        words("tone curve", _curve),
-        words("training views", lambda run: str(len(run.train) or "")),
+        TableRow("preset", tuple(run.preset for run in runs)),
+        TableRow("model", tuple(DESCRIPTIONS.get(model, model) for model in models)),
+        TableRow("tone curve", tuple(map(str, curves))),
+        TableRow("training views", tuple(str(len(run.train) or "") for run in runs)),
     ]
     for name, path in NUMBERS.items():
         rows += numbers(name, [run.number(*path) for run in runs], path[-1])
     rows[6:6] = numbers("seconds, whole run", [seconds_of(run) for run in runs], "seconds")
     return rows + numbers("exposure error, RMS, stops", [_true_error(run) for run in runs], "ev")
-
-
-def _model(run: RunFiles) -> str:
-    model = "" if run.photometry is None else run.photometry["model"]
-    return DESCRIPTIONS.get(model, model)
-
-
-def _curve(run: RunFiles) -> str:
-    return "" if run.photometry is None else str(run.photometry["curve"].get("name", ""))
 
 
 def _true_error(run: RunFiles) -> float | None:

@@ -60,8 +60,8 @@ class SceneMeasurements:
         true_exposures: by view, where the scene has them.
         seams: pairs in the order of the views.
         tried_pairs: number of pairs that were compared, with or without enough in common.
-        shown: the pair of the picture.
-        picture: of the widest seam, or None.
+        shown: the pair of `picture`, which has the widest seam.
+        picture: of both sides of a seam.
         clipped: share of clipped pixels by view, for a sample of the training views.
         comparisons: rendered training views, where the folder has no held-out ones.
         missing: sentences on what could not be measured.

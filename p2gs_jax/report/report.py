@@ -34,9 +34,9 @@ def write_report(
     """Write one page about a run, which needs no other file and no network; return its path.
 
     Args:
-        folder: the run folder.
-        out: the page; None takes `report.html` in the folder.
-        scene: where the run's scene lies now; None looks where it was.
+        folder: of the run.
+        out: the page; None: `report.html` in the folder.
+        scene: where the run's scene lies now; None: where it was.
         render: load the scene and render for the seams; False uses only what the folder holds.
         reporter: receives progress.
 

@@ -102,13 +102,10 @@ def distance_seen(viewmat: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "
 def pose_of(
     viewmat: Float[np.ndarray, "4 4"], space: ViewerSpace, *, distance: float, fov: float
 ) -> Pose:
-    """Return the browser's camera for a view.
+    """Return the browser's camera for a world-to-camera matrix.
 
-    Args:
-        viewmat: world-to-camera.
-        space: of the scene.
-        distance: from the camera to the centre of its orbit, scene units.
-        fov: vertical field of view, radians.
+    `distance` is that from the camera to the centre of its orbit, scene units; `fov` is vertical,
+    radians.
     """
     rotation = viewmat[:3, :3].T.astype(float)
     position = camera_centers(viewmat[None])[0] * space.unit
@@ -120,13 +117,9 @@ def pose_of(
 def camera_of_browser(
     view: BrowserView | Pose, aspect: float, size: Size, space: ViewerSpace
 ) -> Camera:
-    """Return our camera for the browser's.
+    """Return our camera for the browser's, for a canvas with `aspect` = width / height.
 
-    Args:
-        view: the browser's.
-        aspect: width / height of the canvas.
-        size: pixels to render; not square where its aspect differs from the canvas's.
-        space: of the scene.
+    Pixels are not square where the aspect of `size`, the pixels to render, is another.
     """
     rotation = Rotation.from_quat(np.asarray(view.wxyz, float), scalar_first=True).as_matrix()
     viewmat = np.eye(4)

@@ -52,7 +52,11 @@ HINTS = {
 
 
 class Panel:
-    """The controls of one browser."""
+    """The controls of one browser.
+
+    Public ones: `speed` of playing, photographs per second; `locked`, whether moving to a view
+    leaves the display transform as it is; `own_exposures`, whether every photograph's is played.
+    """
 
     def __init__(self, gui: viser.GuiApi, viewed: ViewedRun, actions: BrowserSession):
         """Add the controls to a client's page; they call the actions."""
@@ -127,7 +131,7 @@ class Panel:
         gui.add_html(note(KEYS))
         self._go_to = self._dropdown("Go to", [NOWHERE, *self._names])
         steps = gui.add_button_group("", ["previous", "next"])
-        self._locked = self._checkbox("Lock exposure", False)
+        self.locked = self._checkbox("Lock exposure", False)
         fov = self._slider("FOV", 5.0, 150.0, 0.5, 60.0)
         cameras = self._checkbox("Cameras", False)
         size = self._slider("Camera size", 0.2, 8.0, 0.1, 1.0, visible=False)
@@ -161,8 +165,8 @@ class Panel:
         self._drive = self._dropdown("Along", names, visible=len(names) > 1)
         marks = ((0.0, "0"), (last, f"{last:g}"))
         self._place = self._slider("Frame", 0.0, last, 0.01, 0.0, marks=marks)
-        self._speed = self._slider("Speed", 0.2, 30.0, 0.1, 2.0)
-        self._own = self._checkbox("Each photo's exposure", False)
+        self.speed = self._slider("Speed", 0.2, 30.0, 0.1, 2.0)
+        self.own_exposures = self._checkbox("Each photo's exposure", False)
         self._play = self._gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY)
         self._playing = False
 
@@ -241,21 +245,6 @@ class Panel:
     def drive(self) -> tuple[str, float]:
         """Name of the camera whose drive is played, and the place on it."""
         return self._drive.value, self._place.value
-
-    @property
-    def speed(self) -> float:
-        """Photographs per second."""
-        return self._speed.value
-
-    @property
-    def locked(self) -> bool:
-        """Whether moving to a view leaves the display transform as it is."""
-        return self._locked.value
-
-    @property
-    def own_exposures(self) -> bool:
-        """Whether to play with the exposure of every photograph."""
-        return self._own.value
 
     def set_playing(self, playing: bool) -> None:
         """Set the button to `Pause` or `Play`."""

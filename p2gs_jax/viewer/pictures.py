@@ -57,14 +57,7 @@ COLORS = 12
 
 @dataclass(frozen=True)
 class RenderedFrame:
-    """A rendered view, from which every mode is made.
-
-    Attributes:
-        linear: radiance.
-        alpha: opacity.
-        depth: alpha-weighted depth, scene units.
-        camera: of the view.
-    """
+    """A rendered view, from which every mode is made; depth is weighted by alpha, scene units."""
 
     linear: Float[Array, "h w 3"]
     alpha: Float[np.ndarray, "h w"]
@@ -101,8 +94,7 @@ def picture_of(
         mode: `stops` counts from middle grey at the exposure of the transform; `split` without
             a photograph is `display`.
         transform: from radiance to display values.
-        depth_limits: nearest and farthest depth of the colour scale, scene units; None takes the
-            frame's own.
+        depth_limits: ends of the colour scale, scene units; None takes the frame's own.
         photograph: for `split`.
         split: share of the photograph's width that is shown, from the left.
         taken_by: the camera whose vignetting the transform has; None: that of the frame.

@@ -147,13 +147,15 @@ def check_address(host: str, port: int) -> None:
         UserError: the port is taken or not allowed, or the host is none of this machine's.
     """
     if not 0 <= port <= 65535:
-        raise UserError(f"--port {port} is no port.", fix="choose one from 1024 to 65535")
+        raise UserError(f"--port {port} is not a valid port.", fix="choose one from 1024 to 65535")
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(
             host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
         )[0]
     except (OSError, UnicodeError) as error:
-        raise UserError(f"--host {host!r} is no address: {error}.", fix="leave it out") from None
+        raise UserError(
+            f"--host {host!r} is not a valid address: {error}.", fix="leave it out"
+        ) from None
     with socket.socket(family, kind, protocol) as probe:
         if os.name == "posix":
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -62,8 +62,6 @@ class BrowserSession:
             camera.look_at = pose.look_at
             camera.wxyz = pose.wxyz
 
-    # ------------------------------------------------------------------ the picture
-
     def display_changed(self) -> None:
         """Show the frame under the new settings."""
         self._live.display_changed()
@@ -104,15 +102,13 @@ class BrowserSession:
         self._panel.put(same)
         self._live.display_changed()
 
-    # ------------------------------------------------------------------ the camera
-
     def go_to(self, index: int) -> None:
         """Move to the camera of a view, and take its display transform unless that is locked."""
         self._player.stop()
         self._panel.set_playing(False)
         pose = self._viewed.pose(index, browser_view(self._client).aspect)
         self._panel.put_view(index, float(np.rad2deg(pose.fov)))
-        if not self._panel.locked:
+        if not self._panel.locked.value:
             self.take_display_of(index)
             self._taken = self._panel.settings()
         self._move(pose)
@@ -153,12 +149,10 @@ class BrowserSession:
         if missing:
             self._client.add_notification("Photographs", f"{missing} could not be read.")
 
-    # ------------------------------------------------------------------ the drive
-
     def set_place(self, camera: str, place: float) -> None:
         """Move to a place on the drive of a camera."""
         pose, nearest = self._viewed.pose_along(camera, place, browser_view(self._client).aspect)
-        if self._panel.own_exposures and self._panel.settings().taken_as != nearest:
+        if self._panel.own_exposures.value and self._panel.settings().taken_as != nearest:
             self.take_display_of(nearest)
         self._move(pose)
 
@@ -169,15 +163,13 @@ class BrowserSession:
             return
         camera, place = self._panel.drive
         last = len(self._viewed.frames(camera)) - 1
-        self._player.play(0.0 if place >= last else place, last, lambda: self._panel.speed)
+        self._player.play(0.0 if place >= last else place, last, lambda: self._panel.speed.value)
 
     def _play_to(self, place: float) -> None:
         if time.monotonic() > self._shown_at + SLIDER_S:
             self._shown_at = time.monotonic()
             self._panel.put_place(place)
         self.set_place(self._panel.drive[0], place)
-
-    # ------------------------------------------------------------------ files
 
     def save(self, kind: str, width: int) -> None:
         """Send the view as a file, rendered at a width of its own."""

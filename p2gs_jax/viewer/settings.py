@@ -19,7 +19,6 @@ class Settings:
     """The display transform and the mode.
 
     Attributes:
-        gamma: > 0.
         exposure_ev: stops from the geometric mean of the training exposures, or from the metered
             exposure.
         curve: `run` is what the fit chose.
@@ -27,7 +26,6 @@ class Settings:
             and response apply, or None for the mean and no camera.
         balance_ev: gains of red and of blue over green, stops; None where the run models none.
         vignetting: whether that camera's vignetting is shown.
-        mode: what is shown.
         split: share of the photograph in `split`.
         splats: whether the browser draws splats itself, instead of the renderer's pictures.
         metered: whether the exposure follows what is seen; not of the browser's splats.

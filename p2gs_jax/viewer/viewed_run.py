@@ -45,13 +45,8 @@ SAME_PLACE = 1e-3
 class ViewedRun:
     """A run with its photographs, its scale in the viewer and its compiled renderer.
 
-    Attributes:
-        run: the run.
-        max_width: widest picture to render, pixels.
-        store: its photographs.
-        space: scale and orientation of the scene in the viewer.
-        renderer: for the sizes that windows need.
-        listeners: called when a program was compiled, or is about to be.
+    No picture is rendered wider than `max_width` pixels. `listeners` are called when a program was
+    compiled, or is about to be.
     """
 
     def __init__(self, run: Run, max_width: int):
@@ -67,7 +62,9 @@ class ViewedRun:
         self._points = points if len(points) else np.asarray(self._gaussians.means)
         self._centers = camera_centers(viewmats_of(run.scene.views))
         self.space = make_viewer_space(run.scene, self._points)
-        self.distance = cache(self._distance)
+        # Typical distance to what a view sees, scene units.
+        views = run.scene.views
+        self.distance = cache(lambda index: distance_seen(views[index].viewmat, self._points))
         probes = evenly_spaced(len(run.scene.views), PROBES)
         self.renderer = Renderer(
             self._gaussians,
@@ -123,20 +120,13 @@ class ViewedRun:
     def pose_along(self, camera: str, place: float, aspect: float) -> tuple[Pose, int]:
         """Return the browser's camera on a drive, and the row of the view nearest to it.
 
-        Args:
-            camera: physical camera whose recorded poses are followed.
-            place: in its frames.
-            aspect: width / height of the canvas.
+        The place counts the frames of the physical camera whose recorded poses are followed.
         """
         frames, views = self.frames(camera), self.run.scene.views
         nearest = frames[int(np.clip(round(place), 0, len(frames) - 1))]
         viewmat = viewmat_between(viewmats_of([views[i] for i in frames]), place)
         fov, distance = fov_that_holds(views[nearest], aspect), self.distance(nearest)
         return pose_of(viewmat, self.space, distance=distance, fov=fov), nearest
-
-    def _distance(self, index: int) -> float:
-        """Return the typical distance to what a view sees, scene units."""
-        return distance_seen(self.run.scene.views[index].viewmat, self._points)
 
     def frames(self, camera: str) -> tuple[int, ...]:
         """Return the rows of a physical camera's views."""

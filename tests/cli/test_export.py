@@ -80,22 +80,6 @@ def test_the_display_ply_reads_as_any_3dgs_file(exported):
     np.testing.assert_allclose(determinants, expected, rtol=1e-3)
 
 
-def test_viser_opens_the_display_ply(exported):
-    viser = pytest.importorskip("viser", reason="the extra `viewer` is not installed")
-    shown = as_viewers_do(exported[1] / "display.ply")
-    server = viser.ViserServer(port=0, verbose=False)
-    try:
-        handle = server.scene.add_gaussian_splats("/splats", **shown)
-        # Eight words a Gaussian: centre, one unused, six halves of covariance, RGBA bytes.
-        buffer = handle._impl.props.buffer
-        np.testing.assert_array_equal(buffer[:, :3].copy().view(np.float32), shown["centers"])
-        rgba = buffer[:, 7:].copy().view(np.uint8)
-        expected = np.clip(np.concatenate([shown["rgbs"], shown["opacities"]], 1), 0, 1)
-        assert np.abs(rgba / 255 - expected).max() < 1.01 / 255
-    finally:
-        server.stop()
-
-
 def test_the_baking_error_is_written_and_true(exported):
     fitted, out = exported
     said = json.loads((out / "display.ply.json").read_text())

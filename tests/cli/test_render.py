@@ -32,6 +32,18 @@ def render(run_command):
     return functools.partial(run_command, "render")
 
 
+@pytest.fixture
+def rendered(render):
+    """Return the same for what must succeed: what it printed, its words on one line."""
+
+    def run(*argv):
+        code, text = render(*argv)
+        assert code == 0, text
+        return " ".join(text.split())
+
+    return run
+
+
 def picture(path):
     image = cv2.imread(str(path))
     assert image is not None, path
@@ -75,19 +87,10 @@ def rig_run(finished_run, tmp_path_factory) -> Path:
         # A turn by yaw to the right is one of the world to the left about y (down).
         q, t = (np.cos(half), 0, -np.sin(half), 0), viewmat[:3, 3]
         lines += [" ".join(map(str, (number, *q, *t, 1, name))), "1.0 1.0 1"]
-        train = step == 1
-        views.append(
-            {
-                "image": name,
-                "camera": camera,
-                "exposure": 2.0**ev if train else None,
-                "exposure_ev": ev if train else None,
-                "gamma": 2.2 if train else None,
-                "exif_ev": None,
-                "split": "train" if train else "test",
-                "exposure_fitted": None if train else 2.0**ev,
-            }
-        )
+        known = {"image": name, "camera": camera, "exif_ev": None, "split": "train"}
+        known |= {"exposure": 2.0**ev, "exposure_ev": ev, "gamma": 2.2, "exposure_fitted": None}
+        unknown = {"exposure": None, "exposure_ev": None, "gamma": None, "exposure_fitted": 2.0**ev}
+        views.append(known if step == 1 else known | unknown | {"split": "test"})
     (model / "images.txt").write_text("\n".join(lines) + "\n")
     cx, cy = SIZE[0] / 2, SIZE[1] / 2
     (model / "cameras.txt").write_text(f"1 PINHOLE {SIZE[0]} {SIZE[1]} 70 70 {cx} {cy}\n")
@@ -103,9 +106,8 @@ def rig_run(finished_run, tmp_path_factory) -> Path:
     return root / "run"
 
 
-def test_views_come_with_their_photographs_and_a_file_of_their_cameras(render, own_run, tmp_path):
-    code, text = render(own_run, "--out", tmp_path / "all", "--split", "test")
-    assert code == 0
+def test_views_come_with_their_photographs_and_a_file_of_their_cameras(rendered, own_run, tmp_path):
+    text = rendered(own_run, "--out", tmp_path / "all", "--split", "test")
     assert "2 frames" in text
     for name in ("0", "3"):
         for kind in ("exr", "render.png", "photograph.png"):
@@ -114,14 +116,13 @@ def test_views_come_with_their_photographs_and_a_file_of_their_cameras(render, o
     assert [c["name"] for c in cameras] == ["0", "3"]
 
 
-def test_a_file_of_cameras_renders_what_the_views_rendered(render, own_run, tmp_path):
+def test_a_file_of_cameras_renders_what_the_views_rendered(render, rendered, own_run, tmp_path):
     render(own_run, "--out", tmp_path / "a", "--exposure-ev", "0", "--gamma", "2.2")
     cameras = tmp_path / "a" / "cameras.json"
     data = json.loads(cameras.read_text())[:2]
     data[1].update(exposure_ev=1.0, name="far/brighter")
     cameras.write_text(json.dumps(data))
-    code, _ = render(own_run, "--path", cameras, "--out", tmp_path / "b", "--gamma", "2.2")
-    assert code == 0
+    rendered(own_run, "--path", cameras, "--out", tmp_path / "b", "--gamma", "2.2")
     first = picture(tmp_path / "a" / "0.render.png")
     np.testing.assert_allclose(picture(tmp_path / "b" / "0.png"), first, atol=1 / 255)
     second = picture(tmp_path / "a" / "1.render.png")
@@ -132,11 +133,10 @@ def test_a_file_of_cameras_renders_what_the_views_rendered(render, own_run, tmp_
     assert ratio == pytest.approx(2, rel=1e-5)
 
 
-def test_one_stop_doubles_the_linear_picture_and_leaves_the_radiance(render, own_run, tmp_path):
+def test_one_stop_doubles_the_linear_picture_and_leaves_the_radiance(rendered, own_run, tmp_path):
     for ev in ("-3", "-2"):
         argv = ("--path", "drive", "--frames", "2", "--curve", "linear", "--gamma", "2.2")
-        code, _ = render(own_run, *argv, "--exposure-ev", ev, "--out", tmp_path / ev)
-        assert code == 0
+        rendered(own_run, *argv, "--exposure-ev", ev, "--out", tmp_path / ev)
     dark, bright = (picture(tmp_path / ev / "00001.png") for ev in ("-3", "-2"))
     assert dark.mean() > 0.01
     assert bright.max() < 1
@@ -145,12 +145,9 @@ def test_one_stop_doubles_the_linear_picture_and_leaves_the_radiance(render, own
     np.testing.assert_array_equal(*linear)
 
 
-def test_a_drive_becomes_a_video(render, own_run, tmp_path):
+def test_a_drive_becomes_a_video(rendered, own_run, tmp_path):
     out = tmp_path / "new" / "drive.mp4"
-    code, _ = render(
-        own_run, "--path", "drive", "--frames", 7, "--out", out, "--fps", 12, "--width", 80
-    )
-    assert code == 0
+    rendered(own_run, "--path", "drive", "--frames", 7, "--out", out, "--fps", 12, "--width", 80)
     assert [p.name for p in out.parent.iterdir()] == ["drive.mp4"]
     frames = video(out)
     assert len(frames) == 7
@@ -158,11 +155,10 @@ def test_a_drive_becomes_a_video(render, own_run, tmp_path):
     assert np.abs(frames[0] - frames[-1]).mean() > 0.01
 
 
-def test_a_drive_can_be_exposed_as_photographed(render, own_run, tmp_path):
+def test_a_drive_can_be_exposed_as_photographed(rendered, own_run, tmp_path):
     fitted = load_run(own_run)
     argv = ("--path", "drive", "--frames", "6", "--split", "all")
-    code, _ = render(own_run, *argv, "--exposure-ev", "own", "--out", tmp_path)
-    assert code == 0
+    rendered(own_run, *argv, "--exposure-ev", "own", "--out", tmp_path)
     first, last = (json.loads((tmp_path / "cameras.json").read_text())[k] for k in (0, -1))
     for entry, index in ((first, 0), (last, 5)):
         transform = fitted.own_display(index)
@@ -171,12 +167,11 @@ def test_a_drive_can_be_exposed_as_photographed(render, own_run, tmp_path):
         assert entry["gamma"] == pytest.approx(transform.gamma, rel=1e-6)
 
 
-def test_a_drive_can_be_metered(render, own_run, tmp_path):
+def test_a_drive_can_be_metered(rendered, own_run, tmp_path):
     bare = ["--path", "drive", "--frames", 5, "--width", 64]
     for name, more in (("of", []), ("more", ["--exposure-ev", 1])):
         argv = [own_run, *bare, "--exposure-of", "log_average", *more, "--out", tmp_path / name]
-        code, said = render(*argv)
-        assert code == 0, said
+        rendered(*argv)
     metered, brighter = (
         [shot["exposure_ev"] for shot in json.loads((tmp_path / n / "cameras.json").read_text())]
         for n in ("of", "more")
@@ -186,15 +181,13 @@ def test_a_drive_can_be_metered(render, own_run, tmp_path):
     light = linear @ [0.2126, 0.7152, 0.0722]
     exposed = load_run(own_run).common_display(metered[2]).exposure * light
     assert np.exp(np.log(exposed[exposed > 0]).mean()) == pytest.approx(0.18, rel=0.3)
-    code, said = render(own_run, *bare, "--exposure-of", "auto", "--out", tmp_path / "auto")
-    assert code == 0, said
+    said = rendered(own_run, *bare, "--exposure-of", "auto", "--out", tmp_path / "auto")
     assert "Metering:" in said
 
 
-def test_an_orbit_says_what_it_does(render, own_run, tmp_path):
-    code, text = render(own_run, "--path", "orbit", "--frames", "3", "--out", tmp_path)
-    assert code == 0
-    assert "orbit sways" in " ".join(text.split())
+def test_an_orbit_says_what_it_does(rendered, own_run, tmp_path):
+    text = rendered(own_run, "--path", "orbit", "--frames", "3", "--out", tmp_path)
+    assert "orbit sways" in text
     assert len(list(tmp_path.glob("*.png"))) == 3
 
 
@@ -208,9 +201,8 @@ def rows_of(fitted, image):
     return [image[t : t + cylinder.height] for t in tops]
 
 
-def test_a_panorama_shows_seams_as_taken_and_none_at_one_exposure(render, rig_run, tmp_path):
-    code, _ = render(rig_run, "--panorama", "--out", tmp_path, "--split", "train")
-    assert code == 0
+def test_a_panorama_shows_seams_as_taken_and_none_at_one_exposure(rendered, rig_run, tmp_path):
+    rendered(rig_run, "--panorama", "--out", tmp_path, "--split", "train")
     assert [p.name for p in tmp_path.glob("*.png")] == ["001.png"]
     taken, same, field = rows_of(load_run(rig_run), picture(tmp_path / "001.png"))
     half, edge = taken.shape[1] // 2, taken.shape[1] // 20
@@ -223,10 +215,9 @@ def test_a_panorama_shows_seams_as_taken_and_none_at_one_exposure(render, rig_ru
         assert np.abs(same - field)[:, side][there].mean() < 0.03
 
 
-def test_a_wide_drive(render, rig_run, tmp_path):
+def test_a_wide_drive(rendered, rig_run, tmp_path):
     out = tmp_path / "wide.mp4"
-    code, _ = render(rig_run, "--path", "drive", "--panorama", "--frames", 3, "--out", out)
-    assert code == 0
+    rendered(rig_run, "--path", "drive", "--panorama", "--frames", 3, "--out", out)
     frames = video(out)
     assert len(frames) == 3
     assert frames[0].shape[1] > 1.3 * SIZE[0]
@@ -268,18 +259,17 @@ def test_senseless_requests_end_with_one_message(render, own_run, options, said)
     assert sorted(own_run.rglob("*")) == before
 
 
-def test_what_is_there_is_replaced_only_when_asked_for(render, own_run, tmp_path):
+def test_what_is_there_is_replaced_only_when_asked_for(render, rendered, own_run, tmp_path):
     for out in (tmp_path / "a", tmp_path / "a.mp4"):
         argv = (own_run, "--path", "drive", "--frames", "2", "--width", "48", "--out", out)
-        assert render(*argv)[0] == 0
+        rendered(*argv)
         written = [p for p in (out.iterdir() if out.is_dir() else [out])]
         before = [p.stat().st_mtime_ns for p in written]
         code, text = render(*argv)
         assert code == 2
         assert "--overwrite" in text
         assert [p.stat().st_mtime_ns for p in written] == before
-        code, text = render(*argv, "--overwrite")
-        assert code == 0
+        text = rendered(*argv, "--overwrite")
         assert [p.stat().st_mtime_ns for p in written] != before
         # Where the seconds went adds up.
         spent = re.search(

@@ -27,18 +27,9 @@ def scene():
     stops = np.repeat(rng.normal(-3, 1.2, (1, POINTS)), VIEWS, 0).ravel() + 0.5 * around
     lamp = np.repeat((np.hypot(*(start - [0.4, 0.2]).T) < 0.12)[None], VIEWS, 0).ravel()
     colors = np.where(lamp, 1.0, np.clip(2 ** (stops / 2.2), 0.03, 0.97))[:, None].repeat(3, 1)
-    observations = Observations(
-        views,
-        points,
-        colors,
-        np.zeros_like(colors),
-        VIEWS,
-        POINTS,
-        np.zeros(VIEWS, int),
-        names=NAMES,
-        positions=places,
-        surroundings=around,
-    )
+    sizes = (np.zeros_like(colors), VIEWS, POINTS, np.zeros(VIEWS, int))
+    known = {"names": NAMES, "positions": places, "surroundings": around}
+    observations = Observations(views, points, colors, *sizes, **known)
     usable = np.where(lamp, 0.0, 1.0)[:, None].repeat(3, 1)
     noise = 0.08 * rng.standard_normal((len(views), 1)) + 0.04 * rng.standard_normal(colors.shape)
     return observations, noise, usable, stops
@@ -46,7 +37,7 @@ def scene():
 
 def said(scene, change):
     observations, noise, usable, _ = scene
-    return neighbourhood_warnings(observations, noise + change[:, None], usable, NAMES)
+    return neighbourhood_warnings(observations, noise + change[:, None], usable)
 
 
 def test_noise_and_values_say_nothing(scene):
@@ -71,24 +62,18 @@ def test_each_kind_is_found_in_its_photograph_alone(scene, kind, words):
         "flare": np.log2(1 + 0.3 * near / 2**stops) * (stops < -3),
     }[kind]
     lines = said(scene, np.where(observations.views == ODD, change, 0.0))
-    assert lines, kind
-    mine = [line for line in lines if words in line]
-    assert mine, lines
-    assert f"In 1 of {VIEWS}" in mine[0]
-    assert NAMES[ODD] in mine[0]
+    mine = next(line for line in lines if words in line)
+    assert f"In 1 of {VIEWS}" in mine
+    assert NAMES[ODD] in mine
     assert not any(name in line for line in lines for name in NAMES if name != NAMES[ODD])
 
 
-def test_the_other_sign_is_no_tone_mapping(scene):
-    observations = scene[0]
+def test_the_other_sign_is_no_tone_mapping_and_without_positions_nothing_can_be_told(scene):
+    observations, noise, usable, _ = scene
     change = np.where(observations.views == ODD, 0.25 * observations.surroundings, 0.0)
     assert not any("tone mapping" in line for line in said(scene, change))
-
-
-def test_without_positions_nothing_can_be_told(scene):
-    observations, noise, usable, _ = scene
     blind = replace(observations, positions=None)
-    assert neighbourhood_warnings(blind, noise, usable, NAMES) == []
+    assert neighbourhood_warnings(blind, noise, usable) == []
 
 
 def test_surroundings_are_the_blurred_photograph():

@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from solving import problem_of
 from synthetic_drive import make_drive, make_exposures, observe
 
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.photometry.adjustment.parameters import Splines
-from p2gs_jax.photometry.adjustment.problem import make_problem
 from p2gs_jax.photometry.adjustment.solve import fit_response
 from p2gs_jax.photometry.formation import eotf, inverse_tone_map, tone_map
 from p2gs_jax.photometry.response import (
@@ -43,33 +43,14 @@ def test_knots_and_held_ones():
     assert rises(BENT)
     falling = Response("srgb", tuple(np.where(KNOTS > 0.6, -3.0, 0.0)))
     assert not rises(falling)
-    flat = Response("srgb", tuple(-2.2 * np.log(KNOTS)))
-    assert not rises(flat)
+    assert not rises(Response("srgb", tuple(-2.2 * np.log(KNOTS))))  # flat
 
 
 @pytest.mark.parametrize("by", ["all", "camera", "channel"])
 def test_parameters_of_splines_are_those_that_are_solved_for(by):
     solved = Splines(by, spline_count(by, 4))
-    gauges = bool(solved.powers.size)
-    assert spline_parameters(by, 4) == solved.count - gauges
+    assert spline_parameters(by, 4) == solved.count - bool(solved.powers.size)
     assert spline_parameters(None, 4) == 0
-
-
-def test_values_below_the_first_code_are_clamped():
-    y = np.array([0.0, 1e-6, 0.001, 0.5 / 255])
-    for response in (Response("srgb"), Response("power"), BENT):
-        z, slope = log_exposed(y, response)
-        assert np.all(np.isfinite(z))
-        assert np.ptp(z) == 0
-        assert np.all(np.isfinite(deviation(y, slope)))
-
-
-@pytest.mark.parametrize("base", ["srgb", "power"])
-def test_the_host_decodes_as_the_device_does(base):
-    y = np.linspace(0.01, 1.0, 200)
-    np.testing.assert_allclose(
-        np.exp(base_log(y, base)[0]), eotf(jnp.asarray(y, jnp.float32), base), rtol=5e-6
-    )
 
 
 def test_dark_and_uncertain_values_say_less():
@@ -78,41 +59,44 @@ def test_dark_and_uncertain_values_say_less():
     plain = deviation(y, slope)
     assert np.all(np.diff(plain) < 0)
     assert np.all(deviation(y, slope, spread=0.05) > plain)
+    below_the_first_code = np.array([0.0, 1e-6, 0.001, 0.5 / 255])
+    for response in (Response("srgb"), Response("power"), BENT):
+        z, slope = log_exposed(below_the_first_code, response)
+        assert np.ptp(z) == 0
+        assert np.all(np.isfinite(deviation(below_the_first_code, slope)))
 
 
-def test_formation_follows_the_spline():
+@pytest.mark.parametrize("base", ["srgb", "power"])
+def test_the_host_decodes_as_the_device_does(base):
+    y = np.linspace(0.01, 1.0, 200)
+    on_device = eotf(jnp.asarray(y, jnp.float32), base)
+    np.testing.assert_allclose(np.exp(base_log(y, base)[0]), on_device, rtol=5e-6)
+
+
+def test_formation_follows_the_spline_and_is_never_dead():
     y = jnp.linspace(0.01, 0.995, 200)
     exposed = jnp.exp(jnp.asarray(log_exposed(np.asarray(y), BENT)[0]))
     np.testing.assert_allclose(tone_map(exposed, jnp.float32(2.2), CFG), y, atol=2e-3)
     for gamma in (1.8, 2.2, 2.6):
         back = inverse_tone_map(y, jnp.float32(gamma), CFG)
         np.testing.assert_allclose(tone_map(back, jnp.float32(gamma), CFG), y, atol=2e-4)
-
-
-def test_formation_by_spline_is_monotone_and_never_dead():
     x = jnp.asarray(np.geomspace(2e-6, 50, 500), jnp.float32)
     value, slope = jax.vmap(jax.value_and_grad(lambda v: tone_map(v, jnp.float32(2.2), CFG)))(x)
     assert np.all(np.diff(value) > 0)
-    assert np.all(np.isfinite(slope))
-    assert np.all(np.asarray(slope) > 0)
+    assert np.all(np.isfinite(slope) & (np.asarray(slope) > 0))
 
 
 def test_a_filmic_curve_is_found():
     drive = make_drive(20, 1200)
-    exposures = make_exposures(drive, "iso4")
-    problem = make_problem(
-        observe(drive, exposures, curve="filmic", outliers=0.05),
-        black=4 / 255,
-        saturation=250 / 255,
-        pivot=0.18,
-    )
-    found = fit_response(problem, Response("srgb"))
+    seen = observe(drive, make_exposures(drive, "iso4"), curve="filmic", outliers=0.05)
+    found = fit_response(problem_of(seen), Response("srgb"))
     assert found is not None
     x = np.geomspace(0.02, 0.5, 50)
-    z = log_exposed(encode(x, "filmic"), found)[0]
-    # Up to scale and power, which no photograph can tell.
-    line = np.polyfit(np.log(x), z, 1)
-    assert np.abs(np.polyval(line, np.log(x)) - z).max() < 0.06
-    plain = log_exposed(encode(x, "filmic"), Response("srgb"))[0]
-    straight = np.polyfit(np.log(x), plain, 1)
-    assert np.abs(np.polyval(straight, np.log(x)) - plain).max() > 0.12
+
+    def off(response):
+        """Up to scale and power, which no photograph can tell."""
+        z = log_exposed(encode(x, "filmic"), response)[0]
+        return np.abs(np.polyval(np.polyfit(np.log(x), z, 1), np.log(x)) - z).max()
+
+    assert off(found) < 0.06
+    assert off(Response("srgb")) > 0.12

@@ -6,6 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from p2gs_jax.scene.rigid import camera_centers
 from p2gs_jax.types import Scene, View
+
+pytest.importorskip("viser", reason="the extra `viewer` is not installed")
+
 from p2gs_jax.viewer.camera import (
     TYPICAL_DISTANCE,
     Pose,
@@ -20,18 +23,17 @@ from p2gs_jax.viewer.camera import (
     viewmat_between,
 )
 
-pytest.importorskip("viser", reason="the extra `viewer` is not installed")
-
-
 SPACE = ViewerSpace(2.5, np.array([0.0, -1.0, 0.0]))
 
 
-def a_viewmat(seed=0):
-    rng = np.random.default_rng(seed)
+def viewmat(turn, at):
     out = np.eye(4)
-    out[:3, :3] = Rotation.random(rng=rng).as_matrix()
-    out[:3, 3] = rng.normal(size=3)
+    out[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
+    out[:3, 3] = -out[:3, :3] @ at
     return out
+
+
+A_VIEWMAT = viewmat([0.3, -0.9, 0.4], [1.0, -0.5, 2.0])
 
 
 def pixel(camera, point):
@@ -43,10 +45,6 @@ def pixel(camera, point):
 def a_view(viewmat, name="a"):
     K = np.array([[100, 0, 60], [0, 100, 40], [0, 0, 1.0]], np.float32)
     return View(name, None, "0", viewmat.astype(np.float32), K, 120, 80)
-
-
-def scene_of(views, points):
-    return Scene(None, "test", tuple(views), np.asarray(points, np.float32), np.zeros((0, 3)))
 
 
 def test_a_point_is_where_the_browser_draws_it():
@@ -64,18 +62,17 @@ def test_a_point_is_where_the_browser_draws_it():
 
 
 def test_a_view_survives_the_trip():
-    viewmat = a_viewmat()
-    pose = pose_of(viewmat, SPACE, distance=3.0, fov=0.7)
+    pose = pose_of(A_VIEWMAT, SPACE, distance=3.0, fov=0.7)
     camera = camera_of_browser(pose, 1.5, (300, 200), SPACE)
-    np.testing.assert_allclose(camera.viewmat, viewmat, atol=1e-6)
+    np.testing.assert_allclose(camera.viewmat, A_VIEWMAT, atol=1e-6)
     np.testing.assert_allclose(camera.K[0, 0], camera.K[1, 1], rtol=1e-6)
-    ahead = (pose.look_at / SPACE.unit - camera_centers(viewmat[None])[0]) / 3.0
-    np.testing.assert_allclose(ahead, viewmat[2, :3], atol=1e-6)
+    ahead = (pose.look_at / SPACE.unit - camera_centers(A_VIEWMAT[None])[0]) / 3.0
+    np.testing.assert_allclose(ahead, A_VIEWMAT[2, :3], atol=1e-6)
 
 
 def test_any_size_shows_the_same_part_of_the_world():
-    pose = pose_of(a_viewmat(), SPACE, distance=3.0, fov=0.7)
-    point = camera_centers(a_viewmat()[None])[0] + a_viewmat()[:3, :3].T @ [0.2, -0.1, 2.0]
+    pose = pose_of(A_VIEWMAT, SPACE, distance=3.0, fov=0.7)
+    point = camera_centers(A_VIEWMAT[None])[0] + A_VIEWMAT[:3, :3].T @ [0.2, -0.1, 2.0]
     shares = [
         pixel(camera_of_browser(pose, 1.6, size, SPACE), point) / size
         for size in ((1280, 800), (328, 200), (480, 480))
@@ -100,61 +97,25 @@ def test_a_whole_photograph_is_seen(aspect):
 
 
 def test_up_is_what_cameras_hold_up_and_distances_are_typical():
-    views = []
-    for roll in (-0.3, 0.1, 0.2):
-        viewmat = np.eye(4)
-        viewmat[:3, :3] = Rotation.from_euler("z", roll).as_matrix()
-        views.append(a_view(viewmat))
+    rolls = [viewmat([0, 0, roll], [0, 0, 0]) for roll in (-0.3, 0.1, 0.2)]
     points = np.random.default_rng(0).uniform([-0.1, -0.1, 4.9], [0.1, 0.1, 5.1], (50, 3))
-    space = make_viewer_space(scene_of(views, points), points)
+    scene = Scene(None, "test", tuple(map(a_view, rolls)), points, np.zeros((0, 3)))
+    space = make_viewer_space(scene, points)
     np.testing.assert_allclose(space.up, [0, -1, 0], atol=0.02)
     np.testing.assert_allclose(space.unit, TYPICAL_DISTANCE / 5, rtol=0.03)
-
-
-def test_a_scene_without_points_is_measured_by_its_gaussians():
-    means = np.array([[0, 0, 2.0], [0.1, 0, 2.0]])
-    space = make_viewer_space(scene_of([a_view(np.eye(4))], np.zeros((0, 3))), means)
-    np.testing.assert_allclose(space.unit, TYPICAL_DISTANCE / 2)
-
-
-def test_what_is_behind_or_beside_has_no_distance():
+    # What is behind or beside has no distance.
     assert distance_seen(np.eye(4), np.array([[0, 0, -3.0], [5, 0, 1.0], [0, 0, 7.0]])) == 7.0
     assert distance_seen(np.eye(4), np.array([[0, 0, -3.0]])) == 1.0
 
 
-def viewmat(turn, at):
-    out = np.eye(4)
-    out[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
-    out[:3, 3] = -out[:3, :3] @ at
-    return out
-
-
-POSES = np.stack(
-    [
-        viewmat([0, 0, 0], [0, 0, 0]),
-        viewmat([0, 0.8, 0], [2, 0, 4]),
-        viewmat([0, 0, 1], [3, 0, 4]),
-    ]
-)
-
-
-@pytest.mark.parametrize(
-    ("place", "turn", "at"),
-    [
-        (0.0, [0, 0, 0], [0, 0, 0]),
-        (0.25, [0, 0.2, 0], [0.5, 0, 1]),
-        (1.0, [0, 0.8, 0], [2, 0, 4]),
-        (2.0, [0, 0, 1], [3, 0, 4]),
-        (9.0, [0, 0, 1], [3, 0, 4]),
-        (-1.0, [0, 0, 0], [0, 0, 0]),
-    ],
-)
-def test_poses_between_poses(place, turn, at):
-    np.testing.assert_allclose(viewmat_between(POSES, place), viewmat(turn, at), atol=1e-9)
-
-
-def test_a_drive_of_one_pose_stands_still():
-    np.testing.assert_allclose(viewmat_between(POSES[1:2], 0.7), POSES[1], atol=1e-12)
+def test_poses_between_poses():
+    recorded = [([0, 0, 0], [0, 0, 0]), ([0, 0.8, 0], [2, 0, 4]), ([0, 0, 1], [3, 0, 4])]
+    poses = np.stack([viewmat(*pose) for pose in recorded])
+    places = dict(zip((0.0, 1.0, 2.0), recorded, strict=True))
+    places |= {-1.0: recorded[0], 9.0: recorded[2], 0.25: ([0, 0.2, 0], [0.5, 0, 1])}
+    for place, pose in places.items():
+        np.testing.assert_allclose(viewmat_between(poses, place), viewmat(*pose), atol=1e-9)
+    np.testing.assert_allclose(viewmat_between(poses[1:2], 0.7), poses[1], atol=1e-12)
 
 
 def test_a_drive_is_one_camera_in_the_order_of_names():

@@ -382,14 +382,14 @@ def test_a_split_gives_the_look_back(session, run):
 
 
 def test_the_exposure_can_be_locked(session):
-    session._panel.locked = True
+    session._panel.locked.value = True
     before = session._panel.now
     session.go_to(2)
     assert (session._panel.at, session._panel.now) == (2, before)
     show(session, "split")
     show(session, "display")
     assert session._panel.now == before
-    session._panel.locked = False
+    session._panel.locked.value = False
     session.go_to(2)
     assert session._panel.now.taken_as == 2
 
@@ -441,7 +441,7 @@ def test_the_panel_holds_what_it_is_set_to(viewed, run):
         panel.set_legend("legend")
         assert panel.settings() == replace(wanted, exposure_ev=pytest.approx(wanted.exposure_ev))
         assert panel.drive == (run.scene.views[0].camera, 1.0)
-        assert (panel.speed, panel.locked, panel.own_exposures) == (2.0, False, False)
+        assert (panel.speed.value, panel.locked.value) == (2.0, False)
     finally:
         server.stop()
     assert not actions.method_calls  # these are a person's alone

@@ -10,6 +10,7 @@ import urllib.error
 import urllib.request
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -200,13 +201,9 @@ def served(monkeypatch):
             found.stopped.append(self.client.client_id)
 
     monkeypatch.setattr(module, "BrowserSession", Session)
-    server = SimpleNamespace(
-        gui=SimpleNamespace(configure_theme=lambda **options: None),
-        scene=SimpleNamespace(set_up_direction=lambda up: None),
-        initial_camera=SimpleNamespace(),
-        on_client_connect=lambda call: setattr(found, "connect", call),
-        on_client_disconnect=lambda call: setattr(found, "disconnect", call),
-    )
+    server = MagicMock()
+    server.on_client_connect = lambda call: setattr(found, "connect", call)
+    server.on_client_disconnect = lambda call: setattr(found, "disconnect", call)
     pose = SimpleNamespace(position=np.zeros(3), look_at=np.ones(3), fov=1.0)
     space, view = SimpleNamespace(up="+z"), lambda view, aspect: pose
     viewed = SimpleNamespace(space=space, first_view=0, pose=view)

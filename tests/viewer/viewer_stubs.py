@@ -84,7 +84,8 @@ class Panel:
     """Controls that hold what they are set to."""
 
     def __init__(self, start=None):
-        self.now, self.locked, self.at = start or Settings(gamma=2.2), False, None
+        self.now, self.at = start or Settings(gamma=2.2), None
+        self.locked = SimpleNamespace(value=False)
         self.status = self.legend = None
 
     def settings(self):

@@ -79,10 +79,10 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
     independent: the meat is summed over clusters, and counts them once. What regions of an
     image share besides is added to it.
     """
-    rows = fit.model.rows
-    clusters = side_by_side(observations, rows.layout.row)
+    rows, layout = fit.model.rows, fit.model.rows.layout
+    clusters = side_by_side(observations, layout.row)
     each = summed(fit.model, fit.theta, fit.at, fit.at.weight * fit.at.residual, clusters)
-    if observations.positions is not None and len(rows.layout.row):
+    if observations.positions is not None and len(layout.row):
         labels = regions(observations.positions, observations.views, SHARED_REGION)
         # In all points, also those that count for little: what matte ones share is less.
         alike = weigh(fit.model, fit.theta, fit.at.weight, "geman_mcclure")
@@ -92,8 +92,8 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
             each = sp.csr_array(sp.vstack([each, shared]))
     seen = rows.weight.any(1)
     # A view's exposure is the mean of its clusters, and takes one of them away.
-    pairs = np.unique(np.stack([rows.layout.views[seen], clusters[seen]]), axis=1)[0]
-    count = np.maximum(np.bincount(pairs, minlength=rows.layout.view_count), 2)
+    pairs = np.unique(np.stack([layout.views[seen], clusters[seen]]), axis=1)[0]
+    count = np.maximum(np.bincount(pairs, minlength=layout.view_count), 2)
     few = np.sqrt(count / (count - 1))
     bread = fit.normal * fit.at.curvature + system.priors.normal
     gauges = np.sqrt(gauge_strength(bread, system.unknowns)) * system.anchors.rows
@@ -169,8 +169,7 @@ def _shared_deviation(model: Forward, at: Weighted, labels: Labels) -> float:
     Means of regions vary by more than their own observations explain. Exposures and radiances take
     a part of that away, which is put back. Medians: a region may show something that moved.
     """
-    rows = model.rows
-    weight = at.weight.sum(1)
+    layout, weight = model.rows.layout, at.weight.sum(1)
     count = int(labels.max(initial=-1)) + 1
 
     def total(values):
@@ -187,21 +186,21 @@ def _shared_deviation(model: Forward, at: Weighted, labels: Labels) -> float:
     own = (spread / np.maximum(effective - 1, 1))[good]
     excess = (1.4826 * np.median(np.abs(mean[good]))) ** 2 - np.median(own)
     used = weight > 0
-    seen_by = np.bincount(rows.layout.row[used])
-    per_view = good.sum() / max(len(np.unique(rows.layout.views[used])), 1)
+    seen_by = np.bincount(layout.row[used])
+    per_view = good.sum() / max(len(np.unique(layout.views[used])), 1)
     kept = (1 - 1 / np.mean(seen_by[seen_by > 0])) * (1 - 1 / max(per_view, 2))
     return float(np.sqrt(max(excess, 0.0) / kept))
 
 
 def _shared_scores(model: Forward, theta: Parameters, at: Weighted, labels: Labels) -> sp.csr_array:
     """Return how the right side, points eliminated, moves with errors of regions: (regions, d)."""
-    rows, u = model.rows, model.unknowns
-    coupled = coupling(rows, theta, at)
+    layout, u = model.rows.layout, model.unknowns
+    coupled = coupling(layout, theta, at)
     taken = [
-        at_places(rows, coupled * p.derivative, rows.layout.views, u.views, p.channels).T
+        at_places(layout, coupled * p.derivative, layout.views, u.views, p.channels).T
         for p in of_views(model, at)
     ]
-    terms, place = others(model, theta), 3 * rows.layout.row[:, None] + np.arange(3)
-    more = None if terms is None else terms.sums(coupled, place, 3 * rows.layout.rows)
-    of_points = at_places(rows, coupled, labels, int(labels.max(initial=-1)) + 1)
+    terms, place = others(model, theta), 3 * layout.row[:, None] + np.arange(3)
+    more = None if terms is None else terms.sums(coupled, place, 3 * layout.rows)
+    of_points = at_places(layout, coupled, labels, int(labels.max(initial=-1)) + 1)
     return summed(model, theta, at, at.weight, labels) - of_points @ over_all(u, taken, more)

@@ -142,6 +142,7 @@ def solution_of(
         active = active | given
     scale, color = (_Gauge(problem.component, active & one) for one in (free, True))
     exposures, shifts, lost = _exposures(fit, known, active, scale, color)
+    errors = exposures["exposure_errors"]
     # Points go the other way, as much as one of their views.
     some_view = np.zeros(o.point_count, int)
     some_view[o.points[seen]] = o.views[seen]
@@ -163,8 +164,7 @@ def solution_of(
         converged=fit.converged,
         unknown_errors=int(lost.sum()),
         warnings=(
-            *_of_solver(fit, exposures["exposure_errors"][active & ~lost], lost, o.names),
-            *_of_observations(per_view, problem.component[active], tint, o.names),
+            *_warnings(fit, errors, lost, per_view, problem.component[active], tint, o.names),
             *_unmodelled(problem, residual),
         ),
         white_balance_level=form.white_balance,
@@ -287,15 +287,24 @@ def _per_view_ev(
     return spread, balance
 
 
-def _of_solver(
+def _warnings(
     fit: Fit,
-    errors: Float[np.ndarray, " k"],
+    errors: Float[np.ndarray, " v"],
     lost: Bool[np.ndarray, " v"],
+    per_view: Int[np.ndarray, " v"],
+    component: Int[np.ndarray, " k"],
+    balance: Float[np.ndarray, "v 3"],
     names: Sequence[str],
 ) -> list[str]:
-    """Say where the numbers themselves are not to be trusted: `lost` views have no errors."""
+    """Say where numbers are not to be trusted, and what observations tell besides or do not tell.
+
+    Views that are `lost` have no errors. `component` is of views that have any observations, or a
+    known exposure; those of equal numbers share points. `balance` is the residual of red, green,
+    blue less their mean, stops.
+    """
     out = []
-    typical = float(np.median(errors)) if errors.size else 0.0
+    known = errors[np.isfinite(errors)]
+    typical = float(np.median(known)) if known.size else 0.0
     if not fit.converged and fit.left > NEGLIGIBLE * typical:
         out.append(
             f"The photometric solution had not settled after {fit.rounds} rounds (its last moved a "
@@ -308,21 +317,6 @@ def _of_solver(
             f"The standard errors of {lost.sum()} training view(s) cannot be told: what joins them "
             f"to the others is lost in rounding ({_listed(np.flatnonzero(lost), names)})."
         )
-    return out
-
-
-def _of_observations(
-    per_view: Int[np.ndarray, " v"],
-    component: Int[np.ndarray, " k"],
-    balance: Float[np.ndarray, "v 3"],
-    names: Sequence[str],
-) -> list[str]:
-    """Say what the observations do not tell, or tell of more than exposure.
-
-    `component` is of views that have any, or a known exposure; those of equal numbers share
-    points. `balance` is the residual of red, green, blue less their mean, stops.
-    """
-    out = []
     few = np.flatnonzero(per_view < MIN_OBSERVATIONS)
     if len(few):
         out.append(
@@ -355,9 +349,7 @@ def _unmodelled(problem: Problem, residual: PerChannel) -> list[str]:
     if o.positions is None or not len(o.points):
         return []
     pick = o.thinned(UNMODELLED_PER_VIEW, 0)
-    return neighbourhood_warnings(
-        o.picked(pick), residual[pick] / LN2, problem.usable[pick], o.names
-    )
+    return neighbourhood_warnings(o.picked(pick), residual[pick] / LN2, problem.usable[pick])
 
 
 def _listed(rows: Sequence[int] | Labels, names: Sequence[str]) -> str:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from p2gs_jax.photometry.adjustment.matrices import Entries, Matrix, Terms, assembled, block
 from p2gs_jax.photometry.adjustment.parameters import Forward, Parameters, Unknowns
-from p2gs_jax.photometry.adjustment.problem import Rows
+from p2gs_jax.photometry.adjustment.problem import Layout
 from p2gs_jax.photometry.adjustment.robust import Weighted
 from p2gs_jax.photometry.adjustment.system import EMPTY, Vector
 from p2gs_jax.photometry.observations import Labels, PerChannel
@@ -33,19 +33,19 @@ def normal_equations(
     A prediction b + a (l + k features) - c basis has the derivatives 1, l + k features, a features
     and -basis; a point's own is a. The products of pairs are of a `kind`; see `Pairs.sums`.
     """
-    rows, u = model.rows, model.unknowns
+    layout, u = model.rows.layout, model.unknowns
     w, pull = at.weight, at.weight * at.residual
-    coupled = coupling(rows, theta, at)
+    coupled = coupling(layout, theta, at)
     parts, right = [], []
     per_view = of_views(model, at)
     views = np.arange(u.views)
     for x, one in enumerate(per_view):
-        right.append(_per_view(rows, pull * one.derivative, one.channels))
+        right.append(_per_view(layout, pull * one.derivative, one.channels))
         for y, other in enumerate(per_view):
             if common := [c for c in one.channels if c in other.channels]:
-                values = _per_view(rows, w * one.derivative * other.derivative, common)
+                values = _per_view(layout, w * one.derivative * other.derivative, common)
                 parts.append(Entries(x * u.views + views, y * u.views + views, values))
-    of_pairs = rows.layout.pairs.sums(
+    of_pairs = layout.pairs.sums(
         [(coupled * p.derivative)[:, p.channels] for p in per_view],
         [
             [(p.channels.index(c), q.channels.index(c)) for c in p.channels if c in q.channels]
@@ -64,13 +64,9 @@ def normal_equations(
     return assembled(parts, u.count), np.concatenate(right)
 
 
-def coupling(rows: Rows, theta: Parameters, at: Weighted) -> PerChannel:
+def coupling(layout: Layout, theta: Parameters, at: Weighted) -> PerChannel:
     """Return what couples the observations of a point once it is eliminated: its derivatives."""
-    return (
-        at.weight
-        * theta.a[rows.layout.views][:, None]
-        / np.sqrt(at.precision + EMPTY)[rows.layout.row]
-    )
+    return at.weight * theta.a[layout.views][:, None] / np.sqrt(at.precision + EMPTY)[layout.row]
 
 
 def of_views(model: Forward, at: Weighted) -> list[OfView]:
@@ -95,9 +91,9 @@ def others(model: Forward, theta: Parameters) -> Terms | None:
     return features.joined(basis)
 
 
-def _per_view(rows: Rows, values: PerChannel, channels: list[int]):
+def _per_view(layout: Layout, values: PerChannel, channels: list[int]):
     # Of nothing at all, numpy counts in integers.
-    total = np.bincount(rows.layout.views, values[:, channels].sum(1), rows.layout.view_count)
+    total = np.bincount(layout.views, values[:, channels].sum(1), layout.view_count)
     return total.astype(np.float64)
 
 
@@ -105,16 +101,16 @@ def _with_others(
     model: Forward, at: Weighted, terms: Terms, per_view: list[OfView], coupled: PerChannel
 ) -> tuple[list[Entries], Float[np.ndarray, " k"]]:
     """Return what k and c add to the equations: entries, and their right side."""
-    rows, u = model.rows, model.unknowns
-    place = 3 * rows.layout.row[:, None] + np.arange(3)
-    through = terms.sums(coupled, place, 3 * rows.layout.rows)
+    layout, u = model.rows.layout, model.unknowns
+    place = 3 * layout.row[:, None] + np.arange(3)
+    through = terms.sums(coupled, place, 3 * layout.rows)
     first = u.per_view
     parts = []
-    at_view = np.broadcast_to(rows.layout.views[:, None], at.weight.shape)
+    at_view = np.broadcast_to(layout.views[:, None], at.weight.shape)
     for x, one in enumerate(per_view):
         acting = np.isin(np.arange(3), one.channels)
         side = terms.sums(at.weight * one.derivative * acting, at_view, u.views)
-        mine = at_places(rows, coupled * one.derivative, rows.layout.views, u.views, one.channels)
+        mine = at_places(layout, coupled * one.derivative, layout.views, u.views, one.channels)
         side -= mine @ through
         across = block(x * u.views, first, side)
         parts += [across, Entries(across.columns, across.rows, across.values)]
@@ -122,19 +118,23 @@ def _with_others(
     pulled = terms.sums(at.weight * at.residual, np.zeros_like(place), 1)[0]
     if model.basis is not None:
         share = at.weight * at.sigma**2 * at.scale**2
-        gradient, curvature = u.splines.log_slope_terms(rows, share, at.slope)
+        gradient, curvature = u.splines.log_slope_terms(model.rows, share, at.slope)
         pulled[-len(gradient) :] += gradient
         corner[-len(gradient) :, -len(gradient) :] += curvature
     return [*parts, block(first, first, corner)], pulled
 
 
 def at_places(
-    rows: Rows, values: PerChannel, places: Labels, count: int, channels: Sequence[int] = (0, 1, 2)
+    layout: Layout,
+    values: PerChannel,
+    places: Labels,
+    count: int,
+    channels: Sequence[int] = (0, 1, 2),
 ) -> sp.csr_array:
     """Return the matrix that holds values of channels at places and points: (count, 3 rows)."""
-    at = 3 * rows.layout.row[:, None] + np.array(channels)
+    at = 3 * layout.row[:, None] + np.array(channels)
     where = np.broadcast_to(places[:, None], at.shape)
-    shape = (count, 3 * rows.layout.rows)
+    shape = (count, 3 * layout.rows)
     return sp.csr_array((values[:, channels].ravel(), (where.ravel(), at.ravel())), shape=shape)
 
 
@@ -145,11 +145,11 @@ def summed(
 
     For the pull of observations, weight times residual, these are the scores of clusters.
     """
-    rows, u = model.rows, model.unknowns
+    layout, u = model.rows.layout, model.unknowns
     count = int(places.max(initial=-1)) + 1
     per_view = [
         sp.csr_array(
-            ((values * p.derivative)[:, p.channels].sum(1), (places, rows.layout.views)),
+            ((values * p.derivative)[:, p.channels].sum(1), (places, layout.views)),
             shape=(count, u.views),
         )
         for p in of_views(model, at)

@@ -71,7 +71,9 @@ class Balanced:
         matrix = scaling @ reduced[free][:, free] @ scaling
         low_rank = held[:, free] @ scaling
         if is_small(len(free)):
-            self._solve = _dense(whole(matrix) + (low_rank.T @ low_rank).toarray())
+            dense = whole(matrix) + (low_rank.T @ low_rank).toarray()
+            dense[np.diag_indices_from(dense)] += DAMPING
+            self._solve = functools.partial(np.linalg.solve, dense)
         else:
             self._solve = _iterative(sp.csr_array(matrix), low_rank.toarray())
 
@@ -79,11 +81,6 @@ class Balanced:
         """Return the solution along the free directions."""
         scale = self._scale.reshape(-1, *[1] * (right.ndim - 1))
         return self._directions @ (scale * self._solve(scale * (self._directions.T @ right)))
-
-
-def _dense(matrix: Float[np.ndarray, "n n"]):
-    matrix[np.diag_indices_from(matrix)] += DAMPING
-    return lambda right: np.linalg.solve(matrix, right)
 
 
 def _iterative(sparse: sp.csr_array, low_rank: Float[np.ndarray, "g n"]):

@@ -147,29 +147,21 @@ def stack_colors(stack: Stack, seed: int = 0) -> StackColors:
     xy = choose_points(stack, black, seed)
     pixels = (image[stack.valid] for image in stack.images)
     lit = [((v > 255 * black) & (v < 255 * SATURATED)).any(-1).mean() > SIGNAL for v in pixels]
-    return StackColors(_observe(stack, xy, shifts), xy, shifts, black, np.array(lit))
-
-
-def _observe(
-    stack: Stack, xy: Float[np.ndarray, "p 2"], shifts: Float[np.ndarray, "v 2"]
-) -> Observations:
-    """Sample every frame at the same surface points."""
-    frames, points = len(stack.images), len(xy)
     mask = stack.valid.astype(np.float32)
-    colors, spread, brightest = [], [], []
-    for image, shift in zip(stack.images, shifts, strict=True):
-        s = sample((image / 255).astype(np.float32), mask, xy - shift)
-        colors.append(np.where(s.valid[:, None], s.colors, 0))
-        spread.append(0.5 * s.spread)
-        brightest.append(s.brightest)
-    return Observations(
+    found = [
+        sample((image / 255).astype(np.float32), mask, xy - shift)
+        for image, shift in zip(stack.images, shifts, strict=True)
+    ]
+    frames, points = len(stack.images), len(xy)
+    observations = Observations(
         np.repeat(np.arange(frames), points),
         np.tile(np.arange(points), frames),
-        np.concatenate(colors),
-        np.concatenate(spread),
+        np.concatenate([np.where(s.valid[:, None], s.colors, 0) for s in found]),
+        np.concatenate([0.5 * s.spread for s in found]),
         frames,
         points,
         np.zeros(frames, int),
         names=tuple(v.name for v in stack.views),
-        brightest=np.concatenate(brightest),
+        brightest=np.concatenate([s.brightest for s in found]),
     )
+    return StackColors(observations, xy, shifts, black, np.array(lit))
