@@ -70,9 +70,9 @@ def test_without_a_solution_only_views_learn():
         "photometry.vignetting": "camera",
     }
     cfg = with_fields(FitConfig(), asked)
-    decided = decide(cfg, None, matched=False)
+    decided = decide(cfg, None)
     assert (decided.white_balance, decided.vignetting) == ("view", None)
-    assert likely(cfg, None, matched=False) == decided
+    assert likely(cfg, None) == decided
     by_camera = with_fields(cfg, {"photometry.white_balance": "camera"})
     assert unsolved(Decisions.as_asked(by_camera)).white_balance is None
 
