@@ -5,6 +5,7 @@
 lie `scene` and `street`, a tiny scene, and `RUN` and `runs/street`, a finished run of it.
 """
 
+import dataclasses
 import json
 import re
 import shutil
@@ -15,7 +16,7 @@ import pytest
 from pages import LANGUAGES, PAGES, ROOT, Block, blocks, commands, prose
 from tiny_scene import make_scene
 
-from p2gs_jax import presets
+from p2gs_jax import config, presets
 from p2gs_jax.cli import main
 from p2gs_jax.cli.fit import Calibrate, Fit, checked
 from p2gs_jax.cli.parser import COMMANDS, GROUPS, parse
@@ -40,15 +41,24 @@ def skip_if_said(block: Block) -> None:
 @pytest.fixture
 def quick_presets(monkeypatch):
     """Let `robust` take a few steps at one resolution, with few Gaussians."""
-    quick = {
-        "data.test_every": 3,
-        "render.sh_degree": 1,
-        "densify.max_gaussians": 400,
-        "init.shell": "off",
-        "train.steps": 10,
-        "train.coarse_to_fine": (),
-    }
-    monkeypatch.setitem(presets.PRESETS, "robust", quick)
+    slow = config.FitConfig()
+    quick = dataclasses.replace(
+        slow,
+        data=dataclasses.replace(slow.data, test_every=3),
+        render=dataclasses.replace(slow.render, sh_degree=1),
+        densify=dataclasses.replace(slow.densify, max_gaussians=400),
+        init=dataclasses.replace(slow.init, shell="off"),
+        train=dataclasses.replace(slow.train, steps=10, coarse_to_fine=()),
+    )
+
+    class Quick(type):
+        def __call__(cls, **given):
+            return dataclasses.replace(quick, **given)
+
+        def __instancecheck__(cls, value):
+            return isinstance(value, config.FitConfig)
+
+    monkeypatch.setattr(presets, "FitConfig", Quick("FitConfig", (), {}))
 
 
 @pytest.fixture
