@@ -19,7 +19,7 @@ from p2gs_jax.formats.packed import Packed, pack, unpack
 from p2gs_jax.gaussians.posed import chosen
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render import render_linear
-from p2gs_jax.render.capacity import RenderView, TileCapacity, count_needed, until_it_fits
+from p2gs_jax.render.capacity import PICTURES, RenderView, bucket, count_needed, until_it_fits
 from p2gs_jax.render.harmonics import C0, coefficient_count, degree_of
 from p2gs_jax.render.tiles import smallest_cutoff
 from p2gs_jax.render.xla_cpu import compiler_options
@@ -167,7 +167,7 @@ def weights(
     alive = on_device(np.ones(gaussians.capacity), bool)
     sh = on_device(np.zeros((gaussians.capacity, 1, 3)))
     needed = max(int(count_needed(gaussians, alive, camera, cfg=plain)) for camera in cameras)
-    capacity, total = TileCapacity.allocate(needed), np.zeros(gaussians.capacity)
+    capacity, total = bucket(needed, PICTURES.first), np.zeros(gaussians.capacity)
 
     @functools.partial(jax.jit, static_argnames="capacity", compiler_options=compiler_options())
     def gradient(g: Gaussians, camera: Camera, *, capacity: int) -> tuple[Array, Array, Array]:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from p2gs_jax.config import DensifyConfig
 from p2gs_jax.gaussians.population import Outcome, fresh_population, opacities, place
-from p2gs_jax.render.project import rotation_matrices
+from p2gs_jax.render.project import rotated, rotation_matrices
 from p2gs_jax.types import Gaussians, Population
 
 SPLIT_SHRINK = 1.6
@@ -24,8 +24,7 @@ class Proposal(NamedTuple):
     prune: Bool[Array, " n"]
     clone: Bool[Array, " n"]
     split: Bool[Array, " n"]
-    wanted: Int[Array, ""]
-    """Slots that must exist for it: survivors plus children."""
+    wanted: Int[Array, ""]  # slots that must exist for it: survivors plus children
 
 
 def propose(
@@ -70,8 +69,7 @@ def apply(
 
     def sample(k):
         local = jax.random.normal(k, gaussians.means.shape) * scales
-        offset = jnp.stack([sum(R[i][j] * local[:, j] for j in range(3)) for i in range(3)], -1)
-        return gaussians.means + offset
+        return gaussians.means + rotated(R, local)
 
     first, second = (sample(k) for k in jax.random.split(key))
     shrunk = gaussians.log_scales - jnp.log(SPLIT_SHRINK)

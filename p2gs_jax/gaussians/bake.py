@@ -25,8 +25,9 @@ from p2gs_jax.core.numerics import fibonacci_sphere, on_device
 from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
 from p2gs_jax.render import harmonics, render_linear
 from p2gs_jax.render.capacity import (
+    PICTURES,
     RenderView,
-    TileCapacity,
+    bucket,
     count_needed,
     make_renderer,
     until_it_fits,
@@ -172,7 +173,7 @@ def refine(
     cfg, optimizer = viewer_config(cfg), optax.scale_by_adam(eps=1e-15)
     alive = _all(gaussians)
     needed = max(int(count_needed(gaussians, alive, t.camera, cfg=cfg)) for t in targets)
-    capacity = TileCapacity.allocate(needed)
+    capacity = bucket(needed, PICTURES.first)
     bands = jnp.full((gaussians.sh.shape[1], 1), BANDS_RATE).at[0].set(COLOR_RATE)
     rates = _Trainable(bands, jnp.asarray(OPACITY_RATE))
 

@@ -333,7 +333,6 @@ def gaussians_of(
     A point that has dense seeds around it is as small as they are near. `radiance` is that of the
     points, in the gauge of the exposures.
     """
-    views = list(views)
     if dense is None:
         return gaussians_from_points(points, radiance, views, cfg)
     everything, count = np.concatenate([points, dense.points]), len(points)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from p2gs_jax.config import DensifyConfig
 from p2gs_jax.gaussians.population import Outcome, fresh_population, logit, opacities
-from p2gs_jax.render.project import rotation_matrices
+from p2gs_jax.render.project import rotated, rotation_matrices
 from p2gs_jax.types import Gaussians, Population
 
 # Noise falls off above this opacity, with this steepness (Kheradmand et al. 2024).
@@ -108,17 +108,12 @@ def _apart(
     `spread` is the deviation of the moves over that of the Gaussian, below 1.
     """
     scales = jnp.exp(gaussians.log_scales)
-    moved = _turned(rotation_matrices(gaussians.quats), spread * away * scales)
+    moved = rotated(rotation_matrices(gaussians.quats), spread * away * scales)
     return dataclasses.replace(
         gaussians,
         means=gaussians.means + moved,
         log_scales=gaussians.log_scales + 0.5 * float(np.log1p(-(spread**2))) * where[:, None],
     )
-
-
-def _turned(R, local: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """Return vectors along the principal axes in world coordinates; R from `rotation_matrices`."""
-    return jnp.stack([sum(R[i][j] * local[:, j] for j in range(3)) for i in range(3)], -1)
 
 
 def exploration_noise(
@@ -143,4 +138,4 @@ def shaped_noise(
     variance = jnp.exp(2 * gaussians.log_scales)
     raw = normal * (gate * alive * rate)[:, None]
     local = [sum(R[i][j] * raw[:, i] for i in range(3)) * variance[:, j] for j in range(3)]
-    return _turned(R, jnp.stack(local, -1))
+    return rotated(R, jnp.stack(local, -1))

@@ -104,7 +104,7 @@ def node_gaussians(
             distances, _ = KDTree(points).query(points, k=NEIGHBOURS + 1)
             scales[mine] = np.sqrt(np.mean(np.asarray(distances)[:, 1:] ** 2, axis=1))
     scales = np.clip(scales, 1e-3, WIDEST)
-    return gaussians_from_points(nodes.points, radiance, list(views), cfg, scales=scales)
+    return gaussians_from_points(nodes.points, radiance, views, cfg, scales=scales)
 
 
 def nodes_radiance(

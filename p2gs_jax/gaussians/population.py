@@ -25,10 +25,8 @@ class Outcome(NamedTuple):
 
     gaussians: Gaussians
     population: Population
-    reset_moments: Bool[Array, " n"]
-    """Slots whose optimiser moments must be zeroed."""
-    refused: Int[Array, ""]
-    """Requests for which there was no slot: counted, never silent."""
+    reset_moments: Bool[Array, " n"]  # slots whose optimiser moments must be zeroed
+    refused: Int[Array, ""]  # requests for which there was no slot: counted, never silent
 
 
 def fresh_population(alive: Bool[Array, " n"], owner: Int[Array, " n"] | None = None) -> Population:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import jax
 import numpy as np
@@ -34,12 +34,12 @@ LEAST_WEIGHT = 1e-3
 SeenIn = Callable[[View, int], tuple[Int[np.ndarray, " s"], Float[np.ndarray, "s 2"]]]
 
 
-def camera_centers(views: tuple[View, ...] | list[View]) -> Float[np.ndarray, "v 3"]:
+def camera_centers(views: Sequence[View]) -> Float[np.ndarray, "v 3"]:
     """Return camera centres in world coordinates, in the precision of the view matrices."""
     return np.stack([-v.viewmat[:3, :3].T @ v.viewmat[:3, 3] for v in views])
 
 
-def cameras_radius(views: list[View], points: Float[np.ndarray, "p 3"]) -> float:
+def cameras_radius(views: Sequence[View], points: Float[np.ndarray, "p 3"]) -> float:
     """Return the radius of the cameras (3DGS), scene units.
 
     Where all cameras stand in one place, the median distance of the points is used.
@@ -61,7 +61,7 @@ def subsample(count: int, limit: int, seed: int, stream: Stream = Stream.SEED_PO
 
 
 def neighbour_scales(
-    points: Float[np.ndarray, "p 3"], views: list[View]
+    points: Float[np.ndarray, "p 3"], views: Sequence[View]
 ) -> Float[np.ndarray, " p"]:
     """Return the RMS distance to the three nearest neighbours (3DGS), bounded by the view."""
     to_camera, _ = KDTree(camera_centers(views)).query(points)
@@ -75,7 +75,7 @@ def neighbour_scales(
 def gaussians_from_points(
     points: Float[np.ndarray, "p 3"],
     radiance: Float[np.ndarray, "p 3"],
-    views: list[View],
+    views: Sequence[View],
     cfg: FitConfig,
     *,
     scales: Float[np.ndarray, "p #3"] | Float[np.ndarray, " p"] | None = None,

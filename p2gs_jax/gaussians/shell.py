@@ -66,7 +66,7 @@ class Sphere:
 
 
 def sphere_behind(
-    views: list[View], points: Float[np.ndarray, "p 3"], radius: float, cfg: InitConfig
+    views: Sequence[View], points: Float[np.ndarray, "p 3"], radius: float, cfg: InitConfig
 ) -> Sphere:
     """Return where the shell of a scene lies: behind its seeds, beyond the cameras' radius."""
     middle = camera_centers(views).mean(0)
@@ -100,7 +100,7 @@ def covered_cells(view: View, points: Float[np.ndarray, "p 3"]) -> Bool[np.ndarr
 
 
 def find_shell(
-    views: list[View],
+    views: Sequence[View],
     points: Float[np.ndarray, "p 3"],
     radius: float,
     cfg: InitConfig,
@@ -147,7 +147,6 @@ def black_gaussians(
     points: np.ndarray, shell: Shell | None, views: Sequence[View], cfg: FitConfig
 ) -> Gaussians:
     """Return Gaussians of points and shell without colours: enough to compile for."""
-    views = list(views)
     black = gaussians_from_points(points, np.zeros_like(points), views, cfg)
     if shell is None:
         return black
@@ -178,4 +177,4 @@ def shell_gaussians(
     seen = weight > 0
     radiance = (total[seen] / weight[seen, None]).astype(np.float32)
     own = {"scales": shell.scales[seen], "opacity": SHELL_OPACITY}
-    return gaussians_from_points(shell.points[seen], radiance, list(views), cfg, **own)
+    return gaussians_from_points(shell.points[seen], radiance, views, cfg, **own)

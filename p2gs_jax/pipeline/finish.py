@@ -58,19 +58,10 @@ def finish(
 ) -> dict:
     """Evaluate, write all results and return what `metrics.json` holds.
 
-    Args:
-        params: live Gaussians and photometry.
-        scene: views and points.
-        store: photographs.
-        cfg: what the fit computed under.
-        folder: of the run.
-        account: of the fit.
-        reporter: receives progress.
-        owner: the moving object that each Gaussian belongs to, or None.
-        truth: photographs under one common exposure, or None.
-        lpips_weights: for LPIPS, or None to leave it out.
-        true_ev: true exposures of the training views for the plot, stops, or None.
-        still_ours: raises where the run folder is no longer this run's.
+    Parameters are those of live Gaussians, `owner` says which moving object each belongs to, and
+    `cfg` is what the fit computed under. `truth` is under one common exposure, `true_ev` has true
+    exposures of the training views in stops for the plot, and `still_ours` raises where the run
+    folder is no longer this run's.
     """
     watch = Stopwatch()
     return_freed_memory()

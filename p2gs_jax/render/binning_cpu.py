@@ -87,12 +87,6 @@ def _put(a, value, i):
     return lax.dynamic_update_slice(a, value[None], (i,))
 
 
-def _starts(keys, bound: int):
-    """Return (starts, counts) of every key value below `bound`."""
-    counts = jnp.zeros(bound, jnp.int32).at[keys].add(1, mode="drop")
-    return jnp.cumsum(counts) - counts, counts
-
-
 @compiled_loop
 def _histogram(keys, blank, used):
     """Return how often every value occurs among keys[:used], added to `blank`."""
@@ -140,7 +134,8 @@ def depth_order(depths: Float[Array, " n"], visible: Bool[Array, " n"]) -> Int[A
         digits = (keys >> shift & jnp.uint32(2**DIGIT_BITS - 1)).astype(jnp.int32)
 
         def sort(digits=digits, order=order):
-            return _place_indirect(digits, order, _starts(digits, 2**DIGIT_BITS)[0])
+            counts = jnp.zeros(2**DIGIT_BITS, jnp.int32).at[digits].add(1, mode="drop")
+            return _place_indirect(digits, order, jnp.cumsum(counts) - counts)
 
         if shift == 0:
             order = sort()

@@ -58,41 +58,24 @@ def bucket(needed: int, margin: float = 1.0) -> int:
     return length
 
 
-class TileCapacity(NamedTuple):
-    """The static length of a tile list, and how much of it is to spare."""
-
-    entries: int
-    margins: Margins = PICTURES
-
-    @classmethod
-    def allocate(cls, needed: int, margins: Margins = PICTURES) -> TileCapacity:
-        """Return the capacity for views that need so many entries, as counted."""
-        return cls(bucket(needed, margins.first), margins)
-
-    def holds(self, needed: int) -> bool:
-        """Return whether so many entries fit."""
-        return needed <= self.entries
-
-    def grown(self, needed: int) -> TileCapacity:
-        """Return the capacity for a view that overflowed; this one where it did not."""
-        if self.holds(needed):
-            return self
-        return self._replace(entries=bucket(needed, self.margins.grown))
-
-
 def until_it_fits(
-    draw: Callable[[int], tuple[Result, Any, Any]], capacity: TileCapacity
-) -> tuple[Result, TileCapacity]:
-    """Draw, with a longer tile list as long as it overflows.
+    draw: Callable[[int], tuple[Result, Any, Any]], entries: int
+) -> tuple[Result, int]:
+    """Draw a picture, with a longer tile list as long as it overflows.
 
     `draw` goes from a static number of entries to (result, entries needed, whether they
-    overflowed). The capacity that held the result is returned with it.
+    overflowed). The number that sufficed is returned with the result.
     """
     while True:
-        result, needed, overflow = draw(capacity.entries)
+        result, needed, overflow = draw(entries)
         if not bool(overflow):
-            return result, capacity
-        capacity = capacity.grown(int(needed))
+            return result, entries
+        entries = _grown(entries, int(needed), PICTURES)
+
+
+def _grown(length: int, needed: int, margins: Margins) -> int:
+    """Return the length of a list that was too short, if it was."""
+    return length if needed <= length else bucket(needed, margins.grown)
 
 
 class Room(NamedTuple):
@@ -122,9 +105,10 @@ class Room(NamedTuple):
 
     def grown(self, entries: int, visible: int) -> Room:
         """Return room for a view that needs this, with some to spare; only what was short grows."""
-        lists = TileCapacity(self.entries, TRAINING).grown(entries)
-        shown = TileCapacity(self.visible, TRAINING_VISIBLE).grown(visible)
-        return Room(lists.entries, shown.entries)
+        return Room(
+            _grown(self.entries, entries, TRAINING),
+            _grown(self.visible, visible, TRAINING_VISIBLE),
+        )
 
 
 count_needed = jax.jit(required_capacity, static_argnames="cfg")
@@ -147,7 +131,7 @@ def make_renderer(cfg: RenderConfig, owners: Int[np.ndarray, " n"] | None = None
     `owners` are what `owner` is where it is not given.
     """
     known = None if owners is None else on_device(owners, np.int32)
-    capacities: dict[tuple[int, int], TileCapacity] = {}
+    capacities: dict[tuple[int, int], int] = {}
 
     def render_view(
         gaussians: Gaussians,
@@ -159,7 +143,7 @@ def make_renderer(cfg: RenderConfig, owners: Int[np.ndarray, " n"] | None = None
         size = (camera.width, camera.height)
         if size not in capacities:
             needed = int(count_needed(gaussians, alive, camera, cfg=cfg, owner=owner))
-            capacities[size] = TileCapacity.allocate(needed)
+            capacities[size] = bucket(needed, PICTURES.first)
 
         def draw(entries: int) -> tuple[Render, Array, Array]:
             render = compiled_renderer()

@@ -52,7 +52,7 @@ def basis(directions: Directions, degree: int) -> list[Float[Array, " n"]]:
     """Return the (degree + 1)^2 basis values of unit directions, as separate vectors."""
     x, y, z = directions
     xx, yy, zz = x * x, y * y, z * z
-    values = [jnp.full_like(x, C0)]
+    values: list = [jnp.full_like(x, C0)]
     if degree >= 1:
         values += [-C1 * y, C1 * z, -C1 * x]
     if degree >= 2:

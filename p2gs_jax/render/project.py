@@ -113,6 +113,11 @@ def rotation_matrices(quats: Float[Array, "n 4"]) -> list[list[Float[Array, " n"
     ]
 
 
+def rotated(R: list[list[Float[Array, " n"]]], local: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    """Return vectors along principal axes in world coordinates; R is from `rotation_matrices`."""
+    return jnp.stack([sum(R[i][j] * local[:, j] for j in range(3)) for i in range(3)], -1)
+
+
 def project(
     gaussians: Gaussians, alive: Bool[Array, " n"], camera: Camera | Frustum, cfg: RenderConfig
 ) -> Splats2D:

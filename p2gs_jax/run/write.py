@@ -74,15 +74,15 @@ def write_run(
         params: live Gaussians and photometry.
         scene: its views.
         cfg: what the fit computed under.
-        owner: the moving object that each Gaussian belongs to, or None.
+        owner: the moving object that each Gaussian belongs to, a row of `moving`.
         moving: these objects, with their poses.
         metering: what explains the exposures, from an evaluation.
         decisions: of a fit that wrote no `config.json`: it is written as well.
         fitted: exposures solved for held-out views, by row.
         unknown: names of photographs that tell no exposure.
-        solution: what the fit started from, or None.
+        solution: what the fit started from.
         shown: views of the summary; none: there is no summary.
-        true_ev: true exposures of the training views for the plot, stops, or None.
+        true_ev: true exposures of the training views for the plot, stops.
     """
     if not isinstance(folder, RunFolder):
         folder = RunFolder(Path(folder))

@@ -21,7 +21,7 @@ from p2gs_jax.config import RenderConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.render.capacity import (
     ANYWHERE,
-    TileCapacity,
+    bucket,
     compiled_renderer,
     count_needed,
     make_renderer,
@@ -163,8 +163,8 @@ class Renderer:
         self._on_change()
         cameras = [probe(size) for probe in self._probes]
         counts = [int(count_needed(*self._scene, c, cfg=self._cfg)) for c in cameras]
-        capacity = TileCapacity.allocate(max(needed, *counts), ANYWHERE)
-        static = {"cfg": self._cfg, "capacity": capacity.entries}
+        entries = bucket(max(needed, *counts), ANYWHERE.first)
+        static = {"cfg": self._cfg, "capacity": entries}
         run = compiled_renderer().lower(*self._scene, cameras[0], **static).compile()
         with self._one_frame:
             result = jax.block_until_ready(run(*self._scene, cameras[0]))

@@ -1,5 +1,7 @@
-"""Named seconds, and counted compilations."""
+"""Named seconds, counted compilations, and a budget that was not kept."""
 
+import io
+import json
 import threading
 import time
 
@@ -7,8 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rich.console import Console
+from tiny_scene import make_scene
 
-from p2gs_jax.core.clock import CompileCounter, Stopwatch
+from p2gs_jax.cli import main
+from p2gs_jax.core import progress
+from p2gs_jax.core.clock import CompileCounter, Stopwatch, over_budget, whole_run
+from p2gs_jax.core.progress import LogRecord, TerminalReporter
+from p2gs_jax.train.loop import Trainer
 
 
 def test_seconds_of_a_name_add_up_in_the_order_of_first_use():
@@ -50,3 +58,70 @@ def test_what_other_threads_compile_is_counted():
     for thread in threads:
         thread.join()
     assert counter.programs == 4
+
+
+SECONDS = {
+    "starting": 2.0,
+    "photometry": 12.0,
+    "steps": 5.0,
+    "evaluation": 10.0,
+    "files": 3.0,
+    "total_until_evaluation": 21.0,
+    "optimisation": 6.0,
+    "evaluation_and_files": 13.0,
+    "compiler_in_all_threads": 40.0,
+}
+
+
+def test_a_run_takes_what_comes_before_the_evaluation_and_it():
+    assert whole_run(SECONDS) == 34.0
+    assert whole_run({}) is None
+    assert whole_run({"total_until_evaluation": "long"}) is None
+
+
+def test_a_budget_that_was_exceeded_is_said_with_the_reasons():
+    text = over_budget(5.0, SECONDS)
+    assert text.startswith("The budget of 5 s was exceeded: the run took 34 s (photometry 12, ")
+    assert "evaluation 10, steps 5" in text
+    assert "compiler" not in text
+    for kept in (None, 34.0, 31.0):
+        assert over_budget(kept, SECONDS) is None
+    assert over_budget(29.0, SECONDS) is not None
+
+
+def test_progress_is_a_line_now_and_then_where_there_is_no_terminal(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    out = io.StringIO()
+    with TerminalReporter(Console(file=out, width=200)) as reporter:
+        for k in range(40):
+            now[0] += 1.0
+            reporter.stage("Rendering", k, 40)
+        assert out.getvalue().split("\n") == ["Rendering 14/40", "Rendering 29/40", ""]
+        now[0] += 20
+        reporter.log(LogRecord(70, 0.5, 0.1, 24.0, 900, 1, 5, 30.0, 0.1, 30.0, {}))
+    assert "50%, step 70, PSNR 24.00 dB, 900 Gaussians, 0:30 left" in out.getvalue()
+
+
+def test_what_a_fit_said_about_its_budget_is_in_its_notes(tmp_path, monkeypatch, capsys):
+    early, original = "The budget ended the run at 50% of its schedule.", Trainer.run
+
+    def run(self, *args, **more):
+        self.on_message(early)
+        return original(self, *args, **more)
+
+    monkeypatch.setattr(Trainer, "run", run)
+    argv = [
+        *("fit", str(make_scene(tmp_path / "scene")), "--out", str(tmp_path / "run")),
+        *("--budget", "1s", "--train.coarse-to-fine", "--test-every", "3"),
+        *("--densify.max-gaussians", "400", "--render.sh-degree", "1", "--init.shell", "off"),
+        *("--init.dense", "off"),
+    ]
+    with pytest.raises(SystemExit) as stop:
+        main(argv)
+    assert stop.value.code == 0
+    said = " ".join(capsys.readouterr().err.split())
+    notes = json.loads((tmp_path / "run" / "metrics.json").read_text())["notes"]
+    for start in (early, "The budget of 1 s was exceeded"):
+        (note,) = [n for n in notes if n.startswith(start)]
+        assert " ".join(note.split()) in said

@@ -50,7 +50,15 @@ def quick_presets(monkeypatch):
         init=dataclasses.replace(slow.init, shell="off"),
         train=dataclasses.replace(slow.train, steps=10, coarse_to_fine=()),
     )
-    monkeypatch.setattr(presets, "FitConfig", lambda **given: dataclasses.replace(quick, **given))
+
+    class Quick(type):
+        def __call__(cls, **given):
+            return dataclasses.replace(quick, **given)
+
+        def __instancecheck__(cls, value):
+            return isinstance(value, config.FitConfig)
+
+    monkeypatch.setattr(presets, "FitConfig", Quick("FitConfig", (), {}))
 
 
 @pytest.fixture

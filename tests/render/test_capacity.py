@@ -1,10 +1,8 @@
 """Lists are longer than needed by known margins, and grow until a view fits."""
 
 import numpy as np
-import pytest
 
-from p2gs_jax.render import capacity
-from p2gs_jax.render.capacity import SMALLEST, Margins, Room, TileCapacity, bucket, until_it_fits
+from p2gs_jax.render.capacity import FEWEST_ENTRIES, SMALLEST, Room, bucket, until_it_fits
 from p2gs_jax.render.visible import BLOCK
 
 
@@ -16,15 +14,6 @@ def test_buckets_are_few_and_hold_what_they_must():
         assert needed * 1.5 <= bucket(needed, 1.5) <= max(SMALLEST, 1.26 * 1.5 * needed)
 
 
-@pytest.mark.parametrize("margins", [capacity.PICTURES, capacity.ANYWHERE, capacity.TRAINING])
-def test_a_capacity_is_allocated_and_grown_with_its_margins(margins):
-    first = TileCapacity.allocate(50_000, margins)
-    assert first.entries == bucket(50_000, margins.first)
-    assert first.holds(50_000)
-    assert first.grown(first.entries) is first
-    assert first.grown(first.entries + 1) == (bucket(first.entries + 1, margins.grown), margins)
-
-
 def test_a_view_is_drawn_again_until_it_fits():
     needs, drawn = iter([30_000, 90_000, 60_000]), []
 
@@ -33,9 +22,9 @@ def test_a_view_is_drawn_again_until_it_fits():
         needed = np.int32(next(needs))
         return f"{entries}", needed, needed > entries
 
-    result, found = until_it_fits(draw, TileCapacity(SMALLEST, Margins(1.0, 1.1)))
+    result, found = until_it_fits(draw, SMALLEST)
     assert drawn == [SMALLEST, bucket(30_000, 1.1), bucket(90_000, 1.1)]
-    assert result == f"{found.entries}" == f"{drawn[-1]}"
+    assert result == f"{found}" == f"{drawn[-1]}"
 
 
 def test_room_of_a_run_foresees_growth_within_its_bound():
@@ -45,6 +34,9 @@ def test_room_of_a_run_foresees_growth_within_its_bound():
     # Four times as many Gaussians are smaller: their lists are twice as long.
     assert later == (bucket(4 * int(9000 * 1.1 * 4.0)), 10 * BLOCK)
     assert Room.allocate(40_000, 9000, 4.0, 5000).visible == 2 * BLOCK
-    assert Room.allocate(1, 1, 1.0, 100) == (bucket(capacity.FEWEST_ENTRIES), BLOCK)
+    assert Room.allocate(1, 1, 1.0, 100) == (bucket(FEWEST_ENTRIES), BLOCK)
     assert later.holds(now)
     assert not now.holds(later)
+    # Only what was short grows.
+    assert now.grown(80_000, 1) == (bucket(80_000, 1.5), now.visible)
+    assert now.grown(1, 20_000) == (now.entries, bucket(20_000, 1.2))

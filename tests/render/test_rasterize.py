@@ -7,12 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import camera, cast, street
+from scenes import camera, street
 
 from benchmarks.hard_cases import splats
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import bin_tiles, project, render_linear, required_capacity, view_radiance
-from p2gs_jax.types import Gaussians
 
 CFG = RenderConfig(pixels_in_flight=2048)
 ORACLE = dataclasses.replace(CFG, implementation="reference")
@@ -61,6 +60,7 @@ def oracle():
         ((16, 8), None),
         ((16, 16), None),
         pytest.param((8, 8), None, marks=pytest.mark.slow),
+        pytest.param((32, 4), None, marks=pytest.mark.slow),
     ],
 )
 def test_values_and_gradients_match_oracle(oracle, tile, stop, implementation):
@@ -116,45 +116,11 @@ def test_oracle_gradient_matches_finite_differences():
             assert abs(numeric - exact) <= 1e-6 * max(abs(exact), 1.0), name
 
 
-def test_garden_statistics_match_oracle(shared_data):
-    """Real trained-scene statistics: a crop of the garden, seen through one of its cameras."""
-    data = np.load(shared_data("garden_crop") / "test_garden.npz")
-    rng = np.random.default_rng(0)
-    pick = rng.choice(len(data["means3d"]), 4000, replace=False)
-    g = Gaussians(
-        means=data["means3d"][pick],
-        quats=rng.normal(size=(4000, 4)),
-        log_scales=np.log(rng.uniform(0.002, 0.08, (4000, 3))),
-        opacity_logits=rng.normal(0, 2, 4000),
-        sh=np.log(data["colors"][pick][:, None] / 255.0 + 0.01) / 0.28,
-    )
-    shrink = 0.1
-    K = data["Ks"][0] * np.array([[shrink], [shrink], [1]])
-
-    def image(cfg, dtype):
-        cam = cast(camera(64, 42, viewmat=data["viewmats"][0]), dtype)
-        cam = dataclasses.replace(cam, K=jnp.asarray(K, dtype))
-        return np.asarray(render(cast(jax.tree.map(jnp.asarray, g), dtype), cam, cfg).linear)
-
-    fast = image(CFG, jnp.float32)
-    with jax.enable_x64(True):
-        exact = image(ORACLE, jnp.float64)
-    psnr = 10 * np.log10(exact.max() ** 2 / np.mean((fast - exact) ** 2))
-    assert psnr > 95, psnr
-
-
 @pytest.fixture(scope="module")
 def shown():
     """A small street and its image."""
     g, cam = street(n=300)
     return g, cam, render(g, cam).linear
-
-
-@pytest.mark.parametrize("tile", [(16, 16), (32, 4)])
-def test_tile_size_does_not_change_the_image(shown, tile):
-    g, cam, image = shown
-    other = render(g, cam, dataclasses.replace(CFG, tile=tile)).linear
-    np.testing.assert_allclose(image, other, atol=(2e-5 + CFG.stop_error) * float(image.max()))
 
 
 def test_the_order_of_gaussians_does_not_matter(shown):

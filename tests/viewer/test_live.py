@@ -20,6 +20,7 @@ from p2gs_jax.run.read import load_run
 from p2gs_jax.scene.pixels.store import camera_of
 from p2gs_jax.viewer import live as live_module
 from p2gs_jax.viewer import panel as panels
+from p2gs_jax.viewer import renderer as renderer_module
 from p2gs_jax.viewer import session as sessions
 from p2gs_jax.viewer.live import Darkroom, LivePicture
 from p2gs_jax.viewer.pictures import limits_of_depth
@@ -116,7 +117,7 @@ def test_a_new_look_renders_nothing(setup, client):
 
 
 def test_slow_frames_make_small_pictures_while_moving(setup, client, monkeypatch):
-    monkeypatch.setattr("p2gs_jax.viewer.renderer.TARGET_MS", 1e-3)
+    monkeypatch.setattr(renderer_module, "TARGET_MS", 1e-3)
     setup.live.start()
     seen = client.wait_sharp()
     for x in (0.1, 0.2):
