@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -41,6 +41,32 @@ class Account:
     of: dict | None = None  # scores of the model that was converted, as it was; None: this is a fit
 
 
+class _Shown:
+    """Writes held-out views as they are judged, and keeps those of the summary.
+
+    `fitted` has the exposures of held-out views by row.
+    """
+
+    def __init__(self, scene: Scene, store: ImageStore, folder: RunFolder, watch: Stopwatch):
+        self._scene, self._store, self._folder, self._watch = scene, store, folder, watch
+        self._summary: dict[int, ViewResult | None] = dict.fromkeys(summary_rows(scene))
+        self.fitted: dict[int, float] = {}
+
+    def add(self, result: ViewResult) -> None:
+        """Take a view."""
+        view = self._scene.views[result.index]
+        if view.split == "test":
+            self.fitted[result.index] = result.transform.exposure
+            with self._watch("files"):
+                write_view(self._folder.renders, view.name, result, self._store)
+        if result.index in self._summary:
+            self._summary[result.index] = result
+
+    def summary(self) -> list[ViewResult]:
+        """Return the views of the summary, in its order."""
+        return [result for result in self._summary.values() if result is not None]
+
+
 def finish(
     params: Params,
     scene: Scene,
@@ -53,31 +79,18 @@ def finish(
     owner: np.ndarray | None = None,
     truth: Reference | None = None,
     lpips_weights: LpipsWeights | None = None,
-    true_ev: np.ndarray | None = None,
+    true_exposures: Mapping[str, float] | None = None,
     still_ours: Callable[[], None] = lambda: None,
 ) -> dict:
     """Evaluate, write all results and return what `metrics.json` holds.
 
-    Parameters are those of live Gaussians, `owner` says which moving object each belongs to, and
-    `cfg` is what the fit computed under. `truth` is under one common exposure, `true_ev` has true
-    exposures of the training views in stops for the plot, and `still_ours` raises where the run
-    folder is no longer this run's.
+    Gaussians are the live ones, `owner` says which moving object each belongs to, and `cfg` is what
+    the fit computed under; `still_ours` raises where the run folder is no longer this run's.
     """
     watch = Stopwatch()
     return_freed_memory()
     _import_ahead("matplotlib.figure")
-    fitted: dict[int, float] = {}
-    shown: dict[int, ViewResult | None] = dict.fromkeys(summary_rows(scene))
-
-    def on_view(result: ViewResult) -> None:
-        view = scene.views[result.index]
-        if view.split == "test":
-            fitted[result.index] = result.transform.exposure
-            with watch("files"):
-                write_view(folder.renders, view.name, result, store)
-        if result.index in shown:
-            shown[result.index] = result
-
+    views = _Shown(scene, store, folder, watch)
     with watch("evaluation"):
         found = evaluate(
             params,
@@ -88,11 +101,10 @@ def finish(
             reference=truth,
             radiance=find_radiance(scene, store),
             lpips_weights=lpips_weights,
-            on_view=on_view,
+            on_view=views.add,
             on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
         )
-    metered = [found.metering.sentence] if found.metering.telling else []
-    _tell([*untold_notes(found.metrics), *metered], account, reporter)
+    _tell([*untold_notes(found.metrics), *found.metering.notes], account, reporter)
     # Views are written while they are judged.
     watch.add("evaluation", -watch.seconds.get("files", 0.0))
     reporter.stage("Writing files")
@@ -105,15 +117,14 @@ def finish(
             cfg,
             owner=owner,
             moving=store.moving,
-            fitted={r: e for r, e in fitted.items() if scene.views[r].name not in hidden},
+            fitted={r: e for r, e in views.fitted.items() if scene.views[r].name not in hidden},
             unknown=found.metrics.get("exposures_unknown", ()),
             solution=None if account.selection is None else account.selection.solution,
-            shown=[result for result in shown.values() if result is not None],
+            shown=views.summary(),
             metering=found.metering,
-            true_ev=true_ev,
+            true_exposures=true_exposures,
         )
-        if found.unexplained:
-            write_unexplained(folder.unexplained, scene, store, found.unexplained)
+        write_unexplained(folder.unexplained, scene, store, found.unexplained)
     metrics = found.metrics | _accounted(account, watch, scene, cfg, reporter)
     still_ours()
     write_json(folder.metrics, metrics)
