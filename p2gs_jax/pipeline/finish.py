@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,10 +14,10 @@ from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.clock import CompileCounter, Stopwatch, over_budget
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.core.runtime import return_freed_memory
-from p2gs_jax.evaluation.evaluate import ViewResult, evaluate
+from p2gs_jax.evaluation.evaluate import evaluate
 from p2gs_jax.evaluation.lpips import LpipsWeights
 from p2gs_jax.evaluation.references import Reference, find_radiance
-from p2gs_jax.evaluation.scores import is_drive, untold_notes
+from p2gs_jax.evaluation.scores import ViewResult, is_drive, untold_notes
 from p2gs_jax.photometry.calibrate import Selection
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.folder import RunFolder
@@ -42,25 +42,28 @@ class Account:
 
 
 class _Shown:
-    """Writes held-out views as they are judged, and keeps those of the summary.
-
-    `fitted` has the exposures of held-out views by row.
-    """
+    """Writes held-out views as they are judged, and keeps those of the summary."""
 
     def __init__(self, scene: Scene, store: ImageStore, folder: RunFolder, watch: Stopwatch):
         self._scene, self._store, self._folder, self._watch = scene, store, folder, watch
         self._summary: dict[int, ViewResult | None] = dict.fromkeys(summary_rows(scene))
-        self.fitted: dict[int, float] = {}
+        self._fitted: dict[int, float] = {}
+        _import_ahead("matplotlib.figure")
 
     def add(self, result: ViewResult) -> None:
         """Take a view."""
         view = self._scene.views[result.index]
         if view.split == "test":
-            self.fitted[result.index] = result.transform.exposure
+            self._fitted[result.index] = result.transform.exposure
             with self._watch("files"):
                 write_view(self._folder.renders, view.name, result, self._store)
         if result.index in self._summary:
             self._summary[result.index] = result
+
+    def fitted(self, hidden: Collection[str]) -> dict[int, float]:
+        """Return the exposures of held-out views by row, but those of `hidden` names."""
+        views = self._scene.views
+        return {row: e for row, e in self._fitted.items() if views[row].name not in hidden}
 
     def summary(self) -> list[ViewResult]:
         """Return the views of the summary, in its order."""
@@ -89,7 +92,6 @@ def finish(
     """
     watch = Stopwatch()
     return_freed_memory()
-    _import_ahead("matplotlib.figure")
     views = _Shown(scene, store, folder, watch)
     with watch("evaluation"):
         found = evaluate(
@@ -104,11 +106,10 @@ def finish(
             on_view=views.add,
             on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
         )
-    _tell([*untold_notes(found.metrics), *found.metering.notes], account, reporter)
-    # Views are written while they are judged.
-    watch.add("evaluation", -watch.seconds.get("files", 0.0))
+    metered = [found.metering.sentence] if found.metering.telling else []
+    _tell([*untold_notes(found.metrics), *metered], account, reporter)
+    watch.add("evaluation", -watch.seconds.get("files", 0.0))  # views are written meanwhile
     reporter.stage("Writing files")
-    hidden = found.metrics.get("hidden", ())
     with watch("files"):
         write_run(
             folder,
@@ -117,7 +118,7 @@ def finish(
             cfg,
             owner=owner,
             moving=store.moving,
-            fitted={r: e for r, e in views.fitted.items() if scene.views[r].name not in hidden},
+            fitted=views.fitted(found.metrics.get("hidden", ())),
             unknown=found.metrics.get("exposures_unknown", ()),
             solution=None if account.selection is None else account.selection.solution,
             shown=views.summary(),
