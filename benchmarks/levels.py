@@ -128,7 +128,7 @@ def whole_step(scene: BenchScene, cfg: FitConfig, linear: np.ndarray, entries: i
     holder = [jax.tree.map(jnp.copy, initial_state(params, alive, optimizer))]
     degree = cfg.render.sh_degree
     controls = Controls(jnp.float32(0.5), jnp.int32(degree), jnp.float32(1), jnp.uint32(0))
-    partner, step = Partner(jnp.int32(0)), Step(cfg, optimizer, 1.0)
+    partner, step = Partner(jnp.int32(0)), Step(cfg, optimizer, 1.0, cfg.densify.noise)
     room = Room(entries, whole_blocks(scene.gaussians.capacity))
 
     def run():

@@ -20,17 +20,8 @@ from p2gs_jax.core.atomic import write_text
 from p2gs_jax.core.numerics import srgb_decode
 from p2gs_jax.errors import UserError, broken
 from p2gs_jax.scene.cache import Report, cached_folder, file_fingerprints
+from p2gs_jax.scene.convert import icc
 from p2gs_jax.scene.convert.convert import Converted, cache_of, write_png
-from p2gs_jax.scene.convert.icc import (
-    BT709,
-    BT2020,
-    DISPLAY_P3,
-    Primaries,
-    Transfer,
-    encode_16,
-    to_light,
-    to_srgb_matrix,
-)
 from p2gs_jax.scene.motion import WIDTH, Chosen, choose_frames, thinned
 
 RECORD = "frames.json"
@@ -42,8 +33,8 @@ VIDEO_SUFFIXES = frozenset(
     {".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".ts", ".3gp", ".insv"}
 )
 # Codes of ITU-T H.273, in FFmpeg's numbers.
-_TRANSFERS: dict[int, Transfer] = {16: "pq", 18: "hlg"}
-_PRIMARIES: dict[int, Primaries] = {9: BT2020, 12: DISPLAY_P3}
+_TRANSFERS: dict[int, icc.Transfer] = {16: "pq", 18: "hlg"}
+_PRIMARIES: dict[int, icc.Primaries] = {9: icc.BT2020, 12: icc.DISPLAY_P3}
 _BT601 = (0.299, 0.114)
 # Weights of red and blue in luma, by matrix.
 _LUMA = {1: (0.2126, 0.0722), 5: _BT601, 6: _BT601, 7: (0.212, 0.087), 9: (0.2627, 0.0593)}
@@ -72,7 +63,7 @@ class Frame:
         return (height, width) if self.turn % 2 else (width, height)
 
     @property
-    def transfer(self) -> Transfer | None:
+    def transfer(self) -> icc.Transfer | None:
         """Transfer function, where it is one that gives light; None: a camera's own curve."""
         return _TRANSFERS.get(int(self._decoded.color_trc))
 
@@ -88,12 +79,14 @@ class Frame:
     def codes(self) -> UInt[np.ndarray, "h w 3"]:
         """Return display values in sRGB, upright: of more than 8 bits, and of light, 16."""
         signal = _signal(self._decoded)
-        primaries = _PRIMARIES.get(int(self._decoded.color_primaries), BT709)
+        primaries = _PRIMARIES.get(int(self._decoded.color_primaries), icc.BT709)
         if self.transfer is not None:
-            light = to_light(signal, self.transfer) @ to_srgb_matrix(primaries).T
-            codes = encode_16(light)
-        elif primaries is not BT709:
-            codes = encode_16(srgb_decode(np.clip(signal, 0, 1)) @ to_srgb_matrix(primaries).T)
+            light = icc.to_light(signal, self.transfer) @ icc.to_srgb_matrix(primaries).T
+            codes = icc.encode_16(light)
+        elif primaries is not icc.BT709:
+            codes = icc.encode_16(
+                srgb_decode(np.clip(signal, 0, 1)) @ icc.to_srgb_matrix(primaries).T
+            )
         elif max(c.bits for c in self._decoded.format.components) > 8:
             codes = np.rint(np.clip(signal, 0, 1) * 65535).astype(np.uint16)
         else:

@@ -41,7 +41,7 @@ from p2gs_jax.train.image_gradient import ImageGradient, Listed, differentiable
 from p2gs_jax.train.optimizer import learning_rates, means_rate
 from p2gs_jax.train.state import FitState
 from p2gs_jax.train.step import Step, static_sizes
-from p2gs_jax.train.update import StepReport, is_healthy, settled, update_listed
+from p2gs_jax.train.update import StepReport, concluded, is_healthy, update_listed
 from p2gs_jax.types import Gaussians
 
 VIEWS = "views"
@@ -232,7 +232,7 @@ def _advance(
             seen_count=population.seen_count + jnp.where(healthy, sums.pulled, 0),
         )
     moved = (updated, population)
-    return settled(
+    return concluded(
         state, moved, gradient, fits, most, rates, cfg=cfg, optimizer=optimizer, views=views
     )
 

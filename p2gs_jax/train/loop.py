@@ -18,7 +18,6 @@ from pathlib import Path
 import jax
 import numpy as np
 from jax.sharding import Mesh
-from jaxtyping import Bool
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core import interrupts
@@ -312,7 +311,7 @@ class Trainer:
         with self.stopwatch("checkpoints"):
             self.checkpoints.save(state, host)
 
-    def _allocate(self, gaussians: Gaussians, alive: Bool, owner, host: HostState) -> None:
+    def _allocate(self, gaussians: Gaussians, alive, owner, host: HostState) -> None:
         """Make room for the image sizes to come."""
         host.rooms = room.allocate(
             host.rooms,

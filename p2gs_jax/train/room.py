@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import RenderConfig
@@ -49,7 +49,10 @@ def count_view(
         R, t = np.moveaxis(R[..., seen], -1, 0), t[..., seen].T
         local = np.einsum("nij,nj->ni", R, shown.means) + t
     x, y, z = local.T
-    axes = R @ rotations(shown.quats)
+    # Quaternions have any length; one of zeros is the identity.
+    none = ~np.any(shown.quats, axis=1, keepdims=True)
+    quats = np.where(none, np.eye(1, 4), shown.quats)
+    axes = R @ Rotation.from_quat(quats, scalar_first=True).as_matrix()
     axes *= np.exp(np.clip(shown.log_scales, *LOG_SCALE_RANGE))[:, None]
     reach = -np.logaddexp(0, -shown.opacity_logits) - np.log(smallest_cutoff(cfg))
     tiles, boxed = np.ones(len(z)), np.ones(len(z), bool)
@@ -64,13 +67,6 @@ def count_view(
         first, last = (np.floor(np.clip(edge, 0, size - 1) / cfg.tile[i]) for edge in (low, high))
         tiles *= last - first + 1
     return int(tiles[boxed].sum()), int(seen.sum())
-
-
-def rotations(quats: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:
-    """Return rotation matrices of quaternions (w, x, y, z) of any length; of zero, the identity."""
-    zero = ~np.any(quats, axis=1, keepdims=True)
-    known = np.where(zero, np.eye(1, 4), quats)
-    return Rotation.from_quat(known, scalar_first=True).as_matrix()
 
 
 def room_for(

@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+import numpy as np
+from jaxtyping import Array, Bool, Int
 
 from p2gs_jax.gaussians.population import empty_gaussians, empty_population, fresh_population, grow
 from p2gs_jax.render.capacity import Room
@@ -72,10 +73,10 @@ class HostState:
 
 def initial_state(
     params: Params,
-    alive: Array,
+    alive: Bool[Array, " n"] | Bool[np.ndarray, " n"],
     optimizer: Optimizer,
     slots: int = 0,
-    owner: Int[Array, " n"] | None = None,
+    owner: Int[Array, " n"] | Int[np.ndarray, " n"] | None = None,
 ) -> FitState:
     """Return the state before the first step, with room for `slots` Gaussians at least.
 

@@ -86,6 +86,7 @@ class Step:
     noise: float | None = None  # scale of the exploration noise, or None (`strategies.Strategy`)
     # loss terms that differ from those of `cfg`; see `loss_terms`
     terms: Mapping[str, LossTerm | None] = dataclasses.field(default_factory=dict)
+    _ready: dict[Any, Callable] = dataclasses.field(default_factory=dict, init=False)
 
     def __call__(
         self,
@@ -98,8 +99,10 @@ class Step:
         degree: int,
     ) -> tuple[FitState, StepReport]:
         """Take a step, compiling it on first use."""
-        parts = (self.program(name, room, degree) for name in PROGRAMS)
-        return self.chained(*parts)(state, batch, partner, controls)
+        if (room, degree) not in self._ready:
+            parts = (self.program(name, room, degree) for name in PROGRAMS)
+            self._ready[room, degree] = self.chained(*parts)
+        return self._ready[room, degree](state, batch, partner, controls)
 
     def chained(self, show, differentiate, advance):
         """Return the step made of its three programs, compiled or not."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -64,6 +64,7 @@ class Moment(NamedTuple):
     host: HostState
 
 
+@runtime_checkable
 class Strategy(Protocol):
     """When asked, gives another population.
 

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from p2gs_jax.config import FitConfig, LossConfig, PhotometryConfig, RegularizerConfig
+from p2gs_jax.config import FitConfig, LossConfig
 from p2gs_jax.evaluation.ssim import one_less_ssim
 from p2gs_jax.photometry.appearance import Correction, Corrections, regularisation
 from p2gs_jax.photometry.luminance import ENTRIES, Curves, cumulative, enhanced, pseudo_curve
@@ -87,19 +87,19 @@ The attribute `needs_depth = True` on it makes `Rendered.depth` known.
 
 @dataclass(frozen=True)
 class Term:
-    """A built-in term, `weight` times `of(rendered, target, aux, *given)`.
+    """A built-in term: `weight` times `BUILT_IN[name]`, which is given what else it needs.
 
     It is equal to another where its parts are, so that fits share programs.
     """
 
-    of: Callable[..., Float[Array, ""] | None]
+    name: str
     weight: float = 1.0
     given: tuple[Any, ...] = ()
-    needs_depth: bool = False
+    needs_depth: bool = False  # see `LossTerm`
 
     def __call__(self, rendered: Rendered, target: Target, aux: Aux) -> Float[Array, ""] | None:
         """Return the weighted value."""
-        value = self.of(rendered, target, aux, *self.given)
+        value = BUILT_IN[self.name](rendered, target, aux, *self.given)
         return value if value is None or self.weight == 1.0 else self.weight * value
 
 
@@ -110,31 +110,26 @@ def loss_terms(
 
     Those in `changed` are added, or take the place of those of the same name; None takes one away.
     """
-    loss, photometry = cfg.loss, cfg.photometry
-    found: dict[str, LossTerm] = {"l1": Term(_l1, given=(1 - (loss.dssim_weight or 0.0),))}
+    loss, photometry, kind = cfg.loss, cfg.photometry, cfg.photometry.appearance
+    relative, priors = loss.relative_exposure.weight, loss.regularizers
+    found = [Term("l1", given=(1 - (loss.dssim_weight or 0.0),))]
     if loss.dssim_weight is not None:
-        found["dssim"] = Term(_dssim, loss.dssim_weight)
-    if photometry.appearance == "luminance":
-        found["enhanced"] = Term(_enhanced, given=(loss,))
-        found["contrast"] = Term(_contrast)
-        found["curve"] = Term(_curve, CURVE)
+        found.append(Term("dssim", loss.dssim_weight))
+    if kind == "luminance":
+        found += [Term("enhanced", given=(loss,)), Term("contrast"), Term("curve", CURVE)]
     if loss.alpha is not None:
-        found["alpha"] = Term(_alpha, loss.alpha)
+        found.append(Term("alpha", loss.alpha))
     if loss.lidar is not None:
-        found["lidar"] = Term(_lidar, loss.lidar, needs_depth=True)
-    if loss.relative_exposure.weight is not None:
-        weight = loss.relative_exposure.weight
-        found["relative_exposure"] = Term(_relative_exposure, weight, (loss, photometry))
-    for name in PRIORS:
-        weight = getattr(loss.regularizers, name)
-        if weight is not None:
-            found[name] = Term(_prior, weight, (name,))
-    if photometry.appearance is not None and loss.regularizers.appearance is not None:
-        found["appearance"] = Term(
-            _appearance, loss.regularizers.appearance, (photometry.appearance,)
-        )
-    everything: dict[str, LossTerm | None] = {**found, **(changed or {})}
-    return {name: term for name, term in everything.items() if term is not None}
+        found.append(Term("lidar", loss.lidar, needs_depth=True))
+    if relative is not None:
+        found.append(Term("relative_exposure", relative, (loss, photometry)))
+    weights = {name: getattr(priors, name) for name in PRIORS}
+    found += [Term(name, weight) for name, weight in weights.items() if weight is not None]
+    if kind is not None and priors.appearance is not None:
+        found.append(Term("appearance", priors.appearance, (kind,)))
+    terms: dict[str, LossTerm | None] = {term.name: term for term in found}
+    terms |= changed or {}
+    return {name: term for name, term in terms.items() if term is not None}
 
 
 # ------------------------------------------------------------- photographs against renders
@@ -179,40 +174,15 @@ def photometric_loss(
     weight = cfg.dssim_weight
     terms = {"l1": absolute_error(ldr, target, mask, 1 - (weight or 0.0))}
     if weight is not None:
-        shown = jnp.where(mask[..., None] > 0, ldr, 0.0)
-        terms["dssim"] = weight * one_less_ssim(shown, target, mask)
+        terms["dssim"] = weight * dissimilarity(ldr, target, mask)
     return terms
 
 
-def _l1(rendered: Rendered, target: Target, aux: Aux, weight: float):
-    return absolute_error(rendered.judged, target.ldr, target.mask, weight)
-
-
-def _dssim(rendered: Rendered, target: Target, aux: Aux):
-    shown = jnp.where(target.mask[..., None] > 0, rendered.judged, 0.0)
-    return one_less_ssim(shown, target.ldr, target.mask)
-
-
-def _alpha(rendered: Rendered, target: Target, aux: Aux):
-    """Return the mean difference of opacities; None for photographs without alpha."""
-    if target.alpha is None:
-        return None
-    apart = jnp.sum(target.mask * jnp.abs(rendered.alpha - target.alpha))
-    return apart / jnp.maximum(jnp.sum(target.mask), 1.0)
-
-
-def _lidar(rendered: Rendered, target: Target, aux: Aux):
-    if target.measured is None:
-        return None
-    return lidar_loss(rendered.alpha, rendered.depth, target.measured)
-
-
-def _relative_exposure(
-    rendered: Rendered, target: Target, aux: Aux, loss: LossConfig, formed: PhotometryConfig
-):
-    views = (aux.view, aux.other_view)
-    linears = (rendered.linear, aux.other_linear)
-    return relative_exposure_loss(linears, views, aux.pairs, aux.photometry, loss, formed)
+def dissimilarity(
+    ldr: Float[Array, "h w 3"], target: Float[Array, "h w 3"], mask: Float[Array, "h w"]
+) -> Float[Array, ""]:
+    """Return 1 - SSIM over valid pixels."""
+    return one_less_ssim(jnp.where(mask[..., None] > 0, ldr, 0.0), target, mask)
 
 
 # ------------------------------------------------------------------------------- priors
@@ -232,23 +202,6 @@ PRIORS: dict[str, Callable[[Photometry], Float[Array, ""]]] = {
     "log_exposure_mean": lambda p: jnp.mean(p.log_exposures) ** 2,
     "gamma_mean_variance": lambda p: (jnp.mean(p.gammas) - GAMMA_SRGB) ** 2 + variance(p.gammas),
 }
-
-
-def photometry_regularizers(
-    photometry: Photometry, cfg: RegularizerConfig
-) -> dict[str, Float[Array, ""]]:
-    """Return the weighted terms on exposures and gammas, by name."""
-    weights = {name: getattr(cfg, name) for name in PRIORS}
-    return {k: w * PRIORS[k](photometry) for k, w in weights.items() if w is not None}
-
-
-def _prior(rendered: Rendered, target: Target, aux: Aux, name: str):
-    return PRIORS[name](aux.photometry)
-
-
-def _appearance(rendered: Rendered, target: Target, aux: Aux, kind):
-    assert aux.appearance is not None
-    return regularisation(aux.appearance, kind)
 
 
 # ------------------------------------------------------------------------- Luminance-GS
@@ -310,22 +263,6 @@ def contrast_loss(
     return total / jnp.maximum(whole.sum(), 1)
 
 
-def _enhanced(rendered: Rendered, target: Target, aux: Aux, loss: LossConfig):
-    assert isinstance(aux.correction, Curves)
-    assert rendered.uncorrected is not None
-    return enhanced_loss(rendered.uncorrected, target.ldr, target.mask, aux.correction, loss)
-
-
-def _contrast(rendered: Rendered, target: Target, aux: Aux):
-    assert rendered.uncorrected is not None
-    return contrast_loss(rendered.uncorrected, target.ldr, target.mask)
-
-
-def _curve(rendered: Rendered, target: Target, aux: Aux):
-    assert isinstance(aux.correction, Curves)
-    return curve_prior(aux.correction, target.ldr, target.mask)
-
-
 def _both(whole, axis: int):
     return whole[1:] & whole[:-1] if axis == 0 else whole[:, 1:] & whole[:, :-1]
 
@@ -334,3 +271,34 @@ def _pooled(image: Float[Array, "h w"]) -> Float[Array, "y x"]:
     height, width = (n // POOL * POOL for n in image.shape)
     squares = image[:height, :width].reshape(height // POOL, POOL, width // POOL, POOL)
     return squares.mean((1, 3))
+
+
+def opacity_error(
+    alpha: Float[Array, "h w"], target: Float[Array, "h w"], mask: Float[Array, "h w"]
+) -> Float[Array, ""]:
+    """Return the mean difference of opacities over valid pixels."""
+    apart = jnp.sum(mask * jnp.abs(alpha - target))
+    return apart / jnp.maximum(jnp.sum(mask), 1.0)
+
+
+# Functions of (rendered, target, aux) and what else a term is given.
+BUILT_IN: dict[str, Callable[..., Any]] = {
+    "l1": lambda r, t, a, weight: absolute_error(r.judged, t.ldr, t.mask, weight),
+    "dssim": lambda r, t, a: dissimilarity(r.judged, t.ldr, t.mask),
+    "enhanced": lambda r, t, a, loss: enhanced_loss(
+        r.uncorrected, t.ldr, t.mask, a.correction, loss
+    ),
+    "contrast": lambda r, t, a: contrast_loss(r.uncorrected, t.ldr, t.mask),
+    "curve": lambda r, t, a: curve_prior(a.correction, t.ldr, t.mask),
+    "alpha": lambda r, t, a: None if t.alpha is None else opacity_error(r.alpha, t.alpha, t.mask),
+    "lidar": lambda r, t, a: (
+        None if t.measured is None else lidar_loss(r.alpha, r.depth, t.measured)
+    ),
+    "relative_exposure": lambda r, t, a, loss, formed: relative_exposure_loss(
+        (r.linear, a.other_linear), (a.view, a.other_view), a.pairs, a.photometry, loss, formed
+    ),
+    "appearance": lambda r, t, a, kind: regularisation(a.appearance, kind),
+}
+BUILT_IN |= {
+    name: lambda r, t, a, prior=prior: prior(a.photometry) for name, prior in PRIORS.items()
+}

@@ -142,7 +142,7 @@ def advance(
         where = jnp.where(healthy, ids, n)
         population = _observed(population, where, gradient, frusta[0])
     moved = (updated, population)
-    return settled(state, moved, gradient, fits, count, rates, cfg=cfg, optimizer=optimizer)
+    return concluded(state, moved, gradient, fits, count, rates, cfg=cfg, optimizer=optimizer)
 
 
 def update_listed(
@@ -214,7 +214,7 @@ def is_healthy(state: FitState, gradient: ImageGradient, fits: Array) -> Bool[Ar
     return first & fits & jnp.all(_finite((gradient.terms, gradient.v_rest)))
 
 
-def settled(
+def concluded(
     state: FitState,
     moved: tuple[Updated, Population],
     gradient: ImageGradient,
@@ -305,5 +305,6 @@ def _observed(population: Population, ids, image: ImageGradient, frustum: Frustu
 
 
 def _finite(values) -> Bool[Array, " k"]:
-    """Return whether each array of a tree is finite."""
-    return jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(values)])
+    """Return whether each array of a tree is finite; a formation may have none."""
+    found = [jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(values)]
+    return jnp.stack(found) if found else jnp.ones(1, bool)

@@ -27,7 +27,7 @@ from p2gs_jax.photometry.parameters import recentre
 from p2gs_jax.photometry.response import KNOTS, Response, log_exposed
 from p2gs_jax.presets import preset
 from p2gs_jax.render.harmonics import radiance_activation, radiance_preactivation
-from p2gs_jax.train.terms import photometry_regularizers, variance
+from p2gs_jax.train.terms import PRIORS, variance
 from p2gs_jax.types import Capture, Gaussians, Params, Photometry
 
 HEIGHT, WIDTH = 12, 20
@@ -355,8 +355,7 @@ def test_exposures_below_the_normal_numbers_have_a_gauge():
     weight = RegularizerConfig().log_exposure_mean
 
     def term(raw):
-        terms = photometry_regularizers(Photometry(raw, jnp.zeros(3)), RegularizerConfig())
-        return terms["log_exposure_mean"]
+        return weight * PRIORS["log_exposure_mean"](Photometry(raw, jnp.zeros(3)))
 
     value, gradient = jax.value_and_grad(term)(raw)
     assert float(value) == pytest.approx(weight * 29**2)

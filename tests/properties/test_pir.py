@@ -14,7 +14,7 @@ from p2gs_jax.evaluation.scores import VideoScores
 from p2gs_jax.photometry.formation import eotf, formation, inverse_tone_map, tone_map
 from p2gs_jax.presets import preset
 from p2gs_jax.train import exposure_loss as rel
-from p2gs_jax.train.terms import photometric_loss, photometry_regularizers
+from p2gs_jax.train.terms import PRIORS, photometric_loss
 from p2gs_jax.types import LUMINANCE, Capture, Photometry
 
 PAPER = PhotometryConfig(curve="power", pivot=1.0, clamp=True, parameterization="linear")
@@ -178,8 +178,9 @@ def test_12_closed_form_scale(seed):
     e = jnp.asarray(np.exp(np.random.default_rng(seed).normal(0, 0.5, 20)), jnp.float32)
 
     def loss(c):
-        terms = photometry_regularizers(Photometry(c * e, jnp.full(20, 2.2), "linear"), reg)
-        return terms["exposure_scale"] + terms["exposure_variance"]
+        scaled = Photometry(c * e, jnp.full(20, 2.2), "linear")
+        names = ("exposure_scale", "exposure_variance")
+        return sum(getattr(reg, name) * PRIORS[name](scaled) for name in names)
 
     # docs/photometry.md, 3: the factor that the paper's weights pull all exposures to.
     m, v = jnp.mean(e), jnp.mean((e - jnp.mean(e)) ** 2)

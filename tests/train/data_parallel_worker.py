@@ -107,8 +107,7 @@ def on_devices(count: int) -> dict:
         lowered = [step.lowered(n, state, *inputs, room=room, degree=DEGREE) for n in PROGRAMS]
         return step.chained(*(part.compile() for part in lowered))
 
-    losses, first = [], None
-    found = {}
+    losses, first, found = [], None, {}
     if count == VIEWS:
         before = jax.tree.map(np.asarray, state.params)
         state, _ = taken(state, Room(64, 4096))(state, *inputs)

@@ -42,9 +42,6 @@ class Views:
     def indices_at(self, step, count):
         return tuple((step + k) % VIEWS for k in range(count))
 
-    def index_at(self, step):
-        return step % VIEWS
-
     def prefetch(self, index, shrink):
         pass
 
@@ -82,8 +79,7 @@ class Programs:
             if int(state.fault.kind):
                 return state, REPORT
             self.clock.now += self.step_s(key.size[0])
-            at = int(state.step)
-            kind = 0
+            at, kind = int(state.step), 0
             if at == self.overflows_at and key.room.entries < 10**6:
                 kind = FAULT_OVERFLOW
             if at == self.breaks_at:
@@ -138,10 +134,9 @@ class Harness:
 
     def __init__(self, folder):
         self.clock = SimpleNamespace(now=0.0)
-        self.folder, self.checkpoints = folder, Checkpoints()
-        self.said, self.records = [], []
+        self.folder, self.checkpoints, self.said = folder, Checkpoints(), []
 
-    def run(self, cfg=SHORT, *, resume=False, programs=None, pixels=None, **options):
+    def run(self, cfg=SHORT, *, resume=False, programs=None, **options):
         """Run to the end; return the result and the programs."""
         programs = programs or Programs(self.clock)
         trainer = loop.Trainer(
@@ -149,11 +144,10 @@ class Harness:
             Views(),
             1.0,
             None,
-            Coverage(400 * 300 if pixels is None else pixels, 1.0),
+            Coverage(400 * 300, 1.0),
             self.folder,
             programs,
             Decisions.as_asked(cfg),
-            on_log=self.records.append,
             on_message=self.said.append,
             now=lambda: self.clock.now,
             store=self.checkpoints,
@@ -161,8 +155,8 @@ class Harness:
         result = trainer.run(params(), np.ones(SEEDS, bool), resume=resume, **options)
         return result, programs
 
-    def log(self, name="log.jsonl"):
-        return read_jsonl(self.folder / name)
+    def log(self):
+        return read_jsonl(self.folder / "log.jsonl")
 
 
 def signalled(harness, *numbers, at):

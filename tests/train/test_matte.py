@@ -89,15 +89,6 @@ def test_they_agree_at_every_opacity(surfaces, curve, backdrop):
     np.testing.assert_allclose(shown, expected, atol=2e-5)
 
 
-@pytest.mark.parametrize("backdrop", BACKDROPS)
-def test_display_values_are_composited_as_3dgs_does(surfaces, backdrop):
-    color, alpha = surfaces
-    linear = np.float32(color * alpha[..., None])
-    transform = DisplayTransform(1.0, 2.2, CURVES["3dgs"], backdrop=backdrop)
-    expected = linear + (1 - alpha[..., None]) * np.array(backdrop)
-    np.testing.assert_allclose(develop(linear, transform, alpha=alpha), expected, atol=1e-5)
-
-
 def test_without_a_backdrop_nothing_changes(surfaces):
     radiance, alpha = surfaces
     linear = np.float32(radiance)

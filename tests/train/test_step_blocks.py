@@ -257,30 +257,20 @@ def test_a_view_without_room_changes_nothing_but_the_fault(made):
     assert made.room.grown(1, 10**6).entries == made.room.entries
 
 
-def broken(made, field, value):
-    """Return a step after one visible value was replaced."""
+@pytest.mark.parametrize(("field", "named"), [("sh", "loss term"), ("quats", "gradient of")])
+def test_what_is_no_number_is_named(made, field, named):
     row = np.flatnonzero(made.seen)[-1]
     gaussians = made.params.gaussians
-    array = getattr(gaussians, field)
-    changed = dataclasses.replace(gaussians, **{field: array.at[row].set(value)})
-    params = dataclasses.replace(made.params, gaussians=changed)
+    changed = {field: getattr(gaussians, field).at[row].set(jnp.nan)}
+    params = dataclasses.replace(made.params, gaussians=dataclasses.replace(gaussians, **changed))
     state, report = made.selective(made.room, params)
-    return params, state, finite_names(report.terms, state.params)[int(state.fault.term)]
-
-
-def test_a_radiance_that_is_no_number_is_named(made):
-    params, state, name = broken(made, "sh", jnp.nan)
     assert int(state.fault.kind) == FAULT_NONFINITE
-    assert name.startswith("loss term")
-    fresh = initial_state(params, jnp.asarray(made.alive), make_optimizer(made.cfg))
-    same(dataclasses.replace(state, fault=fresh.fault), fresh)
-
-
-def test_a_gradient_that_is_no_number_is_named(made):
-    _, state, name = broken(made, "quats", jnp.nan)
-    assert int(state.fault.kind) == FAULT_NONFINITE
-    assert name.startswith("gradient of")
     assert int(state.step) == 0
+    names = finite_names(report.terms, state.params)
+    assert names[int(state.fault.term)].startswith(named)
+    if field == "sh":
+        fresh = initial_state(params, jnp.asarray(made.alive), make_optimizer(made.cfg))
+        same(dataclasses.replace(state, fault=fresh.fault), fresh)
 
 
 def test_the_first_term_that_is_no_number_is_named(made):

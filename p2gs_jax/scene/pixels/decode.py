@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt
 from PIL import Image
 
-from p2gs_jax.errors import UserError, broken
+from p2gs_jax.errors import broken
 from p2gs_jax.scene.convert.icc import with_profile_applied
 from p2gs_jax.scene.files import ASPECT_TOLERANCE, image_size, undecodable
 from p2gs_jax.scene.lens import undistortion_maps
@@ -67,11 +68,9 @@ def decode(view: View, sizes: Sequence[tuple[int, int]]) -> list[Decoded]:
 def _decoded(view: View, sizes: Sequence[tuple[int, int]]) -> list[Decoded]:
     pixels, opacity = _decode(view.image_path)
     if pixels.shape[:2] != (view.height, view.width):
-        raise UserError(
-            f"{view.image_path} is {pixels.shape[1]}x{pixels.shape[0]} pixels, but was "
-            f"{view.width}x{view.height} when the scene was read",
-            fix="do not change the photographs during a run; start the run again",
-        )
+        why = f"is {pixels.shape[1]}x{pixels.shape[0]} pixels, but was {view.width}x{view.height} "
+        fix = "do not change the photographs during a run; start the run again"
+        raise broken(view.image_path, why + "when the scene was read", fix)
     valid = np.ones(pixels.shape[:2], bool)
     matte = opacity if view.alpha == "background" else None
     if opacity is not None and view.alpha == "mask":
@@ -156,11 +155,9 @@ def _decode_mask(view: View) -> Bool[np.ndarray, "h w"]:
     assert view.mask_path is not None
     w, h = image_size(view.mask_path)
     if abs(w / h / (view.width / view.height) - 1.0) > ASPECT_TOLERANCE:
-        raise UserError(
-            f"wrong size: the mask {view.mask_path} is {w}x{h}, its photograph "
-            f"{view.width}x{view.height}",
-            fix="make the mask at the size of the photograph",
-        )
+        why = f"is {w}x{h}, its photograph {view.width}x{view.height}"
+        fix = "make the mask at the size of the photograph"
+        raise broken(f"wrong size: the mask {view.mask_path}", why, fix)
     raw = _read_raster(view.mask_path)
     # A mask may carry an opaque alpha channel beside its values.
     colours = raw if raw.ndim == 2 else raw[..., : 3 if raw.shape[2] >= 3 else 1].max(axis=2)
@@ -176,14 +173,11 @@ def _read_raster(path: Path, *, colours: bool = False) -> np.ndarray:
     try:
         data = path.read_bytes()
     except OSError as error:
-        why = f"cannot read {path}: {error.strerror or error}"
-        raise UserError(why, fix="put the file back") from None
-    try:
-        raw = cv2.imdecode(
-            np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
-        )
-    except cv2.error:
-        raw = None
+        why = f"{path}: {error.strerror or error}"
+        raise broken("cannot read", why, "put the file back") from None
+    raw, as_stored = None, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
+    with contextlib.suppress(cv2.error):
+        raw = cv2.imdecode(np.frombuffer(data, np.uint8), as_stored)
     if raw is None or not _complete(path, data):
         raise undecodable(path)
     return with_profile_applied(data, raw) if colours else raw

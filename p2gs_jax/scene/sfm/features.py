@@ -90,10 +90,9 @@ def extract(
             device=pycolmap.Device.cpu,
         )
     except (RuntimeError, ValueError, OSError) as error:
-        raise UserError(
-            f"COLMAP could not extract features in {image_folder}: {error}.",
-            fix="look for an image there that does not open, and remove or replace it",
-        ) from error
+        why = f"COLMAP could not extract features in {image_folder}: {error}."
+        fix = "look for an image there that does not open, and remove or replace it"
+        raise UserError(why, fix=fix) from error
 
 
 def match(database: Path, pairs: Iterable[Pair] | None) -> None:

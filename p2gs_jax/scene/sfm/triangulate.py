@@ -32,11 +32,9 @@ def triangulate(
     """
     views = tuple(scene.training_views) if only_training else scene.views
     if len(views) < 2:
-        raise UserError(
-            f"no point could be triangulated from the poses in {scene.root}",
-            fix="check that there are several photographs, that they are sharp, and that the poses "
-            "are theirs",
-        )
+        why = f"no point could be triangulated from the poses in {scene.root}"
+        fix = "check that there are several photographs, that they are sharp, and that the poses "
+        raise UserError(why, fix=fix + "are theirs")
     key = {
         "pycolmap": pycolmap.__version__,
         "files": file_fingerprints([view.image_path for view in views]),
