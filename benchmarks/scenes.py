@@ -20,7 +20,8 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.gaussians.seeds import gaussians_from_points
 from p2gs_jax.render.harmonics import C0
 from p2gs_jax.synth.furnish import build_town
-from p2gs_jax.synth.rig import MOUNTS, camera_viewmat, drive, image_height, intrinsics
+from p2gs_jax.synth.rig import MOUNTS, camera_viewmat, drive, intrinsics
+from p2gs_jax.synth.settings import image_height
 from p2gs_jax.synth.town import Town
 from p2gs_jax.types import Camera, Gaussians, View
 

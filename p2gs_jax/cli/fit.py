@@ -241,11 +241,11 @@ def resolve_blocks(args: Fit) -> int | str | None:
         UserError: it is neither, or options of blocks are given without them.
     """
     words, alone = args.blocks, args.jobs == 1 and args.engine == "local"
-    nothing, fix = (
+    check(
+        words is not None or alone,
         "--jobs and --engine say nothing without --blocks",
-        "add --blocks auto, or a number",
+        fix="add --blocks auto, or a number",
     )
-    check(words is not None or alone, nothing, fix=fix)
     if words is None:
         return None
     check(args.jobs >= 1, "--jobs must be at least 1")

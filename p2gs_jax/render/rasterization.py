@@ -93,9 +93,10 @@ def _for_each_camera(colors, count: int, cameras: int, sh_degree: int | None):
     Raises:
         ValueError: the shape is not valid.
     """
-    bands = () if sh_degree is None else (coefficient_count(sh_degree),)
-    shape = (count, *bands, 3)
-    kept = colors if sh_degree is None else colors[..., : bands[0], :]
+    kept, shape = colors, (count, 3)
+    if sh_degree is not None:
+        bands = coefficient_count(sh_degree)
+        kept, shape = colors[..., :bands, :], (count, bands, 3)
     if kept.shape not in (shape, (cameras, *shape)):
         raise ValueError(f"colors have shape {colors.shape}: {shape} is needed, or one per camera")
     return jnp.broadcast_to(kept, (cameras, *shape))

@@ -131,40 +131,33 @@ def test_every_mode_shows_something_else(page):
     assert page.locator("label", has_text="Split").count() == 1
 
 
-def test_going_to_a_photograph_takes_its_look_and_place(page):
+def test_going_to_a_photograph_takes_its_look_and_place_and_cameras_appear(page):
     before = picture(page)
     choose(page, "Go to", "5.png")
     until(page, lambda now: np.abs(now - before).mean() > 0.01)
     assert page.get_by_label("Match photo", exact=True).input_value() == "5.png"
-
-
-def test_the_keys_fly_and_the_picture_follows(page):
-    before = picture(page)
-    page.mouse.click(300, 500)
-    page.keyboard.down("KeyD")
-    page.wait_for_timeout(400)
-    page.keyboard.up("KeyD")
-    until(page, lambda now: np.abs(now - before).mean() > 0.005)
-
-
-def test_playing_moves_along_the_drive_until_it_is_paused(page):
-    page.get_by_text("Drive", exact=True).click()
-    before = picture(page)
-    page.get_by_role("button", name="Play").click()
-    until(page, lambda now: np.abs(now - before).mean() > 0.005)
-    page.get_by_role("button", name="Pause").click()
-    steady(page)
-    assert page.get_by_role("button", name="Play").count() == 1
-
-
-def test_cameras_appear_with_their_pictures(page):
-    choose(page, "Go to", "1.png")
     before = steady(page)
     page.get_by_label("Cameras", exact=True).check()
     page.get_by_text("exposure, EV from the mean").wait_for()
     page.mouse.move(300, 500)
     page.mouse.wheel(0, 400)
     until(page, lambda now: np.abs(now - before).mean() > 0.01)
+
+
+def test_the_picture_follows_keys_and_a_drive_until_it_is_paused(page):
+    before = picture(page)
+    page.mouse.click(300, 500)
+    page.keyboard.down("KeyD")
+    page.wait_for_timeout(400)
+    page.keyboard.up("KeyD")
+    until(page, lambda now: np.abs(now - before).mean() > 0.005)
+    page.get_by_text("Drive", exact=True).click()
+    before = steady(page)
+    page.get_by_role("button", name="Play").click()
+    until(page, lambda now: np.abs(now - before).mean() > 0.005)
+    page.get_by_role("button", name="Pause").click()
+    steady(page)
+    assert page.get_by_role("button", name="Play").count() == 1
 
 
 def test_saved_files_arrive(page):

@@ -47,11 +47,12 @@ def a_view(viewmat, name="a"):
     return View(name, None, "0", viewmat.astype(np.float32), K, 120, 80)
 
 
-def test_a_point_is_where_the_browser_draws_it():
+@pytest.mark.parametrize("size", [(340, 200), (1280, 800), (480, 480)])
+def test_a_point_is_where_the_browser_draws_it_at_any_size(size):
     # What three.js does: camera-to-world with y up and z backwards, vertical field of view, the
     # canvas from -1 to 1 upwards.
     rotation = Rotation.from_euler("xyz", [0.2, -0.4, 0.1])
-    position, fov, aspect, size = np.array([1.0, -2.0, 0.5]), 0.9, 1.7, (340, 200)
+    position, fov, aspect = np.array([1.0, -2.0, 0.5]), 0.9, 1.7
     point = position / SPACE.unit + rotation.apply([0.3, 0.2, 4.0])
     pose = Pose(rotation.as_quat(scalar_first=True), position, position, fov)
     camera = camera_of_browser(pose, aspect, size, SPACE)
@@ -68,16 +69,6 @@ def test_a_view_survives_the_trip():
     np.testing.assert_allclose(camera.K[0, 0], camera.K[1, 1], rtol=1e-6)
     ahead = (pose.look_at / SPACE.unit - camera_centers(A_VIEWMAT[None])[0]) / 3.0
     np.testing.assert_allclose(ahead, A_VIEWMAT[2, :3], atol=1e-6)
-
-
-def test_any_size_shows_the_same_part_of_the_world():
-    pose = pose_of(A_VIEWMAT, SPACE, distance=3.0, fov=0.7)
-    point = camera_centers(A_VIEWMAT[None])[0] + A_VIEWMAT[:3, :3].T @ [0.2, -0.1, 2.0]
-    shares = [
-        pixel(camera_of_browser(pose, 1.6, size, SPACE), point) / size
-        for size in ((1280, 800), (328, 200), (480, 480))
-    ]
-    np.testing.assert_allclose(shares, shares[:1] * 3, rtol=1e-5)
 
 
 @pytest.mark.parametrize("aspect", [0.5, 1.0, 1.3, 3.0])
