@@ -16,7 +16,7 @@ from __future__ import annotations
 import functools
 from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -34,6 +34,7 @@ from p2gs_jax.evaluation.references import Reference
 from p2gs_jax.evaluation.scores import (
     Untold,
     VideoScores,
+    ViewResult,
     is_drive,
     masks_of_parts,
     still_mask,
@@ -55,23 +56,6 @@ from p2gs_jax.photometry.models import MODELS
 from p2gs_jax.render.capacity import RenderView, make_renderer
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.types import Camera, Params, Render, Scene
-
-
-@dataclass(frozen=True)
-class ViewResult:
-    """One rendered view, by its row in `Scene.views`.
-
-    It is shown under the view's own transform; of a held-out view under the usual one with the
-    exposure fitted to its photograph.
-    """
-
-    index: int
-    linear: Float32[np.ndarray, "h w 3"]  # radiance
-    alpha: Float32[np.ndarray, "h w"]
-    depth: Float32[np.ndarray, "h w"]  # alpha-weighted
-    ldr: Float32[np.ndarray, "h w 3"]  # display values under `transform`
-    photograph: Float32[np.ndarray, "h w 3"]
-    transform: DisplayTransform
 
 
 class Evaluation(NamedTuple):
@@ -284,8 +268,7 @@ class _Views:
             alpha = result.alpha if over else None
             self._metered.add_held_out(result.index, found.readings, *images, alpha)
         if self._drive is not None:
-            images = (result.ldr, result.photograph, found.mask)
-            self._drive.add(result.index, *images, result.depth, result.alpha)
+            self._drive.add(result, found.mask)
         exposure = result.transform.exposure
         self._videos["per_view"].add(view.camera, result.ldr, exposure)
         self._videos["averaged"].add(view.camera, found.averaged, judge.mean.exposure)
