@@ -33,9 +33,8 @@ import p2gs_jax
 from p2gs_jax.core.atomic import write_json, write_text
 from p2gs_jax.evaluation.references import load_reference
 from p2gs_jax.evaluation.scores import psnr
-from p2gs_jax.synth.rig import image_height
 from p2gs_jax.synth.sensor import read_true_shots
-from p2gs_jax.synth.settings import Sensor
+from p2gs_jax.synth.settings import Sensor, image_height
 
 METHODS = ("robust", "ppisp", "ppisp_solved", "3dgs_affine")
 SENSORS: dict[str, Sensor] = {

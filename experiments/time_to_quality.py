@@ -31,8 +31,8 @@ from mixtures import read_groups, within_groups_ev, write_mixture
 
 from p2gs_jax.core.atomic import atomic_write, write_json
 from p2gs_jax.evaluation.alignment import exposure_error
-from p2gs_jax.synth.rig import image_height
 from p2gs_jax.synth.sensor import Sensor, read_true_exposures
+from p2gs_jax.synth.settings import image_height
 from p2gs_jax.synth.write import write_street
 
 HERE = Path(__file__).resolve().parents[1]

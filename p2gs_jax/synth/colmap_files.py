@@ -41,22 +41,13 @@ def write_seeds(
     rgb: UInt8[np.ndarray, "p 3"],
     depths: Sequence[np.ndarray],
 ) -> dict[str, int]:
-    """Write the model of the points that two views see; return how many points and observations."""
-    xy, seen = observe_seeds(xyz, views, depths)
+    """Write the model of the points that two views see; return how many points and observations.
+
+    cameras.bin, images.bin and points3D.bin are as in https://colmap.github.io/format.html.
+    """
+    xy, seen = _observe_seeds(xyz, views, depths)
     kept = seen.sum(0) >= 2
-    write_colmap(folder, views, xyz[kept], rgb[kept], xy[:, kept], seen[:, kept])
-    return {"points": int(kept.sum()), "observations": int(seen[:, kept].sum())}
-
-
-def write_colmap(
-    folder: Path,
-    views: DriveViews,
-    xyz: Float[np.ndarray, "p 3"],
-    rgb: UInt8[np.ndarray, "p 3"],
-    xy: Float[np.ndarray, "v p 2"],
-    seen: Bool[np.ndarray, "v p"],
-) -> None:
-    """Write cameras.bin, images.bin, points3D.bin (https://colmap.github.io/format.html)."""
+    xyz, rgb, xy, seen = xyz[kept], rgb[kept], xy[:, kept], seen[:, kept]
     folder.mkdir(parents=True)
     ids = {camera: i + 1 for i, camera in enumerate(MOUNTS)}
     params = (views.K[0, 0], views.K[1, 1], views.K[0, 2], views.K[1, 2])
@@ -88,6 +79,7 @@ def write_colmap(
         data.append(struct.pack("<Q3d3Bd", p + 1, *xyz[p], *rgb[p].tolist(), 0.0))
         data.append(struct.pack("<Q", len(track)) + track.tobytes())
     (folder / "points3D.bin").write_bytes(b"".join(data))
+    return {"points": len(xyz), "observations": int(seen.sum())}
 
 
 def sample_seeds(
@@ -114,7 +106,7 @@ def sample_seeds(
     return np.concatenate(xyz), np.concatenate(rgb)
 
 
-def observe_seeds(
+def _observe_seeds(
     xyz: Float64[np.ndarray, "p 3"], views: DriveViews, depths: Sequence[np.ndarray]
 ) -> tuple[Float64[np.ndarray, "v p 2"], Bool[np.ndarray, "v p"]]:
     """Project the points into every view and tell where they are visible.

@@ -25,8 +25,7 @@ from p2gs_jax.core.streams import SceneStream, generator
 from p2gs_jax.errors import UserError
 from p2gs_jax.synth.settings import Curve, Sensor
 
-ISO_REFERENCE = 8
-ISO_MINIMUM = 1
+ISO_REFERENCE, ISO_MINIMUM = 8, 1
 # Variances of photon noise per unit of exposed radiance, and of read noise.
 SHOT_NOISE, READ_NOISE = 2e-4, 1e-6
 DRIFT_PERIODS = 1.3
@@ -153,12 +152,10 @@ def write_true_exposures(
         writer.writerow(COLUMNS)
         exposures, tints = shots.mean_exposures, shots.tints
         for row, (name, camera) in enumerate(zip(names, cameras, strict=True)):
-            e = exposures[row]
-            factors = (f"{factor:.6g}" for factor in tints[row])
-            corners = f"{1 - shots.corner_loss[row]:.6g}"
+            e, iso = exposures[row], int(shots.iso[row])
+            factors = (f"{x:.6g}" for x in (*tints[row], 1 - shots.corner_loss[row]))
             exposure = (f"{e:.6g}", f"{np.log2(e):.6f}")
-            iso = int(shots.iso[row])
-            writer.writerow((name, camera, iso, *exposure, *factors, corners, shots.curves[row]))
+            writer.writerow((name, camera, iso, *exposure, *factors, shots.curves[row]))
 
 
 def read_true_exposures(root: Path) -> dict[str, float]:
@@ -171,7 +168,7 @@ class TrueShot(NamedTuple):
 
     camera: str
     exposure: float
-    balance: tuple[float, float, float]
+    balance: tuple[float, ...]
     corners: float
 
 
@@ -179,8 +176,8 @@ def read_true_shots(root: Path) -> dict[str, TrueShot]:
     """Return image name -> how it was taken; empty where the scene folder has no such file."""
     found = {}
     for row in _rows(root):
-        e, red, green, blue, corners = (float(row[name]) for name in NUMBERS)
-        found[row["image"]] = TrueShot(row["camera"], e, (red, green, blue), corners)
+        e, *balance, corners = (float(row[name]) for name in NUMBERS)
+        found[row["image"]] = TrueShot(row["camera"], e, tuple(balance), corners)
     return found
 
 

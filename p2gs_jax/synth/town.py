@@ -51,10 +51,8 @@ class Light:
 class Town:
     """P primitives, ordered boxes, tapered boxes, ellipsoids; columns as in `Solid`.
 
-    Attributes:
-        planes: (n, d) of the tapered boxes' six faces; inside is n . p <= d, n unit.
-        seed: of the textures' noise.
-        underpass: its extent along x, or None.
+    `planes` are (n, d) of the tapered boxes' six faces: inside is n . p <= d, n unit. `seed` is
+    that of the textures' noise, `underpass` its extent along x, or None.
     """
 
     n_boxes: int
@@ -78,25 +76,16 @@ class Town:
 
 @dataclass
 class Solid:
-    """One primitive.
+    """One primitive, between two corners of its bounding box, m."""
 
-    Attributes:
-        kind: 0 box, 1 tapered box, 2 ellipsoid.
-        lo: lower corner of the bounding box, m; `hi`: the upper one.
-        color: base albedo; radiance for EMISSIVE.
-        accent: second colour: window surrounds, stripes, sign faces.
-        params: (style, bay width m, ground-floor use, random number in [0, 1)).
-        top: x0, x1, y0, y1 of a tapered box's upper face.
-    """
-
-    kind: int
+    kind: int  # 0 box, 1 tapered box, 2 ellipsoid
     lo: Vec3
     hi: Vec3
     material: Material
-    color: Vec3
-    accent: Vec3
-    params: tuple[float, float, float, float]
-    top: tuple[float, float, float, float] | None
+    color: Vec3  # base albedo; radiance for EMISSIVE
+    accent: Vec3  # second colour: window surrounds, stripes, sign faces
+    params: tuple[float, float, float, float]  # style, bay width m, ground-floor use, random [0, 1)
+    top: tuple[float, float, float, float] | None  # x0, x1, y0, y1 of a tapered box's upper face
 
 
 @dataclass
@@ -126,11 +115,9 @@ class Builder:
     ) -> None:
         """Place a solid between two corners; with a `top`, a tapered box."""
         params = (style, bay, use, float(self.rng.random()))
-        a = tuple(min(p, q) for p, q in zip(lo, hi, strict=True))
-        b = tuple(max(p, q) for p, q in zip(lo, hi, strict=True))
-        self.solids.append(
-            Solid(1 if top else kind, a, b, material, color, accent, params, top)  # pyright: ignore[reportArgumentType]
-        )
+        (x0, x1), (y0, y1), (z0, z1) = (sorted(pair) for pair in zip(lo, hi, strict=True))
+        kind, lo, hi = 1 if top else kind, (x0, y0, z0), (x1, y1, z1)
+        self.solids.append(Solid(kind, lo, hi, material, color, accent, params, top))
 
     def is_clear(self, x: float, reach: float) -> bool:
         """Return whether nothing may stand within reach of x."""

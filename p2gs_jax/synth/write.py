@@ -23,7 +23,6 @@ from typing import Any
 
 import numpy as np
 import OpenEXR
-from jaxtyping import UInt8
 from PIL import Image
 
 from p2gs_jax.core.atomic import atomic_folder
@@ -129,7 +128,18 @@ def _photograph(
         rng, own = generator(seed, SceneStream.PHOTOGRAPH, row), shots.sensor(sensor, row)
         shot = photograph(linear, shots.exposures[row], own, balance=shots.balance[row], rng=rng)
         reference = photograph(linear, 1.0, Sensor(curve=sensor.curve))
-        _write_view(root, views.names[row], shot, reference, linear, depth)
+        sky = np.where(np.isinf(depth), np.uint8(255), np.uint8(0))
+        pictures = {"images": shot, "reference": reference, "truth/sky_masks": sky}
+        for folder, pixels in pictures.items():
+            path = root / folder / views.names[row]
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(pixels).save(path, compress_level=4)
+        path = (root / "truth" / "linear" / views.names[row]).with_suffix(".exr")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        channels = {c: np.ascontiguousarray(linear[..., i]) for i, c in enumerate("RGB")}
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        with OpenEXR.File(header, channels | {"Z": depth.astype(np.float32)}) as file:
+            file.write(str(path))
         photographs.append(shot)
         depths.append(depth)
         if (row + 1) % 10 == 0:
@@ -175,25 +185,3 @@ def _render_all(
     yield one(views.viewmats[0])  # compiles once, not once a thread
     with ThreadPoolExecutor(2) as pool:
         yield from pool.map(one, views.viewmats[1:])
-
-
-def _write_view(
-    root: Path,
-    name: str,
-    shot: UInt8[np.ndarray, "h w 3"],
-    reference: UInt8[np.ndarray, "h w 3"],
-    linear: np.ndarray,
-    depth: np.ndarray,
-) -> None:
-    sky = np.where(np.isinf(depth), np.uint8(255), np.uint8(0))
-    pictures = {"images": shot, "reference": reference, "truth/sky_masks": sky}
-    for folder, pixels in pictures.items():
-        path = root / folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(pixels).save(path, compress_level=4)
-    path = (root / "truth" / "linear" / name).with_suffix(".exr")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    channels = {c: np.ascontiguousarray(linear[..., i]) for i, c in enumerate("RGB")}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with OpenEXR.File(header, channels | {"Z": depth.astype(np.float32)}) as file:
-        file.write(str(path))

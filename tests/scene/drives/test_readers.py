@@ -221,7 +221,7 @@ TRACKLETS = writers_kitti.BOXES
 
 def item(old="", new=""):
     one = writers_kitti.tracklet("Car", 0, [[1, 2, 3, 0]])
-    return text(writers_kitti.tracklets(one.replace(old, new) if old else one).decode())
+    return text(writers_kitti.tracklets(one.replace(old, new) if old else one))
 
 
 def tokens(table):

@@ -12,7 +12,7 @@ from scene.drives import writers_kitti as kitti
 from scene.drives import writers_nuscenes as nuscenes
 from scene.drives import writers_pandaset as pandaset
 from scene.drives import writers_waymo as waymo
-from scene.drives.writers import car_at, cut, inv, jpeg, write_jpeg
+from scene.drives.writers import car_at, cut, inv, jpeg, write_bytes
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
@@ -110,8 +110,8 @@ def test_what_argoverse_lacks_is_counted(copied, read):
     log = copied("argoverse").root
     cameras = log / "sensors" / "cameras"
     shutil.rmtree(cameras / "ring_side_right")
-    write_jpeg(cameras / "ring_front_left" / f"{argoverse.ns(-9)}.jpg")
-    write_jpeg(cameras / "ring_rear_left" / f"{argoverse.ns(0)}.jpg")
+    write_bytes(cameras / "ring_front_left" / f"{argoverse.ns(-9)}.jpg")
+    write_bytes(cameras / "ring_rear_left" / f"{argoverse.ns(0)}.jpg")
     sweep = next(iter((log / "sensors" / "lidar").iterdir()))
     sweep.rename(sweep.with_name(f"{argoverse.ns(-8)}.feather"))
     stamps = [argoverse.ns(t) for t in (0, 99, 0.1)]
@@ -316,7 +316,7 @@ def test_what_kitti_lacks_is_counted(write, read, tmp_path):
     for path in drive.glob("image_03/data/*"):
         path.unlink()
     late, empty = kitti.tracklet("Car", 7, [[5, 2, 0, 0]] * 3), kitti.tracklet("Car", 0, [])
-    (date / kitti.BOXES).write_bytes(kitti.tracklets(late, empty))
+    (date / kitti.BOXES).write_text(kitti.tracklets(late, empty))
     recording = read(date)
     assert recording.notes == [
         "4 of 8 frames have no GPS measurement.",
