@@ -6,6 +6,7 @@ that baking leaves is measured and written beside them.
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path, PurePosixPath
@@ -36,7 +37,6 @@ from p2gs_jax.gaussians.bake import (
     bake,
     baking_error,
     display_comments,
-    display_of_splats,
     error_summary,
     refine,
     true_target,
@@ -104,26 +104,17 @@ def convert(
 ) -> Iterator[tuple[Path, str, float]]:
     """Write a run in every format; yield each place, a sentence about it, and seconds.
 
-    Args:
-        fitted: the run.
-        formats: names, as in PLACES.
-        folder: to write into.
-        transform: from radiance to the display colours of formats that hold these.
-        bake_steps: of their refinement; None: enough.
-        page_mb: largest size of the page, millions of bytes.
-        page_photographs: how many photographs the page embeds.
-        overwrite: replace what exists.
-        reporter: receives progress.
-
-    Raises:
-        UserError: something is in the way, or a photograph is missing that a format needs.
+    `transform` leads from radiance to the display colours of formats that hold these, which
+    `bake_steps` steps refine (None: enough). The page has at most `page_mb` million bytes. A
+    UserError says that something is in the way, or that a photograph is missing that a format
+    needs.
     """
     _check_places(folder, [folder / place for name in formats for place in PLACES[name]], overwrite)
     if {"colmap", "nerfstudio", "exr"} & set(formats):
         _check_names(fitted)
     if {"colmap", "nerfstudio"} & set(formats):
         fitted.require_photographs()
-    transform, display = display_of_splats(transform), None
+    transform, display = transform.without_place(), None
     for name in formats:
         begin, place = time.monotonic(), folder / PLACES[name][0]
         if name == "linear-ply":
@@ -133,13 +124,9 @@ def convert(
         elif name == "exr":
             text = _exr(place, fitted, reporter)
         elif name == "html":
+            shown, count = fitted.over_black(), page_photographs
             page = write_page(
-                place,
-                fitted.over_black(),
-                transform,
-                size_mb=page_mb,
-                photographs=page_photographs,
-                say=reporter.stage,
+                place, shown, transform, size_mb=page_mb, photographs=count, say=reporter.stage
             )
             text = " ".join([f"{page.size / MEGABYTE:.1f} MB.", *page.sentences])
         else:
@@ -186,13 +173,8 @@ def _linear_ply(ply: Path, fitted: Run) -> str:
 
 def _other_trainer(name: str, place: Path, fitted: Run, reporter: Reporter) -> str:
     write = write_colmap_folder if name == "colmap" else write_nerfstudio_folder
-    write(
-        place,
-        fitted.scene,
-        fitted.store,
-        fitted.photometry["views"],
-        on_view=lambda done, count: reporter.stage("Writing photographs", done, count),
-    )
+    on_view = functools.partial(reporter.stage, "Writing photographs")
+    write(place, fitted.scene, fitted.store, fitted.photometry["views"], on_view=on_view)
     views = f"{len(fitted.scene.views)} views"
     if name == "colmap":
         return f"{views}, {len(fitted.scene.points)} points, exposures.csv"
@@ -204,16 +186,10 @@ def _exr(place: Path, fitted: Run, reporter: Reporter) -> str:
     with atomic_folder(place) as temporary:
         for index, view in enumerate(views):
             camera = camera_of(fitted.store, index)
-            result = fitted.render(camera)
-            write_exr(
-                (temporary / view.name).with_suffix(".exr"),
-                np.asarray(result.linear),
-                depth=np.asarray(result.depth),
-                alpha=np.asarray(result.alpha),
-                taken=fitted.own_display(index),
-                camera=camera,
-                shot=read_exif_settings(view.image_path),
-            )
+            result, path = fitted.render(camera), (temporary / view.name).with_suffix(".exr")
+            linear, depth, alpha = map(np.asarray, (result.linear, result.depth, result.alpha))
+            taken, shot = fitted.own_display(index), read_exif_settings(view.image_path)
+            write_exr(path, linear, depth=depth, alpha=alpha, taken=taken, camera=camera, shot=shot)
             reporter.stage("Rendering", index + 1, len(views))
     return f"{len(views)} linear renders"
 
@@ -222,11 +198,7 @@ class DisplayFiles:
     """Display colours under one display transform, baked once per degree, with their error."""
 
     def __init__(
-        self,
-        fitted: Run,
-        transform: DisplayTransform,
-        steps: int | None,
-        reporter: Reporter,
+        self, fitted: Run, transform: DisplayTransform, steps: int | None, reporter: Reporter
     ):
         """Render the true pictures that `steps` (None: enough) of refinement aim at."""
         self.fitted, self.transform, self.reporter = fitted, transform, reporter
@@ -239,13 +211,8 @@ class DisplayFiles:
         wanted = scene.train_indices if self.steps else _spread(scene.train_indices)
         rows = [*wanted, *_spread(scene.test_indices)]
         for done, index in enumerate(rows):
-            self.targets[index] = true_target(
-                scene.views[index].name,
-                self.gaussians,
-                camera_of(fitted.store, index),
-                transform,
-                render,
-            )
+            name, camera = scene.views[index].name, camera_of(fitted.store, index)
+            self.targets[index] = true_target(name, self.gaussians, camera, transform, render)
             reporter.stage("Rendering true pictures", done + 1, len(rows))
 
     def write(self, name: str, path: Path, sidecar: Path) -> str:
@@ -286,14 +253,10 @@ class DisplayFiles:
             self.reporter.stage("Baking")
             start = bake(g, self.transform, cfg.render.radiance, degree)
             train = self.fitted.scene.train_indices
-            self.baked[degree] = refine(
-                start,
-                [self.targets[i] for i in train if i in self.targets],
-                cfg.render,
-                steps=self.steps,
-                seed=cfg.train.seed,
-                on_step=lambda done, steps: self.reporter.stage("Baking", done, steps),
-            )
+            aims = [self.targets[i] for i in train if i in self.targets]
+            order = {"steps": self.steps, "seed": cfg.train.seed}
+            on_step = functools.partial(self.reporter.stage, "Baking")
+            self.baked[degree] = refine(start, aims, cfg.render, **order, on_step=on_step)
         return self.baked[degree]
 
     def _error_of_baked(self, degree: int) -> dict:
@@ -307,12 +270,8 @@ class DisplayFiles:
         self.reporter.stage("Measuring")
         scene, render = self.fitted.scene, self.fitted.cfg.render
         splits = {"train": scene.train_indices, "test": scene.test_indices}
-        return {
-            split: error_summary(
-                baking_error(shown, [self.targets[i] for i in _spread(rows)], render)
-            )
-            for split, rows in splits.items()
-        }
+        aims = {split: [self.targets[i] for i in _spread(rows)] for split, rows in splits.items()}
+        return {n: error_summary(baking_error(shown, aim, render)) for n, aim in aims.items()}
 
 
 def named_cameras(fitted: Run) -> list[NamedCamera]:

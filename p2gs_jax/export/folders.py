@@ -49,17 +49,10 @@ def write_colmap_folder(
     """
     with atomic_folder(folder) as temporary:
         _write_model(temporary / "sparse" / "0", scene, store)
-        write_text(temporary / "exposures.csv", exposure_table(photometry))
-        masks: dict[str, Bool[np.ndarray, "h w"]] = {}
-        for index, view in enumerate(scene.views):
-            ldr, mask = store.get(index)
-            _write_photograph(temporary / "images" / view.name, view, ldr)
-            masks[view.name] = mask > 0
-            on_view(index + 1, len(scene.views))
+        masks = _write_images(temporary, scene, store, photometry, on_view)
         if not all(mask.all() for mask in masks.values()):
             for name, mask in masks.items():
-                # COLMAP's name of a mask: the photograph's, suffix included, and .png.
-                _write_mask(temporary / "masks" / f"{name}.png", mask)
+                _write_mask(temporary, name, mask)
 
 
 def write_nerfstudio_folder(
@@ -75,26 +68,39 @@ def write_nerfstudio_folder(
     Arguments and errors are those of `write_colmap_folder`.
     """
     with atomic_folder(folder) as temporary:
-        write_text(temporary / "exposures.csv", exposure_table(photometry))
         _write_points(temporary / CLOUD, scene)
         frames = []
         names: dict[str, list[str]] = {"train": [], "test": []}
+        masks = _write_images(temporary, scene, store, photometry, on_view)
         for index, view in enumerate(scene.views):
-            ldr, mask = store.get(index)
-            place = Path("images") / view.name
-            _write_photograph(temporary / place, view, ldr)
-            names[view.split].append(place.as_posix())
-            frames.append(_frame(store, index) | {"file_path": place.as_posix()})
-            if not (mask > 0).all():
-                there = Path("masks") / f"{view.name}.png"
-                _write_mask(temporary / there, mask > 0)
-                frames[-1]["mask_path"] = there.as_posix()
-            on_view(index + 1, len(scene.views))
+            place = (Path("images") / view.name).as_posix()
+            names[view.split].append(place)
+            frames.append(_frame(store, index) | {"file_path": place})
+            if not masks[view.name].all():
+                frames[-1]["mask_path"] = _write_mask(temporary, view.name, masks[view.name])
         content: dict[str, Any] = {"camera_model": "PINHOLE", "ply_file_path": CLOUD}
         if names["test"]:
             content["train_filenames"] = names["train"]
             content["val_filenames"] = content["test_filenames"] = names["test"]
         write_json(temporary / "transforms.json", {**content, "frames": frames})
+
+
+def _write_images(
+    folder: Path,
+    scene: Scene,
+    store: ImageStore,
+    photometry: Sequence[ViewPhotometry],
+    on_view: OnView,
+) -> dict[str, Bool[np.ndarray, "h w"]]:
+    """Write `images` and `exposures.csv`; return where each photograph is to be used, by name."""
+    write_text(folder / "exposures.csv", exposure_table(photometry))
+    masks: dict[str, Bool[np.ndarray, "h w"]] = {}
+    for index, view in enumerate(scene.views):
+        ldr, mask = store.get(index)
+        _write_photograph(folder / "images" / view.name, view, ldr)
+        masks[view.name] = mask > 0
+        on_view(index + 1, len(scene.views))
+    return masks
 
 
 def exposure_table(photometry: Sequence[ViewPhotometry]) -> str:
@@ -159,10 +165,13 @@ def _write_model(folder: Path, scene: Scene, store: ImageStore) -> None:
     model.write_binary(str(folder))
 
 
-def _write_mask(path: Path, mask: Bool[np.ndarray, "h w"]) -> None:
-    """Write a mask, 255 where it is to be used; its folder is created."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(255 * mask.astype(np.uint8)).save(path)
+def _write_mask(folder: Path, name: str, mask: Bool[np.ndarray, "h w"]) -> str:
+    """Write a mask, 255 where it is to be used; return its path under the folder."""
+    # COLMAP's name of a mask: the photograph's, suffix included, and .png.
+    place = Path("masks") / f"{name}.png"
+    (folder / place).parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(255 * mask.astype(np.uint8)).save(folder / place)
+    return place.as_posix()
 
 
 def _write_photograph(path: Path, view: View, ldr: Float[np.ndarray, "h w 3"]) -> None:

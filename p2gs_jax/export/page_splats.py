@@ -65,14 +65,10 @@ class PageError:
 
 @dataclass(frozen=True)
 class PageSplats:
-    """The Gaussians of a page, with their error against the run.
+    """The packed Gaussians of a page, with their error against the run.
 
-    Attributes:
-        packed: as the page holds them.
-        error: against the run.
-        of: how many Gaussians the run has.
-        degree: of the run's harmonics.
-        unseen: Gaussians that no renderer with our rules ever draws; nothing is lost with them.
+    The run has `of` Gaussians, with harmonics of a `degree`. No renderer with our rules ever draws
+    the `unseen` ones: nothing is lost with them.
     """
 
     packed: Packed
@@ -119,11 +115,14 @@ def fit_into(
     whole = chosen(gaussians, seen)
     if whole.capacity == 0:
         raise UserError("the run has no Gaussian that can be seen.", fix="fit it for longer")
+
+    def judged(packed: Packed) -> PageSplats:
+        return PageSplats(packed, judge(unpack(packed)), gaussians.capacity, degree, unseen)
+
     say("Packing")
     packed = pack(whole)
     if len(packed.data) <= room:
-        error = judge(unpack(packed))
-        return PageSplats(packed, error, gaussians.capacity, degree, unseen)
+        return judged(packed)
     say("Weighing Gaussians")
     order = np.argsort(-weights(whole, cameras, cfg), kind="stable")
     found = []
@@ -131,8 +130,7 @@ def fit_into(
         say(f"Trying harmonics of degree {kept}")
         smaller = _largest_that_fits(room, of_degree(whole, kept), order)
         if smaller is not None:
-            error = judge(unpack(smaller))
-            found.append(PageSplats(smaller, error, gaussians.capacity, degree, unseen))
+            found.append(judged(smaller))
     if not found:
         raise UserError(
             f"of {whole.capacity} Gaussians less than {LEAST_SHARE:.0%} would fit into the page.",
@@ -208,11 +206,7 @@ def _largest_that_fits(room: int, gaussians: Gaussians, order: np.ndarray) -> Pa
 
 
 def true_picture(
-    name: str,
-    gaussians: Gaussians,
-    camera: Camera,
-    transform: DisplayTransform,
-    render: RenderView,
+    name: str, gaussians: Gaussians, camera: Camera, transform: DisplayTransform, render: RenderView
 ) -> TruePicture:
     """Render a view of the run itself, with all of its Gaussians."""
     linear = _linear(gaussians, camera, render)

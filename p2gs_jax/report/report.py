@@ -7,16 +7,12 @@ from pathlib import Path
 
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.report import findings, pictures
+from p2gs_jax.report import measurements as scenes
 from p2gs_jax.report import page as html
 from p2gs_jax.report import photometry_sections as photometry
 from p2gs_jax.report import run_sections as sections
 from p2gs_jax.report.findings import RunWarning, count, duration, run_warnings
-from p2gs_jax.report.measurements import (
-    SceneMeasurements,
-    measure_scene,
-    seam_medians,
-    seam_section,
-)
+from p2gs_jax.report.measurements import SceneMeasurements
 from p2gs_jax.report.page import check_place, listed, page, paragraph, text
 from p2gs_jax.report.run_files import RunFiles, read_run
 
@@ -48,7 +44,7 @@ def write_report(
     run = read_run(folder, None if scene is None else Path(scene))
     path = folder / "report.html" if out is None else Path(out)
     check_place(path)
-    measured = measure_scene(run, reporter, render=render)
+    measured = scenes.measure_scene(run, reporter, render=render)
     reporter.stage("Drawing")
     html.write_page(path, report_page(run, measured))
     return path
@@ -71,7 +67,7 @@ def report_page(run: RunFiles, scene: SceneMeasurements) -> str:
         ("response", "Tone curve", photometry.response_section(run)),
         ("responses", "Responses of cameras", photometry.responses_section(run)),
         ("vignetting", "Vignetting", photometry.vignetting_section(run)),
-        ("seams", "Seams before and after", seam_section(scene)),
+        ("seams", "Seams before and after", scenes.seam_section(scene)),
         ("views", kind, pictures.comparison_section(views, len(run.held_out))),
         ("unexplained", "What no static scene explains", unexplained),
         ("hdr", "Radiance in stops", pictures.hdr_section(run, views)),
@@ -83,8 +79,8 @@ def report_page(run: RunFiles, scene: SceneMeasurements) -> str:
         ("timings", "Timings and counts", sections.timing_section(run)),
         ("configuration", "Configuration", sections.configuration_section(run)),
     ]
-    name = run.scene.name or run.folder.resolve().name
-    under = f"A fit with the preset {run.preset}, in {run.folder.resolve().name}/"
+    folder = run.folder.resolve().name
+    name, under = run.scene.name or folder, f"A fit with the preset {run.preset}, in {folder}/"
     head = f"<h1>{text(name)}</h1>\n{paragraph(under, 'quiet')}"
     head += "".join(paragraph(s, "lead") for s in findings.summary_sentences(run, scene))
     head += html.key_numbers(list(_key_numbers(run, scene, found)))
@@ -105,7 +101,7 @@ def _key_numbers(
     if error is not None:
         yield "Exposure error", f"{error['ev']:.3f}", "stops RMS, truth known"
     if scene.seams:
-        before, after = seam_medians(scene.seams)
+        before, after = scenes.seam_medians(scene.seams)
         pairs = count(len(scene.seams), "pair")
         yield "Seams", f"{before:.2f} → {after:.2f}", f"stops, median of {pairs}"
     gaussians, steps = run.number("counts", "gaussians"), run.number("counts", "steps")

@@ -135,14 +135,17 @@ def test_one_stop_doubles_the_linear_picture_and_leaves_the_radiance(rendered, o
     np.testing.assert_array_equal(*linear)
 
 
-def test_a_drive_becomes_a_video(rendered, own_run, tmp_path):
+def test_a_drive_becomes_a_video_that_is_not_replaced(render, rendered, own_run, tmp_path):
     out = tmp_path / "new" / "drive.mp4"
-    rendered(own_run, "--path", "drive", "--frames", 7, "--out", out, "--fps", 12, "--width", 64)
+    argv = (own_run, "--path", "drive", "--frames", 7, "--fps", 12, "--width", 64, "--out", out)
+    rendered(*argv)
     assert [p.name for p in out.parent.iterdir()] == ["drive.mp4"]
     frames = video(out)
     assert len(frames) == 7
     assert frames[0].shape == (56, 64, 3)  # 57.1 pixels high, cut to an even number
     assert np.abs(frames[0] - frames[-1]).mean() > 0.01
+    code, text = render(*argv)
+    assert (code, "--overwrite" in text) == (2, True)
 
 
 def test_a_drive_can_be_exposed_as_photographed(rendered, own_run, tmp_path):
@@ -250,23 +253,18 @@ def test_senseless_requests_end_with_one_message(render, own_run, options, said)
 
 
 def test_what_is_there_is_replaced_only_when_asked_for(render, rendered, own_run, tmp_path):
-    for out in (tmp_path / "a", tmp_path / "a.mp4"):
-        argv = (own_run, "--path", "drive", "--frames", "2", "--width", "64", "--out", out)
-        rendered(*argv)
-        written = [p for p in (out.iterdir() if out.is_dir() else [out])]
-        before = [p.stat().st_mtime_ns for p in written]
-        code, text = render(*argv)
-        assert code == 2
-        assert "--overwrite" in text
-        assert [p.stat().st_mtime_ns for p in written] == before
-        text = rendered(*argv, "--overwrite")
-        assert [p.stat().st_mtime_ns for p in written] != before
-        # Where the seconds went adds up.
-        spent = re.search(
-            r"([\d.]+) s: ([\d.]+) reading .*? ([\d.]+) compiling.*? ([\d.]+) ren", text
-        )
-        total, *parts = map(float, spent.groups())
-        assert sum(parts) == pytest.approx(total, abs=0.3)
+    argv = (own_run, "--path", "drive", "--frames", 2, "--width", 64, "--out", tmp_path)
+    rendered(*argv)
+    before = [p.stat().st_mtime_ns for p in tmp_path.iterdir()]
+    code, text = render(*argv)
+    assert (code, "--overwrite" in text) == (2, True)
+    assert [p.stat().st_mtime_ns for p in tmp_path.iterdir()] == before
+    text = rendered(*argv, "--overwrite")
+    assert [p.stat().st_mtime_ns for p in tmp_path.iterdir()] != before
+    # Where the seconds went adds up.
+    spent = re.search(r"([\d.]+) s: ([\d.]+) reading .*? ([\d.]+) compiling.*? ([\d.]+) ren", text)
+    total, *parts = map(float, spent.groups())
+    assert sum(parts) == pytest.approx(total, abs=0.3)
 
 
 def test_a_folder_in_place_of_a_video_is_kept(render, own_run, tmp_path):
