@@ -45,13 +45,8 @@ def street(
 ) -> BenchScene:
     """Return a canyon of ground, walls and backdrop: most splats near its surface, some behind.
 
-    Args:
-        count: number of Gaussians.
-        width: image width, pixels.
-        height: image height, pixels.
-        radius: median radius at the 1/255 cutoff, pixels.
-        spread: standard deviation of the log radius.
-        degree: spherical-harmonics degree.
+    `radius` is the median radius at the 1/255 cutoff, pixels, and `spread` the standard deviation
+    of its logarithm.
     """
     rng = np.random.default_rng(0)
     focal = 0.75 * width

@@ -37,7 +37,6 @@ from p2gs_jax.gaussians.bake import (
     bake,
     baking_error,
     display_comments,
-    display_of_splats,
     error_summary,
     refine,
     true_target,
@@ -115,7 +114,7 @@ def convert(
         _check_names(fitted)
     if {"colmap", "nerfstudio"} & set(formats):
         fitted.require_photographs()
-    transform, display = display_of_splats(transform), None
+    transform, display = transform.without_place(), None
     for name in formats:
         begin, place = time.monotonic(), folder / PLACES[name][0]
         if name == "linear-ply":

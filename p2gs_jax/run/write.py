@@ -16,7 +16,7 @@ from p2gs_jax.evaluation.scores import ViewResult
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.frames import write_png
 from p2gs_jax.formats.ply import write_ply, write_radiance
-from p2gs_jax.gaussians.bake import bake, display_comments, display_of_splats
+from p2gs_jax.gaussians.bake import bake, display_comments
 from p2gs_jax.gaussians.posed import posed
 from p2gs_jax.photometry.display import develop, usual_display
 from p2gs_jax.photometry.metering import Metering
@@ -135,7 +135,7 @@ def _write_models(
 ) -> None:
     """Write `splats.ply` (display colours) and `radiance.ply` (linear)."""
     alive = np.ones(params.gaussians.capacity, bool)
-    transform = display_of_splats(usual_display(params, (), None, cfg.photometry))
+    transform = usual_display(params, (), None, cfg.photometry).without_place()
     placed = params.gaussians
     if owner is not None and moving is not None:
         placed = posed(placed, owner, *moving.poses(middle_time(scene)))

@@ -35,7 +35,6 @@ from p2gs_jax.formats.false_color import (
     false_color,
 )
 from p2gs_jax.formats.frames import to_uint8
-from p2gs_jax.gaussians.bake import display_of_splats
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import places
 from p2gs_jax.render import view_radiance
@@ -265,7 +264,7 @@ def splat_colors(
     column = splats.linear[:, None]
     if mode == "stops":
         return to_uint8_fast(false_color(column, MIDDLE_GREY / transform.exposure))[:, 0]
-    return to_uint8_fast(develop(column, display_of_splats(transform)))[:, 0]
+    return to_uint8_fast(develop(column, transform.without_place()))[:, 0]
 
 
 def stops_legend() -> str:
