@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Float32
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.evaluation.passes import ArrayStore
 from p2gs_jax.evaluation.scores import ViewResult
-from p2gs_jax.evaluation.unexplained import Residuals, Surface, Unexplained, shares_by_view
+from p2gs_jax.evaluation.unexplained import Residuals, Surface, Unexplained
 from p2gs_jax.render.warp import OPAQUE, project_points
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.rigid import interpolated, inverse, left_of_way
@@ -76,9 +76,10 @@ class DriveScores:
     def summary(self) -> dict:
         """Return the parts of `metrics.json`."""
         self.unexplained = self._residuals.find()
-        shares = shares_by_view(self._scene, self.unexplained)
-        out = {"unexplained": shares, "novel_views": self._novel()}
         views = self._scene.views
+        shares = {views[row].name: one.share for row, one in self.unexplained.items()}
+        mean = float(np.mean(list(shares.values())))
+        out = {"unexplained": {"share": mean, "per_view": shares}, "novel_views": self._novel()}
         held_out = [d for row, d in self._depths.items() if views[row].split == "test"]
         depth = {"all": summary(list(self._depths.values())), "held_out": summary(held_out)}
         return out if not depth["all"] else {**out, "depth": depth}

@@ -124,17 +124,12 @@ def evaluate(
 ) -> Evaluation:
     """Render and judge all views.
 
-    Args:
-        params: the fit, live Gaussians only.
-        scene: views and their splits.
-        store: photographs.
-        cfg: formation model.
-        render: from `make_renderer`, where it knows which Gaussians belong to moving objects.
-        reference: view row -> photograph under the common exposure, or None where there is none.
-        radiance: view row -> true linear radiance at the size of the photographs, or None.
-        lpips_weights: adds `lpips` wherever a view is compared with a photograph.
-        on_view: receives every rendered view.
-        on_progress: views done, views in all.
+    The parameters are those of live Gaussians; `render` is from `make_renderer`, where it knows
+    which of them belong to moving objects. By the row of a view, `reference` gives the photograph
+    under the common exposure, and `radiance` the true linear radiance at the size of the
+    photographs, each None where there is none. With weights there is `lpips` wherever a view is
+    compared with a photograph. `on_progress` receives how many views are done, and how many there
+    are.
 
     Raises:
         UserError: an image is too small for LPIPS.
@@ -254,19 +249,18 @@ class _Views:
             self._rows["all"][view.name] = found.scores_all
         again = found.radiance is not None or found.reference is not None
         linear = self._arrays.put(result.linear) if again else result.linear
-        over = judge.store.backdrop is not None
+        opacity = [] if judge.store.backdrop is None else [result.alpha]
         if found.radiance is not None:
             self._radiance.add(view.name, view.split, linear, found.radiance, found.mask)
         if found.reference is not None:
-            images = (linear, found.reference, found.mask, *([result.alpha] if over else []))
+            images = (linear, found.reference, found.mask, *opacity)
             self._references.append((result.index, tuple(map(self._arrays.put, images))))
         if view.split == "train":
             self._told.append(judge.row_of[result.index])
             self._metered.add_training(view.name, found.readings)
         else:
-            images = (linear, result.photograph, found.mask)
-            alpha = result.alpha if over else None
-            self._metered.add_held_out(result.index, found.readings, *images, alpha)
+            images = (linear, result.photograph, found.mask, *opacity)
+            self._metered.add_held_out(result.index, found.readings, *images)
         if self._drive is not None:
             self._drive.add(result, found.mask)
         exposure = result.transform.exposure
@@ -306,7 +300,7 @@ class _Views:
             metrics["reference"] = _against_reference(self._references, judge)
         return Evaluation(metrics, metering, {} if drive is None else drive.unexplained)
 
-    def _under_rule(self, index, linear, exposure, photograph, mask, alpha) -> dict[str, Any]:
+    def _under_rule(self, index, exposure, linear, photograph, mask, alpha=None) -> dict[str, Any]:
         shown = replace(self._judge.usual(index), exposure=exposure)
         return self._judge.scorer(index, photograph, mask)(develop(linear, shown, alpha=alpha))
 

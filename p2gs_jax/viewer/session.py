@@ -13,8 +13,14 @@ import viser
 from p2gs_jax.viewer.camera import Frusta, Player, Pose, browser_view
 from p2gs_jax.viewer.live import Darkroom, LivePicture, report
 from p2gs_jax.viewer.panel import Panel
-from p2gs_jax.viewer.pictures import exr_bytes, png_bytes
-from p2gs_jax.viewer.settings import Settings, common_settings, same_display, settings_of_view
+from p2gs_jax.viewer.pictures import exposure_colors, exr_bytes, png_bytes
+from p2gs_jax.viewer.settings import (
+    Settings,
+    common_settings,
+    exposures_ev,
+    same_display,
+    settings_of_view,
+)
 from p2gs_jax.viewer.viewed_run import ViewedRun
 
 # Time between updates of the slider while playing, seconds.
@@ -130,7 +136,9 @@ class BrowserSession:
 
     def _add_frusta(self) -> Frusta:
         viewed, views = self._viewed, self._run.scene.views
-        frusta = Frusta(self._client, views, viewed.camera_colors, viewed.space, self.go_to)
+        evs = exposures_ev(self._run)
+        colors = exposure_colors([evs.get(row) for row in range(len(views))])
+        frusta = Frusta(self._client, views, colors, viewed.space, self.go_to)
         frusta.keep_clear(self._client.camera.position)
         threading.Thread(target=self._add_thumbnails, args=[frusta], daemon=True).start()
         self._frusta = frusta

@@ -112,16 +112,16 @@ def test_short_names_and_long_ones_are_one_option(name):
         assert getattr(getattr(cfg, group), field) == wanted
 
 
-@pytest.mark.parametrize("argv", [["--help"], ["fit", "--help-all"], ["synth", "--help"]])
-def test_help_imports_nothing_heavy(argv):
+def test_help_imports_nothing_heavy():
     child = (
         "import sys\nfrom p2gs_jax.cli import main\n"
-        f"try:\n    main({argv!r})\nexcept SystemExit:\n    pass\n"
+        "for argv in (['--help'], ['fit', '--help-all'], ['synth', '--help']):\n"
+        "    try:\n        main(argv)\n    except SystemExit:\n        pass\n"
         f"print([m for m in {HEAVY!r} if m in sys.modules], file=sys.stderr)"
     )
     done = subprocess.run([sys.executable, "-c", child], capture_output=True, text=True, check=True)
     assert done.stderr.strip() == "[]"
-    assert "usage: p2gs-jax" in done.stdout
+    assert done.stdout.count("usage: p2gs-jax") >= 3
 
 
 @pytest.fixture

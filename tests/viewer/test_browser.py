@@ -109,26 +109,34 @@ def alike(a, b):
     return float(np.corrcoef(a.ravel(), b.ravel())[0, 1])
 
 
-def test_one_stop_on_the_slider_doubles_the_brightness(page, tmp_path):
+def test_one_stop_on_the_slider_doubles_the_brightness(page):
     choose(page, "Curve", "linear")
     enter(page, "Gamma", 2.2)
     enter(page, "Exposure", 0.5)
     before = steady(page)
     enter(page, "Exposure", 1.5)
     after = until(page, lambda shown: abs(brightening(before, shown) / 2 - 1) < 0.02)
-    path = tmp_path / "viewer.png"
-    page.screenshot(path=str(path))
-    assert path.stat().st_size > 10_000
     assert after.mean() > before.mean()
 
 
-def test_every_mode_shows_something_else(page):
+def test_every_mode_shows_something_else_and_saved_files_arrive(page):
     shown = [picture(page)]
     for mode in ("stops (false colour)", "clipping", "depth", "split: photo | render"):
         choose(page, "Show", mode)
         shown.append(until(page, lambda now: all(np.abs(now - s).mean() > 2e-4 for s in shown)))
     assert page.get_by_text("depth, scene units").count() == 0
     assert page.locator("label", has_text="Split").count() == 1
+    page.get_by_text("Save", exact=True).click()
+    enter(page, "Width", 333)
+    for button, start in (("PNG, as shown", b"\x89PNG"), ("EXR, linear light", b"v/1\x01")):
+        with page.expect_download() as download:
+            page.get_by_role("button", name=button).click()
+        with open(download.value.path(), "rb") as file:
+            content = file.read()
+        assert content.startswith(start)
+        if button.startswith("PNG"):
+            shown = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+            assert shown.shape[1] == 333
 
 
 def test_going_to_a_photograph_takes_its_look_and_place_and_cameras_appear(page):
@@ -158,20 +166,6 @@ def test_the_picture_follows_keys_and_a_drive_until_it_is_paused(page):
     page.get_by_role("button", name="Pause").click()
     steady(page)
     assert page.get_by_role("button", name="Play").count() == 1
-
-
-def test_saved_files_arrive(page):
-    page.get_by_text("Save", exact=True).click()
-    enter(page, "Width", 333)
-    for button, start in (("PNG, as shown", b"\x89PNG"), ("EXR, linear light", b"v/1\x01")):
-        with page.expect_download() as download:
-            page.get_by_role("button", name=button).click()
-        with open(download.value.path(), "rb") as file:
-            content = file.read()
-        assert content.startswith(start)
-        if button.startswith("PNG"):
-            shown = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
-            assert shown.shape[1] == 333
 
 
 def test_browser_splats_look_like_the_kernel(page):
