@@ -23,7 +23,6 @@ FACADE_LINE = 9.0
 CROSS_STREET, UNDERPASS, STREET_END = (27.0, 36.0), (54.0, 68.0), 100.0
 UNDERPASS_HEIGHT, FLOOR_HEIGHT, GROUND_FLOOR_HEIGHT = 5.2, 3.2, 4.0
 
-
 # What `tracer` paints a primitive with; ROAD is the ground plane.
 Material = IntEnum(
     "Material",
@@ -150,12 +149,11 @@ def _taper_planes(solid: Solid) -> np.ndarray:
     assert solid.top is not None
     tx0, tx1, ty0, ty1 = solid.top
     rise = z1 - z0
-    along_x = [(-rise, 0, tx0 - x0), (rise, 0, x1 - tx1)]
-    along_y = [(0, -rise, ty0 - y0), (0, rise, y1 - ty1)]
-    normals = np.array([*along_x, *along_y, (0, 0, -1), (0, 0, 1)], np.float64)
+    sides = [(-rise, 0, tx0 - x0), (rise, 0, x1 - tx1), (0, -rise, ty0 - y0), (0, rise, y1 - ty1)]
+    normals = np.array([*sides, (0, 0, -1), (0, 0, 1)], np.float64)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    first = (x0, y0, z0)
-    anchors = np.array([first, (x1, y0, z0), first, (x0, y1, z0), first, (x0, y0, z1)])
+    anchors = np.tile((x0, y0, z0), (6, 1))
+    anchors[[1, 3, 5], [0, 1, 2]] = x1, y1, z1
     return np.concatenate([normals, (normals * anchors).sum(1, keepdims=True)], axis=1)
 
 
@@ -163,11 +161,8 @@ def pack(build: Builder, seed: int, light: Light) -> Town:
     """Return the town of all solids, ordered boxes, tapered boxes, ellipsoids."""
     solids = sorted(build.solids, key=lambda s: s.kind)
     tapered = [s for s in solids if s.kind == 1]
-
-    columns = {
-        name: np.array([getattr(s, name) for s in solids], np.float32)
-        for name in ("lo", "hi", "color", "accent", "params")
-    }
+    names = ("lo", "hi", "color", "accent", "params")
+    columns = {n: np.array([getattr(s, n) for s in solids], np.float32) for n in names}
     return Town(
         n_boxes=sum(s.kind == 0 for s in solids),
         n_tapered=len(tapered),

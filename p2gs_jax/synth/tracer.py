@@ -86,9 +86,8 @@ class Tracer:
             seen = jnp.all((upper > corner) & (lower < corner + _TILE), axis=1)
             t, index = nearest_hit(town, origin[:, None], direction, seen)
             samples = supersample**2 * _TILE**2
-            linear = radiance(
-                town, origin, direction[:, :samples], t[:samples], index[:samples], 1.0 / K[0, 0]
-            )
+            rays = direction[:, :samples], t[:samples], index[:samples]
+            linear = _radiance(town, origin, *rays, 1.0 / K[0, 0])
             return linear.reshape(3, -1, _TILE, _TILE).mean(1), t[samples:].reshape(_TILE, _TILE)
 
         corners = _TILE * np.stack(np.meshgrid(np.arange(across), np.arange(down)), -1)
@@ -99,18 +98,13 @@ class Tracer:
         return linear, depth.reshape(down * _TILE, across * _TILE)[:height, :width]
 
 
-def radiance(
-    town: Town,
-    origin: Float[Array, " 3"],
-    direction: Float[Array, "3 r"],
-    t: Float[Array, " r"],
-    index: Int[Array, " r"],
-    pixel_angle: Array,
+def _radiance(
+    town: Town, origin: Array, direction: Array, t: Array, index: Array, pixel_angle: Array
 ) -> Float[Array, "3 r"]:
-    """Return the linear radiance that arrives along rays.
+    """Return the linear radiance that arrives at the origin [3] along rays [3 R].
 
-    Directions are not normalised; `t` is where a ray hits (inf: sky) and `index` what; a pixel is
-    `pixel_angle` wide at unit camera z, and finer texture fades out.
+    Directions are not normalised; `t` [R] is where a ray hits (inf: sky) and `index` [R] what; a
+    pixel is `pixel_angle` wide at unit camera z, and finer texture fades out.
     """
     hit = jnp.isfinite(t)
     p = origin[:, None] + jnp.where(hit, t, 1.0) * direction

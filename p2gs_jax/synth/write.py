@@ -103,14 +103,15 @@ def write_street(
 
 def _views(frames: int, width: int, height: int, step: float):
     """Return the cameras of a drive, and the frame of each view."""
-    names = tuple(f"{camera}/{f:06d}.png" for camera in sorted(MOUNTS) for f in range(frames))
-    cameras = tuple(name.split("/")[0] for name in names)
-    frame = np.tile(np.arange(frames), len(MOUNTS))
-    track = drive(frames, step=step)
-    viewmats = np.stack(
-        [camera_viewmat(MOUNTS[c], track[f]) for c, f in zip(cameras, frame, strict=True)]
+    places = drive(frames, step=step)
+    taken = [(camera, f) for camera in sorted(MOUNTS) for f in range(frames)]
+    names, cameras = (
+        [f"{camera}/{f:06d}.png" for camera, f in taken],
+        [camera for camera, _ in taken],
     )
-    return DriveViews(names, cameras, viewmats, intrinsics(width, height), width, height), frame
+    viewmats = np.stack([camera_viewmat(MOUNTS[camera], places[f]) for camera, f in taken])
+    views = DriveViews(names, cameras, viewmats, intrinsics(width, height), width, height)
+    return views, np.array([f for _, f in taken])
 
 
 def _photograph(

@@ -58,12 +58,8 @@ def test_what_nuscenes_lacks_is_counted(copied, read):
     root = copied("nuscenes").root
     edit(root, "ego_pose", lambda rows: [r for r in rows if "CAM_FRONT" not in r["token"]])
     edit(root, "scene", lambda rows: [{**rows[0], "nbr_samples": 39}])
-    nameless = {"instance_token": ""}
-    edit(
-        root,
-        "sample_annotation",
-        lambda rows: [{**r, **nameless} if "right" in r["token"] else r for r in rows],
-    )
+    names = {False: {}, True: {"instance_token": ""}}
+    edit(root, "sample_annotation", lambda rows: [r | names["right" in r["token"]] for r in rows])
     for folder in ("samples", "sweeps"):
         next(iter((root / folder / "LIDAR_TOP").iterdir())).unlink()
     drive = read(root)
@@ -221,21 +217,17 @@ def test_what_waymo_lacks_is_counted(copied, read):
     ]
 
 
+def image(prefix, *shape):
+    return {f"{prefix}values": [1.0] * int(np.prod(shape)), f"{prefix}shape": list(shape)}
+
+
 @pytest.mark.parametrize(
     ("component", "changes", "words"),
     [
         ("lidar", {f"{waymo.RANGES}shape": [5, 7, 4]}, "holds no range image"),
         ("lidar", {"key.laser_name": 4}, "has no scanner 4"),
-        (
-            "lidar",
-            {f"{waymo.RANGES}values": [1.0] * 96, f"{waymo.RANGES}shape": [2, 12, 4]},
-            "2 rows",
-        ),
-        (
-            "lidar_pose",
-            {f"{waymo.PIXELS}values": [1.0] * 6, f"{waymo.PIXELS}shape": [1, 1, 6]},
-            "does not fit its range image",
-        ),
+        ("lidar", image(waymo.RANGES, 2, 12, 4), "2 rows"),
+        ("lidar_pose", image(waymo.PIXELS, 1, 1, 6), "does not fit its range image"),
     ],
 )
 def test_senseless_range_images_are_named_when_they_are_read(
