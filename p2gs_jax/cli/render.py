@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from p2gs_jax.cli.shared import MeteringRule, SceneFolder, check
+from p2gs_jax.cli.shared import MeteringRule, RunPath, SceneFolder, check
 from p2gs_jax.errors import UserError
 
 if TYPE_CHECKING:
@@ -33,8 +33,7 @@ class Render:
     p2gs-jax render runs/street --panorama --split test --width 1400 --out wide
     """
 
-    run: Annotated[Path, tyro.conf.Positional]
-    """Run folder."""
+    run: RunPath
     path: str = "views"
     """views: the scene's own. drive: smoothly through the views of one camera. orbit: around what
     the cameras look at. FILE.json: a list of cameras (docs/rendering.md)."""
@@ -84,7 +83,6 @@ class Render:
     fps: float | None = None
     """Frames per second of a video (default: 24)."""
     scene: SceneFolder = None
-    """Where the run's scene lies now, if it is not where it was."""
     overwrite: bool = False
     """Replace what an earlier render wrote."""
 

@@ -220,12 +220,15 @@ class DisplayFiles:
         begin = time.monotonic()
         write, read, degree = WRITERS[name]
         shown, more = self._bake(degree), ()
-        error = self._error_of_baked(degree) if read is None else {}
+        if read is None and degree not in self.errors:
+            self.errors[degree] = self._error(shown)
+        error = self.errors[degree] if read is None else {}
         if name == "display-ply":
             notes = [f"p2gs-jax: {sentence}" for sentence in _sentences(error)]
             more = ([*display_comments(self.transform), *notes],)
         elif name == "usd":
-            more = (named_cameras(self.fitted),)
+            views, camera = self.fitted.scene.views, self.fitted.store.camera
+            more = ([NamedCamera(v.name, *camera(index)) for index, v in enumerate(views)],)
         write(path, shown, *more)
         if read is not None:
             error = self._error(read(path))
@@ -259,12 +262,6 @@ class DisplayFiles:
             self.baked[degree] = refine(start, aims, cfg.render, **order, on_step=on_step)
         return self.baked[degree]
 
-    def _error_of_baked(self, degree: int) -> dict:
-        """Return the error of a file that holds the baked colours as they are."""
-        if degree not in self.errors:
-            self.errors[degree] = self._error(self._bake(degree))
-        return self.errors[degree]
-
     def _error(self, shown: Gaussians) -> dict:
         """Return the baking error by split."""
         self.reporter.stage("Measuring")
@@ -272,12 +269,6 @@ class DisplayFiles:
         splits = {"train": scene.train_indices, "test": scene.test_indices}
         aims = {split: [self.targets[i] for i in _spread(rows)] for split, rows in splits.items()}
         return {n: error_summary(baking_error(shown, aim, render)) for n, aim in aims.items()}
-
-
-def named_cameras(fitted: Run) -> list[NamedCamera]:
-    """Return the cameras of all photographs at the size of the fit."""
-    views = enumerate(fitted.scene.views)
-    return [NamedCamera(view.name, *fitted.store.camera(index)) for index, view in views]
 
 
 def _spread(rows: Sequence[int]) -> list[int]:

@@ -29,14 +29,12 @@ CORRECTIONS = {
 }
 # How sentences of the photometric selection begin (photometry/calibrate.py).
 REASONS = ("Chosen:", "Simpler (", "Richer (", "What predicts best")
-# Least gap between the PSNR of training and held-out views, dB.
-WIDE_GAP = 4.0
-# Least gap between one held-out view and the median of all, dB.
-OUTLIER = 6.0
-# Least standard error of an exposure, stops.
-WEAK_EV = 0.1
-# Least drift of an exposure from its start, stops; it must exceed three standard errors as well.
-DRIFT_EV = 0.1
+# Least gaps, dB: between the PSNR of training and held-out views; between a held-out view and the
+# median of all.
+WIDE_GAP, OUTLIER = 4.0, 6.0
+# Least standard error of an exposure, and least drift from its start, stops; a drift must exceed
+# three standard errors as well.
+WEAK_EV, DRIFT_EV = 0.1, 0.1
 # Gammas of cameras lie between these: two priors' widths about 2.2 (`A_PRIOR` in
 # photometry/adjustment/system.py).
 GAMMAS = (1.65, 3.15)
@@ -126,8 +124,7 @@ def _why(run: RunFiles) -> str:
 
 
 def _how_good(run: RunFiles, scene: SceneMeasurements) -> str:
-    parts = []
-    train = run.number("train", "psnr")
+    parts, train = [], run.number("train", "psnr")
     held_out = run.number("test", "exposure_fitted", "psnr")
     if held_out is not None:
         against = "" if train is None else f" (training photographs at {train:.1f} dB)"
@@ -284,10 +281,10 @@ def _on_exposures(run: RunFiles) -> Iterator[RunWarning]:
         )
     agreement = against_exif(run)
     if agreement is not None and agreement.disagrees.any():
-        views = [v for v in run.train if v["exposure_ev"] is not None]
+        views = [v["image"] for v in run.train if v["exposure_ev"] is not None]
         off = np.flatnonzero(agreement.disagrees)
         off = off[np.argsort(-np.abs(agreement.gap_ev[off]))]
-        names = [f"{views[i]['image']} {agreement.gap_ev[i]:+.2f}" for i in off]
+        names = [f"{views[i]} {agreement.gap_ev[i]:+.2f}" for i in off]
         yield RunWarning(
             "EXIF disagrees with the pixels",
             f"In {len(off)} of {agreement.views} views the exposure recovered from the pixels "

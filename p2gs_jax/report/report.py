@@ -29,15 +29,9 @@ def write_report(
 ) -> Path:
     """Write one page about a run, which needs no other file and no network; return its path.
 
-    Args:
-        folder: of the run.
-        out: the page; None: `report.html` in the folder.
-        scene: where the run's scene lies now; None: where it was.
-        render: load the scene and render for the seams; False uses only what the folder holds.
-        reporter: receives progress.
-
-    Raises:
-        UserError: it is not a run folder, or the page cannot be written.
+    The page is `report.html` in the folder unless `out` names another. `scene` is where the run's
+    scene lies now (None: where it was). Without `render` the page has only what the folder holds,
+    and no seams. A UserError says that it is not a run folder, or that the page cannot be written.
     """
     reporter = reporter or Silent()
     folder = Path(folder)

@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import pytest
 
-from p2gs_jax.config import DataConfig
 from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.paths.panorama import covering
 from p2gs_jax.paths.pictures import RunRenderer
@@ -20,7 +19,7 @@ from p2gs_jax.paths.shots import Shot, view_shots
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.run.read import load_run
 from p2gs_jax.run.scene_file import write_scene
-from p2gs_jax.scene import load_scene
+from p2gs_jax.types import Scene, View
 
 SIZE = (96, 72)
 YAWS = {"left": -22.0, "right": 22.0}
@@ -69,14 +68,11 @@ def rig_run(finished_run, tmp_path_factory) -> Path:
     shutil.copytree(finished_run, root / "run")
     renderer = RunRenderer(load_run(finished_run))
     K = np.array([[70.0, 0, SIZE[0] / 2], [0, 70.0, SIZE[1] / 2], [0, 0, 1]])
-    model = root / "scene" / "sparse" / "0"
-    model.mkdir(parents=True)
-    lines, views = [], []
-    for number, ((camera, step), ev) in enumerate(STOPS.items(), 1):
-        half = np.deg2rad(YAWS[camera]) / 2
-        viewmat = np.eye(4)
-        turn = np.cos(2 * half), np.sin(2 * half)
-        viewmat[0, [0, 2]], viewmat[2, [0, 2]] = (turn[0], -turn[1]), (turn[1], turn[0])
+    views, solved = [], []
+    for (camera, step), ev in STOPS.items():
+        viewmat, yaw = np.eye(4), np.deg2rad(YAWS[camera])
+        viewmat[0, [0, 2]] = np.cos(yaw), -np.sin(yaw)
+        viewmat[2, [0, 2]] = np.sin(yaw), np.cos(yaw)
         viewmat[:3, 3] = -viewmat[:3, :3] @ [0.3 * step, 0, 0]
         linear, _, _ = renderer.linear(Shot("", viewmat, K, *SIZE))
         transform = DisplayTransform(2.0**ev, 2.2, renderer.run.cfg.photometry)
@@ -84,25 +80,22 @@ def rig_run(finished_run, tmp_path_factory) -> Path:
         path = root / "scene" / "images" / name
         path.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(path), np.rint(develop(linear, transform) * 255)[..., ::-1])
-        # A turn by yaw to the right is one of the world to the left about y (down).
-        q, t = (np.cos(half), 0, -np.sin(half), 0), viewmat[:3, 3]
-        lines += [" ".join(map(str, (number, *q, *t, 1, name))), "1.0 1.0 1"]
+        split = "train" if step == 1 else "test"
+        pose = viewmat.astype(np.float32)
+        views.append(View(name, path, camera, pose, K.astype(np.float32), *SIZE, split=split))
         known = {"image": name, "camera": camera, "exif_ev": None, "split": "train"}
         known |= {"exposure": 2.0**ev, "exposure_ev": ev, "gamma": 2.2, "exposure_fitted": None}
         unknown = {"exposure": None, "exposure_ev": None, "gamma": None, "exposure_fitted": 2.0**ev}
-        views.append(known if step == 1 else known | unknown | {"split": "test"})
-    (model / "images.txt").write_text("\n".join(lines) + "\n")
-    cx, cy = SIZE[0] / 2, SIZE[1] / 2
-    (model / "cameras.txt").write_text(f"1 PINHOLE {SIZE[0]} {SIZE[1]} 70 70 {cx} {cy}\n")
-    (model / "points3D.txt").write_text("1 0 0 4 128 128 128 0.5 1 0 2 0\n")
+        solved.append(known if step == 1 else known | unknown | {"split": "test"})
     for name, key, value in (
         ("config.json", "scene", str(root / "scene")),
-        ("photometry.json", "views", views),
+        ("photometry.json", "views", solved),
     ):
         data = json.loads((root / "run" / name).read_text())
         data[key] = value
         (root / "run" / name).write_text(json.dumps(data))
-    write_scene(root / "run", load_scene(root / "scene", DataConfig(test_every=2)))
+    points = np.array([[0, 0, 4]], np.float32)
+    write_scene(root / "run", Scene(root / "scene", "colmap", tuple(views), points, None))
     return root / "run"
 
 

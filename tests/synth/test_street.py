@@ -17,12 +17,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.scene.colmap import load_colmap
 from p2gs_jax.synth.furnish import STREET_M, build_town
 from p2gs_jax.synth.rig import MOUNTS, camera_viewmat, carla_rotation, drive, intrinsics
-from p2gs_jax.synth.sensor import (
-    draw_shots,
-    photograph,
-    read_true_exposures,
-    write_true_exposures,
-)
+from p2gs_jax.synth.sensor import draw_shots, photograph, read_true_exposures, write_true_exposures
 from p2gs_jax.synth.settings import Sensor, image_height
 from p2gs_jax.synth.town import Material
 from p2gs_jax.synth.write import write_street

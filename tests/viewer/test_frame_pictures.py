@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from splats import random_splats
 
 from p2gs_jax.config import CameraFormation, PhotometryConfig, RenderConfig
 from p2gs_jax.formats.exr import read_exr
@@ -14,7 +15,7 @@ from p2gs_jax.formats.false_color import OVER, clipping_overlay, depth_color, fa
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import squared_radii
 from p2gs_jax.render import view_radiance
-from p2gs_jax.types import Camera, Gaussians
+from p2gs_jax.types import Camera
 from p2gs_jax.viewer import pictures
 
 TRANSFORM = DisplayTransform(2.0, 2.2, PhotometryConfig())
@@ -151,17 +152,11 @@ def test_vignetting_is_where_the_photograph_has_it():
     assert np.ptp(shown) > 0.1
 
 
-def splats_of(n=5, *, alive=True, cfg=None, **place):
-    rng = np.random.default_rng(0)
-    g = Gaussians(
-        means=jnp.asarray(rng.normal((0, 0, 5), 1, (n, 3)), jnp.float32),
-        quats=jnp.asarray(rng.normal(size=(n, 4)), jnp.float32).at[0].set(0),
-        log_scales=jnp.asarray(rng.normal(size=(n, 3)), jnp.float32).at[-1].set(20.0),
-        opacity_logits=jnp.asarray(rng.normal(size=n), jnp.float32),
-        sh=jnp.asarray(rng.normal(size=(n, 4, 3)), jnp.float32),
-    )
+def splats_of(*, alive=True, cfg=None, **place):
+    g = random_splats(5, degree=1)
+    g = replace(g, quats=g.quats.at[0].set(0), log_scales=g.log_scales.at[-1].set(20.0))
     place = {"seen_from": np.zeros(3), "unit": 1.0} | place
-    return g, pictures.browser_splats(g, np.broadcast_to(alive, n), cfg or RenderConfig(), **place)
+    return g, pictures.browser_splats(g, np.broadcast_to(alive, 5), cfg or RenderConfig(), **place)
 
 
 def test_browser_splats_are_the_gaussians_in_viewer_units():
