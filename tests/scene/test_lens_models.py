@@ -11,12 +11,7 @@ from scene.helpers import write_image, write_tiny_model
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene import load_scene
-from p2gs_jax.scene.lens import (
-    _fold_radius,
-    intrinsics,
-    undistort_points,
-    undistortion_maps,
-)
+from p2gs_jax.scene.lens import _fold_radius, intrinsics, undistort_points, undistortion_maps
 from p2gs_jax.scene.sfm.triangulate import camera_of
 from p2gs_jax.scene.transforms import load_transforms
 from p2gs_jax.types import Distortion
