@@ -99,9 +99,7 @@ def recentre(params: Params, activation: RadianceKind) -> Params:
     else:
         raw = photometry.raw_exposures / np.exp(log_scale)
     moved = dataclasses.replace(
-        photometry,
-        raw_exposures=raw,
-        raw_white_balance=None if balance is None else balance - tint,
+        photometry, raw_exposures=raw, raw_white_balance=None if balance is None else balance - tint
     )
     return dataclasses.replace(
         params,
