@@ -141,13 +141,8 @@ def homography_of(parameters: Float[Array, " 8"]) -> Float[Array, "3 3"]:
     targets = sources.at[:, :2].add(offsets(parameters))
     blue, red, green, neutral = targets
     # Cramer's rule; the determinant of T is a common factor.
-    k = jnp.stack(
-        [
-            neutral @ jnp.cross(red, green),
-            neutral @ jnp.cross(green, blue),
-            neutral @ jnp.cross(blue, red),
-        ]
-    )
+    pairs = ((red, green), (green, blue), (blue, red))
+    k = jnp.stack([neutral @ jnp.cross(a, b) for a, b in pairs])
     inverse = jnp.asarray(np.linalg.inv(SOURCES[:3].T), parameters.dtype)
     h = (targets[:3].T * k) @ inverse
     return h / h[2, 2]

@@ -21,12 +21,8 @@ from p2gs_jax.core.numerics import Values, namespace
 Base = Literal["srgb", "power"]
 BASES: tuple[Base, ...] = get_args(Base)
 # The spline's knots in display values; two of them are held, which fixes scale and power.
-KNOTS = np.array(
-    [
-        *(0.02, 0.05, 0.08, 0.12, 0.16, 0.21, 0.26, 0.32, 0.38, 0.44),
-        *(0.5, 0.56, 0.62, 0.68, 0.74, 0.8, 0.86, 0.9, 0.94, 0.98),
-    ]
-)
+_PERCENT = [2, 5, 8, 12, 16, 21, 26, 32, 38, 44, 50, 56, 62, 68, 74, 80, 86, 90, 94, 98]
+KNOTS = np.array(_PERCENT) / 100
 HELD = (6, 16)
 # The knots that are solved for; of several splines, the powers differ as well.
 FREE = tuple(k for k in range(len(KNOTS)) if k not in HELD)
@@ -113,10 +109,8 @@ def base_log(y: Numbers, base: Base) -> tuple[Numbers, Numbers]:
         return 2.2 * np.log(y), 2.2 / y
     toe = y <= 0.04045
     high = (y + 0.055) / 1.055
-    return (
-        np.where(toe, np.log(y / 12.92), 2.4 * np.log(high)),
-        np.where(toe, 1 / y, 2.4 / (y + 0.055)),
-    )
+    logs = np.where(toe, np.log(y / 12.92), 2.4 * np.log(high))
+    return logs, np.where(toe, 1 / y, 2.4 / (y + 0.055))
 
 
 def log_exposed(

@@ -69,9 +69,8 @@ def weigh(model: Forward, theta: Parameters, weight: PerChannel, loss: Loss) -> 
     weight = rows.weight / sigma**2 * factor
     radiance, precision = _radiance(rows, a, z_of_point, weight)
     of_point = radiance[rows.layout.row]
-    residual = z_of_point - a * of_point
-    level = of_point + added
-    return Weighted(weight, sigma, slope, residual, radiance, level, precision, scale, curvature)
+    known = z_of_point - a * of_point, radiance, of_point + added, precision
+    return Weighted(weight, sigma, slope, *known, scale, curvature)
 
 
 def _geman_mcclure(

@@ -106,11 +106,10 @@ def _iterative(sparse: sp.csr_array, low_rank: Float[np.ndarray, "g n"]):
     operator = functools.partial(scipy.sparse.linalg.LinearOperator, (count, count))
     matrix, preconditioner = operator(multiply), operator(precondition)
 
+    how = {"rtol": PRECISION, "maxiter": MOST_ITERATIONS, "M": preconditioner}
+
     def one(right):
-        found, _ = scipy.sparse.linalg.cg(
-            matrix, right, rtol=PRECISION, maxiter=MOST_ITERATIONS, M=preconditioner
-        )
-        return found
+        return scipy.sparse.linalg.cg(matrix, right, **how)[0]
 
     def solve(right):
         if right.ndim == 1:
@@ -192,10 +191,8 @@ def solve_model(
     nothing). The tolerance and the loss are those of `solve`.
     """
     weight = problem.usable if use is None else problem.usable * use[:, None]
-    rows, system = (
-        make_rows(problem, weight, response, splines),
-        make_system(problem, form, splines),
-    )
+    rows = make_rows(problem, weight, response, splines)
+    system = make_system(problem, form, splines)
     with one_thread():
         return solve(rows, system, tolerance, loss), system
 

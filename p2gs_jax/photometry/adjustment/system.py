@@ -163,17 +163,12 @@ def _priors(u: Unknowns, log_exposure, precision) -> Held:
     every = sp.csr_array(sp.eye_array(u.count))
     of_a = every[u.at.a.start + views] if u.gammas else every[:0]
     lenses = np.arange(u.at.k.start + u.features.balance_count, u.at.k.stop)
-    gammas = of_a.shape[0]
+    counts = [of_a.shape[0], len(lenses)]
+    others = np.repeat([1 / A_PRIOR**2, 1 / VIGNETTING_PRIOR**2], counts)
     return Held(
         sp.csr_array(sp.vstack([exposures, of_a, every[lenses]])),
-        np.repeat([0.0, 1.0, 0.0], [len(given), gammas, len(lenses)]),
-        np.concatenate(
-            [
-                precision[given],
-                np.full(gammas, 1 / A_PRIOR**2),
-                np.full(len(lenses), 1 / VIGNETTING_PRIOR**2),
-            ]
-        ),
+        np.repeat([0.0, 1.0, 0.0], [len(given), *counts]),
+        np.concatenate([precision[given], others]),
     )
 
 
