@@ -97,18 +97,15 @@ def _modelled(run: RunFiles) -> str:
     if run.photometry is None:
         return "What was modelled of the cameras is not known: photometry.json is missing."
     model, curve = run.photometry["model"], run.photometry["curve"].get("name", "")
-    kind = run.option("photometry", "appearance")
+    kind, preset = run.option("photometry", "appearance"), f"The preset {run.preset}"
     if kind == "ppisp":
         return (
-            f"The preset {run.preset} learns cameras beside the splats: exposure and colours of "
-            "every view, vignetting and response of every camera."
+            f"{preset} learns cameras beside the splats: exposure and colours of every view, "
+            "vignetting and response of every camera."
         )
     correction = f", with {CORRECTIONS.get(kind, kind)} learned for every view" if kind else ""
     if curve == "linear" and model == "constant":
-        return (
-            f"The preset {run.preset} models no camera: display values are splatted as they are"
-            f"{correction}."
-        )
+        return f"{preset} models no camera: display values are splatted as they are{correction}."
     span = exposure_span(run)
     spans = "" if span is None or model == "constant" else f"; exposures span {span:.1f} stops"
     what, under = DESCRIPTIONS.get(model, model), CURVES.get(curve, curve)

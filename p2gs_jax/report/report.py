@@ -85,15 +85,15 @@ def _key_numbers(
     run: RunFiles, scene: SceneMeasurements, found: list[RunWarning]
 ) -> Iterator[tuple[str, str, str]]:
     held_out, train = run.number("test", "exposure_fitted", "psnr"), run.number("train", "psnr")
-    if held_out is not None:
-        yield "Held-out PSNR", f"{held_out:.1f} dB", "exposure fitted to each"
-    if train is not None:
-        yield "Training PSNR", f"{train:.1f} dB", "own exposures"
-    span, error = findings.exposure_span(run), findings.true_error(run, scene.true_exposures)
-    if span is not None:
-        yield "Exposures span", f"{span:.1f}", "stops, training views"
-    if error is not None:
-        yield "Exposure error", f"{error['ev']:.3f}", "stops RMS, truth known"
+    error = findings.true_error(run, scene.true_exposures)
+    for name, value, form, remark in (
+        ("Held-out PSNR", held_out, "{:.1f} dB", "exposure fitted to each"),
+        ("Training PSNR", train, "{:.1f} dB", "own exposures"),
+        ("Exposures span", findings.exposure_span(run), "{:.1f}", "stops, training views"),
+        ("Exposure error", error and error["ev"], "{:.3f}", "stops RMS, truth known"),
+    ):
+        if value is not None:
+            yield name, form.format(value), remark
     if scene.seams:
         before, after = scenes.seam_medians(scene.seams)
         pairs = count(len(scene.seams), "pair")

@@ -59,9 +59,6 @@ def test_shares_of_stops_have_the_colours_of_the_picture_and_these_grow_lighter(
     legend = [color for *_, color in stop_shares(steps, 1.0)][::-1]
     np.testing.assert_allclose(shown, legend, atol=1e-6)
     assert np.all(np.diff(shown @ [0.2126, 0.7152, 0.0722]) > 0)
-
-
-def test_dynamic_range():
     values = np.repeat(2.0 ** np.arange(0, 8.0), 100).reshape(8, 100)
     assert dynamic_range(grey(values)) == pytest.approx(7.0, abs=0.01)
     assert dynamic_range(np.zeros((4, 4, 3))) == 0.0
