@@ -20,27 +20,13 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.export.folders import write_colmap_folder, write_nerfstudio_folder
 from p2gs_jax.export.page import MEGABYTE, write_page
 from p2gs_jax.export.sidecar import corrections_name, linear_sidecar
+from p2gs_jax.formats import gsply_files as gsply
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.gltf import write_gltf
-from p2gs_jax.formats.gsply_files import (
-    read_compressed_ply,
-    read_spz,
-    require_gsply,
-    write_compressed_ply,
-    write_spz,
-)
 from p2gs_jax.formats.ply import write_ply, write_radiance
 from p2gs_jax.formats.splat import read_splat, write_splat
 from p2gs_jax.formats.usd import NamedCamera, require_pxr, write_usd
-from p2gs_jax.gaussians.bake import (
-    Target,
-    bake,
-    baking_error,
-    display_comments,
-    error_summary,
-    refine,
-    true_target,
-)
+from p2gs_jax.gaussians import bake as baking
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.render.harmonics import MAX_DEGREE
@@ -74,8 +60,8 @@ MEASURED = 60
 # written; and degree of the harmonics that the format holds.
 WRITERS: dict[str, tuple[Callable, Callable | None, int]] = {
     "splat": (write_splat, read_splat, 0),
-    "spz": (write_spz, read_spz, MAX_DEGREE),
-    "compressed-ply": (write_compressed_ply, read_compressed_ply, MAX_DEGREE),
+    "spz": (gsply.write_spz, gsply.read_spz, MAX_DEGREE),
+    "compressed-ply": (gsply.write_compressed_ply, gsply.read_compressed_ply, MAX_DEGREE),
     "gltf": (write_gltf, None, MAX_DEGREE),
     "display-ply": (write_ply, None, MAX_DEGREE),
     "usd": (write_usd, None, MAX_DEGREE),
@@ -85,7 +71,7 @@ WRITERS: dict[str, tuple[Callable, Callable | None, int]] = {
 def require_packages(formats: Sequence[str]) -> None:
     """Raise a UserError where a format needs a package that is not installed."""
     if {"spz", "compressed-ply"} & set(formats):
-        require_gsply()
+        gsply.require_gsply()
     if "usd" in formats:
         require_pxr()
 
@@ -203,16 +189,17 @@ class DisplayFiles:
         """Render the true pictures that `steps` (None: enough) of refinement aim at."""
         self.fitted, self.transform, self.reporter = fitted, transform, reporter
         self.errors: dict[int, dict] = {}
-        self.gaussians, scene = at_time(fitted.as_of(), None), fitted.scene
+        g, scene = at_time(fitted.as_of(), None), fitted.scene
+        self.gaussians = g
         self.steps = max(STEPS, len(scene.train_indices)) if steps is None else steps
         self.baked: dict[int, Gaussians] = {}
         render = make_renderer(fitted.cfg.render)
-        self.targets: dict[int, Target] = {}
+        self.targets: dict[int, baking.Target] = {}
         wanted = scene.train_indices if self.steps else _spread(scene.train_indices)
         rows = [*wanted, *_spread(scene.test_indices)]
         for done, index in enumerate(rows):
             name, camera = scene.views[index].name, camera_of(fitted.store, index)
-            self.targets[index] = true_target(name, self.gaussians, camera, transform, render)
+            self.targets[index] = baking.true_target(name, g, camera, transform, render)
             reporter.stage("Rendering true pictures", done + 1, len(rows))
 
     def write(self, name: str, path: Path, sidecar: Path) -> str:
@@ -220,12 +207,15 @@ class DisplayFiles:
         begin = time.monotonic()
         write, read, degree = WRITERS[name]
         shown, more = self._bake(degree), ()
-        error = self._error_of_baked(degree) if read is None else {}
+        if read is None and degree not in self.errors:
+            self.errors[degree] = self._error(shown)
+        error = self.errors[degree] if read is None else {}
         if name == "display-ply":
             notes = [f"p2gs-jax: {sentence}" for sentence in _sentences(error)]
-            more = ([*display_comments(self.transform), *notes],)
+            more = ([*baking.display_comments(self.transform), *notes],)
         elif name == "usd":
-            more = (named_cameras(self.fitted),)
+            views, camera = self.fitted.scene.views, self.fitted.store.camera
+            more = ([NamedCamera(v.name, *camera(index)) for index, v in enumerate(views)],)
         write(path, shown, *more)
         if read is not None:
             error = self._error(read(path))
@@ -251,19 +241,13 @@ class DisplayFiles:
         cfg, g = self.fitted.cfg, self.gaussians
         if degree not in self.baked:
             self.reporter.stage("Baking")
-            start = bake(g, self.transform, cfg.render.radiance, degree)
+            start = baking.bake(g, self.transform, cfg.render.radiance, degree)
             train = self.fitted.scene.train_indices
             aims = [self.targets[i] for i in train if i in self.targets]
             order = {"steps": self.steps, "seed": cfg.train.seed}
             on_step = functools.partial(self.reporter.stage, "Baking")
-            self.baked[degree] = refine(start, aims, cfg.render, **order, on_step=on_step)
+            self.baked[degree] = baking.refine(start, aims, cfg.render, **order, on_step=on_step)
         return self.baked[degree]
-
-    def _error_of_baked(self, degree: int) -> dict:
-        """Return the error of a file that holds the baked colours as they are."""
-        if degree not in self.errors:
-            self.errors[degree] = self._error(self._bake(degree))
-        return self.errors[degree]
 
     def _error(self, shown: Gaussians) -> dict:
         """Return the baking error by split."""
@@ -271,13 +255,8 @@ class DisplayFiles:
         scene, render = self.fitted.scene, self.fitted.cfg.render
         splits = {"train": scene.train_indices, "test": scene.test_indices}
         aims = {split: [self.targets[i] for i in _spread(rows)] for split, rows in splits.items()}
-        return {n: error_summary(baking_error(shown, aim, render)) for n, aim in aims.items()}
-
-
-def named_cameras(fitted: Run) -> list[NamedCamera]:
-    """Return the cameras of all photographs at the size of the fit."""
-    views = enumerate(fitted.scene.views)
-    return [NamedCamera(view.name, *fitted.store.camera(index)) for index, view in views]
+        errors = {split: baking.baking_error(shown, aim, render) for split, aim in aims.items()}
+        return {split: baking.error_summary(found) for split, found in errors.items()}
 
 
 def _spread(rows: Sequence[int]) -> list[int]:
@@ -287,14 +266,11 @@ def _spread(rows: Sequence[int]) -> list[int]:
 
 def _sentences(error: dict) -> list[str]:
     """Return sentences on the baking error."""
-    said = []
-    for split, name in (("train", "training"), ("test", "held-out")):
-        s = error[split]
-        if s is not None:
-            said.append(
-                f"baking error over {s['views']} {name} views: median {s['psnr_median']:.2f} dB, "
-                f"worst {s['psnr_worst']:.2f} dB ({s['worst_view']}), mean {s['mean_codes']:.2f} "
-                f"and largest {s['max_codes']:.0f} 8-bit levels; median "
-                f"{s['psnr_on_white_median']:.2f} dB over white"
-            )
-    return said
+    return [
+        f"baking error over {s['views']} {name} views: median {s['psnr_median']:.2f} dB, "
+        f"worst {s['psnr_worst']:.2f} dB ({s['worst_view']}), mean {s['mean_codes']:.2f} "
+        f"and largest {s['max_codes']:.0f} 8-bit levels; median "
+        f"{s['psnr_on_white_median']:.2f} dB over white"
+        for name, s in (("training", error["train"]), ("held-out", error["test"]))
+        if s is not None
+    ]

@@ -134,9 +134,8 @@ def _write_model(folder: Path, scene: Scene, store: ImageStore) -> None:
         viewmat, K, width, height = store.camera(index)
         params = [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])]
         size = {"width": width, "height": height}
-        camera_id = camera_ids.setdefault(
-            (view.camera, width, height, *params), len(camera_ids) + 1
-        )
+        key = (view.camera, width, height, *params)
+        camera_id = camera_ids.setdefault(key, len(camera_ids) + 1)
         if camera_id not in model.cameras:
             camera = pycolmap.Camera(model="PINHOLE", params=params, camera_id=camera_id, **size)
             model.add_camera_with_trivial_rig(camera)
@@ -186,9 +185,8 @@ def _write_photograph(path: Path, view: View, ldr: Float[np.ndarray, "h w 3"]) -
         return
     picture = Image.fromarray(np.rint(255 * ldr).astype(np.uint8))
     with Image.open(view.image_path) as original:
-        kept: dict[str, Any] = {
-            k: original.info[k] for k in ("exif", "icc_profile") if original.info.get(k)
-        }
+        info = original.info
+        kept: dict[str, Any] = {k: info[k] for k in ("exif", "icc_profile") if info.get(k)}
     if path.suffix.lower() in (".jpg", ".jpeg"):
         kept |= {"quality": JPEG_QUALITY, "subsampling": 0}
     try:

@@ -23,8 +23,8 @@ from p2gs_jax.core.atomic import plain, write_text
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.page_scene import embedded_photographs, page_scene, rounded, uncorrected
-from p2gs_jax.export.page_splats import PageSplats, fit_into, page_error, true_picture
-from p2gs_jax.photometry.display import DisplayTransform
+from p2gs_jax.export.page_splats import PageSplats, TruePicture, fit_into, linear_light, page_error
+from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.read import Run
 
@@ -69,7 +69,8 @@ def write_page(
     pictures = []
     for i in map(int, evenly_spaced(len(scene.views), JUDGED)):
         camera, taken = fitted.camera(i), uncorrected(fitted.own_display(i))
-        pictures.append(true_picture(scene.views[i].name, gaussians, camera, taken, render))
+        linear, name = linear_light(gaussians, camera, render), scene.views[i].name
+        pictures.append(TruePicture(name, camera, taken, linear, develop(linear, taken)))
     train = scene.train_indices
     weighed = [fitted.camera(train[k]) for k in evenly_spaced(len(train), WEIGHED)]
     embedded = embedded_photographs(fitted, photographs)

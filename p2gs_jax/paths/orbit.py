@@ -142,16 +142,10 @@ def _around(focus, centers, up, *, met: bool) -> Orbit:
     arc = 2 * np.pi - gaps[widest]
     begin = azimuths[(widest + 1) % len(azimuths)]
     sway = np.pi if gaps[widest] < LARGEST_GAP else max(arc / 2, LEAST_SWAY)
-    return Orbit(
-        focus=focus,
-        up=up,
-        forward=forward,
-        radius=float(np.median(distances)),
-        elevation=float(np.clip(np.median(heights), -HIGHEST, HIGHEST)),
-        middle=float(begin + arc / 2),
-        sway=float(sway),
-        met=met,
-    )
+    radius, elevation = np.median(distances), np.clip(np.median(heights), -HIGHEST, HIGHEST)
+    numbers = radius, elevation, begin + arc / 2, sway
+    radius, elevation, middle, sway = map(float, numbers)
+    return Orbit(focus, up, forward, radius, elevation, middle, sway, met)
 
 
 def _median_depth(shot: Shot, points, centers) -> float:

@@ -56,8 +56,7 @@ class Calibration:
     # exposures from EXIF or a file, stops, laid over the recovered ones; NaN where unknown
     stated_ev: Float[np.ndarray, " v"]
     agreement: Agreement  # of stated and recovered exposures
-    known: str | None  # where known exposures came from, or None
-    gauge: str  # what fixes the scale where none are known, in words
+    gauge: str  # what fixes the scale, in words
     pivot: float  # linear value that gammas leave alone
     messages: tuple[str, ...]  # what the user should know, in plain words
     details: dict[str, Any]  # the content of `calibration.json`
@@ -85,10 +84,9 @@ class Calibration:
 
 def write_calibration(result: Calibration, out: Path) -> None:
     """Write `photometry.json`, `calibration.json` and `calibration.png`."""
-    gauge = result.gauge if result.known is None else f"known exposures ({result.known})"
     views, pivot = result.views, result.pivot
     path = out / "photometry.json"
-    write_solution(path, result.solution, views=views, pivot=pivot, gauge=gauge)
+    write_solution(path, result.solution, views=views, pivot=pivot, gauge=result.gauge)
     write_json(out / "calibration.json", result.details)
     write_calibration_plot(
         out / "calibration.png",
@@ -229,14 +227,18 @@ def solved(
         selection=selection,
         stated_ev=stated + agreement.offset_ev,
         agreement=agreement,
-        known=cfg.photometry.known,
-        gauge=MEAN_GAUGE,
+        gauge=_gauge(cfg, MEAN_GAUGE),
         pivot=pivot,
         messages=tuple(messages),
         details=details,
         observations=len(observations.views),
         seconds=seconds,
     )
+
+
+def _gauge(cfg: FitConfig, free: str) -> str:
+    known = cfg.photometry.known
+    return free if known is None else f"known exposures ({known})"
 
 
 def calibrate_stack(
@@ -281,8 +283,7 @@ def calibrate_stack(
         selection=selection,
         stated_ev=stated + agreement.offset_ev,
         agreement=agreement,
-        known=p.known,
-        gauge=STACK_GAUGE,
+        gauge=_gauge(cfg, STACK_GAUGE),
         pivot=STACK_PIVOT,
         messages=tuple(messages),
         details={

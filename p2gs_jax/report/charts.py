@@ -217,16 +217,16 @@ def training_chart(
         each, top, left = (150, 56, svg.LEFT) if wide else (120, 22, svg.NARROW_LEFT + 4)
         right = svg.room_for(tuple(losses), wide)
         figure, rows, _ = svg.stack(wide, 3, each, top=top, left=left, right=right)
-        svg.set_title(rows[0], "PSNR on the training views, dB")
+        titles = ("PSNR on the training views, dB", "Loss and its largest terms", "Gaussians")
+        for axes, title in zip(rows, titles, strict=True):
+            svg.set_title(axes, title)
         rows[0].plot(steps, psnr, color=FIRST, alpha=0.35, linewidth=0.8)
         rows[0].plot(steps, smooth_psnr, color=FIRST, linewidth=2)
-        svg.set_title(rows[1], "Loss and its largest terms")
         rows[1].set_yscale("log")
         ends = []
         for name, shown, (color, line) in zip(losses, smooth_losses, styles, strict=False):
             rows[1].plot(steps, shown, color=color, linestyle=line, linewidth=1.6)
             ends.append((name, float(shown[-1]), color))
-        svg.set_title(rows[2], "Gaussians")
         rows[2].plot(steps, gaussians, color=FIRST, linewidth=2, drawstyle="steps-post")
         rows[2].set(ylim=(0, 1.1 * float(gaussians.max())), xlabel="step")
         for k, axes in enumerate(rows):

@@ -33,17 +33,11 @@ class TableRow(NamedTuple):
 
 @dataclass(frozen=True)
 class Comparison:
-    """Several runs, in the order given, side by side.
+    """Several runs, in the order given, side by side, each with a short label of its own.
 
-    Attributes:
-        runs: what their folders hold.
-        labels: a short name for each, all different.
-        remarks: sentences on what cannot be compared.
-        same_scene: whether scores can be compared.
-        scores: the table.
-        options: options that differ.
-        exposures: label of each later run; exposures of the first and of it in stops, of the views
-            that both have, means removed.
+    Remarks are sentences on what cannot be compared; scores compare where the scene is the same.
+    Options are those that differ. `exposures` has the label of each later run, and exposures of
+    the first and of it in stops, of the views that both have, means removed.
     """
 
     runs: tuple[RunFiles, ...]

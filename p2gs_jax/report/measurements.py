@@ -60,17 +60,12 @@ class SeamPair:
 
 @dataclass
 class SceneMeasurements:
-    """What was measured on the scene.
+    """What was measured on the scene; `missing` says in sentences what could not be.
 
-    Attributes:
-        true_exposures: by view, where the scene has them.
-        seams: pairs in the order of the views.
-        tried_pairs: number of pairs that were compared, with or without enough in common.
-        shown: the pair of `picture`, which has the widest seam.
-        picture: of both sides of a seam.
-        clipped: share of clipped pixels by view, for a sample of the training views.
-        comparisons: rendered training views, where the folder has no held-out ones.
-        missing: sentences on what could not be measured.
+    True exposures are by view, where the scene has them. Seams are in the order of the views, of
+    `tried_pairs` that were compared; `shown` is the pair of `picture`, which has the widest one.
+    `clipped` has shares of pixels by view, for a sample of the training views. Comparisons are
+    rendered training views, where the folder has no held-out ones.
     """
 
     true_exposures: dict[str, float] = field(default_factory=dict)

@@ -27,11 +27,8 @@ from p2gs_jax.types import GAMMA_SRGB
 MOST_PANELS, FEWEST_VIEWS = 6, 3
 MID_GREY = 0.18
 CHANNELS = ("red", "green", "blue")
-MARKED = (
-    Style(SECOND, "^", "-", order=4),
-    Style(THIRD, "o", "-", order=3),
-    Style(FIRST, "s", "-", order=2),
-)
+_MARKS = ((SECOND, "^", 4), (THIRD, "o", 3), (FIRST, "s", 2))
+MARKED = tuple(Style(color, marker, "-", order=order) for color, marker, order in _MARKS)
 PLAIN, DASHED = Style(FIRST, "", "-"), Style(INK, "", (0, (4, 4)), width=1.6)
 LINES = (Style(SECOND, "", "-"), Style(THIRD, "", "--"), Style(FIRST, "", ":"))
 # Lines of the cameras of a drive, in turn.

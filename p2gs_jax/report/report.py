@@ -29,15 +29,9 @@ def write_report(
 ) -> Path:
     """Write one page about a run, which needs no other file and no network; return its path.
 
-    Args:
-        folder: of the run.
-        out: the page; None: `report.html` in the folder.
-        scene: where the run's scene lies now; None: where it was.
-        render: load the scene and render for the seams; False uses only what the folder holds.
-        reporter: receives progress.
-
-    Raises:
-        UserError: it is not a run folder, or the page cannot be written.
+    The page is `report.html` in the folder unless `out` names another. `scene` is where the run's
+    scene lies now (None: where it was). Without `render` the page has only what the folder holds,
+    and no seams. A UserError says that it is not a run folder, or that the page cannot be written.
     """
     reporter = reporter or Silent()
     folder = Path(folder)
@@ -91,15 +85,15 @@ def _key_numbers(
     run: RunFiles, scene: SceneMeasurements, found: list[RunWarning]
 ) -> Iterator[tuple[str, str, str]]:
     held_out, train = run.number("test", "exposure_fitted", "psnr"), run.number("train", "psnr")
-    if held_out is not None:
-        yield "Held-out PSNR", f"{held_out:.1f} dB", "exposure fitted to each"
-    if train is not None:
-        yield "Training PSNR", f"{train:.1f} dB", "own exposures"
-    span, error = findings.exposure_span(run), findings.true_error(run, scene.true_exposures)
-    if span is not None:
-        yield "Exposures span", f"{span:.1f}", "stops, training views"
-    if error is not None:
-        yield "Exposure error", f"{error['ev']:.3f}", "stops RMS, truth known"
+    error = findings.true_error(run, scene.true_exposures)
+    for name, value, form, remark in (
+        ("Held-out PSNR", held_out, "{:.1f} dB", "exposure fitted to each"),
+        ("Training PSNR", train, "{:.1f} dB", "own exposures"),
+        ("Exposures span", findings.exposure_span(run), "{:.1f}", "stops, training views"),
+        ("Exposure error", error and error["ev"], "{:.3f}", "stops RMS, truth known"),
+    ):
+        if value is not None:
+            yield name, form.format(value), remark
     if scene.seams:
         before, after = scenes.seam_medians(scene.seams)
         pairs = count(len(scene.seams), "pair")

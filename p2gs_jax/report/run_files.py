@@ -30,20 +30,12 @@ class HeldOutFiles(NamedTuple):
 
 @dataclass(frozen=True)
 class RunFiles:
-    """A run folder.
+    """A run folder, and what its files hold; what is missing is empty or None.
 
-    Attributes:
-        folder: where it lies.
-        scene: where the scene that it was fitted to lies, or lay.
-        given: the scene's place as the caller gave it, or None.
-        options: `config.json`, nested values.
-        cfg: the same as this version reads it, or None where it cannot.
-        metrics: `metrics.json`; empty where there is none.
-        photometry: `photometry.json`, or None.
-        log: lines of `log.jsonl` that hold a step.
-        held_out: held-out views in `renders/`, by name.
-        missing: sentences on what could not be read.
-        broken: names of files that exist but cannot be read.
+    The scene is where it lies, or lay; `given` is its place as the caller gave it. The options are
+    nested values of `config.json`, and `cfg` the same as this version reads them, or None where it
+    cannot. The log has the lines that hold a step. `missing` are sentences on what could not be
+    read, `broken` the names of files that exist but cannot be read.
     """
 
     folder: Path

@@ -20,14 +20,13 @@ _SEED_RANGE = 90.0  # m: farther points are not triangulated
 
 
 class DriveViews(NamedTuple):
-    """The photographs of a drive: sorted names, and the physical camera of each.
+    """The photographs of a drive: sorted names, which begin with the folder of the camera.
 
     `viewmats` are world-to-camera, OpenCV axes, m; K is that of all cameras, pixels, centres at
     +0.5.
     """
 
     names: Sequence[str]
-    cameras: Sequence[str]
     viewmats: Float64[np.ndarray, "v 4 4"]
     K: Float64[np.ndarray, "3 3"]
     width: int
@@ -65,7 +64,7 @@ def write_seeds(
         which = np.flatnonzero(seen[row])
         keypoints = np.empty(len(which), keypoint)
         keypoints["xy"], keypoints["id"] = xy[row, which], which + 1
-        data.append(struct.pack("<I7dI", row + 1, *pose, ids[views.cameras[row]]))
+        data.append(struct.pack("<I7dI", row + 1, *pose, ids[name.split("/")[0]]))
         data.append(name.encode() + b"\0" + struct.pack("<Q", len(which)) + keypoints.tobytes())
     (folder / "images.bin").write_bytes(b"".join(data))
 

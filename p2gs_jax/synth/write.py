@@ -88,7 +88,7 @@ def write_street(
         held = (frame % hold_out == 0) if hold_out and frames > 1 else np.zeros(len(frame), bool)
         xyz, rgb = sample_seeds(views, photographs, depths, ~held, points, seed)
         observed = write_seeds(temporary / "sparse" / "0", views, xyz, rgb, depths)
-        write_true_exposures(temporary, views.names, views.cameras, shots)
+        write_true_exposures(temporary, views.names, shots)
         card = {
             **{"format": FORMAT, **asked, **observed, "iso_reference": ISO_REFERENCE},
             **{"K": views.K.tolist(), "solids": town.size, "sensor": asdict(sensor)},
@@ -105,12 +105,9 @@ def _views(frames: int, width: int, height: int, step: float):
     """Return the cameras of a drive, and the frame of each view."""
     places = drive(frames, step=step)
     taken = [(camera, f) for camera in sorted(MOUNTS) for f in range(frames)]
-    names, cameras = (
-        [f"{camera}/{f:06d}.png" for camera, f in taken],
-        [camera for camera, _ in taken],
-    )
+    names = [f"{camera}/{f:06d}.png" for camera, f in taken]
     viewmats = np.stack([camera_viewmat(MOUNTS[camera], places[f]) for camera, f in taken])
-    views = DriveViews(names, cameras, viewmats, intrinsics(width, height), width, height)
+    views = DriveViews(names, viewmats, intrinsics(width, height), width, height)
     return views, np.array([f for _, f in taken])
 
 

@@ -76,7 +76,7 @@ class BrowserSession:
         """Let the exposure follow what is seen, or keep it where it is now."""
         now, exposure, stops = self._panel.settings(), self._live.darkroom.metered_exposure, 0.0
         if metered:
-            text = "Metering the training views ..."  # of runs of older versions it takes a while
+            text = "Reading how the camera metered ..."
             metered = self._while_shown("Auto exposure", text, lambda: self._run.metering)
         elif exposure is not None:
             stops = float(np.log2(exposure / self._run.mean.exposure_geometric))

@@ -43,6 +43,13 @@ def made(n=8, seed=0, opacity=0.6):
     )
 
 
+def with_room(g, slots):
+    """Return Gaussians with empty slots behind them, and their population."""
+    return grow(g, empty_gaussians(slots, g)), fresh_population(
+        jnp.arange(g.capacity + slots) < g.capacity
+    )
+
+
 def test_place_fills_empty_slots_in_order_and_counts_the_rest():
     alive = jnp.array([True, False, True, False, True])
     requests = jnp.array([True, False, True, False, True])
@@ -124,8 +131,7 @@ def test_shares_look_like_the_whole(copies, opacity):
 def test_relocation_moves_the_transparent_and_adds_births():
     g = made(10)
     g = dataclasses.replace(g, opacity_logits=g.opacity_logits.at[:3].set(-9.0))
-    grown = grow(g, empty_gaussians(6, g))
-    p = fresh_population(jnp.arange(16) < 10)
+    grown, p = with_room(g, 6)
     out = relocate_and_grow(jax.random.key(1), grown, p, jnp.int32(4), CFG)
     assert int(out.population.alive.sum()) == 14
     assert int(out.refused) == 0
@@ -150,7 +156,7 @@ def test_two_that_share_a_place_part_about_its_centre_and_keep_its_extent():
         quats=jnp.full((1, 4), 0.5),  # x -> y -> z -> x
         log_scales=jnp.log(jnp.array([[0.5, 0.1, 0.02]])),
     )
-    grown, p = grow(g, empty_gaussians(1, g)), fresh_population(jnp.arange(2) < 1)
+    grown, p = with_room(g, 1)
 
     @functools.partial(jax.jit, static_argnums=1)
     def births(keys, spread):
@@ -174,7 +180,7 @@ def test_two_that_share_a_place_part_about_its_centre_and_keep_its_extent():
 
 def test_births_go_where_they_are_needed():
     g = made(10)
-    grown, p = grow(g, empty_gaussians(6, g)), fresh_population(jnp.arange(16) < 10)
+    grown, p = with_room(g, 6)
     needed = jnp.zeros(16).at[7].set(1.0)
     together = dataclasses.replace(CFG, spread=0.0)
     out = relocate_and_grow(jax.random.key(0), grown, p, jnp.int32(4), together, needed)

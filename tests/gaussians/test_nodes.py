@@ -38,7 +38,6 @@ def scene(made_once):
 
 def test_laser_points_of_all_sweeps_meet_in_the_box(scene):
     nodes = find_nodes(scene, dataclasses.replace(CFG, few_points=1, voxel=0.02))
-    assert nodes is not None
     assert [o.name for o in nodes.moving.objects] == ["box-1"]
     assert not nodes.left
     assert set(nodes.owner) == {0}
@@ -59,11 +58,9 @@ def test_laser_points_of_all_sweeps_meet_in_the_box(scene):
 def test_boxes_with_few_points_are_filled_and_said(scene):
     few = dataclasses.replace(scene.lidar, objects=np.full(len(scene.lidar.objects), -1))
     nodes = find_nodes(dataclasses.replace(scene, lidar=None), CFG)
-    assert nodes is not None
     assert len(nodes.points) == pytest.approx(CFG.few_points, rel=0.2)
     assert "1 of them have few laser points" in nodes.notes[0]
     left = find_nodes(dataclasses.replace(scene, lidar=few), CFG)
-    assert left is not None
     assert [o.name for o in left.left] == ["box-1"]
     assert "1 are seen too little" in left.notes[0]
     assert not len(left.points)
@@ -87,7 +84,6 @@ def test_what_few_views_show_is_left_to_the_mask(scene):
     scene = dataclasses.replace(scene, views=views)
     for least, left in ((CFG.least_views, 0), (5, 1)):
         nodes = find_nodes(scene, dataclasses.replace(CFG, least_views=least))
-        assert nodes is not None
         assert len(nodes.left) == left
 
 
@@ -106,7 +102,6 @@ def timeless(scene):
 
 def test_without_times_what_moves_is_masked(scene):
     nodes = find_nodes(timeless(scene), CFG)
-    assert nodes is not None
     assert len(nodes.left) == 1
     assert "no times" in nodes.notes[0]
 
@@ -115,7 +110,6 @@ def test_points_get_the_colours_that_photographs_show(scene):
     """Of radiance, whatever the exposures: those of the frames differ by a stop."""
     cfg = with_fields(FitConfig(), {"photometry.model": "view_exposure"})
     nodes = find_nodes(scene, CFG)
-    assert nodes is not None
     taken_by = [v.camera for v in scene.training_views]
     start = initial_photometry(None, taken_by, cfg)
     logs = np.log(make_world().exposures)[[v.frame for v in scene.training_views]]

@@ -56,7 +56,6 @@ def oracle():
     ("tile", "stop"),
     [
         ((16, 8), 1e-4),
-        ((16, 8), None),
         ((16, 16), None),
         pytest.param((8, 8), None, marks=pytest.mark.slow),
         pytest.param((32, 4), None, marks=pytest.mark.slow),

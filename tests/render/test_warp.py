@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -30,7 +31,10 @@ def plane(z):
 @pytest.mark.parametrize(("x", "yaw", "z"), [(0, 0, 1), (-2, 0.5, 0.5), (1.5, -0.4, 7), (2, 0, 50)])
 def test_projecting_what_was_unprojected_gives_the_pixel_back(x, yaw, z):
     seen_by = camera(x, yaw=yaw)
-    xy, depth = project_points(unproject(plane(float(z)), seen_by), seen_by)
+    points = unproject(plane(float(z)), seen_by)
+    host = unproject(np.full(X.shape, float(z)), jax.tree.map(np.asarray, seen_by))
+    np.testing.assert_allclose(points, host, rtol=1e-4, atol=1e-4)
+    xy, depth = project_points(points, seen_by)
     np.testing.assert_allclose(xy, np.stack([X, Y], -1), atol=2e-4)
     np.testing.assert_allclose(depth, z, rtol=1e-5)
 
