@@ -11,13 +11,7 @@ from scene.helpers import write_image, write_tiny_model
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene import load_scene
-from p2gs_jax.scene.lens import (
-    _fold_radius,
-    intrinsics,
-    make_distortion,
-    undistort_points,
-    undistortion_maps,
-)
+from p2gs_jax.scene.lens import _fold_radius, intrinsics, undistort_points, undistortion_maps
 from p2gs_jax.scene.sfm.triangulate import camera_of
 from p2gs_jax.scene.transforms import load_transforms
 from p2gs_jax.types import Distortion
@@ -165,8 +159,3 @@ def test_transforms_with_fisheyes(tmp_path, extra):
     (tmp_path / "transforms.json").write_text(json.dumps(data))
     scene = load_transforms(tmp_path, tmp_path / "transforms.json", DataConfig())
     assert scene.views[0].distortion == Distortion((0.1, 0.02, -0.01, 0.003), "fisheye")
-
-
-def test_a_fisheye_of_zeros_is_no_pinhole():
-    assert make_distortion((0.0,) * 4) is None
-    assert make_distortion((0.0,) * 4, "fisheye") == Distortion((0.0,) * 4, "fisheye")

@@ -298,6 +298,9 @@ def test_val_takes_the_place_of_test_only_where_there_is_none(tmp_path):
     scene = load_blender(write_blender(tmp_path / "val", test=0, val=2), CFG)
     assert scene.split_by == "transforms_val.json"
     assert held_out(scene) == ["val/r_0.png", "val/r_1.png"]
+    no_frame(tmp_path / "both")
+    scene = load_blender(tmp_path / "both", DataConfig(allow_missing=True))
+    assert (len(scene.test_indices), "1 of the 3 images" in scene.notes[0]) == (2, True)
     assert load_blender(write_blender(tmp_path / "alone", test=0), CFG).split_by is None
 
 
@@ -355,39 +358,36 @@ def no_frame(root):
     (root / "test" / "r_1.png").unlink()
 
 
+def other_shape(root):
+    write_rgba(root / "train" / "r_3.png", size=(40, 20))
+
+
+def train_on_test(root):
+    edit(root / TEST, lambda d: d["frames"][0].update(file_path="train/r_0"))
+
+
+def no_angle(root):
+    edit(root / TRAIN, lambda d: d.pop("camera_angle_x"))
+
+
+def cut_short(root):
+    (root / TEST).write_text((root / TEST).read_text()[:-40])
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (no_frame, rf"1 of the 3 images named by .*{TEST} do not exist: test/r_1"),
-        (
-            lambda root: write_rgba(root / "train" / "r_3.png", size=(40, 20)),
-            rf"wrong size: .*train/r_3.png is 40x20, .* 40x30.*{TRAIN}",
-        ),
-        (
-            lambda root: edit(root / TEST, lambda d: d["frames"][0].update(file_path="train/r_0")),
-            BOTH,
-        ),
-        (
-            lambda root: edit(root / TRAIN, lambda d: d.pop("camera_angle_x")),
-            rf"{TRAIN}: no focal length for train/r_0.png",
-        ),
-        (
-            lambda root: (root / TEST).write_text((root / TEST).read_text()[:-40]),
-            rf"{TEST} is not valid JSON",
-        ),
+        (other_shape, rf"wrong size: .*train/r_3.png is 40x20, .* 40x30.*{TRAIN}"),
+        (train_on_test, BOTH),
+        (no_angle, rf"{TRAIN}: no focal length for train/r_0.png"),
+        (cut_short, rf"{TEST} is not valid JSON"),
     ],
 )
 def test_broken_copies(tmp_path, change, message):
     change(write_blender(tmp_path))
     with refused(message):
         load_scene(tmp_path, CFG)
-
-
-def test_missing_frames_may_be_skipped(tmp_path):
-    no_frame(write_blender(tmp_path))
-    scene = find_scene(tmp_path, DataConfig(allow_missing=True))
-    assert len(scene.test_indices) == 2
-    assert "1 of the 3 images" in scene.notes[0]
 
 
 # ------------------------------------------------------------------ LLFF

@@ -38,6 +38,9 @@ BT709: Primaries = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, *_D65)
 BT2020: Primaries = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, *_D65)
 DISPLAY_P3: Primaries = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, *_D65)
 ADOBE_RGB: Primaries = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, *_D65)
+# By the codes of ITU-T H.273; others are a camera's own curve, and sRGB's primaries.
+TRANSFERS: dict[int, Transfer] = {16: "pq", 18: "hlg"}
+PRIMARIES: dict[int, Primaries] = {9: BT2020, 12: DISPLAY_P3}
 
 # Bradford's cone responses.
 _BRADFORD = np.array(

@@ -125,7 +125,13 @@ def kept_features(
     `groups` holds the names of those of one camera by what they have in common. Raises UserError:
     COLMAP failed.
     """
-    record = _record(image_folder, groups)
+    files = {}
+    for key, group in groups.items():
+        prints = file_fingerprints([image_folder / name for name in group])
+        for name, (_, size, changed) in zip(group, prints, strict=True):
+            files[name] = [size, changed, str(key)]
+    options = [pycolmap.__version__, MAX_IMAGE_SIZE, MAX_FEATURES]
+    record = {"options": options, "files": files}
     database = folder / DATABASE
     if not _continues(folder / RECORD, record):
         shutil.rmtree(folder, ignore_errors=True)
@@ -167,17 +173,6 @@ def match_kept(
         match(database, left[start : start + PAIRS_AT_ONCE])
         progress(start + PAIRS_AT_ONCE)
     return len(wanted)
-
-
-def _record(image_folder: Path, groups: Mapping[tuple, Sequence[str]]) -> dict:
-    """Return what the features depend on, as JSON has it."""
-    files = {}
-    for key, group in groups.items():
-        prints = file_fingerprints([image_folder / name for name in group])
-        for name, (_, size, changed) in zip(group, prints, strict=True):
-            files[name] = [size, changed, str(key)]
-    options = [pycolmap.__version__, MAX_IMAGE_SIZE, MAX_FEATURES]
-    return {"options": options, "files": files}
 
 
 def _continues(path: Path, record: dict) -> bool:

@@ -207,11 +207,6 @@ def test_exr_keeps_light_between_photographs(folder: Path) -> None:
     assert noted(result, "multiplied by 0.125")
 
 
-def test_exr_of_a_sensor_keeps_its_white(folder: Path) -> None:
-    write_exr(folder / "a.exr", np.minimum(patches() * 1.3, 1).astype(np.float32))
-    assert record_of(converted(folder))[0]["scale"] == 1
-
-
 def test_exr_that_is_broken_inside(folder: Path) -> None:
     light = np.full((8, 8, 3), 0.5, np.float32)
     light[0, 0], light[0, 1], light[0, 2] = np.nan, np.inf, -1

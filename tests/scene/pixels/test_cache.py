@@ -88,17 +88,6 @@ def test_every_kind_comes_back_bit_for_bit(tmp_path, kinds, shrink):
     assert again.decodings == 0
 
 
-def test_what_is_held_stays_below_the_bound(tmp_path):
-    """64 photographs of 512x512 take 64 MiB; 4 may be held, and none is decoded twice."""
-    pixels = np.zeros((512, 512, 3), np.uint8)
-    made = [make_view(tmp_path / f"{k}.png", pixels + k) for k in range(64)]
-    store = in_files(tmp_path, made, DataConfig(cache_mb=4))
-    for k in (*range(64), *range(64)):
-        assert store.stored(k)[0].max() == k
-        assert store.cached_bytes <= 4 * 2**20
-    assert store.decodings == 64
-
-
 def test_a_set_that_fits_clears_what_an_earlier_start_wrote(tmp_path, kinds, started):
     stored(in_files(tmp_path, kinds), len(kinds), 1)
     assert any((tmp_path / "pixels").rglob("*.px"))
