@@ -21,14 +21,7 @@ from p2gs_jax.synth.settings import Curve
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from synthetic_drive import (
-    CAMERA_NAMES,
-    Curves,
-    Exposures,
-    make_drive,
-    make_exposures,
-    observe,
-)
+from synthetic_drive import CAMERA_NAMES, Curves, Exposures, make_drive, make_exposures, observe
 
 Tints = Literal["camera", "view", "dark"]
 PIVOT = 0.18
