@@ -43,14 +43,11 @@ from p2gs_jax.types import Scene
 # Points of a view that a given kind of curve is fitted to.
 RESPONSE_PER_VIEW = 200
 HELD_OUT = 0.2
-# A response needs this spread of exposures, stops.
-SPLINE_SPREAD_EV = 0.2
+SPLINE_SPREAD_EV = 0.2  # a response needs this spread of exposures, stops
 # Candidates are compared on at most this many observations; the chosen one is solved on all.
 MOST_OBSERVATIONS = 40_000
-# A curve has few parameters; its basis is the most expensive one.
-SPLINE_OBSERVATIONS = 12_000
-# Choices that are compared at most.
-MOST_COMPARED = 80
+SPLINE_OBSERVATIONS = 12_000  # a curve has few parameters; its basis is the most expensive one
+MOST_COMPARED = 80  # choices that are compared at most
 
 OnChosen = Callable[[Form, Response], None]
 

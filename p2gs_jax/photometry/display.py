@@ -119,10 +119,7 @@ class DisplayTransform:
 
 
 def develop(
-    linear: Pixels,
-    transform: DisplayTransform,
-    positions: Positions = None,
-    alpha: Opacity = None,
+    linear: Pixels, transform: DisplayTransform, positions: Positions = None, alpha: Opacity = None
 ) -> Float32[np.ndarray, "... 3"]:
     """Return display values in [0, 1] of linear radiance.
 

@@ -34,22 +34,19 @@ Readings = Mapping[str, float]
 # Weights of linear red, green and blue in luminance (BT.709).
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 HIGHLIGHT = 99.0
-# Standard deviation of the weights about the centre, half diagonals.
-CENTRE = 0.4
+CENTRE = 0.4  # standard deviation of the weights about the centre, half diagonals
 # Luminance this far below the mean counts as that: nothing that a picture shows is darker.
 DARKEST = 2.0**-12
 # Less opaque pixels than this share of the picture are no picture.
 LEAST_SEEN = 0.01
 MID_GREY, BELOW_WHITE = 0.18, 0.98
-# More pixels than about this many tell no more.
-PIXELS = 100_000
+PIXELS = 100_000  # more pixels than about this many tell no more
 # Views are left out in at most this many stretches: neighbours in a video know each other's answer.
 FOLDS = 12
 FEWEST_VIEWS = 6
 # A rule explains the camera if it leaves at most this share of what a constant leaves, left out.
 EXPLAINS = 0.8
-# Exposures that vary less, stops, are constant whatever predicts them.
-NEGLIGIBLE_EV = 0.05
+NEGLIGIBLE_EV = 0.05  # exposures that vary less, stops, are constant whatever predicts them
 # A rule with more free numbers must leave less than this share of what a simpler one leaves.
 WORTH_A_NUMBER = 0.85
 

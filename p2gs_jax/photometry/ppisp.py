@@ -32,8 +32,7 @@ PRECONDITIONERS = np.array(
         [[0.0128369, -0.0034654], [-0.0034654, 0.0128158]],
     ]
 )
-# Added to the intensity that is divided by, so that black stays black.
-EPSILON = 1e-5
+EPSILON = 1e-5  # added to the intensity that is divided by, so that black stays black
 # Response of a channel: toe, shoulder, gamma, centre, as the optimiser sees them.
 LEAST_TOE, LEAST_SHOULDER, LEAST_GAMMA = 0.3, 0.3, 0.1
 # Nearer to black or white than this the powers' slopes may be infinite: there they have none.

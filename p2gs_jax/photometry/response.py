@@ -27,17 +27,14 @@ HELD = (6, 16)
 # The knots that are solved for; of several splines, the powers differ as well.
 FREE = tuple(k for k in range(len(KNOTS)) if k not in HELD)
 FREE_OF_EACH = tuple(k for k in range(len(KNOTS)) if k != HELD[0])
-# Darkest photographed value that is decoded: half a code of 8 bits.
-DARKEST = 0.5 / 255
+DARKEST = 0.5 / 255  # darkest photographed value that is decoded: half a code of 8 bits
 # Noise model: 8-bit quantisation, photon and read noise (linear units), and a floor in log units
 # for what no model explains: texture, specularity, interpolation.
 SHOT_NOISE, READ_NOISE, FLOOR = 2e-4, 1e-6, 0.03
 # A curve with a spline may be at most this much flatter than its base, so that noise stays finite.
 SMALLEST_SLOPE = 0.2
-# d log exposure / d log value of mid tones; flatter curves are a collapse.
-SMALLEST_LOG_SLOPE = 0.3
-# Entries of a table.
-TABLE = 1024
+SMALLEST_LOG_SLOPE = 0.3  # d log exposure / d log value of mid tones; flatter curves are a collapse
+TABLE = 1024  # entries of a table
 # The row of a camera that is not in `PhotometryConfig.cameras`; tables end with a row for it.
 UNKNOWN = -1
 

@@ -16,10 +16,8 @@ from p2gs_jax.photometry.models import MODELS, ModelName
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.types import GAMMA_SRGB
 
-# Views with fewer usable observations have uncertain exposures.
-MIN_OBSERVATIONS = 15
-# Gammas with a larger standard error are only roughly known.
-WEAK_GAMMA = 0.1
+MIN_OBSERVATIONS = 15  # views with fewer usable observations have uncertain exposures
+WEAK_GAMMA = 0.1  # gammas with a larger standard error are only roughly known
 # A view disagrees when its gap exceeds this, and three standard errors.
 NOTICEABLE_EV = 0.2
 STANDARD_ERRORS = 3.0

@@ -361,8 +361,7 @@ def test_gradients_of_luminance_gs_match_and_pass_nothing_else():
     with jax.enable_x64(True):
         at = learned(0.05, jnp.float64)
         render = jnp.asarray(RNG.uniform(1.5, 2.0, IMAGE.shape))
-        # D-SSIM moves the Gaussians only.
-        cfg = LossConfig(dssim_weight=None, censored=False)
+        cfg = LossConfig(dssim_weight=None, censored=False)  # D-SSIM moves the Gaussians only
 
         def f(moved):
             view = replace(at, **moved).view(1)

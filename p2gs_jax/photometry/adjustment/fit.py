@@ -28,14 +28,11 @@ from p2gs_jax.types import GAMMA_SRGB
 PER_VIEW = 1000
 # Observations of all views together, and what each view has nevertheless.
 MOST_SOLVED, LEAST_PER_VIEW = 1_500_000, 200
-# Points of a view from which is told what is not modelled.
-UNMODELLED_PER_VIEW = 2000
+UNMODELLED_PER_VIEW = 2000  # points of a view from which is told what is not modelled
 # Observations that count less than this share of what their noise alone would give are ignored.
 IGNORED = 0.25
-# Observations that are looked at together: 20 million at once are gigabytes.
-BLOCK = 1_000_000
-# A channel off by this much in a view is worth a word.
-NOTICEABLE_BALANCE_EV = 0.1
+BLOCK = 1_000_000  # observations that are looked at together: 20 million at once are gigabytes
+NOTICEABLE_BALANCE_EV = 0.1  # a channel off by this much in a view is worth a word
 # What is left of the way is worth no word below this share of a typical standard error.
 NEGLIGIBLE = 0.1
 
@@ -96,9 +93,7 @@ def explain(fit: Fit, problem: Problem, response: Response) -> Explained:
     return Explained(radiance, residual, ignored / max(int(problem.usable.sum()), 1))
 
 
-def _blocks(
-    problem: Problem,
-) -> Iterator[tuple[np.ndarray | slice, np.ndarray | slice, Problem]]:
+def _blocks(problem: Problem) -> Iterator[tuple[np.ndarray | slice, np.ndarray | slice, Problem]]:
     """Yield whole points with all their observations: which these are, and they alone."""
     points = problem.observations.points
     if len(points) <= BLOCK:

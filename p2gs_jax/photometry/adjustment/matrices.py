@@ -9,10 +9,8 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Int
 
-# Up to this many unknowns, matrices are kept and factorised as a whole.
-DENSE = 1500
-# Pairs whose products are formed at once: they stay in the cache.
-CHUNK = 1 << 15
+DENSE = 1500  # up to this many unknowns, matrices are kept and factorised as a whole
+CHUNK = 1 << 15  # pairs whose products are formed at once: they stay in the cache
 
 Matrix = np.ndarray | sp.csr_array
 

@@ -13,8 +13,7 @@ from p2gs_jax.photometry.adjustment.system import EMPTY
 from p2gs_jax.photometry.observations import PerChannel
 
 Loss = Literal["l1", "geman_mcclure", "whole_points"]
-# Width of the Geman-McClure loss in robust standard deviations.
-GEMAN_MCCLURE = 3.0
+GEMAN_MCCLURE = 3.0  # width of the Geman-McClure loss in robust standard deviations
 # What is known of a point's spread before it is looked at counts as this many observations.
 PRIOR_SPREAD = 3.0
 SMALLEST_SCALE = 0.3

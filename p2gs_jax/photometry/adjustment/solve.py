@@ -32,10 +32,8 @@ L1_ROUNDS, MOST_ROUNDS = 4, 60
 A_RANGE = (0.3, 3.0)
 # Change of a parameter, log units, at which rounds end: for what is kept, and what is compared.
 TOLERANCE, TOLERANCE_TO_COMPARE = 1e-5, 5e-3
-# Damping of the balanced matrix, whose diagonal is 1.
-DAMPING = 1e-8
-# Groups of neighbouring unknowns, whose common changes a coarse system solves.
-GROUPS = 1000
+DAMPING = 1e-8  # damping of the balanced matrix, whose diagonal is 1
+GROUPS = 1000  # groups of neighbouring unknowns, whose common changes a coarse system solves
 # Relative residual at which the iteration ends; a round's step need not be exact.
 PRECISION, MOST_ITERATIONS = 1e-7, 2000
 EXPOSURES = Form("view_exposure")
