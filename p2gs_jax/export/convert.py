@@ -17,7 +17,7 @@ from p2gs_jax.core.atomic import atomic_folder, write_json
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.errors import UserError
-from p2gs_jax.export.folders import write_colmap_folder, write_nerfstudio_folder
+from p2gs_jax.export.folders import Program, write_folder
 from p2gs_jax.export.page import MEGABYTE, write_page
 from p2gs_jax.export.sidecar import corrections_name, linear_sidecar
 from p2gs_jax.formats import gsply_files as gsply
@@ -157,10 +157,10 @@ def _linear_ply(ply: Path, fitted: Run) -> str:
     return f"{count} Gaussians of linear radiance; {sidecar.name} says how to read them"
 
 
-def _other_trainer(name: str, place: Path, fitted: Run, reporter: Reporter) -> str:
-    write = write_colmap_folder if name == "colmap" else write_nerfstudio_folder
+def _other_trainer(name: Program, place: Path, fitted: Run, reporter: Reporter) -> str:
     on_view = functools.partial(reporter.stage, "Writing photographs")
-    write(place, fitted.scene, fitted.store, fitted.photometry["views"], on_view=on_view)
+    photometry = fitted.photometry["views"]
+    write_folder(name, place, fitted.scene, fitted.store, photometry, on_view=on_view)
     views = f"{len(fitted.scene.views)} views"
     if name == "colmap":
         return f"{views}, {len(fitted.scene.points)} points, exposures.csv"

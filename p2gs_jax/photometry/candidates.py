@@ -117,11 +117,15 @@ class Comparison:
         best = self._predicted[max(density, key=lambda k: density[k])]
         return [self._candidate(k, density[k], p, best) for k, p in self._predicted.items()]
 
+    def parameters(self, choice: Choice) -> int:
+        """Return the number of free parameters of a choice."""
+        o = self.problem.observations
+        cameras = int(o.cameras.max(initial=0)) + 1
+        return parameter_count(choice.form, choice.curve.splines, cameras, o.view_count)
+
     def _candidate(
         self, choice: Choice, density: float, found: Predicted, best: Predicted
     ) -> Candidate:
-        o = self.problem.observations
-        cameras = int(o.cameras.max(initial=0)) + 1
         # Neighbours in an image err alike, as do its pixels.
         lower = best.densities - found.densities
         (deficit, of_views), (_, of_regions) = (
@@ -130,7 +134,7 @@ class Comparison:
         return Candidate(
             choice,
             self.fits[choice][1],
-            parameter_count(choice.form, choice.curve.splines, cameras, o.view_count),
+            self.parameters(choice),
             density,
             deficit,
             max(of_views, of_regions),

@@ -32,8 +32,7 @@ _BY_LEVELS = {(model.exposure, model.gamma): name for name, model in MODELS.item
 _LEVELS: tuple[Level | None, ...] = (None, "camera", "view")
 _VIGNETTING: tuple[VignettingKind | None, ...] = (None, "camera", "channel")
 
-# Powers of the radius in log V(r) = k1 r^2 + k2 r^4 + k3 r^6.
-VIGNETTING_POWERS = (2, 4, 6)
+VIGNETTING_POWERS = (2, 4, 6)  # powers of the radius in log V(r) = k1 r^2 + k2 r^4 + k3 r^6
 
 
 def polynomials(vignetting: VignettingKind | None) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -115,17 +116,15 @@ def _measure_seams(run: Run, out: SceneMeasurements, reporter: Reporter) -> None
         )
         return
     store, names = run.store.leaving_out(run.scene.objects), [v.name for v in run.scene.views]
-    known: dict[int, Photographed] = {}
 
+    @functools.cache
     def photographed(index: int) -> Photographed:
         """Return a photograph with rendered depth, rendered once."""
-        if index not in known:
-            shrink = max(1.0, store.camera(index)[2] / SEAM_WIDTH)
-            camera = camera_of(store, index, shrink)
-            depth = np.asarray(surface_depth(run.render(camera)))
-            ldr, mask = store.get(index, shrink)
-            known[index] = Photographed(ldr, mask, camera, depth, run.own_display(index))
-        return known[index]
+        shrink = max(1.0, store.camera(index)[2] / SEAM_WIDTH)
+        camera = camera_of(store, index, shrink)
+        depth = np.asarray(surface_depth(run.render(camera)))
+        ldr, mask = store.get(index, shrink)
+        return Photographed(ldr, mask, camera, depth, run.own_display(index))
 
     pairs = neighbouring_pairs(run.scene, MOST_PAIRS)
     found: dict[tuple[int, int], Seam] = {}

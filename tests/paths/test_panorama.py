@@ -140,13 +140,8 @@ def test_images_come_through_between_lines_of_text():
     rng = np.random.default_rng(0)
     images = [np.rint(255 * rng.uniform(size=(20 + k, 300, 3))) / 255 for k in range(3)]
     captions = [("left", 0, 100), ("right", 100, 300)]
-    sheet = stacked(
-        [
-            CaptionedImage("one", images[0], captions),
-            CaptionedImage("two", images[1]),
-            CaptionedImage("", images[2]),
-        ]
-    )
+    titled = [("one", images[0], captions), ("two", images[1]), ("", images[2])]
+    sheet = stacked([CaptionedImage(*row) for row in titled])
     assert sheet.shape[1::-1] == stacked_size(300, [20, 21, 22], captions=1)
     line = (sheet.shape[0] - 63) // 4
     tops = [line, 20 + 3 * line, 41 + 4 * line]

@@ -103,28 +103,18 @@ def cut(path: Path) -> None:
 
 
 class Made(NamedTuple):
-    """A drive, and the truth of what a reader should find in it.
-
-    Attributes:
-        photographs: time and camera to world, by camera and frame.
-        sweeps: times of sweeps.
-        boxes: times and box to world of "ahead" and "right"; a third one is "parked".
-        tables: files without which the drive is not read, below `root`.
-        optional: tables that may be gone.
-        scans: files of sweeps.
-        error: distances of points from what they were measured on, metres.
-        count: points of a sweep.
-    """
+    """A drive, and the truth of what a reader should find in it; paths are below `root`."""
 
     root: Path
+    # Time and camera to world, by camera and frame.
     photographs: dict[tuple[str, int], tuple[float, np.ndarray]]
-    sweeps: list[float]
-    boxes: dict[str, tuple[np.ndarray, np.ndarray]]
-    tables: list[Path]
-    optional: list[Path]
-    scans: list[Path] = []  # noqa: RUF012
-    error: Callable[[np.ndarray], np.ndarray] = off_landmarks
-    count: int = 50
+    sweeps: list[float]  # times
+    boxes: dict[str, tuple[np.ndarray, np.ndarray]]  # times and poses of all but "parked"
+    tables: list[Path]  # without which the drive is not read
+    optional: list[Path]  # tables that may be gone
+    scans: list[Path] = []  # noqa: RUF012  # files of sweeps
+    error: Callable[[np.ndarray], np.ndarray] = off_landmarks  # from what was measured, m
+    count: int = 50  # points of a sweep
 
 
 def shots(azimuths: dict[str, float], lag: dict[str, float], ats, clock: float = 0.0) -> dict:

@@ -9,6 +9,9 @@ from scipy.spatial.transform import Rotation
 
 EARTH, LATITUDE, LONGITUDE = 6378137.0, 49.0, 8.4
 TURN = 0.1
+# The reader's clock when the drive begins, s.
+START = np.datetime64("2011-09-26T13:02:25", "ns")
+BEGIN = START.astype(int) * 1e-9
 DATE, DRIVE = "2011_09_26", "2011_09_26_drive_0001_sync"
 BOXES = Path(DRIVE) / "tracklet_labels.xml"
 # When the scanner looks forward, and when cameras take photographs, after a frame begins.
@@ -49,10 +52,6 @@ def camera(name: str, seconds: float) -> np.ndarray:
     return imu(seconds) @ w.inv(R_RECT @ VELO_TO_CAM @ IMU_TO_VELO) @ back
 
 
-def places() -> np.ndarray:
-    return w.landmarks() - w.car_at(0)[:3, 3]
-
-
 def local_when_passed(place: np.ndarray, forward: float) -> np.ndarray:
     """Return a place in the scanner's axes when it is seen.
 
@@ -66,12 +65,7 @@ def local_when_passed(place: np.ndarray, forward: float) -> np.ndarray:
 
 
 def stamp(seconds: float) -> str:
-    whole = np.datetime64("2011-09-26T13:02:25", "ns") + np.timedelta64(round(seconds * 1e9), "ns")
-    return str(whole).replace("T", " ")
-
-
-# The reader's clock when the drive begins.
-BEGIN = np.datetime64("2011-09-26T13:02:25", "ns").astype(int) * 1e-9
+    return str(START + np.timedelta64(round(seconds * 1e9), "ns")).replace("T", " ")
 
 
 def write_stamps(path: Path, times) -> None:
@@ -138,7 +132,7 @@ def write(root: Path, frames=3) -> w.Made:
     w.write_bytes(date / "calib_velo_to_cam.txt", rigid(VELO_TO_CAM))
     w.write_bytes(date / "calib_imu_to_velo.txt", rigid(IMU_TO_VELO))
     ats = 0.1 * np.arange(frames)
-    forward = ats + SCANNED
+    forward, places = ats + SCANNED, w.landmarks() - w.car_at(0)[:3, 3]
     for name, lag in {"oxts": 0.0, "velodyne_points": SCANNED, **LAG}.items():
         write_stamps(drive / name / "timestamps.txt", ats + lag)
     write_stamps(drive / "velodyne_points/timestamps_start.txt", forward - TURN / 2)
@@ -148,14 +142,14 @@ def write(root: Path, frames=3) -> w.Made:
         w.write_bytes(drive / f"oxts/data/{k:010d}.txt", oxts(at))
         for name in LAG:
             w.write_bytes(drive / f"{name}/data/{k:010d}.png", picture)
-        seen = np.array([local_when_passed(place, forward[k]) for place in places()])
+        seen = np.array([local_when_passed(place, forward[k]) for place in places])
         scan = np.column_stack([seen, np.ones(len(seen))]).astype("<f4")
         w.write_bytes(drive / f"velodyne_points/data/{k:010d}.bin", scan.tobytes())
     parked = scanner(SCANNED) @ box(w.AHEAD)
-    bottom = [*w.AHEAD, -1.25, np.radians(20)], [*w.RIGHT, -1.25, np.radians(20)]
+    yaw, moving = np.radians(20), {"ahead": w.AHEAD, "right": w.RIGHT}
+    things = {name: [[*place, -1.25, yaw]] * frames for name, place in moving.items()}
     stands = [local_when_passed(parked[:3, 3], at) - [0, 0, 0.75] for at in forward]
-    rows = [[*place, np.radians(20) - 0.3 * at] for place, at in zip(stands, ats, strict=True)]
-    things = {"ahead": [bottom[0]] * frames, "right": [bottom[1]] * frames, "parked": rows}
+    things["parked"] = [[*s, yaw - 0.3 * at] for s, at in zip(stands, ats, strict=True)]
     boxes = tracklets(*(tracklet(name, 0, rows) for name, rows in things.items()))
     w.write_bytes(date / BOXES, boxes)
     late = {"ahead": 0, "right": 0.25 * TURN}
