@@ -5,8 +5,8 @@ import errno
 import os
 import shutil
 import signal
-import time
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -151,9 +151,7 @@ def test_a_disk_without_room_is_refused_at_once(tmp_path, kinds, monkeypatch):
 
 
 def test_a_disk_that_fills_names_the_option(tmp_path, kinds, monkeypatch):
-    def full(*args, **options):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
+    full = Mock(side_effect=OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
     monkeypatch.setattr(cache, "atomic_write", full)
     with refused("No space left on device", "--data.cache-mb"):
         in_files(tmp_path, kinds).stored(0)
@@ -176,19 +174,13 @@ def started(monkeypatch):
     return found
 
 
-def wait_for(processes, seconds=60):
-    end = time.monotonic() + seconds
-    while not all(p.poll() is not None for p in processes):
-        assert time.monotonic() < end, "nothing happens"
-        time.sleep(0.02)
-
-
 def test_processes_decode_all_sizes_and_the_caller_none(tmp_path, views, started):
     views[5].image_path.write_bytes(b"no photograph")
     store = in_files(tmp_path, views)
     store.expect(SHRINKS)
     assert started
-    wait_for(started)
+    for process in started:
+        process.wait(60)
     # What a process cannot decode is reported to the caller that asks.
     with refused(r"5\.png"):
         store.stored(5)
