@@ -84,8 +84,16 @@ def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
         if (width, height) != size:
             resized.append(f"{width}x{height} instead of {camera.width}x{camera.height}")
         name = subfolder(image.name) or ("0" if alone else str(image.camera_id))
-        viewmat = _viewmat(image, model.file("images"))
-        views.append(View(image.name, path, name, viewmat, K, width, height, distortion))
+        finite = (np.abs([*image.qvec, *image.tvec]) < HUGE).all()
+        norm = np.linalg.norm(image.qvec) if finite else 0.0
+        if norm < 1e-6:
+            why = f"the pose of {image.name} is not finite"
+            raise broken(f"{model.file('images')}:", why, _FIX)
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = Rotation.from_quat(np.roll(image.qvec / norm, -1)).as_matrix()
+        viewmat[:3, 3] = image.tvec
+        pose = viewmat.astype(np.float32)
+        views.append(View(image.name, path, name, pose, K, width, height, distortion))
     if resized:
         note = f"{len(resized)} images have another size than their camera (the first: "
         notes.append(f"{note}{resized[0]}): intrinsics were rescaled")
@@ -161,17 +169,6 @@ def _find_images(root: Path, folder: Path, images: Sequence[ImageRecord]) -> Pat
         return root
     why = f"has no image folder: looked for {', '.join(map(str, places))}"
     raise broken(f"the COLMAP model {folder}", why, "name the folder with --images")
-
-
-def _viewmat(image: ImageRecord, path: Path) -> Float[np.ndarray, "4 4"]:
-    finite = (np.abs([*image.qvec, *image.tvec]) < HUGE).all()
-    norm = np.linalg.norm(image.qvec) if finite else 0.0
-    if norm < 1e-6:
-        raise broken(f"{path}:", f"the pose of {image.name} is not finite", _FIX)
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = Rotation.from_quat(np.roll(image.qvec / norm, -1)).as_matrix()
-    viewmat[:3, 3] = image.tvec
-    return viewmat.astype(np.float32)
 
 
 def _lens(path: Path, camera: CameraRecord) -> tuple[Float[np.ndarray, "3 3"], Distortion | None]:

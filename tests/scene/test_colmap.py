@@ -86,6 +86,10 @@ def test_damaged_binary_names_the_file(shared_data, tmp_path, stem):
 
 
 def test_tiny_model_and_names_with_blanks(tmp_path):
+    thinned = "9 0.1 0.2 4 10 20 30 0.5\n8 0 0 4 10 20 30 0.5\n"
+    write_tiny_model(tmp_path / "other_tool", points=thinned)
+    scene = load_scene(tmp_path / "other_tool", CFG)
+    assert (len(scene.points), len(scene.tracks.xy)) == (2, 0)
     write_tiny_model(tmp_path)
     scene = load_scene(tmp_path, CFG)
     assert [v.name for v in scene.views] == ["im 0.png", "im 1.png"]
@@ -150,13 +154,6 @@ def test_image_folder_option(tmp_path):
     assert load_scene(tmp_path, DataConfig(images="photos")).views[0].image_path.is_file()
     with refused("nowhere does not exist"):
         load_scene(tmp_path, DataConfig(images="nowhere"))
-
-
-def test_points_thinned_by_another_tool(tmp_path):
-    write_tiny_model(tmp_path, points="9 0.1 0.2 4 10 20 30 0.5\n8 0 0 4 10 20 30 0.5\n")
-    scene = load_scene(tmp_path, CFG)
-    assert len(scene.points) == 2
-    assert len(scene.tracks.xy) == 0
 
 
 def test_poses_without_points_are_triangulated(shared_data, tmp_path):

@@ -98,33 +98,17 @@ def test_a_set_that_fits_clears_what_an_earlier_start_wrote(tmp_path, kinds, sta
     assert not (tmp_path / "pixels").exists()
 
 
-def _photograph(view, folder):
-    cv2.imwrite(str(view.image_path), np.full((*SIZE, 3), 7, np.uint8))
-    os.utime(view.image_path, ns=(1, 1))
-    return {}
-
-
-def _mask(view, folder):
-    cv2.imwrite(str(folder / "other.png"), np.zeros(SIZE, np.uint8))
-    return {"mask_path": folder / "other.png"}
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        _photograph,
-        _mask,
-        lambda view, folder: {"distortion": Distortion((0.2, 0, 0, 0))},
-        lambda view, folder: {"own_car": np.ones((3, 4), bool)},
-        lambda view, folder: {"K": view.K * [[1.5], [1.5], [1]]},
-    ],
-    ids=["photograph", "mask", "lens", "car", "focal"],
-)
-def test_what_pixels_depend_on_makes_them_anew(tmp_path, change):
+@pytest.mark.parametrize("what", ["image_path", "mask_path", "distortion", "own_car", "K"])
+def test_what_pixels_depend_on_makes_them_anew(tmp_path, what):
     view = noisy_view(tmp_path, "a.png", distortion=Distortion((0.1, 0, 0, 0)))
     in_files(tmp_path, [view]).stored(0)
     (first,) = (tmp_path / "pixels").rglob("*.px")
-    changed = [dataclasses.replace(view, **change(view, tmp_path))]
+    path = view.image_path if what == "image_path" else tmp_path / "other.png"
+    cv2.imwrite(str(path), np.full((*SIZE, 3), 7, np.uint8))
+    os.utime(path, ns=(1, 1))
+    values = {"image_path": path, "mask_path": path, "distortion": Distortion((0.2, 0, 0, 0))}
+    values |= {"own_car": np.ones((3, 4), bool), "K": view.K * [[1.5], [1.5], [1]]}
+    changed = [dataclasses.replace(view, **{what: values[what]})]
     store = in_files(tmp_path, changed)
     assert not first.exists()
     same(store, changed, [1])
