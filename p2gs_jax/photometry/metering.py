@@ -232,11 +232,8 @@ def _fitted(
     read = x[:, [METERS.index(m) for m in meters]]
 
     def solve(rows) -> tuple[np.ndarray, float]:
-        if slopes is not None:
-            taken = np.asarray(slopes)
-        else:
-            middle = read[rows].mean(0)
-            taken = -np.linalg.lstsq(read[rows] - middle, y[rows] - y[rows].mean(), rcond=1e-6)[0]
+        a, b = read[rows] - read[rows].mean(0), y[rows] - y[rows].mean()
+        taken = -np.linalg.lstsq(a, b, rcond=1e-6)[0] if slopes is None else np.asarray(slopes)
         return taken, float((y[rows] + read[rows] @ taken).mean())
 
     everything = np.arange(len(y))

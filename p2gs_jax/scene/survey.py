@@ -58,14 +58,11 @@ class SurveyedCamera:
 
 @dataclass(frozen=True)
 class Survey:
-    """What there is; `scene` is None for photographs alone.
+    """What there is; `scene` is None for photographs alone, `format` as in `DataConfig`.
 
-    Attributes:
-        format: as `DataConfig.format` names it.
-        frames: moments in a drive; `seconds` are from the first photograph to the last.
-        way: length of the way of the camera with the most photographs, scene units.
-        missing: photographs that the cameras lack in these frames.
-        lacks: what a drive may have and this scene lacks, in words.
+    A drive has `frames`, moments, of which the cameras lack `missing` photographs; `seconds` are
+    from the first to the last. The `way` is that of the camera with the most photographs, scene
+    units; `lacks` says in words what a drive may have and this scene lacks.
     """
 
     root: Path
@@ -116,10 +113,7 @@ def survey(root: Path, cfg: DataConfig, report: Report = lambda message: None) -
         sweeps = sum(first <= sweep.time <= last for sweep in found.sweeps)
     else:
         scene = found
-    return _survey_of(with_what_lies_beside(scene, cfg), frames, sweeps)
-
-
-def _survey_of(scene: Scene, frames: int | None, sweeps: int | None) -> Survey:
+    scene = with_what_lies_beside(scene, cfg)
     views, by_camera = scene.views, _by_camera(scene.views)
     times = [view.time for view in views if view.time is not None]
     lacking = {
@@ -135,8 +129,8 @@ def _survey_of(scene: Scene, frames: int | None, sweeps: int | None) -> Survey:
     missing = frames * len(by_camera) - len(views) if frames else 0
     lacks = tuple(what for what, absent in lacking.items() if absent)
     way = way if frames else None
-    found = (cameras, scene, frames, seconds, way, missing, sweeps, lacks)
-    return Survey(scene.root, scene.format, *found)
+    given = (cameras, scene, frames, seconds, way, missing, sweeps, lacks)
+    return Survey(scene.root, scene.format, *given)
 
 
 def _by_camera(views: Sequence[View]) -> dict[str, list[View]]:

@@ -281,12 +281,8 @@ def two_groups() -> tuple[Observations, np.ndarray]:
     """Two groups of views with much in common inside and one dark point between them."""
     group, each, seen_by = 20, 800, 6
     rng = np.random.default_rng(0)
-    seen = np.concatenate(
-        [
-            np.stack([rng.choice(group, seen_by, replace=False) for _ in range(each)]) + offset
-            for offset in (0, group)
-        ]
-    )
+    draws = [rng.choice(group, seen_by, replace=False) for _ in range(2 * each)]
+    seen = np.stack(draws) + np.repeat([0, group], each)[:, None]
     views = np.append(seen.ravel(), [group - 1, group])
     points = np.append(np.repeat(np.arange(len(seen)), seen_by), [len(seen)] * 2)
     h = 0.5 * np.sin(np.arange(2 * group) * 0.37)

@@ -162,10 +162,8 @@ def test_a_view_has_its_own_exposure_and_its_cameras_response():
     start = ppisp.identity(["b", "a", "b"])
     assert start.names == ("a", "b")
     parameters = jax.tree.map(lambda x: jnp.arange(x.size, dtype=x.dtype).reshape(x.shape), start)
-    for view, row, exposure in (
-        (parameters.view(jnp.int32(2)), 1, 2),
-        (parameters.mean("a"), 0, 1),
-    ):
+    views = (parameters.view(jnp.int32(2)), 1, 2), (parameters.mean("a"), 0, 1)
+    for view, row, exposure in views:
         assert float(view.exposure) == exposure
         np.testing.assert_array_equal(view.color, parameters.colors[exposure])
         np.testing.assert_array_equal(view.response, parameters.responses[row])

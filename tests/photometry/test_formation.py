@@ -51,11 +51,7 @@ BY_CHANNEL = PhotometryConfig(
         CameraFormation("b", EACH, (OTHER, THIRD, BENT)),
     ),
 )
-CONFIGS = pytest.mark.parametrize(
-    "cfg",
-    [PLAIN, SHADED, BY_CAMERA, BY_CHANNEL],
-    ids=["plain", "shaded", "by camera", "by channel"],
-)
+CONFIGS = pytest.mark.parametrize("cfg", [PLAIN, SHADED, BY_CAMERA, BY_CHANNEL])
 BALANCE = np.array([0.25, -0.05, -0.2], np.float32)
 
 
