@@ -13,8 +13,6 @@ an ISO and a white balance drawn for every photograph. All methods get the same 
   Every method is shown under the mean of its parameters over the training views, without its
   vignetting, times one factor per channel for all held-out views together: photographs leave scale
   and common tint of radiance open.
-
-Empty cells: a method has no such part.
 """
 
 from __future__ import annotations
@@ -48,7 +46,6 @@ class TrueShot(NamedTuple):
 
 
 def read_true_shots(root: Path) -> dict[str, TrueShot]:
-    """Return image name -> how it was taken."""
     found = {}
     with (root / FILE).open(newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):

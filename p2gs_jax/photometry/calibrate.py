@@ -276,11 +276,8 @@ class _Search:
             chosen = choose(candidates)
             best = max(candidates, key=lambda c: c.density)
             near = neighbours(chosen.choice, self.scope)
-            near += [
-                choice
-                for choice in neighbours(best.choice, self.scope)
-                if self.comparison.parameters(choice) < best.parameters
-            ]
+            others = neighbours(best.choice, self.scope)
+            near += [c for c in others if self.comparison.parameters(c) < best.parameters]
             if len(candidates) > MOST_COMPARED or not self.solve(near):
                 return chosen
 

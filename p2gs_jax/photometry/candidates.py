@@ -157,11 +157,9 @@ def _predict(
     def normal(v):
         return -0.5 * residual**2 / v - 0.5 * np.log(2 * np.pi * v)
 
-    mixture = np.logaddexp(
-        np.log(1 - OUTLIERS) + normal(variance),
-        np.log(OUTLIERS) + normal(variance + OUTLIER_DEVIATION**2),
-    )
-    density = mixture + np.log(np.maximum(slope, 1e-3))
+    inlier = np.log(1 - OUTLIERS) + normal(variance)
+    outlier = np.log(OUTLIERS) + normal(variance + OUTLIER_DEVIATION**2)
+    density = np.logaddexp(inlier, outlier) + np.log(np.maximum(slope, 1e-3))
     # Channels are correlated: an observation counts once, as their mean.
     count = known.sum(1)
     return Predicted(

@@ -150,11 +150,8 @@ def neighbours(choice: Choice, scope: Scope) -> list[Choice]:
     if gamma is not None and exposure == gamma:
         forms += [form._replace(model=_BY_LEVELS[(None, None)])]
     if form.white_balance == "view" and exposure == "view":
-        forms += [
-            Form(name, "camera", form.vignetting)
-            for name, model in MODELS.items()
-            if model.exposure == "camera"
-        ]
+        simpler: list[ModelName] = [k for k, m in MODELS.items() if m.exposure == "camera"]
+        forms += [Form(name, "camera", form.vignetting) for name in simpler]
     forms += [form._replace(white_balance=level) for level in _LEVELS]
     forms += [form._replace(vignetting=kind) for kind in _VIGNETTING]
     near = [Choice(f, curve) for f in forms] + [Choice(form, c) for c in _CURVES[curve.splines]]
