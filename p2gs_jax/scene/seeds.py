@@ -70,10 +70,8 @@ def with_random_seeds(scene: Scene) -> Scene:
     views = scene.training_views
     near, far = depth_range(views) if scene.depths is None else scene.depths
     points = common_points(views, near, far)
-    note = (
-        f"{why}: {len(points)} seeds were drawn at random where the cameras "
-        f"look, at depths of {near:.3g} to {far:.3g}."
-    )
+    note = f"{why}: {len(points)} seeds were drawn at random where the cameras "
+    note += f"look, at depths of {near:.3g} to {far:.3g}."
     notes = (*scene.notes, note)
     unseen = {"point_colors": None, "tracks": None, "random_seeds": True}
     return dataclasses.replace(scene, points=points, notes=notes, **unseen)

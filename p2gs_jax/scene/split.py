@@ -179,10 +179,8 @@ def split_as_listed(scene: Scene, lists: SplitLists, *, allow_missing: bool = Fa
         notes.append(f"{why}: they are not used")
         scene = _without_views(scene, left)
     if not test:
-        notes.append(
-            f"{name} holds no view out: nothing says how good views are that are not trained on. "
-            "--split every holds out every n-th."
-        )
+        why = f"{name} holds no view out: nothing says how good views are that are not trained on."
+        notes.append(f"{why} --split every holds out every n-th.")
     return dataclasses.replace(scene, notes=(*scene.notes, *notes))
 
 

@@ -181,10 +181,8 @@ def _without_twins(kinds: dict[Path, Kind]) -> tuple[dict[Path, Kind], list[str]
             dropped.update(path for path in files if path != best)
     if not dropped:
         return kinds, []
-    note = (
-        f"{len(dropped)} photograph(s) are there twice, as several kinds of file "
-        f"({min(dropped).name}, ...); one file is used for each shot."
-    )
+    note = f"{len(dropped)} photograph(s) are there twice, as several kinds of file "
+    note += f"({min(dropped).name}, ...); one file is used for each shot."
     return {path: kind for path, kind in kinds.items() if path not in dropped}, [note]
 
 
@@ -308,10 +306,8 @@ class _Converter:
         }
         out += [f"{n} {what}" for what, n in counted.items() if n]
         if self._scale != 1:
-            out.append(
-                f"Linear photographs were multiplied by {self._scale:g}, all alike, so that "
-                f"{_BRIGHT:g} % of each are below white."
-            )
+            note = f"Linear photographs were multiplied by {self._scale:g}, all alike, so that "
+            out.append(f"{note}{_BRIGHT:g} % of each are below white.")
         return out
 
 
