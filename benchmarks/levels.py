@@ -148,12 +148,8 @@ def measure_levels(
 ) -> list[Level]:
     """Time rendering, its gradient and the whole step of every scene; compare with float64.
 
-    Args:
-        scenes: by name.
-        cfg: as for a fit.
-        steps: scenes whose whole step is timed; None times all.
-        repeats: timed runs of each.
-        on_progress: called with (stage, done, count).
+    The whole step is timed in the scenes named in `steps`, None: in all. `on_progress` is called
+    with (stage, done, count).
 
     Raises:
         RuntimeError: a step reports a fault.
@@ -163,7 +159,7 @@ def measure_levels(
         on_progress("levels", i, len(scenes))
         scene = make()
         camera, weights = scene.camera, cotangent(scene)
-        forward, both, _, need, _ = programs(scene, DEFAULT, cfg.render, weights)
+        forward, both, need, _ = programs(scene, DEFAULT, cfg.render, weights)
         jobs: dict[str, Callable[[], Any]] = {REFERENCE: reference_workload()}
         jobs |= {"forward": forward, "both": both}
         gradient, linear = jax.tree.map(np.asarray, both())

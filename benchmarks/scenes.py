@@ -20,7 +20,8 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.gaussians.seeds import gaussians_from_points
 from p2gs_jax.render.harmonics import C0
 from p2gs_jax.synth.furnish import build_town
-from p2gs_jax.synth.rig import MOUNTS, camera_viewmat, drive, image_height, intrinsics
+from p2gs_jax.synth.rig import MOUNTS, camera_viewmat, drive, intrinsics
+from p2gs_jax.synth.settings import image_height
 from p2gs_jax.synth.town import Town
 from p2gs_jax.types import Camera, Gaussians, View
 
@@ -44,13 +45,8 @@ def street(
 ) -> BenchScene:
     """Return a canyon of ground, walls and backdrop: most splats near its surface, some behind.
 
-    Args:
-        count: number of Gaussians.
-        width: image width, pixels.
-        height: image height, pixels.
-        radius: median radius at the 1/255 cutoff, pixels.
-        spread: standard deviation of the log radius.
-        degree: spherical-harmonics degree.
+    `radius` is the median radius at the 1/255 cutoff, pixels, and `spread` the standard deviation
+    of its logarithm.
     """
     rng = np.random.default_rng(0)
     focal = 0.75 * width

@@ -18,7 +18,6 @@ from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import render_linear, required_capacity
 from p2gs_jax.render.capacity import bucket
 from p2gs_jax.render.xla_cpu import compiler_options
-from p2gs_jax.types import Gaussians
 
 REFERENCE = "reference workload"
 # Variants compiled and timed together: a few, so that programs fit in memory.
@@ -33,18 +32,11 @@ class Variant:
         knob: name of the varied option.
         setting: its value, in words.
         changes: fields of `RenderConfig`.
-        storage: precision that parameters are kept in: `float32`, `sh` for bfloat16 spherical
-            harmonics, `all` for bfloat16 everything.
-        degree: highest spherical-harmonics degree evaluated, None for all.
-        budget: part of the Gaussians kept, those with the largest footprint times opacity.
     """
 
     knob: str
     setting: str
     changes: tuple[tuple[str, Any], ...] = ()
-    storage: str = "float32"
-    degree: int | None = None
-    budget: float = 1.0
 
     @property
     def name(self) -> str:
@@ -73,10 +65,6 @@ VARIANTS = (
     QUICK[3],
     *_knob("exp degree", "exp_degree", None, 3, 4, label=lambda v: str(v or "exact")),
     QUICK[2],
-    Variant("bfloat16", "SH", storage="sh"),
-    Variant("bfloat16", "all parameters", storage="all"),
-    *(Variant("SH degree", str(d), degree=d) for d in (0, 1, 2)),
-    *(Variant("Gaussians", f"{b:.0%}", budget=b) for b in (0.25, 0.5, 0.75)),
     Variant(
         "everything",
         "exact",
@@ -95,9 +83,8 @@ class MeasuredVariant(NamedTuple):
         variant: what was measured.
         milliseconds: medians, `forward` and `both` (forward and backward).
         ratios: the same over the reference workload of the same run.
-        error: accuracy metrics against the untruncated float64 truth of the full scene.
-        numerics: the same against the float64 truth under the variant's own cutoff; only for
-            variants that change neither scene nor cutoff.
+        error: accuracy metrics against the untruncated float64 truth.
+        numerics: the same under the default cutoff, where the variant does not change it.
         entries: tile-list entries.
         temporaries: bytes that forward and backward need beside inputs and outputs.
     """
@@ -144,30 +131,6 @@ def reference_workload() -> Callable[[], jax.Array]:
     return lambda: work(x, index)
 
 
-def _stored(gaussians: Gaussians, storage: str) -> Gaussians:
-    """Return the parameters as they come back from storage."""
-
-    def narrow(a):
-        return a.astype(jnp.bfloat16).astype(jnp.float32)
-
-    if storage == "sh":
-        return dataclasses.replace(gaussians, sh=narrow(gaussians.sh))
-    return gaussians if storage == "float32" else jax.tree.map(narrow, gaussians)
-
-
-def _kept(scene: BenchScene, budget: float) -> np.ndarray:
-    """Return the indices of that part of the Gaussians whose footprint times opacity is largest."""
-    g = scene.gaussians
-    if budget >= 1:
-        return np.arange(g.capacity)
-    z = np.asarray(g.means @ scene.camera.viewmat[2, :3] + scene.camera.viewmat[2, 3])
-    log_scales = np.sort(np.asarray(g.log_scales), -1)
-    area = log_scales[:, 1:].sum(-1) - 2 * np.log(np.maximum(z, 1e-3))
-    opacity = -np.logaddexp(0, -np.asarray(g.opacity_logits))
-    order = np.argsort(-(area + opacity))
-    return np.sort(order[: max(1, round(budget * g.capacity))])
-
-
 def cotangent(scene: BenchScene) -> np.ndarray:
     """Return the random weights (H, W, 3) whose weighted sum of the image is differentiated."""
     shape = (scene.camera.height, scene.camera.width, 3)
@@ -178,21 +141,16 @@ def programs(scene: BenchScene, variant: Variant, base: RenderConfig, weights: n
     """Compile one variant.
 
     Returns:
-        Forward and forward-and-backward as functions of no arguments, the indices of the Gaussians
-        that are kept, the entries, and the bytes of temporaries of forward-and-backward.
+        Forward and forward-and-backward as functions of no arguments, the entries, and the bytes of
+        temporaries of forward-and-backward.
     """
     cfg = dataclasses.replace(base, **dict(variant.changes))
-    kept = jnp.asarray(_kept(scene, variant.budget))
-    gaussians = jax.tree.map(lambda a: a[kept], scene.gaussians)
-    alive = jnp.ones(gaussians.capacity, bool)
-    need = int(required_capacity(_stored(gaussians, variant.storage), alive, scene.camera, cfg))
+    gaussians, alive = scene.gaussians, jnp.ones(scene.gaussians.capacity, bool)
+    need = int(required_capacity(gaussians, alive, scene.camera, cfg))
     capacity = bucket(need)
 
     def linear(g):
-        g = _stored(g, variant.storage)
-        return render_linear(
-            g, alive, scene.camera, cfg, capacity, active_degree=variant.degree, with_depth=False
-        ).linear
+        return render_linear(g, alive, scene.camera, cfg, capacity, with_depth=False).linear
 
     def objective(g):
         image = linear(g)
@@ -204,7 +162,7 @@ def programs(scene: BenchScene, variant: Variant, base: RenderConfig, weights: n
     both = both.lower(gaussians).compile()
     memory: Any = both.memory_analysis()
     temporaries = 0 if memory is None else int(memory.temp_size_in_bytes)
-    return (lambda: forward(gaussians)), (lambda: both(gaussians)), kept, need, temporaries
+    return (lambda: forward(gaussians)), (lambda: both(gaussians)), need, temporaries
 
 
 def sweep_scene(quick: bool) -> BenchScene:
@@ -240,16 +198,10 @@ def measure_speed_error(
             jobs[f"{v.name} forward"], jobs[f"{v.name} both"] = forward, both
         times = interleaved(jobs, repeats)
         for v in batch:
-            kept, need, temporaries = facts[v.name]
-            gradient, linear = jobs[f"{v.name} both"]()
-            gradient = jax.tree.map(
-                lambda a, b, k=kept: np.asarray(jnp.zeros_like(b).at[k].set(a)),
-                gradient,
-                scene.gaussians,
-            )
-            linear = np.asarray(linear, np.float64)
-            untouched = v.storage == "float32" and v.degree is None and v.budget == 1
-            rules = untouched and not {"alpha_cutoff", "cutoff_rule"} & {k for k, _ in v.changes}
+            need, temporaries = facts[v.name]
+            gradient, linear = jax.tree.map(np.asarray, jobs[f"{v.name} both"]())
+            linear = linear.astype(np.float64)
+            rules = not {"alpha_cutoff", "cutoff_rule"} & {k for k, _ in v.changes}
             ms = {k: times[f"{v.name} {k}"] for k in ("forward", "both")}
             ratios = {k: t / times[REFERENCE] for k, t in ms.items()}
             error = errors(linear, gradient, whole)

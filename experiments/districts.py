@@ -23,8 +23,8 @@ from typing import Any
 from towns import table
 
 from p2gs_jax import write_street
-from p2gs_jax.synth.rig import image_height
 from p2gs_jax.synth.sensor import Sensor
+from p2gs_jax.synth.settings import image_height
 
 PEAK = re.compile(r"VmHWM:\s+(\d+)")
 

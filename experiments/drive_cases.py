@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from p2gs_jax.config import Level, ResponseKind, VignettingKind
 from p2gs_jax.photometry.models import ModelName
@@ -21,17 +21,9 @@ from p2gs_jax.synth.settings import Curve
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from synthetic_drive import (
-    CAMERA_NAMES,
-    Curves,
-    Exposures,
-    Tints,
-    make_drive,
-    make_exposures,
-    make_white_balance,
-    observe,
-)
+from synthetic_drive import CAMERA_NAMES, Curves, Exposures, make_drive, make_exposures, observe
 
+Tints = Literal["camera", "view", "dark"]
 PIVOT = 0.18
 FRAMES, POINTS = 20, 1200
 CAMERA_GAMMAS, GAMMA_SPREAD = (2.0, 2.2, 2.45), 0.15
@@ -56,6 +48,30 @@ _MODELS: dict[tuple[Level | None, Level | None], ModelName] = {
     ("view", "camera"): "view_exposure_camera_gamma",
     ("view", "view"): "view_exposure_gamma",
 }
+
+
+def make_white_balance(
+    kind: Tints,
+    cameras: Int[np.ndarray, " v"],
+    exposures: Float[np.ndarray, " v"],
+    *,
+    ev: float = 0.1,
+    seed: int = 4,
+) -> Float[np.ndarray, "v 3"]:
+    """Return factors on red, green, blue of every view; the mean of their logarithms is 0.
+
+    `camera` and `view` draw factors for each; with `dark`, views darker than the median are bluer.
+    `ev` is the standard deviation of a channel, or how much bluer dark views are, stops.
+    """
+    rng = np.random.default_rng(seed)
+    if kind == "dark":
+        dark = exposures < np.median(exposures)
+        stops = np.where(dark[:, None], np.array([-ev / 2, 0, ev]), 0.0)
+    elif kind == "camera":
+        stops = ev * rng.standard_normal((int(cameras.max()) + 1, 3))[cameras]
+    else:
+        stops = ev * rng.standard_normal((len(cameras), 3))
+    return 2.0 ** (stops - stops.mean(1, keepdims=True))
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,12 @@ an ISO and a white balance drawn for every photograph. All methods get the same 
   Every method is shown under the mean of its parameters over the training views, without its
   vignetting, times one factor per channel for all held-out views together: photographs leave scale
   and common tint of radiance open.
-
-Empty cells: a method has no such part.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -33,9 +32,28 @@ import p2gs_jax
 from p2gs_jax.core.atomic import write_json, write_text
 from p2gs_jax.evaluation.references import load_reference
 from p2gs_jax.evaluation.scores import psnr
-from p2gs_jax.synth.rig import image_height
-from p2gs_jax.synth.sensor import read_true_shots
-from p2gs_jax.synth.settings import Sensor
+from p2gs_jax.synth.sensor import FILE
+from p2gs_jax.synth.settings import Sensor, image_height
+
+
+class TrueShot(NamedTuple):
+    """How a photograph was taken: columns of `truth/exposures.csv`."""
+
+    camera: str
+    exposure: float
+    balance: tuple[float, ...]
+    corners: float
+
+
+def read_true_shots(root: Path) -> dict[str, TrueShot]:
+    found = {}
+    with (root / FILE).open(newline="", encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            names = ("exposure", "red", "green", "blue", "corners")
+            e, *balance, corners = (float(row[name]) for name in names)
+            found[row["image"]] = TrueShot(row["camera"], e, tuple(balance), corners)
+    return found
+
 
 METHODS = ("robust", "ppisp", "ppisp_solved", "3dgs_affine")
 SENSORS: dict[str, Sensor] = {

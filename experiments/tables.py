@@ -24,7 +24,6 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from towns import (
     CONSTANT,
@@ -157,27 +156,6 @@ def novel_views(runs: Runs) -> str:
     rows = [[name, *runs.cells(name, WIDE, columns), PAPER_2.get(name, "")] for name in METHODS]
     header = ("method", *titles(columns), "paper (Waymo): SSIM / PSNR / LPIPS")
     return table(header, rows) + "\n" + NOT_BUILT + "\n"
-
-
-def plot_novel_views(runs: Runs) -> Figure:
-    figure, axis = _bars(list(METHODS), "PSNR of held-out views, dB", 3.6)
-    for k, (label, path) in enumerate(PROTOCOLS.items()):
-        values = [runs.mean(name, WIDE, *path, "psnr") for name in METHODS]
-        bars = axis.barh(np.arange(len(METHODS)) + 0.27 * (1 - k), values, 0.26, label=label)
-        axis.bar_label(bars, fmt="%.1f", fontsize=6, padding=2)
-    axis.set_xlim(10, None)
-    figure.legend(loc="outside upper center", ncols=3, fontsize=8)
-    return figure
-
-
-def _bars(names: Sequence[str], xlabel: str, height: float) -> tuple[Figure, Axes]:
-    """Return a figure whose vertical axis lists names from top to bottom."""
-    figure = Figure(figsize=(8, height), layout="constrained")
-    axis = figure.subplots()
-    axis.set(yticks=np.arange(len(names)), xlabel=xlabel)
-    axis.set_yticklabels(names, fontsize=7)
-    axis.invert_yaxis()
-    return figure, axis
 
 
 # ------------------------------------------------------------------ table 3
@@ -332,7 +310,11 @@ def ablation(runs: Runs) -> str:
 def plot_ablation(runs: Runs) -> Figure:
     names = list(ablations())
     values = [runs.mean(name, WIDE, *ISO8, "test", "psnr") for name in names]
-    figure, axis = _bars(names, "PSNR of held-out views at ISO 8, dB", 5)
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    axis = figure.subplots()
+    axis.set(yticks=np.arange(len(names)), xlabel="PSNR of held-out views at ISO 8, dB")
+    axis.set_yticklabels(names, fontsize=7)
+    axis.invert_yaxis()
     colors = ["tab:green" if n.startswith("robust") else "tab:blue" for n in names]
     bars = axis.barh(np.arange(len(names)), values, color=colors)
     axis.bar_label(bars, fmt="%.2f", fontsize=7, padding=2)
@@ -402,11 +384,11 @@ def make(o: Options, name: str) -> None:
         text, plot = iso(runs), plot_iso
     else:
         runs = fit_all(o, {WIDE: methods()})
-        text, plot = novel_views(runs), plot_novel_views
+        text = novel_views(runs)
         if name == "reconstruction":
             first = o.protocol.towns[0]
             fps = {m: frames_per_second(f) for (m, _, t), f in runs.folders.items() if t == first}
-            text, plot, extra = reconstruction(runs, fps), None, {"fps": fps}
+            text, extra = reconstruction(runs, fps), {"fps": fps}
     write(o, name, text, runs, begin, extra)
     if plot is not None:
         save_plot(o, name, plot(runs))

@@ -26,19 +26,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
 from mixtures import read_groups, within_groups_ev, write_mixture
 
-from p2gs_jax.core.atomic import atomic_write, write_json
+from p2gs_jax.core.atomic import write_json
 from p2gs_jax.evaluation.alignment import exposure_error
-from p2gs_jax.synth.rig import image_height
 from p2gs_jax.synth.sensor import Sensor, read_true_exposures
+from p2gs_jax.synth.settings import image_height
 from p2gs_jax.synth.write import write_street
 
 HERE = Path(__file__).resolve().parents[1]
 SCENES = ("town", "nerf_fox", "sofa", "sceaux_castle")
 THIS, AGAINST = "this", "against"
-COLORS = {THIS: "#0072B2", AGAINST: "#D55E00"}
 
 
 class Version(NamedTuple):
@@ -197,7 +195,7 @@ Curve = list[tuple[float, float]]
 
 
 def curve(rows: Sequence[Mapping[str, Any]], scene: str, label: str) -> Curve:
-    """Return (wall seconds, held-out PSNR) of one line of the plot, by time."""
+    """Return (wall seconds, held-out PSNR) of one version, by time."""
     mine = [r for r in rows if (r["scene"], r["version"]) == (scene, label)]
     return sorted((r["wall_s"], r["test_psnr"]) for r in mine if r["test_psnr"] is not None)
 
@@ -228,21 +226,6 @@ def speedups(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return out
 
 
-def plot(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Return held-out PSNR against wall seconds, one panel a scene."""
-    names = list(dict.fromkeys(r["scene"] for r in rows))
-    figure = Figure(figsize=(1.2 + 3.6 * len(names), 4.0), layout="constrained")
-    for axis, name in zip(np.atleast_1d(figure.subplots(1, len(names))), names, strict=True):
-        for label, color in COLORS.items():
-            if points := curve(rows, name, label):
-                axis.plot(*zip(*points, strict=True), "o-", color=color, label=label)
-        axis.set(xscale="log", title=name, xlabel="wall seconds of the whole command")
-        axis.grid(alpha=0.3)
-        axis.legend()
-    figure.axes[0].set_ylabel("PSNR of held-out views, dB")
-    return figure
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -265,12 +248,10 @@ def main() -> None:
             rows.append(execute(job, work))
             write_json(args.out, rows)
             print(table(rows[-1:]).splitlines()[-1], file=sys.stderr, flush=True)
-    # Rows of other code stay in the file; table and plot show these two versions.
+    # Rows of other code stay in the file; the table shows these two versions.
     shown = [row for job in jobs for row in rows if job.of(row)]
     print(table(shown))
     print("\n".join(f"- {line}" for line in speedups(shown)))
-    with atomic_write(args.out.with_suffix(".png")) as path:
-        plot(shown).savefig(path, dpi=110, format="png")
 
 
 if __name__ == "__main__":

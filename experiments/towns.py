@@ -26,8 +26,8 @@ import p2gs_jax
 from p2gs_jax.config import FitConfig, PresetName
 from p2gs_jax.jobs.sweep import sweep
 from p2gs_jax.presets import to_dict
-from p2gs_jax.synth.rig import image_height
 from p2gs_jax.synth.sensor import Sensor
+from p2gs_jax.synth.settings import image_height
 
 CONSTANT, NARROW, WIDE = 0.0, 2.0, 4.0
 STD_NAMES = {CONSTANT: "ISO-Const", NARROW: "ISO std 2", WIDE: "ISO std 4"}

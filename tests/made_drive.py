@@ -58,14 +58,11 @@ def make_recording(root, cameras=("front", "left", "back", "right"), frames=8):
             at = PERIOD * frame + 0.01 * k
             photographs.append(Photograph(camera, frame, at, path, camera_pose(camera, frame)))
 
-    def reader(frame):
-        def read():
-            points = sweep_points(frame, frames)
-            return SweepPoints(points, np.full(len(points), PERIOD * frame))
-
-        return read
+    def read(frame):
+        points = sweep_points(frame, frames)
+        return SweepPoints(points, np.full(len(points), PERIOD * frame))
 
     rig = [RigCamera(name, K, WIDTH, HEIGHT) for name in cameras]
-    sweeps = [Sweep(k, PERIOD * k, reader(k)) for k in range(frames)]
+    sweeps = [Sweep(k, PERIOD * k, lambda k=k: read(k)) for k in range(frames)]
     cars = (tracked_car(frames), tracked_car(frames, moving=False))
     return Recording(root, "pandaset", rig, photographs, sweeps, cars)

@@ -12,12 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from p2gs_jax.config import RenderConfig
+from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.scene.drives import DriveFormat
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
 from p2gs_jax.types import Camera, Gaussians, TrackedObject
 
 WIDTH, HEIGHT, FOCAL = 160, 96, 110.0
+K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
 FRAMES, INTERVAL, STEREO = 16, 0.1, 0.6
 SIZE = (2.0, 1.2, 1.0)
 # World: x right, y down, z forward, as of the first camera. Boxes: x forward, y left, z up.
@@ -53,9 +55,9 @@ def pose_at(time: float) -> np.ndarray:
     return out
 
 
-def make_world(seed: int = 0) -> World:
+def make_world() -> World:
     """Return a wall with ground before it, and a box with a pattern of its own."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     u, v = np.meshgrid(np.arange(-8, 8, 0.4), np.arange(-4, 1.2, 0.4))
     wall = np.stack([u.ravel(), v.ravel(), np.full(u.size, 10.0)], 1)
     u, w = np.meshgrid(np.arange(-7, 7, 0.4), np.arange(3.5, 10, 0.4))
@@ -93,46 +95,36 @@ def camera_pose(frame: int, camera: int) -> np.ndarray:
     return pose
 
 
-def photograph_of(world: World, frame: int, camera: int, render) -> np.ndarray:
-    """Return 8-bit display values: sRGB of exposed radiance."""
-    box = moved(world.box, pose_at(frame * INTERVAL))
-    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), world.wall, box)
-    viewmat = np.linalg.inv(camera_pose(frame, camera)).astype(np.float32)
-    view = Camera(jnp.asarray(viewmat), jnp.asarray(lens(), jnp.float32), WIDTH, HEIGHT)
-    shown = render(both, jnp.ones(both.capacity, bool), view)
-    exposed = np.asarray(shown.linear) * world.exposures[frame]
-    encoded = np.where(
-        exposed < 0.0031308, 12.92 * exposed, 1.055 * np.maximum(exposed, 1e-9) ** (1 / 2.4) - 0.055
-    )
-    return np.rint(255 * np.clip(encoded, 0, 1)).astype(np.uint8)
+def taken(root: Path) -> list[Photograph]:
+    """Return where, when and from which pose the photographs are taken."""
+    return [
+        Photograph(f"cam{k}", f, f * INTERVAL, root / f"cam{k}" / f"{f:03d}.png", camera_pose(f, k))
+        for k, f in itertools.product(range(2), range(FRAMES))
+    ]
 
 
-def lens() -> np.ndarray:
-    """Return K of both cameras."""
-    return np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+def write_photographs(root: Path) -> None:
+    """Write the photographs of the drive: sRGB of exposed radiance, 8 bits."""
+    world, render = make_world(), make_renderer(RENDER)
+    for photograph in taken(root):
+        box = moved(world.box, pose_at(photograph.time))
+        both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), world.wall, box)
+        viewmat = np.linalg.inv(photograph.pose).astype(np.float32)
+        view = Camera(jnp.asarray(viewmat), jnp.asarray(K, jnp.float32), WIDTH, HEIGHT)
+        shown = np.asarray(render(both, jnp.ones(both.capacity, bool), view).linear)
+        encoded = srgb_encode(shown * world.exposures[photograph.frame])
+        photograph.path.parent.mkdir(parents=True, exist_ok=True)
+        pixels = np.rint(255 * encoded).astype(np.uint8)
+        cv2.imwrite(str(photograph.path), pixels[..., ::-1])
 
 
-def write_photographs(root: Path, seed: int = 0) -> None:
-    """Write the photographs of the drive."""
-    world, render = make_world(seed), make_renderer(RENDER)
-    for camera in range(2):
-        (root / f"cam{camera}").mkdir(parents=True)
-        for frame in range(FRAMES):
-            pixels = photograph_of(world, frame, camera, render)
-            cv2.imwrite(str(root / f"cam{camera}" / f"{frame:03d}.png"), pixels[..., ::-1])
-
-
-def recording(root: Path, seed: int = 0, points: bool = True) -> Recording:
+def recording(root: Path) -> Recording:
     """Return the drive as a reader gives it; the box stays in sight."""
-    world = make_world(seed)
-    cameras = tuple(RigCamera(f"cam{k}", lens(), WIDTH, HEIGHT) for k in range(2))
-    photographs = []
-    for k, frame in itertools.product(range(2), range(FRAMES)):
-        path, pose = root / f"cam{k}" / f"{frame:03d}.png", camera_pose(frame, k)
-        photographs.append(Photograph(f"cam{k}", frame, frame * INTERVAL, path, pose))
+    world = make_world()
+    cameras = tuple(RigCamera(f"cam{k}", K, WIDTH, HEIGHT) for k in range(2))
 
     def sweep(frame: int) -> SweepPoints:
-        rng = np.random.default_rng((seed, frame))
+        rng = np.random.default_rng((0, frame))
         time = frame * INTERVAL
         box = np.asarray(moved(world.box, pose_at(time)).means)
         still = np.asarray(world.wall.means)
@@ -141,13 +133,9 @@ def recording(root: Path, seed: int = 0, points: bool = True) -> Recording:
         return SweepPoints(found.astype(np.float64), np.full(len(found), time))
 
     sweeps = tuple(Sweep(f, f * INTERVAL, lambda f=f: sweep(f)) for f in range(FRAMES))
-    sweeps = sweeps if points else ()
-    return Recording(root, "pandaset", cameras, photographs, sweeps, (world.track,))
+    return Recording(root, "pandaset", cameras, taken(root), sweeps, (world.track,))
 
 
-def drive_format(seed: int = 0, points: bool = True) -> DriveFormat:
+def drive_format() -> DriveFormat:
     """Return a reader of such drives, to put in the place of a data set's."""
-    return DriveFormat(
-        lambda root: (root / "cam0").is_dir(),
-        lambda root, cfg: recording(root, seed, points),
-    )
+    return DriveFormat(lambda root: (root / "cam0").is_dir(), lambda root, cfg: recording(root))

@@ -34,7 +34,11 @@ def haze(n=120, degree=1, seed=0):
     )
 
 
-def camera(x=0.0, width=40, height=32):
-    """Return a camera that looks along +z from (x, 0, 0)."""
-    K = jnp.array([[30.0, 0, width / 2], [0, 30.0, height / 2], [0, 0, 1]])
-    return Camera(jnp.eye(4).at[0, 3].set(-x), K, width, height)
+def camera(x=0.0, width=40, height=32, focal=30.0, yaw=0.0):
+    """Return a camera at (x, 0, 0) that looks along +z, or turned by `yaw` about y."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    viewmat = np.eye(4, dtype=np.float32)
+    viewmat[:3, :3] = [[c, 0, -s], [0, 1, 0], [s, 0, c]]
+    viewmat[:3, 3] = -viewmat[:3, :3] @ [x, 0, 0]
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], np.float32)
+    return Camera(jnp.asarray(viewmat), jnp.asarray(K), width, height)

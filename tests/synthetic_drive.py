@@ -2,8 +2,7 @@
 
 The input of the photometric adjustment on a drive, with every quantity known: three cameras, frames
 one unit apart, facades, road and sky, 4-6 stops of contrast plus a bright sky, 8-bit photographs
-with photon noise, texture and outliers (our own proxy; docs/photometry.md, 3 describes a similar
-one). Cameras
+with photon noise, texture and outliers (docs/photometry.md, 3 describes a similar one). Cameras
 may also tint the light, darken the corners and respond in different ways. Vignetting follows the
 cosine-fourth law, so that no fitted polynomial in r^2 is exactly right.
 """
@@ -20,7 +19,6 @@ from p2gs_jax.synth.sensor import READ_NOISE, SHOT_NOISE, encode
 from p2gs_jax.synth.settings import Curve
 
 Curves = Curve | np.ndarray
-Tints = Literal["camera", "view", "dark"]
 Exposures = Literal["constant", "iso2", "iso4", "cameras", "auto"]
 YAWS = (0.0, -44.2, 44.8)
 CAMERA_NAMES = ("front", "right", "left")
@@ -32,24 +30,14 @@ NEIGHBOURHOOD, WAVES = 0.2, 16
 
 
 class Drive(NamedTuple):
-    """Who sees what.
-
-    Attributes:
-        views: row of the view of each observation; view = camera * frames + frame.
-        points: row of its point.
-        radiance: linear, (P, 3).
-        cameras: of each view.
-        frames: number of frames.
-        positions: of each observation in its image: x to the right, y down, from the centre in
-            units of half the diagonal.
-    """
+    """Who sees what; a view is camera * frames + frame."""
 
     views: Int[np.ndarray, " o"]
     points: Int[np.ndarray, " o"]
-    radiance: Float[np.ndarray, "p 3"]
+    radiance: Float[np.ndarray, "p 3"]  # linear
     cameras: Int[np.ndarray, " v"]
     frames: int
-    positions: Float[np.ndarray, "o 2"]
+    positions: Float[np.ndarray, "o 2"]  # x right, y down, from the centre in half diagonals
 
 
 def _on_image(
@@ -65,13 +53,9 @@ def _on_image(
 
 
 def make_drive(frames: int = 20, points: int = 1200, seed: int = 0, seen: float = 0.6) -> Drive:
-    """Return visibility and radiance of a random street.
+    """Return visibility and radiance of a random street, without points seen less than three times.
 
-    Args:
-        frames: per camera.
-        points: before those seen fewer than three times are dropped.
-        seed: of the random numbers.
-        seen: chance that a visible point was matched.
+    `seen` is the chance that a visible point was matched.
     """
     rng = np.random.default_rng(seed)
     sky, road = points // 8, points // 4
@@ -88,21 +72,15 @@ def make_drive(frames: int = 20, points: int = 1200, seed: int = 0, seen: float 
         height = np.concatenate([np.degrees(np.arctan2(z, distance)), sky_height])
         distance = np.concatenate([distance, np.full(sky, 10.0)])
         for camera, yaw in enumerate(YAWS):
-            inside = (
-                (np.abs(azimuth - yaw) < HALF_WIDTH)
-                & (np.abs(height) < HALF_HEIGHT)
-                & (distance > NEAREST)
-                & (distance < FARTHEST)
-                & (rng.random(points) < seen)
-            )
+            inside = (np.abs(azimuth - yaw) < HALF_WIDTH) & (np.abs(height) < HALF_HEIGHT)
+            inside &= (distance > NEAREST) & (distance < FARTHEST) & (rng.random(points) < seen)
             found = np.flatnonzero(inside)
             views.append(np.full(len(found), camera * frames + frame))
             ids.append(found)
             places.append(_on_image(azimuth[found] - yaw, height[found]))
     v, p, xy = map(np.concatenate, (views, ids, places))
-    shuffled = rng.permutation(len(v))
-    v, p, xy = v[shuffled], p[shuffled], xy[shuffled]
-    order = np.argsort(p, kind="stable")
+    order = rng.permutation(len(v))
+    order = order[np.argsort(p[order], kind="stable")]
     v, p, xy = v[order], p[order], xy[order]
     counts = np.bincount(p, minlength=points)
     rank = np.arange(len(p)) - np.concatenate([[0], np.cumsum(counts)])[p]
@@ -121,11 +99,8 @@ def make_drive(frames: int = 20, points: int = 1200, seed: int = 0, seen: float 
 def make_exposures(drive: Drive, kind: Exposures, seed: int = 2) -> Float[np.ndarray, " v"]:
     """Return exposures > 0 of every view.
 
-    Args:
-        drive: for the number of views.
-        kind: `constant`; `iso2`, `iso4`: ISO ~ N(8, std), rounded, at least 1, over 8; `cameras`:
-            a gain per camera; `auto`: slow drifts as of an automatic exposure.
-        seed: of the ISO values.
+    `iso2` and `iso4` draw ISO ~ N(8, std), rounded, at least 1, over 8; `cameras` is a gain per
+    camera; `auto` drifts slowly, as an automatic exposure does.
     """
     frame = np.tile(np.arange(drive.frames), 3)
     if kind == "constant":
@@ -158,7 +133,7 @@ def observe(
 
     Args:
         drive: who sees what.
-        exposures: of every view, or of every channel of it (a white balance).
+        exposures: one for every view, or for every channel of it (a white balance).
         curve: response of all, or an array of names that fits cameras x channels.
         gammas: of every view, replacing the curve by x^(1 / gamma) about the pivot.
         pivot: linear value that gammas leave alone (encoded by 2.2).
@@ -166,10 +141,8 @@ def observe(
         texture: standard deviation of log radiance between views, common to the channels.
         noise: factor of photon noise and texture.
         bits: of the photographs; None does not round.
-        corner_loss: share of the light that each camera loses in its corners, for all channels or
-            for each; None: none.
-        shared_texture: standard deviation of further errors of log radiance that points near each
-            other in an image have in common.
+        corner_loss: share of the light that each camera loses in its corners.
+        shared_texture: the same as `texture`, of errors that neighbours in an image share.
         seed: of the random numbers.
     """
     rng = np.random.default_rng(seed)
@@ -207,43 +180,12 @@ def observe(
     )
 
 
-def make_white_balance(
-    kind: Tints,
-    cameras: Int[np.ndarray, " v"],
-    exposures: Float[np.ndarray, " v"],
-    *,
-    ev: float = 0.1,
-    seed: int = 4,
-) -> Float[np.ndarray, "v 3"]:
-    """Return factors on red, green, blue of every view; the mean of their logarithms is 0.
-
-    Args:
-        kind: `camera`, `view`: factors of each channel drawn for each; `dark`: views darker than
-            the median are bluer than the others.
-        cameras: of each view.
-        exposures: of each view.
-        ev: standard deviation of a channel, or how much bluer dark views are, stops.
-        seed: of the draws.
-    """
-    rng = np.random.default_rng(seed)
-    if kind == "dark":
-        dark = exposures < np.median(exposures)
-        stops = np.where(dark[:, None], np.array([-ev / 2, 0, ev]), 0.0)
-    elif kind == "camera":
-        stops = ev * rng.standard_normal((int(cameras.max()) + 1, 3))[cameras]
-    else:
-        stops = ev * rng.standard_normal((len(cameras), 3))
-    return 2.0 ** (stops - stops.mean(1, keepdims=True))
-
-
 def falloff(
     radius: Float[np.ndarray, "..."], corner_loss: Float[np.ndarray, "..."] | float
 ) -> Float[np.ndarray, "..."]:
     """Return the share of the light that arrives: cos^4 of the angle to the axis.
 
-    Args:
-        radius: distance from the centre of the image, 1 in its corners.
-        corner_loss: share lost there, in [0, 1).
+    The radius is 1 in the corners of the image, where a share in [0, 1) is lost.
     """
     # cos^2 = 1 / (1 + tan^2), and the tangent grows with the radius.
     return (1 + ((1 - corner_loss) ** -0.5 - 1) * radius**2) ** -2.0
@@ -252,13 +194,7 @@ def falloff(
 def encode_by(
     exposed: Float[np.ndarray, "o 3"], curve: Curves, cameras: Int[np.ndarray, " o"]
 ) -> Float[np.ndarray, "o 3"]:
-    """Return display values of exposed radiance under the response of each camera and channel.
-
-    Args:
-        exposed: radiance times exposure.
-        curve: response of all, or names that broadcast to (cameras, 3).
-        cameras: of each row.
-    """
+    """Return display values of exposed radiance; curves broadcast to (cameras, 3)."""
     if isinstance(curve, str):
         return encode(exposed, curve)
     of_each = np.broadcast_to(curve, (int(cameras.max(initial=0)) + 1, 3))[cameras]
@@ -278,12 +214,6 @@ def smooth_errors(
 
     Sums of random waves approach a Gaussian process with the covariance
     exp(-d^2 / (2 NEIGHBOURHOOD^2)) (Rahimi and Recht 2007).
-
-    Args:
-        views: row of the view.
-        positions: in its image.
-        view_count: number of views.
-        seed: of the waves.
     """
     rng = np.random.default_rng(seed)
     total = np.zeros(len(views))

@@ -1,7 +1,9 @@
-"""A scene small enough to fit in seconds."""
+"""Scenes small enough to fit, or to judge, in seconds."""
 
 import cv2
 import numpy as np
+
+from p2gs_jax.types import Scene, View
 
 
 def make_scene(root, views=6, points=150, size=(112, 100), seed=0):
@@ -45,3 +47,20 @@ def make_scene(root, views=6, points=150, size=(112, 100), seed=0):
         rows.append(f"{p + 1} {xyz[p, 0]} {xyz[p, 1]} {xyz[p, 2]} {rgb} 0.5 {pairs}")
     (model / "points3D.txt").write_text("\n".join(rows) + "\n")
     return root
+
+
+def noise_scene(folder, train, held_out, masked=False):
+    """Return views of noise, 40x34, by their names; their left halves count or are masked."""
+    rng, views = np.random.default_rng(0), []
+    K = np.array([[40, 0, 20], [0, 40, 17], [0, 0, 1]], np.float32)
+    for name in (*train, *held_out):
+        path, mask = folder / name, folder / f"{name}.mask.png" if masked else None
+        cv2.imwrite(str(path), rng.integers(0, 256, (34, 40, 3), np.uint8))
+        if mask is not None:
+            shown = np.full((34, 40), 255, np.uint8)
+            shown[:, :20] = 0
+            cv2.imwrite(str(mask), shown)
+        split, pose = "train" if name in train else "test", np.eye(4, dtype=np.float32)
+        views.append(View(name, path, "0", pose, K, 40, 34, split=split, mask_path=mask))
+    points = np.zeros((0, 3), np.float32)
+    return Scene(folder, "colmap", tuple(views), points, points.astype(np.uint8))

@@ -28,7 +28,6 @@ MODULES = {
     "colour-science": "colour",
     "openexr": "OpenEXR",
     "opencv-contrib-python-headless": "cv2",
-    "orbax-checkpoint": "orbax.checkpoint",
     "pillow": "PIL",
 }
 # Checked where pip has no metadata of p2gs-jax: a copy that was never installed.

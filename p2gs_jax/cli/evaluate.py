@@ -6,11 +6,9 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-import tyro
-
-from p2gs_jax.cli.shared import SceneFolder
+from p2gs_jax.cli.shared import RunPath, SceneFolder
 
 if TYPE_CHECKING:
     from p2gs_jax.evaluation.evaluate import Judge
@@ -30,10 +28,8 @@ class Eval:
     p2gs-jax eval runs/castle --against gaussian-splatting/output/castle
     """
 
-    run: Annotated[Path, tyro.conf.Positional]
-    """Run folder."""
+    run: RunPath
     scene: SceneFolder = None
-    """Where the run's scene lies now, if it is not where it was."""
     reference: Path | None = None
     """Photographs of the same views under one common exposure."""
     against: tuple[Path, ...] = ()

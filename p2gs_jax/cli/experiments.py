@@ -107,7 +107,7 @@ class Synth:
         import time
 
         from p2gs_jax.cli.tables import stdout
-        from p2gs_jax.synth.rig import image_height
+        from p2gs_jax.synth.settings import image_height
         from p2gs_jax.synth.write import write_street
 
         console, begin = stdout(), time.monotonic()

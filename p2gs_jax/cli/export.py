@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
-import tyro
-
-from p2gs_jax.cli.shared import MeteringRule, SceneFolder, check
+from p2gs_jax.cli.shared import MeteringRule, RunPath, SceneFolder, check
 from p2gs_jax.errors import UserError
 
 if TYPE_CHECKING:
@@ -31,8 +29,7 @@ class Export:
     p2gs-jax export runs/street --format usd exr --out for_blender
     """
 
-    run: Annotated[Path, tyro.conf.Positional]
-    """Run folder."""
+    run: RunPath
     format: tuple[Format, ...]
     """One or more: linear-ply (radiance, with a JSON file that explains it), display-ply, splat,
     spz, compressed-ply, gltf and usd (display colours, for viewers and other programs), colmap and
@@ -64,7 +61,6 @@ class Export:
     """html: how many photographs to embed, evenly spread, for the split view (default: none;
     whoever has the page has them, with all they show)."""
     scene: SceneFolder = None
-    """Where the run's scene lies now, if it is not where it was."""
     overwrite: bool = False
     """Replace what an earlier export wrote."""
 

@@ -145,8 +145,6 @@ class Calibrate:
 
     def execute(self) -> int:
         """Solve the photometry alone; print it as a table."""
-        from functools import partial
-
         from p2gs_jax.cli.tables import print_calibration, print_calibration_of, print_stack
         from p2gs_jax.core.progress import TerminalReporter
         from p2gs_jax.pipeline.calibrate import calibrate, calibrate_run, calibrate_stack
@@ -156,15 +154,14 @@ class Calibrate:
         with TerminalReporter() as reporter:
             how = {"compare_with": self.compare_with, "reporter": reporter}
             if self.static:
-                show = partial(print_stack, calibrate_stack(scene, out, cfg, **how), out)
+                show, found = print_stack, calibrate_stack(scene, out, cfg, **how)
             elif self.of is not None:
+                show = print_calibration_of
                 found = calibrate_of(scene, out, cfg, model=self.of, steps=steps, **how)
-                show = partial(print_calibration_of, found, out)
-            elif self.is_run:
-                show = partial(print_calibration, calibrate_run(scene, out, cfg, **how), out)
             else:
-                show = partial(print_calibration, calibrate(scene, out, cfg, **how), out)
-        show()
+                show, solve = print_calibration, calibrate_run if self.is_run else calibrate
+                found = solve(scene, out, cfg, **how)
+        show(found, out)
         return 0
 
     @property
@@ -241,11 +238,11 @@ def resolve_blocks(args: Fit) -> int | str | None:
         UserError: it is neither, or options of blocks are given without them.
     """
     words, alone = args.blocks, args.jobs == 1 and args.engine == "local"
-    nothing, fix = (
+    check(
+        words is not None or alone,
         "--jobs and --engine say nothing without --blocks",
-        "add --blocks auto, or a number",
+        fix="add --blocks auto, or a number",
     )
-    check(words is not None or alone, nothing, fix=fix)
     if words is None:
         return None
     check(args.jobs >= 1, "--jobs must be at least 1")

@@ -47,22 +47,6 @@ class Job:
     notes: Sequence[str] = ()
 
 
-def frames_of(
-    options: Render, renderer: RunRenderer, given: list[Shot] | None, say: Callable[[str], None]
-) -> Job:
-    """Return what to render.
-
-    Cameras that are `given` by a file come in place of the scene's; `say` tells the user something
-    while frames are rendered.
-
-    Raises:
-        UserError: the scene has no such views.
-    """
-    return (
-        _panoramas(options, renderer) if options.panorama else _shots(options, renderer, given, say)
-    )
-
-
 def _display_transform(fitted: Run, options: Render, shot: Shot | None = None) -> DisplayTransform:
     """Return a shot's display transform: from the options, else its own, else its photograph's."""
     if shot is not None and shot.view is not None:
@@ -99,10 +83,16 @@ def _chosen(options: Render, fitted: Run) -> list[Shot]:
     return chosen
 
 
-def _shots(
+def shots_of(
     options: Render, renderer: RunRenderer, given: list[Shot] | None, say: Callable[[str], None]
 ) -> Job:
-    """Return the job of rendering pinhole cameras."""
+    """Return the job of rendering pinhole cameras; those of a file replace the scene's.
+
+    `say` tells the user something while frames are rendered.
+
+    Raises:
+        UserError: the scene has no such views.
+    """
     fitted, notes, photograph = renderer.run, [], None
     views = fitted.scene.views
     if given is not None:
@@ -165,8 +155,12 @@ def _recorded(shots: list[Shot], options: Render, fitted: Run) -> list[Shot]:
     ]
 
 
-def _panoramas(options: Render, renderer: RunRenderer) -> Job:
-    """Return the job of rendering panoramas of a rig."""
+def panoramas_of(options: Render, renderer: RunRenderer) -> Job:
+    """Return the job of rendering panoramas of a rig.
+
+    Raises:
+        UserError: the scene has no rig, or the rig has no such time steps.
+    """
     fitted = renderer.run
     views = fitted.scene.views
     rig = find_rig(view_shots(views, fitted.cfg.data.max_width), views)
@@ -188,11 +182,11 @@ def _panoramas(options: Render, renderer: RunRenderer) -> Job:
         size = (cylinder.width, cylinder.height)
         return Job(wide_frames(renderer, cylinder, poses, transform, times), len(poses), size)
     allowed = {shot.view for shot in _chosen(options, fitted)}
-    steps = []
-    for step in rig.steps:
-        shots = {c: s for c, s in step.shots.items() if s.view in allowed}
-        if shots:
-            steps.append(replace(step, shots=shots))
+    steps = [
+        replace(step, shots={c: s for c, s in step.shots.items() if s.view in allowed})
+        for step in rig.steps
+    ]
+    steps = [step for step in steps if step.shots]
     if not steps:
         raise UserError(f"--split {options.split}: the rig has no such time step.")
     notes = []

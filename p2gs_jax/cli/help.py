@@ -1,7 +1,7 @@
 """How options are read and shown: rules for tyro, the overview of commands, prose around options.
 
-The text of an option is the string below its field. What tyro prints beside it (names of types,
-`(default: None)`) is replaced here.
+The text of an option is the string below its field, or the `help` of its type. What tyro prints
+beside it (names of types, `(default: None)`) is replaced here.
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ def _field(
         name=name,
         type=Annotated[(_plain(hint), *extras)],  # type: ignore
         default=default,
-        helptext=functools.partial(_text, kind, name),
+        helptext=lambda: _field_docs(kind).get(name),
     )
 
 
@@ -230,17 +230,12 @@ def _hints(kind: type) -> dict[str, Any]:
     return {field.name: hints[field.name] for field in dataclasses.fields(kind)}
 
 
-def _text(kind: type, name: str) -> str | None:
-    """Return the string below a field as one paragraph."""
-    text = _field_docs(kind).get(name)
-    return None if text is None else " ".join(text.split())
-
-
 @functools.cache
 def _field_docs(kind: type) -> dict[str, str]:
+    """Return the strings below fields as one paragraph each."""
     body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0].body  # type: ignore
     return {
-        field.target.id: str(text.value.value)
+        field.target.id: " ".join(str(text.value.value).split())
         for field, text in pairwise(body)
         if isinstance(field, ast.AnnAssign)
         and isinstance(field.target, ast.Name)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from p2gs_jax.cli.shared import SceneFolder, check
+from p2gs_jax.cli.shared import RunPath, SceneFolder, check
 from p2gs_jax.errors import UserError
 
 
@@ -19,10 +19,8 @@ class View:
     p2gs-jax view runs/street
     """
 
-    run: Annotated[Path, tyro.conf.Positional]
-    """Run folder."""
+    run: RunPath
     scene: SceneFolder = None
-    """Where the run's scene lies now, if it is not where it was."""
     port: int = 8080
     """Port to listen on; 0 takes any free one."""
     host: str = "127.0.0.1"
@@ -65,14 +63,12 @@ class Report:
     p2gs-jax report runs/street --pdf --out street.html
     """
 
-    run: Annotated[Path, tyro.conf.Positional]
-    """Run folder."""
+    run: RunPath
     out: Path | None = None
     """The page (default: RUN/report.html)."""
     pdf: bool = False
     """Print the page as a PDF as well, beside it (needs a Chromium or Chrome)."""
     scene: SceneFolder = None
-    """Where the run's scene lies now, if it is not where it was."""
     render: bool = True
     """Load the scene and render for the seams; without, only what the run folder holds."""
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from p2gs_jax.cli.shared import MeteringRule, SceneFolder, check
+from p2gs_jax.cli.shared import MeteringRule, RunPath, SceneFolder, check
 from p2gs_jax.errors import UserError
 
 if TYPE_CHECKING:
@@ -33,8 +33,7 @@ class Render:
     p2gs-jax render runs/street --panorama --split test --width 1400 --out wide
     """
 
-    run: Annotated[Path, tyro.conf.Positional]
-    """Run folder."""
+    run: RunPath
     path: str = "views"
     """views: the scene's own. drive: smoothly through the views of one camera. orbit: around what
     the cameras look at. FILE.json: a list of cameras (docs/rendering.md)."""
@@ -84,7 +83,6 @@ class Render:
     fps: float | None = None
     """Frames per second of a video (default: 24)."""
     scene: SceneFolder = None
-    """Where the run's scene lies now, if it is not where it was."""
     overwrite: bool = False
     """Replace what an earlier render wrote."""
 
@@ -92,24 +90,27 @@ class Render:
         """Render the run along the path, into a folder or a video."""
         import time
 
-        from p2gs_jax.cli.frames import frames_of
+        from p2gs_jax.cli.frames import panoramas_of, shots_of
         from p2gs_jax.cli.tables import stdout
         from p2gs_jax.core.clock import CompileCounter
         from p2gs_jax.core.progress import TerminalReporter
         from p2gs_jax.formats.frames import open_frames
         from p2gs_jax.paths.files import read_cameras, write_cameras
         from p2gs_jax.paths.pictures import RunRenderer
-        from p2gs_jax.run.read import load_run
 
         begin, compiler = time.monotonic(), CompileCounter()
-        check_render(self)
+        for refuse in (_check_picture, _check_path, _check_file):  # before anything is read
+            refuse(self)
         out = self.out or self.run / "renders" / _default_name(self)
         _check_place(out, self.overwrite)
         given = read_cameras(Path(self.path)) if self.path not in PATHS else None
-        renderer = RunRenderer(_with_objects(load_run(self.run, self.scene), self))
-        _check_display(renderer.run, self)
+        renderer = RunRenderer(_load(self))
         with TerminalReporter() as reporter:
-            job = frames_of(self, renderer, given, reporter.message)
+            job = (
+                panoramas_of(self, renderer)
+                if self.panorama
+                else shots_of(self, renderer, given, reporter.message)
+            )
             reading = time.monotonic() - begin
             for note in job.notes:
                 reporter.message(note)
@@ -137,21 +138,15 @@ class Render:
         return 0
 
 
-def _with_objects(fitted: Run, options: Render) -> Run:
+def _load(options: Render) -> Run:
     """Return the run with what moves as the options want it.
 
     Raises:
-        UserError: it has none of these objects.
+        UserError: it has no such object, curve or white balance.
     """
-    for name, *offset in options.move_object:
-        fitted = fitted.with_moved(name, offset)
-    if options.without_objects:
-        return fitted.without_objects()
-    return fitted.only_objects() if options.only_objects else fitted
+    from p2gs_jax.run.read import load_run
 
-
-def _check_display(fitted: Run, options: Render) -> None:
-    """Refuse a curve or a white balance that the run does not have."""
+    fitted = load_run(options.run, options.scene)
     curve = fitted.cfg.photometry.curve
     if options.curve == "spline" and curve != "spline":
         raise UserError(
@@ -160,6 +155,11 @@ def _check_display(fitted: Run, options: Render) -> None:
         )
     if options.white_balance_of is not None:
         fitted.white_balance_of(options.white_balance_of)
+    for name, *offset in options.move_object:
+        fitted = fitted.with_moved(name, offset)
+    if options.without_objects:
+        return fitted.without_objects()
+    return fitted.only_objects() if options.only_objects else fitted
 
 
 def _check_place(out: Path, overwrite: bool) -> None:
@@ -191,17 +191,6 @@ def _default_name(options: Render) -> str:
     if options.shift:
         name += f"_{abs(options.shift):g}_{'left' if options.shift > 0 else 'right'}"
     return f"{name}_panorama" if options.panorama else name
-
-
-def check_render(o: Render) -> None:
-    """Reject options that make no sense, alone or together, before anything is read.
-
-    Raises:
-        UserError: one does not.
-    """
-    _check_picture(o)
-    _check_path(o)
-    _check_file(o)
 
 
 def _check_picture(o: Render) -> None:

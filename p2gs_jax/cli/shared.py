@@ -12,7 +12,11 @@ import tyro
 from p2gs_jax.errors import UserError
 
 MeteringRule = Literal["auto", "log_average", "centre", "highlights", "protected"]
-SceneFolder = Annotated[Path | None, tyro.conf.arg(metavar="DIR")]
+RunPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(help="Run folder.")]
+SceneFolder = Annotated[
+    Path | None,
+    tyro.conf.arg(metavar="DIR", help="Where the run's scene lies now, if it is not where it was."),
+]
 # Short names of fields of the configuration: the field, and the placeholder of its value. A command
 # that has any lists them as `SHORT_NAMES`.
 SHORT = {

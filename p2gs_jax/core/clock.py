@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from jax import monitoring
 
 _COMPILED = "/jax/core/compile/backend_compile_duration"
-_READ_BACK = "/jax/compilation_cache/cache_hits"
 
 
 class Stopwatch:
@@ -90,25 +89,20 @@ class CompileCounter:
         return int(_totals()[0] - self._begin[0])
 
     @property
-    def read_back(self) -> int:
-        """How many of `programs` came from the cache on disk."""
-        return int(_totals()[2] - self._begin[2])
-
-    @property
     def seconds(self) -> float:
         """Seconds that threads spent in the compiler or reading the cache, summed over threads."""
         return _totals()[1] - self._begin[1]
 
 
 _lock = threading.Lock()
-_sums = [0.0, 0.0, 0.0]
+_sums = [0.0, 0.0]
 
 
-def _totals() -> tuple[float, float, float]:
-    """Return (programs, seconds, programs read back) since this module was loaded."""
+def _totals() -> tuple[float, float]:
+    """Return (programs, seconds) since this module was loaded."""
     with _lock:
-        programs, seconds, read_back = _sums
-    return programs, seconds, read_back
+        programs, seconds = _sums
+    return programs, seconds
 
 
 def _on_duration(event: str, duration_secs: float, **_) -> None:
@@ -118,11 +112,4 @@ def _on_duration(event: str, duration_secs: float, **_) -> None:
             _sums[1] += duration_secs
 
 
-def _on_event(event: str, **_) -> None:
-    if event == _READ_BACK:
-        with _lock:
-            _sums[2] += 1
-
-
 monitoring.register_event_duration_secs_listener(_on_duration)
-monitoring.register_event_listener(_on_event)

@@ -17,7 +17,10 @@ _SAID = ("RESOURCE_EXHAUSTED", "Out of memory", "out of memory")
 
 def memory() -> tuple[int | None, int | None]:
     """Return (total, available) bytes of memory, each None where unknown."""
-    total, available = _system_memory()
+    found = _numbers(MEMINFO)
+    total, available = found.get("MemTotal"), found.get("MemAvailable")
+    if total is None:
+        total, available = _pages("SC_PHYS_PAGES"), _pages("SC_AVPHYS_PAGES")
     limit, used = text_of(CGROUP / "memory.max"), text_of(CGROUP / "memory.current")
     if limit.isdigit() and (total is None or int(limit) < total):
         total = int(limit)
@@ -75,13 +78,6 @@ def _numbers(path: Path) -> dict[str, int]:
     """Return bytes by name of lines such as "MemTotal: 8000000 kB"."""
     rows = (line.split() for line in text_of(path).splitlines())
     return {row[0].rstrip(":"): int(row[1]) * 1024 for row in rows if len(row) == 3}
-
-
-def _system_memory() -> tuple[int | None, int | None]:
-    found = _numbers(MEMINFO)
-    if "MemTotal" in found:
-        return found["MemTotal"], found.get("MemAvailable")
-    return _pages("SC_PHYS_PAGES"), _pages("SC_AVPHYS_PAGES")
 
 
 def _pages(name: str) -> int | None:

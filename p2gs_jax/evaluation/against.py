@@ -55,8 +55,13 @@ def check_renders(found: OtherRenders, scene: Scene, store: ImageStore) -> Other
     where = where[:MOST_LOOKED_AT]
 
     def distance(order: tuple[int, ...]) -> float:
-        as_views = in_order(found, order)
-        return sum(_distance(as_views, order[k], store) for k in where)
+        """Return the summed mean squared distances of renders from photographs."""
+        as_views, total = in_order(found, order), 0.0
+        for row in (order[k] for k in where):
+            photograph, mask = store.get(row)
+            pixels = as_views.read(row, _size(store, row)).pixels
+            total += float(np.mean(mask[..., None] * (pixels - photograph) ** 2))
+        return total
 
     sizes = {_size(store, row) for row in found.files}
     return in_order(found, min(possible, key=distance)) if len(sizes) == 1 else found
@@ -65,13 +70,6 @@ def check_renders(found: OtherRenders, scene: Scene, store: ImageStore) -> Other
 def _size(store: ImageStore, row: int) -> tuple[int, int]:
     width, height = store.camera(row)[2:]
     return width, height
-
-
-def _distance(found: OtherRenders, row: int, store: ImageStore) -> float:
-    """Return the mean squared distance of a render from a photograph."""
-    photograph, mask = store.get(row)
-    pixels = found.read(row, _size(store, row)).pixels
-    return float(np.mean(mask[..., None] * (pixels - photograph) ** 2))
 
 
 def judge_renders(

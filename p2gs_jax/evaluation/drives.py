@@ -17,7 +17,8 @@ from jaxtyping import Bool, Float, Float32
 
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.evaluation.passes import ArrayStore
-from p2gs_jax.evaluation.unexplained import Residuals, Surface, Unexplained, shares_by_view
+from p2gs_jax.evaluation.scores import ViewResult
+from p2gs_jax.evaluation.unexplained import Residuals, Surface, Unexplained
 from p2gs_jax.render.warp import OPAQUE, project_points
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.rigid import interpolated, inverse, left_of_way
@@ -59,23 +60,13 @@ class DriveScores:
         self._depths: dict[int, DepthErrors] = {}
         self.unexplained: dict[int, Unexplained] = {}
 
-    def add(
-        self,
-        index: int,
-        ldr: Float32[np.ndarray, "h w 3"],
-        photograph: Float32[np.ndarray, "h w 3"],
-        mask: Float32[np.ndarray, "h w"],
-        depth: Float32[np.ndarray, "h w"],
-        alpha: Float32[np.ndarray, "h w"],
-    ) -> None:
-        """Take a view by its row.
-
-        `ldr` is its render, under its own exposure or one fitted to the photograph; the depth is
-        alpha-weighted camera z.
-        """
+    def add(self, result: ViewResult, mask: Float32[np.ndarray, "h w"]) -> None:
+        """Take a rendered view, and which of its pixels count."""
+        index, depth, alpha = result.index, result.depth, result.alpha
         if self._scene.views[index].split == "train":
             K = self._store.camera(index)[1]
-            self._residuals.add(index, ldr, photograph, mask, _surface(depth, alpha), K)
+            surface = _surface(depth, alpha)
+            self._residuals.add(index, result.ldr, result.photograph, mask, surface, K)
         if self._scene.lidar is not None:
             given = (self._view(index), depth, alpha, mask)
             found = depth_errors(self._scene.lidar, self._scene.objects, *given)
@@ -85,9 +76,10 @@ class DriveScores:
     def summary(self) -> dict:
         """Return the parts of `metrics.json`."""
         self.unexplained = self._residuals.find()
-        shares = shares_by_view(self._scene, self.unexplained)
-        out = {"unexplained": shares, "novel_views": self._novel()}
         views = self._scene.views
+        shares = {views[row].name: one.share for row, one in self.unexplained.items()}
+        mean = float(np.mean(list(shares.values())))
+        out = {"unexplained": {"share": mean, "per_view": shares}, "novel_views": self._novel()}
         held_out = [d for row, d in self._depths.items() if views[row].split == "test"]
         depth = {"all": summary(list(self._depths.values())), "held_out": summary(held_out)}
         return out if not depth["all"] else {**out, "depth": depth}

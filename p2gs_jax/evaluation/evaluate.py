@@ -16,7 +16,7 @@ from __future__ import annotations
 import functools
 from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -34,6 +34,7 @@ from p2gs_jax.evaluation.references import Reference
 from p2gs_jax.evaluation.scores import (
     Untold,
     VideoScores,
+    ViewResult,
     is_drive,
     masks_of_parts,
     still_mask,
@@ -55,23 +56,6 @@ from p2gs_jax.photometry.models import MODELS
 from p2gs_jax.render.capacity import RenderView, make_renderer
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.types import Camera, Params, Render, Scene
-
-
-@dataclass(frozen=True)
-class ViewResult:
-    """One rendered view, by its row in `Scene.views`.
-
-    It is shown under the view's own transform; of a held-out view under the usual one with the
-    exposure fitted to its photograph.
-    """
-
-    index: int
-    linear: Float32[np.ndarray, "h w 3"]  # radiance
-    alpha: Float32[np.ndarray, "h w"]
-    depth: Float32[np.ndarray, "h w"]  # alpha-weighted
-    ldr: Float32[np.ndarray, "h w 3"]  # display values under `transform`
-    photograph: Float32[np.ndarray, "h w 3"]
-    transform: DisplayTransform
 
 
 class Evaluation(NamedTuple):
@@ -140,17 +124,12 @@ def evaluate(
 ) -> Evaluation:
     """Render and judge all views.
 
-    Args:
-        params: the fit, live Gaussians only.
-        scene: views and their splits.
-        store: photographs.
-        cfg: formation model.
-        render: from `make_renderer`, where it knows which Gaussians belong to moving objects.
-        reference: view row -> photograph under the common exposure, or None where there is none.
-        radiance: view row -> true linear radiance at the size of the photographs, or None.
-        lpips_weights: adds `lpips` wherever a view is compared with a photograph.
-        on_view: receives every rendered view.
-        on_progress: views done, views in all.
+    The parameters are those of live Gaussians; `render` is from `make_renderer`, where it knows
+    which of them belong to moving objects. By the row of a view, `reference` gives the photograph
+    under the common exposure, and `radiance` the true linear radiance at the size of the
+    photographs, each None where there is none. With weights there is `lpips` wherever a view is
+    compared with a photograph. `on_progress` receives how many views are done, and how many there
+    are.
 
     Raises:
         UserError: an image is too small for LPIPS.
@@ -270,22 +249,20 @@ class _Views:
             self._rows["all"][view.name] = found.scores_all
         again = found.radiance is not None or found.reference is not None
         linear = self._arrays.put(result.linear) if again else result.linear
-        over = judge.store.backdrop is not None
+        opacity = [] if judge.store.backdrop is None else [result.alpha]
         if found.radiance is not None:
             self._radiance.add(view.name, view.split, linear, found.radiance, found.mask)
         if found.reference is not None:
-            images = (linear, found.reference, found.mask, *([result.alpha] if over else []))
+            images = (linear, found.reference, found.mask, *opacity)
             self._references.append((result.index, tuple(map(self._arrays.put, images))))
         if view.split == "train":
             self._told.append(judge.row_of[result.index])
             self._metered.add_training(view.name, found.readings)
         else:
-            images = (linear, result.photograph, found.mask)
-            alpha = result.alpha if over else None
-            self._metered.add_held_out(result.index, found.readings, *images, alpha)
+            images = (linear, result.photograph, found.mask, *opacity)
+            self._metered.add_held_out(result.index, found.readings, *images)
         if self._drive is not None:
-            images = (result.ldr, result.photograph, found.mask)
-            self._drive.add(result.index, *images, result.depth, result.alpha)
+            self._drive.add(result, found.mask)
         exposure = result.transform.exposure
         self._videos["per_view"].add(view.camera, result.ldr, exposure)
         self._videos["averaged"].add(view.camera, found.averaged, judge.mean.exposure)
@@ -323,7 +300,7 @@ class _Views:
             metrics["reference"] = _against_reference(self._references, judge)
         return Evaluation(metrics, metering, {} if drive is None else drive.unexplained)
 
-    def _under_rule(self, index, linear, exposure, photograph, mask, alpha) -> dict[str, Any]:
+    def _under_rule(self, index, exposure, linear, photograph, mask, alpha=None) -> dict[str, Any]:
         shown = replace(self._judge.usual(index), exposure=exposure)
         return self._judge.scorer(index, photograph, mask)(develop(linear, shown, alpha=alpha))
 

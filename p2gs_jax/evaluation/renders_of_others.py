@@ -150,9 +150,8 @@ def find_renders(folder: str | Path, scene: Scene) -> OtherRenders:
         found = next(filter(None, by_name), None)
         if found is not None:
             return found
-        bare = _numbers(folder)
         numbered = _of_trainers(folder)
-        if numbered is None and bare:
+        if numbered is None and (bare := _numbers(folder)):
             numbered = ("numbered pictures", bare, False)
     if numbered is None:
         raise UserError(

@@ -19,6 +19,7 @@ from p2gs_jax.config import LossConfig
 from p2gs_jax.evaluation.lpips import LpipsWeights, lpips
 from p2gs_jax.evaluation.ssim import ssim as _ssim
 from p2gs_jax.evaluation.ssim import ssim_map
+from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.photometry.formation import eotf
 from p2gs_jax.scene.drives.objects import object_mask
 from p2gs_jax.types import LUMINANCE, Scene
@@ -33,6 +34,23 @@ _NAMED = 8
 Masks = Mapping[str, Float32[np.ndarray, "h w"]]
 
 ssim = jax.jit(_ssim)
+
+
+@dataclass(frozen=True)
+class ViewResult:
+    """One rendered view, by its row in `Scene.views`.
+
+    It is shown under the view's own transform; of a held-out view under the usual one with the
+    exposure fitted to its photograph.
+    """
+
+    index: int
+    linear: Float32[np.ndarray, "h w 3"]  # radiance
+    alpha: Float32[np.ndarray, "h w"]
+    depth: Float32[np.ndarray, "h w"]  # alpha-weighted
+    ldr: Float32[np.ndarray, "h w 3"]  # display values under `transform`
+    photograph: Float32[np.ndarray, "h w 3"]
+    transform: DisplayTransform
 
 
 @jax.jit

@@ -31,7 +31,6 @@ from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import inverse_formation, inverse_tone_map, places
 from p2gs_jax.render.warp import project_points, sample_bilinear, surface_depth, unproject, warp
-from p2gs_jax.render.warp import project_points as project
 from p2gs_jax.scene.rigid import moment_of
 from p2gs_jax.scene.visibility import unoccluded
 from p2gs_jax.types import Camera, Render, Scene
@@ -211,7 +210,7 @@ def seam_picture(
     points = unproject(jnp.asarray(np.where(known, depth, far)), camera)
     reached, before, after = [], [], []
     for photograph in (first, second):
-        xy, z = project(points, photograph.camera)
+        xy, z = project_points(points, photograph.camera)
         size = jnp.array([photograph.camera.width, photograph.camera.height])
         inside = np.asarray((z > 1e-6) & jnp.all((xy >= 0) & (xy < size), axis=-1))
         ldr = np.asarray(sample_bilinear(jnp.asarray(photograph.ldr), xy))

@@ -10,7 +10,7 @@ times, and against the usual one where no other photograph shows it.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -22,7 +22,7 @@ from p2gs_jax.core.numerics import on_host
 from p2gs_jax.evaluation.passes import ArrayStore, StoredArray
 from p2gs_jax.render.warp import warp
 from p2gs_jax.scene.lens import scale_intrinsics
-from p2gs_jax.types import Camera, Scene, View
+from p2gs_jax.types import Camera, View
 
 # Photographs are compared at this width; lengths below are in its pixels.
 WIDTH = 480
@@ -116,12 +116,6 @@ def regions(
 def _morphology(mask: Bool[np.ndarray, "h w"], kind: int, side: int) -> Bool[np.ndarray, "h w"]:
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
     return cv2.morphologyEx(mask.astype(np.uint8), kind, disc) > 0
-
-
-def shares_by_view(scene: Scene, found: Mapping[int, Unexplained]) -> dict:
-    """Return the mean share of pixels (`share`), and that of each view by name (`per_view`)."""
-    shares = {scene.views[row].name: one.share for row, one in found.items()}
-    return {"share": float(np.mean(list(shares.values()))), "per_view": shares}
 
 
 class Residuals:

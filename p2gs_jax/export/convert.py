@@ -6,6 +6,7 @@ that baking leaves is measured and written beside them.
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path, PurePosixPath
@@ -16,31 +17,16 @@ from p2gs_jax.core.atomic import atomic_folder, write_json
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.errors import UserError
-from p2gs_jax.export.folders import write_colmap_folder, write_nerfstudio_folder
+from p2gs_jax.export.folders import Program, write_folder
 from p2gs_jax.export.page import MEGABYTE, write_page
 from p2gs_jax.export.sidecar import corrections_name, linear_sidecar
+from p2gs_jax.formats import gsply_files as gsply
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.gltf import write_gltf
-from p2gs_jax.formats.gsply_files import (
-    read_compressed_ply,
-    read_spz,
-    require_gsply,
-    write_compressed_ply,
-    write_spz,
-)
 from p2gs_jax.formats.ply import write_ply, write_radiance
 from p2gs_jax.formats.splat import read_splat, write_splat
 from p2gs_jax.formats.usd import NamedCamera, require_pxr, write_usd
-from p2gs_jax.gaussians.bake import (
-    Target,
-    bake,
-    baking_error,
-    display_comments,
-    display_of_splats,
-    error_summary,
-    refine,
-    true_target,
-)
+from p2gs_jax.gaussians import bake as baking
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.render.harmonics import MAX_DEGREE
@@ -74,8 +60,8 @@ MEASURED = 60
 # written; and degree of the harmonics that the format holds.
 WRITERS: dict[str, tuple[Callable, Callable | None, int]] = {
     "splat": (write_splat, read_splat, 0),
-    "spz": (write_spz, read_spz, MAX_DEGREE),
-    "compressed-ply": (write_compressed_ply, read_compressed_ply, MAX_DEGREE),
+    "spz": (gsply.write_spz, gsply.read_spz, MAX_DEGREE),
+    "compressed-ply": (gsply.write_compressed_ply, gsply.read_compressed_ply, MAX_DEGREE),
     "gltf": (write_gltf, None, MAX_DEGREE),
     "display-ply": (write_ply, None, MAX_DEGREE),
     "usd": (write_usd, None, MAX_DEGREE),
@@ -85,7 +71,7 @@ WRITERS: dict[str, tuple[Callable, Callable | None, int]] = {
 def require_packages(formats: Sequence[str]) -> None:
     """Raise a UserError where a format needs a package that is not installed."""
     if {"spz", "compressed-ply"} & set(formats):
-        require_gsply()
+        gsply.require_gsply()
     if "usd" in formats:
         require_pxr()
 
@@ -104,26 +90,17 @@ def convert(
 ) -> Iterator[tuple[Path, str, float]]:
     """Write a run in every format; yield each place, a sentence about it, and seconds.
 
-    Args:
-        fitted: the run.
-        formats: names, as in PLACES.
-        folder: to write into.
-        transform: from radiance to the display colours of formats that hold these.
-        bake_steps: of their refinement; None: enough.
-        page_mb: largest size of the page, millions of bytes.
-        page_photographs: how many photographs the page embeds.
-        overwrite: replace what exists.
-        reporter: receives progress.
-
-    Raises:
-        UserError: something is in the way, or a photograph is missing that a format needs.
+    `transform` leads from radiance to the display colours of formats that hold these, which
+    `bake_steps` steps refine (None: enough). The page has at most `page_mb` million bytes. A
+    UserError says that something is in the way, or that a photograph is missing that a format
+    needs.
     """
     _check_places(folder, [folder / place for name in formats for place in PLACES[name]], overwrite)
     if {"colmap", "nerfstudio", "exr"} & set(formats):
         _check_names(fitted)
     if {"colmap", "nerfstudio"} & set(formats):
         fitted.require_photographs()
-    transform, display = display_of_splats(transform), None
+    transform, display = transform.without_place(), None
     for name in formats:
         begin, place = time.monotonic(), folder / PLACES[name][0]
         if name == "linear-ply":
@@ -133,13 +110,9 @@ def convert(
         elif name == "exr":
             text = _exr(place, fitted, reporter)
         elif name == "html":
+            shown, count = fitted.over_black(), page_photographs
             page = write_page(
-                place,
-                fitted.over_black(),
-                transform,
-                size_mb=page_mb,
-                photographs=page_photographs,
-                say=reporter.stage,
+                place, shown, transform, size_mb=page_mb, photographs=count, say=reporter.stage
             )
             text = " ".join([f"{page.size / MEGABYTE:.1f} MB.", *page.sentences])
         else:
@@ -184,15 +157,10 @@ def _linear_ply(ply: Path, fitted: Run) -> str:
     return f"{count} Gaussians of linear radiance; {sidecar.name} says how to read them"
 
 
-def _other_trainer(name: str, place: Path, fitted: Run, reporter: Reporter) -> str:
-    write = write_colmap_folder if name == "colmap" else write_nerfstudio_folder
-    write(
-        place,
-        fitted.scene,
-        fitted.store,
-        fitted.photometry["views"],
-        on_view=lambda done, count: reporter.stage("Writing photographs", done, count),
-    )
+def _other_trainer(name: Program, place: Path, fitted: Run, reporter: Reporter) -> str:
+    on_view = functools.partial(reporter.stage, "Writing photographs")
+    photometry = fitted.photometry["views"]
+    write_folder(name, place, fitted.scene, fitted.store, photometry, on_view=on_view)
     views = f"{len(fitted.scene.views)} views"
     if name == "colmap":
         return f"{views}, {len(fitted.scene.points)} points, exposures.csv"
@@ -204,16 +172,10 @@ def _exr(place: Path, fitted: Run, reporter: Reporter) -> str:
     with atomic_folder(place) as temporary:
         for index, view in enumerate(views):
             camera = camera_of(fitted.store, index)
-            result = fitted.render(camera)
-            write_exr(
-                (temporary / view.name).with_suffix(".exr"),
-                np.asarray(result.linear),
-                depth=np.asarray(result.depth),
-                alpha=np.asarray(result.alpha),
-                taken=fitted.own_display(index),
-                camera=camera,
-                shot=read_exif_settings(view.image_path),
-            )
+            result, path = fitted.render(camera), (temporary / view.name).with_suffix(".exr")
+            linear, depth, alpha = map(np.asarray, (result.linear, result.depth, result.alpha))
+            taken, shot = fitted.own_display(index), read_exif_settings(view.image_path)
+            write_exr(path, linear, depth=depth, alpha=alpha, taken=taken, camera=camera, shot=shot)
             reporter.stage("Rendering", index + 1, len(views))
     return f"{len(views)} linear renders"
 
@@ -222,30 +184,22 @@ class DisplayFiles:
     """Display colours under one display transform, baked once per degree, with their error."""
 
     def __init__(
-        self,
-        fitted: Run,
-        transform: DisplayTransform,
-        steps: int | None,
-        reporter: Reporter,
+        self, fitted: Run, transform: DisplayTransform, steps: int | None, reporter: Reporter
     ):
         """Render the true pictures that `steps` (None: enough) of refinement aim at."""
         self.fitted, self.transform, self.reporter = fitted, transform, reporter
         self.errors: dict[int, dict] = {}
-        self.gaussians, scene = at_time(fitted.as_of(), None), fitted.scene
+        g, scene = at_time(fitted.as_of(), None), fitted.scene
+        self.gaussians = g
         self.steps = max(STEPS, len(scene.train_indices)) if steps is None else steps
         self.baked: dict[int, Gaussians] = {}
         render = make_renderer(fitted.cfg.render)
-        self.targets: dict[int, Target] = {}
+        self.targets: dict[int, baking.Target] = {}
         wanted = scene.train_indices if self.steps else _spread(scene.train_indices)
         rows = [*wanted, *_spread(scene.test_indices)]
         for done, index in enumerate(rows):
-            self.targets[index] = true_target(
-                scene.views[index].name,
-                self.gaussians,
-                camera_of(fitted.store, index),
-                transform,
-                render,
-            )
+            name, camera = scene.views[index].name, camera_of(fitted.store, index)
+            self.targets[index] = baking.true_target(name, g, camera, transform, render)
             reporter.stage("Rendering true pictures", done + 1, len(rows))
 
     def write(self, name: str, path: Path, sidecar: Path) -> str:
@@ -253,12 +207,15 @@ class DisplayFiles:
         begin = time.monotonic()
         write, read, degree = WRITERS[name]
         shown, more = self._bake(degree), ()
-        error = self._error_of_baked(degree) if read is None else {}
+        if read is None and degree not in self.errors:
+            self.errors[degree] = self._error(shown)
+        error = self.errors[degree] if read is None else {}
         if name == "display-ply":
             notes = [f"p2gs-jax: {sentence}" for sentence in _sentences(error)]
-            more = ([*display_comments(self.transform), *notes],)
+            more = ([*baking.display_comments(self.transform), *notes],)
         elif name == "usd":
-            more = (named_cameras(self.fitted),)
+            views, camera = self.fitted.scene.views, self.fitted.store.camera
+            more = ([NamedCamera(v.name, *camera(index)) for index, v in enumerate(views)],)
         write(path, shown, *more)
         if read is not None:
             error = self._error(read(path))
@@ -284,41 +241,22 @@ class DisplayFiles:
         cfg, g = self.fitted.cfg, self.gaussians
         if degree not in self.baked:
             self.reporter.stage("Baking")
-            start = bake(g, self.transform, cfg.render.radiance, degree)
+            start = baking.bake(g, self.transform, cfg.render.radiance, degree)
             train = self.fitted.scene.train_indices
-            self.baked[degree] = refine(
-                start,
-                [self.targets[i] for i in train if i in self.targets],
-                cfg.render,
-                steps=self.steps,
-                seed=cfg.train.seed,
-                on_step=lambda done, steps: self.reporter.stage("Baking", done, steps),
-            )
+            aims = [self.targets[i] for i in train if i in self.targets]
+            order = {"steps": self.steps, "seed": cfg.train.seed}
+            on_step = functools.partial(self.reporter.stage, "Baking")
+            self.baked[degree] = baking.refine(start, aims, cfg.render, **order, on_step=on_step)
         return self.baked[degree]
-
-    def _error_of_baked(self, degree: int) -> dict:
-        """Return the error of a file that holds the baked colours as they are."""
-        if degree not in self.errors:
-            self.errors[degree] = self._error(self._bake(degree))
-        return self.errors[degree]
 
     def _error(self, shown: Gaussians) -> dict:
         """Return the baking error by split."""
         self.reporter.stage("Measuring")
         scene, render = self.fitted.scene, self.fitted.cfg.render
         splits = {"train": scene.train_indices, "test": scene.test_indices}
-        return {
-            split: error_summary(
-                baking_error(shown, [self.targets[i] for i in _spread(rows)], render)
-            )
-            for split, rows in splits.items()
-        }
-
-
-def named_cameras(fitted: Run) -> list[NamedCamera]:
-    """Return the cameras of all photographs at the size of the fit."""
-    views = enumerate(fitted.scene.views)
-    return [NamedCamera(view.name, *fitted.store.camera(index)) for index, view in views]
+        aims = {split: [self.targets[i] for i in _spread(rows)] for split, rows in splits.items()}
+        errors = {split: baking.baking_error(shown, aim, render) for split, aim in aims.items()}
+        return {split: baking.error_summary(found) for split, found in errors.items()}
 
 
 def _spread(rows: Sequence[int]) -> list[int]:
@@ -328,14 +266,11 @@ def _spread(rows: Sequence[int]) -> list[int]:
 
 def _sentences(error: dict) -> list[str]:
     """Return sentences on the baking error."""
-    said = []
-    for split, name in (("train", "training"), ("test", "held-out")):
-        s = error[split]
-        if s is not None:
-            said.append(
-                f"baking error over {s['views']} {name} views: median {s['psnr_median']:.2f} dB, "
-                f"worst {s['psnr_worst']:.2f} dB ({s['worst_view']}), mean {s['mean_codes']:.2f} "
-                f"and largest {s['max_codes']:.0f} 8-bit levels; median "
-                f"{s['psnr_on_white_median']:.2f} dB over white"
-            )
-    return said
+    return [
+        f"baking error over {s['views']} {name} views: median {s['psnr_median']:.2f} dB, "
+        f"worst {s['psnr_worst']:.2f} dB ({s['worst_view']}), mean {s['mean_codes']:.2f} "
+        f"and largest {s['max_codes']:.0f} 8-bit levels; median "
+        f"{s['psnr_on_white_median']:.2f} dB over white"
+        for name, s in (("training", error["train"]), ("held-out", error["test"]))
+        if s is not None
+    ]

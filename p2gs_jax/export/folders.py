@@ -12,7 +12,7 @@ import io
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pycolmap
@@ -30,25 +30,26 @@ JPEG_QUALITY = 98
 # nerfstudio's file of points, and the colour of points without one.
 CLOUD, GREY = "sparse_pc.ply", 128
 RGB = ("red", "green", "blue")
-OnView = Callable[[int, int], None]
+Program = Literal["colmap", "nerfstudio"]
 
 
-def write_colmap_folder(
+def write_folder(
+    program: Program,
     folder: Path,
     scene: Scene,
     store: ImageStore,
     photometry: Sequence[ViewPhotometry],
     *,
-    on_view: OnView = lambda done, count: None,
+    on_view: Callable[[int, int], None] = lambda done, count: None,
 ) -> None:
-    """Write `sparse/0`, `images`, `exposures.csv`, and `masks` where a view has any.
+    """Write `images`, `exposures.csv`, `masks` where a view has any, and the scene for a program.
 
+    COLMAP reads `sparse/0`; nerfstudio's `splatfacto` reads `transforms.json` and `sparse_pc.ply`.
     The folder is replaced once the new one is whole. The store has cameras at the size of the fit;
     `on_view` receives how many photographs are written, and of how many. A UserError says that a
     photograph cannot be read, or not be written under its name.
     """
     with atomic_folder(folder) as temporary:
-        _write_model(temporary / "sparse" / "0", scene, store)
         write_text(temporary / "exposures.csv", exposure_table(photometry))
         masks: dict[str, Bool[np.ndarray, "h w"]] = {}
         for index, view in enumerate(scene.views):
@@ -56,45 +57,40 @@ def write_colmap_folder(
             _write_photograph(temporary / "images" / view.name, view, ldr)
             masks[view.name] = mask > 0
             on_view(index + 1, len(scene.views))
-        if not all(mask.all() for mask in masks.values()):
-            for name, mask in masks.items():
-                # COLMAP's name of a mask: the photograph's, suffix included, and .png.
-                _write_mask(temporary / "masks" / f"{name}.png", mask)
+        masked = {name for name, mask in masks.items() if not mask.all()}
+        if program == "nerfstudio":
+            _write_points(temporary / CLOUD, scene)
+            write_json(temporary / "transforms.json", _transforms(scene, store, masked))
+        else:
+            _write_model(temporary / "sparse" / "0", scene, store)
+            masked = set(masks) if masked else masked
+        for name in masked:
+            path = temporary / _place_of_mask(name)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            # 255 where the photograph is to be used.
+            Image.fromarray(255 * masks[name].astype(np.uint8)).save(path)
 
 
-def write_nerfstudio_folder(
-    folder: Path,
-    scene: Scene,
-    store: ImageStore,
-    photometry: Sequence[ViewPhotometry],
-    *,
-    on_view: OnView = lambda done, count: None,
-) -> None:
-    """Write transforms.json, images, masks, sparse_pc.ply and exposures.csv, for `splatfacto`.
+def _place_of_mask(name: str) -> str:
+    """Return COLMAP's name of a mask: the photograph's, suffix included, and .png."""
+    return (Path("masks") / f"{name}.png").as_posix()
 
-    Arguments and errors are those of `write_colmap_folder`.
-    """
-    with atomic_folder(folder) as temporary:
-        write_text(temporary / "exposures.csv", exposure_table(photometry))
-        _write_points(temporary / CLOUD, scene)
-        frames = []
-        names: dict[str, list[str]] = {"train": [], "test": []}
-        for index, view in enumerate(scene.views):
-            ldr, mask = store.get(index)
-            place = Path("images") / view.name
-            _write_photograph(temporary / place, view, ldr)
-            names[view.split].append(place.as_posix())
-            frames.append(_frame(store, index) | {"file_path": place.as_posix()})
-            if not (mask > 0).all():
-                there = Path("masks") / f"{view.name}.png"
-                _write_mask(temporary / there, mask > 0)
-                frames[-1]["mask_path"] = there.as_posix()
-            on_view(index + 1, len(scene.views))
-        content: dict[str, Any] = {"camera_model": "PINHOLE", "ply_file_path": CLOUD}
-        if names["test"]:
-            content["train_filenames"] = names["train"]
-            content["val_filenames"] = content["test_filenames"] = names["test"]
-        write_json(temporary / "transforms.json", {**content, "frames": frames})
+
+def _transforms(scene: Scene, store: ImageStore, masked: set[str]) -> dict[str, Any]:
+    """Return the content of `transforms.json`; some views have masks, by name."""
+    frames = []
+    names: dict[str, list[str]] = {"train": [], "test": []}
+    for index, view in enumerate(scene.views):
+        place = (Path("images") / view.name).as_posix()
+        names[view.split].append(place)
+        frames.append(_frame(store, index) | {"file_path": place})
+        if view.name in masked:
+            frames[-1]["mask_path"] = _place_of_mask(view.name)
+    content: dict[str, Any] = {"camera_model": "PINHOLE", "ply_file_path": CLOUD}
+    if names["test"]:
+        content["train_filenames"] = names["train"]
+        content["val_filenames"] = content["test_filenames"] = names["test"]
+    return {**content, "frames": frames}
 
 
 def exposure_table(photometry: Sequence[ViewPhotometry]) -> str:
@@ -128,9 +124,8 @@ def _write_model(folder: Path, scene: Scene, store: ImageStore) -> None:
         viewmat, K, width, height = store.camera(index)
         params = [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])]
         size = {"width": width, "height": height}
-        camera_id = camera_ids.setdefault(
-            (view.camera, width, height, *params), len(camera_ids) + 1
-        )
+        key = (view.camera, width, height, *params)
+        camera_id = camera_ids.setdefault(key, len(camera_ids) + 1)
         if camera_id not in model.cameras:
             camera = pycolmap.Camera(model="PINHOLE", params=params, camera_id=camera_id, **size)
             model.add_camera_with_trivial_rig(camera)
@@ -159,12 +154,6 @@ def _write_model(folder: Path, scene: Scene, store: ImageStore) -> None:
     model.write_binary(str(folder))
 
 
-def _write_mask(path: Path, mask: Bool[np.ndarray, "h w"]) -> None:
-    """Write a mask, 255 where it is to be used; its folder is created."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(255 * mask.astype(np.uint8)).save(path)
-
-
 def _write_photograph(path: Path, view: View, ldr: Float[np.ndarray, "h w 3"]) -> None:
     """Copy a photograph that is used as it is; encode a changed one again, EXIF included.
 
@@ -177,9 +166,8 @@ def _write_photograph(path: Path, view: View, ldr: Float[np.ndarray, "h w 3"]) -
         return
     picture = Image.fromarray(np.rint(255 * ldr).astype(np.uint8))
     with Image.open(view.image_path) as original:
-        kept: dict[str, Any] = {
-            k: original.info[k] for k in ("exif", "icc_profile") if original.info.get(k)
-        }
+        info = original.info
+        kept: dict[str, Any] = {k: info[k] for k in ("exif", "icc_profile") if info.get(k)}
     if path.suffix.lower() in (".jpg", ".jpeg"):
         kept |= {"quality": JPEG_QUALITY, "subsampling": 0}
     try:

@@ -8,6 +8,7 @@ page names its hash.
 from __future__ import annotations
 
 import base64
+import functools
 import hashlib
 import html
 import json
@@ -22,8 +23,8 @@ from p2gs_jax.core.atomic import plain, write_text
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.page_scene import embedded_photographs, page_scene, rounded, uncorrected
-from p2gs_jax.export.page_splats import PageSplats, fit_into, page_error, true_picture
-from p2gs_jax.photometry.display import DisplayTransform
+from p2gs_jax.export.page_splats import PageSplats, TruePicture, fit_into, linear_light, page_error
+from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.read import Run
 
@@ -65,36 +66,22 @@ def write_page(
     gaussians, scene = fitted.as_of(), fitted.scene
     render = make_renderer(fitted.cfg.render)
     say("Rendering true pictures")
-    judged = [int(i) for i in evenly_spaced(len(scene.views), JUDGED)]
-    pictures = [
-        true_picture(
-            scene.views[i].name,
-            gaussians,
-            fitted.camera(i),
-            uncorrected(fitted.own_display(i)),
-            render,
-        )
-        for i in judged
-    ]
+    pictures = []
+    for i in map(int, evenly_spaced(len(scene.views), JUDGED)):
+        camera, taken = fitted.camera(i), uncorrected(fitted.own_display(i))
+        linear, name = linear_light(gaussians, camera, render), scene.views[i].name
+        pictures.append(TruePicture(name, camera, taken, linear, develop(linear, taken)))
     train = scene.train_indices
     weighed = [fitted.camera(train[k]) for k in evenly_spaced(len(train), WEIGHED)]
     embedded = embedded_photographs(fitted, photographs)
     known = page_scene(fitted, gaussians, uncorrected(look), embedded)
     title = f"{fitted.folder.resolve().name}: linear light"
     room = _room(int(size_mb * MEGABYTE), page_text(title, known, b""), size_mb)
-    splats = fit_into(
-        room,
-        gaussians,
-        fitted.cfg.render,
-        weighed,
-        lambda g: page_error(g, pictures, render),
-        say,
-    )
+    judge = functools.partial(page_error, pictures=pictures, render=render)
+    splats = fit_into(room, gaussians, fitted.cfg.render, weighed, judge, say)
     sentences = _sentences(splats, fitted, size_mb)
-    about = [*sentences, *_fine_print(fitted)]
-    content = page_text(
-        title, {**known, "splats": splats.packed.header, "about": about}, splats.packed.data
-    )
+    known |= {"splats": splats.packed.header, "about": [*sentences, *_fine_print(fitted)]}
+    content = page_text(title, known, splats.packed.data)
     write_text(path, content)
     return Page(len(content.encode()), splats, len(embedded), tuple(sentences))
 
@@ -157,13 +144,10 @@ def _sentences(splats: PageSplats, fitted: Run, size_mb: float) -> list[str]:
     if splats.whole:
         said.append(f"All {seen} Gaussians that can be seen, packed in few bits.")
     else:
-        what = f"{splats.dropped} of {seen} Gaussians that weigh least" if splats.dropped else ""
-        bands = (
-            f"harmonics above degree {splats.kept_degree} (of {splats.degree})"
-            if splats.kept_degree < splats.degree
-            else ""
-        )
-        left_out = " and ".join(filter(None, (what, bands)))
+        what = [f"{splats.dropped} of {seen} Gaussians that weigh least"] * bool(splats.dropped)
+        if splats.kept_degree < splats.degree:
+            what.append(f"harmonics above degree {splats.kept_degree} (of {splats.degree})")
+        left_out = " and ".join(what)
         said.append(f"Left out to stay within {size_mb:g} MB: {left_out}; {kept} Gaussians remain.")
     said.append(
         f"Against our renderer with nothing left out or rounded, {error.views} views at their own "

@@ -36,10 +36,7 @@ def uncorrected(transform: DisplayTransform) -> DisplayTransform:
 
 
 def page_scene(
-    fitted: Run,
-    gaussians: Gaussians,
-    look: DisplayTransform,
-    photographs: Mapping[int, str],
+    fitted: Run, gaussians: Gaussians, look: DisplayTransform, photographs: Mapping[int, str]
 ) -> dict[str, Any]:
     """Return what the page reads besides the Gaussians, as plain values or arrays.
 
@@ -79,9 +76,8 @@ def _webp(picture: np.ndarray) -> str:
     share = LONGEST / max(codes.shape[:2])
     if share < 1:
         codes = cv2.resize(codes, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
-    done, data = cv2.imencode(
-        ".webp", np.ascontiguousarray(codes), [cv2.IMWRITE_WEBP_QUALITY, QUALITY]
-    )
+    options = [cv2.IMWRITE_WEBP_QUALITY, QUALITY]
+    done, data = cv2.imencode(".webp", np.ascontiguousarray(codes), options)
     assert done
     return "data:image/webp;base64," + base64.b64encode(data.tobytes()).decode()
 
@@ -118,25 +114,16 @@ def _log_mean_radiance(fitted: Run, gaussians: Gaussians) -> float:
 
 def _tone(fitted: Run) -> dict[str, Any]:
     cfg = fitted.cfg.photometry
-    own = None
+    own, cameras = None, [camera.vignetting for camera in cfg.cameras]
     if cfg.curve == "spline" and (cfg.spline is not None or by_camera(cfg)):
         found = tables(cfg)
-        own = {
-            "first": found.first,
-            "step": found.step,
-            "values": found.values.astype(np.float32),
-            "channels": found.channels,
-        }
-    return {
-        "pivot": cfg.pivot,
-        "tables": own,
-        "cameras": [camera.vignetting for camera in cfg.cameras],
-    }
+        own = {name: getattr(found, name) for name in ("first", "step", "values", "channels")}
+        own["values"] = found.values.astype(np.float32)
+    return {"pivot": cfg.pivot, "tables": own, "cameras": cameras}
 
 
 def _view(fitted: Run, index: int, mean: float) -> dict[str, Any]:
-    view, taken = fitted.scene.views[index], fitted.own_display(index)
-    camera = fitted.camera(index)
+    view, taken, camera = fitted.scene.views[index], fitted.own_display(index), fitted.camera(index)
     K = np.asarray(camera.K)
     return {
         "name": view.name,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -35,9 +36,8 @@ DARKEST_LEVEL = 1.0
 LEAST_ERROR = 1e-10
 
 
-@dataclass(frozen=True)
-class TruePicture:
-    """A view as the run renders it: its display transform, radiance, and display values."""
+class TruePicture(NamedTuple):
+    """A view as the run renders it, with all of its Gaussians: radiance and display values."""
 
     name: str
     camera: Camera
@@ -65,14 +65,10 @@ class PageError:
 
 @dataclass(frozen=True)
 class PageSplats:
-    """The Gaussians of a page, with their error against the run.
+    """The packed Gaussians of a page, with their error against the run.
 
-    Attributes:
-        packed: as the page holds them.
-        error: against the run.
-        of: how many Gaussians the run has.
-        degree: of the run's harmonics.
-        unseen: Gaussians that no renderer with our rules ever draws; nothing is lost with them.
+    The run has `of` Gaussians, with harmonics of a `degree`. No renderer with our rules ever draws
+    the `unseen` ones: nothing is lost with them.
     """
 
     packed: Packed
@@ -119,20 +115,23 @@ def fit_into(
     whole = chosen(gaussians, seen)
     if whole.capacity == 0:
         raise UserError("the run has no Gaussian that can be seen.", fix="fit it for longer")
+
+    def judged(packed: Packed) -> PageSplats:
+        return PageSplats(packed, judge(unpack(packed)), gaussians.capacity, degree, unseen)
+
     say("Packing")
     packed = pack(whole)
     if len(packed.data) <= room:
-        error = judge(unpack(packed))
-        return PageSplats(packed, error, gaussians.capacity, degree, unseen)
+        return judged(packed)
     say("Weighing Gaussians")
     order = np.argsort(-weights(whole, cameras, cfg), kind="stable")
     found = []
     for kept in range(degree, -1, -1):
         say(f"Trying harmonics of degree {kept}")
-        smaller = _largest_that_fits(room, of_degree(whole, kept), order)
+        cut = replace(whole, sh=whole.sh[:, : coefficient_count(kept)])
+        smaller = _largest_that_fits(room, cut, order)
         if smaller is not None:
-            error = judge(unpack(smaller))
-            found.append(PageSplats(smaller, error, gaussians.capacity, degree, unseen))
+            found.append(judged(smaller))
     if not found:
         raise UserError(
             f"of {whole.capacity} Gaussians less than {LEAST_SHARE:.0%} would fit into the page.",
@@ -149,11 +148,6 @@ def ever_drawn(gaussians: Gaussians, cfg: RenderConfig) -> Bool[np.ndarray, " n"
     logits = np.asarray(gaussians.opacity_logits, np.float64)
     with np.errstate(invalid="ignore"):
         return finite & (-np.logaddexp(0, -logits) > np.log(smallest_cutoff(cfg)))
-
-
-def of_degree(gaussians: Gaussians, degree: int) -> Gaussians:
-    """Return Gaussians whose harmonics end at a degree."""
-    return replace(gaussians, sh=gaussians.sh[:, : coefficient_count(degree)])
 
 
 def weights(
@@ -207,25 +201,13 @@ def _largest_that_fits(room: int, gaussians: Gaussians, order: np.ndarray) -> Pa
     return None
 
 
-def true_picture(
-    name: str,
-    gaussians: Gaussians,
-    camera: Camera,
-    transform: DisplayTransform,
-    render: RenderView,
-) -> TruePicture:
-    """Render a view of the run itself, with all of its Gaussians."""
-    linear = _linear(gaussians, camera, render)
-    return TruePicture(name, camera, transform, linear, develop(linear, transform))
-
-
 def page_error(
     gaussians: Gaussians, pictures: Sequence[TruePicture], render: RenderView
 ) -> PageError:
     """Compare pictures of the page's Gaussians with the true ones, at least one."""
     psnrs, stops = [], []
     for true in pictures:
-        linear = _linear(gaussians, true.camera, render)
+        linear = linear_light(gaussians, true.camera, render)
         shown = develop(linear, true.transform)
         square = np.mean((shown - true.display) ** 2, dtype=np.float64)
         psnrs.append(float(-10 * np.log10(max(square, LEAST_ERROR))))
@@ -250,5 +232,6 @@ def _stops(linear: Float32[np.ndarray, "h w 3"], true: TruePicture) -> Float[np.
     return np.abs(np.log2(here / there))
 
 
-def _linear(g: Gaussians, camera: Camera, render: RenderView) -> Float32[np.ndarray, "h w 3"]:
+def linear_light(g: Gaussians, camera: Camera, render: RenderView) -> Float32[np.ndarray, "h w 3"]:
+    """Return the radiance that a camera sees of all Gaussians."""
     return np.asarray(render(g, on_device(np.ones(g.capacity), bool), camera).linear)

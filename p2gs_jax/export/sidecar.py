@@ -44,6 +44,17 @@ BASIS = (
     f"{C3[4]} * z * (x * x - y * y)",
     f"-{C3[0]} * x * (x * x - 3 * y * y)",
 )
+# What the columns of the PLY hold.
+FIELDS = {
+    "mean": "x, y, z: centre, scene units",
+    "opacity": "opacity: peak opacity is 1 / (1 + exp(-opacity))",
+    "scale": "scale_0..2: standard deviations along the rotated axes are exp(scale), scene units",
+    "rotation": "rot_0..3: quaternion w, x, y, z, not normalised, from the Gaussian's axes to the "
+    "world's",
+    "normals": "nx, ny, nz: 0, unused",
+    "spherical_harmonics": "coefficient 0 of channel c is f_dc_c; coefficient k > 0 is "
+    "f_rest_(c (K - 1) + k - 1); K is `coefficients`",
+}
 # Stops about 1 at which the tone curve is tabulated.
 DARKEST_EV, BRIGHTEST_EV, SAMPLES = -14.0, 4.0, 433
 
@@ -71,17 +82,7 @@ def linear_sidecar(
         "version": VERSION,
         "ply": "linear.ply",
         "gaussians": count,
-        "fields": {
-            "mean": "x, y, z: centre, scene units",
-            "opacity": "opacity: peak opacity is 1 / (1 + exp(-opacity))",
-            "scale": "scale_0..2: standard deviations along the rotated axes are exp(scale), "
-            "scene units",
-            "rotation": "rot_0..3: quaternion w, x, y, z, not normalised, from the Gaussian's "
-            "axes to the world's",
-            "normals": "nx, ny, nz: 0, unused",
-            "spherical_harmonics": "coefficient 0 of channel c is f_dc_c; coefficient k > 0 is "
-            "f_rest_(c (K - 1) + k - 1); K is `coefficients`",
-        },
+        "fields": FIELDS,
         "spherical_harmonics": {
             "degree": degree_of(coefficients),
             "coefficients": coefficients,
@@ -121,10 +122,8 @@ def linear_sidecar(
 
 
 def _tone(cfg: FitConfig, photometry: PhotometryFile) -> dict[str, Any]:
-    p = cfg.photometry
+    p, kind = cfg.photometry, cfg.photometry.appearance
     exposed = np.exp2(np.linspace(DARKEST_EV, BRIGHTEST_EV, SAMPLES)).astype(np.float32)
-    kind = p.appearance
-    limits = [EXPOSED_FLOOR, EXPOSED_CEILING if p.clamp else None]
     return {
         "formula": f"display = base(pivot * (e * W * V * L / pivot) ** ({GAMMA_SRGB} / gamma)); "
         "e * W * V * L is first clipped to exposed_limits; W is the view's white_balance by "
@@ -135,7 +134,7 @@ def _tone(cfg: FitConfig, photometry: PhotometryFile) -> dict[str, Any]:
         "model": photometry["model"],
         "curve": photometry["curve"]["name"],
         "pivot": p.pivot,
-        "exposed_limits": limits,
+        "exposed_limits": [EXPOSED_FLOOR, EXPOSED_CEILING if p.clamp else None],
         "base": {"linear": exposed, "display": _base(exposed, p, None)[:, 0]},
         "cameras": [
             {
@@ -161,24 +160,13 @@ def _base(
 def _views(
     scene: Scene, store: ImageStore, photometry: Mapping[str, ViewPhotometry]
 ) -> list[dict[str, Any]]:
-    keys = (
-        *("exposure", "exposure_ev", "exposure_ev_error", "gamma", "exposure_fitted"),
-        *("white_balance", "white_balance_ev_error"),
-    )
+    keys = ("exposure", "exposure_ev", "exposure_ev_error", "gamma", "exposure_fitted")
+    keys += ("white_balance", "white_balance_ev_error")
     out = []
     for index, view in enumerate(scene.views):
         viewmat, K, width, height = store.camera(index)
-        row = photometry.get(view.name, {})
-        out.append(
-            {
-                "image": view.name,
-                "camera": view.camera,
-                "split": view.split,
-                **{key: row.get(key) for key in keys},
-                "width": width,
-                "height": height,
-                "K": K,
-                "viewmat": viewmat,
-            }
-        )
+        taken = {key: photometry.get(view.name, {}).get(key) for key in keys}
+        camera = {"width": width, "height": height, "K": K, "viewmat": viewmat}
+        name = {"image": view.name, "camera": view.camera, "split": view.split}
+        out.append({**name, **taken, **camera})
     return out

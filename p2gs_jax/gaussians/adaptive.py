@@ -63,27 +63,19 @@ def apply(
     requests = proposal.clone | proposal.split
     slot, refused = place(requests, alive)
     split = proposal.split & (slot < alive.shape[0])
-
-    scales = jnp.exp(gaussians.log_scales)
+    scales, s = jnp.exp(gaussians.log_scales), split[:, None]
     R = rotation_matrices(gaussians.quats)
+    shrunk = gaussians.log_scales - jnp.log(SPLIT_SHRINK)
 
     def sample(k):
-        local = jax.random.normal(k, gaussians.means.shape) * scales
-        return gaussians.means + rotated(R, local)
+        drawn = gaussians.means + rotated(R, jax.random.normal(k, gaussians.means.shape) * scales)
+        return dataclasses.replace(
+            gaussians,
+            means=jnp.where(s, drawn, gaussians.means),
+            log_scales=jnp.where(s, shrunk, gaussians.log_scales),
+        )
 
-    first, second = (sample(k) for k in jax.random.split(key))
-    shrunk = gaussians.log_scales - jnp.log(SPLIT_SHRINK)
-    s = split[:, None]
-    child = dataclasses.replace(
-        gaussians,
-        means=jnp.where(s, second, gaussians.means),
-        log_scales=jnp.where(s, shrunk, gaussians.log_scales),
-    )
-    parent = dataclasses.replace(
-        gaussians,
-        means=jnp.where(s, first, gaussians.means),
-        log_scales=jnp.where(s, shrunk, gaussians.log_scales),
-    )
+    parent, child = map(sample, jax.random.split(key))
     gaussians, owner = jax.tree.map(
         lambda a, b: a.at[slot].set(b, mode="drop"),
         (parent, population.owner),

@@ -81,11 +81,6 @@ def true_target(
     return Target(name, camera, picture)
 
 
-def display_of_splats(transform: DisplayTransform) -> DisplayTransform:
-    """Return the transform without what depends on the place in the image: splats have none."""
-    return transform.without_place()
-
-
 def display_comments(transform: DisplayTransform) -> list[str]:
     """Return the header lines of a PLY with display colours."""
     said = [

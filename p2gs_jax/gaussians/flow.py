@@ -49,16 +49,14 @@ class DepthMap(NamedTuple):
     """Depth of one view: 1 / z, and which pixels passed every check.
 
     `slope` is d(1/z)/dx, d(1/z)/dy per pixel, from the plane through the window; where it is
-    `flat`, the window lies in that plane. `agreeing` [k h w] are the neighbours, in the order
-    given, whose depth agrees; `counts` are the pixels that matched at all, those each of CHECKS
-    refused, and the accepted.
+    `flat`, the window lies in that plane. `counts` are the pixels that matched at all, those each
+    of CHECKS refused, and the accepted.
     """
 
     inverse: Float32[np.ndarray, "h w"]
     valid: Bool[np.ndarray, "h w"]
     slope: Float32[np.ndarray, "h w 2"]
     flat: Bool[np.ndarray, "h w"]
-    agreeing: Bool[np.ndarray, "k h w"]
     counts: Int[np.ndarray, " c"]
 
 
@@ -230,7 +228,7 @@ def depth_map(flows: Flows, row: int, near: Sequence[int] | Int[np.ndarray, " k"
     refused += [int((matched & ~third).sum()), int((third & ~valid).sum())]
     counts = np.array([matched.size, *refused, int(valid.sum())])
     inverse = np.where(flat, smooth, fused)
-    return DepthMap(inverse, valid, slope, flat & valid, agreeing, counts)
+    return DepthMap(inverse, valid, slope, flat & valid, counts)
 
 
 def _fuse(inverse, precision):

@@ -52,13 +52,13 @@ class Nodes(NamedTuple):
 def find_nodes(scene: Scene, cfg: DynamicsConfig) -> Nodes | None:
     """Return the seeds of the objects that move in a scene; None where it has none."""
     moving = [row for row, thing in enumerate(scene.objects) if thing.moving]
-    views = scene.training_views
+    views, empty = scene.training_views, np.zeros((0, 3), np.float32)
     if cfg.method != "rigid" or not moving:
         return None
     if any(view.time is None for view in views):
         left = tuple(scene.objects[row] for row in moving)
         said = "Views have no times: where things that move were is not known; they are masked."
-        return Nodes(MovingObjects(()), *_nothing(), left, (said,))
+        return Nodes(MovingObjects(()), empty, np.zeros(0, np.int32), left, (said,))
     kept, left, points, filled = [], [], [], 0
     for row in moving:
         thing = scene.objects[row]
@@ -73,7 +73,6 @@ def find_nodes(scene: Scene, cfg: DynamicsConfig) -> Nodes | None:
         kept.append(thing)
         points.append(measured.astype(np.float32))
     owner = np.repeat(np.arange(len(kept), dtype=np.int32), [len(p) for p in points])
-    empty = np.zeros((0, 3), np.float32)
     notes = [
         f"{len(kept)} things move as pieces of their own, with {len(owner)} seeds"
         + (f"; {filled} of them have few laser points: their boxes are filled" if filled else "")
@@ -144,10 +143,6 @@ def on_surface(size: tuple[float, float, float], count: int) -> Float[np.ndarray
         flat = np.stack(np.meshgrid(*lines, indexing="ij"), -1).reshape(-1, 2)
         found.append(np.insert(flat, axis, sign * half[axis], axis=1))
     return np.concatenate(found)
-
-
-def _nothing() -> tuple[np.ndarray, np.ndarray]:
-    return np.zeros((0, 3), np.float32), np.zeros(0, np.int32)
 
 
 def _measured(

@@ -55,9 +55,16 @@ def posed(
     for row in np.unique(owner[owner >= 0]):
         mine, R = owner == row, poses[row, :3, :3]
         host.means[mine] = host.means[mine] @ R.T + poses[row, :3, 3]
-        host.quats[mine] = _turned(host.quats[mine], R)
+        turned = Rotation.from_matrix(R) * rotations(host.quats[mine])
+        host.quats[mine] = turned.as_quat(scalar_first=True)
         host.sh[mine] = np.einsum("ij,njc->nic", turning(R, host.sh.shape[1]), host.sh[mine])
     return jax.tree.map(on_device, host)
+
+
+def rotations(quats: Float[np.ndarray, "n 4"]) -> Rotation:
+    """Return rotations of w x y z quaternions of any length; one of zeros is the identity."""
+    zero = ~np.any(quats, axis=1, keepdims=True)
+    return Rotation.from_quat(np.where(zero, np.eye(1, 4), quats), scalar_first=True)
 
 
 def turning(R: Float[np.ndarray, "3 3"], count: int) -> Float[np.ndarray, "k k"]:
@@ -76,14 +83,6 @@ _basis = jax.jit(basis, static_argnums=1)
 def _table(directions: Float[np.ndarray, "d 3"], degree: int) -> Float[np.ndarray, "d k"]:
     axes = tuple(directions.astype(np.float32).T)
     return np.stack([np.asarray(column, np.float64) for column in _basis(axes, degree)], 1)
-
-
-def _turned(
-    quats: Float[np.ndarray, "n 4"], R: Float[np.ndarray, "3 3"]
-) -> Float[np.ndarray, "n 4"]:
-    zero = ~np.any(quats, axis=1, keepdims=True)
-    own = Rotation.from_quat(np.where(zero, np.eye(1, 4), quats), scalar_first=True)
-    return (Rotation.from_matrix(R) * own).as_quat(scalar_first=True).astype(np.float32)
 
 
 def half_turn(g: Gaussians) -> Gaussians:

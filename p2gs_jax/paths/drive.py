@@ -73,11 +73,10 @@ def drive(knots: Sequence[Shot], frames: int | None = None) -> list[Shot]:
         )
     path = PosePath(inverse(np.stack([s.viewmat for s in knots])))
     times = path.evenly(frame_count(len(knots), frames))
-    evs = interpolated(path.times, [s.exposure_ev for s in knots], times)
     logs = [None if s.gamma is None else float(np.log(s.gamma)) for s in knots]
-    found = interpolated(path.times, logs, times)
+    given = [s.exposure_ev for s in knots], logs, [s.time for s in knots]
+    evs, found, clock = (interpolated(path.times, values, times) for values in given)
     gammas = [None if g is None else float(np.exp(g)) for g in found]
-    clock = interpolated(path.times, [s.time for s in knots], times)
     K, width, height = common_lens(knots)
     return [
         Shot(f"{k:05d}", viewmat, K, width, height, evs[k], gammas[k], time=clock[k])

@@ -24,11 +24,8 @@ from p2gs_jax.scene.rigid import inverse
 FIELDS = ("name", "viewmat", "K", "width", "height", "exposure_ev", "gamma", "time")
 MOST_STOPS = 60.0
 # Least and largest values of what an entry may leave out.
-LIMITS = {
-    "exposure_ev": (-MOST_STOPS, MOST_STOPS),
-    "gamma": (1e-3, 1e3),
-    "time": (-math.inf, math.inf),
-}
+LIMITS = {"exposure_ev": (-MOST_STOPS, MOST_STOPS), "gamma": (1e-3, 1e3)}
+LIMITS["time"] = (-math.inf, math.inf)
 _FIX = "correct the file; docs/rendering.md has the format"
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 

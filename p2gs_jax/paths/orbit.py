@@ -26,15 +26,10 @@ HIGHEST = np.deg2rad(85)
 class Orbit:
     """A circle, or an arc that is followed back and forth.
 
-    Attributes:
-        focus: point that the camera looks at; centre of the circle seen from above.
-        up: unit vector.
-        forward: horizontal unit vector, azimuth 0 as seen from the focus.
-        radius: distance from the focus, scene units.
-        elevation: of the camera above the focus, radians.
-        middle: azimuth of the middle of the arc, radians.
-        sway: half the arc, radians; pi for a circle.
-        met: whether the optical axes meet in the focus; otherwise it lies in front of one camera.
+    The camera looks at the focus, where the optical axes `met`; else it lies in front of one
+    camera. `up` and the horizontal `forward`, azimuth 0 as seen from the focus, are unit vectors.
+    The radius is in scene units, angles in radians: elevation of the camera above the focus,
+    azimuth of the middle of the arc, and `sway`, half the arc (pi for a circle).
     """
 
     focus: Float[np.ndarray, " 3"]
@@ -147,16 +142,10 @@ def _around(focus, centers, up, *, met: bool) -> Orbit:
     arc = 2 * np.pi - gaps[widest]
     begin = azimuths[(widest + 1) % len(azimuths)]
     sway = np.pi if gaps[widest] < LARGEST_GAP else max(arc / 2, LEAST_SWAY)
-    return Orbit(
-        focus=focus,
-        up=up,
-        forward=forward,
-        radius=float(np.median(distances)),
-        elevation=float(np.clip(np.median(heights), -HIGHEST, HIGHEST)),
-        middle=float(begin + arc / 2),
-        sway=float(sway),
-        met=met,
-    )
+    radius, elevation = np.median(distances), np.clip(np.median(heights), -HIGHEST, HIGHEST)
+    numbers = radius, elevation, begin + arc / 2, sway
+    radius, elevation, middle, sway = map(float, numbers)
+    return Orbit(focus, up, forward, radius, elevation, middle, sway, met)
 
 
 def _median_depth(shot: Shot, points, centers) -> float:

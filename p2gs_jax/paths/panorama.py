@@ -89,8 +89,7 @@ def covering(shots: Iterable[Shot], viewmat: Pose) -> Cylinder:
     focal = max(float(max(s.K[0, 0], s.K[1, 1])) for s in shots)
     # A probe stands for its surroundings: leave one out at every edge.
     cut = 0 if count == around else 1
-    top = probe.top + (first + 1) / probe.focal
-    bottom = probe.top + last / probe.focal
+    top, bottom = (probe.top + row / probe.focal for row in (first + 1, last))
     left = probe.left + (start + cut) / probe.focal
     width = max(1, round((count - 2 * cut) / probe.focal * focal))
     return Cylinder(viewmat, focal, left, top, width, max(1, round((bottom - top) * focal)))

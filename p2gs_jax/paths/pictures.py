@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -48,17 +49,13 @@ class RunRenderer:
 
     def linear(self, shot: Shot) -> Layers:
         """Return linear radiance, alpha and alpha-weighted depth of a pinhole camera."""
-        begin = time.perf_counter()
-        layers = self._layers(shot)
-        self.render_seconds.append(time.perf_counter() - begin)
-        return layers
+        with _timed(self.render_seconds):
+            return self._layers(shot)
 
     def wide(self, cylinder: Cylinder, at: float | None = None) -> Wide:
         """Return a wide view of the field; what moves is where it was `at` seconds, if anywhere."""
-        begin = time.perf_counter()
-        wide = render_wide(lambda shot: self._layers(replace(shot, time=at)), cylinder)
-        self.render_seconds.append(time.perf_counter() - begin)
-        return wide
+        with _timed(self.render_seconds):
+            return render_wide(lambda shot: self._layers(replace(shot, time=at)), cylinder)
 
     def _layers(self, shot: Shot) -> Layers:
         result = self.run.render(shot.camera(), shot.time)
@@ -71,10 +68,15 @@ class RunRenderer:
         alpha: Float32[np.ndarray, "h w"],
     ):
         """Return display values, over the background if the transform has one."""
-        begin = time.perf_counter()
-        ldr = develop(linear, transform, alpha=alpha)
-        self.develop_seconds.append(time.perf_counter() - begin)
-        return ldr
+        with _timed(self.develop_seconds):
+            return develop(linear, transform, alpha=alpha)
+
+
+@contextmanager
+def _timed(seconds: list[float]) -> Iterator[None]:
+    begin = time.perf_counter()
+    yield
+    seconds.append(time.perf_counter() - begin)
 
 
 def metered_shots(
@@ -177,9 +179,8 @@ def comparison_frames(
         ]
         alike = np.where(seen, develop(same.image, transform), NOTHING)
         field = renderer.develop(wide.linear, transform, wide.alpha)
-        as_taken = np.where(seen, taken.image, NOTHING)
         panels = [
-            CaptionedImage("photographs as taken", as_taken, captions),
+            CaptionedImage("photographs as taken", np.where(seen, taken.image, NOTHING), captions),
             CaptionedImage("the same photographs, developed to one exposure", alike),
             CaptionedImage("the radiance field at that exposure", field),
         ]

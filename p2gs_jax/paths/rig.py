@@ -118,10 +118,8 @@ def _mounts(cameras: list[str], steps: list[dict[str, Shot]]) -> dict[str, Shot]
                 fix="leave out --panorama",
             )
     from_rig = _level(np.stack(list(from_anchor.values())), list(from_anchor))
-    return {
-        c: replace(lens, name=c, viewmat=from_anchor[c] @ from_rig, view=None)
-        for c, lens in lenses.items()
-    }
+    mounts = ((c, lens, from_anchor[c] @ from_rig) for c, lens in lenses.items())
+    return {c: replace(lens, name=c, viewmat=at, view=None) for c, lens, at in mounts}
 
 
 def _level(viewmats: Poses, names: Sequence[str]) -> Pose:

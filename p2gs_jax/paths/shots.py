@@ -32,12 +32,10 @@ TOLERANCE = 0.01
 class Shot:
     """A pinhole camera on a path.
 
+    The name is that of the picture's file, without suffix; it may name subfolders. The viewmat is
+    world-to-camera (OpenCV axes); K, width and height are in pixels, pixel centres at +0.5.
+
     Attributes:
-        name: of the picture's file, without suffix; may name subfolders.
-        viewmat: world-to-camera, OpenCV axes.
-        K: intrinsics in pixels, pixel centres at +0.5.
-        width: pixels.
-        height: pixels.
         exposure_ev: stops from the geometric mean of the training exposures, or None.
         gamma: > 0, or None.
         view: row in `Scene.views` of the photograph taken there, or None.
@@ -120,14 +118,9 @@ def pose_of(rotation: Float[np.ndarray, "... 3 3"], translation: Float[np.ndarra
 def make_camera(K: ArrayLike, viewmat: ArrayLike, width: int, height: int) -> Camera:
     """Return a pinhole camera to render from.
 
-    Args:
-        K: 3x3, pixels, pixel centres at +0.5, without skew.
-        viewmat: 4x4, world-to-camera, OpenCV axes, in the coordinates of the scene.
-        width: pixels.
-        height: pixels.
-
-    Raises:
-        UserError: an argument has another shape or meaning.
+    K is 3x3 without skew, in pixels as width and height, pixel centres at +0.5; the viewmat is 4x4,
+    world-to-camera, OpenCV axes, in the coordinates of the scene. A UserError says that an argument
+    has another shape or meaning.
     """
     fix = "docs/conventions.md says what K and viewmat are"
     for name, value in (("width", width), ("height", height)):

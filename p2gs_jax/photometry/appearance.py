@@ -42,8 +42,7 @@ class Formation(Protocol):
 
 # Of all training views: a row for each, or what PPISP, Luminance-GS or a formation learns.
 Corrections = Float[Array, "v ..."] | Ppisp | Luminance | Formation
-# Of one view.
-Correction = Float[Array, "..."] | OneView | Curves | Formation
+Correction = Float[Array, "..."] | OneView | Curves | Formation  # of one view
 
 # Luminance levels, rows and columns of a bilateral grid, as its authors use.
 GRID = (8, 16, 16)

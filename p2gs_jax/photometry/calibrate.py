@@ -25,15 +25,7 @@ from p2gs_jax.photometry.adjustment.fit import fit_model
 from p2gs_jax.photometry.adjustment.problem import KnownExposures, Problem, make_problem
 from p2gs_jax.photometry.adjustment.solve import EXPOSURES, MOST_ROUNDS, fit_response
 from p2gs_jax.photometry.candidates import Candidate, Comparison, choose
-from p2gs_jax.photometry.models import (
-    MODELS,
-    Choice,
-    Curve,
-    Form,
-    Scope,
-    neighbours,
-    parameter_count,
-)
+from p2gs_jax.photometry.models import MODELS, Choice, Curve, Form, Scope, neighbours
 from p2gs_jax.photometry.observations import COARSEST, Observations
 from p2gs_jax.photometry.response import BASES, Response
 from p2gs_jax.photometry.solution import PhotometricSolution
@@ -43,14 +35,11 @@ from p2gs_jax.types import Scene
 # Points of a view that a given kind of curve is fitted to.
 RESPONSE_PER_VIEW = 200
 HELD_OUT = 0.2
-# A response needs this spread of exposures, stops.
-SPLINE_SPREAD_EV = 0.2
+SPLINE_SPREAD_EV = 0.2  # a response needs this spread of exposures, stops
 # Candidates are compared on at most this many observations; the chosen one is solved on all.
 MOST_OBSERVATIONS = 40_000
-# A curve has few parameters; its basis is the most expensive one.
-SPLINE_OBSERVATIONS = 12_000
-# Choices that are compared at most.
-MOST_COMPARED = 80
+SPLINE_OBSERVATIONS = 12_000  # a curve has few parameters; its basis is the most expensive one
+MOST_COMPARED = 80  # choices that are compared at most
 
 OnChosen = Callable[[Form, Response], None]
 
@@ -244,16 +233,9 @@ class _Search:
         form = choice.form._replace(model="view_exposure")
         key = form, curve
         if key not in self._fitted:
-            base, by = Response(curve.base), curve.splines
-            self._fitted[key] = fit_response(
-                self._training, base, form=form, by=by, spread=self.spread
-            )
+            how = {"form": form, "by": curve.splines, "spread": self.spread}
+            self._fitted[key] = fit_response(self._training, Response(curve.base), **how)
         return self._fitted[key]
-
-    def parameters(self, choice: Choice) -> int:
-        """Return the number of free parameters of a choice."""
-        views = self.comparison.problem.observations.view_count
-        return parameter_count(choice.form, choice.curve.splines, self.scope.cameras, views)
 
     def solve(self, choices: Iterable[Choice]) -> bool:
         """Solve choices that are possible and not solved yet; return whether there were any."""
@@ -294,11 +276,8 @@ class _Search:
             chosen = choose(candidates)
             best = max(candidates, key=lambda c: c.density)
             near = neighbours(chosen.choice, self.scope)
-            near += [
-                choice
-                for choice in neighbours(best.choice, self.scope)
-                if self.parameters(choice) < best.parameters
-            ]
+            others = neighbours(best.choice, self.scope)
+            near += [c for c in others if self.comparison.parameters(c) < best.parameters]
             if len(candidates) > MOST_COMPARED or not self.solve(near):
                 return chosen
 

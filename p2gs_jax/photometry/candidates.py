@@ -117,11 +117,15 @@ class Comparison:
         best = self._predicted[max(density, key=lambda k: density[k])]
         return [self._candidate(k, density[k], p, best) for k, p in self._predicted.items()]
 
+    def parameters(self, choice: Choice) -> int:
+        """Return the number of free parameters of a choice."""
+        o = self.problem.observations
+        cameras = int(o.cameras.max(initial=0)) + 1
+        return parameter_count(choice.form, choice.curve.splines, cameras, o.view_count)
+
     def _candidate(
         self, choice: Choice, density: float, found: Predicted, best: Predicted
     ) -> Candidate:
-        o = self.problem.observations
-        cameras = int(o.cameras.max(initial=0)) + 1
         # Neighbours in an image err alike, as do its pixels.
         lower = best.densities - found.densities
         (deficit, of_views), (_, of_regions) = (
@@ -130,7 +134,7 @@ class Comparison:
         return Candidate(
             choice,
             self.fits[choice][1],
-            parameter_count(choice.form, choice.curve.splines, cameras, o.view_count),
+            self.parameters(choice),
             density,
             deficit,
             max(of_views, of_regions),
@@ -153,11 +157,9 @@ def _predict(
     def normal(v):
         return -0.5 * residual**2 / v - 0.5 * np.log(2 * np.pi * v)
 
-    mixture = np.logaddexp(
-        np.log(1 - OUTLIERS) + normal(variance),
-        np.log(OUTLIERS) + normal(variance + OUTLIER_DEVIATION**2),
-    )
-    density = mixture + np.log(np.maximum(slope, 1e-3))
+    inlier = np.log(1 - OUTLIERS) + normal(variance)
+    outlier = np.log(OUTLIERS) + normal(variance + OUTLIER_DEVIATION**2)
+    density = np.logaddexp(inlier, outlier) + np.log(np.maximum(slope, 1e-3))
     # Channels are correlated: an observation counts once, as their mean.
     count = known.sum(1)
     return Predicted(

@@ -39,25 +39,17 @@ Opacity = Float[Array, "h w"] | Float[np.ndarray, "h w"] | None
 
 @dataclass(frozen=True)
 class DisplayTransform:
-    """How radiance is shown.
+    """How radiance is shown."""
 
-    Attributes:
-        exposure: e > 0, in the run's gauge.
-        gamma: > 0.
-        formation: base curve, pivot, clamping, cameras, kind of correction.
-        correction: of display values (photometry/appearance.py), or None.
-        white_balance: log factors on red, green, blue beside the exposure; None: all 1.
-        camera: row in `formation.cameras`, whose vignetting and response it has; None: no camera's.
-        backdrop: display values that pictures are put over, after all else: of all pixels or of
-            each; None: nothing.
-    """
-
-    exposure: float
-    gamma: float
-    formation: PhotometryConfig
-    correction: Correction | None = None
+    exposure: float  # e > 0, in the run's gauge
+    gamma: float  # > 0
+    formation: PhotometryConfig  # base curve, pivot, clamping, cameras, kind of correction
+    correction: Correction | None = None  # of display values (photometry/appearance.py)
+    # Log factors on red, green, blue beside the exposure; None: all 1.
     white_balance: tuple[float, float, float] | None = None
+    # Row in `formation.cameras`, whose vignetting and response it has; None: no camera's.
     camera: int | None = None
+    # Display values that pictures are put over, after all else: of all pixels or of each.
     backdrop: tuple[float, float, float] | Float32[np.ndarray, "h w 3"] | None = None
 
     @property
@@ -127,10 +119,7 @@ class DisplayTransform:
 
 
 def develop(
-    linear: Pixels,
-    transform: DisplayTransform,
-    positions: Positions = None,
-    alpha: Opacity = None,
+    linear: Pixels, transform: DisplayTransform, positions: Positions = None, alpha: Opacity = None
 ) -> Float32[np.ndarray, "... 3"]:
     """Return display values in [0, 1] of linear radiance.
 

@@ -29,8 +29,7 @@ from p2gs_jax.types import GAMMA_SRGB, Capture
 
 EXPOSED_FLOOR, EXPOSED_CEILING = 1e-6, 10.0  # paper, Tone-mapping estimation
 SRGB_LINEAR_END, SRGB_ENCODED_END = 0.0031308, 0.04045
-# Opacities below this count as this where radiance is divided by them.
-LEAST_ALPHA = 1e-3
+LEAST_ALPHA = 1e-3  # opacities below this count as this where radiance is divided by them
 # A row of `PhotometryConfig.cameras`, one for every pixel, or None where it makes no difference.
 CameraRow = Int[Array, "..."] | int | None
 # Of loose pixels in their images, from the centre in units of half the diagonal.

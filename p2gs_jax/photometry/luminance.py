@@ -19,23 +19,19 @@ from jaxtyping import Array, Float, Int
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.core.streams import Stream, generator
 
-# Entries of a curve, as published.
-ENTRIES = 255
-# Width of the network (ours).
-HIDDEN = 32
+ENTRIES = 255  # entries of a curve, as published
+HIDDEN = 32  # width of the network (ours)
 # Steps of the cumulative histogram that the network sees, and all that it sees.
 LEVELS = 32
 STATISTICS = LEVELS + 3
-# Parameters of the axes.
-AXES = 5
+AXES = 5  # parameters of the axes
 # What a raw unit stands for, so that one learning rate serves all (the authors have rates of 1e-3
 # for the curve, 2e-4 for the axes and 1e-5 for the network).
 AXES_UNIT, BIAS_UNIT = 0.2, 0.1
 # Published: power 1 + 0.1 g, turning point 0.5 + 0.002 a, exponent 1 + 0.002 b.
 POWER_UNIT, TURN_UNIT, BEND_UNIT = 0.1, 0.002, 0.002
 DARKEST = 1e-3
-# Least rise of a curve from one entry to the next where it is inverted.
-LEAST_RISE = 1e-5
+LEAST_RISE = 1e-5  # least rise of a curve from one entry to the next where it is inverted
 
 
 class Curves(eqx.Module):

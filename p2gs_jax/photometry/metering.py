@@ -34,22 +34,19 @@ Readings = Mapping[str, float]
 # Weights of linear red, green and blue in luminance (BT.709).
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 HIGHLIGHT = 99.0
-# Standard deviation of the weights about the centre, half diagonals.
-CENTRE = 0.4
+CENTRE = 0.4  # standard deviation of the weights about the centre, half diagonals
 # Luminance this far below the mean counts as that: nothing that a picture shows is darker.
 DARKEST = 2.0**-12
 # Less opaque pixels than this share of the picture are no picture.
 LEAST_SEEN = 0.01
 MID_GREY, BELOW_WHITE = 0.18, 0.98
-# More pixels than about this many tell no more.
-PIXELS = 100_000
+PIXELS = 100_000  # more pixels than about this many tell no more
 # Views are left out in at most this many stretches: neighbours in a video know each other's answer.
 FOLDS = 12
 FEWEST_VIEWS = 6
 # A rule explains the camera if it leaves at most this share of what a constant leaves, left out.
 EXPLAINS = 0.8
-# Exposures that vary less, stops, are constant whatever predicts them.
-NEGLIGIBLE_EV = 0.05
+NEGLIGIBLE_EV = 0.05  # exposures that vary less, stops, are constant whatever predicts them
 # A rule with more free numbers must leave less than this share of what a simpler one leaves.
 WORTH_A_NUMBER = 0.85
 
@@ -235,11 +232,8 @@ def _fitted(
     read = x[:, [METERS.index(m) for m in meters]]
 
     def solve(rows) -> tuple[np.ndarray, float]:
-        if slopes is not None:
-            taken = np.asarray(slopes)
-        else:
-            middle = read[rows].mean(0)
-            taken = -np.linalg.lstsq(read[rows] - middle, y[rows] - y[rows].mean(), rcond=1e-6)[0]
+        a, b = read[rows] - read[rows].mean(0), y[rows] - y[rows].mean()
+        taken = -np.linalg.lstsq(a, b, rcond=1e-6)[0] if slopes is None else np.asarray(slopes)
         return taken, float((y[rows] + read[rows] @ taken).mean())
 
     everything = np.arange(len(y))

@@ -32,8 +32,7 @@ _BY_LEVELS = {(model.exposure, model.gamma): name for name, model in MODELS.item
 _LEVELS: tuple[Level | None, ...] = (None, "camera", "view")
 _VIGNETTING: tuple[VignettingKind | None, ...] = (None, "camera", "channel")
 
-# Powers of the radius in log V(r) = k1 r^2 + k2 r^4 + k3 r^6.
-VIGNETTING_POWERS = (2, 4, 6)
+VIGNETTING_POWERS = (2, 4, 6)  # powers of the radius in log V(r) = k1 r^2 + k2 r^4 + k3 r^6
 
 
 def polynomials(vignetting: VignettingKind | None) -> int:
@@ -151,11 +150,8 @@ def neighbours(choice: Choice, scope: Scope) -> list[Choice]:
     if gamma is not None and exposure == gamma:
         forms += [form._replace(model=_BY_LEVELS[(None, None)])]
     if form.white_balance == "view" and exposure == "view":
-        forms += [
-            Form(name, "camera", form.vignetting)
-            for name, model in MODELS.items()
-            if model.exposure == "camera"
-        ]
+        simpler: list[ModelName] = [k for k, m in MODELS.items() if m.exposure == "camera"]
+        forms += [Form(name, "camera", form.vignetting) for name in simpler]
     forms += [form._replace(white_balance=level) for level in _LEVELS]
     forms += [form._replace(vignetting=kind) for kind in _VIGNETTING]
     near = [Choice(f, curve) for f in forms] + [Choice(form, c) for c in _CURVES[curve.splines]]

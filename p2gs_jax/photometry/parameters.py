@@ -20,8 +20,7 @@ from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.render.harmonics import RadianceKind, scaled
 from p2gs_jax.types import GAMMA_SRGB, Params, Photometry, Scene, View
 
-# Exposures drawn at random are at least this.
-LEAST_EXPOSURE = 0.1
+LEAST_EXPOSURE = 0.1  # exposures drawn at random are at least this
 
 
 def initial_photometry(
@@ -100,9 +99,7 @@ def recentre(params: Params, activation: RadianceKind) -> Params:
     else:
         raw = photometry.raw_exposures / np.exp(log_scale)
     moved = dataclasses.replace(
-        photometry,
-        raw_exposures=raw,
-        raw_white_balance=None if balance is None else balance - tint,
+        photometry, raw_exposures=raw, raw_white_balance=None if balance is None else balance - tint
     )
     return dataclasses.replace(
         params,

@@ -32,8 +32,7 @@ PRECONDITIONERS = np.array(
         [[0.0128369, -0.0034654], [-0.0034654, 0.0128158]],
     ]
 )
-# Added to the intensity that is divided by, so that black stays black.
-EPSILON = 1e-5
+EPSILON = 1e-5  # added to the intensity that is divided by, so that black stays black
 # Response of a channel: toe, shoulder, gamma, centre, as the optimiser sees them.
 LEAST_TOE, LEAST_SHOULDER, LEAST_GAMMA = 0.3, 0.3, 0.1
 # Nearer to black or white than this the powers' slopes may be infinite: there they have none.
@@ -141,13 +140,8 @@ def homography_of(parameters: Float[Array, " 8"]) -> Float[Array, "3 3"]:
     targets = sources.at[:, :2].add(offsets(parameters))
     blue, red, green, neutral = targets
     # Cramer's rule; the determinant of T is a common factor.
-    k = jnp.stack(
-        [
-            neutral @ jnp.cross(red, green),
-            neutral @ jnp.cross(green, blue),
-            neutral @ jnp.cross(blue, red),
-        ]
-    )
+    pairs = ((red, green), (green, blue), (blue, red))
+    k = jnp.stack([neutral @ jnp.cross(a, b) for a, b in pairs])
     inverse = jnp.asarray(np.linalg.inv(SOURCES[:3].T), parameters.dtype)
     h = (targets[:3].T * k) @ inverse
     return h / h[2, 2]

@@ -21,27 +21,20 @@ from p2gs_jax.core.numerics import Values, namespace
 Base = Literal["srgb", "power"]
 BASES: tuple[Base, ...] = get_args(Base)
 # The spline's knots in display values; two of them are held, which fixes scale and power.
-KNOTS = np.array(
-    [
-        *(0.02, 0.05, 0.08, 0.12, 0.16, 0.21, 0.26, 0.32, 0.38, 0.44),
-        *(0.5, 0.56, 0.62, 0.68, 0.74, 0.8, 0.86, 0.9, 0.94, 0.98),
-    ]
-)
+_PERCENT = [2, 5, 8, 12, 16, 21, 26, 32, 38, 44, 50, 56, 62, 68, 74, 80, 86, 90, 94, 98]
+KNOTS = np.array(_PERCENT) / 100
 HELD = (6, 16)
 # The knots that are solved for; of several splines, the powers differ as well.
 FREE = tuple(k for k in range(len(KNOTS)) if k not in HELD)
 FREE_OF_EACH = tuple(k for k in range(len(KNOTS)) if k != HELD[0])
-# Darkest photographed value that is decoded: half a code of 8 bits.
-DARKEST = 0.5 / 255
+DARKEST = 0.5 / 255  # darkest photographed value that is decoded: half a code of 8 bits
 # Noise model: 8-bit quantisation, photon and read noise (linear units), and a floor in log units
 # for what no model explains: texture, specularity, interpolation.
 SHOT_NOISE, READ_NOISE, FLOOR = 2e-4, 1e-6, 0.03
 # A curve with a spline may be at most this much flatter than its base, so that noise stays finite.
 SMALLEST_SLOPE = 0.2
-# d log exposure / d log value of mid tones; flatter curves are a collapse.
-SMALLEST_LOG_SLOPE = 0.3
-# Entries of a table.
-TABLE = 1024
+SMALLEST_LOG_SLOPE = 0.3  # d log exposure / d log value of mid tones; flatter curves are a collapse
+TABLE = 1024  # entries of a table
 # The row of a camera that is not in `PhotometryConfig.cameras`; tables end with a row for it.
 UNKNOWN = -1
 
@@ -113,10 +106,8 @@ def base_log(y: Numbers, base: Base) -> tuple[Numbers, Numbers]:
         return 2.2 * np.log(y), 2.2 / y
     toe = y <= 0.04045
     high = (y + 0.055) / 1.055
-    return (
-        np.where(toe, np.log(y / 12.92), 2.4 * np.log(high)),
-        np.where(toe, 1 / y, 2.4 / (y + 0.055)),
-    )
+    logs = np.where(toe, np.log(y / 12.92), 2.4 * np.log(high))
+    return logs, np.where(toe, 1 / y, 2.4 / (y + 0.055))
 
 
 def log_exposed(

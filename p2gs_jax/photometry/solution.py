@@ -16,10 +16,8 @@ from p2gs_jax.photometry.models import MODELS, ModelName
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.types import GAMMA_SRGB
 
-# Views with fewer usable observations have uncertain exposures.
-MIN_OBSERVATIONS = 15
-# Gammas with a larger standard error are only roughly known.
-WEAK_GAMMA = 0.1
+MIN_OBSERVATIONS = 15  # views with fewer usable observations have uncertain exposures
+WEAK_GAMMA = 0.1  # gammas with a larger standard error are only roughly known
 # A view disagrees when its gap exceeds this, and three standard errors.
 NOTICEABLE_EV = 0.2
 STANDARD_ERRORS = 3.0
@@ -89,15 +87,6 @@ class PhotometricSolution:
         """Standard errors of the exposures in stops; inf where unknown."""
         return self.exposure_errors / LN2
 
-    def exposures_ev_at(self, level: float, pivot: float) -> PerView:
-        """Return exposures in stops as they act on a linear `level` of tone, 1 = white.
-
-        Where gammas differ between views, "the exposure" depends on where it is read: at
-        the pivot by definition, at another level it includes what gamma does there.
-        """
-        a = GAMMA_SRGB / self.gammas
-        return (self.log_exposures + np.log(level / pivot) * (1 - 1 / a)) / LN2
-
 
 class Agreement(NamedTuple):
     """Recovered exposures against stated ones (EXIF), scale aligned."""
@@ -163,11 +152,16 @@ def compare(exposures_ev: PerView, errors_ev: PerView, stated_ev: PerView) -> Ag
 def note_on_levels(
     solution: PhotometricSolution, stated_ev: PerView, agreement: Agreement, pivot: float
 ) -> list[str]:
-    """Say at which level stated exposures agree best, where gammas make them depend on it."""
+    """Say at which level stated exposures agree best, where gammas make them depend on it.
+
+    By definition exposures are read at the pivot; at another linear level of tone, 1 = white, they
+    include what gamma does there.
+    """
     if MODELS[solution.model].gamma is None or agreement.views < 3:
         return []
-    errors_ev = solution.exposure_errors_ev
-    options = {x: compare(solution.exposures_ev_at(x, pivot), errors_ev, stated_ev) for x in LEVELS}
+    errors_ev, a = solution.exposure_errors_ev, GAMMA_SRGB / solution.gammas
+    read = {x: solution.log_exposures + np.log(x / pivot) * (1 - 1 / a) for x in LEVELS}
+    options = {x: compare(logs / LN2, errors_ev, stated_ev) for x, logs in read.items()}
     level = min(options, key=lambda x: options[x].rms_ev)
     best = options[level]
     if not best.rms_ev < NOTICEABLE_RMS_SHARE * agreement.rms_ev:

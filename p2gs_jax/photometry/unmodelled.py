@@ -25,26 +25,19 @@ from p2gs_jax.photometry.solution import PhotometricSolution
 
 # Fewer observations, or fewer blocks of the image with any, tell nothing of a view.
 FEWEST, FEWEST_BLOCKS = 60, 12
-# Blocks across half the diagonal.
-BLOCKS = 5
-# Classes of equal value, of as many observations.
-CLASSES = 10
-# How far a light's flare reaches, half diagonals.
-REACH = 0.24
-# More saturated observations than this place the lights no better.
-MOST_LAMPS = 200
-# Residuals beyond this many robust standard deviations count as that.
-CLIPPED = 3.0
+BLOCKS = 5  # blocks across half the diagonal
+CLASSES = 10  # classes of equal value, of as many observations
+REACH = 0.24  # how far a light's flare reaches, half diagonals
+MOST_LAMPS = 200  # more saturated observations than this place the lights no better
+CLIPPED = 3.0  # residuals beyond this many robust standard deviations count as that
 # The darkest share of the values, where a veil shows, and values that are its sources.
 DARK, SOURCE = 0.35, 250 / 255
 # A veil that is looked for: light where all is light, 1 = white. Its size is then found.
 VEIL = 0.05
-# As many degrees of freedom make a t value normal.
-MANY = 1e6
+MANY = 1e6  # as many degrees of freedom make a t value normal
 # Smooth residuals of a stack above this many stops, at equal brightness, mean local tone mapping.
 LOCAL_EV = 0.075
-# Rows and columns of a stack's regions.
-GRID = (6, 8)
+GRID = (6, 8)  # rows and columns of a stack's regions
 
 Kind = Literal["place", "local", "flare"]
 Values = Float[np.ndarray, " n"]

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -57,8 +56,7 @@ class Calibration:
     # exposures from EXIF or a file, stops, laid over the recovered ones; NaN where unknown
     stated_ev: Float[np.ndarray, " v"]
     agreement: Agreement  # of stated and recovered exposures
-    known: str | None  # where known exposures came from, or None
-    gauge: str  # what fixes the scale where none are known, in words
+    gauge: str  # what fixes the scale, in words
     pivot: float  # linear value that gammas leave alone
     messages: tuple[str, ...]  # what the user should know, in plain words
     details: dict[str, Any]  # the content of `calibration.json`
@@ -86,10 +84,9 @@ class Calibration:
 
 def write_calibration(result: Calibration, out: Path) -> None:
     """Write `photometry.json`, `calibration.json` and `calibration.png`."""
-    gauge = result.gauge if result.known is None else f"known exposures ({result.known})"
     views, pivot = result.views, result.pivot
     path = out / "photometry.json"
-    write_solution(path, result.solution, views=views, pivot=pivot, gauge=gauge)
+    write_solution(path, result.solution, views=views, pivot=pivot, gauge=result.gauge)
     write_json(out / "calibration.json", result.details)
     write_calibration_plot(
         out / "calibration.png",
@@ -110,13 +107,9 @@ def calibrate(
 ) -> Calibration:
     """Solve the photometry of a scene and write the files of a calibration.
 
-    Args:
-        scene_dir: COLMAP model, transforms.json, or folder of photographs.
-        out: folder for the results; created.
-        cfg: options (data, photometry and the thresholds of loss); default `robust`.
-        compare_with: stated exposures to compare with: `exif` or a CSV file; default EXIF where
-            photographs carry it.
-        reporter: receives progress.
+    The scene is a COLMAP model, a transforms.json or a folder of photographs. Of `cfg` (default
+    `robust`) data, photometry and the thresholds of loss count. The result is compared with stated
+    exposures: `exif` or a CSV file; by default EXIF's where photographs carry them.
 
     Raises:
         UserError: something the user can mend.
@@ -206,34 +199,10 @@ def solved(
     if agreement.views:
         by = "EXIF" if compare_with in (None, "exif") else Path(str(compare_with)).name
         messages += [agreement.sentence(by), *note_on_levels(s, stated, agreement, pivot)]
-    count = len(observations.views)
-    return Calibration(
-        views=views,
-        selection=selection,
-        stated_ev=stated + agreement.offset_ev,
-        agreement=agreement,
-        known=cfg.photometry.known,
-        gauge=MEAN_GAUGE,
-        pivot=pivot,
-        messages=tuple(messages),
-        details=_details(messages, count, seconds, selection, agreement),
-        observations=count,
-        seconds=seconds,
-    )
-
-
-def _details(
-    messages: Sequence[str],
-    observations: int,
-    seconds: dict[str, float],
-    selection: Selection,
-    agreement: Agreement,
-) -> dict[str, Any]:
-    s = selection.solution
     names = ("residual_ev", "view_residual_ev", "view_balance_ev", "outliers", "component")
-    return {
+    details = {
         "messages": messages,
-        "observations": observations,
+        "observations": len(observations.views),
         "seconds": seconds,
         "solution": s.state,
         **{name: getattr(s, name) for name in (*names, "observations_per_view")},
@@ -253,6 +222,23 @@ def _details(
             for c in selection.candidates
         ],
     }
+    return Calibration(
+        views=views,
+        selection=selection,
+        stated_ev=stated + agreement.offset_ev,
+        agreement=agreement,
+        gauge=_gauge(cfg, MEAN_GAUGE),
+        pivot=pivot,
+        messages=tuple(messages),
+        details=details,
+        observations=len(observations.views),
+        seconds=seconds,
+    )
+
+
+def _gauge(cfg: FitConfig, free: str) -> str:
+    known = cfg.photometry.known
+    return free if known is None else f"known exposures ({known})"
 
 
 def calibrate_stack(
@@ -297,8 +283,7 @@ def calibrate_stack(
         selection=selection,
         stated_ev=stated + agreement.offset_ev,
         agreement=agreement,
-        known=p.known,
-        gauge=STACK_GAUGE,
+        gauge=_gauge(cfg, STACK_GAUGE),
         pivot=STACK_PIVOT,
         messages=tuple(messages),
         details={

@@ -11,7 +11,6 @@ import numpy as np
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import no_empty_folders
-from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.against import score_foreign
@@ -106,9 +105,6 @@ def _refit(
     reporter: Reporter,
 ) -> dict[str, Any]:
     """Fit colours and opacities under the exposures found; return what `metrics.json` holds."""
-    clock = Stopwatch()
-    clock.add("reading", found.seconds["reading"])
-    clock.add("photometry", found.seconds["adjustment"])
     with Optimiser(folder, reporter) as optimiser, begun(folder, paths, cfg, start.decisions):
         result = optimiser.run(start)
     params, _ = compact(result)
@@ -119,7 +115,12 @@ def _refit(
             "test_views": len(start.scene.test_indices),
             "steps": result.host.step,
         },
-        seconds={**clock.seconds, **result.seconds, "optimisation": result.host.elapsed_s},
+        seconds={
+            "reading": found.seconds["reading"],
+            "photometry": found.seconds["adjustment"],
+            **result.seconds,
+            "optimisation": result.host.elapsed_s,
+        },
         selection=start.selection,
         notes=start.notes,
         of=before,

@@ -15,8 +15,8 @@ from p2gs_jax.core.progress import Reporter
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.alignment import ExposureError, exposure_error
 from p2gs_jax.pipeline.fit import fit
-from p2gs_jax.synth.rig import image_height
 from p2gs_jax.synth.sensor import read_true_exposures
+from p2gs_jax.synth.settings import image_height
 from p2gs_jax.synth.write import write_street
 
 

@@ -64,14 +64,9 @@ def solve_exposures(
 ) -> Exposures:
     """Sample colours of shared points, and solve the photometry from them; both where possible.
 
-    Args:
-        scene: views, points, tracks.
-        still: photographs of what stands still and is opaque.
-        cfg: as asked.
-        reporter: receives progress.
-        on_chosen: receives model and curve before they are solved.
-        dense: observations are wanted even where the fit starts from no exposures.
-        kept: what the checkpoints of a run that is resumed remember: its model and curve stay.
+    Photographs are those of what stands `still` and is opaque. `on_chosen` receives model and curve
+    before they are solved; those that the checkpoints of a resumed run `kept` stay. With `dense`,
+    observations are wanted even where the fit starts from no exposures.
     """
     found, notes = _sampled(scene, still, cfg, reporter or Silent(), dense=dense)
     selection, under = None, cfg if kept is None else kept.resolve(cfg)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,10 +14,10 @@ from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.clock import CompileCounter, Stopwatch, over_budget
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.core.runtime import return_freed_memory
-from p2gs_jax.evaluation.evaluate import ViewResult, evaluate
+from p2gs_jax.evaluation.evaluate import evaluate
 from p2gs_jax.evaluation.lpips import LpipsWeights
 from p2gs_jax.evaluation.references import Reference, find_radiance
-from p2gs_jax.evaluation.scores import is_drive, untold_notes
+from p2gs_jax.evaluation.scores import ViewResult, is_drive, untold_notes
 from p2gs_jax.photometry.calibrate import Selection
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.folder import RunFolder
@@ -41,6 +41,35 @@ class Account:
     of: dict | None = None  # scores of the model that was converted, as it was; None: this is a fit
 
 
+class _Shown:
+    """Writes held-out views as they are judged, and keeps those of the summary."""
+
+    def __init__(self, scene: Scene, store: ImageStore, folder: RunFolder, watch: Stopwatch):
+        self._scene, self._store, self._folder, self._watch = scene, store, folder, watch
+        self._summary: dict[int, ViewResult | None] = dict.fromkeys(summary_rows(scene))
+        self._fitted: dict[int, float] = {}
+        _import_ahead("matplotlib.figure")
+
+    def add(self, result: ViewResult) -> None:
+        """Take a view."""
+        view = self._scene.views[result.index]
+        if view.split == "test":
+            self._fitted[result.index] = result.transform.exposure
+            with self._watch("files"):
+                write_view(self._folder.renders, view.name, result, self._store)
+        if result.index in self._summary:
+            self._summary[result.index] = result
+
+    def fitted(self, hidden: Collection[str]) -> dict[int, float]:
+        """Return the exposures of held-out views by row, but those of `hidden` names."""
+        views = self._scene.views
+        return {row: e for row, e in self._fitted.items() if views[row].name not in hidden}
+
+    def summary(self) -> list[ViewResult]:
+        """Return the views of the summary, in its order."""
+        return [result for result in self._summary.values() if result is not None]
+
+
 def finish(
     params: Params,
     scene: Scene,
@@ -53,31 +82,17 @@ def finish(
     owner: np.ndarray | None = None,
     truth: Reference | None = None,
     lpips_weights: LpipsWeights | None = None,
-    true_ev: np.ndarray | None = None,
+    true_exposures: Mapping[str, float] | None = None,
     still_ours: Callable[[], None] = lambda: None,
 ) -> dict:
     """Evaluate, write all results and return what `metrics.json` holds.
 
-    Parameters are those of live Gaussians, `owner` says which moving object each belongs to, and
-    `cfg` is what the fit computed under. `truth` is under one common exposure, `true_ev` has true
-    exposures of the training views in stops for the plot, and `still_ours` raises where the run
-    folder is no longer this run's.
+    Gaussians are the live ones, `owner` says which moving object each belongs to, and `cfg` is what
+    the fit computed under; `still_ours` raises where the run folder is no longer this run's.
     """
     watch = Stopwatch()
     return_freed_memory()
-    _import_ahead("matplotlib.figure")
-    fitted: dict[int, float] = {}
-    shown: dict[int, ViewResult | None] = dict.fromkeys(summary_rows(scene))
-
-    def on_view(result: ViewResult) -> None:
-        view = scene.views[result.index]
-        if view.split == "test":
-            fitted[result.index] = result.transform.exposure
-            with watch("files"):
-                write_view(folder.renders, view.name, result, store)
-        if result.index in shown:
-            shown[result.index] = result
-
+    views = _Shown(scene, store, folder, watch)
     with watch("evaluation"):
         found = evaluate(
             params,
@@ -88,15 +103,13 @@ def finish(
             reference=truth,
             radiance=find_radiance(scene, store),
             lpips_weights=lpips_weights,
-            on_view=on_view,
+            on_view=views.add,
             on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
         )
     metered = [found.metering.sentence] if found.metering.telling else []
     _tell([*untold_notes(found.metrics), *metered], account, reporter)
-    # Views are written while they are judged.
-    watch.add("evaluation", -watch.seconds.get("files", 0.0))
+    watch.add("evaluation", -watch.seconds.get("files", 0.0))  # views are written meanwhile
     reporter.stage("Writing files")
-    hidden = found.metrics.get("hidden", ())
     with watch("files"):
         write_run(
             folder,
@@ -105,15 +118,14 @@ def finish(
             cfg,
             owner=owner,
             moving=store.moving,
-            fitted={r: e for r, e in fitted.items() if scene.views[r].name not in hidden},
+            fitted=views.fitted(found.metrics.get("hidden", ())),
             unknown=found.metrics.get("exposures_unknown", ()),
             solution=None if account.selection is None else account.selection.solution,
-            shown=[result for result in shown.values() if result is not None],
+            shown=views.summary(),
             metering=found.metering,
-            true_ev=true_ev,
+            true_exposures=true_exposures,
         )
-        if found.unexplained:
-            write_unexplained(folder.unexplained, scene, store, found.unexplained)
+        write_unexplained(folder.unexplained, scene, store, found.unexplained)
     metrics = found.metrics | _accounted(account, watch, scene, cfg, reporter)
     still_ours()
     write_json(folder.metrics, metrics)

@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -30,7 +30,7 @@ from p2gs_jax.pipeline.prepare import Prepared, load, prepare
 from p2gs_jax.presets import require_config
 from p2gs_jax.run.checkpoint import saved_steps
 from p2gs_jax.run.decisions import Decisions
-from p2gs_jax.run.folder import RunFolder, locked, require_free
+from p2gs_jax.run.folder import RunFolder, RunLock, locked, require_free
 from p2gs_jax.run.write import write_start
 from p2gs_jax.train.data_parallel import mesh_of
 from p2gs_jax.train.inputs import TrainingViews
@@ -71,22 +71,13 @@ def fit(
 ) -> FitResult:
     """Fit a scene and write a run folder.
 
-    Args:
-        scene_dir: COLMAP model, transforms.json, or folder of photographs.
-        run_dir: created; its contract is in docs/files.md.
-        cfg: options; None takes the `robust` preset.
-        reference: photographs of the same views under one common exposure.
-        resume: continue after an interruption.
-        reporter: receives progress.
-        true_exposures: image name -> true exposure, where it is known, for the plot.
-        spent_s: seconds of the budget that were gone before the call.
-        devices: how many share the views of a step; with several, `train.batch` is a multiple of
-            them.
-        terms: loss terms of yours, by name; as for `make_step`, and so are the next two. The run
-            folder does not remember them: `--resume` needs them again, and `load_run` shows
-            pictures through the tone curve of `cfg`.
-        formation: an image formation of yours.
-        strategy: a densification of yours.
+    The scene is a COLMAP model, a transforms.json or a folder of photographs; `reference` has
+    photographs of the same views under one common exposure. Without `cfg` the preset is `robust`.
+    Of the budget, `spent_s` seconds were gone before the call. True exposures by image name are for
+    the plot. Several `devices` share the views of a step; `train.batch` is a multiple of them.
+    Loss terms (by name), formation and densification of yours are as for `make_step`. The run
+    folder does not remember them: `resume` needs them again, and `load_run` shows pictures through
+    the tone curve of `cfg`.
 
     Raises:
         UserError: something the user can mend.
@@ -99,6 +90,8 @@ def fit(
     require_free(paths.run)
     weights = preflight(cfg, paths, resume=resume)
     mesh, clock, compiler = mesh_of(cfg, devices), Stopwatch(), CompileCounter()
+    if spent_s:
+        clock.add("starting", spent_s)
     with no_empty_folders(paths.run), locked(paths.run) as lock, memory_named():
         check_run_dir(paths.run, resume, cfg)  # another may have ended since
         scene = _read(paths, cfg, reporter, clock)
@@ -111,28 +104,12 @@ def fit(
             lock.require()
             reserve_s = seconds_to_finish(scene, cfg, weights, reference=truth is not None)
             with begun(folder, paths, cfg, start.decisions), memory_named():
-                spent_s, starting = time.monotonic() - begin, spent_s
+                spent_s = time.monotonic() - begin
                 result = optimiser.run(start, resume=resume, spent_s=spent_s, reserve_s=reserve_s)
-        params, owner = compact(result)
-        params = centred(exposures_apart(params), cfg)
-        lock.require()
-        seconds = ({"starting": starting} if starting else {}) | clock.seconds
-        metrics = finish(
-            params,
-            start.scene,
-            start.store,
-            start.cfg,
-            folder,
-            _account(params, scene, start, result, seconds, begin, compiler),
-            reporter,
-            owner=owner,
-            truth=truth,
-            lpips_weights=weights,
-            true_ev=true_stops(true_exposures, scene),
-            still_ours=lock.require,
+        known = {"truth": truth, "lpips_weights": weights, "true_exposures": true_exposures}
+        params, metrics = _finished(
+            start, result, cfg, folder, clock, begin, compiler, reporter, lock, **known
         )
-        start.store.close()
-        shutil.rmtree(folder.pixels, ignore_errors=True)
     return FitResult(params, scene, metrics, paths.run, start.selection, start.decisions)
 
 
@@ -235,34 +212,34 @@ def centred(params: Params, cfg: FitConfig) -> Params:
     return params
 
 
-def true_stops(true_exposures: Mapping[str, float] | None, scene: Scene) -> np.ndarray | None:
-    """Return true exposures of the training views in stops, where they are known by name."""
-    if true_exposures is None:
-        return None
-    return np.log2([true_exposures[view.name] for view in scene.training_views])
-
-
-def _account(
-    params: Params,
-    scene: Scene,
+def _finished(
     start: Prepared,
     result: TrainResult,
-    seconds: dict[str, float],
+    asked: FitConfig,
+    folder: RunFolder,
+    clock: Stopwatch,
     begin: float,
     compiler: CompileCounter,
-) -> Account:
-    return Account(
+    reporter: Reporter,
+    lock: RunLock,
+    **known: Any,
+) -> tuple[Params, dict]:
+    """Judge and write what the steps left; what else is `known` is as for `finish`."""
+    params, owner = compact(result)
+    params = centred(exposures_apart(params), asked)
+    lock.require()
+    account = Account(
         counts={
             "gaussians": params.gaussians.capacity,
-            "seed_points": len(scene.points),
-            "train_views": len(scene.train_indices),
-            "test_views": len(scene.test_indices),
+            "seed_points": len(start.scene.points),
+            "train_views": len(start.scene.train_indices),
+            "test_views": len(start.scene.test_indices),
             "steps": result.host.step,
             "refused_densifications": result.host.refused,
             "tile_lists_grown": result.host.overflows,
         },
         seconds={
-            **seconds,
+            **clock.seconds,
             **result.seconds,
             "total_until_evaluation": time.monotonic() - begin,
             "optimisation": result.host.elapsed_s,
@@ -271,6 +248,11 @@ def _account(
         selection=start.selection,
         notes=start.notes,
     )
+    what = (params, start.scene, start.store, start.cfg, folder, account, reporter)
+    metrics = finish(*what, owner=owner, still_ours=lock.require, **known)
+    start.store.close()
+    shutil.rmtree(folder.pixels, ignore_errors=True)
+    return params, metrics
 
 
 @contextlib.contextmanager

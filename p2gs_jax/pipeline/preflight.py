@@ -277,11 +277,11 @@ def memory_named() -> Iterator[None]:
 
 def _way_on(needed: MemoryNeeded, room: float) -> str:
     """Return which option brings a fit into the room there is, the largest part's first."""
-    ways = {
-        "gaussians": (needed.gaussians, "--gaussians {}", needed.population, FEWEST_GAUSSIANS),
-        "photographs": (needed.photographs, "--data.cache-mb {}", needed.photographs / 2**20, 1),
-    }
-    for part, option, now, least in sorted(ways.values(), key=lambda way: -way[0]):
+    ways = (
+        (needed.gaussians, "--gaussians {}", needed.population, FEWEST_GAUSSIANS),
+        (needed.photographs, "--data.cache-mb {}", needed.photographs / 2**20, 1),
+    )
+    for part, option, now, least in sorted(ways, key=lambda way: -way[0]):
         share = 1 - (needed.total - room) / part if part else 0.0
         if share * now >= least:
             return f"add {option.format(_rounded(share * now))}, or end other programs"

@@ -101,17 +101,11 @@ def prepare(
 ) -> Prepared:
     """Start exposures, radiances and Gaussians from what the scene offers.
 
-    Args:
-        scene: from `load`.
-        cfg: as asked.
-        reporter: receives progress.
-        clock: receives the seconds of `photometry` and `seeds`.
-        on_expected: receives what can be told before the exposures are solved, where that is much:
-            parameters of the right shapes, and whether their tone curve is chosen.
-        kept: what the checkpoints of a run that is resumed remember: its model and curve stay.
-        pixels: folder for decoded photographs that are more than memory holds, or None.
-        given: what was solved for a whole of which `scene` is a part, or None.
-        sphere: where the whole puts what lies behind everything, or None.
+    The clock receives the seconds of `photometry` and `seeds`; `on_expected`, what can be told
+    before the exposures are solved, where that is much: parameters of the right shapes, and whether
+    their tone curve is chosen. Model and curve stay that the checkpoints of a resumed run `kept`.
+    The folder `pixels` is for decoded photographs that are more than memory holds. Of a part of a
+    scene, `given` is what was solved for the whole, which puts what lies behind all on `sphere`.
 
     Raises:
         UserError: there is not the memory for it, nothing to see, no room on the disk for

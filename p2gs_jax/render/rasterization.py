@@ -49,25 +49,15 @@ def rasterization(
 ) -> tuple[Float[Array, "c h w x"], Float[Array, "c h w 1"], dict[str, Any]]:
     """Render Gaussians in several cameras of one size; differentiable, also in `jax.jit`.
 
-    Args:
-        means: scene units.
-        quats: w x y z, of any length.
-        scales: standard deviations along the axes, scene units.
-        opacities: in [0, 1].
-        colors: linear radiance (n 3), or (c n 3) for each camera; with `sh_degree`, coefficients of
-            spherical harmonics (n k 3), whose radiance is max(0, value + 1/2).
-        viewmats: world to camera, OpenCV axes.
-        Ks: intrinsics, pixels.
-        width: pixels.
-        height: pixels.
-        near_plane: nearer Gaussians are invisible, scene units.
-        eps2d: variance added to the 2D covariance, pixels^2.
-        sh_degree: coefficients above this degree are ignored.
-        backgrounds: radiance; None: black.
-        render_mode: "RGB", "D" (the sum of weights times z), "ED" (that over alpha), or both.
-        capacity: entries of the tile lists, static; None measures it, which only works outside of
-            `jax.jit`: pass `meta["capacity"]` of such a call.
-        cfg: everything else about rendering; default `RenderConfig()`.
+    Means, scales (standard deviations) and `near_plane`, before which nothing is visible, are in
+    scene units; quats are w x y z, of any length; opacities are in [0, 1]. Colours are linear
+    radiance (n 3), or (c n 3) for each camera; with `sh_degree`, spherical harmonics (n k 3) of
+    radiance max(0, value + 1/2), of which those above the degree are ignored. View matrices go from
+    world to camera, OpenCV axes; `Ks` and the size are in pixels; `eps2d` is the variance added to
+    the 2D covariance, pixels^2; backgrounds are radiance, None is black. The mode is "RGB", "D"
+    (the sum of weights times z), "ED" (that over alpha), or both. The static `capacity` is the
+    number of entries of the tile lists; None measures it, which only works outside of `jax.jit`:
+    pass `meta["capacity"]` of such a call. All other options are in `cfg`.
 
     Returns:
         Colours with depth as their last channel, alphas, and by name: `means2d` (c n 2), `depths`
@@ -80,37 +70,47 @@ def rasterization(
     """
     if render_mode not in MODES:
         raise ValueError(f"render_mode {render_mode!r} is not valid: choose {', '.join(MODES)}")
-    count, cameras, kept = means.shape[0], viewmats.shape[0], colors
-    if sh_degree is not None:
-        kept = colors[..., : coefficient_count(sh_degree), :]
-    bands = () if sh_degree is None else (coefficient_count(sh_degree),)
-    shape = (count, *bands, 3)
-    if kept.shape not in (shape, (cameras, *shape)):
-        raise ValueError(f"colors have shape {colors.shape}: {shape} is needed, or one per camera")
+    each = _for_each_camera(colors, means.shape[0], viewmats.shape[0], sh_degree)
     cfg = dataclasses.replace(
         cfg or RenderConfig(), near=near_plane, blur=eps2d, radiance="linear", background=None
     )
-    limited = jnp.clip(opacities, LEAST_OPACITY, 1 - LEAST_OPACITY)
-    no_color = jnp.zeros((count, 1, 3), means.dtype)
-    gaussians = Gaussians(
-        means, quats, jnp.log(scales), jnp.log(limited) - jnp.log1p(-limited), no_color
-    )
-    each = jnp.broadcast_to(kept, (cameras, *shape))
+    p, no_color = jnp.clip(opacities, LEAST_OPACITY, 1 - LEAST_OPACITY), jnp.zeros_like(means)
+    logits = jnp.log(p) - jnp.log1p(-p)
+    gaussians = Gaussians(means, quats, jnp.log(scales), logits, no_color[:, None])
     arrays, size = (gaussians, each, viewmats, Ks), (width, height)
     if capacity is None:
         capacity = _measured(arrays, size, cfg, sh_degree)
     traced = any(isinstance(a, Tracer) for a in jax.tree.leaves(arrays))
     run = _compiled(None if traced else jax.default_backend())
     rgb, alpha, depth, meta = run(*arrays, size, cfg, capacity, sh_degree, render_mode != "RGB")
-    alpha = alpha[..., None]
+    meta |= {"capacity": capacity, "width": width, "height": height}
+    return _channels(rgb, alpha[..., None], depth, backgrounds, render_mode), alpha[..., None], meta
+
+
+def _for_each_camera(colors, count: int, cameras: int, sh_degree: int | None):
+    """Return colours (c n 3), or the coefficients in use (c n k 3).
+
+    Raises:
+        ValueError: the shape is not valid.
+    """
+    kept, shape = colors, (count, 3)
+    if sh_degree is not None:
+        bands = coefficient_count(sh_degree)
+        kept, shape = colors[..., :bands, :], (count, bands, 3)
+    if kept.shape not in (shape, (cameras, *shape)):
+        raise ValueError(f"colors have shape {colors.shape}: {shape} is needed, or one per camera")
+    return jnp.broadcast_to(kept, (cameras, *shape))
+
+
+def _channels(rgb, alpha, depth, backgrounds, render_mode: str):
+    """Return the channels that a mode asks for."""
     if backgrounds is not None:
         rgb = rgb + (1 - alpha) * backgrounds[:, None, None]
     parts = [rgb] if render_mode.startswith("RGB") else []
     if depth is not None:
         expected = render_mode.endswith("ED")
         parts.append(depth[..., None] / jnp.maximum(alpha, 1e-10) if expected else depth[..., None])
-    meta |= {"capacity": capacity, "width": width, "height": height}
-    return jnp.concatenate(parts, -1), alpha, meta
+    return jnp.concatenate(parts, -1)
 
 
 def _seen(gaussians, color, camera: Camera, cfg: RenderConfig, sh_degree: int | None):

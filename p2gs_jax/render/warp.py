@@ -36,12 +36,16 @@ def surface_depth(render: Render, opaque: float = OPAQUE) -> Float[Array, "h w"]
     return jnp.where(surface, render.depth / jnp.where(surface, render.alpha, 1.0), 0.0)
 
 
-def unproject(depth: Float[Array, "h w"], camera: Camera) -> Float[Array, "h w 3"]:
-    """Return world positions of pixel centres at the given camera depths."""
-    y, x = jnp.mgrid[: camera.height, : camera.width]
-    xy = jnp.stack([x, y], -1) + 0.5
-    focal, center = jnp.diag(camera.K)[:2], camera.K[:2, 2]
-    local = jnp.concatenate([(xy - center) / focal, jnp.ones((*depth.shape, 1))], -1)
+def unproject(depth: Float[Array | np.ndarray, "h w"], camera: Camera) -> Float[Any, "h w 3"]:
+    """Return world positions of pixel centres at the given camera depths.
+
+    NumPy arrays give NumPy results, in double precision.
+    """
+    xp = namespace(depth, camera.K)
+    y, x = xp.mgrid[: camera.height, : camera.width]
+    xy = xp.stack([x, y], -1) + 0.5
+    focal, center = xp.diag(camera.K)[:2], camera.K[:2, 2]
+    local = xp.concatenate([(xy - center) / focal, xp.ones((*depth.shape, 1))], -1)
     rotation, translation = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
     return (local * depth[..., None] - translation) @ rotation
 

@@ -73,12 +73,8 @@ class Series:
 
 def _ends(series: Sequence[Series]) -> list[tuple[str, float, str]]:
     """Return name, last known value and colour of the curves that have a name and a value."""
-    out = []
-    for s in series:
-        known = np.flatnonzero(np.isfinite(s.y))
-        if s.label and len(known):
-            out.append((s.label, float(s.y[known[np.argmax(s.x[known])]]), s.style.color))
-    return out
+    known = [(s, np.isfinite(s.y)) for s in series if s.label]
+    return [(s.label, float(s.y[k][np.argmax(s.x[k])]), s.style.color) for s, k in known if k.any()]
 
 
 def panels_chart(
@@ -147,16 +143,10 @@ def _plot(axes: Axes, s: Series, room: float) -> None:
     # Lines break where a value is missing.
     axes.plot(s.x, s.y, **style)
     if s.error is not None and np.isfinite(s.error).any():
-        axes.errorbar(
-            s.x[known],
-            s.y[known],
-            yerr=np.nan_to_num(s.error[known]),
-            fmt="none",
-            ecolor=s.style.color,
-            elinewidth=0.8 if crowded else 1.3,
-            capsize=0 if crowded else 3,
-            zorder=s.style.order,
-        )
+        width, cap = (0.8, 0) if crowded else (1.3, 3)
+        look = {"ecolor": s.style.color, "elinewidth": width, "capsize": cap}
+        error = np.nan_to_num(s.error[known])
+        axes.errorbar(s.x[known], s.y[known], error, fmt="none", zorder=s.style.order, **look)
 
 
 def response_chart(curves: Sequence[Series], *, label: str) -> str:
@@ -169,10 +159,9 @@ def response_chart(curves: Sequence[Series], *, label: str) -> str:
         for c in curves:
             style = {"color": c.style.color, "linestyle": c.style.line, "linewidth": c.style.width}
             axes.plot(c.x, c.y, alpha=c.style.opacity, **style)
-        axes.set_xlim(-7, 3)
-        axes.set_ylim(0, 1.02)
+        label = "exposed radiance, stops from mid-grey"
+        axes.set(xlim=(-7, 3), ylim=(0, 1.02), xlabel=label)
         svg.set_ticks(axes, 6)
-        axes.set_xlabel("exposed radiance, stops from mid-grey")
         svg.set_title(axes, "photographed value, 1 is white")
         svg.label_ends(axes, [(c.label, float(c.y[-1]), c.style.color) for c in curves])
         return figure
@@ -189,11 +178,9 @@ def seams_chart(rows: Sequence[tuple[str, float, float]], *, label: str) -> str:
         tall = row * len(rows)
         figure = svg.new_figure(wide, top + tall + 44)
         axes = svg.place(figure, left, top, (svg.WIDE if wide else svg.NARROW) - 2 * left, tall)
-        axes.set_ylim(len(rows) - 0.35, -0.65)
-        axes.set_xlim(-0.02 * most, 1.04 * most)
+        axes.set(ylim=(len(rows) - 0.35, -0.65), xlim=(-0.02 * most, 1.04 * most), yticks=[])
         axes.spines["left"].set_visible(False)
         axes.grid(axis="y", visible=False)
-        axes.set_yticks([])
         for k, (name, before, after) in enumerate(rows):
             axes.plot([after, before], [k, k], color=MUTED, linewidth=1.5, zorder=2)
             axes.plot(before, k, **Style(SECOND, "o", "", filled=False, size=9.5).keywords)
@@ -227,27 +214,21 @@ def training_chart(
     smooth_losses = [median_filter(v, window, mode="nearest") for v in losses.values()]
 
     def draw(wide: bool) -> Figure:
-        figure, rows, _ = svg.stack(
-            wide,
-            3,
-            150 if wide else 120,
-            top=56 if wide else 22,
-            left=svg.LEFT if wide else svg.NARROW_LEFT + 4,
-            right=svg.room_for(tuple(losses), wide),
-        )
-        svg.set_title(rows[0], "PSNR on the training views, dB")
+        each, top, left = (150, 56, svg.LEFT) if wide else (120, 22, svg.NARROW_LEFT + 4)
+        right = svg.room_for(tuple(losses), wide)
+        figure, rows, _ = svg.stack(wide, 3, each, top=top, left=left, right=right)
+        titles = ("PSNR on the training views, dB", "Loss and its largest terms", "Gaussians")
+        for axes, title in zip(rows, titles, strict=True):
+            svg.set_title(axes, title)
         rows[0].plot(steps, psnr, color=FIRST, alpha=0.35, linewidth=0.8)
         rows[0].plot(steps, smooth_psnr, color=FIRST, linewidth=2)
-        svg.set_title(rows[1], "Loss and its largest terms")
         rows[1].set_yscale("log")
         ends = []
         for name, shown, (color, line) in zip(losses, smooth_losses, styles, strict=False):
             rows[1].plot(steps, shown, color=color, linestyle=line, linewidth=1.6)
             ends.append((name, float(shown[-1]), color))
-        svg.set_title(rows[2], "Gaussians")
         rows[2].plot(steps, gaussians, color=FIRST, linewidth=2, drawstyle="steps-post")
-        rows[2].set_ylim(bottom=0, top=1.1 * float(gaussians.max()))
-        rows[2].set_xlabel("step")
+        rows[2].set(ylim=(0, 1.1 * float(gaussians.max())), xlabel="step")
         for k, axes in enumerate(rows):
             axes.set_xlim(0, float(steps[-1]))
             svg.set_ticks(axes, 6 if wide else 4)
@@ -259,8 +240,8 @@ def training_chart(
             for at, _ in marks:
                 axes.axvline(at, color=MUTED, linewidth=1, linestyle=(0, (2, 3)))
         svg.label_ends(rows[1], ends)
-        svg.label_ends(rows[0], [(f"{smooth_psnr[-1]:.1f}", float(smooth_psnr[-1]), FIRST)])
-        svg.label_ends(rows[2], [(f"{gaussians[-1]:,.0f}", float(gaussians[-1]), FIRST)])
+        for axes, values, form in ((rows[0], smooth_psnr, ".1f"), (rows[2], gaussians, ",.0f")):
+            svg.label_ends(axes, [(format(values[-1], form), float(values[-1]), FIRST)])
         # Alternating heights: neighbours may be close.
         where = {"transform": rows[0].get_xaxis_transform(), "color": MUTED}
         for k, (at, text) in enumerate(marks if wide else ()):
@@ -295,12 +276,9 @@ def against_chart(
             axes = svg.place(figure, left, 24 + (k // columns) * step, side, side)
             axes.plot(limits, limits, color=MUTED, linewidth=1)
             axes.plot(x, y, **Style(FIRST, "o", "", filled=False).keywords)
-            axes.set_xlim(*limits)
-            axes.set_ylim(*limits)
-            axes.set_aspect("equal")
+            axes.set(xlim=limits, ylim=limits, aspect="equal", xlabel=f"{first}, stops")
             for axis in (axes.xaxis, axes.yaxis):
                 axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
-            axes.set_xlabel(f"{first}, stops")
             svg.set_title(axes, f"{name}, stops")
         return figure
 

@@ -33,17 +33,11 @@ class TableRow(NamedTuple):
 
 @dataclass(frozen=True)
 class Comparison:
-    """Several runs, in the order given, side by side.
+    """Several runs, in the order given, side by side, each with a short label of its own.
 
-    Attributes:
-        runs: what their folders hold.
-        labels: a short name for each, all different.
-        remarks: sentences on what cannot be compared.
-        same_scene: whether scores can be compared.
-        scores: the table.
-        options: options that differ.
-        exposures: label of each later run; exposures of the first and of it in stops, of the views
-            that both have, means removed.
+    Remarks are sentences on what cannot be compared; scores compare where the scene is the same.
+    Options are those that differ. `exposures` has the label of each later run, and exposures of
+    the first and of it in stops, of the views that both have, means removed.
     """
 
     runs: tuple[RunFiles, ...]
@@ -96,20 +90,14 @@ def compare_runs(folders: Sequence[str | Path]) -> Comparison:
     remarks = [f"{n}: {why}" for n, run in zip(labels, runs, strict=True) for why in run.missing]
     if not same:
         names = ", ".join(dict.fromkeys(str(run.scene) for run in runs))
-        remarks.insert(
-            0,
+        why = (
             f"The runs are of different scenes ({names}): their scores do not compare, and "
-            "exposures and views are not held against each other.",
+            "exposures and views are not held against each other."
         )
-    return Comparison(
-        runs,
-        labels,
-        tuple(remarks),
-        same,
-        tuple(_scores(runs, same)),
-        tuple(_options(runs)),
-        tuple(_exposures(runs, labels)) if same else (),
-    )
+        remarks.insert(0, why)
+    exposures = tuple(_exposures(runs, labels)) if same else ()
+    scores, options = tuple(_scores(runs, same)), tuple(_options(runs))
+    return Comparison(runs, labels, tuple(remarks), same, scores, options, exposures)
 
 
 def _labels(folders: list[Path]) -> list[str]:
@@ -204,11 +192,8 @@ def to_markdown(found: Comparison) -> str:
         lines += ["", "Options that differ:", ""]
         lines += _markdown_table("option", found.labels, found.options)
     for label, x, y in found.exposures:
-        lines += [
-            "",
-            f"Exposures of {label} and {found.labels[0]} differ by {apart(x, y):.3f} "
-            f"stops (RMS over {len(x)} views, means removed).",
-        ]
+        differ = f"Exposures of {label} and {found.labels[0]} differ by {apart(x, y):.3f} stops"
+        lines += ["", f"{differ} (RMS over {len(x)} views, means removed)."]
     return "\n".join(lines) + "\n"
 
 
@@ -237,12 +222,11 @@ def comparison_page(found: Comparison) -> str:
     names = dict.fromkeys(run.scene.name or "an unnamed scene" for run in found.runs)
     head = f"<h1>{text(count)} runs of {text(' and '.join(names))}</h1>\n"
     head += paragraph(", ".join(found.labels), "quiet") + listed(found.remarks)
-    scores = _table("", found.labels, found.scores)
+    scores, options = _table("", found, found.scores), _table("option", found, found.options)
     if found.same_scene:
         scores += paragraph("Bold: the best of a line.", "note")
-    options = paragraph("All options are the same.")
-    if found.options:
-        options = _table("option", found.labels, found.options)
+    if not found.options:
+        options = paragraph("All options are the same.")
     sections = [
         ("scores", "Scores", scores),
         ("options", "Options that differ", options),
@@ -252,23 +236,20 @@ def comparison_page(found: Comparison) -> str:
     return html.page(f"{count} runs compared · p2gs-jax", head, sections, html.made_by("compare"))
 
 
-def _table(head: str, labels: Sequence[str], rows: Sequence[TableRow]) -> str:
-    return html.table(
-        [head, *labels],
-        [[r.name, *r.cells] for r in rows],
-        numbers=range(1, len(labels) + 1),
-        best=[frozenset(i + 1 for i in r.best) for r in rows],
-    )
+def _table(head: str, found: Comparison, rows: Sequence[TableRow]) -> str:
+    cells, names = [[r.name, *r.cells] for r in rows], [head, *found.labels]
+    best = [frozenset(i + 1 for i in r.best) for r in rows]
+    return html.table(names, cells, numbers=range(1, len(names)), best=best)
 
 
 def _exposure_body(found: Comparison) -> str:
     if not found.exposures:
         return ""
     label = "Exposures of the runs over the first run's"
-    chart = against_chart(found.exposures, first=found.labels[0], label=label)
+    first = found.labels[0]
+    chart = against_chart(found.exposures, first=first, label=label)
     differ = " ".join(
-        f"{label} and {found.labels[0]} differ by {apart(x, y):.3f} stops (RMS over "
-        f"{len(x)} views)."
+        f"{label} and {first} differ by {apart(x, y):.3f} stops (RMS over {len(x)} views)."
         for label, x, y in found.exposures
     )
     caption = "One mark a photograph, means removed; on the line both agree."

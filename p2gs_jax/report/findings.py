@@ -29,14 +29,12 @@ CORRECTIONS = {
 }
 # How sentences of the photometric selection begin (photometry/calibrate.py).
 REASONS = ("Chosen:", "Simpler (", "Richer (", "What predicts best")
-# Least gap between the PSNR of training and held-out views, dB.
-WIDE_GAP = 4.0
-# Least gap between one held-out view and the median of all, dB.
-OUTLIER = 6.0
-# Least standard error of an exposure, stops.
-WEAK_EV = 0.1
-# Least drift of an exposure from its start, stops; it must exceed three standard errors as well.
-DRIFT_EV = 0.1
+# Least gaps, dB: between the PSNR of training and held-out views; between a held-out view and the
+# median of all.
+WIDE_GAP, OUTLIER = 4.0, 6.0
+# Least standard error of an exposure, and least drift from its start, stops; a drift must exceed
+# three standard errors as well.
+WEAK_EV, DRIFT_EV = 0.1, 0.1
 # Gammas of cameras lie between these: two priors' widths about 2.2 (`A_PRIOR` in
 # photometry/adjustment/system.py).
 GAMMAS = (1.65, 3.15)
@@ -99,18 +97,15 @@ def _modelled(run: RunFiles) -> str:
     if run.photometry is None:
         return "What was modelled of the cameras is not known: photometry.json is missing."
     model, curve = run.photometry["model"], run.photometry["curve"].get("name", "")
-    kind = run.option("photometry", "appearance")
+    kind, preset = run.option("photometry", "appearance"), f"The preset {run.preset}"
     if kind == "ppisp":
         return (
-            f"The preset {run.preset} learns cameras beside the splats: exposure and colours of "
-            "every view, vignetting and response of every camera."
+            f"{preset} learns cameras beside the splats: exposure and colours of every view, "
+            "vignetting and response of every camera."
         )
     correction = f", with {CORRECTIONS.get(kind, kind)} learned for every view" if kind else ""
     if curve == "linear" and model == "constant":
-        return (
-            f"The preset {run.preset} models no camera: display values are splatted as they are"
-            f"{correction}."
-        )
+        return f"{preset} models no camera: display values are splatted as they are{correction}."
     span = exposure_span(run)
     spans = "" if span is None or model == "constant" else f"; exposures span {span:.1f} stops"
     what, under = DESCRIPTIONS.get(model, model), CURVES.get(curve, curve)
@@ -126,8 +121,7 @@ def _why(run: RunFiles) -> str:
 
 
 def _how_good(run: RunFiles, scene: SceneMeasurements) -> str:
-    parts = []
-    train = run.number("train", "psnr")
+    parts, train = [], run.number("train", "psnr")
     held_out = run.number("test", "exposure_fitted", "psnr")
     if held_out is not None:
         against = "" if train is None else f" (training photographs at {train:.1f} dB)"
@@ -284,10 +278,10 @@ def _on_exposures(run: RunFiles) -> Iterator[RunWarning]:
         )
     agreement = against_exif(run)
     if agreement is not None and agreement.disagrees.any():
-        views = [v for v in run.train if v["exposure_ev"] is not None]
+        views = [v["image"] for v in run.train if v["exposure_ev"] is not None]
         off = np.flatnonzero(agreement.disagrees)
         off = off[np.argsort(-np.abs(agreement.gap_ev[off]))]
-        names = [f"{views[i]['image']} {agreement.gap_ev[i]:+.2f}" for i in off]
+        names = [f"{views[i]} {agreement.gap_ev[i]:+.2f}" for i in off]
         yield RunWarning(
             "EXIF disagrees with the pixels",
             f"In {len(off)} of {agreement.views} views the exposure recovered from the pixels "

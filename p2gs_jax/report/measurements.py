@@ -1,10 +1,8 @@
-"""What a page needs from the scene itself: seams, clipped photographs, true exposures, renders.
-
-Seams are shown here, too.
-"""
+"""What a page measures on the scene: seams, which it shows here, clipping, and renders."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -36,6 +34,15 @@ MOST_PAIRS, MOST_CLIPPED, MOST_RENDERED = 12, 24, 3
 SEAM_WIDTH = 960
 # The pair for the picture of a seam has at least this share of the median overlap.
 LEAST_OVERLAP = 0.5
+# Columns of the table of seams: head and format of each number.
+COLUMNS = {
+    "before_ev": ("before, stops", ".3f"),
+    "after_ev": ("after, stops", ".3f"),
+    "step_ev": ("step after, stops", "+.3f"),
+    "before_codes": ("before, 8-bit levels", ".1f"),
+    "after_codes": ("after, 8-bit levels", ".1f"),
+    "pixels": ("pixels", ","),
+}
 
 
 @dataclass(frozen=True)
@@ -54,17 +61,12 @@ class SeamPair:
 
 @dataclass
 class SceneMeasurements:
-    """What was measured on the scene.
+    """What was measured on the scene; `missing` says in sentences what could not be.
 
-    Attributes:
-        true_exposures: by view, where the scene has them.
-        seams: pairs in the order of the views.
-        tried_pairs: number of pairs that were compared, with or without enough in common.
-        shown: the pair of `picture`, which has the widest seam.
-        picture: of both sides of a seam.
-        clipped: share of clipped pixels by view, for a sample of the training views.
-        comparisons: rendered training views, where the folder has no held-out ones.
-        missing: sentences on what could not be measured.
+    True exposures are by view, where the scene has them. Seams are in the order of the views, of
+    `tried_pairs` that were compared; `shown` is the pair of `picture`, which has the widest one.
+    `clipped` has shares of pixels by view, for a sample of the training views. Comparisons are
+    rendered training views, where the folder has no held-out ones.
     """
 
     true_exposures: dict[str, float] = field(default_factory=dict)
@@ -114,17 +116,15 @@ def _measure_seams(run: Run, out: SceneMeasurements, reporter: Reporter) -> None
         )
         return
     store, names = run.store.leaving_out(run.scene.objects), [v.name for v in run.scene.views]
-    known: dict[int, Photographed] = {}
 
+    @functools.cache
     def photographed(index: int) -> Photographed:
         """Return a photograph with rendered depth, rendered once."""
-        if index not in known:
-            shrink = max(1.0, store.camera(index)[2] / SEAM_WIDTH)
-            camera = camera_of(store, index, shrink)
-            depth = np.asarray(surface_depth(run.render(camera)))
-            ldr, mask = store.get(index, shrink)
-            known[index] = Photographed(ldr, mask, camera, depth, run.own_display(index))
-        return known[index]
+        shrink = max(1.0, store.camera(index)[2] / SEAM_WIDTH)
+        camera = camera_of(store, index, shrink)
+        depth = np.asarray(surface_depth(run.render(camera)))
+        ldr, mask = store.get(index, shrink)
+        return Photographed(ldr, mask, camera, depth, run.own_display(index))
 
     pairs = neighbouring_pairs(run.scene, MOST_PAIRS)
     found: dict[tuple[int, int], Seam] = {}
@@ -134,15 +134,15 @@ def _measure_seams(run: Run, out: SceneMeasurements, reporter: Reporter) -> None
         if seam is not None:
             found[i, j] = seam
     out.tried_pairs = len(pairs)
-    out.seams = tuple(SeamPair(names[i], names[j], seam) for (i, j), seam in found.items())
+    named = {(i, j): SeamPair(names[i], names[j], seam) for (i, j), seam in found.items()}
+    out.seams = tuple(named.values())
     if found:
         enough = LEAST_OVERLAP * float(np.median([s.pixels for s in found.values()]))
         good = [pair for pair, seam in found.items() if seam.pixels >= enough]
-        i, j = max(good, key=lambda pair: found[pair].before_ev)
-        out.shown = SeamPair(names[i], names[j], found[i, j])
-        out.picture = seam_picture(
-            photographed(i), photographed(j), run.common_display(), run.render
-        )
+        shown = max(good, key=lambda pair: found[pair].before_ev)
+        first, second = map(photographed, shown)
+        out.shown = named[shown]
+        out.picture = seam_picture(first, second, run.common_display(), run.render)
 
 
 def _comparisons(run: Run, reporter: Reporter) -> tuple[ViewComparison, ...]:
@@ -179,14 +179,13 @@ def seam_section(scene: SceneMeasurements) -> str:
     """Return the differences of neighbouring photographs, as taken and developed alike."""
     seams = scene.seams
     if not seams:
-        why = " ".join(m for m in scene.missing if m.startswith("Seams"))
-        if not why and scene.tried_pairs:
-            why = (
+        none = "No two training views share enough of the scene to be compared."
+        if scene.tried_pairs:
+            none = (
                 f"None of {scene.tried_pairs} pairs of neighbouring photographs shows enough of "
                 "the same unsaturated surface to compare."
             )
-        why = why or "No two training views share enough of the scene to be compared."
-        return paragraph(why)
+        return paragraph(" ".join(m for m in scene.missing if m.startswith("Seams")) or none)
     before, after = seam_medians(seams)
     step = float(np.median([abs(p.seam.step_ev) for p in seams]))
     whole = f"{step:.2f}" if step >= 0.005 else "less than 0.01"
@@ -200,23 +199,16 @@ def seam_section(scene: SceneMeasurements) -> str:
     )
     if scene.picture is not None and scene.shown is not None:
         body += _seam_picture(scene.shown, scene.picture)
-    chart = seams_chart(
-        [(p.name, p.seam.before_ev, p.seam.after_ev) for p in seams],
-        label="Difference of pairs of photographs as taken and developed",
-    )
+    label = "Difference of pairs of photographs as taken and developed"
+    ends = [(p.name, p.seam.before_ev, p.seam.after_ev) for p in seams]
     body += figure(
-        chart,
+        seams_chart(ends, label=label),
         "Median absolute difference over all pixels that both photographs show, found through the "
         "rendered depth; saturated and black pixels are left out.",
     )
-    heads = ["pair", "before, stops", "after, stops", "step after, stops"]
-    heads += ["before, 8-bit levels", "after, 8-bit levels", "pixels"]
-    numbers = []
-    for s in (p.seam for p in seams):
-        cells = [f"{s.before_ev:.3f}", f"{s.after_ev:.3f}", f"{s.step_ev:+.3f}"]
-        cells += [f"{s.before_codes:.1f}", f"{s.after_codes:.1f}", f"{s.pixels:,}"]
-        numbers.append(cells)
-    rows = [[p.name, *cells] for p, cells in zip(seams, numbers, strict=True)]
+    heads = ["pair", *(head for head, _ in COLUMNS.values())]
+    forms = [(name, form) for name, (_, form) in COLUMNS.items()]
+    rows = [[p.name, *(format(getattr(p.seam, name), form) for name, form in forms)] for p in seams]
     body += folded("Every pair in numbers", table(heads, rows, numbers=range(1, 7), tall=True))
     return body
 
@@ -225,16 +217,15 @@ def _seam_picture(pair: SeamPair, picture: SeamPicture) -> str:
     names = [without_suffix(pair.first), without_suffix(pair.second)]
     left, right = names if picture.left_first else names[::-1]
     seam = pair.seam
-    cells = [
-        (
-            jpeg(picture.before, f"{left} beside {right}, as taken", LARGE),
-            f"As taken: {seam.before_ev:.2f} stops, {seam.before_codes:.0f} 8-bit levels apart",
-        ),
-        (
-            jpeg(picture.after, f"{left} beside {right}, developed alike", LARGE),
-            f"Developed alike: {seam.after_ev:.2f} stops, {seam.after_codes:.1f} levels apart",
-        ),
+    pictures = [
+        jpeg(image, f"{left} beside {right}, {how}", LARGE)
+        for image, how in ((picture.before, "as taken"), (picture.after, "developed alike"))
     ]
+    captions = [
+        f"As taken: {seam.before_ev:.2f} stops, {seam.before_codes:.0f} 8-bit levels apart",
+        f"Developed alike: {seam.after_ev:.2f} stops, {seam.after_codes:.1f} levels apart",
+    ]
+    cells = list(zip(pictures, captions, strict=True))
     caption = (
         f"Left half: {left}. Right half: {right}. Both as a camera halfway between them would see "
         "them, with a hard edge in the middle: the widest seam among pairs with a good overlap. "

@@ -29,13 +29,9 @@ SECONDS = 120
 
 
 def page(title: str, head: str, sections: Sequence[tuple[str, str, str]], foot: str) -> str:
-    """Return the whole page.
+    """Return the whole page; `head` and `foot` are HTML above and below the sections.
 
-    Args:
-        title: of the window; text.
-        head: HTML above the sections.
-        sections: anchor, heading and HTML of each, in order; those without HTML are left out.
-        foot: HTML below them.
+    A section is its anchor, its heading, and HTML; those without HTML are left out.
     """
     shown = [(key, text(heading), body) for key, heading, body in sections if body]
     parts = {
@@ -160,14 +156,10 @@ def table(
     tall: bool = False,
     best: Sequence[frozenset[int]] | None = None,
 ) -> str:
-    """Return a table, with a scroll bar where it is too wide.
+    """Return a table of text, with a scroll bar where it is too wide, or `tall`.
 
-    Args:
-        names: of the columns.
-        rows: text of the cells.
-        numbers: columns that hold numbers.
-        tall: scroll vertically as well.
-        best: of each row, its columns that are marked; the first column then heads the rows.
+    `numbers` are the columns that hold numbers. `best` has, for each row, the columns that are
+    marked; the first column then heads the rows.
     """
     kinds = ["n" if i in set(numbers) else "" for i in range(len(names))]
 

@@ -27,16 +27,14 @@ from p2gs_jax.types import GAMMA_SRGB
 MOST_PANELS, FEWEST_VIEWS = 6, 3
 MID_GREY = 0.18
 CHANNELS = ("red", "green", "blue")
-MARKED = (
-    Style(SECOND, "^", "-", order=4),
-    Style(THIRD, "o", "-", order=3),
-    Style(FIRST, "s", "-", order=2),
-)
+_MARKS = ((SECOND, "^", 4), (THIRD, "o", 3), (FIRST, "s", 2))
+MARKED = tuple(Style(color, marker, "-", order=order) for color, marker, order in _MARKS)
 PLAIN, DASHED = Style(FIRST, "", "-"), Style(INK, "", (0, (4, 4)), width=1.6)
 LINES = (Style(SECOND, "", "-"), Style(THIRD, "", "--"), Style(FIRST, "", ":"))
 # Lines of the cameras of a drive, in turn.
 CAMERA_COLORS, CAMERA_MARKERS = (FIRST, SECOND, THIRD, FOURTH, INK, MUTED), "osD^vPX*"
 COLORS, DASHES = (FIRST, SECOND, THIRD, FOURTH), ("-", "--", "-.", ":")
+STOPS = "exposure, stops from the mean"
 # Display values at which tone curves are drawn.
 VALUES = np.linspace(0.004, 1.0, 240)
 
@@ -62,9 +60,9 @@ def model_section(run: RunFiles) -> str:
 def _chart(
     run: RunFiles,
     curves: Callable[[list[ViewPhotometry], np.ndarray], Sequence[Series]],
-    *,
     y_label: str,
     label: str,
+    caption: str,
     band: float = 0.0,
 ) -> str:
     """Return a panel for each camera, or one for all where there are many or small ones.
@@ -79,7 +77,15 @@ def _chart(
         by_camera = {"": run.views}
     panels = [(title, curves(v, np.arange(1.0, len(v) + 1))) for title, v in by_camera.items()]
     order = "photograph, in the order of names"
-    return charts.panels_chart(panels, y_label=y_label, x_label=order, label=label, band=band)
+    chart = charts.panels_chart(panels, y_label=y_label, x_label=order, label=label, band=band)
+    return figure(chart, caption)
+
+
+def _every(names: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a folded table of all photographs; numbers follow their name and camera."""
+    names = ["photograph", "camera", *names]
+    numbers = table(names, rows, numbers=range(2, len(names)), tall=True)
+    return folded("Every photograph in numbers", numbers)
 
 
 def exposure_section(run: RunFiles, truth: dict[str, float]) -> str:
@@ -111,29 +117,20 @@ def exposure_section(run: RunFiles, truth: dict[str, float]) -> str:
         every = [Series(n, x, y, charts.SOURCES[n], errors.get(n)) for n, y in stops(rows).items()]
         return [s for s in every if np.isfinite(s.y).any()]
 
-    chart = _chart(
-        run,
-        curves,
-        y_label="exposure, stops from the mean",
-        label="Exposures of the photographs of each camera, in stops",
-    )
-    body = figure(chart, " ".join(_exposure_caption(run, truth)))
+    label = "Exposures of the photographs of each camera, in stops"
+    body = _chart(run, curves, STOPS, label, " ".join(_exposure_caption(run, truth)))
     times = read_times(run.folder)
     if times:
         body = _over_time(run, times, stops) + folded("Each camera by itself", body)
-    names = ["photograph", "camera", "stops", "error", "gamma"]
-    names += [name for name in stops([]) if name in ("EXIF", "true")]
-    rows = []
+    more, rows = [name for name in stops([]) if name in ("EXIF", "true")], []
     for v, *values in zip(run.views, *stops(run.views).values(), strict=True):
         found, fitted, *others = values
         held_out = np.isfinite(fitted) and v["exposure"] is None
         error = "held out" if held_out else _shown(v.get("exposure_ev_error"), ".3f")
         ev = _shown(fitted if held_out else found, "+.2f")
-        gamma = _shown(v["gamma"], ".2f")
-        more = [_shown(value, "+.2f") for value in others]
-        rows.append([v["image"], v["camera"], ev, error, gamma, *more])
-    numbers = table(names, rows, numbers=range(2, len(names)), tall=True)
-    return body + folded("Every photograph in numbers", numbers)
+        stated = [_shown(value, "+.2f") for value in others]
+        rows.append([v["image"], v["camera"], ev, error, _shown(v["gamma"], ".2f"), *stated])
+    return body + _every(["stops", "error", "gamma", *more], rows)
 
 
 def _shown(value: float | None, form: str) -> str:
@@ -162,25 +159,19 @@ def _over_time(
         rows = [v for v in run.views if v["camera"] == name and v["image"] in times]
         rows.sort(key=lambda v: times[v["image"]])
         seconds, found = np.array([times[v["image"]] - start for v in rows]), stops(rows)
-        line = ("-", (0, (5, 2)))[k // len(CAMERA_COLORS) % 2]
-        marker = CAMERA_MARKERS[k % len(CAMERA_MARKERS)]
-        style = Style(CAMERA_COLORS[k % len(CAMERA_COLORS)], marker, line, size=4, width=1.2)
+        turn, color = divmod(k, len(CAMERA_COLORS))
+        line, marker = ("-", (0, (5, 2)))[turn % 2], CAMERA_MARKERS[k % len(CAMERA_MARKERS)]
+        style = Style(CAMERA_COLORS[color], marker, line, size=4, width=1.2)
         empty = replace(style, line="", filled=False, size=5)
         known = np.isfinite(found["found"])
         y, errors = found["found"][known], 2 * _errors(rows)[known]
         series.append(Series(short_name(name), seconds[known], y, style, errors))
         series.append(Series("", seconds, found["held out"], empty))
-    chart = charts.panels_chart(
-        [("", series)],
-        y_label="exposure, stops from the mean",
-        x_label="seconds",
-        label="Exposures of every camera over the seconds of the drive, in stops",
-        band=0.0,
-    )
-    return figure(
-        chart,
-        "A line a camera; error bars: two standard errors; empty marks: held-out photographs.",
-    )
+    label = "Exposures of every camera over the seconds of the drive, in stops"
+    caption = "A line a camera; error bars: two standard errors; empty marks: held-out photographs."
+    panels = [("", series)]
+    chart = charts.panels_chart(panels, y_label=STOPS, x_label="seconds", label=label, band=0.0)
+    return figure(chart, caption)
 
 
 def _exposure_caption(run: RunFiles, truth: dict[str, float]) -> list[str]:
@@ -223,15 +214,12 @@ def white_balance_section(run: RunFiles) -> str:
         names = enumerate(CHANNELS)
         return [Series(name, x, y[:, c], MARKED[c], errors[:, c]) for c, name in names]
 
-    chart = _chart(
+    most = views[int(np.argmax(np.ptp(stops(views), axis=1)))]
+    body = _chart(
         run,
         curves,
-        y_label="gain beside the exposure, stops",
-        label="White balance of the photographs of each camera, in stops",
-    )
-    most = views[int(np.argmax(np.ptp(stops(views), axis=1)))]
-    body = figure(
-        chart,
+        "gain beside the exposure, stops",
+        "White balance of the photographs of each camera, in stops",
         "Gains of the channels beside the exposure. In every photograph they average to 0, and so "
         "does each channel over the photographs: only differences can be known. Error bars: two "
         f"standard errors. Furthest from neutral: {most['image']}.",
@@ -242,10 +230,7 @@ def white_balance_section(run: RunFiles) -> str:
         known = ["" if errors is None else f" ± {e:.3f}" for e in errors or CHANNELS]
         each = [f"{gain:+.3f}{error}" for gain, error in zip(gains, known, strict=True)]
         cells.append([v["image"], v["camera"], *each])
-    names = ["photograph", "camera", *(f"{name}, stops" for name in CHANNELS)]
-    numbers = table(names, cells, numbers=range(2, len(names)), tall=True)
-    body += folded("Every photograph in numbers", numbers)
-    return body
+    return body + _every([f"{name}, stops" for name in CHANNELS], cells)
 
 
 def _triples(values) -> np.ndarray:
@@ -259,28 +244,21 @@ def gamma_section(run: RunFiles) -> str:
         return ""
     level = MODELS[run.photometry["model"]].gamma if run.photometry["model"] in MODELS else "view"
     if level is None or np.ptp(found) < 1e-3:
-        body = paragraph(
+        return paragraph(
             f"Gamma was not modelled: it is {np.mean(found):.2f} in all views. Contrast that "
             "differs between photographs is left to the radiance."
         )
-        return body
 
     def curves(rows: list[ViewPhotometry], x: np.ndarray) -> list[Series]:
         errors = 2 * column(v.get("gamma_error") for v in rows)
         return [Series("", x, column(v["gamma"] for v in rows), charts.FOUND, errors)]
 
-    chart = _chart(
-        run,
-        curves,
-        y_label="gamma",
-        label="Gammas of the photographs of each camera",
-        band=GAMMA_SRGB,
-    )
     caption = (
         "Gamma turns the tone curve about mid-grey: above the line at 2.2 a photograph has less "
         "contrast than its curve alone. Error bars: two standard errors."
     )
-    return figure(chart, caption)
+    label = "Gammas of the photographs of each camera"
+    return _chart(run, curves, "gamma", label, caption, GAMMA_SRGB)
 
 
 def _stops(
@@ -312,12 +290,10 @@ def response_section(run: RunFiles) -> str:
     curves.append(Series("this run", own, VALUES, broad))
     curves.append(Series("sRGB", standard, VALUES, DASHED))
     apart = np.abs(own - standard)[VALUES > 0.05].max()
+    far = f"They are at most {apart:.2f} stops apart at values above 0.05."
     caption = "How exposed radiance becomes a value in the photograph. "
-    if apart < 0.01:
-        caption += "The curve of this run is sRGB's."
-    else:
-        caption += "Broad: this run; dashed: sRGB. They are at most "
-        caption += f"{apart:.2f} stops apart at values above 0.05."
+    same = "The curve of this run is sRGB's."
+    caption += same if apart < 0.01 else f"Broad: this run; dashed: sRGB. {far}"
     if differ:
         caption += " Dash-dotted and dotted: the smallest and the largest gamma of a view."
     chart = charts.response_chart(curves, label="Tone curve of this run against sRGB")
@@ -346,8 +322,7 @@ def responses_section(run: RunFiles) -> str:
         stops = _stops(np.repeat(VALUES[:, None], 3, 1), cfg, camera=k)
         several = len(camera.splines) > 1
         for c in range(len(camera.splines)):
-            named = [camera.name] if len(formations) > 1 else []
-            named += [CHANNELS[c]] if several else []
+            named = [camera.name] * (len(formations) > 1) + [CHANNELS[c]] * several
             label = " ".join(named) if len(formations) <= MOST_PANELS else ""
             color, line = (c, k) if several else (k, c)
             style = Style(COLORS[color % len(COLORS)], "", DASHES[line % len(DASHES)], width=1.6)
@@ -377,13 +352,12 @@ def vignetting_section(run: RunFiles) -> str:
     light = [100 * np.exp(log_vignetting(r**2, k, cfg)) for k in range(len(formations))]
     panels: list[tuple[str, Sequence[Series]]] = []
     if len(formations) > MOST_PANELS:
-        every = [Series("", 100 * r, v[:, c], PLAIN) for v in light for c in range(v.shape[1])]
+        every = [Series("", 100 * r, y, PLAIN) for v in light for y in v.T]
         panels.append((f"{len(formations)} cameras", every))
     for c, v in zip(formations, light, strict=True) if not panels else ():
-        series = [Series("", 100 * r, v[:, 0], PLAIN)]
-        if len(c.vignetting) > 1:
-            channels = zip(CHANNELS, v.T, LINES, strict=True)
-            series = [Series(name, 100 * r, y, line) for name, y, line in channels]
+        named = zip(CHANNELS, v.T, LINES, strict=True)
+        lines = named if len(c.vignetting) > 1 else [("", v[:, 0], PLAIN)]
+        series = [Series(name, 100 * r, y, line) for name, y, line in lines]
         panels.append((f"camera {c.name}" if len(formations) > 1 else "", series))
     chart = charts.panels_chart(
         panels,

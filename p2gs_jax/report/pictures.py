@@ -109,9 +109,8 @@ def _clamped(image: np.ndarray) -> np.ndarray:
 
 
 def _element(kind: str, image: np.ndarray, alt: str) -> str:
-    codes = to_uint8(image)[..., ::-1]
     options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if kind == "jpeg" else []
-    good, data = cv2.imencode(".jpg" if kind == "jpeg" else ".png", codes, options)
+    good, data = cv2.imencode(f".{kind}", to_uint8(image)[..., ::-1], options)
     assert good
     encoded = base64.b64encode(data.tobytes()).decode("ascii")
     (h, w), alt = image.shape[:2], html.escape(alt)
@@ -145,12 +144,10 @@ def stop_shares(
     low, high = (round(v) for v in STOPS)
     whole = np.clip(np.floor(stops(np.nan_to_num(linear), middle)), low, high - 1).astype(int)
     counts = np.bincount((whole - low).ravel(), minlength=high - low) / whole.size
-    out = []
-    for stop in range(high - 1, low - 1, -1):
-        level = np.full((1, 1, 3), middle * 2.0 ** (stop + 0.5), np.float32)
-        red, green, blue = (float(v) for v in false_color(level, middle)[0, 0])
-        out.append((stop, float(counts[stop - low]), (red, green, blue)))
-    return out
+    steps = np.arange(high - 1, low - 1, -1)
+    levels = np.repeat(middle * 2.0 ** (steps[None, :, None] + 0.5), 3, -1).astype(np.float32)
+    colors = map(tuple, false_color(levels, middle)[0].tolist())
+    return list(zip(steps.tolist(), counts[::-1].tolist(), colors, strict=True))
 
 
 def dynamic_range(linear: Float[np.ndarray, "h w 3"]) -> float:
@@ -191,11 +188,8 @@ def comparison_section(comparisons: Sequence[ViewComparison], total: int) -> str
             difference = signed_difference(s.render, s.photograph)
         else:
             difference = np.full_like(s.render, 0.5)
-        cells = [
-            (jpeg(s.photograph, f"Photograph {s.name}"), "Photograph"),
-            (jpeg(s.render, f"Render of {s.name}"), "Render"),
-            (jpeg(difference, f"Difference at {s.name}"), "Difference"),
-        ]
+        shown = {"Photograph": s.photograph, "Render of": s.render, "Difference at": difference}
+        cells = [(jpeg(p, f"{what} {s.name}"), what.split()[0]) for what, p in shown.items()]
         body += f"<h3>{text(without_suffix(s.name))}{text(score)}</h3>{row(cells, 'three')}"
     return body
 

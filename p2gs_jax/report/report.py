@@ -7,16 +7,12 @@ from pathlib import Path
 
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.report import findings, pictures
+from p2gs_jax.report import measurements as scenes
 from p2gs_jax.report import page as html
 from p2gs_jax.report import photometry_sections as photometry
 from p2gs_jax.report import run_sections as sections
 from p2gs_jax.report.findings import RunWarning, count, duration, run_warnings
-from p2gs_jax.report.measurements import (
-    SceneMeasurements,
-    measure_scene,
-    seam_medians,
-    seam_section,
-)
+from p2gs_jax.report.measurements import SceneMeasurements
 from p2gs_jax.report.page import check_place, listed, page, paragraph, text
 from p2gs_jax.report.run_files import RunFiles, read_run
 
@@ -33,22 +29,16 @@ def write_report(
 ) -> Path:
     """Write one page about a run, which needs no other file and no network; return its path.
 
-    Args:
-        folder: of the run.
-        out: the page; None: `report.html` in the folder.
-        scene: where the run's scene lies now; None: where it was.
-        render: load the scene and render for the seams; False uses only what the folder holds.
-        reporter: receives progress.
-
-    Raises:
-        UserError: it is not a run folder, or the page cannot be written.
+    The page is `report.html` in the folder unless `out` names another. `scene` is where the run's
+    scene lies now (None: where it was). Without `render` the page has only what the folder holds,
+    and no seams. A UserError says that it is not a run folder, or that the page cannot be written.
     """
     reporter = reporter or Silent()
     folder = Path(folder)
     run = read_run(folder, None if scene is None else Path(scene))
     path = folder / "report.html" if out is None else Path(out)
     check_place(path)
-    measured = measure_scene(run, reporter, render=render)
+    measured = scenes.measure_scene(run, reporter, render=render)
     reporter.stage("Drawing")
     html.write_page(path, report_page(run, measured))
     return path
@@ -71,7 +61,7 @@ def report_page(run: RunFiles, scene: SceneMeasurements) -> str:
         ("response", "Tone curve", photometry.response_section(run)),
         ("responses", "Responses of cameras", photometry.responses_section(run)),
         ("vignetting", "Vignetting", photometry.vignetting_section(run)),
-        ("seams", "Seams before and after", seam_section(scene)),
+        ("seams", "Seams before and after", scenes.seam_section(scene)),
         ("views", kind, pictures.comparison_section(views, len(run.held_out))),
         ("unexplained", "What no static scene explains", unexplained),
         ("hdr", "Radiance in stops", pictures.hdr_section(run, views)),
@@ -83,8 +73,8 @@ def report_page(run: RunFiles, scene: SceneMeasurements) -> str:
         ("timings", "Timings and counts", sections.timing_section(run)),
         ("configuration", "Configuration", sections.configuration_section(run)),
     ]
-    name = run.scene.name or run.folder.resolve().name
-    under = f"A fit with the preset {run.preset}, in {run.folder.resolve().name}/"
+    folder = run.folder.resolve().name
+    name, under = run.scene.name or folder, f"A fit with the preset {run.preset}, in {folder}/"
     head = f"<h1>{text(name)}</h1>\n{paragraph(under, 'quiet')}"
     head += "".join(paragraph(s, "lead") for s in findings.summary_sentences(run, scene))
     head += html.key_numbers(list(_key_numbers(run, scene, found)))
@@ -95,17 +85,17 @@ def _key_numbers(
     run: RunFiles, scene: SceneMeasurements, found: list[RunWarning]
 ) -> Iterator[tuple[str, str, str]]:
     held_out, train = run.number("test", "exposure_fitted", "psnr"), run.number("train", "psnr")
-    if held_out is not None:
-        yield "Held-out PSNR", f"{held_out:.1f} dB", "exposure fitted to each"
-    if train is not None:
-        yield "Training PSNR", f"{train:.1f} dB", "own exposures"
-    span, error = findings.exposure_span(run), findings.true_error(run, scene.true_exposures)
-    if span is not None:
-        yield "Exposures span", f"{span:.1f}", "stops, training views"
-    if error is not None:
-        yield "Exposure error", f"{error['ev']:.3f}", "stops RMS, truth known"
+    error = findings.true_error(run, scene.true_exposures)
+    for name, value, form, remark in (
+        ("Held-out PSNR", held_out, "{:.1f} dB", "exposure fitted to each"),
+        ("Training PSNR", train, "{:.1f} dB", "own exposures"),
+        ("Exposures span", findings.exposure_span(run), "{:.1f}", "stops, training views"),
+        ("Exposure error", error and error["ev"], "{:.3f}", "stops RMS, truth known"),
+    ):
+        if value is not None:
+            yield name, form.format(value), remark
     if scene.seams:
-        before, after = seam_medians(scene.seams)
+        before, after = scenes.seam_medians(scene.seams)
         pairs = count(len(scene.seams), "pair")
         yield "Seams", f"{before:.2f} → {after:.2f}", f"stops, median of {pairs}"
     gaussians, steps = run.number("counts", "gaussians"), run.number("counts", "steps")

@@ -30,20 +30,12 @@ class HeldOutFiles(NamedTuple):
 
 @dataclass(frozen=True)
 class RunFiles:
-    """A run folder.
+    """A run folder, and what its files hold; what is missing is empty or None.
 
-    Attributes:
-        folder: where it lies.
-        scene: where the scene that it was fitted to lies, or lay.
-        given: the scene's place as the caller gave it, or None.
-        options: `config.json`, nested values.
-        cfg: the same as this version reads it, or None where it cannot.
-        metrics: `metrics.json`; empty where there is none.
-        photometry: `photometry.json`, or None.
-        log: lines of `log.jsonl` that hold a step.
-        held_out: held-out views in `renders/`, by name.
-        missing: sentences on what could not be read.
-        broken: names of files that exist but cannot be read.
+    The scene is where it lies, or lay; `given` is its place as the caller gave it. The options are
+    nested values of `config.json`, and `cfg` the same as this version reads them, or None where it
+    cannot. The log has the lines that hold a step. `missing` are sentences on what could not be
+    read, `broken` the names of files that exist but cannot be read.
     """
 
     folder: Path
@@ -123,15 +115,12 @@ def read_run(folder: Path, scene: Path | None = None) -> RunFiles:
         )
     missing: list[str] = []
     saved = _read_object(path, "the configuration", missing)
-    options = saved.get("fit")
-    options = options if isinstance(options, dict) else {}
-    cfg = None
+    options, cfg, photometry = part_at(saved, "fit"), None, None
     try:
         cfg = from_dict(options) if options else None
     except (TypeError, ValueError) as error:
         missing.append(f"config.json is of another version of this program ({error}).")
     metrics = _read_object(folder / "metrics.json", "the scores", missing)
-    photometry = None
     try:
         photometry = read_photometry(folder / "photometry.json")
     except UserError as error:
@@ -181,8 +170,8 @@ def _find_held_out(folder: Path, names: list[str]) -> tuple[HeldOutFiles, ...]:
         # What `p2gs-jax render` wrote into renders/all is not a held-out view.
         if photograph.is_file() and (short in whole or not whole):
             exr = render.with_name(f"{stem}.exr")
-            exr = exr if exr.is_file() else None
-            out.append(HeldOutFiles(whole.get(short, short), photograph, render, exr))
+            files = photograph, render, exr if exr.is_file() else None
+            out.append(HeldOutFiles(whole.get(short, short), *files))
     return tuple(out)
 
 
@@ -192,10 +181,8 @@ def _read_object(path: Path, what: str, missing: list[str]) -> dict[str, Any]:
         value = parse_json(path.read_text(encoding="utf-8"))
         why = f"{path.name} does not hold an object: {what} cannot be shown."
     except FileNotFoundError:
-        value, why = (
-            None,
-            f"{path.name} is missing: {what} cannot be shown. The run is not finished.",
-        )
+        value = None
+        why = f"{path.name} is missing: {what} cannot be shown. The run is not finished."
     except (OSError, ValueError) as error:
         value, why = None, f"{path.name} cannot be read: {what} cannot be shown ({error})."
     if isinstance(value, dict):

@@ -175,9 +175,8 @@ def unexplained_section(run: RunFiles, problems: list[str]) -> str:
         "more than the noise of that view, and more than the same surfaces do at other times. "
         "That is what moves where nothing follows it, its shadow and its mirror image."
     )
-    by_view = run.part("unexplained", "per_view")
+    by_view, cells = run.part("unexplained", "per_view"), []
     shares = {name: number_at(by_view, name) or 0.0 for name in by_view}
-    cells = []
     for path in sorted(folder.rglob("*.png")):
         name = path.relative_to(folder).with_suffix("").as_posix()
         try:
@@ -189,10 +188,8 @@ def unexplained_section(run: RunFiles, problems: list[str]) -> str:
         cells.append((picture, f"{name}: {found[0]:.1%}" if found else name))
     body += "".join(row(cells[k : k + 2], "two") for k in range(0, len(cells), 2))
     rows = [[view, f"{s:.2%}"] for view, s in sorted(shares.items(), key=lambda item: -item[1])]
-    if rows:
-        every = table(["view", "share"], rows, numbers=(1,), tall=True)
-        body += folded("Every training view", every)
-    return body
+    every = table(["view", "share"], rows, numbers=(1,), tall=True)
+    return body + (folded("Every training view", every) if rows else "")
 
 
 def training_section(run: RunFiles) -> str:
@@ -206,19 +203,13 @@ def training_section(run: RunFiles) -> str:
         return column(number_at(r, *path) for r in log)
 
     terms = sorted({name for r in log for name in r.get("terms") or {}})
-    values = {name: over_steps("terms", name) for name in terms}
-    known = [n for n in terms if np.isfinite(values[n]).any()]
-    ranked = sorted(known, key=lambda n: -np.nanmedian(values[n]))[:MOST_TERMS]
+    values = {n: v for n in terms if np.isfinite(v := over_steps("terms", n)).any()}
+    ranked = sorted(values, key=lambda n: -np.nanmedian(values[n]))[:MOST_TERMS]
     losses = {"loss": over_steps("loss")} | {n.replace("_", " "): values[n] for n in ranked}
-    marks = _marks(run, log)
-    chart = training_chart(
-        over_steps("step"),
-        over_steps("psnr"),
-        {n: np.where(v > 0, v, np.nan) for n, v in losses.items()},
-        over_steps("gaussians"),
-        marks,
-        label="PSNR, loss and Gaussians over the steps of the run",
-    )
+    losses = {n: np.where(v > 0, v, np.nan) for n, v in losses.items()}
+    steps, psnr, gaussians = (over_steps(name) for name in ("step", "psnr", "gaussians"))
+    marks, label = _marks(run, log), "PSNR, loss and Gaussians over the steps of the run"
+    chart = training_chart(steps, psnr, losses, gaussians, marks, label=label)
     caption = (
         "From log.jsonl; lines are running medians, the pale one is each entry. Entries average a "
         "few training views, so they scatter with how hard these are."
@@ -254,11 +245,9 @@ def timing_section(run: RunFiles) -> str:
         run.number("seconds", name)
         for name in ("total_until_evaluation", "optimisation", "evaluation_and_files")
     )
-    start = None
-    if before is not None and optimisation is not None and before >= optimisation:
-        start = before - optimisation
+    start = None if before is None or optimisation is None else before - optimisation
     spent = {
-        "Reading, exposures, seeds": start,
+        "Reading, exposures, seeds": None if start is None or start < 0 else start,
         "Optimisation, with compiling": optimisation,
         "Judging and writing files": after,
         "In all": seconds_of(run),
@@ -269,8 +258,7 @@ def timing_section(run: RunFiles) -> str:
         rows.append(["Steps", f"{steps:,.0f}, {1e3 * step:.0f} ms each"])
     counts = {name: run.number("counts", key) for key, name in COUNTS.items()}
     rows += [[name, f"{value:,.0f}"] for name, value in counts.items() if value is not None]
-    body = table(["", ""], rows, numbers=(1,)) if rows else ""
-    return body
+    return table(["", ""], rows, numbers=(1,)) if rows else ""
 
 
 def configuration_section(run: RunFiles) -> str:
@@ -287,13 +275,11 @@ def configuration_section(run: RunFiles) -> str:
         if option_text(value) != option_text(base.get(name))
     ]
     body = paragraph(f"Preset {run.preset}. Scene: {run.scene}.")
-    if differs and base:
-        body += table(["option", "here", "in the preset"], differs)
-    elif base:
-        body += paragraph("All options are the preset's.")
+    if base:
+        same = paragraph("All options are the preset's.")
+        body += table(["option", "here", "in the preset"], differs) if differs else same
     dump = text(json.dumps(run.options, indent=2))
-    body += folded("The whole configuration (config.json)", f'<pre tabindex="0">{dump}</pre>')
-    return body
+    return body + folded("The whole configuration (config.json)", f'<pre tabindex="0">{dump}</pre>')
 
 
 def flat(options: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -42,10 +42,8 @@ class CheckpointStore:
     def save(self, step: int, tree: Any, meta: dict) -> None:
         """Write a checkpoint; an interruption leaves the previous ones as they were.
 
-        Args:
-            step: its number; one that exists already is left alone.
-            tree: any pytree of arrays; None and static fields come from `like` on restoring.
-            meta: JSON values; scalars and arrays of numpy and jax become plain ones.
+        One that exists already is left alone. The tree is any pytree of arrays: None and static
+        fields come from `like` on restoring. In `meta`, scalars and arrays become plain values.
 
         Raises:
             TypeError: `meta` holds something else.

@@ -82,30 +82,14 @@ class PhotometryFile(TypedDict):
     views: list[ViewPhotometry]
 
 
-def write_photometry(
-    path: Path,
-    *,
-    model: str,
-    curve: dict,
-    gauge: str,
-    mean: dict,
-    views: list[ViewPhotometry],
-    cameras: Sequence[CameraPhotometry] = (),
-) -> None:
-    """Write `photometry.json` atomically.
+def write_photometry(path: Path, **values: Any) -> None:
+    """Write `photometry.json` atomically; values are the fields of a `PhotometryFile`.
 
     Raises:
-        ValueError: a view lacks a field.
+        ValueError: a field is missing, or a view lacks one.
     """
-    data = {
-        "version": VERSION,
-        "model": model,
-        "curve": curve,
-        "gauge": gauge,
-        "mean": mean,
-        "cameras": list(cameras),
-        "views": views,
-    }
+    given = {"version": VERSION, "cameras": [], **values}
+    data = {name: given[name] for name in PhotometryFile.__annotations__ if name in given}
     if problem := _problem(data):
         raise ValueError(problem)
     write_json(path, data)

@@ -2,8 +2,8 @@
 
 `scene.npz` has cameras, points and tracks. Photographs are not in it; where they lie is kept
 relative to the scene's folder, or to the run's where its cache holds them (frames of a video,
-developed raw files). `objects.npz` says which Gaussians belong to which moving object of the scene,
-with corrections of the objects' poses; runs in which nothing moves have no such file.
+developed raw files). `objects.npz` says which Gaussians belong to which moving object of the scene;
+runs in which nothing moves have no such file.
 """
 
 from __future__ import annotations

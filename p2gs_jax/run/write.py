@@ -12,11 +12,11 @@ import numpy as np
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.numerics import evenly_spaced
-from p2gs_jax.evaluation.evaluate import ViewResult
+from p2gs_jax.evaluation.scores import ViewResult
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.frames import write_png
 from p2gs_jax.formats.ply import write_ply, write_radiance
-from p2gs_jax.gaussians.bake import bake, display_comments, display_of_splats
+from p2gs_jax.gaussians.bake import bake, display_comments
 from p2gs_jax.gaussians.posed import posed
 from p2gs_jax.photometry.display import develop, usual_display
 from p2gs_jax.photometry.metering import Metering
@@ -65,24 +65,15 @@ def write_run(
     unknown: Sequence[str] = (),
     solution: PhotometricSolution | None = None,
     shown: Sequence[ViewResult] = (),
-    true_ev: np.ndarray | None = None,
+    true_exposures: Mapping[str, float] | None = None,
 ) -> None:
     """Write the scene, the Gaussians, the photometry and the summary, for `load_run` to open.
 
-    Args:
-        folder: of the run; created.
-        params: live Gaussians and photometry.
-        scene: its views.
-        cfg: what the fit computed under.
-        owner: the moving object that each Gaussian belongs to, a row of `moving`.
-        moving: these objects, with their poses.
-        metering: what explains the exposures, from an evaluation.
-        decisions: of a fit that wrote no `config.json`: it is written as well.
-        fitted: exposures solved for held-out views, by row.
-        unknown: names of photographs that tell no exposure.
-        solution: what the fit started from.
-        shown: views of the summary; none: there is no summary.
-        true_ev: true exposures of the training views for the plot, stops.
+    The Gaussians are the live ones; `owner` has the row in `moving` of the object that each belongs
+    to, and `cfg` is what the fit computed under. `decisions` are given by a fit that wrote no
+    `config.json`: it is written as well. Exposures `fitted` to held-out views go by row, `unknown`
+    has the names of photographs that tell none, and true exposures by image name are for the plot.
+    Without `shown` there is no summary.
     """
     if not isinstance(folder, RunFolder):
         folder = RunFolder(Path(folder))
@@ -107,7 +98,7 @@ def write_run(
     if kind is not None:
         write_appearance(folder.appearance(kind), params.appearance, scene.training_views)
     if shown:
-        _write_summary(folder.summary, shown, params, scene, cfg, true_ev)
+        _write_summary(folder.summary, shown, params, scene, cfg, true_exposures)
 
 
 def write_view(folder: Path, name: str, result: ViewResult, store: ImageStore) -> None:
@@ -144,7 +135,7 @@ def _write_models(
 ) -> None:
     """Write `splats.ply` (display colours) and `radiance.ply` (linear)."""
     alive = np.ones(params.gaussians.capacity, bool)
-    transform = display_of_splats(usual_display(params, (), None, cfg.photometry))
+    transform = usual_display(params, (), None, cfg.photometry).without_place()
     placed = params.gaussians
     if owner is not None and moving is not None:
         placed = posed(placed, owner, *moving.poses(middle_time(scene)))
@@ -160,7 +151,7 @@ def _write_summary(
     params: Params,
     scene: Scene,
     cfg: FitConfig,
-    true_ev: np.ndarray | None,
+    true_exposures: Mapping[str, float] | None,
 ) -> None:
     common = usual_display(params, (), None, cfg.photometry)
     common = dataclasses.replace(common, backdrop=shown[0].transform.backdrop)
@@ -174,7 +165,9 @@ def _write_summary(
         names=[f"{scene.views[v.index].name} ({scene.views[v.index].split})" for v in shown],
         exposures_ev=np.log2(jax.tree.map(np.asarray, params.photometry).exposures),
         cameras=[v.camera for v in train],
-        true_ev=true_ev,
+        true_ev=None
+        if true_exposures is None
+        else np.log2([true_exposures[view.name] for view in train]),
         exif_ev=None
         if all(e is None for e in exif)
         else np.array([np.nan if e is None else e for e in exif]),

@@ -72,7 +72,9 @@ def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
     skipped = set(missing)
     images = [image for image in images if image.name not in skipped]
 
-    fallback = _camera_names(images)
+    uses = Counter(image.camera_id for image in images)
+    # A model with one camera per image does not identify the same ones.
+    alone = len(uses) > 1 and max(uses.values()) == 1
     views, resized = [], []
     for image in images:
         camera, path = model.cameras[image.camera_id], place / image.name
@@ -81,14 +83,20 @@ def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
         K, width, height = at_file_size(path, K, size, model.file("cameras"))
         if (width, height) != size:
             resized.append(f"{width}x{height} instead of {camera.width}x{camera.height}")
-        name = subfolder(image.name) or fallback[image.camera_id]
-        viewmat = _viewmat(image, model.file("images"))
-        views.append(View(image.name, path, name, viewmat, K, width, height, distortion))
+        name = subfolder(image.name) or ("0" if alone else str(image.camera_id))
+        finite = (np.abs([*image.qvec, *image.tvec]) < HUGE).all()
+        norm = np.linalg.norm(image.qvec) if finite else 0.0
+        if norm < 1e-6:
+            why = f"the pose of {image.name} is not finite"
+            raise broken(f"{model.file('images')}:", why, _FIX)
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = Rotation.from_quat(np.roll(image.qvec / norm, -1)).as_matrix()
+        viewmat[:3, 3] = image.tvec
+        pose = viewmat.astype(np.float32)
+        views.append(View(image.name, path, name, pose, K, width, height, distortion))
     if resized:
-        note = (
-            f"{len(resized)} images have another size than their camera (the first: {resized[0]})"
-        )
-        notes.append(f"{note}: intrinsics were rescaled")
+        note = f"{len(resized)} images have another size than their camera (the first: "
+        notes.append(f"{note}{resized[0]}): intrinsics were rescaled")
     others = sorted(p.name for p in folder.parent.iterdir() if p != folder and is_model(p))
     if folder.name == "0" and others:
         notes.append(f"used the model {folder}; beside it lie {', '.join(others)}, not used")
@@ -132,13 +140,6 @@ def subfolder(name: str) -> str | None:
     return parts[0] if len(parts) > 1 else None
 
 
-def _camera_names(images: Sequence[ImageRecord]) -> dict[int, str]:
-    """Name cameras by id; a model with one camera per image does not identify the same ones."""
-    uses = Counter(image.camera_id for image in images)
-    alone = len(uses) > 1 and max(uses.values()) == 1
-    return {camera: "0" if alone else str(camera) for camera in uses}
-
-
 def _check_model(model: Model) -> None:
     if not model.cameras:
         raise broken(model.file("cameras"), "holds no cameras", _FIX)
@@ -168,17 +169,6 @@ def _find_images(root: Path, folder: Path, images: Sequence[ImageRecord]) -> Pat
         return root
     why = f"has no image folder: looked for {', '.join(map(str, places))}"
     raise broken(f"the COLMAP model {folder}", why, "name the folder with --images")
-
-
-def _viewmat(image: ImageRecord, path: Path) -> Float[np.ndarray, "4 4"]:
-    finite = (np.abs([*image.qvec, *image.tvec]) < HUGE).all()
-    norm = np.linalg.norm(image.qvec) if finite else 0.0
-    if norm < 1e-6:
-        raise broken(f"{path}:", f"the pose of {image.name} is not finite", _FIX)
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = Rotation.from_quat(np.roll(image.qvec / norm, -1)).as_matrix()
-    viewmat[:3, 3] = image.tvec
-    return viewmat.astype(np.float32)
 
 
 def _lens(path: Path, camera: CameraRecord) -> tuple[Float[np.ndarray, "3 3"], Distortion | None]:

@@ -78,21 +78,18 @@ def _read(path: Path) -> dict[str, float]:
         raise broken(path, why, f"it needs `image` and one of {', '.join(KINDS)}")
     out = {}
     for number, row in enumerate(rows, 2):
-        if (row[kind] or "").strip():
-            out[(row[name] or "").strip()] = _log_exposure(row[kind], kind, path, number)
-    return out
-
-
-def _log_exposure(text: str, kind: str, path: Path, line: int) -> float:
-    try:
-        value = float(text)
-        if kind.endswith("ev"):
-            log = value * LN2
-        else:
+        if not (text := row[kind] or "").strip():
+            continue
+        try:
+            value = float(text)
+        except ValueError:
+            value = np.nan
+        if not kind.endswith("ev"):
             log = float(np.log(value)) if value > 0 else np.nan
-    except ValueError:
-        log = np.nan
-    if not np.isfinite(log):
-        fix = "write a finite number, above 0 for exposures"
-        raise broken(f"{path}, line {line}:", f"{kind} is {text!r}.", fix)
-    return log
+        else:
+            log = value * LN2
+        if not np.isfinite(log):
+            fix = "write a finite number, above 0 for exposures"
+            raise broken(f"{path}, line {number}:", f"{kind} is {text!r}.", fix)
+        out[(row[name] or "").strip()] = log
+    return out

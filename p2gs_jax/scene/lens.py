@@ -7,7 +7,7 @@ where centres lie, so points need no shift; only OpenCV's *rasters* (remap) do, 
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -64,14 +64,9 @@ def undistort_points(
         for _ in range(_MOST_ROUNDS):
             before, (x, y) = untilted, _radially_undone(untilted, distortion, rough=True).T
             square = x * x + y * y
-            tangential = np.stack(
-                [
-                    2 * p1 * x * y + p2 * (square + 2 * x * x),
-                    p1 * (square + 2 * y * y) + 2 * p2 * x * y,
-                ],
-                axis=1,
-            )
-            untilted = distorted - tangential
+            along = 2 * p1 * x * y + p2 * (square + 2 * x * x)
+            across = p1 * (square + 2 * y * y) + 2 * p2 * x * y
+            untilted = distorted - np.stack([along, across], axis=1)
             if np.abs(untilted - before).max() < _SETTLED:
                 break
     straight = _radially_undone(untilted, distortion)
@@ -105,15 +100,11 @@ def undistortion_maps(
     return map_x, map_y
 
 
-class _Profile(NamedTuple):
-    """A lens along a radius: n(x) / d(x), of x = r or the angle, and up to which x it grows."""
+def _profile(distortion: Distortion) -> tuple[Polynomial, Polynomial, float]:
+    """Return n and d of a lens along a radius, n(x) / d(x), and up to which x it grows.
 
-    n: Polynomial
-    d: Polynomial
-    limit: float
-
-
-def _profile(distortion: Distortion) -> _Profile:
+    The x is the radius, or the angle of a fisheye.
+    """
     x, one = Polynomial([0.0, 1.0]), Polynomial([1.0])
     if distortion.model == "fisheye":
         k1, k2, k3, k4 = distortion.coefficients
@@ -124,7 +115,7 @@ def _profile(distortion: Distortion) -> _Profile:
         n = x * Polynomial([1.0, 0.0, c[0], 0.0, c[1], 0.0, c[4]])
         d = Polynomial([1.0, 0.0, c[5], 0.0, c[6], 0.0, c[7]])
     # The slope's sign is that of its numerator; where d vanishes the radius is infinite.
-    return _Profile(n, d, min(_first_root(n.deriv() * d - n * d.deriv()), _first_root(d)))
+    return n, d, min(_first_root(n.deriv() * d - n * d.deriv()), _first_root(d))
 
 
 def _first_root(polynomial: Polynomial) -> float:
@@ -139,7 +130,7 @@ def _first_root(polynomial: Polynomial) -> float:
 
 def _fold_radius(distortion: Distortion) -> float:
     """Return the undistorted radius at which the distorted one stops growing."""
-    limit = _profile(distortion).limit
+    _, _, limit = _profile(distortion)
     if distortion.model == "radial":
         return limit
     return float(np.tan(limit)) if limit < np.pi / 2 else float("inf")

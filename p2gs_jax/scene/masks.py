@@ -52,10 +52,7 @@ def mask_of(view: View) -> Path | None:
 
 def image_folder_of(view: View) -> Path:
     """Return the folder that the name of a view is relative to."""
-    folder = view.image_path
-    for _ in Path(view.name).parts:
-        folder = folder.parent
-    return folder
+    return view.image_path.parents[len(Path(view.name).parts) - 1]
 
 
 def background_color(cfg: DataConfig) -> Float32[np.ndarray, " 3"]:
@@ -71,10 +68,8 @@ def background_color(cfg: DataConfig) -> Float32[np.ndarray, " 3"]:
     except ValueError:
         color = np.zeros(0, np.float32)
     if color.shape != (3,) or not ((color >= 0) & (color <= 1)).all():
-        raise UserError(
-            f"--background {cfg.background} is not a valid colour",
-            fix="use white, black, random, or display values from 0 to 1: --background 0.5,0.5,0.5",
-        )
+        fix = "use white, black, random, or display values from 0 to 1: --background 0.5,0.5,0.5"
+        raise UserError(f"--background {cfg.background} is not a valid colour", fix=fix)
     return color
 
 

@@ -42,10 +42,8 @@ _FIRST = 6
 class Motion:
     """How far a frame is from the reference, in longer sides of the picture.
 
-    Attributes:
-        displacement: median displacement of the corners.
-        parallax: upper quartile of what the best rotation leaves of it.
-        kept: share of the reference's corners that are still seen.
+    `displacement` is the median of the corners', `parallax` the upper quartile of what the best
+    rotation leaves of it, `kept` the share of the reference's corners that are still seen.
     """
 
     displacement: float
@@ -68,15 +66,8 @@ class Chosen:
 def normalised(grey: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
     """Return a frame of fixed mean and contrast: automatic exposure must not look like motion."""
     values = grey.astype(np.float32)
-    deviation = max(float(values.std()), 1.0)
-    return np.clip((values - values.mean()) * (_CONTRAST / deviation) + _MID, 0, 255).astype(
-        np.uint8
-    )
-
-
-def sharpness(grey: UInt8[np.ndarray, "h w"]) -> float:
-    """Return the power of a normalised frame's finest details; compares frames of one place."""
-    return float(cv2.Laplacian(grey, cv2.CV_32F).var())
+    gain = _CONTRAST / max(float(values.std()), 1.0)
+    return np.clip((values - values.mean()) * gain + _MID, 0, 255).astype(np.uint8)
 
 
 class Tracker:
@@ -106,12 +97,9 @@ class Tracker:
         if len(self._now) < _FEWEST:
             return Motion(1.0, 1.0, 0.0)
         side = max(grey.shape)
-        ways = np.linalg.norm(self._now - self._start, axis=1)
-        return Motion(
-            float(np.median(ways)) / side,
-            _parallax(self._start, self._now, grey.shape),
-            len(self._now) / self._count,
-        )
+        way = float(np.median(np.linalg.norm(self._now - self._start, axis=1))) / side
+        parallax = _parallax(self._start, self._now, grey.shape)
+        return Motion(way, parallax, len(self._now) / self._count)
 
 
 def _parallax(
@@ -160,15 +148,18 @@ def choose_frames(frames: Iterable[tuple[int, UInt8[np.ndarray, "h w"]]]) -> lis
         return max(one.sharpness for one, _ in waiting) >= _BLURRED * chosen[-1].sharpness
 
     def consider(tracker: Tracker, number: int, grey: np.ndarray, sharp: float) -> float:
+        """Keep a frame that may be chosen; return the share of the way; 1: one is due."""
         way = tracker.follow(grey)
-        share = progress(way)
+        lost = (1 - way.kept) / LOST
+        share = max(way.parallax / PARALLAX, way.displacement / DISPLACEMENT, lost)
         if share >= _CANDIDATE:
             waiting.append((Chosen(number, sharp, way), grey))
         return share
 
     for number, grey in frames:
         grey = normalised(grey)
-        sharp = sharpness(grey)
+        # The power of the finest details.
+        sharp = float(cv2.Laplacian(grey, cv2.CV_32F).var())
         if tracker is None:
             waiting.append((Chosen(number, sharp, None), grey))
             if len(waiting) == _FIRST:
@@ -180,12 +171,6 @@ def choose_frames(frames: Iterable[tuple[int, UInt8[np.ndarray, "h w"]]]) -> lis
     if waiting:
         take()
     return chosen
-
-
-def progress(way: Motion) -> float:
-    """Return how much of the way to the next photograph is behind; 1: it is due."""
-    lost = (1 - way.kept) / LOST
-    return max(way.parallax / PARALLAX, way.displacement / DISPLACEMENT, lost)
 
 
 def thinned(numbers: list[int], most: int) -> list[int]:

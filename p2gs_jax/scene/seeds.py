@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float32, UInt8
 
 from p2gs_jax.core.ply import read_table, refusing
 from p2gs_jax.core.streams import Stream, generator
@@ -108,10 +108,21 @@ def common_points(
     rng = generator(0, Stream.RANDOM_SEEDS)
     step = max(1, -(-len(views) // MOST_VIEWS))
     judges = views[::step]
+    sizes = np.array([(v.width, v.height) for v in views], float)
+    Ks = np.stack([v.K for v in views]).astype(np.float64)
+    viewmats = np.stack([v.viewmat for v in views]).astype(np.float64)
     kept: list[np.ndarray] = []
     best, found = 0, 0
     for _ in range(_ROUNDS):
-        points = _drawn(views, near, far, count, rng)
+        # Random points in front of random views.
+        rows = rng.integers(len(views), size=count)
+        share = rng.random((count, 2))
+        depth = 1 / rng.uniform(1 / far, 1 / near, count)
+        K = Ks[rows]
+        xy = (share * sizes[rows] - K[:, :2, 2]) / np.stack([K[:, 0, 0], K[:, 1, 1]], 1)
+        local = np.concatenate([xy, np.ones((count, 1))], 1) * depth[:, None]
+        poses = viewmats[rows]
+        points = np.einsum("nji,nj->ni", poses[:, :3, :3], local - poses[:, :3, 3])
         seen = np.zeros(len(points), int)
         for view in judges:
             seen += in_frame(*project_points(points, view), view.width, view.height)
@@ -122,18 +133,3 @@ def common_points(
         if found >= count:
             break
     return np.concatenate(kept)[:count].astype(np.float32)
-
-
-def _drawn(
-    views: Sequence[View], near: float, far: float, count: int, rng: np.random.Generator
-) -> Float[np.ndarray, "n 3"]:
-    """Return random points in front of random views."""
-    rows = rng.integers(len(views), size=count)
-    share = rng.random((count, 2))
-    depth = 1 / rng.uniform(1 / far, 1 / near, count)
-    sizes = np.array([(v.width, v.height) for v in views], float)[rows]
-    K = np.stack([v.K for v in views]).astype(np.float64)[rows]
-    viewmats = np.stack([v.viewmat for v in views]).astype(np.float64)[rows]
-    xy = (share * sizes - K[:, :2, 2]) / np.stack([K[:, 0, 0], K[:, 1, 1]], 1)
-    local = np.concatenate([xy, np.ones((count, 1))], 1) * depth[:, None]
-    return np.einsum("nji,nj->ni", viewmats[:, :3, :3], local - viewmats[:, :3, 3])

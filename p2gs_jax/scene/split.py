@@ -142,7 +142,13 @@ def split_as_listed(scene: Scene, lists: SplitLists, *, allow_missing: bool = Fa
     in two lists; or nothing is left to train on.
     """
     views, where, name, notes = scene.views, lists.where, lists.where.name, []
-    rows_of = _rows_by_name(views)
+    # The views that each end of a path may mean, with and without its suffix.
+    rows_of: dict[str, set[int]] = defaultdict(set)
+    for row, view in enumerate(views):
+        parts = view.image_path.as_posix().lstrip("/").split("/")
+        for tail in ("/".join(parts[start:]) for start in range(len(parts))):
+            rows_of[tail].add(row)
+            rows_of[tail.removesuffix(view.image_path.suffix)].add(row)
     found = [
         None if names is None else {n: _row(n, views, rows_of, where) for n in names}
         for names in (lists.train, lists.test)
@@ -208,18 +214,6 @@ def _lines(path: Path) -> tuple[str, ...]:
 
 def _normal(name: str) -> str:
     return PurePosixPath(name.replace("\\", "/")).as_posix()
-
-
-def _rows_by_name(views: Sequence[View]) -> dict[str, set[int]]:
-    """Return the views that each end of a path may mean, with and without its suffix."""
-    rows: dict[str, set[int]] = defaultdict(set)
-    for row, view in enumerate(views):
-        parts = view.image_path.as_posix().lstrip("/").split("/")
-        for start in range(len(parts)):
-            tail = "/".join(parts[start:])
-            rows[tail].add(row)
-            rows[tail.removesuffix(view.image_path.suffix)].add(row)
-    return rows
 
 
 def _row(name: str, views: Sequence[View], rows_of: dict[str, set[int]], where: Path) -> int | None:

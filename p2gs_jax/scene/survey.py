@@ -58,14 +58,11 @@ class SurveyedCamera:
 
 @dataclass(frozen=True)
 class Survey:
-    """What there is; `scene` is None for photographs alone.
+    """What there is; `scene` is None for photographs alone, `format` as in `DataConfig`.
 
-    Attributes:
-        format: as `DataConfig.format` names it.
-        frames: moments in a drive; `seconds` are from the first photograph to the last.
-        way: length of the way of the camera with the most photographs, scene units.
-        missing: photographs that the cameras lack in these frames.
-        lacks: what a drive may have and this scene lacks, in words.
+    A drive has `frames`, moments, of which the cameras lack `missing` photographs; `seconds` are
+    from the first to the last. The `way` is that of the camera with the most photographs, scene
+    units; `lacks` says in words what a drive may have and this scene lacks.
     """
 
     root: Path
@@ -116,10 +113,7 @@ def survey(root: Path, cfg: DataConfig, report: Report = lambda message: None) -
         sweeps = sum(first <= sweep.time <= last for sweep in found.sweeps)
     else:
         scene = found
-    return _survey_of(with_what_lies_beside(scene, cfg), frames, sweeps)
-
-
-def _survey_of(scene: Scene, frames: int | None, sweeps: int | None) -> Survey:
+    scene = with_what_lies_beside(scene, cfg)
     views, by_camera = scene.views, _by_camera(scene.views)
     times = [view.time for view in views if view.time is not None]
     lacking = {
@@ -130,13 +124,20 @@ def _survey_of(scene: Scene, frames: int | None, sweeps: int | None) -> Survey:
     }
     longest = camera_centers(_viewmats(max(by_camera.values(), key=len)))
     way = float(np.linalg.norm(np.diff(longest, axis=0), axis=1).sum())
-    cameras = tuple(_camera(name, taken) for name, taken in by_camera.items())
+    cameras = []
+    for name, taken in by_camera.items():
+        view, (focal, ev) = taken[0], (float(taken[0].K[0, 0]), _range([v.exif_ev for v in taken]))
+        across = float(np.rad2deg(2 * np.arctan(view.width / 2 / focal)))
+        lens = "" if view.distortion is None else view.distortion.model
+        bonnet = None if view.own_car is None else float(view.own_car.mean())
+        seen = (len(taken), (view.width, view.height), focal, across, lens, bonnet, ev)
+        cameras.append(SurveyedCamera(name, *seen))
     seconds = max(times) - min(times) if times else None
     missing = frames * len(by_camera) - len(views) if frames else 0
     lacks = tuple(what for what, absent in lacking.items() if absent)
     way = way if frames else None
-    found = (cameras, scene, frames, seconds, way, missing, sweeps, lacks)
-    return Survey(scene.root, scene.format, *found)
+    given = (tuple(cameras), scene, frames, seconds, way, missing, sweeps, lacks)
+    return Survey(scene.root, scene.format, *given)
 
 
 def _by_camera(views: Sequence[View]) -> dict[str, list[View]]:
@@ -147,16 +148,6 @@ def _by_camera(views: Sequence[View]) -> dict[str, list[View]]:
 
 def _viewmats(views: Sequence[View]) -> np.ndarray:
     return np.stack([view.viewmat for view in views]).astype(np.float64)
-
-
-def _camera(name: str, views: Sequence[View]) -> SurveyedCamera:
-    view = views[0]
-    size, focal = (view.width, view.height), float(view.K[0, 0])
-    across = float(np.rad2deg(2 * np.arctan(view.width / 2 / focal)))
-    lens = "" if view.distortion is None else view.distortion.model
-    bonnet = None if view.own_car is None else float(view.own_car.mean())
-    ev = _range([v.exif_ev for v in views])
-    return SurveyedCamera(name, len(views), size, focal, across, lens, bonnet, ev)
 
 
 def _range(values: Sequence[float | None]) -> tuple[float, float] | None:

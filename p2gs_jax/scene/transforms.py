@@ -204,7 +204,14 @@ def _assembled(root: Path, name: str, frames: Sequence[_Frame], cfg: DataConfig)
         missing = [frame.path.as_posix() for where, frame in listed if where is None]
         notes += check_missing(missing, len(listed), source, cfg)
     found = [(where, frame) for where, frame in located if where is not None]
-    _require_once(found)
+    twice = next((n for n, times in Counter(n for n, _ in found).items() if times > 1), None)
+    if twice is not None:
+        first, *_, last = (frame.source for name, frame in found if name == twice)
+        if first == last:
+            raise broken(first, f"lists {twice} more than once", _FIX)
+        why = f"both list {twice}: it cannot be both trained on and held out"
+        fix = f"take it out of one of them, or name {first} itself for every 8th view"
+        raise broken(f"{first} and {last.name}", why, fix)
     views, resized = [], 0
     for where, frame in sorted(found, key=lambda item: item[0]):
         view, differs = _view(frame, place, where)
@@ -215,21 +222,6 @@ def _assembled(root: Path, name: str, frames: Sequence[_Frame], cfg: DataConfig)
     return _scene(root, name, views, [*notes, *_rescaled(resized, sources)])
 
 
-def _require_once(found: Sequence[tuple[str, _Frame]]) -> None:
-    """Refuse photographs that are listed twice."""
-    twice = [name for name, n in Counter(name for name, _ in found).items() if n > 1]
-    if not twice:
-        return
-    sources = [frame.source for name, frame in found if name == twice[0]]
-    if len(set(sources)) == 1:
-        raise broken(sources[0], f"lists {twice[0]} more than once", _FIX)
-    raise broken(
-        f"{sources[0]} and {sources[1].name}",
-        f"both list {twice[0]}: it cannot be both trained on and held out",
-        f"take it out of one of them, or name {sources[0]} itself for every 8th view",
-    )
-
-
 def _require_one_shape(views: Sequence[View], frames: Mapping[str, _Frame]) -> None:
     """Refuse photographs of several shapes where only the photographs say which is right."""
     free = [v for v in views if not {"w", "h"} <= set(frames[v.name].values)]
@@ -237,13 +229,11 @@ def _require_one_shape(views: Sequence[View], frames: Mapping[str, _Frame]) -> N
         first = free[0]
         shapes = (view.width / view.height) / (first.width / first.height)
         if abs(shapes - 1) > ASPECT_TOLERANCE:
-            raise broken(
-                f"wrong size: {view.image_path}",
-                f"is {view.width}x{view.height}, {first.name} {first.width}x{first.height}, and "
-                f"{frames[view.name].source} gives all of them one lens",
-                "use the photographs that belong to the poses, neither cropped nor rotated, or "
-                'give frames their own "w", "h" and "fl_x"',
-            )
+            why = f"is {view.width}x{view.height}, {first.name} {first.width}x{first.height}, and "
+            why += f"{frames[view.name].source} gives all of them one lens"
+            fix = "use the photographs that belong to the poses, neither cropped nor rotated, or "
+            fix += 'give frames their own "w", "h" and "fl_x"'
+            raise broken(f"wrong size: {view.image_path}", why, fix)
 
 
 def _frames(path: Path, split: Split = "train") -> tuple[list[_Frame], dict[str, Any]]:

@@ -32,9 +32,6 @@ _SHORT = "film while walking around the thing"
 VIDEO_SUFFIXES = frozenset(
     {".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".ts", ".3gp", ".insv"}
 )
-# Codes of ITU-T H.273, in FFmpeg's numbers.
-_TRANSFERS: dict[int, icc.Transfer] = {16: "pq", 18: "hlg"}
-_PRIMARIES: dict[int, icc.Primaries] = {9: icc.BT2020, 12: icc.DISPLAY_P3}
 _BT601 = (0.299, 0.114)
 # Weights of red and blue in luma, by matrix.
 _LUMA = {1: (0.2126, 0.0722), 5: _BT601, 6: _BT601, 7: (0.212, 0.087), 9: (0.2627, 0.0593)}
@@ -65,7 +62,7 @@ class Frame:
     @property
     def transfer(self) -> icc.Transfer | None:
         """Transfer function, where it is one that gives light; None: a camera's own curve."""
-        return _TRANSFERS.get(int(self._decoded.color_trc))
+        return icc.TRANSFERS.get(int(self._decoded.color_trc))
 
     def grey(self, width: int) -> UInt8[np.ndarray, "h w"]:
         """Return it small and grey, not turned; its longer side has at most `width` pixels."""
@@ -79,7 +76,7 @@ class Frame:
     def codes(self) -> UInt[np.ndarray, "h w 3"]:
         """Return display values in sRGB, upright: of more than 8 bits, and of light, 16."""
         signal = _signal(self._decoded)
-        primaries = _PRIMARIES.get(int(self._decoded.color_primaries), icc.BT709)
+        primaries = icc.PRIMARIES.get(int(self._decoded.color_primaries), icc.BT709)
         if self.transfer is not None:
             light = icc.to_light(signal, self.transfer) @ icc.to_srgb_matrix(primaries).T
             codes = icc.encode_16(light)

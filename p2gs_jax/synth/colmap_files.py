@@ -20,14 +20,13 @@ _SEED_RANGE = 90.0  # m: farther points are not triangulated
 
 
 class DriveViews(NamedTuple):
-    """The photographs of a drive: sorted names, and the physical camera of each.
+    """The photographs of a drive: sorted names, which begin with the folder of the camera.
 
     `viewmats` are world-to-camera, OpenCV axes, m; K is that of all cameras, pixels, centres at
     +0.5.
     """
 
     names: Sequence[str]
-    cameras: Sequence[str]
     viewmats: Float64[np.ndarray, "v 4 4"]
     K: Float64[np.ndarray, "3 3"]
     width: int
@@ -41,22 +40,13 @@ def write_seeds(
     rgb: UInt8[np.ndarray, "p 3"],
     depths: Sequence[np.ndarray],
 ) -> dict[str, int]:
-    """Write the model of the points that two views see; return how many points and observations."""
-    xy, seen = observe_seeds(xyz, views, depths)
+    """Write the model of the points that two views see; return how many points and observations.
+
+    cameras.bin, images.bin and points3D.bin are as in https://colmap.github.io/format.html.
+    """
+    xy, seen = _observe_seeds(xyz, views, depths)
     kept = seen.sum(0) >= 2
-    write_colmap(folder, views, xyz[kept], rgb[kept], xy[:, kept], seen[:, kept])
-    return {"points": int(kept.sum()), "observations": int(seen[:, kept].sum())}
-
-
-def write_colmap(
-    folder: Path,
-    views: DriveViews,
-    xyz: Float[np.ndarray, "p 3"],
-    rgb: UInt8[np.ndarray, "p 3"],
-    xy: Float[np.ndarray, "v p 2"],
-    seen: Bool[np.ndarray, "v p"],
-) -> None:
-    """Write cameras.bin, images.bin, points3D.bin (https://colmap.github.io/format.html)."""
+    xyz, rgb, xy, seen = xyz[kept], rgb[kept], xy[:, kept], seen[:, kept]
     folder.mkdir(parents=True)
     ids = {camera: i + 1 for i, camera in enumerate(MOUNTS)}
     params = (views.K[0, 0], views.K[1, 1], views.K[0, 2], views.K[1, 2])
@@ -74,7 +64,7 @@ def write_colmap(
         which = np.flatnonzero(seen[row])
         keypoints = np.empty(len(which), keypoint)
         keypoints["xy"], keypoints["id"] = xy[row, which], which + 1
-        data.append(struct.pack("<I7dI", row + 1, *pose, ids[views.cameras[row]]))
+        data.append(struct.pack("<I7dI", row + 1, *pose, ids[name.split("/")[0]]))
         data.append(name.encode() + b"\0" + struct.pack("<Q", len(which)) + keypoints.tobytes())
     (folder / "images.bin").write_bytes(b"".join(data))
 
@@ -88,6 +78,7 @@ def write_colmap(
         data.append(struct.pack("<Q3d3Bd", p + 1, *xyz[p], *rgb[p].tolist(), 0.0))
         data.append(struct.pack("<Q", len(track)) + track.tobytes())
     (folder / "points3D.bin").write_bytes(b"".join(data))
+    return {"points": len(xyz), "observations": int(seen.sum())}
 
 
 def sample_seeds(
@@ -114,7 +105,7 @@ def sample_seeds(
     return np.concatenate(xyz), np.concatenate(rgb)
 
 
-def observe_seeds(
+def _observe_seeds(
     xyz: Float64[np.ndarray, "p 3"], views: DriveViews, depths: Sequence[np.ndarray]
 ) -> tuple[Float64[np.ndarray, "v p 2"], Bool[np.ndarray, "v p"]]:
     """Project the points into every view and tell where they are visible.

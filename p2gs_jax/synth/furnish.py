@@ -10,7 +10,7 @@ import numpy as np
 from p2gs_jax.core.streams import SceneStream, generator
 from p2gs_jax.synth import town as t
 from p2gs_jax.synth.settings import Layout
-from p2gs_jax.synth.town import Builder, Light, Material, Solid, Town, Vec3
+from p2gs_jax.synth.town import Builder, Light, Material, Town, Vec3
 
 # Length of the houses along one street, m; the next street begins there.
 STREET_M = 126.0
@@ -74,16 +74,12 @@ def _streets(seed: int, count: int) -> Builder:
     for number in range(count):
         street = Builder(generator(seed, SceneStream.BUILDINGS, number))
         _furnish(street, closed=number == count - 1)
-        whole.solids += [_moved(solid, number * STREET_M) for solid in street.solids]
+        way = number * STREET_M
+        for s in street.solids:
+            lo, hi, top = (s.lo[0] + way, *s.lo[1:]), (s.hi[0] + way, *s.hi[1:]), s.top
+            top = top and (top[0] + way, top[1] + way, *top[2:])
+            whole.solids.append(dataclasses.replace(s, lo=lo, hi=hi, top=top))
     return whole
-
-
-def _moved(solid: Solid, x: float) -> Solid:
-    """Return a solid moved along the street."""
-    (x0, y0, z0), (x1, y1, z1), top = solid.lo, solid.hi, solid.top
-    if top is not None:
-        top = (top[0] + x, top[1] + x, top[2], top[3])
-    return dataclasses.replace(solid, lo=(x0 + x, y0, z0), hi=(x1 + x, y1, z1), top=top)
 
 
 def _light(seed: int) -> Light:
@@ -91,8 +87,7 @@ def _light(seed: int) -> Light:
     rng = generator(seed, SceneStream.LIGHT)
     azimuth = np.deg2rad(rng.uniform(200.0, 340.0) if rng.random() < 0.5 else rng.uniform(20, 160))
     height = np.deg2rad(rng.uniform(35.0, 55.0))
-    flat = np.cos(height)
-    x, y, z = flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(height)
+    x, y, z = np.cos(height) * np.cos(azimuth), np.cos(height) * np.sin(azimuth), np.sin(height)
     return Light(sun_direction=(float(x), float(y), float(z)))
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from p2gs_jax.synth import town as t
 from p2gs_jax.synth.textures import (
     Point,
     Surface,
@@ -24,15 +25,7 @@ from p2gs_jax.synth.textures import (
     smooth,
     value_noise,
 )
-from p2gs_jax.synth.town import (
-    CROSS_STREET,
-    FLOOR_HEIGHT,
-    GROUND_FLOOR_HEIGHT,
-    KERB_HEIGHT,
-    ROAD_HALF_WIDTH,
-    Material,
-    Town,
-)
+from p2gs_jax.synth.town import Material, Town
 
 # Wavelengths of noise by material, m; others have the defaults of `_point`.
 _FINE = {Material.ROAD: 0.07, Material.PAVEMENT: 0.08, Material.FOLIAGE: 0.16, Material.BARK: 0.05}
@@ -139,7 +132,7 @@ def _brushes(
 def _road(s: Point, seed: int) -> Array:
     x, y = s.p[0], s.p[1]
     across = jnp.abs(y)
-    crossing = (x > CROSS_STREET[0] + 1.0) & (x < CROSS_STREET[1] - 1.0)
+    crossing = (x > t.CROSS_STREET[0] + 1.0) & (x < t.CROSS_STREET[1] - 1.0)
     tyre = jnp.exp(-((((across - 1.75) ** 2) - 0.75) ** 2) * 6.0)
     tone = 0.105 * (1.0 + 0.30 * s.coarse[0] + 0.22 * s.fine[0] + 0.10 * tyre * (~crossing))
     patch = hash1(jnp.floor(x / 3.1), jnp.floor(y / 1.9), 0.0 * x, seed + 5)
@@ -154,15 +147,15 @@ def _road(s: Point, seed: int) -> Array:
     bays = s.grid(x - 3.1, 6.5, 0.05) * s.bar(across - 4.5, 1.1)
     lines = jnp.maximum(jnp.maximum(dash, side), bays) * (~crossing)
     zebra = 0.0 * x
-    for start in (CROSS_STREET[0] - 5.2, CROSS_STREET[1] + 1.4):
+    for start in (t.CROSS_STREET[0] - 5.2, t.CROSS_STREET[1] + 1.4):
         stripes = s.grid(y, 1.0, 0.25) * s.bar(across, 5.3)
         band = s.bar(x - start - 1.8, 1.8)
         lines = lines * (1.0 - s.bar(x - start - 1.8, 3.4))
         zebra = jnp.maximum(zebra, stripes * band)
-    stop = s.bar(x - CROSS_STREET[0] + 6.4, 0.2) * s.bar(y + 2.0, 1.75)
+    stop = s.bar(x - t.CROSS_STREET[0] + 6.4, 0.2) * s.bar(y + 2.0, 1.75)
     marks = jnp.maximum(jnp.maximum(lines, zebra), stop)
     marks = marks * (0.88 - 0.5 * smooth(0.25, 0.75, s.fine[1] + 0.5 * s.coarse[2]))
-    gutter = s.bar(across - ROAD_HALF_WIDTH, 0.25) * (~crossing)
+    gutter = s.bar(across - t.ROAD_HALF_WIDTH, 0.25) * (~crossing)
     tone = tone * (1.0 - 0.35 * gutter)
     asphalt = tone * as_column((1.0, 0.985, 0.96))
     return asphalt + marks * (as_column((0.66, 0.65, 0.61)) - asphalt)
@@ -173,7 +166,7 @@ def _pavement(s: Point, seed: int) -> Array:
     shade = hash1(jnp.floor(x / 0.9), jnp.floor(y / 0.6), 0.0 * x, seed + 6)
     joint = jnp.minimum(s.grid(x, 0.9, 0.435), s.grid(y, 0.6, 0.285))
     visible = detail(s.footprint, jnp.float32(0.6))
-    kerb = jnp.abs(y) < ROAD_HALF_WIDTH + 0.25
+    kerb = jnp.abs(y) < t.ROAD_HALF_WIDTH + 0.25
     slabs = 1.0 + visible * (0.26 * (shade - 0.5) - 0.35 * (1.0 - joint))
     tone = jnp.where(kerb, 1.25 + 0.12 * s.fine[1], slabs)
     return s.color * tone * (1.0 + 0.14 * s.coarse[0] + 0.14 * s.fine[0])
@@ -219,24 +212,17 @@ def _normal(town: Town, p: Array, index: Array, lo: Array, hi: Array) -> Array:
 
 
 class _Bay(NamedTuple):
-    """Where on a wall points are, in bays and floors.
+    """Where on a wall points are, in bays and floors; lengths are in m."""
 
-    Attributes:
-        u: along the wall, m; `du`, `dz` from the middle of a bay and floor, of a width `cell`.
-        seen: number of the wall, which no other has.
-        draw: three random numbers a bay and floor.
-        half: half the width of a window, m; `frame`: tone of its frames.
-    """
-
-    u: Array
-    du: Array
-    dz: Array
-    cell: Array
+    u: Array  # along the wall
+    du: Array  # from the middle of a bay
+    dz: Array  # from the middle of a floor
+    cell: Array  # width of a bay
     length: Array
-    seen: Array
-    draw: Array
-    half: Array
-    frame: Array
+    seen: Array  # number of the wall, which no other has
+    draw: Array  # three random numbers a bay and floor
+    half: Array  # half the width of a window
+    frame: Array  # tone of its frames
 
 
 def _facade(s: Point, seed: int) -> tuple[Array, Array, Array]:
@@ -249,8 +235,8 @@ def _facade(s: Point, seed: int) -> tuple[Array, Array, Array]:
     cell = length / bays
     column = jnp.clip(jnp.floor(u / cell), 0.0, bays - 1.0)
     du = u - (column + 0.5) * cell
-    floor = jnp.floor((z - GROUND_FLOOR_HEIGHT) / FLOOR_HEIGHT)
-    dz = z - GROUND_FLOOR_HEIGHT - (floor + 0.5) * FLOOR_HEIGHT - 0.05
+    floor = jnp.floor((z - t.GROUND_FLOOR_HEIGHT) / t.FLOOR_HEIGHT)
+    dz = z - t.GROUND_FLOOR_HEIGHT - (floor + 0.5) * t.FLOOR_HEIGHT - 0.05
     seen = s.row.astype(jnp.float32) + 0.25 * along_y
     draw = hash3(column, floor, seen, seed + 20)
     half, frame = jnp.minimum(0.58, 0.3 * cell), jnp.where(s.random < 0.6, 0.62, 0.07)
@@ -258,7 +244,7 @@ def _facade(s: Point, seed: int) -> tuple[Array, Array, Array]:
     albedo, emission, gloss = _windows(s, bay, seed)
 
     # Ground floor: shop windows, doors, dark gateways, or plain windows in a rusticated base.
-    ground = z < GROUND_FLOOR_HEIGHT
+    ground = z < t.GROUND_FLOOR_HEIGHT
     shop = ground & (s.use > 0.3) & ~along_y
     base, light, shine = _shop(s, bay, shop, seed)
     albedo = jnp.where(shop, base, albedo)
@@ -282,9 +268,9 @@ def _windows(s: Point, bay: _Bay, seed: int) -> tuple[Array, Array, Array]:
     z, du, dz, draw, half_w, half_h = s.p[2], bay.du, bay.dz, bay.draw, bay.half, 0.92
     wall = s.color * _masonry(s, bay.u, z, seed)
     drip = jnp.exp(-jnp.abs(dz + 1.15) * 2.5) * jnp.clip(s.coarse[2] + 0.3, 0.0, 1.0)
-    grime = 1.0 - 0.22 * jnp.exp(-jnp.maximum(z - KERB_HEIGHT, 0.0) / 0.8) - 0.10 * drip
+    grime = 1.0 - 0.22 * jnp.exp(-jnp.maximum(z - t.KERB_HEIGHT, 0.0) / 0.8) - 0.10 * drip
     wall = wall * grime
-    upper = (z > GROUND_FLOOR_HEIGHT) & (z < s.hi[2] - 0.55)
+    upper = (z > t.GROUND_FLOOR_HEIGHT) & (z < s.hi[2] - 0.55)
     opening = s.bar(du, half_w) * s.bar(dz, half_h) * upper
     trim = s.bar(du, half_w + 0.15) * s.bar(dz, half_h + 0.17) * upper
     sill = s.bar(du, half_w + 0.24) * s.bar(dz + half_h + 0.08, 0.08) * upper
@@ -324,7 +310,10 @@ def _shop(s: Point, bay: _Bay, shop: Array, seed: int) -> tuple[Array, Array, Ar
     show = 0.03 + shelf * 0.30 * (0.35 + 0.45 * tint[:1] + 0.3 * tint)
     show = jnp.where(gate, 0.004, show)
     bright = jnp.where(draw[1] > 0.55, 1.1 * draw[2] + 0.35, 0.06) * (~gate)
-    front = _shop_color(s)
+    # A wooden front in one of four deep colours, by the house's random number.
+    colors = [(0.05, 0.13, 0.10), (0.30, 0.05, 0.04), (0.06, 0.09, 0.20), (0.34, 0.28, 0.18)]
+    colors = jnp.asarray(colors, jnp.float32)
+    front = colors[jnp.clip((s.random * 4).astype(jnp.int32), 0, 3)].T
     board = s.bar(z - 3.42, 0.30) * shop
     letters = s.grid(u, 0.34, 0.11) * s.bar(z - 3.42, 0.15)
     letters = letters * (hash1(jnp.floor(u / 0.34), 0.0 * u, seen, seed + 40) > 0.25)
@@ -336,13 +325,6 @@ def _shop(s: Point, bay: _Bay, shop: Array, seed: int) -> tuple[Array, Array, Ar
     lit = 0.12 + shelf * (0.5 + 0.45 * tint[:1] + 0.3 * tint)
     light = hole * (1.0 - rim) * bright * ambient * warm * lit
     return base, light, hole * (1.0 - rim) * (~gate)
-
-
-def _shop_color(s: Point) -> Array:
-    """A wooden shop front in one of four deep colours, by the house's random number."""
-    colors = [(0.05, 0.13, 0.10), (0.30, 0.05, 0.04), (0.06, 0.09, 0.20), (0.34, 0.28, 0.18)]
-    colors = jnp.asarray(colors, jnp.float32)
-    return colors[jnp.clip((s.random * 4).astype(jnp.int32), 0, 3)].T
 
 
 def _masonry(s: Point, u: Array, z: Array, seed: int) -> Array:
@@ -367,13 +349,12 @@ def _masonry(s: Point, u: Array, z: Array, seed: int) -> Array:
 
 def _tiles(s: Point, seed: int) -> Array:
     """Roof tiles in rows."""
-    f = s.footprint
     along_y = jnp.abs(s.normal[0]) > jnp.abs(s.normal[1])
     u = jnp.where(along_y, s.p[1], s.p[0])
     row = jnp.floor(s.p[2] / 0.28)
     shade = hash1(jnp.floor(u / 0.3), row, 0.0 * u, seed + 60) - 0.5
     lip = 1.0 - s.grid(s.p[2], 0.28, 0.11)
-    visible = detail(f, jnp.float32(0.28))
+    visible = detail(s.footprint, jnp.float32(0.28))
     return s.color * (1.0 + visible * (0.5 * shade - 0.35 * lip) + 0.18 * s.coarse[0])
 
 

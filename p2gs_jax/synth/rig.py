@@ -15,8 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-# Pixels of the paper's images.
-IMAGE_WIDTH, IMAGE_HEIGHT = 1920, 1300
 FOV_DEGREES = 60.0
 # y of the middle of the lane.
 LANE = -1.75
@@ -31,12 +29,12 @@ class Mount:
     rotation: tuple[float, float, float]
 
 
+# The paper's mount table.
 MOUNTS: dict[str, Mount] = {
     "front": Mount((1.539, 0.025, 3.845), (0.696, 0.420, 0.338)),
     "front_left": Mount((1.494, -0.091, 3.845), (0.003, 1.387, -44.205)),
     "front_right": Mount((1.489, 0.095, 3.846), (0.189, 0.111, 44.756)),
 }
-"""The paper's mount table."""
 
 
 def carla_rotation(roll: float, pitch: float, yaw: float) -> Float[np.ndarray, "3 3"]:
@@ -62,14 +60,8 @@ def camera_viewmat(
     R = np.stack([right, -up, forward])
     center = np.asarray(vehicle) + _FLIP @ np.asarray(mount.location)
     viewmat = np.eye(4)
-    viewmat[:3, :3] = R
-    viewmat[:3, 3] = -R @ center
+    viewmat[:3, :3], viewmat[:3, 3] = R, -R @ center
     return viewmat
-
-
-def image_height(width: int, *, multiple: int = 1) -> int:
-    """Return the height, a multiple of a number, with the proportions of the paper's images."""
-    return max(round(width * IMAGE_HEIGHT / IMAGE_WIDTH / multiple), 1) * multiple
 
 
 def intrinsics(width: int, height: int) -> Float[np.ndarray, "3 3"]:

@@ -25,16 +25,17 @@ from p2gs_jax.core.streams import SceneStream, generator
 from p2gs_jax.errors import UserError
 from p2gs_jax.synth.settings import Curve, Sensor
 
-ISO_REFERENCE = 8
-ISO_MINIMUM = 1
+ISO_REFERENCE, ISO_MINIMUM = 8, 1
 # Variances of photon noise per unit of exposed radiance, and of read noise.
 SHOT_NOISE, READ_NOISE = 2e-4, 1e-6
 DRIFT_PERIODS = 1.3
 # Lenses lose no more than this in their corners, whatever was drawn.
 MOST_LOST = 0.8
 FILE = Path("truth", "exposures.csv")
-NUMBERS = ("exposure", "red", "green", "blue", "corners")
-COLUMNS = ("image", "camera", "iso", "exposure", "exposure_ev", *NUMBERS[1:], "curve")
+COLUMNS = (
+    *("image", "camera", "iso", "exposure", "exposure_ev"),
+    *("red", "green", "blue", "corners", "curve"),
+)
 
 
 class Shots(NamedTuple):
@@ -144,49 +145,24 @@ def photograph(
     return np.rint(255.0 * encode(exposed, sensor.curve)).astype(np.uint8)
 
 
-def write_true_exposures(
-    root: Path, names: Sequence[str], cameras: Sequence[str], shots: Shots
-) -> None:
-    """Write how the photographs were taken below a scene folder, which has `truth/`."""
+def write_true_exposures(root: Path, names: Sequence[str], shots: Shots) -> None:
+    """Write how the photographs, CAMERA/FILE, were taken, below a scene folder with `truth/`."""
     with (root / FILE).open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)
         exposures, tints = shots.mean_exposures, shots.tints
-        for row, (name, camera) in enumerate(zip(names, cameras, strict=True)):
-            e = exposures[row]
-            factors = (f"{factor:.6g}" for factor in tints[row])
-            corners = f"{1 - shots.corner_loss[row]:.6g}"
+        for row, name in enumerate(names):
+            camera = name.split("/")[0]
+            e, iso = exposures[row], int(shots.iso[row])
+            factors = (f"{x:.6g}" for x in (*tints[row], 1 - shots.corner_loss[row]))
             exposure = (f"{e:.6g}", f"{np.log2(e):.6f}")
-            iso = int(shots.iso[row])
-            writer.writerow((name, camera, iso, *exposure, *factors, corners, shots.curves[row]))
+            writer.writerow((name, camera, iso, *exposure, *factors, shots.curves[row]))
 
 
 def read_true_exposures(root: Path) -> dict[str, float]:
     """Return image name -> true exposure; empty where the scene folder has no such file."""
-    return {row["image"]: float(row["exposure"]) for row in _rows(root)}
-
-
-class TrueShot(NamedTuple):
-    """How a photograph was taken; the columns of `truth/exposures.csv`."""
-
-    camera: str
-    exposure: float
-    balance: tuple[float, float, float]
-    corners: float
-
-
-def read_true_shots(root: Path) -> dict[str, TrueShot]:
-    """Return image name -> how it was taken; empty where the scene folder has no such file."""
-    found = {}
-    for row in _rows(root):
-        e, red, green, blue, corners = (float(row[name]) for name in NUMBERS)
-        found[row["image"]] = TrueShot(row["camera"], e, (red, green, blue), corners)
-    return found
-
-
-def _rows(root: Path) -> list[dict[str, str]]:
     path = root / FILE
     if not path.is_file():
-        return []
+        return {}
     with path.open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
+        return {row["image"]: float(row["exposure"]) for row in csv.DictReader(file)}

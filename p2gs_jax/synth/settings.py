@@ -1,4 +1,4 @@
-"""Options of a data set, apart from the code that makes it: `--help` needs no numpy."""
+"""Options of a data set, and the size of its images, without numpy, so that `--help` is fast."""
 
 from __future__ import annotations
 
@@ -7,6 +7,13 @@ from typing import Literal
 
 Curve = Literal["srgb", "power", "filmic"]
 Layout = Literal["street", "town", "long"]
+# Pixels of the paper's images.
+IMAGE_WIDTH, IMAGE_HEIGHT = 1920, 1300
+
+
+def image_height(width: int, *, multiple: int = 1) -> int:
+    """Return the height, a multiple of a number, with the proportions of the paper's images."""
+    return max(round(width * IMAGE_HEIGHT / IMAGE_WIDTH / multiple), 1) * multiple
 
 
 @dataclass(frozen=True)

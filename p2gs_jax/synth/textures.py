@@ -13,14 +13,8 @@ from jaxtyping import Array, Float
 
 
 class Surface(NamedTuple):
-    """Optical properties at R points.
-
-    Attributes:
-        emission: radiance of its own.
-        gloss: scale of the mirror reflection, 0 to 1.
-        normal: of the geometry, unit.
-        shading_normal: with the texture's relief, unit.
-    """
+    """Optical properties at R points: emitted radiance, scale of the mirror reflection (0 to 1),
+    and unit normals of the geometry and with the texture's relief."""
 
     albedo: Float[Array, "3 r"]
     emission: Float[Array, "3 r"]
@@ -53,7 +47,8 @@ class Point(NamedTuple):
 
     def grid(self, x: Array, period: float, half: Array | float) -> Array:
         """Return bars in every cell of a periodic pattern, about its middle."""
-        return slab(cell_offset(x, period), half, self.footprint)
+        offset = x - (jnp.floor(x / period) + 0.5) * period
+        return slab(offset, half, self.footprint)
 
 
 def detail(footprint: Array, wavelength: Array) -> Array:
@@ -64,11 +59,6 @@ def detail(footprint: Array, wavelength: Array) -> Array:
 def slab(x: Array, half: Array | float, footprint: Array) -> Array:
     """Return 1 for |x| < half, with an edge half a pixel wide."""
     return jnp.clip(0.5 + (half - jnp.abs(x)) / (0.5 * footprint + 1e-6), 0.0, 1.0)
-
-
-def cell_offset(x: Array, period: float) -> Array:
-    """Return the offset from the middle of the cell of a periodic pattern."""
-    return x - (jnp.floor(x / period) + 0.5) * period
 
 
 def smooth(low: float, high: float, x: Array) -> Array:

@@ -23,7 +23,6 @@ FACADE_LINE = 9.0
 CROSS_STREET, UNDERPASS, STREET_END = (27.0, 36.0), (54.0, 68.0), 100.0
 UNDERPASS_HEIGHT, FLOOR_HEIGHT, GROUND_FLOOR_HEIGHT = 5.2, 3.2, 4.0
 
-
 # What `tracer` paints a primitive with; ROAD is the ground plane.
 Material = IntEnum(
     "Material",
@@ -51,10 +50,8 @@ class Light:
 class Town:
     """P primitives, ordered boxes, tapered boxes, ellipsoids; columns as in `Solid`.
 
-    Attributes:
-        planes: (n, d) of the tapered boxes' six faces; inside is n . p <= d, n unit.
-        seed: of the textures' noise.
-        underpass: its extent along x, or None.
+    `planes` are (n, d) of the tapered boxes' six faces: inside is n . p <= d, n unit. `seed` is
+    that of the textures' noise, `underpass` its extent along x, or None.
     """
 
     n_boxes: int
@@ -78,25 +75,16 @@ class Town:
 
 @dataclass
 class Solid:
-    """One primitive.
+    """One primitive, between two corners of its bounding box, m."""
 
-    Attributes:
-        kind: 0 box, 1 tapered box, 2 ellipsoid.
-        lo: lower corner of the bounding box, m; `hi`: the upper one.
-        color: base albedo; radiance for EMISSIVE.
-        accent: second colour: window surrounds, stripes, sign faces.
-        params: (style, bay width m, ground-floor use, random number in [0, 1)).
-        top: x0, x1, y0, y1 of a tapered box's upper face.
-    """
-
-    kind: int
+    kind: int  # 0 box, 1 tapered box, 2 ellipsoid
     lo: Vec3
     hi: Vec3
     material: Material
-    color: Vec3
-    accent: Vec3
-    params: tuple[float, float, float, float]
-    top: tuple[float, float, float, float] | None
+    color: Vec3  # base albedo; radiance for EMISSIVE
+    accent: Vec3  # second colour: window surrounds, stripes, sign faces
+    params: tuple[float, float, float, float]  # style, bay width m, ground-floor use, random [0, 1)
+    top: tuple[float, float, float, float] | None  # x0, x1, y0, y1 of a tapered box's upper face
 
 
 @dataclass
@@ -126,11 +114,9 @@ class Builder:
     ) -> None:
         """Place a solid between two corners; with a `top`, a tapered box."""
         params = (style, bay, use, float(self.rng.random()))
-        a = tuple(min(p, q) for p, q in zip(lo, hi, strict=True))
-        b = tuple(max(p, q) for p, q in zip(lo, hi, strict=True))
-        self.solids.append(
-            Solid(1 if top else kind, a, b, material, color, accent, params, top)  # pyright: ignore[reportArgumentType]
-        )
+        (x0, x1), (y0, y1), (z0, z1) = (sorted(pair) for pair in zip(lo, hi, strict=True))
+        kind, lo, hi = 1 if top else kind, (x0, y0, z0), (x1, y1, z1)
+        self.solids.append(Solid(kind, lo, hi, material, color, accent, params, top))
 
     def is_clear(self, x: float, reach: float) -> bool:
         """Return whether nothing may stand within reach of x."""
@@ -163,12 +149,11 @@ def _taper_planes(solid: Solid) -> np.ndarray:
     assert solid.top is not None
     tx0, tx1, ty0, ty1 = solid.top
     rise = z1 - z0
-    along_x = [(-rise, 0, tx0 - x0), (rise, 0, x1 - tx1)]
-    along_y = [(0, -rise, ty0 - y0), (0, rise, y1 - ty1)]
-    normals = np.array([*along_x, *along_y, (0, 0, -1), (0, 0, 1)], np.float64)
+    sides = [(-rise, 0, tx0 - x0), (rise, 0, x1 - tx1), (0, -rise, ty0 - y0), (0, rise, y1 - ty1)]
+    normals = np.array([*sides, (0, 0, -1), (0, 0, 1)], np.float64)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    first = (x0, y0, z0)
-    anchors = np.array([first, (x1, y0, z0), first, (x0, y1, z0), first, (x0, y0, z1)])
+    anchors = np.tile((x0, y0, z0), (6, 1))
+    anchors[[1, 3, 5], [0, 1, 2]] = x1, y1, z1
     return np.concatenate([normals, (normals * anchors).sum(1, keepdims=True)], axis=1)
 
 
@@ -176,11 +161,8 @@ def pack(build: Builder, seed: int, light: Light) -> Town:
     """Return the town of all solids, ordered boxes, tapered boxes, ellipsoids."""
     solids = sorted(build.solids, key=lambda s: s.kind)
     tapered = [s for s in solids if s.kind == 1]
-
-    columns = {
-        name: np.array([getattr(s, name) for s in solids], np.float32)
-        for name in ("lo", "hi", "color", "accent", "params")
-    }
+    names = ("lo", "hi", "color", "accent", "params")
+    columns = {n: np.array([getattr(s, n) for s in solids], np.float32) for n in names}
     return Town(
         n_boxes=sum(s.kind == 0 for s in solids),
         n_tapered=len(tapered),

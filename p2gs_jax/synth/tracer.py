@@ -13,6 +13,7 @@ vectorised over some thousand rays.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import reduce
 
 import jax
 import jax.numpy as jnp
@@ -35,10 +36,7 @@ _CANYON_REACH, _CANYON_WEIGHT = 5.0, 0.28  # the same for the houses alone
 
 
 class Tracer:
-    """Renders one town; compiled once per image size.
-
-    Thread-safe: views may be rendered from several threads at once.
-    """
+    """Renders one town; compiled once per image size; safe to use from several threads at once."""
 
     def __init__(self, town: Town):
         """Keep the town; nothing is compiled yet."""
@@ -88,9 +86,8 @@ class Tracer:
             seen = jnp.all((upper > corner) & (lower < corner + _TILE), axis=1)
             t, index = nearest_hit(town, origin[:, None], direction, seen)
             samples = supersample**2 * _TILE**2
-            linear = radiance(
-                town, origin, direction[:, :samples], t[:samples], index[:samples], 1.0 / K[0, 0]
-            )
+            rays = direction[:, :samples], t[:samples], index[:samples]
+            linear = _radiance(town, origin, *rays, 1.0 / K[0, 0])
             return linear.reshape(3, -1, _TILE, _TILE).mean(1), t[samples:].reshape(_TILE, _TILE)
 
         corners = _TILE * np.stack(np.meshgrid(np.arange(across), np.arange(down)), -1)
@@ -101,18 +98,13 @@ class Tracer:
         return linear, depth.reshape(down * _TILE, across * _TILE)[:height, :width]
 
 
-def radiance(
-    town: Town,
-    origin: Float[Array, " 3"],
-    direction: Float[Array, "3 r"],
-    t: Float[Array, " r"],
-    index: Int[Array, " r"],
-    pixel_angle: Array,
+def _radiance(
+    town: Town, origin: Array, direction: Array, t: Array, index: Array, pixel_angle: Array
 ) -> Float[Array, "3 r"]:
-    """Return the linear radiance that arrives along rays.
+    """Return the linear radiance that arrives at the origin [3] along rays [3 R].
 
-    Directions are not normalised; `t` is where a ray hits (inf: sky) and `index` what; a pixel is
-    `pixel_angle` wide at unit camera z, and finer texture fades out.
+    Directions are not normalised; `t` [R] is where a ray hits (inf: sky) and `index` [R] what; a
+    pixel is `pixel_angle` wide at unit camera z, and finer texture fades out.
     """
     hit = jnp.isfinite(t)
     p = origin[:, None] + jnp.where(hit, t, 1.0) * direction
@@ -135,9 +127,8 @@ def _light(town: Town, p: Array, view: Array, surface: Surface, hit: Array) -> A
     facing = jnp.where(jnp.sum(n * to_sun, 0) > 0, facing, 0.0)
     sun = facing * (1.0 - in_shadow(town, start, direction, lower, upper))
     up = surface.shading_normal[2]
-    ambient = as_column(_AMBIENT_UP) * (0.56 + 0.44 * up) + as_column(light.bounce) * (
-        0.5 - 0.5 * up
-    )
+    ambient = as_column(_AMBIENT_UP) * (0.56 + 0.44 * up)
+    ambient = ambient + as_column(light.bounce) * (0.5 - 0.5 * up)
     ambient = ambient * open_sky(town, p, n, lower, upper)
     if town.underpass is not None:
         ambient = ambient * _daylight(p, town.underpass)
@@ -227,7 +218,7 @@ def _intersect(town: Town, o: Array, d: Array, among: Array, carry, update: Call
         a = [(lo[i] - o[i]) * inverse[i] for i in range(3)]
         b = [(hi[i] - o[i]) * inverse[i] for i in range(3)]
         near, far = [list(map(f, a, b)) for f in (jnp.minimum, jnp.maximum)]
-        return update(carry, _fold(jnp.maximum, near), _fold(jnp.minimum, far), row)
+        return update(carry, reduce(jnp.maximum, near), reduce(jnp.minimum, far), row)
 
     def tapered(carry, row: Array, planes: Array):
         entry, leave = jnp.full(1, -jnp.inf), jnp.full(1, jnp.inf)
@@ -277,7 +268,7 @@ def open_sky(
             planes[k, 0] * q[0] + planes[k, 1] * q[1] + planes[k, 2] * q[2] - planes[k, 3]
             for k in range(6)
         ]
-        return jnp.maximum(_fold(jnp.maximum, inside), 0.0) ** 2
+        return jnp.maximum(reduce(jnp.maximum, inside), 0.0) ** 2
 
     def to_ellipsoid(q: Array, lo: Array, hi: Array) -> Array:
         c, h = (lo + hi) / 2, (hi - lo) / 2
@@ -285,22 +276,17 @@ def open_sky(
         return (jnp.maximum(k - 1.0, 0.0) * (h[0] + h[1] + h[2]) / 3.0) ** 2
 
     def nearer(distance: Callable) -> Callable:
-        def body(best, row: Array, *item: Array):
-            return tuple(
-                jnp.minimum(b, distance(q, *item)) for b, q in zip(best, probes, strict=True)
-            )
-
-        return body
+        return lambda best, row, *item: tuple(
+            jnp.minimum(b, distance(q, *item)) for b, q in zip(best, probes, strict=True)
+        )
 
     best = tuple(jnp.maximum(q[2], 0.0) ** 2 for q in probes)
     bodies = map(nearer, (to_box, to_taper, to_ellipsoid))
     best = _over(town, within(2 * _REACH[-1]), best, *bodies)
     houses = within(2 * _CANYON_REACH) & (town.material == Material.FACADE)
 
-    def nearer_house(best, row: Array, lo: Array, hi: Array):
-        return jnp.minimum(best, to_box(far, lo, hi))
-
-    canyon = _over(town, houses, jnp.maximum(far[2], 0.0) ** 2, nearer_house)
+    start = jnp.maximum(far[2], 0.0) ** 2
+    canyon = _over(town, houses, start, lambda best, row, *c: jnp.minimum(best, to_box(far, *c)))
     light = 1.0 - _CANYON_WEIGHT * (1.0 - jnp.minimum(jnp.sqrt(canyon) / _CANYON_REACH, 1.0))
     for squared, reach, weight in zip(best, _REACH, _WEIGHT, strict=True):
         light = light - weight * (1.0 - jnp.minimum(jnp.sqrt(squared) / reach, 1.0))
@@ -337,10 +323,3 @@ def _over(town: Town, among: Array, carry, box: Callable, tapered=None, ellipsoi
 
         carry = lax.fori_loop(0, (count + _UNROLL - 1) // _UNROLL, several, carry)
     return carry
-
-
-def _fold(function: Callable, values) -> Array:
-    first, *rest = values
-    for value in rest:
-        first = function(first, value)
-    return first

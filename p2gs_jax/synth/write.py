@@ -23,7 +23,6 @@ from typing import Any
 
 import numpy as np
 import OpenEXR
-from jaxtyping import UInt8
 from PIL import Image
 
 from p2gs_jax.core.atomic import atomic_folder
@@ -89,7 +88,7 @@ def write_street(
         held = (frame % hold_out == 0) if hold_out and frames > 1 else np.zeros(len(frame), bool)
         xyz, rgb = sample_seeds(views, photographs, depths, ~held, points, seed)
         observed = write_seeds(temporary / "sparse" / "0", views, xyz, rgb, depths)
-        write_true_exposures(temporary, views.names, views.cameras, shots)
+        write_true_exposures(temporary, views.names, shots)
         card = {
             **{"format": FORMAT, **asked, **observed, "iso_reference": ISO_REFERENCE},
             **{"K": views.K.tolist(), "solids": town.size, "sensor": asdict(sensor)},
@@ -104,14 +103,12 @@ def write_street(
 
 def _views(frames: int, width: int, height: int, step: float):
     """Return the cameras of a drive, and the frame of each view."""
-    names = tuple(f"{camera}/{f:06d}.png" for camera in sorted(MOUNTS) for f in range(frames))
-    cameras = tuple(name.split("/")[0] for name in names)
-    frame = np.tile(np.arange(frames), len(MOUNTS))
-    track = drive(frames, step=step)
-    viewmats = np.stack(
-        [camera_viewmat(MOUNTS[c], track[f]) for c, f in zip(cameras, frame, strict=True)]
-    )
-    return DriveViews(names, cameras, viewmats, intrinsics(width, height), width, height), frame
+    places = drive(frames, step=step)
+    taken = [(camera, f) for camera in sorted(MOUNTS) for f in range(frames)]
+    names = [f"{camera}/{f:06d}.png" for camera, f in taken]
+    viewmats = np.stack([camera_viewmat(MOUNTS[camera], places[f]) for camera, f in taken])
+    views = DriveViews(names, viewmats, intrinsics(width, height), width, height)
+    return views, np.array([f for _, f in taken])
 
 
 def _photograph(
@@ -129,7 +126,18 @@ def _photograph(
         rng, own = generator(seed, SceneStream.PHOTOGRAPH, row), shots.sensor(sensor, row)
         shot = photograph(linear, shots.exposures[row], own, balance=shots.balance[row], rng=rng)
         reference = photograph(linear, 1.0, Sensor(curve=sensor.curve))
-        _write_view(root, views.names[row], shot, reference, linear, depth)
+        sky = np.where(np.isinf(depth), np.uint8(255), np.uint8(0))
+        pictures = {"images": shot, "reference": reference, "truth/sky_masks": sky}
+        for folder, pixels in pictures.items():
+            path = root / folder / views.names[row]
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(pixels).save(path, compress_level=4)
+        path = (root / "truth" / "linear" / views.names[row]).with_suffix(".exr")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        channels = {c: np.ascontiguousarray(linear[..., i]) for i, c in enumerate("RGB")}
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        with OpenEXR.File(header, channels | {"Z": depth.astype(np.float32)}) as file:
+            file.write(str(path))
         photographs.append(shot)
         depths.append(depth)
         if (row + 1) % 10 == 0:
@@ -175,25 +183,3 @@ def _render_all(
     yield one(views.viewmats[0])  # compiles once, not once a thread
     with ThreadPoolExecutor(2) as pool:
         yield from pool.map(one, views.viewmats[1:])
-
-
-def _write_view(
-    root: Path,
-    name: str,
-    shot: UInt8[np.ndarray, "h w 3"],
-    reference: UInt8[np.ndarray, "h w 3"],
-    linear: np.ndarray,
-    depth: np.ndarray,
-) -> None:
-    sky = np.where(np.isinf(depth), np.uint8(255), np.uint8(0))
-    pictures = {"images": shot, "reference": reference, "truth/sky_masks": sky}
-    for folder, pixels in pictures.items():
-        path = root / folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(pixels).save(path, compress_level=4)
-    path = (root / "truth" / "linear" / name).with_suffix(".exr")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    channels = {c: np.ascontiguousarray(linear[..., i]) for i, c in enumerate("RGB")}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with OpenEXR.File(header, channels | {"Z": depth.astype(np.float32)}) as file:
-        file.write(str(path))

@@ -10,10 +10,10 @@ from collections.abc import Iterable, Mapping, Sequence
 import jax
 import numpy as np
 from jaxtyping import Bool, Int
-from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import evenly_spaced
+from p2gs_jax.gaussians.posed import rotations
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.render.project import LOG_SCALE_RANGE, TANGENT_LIMIT, at_time, camera_of_each
 from p2gs_jax.render.tiles import smallest_cutoff
@@ -49,10 +49,7 @@ def count_view(
         R, t = np.moveaxis(R[..., seen], -1, 0), t[..., seen].T
         local = np.einsum("nij,nj->ni", R, shown.means) + t
     x, y, z = local.T
-    # Quaternions have any length; one of zeros is the identity.
-    none = ~np.any(shown.quats, axis=1, keepdims=True)
-    quats = np.where(none, np.eye(1, 4), shown.quats)
-    axes = R @ Rotation.from_quat(quats, scalar_first=True).as_matrix()
+    axes = R @ rotations(shown.quats).as_matrix()
     axes *= np.exp(np.clip(shown.log_scales, *LOG_SCALE_RANGE))[:, None]
     reach = -np.logaddexp(0, -shown.opacity_logits) - np.log(smallest_cutoff(cfg))
     tiles, boxed = np.ones(len(z)), np.ones(len(z), bool)

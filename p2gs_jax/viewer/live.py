@@ -73,17 +73,14 @@ def report(client: viser.ClientHandle, what: str, error: Exception) -> None:
 class Darkroom:
     """Develops frames, for one thread: new display settings need no rendering.
 
-    Attributes:
-        depth_limits: nearest and farthest depth of the colour scale, scene units, or None.
-        metered_exposure: the newest that was metered, or None.
-        photograph_error: why the last photograph could not be shown, or None.
+    `depth_limits` are the nearest and farthest depth of the colour scale, scene units.
     """
 
     def __init__(self, viewed: ViewedRun, depth_limits: tuple[float, float] | None = None):
         """Begin without a photograph."""
         self.depth_limits = depth_limits
         self.metered_exposure: float | None = None
-        self.photograph_error: str | None = None
+        self.photograph_error: str | None = None  # why the last one could not be shown
         self._viewed = viewed
         self._photograph: tuple[int, Camera, WarpedPhotograph] | None = None
         # The frame that was metered last, when, and the log exposure that had been reached.
@@ -161,9 +158,7 @@ class Darkroom:
 class LivePicture:
     """Renders and sends the picture of one browser, in a thread.
 
-    Attributes:
-        darkroom: develops its frames; others may read its attributes.
-        with_depth: whether depth is sent along, to hide frusta.
+    Where `with_depth` is set, depth is sent along, to hide frusta.
     """
 
     def __init__(self, client: viser.ClientHandle, viewed: ViewedRun, panel: Panel):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 import viser
 
+from p2gs_jax.core.numerics import LN2
 from p2gs_jax.photometry.formation import darkens
 from p2gs_jax.viewer.pictures import SAVED_WIDTHS, Mode, exposure_legend, note
 from p2gs_jax.viewer.settings import ChosenCurve, Settings, common_settings, exposures_ev
@@ -105,8 +106,10 @@ class Panel:
         marks = ((low, f"{low:g}"), (2.2, "2.2"), (high, f"{high:g}"))
         self._gamma = self._slider("Gamma", low, high, 0.01, 2.2, marks=marks)
         self._balance: tuple[viser.GuiInputHandle[float], ...] = ()
-        if (balance := self._viewed.most_balance_ev) is not None:
-            most = float(max(2, math.ceil(balance) + 1))
+        if (balance := run.params.photometry.white_balance) is not None:
+            stops = np.asarray(balance) / LN2
+            largest = float(np.abs(stops[:, ::2] - stops[:, 1:2]).max())  # over green
+            most = float(max(2, math.ceil(largest) + 1))
             marks = ((-most, f"{-most:+g}"), (0.0, "0"), (most, f"{most:+g}"))
             self._balance = tuple(
                 self._slider(name, -most, most, 0.01, 0.0, marks=marks)

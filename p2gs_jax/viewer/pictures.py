@@ -7,7 +7,7 @@ soft edges differ a little. viser has no spherical harmonics: colours are those 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -34,8 +34,7 @@ from p2gs_jax.formats.false_color import (
     depth_color,
     false_color,
 )
-from p2gs_jax.formats.frames import write_png
-from p2gs_jax.gaussians.bake import display_of_splats
+from p2gs_jax.formats.frames import to_uint8
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import places
 from p2gs_jax.render import view_radiance
@@ -90,12 +89,9 @@ def picture_of(
     """Return display values of a frame in one of the modes.
 
     Args:
-        frame: the rendered view.
         mode: `stops` counts from middle grey at the exposure of the transform; `split` without
             a photograph is `display`.
-        transform: from radiance to display values.
         depth_limits: ends of the colour scale, scene units; None takes the frame's own.
-        photograph: for `split`.
         split: share of the photograph's width that is shown, from the left.
         taken_by: the camera whose vignetting the transform has; None: that of the frame.
     """
@@ -202,28 +198,21 @@ def to_uint8_fast(ldr: Float[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]
 
 def png_bytes(ldr: Float32[np.ndarray, "h w 3"]) -> bytes:
     """Return display values as a PNG file."""
-    return _file_bytes("view.png", lambda path: write_png(path, ldr))
+    return cv2.imencode(".png", to_uint8(ldr)[..., ::-1])[1].tobytes()
 
 
 def exr_bytes(frame: RenderedFrame, transform: DisplayTransform) -> bytes:
     """Return a frame as an EXR file with depth, opacity, display transform and camera in it."""
-    return _file_bytes(
-        "view.exr",
-        lambda path: write_exr(
+    with tempfile.TemporaryDirectory(prefix="p2gs-view-") as folder:
+        path = Path(folder) / "view.exr"
+        write_exr(
             path,
             np.asarray(frame.linear),
             depth=frame.depth,
             alpha=frame.alpha,
             taken=transform,
             camera=frame.camera,
-        ),
-    )
-
-
-def _file_bytes(name: str, write: Callable[[Path], object]) -> bytes:
-    with tempfile.TemporaryDirectory(prefix="p2gs-view-") as folder:
-        path = Path(folder) / name
-        write(path)
+        )
         return path.read_bytes()
 
 
@@ -275,7 +264,7 @@ def splat_colors(
     column = splats.linear[:, None]
     if mode == "stops":
         return to_uint8_fast(false_color(column, MIDDLE_GREY / transform.exposure))[:, 0]
-    return to_uint8_fast(develop(column, display_of_splats(transform)))[:, 0]
+    return to_uint8_fast(develop(column, transform.without_place()))[:, 0]
 
 
 def stops_legend() -> str:

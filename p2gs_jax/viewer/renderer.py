@@ -61,15 +61,10 @@ class Renderer:
         on_change: Callable[[], None] = lambda: None,
         warm_up: Callable[[Render], object] = lambda result: None,
     ):
-        """Begin without a program.
+        """Begin without a program; new ones have room for what the typical cameras `probes` see.
 
-        Args:
-            gaussians: the scene.
-            alive: slots in use.
-            cfg: rendering options.
-            probes: functions from a size to a typical camera; new programs are made for them.
-            on_change: called when a program was compiled, or is about to be.
-            warm_up: called with a render of every new size, to compile what uses it.
+        `on_change` is called when a program was compiled, or is about to be; `warm_up` with a
+        render of every new size, to compile what uses it.
         """
         self._scene, self._cfg, self._probes = (gaussians, alive), cfg, probes
         self._on_change, self._warm_up = on_change, warm_up
@@ -212,11 +207,8 @@ def next_size(
 ) -> Size | None:
     """Return the size for the next frame of a moving camera, or None where none is ready.
 
-    Args:
-        sizes: of the canvas, smallest first.
-        ready: sizes that are compiled, of this canvas or another.
-        current: size of the last frame, kept unless another is clearly better; None: there is none.
-        ms: how long that frame took.
+    `sizes` of the canvas rise; `ready` ones may be of another canvas. The last frame took `ms`
+    milliseconds at the size `current`, which is kept unless another is clearly better.
     """
     usable = [size for size in sizes if size in ready]
     if not usable:

@@ -48,11 +48,9 @@ Hook = Callable[[ServerConnection, Request], Response | None]
 
 
 class Guard(NamedTuple):
-    """What a request needs.
+    """What a request needs: one of this machine's names (None: any), and a token (None: none).
 
-    Attributes:
-        hosts: names by which this machine may be called; None: any.
-        token: that has to be in the address, or in the cookie that is set then; None: none.
+    The token has to be in the address, or in the cookie that is set then.
     """
 
     hosts: frozenset[str] | None
@@ -172,10 +170,8 @@ def check_address(host: str, port: int) -> None:
 def open_viewer(run: Run, *, host: str, port: int, max_width: int) -> Iterator[str]:
     """Serve a run until the block ends; yield the address to open, with its token if it needs one.
 
-    Port 0 takes any free one; no picture is rendered wider than `max_width` pixels.
-
     Raises:
-        UserError: one cannot listen there.
+        UserError: the port or the host cannot be listened on.
     """
     check_address(host, port)
     # viser warns when a browser disconnects while a picture is being sent.
@@ -191,9 +187,8 @@ def open_viewer(run: Run, *, host: str, port: int, max_width: int) -> Iterator[s
         if port not in (0, server.get_port()):
             raise UserError(f"port {port} was taken just now.", fix="choose another with --port")
         _set_up_server(server, viewed, sessions)
-        viewed.renderer.request(
-            compilation_order(render_sizes(full_size(LIKELY_CANVAS, max_width)))
-        )
+        sizes = render_sizes(full_size(LIKELY_CANVAS, max_width))
+        viewed.renderer.request(compilation_order(sizes))
         shown = "localhost" if host in ("0.0.0.0", "::", "") else host
         address = f"http://{f'[{shown}]' if ':' in shown else shown}:{server.get_port()}"
         yield address if guard.token is None else f"{address}/?{QUERY}={guard.token}"

@@ -13,8 +13,14 @@ import viser
 from p2gs_jax.viewer.camera import Frusta, Player, Pose, browser_view
 from p2gs_jax.viewer.live import Darkroom, LivePicture, report
 from p2gs_jax.viewer.panel import Panel
-from p2gs_jax.viewer.pictures import exr_bytes, png_bytes
-from p2gs_jax.viewer.settings import Settings, common_settings, same_display, settings_of_view
+from p2gs_jax.viewer.pictures import exposure_colors, exr_bytes, png_bytes
+from p2gs_jax.viewer.settings import (
+    Settings,
+    common_settings,
+    exposures_ev,
+    same_display,
+    settings_of_view,
+)
 from p2gs_jax.viewer.viewed_run import ViewedRun
 
 # Time between updates of the slider while playing, seconds.
@@ -70,7 +76,7 @@ class BrowserSession:
         """Let the exposure follow what is seen, or keep it where it is now."""
         now, exposure, stops = self._panel.settings(), self._live.darkroom.metered_exposure, 0.0
         if metered:
-            text = "Metering the training views ..."  # of runs of older versions it takes a while
+            text = "Reading how the camera metered ..."
             metered = self._while_shown("Auto exposure", text, lambda: self._run.metering)
         elif exposure is not None:
             stops = float(np.log2(exposure / self._run.mean.exposure_geometric))
@@ -130,7 +136,9 @@ class BrowserSession:
 
     def _add_frusta(self) -> Frusta:
         viewed, views = self._viewed, self._run.scene.views
-        frusta = Frusta(self._client, views, viewed.camera_colors, viewed.space, self.go_to)
+        evs = exposures_ev(self._run)
+        colors = exposure_colors([evs.get(row) for row in range(len(views))])
+        frusta = Frusta(self._client, views, colors, viewed.space, self.go_to)
         frusta.keep_clear(self._client.camera.position)
         threading.Thread(target=self._add_thumbnails, args=[frusta], daemon=True).start()
         self._frusta = frusta

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 
-import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from p2gs_jax.core.numerics import LN2, evenly_spaced, on_device
+from p2gs_jax.core.numerics import evenly_spaced, on_device
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.display import develop
 from p2gs_jax.render.project import at_time
@@ -31,9 +30,8 @@ from p2gs_jax.viewer.camera import (
     viewmat_between,
     viewmats_of,
 )
-from p2gs_jax.viewer.pictures import BrowserSplats, browser_splats, exposure_colors
+from p2gs_jax.viewer.pictures import BrowserSplats, browser_splats, to_uint8_fast
 from p2gs_jax.viewer.renderer import Renderer
-from p2gs_jax.viewer.settings import exposures_ev
 
 # Views on which new programs are run.
 PROBES = 4
@@ -70,7 +68,7 @@ class ViewedRun:
             self._gaussians,
             self._alive,
             run.cfg.render,
-            [self._probe(int(row)) for row in probes],
+            [partial(self._probe, int(row)) for row in probes],
             self._notify,
             lambda result: develop(result.linear, run.common_display(), alpha=result.alpha),
         )
@@ -79,12 +77,9 @@ class ViewedRun:
         for listener in tuple(self.listeners):
             listener()
 
-    def _probe(self, index: int) -> Callable[[Size], Camera]:
-        def camera(size: Size) -> Camera:
-            aspect = size[0] / size[1]
-            return camera_of_browser(self.pose(index, aspect), aspect, size, self.space)
-
-        return camera
+    def _probe(self, index: int, size: Size) -> Camera:
+        aspect = size[0] / size[1]
+        return camera_of_browser(self.pose(index, aspect), aspect, size, self.space)
 
     def view_at(self, camera: Camera) -> int | None:
         """Return the row of the view taken from the place of a camera, or None."""
@@ -113,9 +108,11 @@ class ViewedRun:
 
         The whole photograph fits into a canvas with `aspect` = width / height.
         """
-        view = self.run.scene.views[index]
-        fov = fov_that_holds(view, aspect)
-        return pose_of(view.viewmat, self.space, distance=self.distance(index), fov=fov)
+        return self._pose_at(self.run.scene.views[index].viewmat, index, aspect)
+
+    def _pose_at(self, viewmat: np.ndarray, index: int, aspect: float) -> Pose:
+        fov = fov_that_holds(self.run.scene.views[index], aspect)
+        return pose_of(viewmat, self.space, distance=self.distance(index), fov=fov)
 
     def pose_along(self, camera: str, place: float, aspect: float) -> tuple[Pose, int]:
         """Return the browser's camera on a drive, and the row of the view nearest to it.
@@ -125,43 +122,23 @@ class ViewedRun:
         frames, views = self.frames(camera), self.run.scene.views
         nearest = frames[int(np.clip(round(place), 0, len(frames) - 1))]
         viewmat = viewmat_between(viewmats_of([views[i] for i in frames]), place)
-        fov, distance = fov_that_holds(views[nearest], aspect), self.distance(nearest)
-        return pose_of(viewmat, self.space, distance=distance, fov=fov), nearest
+        return self._pose_at(viewmat, nearest, aspect), nearest
 
     def frames(self, camera: str) -> tuple[int, ...]:
         """Return the rows of a physical camera's views."""
         return frames_of(self.run.scene, camera)
 
-    @cached_property
-    def most_balance_ev(self) -> float | None:
-        """Largest gain of red or blue over green, stops; None without white balance."""
-        balance = self.run.params.photometry.white_balance
-        if balance is None:
-            return None
-        stops = np.asarray(balance) / LN2
-        return float(np.abs(stops[:, ::2] - stops[:, 1:2]).max())
-
-    @cached_property
-    def camera_colors(self) -> UInt8[np.ndarray, "v 3"]:
-        """Colours of the views' cameras."""
-        evs = exposures_ev(self.run)
-        return exposure_colors([evs.get(i) for i in range(len(self.run.scene.views))])
-
     def thumbnail(self, index: int) -> UInt8[np.ndarray, "h w 3"] | None:
         """Return a small picture of a photograph, or None where it cannot be read."""
-        with self._lock:
-            kept = self._thumbnails.get(index)
-        if kept is not None:
-            return kept
+        if index in self._thumbnails:
+            return self._thumbnails[index]
         view, limit = self.run.scene.views[index], self.run.cfg.data.max_width
         try:
             width, _ = size_at(view, limit)
             ldr, _ = self.store.get(index, max(1.0, width / THUMBNAIL_WIDTH))
         except UserError:
             return None
-        small = cv2.convertScaleAbs(ldr, alpha=255.0)
-        with self._lock:
-            self._thumbnails[index] = small
+        self._thumbnails[index] = small = to_uint8_fast(ldr)
         return small
 
     def splats(self) -> BrowserSplats:

@@ -113,18 +113,6 @@ def test_levels_differ_in_size_and_have_the_population_of_their_time():
     assert 0.6 < high < 0.9
 
 
-@pytest.mark.slow
-def test_coarse_levels_of_a_town_have_the_longest_lists():
-    coarse, fine = (
-        levels.lists(town_level(s, width=240, points=15_000), FitConfig()) for s in (4, 1)
-    )
-    assert coarse.longest > 1500
-    assert coarse.entries / coarse.tiles > 400
-    assert coarse.quantiles[2] > 5 * coarse.quantiles[0]
-    assert 80 < fine.entries / fine.tiles < 300
-    assert 300 < fine.longest < coarse.longest
-
-
 def test_lists_of_the_room_are_deep_and_the_same_every_time():
     scene = room()
     found = levels.lists(scene, FitConfig())

@@ -11,7 +11,7 @@ import pytest
 from packaging.requirements import Requirement
 
 import p2gs_jax.render as rendering
-from p2gs_jax.cli import doctor, main
+from p2gs_jax.cli import doctor
 from p2gs_jax.cli.doctor import Doctor
 from p2gs_jax.core import runtime
 
@@ -39,14 +39,6 @@ def test_everything_here_is_well(capsys):
     text = doctor.as_text(found)
     assert "All that a fit needs is there." in text
     assert "BROKEN" not in text
-
-
-def test_the_self_test_can_be_skipped(capsys, monkeypatch):
-    monkeypatch.setattr(doctor, "check_render", None)
-    with pytest.raises(SystemExit) as stop:
-        main(["doctor", "--skip-self-test"])
-    assert stop.value.code == 0
-    assert "skipped" in capsys.readouterr().out
 
 
 def test_every_dependency_can_be_tried(monkeypatch):

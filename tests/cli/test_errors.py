@@ -150,6 +150,7 @@ def test_folders_that_were_there_before_a_failure_stay(tmp_path):
     [
         ("radiance.ply", 500, "restore it from a copy"),
         ("photometry.json", 500, "restore it from a copy"),
+        ("scene.npz", 300, "fit again"),
         ("config.json", 300, "--resume"),
         ("config.json", "{}", "--resume"),
         ("config.json", "newer", "with the version that made it"),

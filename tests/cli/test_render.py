@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import pytest
 
-from p2gs_jax.config import DataConfig
 from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.paths.panorama import covering
 from p2gs_jax.paths.pictures import RunRenderer
@@ -20,7 +19,7 @@ from p2gs_jax.paths.shots import Shot, view_shots
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.run.read import load_run
 from p2gs_jax.run.scene_file import write_scene
-from p2gs_jax.scene import load_scene
+from p2gs_jax.types import Scene, View
 
 SIZE = (96, 72)
 YAWS = {"left": -22.0, "right": 22.0}
@@ -69,14 +68,11 @@ def rig_run(finished_run, tmp_path_factory) -> Path:
     shutil.copytree(finished_run, root / "run")
     renderer = RunRenderer(load_run(finished_run))
     K = np.array([[70.0, 0, SIZE[0] / 2], [0, 70.0, SIZE[1] / 2], [0, 0, 1]])
-    model = root / "scene" / "sparse" / "0"
-    model.mkdir(parents=True)
-    lines, views = [], []
-    for number, ((camera, step), ev) in enumerate(STOPS.items(), 1):
-        half = np.deg2rad(YAWS[camera]) / 2
-        viewmat = np.eye(4)
-        turn = np.cos(2 * half), np.sin(2 * half)
-        viewmat[0, [0, 2]], viewmat[2, [0, 2]] = (turn[0], -turn[1]), (turn[1], turn[0])
+    views, solved = [], []
+    for (camera, step), ev in STOPS.items():
+        viewmat, yaw = np.eye(4), np.deg2rad(YAWS[camera])
+        viewmat[0, [0, 2]] = np.cos(yaw), -np.sin(yaw)
+        viewmat[2, [0, 2]] = np.sin(yaw), np.cos(yaw)
         viewmat[:3, 3] = -viewmat[:3, :3] @ [0.3 * step, 0, 0]
         linear, _, _ = renderer.linear(Shot("", viewmat, K, *SIZE))
         transform = DisplayTransform(2.0**ev, 2.2, renderer.run.cfg.photometry)
@@ -84,36 +80,23 @@ def rig_run(finished_run, tmp_path_factory) -> Path:
         path = root / "scene" / "images" / name
         path.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(path), np.rint(develop(linear, transform) * 255)[..., ::-1])
-        # A turn by yaw to the right is one of the world to the left about y (down).
-        q, t = (np.cos(half), 0, -np.sin(half), 0), viewmat[:3, 3]
-        lines += [" ".join(map(str, (number, *q, *t, 1, name))), "1.0 1.0 1"]
+        split = "train" if step == 1 else "test"
+        pose = viewmat.astype(np.float32)
+        views.append(View(name, path, camera, pose, K.astype(np.float32), *SIZE, split=split))
         known = {"image": name, "camera": camera, "exif_ev": None, "split": "train"}
         known |= {"exposure": 2.0**ev, "exposure_ev": ev, "gamma": 2.2, "exposure_fitted": None}
         unknown = {"exposure": None, "exposure_ev": None, "gamma": None, "exposure_fitted": 2.0**ev}
-        views.append(known if step == 1 else known | unknown | {"split": "test"})
-    (model / "images.txt").write_text("\n".join(lines) + "\n")
-    cx, cy = SIZE[0] / 2, SIZE[1] / 2
-    (model / "cameras.txt").write_text(f"1 PINHOLE {SIZE[0]} {SIZE[1]} 70 70 {cx} {cy}\n")
-    (model / "points3D.txt").write_text("1 0 0 4 128 128 128 0.5 1 0 2 0\n")
+        solved.append(known if step == 1 else known | unknown | {"split": "test"})
     for name, key, value in (
         ("config.json", "scene", str(root / "scene")),
-        ("photometry.json", "views", views),
+        ("photometry.json", "views", solved),
     ):
         data = json.loads((root / "run" / name).read_text())
         data[key] = value
         (root / "run" / name).write_text(json.dumps(data))
-    write_scene(root / "run", load_scene(root / "scene", DataConfig(test_every=2)))
+    points = np.array([[0, 0, 4]], np.float32)
+    write_scene(root / "run", Scene(root / "scene", "colmap", tuple(views), points, None))
     return root / "run"
-
-
-def test_views_come_with_their_photographs_and_a_file_of_their_cameras(rendered, own_run, tmp_path):
-    text = rendered(own_run, "--out", tmp_path / "all", "--split", "test")
-    assert "2 frames" in text
-    for name in ("0", "3"):
-        for kind in ("exr", "render.png", "photograph.png"):
-            assert (tmp_path / "all" / f"{name}.{kind}").is_file()
-    cameras = json.loads((tmp_path / "all" / "cameras.json").read_text())
-    assert [c["name"] for c in cameras] == ["0", "3"]
 
 
 def test_a_file_of_cameras_renders_what_the_views_rendered(render, rendered, own_run, tmp_path):
@@ -145,14 +128,17 @@ def test_one_stop_doubles_the_linear_picture_and_leaves_the_radiance(rendered, o
     np.testing.assert_array_equal(*linear)
 
 
-def test_a_drive_becomes_a_video(rendered, own_run, tmp_path):
+def test_a_drive_becomes_a_video_that_is_not_replaced(render, rendered, own_run, tmp_path):
     out = tmp_path / "new" / "drive.mp4"
-    rendered(own_run, "--path", "drive", "--frames", 7, "--out", out, "--fps", 12, "--width", 80)
+    argv = (own_run, "--path", "drive", "--frames", 7, "--fps", 12, "--width", 64, "--out", out)
+    rendered(*argv)
     assert [p.name for p in out.parent.iterdir()] == ["drive.mp4"]
     frames = video(out)
     assert len(frames) == 7
-    assert frames[0].shape == (70, 80, 3)  # 71.4 pixels high, cut to an even number
+    assert frames[0].shape == (56, 64, 3)  # 57.1 pixels high, cut to an even number
     assert np.abs(frames[0] - frames[-1]).mean() > 0.01
+    code, text = render(*argv)
+    assert (code, "--overwrite" in text) == (2, True)
 
 
 def test_a_drive_can_be_exposed_as_photographed(rendered, own_run, tmp_path):
@@ -260,23 +246,18 @@ def test_senseless_requests_end_with_one_message(render, own_run, options, said)
 
 
 def test_what_is_there_is_replaced_only_when_asked_for(render, rendered, own_run, tmp_path):
-    for out in (tmp_path / "a", tmp_path / "a.mp4"):
-        argv = (own_run, "--path", "drive", "--frames", "2", "--width", "48", "--out", out)
-        rendered(*argv)
-        written = [p for p in (out.iterdir() if out.is_dir() else [out])]
-        before = [p.stat().st_mtime_ns for p in written]
-        code, text = render(*argv)
-        assert code == 2
-        assert "--overwrite" in text
-        assert [p.stat().st_mtime_ns for p in written] == before
-        text = rendered(*argv, "--overwrite")
-        assert [p.stat().st_mtime_ns for p in written] != before
-        # Where the seconds went adds up.
-        spent = re.search(
-            r"([\d.]+) s: ([\d.]+) reading .*? ([\d.]+) compiling.*? ([\d.]+) ren", text
-        )
-        total, *parts = map(float, spent.groups())
-        assert sum(parts) == pytest.approx(total, abs=0.3)
+    argv = (own_run, "--path", "drive", "--frames", 2, "--width", 64, "--out", tmp_path)
+    rendered(*argv)
+    before = [p.stat().st_mtime_ns for p in tmp_path.iterdir()]
+    code, text = render(*argv)
+    assert (code, "--overwrite" in text) == (2, True)
+    assert [p.stat().st_mtime_ns for p in tmp_path.iterdir()] == before
+    text = rendered(*argv, "--overwrite")
+    assert [p.stat().st_mtime_ns for p in tmp_path.iterdir()] != before
+    # Where the seconds went adds up.
+    spent = re.search(r"([\d.]+) s: ([\d.]+) reading .*? ([\d.]+) compiling.*? ([\d.]+) ren", text)
+    total, *parts = map(float, spent.groups())
+    assert sum(parts) == pytest.approx(total, abs=0.3)
 
 
 def test_a_folder_in_place_of_a_video_is_kept(render, own_run, tmp_path):

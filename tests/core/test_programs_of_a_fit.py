@@ -1,7 +1,5 @@
 """Few programs: what is small is computed by numpy, what is large by one program per image size."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from tiny_scene import make_scene
@@ -9,6 +7,7 @@ from tiny_scene import make_scene
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.clock import CompileCounter
 from p2gs_jax.core.progress import Silent
+from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.photometry.parameters import recentre
 from p2gs_jax.pipeline.calibrate import calibrate
 from p2gs_jax.pipeline.finish import Account, finish
@@ -29,12 +28,8 @@ def test_calibration_compiles_nothing(scene, tmp_path):
 
 
 def test_a_fit_without_its_steps_compiles_few_programs(scene, tmp_path):
-    cfg = FitConfig()
-    cfg = dataclasses.replace(
-        cfg,
-        data=dataclasses.replace(cfg.data, test_every=3),
-        render=dataclasses.replace(cfg.render, sh_degree=1),
-    )
+    fields = {"data.test_every": 3, "render.sh_degree": 1, "train.budget_s": 1.0}
+    cfg = with_fields(FitConfig(), fields)
     counter = CompileCounter()
     loaded = load(scene, tmp_path, cfg, Silent())
     prepared = prepare(loaded, cfg, Silent())
@@ -47,7 +42,7 @@ def test_a_fit_without_its_steps_compiles_few_programs(scene, tmp_path):
         prepared.store,
         prepared.cfg,
         RunFolder(tmp_path),
-        Account({}, {"reading": 1.0}, counter, prepared.selection, prepared.notes),
+        Account({}, {"total_until_evaluation": 60.0}, counter, prepared.selection, prepared.notes),
         Silent(),
     )
     # Counting tiles, rendering, developing (images; colours of splats), fitting an exposure, PSNR,
@@ -59,8 +54,14 @@ def test_a_fit_without_its_steps_compiles_few_programs(scene, tmp_path):
     compiling = seconds.pop("compiler_in_all_threads")
     assert compiling == counter.seconds > 0
     assert metrics["counts"]["programs"] == counter.programs
-    assert list(seconds) == ["reading", "files", "evaluation", "evaluation_and_files"]
+    assert list(seconds) == [
+        "total_until_evaluation",
+        "files",
+        "evaluation",
+        "evaluation_and_files",
+    ]
     assert min(seconds.values()) > 0
+    assert any(n.startswith("The budget of 1 s was exceeded") for n in metrics["notes"])
 
 
 def test_reading_a_run_compiles_nothing(finished_run):

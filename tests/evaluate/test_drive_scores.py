@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from made_drive import FAR, SPEED, WALL, make_recording
+from splats import random_splats
 
 from p2gs_jax.config import DataConfig, FitConfig
 from p2gs_jax.core.atomic import plain
@@ -18,7 +19,7 @@ from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.rigid import headings, left_of_way, moment_of, up_of_drive
 from p2gs_jax.scene.split import assign_split
-from p2gs_jax.types import Gaussians, Lidar, Params, Photometry, Render, View
+from p2gs_jax.types import Lidar, Params, Photometry, Render, View
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -62,13 +63,8 @@ def metrics(scene):
         arrays = map(jnp.asarray, (linear, alpha, depth))
         return Render(*arrays, jnp.int32(0), jnp.bool_(False), alive)
 
-    shapes = ((0, 3), (0, 4), (0, 3), (0,), (0, 1, 3))
-    train = len(scene.train_indices)
-    params = Params(
-        Gaussians(*(jnp.zeros(s, jnp.float32) for s in shapes)),
-        Photometry(jnp.zeros(train), jnp.zeros(train), "log"),
-        None,
-    )
+    zeros = jnp.zeros(len(scene.train_indices))
+    params = Params(random_splats(0, degree=0), Photometry(zeros, zeros, "log"))
     cfg = FitConfig()
     store = ImageStore(scene.views, cfg.data)
     out = evaluate(params, scene, store, cfg, render=render)

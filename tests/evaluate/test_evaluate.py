@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from lpips_files import made_arrays, write_weights
+from splats import random_splats
+from tiny_scene import noise_scene
 
 from p2gs_jax.cli.tables import print_metrics
 from p2gs_jax.config import FitConfig, LossConfig, PhotometryConfig
@@ -21,7 +23,7 @@ from p2gs_jax.evaluation.scores import Untold, untold_notes
 from p2gs_jax.photometry.metering import meter
 from p2gs_jax.run.read import load_run
 from p2gs_jax.scene.pixels.store import ImageStore
-from p2gs_jax.types import Gaussians, Params, Photometry, Render, Scene, View
+from p2gs_jax.types import Params, Photometry, Render
 
 HEIGHT, WIDTH = 34, 40
 
@@ -35,16 +37,7 @@ def weights(tmp_path_factory):
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     """Return two training views and one held out, of noise."""
-    folder, views = tmp_path_factory.mktemp("noise"), []
-    rng = np.random.default_rng(0)
-    K = np.array([[40, 0, 20], [0, 40, 17], [0, 0, 1]], np.float32)
-    for k, split in enumerate(("train", "train", "test")):
-        path = folder / f"{k}.png"
-        cv2.imwrite(str(path), rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8))
-        pose = np.eye(4, dtype=np.float32)
-        views.append(View(path.name, path, "0", pose, K, WIDTH, HEIGHT, split=split))
-    points = np.zeros((0, 3), np.float32)
-    return Scene(folder, "colmap", tuple(views), points, points.astype(np.uint8))
+    return noise_scene(tmp_path_factory.mktemp("noise"), ("0.png", "1.png"), ("2.png",))
 
 
 def judged(scene, *, slope=0.0, **options):
@@ -57,10 +50,8 @@ def judged(scene, *, slope=0.0, **options):
         linear = 0.2 * jnp.tile((flat * across)[..., None], 3)
         return Render(linear, flat, flat, jnp.int32(0), jnp.bool_(False), alive)
 
-    shapes = ((0, 3), (0, 4), (0, 3), (0,), (0, 1, 3))
-    gaussians = Gaussians(*(jnp.zeros(s, jnp.float32) for s in shapes))
     return evaluate(
-        Params(gaussians, Photometry(jnp.zeros(2), jnp.zeros(2), "log"), None),
+        Params(random_splats(0, degree=0), Photometry(jnp.zeros(2), jnp.zeros(2), "log"), None),
         scene,
         store,
         FitConfig(),
@@ -222,7 +213,7 @@ def test_held_out_views_are_scored_under_the_exposure_of_the_training_views_rule
         views.add_held_out(7, meter(linear, mask), linear, linear, mask)
         exposures = KEY / levels if metered else drawn
         found = views.fit(exposures, 2.2, PhotometryConfig())
-        scores = views.scores(found, lambda row, image, e, *_: {"level": float(image.mean() * e)})
+        scores = views.scores(found, lambda row, e, image, *_: {"level": float(image.mean() * e)})
     if metered:
         assert scores[7]["level"] == pytest.approx(KEY, rel=1e-4)
         assert scores[7]["exposure"] == pytest.approx(KEY / 0.4, rel=1e-4)

@@ -90,7 +90,9 @@ def test_colour_difference_sees_hue():
     assert pu21_psnr(red, truth, EVERYWHERE, 1.0) < 40
 
 
-def test_nothing_to_judge():
+def test_nothing_to_judge_has_no_score():
+    assert np.isnan(mu_law_psnr(TRUTH, TRUTH, ~SOME))
+    assert np.isnan(mu_law_psnr(TRUTH, 0 * TRUTH, SOME))
     assert RadianceScores().summary(1.0) == {}
     none = np.zeros((24, 32), bool)
     s = RadianceScores()
@@ -125,8 +127,3 @@ def test_masked_pixels_neither_count_nor_say_what_is_brightest():
     wrong[0, 0], truth[0, 0] = 1e6, 1e4
     assert mu_law_psnr(wrong, truth, mask) == before
     assert before < mu_law_psnr(TRUTH, TRUTH, SOME)
-
-
-def test_nothing_to_compare_has_no_mu_law_score():
-    assert np.isnan(mu_law_psnr(TRUTH, TRUTH, ~SOME))
-    assert np.isnan(mu_law_psnr(TRUTH, 0 * TRUTH, SOME))

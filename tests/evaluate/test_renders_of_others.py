@@ -6,6 +6,7 @@ import cv2
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tiny_scene import noise_scene
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
@@ -13,32 +14,15 @@ from p2gs_jax.evaluation.against import check_renders, judge_renders
 from p2gs_jax.evaluation.evaluate import Judge
 from p2gs_jax.evaluation.renders_of_others import find_renders, orders
 from p2gs_jax.scene.pixels.store import ImageStore
-from p2gs_jax.types import Params, Photometry, Scene, View
+from p2gs_jax.types import Params, Photometry
 
 SIZE = (40, 34)
 
 
 def made_scene(folder, held_out, masked=False):
-    """Return a training view and some held out, of noise."""
-    rng = np.random.default_rng(0)
+    """Return a training view and some held out, of noise, and their photographs."""
     folder.mkdir()
-    views = []
-    for name in ("train.png", *held_out):
-        path = folder / name
-        cv2.imwrite(str(path), rng.integers(0, 256, (*SIZE[::-1], 3), np.uint8))
-        mask = None
-        if masked:
-            mask = folder / f"{name}.mask.png"
-            shown = np.full(SIZE[::-1], 255, np.uint8)
-            shown[:, :20] = 0
-            cv2.imwrite(str(mask), shown)
-        K = np.array([[40, 0, 20], [0, 40, 17], [0, 0, 1]], "f4")
-        split = "train" if name == "train.png" else "test"
-        pose = np.eye(4, dtype="f4")
-        view = View(name, path, "0", pose, K, *SIZE, split=split, mask_path=mask)
-        views.append(view)
-    points = np.zeros((0, 3), "f4")
-    scene = Scene(folder, "colmap", tuple(views), points, points.astype(np.uint8))
+    scene = noise_scene(folder, ("train.png",), held_out, masked)
     return scene, ImageStore(scene.views, FitConfig().data)
 
 

@@ -12,7 +12,7 @@ from plyfile import PlyData
 from tiny_scene import make_scene
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.export.folders import write_colmap_folder, write_nerfstudio_folder
+from p2gs_jax.export.folders import write_folder
 from p2gs_jax.scene import ImageStore, load_scene
 from p2gs_jax.scene.exposures import read_known_exposures
 
@@ -33,7 +33,7 @@ def rows(scene):
 def export(root, cfg):
     scene = load_scene(root, cfg)
     store = ImageStore(scene.views, cfg)
-    write_colmap_folder(root / "out", scene, store, rows(scene))
+    write_folder("colmap", root / "out", scene, store, rows(scene))
     return scene, store, load_scene(root / "out", DataConfig())
 
 
@@ -130,13 +130,13 @@ def test_points_keep_the_errors_of_their_tracks_and_need_none(tmp_path):
     first = scene.tracks.point_indices == 0
     moved = np.where(first[:, None], scene.tracks.xy + np.float32(0.5), scene.tracks.xy)
     noisy = dataclasses.replace(scene, tracks=dataclasses.replace(scene.tracks, xy=moved))
-    write_colmap_folder(tmp_path / "out", noisy, store, rows(scene))
+    write_folder("colmap", tmp_path / "out", noisy, store, rows(scene))
     model = pycolmap.Reconstruction(str(tmp_path / "out" / "sparse" / "0"))
     errors = [p.error for _, p in sorted(model.points3D.items())]
     assert errors[0] == pytest.approx(0.5 * 2**0.5, abs=1e-3)
     assert max(errors[1:]) < 1e-3
     bare = dataclasses.replace(scene, tracks=None)
-    write_colmap_folder(tmp_path / "bare", bare, store, rows(bare))
+    write_folder("colmap", tmp_path / "bare", bare, store, rows(bare))
     after = load_scene(tmp_path / "bare", DataConfig())
     np.testing.assert_array_equal(after.points, scene.points)
     assert after.tracks is None
@@ -161,10 +161,10 @@ def test_a_failure_leaves_nothing_behind(tmp_path):
     root = make_scene(tmp_path)
     scene = load_scene(root, DataConfig())
     (root / "images" / "3.png").write_bytes(b"broken")
-    for write in (write_colmap_folder, write_nerfstudio_folder):
+    for program in ("colmap", "nerfstudio"):
         store = ImageStore(scene.views, DataConfig())
         with pytest.raises(Exception, match=r"3\.png"):
-            write(root / "out", scene, store, rows(scene))
+            write_folder(program, root / "out", scene, store, rows(scene))
     assert sorted(p.name for p in root.iterdir()) == ["images", "sparse"]
 
 
@@ -172,7 +172,7 @@ def test_nerfstudio_has_the_same_scene(tmp_path):
     cfg = DataConfig(max_width=80, test_every=3)
     scene = load_scene(camera_with_distortion(make_scene(tmp_path / "scene")), cfg)
     store = ImageStore(scene.views, cfg)
-    write_nerfstudio_folder(tmp_path / "out", scene, store, rows(scene))
+    write_folder("nerfstudio", tmp_path / "out", scene, store, rows(scene))
     back = load_scene(tmp_path / "out", DataConfig())
     again = ImageStore(back.views, DataConfig())
     assert back.format == "transforms"

@@ -134,9 +134,8 @@ def test_the_header_holds_white_balance_and_vignetting(tmp_path):
         write_exr(path, linear, taken=taken)
         header = read_exr(path)[1]
         np.testing.assert_allclose(header["p2gsWhiteBalance"], np.exp(balance), rtol=1e-6)
-        for name, row in zip(
-            ("Red", "Green", "Blue"), rows if len(rows) == 3 else rows * 3, strict=True
-        ):
+        each = rows if len(rows) == 3 else rows * 3
+        for name, row in zip(("Red", "Green", "Blue"), each, strict=True):
             np.testing.assert_allclose(header[f"p2gsVignetting{name}"], row, rtol=1e-6)
     write_exr(path, linear, taken=taken.without_place())
     assert "p2gsVignettingRed" not in read_exr(path)[1]

@@ -35,9 +35,6 @@ def test_a_failure_leaves_the_old_file_or_folder_and_success_replaces_it(tmp_pat
         (folder / "new").write_text("whole")
     assert sorted(os.listdir(tmp_path)) == ["a.json", "out"]
     assert os.listdir(tmp_path / "out") == ["new"]
-
-
-def test_json_has_no_nan(tmp_path):
     write_json(tmp_path / "a.json", {"a": float("nan"), "b": jnp.float32(2), "c": np.arange(2)})
     assert "NaN" not in (tmp_path / "a.json").read_text()
 

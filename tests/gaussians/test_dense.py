@@ -129,7 +129,6 @@ def test_wrong_matches_are_refused(tmp_path):
     found, error = one.depth()
     assert found.valid.mean() > 0.5
     assert np.quantile(error[found.valid], 0.95) < 0.01
-    assert found.agreeing[0][found.valid].mean() < 0.05
     # A picture of something else is no view of this.
     assert one.depth(1)[0].valid.mean() < 0.01
 

@@ -1,4 +1,4 @@
-"""Points projected into views: positions, occlusion, samples, and exposures without tracks."""
+"""Points projected into views: occlusion, samples, and exposures without tracks."""
 
 import csv
 import dataclasses
@@ -15,7 +15,6 @@ from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.sources.points import MOST_PER_POINT, projected_colors, track_colors
 from p2gs_jax.photometry.sources.sampling import sample
 from p2gs_jax.presets import preset
-from p2gs_jax.render.warp import project_points
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.visibility import unoccluded
@@ -48,14 +47,6 @@ CFG = preset("robust")
 @pytest.fixture
 def street(noisy_street, tmp_path):
     return load_scene(noisy_street, CFG.data, tmp_path, lambda text: None)
-
-
-def test_positions_are_those_of_the_tracks(street):
-    mine = street.tracks.view_indices == 3
-    points = street.points[street.tracks.point_indices[mine]]
-    xy, z = project_points(points, street.views[3])
-    assert np.all(z > 0)
-    assert np.median(np.abs(xy - street.tracks.xy[mine])) < 0.5
 
 
 def test_exposures_without_tracks(street, noisy_street):
@@ -181,13 +172,6 @@ def test_exposures_are_right_where_a_surface_has_highlights():
     np.testing.assert_array_equal(few.brightest, observations.brightest[:7])
 
 
-def test_wide_patches_keep_away_from_the_border():
-    image, mask = np.full((20, 20, 3), 0.5, np.float32), np.ones((20, 20), np.float32)
-    xy = np.array([[3.5, 10.0], [10.0, 10.0]])
-    assert sample(image, mask, xy).valid.tolist() == [True, True]
-    assert sample(image, mask, xy, np.full(2, 4.0)).valid.tolist() == [False, True]
-
-
 def test_samples_sit_at_pixel_centres():
     rng = np.random.default_rng(0)
     # A ramp of light: patches are averaged linearly.
@@ -204,12 +188,15 @@ def test_samples_sit_at_pixel_centres():
         np.testing.assert_allclose(spread[:, 0], 0.5 * slope * 0.8 / 49, rtol=5e-3)
 
 
-def test_samples_outside_and_masked_are_invalid():
+def test_samples_outside_and_masked_and_wide_patches_at_the_border_are_invalid():
+    image, ones = np.zeros((40, 50, 3), np.float32), np.ones((40, 50), np.float32)
+    xy = np.array([[3.5, 10.0], [10.0, 10.0]])
+    assert sample(image, ones, xy).valid.tolist() == [True, True]
+    assert sample(image, ones, xy, np.full(2, 4.0)).valid.tolist() == [False, True]
     mask = np.ones((40, 50), np.float32)
     mask[:20] = 0
     xy = np.array([[-3.0, 30], [25, 10], [25, 30], [60, 30], [25, 20.4]])
-    valid = sample(np.zeros((40, 50, 3), np.float32), mask, xy).valid
-    assert valid.tolist() == [False, False, True, False, False]
+    assert sample(image, mask, xy).valid.tolist() == [False, False, True, False, False]
 
 
 def observations(views, points):

@@ -9,7 +9,7 @@ from walls import halves, wall
 
 from p2gs_jax.config import DataConfig, RenderConfig
 from p2gs_jax.errors import UserError
-from p2gs_jax.jobs.blocks.seams import measure_seams, merge_cores, unprojected
+from p2gs_jax.jobs.blocks.seams import measure_seams, merge_cores
 from p2gs_jax.render.harmonics import C0
 from p2gs_jax.scene.pixels.store import ImageStore
 
@@ -55,17 +55,3 @@ def test_a_boundary_that_no_view_shows_is_said(two_views):
         two_views, store, halves(views=()), [wall(), wall()], RenderConfig(sh_degree=0)
     )
     assert (seam.views, seam.pixels, seam.step_stops) == (0, 0, None)
-
-
-def test_pixels_go_back_to_where_they_came_from():
-    rng = np.random.default_rng(0)
-    rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = rotation, [0.1, -0.4, 2.0]
-    K = np.array([[30.0, 0, 8], [0, 35.0, 6], [0, 0, 1]])
-    depth = rng.uniform(1, 5, (12, 16))
-    points = unprojected(depth, K, viewmat)
-    local = points @ rotation.T + viewmat[:3, 3]
-    np.testing.assert_allclose(local[..., 2], depth, rtol=1e-9)
-    x = local[..., 0] / depth * 30 + 8
-    np.testing.assert_allclose(x, np.broadcast_to(np.arange(16) + 0.5, (12, 16)), atol=1e-9)

@@ -34,39 +34,32 @@ def test_what_is_written_is_read_again(tmp_path):
         for field in ("name", "width", "height", "exposure_ev", "gamma"):
             assert getattr(after, field) == getattr(before, field)
     assert back[1].view is None
+    # Names are numbers where there are none.
+    unnamed = read_cameras(save(tmp_path / "c.json", [GOOD, GOOD]))
+    assert [s.name for s in unnamed] == ["00000", "00001"]
 
 
-def test_names_are_numbers_where_there_are_none(tmp_path):
-    shots = read_cameras(save(tmp_path / "c.json", [GOOD, GOOD]))
-    assert [s.name for s in shots] == ["00000", "00001"]
+# Values that a field cannot have, `...` where it is missing, by words of the message.
+WRONG = {
+    "no viewmat": ("viewmat", ...),
+    "no K": ("K", ...),
+    "K with no positive": ("K", [[0, 0, 1], [0, 50, 1], [0, 0, 1]]),
+    "skew": ("K", [[50, 3, 32], [0, 50, 24], [0, 0, 1]]),
+    "unknown field 'exposure'": ("exposure", 2),
+    "viewmat": ("viewmat", None, [[1, 2], [3, 4]], (2 * np.eye(4)).tolist()),
+    "has a viewmat": ("viewmat", np.diag([1.0, 1, -1, 1]).tolist()),
+    "width": ("width", ..., 0, 64.5, True),
+    "height": ("height", ..., "48", 1e300),
+    "gamma": ("gamma", 0),
+    "exposure_ev": ("exposure_ev", "bright", 5000),
+    "name": ("name", "../../etc", "/a", 3),
+}
+CASES = [(field, value, words) for words, (field, *some) in WRONG.items() for value in some]
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        *(({key: ...}, f"no {key}" if key in "Kviewmat" else key) for key in list(GOOD)),
-        ({"viewmat": None}, "viewmat"),
-        ({"viewmat": [[1, 2], [3, 4]]}, "viewmat"),
-        ({"viewmat": (2 * np.eye(4)).tolist()}, "viewmat"),
-        ({"viewmat": np.diag([1.0, 1, -1, 1]).tolist()}, "viewmat"),
-        ({"K": [[0, 0, 1], [0, 50, 1], [0, 0, 1]]}, "K"),
-        ({"K": [[50, 3, 32], [0, 50, 24], [0, 0, 1]]}, "skew"),
-        ({"width": 0}, "width"),
-        ({"width": 64.5}, "width"),
-        ({"width": True}, "width"),
-        ({"height": "48"}, "height"),
-        ({"height": 1e300}, "height"),
-        ({"gamma": 0}, "gamma"),
-        ({"exposure_ev": "bright"}, "exposure_ev"),
-        ({"exposure_ev": 5000}, "exposure_ev"),
-        ({"name": "../../etc"}, "name"),
-        ({"name": "/a"}, "name"),
-        ({"name": 3}, "name"),
-        ({"exposure": 2}, "unknown field 'exposure'"),
-    ],
-)
-def test_errors_name_the_entry_and_the_field(tmp_path, change, words):
-    entry = {k: v for k, v in {**GOOD, **change}.items() if v is not ...}
+@pytest.mark.parametrize(("field", "value", "words"), CASES)
+def test_errors_name_the_entry_and_the_field(tmp_path, field, value, words):
+    entry = {k: v for k, v in {**GOOD, field: value}.items() if v is not ...}
     path = save(tmp_path / "c.json", [GOOD, entry])
     with pytest.raises(UserError) as error:
         read_cameras(path)

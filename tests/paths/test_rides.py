@@ -150,10 +150,9 @@ def test_a_vehicle_sways_about_its_middle_view(yaws):
     assert "no common point" in circle.description()
 
 
-@pytest.mark.parametrize("count", [1, 3])
-def test_odd_cameras_still_give_an_orbit(count):
-    ahead = [shot(turned(0, (0, 0, z))) for z in range(count)]
-    for cameras in (ahead, around([0, 90, 180, 270], elevation=89.99)):
+def test_odd_cameras_still_give_an_orbit():
+    ahead = [shot(turned(0, (0, 0, z))) for z in range(3)]
+    for cameras in (ahead[:1], ahead, around([0, 90, 180, 270], elevation=89.99)):
         circle = find_orbit(cameras, cameras, NO_POINTS)
         assert all(np.isfinite(s.viewmat).all() for s in orbit(circle, cameras, 9))
 

@@ -69,18 +69,12 @@ LOOSE = [
     view(f"{c}/{k}.png", turned(40 * k * (c == "b"), (0, 0, k))) for c in "ab" for k in range(4)
 ]
 ABSENT = [*photographs(), view("back/000099.png", turned(180))]
+NO_RIGS = {"one camera": ALONE, "never agree": UNLIKE, "turn against each other": LOOSE}
+NO_RIGS["'back'"] = ABSENT
 
 
-@pytest.mark.parametrize(
-    ("views", "words"),
-    [
-        (ALONE, "one camera"),
-        (UNLIKE, "never agree"),
-        (LOOSE, "turn against each other"),
-        (ABSENT, "'back'"),
-    ],
-)
-def test_what_is_not_a_rig_is_refused(views, words):
+@pytest.mark.parametrize(("words", "views"), NO_RIGS.items(), ids=NO_RIGS)
+def test_what_is_not_a_rig_is_refused(words, views):
     with pytest.raises(UserError, match=words):
         rig_of(views)
 

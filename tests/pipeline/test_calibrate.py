@@ -14,22 +14,21 @@ from p2gs_jax.evaluation.alignment import exposure_error
 from p2gs_jax.photometry.sources.stack import read_stack
 from p2gs_jax.presets import preset
 from p2gs_jax.run.photometry_files import read_photometry
+from p2gs_jax.synth.sensor import read_true_exposures
 
-
-def read_truth(root):
-    with (root / "truth" / "exposures.csv").open(newline="") as file:
-        return {row["image"]: float(row["exposure"]) for row in csv.DictReader(file)}
+AS_GIVEN = ("--photometry.no-select", "--photometry.model", "view_exposure")
 
 
 def test_street(noisy_street, tmp_path):
     result = calibrate(noisy_street, tmp_path / "out", preset("robust"))
     saved = read_photometry(tmp_path / "out" / "photometry.json")
     found = {v["image"]: v["exposure"] for v in saved["views"]}
-    truth = read_truth(noisy_street)
+    truth = read_true_exposures(noisy_street)
     names = sorted(found)
     error = exposure_error(np.array([found[n] for n in names]), np.array([truth[n] for n in names]))
     assert error["ev"] < 0.05
     assert result.selection.solution.model == "view_exposure"
+    assert any(m.startswith("Chosen: ") for m in result.messages)
     assert all(v["exposure_ev_error"] < 0.2 for v in saved["views"])
     assert (tmp_path / "out" / "calibration.png").stat().st_size > 10_000
     candidates = json.loads((tmp_path / "out" / "calibration.json").read_text())["candidates"]
@@ -38,24 +37,16 @@ def test_street(noisy_street, tmp_path):
 
 
 def test_command_keeps_known_exposures(noisy_street, tmp_path, run_command):
-    truth = read_truth(noisy_street)
+    truth = read_true_exposures(noisy_street)
     path = tmp_path / "known.csv"
     path.write_text("image,exposure\n" + "\n".join(f"{k},{5 * v}" for k, v in truth.items()))
     argv = ("calibrate", noisy_street, "--out", tmp_path / "out", "--known-exposures", path)
-    code, text = run_command(*argv)
+    # What is chosen without known exposures, `test_street` says.
+    code, text = run_command(*argv, *AS_GIVEN)
     assert code == 0
-    assert "Chosen:" in text
+    assert "Results: " in text
     for view in read_photometry(tmp_path / "out" / "photometry.json")["views"]:
         assert view["exposure"] == pytest.approx(5 * truth[view["image"]], rel=1e-3)
-
-
-def test_fit_refuses_known_exposures_it_would_ignore(noisy_street, tmp_path, run_command):
-    path = tmp_path / "known.csv"
-    path.write_text("image,exposure\n" + "\n".join(f"{k},1" for k in read_truth(noisy_street)))
-    argv = ("fit", noisy_street, "--out", tmp_path / "r", "--preset", "paper")
-    code, text = run_command(*argv, "--known-exposures", path)
-    assert code == 2
-    assert "starts exposures at random" in text
 
 
 def test_castle_says_that_exif_and_pixels_disagree(shared_data, tmp_path):

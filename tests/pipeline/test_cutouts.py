@@ -58,17 +58,13 @@ def ball(tmp_path_factory):
     return result, load_run(root / "run")
 
 
-def test_what_is_held_out_is_what_the_data_set_says(ball):
-    result, _ = ball
+def test_held_out_views_are_the_data_set_s_and_scores_over_the_background(ball):
+    result, run = ball
     assert result.metrics["split"] == "transforms_test.json"
     assert sorted(result.metrics["test"]["averaged"]["per_view"]) == [
         f"test/r_{k}.png" for k in range(4)
     ]
     assert any("over 0.1,0.9,0.1" in note for note in result.metrics["notes"])
-
-
-def test_scores_are_over_the_background(ball):
-    result, run = ball
     # The bare background scores 9.5 dB.
     assert result.metrics["test"]["averaged"]["psnr"] > 20
     store = run.store

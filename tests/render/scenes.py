@@ -40,7 +40,3 @@ def camera(width=72, height=53, focal=54.0, viewmat=None, dtype=np.float32):
         width=width,
         height=height,
     )
-
-
-def cast(tree, dtype):
-    return jax.tree.map(lambda a: jnp.asarray(a, dtype), tree)

@@ -10,10 +10,8 @@ from scipy.spatial.transform import Rotation
 from splats import random_splats
 
 from p2gs_jax.config import RenderConfig
-from p2gs_jax.core.numerics import fibonacci_sphere
-from p2gs_jax.gaussians.posed import posed, turning
+from p2gs_jax.gaussians.posed import posed
 from p2gs_jax.render import render_linear, required_capacity
-from p2gs_jax.render.harmonics import evaluate
 from p2gs_jax.render.project import HIDDEN, camera_of_each
 from p2gs_jax.render.visible import BLOCK, compact, in_view, splat, splat_listed
 from p2gs_jax.train.room import count_view
@@ -127,14 +125,3 @@ def test_blocks_take_each_gaussian_to_its_own_box():
     for a, b in zip(jax.tree.leaves(listed), jax.tree.leaves(whole), strict=True):
         np.testing.assert_allclose(np.asarray(a)[:COUNT], b, rtol=1e-5, atol=1e-5)
     assert not np.asarray(listed[0].visible)[COUNT:].any()
-
-
-def test_coefficients_turn_with_the_box():
-    rng = np.random.default_rng(0)
-    R = Rotation.random(rng=rng).as_matrix()
-    sh = rng.normal(size=(5, 16, 3)).astype(np.float32)
-    turned = np.einsum("ij,njc->nic", turning(R, 16), sh).astype(np.float32)
-    directions = fibonacci_sphere(5).astype(np.float32)
-    here = tuple(map(jnp.asarray, directions.T))
-    there = tuple(map(jnp.asarray, (directions @ R).T.astype(np.float32)))
-    np.testing.assert_allclose(evaluate(turned, here), evaluate(sh, there), atol=2e-5)

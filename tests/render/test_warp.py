@@ -1,10 +1,13 @@
 """The warp through depth against geometry that can be written down."""
 
 import dataclasses
+import functools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import splats
 
 from p2gs_jax.render.warp import (
     project_points,
@@ -14,19 +17,11 @@ from p2gs_jax.render.warp import (
     visible,
     warp,
 )
-from p2gs_jax.types import Camera, Render
+from p2gs_jax.types import Render
 
 WIDTH, HEIGHT = 24, 16
 Y, X = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-
-
-def camera(x=0.0, yaw=0.0, focal=20.0):
-    c, s = np.cos(yaw), np.sin(yaw)
-    viewmat = np.eye(4, dtype=np.float32)
-    viewmat[:3, :3] = [[c, 0, -s], [0, 1, 0], [s, 0, c]]
-    viewmat[:3, 3] = -viewmat[:3, :3] @ [x, 0, 0]
-    K = np.array([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]], np.float32)
-    return Camera(jnp.asarray(viewmat), jnp.asarray(K), WIDTH, HEIGHT)
+camera = functools.partial(splats.camera, width=WIDTH, height=HEIGHT, focal=20.0)
 
 
 def plane(z):
@@ -35,8 +30,11 @@ def plane(z):
 
 @pytest.mark.parametrize(("x", "yaw", "z"), [(0, 0, 1), (-2, 0.5, 0.5), (1.5, -0.4, 7), (2, 0, 50)])
 def test_projecting_what_was_unprojected_gives_the_pixel_back(x, yaw, z):
-    seen_by = camera(x, yaw)
-    xy, depth = project_points(unproject(plane(float(z)), seen_by), seen_by)
+    seen_by = camera(x, yaw=yaw)
+    points = unproject(plane(float(z)), seen_by)
+    host = unproject(np.full(X.shape, float(z)), jax.tree.map(np.asarray, seen_by))
+    np.testing.assert_allclose(points, host, rtol=1e-4, atol=1e-4)
+    xy, depth = project_points(points, seen_by)
     np.testing.assert_allclose(xy, np.stack([X, Y], -1), atol=2e-4)
     np.testing.assert_allclose(depth, z, rtol=1e-5)
 

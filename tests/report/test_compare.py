@@ -50,6 +50,11 @@ def test_tables_hold_every_run_and_mark_the_best(runs):
         assert row(found, name).best == best.get(name, set())
     options = {r.name: r.cells for r in found.options}
     assert options == {"preset": ("robust", "paper"), "train.seed": ("0", "7")}
+    # Exposures have no common gauge: means are removed.
+    ((label, x, y),) = found.exposures
+    assert label == "other"
+    np.testing.assert_allclose([x.mean(), y.mean()], 0, atol=1e-9)
+    np.testing.assert_allclose(np.abs(y - x), 0.1, atol=1e-6)
 
 
 def test_no_star_is_announced_where_scores_do_not_compare(runs, tmp_path, monkeypatch, run_command):
@@ -59,13 +64,6 @@ def test_no_star_is_announced_where_scores_do_not_compare(runs, tmp_path, monkey
         _, printed = run_command("compare", *runs, "--out", tmp_path / "compare.html")
         assert ("* best" in printed) is not different
         assert "seconds, whole run" in printed
-
-
-def test_exposures_without_their_gauge(runs):
-    ((label, x, y),) = compare_runs(runs).exposures
-    assert label == "other"
-    np.testing.assert_allclose([x.mean(), y.mean()], 0, atol=1e-9)
-    np.testing.assert_allclose(np.abs(y - x), 0.1, atol=1e-6)
 
 
 def test_command_page_and_markdown(runs, tmp_path, run_command):
@@ -109,16 +107,13 @@ def test_runs_of_different_scenes_get_a_table_and_a_sentence(runs, tmp_path):
     assert "data:image" not in comparison_page(found)
 
 
-def test_an_unfinished_run_has_empty_cells(runs, tmp_path):
+def test_an_unfinished_run_has_empty_cells_and_runs_of_one_name_are_told_apart(runs, tmp_path):
     poor = copy_run(runs[1], tmp_path / "poor")
     (poor / "metrics.json").unlink()
     found = compare_runs([runs[0], poor])
     assert row(found, "training PSNR, dB").cells[1] == ""
     assert any(r.startswith("poor: metrics.json is missing") for r in found.remarks)
     assert "| - |" in to_markdown(found)
-
-
-def test_runs_of_one_name_are_told_apart(runs, tmp_path):
     twin = copy_run(runs[0], tmp_path / "plain")
     labels = compare_runs([runs[0], twin]).labels
     assert len(set(labels)) == 2

@@ -80,15 +80,10 @@ def wall_run(tmp_path_factory):
         jnp.zeros((n, 1, 3)),
     )
     write_radiance(run / "radiance.ply", gaussians, np.ones(n, bool), activation="exp")
-    common = {"camera": "1", "gamma": 2.2, "exif_ev": None, "split": "train"}
+    common = {"camera": "1", "gamma": 2.2, "split": "train"}
+    common |= dict.fromkeys(("exif_ev", "exposure_fitted"))
     views = [
-        {
-            **common,
-            "image": f"{i}.png",
-            "exposure": e,
-            "exposure_ev": float(np.log2(e)),
-            "exposure_fitted": None,
-        }
+        {**common, "image": f"{i}.png", "exposure": e, "exposure_ev": float(np.log2(e))}
         for i, e in enumerate(EXPOSURES)
     ]
     write_photometry(

@@ -145,6 +145,9 @@ def test_without_held_out_files_training_views_are_rendered(run, tmp_path):
     text = write_report(poor).read_text()
     assert {"Training views", "Radiance in stops"} <= set(headings(text))
     assert any(f"Render of {v['image']}" in pictures(text) for v in read_run(run).train)
+    # A configuration alone gives a page.
+    shutil.copy(run / "config.json", tmp_path / "config.json")
+    assert {"What to watch", "Configuration"} <= set(headings(write_report(tmp_path).read_text()))
 
 
 @pytest.mark.parametrize("name", ["metrics.json", "photometry.json", "log.jsonl", "config.json"])
@@ -164,13 +167,6 @@ def test_the_command_reports_broken_files_and_missing_ones(run, tmp_path, run_co
         assert code == expected
         assert "photometry.json" in printed.replace("\n", "")
         (broken / "photometry.json").unlink(missing_ok=True)
-
-
-def test_a_configuration_alone_gives_a_page(run, tmp_path):
-    shutil.copy(run / "config.json", tmp_path / "config.json")
-    text = write_report(tmp_path).read_text()
-    assert headings(text)[0] == "What to watch"
-    assert "Configuration" in headings(text)
 
 
 def test_names_are_text_never_markup(run, tmp_path):
@@ -224,20 +220,16 @@ def test_changes_of_resolution_and_freezing_are_marked(run):
 
 
 @pytest.mark.parametrize(
-    ("camera_of", "shown", "hidden"),
+    ("cameras", "shown", "hidden"),
     [
-        (
-            lambda i: "left" if i < 3 else "right",
-            ("camera left", "camera right"),
-            "all photographs",
-        ),
-        (str, ("all photographs",), "camera 0"),
+        (["left"] * 3 + ["right"] * 3, ("camera left", "camera right"), "all photographs"),
+        ("012345", ("all photographs",), "camera 0"),
     ],
 )
-def test_two_cameras_get_a_panel_each_and_many_share_one(run, camera_of, shown, hidden):
+def test_two_cameras_get_a_panel_each_and_many_share_one(run, cameras, shown, hidden):
     files = read_run(run)
-    for i, view in enumerate(files.views):
-        view["camera"] = camera_of(i)
+    for view, camera in zip(files.views, cameras, strict=True):
+        view["camera"] = camera
     text = words(files)
     assert all(words in text for words in shown)
     assert hidden not in text

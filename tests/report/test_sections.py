@@ -1,6 +1,7 @@
 """Charts, pictures and the sections of drives: what they encode, and that they can be read."""
 
 import dataclasses
+import itertools
 import re
 import xml.etree.ElementTree as ElementTree
 
@@ -58,9 +59,6 @@ def test_shares_of_stops_have_the_colours_of_the_picture_and_these_grow_lighter(
     legend = [color for *_, color in stop_shares(steps, 1.0)][::-1]
     np.testing.assert_allclose(shown, legend, atol=1e-6)
     assert np.all(np.diff(shown @ [0.2126, 0.7152, 0.0722]) > 0)
-
-
-def test_dynamic_range():
     values = np.repeat(2.0 ** np.arange(0, 8.0), 100).reshape(8, 100)
     assert dynamic_range(grey(values)) == pytest.approx(7.0, abs=0.01)
     assert dynamic_range(np.zeros((4, 4, 3))) == 0.0
@@ -166,21 +164,13 @@ def test_parts_depth_and_shifted_views_are_tables(drive):
 
 def test_exposures_of_a_drive_are_a_line_a_camera_over_seconds(drive, monkeypatch):
     cameras = ("front", "front_left", "front_right", "left", "right", "back", "roof")
-    views = [
-        {
-            "image": f"{camera}/{k}.png",
-            "camera": camera,
-            "split": "test" if k == 2 else "train",
-            "exposure": None if k == 2 else 1.0 + k,
-            "exposure_ev": None if k == 2 else float(np.log2(1.0 + k)),
-            "exposure_fitted": 1.5 if k == 2 else None,
-            "exposure_ev_error": 0.05,
-            "exif_ev": None,
-            "gamma": None,
-        }
-        for camera in cameras
-        for k in range(5)
-    ]
+    unknown = dict.fromkeys(("exposure", "exposure_ev", "exposure_fitted", "exif_ev", "gamma"))
+    views = []
+    for camera, k in itertools.product(cameras, range(5)):
+        known = {"exposure": 1.0 + k, "exposure_ev": float(np.log2(1.0 + k)), "split": "train"}
+        known = {"exposure_fitted": 1.5, "split": "test"} if k == 2 else known
+        views.append({**unknown, **known, "image": f"{camera}/{k}.png", "camera": camera})
+        views[-1]["exposure_ev_error"] = 0.05
     times = {v["image"]: k / 10 for k, v in enumerate(views)}
     monkeypatch.setattr("p2gs_jax.report.photometry_sections.read_times", lambda folder: times)
     run = dataclasses.replace(drive(), photometry={"views": views})

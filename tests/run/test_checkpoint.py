@@ -10,19 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from splats import random_splats
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.train.optimizer import make_optimizer
 from p2gs_jax.train.state import grow_state, initial_state
-from p2gs_jax.types import Gaussians, Params, Photometry
+from p2gs_jax.types import Params, Photometry
 
 
 def state(capacity, seed=0):
-    rng = np.random.default_rng(seed)
-    shapes = [(capacity, 3), (capacity, 4), (capacity, 3), (capacity,), (capacity, 16, 3)]
-    gaussians = Gaussians(*(jnp.asarray(rng.normal(size=s), jnp.float32) for s in shapes))
+    gaussians = random_splats(capacity, seed=seed)
     params = Params(gaussians, Photometry(jnp.zeros(4), jnp.ones(4), "linear"))
     return initial_state(params, jnp.ones(capacity, bool), make_optimizer(FitConfig()))
 
@@ -165,7 +164,7 @@ while True:
 def test_killed_at_any_moment_the_last_good_checkpoint_stays(tmp_path):
     folder, moments = tmp_path / "c", random.Random(0)
     like = {"x": jax.ShapeDtypeStruct((2_000_000,), np.dtype("float32"))}
-    for _ in range(5):
+    for _ in range(3):
         child = subprocess.Popen(
             [sys.executable, "-c", CHILD, str(folder)], stdout=subprocess.PIPE, text=True
         )

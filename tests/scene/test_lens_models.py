@@ -11,13 +11,7 @@ from scene.helpers import write_image, write_tiny_model
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene import load_scene
-from p2gs_jax.scene.lens import (
-    _fold_radius,
-    intrinsics,
-    make_distortion,
-    undistort_points,
-    undistortion_maps,
-)
+from p2gs_jax.scene.lens import _fold_radius, intrinsics, undistort_points, undistortion_maps
 from p2gs_jax.scene.sfm.triangulate import camera_of
 from p2gs_jax.scene.transforms import load_transforms
 from p2gs_jax.types import Distortion
@@ -85,22 +79,16 @@ def test_lenses_grow_up_to_their_fold_and_no_further(lens):
         assert after - before < 1e-3 * abs(before)
 
 
-def test_positions_beyond_the_fold_have_no_ray():
-    lens = Distortion((-0.3, 0.0, 0.0, 0.0))
+def test_beyond_the_fold_and_at_the_side_of_a_fisheye_there_is_no_ray():
+    lens, fisheye = Distortion((-0.3, 0.0, 0.0, 0.0)), Distortion((0.0,) * 4, "fisheye")
     r = _fold_radius(lens)
-    outermost = 500 + 400 * r * (1 - 0.3 * r**2)
-    xy = undistort_points(np.array([[outermost - 1, 300], [outermost + 1, 300]]), K, lens)
-    assert np.isfinite(xy[0]).all()
-    assert np.isnan(xy[1]).all()
-
-
-def test_what_a_fisheye_sees_at_its_side_has_no_ray():
-    lens = Distortion((0.0, 0.0, 0.0, 0.0), "fisheye")
-    side = 500 + 400 * np.pi / 2
-    xy = undistort_points(np.array([[500, 300], [side - 1, 300], [side + 1, 300]]), K, lens)
-    np.testing.assert_allclose(xy[0], [500, 300])
-    assert xy[1, 0] > 1e5
-    assert np.isnan(xy[2]).all()
+    for one, outermost in ((lens, r * (1 - 0.3 * r**2)), (fisheye, np.pi / 2)):
+        x = 500 + 400 * outermost
+        xy = undistort_points(np.array([[500, 300], [x - 1, 300], [x + 1, 300]]), K, one)
+        np.testing.assert_allclose(xy[0], [500, 300])
+        assert np.isfinite(xy[1]).all()
+        assert xy[1, 0] > (1e5 if one is fisheye else x)
+        assert np.isnan(xy[2]).all()
 
 
 @pytest.mark.parametrize(
@@ -165,8 +153,3 @@ def test_transforms_with_fisheyes(tmp_path, extra):
     (tmp_path / "transforms.json").write_text(json.dumps(data))
     scene = load_transforms(tmp_path, tmp_path / "transforms.json", DataConfig())
     assert scene.views[0].distortion == Distortion((0.1, 0.02, -0.01, 0.003), "fisheye")
-
-
-def test_a_fisheye_of_zeros_is_no_pinhole():
-    assert make_distortion((0.0,) * 4) is None
-    assert make_distortion((0.0,) * 4, "fisheye") == Distortion((0.0,) * 4, "fisheye")

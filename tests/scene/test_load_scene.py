@@ -185,17 +185,14 @@ def test_alpha_as_a_mask_and_not_at_all(cutouts, alpha):
     assert np.allclose(ldr, held[0][..., :3])
 
 
-@pytest.mark.parametrize(
-    ("options", "note"),
-    [
+def test_alpha_is_always_noted(cutouts):
+    for options, note in (
         ({}, "3 of 4 photographs have an alpha channel: photographs and renders are shown"),
         ({"background": "random"}, "shown over a random colour at every step, and white to judge"),
         ({"alpha": "mask"}, "transparent pixels are left out"),
         ({"alpha": "ignore"}, "it is ignored"),
-    ],
-)
-def test_alpha_is_always_noted(cutouts, options, note):
-    assert note in load_scene(cutouts[0], DataConfig(**options)).notes[-1]
+    ):
+        assert note in load_scene(cutouts[0], DataConfig(**options)).notes[-1]
 
 
 def test_scenes_without_alpha_are_as_they_were(tmp_path):
@@ -292,9 +289,6 @@ def test_photographs_alone_are_looked_at_before_their_features_are(tmp_path, bom
     (tmp_path / "a.png").write_bytes(bomb)
     with refused(f"a{HUGE}"):
         load_scene(tmp_path, CFG)
-
-
-def test_what_is_no_file_is_no_photograph(tmp_path):
-    (tmp_path / "a.png").mkdir()
+    (tmp_path / "folder.png").mkdir()
     with refused("cannot decode"):
-        image_size(tmp_path / "a.png")
+        image_size(tmp_path / "folder.png")

@@ -109,65 +109,23 @@ def alike(a, b):
     return float(np.corrcoef(a.ravel(), b.ravel())[0, 1])
 
 
-def test_one_stop_on_the_slider_doubles_the_brightness(page, tmp_path):
+def test_one_stop_on_the_slider_doubles_the_brightness(page):
     choose(page, "Curve", "linear")
     enter(page, "Gamma", 2.2)
     enter(page, "Exposure", 0.5)
     before = steady(page)
     enter(page, "Exposure", 1.5)
     after = until(page, lambda shown: abs(brightening(before, shown) / 2 - 1) < 0.02)
-    path = tmp_path / "viewer.png"
-    page.screenshot(path=str(path))
-    assert path.stat().st_size > 10_000
     assert after.mean() > before.mean()
 
 
-def test_every_mode_shows_something_else(page):
+def test_every_mode_shows_something_else_and_saved_files_arrive(page):
     shown = [picture(page)]
     for mode in ("stops (false colour)", "clipping", "depth", "split: photo | render"):
         choose(page, "Show", mode)
         shown.append(until(page, lambda now: all(np.abs(now - s).mean() > 2e-4 for s in shown)))
     assert page.get_by_text("depth, scene units").count() == 0
     assert page.locator("label", has_text="Split").count() == 1
-
-
-def test_going_to_a_photograph_takes_its_look_and_place(page):
-    before = picture(page)
-    choose(page, "Go to", "5.png")
-    until(page, lambda now: np.abs(now - before).mean() > 0.01)
-    assert page.get_by_label("Match photo", exact=True).input_value() == "5.png"
-
-
-def test_the_keys_fly_and_the_picture_follows(page):
-    before = picture(page)
-    page.mouse.click(300, 500)
-    page.keyboard.down("KeyD")
-    page.wait_for_timeout(400)
-    page.keyboard.up("KeyD")
-    until(page, lambda now: np.abs(now - before).mean() > 0.005)
-
-
-def test_playing_moves_along_the_drive_until_it_is_paused(page):
-    page.get_by_text("Drive", exact=True).click()
-    before = picture(page)
-    page.get_by_role("button", name="Play").click()
-    until(page, lambda now: np.abs(now - before).mean() > 0.005)
-    page.get_by_role("button", name="Pause").click()
-    steady(page)
-    assert page.get_by_role("button", name="Play").count() == 1
-
-
-def test_cameras_appear_with_their_pictures(page):
-    choose(page, "Go to", "1.png")
-    before = steady(page)
-    page.get_by_label("Cameras", exact=True).check()
-    page.get_by_text("exposure, EV from the mean").wait_for()
-    page.mouse.move(300, 500)
-    page.mouse.wheel(0, 400)
-    until(page, lambda now: np.abs(now - before).mean() > 0.01)
-
-
-def test_saved_files_arrive(page):
     page.get_by_text("Save", exact=True).click()
     enter(page, "Width", 333)
     for button, start in (("PNG, as shown", b"\x89PNG"), ("EXR, linear light", b"v/1\x01")):
@@ -179,6 +137,35 @@ def test_saved_files_arrive(page):
         if button.startswith("PNG"):
             shown = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
             assert shown.shape[1] == 333
+
+
+def test_going_to_a_photograph_takes_its_look_and_place_and_cameras_appear(page):
+    before = picture(page)
+    choose(page, "Go to", "5.png")
+    until(page, lambda now: np.abs(now - before).mean() > 0.01)
+    assert page.get_by_label("Match photo", exact=True).input_value() == "5.png"
+    before = steady(page)
+    page.get_by_label("Cameras", exact=True).check()
+    page.get_by_text("exposure, EV from the mean").wait_for()
+    page.mouse.move(300, 500)
+    page.mouse.wheel(0, 400)
+    until(page, lambda now: np.abs(now - before).mean() > 0.01)
+
+
+def test_the_picture_follows_keys_and_a_drive_until_it_is_paused(page):
+    before = picture(page)
+    page.mouse.click(300, 500)
+    page.keyboard.down("KeyD")
+    page.wait_for_timeout(400)
+    page.keyboard.up("KeyD")
+    until(page, lambda now: np.abs(now - before).mean() > 0.005)
+    page.get_by_text("Drive", exact=True).click()
+    before = steady(page)
+    page.get_by_role("button", name="Play").click()
+    until(page, lambda now: np.abs(now - before).mean() > 0.005)
+    page.get_by_role("button", name="Pause").click()
+    steady(page)
+    assert page.get_by_role("button", name="Play").count() == 1
 
 
 def test_browser_splats_look_like_the_kernel(page):

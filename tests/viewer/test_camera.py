@@ -9,21 +9,9 @@ from p2gs_jax.types import Scene, View
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 
-from p2gs_jax.viewer.camera import (
-    TYPICAL_DISTANCE,
-    Pose,
-    ViewerSpace,
-    camera_of_browser,
-    distance_seen,
-    fov_that_holds,
-    frames_of,
-    frustum_size,
-    make_viewer_space,
-    pose_of,
-    viewmat_between,
-)
+from p2gs_jax.viewer import camera as cameras
 
-SPACE = ViewerSpace(2.5, np.array([0.0, -1.0, 0.0]))
+SPACE = cameras.ViewerSpace(2.5, np.array([0.0, -1.0, 0.0]))
 
 
 def viewmat(turn, at):
@@ -47,14 +35,15 @@ def a_view(viewmat, name="a"):
     return View(name, None, "0", viewmat.astype(np.float32), K, 120, 80)
 
 
-def test_a_point_is_where_the_browser_draws_it():
+@pytest.mark.parametrize("size", [(340, 200), (1280, 800), (480, 480)])
+def test_a_point_is_where_the_browser_draws_it_at_any_size(size):
     # What three.js does: camera-to-world with y up and z backwards, vertical field of view, the
     # canvas from -1 to 1 upwards.
     rotation = Rotation.from_euler("xyz", [0.2, -0.4, 0.1])
-    position, fov, aspect, size = np.array([1.0, -2.0, 0.5]), 0.9, 1.7, (340, 200)
+    position, fov, aspect = np.array([1.0, -2.0, 0.5]), 0.9, 1.7
     point = position / SPACE.unit + rotation.apply([0.3, 0.2, 4.0])
-    pose = Pose(rotation.as_quat(scalar_first=True), position, position, fov)
-    camera = camera_of_browser(pose, aspect, size, SPACE)
+    pose = cameras.Pose(rotation.as_quat(scalar_first=True), position, position, fov)
+    camera = cameras.camera_of_browser(pose, aspect, size, SPACE)
     x, y, z = rotation.inv().apply(point * SPACE.unit - position) * [1, -1, -1]
     ndc = np.array([x / aspect, y]) / (-z * np.tan(fov / 2))
     expected = (ndc * [1, -1] + 1) / 2 * size
@@ -62,31 +51,21 @@ def test_a_point_is_where_the_browser_draws_it():
 
 
 def test_a_view_survives_the_trip():
-    pose = pose_of(A_VIEWMAT, SPACE, distance=3.0, fov=0.7)
-    camera = camera_of_browser(pose, 1.5, (300, 200), SPACE)
+    pose = cameras.pose_of(A_VIEWMAT, SPACE, distance=3.0, fov=0.7)
+    camera = cameras.camera_of_browser(pose, 1.5, (300, 200), SPACE)
     np.testing.assert_allclose(camera.viewmat, A_VIEWMAT, atol=1e-6)
     np.testing.assert_allclose(camera.K[0, 0], camera.K[1, 1], rtol=1e-6)
     ahead = (pose.look_at / SPACE.unit - camera_centers(A_VIEWMAT[None])[0]) / 3.0
     np.testing.assert_allclose(ahead, A_VIEWMAT[2, :3], atol=1e-6)
 
 
-def test_any_size_shows_the_same_part_of_the_world():
-    pose = pose_of(A_VIEWMAT, SPACE, distance=3.0, fov=0.7)
-    point = camera_centers(A_VIEWMAT[None])[0] + A_VIEWMAT[:3, :3].T @ [0.2, -0.1, 2.0]
-    shares = [
-        pixel(camera_of_browser(pose, 1.6, size, SPACE), point) / size
-        for size in ((1280, 800), (328, 200), (480, 480))
-    ]
-    np.testing.assert_allclose(shares, shares[:1] * 3, rtol=1e-5)
-
-
 @pytest.mark.parametrize("aspect", [0.5, 1.0, 1.3, 3.0])
 def test_a_whole_photograph_is_seen(aspect):
     K = np.array([[90.0, 0, 70], [0, 110, 30], [0, 0, 1]])
     view = View("a", None, "0", np.eye(4), K, 120, 80)
-    pose = Pose((1, 0, 0, 0), (0, 0, 0), (0, 0, 1), fov_that_holds(view, aspect))
+    pose = cameras.Pose((1, 0, 0, 0), (0, 0, 0), (0, 0, 1), cameras.fov_that_holds(view, aspect))
     size = (round(1000 * aspect), 1000)
-    camera = camera_of_browser(pose, size[0] / size[1], size, SPACE)
+    camera = cameras.camera_of_browser(pose, size[0] / size[1], size, SPACE)
     corners = [(np.linalg.inv(K) @ [x, y, 1.0]) for x in (0, view.width) for y in (0, view.height)]
     at = np.array([pixel(camera, corner) for corner in corners])
     assert at.min() > -1
@@ -100,12 +79,14 @@ def test_up_is_what_cameras_hold_up_and_distances_are_typical():
     rolls = [viewmat([0, 0, roll], [0, 0, 0]) for roll in (-0.3, 0.1, 0.2)]
     points = np.random.default_rng(0).uniform([-0.1, -0.1, 4.9], [0.1, 0.1, 5.1], (50, 3))
     scene = Scene(None, "test", tuple(map(a_view, rolls)), points, np.zeros((0, 3)))
-    space = make_viewer_space(scene, points)
+    space = cameras.make_viewer_space(scene, points)
     np.testing.assert_allclose(space.up, [0, -1, 0], atol=0.02)
-    np.testing.assert_allclose(space.unit, TYPICAL_DISTANCE / 5, rtol=0.03)
+    np.testing.assert_allclose(space.unit, cameras.TYPICAL_DISTANCE / 5, rtol=0.03)
     # What is behind or beside has no distance.
-    assert distance_seen(np.eye(4), np.array([[0, 0, -3.0], [5, 0, 1.0], [0, 0, 7.0]])) == 7.0
-    assert distance_seen(np.eye(4), np.array([[0, 0, -3.0]])) == 1.0
+    assert (
+        cameras.distance_seen(np.eye(4), np.array([[0, 0, -3.0], [5, 0, 1.0], [0, 0, 7.0]])) == 7.0
+    )
+    assert cameras.distance_seen(np.eye(4), np.array([[0, 0, -3.0]])) == 1.0
 
 
 def test_poses_between_poses():
@@ -114,8 +95,8 @@ def test_poses_between_poses():
     places = dict(zip((0.0, 1.0, 2.0), recorded, strict=True))
     places |= {-1.0: recorded[0], 9.0: recorded[2], 0.25: ([0, 0.2, 0], [0.5, 0, 1])}
     for place, pose in places.items():
-        np.testing.assert_allclose(viewmat_between(poses, place), viewmat(*pose), atol=1e-9)
-    np.testing.assert_allclose(viewmat_between(poses[1:2], 0.7), poses[1], atol=1e-12)
+        np.testing.assert_allclose(cameras.viewmat_between(poses, place), viewmat(*pose), atol=1e-9)
+    np.testing.assert_allclose(cameras.viewmat_between(poses[1:2], 0.7), poses[1], atol=1e-12)
 
 
 def test_a_drive_is_one_camera_in_the_order_of_names():
@@ -124,10 +105,10 @@ def test_a_drive_is_one_camera_in_the_order_of_names():
         for name, camera in (("b/2", "b"), ("a/1", "a"), ("b/1", "b"))
     ]
     scene = Scene(None, "test", tuple(views), np.zeros((0, 3)), np.zeros((0, 3)))
-    assert frames_of(scene, "b") == (2, 0)
+    assert cameras.frames_of(scene, "b") == (2, 0)
 
 
 def test_frusta_of_neighbours_hardly_touch():
     views = [a_view(viewmat([0, 0, 0], [k, 0, 0])) for k in range(4)]
-    assert frustum_size(views, SPACE._replace(unit=1.0)) == pytest.approx(0.35)
-    assert frustum_size(views[:1], SPACE) == pytest.approx(0.35)
+    assert cameras.frustum_size(views, SPACE._replace(unit=1.0)) == pytest.approx(0.35)
+    assert cameras.frustum_size(views[:1], SPACE) == pytest.approx(0.35)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from splats import random_splats
 
 from p2gs_jax.config import CameraFormation, PhotometryConfig, RenderConfig
 from p2gs_jax.formats.exr import read_exr
@@ -14,25 +15,8 @@ from p2gs_jax.formats.false_color import OVER, clipping_overlay, depth_color, fa
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import squared_radii
 from p2gs_jax.render import view_radiance
-from p2gs_jax.types import Camera, Gaussians
-from p2gs_jax.viewer.pictures import (
-    LARGEST_DEVIATION,
-    MIDDLE_GREY,
-    RenderedFrame,
-    WarpedPhotograph,
-    browser_splats,
-    exposure_colors,
-    exr_bytes,
-    limits_of_depth,
-    picture_of,
-    places_in,
-    png_bytes,
-    splat_colors,
-    split_picture,
-    stops_legend,
-    to_uint8_fast,
-    warp_photograph,
-)
+from p2gs_jax.types import Camera
+from p2gs_jax.viewer import pictures
 
 TRANSFORM = DisplayTransform(2.0, 2.2, PhotometryConfig())
 SIZE = (24, 40)
@@ -53,7 +37,7 @@ def frame():
     linear = np.exp2(rng.uniform(-8, 3, (*SIZE, 3))).astype(np.float32)
     alpha = rng.uniform(0, 1, SIZE).astype(np.float32)
     depth = alpha * rng.uniform(2, 9, SIZE).astype(np.float32)
-    return RenderedFrame(jnp.asarray(linear), alpha, depth, camera())
+    return pictures.RenderedFrame(jnp.asarray(linear), alpha, depth, camera())
 
 
 def test_every_mode_shows_what_it_says(frame):
@@ -64,52 +48,54 @@ def test_every_mode_shows_what_it_says(frame):
         "split": shown,  # without a photograph
         "clipping": clipping_overlay(shown),
         "depth": depth_color(frame.depth, frame.alpha, limits),
-        "stops": false_color(linear, MIDDLE_GREY / TRANSFORM.exposure),
+        "stops": false_color(linear, pictures.MIDDLE_GREY / TRANSFORM.exposure),
     }
     for mode, picture in wanted.items():
-        found = picture_of(frame, mode, TRANSFORM, depth_limits=limits)
+        found = pictures.picture_of(frame, mode, TRANSFORM, depth_limits=limits)
         np.testing.assert_array_equal(found, picture)
     assert np.any(np.all(np.isclose(wanted["clipping"], OVER), axis=-1))
     # Stops count at the exposure of the transform.
-    brighter = picture_of(frame, "stops", replace(TRANSFORM, exposure=4.0))
-    twice = picture_of(replace(frame, linear=2 * frame.linear), "stops", TRANSFORM)
+    brighter = pictures.picture_of(frame, "stops", replace(TRANSFORM, exposure=4.0))
+    twice = pictures.picture_of(replace(frame, linear=2 * frame.linear), "stops", TRANSFORM)
     np.testing.assert_array_equal(brighter, twice)
     assert np.any(brighter != wanted["stops"])
 
 
 def test_the_limits_of_depth_hold_almost_everything(frame):
-    near, far = limits_of_depth(frame)
+    near, far = pictures.limits_of_depth(frame)
     assert 2 <= near < 3
     assert 8 < far <= 9
-    near, far = limits_of_depth(replace(frame, alpha=0 * frame.alpha, depth=0 * frame.depth))
+    near, far = pictures.limits_of_depth(
+        replace(frame, alpha=0 * frame.alpha, depth=0 * frame.depth)
+    )
     assert 0 < near < far
 
 
 def test_photograph_left_render_right():
     inside = np.zeros(SIZE, bool)
     inside[4:20, 10:30] = True
-    photo = WarpedPhotograph(np.full((*SIZE, 3), 0.25, np.float32), inside)
+    photo = pictures.WarpedPhotograph(np.full((*SIZE, 3), 0.25, np.float32), inside)
     render = np.full((*SIZE, 3), 0.75, np.float32)
-    out = split_picture(photo, render, 0.5)
+    out = pictures.split_picture(photo, render, 0.5)
     assert np.all(out[4:20, 10:19] == 0.25)
     assert np.all(out[:, 21:] == 0.75)
     assert np.all(out[:, :10] == 0.75)
     assert np.all(out[:4, :19] == 0.75)
     assert np.all(out[:, 19:21] == 1)
-    assert np.all(split_picture(photo, render, 1.0)[inside] == 0.25)
-    assert np.all(split_picture(photo, render, 0.0) == 0.75)
+    assert np.all(pictures.split_picture(photo, render, 1.0)[inside] == 0.25)
+    assert np.all(pictures.split_picture(photo, render, 0.0) == 0.75)
 
 
 def test_a_photograph_in_its_own_camera_stays_as_it_is_and_nothing_is_seen_behind():
     ldr = np.random.default_rng(0).uniform(0, 1, (*SIZE, 3)).astype(np.float32)
     mask = np.ones(SIZE, np.float32)
-    seen = warp_photograph(ldr, mask, camera(), camera())
+    seen = pictures.warp_photograph(ldr, mask, camera(), camera())
     np.testing.assert_allclose(seen.ldr, ldr, atol=1e-4)
     assert seen.inside[1:-1, 1:-1].all()
     back = camera(rotation=(0, np.pi, 0))
-    assert not warp_photograph(ldr, mask, camera(), back).inside.any()
+    assert not pictures.warp_photograph(ldr, mask, camera(), back).inside.any()
     mask[:, :20] = 0
-    seen = warp_photograph(ldr, mask, camera(), camera())
+    seen = pictures.warp_photograph(ldr, mask, camera(), camera())
     assert not seen.inside[:, :19].any()
     assert seen.inside[2:-2, 21:-2].all()
 
@@ -127,7 +113,7 @@ def test_a_photograph_lines_up_with_a_turned_camera(size):
         return rays / rays[..., 2:]
 
     ldr = (0.5 + 0.4 * directions(taken)).astype(np.float32)
-    seen = warp_photograph(ldr, np.ones((300, 400), np.float32), taken, other)
+    seen = pictures.warp_photograph(ldr, np.ones((300, 400), np.float32), taken, other)
     expected = 0.5 + 0.4 * directions(other)
     np.testing.assert_allclose(seen.ldr[seen.inside], expected[seen.inside], atol=2e-3)
     local = directions(other) @ np.asarray(taken.viewmat, float)[:3, :3].T
@@ -142,41 +128,35 @@ def test_a_photograph_lines_up_with_a_turned_camera(size):
 
 def test_codes_are_rounded_and_kept_in_range():
     values = np.array([[[0.0, 1.4 / 255, 1.6 / 255], [1.0, 1.2, 0.5]]], np.float32)
-    np.testing.assert_array_equal(to_uint8_fast(values)[0], [[0, 1, 2], [255, 255, 128]])
+    np.testing.assert_array_equal(pictures.to_uint8_fast(values)[0], [[0, 1, 2], [255, 255, 128]])
 
 
 def test_vignetting_is_where_the_photograph_has_it():
     """The window's shape is not the photograph's; beyond its corners nothing darkens further."""
     K = np.array([[50.0, 0, 40], [0, 50.0, 30], [0, 0, 1]], np.float32)
     taken_by = Camera(np.eye(4, dtype=np.float32), K, 80, 60)
-    radii = (places_in(taken_by, taken_by) ** 2).sum(-1)
+    radii = (pictures.places_in(taken_by, taken_by) ** 2).sum(-1)
     np.testing.assert_allclose(radii, squared_radii(60, 80), atol=1e-6)
     wide = Camera(taken_by.viewmat, K + np.array([[0, 0, 40], [0, 0, 0], [0, 0, 0]]), 160, 60)
-    seen = places_in(taken_by, wide)
-    np.testing.assert_allclose(seen[:, 40:120], places_in(taken_by, taken_by), atol=1e-6)
+    seen = pictures.places_in(taken_by, wide)
+    np.testing.assert_allclose(seen[:, 40:120], pictures.places_in(taken_by, taken_by), atol=1e-6)
     assert np.linalg.norm(seen, axis=-1).max() <= 1 + 1e-6
     shaded = PhotometryConfig(cameras=(CameraFormation("a", ((-0.5, 0.0, 0.0),)),))
     transform = DisplayTransform(1.0, 2.2, shaded, camera=0)
     grey = np.full((60, 160, 3), 0.2, np.float32)
-    window = RenderedFrame(grey, np.ones((60, 160)), np.ones((60, 160)), wide)
-    shown = picture_of(window, "display", transform, taken_by=taken_by)
+    window = pictures.RenderedFrame(grey, np.ones((60, 160)), np.ones((60, 160)), wide)
+    shown = pictures.picture_of(window, "display", transform, taken_by=taken_by)
     np.testing.assert_allclose(shown[:, 40:120], develop(grey[:, :80], transform), atol=1e-5)
-    flat = picture_of(window, "display", transform.without_place(), taken_by=taken_by)
+    flat = pictures.picture_of(window, "display", transform.without_place(), taken_by=taken_by)
     assert np.ptp(flat) < 1e-6
     assert np.ptp(shown) > 0.1
 
 
-def splats_of(n=5, *, alive=True, cfg=None, **place):
-    rng = np.random.default_rng(0)
-    g = Gaussians(
-        means=jnp.asarray(rng.normal((0, 0, 5), 1, (n, 3)), jnp.float32),
-        quats=jnp.asarray(rng.normal(size=(n, 4)), jnp.float32).at[0].set(0),
-        log_scales=jnp.asarray(rng.normal(size=(n, 3)), jnp.float32).at[-1].set(20.0),
-        opacity_logits=jnp.asarray(rng.normal(size=n), jnp.float32),
-        sh=jnp.asarray(rng.normal(size=(n, 4, 3)), jnp.float32),
-    )
+def splats_of(*, alive=True, cfg=None, **place):
+    g = random_splats(5, degree=1)
+    g = replace(g, quats=g.quats.at[0].set(0), log_scales=g.log_scales.at[-1].set(20.0))
     place = {"seen_from": np.zeros(3), "unit": 1.0} | place
-    return g, browser_splats(g, np.broadcast_to(alive, n), cfg or RenderConfig(), **place)
+    return g, pictures.browser_splats(g, np.broadcast_to(alive, 5), cfg or RenderConfig(), **place)
 
 
 def test_browser_splats_are_the_gaussians_in_viewer_units():
@@ -194,7 +174,7 @@ def test_browser_splats_are_the_gaussians_in_viewer_units():
     # Half floats end at 65504.
     assert np.isfinite(splats.covariances.astype(np.float16)).all()
     largest = np.linalg.eigvalsh(splats.covariances[-1].astype(float))
-    np.testing.assert_allclose(largest, LARGEST_DEVIATION**2, rtol=1e-3)
+    np.testing.assert_allclose(largest, pictures.LARGEST_DEVIATION**2, rtol=1e-3)
     towards = Camera(jnp.eye(4).at[:3, 3].set(-seen_from), jnp.eye(3), 1, 1)
     radiance = np.asarray(view_radiance(g, towards, cfg))[alive]
     np.testing.assert_allclose(splats.linear, radiance, rtol=1e-6)
@@ -202,30 +182,30 @@ def test_browser_splats_are_the_gaussians_in_viewer_units():
 
 def test_splat_colours_are_developed_without_what_depends_on_the_place():
     _, splats = splats_of()
-    shown = splat_colors(splats, TRANSFORM, "display").astype(float)
+    shown = pictures.splat_colors(splats, TRANSFORM, "display").astype(float)
     assert np.abs(shown - np.rint(255 * np.asarray(develop(splats.linear, TRANSFORM)))).max() <= 1
-    assert np.any(splat_colors(splats, TRANSFORM, "stops") != shown)
+    assert np.any(pictures.splat_colors(splats, TRANSFORM, "stops") != shown)
     bilateral = PhotometryConfig(appearance="bilateral")
     grid = DisplayTransform(2.0, 2.2, bilateral, np.ones((12, 8, 16, 16)))
-    np.testing.assert_array_equal(splat_colors(splats, grid, "display"), shown)
+    np.testing.assert_array_equal(pictures.splat_colors(splats, grid, "display"), shown)
 
 
 def test_longer_exposures_are_lighter_and_unknown_ones_grey():
-    colors = exposure_colors([1.0, -2.0, None, 0.0])
+    colors = pictures.exposure_colors([1.0, -2.0, None, 0.0])
     light = luminance(colors.astype(float))
     assert light[1] < light[3] < light[0]
     np.testing.assert_array_equal(colors[2], 128)
-    assert exposure_colors([0.0, 0.0]).shape == (2, 3)
-    assert exposure_colors([None]).tolist() == [[128, 128, 128]]
-    assert all(f">{name}<" in stops_legend() for name in ("-6", "-1", "0", "+1", "+5"))
+    assert pictures.exposure_colors([0.0, 0.0]).shape == (2, 3)
+    assert pictures.exposure_colors([None]).tolist() == [[128, 128, 128]]
+    assert all(f">{name}<" in pictures.stops_legend() for name in ("-6", "-1", "0", "+1", "+5"))
 
 
 def test_saved_files_hold_what_is_shown(frame, tmp_path):
     linear = np.asarray(frame.linear)
     ldr = np.clip(linear, 0, 1)
-    png = cv2.imdecode(np.frombuffer(png_bytes(ldr), np.uint8), cv2.IMREAD_COLOR)
+    png = cv2.imdecode(np.frombuffer(pictures.png_bytes(ldr), np.uint8), cv2.IMREAD_COLOR)
     np.testing.assert_array_equal(png[..., ::-1], np.rint(ldr * 255))
-    (tmp_path / "a.exr").write_bytes(exr_bytes(frame, TRANSFORM))
+    (tmp_path / "a.exr").write_bytes(pictures.exr_bytes(frame, TRANSFORM))
     back, header = read_exr(tmp_path / "a.exr")
     np.testing.assert_allclose(back, linear, rtol=1e-3)
     assert header["p2gsExposureEV"] == pytest.approx(1.0)

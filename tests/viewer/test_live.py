@@ -30,7 +30,6 @@ from p2gs_jax.viewer.settings import (
     common_settings,
     display_of,
     exposures_ev,
-    same_display,
     settings_of_view,
 )
 from p2gs_jax.viewer.viewed_run import ViewedRun
@@ -137,21 +136,14 @@ def test_the_newest_camera_wins(setup, client, viewed):
     assert len(setup.renderer.rendered) < 32
 
 
-def test_the_best_there_is_until_more_is_compiled(setup, client, viewed):
-    setup.renderer.ready = frozenset(SIZES[:1])
+def test_the_best_there_is_comes_until_more_is_compiled_or_has_room(setup, client, viewed):
+    setup.renderer.ready, setup.renderer.refused = frozenset(SIZES[:1]), {SIZES[-1]}
     setup.live.start()
     seen = client.wait_sharp()
     assert shape(setup.pictures[-1]) == SIZES[0]
     setup.renderer.ready = frozenset(SIZES)
     compiled(viewed)
-    client.wait_sharp(seen)
-    assert shape(setup.pictures[-1]) == CANVAS
-
-
-def test_what_overflows_is_shown_smaller_and_later_when_there_is_room(setup, client, viewed):
-    setup.renderer.refused = {SIZES[-1]}
-    setup.live.start()
-    seen = client.wait_sharp()
+    seen = client.wait_sharp(seen)
     assert shape(setup.pictures[-1]) == SIZES[-2]
     time.sleep(2 * REST_S)
     assert len(setup.pictures) == seen  # it is not tried again and again
@@ -265,17 +257,6 @@ def test_exposures_count_from_the_mean_whatever_the_gauge(run):
     own = other.own_display(index).exposure
     assert display_of(other, settings).exposure == pytest.approx(own, rel=1e-5)
     assert settings.exposure_ev == pytest.approx(exposures_ev(run)[index], abs=1e-5)
-
-
-def test_looks_keep_what_does_not_belong_to_them(run):
-    before = Settings(gamma=3.0, exposure_ev=2.0, curve="linear", mode="stops", split=0.2)
-    common = common_settings(run, before)
-    assert (common.mode, common.split, common.curve, common.exposure_ev) == ("stops", 0.2, "run", 0)
-    view = settings_of_view(run, 1, before)
-    assert (view.mode, view.split, view.taken_as) == ("stops", 0.2, 1)
-    a = Settings(gamma=2.2, exposure_ev=0.5)
-    assert same_display(a, replace(a, mode="split", split=0.1, splats=True))
-    assert not same_display(a, replace(a, exposure_ev=0.6))
 
 
 def test_corrections_hold_under_the_curve_they_were_learned_with(run):

@@ -44,7 +44,7 @@ from p2gs_jax.jobs.job import JobState
 from p2gs_jax.jobs.run import run_jobs
 from p2gs_jax.pipeline import preflight
 from p2gs_jax.pipeline.finish import Account, finish
-from p2gs_jax.pipeline.fit import FitResult, centred, fit, true_stops
+from p2gs_jax.pipeline.fit import FitResult, centred, fit
 from p2gs_jax.pipeline.preflight import Paths, check_run_dir
 from p2gs_jax.pipeline.prepare import load
 from p2gs_jax.presets import require_config
@@ -210,7 +210,7 @@ class _Blocks:
             self.reporter,
             truth=truth,
             lpips_weights=weights,
-            true_ev=true_stops(true_exposures, solved.scene),
+            true_exposures=true_exposures,
             still_ours=self.lock.require,
         )
         metrics[KEY] = self._summary(seams, counts)

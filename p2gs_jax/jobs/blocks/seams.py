@@ -22,6 +22,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.jobs.blocks.cut import OVERLAP, Cut
 from p2gs_jax.render.capacity import RenderView, make_renderer
 from p2gs_jax.render.harmonics import scaled
+from p2gs_jax.render.warp import unproject
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.types import Gaussians, Scene
 
@@ -141,7 +142,7 @@ def _compared(
     (one, near, solid), (other, far, covered) = shown
     # Chosen by one of the depths, pixels would be those in which the other is farther off.
     middle = np.sqrt(np.maximum(near * far, 0.0))
-    points = unprojected(middle, np.asarray(camera.K), np.asarray(camera.viewmat))
+    points = unproject(middle, jax.tree.map(np.asarray, camera))
     places = cut.ground.place(points.reshape(-1, 3))
     strip = np.ones(len(places), bool)
     for number in pair:
@@ -150,16 +151,6 @@ def _compared(
     good &= (near > 0) & (far > 0)
     ratio = np.log2(np.maximum(other[good], DARKEST) / np.maximum(one[good], DARKEST))
     return ratio, far[good] / near[good] - 1
-
-
-def unprojected(
-    depth: Float[np.ndarray, "h w"], K: Float[np.ndarray, "3 3"], viewmat: Float[np.ndarray, "4 4"]
-) -> Float[np.ndarray, "h w 3"]:
-    """Return where in the world the pixels of a depth map lie."""
-    height, width = depth.shape
-    y, x = np.mgrid[:height, :width] + 0.5
-    rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], -1)
-    return (rays * depth[..., None] - viewmat[:3, 3]) @ viewmat[:3, :3]
 
 
 def level_seams(

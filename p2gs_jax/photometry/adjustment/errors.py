@@ -31,8 +31,7 @@ from p2gs_jax.photometry.adjustment.solve import Balanced, Fit, one_thread
 from p2gs_jax.photometry.adjustment.system import EMPTY, System, gauge_strength
 from p2gs_jax.photometry.observations import Labels, Observations
 
-# Relative size of what a difference of equal numbers leaves of them.
-CANCELLED = 1e-6
+CANCELLED = 1e-6  # relative size of what a difference of equal numbers leaves of them
 # Share of a parameter's information that must be left beside all others'. Rounding leaves less, and
 # so does what keeps points without observations finite (`system.EMPTY`).
 HELD = 1e-11
@@ -43,8 +42,7 @@ DRAWS = 32
 # error bars on photographs of known exposure: 2.1 where every point counts by itself, 1.6 in
 # regions of this size, and no better in larger ones (BUILD_NOTES, "The camera as it is").
 REGION = 1 / 3
-# Side of the regions that share an error, in the same units.
-SHARED_REGION = 2 / 3
+SHARED_REGION = 2 / 3  # side of the regions that share an error, in the same units
 # Regions that hold fewer observations, or the weight of fewer, say nothing of what they share.
 FEWEST, FEWEST_EFFECTIVE = 4, 3.0
 

@@ -15,7 +15,7 @@ from p2gs_jax.core.numerics import LN2
 from p2gs_jax.photometry.adjustment.errors import Uncertainty, uncertainty
 from p2gs_jax.photometry.adjustment.parameters import Parameters, make_forward
 from p2gs_jax.photometry.adjustment.problem import Problem, make_rows
-from p2gs_jax.photometry.adjustment.robust import Weighted, noise_weight, weigh
+from p2gs_jax.photometry.adjustment.robust import noise_weight, weigh
 from p2gs_jax.photometry.adjustment.solve import Fit, solve_model
 from p2gs_jax.photometry.models import Form, ModelName
 from p2gs_jax.photometry.observations import Labels, Observations, PerChannel
@@ -28,14 +28,11 @@ from p2gs_jax.types import GAMMA_SRGB
 PER_VIEW = 1000
 # Observations of all views together, and what each view has nevertheless.
 MOST_SOLVED, LEAST_PER_VIEW = 1_500_000, 200
-# Points of a view from which is told what is not modelled.
-UNMODELLED_PER_VIEW = 2000
+UNMODELLED_PER_VIEW = 2000  # points of a view from which is told what is not modelled
 # Observations that count less than this share of what their noise alone would give are ignored.
 IGNORED = 0.25
-# Observations that are looked at together: 20 million at once are gigabytes.
-BLOCK = 1_000_000
-# A channel off by this much in a view is worth a word.
-NOTICEABLE_BALANCE_EV = 0.1
+BLOCK = 1_000_000  # observations that are looked at together: 20 million at once are gigabytes
+NOTICEABLE_BALANCE_EV = 0.1  # a channel off by this much in a view is worth a word
 # What is left of the way is worth no word below this share of a typical standard error.
 NEGLIGIBLE = 0.1
 
@@ -76,8 +73,13 @@ def explain(fit: Fit, problem: Problem, response: Response) -> Explained:
     residual = np.zeros((len(o.points), 3), np.float32)
     ignored = 0
     for pick, points, part in _blocks(problem):
-        at = _weighed(fit, part, response)
         mine, usable = part.observations, part.usable
+        # At the solution each observation is judged by itself.
+        rows = make_rows(part, usable, response)
+        model = make_forward(rows, fit.model.unknowns)
+        at = weigh(model, fit.theta, noise_weight(rows), "l1")
+        for loss in ("l1", "geman_mcclure", "geman_mcclure"):
+            at = weigh(model, fit.theta, at.weight, loss)
         # The rows of each point are combined.
         total, weight = (np.zeros((mine.point_count, 3)) for _ in range(2))
         np.add.at(total, part.layout.point_of_row, at.precision * at.radiance)
@@ -91,9 +93,7 @@ def explain(fit: Fit, problem: Problem, response: Response) -> Explained:
     return Explained(radiance, residual, ignored / max(int(problem.usable.sum()), 1))
 
 
-def _blocks(
-    problem: Problem,
-) -> Iterator[tuple[np.ndarray | slice, np.ndarray | slice, Problem]]:
+def _blocks(problem: Problem) -> Iterator[tuple[np.ndarray | slice, np.ndarray | slice, Problem]]:
     """Yield whole points with all their observations: which these are, and they alone."""
     points = problem.observations.points
     if len(points) <= BLOCK:
@@ -110,17 +110,6 @@ def _blocks(
         few = replace(part.observations, points=label, point_count=len(own))
         yield pick, own, replace(part, observations=few)
         place = end
-
-
-def _weighed(fit: Fit, part: Problem, response: Response) -> Weighted:
-    """Return residuals and weights at the solution, each observation judged by itself."""
-    rows = make_rows(part, part.usable, response)
-    model = make_forward(rows, fit.model.unknowns)
-    at = weigh(model, fit.theta, noise_weight(rows), "l1")
-    at = weigh(model, fit.theta, at.weight, "l1")
-    for _ in range(2):
-        at = weigh(model, fit.theta, at.weight, "geman_mcclure")
-    return at
 
 
 def solution_of(

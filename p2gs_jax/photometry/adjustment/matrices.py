@@ -9,10 +9,8 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Int
 
-# Up to this many unknowns, matrices are kept and factorised as a whole.
-DENSE = 1500
-# Pairs whose products are formed at once: they stay in the cache.
-CHUNK = 1 << 15
+DENSE = 1500  # up to this many unknowns, matrices are kept and factorised as a whole
+CHUNK = 1 << 15  # pairs whose products are formed at once: they stay in the cache
 
 Matrix = np.ndarray | sp.csr_array
 
@@ -65,11 +63,8 @@ class Terms:
         """Return the terms of two sets of parameters, these first."""
         count = self.count + other.count
         mine = np.where(self.index == self.count, count, self.index)
-        return Terms(
-            np.concatenate([mine, other.index + self.count], -1),
-            np.concatenate([self.factor, other.factor], -1),
-            count,
-        )
+        index = np.concatenate([mine, other.index + self.count], -1)
+        return Terms(index, np.concatenate([self.factor, other.factor], -1), count)
 
     def sums(
         self, values: Float[np.ndarray, "o 3"], place: Int[np.ndarray, "o 3"], places: int
@@ -159,8 +154,5 @@ class Pairs:
         columns = np.concatenate([self._columns + k % count * views for k in used])
         totals = totals.ravel()
         # The other order of each pair.
-        return Entries(
-            np.concatenate([rows, columns]),
-            np.concatenate([columns, rows]),
-            np.concatenate([totals, totals]),
-        )
+        both = ((rows, columns), (columns, rows), (totals, totals))
+        return Entries(*map(np.concatenate, both))

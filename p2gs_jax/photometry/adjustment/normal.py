@@ -147,13 +147,9 @@ def summed(
     """
     layout, u = model.rows.layout, model.unknowns
     count = int(places.max(initial=-1)) + 1
-    per_view = [
-        sp.csr_array(
-            ((values * p.derivative)[:, p.channels].sum(1), (places, layout.views)),
-            shape=(count, u.views),
-        )
-        for p in of_views(model, at)
-    ]
+    totals = [(values * p.derivative)[:, p.channels].sum(1) for p in of_views(model, at)]
+    at_views, shape = (places, layout.views), (count, u.views)
+    per_view = [sp.csr_array((total, at_views), shape=shape) for total in totals]
     terms, place = others(model, theta), np.broadcast_to(places[:, None], values.shape)
     more = None if terms is None else terms.sums(values, place, count)
     return over_all(u, per_view, more)

@@ -53,10 +53,8 @@ class Layout:
         self.row = first[points] + rank % np.maximum(split[points], 1)
         self.rows = int(first[-1])
         self.point_of_row = np.repeat(np.arange(observations.point_count), split)
-        count = len(points)
-        self.by_row = sp.csr_array(
-            (np.ones(count), (self.row, np.arange(count))), shape=(self.rows, count)
-        )
+        ones, at = np.ones(len(points)), (self.row, np.arange(len(points)))
+        self.by_row = sp.csr_array((ones, at), shape=(self.rows, len(points)))
 
     @functools.cached_property
     def pairs(self) -> Pairs:

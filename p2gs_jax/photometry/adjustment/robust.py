@@ -13,8 +13,7 @@ from p2gs_jax.photometry.adjustment.system import EMPTY
 from p2gs_jax.photometry.observations import PerChannel
 
 Loss = Literal["l1", "geman_mcclure", "whole_points"]
-# Width of the Geman-McClure loss in robust standard deviations.
-GEMAN_MCCLURE = 3.0
+GEMAN_MCCLURE = 3.0  # width of the Geman-McClure loss in robust standard deviations
 # What is known of a point's spread before it is looked at counts as this many observations.
 PRIOR_SPREAD = 3.0
 SMALLEST_SCALE = 0.3
@@ -69,9 +68,8 @@ def weigh(model: Forward, theta: Parameters, weight: PerChannel, loss: Loss) -> 
     weight = rows.weight / sigma**2 * factor
     radiance, precision = _radiance(rows, a, z_of_point, weight)
     of_point = radiance[rows.layout.row]
-    residual = z_of_point - a * of_point
-    level = of_point + added
-    return Weighted(weight, sigma, slope, residual, radiance, level, precision, scale, curvature)
+    known = z_of_point - a * of_point, radiance, of_point + added, precision
+    return Weighted(weight, sigma, slope, *known, scale, curvature)
 
 
 def _geman_mcclure(

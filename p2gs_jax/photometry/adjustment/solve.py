@@ -32,10 +32,8 @@ L1_ROUNDS, MOST_ROUNDS = 4, 60
 A_RANGE = (0.3, 3.0)
 # Change of a parameter, log units, at which rounds end: for what is kept, and what is compared.
 TOLERANCE, TOLERANCE_TO_COMPARE = 1e-5, 5e-3
-# Damping of the balanced matrix, whose diagonal is 1.
-DAMPING = 1e-8
-# Groups of neighbouring unknowns, whose common changes a coarse system solves.
-GROUPS = 1000
+DAMPING = 1e-8  # damping of the balanced matrix, whose diagonal is 1
+GROUPS = 1000  # groups of neighbouring unknowns, whose common changes a coarse system solves
 # Relative residual at which the iteration ends; a round's step need not be exact.
 PRECISION, MOST_ITERATIONS = 1e-7, 2000
 EXPOSURES = Form("view_exposure")
@@ -106,11 +104,10 @@ def _iterative(sparse: sp.csr_array, low_rank: Float[np.ndarray, "g n"]):
     operator = functools.partial(scipy.sparse.linalg.LinearOperator, (count, count))
     matrix, preconditioner = operator(multiply), operator(precondition)
 
+    how = {"rtol": PRECISION, "maxiter": MOST_ITERATIONS, "M": preconditioner}
+
     def one(right):
-        found, _ = scipy.sparse.linalg.cg(
-            matrix, right, rtol=PRECISION, maxiter=MOST_ITERATIONS, M=preconditioner
-        )
-        return found
+        return scipy.sparse.linalg.cg(matrix, right, **how)[0]
 
     def solve(right):
         if right.ndim == 1:
@@ -192,10 +189,8 @@ def solve_model(
     nothing). The tolerance and the loss are those of `solve`.
     """
     weight = problem.usable if use is None else problem.usable * use[:, None]
-    rows, system = (
-        make_rows(problem, weight, response, splines),
-        make_system(problem, form, splines),
-    )
+    rows = make_rows(problem, weight, response, splines)
+    system = make_system(problem, form, splines)
     with one_thread():
         return solve(rows, system, tolerance, loss), system
 

@@ -18,16 +18,13 @@ from p2gs_jax.photometry.adjustment.problem import Problem
 from p2gs_jax.photometry.models import MODELS, Form
 from p2gs_jax.photometry.response import KNOTS, spline_count
 
-# How hard gauges are held, relative to the mean diagonal of the normal matrix.
-ANCHOR = 10.0
-# What keeps sums over no observations from being zero.
-EMPTY = 1e-9
+ANCHOR = 10.0  # how hard gauges are held, relative to the mean diagonal of the normal matrix
+EMPTY = 1e-9  # what keeps sums over no observations from being zero
 # Standard deviation of a = 2.2 / gamma about 1 (gammas of 1.9 to 2.6 are within one of these).
 A_PRIOR = 0.15
 # Standard deviation of each coefficient of log V about 0: lenses lose up to two stops.
 VIGNETTING_PRIOR = 0.7
-# Deviation of a known exposure that is to be kept, stops.
-FIXED_EV = 1e-5
+FIXED_EV = 1e-5  # deviation of a known exposure that is to be kept, stops
 # Smoothness of the spline relative to its mean information, and the spacing of knots it holds for.
 SMOOTHNESS, KNOT_SPACING = 3e-3, 0.12
 
@@ -163,17 +160,12 @@ def _priors(u: Unknowns, log_exposure, precision) -> Held:
     every = sp.csr_array(sp.eye_array(u.count))
     of_a = every[u.at.a.start + views] if u.gammas else every[:0]
     lenses = np.arange(u.at.k.start + u.features.balance_count, u.at.k.stop)
-    gammas = of_a.shape[0]
+    counts = [of_a.shape[0], len(lenses)]
+    others = np.repeat([1 / A_PRIOR**2, 1 / VIGNETTING_PRIOR**2], counts)
     return Held(
         sp.csr_array(sp.vstack([exposures, of_a, every[lenses]])),
-        np.repeat([0.0, 1.0, 0.0], [len(given), gammas, len(lenses)]),
-        np.concatenate(
-            [
-                precision[given],
-                np.full(gammas, 1 / A_PRIOR**2),
-                np.full(len(lenses), 1 / VIGNETTING_PRIOR**2),
-            ]
-        ),
+        np.repeat([0.0, 1.0, 0.0], [len(given), *counts]),
+        np.concatenate([precision[given], others]),
     )
 
 

@@ -17,8 +17,7 @@ from p2gs_jax.render.warp import project_points
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Scene
 
-# Averaging a few pixels quiets noise and hides the misplacement of a fraction of a pixel.
-PATCH = 3
+PATCH = 3  # averaging a few pixels quiets noise and hides the misplacement of a fraction of a pixel
 # A track's position is uncertain by this much, in pixels of the sampled image; where the image is
 # steep, so is its colour.
 POSITION_DEVIATION = 0.5

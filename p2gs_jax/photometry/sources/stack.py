@@ -19,12 +19,10 @@ from p2gs_jax.types import View
 POINTS, CANDIDATES = 4000, 40_000
 MARGIN = 8
 SATURATED = 250 / 255
-# Above the black level by this much a value carries signal, display values.
-ABOVE_BLACK = 8 / 255
+ABOVE_BLACK = 8 / 255  # above the black level by this much a value carries signal, display values
 # A spike below this 8-bit value that holds this share of a frame is its black level.
 BLACKEST, SPIKE = 40, 0.3
-# Frames in which fewer pixels than this share carry signal say little.
-SIGNAL = 0.15
+SIGNAL = 0.15  # frames in which fewer pixels than this share carry signal say little
 # Shifts beyond this many pixels are mistakes of the matcher, not of the tripod.
 LARGEST_SHIFT = 7
 SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"}

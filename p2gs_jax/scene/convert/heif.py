@@ -11,12 +11,9 @@ import numpy as np
 from PIL import Image, features
 
 from p2gs_jax.errors import UserError, broken
-from p2gs_jax.scene.convert.icc import BT709, BT2020, DISPLAY_P3, to_light, to_srgb_matrix
+from p2gs_jax.scene.convert.icc import BT709, PRIMARIES, TRANSFERS, to_light, to_srgb_matrix
 from p2gs_jax.scene.convert.kinds import Picture, kind_of
 
-# Codes of ITU-T H.273.
-_TRANSFERS = {16: "pq", 18: "hlg"}
-_PRIMARIES = {1: BT709, 9: BT2020, 12: DISPLAY_P3}
 _MODES = {1: "L", 2: "LA", 3: "RGB", 4: "RGBA"}
 
 
@@ -26,38 +23,29 @@ def opened(path: Path) -> Iterator[Any]:
 
     Raises UserError: the library is missing or too old, or the file is broken.
     """
+    kind = kind_of(path)
     try:
-        with _open(path) as image:
-            yield image
+        if kind != "heif":
+            if not features.check(kind):
+                why = f"{path} is {'AVIF' if kind == 'avif' else 'WebP'}, which this Pillow does "
+                fix = "pip install --upgrade 'pillow>=11.3', or export the photographs as JPEG"
+                raise UserError(why + "not read.", fix=fix)
+            with Image.open(path, formats=[kind]) as image:
+                yield image
+            return
+        import pillow_heif
+
+        # Not Pillow's opener: it has no 16 bits of colour.
+        yield pillow_heif.open_heif(path, convert_hdr_to_8bit=False)
     except UserError:
         raise
+    except ImportError:
+        why = f"{path} is HEIC, which is read with pillow-heif."
+        fix = "pip install 'p2gs-jax[heic]', or export the photographs as JPEG"
+        raise UserError(why, fix=fix) from None
     except Exception as error:  # decoding is lazy, and the libraries raise errors of many kinds
         fix = "copy that photograph again, or remove it from the scene"
         raise broken(path, f"cannot be decoded: {error}.", fix) from None
-
-
-@contextmanager
-def _open(path: Path) -> Iterator[Any]:
-    kind = kind_of(path)
-    if kind != "heif":
-        if not features.check(kind):
-            name = "AVIF" if kind == "avif" else "WebP"
-            raise UserError(
-                f"{path} is {name}, which this Pillow does not read.",
-                fix="pip install --upgrade 'pillow>=11.3', or export the photographs as JPEG",
-            )
-        with Image.open(path, formats=[kind]) as image:
-            yield image
-        return
-    try:
-        import pillow_heif
-    except ImportError:
-        raise UserError(
-            f"{path} is HEIC, which is read with pillow-heif.",
-            fix="pip install 'p2gs-jax[heic]', or export the photographs as JPEG",
-        ) from None
-    # Not Pillow's opener: it has no 16 bits of colour.
-    yield pillow_heif.open_heif(path, convert_hdr_to_8bit=False)
 
 
 def read_heif(path: Path) -> Picture:
@@ -74,11 +62,11 @@ def read_heif(path: Path) -> Picture:
     if pixels.ndim == 2:
         pixels = pixels[..., None]
     nclx = info.get("nclx_profile") or {}
-    transfer = _TRANSFERS.get(int(nclx.get("transfer_characteristics", 0)))
+    transfer = TRANSFERS.get(int(nclx.get("transfer_characteristics", 0)))
     if transfer is None:
         return Picture(codes=pixels, exif=exif, profile=info.get("icc_profile"))
-    light = to_light(pixels[..., :3] / np.iinfo(pixels.dtype).max, transfer)  # type: ignore[arg-type]
-    primaries = _PRIMARIES.get(int(nclx.get("color_primaries", 0)), BT709)
+    light = to_light(pixels[..., :3] / np.iinfo(pixels.dtype).max, transfer)
+    primaries = PRIMARIES.get(int(nclx.get("color_primaries", 0)), BT709)
     light = np.broadcast_to(light, (*light.shape[:2], 3)) @ to_srgb_matrix(primaries).T
     return Picture(light=light.astype(np.float32), exif=exif)
 

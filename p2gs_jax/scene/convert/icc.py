@@ -38,6 +38,9 @@ BT709: Primaries = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, *_D65)
 BT2020: Primaries = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, *_D65)
 DISPLAY_P3: Primaries = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, *_D65)
 ADOBE_RGB: Primaries = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, *_D65)
+# By the codes of ITU-T H.273; others are a camera's own curve, and sRGB's primaries.
+TRANSFERS: dict[int, Transfer] = {16: "pq", 18: "hlg"}
+PRIMARIES: dict[int, Primaries] = {9: BT2020, 12: DISPLAY_P3}
 
 # Bradford's cone responses.
 _BRADFORD = np.array(
@@ -141,8 +144,10 @@ def read_profile(data: bytes) -> Profile | None:
         return None
     srgb = rgb_to_xyz(BT709)
     matrix = np.linalg.inv(srgb) @ adapted(_PCS_WHITE, srgb.sum(1)) @ np.stack(columns, 1)
-    profile = Profile(name, np.stack(curves, 1), matrix)
-    return None if _is_srgb(profile) else profile
+    decode, grid = np.stack(curves, 1), np.linspace(0, 1, _ENTRIES)[:, None]
+    curves_alike = np.abs(srgb_encode(decode) - grid).max() < _INVISIBLE
+    is_srgb = curves_alike and np.abs(matrix - np.eye(3)).max() < _INVISIBLE
+    return None if is_srgb else Profile(name, decode, matrix)
 
 
 def to_srgb(pixels: UInt[np.ndarray, "h w 3"], profile: Profile) -> UInt[np.ndarray, "h w 3"]:
@@ -186,14 +191,6 @@ def with_profile_applied(
         return colours
     alpha = pixels[..., 3:].astype(np.uint16)
     return np.concatenate([colours, alpha * 257 if pixels.dtype == np.uint8 else alpha], axis=2)
-
-
-def _is_srgb(profile: Profile) -> bool:
-    assert profile.decode is not None
-    assert profile.matrix is not None
-    grid = np.linspace(0, 1, _ENTRIES)
-    curves_alike = np.abs(srgb_encode(profile.decode) - grid[:, None]).max() < _INVISIBLE
-    return bool(curves_alike and np.abs(profile.matrix - np.eye(3)).max() < _INVISIBLE)
 
 
 def _tags(data: bytes) -> dict[bytes, bytes]:
@@ -248,9 +245,7 @@ def _curve(tag: bytes) -> Float[np.ndarray, " n"]:
 
 def colour_notes(paths: Iterable[Path]) -> tuple[str, ...]:
     """Return what the user should know of profiles and gain maps; headers are read, no pixels."""
-    applied: Counter[str] = Counter()
-    kept: Counter[str] = Counter()
-    maps = 0
+    applied, kept, maps = Counter[str](), Counter[str](), 0
     for path in paths:
         maps += has_gain_map(path)
         try:

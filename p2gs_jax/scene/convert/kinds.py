@@ -51,18 +51,11 @@ class Picture:
 
 
 def kind_of(path: Path) -> Kind:
-    """Return the kind of a photograph; a TIFF is opened to see whether it holds floats."""
+    """Return the kind of a photograph; the tags of a TIFF say whether it holds floats."""
     suffix = path.suffix.lower()
-    if suffix in (".tif", ".tiff") and _floating(path):
-        return "float_tiff"
-    return _KINDS.get(suffix, "plain")
-
-
-def _floating(path: Path) -> bool:
-    """Return whether the samples of a TIFF are floats, read from its tags.
-
-    Pillow refuses to open most of these.
-    """
+    if suffix not in (".tif", ".tiff"):
+        return _KINDS.get(suffix, "plain")
+    # Pillow refuses to open most TIFFs of floats.
     try:
         with path.open("rb") as file:
             tags = TiffImagePlugin.ImageFileDirectory_v2(file.read(8))
@@ -70,8 +63,9 @@ def _floating(path: Path) -> bool:
             tags.load(file)
             formats = tags.get(_SAMPLE_FORMAT, (1,))
     except Exception:  # whoever decodes a broken file complains
-        return False
-    return _FLOATING in (formats if isinstance(formats, tuple) else (formats,))
+        return "plain"
+    formats = formats if isinstance(formats, tuple) else (formats,)
+    return "float_tiff" if _FLOATING in formats else "plain"
 
 
 def has_gain_map(path: Path) -> bool:

@@ -26,6 +26,9 @@ from p2gs_jax.scene.convert.kinds import Picture
 Balance = tuple[float, float, float]
 
 _TIME, _F_NUMBER, _ISO, _FOCAL_LENGTH = 0x829A, 0x829D, 0x8827, 0x920A
+# LibRaw's attributes.
+_RAW_SETTINGS = {"shutter_speed": _TIME, "aperture": _F_NUMBER, "iso_speed": _ISO}
+_RAW_SETTINGS |= {"focal_length": _FOCAL_LENGTH}
 # OpenEXR's standard attributes.
 _EXR_SETTINGS = {"expTime": _TIME, "aperture": _F_NUMBER, "isoSpeed": _ISO}
 _EXR_ERRORS = (RuntimeError, KeyError, OSError, ValueError)
@@ -33,13 +36,11 @@ _EXR_ERRORS = (RuntimeError, KeyError, OSError, ValueError)
 
 @dataclass(frozen=True)
 class RawFacts:
-    """What a raw file states about itself.
+    """What a raw file states about itself; the size is pixels, as the sensor lies.
 
-    Attributes:
-        size: width and height in pixels, as the sensor lies.
-        balance: factors on red, green and blue that the camera chose, green 1; None: not recorded.
-        black: levels that are subtracted, by colour of the filter; `white` becomes 1.
-        matrix: whether the camera's colours are known; otherwise its primaries are kept.
+    `balance` are the factors on red, green (1) and blue that the camera chose, None where it is not
+    recorded; `black` is subtracted, by colour of the filter, and `white` becomes 1. Without a
+    `matrix` the camera's colours are unknown, and its primaries are kept.
     """
 
     size: tuple[int, int]
@@ -98,10 +99,9 @@ def _raw(path: Path) -> Iterator[Any]:
     try:
         import rawpy
     except ImportError:
-        raise UserError(
-            f"{path} is camera raw, which is read with rawpy.",
-            fix="pip install 'p2gs-jax[raw]', or export the photographs as 16-bit TIFF",
-        ) from None
+        why = f"{path} is camera raw, which is read with rawpy."
+        fix = "pip install 'p2gs-jax[raw]', or export the photographs as 16-bit TIFF"
+        raise UserError(why, fix=fix) from None
     try:
         with rawpy.imread(str(path)) as raw:
             yield raw
@@ -130,13 +130,8 @@ def _raw_exif(path: Path, raw: Any) -> Image.Exif:
     except Exception:  # malformed EXIF raises many kinds of errors
         out = Image.Exif()
     shot, other = out.get_ifd(ExifTags.IFD.Exif), getattr(raw, "other", None)
-    found = {
-        _TIME: getattr(other, "shutter_speed", None),
-        _F_NUMBER: getattr(other, "aperture", None),
-        _ISO: getattr(other, "iso_speed", None),
-        _FOCAL_LENGTH: getattr(other, "focal_length", None),
-    }
-    for tag, value in found.items():
+    for name, tag in _RAW_SETTINGS.items():
+        value = getattr(other, name, None)
         if tag not in shot and value:
             shot[tag] = int(value) if tag == _ISO else float(value)
     return out

@@ -77,12 +77,10 @@ class PixelFiles:
         try:
             write_photograph(self.path(key), photograph)
         except OSError as error:
-            raise UserError(
-                f"decoded photographs cannot be written to {self.folder}: "
-                f"{error.strerror or error}",
-                fix="make room on that disk or name another --out; or give --data.cache-mb the "
-                "memory that all photographs take, a smaller --max-width, or both",
-            ) from None
+            why = f"decoded photographs cannot be written to {self.folder}: "
+            fix = "make room on that disk or name another --out; or give --data.cache-mb the "
+            fix += "memory that all photographs take, a smaller --max-width, or both"
+            raise UserError(f"{why}{error.strerror or error}", fix=fix) from None
         return self.read(key) or photograph
 
     def require_room(self, needed: int) -> None:

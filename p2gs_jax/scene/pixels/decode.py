@@ -85,27 +85,19 @@ def _decoded(view: View, sizes: Sequence[tuple[int, int]]) -> list[Decoded]:
     as_stored = view.distortion is None and matte is None
     if as_stored and all(size == whole for size in sizes):
         return [_read_only(pixels, valid) for _ in sizes]
-    ldr, straight = _straightened(view, pixels, matte, valid)
-    return [
-        _read_only(pixels, valid) if as_stored and size == whole else _at_size(ldr, straight, size)
-        for size in sizes
-    ]
-
-
-def _straightened(
-    view: View, pixels: np.ndarray, matte: np.ndarray | None, valid: np.ndarray
-) -> tuple[Float32[np.ndarray, "h w c"], Bool[np.ndarray, "h w"]]:
-    """Return colours, premultiplied by opacity and with it where there is any, undistorted."""
-    ldr = floats(pixels)
+    ldr, straight = floats(pixels), valid
     if matte is not None:
         # What is transparent must not colour its neighbours: all four are resampled together.
         opaque = floats(matte)[..., None]
         ldr = np.concatenate([ldr * opaque, opaque], axis=2)
-    if view.distortion is None:
-        return ldr, valid
-    maps = undistortion_maps(view.K, view.distortion, view.width, view.height)
-    ldr = cv2.remap(ldr, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return ldr, cv2.remap(valid.astype(np.float32), *maps, cv2.INTER_LINEAR) >= _FULL
+    if view.distortion is not None:
+        maps = undistortion_maps(view.K, view.distortion, view.width, view.height)
+        ldr = cv2.remap(ldr, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        straight = cv2.remap(valid.astype(np.float32), *maps, cv2.INTER_LINEAR) >= _FULL
+    return [
+        _read_only(pixels, valid) if as_stored and size == whole else _at_size(ldr, straight, size)
+        for size in sizes
+    ]
 
 
 def _at_size(

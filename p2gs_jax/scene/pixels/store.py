@@ -67,13 +67,9 @@ class ImageStore:
     ):
         """Begin with nothing in memory.
 
-        Args:
-            views: all views of the scene.
-            cfg: `max_width`, `cache_mb` and `background`.
-            objects: pixels in the boxes of those that move are left out.
-            moving: objects that Gaussians belong to, for the cameras.
-            folder: takes decoded photographs that memory does not hold (UserError: it has no room);
-                None: they are decoded again when they are needed.
+        Pixels in the boxes of `objects` that move are left out; `moving` are those that Gaussians
+        belong to, for the cameras. Photographs that memory does not hold are kept in `folder`
+        (UserError: it has no room), or decoded again when they are needed.
         """
         self.views = tuple(views)
         self.moving = moving
@@ -83,7 +79,14 @@ class ImageStore:
         self.random_backdrop = matted and cfg.background == RANDOM
         self._only_opaque = False
         limit = cfg.cache_mb * 2**20
-        files = _files_beyond(limit, views, cfg.max_width, folder)
+        files = None
+        if folder is not None:
+            needed = sum(file_bytes(view, size_at(view, cfg.max_width)) for view in views)
+            if _LEVELS * needed > limit:
+                files = PixelFiles(folder, views)
+                files.require_room(needed)
+            else:  # An earlier start had less memory.
+                shutil.rmtree(folder, ignore_errors=True)
         self._photographs = _DecodedPhotographs(self.views, limit, files)
         self._placements: dict[int, Placement] = {}
         self._leave_out(objects, MARGIN)
@@ -214,22 +217,6 @@ def camera_of(store: ImageStore, index: int, shrink: float = 1.0) -> Camera:
     return Camera(on_device(viewmat), on_device(K), width, height, store.placement(index))
 
 
-def _files_beyond(
-    limit: int, views: Sequence[View], max_width: int | None, folder: Path | None
-) -> PixelFiles | None:
-    """Return where photographs go that memory does not hold; None: it holds all, or nowhere."""
-    if folder is None:
-        return None
-    needed = sum(file_bytes(view, size_at(view, max_width)) for view in views)
-    if _LEVELS * needed <= limit:
-        # An earlier start had less memory.
-        shutil.rmtree(folder, ignore_errors=True)
-        return None
-    files = PixelFiles(folder, views)
-    files.require_room(needed)
-    return files
-
-
 class _DecodedPhotographs:
     """Photographs of some views, decoded on demand and kept up to a limit in bytes.
 
@@ -245,7 +232,7 @@ class _DecodedPhotographs:
         self._bytes = 0
         self._pending: dict[Key, Future[Decoded]] = {}
         self._lock = threading.Lock()
-        self._expected: tuple[tuple[Key, ...], ...] = tuple(() for _ in views)
+        self._expected: Sequence[Sequence[Key]] = [()] * len(views)
         self._ahead: list[subprocess.Popen[bytes]] = []
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="decode")
 
@@ -260,9 +247,8 @@ class _DecodedPhotographs:
             pending = self._pending.get(key)
             if entry is not None:
                 self._cache.move_to_end(key)
-        if entry is None:
-            entry = self._load(key) if pending is None else pending.result()
-        return entry
+                return entry
+        return self._load(key) if pending is None else pending.result()
 
     def prefetch(self, key: Key) -> None:
         with self._lock:
@@ -275,7 +261,7 @@ class _DecodedPhotographs:
         """Begin to decode what will be asked for into the files; without files nothing happens."""
         if self._files is None:
             return
-        self._expected = tuple(map(tuple, keys))
+        self._expected = keys
         self._ahead = decode_ahead(self.views, self._files, self._expected)
         weakref.finalize(self, stop, self._ahead)
 
@@ -288,7 +274,12 @@ class _DecodedPhotographs:
             self._bytes = 0
 
     def _load(self, key: Key) -> Decoded:
-        entry = self._decoded(key) if self._files is None else self._filed(key, self._files)
+        files, entry = self._files, None
+        if files is not None:
+            entry = files.read(key)
+        if entry is None:
+            sizes = (k for k in self._expected[key.view] if k != key)
+            entry = self._decoded(key, *(k for k in sizes if files and not files.path(k).exists()))
         with self._lock:
             if key not in self._cache:
                 self._cache[key] = entry
@@ -307,10 +298,3 @@ class _DecodedPhotographs:
             return found[0]
         mapped = [self._files.write(key, one) for key, one in zip(keys, found, strict=True)]
         return mapped[0]
-
-    def _filed(self, key: Key, files: PixelFiles) -> Decoded:
-        entry = files.read(key)
-        if entry is None:
-            sizes = (k for k in self._expected[key.view] if k != key)
-            entry = self._decoded(key, *(k for k in sizes if not files.path(k).exists()))
-        return entry

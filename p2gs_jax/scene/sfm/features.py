@@ -125,7 +125,13 @@ def kept_features(
     `groups` holds the names of those of one camera by what they have in common. Raises UserError:
     COLMAP failed.
     """
-    record = _record(image_folder, groups)
+    files = {}
+    for key, group in groups.items():
+        prints = file_fingerprints([image_folder / name for name in group])
+        for name, (_, size, changed) in zip(group, prints, strict=True):
+            files[name] = [size, changed, str(key)]
+    options = [pycolmap.__version__, MAX_IMAGE_SIZE, MAX_FEATURES]
+    record = {"options": options, "files": files}
     database = folder / DATABASE
     if not _continues(folder / RECORD, record):
         shutil.rmtree(folder, ignore_errors=True)
@@ -159,7 +165,10 @@ def match_kept(
         report(f"matching: {len(wanted)} image pairs")
         match(database, pairs)
         return len(wanted)
-    left = _unmatched(database, wanted)
+    with opened(database) as db:
+        ids = {image.name: image.image_id for image in db.read_all_images()}
+        known = ((a, b) for a, b in wanted if a in ids and b in ids)
+        left = [(a, b) for a, b in known if not db.exists_two_view_geometry(ids[a], ids[b])]
     if len(left) < len(wanted):
         report(f"matches of {len(wanted) - len(left)} image pairs are kept from an earlier run")
     progress = stage_progress(report, "matching", len(left), "image pairs")
@@ -167,17 +176,6 @@ def match_kept(
         match(database, left[start : start + PAIRS_AT_ONCE])
         progress(start + PAIRS_AT_ONCE)
     return len(wanted)
-
-
-def _record(image_folder: Path, groups: Mapping[tuple, Sequence[str]]) -> dict:
-    """Return what the features depend on, as JSON has it."""
-    files = {}
-    for key, group in groups.items():
-        prints = file_fingerprints([image_folder / name for name in group])
-        for name, (_, size, changed) in zip(group, prints, strict=True):
-            files[name] = [size, changed, str(key)]
-    options = [pycolmap.__version__, MAX_IMAGE_SIZE, MAX_FEATURES]
-    return {"options": options, "files": files}
 
 
 def _continues(path: Path, record: dict) -> bool:
@@ -199,14 +197,6 @@ def _cameras(database: Path) -> dict[str, int]:
     with opened(database) as db:
         images = (image for image in db.read_all_images() if db.exists_keypoints(image.image_id))
         return {image.name: image.camera_id for image in images}
-
-
-def _unmatched(database: Path, pairs: Sequence[Pair]) -> list[Pair]:
-    """Return the pairs of photographs with features that were never matched."""
-    with opened(database) as db:
-        ids = {image.name: image.image_id for image in db.read_all_images()}
-        known = ((a, b) for a, b in pairs if a in ids and b in ids)
-        return [(a, b) for a, b in known if not db.exists_two_view_geometry(ids[a], ids[b])]
 
 
 def pairs_by_name(names: Sequence[str], matching: Matching = "auto") -> list[Pair] | None:

@@ -171,7 +171,15 @@ def reasons(
     left = [name for name in names if name not in used]
     if not left:
         return {}
-    features, partners = _known(database)
+    partners: dict[str, dict[str, int]] = defaultdict(dict)
+    with opened(database) as db:
+        images = {image.image_id: image.name for image in db.read_all_images()}
+        features = {name: db.num_keypoints_for_image(i) for i, name in images.items()}
+        pairs, counts = db.read_two_view_geometry_num_inliers()
+    for pair, inliers in zip(pairs, counts, strict=True):
+        a, b = (images[i] for i in pycolmap.pair_id_to_image_pair(pair))
+        if inliers >= LEAST_INLIERS:
+            partners[a][b] = partners[b][a] = int(inliers)
     return {name: _why(name, features.get(name, 0), partners.get(name, {}), parts) for name in left}
 
 
@@ -199,21 +207,5 @@ def _why(name: str, count: int, met: Mapping[str, int], parts: Sequence[set[str]
     if count < FEW_FEATURES:
         return few
     best = max(here, key=lambda other: here[other])
-    return (
-        f"{here[best]} matches with {best}, its best of {len(here)}: too few of them are points "
-        "that others see too"
-    )
-
-
-def _known(database: Path) -> tuple[dict[str, int], dict[str, dict[str, int]]]:
-    """Return the number of features of every photograph, and its verified matches by partner."""
-    with opened(database) as db:
-        images = {image.image_id: image.name for image in db.read_all_images()}
-        features = {name: db.num_keypoints_for_image(i) for i, name in images.items()}
-        partners: dict[str, dict[str, int]] = defaultdict(dict)
-        pairs, counts = db.read_two_view_geometry_num_inliers()
-        for pair, inliers in zip(pairs, counts, strict=True):
-            a, b = (images[i] for i in pycolmap.pair_id_to_image_pair(pair))
-            if inliers >= LEAST_INLIERS:
-                partners[a][b] = partners[b][a] = int(inliers)
-        return features, partners
+    few = f"{here[best]} matches with {best}, its best of {len(here)}"
+    return f"{few}: too few of them are points that others see too"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -42,10 +43,7 @@ def triangulate(
             [view.name, view.viewmat.tolist(), view.K.tolist(), *_lens(view)] for view in views
         ],
     }
-
-    def build(folder: Path) -> None:
-        _build(folder, views, report)
-
+    build = functools.partial(_build, views=views, report=report)
     with cached_folder(work_dir, "triangulated", key, build) as folder:
         model = read_model(folder)
         tracks = tracks_of(model, scene.views)
@@ -80,17 +78,12 @@ def _build(folder: Path, views: Sequence[View], report: Report) -> None:
     report("triangulating")
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = 0
-
-    def triangulated() -> pycolmap.Reconstruction:
-        return pycolmap.triangulate_points(
-            prior, database, image_folder, folder, refine_intrinsics=False, options=options
-        )
-
-    model = triangulated()
+    given = (prior, database, image_folder, folder)
+    model = pycolmap.triangulate_points(*given, refine_intrinsics=False, options=options)
     if not model.points3D:
         # COLMAP takes no point that two photographs alone show; of two there are no others.
         options.triangulation.ignore_two_view_tracks = False
-        model = triangulated()
+        model = pycolmap.triangulate_points(*given, refine_intrinsics=False, options=options)
     model.write(folder)
     database.unlink()  # large, and not needed again
     shutil.rmtree(folder / LINKS, ignore_errors=True)
@@ -107,10 +100,9 @@ def _set_cameras(database: Path, views: Sequence[View]) -> pycolmap.Reconstructi
             db.update_camera(camera)
             reconstruction.add_camera_with_trivial_rig(camera)
             pose = pycolmap.Rigid3d(view.viewmat[:3].astype(np.float64))
-            reconstruction.add_image_with_trivial_frame(
-                pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id),
-                pose,
-            )
+            ids = {"camera_id": image.camera_id, "image_id": image.image_id}
+            posed = pycolmap.Image(name=image.name, **ids)
+            reconstruction.add_image_with_trivial_frame(posed, pose)
     return reconstruction
 
 

@@ -207,11 +207,6 @@ def test_exr_keeps_light_between_photographs(folder: Path) -> None:
     assert noted(result, "multiplied by 0.125")
 
 
-def test_exr_of_a_sensor_keeps_its_white(folder: Path) -> None:
-    write_exr(folder / "a.exr", np.minimum(patches() * 1.3, 1).astype(np.float32))
-    assert record_of(converted(folder))[0]["scale"] == 1
-
-
 def test_exr_that_is_broken_inside(folder: Path) -> None:
     light = np.full((8, 8, 3), 0.5, np.float32)
     light[0, 0], light[0, 1], light[0, 2] = np.nan, np.inf, -1
@@ -238,34 +233,25 @@ def test_exr_grey_alpha_and_chromaticities(folder: Path) -> None:
     assert light_of(c)[4, 4] == pytest.approx((0, 0.521, 0), abs=2e-3)
 
 
-def cut_raw(path: Path) -> None:
-    write_dng(path, GREY)
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-
-
 @pytest.mark.parametrize(
-    ("name", "make", "words"),
+    ("name", "data", "words"),
     [
-        (
-            "a.nef",
-            lambda path: path.write_bytes(b"II*\0" + bytes(range(256)) * 40),
-            [r"does not know .*a\.nef", "DNG Converter"],
-        ),
-        ("a.dng", cut_raw, [r"a\.dng"]),
-        (
-            "a.exr",
-            lambda path: path.write_bytes(b"\x76\x2f\x31\x01 and nothing"),
-            [r"a\.exr is not a readable OpenEXR"],
-        ),
-        (
-            "a.exr",
-            lambda path: write_exr(path, np.ones((8, 8, 1), np.float32), "Z"),
-            ["has the channels Z"],
-        ),
+        ("a.nef", b"II*\0" + bytes(range(256)) * 40, [r"does not know .*a\.nef", "DNG Converter"]),
+        ("a.exr", b"\x76\x2f\x31\x01 and nothing", [r"a\.exr is not a readable OpenEXR"]),
+        ("a.dng", None, [r"a\.dng"]),
+        ("b.exr", None, ["has the channels Z"]),
     ],
 )
-def test_files_that_are_refused(folder: Path, name: str, make, words: list[str]) -> None:
-    make(folder / name)
+def test_files_that_are_refused(folder: Path, name: str, data, words: list[str]) -> None:
+    write_exr(folder / "b.exr", np.ones((8, 8, 1), np.float32), "Z")
+    write_dng(folder / "a.dng", GREY)
+    cut = (folder / "a.dng").read_bytes()
+    (folder / "a.dng").write_bytes(cut[: len(cut) // 2])
+    for path in folder.iterdir():
+        if path.name != name:
+            path.unlink()
+    if data is not None:
+        (folder / name).write_bytes(data)
     with refused(*words):
         converted(folder)
 

@@ -4,23 +4,18 @@ import shutil
 from pathlib import Path
 
 import pytest
-from scene.drives import (
-    writers_argoverse,
-    writers_kitti,
-    writers_nuscenes,
-    writers_pandaset,
-    writers_waymo,
-)
+from scene.drives import writers_argoverse as argoverse
+from scene.drives import writers_kitti as kitti
+from scene.drives import writers_nuscenes as nuscenes
+from scene.drives import writers_pandaset as pandaset
+from scene.drives import writers_waymo as waymo
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene.drives import read_drive
 
 WRITERS = {
-    "argoverse": writers_argoverse,
-    "kitti_raw": writers_kitti,
-    "nuscenes": writers_nuscenes,
-    "pandaset": writers_pandaset,
-    "waymo": writers_waymo,
+    **{"argoverse": argoverse, "kitti_raw": kitti, "nuscenes": nuscenes},
+    **{"pandaset": pandaset, "waymo": waymo},
 }
 
 

@@ -1,7 +1,8 @@
 """From a recording to a scene: what is chosen, what is counted, what the user reads."""
 
-import dataclasses
+from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -18,23 +19,22 @@ from p2gs_jax.scene.split import assign_split
 from p2gs_jax.types import Lidar
 
 PLAIN = DataConfig(own_car=False)
-FRAMES, CAMERAS = 6, ("CAM_FRONT", "CAM_BACK")
+FRAMES = 6
 
 
 @pytest.fixture
 def drive(tmp_path):
     """Return a drive of two cameras; every sweep has a point that is not a number."""
     made = make_recording(tmp_path, ("front", "back"), FRAMES)
-    names = dict(zip(("front", "back"), CAMERAS, strict=True))
-    photographs = [dataclasses.replace(p, camera=names[p.camera]) for p in made.photographs]
-    cameras = [dataclasses.replace(c, name=names[c.name]) for c in made.cameras]
+    photographs = [replace(p, camera=f"CAM_{p.camera.upper()}") for p in made.photographs]
+    cameras = [replace(c, name=f"CAM_{c.name.upper()}") for c in made.cameras]
 
     def with_nan(sweep):
         points, times = sweep.read()
         return SweepPoints(np.append(points, [[np.nan] * 3], 0), np.append(times, sweep.time))
 
-    sweeps = [dataclasses.replace(s, read=lambda s=s: with_nan(s)) for s in made.sweeps]
-    return dataclasses.replace(made, cameras=cameras, photographs=photographs, sweeps=sweeps)
+    sweeps = [replace(s, read=lambda s=s: with_nan(s)) for s in made.sweeps]
+    return replace(made, cameras=cameras, photographs=photographs, sweeps=sweeps)
 
 
 def test_a_drive_becomes_views_with_frames_and_times_near_the_origin(drive):
@@ -52,9 +52,9 @@ def test_a_drive_becomes_views_with_frames_and_times_near_the_origin(drive):
 
 @pytest.mark.parametrize("name", ["../../CAM", "/CAM", "CAM/a", "..", "", "CAM\\a"])
 def test_a_camera_whose_name_is_a_path_is_refused(drive, name):
-    hostile = dataclasses.replace(drive.cameras[1], name=name)
+    hostile = replace(drive.cameras[1], name=name)
     with pytest.raises(UserError, match="camera by the name of"):
-        assemble(dataclasses.replace(drive, cameras=(drive.cameras[0], hostile)), PLAIN)
+        assemble(replace(drive, cameras=(drive.cameras[0], hostile)), PLAIN)
 
 
 def test_laser_points_are_told_apart_by_what_they_lie_on(drive):
@@ -87,7 +87,7 @@ def test_without_lidar_there_are_no_seeds_yet(drive):
 
 def test_every_camera_holds_out_the_same_frames(drive):
     few = [p for p in drive.photographs if (p.camera, p.frame) != ("CAM_BACK", 0)]
-    scene = assemble(dataclasses.replace(drive, photographs=few, sweeps=()), PLAIN)
+    scene = assemble(replace(drive, photographs=few, sweeps=()), PLAIN)
     assert any("CAM_BACK 5" in note for note in scene.notes)
     assert any("No LiDAR sweep" in note for note in scene.notes)
     held_out = {(v.camera, v.frame) for v in assign_split(scene.views, 4) if v.split == "test"}
@@ -102,24 +102,16 @@ def test_missing_photographs_stop_or_are_counted(drive):
     assert len(scene.views) == 11
     assert any("CAM_FRONT/000000.png" in note for note in scene.notes)
     with pytest.raises(UserError, match="no photograph with a pose"):
-        assemble(dataclasses.replace(drive, photographs=()), PLAIN)
+        assemble(replace(drive, photographs=()), PLAIN)
 
 
 def test_embedded_photographs_are_written_once(drive, tmp_path):
-    asked = []
-
-    def embedded():
-        asked.append(1)
-        return drive.photographs[0].path.read_bytes()
-
-    photographs = [
-        dataclasses.replace(p, path=Path(f"{p.frame}.png"), embedded=embedded)
-        for p in drive.photographs[:3]
-    ]
-    recording = dataclasses.replace(drive, photographs=photographs)
+    embedded = Mock(side_effect=drive.photographs[0].path.read_bytes)
+    first = drive.photographs[:3]
+    photographs = [replace(p, path=Path(f"{p.frame}.png"), embedded=embedded) for p in first]
     for _ in range(2):
-        scene = assemble(recording, PLAIN, tmp_path / "work")
-    assert len(asked) == 3
+        scene = assemble(replace(drive, photographs=photographs), PLAIN, tmp_path / "work")
+    assert embedded.call_count == 3
     assert all(view.image_path.is_file() for view in scene.views)
     assert scene.views[0].image_path.is_relative_to(tmp_path / "work")
 
@@ -222,8 +214,7 @@ def test_what_gets_away_from_where_it_was_moves(xs, says, moves):
     thing = tracked("a", "Car", (4, 2, 1.5), np.arange(len(xs)), poses, says)
     assert thing.moving is moves
     # Sorted, and each time counts once.
-    again = tracked(
-        "a", "Car", (4, 2, 1.5), [*range(len(xs))[::-1], 0], [*poses[::-1], 9 * poses[0]], says
-    )
+    times, poses = [*range(len(xs))[::-1], 0], [*poses[::-1], 9 * poses[0]]
+    again = tracked("a", "Car", (4, 2, 1.5), times, poses, says)
     np.testing.assert_array_equal(again.poses, thing.poses)
     assert again.size == (4.0, 2.0, 1.5)

@@ -31,10 +31,8 @@ def pose_at(way, turned=0.0):
     return pose
 
 
-def bonnet():
-    """Where the bonnet is: an arch at the bottom."""
-    x = np.linspace(-1, 1, W)
-    return np.arange(H)[:, None] >= (H - 60 + 30 * x**2)[None]
+# Where the bonnet is: an arch at the bottom.
+BONNET = np.arange(H)[:, None] >= (H - 60 + 30 * np.linspace(-1, 1, W) ** 2)[None]
 
 
 def road(pose):
@@ -61,12 +59,9 @@ def road(pose):
 def pictures(poses, *, own=True, exposures=None):
     """Display pictures, 8 bits, with a smooth bonnet that mirrors a little of what passes."""
     out = []
-    for k, pose in enumerate(poses):
-        linear = road(pose)
-        if own:
-            glint = 0.02 * np.sin(np.arange(W) / 40 + k)[None]
-            linear = np.where(bonnet(), 0.5 + glint, linear)
-        exposure = 1.0 if exposures is None else exposures[k]
+    for k, (pose, exposure) in enumerate(zip(poses, exposures or [1.0] * len(poses), strict=True)):
+        glint = 0.02 * np.sin(np.arange(W) / 40 + k)[None]
+        linear = np.where(own & BONNET, 0.5 + glint, road(pose))
         shown = np.clip(linear * exposure, 0, 1) ** (1 / 2.2)
         out.append(np.rint(255 * np.clip(shown + RNG.normal(0, 0.004, shown.shape), 0, 1)))
     return np.array(out, np.uint8)
@@ -76,11 +71,10 @@ DRIVEN = np.array([pose_at(0.7 * k) for k in range(12)])
 
 
 def test_the_bonnet_is_found_whatever_the_exposures():
-    exposures = 2.0 ** np.tile([-0.8, 0.3, 0.0], 4)
-    found = find_ego_mask(CAMERA, pictures(DRIVEN, exposures=exposures), DRIVEN, UP)
-    assert found.mask is not None
-    both = (found.mask & bonnet()).sum() / (found.mask | bonnet()).sum()
-    assert both > 0.93
+    exposures = [2.0**-0.8, 2.0**0.3, 1.0] * 4
+    mask = find_ego_mask(CAMERA, pictures(DRIVEN, exposures=exposures), DRIVEN, UP).mask
+    assert mask is not None
+    assert (mask & BONNET).sum() / (mask | BONNET).sum() > 0.93
 
 
 def test_a_road_alone_holds_no_car():
@@ -125,10 +119,9 @@ def recording(tmp_path):
 
 def test_drives_leave_it_out_and_runs_remember(recording, tmp_path):
     scene = assemble(recording, DataConfig(frames="0:4"), tmp_path / "work")
-    said = [note for note in scene.notes if note.startswith("own car")]
-    assert len(said) == 2
-    assert "front 1" in said[0]
-    assert said[1] == "own car: not seen by back"
+    seen, unseen = [note for note in scene.notes if note.startswith("own car")]
+    assert "front 1" in seen
+    assert unseen == "own car: not seen by back"
     assert (tmp_path / "work" / "own_car" / "front" / "car.png").is_file()
     by_camera = {view.camera: row for row, view in enumerate(scene.views)}
     with_masks = dataclasses.replace(

@@ -13,8 +13,7 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.drives.lidar import owners
 from p2gs_jax.scene.drives.tables import read_pickled
-from p2gs_jax.scene.pixels.store import ImageStore
-from p2gs_jax.scene.rigid import interpolated, inverse
+from p2gs_jax.scene.rigid import inverse
 
 
 @pytest.fixture
@@ -46,6 +45,9 @@ def test_poses_are_those_of_the_flat_calibration(keyframe, read):
         seconds = (known["timestamp_us"] - flat["LIDAR_TOP"]["timestamp_us"]) * 1e-6
         assert photograph.time == pytest.approx(seconds, abs=1e-9)
         assert photograph.path.is_file()
+    scene = assemble(drive, DataConfig())
+    assert len(scene.views) == 6
+    assert len(scene.points) > 10_000
 
 
 def test_laser_points_land_in_the_images_when_those_were_taken(keyframe, read):
@@ -66,34 +68,6 @@ def test_laser_points_land_in_the_images_when_those_were_taken(keyframe, read):
         assert photograph.time - passed == pytest.approx(0.002, abs=0.0006)
 
 
-def test_pictures_have_edges_where_depth_jumps(keyframe, read):
-    drive = read(keyframe)
-    scene = assemble(drive, DataConfig())
-    assert len(scene.views) == 6
-    assert len(scene.points) > 10_000
-    points = drive.sweeps[0].read().points - scene.origin
-    store = ImageStore(scene.views, DataConfig())
-    ratios = []
-    for index, view in enumerate(scene.views):
-        xy, depth = project(points, view.viewmat.astype(np.float64), view.K)
-        # Neighbours of one beam follow each other 32 apart.
-        near, z = np.stack([xy[:-32], xy[32:]], 1), np.stack([depth[:-32], depth[32:]], 1)
-        inside = ((near >= 0) & (near < [view.width - 1, view.height])).all((1, 2))
-        gap = np.abs(near[:, 1] - near[:, 0])
-        use = inside & (z > 1).all(1) & (gap < [25, 8]).all(1)
-        gradient = np.abs(np.diff(store.get(index, 1)[0].mean(2), axis=1))
-        strongest = np.array(
-            [
-                gradient[int(row), int(min(ends)) : int(max(ends)) + 1].max()
-                for ends, row in zip(near[use, :, 0], near[use, 0, 1], strict=True)
-            ]
-        )
-        jumps = z[use].max(1) > 1.2 * z[use].min(1)
-        ratios.append(strongest[jumps].mean() / strongest[~jumps].mean())
-    # 2.2; with the points 4 pixels to either side below 2.
-    assert np.median(ratios) > 2.1
-
-
 def test_the_real_sequence(sequence):
     assert sequence.format == "pandaset"
     assert len(sequence.cameras) == 6
@@ -103,12 +77,10 @@ def test_the_real_sequence(sequence):
     assert (len(sequence.objects), sum(thing.moving for thing in sequence.objects)) == (94, 32)
     assert sequence.notes == ["26 of 30 LiDAR sweeps are missing."]
     # Cars are longer than wide, and drive about where they look (one turns).
-    for thing in sequence.objects:
-        if thing.label == "Car":
-            assert thing.size[0] > thing.size[1]
-        way = thing.poses[-1, :3, 3] - thing.poses[0, :3, 3]
-        if thing.label == "Car" and np.linalg.norm(way) > 3:
-            assert way @ thing.poses[0, :3, 0] > 0.8 * np.linalg.norm(way)
+    for car in (thing for thing in sequence.objects if thing.label == "Car"):
+        assert car.size[0] > car.size[1]
+        way = car.poses[-1, :3, 3] - car.poses[0, :3, 3]
+        assert np.linalg.norm(way) <= 3 or way @ car.poses[0, :3, 0] > 0.8 * np.linalg.norm(way)
 
 
 def test_the_scanner_passed_boxes_when_it_is_said_to(sequence):
@@ -121,39 +93,10 @@ def test_the_scanner_passed_boxes_when_it_is_said_to(sequence):
         times = table["t"][spinning]
         row = owners(points, times, sequence.objects)
         for k in set(row[row >= 0]):
-            nearest = np.abs(sequence.objects[k].times - np.median(times[row == k])).min()
-            apart.append(nearest)
+            apart.append(np.abs(sequence.objects[k].times - np.median(times[row == k])).min())
     assert len(apart) > 50
     assert np.median(apart) < 0.002
     assert np.quantile(apart, 0.9) < 0.006
-
-
-def test_boxes_are_where_the_forward_scanner_saw_them_at_another_time(sequence):
-    """Second boxes are left out; they are of other times, to which tracks are interpolated."""
-    things = {thing.name: thing for thing in sequence.objects}
-    ours, unmoved = [], []
-    for sweep in sequence.sweeps:
-        points = read_pickled(sequence.root / f"lidar/{sweep.frame:02d}.pkl.gz")
-        boxes = read_pickled(sequence.root / f"annotations/cuboids/{sweep.frame:02d}.pkl.gz")
-        xyz, forward = np.stack([points[a] for a in "xyz"], 1), points["d"] == 1
-        for k in np.flatnonzero(boxes["cuboids.sensor_id"] == 1):
-            sibling = boxes["cuboids.sibling_id"][k]
-            thing = next((t for name, t in things.items() if name.startswith(sibling)), None)
-            place = np.array([boxes[f"position.{a}"][k] for a in "xyz"])
-            near = forward & (np.linalg.norm(xyz - place, axis=1) < 2)
-            if thing is None or near.sum() < 10:
-                continue
-            way = thing.poses[-1, :3, 3] - thing.poses[0, :3, 3]
-            if np.linalg.norm(way) / np.ptp(thing.times) < 4:
-                continue
-            there, _ = interpolated(thing.times, thing.poses, [np.median(points["t"][near])])
-            frame = np.argmin(np.abs(thing.times - (sweep.time - 0.05)))
-            along = thing.poses[0, :3, 0]
-            ours.append(abs((there[0, :3, 3] - place) @ along))
-            unmoved.append(abs((thing.poses[frame, :3, 3] - place) @ along))
-    assert len(ours) > 20
-    assert np.median(ours) < 0.12
-    assert np.median(unmoved) > 2 * np.median(ours)
 
 
 def test_scans_agree_with_the_disparity_of_the_real_photographs(shared_data, read, tmp_path):

@@ -12,7 +12,7 @@ from scene.drives import writers_kitti as kitti
 from scene.drives import writers_nuscenes as nuscenes
 from scene.drives import writers_pandaset as pandaset
 from scene.drives import writers_waymo as waymo
-from scene.drives.writers import car_at, cut, inv, jpeg, write_jpeg
+from scene.drives.writers import car_at, cut, inv, jpeg, write_bytes
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
@@ -58,12 +58,8 @@ def test_what_nuscenes_lacks_is_counted(copied, read):
     root = copied("nuscenes").root
     edit(root, "ego_pose", lambda rows: [r for r in rows if "CAM_FRONT" not in r["token"]])
     edit(root, "scene", lambda rows: [{**rows[0], "nbr_samples": 39}])
-    nameless = {"instance_token": ""}
-    edit(
-        root,
-        "sample_annotation",
-        lambda rows: [{**r, **nameless} if "right" in r["token"] else r for r in rows],
-    )
+    names = {False: {}, True: {"instance_token": ""}}
+    edit(root, "sample_annotation", lambda rows: [r | names["right" in r["token"]] for r in rows])
     for folder in ("samples", "sweeps"):
         next(iter((root / folder / "LIDAR_TOP").iterdir())).unlink()
     drive = read(root)
@@ -110,8 +106,8 @@ def test_what_argoverse_lacks_is_counted(copied, read):
     log = copied("argoverse").root
     cameras = log / "sensors" / "cameras"
     shutil.rmtree(cameras / "ring_side_right")
-    write_jpeg(cameras / "ring_front_left" / f"{argoverse.ns(-9)}.jpg")
-    write_jpeg(cameras / "ring_rear_left" / f"{argoverse.ns(0)}.jpg")
+    write_bytes(cameras / "ring_front_left" / f"{argoverse.ns(-9)}.jpg")
+    write_bytes(cameras / "ring_rear_left" / f"{argoverse.ns(0)}.jpg")
     sweep = next(iter((log / "sensors" / "lidar").iterdir()))
     sweep.rename(sweep.with_name(f"{argoverse.ns(-8)}.feather"))
     stamps = [argoverse.ns(t) for t in (0, 99, 0.1)]
@@ -221,21 +217,17 @@ def test_what_waymo_lacks_is_counted(copied, read):
     ]
 
 
+def image(prefix, *shape):
+    return {f"{prefix}values": [1.0] * int(np.prod(shape)), f"{prefix}shape": list(shape)}
+
+
 @pytest.mark.parametrize(
     ("component", "changes", "words"),
     [
         ("lidar", {f"{waymo.RANGES}shape": [5, 7, 4]}, "holds no range image"),
         ("lidar", {"key.laser_name": 4}, "has no scanner 4"),
-        (
-            "lidar",
-            {f"{waymo.RANGES}values": [1.0] * 96, f"{waymo.RANGES}shape": [2, 12, 4]},
-            "2 rows",
-        ),
-        (
-            "lidar_pose",
-            {f"{waymo.PIXELS}values": [1.0] * 6, f"{waymo.PIXELS}shape": [1, 1, 6]},
-            "does not fit its range image",
-        ),
+        ("lidar", image(waymo.RANGES, 2, 12, 4), "2 rows"),
+        ("lidar_pose", image(waymo.PIXELS, 1, 1, 6), "does not fit its range image"),
     ],
 )
 def test_senseless_range_images_are_named_when_they_are_read(
@@ -316,7 +308,7 @@ def test_what_kitti_lacks_is_counted(write, read, tmp_path):
     for path in drive.glob("image_03/data/*"):
         path.unlink()
     late, empty = kitti.tracklet("Car", 7, [[5, 2, 0, 0]] * 3), kitti.tracklet("Car", 0, [])
-    (date / kitti.BOXES).write_bytes(kitti.tracklets(late, empty))
+    (date / kitti.BOXES).write_text(kitti.tracklets(late, empty))
     recording = read(date)
     assert recording.notes == [
         "4 of 8 frames have no GPS measurement.",

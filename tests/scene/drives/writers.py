@@ -17,6 +17,7 @@ K = (50, 51, 32, 24)
 FORWARD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 # Boxes about the scanner, in axes x forward, y left: one ahead, one to the right.
 AHEAD, RIGHT = (12.0, 0.0), (0.0, -8.0)
+LENGTH, BREADTH, TALL = SIZE = (4.2, 1.8, 1.5)
 
 
 def matrix(turn: Rotation, position) -> np.ndarray:
@@ -25,8 +26,9 @@ def matrix(turn: Rotation, position) -> np.ndarray:
     return out
 
 
-def inv(pose: np.ndarray) -> np.ndarray:
-    return np.linalg.inv(pose)
+inv = np.linalg.inv
+# A scanner on the car whose x is to the right, y forward.
+SCANNER = matrix(Rotation.from_euler("z", -np.pi / 2), [0.9, 0, 1.8])
 
 
 def car_at(seconds: float) -> np.ndarray:
@@ -45,10 +47,23 @@ def mounted(azimuth: float, position=(1.5, 0.2, 1.6)) -> np.ndarray:
     return matrix(turn, position)
 
 
+def box(place, yaw: float, height: float = 0.8) -> np.ndarray:
+    """Return a box about a scanner with axes x forward, y left."""
+    return matrix(Rotation.from_euler("z", yaw), [*place, height])
+
+
+def beside(seconds: float, place, yaw: float = 0.0) -> np.ndarray:
+    """Return a box in the world at a place about SCANNER, given x forward, y left."""
+    return car_at(seconds) @ SCANNER @ box((-place[1], place[0]), yaw, 0)
+
+
 def upright(pose: np.ndarray) -> np.ndarray:
     """Return a pose without pitch and roll, which sets that annotate only a yaw cannot keep."""
-    yaw = np.arctan2(pose[1, 0], pose[0, 0])
-    return matrix(Rotation.from_euler("z", yaw), pose[:3, 3])
+    return box(pose[:2, 3], yaw_of(pose), pose[2, 3])
+
+
+def yaw_of(pose: np.ndarray) -> float:
+    return np.arctan2(pose[1, 0], pose[0, 0])
 
 
 def wxyz(pose: np.ndarray) -> list[float]:
@@ -65,54 +80,41 @@ def landmarks(count: int = 50) -> np.ndarray:
     return applied(car_at(0.5), rng.uniform([-30, -30, -1], [30, 30, 6], (count, 3)))
 
 
-def off_landmarks(points: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(points[:, None] - landmarks(), axis=2).min(1)
+def off_landmarks(points: np.ndarray, origin=0.0) -> np.ndarray:
+    """Return the distances of points from the landmarks, in a world with another origin."""
+    return np.linalg.norm(points[:, None] - (landmarks() - origin), axis=2).min(1)
 
 
 def jpeg(seed: int = 0) -> bytes:
-    rng = np.random.default_rng(seed)
-    picture = rng.integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
+    picture = np.random.default_rng(seed).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
     return cv2.imencode(".jpg", picture)[1].tobytes()
 
 
-def write_jpeg(path: Path, seed: int = 0) -> None:
-    write_bytes(path, jpeg(seed))
-
-
-def write_bytes(path: Path, data: bytes) -> None:
+def write_bytes(path: Path, data: bytes | str | None = None) -> None:
+    """Write bytes, a text, or a photograph."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(data)
+    data = jpeg() if data is None else data
+    path.write_bytes(data.encode() if isinstance(data, str) else data)
 
 
 def cut(path: Path) -> None:
     """Leave the first half of a file."""
-    held = path.read_bytes()
-    path.write_bytes(held[: len(held) // 2])
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
 class Made(NamedTuple):
-    """A drive, and the truth of what a reader should find in it.
-
-    Attributes:
-        photographs: time and camera to world, by camera and frame.
-        sweeps: times of sweeps.
-        boxes: times and box to world of "ahead" and "right"; a third one is "parked".
-        tables: files without which the drive is not read, below `root`.
-        optional: tables that may be gone.
-        scans: files of sweeps.
-        error: distances of points from what they were measured on, metres.
-        count: points of a sweep.
-    """
+    """A drive, and the truth of what a reader should find in it; paths are below `root`."""
 
     root: Path
+    # Time and camera to world, by camera and frame.
     photographs: dict[tuple[str, int], tuple[float, np.ndarray]]
-    sweeps: list[float]
-    boxes: dict[str, tuple[np.ndarray, np.ndarray]]
-    tables: list[Path]
-    optional: list[Path]
-    scans: list[Path] = []  # noqa: RUF012
-    error: Callable[[np.ndarray], np.ndarray] = off_landmarks
-    count: int = 50
+    sweeps: list[float]  # times
+    boxes: dict[str, tuple[np.ndarray, np.ndarray]]  # times and poses of all but "parked"
+    tables: list[Path]  # without which the drive is not read
+    optional: list[Path]  # tables that may be gone
+    scans: list[Path] = []  # noqa: RUF012  # files of sweeps
+    error: Callable[[np.ndarray], np.ndarray] = off_landmarks  # from what was measured, m
+    count: int = 50  # points of a sweep
 
 
 def shots(azimuths: dict[str, float], lag: dict[str, float], ats, clock: float = 0.0) -> dict:

@@ -38,7 +38,7 @@ def posed(poses) -> dict:
 
 
 def box(place) -> np.ndarray:
-    return w.matrix(Rotation.from_euler("z", 0.5), [*place, 0.8])
+    return w.box(place, 0.5)
 
 
 def write_boxes(log: Path, turns: int, **changes) -> None:
@@ -49,13 +49,12 @@ def write_boxes(log: Path, turns: int, **changes) -> None:
         "right": [box(w.RIGHT)] * turns,
         "parked": [w.inv(w.car_at(0.1 * k)) @ parked for k in range(turns)],
     }
+    same = {"category": "REGULAR_VEHICLE"}
+    same |= dict(zip(("length_m", "width_m", "height_m"), w.SIZE, strict=True))
     columns = {
         "timestamp_ns": [ns(0.1 * k) for k in range(turns)] * len(local),
         "track_uuid": [name for name in local for _ in range(turns)],
-        "category": ["REGULAR_VEHICLE"] * turns * len(local),
-        "length_m": [4.2] * turns * len(local),
-        "width_m": [1.8] * turns * len(local),
-        "height_m": [1.5] * turns * len(local),
+        **{name: [value] * turns * len(local) for name, value in same.items()},
         **posed([pose for poses in local.values() for pose in poses]),
     }
     write_table(log / BOXES, **(columns | changes))
@@ -78,14 +77,12 @@ def write(log: Path, frames=3) -> w.Made:
         start = 0.1 * turn
         for name, lag in LAG.items():
             for half in (0, 0.05):
-                w.write_jpeg(log / "sensors" / "cameras" / name / f"{ns(start + half + lag)}.jpg")
-        w.write_jpeg(log / "sensors" / "cameras" / GREY / f"{ns(start)}.jpg")
+                w.write_bytes(log / "sensors/cameras" / name / f"{ns(start + half + lag)}.jpg")
+        w.write_bytes(log / "sensors/cameras" / GREY / f"{ns(start)}.jpg")
         local = w.applied(w.inv(w.car_at(start)), w.landmarks())
-        write_table(
-            log / "sensors" / "lidar" / f"{ns(start)}.feather",
-            **{axis: local[:, k].astype(np.float16) for k, axis in enumerate("xyz")},
-            offset_ns=np.linspace(0, 1e8, len(local)).astype(np.int32),
-        )
+        columns = {axis: local[:, k].astype(np.float16) for k, axis in enumerate("xyz")}
+        columns["offset_ns"] = np.linspace(0, 1e8, len(local)).astype(np.int32)
+        write_table(log / "sensors/lidar" / f"{ns(start)}.feather", **columns)
     write_boxes(log, frames)
     ats = 0.1 * np.arange(frames)
     return w.Made(

@@ -9,21 +9,17 @@ from scipy.spatial.transform import Rotation
 
 EARTH, LATITUDE, LONGITUDE = 6378137.0, 49.0, 8.4
 TURN = 0.1
+# The reader's clock when the drive begins, s.
+START = np.datetime64("2011-09-26T13:02:25", "ns")
+BEGIN = START.astype(int) * 1e-9
 DATE, DRIVE = "2011_09_26", "2011_09_26_drive_0001_sync"
 BOXES = Path(DRIVE) / "tracklet_labels.xml"
 # When the scanner looks forward, and when cameras take photographs, after a frame begins.
 SCANNED, LAG = 0.0035, {"image_02": 0.003, "image_03": 0.004}
 
 
-def square(rows) -> np.ndarray:
-    return np.vstack([np.reshape(rows, (3, 4)), [0, 0, 0, 1]])
-
-
 def small(angles, position) -> np.ndarray:
-    out = np.eye(4)
-    out[:3, :3] = Rotation.from_euler("zyx", angles, degrees=True).as_matrix()
-    out[:3, 3] = position
-    return out
+    return w.matrix(Rotation.from_euler("zyx", angles, degrees=True), position)
 
 
 IMU_TO_VELO = small([0.3, -0.2, 0.5], [-0.81, 0.32, -0.8])
@@ -52,17 +48,8 @@ def scanner(seconds: float) -> np.ndarray:
 def camera(name: str, seconds: float) -> np.ndarray:
     """Return camera to world: readme.txt has Y = P_rect R_rect velo_to_cam imu_to_velo X."""
     P = P_RECT[name[-2:]]
-    back = np.eye(4)
-    back[:3, 3] = -np.linalg.solve(P[:, :3], P[:, 3])
+    back = w.matrix(Rotation.identity(), -np.linalg.solve(P[:, :3], P[:, 3]))
     return imu(seconds) @ w.inv(R_RECT @ VELO_TO_CAM @ IMU_TO_VELO) @ back
-
-
-def places() -> np.ndarray:
-    return w.landmarks() - w.car_at(0)[:3, 3]
-
-
-def off_places(points: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(points[:, None] - places(), axis=2).min(1)
 
 
 def local_when_passed(place: np.ndarray, forward: float) -> np.ndarray:
@@ -78,28 +65,23 @@ def local_when_passed(place: np.ndarray, forward: float) -> np.ndarray:
 
 
 def stamp(seconds: float) -> str:
-    whole = np.datetime64("2011-09-26T13:02:25", "ns") + np.timedelta64(round(seconds * 1e9), "ns")
-    return str(whole).replace("T", " ")
-
-
-# The reader's clock when the drive begins.
-BEGIN = np.datetime64("2011-09-26T13:02:25", "ns").astype(int) * 1e-9
+    return str(START + np.timedelta64(round(seconds * 1e9), "ns")).replace("T", " ")
 
 
 def write_stamps(path: Path, times) -> None:
-    w.write_bytes(path, "".join(stamp(t) + "\n" for t in times).encode())
+    w.write_bytes(path, "".join(stamp(t) + "\n" for t in times))
 
 
 def numbers(values) -> str:
     return " ".join(f"{v:.12e}" for v in np.ravel(values))
 
 
-def rigid(pose: np.ndarray) -> bytes:
+def rigid(pose: np.ndarray) -> str:
     head = "calib_time: 25-May-2012 16:47:16\n"
-    return f"{head}R: {numbers(pose[:3, :3])}\nT: {numbers(pose[:3, 3])}\n".encode()
+    return f"{head}R: {numbers(pose[:3, :3])}\nT: {numbers(pose[:3, 3])}\n"
 
 
-def oxts(seconds: float) -> bytes:
+def oxts(seconds: float) -> str:
     """Return a line of the GPS unit: the inverse of convertOxtsToPose.m."""
     pose = imu(seconds)
     scale = EARTH * np.cos(np.radians(LATITUDE))
@@ -108,7 +90,7 @@ def oxts(seconds: float) -> bytes:
     latitude = np.degrees(2 * np.arctan(np.exp((start + pose[1, 3]) / scale))) - 90
     yaw, pitch, roll = Rotation.from_matrix(pose[:3, :3]).as_euler("ZYX")
     head = [f"{v:.16e}" for v in (latitude, longitude, 110 + pose[2, 3], roll, pitch, yaw)]
-    return (" ".join([*head, *["0"] * 24]) + "\n").encode()
+    return " ".join([*head, *["0"] * 24]) + "\n"
 
 
 def tracklet(label: str, first: int, rows) -> str:
@@ -125,14 +107,14 @@ def tracklet(label: str, first: int, rows) -> str:
     )
 
 
-def tracklets(*items: str) -> bytes:
+def tracklets(*items: str) -> str:
     return (
         '<?xml version="1.0" encoding="UTF-8" standalone="yes" ?>\n'
         "<!DOCTYPE boost_serialization>\n"
         '<boost_serialization signature="serialization::archive" version="9">\n'
         f"<tracklets><count>{len(items)}</count><item_version>1</item_version>{''.join(items)}"
         "</tracklets></boost_serialization>\n"
-    ).encode()
+    )
 
 
 def box(place) -> np.ndarray:
@@ -146,11 +128,11 @@ def write(root: Path, frames=3) -> w.Made:
     lines = ["calib_time: 09-Jan-2012 13:57:47", "corner_dist: 9.950000e-02"]
     lines += [f"R_rect_00: {numbers(R_RECT[:3, :3])}"]
     lines += [f"P_rect_{name}: {numbers(P)}" for name, P in P_RECT.items()]
-    w.write_bytes(date / "calib_cam_to_cam.txt", ("\n".join(lines) + "\n").encode())
+    w.write_bytes(date / "calib_cam_to_cam.txt", "\n".join(lines) + "\n")
     w.write_bytes(date / "calib_velo_to_cam.txt", rigid(VELO_TO_CAM))
     w.write_bytes(date / "calib_imu_to_velo.txt", rigid(IMU_TO_VELO))
     ats = 0.1 * np.arange(frames)
-    forward = ats + SCANNED
+    forward, places = ats + SCANNED, w.landmarks() - w.car_at(0)[:3, 3]
     for name, lag in {"oxts": 0.0, "velodyne_points": SCANNED, **LAG}.items():
         write_stamps(drive / name / "timestamps.txt", ats + lag)
     write_stamps(drive / "velodyne_points/timestamps_start.txt", forward - TURN / 2)
@@ -160,16 +142,15 @@ def write(root: Path, frames=3) -> w.Made:
         w.write_bytes(drive / f"oxts/data/{k:010d}.txt", oxts(at))
         for name in LAG:
             w.write_bytes(drive / f"{name}/data/{k:010d}.png", picture)
-        seen = np.array([local_when_passed(place, forward[k]) for place in places()])
+        seen = np.array([local_when_passed(place, forward[k]) for place in places])
         scan = np.column_stack([seen, np.ones(len(seen))]).astype("<f4")
         w.write_bytes(drive / f"velodyne_points/data/{k:010d}.bin", scan.tobytes())
     parked = scanner(SCANNED) @ box(w.AHEAD)
-    bottom = [*w.AHEAD, -1.25, np.radians(20)], [*w.RIGHT, -1.25, np.radians(20)]
+    yaw, moving = np.radians(20), {"ahead": w.AHEAD, "right": w.RIGHT}
+    things = {name: [[*place, -1.25, yaw]] * frames for name, place in moving.items()}
     stands = [local_when_passed(parked[:3, 3], at) - [0, 0, 0.75] for at in forward]
-    rows = [[*place, np.radians(20) - 0.3 * at] for place, at in zip(stands, ats, strict=True)]
-    items = [[bottom[0]] * frames, [bottom[1]] * frames, rows]
-    names = ("ahead", "right", "parked")
-    boxes = tracklets(*(tracklet(n, 0, r) for n, r in zip(names, items, strict=True)))
+    things["parked"] = [[*s, yaw - 0.3 * at] for s, at in zip(stands, ats, strict=True)]
+    boxes = tracklets(*(tracklet(name, 0, rows) for name, rows in things.items()))
     w.write_bytes(date / BOXES, boxes)
     late = {"ahead": 0, "right": 0.25 * TURN}
 
@@ -184,7 +165,7 @@ def write(root: Path, frames=3) -> w.Made:
             for k, at in enumerate(ats)
         },
         sweeps=list(BEGIN + forward),
-        error=off_places,
+        error=lambda points: w.off_landmarks(points, w.car_at(0)[:3, 3]),
         boxes=w.tracks(forward, late, box_at, BEGIN),
         tables=[Path(f"calib_{name}.txt") for name in ("cam_to_cam", "velo_to_cam", "imu_to_velo")]
         + [Path(DRIVE) / folder / "timestamps.txt" for folder in ("oxts", "image_03")],

@@ -5,26 +5,22 @@ from pathlib import Path
 
 import numpy as np
 from scene.drives import writers as w
-from scipy.spatial.transform import Rotation
 
 START = 1532402927647951
 TABLES = Path("v1.0-mini")
 CAMERAS = {"CAM_FRONT": 0.0, "CAM_BACK_LEFT": 1.9}
 LAG = {"CAM_FRONT": -0.035, "CAM_BACK_LEFT": -0.001}
-# x to the right, y forward.
-SCANNER = w.matrix(Rotation.from_euler("z", -np.pi / 2), [0.9, 0, 1.8])
 K = [[50.0, 0, 31.5], [0, 51, 23.5], [0, 0, 1]]
 TURN = 0.05
 
 
+def placed(pose) -> dict:
+    return {"translation": pose[:3, 3].tolist(), "rotation": w.wxyz(pose)}
+
+
 def calibrated(channel, pose, K) -> dict:
-    return {
-        "token": f"calibrated {channel}",
-        "sensor_token": channel,
-        "translation": pose[:3, 3].tolist(),
-        "rotation": w.wxyz(pose),
-        "camera_intrinsic": K,
-    }
+    token = {"token": f"calibrated {channel}", "sensor_token": channel}
+    return {**token, **placed(pose), "camera_intrinsic": K}
 
 
 def recorded(root, sample, scene, channel, seconds, key) -> tuple[dict, dict]:
@@ -35,11 +31,11 @@ def recorded(root, sample, scene, channel, seconds, key) -> tuple[dict, dict]:
     name = f"{folder}/{channel}/{scene}__{channel}__{stamp}.{ending}"
     ego = w.car_at(seconds)
     if channel == "LIDAR_TOP":
-        local = w.applied(w.inv(ego @ SCANNER), w.landmarks())
+        local = w.applied(w.inv(ego @ w.SCANNER), w.landmarks())
         data = np.column_stack([local, np.zeros((len(local), 2))]).astype("<f4").tobytes()
         w.write_bytes(root / name, data)
     else:
-        w.write_jpeg(root / name)
+        w.write_bytes(root / name)
     token = f"{scene} {channel} {stamp}"
     row = {
         "token": token,
@@ -52,25 +48,18 @@ def recorded(root, sample, scene, channel, seconds, key) -> tuple[dict, dict]:
         "width": w.WIDTH if camera else 0,
         "height": w.HEIGHT if camera else 0,
     }
-    placed = {"translation": ego[:3, 3].tolist(), "rotation": w.wxyz(ego)}
-    return row, {"token": token, "timestamp": stamp, **placed}
+    return row, {"token": token, "timestamp": stamp, **placed(ego)}
 
 
-def boxed(scene, sample, instance, pose, attributes) -> dict:
+def boxed(scene, sample, instance, pose, attribute) -> dict:
     return {
         "token": f"{sample} {instance}",
         "sample_token": sample,
         "instance_token": f"{scene} {instance}",
-        "attribute_tokens": attributes,
-        "translation": pose[:3, 3].tolist(),
-        "size": [1.8, 4.2, 1.5],
-        "rotation": w.wxyz(pose),
+        "attribute_tokens": [attribute],
+        **placed(pose),
+        "size": [w.BREADTH, w.LENGTH, w.TALL],
     }
-
-
-def beside(seconds: float, place) -> np.ndarray:
-    """Return a box at a place about the scanner, given x forward, y left; it looks along y."""
-    return w.car_at(seconds) @ SCANNER @ w.matrix(Rotation.identity(), [-place[1], place[0], 0])
 
 
 def write(root: Path, frames=3, scenes=("scene-0001",), version=TABLES) -> w.Made:
@@ -80,7 +69,7 @@ def write(root: Path, frames=3, scenes=("scene-0001",), version=TABLES) -> w.Mad
     tables["sensor"] = [{"token": c, "channel": c, "modality": kinds[c]} for c in kinds]
     tables["calibrated_sensor"] = [
         *(calibrated(channel, w.mounted(azimuth), K) for channel, azimuth in CAMERAS.items()),
-        calibrated("LIDAR_TOP", SCANNER, []),
+        calibrated("LIDAR_TOP", w.SCANNER, []),
         calibrated("RADAR", np.eye(4), []),
     ]
     tables["category"].append({"token": "car", "name": "vehicle.car"})
@@ -99,12 +88,11 @@ def write(root: Path, frames=3, scenes=("scene-0001",), version=TABLES) -> w.Mad
                 row, pose = recorded(root, sample, scene, channel, when, key)
                 tables["sample_data"].append(row)
                 tables["ego_pose"].append(pose)
+            starts = "moving" if moment else "parked"
             tables["sample_annotation"] += [
-                boxed(scene, sample, "ahead", beside(at, w.AHEAD), ["rider"]),
-                boxed(
-                    scene, sample, "right", beside(at, w.RIGHT), ["moving" if moment else "parked"]
-                ),
-                boxed(scene, sample, "parked", beside(0, w.AHEAD), ["parked"]),
+                boxed(scene, sample, "ahead", w.beside(at, w.AHEAD), "rider"),
+                boxed(scene, sample, "right", w.beside(at, w.RIGHT), starts),
+                boxed(scene, sample, "parked", w.beside(0, w.AHEAD), "parked"),
             ]
         for instance in ("ahead", "right", "parked"):
             tables["instance"].append({"token": f"{scene} {instance}", "category_token": "car"})
@@ -117,9 +105,11 @@ def write(root: Path, frames=3, scenes=("scene-0001",), version=TABLES) -> w.Mad
         root=root,
         photographs=w.shots(CAMERAS, LAG, ats),
         sweeps=[t for at in ats for t in (at - TURN, at)],
-        boxes=w.tracks(ats, late, beside),
-        tables=[version / f"{name}.json" for name in ("scene", "sample", "ego_pose", "sensor")]
-        + [version / "calibrated_sensor.json"],
+        boxes=w.tracks(ats, late, w.beside),
+        tables=[
+            version / f"{name}.json"
+            for name in ("scene", "sample", "ego_pose", "sensor", "calibrated_sensor")
+        ],
         optional=[version / "sample_annotation.json"],
         scans=sorted(p.relative_to(root) for p in root.glob("s*/LIDAR_TOP/*")),
     )

@@ -8,20 +8,17 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from scene.drives import writers as w
-from scipy.spatial.transform import Rotation
 
 BEGIN = 1557539956.5
 CAMERAS = {"front_camera": 0.0, "left_camera": np.pi / 2}
 LAG = {"front_camera": -0.05, "left_camera": -0.075}
 TURN = 0.1
-# x to the right, y forward.
-SCANNER = w.matrix(Rotation.from_euler("z", -np.pi / 2), [0.9, 0, 1.8])
 FRONT = Path("camera/front_camera")
 CUBOIDS = Path("annotations/cuboids")
 
 
 def put(path: Path, held) -> None:
-    w.write_bytes(path, json.dumps(held).encode())
+    w.write_bytes(path, json.dumps(held))
 
 
 def placed(pose: np.ndarray) -> dict:
@@ -32,9 +29,7 @@ def placed(pose: np.ndarray) -> dict:
 
 
 def beside(seconds: float, place) -> np.ndarray:
-    """Return an w.upright box about the scanner, at a place x forward, y left; it looks along x."""
-    turned = w.matrix(Rotation.from_euler("z", np.pi / 2), [-place[1], place[0], 0])
-    return w.upright(w.car_at(seconds) @ SCANNER @ turned)
+    return w.upright(w.beside(seconds, place, np.pi / 2))
 
 
 def cuboid(uuid, pose, *, stationary=False, sensor=-1, sibling="-") -> dict:
@@ -42,10 +37,10 @@ def cuboid(uuid, pose, *, stationary=False, sensor=-1, sibling="-") -> dict:
     return {
         "uuid": uuid,
         "label": "Car",
-        "yaw": np.arctan2(pose[1, 0], pose[0, 0]) - np.pi / 2,
+        "yaw": w.yaw_of(pose) - np.pi / 2,
         "stationary": stationary,
         **{f"position.{a}": float(v) for a, v in zip("xyz", pose[:3, 3], strict=True)},
-        **{f"dimensions.{a}": v for a, v in zip("xyz", (1.8, 4.2, 1.5), strict=True)},
+        **{"dimensions.x": w.BREADTH, "dimensions.y": w.LENGTH, "dimensions.z": w.TALL},
         "cuboids.sibling_id": sibling,
         "cuboids.sensor_id": sensor,
     }
@@ -80,12 +75,10 @@ def write(folder: Path, frames=3) -> w.Made:
     for camera, azimuth in CAMERAS.items():
         place = folder / "camera" / camera
         for k in range(frames):
-            w.write_jpeg(place / f"{k:02d}.jpg")
+            w.write_bytes(place / f"{k:02d}.jpg")
         put(place / "intrinsics.json", {"fx": 50, "fy": 51, "cx": 31.5, "cy": 23.5})
-        put(
-            place / "poses.json",
-            [placed(w.car_at(at + LAG[camera]) @ w.mounted(azimuth)) for at in ats],
-        )
+        poses = [w.car_at(at + LAG[camera]) @ w.mounted(azimuth) for at in ats]
+        put(place / "poses.json", [placed(pose) for pose in poses])
         put(place / "timestamps.json", list(BEGIN + ats + LAG[camera]))
     for k, at in enumerate(ats):
         x, y, z = w.landmarks().T
@@ -93,7 +86,7 @@ def write(folder: Path, frames=3) -> w.Made:
         table.columns = table.columns.astype(object)
         w.write_bytes(folder / f"lidar/{k:02d}.pkl.gz", gzip.compress(pickle.dumps(table)))
         write_rows(folder / CUBOIDS / f"{k:02d}.pkl.gz", cuboids(k))
-    put(folder / "lidar/poses.json", [placed(w.car_at(at) @ SCANNER) for at in ats])
+    put(folder / "lidar/poses.json", [placed(w.car_at(at) @ w.SCANNER) for at in ats])
     put(folder / "lidar/timestamps.json", list(BEGIN + ats))
     # A turn begins at the back; the sweep's stamp is its end.
     late = {"ahead": -0.5 * TURN, "right": -0.25 * TURN}
@@ -102,8 +95,11 @@ def write(folder: Path, frames=3) -> w.Made:
         photographs=w.shots(CAMERAS, LAG, ats, BEGIN),
         sweeps=list(BEGIN + ats),
         boxes=w.tracks(ats, late, beside, BEGIN),
-        tables=[FRONT / f"{name}.json" for name in ("poses", "timestamps")]
-        + [Path("lidar/poses.json"), Path("lidar/timestamps.json")],
+        tables=[
+            Path(place, f"{name}.json")
+            for place in (FRONT, "lidar")
+            for name in ("poses", "timestamps")
+        ],
         optional=[CUBOIDS / "01.pkl.gz"],
         scans=[Path(f"lidar/{k:02d}.pkl.gz") for k in range(frames)],
     )

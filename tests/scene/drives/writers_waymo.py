@@ -45,13 +45,12 @@ def write_rows(root, component, rows, segment=SEGMENT) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     keyed = [{"key.segment_context_name": segment, **row} for row in rows]
     names = list(keyed[0])
-    arrays = [pa.array([row[name] for row in keyed], LISTS.get(name)) for name in names]
+    flat = {
+        n: [r[n].ravel() if isinstance(r[n], np.ndarray) else r[n] for r in keyed] for n in names
+    }
+    arrays = [pa.array(column, LISTS.get(name)) for name, column in flat.items()]
     # Several groups of rows, of which the last is smaller.
     parquet.write_table(pa.table(arrays, names=names), path, row_group_size=4)
-
-
-def flat(pose) -> list[float]:
-    return pose.reshape(-1).tolist()
 
 
 def mount(camera) -> np.ndarray:
@@ -71,7 +70,7 @@ def image_row(k, camera, **changes) -> dict:
         "key.frame_timestamp_micros": stamp(k),
         "key.camera_name": camera,
         f"{IMAGE}image": w.jpeg(10 * k + camera),
-        f"{IMAGE}pose.transform": flat(pose),
+        f"{IMAGE}pose.transform": pose,
         f"{IMAGE}pose_timestamp": START * 1e-6 + at,
         f"{shutter}shutter": 0.004,
         f"{shutter}camera_trigger_time": START * 1e-6 + at - 0.003,
@@ -88,7 +87,7 @@ def lens_row(camera, **changes) -> dict:
     numbers |= {"p1": 1e-3, "p2": -1e-3, "k3": 0.0}
     row = {"key.camera_name": camera}
     row |= {f"{LENS}intrinsic.{name}": value for name, value in numbers.items()}
-    row |= {f"{LENS}extrinsic.transform": flat(mount(camera))}
+    row |= {f"{LENS}extrinsic.transform": mount(camera)}
     row |= {f"{LENS}width": w.WIDTH, f"{LENS}height": w.HEIGHT}
     return row | {f"{LENS}rolling_shutter_direction": 2} | changes
 
@@ -105,9 +104,8 @@ def scan(scanner, beams, poses) -> np.ndarray:
     width = len(poses)
     # The middle column looks ahead, in the car's axes.
     bearing = np.radians(180 - 360 * (np.arange(width) + 0.5) / width)
-    yaw = np.arctan2(scanner[1, 0], scanner[0, 0])
     image = np.full((len(beams), width, 4), -1.0, np.float32)
-    for column, angle in enumerate(bearing - yaw):
+    for column, angle in enumerate(bearing - w.yaw_of(scanner)):
         up = beams[::-1]
         flat = [np.cos(up) * np.cos(angle), np.cos(up) * np.sin(angle), np.sin(up)]
         pose = poses[column] @ scanner
@@ -118,19 +116,16 @@ def scan(scanner, beams, poses) -> np.ndarray:
     return image
 
 
-def pixel_poses(poses, height) -> np.ndarray:
-    six = np.zeros((height, len(poses), 6), np.float32)
-    for column, pose in enumerate(poses):
-        yaw, pitch, roll = Rotation.from_matrix(pose[:3, :3]).as_euler("ZYX")
-        six[:, column] = [roll, pitch, yaw, *pose[:3, 3]]
-    return six
+def six(pose) -> list[float]:
+    """Return roll, pitch, yaw and the position of a pose."""
+    return [*Rotation.from_matrix(pose[:3, :3]).as_euler("ZYX")[::-1], *pose[:3, 3]]
 
 
 def ranged(prefix, k, laser, image) -> dict:
     return {
         "key.frame_timestamp_micros": stamp(k),
         "key.laser_name": laser,
-        f"{prefix}values": image.ravel().tolist(),
+        f"{prefix}values": image,
         f"{prefix}shape": list(image.shape),
     }
 
@@ -141,7 +136,7 @@ def write_lidar(root, count, segment) -> None:
     for k in range(count):
         turning = [w.car_at(TURN * (k + (c + 0.5) / WIDE)) for c in range(WIDE)]
         upper = scan(UPPER, BEAMS, turning)
-        own = pixel_poses(turning, len(BEAMS))
+        own = np.tile(np.array([six(pose) for pose in turning], np.float32), (len(BEAMS), 1, 1))
         # Nothing was measured here, and there is no pose.
         upper[0, :5, 0], own[0, :5] = -1, 0
         still = [w.car_at(TURN * k + MIDDLE)] * NARROW
@@ -151,37 +146,28 @@ def write_lidar(root, count, segment) -> None:
     write_rows(root, "lidar", images, segment)
     write_rows(root, "lidar_pose", poses, segment)
     beams = f"{SCANNERS}beam_inclination."
-    rows = [
-        {
-            "key.laser_name": laser,
-            f"{SCANNERS}extrinsic.transform": flat(pose),
-            f"{beams}min": low,
-            f"{beams}max": high,
-            f"{beams}values": values,
-        }
-        for laser, pose, low, high, values in (
-            (1, UPPER, 0.0, 0.0, BEAMS.tolist()),
-            (3, SIDE, -0.5, 0.3, None),
-        )
-    ]
+    names = ("key.laser_name", f"{SCANNERS}extrinsic.transform")
+    names += tuple(f"{beams}{name}" for name in ("min", "max", "values"))
+    scanners = ((1, UPPER, 0.0, 0.0, BEAMS), (3, SIDE, -0.5, 0.3, None))
+    rows = [dict(zip(names, row, strict=True)) for row in scanners]
     write_rows(root, "lidar_calibration", rows, segment)
 
 
 def box(place) -> np.ndarray:
-    return w.matrix(Rotation.from_euler("z", 0.2), [*place, 0.8])
+    return w.box(place, 0.2)
 
 
-def box_row(k, track, pose, **changes) -> dict:
+def box_row(k, track, pose) -> dict:
     row = {
         "key.frame_timestamp_micros": stamp(k),
         "key.laser_object_id": track,
         f"{BOX}type": 1,
-        f"{BOX}box.heading": np.arctan2(pose[1, 0], pose[0, 0]),
+        f"{BOX}box.heading": w.yaw_of(pose),
     }
-    for axis, c, s in zip("xyz", pose[:3, 3], (4.2, 1.8, 1.5), strict=True):
+    for axis, c, s in zip("xyz", pose[:3, 3], w.SIZE, strict=True):
         row[f"{BOX}box.center.{axis}"] = float(c)
         row[f"{BOX}box.size.{axis}"] = s
-    return row | changes
+    return row
 
 
 def write(root: Path, frames=3, segment=SEGMENT) -> w.Made:
@@ -189,12 +175,12 @@ def write(root: Path, frames=3, segment=SEGMENT) -> w.Made:
     images = [image_row(k, camera) for k in range(frames) for camera in (5, 1, 2)]
     write_rows(root, "camera_image", images, segment)
     write_rows(root, "camera_calibration", [lens_row(camera) for camera in AZIMUTHS], segment)
-    rows = [{"key.frame_timestamp_micros": stamp(k), CAR: flat(c)} for k, c in enumerate(cars)]
+    rows = [{"key.frame_timestamp_micros": stamp(k), CAR: car} for k, car in enumerate(cars)]
     write_rows(root, "vehicle_pose", rows, segment)
     parked = cars[0] @ box(w.AHEAD)
-    boxes = [box_row(k, "ahead", box(w.AHEAD)) for k in range(frames)]
-    boxes += [box_row(k, "right", box(w.RIGHT)) for k in range(frames)]
-    boxes += [box_row(k, "parked", np.linalg.inv(car) @ parked) for k, car in enumerate(cars)]
+    beside = {"ahead": box(w.AHEAD), "right": box(w.RIGHT)}
+    boxes = [box_row(k, name, pose) for name, pose in beside.items() for k in range(frames)]
+    boxes += [box_row(k, "parked", w.inv(car) @ parked) for k, car in enumerate(cars)]
     write_rows(root, "lidar_box", boxes, segment)
     write_lidar(root, frames, segment)
     opencv = w.matrix(Rotation.from_matrix(w.FORWARD), [0, 0, 0])

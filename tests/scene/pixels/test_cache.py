@@ -5,8 +5,8 @@ import errno
 import os
 import shutil
 import signal
-import time
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -88,17 +88,6 @@ def test_every_kind_comes_back_bit_for_bit(tmp_path, kinds, shrink):
     assert again.decodings == 0
 
 
-def test_what_is_held_stays_below_the_bound(tmp_path):
-    """64 photographs of 512x512 take 64 MiB; 4 may be held, and none is decoded twice."""
-    pixels = np.zeros((512, 512, 3), np.uint8)
-    made = [make_view(tmp_path / f"{k}.png", pixels + k) for k in range(64)]
-    store = in_files(tmp_path, made, DataConfig(cache_mb=4))
-    for k in (*range(64), *range(64)):
-        assert store.stored(k)[0].max() == k
-        assert store.cached_bytes <= 4 * 2**20
-    assert store.decodings == 64
-
-
 def test_a_set_that_fits_clears_what_an_earlier_start_wrote(tmp_path, kinds, started):
     stored(in_files(tmp_path, kinds), len(kinds), 1)
     assert any((tmp_path / "pixels").rglob("*.px"))
@@ -109,33 +98,17 @@ def test_a_set_that_fits_clears_what_an_earlier_start_wrote(tmp_path, kinds, sta
     assert not (tmp_path / "pixels").exists()
 
 
-def _photograph(view, folder):
-    cv2.imwrite(str(view.image_path), np.full((*SIZE, 3), 7, np.uint8))
-    os.utime(view.image_path, ns=(1, 1))
-    return {}
-
-
-def _mask(view, folder):
-    cv2.imwrite(str(folder / "other.png"), np.zeros(SIZE, np.uint8))
-    return {"mask_path": folder / "other.png"}
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        _photograph,
-        _mask,
-        lambda view, folder: {"distortion": Distortion((0.2, 0, 0, 0))},
-        lambda view, folder: {"own_car": np.ones((3, 4), bool)},
-        lambda view, folder: {"K": view.K * [[1.5], [1.5], [1]]},
-    ],
-    ids=["photograph", "mask", "lens", "car", "focal"],
-)
-def test_what_pixels_depend_on_makes_them_anew(tmp_path, change):
+@pytest.mark.parametrize("what", ["image_path", "mask_path", "distortion", "own_car", "K"])
+def test_what_pixels_depend_on_makes_them_anew(tmp_path, what):
     view = noisy_view(tmp_path, "a.png", distortion=Distortion((0.1, 0, 0, 0)))
     in_files(tmp_path, [view]).stored(0)
     (first,) = (tmp_path / "pixels").rglob("*.px")
-    changed = [dataclasses.replace(view, **change(view, tmp_path))]
+    path = view.image_path if what == "image_path" else tmp_path / "other.png"
+    cv2.imwrite(str(path), np.full((*SIZE, 3), 7, np.uint8))
+    os.utime(path, ns=(1, 1))
+    values = {"image_path": path, "mask_path": path, "distortion": Distortion((0.2, 0, 0, 0))}
+    values |= {"own_car": np.ones((3, 4), bool), "K": view.K * [[1.5], [1.5], [1]]}
+    changed = [dataclasses.replace(view, **{what: values[what]})]
     store = in_files(tmp_path, changed)
     assert not first.exists()
     same(store, changed, [1])
@@ -162,9 +135,7 @@ def test_a_disk_without_room_is_refused_at_once(tmp_path, kinds, monkeypatch):
 
 
 def test_a_disk_that_fills_names_the_option(tmp_path, kinds, monkeypatch):
-    def full(*args, **options):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
+    full = Mock(side_effect=OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
     monkeypatch.setattr(cache, "atomic_write", full)
     with refused("No space left on device", "--data.cache-mb"):
         in_files(tmp_path, kinds).stored(0)
@@ -187,19 +158,13 @@ def started(monkeypatch):
     return found
 
 
-def wait_for(processes, seconds=60):
-    end = time.monotonic() + seconds
-    while not all(p.poll() is not None for p in processes):
-        assert time.monotonic() < end, "nothing happens"
-        time.sleep(0.02)
-
-
 def test_processes_decode_all_sizes_and_the_caller_none(tmp_path, views, started):
     views[5].image_path.write_bytes(b"no photograph")
     store = in_files(tmp_path, views)
     store.expect(SHRINKS)
     assert started
-    wait_for(started)
+    for process in started:
+        process.wait(60)
     # What a process cannot decode is reported to the caller that asks.
     with refused(r"5\.png"):
         store.stored(5)
