@@ -70,15 +70,10 @@ def sweep(
     failure ends its run, not the sweep. The table is written anew after every run.
 
     Args:
-        out: folder of the runs and the table.
-        configs: by name.
         seeds: each replaces `train.seed`.
-        reference: see `fit`.
         max_parallel: processes at a time; steps of one hardly use more than one core (BUILD_NOTES).
         engine: where they run (`jobs.engines.open_engine`): local, dask://HOST:PORT or slurm.
-        report: receives a line per run.
-        on_look: receives how far the unfinished runs are, twice a second.
-        run: see `run_jobs`.
+        report: receives a line per run; `on_look` and `run` are those of `run_jobs`.
 
     Raises:
         UserError: nothing to do, names that would share a folder, a folder of other options, one
@@ -102,10 +97,9 @@ def sweep(
         write_text(out / TABLE_TEXT, to_markdown(rows))
 
     with locked(out):
-        done = [number for number, job in enumerate(jobs) if _metrics(job.folder).exists()]
-        for number in done:
+        left = [number for number, job in enumerate(jobs) if not _metrics(job.folder).exists()]
+        for number in sorted({*range(len(jobs))} - {*left}):
             tell(number, None)
-        left = [number for number in range(len(jobs)) if number not in done]
         if left:
             with open_engine(engine, max_parallel, out / JOBS) as workers:
                 run_jobs(

@@ -231,10 +231,8 @@ def _advance(
             grad2d_sum=population.grad2d_sum + jnp.where(healthy, sums.grad2d, 0),
             seen_count=population.seen_count + jnp.where(healthy, sums.pulled, 0),
         )
-    moved = (updated, population)
-    return concluded(
-        state, moved, gradient, fits, most, rates, cfg=cfg, optimizer=optimizer, views=views
-    )
+    options = {"cfg": cfg, "optimizer": optimizer, "views": views}
+    return concluded(state, (updated, population), gradient, fits, most, rates, **options)
 
 
 def _sums(state, ids, visible, gradient, frusta, controls, cfg, bands: int) -> Sums:

@@ -164,9 +164,6 @@ def update_listed(
     """Move the listed Gaussians by one step; nothing is written unless the step is `healthy`.
 
     Args:
-        gaussians: the scene.
-        moments: Adam's, of all of them.
-        alive: slots in use.
         ids: from `compact`, whole blocks, of which `count` are listed.
         bands: spherical-harmonics coefficients that are looked at and moved.
         seen: (Gaussians, alive, owner) of a block -> what the image is made of, per Gaussian.
