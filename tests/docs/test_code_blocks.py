@@ -16,7 +16,7 @@ import pytest
 from pages import LANGUAGES, PAGES, ROOT, Block, blocks, commands, prose
 from tiny_scene import make_scene
 
-from p2gs_jax import config, presets
+from p2gs_jax import config
 from p2gs_jax.cli import main
 from p2gs_jax.cli.fit import Calibrate, Fit, checked
 from p2gs_jax.cli.parser import COMMANDS, GROUPS, parse
@@ -41,24 +41,17 @@ def skip_if_said(block: Block) -> None:
 @pytest.fixture
 def quick_presets(monkeypatch):
     """Let `robust` take a few steps at one resolution, with few Gaussians."""
-    slow = config.FitConfig()
-    quick = dataclasses.replace(
-        slow,
-        data=dataclasses.replace(slow.data, test_every=3),
-        render=dataclasses.replace(slow.render, sh_degree=1),
-        densify=dataclasses.replace(slow.densify, max_gaussians=400),
-        init=dataclasses.replace(slow.init, shell="off"),
-        train=dataclasses.replace(slow.train, steps=10, coarse_to_fine=()),
+    slow, made = config.FitConfig(), config.FitConfig.__init__
+    quick = {
+        "data": dataclasses.replace(slow.data, test_every=3),
+        "render": dataclasses.replace(slow.render, sh_degree=1),
+        "densify": dataclasses.replace(slow.densify, max_gaussians=400),
+        "init": dataclasses.replace(slow.init, shell="off"),
+        "train": dataclasses.replace(slow.train, steps=10, coarse_to_fine=()),
+    }
+    monkeypatch.setattr(
+        config.FitConfig, "__init__", lambda self, **given: made(self, **(quick | given))
     )
-
-    class Quick(type):
-        def __call__(cls, **given):
-            return dataclasses.replace(quick, **given)
-
-        def __instancecheck__(cls, value):
-            return isinstance(value, config.FitConfig)
-
-    monkeypatch.setattr(presets, "FitConfig", Quick("FitConfig", (), {}))
 
 
 @pytest.fixture
