@@ -14,7 +14,7 @@ from typing import Any
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
-from p2gs_jax.presets import preset
+from p2gs_jax.presets import preset, with_values
 
 KEYS = ("scene", "reference", "out", "preset", "seeds", "max_parallel", "set", "grid", "case")
 
@@ -27,33 +27,39 @@ def with_fields(cfg: FitConfig, fields: Mapping[str, Any]) -> FitConfig:
             value.
     """
     for name, value in fields.items():
-        cfg = _replaced(cfg, name.split("."), value, name)
+        cfg = with_values(cfg, {name: _checked(cfg, name, value)})
     return cfg
 
 
-def _replaced(record: Any, path: Sequence[str], value: Any, whole: str) -> Any:
-    names = [f.name for f in dataclasses.fields(record)]
-    if path[0] not in names:
-        raise UserError(
-            f"there is no configuration field {whole!r}.",
-            fix=f"beside {path[0]!r} there are: {', '.join(names)}",
-        )
-    if len(path) > 1:
-        current = getattr(record, path[0])
-        if not dataclasses.is_dataclass(current):
+def _checked(cfg: FitConfig, whole: str, value: Any) -> Any:
+    """Return a value as the field takes it: lists as tuples, whole numbers as floats if need be."""
+    record: Any = cfg
+    *groups, last = whole.split(".")
+    for name in groups:
+        _require_field(record, name, whole)
+        record = getattr(record, name)
+        if not dataclasses.is_dataclass(record):
             raise UserError(
                 f"the configuration field {whole!r} goes too deep.",
-                fix=f"{path[0]!r} is a value itself: leave out what follows it",
+                fix=f"{name!r} is a value itself: leave out what follows it",
             )
-        value = _replaced(current, path[1:], value, whole)
-    else:
-        hint = typing.get_type_hints(type(record))[path[0]]
-        value = tuple(value) if isinstance(value, list) else value
-        if isinstance(value, int) and not isinstance(value, bool) and not _fits(value, hint):
-            value = float(value)
-        if not _fits(value, hint):
-            raise UserError(f"{whole} = {value!r} does not fit.", fix=f"it takes {_shown(hint)}")
-    return dataclasses.replace(record, **{path[0]: value})
+    _require_field(record, last, whole)
+    hint = typing.get_type_hints(type(record))[last]
+    value = tuple(value) if isinstance(value, list) else value
+    if isinstance(value, int) and not isinstance(value, bool) and not _fits(value, hint):
+        value = float(value)
+    if not _fits(value, hint):
+        raise UserError(f"{whole} = {value!r} does not fit.", fix=f"it takes {_shown(hint)}")
+    return value
+
+
+def _require_field(record: Any, name: str, whole: str) -> None:
+    names = [f.name for f in dataclasses.fields(record)]
+    if name not in names:
+        raise UserError(
+            f"there is no configuration field {whole!r}.",
+            fix=f"beside {name!r} there are: {', '.join(names)}",
+        )
 
 
 def _fits(value: Any, hint: Any) -> bool:

@@ -159,14 +159,7 @@ def level_seams(
     """Take steps between blocks out, and say what is left of them.
 
     Every second view of a boundary tells the step, the others judge: what is left is measured where
-    nothing was fitted to.
-
-    Args:
-        scene: the whole.
-        store: its photographs; only their cameras are used.
-        cut: of the scene.
-        fitted: all Gaussians of each block.
-        cfg: rendering options.
+    nothing was fitted to. Arguments are those of `measure_seams`.
 
     Returns:
         All Gaussians of each block, and its seams, with what was taken out of each.
