@@ -55,7 +55,6 @@ Level = Literal["camera", "view"]
 VignettingKind = Literal["camera", "channel"]
 # What has a response of its own.
 ResponseKind = Literal["all", "camera", "channel"]
-ExposureLossForm = Literal["literal_same_pose", "literal_pixels", "observed_ldr"]
 
 
 @dataclass(frozen=True)
@@ -63,13 +62,11 @@ class DataConfig:
     """Which photographs are used, and how."""
 
     test_every: int = 8
-    """Hold out every n-th view of each camera, sorted by name; 0 holds out none
-    (paper, Experiments: 1/8 of the frames). Where the data set says what is held out, that counts
-    instead; 0 still holds out none."""
+    """Hold out every n-th view of each camera, sorted by name, where the data set does not say what
+    is held out (paper, Experiments: 1/8 of the frames); 0 holds out none in any case."""
     split: str | None = None
-    """File that says what is held out: .json with the lists `train` and `test`, or text with the
-    names of the held-out photographs, a line each; `every` goes by `test_every` even where the data
-    set says otherwise."""
+    """File that says what is held out: .json with the lists `train` and `test`, or text with a name
+    a line; `every` goes by `test_every` even where the data set says otherwise."""
     max_width: int | None = None
     """Shrink images to at most this many pixels across; None keeps them as they are."""
     images: str | None = None
@@ -132,8 +129,8 @@ class RenderConfig:
     BUILD_NOTES, "Blur")."""
     background: tuple[float, float, float] | None = None
     """Linear radiance of red, green and blue behind all splats, under the run's exposures; None:
-    none, black. Where early stopping leaves transmittance T it is off by T times this. What alpha
-    in photographs is shown over is `data.background`, which is no light."""
+    black. Where early stopping leaves transmittance T it is off by T times this. Photographs with
+    alpha are shown over `data.background`, which is no light."""
     tile: tuple[int, int] = (16, 8)
     """Tile width and height in pixels (ours: docs/kernel.md)."""
     chunk: int = 16
@@ -197,11 +194,9 @@ class PhotometryConfig:
     white_balance: Level | None = None
     """Per what the white balance varies (with `select`: chosen)."""
     vignetting: VignettingKind | None = None
-    """Whether cameras darken towards the corners, and whether each channel does so in its own way
-    (with `select`: chosen)."""
+    """Whether corners darken, and each channel by itself (with `select`: chosen)."""
     responses: ResponseKind = "all"
-    """What has a fitted response of its own, where the curve is `spline` (with `select`:
-    chosen)."""
+    """What has a response of its own, where the curve is `spline` (with `select`: chosen)."""
     cameras: tuple[CameraFormation, ...] = ()
     """What each camera does besides; the photographs decide, and no option sets it."""
     known: str | None = None
@@ -222,10 +217,9 @@ class PhotometryConfig:
     start_std: float = 0.05
     """Standard deviation of the random start (paper, Exposure modeling)."""
     appearance: Appearance | None = None
-    """A learned correction of display values per view, as baselines have: a colour matrix (3DGS's
-    exposure compensation), a bilateral grid of them, or a curve (photometry/appearance.py); in
-    place of a tone curve, a whole camera (`ppisp`, photometry/ppisp); or a curve that enhances
-    every photograph (`luminance`, photometry/luminance)."""
+    """A learned correction of display values per view: a colour matrix (3DGS's exposure
+    compensation), a bilateral grid of them, or a curve (photometry/appearance.py); `ppisp`: a whole
+    camera in place of a tone curve; `luminance`: a curve that enhances every photograph."""
     freeze_until: float = 0.6
     """Fraction of the run during which exposure and gamma stay at their start, where that start
     comes from tracks (ours: docs/photometry.md, 4)."""
@@ -236,18 +230,17 @@ class RelativeExposureConfig:
     """The relative-exposure loss L_exp (paper, eq. 9) and its readings (docs/photometry.md, 3)."""
 
     weight: float | None = None
-    """lambda_exp (paper: 0.01 in the main text, 0.1 in the appendix); None leaves it out."""
-    form: ExposureLossForm = "literal_same_pose"
+    """lambda_exp (paper: 0.01 in the main text, 0.1 in the appendix)."""
+    form: Literal["literal_same_pose", "observed_ldr"] = "literal_same_pose"
     """Which reading of the printed formula."""
     huber_delta: float = 0.05
-    """Transition of the Huber loss in LDR units; `observed_ldr` compares photographed colours at
-    track observations."""
+    """Transition of the Huber loss of `observed_ldr`, which compares photographs, LDR units."""
 
 
 @dataclass(frozen=True)
 class RegularizerConfig:
     """What fixes the common scale and contrast that photographs leave open (paper, eq. 10;
-    docs/photometry.md, 4). None leaves a term out."""
+    docs/photometry.md, 4)."""
 
     exposure_scale: float | None = None
     """lambda_escale E[(e - 1)^2] (paper: 0.01)."""
@@ -260,8 +253,7 @@ class RegularizerConfig:
     gamma_mean_variance: float | None = 0.1
     """(mean gamma - 2.2)^2 + Var gamma: fixes the common contrast (ours)."""
     appearance: float | None = 10.0
-    """Roughness of bilateral grids (bilateral-guided radiance fields: 10); a factor on the
-    published weights of PPISP (1)."""
+    """Roughness of bilateral grids (bilateral-guided radiance fields: 10); for PPISP a factor."""
 
 
 @dataclass(frozen=True)
@@ -277,11 +269,10 @@ class LossConfig:
     black: float = 4.0 / 255.0
     """Photographed values up to here carry no exposure information (docs/photometry.md, 3)."""
     alpha: float | None = None
-    """Weight of the mean difference between the render's opacity and the alpha channel of
-    photographs shown over a background; None leaves it out (ours)."""
+    """Weight of the mean difference of opacities, the render's and that of photographs shown over
+    a background (ours)."""
     lidar: float | None = None
-    """Weight of the error of log depth at laser measurements, of scenes that have them; None
-    leaves it out (ours)."""
+    """Weight of the error of log depth at laser measurements (ours)."""
     relative_exposure: RelativeExposureConfig = field(default_factory=RelativeExposureConfig)
     """The relative-exposure loss."""
     regularizers: RegularizerConfig = field(default_factory=RegularizerConfig)
@@ -398,8 +389,7 @@ class DynamicsConfig:
     method: Literal["rigid", "mask", "vibration", "off"] = "rigid"
     """`rigid`: each moves as one piece, with Gaussians of its own; `mask`: their pixels are left
     out of the fit; `off`: the fit knows no boxes; nor does `vibration`: Gaussians that come, move
-    and go are learned (PVG, arXiv 2311.18561). Exposures are solved from what stands still in any
-    case."""
+    and go are learned (PVG, arXiv 2311.18561). Exposures come from what stands still."""
     margin: float = 0.15
     """Boxes whose pixels are left out are widened by this much to every side, scene units."""
     least_views: int = 4
@@ -407,8 +397,7 @@ class DynamicsConfig:
     least_points: int = 10
     """Likewise of one on which fewer laser points lie, where the scene has any (ours)."""
     few_points: int = 300
-    """Where fewer points than this were measured on a thing, the surface of its box gets as many
-    (ours)."""
+    """Where fewer points were measured on a thing, the surface of its box gets as many (ours)."""
     voxel: float = 0.08
     """Its points are thinned to one in a cube of this side, scene units (ours)."""
     most_points: int = 8000
@@ -464,8 +453,7 @@ class TrainConfig:
     log_every: int = 10
     """Steps between log lines; also how often the host looks at the device."""
     checkpoint_every_s: float = 30.0
-    """Seconds between checkpoints; up to 20 times as many where writing them would take more than a
-    hundredth of the run."""
+    """Seconds between checkpoints; up to 20 times as many where they take over 1 % of the run."""
 
 
 @dataclass(frozen=True)

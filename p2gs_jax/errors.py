@@ -2,15 +2,12 @@
 
 
 class UserError(Exception):
-    """Bad input or an impossible request: which file, what is wrong, what to do."""
+    """Bad input or an impossible request.
+
+    The `message` says what is wrong with which file or option, `fix` what the person can do.
+    """
 
     def __init__(self, message: str, *, fix: str | None = None):
-        """Store the message and, where there is one, the remedy.
-
-        Args:
-            message: what is wrong, naming the file or the option.
-            fix: what the person can do about it.
-        """
         super().__init__(message)
         self.message = message
         self.fix = fix
@@ -29,11 +26,5 @@ def broken(
     why: object,
     fix: str = "get the file again: it is damaged or of another version",
 ) -> UserError:
-    """Return the error for a file that does not hold what it should.
-
-    Args:
-        source: the file.
-        why: what is wrong, in words that follow the file's name.
-        fix: the remedy.
-    """
+    """Return the error for a file that does not hold what it should; `why` follows its name."""
     return UserError(f"{source} {why}", fix=fix)

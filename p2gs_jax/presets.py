@@ -6,7 +6,7 @@ A preset is a table of the fields in which it differs from `robust`, which is `F
 from __future__ import annotations
 
 import dataclasses
-import functools
+from collections import namedtuple
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar, get_args
 
@@ -121,11 +121,7 @@ def preset(name: PresetName) -> FitConfig:
     """Return the configuration of a preset.
 
     `robust`; `paper` (as printed, lambda_exp 0.01) or `paper_appendix` (0.1); baselines that splat
-    display values: `3dgs` under our own schedule, `3dgs_published` under that of Kerbl et al. 2023
-    (adaptive, 30,000 steps); ours with a gain per view `3dgs_gain`, or with a learned correction
-    per view `3dgs_affine`, `3dgs_bilateral`, `3dgs_curve`; `ppisp`, a camera learned beside the
-    splats, and `ppisp_solved`, about the same camera solved before; `luminance_gs`, a curve that
-    enhances every photograph.
+    display values (`3dgs...`, `ppisp`, `luminance_gs`); `ppisp_solved` (docs/fitting.md).
 
     Raises:
         UserError: there is no such preset.
@@ -153,50 +149,19 @@ def require_config(cfg: FitConfig | None) -> FitConfig:
     return cfg
 
 
-def narrowed(record: Record, taken: Mapping[str, Any]) -> Record:
-    """Return a configuration with some of its fields only; reading another raises AttributeError.
+def narrowed(record: Any, taken: Mapping[str, Any]) -> Any:
+    """Return some fields of a configuration, by name; reading another raises AttributeError.
 
-    What is compiled for it can therefore be shared by all configurations that agree in these
-    fields, and nothing can depend on one that was forgotten. Two are equal where the fields are.
-
-    Args:
-        record: a frozen dataclass.
-        taken: by the name of a field what of it is taken: None for all, the names of its fields,
-            or again a mapping like this.
+    What is compiled for them is shared by all configurations that agree in these fields, and
+    nothing can depend on one that was forgotten. `taken` says by the name of a field what of it is
+    taken: None for all, the names of its fields, or again a mapping like this.
     """
-    kind = _narrowed_type(type(record), tuple(taken))
-    made = object.__new__(kind)
+    values = {name: getattr(record, name) for name in taken}
     for name, inner in taken.items():
-        value = getattr(record, name)
         if inner is not None:
             inner = inner if isinstance(inner, Mapping) else dict.fromkeys(inner)
-            value = narrowed(value, inner)
-        object.__setattr__(made, name, value)
-    return made
-
-
-@functools.cache
-def _narrowed_type(kind: type, names: tuple[str, ...]) -> Any:
-    """Return a subclass whose instances have these fields only."""
-
-    def hidden(name: str) -> property:
-        def read(self):
-            raise AttributeError(f"{kind.__name__}.{name} was not given to this program")
-
-        return property(read)
-
-    def values(self) -> tuple:
-        return tuple(getattr(self, name) for name in names)
-
-    def equal(self, other) -> bool:
-        return type(self) is type(other) and values(self) == values(other)
-
-    fields = {f.name: hidden(f.name) for f in dataclasses.fields(kind) if f.name not in names}
-    methods = {"__eq__": equal, "__hash__": lambda self: hash(values(self))}
-    methods["__repr__"] = lambda self: (
-        f"{kind.__name__}{dict(zip(names, values(self), strict=True))}"
-    )
-    return type(kind.__name__, (kind,), fields | methods)
+            values[name] = narrowed(values[name], inner)
+    return namedtuple(type(record).__name__, values)(**values)
 
 
 def with_values(record: Record, values: Mapping[str, Any]) -> Record:
@@ -214,13 +179,24 @@ def to_dict(config: FitConfig) -> dict:
     return dataclasses.asdict(config)
 
 
-def from_dict(values: dict) -> FitConfig:
-    """Rebuild a configuration from `to_dict`'s result.
+def from_dict(values: Mapping[str, Any], kind: Any = FitConfig) -> Any:
+    """Rebuild a configuration, or a record of one, from `to_dict`'s result.
 
     Raises:
         TypeError: a field is unknown to this version.
     """
-    return _build(FitConfig, values)
+    kinds = {f.name: f.default_factory for f in dataclasses.fields(kind)}
+    unknown = sorted(set(values) - set(kinds))
+    if unknown:
+        raise TypeError(f"unknown field(s) in {kind.__name__}: {', '.join(unknown)}")
+    made = {}
+    for name, value in values.items():
+        if isinstance(value, dict):
+            value = from_dict(value, kinds[name])
+        elif (kind, name) == (PhotometryConfig, "cameras"):
+            value = camera_formations(value)
+        made[name] = tuple(value) if isinstance(value, list) else value
+    return kind(**made)
 
 
 def camera_formations(values: Sequence[dict]) -> tuple[CameraFormation, ...]:
@@ -236,23 +212,3 @@ def camera_formations(values: Sequence[dict]) -> tuple[CameraFormation, ...]:
         )
         for each in values
     )
-
-
-def _build(cls, values: dict):
-    kwargs = {}
-    for f in dataclasses.fields(cls):
-        if f.name not in values:
-            continue
-        value = values[f.name]
-        factory = f.default_factory
-        if dataclasses.is_dataclass(factory) and isinstance(value, dict):
-            value = _build(factory, value)
-        elif cls is PhotometryConfig and f.name == "cameras":
-            value = camera_formations(value)
-        elif isinstance(value, list):
-            value = tuple(value)
-        kwargs[f.name] = value
-    unknown = set(values) - {f.name for f in dataclasses.fields(cls)}
-    if unknown:
-        raise TypeError(f"unknown field(s) in {cls.__name__}: {', '.join(sorted(unknown))}")
-    return cls(**kwargs)

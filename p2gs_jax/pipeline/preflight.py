@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 
-from p2gs_jax.config import FitConfig, PhotometryConfig
+from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import plain
 from p2gs_jax.core.memory import left_to_process, ran_out, resident
 from p2gs_jax.core.text import parse_json
@@ -31,10 +31,7 @@ from p2gs_jax.presets import to_dict as config_to_dict
 from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.scene.exposures import check_source, read_known_exposures
 from p2gs_jax.scene.pixels.store import size_at
-from p2gs_jax.train.exposure_loss import SECOND_RENDER_FORMS
-from p2gs_jax.train.schedule import shrinks
-from p2gs_jax.train.strategies import check_spread
-from p2gs_jax.types import Scene, View
+from p2gs_jax.types import Scene
 
 # Bytes.
 OF_PROGRAMS = 0.8e9
@@ -64,8 +61,7 @@ def preflight(cfg: FitConfig, paths: Paths, *, resume: bool = False) -> LpipsWei
         UserError: an option contradicts another, a file it names cannot be used, or the run folder
             holds another run.
     """
-    check_spread(cfg.densify)
-    check_start(cfg.photometry, cfg.preset)
+    check_options(cfg)
     check_run_dir(paths.run, resume, cfg)
     check_source(cfg.photometry.known)
     check_reference(paths.reference)
@@ -89,21 +85,26 @@ def check_scene(
         lpips_weights.require_sizes(scene.views, cfg.data.max_width)
     if cfg.photometry.known is not None:
         read_known_exposures(cfg.photometry.known, training)
-    check_sizes(training, cfg)
     return None if paths.reference is None else load_reference(paths.reference, scene, cfg)
 
 
-def check_start(p: PhotometryConfig, preset: str) -> None:
-    """Refuse a start of the exposures that the rest of the photometry contradicts.
+def check_options(cfg: FitConfig) -> None:
+    """Refuse moves that no shrinking makes up for, and a start of the exposures that contradicts.
 
     Raises:
-        UserError: known exposures or the curve do not go with it.
+        UserError: the spread is not in [0, 1); known exposures or the curve do not suit the start.
     """
+    p, share = cfg.photometry, cfg.densify.spread
     curved, random = p.curve != "linear", "--photometry.curve linear --photometry.start random"
     refused = [
         (
+            not 0 <= share < 1,
+            f"--densify.spread {share:g} is not between 0 and 1 (1 excluded).",
+            "give a share of a Gaussian's own extent, for example 0.5",
+        ),
+        (
             p.known is not None and p.start != "tracks",
-            f"the preset {preset!r} starts exposures at random: known ones would be ignored.",
+            f"the preset {cfg.preset!r} starts exposures at random: known ones would be ignored.",
             "leave out --known-exposures, or add --photometry.start tracks",
         ),
         (
@@ -126,30 +127,6 @@ def check_start(p: PhotometryConfig, preset: str) -> None:
     for wrong, message, fix in refused:
         if wrong:
             raise UserError(message, fix=fix)
-
-
-def check_sizes(views: Sequence[View], cfg: FitConfig) -> None:
-    """Refuse to subtract images of different sizes.
-
-    Raises:
-        UserError: the reading subtracts renders of two views, and their sizes differ.
-    """
-    relative = cfg.loss.relative_exposure
-    if relative.weight is None or relative.form not in SECOND_RENDER_FORMS:
-        return
-    for shrink in reversed(shrinks(cfg.train)):
-        sizes: dict[tuple[int, int], str] = {}
-        for view in views:
-            sizes.setdefault(size_at(view, cfg.data.max_width, shrink), view.name)
-        if len(sizes) > 1:
-            (a, first), (b, second) = list(sizes.items())[:2]
-            raise UserError(
-                f"the reading {relative.form!r} of the relative-exposure loss subtracts renders of "
-                f"two views pixel by pixel, and {first} is {a[0]}x{a[1]} where {second} is "
-                f"{b[0]}x{b[1]}.",
-                fix="use --loss.relative-exposure.form literal_same_pose or observed_ldr, or "
-                "photographs of one size",
-            )
 
 
 def check_run_dir(run_dir: Path, resume: bool, cfg: FitConfig) -> None:

@@ -10,7 +10,6 @@ took as long as projecting them (BUILD_NOTES, "The step costs what a view shows"
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -153,18 +152,14 @@ def slice_of(tree, block: Int[Array, ""] | int, size: int):
 def splat(
     gaussians: Gaussians,
     alive: Bool[Array, " v"],
-    cameras: Sequence[Camera | Frustum],
+    camera: Camera | Frustum,
     cfg: RenderConfig,
     active_degree: Int[Array, ""] | int | None = None,
     owner: Int[Array, " v"] | None = None,
-) -> tuple[Shown, ...]:
-    """Return the splats and the radiance of Gaussians in each of some views."""
-
-    def seen_by(camera: Camera | Frustum) -> Shown:
-        now, of_each = at_time(gaussians, camera.objects), camera_of_each(camera, owner)
-        return project(now, alive, of_each, cfg), view_radiance(now, of_each, cfg, active_degree)
-
-    return tuple(map(seen_by, cameras))
+) -> Shown:
+    """Return the splats and the radiance of Gaussians in a view."""
+    now, of_each = at_time(gaussians, camera.objects), camera_of_each(camera, owner)
+    return project(now, alive, of_each, cfg), view_radiance(now, of_each, cfg, active_degree)
 
 
 def owners_at(owner: Int[Array, " n"] | None, ids: Int[Array, " v"]) -> Int[Array, " v"] | None:
@@ -177,13 +172,13 @@ def splat_listed(
     alive: Bool[Array, " n"],
     ids: Int[Array, " v"],
     count: Int[Array, ""],
-    cameras: Sequence[Camera | Frustum],
+    camera: Camera | Frustum,
     cfg: RenderConfig,
     active_degree: Int[Array, ""] | int,
     bands: int,
     owner: Int[Array, " n"] | None = None,
-) -> tuple[Shown, ...]:
-    """Return the splats and the radiance of the listed Gaussians in each of some views.
+) -> Shown:
+    """Return the splats and the radiance of the listed Gaussians in a view.
 
     `ids` are from `compact`, whole blocks long, of which `count` are listed; `bands` is the number
     of coefficients in use.
@@ -195,7 +190,7 @@ def splat_listed(
         here = slice_of(ids, k, size)
         shown = alive.at[here].get(mode="fill", fill_value=False)
         block = take_rows(gaussians, here, bands)
-        return splat(block, shown, cameras, cfg, active_degree, owners_at(owner, here))
+        return splat(block, shown, camera, cfg, active_degree, owners_at(owner, here))
 
     def body(k, out):
         return jax.tree.map(

@@ -42,7 +42,7 @@ from p2gs_jax.train.optimizer import learning_rates, means_rate
 from p2gs_jax.train.state import FitState
 from p2gs_jax.train.step import Step, static_sizes
 from p2gs_jax.train.update import StepReport, concluded, is_healthy, update_listed
-from p2gs_jax.types import Gaussians
+from p2gs_jax.types import Batch, Frustum, Gaussians
 
 VIEWS = "views"
 EVERYWHERE, OF_VIEWS = P(), P(VIEWS)
@@ -59,15 +59,11 @@ def _counted(devices: Count) -> int:
     there = jax.device_count()
     if devices == "all":
         return there
-    if devices < 1:
+    if not 1 <= devices <= there:
         raise UserError(
-            f"--devices {devices} is not a number of devices.", fix="give 1 or more, or all"
-        )
-    if devices > there:
-        raise UserError(
-            f"--devices {devices} asks for more than the {there} that JAX sees here "
+            f"--devices {devices} is not between 1 and the {there} that JAX sees here "
             f"({jax.default_backend()}).",
-            fix="give fewer, or all; on a CPU, XLA_FLAGS="
+            fix="give one of these, or all; on a CPU, XLA_FLAGS="
             f"--xla_force_host_platform_device_count={devices} makes as many of its cores",
         )
     return devices
@@ -106,18 +102,14 @@ def mesh_of(cfg: FitConfig, devices: Count = 1) -> Mesh | None:
 
 def spread(state: FitState, mesh: Mesh | None) -> FitState:
     """Return a state as steps take it: whole on each of the devices; None: where it is."""
-    return state if mesh is None else placed(state, mesh, EVERYWHERE)
+    if mesh is None:
+        return state
+    return jax.device_put(jax.device_get(state), NamedSharding(mesh, EVERYWHERE))
 
 
 def whole(state: FitState, mesh: Mesh | None) -> FitState:
     """Return a state of steps on the default device, for what looks at all Gaussians."""
-    return state if mesh is None else jax.tree.map(lambda a: jnp.asarray(np.asarray(a)), state)
-
-
-def placed(tree: Any, mesh: Mesh, spec: P) -> Any:
-    """Return the arrays of a tree on the devices of a mesh."""
-    sharding = NamedSharding(mesh, spec)
-    return jax.tree.map(lambda a: jax.device_put(np.asarray(a), sharding), tree)
+    return state if mesh is None else jax.tree.map(jnp.asarray, jax.device_get(state))
 
 
 # ------------------------------------------------- what each device does, with its own views
@@ -126,8 +118,8 @@ def placed(tree: Any, mesh: Mesh, spec: P) -> Any:
 def _show(gaussians, alive, frusta, active_degree, owner, **given) -> Listed:
     """List and project what each view may show; everything is stacked, `visible` as [b, 1]."""
 
-    def one(views):
-        return image_gradient.show(gaussians, alive, views, active_degree, owner, **given)
+    def one(frustum):
+        return image_gradient.show(gaussians, alive, frustum, active_degree, owner, **given)
 
     listed = lax.map(one, frusta)
     return listed._replace(visible=listed.visible[:, None])
@@ -149,18 +141,13 @@ def _differentiate(
 
     each = lax.map(one, (shown, batch, partner))
 
-    def mean(tree):
-        return jax.tree.map(lambda a: lax.psum(jnp.sum(a, 0), VIEWS) / views, tree)
+    def mean(name):
+        return jax.tree.map(lambda a: lax.psum(jnp.sum(a, 0), VIEWS) / views, getattr(each, name))
 
-    return ImageGradient(
-        mean(each.loss),
-        mean(each.terms),
-        each.v_shown,
-        mean(each.v_rest),
-        lax.pmax(jnp.max(each.entries), VIEWS),
-        lax.pmax(jnp.max(each.overflow.astype(jnp.int32)), VIEWS) > 0,
-        each.visible,
-        mean(each.psnr),
+    return each._replace(
+        **{name: mean(name) for name in ("loss", "terms", "v_rest", "psnr")},
+        entries=lax.pmax(jnp.max(each.entries), VIEWS),
+        overflow=lax.pmax(jnp.max(each.overflow.astype(jnp.int32)), VIEWS) > 0,
     )
 
 
@@ -241,7 +228,7 @@ def _sums(state, ids, visible, gradient, frusta, controls, cfg, bands: int) -> S
     owner, n = state.population.owner, gaussians.capacity
 
     def add(sums: Sums, view) -> tuple[Sums, None]:
-        here, count, v_view, image, views = view
+        here, count, v_view, image, frustum = view
         size = block_size(here.shape[0])
 
         def body(k, sums: Sums) -> Sums:
@@ -251,13 +238,13 @@ def _sums(state, ids, visible, gradient, frusta, controls, cfg, bands: int) -> S
 
             def seen(block):
                 degree = controls.active_degree
-                return differentiable(splat(block, on, views, cfg.render, degree, mine))
+                return differentiable(splat(block, on, frustum, cfg.render, degree, mine))
 
             _, pull = jax.vjp(seen, take_rows(gaussians, rows, bands))
             v_block = slice_of(v_view, k, size)
             (v_rows,) = pull(v_block)
-            half = jnp.stack([views[0].width / 2, views[0].height / 2])
-            on_screen = v_block[0][0] * half
+            half = jnp.stack([frustum.width / 2, frustum.height / 2])
+            on_screen = v_block[0] * half
             pulled = slice_of(image, k, size) & (jnp.sum(jnp.abs(on_screen), -1) > 0)
             added = Sums(
                 v_rows,
@@ -300,20 +287,29 @@ PROGRAMS: dict[str, tuple[Any, Any, Any]] = {
         EVERYWHERE,
     ),
 }
-# Where the shapes lie that `Step.lowered` asks for.
-SPECS = {name: out for name, (_, _, out) in PROGRAMS.items()}
-SPECS["given"] = (EVERYWHERE, OF_VIEWS, OF_VIEWS, OF_VIEWS, EVERYWHERE)
 
 
 @functools.cache
 def _compiled(name: str, *, mesh: Mesh, **static: Any) -> Any:
-    """Return a part of a step, divided over the mesh and jitted."""
-    part, into, out = PROGRAMS[name]
-    body = jax.shard_map(
-        functools.partial(part, **static), mesh=mesh, in_specs=into, out_specs=out, check_vma=False
+    """Return a part of a step, divided over the mesh and jitted; it takes arrays of the host."""
+    part, *specs = PROGRAMS[name]
+    into, out = jax.tree.map(
+        lambda spec: NamedSharding(mesh, spec), specs, is_leaf=lambda spec: isinstance(spec, P)
     )
-    donated = (0,) if name == "advance" else ()
-    return jax.jit(body, compiler_options=compiler_options(), donate_argnums=donated)
+    body = jax.shard_map(
+        functools.partial(part, **static),
+        mesh=mesh,
+        in_specs=specs[0],
+        out_specs=specs[1],
+        check_vma=False,
+    )
+    return jax.jit(
+        body,
+        in_shardings=into,
+        out_shardings=out,
+        compiler_options=compiler_options(),
+        donate_argnums=(0,) if name == "advance" else (),
+    )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -334,30 +330,8 @@ class ParallelStep(Step):
         """Return one of the three programs, divided over the mesh and jitted."""
         return _compiled(name, **self.settings(name), **static_sizes(name, room, degree))
 
-    def frusta(self, batch, partner):
+    def frustum(self, batch: Batch) -> Frustum:
         """Return the views of a step, stacked."""
-        every = (self.cfg.train.batch,)
-        return tuple(
-            dataclasses.replace(
-                f,
-                width=np.full(every, f.width, np.float32),
-                height=np.full(every, f.height, np.float32),
-            )
-            for f in super().frusta(batch, partner)
-        )
-
-    def given(self, batch, partner, controls):
-        """Return the inputs of a step and its views, on the devices."""
-        views = (batch, partner, self.frusta(batch, partner))
-        return *placed(views, self.mesh, OF_VIEWS), placed(controls, self.mesh, EVERYWHERE)
-
-    def shapes(self, name: str, tree: Any) -> Any:
-        """Return shapes with where their arrays lie."""
-
-        def of(spec: P, part: Any) -> Any:
-            sharding = NamedSharding(self.mesh, spec)
-            return jax.tree.map(
-                lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype, sharding=sharding), part
-            )
-
-        return jax.tree.map(of, SPECS[name], tree, is_leaf=lambda spec: isinstance(spec, P))
+        one, every = super().frustum(batch), (self.cfg.train.batch,)
+        width, height = (np.full(every, size) for size in (one.width, one.height))
+        return dataclasses.replace(one, width=width, height=height)

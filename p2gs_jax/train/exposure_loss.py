@@ -2,7 +2,7 @@
 
 Printed: L_exp = (1/M) sum |alpha_ij L_i - L_j|_1 with alpha_ij = e_j / e_i and L free of exposure.
 At the truth L_i = L_j for the same surface, so the printed formula is zero only where all
-exposures are equal; each reading below is one way of making sense of it. Where white balance and
+exposures are equal; both readings below are ways of making sense of it. Where white balance and
 vignetting are modelled, e W V stands for e.
 """
 
@@ -18,10 +18,8 @@ from p2gs_jax.core.numerics import on_device
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.formation import darkens, expose, gain, inverse_formation, tone_map
 from p2gs_jax.photometry.observations import Observations, sample_pairs
-from p2gs_jax.types import Camera, Photometry
+from p2gs_jax.types import Photometry
 
-# The readings that subtract renders from two poses.
-SECOND_RENDER_FORMS = ("literal_pixels",)
 # Where less than this share of the pairs is valid, the mean is taken as if that many were.
 FEWEST_VALID = 0.01
 # Pairs that the steps of a fit draw from.
@@ -46,29 +44,15 @@ class Partner(eqx.Module):
     """What the relative-exposure loss compares the training view with."""
 
     view_index: Int[Array, ""]  # a second view, drawn at random
-    # its camera, for the reading that subtracts renders; same size as the training view's
-    camera: Camera | None = None
     pairs: ColorPairs | None = None  # track observations, for the reading that compares photographs
 
-    @property
-    def cameras(self) -> tuple[Camera, ...]:
-        """The camera of the second render, if there is one."""
-        return () if self.camera is None else (self.camera,)
 
+def literal_same_pose(linear: Float[Array, "h w 3"], e_i, e_j) -> Float[Array, ""]:
+    """Both radiances at one pose: |e_j/e_i - 1| L, the mean over pixels of the sum over channels.
 
-def _per_pixel_l1(difference: Float[Array, "h w 3"]) -> Float[Array, ""]:
-    """(1/M) times the L1 norm over pixels and channels, M the number of pixels."""
-    return jnp.mean(jnp.sum(jnp.abs(difference), -1))
-
-
-def literal_same_pose(linear_i, e_i, e_j) -> Float[Array, ""]:
-    """Both radiances at one pose: |e_j/e_i - 1| L. Zero iff the exposures are equal."""
-    return _per_pixel_l1((e_j / e_i - 1) * linear_i)
-
-
-def literal_pixels(linear_i, linear_j, e_i, e_j) -> Float[Array, ""]:
-    """Renders of two poses, pixel by pixel: compares unrelated surface points."""
-    return _per_pixel_l1(e_j / e_i * linear_i - linear_j)
+    Zero iff the exposures are equal.
+    """
+    return jnp.mean(jnp.sum(jnp.abs((e_j / e_i - 1) * linear), -1))
 
 
 def usable(colors: Float[Array, "m 3"], cfg: LossConfig) -> Float[Array, "m 3"]:
@@ -100,7 +84,7 @@ def observed_ldr(
 
 
 def relative_exposure_loss(
-    linears: tuple[Float[Array, "h w 3"], Float[Array, "h w 3"] | None],
+    linear: Float[Array, "h w 3"],
     views: tuple[Int[Array, ""], Int[Array, ""]],
     pairs: ColorPairs | None,
     photometry: Photometry,
@@ -109,28 +93,18 @@ def relative_exposure_loss(
 ) -> Float[Array, ""]:
     """Return the configured reading, unweighted.
 
-    `linears` are renders of both `views`, the second for `literal_pixels` only; `pairs` are
-    corresponding observations, for `observed_ldr`.
+    `linear` is the render of the first of the `views`; `pairs` are corresponding observations, for
+    `observed_ldr`.
 
     Raises:
-        ValueError: the reading needs a second render or observations that were not given, or
-            renders of one size.
+        ValueError: the reading needs observations that were not given.
     """
-    form = loss.relative_exposure.form
-    if form == "observed_ldr":
+    if loss.relative_exposure.form == "observed_ldr":
         if pairs is None:
-            raise ValueError(f"the reading {form!r} needs corresponding observations")
+            raise ValueError("the reading 'observed_ldr' needs corresponding observations")
         return observed_ldr(pairs, photometry, loss, cfg)
-    linear_i, linear_j = linears
-    e_i, e_j = (gain(linear_i.shape, photometry.capture(row), cfg) for row in views)
-    if form == "literal_same_pose":
-        return literal_same_pose(linear_i, e_i, e_j)
-    if linear_j is None:
-        raise ValueError(f"the reading {form!r} needs the render of a second view")
-    if linear_j.shape != linear_i.shape:
-        sizes = f"{linear_i.shape} and {linear_j.shape}"
-        raise ValueError(f"the reading {form!r} subtracts renders of one size, not {sizes}")
-    return literal_pixels(linear_i, linear_j, e_i, e_j)
+    e_i, e_j = (gain(linear.shape, photometry.capture(row), cfg) for row in views)
+    return literal_same_pose(linear, e_i, e_j)
 
 
 def color_pairs(tracks: Observations | None, cfg: FitConfig) -> ColorPairs | None:
@@ -149,20 +123,14 @@ def color_pairs(tracks: Observations | None, cfg: FitConfig) -> ColorPairs | Non
             fix="use --loss.relative-exposure.form literal_same_pose, or a scene with tracks",
         )
     first, second = sample_pairs(tracks, PAIR_POOL, cfg.train.seed)
+    placed = (first, second) if darkens(cfg.photometry) else ()
+    if placed and tracks.positions is None:
+        raise ValueError("vignetting is modelled, and nobody knows where in the images points lie")
     return ColorPairs(
         on_device(tracks.colors[first]),
         on_device(tracks.colors[second]),
         on_device(tracks.views[first], np.int32),
         on_device(tracks.views[second], np.int32),
         on_device(np.ones(len(first))),
-        *_positions(tracks, (first, second), cfg),
+        *(on_device(tracks.positions[pick]) for pick in placed),
     )
-
-
-def _positions(tracks: Observations, picks, cfg: FitConfig):
-    """Return where in their images observations lie; nothing where no camera has vignetting."""
-    if not darkens(cfg.photometry):
-        return ()
-    if tracks.positions is None:
-        raise ValueError("vignetting is modelled, and nobody knows where in the images points lie")
-    return tuple(on_device(tracks.positions[pick]) for pick in picks)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -28,24 +27,19 @@ LEAST_SEEN = 0.5 / 255
 
 
 class Listed(NamedTuple):
-    """The Gaussians that the views of a step may show."""
+    """The Gaussians that the view of a step may show."""
 
     ids: Int[Array, " v"]  # from `compact`
     visible: Int[Array, ""]  # how many there are; more than `ids` hold where there was no room
-    shown: tuple[Shown, ...]  # splats and radiance of the listed ones in each view
+    shown: Shown  # splats and radiance of the listed ones
 
 
 class LossAux(NamedTuple):
-    """What a step reports beside the loss.
-
-    `ldr` is the unclamped display image, `entries` are those that the larger of the renders needed.
-    """
+    """What a step reports beside the loss."""
 
     terms: dict[str, Float[Array, ""]]
     render: Render
-    ldr: Float[Array, "h w 3"]
-    entries: Int[Array, ""]
-    overflow: Bool[Array, ""]
+    ldr: Float[Array, "h w 3"]  # the unclamped display image
 
 
 class ImageGradient(NamedTuple):
@@ -64,7 +58,7 @@ class ImageGradient(NamedTuple):
 def show(
     gaussians: Gaussians,
     alive: Bool[Array, " n"],
-    frusta: tuple[Frustum, ...],
+    frustum: Frustum,
     active_degree: Int[Array, ""],
     owner: Int[Array, " n"] | None = None,
     *,
@@ -72,25 +66,22 @@ def show(
     room: int,
     degree: int,
 ) -> Listed:
-    """List what the views of a step may show, and project it.
+    """List what the view of a step may show, and project it.
 
-    Only what a view may show is listed, unless `cfg.optimizer.visible_only` is off. What finds no
+    Only what it may show is listed, unless `cfg.optimizer.visible_only` is off. What finds no
     place in a list of length `room` is counted, not listed. `degree` is the highest
     spherical-harmonics degree that is evaluated, `owner` the moving object that each Gaussian
     belongs to.
     """
     n, render = gaussians.capacity, cfg.render
     if cfg.optimizer.visible_only:
-        views = (camera_of_each(f, owner) for f in frusta)
-        may = functools.reduce(
-            jnp.logical_or, (in_view(gaussians, alive, v, render) for v in views)
-        )
+        may = in_view(gaussians, alive, camera_of_each(frustum, owner), render)
         ids, count = compact(may, whole_blocks(min(room, n)))
     else:
         index = jnp.arange(whole_blocks(n), dtype=jnp.int32)
         ids, count = jnp.minimum(index, n), jnp.int32(n)
     bands = coefficient_count(degree)
-    shown = splat_listed(gaussians, alive, ids, count, frusta, render, active_degree, bands, owner)
+    shown = splat_listed(gaussians, alive, ids, count, frustum, render, active_degree, bands, owner)
     return Listed(ids, count, shown)
 
 
@@ -155,7 +146,7 @@ def compared(
 
 
 def image_loss(
-    shown: tuple[Shown, ...],
+    shown: Shown,
     photometry: Photometry,
     appearance: Corrections | None,
     batch: Batch,
@@ -166,15 +157,11 @@ def image_loss(
 ) -> tuple[Float[Array, ""], LossAux]:
     """Return the loss of one view and its terms.
 
-    `shown` are splats and radiance in the view and in each of `partner.cameras`; `photometry` and
-    `appearance` are those of all views; `capacity` is the length of the tile lists.
+    `shown` are splats and radiance in the view; `photometry` and `appearance` are those of all
+    views; `capacity` is the length of the tile lists.
     """
     deep = any(getattr(term, "needs_depth", False) for term in terms.values())
-    cameras = (batch.camera, *partner.cameras)
-    render, *others = (
-        render_splats(*splats, camera, cfg.render, capacity, with_depth=deep and k == 0)
-        for k, (splats, camera) in enumerate(zip(shown, cameras, strict=True))
-    )
+    render = render_splats(*shown, batch.camera, cfg.render, capacity, with_depth=deep)
     correction = correction_of(appearance, batch.view_index)
     rendered, target = compared(render, batch, photometry, correction, cfg)
     aux = Aux(
@@ -184,16 +171,11 @@ def image_loss(
         appearance,
         correction,
         partner.view_index,
-        others[0].linear if others else None,
         partner.pairs,
     )
     found = {name: term(rendered, target, aux) for name, term in terms.items()}
     values = {name: value for name, value in found.items() if value is not None}
-    entries, overflow = render.count, render.overflow
-    for other in others:
-        entries, overflow = jnp.maximum(entries, other.count), overflow | other.overflow
-    loss = jax.tree.reduce(jnp.add, values)
-    return loss, LossAux(values, render, rendered.ldr, entries, overflow)
+    return jax.tree.reduce(jnp.add, values), LossAux(values, render, rendered.ldr)
 
 
 def total_loss(
@@ -213,14 +195,13 @@ def total_loss(
     The step computes the same in blocks (train/step.py). Arguments are those of `image_loss`,
     `show`.
     """
-    cameras = (batch.camera, *partner.cameras)
-    shown = splat(params.gaussians, alive, cameras, cfg.render, active_degree, owner)
+    shown = splat(params.gaussians, alive, batch.camera, cfg.render, active_degree, owner)
     given = (params.photometry, params.appearance, batch, partner, cfg, terms, capacity)
     return image_loss(shown, *given)
 
 
 def differentiate(
-    shown: tuple[Shown, ...],
+    shown: Shown,
     photometry: Photometry,
     appearance: Corrections | None,
     batch: Batch,
@@ -245,15 +226,14 @@ def differentiate(
         aux.terms,
         differentiable(v_shown),
         tuple(v_rest),
-        aux.entries,
-        aux.overflow,
+        aux.render.count,
+        aux.render.overflow,
         aux.render.visible,
         -10 * jnp.log10(jnp.maximum(mse, 1e-10)),
     )
 
 
-def differentiable(shown: tuple[Shown, ...]) -> tuple[tuple[Array, ...], ...]:
+def differentiable(shown: Shown) -> tuple[Array, ...]:
     """Return what the image is made of, without flags and what only bins."""
-    return tuple(
-        (s.means2d, s.conic_factor, s.log_opacities, s.depths, radiance) for s, radiance in shown
-    )
+    splats, radiance = shown
+    return splats.means2d, splats.conic_factor, splats.log_opacities, splats.depths, radiance

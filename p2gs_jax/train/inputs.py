@@ -17,9 +17,10 @@ from p2gs_jax.core.numerics import on_host
 from p2gs_jax.core.streams import Stream, device_seed, generator, view_order
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.train import schedule
-from p2gs_jax.train.exposure_loss import SECOND_RENDER_FORMS, ColorPairs, Partner
+from p2gs_jax.train.exposure_loss import ColorPairs, Partner
+from p2gs_jax.train.lidar_depths import KeptDepths
 from p2gs_jax.train.update import Controls
-from p2gs_jax.types import Batch, Camera, Measured
+from p2gs_jax.types import Batch, Camera
 
 Tree = TypeVar("Tree")
 
@@ -39,7 +40,7 @@ class TrainingViews:
         store: ImageStore,
         rows: Sequence[int],
         seed: int,
-        measured: Sequence[Measured] | None = None,
+        measured: KeptDepths | None = None,
     ):
         self.store, self.rows = store, tuple(rows)
         self.seed, self.measured = seed, measured
@@ -182,7 +183,7 @@ def inputs_at(
     each = [
         (
             views.batch(row, shrink, step + k),
-            partner_at(step + k, row, shrink, views, pairs, cfg),
+            partner_at(step + k, row, views, pairs, cfg),
         )
         for k, row in enumerate(rows)
     ]
@@ -193,27 +194,18 @@ def inputs_at(
 
 
 def partner_at(
-    step: int,
-    index: int,
-    shrink: int,
-    views: TrainingViews,
-    pairs: ColorPairs | None,
-    cfg: FitConfig,
+    step: int, index: int, views: TrainingViews, pairs: ColorPairs | None, cfg: FitConfig
 ) -> Partner:
     """Return the partner of a step's view, as much of it as the reading of the loss needs.
 
     `index` is the row of the view; for the others see `inputs_at`.
     """
-    relative = cfg.loss.relative_exposure
-    if relative.weight is None:
+    if cfg.loss.relative_exposure.weight is None:
         return on_host(Partner, np.int32(0))
-    other = views.partner_at(step, index)
-    camera, drawn = None, None
-    if relative.form in SECOND_RENDER_FORMS:
-        camera = views.camera(other, shrink)
-    elif pairs is not None:
+    drawn = None
+    if pairs is not None:
         count = pairs.views_i.shape[0]
         rng = generator(cfg.train.seed, Stream.STEP_PAIRS, step)
         pick = rng.integers(0, count, min(PAIRS_PER_STEP, count))
         drawn = jax.tree.map(lambda a: np.asarray(a)[pick], pairs)
-    return on_host(Partner, np.int32(other), camera, drawn)
+    return on_host(Partner, np.int32(views.partner_at(step, index)), drawn)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -13,7 +13,7 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluation.passes import ArrayStore, StoredArray, most_bytes
+from p2gs_jax.evaluation.passes import ArrayStore, most_bytes
 from p2gs_jax.render.warp import project_points
 from p2gs_jax.scene.drives.objects import object_mask
 from p2gs_jax.scene.visibility import unoccluded
@@ -50,35 +50,18 @@ def lidar_loss(
     return jnp.sum(jnp.where(known, huber, 0.0)) / jnp.maximum(jnp.sum(known), 1)
 
 
-class KeptDepths(Sequence[Measured]):
-    """The measured depths of some views, in memory up to a bound and on disk beyond it."""
+class KeptDepths:
+    """The measured depths of some views by number, in memory up to a bound and on disk beyond."""
 
-    def __init__(self, most: int):
-        """Begin empty, with at most so many bytes in memory."""
-        self._arrays = ArrayStore(most)
-        self._kept: list[tuple[StoredArray, StoredArray]] = []
+    def __init__(self, views: Iterable[Measured], most_bytes: int):
+        self.arrays = ArrayStore(most_bytes)
+        self._kept = [jax.tree.map(self.arrays.put, view) for view in views]
 
-    @property
-    def bytes_held(self) -> int:
-        """Bytes in memory."""
-        return self._arrays.bytes_held
-
-    def __len__(self) -> int:
-        return len(self._kept)
-
-    def __getitem__(self, row: Any) -> Any:
-        if isinstance(row, slice):
-            return [self[k] for k in range(*row.indices(len(self)))]
-        places, depths = self._kept[row]
-        return on_host(Measured, places.read(), depths.read())
-
-    def add(self, measured: Measured) -> None:
-        """Keep those of one more view."""
-        put = self._arrays.put
-        self._kept.append((put(np.asarray(measured.places)), put(np.asarray(measured.depths))))
+    def __getitem__(self, number: int) -> Measured:
+        return jax.tree.map(lambda stored: stored.read(), self._kept[number])
 
 
-def measured_depths(scene: Scene, cfg: FitConfig) -> Sequence[Measured] | None:
+def measured_depths(scene: Scene, cfg: FitConfig) -> KeptDepths | None:
     """Return the measured depths of every training view; None where the loss asks for none.
 
     Only what stands still counts, so that every sweep serves all views; what a nearer measurement
@@ -97,10 +80,8 @@ def measured_depths(scene: Scene, cfg: FitConfig) -> Sequence[Measured] | None:
     rng = generator(cfg.train.seed, Stream.MEASURED_DEPTHS)
     static = scene.lidar.objects < 0
     points, times = scene.lidar.points[static], scene.lidar.times[static]
-    kept = KeptDepths(most_bytes(cfg.data.cache_mb, DEPTHS_SHARE))
-    for view in scene.training_views:
-        kept.add(_of_view(points, times, view, scene.objects, rng))
-    return kept
+    found = (_of_view(points, times, v, scene.objects, rng) for v in scene.training_views)
+    return KeptDepths(found, most_bytes(cfg.data.cache_mb, DEPTHS_SHARE))
 
 
 def _of_view(points, times, view, objects, rng) -> Measured:

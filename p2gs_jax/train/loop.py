@@ -12,7 +12,7 @@ from __future__ import annotations
 import functools
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import jax
@@ -33,7 +33,7 @@ from p2gs_jax.train.data_parallel import ParallelStep, default_mesh, spread, who
 from p2gs_jax.train.exposure_loss import ColorPairs
 from p2gs_jax.train.inputs import Inputs, TrainingViews, controls_at, inputs_at
 from p2gs_jax.train.optimizer import make_optimizer
-from p2gs_jax.train.records import RunCheckpoints, RunLog, pause_between, record_of
+from p2gs_jax.train.records import Records, pause_between, record_of
 from p2gs_jax.train.schedule import RunClock
 from p2gs_jax.train.state import (
     FAULT_NONFINITE,
@@ -58,16 +58,14 @@ PACE_SHARE = 0.3
 
 @dataclass(frozen=True)
 class TrainResult:
-    """The end of a run: state, counters, and the bound on its population.
+    """The end of a run: state, counters, and the seconds of this session.
 
-    `seconds` are those of this session, by name: compiling (waited for), steps, densification,
-    checkpoints.
+    They are, by name: compiling (waited for), steps, densification, checkpoints.
     """
 
     state: FitState
     host: HostState
-    max_gaussians: int
-    seconds: dict[str, float] = field(default_factory=dict)
+    seconds: dict[str, float]
 
 
 @dataclass(eq=False)
@@ -101,9 +99,9 @@ class Trainer:
         width, height = min(c.width for c in sizes), min(c.height for c in sizes)
         self.levels = schedule.levels(cfg.train, width, height)
         self.stopwatch = Stopwatch()
-        self.log = RunLog(self.run_dir, self.on_log)
         store = self.store or CheckpointStore(self.run_dir / "checkpoints")
-        self.checkpoints = RunCheckpoints(store, cfg, self.decided, self.on_message)
+        given = (self.run_dir, store, cfg, self.decided, self.on_log, self.on_message)
+        self.records = Records(*given)
         self.asked = interrupts.Held()
         self.optimizer = make_optimizer(cfg)
         chosen = strategies.make_strategy(cfg, self.coverage, self.levels)
@@ -138,20 +136,10 @@ class Trainer:
         self.slots = strategies.started(self.densification, int(np.sum(np.asarray(alive))))
         state = initial_state(params, alive, self.optimizer, self.slots.slots, owner)
         host = HostState(pace=1.0 / max(self.cfg.train.steps, 1))
-        restored = self.checkpoints.restore(state) if resume else None
-        if restored is None:
-            self.log.clear()
-        else:
-            state, host = restored
-            self.log.truncate(host.step)
-        clock = RunClock(
-            self.cfg.train,
-            host,
-            spent_s=spent_s,
-            finish_s=finish_s,
-            full_step_s=STEP_SECONDS_PER_PIXEL * self.coverage.pixels,
-            now=self.now,
-        )
+        state, host = self.records.begin(state, resume) or (state, host)
+        full_step_s = STEP_SECONDS_PER_PIXEL * self.coverage.pixels
+        seconds = {"spent_s": spent_s, "finish_s": finish_s, "full_step_s": full_step_s}
+        clock = RunClock(self.cfg.train, host, **seconds, now=self.now)
         population = state.population
         self._allocate(state.params.gaussians, population.alive, population.owner, host)
         state = spread(state, self.devices)
@@ -160,12 +148,8 @@ class Trainer:
             state = self._loop(state, host, clock)
             state = whole(state, self.devices)
             self._save(state, host)
-        return TrainResult(
-            state,
-            host,
-            self.slots.limit or state.params.gaussians.capacity,
-            {"compiling": self.programs.waited_s, **self.stopwatch.seconds},
-        )
+        seconds = {"compiling": self.programs.waited_s, **self.stopwatch.seconds}
+        return TrainResult(state, host, seconds)
 
     def expect(self, params: Params, owner, images: bool) -> None:
         """Begin to compile the steps of a run before its colours and exposures are known.
@@ -192,7 +176,7 @@ class Trainer:
             clock.tick(host)
             if reports:
                 alive, left_s = alive_in(state.population), clock.left(host, self.levels)
-                self.log.append(record_of(reports, host, alive, left_s))
+                self.records.log(record_of(reports, host, alive, left_s))
                 # From here on a signal waits for the next place to continue from.
                 self.asked.begin()
                 state = self._densified(state, host)
@@ -244,7 +228,7 @@ class Trainer:
             name = finite_names(reports[taken].terms, state.params)[int(state.fault.term)]
             raise DivergenceError(
                 f"Step {host.step + done + 1}: the {name} is not finite; "
-                f"{self.checkpoints.last_good()}.",
+                f"{self.records.last_good()}.",
                 fix="lower the learning rates (--optimizer.*) or report the scene; "
                 "--resume continues from the last good checkpoint",
             )
@@ -293,7 +277,8 @@ class Trainer:
     def _densified(self, state: FitState, host: HostState) -> FitState:
         """Return the state with another population, where it is time to change it."""
         with self.stopwatch("densification"):
-            if not strategies.is_due(self.densification, self.cfg.densify, host):
+            due = strategies.is_due(self.cfg.densify, host)
+            if self.densification is None or not due:
                 return state
             host.densified_at = host.progress
             state = strategies.densified(
@@ -309,7 +294,7 @@ class Trainer:
 
     def _save(self, state: FitState, host: HostState) -> None:
         with self.stopwatch("checkpoints"):
-            self.checkpoints.save(state, host)
+            self.records.save(state, host)
 
     def _allocate(self, gaussians: Gaussians, alive, owner, host: HostState) -> None:
         """Make room for the image sizes to come."""

@@ -140,6 +140,8 @@ class TrainingStep:
 
     def densify(self, state: FitState, progress: float) -> FitState:
         """Return the state with the population that the strategy gives; the state is donated."""
+        if self.strategy is None:
+            return state
         self._host.step, self._host.progress = int(state.step), progress
         return strategies.densified(
             self.strategy,

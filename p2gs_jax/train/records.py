@@ -52,28 +52,6 @@ def _mean(values) -> float:
     return float(np.mean([float(v) for v in values]))
 
 
-class RunLog:
-    """`log.jsonl` of a run folder; `on_record` is called with every record."""
-
-    def __init__(self, run_dir: Path, on_record: Callable[[LogRecord], None]):
-        self.path, self.on_record = run_dir / "log.jsonl", on_record
-
-    def clear(self) -> None:
-        """Begin anew."""
-        self.path.unlink(missing_ok=True)
-
-    def truncate(self, step: int) -> None:
-        """Drop the lines after a step, which a resumed run takes again."""
-        if self.path.exists():
-            kept = [line for line in read_jsonl(self.path) if line["step"] <= step]
-            write_text(self.path, "".join(json.dumps(line) + "\n" for line in kept))
-
-    def append(self, record: LogRecord) -> None:
-        """Write a record down and pass it on."""
-        append_jsonl(self.path, dataclasses.asdict(record))
-        self.on_record(record)
-
-
 def pause_between(every_s: float, took_s: float) -> float:
     """Return how long a run goes on after a checkpoint, seconds.
 
@@ -82,21 +60,39 @@ def pause_between(every_s: float, took_s: float) -> float:
     return max(every_s, min(took_s / SHARE, LATEST * every_s))
 
 
-class RunCheckpoints:
-    """State and counters of a run, what its scene decided, and how it continues from them.
+class Records:
+    """The log of a run, its checkpoints, and how it continues from them.
 
-    A run that is resumed must have `decided` the same.
+    `run_dir` is for `log.jsonl`, every record of which goes to `on_log` as well; `store` is for
+    state, counters and what the scene `decided`, which must be the same in a run that is resumed.
     """
 
     def __init__(
         self,
+        run_dir: Path,
         store: CheckpointStore,
         cfg: FitConfig,
         decided: Decisions,
+        on_log: Callable[[LogRecord], None],
         on_message: Callable[[str], None],
     ):
-        self.cfg, self.on_message = cfg, on_message
-        self._decided, self._store = decided, store
+        self.cfg, self.on_log, self.on_message = cfg, on_log, on_message
+        self._log, self._store, self._decided = run_dir / "log.jsonl", store, decided
+
+    def begin(self, template: FitState, resume: bool) -> tuple[FitState, HostState] | None:
+        """Return what `restore` does, for a run that is resumed; drop what was logged after it."""
+        found = self.restore(template) if resume else None
+        if found is None:
+            self._log.unlink(missing_ok=True)
+        elif self._log.exists():
+            kept = [line for line in read_jsonl(self._log) if line["step"] <= found[1].step]
+            write_text(self._log, "".join(json.dumps(line) + "\n" for line in kept))
+        return found
+
+    def log(self, record: LogRecord) -> None:
+        """Write a record down and pass it on."""
+        append_jsonl(self._log, dataclasses.asdict(record))
+        self.on_log(record)
 
     def save(self, state: FitState, host: HostState) -> None:
         """Write a checkpoint."""

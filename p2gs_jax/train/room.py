@@ -86,8 +86,7 @@ def room_for(
     return Room.allocate(entries, visible, growth, limit)
 
 
-Rooms = dict[str, Room]
-"""Room of a view for every image size, by its name."""
+Rooms = dict[str, Room]  # room of a view for every image size, by its name
 
 
 def size_name(size: tuple[int, int]) -> str:

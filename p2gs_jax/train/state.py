@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Int
 from p2gs_jax.gaussians.population import empty_gaussians, empty_population, fresh_population, grow
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.train.optimizer import Optimizer, OptState, grow_moments
-from p2gs_jax.types import Gaussians, Params, Population
+from p2gs_jax.types import Params, Population
 
 FAULT_NONE, FAULT_OVERFLOW, FAULT_NONFINITE = 0, 1, 2
 
@@ -119,15 +119,3 @@ def grow_state(state: FitState, capacity: int) -> FitState:
 def healed(state: FitState) -> FitState:
     """Return the state without its fault, which lies where it lay."""
     return dataclasses.replace(state, fault=jax.tree.map(jnp.zeros_like, state.fault))
-
-
-def replace_gaussians(
-    state: FitState, gaussians: Gaussians, population: Population, opt_state: OptState
-) -> FitState:
-    """Return the state with another population."""
-    return dataclasses.replace(
-        state,
-        params=dataclasses.replace(state.params, gaussians=gaussians),
-        population=population,
-        opt_state=opt_state,
-    )

@@ -108,13 +108,12 @@ class Step:
         """Return the step made of its three programs, compiled or not."""
 
         def step(state: FitState, batch: Batch, partner: Partner, controls: Controls):
-            params = state.params
-            batch, partner, frusta, controls = self.given(batch, partner, controls)
-            listed = show(*per_gaussian(state, frusta, controls))
+            params, frustum = state.params, self.frustum(batch)
+            listed = show(*per_gaussian(state, frustum, controls))
             gradient = differentiate(
                 listed.shown, params.photometry, params.appearance, batch, partner
             )
-            return advance(state, listed.ids, listed.visible, gradient, frusta, controls)
+            return advance(state, listed.ids, listed.visible, gradient, frustum, controls)
 
         return step
 
@@ -138,19 +137,16 @@ class Step:
     ):
         """Return one of the three programs, by its name, traced for arguments of these shapes."""
         program = functools.partial(self.program, room=room, degree=degree)
-        given = jax.eval_shape(self.frusta, batch, partner)
-        state, batch, partner, frusta, controls = self.shapes(
-            "given", (state, batch, partner, given, controls)
-        )
-        params, arguments = state.params, per_gaussian(state, frusta, controls)
+        frustum, params = jax.eval_shape(self.frustum, batch), state.params
+        arguments = per_gaussian(state, frustum, controls)
         if name == "show":
             return program(name).lower(*arguments)
-        listed = self.shapes("show", program("show").eval_shape(*arguments))
+        listed = program("show").eval_shape(*arguments)
         image = (listed.shown, params.photometry, params.appearance, batch, partner)
         if name == "differentiate":
             return program(name).lower(*image)
-        gradient = self.shapes("differentiate", program("differentiate").eval_shape(*image))
-        moved = (state, listed.ids, listed.visible, gradient, frusta, controls)
+        gradient = program("differentiate").eval_shape(*image)
+        moved = (state, listed.ids, listed.visible, gradient, frustum, controls)
         return program(name).lower(*moved)
 
     # What a step of several views on several devices does otherwise (`data_parallel.py`).
@@ -159,22 +155,11 @@ class Step:
         """Return one of the three programs, jitted."""
         return compiled(name, **self.settings(name), **static_sizes(name, room, degree))
 
-    def frusta(self, batch: Batch, partner: Partner) -> tuple[Frustum, ...]:
-        """Return the views of a step, for the programs that know no image size."""
-        cameras = (batch.camera, *partner.cameras)
-        sizes = (map(c.K.dtype.type, (c.width, c.height)) for c in cameras)
-        return tuple(
-            on_host(Frustum, c.viewmat, c.K, width, height, c.objects)
-            for c, (width, height) in zip(cameras, sizes, strict=True)
-        )
-
-    def given(self, batch: Batch, partner: Partner, controls: Controls):
-        """Return the inputs of a step and its views, where its programs take them."""
-        return batch, partner, self.frusta(batch, partner), controls
-
-    def shapes(self, name: str, tree: Any) -> Any:
-        """Return shapes of inputs (`given`) or of a program's results with where they lie."""
-        return tree
+    def frustum(self, batch: Batch) -> Frustum:
+        """Return the view of a step, for the programs that know no image size."""
+        c = batch.camera
+        width, height = map(c.K.dtype.type, (c.width, c.height))
+        return on_host(Frustum, c.viewmat, c.K, width, height, c.objects)
 
 
 def static_sizes(name: str, room: Room, degree: int) -> dict[str, int]:
@@ -184,10 +169,10 @@ def static_sizes(name: str, room: Room, degree: int) -> dict[str, int]:
     return {"room": room.entries} if name == "differentiate" else {"degree": degree}
 
 
-def per_gaussian(state: FitState, frusta: tuple[Frustum, ...], controls: Controls) -> tuple:
+def per_gaussian(state: FitState, frustum: Frustum, controls: Controls) -> tuple:
     """Return the arguments of `show`."""
     params, population = state.params, state.population
-    return params.gaussians, population.alive, frusta, controls.active_degree, population.owner
+    return params.gaussians, population.alive, frustum, controls.active_degree, population.owner
 
 
 # ----------------------------------------------------------------------- compiled ahead

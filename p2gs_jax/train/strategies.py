@@ -7,6 +7,7 @@ dies is pure: Gaussians and population in, an `Outcome` out.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from collections.abc import Callable
@@ -32,7 +33,7 @@ from p2gs_jax.gaussians.population import (
 )
 from p2gs_jax.train.optimizer import AdamState, zero_moments, zero_opacity_moments
 from p2gs_jax.train.schedule import Levels, shrinks_left
-from p2gs_jax.train.state import FitState, HostState, alive_in, grow_state, replace_gaussians
+from p2gs_jax.train.state import FitState, HostState, alive_in, grow_state
 from p2gs_jax.types import Gaussians, Population
 
 SLOTS = 1024
@@ -85,24 +86,6 @@ class Strategy(Protocol):
         where it returns `fresh_population`.
         """
         ...
-
-
-class Keep:
-    """`densify.method` None: keeps the seeds; nothing is born, nothing dies."""
-
-    noise = None
-    slots_stay = True
-
-    def __init__(self, cfg: FitConfig):
-        self.limit = cfg.densify.max_gaussians
-
-    def start(self, seeds: int) -> Slots:
-        """Return slots for the seeds."""
-        return Slots(self.limit, seeds)
-
-    def densify(self, gaussians: Gaussians, population: Population, now: Moment) -> Outcome:
-        """Return what is there; never asked for."""
-        return Outcome(gaussians, population, jnp.zeros_like(population.alive), jnp.int32(0))
 
 
 def demand(gaussians: Gaussians, moments: AdamState, b2: float) -> Float[Array, " n"]:
@@ -237,16 +220,16 @@ class Adaptive:
         return outcome
 
 
-def make_strategy(cfg: FitConfig, coverage: Coverage, levels: Levels) -> Strategy:
-    """Return the strategy that `DensifyConfig` asks for."""
+def make_strategy(cfg: FitConfig, coverage: Coverage, levels: Levels) -> Strategy | None:
+    """Return the strategy that `DensifyConfig` asks for; None: nothing is born, nothing dies."""
     if cfg.densify.method == "mcmc":
         return Mcmc(cfg, coverage, levels)
-    return Keep(cfg) if cfg.densify.method is None else Adaptive(cfg)
+    return None if cfg.densify.method is None else Adaptive(cfg)
 
 
-def started(strategy: Strategy, seeds: int) -> Slots:
+def started(strategy: Strategy | None, seeds: int) -> Slots:
     """Return the slots of a strategy, which may have given a number only."""
-    found = strategy.start(seeds)
+    found = Slots(None, seeds) if strategy is None else strategy.start(seeds)
     return found if isinstance(found, Slots) else Slots(found, found)
 
 
@@ -255,9 +238,9 @@ def interval(d: DensifyConfig, host: HostState) -> float:
     return max(d.every, d.min_every_steps * host.pace)
 
 
-def is_due(strategy: Strategy, d: DensifyConfig, host: HostState) -> bool:
+def is_due(d: DensifyConfig, host: HostState) -> bool:
     """Return whether it is time for a densification."""
-    within = not isinstance(strategy, Keep) and d.start <= host.progress < d.stop
+    within = d.start <= host.progress < d.stop
     return within and host.progress - host.densified_at >= interval(d, host)
 
 
@@ -298,23 +281,11 @@ def densified(
     opt_state = _zero_moments(state.opt_state, outcome.reset_moments)
     if host.reset_at != reset_at:
         opt_state = zero_opacity_moments(opt_state)
-    state = replace_gaussians(state, outcome.gaussians, outcome.population, opt_state)
+    params = dataclasses.replace(state.params, gaussians=outcome.gaussians)
+    state = FitState(params, opt_state, outcome.population, state.step, state.fault)
     if alive_in(state.population) == 0:
         raise UserError(
             f"Step {host.step}: densification removed every Gaussian.",
             fix="lower --densify.prune-opacity or raise --densify.prune-scale",
         )
     return state
-
-
-def check_spread(cfg: DensifyConfig) -> None:
-    """Refuse moves that no shrinking makes up for.
-
-    Raises:
-        UserError: `spread` is not in [0, 1).
-    """
-    if not 0 <= cfg.spread < 1:
-        raise UserError(
-            f"--densify.spread {cfg.spread:g} is not between 0 and 1 (1 excluded).",
-            fix="give a share of a Gaussian's own extent, for example 0.5",
-        )

@@ -72,9 +72,7 @@ class Aux(NamedTuple):
     appearance: Corrections | None  # learned corrections of all training views, or None
     correction: Correction | None  # that of this view, or None
     other_view: Int[Array, ""]  # row of a second view, drawn at random
-    # its render, where `relative_exposure` subtracts renders; else None
-    other_linear: Float[Array, "h w 3"] | None
-    # photographed colours of the same points in two views, where it compares them
+    # photographed colours of the same points in two views, where `relative_exposure` compares them
     pairs: ColorPairs | None
 
 
@@ -295,7 +293,7 @@ BUILT_IN: dict[str, Callable[..., Any]] = {
         None if t.measured is None else lidar_loss(r.alpha, r.depth, t.measured)
     ),
     "relative_exposure": lambda r, t, a, loss, formed: relative_exposure_loss(
-        (r.linear, a.other_linear), (a.view, a.other_view), a.pairs, a.photometry, loss, formed
+        r.linear, (a.view, a.other_view), a.pairs, a.photometry, loss, formed
     ),
     "appearance": lambda r, t, a, kind: regularisation(a.appearance, kind),
 }

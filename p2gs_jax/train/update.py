@@ -93,7 +93,7 @@ def advance(
     ids: Int[Array, " v"],
     count: Int[Array, ""],
     gradient: ImageGradient,
-    frusta: tuple[Frustum, ...],
+    frustum: Frustum,
     controls: Controls,
     *,
     cfg: FitConfig,
@@ -104,7 +104,7 @@ def advance(
 ) -> tuple[FitState, StepReport]:
     """Move the listed Gaussians, photometry and corrections by one step; the state is donated.
 
-    `ids` are those of the listed Gaussians and `count` is how many the `frusta` may show, both from
+    `ids` are those of the listed Gaussians and `count` is how many the view may show, both from
     `show`. `extent` is the scene's, scene units; `degree` the highest spherical-harmonics degree
     that moves; `noise` the scale of the exploration noise on the means: None adds none, and sums
     statistics for densification instead.
@@ -130,7 +130,7 @@ def advance(
         healthy,
         bands=bands,
         seen=lambda block, on, owner: differentiable(
-            splat(block, on, frusta, cfg.render, controls.active_degree, owner)
+            splat(block, on, frustum, cfg.render, controls.active_degree, owner)
         ),
         v_seen=gradient.v_shown,
         adam=optimizer.gaussians,
@@ -140,7 +140,7 @@ def advance(
     )
     if noise is None:
         where = jnp.where(healthy, ids, n)
-        population = _observed(population, where, gradient, frusta[0])
+        population = _observed(population, where, gradient, frustum)
     moved = (updated, population)
     return concluded(state, moved, gradient, fits, count, rates, cfg=cfg, optimizer=optimizer)
 
@@ -287,7 +287,7 @@ def _observed(population: Population, ids, image: ImageGradient, frustum: Frustu
 
     Gradients are in units of half the image, as 3DGS has them.
     """
-    v_means2d = image.v_shown[0][0]
+    v_means2d = image.v_shown[0]
     gradient = v_means2d * jnp.stack([frustum.width / 2, frustum.height / 2])
     seen = image.visible & (jnp.sum(jnp.abs(gradient), -1) > 0)
 

@@ -1,7 +1,4 @@
-"""Twenty deliberate faults, each with the test that has to notice it.
-
-`python tests/faults/apply.py [NAME ...]` plants them one by one in a copy of the package.
-"""
+"""Deliberate faults, each with the test that has to notice it (`pytest -m slow tests/faults`)."""
 
 from __future__ import annotations
 

@@ -25,7 +25,6 @@ from p2gs_jax.pipeline.preflight import (
     MemoryNeeded,
     Paths,
     check_run_dir,
-    check_sizes,
     memory_needed,
     preflight,
     require_memory,
@@ -36,7 +35,6 @@ from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import KEY, Decisions
 from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.scene.pixels import store as held
-from p2gs_jax.types import View
 
 
 @pytest.fixture(scope="module")
@@ -157,26 +155,6 @@ def test_the_saved_choice_is_solved_and_its_reasons_repeated(tmp_path, scene):
     solved = (first.selection.solution, again.selection.solution)
     np.testing.assert_array_equal(*(s.log_exposures for s in solved))
     np.testing.assert_array_equal(*(s.gammas for s in solved))
-
-
-def views(tmp_path, *sizes):
-    pose, K = np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32)
-    return [View(f"{k}.png", tmp_path, "0", pose, K, *size) for k, size in enumerate(sizes)]
-
-
-def test_a_reading_that_subtracts_images_needs_one_size(tmp_path):
-    cfg = with_fields(FitConfig(), {"loss.relative_exposure.weight": 0.01})
-    subtracting = with_fields(cfg, {"loss.relative_exposure.form": "literal_pixels"})
-    unequal = views(tmp_path, (400, 300), (400, 300), (300, 400))
-    with pytest.raises(UserError, match=r"0\.png is 400x300 where 2\.png is 300x400"):
-        check_sizes(unequal, subtracting)
-    # Equal at full size only: halves are rounded up and down.
-    narrow = with_fields(subtracting, {"data.max_width": 201})
-    with pytest.raises(UserError, match="pixel by pixel"):
-        check_sizes(views(tmp_path, (402, 290), (700, 505)), narrow)
-    check_sizes(unequal[:2], subtracting)
-    check_sizes(unequal, cfg)
-    check_sizes(unequal, with_fields(subtracting, {"loss.relative_exposure.weight": None}))
 
 
 def test_the_config_of_a_run_is_what_the_user_gave(finished_run):

@@ -120,8 +120,8 @@ def test_blocks_take_each_gaussian_to_its_own_box():
     alive = jnp.ones(COUNT, bool)
     camera = view()
     ids, count = compact(alive, BLOCK)
-    (listed,) = splat_listed(g, alive, ids, count, (camera,), CFG, 3, 16, jnp.asarray(owner))
-    (whole,) = splat(g, alive, (camera,), CFG, 3, jnp.asarray(owner))
+    listed = splat_listed(g, alive, ids, count, camera, CFG, 3, 16, jnp.asarray(owner))
+    whole = splat(g, alive, camera, CFG, 3, jnp.asarray(owner))
     for a, b in zip(jax.tree.leaves(listed), jax.tree.leaves(whole), strict=True):
         np.testing.assert_allclose(np.asarray(a)[:COUNT], b, rtol=1e-5, atol=1e-5)
     assert not np.asarray(listed[0].visible)[COUNT:].any()

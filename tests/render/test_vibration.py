@@ -93,7 +93,7 @@ def test_far_from_its_peak_it_is_out_of_view_and_all_stays_finite():
     assert [bool(in_view(g, ALIVE, seen(t), CFG)[0]) for t in (0.2, 0.9)] == [True, False]
 
     def total(g):
-        ((splats, radiance),) = splat(g, ALIVE, [seen(0.9)], CFG)
+        splats, radiance = splat(g, ALIVE, seen(0.9), CFG)
         return jnp.sum(splats.log_opacities) + jnp.sum(splats.means2d) + jnp.sum(radiance)
 
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(jax.jit(jax.grad(total))(g)))

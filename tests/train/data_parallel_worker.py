@@ -4,7 +4,6 @@ JAX counts its devices once, so a test run cannot have both one and four: four a
 (XLA_FLAGS=--xla_force_host_platform_device_count=4).
 """
 
-import dataclasses
 import json
 import sys
 
@@ -13,6 +12,7 @@ import numpy as np
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import on_host
+from p2gs_jax.presets import with_values
 from p2gs_jax.render import xla_cpu
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.train.data_parallel import ParallelStep, default_mesh, spread, whole
@@ -32,15 +32,17 @@ CONTROLS = on_host(Controls, np.float32(0.3), np.int32(DEGREE), np.float32(0.7),
 
 
 def config(batch: int, method: str | None = "mcmc") -> FitConfig:
-    base = FitConfig()
-    return dataclasses.replace(
-        base,
-        render=dataclasses.replace(base.render, sh_degree=DEGREE, pixels_in_flight=2048),
-        densify=dataclasses.replace(base.densify, method=method),
+    fields = {
+        "render.sh_degree": DEGREE,
+        "render.pixels_in_flight": 2048,
+        "densify.method": method,
+        # It would only cost compiling here.
+        "loss.dssim_weight": None,
         # With an epsilon of about the gradient's size, updates are as smooth as the gradient.
-        optimizer=dataclasses.replace(base.optimizer, eps=1e-5),
-        train=dataclasses.replace(base.train, batch=batch),
-    )
+        "optimizer.eps": 1e-5,
+        "train.batch": batch,
+    }
+    return with_values(FitConfig(), fields)
 
 
 def start() -> Params:

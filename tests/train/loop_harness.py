@@ -1,11 +1,9 @@
 """A training loop whose steps cost nothing: a clock that stands still, programs that only count."""
 
 import dataclasses
-import json
 import os
 from types import SimpleNamespace
 
-import jax
 import numpy as np
 
 from p2gs_jax.config import FitConfig
@@ -13,6 +11,7 @@ from p2gs_jax.core.atomic import read_jsonl
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.jobs.configs import with_fields
+from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.train import loop
 from p2gs_jax.train.state import FAULT_NONFINITE, FAULT_OVERFLOW, Fault
@@ -96,37 +95,11 @@ class Programs:
 REPORT = StepReport(*map(np.float32, (1, 1, 20, 7, 3)))._replace(terms={"l1": np.float32(1)})
 
 
-class Checkpoints:
-    """Checkpoints in memory; their plain values are JSON."""
-
-    folder = "checkpoints"
-
-    def __init__(self):
-        self.saved = {}
-
-    def save(self, step, state, meta):
-        self.saved[step] = jax.tree.map(np.array, state), json.loads(json.dumps(meta))
-
-    def latest_step(self):
-        return max(self.saved, default=None)
-
-    def restore_latest(self, like, on_message):
-        return self.saved[self.latest_step()] if self.saved else None
-
-    def discard_after(self, step):
-        self.saved = {k: v for k, v in self.saved.items() if k <= step}
-
-
-def gaussians(count):
-    shapes = ((3,), (4,), (3,), (), (1, 3))
-    values = [np.zeros((count, *shape), np.float32) for shape in shapes]
-    values[0][:, 2], values[1][:, 0], values[2][:] = 3, 1, -5
-    return on_host(Gaussians, *values)
-
-
 def params():
+    values = [np.zeros((SEEDS, *shape), np.float32) for shape in ((3,), (4,), (3,), (), (1, 3))]
+    values[0][:, 2], values[1][:, 0], values[2][:] = 3, 1, -5
     zeros = np.zeros(VIEWS, np.float32)
-    return Params(gaussians(SEEDS), on_host(Photometry, zeros, zeros))
+    return Params(on_host(Gaussians, *values), on_host(Photometry, zeros, zeros))
 
 
 class Harness:
@@ -134,7 +107,8 @@ class Harness:
 
     def __init__(self, folder):
         self.clock = SimpleNamespace(now=0.0)
-        self.folder, self.checkpoints, self.said = folder, Checkpoints(), []
+        self.checkpoints = CheckpointStore(folder / "checkpoints")
+        self.folder, self.said = folder, []
 
     def run(self, cfg=SHORT, *, resume=False, programs=None, **options):
         """Run to the end; return the result and the programs."""

@@ -21,6 +21,7 @@ from p2gs_jax.train.exposure_loss import color_pairs
 from p2gs_jax.types import Photometry
 
 WIDTH, HEIGHT = 48, 32
+OBSERVED = LossConfig(relative_exposure=RelativeExposureConfig(1.0, "observed_ldr"))
 CAMERAS = (
     CameraFormation("a", ((-0.5, 0.1, 0.0),), (tuple(0.2 * np.sin(4 * KNOTS)),)),
     CameraFormation("b", ((-0.2, -0.3, 0.0),), (tuple(0.2 * np.cos(4 * KNOTS)),)),
@@ -54,9 +55,7 @@ def observed(photometry, cfg, count=400) -> rel.ColorPairs:
 def test_zero_at_the_truth_and_only_there(cfg):
     right = truth()
     pairs = observed(right, cfg)
-    loss = LossConfig(relative_exposure=RelativeExposureConfig(1.0, "observed_ldr"))
-    reading = rel.observed_ldr
-    at_truth = float(reading(pairs, right, loss, cfg))
+    at_truth = float(rel.observed_ldr(pairs, right, OBSERVED, cfg))
     assert at_truth < 2e-4
     wrong = {
         "white balance": (dataclasses.replace(right, raw_white_balance=jnp.zeros((4, 3))), cfg),
@@ -66,7 +65,9 @@ def test_zero_at_the_truth_and_only_there(cfg):
     if cfg is CURVED:
         wrong["responses"] = (right, dataclasses.replace(cfg, curve="srgb"))
     for name, (photometry, under) in wrong.items():
-        assert float(reading(pairs, photometry, loss, under)) > max(2e-3, 20 * at_truth), name
+        assert float(rel.observed_ldr(pairs, photometry, OBSERVED, under)) > max(
+            2e-3, 20 * at_truth
+        ), name
 
 
 def _without(cfg, name):
@@ -78,36 +79,23 @@ def test_a_common_tint_is_a_gauge():
     """W -> s W for all views leaves the relation of two photographs as it is."""
     right = truth()
     pairs = observed(right, SHADED)
-    loss = LossConfig(relative_exposure=RelativeExposureConfig(1.0, "observed_ldr"))
     moved = dataclasses.replace(right, raw_exposures=0.5 * right.raw_exposures)
     tint = jnp.array([0.2, -0.15, -0.05])
     tinted = dataclasses.replace(moved, raw_white_balance=moved.raw_white_balance + tint)
-    a, b = (float(rel.observed_ldr(pairs, p, loss, SHADED)) for p in (moved, tinted))
+    a, b = (float(rel.observed_ldr(pairs, p, OBSERVED, SHADED)) for p in (moved, tinted))
     assert a == pytest.approx(b, rel=1e-4)
     assert a > 2e-3
 
 
-def test_the_literal_readings_take_the_whole_gain():
+def test_the_literal_reading_takes_the_whole_gain():
     right = dataclasses.replace(truth(), raw_gammas=jnp.zeros(4))
-    linear = jnp.full((HEIGHT, WIDTH, 3), 0.2)
-    given = ((linear, linear), (jnp.int32(0), jnp.int32(1)), None, right)
-    for form in ("literal_same_pose", "literal_pixels"):
-        cfg = LossConfig(relative_exposure=RelativeExposureConfig(1.0, form))
-        found = float(rel.relative_exposure_loss(*given, cfg, SHADED))
-        shaded, plain = (np.asarray(formation(linear, right.capture(i), LINEAR)) for i in (0, 1))
-        expected = np.abs((plain / shaded - 1) * 0.2).sum(-1).mean()
-        assert found == pytest.approx(expected, rel=1e-4)
-
-
-def test_a_reading_that_subtracts_renders_needs_two_of_one_size():
-    cfg = LossConfig(relative_exposure=RelativeExposureConfig(1.0, "literal_pixels"))
-    nothing = jnp.zeros((4, 6, 3))
-    for other, words in ((nothing[:1], "renders of one size"), (None, "second view")):
-        with pytest.raises(ValueError, match=words):
-            rel.relative_exposure_loss((nothing, other), (0, 1), None, truth(), cfg, SHADED)
-
-
-LINEAR = dataclasses.replace(SHADED, curve="linear", pivot=1.0)
+    linear, views = jnp.full((HEIGHT, WIDTH, 3), 0.2), (jnp.int32(0), jnp.int32(1))
+    cfg = LossConfig(relative_exposure=RelativeExposureConfig(1.0))
+    found = float(rel.relative_exposure_loss(linear, views, None, right, cfg, SHADED))
+    uncurved = dataclasses.replace(SHADED, curve="linear", pivot=1.0)
+    first, second = (np.asarray(formation(linear, right.capture(i), uncurved)) for i in views)
+    expected = np.abs((second / first - 1) * 0.2).sum(-1).mean()
+    assert found == pytest.approx(expected, rel=1e-4)
 
 
 def test_pairs_of_tracks_have_places_where_they_count():
@@ -124,18 +112,14 @@ def test_pairs_of_tracks_have_places_where_they_count():
         cameras=np.zeros(3, int),
         positions=rng.uniform(-0.5, 0.5, (count, 2)).astype(np.float32),
     )
-    base = FitConfig()
-    relative = RelativeExposureConfig(1.0, "observed_ldr")
-    cfg = dataclasses.replace(base, loss=dataclasses.replace(base.loss, relative_exposure=relative))
+    cfg = FitConfig(loss=OBSERVED)
     plain = color_pairs(observations, cfg)
     assert plain is not None
     assert plain.positions_i is None
     placed = color_pairs(observations, dataclasses.replace(cfg, photometry=SHADED))
     assert placed is not None
-    for colors, positions in (
-        (placed.colors_i, placed.positions_i),
-        (placed.colors_j, placed.positions_j),
-    ):
+    of_i, of_j = (placed.colors_i, placed.positions_i), (placed.colors_j, placed.positions_j)
+    for colors, positions in (of_i, of_j):
         rows = [np.flatnonzero((observations.colors == c).all(1))[0] for c in np.asarray(colors)]
         np.testing.assert_array_equal(positions, observations.positions[rows])
     unplaced = dataclasses.replace(observations, positions=None)

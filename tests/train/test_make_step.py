@@ -10,13 +10,14 @@ import pytest
 from data_parallel_worker import DEGREE, EXTENT, config, start, view
 
 import p2gs_jax
+from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import DivergenceError
 from p2gs_jax.train.image_gradient import total_loss
 from p2gs_jax.train.terms import loss_terms
 
 CFG = config(1)
-# None of these is looked at by what is tested here: they only cost compiling.
-PLAIN = {"dssim": None, "log_exposure_mean": None, "gamma_mean_variance": None}
+# Neither is looked at by what is tested here.
+PLAIN = {"log_exposure_mean": None, "gamma_mean_variance": None}
 
 
 def dark(rendered, target, aux):
@@ -46,9 +47,9 @@ def test_terms_are_added_taken_away_and_summed_under_their_names():
     params, (batch, partner) = start(), view(0)
     terms = loss_terms(CFG, PLAIN | {"dark": dark, "deep": deep})
     alive = np.ones(params.gaussians.capacity, bool)
-    expected, aux = total_loss(
-        params, alive, batch, partner, CFG, terms, capacity=2**15, active_degree=DEGREE
-    )
+    sizes = {"capacity": 2**15, "active_degree": DEGREE}
+    loss = jax.jit(lambda params: total_loss(params, alive, batch, partner, CFG, terms, **sizes))
+    expected, aux = loss(params)
     assert float(report.loss) == pytest.approx(float(expected), rel=1e-5)
     for name, value in aux.terms.items():
         assert float(report.terms[name]) == pytest.approx(float(value), rel=1e-5), name
@@ -58,8 +59,8 @@ def test_terms_are_added_taken_away_and_summed_under_their_names():
 
 def test_without_anything_of_ones_own_the_terms_are_those_of_the_configuration():
     names = {"l1", "dssim", "log_exposure_mean", "gamma_mean_variance"}
-    assert set(loss_terms(CFG)) == names
-    assert loss_terms(CFG) == loss_terms(config(1))  # so that fits share programs
+    assert set(loss_terms(FitConfig())) == names
+    assert loss_terms(FitConfig()) == loss_terms(FitConfig())  # so that fits share programs
 
 
 class Gain(eqx.Module):

@@ -75,10 +75,9 @@ def test_opacity_resets_empty_the_scene_and_it_grows_back(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("form", ["literal_pixels", "observed_ldr"])
-def test_readings_that_no_preset_uses_run(tmp_path, form):
-    fields = {"loss__relative_exposure__weight": 0.01, "loss__relative_exposure__form": form}
-    cfg = small("robust", **fields)
+def test_the_reading_that_no_preset_uses_runs(tmp_path):
+    reading = {"weight": 0.01, "form": "observed_ldr"}
+    cfg = small("robust", **{f"loss__relative_exposure__{k}": v for k, v in reading.items()})
     result = p2gs_jax.fit(make_scene(tmp_path / "scene"), tmp_path / "run", cfg)
     assert "relative_exposure" in check(result, tmp_path / "run")[0]["terms"]
 
@@ -138,10 +137,4 @@ def test_a_learned_camera_warms_up_and_decays_as_published():
 def test_display_values_know_no_track_start(tmp_path):
     cfg = small("3dgs", photometry__start="tracks")
     with pytest.raises(p2gs_jax.UserError, match="splats display values"):
-        p2gs_jax.fit(make_scene(tmp_path / "scene"), tmp_path / "run", cfg)
-
-
-def test_a_population_that_dies_is_said(tmp_path):
-    cfg = small("paper", train__steps=60, densify__prune_opacity=0.99)
-    with pytest.raises(p2gs_jax.UserError, match="every Gaussian"):
         p2gs_jax.fit(make_scene(tmp_path / "scene"), tmp_path / "run", cfg)

@@ -1,23 +1,20 @@
-"""One step in blocks is one Adam update of `total_loss`; what cannot be taken changes nothing."""
+"""One step in blocks is one Adam update of the loss; what cannot be taken changes nothing."""
 
 import dataclasses
 from types import SimpleNamespace
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from tiny_scene import make_scene
 
 from p2gs_jax.config import FitConfig
-from p2gs_jax.pipeline.fit import fit
+from p2gs_jax.presets import with_values
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.render.visible import BLOCK, in_view, splat
-from p2gs_jax.train import image_gradient, update
 from p2gs_jax.train.exposure_loss import Partner
-from p2gs_jax.train.image_gradient import image_loss, total_loss
+from p2gs_jax.train.image_gradient import image_loss
 from p2gs_jax.train.optimizer import learning_rates, make_optimizer
 from p2gs_jax.train.state import FAULT_NONE, FAULT_NONFINITE, FAULT_OVERFLOW, initial_state
 from p2gs_jax.train.step import Step
@@ -29,17 +26,21 @@ COUNT, HIDDEN = 6000, 600
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 EXTENT, DEGREE, PROGRESS, RATE = 2.0, 1, 0.3, 0.7
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
+PHOTOMETRY = ("raw_exposures", "raw_gammas")
 
 
 def config(visible_only: bool) -> FitConfig:
-    base = FitConfig()
-    return dataclasses.replace(
-        base,
-        render=dataclasses.replace(base.render, sh_degree=DEGREE, pixels_in_flight=2048),
-        densify=dataclasses.replace(base.densify, method=None),
+    fields = {
+        "render.sh_degree": DEGREE,
+        "render.pixels_in_flight": 2048,
+        "densify.method": None,
+        # Its gradient is checked by itself (`test_image_loss.py`), and it costs compiling.
+        "loss.dssim_weight": None,
         # With an epsilon of about the gradient's size, updates are as smooth as the gradient.
-        optimizer=dataclasses.replace(base.optimizer, visible_only=visible_only, eps=1e-5),
-    )
+        "optimizer.eps": 1e-5,
+        "optimizer.visible_only": visible_only,
+    }
+    return with_values(FitConfig(), fields)
 
 
 def start() -> Params:
@@ -86,20 +87,16 @@ def made():
 
         return step
 
+    @jax.jit
     def objective(params, probe):
-        shown = splat(params.gaussians, alive, (batch.camera,), cfg.render, DEGREE)
-        ((splats, radiance),) = shown
+        splats, radiance = splat(params.gaussians, alive, batch.camera, cfg.render, DEGREE)
         splats = dataclasses.replace(splats, means2d=splats.means2d + probe)
-        given, terms = (batch, partner, cfg), loss_terms(cfg)
-        loss, _ = image_loss(((splats, radiance),), params.photometry, None, *given, terms, 2**16)
-        whole, _ = total_loss(params, alive, *given, terms, capacity=2**16, active_degree=DEGREE)
-        return whole + loss, (whole, loss)
+        given = (batch, partner, cfg, loss_terms(cfg), 2**16)
+        return image_loss((splats, radiance), params.photometry, None, *given)[0]
 
-    # Both losses are the same here: their sum has twice the gradient.
-    (_, (whole, loss)), (grads, probe) = jax.jit(
-        jax.value_and_grad(objective, argnums=(0, 1), has_aux=True)
-    )(params, jnp.zeros((COUNT, 2)))
-    assert float(whole) == pytest.approx(float(loss), rel=1e-6)
+    loss, (gradient, probe) = jax.value_and_grad(objective, argnums=(0, 1))(
+        params, jnp.zeros((COUNT, 2))
+    )
     seen = np.asarray(in_view(params.gaussians, alive, batch.camera, cfg.render))
     selective = steps(cfg)
     tight = Room(64, BLOCK)
@@ -111,9 +108,9 @@ def made():
         alive=np.asarray(alive),
         seen=seen,
         cfg=cfg,
-        gradient=jax.tree.map(lambda g: np.asarray(g) / 2, grads),
+        gradient=jax.tree.map(np.asarray, gradient),
         probe=np.asarray(probe),
-        loss=float(whole),
+        loss=float(loss),
         tight=tight,
         refused=refused,
         room=room,
@@ -146,7 +143,7 @@ def rows_of(tree, name, rows):
 
 
 @pytest.mark.parametrize("which", ["after", "everyone"])
-def test_one_step_is_an_adam_update_of_the_gradient_of_the_total_loss(made, which):
+def test_one_step_is_an_adam_update_of_the_gradient_of_the_loss(made, which):
     state, report = getattr(made, which)
     assert int(state.fault.kind) == FAULT_NONE
     assert int(state.step) == 1
@@ -173,41 +170,24 @@ def test_one_step_is_an_adam_update_of_the_gradient_of_the_total_loss(made, whic
         moved = np.abs(new - old).max()
         assert moved > 0.5 * rate.max(), name
     got, v = state.opt_state.rest.mu[0], made.gradient.photometry
-    for name in ("raw_exposures", "raw_gammas"):
+    for name in PHOTOMETRY:
         np.testing.assert_allclose(
             getattr(got, name) / (1 - 0.9), getattr(v, name), rtol=1e-4, atol=1e-8
         )
 
 
-def test_blocks_and_the_whole_population_agree(made):
-    a, b = made.after[0].params.gaussians, made.everyone[0].params.gaussians
-    for name in FIELDS:
-        old = rows_of(made.params.gaussians, name, made.seen)
-        moved = rows_of(b, name, made.seen) - old
-        apart = rows_of(a, name, made.seen) - rows_of(b, name, made.seen)
-        assert np.linalg.norm(apart) <= 1e-3 * np.linalg.norm(moved), name
-
-
-def test_in_float64_nothing_becomes_narrow(wide):
-    state, report = wide
-    assert int(state.fault.kind) == FAULT_NONE
-    floats = jax.tree_util.tree_leaves_with_path((state, report))
-    for path, leaf in floats:
-        if leaf.dtype.kind == "f":
-            assert leaf.dtype == np.float64, jax.tree_util.keystr(path)
-
-
-def test_a_step_agrees_with_one_in_float64(made, wide):
+def test_a_step_agrees_with_one_in_float64_where_nothing_becomes_narrow(made, wide):
     (state, report), (exact, exact_report) = made.after, wide
+    assert int(exact.fault.kind) == FAULT_NONE
+    for path, leaf in jax.tree_util.tree_leaves_with_path(wide):
+        assert leaf.dtype.kind != "f" or leaf.dtype == np.float64, jax.tree_util.keystr(path)
     assert float(report.loss) == pytest.approx(float(exact_report.loss), rel=1e-6)
     assert float(report.loss) != float(exact_report.loss)  # it is computed otherwise
-    a, b = (s.opt_state.gaussians.mu for s in (state, exact))
-    pairs = {name: (getattr(a, name), getattr(b, name)) for name in FIELDS}
-    a, b = (s.opt_state.rest.mu[0] for s in (state, exact))
-    pairs |= {
-        name: (getattr(a, name), getattr(b, name)) for name in ("raw_exposures", "raw_gammas")
-    }
-    for name, (got, expected) in pairs.items():
+    of_gaussians = [s.opt_state.gaussians.mu for s in (state, exact)]
+    of_photometry = [s.opt_state.rest.mu[0] for s in (state, exact)]
+    for name in (*FIELDS, *PHOTOMETRY):
+        moments = of_photometry if name in PHOTOMETRY else of_gaussians
+        got, expected = (getattr(m, name) for m in moments)
         assert np.any(expected), name
         assert np.linalg.norm(got - expected) < 1e-4 * np.linalg.norm(expected), name
 
@@ -279,37 +259,5 @@ def test_the_first_term_that_is_no_number_is_named(made):
     params = dataclasses.replace(made.params, photometry=photometry)
     state, report = made.selective(made.room, params)
     assert int(state.fault.kind) == FAULT_NONFINITE
-    assert (
-        finite_names(report.terms, state.params)[int(state.fault.term)]
-        == "loss term log_exposure_mean"
-    )
-
-
-@pytest.mark.slow
-def test_a_short_fit_traces_its_step_once_per_image_size(tmp_path, monkeypatch):
-    scene = make_scene(tmp_path / "scene", size=(200, 192))
-    base = FitConfig()
-    cfg = dataclasses.replace(
-        base,
-        render=dataclasses.replace(base.render, sh_degree=0),
-        densify=dataclasses.replace(base.densify, max_gaussians=400, min_every_steps=5),
-        init=dataclasses.replace(base.init, dense="off", shell="off"),
-        train=dataclasses.replace(base.train, steps=30, coarse_to_fine=(0.5,)),
-    )
-    sizes = []
-
-    def counted(shown, photometry, appearance, batch, *others):
-        sizes.append((batch.camera.width, batch.camera.height))
-        return image_loss(shown, photometry, appearance, batch, *others)
-
-    chex.clear_trace_counter()
-    jax.clear_caches()  # steps of all fits share what was traced
-    # Once more before exposures are known, for the shapes that the last program of a step takes.
-    monkeypatch.setattr(image_gradient, "image_loss", chex.assert_max_traces(counted, n=3))
-    # What is done per Gaussian knows no image size, and the view's list no exposures; rates do.
-    for module, name, n in ((image_gradient, "splat_listed", 1), (update, "update_listed", 2)):
-        few = chex.assert_max_traces(getattr(module, name), n=n)
-        monkeypatch.setattr(module, name, few)
-    fit(scene, tmp_path / "run", cfg)
-    assert len(set(sizes)) == 2
-    assert len(sizes) <= 3
+    names = finite_names(report.terms, state.params)
+    assert names[int(state.fault.term)] == "loss term log_exposure_mean"

@@ -1,6 +1,5 @@
 """Which steps share a program, and what waiting for one is counted as."""
 
-import dataclasses
 import threading
 import time
 from types import SimpleNamespace
@@ -29,9 +28,9 @@ def test_a_program_that_reads_what_it_was_not_given_raises():
         for missing in ("train", "densify", "data"):
             with pytest.raises(AttributeError, match=missing):
                 getattr(cfg, missing)
-    with pytest.raises(AttributeError, match=r"PhotometryConfig\.model"):
+    with pytest.raises(AttributeError, match="model"):
         _ = step.settings("differentiate")["cfg"].photometry.model
-    with pytest.raises(AttributeError, match=r"PhotometryConfig\.curve"):
+    with pytest.raises(AttributeError, match="curve"):
         _ = step.settings("advance")["cfg"].photometry.curve
 
 
@@ -41,7 +40,6 @@ def test_what_was_taken_is_equal_where_the_values_are():
     for taken, same in (({"render": None}, True), ({"photometry": ("curve", "pivot")}, False)):
         a, b = narrowed(cfg, taken), narrowed(other, taken)
         assert (a == b, hash(a) == hash(b)) == (same, same)
-        assert isinstance(a, FitConfig)
 
 
 class Traced:
@@ -72,13 +70,8 @@ def programs():
 
 
 def under(curve="srgb", model="view_exposure", seed=0, **optimizer):
-    cfg = FitConfig()
-    return dataclasses.replace(
-        cfg,
-        train=dataclasses.replace(cfg.train, seed=seed),
-        photometry=dataclasses.replace(cfg.photometry, curve=curve, model=model),
-        optimizer=dataclasses.replace(cfg.optimizer, **optimizer),
-    )
+    fields = {"train.seed": seed, "photometry.curve": curve, "photometry.model": model}
+    return with_fields(FitConfig(), fields | {f"optimizer.{k}": v for k, v in optimizer.items()})
 
 
 def test_levels_share_what_is_done_per_gaussian(programs):
