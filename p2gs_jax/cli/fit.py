@@ -43,7 +43,7 @@ class Fit:
     luminance_gs or ppisp; or ppisp_solved."""
     reference: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Photographs of the same views under one common exposure, for evaluation."""
-    blocks: Annotated[str | None, tyro.conf.arg(metavar="N|auto")] = None
+    blocks: int | Literal["auto"] | None = None
     """Cut the scene into N blocks that are fitted apart and merged; auto: into as few as memory
     allows (docs/districts.md). Default: one fit."""
     jobs: int = 1
@@ -51,7 +51,7 @@ class Fit:
     engine: Annotated[str, tyro.conf.arg(metavar="NAME")] = "local"
     """Where blocks are fitted: local, dask://HOST:PORT, or slurm:OPTION=VALUE,...
     (docs/sweeps.md)."""
-    devices: Annotated[str, tyro.conf.arg(metavar="N|all")] = "1"
+    devices: int | Literal["all"] = 1
     """Devices of a step, each with its own views (--train.batch; default then: one view each)."""
 
     def execute(self) -> int:
@@ -63,24 +63,41 @@ class Fit:
         from p2gs_jax.pipeline.fit import fit
         from p2gs_jax.train.data_parallel import with_a_view_each
 
-        blocks = resolve_blocks(self)
-        if blocks is not None:
-            return self._execute_in_blocks(blocks)
-        devices = resolve_devices(self)
+        self._check()
+        if self.blocks is not None:
+            return self._execute_in_blocks(self.blocks)
         with TerminalReporter() as reporter:
             result = fit(
                 self.scene,
                 self.out,
-                with_a_view_each(checked(self.config), devices),
+                with_a_view_each(checked(self.config), self.devices),
                 reference=self.reference,
                 resume=self.resume,
                 reporter=reporter,
                 # Starting the interpreter and loading libraries is processor time throughout.
                 spent_s=time.process_time(),
-                devices=devices,
+                devices=self.devices,
             )
         print_metrics(result.metrics, self.out)
         return 0
+
+    def _check(self) -> None:
+        count, whole = self.blocks, "write a whole number from 1 on, or"
+        check(
+            count is not None or (self.jobs == 1 and self.engine == "local"),
+            "--jobs and --engine say nothing without --blocks",
+            fix="add --blocks auto, or a number",
+        )
+        right = not isinstance(count, int) or count >= 1
+        check(right, f"--blocks {count} is not a number of blocks", fix=f"{whole} auto")
+        check(self.jobs >= 1, "--jobs must be at least 1")
+        check(
+            count is None or self.devices == 1,
+            "--blocks fits every block on one device",
+            fix="leave out --devices; blocks have --jobs and --engine",
+        )
+        right = not isinstance(self.devices, int) or self.devices >= 1
+        check(right, f"--devices {self.devices} is not a number of devices", fix=f"{whole} all")
 
     def _execute_in_blocks(self, count: int | str) -> int:
         from rich.console import Console
@@ -229,43 +246,3 @@ def checked(cfg: FitConfig) -> FitConfig:
         fix="add --known-exposures FILE, or exif",
     )
     return cfg
-
-
-def resolve_blocks(args: Fit) -> int | str | None:
-    """Return how many blocks are asked for: a number, `auto`, or None for one fit.
-
-    Raises:
-        UserError: it is neither, or options of blocks are given without them.
-    """
-    words, alone = args.blocks, args.jobs == 1 and args.engine == "local"
-    check(
-        words is not None or alone,
-        "--jobs and --engine say nothing without --blocks",
-        fix="add --blocks auto, or a number",
-    )
-    if words is None:
-        return None
-    check(args.jobs >= 1, "--jobs must be at least 1")
-    check(
-        args.devices == "1",
-        "--blocks fits every block on one device",
-        fix="leave out --devices; blocks have --jobs and --engine",
-    )
-    fix = "write a whole number from 1 on, or auto"
-    right = words == "auto" or (words.isdigit() and int(words) >= 1)
-    check(right, f"--blocks {words!r} is not a number of blocks", fix=fix)
-    return words if words == "auto" else int(words)
-
-
-def resolve_devices(args: Fit) -> int | Literal["all"]:
-    """Return the number of devices of a fit, or `all`.
-
-    Raises:
-        UserError: the number is not valid.
-    """
-    words = args.devices
-    if words == "all":
-        return "all"
-    right = words.isdecimal() and int(words) >= 1
-    check(right, f"--devices {words} is not a number of devices", fix="give 1 or more, or all")
-    return int(words)

@@ -10,12 +10,10 @@ import ast
 import dataclasses
 import functools
 import inspect
-import io
 import shutil
-import sys
 import textwrap
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import redirect_stdout, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 from types import NoneType, UnionType
@@ -37,8 +35,6 @@ from p2gs_jax.cli.shared import SHORT, parse_duration
 from p2gs_jax.config import DataConfig, FitConfig
 
 PLACEHOLDERS = {int: "N", float: "X", str: "TEXT", Path: "PATH"}
-# Placeholder of the description in tyro's help, replaced by `with_prose`.
-ABOUT = "@about@"
 EXAMPLE = "p2gs-jax "
 INDENT = "    "
 DURATION = PrimitiveConstructorSpec(
@@ -256,7 +252,7 @@ def overview(commands: Mapping[str, type], groups: Mapping[str, tuple[str, ...]]
         lines += ["", heading]
         for name in names:
             head = f"  {name}".ljust(indent)
-            lines += _wrapped(first_paragraph(commands[name]), head, " " * indent)
+            lines += _wrapped(_paragraphs(commands[name])[0][0], head, " " * indent)
     lines += [
         "",
         "p2gs-jax COMMAND --help   options and examples of one command",
@@ -267,50 +263,30 @@ def overview(commands: Mapping[str, type], groups: Mapping[str, tuple[str, ...]]
     return "\n".join(lines)
 
 
-def first_paragraph(kind: type) -> str:
-    """Return the first paragraph of an option class's docstring."""
-    return _paragraphs(kind)[0]
+def prose(kind: type) -> str:
+    """Return what stands above the options in the help of a command: the docstring's prose."""
+    return "\n\n".join("\n".join(_wrapped(p)) for p in _paragraphs(kind)[0])
 
 
-def with_prose(text: str, kind: type, name: str) -> str:
-    """Return tyro's help, described by `ABOUT`, with a docstring's prose above and examples below.
+def examples(kind: type, name: str) -> str:
+    """Return what stands below the options: the docstring's examples.
 
     The name is that of a command whose options were left out: how to list them is added.
     """
-    found = _paragraphs(kind)
-    examples = [p for p in found if p.startswith(EXAMPLE)]
-    prose = ("\n".join(_wrapped(p)) for p in found if not p.startswith(EXAMPLE))
-    parts = [text.rstrip().replace(ABOUT, "\n\n".join(prose))]
+    below = [f"{INDENT}{line}" for line in _paragraphs(kind)[1]]
+    if below:
+        below.insert(0, "Examples:")
     if name:
-        parts.append(
-            f"Every other number of the method, with its unit and source:\n"
-            f"{INDENT}p2gs-jax {name} --help-all"
-        )
-    if examples:
-        parts.append("Examples:\n" + textwrap.indent("\n".join(examples), INDENT))
-    return "\n\n".join(parts)
+        more = "Every other number of the method, with its unit and source:"
+        below = [more, f"{INDENT}p2gs-jax {name} --help-all", "", *below]
+    return "\n".join(below)
 
 
-def captured(print_help: Callable[[], Any]) -> str:
-    """Return what a function prints before it exits, with the colours of the terminal."""
-    stream = _Recorder(io.BytesIO(), encoding=sys.stdout.encoding or "utf-8", write_through=True)
-    with redirect_stdout(stream), suppress(SystemExit):
-        print_help()
-    stream.seek(0)
-    return stream.read()
-
-
-class _Recorder(io.TextIOWrapper):
-    terminal = sys.__stdout__
-
-    def isatty(self) -> bool:
-        return self.terminal is not None and self.terminal.isatty()
-
-
-def _paragraphs(kind: type) -> list[str]:
-    """Return the docstring's paragraphs: prose joined to one line, examples a line each."""
+def _paragraphs(kind: type) -> tuple[list[str], list[str]]:
+    """Return the paragraphs of an option class's docstring, a line each, and its examples."""
     blocks = [textwrap.dedent(b) for b in inspect.cleandoc(kind.__doc__ or "").split("\n\n")]
-    return [b.rstrip() if b.startswith(EXAMPLE) else " ".join(b.split()) for b in blocks]
+    shown = [line for b in blocks if b.startswith(EXAMPLE) for line in b.splitlines()]
+    return [" ".join(b.split()) for b in blocks if not b.startswith(EXAMPLE)], shown
 
 
 def _wrapped(text: str, first: str = "", rest: str = "") -> list[str]:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from p2gs_jax.cli.shared import MeteringRule, RunPath, SceneFolder, check
+from p2gs_jax.cli.shared import MeteringRule, RunPath, SceneFolder, check, count_of
 from p2gs_jax.errors import UserError
 
 if TYPE_CHECKING:
@@ -92,13 +91,12 @@ class Render:
 
         from p2gs_jax.cli.frames import panoramas_of, shots_of
         from p2gs_jax.cli.tables import stdout
-        from p2gs_jax.core.clock import CompileCounter
         from p2gs_jax.core.progress import TerminalReporter
         from p2gs_jax.formats.frames import open_frames
         from p2gs_jax.paths.files import read_cameras, write_cameras
         from p2gs_jax.paths.pictures import RunRenderer
 
-        begin, compiler = time.monotonic(), CompileCounter()
+        begin = time.monotonic()
         for refuse in (_check_picture, _check_path, _check_file):  # before anything is read
             refuse(self)
         out = self.out or self.run / "renders" / _default_name(self)
@@ -111,7 +109,6 @@ class Render:
                 if self.panorama
                 else shots_of(self, renderer, given, reporter.message)
             )
-            reading = time.monotonic() - begin
             for note in job.notes:
                 reporter.message(note)
             reporter.stage("Rendering", 0, job.count)
@@ -121,20 +118,8 @@ class Render:
                     reporter.stage("Rendering", done + 1, job.count)
             if job.shots and not is_video(out):
                 write_cameras(out / "cameras.json", job.shots)
-        console, total, compiling = stdout(), time.monotonic() - begin, compiler.seconds
-        kept = " (kept: the next time is faster)" if compiling >= 1.0 else ""
-        console.print(
-            f"{job.count} {'frame' if job.count == 1 else 'frames'}: {out}", soft_wrap=True
-        )
-        console.print(
-            f"{total:.1f} s: {reading:.1f} reading the run, {compiling:.1f} compiling{kept}, "
-            f"{max(total - reading - compiling, 0.0):.1f} rendering and writing."
-        )
-        console.print(
-            f"A frame takes {_median_ms(renderer.render_seconds)} to render and "
-            f"{_median_ms(renderer.develop_seconds)} to expose and encode, whatever exposure and "
-            "gamma."
-        )
+        count, seconds = count_of(job.count, "frame"), time.monotonic() - begin
+        stdout().print(f"{count} in {seconds:.1f} s: {out}", soft_wrap=True)
         return 0
 
 
@@ -170,13 +155,6 @@ def _check_place(out: Path, overwrite: bool) -> None:
         raise UserError(
             f"{what}.", fix="add --overwrite to replace them, or choose another place with --out"
         )
-
-
-def _median_ms(seconds: Sequence[float]) -> str:
-    """Return the median; the first time includes compiling and counts only if it is alone."""
-    from statistics import median
-
-    return f"{1e3 * median(seconds[1:] or seconds):.1f} ms"
 
 
 def is_video(out: Path) -> bool:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import tyro
 
-from p2gs_jax.cli.shared import check
+from p2gs_jax.cli.shared import check, count_of
 from p2gs_jax.config import DataConfig
 
 if TYPE_CHECKING:
@@ -71,25 +71,21 @@ class Survey:
 
 
 def _head(found: surveys.Survey) -> str:
-    photographs = _count(found.photographs, "photograph")
+    photographs = count_of(found.photographs, "photograph")
     if found.scene is None:
         return (
             f"{found.root}: {photographs}, and nothing else. Their cameras are found by structure "
             "from motion when a fit starts."
         )
-    cameras = _count(len(found.cameras), "camera")
+    cameras = count_of(len(found.cameras), "camera")
     text = f"{found.root} ({found.format}): {photographs} of {cameras}"
     if found.frames is not None:
-        text += f" in {_count(found.frames, 'frame')}"
+        text += f" in {count_of(found.frames, 'frame')}"
     if found.seconds is not None:
         text += f", {found.seconds:.1f} s"
     if found.way is not None:
         text += f", {found.way:.1f} {found.unit} driven"
     return text + "."
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def _cameras(found: surveys.Survey):
@@ -117,9 +113,9 @@ def _measurements(found: surveys.Survey) -> list[str]:
     if scene is None:
         return lines
     if found.missing:
-        lines.append(f"{_count(found.missing, 'photograph')} missing in these frames.")
+        lines.append(f"{count_of(found.missing, 'photograph')} missing in these frames.")
     if found.sweeps:
-        lines.append(f"{_count(found.sweeps, 'LiDAR sweep')}.")
+        lines.append(f"{count_of(found.sweeps, 'LiDAR sweep')}.")
     elif len(scene.points):
         lines.append(f"{len(scene.points):,} points.")
     if scene.tracks is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,27 +15,16 @@ from rich.text import Text
 
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.core.progress import PlainConsole
+from p2gs_jax.evaluation.protocols import PROTOCOLS
 from p2gs_jax.photometry.formation import corner
 from p2gs_jax.photometry.solution import WEAK_GAMMA, PhotometricSolution
 from p2gs_jax.pipeline.calibrate import Calibration
 
 # Columns of words; all others hold numbers.
 WORDS = ("views", "view", "camera", "protocol", "program", "lens", "configuration", "")
-# Parts of a fit, as metrics.json has them under "seconds", and what they are called in print.
-PARTS = {
-    "starting": "starting",
-    "reading": "reading",
-    "structure_from_motion": "structure from motion",
-    "photometry": "photometry",
-    "seeds": "seeds",
-    "compiling": "waiting for the compiler",
-    "steps": "steps",
-    "densification": "densification",
-    "looking": "looking for what moves",
-    "checkpoints": "checkpoints",
-    "evaluation": "evaluation",
-    "files": "files",
-}
+# Parts of a fit, as metrics.json has them under "seconds".
+PARTS = ("starting", "reading", "structure_from_motion", "photometry", "seeds", "compiling")
+PARTS += ("steps", "densification", "looking", "checkpoints", "evaluation", "files")
 
 
 def stdout() -> Console:
@@ -66,23 +56,11 @@ def scores(part: Mapping[str, Any]) -> tuple[str, str, str]:
 
 def print_metrics(metrics: dict[str, Any], out: Path) -> None:
     """Print the scores of a run as a table."""
-    console, test = stdout(), metrics["test"]
-    parts = [
-        ("training", "own exposure and gamma", metrics["train"]),
-        ("training", "mean parameters", metrics["train"]["averaged"]),
-        ("held out", "mean parameters", test["averaged"]),
-        ("held out", "exposure fitted to each photograph", test["exposure_fitted"]),
-        (
-            "held out",
-            "all that varies per view fitted to each photograph",
-            test.get("photometry_fitted"),
-        ),
-        ("held out", "metered, as the camera would", test.get("metered")),
-    ]
-    for name, part in metrics.get("reference", {}).items():
-        how = f"reference photographs, {name.replace('_', ' ')}"
-        parts += [("all", how, part), ("held out", how, part["test"])]
-    rows = [(views, how, *scores(part)) for views, how, part in parts if part and "psnr" in part]
+    console, rows = stdout(), []
+    for protocol in PROTOCOLS.values():
+        part = functools.reduce(lambda at, key: at.get(key, {}), protocol.path, metrics)
+        if "psnr" in part:
+            rows.append((protocol.views, protocol.shown, *scores(part)))
     columns = ("views", "protocol", "PSNR dB", "SSIM", "LPIPS")
     console.print(make_table(columns, rows, "How well it fits"))
     hdr = metrics.get("radiance")
@@ -101,7 +79,7 @@ def print_metrics(metrics: dict[str, Any], out: Path) -> None:
         )
     seconds = {k: v for k, v in metrics.get("seconds", {}).items() if k in PARTS and v >= 0.5}
     if seconds:
-        spent = ", ".join(f"{PARTS[k]} {v:.0f}" for k, v in seconds.items())
+        spent = ", ".join(f"{k.replace('_', ' ')} {v:.0f}" for k, v in seconds.items())
         programs = f" ({counts['programs']} programs)" if "programs" in counts else ""
         console.print(f"Seconds: {spent}{programs}.")
     console.print(f"Results: {out} (open {out / 'summary.png'} first)")
@@ -218,12 +196,9 @@ def print_against(
     against: dict[str, Any], run: Path, metrics: dict[str, Any], remarks: Iterable[str], path: Path
 ) -> None:
     """Print the scores of other programs, as against.json (`path`) has them, beside a run's."""
-    protocols = {
-        "averaged": "mean parameters",
-        "as_rendered": "as rendered",
-        "exposure_fitted": "exposure fitted to each photograph",
-    }
-    reference = {"as_rendered": "as rendered", "scale_aligned": "scale aligned"}
+    fitted = PROTOCOLS["test_fitted"].shown
+    protocols = {"averaged": PROTOCOLS["test_averaged"].shown, "as_rendered": "as rendered"}
+    protocols |= {"exposure_fitted": fitted, "scale_aligned": "one scale for all"}
     own = Path(run).resolve().name + " (this run)"
     rows, shown = [], []
     for label, program in against["programs"].items():
@@ -234,11 +209,11 @@ def print_against(
             rows += [(own, protocols[n], views, part) for n, part in program["run"].items()]
             if "reference" in program and "reference" in metrics:
                 part = metrics["reference"]["scale_aligned"]["test"]
-                rows.append((own, "reference, scale aligned", len(part["per_view"]), part))
+                rows.append((own, "reference, one scale for all", len(part["per_view"]), part))
         for name in ("as_rendered", "exposure_fitted"):
             rows.append((label, protocols[name], views, program[name]))
         for name, part in program.get("reference", {}).items():
-            rows.append((label, f"reference, {reference[name]}", len(part["per_view"]), part))
+            rows.append((label, f"reference, {protocols[name]}", len(part["per_view"]), part))
     columns = ("program", "protocol", "views", "PSNR dB", "SSIM", "LPIPS")
     cells = [(who, how, str(views), *scores(part)) for who, how, views, part in rows]
     console = stdout()

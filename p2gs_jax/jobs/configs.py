@@ -95,10 +95,8 @@ def _shown(hint: Any) -> str:
 def grid(base: FitConfig, **axes: Sequence[Any]) -> dict[str, FitConfig]:
     """Return every combination of some fields' values, by a name that lists them.
 
-    Args:
-        base: gives all other fields.
-        axes: values by field; double underscores stand for dots, as in
-            `loss__relative_exposure__weight=[0.01, 0.1]`.
+    All other fields are those of `base`. Double underscores stand for dots in the names of
+    `axes`, as in `loss__relative_exposure__weight=[0.01, 0.1]`.
 
     Raises:
         UserError: see `with_fields`.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor
 from importlib.util import find_spec
@@ -21,8 +21,10 @@ LOCAL = "local"
 KNOWN = "local, dask://HOST:PORT, slurm or slurm:OPTION=VALUE,..."
 # Seconds until a scheduler must have answered.
 ANSWER_S = 20
-# Seconds between questions how submitit's jobs are; it asks Slurm less often by itself.
+# Seconds between questions how a job of submitit is; it asks Slurm less often by itself.
 ASK_S = 1.0
+# Jobs of a cluster that are waited for at a time.
+MOST_JOBS = 1000
 # By their names, so that no engine is imported that is not used: a worker died, or its node.
 _LOST = ("KilledWorker", "UncompletedJobError", "FutureCancelledError", "CommClosedError")
 
@@ -143,66 +145,19 @@ def _require(module: str, extra: str, name: str) -> None:
         raise UserError(f"--engine {name} needs {module}.", fix=f"pip install 'p2gs-jax[{extra}]'")
 
 
-class _Submitit(Executor):
-    """submitit's jobs as futures; a thread asks how they are."""
+class _Submitit(ThreadPoolExecutor):
+    """submitit's jobs as futures; a thread for each asks how it is."""
 
-    def __init__(self, executor: Any):
-        self._executor = executor
-        self._waiting: list[tuple[Any, Future]] = []
-        self._changed = threading.Condition()
-        self._closed = False
-        self._asking = threading.Thread(target=self._ask, name="submitit", daemon=True)
-        self._asking.start()
+    def __init__(self, cluster: Any):
+        super().__init__(MOST_JOBS, "submitit")
+        self._cluster = cluster
 
     def submit(self, fn, /, *args, **kwargs) -> Future:
-        """Begin a job.
-
-        Raises:
-            RuntimeError: the executor was shut down.
-        """
-        future: Future = Future()
-        future.set_running_or_notify_cancel()
-        with self._changed:
-            if self._closed:
-                raise RuntimeError("this executor was shut down")
-            self._waiting.append((self._executor.submit(fn, *args, **kwargs), future))
-            self._changed.notify()
-        return future
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Take no more jobs; wait for those under way unless told otherwise."""
-        with self._changed:
-            self._closed = True
-            if cancel_futures:
-                for job, _ in self._waiting:
-                    job.cancel()
-            self._changed.notify()
-        if wait:
-            self._asking.join()
-
-    def _ask(self) -> None:
-        while True:
-            with self._changed:
-                if not self._waiting and not self._closed:
-                    self._changed.wait()
-                if not self._waiting and self._closed:
-                    return
-                waiting = list(self._waiting)
-            ended = [pair for pair in waiting if pair[0].done()]
-            for job, future in ended:
-                _settle(job, future)
-            with self._changed:
-                self._waiting = [pair for pair in self._waiting if pair not in ended]
-                if self._waiting:
-                    self._changed.wait(ASK_S)
+        """Hand a job to the cluster."""
+        return super().submit(_wait_for, self._cluster.submit(fn, *args, **kwargs))
 
 
-def _settle(job: Any, future: Future) -> None:
-    try:
-        error = job.exception()
-        if error is None:
-            future.set_result(job.result())
-        else:
-            future.set_exception(error)
-    except Exception as error:  # it left no result that can be read
-        future.set_exception(error)
+def _wait_for(job: Any) -> Any:
+    while not job.done():
+        time.sleep(ASK_S)
+    return job.result()

@@ -27,54 +27,36 @@ Status = Literal["waiting", "running", "done", "failed", "stopped", "lost"]
 
 @dataclass(frozen=True)
 class Job:
-    """Something to be done once, which can be begun again where it was left.
+    """Something to be done once, which can be begun again where it was left."""
 
-    Attributes:
-        name: as the user knows it; jobs of one call have different names.
-        folder: for the results. All machines of the engine see it under this path.
-        task: a function at the top of a module. Called again with the same folder, it goes on from
-            its checkpoint.
-        arguments: JSON values.
-    """
-
-    name: str
-    folder: Path
-    task: Task
-    arguments: dict[str, Any]
+    name: str  # as the user knows it; jobs of one call have different names
+    folder: Path  # for the results; all machines of the engine see it under this path
+    task: Task  # at the top of a module; called again, it goes on from its checkpoint
+    arguments: dict[str, Any]  # JSON values
 
 
 @dataclass
 class JobState:
     """How far a job is.
 
-    Attributes:
-        status: `stopped` where a signal asked for the end: the same call goes on with it. `lost`
-            never stays: such a job is begun again, or has failed.
-        begun: how many times this call began it; more than once where a worker was lost.
-        reason: why it failed.
-        doing: its present stage, in words.
-        progress: of that stage, 0 to 1, or None.
-        seconds: since this call began it.
+    `stopped` is one that a signal ended: the same call goes on with it. `lost` never stays: such a
+    job is begun again, or has failed.
     """
 
     name: str
     status: Status = "waiting"
-    begun: int = 0
-    reason: str | None = None
-    doing: str = ""
-    progress: float | None = None
-    seconds: float = 0.0
+    begun: int = 0  # times in this call; more than one where a worker was lost
+    reason: str | None = None  # why it failed
+    doing: str = ""  # its present stage, in words
+    progress: float | None = None  # of that stage, 0 to 1
+    seconds: float = 0.0  # since this call began it
 
 
 @dataclass(frozen=True)
 class JobFiles:
-    """The files of a job, which lie beside those of the other jobs, apart from results.
+    """The files of a job, which lie beside those of the other jobs, apart from results."""
 
-    Attributes:
-        path: of the job file itself.
-    """
-
-    path: Path
+    path: Path  # of the job file itself
 
     @property
     def progress(self) -> Path:

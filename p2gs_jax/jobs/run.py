@@ -90,17 +90,12 @@ def run_jobs(
 
 
 class _Watched:
-    """A job that was handed to an engine.
-
-    Attributes:
-        state: how far it is.
-        future: what the engine gave for it; None before, and once its end was told.
-    """
+    """A job that was handed to an engine."""
 
     def __init__(self, job: Job, files: JobFiles, run: Runner):
         self.job, self.files, self.run = job, files, run
         self.state = JobState(job.name)
-        self.future: Future | None = None
+        self.future: Future | None = None  # None before, and once its end was told
         self._since: float | None = None
 
     def begin(self, engine: Executor) -> None:
@@ -111,11 +106,7 @@ class _Watched:
         self.future = engine.submit(self.run, str(self.files.path))
 
     def end(self, engine: Executor | None) -> bool:
-        """Note how the job ended, or begin it again; return whether it ended.
-
-        Args:
-            engine: takes it again where its worker was lost; None: nothing begins any more.
-        """
+        """Note how the job ended, or begin it again on an engine; return whether it ended."""
         assert self.future is not None
         self.look()
         state = self.state

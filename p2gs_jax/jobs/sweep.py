@@ -18,6 +18,7 @@ from p2gs_jax.core.runtime import tune_process, use_compile_cache
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.alignment import exposure_error
+from p2gs_jax.evaluation.protocols import PROTOCOLS
 from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.jobs.engines import LOCAL, check_engine, open_engine
 from p2gs_jax.jobs.job import Job, JobState, read_reason, slug
@@ -34,17 +35,14 @@ TABLE, TABLE_TEXT, JOBS = "sweep.json", "sweep.md", "jobs"
 
 @dataclass(frozen=True)
 class SweepResult:
-    """Result of a sweep.
+    """Result of a sweep: one row per configuration and seed.
 
-    Attributes:
-        rows: one dict per configuration and seed: name, seed, status (`done` or `failed`; in the
-            table of a sweep that was stopped also `waiting` and `interrupted`), run, the reason of
-            a failure, and those of `COLUMNS` that the run has.
-        out: the folder, with sweep.json and sweep.md.
+    Rows have name, seed, status (`done` or `failed`; in the table of a sweep that was stopped also
+    `waiting` and `interrupted`), run, the reason of a failure, and the `COLUMNS` of the run.
     """
 
     rows: list[dict[str, Any]]
-    out: Path
+    out: Path  # the folder, with sweep.json and sweep.md
 
     def to_markdown(self) -> str:
         """Return the table, means over seeds."""
@@ -69,11 +67,9 @@ def sweep(
     Finished runs in `out` are kept, interrupted ones continue, failed ones are tried again; a
     failure ends its run, not the sweep. The table is written anew after every run.
 
-    Args:
-        seeds: each replaces `train.seed`.
-        max_parallel: processes at a time; steps of one hardly use more than one core (BUILD_NOTES).
-        engine: where they run (`jobs.engines.open_engine`): local, dask://HOST:PORT or slurm.
-        report: receives a line per run; `on_look` and `run` are those of `run_jobs`.
+    Every one of `seeds` replaces `train.seed`. `max_parallel` processes run at a time; steps of one
+    hardly use more than one core (BUILD_NOTES). The engine is one of `jobs.engines.open_engine`;
+    `report` receives a line per run; `on_look` and `run` are those of `run_jobs`.
 
     Raises:
         UserError: nothing to do, names that would share a folder, a folder of other options, one
@@ -198,18 +194,20 @@ def _outcome(run: Path, scene: Path, state: JobState | None) -> dict[str, Any]:
 
 
 class Column(NamedTuple):
-    """A column of the table.
-
-    Attributes:
-        path: keys in metrics.json; () for values that are computed.
-        digits: after the decimal point.
-        heading: in the short table, which fits a terminal; "" where it is not there.
-    """
+    """A column of the table."""
 
     name: str
-    path: tuple[str, ...]
-    digits: int
-    heading: str = ""
+    path: tuple[str, ...]  # keys in metrics.json; () for values that are computed
+    digits: int  # after the decimal point
+    heading: str = ""  # in the short table, which fits a terminal; "" where it is not there
+
+    @property
+    def meaning(self) -> str:
+        """What it says, in words."""
+        for protocol in PROTOCOLS.values():
+            if protocol.path == self.path[:-1]:
+                return f"{protocol.views} views, {protocol.shown}"
+        return MEANING.get(self.name, "")
 
 
 COLUMNS = (
@@ -232,16 +230,9 @@ COLUMNS = (
     Column("ev", (), 4, "exposure error EV"),
     Column("ev_power", (), 4),
 )
-# Explanations of columns by their names, or how these begin.
+# Explanations of columns that are of no protocol.
 MEANING = {
     "seconds": "of the whole run, compilation and evaluation included",
-    "train_": "training views, each under its own exposure and gamma",
-    "test_psnr_averaged": "held-out views under the mean exposure and gamma (as in the paper)",
-    "test_psnr_fitted": "held-out views, exposure fitted to each photograph: the one to trust",
-    "test_psnr_all_fitted": "likewise, everything fitted that varies per view",
-    "reference_psnr": "all views against photographs of one exposure, one scale for all",
-    "reference_psnr_averaged": "likewise under the mean exposure",
-    "reference_test_": "likewise, held-out views only",
     "radiance_stops": "RMS error of the radiance against HDR truth, stops",
     "ev": "RMS error of the exposures against the truth, stops, after one scale",
     "ev_power": "likewise after the best power as well",
@@ -249,11 +240,7 @@ MEANING = {
 
 
 def read_row(run: Path, scene: Path) -> dict[str, Any]:
-    """Return the columns that a finished run has, by name.
-
-    Args:
-        scene: where `truth/exposures.csv` may lie.
-    """
+    """Return the columns that a finished run of a scene has, by name."""
     metrics = parse_json(_metrics(run).read_text(encoding="utf-8"))
     row: dict[str, Any] = {}
     for column in COLUMNS:
@@ -319,11 +306,7 @@ def to_markdown(rows: Sequence[Mapping[str, Any]]) -> str:
         "|---|---:|" + "---:|" * len(shown),
         *("| " + " | ".join(line) + " |" for line in _means(rows, shown)),
     ]
-    meant = [
-        f"- `{name}{'*' if name.endswith('_') else ''}`: {text}"
-        for name, text in MEANING.items()
-        if any(c.name == name or (name.endswith("_") and c.name.startswith(name)) for c in shown)
-    ]
+    meant = [f"- `{c.name}`: {c.meaning}" for c in shown if c.meaning]
     bad = [f"- {line}" for line in failures(rows)]
     lines += ["", *meant] if meant else []
     lines += ["", "Not finished:", "", *bad] if bad else []

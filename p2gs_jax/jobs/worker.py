@@ -36,8 +36,7 @@ ASKED = tuple(interrupts.exit_code(interrupts.Interrupted(n)) for n in interrupt
 def run_in_process(job_path: str) -> tuple[Status, str | None]:
     """Run the job of a file in a process and wait for it: what engines call.
 
-    Returns:
-        How it ended, and why it failed; `lost` where a signal from elsewhere ended its process.
+    Returns how it ended, and why it failed; `lost` where a signal from elsewhere ended its process.
     """
     files = JobFiles(Path(job_path))
     folder = read_job(files.path).folder

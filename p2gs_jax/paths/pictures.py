@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -40,22 +38,18 @@ FONT, SMALLEST_FONT = 1 / 60, 11
 
 
 class RunRenderer:
-    """Renders and develops pictures of a run, and measures the seconds of each."""
+    """Renders and develops pictures of a run."""
 
     def __init__(self, run: Run):
         self.run = run
-        self.render_seconds: list[float] = []
-        self.develop_seconds: list[float] = []
 
     def linear(self, shot: Shot) -> Layers:
         """Return linear radiance, alpha and alpha-weighted depth of a pinhole camera."""
-        with _timed(self.render_seconds):
-            return self._layers(shot)
+        return self._layers(shot)
 
     def wide(self, cylinder: Cylinder, at: float | None = None) -> Wide:
         """Return a wide view of the field; what moves is where it was `at` seconds, if anywhere."""
-        with _timed(self.render_seconds):
-            return render_wide(lambda shot: self._layers(replace(shot, time=at)), cylinder)
+        return render_wide(lambda shot: self._layers(replace(shot, time=at)), cylinder)
 
     def _layers(self, shot: Shot) -> Layers:
         result = self.run.render(shot.camera(), shot.time)
@@ -68,15 +62,7 @@ class RunRenderer:
         alpha: Float32[np.ndarray, "h w"],
     ):
         """Return display values, over the background if the transform has one."""
-        with _timed(self.develop_seconds):
-            return develop(linear, transform, alpha=alpha)
-
-
-@contextmanager
-def _timed(seconds: list[float]) -> Iterator[None]:
-    begin = time.perf_counter()
-    yield
-    seconds.append(time.perf_counter() - begin)
+        return develop(linear, transform, alpha=alpha)
 
 
 def metered_shots(

@@ -36,7 +36,6 @@ from p2gs_jax.viewer.pictures import (
     limits_of_depth,
     note,
     picture_of,
-    splat_colors,
     stops_legend,
     to_uint8_fast,
     warp_photograph,
@@ -48,13 +47,8 @@ from p2gs_jax.viewer.viewed_run import ViewedRun
 # Nothing has changed for this long: at rest, seconds.
 REST_S = 0.3
 JPEG_QUALITY = 85
-# Depth that is sent along to hide frusta: width in pixels, quantum and maximum in viewer units.
-DEPTH_WIDTH, DEPTH_STEP, FARTHEST = 480, 256e-5, 167.0
-# Least time between two updates of a million splats' colours, seconds.
-SPLATS_S = 1.0
 # A metered exposure comes this close (1/e) to what is seen within this time, seconds.
 ADAPT_S = 0.5
-BLACK = np.zeros((1, 1, 3), np.uint8)
 NO_PHOTOGRAPH = "No photograph was taken from here: choose one under Camera, Go to."
 
 Request = Literal["look", "camera", "rest"]
@@ -156,15 +150,12 @@ class Darkroom:
 
 
 class LivePicture:
-    """Renders and sends the picture of one browser, in a thread.
-
-    Where `with_depth` is set, depth is sent along, to hide frusta.
-    """
+    """Renders and sends the picture of one browser, in a thread."""
 
     def __init__(self, client: viser.ClientHandle, viewed: ViewedRun, panel: Panel):
         """Prepare the thread; `start` starts it."""
         self._client, self._viewed, self._panel = client, viewed, panel
-        self.darkroom, self.with_depth = Darkroom(viewed), False
+        self.darkroom = Darkroom(viewed)
         self._changed = threading.Condition()
         self._request: Request | None = "camera"
         self._rest_at: float | None = None  # when a picture at rest is due
@@ -174,8 +165,6 @@ class LivePicture:
         self._sharp = False  # whether it was shown at rest, and nothing has changed since
         self._moving: tuple[Size | None, float] = (None, 0.0)  # size and time of the last frame
         self._last_ms = 0.0
-        self._splats: viser.GaussianSplatHandle | None = None
-        self._colored: Settings | None = None
         self._thread = threading.Thread(target=self._work, name="draw", daemon=True)
 
     def start(self) -> None:
@@ -232,12 +221,7 @@ class LivePicture:
     def _work(self) -> None:
         while (request := self._take()) is not None:
             try:
-                settings = self._panel.settings()
-                if settings.splats:
-                    self._draw_splats(settings)
-                else:
-                    self._hide_splats()
-                    self._draw(request, settings)
+                self._draw(request, self._panel.settings())
             except Exception as error:
                 report(self._client, "This went wrong", error)
 
@@ -285,46 +269,12 @@ class LivePicture:
 
     def _show(self, frame: RenderedFrame, settings: Settings, *, sharp: bool) -> None:
         image = to_uint8_fast(self.darkroom.develop(frame, settings, settled=sharp))
-        self._client.scene.set_background_image(
-            image,
-            "png" if sharp else "jpeg",
-            jpeg_quality=JPEG_QUALITY,
-            depth=_depth_for_browser(frame, self._viewed.space.unit) if self.with_depth else None,
-        )
+        kind = "png" if sharp else "jpeg"
+        self._client.scene.set_background_image(image, kind, jpeg_quality=JPEG_QUALITY)
         self._client.flush()
         self._panel.set_legend(self.darkroom.legend(frame, settings))
 
-    def _draw_splats(self, settings: Settings) -> None:
-        if settings == self._colored:
-            return
-        handle = self._splats
-        if handle is None:
-            self._panel.set_status(note("preparing splats ..."))
-        splats = self._viewed.splats()
-        begin = time.monotonic()
-        colors = splat_colors(splats, display_of(self._viewed.run, settings), settings.mode)
-        if handle is None:
-            self._splats = self._client.scene.add_gaussian_splats(
-                "/splats", splats.centers, splats.covariances, colors, splats.opacities
-            )
-        else:
-            handle.rgbs = colors
-            handle.visible = True
-        self._colored, self._sharp = settings, False
-        self._client.scene.set_background_image(BLACK, "png")
-        self._panel.set_legend(stops_legend() if settings.mode == "stops" else None)
-        self._panel.set_status(note(f"{len(colors):,} splats, drawn by the browser"))
-        pause = SPLATS_S * len(colors) / 1e6 - (time.monotonic() - begin)
-        time.sleep(max(0.0, pause))
-
-    def _hide_splats(self) -> None:
-        if self._splats is not None and self._colored is not None:
-            self._splats.visible = False
-            self._colored = None
-
     def _update_status(self) -> None:
-        if self._panel.settings().splats:
-            return
         frame, renderer = self._frame, self._viewed.renderer
         busy, failure, parts = renderer.compiling, renderer.failure, []
         if frame is not None:
@@ -334,11 +284,3 @@ class LivePicture:
         if failure is not None:
             parts.append(html.escape(failure[:200]))
         self._panel.set_status(note(" &middot; ".join(parts) or "starting ..."))
-
-
-def _depth_for_browser(frame: RenderedFrame, unit: float) -> Float32[np.ndarray, "h w"]:
-    """Return depth in viewer units, coarse enough to be sent with every frame."""
-    step = max(1, frame.size[0] // DEPTH_WIDTH)
-    alpha, depth = frame.alpha[::step, ::step], frame.depth[::step, ::step]
-    expected = np.where(alpha > 0.5, unit * depth / np.maximum(alpha, 1e-6), FARTHEST)
-    return (np.rint(np.minimum(expected, FARTHEST) / DEPTH_STEP) * DEPTH_STEP).astype(np.float32)

@@ -27,7 +27,6 @@ MODES: dict[str, Mode] = {
 }
 MEAN = "mean of all"
 NOWHERE = "choose ..."
-FULL, SPLATS = "full (linear light)", "browser splats (fast)"
 KEYS = "Drag to orbit, right-drag to pan, scroll to approach; W A S D Q E fly, arrows turn."
 HINTS = {
     "Show": "The split needs a camera that stands where a photograph was taken.",
@@ -40,7 +39,6 @@ HINTS = {
     "Vignetting": "Darkens towards the corners as the camera of the matched photo does.",
     "Curve": "The tone curve from exposed light to display values.",
     "Match photo": "Sets all of this as a photograph was taken.",
-    "Renderer": "Browser splats move at any speed, but mix display values instead of light.",
     "Go to": "Stands where a photograph was taken, and matches its exposure and gamma.",
     "Lock exposure": "Go to, previous, next and split leave exposure, gamma and curve as they are.",
     "FOV": "Vertical field of view, degrees.",
@@ -120,13 +118,11 @@ class Panel:
         self._curves |= {c: c for c in get_args(ChosenCurve) if c not in ("run", curve)}
         self._curve = self._dropdown("Curve", list(self._curves))
         self._match = self._dropdown("Match photo", [MEAN, *self._names])
-        self._renderer = self._dropdown("Renderer", [FULL, SPLATS])
         look = (self._exposure, self._gamma, self._curve, self._split, self._vignetting)
         for handle in (*look, *self._balance):
             self._when_chosen(handle, lambda _: actions.display_changed())
         self._when_chosen(self._metered, actions.set_metered)
-        for handle in (self._mode, self._renderer):
-            self._when_chosen(handle, lambda _: actions.mode_changed())
+        self._when_chosen(self._mode, lambda _: actions.mode_changed())
         self._when_chosen(self._match, lambda name: actions.take_display_of(self._index(name)))
 
     def _add_camera(self) -> None:
@@ -219,7 +215,6 @@ class Panel:
             vignetting=self._vignetting.value,
             mode=MODES[self._mode.value],
             split=self._split.value,
-            splats=self._renderer.value == SPLATS,
             metered=self._metered.value,
         )
 

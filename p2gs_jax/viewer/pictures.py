@@ -1,28 +1,18 @@
-"""What the viewer shows of a rendered frame, in every mode, with its legend; also as files.
-
-The browser can draw splats itself: fast, but it composites display values instead of radiance, so
-soft edges differ a little. viser has no spherical harmonics: colours are those seen from one place.
-"""
+"""What the viewer shows of a rendered frame, in every mode, with its legend; also as files."""
 
 from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 import cv2
-import jax
-import jax.numpy as jnp
 import matplotlib
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, UInt8
-from scipy.spatial.transform import Rotation
-from scipy.special import expit
 
-from p2gs_jax.config import RenderConfig
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.false_color import (
     DEPTH_MAP,
@@ -37,8 +27,7 @@ from p2gs_jax.formats.false_color import (
 from p2gs_jax.formats.frames import to_uint8
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import places
-from p2gs_jax.render import view_radiance
-from p2gs_jax.types import Camera, Gaussians
+from p2gs_jax.types import Camera
 
 Mode = Literal["display", "stops", "clipping", "depth", "split"]
 # Exposed radiance at 0 stops.
@@ -46,8 +35,6 @@ MIDDLE_GREY = 0.18
 # Percentiles of depth at the ends of the colour scale.
 DEPTH_TAILS = (1.0, 99.0)
 LINE = 1.0
-# viser sends covariances of splats as 16-bit floats, at most 65504.
-LARGEST_DEVIATION = 250.0
 # Fewest and most pixels across of a saved picture.
 SAVED_WIDTHS = (16, 16384)
 BOX = "margin:0 0.75em 0.75em;font-size:0.75em;line-height:1.4;opacity:0.9"
@@ -214,57 +201,6 @@ def exr_bytes(frame: RenderedFrame, transform: DisplayTransform) -> bytes:
             camera=frame.camera,
         )
         return path.read_bytes()
-
-
-class BrowserSplats(NamedTuple):
-    """Splats in viewer units, with peak opacities and the radiance towards one place."""
-
-    centers: Float32[np.ndarray, "n 3"]
-    covariances: Float32[np.ndarray, "n 3 3"]
-    opacities: Float32[np.ndarray, "n 1"]
-    linear: Float32[np.ndarray, "n 3"]
-
-
-def browser_splats(
-    gaussians: Gaussians,
-    alive: Bool[np.ndarray, " n"],
-    cfg: RenderConfig,
-    *,
-    seen_from: Float[np.ndarray, " 3"],
-    unit: float,
-) -> BrowserSplats:
-    """Return live Gaussians as splats in colours seen from a place in scene units.
-
-    `unit` is the number of viewer units in a scene unit.
-    """
-    rows = np.flatnonzero(np.asarray(alive))
-    viewmat = np.eye(4, dtype=np.float32)
-    viewmat[:3, 3] = -np.asarray(seen_from)
-    there = Camera(jnp.asarray(viewmat), jnp.eye(3), 1, 1)
-    quats = np.asarray(gaussians.quats, float)[rows]
-    quats[np.linalg.norm(quats, axis=1) < 1e-30] = (1, 0, 0, 0)
-    scales = np.minimum(np.exp(np.asarray(gaussians.log_scales)[rows]) * unit, LARGEST_DEVIATION)
-    axes = Rotation.from_quat(quats, scalar_first=True).as_matrix() * scales[:, None, :]
-    logits = np.asarray(gaussians.opacity_logits, float)[rows]
-    return BrowserSplats(
-        (np.asarray(gaussians.means)[rows] * unit).astype(np.float32),
-        (axes @ axes.transpose(0, 2, 1)).astype(np.float32),
-        expit(logits)[:, None].astype(np.float32),
-        np.asarray(jax.jit(partial(view_radiance, cfg=cfg))(gaussians, there))[rows],
-    )
-
-
-def splat_colors(
-    splats: BrowserSplats, transform: DisplayTransform, mode: Mode
-) -> UInt8[np.ndarray, "n 3"]:
-    """Return a colour for each splat: false colour in mode `stops`, else display values.
-
-    What depends on the place in the image is left out.
-    """
-    column = splats.linear[:, None]
-    if mode == "stops":
-        return to_uint8_fast(false_color(column, MIDDLE_GREY / transform.exposure))[:, 0]
-    return to_uint8_fast(develop(column, transform.without_place()))[:, 0]
 
 
 def stops_legend() -> str:

@@ -131,8 +131,6 @@ class BrowserSession:
         with self._one_at_a_time:
             frusta = self._frusta or self._add_frusta()
             frusta.show(visible, scale)
-        self._live.with_depth = visible
-        self._live.display_changed()
 
     def _add_frusta(self) -> Frusta:
         viewed, views = self._viewed, self._run.scene.views

@@ -27,8 +27,7 @@ class Settings:
         balance_ev: gains of red and of blue over green, stops; None where the run models none.
         vignetting: whether that camera's vignetting is shown.
         split: share of the photograph in `split`.
-        splats: whether the browser draws splats itself, instead of the renderer's pictures.
-        metered: whether the exposure follows what is seen; not of the browser's splats.
+        metered: whether the exposure follows what is seen.
     """
 
     gamma: float
@@ -39,7 +38,6 @@ class Settings:
     vignetting: bool = True
     mode: Mode = "display"
     split: float = 0.5
-    splats: bool = False
     metered: bool = False
 
 
@@ -64,7 +62,7 @@ def _taken(before: Settings, shown: DisplayTransform, ev: float, view: int | Non
 
 def same_display(a: Settings, b: Settings) -> bool:
     """Return whether two settings have the same display transform, whatever their mode."""
-    return replace(a, mode=b.mode, split=b.split, splats=b.splats) == b
+    return replace(a, mode=b.mode, split=b.split) == b
 
 
 def display_of(run: Run, settings: Settings) -> DisplayTransform:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
-from functools import cache, cached_property, partial
+from functools import cache, partial
 
 import numpy as np
 from jaxtyping import UInt8
@@ -30,7 +29,7 @@ from p2gs_jax.viewer.camera import (
     viewmat_between,
     viewmats_of,
 )
-from p2gs_jax.viewer.pictures import BrowserSplats, browser_splats, to_uint8_fast
+from p2gs_jax.viewer.pictures import to_uint8_fast
 from p2gs_jax.viewer.renderer import Renderer
 
 # Views on which new programs are run.
@@ -51,13 +50,11 @@ class ViewedRun:
         """Find scale and orientation of the scene; compile nothing yet."""
         self.run, self.max_width, self.store = run, max_width, run.store
         self.listeners: list[Callable[[], None]] = []
-        self._lock = threading.Lock()
         self._thumbnails: dict[int, UInt8[np.ndarray, "h w 3"]] = {}
         # The programs of a viewer know no time.
-        self._gaussians = at_time(run.as_of(), None)
-        self._alive = on_device(np.ones(self._gaussians.capacity), bool)
+        gaussians = at_time(run.as_of(), None)
         points = run.scene.points
-        self._points = points if len(points) else np.asarray(self._gaussians.means)
+        self._points = points if len(points) else np.asarray(gaussians.means)
         self._centers = camera_centers(viewmats_of(run.scene.views))
         self.space = make_viewer_space(run.scene, self._points)
         # Typical distance to what a view sees, scene units.
@@ -65,8 +62,8 @@ class ViewedRun:
         self.distance = cache(lambda index: distance_seen(views[index].viewmat, self._points))
         probes = evenly_spaced(len(run.scene.views), PROBES)
         self.renderer = Renderer(
-            self._gaussians,
-            self._alive,
+            gaussians,
+            on_device(np.ones(gaussians.capacity), bool),
             run.cfg.render,
             [partial(self._probe, int(row)) for row in probes],
             self._notify,
@@ -140,18 +137,3 @@ class ViewedRun:
             return None
         self._thumbnails[index] = small = to_uint8_fast(ldr)
         return small
-
-    def splats(self) -> BrowserSplats:
-        """Return the scene as the browser's splats, in the colours seen from the cameras' mean."""
-        with self._lock:
-            return self._splats
-
-    @cached_property
-    def _splats(self) -> BrowserSplats:
-        return browser_splats(
-            self._gaussians,
-            np.asarray(self._alive),
-            self.run.cfg.render,
-            seen_from=self._centers.mean(0),
-            unit=self.space.unit,
-        )

@@ -40,9 +40,14 @@ WRONG = [
     ("fit castle --out run --densify.spread 1", "for example 0.5"),
     ("fit castle --out run --preset bset", "choose paper, paper_appendix, robust"),
     ("fit castle --out run --preset", "--preset"),
-    ("fit castle --out run --blocks some", "a whole number from 1 on, or auto"),
+    ("fit castle --out run --blocks some", "'some' is not a whole number, and not auto"),
+    ("fit castle --out run --blocks 0", "a whole number from 1 on, or auto"),
+    ("fit castle --out run --blocks 2 --jobs 0", "--jobs must be at least 1"),
+    ("fit castle --out run --blocks 2 --devices 2", "on one device"),
+    ("fit castle --out run --blocks 2 --engine ray", "no engine 'ray'"),
+    ("fit castle --out run --blocks 2 --preset 3dgs", "learns them"),
     ("fit castle --out run --jobs 2", "add --blocks auto, or a number"),
-    ("fit castle --out run --devices some", "give 1 or more, or all"),
+    ("fit castle --out run --devices 0", "from 1 on, or all"),
     ("fit castle --out run --known-deviation-ev 0.1", "add --known-exposures FILE"),
     ("fit castle --out run --known-exposures none.csv", "none.csv cannot be read"),
     ("fit castle --out run --reference nowhere", "give --reference a folder"),
@@ -81,8 +86,7 @@ WRONG = [
     ("synth new --layout village", "'street', 'town'"),
     ("sweep none.toml", "docs/sweeps.md"),
     ("sweep file.txt", "is not valid TOML"),
-    ("doctor --jsn", "--json"),
-    ("completion ksh", "'bash', 'zsh'"),
+    ("doctor --skip-selftest", "--skip-self-test"),
 ]
 
 

@@ -1,18 +1,14 @@
-"""Help that a person can work from: at once, at 80 columns, with examples that are right.
-
-And completion: scripts that the shells can read, with commands, options and paths.
-"""
+"""Help that a person can work from: at once, at 80 columns, with examples that are right."""
 
 import os
 import shlex
-import shutil
 import subprocess
 import sys
 
 import pytest
 
 from p2gs_jax.cli import main
-from p2gs_jax.cli.parser import COMMANDS, GROUPS, completion_script, parse
+from p2gs_jax.cli.parser import COMMANDS, GROUPS, parse
 from p2gs_jax.cli.shared import SHORT
 
 HEAVY = ("jax", "numpy", "cv2", "equinox", "rich")
@@ -37,7 +33,6 @@ def test_help_of_every_command(capsys, monkeypatch, name):
     assert code == 0
     options, _, examples = text.partition("Examples:")
     assert not wide(options)
-    assert "@" not in text
     # In a command's own options None says nothing.
     assert "{None}" not in text
     assert "default: None" not in text
@@ -154,72 +149,3 @@ def test_doctor_survives_what_it_looks_for(broken, module):
     assert "libfoo.so.1 is missing" in done.stdout
     assert "Traceback" not in done.stderr + done.stdout
     assert "force-reinstall" in done.stdout
-
-
-TRY = """
-source {script}
-try() {{
-  COMP_WORDS=("$@"); COMP_CWORD=$(( $# - 1 )); COMPREPLY=()
-  _p2gs_jax
-  echo "${{#COMPREPLY[@]}} ${{COMPREPLY[*]}}"
-}}
-"""
-
-
-@pytest.fixture(scope="module")
-def bash(tmp_path_factory):
-    """Return a function from the words before the cursor to what bash would offer."""
-    if shutil.which("bash") is None:
-        pytest.skip("there is no bash here")
-    folder = tmp_path_factory.mktemp("bash")
-    (folder / "completion").write_text(completion_script("bash"))
-    (folder / "elsewhere").mkdir()  # a checkout has `runs/` once the README was followed
-
-    def run(code):
-        argv = ["bash", "--norc", "-c", TRY.format(script=folder / "completion") + code]
-        done = subprocess.run(
-            argv, capture_output=True, text=True, check=True, cwd=folder / "elsewhere"
-        )
-        assert done.stderr == ""
-        return done.stdout.split()
-
-    return run
-
-
-@pytest.mark.parametrize(
-    ("words", "offered"),
-    [
-        ("re", "2 render report"),
-        ("cal", "1 calibrate"),
-        ("fit --pre", "1 --preset"),
-        ("fit --max-w", "1 --max-width"),
-        ("fit castle --photometry.cu", "1 --photometry.curve"),
-        ("synth town --sensor.curve f", "1 filmic"),
-        # A path of cameras is a word or a file; files are left to bash.
-        ('render RUN --path ""', "3 views drive orbit"),
-        ("render RUN --path dr", "1 drive"),
-        ("render RUN --path cameras.j", "0"),
-        ("fit cast", "0"),
-        ("fit castle --out ru", "0"),
-    ],
-)
-def test_bash_completes_commands_options_and_values(bash, words, offered):
-    assert bash(f"try p2gs-jax {words}") == offered.split()
-
-
-def test_bash_completes_presets_and_files(bash):
-    assert "paper_appendix" in bash('try p2gs-jax fit castle --preset ""')
-    assert "default" in bash("complete -p p2gs-jax")
-
-
-@pytest.mark.parametrize(("shell", "check"), [("zsh", "-n"), ("fish", "--no-execute")])
-def test_other_shells(tmp_path, shell, check):
-    text = completion_script(shell)
-    assert "--preset" in text
-    assert "calibrate" in text
-    assert "'choices': ['views', 'drive', 'orbit']" in text
-    path = tmp_path / "completion"
-    path.write_text(text)
-    if shutil.which(shell) is None:
-        pytest.skip(f"there is no {shell} here")
-    subprocess.run([shell, check, str(path)], check=True)

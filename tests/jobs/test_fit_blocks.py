@@ -170,22 +170,3 @@ def test_a_plan_is_kept_also_where_its_number_was_chosen(tmp_path):
     write_plan(tmp_path, cut, "auto")
     for asked in ("auto", "3"):
         assert read_plan(tmp_path, asked).blocks == cut.blocks
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("--blocks", "0"), "is not a number of blocks"),
-        (("--blocks", "many"), "is not a number of blocks"),
-        (("--jobs", "2"), "say nothing without --blocks"),
-        (("--blocks", "2", "--jobs", "0"), "--jobs must be at least 1"),
-        (("--blocks", "2", "--devices", "2"), "on one device"),
-        (("--blocks", "2", "--engine", "ray"), "no engine 'ray'"),
-        (("--blocks", "2", "--preset", "3dgs"), "learns them"),
-    ],
-)
-def test_wrong_words_end_with_a_message(run_command, tmp_path, words, said):
-    code, text = run_command("fit", tmp_path, "--out", tmp_path / "run", *words)
-    assert code == 2
-    assert said in text
-    assert not (tmp_path / "run").exists()

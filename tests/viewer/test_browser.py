@@ -14,8 +14,6 @@ pytestmark = pytest.mark.slow
 
 SIZE = {"width": 900, "height": 640}
 PATIENCE_S = 120
-# viser's splats are drawn with corners in two dimensions, which three.js remarks on once.
-VISERS_OWN = "computeBoundingSphere(): Computed radius is NaN"
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +36,7 @@ def page(browser, address):
     at_rest(page)
     yield page
     page.close()
-    assert [text for text in wrong if VISERS_OWN not in text] == []
+    assert wrong == []
 
 
 def at_rest(page):
@@ -105,10 +103,6 @@ def brightening(dark, light):
     return float(np.median(light[inside] / dark[inside]))
 
 
-def alike(a, b):
-    return float(np.corrcoef(a.ravel(), b.ravel())[0, 1])
-
-
 def test_one_stop_on_the_slider_doubles_the_brightness(page):
     choose(page, "Curve", "linear")
     enter(page, "Gamma", 2.2)
@@ -166,13 +160,3 @@ def test_the_picture_follows_keys_and_a_drive_until_it_is_paused(page):
     page.get_by_role("button", name="Pause").click()
     steady(page)
     assert page.get_by_role("button", name="Play").count() == 1
-
-
-def test_browser_splats_look_like_the_kernel(page):
-    kernel = picture(page)
-    choose(page, "Renderer", "browser splats (fast)")
-    page.get_by_text("drawn by the browser").wait_for()
-    # Display values mix differently from light, but things are where they were.
-    until(page, lambda now: np.any(now != kernel) and alike(now, kernel) > 0.85)
-    choose(page, "Renderer", "full (linear light)")
-    until(page, lambda now: np.abs(now - kernel).mean() < 0.01)

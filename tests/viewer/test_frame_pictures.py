@@ -7,14 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from splats import random_splats
 
-from p2gs_jax.config import CameraFormation, PhotometryConfig, RenderConfig
+from p2gs_jax.config import CameraFormation, PhotometryConfig
 from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.formats.false_color import OVER, clipping_overlay, depth_color, false_color, luminance
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import squared_radii
-from p2gs_jax.render import view_radiance
 from p2gs_jax.types import Camera
 from p2gs_jax.viewer import pictures
 
@@ -150,44 +148,6 @@ def test_vignetting_is_where_the_photograph_has_it():
     flat = pictures.picture_of(window, "display", transform.without_place(), taken_by=taken_by)
     assert np.ptp(flat) < 1e-6
     assert np.ptp(shown) > 0.1
-
-
-def splats_of(*, alive=True, cfg=None, **place):
-    g = random_splats(5, degree=1)
-    g = replace(g, quats=g.quats.at[0].set(0), log_scales=g.log_scales.at[-1].set(20.0))
-    place = {"seen_from": np.zeros(3), "unit": 1.0} | place
-    return g, pictures.browser_splats(g, np.broadcast_to(alive, 5), cfg or RenderConfig(), **place)
-
-
-def test_browser_splats_are_the_gaussians_in_viewer_units():
-    seen_from, cfg = np.array([0.5, -0.2, 1.0]), RenderConfig(sh_degree=1)
-    alive = np.array([True, True, True, False, True])
-    g, splats = splats_of(alive=alive, cfg=cfg, seen_from=seen_from, unit=2.0)
-    np.testing.assert_allclose(splats.centers, 2 * np.asarray(g.means)[alive], rtol=1e-6)
-    rotation = Rotation.from_quat(np.asarray(g.quats[1], float), scalar_first=True).as_matrix()
-    variances = (2 * np.exp(np.asarray(g.log_scales, float))) ** 2
-    expected = rotation @ np.diag(variances[1]) @ rotation.T
-    np.testing.assert_allclose(splats.covariances[1], expected, rtol=1e-4)
-    np.testing.assert_allclose(splats.covariances[0], np.diag(variances[0]), rtol=1e-4)
-    opacities = 1 / (1 + np.exp(-np.asarray(g.opacity_logits)[alive]))
-    np.testing.assert_allclose(splats.opacities[:, 0], opacities, rtol=1e-5)
-    # Half floats end at 65504.
-    assert np.isfinite(splats.covariances.astype(np.float16)).all()
-    largest = np.linalg.eigvalsh(splats.covariances[-1].astype(float))
-    np.testing.assert_allclose(largest, pictures.LARGEST_DEVIATION**2, rtol=1e-3)
-    towards = Camera(jnp.eye(4).at[:3, 3].set(-seen_from), jnp.eye(3), 1, 1)
-    radiance = np.asarray(view_radiance(g, towards, cfg))[alive]
-    np.testing.assert_allclose(splats.linear, radiance, rtol=1e-6)
-
-
-def test_splat_colours_are_developed_without_what_depends_on_the_place():
-    _, splats = splats_of()
-    shown = pictures.splat_colors(splats, TRANSFORM, "display").astype(float)
-    assert np.abs(shown - np.rint(255 * np.asarray(develop(splats.linear, TRANSFORM)))).max() <= 1
-    assert np.any(pictures.splat_colors(splats, TRANSFORM, "stops") != shown)
-    bilateral = PhotometryConfig(appearance="bilateral")
-    grid = DisplayTransform(2.0, 2.2, bilateral, np.ones((12, 8, 16, 16)))
-    np.testing.assert_array_equal(pictures.splat_colors(splats, grid, "display"), shown)
 
 
 def test_longer_exposures_are_lighter_and_unknown_ones_grey():

@@ -193,36 +193,6 @@ def test_what_fails_is_said_once_and_the_next_request_is_served(
     assert len(client.said) == said
 
 
-def test_depth_travels_only_where_cameras_are_shown(setup, client, viewed):
-    setup.live.start()
-    seen = client.wait_sharp()
-    assert setup.pictures[-1][2]["depth"] is None
-    setup.live.with_depth = True
-    setup.live.display_changed()
-    client.wait_sharp(seen)
-    depth, frame = setup.pictures[-1][2]["depth"], setup.live._frame
-    opaque = frame.alpha > 0.9
-    expected = viewed.space.unit * frame.depth / np.maximum(frame.alpha, 1e-6)
-    np.testing.assert_allclose(depth[opaque], np.minimum(expected[opaque], 167), atol=2e-3)
-    assert np.all(depth[frame.alpha < 0.4] > 160)
-
-
-def test_the_browser_draws_splats_itself(setup, client):
-    setup.live.start()
-    seen, before = client.wait_sharp(), len(setup.renderer.rendered)
-    for ev in (0.0, 1.0):
-        setup.panel.now = Settings(gamma=2.2, exposure_ev=ev, splats=True)
-        setup.live.display_changed()
-        seen = client.wait_sharp(seen)
-    (handle,) = client.splats
-    assert handle.visible
-    assert len(setup.renderer.rendered) == before
-    setup.panel.now = Settings(gamma=2.2)
-    setup.live.camera_moved()
-    client.wait(lambda: shape(setup.pictures[-1]) == CANVAS)
-    assert not handle.visible
-
-
 # ------------------------------------------------------------------ the darkroom
 
 

@@ -42,11 +42,9 @@ class Client:
     """A browser."""
 
     def __init__(self):
-        self.pictures, self.said, self.files, self.splats = [], [], [], []
+        self.pictures, self.said, self.files = [], [], []
         self.came = threading.Condition()
-        self.scene = SimpleNamespace(
-            set_background_image=self.show, add_gaussian_splats=self.add_splats
-        )
+        self.scene = SimpleNamespace(set_background_image=self.show)
         place = {"wxyz": np.array([1.0, 0, 0, 0]), "position": np.zeros(3), "fov": 0.9}
         size = {"image_width": CANVAS[0], "image_height": CANVAS[1]}
         self.camera = SimpleNamespace(on_update=lambda call: None, **place, **size)
@@ -59,10 +57,6 @@ class Client:
 
     def show(self, image, kind, **more):
         self.keep(self.pictures, (kind, image, more))
-
-    def add_splats(self, *content):
-        self.splats.append(SimpleNamespace(rgbs=content[3], visible=True))
-        return self.splats[-1]
 
     def add_notification(self, title, body, **more):
         self.keep(self.said, body)

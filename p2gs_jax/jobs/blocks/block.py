@@ -42,19 +42,12 @@ OUTSIDE = 1.6
 
 @dataclasses.dataclass(frozen=True)
 class BlockScene:
-    """A block as a scene of its own.
+    """A block as a scene of its own."""
 
-    Attributes:
-        scene: its training views, its points first.
-        exposures: with radiances, as solved for all blocks.
-        shell: where what lies behind everything is.
-        own: how many of the points lie in the block; the others are coarse.
-    """
-
-    scene: Scene
-    exposures: Exposures
-    shell: Sphere
-    own: int
+    scene: Scene  # its training views, its points first
+    exposures: Exposures  # with radiances, as solved for all blocks
+    shell: Sphere  # where what lies behind everything is
+    own: int  # how many of the points lie in the block; the others are coarse
 
 
 def block_scene(scene: Scene, shared: Shared, cut: Cut, number: int) -> BlockScene:
@@ -69,15 +62,9 @@ def block_scene(scene: Scene, shared: Shared, cut: Cut, number: int) -> BlockSce
 
 
 def block_job(scene: Path, run: Path, folder: Path, cut: Cut, number: int, cfg: FitConfig) -> Job:
-    """Return the job of a block.
+    """Return the job of a block, from the folders of the scene, of the whole run and of all blocks.
 
-    Args:
-        scene: folder of the scene.
-        run: run folder of the whole; its cache is read.
-        folder: of the blocks, with what they share.
-        cut: of the scene.
-        number: of the block.
-        cfg: of the whole.
+    The cache of the whole run is read; the folder of the blocks has what they share.
     """
     arguments = {
         "scene": str(scene.absolute()),
@@ -93,15 +80,9 @@ def block_job(scene: Path, run: Path, folder: Path, cut: Cut, number: int, cfg: 
 def block_config(
     cfg: FitConfig, cut: Cut, number: int, block: Scene, own: int, *, train_views: int
 ) -> FitConfig:
-    """Return the options of a block: its share of the steps and of the Gaussians.
+    """Return the options of a block: its share of the steps and of the Gaussians of `cfg`.
 
-    Args:
-        cfg: of the whole.
-        cut: of the scene.
-        number: of the block.
-        block: its scene.
-        own: how many of its points lie in the block.
-        train_views: number of training views of the whole.
+    `own` of the points of its scene lie in the block; the whole has so many `train_views`.
     """
     share = len(cut.blocks[number].views) / train_views
     train, densify = cfg.train, cfg.densify

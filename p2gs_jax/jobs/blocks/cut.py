@@ -6,8 +6,9 @@ outer edge, so that every point of space is in the core of exactly one block.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -35,15 +36,10 @@ MOST_LOOKED = 48
 
 @dataclass(frozen=True)
 class Ground:
-    """The plane in which cells lie.
+    """The plane in which cells lie."""
 
-    Attributes:
-        origin: middle of the cameras, scene units.
-        axes: unit vectors, the one along which cameras spread most first.
-    """
-
-    origin: Float[np.ndarray, " 3"]
-    axes: Float[np.ndarray, "2 3"]
+    origin: Float[np.ndarray, " 3"]  # middle of the cameras, scene units
+    axes: Float[np.ndarray, "2 3"]  # unit vectors; cameras spread most along the first
 
     def place(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 2"]:
         """Return where in the plane points lie."""
@@ -52,17 +48,11 @@ class Ground:
 
 @dataclass(frozen=True)
 class Block:
-    """A cell, and the photographs that show it.
+    """A cell, and the photographs that show it."""
 
-    Attributes:
-        lower: least coordinates in the plane; -inf at an outer edge.
-        upper: greatest ones, which belong to the neighbour.
-        views: rows among the training views.
-    """
-
-    lower: tuple[float, float]
-    upper: tuple[float, float]
-    views: tuple[int, ...] = ()
+    lower: tuple[float, float]  # least coordinates in the plane; -inf at an outer edge
+    upper: tuple[float, float]  # greatest ones, which belong to the neighbour
+    views: tuple[int, ...] = ()  # rows among the training views
 
     def holds(
         self, places: Float[np.ndarray, "p 2"], margin: float = 0.0
@@ -80,16 +70,10 @@ class Block:
 
 @dataclass(frozen=True)
 class Cut:
-    """A scene's blocks.
+    """A scene's blocks."""
 
-    Attributes:
-        ground: the plane of the cells.
-        margin: how far blocks reach beyond their cores, scene units.
-        blocks: with their views.
-    """
-
-    ground: Ground
-    margin: float
+    ground: Ground  # the plane of the cells
+    margin: float  # how far blocks reach beyond their cores, scene units
     blocks: tuple[Block, ...]
 
     def core(self, number: int, points: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, " p"]:
@@ -98,15 +82,13 @@ class Cut:
 
     def neighbours(self) -> list[tuple[int, int]]:
         """Return the pairs of blocks whose cores touch, be it at a corner."""
-        found = []
-        for a, first in enumerate(self.blocks):
-            for b in range(a + 1, len(self.blocks)):
-                second = self.blocks[b]
-                low = np.maximum(first.lower, second.lower)
-                high = np.minimum(first.upper, second.upper)
-                if (high >= low).all():
-                    found.append((a, b))
-        return found
+        low, high = (np.array([getattr(b, k) for b in self.blocks]) for k in ("lower", "upper"))
+        pairs = itertools.combinations(range(len(self.blocks)), 2)
+        return [
+            (a, b)
+            for a, b in pairs
+            if (np.minimum(high[a], high[b]) >= np.maximum(low[a], low[b])).all()
+        ]
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values; edges that are none become null."""
@@ -114,10 +96,7 @@ class Cut:
             "origin": self.ground.origin.tolist(),
             "axes": self.ground.axes.tolist(),
             "margin": self.margin,
-            "blocks": [
-                {"lower": list(b.lower), "upper": list(b.upper), "views": list(b.views)}
-                for b in self.blocks
-            ],
+            "blocks": [asdict(block) for block in self.blocks],
         }
 
     @classmethod
@@ -249,11 +228,6 @@ def shows(view: View, points: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, " p"
     return in_frame(*project_points(points, view), view.width, view.height)
 
 
-def views_of(scene: Scene, block: Block) -> Int[np.ndarray, " k"]:
-    """Return the rows in `scene.views` of a block's views."""
-    return np.asarray(scene.train_indices)[list(block.views)]
-
-
 def whole_of(scene: Scene, cut: Cut, number: int) -> tuple[Scene, Int[np.ndarray, " k"], int]:
     """Return a block as a scene: its views, its points, and coarse ones of what lies around it.
 
@@ -262,7 +236,7 @@ def whole_of(scene: Scene, cut: Cut, number: int) -> tuple[Scene, Int[np.ndarray
     block = cut.blocks[number]
     places = cut.ground.place(scene.points)
     near = block.holds(places, cut.margin)
-    rows = views_of(scene, block)
+    rows = np.asarray(scene.train_indices)[list(block.views)]
     beyond = np.flatnonzero(~near & _seen(scene, rows))
     distance = block.distance(places[beyond]) - cut.margin
     coarse = beyond[thinned(scene.points[beyond], distance)]

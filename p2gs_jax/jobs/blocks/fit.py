@@ -61,17 +61,11 @@ KEY = "districts"
 
 @dataclasses.dataclass(frozen=True)
 class Asked:
-    """How a scene is to be fitted in blocks.
+    """How a scene is to be fitted in blocks: as `fit_blocks` is asked."""
 
-    Attributes:
-        blocks: how many, or `auto`: as few as memory allows.
-        parallel: how many at a time on this machine.
-        engine: where they are fitted (`jobs.engines.open_engine`).
-    """
-
-    blocks: int | str = "auto"
-    parallel: int = 1
-    engine: str = LOCAL
+    blocks: int | str
+    parallel: int
+    engine: str
 
 
 def fit_blocks(

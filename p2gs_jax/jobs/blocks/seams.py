@@ -39,28 +39,19 @@ FEWEST_PIXELS = 50
 
 @dataclass(frozen=True)
 class Seam:
-    """How two blocks differ in the strip around their boundary.
+    """How two blocks differ in the strip around their boundary; None where nothing was compared.
 
-    Attributes:
-        blocks: their numbers.
-        views: that show the strip.
-        pixels: that were compared.
-        step_stops: median of the second's radiance over the first's, stops: what one sees as a
-            seam. None where nothing was compared.
-        spread_stops: median size of that ratio.
-        step_depth: median of the second's depth over the first's, less one.
-        spread_depth: median size of that.
-        levelled_stops: the step that was taken out before, as other views told it; None: nothing.
+    The step of radiance is what one sees as a seam.
     """
 
-    blocks: tuple[int, int]
-    views: int
-    pixels: int
-    step_stops: float | None
-    spread_stops: float | None
-    step_depth: float | None
-    spread_depth: float | None
-    levelled_stops: float | None = None
+    blocks: tuple[int, int]  # their numbers
+    views: int  # that show the strip
+    pixels: int  # that were compared
+    step_stops: float | None = None  # median of the second's radiance over the first's, stops
+    spread_stops: float | None = None  # median size of that ratio
+    step_depth: float | None = None  # median of the second's depth over the first's, less one
+    spread_depth: float | None = None  # median size of that
+    levelled_stops: float | None = None  # the step that was taken out before, as other views told
 
 
 def measure_seams(
@@ -74,13 +65,8 @@ def measure_seams(
 ) -> list[Seam]:
     """Compare neighbouring blocks, by all Gaussians of each, in training views of both.
 
-    Args:
-        scene: the whole.
-        store: its photographs; only their cameras are used.
-        cut: of the scene.
-        fitted: all Gaussians of each block.
-        cfg: rendering options.
-        which: selects among the views that two blocks share, in the order of the scene.
+    Of the photographs only the cameras are used; `which` selects among the views that two blocks
+    share, in the order of the scene.
     """
     return [
         _seam(scene, store, cut, (a, b), (fitted[a], fitted[b]), cfg, which)
@@ -109,17 +95,10 @@ def _seam(
             stops.append(found[0])
             depths.append(found[1])
     if not views:
-        return Seam(pair, 0, 0, None, None, None, None)
+        return Seam(pair, 0, 0)
     ratio, depth = np.concatenate(stops), np.concatenate(depths)
-    return Seam(
-        pair,
-        views,
-        len(ratio),
-        float(np.median(ratio)),
-        float(np.median(np.abs(ratio))),
-        float(np.median(depth)),
-        float(np.median(np.abs(depth))),
-    )
+    medians = (float(np.median(x)) for x in (ratio, np.abs(ratio), depth, np.abs(depth)))
+    return Seam(pair, views, len(ratio), *medians)
 
 
 def _compared(
@@ -156,13 +135,10 @@ def _compared(
 def level_seams(
     scene: Scene, store: ImageStore, cut: Cut, fitted: Sequence[Gaussians], cfg: RenderConfig
 ) -> tuple[list[Gaussians], list[Seam]]:
-    """Take steps between blocks out, and say what is left of them.
+    """Take steps between blocks out; return their Gaussians, and seams with what was taken out.
 
     Every second view of a boundary tells the step, the others judge: what is left is measured where
     nothing was fitted to. Arguments are those of `measure_seams`.
-
-    Returns:
-        All Gaussians of each block, and its seams, with what was taken out of each.
     """
     told = measure_seams(scene, store, cut, fitted, cfg, which=slice(0, None, 2))
     steps = {s.blocks: s.step_stops for s in told if s.step_stops is not None}
@@ -181,17 +157,12 @@ def shifts(
     means: Float[np.ndarray, "n 3"],
     steps: Mapping[tuple[int, int], float],
 ) -> Float[np.ndarray, " n"]:
-    """Return by how many stops a block's radiance is to grow at some places.
+    """Return by how many stops a block's radiance is to grow at some places (scene units).
 
     Where several blocks are near, their radiance becomes the mean of what each has, with weights
     that fall with the distance from its core: two blocks come out alike wherever no third is near,
-    and a block's own radiance stays where none is.
-
-    Args:
-        cut: of the scene.
-        number: of the block.
-        means: places, scene units.
-        steps: second block over first, stops; pairs without one have no part in each other's mean.
+    and a block's own radiance stays where none is. `steps` are of the second block over the first,
+    stops; pairs without one have no part in each other's mean.
     """
     places = cut.ground.place(means)
     reach = INWARDS * cut.margin / OVERLAP
@@ -213,14 +184,8 @@ def _near(distance: Float[np.ndarray, " n"], reach: float) -> Float[np.ndarray, 
 def merge_cores(cut: Cut, fitted: Sequence[Gaussians]) -> tuple[Gaussians, list[int]]:
     """Return the Gaussians whose centres lie in the core of the block that fitted them.
 
-    Cores cover space once: nothing is there twice, and nothing is left out.
-
-    Args:
-        cut: of the scene.
-        fitted: of each block, in its order.
-
-    Returns:
-        All of them, block after block, and how many each gave.
+    They stand block after block; also how many each gave. Cores cover space once: nothing is there
+    twice, and nothing is left out.
 
     Raises:
         UserError: there are none.

@@ -28,36 +28,22 @@ ARRAYS, DECISIONS = "shared.npz", "decisions.json"
 
 @dataclasses.dataclass(frozen=True)
 class Shared:
-    """What all blocks share: one gauge of radiance.
+    """What all blocks share: one gauge of radiance."""
 
-    Attributes:
-        photometry: of all training views, on the host.
-        decisions: what the scene settled; exposures stay.
-        radiance: of all points, linear.
-        shell: where what lies behind everything is.
-    """
-
-    photometry: Photometry
-    decisions: Decisions
-    radiance: Float32[np.ndarray, "p 3"]
-    shell: Sphere
+    photometry: Photometry  # of all training views, on the host
+    decisions: Decisions  # what the scene settled; exposures stay
+    radiance: Float32[np.ndarray, "p 3"]  # of all points, linear
+    shell: Sphere  # where what lies behind everything is
 
 
 @dataclasses.dataclass(frozen=True)
 class Solved:
-    """A scene whose exposures are solved.
+    """A scene whose exposures are solved."""
 
-    Attributes:
-        scene: with colours of the points.
-        shared: what the blocks are given.
-        selection: exposures with their errors.
-        notes: what the user should know.
-    """
-
-    scene: Scene
-    shared: Shared
-    selection: Selection
-    notes: tuple[str, ...]
+    scene: Scene  # with colours of the points
+    shared: Shared  # what the blocks are given
+    selection: Selection  # exposures with their errors
+    notes: tuple[str, ...]  # what the user should know
 
 
 def solve_shared(
