@@ -140,23 +140,23 @@ class Sweep:
 
     def execute(self) -> int:
         """Run the sweep and print its table; 1 where a run failed."""
+        from functools import partial
+
         from p2gs_jax.cli.tables import make_table, stdout
+        from p2gs_jax.core.progress import TerminalReporter
         from p2gs_jax.jobs.configs import read_sweep
         from p2gs_jax.jobs.sweep import brief, failures, sweep
-        from p2gs_jax.jobs.table import JobsTable
+        from p2gs_jax.jobs.table import show
 
-        console, wanted = stdout(), read_sweep(self.file)
-        with JobsTable(console) as table:
+        console, wanted = stdout(), dict(vars(read_sweep(self.file)))
+        own = {"out": self.out, "max_parallel": self.max_parallel}
+        wanted |= {name: value for name, value in own.items() if value is not None}
+        with TerminalReporter() as reporter:
             result = sweep(
-                wanted.scene,
-                self.out or wanted.out,
-                wanted.configs,
-                seeds=wanted.seeds,
-                reference=wanted.reference,
-                max_parallel=self.max_parallel or wanted.max_parallel,
+                **wanted,
                 engine=self.engine,
-                report=table.say,
-                on_look=table.show,
+                report=reporter.message,
+                on_look=partial(show, reporter),
             )
         console.print(make_table(*brief(result.rows)))
         for line in failures(result.rows):

@@ -98,11 +98,7 @@ class Export:
 
 
 def display_transform(fitted: Run, options: Export) -> DisplayTransform:
-    """Return the display transform that the options ask for.
-
-    Raises:
-        UserError: the run has no such curve, or no such white balance.
-    """
+    """Return the display transform; UserError: the run has no such curve or white balance."""
     ev = options.exposure_ev or 0.0
     transform = fitted.common_display(ev)
     if options.exposure_of is not None:
@@ -125,11 +121,7 @@ def display_transform(fitted: Run, options: Export) -> DisplayTransform:
 
 
 def check_export(args: Export) -> None:
-    """Reject values that make no sense.
-
-    Raises:
-        UserError: one does not.
-    """
+    """Raise a UserError for values that make no sense."""
     ev, gamma, size = args.exposure_ev, args.gamma, args.size_mb
     check(bool(args.format), "--format names nothing", fix=f"choose from {', '.join(FORMATS)}")
     check(ev is None or abs(ev) <= 32, "--exposure-ev must be a number of stops from -32 to 32")

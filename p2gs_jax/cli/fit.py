@@ -100,15 +100,14 @@ class Fit:
         check(right, f"--devices {self.devices} is not a number of devices", fix=f"{whole} all")
 
     def _execute_in_blocks(self, count: int | str) -> int:
-        from rich.console import Console
+        from functools import partial
 
         from p2gs_jax.cli.tables import print_metrics
         from p2gs_jax.core.progress import TerminalReporter
         from p2gs_jax.jobs.blocks.fit import fit_blocks
-        from p2gs_jax.jobs.table import JobsTable
+        from p2gs_jax.jobs.table import show
 
-        console = Console(stderr=True, highlight=False)
-        with TerminalReporter(console) as reporter:
+        with TerminalReporter() as reporter:
             result = fit_blocks(
                 self.scene,
                 self.out,
@@ -119,7 +118,7 @@ class Fit:
                 reference=self.reference,
                 resume=self.resume,
                 reporter=reporter,
-                on_look=JobsTable(console, reporter.live).show,
+                on_look=partial(show, reporter),
             )
         print_metrics(result.metrics, self.out)
         return 0
@@ -187,11 +186,7 @@ class Calibrate:
         return all((self.scene / name).is_file() for name in ("config.json", "radiance.ply"))
 
     def checked(self) -> FitConfig:
-        """Return the configuration.
-
-        Raises:
-            UserError: a value makes no sense.
-        """
+        """Return the configuration; raise a UserError where a value makes no sense."""
         scene, is_run = self.scene, self.is_run
         own_size = self.config.data == FitConfig().data
         check(
@@ -221,11 +216,7 @@ class Calibrate:
 
 
 def checked(cfg: FitConfig) -> FitConfig:
-    """Return the configuration if its values make sense.
-
-    Raises:
-        UserError: one does not.
-    """
+    """Return the configuration; raise a UserError where a value makes no sense."""
     data, train, known, behind = cfg.data, cfg.train, cfg.photometry, cfg.render.background
     most = cfg.densify.max_gaussians
     check(data.max_width is None or data.max_width >= 16, "--max-width must be at least 16")

@@ -28,23 +28,20 @@ from p2gs_jax.paths.shots import Shot, of_camera, view_shots
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.run.read import Run
 
+Photograph = Callable[[int], Float32[np.ndarray, "h w 3"] | None]
 # A metered exposure follows what is seen within about this time, seconds.
 ADAPT_S = 0.5
 
 
 @dataclass(frozen=True)
 class Job:
-    """Frames to render, one by one as the iterator advances, and how many there are.
-
-    The size (width, height) is that of the largest, pixels. Shots are cameras that can be kept as
-    a file; panoramas have none. Notes are what the user should know.
-    """
+    """Frames to render, one by one as the iterator advances."""
 
     frames: Iterator[OutputFrame]
     count: int
-    size: tuple[int, int]
-    shots: Sequence[Shot] = ()
-    notes: Sequence[str] = ()
+    size: tuple[int, int]  # width and height of the largest, pixels
+    shots: Sequence[Shot] = ()  # cameras that can be kept as a file; panoramas have none
+    notes: Sequence[str] = ()  # what the user should know
 
 
 def _display_transform(fitted: Run, options: Render, shot: Shot | None = None) -> DisplayTransform:
@@ -88,10 +85,8 @@ def shots_of(
 ) -> Job:
     """Return the job of rendering pinhole cameras; those of a file replace the scene's.
 
-    `say` tells the user something while frames are rendered.
-
-    Raises:
-        UserError: the scene has no such views.
+    `say` tells the user something while frames are rendered. Raises a UserError where the scene has
+    no such views.
     """
     fitted, notes, photograph = renderer.run, [], None
     views = fitted.scene.views
@@ -100,7 +95,7 @@ def shots_of(
     elif options.path == "views":
         chosen = _chosen(options, fitted)
         shots = chosen if options.camera is None else of_camera(chosen, views, options.camera)
-        photograph = _Photographs(fitted, say)
+        photograph = _photographs(fitted, say)
     else:
         chosen = _chosen(options, fitted)
         own = of_camera(chosen, views, options.camera)
@@ -127,20 +122,20 @@ def shots_of(
     return Job(frames, len(shots), size, shots, notes)
 
 
-class _Photographs:
-    """Photographs to write beside their renders, where they exist."""
+def _photographs(fitted: Run, say: Callable[[str], None]) -> Photograph:
+    """Return a function to the photographs that are written beside renders, where they exist."""
+    missing = []
 
-    def __init__(self, fitted: Run, say: Callable[[str], None]):
-        self._fitted, self._say, self._silent = fitted, say, False
-
-    def __call__(self, index: int) -> Float32[np.ndarray, "h w 3"] | None:
+    def of(index: int) -> Float32[np.ndarray, "h w 3"] | None:
         try:
-            return self._fitted.photograph(index)
+            return fitted.photograph(index)
         except UserError as error:
-            if not self._silent:
-                self._say(f"Views without their photographs are NAME.png alone: {error.message}.")
-            self._silent = True
+            if not missing:
+                say(f"Views without their photographs are NAME.png alone: {error.message}.")
+            missing.append(index)
             return None
+
+    return of
 
 
 def _recorded(shots: list[Shot], options: Render, fitted: Run) -> list[Shot]:
@@ -156,11 +151,7 @@ def _recorded(shots: list[Shot], options: Render, fitted: Run) -> list[Shot]:
 
 
 def panoramas_of(options: Render, renderer: RunRenderer) -> Job:
-    """Return the job of rendering panoramas of a rig.
-
-    Raises:
-        UserError: the scene has no rig, or the rig has no such time steps.
-    """
+    """Return the job of rendering panoramas; UserError: there is no such rig, or time step."""
     fitted = renderer.run
     views = fitted.scene.views
     rig = find_rig(view_shots(views, fitted.cfg.data.max_width), views)

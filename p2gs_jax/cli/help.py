@@ -240,19 +240,19 @@ def _field_docs(kind: type) -> dict[str, str]:
     }
 
 
-def overview(commands: Mapping[str, type], groups: Mapping[str, tuple[str, ...]]) -> str:
+def overview(groups: Mapping[str, Mapping[str, type]]) -> str:
     """Return what `p2gs-jax --help` prints of commands, whose names stand under headings."""
-    indent = 2 + 2 + max(map(len, commands))
+    indent = 2 + 2 + max(len(name) for commands in groups.values() for name in commands)
     about = (
         "One linear HDR radiance field, and an exposure and a gamma for every view, from ordinary "
         "photographs."
     )
     lines = ["usage: p2gs-jax COMMAND [OPTIONS]", "", *_wrapped(about)]
-    for heading, names in groups.items():
+    for heading, commands in groups.items():
         lines += ["", heading]
-        for name in names:
+        for name, kind in commands.items():
             head = f"  {name}".ljust(indent)
-            lines += _wrapped(_paragraphs(commands[name])[0][0], head, " " * indent)
+            lines += _wrapped(_paragraphs(kind)[0][0], head, " " * indent)
     lines += [
         "",
         "p2gs-jax COMMAND --help   options and examples of one command",

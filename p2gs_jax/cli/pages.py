@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from p2gs_jax.cli.shared import RunPath, SceneFolder, check
-from p2gs_jax.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -34,15 +34,13 @@ class View:
         from p2gs_jax.cli.tables import stdout
         from p2gs_jax.run.read import load_run
 
-        try:
-            from p2gs_jax.viewer.server import check_address, serve
-        except ModuleNotFoundError as error:
-            if error.name is None or error.name.split(".")[0] != "viser":
-                raise
-            raise UserError(
-                "the viewer needs viser, which is not installed.",
-                fix="pip install 'p2gs-jax[viewer]'",
-            ) from None
+        check(
+            find_spec("viser") is not None,
+            "the viewer needs viser, which is not installed",
+            fix="pip install 'p2gs-jax[viewer]'",
+        )
+        from p2gs_jax.viewer.server import check_address, serve
+
         check(self.max_width >= 64, "--max-width must be at least 64")
         check_address(self.host, self.port)
         serve(

@@ -23,29 +23,17 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.presets import preset
 
 # Every class holds the options of a command and does what the command does: `execute` returns the
-# exit code.
-COMMANDS: dict[str, type] = {
-    "fit": Fit,
-    "calibrate": Calibrate,
-    "scene": Survey,
-    "render": Render,
-    "eval": Eval,
-    "export": Export,
-    "view": View,
-    "report": Report,
-    "compare": Compare,
-    "demo": Demo,
-    "synth": Synth,
-    "sweep": Sweep,
-    "doctor": Doctor,
+# exit code. The order is that of `p2gs-jax --help`: as a new user needs them.
+GROUPS: dict[str, dict[str, type]] = {
+    "First": {"doctor": Doctor, "demo": Demo},
+    "From photographs": {"scene": Survey, "fit": Fit, "calibrate": Calibrate},
+    "With a finished run": {
+        **{"view": View, "report": Report, "render": Render},
+        **{"export": Export, "eval": Eval, "compare": Compare},
+    },
+    "Data with truth, and many fits": {"synth": Synth, "sweep": Sweep},
 }
-# The order of `p2gs-jax --help`: as a new user needs them.
-GROUPS: dict[str, tuple[str, ...]] = {
-    "First": ("doctor", "demo"),
-    "From photographs": ("scene", "fit", "calibrate"),
-    "With a finished run": ("view", "report", "render", "export", "eval", "compare"),
-    "Data with truth, and many fits": ("synth", "sweep"),
-}
+COMMANDS = {name: kind for group in GROUPS.values() for name, kind in group.items()}
 WITH_PRESET = ("fit", "calibrate")
 # Their `--help` is short, and `--help-all` is not.
 WITH_CONFIGURATION = (*WITH_PRESET, "scene")
@@ -61,7 +49,7 @@ def parse(argv: list[str]) -> tuple[str, Any]:
     """
     first = argv[0] if argv else ""
     if first in HELP or first in (HELP_ALL, ""):
-        _print_and_exit(help_text.overview(COMMANDS, GROUPS), 0 if first else 2)
+        _print_and_exit(help_text.overview(GROUPS), 0 if first else 2)
     if first in VERSION:
         from p2gs_jax import __version__
 

@@ -124,11 +124,7 @@ class Render:
 
 
 def _load(options: Render) -> Run:
-    """Return the run with what moves as the options want it.
-
-    Raises:
-        UserError: it has no such object, curve or white balance.
-    """
+    """Return the run; UserError: it has no such object, curve or white balance."""
     from p2gs_jax.run.read import load_run
 
     fitted = load_run(options.run, options.scene)

@@ -59,11 +59,7 @@ SYNONYMS = {f"--{theirs}": ours for ours, names in OTHERS.items() for theirs in 
 
 
 def parse_duration(text: str) -> float:
-    """Return the seconds of `90`, `90s`, `5m` or `1h30m`.
-
-    Raises:
-        UserError: the text is not a valid duration.
-    """
+    """Return the seconds of `90`, `90s`, `5m` or `1h30m`; raise a UserError for anything else."""
     match = re.fullmatch(r"(?:(\d+)h)?(?:(\d+(?:\.\d+)?)m)?(?:(\d+(?:\.\d+)?)s?)?", text.strip())
     if match is None or not any(match.groups()):
         raise UserError(f"--budget {text!r} is not a valid duration.", fix="write 90s, 5m or 1h30m")
@@ -86,11 +82,7 @@ def check(condition: bool, text: str, *, fix: str | None = None) -> None:
 
 
 def check_option_names(command: str, argv: Sequence[str], options: Collection[str]) -> None:
-    """Reject options of other programs that are not in `options`, the command's own; name ours.
-
-    Raises:
-        UserError: there is an option of another program.
-    """
+    """Raise a UserError that names ours for options of other programs that are not in `options`."""
     for word in argv:
         name = word.split("=", 1)[0].replace("_", "-")
         ours = SYNONYMS.get(name)

@@ -110,22 +110,18 @@ class TerminalReporter(Reporter):
     def stage(self, name: str, done: int = 0, total: int = 0) -> None:
         """Show a stage and how far it is."""
         text = f"{name} {done}/{total}" if total else f"{name} ..."
-        if self.live is not None:
-            self.live.update(Text(text))
-        else:
-            self._now_and_then(text)
+        self.show(Text(text), text)
 
-    def _now_and_then(self, text: str) -> None:
-        """Print a line for those who watch a log, unless the last one is recent."""
-        if time.monotonic() - self._said_at >= EVERY_S:
+    def show(self, display: RenderableType, line: str) -> None:
+        """Show something in a terminal; elsewhere a line, unless the last one is recent."""
+        if self.live is not None:
+            self.live.update(display)
+        elif time.monotonic() - self._said_at >= EVERY_S:
             self._said_at = time.monotonic()
-            self.console.print(Text(text), soft_wrap=True)
+            self.console.print(Text(line), soft_wrap=True)
 
     def log(self, record: LogRecord) -> None:
         """Show loss, PSNR, Gaussians, views per second and the time left."""
-        if self.live is None:
-            self._now_and_then(f"{record.progress:.0%}, {record.summary()}")
-            return
         rate = 1 / record.step_seconds if record.step_seconds else 0.0
         left = "" if record.left_s is None else f"{clock(record.left_s)} left"
         bar = "█" * int(24 * record.progress)
@@ -139,4 +135,4 @@ class TerminalReporter(Reporter):
             f"{rate:.1f} views/s",
             left,
         )
-        self.live.update(table)
+        self.show(table, f"{record.progress:.0%}, {record.summary()}")

@@ -22,9 +22,8 @@ KEYS = ("scene", "reference", "out", "preset", "seeds", "max_parallel", "set", "
 def with_fields(cfg: FitConfig, fields: Mapping[str, Any]) -> FitConfig:
     """Return the configuration with the values of some dotted fields replaced.
 
-    Raises:
-        UserError: a field (`loss.relative_exposure.weight`) does not exist, or does not take the
-            value.
+    Raises a UserError where a field (`loss.relative_exposure.weight`) does not exist, or does not
+    take the value.
     """
     for name, value in fields.items():
         cfg = with_values(cfg, {name: _checked(cfg, name, value)})
@@ -95,11 +94,8 @@ def _shown(hint: Any) -> str:
 def grid(base: FitConfig, **axes: Sequence[Any]) -> dict[str, FitConfig]:
     """Return every combination of some fields' values, by a name that lists them.
 
-    All other fields are those of `base`. Double underscores stand for dots in the names of
-    `axes`, as in `loss__relative_exposure__weight=[0.01, 0.1]`.
-
-    Raises:
-        UserError: see `with_fields`.
+    All other fields are those of `base`. Double underscores stand for dots in the names of `axes`,
+    as in `loss__relative_exposure__weight=[0.01, 0.1]`. Raises what `with_fields` does.
     """
     return _product(base, {name.replace("__", "."): values for name, values in axes.items()})
 

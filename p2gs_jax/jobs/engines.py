@@ -36,11 +36,7 @@ def is_lost(error: BaseException) -> bool:
 
 
 def check_engine(name: str) -> None:
-    """Refuse an engine that does not exist, or whose library is not installed.
-
-    Raises:
-        UserError: with what to write or install instead.
-    """
+    """Raise a UserError for an engine that does not exist, or whose library is not installed."""
     if name == LOCAL:
         return
     if name.startswith("dask://"):
@@ -63,14 +59,10 @@ def check_engine(name: str) -> None:
 def open_engine(name: str, parallel: int, folder: Path) -> Iterator[Executor]:
     """Yield an engine; when the block ends it waits for what still runs.
 
-    Args:
-        name: see `check_engine`; OPTIONs of Slurm are those of submitit's `update_parameters`
-            (timeout_min, slurm_partition, gpus_per_node, ...).
-        parallel: jobs at a time on this machine; a Dask scheduler and Slurm decide for themselves.
-        folder: for submitit's files; seen by all machines.
-
-    Raises:
-        UserError: there is no such engine, or it does not answer.
+    OPTIONs of Slurm are those of submitit's `update_parameters` (timeout_min, slurm_partition,
+    gpus_per_node, ...); its files go into `folder`, which all machines see. On this machine
+    `parallel` jobs run at a time; a Dask scheduler and Slurm decide for themselves. Raises a
+    UserError where there is no such engine, or it does not answer.
     """
     check_engine(name)
     if parallel < 1:

@@ -13,7 +13,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
-from p2gs_jax.core.atomic import write_json
+from p2gs_jax.core.atomic import atomic_write, write_json
 from p2gs_jax.core.progress import LogRecord, Reporter
 
 # In the folder of a job that failed.
@@ -95,11 +95,7 @@ def write_job(folder: Path, job: Job) -> JobFiles:
 
 
 def read_job(path: Path) -> Job:
-    """Read a job file.
-
-    Raises:
-        ImportError, AttributeError: this version of the package does not have the task.
-    """
+    """Read a job file; ImportError, AttributeError: this version does not have its task."""
     saved = json.loads(path.read_text(encoding="utf-8"))
     module, name = saved["task"].split(":")
     task = getattr(import_module(module), name)
@@ -144,11 +140,8 @@ class ProgressFile(Reporter):
         if not now and time.monotonic() - self._written < EVERY_S:
             return
         self._written = time.monotonic()
-        # Not synced to the disk: nobody misses what a crash loses here.
-        beside = self.path.with_name(f".{self.path.name}.{os.getpid()}")
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError), atomic_write(self.path, durable=False) as beside:
             beside.write_text(json.dumps({**state, "pid": os.getpid()}), encoding="utf-8")
-            os.replace(beside, self.path)
 
 
 def read_progress(path: Path) -> dict[str, Any] | None:

@@ -38,16 +38,11 @@ def run_jobs(
     on_look: Callable[[Sequence[JobState]], None] = lambda states: None,
     run: Runner = run_in_process,
 ) -> list[JobState]:
-    """Run jobs and wait for all; a job that fails leaves its reason and ends nothing else.
+    """Run jobs of different names; one that fails leaves its reason and ends nothing else.
 
-    Args:
-        jobs: of different names.
-        engine: from `open_engine`.
-        folder: for job files, progress and output of the jobs; all machines see it.
-        on_end: called with the number of a job that has ended, in this thread; once more where a
-            signal came into the call.
-        on_look: called with all states, twice a second.
-        run: what the engine calls for each job file.
+    The folder is for job files, progress and output; all machines see it. `run` is what the engine
+    calls for each job file. `on_look` is called with all states, twice a second; `on_end` with the
+    number of a job that has ended, in this thread, and once more where a signal came into the call.
 
     Raises:
         KeyboardInterrupt: a signal asked for the end; the jobs under way were asked as well, and

@@ -161,11 +161,7 @@ def fit_job(name: str, scene: Path, run: Path, cfg: FitConfig, reference: Path |
 
 
 def fit_task(folder: Path, arguments: dict[str, Any], reporter: Reporter) -> None:
-    """Fit, or go on with a fit, under the arguments of a `fit_job`.
-
-    Raises:
-        UserError: see `fit`.
-    """
+    """Fit, or go on with a fit, under the arguments of a `fit_job`; raises what `fit` does."""
     use_compile_cache()
     tune_process()
     fit(

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 
-from rich.console import Console
-from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from p2gs_jax.core.progress import EVERY_S, clock
+from p2gs_jax.core.progress import TerminalReporter, clock
 from p2gs_jax.jobs.job import JobState
 
 # Rows that a terminal has room for; of more, those that run come first.
@@ -18,39 +15,9 @@ MOST_ROWS = 20
 _ORDER = ("running", "waiting", "failed", "stopped", "done")
 
 
-class JobsTable:
-    """Shows the states of jobs, as a context manager.
-
-    Args:
-        live: a display that then shows the table; None: the table has its own.
-    """
-
-    def __init__(self, console: Console, live: Live | None = None):
-        self.console = console
-        self._live = live
-        self._said_at = time.monotonic()
-
-    def __enter__(self) -> JobsTable:
-        if self.console.is_terminal:
-            self._live = Live(console=self.console, refresh_per_second=4, transient=True)
-            self._live.start()
-        return self
-
-    def __exit__(self, *error) -> None:
-        if self._live is not None:
-            self._live.stop()
-
-    def show(self, states: Sequence[JobState]) -> None:
-        """Show how far all are."""
-        if self._live is not None:
-            self._live.update(table_of(states))
-        elif time.monotonic() - self._said_at >= EVERY_S:
-            self._said_at = time.monotonic()
-            self.console.print(Text(line_of(states)), soft_wrap=True)
-
-    def say(self, text: str) -> None:
-        """Print a line that stays."""
-        self.console.print(Text(text), soft_wrap=True)
+def show(reporter: TerminalReporter, states: Sequence[JobState]) -> None:
+    """Show how far all jobs are."""
+    reporter.show(table_of(states), line_of(states))
 
 
 def table_of(states: Sequence[JobState]) -> Table:

@@ -144,12 +144,6 @@ def fov_that_holds(view: View, aspect: float) -> float:
     return float(np.clip(fov, SMALLEST_FOV, LARGEST_FOV))
 
 
-def frames_of(scene: Scene, camera: str) -> tuple[int, ...]:
-    """Return the rows of a physical camera's views, in the order of names."""
-    rows = [i for i, view in enumerate(scene.views) if view.camera == camera]
-    return tuple(sorted(rows, key=lambda i: scene.views[i].name))
-
-
 def viewmat_between(viewmats: Float[np.ndarray, "k 4 4"], place: float) -> Float[np.ndarray, "4 4"]:
     """Return the matrix at a place along recorded poses: 0 is the first, 1 the second.
 

@@ -135,8 +135,7 @@ class Renderer:
     def render_now(self, camera: Camera) -> RenderedFrame:
         """Return a frame of any size, however long its program takes to compile.
 
-        Raises:
-            UserError: it would need more memory than is reasonable.
+        Raises a UserError where it would need more memory than is reasonable.
         """
         if int(count_needed(*self._scene, camera, cfg=self._cfg)) > MOST_ENTRIES:
             raise UserError(

@@ -16,10 +16,8 @@ import io
 import ipaddress
 import os
 import secrets
-import signal
 import socket
 import threading
-import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -139,11 +137,7 @@ def _tokens(request: Request) -> list[str]:
 
 
 def check_address(host: str, port: int) -> None:
-    """Check that a server can listen on an address.
-
-    Raises:
-        UserError: the port is taken or not allowed, or the host is none of this machine's.
-    """
+    """Raise a UserError unless a server can listen on an address."""
     if not 0 <= port <= 65535:
         raise UserError(f"--port {port} is not a valid port.", fix="choose one from 1024 to 65535")
     try:
@@ -170,8 +164,7 @@ def check_address(host: str, port: int) -> None:
 def open_viewer(run: Run, *, host: str, port: int, max_width: int) -> Iterator[str]:
     """Serve a run until the block ends; yield the address to open, with its token if it needs one.
 
-    Raises:
-        UserError: the port or the host cannot be listened on.
+    Raises a UserError where nothing can listen there.
     """
     check_address(host, port)
     # viser warns when a browser disconnects while a picture is being sent.
@@ -241,31 +234,14 @@ def _set_up_server(
 
 
 def serve(run: Run, *, host: str, port: int, max_width: int, say: Callable[[str], None]) -> None:
-    """Serve a run until Ctrl-C or SIGTERM; a second one ends the process at once.
+    """Serve a run until Ctrl-C or SIGTERM, which have to raise (`core.interrupts`).
 
-    For the main thread; `say` prints a line.
-
-    Raises:
-        UserError: one cannot listen there.
+    `say` prints a line. Raises a UserError where nothing can listen there.
     """
-    asked: list[int] = []
-
-    def end(number: int, frame: object) -> None:
-        if asked:
-            os._exit(128 + number)
-        asked.append(number)
-
-    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        with open_viewer(run, host=host, port=port, max_width=max_width) as address:
-            who = "only this machine" if is_loopback(host) else "any machine with this address"
-            say(
-                f"{run.params.gaussians.capacity} Gaussians at {address} (open to {who}; Ctrl-C "
-                "ends)"
-            )
-            while not asked:
-                time.sleep(0.1)
-            say("Ending, once what is being compiled is done.")
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    with open_viewer(run, host=host, port=port, max_width=max_width) as address:
+        who = "only this machine" if is_loopback(host) else "any machine with this address"
+        count = run.params.gaussians.capacity
+        say(f"{count} Gaussians at {address} (open to {who}; Ctrl-C ends)")
+        with contextlib.suppress(KeyboardInterrupt):
+            threading.Event().wait()
+        say("Ending, once what is being compiled is done.")

@@ -18,27 +18,19 @@ ChosenCurve = Literal["run", "srgb", "power", "linear"]
 class Settings:
     """The display transform and the mode.
 
-    Attributes:
-        exposure_ev: stops from the geometric mean of the training exposures, or from the metered
-            exposure.
-        curve: `run` is what the fit chose.
-        taken_as: row in `scene.views` of the view whose correction and whose camera's vignetting
-            and response apply, or None for the mean and no camera.
-        balance_ev: gains of red and of blue over green, stops; None where the run models none.
-        vignetting: whether that camera's vignetting is shown.
-        split: share of the photograph in `split`.
-        metered: whether the exposure follows what is seen.
+    `taken_as` is the row in `scene.views` of the view whose correction and whose camera's
+    vignetting and response apply; None is the mean, and no camera.
     """
 
     gamma: float
-    exposure_ev: float = 0.0
-    curve: ChosenCurve = "run"
+    exposure_ev: float = 0.0  # stops from the mean training exposure, or from the metered one
+    curve: ChosenCurve = "run"  # what the fit chose
     taken_as: int | None = None
-    balance_ev: tuple[float, float] | None = None
-    vignetting: bool = True
+    balance_ev: tuple[float, float] | None = None  # of red and blue over green, where modelled
+    vignetting: bool = True  # whether that camera's is shown
     mode: Mode = "display"
-    split: float = 0.5
-    metered: bool = False
+    split: float = 0.5  # share of the photograph in `split`
+    metered: bool = False  # whether the exposure follows what is seen
 
 
 def common_settings(run: Run, before: Settings | None = None) -> Settings:

@@ -23,7 +23,6 @@ from p2gs_jax.viewer.camera import (
     camera_of_browser,
     distance_seen,
     fov_that_holds,
-    frames_of,
     make_viewer_space,
     pose_of,
     viewmat_between,
@@ -122,8 +121,10 @@ class ViewedRun:
         return self._pose_at(viewmat, nearest, aspect), nearest
 
     def frames(self, camera: str) -> tuple[int, ...]:
-        """Return the rows of a physical camera's views."""
-        return frames_of(self.run.scene, camera)
+        """Return the rows of a physical camera's views, in the order of names."""
+        views = self.run.scene.views
+        rows = (row for row, view in enumerate(views) if view.camera == camera)
+        return tuple(sorted(rows, key=lambda row: views[row].name))
 
     def thumbnail(self, index: int) -> UInt8[np.ndarray, "h w 3"] | None:
         """Return a small picture of a photograph, or None where it cannot be read."""

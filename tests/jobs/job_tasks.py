@@ -32,14 +32,3 @@ def count(folder, arguments, reporter):
         os._exit(3)
     elif todo == "wait":
         time.sleep(120)
-
-
-def fit_with_least_effort(folder, arguments, reporter):
-    """Fit, compiling as the tests' own process does (conftest)."""
-    from p2gs_jax.jobs.sweep import fit_task
-    from p2gs_jax.render import xla_cpu
-
-    flags = [word.removeprefix("--").split("=") for word in os.environ["XLA_FLAGS"].split()]
-    values = {"true": True, "false": False}
-    xla_cpu._CPU_OPTIONS = {k: values[v] if v in values else int(v) for k, v in flags}
-    fit_task(folder, arguments, reporter)

@@ -1,6 +1,5 @@
-"""A scheduler and two workers on loopback; one worker is killed while it fits."""
+"""A scheduler and two workers on loopback; one worker is killed while it works."""
 
-import dataclasses
 import json
 import os
 import signal
@@ -10,33 +9,14 @@ import time
 from pathlib import Path
 
 import pytest
-from job_tasks import fit_with_least_effort
-from tiny_scene import make_scene
+from job_tasks import count
 
-import p2gs_jax
 from p2gs_jax.errors import UserError
-from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.jobs.engines import open_engine
-from p2gs_jax.jobs.job import JobFiles, read_progress
+from p2gs_jax.jobs.job import Job, JobFiles, read_progress
 from p2gs_jax.jobs.run import run_jobs
-from p2gs_jax.jobs.sweep import fit_job
 
 pytest.importorskip("distributed")
-
-STEPS = 150
-SMALL = with_fields(
-    p2gs_jax.preset("robust"),
-    {
-        "train.steps": STEPS,
-        "train.coarse_to_fine": [],
-        # After every burst.
-        "train.checkpoint_every_s": 0.0,
-        "densify.max_gaussians": 300,
-        "render.sh_degree": 0,
-        "init.dense": "off",
-        "init.shell": "off",
-    },
-)
 
 
 @pytest.fixture
@@ -80,26 +60,20 @@ def _parent(pid: int) -> int:
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="parents are read from /proc")
 def test_a_killed_worker_costs_nothing_but_time(cluster, tmp_path):
     engine_name, workers = cluster
-    run, files = tmp_path / "run", JobFiles(tmp_path / "jobs" / "fit.json")
-    job = fit_job("fit", make_scene(tmp_path / "scene"), run, SMALL, None)
-    job = dataclasses.replace(job, task=fit_with_least_effort)
-    killed = []
+    job, killed = Job("one", tmp_path / "one", count, {"first": "wait"}), []
+    files = JobFiles(tmp_path / "jobs" / "one.json")
 
     def kill_its_worker(states):
-        saved = [path.name for path in (run / "checkpoints").glob("*") if path.name.isdigit()]
-        if killed or not saved:
-            return
-        killed.append(_parent(read_progress(files.progress)["pid"]))
-        assert killed[0] in [w.pid for w in workers]
-        os.kill(killed[0], signal.SIGKILL)
+        if not killed and states[0].doing == "Counting":
+            killed.append(_parent(read_progress(files.progress)["pid"]))
+            assert killed[0] in [w.pid for w in workers]
+            os.kill(killed[0], signal.SIGKILL)
 
     with open_engine(engine_name, 1, tmp_path) as engine:
         (state,) = run_jobs([job], engine, tmp_path / "jobs", on_look=kill_its_worker)
-    assert killed
-    assert (state.status, state.reason) == ("done", None)
-    # By the other worker, and not from the beginning.
-    assert "Resuming after step" in files.output.read_text()
-    assert json.loads((run / "metrics.json").read_text())["counts"]["steps"] == STEPS
+    # The other worker began it again, where it had been left.
+    assert (state.status, state.reason, state.begun) == ("done", None, 2)
+    assert (tmp_path / "one" / "tries").read_text() == "xx"
 
 
 def test_a_scheduler_that_is_not_there_is_said(tmp_path, monkeypatch):

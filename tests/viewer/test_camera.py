@@ -99,15 +99,6 @@ def test_poses_between_poses():
     np.testing.assert_allclose(cameras.viewmat_between(poses[1:2], 0.7), poses[1], atol=1e-12)
 
 
-def test_a_drive_is_one_camera_in_the_order_of_names():
-    views = [
-        View(name, None, camera, np.eye(4), np.eye(3), 2, 2)
-        for name, camera in (("b/2", "b"), ("a/1", "a"), ("b/1", "b"))
-    ]
-    scene = Scene(None, "test", tuple(views), np.zeros((0, 3)), np.zeros((0, 3)))
-    assert cameras.frames_of(scene, "b") == (2, 0)
-
-
 def test_frusta_of_neighbours_hardly_touch():
     views = [a_view(viewmat([0, 0, 0], [k, 0, 0])) for k in range(4)]
     assert cameras.frustum_size(views, SPACE._replace(unit=1.0)) == pytest.approx(0.35)

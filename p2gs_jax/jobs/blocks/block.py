@@ -20,7 +20,7 @@ from p2gs_jax.formats.ply import write_radiance
 from p2gs_jax.gaussians.population import Coverage, default_max_gaussians
 from p2gs_jax.gaussians.shell import Sphere
 from p2gs_jax.jobs.blocks.cut import Cut, whole_of
-from p2gs_jax.jobs.blocks.shared import Shared, photometry_of, read_shared
+from p2gs_jax.jobs.blocks.shared import photometry_of, read_shared
 from p2gs_jax.jobs.job import Job
 from p2gs_jax.pipeline.exposures import Exposures
 from p2gs_jax.pipeline.fit import Optimiser, begun, compact
@@ -48,17 +48,6 @@ class BlockScene:
     exposures: Exposures  # with radiances, as solved for all blocks
     shell: Sphere  # where what lies behind everything is
     own: int  # how many of the points lie in the block; the others are coarse
-
-
-def block_scene(scene: Scene, shared: Shared, cut: Cut, number: int) -> BlockScene:
-    """Return what a block is fitted to."""
-    found, keep, own = whole_of(scene, cut, number)
-    exposures = Exposures(
-        photometry=photometry_of(shared.photometry, np.array(cut.blocks[number].views)),
-        decisions=shared.decisions,
-        radiance=shared.radiance[keep],
-    )
-    return BlockScene(found, exposures, shared.shell, own)
 
 
 def block_job(scene: Path, run: Path, folder: Path, cut: Cut, number: int, cfg: FitConfig) -> Job:
@@ -122,8 +111,7 @@ def shown_by(scene: Scene, cfg: FitConfig) -> Coverage:
 def fit_block(folder: Path, arguments: dict[str, Any], reporter: Reporter) -> None:
     """Fit the block of a `block_job`, or go on with it; leaves `radiance.ply` and `metrics.json`.
 
-    Raises:
-        UserError: the scene cannot be read, or memory is short.
+    UserError: the scene cannot be read, or memory is short.
     """
     use_compile_cache()
     tune_process()
@@ -133,7 +121,10 @@ def fit_block(folder: Path, arguments: dict[str, Any], reporter: Reporter) -> No
     scene = load(Path(arguments["scene"]), Path(arguments["run"]), whole, Silent())
     shared, scene = read_shared(Path(arguments["shared"]), scene, whole)
     number = arguments["number"]
-    block = block_scene(scene, shared, cut, number)
+    found, keep, own = whole_of(scene, cut, number)
+    photometry = photometry_of(shared.photometry, np.array(cut.blocks[number].views))
+    exposures = Exposures(photometry, shared.decisions, radiance=shared.radiance[keep])
+    block = BlockScene(found, exposures, shared.shell, own)
     train_views = len(scene.train_indices)
     cfg = block_config(whole, cut, number, block.scene, block.own, train_views=train_views)
     del scene, shared

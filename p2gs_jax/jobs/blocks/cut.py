@@ -116,11 +116,7 @@ def _edge(values: Sequence[float | None], outer: float) -> tuple[float, float]:
 
 
 def cut_scene(scene: Scene, count: int) -> Cut:
-    """Cut a scene into so many blocks.
-
-    Raises:
-        UserError: there are too few photographs, or places, for so many blocks.
-    """
+    """Cut a scene into blocks; UserError: photographs or their places are too few for so many."""
     seen = seen_points(scene)
     centers = camera_centers(scene.training_views)
     ground = ground_of(centers)

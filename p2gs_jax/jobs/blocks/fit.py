@@ -84,13 +84,10 @@ def fit_blocks(
 ) -> FitResult:
     """Fit a scene in blocks and write a run folder as `fit` does, whose arguments it shares.
 
-    Args:
-        run_dir: the blocks are in its folder `blocks`.
-        blocks: how many, or `auto`: as few as memory allows; with one, this is `fit`.
-        parallel: blocks at a time on this machine.
-        engine: where they are fitted: local, dask://HOST:PORT or slurm (docs/sweeps.md).
-        resume: continue after an interruption; blocks that are finished stay.
-        on_look: receives how far the blocks are, twice a second.
+    The blocks are in the run's folder `blocks`: so many, or `auto`, as few as memory allows; with
+    one, this is `fit`. So many are fitted in parallel on this machine, or on an engine: local,
+    dask://HOST:PORT or slurm (docs/sweeps.md). Finished blocks stay where a run is resumed;
+    `on_look` receives how far all are, twice a second.
 
     Raises:
         UserError: something the user can mend; a block that failed is named, with its reason.
@@ -152,23 +149,20 @@ def _cut(
     return cut
 
 
+@dataclasses.dataclass
 class _Blocks:
     """A scene that is fitted in blocks, its folder locked."""
 
-    def __init__(
-        self,
-        paths: Paths,
-        cfg: FitConfig,
-        asked: Asked,
-        cut: Cut,
-        lock: RunLock,
-        reporter: Reporter,
-        on_look: Callable[[Sequence[JobState]], None],
-    ):
-        self.paths, self.cfg, self.asked, self.cut = paths, cfg, asked, cut
-        self.lock, self.reporter, self.on_look = lock, reporter, on_look
-        self.folder = RunFolder(paths.run)
-        self.blocks = paths.run / BLOCKS
+    paths: Paths
+    cfg: FitConfig
+    asked: Asked
+    cut: Cut
+    lock: RunLock
+    reporter: Reporter
+    on_look: Callable[[Sequence[JobState]], None]
+
+    def __post_init__(self):
+        self.folder, self.blocks = RunFolder(self.paths.run), self.paths.run / BLOCKS
         self.clock, self.compiler = Stopwatch(), CompileCounter()
 
     def fit(

@@ -21,11 +21,7 @@ MOST_BLOCKS = 256
 
 
 def check_options(cfg: FitConfig) -> None:
-    """Refuse options under which blocks would share nothing.
-
-    Raises:
-        UserError: exposures are learned with the Gaussians, or something moves.
-    """
+    """Raise a UserError for options under which blocks would share nothing."""
     p = cfg.photometry
     if p.start != "tracks" or p.appearance is not None:
         raise UserError(
@@ -47,11 +43,7 @@ def check_options(cfg: FitConfig) -> None:
 
 
 def check_scene(scene: Scene, cfg: FitConfig) -> None:
-    """Refuse a scene whose moving objects are to be fitted.
-
-    Raises:
-        UserError: there are some.
-    """
+    """Raise a UserError where moving objects of a scene are to be fitted."""
     if cfg.dynamics.method != "mask" and any(thing.moving for thing in scene.objects):
         raise UserError(
             f"--blocks fits what stands still, and things move in {scene.root}.",
@@ -67,8 +59,7 @@ def write_plan(folder: Path, cut: Cut, asked: str) -> None:
 def read_plan(folder: Path, asked: str) -> Cut | None:
     """Return how a run that is resumed was cut, or None where it was not yet.
 
-    Raises:
-        UserError: it was cut otherwise than `asked` now, or the file is broken.
+    UserError: it was cut otherwise than `asked` now, or the file is broken.
     """
     path = folder / PLAN
     if not path.exists():
@@ -107,8 +98,7 @@ def largest_block(scene: Scene, cfg: FitConfig, cut: Cut) -> float:
 def fewest_blocks(scene: Scene, cfg: FitConfig, parallel: int) -> int:
     """Return into how few blocks a scene must be cut for the memory there is; 1: it fits whole.
 
-    Raises:
-        UserError: no cut is small enough.
+    Raises a UserError where no cut is small enough.
     """
     room = left_to_process()
     if room is None or bytes_needed(scene, cfg) <= room:
@@ -124,11 +114,7 @@ def fewest_blocks(scene: Scene, cfg: FitConfig, parallel: int) -> int:
 
 
 def require_room(scene: Scene, cfg: FitConfig, cut: Cut, parallel: int) -> None:
-    """Refuse a cut whose blocks, so many at a time, are too large for the memory there is.
-
-    Raises:
-        UserError: they are; says how many blocks would fit.
-    """
+    """Raise a UserError where so many blocks at a time are too large for the memory there is."""
     room = left_to_process()
     if room is None:
         return

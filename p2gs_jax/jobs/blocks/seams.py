@@ -185,10 +185,7 @@ def merge_cores(cut: Cut, fitted: Sequence[Gaussians]) -> tuple[Gaussians, list[
     """Return the Gaussians whose centres lie in the core of the block that fitted them.
 
     They stand block after block; also how many each gave. Cores cover space once: nothing is there
-    twice, and nothing is left out.
-
-    Raises:
-        UserError: there are none.
+    twice, and nothing is left out. UserError: no block has any in its core.
     """
     kept = [
         np.flatnonzero(cut.core(number, np.asarray(gaussians.means)))

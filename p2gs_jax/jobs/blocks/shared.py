@@ -56,8 +56,7 @@ def solve_shared(
 ) -> Solved:
     """Solve the photometry of a scene; `kept` is what a run that is resumed decided before.
 
-    Raises:
-        UserError: no point is seen twice.
+    UserError: no point is seen twice.
     """
     still = store.leaving_out(scene.objects, cfg.dynamics.margin).only_opaque()
     solved = solve_exposures(scene, still, cfg, reporter, kept=kept)
@@ -110,8 +109,7 @@ def write_shared(folder: Path, shared: Shared, scene: Scene) -> None:
 def read_shared(folder: Path, scene: Scene, cfg: FitConfig) -> tuple[Shared, Scene]:
     """Return what the blocks share, and the scene, read again, with the colours of its points.
 
-    Raises:
-        UserError: the files are broken, or of another scene.
+    UserError: the files are broken, or of another scene.
     """
     path = folder / ARRAYS
     decisions = read_decisions(folder / DECISIONS)
