@@ -138,4 +138,4 @@ def recording(root: Path) -> Recording:
 
 def drive_format() -> DriveFormat:
     """Return a reader of such drives, to put in the place of a data set's."""
-    return DriveFormat(lambda root: (root / "cam0").is_dir(), lambda root, cfg: recording(root))
+    return DriveFormat(("cam0",), lambda root, cfg: recording(root))

@@ -7,27 +7,35 @@ from pathlib import Path
 from typing import NamedTuple
 
 from p2gs_jax.config import DataConfig, SceneFormat
-from p2gs_jax.scene.drives.argoverse import is_argoverse, read_argoverse
-from p2gs_jax.scene.drives.kitti import is_kitti_raw, read_kitti_raw
-from p2gs_jax.scene.drives.nuscenes import is_nuscenes, read_nuscenes
-from p2gs_jax.scene.drives.pandaset import is_pandaset, read_pandaset
+from p2gs_jax.scene.drives import argoverse, kitti, nuscenes, pandaset, waymo
 from p2gs_jax.scene.drives.recording import Recording, Report
-from p2gs_jax.scene.drives.waymo import is_waymo, read_waymo
 
 
 class DriveFormat(NamedTuple):
-    """A reader: whether a folder is of its format, and what reads it (UserError: it is broken)."""
+    """A reader: files (globs) by which a folder is recognised, and what reads it.
 
-    recognise: Callable[[Path], bool]
+    `read` raises UserError: the folder holds several drives, or a file is missing or broken.
+    """
+
+    markers: tuple[str, ...]
     read: Callable[[Path, DataConfig], Recording]
+
+    def recognise(self, root: Path) -> bool:
+        """Return whether a folder holds a drive, by names of files only."""
+        return any(any(root.glob(marker)) for marker in self.markers)
+
+
+def _in_folders(marker: str) -> tuple[str, ...]:
+    """Return the markers of a format whose drives may lie in folders below the one named."""
+    return marker, f"*/{marker}"
 
 
 FORMATS: dict[SceneFormat, DriveFormat] = {
-    "pandaset": DriveFormat(is_pandaset, read_pandaset),
-    "nuscenes": DriveFormat(is_nuscenes, read_nuscenes),
-    "waymo": DriveFormat(is_waymo, read_waymo),
-    "argoverse": DriveFormat(is_argoverse, read_argoverse),
-    "kitti_raw": DriveFormat(is_kitti_raw, read_kitti_raw),
+    "pandaset": DriveFormat(_in_folders(pandaset.MARKER), pandaset.read_pandaset),
+    "nuscenes": DriveFormat((nuscenes.MARKER,), nuscenes.read_nuscenes),
+    "waymo": DriveFormat((waymo.MARKER,), waymo.read_waymo),
+    "argoverse": DriveFormat(_in_folders(argoverse.MARKER), argoverse.read_argoverse),
+    "kitti_raw": DriveFormat(_in_folders(kitti.MARKER), kitti.read_kitti_raw),
 }
 
 

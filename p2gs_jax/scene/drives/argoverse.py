@@ -27,15 +27,23 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import broken
 from p2gs_jax.scene.drives.arrow import read_feather
 from p2gs_jax.scene.drives.objects import Box, Pose, tracks
-from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
-from p2gs_jax.scene.drives.tables import chosen_drive, counted, numbered
+from p2gs_jax.scene.drives.recording import (
+    Photograph,
+    Recording,
+    RigCamera,
+    Sweep,
+    SweepPoints,
+    Trajectory,
+)
+from p2gs_jax.scene.drives.tables import Columns, counted, drive_folder, numbered
 from p2gs_jax.scene.lens import intrinsics
-from p2gs_jax.scene.rigid import from_quaternions, interpolated
+from p2gs_jax.scene.rigid import from_quaternions
 from p2gs_jax.types import TrackedObject
 
-POSES = "city_SE3_egovehicle.feather"
+MARKER = POSES = "city_SE3_egovehicle.feather"
 INTRINSICS = "calibration/intrinsics.feather"
 EXTRINSICS = "calibration/egovehicle_SE3_sensor.feather"
+STAMP = "timestamp_ns"
 LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
 QUATERNION = ("qw", "qx", "qy", "qz")
 POSITION = ("tx_m", "ty_m", "tz_m")
@@ -44,71 +52,47 @@ SIZE = ("length_m", "width_m", "height_m")
 GREY = "stereo"
 
 
-def is_argoverse(root: Path) -> bool:
-    """Return whether a folder is a log of Argoverse 2, or holds logs."""
-    return (root / POSES).is_file() or bool(_logs(root))
-
-
 def read_argoverse(root: Path, cfg: DataConfig) -> Recording:
     """Read a log; `cfg.cameras` may ask for the stereo pair; UserError: a table is broken."""
-    log = root
-    if not (root / POSES).is_file():
-        log = root / chosen_drive(cfg.drive, [folder.name for folder in _logs(root)], root)
-    car = _Car(log)
+    log = drive_folder(root, cfg.drive, MARKER)
     cameras, files, notes = _cameras(log, cfg)
+    # Frames are the photographs of the camera that has most: cameras are triggered twice in a turn
+    # of the scanners, so that a sweep's number would name two of each.
+    most = max((files[camera.name] for camera in cameras), key=len, default={})
+    car = _Car(log, np.array(sorted(most), np.int64))
     photographs, photograph_notes = _photographs(car, cameras, files)
     sweeps, sweep_notes = _sweeps(car)
     objects, box_notes = _objects(car)
     notes += [*photograph_notes, *sweep_notes, *box_notes]
-    return Recording(root, "argoverse", cameras, photographs, sweeps, objects, notes)
-
-
-def _logs(root: Path) -> list[Path]:
-    return sorted(path.parent for path in root.glob(f"*/{POSES}"))
+    return Recording(log, "argoverse", cameras, photographs, sweeps, objects, notes)
 
 
 class _Car:
-    """Poses of a car, and the clock of its log."""
+    """The way of a car, the clock of its log, and the time stamps of its frames."""
 
-    def __init__(self, log: Path):
+    def __init__(self, log: Path, moments: Int64[np.ndarray, " m"]):
         path = log / POSES
-        table = read_feather(path, ["timestamp_ns", *QUATERNION, *POSITION])
-        stamps = _stamps(table, path)
+        table = read_feather(path, [STAMP, *QUATERNION, *POSITION])
+        stamps = table.whole(STAMP)
         if not len(stamps):
             raise broken(path, "holds no pose")
-        _, rows = np.unique(stamps, return_index=True)
-        self.log = log
-        self.start = int(stamps.min())
-        self.moments: Int64[np.ndarray, " m"] = np.zeros(0, np.int64)
-        self._times = self.seconds(stamps[rows])
-        self._poses = _poses(table, path, "pose")[rows]
+        stamps, rows = np.unique(stamps, return_index=True)
+        self.log, self.moments, self.start = log, moments, stamps[0]
+        self.way = Trajectory(self.seconds(stamps), _poses(table, "pose")[rows])
 
     def seconds(self, stamps: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
         """Return time stamps in seconds since the first pose."""
         return (stamps - self.start) * 1e-9
 
-    def poses(self, stamps: Int64[np.ndarray, " n"]):
-        """Return poses, car to world, and which of these are known."""
-        return interpolated(self._times, self._poses, self.seconds(stamps))
-
     def frames(self, stamps: Int64[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-        """Return the nearest of the moments."""
+        """Return the nearest frames."""
         if not len(self.moments):
             return np.zeros(len(stamps), int)
         return np.abs(stamps[:, None] - self.moments).argmin(1)
 
 
-def _stamps(table: dict[str, np.ndarray], path: Path) -> Int64[np.ndarray, " n"]:
-    stamps = table["timestamp_ns"]
-    if stamps.dtype.kind not in "iu":
-        raise broken(f"{path}:", "timestamp_ns should be whole numbers, all of them")
-    return stamps.astype(np.int64)
-
-
-def _poses(table: dict[str, np.ndarray], path: Path, what: str):
-    wxyz = np.stack([table[name] for name in QUATERNION], 1).astype(np.float64)
-    position = np.stack([table[name] for name in POSITION], 1).astype(np.float64)
-    return from_quaternions(wxyz, position, path, what)
+def _poses(table: Columns, what: str) -> Float64[np.ndarray, "n 4 4"]:
+    return from_quaternions(table.stacked(QUATERNION), table.stacked(POSITION), table.path, what)
 
 
 def _cameras(
@@ -116,34 +100,27 @@ def _cameras(
 ) -> tuple[list[RigCamera], dict[str, dict[int, Path]], list[str]]:
     """Return cameras that have photographs, these by time stamp, and notes."""
     path = log / INTRINSICS
-    table = read_feather(path, LENS, ["sensor_name"])
-    rows = {str(name): row for row, name in enumerate(table["sensor_name"])}
-    folder = log / "sensors" / "cameras"
-    found = {
-        f.name: files
-        for f in (sorted(folder.iterdir()) if folder.is_dir() else ())
-        if f.is_dir() and (files := numbered(f, (".jpg", ".png")))
-    }
+    table = read_feather(path, [*LENS, "sensor_name"])
+    lenses = dict(zip(map(str, table["sensor_name"]), table.stacked(LENS), strict=True))
+    folders = sorted((log / "sensors" / "cameras").glob("*/"))
+    found = {f.name: files for f in folders if (files := numbered(f, (".jpg", ".png")))}
     notes = []
     grey = [name for name in found if name.startswith(GREY)]
     if grey and not any(GREY in name for name in cfg.cameras):
         notes.append(f"The stereo cameras are grey and left out; --cameras {grey[0]} takes one.")
         found = {name: files for name, files in found.items() if name not in grey}
-    unknown = [name for name in found if name not in rows]
+    unknown = [name for name in found if name not in lenses]
     if unknown:
         notes.append(f"{INTRINSICS} has no row for {', '.join(unknown)}: left out.")
-    absent = [n for n in rows if n not in found and not n.startswith(GREY)]
+    absent = [n for n in lenses if n not in found and not n.startswith(GREY)]
     if absent:
         notes.append(f"There are no photographs of {', '.join(absent)}.")
     cameras = []
-    for name in found:
-        if name in unknown:
-            continue
-        values = np.array([table[column][rows[name]] for column in LENS], np.float64)
-        if not np.isfinite(values).all() or (values[[0, 1, 4, 5]] <= 0).any():
+    for name in (n for n in found if n in lenses):
+        if not np.isfinite(lenses[name]).all() or (lenses[name][[0, 1, 4, 5]] <= 0).any():
             why = f"focal lengths and sizes of {name} should be positive numbers"
             raise broken(f"{path}:", why)
-        fx, fy, cx, cy, width, height = values.tolist()
+        fx, fy, cx, cy, width, height = lenses[name].tolist()
         # The API takes projections from 0 to width - 1 as inside: pixel centres at integers.
         K = intrinsics(fx, fy, cx + 0.5, cy + 0.5)
         cameras.append(RigCamera(name, K, int(width), int(height)))
@@ -153,25 +130,19 @@ def _cameras(
 def _photographs(
     car: _Car, cameras: list[RigCamera], files: dict[str, dict[int, Path]]
 ) -> tuple[list[Photograph], list[str]]:
-    """Return photographs with poses, and notes.
-
-    Their frames are the nearest photographs of the camera that has most: cameras are triggered
-    twice in a turn of the scanners, so that a sweep's number would name two of each.
-    """
+    """Return photographs with poses, and notes."""
     if not cameras:
         return [], []
     path = car.log / EXTRINSICS
-    table = read_feather(path, [*QUATERNION, *POSITION], ["sensor_name"])
-    mounts = dict(zip(map(str, table["sensor_name"]), _poses(table, path, "sensor"), strict=True))
-    most = max(cameras, key=lambda camera: len(files[camera.name]))
-    car.moments = np.array(sorted(files[most.name]), np.int64)
+    table = read_feather(path, [*QUATERNION, *POSITION, "sensor_name"])
+    mounts = dict(zip(map(str, table["sensor_name"]), _poses(table, "sensor"), strict=True))
     photographs, without = [], 0
     for name in (camera.name for camera in cameras):
         if name not in mounts:
             raise broken(path, f"does not say where {name} is")
         stamps = np.array(list(files[name]), np.int64)
-        poses, known = car.poses(stamps)
         times, frames = car.seconds(stamps), car.frames(stamps)
+        poses, known = car.way.at(times)
         without += int((~known).sum())
         for k in np.flatnonzero(known):
             pose, file = poses[k] @ mounts[name], files[name][int(stamps[k])]
@@ -181,11 +152,9 @@ def _photographs(
 
 def _sweeps(car: _Car) -> tuple[list[Sweep], list[str]]:
     files = numbered(car.log / "sensors" / "lidar", (".feather",))
-    if not files:
-        return [], []
     stamps = np.array(list(files), np.int64)
-    poses, known = car.poses(stamps)
     times, frames = car.seconds(stamps), car.frames(stamps)
+    poses, known = car.way.at(times)
     sweeps = [
         Sweep(int(frames[k]), float(times[k]), partial(_read_sweep, path, poses[k], times[k]))
         for k, path in enumerate(files.values())
@@ -196,28 +165,25 @@ def _sweeps(car: _Car) -> tuple[list[Sweep], list[str]]:
 
 def _read_sweep(path: Path, pose: Pose, start: float) -> SweepPoints:
     table = read_feather(path, ["x", "y", "z", "offset_ns"])
-    local = np.stack([table[name] for name in "xyz"], 1).astype(np.float64)
-    times = start + table["offset_ns"] * 1e-9
-    return SweepPoints(local @ pose[:3, :3].T + pose[:3, 3], times)
+    times = start + table.numbers("offset_ns") * 1e-9
+    return SweepPoints(table.stacked("xyz") @ pose[:3, :3].T + pose[:3, 3], times)
 
 
 def _objects(car: _Car) -> tuple[tuple[TrackedObject, ...], list[str]]:
     path = car.log / "annotations.feather"
     if not path.is_file():
         return (), [f"{path.name} is missing: what moves is not known."]
-    table = read_feather(
-        path, ["timestamp_ns", *SIZE, *QUATERNION, *POSITION], ["track_uuid", "category"]
-    )
-    stamps, names = _stamps(table, path), table["track_uuid"]
-    size = np.stack([table[name] for name in SIZE], 1).astype(np.float64)
+    columns = [STAMP, *SIZE, *QUATERNION, *POSITION, "track_uuid", "category"]
+    table = read_feather(path, columns)
+    times, size = car.seconds(table.whole(STAMP)), table.stacked(SIZE)
     if not (size > 0).all():
         raise broken(f"{path}:", "a box has no size")
-    egos, known = car.poses(stamps)
-    poses = egos @ _poses(table, path, "box")
-    times = car.seconds(stamps)
+    cars, known = car.way.at(times)
+    poses = cars @ _poses(table, "box")
+    names, labels = table["track_uuid"], table["category"]
     named = np.array([bool(name) for name in names], bool)
     boxes = [
-        Box(str(names[k]), str(table["category"][k]), tuple(size[k]), float(times[k]), poses[k])
+        Box(str(names[k]), str(labels[k]), tuple(size[k]), float(times[k]), poses[k])
         for k in np.flatnonzero(known & named)
     ]
     notes = counted(int((~named).sum()), "boxes belong to no track: they are left out.")

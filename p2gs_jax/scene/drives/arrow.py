@@ -10,18 +10,15 @@ from typing import Any
 import numpy as np
 
 from p2gs_jax.errors import UserError, broken
-from p2gs_jax.scene.drives.tables import missing_file
+from p2gs_jax.scene.drives.tables import Columns, missing_file
 
 
-def read_feather(
-    path: Path, numbers: Sequence[str], objects: Sequence[str] = ()
-) -> dict[str, np.ndarray]:
-    """Return columns of a Feather file; see `ParquetTable.columns`."""
+def read_feather(path: Path, names: Sequence[str]) -> Columns:
+    """Return columns of a Feather file; UserError: one is not there, or the file is broken."""
     with _reading(path):
         from pyarrow import feather
 
-        table = feather.read_table(path, memory_map=False)
-        return _columns(table, path, numbers, objects)
+        return _columns(feather.read_table(path, memory_map=False), names, path)
 
 
 class ParquetTable:
@@ -37,17 +34,12 @@ class ParquetTable:
         meta = self._file.metadata
         counts = [meta.row_group(group).num_rows for group in range(meta.num_row_groups)]
         self._ends = np.cumsum(counts, dtype=int)
-        self._held: tuple[int, tuple[str, ...], Any] | None = None
+        self._held: tuple[int, Sequence[str], Any] | None = None
 
-    def columns(self, numbers: Sequence[str], objects: Sequence[str] = ()) -> dict[str, np.ndarray]:
-        """Return columns by name: numbers, of which whole ones stay whole, and objects.
-
-        Objects are texts or lists, None where there is nothing. UserError: a column is not there,
-        or does not hold numbers, or the file is broken.
-        """
+    def columns(self, names: Sequence[str]) -> Columns:
+        """Return columns by name; UserError: one is not there, or the file is broken."""
         with _reading(self.path):
-            table = self._file.read(columns=[*numbers, *objects])
-            return _columns(table, self.path, numbers, objects)
+            return _columns(self._file.read(columns=list(names)), names, self.path)
 
     def cells(self, row: int, names: Sequence[str]) -> list[Any]:
         """Return cells of one row: lists of numbers as arrays, texts and bytes as they are.
@@ -56,14 +48,15 @@ class ParquetTable:
         the file is broken.
         """
         group = int(np.searchsorted(self._ends, row, side="right"))
-        key = (group, tuple(names))
-        if self._held is None or self._held[:2] != key:
+        if self._held is None or self._held[:2] != (group, names):
             self._held = None
             with _reading(self.path):
-                self._held = (*key, self._file.read_row_group(group, columns=list(names)))
+                table = self._file.read_row_group(group, columns=list(names))
+            self._held = group, names, table
         table = self._held[2]
         inside = row - int(self._ends[group]) + table.num_rows
-        return [_cell(_column(table, name, self.path)[inside]) for name in names]
+        cells = _columns(table.slice(inside, 1), names, self.path)
+        return [cells[name][0] for name in names]
 
 
 @contextmanager
@@ -85,34 +78,9 @@ def _reading(path: Path) -> Iterator[None]:
         raise broken(path, f"cannot be read: {why}") from None
 
 
-def _columns(table: Any, path: Path, numbers: Sequence[str], objects: Sequence[str]):
-    found = {name: _numbers(_column(table, name, path), name, path) for name in numbers}
-    for name in objects:
-        values = _column(table, name, path).to_pylist()
-        found[name] = np.empty(len(values), object)
-        found[name][:] = values
-    return found
-
-
-def _column(table: Any, name: str, path: Path):
-    if name not in table.column_names:
-        raise broken(path, f"has no column {name!r}")
-    return table[name]
-
-
-def _numbers(column: Any, name: str, path: Path) -> np.ndarray:
-    # Whole numbers with gaps would become float64, which time stamps do not fit into.
-    gaps = column.null_count and not str(column.type).startswith(("float", "double", "half"))
-    values = column.to_numpy()
-    if gaps or values.dtype.kind not in "iuf":
-        raise broken(f"{path}:", f"its column {name!r} should hold numbers, without gaps")
-    return values
-
-
-def _cell(scalar: Any) -> Any:
-    if not scalar.is_valid:
-        return None
-    # Lists become arrays without a Python object for every number.
-    if hasattr(scalar, "values"):
-        return scalar.values.to_numpy(zero_copy_only=False)
-    return scalar.as_py()
+def _columns(table: Any, names: Sequence[str], path: Path) -> Columns:
+    there = {name: table[name] for name in names if name in table.column_names}
+    # What is nowhere given would come as NaN.
+    nothing = np.full(len(table), None)
+    values = {n: nothing if str(c.type) == "null" else c.to_numpy() for n, c in there.items()}
+    return Columns(values, path)

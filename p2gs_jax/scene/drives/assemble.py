@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import platformdirs
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Float, Float64
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.atomic import atomic_write
@@ -21,7 +21,6 @@ from p2gs_jax.scene.drives.recording import (
     Photograph,
     Recording,
     Report,
-    RigCamera,
     chosen_cameras,
     chosen_frames,
 )
@@ -69,7 +68,19 @@ def assemble(
     origin = np.rint(middle) if np.abs(middle).max() > FARTHEST_ORIGIN else np.zeros(3)
     folder = _embedded_folder(recording.root, work_dir)
     views = [
-        _view(p, cameras[p.camera], origin, _file_of(p, folder, write_embedded), masks)
+        View(
+            name=_name(p),
+            image_path=_file_of(p, folder, write_embedded),
+            camera=p.camera,
+            viewmat=inverse(_moved(p.pose, origin)).astype(np.float32),
+            K=cameras[p.camera].K.astype(np.float32),
+            width=cameras[p.camera].width,
+            height=cameras[p.camera].height,
+            distortion=cameras[p.camera].distortion,
+            frame=p.frame,
+            time=p.time,
+            own_car=masks.get(p.camera),
+        )
         for p in photographs
     ]
     things = recording.objects
@@ -117,10 +128,10 @@ def _chosen_photographs(
             fix="name other --cameras, or leave out --frames",
         )
     chosen.sort(key=lambda p: (p.camera, p.frame))
-    missing = [_name(p) for p in chosen if p.embedded is None and not p.path.is_file()]
+    there = [p for p in chosen if p.embedded is not None or p.path.is_file()]
+    missing = sorted({_name(p) for p in chosen} - {_name(p) for p in there})
     notes = [*recording.notes, *check_missing(missing, len(chosen), recording.root, cfg)]
-    gone = set(missing)
-    chosen = [p for p in chosen if _name(p) not in gone]
+    chosen = there
     counts = {name: sum(p.camera == name for p in chosen) for name in names}
     few = [f"{name} {count}" for name, count in counts.items() if count < len(frames)]
     if few:
@@ -138,28 +149,6 @@ def _chosen_photographs(
 
 def _name(photograph: Photograph) -> str:
     return f"{photograph.camera}/{photograph.path.name}"
-
-
-def _view(
-    photograph: Photograph,
-    camera: RigCamera,
-    origin: Float[np.ndarray, " 3"],
-    path: Path,
-    masks: dict[str, Bool[np.ndarray, "h w"]],
-) -> View:
-    return View(
-        name=_name(photograph),
-        image_path=path,
-        camera=camera.name,
-        viewmat=inverse(_moved(photograph.pose, origin)).astype(np.float32),
-        K=camera.K.astype(np.float32),
-        width=camera.width,
-        height=camera.height,
-        distortion=camera.distortion,
-        frame=photograph.frame,
-        time=photograph.time,
-        own_car=masks.get(camera.name),
-    )
 
 
 def _moved(poses: Float64[np.ndarray, "*n 4 4"], origin: Float[np.ndarray, " 3"]):
@@ -213,7 +202,6 @@ def _read_sweeps(
         broken += int((~finite).sum())
         local, at = local[finite], np.asarray(at, np.float64)[finite]
         part = thinned(Lidar(local, at, np.full(len(local), -1, np.int32)), each, rng)
-        parts.append(Lidar(part.points, part.times, owners(part.points, part.times, objects)))
-    columns = ([p.points for p in parts], [p.times for p in parts], [p.objects for p in parts])
+        parts.append((part.points, part.times, owners(part.points, part.times, objects)))
     notes = counted(broken, "LiDAR points are not finite numbers and are left out.")
-    return Lidar(*map(np.concatenate, columns)), notes
+    return Lidar(*map(np.concatenate, zip(*parts, strict=True))), notes

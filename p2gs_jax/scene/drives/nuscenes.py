@@ -14,14 +14,12 @@ turn begins and ends at azimuth 180 degrees of the scanner's axes (x right, y fo
 
 from __future__ import annotations
 
-import os
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import broken
@@ -40,6 +38,7 @@ from p2gs_jax.scene.files import require_inside
 from p2gs_jax.scene.rigid import from_quaternion, inverse
 from p2gs_jax.types import TrackedObject
 
+MARKER = "v1.0-*/sample_data.json"
 NUMBER = (int, float)
 # The scanner: seconds a turn (20 Hz), and where a turn begins.
 TURN_S, TURN_START = 0.05, np.pi
@@ -53,11 +52,6 @@ RECORDED: Kinds = {
     "is_key_frame": bool,
 }
 _FIX = "get the tables again, all of one version"
-
-
-def is_nuscenes(root: Path) -> bool:
-    """Return whether a folder holds nuScenes' tables."""
-    return bool(_versions(root))
 
 
 def read_nuscenes(root: Path, cfg: DataConfig) -> Recording:
@@ -79,37 +73,28 @@ def read_nuscenes(root: Path, cfg: DataConfig) -> Recording:
     return Recording(root, "nuscenes", cameras, photographs, sweeps, objects, notes)
 
 
-def _versions(root: Path) -> list[Path]:
-    return sorted(path.parent for path in root.glob("v1.0-*/sample_data.json"))
-
-
 def _chosen_scene(root: Path, asked: str | None) -> tuple[Path, Row]:
-    """Return the tables' folder and the row of the drive."""
+    """Return the tables' folder and the row of the drive; the first version that has it counts."""
+    versions = sorted(path.parent for path in root.glob(MARKER))
     there: dict[str, tuple[Path, Row]] = {}
-    for tables in _versions(root):
-        for row in read_rows(tables / "scene.json", {"name": str, "token": str}):
-            there.setdefault(row["name"], (tables, row))
+    for tables in reversed(versions):
+        rows = read_rows(tables / "scene.json", {"name": str, "token": str})
+        there |= {row["name"]: (tables, row) for row in rows}
     names = list(there)
     if asked is None and len(names) > 1:
         # Tables are of the whole set, also where photographs of a few drives were unpacked.
-        photographed = _photographed(root)
-        names = [name for name in names if name in photographed] or names
+        photographed = {token for tables in versions for token in _photographed(root, tables)}
+        names = [name for name in names if there[name][1]["token"] in photographed] or names
     return there[chosen_drive(asked, names, root)]
 
 
-def _photographed(root: Path) -> set[str]:
-    """Return the names of drives that have photographs on disk."""
-    there = set()
-    for folder in (root / "samples").glob("CAM_*"):
-        there |= {f"samples/{folder.name}/{entry.name}" for entry in os.scandir(folder)}
-    found = set()
-    for tables in _versions(root):
-        data = read_rows(tables / "sample_data.json", {"sample_token": str}, "filename", there)
-        of = {row["sample_token"] for row in data}
-        samples = read_rows(tables / "sample.json", {"scene_token": str}, "token", of)
-        scenes = {row["scene_token"] for row in samples}
-        found |= {r["name"] for r in read_rows(tables / "scene.json", {}, "token", scenes)}
-    return found
+def _photographed(root: Path, tables: Path) -> set[str]:
+    """Return the tokens of drives that have photographs on disk."""
+    there = {path.relative_to(root).as_posix() for path in root.glob("samples/CAM_*/*")}
+    data = read_rows(tables / "sample_data.json", {"sample_token": str}, "filename", there)
+    of = {row["sample_token"] for row in data}
+    samples = read_rows(tables / "sample.json", {"scene_token": str}, "token", of)
+    return {row["scene_token"] for row in samples}
 
 
 class _Sensor(NamedTuple):
@@ -136,7 +121,7 @@ class _Drive:
         self.data = self.rows("sample_data", RECORDED, "sample_token", self.moments)
         self.data.sort(key=lambda row: row["timestamp"])
         wanted = {row["ego_pose_token"] for row in self.data}
-        self._egos = {row["token"]: row for row in self.rows("ego_pose", PLACED, "token", wanted)}
+        self._egos = self.by_token("ego_pose", PLACED, wanted)
         self._sensors = self._read_sensors()
 
     def path(self, table: str) -> Path:
@@ -144,6 +129,11 @@ class _Drive:
 
     def rows(self, table: str, needs: Kinds, column: str = "", among=()) -> list[Row]:
         return read_rows(self.path(table), needs, column, among)
+
+    def by_token(self, table: str, needs: Kinds, wanted: Container[Any] = ()) -> dict[str, Row]:
+        """Return rows by their tokens: those wanted, or all."""
+        rows = self.rows(table, {"token": str, **needs}, "token" if wanted else "", wanted)
+        return {row["token"]: row for row in rows}
 
     def seconds(self, timestamp: float) -> float:
         """Return a time stamp in seconds since the first sample."""
@@ -176,31 +166,22 @@ class _Drive:
     def _read_sensors(self) -> dict[str, _Sensor]:
         wanted = {row["calibrated_sensor_token"] for row in self.data}
         needs: Kinds = {**PLACED, "sensor_token": str, "camera_intrinsic": list}
-        kinds: Kinds = {"token": str, "channel": str, "modality": str}
-        rows = self.rows("calibrated_sensor", needs, "token", wanted)
-        known = {row["token"]: row for row in self.rows("sensor", kinds)}
+        kinds = self.by_token("sensor", {"channel": str, "modality": str})
         sensors = {}
-        for row in rows:
-            kind = known.get(row["sensor_token"])
+        for token, row in self.by_token("calibrated_sensor", needs, wanted).items():
+            kind = kinds.get(row["sensor_token"])
             if kind is None:
                 raise broken(self.path("sensor"), f"has no sensor {row['sensor_token']}", _FIX)
             pose, K = _pose(row, self.path("calibrated_sensor")), row["camera_intrinsic"]
-            sensors[row["token"]] = _Sensor(kind["channel"], kind["modality"], pose, K)
+            sensors[token] = _Sensor(kind["channel"], kind["modality"], pose, K)
         return sensors
 
 
 def _pose(row: Row, path: Path) -> Pose:
-    what = f"{row['token']}"
-    wxyz = _numbers(row["rotation"], 4, path, f"the rotation of {what}")
-    position = _numbers(row["translation"], 3, path, f"the translation of {what}")
+    what = row["token"]
+    wxyz = finite_numbers(row["rotation"], path, f"the rotation of {what}", 4)
+    position = finite_numbers(row["translation"], path, f"the translation of {what}", 3)
     return from_quaternion(wxyz, position, path, what)
-
-
-def _numbers(values: Sequence, count: int, path: Path, what: str) -> Float64[np.ndarray, " n"]:
-    numbers = finite_numbers(values, path, what)
-    if len(numbers) != count:
-        raise broken(f"{path}:", f"{what} should be {count} numbers, not {len(numbers)}")
-    return numbers
 
 
 def _photographs(drive: _Drive) -> tuple[list[Photograph], list[RigCamera], int]:
@@ -230,14 +211,14 @@ def _camera(drive: _Drive, row: Row) -> RigCamera:
     sensor, path = drive.sensor(row), drive.path("calibrated_sensor")
     what = f"camera_intrinsic of {sensor.channel}"
     flat = [value for line in sensor.intrinsics for value in np.atleast_1d(line).tolist()]
-    K = _numbers(flat, 9, path, what).reshape(3, 3)
+    K = finite_numbers(flat, path, what, 9).reshape(3, 3)
     if K[0, 0] <= 0 or K[1, 1] <= 0 or not np.allclose(K[2], [0, 0, 1]):
         raise broken(f"{path}:", f"{what} is not a camera matrix")
     # The devkit draws K's products over pixels whose centres lie at integers (`imshow`), and asks
     # for 0 to width - 1; ours are at +0.5.
     K[:2, 2] += 0.5
     what, sides = f"the size of {row['filename']}", (row.get("width"), row.get("height"))
-    width, height = _numbers(sides, 2, drive.path("sample_data"), what)
+    width, height = finite_numbers(sides, drive.path("sample_data"), what)
     return RigCamera(sensor.channel, K, int(width), int(height))
 
 
@@ -274,8 +255,9 @@ def _objects(drive: _Drive) -> tuple[tuple[TrackedObject, ...], list[str]]:
     if not rows:
         why = "holds no box of this drive" if there else "is missing"
         return (), [f"{path.name} {why}: what moves is not known."]
-    labels = _labels(drive, {row.get("instance_token") for row in rows})
-    attributes = _names(drive, "attribute")
+    instances = {row.get("instance_token") for row in rows}
+    of = drive.by_token("instance", {"category_token": str}, instances)
+    categories, attributes = (drive.by_token(t, {"name": str}) for t in ("category", "attribute"))
     scanners = {}
     for row in drive.of("lidar"):
         if row["is_key_frame"] and (pose := drive.pose(row)) is not None:
@@ -283,11 +265,13 @@ def _objects(drive: _Drive) -> tuple[tuple[TrackedObject, ...], list[str]]:
     boxes, untracked = [], 0
     for row in rows:
         name = row.get("instance_token")
-        if name not in labels:
+        if name not in of:
             untracked += 1
             continue
+        label = categories.get(of[name]["category_token"], {"name": "unknown"})["name"]
         pose = _pose({"token": f"a box of {name}", **row}, path)
-        width, length, height = _numbers(row["size"], 3, path, f"the size of {name}").tolist()
+        size = finite_numbers(row["size"], path, f"the size of {name}", 3)
+        width, length, height = size.tolist()
         if min(width, length, height) <= 0:
             raise broken(f"{path}:", f"a box of {name} has no size")
         sample = row["sample_token"]
@@ -297,21 +281,11 @@ def _objects(drive: _Drive) -> tuple[tuple[TrackedObject, ...], list[str]]:
             to_scanner = scanners[sample]
             x, y, _ = to_scanner[:3, :3] @ pose[:3, 3] + to_scanner[:3, 3]
             time -= TURN_S * float(1 - turned(np.arctan2(y, x), TURN_START))
-        moving = _moving([attributes.get(t, "") for t in row.get("attribute_tokens") or ()])
-        boxes.append(Box(name, labels[name], (length, width, height), time, pose, moving))
+        tokens = [t for t in row.get("attribute_tokens") or () if t in attributes]
+        moving = _moving([attributes[token]["name"] for token in tokens])
+        boxes.append(Box(name, label, (length, width, height), time, pose, moving))
     words = f"boxes in {path.name} belong to no instance: they are left out."
     return tracks(boxes), counted(untracked, words)
-
-
-def _names(drive: _Drive, table: str) -> dict[str, str]:
-    return {row["token"]: row["name"] for row in drive.rows(table, {"token": str, "name": str})}
-
-
-def _labels(drive: _Drive, instances: set) -> dict[str, str]:
-    """Return the category of each instance."""
-    categories = _names(drive, "category")
-    rows = drive.rows("instance", {"category_token": str}, "token", instances)
-    return {row["token"]: categories.get(row["category_token"], "unknown") for row in rows}
 
 
 def _moving(attributes: Sequence[str]) -> bool | None:

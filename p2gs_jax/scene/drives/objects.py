@@ -33,35 +33,6 @@ _SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
 _EDGES = [(a, a | bit) for bit in (4, 2, 1) for a in range(8) if not a & bit]
 
 
-def tracked(
-    name: str,
-    label: str,
-    size: tuple[float, float, float],
-    times: Sequence[float] | Float64[np.ndarray, " k"],
-    poses: Sequence[Pose] | Float64[np.ndarray, "k 4 4"],
-    moving: bool | None,
-) -> TrackedObject:
-    """Return a track in the order of its times, each time once.
-
-    Args:
-        name: of the track.
-        label: what it is, in the data set's words.
-        size: see `Box`.
-        times: seconds, in any order; of repeated ones the first counts.
-        poses: see `Box`; at least one.
-        moving: what the set says; None: it moves if it gets further than a metre from where it
-            was first.
-    """
-    at, rows = np.unique(np.asarray(times, np.float64), return_index=True)
-    ordered = np.asarray(poses, np.float64).reshape(-1, 4, 4)[rows]
-    if moving is None:
-        positions = ordered[:, :3, 3]
-        away = np.linalg.norm(positions - positions[0], axis=1)
-        moving = bool(away.max() > STANDS_WITHIN_M)
-    length, width, height = (float(side) for side in size)
-    return TrackedObject(name, label, (length, width, height), at, ordered, moving)
-
-
 class Box(NamedTuple):
     """One box around a thing, at one time.
 
@@ -82,21 +53,25 @@ class Box(NamedTuple):
 
 
 def tracks(boxes: Iterable[Box]) -> tuple[TrackedObject, ...]:
-    """Return the things that boxes belong to, by their names.
+    """Return the things that boxes belong to, in the order of their first boxes.
 
-    The size of a thing is the median of its boxes. It moves if it does in one of them.
+    Boxes may come in any order of time; of those of one time the first counts. The size of a thing
+    is the median of its boxes. It moves if it does in one of them; where the set says nothing, if
+    it gets further than a metre from where it was first.
     """
     of: dict[str, list[Box]] = {}
     for box in boxes:
         of.setdefault(box.track, []).append(box)
     things = []
-    for name, own in sorted(of.items()):
-        known = [box.moving for box in own if box.moving is not None]
-        length, width, height = np.median([box.size for box in own], axis=0)
+    for name, own in of.items():
+        times, rows = np.unique([box.time for box in own], return_index=True)
+        poses = np.stack([own[row].pose for row in rows])
+        told = [box.moving for box in own if box.moving is not None]
+        away = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1).max()
+        moving = any(told) if told else bool(away > STANDS_WITHIN_M)
+        length, width, height = np.median([box.size for box in own], axis=0).tolist()
         size = (length, width, height)
-        times, poses = [box.time for box in own], [box.pose for box in own]
-        moving = any(known) if known else None
-        things.append(tracked(name, own[0].label, size, times, poses, moving))
+        things.append(TrackedObject(name, own[0].label, size, times, poses, moving))
     return tuple(things)
 
 

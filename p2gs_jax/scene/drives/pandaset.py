@@ -15,33 +15,33 @@ boxes of a frame are therefore not of one moment: each is of the time when the s
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float64
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import broken
 from p2gs_jax.scene.drives.lidar import turned
-from p2gs_jax.scene.drives.objects import Pose, tracked
+from p2gs_jax.scene.drives.objects import Box, Pose, tracks
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
 from p2gs_jax.scene.drives.tables import (
-    chosen_drive,
+    UNPACK,
     counted,
+    drive_folder,
     finite_numbers,
     numbered,
-    read_json,
-    read_json_list,
     read_pickled,
 )
-from p2gs_jax.scene.files import image_size
+from p2gs_jax.scene.files import image_size, read_json
 from p2gs_jax.scene.lens import intrinsics
 from p2gs_jax.scene.rigid import from_quaternion, inverse
 from p2gs_jax.types import TrackedObject
 
+MARKER = "camera/*/intrinsics.json"
 PICKLES = (".pkl.gz", ".pkl")
 # Seconds a turn of the spinning scanner.
 TURN_S = 0.1
@@ -53,25 +53,11 @@ POSITION = ("position.x", "position.y", "position.z")
 SIZE = ("dimensions.y", "dimensions.x", "dimensions.z")
 
 
-def is_pandaset(root: Path) -> bool:
-    """Return whether a folder is a sequence of PandaSet, or holds some."""
-    return _is_sequence(root) or bool(_sequences(root))
-
-
-def _is_sequence(folder: Path) -> bool:
-    return any((folder / "camera").glob("*/intrinsics.json"))
-
-
-def _sequences(root: Path) -> list[str]:
-    return sorted({p.parts[-4] for p in root.glob("*/camera/*/intrinsics.json")})
-
-
 def read_pandaset(root: Path, cfg: DataConfig) -> Recording:
     """Read a sequence, with `camera` and `lidar` in its folder; UserError: a table is broken."""
-    if not _is_sequence(root):
-        root = root / chosen_drive(cfg.drive, _sequences(root), root)
+    root = drive_folder(root, cfg.drive, MARKER)
     cameras, photographs, notes = [], [], []
-    for folder in sorted(p.parent for p in (root / "camera").glob("*/intrinsics.json")):
+    for folder in sorted(p.parent for p in root.glob(MARKER)):
         files = numbered(folder, (".jpg", ".png"))
         if not files:
             notes.append(f"{folder.name} has no photographs: it is left out.")
@@ -88,7 +74,7 @@ def read_pandaset(root: Path, cfg: DataConfig) -> Recording:
 
 def _camera(folder: Path, photograph: Path) -> RigCamera:
     path = folder / "intrinsics.json"
-    held = read_json(path)
+    held = read_json(path, UNPACK)
     try:
         values = (held[name] for name in ("fx", "fy", "cx", "cy"))
         fx, fy, cx, cy = finite_numbers(values, path, "fx fy cx cy").tolist()
@@ -101,8 +87,8 @@ def _camera(folder: Path, photograph: Path) -> RigCamera:
 
 def _photographs(folder: Path, files: dict[int, Path]) -> tuple[list[Photograph], int]:
     """Return the photographs of a camera, and how many have no pose or time."""
-    poses = read_json_list(folder / "poses.json")
-    times = read_json_list(folder / "timestamps.json")
+    poses = _read_list(folder / "poses.json")
+    times = _read_list(folder / "timestamps.json")
     count = min(len(poses), len(times))
     photographs, without = [], 0
     for frame in sorted({*files, *range(count)}):
@@ -114,6 +100,13 @@ def _photographs(folder: Path, files: dict[int, Path]) -> tuple[list[Photograph]
         path = files.get(frame, folder / f"{frame:02d}.jpg")
         photographs.append(Photograph(folder.name, frame, float(time), path, pose))
     return photographs, without
+
+
+def _read_list(path: Path) -> list[Any]:
+    held = read_json(path, UNPACK)
+    if not isinstance(held, list):
+        raise broken(path, "should hold a list with an entry for each frame")
+    return held
 
 
 def _pose(held: Any, path: Path, frame: int) -> Pose:
@@ -128,7 +121,7 @@ def _pose(held: Any, path: Path, frame: int) -> Pose:
 
 def _sweep_times(root: Path) -> Float64[np.ndarray, " k"]:
     path = root / "lidar" / "timestamps.json"
-    return finite_numbers(read_json_list(path), path, "times of sweeps")
+    return finite_numbers(_read_list(path), path, "times of sweeps")
 
 
 def _sweeps(root: Path) -> tuple[list[Sweep], list[str]]:
@@ -146,106 +139,80 @@ def _sweeps(root: Path) -> tuple[list[Sweep], list[str]]:
 
 def _read_sweep(path: Path) -> SweepPoints:
     table = read_pickled(path)
-    x, y, z, t = (table.numbers(name) for name in "xyzt")
-    return SweepPoints(np.stack([x, y, z], 1), t)
+    return SweepPoints(table.stacked("xyz"), table.numbers("t"))
 
 
-def _objects(root: Path) -> tuple[list[TrackedObject], list[str]]:
+class _Cuboid(NamedTuple):
+    """A box, whether it is the forward scanner's, and the name of its thing's other track."""
+
+    box: Box
+    forward: bool
+    sibling: str
+
+
+def _objects(root: Path) -> tuple[tuple[TrackedObject, ...], list[str]]:
     """Return what was followed through the sequence, once each, and notes."""
     files = numbered(root / "annotations" / "cuboids", PICKLES)
     if not files:
-        return [], ["There are no boxes of moving things."]
+        return (), ["There are no boxes of moving things."]
     times = _sweep_times(root)
     path = root / "lidar" / "poses.json"
-    scanner = read_json_list(path)
-    tracks: dict[str, _Track] = {}
-    nameless = 0
+    scanner = _read_list(path)
     known = min(len(times), len(scanner))
     used = [frame for frame in files if frame < known]
+    of: dict[str, list[_Cuboid]] = {}
     for frame in used:
-        pose = _pose(scanner[frame], path, frame)
-        nameless += _add_boxes(tracks, files[frame], times[frame], pose)
-    doubled = _doubled(tracks)
-    alone = [t for name, t in tracks.items() if t.forward and name not in doubled]
-    # `stationary` is of the whole sequence; what is not may still wait all the time.
-    objects = [
-        tracked(name, t.label, t.size, t.times, t.poses, False if t.stands else None)
-        for name, t in tracks.items()
-        if name not in doubled
-    ]
+        for cuboid in _cuboids(files[frame], times[frame], _pose(scanner[frame], path, frame)):
+            of.setdefault(cuboid.box.track, []).append(cuboid)
+    nameless = len(of.pop("", []))
+    doubled = _doubled(of)
+    alone = [name for name, own in of.items() if own[0].forward and name not in doubled]
     notes = [
         *counted(known - len(used), f"of {known} frames have no boxes."),
         *counted(len(files) - len(used), "tables of boxes are of frames without a time."),
         *counted(nameless, "boxes belong to no track: they are left out."),
         *counted(len(alone), ALONE),
     ]
-    return objects, notes
+    return tracks(c.box for name in of if name not in doubled for c in of[name]), notes
 
 
-@dataclass
-class _Track:
-    """Boxes of one uuid."""
-
-    label: str
-    size: tuple[float, float, float]
-    stands: bool
-    forward: bool
-    siblings: set[str] = field(default_factory=set)
-    times: list[float] = field(default_factory=list)
-    poses: list[np.ndarray] = field(default_factory=list)
-
-
-def _add_boxes(tracks: dict[str, _Track], path: Path, time: float, scanner: Pose) -> int:
-    """Add the boxes of a frame to their tracks; return how many have none."""
+def _cuboids(path: Path, time: float, scanner: Pose) -> Iterator[_Cuboid]:
+    """Yield the boxes of a frame, whose turn of the scanner ended at a time, seconds."""
     table = read_pickled(path)
-    names, labels = table["uuid"], table["label"]
-    position, size = (
-        np.stack([table.numbers(name) for name in columns], 1) for columns in (POSITION, SIZE)
-    )
+    position, size = table.stacked(POSITION), table.stacked(SIZE)
     # 0 looks along y, counterclockwise; our boxes look along x.
     yaw = table.numbers("yaw") + np.pi / 2
     stands = table.numbers("stationary") > 0
-    none = np.full(len(names), -1)
+    none = np.full(len(yaw), -1)
     sensor = table.get("cuboids.sensor_id", none)
     sibling = table.get("cuboids.sibling_id", none)
     if not np.isfinite(np.column_stack([position, size, yaw])).all() or (size <= 0).any():
         raise broken(f"{path}:", "boxes should have finite positions and positive sizes")
-    passed = time + _since_end(position, scanner)
-    named = [row for row, name in enumerate(names) if isinstance(name, str) and name]
-    for row in named:
-        length, width, height = map(float, size[row])
-        forward = sensor[row] == FORWARD
-        new = _Track(str(labels[row]), (length, width, height), bool(stands[row]), forward)
-        track = tracks.setdefault(names[row], new)
-        track.siblings.add(str(sibling[row]))
-        track.times.append(float(passed[row]))
-        c, s = np.cos(yaw[row]), np.sin(yaw[row])
-        pose = np.eye(4)
-        pose[:2, :2], pose[:3, 3] = [[c, -s], [s, c]], position[row]
-        track.poses.append(pose)
-    return len(names) - len(named)
-
-
-def _since_end(position: Float[np.ndarray, "n 3"], scanner: Pose) -> Float64[np.ndarray, " n"]:
-    """Return when the scanner passed places, seconds from the end of its turn (so not positive).
-
-    Its axes are x to the right, y forward.
-    """
+    # The scanner's axes are x to the right, y forward.
     local = (position - scanner[:3, 3]) @ inverse(scanner)[:3, :3].T
     azimuth = np.arctan2(local[:, 1], local[:, 0])
-    return TURN_S * (turned(azimuth, start=-np.pi / 2) - 1)
+    passed = time + TURN_S * (turned(azimuth, start=-np.pi / 2) - 1)
+    for row, (name, label) in enumerate(zip(table["uuid"], table["label"], strict=True)):
+        pose, (c, s) = np.eye(4), (np.cos(yaw[row]), np.sin(yaw[row]))
+        pose[:2, :2], pose[:3, 3] = [[c, -s], [s, c]], position[row]
+        # `stationary` is of the whole sequence; what is not may still wait all the time.
+        moving = False if stands[row] else None
+        name = name if isinstance(name, str) else ""
+        box = Box(name, str(label), tuple(size[row]), float(passed[row]), pose, moving)
+        yield _Cuboid(box, sensor[row] == FORWARD, str(sibling[row]))
 
 
-def _doubled(tracks: dict[str, _Track]) -> set[str]:
-    """Return boxes of the forward scanner whose thing has others.
+def _doubled(of: dict[str, list[_Cuboid]]) -> set[str]:
+    """Return the forward scanner's tracks whose thing has another one.
 
     Either may name its sibling; of some names the last letters are missing.
     """
-    others = {name: t for name, t in tracks.items() if not t.forward}
-    told = {s for t in others.values() for s in t.siblings}
+    others = {name for name, own in of.items() if not own[0].forward}
+    told = {cuboid.sibling for name in others for cuboid in of[name]}
     doubled = set()
-    for name, track in tracks.items():
-        named = any(o.startswith(s) for s in track.siblings if len(s) > 8 for o in others)
-        if track.forward and (named or name in told):
+    for name in of.keys() - others:
+        siblings = {cuboid.sibling for cuboid in of[name]}
+        named = any(o.startswith(s) for s in siblings if len(s) > 8 for o in others)
+        if named or name in told:
             doubled.add(name)
     return doubled

@@ -1,9 +1,9 @@
 """The contract between readers of driving data sets and the rest of the program.
 
-A reader is a pair of functions in a module of its own, listed in `FORMATS`: `is_NAME(root)` looks
-at names of files only; `read_NAME(root, cfg)` reads the tables and returns a `Recording`, but
-decodes neither photographs nor laser points. `root` is the folder of a drive, or of several of
-which `cfg.drive` names one. What a reader promises:
+A reader is a module, listed in `FORMATS`: by `MARKER`, the name of a file, a folder with a drive is
+recognised; `read_NAME(root, cfg)` reads the tables and returns a `Recording`, but decodes neither
+photographs nor laser points. `root` is the folder of a drive, or of several of which `cfg.drive`
+names one. What a reader promises:
 
 - The world is right-handed and metric; its origin may be anywhere. One clock, in seconds, serves
   photographs, laser points and tracks.
@@ -30,6 +30,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from p2gs_jax.errors import UserError
+from p2gs_jax.scene.rigid import interpolated
 from p2gs_jax.types import Distortion, TrackedObject
 
 Report = Callable[[str], None]
@@ -54,6 +55,18 @@ class RigCamera:
     height: int
     distortion: Distortion | None = None
     readout_s: float | None = None
+
+
+class Trajectory(NamedTuple):
+    """Where something was at some times: seconds, rising, and poses to the world."""
+
+    times: Float64[np.ndarray, " t"]
+    poses: Float64[np.ndarray, "t 4 4"]
+
+    def at(self, times: Float64[np.ndarray, " n"]):
+        """Return poses [n 4 4] at times, and which of these [n] are covered; NaN never is."""
+        poses, covered = interpolated(self.times, self.poses, np.nan_to_num(times))
+        return poses, covered & np.isfinite(times)
 
 
 @dataclass(frozen=True)

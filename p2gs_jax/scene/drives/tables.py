@@ -1,4 +1,4 @@
-"""What readers of driving data sets share: files, numbers, JSON and pickled pandas tables.
+"""What readers of driving data sets share: folders of drives, numbers, and tables in their files.
 
 A pickle names functions and calls them. Here every name that a table of numbers and texts may hold
 stands for an inert record of what it was called with; other names are refused. What the records
@@ -10,6 +10,7 @@ from __future__ import annotations
 import gzip
 import io
 import json
+import mmap
 import pickle
 import re
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
@@ -17,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError, broken
@@ -25,8 +26,10 @@ from p2gs_jax.errors import UserError, broken
 Row = dict[str, Any]
 Kinds = Mapping[str, type | tuple[type, ...]]
 
-_GAP = re.compile(r"[\s,]*")
+UNPACK = "unpack that part of the data set there as well"
 _DECODER = json.JSONDecoder()
+# Rows of large JSON tables take less, bytes.
+_LONGEST_ROW = 2**14
 # Modules moved between versions of pandas and numpy.
 _IN_TABLES = re.compile(
     r"pandas(\.\w+)*\.(DataFrame|BlockManager|_unpickle_block|_new_Index|(Range|Int64)?Index)"
@@ -42,6 +45,17 @@ _MOST_BYTES = 2**28
 def counted(count: int, words: str) -> list[str]:
     """Return the note `COUNT WORDS`, or none where nothing was counted."""
     return [f"{count} {words}"] if count else []
+
+
+def drive_folder(root: Path, asked: str | None, marker: str) -> Path:
+    """Return the folder of a drive: `root`, or the one below it that is asked for.
+
+    The folder of a drive is where the glob `marker` finds something. UserError: see `chosen_drive`.
+    """
+    if any(root.glob(marker)):
+        return root
+    there = {path.relative_to(root).parts[0] for path in root.glob(f"*/{marker}")}
+    return root / chosen_drive(asked, sorted(there), root)
 
 
 def chosen_drive(asked: str | None, there: Sequence[str], root: Path) -> str:
@@ -66,17 +80,23 @@ def chosen_drive(asked: str | None, there: Sequence[str], root: Path) -> str:
 
 def missing_file(path: Path) -> UserError:
     """Return the error for a file that a drive needs and that is not there."""
-    return UserError(f"{path} is missing", fix="unpack that part of the data set there as well")
+    return UserError(f"{path} does not exist", fix=UNPACK)
 
 
-def finite_numbers(values: Iterable[Any], path: Path, what: str) -> Float64[np.ndarray, " n"]:
-    """Return numbers, or their texts, as an array; UserError: one (of `what`) is not finite."""
+def finite_numbers(
+    values: Iterable[Any], path: Path, what: str, count: int | None = None
+) -> Float64[np.ndarray, " n"]:
+    """Return numbers, or their texts, as an array.
+
+    UserError: one (of `what`) is not finite, or there are not as many as `count` says.
+    """
     try:
         numbers = np.array([float(value) for value in values])
     except (TypeError, ValueError):
         numbers = np.array([np.nan])
-    if not np.isfinite(numbers).all():
-        raise broken(f"{path}:", f"{what} should be finite numbers")
+    if not np.isfinite(numbers).all() or count not in (None, len(numbers)):
+        many = "finite numbers" if count is None else f"{count} finite numbers"
+        raise broken(f"{path}:", f"{what} should be {many}")
     return numbers
 
 
@@ -87,44 +107,18 @@ def numbered(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
     """
     found: dict[int, Path] = {}
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
-        for suffix in suffixes:
-            stem = path.name.removesuffix(suffix)
-            if stem != path.name and stem.isdigit():
-                found.setdefault(int(stem), path)
+        stems = (path.name.removesuffix(suffix) for suffix in suffixes)
+        stem = next((stem for stem in stems if stem != path.name), "")
+        if stem.isdigit():
+            found.setdefault(int(stem), path)
     return dict(sorted(found.items()))
-
-
-def read_lines(path: Path) -> list[str]:
-    """Return the lines of a text, whatever its encoding; UserError: it is missing."""
-    try:
-        return path.read_text(errors="replace").splitlines()
-    except FileNotFoundError:
-        raise missing_file(path) from None
-
-
-def read_json(path: Path) -> Any:
-    """Return what a JSON file holds; UserError: it is missing or broken."""
-    try:
-        return parse_json(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise missing_file(path) from None
-    except (ValueError, RecursionError) as error:
-        raise broken(path, f"is not valid JSON: {error}") from None
-
-
-def read_json_list(path: Path) -> list[Any]:
-    """Return the list that a JSON file holds; UserError: it is missing, broken or not a list."""
-    held = read_json(path)
-    if not isinstance(held, list):
-        raise broken(path, "should hold a list with an entry for each frame")
-    return held
 
 
 def read_rows(path: Path, needs: Kinds, column: str = "", among: Container[Any] = ()) -> list[Row]:
     """Return rows of a large JSON list of objects; only those wanted are decoded.
 
     Tables of all of nuScenes' drives are millions of rows; those of one drive are found in the
-    text, which takes a fifth of the time that decoding all does. Rows should hold no objects.
+    text, which is not held in memory. Rows should hold no objects.
 
     Args:
         path: the table.
@@ -136,59 +130,61 @@ def read_rows(path: Path, needs: Kinds, column: str = "", among: Container[Any] 
         UserError: the file is missing, not a list of objects, or cut off, or a row lacks a column.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
+            if not (
+                re.match(rb"\s*\[\s*[{\]]", text) and re.search(rb"[}\[]\s*]\s*$", text[-999:])
+            ):
+                raise ValueError("it should be a list of objects")
+            rows = list(_found(text, column, among)) if column else parse_json(text[:].decode())
     except FileNotFoundError:
         raise missing_file(path) from None
-    except ValueError as error:
-        raise _not_rows(path, error) from None
-    closed = re.search(r"[}\[]\s*\]\s*$", text[-1000:])
-    rows = list(_found(text, column, among)) if column and closed else []
-    # Where nothing is found, the table may be written otherwise, or not be a table.
-    rows = rows or [row for row in _every(text, path) if not column or row.get(column) in among]
+    except (ValueError, RecursionError) as error:
+        raise broken(path, f"is not a valid table: {error}") from None
     for row in rows:
         for name, kind in needs.items():
-            if not isinstance(row.get(name), kind):
-                raise _not_rows(path, f"a row has no valid {name!r}: {json.dumps(row)[:200]}")
+            if not (isinstance(row, dict) and isinstance(row.get(name), kind)):
+                why = f"a row has no valid {name!r}: {json.dumps(row)[:200]}"
+                raise broken(path, f"is not a valid table: {why}")
     return rows
 
 
-def _found(text: str, column: str, among: Container[Any]) -> Iterator[Row]:
+def _found(text: mmap.mmap, column: str, among: Container[Any]) -> Iterator[Row]:
     """Yield the rows that hold one of the values; rows are taken to hold no objects."""
-    for match in re.finditer(rf'"{re.escape(column)}"\s*:\s*"([^"]*)"', text):
-        if match[1] not in among:
-            continue
-        try:
-            row, end = _DECODER.raw_decode(text, text.rfind("{", 0, match.start()))
-        except (ValueError, RecursionError):
-            continue
-        if end > match.start() and isinstance(row, dict) and row.get(column) == match[1]:
-            yield row
+    for match in re.finditer(rf'"{re.escape(column)}"\s*:\s*"([^"]*)"'.encode(), text):
+        if match[1].decode() in among:
+            start = text.rfind(b"{", 0, match.start())
+            row = text[start : start + _LONGEST_ROW].decode(errors="replace")
+            yield _DECODER.raw_decode(row)[0]
 
 
-def _every(text: str, path: Path) -> Iterator[Row]:
-    at = _skip(text, 0)
-    if text[at : at + 1] != "[":
-        raise _not_rows(path, "it should be a list of objects")
-    at = _skip(text, at + 1)
-    while text[at : at + 1] != "]":
-        try:
-            row, at = _DECODER.raw_decode(text, at)
-        except (ValueError, RecursionError) as error:
-            raise _not_rows(path, error) from None
-        if not isinstance(row, dict):
-            raise _not_rows(path, "it should be a list of objects")
-        yield row
-        at = _skip(text, at)
+class Columns(dict[str, np.ndarray]):
+    """Columns of a table by name; UserError where one that is asked for is not there.
 
+    What is not a number is an object, None where there is nothing.
+    """
 
-def _skip(text: str, at: int) -> int:
-    """Return where the next value, or the end of the list, begins."""
-    gap = _GAP.match(text, at)
-    return gap.end() if gap else at
+    def __init__(self, columns: Mapping[str, np.ndarray], path: Path):
+        super().__init__(columns)
+        self.path = path
 
+    def __missing__(self, name: str):
+        raise broken(self.path, f"has no column {name!r}, only {', '.join(self)}")
 
-def _not_rows(path: Path, why: object) -> UserError:
-    return broken(path, f"is not a valid table: {why}")
+    def numbers(self, name: str) -> Float64[np.ndarray, " n"]:
+        """Return a column of numbers; UserError: it holds something else."""
+        if self[name].dtype.kind not in "biuf":
+            raise broken(f"{self.path}:", f"its column {name!r} should hold numbers")
+        return self[name].astype(np.float64)
+
+    def stacked(self, names: Iterable[str]) -> Float64[np.ndarray, "n k"]:
+        """Return columns of numbers side by side; UserError: one holds something else."""
+        return np.stack([self.numbers(name) for name in names], 1)
+
+    def whole(self, name: str) -> Int64[np.ndarray, " n"]:
+        """Return a column of whole numbers; UserError: it holds others, or has gaps."""
+        if self[name].dtype.kind not in "iu":
+            raise broken(f"{self.path}:", f"{name} should be whole numbers, without gaps")
+        return self[name].astype(np.int64)
 
 
 class _Record:
@@ -214,23 +210,6 @@ class _Records(pickle.Unpickler):
         if not _IN_TABLES.fullmatch(f"{module}.{name}"):
             raise pickle.UnpicklingError(f"it holds a {module}.{name}")
         return type(name, (_Record,), {"name": name})
-
-
-class Columns(dict[str, np.ndarray]):
-    """Columns of a table by name; UserError where one that is asked for is not there."""
-
-    def __init__(self, columns: dict[str, np.ndarray], path: Path):
-        super().__init__(columns)
-        self.path = path
-
-    def __missing__(self, name: str):
-        raise broken(self.path, f"has no column {name!r}, only {', '.join(self)}")
-
-    def numbers(self, name: str) -> Float64[np.ndarray, " n"]:
-        """Return a column of numbers; UserError: it holds something else."""
-        if self[name].dtype.kind not in "biuf":
-            raise broken(f"{self.path}:", f"its column {name!r} should hold numbers")
-        return self[name].astype(np.float64)
 
 
 def read_pickled(path: Path) -> Columns:

@@ -47,6 +47,7 @@ from p2gs_jax.scene.lens import intrinsics, make_distortion
 from p2gs_jax.scene.rigid import LONGEST_BEYOND_S, rigid
 from p2gs_jax.types import TrackedObject
 
+MARKER = "camera_image/*.parquet"
 STAMP, CAMERA, LASER = "key.frame_timestamp_micros", "key.camera_name", "key.laser_name"
 TRACK = "key.laser_object_id"
 CAMERAS = ("UNKNOWN", "FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")
@@ -88,14 +89,10 @@ MISSING = {
 OPENCV = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
 
-def is_waymo(root: Path) -> bool:
-    """Return whether a folder holds Waymo's photographs in Parquet files."""
-    return bool(_segments(root))
-
-
 def read_waymo(root: Path, cfg: DataConfig) -> Recording:
     """Read a segment in a folder with `camera_image`, `lidar`, ...; UserError: a file is broken."""
-    segment = _Segment(root, chosen_drive(cfg.drive, _segments(root), root))
+    there = sorted(path.stem for path in root.glob(MARKER))
+    segment = _Segment(root, chosen_drive(cfg.drive, there, root))
     cameras, mounts, rolling = _cameras(segment.open("camera_calibration"))
     photographs, readouts, notes = _photographs(segment, mounts, rolling)
     notes += [f"{n} is missing: {why}." for n, why in MISSING.items() if not segment.has(n)]
@@ -108,20 +105,15 @@ def read_waymo(root: Path, cfg: DataConfig) -> Recording:
     return Recording(root, "waymo", rig, photographs, sweeps, objects, notes)
 
 
-def _segments(root: Path) -> list[str]:
-    return sorted(path.stem for path in (root / "camera_image").glob("*.parquet"))
-
-
 class _Segment:
     """The files of a segment, its moments, and its clock."""
 
     def __init__(self, root: Path, name: str):
         self.root, self.name = root, name
         self.images = self.open("camera_image")
-        stamps = self.images.columns([STAMP])[STAMP]
-        if stamps.dtype.kind not in "iu" or not len(stamps):
+        self._stamps = np.unique(self.images.columns([STAMP]).whole(STAMP))
+        if not len(self._stamps):
             raise broken(self.images.path, "holds no photograph")
-        self._stamps = np.unique(stamps.astype(np.int64))
 
     def path(self, component: str) -> Path:
         return self.root / component / f"{self.name}.parquet"
@@ -155,15 +147,15 @@ def _transform(values: Any, path: Path, what: str) -> Pose:
 
 def _cameras(table: ParquetTable) -> tuple[list[RigCamera], dict[str, Pose], set[str]]:
     """Return cameras, where they are on the car (OpenCV axes), and which roll."""
-    columns = table.columns([CAMERA, *LENS_NUMBERS, DIRECTION], [MOUNT])
+    columns = table.columns([CAMERA, *LENS_NUMBERS, DIRECTION, MOUNT])
     cameras, mounts, rolling = [], {}, set()
-    for row, number in enumerate(columns[CAMERA]):
-        name = _name(CAMERAS, int(number))
-        values = np.array([columns[key][row] for key in LENS_NUMBERS], np.float64)
-        if not np.isfinite(values).all() or (values[[0, 1, -2, -1]] <= 0).any():
+    numbers, lenses = columns.whole(CAMERA), columns.stacked(LENS_NUMBERS)
+    for row, (number, lens) in enumerate(zip(numbers, lenses, strict=True)):
+        name = _name(CAMERAS, number)
+        if not np.isfinite(lens).all() or (lens[[0, 1, -2, -1]] <= 0).any():
             why = f"the lens of {name} should be finite numbers, with positive focal lengths and "
             raise broken(f"{table.path}:", f"{why}sizes")
-        fu, fv, cu, cv, *bent, width, height = values.tolist()
+        fu, fv, cu, cv, *bent, width, height = lens.tolist()
         K, distortion = intrinsics(fu, fv, cu, cv), make_distortion((*bent,))
         cameras.append(RigCamera(name, K, int(width), int(height), distortion))
         mounts[name] = _transform(columns[MOUNT][row], table.path, name) @ OPENCV
@@ -177,16 +169,15 @@ def _photographs(
 ) -> tuple[list[Photograph], dict[str, float], list[str]]:
     """Return photographs, seconds of readout of rolling cameras, and notes."""
     images = segment.images
-    table = images.columns([STAMP, CAMERA, POSE_TIME, *MOTION, *SHUTTER], [POSE])
-    motion = np.stack([table[name] for name in MOTION], 1).astype(np.float64)
-    shutter, trigger, done = (table[name].astype(np.float64) for name in SHUTTER)
+    table = images.columns([STAMP, CAMERA, POSE_TIME, *MOTION, *SHUTTER, POSE])
+    motion, stamps, times = table.stacked(MOTION), table.whole(STAMP), table.numbers(POSE_TIME)
+    shutter, trigger, done = map(table.numbers, SHUTTER)
     photographs, without = [], 0
     readouts: dict[str, list[float]] = {}
-    for row, number in enumerate(table[CAMERA]):
-        name, stamp = _name(CAMERAS, int(number)), int(table[STAMP][row])
+    for row, number in enumerate(table.whole(CAMERA)):
+        name, stamp, posed = _name(CAMERAS, number), int(stamps[row]), float(times[row])
         if name not in mounts:
             raise broken(segment.path("camera_calibration"), f"has no camera {name}")
-        posed = float(table[POSE_TIME][row])
         if table[POSE][row] is None or not np.isfinite(posed):
             without += 1
             continue
@@ -236,10 +227,10 @@ def _jpeg(images: ParquetTable, row: int) -> bytes:
 
 def _cars(table: ParquetTable) -> dict[int, Pose]:
     """Return the pose of the car that boxes refer to, by time stamp."""
-    columns = table.columns([STAMP], [CAR])
+    columns = table.columns([STAMP, CAR])
     return {
-        int(stamp): _transform(pose, table.path, f"frame {stamp}")
-        for stamp, pose in zip(columns[STAMP], columns[CAR], strict=True)
+        stamp: _transform(pose, table.path, f"frame {stamp}")
+        for stamp, pose in zip(columns.whole(STAMP).tolist(), columns[CAR], strict=True)
         if pose is not None
     }
 
@@ -248,12 +239,9 @@ def _objects(
     segment: _Segment, cars: dict[int, Pose]
 ) -> tuple[tuple[TrackedObject, ...], list[str]]:
     table = segment.open("lidar_box")
-    columns = table.columns([STAMP, *CENTRE, *EXTENT, HEADING, TYPE], [TRACK])
-    centre, extent = (
-        np.stack([columns[name] for name in names], 1).astype(np.float64)
-        for names in (CENTRE, EXTENT)
-    )
-    heading = columns[HEADING].astype(np.float64)
+    columns = table.columns([STAMP, *CENTRE, *EXTENT, HEADING, TYPE, TRACK])
+    centre, extent = columns.stacked(CENTRE), columns.stacked(EXTENT)
+    heading, types = columns.numbers(HEADING), columns.whole(TYPE)
     if not (np.isfinite(np.column_stack([centre, extent, heading])).all() and (extent > 0).all()):
         raise broken(f"{table.path}:", "boxes should have finite positions and positive sizes")
     local = np.tile(np.eye(4), (len(centre), 1, 1))
@@ -263,7 +251,7 @@ def _objects(
     # Boxes are drawn on laser points, which were measured as the scanner passed.
     passed = TURN_S * turned(np.arctan2(centre[:, 1], centre[:, 0]), TURN_START)
     boxes, untracked, lost = [], 0, 0
-    for row, stamp in enumerate(map(int, columns[STAMP])):
+    for row, stamp in enumerate(columns.whole(STAMP).tolist()):
         track = columns[TRACK][row]
         if not track:
             untracked += 1
@@ -271,7 +259,7 @@ def _objects(
             lost += 1
         else:
             length, width, height = extent[row].tolist()
-            label = _name(TYPES, int(columns[TYPE][row]))
+            label = _name(TYPES, types[row])
             time = segment.seconds(stamp) + float(passed[row])
             boxes.append(Box(track, label, (length, width, height), time, cars[stamp] @ local[row]))
     notes = counted(untracked, "boxes belong to no track: they are left out.")
@@ -281,17 +269,13 @@ def _objects(
 
 
 class _Scanner(NamedTuple):
-    """Where a scanner is on the car, and its beams.
+    """Where a scanner is on the car, scanner to car, and its beams.
 
-    Attributes:
-        mount: scanner to car.
-        beams: inclinations, radians, from below; empty: evenly between `low` and `high`.
+    `beams` are inclinations, radians, from below; two are the ends of evenly spaced ones.
     """
 
     mount: Pose
     beams: Float64[np.ndarray, " h"]
-    low: float
-    high: float
 
 
 def _sweeps(segment: _Segment, cars: dict[int, Pose]) -> tuple[list[Sweep], list[str]]:
@@ -326,21 +310,21 @@ def _sweeps(segment: _Segment, cars: dict[int, Pose]) -> tuple[list[Sweep], list
 def _rows(table: ParquetTable) -> dict[tuple[int, int], int]:
     """Return rows by time stamp and scanner."""
     keys = table.columns([STAMP, LASER])
-    pairs = zip(keys[STAMP], keys[LASER], strict=True)
-    return {(int(stamp), int(laser)): row for row, (stamp, laser) in enumerate(pairs)}
+    pairs = zip(keys.whole(STAMP).tolist(), keys.whole(LASER).tolist(), strict=True)
+    return {pair: row for row, pair in enumerate(pairs)}
 
 
 def _scanners(table: ParquetTable) -> dict[int, _Scanner]:
     mount = f"{SCANNER}extrinsic.transform"
-    columns = table.columns([LASER, LOW, HIGH], [mount, BEAMS])
+    columns = table.columns([LASER, LOW, HIGH, mount, BEAMS])
+    ends = columns.stacked((LOW, HIGH))
     found = {}
-    for row, laser in enumerate(columns[LASER]):
-        pose = _transform(columns[mount][row], table.path, f"scanner {laser}")
-        beams = np.array(columns[BEAMS][row] or [], np.float64)
-        low, high = float(columns[LOW][row]), float(columns[HIGH][row])
-        if not (np.isfinite(beams).all() if len(beams) else np.isfinite([low, high]).all()):
+    for row, laser in enumerate(columns.whole(LASER).tolist()):
+        pose, beams = columns[mount][row], columns[BEAMS][row]
+        beams = ends[row] if beams is None or not len(beams) else np.array(beams, np.float64)
+        if not np.isfinite(beams).all():
             raise broken(f"{table.path}:", f"scanner {laser} has no beams")
-        found[int(laser)] = _Scanner(pose, beams, low, high)
+        found[laser] = _Scanner(_transform(pose, table.path, f"scanner {laser}"), beams)
     return found
 
 
@@ -422,8 +406,8 @@ def _vehicle_points(
     """Return points in the car's axes: the first row looks highest, the first column back."""
     height, width = distances.shape
     beams = scanner.beams
-    if not len(beams):
-        beams = scanner.low + (np.arange(height) + 0.5) / height * (scanner.high - scanner.low)
+    if len(beams) == 2:
+        beams = beams[0] + (np.arange(height) + 0.5) / height * (beams[1] - beams[0])
     if len(beams) != height:
         why = f"a range image has {height} rows, its scanner {len(beams)} beams"
         raise broken(f"{path}:", why, "get the file and that in lidar_calibration again")

@@ -12,7 +12,7 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.drives.lidar import owners, seeds
-from p2gs_jax.scene.drives.objects import tracked
+from p2gs_jax.scene.drives.objects import Box, tracks
 from p2gs_jax.scene.drives.recording import SweepPoints, chosen_cameras, chosen_frames, short_name
 from p2gs_jax.scene.rigid import from_quaternion, interpolated, inverse, rigid
 from p2gs_jax.scene.split import assign_split
@@ -211,10 +211,10 @@ def test_nothing_is_owned_where_nothing_is_tracked():
 def test_what_gets_away_from_where_it_was_moves(xs, says, moves):
     poses = np.tile(np.eye(4), (len(xs), 1, 1))
     poses[:, 0, 3] = xs
-    thing = tracked("a", "Car", (4, 2, 1.5), np.arange(len(xs)), poses, says)
+    boxes = [Box("a", "Car", (4, 2, 1.5), k, pose, says) for k, pose in enumerate(poses)]
+    (thing,) = tracks(boxes)
     assert thing.moving is moves
-    # Sorted, and each time counts once.
-    times, poses = [*range(len(xs))[::-1], 0], [*poses[::-1], 9 * poses[0]]
-    again = tracked("a", "Car", (4, 2, 1.5), times, poses, says)
-    np.testing.assert_array_equal(again.poses, thing.poses)
+    # Sorted, and of one time the first box counts.
+    (again,) = tracks([*boxes[::-1], boxes[0]._replace(pose=9 * poses[0])])
+    np.testing.assert_array_equal(again.poses, poses)
     assert again.size == (4.0, 2.0, 1.5)
