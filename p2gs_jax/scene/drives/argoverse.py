@@ -25,7 +25,6 @@ from jaxtyping import Float64, Int, Int64
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import broken
-from p2gs_jax.scene.drives.arrow import read_feather
 from p2gs_jax.scene.drives.objects import Box, Pose, tracks
 from p2gs_jax.scene.drives.recording import (
     Photograph,
@@ -35,7 +34,7 @@ from p2gs_jax.scene.drives.recording import (
     SweepPoints,
     Trajectory,
 )
-from p2gs_jax.scene.drives.tables import Columns, counted, drive_folder, numbered
+from p2gs_jax.scene.drives.tables import Columns, counted, drive_folder, numbered, read_feather
 from p2gs_jax.scene.lens import intrinsics
 from p2gs_jax.scene.rigid import from_quaternions
 from p2gs_jax.types import TrackedObject

@@ -15,12 +15,12 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.errors import UserError
+from p2gs_jax.scene.cache import Report
 from p2gs_jax.scene.drives.ego_mask import find_ego_masks
 from p2gs_jax.scene.drives.lidar import MOST_MEASURED, owners, seeds, thinned
 from p2gs_jax.scene.drives.recording import (
     Photograph,
     Recording,
-    Report,
     chosen_cameras,
     chosen_frames,
 )
@@ -137,12 +137,6 @@ def _chosen_photographs(
     if few:
         notes.append(
             f"of {len(frames)} frames some cameras have fewer photographs: {', '.join(few)}"
-        )
-    rolling = [abs(c.readout_s) for c in recording.cameras if c.name in names and c.readout_s]
-    if rolling:
-        notes.append(
-            f"{len(rolling)} cameras have rolling shutters (up to {1000 * max(rolling):.0f} ms "
-            "from the first row or column to the last): each photograph is taken as of one moment."
         )
     return chosen, notes
 

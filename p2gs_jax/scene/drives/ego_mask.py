@@ -22,8 +22,8 @@ from scipy.sparse import coo_array, csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from p2gs_jax.core.atomic import atomic_write
-from p2gs_jax.scene.cache import cached_folder
-from p2gs_jax.scene.drives.recording import Photograph, Recording, Report, RigCamera
+from p2gs_jax.scene.cache import Report, cached_folder
+from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera
 from p2gs_jax.scene.files import decode_grey, undecodable
 from p2gs_jax.scene.lens import scale_intrinsics, undistort_points
 from p2gs_jax.scene.rigid import inverse, up_of_drive
@@ -34,7 +34,7 @@ MOST_LOOKED_AT, FEWEST_LOOKED_AT = 24, 6
 # A turn by one radian counts as this way, metres.
 TURN_AS_WAY = 10.0
 # The version is part of the key of kept results: raise it with every change of what is found.
-_VERSION = 1
+_VERSION = 2
 _SAID = "own car"
 # Lengths in the picture are in pixels at this width; so are all thresholds (BUILD_NOTES).
 WIDTH = 480
@@ -60,16 +60,6 @@ _MOTION_STEP = 8
 _CAPACITY = 1000
 
 
-class EgoMask(NamedTuple):
-    """The car itself in one camera: in the photograph as stored, at a lower resolution.
-
-    `looked_at` counts photographs; it is 0 where the camera hardly moves and nothing can be told.
-    """
-
-    mask: Bool[np.ndarray, "h w"] | None
-    looked_at: int
-
-
 def find_ego_masks(
     recording: Recording,
     names: Sequence[str],
@@ -78,8 +68,9 @@ def find_ego_masks(
 ) -> tuple[dict[str, Bool[np.ndarray, "h w"]], list[str]]:
     """Return where the named cameras see their own car, and notes.
 
-    All photographs of the drive serve, whatever frames are used. Results are kept as pictures below
-    `work_dir` for a resume; None keeps nothing.
+    Masks are of the photographs as stored, at a lower resolution. All photographs of the drive
+    serve, whatever frames are used. Results are kept as pictures below `work_dir` for a resume;
+    None keeps nothing.
     """
     cameras = {c.name: c for c in recording.cameras}
     poses = np.stack([p.pose for p in recording.photographs])
@@ -88,17 +79,16 @@ def find_ego_masks(
     masks: dict[str, Bool[np.ndarray, "h w"]] = {}
     standing, without = [], []
     for name in names:
-        there = [
-            p
-            for p in recording.photographs
-            if p.camera == name and (p.embedded is not None or p.path.is_file())
-        ]
+        own = [p for p in recording.photographs if p.camera == name]
+        there = [p for p in own if p.embedded is not None or p.path.is_file()]
         spread = spread_over_the_way(sorted(there, key=lambda p: p.frame), MOST_LOOKED_AT)
-        found = _kept(cameras[name], spread, up, work_dir)
-        if found.mask is not None:
-            masks[name] = found.mask
+        mask = _kept(cameras[name], spread, up, work_dir)
+        if mask is None:
+            standing.append(name)
+        elif mask.any():
+            masks[name] = mask
         else:
-            (without if found.looked_at else standing).append(name)
+            without.append(name)
     shares = [f"{name} {mask.mean():.1%}" for name, mask in masks.items()]
     notes = [f"{_SAID}: {', '.join(shares)} of the picture, left out of the fit"] if shares else []
     if without:
@@ -113,27 +103,25 @@ def find_ego_masks(
 
 def _kept(
     camera: RigCamera, shots: Sequence[Photograph], up: np.ndarray, work_dir: Path | None
-) -> EgoMask:
+) -> Bool[np.ndarray, "h w"] | None:
     """Return where a camera sees its car, from an earlier run if that found it."""
 
     def build(folder: Path) -> None:
         pictures = np.array([_picture(p, camera) for p in shots])
         poses = np.array([p.pose for p in shots]).reshape(-1, 4, 4)
-        result = find_ego_mask(camera, pictures, poses, up)
-        if result.mask is not None:
+        mask = find_ego_mask(camera, pictures, poses, up)
+        if mask is not None:
             with atomic_write(folder / "car.png") as temporary:
-                cv2.imwrite(str(temporary), result.mask.astype(np.uint8) * 255)
-        (folder / "looked_at").write_text(str(result.looked_at))
+                cv2.imwrite(str(temporary), mask.astype(np.uint8) * 255)
 
     stamps = [(p.path.name, p.frame, 0 if p.embedded else p.path.stat().st_mtime_ns) for p in shots]
     places = [np.round(p.pose, 6).tolist() for p in shots]
     key = [_VERSION, camera.name, camera.K.tolist(), stamps, places]
     with cached_folder(work_dir, f"own_car/{camera.name}", key, build) as folder:
-        looked_at = int((folder / "looked_at").read_text())
         if not (folder / "car.png").is_file():
-            return EgoMask(None, looked_at)
+            return None
         picture = cv2.imread(str(folder / "car.png"), cv2.IMREAD_GRAYSCALE)
-    return EgoMask(np.asarray(picture) > 0, looked_at)
+    return np.asarray(picture) > 0
 
 
 def _picture(photograph: Photograph, camera: RigCamera) -> UInt8[np.ndarray, "h w"]:
@@ -168,22 +156,21 @@ def find_ego_mask(
     pictures: UInt8[np.ndarray, "n h w"],
     poses: Float[np.ndarray, "n 4 4"],
     up: Float[np.ndarray, " 3"],
-) -> EgoMask:
-    """Return where a camera sees its own car.
+) -> Bool[np.ndarray, "h w"] | None:
+    """Return where a camera sees its own car; None: it hardly moves, and nothing can be told.
 
     Pictures are grey, `WIDTH` pixels wide and in the order of the drive; poses are camera to world;
     `up` leads away from the road and has length 1.
     """
     if len(pictures) < FEWEST_LOOKED_AT:
-        return EgoMask(None, 0)
+        return None
     height = pictures.shape[1]
     K = scale_intrinsics(camera.K, WIDTH / camera.width, height / camera.height)
     motion = expected_motion(poses, up, K, camera.distortion, WIDTH, height)
     # How often the world has moved on at each pixel.
     if np.minimum(np.linalg.norm(motion, axis=-1) / APART, 1).sum(0).max() < FEWEST:
-        return EgoMask(None, 0)
-    mask = cut(weigh(pictures, motion))
-    return EgoMask(mask if mask.any() else None, len(pictures))
+        return None
+    return cut(weigh(pictures, motion))
 
 
 class Evidence(NamedTuple):

@@ -33,7 +33,6 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.scene.rigid import interpolated
 from p2gs_jax.types import Distortion, TrackedObject
 
-Report = Callable[[str], None]
 # Words that data sets put around the names of their cameras.
 _AROUND = re.compile(r"(?:^|_)(?:camera|cam|ring)(?=_|$)")
 
@@ -45,8 +44,6 @@ class RigCamera:
     Attributes:
         K: intrinsics in pixels of the undistorted image, pixel centres at +0.5.
         distortion: what to remove on load, or None.
-        readout_s: seconds from the exposure of the first row, or column, to that of the last,
-            where the set states a rolling shutter; else None.
     """
 
     name: str
@@ -54,7 +51,6 @@ class RigCamera:
     width: int
     height: int
     distortion: Distortion | None = None
-    readout_s: float | None = None
 
 
 class Trajectory(NamedTuple):

@@ -27,7 +27,6 @@ boxes are.
 
 from __future__ import annotations
 
-import dataclasses
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -38,11 +37,10 @@ from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import broken
-from p2gs_jax.scene.drives.arrow import ParquetTable
 from p2gs_jax.scene.drives.lidar import turned
 from p2gs_jax.scene.drives.objects import Box, Pose, tracks
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
-from p2gs_jax.scene.drives.tables import chosen_drive, counted
+from p2gs_jax.scene.drives.tables import ParquetTable, chosen_drive, counted
 from p2gs_jax.scene.lens import intrinsics, make_distortion
 from p2gs_jax.scene.rigid import LONGEST_BEYOND_S, rigid
 from p2gs_jax.types import TrackedObject
@@ -57,15 +55,13 @@ LENS_NUMBERS = (
     *(f"{LENS}intrinsic.{k}" for k in ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")),
     *(f"{LENS}width", f"{LENS}height"),
 )
-DIRECTION, MOUNT = f"{LENS}rolling_shutter_direction", f"{LENS}extrinsic.transform"
-# Readout along rows or columns, from either side; 5 is a global shutter.
-ROLLING = (1, 2, 3, 4)
+MOUNT = f"{LENS}extrinsic.transform"
 IMAGE = "[CameraImageComponent]."
 JPEG, POSE, POSE_TIME = f"{IMAGE}image", f"{IMAGE}pose.transform", f"{IMAGE}pose_timestamp"
 MOTION = tuple(f"{IMAGE}velocity.{k}_velocity.{a}" for k in ("linear", "angular") for a in "xyz")
 SHUTTER = tuple(
     f"{IMAGE}rolling_shutter_params.{name}"
-    for name in ("shutter", "camera_trigger_time", "camera_readout_done_time")
+    for name in ("camera_trigger_time", "camera_readout_done_time")
 )
 CAR = "[VehiclePoseComponent].world_from_vehicle.transform"
 BOX = "[LiDARBoxComponent]."
@@ -93,16 +89,16 @@ def read_waymo(root: Path, cfg: DataConfig) -> Recording:
     """Read a segment in a folder with `camera_image`, `lidar`, ...; UserError: a file is broken."""
     there = sorted(path.stem for path in root.glob(MARKER))
     segment = _Segment(root, chosen_drive(cfg.drive, there, root))
-    cameras, mounts, rolling = _cameras(segment.open("camera_calibration"))
-    photographs, readouts, notes = _photographs(segment, mounts, rolling)
+    cameras, mounts = _cameras(segment.open("camera_calibration"))
+    photographs, notes = _photographs(segment, mounts)
     notes += [f"{n} is missing: {why}." for n, why in MISSING.items() if not segment.has(n)]
     cars = _cars(segment.open("vehicle_pose")) if segment.has("vehicle_pose") else {}
     objects, box_notes = _objects(segment, cars) if segment.has("lidar_box") else ((), [])
     sweeps, sweep_notes = _sweeps(segment, cars) if cars and segment.has("lidar") else ([], [])
     own = {photograph.camera for photograph in photographs}
-    rig = [dataclasses.replace(c, readout_s=readouts.get(c.name)) for c in cameras if c.name in own]
+    cameras = [camera for camera in cameras if camera.name in own]
     notes += [*box_notes, *sweep_notes]
-    return Recording(root, "waymo", rig, photographs, sweeps, objects, notes)
+    return Recording(root, "waymo", cameras, photographs, sweeps, objects, notes)
 
 
 class _Segment:
@@ -145,10 +141,10 @@ def _transform(values: Any, path: Path, what: str) -> Pose:
     return rigid(matrix[:3, :3], matrix[:3, 3], path, what)
 
 
-def _cameras(table: ParquetTable) -> tuple[list[RigCamera], dict[str, Pose], set[str]]:
-    """Return cameras, where they are on the car (OpenCV axes), and which roll."""
-    columns = table.columns([CAMERA, *LENS_NUMBERS, DIRECTION, MOUNT])
-    cameras, mounts, rolling = [], {}, set()
+def _cameras(table: ParquetTable) -> tuple[list[RigCamera], dict[str, Pose]]:
+    """Return cameras, and where they are on the car (OpenCV axes)."""
+    columns = table.columns([CAMERA, *LENS_NUMBERS, MOUNT])
+    cameras, mounts = [], {}
     numbers, lenses = columns.whole(CAMERA), columns.stacked(LENS_NUMBERS)
     for row, (number, lens) in enumerate(zip(numbers, lenses, strict=True)):
         name = _name(CAMERAS, number)
@@ -159,21 +155,16 @@ def _cameras(table: ParquetTable) -> tuple[list[RigCamera], dict[str, Pose], set
         K, distortion = intrinsics(fu, fv, cu, cv), make_distortion((*bent,))
         cameras.append(RigCamera(name, K, int(width), int(height), distortion))
         mounts[name] = _transform(columns[MOUNT][row], table.path, name) @ OPENCV
-        if columns[DIRECTION][row] in ROLLING:
-            rolling.add(name)
-    return cameras, mounts, rolling
+    return cameras, mounts
 
 
-def _photographs(
-    segment: _Segment, mounts: dict[str, Pose], rolling: set[str]
-) -> tuple[list[Photograph], dict[str, float], list[str]]:
-    """Return photographs, seconds of readout of rolling cameras, and notes."""
+def _photographs(segment: _Segment, mounts: dict[str, Pose]) -> tuple[list[Photograph], list[str]]:
+    """Return photographs, and notes."""
     images = segment.images
     table = images.columns([STAMP, CAMERA, POSE_TIME, *MOTION, *SHUTTER, POSE])
     motion, stamps, times = table.stacked(MOTION), table.whole(STAMP), table.numbers(POSE_TIME)
-    shutter, trigger, done = map(table.numbers, SHUTTER)
+    trigger, done = map(table.numbers, SHUTTER)
     photographs, without = [], 0
-    readouts: dict[str, list[float]] = {}
     for row, number in enumerate(table.whole(CAMERA)):
         name, stamp, posed = _name(CAMERAS, number), int(stamps[row]), float(times[row])
         if name not in mounts:
@@ -182,16 +173,10 @@ def _photographs(
             without += 1
             continue
         car = _transform(table[POSE][row], images.path, f"photograph {row + 1}")
-        # From the trigger to the end of the readout; exposures of the first and last column are
-        # in the middle of their shutter times, which cancels.
-        middle = (
-            (trigger[row] + done[row]) / 2 if name in rolling else trigger[row] + shutter[row] / 2
-        )
-        lag = middle - posed
+        # From the trigger to the end of the readout, the middle column is exposed in the middle.
+        lag = (trigger[row] + done[row]) / 2 - posed
         if not (abs(lag) < LONGEST_BEYOND_S and np.isfinite(motion[row]).all()):
             lag = 0.0
-        if name in rolling and np.isfinite(readout := done[row] - trigger[row] - shutter[row]):
-            readouts.setdefault(name, []).append(readout)
         photographs.append(
             Photograph(
                 camera=name,
@@ -202,8 +187,7 @@ def _photographs(
                 embedded=partial(_jpeg, images, row),
             )
         )
-    notes = counted(without, "photographs have no pose: they are left out.")
-    return photographs, {n: float(np.median(r)) for n, r in readouts.items()}, notes
+    return photographs, counted(without, "photographs have no pose: they are left out.")
 
 
 def _carried(pose: Pose, motion: Float[np.ndarray, " 6"], lag: float) -> Pose:

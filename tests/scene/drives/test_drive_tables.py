@@ -13,8 +13,7 @@ import pytest
 from scene.drives.writers_pandaset import as_published
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.drives.arrow import read_feather
-from p2gs_jax.scene.drives.tables import chosen_drive, read_pickled, read_rows
+from p2gs_jax.scene.drives.tables import chosen_drive, read_feather, read_pickled, read_rows
 
 ROWS = [
     {"token": "a", "of": "x", "values": [1, 2.5, [3]]},
