@@ -21,6 +21,7 @@ from p2gs_jax.scene.drives.lidar import MOST_MEASURED, owners, seeds, thinned
 from p2gs_jax.scene.drives.recording import (
     Photograph,
     Recording,
+    RigCamera,
     chosen_cameras,
     chosen_frames,
 )
@@ -68,17 +69,9 @@ def assemble(
     origin = np.rint(middle) if np.abs(middle).max() > FARTHEST_ORIGIN else np.zeros(3)
     folder = _embedded_folder(recording.root, work_dir)
     views = [
-        View(
-            name=_name(p),
+        dataclasses.replace(
+            _view(p, cameras[p.camera], origin),
             image_path=_file_of(p, folder, write_embedded),
-            camera=p.camera,
-            viewmat=inverse(_moved(p.pose, origin)).astype(np.float32),
-            K=cameras[p.camera].K.astype(np.float32),
-            width=cameras[p.camera].width,
-            height=cameras[p.camera].height,
-            distortion=cameras[p.camera].distortion,
-            frame=p.frame,
-            time=p.time,
             own_car=masks.get(p.camera),
         )
         for p in photographs
@@ -88,14 +81,9 @@ def assemble(
     lidar, lidar_notes = None, ["Laser measurements are not used (--data.no-lidar)."]
     if cfg.lidar:
         lidar, lidar_notes = _read_sweeps(recording, photographs, objects, origin, report)
-    notes += [*mask_notes, *lidar_notes]
-    points = np.zeros((0, 3), np.float32)
-    if lidar is not None:
-        points, angle = seeds(lidar, np.stack([p.pose[:3, 3] - origin for p in photographs]))
-        notes.append(
-            f"LiDAR: {len(lidar.points)} points, {np.mean(lidar.objects >= 0):.1%} on moving "
-            f"things; {len(points)} seeds, one in {angle:.3f} of its distance from the cameras."
-        )
+    centres = np.stack([p.pose[:3, 3] - origin for p in photographs])
+    points, seed_notes = _seeds(lidar, centres)
+    notes += [*mask_notes, *lidar_notes, *seed_notes]
     return Scene(
         root=recording.root,
         format=recording.format,
@@ -145,6 +133,21 @@ def _name(photograph: Photograph) -> str:
     return f"{photograph.camera}/{photograph.path.name}"
 
 
+def _view(photograph: Photograph, camera: RigCamera, origin: Float[np.ndarray, " 3"]) -> View:
+    return View(
+        name=_name(photograph),
+        image_path=photograph.path,
+        camera=camera.name,
+        viewmat=inverse(_moved(photograph.pose, origin)).astype(np.float32),
+        K=camera.K.astype(np.float32),
+        width=camera.width,
+        height=camera.height,
+        distortion=camera.distortion,
+        frame=photograph.frame,
+        time=photograph.time,
+    )
+
+
 def _moved(poses: Float64[np.ndarray, "*n 4 4"], origin: Float[np.ndarray, " 3"]):
     out = poses.copy()
     out[..., :3, 3] -= origin
@@ -169,6 +172,18 @@ def _file_of(photograph: Photograph, folder: Path, write_embedded: bool) -> Path
         with atomic_write(path) as temporary:
             temporary.write_bytes(photograph.embedded())
     return path
+
+
+def _seeds(lidar: Lidar | None, cameras: Float64[np.ndarray, "v 3"]):
+    """Return seeds [s 3] of what does not move, float32, and notes."""
+    if lidar is None:
+        return np.zeros((0, 3), np.float32), []
+    points, angle = seeds(lidar, cameras)
+    moving = np.mean(lidar.objects >= 0)
+    return points, [
+        f"LiDAR: {len(lidar.points)} points, {moving:.1%} on moving things; {len(points)} seeds, "
+        f"one in {angle:.3f} of its distance from the cameras."
+    ]
 
 
 def _read_sweeps(
