@@ -241,7 +241,7 @@ def serve(run: Run, *, host: str, port: int, max_width: int, say: Callable[[str]
     with open_viewer(run, host=host, port=port, max_width=max_width) as address:
         who = "only this machine" if is_loopback(host) else "any machine with this address"
         count = run.params.gaussians.capacity
-        say(f"{count} Gaussians at {address} (open to {who}; Ctrl-C ends)")
         with contextlib.suppress(KeyboardInterrupt):
+            say(f"{count} Gaussians at {address} (open to {who}; Ctrl-C ends)")
             threading.Event().wait()
         say("Ending, once what is being compiled is done.")
