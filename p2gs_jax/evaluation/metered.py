@@ -10,7 +10,8 @@ from jaxtyping import Float
 
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.evaluation.passes import ArrayStore, StoredArray, map_in_order
-from p2gs_jax.photometry.metering import Metering, Readings, fit_metering, white_level
+from p2gs_jax.photometry.formation import exposed_at
+from p2gs_jax.photometry.metering import BELOW_WHITE, Metering, Readings, fit_metering
 
 
 class _Kept(NamedTuple):
@@ -55,7 +56,8 @@ class MeteredViews:
         `gamma` is that of new views.
         """
         logs = np.log(np.asarray(exposures, np.float64))
-        return fit_metering(self._names, self._readings, logs, white_level(gamma, tone))
+        white = exposed_at(BELOW_WHITE, gamma, tone)
+        return fit_metering(self._names, self._readings, logs, white)
 
     def scores(
         self, metering: Metering, score: Callable[..., dict[str, Any]]

@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Float32
 from PIL import Image, ImageDraw, ImageFont
 
-from p2gs_jax.core.numerics import LN2
 from p2gs_jax.formats.frames import OutputFrame, to_uint8
 from p2gs_jax.paths.panorama import Cylinder, Layers, Wide, borders, render_wide, stitch
 from p2gs_jax.paths.rig import Rig, TimeStep
@@ -78,17 +77,16 @@ def metered_shots(
     order; 0 meters each by itself.
     """
     run = renderer.run
-    logs = []
+    stops = []
     for shot in shots:
         small = shot.resized(METERED_WIDTH) if shot.width > METERED_WIDTH else shot
         rendered = run.render(small.camera(), small.time)
         readings = meter(np.asarray(rendered.linear), np.asarray(rendered.alpha))
-        logs.append(run.metering.log_exposure(readings, of))
+        stops.append(run.metering.exposure_ev(readings, of))
     if frames > 0:
-        logs = adapted(np.array(logs), frames).tolist()
-    mean = np.log(run.mean.exposure_geometric)
-    stops = [(float(log) - float(mean)) / LN2 + exposure_ev for log in logs]
-    return [replace(shot, exposure_ev=ev) for shot, ev in zip(shots, stops, strict=True)]
+        stops = adapted(np.array(stops), frames).tolist()
+    added = exposure_ev - float(np.log2(run.mean.exposure_geometric))
+    return [replace(shot, exposure_ev=ev + added) for shot, ev in zip(shots, stops, strict=True)]
 
 
 def shot_frames(

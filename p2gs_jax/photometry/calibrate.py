@@ -12,20 +12,19 @@ to a gamma per view; so would a white balance that is left out.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from p2gs_jax.config import FitConfig, PhotometryConfig
-from p2gs_jax.core.numerics import LN2
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.photometry.adjustment.fit import fit_model
 from p2gs_jax.photometry.adjustment.problem import KnownExposures, Problem, make_problem
-from p2gs_jax.photometry.adjustment.solve import EXPOSURES, MOST_ROUNDS, fit_response
-from p2gs_jax.photometry.candidates import Candidate, Comparison, choose
-from p2gs_jax.photometry.models import MODELS, Choice, Curve, Form, Scope, neighbours
+from p2gs_jax.photometry.adjustment.solve import MOST_ROUNDS, fit_response
+from p2gs_jax.photometry.candidates import Candidate, Search
+from p2gs_jax.photometry.models import Curve, Form
 from p2gs_jax.photometry.observations import COARSEST, Observations
 from p2gs_jax.photometry.response import BASES, Response
 from p2gs_jax.photometry.solution import PhotometricSolution
@@ -35,11 +34,9 @@ from p2gs_jax.types import Scene
 # Points of a view that a given kind of curve is fitted to.
 RESPONSE_PER_VIEW = 200
 HELD_OUT = 0.2
-SPLINE_SPREAD_EV = 0.2  # a response needs this spread of exposures, stops
 # Candidates are compared on at most this many observations; the chosen one is solved on all.
 MOST_OBSERVATIONS = 40_000
 SPLINE_OBSERVATIONS = 12_000  # a curve has few parameters; its basis is the most expensive one
-MOST_COMPARED = 80  # choices that are compared at most
 
 OnChosen = Callable[[Form, Response], None]
 
@@ -188,8 +185,7 @@ def _chosen(
     small = blind.problem(_subset(observations, seed, MOST_OBSERVATIONS))
     held = generator(seed, Stream.HELD_OUT).random(len(small.observations.points)) < HELD_OUT
     training = blind.problem(_subset(small.observations.picked(~held), seed, SPLINE_OBSERVATIONS))
-    comparison = Comparison(small, held)
-    search = _Search(comparison, training, known=options.known_response is not None)
+    search = Search(small, held, training, known=options.known_response is not None)
     notes = search.first()
     if options.known_response is not None:
         notes = [
@@ -198,88 +194,14 @@ def _chosen(
         ]
     chosen = search.rest()
     on_chosen(chosen.form, chosen.response)
-    candidates = sorted(comparison.judged(), key=lambda c: -c.density)
-    if loose := sum(not f.converged for f, _ in comparison.fits.values()):
+    candidates = sorted(search.judged(), key=lambda c: -c.density)
+    if loose := sum(not f.converged for f, _ in search.fits.values()):
         notes.append(
             f"{loose} of the {len(candidates)} models compared had not settled after "
             f"{MOST_ROUNDS} rounds; they are judged as they were then."
         )
     solution = fit_model(options.problem(observations), chosen.form, chosen.response)
     return Selection(solution, tuple(candidates), (*notes, *_reasons(chosen, candidates)))
-
-
-class _Search:
-    """Choices compared on held-out colours, with splines fitted on some of the others.
-
-    If the curve is `known`, it is sRGB's. `spread` is the standard deviation of the exposures under
-    sRGB, log units; `scope` is what there is to choose from.
-    """
-
-    def __init__(self, comparison: Comparison, training: Problem, *, known: bool):
-        self.comparison, self._training = comparison, training
-        o = comparison.problem.observations
-        cameras = int(o.cameras.max(initial=0)) + 1
-        self._fitted: dict[tuple[Form, Curve], Response | None] = {}
-        exposures = comparison.solve(Choice(EXPOSURES), Response()).theta.b
-        self.spread = float(np.std(exposures))
-        told = self.spread / LN2 >= SPLINE_SPREAD_EV
-        self.scope = Scope(cameras, o.positions is not None, told, known)
-
-    def response(self, choice: Choice) -> Response | None:
-        """Return the curve of a choice, fitted beside what cameras do; None: it collapsed."""
-        curve = choice.curve
-        if curve.splines is None:
-            return Response(curve.base)
-        form = choice.form._replace(model="view_exposure")
-        key = form, curve
-        if key not in self._fitted:
-            how = {"form": form, "by": curve.splines, "spread": self.spread}
-            self._fitted[key] = fit_response(self._training, Response(curve.base), **how)
-        return self._fitted[key]
-
-    def solve(self, choices: Iterable[Choice]) -> bool:
-        """Solve choices that are possible and not solved yet; return whether there were any."""
-        found = False
-        for choice in choices:
-            if choice in self.comparison.fits or not self.scope.allows(choice):
-                continue
-            if (response := self.response(choice)) is not None:
-                self.comparison.solve(choice, response)
-                found = True
-        return found
-
-    def first(self) -> list[str]:
-        """Solve models under curves, and exposures with what cameras may do besides.
-
-        What the user should know of curves left out is returned.
-        """
-        curves = [*(Curve(base) for base in BASES), Curve("srgb", "all")]
-        self.solve(Choice(Form(model), curve) for curve in curves for model in MODELS)
-        richest = Form("view_exposure", "view", "camera" if self.scope.places else None)
-        self.solve(Choice(richest, curve) for curve in curves)
-        # One response for different cameras may collapse where theirs would not.
-        for by in ("camera", "channel"):
-            self.solve(Choice(form, Curve("srgb", by)) for form in (EXPOSURES, richest))
-        if not self.scope.curves:
-            return [
-                f"Exposures differ by {self.spread / LN2:.2f} EV (standard deviation): too little "
-                "to tell the shape of the tone curve, so only standard curves were tried."
-            ]
-        if all(response is None for response in self._fitted.values()):
-            return ["A fitted tone curve collapsed; only standard curves were compared."]
-        return []
-
-    def rest(self) -> Candidate:
-        """Compare what is one step from the choice, or simpler than the best; choose."""
-        while True:
-            candidates = self.comparison.judged()
-            chosen = choose(candidates)
-            best = max(candidates, key=lambda c: c.density)
-            near = neighbours(chosen.choice, self.scope)
-            others = neighbours(best.choice, self.scope)
-            near += [c for c in others if self.comparison.parameters(c) < best.parameters]
-            if len(candidates) > MOST_COMPARED or not self.solve(near):
-                return chosen
 
 
 def _reasons(chosen: Candidate, candidates: list[Candidate]) -> list[str]:

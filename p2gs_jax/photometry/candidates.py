@@ -5,18 +5,37 @@ Densities over display values can be compared between curves; over decoded ones 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
+from p2gs_jax.core.numerics import LN2
 from p2gs_jax.photometry.adjustment.errors import side_by_side
 from p2gs_jax.photometry.adjustment.problem import Problem
-from p2gs_jax.photometry.adjustment.solve import TOLERANCE_TO_COMPARE, Fit, solve_model
-from p2gs_jax.photometry.models import Choice, Form, parameter_count
-from p2gs_jax.photometry.response import Response
+from p2gs_jax.photometry.adjustment.solve import (
+    EXPOSURES,
+    TOLERANCE_TO_COMPARE,
+    Fit,
+    fit_response,
+    solve_model,
+)
+from p2gs_jax.photometry.models import (
+    MODELS,
+    Choice,
+    Curve,
+    Form,
+    Scope,
+    neighbours,
+    parameter_count,
+)
+from p2gs_jax.photometry.observations import Labels
+from p2gs_jax.photometry.response import BASES, Response
 
+SPLINE_SPREAD_EV = 0.2  # a response needs this spread of exposures, stops
+MOST_COMPARED = 80  # choices that are compared at most
 STANDARD_ERRORS, SMALLEST_GAIN = 2.0, 0.01
 # Predictions that differ by no more than this in any view are as good as equal, 8-bit levels.
 INVISIBLE_DIFFERENCE = 1.0
@@ -24,7 +43,6 @@ INVISIBLE_DIFFERENCE = 1.0
 OUTLIERS, OUTLIER_DEVIATION = 0.1, 1.2
 
 Densities = Float[np.ndarray, " h"]
-Labels = Int[np.ndarray, " h"]
 
 
 @dataclass(frozen=True)
@@ -80,25 +98,89 @@ class Predicted(NamedTuple):
     errors: Float[np.ndarray, "h 3"]  # photographed minus predicted display values
 
 
-class Comparison:
-    """Choices solved so far (`fits`), and how well they predict what was `held` out."""
+class Search:
+    """Choices solved so far (`fits`), and how well they predict what was `held` out.
 
-    def __init__(self, problem: Problem, held: Bool[np.ndarray, " o"]):
-        self.problem, self.fits = problem, dict[Choice, tuple[Fit, Response]]()
+    Splines are fitted to `training`, a part of the rest. If the curve is `known`, it is sRGB's.
+    """
+
+    def __init__(
+        self, problem: Problem, held: Bool[np.ndarray, " o"], training: Problem, *, known: bool
+    ):
+        self.fits: dict[Choice, tuple[Fit, Response]] = {}
+        self._problem, self._training, o = problem, training, problem.observations
         self._use, self._where = (~held).astype(np.float64), np.flatnonzero(held)
-        o = problem.observations
         self._views = o.views[self._where]
         self._regions = side_by_side(o, problem.layout.row)[self._where]
         self._predicted: dict[Choice, Predicted] = {}
         self._scale = np.inf
+        self._fitted: dict[tuple[Form, Curve], Response | None] = {}
+        # Standard deviation of the exposures under sRGB, log units.
+        self._spread = float(np.std(self._solve(Choice(EXPOSURES), Response()).theta.b))
+        told = self._spread / LN2 >= SPLINE_SPREAD_EV
+        cameras = int(o.cameras.max(initial=0)) + 1
+        self._scope = Scope(cameras, o.positions is not None, told, known)
 
-    def solve(self, choice: Choice, response: Response) -> Fit:
+    def first(self) -> list[str]:
+        """Solve models under curves, and exposures with what cameras may do besides.
+
+        What the user should know of curves left out is returned.
+        """
+        curves = [*(Curve(base) for base in BASES), Curve("srgb", "all")]
+        self._try(Choice(Form(model), curve) for curve in curves for model in MODELS)
+        richest = Form("view_exposure", "view", "camera" if self._scope.places else None)
+        self._try(Choice(richest, curve) for curve in curves)
+        # One response for different cameras may collapse where theirs would not.
+        for by in ("camera", "channel"):
+            self._try(Choice(form, Curve("srgb", by)) for form in (EXPOSURES, richest))
+        if not self._scope.curves:
+            return [
+                f"Exposures differ by {self._spread / LN2:.2f} EV (standard deviation): too little "
+                "to tell the shape of the tone curve, so only standard curves were tried."
+            ]
+        if all(response is None for response in self._fitted.values()):
+            return ["A fitted tone curve collapsed; only standard curves were compared."]
+        return []
+
+    def rest(self) -> Candidate:
+        """Compare what is one step from the choice, or simpler than the best; choose."""
+        while True:
+            candidates = self.judged()
+            chosen = choose(candidates)
+            best = max(candidates, key=lambda c: c.density)
+            near = neighbours(chosen.choice, self._scope)
+            others = neighbours(best.choice, self._scope)
+            near += [c for c in others if self._parameters(c) < best.parameters]
+            if len(candidates) > MOST_COMPARED or not self._try(near):
+                return chosen
+
+    def _try(self, choices: Iterable[Choice]) -> bool:
+        """Solve choices that are possible and not solved yet; return whether there were any."""
+        found = False
+        for choice in choices:
+            if choice in self.fits or not self._scope.allows(choice):
+                continue
+            if (response := self._response(choice)) is not None:
+                self._solve(choice, response)
+                found = True
+        return found
+
+    def _response(self, choice: Choice) -> Response | None:
+        """Return the curve of a choice, fitted beside what cameras do; None: it collapsed."""
+        curve = choice.curve
+        if curve.splines is None:
+            return Response(curve.base)
+        form = choice.form._replace(model="view_exposure")
+        if (form, curve) not in self._fitted:
+            how = {"form": form, "by": curve.splines, "spread": self._spread}
+            self._fitted[form, curve] = fit_response(self._training, Response(curve.base), **how)
+        return self._fitted[form, curve]
+
+    def _solve(self, choice: Choice, response: Response) -> Fit:
         """Solve a choice under its curve on what is not held out."""
-        fit, _ = solve_model(
-            self.problem, choice.form, response, use=self._use, tolerance=TOLERANCE_TO_COMPARE
-        )
-        self.fits[choice] = fit, response
-        return fit
+        how = {"use": self._use, "tolerance": TOLERANCE_TO_COMPARE}
+        self.fits[choice] = solve_model(self._problem, choice.form, response, **how)[0], response
+        return self.fits[choice][0]
 
     def judged(self) -> list[Candidate]:
         """Return every solution with how well it predicts."""
@@ -107,7 +189,7 @@ class Comparison:
             self._scale, self._predicted = scale, {}
         for choice, (fit, response) in self.fits.items():
             if choice not in self._predicted:
-                predicted = _predict(self.problem, fit, response, self._where, scale)
+                predicted = _predict(self._problem, fit, response, self._where, scale)
                 self._predicted[choice] = predicted
         # Where nothing is known, no solution predicts anything.
         density = {
@@ -117,9 +199,9 @@ class Comparison:
         best = self._predicted[max(density, key=lambda k: density[k])]
         return [self._candidate(k, density[k], p, best) for k, p in self._predicted.items()]
 
-    def parameters(self, choice: Choice) -> int:
+    def _parameters(self, choice: Choice) -> int:
         """Return the number of free parameters of a choice."""
-        o = self.problem.observations
+        o = self._problem.observations
         cameras = int(o.cameras.max(initial=0)) + 1
         return parameter_count(choice.form, choice.curve.splines, cameras, o.view_count)
 
@@ -134,7 +216,7 @@ class Comparison:
         return Candidate(
             choice,
             self.fits[choice][1],
-            self.parameters(choice),
+            self._parameters(choice),
             density,
             deficit,
             max(of_views, of_regions),

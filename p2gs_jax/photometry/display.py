@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import jax
 import numpy as np
@@ -19,7 +19,7 @@ from p2gs_jax.core.numerics import LN2, on_host
 from p2gs_jax.photometry.appearance import Correction, correction_of, mean_correction, without_place
 from p2gs_jax.photometry.formation import (
     Matte,
-    camera_row,
+    camera_rows,
     composited,
     display,
     formation,
@@ -32,6 +32,7 @@ from p2gs_jax.types import Capture, Params, Photometry
 Curve = Literal["power", "srgb", "spline", "linear"]
 CURVES: tuple[Curve, ...] = get_args(Curve)
 
+Balance = tuple[float, float, float]
 Pixels = Float[Array, "... 3"] | Float[np.ndarray, "... 3"]
 Positions = Float[np.ndarray, "... 2"] | None
 Opacity = Float[Array, "h w"] | Float[np.ndarray, "h w"] | None
@@ -46,11 +47,11 @@ class DisplayTransform:
     formation: PhotometryConfig  # base curve, pivot, clamping, cameras, kind of correction
     correction: Correction | None = None  # of display values (photometry/appearance.py)
     # Log factors on red, green, blue beside the exposure; None: all 1.
-    white_balance: tuple[float, float, float] | None = None
+    white_balance: Balance | None = None
     # Row in `formation.cameras`, whose vignetting and response it has; None: no camera's.
     camera: int | None = None
     # Display values that pictures are put over, after all else: of all pixels or of each.
-    backdrop: tuple[float, float, float] | Float32[np.ndarray, "h w 3"] | None = None
+    backdrop: Balance | Float32[np.ndarray, "h w 3"] | None = None
 
     @property
     def capture(self) -> Capture:
@@ -63,11 +64,6 @@ class DisplayTransform:
             None if w is None else np.asarray(w, np.float32),
             None if self.camera is None else np.int32(self.camera),
         )
-
-    @property
-    def factors(self) -> Float[np.ndarray, " 3"]:
-        """Exposure times white balance of each channel."""
-        return self.exposure * np.exp(np.asarray(self.white_balance or (0.0, 0.0, 0.0), float))
 
     @property
     def vignetting(self) -> tuple[tuple[float, ...], ...]:
@@ -166,13 +162,11 @@ def display_of_view(params: Params, row: int, cfg: PhotometryConfig) -> DisplayT
 
 def with_capture(transform: DisplayTransform, taken: Capture) -> DisplayTransform:
     """Return a transform that does to light what a photograph did."""
-    balance = taken.white_balance
-    red, green, blue = (0.0, 0.0, 0.0) if balance is None else map(float, balance)
     return replace(
         transform,
         exposure=float(taken.exposure),
         gamma=float(taken.gamma),
-        white_balance=None if balance is None else (red, green, blue),
+        white_balance=_balance(taken.white_balance),
         camera=None if taken.camera is None else int(taken.camera),
     )
 
@@ -185,7 +179,7 @@ class MeanParameters:
     exposure_geometric: float  # geometric mean, which the gauges leave in place
     gamma: float  # arithmetic mean
     # Mean of the log factors, or None where white balance is not modelled.
-    white_balance: tuple[float, float, float] | None = None
+    white_balance: Balance | None = None
 
 
 def mean_parameters(photometry: Photometry) -> MeanParameters:
@@ -196,7 +190,7 @@ def mean_parameters(photometry: Photometry) -> MeanParameters:
         float(e.mean()),
         float(np.exp(np.log(e).mean())),
         float(taken.gammas.astype(np.float64).mean()),
-        _mean_balance(taken, slice(None)),
+        _mean_balance(taken),
     )
 
 
@@ -216,19 +210,16 @@ def usual_display(
     own = np.array([name == camera for name in taken_by], bool)
     if cfg.white_balance == "camera" and own.any():
         balance = _mean_balance(taken, own)
-    return DisplayTransform(
-        mean.exposure_geometric,
-        mean.gamma,
-        cfg,
-        mean_correction(params.appearance, camera),
-        balance,
-        None if camera is None else camera_row(camera, cfg),
-    )
+    correction = mean_correction(params.appearance, camera)
+    rows = None if camera is None else camera_rows((camera,), cfg)
+    row = None if rows is None else rows[0]
+    return DisplayTransform(mean.exposure_geometric, mean.gamma, cfg, correction, balance, row)
 
 
-def _mean_balance(photometry: Photometry, rows) -> tuple[float, float, float] | None:
+def _mean_balance(photometry: Photometry, rows: Any = slice(None)) -> Balance | None:
     balance = photometry.white_balance
-    if balance is None:
-        return None
-    red, green, blue = (float(v) for v in np.asarray(balance, np.float64)[rows].mean(0))
-    return red, green, blue
+    return None if balance is None else _balance(np.asarray(balance, np.float64)[rows].mean(0))
+
+
+def _balance(logs: Float[Array, " 3"] | Float[np.ndarray, " 3"] | None) -> Balance | None:
+    return None if logs is None else tuple(map(float, logs))  # pyright: ignore[reportReturnType]

@@ -48,14 +48,8 @@ def eotf(encoded: Values, curve: str) -> Values:
     return xp.where(toe, encoded / 12.92, positive_pow(base, 2.4, 1e-3))
 
 
-def camera_row(name: str, cfg: PhotometryConfig) -> int | None:
-    """Return the row of a camera in `cfg.cameras`: -1 if it is not there, None if nothing is."""
-    rows = camera_rows((name,), cfg)
-    return None if rows is None else rows[0]
-
-
 def camera_rows(names: Sequence[str], cfg: PhotometryConfig) -> tuple[int, ...] | None:
-    """Return the row of each camera in `cfg.cameras`: likewise."""
+    """Return the row of each camera in `cfg.cameras`: -1 if it is not there; None if none is."""
     known = [camera.name for camera in cfg.cameras]
     return tuple(known.index(n) if n in known else UNKNOWN for n in names) if known else None
 
@@ -121,7 +115,7 @@ def corner(camera: CameraFormation) -> tuple[float, ...]:
 def gain(
     shape: tuple[int, ...], capture: Capture, cfg: PhotometryConfig, positions: Positions = None
 ) -> Any:
-    """Return e W V: what exposed radiance is of radiance, shaped to broadcast against it.
+    """Return e W V: exposed radiance over radiance (paper, eq. 4: e), to broadcast against it.
 
     `capture` is of the view, or of each of loose pixels; these have `positions`, or none.
 
@@ -141,13 +135,6 @@ def gain(
         shade = log_vignetting(squared, capture.camera, cfg)
         logs = shade if logs is None else logs + shade
     return e if logs is None else e * namespace(e, logs).exp(logs)
-
-
-def expose(
-    linear: Values, capture: Capture, cfg: PhotometryConfig, positions: Positions = None
-) -> Values:
-    """Return e W V L (paper, eq. 4: e L); see `gain`."""
-    return gain(linear.shape, capture, cfg, positions) * linear
 
 
 def tone_map(
@@ -224,7 +211,7 @@ def formation(
     shown: Any = linear
     if isinstance(correction, Formation):
         return correction.apply(shown, capture)  # pyright: ignore[reportReturnType]
-    exposed = expose(linear, capture, cfg, positions)
+    exposed = gain(linear.shape, capture, cfg, positions) * linear
     shown = tone_map(exposed, _by_pixel(capture.gamma), cfg, capture.camera)
     if cfg.appearance is not None and correction is not None:
         shown = corrected(shown, correction, cfg.appearance)

@@ -14,9 +14,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.core.numerics import LN2
-from p2gs_jax.photometry.formation import exposed_at
 
 # The meters, and what people call them.
 WORDS: dict[str, str] = {
@@ -31,15 +29,14 @@ METERS = tuple(WORDS)
 ExposureOf = Literal["auto", "log_average", "centre", "highlights", "protected"]
 Readings = Mapping[str, float]
 
-# Weights of linear red, green and blue in luminance (BT.709).
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear red, green and blue (BT.709)
 HIGHLIGHT = 99.0
 CENTRE = 0.4  # standard deviation of the weights about the centre, half diagonals
 # Luminance this far below the mean counts as that: nothing that a picture shows is darker.
 DARKEST = 2.0**-12
 # Less opaque pixels than this share of the picture are no picture.
 LEAST_SEEN = 0.01
-MID_GREY, BELOW_WHITE = 0.18, 0.98
+MID_GREY, BELOW_WHITE = 0.18, 0.98  # exposed radiance, and display value
 PIXELS = 100_000  # more pixels than about this many tell no more
 # Views are left out in at most this many stretches: neighbours in a video know each other's answer.
 FOLDS = 12
@@ -78,11 +75,6 @@ def meter(linear: Float[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"]) -
         "centre_average": float(np.log(np.average(light, weights=central))),
         "highlights": float(logs[top]),
     }
-
-
-def white_level(gamma: float, cfg: PhotometryConfig) -> float:
-    """Return the exposed radiance that a display of this gamma shows just below white."""
-    return exposed_at(BELOW_WHITE, gamma, cfg)
 
 
 @dataclass(frozen=True)
@@ -127,15 +119,11 @@ class Metering:
         """The rule that reads nothing: the geometric mean of the training exposures."""
         return next(rule for rule in self.candidates if not rule.meters)
 
-    def log_exposure(self, readings: Readings, of: ExposureOf = "auto") -> float:
-        """Return the natural logarithm of the exposure of a picture.
+    def exposure_ev(self, readings: Readings, of: ExposureOf = "auto") -> float:
+        """Return the exposure of a picture in stops; see `exposure`."""
+        return self._log_exposure(readings, of) / LN2
 
-        Args:
-            readings: from `meter`; where nothing was seen the exposure is the mean.
-            of: `auto` follows `rule`; `log_average` and `centre` bring that to mid-grey;
-                `highlights` brings the 99th percentile just below white; `protected` is the log
-                average, or `highlights` where that would clip them.
-        """
+    def _log_exposure(self, readings: Readings, of: ExposureOf) -> float:
         grey, white = np.log(MID_GREY), np.log(self.white)
         if of == "auto":
             found = self.rule.log_exposure(readings)
@@ -148,13 +136,18 @@ class Metering:
         return float(found) if np.isfinite(found) else self.constant.offset
 
     def exposure(self, readings: Readings, of: ExposureOf = "auto") -> float:
-        """Return the exposure of a picture, a factor on radiance; see `log_exposure`."""
-        return float(np.exp(self.log_exposure(readings, of)))
+        """Return the exposure of a picture, a factor on radiance.
+
+        Where the `readings` saw nothing, it is the mean. `auto` follows `rule`; `log_average` and
+        `centre` bring that to mid-grey; `highlights` brings the 99th percentile just below white;
+        `protected` is the log average, or `highlights` where that would clip them.
+        """
+        return float(np.exp(self._log_exposure(readings, of)))
 
     def typical_exposure(self, of: ExposureOf = "auto") -> float:
         """Return the geometric mean over the training views: one exposure for all of a scene."""
         rows = [dict(zip(METERS, row, strict=True)) for row in self.readings.tolist()]
-        return float(np.exp(float(np.mean([self.log_exposure(row, of) for row in rows]))))
+        return float(np.exp(float(np.mean([self._log_exposure(row, of) for row in rows]))))
 
     @property
     def telling(self) -> bool:
@@ -249,12 +242,12 @@ def _fitted(
     return Rule(meters, tuple(map(float, taken)), offset, *rms), np.array(errors)
 
 
-def adapted(log_exposures: Float[np.ndarray, " f"], frames: float) -> Float[np.ndarray, " f"]:
-    """Return exposures that follow those metered slowly, to 1/e in so many frames.
+def adapted(exposures_ev: Float[np.ndarray, " f"], frames: float) -> Float[np.ndarray, " f"]:
+    """Return exposures in stops that follow those metered slowly, to 1/e in so many frames.
 
     An exponential filter to both sides, so that a path played backwards looks the same.
     """
-    count = len(log_exposures)
+    count = len(exposures_ev)
     away = np.abs(np.arange(count)[:, None] - np.arange(count))
     weight = np.exp(-away / max(frames, 1e-6))
-    return weight @ np.asarray(log_exposures, np.float64) / weight.sum(1)
+    return weight @ np.asarray(exposures_ev, np.float64) / weight.sum(1)

@@ -38,9 +38,6 @@ class Observations:
     # nothing depends on the place.
     positions: Float[np.ndarray, "o 2"] | None = None
     camera_names: tuple[str, ...] = ()  # empty: their rows
-    # Log2 brightness of the photograph about each, as `surroundings` in `sources/sampling.py`
-    # measures it; None where nobody knows.
-    surroundings: Float[np.ndarray, " o"] | None = None
     brightest: PerChannel | None = None  # largest of the pixels that `colors` are means of
 
     def decoded(self, response: Response) -> tuple[PerChannel, PerChannel, PerChannel]:
@@ -72,7 +69,7 @@ class Observations:
 
     def picked(self, pick: np.ndarray | slice) -> Observations:
         """Return some of them, chosen by a mask or by their rows."""
-        names = ("views", "points", "colors", "spread", "positions", "surroundings", "brightest")
+        names = ("views", "points", "colors", "spread", "positions", "brightest")
         kept = {k: v[pick] for k in names if (v := getattr(self, k)) is not None}
         return replace(self, **kept)
 
@@ -89,6 +86,12 @@ class Observations:
         kept = np.zeros(self.point_count, bool)
         kept[self.points[order[rank < per_view]]] = True
         return kept[self.points]
+
+
+def grouped(labels: Labels, count: int) -> list[Int[np.ndarray, " n"]]:
+    """Return the places of each of the labels 0, 1, ... below `count`, in order."""
+    order = np.argsort(labels, kind="stable")
+    return np.split(order, np.searchsorted(labels[order], np.arange(1, count)))
 
 
 def sample_pairs(

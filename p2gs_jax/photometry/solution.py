@@ -12,19 +12,14 @@ from jaxtyping import Bool, Float, Int
 
 from p2gs_jax.config import CameraFormation, Level, VignettingKind
 from p2gs_jax.core.numerics import LN2
-from p2gs_jax.photometry.models import MODELS, ModelName
+from p2gs_jax.photometry.models import ModelName
 from p2gs_jax.photometry.response import Response
-from p2gs_jax.types import GAMMA_SRGB
 
 MIN_OBSERVATIONS = 15  # views with fewer usable observations have uncertain exposures
 WEAK_GAMMA = 0.1  # gammas with a larger standard error are only roughly known
 # A view disagrees when its gap exceeds this, and three standard errors.
 NOTICEABLE_EV = 0.2
 STANDARD_ERRORS = 3.0
-# Linear values at which exposures may be read instead of at the pivot.
-LEVELS = (0.05, 0.1, 0.18, 0.3, 0.5, 0.8)
-# One of them is worth a word where its RMS gap is below this share of the pivot's.
-NOTICEABLE_RMS_SHARE = 0.8
 
 PerView = Float[np.ndarray, " v"]
 
@@ -147,27 +142,3 @@ def compare(exposures_ev: PerView, errors_ev: PerView, stated_ev: PerView) -> Ag
         gap,
         disagrees & both,
     )
-
-
-def note_on_levels(
-    solution: PhotometricSolution, stated_ev: PerView, agreement: Agreement, pivot: float
-) -> list[str]:
-    """Say at which level stated exposures agree best, where gammas make them depend on it.
-
-    By definition exposures are read at the pivot; at another linear level of tone, 1 = white, they
-    include what gamma does there.
-    """
-    if MODELS[solution.model].gamma is None or agreement.views < 3:
-        return []
-    errors_ev, a = solution.exposure_errors_ev, GAMMA_SRGB / solution.gammas
-    read = {x: solution.log_exposures + np.log(x / pivot) * (1 - 1 / a) for x in LEVELS}
-    options = {x: compare(logs / LN2, errors_ev, stated_ev) for x, logs in read.items()}
-    level = min(options, key=lambda x: options[x].rms_ev)
-    best = options[level]
-    if not best.rms_ev < NOTICEABLE_RMS_SHARE * agreement.rms_ev:
-        return []
-    return [
-        f"Read at a linear value of {level:g} instead of {pivot:g}, correlation is "
-        f"{best.correlation:.3f}, slope {best.slope:.2f}, RMS {best.rms_ev:.2f} EV: the cameras "
-        "did not only change exposure, they also moved other tones against it."
-    ]

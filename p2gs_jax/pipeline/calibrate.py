@@ -28,10 +28,10 @@ from p2gs_jax.photometry.calibrate import (
     options_of,
 )
 from p2gs_jax.photometry.observations import Observations
-from p2gs_jax.photometry.solution import Agreement, PhotometricSolution, compare, note_on_levels
+from p2gs_jax.photometry.solution import Agreement, PhotometricSolution, compare
 from p2gs_jax.photometry.sources.points import has_tracks, rendered_colors, surface_colors
 from p2gs_jax.photometry.sources.stack import SATURATED, StackColors, read_stack, stack_colors
-from p2gs_jax.photometry.unmodelled import LOCAL_EV, Unexplained, residuals, unexplained
+from p2gs_jax.photometry.unmodelled import LOCAL_EV, regional_ev
 from p2gs_jax.presets import require_config
 from p2gs_jax.run.photometry_files import write_solution
 from p2gs_jax.run.plots import write_calibration_plot
@@ -198,7 +198,7 @@ def solved(
     messages = [*scene.notes, *selection.reasons, *s.warnings]
     if agreement.views:
         by = "EXIF" if compare_with in (None, "exif") else Path(str(compare_with)).name
-        messages += [agreement.sentence(by), *note_on_levels(s, stated, agreement, pivot)]
+        messages.append(agreement.sentence(by))
     names = ("residual_ev", "view_residual_ev", "view_balance_ev", "outliers", "component")
     details = {
         "messages": messages,
@@ -272,10 +272,10 @@ def calibrate_stack(
     options = CalibrationOptions(found.black, SATURATED, STACK_PIVOT, given, seed, "one_response")
     selection = calibrate_observations(found.observations, options)
     s, problem = selection.solution, options.problem(found.observations)
-    left = unexplained(problem, residuals(problem, s), found.xy, stack.valid.shape, found.signal)
+    local_ev = regional_ev(problem, s, found.xy, stack.valid.shape, found.signal)
     errors_ev = np.where(found.signal, s.exposure_errors_ev, np.inf)
     agreement = compare(s.exposures_ev, errors_ev, stated)
-    messages = [*selection.reasons, *s.warnings, *_stack_messages(stack.views, found, left)]
+    messages = [*selection.reasons, *s.warnings, *_stack_messages(stack.views, found, local_ev)]
     if agreement.views >= 2:
         messages.append(agreement.sentence("The stated exposures"))
     result = Calibration(
@@ -291,9 +291,8 @@ def calibrate_stack(
             "signal": found.signal,
             "shifts": found.shifts,
             "black": found.black,
-            "one_response": left.local_ev <= LOCAL_EV,
-            "local_ev": left.local_ev,
-            "curve_ev": left.curve_ev,
+            "one_response": local_ev <= LOCAL_EV,
+            "local_ev": local_ev,
             "residual_ev": s.residual_ev,
         },
     )
@@ -302,7 +301,7 @@ def calibrate_stack(
     return result
 
 
-def _stack_messages(views: tuple[View, ...], found: StackColors, left: Unexplained) -> list[str]:
+def _stack_messages(views: tuple[View, ...], found: StackColors, local_ev: float) -> list[str]:
     """Say which frames are dark, that frames were moved, and that one response is not enough."""
     out = []
     dark = [view.name for view, signal in zip(views, found.signal, strict=True) if not signal]
@@ -314,10 +313,10 @@ def _stack_messages(views: tuple[View, ...], found: StackColors, left: Unexplain
     moved = np.abs(found.shifts).max()
     if moved > 0:
         out.append(f"Frames were moved by up to {moved:.0f} pixel(s).")
-    if left.local_ev > LOCAL_EV:
+    if local_ev > LOCAL_EV:
         out.append(
             f"One response does not explain this stack: between frames, regions of equal "
-            f"brightness change by {left.local_ev:.2f} EV (RMS; {LOCAL_EV:g} at most for one "
+            f"brightness change by {local_ev:.2f} EV (RMS; {LOCAL_EV:g} at most for one "
             "camera pipeline). The frames were tone-mapped by region, or the light changed; do not "
             "trust the exposures."
         )

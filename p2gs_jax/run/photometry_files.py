@@ -301,14 +301,14 @@ def _balance(
 
 
 def write_metering(path: Path, metering: Metering) -> None:
-    """Write `metering.json`: what the meters read, and which rule explains the exposures."""
-    rows = zip(metering.names, metering.readings.tolist(), strict=True)
+    """Write `metering.json`: what the meters read, stops, and which rule explains the exposures."""
+    rows = zip(metering.names, (metering.readings / LN2).tolist(), strict=True)
     write_json(
         path,
         {
             "said": metering.sentence,
-            "rule": dataclasses.asdict(metering.rule),
-            "candidates": [dataclasses.asdict(rule) for rule in metering.candidates],
+            "rule": _rule_in_file(metering.rule),
+            "candidates": [_rule_in_file(rule) for rule in metering.candidates],
             "white": metering.white,
             "readings": {name: dict(zip(METERS, row, strict=True)) for name, row in rows},
         },
@@ -325,7 +325,7 @@ def read_metering(path: Path) -> Metering:
         data = parse_json(path.read_text(encoding="utf-8"))
         readings = data["readings"]
         values = [[row[name] for name in METERS] for row in readings.values()]
-        table = np.array(values, np.float64).reshape(-1, len(METERS))
+        table = np.array(values, np.float64).reshape(-1, len(METERS)) * LN2
         candidates = tuple(map(_rule, data["candidates"]))
         if all(rule.meters for rule in candidates):
             raise ValueError("no candidate is a constant")
@@ -337,10 +337,15 @@ def read_metering(path: Path) -> Metering:
         ) from error
 
 
+def _rule_in_file(rule: Rule) -> dict[str, Any]:
+    data = dataclasses.asdict(rule)
+    return {"offset_ev": data.pop("offset") / LN2, **data}
+
+
 def _rule(data: dict) -> Rule:
-    numbers = (data["offset"], data["residual_ev"], data["left_out_ev"])
+    numbers = (data["offset_ev"], data["residual_ev"], data["left_out_ev"])
     offset, residual, left_out = (float("nan") if v is None else float(v) for v in numbers)
-    return Rule(tuple(data["meters"]), tuple(data["slopes"]), offset, residual, left_out)
+    return Rule(tuple(data["meters"]), tuple(data["slopes"]), LN2 * offset, residual, left_out)
 
 
 def write_appearance(path: Path, appearance: Corrections, views: Sequence[View]) -> None:

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 from p2gs_jax.config import FitConfig, LossConfig, PhotometryConfig
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.errors import UserError
-from p2gs_jax.photometry.formation import darkens, expose, gain, inverse_formation, tone_map
+from p2gs_jax.photometry.formation import darkens, gain, inverse_formation, tone_map
 from p2gs_jax.photometry.observations import Observations, sample_pairs
 from p2gs_jax.types import Photometry
 
@@ -75,7 +75,7 @@ def observed_ldr(
     """
     capture_i, capture_j = photometry.capture(pairs.views_i), photometry.capture(pairs.views_j)
     radiance = inverse_formation(pairs.colors_i, capture_i, cfg, pairs.positions_i)
-    predicted = expose(radiance, capture_j, cfg, pairs.positions_j)
+    predicted = gain(radiance.shape, capture_j, cfg, pairs.positions_j) * radiance
     shown = tone_map(predicted, capture_j.gamma[:, None], cfg, capture_j.camera)
     error = huber(shown - pairs.colors_j, loss.relative_exposure.huber_delta)
     weight = usable(pairs.colors_i, loss) * usable(pairs.colors_j, loss) * pairs.valid[:, None]

@@ -93,12 +93,12 @@ class Darkroom:
             return shown
         before, now = self._metered, time.monotonic()
         if before is None or before[0] is not frame or settled:
-            log = run.metering.log_exposure(meter(np.asarray(frame.linear), frame.alpha))
+            stops = run.metering.exposure_ev(meter(np.asarray(frame.linear), frame.alpha))
             if before is not None and not settled:
                 share = 1 - math.exp(-(now - before[1]) / ADAPT_S)
-                log = before[2] + share * (log - before[2])
-            self._metered = before = (frame, now, log)
-        self.metered_exposure = float(np.exp(before[2])) * 2**settings.exposure_ev
+                stops = before[2] + share * (stops - before[2])
+            self._metered = before = (frame, now, stops)
+        self.metered_exposure = 2 ** (before[2] + settings.exposure_ev)
         return replace(shown, exposure=self.metered_exposure)
 
     def develop(

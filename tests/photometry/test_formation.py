@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from p2gs_jax.config import CameraFormation, PhotometryConfig, RegularizerConfig
 from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
 from p2gs_jax.photometry.formation import (
-    camera_row,
     camera_rows,
     corner,
     eotf,
@@ -186,9 +185,8 @@ def test_what_is_not_modelled_leaves_the_trace():
 
 
 def test_cameras_are_found_by_name_and_radii_are_1_in_corners():
-    assert [camera_row(name, SHADED) for name in ("b", "elsewhere")] == [1, -1]
     assert camera_rows(["c", "a", "x"], SHADED) == (2, 0, -1)
-    assert camera_row("b", PLAIN) is camera_rows(["c", "a", "x"], PLAIN) is None
+    assert camera_rows(["c", "a", "x"], PLAIN) is None
     squared = squared_radii(HEIGHT, WIDTH)
     assert squared.min() < 0.01
     outer = ((WIDTH - 1) ** 2 + (HEIGHT - 1) ** 2) / (WIDTH**2 + HEIGHT**2)

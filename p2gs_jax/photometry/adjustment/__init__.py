@@ -7,9 +7,9 @@ eliminated exactly (variable projection). What remains is the Schur complement o
 entries are sums over pairs of observations of a point, so cost and memory grow with those pairs,
 never with points times views.
 
-`problem` lays observations out; `parameters` says what is solved for and `system` what is free and
-what is known besides. `robust` weighs, `normal` assembles sums from `matrices`, and `solve` repeats
-both until nothing moves. `errors` says how sure the result is, and `fit` makes a solution of it.
+`problem` lays observations out; `parameters` says what is solved for, what is free and what is
+known besides. `equations` weighs and assembles sums from `matrices`, and `solve` repeats both until
+nothing moves. `errors` says how sure the result is, and `fit` makes a solution of it.
 
 All runs on the host, in numpy: derivatives are written out anyway, a round takes milliseconds, and
 four programs for the models, curves and sizes of one scene took longer to compile than to solve

@@ -16,24 +16,30 @@ import scipy.sparse as sp
 from jaxtyping import Float, Int
 
 from p2gs_jax.core.streams import Stream, generator
-from p2gs_jax.photometry.adjustment.matrices import is_small, whole
-from p2gs_jax.photometry.adjustment.normal import (
+from p2gs_jax.photometry.adjustment.equations import (
+    Weighted,
     at_places,
     coupling,
     of_views,
     others,
     over_all,
     summed,
+    weigh,
 )
-from p2gs_jax.photometry.adjustment.parameters import Forward, Parameters
-from p2gs_jax.photometry.adjustment.robust import Weighted, weigh
+from p2gs_jax.photometry.adjustment.matrices import is_small, whole
+from p2gs_jax.photometry.adjustment.parameters import (
+    EMPTY,
+    Forward,
+    Parameters,
+    System,
+    gauge_strength,
+)
 from p2gs_jax.photometry.adjustment.solve import Balanced, Fit, one_thread
-from p2gs_jax.photometry.adjustment.system import EMPTY, System, gauge_strength
 from p2gs_jax.photometry.observations import Labels, Observations
 
 CANCELLED = 1e-6  # relative size of what a difference of equal numbers leaves of them
 # Share of a parameter's information that must be left beside all others'. Rounding leaves less, and
-# so does what keeps points without observations finite (`system.EMPTY`).
+# so does what keeps points without observations finite (`parameters.EMPTY`).
 HELD = 1e-11
 # Draws from the errors where unknowns are too many for their covariance: a standard error is then
 # known to 12 %.
@@ -58,15 +64,14 @@ class Uncertainty(NamedTuple):
     # Directions that the observations do not hold: `roots` knows nothing of them.
     unknown: Float[np.ndarray, "d k"]
     few: Float[np.ndarray, " v"]  # factors on the errors of views that few clusters tell of
-    system: System  # what was solved
+    split: Callable[[Float[np.ndarray, "d c"]], Parameters]  # their parts
 
     def of(self, asked: Asked) -> Float[np.ndarray, " n"]:
         """Return the standard deviations of what is asked; inf where nothing is known."""
-        split = self.system.unknowns.split
-        deviation = np.linalg.norm(asked(split(self.roots)), axis=1)
+        deviation = np.linalg.norm(asked(self.split(self.roots)), axis=1)
         if not self.unknown.size:
             return deviation
-        lost = (np.abs(asked(split(self.unknown))) > CANCELLED).any(1)
+        lost = (np.abs(asked(self.split(self.unknown))) > CANCELLED).any(1)
         return np.where(lost, np.inf, deviation)
 
 
@@ -77,7 +82,7 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
     independent: the meat is summed over clusters, and counts them once. What regions of an
     image share besides is added to it.
     """
-    rows, layout = fit.model.rows, fit.model.rows.layout
+    layout = fit.model.layout
     clusters = side_by_side(observations, layout.row)
     each = summed(fit.model, fit.theta, fit.at, fit.at.weight * fit.at.residual, clusters)
     if observations.positions is not None and len(layout.row):
@@ -88,7 +93,7 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
         if deviation > 0:
             shared = deviation * _shared_scores(fit.model, fit.theta, fit.at, labels)
             each = sp.csr_array(sp.vstack([each, shared]))
-    seen = rows.weight.any(1)
+    seen = fit.model.weight.any(1)
     # A view's exposure is the mean of its clusters, and takes one of them away.
     pairs = np.unique(np.stack([layout.views[seen], clusters[seen]]), axis=1)[0]
     count = np.maximum(np.bincount(pairs, minlength=layout.view_count), 2)
@@ -97,12 +102,12 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
     gauges = np.sqrt(gauge_strength(bread, system.unknowns)) * system.anchors.rows
     if not is_small(system.basis.shape[1]):  # pyright: ignore
         drawn = _drawn(bread, gauges, each, system)
-        return Uncertainty(drawn, np.zeros((len(drawn), 0)), few, system)
+        return Uncertainty(drawn, np.zeros((len(drawn), 0)), few, system.unknowns.split)
     # A prior is itself an observation with variance 1 / precision: it is its own meat.
     meat = each.T @ each + system.priors.normal
     with one_thread():
         everything = whole(bread + gauges.T @ gauges)
-        return Uncertainty(*_sandwich(everything, meat, system.basis), few, system)
+        return Uncertainty(*_sandwich(everything, meat, system.basis), few, system.unknowns.split)
 
 
 def _sandwich(bread, meat, basis) -> tuple[Float[np.ndarray, "d r"], Float[np.ndarray, "d k"]]:
@@ -123,13 +128,10 @@ def _sandwich(bread, meat, basis) -> tuple[Float[np.ndarray, "d r"], Float[np.nd
 def _drawn(bread, gauges, each, system: System) -> Float[np.ndarray, "d r"]:
     """Return solutions for clusters and priors with random signs (wild bootstrap)."""
     rng = generator(0, Stream.SCORE_SIGNS)
-
-    def signs(count: int) -> Float[np.ndarray, "n r"]:
-        return rng.choice([-1.0, 1.0], (count, DRAWS))
-
     priors = system.priors
-    right = each.T @ signs(each.shape[0])
-    right += priors.rows.T @ (np.sqrt(priors.precisions)[:, None] * signs(len(priors.targets)))
+    own, known = (rng.choice([-1.0, 1.0], (n, DRAWS)) for n in (each.shape[0], len(priors.targets)))
+    right = each.T @ own
+    right += priors.rows.T @ (np.sqrt(priors.precisions)[:, None] * known)
     return Balanced(bread, gauges, system.basis).solve(right) / np.sqrt(DRAWS)
 
 
@@ -167,7 +169,7 @@ def _shared_deviation(model: Forward, at: Weighted, labels: Labels) -> float:
     Means of regions vary by more than their own observations explain. Exposures and radiances take
     a part of that away, which is put back. Medians: a region may show something that moved.
     """
-    layout, weight = model.rows.layout, at.weight.sum(1)
+    layout, weight = model.layout, at.weight.sum(1)
     count = int(labels.max(initial=-1)) + 1
 
     def total(values):
@@ -192,7 +194,7 @@ def _shared_deviation(model: Forward, at: Weighted, labels: Labels) -> float:
 
 def _shared_scores(model: Forward, theta: Parameters, at: Weighted, labels: Labels) -> sp.csr_array:
     """Return how the right side, points eliminated, moves with errors of regions: (regions, d)."""
-    layout, u = model.rows.layout, model.unknowns
+    layout, u = model.layout, model.unknowns
     coupled = coupling(layout, theta, at)
     taken = [
         at_places(layout, coupled * p.derivative, layout.views, u.views, p.channels).T

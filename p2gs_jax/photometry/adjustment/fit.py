@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -12,16 +11,16 @@ from jaxtyping import Bool, Float, Float32, Int
 
 from p2gs_jax.config import CameraFormation
 from p2gs_jax.core.numerics import LN2
+from p2gs_jax.photometry.adjustment.equations import weigh
 from p2gs_jax.photometry.adjustment.errors import Uncertainty, uncertainty
 from p2gs_jax.photometry.adjustment.parameters import Parameters, make_forward
-from p2gs_jax.photometry.adjustment.problem import Problem, make_rows
-from p2gs_jax.photometry.adjustment.robust import noise_weight, weigh
+from p2gs_jax.photometry.adjustment.problem import Problem
 from p2gs_jax.photometry.adjustment.solve import Fit, solve_model
 from p2gs_jax.photometry.models import Form, ModelName
-from p2gs_jax.photometry.observations import Labels, Observations, PerChannel
+from p2gs_jax.photometry.observations import Labels, Observations, PerChannel, grouped
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.solution import MIN_OBSERVATIONS, PhotometricSolution
-from p2gs_jax.photometry.unmodelled import neighbourhood_warnings
+from p2gs_jax.photometry.unmodelled import place_warnings
 from p2gs_jax.types import GAMMA_SRGB
 
 # Points by which a view is solved; more only repeat them (BUILD_NOTES, "Exposures from a part").
@@ -52,22 +51,18 @@ def fit_model(
     pick = o.thinned(most, 0)
     few = problem if pick.all() else problem.part(pick)
     fit, system = solve_model(few, form, response, loss="whole_points")
-    known = uncertainty(fit, system, few.observations)
-    return solution_of(problem, form, response, fit, explain(fit, problem, response), known)
+    return solution_of(problem, form, response, fit, uncertainty(fit, system, few.observations))
 
 
-class Explained(NamedTuple):
-    """Radiances of points, and what is left of their observations."""
+def explain(
+    fit: Fit, problem: Problem, response: Response
+) -> tuple[Float[np.ndarray, "p 3"], Float32[np.ndarray, "o 3"], float]:
+    """Explain all observations, whatever part `fit` was solved from.
 
-    # Of each point relative to the pivot, gauges not yet set; NaN where unobserved.
-    log_radiance: Float[np.ndarray, "p 3"]
-    # Of each observation in log exposure; 0 where it is not usable.
-    residual: Float32[np.ndarray, "o 3"]
-    outliers: float  # share of the usable values that the robust loss ignores
-
-
-def explain(fit: Fit, problem: Problem, response: Response) -> Explained:
-    """Return radiances and residuals of all observations, whatever part `fit` was solved from."""
+    Return the log radiance of points relative to the pivot, gauges not yet set and NaN where
+    unobserved; residuals in log exposure, 0 where not usable; and the share of the usable values
+    that the robust loss ignores.
+    """
     o = problem.observations
     radiance = np.full((o.point_count, 3), np.nan)
     residual = np.zeros((len(o.points), 3), np.float32)
@@ -75,11 +70,11 @@ def explain(fit: Fit, problem: Problem, response: Response) -> Explained:
     for pick, points, part in _blocks(problem):
         mine, usable = part.observations, part.usable
         # At the solution each observation is judged by itself.
-        rows = make_rows(part, usable, response)
-        model = make_forward(rows, fit.model.unknowns)
-        at = weigh(model, fit.theta, noise_weight(rows), "l1")
-        for loss in ("l1", "geman_mcclure", "geman_mcclure"):
-            at = weigh(model, fit.theta, at.weight, loss)
+        model = make_forward(part, usable, response, fit.model.unknowns)
+        weight = model.noise_weight
+        for loss in ("l1", "l1", "geman_mcclure", "geman_mcclure"):
+            at = weigh(model, fit.theta, weight, loss)
+            weight = at.weight
         # The rows of each point are combined.
         total, weight = (np.zeros((mine.point_count, 3)) for _ in range(2))
         np.add.at(total, part.layout.point_of_row, at.precision * at.radiance)
@@ -90,7 +85,7 @@ def explain(fit: Fit, problem: Problem, response: Response) -> Explained:
         residual[pick] = np.where(usable, of_exposure, 0.0)
         ideal = 1 / mine.decoded(response)[1] ** 2
         ignored += int(((at.weight < IGNORED * ideal) & usable).sum())
-    return Explained(radiance, residual, ignored / max(int(problem.usable.sum()), 1))
+    return radiance, residual, ignored / max(int(problem.usable.sum()), 1)
 
 
 def _blocks(problem: Problem) -> Iterator[tuple[np.ndarray | slice, np.ndarray | slice, Problem]]:
@@ -113,15 +108,11 @@ def _blocks(problem: Problem) -> Iterator[tuple[np.ndarray | slice, np.ndarray |
 
 
 def solution_of(
-    problem: Problem,
-    form: Form,
-    response: Response,
-    fit: Fit,
-    explained: Explained,
-    known: Uncertainty,
+    problem: Problem, form: Form, response: Response, fit: Fit, known: Uncertainty
 ) -> PhotometricSolution:
     """Return exposures in their gauge, with errors and warnings; the problem holds everything."""
-    o, used, residual = problem.observations, problem.usable, explained.residual
+    o, used = problem.observations, problem.usable
+    log_radiance, residual, outliers = explain(fit, problem, response)
     seen = used.any(1)
     per_view = np.bincount(o.views[seen], minlength=o.view_count)
     active, free = per_view > 0, np.ones(o.view_count, bool)
@@ -137,24 +128,25 @@ def solution_of(
     some_view[o.points[seen]] = o.views[seen]
     view_residual, tint = _per_view_ev(o.views, residual, used, o.view_count)
     cameras, corner_errors = _cameras(fit, response, known, o)
+    part = o.thinned(UNMODELLED_PER_VIEW, 0)
     return PhotometricSolution(
         model=form.model,
         response=response,
         **exposures,
         observations_per_view=per_view,
         component=problem.component,
-        point_log_radiance=explained.log_radiance + shifts[some_view] + problem.log_pivot,
+        point_log_radiance=log_radiance + shifts[some_view] + problem.log_pivot,
         residual_ev=_spread_ev(residual[used]) if used.any() else 0.0,
         view_residual_ev=view_residual,
         view_balance_ev=tint,
-        outliers=explained.outliers,
+        outliers=outliers,
         rounds=fit.rounds,
         moved=fit.moved,
         converged=fit.converged,
         unknown_errors=int(lost.sum()),
         warnings=(
             *_warnings(fit, errors, lost, per_view, problem.component[active], tint, o.names),
-            *_unmodelled(problem, residual),
+            *place_warnings(o.picked(part), residual[part] / LN2, used[part]),
         ),
         white_balance_level=form.white_balance,
         vignetting=form.vignetting,
@@ -171,7 +163,7 @@ def _exposures(
     h, balance = light.mean(1), light - light.mean(1, keepdims=True)
     shift = scale.shift(h)
     shifts = shift[:, None] + color.shift(balance)
-    features, cameras = fit.model.unknowns.features, fit.model.rows.layout.cameras
+    features, cameras = fit.model.unknowns.features, fit.model.layout.cameras
 
     def of_light(change: Parameters):
         return (change.b - light[..., None] * change.a[:, None]) / a[:, None, None]
@@ -209,20 +201,17 @@ class _Gauge:
     """Means over those `counted` of the views of a component, whose absolute terms are unknown."""
 
     def __init__(self, component: Int[np.ndarray, " v"], counted: Bool[np.ndarray, " v"]):
-        views = len(component)
-        labels = np.unique(component, return_inverse=True)[1]
-        count = int(labels.max(initial=-1)) + 1
         members = np.flatnonzero(counted)
-        sizes = np.bincount(labels[members], minlength=count)
-        shares = 1 / sizes[labels[members]]
-        mean = sp.csr_array((shares, (labels[members], members)), shape=(count, views))
-        of_label = sp.csr_array((np.ones(views), (np.arange(views), labels)), shape=(views, count))
-        self._mean, self._of_label = mean, of_label
+        mine = component[members]
+        shape = (int(component.max(initial=-1)) + 1, len(component))
+        shares = 1 / np.bincount(mine, minlength=shape[0])[mine]
+        self._mean = sp.csr_array((shares, (mine, members)), shape=shape)
+        self._component = component
 
     def shift(self, values: Float[np.ndarray, "v ..."]) -> Float[np.ndarray, "v ..."]:
         """Return the mean of each view's component."""
         flat = values.reshape(len(values), -1)
-        return (self._of_label @ (self._mean @ flat)).reshape(values.shape)
+        return (self._mean @ flat)[self._component].reshape(values.shape)
 
     def centred(self, values: Float[np.ndarray, "v ..."]) -> Float[np.ndarray, "v ..."]:
         """Return values less that."""
@@ -254,7 +243,6 @@ def _cameras(
 
 
 def _spread_ev(residual: Float[np.ndarray, " n"]) -> float:
-    """Return the robust standard deviation of residuals, in stops."""
     return 1.4826 * float(np.median(np.abs(residual))) / LN2
 
 
@@ -263,10 +251,7 @@ def _per_view_ev(
 ) -> tuple[Float[np.ndarray, " v"], Float[np.ndarray, "v 3"]]:
     """Return the spread of every view and its colour balance; NaN where it has none."""
     spread, balance = np.full(count, np.nan), np.full((count, 3), np.nan)
-    order = np.argsort(views, kind="stable")
-    bounds = np.searchsorted(views[order], np.arange(count + 1))
-    for view in range(count):
-        mine = order[bounds[view] : bounds[view + 1]]
+    for view, mine in enumerate(grouped(views, count)):
         seen = used[mine]
         if seen.any():
             spread[view] = _spread_ev(residual[mine][seen])
@@ -288,8 +273,7 @@ def _warnings(
     """Say where numbers are not to be trusted, and what observations tell besides or do not tell.
 
     Views that are `lost` have no errors. `component` is of views that have any observations, or a
-    known exposure; those of equal numbers share points. `balance` is the residual of red, green,
-    blue less their mean, stops.
+    known exposure. `balance` is the residual of red, green, blue less their mean, stops.
     """
     out = []
     known = errors[np.isfinite(errors)]
@@ -330,15 +314,6 @@ def _warnings(
             "An exposure here is one number for all channels."
         )
     return out
-
-
-def _unmodelled(problem: Problem, residual: PerChannel) -> list[str]:
-    """Say what depends on the place or the surroundings; of many observations, of a part."""
-    o = problem.observations
-    if o.positions is None or not len(o.points):
-        return []
-    pick = o.thinned(UNMODELLED_PER_VIEW, 0)
-    return neighbourhood_warnings(o.picked(pick), residual[pick] / LN2, problem.usable[pick])
 
 
 def _listed(rows: Sequence[int] | Labels, names: Sequence[str]) -> str:

@@ -1,4 +1,4 @@
-"""What is solved for: exposures and gammas of views, features of cameras, and response splines.
+"""What is solved for, how it may move, and what holds it besides photographs.
 
 Features are what cameras do besides exposing, linear in log radiance: a white balance per camera is
 a constant per channel, vignetting a polynomial of the radius. Both act on light, before the tone
@@ -14,17 +14,40 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from p2gs_jax.config import ResponseKind, VignettingKind
-from p2gs_jax.photometry.adjustment.matrices import Terms
-from p2gs_jax.photometry.adjustment.problem import Rows
-from p2gs_jax.photometry.models import VIGNETTING_POWERS, polynomials
+from p2gs_jax.config import Level, ResponseKind, VignettingKind
+from p2gs_jax.core.numerics import LN2
+from p2gs_jax.photometry.adjustment.matrices import Matrix, Terms
+from p2gs_jax.photometry.adjustment.problem import Layout, Problem
+from p2gs_jax.photometry.models import MODELS, VIGNETTING_POWERS, Form, polynomials
 from p2gs_jax.photometry.observations import PerChannel
-from p2gs_jax.photometry.response import FLOOR, FREE, FREE_OF_EACH, HELD, KNOTS, SMALLEST_SLOPE
+from p2gs_jax.photometry.response import (
+    FLOOR,
+    FREE,
+    FREE_OF_EACH,
+    HELD,
+    KNOTS,
+    SMALLEST_SLOPE,
+    Response,
+    hat,
+    spline_count,
+    spline_groups,
+)
 
 # Two directions that change the ratios of red, green and blue, and not their mean.
 CHROMA = np.array([[2.0, -1.0, -1.0], [0.0, 1.0, -1.0]]) / np.sqrt([[6.0], [2.0]])
+ANCHOR = 10.0  # how hard gauges are held, relative to the mean diagonal of the normal matrix
+EMPTY = 1e-9  # what keeps sums over no observations from being zero
+# Standard deviation of a = 2.2 / gamma about 1 (gammas of 1.9 to 2.6 are within one of these).
+A_PRIOR = 0.15
+# Standard deviation of each coefficient of log V about 0: lenses lose up to two stops.
+VIGNETTING_PRIOR = 0.7
+FIXED_EV = 1e-5  # deviation of a known exposure that is to be kept, stops
+# Smoothness of the spline relative to its mean information, and the spacing of knots it holds for.
+SMOOTHNESS, KNOT_SPACING = 3e-3, 0.12
+
+Vector = Float[np.ndarray, " d"]
 
 
 @dataclass(frozen=True)
@@ -46,21 +69,21 @@ class Features:
         each = polynomials(self.vignetting) * len(VIGNETTING_POWERS)
         return self.balance_count + self.cameras * each
 
-    def terms(self, rows: Rows) -> Terms:
+    def terms(self, layout: Layout) -> Terms:
         """Return the features of every value."""
-        camera = rows.layout.cameras[rows.layout.views][:, None]
-        shape = (len(camera), 3)
+        camera = layout.cameras[layout.views][:, None]
         index, factor = [], []
         if self.balance:
-            for direction, of_channel in enumerate(CHROMA):
-                index.append(np.broadcast_to(camera + direction * self.cameras, shape))
-                factor.append(np.broadcast_to(of_channel, shape))
+            index += [camera + direction * self.cameras for direction in range(len(CHROMA))]
+            factor += list(CHROMA)
         if self.vignetting:
             of_channel = np.arange(3) if self.vignetting == "channel" else np.zeros(3, int)
             polynomial = camera * polynomials(self.vignetting) + of_channel
             for k, power in enumerate(VIGNETTING_POWERS):
                 index.append(self.balance_count + polynomial * len(VIGNETTING_POWERS) + k)
-                factor.append(np.broadcast_to(rows.layout.radius2[:, None] ** (power // 2), shape))
+                factor.append(layout.radius2[:, None] ** (power // 2))
+        shape = (len(camera), 3)
+        index, factor = ([np.broadcast_to(p, shape) for p in part] for part in (index, factor))
         return Terms(np.stack(index, -1), np.stack(factor, -1), self.count)
 
     def balance_of(self, k: Float[np.ndarray, " k"]) -> Float[np.ndarray, "c 3"]:
@@ -97,8 +120,7 @@ class Splines:
         """Parameters whose mean is a gauge: how steep the splines are, where they are several."""
         if self.by == "all":
             return np.zeros(0, int)
-        place = int(np.flatnonzero(self.free == HELD[1])[0])
-        return place + len(self.free) * np.arange(self.groups)
+        return np.flatnonzero(np.tile(self.free == HELD[1], self.groups))
 
     def values(self, c: Float[np.ndarray, " k"]) -> Float[np.ndarray, "g n"]:
         """Return the splines at all knots."""
@@ -106,29 +128,30 @@ class Splines:
         full[:, self.free] = c.reshape(self.groups, -1)
         return full
 
-    def terms(self, rows: Rows) -> Terms:
+    def terms(
+        self, knot: Int[np.ndarray, "o 3"], fraction: PerChannel, group: Int[np.ndarray, "o 3"]
+    ) -> Terms:
         """Return the basis at every value; knots that are held have no parameter."""
         place = np.full(len(KNOTS), -1)
         place[self.free] = np.arange(len(self.free))
-        knots = np.stack([rows.knot, rows.knot + 1], -1)
-        index = rows.group[..., None] * len(self.free) + place[knots]
-        index = np.where(place[knots] < 0, self.count, index)
-        return Terms(index, np.stack([1 - rows.fraction, rows.fraction], -1), self.count)
+        place = place[np.stack([knot, knot + 1], -1)]
+        index = np.where(place < 0, self.count, group[..., None] * len(self.free) + place)
+        return Terms(index, np.stack([1 - fraction, fraction], -1), self.count)
 
     def decode(
-        self, rows: Rows, c: Float[np.ndarray, " k"]
+        self, model: Forward, c: Float[np.ndarray, " k"]
     ) -> tuple[PerChannel, PerChannel, PerChannel]:
         """Return z, its standard deviation and dz/dy under splines over the base curve."""
         full = self.values(c)
-        low, high = full[rows.group, rows.knot], full[rows.group, rows.knot + 1]
-        z = rows.z + (1 - rows.fraction) * low + rows.fraction * high
-        steeper = (high - low) / np.diff(KNOTS)[rows.knot]
-        slope = np.maximum(rows.slope + steeper, SMALLEST_SLOPE * rows.slope)
-        of_pixel = np.maximum(rows.sigma**2 - FLOOR**2, 0) * (slope / rows.slope) ** 2
+        low, high = full[model.group, model.knot], full[model.group, model.knot + 1]
+        z = model.z + (1 - model.fraction) * low + model.fraction * high
+        steeper = (high - low) / np.diff(KNOTS)[model.knot]
+        slope = np.maximum(model.slope + steeper, SMALLEST_SLOPE * model.slope)
+        of_pixel = np.maximum(model.sigma**2 - FLOOR**2, 0) * (slope / model.slope) ** 2
         return z, np.sqrt(of_pixel + FLOOR**2), slope
 
     def log_slope_terms(
-        self, rows: Rows, share: PerChannel, slope: PerChannel
+        self, model: Forward, share: PerChannel, slope: PerChannel
     ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
         """Return gradient and curvature of the sum of log dz/dy, weighted by `share`.
 
@@ -138,7 +161,7 @@ class Splines:
         """
         steps = np.diff(np.eye(len(KNOTS)), axis=0)[:, self.free] / np.diff(KNOTS)[:, None]
         gaps = len(KNOTS) - 1
-        at = (rows.group * gaps + rows.knot).ravel()
+        at = (model.group * gaps + model.knot).ravel()
         first, second = (
             np.bincount(at, (share / slope**k).ravel(), self.groups * gaps).reshape(-1, gaps)
             for k in (1, 2)
@@ -157,7 +180,7 @@ class Parameters(NamedTuple):
     # Response splines at their free knots; empty where the response is given.
     c: Float[np.ndarray, " c"]
 
-    def vector(self) -> Float[np.ndarray, " d"]:
+    def vector(self) -> Vector:
         """Return all of them in one vector: columns of b, a, k, c."""
         return np.concatenate([self.b.T.ravel(), self.a, self.k, self.c])
 
@@ -180,11 +203,6 @@ class Unknowns:
         return Parameters(*(slice(*pair) for pair in ends))  # pyright: ignore[reportArgumentType]
 
     @property
-    def per_view(self) -> int:
-        """Parameters of b and a."""
-        return self.at.a.stop
-
-    @property
     def count(self) -> int:
         """Length of the vector."""
         return self.at.c.stop
@@ -197,20 +215,203 @@ class Unknowns:
 
 
 class Forward(NamedTuple):
-    """Observations and what explains them; `make_forward` lays the terms out."""
+    """Observations by row (one point each, or a part of a long track), and what explains them."""
 
-    rows: Rows  # the observations
     unknowns: Unknowns  # what is solved for
+    layout: Layout
+    z: PerChannel  # log exposed radiance under the base curve, relative to the pivot
+    sigma: PerChannel  # its standard deviation
+    weight: PerChannel  # 1 used, 0 masked or held out
+    knot: Int[np.ndarray, "o 3"]  # left spline knot
+    fraction: PerChannel  # of the way to the next knot
+    slope: PerChannel  # dz/dy under the base curve
+    group: Int[np.ndarray, "o 3"]  # which spline decodes a value, where they are solved for
     features: Terms | None  # what cameras do, at every value
     basis: Terms | None  # of the splines, at every value; None where the response is given
 
+    @property
+    def noise_weight(self) -> PerChannel:
+        """Weights by the stated noise alone: where robust ones start."""
+        return self.weight / self.sigma**2
 
-def make_forward(rows: Rows, unknowns: Unknowns) -> Forward:
-    """Return the model with its terms laid out."""
+
+def make_forward(
+    problem: Problem, weight: PerChannel, response: Response, unknowns: Unknowns
+) -> Forward:
+    """Return the observations under a response, with the terms of the model laid out."""
+    layout, o = problem.layout, problem.observations
     features, splines = unknowns.features, unknowns.splines
+    z, sigma, slope = o.decoded(response)
+    knot, fraction = hat(np.asarray(o.colors, np.float64))
+    group = spline_groups(splines.by, layout.cameras[layout.views], z.shape)
     return Forward(
-        rows,
         unknowns,
-        features.terms(rows) if features.count else None,
-        splines.terms(rows) if splines.count else None,
+        layout,
+        z - problem.log_pivot,
+        sigma,
+        np.asarray(weight, np.float64),
+        knot,
+        fraction,
+        slope,
+        group,
+        features.terms(layout) if features.count else None,
+        splines.terms(knot, fraction, group) if splines.count else None,
     )
+
+
+@dataclass(frozen=True)
+class Held:
+    """Linear combinations of the parameters (rows), held at targets with inverse variances."""
+
+    rows: sp.csr_array
+    targets: Float[np.ndarray, " n"]
+    precisions: Float[np.ndarray, " n"]
+
+    @functools.cached_property
+    def normal(self) -> sp.csr_array:
+        """Its normal matrix."""
+        return sp.csr_array(self.rows.T @ self.rows.multiply(self.precisions[:, None]))
+
+    def pull(self, vector: Vector) -> Vector:
+        """Return its right side at some parameters."""
+        return self.rows.T @ (self.precisions * (self.targets - self.rows @ vector))
+
+
+class System(NamedTuple):
+    """Which directions are free, and what is known besides the photographs."""
+
+    unknowns: Unknowns  # what the parameters are
+    basis: sp.csr_array  # columns are the free directions
+    anchors: Held  # the gauges; their precisions are relative (`gauge_strength`)
+    priors: Held  # what is known
+    log_exposure: Float[np.ndarray, " v"]  # prior mean of h: where rounds start
+    smoothness: Float[np.ndarray, "k k"]  # its quadratic form keeps a spline smooth
+
+    @property
+    def start(self) -> Parameters:
+        """Where rounds begin."""
+        u = self.unknowns
+        b = np.repeat(self.log_exposure[:, None], u.channels, 1)
+        k, c = (np.zeros(terms.count) for terms in (u.features, u.splines))
+        return Parameters(b, np.ones(u.views), k, c)
+
+
+def make_system(problem: Problem, form: Form, splines: ResponseKind | None = None) -> System:
+    """Return free directions, gauges and priors of a form.
+
+    `splines` says what gets a spline that is solved for (None: nothing).
+    """
+    cameras, views = problem.observations.cameras, problem.observations.view_count
+    camera_count = int(cameras.max(initial=0)) + 1
+    model = MODELS[form.model]
+    unknowns = Unknowns(
+        views,
+        3 if form.white_balance == "view" else 1,
+        model.gamma is not None,
+        Features(camera_count, form.white_balance == "camera", form.vignetting),
+        Splines(splines or "all", spline_count(splines, camera_count)),
+    )
+    of_b, of_a = _directions(model.exposure, cameras), _directions(model.gamma, cameras)
+    others = sp.eye_array(unknowns.count - unknowns.at.a.stop)
+    basis = sp.block_diag([*[of_b] * unknowns.channels, of_a, others], format="csr")
+
+    known = problem.known
+    log_exposure, precision = np.zeros(views), np.zeros(views)
+    if known is not None:
+        given = np.isfinite(known.log_exposures)
+        log_exposure = np.where(given, known.log_exposures, 0.0)
+        precision = given / (max(known.deviation_ev, FIXED_EV) * LN2) ** 2
+    return System(
+        unknowns=unknowns,
+        basis=sp.csr_array(basis),
+        anchors=_anchors(problem, unknowns, log_exposure, precision),
+        priors=_priors(unknowns, log_exposure, precision),
+        log_exposure=log_exposure,
+        smoothness=_smoothness(unknowns.splines),
+    )
+
+
+def _directions(level: Level | None, cameras: np.ndarray) -> sp.csr_array:
+    """Return what may move together: nothing, the views of a camera, or each by itself."""
+    views = np.arange(len(cameras))
+    if level is None:
+        return sp.csr_array((len(views), 0))
+    column = views if level == "view" else cameras
+    return sp.csr_array((np.ones(len(views)), (views, column)))
+
+
+def _anchors(problem: Problem, u: Unknowns, log_exposure, precision) -> Held:
+    """Return the gauges: scale, power and colour of each group of views that share points."""
+    rows, targets = [sp.csr_array((0, u.count))], []
+
+    def hold(index, weights, target=0.0) -> None:
+        row = np.zeros(u.count)
+        row[index] = weights
+        rows.append(sp.csr_array(row[None]))
+        targets.append(target)
+
+    for label in np.unique(problem.component):
+        members = np.flatnonzero(problem.component == label)
+        share, known = 1 / len(members), precision[members] > 0
+        if not known.any():
+            for channel in range(u.channels):
+                hold(channel * u.views + members, share)
+        elif u.channels == 3:
+            # Known exposures say nothing of colours.
+            for channel in (0, 2):
+                both = np.concatenate([channel * u.views + members, u.views + members])
+                hold(both, np.repeat([share, -share], len(members)))
+        if known.sum() < 2 or np.ptp(log_exposure[members]) < 1e-3:
+            hold(u.at.a.start + members, share, 1.0)
+    if u.features.balance:
+        views_of = np.bincount(problem.observations.cameras, minlength=u.features.cameras)
+        for direction in range(u.features.balance_count // u.features.cameras):
+            at = u.at.k.start + direction * u.features.cameras + np.arange(u.features.cameras)
+            hold(at, views_of / views_of.sum())
+    powers = u.at.c.start + u.splines.powers
+    if u.splines.by == "channel" and u.channels == 3:
+        # No photograph tells the power of a channel with exposures of its own.
+        for power in powers:
+            hold(power, 1.0)
+    elif powers.size:
+        hold(powers, 1 / u.splines.groups)
+    return Held(sp.csr_array(sp.vstack(rows)), np.array(targets), np.ones(len(targets)))
+
+
+def _priors(u: Unknowns, log_exposure, precision) -> Held:
+    """Return what is known: exposures (b - a mu = 0 for h = mu), gammas, lenses."""
+    given, views = np.flatnonzero(precision > 0), np.arange(u.views)
+    at = np.arange(len(given))
+    b = [(np.full(len(given), 1 / u.channels), c * u.views + given) for c in range(u.channels)]
+    b.append((-log_exposure[given], u.at.a.start + given))
+    values, columns = (np.concatenate(part) for part in zip(*b, strict=True))
+    exposures = sp.csr_array(
+        (values, (np.tile(at, u.channels + 1), columns)), shape=(len(given), u.count)
+    )
+    every = sp.csr_array(sp.eye_array(u.count))
+    of_a = every[u.at.a.start + views] if u.gammas else every[:0]
+    lenses = np.arange(u.at.k.start + u.features.balance_count, u.at.k.stop)
+    counts = [of_a.shape[0], len(lenses)]
+    others = np.repeat([1 / A_PRIOR**2, 1 / VIGNETTING_PRIOR**2], counts)
+    return Held(
+        sp.csr_array(sp.vstack([exposures, of_a, every[lenses]])),
+        np.repeat([0.0, 1.0, 0.0], [len(given), *counts]),
+        np.concatenate([precision[given], others]),
+    )
+
+
+def _smoothness(splines: Splines) -> Float[np.ndarray, "k k"]:
+    """Return the quadratic form of second differences between the knots of each spline."""
+    if not splines.groups:
+        return np.zeros((0, 0))
+    gaps = np.diff(KNOTS)
+    second = np.diff(np.diff(np.eye(len(KNOTS)), axis=0) / gaps[:, None], axis=0)[:, splines.free]
+    between = 0.5 * (gaps[1:] + gaps[:-1])
+    second = second * (KNOT_SPACING**1.5 / np.sqrt(between))[:, None]
+    return np.kron(np.eye(splines.groups), SMOOTHNESS * second.T @ second)
+
+
+def gauge_strength(normal: Matrix, unknowns: Unknowns) -> float:
+    """Return how hard the anchors hold, on the scale of the exposures' information."""
+    of_b = normal.diagonal()[: unknowns.channels * unknowns.views]
+    return ANCHOR * float(np.mean(of_b) + EMPTY)

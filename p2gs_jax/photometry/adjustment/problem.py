@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Int
 
-from p2gs_jax.config import ResponseKind
 from p2gs_jax.photometry.adjustment.matrices import Pairs
-from p2gs_jax.photometry.observations import Observations, PerChannel
-from p2gs_jax.photometry.response import Response, hat, spline_groups
+from p2gs_jax.photometry.observations import Observations
 
 LONGEST_ROW = 16
 
@@ -96,28 +93,3 @@ def make_problem(
     usable = observations.usable(black, saturation)
     component = observations.components(usable)
     return Problem(observations, usable, component, float(np.log(pivot)), known)
-
-
-class Rows(NamedTuple):
-    """Observations by row (one point each, or a part of a long track) under one response."""
-
-    layout: Layout
-    z: PerChannel  # log exposed radiance under the base curve, relative to the pivot
-    sigma: PerChannel  # its standard deviation
-    weight: PerChannel  # 1 used, 0 masked or held out
-    knot: Int[np.ndarray, "o 3"]  # left spline knot
-    fraction: PerChannel  # of the way to the next knot
-    slope: PerChannel  # dz/dy under the base curve
-    group: Int[np.ndarray, "o 3"]  # which spline decodes a value, where they are solved for
-
-
-def make_rows(
-    problem: Problem, weight: PerChannel, response: Response, splines: ResponseKind | None = None
-) -> Rows:
-    """Return rows under one response; `splines` says what gets a spline that is solved for."""
-    layout, o = problem.layout, problem.observations
-    z, sigma, slope = o.decoded(response)
-    knot, fraction = hat(np.asarray(o.colors, np.float64))
-    group = spline_groups(splines or "all", layout.cameras[layout.views], z.shape)
-    weight = np.asarray(weight, np.float64)
-    return Rows(layout, z - problem.log_pivot, sigma, weight, knot, fraction, slope, group)

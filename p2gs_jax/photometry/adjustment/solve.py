@@ -1,5 +1,5 @@
 """Rounds of weighing and stepping: four under an L1 loss, then Geman-McClure's to a fixed point,
-either of single observations or of whole points (`robust.py`).
+either of single observations or of whole points (`equations.py`).
 
 Outliers are weighted away: 0 / 10 / 30 % of them give 0.005 / 0.006 / 0.007 EV (docs/photometry.md,
 4). The L1 rounds bring the start near enough for the loss that ignores what is far away.
@@ -18,12 +18,17 @@ import threadpoolctl
 from jaxtyping import Float
 
 from p2gs_jax.config import ResponseKind
+from p2gs_jax.photometry.adjustment.equations import Loss, Weighted, normal_equations, weigh
 from p2gs_jax.photometry.adjustment.matrices import Matrix, is_small, whole
-from p2gs_jax.photometry.adjustment.normal import normal_equations
-from p2gs_jax.photometry.adjustment.parameters import Forward, Parameters, make_forward
-from p2gs_jax.photometry.adjustment.problem import Problem, Rows, make_rows
-from p2gs_jax.photometry.adjustment.robust import Loss, Weighted, noise_weight, weigh
-from p2gs_jax.photometry.adjustment.system import System, make_system, with_priors
+from p2gs_jax.photometry.adjustment.parameters import (
+    Forward,
+    Parameters,
+    System,
+    gauge_strength,
+    make_forward,
+    make_system,
+)
+from p2gs_jax.photometry.adjustment.problem import Problem
 from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.response import Response, rises
 
@@ -109,12 +114,7 @@ def _iterative(sparse: sp.csr_array, low_rank: Float[np.ndarray, "g n"]):
     def one(right):
         return scipy.sparse.linalg.cg(matrix, right, **how)[0]
 
-    def solve(right):
-        if right.ndim == 1:
-            return one(right)
-        return np.stack([one(column) for column in right.T], 1)
-
-    return solve
+    return functools.partial(np.apply_along_axis, one, 0)
 
 
 class Fit(NamedTuple):
@@ -135,23 +135,34 @@ def _step(
     model: Forward, system: System, theta: Parameters, at: Weighted
 ) -> tuple[Parameters, float]:
     """Return the parameters after one Gauss-Newton step, and its largest change of one of them."""
+    u, vector = system.unknowns, theta.vector()
     normal, right = normal_equations(model, theta, at, np.float32)
-    normal, gauges, right = with_priors(system, theta, normal, right)
-    step = system.unknowns.split(Balanced(normal, gauges, system.basis).solve(right))
+    normal = normal + system.priors.normal
+    # A gauge is a mean over views: over thousands of them its normal matrix would not be sparse.
+    strength = gauge_strength(normal, u)
+    gauges = np.sqrt(strength) * system.anchors.rows
+    right = right + system.priors.pull(vector)
+    right = right + strength * system.anchors.pull(vector)
+    if theta.c.size:
+        stiffness = float(np.mean(normal.diagonal()[u.at.c]))
+        smooth = stiffness * system.smoothness
+        before = sp.csr_array((u.at.c.start,) * 2)
+        normal = normal + sp.block_diag([before, smooth], format="csr")
+        right = right - np.concatenate([np.zeros(u.at.c.start), smooth @ theta.c])
+    step = u.split(Balanced(normal, gauges, system.basis).solve(right))
     new = Parameters(*(x + dx for x, dx in zip(theta, step, strict=True)))
     new = new._replace(a=np.clip(new.a, *A_RANGE))
     changes = zip(new, theta, strict=True)
     return new, float(np.max([np.abs(x - y).max(initial=0.0) for x, y in changes]))
 
 
-def solve(rows: Rows, system: System, tolerance: float, loss: Loss) -> Fit:
+def solve(model: Forward, system: System, tolerance: float, loss: Loss) -> Fit:
     """Adjust exposures, gammas, cameras and response to observations (float64).
 
     A largest change of a parameter below the tolerance, log units, counts as none. `loss` is of the
     rounds after those under L1.
     """
-    model = make_forward(rows, system.unknowns)
-    theta, weight = system.start, noise_weight(rows)
+    theta, weight = system.start, model.noise_weight
     moved, before, count = np.inf, np.inf, 0
     for count in range(1, MOST_ROUNDS + 1):
         at = weigh(model, theta, weight, "l1" if count <= L1_ROUNDS else loss)
@@ -189,10 +200,10 @@ def solve_model(
     nothing). The tolerance and the loss are those of `solve`.
     """
     weight = problem.usable if use is None else problem.usable * use[:, None]
-    rows = make_rows(problem, weight, response, splines)
     system = make_system(problem, form, splines)
+    model = make_forward(problem, weight, response, system.unknowns)
     with one_thread():
-        return solve(rows, system, tolerance, loss), system
+        return solve(model, system, tolerance, loss), system
 
 
 def fit_response(

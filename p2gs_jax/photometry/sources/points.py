@@ -15,7 +15,7 @@ from jaxtyping import Bool
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.streams import Stream, generator
-from p2gs_jax.photometry.observations import Observations
+from p2gs_jax.photometry.observations import Observations, grouped
 from p2gs_jax.photometry.sources.sampling import PROJECTED_UNCERTAINTY, point_colors
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.render.warp import project_points, surface_depth, unproject, visible
@@ -53,9 +53,8 @@ def has_tracks(scene: Scene) -> bool:
 def track_colors(scene: Scene, store: ImageStore, on_view: OnView = None) -> Observations:
     """Sample every track in every training view, at its training resolution."""
     assert scene.tracks is not None
-    order = np.argsort(scene.tracks.view_indices, kind="stable")
-    bounds = np.searchsorted(scene.tracks.view_indices[order], np.arange(len(scene.views) + 1))
-    picks = [order[bounds[i] : bounds[i + 1]] for i in scene.train_indices]
+    of_view = grouped(scene.tracks.view_indices, len(scene.views))
+    picks = [of_view[i] for i in scene.train_indices]
     points = [scene.tracks.point_indices[pick] for pick in picks]
     xy = [scene.tracks.xy[pick] for pick in picks]
     return point_colors(scene, store, points, xy, on_view=on_view)

@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float, Float32, Int
 from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 from p2gs_jax.photometry.formation import places
 from p2gs_jax.photometry.observations import COARSEST, Observations
-from p2gs_jax.photometry.response import DARKEST
 from p2gs_jax.render.warp import project_points
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Scene
@@ -24,9 +23,6 @@ POSITION_DEVIATION = 0.5
 # Positions that come from calibration or rendered depth, not from matching, are less certain than
 # tracks by this factor.
 PROJECTED_UNCERTAINTY = 2.0
-# For its surroundings a photograph is reduced to about this diagonal, pixels; it is blurred over
-# this part of half.
-DIAGONAL, REACH = 200, 0.12
 
 
 class Samples(NamedTuple):
@@ -93,22 +89,6 @@ def _sample_smooth(smooth, brightest, mask, xy, margin: int) -> Samples:
     return Samples(between(shown[:, 1:3, 1:3]), spread, around_it, valid)
 
 
-def surroundings(
-    ldr: Float32[np.ndarray, "h w 3"], xy: Float[np.ndarray, "o 2"]
-) -> Float32[np.ndarray, " o"]:
-    """Return the mean log2 brightness about pixel positions, in stops by a power of 2.2."""
-    height, width = ldr.shape[:2]
-    step = max(1, round(float(np.hypot(height, width)) / DIAGONAL))
-    size = (max(1, width // step), max(1, height // step))
-    gray = np.ascontiguousarray(ldr.mean(-1), np.float32)
-    small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
-    stops = 2.2 * np.log2(np.maximum(small, DARKEST))
-    blurred = cv2.GaussianBlur(stops, (0, 0), REACH * float(np.hypot(*stops.shape)) / 2)
-    at = np.floor(xy * [size[0] / width, size[1] / height]).astype(int)
-    column, row = np.clip(at, 0, [size[0] - 1, size[1] - 1]).T
-    return blurred[row, column].astype(np.float32)
-
-
 def point_colors(
     scene: Scene,
     store: ImageStore,
@@ -129,9 +109,7 @@ def point_colors(
     wider, keep = _at_one_scale(scene, store, points)
     nothing = np.zeros((0, 3), np.float32)
     empty = np.zeros(0, int), np.zeros(0, int), nothing, nothing, nothing
-    parts: list[tuple[np.ndarray, ...]] = [
-        (*empty, np.zeros(0, np.float32), np.zeros((0, 2), np.float32))
-    ]
+    parts: list[tuple[np.ndarray, ...]] = [(*empty, np.zeros((0, 2), np.float32))]
     for row, (index, kept) in enumerate(zip(scene.train_indices, keep, strict=True)):
         mine = points[row][kept]
         if len(mine):
@@ -144,11 +122,11 @@ def point_colors(
             at = there[good]
             at_places = places(at, width, height).astype(np.float32)
             labels = np.full(len(at), row), mine[good]
-            parts.append((*labels, *shown, surroundings(ldr, at), at_places))
+            parts.append((*labels, *shown, at_places))
         if on_view is not None:
             on_view(row + 1, len(scene.train_indices))
-    views, seen, colors, spread, brightest, around, positions = (
-        np.concatenate(part) for part in zip(*parts, strict=True)
+    views, seen, colors, spread, brightest, positions = map(
+        np.concatenate, zip(*parts, strict=True)
     )
     cameras = [scene.views[i].camera for i in scene.train_indices]
     return Observations(
@@ -162,7 +140,6 @@ def point_colors(
         too_coarse=int(sum((~kept).sum() for kept in keep)),
         names=tuple(scene.views[i].name for i in scene.train_indices),
         positions=positions,
-        surroundings=around,
         brightest=brightest,
         camera_names=tuple(sorted(set(cameras))),
     )

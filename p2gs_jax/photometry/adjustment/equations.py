@@ -1,21 +1,132 @@
-"""Normal equations, points eliminated: the Schur complement, and sums over its rows."""
+"""Residuals at given parameters, robust weights, and the normal equations they sum to.
+
+The points are eliminated from the equations: the Schur complement.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple, cast
+from typing import Literal, NamedTuple, cast
 
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float
 
 from p2gs_jax.photometry.adjustment.matrices import Entries, Matrix, Terms, assembled, block
-from p2gs_jax.photometry.adjustment.parameters import Forward, Parameters, Unknowns
+from p2gs_jax.photometry.adjustment.parameters import EMPTY, Forward, Parameters, Unknowns, Vector
 from p2gs_jax.photometry.adjustment.problem import Layout
-from p2gs_jax.photometry.adjustment.robust import Weighted
-from p2gs_jax.photometry.adjustment.system import EMPTY, Vector
 from p2gs_jax.photometry.observations import Labels, PerChannel
+
+Loss = Literal["l1", "geman_mcclure", "whole_points"]
+GEMAN_MCCLURE = 3.0  # width of the Geman-McClure loss in robust standard deviations
+# What is known of a point's spread before it is looked at counts as this many observations.
+PRIOR_SPREAD = 3.0
+SMALLEST_SCALE = 0.3
+MEDIAN_ROWS = 4096
+
+PerObservation = Float[np.ndarray, " o"]
+
+
+class Weighted(NamedTuple):
+    """Everything per observation at given parameters."""
+
+    weight: PerChannel  # robust weight over variance
+    sigma: PerChannel  # stated standard deviation of z
+    slope: PerChannel  # dz/dy
+    residual: PerChannel  # of each observation, log units
+    radiance: Float[np.ndarray, "r 3"]  # log radiance of each row's point relative to the pivot
+    level: PerChannel  # the same at every observation, with what its camera adds
+    precision: Float[np.ndarray, "r 3"]  # of `radiance`
+    scale: float  # robust standard deviation of one observation in units of its stated one
+    curvature: float  # mean second derivative of the robust loss over its weight (1 for squares)
+
+
+def weigh(model: Forward, theta: Parameters, weight: PerChannel, loss: Loss) -> Weighted:
+    """Return residuals at some parameters, and the weights that they imply under a loss.
+
+    The weight of the round before decides the point radiances that residuals are taken from.
+    """
+    layout, z, sigma, slope = model.layout, model.z, model.sigma, model.slope
+    if theta.c.size:
+        z, sigma, slope = model.unknowns.splines.decode(model, theta.c)
+    a, b = theta.a[layout.views][:, None], theta.b[layout.views]
+    added = 0.0 if model.features is None else model.features.of(theta.k)
+    z_of_point = z - (b + a * added)
+    radiance, _ = _radiance(layout, a, z_of_point, weight)
+    u = (z_of_point - a * radiance[layout.row]) / sigma
+    scale = max(1.4826 * _median(model, np.abs(u)), SMALLEST_SCALE)
+    # One weight for the whole observation: an outlier is wrong in all channels.
+    used = model.weight.sum(1)
+    square = (u**2 * model.weight).sum(1) / np.maximum(used, 1) / (GEMAN_MCCLURE * scale) ** 2
+    if loss == "l1":
+        factor, curvature = 1 / np.maximum(np.abs(u) / scale, 0.5), 1.0
+    else:
+        of = _whole_points if loss == "whole_points" else _geman_mcclure
+        of_observation, curvature = of(model, square, used / 3)
+        factor = of_observation[:, None]
+    weight = model.weight / sigma**2 * factor
+    radiance, precision = _radiance(layout, a, z_of_point, weight)
+    of_point = radiance[layout.row]
+    known = z_of_point - a * of_point, radiance, of_point + added, precision
+    return Weighted(weight, sigma, slope, *known, scale, curvature)
+
+
+def _geman_mcclure(
+    model: Forward, square: PerObservation, share: PerObservation
+) -> tuple[PerObservation, float]:
+    """Return weights of squares in widths of the loss, and its mean curvature over them."""
+    robust, second = _derivatives(square)
+    seen = share > 0
+    return robust, float(second[seen].sum() / max(robust[seen].sum(), 1e-9))
+
+
+def _whole_points(
+    model: Forward, square: PerObservation, share: PerObservation
+) -> tuple[PerObservation, float]:
+    """Return weights and curvature where every point has a spread of its own.
+
+    Gloss and silhouettes make all that a point shows uncertain, and by different amounts. So the
+    Geman-McClure losses of a point's observations are summed as the squares of Student's t are,
+    whose scale is the point's own: it counts the less, the more its views differ. Arguments as for
+    `_geman_mcclure`.
+    """
+    layout = model.layout
+    alone, curved = _derivatives(square)
+    bound = GEMAN_MCCLURE**2
+    losses = layout.by_row @ (share * bound * square / (1 + square))
+    # A point's radiance takes one observation away.
+    freedom = np.maximum(layout.by_row @ share - 1, 0)
+    of_row = (PRIOR_SPREAD + freedom) / (PRIOR_SPREAD + losses)
+    robust = alone * of_row[layout.row]
+    second = share * curved * of_row[layout.row]
+    pulls = layout.by_row @ (share**2 * bound * square * alone**2)
+    along = 2 * of_row / (PRIOR_SPREAD + losses) * pulls
+    return robust, float((second.sum() - along.sum()) / max((share * robust).sum(), 1e-9))
+
+
+def _derivatives(square: PerObservation) -> tuple[PerObservation, PerObservation]:
+    """Return slope over residual and curvature of the Geman-McClure loss, of one observation."""
+    return 1 / (1 + square) ** 2, (1 - 3 * square) / (1 + square) ** 3
+
+
+def _radiance(layout: Layout, a, z, weight):
+    """Return the log radiance of each row and its precision; a per observation."""
+    precision = layout.by_row @ (weight * a**2)
+    return layout.by_row @ (weight * a * z) / (precision + EMPTY), precision
+
+
+def _median(model: Forward, values: PerChannel) -> float:
+    """Return the median of used values; of more rows than MEDIAN_ROWS, of every n-th row."""
+    used = model.weight > 0
+    step = max(1, model.layout.rows // MEDIAN_ROWS)
+    if step > 1:
+        used = used & (model.layout.row % step == 0)[:, None]
+    picked = values[used]
+    if not picked.size:
+        return 0.0
+    middle = (picked.size + 1) // 2 - 1
+    return float(np.partition(picked, middle)[middle])
 
 
 class OfView(NamedTuple):
@@ -33,7 +144,7 @@ def normal_equations(
     A prediction b + a (l + k features) - c basis has the derivatives 1, l + k features, a features
     and -basis; a point's own is a. The products of pairs are of a `kind`; see `Pairs.sums`.
     """
-    layout, u = model.rows.layout, model.unknowns
+    layout, u = model.layout, model.unknowns
     w, pull = at.weight, at.weight * at.residual
     coupled = coupling(layout, theta, at)
     parts, right = [], []
@@ -82,7 +193,7 @@ def others(model: Forward, theta: Parameters) -> Terms | None:
     """Return the derivatives of predictions by k and c."""
     features, basis = model.features, model.basis
     if features is not None:
-        a = theta.a[model.rows.layout.views][:, None, None]
+        a = theta.a[model.layout.views][:, None, None]
         features = replace(features, factor=a * features.factor)
     if basis is not None:
         basis = replace(basis, factor=-basis.factor)
@@ -101,10 +212,10 @@ def _with_others(
     model: Forward, at: Weighted, terms: Terms, per_view: list[OfView], coupled: PerChannel
 ) -> tuple[list[Entries], Float[np.ndarray, " k"]]:
     """Return what k and c add to the equations: entries, and their right side."""
-    layout, u = model.rows.layout, model.unknowns
+    layout, u = model.layout, model.unknowns
     place = 3 * layout.row[:, None] + np.arange(3)
     through = terms.sums(coupled, place, 3 * layout.rows)
-    first = u.per_view
+    first = u.at.a.stop
     parts = []
     at_view = np.broadcast_to(layout.views[:, None], at.weight.shape)
     for x, one in enumerate(per_view):
@@ -118,7 +229,7 @@ def _with_others(
     pulled = terms.sums(at.weight * at.residual, np.zeros_like(place), 1)[0]
     if model.basis is not None:
         share = at.weight * at.sigma**2 * at.scale**2
-        gradient, curvature = u.splines.log_slope_terms(model.rows, share, at.slope)
+        gradient, curvature = u.splines.log_slope_terms(model, share, at.slope)
         pulled[-len(gradient) :] += gradient
         corner[-len(gradient) :, -len(gradient) :] += curvature
     return [*parts, block(first, first, corner)], pulled
@@ -145,7 +256,7 @@ def summed(
 
     For the pull of observations, weight times residual, these are the scores of clusters.
     """
-    layout, u = model.rows.layout, model.unknowns
+    layout, u = model.layout, model.unknowns
     count = int(places.max(initial=-1)) + 1
     totals = [(values * p.derivative)[:, p.channels].sum(1) for p in of_views(model, at)]
     at_views, shape = (places, layout.views), (count, u.views)
