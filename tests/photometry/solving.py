@@ -1,9 +1,6 @@
 """What tests of the adjustment share: a drive, its exposures, and how it is solved."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-import pytest
 from synthetic_drive import make_drive, make_exposures, observe
 
 from p2gs_jax.evaluation.alignment import exposure_error
@@ -35,21 +32,3 @@ def ev(solved, truth=ISO4):
 
 def rms(values):
     return np.sqrt(np.mean(np.square(values)))
-
-
-def check_gradients(f, *at, step=1e-6, rel=1e-4, floor=1e-6):
-    """Compare the slope of f along a random direction of every leaf with finite differences."""
-    leaves, tree = jax.tree.flatten(at)
-    value = jax.jit(lambda *leaves: f(*jax.tree.unflatten(tree, leaves)))
-    exact = jax.jit(jax.grad(value, argnums=tuple(range(len(leaves)))))(*leaves)
-    rng = np.random.default_rng(4)
-    slopes = []
-    for k, leaf in enumerate(leaves):
-        along = jnp.asarray(rng.normal(size=leaf.shape), leaf.dtype)
-        high, low = (
-            value(*leaves[:k], leaf + sign * step * along, *leaves[k + 1 :]) for sign in (1, -1)
-        )
-        slopes.append(float(jnp.sum(exact[k] * along)))
-        numeric = float(high - low) / (2 * step)
-        assert slopes[-1] == pytest.approx(numeric, rel=rel, abs=floor), k
-    return slopes

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import RegularGridInterpolator
-from solving import check_gradients
 
 from p2gs_jax.config import LossConfig, PhotometryConfig
 from p2gs_jax.evaluation.alignment import fit_exposure
@@ -25,10 +24,9 @@ from p2gs_jax.photometry.appearance import (
     regularisation,
 )
 from p2gs_jax.photometry.formation import formation
-from p2gs_jax.train.terms import CURVE, contrast_loss, curve_prior, enhanced_loss
+from p2gs_jax.train.terms import contrast_loss, curve_prior, enhanced_loss
 from p2gs_jax.types import LUMINANCE, Capture, Params, Photometry
 
-KINDS = pytest.mark.parametrize("kind", ["affine", "bilateral", "curve"])
 RNG = np.random.default_rng(0)
 IMAGE = RNG.uniform(0.02, 0.9, (12, 20, 3))
 PICTURE = jnp.asarray(IMAGE, jnp.float32)
@@ -51,18 +49,6 @@ def test_the_identity_changes_nothing(kind):
             np.testing.assert_allclose(gs.enhanced(PICTURE, one), PICTURE, atol=1e-6)
     even = np.linspace(0, 1, gs.ENTRIES)
     np.testing.assert_allclose(gs.pseudo_curve(jnp.zeros(3)), even, atol=2.1e-3)
-
-
-@KINDS
-def test_gradients_match_finite_differences(kind):
-    with jax.enable_x64(True):
-        weight = jnp.asarray(RNG.normal(size=IMAGE.shape))
-
-        def f(parameters, ldr):
-            return jnp.sum(weight * corrected(ldr, parameters, kind))
-
-        at = (jnp.asarray(np.asarray(noisy(kind)), jnp.float64), jnp.asarray(IMAGE))
-        check_gradients(f, *at, step=1e-7, rel=1e-3)
 
 
 def test_a_bilateral_grid_is_sliced_trilinearly():
@@ -105,12 +91,12 @@ def test_a_correction_is_part_of_the_image_and_of_the_fitted_exposure():
 # ------------------------------------------------------- PPISP, as published, in numpy
 
 
-def some_view(seed=1, size=0.3, dtype=np.float32) -> ppisp.OneView:
+def some_view(seed=1, size=0.3) -> ppisp.OneView:
     rng = np.random.default_rng(seed)
     vignetting = rng.normal(0, 0.1 * size, (3, 5)) - [0, 0, 0.3, 0.3, 0.3]
     response = ppisp.identity_response() + rng.normal(0, size, (3, 4))
     values = (rng.normal(0, size) - 0.5, rng.normal(0, size, 8), response, vignetting)
-    return ppisp.OneView(*(jnp.asarray(v, dtype) for v in values))
+    return ppisp.OneView(*(jnp.asarray(v, jnp.float32) for v in values))
 
 
 def four_point_homography(targets):
@@ -205,14 +191,7 @@ def test_responses_rise_from_black_to_white(raw):
     assert np.all(np.diff(y[:, ::50], axis=1) > 0)
 
 
-def test_gradients_of_ppisp_match_and_are_finite_at_black_and_white():
-    with jax.enable_x64(True):
-        weight = jnp.asarray(RNG.normal(size=IMAGE.shape))
-
-        def f(view, linear):
-            return jnp.sum(weight * ppisp.applied(linear, view))
-
-        check_gradients(f, some_view(dtype=np.float64), jnp.asarray(IMAGE), step=1e-7)
+def test_gradients_of_ppisp_are_finite_at_black_and_white():
     image = jnp.asarray([[[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [3.0, 0.0, 1e-9]]], jnp.float32)
     slope = jax.jit(jax.grad(lambda v, x: jnp.sum(ppisp.applied(x, v)), (0, 1)))
     gradient = slope(some_view(2, 1.5), image)
@@ -355,19 +334,7 @@ def test_contrast_compares_with_the_brightened_photograph():
     assert float(contrast_loss(aligned, dark, half)) == pytest.approx(0, abs=1e-9)
 
 
-def test_gradients_of_luminance_gs_match_and_pass_nothing_else():
-    with jax.enable_x64(True):
-        at = learned(0.05, jnp.float64)
-        render = jnp.asarray(RNG.uniform(1.5, 2.0, IMAGE.shape))
-        cfg = LossConfig(dssim_weight=None, censored=False)  # D-SSIM moves the Gaussians only
-
-        def f(moved):
-            view = replace(at, **moved).view(1)
-            compared = enhanced_loss(render, jnp.asarray(IMAGE), jnp.asarray(MASK), view, cfg)
-            return compared + CURVE * curve_prior(view, jnp.asarray(IMAGE), jnp.asarray(MASK))
-
-        slopes = check_gradients(f, {n: getattr(at, n) for n in LEARNED}, floor=1e-9)
-        assert np.abs(slopes).min() > 1e-9
+def test_renders_teach_gaussians_alone_and_nothing_the_statistics():
     at = learned(0.05)
 
     def shown(parameters):

@@ -138,29 +138,6 @@ def test_vignetting_without_a_place_is_refused():
     assert develop(picture()[0], alone.without_place()).shape == (WIDTH, 3)
 
 
-@CONFIGS
-def test_gradients_against_finite_differences(cfg):
-    linear = jnp.asarray(picture(3))
-    weights = jnp.asarray(np.random.default_rng(1).normal(size=linear.shape), jnp.float32)
-
-    @jax.jit
-    def value(logs):
-        photometry = Photometry(logs[:2], logs[2:4], "log", logs[4:].reshape(2, 3), (1, 0))
-        taken = photometry.capture(1)
-        taken = taken if cfg.cameras else replace(taken, camera=None)
-        return jnp.mean(weights * formation(linear, taken, cfg))
-
-    at = jnp.asarray([0.1, 0.4, 0.05, -0.1, 0.0, 0.1, -0.1, 0.2, -0.1, 0.05], jnp.float32)
-    gradient, step = np.asarray(jax.grad(value)(at)), 1e-2
-    steps = step * jnp.eye(len(at))
-    numeric = [(value(at + s) - value(at - s)) / (2 * step) for s in steps]
-    np.testing.assert_allclose(gradient, np.asarray(numeric), atol=3e-4)
-    # The other view, and the mean over channels, which is the exposure's.
-    assert not np.any(gradient[[0, 2, 4, 5, 6]])
-    assert abs(gradient[7:].sum()) < 1e-6
-    assert np.abs(gradient[[1, 3, 7, 8]]).min() > 1e-4
-
-
 def test_what_is_not_modelled_leaves_the_trace():
     linear, row = jnp.asarray(picture()), jnp.int32(1)
     photometry = Photometry(jnp.zeros(3), jnp.zeros(3))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal, NamedTuple, cast
+from typing import Literal, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -63,7 +63,7 @@ def weigh(model: Forward, theta: Parameters, weight: PerChannel, loss: Loss) -> 
         factor, curvature = 1 / np.maximum(np.abs(u) / scale, 0.5), 1.0
     else:
         of = _whole_points if loss == "whole_points" else _geman_mcclure
-        of_observation, curvature = of(model, square, used / 3)
+        of_observation, curvature = of(square, used / 3, layout)
         factor = of_observation[:, None]
     weight = model.weight / sigma**2 * factor
     radiance, precision = _radiance(layout, a, z_of_point, weight)
@@ -73,7 +73,7 @@ def weigh(model: Forward, theta: Parameters, weight: PerChannel, loss: Loss) -> 
 
 
 def _geman_mcclure(
-    model: Forward, square: PerObservation, share: PerObservation
+    square: PerObservation, share: PerObservation, layout: Layout
 ) -> tuple[PerObservation, float]:
     """Return weights of squares in widths of the loss, and its mean curvature over them."""
     robust, second = _derivatives(square)
@@ -82,16 +82,14 @@ def _geman_mcclure(
 
 
 def _whole_points(
-    model: Forward, square: PerObservation, share: PerObservation
+    square: PerObservation, share: PerObservation, layout: Layout
 ) -> tuple[PerObservation, float]:
     """Return weights and curvature where every point has a spread of its own.
 
     Gloss and silhouettes make all that a point shows uncertain, and by different amounts. So the
     Geman-McClure losses of a point's observations are summed as the squares of Student's t are,
-    whose scale is the point's own: it counts the less, the more its views differ. Arguments as for
-    `_geman_mcclure`.
+    whose scale is the point's own: it counts the less, the more its views differ.
     """
-    layout = model.layout
     alone, curved = _derivatives(square)
     bound = GEMAN_MCCLURE**2
     losses = layout.by_row @ (share * bound * square / (1 + square))
@@ -150,11 +148,16 @@ def normal_equations(
     parts, right = [], []
     per_view = of_views(model, at)
     views = np.arange(u.views)
+
+    def of_each(values: PerChannel, channels: list[int]):
+        # Of nothing at all, numpy counts in integers.
+        return np.bincount(layout.views, values[:, channels].sum(1), u.views).astype(np.float64)
+
     for x, one in enumerate(per_view):
-        right.append(_per_view(layout, pull * one.derivative, one.channels))
+        right.append(of_each(pull * one.derivative, one.channels))
         for y, other in enumerate(per_view):
             if common := [c for c in one.channels if c in other.channels]:
-                values = _per_view(layout, w * one.derivative * other.derivative, common)
+                values = of_each(w * one.derivative * other.derivative, common)
                 parts.append(Entries(x * u.views + views, y * u.views + views, values))
     of_pairs = layout.pairs.sums(
         [(coupled * p.derivative)[:, p.channels] for p in per_view],
@@ -200,12 +203,6 @@ def others(model: Forward, theta: Parameters) -> Terms | None:
     if features is None or basis is None:
         return features or basis
     return features.joined(basis)
-
-
-def _per_view(layout: Layout, values: PerChannel, channels: list[int]):
-    # Of nothing at all, numpy counts in integers.
-    total = np.bincount(layout.views, values[:, channels].sum(1), layout.view_count)
-    return total.astype(np.float64)
 
 
 def _with_others(
@@ -272,7 +269,7 @@ def over_all(
     """Return columns for all parameters: those of views, then those of k and c, if any."""
     parts = [*per_view]
     if not u.gammas:  # a keeps its place
-        parts.append(sp.csr_array((cast(tuple[int, int], parts[0].shape)[0], u.views)))
+        parts.append(sp.csr_array((parts[0].shape[0], u.views)))  # pyright: ignore
     if more is not None:
         parts.append(sp.csr_array(more))
     return sp.csr_array(sp.hstack(parts))

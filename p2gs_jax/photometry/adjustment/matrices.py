@@ -21,7 +21,7 @@ def is_small(size: int) -> bool:
 
 
 class Entries(NamedTuple):
-    """PerChannel at places of a matrix; those at one place are summed."""
+    """Values at places of a matrix; those at one place are summed."""
 
     rows: Int[np.ndarray, " n"]
     columns: Int[np.ndarray, " n"]

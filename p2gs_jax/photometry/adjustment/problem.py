@@ -34,9 +34,9 @@ class Layout:
     def __init__(self, observations: Observations):
         points, places = np.asarray(observations.points), observations.positions
         self.views, self.view_count = np.asarray(observations.views), observations.view_count
-        self.cameras = np.asarray(observations.cameras)
-        known = places is not None
-        self.radius2 = (places.astype(float) ** 2).sum(1) if known else np.zeros(len(points))
+        self.cameras, self.radius2 = np.asarray(observations.cameras), np.zeros(len(points))
+        if places is not None:
+            self.radius2 = (places.astype(float) ** 2).sum(1)
         lengths = np.bincount(points, minlength=observations.point_count)
         used = lengths[lengths > 0]
         typical = int(np.quantile(used, 0.9)) if len(used) else 2

@@ -36,10 +36,7 @@ OnView = Callable[[int, int], object] | None
 def surface_colors(
     scene: Scene, store: ImageStore, seed: int, on_view: OnView = None
 ) -> Observations:
-    """Return colours of shared points: at the tracks, or of projected points where there are none.
-
-    `seed` is for `projected_colors`.
-    """
+    """Return colours of shared points: at the tracks, or of projected points where there are none."""
     if has_tracks(scene):
         return track_colors(scene, store, on_view)
     return projected_colors(scene, store, seed, on_view)
@@ -65,8 +62,7 @@ def projected_colors(
 ) -> Observations:
     """Sample a scene's points (LiDAR or others) in every training view that sees them.
 
-    The views are sampled at their training resolution; `seed` chooses among the points, and among
-    the views of a point.
+    The views have their training resolution; `seed` chooses among points, and views of a point.
     """
     rng = generator(seed, Stream.SURFACE_COLORS)
     chosen = np.arange(len(scene.points))
@@ -91,10 +87,9 @@ def rendered_colors(
     seed: int = 0,
     on_view: OnView = None,
 ) -> Observations:
-    """Warp pixels of each training view into the others through rendered depth.
+    """Warp pixels of each training view, chosen by `seed`, into the others through rendered depth.
 
-    Points that a view hides are left out by their depth. All Gaussians are alive; photographs
-    are sampled at the resolution of the fit, and `seed` chooses the pixels.
+    Points that a view hides are left out. Photographs are sampled at the resolution of the fit.
     """
     rng = generator(seed, Stream.RENDERED_PIXELS)
     render = make_renderer(cfg)

@@ -107,9 +107,8 @@ def point_colors(
     POSITION_DEVIATION.
     """
     wider, keep = _at_one_scale(scene, store, points)
-    nothing = np.zeros((0, 3), np.float32)
-    empty = np.zeros(0, int), np.zeros(0, int), nothing, nothing, nothing
-    parts: list[tuple[np.ndarray, ...]] = [(*empty, np.zeros((0, 2), np.float32))]
+    nothing, none = np.zeros((0, 3), np.float32), np.zeros(0, int)
+    parts: list[tuple[np.ndarray, ...]] = [(none, none, *[nothing] * 3, nothing[:, :2])]
     for row, (index, kept) in enumerate(zip(scene.train_indices, keep, strict=True)):
         mine = points[row][kept]
         if len(mine):
@@ -119,10 +118,8 @@ def point_colors(
             found = sample(ldr, mask, there, wider[row][kept])
             good = found.valid
             shown = (values[good] for values in found[:3])
-            at = there[good]
-            at_places = places(at, width, height).astype(np.float32)
-            labels = np.full(len(at), row), mine[good]
-            parts.append((*labels, *shown, at_places))
+            at = places(there[good], width, height).astype(np.float32)
+            parts.append((np.full(len(at), row), mine[good], *shown, at))
         if on_view is not None:
             on_view(row + 1, len(scene.train_indices))
     views, seen, colors, spread, brightest, positions = map(
