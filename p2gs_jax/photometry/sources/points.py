@@ -36,7 +36,7 @@ OnView = Callable[[int, int], object] | None
 def surface_colors(
     scene: Scene, store: ImageStore, seed: int, on_view: OnView = None
 ) -> Observations:
-    """Return colours of shared points: at the tracks, or of projected points where there are none."""
+    """Return colours at the tracks; where there are none, of points that `seed` draws."""
     if has_tracks(scene):
         return track_colors(scene, store, on_view)
     return projected_colors(scene, store, seed, on_view)
