@@ -6,8 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.interpolate import RegularGridInterpolator
 
 from p2gs_jax.config import LossConfig, PhotometryConfig
@@ -157,16 +155,8 @@ def test_a_view_has_its_own_exposure_and_its_cameras_response():
     assert parameters.mean("unknown").vignetting is None
 
 
-def three(size, largest):
-    """Draw three lists of numbers, which are mapped over at once."""
-    each = st.lists(st.floats(-largest, largest), min_size=size, max_size=size)
-    return st.lists(each, min_size=3, max_size=3)
-
-
-@settings(max_examples=30, deadline=None)
-@given(three(8, 2))
-def test_homographies_map_the_control_points_and_keep_intensity(parameters):
-    latent = jnp.asarray(parameters, jnp.float32)
+def test_homographies_map_the_control_points_and_keep_intensity():
+    latent = jnp.asarray(RNG.uniform(-2, 2, (90, 8)), jnp.float32)
     h = np.asarray(jax.vmap(ppisp.homography_of)(latent), float)
     moved = np.einsum("bij,kj->bki", h, ppisp.SOURCES)
     expected = ppisp.SOURCES[None, :, :2] + np.asarray(ppisp.offsets(latent))
@@ -178,12 +168,10 @@ def test_homographies_map_the_control_points_and_keep_intensity(parameters):
     np.testing.assert_allclose(np.asarray(colored).sum(-1), sums, rtol=1e-3)
 
 
-@settings(max_examples=30, deadline=None)
-@given(three(12, 4))
-def test_responses_rise_from_black_to_white(raw):
+def test_responses_rise_from_black_to_white():
     with jax.enable_x64(True):
         x = jnp.linspace(0.0, 1.0, 301, dtype=jnp.float64)[:, None] * jnp.ones(3)
-        many = jnp.asarray(raw, jnp.float64).reshape(3, 3, 4)
+        many = jnp.asarray(RNG.uniform(-4, 4, (90, 3, 4)))
         y = np.asarray(jax.vmap(ppisp.respond, in_axes=(None, 0))(x, many))
     np.testing.assert_array_equal(y[:, 0], 0)
     np.testing.assert_array_equal(y[:, -1], 1)
