@@ -21,6 +21,8 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 
 # From here on, programs of a finished file are forgotten; those wanted again come from disk.
 MOST_MEMORY_GB = 1.2
+# The cache is cut to this between sessions: JAX's own bound would look at every file at every write.
+MOST_CACHED_GB = 2.0
 
 
 def memory_gb() -> float:
@@ -29,6 +31,16 @@ def memory_gb() -> float:
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
         return pages * resource.getpagesize() / 1e9
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e9
+
+
+def pytest_sessionstart(session):
+    """Remove the programs that were compiled the longest ago."""
+    kept = 0.0
+    if not hasattr(session.config, "workerinput"):
+        for path in sorted(COMPILED.glob("*"), key=os.path.getmtime, reverse=True):
+            kept += path.stat().st_size / 1e9
+            if kept > MOST_CACHED_GB:
+                path.unlink(missing_ok=True)
 
 
 @pytest.fixture(scope="session", autouse=True)

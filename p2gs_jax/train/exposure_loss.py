@@ -123,14 +123,16 @@ def color_pairs(tracks: Observations | None, cfg: FitConfig) -> ColorPairs | Non
             fix="use --loss.relative-exposure.form literal_same_pose, or a scene with tracks",
         )
     first, second = sample_pairs(tracks, PAIR_POOL, cfg.train.seed)
-    placed = (first, second) if darkens(cfg.photometry) else ()
-    if placed and tracks.positions is None:
-        raise ValueError("vignetting is modelled, and nobody knows where in the images points lie")
+    places = ()
+    if darkens(cfg.photometry):
+        if tracks.positions is None:
+            raise ValueError("vignetting is modelled, and no places in the images are known")
+        places = (tracks.positions[first], tracks.positions[second])
     return ColorPairs(
         on_device(tracks.colors[first]),
         on_device(tracks.colors[second]),
         on_device(tracks.views[first], np.int32),
         on_device(tracks.views[second], np.int32),
         on_device(np.ones(len(first))),
-        *(on_device(tracks.positions[pick]) for pick in placed),
+        *map(on_device, places),
     )

@@ -5,6 +5,7 @@ All of it follows from the seed and the step number.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Hashable, Sequence
 from typing import NamedTuple, TypeVar
 
@@ -44,39 +45,23 @@ class TrainingViews:
     ):
         self.store, self.rows = store, tuple(rows)
         self.seed, self.measured = seed, measured
-        self._orders: dict[int, np.ndarray] = {}
-        self._per_epoch: dict[int, int] = {}
-        self._batched: tuple[int, int, list[tuple[int, ...]]] = (-1, 0, [])
+        self._batches = functools.lru_cache(4)(self._epoch)
 
     def __len__(self) -> int:
         return len(self.rows)
 
-    def index_at(self, step: int) -> int:
-        """Return the row in `Photometry` of the view of a step; every epoch is a permutation."""
-        epoch, position = divmod(step, len(self.rows))
-        if epoch not in self._orders:
-            self._orders = {epoch: view_order(self.seed, epoch, len(self.rows))}
-        return int(self._orders[epoch][position])
-
     def indices_at(self, step: int, count: int) -> tuple[int, ...]:
-        """Return the rows of the views that a step of `count` views takes; they have one size.
+        """Return the rows in `Photometry` of the views that a step of `count` views takes.
 
-        `step` counts the views taken before it.
+        They have images of one size. `step` counts the views taken before it.
         """
-        if count == 1:
-            return (self.index_at(step),)
-        if count not in self._per_epoch:
-            self._per_epoch[count] = len(self._batches(0, count))
-        epoch, position = divmod(step // count, self._per_epoch[count])
+        epoch, position = divmod(step // count, len(self._batches(0, count)))
         return self._batches(epoch, count)[position]
 
-    def _batches(self, epoch: int, count: int) -> list[tuple[int, ...]]:
-        if self._batched[:2] != (epoch, count):
-            views = [self.store.views[row] for row in self.rows]
-            kinds = [(v.width, v.height) for v in views]
-            order = view_order(self.seed, epoch, len(self.rows))
-            self._batched = (epoch, count, batches_of(order, kinds, count))
-        return self._batched[2]
+    def _epoch(self, epoch: int, count: int) -> list[tuple[int, ...]]:
+        views = [self.store.views[row] for row in self.rows]
+        kinds = [(v.width, v.height) for v in views]
+        return batches_of(view_order(self.seed, epoch, len(self.rows)), kinds, count)
 
     def partner_at(self, step: int, index: int) -> int:
         """Return a second view, different from that of the step where there are two."""

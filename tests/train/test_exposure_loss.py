@@ -120,8 +120,9 @@ def test_pairs_of_tracks_have_places_where_they_count():
     assert placed is not None
     of_i, of_j = (placed.colors_i, placed.positions_i), (placed.colors_j, placed.positions_j)
     for colors, positions in (of_i, of_j):
-        rows = [np.flatnonzero((observations.colors == c).all(1))[0] for c in np.asarray(colors)]
-        np.testing.assert_array_equal(positions, observations.positions[rows])
+        few = np.asarray(colors)[:count]
+        rows = [np.flatnonzero((observations.colors == c).all(1))[0] for c in few]
+        np.testing.assert_array_equal(positions[:count], observations.positions[rows])
     unplaced = dataclasses.replace(observations, positions=None)
-    with pytest.raises(ValueError, match="where in the images"):
+    with pytest.raises(ValueError, match="no places in the images"):
         color_pairs(unplaced, dataclasses.replace(cfg, photometry=SHADED))

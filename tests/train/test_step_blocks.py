@@ -17,7 +17,7 @@ from p2gs_jax.train.exposure_loss import Partner
 from p2gs_jax.train.image_gradient import image_loss
 from p2gs_jax.train.optimizer import learning_rates, make_optimizer
 from p2gs_jax.train.state import FAULT_NONE, FAULT_NONFINITE, FAULT_OVERFLOW, initial_state
-from p2gs_jax.train.step import Step
+from p2gs_jax.train.step import Step, per_gaussian
 from p2gs_jax.train.terms import loss_terms
 from p2gs_jax.train.update import Controls, finite_names
 from p2gs_jax.types import Batch, Camera, Gaussians, Params, Photometry
@@ -29,8 +29,9 @@ FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
 PHOTOMETRY = ("raw_exposures", "raw_gammas")
 
 
-def config(visible_only: bool) -> FitConfig:
-    fields = {
+CFG = with_values(
+    FitConfig(),
+    {
         "render.sh_degree": DEGREE,
         "render.pixels_in_flight": 2048,
         "densify.method": None,
@@ -38,9 +39,9 @@ def config(visible_only: bool) -> FitConfig:
         "loss.dssim_weight": None,
         # With an epsilon of about the gradient's size, updates are as smooth as the gradient.
         "optimizer.eps": 1e-5,
-        "optimizer.visible_only": visible_only,
-    }
-    return with_values(FitConfig(), fields)
+    },
+)
+CONTROLS = Controls(np.float32(PROGRESS), np.int32(DEGREE), np.float32(RATE), np.uint32(0))
 
 
 def start() -> Params:
@@ -70,53 +71,40 @@ def photograph() -> Batch:
 
 @pytest.fixture(scope="module")
 def made():
-    """Return one step of each kind from the same start, and the gradient it should follow."""
-    params, batch, partner = start(), photograph(), Partner(jnp.int32(0))
+    """Return steps from one start, with and without room, and the gradient they should follow."""
+    params, batch, optimizer = start(), photograph(), make_optimizer(CFG)
     # A tenth of the slots are empty.
     alive = jnp.arange(COUNT) % 10 != 0
-    controls = Controls(jnp.float32(PROGRESS), jnp.int32(DEGREE), jnp.float32(RATE), jnp.uint32(0))
-    cfg = config(True)
+    run, partner = Step(CFG, optimizer, EXTENT), Partner(jnp.int32(0))
 
-    def steps(cfg):
-        optimizer = make_optimizer(cfg)
-        run = Step(cfg, optimizer, EXTENT)
+    def step(room, params=params):
+        state = initial_state(params, alive, optimizer)
+        return run(state, batch, partner, CONTROLS, room=room, degree=DEGREE)
 
-        def step(room, params=params, alive=alive):
-            state = initial_state(params, alive, optimizer)
-            return run(state, batch, partner, controls, room=room, degree=DEGREE)
-
-        return step
-
-    @jax.jit
     def objective(params, probe):
-        splats, radiance = splat(params.gaussians, alive, batch.camera, cfg.render, DEGREE)
+        splats, radiance = splat(params.gaussians, alive, batch.camera, CFG.render, DEGREE)
         splats = dataclasses.replace(splats, means2d=splats.means2d + probe)
-        given = (batch, partner, cfg, loss_terms(cfg), 2**16)
+        given = (batch, partner, CFG, loss_terms(CFG), 2**16)
         return image_loss((splats, radiance), params.photometry, None, *given)[0]
 
-    loss, (gradient, probe) = jax.value_and_grad(objective, argnums=(0, 1))(
-        params, jnp.zeros((COUNT, 2))
-    )
-    seen = np.asarray(in_view(params.gaussians, alive, batch.camera, cfg.render))
-    selective = steps(cfg)
+    slope = jax.jit(jax.value_and_grad(objective, argnums=(0, 1)))
+    loss, (gradient, probe) = jax.device_get(slope(params, jnp.zeros((COUNT, 2))))
     tight = Room(64, BLOCK)
-    refused = selective(tight)
+    refused = step(tight)
     fault = refused[0].fault
     room = tight.grown(int(fault.needed), int(fault.visible))
     return SimpleNamespace(
         params=params,
         alive=np.asarray(alive),
-        seen=seen,
-        cfg=cfg,
-        gradient=jax.tree.map(np.asarray, gradient),
-        probe=np.asarray(probe),
+        seen=np.asarray(in_view(params.gaussians, alive, batch.camera, CFG.render)),
+        gradient=gradient,
+        probe=probe,
         loss=float(loss),
         tight=tight,
         refused=refused,
         room=room,
-        selective=selective,
-        after=selective(room),
-        everyone=steps(config(False))(room),
+        step=step,
+        after=step(room),
     )
 
 
@@ -128,13 +116,13 @@ def wide(made):
         narrow = jax.tree.map(np.asarray, tree)
         return jax.tree.map(lambda a: a.astype(np.float64) if a.dtype.kind == "f" else a, narrow)
 
-    optimizer = make_optimizer(made.cfg)
+    optimizer = make_optimizer(CFG)
     state = widened(initial_state(made.params, made.alive, optimizer))
     controls = Controls(np.float64(PROGRESS), np.int32(DEGREE), np.float64(RATE), np.uint32(0))
     given = widened((photograph(), Partner(np.int32(0))))
     with jax.enable_x64(True):
         state = jax.tree.map(jnp.asarray, state)
-        step = Step(made.cfg, optimizer, EXTENT)
+        step = Step(CFG, optimizer, EXTENT)
         return jax.device_get(step(state, *given, controls, room=made.room, degree=DEGREE))
 
 
@@ -142,17 +130,16 @@ def rows_of(tree, name, rows):
     return np.asarray(getattr(tree, name))[rows]
 
 
-@pytest.mark.parametrize("which", ["after", "everyone"])
-def test_one_step_is_an_adam_update_of_the_gradient_of_the_loss(made, which):
-    state, report = getattr(made, which)
+def test_one_step_is_an_adam_update_of_the_gradient_of_the_loss(made):
+    state, report = made.after
     assert int(state.fault.kind) == FAULT_NONE
     assert int(state.step) == 1
     assert float(report.loss) == pytest.approx(made.loss, rel=1e-6)
-    assert int(report.visible) == (made.seen.sum() if which == "after" else COUNT)
+    assert int(report.visible) == made.seen.sum()
     rates = learning_rates(
-        jnp.float32(PROGRESS), jnp.float32(RATE), EXTENT, made.params, made.cfg, (DEGREE + 1) ** 2
+        jnp.float32(PROGRESS), jnp.float32(RATE), EXTENT, made.params, CFG, (DEGREE + 1) ** 2
     )
-    o = made.cfg.optimizer
+    o = CFG.optimizer
     adam = optax.scale_by_adam(o.b1, o.b2, o.eps)
     updates, _ = adam.update(made.gradient, adam.init(made.params))
     moments = state.opt_state.gaussians
@@ -205,6 +192,16 @@ def test_out_of_view_nothing_is_touched(made):
     np.testing.assert_array_equal(moments.counts, made.seen.astype(np.int32))
 
 
+def test_where_every_gaussian_moves_all_are_listed(made):
+    cfg = with_values(CFG, {"optimizer.visible_only": False})
+    step, room, state = Step(cfg, make_optimizer(cfg), EXTENT), made.room, made.after[0]
+    listed = step.program("show", room, DEGREE)(
+        *per_gaussian(state, step.frustum(photograph()), CONTROLS)
+    )
+    assert int(listed.visible) == COUNT
+    np.testing.assert_array_equal(listed.ids, np.minimum(np.arange(len(listed.ids)), COUNT))
+
+
 def test_the_statistic_is_the_screen_space_gradient(made):
     state, _ = made.after
     norm = np.linalg.norm(made.probe * [WIDTH / 2, HEIGHT / 2], axis=1)
@@ -221,7 +218,7 @@ def same(a, b):
 
 def test_a_view_without_room_changes_nothing_but_the_fault(made):
     state, report = made.refused
-    fresh = initial_state(made.params, jnp.asarray(made.alive), make_optimizer(made.cfg))
+    fresh = initial_state(made.params, jnp.asarray(made.alive), make_optimizer(CFG))
     same(dataclasses.replace(state, fault=fresh.fault), fresh)
     assert int(state.fault.kind) == FAULT_OVERFLOW
     assert int(state.fault.visible) == made.seen.sum() > made.tight.visible
@@ -243,13 +240,13 @@ def test_what_is_no_number_is_named(made, field, named):
     gaussians = made.params.gaussians
     changed = {field: getattr(gaussians, field).at[row].set(jnp.nan)}
     params = dataclasses.replace(made.params, gaussians=dataclasses.replace(gaussians, **changed))
-    state, report = made.selective(made.room, params)
+    state, report = made.step(made.room, params)
     assert int(state.fault.kind) == FAULT_NONFINITE
     assert int(state.step) == 0
     names = finite_names(report.terms, state.params)
     assert names[int(state.fault.term)].startswith(named)
     if field == "sh":
-        fresh = initial_state(params, jnp.asarray(made.alive), make_optimizer(made.cfg))
+        fresh = initial_state(params, jnp.asarray(made.alive), make_optimizer(CFG))
         same(dataclasses.replace(state, fault=fresh.fault), fresh)
 
 
@@ -257,7 +254,7 @@ def test_the_first_term_that_is_no_number_is_named(made):
     """The exposure of another view than the step's: only the mean over all views knows it."""
     photometry = Photometry(jnp.array([jnp.nan, -0.1]), made.params.photometry.raw_gammas)
     params = dataclasses.replace(made.params, photometry=photometry)
-    state, report = made.selective(made.room, params)
+    state, report = made.step(made.room, params)
     assert int(state.fault.kind) == FAULT_NONFINITE
     names = finite_names(report.terms, state.params)
     assert names[int(state.fault.term)] == "loss term log_exposure_mean"
