@@ -21,7 +21,7 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 
 # From here on, programs of a finished file are forgotten; those wanted again come from disk.
 MOST_MEMORY_GB = 1.2
-# The cache is cut to this between sessions: JAX's own bound would look at every file at every write.
+# The cache is cut to this between sessions: JAX's own bound looks at every file at every write.
 MOST_CACHED_GB = 2.0
 
 
