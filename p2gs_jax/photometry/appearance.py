@@ -125,13 +125,10 @@ def _curve(ldr: Float[Array, "h w 3"], raw: Float[Array, " k"]) -> Float[Array, 
 
 
 def _bilateral(ldr: Float[Array, "h w 3"], grid: Float[Array, "12 d y x"]) -> Float[Array, "h w 3"]:
-    """Slice by matrix products and hat functions: dense, so that its gradient is as well.
-
-    The coefficients lie innermost: a third of the time of the grid's own order.
-    """
+    """Slice by matrix products and hat functions: dense, so that its gradient is as well."""
     height, width, _ = ldr.shape
     levels, rows, columns = grid.shape[1:]
-    # y, x, level, coefficient.
+    # y, x, level, coefficient: a third of the time of the grid's own order.
     cells = grid.transpose(2, 3, 1, 0).reshape(rows, -1)
     up = (jnp.asarray(_hats(height, rows), ldr.dtype) @ cells).reshape(height, columns, -1)
     up = jnp.einsum("wx,hxk->hwk", jnp.asarray(_hats(width, columns), ldr.dtype), up)

@@ -75,10 +75,8 @@ class Selection:
 def options_of(cfg: FitConfig, scene: Scene) -> CalibrationOptions:
     """Return the options of a fit to a scene, whose training views are the ones observed.
 
-    With `photometry.select` off, the model and curve of `cfg` are solved as they are.
-
-    Raises:
-        UserError: the known exposures cannot be read.
+    With `photometry.select` off, the model and curve of `cfg` are solved as they are. Raises
+    UserError: the known exposures cannot be read.
     """
     p = cfg.photometry
     known = None
@@ -115,10 +113,7 @@ def calibrate_observations(
     options: CalibrationOptions,
     on_chosen: OnChosen = lambda form, response: None,
 ) -> Selection:
-    """Choose the photometric model and solve it.
-
-    `on_chosen` receives a choice by held-out colours before it is solved on all observations.
-    """
+    """Choose the model and solve it; `on_chosen` is told of a choice by held-out colours first."""
     if options.choice == "held_out":
         selection = _chosen(observations, options, on_chosen)
     elif options.choice == "one_response":

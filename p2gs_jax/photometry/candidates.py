@@ -81,12 +81,9 @@ class Candidate:
 
 
 def choose(candidates: list[Candidate]) -> Candidate:
-    """Return the simplest candidate that is not clearly worse than the best.
-
-    Of those as simple, or simpler, the one that predicts best: curves cost nothing within a
-    form.
-    """
+    """Return the simplest candidate that is not clearly worse than the best."""
     simplest = min((c for c in candidates if c.good), key=lambda c: c.parameters)
+    # Curves cost nothing within a form.
     as_simple = [c for c in candidates if c.parameters <= simplest.parameters]
     return max(as_simple, key=lambda c: c.density)
 
@@ -122,10 +119,7 @@ class Search:
         self._scope = Scope(cameras, o.positions is not None, told, known)
 
     def first(self) -> list[str]:
-        """Solve models under curves, and exposures with what cameras may do besides.
-
-        What the user should know of curves left out is returned.
-        """
+        """Solve models under curves, and what cameras may do; say which curves were left out."""
         curves = [*(Curve(base) for base in BASES), Curve("srgb", "all")]
         self._try(Choice(Form(model), curve) for curve in curves for model in MODELS)
         richest = Form("view_exposure", "view", "camera" if self._scope.places else None)

@@ -104,8 +104,7 @@ class DisplayTransform:
     def with_curve(self, curve: Curve) -> DisplayTransform:
         """Return the transform under another base curve; a correction belongs to the old one.
 
-        Raises:
-            ValueError: `spline` where the run has none.
+        Raises ValueError: `spline` where the run has none.
         """
         if curve == self.formation.curve:
             return self
@@ -151,10 +150,7 @@ def _undevelop(ldr, capture, positions, cfg: PhotometryConfig):
 
 
 def display_of_view(params: Params, row: int, cfg: PhotometryConfig) -> DisplayTransform:
-    """Return how the training view in a row of `Photometry` was taken.
-
-    If the small arrays of `params` are on the host, this compiles nothing.
-    """
+    """Return how the training view in a row was taken; compiles nothing of host arrays."""
     taken = jax.tree.map(np.asarray, params.photometry).capture(row)
     plain = DisplayTransform(1.0, 1.0, cfg, correction_of(params.appearance, row))
     return with_capture(plain, taken)

@@ -94,10 +94,7 @@ def places(xy: Values, width: int, height: int) -> Values:
 def log_vignetting(
     squared: Values, camera: Int[Array, "..."] | int, cfg: PhotometryConfig
 ) -> Values:
-    """Return log V at r^2 of any shape, with an axis of one or three channels appended.
-
-    `camera` is a row in `cfg.cameras`, or -1: one for all, or one each.
-    """
+    """Return log V at r^2, with an axis of one or three channels appended, of a row or of each."""
     xp = namespace(squared, camera)
     k = xp.asarray(vignetting_table(cfg))[camera]
     s = squared[..., None]
@@ -117,10 +114,8 @@ def gain(
 ) -> Any:
     """Return e W V: exposed radiance over radiance (paper, eq. 4: e), to broadcast against it.
 
-    `capture` is of the view, or of each of loose pixels; these have `positions`, or none.
-
-    Raises:
-        ValueError: vignetting is modelled, and nobody knows where in the image the pixels lie.
+    `capture` is of the view, or of each of loose pixels; these have `positions`, or none. Raises
+    ValueError: vignetting is modelled, and nobody knows where in the image the pixels lie.
     """
     e = _by_pixel(capture.exposure)
     logs: Any = capture.white_balance
@@ -172,10 +167,7 @@ def tone_map(
 def inverse_tone_map(
     ldr: Values, gamma: Scalar, cfg: PhotometryConfig, camera: CameraRow = None
 ) -> Values:
-    """Return the exposed radiance e L of display values, by the arguments of `tone_map`.
-
-    Values below half a code count as that.
-    """
+    """Return the exposed radiance e L of display values; those below half a code count as that."""
     xp = namespace(ldr, gamma)
     y = xp.maximum(ldr, DARKEST)
     if cfg.curve == "power" and cfg.pivot == 1.0:
@@ -221,10 +213,7 @@ def formation(
 def inverse_formation(
     ldr: Values, capture: Capture, cfg: PhotometryConfig, positions: Positions = None
 ) -> Values:
-    """Return the radiance of display values: the inverse of `formation` below saturation.
-
-    Values below half a code count as that; corrections are not undone.
-    """
+    """Return the radiance of display values: the inverse of `formation` without corrections."""
     exposed = inverse_tone_map(ldr, _by_pixel(capture.gamma), cfg, capture.camera)
     return exposed / gain(ldr.shape, capture, cfg, positions)
 

@@ -89,9 +89,8 @@ def identity(views: int) -> Luminance:
 def axes_of(raw: Float[Array, " 5"]) -> Float[Array, "3 3"]:
     """Return three orthonormal axes as rows: the identity at zero, as their authors build them.
 
-    Args:
-        raw: three numbers beside (1, 0, 0), then the green and blue parts of the second axis
-            beside (1, 0); its red part makes it orthogonal to the first.
+    `raw` is added to (1, 0, 0), and to the green and blue parts (1, 0) of the second axis, whose
+    red part makes it orthogonal to the first.
     """
     first = raw[:3] + jnp.array([1.0, 0.0, 0.0], raw.dtype)
     green, blue = raw[3] + 1.0, raw[4]

@@ -243,10 +243,8 @@ def _fitted(
 
 
 def adapted(exposures_ev: Float[np.ndarray, " f"], frames: float) -> Float[np.ndarray, " f"]:
-    """Return exposures in stops that follow those metered slowly, to 1/e in so many frames.
-
-    An exponential filter to both sides, so that a path played backwards looks the same.
-    """
+    """Return exposures in stops that follow those metered slowly, to 1/e in so many frames."""
+    # To both sides, so that a path played backwards looks the same.
     count = len(exposures_ev)
     away = np.abs(np.arange(count)[:, None] - np.arange(count))
     weight = np.exp(-away / max(frames, 1e-6))

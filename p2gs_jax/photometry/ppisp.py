@@ -167,12 +167,8 @@ def respond(light: Float[Array, "... 3"], raw: Float[Array, "3 4"]) -> Float[Arr
     """Return display values of light; 0 stays 0, 1 stays 1, and what lies beyond is clipped.
 
     y = a (x / c)^t up to the centre c and 1 - (1 - a) ((1 - x) / (1 - c))^s beyond it, to the power
-    of g; a gives both parts the same slope at c.
-
-    Args:
-        light: exposed, after the corrections of colour.
-        raw: of each channel, before softplus (toe t >= 0.3, shoulder s >= 0.3, gamma g >= 0.1) and
-            sigmoid (centre c).
+    of g; a gives both parts the same slope at c. `raw` has, for each channel, what softplus (toe
+    t >= 0.3, shoulder s >= 0.3, gamma g >= 0.1) and a sigmoid (centre c) take.
     """
     toe = LEAST_TOE + jax.nn.softplus(raw[:, 0])
     shoulder = LEAST_SHOULDER + jax.nn.softplus(raw[:, 1])

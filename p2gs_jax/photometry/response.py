@@ -180,10 +180,7 @@ def tables(cfg: PhotometryConfig) -> Tables:
     """Return the tables of all responses.
 
     With responses per camera there are rows for each, in order, and at the end for an unknown one:
-    the spline of all cameras, or else the mean of those there are.
-
-    Raises:
-        ValueError: there is no spline.
+    the spline of all cameras, or else the mean. Raises ValueError: there is no spline.
     """
     if cfg.spline is None and not by_camera(cfg):
         raise ValueError("the curve 'spline' needs the values of its spline")
@@ -241,10 +238,7 @@ def encode(log_linear: Values, cfg: PhotometryConfig, camera=None) -> Values:
 
 
 def decode(y: Values, cfg: PhotometryConfig, camera=None) -> Values:
-    """Return log exposed radiance of display values, by tables as for `encode`.
-
-    Values beyond a table count as its ends.
-    """
+    """Return log exposed radiance, by tables as for `encode`; beyond them it is that of the ends."""
     xp, table = namespace(y, camera), tables(cfg)
     if not by_camera(cfg):
         logs = table.first[0] + table.step[0] * np.arange(TABLE)

@@ -114,11 +114,7 @@ class Agreement(NamedTuple):
 
 
 def compare(exposures_ev: PerView, errors_ev: PerView, stated_ev: PerView) -> Agreement:
-    """Compare recovered with stated exposures, in stops.
-
-    Errors are inf where unknown; stated exposures hold up to a constant, and are NaN where
-    unknown.
-    """
+    """Compare recovered exposures, stops, with stated ones: NaN where unknown; errors then inf."""
     both = np.isfinite(stated_ev) & np.isfinite(errors_ev)
     gap = np.full(len(exposures_ev), np.nan)
     count = int(both.sum())

@@ -249,10 +249,7 @@ def at_places(
 def summed(
     model: Forward, theta: Parameters, at: Weighted, values: PerChannel, places: Labels
 ) -> sp.csr_array:
-    """Return sums over places of values times derivatives by all parameters: (places, d).
-
-    For the pull of observations, weight times residual, these are the scores of clusters.
-    """
+    """Return sums over places of values (for scores: weight times residual) times derivatives."""
     layout, u = model.layout, model.unknowns
     count = int(places.max(initial=-1)) + 1
     totals = [(values * p.derivative)[:, p.channels].sum(1) for p in of_views(model, at)]

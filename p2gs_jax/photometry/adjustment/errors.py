@@ -138,11 +138,7 @@ def _drawn(bread, gauges, each, system: System) -> Float[np.ndarray, "d r"]:
 def regions(
     positions: Float[np.ndarray, "n 2"], views: Int[np.ndarray, " n"], side: float
 ) -> Int[np.ndarray, " n"]:
-    """Return labels 0, 1, ... of the regions of images (`views`) that positions lie in.
-
-    Positions are from the image's centre in units of half its diagonal, as is the side of a
-    region.
-    """
+    """Return labels 0, 1, ... of the regions of images (`views`), with sides in half diagonals."""
     x, y = np.floor((positions + 1) / side).astype(np.int64).T
     across = int(np.ceil(2 / side)) + 1
     return np.unique((views * np.int64(across) + x) * across + y, return_inverse=True)[1]

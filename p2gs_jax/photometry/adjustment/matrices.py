@@ -91,11 +91,7 @@ class Terms:
 
 
 class Pairs:
-    """Every pair of observations of a row once, each with itself included.
-
-    Entries of the sums exist only where two views share a point: with thousands of views, those
-    are few of all.
-    """
+    """Every pair of observations of a row once, each with itself: few of all pairs of views."""
 
     def __init__(self, row: Int[np.ndarray, " o"], views: Int[np.ndarray, " o"], view_count: int):
         # Sorted by row, the two of a pair lie close together.

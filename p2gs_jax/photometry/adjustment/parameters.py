@@ -297,10 +297,7 @@ class System(NamedTuple):
 
 
 def make_system(problem: Problem, form: Form, splines: ResponseKind | None = None) -> System:
-    """Return free directions, gauges and priors of a form.
-
-    `splines` says what gets a spline that is solved for (None: nothing).
-    """
+    """Return free directions, gauges and priors; `splines` is what has one that is solved for."""
     cameras, views = problem.observations.cameras, problem.observations.view_count
     camera_count = int(cameras.max(initial=0)) + 1
     model = MODELS[form.model]

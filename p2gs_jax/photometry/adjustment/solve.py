@@ -59,10 +59,7 @@ def one_thread():
 
 
 class Balanced:
-    """A symmetric matrix over its free directions (columns of `basis`), its diagonal scaled to 1.
-
-    Outer products of few rows, the gauges, are added to it.
-    """
+    """A matrix plus products of few rows, over its free directions (`basis`), its diagonal 1."""
 
     def __init__(self, normal: Matrix, gauges: sp.csr_array, basis: sp.csr_array):
         reduced, held = basis.T @ normal @ basis, sp.csr_array(gauges @ basis)

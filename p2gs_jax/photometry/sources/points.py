@@ -124,10 +124,7 @@ def _sampled_where_seen(
     kept: Bool[np.ndarray, "v c"],
     on_view: OnView,
 ) -> Observations:
-    """Sample chosen points (c rows) where they are in the training views that keep them.
-
-    `where` is their position in each view, (c, 2), at full resolution.
-    """
+    """Sample chosen points in the views that keep them, where they are at full resolution."""
     picks = [np.flatnonzero(row) for row in kept]
     points = [chosen[pick] for pick in picks]
     xy = [where[row][pick] for row, pick in enumerate(picks)]

@@ -53,8 +53,7 @@ class StackColors(NamedTuple):
 def read_stack(folder: Path) -> Stack:
     """Read the photographs of a folder (or of its `images/`).
 
-    Raises:
-        UserError: fewer than two photographs, unreadable ones, or different sizes.
+    Raises UserError: fewer than two photographs, unreadable ones, or different sizes.
     """
     if not folder.is_dir():
         raise UserError(f"{folder} is not a folder.", fix="name the folder of the photographs")
