@@ -238,7 +238,7 @@ def encode(log_linear: Values, cfg: PhotometryConfig, camera=None) -> Values:
 
 
 def decode(y: Values, cfg: PhotometryConfig, camera=None) -> Values:
-    """Return log exposed radiance, by tables as for `encode`; beyond them it is that of the ends."""
+    """Return log exposed radiance, by tables as for `encode`, whose ends hold beyond them."""
     xp, table = namespace(y, camera), tables(cfg)
     if not by_camera(cfg):
         logs = table.first[0] + table.step[0] * np.arange(TABLE)
