@@ -45,7 +45,6 @@ SceneFormat = Literal[
     "images",
 ]
 # How structure from motion finds poses, and which photographs it matches with which.
-Mapper = Literal["incremental", "global"]
 Matching = Literal["auto", "all", "sequence"]
 # What the alpha channel of photographs means.
 AlphaUse = Literal["background", "mask", "ignore"]
@@ -91,9 +90,6 @@ class DataConfig:
     """Take every n-th frame of a video; None takes sharp ones, each from a new place."""
     max_frames: int = 150
     """Most frames of a video that are used; more are thinned evenly."""
-    mapper: Mapper = "incremental"
-    """Structure from motion: COLMAP's incremental mapper, or its global one (GLOMAP), which is
-    faster for many photographs and needs more matches."""
     matching: Matching = "auto"
     """Which photographs are matched: all pairs, or neighbours in the order of their names
     (`sequence`); `auto`: all pairs of up to 60, else neighbours, and for videos a sequence."""

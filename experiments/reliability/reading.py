@@ -9,10 +9,6 @@ import numpy as np
 from reliability.trials import NONSENSE, REFUSED
 
 # Everything that reading needs, so that a forked child imports nothing.
-import p2gs_jax.cli.parser
-import p2gs_jax.cli.tables
-import p2gs_jax.scene.sfm.map
-import p2gs_jax.scene.sfm.triangulate  # noqa: F401
 from p2gs_jax.cli import main
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.text import printable

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import tyro
 
-from p2gs_jax.cli.shared import check, count_of
+from p2gs_jax.cli.shared import count_of
 from p2gs_jax.config import DataConfig
 
 if TYPE_CHECKING:
@@ -25,39 +25,23 @@ class Survey:
     Reads every format that can be fitted. Structure from motion is not started.
 
         p2gs-jax scene drive
-        p2gs-jax scene drive --cameras front front_left --frames 0:40 --out plan.png
+        p2gs-jax scene drive --cameras front front_left --frames 0:40
     """
 
     SHORT_NAMES: ClassVar = ("drive", "cameras", "frames")
     scene: Annotated[Path, tyro.conf.Positional]
     """What a fit could be given."""
-    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Draw the scene from above into this PNG: cameras and what they see, points, boxes."""
     data: DataConfig = field(default_factory=DataConfig)
 
     def execute(self) -> int:
-        """Print what there is, and draw it."""
+        """Print what there is."""
         from p2gs_jax.cli.tables import stdout
         from p2gs_jax.core.progress import TerminalReporter
-        from p2gs_jax.scene.survey import draw_plan, survey
+        from p2gs_jax.scene.survey import survey
 
-        out = self.out
-        check(
-            out is None or out.suffix.lower() == ".png",
-            f"--out {out}: only PNG is drawn",
-            fix="name it NAME.png",
-        )
         with TerminalReporter() as reporter:
             reporter.stage("Reading the scene")
             found = survey(self.scene, self.data, reporter.message)
-            if out is not None:
-                check(
-                    found.scene is not None,
-                    f"{self.scene} holds photographs alone: where they were taken is not known",
-                    fix="leave out --out; a fit finds their cameras",
-                )
-                reporter.stage("Drawing")
-                draw_plan(out, found)
         console = stdout()
         console.print(_head(found), soft_wrap=True)
         console.print(_cameras(found))
@@ -65,8 +49,6 @@ class Survey:
         notes = () if found.scene is None else found.scene.notes
         for line in (*_measurements(found), *lacks, *notes):
             console.print(line, soft_wrap=True)
-        if out is not None:
-            console.print(f"From above: {out}", soft_wrap=True)
         return 0
 
 
@@ -84,7 +66,7 @@ def _head(found: surveys.Survey) -> str:
     if found.seconds is not None:
         text += f", {found.seconds:.1f} s"
     if found.way is not None:
-        text += f", {found.way:.1f} {found.unit} driven"
+        text += f", {found.way:.1f} m driven"
     return text + "."
 
 

@@ -39,7 +39,6 @@ class Stream(IntEnum):
     RENDERED_PIXELS = 43  # pixels of a fit that are looked for in other views
     LIDAR = 53  # laser measurements that are kept
     MEASURED_DEPTHS = 59  # laser measurements that a view is compared with
-    PLAN_POINTS = 61  # points that a plan from above shows
     RANDOM_SEEDS = 67  # seeds of scenes without points and matches
     BACKDROP = 71  # what a step composites a photograph with alpha over
     VIBRATING = 73  # laser points that start as Gaussians that vibrate

@@ -33,7 +33,7 @@ from p2gs_jax.render.harmonics import MAX_DEGREE
 from p2gs_jax.render.project import at_time
 from p2gs_jax.run.photometry_files import write_appearance
 from p2gs_jax.run.read import Run
-from p2gs_jax.scene.convert.headers import read_exif_settings
+from p2gs_jax.scene.convert.readers import read_exif_settings
 from p2gs_jax.scene.pixels.store import camera_of
 from p2gs_jax.types import Gaussians
 

@@ -8,15 +8,14 @@ from typing import NamedTuple
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError, broken
-from p2gs_jax.scene.cache import Report
 from p2gs_jax.scene.colmap import find_model, load_colmap
 from p2gs_jax.scene.convert.convert import convert_photographs, converted_views, with_originals
-from p2gs_jax.scene.convert.headers import read_exif_ev
 from p2gs_jax.scene.convert.icc import colour_notes
+from p2gs_jax.scene.convert.readers import read_exif_ev
 from p2gs_jax.scene.drives import read_drive
 from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.drives.recording import Recording
-from p2gs_jax.scene.files import image_size, list_images
+from p2gs_jax.scene.files import Report, image_size, list_images
 from p2gs_jax.scene.masks import attach_masks, with_alpha
 from p2gs_jax.scene.pixels.store import ImageStore, camera_at, size_at
 from p2gs_jax.scene.seeds import FEWEST, with_random_seeds
@@ -71,7 +70,7 @@ def load_scene(
     scene = converted_views(with_what_lies_beside(scene, cfg), work_dir, report)
     scene = with_alpha(scene, cfg)
     if len(scene.points) == 0:
-        from p2gs_jax.scene.sfm.triangulate import triangulate
+        from p2gs_jax.scene.sfm.map import triangulate
 
         # Where somebody says what is held out, it gives no seeds either.
         scene = triangulate(scene, work_dir, report, only_training=listed)

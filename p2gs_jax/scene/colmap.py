@@ -21,15 +21,24 @@ from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError, broken
-from p2gs_jax.scene.files import HUGE, at_file_size, check_missing, image_folder, require_inside
+from p2gs_jax.scene.files import (
+    HUGE,
+    at_file_size,
+    check_missing,
+    image_folder,
+    require_inside,
+    rescaled,
+)
 from p2gs_jax.scene.lens import intrinsics, make_distortion, undistort_points
 from p2gs_jax.types import Distortion, Scene, Tracks, View
 
 _FIX = "export the model again from COLMAP"
 _FIX_FILES = "copy the model again from where it was made, or export it again from COLMAP"
-_LARGEST_ID = 2**63 - 1
+_LENGTH = struct.Struct("<Q")
 _STEMS = ("cameras", "images", "points3D")
-_POINT = np.dtype([("id", np.int64), ("xyz", np.float64, 3), ("rgb", np.uint8, 3)])
+_POINT = np.dtype([("id", "<i8"), ("xyz", "<f8", 3), ("rgb", "u1", 3)])
+# Behind a point its error, and how many observations of 8 bytes follow.
+_POINT_BYTES, _LENGTH_AT = 51, 43
 _KEYPOINT = np.dtype([("xy", "<f8", 2), ("id", "<i8")])
 # Number of parameters and of focal lengths among them, in the order of COLMAP's model ids; 0: the
 # model is not supported.
@@ -75,14 +84,13 @@ def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
     uses = Counter(image.camera_id for image in images)
     # A model with one camera per image does not identify the same ones.
     alone = len(uses) > 1 and max(uses.values()) == 1
-    views, resized = [], []
+    views, resized = [], 0
     for image in images:
         camera, path = model.cameras[image.camera_id], place / image.name
         K, distortion = _lens(model.file("cameras"), camera)
         size = (camera.width, camera.height)
         K, width, height = at_file_size(path, K, size, model.file("cameras"))
-        if (width, height) != size:
-            resized.append(f"{width}x{height} instead of {camera.width}x{camera.height}")
+        resized += (width, height) != size
         name = subfolder(image.name) or ("0" if alone else str(image.camera_id))
         finite = (np.abs([*image.qvec, *image.tvec]) < HUGE).all()
         norm = np.linalg.norm(image.qvec) if finite else 0.0
@@ -94,9 +102,7 @@ def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
         viewmat[:3, 3] = image.tvec
         pose = viewmat.astype(np.float32)
         views.append(View(image.name, path, name, pose, K, width, height, distortion))
-    if resized:
-        note = f"{len(resized)} images have another size than their camera (the first: "
-        notes.append(f"{note}{resized[0]}): intrinsics were rescaled")
+    notes += rescaled(resized, model.file("cameras").name)
     others = sorted(p.name for p in folder.parent.iterdir() if p != folder and is_model(p))
     if folder.name == "0" and others:
         notes.append(f"used the model {folder}; beside it lie {', '.join(others)}, not used")
@@ -249,7 +255,7 @@ def read_model(folder: Path) -> Model:
     text = (_text_cameras, _text_images, _text_points)
     binary = (_binary_cameras, _binary_images, _binary_points)
     cameras, images, points = binary if ext == "bin" else text
-    rows = np.fromiter(((n, tuple(xyz), tuple(rgb)) for n, xyz, rgb in points(paths[2])), _POINT)
+    rows = points(paths[2])
     rows = rows[np.argsort(rows["id"], kind="stable")]
     ids, xyz, rgb = (np.ascontiguousarray(rows[name]) for name in ("id", "xyz", "rgb"))
     return Model(folder, ext, cameras(paths[0]), tuple(images(paths[1])), ids, xyz, rgb)
@@ -317,19 +323,22 @@ def _binary_images(path: Path) -> Iterator[ImageRecord]:
         yield _image(name, camera_id, pose, keypoints["xy"], keypoints["id"])
 
 
-def _binary_points(path: Path) -> Iterator[tuple]:
+def _binary_points(path: Path) -> np.ndarray:
     cursor = _Cursor(path)
-    for _ in range(cursor.count(51)):
-        point_id, *rest = cursor.unpack("<q3d3Bd")
-        cursor.skip(8 * cursor.count(8))  # tracks: the images file has them too
-        yield point_id, rest[:3], rest[3:6]
+    starts = np.empty(cursor.count(_POINT_BYTES), np.int64)
+    for k in range(len(starts)):
+        start = starts[k] = cursor.skip(_POINT_BYTES)
+        (length,) = _LENGTH.unpack_from(cursor.data, start + _LENGTH_AT)
+        cursor.skip(8 * length)  # tracks: the images file has them too
+    records = np.frombuffer(cursor.data, np.uint8)[starts[:, None] + np.arange(_POINT.itemsize)]
+    return records.view(_POINT)[:, 0]
 
 
 @contextmanager
 def _parsing(path: Path, line: int) -> Iterator[None]:
     try:
         yield
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:
         raise broken(path, f"is malformed in line {line}: {error}", _FIX_FILES) from None
 
 
@@ -363,17 +372,16 @@ def _text_images(path: Path) -> Iterator[ImageRecord]:
         yield record
 
 
-def _text_points(path: Path) -> Iterator[tuple]:
+def _text_points(path: Path) -> np.ndarray:
+    rows = []
     for number, line in _text_lines(path):
         with _parsing(path, number):
             fields = line.split(maxsplit=8)
             if len(fields) < 8:
                 raise ValueError("a point line needs at least 8 fields")
-            if abs(int(fields[0])) > _LARGEST_ID:
-                raise ValueError(f"{fields[0]} is not a valid id of a point")
-            color = [int(value) & 255 for value in fields[4:7]]
-            row = int(fields[0]), [float(value) for value in fields[1:4]], color
-        yield row
+            color = tuple(int(value) & 255 for value in fields[4:7])
+            rows.append((np.int64(fields[0]), tuple(map(float, fields[1:4])), color))
+    return np.array(rows, _POINT)
 
 
 def _text_lines(path: Path, *, blank: bool = False) -> Iterator[tuple[int, str]]:

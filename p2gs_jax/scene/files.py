@@ -1,12 +1,17 @@
-"""Files of scenes: listing and measuring images, names and sizes that models give, JSON."""
+"""Files of scenes: images, names and sizes that models give, JSON; and results that are kept."""
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
+import shutil
+import tempfile
+import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -16,10 +21,10 @@ from jaxtyping import Float, Float32, UInt8
 from PIL import Image
 
 from p2gs_jax.config import DataConfig
+from p2gs_jax.core.atomic import write_text
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError, broken
-from p2gs_jax.scene.convert.headers import size_of
-from p2gs_jax.scene.convert.kinds import CONVERTED_SUFFIXES
+from p2gs_jax.scene.convert.readers import CONVERTED_SUFFIXES, size_of
 from p2gs_jax.scene.lens import scale_intrinsics
 from p2gs_jax.scene.masks import first_few
 
@@ -31,6 +36,12 @@ HUGE = 1e30
 _MOVED = "move it there; or name the folder of all photographs with --images, and names in it"
 # Where Pillow takes a picture for an attack.
 MOST_PIXELS = 2 * (Image.MAX_IMAGE_PIXELS or 2**26)
+_MARKER = "finished"
+# Seconds between two messages.
+EVERY_S = 10.0
+
+Report = Callable[[str], None]
+"""Receives progress, a line at a time."""
 
 
 def list_images(folder: Path, *, recursive: bool = True) -> list[Path]:
@@ -94,10 +105,14 @@ def image_size(path: Path) -> tuple[int, int]:
         str(path).encode()  # no other name can be written into the files of a run
     except UnicodeEncodeError:
         raise UserError(f"the name of {path} is not UTF-8", fix="rename it") from None
-    size = size_of(path) or _size_in_header(path)
-    if size[0] * size[1] > MOST_PIXELS:
-        raise _too_large(path)
-    return size
+    try:
+        width, height = size_of(path) or _size_in_header(path)
+    except Image.DecompressionBombError:
+        width, height = MOST_PIXELS, 2
+    if width * height > MOST_PIXELS:
+        fix = "make the photographs smaller, or remove that one from the scene"
+        raise broken(path, f"has more than {MOST_PIXELS / 1e6:.0f} million pixels", fix)
+    return width, height
 
 
 def _size_in_header(path: Path) -> tuple[int, int]:
@@ -105,21 +120,14 @@ def _size_in_header(path: Path) -> tuple[int, int]:
         with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
             return image.size
     except Image.DecompressionBombError:
-        raise _too_large(path) from None
+        raise
     except Exception:  # PIL's error types are not a closed set
         pass
-    if not path.is_file():
-        raise undecodable(path)
-    with contextlib.suppress(cv2.error):
+    with contextlib.suppress(cv2.error, OSError):
         pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
         if pixels is not None:
             return pixels.shape[1], pixels.shape[0]
     raise undecodable(path)
-
-
-def _too_large(path: Path) -> UserError:
-    fix = "make the photographs smaller, or remove that one from the scene"
-    return broken(path, f"has more than {MOST_PIXELS / 1e6:.0f} million pixels", fix)
 
 
 def decode_grey(data: bytes, shrink: int) -> UInt8[np.ndarray, "h w"] | None:
@@ -170,3 +178,66 @@ def at_file_size(
         fix = "use the photographs from which the model was made, neither cropped nor rotated"
         raise broken(f"wrong size: {path}", why, fix)
     return scale_intrinsics(K, sx, sy).astype(np.float32), w, h
+
+
+def rescaled(count: int, source: str) -> list[str]:
+    """Return a note about so many images, or none."""
+    note = f"{count} images have another size than {source} says: intrinsics were rescaled"
+    return [note] if count else []
+
+
+@contextmanager
+def cached_folder(
+    work_dir: Path | None, name: str, key: object, build: Callable[[Path], None]
+) -> Iterator[Path]:
+    """Provide a folder that `build` has filled, now or in an earlier run.
+
+    It counts as finished once a marker with the hash of `key`, JSON of everything the result
+    depends on, has been moved into it; one that was interrupted half-way, or made from other
+    inputs, is emptied and filled again. A `work_dir` of None makes it a temporary folder.
+    """
+    if work_dir is None:
+        with tempfile.TemporaryDirectory(prefix="p2gs_") as temporary:
+            build(Path(temporary))
+            yield Path(temporary)
+        return
+    folder = work_dir / name
+    marker = folder / _MARKER
+    digest = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()
+    if not (marker.is_file() and marker.read_text().strip() == digest):
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        build(folder)
+        write_text(marker, digest)
+    yield folder
+
+
+def file_fingerprints(paths: Sequence[Path]) -> list[tuple[str, int, int]]:
+    """Return (path, size in bytes, modification time in ns) of every file."""
+    stats = [(path, path.stat()) for path in paths]
+    return [(str(path.resolve()), stat.st_size, stat.st_mtime_ns) for path, stat in stats]
+
+
+def stage_progress(
+    report: Report, stage: str, total: int, unit: str, clock: Callable[[], float] = time.monotonic
+) -> Callable[[int], None]:
+    """Begin a stage, such as "matching" 100 "image pairs"; return what reports how many are done.
+
+    The first message comes at once, others now and then.
+    """
+    begin = last = clock()
+    if total:
+        report(f"{stage}: {total} {unit}")
+
+    def progress(done: int) -> None:
+        nonlocal last
+        now = clock()
+        if now - last < EVERY_S or not 0 < done < total:
+            return
+        last = now
+        minutes, seconds = divmod(round((now - begin) / done * max(total - done, 0)), 60)
+        hours, minutes = divmod(minutes, 60)
+        left = f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
+        report(f"{stage}: {done} of {total} {unit}, about {left} left at this pace")
+
+    return progress

@@ -52,7 +52,7 @@ def rigid(rotation: Rotation3, position: Vector3, source: Path, what: str) -> Po
         if finite and nearest_rotation(-rotation, ORTHOGONAL) is not None:
             fix = "write rotations of determinant 1"
             raise broken(f"{source}:", f"the pose of {what} mirrors", fix)
-        raise broken(f"{source}:", f"the pose of {what} is no rotation and position")
+        raise broken(f"{source}:", f"the pose of {what} is not a rotation and a position")
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = nearest, position
     return out
@@ -69,10 +69,10 @@ def from_quaternions(
     bad = ~(np.abs(np.linalg.norm(wxyz, axis=1) - 1) < 1e-2) | ~np.isfinite(positions).all(1)
     if bad.any():
         where = f"{what} number {np.argmax(bad) + 1}"
-        raise broken(f"{source}:", f"{where} is no unit quaternion and position")
+        raise broken(f"{source}:", f"{where} is not a unit quaternion and position")
     out = np.tile(np.eye(4), (len(wxyz), 1, 1))
     if len(wxyz):
-        out[:, :3, :3] = Rotation.from_quat(np.roll(wxyz, -1, axis=1)).as_matrix()
+        out[:, :3, :3] = Rotation.from_quat(wxyz, scalar_first=True).as_matrix()
         out[:, :3, 3] = positions
     return out
 
@@ -83,9 +83,9 @@ def from_quaternion(
     """Return the matrix of one quaternion and a position; errors are as of `from_quaternions`."""
     wxyz = np.asarray(wxyz, np.float64)
     if wxyz.shape != (4,) or not abs(np.linalg.norm(wxyz) - 1) < 1e-2:
-        why = f"the pose of {what} has a rotation that is no unit quaternion"
-        raise broken(f"{source}:", why)
-    return rigid(Rotation.from_quat(np.roll(wxyz, -1)).as_matrix(), position, source, what)
+        raise broken(f"{source}:", f"the rotation of {what} is not a unit quaternion")
+    rotation = Rotation.from_quat(wxyz, scalar_first=True)
+    return rigid(rotation.as_matrix(), position, source, what)
 
 
 def inverse(poses: Float64[np.ndarray, "*n 4 4"]) -> Float64[np.ndarray, "*n 4 4"]:
@@ -158,7 +158,7 @@ def up_of_drive(viewmats: Float[np.ndarray, "n 4 4"], cameras: Sequence[str]) ->
     Poses are world-to-camera; `cameras` names the camera of each.
     """
     up = up_direction(viewmats)
-    centers = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
+    centers = camera_centers(viewmats)
     names = np.asarray(cameras)
     for name in set(cameras):
         centers[names == name] -= centers[names == name].mean(0)

@@ -17,6 +17,7 @@ from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Int
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError, broken
@@ -177,24 +178,32 @@ def split_as_listed(scene: Scene, lists: SplitLists, *, allow_missing: bool = Fa
     if left := sorted(everything - train - test):
         why = f"{len(left)} views are neither trained on nor held out by {name}"
         notes.append(f"{why}: they are not used")
-        scene = _without_views(scene, left)
+        scene = only(scene, sorted(train | test))
     if not test:
         why = f"{name} holds no view out: nothing says how good views are that are not trained on."
         notes.append(f"{why} --split every holds out every n-th.")
     return dataclasses.replace(scene, notes=(*scene.notes, *notes))
 
 
-def _without_views(scene: Scene, rows: Sequence[int]) -> Scene:
-    """Return a scene without some of its views and their observations."""
-    kept = np.setdiff1d(np.arange(len(scene.views)), np.asarray(rows, int))
-    tracks = scene.tracks
+def only(
+    scene: Scene, rows: Sequence[int] | np.ndarray, points: Int[np.ndarray, " k"] | None = None
+) -> Scene:
+    """Return a scene with some of its views and points (None: all), and observations among them."""
+    points = np.arange(len(scene.points)) if points is None else points
+    view, point = (np.full(len(a), -1, np.int32) for a in (scene.views, scene.points))
+    view[rows], point[points] = np.arange(len(rows)), np.arange(len(points))
+    tracks, colors = scene.tracks, scene.point_colors
     if tracks is not None:
-        place = np.full(len(scene.views), -1)
-        place[kept] = np.arange(len(kept))
-        seen = place[tracks.view_indices] >= 0
-        rows_seen = place[tracks.view_indices[seen]].astype(tracks.view_indices.dtype)
-        tracks = Tracks(rows_seen, tracks.point_indices[seen], tracks.xy[seen])
-    return dataclasses.replace(scene, views=tuple(scene.views[i] for i in kept), tracks=tracks)
+        seen_in, seen = view[tracks.view_indices], point[tracks.point_indices]
+        left = (seen_in >= 0) & (seen >= 0)
+        tracks = Tracks(seen_in[left], seen[left], tracks.xy[left])
+    return dataclasses.replace(
+        scene,
+        views=tuple(scene.views[i] for i in rows),
+        points=scene.points[points],
+        point_colors=None if colors is None else colors[points],
+        tracks=tracks,
+    )
 
 
 def _lines(path: Path) -> tuple[str, ...]:

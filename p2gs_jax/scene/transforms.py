@@ -27,19 +27,9 @@ from jaxtyping import Float, Float64
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.atomic import BROKEN_ARRAYS
 from p2gs_jax.errors import broken
+from p2gs_jax.scene import files
 from p2gs_jax.scene.colmap import subfolder
-from p2gs_jax.scene.files import (
-    ASPECT_TOLERANCE,
-    HUGE,
-    IMAGE_SUFFIXES,
-    at_file_size,
-    check_missing,
-    image_folder,
-    image_size,
-    list_images,
-    read_json,
-    require_inside,
-)
+from p2gs_jax.scene.files import at_file_size, require_inside
 from p2gs_jax.scene.lens import intrinsics, make_distortion
 from p2gs_jax.scene.rigid import nearest_rotation
 from p2gs_jax.scene.seeds import read_points
@@ -122,7 +112,7 @@ def load_llff(root: Path, cfg: DataConfig) -> Scene:
     path = root / LLFF_FILE
     rows = _read_llff(path)
     folder = root / (cfg.images or "images")
-    photographs = list_images(folder, recursive=False)
+    photographs = files.list_images(folder, recursive=False)
     if len(photographs) != len(rows):
         why = f"has {len(rows)} rows, and {folder} holds {len(photographs)} photographs"
         fix = "put all photographs of the poses there and no others, or name their folder with "
@@ -131,26 +121,18 @@ def load_llff(root: Path, cfg: DataConfig) -> Scene:
     for k, (image, row) in enumerate(zip(photographs, rows, strict=True)):
         matrix, what = row[:15].reshape(3, 5), f"row {k}"
         height, width, focal = matrix[:, 4]
-        if not (min(height, width) >= 1 and focal > 0):
-            why = f"{what} has an impossible height, width or focal length"
-            raise broken(f"{path}:", why, _LLFF_FIX)
         stated = (round(width), round(height))
         K, w, h = at_file_size(image, intrinsics(focal, focal, width / 2, height / 2), stated, path)
         resized += (w, h) != stated
         viewmat = _viewmat(matrix[:, _LLFF_AXES] * _LLFF_SIGNS, path, what, _LLFF_FIX)
         views.append(View(image.name, image, "0", viewmat, K, w, h))
     bounds = (float(rows[:, 15].min()), float(rows[:, 16].max()))
-    return replace(_scene(root, "llff", views, _rescaled(resized, LLFF_FILE)), depths=bounds)
+    return replace(_scene(root, "llff", views, files.rescaled(resized, LLFF_FILE)), depths=bounds)
 
 
 def _scene(root: Path, name: str, views: Sequence[View], notes: Sequence[str]) -> Scene:
     points, colors = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
     return Scene(root, name, tuple(views), points, colors, notes=tuple(notes))
-
-
-def _rescaled(count: int, source: str) -> list[str]:
-    note = f"{count} images have another size than {source} says: intrinsics were rescaled"
-    return [note] if count else []
 
 
 def _viewmat(
@@ -179,10 +161,14 @@ def _read_llff(path: Path) -> Float64[np.ndarray, "v 17"]:
         raise broken(path, f"holds {shape} numbers, not N x {_LLFF_COLUMNS}", _LLFF_FIX)
     table = table.astype(np.float64)
     for k, (*pose, near, far) in enumerate(table):
+        why = None
         if not np.isfinite(pose).all():
-            raise broken(f"{path}:", f"the pose in row {k} is not finite", _LLFF_FIX)
-        if not 0 < near < far < math.inf:
+            why = f"the pose in row {k} is not finite"
+        elif not (min(pose[4], pose[9]) >= 1 and pose[14] > 0):
+            why = f"row {k} has an impossible height, width or focal length"
+        elif not 0 < near < far < math.inf:
             why = f"row {k} has impossible bounds: {near:g} to {far:g}"
+        if why is not None:
             raise broken(f"{path}:", why, _LLFF_FIX)
     return table
 
@@ -192,7 +178,7 @@ def _assembled(root: Path, name: str, frames: Sequence[_Frame], cfg: DataConfig)
     folder = frames[0].source.parent
     # Names are relative to the deepest folder that holds all images, as `images/` for COLMAP.
     common = Path(os.path.commonpath([frame.path.parent for frame in frames]))
-    asked = image_folder(folder, cfg)
+    asked = files.image_folder(folder, cfg)
     place = folder / common if asked is None else asked
     for frame in frames:
         name_of = frame.path if asked is None else frame.path.relative_to(common)
@@ -202,7 +188,7 @@ def _assembled(root: Path, name: str, frames: Sequence[_Frame], cfg: DataConfig)
     for source in dict.fromkeys(frame.source for frame in frames):
         listed = [(where, frame) for where, frame in located if frame.source == source]
         missing = [frame.path.as_posix() for where, frame in listed if where is None]
-        notes += check_missing(missing, len(listed), source, cfg)
+        notes += files.check_missing(missing, len(listed), source, cfg)
     found = [(where, frame) for where, frame in located if where is not None]
     twice = next((n for n, times in Counter(n for n, _ in found).items() if times > 1), None)
     if twice is not None:
@@ -219,7 +205,7 @@ def _assembled(root: Path, name: str, frames: Sequence[_Frame], cfg: DataConfig)
         resized += differs
     sources = " and ".join(dict.fromkeys(frame.source.name for frame in frames))
     _require_one_shape(views, dict(found))
-    return _scene(root, name, views, [*notes, *_rescaled(resized, sources)])
+    return _scene(root, name, views, [*notes, *files.rescaled(resized, sources)])
 
 
 def _require_one_shape(views: Sequence[View], frames: Mapping[str, _Frame]) -> None:
@@ -228,7 +214,7 @@ def _require_one_shape(views: Sequence[View], frames: Mapping[str, _Frame]) -> N
     for view in free:
         first = free[0]
         shapes = (view.width / view.height) / (first.width / first.height)
-        if abs(shapes - 1) > ASPECT_TOLERANCE:
+        if abs(shapes - 1) > files.ASPECT_TOLERANCE:
             why = f"is {view.width}x{view.height}, {first.name} {first.width}x{first.height}, and "
             why += f"{frames[view.name].source} gives all of them one lens"
             fix = "use the photographs that belong to the poses, neither cropped nor rotated, or "
@@ -238,7 +224,7 @@ def _require_one_shape(views: Sequence[View], frames: Mapping[str, _Frame]) -> N
 
 def _frames(path: Path, split: Split = "train") -> tuple[list[_Frame], dict[str, Any]]:
     """Return the frames in a file, and all that it holds."""
-    data, frames = read_json(path, _FIX), []
+    data, frames = files.read_json(path, _FIX), []
     if not isinstance(data, dict) or not isinstance(data.get("frames"), list):
         raise broken(path, 'has no list "frames"', _FIX)
     if not data["frames"]:
@@ -269,7 +255,7 @@ def _with_suffix(folder: Path, relative: Path) -> str | None:
     """Return the name of the image file; Blender's scenes leave the extension out."""
     if (folder / relative).is_file():
         return relative.as_posix()
-    for suffix in (".png", ".jpg", *sorted(IMAGE_SUFFIXES)):
+    for suffix in (".png", ".jpg", *sorted(files.IMAGE_SUFFIXES)):
         for candidate in (suffix, suffix.upper()):
             path = relative.with_name(relative.name + candidate)
             if (folder / path).is_file():
@@ -286,7 +272,7 @@ def _view(frame: _Frame, folder: Path, name: str) -> tuple[View, bool]:
         if min(size) <= 0:
             raise ValueError
     except KeyError:
-        size = image_size(image_path)
+        size = files.image_size(image_path)
     except (TypeError, ValueError, OverflowError):
         raise broken(f"{path}:", f"{name} has an impossible size w, h", _FIX) from None
     K, distortion = _lens(path, values, name, *size)
@@ -300,7 +286,7 @@ def _view(frame: _Frame, folder: Path, name: str) -> tuple[View, bool]:
         c2w = np.array(values.get("transform_matrix"), np.float64)[:3]
     except (TypeError, ValueError, IndexError):
         c2w = np.zeros(0)
-    if c2w.shape != (3, 4) or not (np.abs(c2w) < HUGE).all():
+    if c2w.shape != (3, 4) or not (np.abs(c2w) < files.HUGE).all():
         raise broken(f"{path}:", f"{what} is not a finite 4x4 matrix", _FIX)
     viewmat = _viewmat(c2w * _OPENGL_SIGNS, path, what, _FIX)
     camera = subfolder(name) or "0"
@@ -319,7 +305,11 @@ def _lens(
 
     def number(key: str, default: float) -> float:
         value = values.get(key, default)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < HUGE:
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, int | float)
+            or not abs(value) < files.HUGE
+        ):
             raise broken(f"{path}:", f"{key} of {name} is {value!r}, not a number", _FIX)
         return float(value)
 

@@ -1,9 +1,15 @@
-"""From a video to a folder of photographs: its frames and their colours, and what is kept."""
+"""From a video to a folder of photographs: its frames, their colours, and which are kept.
+
+Corners are followed from frame to frame. Parallax is what the best rotation leaves of their motion:
+turning on the spot shows nothing new of depth. A frame is due once the camera has come far enough
+since the last chosen one; the sharpest of those about then is chosen. So frame rate and speed do
+not matter, and a camera that rests gives one photograph.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,16 +19,15 @@ import av
 import cv2
 import numpy as np
 from av.stream import Disposition
-from jaxtyping import Float, UInt, UInt8
+from jaxtyping import Float, Float32, UInt, UInt8
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.atomic import write_text
-from p2gs_jax.core.numerics import srgb_decode
+from p2gs_jax.core.numerics import evenly_spaced, srgb_decode
 from p2gs_jax.errors import UserError, broken
-from p2gs_jax.scene.cache import Report, cached_folder, file_fingerprints
 from p2gs_jax.scene.convert import icc
 from p2gs_jax.scene.convert.convert import Converted, cache_of, write_png
-from p2gs_jax.scene.motion import WIDTH, Chosen, choose_frames, thinned
+from p2gs_jax.scene.files import Report, cached_folder, file_fingerprints
 
 RECORD = "frames.json"
 _VERSION = 1
@@ -37,6 +42,27 @@ _BT601 = (0.299, 0.114)
 _LUMA = {1: (0.2126, 0.0722), 5: _BT601, 6: _BT601, 7: (0.212, 0.087), 9: (0.2627, 0.0593)}
 _FULL_RANGE = 2
 _SMALLEST_HD = 720
+# Longer side of the frames that are compared, pixels.
+WIDTH = 640
+_CORNERS, _FEWEST = 400, 30
+# Focal length of most cameras that film, in longer sides; a wrong one leaves some of a rotation
+# over as parallax: a tenth of a turn of 10 degrees if it is wrong by a third.
+_FOCAL = 0.85
+_BACK = 1.0  # pixels by which a corner may miss its start when followed back
+_MID, _CONTRAST = 128.0, 48.0
+_ROUNDS = 4
+# A frame is due at one of these (BUILD_NOTES, "Videos").
+PARALLAX, DISPLACEMENT, LOST = 0.012, 0.10, 0.5
+# From this share of the way on, frames are candidates.
+_CANDIDATE = 0.6
+# The sharpest is chosen among at most so many: a camera that hovers must not fill the memory.
+_MOST_CANDIDATES = 48
+# Where all candidates are blurred, frames up to this share of the way are waited for.
+_LATEST = 1.5
+# Blurred: below this share of the sharpness of the frame chosen before.
+_BLURRED = 0.7
+# The first photograph is one of the first frames.
+_FIRST = 6
 
 
 @dataclass(frozen=True)
@@ -81,13 +107,12 @@ class Frame:
             light = icc.to_light(signal, self.transfer) @ icc.to_srgb_matrix(primaries).T
             codes = icc.encode_16(light)
         elif primaries is not icc.BT709:
-            codes = icc.encode_16(
-                srgb_decode(np.clip(signal, 0, 1)) @ icc.to_srgb_matrix(primaries).T
-            )
-        elif max(c.bits for c in self._decoded.format.components) > 8:
-            codes = np.rint(np.clip(signal, 0, 1) * 65535).astype(np.uint16)
+            light = srgb_decode(np.clip(signal, 0, 1)) @ icc.to_srgb_matrix(primaries).T
+            codes = icc.encode_16(light)
         else:
-            codes = np.rint(np.clip(signal, 0, 1) * 255).astype(np.uint8)
+            deep = max(c.bits for c in self._decoded.format.components) > 8
+            kind = np.uint16 if deep else np.uint8
+            codes = np.rint(np.clip(signal, 0, 1) * np.iinfo(kind).max).astype(kind)
         if self.square != 1:
             width = round(codes.shape[1] * self.square)
             how = cv2.INTER_AREA if self.square < 1 else cv2.INTER_LINEAR
@@ -105,20 +130,16 @@ def frames_of(path: Path) -> Iterator[Frame]:
         rate = float(stream.average_rate or 30)
         ratio = stream.sample_aspect_ratio
         square = float(ratio) if ratio else 1.0
-        first: tuple[int, int] | None = None
-        begin: float | None = None
-        number = 0
+        first, begin, number = None, 0.0, 0
         try:
             for decoded in container.decode(stream):
-                size = decoded.width, decoded.height
-                if size != (first or size):
-                    assert first is not None
-                    why = f"changes its size: frame {number} is {size[0]}x{size[1]}, those "
-                    why += f"before are {first[0]}x{first[1]}."
-                    raise broken(path, why, "cut it into parts of one size and fit one of them")
-                first = size
+                size = f"{decoded.width}x{decoded.height}"
                 time = float(decoded.time) if decoded.time is not None else number / rate
-                begin = time if begin is None else begin
+                if first is None:
+                    first, begin = size, time
+                if size != first:
+                    why = f"changes its size: frame {number} is {size}, those before are {first}."
+                    raise broken(path, why, "cut it into parts of one size and fit one of them")
                 turn = round(decoded.rotation / 90) % 4
                 yield Frame(number, time - begin, turn, square, decoded)
                 number += 1
@@ -226,14 +247,14 @@ def _keep(path: Path, cfg: DataConfig, folder: Path, report: Report) -> dict[str
             yield frame.number, frame.grey(WIDTH)
 
     if cfg.every is None:
-        found = {one.number: one for one in choose_frames(watched())}
+        found = choose_frames(watched())
         how = "sharp ones, each from a new place"
     else:
-        found = {n: Chosen(n, 0.0, None) for n, _ in watched() if n % cfg.every == 0}
+        found = [n for n, _ in watched() if n % cfg.every == 0]
         how = "all of them" if cfg.every == 1 else f"every {cfg.every}th"
     if seen < 2:
         raise no_frames(path, seen)
-    kept = {n: found[n] for n in thinned(list(found), cfg.max_frames)}
+    kept = [found[row] for row in evenly_spaced(len(found), cfg.max_frames)]
     thin = f", thinned from {len(found)} (--max-frames)" if len(kept) < len(found) else ""
     notes = [f"Of {seen} frames of the video {len(kept)} are used: {how}{thin}."]
     if expected is not None and seen < expected - 2:
@@ -250,22 +271,142 @@ def _keep(path: Path, cfg: DataConfig, folder: Path, report: Report) -> dict[str
 
 
 def _write(
-    path: Path, kept: dict[int, Chosen], folder: Path, report: Report
+    path: Path, kept: list[int], folder: Path, report: Report
 ) -> tuple[list[dict[str, Any]], set[str | None]]:
     """Write frames as PNG; return a record of each, and their transfer functions."""
     records: list[dict[str, Any]] = []
     transfers: set[str | None] = set()
     for frame in frames_of(path):
-        if (one := kept.get(frame.number)) is None:
+        if frame.number not in kept:
             continue
         if len(records) % 10 == 0:
             report(f"keeping frames: {len(records)} of {len(kept)}")
-        record = {"file": f"{frame.number:06d}.png", "frame": frame.number}
-        write_png(folder / record["file"], frame.codes())
+        name = f"{frame.number:06d}.png"
+        write_png(folder / name, frame.codes())
         transfers.add(frame.transfer)
-        record |= {"time": round(frame.time, 6), "turn": 90 * frame.turn}
-        way = None if one.way is None else vars(one.way)
-        records.append(record | {"sharpness": one.sharpness, "way": way})
+        records.append({"file": name, "frame": frame.number, "time": round(frame.time, 6)})
         if len(records) == len(kept):
             break
     return records, transfers
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How far a frame is from the reference, in longer sides of the picture.
+
+    `displacement` is the median of the corners', `parallax` the upper quartile of what the best
+    rotation leaves of it, `kept` the share of the reference's corners that are still seen.
+    """
+
+    displacement: float
+    parallax: float
+    kept: float
+
+
+def normalised(grey: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
+    """Return a frame of fixed mean and contrast: automatic exposure must not look like motion."""
+    values = grey.astype(np.float32)
+    gain = _CONTRAST / max(float(values.std()), 1.0)
+    return np.clip((values - values.mean()) * gain + _MID, 0, 255).astype(np.uint8)
+
+
+class Tracker:
+    """Follows corners of a normalised reference frame."""
+
+    def __init__(self, grey: UInt8[np.ndarray, "h w"]):
+        corners = cv2.goodFeaturesToTrack(grey, _CORNERS, 0.01, 7)
+        self._start = np.zeros((0, 2), np.float32) if corners is None else corners[:, 0]
+        self._now, self._last = self._start, grey
+        self._count = max(len(self._start), 1)
+
+    def follow(self, grey: UInt8[np.ndarray, "h w"]) -> Motion:
+        """Return how far the next frame is, normalised as the reference."""
+        if len(self._now) >= _FEWEST:
+            there, found, _ = cv2.calcOpticalFlowPyrLK(
+                self._last, grey, self._now, np.empty_like(self._now)
+            )
+            back, found_back, _ = cv2.calcOpticalFlowPyrLK(
+                grey, self._last, there, np.empty_like(there)
+            )
+            missed = np.linalg.norm(back - self._now, axis=1)
+            good = (found[:, 0] == 1) & (found_back[:, 0] == 1) & (missed < _BACK)
+            height, width = grey.shape
+            good &= ((there >= 0) & (there < [width, height])).all(1)
+            self._start, self._now = self._start[good], there[good]
+        self._last = grey
+        if len(self._now) < _FEWEST:
+            return Motion(1.0, 1.0, 0.0)
+        side = max(grey.shape)
+        way = float(np.median(np.linalg.norm(self._now - self._start, axis=1))) / side
+        parallax = _parallax(self._start, self._now, grey.shape)
+        return Motion(way, parallax, len(self._now) / self._count)
+
+
+def _parallax(
+    start: Float32[np.ndarray, "n 2"], now: Float32[np.ndarray, "n 2"], shape: tuple[int, ...]
+) -> float:
+    """Return what remains after the best rotation, in longer sides."""
+    side = max(shape)
+    focal = _FOCAL * side
+    middle = np.array([shape[1] / 2, shape[0] / 2])
+
+    def rays(points: np.ndarray) -> np.ndarray:
+        rays = np.concatenate([points - middle, np.full((len(points), 1), focal)], axis=1)
+        return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+    a, b = rays(start), rays(now)
+    use = np.ones(len(a), bool)
+    rest = np.zeros(len(a))
+    for _ in range(_ROUNDS):
+        u, _, vt = np.linalg.svd(b[use].T @ a[use])
+        rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+        turned = a @ rotation.T
+        landed = turned[:, :2] / np.maximum(turned[:, 2:], 1e-3) * focal + middle
+        rest = np.linalg.norm(landed - now, axis=1) / side
+        use = rest <= max(2 * float(np.median(rest)), 1e-4)
+    return float(np.percentile(rest, 75))
+
+
+def choose_frames(frames: Iterable[tuple[int, UInt8[np.ndarray, "h w"]]]) -> list[int]:
+    """Return which frames are worth keeping, in order, from numbers and small grey pictures."""
+    chosen: list[tuple[float, int]] = []
+    tracker: Tracker | None = None
+    # Sharpness, number and picture of candidates.
+    waiting: list[tuple[float, int, UInt8[np.ndarray, "h w"]]] = []
+
+    def take() -> Tracker:
+        """Choose the sharpest candidate; follow from it to the newest frame."""
+        best = max(range(len(waiting)), key=lambda k: waiting[k][0])
+        (sharp, number, grey), later = waiting[best], waiting[best + 1 :]
+        chosen.append((sharp, number))
+        waiting.clear()
+        begun = Tracker(grey)
+        for candidate in later:
+            consider(begun, *candidate)
+        return begun
+
+    def consider(tracker: Tracker, sharp: float, number: int, grey: np.ndarray) -> float:
+        """Keep a frame that may be chosen; return the share of the way; 1: one is due."""
+        way = tracker.follow(grey)
+        lost = (1 - way.kept) / LOST
+        share = max(way.parallax / PARALLAX, way.displacement / DISPLACEMENT, lost)
+        if share >= _CANDIDATE:
+            waiting.append((sharp, number, grey))
+        return share
+
+    for number, grey in frames:
+        grey = normalised(grey)
+        # The power of the finest details.
+        sharp = float(cv2.Laplacian(grey, cv2.CV_32F).var())
+        if tracker is None:
+            waiting.append((sharp, number, grey))
+            if len(waiting) == _FIRST:
+                tracker = take()
+            continue
+        share = consider(tracker, sharp, number, grey)
+        due = share >= 1 and max(sharp for sharp, *_ in waiting) >= _BLURRED * chosen[-1][0]
+        if due or share >= _LATEST or len(waiting) >= _MOST_CANDIDATES:
+            tracker = take()
+    if waiting:
+        take()
+    return [number for _, number in chosen]

@@ -25,7 +25,7 @@ from p2gs_jax.formats.false_color import (
 )
 from p2gs_jax.formats.frames import open_video, write_png
 from p2gs_jax.photometry.display import DisplayTransform
-from p2gs_jax.scene.convert.headers import ExifSettings
+from p2gs_jax.scene.convert.readers import ExifSettings
 from p2gs_jax.types import Camera
 
 WIDTH, HEIGHT = 90, 70

@@ -15,7 +15,7 @@ from scene.helpers import refused, write_image, write_tiny_model
 from p2gs_jax.config import DataConfig
 from p2gs_jax.run.scene_file import read_scene, write_scene
 from p2gs_jax.scene import ImageStore, PhotographsAlone, find_scene, load_scene
-from p2gs_jax.scene.convert.headers import ExifSettings, read_exif_ev, read_exif_settings
+from p2gs_jax.scene.convert.readers import ExifSettings, read_exif_ev, read_exif_settings
 from p2gs_jax.scene.files import image_size
 from p2gs_jax.scene.masks import background_color, has_alpha
 from p2gs_jax.train.inputs import TrainingViews
@@ -95,8 +95,12 @@ def jpeg_with_exif(path, tags):
     return path
 
 
-def test_exif_rules(tmp_path):
-    path = tmp_path / "a.jpg"
+def test_how_a_photograph_was_taken(tmp_path):
+    path, taken = tmp_path / "a.jpg", "2010:10:12 14:43:07"
+    shot = read_exif_settings(jpeg_with_exif(path, {**FULL, TAKEN: taken}))
+    assert shot == ExifSettings(pytest.approx(0.01), 2.0, 400.0, taken)
+    for tags in ({TAKEN: "    :  :     :  :  "}, {ISO: 65535, TAKEN: "yesterday"}):
+        assert read_exif_settings(jpeg_with_exif(path, tags)) == ExifSettings()
     for tags, ev in (
         (FULL, 0.0),
         ({TIME: 0.01, F_NUMBER: 2.0}, -2.0),
@@ -117,15 +121,6 @@ def test_exif_rules(tmp_path):
     assert read_exif_ev(path) is read_exif_ev(tmp_path / "absent.jpg") is None
 
 
-def test_how_a_photograph_was_taken(tmp_path):
-    path, taken = tmp_path / "a.jpg", "2010:10:12 14:43:07"
-    shot = read_exif_settings(jpeg_with_exif(path, {**FULL, TAKEN: taken}))
-    assert shot == ExifSettings(pytest.approx(0.01), 2.0, 400.0, taken)
-    for tags in ({TAKEN: "    :  :     :  :  "}, {ISO: 65535, TAKEN: "yesterday"}):
-        assert read_exif_settings(jpeg_with_exif(path, tags)) == ExifSettings()
-    assert read_exif_settings(tmp_path / "absent.jpg") == ExifSettings()
-
-
 # ------------------------------------------------------------------ alpha
 
 
@@ -144,13 +139,9 @@ def cutouts(tmp_path):
 
 @pytest.mark.parametrize(
     ("background", "color"),
-    [
-        ("white", (1, 1, 1)),
-        ("black", (0, 0, 0)),
-        ("0.2,0.4,0.6", (0.2, 0.4, 0.6)),
-        ("random", (1, 1, 1)),
-    ],
-)
+    [("white", (1, 1, 1)), ("black", (0, 0, 0)), ("0.2,0.4,0.6", (0.2, 0.4, 0.6)),
+     ("random", (1, 1, 1))],
+)  # fmt: skip
 def test_photographs_are_composited(cutouts, background, color):
     root, held = cutouts
     store = store_of(root, background=background)
@@ -164,14 +155,10 @@ def test_photographs_are_composited(cutouts, background, color):
     # Exposures and seeds see opaque pixels only.
     assert np.array_equal(store.only_opaque().get(1)[1], (held[1][..., 3] == 1).astype(np.float32))
     assert store.only_opaque().get(3)[1].min() == 1.0
-
-
-def test_transparent_pixels_do_not_colour_their_neighbours(cutouts):
-    root, held = cutouts
-    ldr, _ = store_of(root, background="black").get(0, 2)
-    premultiplied = held[0][..., :3] * held[0][..., 3:]
-    expected = premultiplied.reshape(15, 2, 20, 2, 3).mean((1, 3))
-    assert np.allclose(ldr, expected, atol=2e-5)
+    # Transparent pixels do not colour their neighbours.
+    shrunk, premultiplied = store.get(0, 2)[0], held[0][..., :3] * held[0][..., 3:]
+    premultiplied = premultiplied + (1 - held[0][..., 3:]) * color
+    assert np.allclose(shrunk, premultiplied.reshape(15, 2, 20, 2, 3).mean((1, 3)), atol=2e-5)
 
 
 @pytest.mark.parametrize("alpha", ["mask", "ignore"])
@@ -185,14 +172,24 @@ def test_alpha_as_a_mask_and_not_at_all(cutouts, alpha):
     assert np.allclose(ldr, held[0][..., :3])
 
 
-def test_alpha_is_always_noted(cutouts):
+def test_alpha_is_always_noted_and_remembered(cutouts, tmp_path_factory):
     for options, note in (
         ({}, "3 of 4 photographs have an alpha channel: photographs and renders are shown"),
         ({"background": "random"}, "shown over a random colour at every step, and white to judge"),
         ({"alpha": "mask"}, "transparent pixels are left out"),
         ({"alpha": "ignore"}, "it is ignored"),
     ):
-        assert note in load_scene(cutouts[0], DataConfig(**options)).notes[-1]
+        scene = load_scene(cutouts[0], DataConfig(**options))
+        assert note in scene.notes[-1]
+    run = tmp_path_factory.mktemp("run")
+    write_scene(run, scene)
+    again = read_scene(run, cutouts[0])
+    assert [view.alpha for view in again.views] == [view.alpha for view in scene.views]
+    assert again.split_by == scene.split_by
+    folder = cutouts[0] / "images"
+    (folder / "broken.png").write_bytes(b"\x89PNG")
+    names = ("im 0.png", "im 3.png", "broken.png")
+    assert [has_alpha(folder / name) for name in names] == [True, False, False]
 
 
 def test_scenes_without_alpha_are_as_they_were(tmp_path):
@@ -224,23 +221,6 @@ def test_random_backgrounds_follow_from_seed_and_step(cutouts):
     assert np.array_equal(batch.backdrop, [1, 1, 1])
     assert batch.ldr.dtype == batch.alpha.dtype == np.uint16
     assert (batch.ldr.astype(int) <= batch.alpha[..., None].astype(int) + 1).all()
-
-
-def test_a_run_remembers_what_alpha_meant(cutouts, tmp_path_factory):
-    root, _ = cutouts
-    run = tmp_path_factory.mktemp("run")
-    scene = load_scene(root, CFG)
-    write_scene(run, scene)
-    again = read_scene(run, root)
-    assert [view.alpha for view in again.views] == [view.alpha for view in scene.views]
-    assert again.split_by == scene.split_by
-
-
-def test_which_files_have_alpha(cutouts):
-    folder = cutouts[0] / "images"
-    (folder / "broken.png").write_bytes(b"\x89PNG")
-    names = ("im 0.png", "im 3.png", "broken.png")
-    assert [has_alpha(folder / name) for name in names] == [True, False, False]
 
 
 @pytest.mark.parametrize("text", ["blue", "1,1", "0.5,0.5,1.5", "0,0,nan", "", "1,1,1,1"])
@@ -278,17 +258,12 @@ def test_what_is_too_large_is_refused_by_its_header(tmp_path, bomb):
     (tmp_path / "images" / "im 1.png").write_bytes(bomb)
     tracemalloc.start()
     try:
-        with refused(f"im 1{HUGE}"):
-            load_scene(tmp_path, CFG)
+        # Photographs alone are looked at before their features are.
+        for root in (tmp_path, tmp_path / "images"):
+            with refused(f"im 1{HUGE}"):
+                load_scene(root, CFG)
         assert tracemalloc.get_traced_memory()[1] < SIDE * SIDE / 4
     finally:
         tracemalloc.stop()
-
-
-def test_photographs_alone_are_looked_at_before_their_features_are(tmp_path, bomb):
-    (tmp_path / "a.png").write_bytes(bomb)
-    with refused(f"a{HUGE}"):
-        load_scene(tmp_path, CFG)
-    (tmp_path / "folder.png").mkdir()
     with refused("cannot decode"):
-        image_size(tmp_path / "folder.png")
+        image_size(tmp_path / "images")

@@ -16,9 +16,17 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.core.numerics import srgb_decode
 from p2gs_jax.scene import find_scene
 from p2gs_jax.scene.convert.icc import PQ_WHITE, to_light
-from p2gs_jax.scene.motion import Tracker, choose_frames, normalised, thinned
 from p2gs_jax.scene.survey import survey
-from p2gs_jax.scene.video import RECORD, expected_frames, frames_of, read_video, video_size
+from p2gs_jax.scene.video import (
+    RECORD,
+    Tracker,
+    choose_frames,
+    expected_frames,
+    frames_of,
+    normalised,
+    read_video,
+    video_size,
+)
 
 COLOURS = np.array(
     [
@@ -65,8 +73,7 @@ def test_transfer_functions() -> None:
 @pytest.mark.parametrize(("coding", "name"), [(HLG, "hlg"), (PQ, "pq")])
 def test_hdr_video_becomes_light(tmp_path: Path, coding, name) -> None:
     grey = np.repeat(np.repeat(np.linspace(6000, 46000, 8)[None, :, None], 64, 0), 40, 1)
-    card = np.repeat(grey, 3, 2).astype(np.uint16)
-    path = tmp_path / "a.mkv"
+    card, path = np.repeat(grey, 3, 2).astype(np.uint16), tmp_path / "a.mkv"
     write_video(path, [card] * 2, codec="ffv1", layout="yuv422p10le", coding=coding)
     frame = next(iter(frames_of(path)))
     assert frame.transfer == name
@@ -83,27 +90,22 @@ def test_wide_colours_of_a_phones_hdr_video_are_brought_to_srgb() -> None:
 
 
 @pytest.mark.parametrize(("degrees", "top"), [(90, "left"), (180, "bottom"), (270, "right")])
-def test_a_phone_held_upright(tmp_path: Path, degrees: int, top: str) -> None:
+def test_a_phone_held_upright_and_the_file_s_times(tmp_path: Path, degrees: int, top: str) -> None:
     card = np.zeros((64, 96, 3), np.uint8)
     edges = {"bottom": np.s_[-12:], "left": np.s_[:, :12], "right": np.s_[:, -12:]}
     card[edges[top]] = 255
-    path = tmp_path / "a.mp4"
-    write_video(path, [card] * 2, quality=1)
+    path, times = tmp_path / "a.mp4", [0, 0.1, 0.15, 0.9, 0.95]
+    write_video(path, [card] * 5, quality=1, times=times)
     turn(path, degrees)
-    frame = next(iter(frames_of(path)))
+    frame, *others = frames_of(path)
+    assert [one.time for one in (frame, *others)] == pytest.approx(times, abs=2e-3)
+    assert expected_frames(path) == 5
     codes = frame.codes()
     assert frame.size == video_size(path) == (codes.shape[1], codes.shape[0])
     assert codes.shape[:2] == ((64, 96) if degrees == 180 else (96, 64))
     # Turned clockwise, what was on the left is above.
     assert codes[4:8, 20:-20].min() > 240
     assert codes[-12:, 20:-20].max() < 15
-
-
-def test_time_is_that_of_the_file(tmp_path: Path) -> None:
-    times, path = [0, 0.1, 0.15, 0.9, 0.95], tmp_path / "a.mp4"
-    write_video(path, [CARD] * 5, times=times)
-    assert [frame.time for frame in frames_of(path)] == pytest.approx(times, abs=2e-3)
-    assert expected_frames(path) == 5
 
 
 def test_what_is_no_video_is_refused(tmp_path: Path) -> None:
@@ -142,7 +144,7 @@ def chosen(path: list[tuple[float, float]], blurred: int | None = None) -> list[
     frames = [grey(*place) for place in path]
     if blurred is not None:
         frames[blurred] = cv2.GaussianBlur(frames[blurred], (15, 15), 4)
-    return [one.number for one in choose_frames(enumerate(frames))]
+    return choose_frames(enumerate(frames))
 
 
 def test_walking_gives_frames_at_even_distances_at_any_speed() -> None:
@@ -223,7 +225,10 @@ def test_by_number(film: Path, tmp_path: Path) -> None:
     few = read(film, tmp_path, every=10, max_frames=3)
     assert [path.name for path in few.paths] == ["000000.png", "000020.png", "000040.png"]
     assert "thinned from 5 (--max-frames)" in few.notes[0]
-    assert thinned(list(range(10)), 20) == list(range(10))
+    assert find_scene(film, DataConfig()) == (film,)
+    surveyed = survey(film, DataConfig())
+    assert surveyed.format == "video"
+    assert (surveyed.cameras[0].photographs, surveyed.cameras[0].size) == (50, (240, 136))
 
 
 def test_one_frame_no_motion_or_half_a_file(tmp_path: Path) -> None:
@@ -249,10 +254,3 @@ def test_hdr_and_rotation_reach_the_photographs(tmp_path: Path) -> None:
     assert found.known == "HLG video"
     stored = cv2.imread(str(found.paths[0]), cv2.IMREAD_UNCHANGED)
     assert (stored.dtype, stored.shape) == (np.uint16, (240, 136, 3))
-
-
-def test_a_video_is_a_scene(film: Path) -> None:
-    assert find_scene(film, DataConfig()) == (film,)
-    found = survey(film, DataConfig())
-    assert found.format == "video"
-    assert (found.cameras[0].photographs, found.cameras[0].size) == (50, (240, 136))

@@ -18,8 +18,9 @@ from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.seeds import camera_centers
 from p2gs_jax.render.warp import project_points
+from p2gs_jax.scene.split import only
 from p2gs_jax.scene.visibility import in_frame
-from p2gs_jax.types import Scene, Tracks, View
+from p2gs_jax.types import Scene, View
 
 # A block reaches beyond its core by this share of the shortest core.
 OVERLAP = 0.15
@@ -237,15 +238,7 @@ def whole_of(scene: Scene, cut: Cut, number: int) -> tuple[Scene, Int[np.ndarray
     distance = block.distance(places[beyond]) - cut.margin
     coarse = beyond[thinned(scene.points[beyond], distance)]
     keep = np.concatenate([np.flatnonzero(near), coarse])
-    colors = scene.point_colors
-    found = replace(
-        scene,
-        views=tuple(scene.views[i] for i in rows),
-        points=scene.points[keep],
-        point_colors=None if colors is None else colors[keep],
-        tracks=_tracks(scene, rows, keep),
-        notes=(),
-    )
+    found = replace(only(scene, rows, keep), notes=())
     return found, keep, int(near.sum())
 
 
@@ -275,20 +268,3 @@ def thinned(
     keys = np.concatenate([level[:, None], cube], 1)
     _, first = np.unique(keys, axis=0, return_index=True)
     return np.sort(first)
-
-
-def _tracks(
-    scene: Scene, rows: Int[np.ndarray, " k"], keep: Int[np.ndarray, " p"]
-) -> Tracks | None:
-    """Return the observations that are left, under the new rows of views and points."""
-    tracks = scene.tracks
-    if tracks is None:
-        return None
-    view, point = np.full(len(scene.views), -1), np.full(len(scene.points), -1)
-    view[rows], point[keep] = np.arange(len(rows)), np.arange(len(keep))
-    left: Bool[np.ndarray, " o"] = (view[tracks.view_indices] >= 0) & (
-        point[tracks.point_indices] >= 0
-    )
-    return Tracks(
-        view[tracks.view_indices[left]], point[tracks.point_indices[left]], tracks.xy[left]
-    )

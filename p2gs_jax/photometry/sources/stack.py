@@ -13,7 +13,7 @@ from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.sources.sampling import sample
-from p2gs_jax.scene.convert.headers import read_exif_ev
+from p2gs_jax.scene.convert.readers import read_exif_ev
 from p2gs_jax.types import View
 
 POINTS, CANDIDATES = 4000, 40_000

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -25,11 +26,10 @@ from PIL import ExifTags, Image
 
 from p2gs_jax.core.atomic import atomic_write, write_text
 from p2gs_jax.errors import broken
-from p2gs_jax.scene.cache import Report, cached_folder, file_fingerprints
-from p2gs_jax.scene.convert.heif import read_heif
-from p2gs_jax.scene.convert.icc import GAIN_MAP_UNUSED, encode_16
-from p2gs_jax.scene.convert.kinds import Kind, Picture, has_gain_map, kind_of
-from p2gs_jax.scene.convert.linear import Balance, read_exr, read_facts, read_float_tiff, read_raw
+from p2gs_jax.scene.convert import readers
+from p2gs_jax.scene.convert.icc import encode_16
+from p2gs_jax.scene.convert.readers import Balance, Kind, Picture, kind_of
+from p2gs_jax.scene.files import Report, cached_folder, file_fingerprints
 from p2gs_jax.scene.masks import mask_of
 from p2gs_jax.types import Scene
 
@@ -42,11 +42,9 @@ _NAMES: dict[Kind, str] = {
     "avif": "AVIF",
     "webp": "WebP",
     "exr": "linear EXR",
-    "float_tiff": "TIFF of floats",
 }
 # Where one shot has two files, the first of these kinds is used: it holds most of the light.
-_RANK: tuple[Kind, ...] = ("exr", "float_tiff", "raw", "heif", "avif", "webp", "plain")
-_LINEAR = ("exr", "float_tiff")
+_RANK: tuple[Kind, ...] = ("exr", "raw", "heif", "avif", "webp", "plain")
 # In light of files without a white of their own, what fewer pixels exceed is saturated, percent.
 _BRIGHT = 99.9
 _DARK = 0.25
@@ -95,11 +93,10 @@ def convert_photographs(
         path: name if kinds[path] == "plain" else Path(name).with_suffix(".png").as_posix()
         for path, name in names.items()
     }
-    target, record = _converted(folder, kinds, places, work_dir, report)
+    target, more, known = _converted(folder, kinds, places, work_dir, report)
     paths = sorted((target / place for place in places.values()), key=lambda p: p.as_posix())
-    known, mixed = _known(record, kinds)
     originals = {place: path for path, place in places.items()}
-    return Converted(target, paths, originals, (*notes, *record["notes"], *mixed), known)
+    return Converted(target, paths, originals, (*notes, *more), known)
 
 
 def with_originals(scene: Scene, converted: Converted) -> Scene:
@@ -128,22 +125,18 @@ def converted_views(scene: Scene, work_dir: Path | None, report: Report) -> Scen
     package for it is missing.
     """
     kinds: dict[Path, Kind] = {v.image_path: kind_of(v.image_path) for v in scene.views}
-    wanted: dict[Path, Kind] = {path: kind for path, kind in kinds.items() if kind != "plain"}
-    if not wanted:
-        return scene
     # A suffix more keeps photographs apart that differ in theirs.
-    places = {v.image_path: v.name + ".png" for v in scene.views if v.image_path in wanted}
-    target, record = _converted(scene.root, wanted, places, work_dir, report)
-    views = list(scene.views)
-    for k, view in enumerate(views):
-        if view.image_path in places:
-            path, mask = target / places[view.image_path], view.mask_path or mask_of(view)
-            views[k] = dataclasses.replace(view, image_path=path, mask_path=mask)
-    known, mixed = _known(record, kinds)
-    notes = (*scene.notes, *record["notes"], *mixed)
-    if len(wanted) < len(kinds):
-        known = scene.known_response
-    return dataclasses.replace(scene, views=tuple(views), notes=notes, known_response=known)
+    places = {v.image_path: v.name + ".png" for v in scene.views if kinds[v.image_path] != "plain"}
+    if not places:
+        return scene
+    target, notes, known = _converted(scene.root, kinds, places, work_dir, report)
+    paths = {path: target / place for path, place in places.items()}
+    views = tuple(
+        dataclasses.replace(view, image_path=paths.get(view.image_path, view.image_path))
+        for view in scene.views
+    )
+    notes = (*scene.notes, *notes)
+    return dataclasses.replace(scene, views=views, notes=notes, known_response=known)
 
 
 def cache_of(root: Path, work_dir: Path | None) -> Path:
@@ -152,15 +145,6 @@ def cache_of(root: Path, work_dir: Path | None) -> Path:
         return work_dir
     scene = hashlib.sha256(str(root.resolve()).encode()).hexdigest()[:16]
     return platformdirs.user_cache_path("p2gs-jax") / "photographs" / scene
-
-
-def _known(record: dict[str, Any], kinds: Mapping[Path, Kind]) -> tuple[str | None, list[str]]:
-    """Return why the response of all photographs is known, or None, and what there is to say."""
-    if not record["known"] or "plain" not in kinds.values():
-        return record["known"], []
-    listed = _listed(_NAMES.get(kind, "others") for kind in kinds.values())
-    note = f"Photographs are of several kinds ({listed}): the tone curve is not known for all, "
-    return None, [note + "and is chosen for all."]
 
 
 def _listed(names: Iterable[str]) -> str:
@@ -192,17 +176,25 @@ def _converted(
     places: Mapping[Path, str],
     work_dir: Path | None,
     report: Report,
-) -> tuple[Path, dict[str, Any]]:
-    """Fill a folder with the photographs at their places; return it and the record of it."""
+) -> tuple[Path, list[str], str | None]:
+    """Fill a folder with photographs at their places, and return it.
+
+    With it come notes, and why the response of all photographs is known, or None.
+    """
     names = list(places.values())
     key = {"version": _VERSION, "files": file_fingerprints(list(places)), "places": names}
 
     def build(folder: Path) -> None:
-        record = _Converter(kinds).fill(folder, places, report)
+        record = _Converter({path: kinds[path] for path in places}).fill(folder, places, report)
         write_text(folder / _RECORD, json.dumps(record, indent=1))
 
     with cached_folder(cache_of(root, work_dir), _FOLDER, key, build) as folder:
-        return folder, json.loads((folder / _RECORD).read_text())
+        record = json.loads((folder / _RECORD).read_text())
+    if not record["known"] or "plain" not in kinds.values():
+        return folder, record["notes"], record["known"]
+    listed = _listed(_NAMES.get(kind, "others") for kind in kinds.values())
+    note = f"Photographs are of several kinds ({listed}): the tone curve is not known for all, "
+    return folder, [*record["notes"], note + "and is chosen for all."], None
 
 
 class _Converter:
@@ -210,16 +202,16 @@ class _Converter:
 
     def __init__(self, kinds: Mapping[Path, Kind]):
         self._kinds = kinds
-        self._facts = {p: read_facts(p) for p, kind in kinds.items() if kind == "raw"}
-        chosen: dict[str, list[Balance]] = defaultdict(list)
+        self._facts = {p: readers.read_facts(p) for p, kind in kinds.items() if kind == "raw"}
+        self._chosen: dict[str, list[Balance]] = defaultdict(list)
         for facts in self._facts.values():
             if facts.balance is not None:
-                chosen[facts.camera].append(facts.balance)
+                self._chosen[facts.camera].append(facts.balance)
         # One for each camera: the median of what it chose.
-        self._balances: dict[str, Balance] = {}
-        for camera, balances in chosen.items():
-            red, green, blue = np.exp(np.median(np.log(balances), axis=0)).tolist()
-            self._balances[camera] = (red, green, blue)
+        self._balances: dict[str, Balance] = {
+            camera: tuple(np.exp(np.median(np.log(balances), axis=0)).tolist())
+            for camera, balances in self._chosen.items()
+        }
         self._scale = self._common_scale()
 
     def fill(self, folder: Path, places: Mapping[Path, str], report: Report) -> dict[str, Any]:
@@ -243,7 +235,7 @@ class _Converter:
         """Return the factor on files of light that have no white of their own, a power of 2."""
         brightest = 0.0
         for path, kind in self._kinds.items():
-            if kind in _LINEAR:
+            if kind == "exr":
                 light = self._read(path).light
                 assert light is not None
                 brightest = max(brightest, float(np.percentile(light[::3, ::3].max(2), _BRIGHT)))
@@ -252,23 +244,18 @@ class _Converter:
         return 2.0 ** -math.ceil(math.log2(brightest))
 
     def _read(self, path: Path) -> Picture:
-        kind = self._kinds[path]
-        if kind == "raw":
-            return read_raw(path, self._balances.get(self._facts[path].camera))
-        if kind in ("heif", "avif", "webp"):
-            return read_heif(path)
-        return read_exr(path) if kind == "exr" else read_float_tiff(path)
+        if path in self._facts:
+            return readers.read_raw(path, self._balances.get(self._facts[path].camera))
+        return (readers.read_exr if self._kinds[path] == "exr" else readers.read_heif)(path)
 
     def _write(self, path: Path, target: Path) -> dict[str, Any]:
         """Convert one photograph; return its entry in the record."""
         picture, kind = self._read(path), self._kinds[path]
-        lit = picture.light is not None
-        record: dict[str, Any] = {"kind": kind, "light": lit, "gain_map": has_gain_map(path)}
+        record: dict[str, Any] = {"kind": kind, "light": picture.light is not None}
         if picture.light is None:
-            assert picture.codes is not None
             write_png(target, picture.codes, picture.exif, picture.profile)
             return record
-        scale = self._scale if kind in _LINEAR else 1.0
+        scale = self._scale if kind == "exr" else 1.0
         light = picture.light * np.float32(scale)
         codes = encode_16(light)
         if picture.alpha is not None:
@@ -285,11 +272,11 @@ class _Converter:
     def _notes(self, records: Sequence[Mapping[str, Any]]) -> list[str]:
         out = [f"Converted into the run's cache: {_listed(_NAMES[r['kind']] for r in records)}."]
         for camera, balance in self._balances.items():
-            facts = [f for f in self._facts.values() if f.camera == camera]
-            chosen = np.log2([f.balance for f in facts if f.balance is not None])
+            count = sum(f.camera == camera for f in self._facts.values())
+            chosen = np.log2(self._chosen[camera])
             spread = float(np.ptp(chosen - chosen[:, 1:2], axis=0).max())
             out.append(
-                f"White balance of {len(facts)} raw photographs ({camera or 'camera unknown'}): "
+                f"White balance of {count} raw photographs ({camera or 'camera unknown'}): "
                 f"red {balance[0]:.3f}, blue {balance[2]:.3f} for all, the median of what the "
                 f"camera chose, which varied by {spread:.2f} EV."
             )
@@ -299,7 +286,6 @@ class _Converter:
             ),
             "raw photographs are of a camera whose colours LibRaw does not know: they stay in the "
             "camera's own primaries.": sum(not f.matrix for f in self._facts.values()),
-            f"of them {GAIN_MAP_UNUSED}": sum(r["gain_map"] for r in records),
             "pixels of linear photographs are not numbers; they count as black.": sum(
                 r.get("invalid", 0) for r in records
             ),
@@ -313,14 +299,14 @@ class _Converter:
 
 def _link(source: Path, target: Path) -> None:
     """Make a file appear at another place; file systems without links copy it."""
-    why: object = None
-    for place in (os.symlink, os.link, shutil.copyfile):
-        try:
-            place(source, target)
+    try:
+        with contextlib.suppress(OSError):
+            os.symlink(source, target)
             return
-        except OSError as error:
-            why = error.strerror or error
-    raise broken(source, f"cannot be copied to {target}: {why}.", _NO_ROOM)
+        shutil.copyfile(source, target)
+    except OSError as error:
+        why = f"cannot be copied to {target}: {error.strerror or error}."
+        raise broken(source, why, _NO_ROOM) from None
 
 
 def write_png(

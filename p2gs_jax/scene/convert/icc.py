@@ -7,6 +7,7 @@ and phones write are. A photograph with another profile is used as it is, which 
 
 from __future__ import annotations
 
+import contextlib
 import io
 import struct
 from collections import Counter
@@ -17,10 +18,9 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, UInt
-from PIL import Image
+from PIL import Image, ImageCms
 
 from p2gs_jax.core.numerics import srgb_encode
-from p2gs_jax.scene.convert.kinds import has_gain_map
 
 Transfer = Literal["linear", "hlg", "pq"]
 
@@ -54,9 +54,6 @@ _INTEROPERABILITY, _INTEROP_INDEX = 0xA005, 1
 # How DCF marks Adobe RGB where there is no profile.
 _DCF_OPTION = "R03"
 _ENTRIES = 1024
-GAIN_MAP_UNUSED = (
-    "carry a gain map for bright displays; the photograph itself is used, the map is not."
-)
 
 
 def to_light(signal: Float[np.ndarray, "..."], transfer: Transfer) -> Float[np.ndarray, "..."]:
@@ -132,18 +129,18 @@ def adobe_rgb() -> Profile:
 def read_profile(data: bytes) -> Profile | None:
     """Return the colour space that an ICC profile describes; None: sRGB, grey or broken."""
     try:
-        tags = _tags(data)
-        if data[16:20] != b"RGB ":
+        header = ImageCms.ImageCmsProfile(io.BytesIO(data)).profile
+        if header.xcolor_space.strip() != "RGB":
             return None
-        name = _text(tags.get(b"desc", b"")) or "unnamed"
-        if not {b"rXYZ", b"gXYZ", b"bXYZ", b"rTRC", b"gTRC", b"bTRC"} <= tags.keys():
+        name, tags = header.profile_description or "unnamed", _tags(data)
+        colorants = (header.red_colorant, header.green_colorant, header.blue_colorant)
+        if None in colorants or not {b"rTRC", b"gTRC", b"bTRC"} <= tags.keys():
             return Profile(name)
-        columns = [_xyz(tags[key]) for key in (b"rXYZ", b"gXYZ", b"bXYZ")]
         curves = [_curve(tags[key]) for key in (b"rTRC", b"gTRC", b"bTRC")]
-    except (struct.error, ValueError, IndexError):
+    except (OSError, struct.error, ValueError, IndexError):
         return None
-    srgb = rgb_to_xyz(BT709)
-    matrix = np.linalg.inv(srgb) @ adapted(_PCS_WHITE, srgb.sum(1)) @ np.stack(columns, 1)
+    srgb, columns = rgb_to_xyz(BT709), np.stack([xyz for xyz, _ in colorants], 1)
+    matrix = np.linalg.inv(srgb) @ adapted(_PCS_WHITE, srgb.sum(1)) @ columns
     decode, grid = np.stack(curves, 1), np.linspace(0, 1, _ENTRIES)[:, None]
     curves_alike = np.abs(srgb_encode(decode) - grid).max() < _INVISIBLE
     is_srgb = curves_alike and np.abs(matrix - np.eye(3)).max() < _INVISIBLE
@@ -194,27 +191,9 @@ def with_profile_applied(
 
 
 def _tags(data: bytes) -> dict[bytes, bytes]:
-    if data[36:40] != b"acsp":
-        raise ValueError("not a profile")
     (count,) = struct.unpack(">I", data[128:132])
     rows = (struct.unpack(">4sII", data[132 + 12 * k : 144 + 12 * k]) for k in range(count))
     return {key: data[start : start + size] for key, start, size in rows}
-
-
-def _text(tag: bytes) -> str:
-    if tag[:4] == b"desc":
-        (size,) = struct.unpack(">I", tag[8:12])
-        return tag[12 : 12 + size].decode("latin-1").strip("\0 ")
-    if tag[:4] == b"mluc":
-        size, start = struct.unpack(">II", tag[20:28])
-        return tag[start : start + size].decode("utf-16-be", "replace").strip("\0 ")
-    return ""
-
-
-def _xyz(tag: bytes) -> Float[np.ndarray, " 3"]:
-    if tag[:4] != b"XYZ ":
-        raise ValueError("not a colour")
-    return np.array(struct.unpack(">3i", tag[8:20])) / 65536
 
 
 def _curve(tag: bytes) -> Float[np.ndarray, " n"]:
@@ -244,23 +223,16 @@ def _curve(tag: bytes) -> Float[np.ndarray, " n"]:
 
 
 def colour_notes(paths: Iterable[Path]) -> tuple[str, ...]:
-    """Return what the user should know of profiles and gain maps; headers are read, no pixels."""
-    applied, kept, maps = Counter[str](), Counter[str](), 0
+    """Return what the user should know of colour profiles; headers are read, no pixels."""
+    found = Counter[tuple[str, bool]]()
     for path in paths:
-        maps += has_gain_map(path)
-        try:
-            with Image.open(path) as image:
-                profile = profile_of(image)
-        except Exception:  # whoever decodes it complains
-            continue
-        if profile is not None:
-            (kept if profile.decode is None else applied)[profile.name] += 1
-    out = [
-        f"{n} photographs are in {name}; they are converted to sRGB." for name, n in applied.items()
-    ]
-    out += [
+        with contextlib.suppress(Exception), Image.open(path) as image:  # who decodes it complains
+            if (profile := profile_of(image)) is not None:
+                found[profile.name, profile.decode is None] += 1
+    return tuple(
         f"{n} photographs have the colour profile {name}, made of tables, which is not applied: "
         "their colours count as sRGB."
-        for name, n in kept.items()
-    ]
-    return (*out, f"{maps} photographs {GAIN_MAP_UNUSED}") if maps else tuple(out)
+        if tables
+        else f"{n} photographs are in {name}; they are converted to sRGB."
+        for (name, tables), n in found.items()
+    )

@@ -15,7 +15,7 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.cache import Report
+from p2gs_jax.scene.files import Report
 from p2gs_jax.scene.drives.ego_mask import find_ego_masks
 from p2gs_jax.scene.drives.lidar import MOST_MEASURED, owners, seeds, thinned
 from p2gs_jax.scene.drives.recording import (

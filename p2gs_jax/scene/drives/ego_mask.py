@@ -22,9 +22,8 @@ from scipy.sparse import coo_array, csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from p2gs_jax.core.atomic import atomic_write
-from p2gs_jax.scene.cache import Report, cached_folder
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera
-from p2gs_jax.scene.files import decode_grey, undecodable
+from p2gs_jax.scene.files import Report, cached_folder, decode_grey, undecodable
 from p2gs_jax.scene.lens import scale_intrinsics, undistort_points
 from p2gs_jax.scene.rigid import inverse, up_of_drive
 from p2gs_jax.types import Distortion

@@ -1,8 +1,7 @@
 """Decoded photographs in files that are mapped into memory: the system drops and reads pages.
 
 A folder for every size holds a record of NumPy's for every photograph, named by all that its pixels
-depend on. Processes fill the files before they are asked for. They run this module:
-`multiprocessing` would run the caller's script again, or fork a process in which JAX has threads.
+depend on. Threads fill the files before they are asked for.
 """
 
 from __future__ import annotations
@@ -10,11 +9,8 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
-import pickle
 import shutil
-import subprocess
-import sys
-import tempfile
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,15 +19,13 @@ import numpy as np
 
 from p2gs_jax.core.atomic import BROKEN_ARRAYS, atomic_write
 from p2gs_jax.errors import UserError
+from p2gs_jax.scene.files import file_fingerprints
 from p2gs_jax.scene.pixels.decode import Decoded, decode, resamples
 from p2gs_jax.types import View
 
 # Any change of what pixels come out of `decode` raises it.
 _VERSION = 2
-MOST_PROCESSES = 4
-# Starting a process takes as long as decoding some dozens.
-FEWEST = 64
-_STOPPING_S = 5.0
+MOST_THREADS = 4
 
 
 class Key(NamedTuple):
@@ -74,8 +68,18 @@ class PixelFiles:
 
         Raises UserError: the disk is full, or cannot be written.
         """
+        arrays = {name: array for name, array in vars(photograph).items() if array is not None}
+        kind = np.dtype([(name, array.dtype, array.shape) for name, array in arrays.items()])
+        header: dict[str, Any] = {"fortran_order": False, "shape": (1,)}
+        header["descr"] = np.lib.format.dtype_to_descr(kind)
+        parts = (np.ascontiguousarray(array).data.cast("B") for array in arrays.values())
         try:
-            write_photograph(self.path(key), photograph)
+            with (
+                atomic_write(self.path(key), durable=False) as temporary,
+                temporary.open("wb") as f,
+            ):
+                np.lib.format.write_array_header_1_0(f, header)
+                f.writelines(parts)
         except OSError as error:
             why = f"decoded photographs cannot be written to {self.folder}: "
             fix = "make room on that disk or name another --out; or give --data.cache-mb the "
@@ -99,17 +103,6 @@ class PixelFiles:
                 fix=f"make room on that disk or name another --out; or --data.cache-mb {wanted}, "
                 "if there is so much memory, or a smaller --max-width",
             )
-
-
-def write_photograph(path: Path, photograph: Decoded) -> None:
-    """Write a decoded photograph as a record; raises OSError where the disk cannot be written."""
-    arrays = {name: array for name, array in vars(photograph).items() if array is not None}
-    kind = np.dtype([(name, array.dtype, array.shape) for name, array in arrays.items()])
-    header: dict[str, Any] = {"fortran_order": False, "shape": (1,)}
-    header["descr"] = np.lib.format.dtype_to_descr(kind)
-    with atomic_write(path, durable=False) as temporary, temporary.open("wb") as file:
-        np.lib.format.write_array_header_1_0(file, header)
-        file.writelines(np.ascontiguousarray(array).data.cast("B") for array in arrays.values())
 
 
 def file_bytes(view: View, size: tuple[int, int]) -> int:
@@ -138,68 +131,39 @@ def _digest(view: View, bonnets: dict[int, str]) -> str:
 
 def _fingerprint(path: Path) -> tuple[str, int, int]:
     """Return path, size and time of a file; of a missing one, what no file has."""
-    try:
-        stat = os.stat(path)
-    except OSError:
-        return os.path.abspath(path), -1, -1
-    return os.path.abspath(path), stat.st_size, stat.st_mtime_ns
+    return file_fingerprints([path])[0] if path.exists() else (str(path), -1, -1)
 
 
-def decode_ahead(
-    views: Sequence[View], files: PixelFiles, keys: Sequence[Sequence[Key]]
-) -> list[subprocess.Popen[bytes]]:
-    """Start processes that decode what the files lack; none for a few photographs.
+class DecodingAhead:
+    """Threads that decode what the files lack; they end with the main thread at the latest.
 
-    `keys` are for every view the sizes that will be asked for. What a process cannot decode is left
-    to the caller that asks for it, and that gets the error.
+    What they cannot decode is left to the caller that asks for it, and that gets the error.
     """
-    jobs = []
-    for view, sizes in zip(views, keys, strict=True):
-        lacking = [key for key in sizes if not files.path(key).exists()]
-        if lacking:
-            jobs.append((view, [key[1:] for key in lacking], [files.path(key) for key in lacking]))
-    if len(jobs) < FEWEST:
-        return []
-    count = min(max(1, (os.cpu_count() or 1) // 2), MOST_PROCESSES)
-    processes = []
-    for first in range(count):
-        with tempfile.TemporaryFile() as given:
-            pickle.dump(jobs[first::count], given)
-            given.seek(0)
-            # In a session of its own: an interrupt at the terminal is the caller's to handle.
-            process = subprocess.Popen(
-                [sys.executable, "-m", "p2gs_jax.scene.pixels.cache"],
-                stdin=given,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-                env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-                start_new_session=True,
-            )
-            processes.append(process)
-    return processes
+
+    def __init__(self, views: Sequence[View], files: PixelFiles, keys: Sequence[Sequence[Key]]):
+        """Begin; `keys` are for every view the sizes that will be asked for."""
+        self._jobs = list(zip(reversed(views), reversed(keys), strict=True))
+        count = min(max(1, (os.cpu_count() or 1) // 2), MOST_THREADS)
+        given = (self._jobs, files)
+        self._threads = [threading.Thread(target=_decode, args=given) for _ in range(count)]
+        for thread in self._threads:
+            thread.start()
+
+    def stop(self) -> None:
+        """End the threads; what they had not begun is left."""
+        self._jobs.clear()
+        for thread in self._threads:
+            thread.join()
 
 
-def stop(processes: Sequence[subprocess.Popen[bytes]]) -> None:
-    """End the processes; what they had not begun is left."""
-    for process in processes:
-        process.terminate()
-    for process in processes:
-        process.wait(_STOPPING_S)
-
-
-def _serve() -> None:
-    """Decode the pickled jobs in standard input, as long as whoever started this process lives."""
-    caller = os.getppid()
-    for view, sizes, paths in pickle.load(sys.stdin.buffer):
-        if os.getppid() != caller:
+def _decode(jobs: list[tuple[View, Sequence[Key]]], files: PixelFiles) -> None:
+    while threading.main_thread().is_alive():
+        try:
+            view, keys = jobs.pop()
+        except IndexError:
             return
-        if all(path.exists() for path in paths):
-            continue
-        # The caller that asks for the photograph meets the same error, and reports it.
-        with contextlib.suppress(UserError, OSError):
-            for path, photograph in zip(paths, decode(view, sizes), strict=True):
-                write_photograph(path, photograph)
-
-
-if __name__ == "__main__":
-    _serve()
+        lacking = [key for key in keys if not files.path(key).exists()]
+        with contextlib.suppress(UserError):
+            found = decode(view, [key[1:] for key in lacking]) if lacking else []
+            for key, photograph in zip(lacking, found, strict=True):
+                files.write(key, photograph)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import copy
 import shutil
-import subprocess
 import threading
 import weakref
 from collections import OrderedDict
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float32, UInt
@@ -20,7 +20,7 @@ from p2gs_jax.core.numerics import on_device
 from p2gs_jax.scene.drives.objects import MARGIN, MovingObjects, outlines, painted
 from p2gs_jax.scene.lens import scale_intrinsics
 from p2gs_jax.scene.masks import RANDOM, background_color
-from p2gs_jax.scene.pixels.cache import Key, PixelFiles, decode_ahead, file_bytes, stop
+from p2gs_jax.scene.pixels.cache import DecodingAhead, Key, PixelFiles, file_bytes
 from p2gs_jax.scene.pixels.decode import Decoded, decode, floats
 from p2gs_jax.types import Camera, Placement, TrackedObject, View
 
@@ -89,19 +89,16 @@ class ImageStore:
                 shutil.rmtree(folder, ignore_errors=True)
         self._photographs = _DecodedPhotographs(self.views, limit, files)
         self._placements: dict[int, Placement] = {}
-        self._leave_out(objects, MARGIN)
+        self._objects, self._margin = _moving(objects), MARGIN
+        self._outlines: dict[int, list[np.ndarray]] = {}
 
     def leaving_out(self, objects: Sequence[TrackedObject], margin: float = MARGIN) -> ImageStore:
         """Return a store of the same photographs without the boxes of other objects that move."""
-        other = copy.copy(self)
-        other._leave_out(objects, margin)
-        return other
+        return self._with(_objects=_moving(objects), _margin=margin, _outlines={})
 
     def placing(self, moving: MovingObjects | None) -> ImageStore:
         """Return a store of the same photographs whose cameras see moving objects."""
-        other = copy.copy(self)
-        other.moving, other._placements = moving, {}
-        return other
+        return self._with(moving=moving, _placements={})
 
     @property
     def backdrop_values(self) -> tuple[float, float, float] | None:
@@ -113,11 +110,7 @@ class ImageStore:
 
     def only_opaque(self) -> ImageStore:
         """Return a store of the same photographs without pixels that a background shows through."""
-        if self.backdrop is None:
-            return self
-        other = copy.copy(self)
-        other._only_opaque = True
-        return other
+        return self if self.backdrop is None else self._with(_only_opaque=True)
 
     @property
     def cached_bytes(self) -> int:
@@ -206,9 +199,14 @@ class ImageStore:
     def _decoded(self, index: int, shrink: float) -> Decoded:
         return self._photographs.get(self._key(index, shrink))
 
-    def _leave_out(self, objects: Sequence[TrackedObject], margin: float) -> None:
-        self._objects, self._margin = tuple(o for o in objects if o.moving), margin
-        self._outlines: dict[int, list[np.ndarray]] = {}
+    def _with(self, **changed: Any) -> ImageStore:
+        other = copy.copy(self)
+        vars(other).update(changed)
+        return other
+
+
+def _moving(objects: Sequence[TrackedObject]) -> tuple[TrackedObject, ...]:
+    return tuple(thing for thing in objects if thing.moving)
 
 
 def camera_of(store: ImageStore, index: int, shrink: float = 1.0) -> Camera:
@@ -232,8 +230,7 @@ class _DecodedPhotographs:
         self._bytes = 0
         self._pending: dict[Key, Future[Decoded]] = {}
         self._lock = threading.Lock()
-        self._expected: Sequence[Sequence[Key]] = [()] * len(views)
-        self._ahead: list[subprocess.Popen[bytes]] = []
+        self._ahead: DecodingAhead | None = None
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="decode")
 
     @property
@@ -259,14 +256,13 @@ class _DecodedPhotographs:
 
     def expect(self, keys: Sequence[Sequence[Key]]) -> None:
         """Begin to decode what will be asked for into the files; without files nothing happens."""
-        if self._files is None:
-            return
-        self._expected = keys
-        self._ahead = decode_ahead(self.views, self._files, self._expected)
-        weakref.finalize(self, stop, self._ahead)
+        if self._files is not None:
+            self._ahead = DecodingAhead(self.views, self._files, keys)
+            weakref.finalize(self, self._ahead.stop)
 
     def close(self) -> None:
-        stop(self._ahead)
+        if self._ahead is not None:
+            self._ahead.stop()
         self._worker.shutdown(wait=True, cancel_futures=True)
         with self._lock:
             self._cache.clear()
@@ -274,13 +270,14 @@ class _DecodedPhotographs:
             self._bytes = 0
 
     def _load(self, key: Key) -> Decoded:
-        files, entry = self._files, None
-        if files is not None:
-            entry = files.read(key)
+        entry = None if self._files is None else self._files.read(key)
+        decoded = entry is None
         if entry is None:
-            sizes = (k for k in self._expected[key.view] if k != key)
-            entry = self._decoded(key, *(k for k in sizes if files and not files.path(k).exists()))
+            (entry,) = decode(self.views[key.view], [(key.width, key.height)])
+            if self._files is not None:
+                entry = self._files.write(key, entry)
         with self._lock:
+            self.decodings += decoded
             if key not in self._cache:
                 self._cache[key] = entry
                 self._bytes += entry.nbytes
@@ -288,13 +285,3 @@ class _DecodedPhotographs:
                 _, dropped = self._cache.popitem(last=False)
                 self._bytes -= dropped.nbytes
         return entry
-
-    def _decoded(self, *keys: Key) -> Decoded:
-        """Return a photograph; further sizes of it go into the files."""
-        found = decode(self.views[keys[0].view], [(key.width, key.height) for key in keys])
-        with self._lock:
-            self.decodings += len(keys)
-        if self._files is None:
-            return found[0]
-        mapped = [self._files.write(key, one) for key, one in zip(keys, found, strict=True)]
-        return mapped[0]

@@ -1,7 +1,7 @@
 """SIFT features and matches in a COLMAP database, and which pairs of images to match.
 
-The database of `kept_features` outlives what is made of it: another mapper, an interruption or ten
-photographs more cost only what is new. It is thrown away where a photograph changed or is gone.
+The database of `kept_features` outlives what is made of it: an interruption or ten photographs
+more cost only what is new. It is thrown away where a photograph changed or is gone.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from jaxtyping import Float
 from p2gs_jax.config import Matching
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.cache import Report, file_fingerprints, stage_progress
 from p2gs_jax.scene.colmap import subfolder
+from p2gs_jax.scene.files import Report, file_fingerprints, stage_progress
 from p2gs_jax.scene.rigid import camera_centers
 
 MAX_IMAGE_SIZE = 1600
@@ -158,13 +158,13 @@ def kept_features(
 
 def match_kept(
     database: Path, names: Sequence[str], pairs: Sequence[Pair] | None, report: Report
-) -> int:
-    """Match what is not matched yet, of these pairs or of all; return how many there are in all."""
+) -> None:
+    """Match what is not matched yet, of these pairs or of all."""
     wanted = list(combinations(sorted(names), 2)) if pairs is None else list(pairs)
     if not _quotable(names):
         report(f"matching: {len(wanted)} image pairs")
         match(database, pairs)
-        return len(wanted)
+        return
     with opened(database) as db:
         ids = {image.name: image.image_id for image in db.read_all_images()}
         known = ((a, b) for a, b in wanted if a in ids and b in ids)
@@ -175,7 +175,6 @@ def match_kept(
     for start in range(0, len(left), PAIRS_AT_ONCE):
         match(database, left[start : start + PAIRS_AT_ONCE])
         progress(start + PAIRS_AT_ONCE)
-    return len(wanted)
 
 
 def _continues(path: Path, record: dict) -> bool:

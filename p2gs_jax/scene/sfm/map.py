@@ -1,39 +1,43 @@
-"""Cameras, points and tracks from nothing but photographs, and why some did not register."""
+"""Cameras, points and tracks from photographs alone, or points and tracks from known poses."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import shutil
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 import pycolmap
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.atomic import write_json
-from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.errors import UserError, broken
-from p2gs_jax.scene.cache import Report, cached_folder, file_fingerprints, stage_progress
-from p2gs_jax.scene.colmap import load_colmap, subfolder
-from p2gs_jax.scene.convert.headers import read_exif_camera
-from p2gs_jax.scene.files import image_size
-from p2gs_jax.scene.sfm.features import (
-    kept_features,
-    match_kept,
-    opened,
-    pairs_by_name,
-    quiet_colmap,
+from p2gs_jax.scene.colmap import load_colmap, read_model, subfolder, tracks_of
+from p2gs_jax.scene.convert.readers import read_exif_camera
+from p2gs_jax.scene.files import (
+    Report,
+    cached_folder,
+    file_fingerprints,
+    image_size,
+    stage_progress,
 )
-from p2gs_jax.types import Scene
+from p2gs_jax.scene.sfm import features
+from p2gs_jax.scene.sfm.features import opened, quiet_colmap
+from p2gs_jax.types import Scene, View
 
-KEPT, ACCOUNT = "features", "account.json"
+KEPT, ACCOUNT = "features", "left_out.json"
 # Fewer features than this seldom give a pose.
 FEW_FEATURES = 100
 # COLMAP takes a pair with fewer inliers for unverified.
 LEAST_INLIERS = 15
+# Photographs with at least this many pixels along their longer side are not enlarged for SIFT
+# (nerf_fox: 53 s and 12,017 points become 15 s and 5,449); exposures and dense seeds need no more.
+LONG_ENOUGH = 800
+LINKS = "photographs"
 _ADVICE = (
     "photographs register when they are sharp, textured and overlap by more than half with at "
     "least two others, taken from different places"
@@ -51,8 +55,8 @@ def load_images(
     """Run COLMAP's structure from motion on the photographs in a folder; read the largest model.
 
     `work_dir` keeps it under `sfm/` while the photographs stay the same, and features and matches
-    under `features/`, which serve more photographs or another mapper. Raises UserError: fewer than
-    two photographs, one of them is not an image, none registered, or pycolmap lacks the mapper.
+    under `features/`, which serve more photographs. Raises UserError: fewer than two photographs,
+    one of them is not an image, or none registered.
     """
     names = [path.relative_to(image_folder).as_posix() for path in paths]
     if len(paths) < 2:
@@ -62,12 +66,7 @@ def load_images(
     groups: dict[tuple, list[str]] = defaultdict(list)
     for path, name in zip(paths, names, strict=True):
         groups[(image_size(path), read_exif_camera(path), subfolder(name))].append(name)
-    key: dict[str, Any] = {"pycolmap": pycolmap.__version__, "files": file_fingerprints(paths)}
-    if cfg.mapper != "incremental":
-        key["mapper"] = cfg.mapper
-    if cfg.mapper == "global" and not hasattr(pycolmap, "global_mapping"):
-        fix = "pip install --upgrade pycolmap, or leave out --data.mapper global"
-        raise broken(f"pycolmap {pycolmap.__version__}", "has no global mapper.", fix)
+    key = {"pycolmap": pycolmap.__version__, "files": file_fingerprints(paths)}
 
     def build(folder: Path) -> None:
         kept = (folder if work_dir is None else work_dir) / KEPT
@@ -76,7 +75,7 @@ def load_images(
     with cached_folder(work_dir, "sfm", key, build) as folder:
         images = str(image_folder.resolve())
         scene = load_colmap(root, folder / "model", dataclasses.replace(cfg, images=images))
-        why = json.loads((folder / ACCOUNT).read_text())["left_out"]
+        why = json.loads((folder / ACCOUNT).read_text())
     registered = {view.name for view in scene.views}
     left_out = [name for name in names if name not in registered]
     notes = scene.notes
@@ -96,30 +95,25 @@ def _build(
     cfg: DataConfig,
     report: Report,
 ) -> None:
-    """Fill the folder with the largest model and an account; the features are kept beside it."""
+    """Fill the folder with the largest model, and why photographs are not in it.
+
+    The features are kept beside it.
+    """
     quiet_colmap()
     names = [name for group in groups.values() for name in group]
-    watch = Stopwatch()
-    with watch("features"):
-        database = kept_features(kept, image_folder, groups, report)
-    with watch("matching"):
-        pairs = match_kept(database, names, pairs_by_name(names, cfg.matching), report)
+    database = features.kept_features(kept, image_folder, groups, report)
+    features.match_kept(database, names, features.pairs_by_name(names, cfg.matching), report)
     models_folder = folder / "models"
     models_folder.mkdir()
-    with watch("mapping"):
-        run = _map_globally if cfg.mapper == "global" else _map
-        found = run(database, image_folder, models_folder, len(names), report)
-        models = sorted(found, key=lambda m: (m.num_reg_images(), m.num_points3D()), reverse=True)
+    found = _map(database, image_folder, models_folder, len(names), report)
+    models = sorted(found, key=lambda m: (m.num_reg_images(), m.num_points3D()), reverse=True)
     why = reasons(database, names, models)
     if not models:
         none = f"none of the {len(names)} images in {image_folder} could be registered"
         raise UserError(f"{none}: {sentence(why)}", fix=_ADVICE)
     (folder / "model").mkdir()
     models[0].write(folder / "model")
-    spent = ", ".join(f"{stage} {seconds:.0f}" for stage, seconds in watch.seconds.items())
-    report(f"structure from motion of {len(names)} images and {pairs} pairs, seconds: {spent}")
-    account = {"images": len(names), "pairs": pairs, "seconds": watch.seconds, "left_out": why}
-    write_json(folder / ACCOUNT, account)
+    write_json(folder / ACCOUNT, why)
     shutil.rmtree(models_folder)
 
 
@@ -141,27 +135,6 @@ def _map(
     return list(models.values())
 
 
-def _map_globally(
-    database: Path, image_folder: Path, output: Path, count: int, report: Report
-) -> list[pycolmap.Reconstruction]:
-    """Map all photographs at once; focal lengths, which this does not find, come first."""
-    report(f"mapping {count} images at once")
-    # The copy keeps what it changes out of the matches that are kept.
-    copy = output / database.name
-    shutil.copyfile(database, copy)
-    calibration = pycolmap.ViewGraphCalibrationOptions()
-    calibration.random_seed = 0
-    options = pycolmap.GlobalPipelineOptions()
-    options.random_seed = 0
-    try:
-        pycolmap.calibrate_view_graph(copy, calibration)
-        models = pycolmap.global_mapping(copy, image_folder, output, options=options)
-    except (RuntimeError, ValueError) as error:
-        fix = "leave out --data.mapper global"
-        raise UserError(f"the global mapper failed: {error}.", fix=fix) from error
-    return list(models.values())
-
-
 def reasons(
     database: Path, names: Sequence[str], models: Sequence[pycolmap.Reconstruction]
 ) -> dict[str, str]:
@@ -174,13 +147,13 @@ def reasons(
     partners: dict[str, dict[str, int]] = defaultdict(dict)
     with opened(database) as db:
         images = {image.image_id: image.name for image in db.read_all_images()}
-        features = {name: db.num_keypoints_for_image(i) for i, name in images.items()}
+        found = {name: db.num_keypoints_for_image(i) for i, name in images.items()}
         pairs, counts = db.read_two_view_geometry_num_inliers()
     for pair, inliers in zip(pairs, counts, strict=True):
         a, b = (images[i] for i in pycolmap.pair_id_to_image_pair(pair))
         if inliers >= LEAST_INLIERS:
             partners[a][b] = partners[b][a] = int(inliers)
-    return {name: _why(name, features.get(name, 0), partners.get(name, {}), parts) for name in left}
+    return {name: _why(name, found.get(name, 0), partners.get(name, {}), parts) for name in left}
 
 
 def sentence(why: Mapping[str, str]) -> str:
@@ -209,3 +182,128 @@ def _why(name: str, count: int, met: Mapping[str, int], parts: Sequence[set[str]
     best = max(here, key=lambda other: here[other])
     few = f"{here[best]} matches with {best}, its best of {len(here)}"
     return f"{few}: too few of them are points that others see too"
+
+
+def triangulate(
+    scene: Scene, work_dir: Path | None, report: Report, *, only_training: bool = False
+) -> Scene:
+    """Return the scene of posed views with points and tracks, none where nothing matches.
+
+    `work_dir` keeps the result under `triangulated/`. Raises UserError: there is only one view, or
+    a photograph cannot be read.
+    """
+    views = tuple(scene.training_views) if only_training else scene.views
+    if len(views) < 2:
+        why = f"no point could be triangulated from the poses in {scene.root}"
+        fix = "check that there are several photographs, that they are sharp, and that the poses "
+        raise UserError(why, fix=fix + "are theirs")
+    key = {
+        "pycolmap": pycolmap.__version__,
+        "files": file_fingerprints([view.image_path for view in views]),
+        "cameras": [
+            [view.name, view.viewmat.tolist(), view.K.tolist(), *_lens(view)] for view in views
+        ],
+    }
+    build = functools.partial(_triangulate, views=views, report=report)
+    with cached_folder(work_dir, "triangulated", key, build) as folder:
+        model = read_model(folder)
+        tracks = tracks_of(model, scene.views)
+    if tracks is None:
+        return scene
+    report(f"triangulated {len(model.xyz)} points with {len(tracks.xy)} observations")
+    points = model.xyz.astype(np.float32)
+    return dataclasses.replace(scene, points=points, point_colors=model.rgb, tracks=tracks)
+
+
+def _triangulate(folder: Path, views: Sequence[View], report: Report) -> None:
+    quiet_colmap()
+    names = [view.name for view in views]
+    image_folder = _image_folder(views, folder)
+    database = folder / "database.db"
+    report(f"no seed points: detecting features in {len(views)} images")
+    # Intrinsics are held fixed, so it does not matter that every image has its own camera.
+    enlarge = max(max(view.width, view.height) for view in views) < LONG_ENOUGH
+    mode = pycolmap.CameraMode.PER_IMAGE
+    features.extract(database, image_folder, names, mode=mode, enlarge=enlarge)
+    prior = _set_cameras(database, views)
+    if unread := sorted({*names} - {image.name for image in prior.images.values()}):
+        raise UserError(
+            f"COLMAP reads {len(views) - len(unread)} of {len(views)} photographs; one that it "
+            f"cannot read is {image_folder / unread[0]}.",
+            fix="export those photographs again as PNG or JPEG, or remove them from the scene",
+        )
+    pairs = features.pairs_by_pose(names, np.stack([view.viewmat for view in views]))
+    n = len(views) * (len(views) - 1) // 2 if pairs is None else len(pairs)
+    report(f"matching {n} image pairs")
+    features.match(database, pairs)
+    report("triangulating")
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = 0
+    given = (prior, database, image_folder, folder)
+    model = pycolmap.triangulate_points(*given, refine_intrinsics=False, options=options)
+    if not model.points3D:
+        # COLMAP takes no point that two photographs alone show; of two there are no others.
+        options.triangulation.ignore_two_view_tracks = False
+        model = pycolmap.triangulate_points(*given, refine_intrinsics=False, options=options)
+    model.write(folder)
+    database.unlink()  # large, and not needed again
+    shutil.rmtree(folder / LINKS, ignore_errors=True)
+
+
+def _set_cameras(database: Path, views: Sequence[View]) -> pycolmap.Reconstruction:
+    """Overwrite the guessed cameras in the database; return a model of the known poses."""
+    known = {view.name: view for view in views}
+    reconstruction = pycolmap.Reconstruction()
+    with opened(database) as db:
+        for image in db.read_all_images():
+            view = known[image.name]
+            camera = camera_of(view, image.camera_id)
+            db.update_camera(camera)
+            reconstruction.add_camera_with_trivial_rig(camera)
+            pose = pycolmap.Rigid3d(view.viewmat[:3].astype(np.float64))
+            ids = {"camera_id": image.camera_id, "image_id": image.image_id}
+            posed = pycolmap.Image(name=image.name, **ids)
+            reconstruction.add_image_with_trivial_frame(posed, pose)
+    return reconstruction
+
+
+def camera_of(view: View, camera_id: int) -> pycolmap.Camera:
+    """Return COLMAP's camera for a view."""
+    model, coefficients = _lens(view)
+    K = view.K.astype(np.float64)
+    return pycolmap.Camera(
+        camera_id=camera_id,
+        model=model,
+        width=view.width,
+        height=view.height,
+        params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2], *coefficients],
+        has_prior_focal_length=True,
+    )
+
+
+def _lens(view: View) -> tuple[str, tuple[float, ...]]:
+    """Return COLMAP's name of the lens model, and as many coefficients as it has."""
+    if view.distortion is None:
+        return "OPENCV", (0.0,) * 4
+    held = view.distortion.coefficients
+    if view.distortion.model == "fisheye":
+        return "OPENCV_FISHEYE", held
+    if len(held) == 4:
+        return "OPENCV", held
+    return "FULL_OPENCV", (*held, 0.0, 0.0, 0.0)[:8]
+
+
+def _image_folder(views: Sequence[View], folder: Path) -> Path:
+    """Return the folder that the names of photographs are relative to.
+
+    Where there is none (KITTI's `image_02/data` belongs to camera `image_02`), one of links is
+    made.
+    """
+    before = {str(view.image_path).removesuffix(view.name) for view in views}
+    if len(before) == 1:
+        return Path(before.pop() or ".")
+    for view in views:
+        link = folder / LINKS / view.name
+        link.parent.mkdir(parents=True, exist_ok=True)
+        link.symlink_to(view.image_path.resolve())
+    return folder / LINKS

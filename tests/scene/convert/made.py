@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import struct
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import cv2
 import numpy as np
 import OpenEXR
 import pillow_heif
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, TiffImagePlugin
 
 # Linear sRGB to the made camera's colours, which are XYZ: LibRaw inverts this itself.
 _XYZ_TO_CAMERA = (
@@ -34,75 +35,38 @@ def write_dng(
     light: np.ndarray,
     *,
     balance: tuple[float, float, float] = (2.0, 1.0, 1.5),
-    black: int = 512,
-    white: int = 16383,
-    model: str = "Made One",
+    chosen: tuple[float, float, float] | None = None,
     orientation: int = 1,
     time: tuple[int, int] = (1, 60),
     iso: int = 200,
 ) -> None:
-    """Write the light of a scene as a sensor with an RGGB filter would have seen it."""
+    """Write the light of a scene as a sensor with an RGGB filter would have seen it.
+
+    The camera chose the white balance `chosen`, or that of the sensor.
+    """
     h, w = light.shape[:2]
     camera = np.minimum(light / balance, 1)
     channel = np.array([[0, 1], [1, 2]])[np.indices((h, w))[0] % 2, np.indices((h, w))[1] % 2]
     seen = np.take_along_axis(camera, channel[..., None], 2)[..., 0]
-    data = np.rint(black + seen * (white - black)).astype("<u2").tobytes()
-
-    def of(*values: float) -> list[tuple[int, int]]:
-        return [(round(v * 1_000_000), 1_000_000) for v in values]
-
-    main = [
-        (254, "I", [0]), (256, "I", [w]), (257, "I", [h]), (258, "H", [16]), (259, "H", [1]),
-        (262, "H", [32803]), (271, "s", "Made"), (272, "s", model), (273, "I", [0]),
-        (274, "H", [orientation]), (277, "H", [1]), (278, "I", [h]), (279, "I", [len(data)]),
-        (284, "H", [1]), (33421, "H", [2, 2]), (33422, "B", [0, 1, 1, 2]), (34665, "I", [0]),
-        (50706, "B", [1, 4, 0, 0]), (50708, "s", model), (50714, "H", [black]),
-        (50717, "I", [white]), (50721, "ii", of(*_XYZ_TO_CAMERA)),
-        (50728, "II", of(*(1 / b for b in balance))), (50778, "H", [21]),
-    ]  # fmt: skip
-    shot = [(33434, "II", [time]), (33437, "II", of(2.8)), (34855, "H", [iso])]
-    shot += [(37386, "II", of(50))]
-    places, first = _laid_out(main, 8)
-    shot_places, second = _laid_out(shot, first)
-    main = [
-        (tag, kind, [second] if tag == 273 else [first] if tag == 34665 else values)
-        for tag, kind, values in main
-    ]
-    body = _directory(main, places) + _directory(shot, shot_places)
-    path.write_bytes(b"II*\0" + struct.pack("<I", 8) + body + data)
-
-
-def _packed(kind: str, values) -> tuple[int, int, bytes]:
-    if kind == "s":
-        data = values.encode() + b"\0"
-        return 2, len(data), data
-    flat = [v if isinstance(v, tuple) else (v,) for v in values]
-    code = {"B": 1, "H": 3, "I": 4, "II": 5, "ii": 10}[kind]
-    return code, len(flat), b"".join(struct.pack("<" + kind, *v) for v in flat)
-
-
-def _laid_out(entries, start: int) -> tuple[dict[int, int], int]:
-    """Return where the long values of a directory go, and where it ends."""
-    at, places = start + 2 + 12 * len(entries) + 4, {}
-    for tag, kind, values in entries:
-        size = len(_packed(kind, values)[2])
-        if size > 4:
-            places[tag] = at
-            at += size + size % 2
-    return places, at
-
-
-def _directory(entries, places: dict[int, int]) -> bytes:
-    rows, body = struct.pack("<H", len(entries)), b""
-    for tag, kind, values in entries:
-        code, count, data = _packed(kind, values)
-        rows += struct.pack("<HHI", tag, code, count)
-        if tag in places:
-            rows += struct.pack("<I", places[tag])
-            body += data + b"\0" * (len(data) % 2)
-        else:
-            rows += data.ljust(4, b"\0")
-    return rows + struct.pack("<I", 0) + body
+    data = np.rint(512 + seen * (16383 - 512)).astype("<u2")
+    fraction = TiffImagePlugin.IFDRational
+    neutral = [fraction(round(1e6 / b), 1_000_000) for b in chosen or balance]
+    matrix = [fraction(round(v * 1e6), 1_000_000) for v in _XYZ_TO_CAMERA]
+    shot = {33434: fraction(*time), 33437: 2.8, 34855: iso, 37386: 50.0}
+    tags = TiffImagePlugin.ImageFileDirectory_v2()
+    for tag, (kind, value) in {
+        **{271: (2, "Made"), 272: (2, "Made One"), 274: (3, orientation), 34665: (4, shot)},
+        **{33421: (3, (2, 2)), 33422: (1, b"\0\1\1\2"), 50706: (1, b"\1\4\0\0")},
+        **{50708: (2, "Made One"), 50714: (3, 512), 50717: (4, 16383), 50778: (3, 21)},
+        **{50721: (10, tuple(matrix)), 50728: (5, tuple(neutral))},
+    }.items():
+        tags.tagtype[tag] = kind
+        tags[tag] = value
+    file = io.BytesIO()
+    Image.fromarray(data).save(file, "TIFF", tiffinfo=tags)
+    # Pillow calls it grey; it is a colour filter's.
+    grey, filtered = (struct.pack("<HHII", 262, 3, 1, what) for what in (1, 32803))
+    path.write_bytes(file.getvalue().replace(grey, filtered))
 
 
 def icc_profile(name: str, columns, curve: bytes) -> bytes:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import struct
 import sys
 from pathlib import Path
 
@@ -21,8 +20,7 @@ from p2gs_jax.photometry.calibrate import options_of
 from p2gs_jax.run.scene_file import read_scene, write_scene
 from p2gs_jax.scene import ImageStore, load_scene
 from p2gs_jax.scene.convert.convert import Converted, convert_photographs, with_originals
-from p2gs_jax.scene.convert.headers import read_exif_ev, read_exif_settings
-from p2gs_jax.scene.convert.kinds import has_gain_map, kind_of
+from p2gs_jax.scene.convert.readers import read_exif_ev, read_exif_settings
 from p2gs_jax.scene.files import image_size, list_images
 from p2gs_jax.scene.survey import survey
 
@@ -62,16 +60,6 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "photos"
 
 
-def test_ordinary_photographs_stay_where_they_are(folder: Path) -> None:
-    for name in ("a.jpg", "b.png"):
-        write_image(folder / name)
-    result = converted(folder)
-    assert result.folder == folder
-    assert [path.name for path in result.paths] == ["a.jpg", "b.png"]
-    assert result.known is None
-    assert not (folder.parent / "work").exists()
-
-
 # ---------------------------------------------------------------------- raw
 
 
@@ -97,32 +85,16 @@ def test_raw_is_linear_above_its_black_level(folder: Path) -> None:
 
 
 def test_one_white_balance_for_all_raws_of_a_camera(folder: Path) -> None:
-    def neutral(balance) -> bytes:
-        """Return the tag AsShotNeutral as `write_dng` writes it."""
-        return b"".join(struct.pack("<II", round(1e6 / b), 1_000_000) for b in balance)
-
     # The same light and sensor; the camera changed its mind about white.
     light = np.full((64, 96, 3), (0.2, 0.3, 0.25))
     for name, chosen in {"a": (2.0, 1, 1.5), "b": (2.2, 1, 1.4), "c": (1.6, 1, 1.8)}.items():
-        path = folder / f"{name}.dng"
-        write_dng(path, light, balance=(2.0, 1, 1.5))
-        assert neutral((2.0, 1, 1.5)) in path.read_bytes()
-        path.write_bytes(path.read_bytes().replace(neutral((2.0, 1, 1.5)), neutral(chosen)))
+        write_dng(folder / f"{name}.dng", light, chosen=chosen)
     result = converted(folder)
     colours = [light_of(path)[32, 48] for path in result.paths]
     np.testing.assert_allclose(colours, np.broadcast_to((0.2, 0.3, 0.25), (3, 3)), atol=2e-3)
     assert record_of(result)[1]["balance"] == pytest.approx((2.2, 1, 1.4), rel=1e-3)
     (note,) = (note for note in result.notes if note.startswith("White balance of 3"))
     assert "red 2.000, blue 1.500" in note
-
-
-def test_exif_of_raw_reaches_the_converted_file(folder: Path) -> None:
-    write_dng(folder / "a.dng", GREY, time=(1, 250), iso=400)
-    (path,) = converted(folder).paths
-    for file in (folder / "a.dng", path):
-        assert read_exif_ev(file) == pytest.approx(np.log2(1 / 250 * 400 / 2.8**2), abs=1e-3)
-    assert read_exif_settings(path).time == pytest.approx(1 / 250)
-    assert image_size(folder / "a.dng") == (96, 64)
 
 
 @pytest.mark.parametrize(
@@ -137,16 +109,21 @@ def test_what_to_install(folder: Path, monkeypatch, module: str, name: str, comm
 
 
 def test_raw_beside_jpeg_is_one_photograph(folder: Path, monkeypatch) -> None:
-    write_dng(folder / "a.dng", GREY)
+    write_dng(folder / "a.dng", GREY, time=(1, 250), iso=400)
     write_image(folder / "a.jpg", 90, (96, 64))
     result = converted(folder)
     assert list(result.originals.values()) == [folder / "a.dng"]
     assert noted(result, "there twice")
-    # Without rawpy the JPEG is used.
+    # Its EXIF reaches the converted file.
+    for file in (folder / "a.dng", *result.paths):
+        assert read_exif_ev(file) == pytest.approx(np.log2(1 / 250 * 400 / 2.8**2), abs=1e-3)
+    assert read_exif_settings(result.paths[0]).time == pytest.approx(1 / 250)
+    assert image_size(folder / "a.dng") == (96, 64)
+    # Without rawpy the JPEG is used, where it is.
     monkeypatch.setattr("p2gs_jax.scene.convert.convert.find_spec", lambda name: None)
     result = converted(folder)
-    assert list(result.originals.values()) == [folder / "a.jpg"]
-    assert result.known is None
+    assert list(result.originals.values()) == result.paths == [folder / "a.jpg"]
+    assert (result.folder, result.known) == (folder, None)
 
 
 # ------------------------------------------------------ HEIC, AVIF and WebP
@@ -207,25 +184,20 @@ def test_exr_keeps_light_between_photographs(folder: Path) -> None:
     assert noted(result, "multiplied by 0.125")
 
 
-def test_exr_that_is_broken_inside(folder: Path) -> None:
-    light = np.full((8, 8, 3), 0.5, np.float32)
-    light[0, 0], light[0, 1], light[0, 2] = np.nan, np.inf, -1
-    write_exr(folder / "a.exr", light)
-    result = converted(folder)
-    assert noted(result, "1 pixels of linear photographs are not numbers")
-    np.testing.assert_array_equal(light_of(result.paths[0])[0, :3], [[0] * 3, [1] * 3, [0] * 3])
-
-
-def test_exr_grey_alpha_and_chromaticities(folder: Path) -> None:
+def test_exr_grey_alpha_chromaticities_and_no_numbers(folder: Path) -> None:
     grey = np.full((8, 8, 1), 0.3, np.float32)
+    grey[0, 0], grey[0, 1], grey[0, 2] = np.nan, np.inf, -1
     write_exr(folder / "a.exr", grey, "Y", expTime=0.01, aperture=4.0, isoSpeed=100.0)
     clear = np.full((8, 8, 4), 0.5, np.float32) * (0.6, 0.6, 0.6, 1)
     write_exr(folder / "b.exr", clear.astype(np.float32), "RGBA")
     p3 = (0.68, 0.32, 0.265, 0.69, 0.15, 0.06, 0.3127, 0.329)
     green = np.broadcast_to(np.array([0, 0.5, 0], np.float32), (8, 8, 3))
     write_exr(folder / "c.exr", green, chromaticities=p3)
-    a, b, c = converted(folder).paths
+    result = converted(folder)
+    a, b, c = result.paths
     assert light_of(a)[4, 4] == pytest.approx(0.3, abs=1e-4)
+    assert noted(result, "1 pixels of linear photographs are not numbers")
+    np.testing.assert_array_equal(light_of(a)[0, :3], [[0] * 3, [1] * 3, [0] * 3])
     assert read_exif_ev(a) == pytest.approx(np.log2(0.01 * 100 / 16), abs=1e-3)
     assert stored(b).shape[2] == 4
     assert light_of(b)[4, 4] == pytest.approx(0.6, abs=1e-3)
@@ -243,34 +215,22 @@ def test_exr_grey_alpha_and_chromaticities(folder: Path) -> None:
     ],
 )
 def test_files_that_are_refused(folder: Path, name: str, data, words: list[str]) -> None:
-    write_exr(folder / "b.exr", np.ones((8, 8, 1), np.float32), "Z")
-    write_dng(folder / "a.dng", GREY)
-    cut = (folder / "a.dng").read_bytes()
-    (folder / "a.dng").write_bytes(cut[: len(cut) // 2])
-    for path in folder.iterdir():
-        if path.name != name:
-            path.unlink()
+    path = folder / name
     if data is not None:
-        (folder / name).write_bytes(data)
+        path.write_bytes(data)
+    elif name == "b.exr":
+        write_exr(path, np.ones((8, 8, 1), np.float32), "Z")
+    else:
+        write_dng(path, GREY)
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     with refused(*words):
         converted(folder)
-
-
-def test_tiff_of_floats_is_light_and_of_integers_is_not(folder: Path) -> None:
-    light, path = (0.9 * patches()).astype(np.float32), folder / "a.tif"
-    cv2.imwrite(str(path), light[..., ::-1])
-    assert kind_of(path) == "float_tiff"
-    result = converted(folder)
-    assert result.known == "TIFF of floats"
-    np.testing.assert_allclose(light_of(result.paths[0]), light, atol=1e-4)
-    cv2.imwrite(str(path), np.rint(srgb_encode(light) * 65535).astype(np.uint16)[..., ::-1])
-    assert kind_of(path) == "plain"
 
 
 # -------------------------------------------------------------------- mixed
 
 
-def test_kinds_beside_each_other(folder: Path) -> None:
+def test_kinds_beside_each_other_are_converted_once(folder: Path) -> None:
     (folder / "sub").mkdir()
     write_dng(folder / "sub" / "a.dng", GREY)
     write_image(folder / "b.jpg", 90, (96, 64))
@@ -279,31 +239,10 @@ def test_kinds_beside_each_other(folder: Path) -> None:
     assert (result.folder / "b.jpg").read_bytes() == (folder / "b.jpg").read_bytes()
     assert result.known is None
     assert noted(result, "of several kinds (1 ")
-
-
-def test_converted_once(folder: Path) -> None:
-    write_dng(folder / "a.dng", GREY)
-    (path,) = converted(folder).paths
-    before = path.stat().st_mtime_ns
-    assert converted(folder).paths[0].stat().st_mtime_ns == before
-    write_dng(folder / "a.dng", 2 * GREY)
-    assert light_of(converted(folder).paths[0])[32, 48, 1] == pytest.approx(0.6, abs=5e-3)
-
-
-def test_gain_maps_are_found_in_headers_only(folder: Path) -> None:
-    path = folder / "a.jpg"
-    write_image(path)
-    assert not has_gain_map(path)
-    data = path.read_bytes()
-    xmp = b'http://ns.adobe.com/xap/1.0/\0<x xmlns:hdrgm="http://ns.adobe.com/hdr-gain-map/1.0/"/>'
-    iso = b"urn:iso:std:iso:ts:21496:-1\0\0\0\0\0"
-    for marker, payload in ((b"\xff\xe1", xmp), (b"\xff\xe2", iso)):
-        segment = marker + (len(payload) + 2).to_bytes(2, "big") + payload
-        path.write_bytes(data[:2] + segment + data[2:])
-        assert has_gain_map(path)
-    # The second picture of such a file, behind the first, is not part of the header.
-    path.write_bytes(data + iso)
-    assert not has_gain_map(path)
+    before = result.paths[1].stat().st_mtime_ns
+    assert converted(folder).paths[1].stat().st_mtime_ns == before
+    write_dng(folder / "sub" / "a.dng", 2 * GREY)
+    assert light_of(converted(folder).paths[1])[32, 48, 1] == pytest.approx(0.6, abs=5e-3)
 
 
 # ------------------------------------------------------------------- scenes

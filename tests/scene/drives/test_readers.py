@@ -217,7 +217,7 @@ def tokens(table):
 
 REFUSED = {
     "nuscenes": [
-        (tokens("calibrated_sensor"), first(rotation=[2, 0, 0, 0]), "no unit quaternion"),
+        (tokens("calibrated_sensor"), first(rotation=[2, 0, 0, 0]), "not a unit quaternion"),
         (tokens("calibrated_sensor"), first(rotation=[1, 0, 0]), "should be 4 finite numbers"),
         (tokens("calibrated_sensor"), first(camera_intrinsic=[[1, 2], [3]]), "9 finite numbers"),
         (tokens("calibrated_sensor"), first(camera_intrinsic=[[0] * 3] * 3), "a camera matrix"),
@@ -232,7 +232,7 @@ REFUSED = {
         (tokens("scene"), lambda rows: [1], "is not a valid table"),
     ],
     "argoverse": [
-        (argoverse.EXTRINSICS, every(qw=9.0), "sensor number 1 is no unit quaternion"),
+        (argoverse.EXTRINSICS, every(qw=9.0), "sensor number 1 is not a unit quaternion"),
         (argoverse.EXTRINSICS, every(sensor_name="a"), "where ring_front_center is"),
         (argoverse.INTRINSICS, every(fx_px=0.0), "should be positive"),
         (argoverse.BOXES, every(width_m=0.0), "has no size"),
@@ -241,8 +241,8 @@ REFUSED = {
         (argoverse.POSES, lambda rows: [{"other": 1}], "no column"),
     ],
     "waymo": [
-        (LENSES, every(**{MOUNT: [2.0] * 16}), "the pose of FRONT is no rotation"),
-        (LENSES, every(**{MOUNT: [1.0] * 9}), "no rotation"),
+        (LENSES, every(**{MOUNT: [2.0] * 16}), "the pose of FRONT is not a rotation"),
+        (LENSES, every(**{MOUNT: [1.0] * 9}), "not a rotation"),
         (LENSES, first(**{FOCAL: 0.0}), "the lens of FRONT"),
         (LENSES, first(**{FOCAL: float("nan")}), "the lens of FRONT"),
         (LENSES, every(**{FOCAL: "50"}), "should hold numbers"),
@@ -258,7 +258,7 @@ REFUSED = {
     "pandaset": [
         (FRONT / "poses.json", lambda held: {}, "should hold a list"),
         (FRONT / "poses.json", lambda held: [HALF], "the pose of frame 0 lacks"),
-        (FRONT / "poses.json", lambda held: [BENT], "a rotation that is no unit"),
+        (FRONT / "poses.json", lambda held: [BENT], "the rotation of frame 0 is not a unit"),
         (FRONT / "intrinsics.json", lambda held: {"fx": 60}, "lacks"),
         (FRONT / "timestamps.json", lambda held: ["now", "a", "b"], "entry 0 should be finite"),
         (CUBOIDS, lambda rows: [{"uuid": "a"}], "no column 'position.x'"),
@@ -266,7 +266,7 @@ REFUSED = {
         (CUBOIDS, every(**{"dimensions.x": 0.0}), "positive sizes"),
     ],
     "kitti_raw": [
-        ("calib_imu_to_velo.txt", given("R: 1 0 0 0 1 0 0 0 2\nT: 0 0 0\n"), "no rotation"),
+        ("calib_imu_to_velo.txt", given("R: 1 0 0 0 1 0 0 0 2\nT: 0 0 0\n"), "not a rotation"),
         ("calib_cam_to_cam.txt", given("R_rect_00: 1 0 0 0 1 0 0 0 1\n"), "P_rect_02 should be 12"),
         ("calib_cam_to_cam.txt", given("R_rect_00: 1 0 0\n"), "R_rect_00 should be 9"),
         (f"{SHOTS}/timestamps.txt", given("yesterday\n"), "'yesterday' is not a date"),

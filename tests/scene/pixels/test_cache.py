@@ -1,10 +1,10 @@
-"""Photographs that memory does not hold are decoded once, by processes, and read bit for bit."""
+"""Photographs that memory does not hold are decoded once, ahead, and read bit for bit."""
 
 import dataclasses
 import errno
 import os
 import shutil
-import signal
+import threading
 from types import SimpleNamespace
 from unittest.mock import Mock
 
@@ -14,7 +14,7 @@ import pytest
 from scene.helpers import make_view, refused
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.scene.pixels import cache
+from p2gs_jax.scene.pixels import cache, decode
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Distortion
 
@@ -82,19 +82,12 @@ def test_every_kind_comes_back_bit_for_bit(tmp_path, kinds, shrink):
     for _ in range(2):
         same(store, kinds, [shrink])
     assert store.decodings == len(kinds)
-    # Another start decodes nothing.
+    # Another start decodes nothing; one with more memory clears what was written.
     again = in_files(tmp_path, kinds)
     stored(again, len(kinds), shrink)
     assert again.decodings == 0
-
-
-def test_a_set_that_fits_clears_what_an_earlier_start_wrote(tmp_path, kinds, started):
-    stored(in_files(tmp_path, kinds), len(kinds), 1)
     assert any((tmp_path / "pixels").rglob("*.px"))
-    store = in_files(tmp_path, kinds, DataConfig())
-    store.expect(SHRINKS)
-    stored(store, len(kinds), 1)
-    assert not started
+    in_files(tmp_path, kinds, DataConfig()).expect(SHRINKS)
     assert not (tmp_path / "pixels").exists()
 
 
@@ -126,7 +119,12 @@ def test_a_damaged_file_is_made_again(tmp_path, damage):
     assert [p.name for p in path.parent.iterdir()] == [path.name]
 
 
-def test_a_disk_without_room_is_refused_at_once(tmp_path, kinds, monkeypatch):
+def test_a_disk_without_room_is_refused_at_once_or_names_the_option(tmp_path, kinds, monkeypatch):
+    full = Mock(side_effect=OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
+    with monkeypatch.context() as patch:
+        patch.setattr(cache, "atomic_write", full)
+        with refused("No space left on device", "--data.cache-mb"):
+            in_files(tmp_path, kinds).stored(0)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=1000))
     message = r"8 decoded photographs take 1 MB of disk.*1 MB left"
     with refused(message, "--data.cache-mb 1"):
@@ -134,38 +132,16 @@ def test_a_disk_without_room_is_refused_at_once(tmp_path, kinds, monkeypatch):
     in_files(tmp_path, kinds, DataConfig())
 
 
-def test_a_disk_that_fills_names_the_option(tmp_path, kinds, monkeypatch):
-    full = Mock(side_effect=OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
-    monkeypatch.setattr(cache, "atomic_write", full)
-    with refused("No space left on device", "--data.cache-mb"):
-        in_files(tmp_path, kinds).stored(0)
+# ------------------------------------------------------------------ ahead
 
 
-# ------------------------------------------------------------------ processes
-
-
-@pytest.fixture
-def started(monkeypatch):
-    """Let processes begin for a few photographs; return those that were started."""
-    found, begin = [], cache.subprocess.Popen
-
-    def kept(*args, **options):
-        found.append(begin(*args, **options))
-        return found[-1]
-
-    monkeypatch.setattr(cache, "FEWEST", 1)
-    monkeypatch.setattr(cache.subprocess, "Popen", kept)
-    return found
-
-
-def test_processes_decode_all_sizes_and_the_caller_none(tmp_path, views, started):
+def test_threads_decode_all_sizes_and_the_caller_none(tmp_path, views):
     views[5].image_path.write_bytes(b"no photograph")
     store = in_files(tmp_path, views)
     store.expect(SHRINKS)
-    assert started
-    for process in started:
-        process.wait(60)
-    # What a process cannot decode is reported to the caller that asks.
+    for thread in store._photographs._ahead._threads:
+        thread.join()
+    # What a thread cannot decode is reported to the caller that asks.
     with refused(r"5\.png"):
         store.stored(5)
     for row in {*range(12)} - {5}:
@@ -174,33 +150,24 @@ def test_processes_decode_all_sizes_and_the_caller_none(tmp_path, views, started
     store.close()
 
 
-def test_the_caller_goes_on_where_a_process_dies(tmp_path, views, started):
-    store = in_files(tmp_path, views)
-    store.expect(SHRINKS)
-    for process in started:
-        os.kill(process.pid, signal.SIGKILL)
-    same(store, views)
-    assert store.decodings > 0
-    store.close()
-
-
-def test_one_who_decodes_alone_opens_a_photograph_once(tmp_path, views):
-    """Too few for processes: the size that is asked for first brings the others with it."""
-    store = in_files(tmp_path, views)
-    store.expect(SHRINKS)
-    store.stored(3, 1)
-    views[3].image_path.unlink()
-    assert store.stored(3, 2)[0].shape == (24, 32, 3)
-    assert store.decodings == 2
-    store.close()
-
-
 @pytest.mark.parametrize("end", ["closed", "forgotten"])
-def test_processes_end_with_the_store(tmp_path, views, started, end):
+def test_threads_end_with_the_store(tmp_path, views, monkeypatch, end):
+    begun, go = threading.Event(), threading.Event()
+
+    def held(*given):
+        begun.set()
+        assert go.wait(60)
+        return decode.decode(*given)
+
+    monkeypatch.setattr(cache, "decode", held)
+    monkeypatch.setattr(cache, "MOST_THREADS", 1)
     store = in_files(tmp_path, views)
     store.expect(SHRINKS)
-    assert started
+    assert begun.wait(60)
+    (thread,) = store._photographs._ahead._threads
+    threading.Timer(0.05, go.set).start()
     if end == "closed":
         store.close()
     del store
-    assert all(p.poll() is not None for p in started)
+    assert not thread.is_alive()
+    assert len(list((tmp_path / "pixels").rglob("*.px"))) == 2

@@ -1,0 +1,369 @@
+"""How photographs were taken, and those that OpenCV does not read: raw, HEIC, AVIF, WebP, OpenEXR.
+
+LibRaw subtracts the black level of raw, makes white 1, interpolates the colour filter, and goes to
+sRGB's primaries with the camera's matrix. A camera's automatic white balance differs between
+photographs, but a sensor does not: all photographs of one camera model get the same factors. AVIF
+and WebP come through Pillow, 8 bits whatever the file holds.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import OpenEXR
+from jaxtyping import Float32, UInt
+from PIL import ExifTags, Image
+
+from p2gs_jax.errors import UserError, broken
+from p2gs_jax.scene.convert.icc import BT709, PRIMARIES, TRANSFERS, to_light, to_srgb_matrix
+
+Kind = Literal["plain", "raw", "heif", "avif", "webp", "exr"]
+Balance = tuple[float, float, float]
+
+_RAW = frozenset(
+    {".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".sr2", ".raf", ".orf", ".rw2"}
+    | {".pef", ".srw", ".rwl", ".3fr", ".iiq", ".erf", ".mrw", ".x3f"}
+)
+_KINDS: dict[str, Kind] = {
+    **dict.fromkeys(_RAW, "raw"),
+    **dict.fromkeys((".heic", ".heif", ".hif"), "heif"),
+    **{".avif": "avif", ".webp": "webp", ".exr": "exr"},
+}
+CONVERTED_SUFFIXES = frozenset(_KINDS)
+"""What cannot be used before it is converted."""
+_TIME, _F_NUMBER, _ISO, _FOCAL_LENGTH, _TAKEN = 0x829A, 0x829D, 0x8827, 0x920A, 0x9003
+# PhotographicSensitivity is 16 bits: 65535 there means "see the others".
+_SENSITIVITIES = (_ISO, 0x8833, 0x8832, 0x8831)
+_DEFAULT_ISO = 100.0
+_MAKE, _MODEL = 0x010F, 0x0110
+# LibRaw's attributes.
+_RAW_SETTINGS = {"shutter_speed": _TIME, "aperture": _F_NUMBER, "iso_speed": _ISO}
+_RAW_SETTINGS |= {"focal_length": _FOCAL_LENGTH}
+# OpenEXR's standard attributes.
+_EXR_SETTINGS = {"expTime": _TIME, "aperture": _F_NUMBER, "isoSpeed": _ISO}
+_EXR_ERRORS = (RuntimeError, KeyError, OSError, ValueError)
+_AGAIN = "copy that photograph again, or remove it from the scene"
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A decoded photograph, of display values (`codes`, `profile`) or of light.
+
+    Codes are unsigned integers of which the largest is 1: R G B, perhaps with alpha behind, or one
+    channel. Light is linear in the primaries of sRGB; `invalid` pixels, not numbers, are black.
+    """
+
+    codes: UInt[np.ndarray, "h w c"] | None = None
+    light: Float32[np.ndarray, "h w 3"] | None = None
+    alpha: Float32[np.ndarray, "h w"] | None = None
+    exif: Image.Exif | None = None
+    profile: bytes | None = None
+    invalid: int = 0
+
+
+def kind_of(path: Path) -> Kind:
+    """Return the kind of a photograph, by its suffix."""
+    return _KINDS.get(path.suffix.lower(), "plain")
+
+
+def pillow_heif(path: Path) -> Any:
+    """Return the library that reads HEIC, with which Pillow opens it from now on.
+
+    Raises UserError: it is not installed.
+    """
+    try:
+        import pillow_heif
+    except ImportError:
+        why = f"{path} is HEIC, which is read with pillow-heif."
+        fix = "pip install 'p2gs-jax[heic]', or export the photographs as JPEG"
+        raise UserError(why, fix=fix) from None
+    pillow_heif.register_heif_opener()
+    return pillow_heif
+
+
+def read_heif(path: Path) -> Picture:
+    """Return display values, or the light of a HEIC whose transfer function is HLG or PQ.
+
+    Raises UserError: the library is missing, or the file is broken.
+    """
+    try:
+        if kind_of(path) == "heif":
+            # Pillow's opener has no 16 bits of colour.
+            image = pillow_heif(path).open_heif(path, convert_hdr_to_8bit=False)
+            pixels = np.asarray(image)
+        else:
+            with Image.open(path) as image:
+                mode = {1: "L", 2: "LA", 3: "RGB", 4: "RGBA"}[len(image.getbands())]
+                pixels = np.asarray(image.convert(mode))
+        info = dict(image.info)
+    except UserError:
+        raise
+    except Exception as error:  # decoding is lazy, and the libraries raise errors of many kinds
+        raise broken(path, f"cannot be decoded: {error}.", _AGAIN) from None
+    exif = Image.Exif()
+    try:
+        exif.load(info.get("exif") or b"")
+    except Exception:  # malformed EXIF raises many kinds of errors
+        exif = None
+    if pixels.ndim == 2:
+        pixels = pixels[..., None]
+    nclx = info.get("nclx_profile") or {}
+    transfer = TRANSFERS.get(int(nclx.get("transfer_characteristics", 0)))
+    if transfer is None:
+        return Picture(codes=pixels, exif=exif, profile=info.get("icc_profile"))
+    light = to_light(pixels[..., :3] / np.iinfo(pixels.dtype).max, transfer)
+    primaries = PRIMARIES.get(int(nclx.get("color_primaries", 0)), BT709)
+    light = np.broadcast_to(light, (*light.shape[:2], 3)) @ to_srgb_matrix(primaries).T
+    return Picture(light=light.astype(np.float32), exif=exif)
+
+
+@dataclass(frozen=True)
+class RawFacts:
+    """What a raw file states about itself; the size is pixels, as the sensor lies.
+
+    `balance` are the factors on red, green (1) and blue that the camera chose, None where it is not
+    recorded. Without a `matrix` the camera's colours are unknown, and its primaries are kept.
+    """
+
+    size: tuple[int, int]
+    camera: str
+    balance: Balance | None
+    matrix: bool
+
+
+def read_facts(path: Path) -> RawFacts:
+    """Return what a raw file states about itself; pixels are not read.
+
+    Raises UserError: rawpy is not installed, or LibRaw does not know this file.
+    """
+    with _raw(path) as raw:
+        chosen = [float(x) for x in raw.camera_whitebalance[:3]]
+        exif = _raw_exif(path, raw)
+        names = (str(exif.get(tag, "")).strip("\0 ") for tag in (_MAKE, _MODEL))
+        green = chosen[1]
+        balance = (chosen[0] / green, 1.0, chosen[2] / green) if min(chosen) > 0 else None
+        matrix = bool(np.any(raw.color_matrix) or np.any(raw.rgb_xyz_matrix))
+        size, camera = (raw.sizes.width, raw.sizes.height), " ".join(n for n in names if n)
+        return RawFacts(size, camera, balance, matrix)
+
+
+def read_raw(path: Path, balance: Balance | None) -> Picture:
+    """Return the light of a raw photograph, saturated at 1, unrotated.
+
+    The factors on red, green and blue are `balance`, or LibRaw's for daylight. Raises UserError:
+    rawpy is not installed, or LibRaw cannot decode this file.
+    """
+    with _raw(path) as raw:
+        pixels = raw.postprocess(
+            user_wb=None if balance is None else [*balance, balance[1]],
+            gamma=(1, 1),
+            no_auto_bright=True,
+            # White would follow the brightest pixel of each photograph.
+            adjust_maximum_thr=0.0,
+            output_bps=16,
+            user_flip=0,
+        )
+        light = pixels.astype(np.float32) / np.float32(65535)
+        return Picture(light=light, exif=_raw_exif(path, raw))
+
+
+def read_raw_exif(path: Path) -> Image.Exif:
+    """Return how a raw photograph was taken; errors are as of `read_facts`."""
+    with _raw(path) as raw:
+        return _raw_exif(path, raw)
+
+
+@contextmanager
+def _raw(path: Path) -> Iterator[Any]:
+    try:
+        import rawpy
+    except ImportError:
+        why = f"{path} is camera raw, which is read with rawpy."
+        fix = "pip install 'p2gs-jax[raw]', or export the photographs as 16-bit TIFF"
+        raise UserError(why, fix=fix) from None
+    try:
+        with rawpy.imread(str(path)) as raw:
+            yield raw
+    except rawpy.LibRawFileUnsupportedError:
+        raise UserError(
+            f"LibRaw {'.'.join(map(str, rawpy.libraw_version))} does not know {path}: it is of a "
+            "newer camera, or not a raw file.",
+            fix="pip install --upgrade rawpy, or convert it with Adobe's DNG Converter",
+        ) from None
+    except (rawpy.LibRawError, rawpy.NotSupportedError) as error:
+        why = error.args[0] if error.args else error
+        text = why.decode("latin-1") if isinstance(why, bytes) else str(why)
+        raise broken(path, f"cannot be decoded: {text}.", _AGAIN) from None
+
+
+def _raw_exif(path: Path, raw: Any) -> Image.Exif:
+    """Return EXIF: the file's where it is laid out as TIFF, completed by what LibRaw found."""
+    out = Image.Exif()
+    try:
+        with path.open("rb") as file:
+            if file.read(2) in (b"II", b"MM"):
+                file.seek(0)
+                out.load_from_fp(file)
+                out.get_ifd(ExifTags.IFD.Exif)
+    except Exception:  # malformed EXIF raises many kinds of errors
+        out = Image.Exif()
+    shot, other = out.get_ifd(ExifTags.IFD.Exif), getattr(raw, "other", None)
+    for name, tag in _RAW_SETTINGS.items():
+        value = getattr(other, name, None)
+        if tag not in shot and value:
+            shot[tag] = int(value) if tag == _ISO else float(value)
+    return out
+
+
+@contextmanager
+def _exr(path: Path, **how: bool) -> Iterator[Any]:
+    try:
+        with OpenEXR.File(str(path), **how) as file:
+            yield file
+    except _EXR_ERRORS as error:
+        fix = "copy or render it again, or remove it"
+        raise broken(path, f"is not a readable OpenEXR file: {error}.", fix) from None
+
+
+def exr_size(path: Path) -> tuple[int, int]:
+    """Return (width, height) of the data window; UserError: it is not a readable OpenEXR."""
+    with _exr(path, header_only=True) as file:
+        low, high = file.header()["dataWindow"]
+    return int(high[0] - low[0] + 1), int(high[1] - low[1] + 1)
+
+
+def read_exr_exif(path: Path) -> Image.Exif | None:
+    """Return how an OpenEXR was taken, from its standard attributes; errors as of `exr_size`."""
+    with _exr(path, header_only=True) as file:
+        return _exr_exif(dict(file.header()))
+
+
+def read_exr(path: Path) -> Picture:
+    """Return the light of an OpenEXR: channels R, G, B (of its only layer, too) or Y.
+
+    Chromaticities in the header are converted. What is premultiplied by A is divided by it again.
+    Raises UserError: the file is not a readable OpenEXR, or has no such channels.
+    """
+    with _exr(path, separate_channels=True) as file:
+        channels: dict[str, Any] = {k: c.pixels for k, c in file.channels().items()}
+        header = dict(file.header())
+    layers = {k[: -len("R")] for k in channels if k == "R" or k.endswith(".R")}
+    layer = "" if "" in layers else next(iter(sorted(layers)), None)
+    if layer is not None and {layer + "G", layer + "B"} <= channels.keys():
+        light = np.stack([channels[layer + c] for c in "RGB"], -1).astype(np.float32)
+    elif "Y" in channels and "RY" not in channels:
+        light, layer = np.repeat(channels["Y"].astype(np.float32)[..., None], 3, 2), ""
+    else:
+        why = f"has the channels {', '.join(sorted(channels))}."
+        raise broken(path, why, "photographs need R, G and B, or Y")
+    primaries = header.get("chromaticities")
+    if primaries is not None and len(np.ravel(primaries)) == 8:
+        matrix = to_srgb_matrix(tuple(np.ravel(primaries)))
+        if np.abs(matrix - np.eye(3)).max() > 1e-3:
+            light = light @ matrix.T.astype(np.float32)
+    alpha = channels.get(f"{layer}A")
+    if alpha is not None:
+        alpha = np.clip(np.nan_to_num(alpha.astype(np.float32)), 0, 1)
+        light = light / np.maximum(alpha, 1e-6)[..., None]
+    # Infinite light is saturated; what is not a number is nothing.
+    invalid = int(np.isnan(light).any(2).sum())
+    light = np.nan_to_num(light, nan=0.0, posinf=float(np.finfo(np.float32).max), neginf=0.0)
+    return Picture(light=light, alpha=alpha, exif=_exr_exif(header), invalid=invalid)
+
+
+def _exr_exif(header: dict) -> Image.Exif | None:
+    shot = {tag: float(header[key]) for key, tag in _EXR_SETTINGS.items() if header.get(key)}
+    if not shot:
+        return None
+    if _ISO in shot:
+        shot[_ISO] = int(shot[_ISO])
+    out = Image.Exif()
+    out.get_ifd(ExifTags.IFD.Exif).update(shot)
+    return out
+
+
+def size_of(path: Path) -> tuple[int, int] | None:
+    """Return (width, height) of raw and OpenEXR; None: Pillow opens it.
+
+    Raises UserError: the file is broken, or a package for it is missing.
+    """
+    kind = kind_of(path)
+    if kind == "heif":
+        pillow_heif(path)
+    if kind == "raw":
+        return read_facts(path).size
+    return exr_size(path) if kind == "exr" else None
+
+
+@dataclass(frozen=True)
+class ExifSettings:
+    """Exposure time in seconds, f-number, sensitivity and local date, as far as EXIF has them."""
+
+    time: float | None = None
+    aperture: float | None = None
+    iso: float | None = None
+    taken: str | None = None
+
+
+def read_exif_settings(path: Path) -> ExifSettings:
+    """Return the settings in the EXIF of an image; where it has none or is broken, all are None."""
+    tags = _exif_tags(path)
+    isos = (_positive(tags.get(tag)) for tag in _SENSITIVITIES)
+    taken = str(tags.get(_TAKEN, "")).strip("\0 ")
+    return ExifSettings(
+        time=_positive(tags.get(_TIME)),
+        aperture=_positive(tags.get(_F_NUMBER)),
+        iso=next((value for value in isos if value not in (None, 65535.0)), None),
+        taken=taken if re.fullmatch(r"\d{4}:\d\d:\d\d \d\d:\d\d:\d\d", taken) else None,
+    )
+
+
+def read_exif_ev(path: Path) -> float | None:
+    """Return log2(time * ISO / N^2) in stops, or None where time or F-number is missing or broken.
+
+    A missing ISO counts as 100: only differences between views matter, and cameras that do not
+    record it usually keep it. Exposure bias is ignored; the shutter already contains it.
+    """
+    shot = read_exif_settings(path)
+    if shot.time is None or shot.aperture is None:
+        return None
+    return math.log2(shot.time * (shot.iso or _DEFAULT_ISO) / shot.aperture**2)
+
+
+def read_exif_camera(path: Path) -> str:
+    """Return make, model and focal length as one string; empty without EXIF."""
+    tags = _exif_tags(path)
+    parts = (tags.get(tag) for tag in (_MAKE, _MODEL, _FOCAL_LENGTH))
+    return " ".join(str(part).strip("\0 ") for part in parts if part is not None)
+
+
+def _exif_tags(path: Path) -> dict:
+    kind = kind_of(path)
+    # Pillow raises many kinds of errors on malformed EXIF (struct, Syntax, Value, OS, ...).
+    try:
+        if kind in ("raw", "exr"):
+            exif = read_raw_exif(path) if kind == "raw" else read_exr_exif(path)
+            return {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
+        if kind == "heif":
+            pillow_heif(path)
+        with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
+            exif = image.getexif()
+            return {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
+    except Exception:
+        return {}
+
+
+def _positive(value: object) -> float | None:
+    try:
+        number = float(value[0] if isinstance(value, tuple) else value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, ZeroDivisionError, IndexError):
+        return None
+    return number if math.isfinite(number) and number > 0 else None
