@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from p2gs_jax.config import DataConfig, SceneFormat
-from p2gs_jax.scene.files import Report
 from p2gs_jax.scene.drives import argoverse, kitti, nuscenes, pandaset, waymo
 from p2gs_jax.scene.drives.recording import Recording
+from p2gs_jax.scene.files import Report
 
 
 class DriveFormat(NamedTuple):

@@ -15,7 +15,6 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.files import Report
 from p2gs_jax.scene.drives.ego_mask import find_ego_masks
 from p2gs_jax.scene.drives.lidar import MOST_MEASURED, owners, seeds, thinned
 from p2gs_jax.scene.drives.recording import (
@@ -26,7 +25,7 @@ from p2gs_jax.scene.drives.recording import (
     chosen_frames,
 )
 from p2gs_jax.scene.drives.tables import counted
-from p2gs_jax.scene.files import check_missing, require_plain
+from p2gs_jax.scene.files import Report, check_missing, require_plain
 from p2gs_jax.scene.rigid import inverse
 from p2gs_jax.types import Lidar, Scene, TrackedObject, View
 
