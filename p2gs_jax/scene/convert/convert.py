@@ -253,6 +253,7 @@ class _Converter:
         picture, kind = self._read(path), self._kinds[path]
         record: dict[str, Any] = {"kind": kind, "light": picture.light is not None}
         if picture.light is None:
+            assert picture.codes is not None
             write_png(target, picture.codes, picture.exif, picture.profile)
             return record
         scale = self._scale if kind == "exr" else 1.0

@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, UInt
@@ -129,7 +129,7 @@ def adobe_rgb() -> Profile:
 def read_profile(data: bytes) -> Profile | None:
     """Return the colour space that an ICC profile describes; None: sRGB, grey or broken."""
     try:
-        header = ImageCms.ImageCmsProfile(io.BytesIO(data)).profile
+        header: Any = ImageCms.ImageCmsProfile(io.BytesIO(data)).profile
         if header.xcolor_space.strip() != "RGB":
             return None
         name, tags = header.profile_description or "unnamed", _tags(data)

@@ -350,7 +350,7 @@ def _exif_tags(path: Path) -> dict:
     # Pillow raises many kinds of errors on malformed EXIF (struct, Syntax, Value, OS, ...).
     try:
         if kind in ("raw", "exr"):
-            exif = read_raw_exif(path) if kind == "raw" else read_exr_exif(path)
+            exif = (read_raw_exif(path) if kind == "raw" else read_exr_exif(path)) or Image.Exif()
             return {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
         if kind == "heif":
             pillow_heif(path)
