@@ -29,7 +29,7 @@ UNDECIDED = 2e-4
 SMALL_GROUP = 1e-4
 
 
-def camera(width: int = 40, height: int = 24, focal: float = 32.0) -> Camera:
+def camera(width: int = 37, height: int = 21, focal: float = 30.0) -> Camera:
     """Return a camera at the origin that looks along z."""
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], np.float32)
     return Camera(jnp.eye(4), jnp.asarray(K), width, height)
@@ -67,6 +67,7 @@ def crowd(n: int = 60, seed: int = 0, **overrides) -> Gaussians:
     return splats(n, **(values | overrides))
 
 
+# Its size is not divisible by the tile's.
 VIEW = camera()
 
 
@@ -195,7 +196,6 @@ CASES = (
         "black, transmittance 1",
         lambda: splats(mean=(-1.8, -1.0, 4.0), scales=(0.05,) * 3),
     ),
-    HardCase("size not divisible by the tile", "no seam", crowd, camera(37, 21, 30.0)),
     HardCase("1 x 1 pixel", "one right pixel", crowd, camera(1, 1, 2.0)),
 )
 

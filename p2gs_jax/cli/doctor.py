@@ -213,7 +213,7 @@ def check_devices() -> list[Finding]:
     try:
         import jax
 
-        from p2gs_jax.render import fastest_here
+        from p2gs_jax.render.tiles import fastest_here
 
         # Tile lists as `render.binning` chooses where the configuration says None.
         cpu = jax.default_backend() == "cpu"

@@ -44,19 +44,17 @@ def naming(path: Path, *, begun: Path | None = None, size: int = _PART) -> Itera
     """
     try:
         yield
-    except OSError as error:
-        if error.errno is None:
-            _raise_reason(path, begun, size, error)
-        elif error.filename is None:
-            raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
-        raise
     except Exception as error:
-        _raise_reason(path, begun, size, error)
-        raise
+        if isinstance(error, OSError) and error.filename is not None:
+            raise
+        code = getattr(error, "errno", None) or _reason(path, begun, size)
+        if code is None:
+            raise
+        raise OSError(code, os.strerror(code), str(path)) from error
 
 
-def _raise_reason(path: Path, begun: Path | None, size: int, error: Exception) -> None:
-    """Raise what the system says to so many bytes more; nothing if it takes them."""
+def _reason(path: Path, begun: Path | None, size: int) -> int | None:
+    """Return the number of what the system says to so many bytes more; None if it takes them."""
     try:
         with (
             tempfile.NamedTemporaryFile(dir=path.parent, prefix=".trying-")
@@ -67,8 +65,8 @@ def _raise_reason(path: Path, begun: Path | None, size: int, error: Exception) -
                 file.write(bytes(_PART))
             file.flush()
     except OSError as reason:
-        code = reason.errno or errno.EIO
-        raise OSError(code, os.strerror(code), str(path)) from error
+        return reason.errno or errno.EIO
+    return None
 
 
 @contextlib.contextmanager
@@ -147,13 +145,10 @@ def no_empty_folders(path: Path) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        if new:
-            for folder, _, _ in os.walk(path, topdown=False):
-                with contextlib.suppress(OSError):
-                    os.rmdir(folder)
-            for folder in new[1:]:
-                with contextlib.suppress(OSError):
-                    folder.rmdir()
+        made = [Path(at) for at, _, _ in os.walk(path, topdown=False)] if new else []
+        for folder in [*made, *new[1:]]:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
         raise
 
 
@@ -181,12 +176,6 @@ def write_text(path: Path, text: str) -> None:
 def write_json(path: Path, value: Any) -> None:
     """Write JSON atomically, keys in the given order."""
     write_text(path, json.dumps(plain(value), indent=2, allow_nan=False) + "\n")
-
-
-def write_array(path: Path, array: np.ndarray) -> None:
-    """Write a .npy file atomically."""
-    with atomic_write(path) as temporary:
-        np.save(temporary, array)
 
 
 def append_jsonl(path: Path, record: dict) -> None:

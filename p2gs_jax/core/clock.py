@@ -76,40 +76,31 @@ def over_budget(budget_s: float | None, seconds: Mapping[str, float]) -> str | N
 class CompileCounter:
     """What XLA compiled since this counter was made, in all threads of the process.
 
-    JAX offers listeners but no counter. One listener adds everything up for the whole process, and
-    counters are differences: none needs an end, and threads cannot miss one.
+    JAX offers listeners but no counter. One listener collects for the whole process, and counters
+    remember where they began: none needs an end, and threads cannot miss one.
     """
 
     def __init__(self):
-        self._begin = _totals()
+        self._begin = len(_compiled)
 
     @property
     def programs(self) -> int:
         """Programs compiled, or read back from the cache on disk."""
-        return int(_totals()[0] - self._begin[0])
+        return len(_compiled) - self._begin
 
     @property
     def seconds(self) -> float:
         """Seconds that threads spent in the compiler or reading the cache, summed over threads."""
-        return _totals()[1] - self._begin[1]
+        return sum(_compiled[self._begin :], 0.0)
 
 
-_lock = threading.Lock()
-_sums = [0.0, 0.0]
-
-
-def _totals() -> tuple[float, float]:
-    """Return (programs, seconds) since this module was loaded."""
-    with _lock:
-        programs, seconds = _sums
-    return programs, seconds
+# Seconds of every program since this module was loaded.
+_compiled: list[float] = []
 
 
 def _on_duration(event: str, duration_secs: float, **_) -> None:
     if event == _COMPILED:
-        with _lock:
-            _sums[0] += 1
-            _sums[1] += duration_secs
+        _compiled.append(duration_secs)
 
 
 monitoring.register_event_duration_secs_listener(_on_duration)

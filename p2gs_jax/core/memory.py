@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import resource
 from pathlib import Path
 
@@ -25,7 +26,9 @@ def memory() -> tuple[int | None, int | None]:
     if limit.isdigit() and (total is None or int(limit) < total):
         total = int(limit)
         # What it holds of files goes when memory is wanted.
-        left = total - int(used) + _cached_files() if used.isdigit() else total
+        files = re.search(r"^inactive_file (\d+)$", text_of(CGROUP / "memory.stat"), re.MULTILINE)
+        cached = int(files[1]) if files else 0
+        left = total - int(used) + cached if used.isdigit() else total
         available = left if available is None else min(available, left)
     return total, available
 
@@ -66,12 +69,6 @@ def text_of(path: Path) -> str:
         return path.read_text().strip()
     except (OSError, UnicodeDecodeError):
         return ""
-
-
-def _cached_files() -> int:
-    rows = dict(line.split(" ", 1) for line in text_of(CGROUP / "memory.stat").splitlines())
-    found = rows.get("inactive_file", "")
-    return int(found) if found.isdigit() else 0
 
 
 def _numbers(path: Path) -> dict[str, int]:

@@ -8,11 +8,12 @@ with the types' later names that say their sizes (int8, float32).
 from __future__ import annotations
 
 import io
+import itertools
 import mmap
 import re
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,7 +23,6 @@ from p2gs_jax.errors import UserError
 
 # A header that is longer has no end.
 MOST_HEADER = 2**20
-_MOST_DIGITS = 18
 _CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 _NAMES = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")
 _SIZED = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64")
@@ -35,32 +35,11 @@ class PlyError(ValueError):
     """What is wrong with the contents of a file."""
 
 
-class CountError(PlyError):
-    """A count that a file of this size cannot hold."""
-
-
-class Property(NamedTuple):
-    """The types of a column: of its values and, where they are lists, of their lengths."""
-
-    kind: np.dtype
-    length: np.dtype | None
-
-
-@dataclass(frozen=True)
-class Element:
-    """A table as a header announces it: rows, and properties by name in their order."""
+class Element(NamedTuple):
+    """A table as a header announces it: its rows, and its columns: NumPy's types, "" for lists."""
 
     count: int
-    properties: dict[str, Property]
-
-    def lists(self) -> bool:
-        """Return whether rows may differ in length."""
-        return any(p.length is not None for p in self.properties.values())
-
-    def row(self) -> np.dtype:
-        """Return a row without its lists."""
-        items = self.properties.items()
-        return np.dtype([(name, p.kind) for name, p in items if p.length is None])
+    columns: dict[str, str]
 
 
 class Header(NamedTuple):
@@ -91,18 +70,22 @@ def parse_header(head: bytes, size: int) -> Header:
     if end is None:
         raise PlyError("it has no line 'end_header'")
     lines = head[magic.end() : end.start()].decode("ascii").split(newline.decode())
-    order, elements, properties = "", dict[str, Element](), dict[str, Property]()
+    order, elements, columns = "", dict[str, Element](), dict[str, str]()
     for number, line in enumerate(lines, 2):
         match line.split():
             case ["comment" | "obj_info", *_]:
                 continue
             case ["format", kind, "1.0"] if not order and kind in _ORDERS:
                 order = _ORDERS[kind]
-            case ["element", name, count] if order and name not in elements:
-                properties = {}
-                elements[name] = Element(_count(count, size), properties)
-            case ["property", *types, name] if elements and name not in properties:
-                properties[name] = _property(types, order)
+            case ["element", name, count] if order and name not in elements and count.isdigit():
+                if int(count) > size:
+                    raise PlyError(f"it announces {count[:18]} records and has {size} bytes")
+                columns = {}
+                elements[name] = Element(int(count), columns)
+            case ["property", kind, name] if elements and name not in columns and kind in _TYPES:
+                columns[name] = order + _TYPES[kind]
+            case ["property", "list", *_, name] if elements and name not in columns:
+                columns[name] = ""
             case _:
                 said = f"line {number} of its header, {line[:80]!r}"
                 raise PlyError(f"{said}, is unknown, misplaced or there twice")
@@ -131,24 +114,6 @@ def header_of(name: str, row: np.dtype, count: int, comments: Sequence[str] = ()
     return ("\n".join(lines) + "\n").encode("ascii")
 
 
-def _count(said: str, size: int) -> int:
-    if not re.fullmatch("[0-9]+", said):
-        raise PlyError(f"its header has {said[:80]!r} for a count")
-    if len(said) > _MOST_DIGITS or int(said) > size:
-        raise CountError(f"announces {said[:_MOST_DIGITS]} records and has {size} bytes")
-    return int(said)
-
-
-def _property(types: list[str], order: str) -> Property:
-    """Return what stands before a property's name."""
-    match types:
-        case [kind] if kind in _TYPES:
-            return Property(np.dtype(order + _TYPES[kind]), None)
-        case ["list", length, kind] if kind in _TYPES and _TYPES.get(length, "f")[0] != "f":
-            return Property(np.dtype(order + _TYPES[kind]), np.dtype(order + _TYPES[length]))
-    raise PlyError(f"its header has a property of type {' '.join(types)[:80]!r}, which PLY lacks")
-
-
 @contextmanager
 def refusing(path: Path, what: str, *, fix: str) -> Iterator[None]:
     """Turn errors inside into one for the user: `path` is not a PLY of `what`.
@@ -158,21 +123,20 @@ def refusing(path: Path, what: str, *, fix: str) -> Iterator[None]:
     """
     try:
         yield
-    except CountError as error:
-        raise UserError(f"{path} {error}.", fix=fix) from error
     except (OSError, ValueError, KeyError) as error:
-        raise UserError(f"{path} is no PLY of {what}: {error}.", fix=fix) from error
+        said = str(error).rstrip(".")
+        raise UserError(f"{path} is not a valid PLY of {what}: {said}.", fix=fix) from error
 
 
 def read_table(path: Path, name: str) -> np.ndarray:
-    """Return the rows of an element without its lists: a field for each property.
+    """Return the rows of an element: a field for each property.
 
-    Binary rows without lists are mapped: what has been read may leave memory again. All elements
-    are gone through, so a file that was cut anywhere is refused.
+    Binary rows are mapped: what has been read may leave memory again. What follows a later element
+    with lists is not looked at; a file that was cut before is refused.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: it is not a PLY, was cut, or has no such element.
+        ValueError: it is not a PLY, was cut, has no such element, or has lists in it or before it.
     """
     with path.open("rb") as file:
         if not path.stat().st_size:
@@ -182,102 +146,32 @@ def read_table(path: Path, name: str) -> np.ndarray:
         header = parse_header(data[:MOST_HEADER], len(data))
         if name not in header.elements:
             raise PlyError(f"it has no element {name!r}")
-        if header.order != "=":
-            return _from_bytes(data, header, name)
         file.seek(header.size)
-        with io.TextIOWrapper(file, "ascii") as lines:
-            return _from_text(lines, header, name)
+        lines, at, found = io.TextIOWrapper(file, "ascii"), header.size, None
+        for here, (count, columns) in header.elements.items():
+            if "" in columns.values():
+                if found is None:
+                    raise PlyError(f"its element {here!r}, up to {name!r}, has lists")
+                break
+            row = np.dtype(list(columns.items()))
+            if header.order == "=":
+                rows = _from_text(lines, count, row)
+            else:
+                whole = min((len(data) - at) // max(row.itemsize, 1), count)
+                rows = np.ndarray(whole, row, data, at)
+                at += whole * row.itemsize
+            if len(rows) < count:
+                raise PlyError(f"it ends before the last of its {count} rows of {here!r}")
+            found = rows if here == name else found
+        assert found is not None
+        return found
 
 
-def _from_bytes(data: mmap.mmap, header: Header, wanted: str) -> np.ndarray:
-    """Return the rows of an element of a binary file."""
-    at, found = header.size, None
-    for name, element in header.elements.items():
-        row, begin, kept = element.row(), at, bytearray()
-        if element.lists():
-            at = _walk(data, at, element, header.order, kept if name == wanted else None)
-        else:
-            at += element.count * row.itemsize
-        if at > len(data):
-            raise _cut(name, element)
-        if name == wanted:
-            lies, first = (kept, 0) if element.lists() else (data, begin)
-            found = np.ndarray(element.count, row, buffer=lies, offset=first)
-    assert found is not None
-    return found
-
-
-def _walk(data: mmap.mmap, at: int, element: Element, order: str, kept: bytearray | None) -> int:
-    """Go through rows with lists that begin at `at`; return where they end.
-
-    That is beyond the file where it was cut. `kept` receives what is not in a list.
-    """
-    ending, columns = ("big" if order == ">" else "little"), element.properties.values()
-    for _ in range(element.count):
-        for kind, length in columns:
-            first, at = at, at + (kind if length is None else length).itemsize
-            value = data[first:at]
-            if length is not None:
-                count = int.from_bytes(value, ending, signed=length.kind == "i")
-                at += _length(count) * kind.itemsize
-            elif kept is not None:
-                kept += value
-        if at > len(data):
-            break
-    return at
-
-
-def _from_text(lines: io.TextIOWrapper, header: Header, wanted: str) -> np.ndarray:
-    """Return the rows of an element of a text file."""
-    found = None
-    for name, element in header.elements.items():
-        row, rows = element.row(), _text_rows(lines, name, element)
-        if name != wanted or not (element.count and row.names):
-            passed = sum(1 for _ in rows)
-            found = np.empty(passed, row) if name == wanted else found
-            continue
-        try:
-            found = np.loadtxt(rows, row, comments=None, ndmin=1)
-        except PlyError:
-            raise
-        except ValueError as error:
-            raise PlyError(f"among its rows of {name!r}: {str(error).rstrip('.')}") from error
-    assert found is not None
-    return found
-
-
-def _text_rows(lines: io.TextIOWrapper, name: str, element: Element) -> Iterator[str]:
-    """Yield the lines of an element without its lists."""
-    lists, columns = element.lists(), len(element.properties)
-    for number in range(element.count):
-        line = lines.readline()
-        if not line:
-            raise _cut(name, element)
-        words = line.split()
-        at, line = _without_lists(words, element) if lists else (columns, line)
-        if at != len(words):
-            raise PlyError(f"row {number} of {name!r} has {len(words)} values instead of {at}")
-        yield line
-
-
-def _without_lists(words: list[str], element: Element) -> tuple[int, str]:
-    """Return how many words a row takes, and those of them that belong to no list."""
-    at, kept = 0, []
-    for _, length in element.properties.values():
-        value = words[at : at + 1]
-        at += 1
-        if length is None:
-            kept += value
-        elif value:
-            at += _length(int(value[0]))
-    return at, " ".join(kept)
-
-
-def _length(count: int) -> int:
-    if count < 0:
-        raise PlyError(f"it has a list of {count} values")
-    return count
-
-
-def _cut(name: str, element: Element) -> PlyError:
-    return PlyError(f"it ends before the last of its {element.count} rows of {name!r}")
+def _from_text(lines: io.TextIOWrapper, count: int, row: np.dtype) -> np.ndarray:
+    """Return the next rows of a text file, at most `count`."""
+    rows = itertools.islice(lines, count)
+    if not count or not row.names:
+        return np.empty(sum(1 for _ in rows), row)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "loadtxt: input contained no data")
+        return np.loadtxt(rows, row, comments=None, ndmin=1)

@@ -11,7 +11,6 @@ from typing import Any
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.live import Live
 from rich.segment import Segment
-from rich.table import Table
 from rich.text import Text
 
 from p2gs_jax.core.text import printable
@@ -121,18 +120,9 @@ class TerminalReporter(Reporter):
             self.console.print(Text(line), soft_wrap=True)
 
     def log(self, record: LogRecord) -> None:
-        """Show loss, PSNR, Gaussians, views per second and the time left."""
+        """Show how far the optimisation is and, in a terminal, its loss and views per second."""
         rate = 1 / record.step_seconds if record.step_seconds else 0.0
-        left = "" if record.left_s is None else f"{clock(record.left_s)} left"
-        bar = "█" * int(24 * record.progress)
-        table = Table.grid(padding=(0, 2))
-        table.add_row(
-            f"{bar:<24} {record.progress:4.0%}",
-            f"step {record.step}",
-            f"loss {record.loss:.4f}",
-            f"PSNR {record.psnr:.2f} dB",
-            f"{record.gaussians} Gaussians",
-            f"{rate:.1f} views/s",
-            left,
-        )
-        self.show(table, f"{record.progress:.0%}, {record.summary()}")
+        bar = f"{'█' * int(24 * record.progress):<24} {record.progress:4.0%}"
+        more = f"loss {record.loss:.4f}, {rate:.1f} views/s"
+        text = f"{record.progress:.0%}, {record.summary()}"
+        self.show(Text(f"{bar}  {record.summary()}, {more}"), text)

@@ -13,6 +13,7 @@ import hashlib
 import platform
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import platformdirs
@@ -30,9 +31,7 @@ def keep_freed_memory() -> bool:
 
     The process then shrinks only by `return_freed_memory`. glibc only.
     """
-    if not sys.platform.startswith("linux"):
-        return False
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    mallopt = _of_glibc("mallopt")
     if mallopt is None:
         return False
     wanted = ((_M_MMAP_THRESHOLD, 1 << 30), (_M_TRIM_THRESHOLD, 2**31 - 1), (_M_TOP_PAD, 64 << 20))
@@ -45,10 +44,14 @@ def return_freed_memory() -> None:
 
     It costs what the next part takes anew, some tenths of a second a gigabyte.
     """
-    if sys.platform.startswith("linux"):
-        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-        if trim is not None:
-            trim(0)
+    trim = _of_glibc("malloc_trim")
+    if trim is not None:
+        trim(0)
+
+
+def _of_glibc(name: str) -> Any:
+    """Return a function of the C library, None where there is no such function."""
+    return getattr(ctypes.CDLL(None), name, None) if sys.platform.startswith("linux") else None
 
 
 def tune_process() -> None:

@@ -255,8 +255,7 @@ class DisplayFiles:
         scene, render = self.fitted.scene, self.fitted.cfg.render
         splits = {"train": scene.train_indices, "test": scene.test_indices}
         aims = {split: [self.targets[i] for i in _spread(rows)] for split, rows in splits.items()}
-        errors = {split: baking.baking_error(shown, aim, render) for split, aim in aims.items()}
-        return {split: baking.error_summary(found) for split, found in errors.items()}
+        return {split: baking.baking_error(shown, aim, render) for split, aim in aims.items()}
 
 
 def _spread(rows: Sequence[int]) -> list[int]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, cast
 
 import jax
@@ -57,21 +57,6 @@ class Target:
     picture: UInt8[np.ndarray, "h w 3"]
 
 
-@dataclass(frozen=True)
-class ViewError:
-    """Differences between a viewer's picture of one view and the true one.
-
-    The PSNR is in dB, also that in a viewer whose background is white instead of black; mean and
-    largest absolute difference of any channel are in 8-bit levels.
-    """
-
-    name: str
-    psnr: float
-    mean_codes: float
-    max_codes: float
-    psnr_on_white: float
-
-
 def true_target(
     name: str, gaussians: Gaussians, camera: Camera, transform: DisplayTransform, render: RenderView
 ) -> Target:
@@ -115,9 +100,8 @@ def display_sh(
     Exact for degree 0. `tone` takes radiance to display values, clamped to [0, 1] here; `degree`
     is that of the result, None keeps the radiance's.
     """
-    directions = fibonacci_sphere(DIRECTIONS).astype(np.float32)
-    axes = tuple(directions.T)
-    table = np.stack(_basis(axes, degree_of(sh.shape[1])), 1)
+    directions = fibonacci_sphere(DIRECTIONS)
+    table = harmonics.table(directions, degree_of(sh.shape[1]))
     kept = table if degree is None else table[:, : coefficient_count(degree)]
     inverse = np.linalg.pinv(kept)
     out = np.empty((len(sh), kept.shape[1], 3), np.float32)
@@ -129,9 +113,6 @@ def display_sh(
         shown = np.clip(colors, 0, 1) - 0.5
         out[start : start + CHUNK] = np.einsum("kd,ndc->nkc", inverse, shown, optimize=True)
     return out
-
-
-_basis = jax.jit(harmonics.basis, static_argnums=1)
 
 
 def viewer_config(cfg: RenderConfig) -> RenderConfig:
@@ -208,47 +189,51 @@ def refine(
 
 def baking_error(
     gaussians: Gaussians, targets: Sequence[Target], cfg: RenderConfig
-) -> list[ViewError]:
-    """Compare a viewer's pictures of display colours, as a file holds them, with the true ones."""
+) -> dict[str, Any] | None:
+    """Compare a viewer's pictures of display colours, as a file holds them, with the true ones.
+
+    PSNR is in dB, also that in a viewer whose background is white instead of black; mean and
+    largest absolute difference of any channel are in 8-bit levels. None where there are no targets.
+    """
+    if not targets:
+        return None
     render = make_renderer(viewer_config(cfg))
-    return [_difference(t, render(gaussians, _all(gaussians), t.camera)) for t in targets]
+    views = {t.name: _difference(t, render(gaussians, _all(gaussians), t.camera)) for t in targets}
+    worst = min(views, key=lambda name: views[name]["psnr"])
+    psnr, mean, most, white = zip(*(view.values() for view in views.values()), strict=True)
+    return {
+        "views": len(views),
+        "psnr_median": float(np.median(psnr)),
+        "psnr_worst": views[worst]["psnr"],
+        "worst_view": worst,
+        "mean_codes": float(np.mean(mean)),
+        "max_codes": max(most),
+        "psnr_on_white_median": float(np.median(white)),
+        "per_view": views,
+    }
 
 
 def _over(render: Render, background: Float[Array, " 3"]) -> Float[Array, "h w 3"]:
     return render.linear + (1 - render.alpha)[..., None] * background
 
 
-def _difference(target: Target, render: Render) -> ViewError:
-    on_black, on_white = (
-        np.abs(
-            255.0 * np.clip(np.asarray(_over(render, jnp.full(3, level))), 0, 1) - target.picture
-        )
-        for level in (0.0, 1.0)
-    )
-    mean, most = float(on_black.mean()), float(on_black.max())
-    return ViewError(target.name, _psnr(on_black), mean, most, _psnr(on_white))
+def _difference(target: Target, render: Render) -> dict[str, float]:
+    """Return the differences of one view."""
 
+    def from_truth(level: float) -> np.ndarray:
+        shown = np.clip(np.asarray(_over(render, jnp.full(3, level))), 0, 1)
+        return np.abs(255.0 * shown - target.picture)
 
-def _psnr(difference: Float[np.ndarray, "h w 3"]) -> float:
-    """Return the PSNR of absolute differences in 8-bit levels, dB."""
-    mse = float(np.mean((difference / 255.0) ** 2, dtype=np.float64))
-    return float(-10 * np.log10(max(mse, 1e-10)))
+    def psnr(difference: np.ndarray) -> float:
+        mse = float(np.mean((difference / 255.0) ** 2, dtype=np.float64))
+        return float(-10 * np.log10(max(mse, 1e-10)))
 
-
-def error_summary(errors: Sequence[ViewError]) -> dict | None:
-    """Return median and worst of some views as plain values; None where there are none."""
-    if not errors:
-        return None
-    worst = min(errors, key=lambda e: e.psnr)
+    on_black = from_truth(0.0)
     return {
-        "views": len(errors),
-        "psnr_median": float(np.median([e.psnr for e in errors])),
-        "psnr_worst": worst.psnr,
-        "worst_view": worst.name,
-        "mean_codes": float(np.mean([e.mean_codes for e in errors])),
-        "max_codes": max(e.max_codes for e in errors),
-        "psnr_on_white_median": float(np.median([e.psnr_on_white for e in errors])),
-        "per_view": {e.name: {k: v for k, v in asdict(e).items() if k != "name"} for e in errors},
+        "psnr": psnr(on_black),
+        "mean_codes": float(on_black.mean()),
+        "max_codes": float(on_black.max()),
+        "psnr_on_white": psnr(from_truth(1.0)),
     }
 
 

@@ -126,8 +126,7 @@ def dense_seeds(
     evenly, and their neighbours may be any. `on_view` is called with views done and views in all.
     """
     rows = scene.train_indices
-    empty = np.zeros((0, 3), np.float32)
-    nothing = DenseSeeds(empty, empty, empty, np.zeros((0, 4), np.float32))
+    nothing = DenseSeeds(*np.zeros((3, 0, 3), np.float32), np.zeros((0, 4), np.float32))
     if len(rows) < FEWEST_VIEWS or limit < 1 or not len(scene.points):
         return nothing
     images = MatchImages(scene, store, match, MATCH_SIDE, cfg.loss.black, cfg.loss.saturation)
@@ -231,9 +230,14 @@ def choose_seeds(
 
 def _world(candidates: Candidates, images: MatchImages, pick) -> Float[np.ndarray, "c 3"]:
     frame = images[candidates.row]
-    xy1 = np.concatenate([candidates.xy[pick], np.ones((len(pick), 1))], 1)
-    local = xy1 @ np.linalg.inv(frame.K).T / candidates.inverse[pick, None]
+    local = frame.rays(candidates.xy[pick]) / candidates.inverse[pick, None]
     return (local - frame.viewmat[:3, 3]) @ frame.viewmat[:3, :3]
+
+
+def _cells(xy: Float[np.ndarray, "c 2"], size: float, width: int) -> Int[np.ndarray, " c"]:
+    """Return the number of the square cell that each pixel position lies in."""
+    across = int(np.ceil(width / size)) + 1
+    return (xy[:, 0] // size).astype(int) + (xy[:, 1] // size).astype(int) * across
 
 
 def _draw(found, images: MatchImages, existing, tree, cell: float, plain: float):
@@ -243,15 +247,7 @@ def _draw(found, images: MatchImages, existing, tree, cell: float, plain: float)
         frame = images[candidates.row]
         height, width = frame.luminance.shape
         xy, z = candidates.xy, 1 / candidates.inverse
-        across = int(np.ceil(width / cell)) + 1
-        coarse_across = int(np.ceil(width / (2 * cell))) + 1
-
-        def ids(at, cell=cell, across=across, coarse_across=coarse_across):
-            fine = (at[:, 0] // cell).astype(int) + (at[:, 1] // cell).astype(int) * across
-            coarse = (at[:, 0] // (2 * cell)).astype(int)
-            return fine, coarse + (at[:, 1] // (2 * cell)).astype(int) * coarse_across
-
-        fine, coarse = ids(xy)
+        fine, coarse = (_cells(xy, size, width) for size in (cell, 2 * cell))
         most = int(coarse.max(initial=0)) + 1
         mean = np.bincount(coarse, candidates.texture, most)
         rich = (mean / np.maximum(np.bincount(coarse, minlength=most), 1))[coarse] > plain
@@ -265,19 +261,17 @@ def _draw(found, images: MatchImages, existing, tree, cell: float, plain: float)
         pick = _winners(place, key)
         spacing = np.where(rich[pick], cell, 2 * cell)
         # What other views and existing seeds show here already.
-        local = np.concatenate(chosen) @ frame.viewmat[:3, :3].T + frame.viewmat[:3, 3]
-        local = local[local[:, 2] > 1e-6]
-        at = local @ frame.K.T
-        at = at[:, :2] / at[:, 2:]
+        at, depths = frame.project(np.concatenate(chosen))
         inside = (at >= 0).all(1) & (at < [width, height]).all(1)
-        f, c = ids(at[inside])
+        at, depths = at[inside], depths[inside]
         taken = np.zeros(len(pick), bool)
         slot = np.full(first + most, -1)
         slot[place[pick]] = np.arange(len(pick))
-        for where, bound, offset in ((f, first, 0), (c, most, first)):
+        for size, bound, offset in ((cell, first, 0), (2 * cell, most, first)):
+            where = _cells(at, size, width)
             known = where < bound
             hit = slot[where[known] + offset]
-            zs, hit = local[inside, 2][known][hit >= 0], hit[hit >= 0]
+            zs, hit = depths[known][hit >= 0], hit[hit >= 0]
             taken[hit[np.abs(zs / z[pick[hit]] - 1) < SAME_DEPTH]] = True
         pick, spacing = pick[~taken], spacing[~taken]
         points = _world(candidates, images, pick)
@@ -298,8 +292,7 @@ def _seeds(candidates: Candidates, images: MatchImages, pick, spacing):
     size = SPREAD * spacing * z / np.mean(np.diag(frame.K)[:2])
     normal = candidates.normals[pick].astype(np.float64)
     flat = (normal**2).sum(1) > 0.5
-    ray = np.concatenate([candidates.xy[pick], np.ones((len(pick), 1))], 1)
-    ray = ray @ np.linalg.inv(frame.K).T
+    ray = frame.rays(candidates.xy[pick])
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     normal[~flat] = -ray[~flat]
     facing = np.clip(-(normal * ray).sum(1), 1 / LARGEST_STRETCH, 1)
@@ -336,14 +329,13 @@ def gaussians_of(
     if dense is None:
         return gaussians_from_points(points, radiance, views, cfg)
     everything, count = np.concatenate([points, dense.points]), len(points)
+    bare = neighbour_scales(everything, views)[:count]
+    opacities = [cfg.init.opacity, cfg.init.dense_opacity]
     own = {
-        "scales": np.repeat(neighbour_scales(everything, views)[:, None], 3, 1),
-        "opacity": np.full(len(everything), cfg.init.opacity),
-        "quats": np.tile(np.eye(1, 4), (len(everything), 1)),
+        "scales": np.concatenate([np.repeat(bare[:, None], 3, 1), dense.scales]),
+        "opacity": np.repeat(opacities, [count, len(dense.points)]),
+        "quats": np.concatenate([np.tile(np.eye(1, 4), (count, 1)), dense.quats]),
     }
-    own["scales"][count:] = dense.scales
-    own["opacity"][count:] = cfg.init.dense_opacity
-    own["quats"][count:] = dense.quats
     colors = np.concatenate([radiance, dense.radiance])
     return gaussians_from_points(everything, colors, views, cfg, **own)
 

@@ -92,19 +92,16 @@ def _geometry(a: MatchImage, b: MatchImage) -> _Geometry:
 def guide(frame: MatchImage, points: Float[np.ndarray, "p 3"]) -> Float32[np.ndarray, "h w"]:
     """Return inverse depth interpolated between points that the view sees, to start the flow."""
     height, width = frame.luminance.shape
-    local = points @ frame.viewmat[:3, :3].T + frame.viewmat[:3, 3]
-    local = local[local[:, 2] > 1e-6]
-    if not len(local):
+    xy, z = frame.project(points)
+    if not len(z):
         return np.zeros((height, width), np.float32)
-    xy = local @ frame.K.T
-    xy = xy[:, :2] / xy[:, 2:]
     down, across = -(-height // GUIDE_CELL), -(-width // GUIDE_CELL)
     grid = pixel_centers(down, across).reshape(-1, 2) * [width / across, height / down]
-    nearest = min(GUIDES, len(local))
+    nearest = min(GUIDES, len(z))
     found = KDTree(xy).query(grid, k=nearest)
     distance, which = (np.asarray(f).reshape(len(grid), nearest) for f in found)
     weight = 1 / (distance**2 + GUIDE_CELL**2)
-    coarse = (weight / local[which, 2]).sum(1) / weight.sum(1)
+    coarse = (weight / z[which]).sum(1) / weight.sum(1)
     coarse = coarse.reshape(down, across).astype(np.float32)
     return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
 
@@ -138,20 +135,13 @@ def _sampled(image, xy, how=cv2.INTER_LINEAR):
     return cv2.remap(image, at[..., 0], at[..., 1], how, borderMode=cv2.BORDER_CONSTANT)
 
 
-def _start(there: _Geometry, inverse, xy):
-    """Return the flow that a depth predicts, 0 where it leads nowhere."""
-    height, width = inverse.shape
-    flow = there.project(inverse)[0] - xy
-    flow = np.nan_to_num(flow, nan=0.0)
-    return np.clip(flow, -max(width, height), max(width, height))
-
-
 class _Pair(NamedTuple):
     inverse: np.ndarray
     precision: np.ndarray  # of `inverse`; 0 = refused
     refused: list[np.ndarray]
 
 
+@dataclass
 class Flows:
     """Flows between training views, computed when asked for; from any thread.
 
@@ -159,11 +149,14 @@ class Flows:
     flows, and what starts them, are kept.
     """
 
-    def __init__(
-        self, images: MatchImages, points: Float[np.ndarray, "p 3"], seen: Bool[np.ndarray, "v p"]
-    ):
-        self.images = images
-        self._guide = lru_cache(KEPT_FLOWS)(lambda i: guide(images[i], points[seen[i]]))
+    images: MatchImages
+    points: Float[np.ndarray, "p 3"]
+    seen: Bool[np.ndarray, "v p"]
+
+    def __post_init__(self):
+        self._guide = lru_cache(KEPT_FLOWS)(
+            lambda i: guide(self.images[i], self.points[self.seen[i]])
+        )
         self.between = lru_cache(KEPT_FLOWS)(self._flow)
 
     def _flow(self, i: int, j: int) -> Float32[np.ndarray, "h w 2"]:
@@ -171,8 +164,10 @@ class Flows:
         a, b = self.images[i], self.images[j]
         # Always in one order, so that both directions compare the same pictures.
         first, second = at_common_exposure(a, b) if i < j else at_common_exposure(b, a)[::-1]
-        here = pixel_centers(*a.luminance.shape)
-        return _flow(first, second, _start(_geometry(a, b), self._guide(i), here))
+        # It starts where the depth of the guide leads, if it leads anywhere.
+        start = _geometry(a, b).project(self._guide(i))[0] - pixel_centers(*a.luminance.shape)
+        most = max(a.luminance.shape)
+        return _flow(first, second, np.clip(np.nan_to_num(start, nan=0.0), -most, most))
 
 
 def _match(flows: Flows, i: int, j: int) -> _Pair:

@@ -75,10 +75,16 @@ class Tones:
         camera = None if self.cameras is None else self.cameras[row]
         y = np.linspace(0.0, 1.0, TABLE)
         log_pivot = np.log(self.formation.pivot)
-        curves = []
-        for z in self._curves(y, camera):
-            bent = log_pivot + (z - log_pivot) * (self.gammas[row] / GAMMA_SRGB)
-            curves.append(bent - self.log_exposures[row])
+        if self.formation.curve == "linear":
+            exposed = [np.log(np.maximum(y, 0.5 / 255))]
+        else:
+            base = "power" if self.formation.curve == "power" else "srgb"
+            splines = (None,)
+            if self.formation.curve == "spline":
+                splines = spline_of(self.formation, camera)
+            exposed = [log_exposed(y, Response(base, spline))[0] for spline in splines]
+        bend = self.gammas[row] / GAMMA_SRGB
+        curves = [log_pivot + (z - log_pivot) * bend - self.log_exposures[row] for z in exposed]
         if len(curves) == 1:
             logs = np.interp(ldr, y, curves[0])
         else:
@@ -89,16 +95,6 @@ class Tones:
             squared = squared_radii(*ldr.shape[:2]) if positions is None else (positions**2).sum(-1)
             logs = logs - log_vignetting(squared, camera, self.formation)
         return logs.astype(np.float32)
-
-    def _curves(self, y: Float[np.ndarray, " t"], camera: int | None) -> list[np.ndarray]:
-        """Return log exposed radiance of display values: for all channels, or for each."""
-        curve = self.formation.curve
-        if curve == "linear":
-            return [np.log(np.maximum(y, 0.5 / 255))]
-        if curve == "spline":
-            splines = spline_of(self.formation, camera)
-            return [log_exposed(y, Response("srgb", spline))[0] for spline in splines]
-        return [log_exposed(y, Response("power" if curve == "power" else "srgb"))[0]]
 
 
 def rough_tones(tracks: Observations | None, count: int) -> Tones:
@@ -138,7 +134,19 @@ class MatchImage:
     K: Float[np.ndarray, "3 3"]
     log_exposure: float
 
+    def project(self, points: Float[np.ndarray, "p 3"]):
+        """Return positions [q 2], pixels, and depths [q] of the points before the camera."""
+        local = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
+        local = local[local[:, 2] > 1e-6]
+        xy = local @ self.K.T
+        return xy[:, :2] / xy[:, 2:], local[:, 2]
 
+    def rays(self, xy: Float[np.ndarray, "c 2"]) -> Float[np.ndarray, "c 3"]:
+        """Return directions of pixel positions in camera coordinates, whose z is 1."""
+        return np.concatenate([xy, np.ones((len(xy), 1))], 1) @ np.linalg.inv(self.K).T
+
+
+@dataclass
 class MatchImages:
     """The training views of a scene, loaded when asked for by their rows; from any thread.
 
@@ -146,17 +154,14 @@ class MatchImages:
     are not used. The last images are kept.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        store: ImageStore,
-        tones: Tones,
-        longest: int,
-        black: float,
-        saturation: float,
-    ):
-        self.scene, self.store, self.tones = scene, store, tones
-        self.longest, self.black, self.saturation = longest, black, saturation
+    scene: Scene
+    store: ImageStore
+    tones: Tones
+    longest: int
+    black: float
+    saturation: float
+
+    def __post_init__(self):
         self._load = lru_cache(CACHED)(self._make)
 
     def __getitem__(self, row: int) -> MatchImage:
@@ -172,9 +177,8 @@ class MatchImages:
         # Pixels beside clipped ones contain some of their light.
         usable = cv2.erode(usable.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
         luminance = np.exp(self.tones.log_radiance(row, ldr)) @ LUMINANCE
-        viewmat, K = viewmat.astype(np.float64), K.astype(np.float64)
-        exposure = float(self.tones.log_exposures[row])
-        return MatchImage(ldr, luminance, usable, viewmat, K, exposure)
+        pose = viewmat.astype(np.float64), K.astype(np.float64)
+        return MatchImage(ldr, luminance, usable, *pose, float(self.tones.log_exposures[row]))
 
 
 def at_common_exposure(

@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from p2gs_jax.config import DynamicsConfig, FitConfig
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.core.streams import Stream, generator
-from p2gs_jax.gaussians.seeds import NEIGHBOURS, gaussians_from_points, mean_radiance, merge
+from p2gs_jax.gaussians.seeds import gaussians_from_points, mean_radiance, merge, spacings
 from p2gs_jax.render.project import STILL
 from p2gs_jax.render.warp import project_points
 from p2gs_jax.scene.drives.objects import MovingObjects, middle_time, outline_of, painted
@@ -73,19 +73,13 @@ def find_nodes(scene: Scene, cfg: DynamicsConfig) -> Nodes | None:
         kept.append(thing)
         points.append(measured.astype(np.float32))
     owner = np.repeat(np.arange(len(kept), dtype=np.int32), [len(p) for p in points])
-    notes = [
-        f"{len(kept)} things move as pieces of their own, with {len(owner)} seeds"
-        + (f"; {filled} of them have few laser points: their boxes are filled" if filled else "")
-        + (f"; {len(left)} are seen too little: their pixels are left out" if left else "")
-        + "."
-    ]
-    return Nodes(
-        MovingObjects(tuple(kept)),
-        np.concatenate([empty, *points]),
-        owner,
-        tuple(left),
-        tuple(notes),
-    )
+    note = f"{len(kept)} things move as pieces of their own, with {len(owner)} seeds"
+    if filled:
+        note += f"; {filled} of them have few laser points: their boxes are filled"
+    if left:
+        note += f"; {len(left)} are seen too little: their pixels are left out"
+    seeds = np.concatenate([empty, *points])
+    return Nodes(MovingObjects(tuple(kept)), seeds, owner, tuple(left), (f"{note}.",))
 
 
 def node_gaussians(
@@ -95,13 +89,10 @@ def node_gaussians(
 
     `radiance` is that of their points, in the gauge of the exposures.
     """
-    scales = np.full(len(nodes.points), WIDEST)
+    scales = np.empty(len(nodes.points))
     for row in np.unique(nodes.owner):
         mine = nodes.owner == row
-        points = nodes.points[mine]
-        if len(points) > NEIGHBOURS:
-            distances, _ = KDTree(points).query(points, k=NEIGHBOURS + 1)
-            scales[mine] = np.sqrt(np.mean(np.asarray(distances)[:, 1:] ** 2, axis=1))
+        scales[mine] = spacings(nodes.points[mine])
     scales = np.clip(scales, 1e-3, WIDEST)
     return gaussians_from_points(nodes.points, radiance, views, cfg, scales=scales)
 
@@ -158,12 +149,13 @@ def _measured(
     half = np.asarray(thing.size) / 2
     inside = there & (np.abs(local) <= half + OUTSIDE).all(1) & (local[:, 2] > GROUND - half[2])
     local, side = local[inside], cfg.voxel
-    while True:
+    while len(local):
         cells = np.floor(local / side).astype(int)
-        kept = np.sort(np.unique(cells, axis=0, return_index=True)[1]) if len(local) else []
+        kept = np.sort(np.unique(cells, axis=0, return_index=True)[1])
         if len(kept) <= cfg.most_points:
-            return local[kept] if len(local) else local
+            return local[kept]
         side *= VOXEL_GROWTH
+    return local
 
 
 def _views_that_show(thing: TrackedObject, views: Sequence[View], cfg: DynamicsConfig) -> int:

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax.core.numerics import fibonacci_sphere, on_device
-from p2gs_jax.render.harmonics import basis, degree_of
+from p2gs_jax.render.harmonics import degree_of, table
 from p2gs_jax.render.project import STILL
 from p2gs_jax.types import Gaussians
 
@@ -73,16 +73,10 @@ def turning(R: Float[np.ndarray, "3 3"], count: int) -> Float[np.ndarray, "k k"]
     A function of directions d becomes one of R^T d.
     """
     directions = fibonacci_sphere(DIRECTIONS)
-    degree = degree_of(count)
-    return np.linalg.lstsq(_table(directions, degree), _table(directions @ R, degree))[0]
-
-
-_basis = jax.jit(basis, static_argnums=1)
-
-
-def _table(directions: Float[np.ndarray, "d 3"], degree: int) -> Float[np.ndarray, "d k"]:
-    axes = tuple(directions.astype(np.float32).T)
-    return np.stack([np.asarray(column, np.float64) for column in _basis(axes, degree)], 1)
+    here, there = (
+        table(d, degree_of(count)).astype(np.float64) for d in (directions, directions @ R)
+    )
+    return np.linalg.lstsq(here, there)[0]
 
 
 def half_turn(g: Gaussians) -> Gaussians:
@@ -90,17 +84,11 @@ def half_turn(g: Gaussians) -> Gaussians:
 
     From COLMAP's axes (right, down, forward) to those of graphics (right, up, back), and back.
     """
-    flip = jnp.asarray(FLIP)
-    direction = np.array([[0.36, 0.48, 0.8]], np.float32)
-    degree = degree_of(g.sh.shape[1])
     # A half turn about an axis only changes signs of the harmonics.
-    here, there = (
-        np.array([float(b[0]) for b in basis(tuple(jnp.asarray(d).T), degree)])
-        for d in (direction, direction * np.array(FLIP, np.float32))
-    )
+    signs = np.rint(np.diag(turning(np.diag(FLIP), g.sh.shape[1])))
     return dataclasses.replace(
         g,
-        means=g.means * flip,
+        means=g.means * jnp.asarray(FLIP),
         quats=g.quats * jnp.asarray([1.0, *FLIP]),
-        sh=g.sh * jnp.asarray(np.sign(here * there), g.sh.dtype)[:, None],
+        sh=g.sh * jnp.asarray(signs, g.sh.dtype)[:, None],
     )

@@ -60,16 +60,20 @@ def subsample(count: int, limit: int, seed: int, stream: Stream = Stream.SEED_PO
     return np.sort(generator(seed, stream).choice(count, limit, replace=False))
 
 
+def spacings(points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, " p"]:
+    """Return the RMS distance to the three nearest neighbours (3DGS); inf without so many."""
+    if len(points) <= NEIGHBOURS:
+        return np.full(len(points), np.inf)
+    distances, _ = KDTree(points).query(points, k=NEIGHBOURS + 1)
+    return np.sqrt(np.mean(np.asarray(distances)[:, 1:] ** 2, axis=1))
+
+
 def neighbour_scales(
     points: Float[np.ndarray, "p 3"], views: Sequence[View]
 ) -> Float[np.ndarray, " p"]:
-    """Return the RMS distance to the three nearest neighbours (3DGS), bounded by the view."""
+    """Return the spacings of points, bounded by the view."""
     to_camera, _ = KDTree(camera_centers(views)).query(points)
-    if len(points) <= NEIGHBOURS:
-        return MAX_ANGLE * np.asarray(to_camera)
-    distances, _ = KDTree(points).query(points, k=NEIGHBOURS + 1)
-    scales = np.sqrt(np.mean(np.asarray(distances)[:, 1:] ** 2, axis=1))
-    return np.clip(scales, 1e-7, np.maximum(MAX_ANGLE * np.asarray(to_camera), 1e-6))
+    return np.clip(spacings(points), 1e-7, np.maximum(MAX_ANGLE * np.asarray(to_camera), 1e-6))
 
 
 def gaussians_from_points(
@@ -88,9 +92,7 @@ def gaussians_from_points(
     neighbours (3DGS), bounded by the distance from the views; orientations are w x y z.
     """
     count = len(points)
-    if scales is None:
-        scales = neighbour_scales(points, views)
-    scales = np.asarray(scales)
+    scales = neighbour_scales(points, views) if scales is None else np.asarray(scales)
     axes = np.broadcast_to(scales if scales.ndim == 2 else scales[:, None], (count, 3))
     start = np.broadcast_to(cfg.init.opacity if opacity is None else opacity, (count,))
     dc = radiance_preactivation(

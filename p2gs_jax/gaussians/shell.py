@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
@@ -77,26 +78,23 @@ def sphere_behind(
     return Sphere(middle, radius)
 
 
-def _project(view: View, points: Float[np.ndarray, "p 3"]):
-    """Return pixel positions [p 2] and which points are in front and inside the image."""
+def _project(view: View, points: Float[np.ndarray, "p 3"], shape: tuple[int, int]):
+    """Return pixel positions [p 2], which points are seen, and rows and columns of their cells.
+
+    The image is cut into cells of the given shape, rows and columns.
+    """
     xy, z = project_points(points.astype(np.float64), view)
-    return xy, in_frame(xy, z, view.width, view.height)
+    inside = in_frame(xy, z, view.width, view.height)
+    row = (xy[inside, 1] * shape[0] / view.height).astype(int)
+    return xy, inside, (row, (xy[inside, 0] * shape[1] / view.width).astype(int))
 
 
 def covered_cells(view: View, points: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, "gy gx"]:
     """Return which cells of a view hold a seed, or touch one that does."""
-    across = CELLS_ACROSS
-    down = max(1, round(across * view.height / view.width))
-    xy, inside = _project(view, points)
-    cells = np.zeros((down + 2, across + 2), bool)
-    column = (xy[inside, 0] * across / view.width).astype(int)
-    row = (xy[inside, 1] * down / view.height).astype(int)
-    cells[row + 1, column + 1] = True
-    near = np.zeros_like(cells)
-    for dy in (-1, 0, 1):
-        for dx in (-1, 0, 1):
-            near |= np.roll(cells, (dy, dx), (0, 1))
-    return near[1:-1, 1:-1]
+    shape = max(1, round(CELLS_ACROSS * view.height / view.width)), CELLS_ACROSS
+    cells = np.zeros(shape, np.uint8)
+    cells[_project(view, points, shape)[2]] = 1
+    return cv2.dilate(cells, np.ones((3, 3), np.uint8)) > 0
 
 
 def find_shell(
@@ -124,11 +122,8 @@ def find_shell(
     explained = np.zeros_like(seen)
     xy = np.zeros((len(candidates), len(views), 2), np.float32)
     for k, (view, cells) in enumerate(zip(views, covered, strict=True)):
-        position, inside = _project(view, candidates)
-        xy[:, k], seen[:, k] = position, inside
-        column = (position[inside, 0] * cells.shape[1] / view.width).astype(int)
-        row = (position[inside, 1] * cells.shape[0] / view.height).astype(int)
-        explained[inside, k] = cells[row, column]
+        xy[:, k], seen[:, k], here = _project(view, candidates, cells.shape)
+        explained[seen[:, k], k] = cells[here]
     looked = seen.sum(1)
     keep = (looked > 0) & (explained.sum(1) < COVERED_FRACTION * looked)
     if not keep.any():

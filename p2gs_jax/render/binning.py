@@ -65,21 +65,14 @@ def longest_first(lengths: Int[Array, " n"]) -> Int[Array, " n"]:
 def depth_order(depths: Float[Array, " n"], visible: Bool[Array, " n"]) -> Int[Array, " n"]:
     """Return a stable argsort of positive depths, invisible ones last.
 
-    Two least-significant-digit passes. Exact while the visible depths' bit range fits two digits
-    of 32 - log2(N) bits each; beyond that the lowest mantissa bits tie and the index decides.
+    Exact while the visible depths' bit range fits two digits of 32 - log2(N) bits each; beyond
+    that the lowest mantissa bits tie and the index decides.
     """
-    n = depths.shape[0]
-    payload_bits = bits_for(n)
-    digit_bits = 32 - payload_bits
+    bits = min(2 * (32 - bits_for(depths.shape[0])), 32)
     key, span = depth_keys(depths, visible)
-    excess = (32 - lax.clz(span)).astype(jnp.int32) - 2 * digit_bits
+    excess = (32 - lax.clz(span)).astype(jnp.int32) - bits
     key = key >> jnp.maximum(0, excess).astype(jnp.uint32)
-    key = jnp.minimum(key, jnp.uint32(2 ** min(2 * digit_bits, 32) - 1))
-    index = jnp.arange(n, dtype=jnp.uint32)
-    low_digit = key & jnp.uint32(2**digit_bits - 1)
-    by_low = sort_payloads(low_digit << payload_bits | index, payload_bits)
-    high_digit = (key >> digit_bits)[by_low]
-    return by_low[sort_payloads(high_digit << payload_bits | index, payload_bits)]
+    return _stable_order(jnp.minimum(key, jnp.uint32(2**bits - 1)), bits)
 
 
 def _extents(splats: Splats2D, width: int, height: int, cfg: RenderConfig):
@@ -169,23 +162,22 @@ def _bin_by_sorting(
         key = tile_id.astype(jnp.uint32) << rank_bits | rank.astype(jnp.uint32)
         sorted_ids = order[sort_payloads(key, rank_bits)]
     else:
-        sorted_ids = ids[_stable_order(tile_id, tile_count + 1)]
+        sorted_ids = ids[_stable_order(tile_id.astype(jnp.uint32), bits_for(tile_count + 1))]
     histogram = jnp.zeros(tile_count + 1, jnp.int32).at[tile_id].add(1)
     offsets = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(histogram[:tile_count])])
     return TileList(sorted_ids, offsets, count, count > capacity)
 
 
-def _stable_order(keys: Int[Array, " m"], bound: int) -> Int[Array, " m"]:
-    """Return a stable argsort of integers below `bound`, digit by digit."""
+def _stable_order(keys: UInt32[Array, " m"], bits: int) -> Int[Array, " m"]:
+    """Return a stable argsort of keys of so many bits, lowest digits first."""
     index = jnp.arange(keys.shape[0], dtype=jnp.uint32)
     payload_bits = bits_for(keys.shape[0])
     digit_bits = 32 - payload_bits
     order = None
-    for shift in range(0, bits_for(bound), digit_bits):
-        digit = (keys.astype(jnp.uint32) >> shift) & jnp.uint32(2**digit_bits - 1)
-        if order is None:
-            order = sort_payloads(digit << payload_bits | index, payload_bits)
-        else:
-            order = order[sort_payloads(digit[order] << payload_bits | index, payload_bits)]
+    for shift in range(0, bits, digit_bits):
+        digit = (keys >> shift) & jnp.uint32(2**digit_bits - 1)
+        digit = digit if order is None else digit[order]
+        moved = sort_payloads(digit << payload_bits | index, payload_bits)
+        order = moved if order is None else order[moved]
     assert order is not None
     return order

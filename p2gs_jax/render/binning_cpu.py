@@ -185,13 +185,13 @@ class _Ellipses(NamedTuple):
     dy)^2); it is widest to the right at dy = peak and reaches +-extent.
     """
 
-    x: Array
-    y: Array
-    slope: Array
-    half_width: Array
-    curvature: Array
-    peak: Array
-    extent: Array
+    x: Float[Array, " n"]
+    y: Float[Array, " n"]
+    slope: Float[Array, " n"]
+    half_width: Float[Array, " n"]
+    curvature: Float[Array, " n"]
+    peak: Float[Array, " n"]
+    extent: Float[Array, " n"]
 
 
 def _ellipses(splats: Splats2D, box: Boxes) -> _Ellipses:

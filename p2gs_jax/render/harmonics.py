@@ -7,7 +7,7 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Float32, Int
 
 from p2gs_jax.core.numerics import Values, namespace
 from p2gs_jax.render.xla_cpu import stack_columns
@@ -42,10 +42,10 @@ def degree_of(count: int) -> int:
     Raises:
         ValueError: `count` is not 1, 4, 9 or 16.
     """
-    for degree in range(MAX_DEGREE + 1):
-        if coefficient_count(degree) == count:
-            return degree
-    raise ValueError(f"{count} spherical-harmonics coefficients belong to no degree up to 3")
+    degree = {coefficient_count(d): d for d in range(MAX_DEGREE + 1)}.get(count)
+    if degree is None:
+        raise ValueError(f"{count} spherical-harmonics coefficients belong to no degree up to 3")
+    return degree
 
 
 def basis(directions: Directions, degree: int) -> list[Float[Array, " n"]]:
@@ -74,6 +74,14 @@ def basis(directions: Directions, degree: int) -> list[Float[Array, " n"]]:
             -C3[0] * x * (xx - 3.0 * yy),
         ]
     return values
+
+
+_compiled_basis = jax.jit(basis, static_argnums=1)
+
+
+def table(directions: Float[np.ndarray, "d 3"], degree: int) -> Float32[np.ndarray, "d k"]:
+    """Return the basis values of unit directions, on the host."""
+    return np.stack(_compiled_basis(tuple(directions.astype(np.float32).T), degree), 1)
 
 
 @jax.custom_vjp

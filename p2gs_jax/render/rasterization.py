@@ -79,12 +79,27 @@ def rasterization(
     gaussians = Gaussians(means, quats, jnp.log(scales), logits, no_color[:, None])
     arrays, size = (gaussians, each, viewmats, Ks), (width, height)
     if capacity is None:
-        capacity = _measured(arrays, size, cfg, sh_degree)
+        try:
+            fixed: tuple = jax.lax.stop_gradient(arrays)
+            needed = int(jnp.max(_entries(*fixed, size, cfg, sh_degree)))
+        except jax.errors.ConcretizationTypeError as error:
+            raise ValueError(
+                "the capacity of the tile lists cannot be measured inside jax.jit: pass capacity=, "
+                'such as meta["capacity"] of a call outside of it'
+            ) from error
+        capacity = bucket(needed, PICTURES.first)
     traced = any(isinstance(a, Tracer) for a in jax.tree.leaves(arrays))
     run = _compiled(None if traced else jax.default_backend())
     rgb, alpha, depth, meta = run(*arrays, size, cfg, capacity, sh_degree, render_mode != "RGB")
     meta |= {"capacity": capacity, "width": width, "height": height}
-    return _channels(rgb, alpha[..., None], depth, backgrounds, render_mode), alpha[..., None], meta
+    alpha = alpha[..., None]
+    if backgrounds is not None:
+        rgb = rgb + (1 - alpha) * backgrounds[:, None, None]
+    parts = [rgb] if render_mode.startswith("RGB") else []
+    if depth is not None:
+        expected = render_mode.endswith("ED")
+        parts.append(depth[..., None] / (jnp.maximum(alpha, 1e-10) if expected else 1.0))
+    return jnp.concatenate(parts, -1), alpha, meta
 
 
 def _for_each_camera(colors, count: int, cameras: int, sh_degree: int | None):
@@ -102,33 +117,21 @@ def _for_each_camera(colors, count: int, cameras: int, sh_degree: int | None):
     return jnp.broadcast_to(kept, (cameras, *shape))
 
 
-def _channels(rgb, alpha, depth, backgrounds, render_mode: str):
-    """Return the channels that a mode asks for."""
-    if backgrounds is not None:
-        rgb = rgb + (1 - alpha) * backgrounds[:, None, None]
-    parts = [rgb] if render_mode.startswith("RGB") else []
-    if depth is not None:
-        expected = render_mode.endswith("ED")
-        parts.append(depth[..., None] / jnp.maximum(alpha, 1e-10) if expected else depth[..., None])
-    return jnp.concatenate(parts, -1)
-
-
-def _seen(gaussians, color, camera: Camera, cfg: RenderConfig, sh_degree: int | None):
-    """Return the splats of a view and their radiance."""
-    alive = jnp.ones(gaussians.means.shape[0], bool)
-    splats = project(gaussians, alive, camera, cfg)
+def _seen(gaussians, each, size, cfg: RenderConfig, sh_degree: int | None):
+    """Return the camera of a view, the splats in it, and their radiance."""
+    color, viewmat, K = each
+    camera = Camera(viewmat, K, *size)
+    splats = project(gaussians, jnp.ones(gaussians.means.shape[0], bool), camera, cfg)
     if sh_degree is not None:
         color = view_radiance(dataclasses.replace(gaussians, sh=color), camera, cfg)
-    return with_cutoffs(splats, color, cfg), color
+    return camera, with_cutoffs(splats, color, cfg), color
 
 
 def _render(gaussians, colors, viewmats, Ks, size, cfg, capacity, sh_degree, with_depth):
     """Return radiance, alpha, depth (c h w) or None, and what is known of each camera."""
 
     def one(each):
-        color, viewmat, K = each
-        camera = Camera(viewmat, K, *size)
-        splats, color = _seen(gaussians, color, camera, cfg, sh_degree)
+        camera, splats, color = _seen(gaussians, each, size, cfg, sh_degree)
         result = render_splats(splats, color, camera, cfg, capacity, with_depth=with_depth)
         reach = jnp.maximum(splats.log_opacities - splats.log_cutoffs, 0)
         radii = jnp.ceil(jnp.sqrt(2 * reach[:, None] * splats.cov_diagonal))
@@ -152,32 +155,11 @@ def _compiled(backend: str | None):
 
 
 @functools.partial(jax.jit, static_argnums=(4, 5, 6))
-def _needed(gaussians, colors, viewmats, Ks, size, cfg, sh_degree):
-    """Return the entries that the neediest of some cameras needs."""
+def _entries(gaussians, colors, viewmats, Ks, size, cfg, sh_degree):
+    """Return the entries that each camera needs."""
 
     def one(each):
-        color, viewmat, K = each
-        camera = Camera(viewmat, K, *size)
-        splats, _ = _seen(gaussians, color, camera, cfg, sh_degree)
-        return count_entries(splats, camera.width, camera.height, cfg)
+        _, splats, _ = _seen(gaussians, each, size, cfg, sh_degree)
+        return count_entries(splats, *size, cfg)
 
-    return jnp.max(jax.lax.map(one, (colors, viewmats, Ks)))
-
-
-def _measured(
-    arrays: tuple, size: tuple[int, int], cfg: RenderConfig, sh_degree: int | None
-) -> int:
-    """Return the length of the tile lists that some cameras need, with some to spare.
-
-    Raises:
-        ValueError: the values are not known yet, inside `jax.jit`.
-    """
-    fixed: tuple = jax.lax.stop_gradient(arrays)
-    try:
-        needed = int(_needed(*fixed, size, cfg, sh_degree))
-    except jax.errors.ConcretizationTypeError as error:
-        raise ValueError(
-            "the capacity of the tile lists cannot be measured inside jax.jit: pass capacity=, "
-            'such as meta["capacity"] of a call outside of it'
-        ) from error
-    return bucket(needed, PICTURES.first)
+    return jax.lax.map(one, (colors, viewmats, Ks))

@@ -54,24 +54,17 @@ def _parameters(pixels: int) -> plt.CompilerParams:
     return plt.CompilerParams(num_warps=max(1, pixels // (32 * PIXELS_PER_THREAD)), num_stages=1)
 
 
-def _check(plan: Plan) -> None:
-    if plan.pixels & (plan.pixels - 1):
-        raise ValueError(
-            f"the pallas rasterizer needs tiles with a power of two of pixels, not "
-            f"{plan.tile_x}x{plan.tile_y}: set RenderConfig.tile to (16, 8) or (16, 16)"
-        )
-
-
 class _Tile:
     """The pixels of one tile, and an entry's values at them."""
 
     def __init__(self, tile, plan: Plan):
         self.plan = plan
-        self.center_x = (tile % plan.across).astype(jnp.float32) * plan.tile_x + plan.tile_x / 2
-        self.center_y = (tile // plan.across).astype(jnp.float32) * plan.tile_y + plan.tile_y / 2
+        tile_x, tile_y = plan.cfg.tile
+        self.center_x = (tile % plan.across).astype(jnp.float32) * tile_x + tile_x / 2
+        self.center_y = (tile // plan.across).astype(jnp.float32) * tile_y + tile_y / 2
         pixel = lax.broadcasted_iota(jnp.int32, (plan.pixels,), 0)
-        self.x = (pixel % plan.tile_x).astype(jnp.float32) - (plan.tile_x - 1) / 2
-        self.y = (pixel // plan.tile_x).astype(jnp.float32) - (plan.tile_y - 1) / 2
+        self.x = (pixel % tile_x).astype(jnp.float32) - (tile_x - 1) / 2
+        self.y = (pixel // tile_x).astype(jnp.float32) - (tile_y - 1) / 2
 
     def load(self, rows_ref, ids_ref, position, end) -> list[list]:
         """Return id and row of the next `UNROLL` entries, the dummy's beyond the end."""
@@ -97,7 +90,7 @@ class _Tile:
         v = center[1] + a22 * self.y
         exponent = log_opacity - (u * u + v * v)
         cutoff = row[-1] if plan.own_cutoffs else plan.log_cutoff / plan.exponent_scale
-        alpha = jnp.minimum(jnp.exp2(exponent), plan.alpha_max)
+        alpha = jnp.minimum(jnp.exp2(exponent), plan.cfg.alpha_max)
         return jnp.where(exponent > cutoff, alpha, 0.0)
 
 
@@ -116,9 +109,9 @@ def _forward_kernel(rows, ids, offsets, order, brightest, *outputs, plan: Plan):
             transmittance = transmittance - weight
         position = jnp.minimum(position + UNROLL, end)
         done = position >= end
-        if plan.stop_error is not None:
+        if plan.cfg.stop_error is not None:
             so_far = functools.reduce(jnp.maximum, channels[:3]) / brightest
-            hidden = transmittance - plan.stop_error * jnp.maximum(so_far, DARKEST)
+            hidden = transmittance - plan.cfg.stop_error * jnp.maximum(so_far, DARKEST)
             done = done | (jnp.max(hidden) <= 0)
         return position, done, transmittance, *channels
 
@@ -134,7 +127,11 @@ def _forward_kernel(rows, ids, offsets, order, brightest, *outputs, plan: Plan):
 
 def forward(rows, ids, offsets, plan: Plan):
     """Return the channels of the image and the transmittance, [T P] each, and the stops [T]."""
-    _check(plan)
+    if plan.pixels & (plan.pixels - 1):
+        raise ValueError(
+            "the pallas rasterizer needs tiles with a power of two of pixels, not "
+            f"{plan.cfg.tile}: set RenderConfig.tile to (16, 8) or (16, 16)"
+        )
     shape = jax.ShapeDtypeStruct((plan.tile_count, plan.pixels), jnp.float32)
     radiance = rows[:, GEOMETRY : GEOMETRY + 3]
     *image, stops = pl.pallas_call(
@@ -179,7 +176,7 @@ def _backward_kernel(rows, ids, offsets, stops, order, *arrays, plan: Plan):
             q = weight * sum(row[GEOMETRY + k] * v_out[k] for k in range(channels))
             remaining = remaining - q
             transmittance = transmittance - weight
-            v = jnp.where(alpha < plan.alpha_max, q - remaining * (alpha / (1 - alpha)), 0.0)
+            v = jnp.where(alpha < plan.cfg.alpha_max, q - remaining * (alpha / (1 - alpha)), 0.0)
             vx, vy = v * x, v * y
             moments = [jnp.sum(m) for m in (v, vx, vy, vx * x, vx * y, vy * y)]
             gradient = (
@@ -189,7 +186,7 @@ def _backward_kernel(rows, ids, offsets, stops, order, *arrays, plan: Plan):
             values = jnp.zeros(COLUMNS, jnp.float32)
             for k, value in enumerate(gradient):
                 values = jnp.where(column == k, value, values)
-            if plan.deterministic:
+            if plan.cfg.deterministic:
                 # Entries beyond the end write to the place behind the list.
                 place = jnp.where(position + c < end, position + c, target.shape[0] - 1)
                 target[place, :] = values
@@ -237,20 +234,11 @@ def _in_order(entries, ids, count: int):
 def backward(rows, ids, residuals, image, v_image, plan: Plan):
     """Return the gradient of the rows from those of the channels and transmittance."""
     offsets, stops = residuals
-    _check(plan)
     capacity, count = ids.shape[0], rows.shape[0]
-    shape = (capacity + 1 if plan.deterministic else count, COLUMNS)
+    shape = (capacity + 1 if plan.cfg.deterministic else count, COLUMNS)
     blank = jnp.zeros(shape, jnp.float32)
-    operands = (
-        rows,
-        ids,
-        offsets,
-        stops,
-        longest_first(stops - offsets[:-1]),
-        *image,
-        *v_image,
-        blank,
-    )
+    order = longest_first(stops - offsets[:-1])
+    operands = (rows, ids, offsets, stops, order, *image, *v_image, blank)
     v_rows = pl.pallas_call(
         functools.partial(_backward_kernel, plan=plan),
         out_shape=jax.ShapeDtypeStruct(shape, jnp.float32),
@@ -260,7 +248,7 @@ def backward(rows, ids, residuals, image, v_image, plan: Plan):
         interpret=_interpreted(),
         name="composite_tiles_gradient",
     )(*operands)
-    if plan.deterministic:
+    if plan.cfg.deterministic:
         v_rows = _in_order(v_rows[:capacity], ids, count)
     used = GEOMETRY + plan.channels
     # The dummy has no gradient, nor a splat's own cutoff.

@@ -59,8 +59,8 @@ def cut(offsets: Int[Array, " t1"], plan: Plan) -> Segments:
     """Cut lists into segments; `offsets` are the start of every tile's list, and the last end."""
     starts, ends = offsets[:-1], offsets[1:]
     most = SEGMENTS_PER_LANE * plan.lanes
-    chunks = -((starts - ends) // plan.chunk)
-    length = jnp.maximum(1, -(-jnp.sum(chunks) // most)) * plan.chunk
+    chunks = -((starts - ends) // plan.cfg.chunk)
+    length = jnp.maximum(1, -(-jnp.sum(chunks) // most)) * plan.cfg.chunk
     more = jnp.maximum(-((starts - ends) // length) - 1, 0)
     last = jnp.cumsum(more)
     first = last - more
@@ -78,6 +78,16 @@ def cut(offsets: Int[Array, " t1"], plan: Plan) -> Segments:
         jnp.concatenate([jnp.minimum(starts + length, ends), jnp.where(used, end, 0)]),
         last[-1],
     )
+
+
+def merge(
+    composited: tuple[Float[Array, "s p"], ...], segments: Segments, plan: Plan
+) -> tuple[tuple[Float[Array, "t p"], ...], tuple[Float[Array, "e p"], ...]]:
+    """Return the channels and transmittance of every tile, and in front of each extra slot.
+
+    `composited` are the channels and, last, the transmittance of every slot.
+    """
+    return _merge(composited, segments.tiles[plan.tile_count :], segments.extra)
 
 
 @compiled_loop
@@ -110,41 +120,30 @@ def _merge(composited, tiles, extra):
     return lax.fori_loop(0, extra, body, state)[:2]
 
 
-def merge(
-    composited: tuple[Float[Array, "s p"], ...], segments: Segments, plan: Plan
-) -> tuple[tuple[Float[Array, "t p"], ...], tuple[Float[Array, "e p"], ...]]:
-    """Return the channels and transmittance of every tile, and in front of each extra slot.
-
-    `composited` are the channels and, last, the transmittance of every slot.
-    """
-    return _merge(composited, segments.tiles[plan.tile_count :], segments.extra)
-
-
 class Queue(NamedTuple):
     """Segments in the order in which lanes take them, longest first, then an empty slot per lane.
 
-    S slots hold segments; those from S on are empty: lanes wait there at the end.
+    S slots hold segments; those from S on are empty: lanes wait there at the end. `work` slots
+    hold entries; `centers` are the middles of tiles, pixels.
     """
 
-    order: Array  # [S + B]
-    work: Array  # how many slots hold entries
-    starts: Array  # [S + B]
-    ends: Array
-    centers: Array  # [S + B 2], middle of the tile, pixels
-    lane: Array  # [B]
+    order: Int[Array, " sb"]
+    work: Int[Array, ""]
+    starts: Int[Array, " sb"]
+    ends: Int[Array, " sb"]
+    centers: Float[Array, "sb 2"]
+    lane: Int[Array, " b"]
 
     @classmethod
     def build(cls, segments: Segments, ends: Array, plan: Plan) -> Queue:
         """Queue the segments; `ends` is where each is composited to, at most its own end."""
-        count, lanes = segments.starts.shape[0], plan.lanes
+        count, lanes, (tile_x, tile_y) = segments.starts.shape[0], plan.lanes, plan.cfg.tile
         lane = jnp.arange(lanes, dtype=jnp.int32)
         lengths = ends - segments.starts
         parked = jnp.zeros(lanes, jnp.int32)
         tiles = jnp.concatenate([segments.tiles, parked])
         column, line = tiles % plan.across, tiles // plan.across
-        centers = jnp.stack(
-            [column * plan.tile_x + plan.tile_x / 2, line * plan.tile_y + plan.tile_y / 2], -1
-        )
+        centers = jnp.stack([column * tile_x + tile_x / 2, line * tile_y + tile_y / 2], -1)
         return cls(
             jnp.concatenate([longest_first(lengths), count + lane]),
             jnp.sum(lengths > 0, dtype=jnp.int32),
@@ -188,9 +187,9 @@ def _exp_coefficients(degree: int) -> tuple[float, ...]:
 
 def _scaled_exp(x: Array, plan: Plan) -> Array:
     """Return exp(exponent_scale x) for x in [-0.7, 0]; other values are masked by callers."""
-    if plan.exp_degree is None:
+    if plan.cfg.exp_degree is None:
         return jnp.exp(plan.exponent_scale * x)
-    *rest, p = _exp_coefficients(plan.exp_degree)
+    *rest, p = _exp_coefficients(plan.cfg.exp_degree)
     for c in reversed(rest):
         p = c + x * p
     for _ in range(int(np.log2(plan.exponent_scale))):
@@ -199,20 +198,20 @@ def _scaled_exp(x: Array, plan: Plan) -> Array:
 
 
 class _Entries(NamedTuple):
-    """What a lane needs of its next C entries: gathered rows and their alphas."""
+    """What a lane needs of its next C entries: gathered rows and their alphas.
 
-    ids: Array  # [B C]
-    rows: Array  # [B C row]
-    u0: Array  # [B C], u at the tile centre
-    v0: Array
-    dx0: Array  # tile centre minus mean
-    dy0: Array
-    alpha: Array  # [B C P]
+    `center` has u, v and the offsets x and y from the mean at the tile's centre.
+    """
+
+    ids: Int[Array, "b c"]
+    rows: Float[Array, "b c row"]
+    center: tuple[Float[Array, "b c"], ...]
+    alpha: Float[Array, "b c p"]
 
 
 def _gather(rows, ids_list, center, position, end, local, plan: Plan, always) -> _Entries:
     local_x, local_y = local
-    entry = position[:, None] + jnp.arange(plan.chunk)
+    entry = position[:, None] + jnp.arange(plan.cfg.chunk)
     ids = materialize(
         always,
         lambda: jnp.where(
@@ -228,19 +227,19 @@ def _gather(rows, ids_list, center, position, end, local, plan: Plan, always) ->
     exponent = log_opacity[..., None] - (u * u + v * v)
     cutoff = row[..., -1:] if plan.own_cutoffs else plan.log_cutoff / plan.exponent_scale
     alpha = jnp.where(
-        exponent > cutoff, jnp.minimum(_scaled_exp(exponent, plan), plan.alpha_max), 0.0
+        exponent > cutoff, jnp.minimum(_scaled_exp(exponent, plan), plan.cfg.alpha_max), 0.0
     )
-    return _Entries(ids, row, u0, v0, dx0, dy0, alpha)
+    return _Entries(ids, row, (u0, v0, dx0, dy0), alpha)
 
 
 def _padded(ids_list, plan: Plan):
-    return jnp.concatenate([ids_list, jnp.full((plan.chunk,), plan.gaussians, jnp.int32)])
+    return jnp.concatenate([ids_list, jnp.full((plan.cfg.chunk,), plan.gaussians, jnp.int32)])
 
 
 def _opaque(channels, transmittance, brightest, plan: Plan):
     """Return whether what lies behind can be left out (RenderConfig.stop_error)."""
     so_far = functools.reduce(jnp.maximum, channels[:3]) / brightest
-    hidden = transmittance - (plan.stop_error or 0.0) * jnp.maximum(so_far, DARKEST)
+    hidden = transmittance - (plan.cfg.stop_error or 0.0) * jnp.maximum(so_far, DARKEST)
     return jnp.max(hidden, -1) <= 0
 
 
@@ -265,16 +264,16 @@ def forward(rows, ids_list, offsets, plan: Plan):
         entries = _gather(rows, ids_list, center, position, end, local, plan, turn > 0)
         transmittance = jnp.where(fresh[:, None], 1.0, sums[-1])
         channels = [jnp.where(fresh[:, None], 0.0, a) for a in sums[:-1]]
-        for c in range(plan.chunk):
+        for c in range(plan.cfg.chunk):
             weight = entries.alpha[:, c] * transmittance
             channels = [
                 a + weight * entries.rows[:, c, GEOMETRY + k, None] for k, a in enumerate(channels)
             ]
             transmittance = transmittance - weight
         sums = (*channels, transmittance)
-        position = jnp.minimum(position + plan.chunk, end)
+        position = jnp.minimum(position + plan.cfg.chunk, end)
         done = position >= end
-        if plan.stop_error is not None:
+        if plan.cfg.stop_error is not None:
             done = done | _opaque(channels, transmittance, brightest, plan)
         target = jnp.where(done, slot, slots + lanes)
         image = tuple(
@@ -296,7 +295,7 @@ def forward(rows, ids_list, offsets, plan: Plan):
     state = lax.while_loop(lambda s: jnp.any(s[1] < slots), body, state)
     composited, stops = tuple(a[:slots] for a in state[5]), state[6][:slots]
     image, before = merge(composited, segments, plan)
-    if plan.stop_error is not None:
+    if plan.cfg.stop_error is not None:
         hidden = _opaque(before[:-1], before[-1], brightest, plan)
         starts = segments.starts[plan.tile_count :]
         stops = stops.at[plan.tile_count :].set(jnp.where(hidden, starts, stops[plan.tile_count :]))
@@ -348,7 +347,7 @@ def _through(entries: _Entries, v_out, transmittance, remaining, within, plan: P
     for j in range(group):
         after = after - jnp.where(within >= j, q_grouped[:, :, j : j + 1], 0.0)
     v_exponent = jnp.where(
-        grouped < plan.alpha_max, q_grouped - after * (grouped / (1 - grouped)), 0.0
+        grouped < plan.cfg.alpha_max, q_grouped - after * (grouped / (1 - grouped)), 0.0
     ).reshape(lanes, chunk, pixels)
     remaining, transmittance = r_groups[:, -1], t_groups[:, -1]
     for j in range(chunk - group, chunk):
@@ -361,24 +360,17 @@ def _row_gradient(entries: _Entries, w, v_exponent, v_out, features, plan: Plan)
     """Return the gradient to the rows of entries, [B C row], from moments over the pixels."""
     lanes, chunk, pixels = w.shape
     moments = (v_exponent.reshape(lanes * chunk, pixels) @ features).reshape(lanes, chunk, 8)
-    v_geometry = jnp.stack(
-        geometry_gradient(
-            [moments[..., i] for i in range(6)],
-            [entries.rows[..., i] for i in (2, 3, 4)],
-            (entries.u0, entries.v0, entries.dx0, entries.dy0),
-            plan.exponent_scale,
-        ),
-        -1,
-    )
+    sums, factor = [moments[..., i] for i in range(6)], [entries.rows[..., i] for i in (2, 3, 4)]
+    v_geometry = geometry_gradient(sums, factor, entries.center, plan.exponent_scale)
     v_color = jnp.einsum("bcp,bkp->bck", w, v_out)
-    return jnp.concatenate([v_geometry, v_color], -1)
+    return jnp.concatenate([jnp.stack(v_geometry, -1), v_color], -1)
 
 
 def backward(rows, ids_list, residuals, image, v_image, plan: Plan):
     """Return the gradient of the rows from those of the channels and transmittance."""
     segments, stops, before = residuals
     plan = plan._replace(lanes=plan.lanes * BACKWARD_LANE_FACTOR)
-    lanes, pixels, chunk = plan.lanes, plan.pixels, plan.chunk
+    lanes, pixels, chunk = plan.lanes, plan.pixels, plan.cfg.chunk
     local_x, local_y = plan.local_pixels()
     ids_list = _padded(ids_list, plan)
     queue = Queue.build(segments, stops, plan)

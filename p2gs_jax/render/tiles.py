@@ -37,6 +37,8 @@ DUMMY_LOG_OPACITY = -100.0
 GEOMETRY = 6  # columns of a row before its channels
 # Lanes for every tile of an image too small to fill them.
 MOST_LANES = 8
+# The oldest NVIDIA GPUs that Pallas supports through Triton.
+AMPERE = 8.0
 # Floor of a pixel's brightness in the stop rule, over the brightest splat
 # (RenderConfig.stop_error).
 DARKEST = 1e-4
@@ -97,23 +99,17 @@ def rasterize_reference(
 
 
 class Plan(NamedTuple):
-    """Static shape of one compositing run."""
+    """Static shape of one compositing run; cutoffs are logarithms."""
 
     across: int
     down: int
-    tile_x: int
-    tile_y: int
     lanes: int
-    chunk: int
     gaussians: int
     channels: int
     exponent_scale: float
     log_cutoff: float
     own_cutoffs: bool
-    alpha_max: float
-    stop_error: float | None
-    exp_degree: int | None
-    deterministic: bool
+    cfg: RenderConfig
 
     @property
     def tile_count(self) -> int:
@@ -123,12 +119,13 @@ class Plan(NamedTuple):
     @property
     def pixels(self) -> int:
         """Pixels of a tile."""
-        return self.tile_x * self.tile_y
+        return self.cfg.tile[0] * self.cfg.tile[1]
 
     def local_pixels(self) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
         """Return pixel-centre offsets from the tile centre."""
-        x = jnp.tile(jnp.arange(self.tile_x) - (self.tile_x - 1) / 2, self.tile_y)
-        y = jnp.repeat(jnp.arange(self.tile_y) - (self.tile_y - 1) / 2, self.tile_x)
+        tile_x, tile_y = self.cfg.tile
+        x = jnp.tile(jnp.arange(tile_x) - (tile_x - 1) / 2, tile_y)
+        y = jnp.repeat(jnp.arange(tile_y) - (tile_y - 1) / 2, tile_x)
         return x.astype(jnp.float32), y.astype(jnp.float32)
 
 
@@ -205,49 +202,64 @@ _composite.defvjp(_composite_fwd, _composite_bwd)
 
 def _untile(channel, plan: Plan):
     """Return a channel [T P] as an image."""
-    grid = channel.reshape(plan.down, plan.across, plan.tile_y, plan.tile_x)
-    return grid.transpose(0, 2, 1, 3).reshape(plan.down * plan.tile_y, plan.across * plan.tile_x)
+    tile_x, tile_y = plan.cfg.tile
+    grid = channel.reshape(plan.down, plan.across, tile_y, tile_x)
+    return grid.transpose(0, 2, 1, 3).reshape(plan.down * tile_y, plan.across * tile_x)
 
 
-def rasterize_tiles(
+def fastest_here() -> TileImplementation:
+    """Return the rasterizer of the default backend: `pallas` on NVIDIA GPUs that Triton knows.
+
+    Called while tracing, so that a program contains one of them only.
+    """
+    if jax.default_backend() != "gpu":
+        return "xla"
+    capability = getattr(jax.devices()[0], "compute_capability", None)
+    return "pallas" if capability is not None and float(capability) >= AMPERE else "xla"
+
+
+def rasterize(
     splats: Splats2D,
     radiance: Float[Array, "n 3"],
-    tiles: TileList,
+    tiles: TileList | None,
     width: int,
     height: int,
     cfg: RenderConfig,
-    implementation: TileImplementation,
     with_depth: bool = True,
 ) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"], Float[Array, "h w"] | None]:
-    """Composite the lists of a view, which must not have overflowed, tile by tile.
+    """Composite splats of linear HDR radiance into radiance, alpha and alpha-weighted depth.
 
-    Returns:
-        Linear radiance (black background), alpha, and alpha-weighted depth or None.
+    Radiance is >= 0, the background is black. `cfg.implementation` is `reference` (dense, any
+    precision, without a tile list), `xla` (lane queue), `pallas` (a GPU block per tile), or None
+    for the fastest that runs here. A tile list must not have overflowed. Without depth there is
+    None in its place, and about 5 % less work.
+
+    Raises:
+        ValueError: no such implementation, or one of tiles without a tile list.
     """
-    tile_x, tile_y = cfg.tile
+    name = cfg.implementation or fastest_here()
+    if name == "reference":
+        linear, alpha, depth = rasterize_reference(splats, radiance, width, height, cfg)
+        return linear, alpha, depth if with_depth else None
+    if name not in ("xla", "pallas"):
+        raise ValueError(f"there is no rasterizer {name!r}; choose 'reference', 'xla' or 'pallas'")
+    if tiles is None:
+        raise ValueError(f"the {name} rasterizer needs a tile list: pass bin_tiles(...)")
     across, down = grid_size(width, height, cfg.tile)
-    smallest = smallest_cutoff(cfg)
+    smallest, pixels = smallest_cutoff(cfg), cfg.tile[0] * cfg.tile[1]
     plan = Plan(
         across=across,
         down=down,
-        tile_x=tile_x,
-        tile_y=tile_y,
-        lanes=max(1, min(cfg.pixels_in_flight // (tile_x * tile_y), MOST_LANES * across * down)),
-        chunk=cfg.chunk,
+        lanes=max(1, min(cfg.pixels_in_flight // pixels, MOST_LANES * across * down)),
         gaussians=splats.depths.shape[0],
         channels=4 if with_depth else 3,
-        exponent_scale=_module(implementation).exponent_scale(smallest),
+        exponent_scale=_module(name).exponent_scale(smallest),
         log_cutoff=float(np.log(smallest)),
         own_cutoffs=cfg.cutoff_rule == "radiance",
-        alpha_max=cfg.alpha_max,
-        stop_error=cfg.stop_error,
-        exp_degree=cfg.exp_degree,
-        deterministic=cfg.deterministic,
+        cfg=cfg,
     )
     rows = pack_rows(splats, radiance, plan)
-    tiled: tuple[Array, ...] = _composite(
-        rows, tiles.gaussian_ids, tiles.offsets, plan, implementation
-    )
+    tiled: tuple[Array, ...] = _composite(rows, tiles.gaussian_ids, tiles.offsets, plan, name)
     *channels, transmittance = (_untile(a, plan)[:height, :width] for a in tiled)
     depth = channels[3] if with_depth else None
     return jnp.stack(channels[:3], -1), 1 - transmittance, depth

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.config import Appearance, CameraFormation, FitConfig, PhotometryConfig
-from p2gs_jax.core.atomic import write_array, write_json
+from p2gs_jax.core.atomic import atomic_write, write_json
 from p2gs_jax.core.numerics import LN2, on_device
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
@@ -371,7 +371,8 @@ def write_appearance(path: Path, appearance: Corrections, views: Sequence[View])
         }
         write_json(path, data)
     else:
-        write_array(path, np.asarray(appearance))
+        with atomic_write(path) as temporary:
+            np.save(temporary, np.asarray(appearance))
 
 
 # Names in `luminance.json`: parameters of all views, and those of single ones.

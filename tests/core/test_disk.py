@@ -13,7 +13,6 @@ from p2gs_jax.core.atomic import (
     atomic_write,
     naming,
     read_jsonl,
-    write_array,
     write_text,
 )
 from p2gs_jax.formats.exr import write_exr
@@ -35,7 +34,6 @@ def room_for(size):
 NOISE = np.random.default_rng(0).random((64, 64, 3), np.float32)
 WRITERS = {
     "a.txt": lambda path: write_text(path, "x" * 9000),
-    "a.npy": lambda path: write_array(path, NOISE),
     "a.png": lambda path: write_png(path, NOISE),
     "a.exr": lambda path: write_exr(path, NOISE),
 }

@@ -100,5 +100,5 @@ def test_a_file_that_was_cut_and_another_one_are_refused(tmp_path, kept):
     write_ply(path, population(100), [])
     content = path.read_bytes()
     path.write_bytes(b"hello" if kept is None else content[: int(kept * len(content))])
-    with pytest.raises(UserError, match=r"a\.ply is no PLY of Gaussians"):
+    with pytest.raises(UserError, match=r"a\.ply is not a valid PLY of Gaussians"):
         read_ply(path)

@@ -41,7 +41,7 @@ def test_behind_and_outside_are_invisible():
     assert not unoccluded(xy[1:2], z[1:2], 10, 10).any()
 
 
-CFG = preset("robust")
+CFG, CHOICE = preset("robust"), ("view_exposure", Response())
 
 
 @pytest.fixture
@@ -53,7 +53,8 @@ def test_exposures_without_tracks(street, noisy_street):
     scene = dataclasses.replace(street, tracks=None)
     observations = projected_colors(scene, ImageStore(scene.views, CFG.data))
     assert np.bincount(observations.points).max() <= MOST_PER_POINT
-    solved = calibrate_observations(observations, options_of(CFG, scene)).solution
+    options = dataclasses.replace(options_of(CFG, scene), choice=CHOICE)
+    solved = calibrate_observations(observations, options).solution
     with (noisy_street / "truth" / "exposures.csv").open(newline="") as file:
         truth = {r["image"]: float(r["exposure"]) for r in csv.DictReader(file)}
     expected = np.array([truth[scene.views[i].name] for i in scene.train_indices])
@@ -62,7 +63,7 @@ def test_exposures_without_tracks(street, noisy_street):
 
 def test_what_was_left_out_is_said(street):
     observations = track_colors(street, ImageStore(street.views, CFG.data))
-    options = dataclasses.replace(options_of(CFG, street), choice=("view_exposure", Response()))
+    options = dataclasses.replace(options_of(CFG, street), choice=CHOICE)
     reasons = calibrate_observations(observations, options).reasons
     assert not any("left out" in r for r in reasons)
     some = dataclasses.replace(observations, too_coarse=7)

@@ -15,10 +15,8 @@ from p2gs_jax.render import render_linear
 BASE = hard_cases.CONFIG
 IMPLEMENTATIONS = {
     "xla, counting": dataclasses.replace(BASE, implementation="xla", binning="counting"),
-    "xla, sorting": dataclasses.replace(BASE, implementation="xla", binning="sorting"),
     "pallas, interpreted": dataclasses.replace(BASE, implementation="pallas", binning="sorting"),
 }
-OF_ALL_SIZES = ("xla, counting", "pallas, interpreted")
 
 
 @functools.cache
@@ -37,10 +35,8 @@ def oracle(name: str):
 )
 def test_hard_case(case: HardCase, implementation: str):
     cfg = IMPLEMENTATIONS[implementation]
-    if case.view is not VIEW and implementation not in OF_ALL_SIZES:
-        pytest.skip("an image of another size costs a program, and this one learns nothing by it")
-    if case.name.startswith("10^5") and implementation != "xla, counting":
-        pytest.skip("a minute where kernels are interpreted")
+    if case.view is not VIEW and implementation != "xla, counting":
+        pytest.skip("an image of another size costs a program")
     g = gap(case, cfg, oracle(case.name))
     assert g.finite, case.expect
     assert g.silent == case.unseen, case.expect
@@ -70,6 +66,3 @@ def test_relative_error_over_a_high_dynamic_range():
     case = HardCase("bright behind dark", "", lambda: crowd(n, **values))
     g = gap(case, cfg)
     assert g.relative < 1e-3, g
-    # Without the bound, the usual rule T < 1e-4 would be off by far more than that: the test bites.
-    loose = gap(case, dataclasses.replace(cfg, stop_error=1.0))
-    assert loose.relative > 1e-2, loose

@@ -6,13 +6,14 @@ import numpy as np
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from p2gs_jax.config import RenderConfig
 from p2gs_jax.render.rasterize_xla import SEGMENTS_PER_LANE, cut, merge
 from p2gs_jax.render.tiles import Plan
 
 TILES, LANES, CHUNK, PIXELS = 6, 4, 2, 3
-UNUSED = dict.fromkeys(Plan._fields)
+UNUSED = dict.fromkeys(Plan._fields) | {"cfg": RenderConfig(chunk=CHUNK)}
 PLAN = Plan(
-    **UNUSED | {"across": TILES, "down": 1, "lanes": LANES, "chunk": CHUNK}  # type: ignore[arg-type]
+    **UNUSED | {"across": TILES, "down": 1, "lanes": LANES}  # type: ignore[arg-type]
 )
 MOST = SEGMENTS_PER_LANE * LANES
 LENGTHS = st.lists(

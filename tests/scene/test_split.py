@@ -177,7 +177,7 @@ def test_broken_nerfstudio_seeds(tmp_path):
         find_scene(tmp_path, CFG)
     write_ply(path, np.zeros((9, 3)))
     path.write_bytes(path.read_bytes()[:-7])
-    with refused(r"sparse_pc.ply is no PLY of points"):
+    with refused(r"sparse_pc.ply is not a valid PLY of points"):
         find_scene(tmp_path, CFG)
     write_ply(path, np.zeros((0, 3)))
     assert "sparse_pc.ply holds no points" in find_scene(tmp_path, CFG).notes[-1]
