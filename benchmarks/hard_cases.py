@@ -265,13 +265,14 @@ def _splats(gaussians, alive, view, cfg):
     return project(gaussians, alive, view, cfg), brightest
 
 
-def _undecided(s: Splats2D, view: Camera) -> np.ndarray:
+def _undecided(s: Splats2D, view: Camera, cfg: RenderConfig) -> np.ndarray:
     """Return per pixel how many splats are too close to the cutoff for float32 to decide."""
     x = np.arange(view.width) + 0.5
     y = np.arange(view.height) + 0.5
     counts = np.zeros((view.height, view.width), int)
-    arrays = (s.means2d, s.conic_factor, s.log_opacities, s.log_cutoffs, s.visible)
-    for m, f, o, cutoff, shown in zip(*map(np.asarray, arrays), strict=True):
+    cutoff = np.log(cfg.alpha_cutoff)
+    arrays = (s.means2d, s.conic_factor, s.log_opacities, s.visible)
+    for m, f, o, shown in zip(*map(np.asarray, arrays), strict=True):
         if shown:
             dx, dy = x[None] - m[0], y[:, None] - m[1]
             e = o - 0.5 * ((f[0] * dx + f[1] * dy) ** 2 + (f[2] * dy) ** 2)
@@ -286,7 +287,7 @@ def float64_oracle(gaussians: Gaussians, view: Camera, cfg: RenderConfig):
         exact = dataclasses.replace(cfg, implementation="reference")
         result, gradient = _evaluate(g64, view64, exact)
         splats, brightest = _splats(*_padded(g64), view64, exact)
-    return result, gradient, _undecided(splats, view), float(brightest)
+    return result, gradient, _undecided(splats, view, cfg), float(brightest)
 
 
 def gap(case: HardCase, cfg: RenderConfig, oracle=None) -> Gap:

@@ -18,7 +18,6 @@ from jaxtyping import Float
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.render import project, rasterize, view_radiance
-from p2gs_jax.render.tiles import with_cutoffs
 from p2gs_jax.types import Camera, Gaussians, Splats2D
 
 BLOCK = (32, 24)
@@ -43,9 +42,7 @@ class Truth(NamedTuple):
 
 def untruncated(cfg: RenderConfig) -> RenderConfig:
     """Return the options under which nothing is left out."""
-    return dataclasses.replace(
-        cfg, alpha_cutoff=NEGLIGIBLE, cutoff_rule="opacity", stop_error=None, exp_degree=None
-    )
+    return dataclasses.replace(cfg, alpha_cutoff=NEGLIGIBLE, stop_error=None, exp_degree=None)
 
 
 def truth(
@@ -68,7 +65,7 @@ def truth(
 def _prepared(gaussians: Gaussians, view: Camera, cfg: RenderConfig):
     radiance = view_radiance(gaussians, view, cfg)
     alive = jnp.ones(gaussians.capacity, bool)
-    s = with_cutoffs(project(gaussians, alive, view, cfg), radiance, cfg)
+    s = project(gaussians, alive, view, cfg)
     return ((s.means2d, s.conic_factor, s.log_opacities), radiance), s
 
 
@@ -89,7 +86,7 @@ def _block(splats: Splats2D, leaves, radiance, origin, v, cfg: RenderConfig):
 
 def _blocks(splats, leaves, radiance, camera, cfg, cotangent):
     means, cov = np.asarray(splats.means2d), np.asarray(splats.cov_diagonal)
-    room = np.asarray(splats.log_opacities) - np.asarray(splats.log_cutoffs)
+    room = np.asarray(splats.log_opacities) - np.log(cfg.alpha_cutoff)
     shown = np.asarray(splats.visible) & (room > 0)
     reach = np.sqrt(2 * np.maximum(room, 0)[:, None] * cov)
     low, high = means - reach, means + reach

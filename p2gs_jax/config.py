@@ -139,10 +139,6 @@ class RenderConfig:
     deterministic: bool = False
     """Sum gradients in a fixed order, so that runs repeat bit for bit on GPUs as well (`pallas`;
     on CPUs they always do)."""
-    cutoff_rule: Literal["opacity", "radiance"] = "opacity"
-    """`radiance` lowers the cutoff of every splat brighter than the view's geometric mean by the
-    same factor, down to 1e-7, so that no skipped contribution exceeds the cutoff times that mean,
-    whatever the dynamic range. Splats reach further and cost more (ours: BUILD_NOTES)."""
     alpha_max: float = 0.999
     """Largest opacity of one splat at one pixel (keeps 1 - alpha invertible)."""
     stop_error: float | None = 5e-4

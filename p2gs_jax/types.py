@@ -206,7 +206,6 @@ class Splats2D(eqx.Module):
     log_opacities: Float[Array, " n"]  # log peak opacity (-100 where not visible)
     depths: Float[Array, " n"]  # z in the camera, scene units
     visible: Bool[Array, " n"]  # in front of the near plane and well defined
-    log_cutoffs: Float[Array, " n"]  # log opacity below which a contribution is skipped
 
 
 class TileList(eqx.Module):

@@ -74,7 +74,7 @@ def write_page(
     train = scene.train_indices
     weighed = [fitted.camera(train[k]) for k in evenly_spaced(len(train), WEIGHED)]
     embedded = embedded_photographs(fitted, photographs)
-    known = page_scene(fitted, gaussians, uncorrected(look), embedded)
+    known = page_scene(fitted, uncorrected(look), embedded)
     title = f"{fitted.folder.resolve().name}: linear light"
     room = _room(int(size_mb * MEGABYTE), page_text(title, known, b""), size_mb)
     judge = functools.partial(page_error, pictures=pictures, render=render)

@@ -8,22 +8,16 @@ from dataclasses import replace
 from typing import Any
 
 import cv2
-import jax
 import numpy as np
 
-from p2gs_jax.core.numerics import evenly_spaced, on_device
+from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.formats.false_color import false_color
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.photometry.response import by_camera, tables
-from p2gs_jax.render import project, view_radiance
-from p2gs_jax.render.tiles import smallest_cutoff
 from p2gs_jax.run.read import Run
-from p2gs_jax.types import Gaussians
 
 # Steps of false colour: whole stops from -6 to 6 about middle grey (formats/false_color.py).
 STEPS = np.arange(-6, 6) + 0.5
-# Views whose mean log radiance stands for that of the window, under the cutoff rule `radiance`.
-METERED = 8
 # Longer side of embedded photographs, pixels, and their quality.
 LONGEST, QUALITY = 960, 80
 # Digits of numbers in the page: those of float32.
@@ -36,15 +30,21 @@ def uncorrected(transform: DisplayTransform) -> DisplayTransform:
 
 
 def page_scene(
-    fitted: Run, gaussians: Gaussians, look: DisplayTransform, photographs: Mapping[int, str]
+    fitted: Run, look: DisplayTransform, photographs: Mapping[int, str]
 ) -> dict[str, Any]:
     """Return what the page reads besides the Gaussians, as plain values or arrays.
 
     It opens with `look`; `photographs` are data URLs by row of the view.
     """
-    mean = fitted.mean.exposure_geometric
+    mean, cfg = fitted.mean.exposure_geometric, fitted.cfg.render
     return {
-        "render": _rendering(fitted, gaussians),
+        "render": {
+            "radiance": cfg.radiance,
+            "near": cfg.near,
+            "blur": cfg.blur,
+            "alphaMax": cfg.alpha_max,
+            "logCutoff": float(np.log(cfg.alpha_cutoff)),
+        },
         "look": {
             "exposure": mean,
             "ev": float(np.log2(look.exposure / mean)),
@@ -80,36 +80,6 @@ def _webp(picture: np.ndarray) -> str:
     done, data = cv2.imencode(".webp", np.ascontiguousarray(codes), options)
     assert done
     return "data:image/webp;base64," + base64.b64encode(data.tobytes()).decode()
-
-
-def _rendering(fitted: Run, gaussians: Gaussians) -> dict[str, Any]:
-    cfg = fitted.cfg.render
-    follows = cfg.cutoff_rule == "radiance"
-    return {
-        "radiance": cfg.radiance,
-        "near": cfg.near,
-        "blur": cfg.blur,
-        "alphaMax": cfg.alpha_max,
-        "logCutoff": float(np.log(cfg.alpha_cutoff)),
-        "smallestLog": float(np.log(smallest_cutoff(cfg))),
-        # No radiance is above that: the cutoff is the same for all.
-        "logMean": _log_mean_radiance(fitted, gaussians) if follows else 1e30,
-    }
-
-
-def _log_mean_radiance(fitted: Run, gaussians: Gaussians) -> float:
-    """Return the mean over views of what render/tiles.py takes for each."""
-    alive = on_device(np.ones(gaussians.capacity), bool)
-    cfg, means = fitted.cfg.render, []
-    seen = jax.jit(lambda camera: project(gaussians, alive, camera, cfg).visible)
-    light = jax.jit(lambda camera: view_radiance(gaussians, camera, cfg).max(-1))
-    train = fitted.scene.train_indices
-    for k in evenly_spaced(len(train), METERED):
-        camera = fitted.camera(train[k])
-        brightest = np.asarray(light(camera))[np.asarray(seen(camera))]
-        if brightest.size:
-            means.append(np.log(np.maximum(brightest, 1e-30)).mean())
-    return float(np.mean(means)) if means else 0.0
 
 
 def _tone(fitted: Run) -> dict[str, Any]:

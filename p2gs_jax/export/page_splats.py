@@ -22,7 +22,6 @@ from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render import render_linear
 from p2gs_jax.render.capacity import PICTURES, RenderView, bucket, count_needed, until_it_fits
 from p2gs_jax.render.harmonics import C0, coefficient_count, degree_of
-from p2gs_jax.render.tiles import smallest_cutoff
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians
 
@@ -147,7 +146,7 @@ def ever_drawn(gaussians: Gaussians, cfg: RenderConfig) -> Bool[np.ndarray, " n"
         finite &= np.isfinite(np.asarray(value).reshape(gaussians.capacity, -1)).all(1)
     logits = np.asarray(gaussians.opacity_logits, np.float64)
     with np.errstate(invalid="ignore"):
-        return finite & (-np.logaddexp(0, -logits) > np.log(smallest_cutoff(cfg)))
+        return finite & (-np.logaddexp(0, -logits) > np.log(cfg.alpha_cutoff))
 
 
 def weights(
@@ -157,7 +156,7 @@ def weights(
 
     Where all radiance is 1 that is the gradient of the pictures' sum by log radiance.
     """
-    plain = replace(cfg, radiance="exp", cutoff_rule="opacity")
+    plain = replace(cfg, radiance="exp")
     alive = on_device(np.ones(gaussians.capacity), bool)
     sh = on_device(np.zeros((gaussians.capacity, 1, 3)))
     needed = max(int(count_needed(gaussians, alive, camera, cfg=plain)) for camera in cameras)

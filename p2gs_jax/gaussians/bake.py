@@ -12,7 +12,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -117,15 +117,8 @@ def display_sh(
 
 def viewer_config(cfg: RenderConfig) -> RenderConfig:
     """Return the options of an ordinary 3DGS viewer: display colours max(0, sh + 1/2)."""
-    usual = {"radiance": "linear", "cutoff_rule": "opacity", "blur": VIEWER_BLUR}
+    usual = {"radiance": "linear", "blur": VIEWER_BLUR}
     return replace(cfg, **usual, background=None)
-
-
-class _Trainable(NamedTuple):
-    """The parameters that `refine` optimises."""
-
-    sh: Float[Array, "n k 3"]
-    opacity_logits: Float[Array, " n"]
 
 
 def refine(
@@ -151,28 +144,27 @@ def refine(
     needed = max(int(count_needed(gaussians, alive, t.camera, cfg=cfg)) for t in targets)
     capacity = bucket(needed, PICTURES.first)
     bands = jnp.full((gaussians.sh.shape[1], 1), BANDS_RATE).at[0].set(COLOR_RATE)
-    rates = _Trainable(bands, jnp.asarray(OPACITY_RATE))
+    rates = {"sh": bands, "opacity_logits": OPACITY_RATE}
 
     # Made here: places and shapes are constants to XLA, which folds what depends on them alone.
     @functools.partial(jax.jit, static_argnames="capacity", compiler_options=compiler_options())
     def step(moving, state, camera, picture, background, decay, *, capacity):
-        def loss(moving: _Trainable):
-            shown = replace(gaussians, **moving._asdict())
+        def loss(moving):
+            shown = replace(gaussians, **moving)
             result = render_linear(shown, _all(shown), camera, cfg, capacity, with_depth=False)
             picture_shown = _over(result, background)
             return jnp.mean((picture_shown - picture / 255.0) ** 2), result
 
         (_, result), gradient = jax.value_and_grad(loss, has_aux=True)(moving)
         updates, state = optimizer.update(gradient, state)
-        changes = jax.tree.map(lambda rate, u: -decay * rate * u, rates, updates)
-        moved = cast(_Trainable, optax.apply_updates(cast(Any, moving), cast(Any, changes)))
-        limit = 0.5 / C0
-        sh = moved.sh.at[:, 0].set(jnp.clip(moved.sh[:, 0], -limit, limit))
-        return (_Trainable(sh, moved.opacity_logits), state), result.count, result.overflow
+        moved = jax.tree.map(lambda m, rate, u: m - decay * rate * u, moving, rates, updates)
+        base = jnp.clip(moved["sh"][:, 0], -0.5 / C0, 0.5 / C0)
+        moved["sh"] = moved["sh"].at[:, 0].set(base)
+        return (moved, state), result.count, result.overflow
 
     rng, order = np.random.default_rng(seed), []
-    moving = _Trainable(gaussians.sh, gaussians.opacity_logits)
-    state = optimizer.init(cast(Any, moving))
+    moving = {"sh": gaussians.sh, "opacity_logits": gaussians.opacity_logits}
+    state = optimizer.init(moving)
     for done in range(steps):
         order = order or list(rng.permutation(len(targets)))
         target = targets[order.pop()]
@@ -184,7 +176,7 @@ def refine(
             lambda entries, given=given: step(*given, capacity=entries), capacity
         )
         on_step(done + 1, steps)
-    return replace(gaussians, **moving._asdict())
+    return replace(gaussians, **moving)
 
 
 def baking_error(

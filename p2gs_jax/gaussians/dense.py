@@ -139,12 +139,9 @@ def dense_seeds(
     wanted = [int(r) for r in evenly_spaced(len(rows), most_views) if len(near[r]) >= 2]
     flows = Flows(images, scene.points, seen)
     found: list[Candidates] = []
-
-    def one(row: int) -> Candidates:
-        return _candidates(row, near[row], flows, color, cfg.train.seed)
-
     with ThreadPoolExecutor(WORKERS, thread_name_prefix="dense") as pool:
-        for done, candidates in enumerate(pool.map(one, wanted)):
+        made = pool.map(lambda r: _candidates(r, near[r], flows, color, cfg.train.seed), wanted)
+        for done, candidates in enumerate(made):
             found.append(candidates)
             on_view(done + 1, len(wanted))
     if not sum(len(c.xy) for c in found):

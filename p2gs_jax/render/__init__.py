@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render.binning import bin_tiles, count_entries
 from p2gs_jax.render.project import at_time, camera_of_each, project, view_radiance
-from p2gs_jax.render.tiles import rasterize, with_cutoffs
+from p2gs_jax.render.tiles import rasterize
 from p2gs_jax.types import Camera, Gaussians, Render, Splats2D
 
 
@@ -48,7 +48,6 @@ def render_splats(
     with_depth: bool = True,
 ) -> Render:
     """Render Gaussians that are projected already; see `render_linear`."""
-    splats = with_cutoffs(splats, radiance, cfg)
     size, tiles = (camera.width, camera.height), None
     count, overflow = jnp.int32(0), jnp.array(False)
     if cfg.implementation != "reference":
@@ -72,8 +71,6 @@ def required_capacity(
     gaussians = at_time(gaussians, camera.objects)
     camera = camera_of_each(camera, owner)
     splats = project(gaussians, alive, camera, cfg)
-    if cfg.cutoff_rule == "radiance":
-        splats = with_cutoffs(splats, view_radiance(gaussians, camera, cfg), cfg)
     return count_entries(splats, camera.width, camera.height, cfg)
 
 

@@ -77,7 +77,7 @@ def depth_order(depths: Float[Array, " n"], visible: Bool[Array, " n"]) -> Int[A
 
 def _extents(splats: Splats2D, width: int, height: int, cfg: RenderConfig):
     """Return (boxes, x0, y0, tiles across, entries): the tiles of each bounding box."""
-    box = boxes(splats, width, height)
+    box = boxes(splats, width, height, cfg)
     tile_x, tile_y = cfg.tile
     x0, y0 = box.first[:, 0] // tile_x, box.first[:, 1] // tile_y
     across = jnp.maximum(box.last[:, 0] // tile_x + 1 - x0, 1)

@@ -13,6 +13,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
@@ -54,9 +55,9 @@ def bits_for(count: int) -> int:
     return max(1, int(count - 1).bit_length())
 
 
-def boxes(splats: Splats2D, width: int, height: int) -> Boxes:
+def boxes(splats: Splats2D, width: int, height: int, cfg: RenderConfig) -> Boxes:
     """Return the box of every splat, clipped to the image."""
-    reach = splats.log_opacities - splats.log_cutoffs
+    reach = splats.log_opacities - float(np.log(cfg.alpha_cutoff))
     radius = jnp.sqrt(2 * jnp.maximum(reach, 0.0))[:, None] * jnp.sqrt(splats.cov_diagonal)
     size = jnp.array([width, height], jnp.float32)
     # Pixel centres sit at +0.5: the first and last centres inside the box.
@@ -239,7 +240,7 @@ def _tile_rows(box: Boxes, tile_y: int):
 
 def count_entries(splats: Splats2D, width: int, height: int, cfg: RenderConfig) -> Int[Array, ""]:
     """Return the tile-list capacity this view needs: rows or entries, whichever are more."""
-    box = boxes(splats, width, height)
+    box = boxes(splats, width, height, cfg)
     ellipses = _ellipses(splats, box)
     first, rows = _tile_rows(box, cfg.tile[1])
 
@@ -259,7 +260,7 @@ def bin_tiles(
     """Return the lists, see `p2gs_jax.render.binning.bin_tiles`."""
     across, down = grid_size(width, height, cfg.tile)
     tile_count = across * down
-    box = boxes(splats, width, height)
+    box = boxes(splats, width, height, cfg)
     order = depth_order(splats.depths, box.visible)
     first, rows = (a[order] for a in _tile_rows(box, cfg.tile[1]))
     visible = jnp.sum(box.visible, dtype=jnp.int32)

@@ -174,7 +174,6 @@ def project(
         log_opacities=log_opacities,
         depths=z,
         visible=visible,
-        log_cutoffs=jnp.full_like(z, float(np.log(cfg.alpha_cutoff))),
     )
 
 

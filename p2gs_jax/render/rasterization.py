@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
@@ -19,7 +20,6 @@ from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import count_entries, project, render_splats, view_radiance
 from p2gs_jax.render.capacity import PICTURES, bucket
 from p2gs_jax.render.harmonics import coefficient_count
-from p2gs_jax.render.tiles import with_cutoffs
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians
 
@@ -124,7 +124,7 @@ def _seen(gaussians, each, size, cfg: RenderConfig, sh_degree: int | None):
     splats = project(gaussians, jnp.ones(gaussians.means.shape[0], bool), camera, cfg)
     if sh_degree is not None:
         color = view_radiance(dataclasses.replace(gaussians, sh=color), camera, cfg)
-    return camera, with_cutoffs(splats, color, cfg), color
+    return camera, splats, color
 
 
 def _render(gaussians, colors, viewmats, Ks, size, cfg, capacity, sh_degree, with_depth):
@@ -133,7 +133,7 @@ def _render(gaussians, colors, viewmats, Ks, size, cfg, capacity, sh_degree, wit
     def one(each):
         camera, splats, color = _seen(gaussians, each, size, cfg, sh_degree)
         result = render_splats(splats, color, camera, cfg, capacity, with_depth=with_depth)
-        reach = jnp.maximum(splats.log_opacities - splats.log_cutoffs, 0)
+        reach = jnp.maximum(splats.log_opacities - float(np.log(cfg.alpha_cutoff)), 0)
         radii = jnp.ceil(jnp.sqrt(2 * reach[:, None] * splats.cov_diagonal))
         meta = {
             "means2d": splats.means2d,

@@ -40,9 +40,9 @@ COLUMNS = 16
 SUMMED = 32
 
 
-def exponent_scale(smallest_cutoff: float) -> float:
+def exponent_scale(alpha_cutoff: float) -> float:
     """Return ln 2: alpha = 2^e, the exponential that the hardware has."""
-    del smallest_cutoff
+    del alpha_cutoff
     return float(np.log(2.0))
 
 
@@ -89,9 +89,8 @@ class _Tile:
         u = center[0] + a11 * self.x + a12 * self.y
         v = center[1] + a22 * self.y
         exponent = log_opacity - (u * u + v * v)
-        cutoff = row[-1] if plan.own_cutoffs else plan.log_cutoff / plan.exponent_scale
         alpha = jnp.minimum(jnp.exp2(exponent), plan.cfg.alpha_max)
-        return jnp.where(exponent > cutoff, alpha, 0.0)
+        return jnp.where(exponent > plan.cutoff, alpha, 0.0)
 
 
 def _forward_kernel(rows, ids, offsets, order, brightest, *outputs, plan: Plan):
@@ -250,7 +249,5 @@ def backward(rows, ids, residuals, image, v_image, plan: Plan):
     )(*operands)
     if plan.cfg.deterministic:
         v_rows = _in_order(v_rows[:capacity], ids, count)
-    used = GEOMETRY + plan.channels
-    # The dummy has no gradient, nor a splat's own cutoff.
-    v_rows = v_rows[:, :used].at[-1].set(0.0)
-    return jnp.pad(v_rows, ((0, 0), (0, rows.shape[1] - used)))
+    # The dummy has no gradient.
+    return v_rows[:, : rows.shape[1]].at[-1].set(0.0)

@@ -2,13 +2,10 @@
 
 B lanes each own one segment of a tile's list. Every iteration a lane composites the next C entries
 of its segment; when that ends, or all its pixels are opaque, it writes the result and takes the
-next segment, longest first. Long lists are cut so that no segment is longer than a fraction of a
-lane's fair share (`cut`): all lanes are busy to the end, however few tiles there are and
-however uneven their lists. Compositing is associative, so the segments of a tile are composited
-independently and merged: one of colour c and transmittance t in front of one of colour d gives
-colour c + t d. Work wasted on padding is bounded by C per tile. A queue of whole lists took at
-least as long as its longest list: at a quarter of the resolution of a fit, lanes were idle for two
-thirds of the time (BUILD_NOTES, "Full lanes").
+next segment, longest first. Long lists are cut (`cut`), so that all lanes are busy to the end,
+however uneven the lists (BUILD_NOTES, "Full lanes"). Compositing is associative: the segments of a
+tile are composited independently and merged, one of colour c and transmittance t in front of one of
+colour d giving c + t d. Work wasted on padding is bounded by C per tile.
 
 The exponential is a polynomial on [-0.7, 0], squared as often as it takes to reach the cutoff
 (`exponent_scale`); rows are what tiles.py says.
@@ -173,9 +170,9 @@ class Queue(NamedTuple):
         return turn + total[-1], new, jnp.where(done, self.starts[new], position)
 
 
-def exponent_scale(smallest_cutoff: float) -> float:
+def exponent_scale(alpha_cutoff: float) -> float:
     """Return 2^s with s such that [-0.7, 0] times it reaches the log of the cutoff."""
-    return float(2 ** max(3, int(np.ceil(np.log2(-np.log(smallest_cutoff) / 0.7)))))
+    return float(2 ** max(3, int(np.ceil(np.log2(-np.log(alpha_cutoff) / 0.7)))))
 
 
 @functools.cache
@@ -225,9 +222,8 @@ def _gather(rows, ids_list, center, position, end, local, plan: Plan, always) ->
     u = u0[..., None] + a11[..., None] * local_x + a12[..., None] * local_y
     v = v0[..., None] + a22[..., None] * local_y
     exponent = log_opacity[..., None] - (u * u + v * v)
-    cutoff = row[..., -1:] if plan.own_cutoffs else plan.log_cutoff / plan.exponent_scale
     alpha = jnp.where(
-        exponent > cutoff, jnp.minimum(_scaled_exp(exponent, plan), plan.cfg.alpha_max), 0.0
+        exponent > plan.cutoff, jnp.minimum(_scaled_exp(exponent, plan), plan.cfg.alpha_max), 0.0
     )
     return _Entries(ids, row, (u0, v0, dx0, dy0), alpha)
 
@@ -416,8 +412,5 @@ def backward(rows, ids_list, residuals, image, v_image, plan: Plan):
 
     blank = jnp.zeros((lanes, pixels), rows.dtype)
     begin = jnp.int32(lanes), slot, queue.starts[slot], jnp.ones(lanes, bool)
-    v_rows = jnp.zeros((rows.shape[0], GEOMETRY + plan.channels), rows.dtype)
-    state = (*begin, blank, blank, v_rows)
-    v_rows = lax.while_loop(lambda s: jnp.any(s[1] < queue.slots), body, state)[6]
-    # A splat's own cutoff has no gradient.
-    return jnp.pad(v_rows, ((0, 0), (0, rows.shape[1] - v_rows.shape[1])))
+    state = (*begin, blank, blank, jnp.zeros_like(rows))
+    return lax.while_loop(lambda s: jnp.any(s[1] < queue.slots), body, state)[6]

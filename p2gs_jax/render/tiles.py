@@ -7,15 +7,14 @@ each, and what its own backward needs;
 `backward(rows, ids, residuals, image, v_image, plan)` gives the gradient of the rows.
 
 Rows. A Gaussian is a row of floats: mean x, y; conic factor a11, a12, a22; log opacity; three
-radiances; depth if asked for; its own log cutoff if they differ. Factor, opacity and cutoff are
-divided by the plan's `exponent_scale` (the factor by its root), in the units that suit an
-implementation's exponential: e = log opacity - (u^2 + v^2) and alpha = exp(exponent_scale e).
-Row N is a dummy that absorbs padding.
+radiances; depth if asked for. Factor, opacity and the plan's cutoff are divided by its
+`exponent_scale` (the factor by its root), in the units that suit an implementation's exponential:
+e = log opacity - (u^2 + v^2) and alpha = exp(exponent_scale e). Row N is a dummy that absorbs
+padding.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Sequence
 from importlib import import_module
@@ -24,7 +23,6 @@ from typing import Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float
 
 from p2gs_jax.config import RenderConfig
@@ -32,7 +30,6 @@ from p2gs_jax.render.binning import grid_size
 from p2gs_jax.types import Splats2D, TileList
 
 TileImplementation = Literal["xla", "pallas"]
-SMALLEST_CUTOFF = 1e-7
 DUMMY_LOG_OPACITY = -100.0
 GEOMETRY = 6  # columns of a row before its channels
 # Lanes for every tile of an image too small to fill them.
@@ -42,30 +39,6 @@ AMPERE = 8.0
 # Floor of a pixel's brightness in the stop rule, over the brightest splat
 # (RenderConfig.stop_error).
 DARKEST = 1e-4
-
-
-def smallest_cutoff(cfg: RenderConfig) -> float:
-    """Return the lowest opacity cutoff that any splat may have."""
-    if cfg.cutoff_rule == "opacity":
-        return cfg.alpha_cutoff
-    return min(SMALLEST_CUTOFF, cfg.alpha_cutoff)
-
-
-def with_cutoffs(splats: Splats2D, radiance: Float[Array, "n 3"], cfg: RenderConfig) -> Splats2D:
-    """Return splats with the log cutoffs that `cfg.cutoff_rule` gives them.
-
-    Rule `radiance`: with L the brightest channel of a splat and M the geometric mean of L over the
-    visible splats, the cutoff is alpha_cutoff min(1, M / L), at least 1e-7 and at most
-    alpha_cutoff. A skipped contribution is then at most alpha_cutoff M (or 1e-7 L).
-    """
-    if cfg.cutoff_rule == "opacity":
-        return splats
-    log_l = jnp.log(jnp.maximum(lax.stop_gradient(jnp.max(radiance, -1)), 1e-30))
-    shown = splats.visible
-    mean = jnp.sum(jnp.where(shown, log_l, 0)) / jnp.maximum(jnp.sum(shown), 1)
-    lowered = float(np.log(cfg.alpha_cutoff)) - jnp.maximum(log_l - mean, 0)
-    lowest = float(np.log(smallest_cutoff(cfg)))
-    return dataclasses.replace(splats, log_cutoffs=jnp.maximum(lowered, lowest))
 
 
 def rasterize_reference(
@@ -85,7 +58,7 @@ def rasterize_reference(
     a11, a12, a22 = (s.conic_factor[:, i, None, None] for i in range(3))
     exponent = s.log_opacities[:, None, None] - 0.5 * ((a11 * dx + a12 * dy) ** 2 + (a22 * dy) ** 2)
     alpha = jnp.where(
-        exponent > s.log_cutoffs[:, None, None],
+        exponent > float(np.log(cfg.alpha_cutoff)),
         jnp.minimum(jnp.exp(exponent), cfg.alpha_max),
         0.0,
     )
@@ -99,7 +72,7 @@ def rasterize_reference(
 
 
 class Plan(NamedTuple):
-    """Static shape of one compositing run; cutoffs are logarithms."""
+    """Static shape of one compositing run; the cutoff is one of exponents."""
 
     across: int
     down: int
@@ -107,8 +80,7 @@ class Plan(NamedTuple):
     gaussians: int
     channels: int
     exponent_scale: float
-    log_cutoff: float
-    own_cutoffs: bool
+    cutoff: float
     cfg: RenderConfig
 
     @property
@@ -142,8 +114,6 @@ def pack_rows(
     ]
     if plan.channels == 4:
         columns.append(splats.depths[:, None])
-    if plan.own_cutoffs:
-        columns.append(splats.log_cutoffs[:, None] / plan.exponent_scale)
     rows = jnp.where(splats.visible[:, None], jnp.concatenate(columns, axis=1), 0.0)
     dummy = jnp.zeros((1, rows.shape[1]), rows.dtype).at[0, GEOMETRY - 1].set(DUMMY_LOG_OPACITY)
     return jnp.concatenate([rows, dummy])
@@ -246,16 +216,15 @@ def rasterize(
     if tiles is None:
         raise ValueError(f"the {name} rasterizer needs a tile list: pass bin_tiles(...)")
     across, down = grid_size(width, height, cfg.tile)
-    smallest, pixels = smallest_cutoff(cfg), cfg.tile[0] * cfg.tile[1]
+    pixels, scale = cfg.tile[0] * cfg.tile[1], _module(name).exponent_scale(cfg.alpha_cutoff)
     plan = Plan(
         across=across,
         down=down,
         lanes=max(1, min(cfg.pixels_in_flight // pixels, MOST_LANES * across * down)),
         gaussians=splats.depths.shape[0],
         channels=4 if with_depth else 3,
-        exponent_scale=_module(name).exponent_scale(smallest),
-        log_cutoff=float(np.log(smallest)),
-        own_cutoffs=cfg.cutoff_rule == "radiance",
+        exponent_scale=scale,
+        cutoff=float(np.log(cfg.alpha_cutoff)) / scale,
         cfg=cfg,
     )
     rows = pack_rows(splats, radiance, plan)

@@ -28,7 +28,6 @@ from p2gs_jax.render.project import (
     project,
     view_radiance,
 )
-from p2gs_jax.render.tiles import smallest_cutoff
 from p2gs_jax.render.xla_cpu import compiled_loop
 from p2gs_jax.types import Camera, Frustum, Gaussians, Splats2D
 
@@ -55,7 +54,7 @@ def in_view(
     xp = namespace(gaussians.means, camera.viewmat)
     R, t = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
     x, y, z = (sum(gaussians.means[:, k] * R[i, k] for k in range(3)) + t[i] for i in range(3))
-    reach = -xp.logaddexp(0.0, -gaussians.opacity_logits) - float(np.log(smallest_cutoff(cfg)))
+    reach = -xp.logaddexp(0.0, -gaussians.opacity_logits) - float(np.log(cfg.alpha_cutoff))
     seen = alive & (z > cfg.near) & (reach > 0)
     inverse_z = 1 / xp.where(z > cfg.near, z, 1.0)
     widest = xp.exp(xp.clip(xp.max(gaussians.log_scales, -1), *LOG_SCALE_RANGE))

@@ -16,7 +16,6 @@ from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.gaussians.posed import rotations
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.render.project import LOG_SCALE_RANGE, TANGENT_LIMIT, at_time, camera_of_each
-from p2gs_jax.render.tiles import smallest_cutoff
 from p2gs_jax.render.visible import in_view
 from p2gs_jax.train.inputs import TrainingViews
 from p2gs_jax.types import Camera, Gaussians
@@ -51,7 +50,7 @@ def count_view(
     x, y, z = local.T
     axes = R @ rotations(shown.quats).as_matrix()
     axes *= np.exp(np.clip(shown.log_scales, *LOG_SCALE_RANGE))[:, None]
-    reach = -np.logaddexp(0, -shown.opacity_logits) - np.log(smallest_cutoff(cfg))
+    reach = -np.logaddexp(0, -shown.opacity_logits) - np.log(cfg.alpha_cutoff)
     tiles, boxed = np.ones(len(z)), np.ones(len(z), bool)
     for i, (along, size) in enumerate(((x, camera.width), (y, camera.height))):
         f, c = camera.K[i, i], camera.K[i, 2]

@@ -1,4 +1,4 @@
-"""The gate of the benchmarks, their error metrics, and scenes with the lists that fits have."""
+"""The gate of the benchmarks, and their error metrics."""
 
 import json
 
@@ -6,12 +6,10 @@ import jax
 import numpy as np
 import pytest
 
-from benchmarks import gate, levels
+from benchmarks import gate
 from benchmarks.hard_cases import splats
 from benchmarks.oracle import Truth, trimmed_errors
 from benchmarks.run import options_of
-from benchmarks.scenes import GROWN, room, town_level
-from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
 
 ROWS = {"default": {"both": 1.0, "numerics psnr": 90.0}}
@@ -93,30 +91,3 @@ def test_a_contribution_on_the_cutoff_does_not_hide_the_others():
     np.testing.assert_allclose(found["gradient_99"], 1e-6, rtol=0.02)
     linear += 1e-3
     assert trimmed_errors(linear, off, exact)["relative_99"] > 1e-3
-
-
-def test_levels_differ_in_size_and_have_the_population_of_their_time():
-    scenes = [town_level(s, width=240, points=3000) for s in (4, 2, 1)]
-    assert [s.camera.width for s in scenes] == [60, 120, 240]
-    counts = [s.gaussians.capacity for s in scenes]
-    assert counts == sorted(counts)
-    assert counts[-1] == round(3000 * GROWN)
-    opacities = [
-        1 / (1 + np.exp(-np.asarray(s.gaussians.opacity_logits, np.float64))) for s in scenes
-    ]
-    spread = [o.std() for o in opacities]
-    assert spread == sorted(spread)
-    # The end of a fit, as measured: half of the Gaussians hide little, some nearly all.
-    low, middle, high = np.percentile(opacities[-1], (25, 50, 95))
-    assert 0.01 < low < 0.05
-    assert 0.07 < middle < 0.17
-    assert 0.6 < high < 0.9
-
-
-def test_lists_of_the_room_are_deep_and_the_same_every_time():
-    scene = room()
-    found = levels.lists(scene, FitConfig())
-    assert 150 < found.entries / found.tiles < 300
-    assert 500 < found.longest < 1200
-    for x, y in zip(jax.tree.leaves(scene), jax.tree.leaves(room()), strict=True):
-        np.testing.assert_array_equal(x, y)

@@ -167,14 +167,11 @@ WHOLE = ply("ascii", VERTICES, TEXT)
 REFUSED = {
     "no count": ((["element vertex", *AXES], TEXT), r"line 3 of its header, 'element vertex', is"),
     "no whole count": ((["element vertex 2.0", *AXES], TEXT), r"line 3 .*'element vertex 2.0'"),
-    "a negative count": ((["element vertex -2", *AXES], TEXT), r"line 3 .*'element vertex -2'"),
     "a type unknown": ((["element vertex 2", "property int64 x"], TEXT), r"line 4 .*int64 x', is"),
-    "no name": ((["element vertex 2", "property list"], TEXT), r"line 4 .*'property list'"),
     "a property twice": (([*VERTICES, AXES[0]], TEXT), r"'property float x', is .*there twice"),
     "an element twice": (([*VERTICES, *VERTICES], TEXT + TEXT), r"'element vertex 2', is .*twice"),
     "a property of nothing": (([AXES[0], *VERTICES], TEXT), r"line 3 of its header.*misplaced"),
     "a format twice": ((["format ascii 1.0", *VERTICES], TEXT), r"'format ascii 1.0', is .*twice"),
-    "an empty line": ((["", *VERTICES], TEXT), r"line 3 of its header, '', is"),
     "no ASCII": ((["comment Straße", *VERTICES], TEXT), r"'ascii' codec can't decode"),
     "no vertices": ((["element points 2", *AXES], TEXT), r"it has no element 'vertex'"),
     "lists before": (([*FACES, *VERTICES], TEXT), r"its element 'face' has lists"),
@@ -183,9 +180,7 @@ REFUSED = {
     "a row short": ((VERTICES, b"0 0 1\n0 1\n"), r"requires 3 columns but 2 were found at row 2"),
     "a row long": ((VERTICES, b"0 0 1 5\n0 1 0\n"), r"requires 3 columns but 4 were found"),
     "a row empty": ((VERTICES, b"0 0 1\n\n0 1 0\n"), r"ends before the last of its 2 rows"),
-    "a row commented": ((VERTICES, b"0 0 1 # c\n0 1 0\n"), r"requires 3 columns but 5 were found"),
     "rows missing": ((VERTICES, b"0 0 1\n"), r"ends before the last of its 2 rows of 'vertex'"),
-    "no rows": ((VERTICES, b""), r"ends before the last of its 2 rows of 'vertex'"),
     "a word": ((VERTICES, b"0 0 x\n0 1 0\n"), r"could not convert string 'x' to float32"),
     "no ASCII in rows": ((VERTICES, b"0 0 \xb2\n0 1 0\n"), r"'ascii' codec can't decode"),
     "a colour of 256": ((COLORED, b"0 0 1 256\n0 1 0 0\n"), r"'256' to uint8"),
@@ -193,11 +188,9 @@ REFUSED = {
     "a count without end": ((["element vertex " + "9" * 5000], TEXT), r"limit \(4300 digits\)"),
     "huge behind": (([*VERTICES, "element face 99999999"], TEXT), r"announces 99999999 records"),
     "empty": (b"", r"is not a valid PLY of points: it is empty"),
-    "text": (b"hello", r"its first line is not 'ply'"),
     "no end": (WHOLE.replace(b"end_header\n", b""), r"it has no line 'end_header'"),
     "no format": (WHOLE.replace(b"format ascii 1.0\n", b""), r"line 2 of its header.*misplaced"),
     "nothing at all": (b"ply\ncomment\nend_header\n", r"its header states no format"),
-    "version 2": (WHOLE.replace(b"1.0", b"2.0"), r"line 2 of its header, 'format ascii 2.0', is"),
 }
 
 

@@ -23,12 +23,6 @@ PACKAGE = Path(p2gs_jax.__file__).parent
 ALONE = ("core/streams.py", "synth/drive", "gaussians/bake.py")
 
 
-@pytest.mark.parametrize("streams", [Stream, SceneStream])
-def test_no_two_streams_draw_the_same(streams):
-    drawn = {s: generator(5, s).random(4).tobytes() for s in streams}
-    assert len(set(drawn.values())) == len(streams)
-
-
 def test_every_stream_has_one_user():
     uses = {}
     for path in PACKAGE.rglob("*.py"):

@@ -64,8 +64,6 @@ def test_exposures_without_tracks(street, noisy_street):
 def test_what_was_left_out_is_said(street):
     observations = track_colors(street, ImageStore(street.views, CFG.data))
     options = dataclasses.replace(options_of(CFG, street), choice=CHOICE)
-    reasons = calibrate_observations(observations, options).reasons
-    assert not any("left out" in r for r in reasons)
     some = dataclasses.replace(observations, too_coarse=7)
     assert calibrate_observations(some, options).reasons[0].startswith("7 of ")
 

@@ -190,7 +190,7 @@ class Renderer {
     gl.uniform3fv(p.at.centre, camera.c);
     gl.uniform4fv(p.at.lens, camera.lens);
     gl.uniform2f(p.at.size, width, height);
-    for (const name of ["near", "blur", "logCutoff", "logMean", "smallestLog"])
+    for (const name of ["near", "blur", "logCutoff"])
       gl.uniform1f(p.at[name], r[name]);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
 

@@ -17,7 +17,7 @@ uniform mat3 rotation;  // world to camera
 uniform vec3 centre;
 uniform vec4 lens;      // fx, fy, cx, cy
 uniform vec2 size;
-uniform float near, blur, logCutoff, logMean, smallestLog;
+uniform float near, blur, logCutoff;
 layout(location = 0) out uvec4 place;   // x, y, log opacity, log cutoff
 layout(location = 1) out uvec4 shape;   // factor of the inverse covariance
 layout(location = 2) out uvec4 light;   // radiance
@@ -79,9 +79,7 @@ void main() {
   vec3 L = radiance(harmonics(at, normalize(mean - centre)));
   float logit = read(3, at).x;
   float opacity = min(logit, 0.0) - log(1.0 + exp(-abs(logit)));
-  float brightest = log(max(max(L.r, max(L.g, L.b)), 1e-30));
-  float cutoff = max(logCutoff - max(brightest - logMean, 0.0), smallestLog);
-  place = floatBitsToUint(vec4(lens.xy * p.xy / p.z + lens.zw, opacity, cutoff));
+  place = floatBitsToUint(vec4(lens.xy * p.xy / p.z + lens.zw, opacity, logCutoff));
   shape = floatBitsToUint(vec4(a11, -xy / cyy * a11, inversesqrt(cyy), 0.0));
   light = floatBitsToUint(vec4(L, 0.0));
 }`;
