@@ -357,9 +357,9 @@ def _row_gradient(entries: _Entries, w, v_exponent, v_out, features, plan: Plan)
     lanes, chunk, pixels = w.shape
     moments = (v_exponent.reshape(lanes * chunk, pixels) @ features).reshape(lanes, chunk, 8)
     sums, factor = [moments[..., i] for i in range(6)], [entries.rows[..., i] for i in (2, 3, 4)]
-    v_geometry = geometry_gradient(sums, factor, entries.center, plan.exponent_scale)
+    v_geometry = jnp.stack(geometry_gradient(sums, factor, entries.center, plan.exponent_scale), -1)
     v_color = jnp.einsum("bcp,bkp->bck", w, v_out)
-    return jnp.concatenate([jnp.stack(v_geometry, -1), v_color], -1)
+    return jnp.concatenate([v_geometry, v_color], -1)
 
 
 def backward(rows, ids_list, residuals, image, v_image, plan: Plan):
