@@ -61,7 +61,6 @@ VARIANTS = (
     *_knob("in flight", "pixels_in_flight", 8192, 131072),
     *_knob("stop", "stop_error", None, 1e-5, 5e-3, 5e-2, label=lambda v: f"{v or 'none'}"),
     *_knob("cutoff", "alpha_cutoff", 1 / 64, 1 / 1024, 1e-5, label=lambda v: f"1/{1 / v:.0f}"),
-    QUICK[3],
     *_knob("exp degree", "exp_degree", None, 3, 4, label=lambda v: str(v or "exact")),
     QUICK[2],
     Variant(

@@ -185,6 +185,7 @@ def test_light_behind_shows_through(shown):
         )
         through = (1 - lit.alpha)[..., None] * np.array(BEHIND)
         np.testing.assert_allclose(lit.linear, dark.linear + through, rtol=1e-12)
+        lit = jax.tree.map(np.asarray, lit)
     assert 0.1 < float(lit.alpha.mean()) < 0.9
     np.testing.assert_allclose(render(*street(60)).linear, lit.linear, rtol=2e-3, atol=2e-3)
     g, cam, image = shown
