@@ -151,7 +151,7 @@ def read_table(path: Path, name: str) -> np.ndarray:
         for here, (count, columns) in header.elements.items():
             if "" in columns.values():
                 if found is None:
-                    raise PlyError(f"its element {here!r}, up to {name!r}, has lists")
+                    raise PlyError(f"its element {here!r} has lists, which are not read")
                 break
             row = np.dtype(list(columns.items()))
             if header.order == "=":
