@@ -38,7 +38,7 @@ class PlyError(ValueError):
 class Element(NamedTuple):
     """A table as a header announces it: its rows, and its columns: NumPy's types, "" for lists."""
 
-    count: int
+    rows: int
     columns: dict[str, str]
 
 

@@ -126,7 +126,8 @@ def dense_seeds(
     evenly, and their neighbours may be any. `on_view` is called with views done and views in all.
     """
     rows = scene.train_indices
-    nothing = DenseSeeds(*np.zeros((3, 0, 3), np.float32), np.zeros((0, 4), np.float32))
+    empty = np.zeros((0, 3), np.float32)
+    nothing = DenseSeeds(empty, empty, empty, np.zeros((0, 4), np.float32))
     if len(rows) < FEWEST_VIEWS or limit < 1 or not len(scene.points):
         return nothing
     images = MatchImages(scene, store, match, MATCH_SIDE, cfg.loss.black, cfg.loss.saturation)

@@ -159,7 +159,7 @@ def _entries(gaussians, colors, viewmats, Ks, size, cfg, sh_degree):
     """Return the entries that each camera needs."""
 
     def one(each):
-        _, splats, _ = _seen(gaussians, each, size, cfg, sh_degree)
-        return count_entries(splats, *size, cfg)
+        camera, splats, _ = _seen(gaussians, each, size, cfg, sh_degree)
+        return count_entries(splats, camera.width, camera.height, cfg)
 
     return jax.lax.map(one, (colors, viewmats, Ks))
