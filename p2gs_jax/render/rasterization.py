@@ -79,15 +79,7 @@ def rasterization(
     gaussians = Gaussians(means, quats, jnp.log(scales), logits, no_color[:, None])
     arrays, size = (gaussians, each, viewmats, Ks), (width, height)
     if capacity is None:
-        try:
-            fixed: tuple = jax.lax.stop_gradient(arrays)
-            needed = int(jnp.max(_entries(*fixed, size, cfg, sh_degree)))
-        except jax.errors.ConcretizationTypeError as error:
-            raise ValueError(
-                "the capacity of the tile lists cannot be measured inside jax.jit: pass capacity=, "
-                'such as meta["capacity"] of a call outside of it'
-            ) from error
-        capacity = bucket(needed, PICTURES.first)
+        capacity = _measured(arrays, size, cfg, sh_degree)
     traced = any(isinstance(a, Tracer) for a in jax.tree.leaves(arrays))
     run = _compiled(None if traced else jax.default_backend())
     rgb, alpha, depth, meta = run(*arrays, size, cfg, capacity, sh_degree, render_mode != "RGB")
@@ -163,3 +155,20 @@ def _entries(gaussians, colors, viewmats, Ks, size, cfg, sh_degree):
         return count_entries(splats, camera.width, camera.height, cfg)
 
     return jax.lax.map(one, (colors, viewmats, Ks))
+
+
+def _measured(arrays: tuple, size: tuple[int, int], cfg: RenderConfig, degree: int | None) -> int:
+    """Return the length of the tile lists that some cameras need, with some to spare.
+
+    Raises:
+        ValueError: the values are not known yet, inside `jax.jit`.
+    """
+    fixed: tuple = jax.lax.stop_gradient(arrays)
+    try:
+        needed = int(jnp.max(_entries(*fixed, size, cfg, degree)))
+    except jax.errors.ConcretizationTypeError as error:
+        raise ValueError(
+            "the capacity of the tile lists cannot be measured inside jax.jit: pass capacity=, "
+            'such as meta["capacity"] of a call outside of it'
+        ) from error
+    return bucket(needed, PICTURES.first)
