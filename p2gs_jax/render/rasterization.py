@@ -84,14 +84,18 @@ def rasterization(
     run = _compiled(None if traced else jax.default_backend())
     rgb, alpha, depth, meta = run(*arrays, size, cfg, capacity, sh_degree, render_mode != "RGB")
     meta |= {"capacity": capacity, "width": width, "height": height}
-    alpha = alpha[..., None]
+    return _channels(rgb, alpha[..., None], depth, backgrounds, render_mode), alpha[..., None], meta
+
+
+def _channels(rgb, alpha, depth, backgrounds, render_mode: str):
+    """Return the channels that a mode asks for."""
     if backgrounds is not None:
         rgb = rgb + (1 - alpha) * backgrounds[:, None, None]
     parts = [rgb] if render_mode.startswith("RGB") else []
     if depth is not None:
         expected = render_mode.endswith("ED")
         parts.append(depth[..., None] / (jnp.maximum(alpha, 1e-10) if expected else 1.0))
-    return jnp.concatenate(parts, -1), alpha, meta
+    return jnp.concatenate(parts, -1)
 
 
 def _for_each_camera(colors, count: int, cameras: int, sh_degree: int | None):
