@@ -3,10 +3,8 @@
 import collections
 import gc
 import os
-import resource
 import shutil
 import signal
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,20 +15,9 @@ from filelock import FileLock
 # finds them by what they compute.
 COMPILED = Path(__file__).parents[1] / ".pytest_cache" / "xla"
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(COMPILED))
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
-
-# From here on, programs of a finished file are forgotten; those wanted again come from disk.
-MOST_MEMORY_GB = 1.2
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 # The cache is cut to this between sessions: JAX's own bound looks at every file at every write.
 MOST_CACHED_GB = 2.0
-
-
-def memory_gb() -> float:
-    """Return the resident memory of this process, GB."""
-    if sys.platform == "linux":
-        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-        return pages * resource.getpagesize() / 1e9
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e9
 
 
 def pytest_sessionstart(session):
@@ -54,9 +41,13 @@ def _signals_as_in_a_terminal():
 
 @pytest.fixture(scope="module", autouse=True)
 def _forget_programs():
-    """Let compiled programs go between files once they have taken much memory."""
+    """Let compiled programs go between files once processes of the run fill half of the memory."""
     yield
-    if memory_gb() > MOST_MEMORY_GB:
+    from p2gs_jax.core.memory import resident
+
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if resident() > 0.5 * memory / workers:
         import jax
 
         jax.clear_caches()
