@@ -129,21 +129,14 @@ def observe(
     shared_texture: float = 0.0,
     seed: int = 3,
 ) -> Observations:
-    """Photograph the points.
+    """Photograph the points under exposures of every view, or of every channel of it.
 
-    Args:
-        drive: who sees what.
-        exposures: one for every view, or for every channel of it (a white balance).
-        curve: response of all, or an array of names that fits cameras x channels.
-        gammas: of every view, replacing the curve by x^(1 / gamma) about the pivot.
-        pivot: linear value that gammas leave alone (encoded by 2.2).
-        outliers: share of observations that show another point.
-        texture: standard deviation of log radiance between views, common to the channels.
-        noise: factor of photon noise and texture.
-        bits: of the photographs; None does not round.
-        corner_loss: share of the light that each camera loses in its corners.
-        shared_texture: the same as `texture`, of errors that neighbours in an image share.
-        seed: of the random numbers.
+    `curve` is the response, or an array of names that fits cameras x channels; `gammas` of every
+    view replace it by x^(1 / gamma) about the pivot, the linear value that they leave alone.
+    `outliers` is the share of observations that show another point, `texture` the standard
+    deviation of log radiance between views, `shared_texture` that of errors that neighbours in an
+    image share, `noise` a factor of photon noise and texture; `bits` of None do not round;
+    `corner_loss` is the share of the light that each camera loses in its corners.
     """
     rng = np.random.default_rng(seed)
     v, p = drive.views, drive.points

@@ -8,7 +8,7 @@ import pytest
 from p2gs_jax.core.numerics import srgb_decode
 from p2gs_jax.errors import UserError
 from p2gs_jax.synth.furnish import build_town
-from p2gs_jax.synth.sensor import draw_iso, draw_shots, encode, photograph, vignette
+from p2gs_jax.synth.sensor import draw_iso, draw_shots, photograph, vignette
 from p2gs_jax.synth.settings import Sensor
 from p2gs_jax.synth.town import UNDERPASS, Material
 
@@ -39,12 +39,10 @@ def test_gain_drift_and_tint_are_each_cameras_own():
     assert np.abs(np.diff(drift, axis=1)).max() < 0.1
     assert 0.9 < np.abs(drift).max() <= 1.0
     assert np.abs(drift[0] - drift[1]).max() > 0.3
-    base = Sensor(iso_std=2, drift_ev=1.0)
-    plain, darker = (
-        draw_shots(dataclasses.replace(base, compensation_ev=ev), 10, 3, seed=1).exposures
-        for ev in (0.0, -2.0)
+    darker = Sensor(iso_std=0, drift_ev=1.0, compensation_ev=-2.0)
+    np.testing.assert_allclose(
+        np.log2(draw_shots(darker, 100, 3, seed=1).exposures[:100]), drift[0] - 2
     )
-    np.testing.assert_allclose(darker, plain / 4)
 
 
 def test_vignetting_spares_the_centre():
@@ -101,15 +99,6 @@ def test_noise_has_the_stated_size_and_needs_a_generator():
         photograph(flat, 1.0, Sensor(noise=1.0))
 
 
-def test_the_filmic_curve_is_an_s():
-    x = np.logspace(-3, 0, 100)
-    y = encode(x, "filmic")
-    assert np.all(np.diff(y) > 0)
-    slope = np.gradient(np.log(y), np.log(x))
-    assert slope.max() > slope[0]
-    assert slope[-1] < 0.5 * slope.max()
-
-
 def test_towns_have_an_underpass_and_their_own_sun():
     towns = [build_town(seed, "town") for seed in range(3)]
     assert len({t.light.sun_direction for t in towns}) == 3
@@ -120,6 +109,4 @@ def test_towns_have_an_underpass_and_their_own_sun():
         inside = (town.lo[:, 0] < UNDERPASS[1]) & (town.hi[:, 0] > UNDERPASS[0])
         things = (Material.CAR_BODY, Material.WHEEL, Material.FOLIAGE, Material.BARK)
         assert not np.any(inside & np.isin(town.material, things))
-    plain, other = build_town(0), build_town(1)
-    assert plain.underpass is None
-    assert plain.size != other.size or not np.array_equal(plain.hi, other.hi)
+    assert build_town(0).underpass is None

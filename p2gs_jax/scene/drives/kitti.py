@@ -15,7 +15,6 @@ from __future__ import annotations
 import re
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
@@ -88,9 +87,18 @@ def read_kitti_raw(root: Path, cfg: DataConfig) -> Recording:
     named = {camera.name for camera in cameras}
     if named & set(GREY) and named - set(GREY):
         notes.append("image_00 and image_01 are grey: --cameras image_02 image_03 omits them.")
-    sweeps, turns, sweep_notes = _sweeps(root, scanner)
-    objects, box_notes = _objects(root, turns, scanner)
-    notes += [*sweep_notes, *box_notes]
+    forward, lengths = _turns(root)
+    scans = numbered(root / "velodyne_points" / "data", (".bin",))
+    known = scanner.at(forward)[1] if len(forward) else forward
+    sweeps = [
+        Sweep(k, float(forward[k]), partial(_read_sweep, path, forward[k], lengths[k], scanner))
+        for k, path in scans.items()
+        if k < len(forward) and known[k]
+    ]
+    absent = len(forward) - len(sweeps)
+    notes += counted(absent, f"of {len(forward)} LiDAR sweeps are missing.")
+    objects, box_notes = _objects(root, forward, lengths, scanner)
+    notes += box_notes
     return Recording(root, "kitti_raw", cameras, photographs, sweeps, objects, notes)
 
 
@@ -204,40 +212,20 @@ def _photographs(
     return photographs, len(set(files) | set(range(len(stamps)))) - len(photographs)
 
 
-class _Turns(NamedTuple):
-    """When the scanner looked forward in each frame, and how long its turns took, seconds."""
-
-    forward: Float64[np.ndarray, " f"]
-    lengths: Float64[np.ndarray, " f"]
-
-
-def _sweeps(root: Path, scanner: Trajectory) -> tuple[list[Sweep], _Turns, list[str]]:
+def _turns(root: Path) -> tuple[Float64[np.ndarray, " f"], Float64[np.ndarray, " f"]]:
+    """Return when the scanner looked forward in each frame, and how long a turn took, seconds."""
     folder = root / "velodyne_points"
-    files = numbered(folder / "data", (".bin",))
-    path = folder / "timestamps.txt"
-    if not files and not path.is_file():
-        return [], _Turns(np.zeros(0), np.zeros(0)), []
-    forward = _read_stamps(path)
-    turns = _Turns(forward, _lengths(folder, len(forward)))
-    _, covered = scanner.at(forward)
-    sweeps = []
-    for k in files:
-        if k < len(forward) and covered[k]:
-            at, length = float(forward[k]), float(turns.lengths[k])
-            sweeps.append(Sweep(k, at, partial(_read_sweep, files[k], at, length, scanner)))
-    absent = len(forward) - len(sweeps)
-    return sweeps, turns, counted(absent, f"of {len(forward)} LiDAR sweeps are missing.")
-
-
-def _lengths(folder: Path, count: int) -> Float64[np.ndarray, " f"]:
+    if not (folder / "timestamps.txt").is_file() and not (folder / "data").is_dir():
+        return np.zeros(0), np.zeros(0)
+    forward = _read_stamps(folder / "timestamps.txt")
     start, end = folder / "timestamps_start.txt", folder / "timestamps_end.txt"
-    lengths = np.full(count, TURN_S)
+    lengths = np.full(len(forward), TURN_S)
     if start.is_file() and end.is_file():
         begun, ended = _read_stamps(start), _read_stamps(end)
-        known = min(count, len(begun), len(ended))
+        known = min(len(forward), len(begun), len(ended))
         lengths[:known] = ended[:known] - begun[:known]
     plausible = (lengths > TURN_S / 2) & (lengths < TURN_S * 2)
-    return np.where(plausible, lengths, TURN_S)
+    return forward, np.where(plausible, lengths, TURN_S)
 
 
 def _read_sweep(path: Path, forward_s: float, turn_s: float, scanner: Trajectory) -> SweepPoints:
@@ -261,14 +249,16 @@ def _passed(
 
 
 def _objects(
-    root: Path, turns: _Turns, scanner: Trajectory
+    root: Path,
+    forward: Float64[np.ndarray, " f"],
+    lengths: Float64[np.ndarray, " f"],
+    scanner: Trajectory,
 ) -> tuple[tuple[TrackedObject, ...], list[str]]:
     """Return the tracklets in the world, each box as of when the scanner passed it."""
     path = root / "tracklet_labels.xml"
     if not path.is_file():
         return (), ["There are no boxes of moving things (tracklet_labels.xml)."]
     boxes, empty = _tracklets(path)
-    forward = turns.forward
     timed = [b for b in boxes if 0 <= b.time < len(forward) and np.isfinite(forward[int(b.time)])]
     notes = counted(empty, "tracklets have no boxes: they are left out.")
     lost = len(boxes) - len(timed)
@@ -276,7 +266,7 @@ def _objects(
     if not timed:
         return (), notes
     local = np.stack([box.pose for box in timed])
-    turn = float(np.median(turns.lengths))
+    turn = float(np.median(lengths))
     at = forward[[int(box.time) for box in timed]] + _passed(local[:, :3, 3], 0.0, turn)
     poses = scanner.at(at)[0] @ local
     moved = zip(timed, at.tolist(), poses, strict=True)

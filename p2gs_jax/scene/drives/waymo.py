@@ -264,31 +264,27 @@ class _Scanner(NamedTuple):
 
 def _sweeps(segment: _Segment, cars: dict[int, Pose]) -> tuple[list[Sweep], list[str]]:
     """Return a sweep a frame, of all scanners together, and notes."""
-    images = segment.open("lidar")
-    rows: dict[int, dict[int, int]] = {}
-    for (stamp, laser), row in _rows(images).items():
-        rows.setdefault(stamp, {})[laser] = row
-    scanners = _scanners(segment.open("lidar_calibration"))
+    images, scanners = segment.open("lidar"), _scanners(segment.open("lidar_calibration"))
     poses = segment.open("lidar_pose") if segment.has("lidar_pose") else None
-    posed = {} if poses is None else _rows(poses)
-    unposed = sum(UPPER in own and (stamp, UPPER) not in posed for stamp, own in rows.items())
-    notes = []
-    if unposed:
-        notes.append(
-            f"lidar_pose lacks {unposed} of {len(rows)} turns: their points are as if the car "
-            "had stood still."
+    rows, posed = _rows(images), {} if poses is None else _rows(poses)
+    source = _Source(segment, images, poses, scanners, rows, posed)
+    turns = sorted({stamp for stamp, _ in rows})
+    sweeps = [
+        Sweep(
+            segment.frame(stamp),
+            segment.seconds(stamp) + TURN_S / 2,
+            partial(source.read, stamp, cars[stamp]),
         )
-    lost = sum(stamp not in cars for stamp in rows)
-    notes += counted(lost, "LiDAR sweeps are of frames without a pose: they are left out.")
-    source = _Source(segment, images, poses, scanners)
-    sweeps = []
-    for stamp, own in sorted(rows.items()):
-        if stamp in cars:
-            begin = segment.seconds(stamp)
-            of_pixels = {laser: posed[stamp, laser] for laser in own if (stamp, laser) in posed}
-            read = partial(source.read, own, of_pixels, cars[stamp], begin)
-            sweeps.append(Sweep(segment.frame(stamp), begin + TURN_S / 2, read))
-    return sweeps, notes
+        for stamp in turns
+        if stamp in cars
+    ]
+    unposed = sum((turn, UPPER) in rows and (turn, UPPER) not in posed for turn in turns)
+    words = (
+        f"of {len(turns)} LiDAR turns lack lidar_pose: their points are as if the car had stood."
+    )
+    notes = counted(unposed, words)
+    lost = len(turns) - len(sweeps)
+    return sweeps, notes + counted(lost, "LiDAR sweeps are of frames without a pose: left out.")
 
 
 def _rows(table: ParquetTable) -> dict[tuple[int, int], int]:
@@ -313,24 +309,27 @@ def _scanners(table: ParquetTable) -> dict[int, _Scanner]:
 
 
 class _Source(NamedTuple):
-    """Tables that sweeps are read from."""
+    """Tables that sweeps are read from, and their rows by time stamp and scanner."""
 
     segment: _Segment
     images: ParquetTable
     poses: ParquetTable | None
     scanners: dict[int, _Scanner]
+    rows: dict[tuple[int, int], int]
+    posed: dict[tuple[int, int], int]
 
-    def read(
-        self, rows: dict[int, int], posed: dict[int, int], car: Pose, begin: float
-    ) -> SweepPoints:
-        """Return the points of one turn that begins at a time, seconds.
+    def read(self, stamp: int, car: Pose) -> SweepPoints:
+        """Return the points of the turn that begins at a time stamp.
 
-        Range images, and poses of their pixels where there are any, are rows by scanner. For all
-        other pixels `car` leads from car to world.
+        `car` leads from car to world, for the pixels that have no pose of their own.
         """
-        parts = [self._scanned(laser, row, posed.get(laser), car) for laser, row in rows.items()]
-        points, shares = zip(*parts, strict=True)
-        return SweepPoints(np.concatenate(points), begin + TURN_S * np.concatenate(shares))
+        parts = [
+            self._scanned(key[1], row, self.posed.get(key), car)
+            for key, row in self.rows.items()
+            if key[0] == stamp
+        ]
+        points, shares = map(np.concatenate, zip(*parts, strict=True))
+        return SweepPoints(points, self.segment.seconds(stamp) + TURN_S * shares)
 
     def _scanned(
         self, laser: int, row: int, posed: int | None, car: Pose

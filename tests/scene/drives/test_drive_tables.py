@@ -128,8 +128,6 @@ class Malicious:
 
 SYSTEM = Malicious(os.system, ("touch malicious",))
 IN_THE_TABLE = Malicious(eval, ("__import__('os').system('touch malicious')",))
-
-
 UNREADABLE = "is not a table that can be read"
 REFUSED = {
     "call": (pickle.dumps(SYSTEM), "00.pkl is not a table .*: it holds a posix"),

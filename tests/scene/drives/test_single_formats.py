@@ -189,8 +189,8 @@ def test_what_waymo_lacks_is_counted(copied, read):
         "1 photographs have no pose: they are left out.",
         "1 boxes belong to no track: they are left out.",
         "1 boxes are of frames without a pose: they are left out.",
-        "lidar_pose lacks 1 of 3 turns: their points are as if the car had stood still.",
-        "1 LiDAR sweeps are of frames without a pose: they are left out.",
+        "1 of 3 LiDAR turns lack lidar_pose: their points are as if the car had stood.",
+        "1 LiDAR sweeps are of frames without a pose: left out.",
     ]
     # Within what the car drives in half a turn.
     assert 0.1 < waymo.off_walls(drive.sweeps[0].read().points).max() < 1.5
