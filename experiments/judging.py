@@ -22,7 +22,7 @@ import p2gs_jax
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.formats.frames import write_png
-from p2gs_jax.paths.pictures import CaptionedImage, stacked
+from p2gs_jax.paths.pictures import titled
 from p2gs_jax.photometry.luminance import Luminance
 from p2gs_jax.photometry.ppisp import Ppisp, falloff, recolored
 
@@ -100,11 +100,9 @@ def contact_sheet(path: Path, rows: Sequence[tuple[str, Sequence[tuple[str, np.n
     """
     images = []
     for title, columns in rows:
-        width = columns[0][1].shape[1]
-        captions = [(text, k * width, (k + 1) * width) for k, (text, _) in enumerate(columns)]
-        picture = np.concatenate([image for _, image in columns], axis=1)
-        images.append(CaptionedImage(title, picture, captions))
-    write_png(path, stacked(images))
+        texts, pictures = zip(*columns, strict=True)
+        images.append((f"{title}: {'; '.join(texts)}", np.concatenate(pictures, axis=1)))
+    write_png(path, titled(images))
 
 
 def mean_of_rows(run: p2gs_jax.Run, rows: Sequence[int]) -> p2gs_jax.Run:

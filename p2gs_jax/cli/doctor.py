@@ -157,12 +157,6 @@ def check_features(broken: Sequence[str]) -> list[Finding]:
         ready = needed not in broken and importlib.util.find_spec(module_of(needed)) is not None
         fix = f"pip install 'p2gs-jax[{extra}]'" if extra else f"pip install {needed}"
         rows.append(Finding(name, f"{needed} {installed(needed) or ''}" if ready else fix, ready))
-    try:
-        from p2gs_jax.report.page import find_browser
-
-        rows.append(Finding("report --pdf", find_browser()))
-    except Exception:  # there is none, or a library is broken, which another check reports
-        rows.append(Finding("report --pdf", "install Chromium or Chrome", False))
     return rows
 
 

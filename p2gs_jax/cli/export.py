@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from p2gs_jax.run.read import Run
 
 # The formats that hold display colours and therefore one display transform.
-Display = Literal["display-ply", "splat", "spz", "compressed-ply", "gltf", "usd"]
+Display = Literal["display-ply", "spz", "compressed-ply", "gltf", "usd"]
 Format = Literal["linear-ply", Display, "colmap", "nerfstudio", "exr", "html"]
 FORMATS, DISPLAY = get_args(Format), get_args(Display)
 
@@ -31,8 +31,8 @@ class Export:
 
     run: RunPath
     format: tuple[Format, ...]
-    """One or more: linear-ply (radiance, with a JSON file that explains it), display-ply, splat,
-    spz, compressed-ply, gltf and usd (display colours, for viewers and other programs), colmap and
+    """One or more: linear-ply (radiance, with a JSON file that explains it), display-ply, spz,
+    compressed-ply, gltf and usd (display colours, for viewers and other programs), colmap and
     nerfstudio (undistorted photographs, model, exposures), exr (linear renders of all views), html
     (one page that is the scene: linear light, developed in the browser)."""
     out: Path | None = None

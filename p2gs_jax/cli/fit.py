@@ -152,7 +152,7 @@ class Calibrate:
     static: bool = False
     """The folder holds photographs from one fixed viewpoint at several exposures."""
     of: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Somebody's splats of the scene (.ply, .splat, .spz; display colours): exposures are
+    """Somebody's splats of the scene (.ply, .spz, .compressed.ply; display colours): exposures are
     solved, and it is written as linear radiance into --out, a run folder."""
     steps: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """With --of: steps in which its colours and opacities are fitted again; default: 600."""

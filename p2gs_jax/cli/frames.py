@@ -16,7 +16,6 @@ from p2gs_jax.paths.drive import PosePath, beside, beside_shots, drive, frame_co
 from p2gs_jax.paths.orbit import find_orbit, orbit
 from p2gs_jax.paths.panorama import covering
 from p2gs_jax.paths.pictures import (
-    RunRenderer,
     comparison_frames,
     comparison_size,
     metered_shots,
@@ -81,14 +80,14 @@ def _chosen(options: Render, fitted: Run) -> list[Shot]:
 
 
 def shots_of(
-    options: Render, renderer: RunRenderer, given: list[Shot] | None, say: Callable[[str], None]
+    options: Render, fitted: Run, given: list[Shot] | None, say: Callable[[str], None]
 ) -> Job:
     """Return the job of rendering pinhole cameras; those of a file replace the scene's.
 
     `say` tells the user something while frames are rendered. Raises a UserError where the scene has
     no such views.
     """
-    fitted, notes, photograph = renderer.run, [], None
+    notes, photograph = [], None
     views = fitted.scene.views
     if given is not None:
         shots = given
@@ -112,12 +111,12 @@ def shots_of(
     if options.exposure_of is not None:
         added = options.exposure_ev if isinstance(options.exposure_ev, float | int) else 0.0
         frames_s = ADAPT_S * (options.fps or FPS) if options.path != "views" else 0.0
-        shots = metered_shots(renderer, shots, options.exposure_of, added, frames_s)
+        shots = metered_shots(fitted, shots, options.exposure_of, added, frames_s)
         if options.exposure_of == "auto":
             notes = [*notes, fitted.metering.sentence]
     size = (max(s.width for s in shots), max(s.height for s in shots))
     frames = shot_frames(
-        renderer, shots, lambda shot: _display_transform(fitted, options, shot), photograph
+        fitted, shots, lambda shot: _display_transform(fitted, options, shot), photograph
     )
     return Job(frames, len(shots), size, shots, notes)
 
@@ -150,9 +149,8 @@ def _recorded(shots: list[Shot], options: Render, fitted: Run) -> list[Shot]:
     ]
 
 
-def panoramas_of(options: Render, renderer: RunRenderer) -> Job:
+def panoramas_of(options: Render, fitted: Run) -> Job:
     """Return the job of rendering panoramas; UserError: there is no such rig, or time step."""
-    fitted = renderer.run
     views = fitted.scene.views
     rig = find_rig(view_shots(views, fitted.cfg.data.max_width), views)
     cylinder = covering(rig.mounts.values(), np.eye(4))
@@ -171,7 +169,7 @@ def panoramas_of(options: Render, renderer: RunRenderer) -> Job:
         if options.shift is not None:
             poses = beside(poses, views, options.shift)
         size = (cylinder.width, cylinder.height)
-        return Job(wide_frames(renderer, cylinder, poses, transform, times), len(poses), size)
+        return Job(wide_frames(fitted, cylinder, poses, transform, times), len(poses), size)
     allowed = {shot.view for shot in _chosen(options, fitted)}
     steps = [
         replace(step, shots={c: s for c, s in step.shots.items() if s.view in allowed})
@@ -188,5 +186,5 @@ def panoramas_of(options: Render, renderer: RunRenderer) -> Job:
         notes.append("Corrections of display values that this run learned stay in the photographs.")
     taken = [shot.view for step in steps for shot in step.shots.values() if shot.view is not None]
     fitted.require_photographs(taken)
-    frames = comparison_frames(renderer, rig, steps, cylinder, transform, fitted.store)
+    frames = comparison_frames(fitted, rig, steps, cylinder, transform, fitted.store)
     return Job(frames, len(steps), comparison_size(cylinder), (), notes)

@@ -58,40 +58,30 @@ class Report:
     """Explain a run on one page: exposures, seams, views, training.
 
     p2gs-jax report runs/street
-    p2gs-jax report runs/street --pdf --out street.html
     """
 
     run: RunPath
     out: Path | None = None
     """The page (default: RUN/report.html)."""
-    pdf: bool = False
-    """Print the page as a PDF as well, beside it (needs a Chromium or Chrome)."""
     scene: SceneFolder = None
     render: bool = True
     """Load the scene and render for the seams; without, only what the run folder holds."""
 
     def execute(self) -> int:
-        """Write the page, and print it where that is asked for; 1 where a file is broken."""
+        """Write the page; 1 where a file of the run is broken."""
         from p2gs_jax.cli.tables import stdout
         from p2gs_jax.core.progress import TerminalReporter
-        from p2gs_jax.report.page import find_browser, print_pdf
         from p2gs_jax.report.report import write_report
         from p2gs_jax.report.run_files import read_run
 
-        # Before anything is rendered: there may be no browser.
-        browser = find_browser() if self.pdf else None
         with TerminalReporter() as reporter:
             page = write_report(
                 self.run, self.out, scene=self.scene, render=self.render, reporter=reporter
             )
-            paths, found = [page], read_run(self.run, self.scene)
+            found = read_run(self.run, self.scene)
             for sentence in found.missing:
                 reporter.message(sentence)
-            if browser is not None:
-                reporter.stage("Printing")
-                paths.append(print_pdf(page, page.with_suffix(".pdf"), browser))
-        for path in paths:
-            stdout().print(f"{path} ({path.stat().st_size / 2**20:.1f} MB)")
+        stdout().print(f"{page} ({page.stat().st_size / 2**20:.1f} MB)")
         return 1 if found.broken else 0
 
 
@@ -110,28 +100,18 @@ class Compare:
     def execute(self) -> int:
         """Print the runs side by side and write the page."""
         from p2gs_jax.cli.tables import make_table, stdout
-        from p2gs_jax.report.compare import apart, compare_runs, write_comparison
+        from p2gs_jax.report.compare import compare_runs, starred, write_comparison
 
         found = compare_runs(self.runs)
         page, table = write_comparison(found, self.out)
         console = stdout()
         for remark in found.remarks:
             console.print(remark)
-        marked = " (* best)" if any(row.best for row in found.scores) else ""
-        for title, rows in (
-            (f"Scores{marked}", found.scores),
-            ("Options that differ", found.options),
-        ):
-            cells = [
-                (row.name, *(f"{c} *" if i in row.best else c for i, c in enumerate(row.cells)))
-                for row in rows
-            ]
-            if cells:
-                console.print(make_table(("", *found.labels), cells, title))
-        for label, x, y in found.exposures:
-            console.print(
-                f"Exposures of {label} and {found.labels[0]} differ by {apart(x, y):.3f} stops "
-                f"(RMS over {len(x)} views, means removed)."
-            )
+        for title, rows in found.tables.items():
+            best = " (* best)" if any(row.best for row in rows) else ""
+            cells = [(row.name, *starred(row)) for row in rows]
+            console.print(make_table(("", *found.labels), cells, title + best))
+        for sentence in found.sentences:
+            console.print(sentence)
         console.print(f"Results: {page}, {table}")
         return 0

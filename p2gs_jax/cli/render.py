@@ -94,7 +94,6 @@ class Render:
         from p2gs_jax.core.progress import TerminalReporter
         from p2gs_jax.formats.frames import open_frames
         from p2gs_jax.paths.files import read_cameras, write_cameras
-        from p2gs_jax.paths.pictures import RunRenderer
 
         begin = time.monotonic()
         for refuse in (_check_picture, _check_path, _check_file):  # before anything is read
@@ -102,12 +101,12 @@ class Render:
         out = self.out or self.run / "renders" / _default_name(self)
         _check_place(out, self.overwrite)
         given = read_cameras(Path(self.path)) if self.path not in PATHS else None
-        renderer = RunRenderer(_load(self))
+        fitted = _load(self)
         with TerminalReporter() as reporter:
             job = (
-                panoramas_of(self, renderer)
+                panoramas_of(self, fitted)
                 if self.panorama
-                else shots_of(self, renderer, given, reporter.message)
+                else shots_of(self, fitted, given, reporter.message)
             )
             for note in job.notes:
                 reporter.message(note)

@@ -1,4 +1,4 @@
-"""Text of others, such as file names and their JSON: harmless in terminals, pictures and errors."""
+"""Text of others, as file names and their JSON: harmless in terminals, Markdown and pictures."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import contextlib
 import json
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 # Control characters but tab and newline, surrogates, and what turns the direction of writing.
@@ -33,6 +33,22 @@ def parse_json(text: str) -> Any:
         raise json.JSONDecodeError("nested too deeply", text, 0) from None
     except ValueError as error:
         raise json.JSONDecodeError(str(error), text, 0) from None
+
+
+# What Markdown, or HTML within it, would take for more than text.
+_MARKUP = re.compile(r"[\\`*|<>\[\]]")
+
+
+def escaped(text: str) -> str:
+    """Return a text of one line as Markdown that shows it as it is."""
+    return _MARKUP.sub(r"\\\g<0>", " ".join(printable(text).split()))
+
+
+def markdown_table(names: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table of text as Markdown; all columns but the first are aligned to the right."""
+    lines = [[escaped(cell) for cell in row] for row in (names, *rows)]
+    lines.insert(1, ["---", *["---:"] * (len(names) - 1)])
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 @contextlib.contextmanager

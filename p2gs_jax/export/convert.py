@@ -1,7 +1,7 @@
 """A finished run in the files of other programs: one function that writes the formats asked for.
 
-Display colours are baked once for every degree of the harmonics that formats hold, and the error
-that baking leaves is measured and written beside them.
+Display colours are baked once, and the error that baking leaves is measured and written beside
+them.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from p2gs_jax.formats import gsply_files as gsply
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.gltf import write_gltf
 from p2gs_jax.formats.ply import write_ply, write_radiance
-from p2gs_jax.formats.splat import read_splat, write_splat
 from p2gs_jax.formats.usd import NamedCamera, require_pxr, write_usd
 from p2gs_jax.gaussians import bake as baking
 from p2gs_jax.photometry.display import DisplayTransform
@@ -41,7 +40,6 @@ from p2gs_jax.types import Gaussians
 PLACES: dict[str, tuple[str, ...]] = {
     "linear-ply": ("linear.ply", "linear.json"),
     "display-ply": ("display.ply", "display.ply.json"),
-    "splat": ("display.splat", "display.splat.json"),
     "spz": ("display.spz", "display.spz.json"),
     "compressed-ply": ("display.compressed.ply", "display.compressed.ply.json"),
     "gltf": ("display.glb", "display.glb.json"),
@@ -56,15 +54,14 @@ STEPS = 240
 MEASURED = 60
 
 
-# Of formats with display colours: writer; reader, where what programs read differs from what was
-# written; and degree of the harmonics that the format holds.
-WRITERS: dict[str, tuple[Callable, Callable | None, int]] = {
-    "splat": (write_splat, read_splat, 0),
-    "spz": (gsply.write_spz, gsply.read_spz, MAX_DEGREE),
-    "compressed-ply": (gsply.write_compressed_ply, gsply.read_compressed_ply, MAX_DEGREE),
-    "gltf": (write_gltf, None, MAX_DEGREE),
-    "display-ply": (write_ply, None, MAX_DEGREE),
-    "usd": (write_usd, None, MAX_DEGREE),
+# Of formats with display colours: writer; and reader, where what programs read differs from what
+# was written.
+WRITERS: dict[str, tuple[Callable, Callable | None]] = {
+    "spz": (gsply.write_spz, gsply.read_spz),
+    "compressed-ply": (gsply.write_compressed_ply, gsply.read_compressed_ply),
+    "gltf": (write_gltf, None),
+    "display-ply": (write_ply, None),
+    "usd": (write_usd, None),
 }
 
 
@@ -181,19 +178,17 @@ def _exr(place: Path, fitted: Run, reporter: Reporter) -> str:
 
 
 class DisplayFiles:
-    """Display colours under one display transform, baked once per degree, with their error."""
+    """Display colours under one display transform, baked once, with their error."""
 
     def __init__(
         self, fitted: Run, transform: DisplayTransform, steps: int | None, reporter: Reporter
     ):
-        """Render the true pictures that `steps` (None: enough) of refinement aim at."""
+        """Render the true pictures that `steps` (None: enough) of refinement aim at, and bake."""
         self.fitted, self.transform, self.reporter = fitted, transform, reporter
-        self.errors: dict[int, dict] = {}
-        g, scene = at_time(fitted.as_of(), None), fitted.scene
-        self.gaussians = g
+        scene, cfg = fitted.scene, fitted.cfg
+        g = at_time(fitted.as_of(), None)
         self.steps = max(STEPS, len(scene.train_indices)) if steps is None else steps
-        self.baked: dict[int, Gaussians] = {}
-        render = make_renderer(fitted.cfg.render)
+        render = make_renderer(cfg.render)
         self.targets: dict[int, baking.Target] = {}
         wanted = scene.train_indices if self.steps else _spread(scene.train_indices)
         rows = [*wanted, *_spread(scene.test_indices)]
@@ -201,22 +196,25 @@ class DisplayFiles:
             name, camera = scene.views[index].name, camera_of(fitted.store, index)
             self.targets[index] = baking.true_target(name, g, camera, transform, render)
             reporter.stage("Rendering true pictures", done + 1, len(rows))
+        reporter.stage("Baking")
+        start = baking.bake(g, transform, cfg.render.radiance, MAX_DEGREE)
+        aims = [self.targets[i] for i in scene.train_indices if i in self.targets]
+        order = {"steps": self.steps, "seed": cfg.train.seed}
+        on_step = functools.partial(reporter.stage, "Baking")
+        self.baked = baking.refine(start, aims, cfg.render, **order, on_step=on_step)
 
     def write(self, name: str, path: Path, sidecar: Path) -> str:
         """Write a format, and the JSON that says how far it is from the truth; return sentences."""
-        begin = time.monotonic()
-        write, read, degree = WRITERS[name]
-        shown, more = self._bake(degree), ()
-        if read is None and degree not in self.errors:
-            self.errors[degree] = self._error(shown)
-        error = self.errors[degree] if read is None else {}
+        begin, more = time.monotonic(), ()
+        write, read = WRITERS[name]
+        error = self.error if read is None else {}
         if name == "display-ply":
             notes = [f"p2gs-jax: {sentence}" for sentence in _sentences(error)]
             more = ([*baking.display_comments(self.transform), *notes],)
         elif name == "usd":
             views, camera = self.fitted.scene.views, self.fitted.store.camera
             more = ([NamedCamera(v.name, *camera(index)) for index, v in enumerate(views)],)
-        write(path, shown, *more)
+        write(path, self.baked, *more)
         if read is not None:
             error = self._error(read(path))
         mean, balance = self.fitted.mean.exposure_geometric, self.transform.white_balance
@@ -224,7 +222,7 @@ class DisplayFiles:
             sidecar,
             {
                 "file": path.name,
-                "gaussians": self.gaussians.capacity,
+                "gaussians": self.baked.capacity,
                 "exposure": self.transform.exposure,
                 "exposure_ev_from_mean": float(np.log2(self.transform.exposure / mean)),
                 "gamma": self.transform.gamma,
@@ -235,19 +233,12 @@ class DisplayFiles:
                 "baking_error": error,
             },
         )
-        return "; ".join([f"{self.gaussians.capacity} Gaussians", *_sentences(error)])
+        return "; ".join([f"{self.baked.capacity} Gaussians", *_sentences(error)])
 
-    def _bake(self, degree: int) -> Gaussians:
-        cfg, g = self.fitted.cfg, self.gaussians
-        if degree not in self.baked:
-            self.reporter.stage("Baking")
-            start = baking.bake(g, self.transform, cfg.render.radiance, degree)
-            train = self.fitted.scene.train_indices
-            aims = [self.targets[i] for i in train if i in self.targets]
-            order = {"steps": self.steps, "seed": cfg.train.seed}
-            on_step = functools.partial(self.reporter.stage, "Baking")
-            self.baked[degree] = baking.refine(start, aims, cfg.render, **order, on_step=on_step)
-        return self.baked[degree]
+    @functools.cached_property
+    def error(self) -> dict:
+        """The error of what was baked, by split."""
+        return self._error(self.baked)
 
     def _error(self, shown: Gaussians) -> dict:
         """Return the baking error by split."""

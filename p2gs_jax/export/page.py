@@ -58,10 +58,8 @@ def write_page(
 ) -> Page:
     """Write the page of at most `size_mb` million bytes, with photographs for the split view.
 
-    The page opens with `look`; `say` receives what is going on.
-
-    Raises:
-        UserError: too little of the scene fits, or photographs are asked for and gone.
+    The page opens with `look`; `say` receives what is going on. A UserError says that too little of
+    the scene fits, or that photographs are asked for and gone.
     """
     gaussians, scene = fitted.as_of(), fitted.scene
     render = make_renderer(fitted.cfg.render)

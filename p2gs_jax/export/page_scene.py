@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-import cv2
 import numpy as np
 
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.formats.false_color import false_color
+from p2gs_jax.formats.frames import data_url, shrunk
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.photometry.response import by_camera, tables
 from p2gs_jax.run.read import Run
@@ -68,18 +67,8 @@ def embedded_photographs(fitted: Run, count: int) -> dict[int, str]:
     """
     rows = [int(i) for i in evenly_spaced(len(fitted.scene.views), count)] if count else []
     fitted.require_photographs(rows)
-    return {row: _webp(fitted.photograph(row)) for row in rows}
-
-
-def _webp(picture: np.ndarray) -> str:
-    codes = np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)[..., ::-1]
-    share = LONGEST / max(codes.shape[:2])
-    if share < 1:
-        codes = cv2.resize(codes, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
-    options = [cv2.IMWRITE_WEBP_QUALITY, QUALITY]
-    done, data = cv2.imencode(".webp", np.ascontiguousarray(codes), options)
-    assert done
-    return "data:image/webp;base64," + base64.b64encode(data.tobytes()).decode()
+    pictures = ((row, shrunk(fitted.photograph(row), LONGEST)) for row in rows)
+    return {row: data_url("webp", picture, QUALITY) for row, picture in pictures}
 
 
 def _tone(fitted: Run) -> dict[str, Any]:

@@ -104,10 +104,8 @@ def fit_into(
 
     If all do not fit, as many as do are kept at every degree of the harmonics, those first that
     weigh most in the pictures of `cameras`; of these the one with the highest median PSNR is taken.
-    `judge` returns the error of some Gaussians.
-
-    Raises:
-        UserError: hardly any would fit, or there are none.
+    `judge` returns the error of some Gaussians. A UserError says that hardly any would fit, or that
+    there are none.
     """
     seen = ever_drawn(gaussians, cfg)
     unseen, degree = int((~seen).sum()), degree_of(gaussians.sh.shape[1])

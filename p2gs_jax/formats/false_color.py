@@ -5,8 +5,6 @@ The lightness of all colour maps rises evenly, so that they can be read without 
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import matplotlib
 import numpy as np
 from jaxtyping import Bool, Float, Float32
@@ -17,13 +15,6 @@ STOPS = (-6.0, 6.0)
 STOPS_MAP, DEPTH_MAP = "viridis", "cividis"
 OVER, UNDER = (1.0, 0.15, 0.15), (0.15, 0.35, 1.0)
 STRIPE = 6
-
-
-class Clipping(NamedTuple):
-    """Pixels of an image outside the range of a display."""
-
-    over: Bool[np.ndarray, "h w"]
-    under: Bool[np.ndarray, "h w"]
 
 
 def luminance(linear: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "..."]:
@@ -50,12 +41,15 @@ def false_color(
     return _mapped((whole + 0.5 - low) / (high - low), STOPS_MAP)
 
 
-def clipping(ldr: Float[np.ndarray, "h w 3"]) -> Clipping:
+Mask = Bool[np.ndarray, "h w"]
+
+
+def clipping(ldr: Float[np.ndarray, "h w 3"]) -> tuple[Mask, Mask]:
     """Return where any channel is at the top, and where all are at the bottom, of 8 bits."""
     # One channel at a time: reductions over an axis of three are 20 times slower.
     r, g, b = (255 * ldr[..., channel] for channel in range(3))
     over = (r > 254.5) | (g > 254.5) | (b > 254.5)
-    return Clipping(over, (r <= 0.5) & (g <= 0.5) & (b <= 0.5))
+    return over, (r <= 0.5) & (g <= 0.5) & (b <= 0.5)
 
 
 def clipping_overlay(ldr: Float[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -26,17 +27,11 @@ SMALLEST = 16
 
 @dataclass(frozen=True)
 class OutputFrame:
-    """A rendered picture.
+    """A rendered picture: radiance without exposure, opacity, and display values in [0, 1].
 
-    Attributes:
-        name: of its files, without suffix; may name subfolders.
-        linear: radiance, without exposure.
-        alpha: opacity.
-        ldr: display values in [0, 1].
-        transform: from `linear` to `ldr`.
-        depth: alpha-weighted.
-        camera: of a pinhole image.
-        photograph: display values of what was photographed there.
+    The name is that of its files, without suffix, and may name subfolders. The transform leads from
+    `linear` to `ldr`; depth is alpha-weighted; `photograph` has display values of what was
+    photographed there.
     """
 
     name: str
@@ -78,6 +73,23 @@ def write_frame(folder: Path, frame: OutputFrame) -> None:
     else:
         write_png(stem.with_name(f"{stem.name}.render.png"), frame.ldr)
         write_png(stem.with_name(f"{stem.name}.photograph.png"), frame.photograph)
+
+
+def data_url(kind: str, ldr: Float[np.ndarray, "h w 3"], quality: int | None = None) -> str:
+    """Return display values as the address of a picture (png, jpeg, webp) that holds it all."""
+    flags = {"jpeg": cv2.IMWRITE_JPEG_QUALITY, "webp": cv2.IMWRITE_WEBP_QUALITY}
+    options = [] if quality is None else [flags[kind], quality]
+    done, data = cv2.imencode(f".{kind}", to_uint8(ldr)[..., ::-1], options)
+    assert done
+    return f"data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode()}"
+
+
+def shrunk(image: Float[np.ndarray, "h w c"], longest: int) -> Float[np.ndarray, "h2 w2 c"]:
+    """Return an image whose longer side has at most so many pixels."""
+    share = longest / max(image.shape[:2])
+    if share >= 1:
+        return image
+    return cv2.resize(image, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
 
 
 @contextlib.contextmanager

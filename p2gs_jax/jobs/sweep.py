@@ -15,7 +15,7 @@ from p2gs_jax.core.atomic import write_json, write_text
 from p2gs_jax.core.clock import whole_run
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.core.runtime import tune_process, use_compile_cache
-from p2gs_jax.core.text import parse_json
+from p2gs_jax.core.text import escaped, markdown_table, parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.alignment import exposure_error
 from p2gs_jax.evaluation.protocols import PROTOCOLS
@@ -297,13 +297,10 @@ def failures(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 def to_markdown(rows: Sequence[Mapping[str, Any]]) -> str:
     """Return a table: a line per configuration, means over its seeds; failures with reasons."""
     shown = [column for column in COLUMNS if any(column.name in row for row in rows)]
-    lines = [
-        "| configuration | seeds | " + " | ".join(c.name for c in shown) + " |",
-        "|---|---:|" + "---:|" * len(shown),
-        *("| " + " | ".join(line) + " |" for line in _means(rows, shown)),
-    ]
+    names = ["configuration", "seeds", *(c.name for c in shown)]
+    lines = [markdown_table(names, _means(rows, shown))]
     meant = [f"- `{c.name}`: {c.meaning}" for c in shown if c.meaning]
-    bad = [f"- {line}" for line in failures(rows)]
+    bad = [f"- {escaped(line)}" for line in failures(rows)]
     lines += ["", *meant] if meant else []
     lines += ["", "Not finished:", "", *bad] if bad else []
     return "\n".join(lines) + "\n"

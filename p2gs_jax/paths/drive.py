@@ -26,10 +26,8 @@ class PosePath:
 
     Positions follow a natural cubic spline, rotations scipy's `RotationSpline`. The time between
     two poses is the square root of how far apart they are (centripetal), so that splines neither
-    loop nor overshoot where distances differ; equal distances take equal times.
-
-    Attributes:
-        times: of the given poses, from 0; 1 is the mean of their differences.
+    loop nor overshoot where distances differ; equal distances take equal times. `times` are those
+    of the given poses, from 0; 1 is the mean of their differences.
     """
 
     def __init__(self, poses: Poses):
@@ -61,10 +59,8 @@ def drive(knots: Sequence[Shot], frames: int | None = None) -> list[Shot]:
     """Return a smooth path through shots, with their commonest lens.
 
     Exposures (in stops), gammas (their logarithms) and times are interpolated linearly where all
-    shots have them. None takes `FRAMES_BETWEEN` frames from one shot to the next.
-
-    Raises:
-        UserError: there are fewer than two knots.
+    shots have them. None takes `FRAMES_BETWEEN` frames from one shot to the next. A UserError says
+    that there are fewer than two knots.
     """
     if len(knots) < 2:
         raise UserError(

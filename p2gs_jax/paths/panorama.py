@@ -157,14 +157,6 @@ def _sample(image: np.ndarray, at: Float32[np.ndarray, "h w 2"]) -> np.ndarray:
     return out.reshape(*at.shape[:2], *image.shape[2:])
 
 
-def borders(source: Sequence[int] | np.ndarray) -> list[tuple[int, int, int]]:
-    """Return (camera, first column, end column) of the runs of a row of `stitch`'s source map."""
-    row = np.asarray(source)
-    edges = np.flatnonzero(np.diff(row)) + 1
-    starts, ends = np.append(0, edges), np.append(edges, len(row))
-    return [(int(row[s]), int(s), int(e)) for s, e in zip(starts, ends, strict=True) if row[s] >= 0]
-
-
 def slices(cylinder: Cylinder) -> list[Shot]:
     """Return pinhole cameras of one size that together see a cylinder from its centre.
 

@@ -33,13 +33,10 @@ class Shot:
     """A pinhole camera on a path.
 
     The name is that of the picture's file, without suffix; it may name subfolders. The viewmat is
-    world-to-camera (OpenCV axes); K, width and height are in pixels, pixel centres at +0.5.
-
-    Attributes:
-        exposure_ev: stops from the geometric mean of the training exposures, or None.
-        gamma: > 0, or None.
-        view: row in `Scene.views` of the photograph taken there, or None.
-        time: seconds: what moves is where it was then; None: it is not shown.
+    world-to-camera (OpenCV axes); K, width and height are in pixels, pixel centres at +0.5. The
+    exposure is in stops from the geometric mean of the training exposures; `view` is the row in
+    `Scene.views` of the photograph taken there. What moves is where it was at `time`, seconds, or
+    is not shown.
     """
 
     name: str

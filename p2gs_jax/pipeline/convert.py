@@ -14,7 +14,7 @@ from p2gs_jax.core.atomic import no_empty_folders
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.against import score_foreign
-from p2gs_jax.formats.splat import read_foreign
+from p2gs_jax.formats.foreign import read_foreign
 from p2gs_jax.gaussians.bake import relit, viewer_config
 from p2gs_jax.gaussians.dense import coverage_of
 from p2gs_jax.gaussians.seeds import cameras_radius

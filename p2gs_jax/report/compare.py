@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from p2gs_jax.core.atomic import write_text
+from p2gs_jax.core.text import escaped, markdown_table
 from p2gs_jax.errors import UserError
 from p2gs_jax.report import page as html
-from p2gs_jax.report.charts import against_chart
 from p2gs_jax.report.findings import DESCRIPTIONS, seconds_of, true_error
-from p2gs_jax.report.page import figure, listed, paragraph, text
+from p2gs_jax.report.page import listed, paragraph, text
 from p2gs_jax.report.pictures import jpeg, read_png, spread
 from p2gs_jax.report.run_files import RunFiles, read_run
 from p2gs_jax.report.run_sections import flat, option_text
@@ -36,8 +36,8 @@ class Comparison:
     """Several runs, in the order given, side by side, each with a short label of its own.
 
     Remarks are sentences on what cannot be compared; scores compare where the scene is the same.
-    Options are those that differ. `exposures` has the label of each later run, and exposures of
-    the first and of it in stops, of the views that both have, means removed.
+    Options are those that differ. Of later runs `apart` has the label, the RMS difference of their
+    exposures from the first run's, stops, means removed, and the number of views that both have.
     """
 
     runs: tuple[RunFiles, ...]
@@ -46,7 +46,22 @@ class Comparison:
     same_scene: bool
     scores: tuple[TableRow, ...]
     options: tuple[TableRow, ...]
-    exposures: tuple[tuple[str, np.ndarray, np.ndarray], ...]
+    apart: tuple[tuple[str, float, int], ...]
+
+    @property
+    def tables(self) -> dict[str, tuple[TableRow, ...]]:
+        """The tables that have rows, by their titles."""
+        every = {"Scores": self.scores, "Options that differ": self.options}
+        return {title: rows for title, rows in every.items() if rows}
+
+    @property
+    def sentences(self) -> list[str]:
+        """What is said about exposures of the later runs."""
+        return [
+            f"Exposures of {label} and {self.labels[0]} differ by {rms:.3f} stops (RMS over "
+            f"{count} views, means removed)."
+            for label, rms, count in self.apart
+        ]
 
 
 # Where `metrics.json` has the numbers of the table; the last part says how they are shown.
@@ -74,11 +89,7 @@ BETTER |= dict.fromkeys(("lpips", "stops_median", "stops_rms", "ev"), min)
 
 
 def compare_runs(folders: Sequence[str | Path]) -> Comparison:
-    """Read and compare runs; exposures are drawn over those of the first.
-
-    Raises:
-        UserError: there are fewer than two, or one is not a run folder.
-    """
+    """Read and compare runs; a UserError says that there is but one, or which is not a run."""
     if len(folders) < 2:
         raise UserError(
             f"there {'is one run' if folders else 'are no runs'} to compare.",
@@ -95,9 +106,9 @@ def compare_runs(folders: Sequence[str | Path]) -> Comparison:
             "exposures and views are not held against each other."
         )
         remarks.insert(0, why)
-    exposures = tuple(_exposures(runs, labels)) if same else ()
+    apart = tuple(_apart(runs, labels)) if same else ()
     scores, options = tuple(_scores(runs, same)), tuple(_options(runs))
-    return Comparison(runs, labels, tuple(remarks), same, scores, options, exposures)
+    return Comparison(runs, labels, tuple(remarks), same, scores, options, apart)
 
 
 def _labels(folders: list[Path]) -> list[str]:
@@ -144,19 +155,18 @@ def _scores(runs: Sequence[RunFiles], same: bool) -> list[TableRow]:
         TableRow("model", tuple(DESCRIPTIONS.get(model, model) for model in models)),
         TableRow("tone curve", tuple(map(str, curves))),
         TableRow("training views", tuple(str(len(run.train) or "") for run in runs)),
+        *numbers("seconds, whole run", [seconds_of(run) for run in runs], "seconds"),
     ]
     for name, path in NUMBERS.items():
         rows += numbers(name, [run.number(*path) for run in runs], path[-1])
-    rows[6:6] = numbers("seconds, whole run", [seconds_of(run) for run in runs], "seconds")
     return rows + numbers("exposure error, RMS, stops", [_true_error(run) for run in runs], "ev")
 
 
 def _true_error(run: RunFiles) -> float | None:
     try:
-        truth = read_true_exposures(run.scene)
+        error = true_error(run, read_true_exposures(run.scene))
     except (OSError, KeyError, ValueError):
         return None
-    error = true_error(run, truth)
     return None if error is None else error["ev"]
 
 
@@ -167,7 +177,7 @@ def _options(runs: Sequence[RunFiles]) -> list[TableRow]:
     return [r for r in rows if len(set(r.cells)) > 1]
 
 
-def _exposures(runs: Sequence[RunFiles], labels: Sequence[str]):
+def _apart(runs: Sequence[RunFiles], labels: Sequence[str]) -> Iterator[tuple[str, float, int]]:
     first, *others = (
         {v["image"]: v["exposure_ev"] for v in run.train if v["exposure_ev"] is not None}
         for run in runs
@@ -175,37 +185,21 @@ def _exposures(runs: Sequence[RunFiles], labels: Sequence[str]):
     for label, other in zip(labels[1:], others, strict=True):
         common = [name for name in first if name in other]
         if len(common) >= 2:
-            x, y = (np.array([values[n] for n in common]) for values in (first, other))
-            yield label, x - x.mean(), y - y.mean()
-
-
-def apart(x: np.ndarray, y: np.ndarray) -> float:
-    """Return the RMS difference."""
-    return float(np.sqrt(np.mean((x - y) ** 2)))
+            yield label, float(np.std([first[n] - other[n] for n in common])), len(common)
 
 
 def to_markdown(found: Comparison) -> str:
-    """Return the tables as Markdown, the best scores bold."""
-    lines = [f"{remark}\n" for remark in found.remarks]
-    lines += _markdown_table("", found.labels, found.scores)
-    if found.options:
-        lines += ["", "Options that differ:", ""]
-        lines += _markdown_table("option", found.labels, found.options)
-    for label, x, y in found.exposures:
-        differ = f"Exposures of {label} and {found.labels[0]} differ by {apart(x, y):.3f} stops"
-        lines += ["", f"{differ} (RMS over {len(x)} views, means removed)."]
-    return "\n".join(lines) + "\n"
+    """Return the tables as Markdown, the best scores starred."""
+    parts = [escaped(remark) for remark in found.remarks]
+    for title, rows in found.tables.items():
+        cells = [[r.name, *starred(r)] for r in rows]
+        parts += [f"{title}:", markdown_table(["", *found.labels], cells)]
+    return "\n\n".join([*parts, *map(escaped, found.sentences)]) + "\n"
 
 
-def _markdown_table(head: str, labels: Sequence[str], rows: Sequence[TableRow]) -> list[str]:
-    def line(cells: Sequence[str]) -> str:
-        return f"| {' | '.join(c.replace('|', chr(92) + '|') for c in cells)} |"
-
-    out = [line([head, *labels]), "|---|" + "---:|" * len(labels)]
-    for r in rows:
-        cells = [f"**{c}**" if i in r.best else c or "-" for i, c in enumerate(r.cells)]
-        out.append(line([r.name, *cells]))
-    return out
+def starred(row: TableRow) -> list[str]:
+    """Return the cells of a row; a star follows those of the best runs."""
+    return [f"{c} *" if i in row.best else c or "-" for i, c in enumerate(row.cells)]
 
 
 def write_comparison(found: Comparison, out: Path) -> tuple[Path, Path]:
@@ -222,38 +216,22 @@ def comparison_page(found: Comparison) -> str:
     names = dict.fromkeys(run.scene.name or "an unnamed scene" for run in found.runs)
     head = f"<h1>{text(count)} runs of {text(' and '.join(names))}</h1>\n"
     head += paragraph(", ".join(found.labels), "quiet") + listed(found.remarks)
-    scores, options = _table("", found, found.scores), _table("option", found, found.options)
-    if found.same_scene:
-        scores += paragraph("Bold: the best of a line.", "note")
+    sections = [(title.split()[0].lower(), title, _table(found, title)) for title in found.tables]
     if not found.options:
-        options = paragraph("All options are the same.")
-    sections = [
-        ("scores", "Scores", scores),
-        ("options", "Options that differ", options),
-        ("exposures", "Exposures against each other", _exposure_body(found)),
+        sections.append(("options", "Options", paragraph("All options are the same.")))
+    sections += [
+        ("exposures", "Exposures against each other", listed(found.sentences)),
         ("views", "The same held-out views", _view_body(found)),
     ]
     return html.page(f"{count} runs compared · p2gs-jax", head, sections, html.made_by("compare"))
 
 
-def _table(head: str, found: Comparison, rows: Sequence[TableRow]) -> str:
-    cells, names = [[r.name, *r.cells] for r in rows], [head, *found.labels]
+def _table(found: Comparison, title: str) -> str:
+    rows, names = found.tables[title], ["", *found.labels]
     best = [frozenset(i + 1 for i in r.best) for r in rows]
-    return html.table(names, cells, numbers=range(1, len(names)), best=best)
-
-
-def _exposure_body(found: Comparison) -> str:
-    if not found.exposures:
-        return ""
-    label = "Exposures of the runs over the first run's"
-    first = found.labels[0]
-    chart = against_chart(found.exposures, first=first, label=label)
-    differ = " ".join(
-        f"{label} and {first} differ by {apart(x, y):.3f} stops (RMS over {len(x)} views)."
-        for label, x, y in found.exposures
-    )
-    caption = "One mark a photograph, means removed; on the line both agree."
-    return figure(chart, f"{differ} {caption}")
+    cells = [[r.name, *r.cells] for r in rows]
+    body = html.table(names, cells, numbers=range(1, len(names)), best=best)
+    return body + (paragraph("Bold: the best of a line.", "note") if any(best) else "")
 
 
 def _view_body(found: Comparison) -> str:

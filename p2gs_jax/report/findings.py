@@ -10,7 +10,7 @@ import numpy as np
 from p2gs_jax.core.clock import whole_run
 from p2gs_jax.evaluation.alignment import ExposureError, exposure_error
 from p2gs_jax.photometry.models import MODELS
-from p2gs_jax.photometry.solution import MIN_OBSERVATIONS, WEAK_GAMMA, Agreement, compare
+from p2gs_jax.photometry.solution import Agreement, compare
 from p2gs_jax.report.measurements import SceneMeasurements, seam_medians
 from p2gs_jax.report.run_files import RunFiles, number_at
 
@@ -27,19 +27,11 @@ CORRECTIONS = {
     "curve": "a curve",
     "luminance": "colour axes and an enhancing curve",
 }
-# How sentences of the photometric selection begin (photometry/calibrate.py).
-REASONS = ("Chosen:", "Simpler (", "Richer (", "What predicts best")
-# Least gaps, dB: between the PSNR of training and held-out views; between a held-out view and the
-# median of all.
-WIDE_GAP, OUTLIER = 4.0, 6.0
+# Least gap between the PSNR of training and held-out views, dB.
+WIDE_GAP = 4.0
 # Least standard error of an exposure, and least drift from its start, stops; a drift must exceed
 # three standard errors as well.
 WEAK_EV, DRIFT_EV = 0.1, 0.1
-# Gammas of cameras lie between these: two priors' widths about 2.2 (`A_PRIOR` in
-# photometry/adjustment/system.py).
-GAMMAS = (1.65, 3.15)
-# The floor of exposures and gammas in the `linear` parameterisation (types.py).
-FLOOR = 1e-3
 # Least share of clipped pixels of a photograph.
 CLIPPED = 0.25
 # Least rise of the PSNR between the last two tenths of a run, dB.
@@ -83,14 +75,14 @@ def _what(run: RunFiles) -> str:
     name = run.scene.name or "an unnamed scene"
     if not train:
         return f"A fit of {name} with the preset {run.preset}; it left no list of its views."
-    by = f" by {count(cameras, 'camera')}" if cameras else ""
     split = run.metrics.get("split")
     how = f": {split}" if isinstance(split, str) else ""
     rest = f" ({held_out} more were held out{how})" if held_out else ""
     gaussians, took = run.number("counts", "gaussians"), seconds_of(run)
     made = "" if gaussians is None else f" with {count(gaussians, 'Gaussian')}"
     when = "" if took is None else f" in {duration(took)}"
-    return f"{count(train, 'photograph')} of {name}{by}{rest} were fitted{made}{when}."
+    by = count(cameras, "camera")
+    return f"{count(train, 'photograph')} of {name} by {by}{rest} were fitted{made}{when}."
 
 
 def _modelled(run: RunFiles) -> str:
@@ -106,18 +98,15 @@ def _modelled(run: RunFiles) -> str:
     correction = f", with {CORRECTIONS.get(kind, kind)} learned for every view" if kind else ""
     if curve == "linear" and model == "constant":
         return f"{preset} models no camera: display values are splatted as they are{correction}."
+    why = f"as the preset {run.preset} or the options say"
+    if any(note.startswith("Chosen:") for note in notes_of(run)):
+        why = "the simplest choice that predicts held-out colours about as well as any"
+    elif run.option("photometry", "select"):
+        why = "as there were no shared points to choose by"
     span = exposure_span(run)
     spans = "" if span is None or model == "constant" else f"; exposures span {span:.1f} stops"
     what, under = DESCRIPTIONS.get(model, model), CURVES.get(curve, curve)
-    return f"It models {what} under {under}{correction}, {_why(run)}{spans}."
-
-
-def _why(run: RunFiles) -> str:
-    if any(r.startswith("Chosen:") for r in reasons(run)):
-        return "the simplest choice that predicts held-out colours about as well as any"
-    if run.option("photometry", "select"):
-        return "as there were no shared points to choose by"
-    return f"as the preset {run.preset} or the options say"
+    return f"It models {what} under {under}{correction}, {why}{spans}."
 
 
 def _how_good(run: RunFiles, scene: SceneMeasurements) -> str:
@@ -127,7 +116,10 @@ def _how_good(run: RunFiles, scene: SceneMeasurements) -> str:
         against = "" if train is None else f" (training photographs at {train:.1f} dB)"
         parts.append(f"Held-out photographs are met at {held_out:.1f} dB{against}")
     elif train is not None:
-        parts.append(f"Training photographs are met at {train:.1f} dB; none was held out")
+        parts.append(
+            f"Training photographs are met at {train:.1f} dB; none was held out, so nothing tells "
+            "how good new views are (--test-every 8 would)"
+        )
     if scene.seams:
         before, after = seam_medians(scene.seams)
         parts.append(
@@ -162,17 +154,8 @@ def true_error(run: RunFiles, true_exposures: dict[str, float]) -> ExposureError
     return exposure_error(found, true)
 
 
-def reasons(run: RunFiles) -> list[str]:
-    """Return why the photometric model was chosen, in the fit's own words."""
-    return [n for n in _notes(run) if n.startswith(REASONS)]
-
-
-def remarks(run: RunFiles) -> list[str]:
-    """Return all other notes of the fit."""
-    return [n for n in _notes(run) if not n.startswith(REASONS)]
-
-
-def _notes(run: RunFiles) -> list[str]:
+def notes_of(run: RunFiles) -> list[str]:
+    """Return what the fit remarked, and why it chose its photometric model, in its own words."""
     notes = run.metrics.get("notes")
     return [str(n) for n in notes] if isinstance(notes, list) else []
 
@@ -195,15 +178,28 @@ class RunWarning(NamedTuple):
 
 def run_warnings(run: RunFiles, scene: SceneMeasurements) -> list[RunWarning]:
     """Return all warnings, the most serious first."""
-    checks = (_on_the_run, _on_held_out_views, _on_exposures, _on_gammas, _on_drift)
-    found = [warning for check in checks for warning in check(run)]
-    return [*found, *_on_clipping(scene), *_on_more_to_gain(run)]
+    named = [
+        RunWarning(title, said.format(count=count(len(found), "view"), names=_named(found)))
+        for title, found, said in _on_views(run, scene)
+        if found
+    ]
+    return [*_on_the_run(run), *named, *_on_more_to_gain(run)]
+
+
+# A warning about views: its title; the views, the worst first; and what it says, with a place for
+# their `{count}` and for their `{names}`.
+ViewWarning = tuple[str, list[str], str]
 
 
 def _named(names: Sequence[str]) -> str:
     """Return the first few names, and how many more there are."""
     rest = len(names) - MOST_NAMES
     return ", ".join(names[:MOST_NAMES]) + (f" and {rest} more" if rest > 0 else "")
+
+
+def _worst(pairs: Iterable[tuple[str, float]], form: str) -> list[str]:
+    """Return names with their numbers, those of the largest size first."""
+    return [f"{name} {value:{form}}" for name, value in sorted(pairs, key=lambda p: -abs(p[1]))]
 
 
 def _on_the_run(run: RunFiles) -> Iterator[RunWarning]:
@@ -222,149 +218,71 @@ def _on_the_run(run: RunFiles) -> Iterator[RunWarning]:
     if progress is not None and progress < FINISHED:
         yield RunWarning(
             "Ended early",
-            f"The log ends at {progress:.0%} of the schedule: the budget was too short, or the "
-            "run was stopped. Continue it with --resume, or give it more time.",
+            f"The log ends at {progress:.0%} of the schedule: the run was stopped. The command "
+            "that began it, with --resume added, brings it to its end.",
         )
-    names = [v["image"] for v in run.train if v["exposure"] is None]
-    if names:
-        yield RunWarning(
-            "Views without an exposure",
-            f"{count(len(names), 'training view')} got no exposure ({_named(names)}): nothing ties "
-            "them to the others. They are shown at the mean of the rest.",
-        )
-
-
-def _on_held_out_views(run: RunFiles) -> Iterator[RunWarning]:
     # The protocol that fits most of a held-out view's photometry.
-    richer = bool(run.part("test", "photometry_fitted"))
-    fitted = "photometry_fitted" if richer else "exposure_fitted"
-    train, held_out = run.number("train", "psnr"), run.number("test", fitted, "psnr")
+    fitted = [run.number("test", name, "psnr") for name in ("photometry_fitted", "exposure_fitted")]
+    held_out = next((score for score in fitted if score is not None), None)
+    train = run.number("train", "psnr")
     if train is not None and held_out is not None and train - held_out >= WIDE_GAP:
-        solved = "photometry" if richer else "exposure"
         yield RunWarning(
             "New views are worse than training views",
             f"Training photographs are met at {train:.1f} dB, held-out ones at {held_out:.1f} dB, "
-            f"even with {solved} fitted to each. Either the held-out views look where few others "
+            "even with their photometry fitted. Either the held-out views look where few others "
             "do, or there are too few photographs for this many Gaussians: add photographs, or "
             "lower --gaussians.",
         )
-    per_view = run.part("test", fitted, "per_view")
-    scores = {n: s for n, v in per_view.items() if (s := number_at(v, "psnr")) is not None}
-    middle = float(np.median(list(scores.values()))) if len(scores) >= 3 else -np.inf
-    bad = sorted((n for n in scores if scores[n] < middle - OUTLIER), key=lambda n: scores[n])
-    if bad:
-        yield RunWarning(
-            "Some held-out views fail",
-            f"{_named([f'{n} {scores[n]:.1f} dB' for n in bad])}, against a median of "
-            f"{middle:.1f} dB. Look at them below: often such a view shows a corner that no "
-            "training view sees.",
-        )
-    if run.views and len(run.train) == len(run.views):
-        yield RunWarning(
-            "Nothing was held out",
-            "Every photograph was trained on, so nothing here tells how good new views are. Fit "
-            "with --test-every 8 to find out.",
-        )
 
 
-def _on_exposures(run: RunFiles) -> Iterator[RunWarning]:
-    weight, form = (run.option("loss", "relative_exposure", name) for name in ("weight", "form"))
-    if weight is not None and form == "literal_same_pose":
-        yield RunWarning(
-            "A loss pulls exposures together",
-            "The relative-exposure loss as printed in the paper is smallest when all exposures are "
-            "equal, so the recovered ones are too close to each other. The preset robust leaves it "
-            "out.",
-        )
+def _on_views(run: RunFiles, scene: SceneMeasurements) -> Iterator[ViewWarning]:
+    yield (
+        "Views without an exposure",
+        [v["image"] for v in run.train if v["exposure"] is None],
+        "{count} got no exposure ({names}): nothing ties them to the others. They are shown at the "
+        "mean of the rest.",
+    )
     agreement = against_exif(run)
-    if agreement is not None and agreement.disagrees.any():
-        views = [v["image"] for v in run.train if v["exposure_ev"] is not None]
-        off = np.flatnonzero(agreement.disagrees)
-        off = off[np.argsort(-np.abs(agreement.gap_ev[off]))]
-        names = [f"{views[i]} {agreement.gap_ev[i]:+.2f}" for i in off]
-        yield RunWarning(
+    if agreement is not None:
+        names = [v["image"] for v in run.train if v["exposure_ev"] is not None]
+        off = [(names[i], agreement.gap_ev[i]) for i in np.flatnonzero(agreement.disagrees)]
+        yield (
             "EXIF disagrees with the pixels",
-            f"In {len(off)} of {agreement.views} views the exposure recovered from the pixels "
-            f"differs from EXIF's by more than 0.2 stops ({_named(names)}). EXIF knows nothing of "
-            "flare, vignetting, or what the camera did after the exposure; the fit used the "
-            "pixels.",
+            _worst(off, "+.2f"),
+            f"In {{count}} of {agreement.views} the exposure recovered from the pixels differs "
+            "from EXIF's by more than 0.2 stops ({names}). EXIF knows nothing of flare, "
+            "vignetting, or what the camera did after the exposure; the fit used the pixels.",
         )
-    weak = [(v["image"], e) for v in run.train if (e := v.get("exposure_ev_error") or 0) > WEAK_EV]
-    if weak:
-        names = [f"{name} ± {error:.2f}" for name, error in sorted(weak, key=lambda w: -w[1])]
-        yield RunWarning(
-            "Exposures are only roughly known",
-            f"{count(len(weak), 'view')} with a standard error above {WEAK_EV:g} stops: "
-            f"{_named(names)}. They share few points with the others; more overlap would help.",
-        )
-    counts = [(v["image"], v.get("observations") or MIN_OBSERVATIONS) for v in run.train]
-    few = [f"{name} ({n})" for name, n in counts if n < MIN_OBSERVATIONS]
-    if few:
-        yield RunWarning(
-            "Views with few shared points",
-            f"{_named(few)}: fewer than {MIN_OBSERVATIONS} usable observations each, so their "
-            "exposures rest on little.",
-        )
+    errors = [(v["image"], v.get("exposure_ev_error") or 0.0) for v in run.train]
+    yield (
+        "Exposures are only roughly known",
+        _worst((pair for pair in errors if pair[1] > WEAK_EV), ".2f"),
+        f"{{count}} with a standard error above {WEAK_EV:g} stops: {{names}}. They share few "
+        "points with the others; more overlap would help.",
+    )
+    yield (
+        "Exposures left their start",
+        _worst(_drifts(run), "+.2f"),
+        f"In {{count}} the fit moved the exposure by more than {DRIFT_EV:g} stops and three "
+        "standard errors from what the shared points said ({names}). One of the two is wrong; "
+        "p2gs-jax calibrate RUN solves them anew through the rendered depth.",
+    )
+    yield (
+        "Clipped photographs",
+        _worst(((n, s) for n, s in scene.clipped.items() if s > CLIPPED), ".0%"),
+        f"More than {CLIPPED:.0%} of the pixels are clipped in {{count}} of the "
+        f"{len(scene.clipped)} looked at ({{names}}). There the radiance is only known to be at "
+        "least that bright, unless a darker photograph shows the same place.",
+    )
 
 
-def _on_gammas(run: RunFiles) -> Iterator[RunWarning]:
-    low, high = GAMMAS
-    model = "" if run.photometry is None else run.photometry["model"]
-    curve = {} if run.photometry is None else run.photometry["curve"]
-    gammas = [(v["image"], v["gamma"]) for v in run.train if v["gamma"] is not None]
-    off = [f"{name} {gamma:.2f}" for name, gamma in gammas if not low < gamma < high]
-    if off and curve.get("name") != "linear":
-        yield RunWarning(
-            "Unusual gammas",
-            f"{_named(off)}: outside {low:g} to {high:g}, where cameras lie. Gamma may have taken "
-            "over what exposure or the tone curve should explain; compare with a model without it "
-            "(--photometry.no-select --photometry.model view_exposure).",
-        )
-    weak = [v["image"] for v in run.train if (v.get("gamma_error") or 0) > WEAK_GAMMA]
-    if weak and model in MODELS and MODELS[model].gamma is not None:
-        yield RunWarning(
-            "Gammas are only roughly known",
-            f"{count(len(weak), 'view')} with a standard error above {WEAK_GAMMA:g} "
-            f"({_named(weak)}): the shared points there have nearly one brightness.",
-        )
-
-
-def _on_drift(run: RunFiles) -> Iterator[RunWarning]:
-    least = [(v["image"], np.nanmin(column([v["exposure"], v["gamma"], 1]))) for v in run.train]
-    lost = [name for name, value in least if value <= 1.01 * FLOOR]
-    if lost:
-        yield RunWarning(
-            "Exposures at their floor",
-            f"The exposure or gamma of {_named(lost)} fell to the smallest value it may have, "
-            f"{FLOOR:g}. The fit lost these views; start exposures from tracks (preset robust).",
-        )
-    moved = []
+def _drifts(run: RunFiles) -> Iterator[tuple[str, float]]:
+    """Yield views whose exposure left its start, and by how many stops."""
     for v in run.train:
         start, end = v.get("exposure_ev_start"), v["exposure_ev"]
         enough = max(DRIFT_EV, 3 * (v.get("exposure_ev_error") or 0))
         if start is not None and end is not None and abs(end - start) > enough:
-            moved.append((v["image"], end - start))
-    if moved:
-        names = [f"{name} {d:+.2f}" for name, d in sorted(moved, key=lambda m: -abs(m[1]))]
-        yield RunWarning(
-            "Exposures left their start",
-            f"In {count(len(moved), 'view')} the fit moved the exposure by more than {DRIFT_EV:g} "
-            f"stops and three standard errors from what the shared points said ({_named(names)}). "
-            "One of the two is wrong; p2gs-jax calibrate RUN solves them anew through the rendered "
-            "depth.",
-        )
-
-
-def _on_clipping(scene: SceneMeasurements) -> Iterator[RunWarning]:
-    bad = sorted(((s, n) for n, s in scene.clipped.items() if s > CLIPPED), reverse=True)
-    if bad:
-        names = _named([f"{n} {s:.0%}" for s, n in bad])
-        yield RunWarning(
-            "Clipped photographs",
-            f"More than {CLIPPED:.0%} of the pixels are clipped in {len(bad)} of the "
-            f"{len(scene.clipped)} photographs looked at ({names}). There the radiance is only "
-            "known to be at least that bright, unless a darker photograph shows the same place.",
-        )
+            yield v["image"], end - start
 
 
 def _on_more_to_gain(run: RunFiles) -> Iterator[RunWarning]:
@@ -386,5 +304,5 @@ def _on_more_to_gain(run: RunFiles) -> Iterator[RunWarning]:
             yield RunWarning(
                 "Not finished improving",
                 f"The training PSNR rose by {rise:.1f} dB between the last two tenths of the run. "
-                "More steps, or a longer --budget, would still help.",
+                "A new fit with more --steps, or a longer --budget, would be better.",
             )

@@ -21,8 +21,7 @@ from p2gs_jax.evaluation.seams import (
 )
 from p2gs_jax.photometry.display import develop
 from p2gs_jax.render.warp import surface_depth
-from p2gs_jax.report.charts import seams_chart
-from p2gs_jax.report.page import figure, folded, paragraph, row, table
+from p2gs_jax.report.page import figure, paragraph, row, table
 from p2gs_jax.report.pictures import LARGE, ViewComparison, jpeg, spread, without_suffix
 from p2gs_jax.report.run_files import RunFiles
 from p2gs_jax.run.read import Run, load_run
@@ -34,15 +33,15 @@ MOST_PAIRS, MOST_CLIPPED, MOST_RENDERED = 12, 24, 3
 SEAM_WIDTH = 960
 # The pair for the picture of a seam has at least this share of the median overlap.
 LEAST_OVERLAP = 0.5
-# Columns of the table of seams: head and format of each number.
-COLUMNS = {
-    "before_ev": ("before, stops", ".3f"),
-    "after_ev": ("after, stops", ".3f"),
-    "step_ev": ("step after, stops", "+.3f"),
-    "before_codes": ("before, 8-bit levels", ".1f"),
-    "after_codes": ("after, 8-bit levels", ".1f"),
-    "pixels": ("pixels", ","),
-}
+# Columns of the table of seams: number, head and format of each.
+COLUMNS = (
+    ("before_ev", "as taken, stops", ".3f"),
+    ("after_ev", "developed alike, stops", ".3f"),
+    ("step_ev", "step after, stops", "+.3f"),
+    ("before_codes", "as taken, 8-bit levels", ".1f"),
+    ("after_codes", "developed alike, 8-bit levels", ".1f"),
+    ("pixels", "pixels", ","),
+)
 
 
 @dataclass(frozen=True)
@@ -179,12 +178,8 @@ def seam_section(scene: SceneMeasurements) -> str:
     """Return the differences of neighbouring photographs, as taken and developed alike."""
     seams = scene.seams
     if not seams:
-        none = "No two training views share enough of the scene to be compared."
-        if scene.tried_pairs:
-            none = (
-                f"None of {scene.tried_pairs} pairs of neighbouring photographs shows enough of "
-                "the same unsaturated surface to compare."
-            )
+        none = f"{scene.tried_pairs} pairs of training views share enough points, and none of them "
+        none += "enough of the same unsaturated surface to be compared."
         return paragraph(" ".join(m for m in scene.missing if m.startswith("Seams")) or none)
     before, after = seam_medians(seams)
     step = float(np.median([abs(p.seam.step_ev) for p in seams]))
@@ -199,33 +194,30 @@ def seam_section(scene: SceneMeasurements) -> str:
     )
     if scene.picture is not None and scene.shown is not None:
         body += _seam_picture(scene.shown, scene.picture)
-    label = "Difference of pairs of photographs as taken and developed"
-    ends = [(p.name, p.seam.before_ev, p.seam.after_ev) for p in seams]
-    body += figure(
-        seams_chart(ends, label=label),
-        "Median absolute difference over all pixels that both photographs show, found through the "
-        "rendered depth; saturated and black pixels are left out.",
+    heads = ["pair", *(head for _, head, _ in COLUMNS)]
+    rows = [
+        [p.name, *(format(getattr(p.seam, name), form) for name, _, form in COLUMNS)] for p in seams
+    ]
+    note = (
+        "Median absolute differences over all pixels that both photographs show, found through the "
+        "rendered depth; saturated and black pixels are left out."
     )
-    heads = ["pair", *(head for head, _ in COLUMNS.values())]
-    forms = [(name, form) for name, (_, form) in COLUMNS.items()]
-    rows = [[p.name, *(format(getattr(p.seam, name), form) for name, form in forms)] for p in seams]
-    body += folded("Every pair in numbers", table(heads, rows, numbers=range(1, 7), tall=True))
-    return body
+    return body + table(heads, rows, numbers=range(1, 7), tall=True) + paragraph(note, "note")
 
 
 def _seam_picture(pair: SeamPair, picture: SeamPicture) -> str:
     names = [without_suffix(pair.first), without_suffix(pair.second)]
     left, right = names if picture.left_first else names[::-1]
-    seam = pair.seam
-    pictures = [
-        jpeg(image, f"{left} beside {right}, {how}", LARGE)
-        for image, how in ((picture.before, "as taken"), (picture.after, "developed alike"))
+    cells = [
+        (
+            jpeg(image, f"{left} beside {right}, {how}", LARGE),
+            f"{how.capitalize()}: {ev:.2f} stops, {codes:.0f} 8-bit levels apart",
+        )
+        for image, how, ev, codes in (
+            (picture.before, "as taken", pair.seam.before_ev, pair.seam.before_codes),
+            (picture.after, "developed alike", pair.seam.after_ev, pair.seam.after_codes),
+        )
     ]
-    captions = [
-        f"As taken: {seam.before_ev:.2f} stops, {seam.before_codes:.0f} 8-bit levels apart",
-        f"Developed alike: {seam.after_ev:.2f} stops, {seam.after_codes:.1f} levels apart",
-    ]
-    cells = list(zip(pictures, captions, strict=True))
     caption = (
         f"Left half: {left}. Right half: {right}. Both as a camera halfway between them would see "
         "them, with a hard edge in the middle: the widest seam among pairs with a good overlap. "

@@ -1,31 +1,18 @@
-"""Building blocks of the pages, and a page on paper: one HTML file without external resources."""
+"""Building blocks of the pages, each one HTML file without external resources."""
 
 from __future__ import annotations
 
 import html
-import os
 import re
-import shutil
-import subprocess
-import tempfile
 from collections.abc import Iterable, Sequence
 from importlib import resources
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from p2gs_jax.core.atomic import atomic_write, write_text
+from p2gs_jax.core.atomic import write_text
 from p2gs_jax.errors import UserError
 
 # The browser loads nothing from elsewhere, whatever the page contains.
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
-BROWSERS = (
-    *("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome"),
-    *("microsoft-edge", "msedge", "brave-browser"),
-    "/Applications/Google Chrome.app/Contents/MacOS/Google Chrome",
-    "/Applications/Chromium.app/Contents/MacOS/Chromium",
-)
-# Longest wait for a browser to print.
-SECONDS = 120
 
 
 def page(title: str, head: str, sections: Sequence[tuple[str, str, str]], foot: str) -> str:
@@ -74,47 +61,11 @@ def write_page(path: Path, html_text: str) -> None:
         ) from error
 
 
-def find_browser() -> str:
-    """Return the path of a browser that prints; a UserError says what was looked for."""
-    path = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if path is None:
-        raise UserError(
-            f"--pdf needs Chromium or Chrome, and none was found (tried: {', '.join(BROWSERS)}).",
-            fix="install one of them, or open the page in any browser and print it from there",
-        )
-    return path
-
-
-def print_pdf(page: Path, out: Path, browser: str) -> Path:
-    """Print a page into a PDF file; a UserError says why the browser did not."""
-    with atomic_write(out) as temporary, tempfile.TemporaryDirectory() as profile:
-        command = [
-            *(browser, "--headless", "--disable-gpu", "--no-first-run", "--no-pdf-header-footer"),
-            *(f"--user-data-dir={profile}", f"--print-to-pdf={temporary}"),
-            page.resolve().as_uri(),
-        ]
-        if hasattr(os, "geteuid") and os.geteuid() == 0:
-            command.insert(1, "--no-sandbox")  # Chromium refuses to run as root otherwise
-        try:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=SECONDS)
-            why = done.stderr.strip().splitlines()[-1:] or [f"exit code {done.returncode}"]
-        except (OSError, subprocess.TimeoutExpired) as error:
-            why = [str(error)]
-        if not temporary.read_bytes().startswith(b"%PDF"):
-            raise UserError(
-                f"{browser} did not print {page}: {why[0]}",
-                fix=f"open {page} in a browser and print it from there",
-            )
-    return out
-
-
 def made_by(command: str) -> str:
     """Return the foot of a page."""
-    try:
-        number = version("p2gs-jax")
-    except PackageNotFoundError:
-        number = ""
-    return text(f"Made by p2gs-jax {command}, version {number or 'unknown'}.")
+    from p2gs_jax import __version__
+
+    return text(f"Made by p2gs-jax {command}, version {__version__}.")
 
 
 def text(value: object) -> str:
@@ -154,35 +105,26 @@ def table(
     *,
     numbers: Iterable[int] = (),
     tall: bool = False,
-    best: Sequence[frozenset[int]] | None = None,
+    best: Sequence[frozenset[int]] = (),
 ) -> str:
     """Return a table of text, with a scroll bar where it is too wide, or `tall`.
 
     `numbers` are the columns that hold numbers. `best` has, for each row, the columns that are
-    marked; the first column then heads the rows.
+    marked; the first column then stays in sight.
     """
-    kinds = ["n" if i in set(numbers) else "" for i in range(len(names))]
+    numbers = set(numbers)
 
-    def cells(values: Sequence[str], marked: frozenset[int], tag: str) -> str:
-        out = ""
-        for i, (kind, value) in enumerate(zip(kinds, values, strict=True)):
-            head = best is not None and tag == "td" and i == 0
-            named = f"{kind} best" if i in marked else kind
-            attribute = f' class="{named}"' if named else ' scope="row"' if head else ""
-            element = "th" if head else tag
-            out += f"<{element}{attribute}>{text(value)}</{element}>"
-        return out
+    def cells(values: Sequence[str], tag: str, marked: frozenset[int] = frozenset()) -> str:
+        kinds = [" n" * (i in numbers) + " best" * (i in marked) for i in range(len(values))]
+        each = zip(kinds, values, strict=True)
+        inner = "".join(f'<{tag} class="{kind[1:]}">{text(v)}</{tag}>' for kind, v in each)
+        return f"<tr>{inner}</tr>"
 
-    marks = [frozenset[int]()] * len(rows) if best is None else best
-    body = "\n".join(
-        f"<tr>{cells(values, marked, 'td')}</tr>"
-        for values, marked in zip(rows, marks, strict=True)
-    )
-    kind = "" if best is None else ' class="compare"'
+    marks = best or [frozenset[int]()] * len(rows)
+    body = "\n".join(cells(v, "td", marked) for v, marked in zip(rows, marks, strict=True))
     return (
-        f'<div class="{"scroll tall" if tall else "scroll"}" tabindex="0"><table{kind}>\n'
-        f"<thead><tr>{cells(names, frozenset(), 'th')}</tr></thead>\n<tbody>\n{body}\n</tbody>"
-        "</table></div>"
+        f'<div class="scroll{" tall" * tall}" tabindex="0"><table class="{"compare" * bool(best)}">'
+        f"\n<thead>{cells(names, 'th')}</thead>\n<tbody>\n{body}\n</tbody></table></div>"
     )
 
 

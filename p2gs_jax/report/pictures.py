@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import html
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,12 +14,12 @@ from jaxtyping import Float, Float32
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.exr import read_exr
-from p2gs_jax.formats.false_color import STOPS, false_color, luminance, stops
-from p2gs_jax.formats.frames import to_uint8
+from p2gs_jax.formats.false_color import STOPS, false_color, luminance
+from p2gs_jax.formats.frames import data_url, shrunk, to_uint8
 from p2gs_jax.report.page import paragraph, row, text
 from p2gs_jax.report.run_files import RunFiles, number_at
 
-# Largest width, pixels: a third of the page on a screen of twice its resolution, and all of it.
+# Longest side, pixels: a third of the page on a screen of twice its resolution, and all of it.
 SMALL, LARGE = 560, 900
 JPEG_QUALITY = 84
 # A difference of 1 / GAIN of the display's range is shown as white or black.
@@ -85,36 +84,15 @@ def read_png(path: Path) -> Float32[np.ndarray, "h w 3"]:
     return raw[..., ::-1].astype(np.float32) / 255
 
 
-def jpeg(ldr: Float[np.ndarray, "h w 3"], alt: str, width: int = SMALL) -> str:
+def jpeg(ldr: Float[np.ndarray, "h w 3"], alt: str, longest: int = SMALL) -> str:
     """Return an `img` element of display values; NaN becomes black."""
-    return _element("jpeg", _shrunk(_clamped(ldr), width), alt)
+    small = shrunk(np.nan_to_num(ldr).clip(0, 1), longest)
+    return picture(data_url("jpeg", small, JPEG_QUALITY), alt)
 
 
-def png(ldr: Float[np.ndarray, "h w 3"], alt: str) -> str:
-    """Return an `img` element without loss: for flat colours, which JPEG would smear."""
-    return _element("png", np.asarray(ldr, np.float32), alt)
-
-
-def _shrunk(image: Float[np.ndarray, "h w c"], width: int) -> Float[np.ndarray, "h2 w2 c"]:
-    """Return an image of at most `width` pixels across."""
-    h, w = image.shape[:2]
-    if w <= width:
-        return image
-    size = (width, max(1, round(h * width / w)))
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-
-
-def _clamped(image: np.ndarray) -> np.ndarray:
-    return np.clip(np.nan_to_num(np.asarray(image, np.float32)), 0, 1)
-
-
-def _element(kind: str, image: np.ndarray, alt: str) -> str:
-    options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if kind == "jpeg" else []
-    good, data = cv2.imencode(f".{kind}", to_uint8(image)[..., ::-1], options)
-    assert good
-    encoded = base64.b64encode(data.tobytes()).decode("ascii")
-    (h, w), alt = image.shape[:2], html.escape(alt)
-    return f'<img src="data:image/{kind};base64,{encoded}" width="{w}" height="{h}" alt="{alt}">'
+def picture(url: str, alt: str) -> str:
+    """Return an `img` element."""
+    return f'<img src="{url}" alt="{html.escape(alt)}">'
 
 
 def signed_difference(
@@ -122,32 +100,9 @@ def signed_difference(
 ) -> Float32[np.ndarray, "h w 3"]:
     """Return render minus photograph in luminance: grey where they agree, lighter where the render
     is too bright."""
-    gap = luminance(_clamped(render)) - luminance(_clamped(photograph))
-    shown = np.clip(0.5 + 0.5 * GAIN * gap, 0, 1)
+    bright, there = (luminance(np.nan_to_num(p).clip(0, 1)) for p in (render, photograph))
+    shown = np.clip(0.5 + 0.5 * GAIN * (bright - there), 0, 1)
     return np.repeat(shown[..., None], 3, -1).astype(np.float32)
-
-
-def stop_picture(
-    linear: Float[np.ndarray, "h w 3"], middle: float, width: int = SMALL
-) -> Float32[np.ndarray, "h w 3"]:
-    """Return false colour in whole stops from `middle`, a luminance."""
-    return false_color(_shrunk(np.maximum(np.nan_to_num(linear), 0), width), middle)
-
-
-def stop_shares(
-    linear: Float[np.ndarray, "h w 3"], middle: float
-) -> list[tuple[int, float, tuple[float, float, float]]]:
-    """Return (lower end of the stop, share of the pixels, colour), the brightest first.
-
-    The first and the last hold everything beyond them.
-    """
-    low, high = (round(v) for v in STOPS)
-    whole = np.clip(np.floor(stops(np.nan_to_num(linear), middle)), low, high - 1).astype(int)
-    counts = np.bincount((whole - low).ravel(), minlength=high - low) / whole.size
-    steps = np.arange(high - 1, low - 1, -1)
-    levels = np.repeat(middle * 2.0 ** (steps[None, :, None] + 0.5), 3, -1).astype(np.float32)
-    colors = map(tuple, false_color(levels, middle)[0].tolist())
-    return list(zip(steps.tolist(), counts[::-1].tolist(), colors, strict=True))
 
 
 def dynamic_range(linear: Float[np.ndarray, "h w 3"]) -> float:
@@ -211,36 +166,28 @@ def hdr_section(run: RunFiles, comparisons: Sequence[ViewComparison]) -> str:
         f"photograph at that exposure is white from about {np.log2(1 / MID_GREY):+.1f} on."
     )
     for s, linear in widest:
-        picture = png(stop_picture(linear, middle), f"Radiance of {s.name} in stops")
-        body += (
-            f"<h3>{text(without_suffix(s.name))} · {dynamic_range(linear):.1f} stops</h3>"
-            f'<div class="row two legend"><div>{picture}</div>'
-            f"<div>{_legend(stop_shares(linear, middle))}</div></div>"
+        colors = false_color(shrunk(np.maximum(np.nan_to_num(linear), 0), LARGE), middle)
+        # Without loss: JPEG would smear flat colours.
+        shown = picture(data_url("png", colors), f"Radiance of {s.name} in stops")
+        title = f"{without_suffix(s.name)} · {dynamic_range(linear):.1f} stops"
+        body += f"<h3>{text(title)}</h3>{shown}"
+    return (
+        body
+        + _legend()
+        + paragraph(
+            "Stops in the titles lie between the darkest and the brightest half percent of pixels.",
+            "note",
         )
-    body += paragraph(
-        "Stops in the titles lie between the darkest and the brightest half percent of the pixels. "
-        "Bars: share of the pixels in each step.",
-        "note",
     )
-    return body
 
 
-def _legend(shares: Sequence[tuple[int, float, tuple[float, float, float]]]) -> str:
+def _legend() -> str:
+    """Return the colours of whole stops, from the darkest on, with the lower end of each."""
     low, high = (round(v) for v in STOPS)
-    most = max(share for _, share, _ in shares) or 1.0
-    cells = []
-    for stop, share, color in shares:
-        ends = f"{stop:+d} to {stop + 1:+d}"
-        if stop == high - 1:
-            ends = f"above {stop:+d}"
-        elif stop == low:
-            ends = f"below {stop + 1:+d}"
-        rgb = ",".join(str(round(255 * c)) for c in color)
-        cells.append(
-            f'<span class="from">{ends.replace("-", "−").replace("+0", "0")}</span>'
-            f'<span class="swatch" style="background:rgb({rgb})"></span>'
-            f'<span class="share">{share:.0%}</span>'
-            f'<span><span class="bar" style="display:block;width:{100 * share / most:.1f}%">'
-            "</span></span>"
-        )
-    return f'<div class="stops">{"".join(cells)}</div>'
+    steps = np.arange(low, high)
+    levels = np.repeat(2.0 ** (steps[None, :, None] + 0.5), 3, -1)
+    cells = "".join(
+        f'<span style="border-top: 18px solid rgb({",".join(map(str, color))})">{step:+d}</span>'
+        for step, color in zip(steps, to_uint8(false_color(levels, 1.0))[0].tolist(), strict=True)
+    )
+    return f'<div class="stops">{cells}</div>'

@@ -59,7 +59,6 @@ def report_page(run: RunFiles, scene: SceneMeasurements) -> str:
         ("white-balance", "White balance", photometry.white_balance_section(run)),
         ("gamma", "Gamma", photometry.gamma_section(run)),
         ("response", "Tone curve", photometry.response_section(run)),
-        ("responses", "Responses of cameras", photometry.responses_section(run)),
         ("vignetting", "Vignetting", photometry.vignetting_section(run)),
         ("seams", "Seams before and after", scenes.seam_section(scene)),
         ("views", kind, pictures.comparison_section(views, len(run.held_out))),
@@ -114,5 +113,4 @@ def _warnings(found: list[RunWarning], run: RunFiles, missing: list[str]) -> str
     body = f'<ul class="warnings">{items}</ul>' if found else paragraph("Nothing stands out.")
     if run.missing or missing:
         body += f"<h3>What this page lacks</h3>{listed([*run.missing, *missing])}"
-    notes = findings.remarks(run)
-    return body + (f"<h3>What the fit remarked</h3>{listed(notes)}" if notes else "")
+    return body

@@ -142,13 +142,13 @@ def _depth(found: dict[str, Any], name: str) -> str:
 def novel_section(run: RunFiles) -> str:
     """Return views from beside the way."""
     items, rows = run.metrics.get("novel_views"), []
-    for item in sorted(items if isinstance(items, list) else [], key=_shift, reverse=True):
-        unseen, found = number_at(item, "unseen"), part_at(item, "depth", "static")
-        if number_at(item, "shift_m") is not None and unseen is not None:
-            known = number_at(found, "points") is not None
-            depth = [_depth(found, n) if known else "" for n in ("median_m", "within_10_percent")]
-            side = "left" if _shift(item) > 0 else "right"
-            rows.append([f"{abs(_shift(item)):g} m to the {side}", f"{unseen:.1%}", *depth])
+    shifts = [(number_at(item, "shift_m"), item) for item in items or ()]
+    for shift, item in sorted(((s, i) for s, i in shifts if s is not None), key=lambda p: -p[0]):
+        found, unseen = part_at(item, "depth", "static"), number_at(item, "unseen")
+        known = number_at(found, "points") is not None
+        depth = [_depth(found, n) if known else "" for n in ("median_m", "within_10_percent")]
+        side = "left" if shift > 0 else "right"
+        rows.append([f"{abs(shift):g} m to the {side}", f"{unseen or 0:.1%}", *depth])
     names = ["camera", "pixels that no training view shows", "median depth error"]
     note = (
         "Some views moved sideways, seen from the driving direction. There are no photographs to "
@@ -156,10 +156,6 @@ def novel_section(run: RunFiles) -> str:
         "depth is held against LiDAR as above, what stands only."
     )
     return _numbers([*names, "depth within 10 %"], rows, 1, note)
-
-
-def _shift(item: Any) -> float:
-    return number_at(item, "shift_m") or 0.0
 
 
 def unexplained_section(run: RunFiles, problems: list[str]) -> str:
@@ -208,8 +204,9 @@ def training_section(run: RunFiles) -> str:
     losses = {"loss": over_steps("loss")} | {n.replace("_", " "): values[n] for n in ranked}
     losses = {n: np.where(v > 0, v, np.nan) for n, v in losses.items()}
     steps, psnr, gaussians = (over_steps(name) for name in ("step", "psnr", "gaussians"))
-    marks, label = _marks(run, log), "PSNR, loss and Gaussians over the steps of the run"
-    chart = training_chart(steps, psnr, losses, gaussians, marks, label=label)
+    marks, label = _marks(log), "PSNR, loss and Gaussians over the steps of the run"
+    at = [step for step, _ in marks]
+    chart = training_chart(steps, psnr, losses, gaussians, at, label=label)
     caption = (
         "From log.jsonl; lines are running medians, the pale one is each entry. Entries average a "
         "few training views, so they scatter with how hard these are."
@@ -222,38 +219,28 @@ def training_section(run: RunFiles) -> str:
     return figure(chart, caption)
 
 
-def _marks(run: RunFiles, log: Sequence[dict[str, Any]]) -> list[tuple[float, str]]:
-    """Return the steps at which images grow and exposures begin to move."""
+def _marks(log: Sequence[dict[str, Any]]) -> list[tuple[float, str]]:
+    """Return the steps at which images grow, and to what."""
     out = []
     for before, now in itertools.pairwise(log):
         a, b = number_at(before, "shrink"), number_at(now, "shrink")
         if a is not None and b is not None and a != b:
             size = "full-size images" if b == 1 else f"images at 1/{b:.0f}"
             out.append((number_at(now, "step") or 0.0, size))
-    freeze = run.option("photometry", "freeze_until")
-    solved = any(v.get("exposure_ev_error") is not None for v in run.train)
-    if isinstance(freeze, int | float) and 0 < freeze < 1 and solved:
-        later = [r for r in log if (number_at(r, "progress") or 0) >= freeze]
-        if later:
-            out.append((number_at(later[0], "step") or 0.0, "exposures move"))
-    return sorted(out)
+    return out
 
 
 def timing_section(run: RunFiles) -> str:
-    """Return where the time went."""
-    before, optimisation, after = (
-        run.number("seconds", name)
-        for name in ("total_until_evaluation", "optimisation", "evaluation_and_files")
-    )
-    start = None if before is None or optimisation is None else before - optimisation
+    """Return where the time went, and how much there was."""
+    until, step = run.number("seconds", "total_until_evaluation"), run.number("seconds_per_step")
+    optimisation, steps = run.number("seconds", "optimisation"), run.number("counts", "steps")
     spent = {
-        "Reading, exposures, seeds": None if start is None or start < 0 else start,
-        "Optimisation, with compiling": optimisation,
-        "Judging and writing files": after,
+        "Until the evaluation": until,
+        "of it optimisation, with compiling": optimisation,
+        "Judging and writing files": run.number("seconds", "evaluation_and_files"),
         "In all": seconds_of(run),
     }
     rows = [[name, duration(s)] for name, s in spent.items() if s is not None]
-    step, steps = run.number("seconds_per_step"), run.number("counts", "steps")
     if step is not None and steps is not None:
         rows.append(["Steps", f"{steps:,.0f}, {1e3 * step:.0f} ms each"])
     counts = {name: run.number("counts", key) for key, name in COUNTS.items()}

@@ -90,7 +90,6 @@ def test_features_say_what_to_install(monkeypatch):
     assert found["fit, calibrate, render, eval"].ok
     assert not found["photographs without poses"].ok
     assert "p2gs-jax[viewer]" in found["view"].text
-    assert "Chromium" in found["report --pdf"].text
     monkeypatch.setattr(doctor.shutil, "which", lambda name: f"/usr/bin/{name}")
     assert "p2gs-jax[cuda]" in doctor.check_devices()[0].text
 

@@ -28,7 +28,7 @@ STEPS = ("--bake-steps", "12")
 def exported(finished_run, tmp_path_factory):
     """Return a run and a folder with every format whose package is here."""
     out = tmp_path_factory.mktemp("exports")
-    formats = ("linear-ply", "display-ply", "splat", *SPZ, "colmap", "exr", "gltf", "nerfstudio")
+    formats = ("linear-ply", "display-ply", *SPZ, "colmap", "exr", "gltf", "nerfstudio")
     argv = ["export", str(finished_run), "--format", *formats, "--out", str(out), *STEPS]
     with pytest.raises(SystemExit) as stop:
         main(argv)
@@ -79,7 +79,7 @@ def test_the_baking_error_is_written_and_true(exported):
     assert found["mean_codes"] == pytest.approx(np.abs(difference).mean(), abs=0.5)
     psnr = -20 * np.log10(np.sqrt((difference**2).mean()) / 255)
     assert found["psnr"] == pytest.approx(psnr, abs=0.1)
-    for kind in ("splat", *SPZ):  # measured as they are read back
+    for kind in SPZ:  # measured as they are read back
         said = json.loads((out / f"display.{kind}.json").read_text())
         assert said["file"] == f"display.{kind}"
         assert 10 < said["baking_error"]["train"]["psnr_median"] < 60

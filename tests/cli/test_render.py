@@ -12,7 +12,6 @@ import pytest
 
 from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.paths.panorama import covering
-from p2gs_jax.paths.pictures import RunRenderer
 from p2gs_jax.paths.rig import find_rig
 from p2gs_jax.paths.shots import Shot, view_shots
 from p2gs_jax.photometry.display import DisplayTransform, develop
@@ -65,7 +64,7 @@ def rig_run(finished_run, tmp_path_factory) -> Path:
     """Return a run whose photographs are its own field, taken by a rig at known exposures."""
     root = tmp_path_factory.mktemp("rig")
     shutil.copytree(finished_run, root / "run")
-    renderer = RunRenderer(load_run(finished_run))
+    fitted = load_run(finished_run)
     K = np.array([[70.0, 0, SIZE[0] / 2], [0, 70.0, SIZE[1] / 2], [0, 0, 1]])
     views, solved = [], []
     for (camera, step), ev in STOPS.items():
@@ -73,8 +72,8 @@ def rig_run(finished_run, tmp_path_factory) -> Path:
         viewmat[0, [0, 2]] = np.cos(yaw), -np.sin(yaw)
         viewmat[2, [0, 2]] = np.sin(yaw), np.cos(yaw)
         viewmat[:3, 3] = -viewmat[:3, :3] @ [0.3 * step, 0, 0]
-        linear, _, _ = renderer.linear(Shot("", viewmat, K, *SIZE))
-        transform = DisplayTransform(2.0**ev, 2.2, renderer.run.cfg.photometry)
+        linear = np.asarray(fitted.render(Shot("", viewmat, K, *SIZE).camera()).linear)
+        transform = DisplayTransform(2.0**ev, 2.2, fitted.cfg.photometry)
         name = f"{camera}/{step:03d}.png"
         path = root / "scene" / "images" / name
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from splats import random_splats
 
 from p2gs_jax.errors import UserError
+from p2gs_jax.formats.foreign import read_foreign
 from p2gs_jax.formats.gltf import EXTENSION, write_gltf
 from p2gs_jax.formats.gsply_files import (
     fractional_bits,
@@ -24,7 +25,6 @@ from p2gs_jax.formats.gsply_files import (
     write_spz,
 )
 from p2gs_jax.formats.ply import write_ply
-from p2gs_jax.formats.splat import read_foreign, read_splat, write_splat
 from p2gs_jax.formats.usd import CAMERAS, SPLATS, NamedCamera, write_usd
 from p2gs_jax.render.harmonics import C0, evaluate
 
@@ -176,39 +176,6 @@ def by_x(records, x):
     return np.argsort(records)[np.argsort(np.argsort(x))]
 
 
-def test_splat_holds_what_viewers_expect(tmp_path):
-    """32 bytes each; decoded as viser's example does (bytes to [-1, 1] by * 2 / 255 - 1)."""
-    g, path = random_splats(degree=0), tmp_path / "a.splat"
-    assert write_splat(path, g) == 50
-    raw = np.frombuffer(path.read_bytes(), np.uint8).reshape(50, 32)
-    means, scales = raw[:, :12].copy().view("<f4"), raw[:, 12:24].copy().view("<f4")
-    conspicuous = scales.prod(1) * raw[:, 27]
-    assert (np.diff(conspicuous) <= 0.02 * conspicuous[:-1]).all(), "the largest come first"
-    raw, means, scales = (
-        a[by_x(means[:, 0], np.asarray(g.means[:, 0]))] for a in (raw, means, scales)
-    )
-    np.testing.assert_array_equal(means, g.means)
-    np.testing.assert_allclose(scales, np.exp(g.log_scales), rtol=1e-6)
-    colors = np.clip(0.5 + C0 * np.asarray(g.sh[:, 0]), 0, 1)
-    np.testing.assert_allclose(raw[:, 24:27] / 255, colors, atol=0.5 / 255 + 1e-6)
-    np.testing.assert_allclose(raw[:, 27] / 255, ours(g)[1], atol=0.5 / 255 + 1e-6)
-    found = covariances(np.roll(raw[:, 28:32] / 255.0 * 2 - 1, -1, axis=1), scales)
-    largest = np.exp(2 * np.asarray(g.log_scales)).max(1)[:, None, None]
-    assert np.abs(found - ours(g)[0]).max() < 0.05 * largest.max()
-    assert (np.abs(found - ours(g)[0]) < 0.05 * largest).all()
-    # Read back, the same, and a second trip changes nothing more.
-    back = read_splat(path)
-    order = by_x(np.asarray(back.means[:, 0]), np.asarray(g.means[:, 0]))
-    np.testing.assert_array_equal(back.means[order], g.means)
-    np.testing.assert_allclose(back.log_scales[order], g.log_scales, atol=1e-5)
-    np.testing.assert_allclose(ours(back)[1][order], ours(g)[1], atol=0.5 / 255 + 1e-6)
-    np.testing.assert_allclose(0.5 + C0 * back.sh[order, 0], colors, atol=0.5 / 255 + 1e-6)
-    write_splat(tmp_path / "b.splat", back)
-    np.testing.assert_allclose(read_splat(tmp_path / "b.splat").sh, back.sh, atol=1e-5)
-    with pytest.raises(ValueError, match="degree 0"):
-        write_splat(path, random_splats(degree=1))
-
-
 @pytest.fixture
 def with_gsply():
     pytest.importorskip("gsply", reason="the extra `spz` is not installed")
@@ -275,7 +242,7 @@ def test_without_its_package_the_error_names_what_to_install(tmp_path, monkeypat
             write(tmp_path / "a", mild(0))
 
 
-@pytest.mark.parametrize("read", [read_splat, read_spz, read_compressed_ply])
+@pytest.mark.parametrize("read", [read_spz, read_compressed_ply])
 @pytest.mark.parametrize("content", [b"hello, this is not a splat", b"x" * 33, None])
 def test_wrong_files_and_missing_ones_are_refused(tmp_path, with_gsply, read, content):
     path = tmp_path / "some.file"
@@ -290,7 +257,6 @@ def test_every_kind_of_foreign_file_is_known_by_its_end(tmp_path, with_gsply):
     writers = {
         "a.ply": lambda path, g: write_ply(path, g, []),
         "a.compressed.ply": write_compressed_ply,
-        "a.splat": write_splat,
         "a.SPZ": write_spz,
     }
     for name, write in writers.items():

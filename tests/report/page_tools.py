@@ -18,13 +18,12 @@ LOOK = """() => ({
     anchors: [...document.querySelectorAll('nav a')].map(
         a => document.querySelector(a.getAttribute('href')) !== null),
     smallest: Math.min(...[...document.querySelectorAll('svg text')]
-        .filter(t => t.getBoundingClientRect().height > 0)
         .map(t => [parseFloat(getComputedStyle(t).fontSize), t.getScreenCTM()])
         .map(([size, m]) => size * Math.hypot(m.a, m.b))),
     ids: [...document.querySelectorAll('[id]')].map(e => e.id),
     spilled: [...document.querySelectorAll('svg text')]
-        .map(t => [t.textContent, t.getBoundingClientRect()])
-        .filter(([_, r]) => r.width > 0 && (r.left < 0 || r.right > innerWidth))
+        .map(t => [t.textContent, ...[t, t.closest('svg')].map(e => e.getBoundingClientRect())])
+        .filter(([_, r, s]) => r.left < s.left - 2 || r.right > s.right + 2)
         .map(([text]) => text),
 })"""
 
