@@ -70,5 +70,6 @@ def test_what_cannot_be_is_refused_by_name(devices, batch, words):
 def test_the_command_line_refuses_what_is_no_number(run_command, tmp_path):
     code, said = run_command("fit", tmp_path, "--out", tmp_path / "run", "--devices", "two")
     assert code == 2
-    assert "--devices two" in said
+    assert "--devices" in said
+    assert "two" in said
     assert not (tmp_path / "run").exists()
