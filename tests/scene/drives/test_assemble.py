@@ -163,7 +163,7 @@ def test_what_is_not_a_rotation_is_refused():
     for rotation, position, words in (
         (1.1 * np.eye(3), zero, r"poses.json: the pose of frame 3 is no"),
         (np.diag([1.0, 1, -1]), zero, "mirrors"),
-        (np.eye(3), np.array([0, np.nan, 0]), "rotation and position"),
+        (np.eye(3), np.array([0, np.nan, 0]), "rotation and a position"),
     ):
         with pytest.raises(UserError, match=words):
             rigid(rotation, position, source, "frame 3")
