@@ -180,8 +180,8 @@ def rows_of(fitted, image):
     views = fitted.scene.views
     rig = find_rig(view_shots(views), views)
     cylinder = covering(rig.mounts.values(), np.eye(4))
-    line = (image.shape[0] - 3 * cylinder.height) // 4
-    tops = [line, 3 * line + cylinder.height, 4 * line + 2 * cylinder.height]
+    line = (image.shape[0] - 3 * cylinder.height) // 3
+    tops = [line, 2 * line + cylinder.height, 3 * line + 2 * cylinder.height]
     return [image[t : t + cylinder.height] for t in tops]
 
 

@@ -193,7 +193,11 @@ OTHERS = {"--help", "--help-all", "--version", "--ckpt", "--only", "--nthreads"}
 OTHERS |= {"--data", "--orientation-method", "--center-method", "--auto-scale-poses"}
 
 
-@pytest.mark.parametrize("page", PAGES, ids=[str(p.relative_to(ROOT)) for p in PAGES])
+# The history names options that are gone.
+TODAY = [page for page in PAGES if page.name != "CHANGELOG.md"]
+
+
+@pytest.mark.parametrize("page", TODAY, ids=[str(p.relative_to(ROOT)) for p in TODAY])
 def test_options_in_the_text_exist(page, options):
     for span in re.findall(r"`([^`\n]+)`", prose(page)):
         if span.startswith("p2gs-jax ") and "..." not in span and "COMMAND" not in span:

@@ -150,7 +150,7 @@ def test_the_command_writes_it_once(finished_run, run_command, tmp_path):
 
 REFUSED = [
     *("html --size-mb 0", "html --size-mb 0.02", "html --photographs -1", "html --bake-steps 3"),
-    *("splat --size-mb 3", "exr --photographs 3"),
+    *("gltf --size-mb 3", "exr --photographs 3"),
 ]
 
 
