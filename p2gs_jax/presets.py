@@ -149,8 +149,8 @@ def require_config(cfg: FitConfig | None) -> FitConfig:
     return cfg
 
 
-def narrowed(record: Any, taken: Mapping[str, Any]) -> Any:
-    """Return some fields of a configuration, by name; reading another raises AttributeError.
+def narrowed(record: Record, taken: Mapping[str, Any]) -> Record:
+    """Return a configuration with some of its fields only; reading another raises AttributeError.
 
     What is compiled for them is shared by all configurations that agree in these fields, and
     nothing can depend on one that was forgotten. `taken` says by the name of a field what of it is
@@ -161,7 +161,11 @@ def narrowed(record: Any, taken: Mapping[str, Any]) -> Any:
         if inner is not None:
             inner = inner if isinstance(inner, Mapping) else dict.fromkeys(inner)
             values[name] = narrowed(values[name], inner)
-    return namedtuple(type(record).__name__, values)(**values)
+    kind: Any = type(record)
+    hidden = {f.name: property() for f in dataclasses.fields(kind) if f.name not in values}
+    # As a tuple it is equal to another where the fields are.
+    bases = (namedtuple(kind.__name__, values), kind)
+    return type(kind.__name__, bases, hidden | {"__init__": object.__init__})(**values)
 
 
 def with_values(record: Record, values: Mapping[str, Any]) -> Record:

@@ -40,6 +40,7 @@ def test_what_was_taken_is_equal_where_the_values_are():
     for taken, same in (({"render": None}, True), ({"photometry": ("curve", "pivot")}, False)):
         a, b = narrowed(cfg, taken), narrowed(other, taken)
         assert (a == b, hash(a) == hash(b)) == (same, same)
+        assert isinstance(a, FitConfig)
 
 
 class Traced:
