@@ -350,8 +350,9 @@ def _exif_tags(path: Path) -> dict:
     # Pillow raises many kinds of errors on malformed EXIF (struct, Syntax, Value, OS, ...).
     try:
         if kind in ("raw", "exr"):
-            exif = (read_raw_exif(path) if kind == "raw" else read_exr_exif(path)) or Image.Exif()
-            return {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
+            # One of settings alone has length 0.
+            exif = read_raw_exif(path) if kind == "raw" else read_exr_exif(path)
+            return {} if exif is None else {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
         if kind == "heif":
             pillow_heif(path)
         with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
