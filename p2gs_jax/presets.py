@@ -183,6 +183,15 @@ def to_dict(config: FitConfig) -> dict:
     return dataclasses.asdict(config)
 
 
+def flat(options: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested values by dotted names."""
+    out: dict[str, Any] = {}
+    for name, value in options.items():
+        nested = isinstance(value, dict)
+        out |= flat(value, f"{prefix}{name}.") if nested else {prefix + name: value}
+    return out
+
+
 def from_dict(values: Mapping[str, Any], kind: Any = FitConfig) -> Any:
     """Rebuild a configuration, or a record of one, from `to_dict`'s result.
 

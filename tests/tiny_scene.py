@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 
+from p2gs_jax import initialise, solve_exposures, survey
 from p2gs_jax.types import Scene, View
 
 
@@ -47,6 +48,13 @@ def make_scene(root, views=6, points=150, size=(112, 100), seed=0):
         rows.append(f"{p + 1} {xyz[p, 0]} {xyz[p, 1]} {xyz[p, 2]} {rgb} 0.5 {pairs}")
     (model / "points3D.txt").write_text("\n".join(rows) + "\n")
     return root
+
+
+def prepared(scene, cfg, kept=None):
+    """Return what a fit of a scene starts from."""
+    found = survey(scene, cfg)
+    exposures = solve_exposures(scene, found.still, cfg, dense=found.dense, kept=kept)
+    return initialise(found, exposures)
 
 
 def noise_scene(folder, train, held_out, masked=False):

@@ -35,7 +35,7 @@ class Eval:
     against: tuple[Path, ...] = ()
     """Folders of renders of the held-out views, by other programs (docs/comparing.md)."""
     lpips_weights: str | None = None
-    """Evaluate with LPIPS: alex, vgg, a .npz of weights, or none (default: as the run was)."""
+    """Evaluate with LPIPS: alex, vgg, or none (default: as the run was)."""
 
     def execute(self) -> int:
         """Evaluate the run and rewrite its metrics; options replace those of the run."""
@@ -50,7 +50,6 @@ class Eval:
         from p2gs_jax.render.capacity import make_renderer
         from p2gs_jax.run.folder import RunFolder
         from p2gs_jax.run.photometry_files import write_metering
-        from p2gs_jax.run.plots import write_unexplained
         from p2gs_jax.run.read import load_run
 
         fitted = load_run(self.run, self.scene)
@@ -80,8 +79,6 @@ class Eval:
             )
             metrics = found.metrics
             write_metering(folder.metering, found.metering)
-            if found.unexplained:
-                write_unexplained(folder.unexplained, scene, store, found.unexplained)
             judge = Judge(scene, store, fitted.params, cfg, weights, truth)
             beside = _judged(
                 others, judge, metrics, lambda done, count: reporter.stage("Judging", done, count)

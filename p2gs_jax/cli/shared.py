@@ -36,7 +36,7 @@ SHORT = {
     "max_frames": ("data.max_frames", "N"),
     "known_exposures": ("photometry.known", "FILE|exif"),
     "known_deviation_ev": ("photometry.known_deviation_ev", "STOPS"),
-    "lpips_weights": ("evaluation.lpips_weights", "alex|vgg|FILE"),
+    "lpips_weights": ("evaluation.lpips_weights", "alex|vgg"),
     "seed": ("train.seed", "N"),
 }
 SCENE = "the scene's folder itself, without an option"

@@ -19,8 +19,8 @@ class Stopwatch:
     full.
     """
 
-    def __init__(self):
-        self.seconds: dict[str, float] = {}
+    def __init__(self, seconds: Mapping[str, float] | None = None):
+        self.seconds = dict(seconds or {})
         self._lock = threading.Lock()
 
     @contextmanager

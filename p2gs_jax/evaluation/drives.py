@@ -16,10 +16,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from p2gs_jax.core.numerics import on_device
-from p2gs_jax.evaluation.passes import ArrayStore
+from p2gs_jax.evaluation.passes import ArrayStore, StoredArray
 from p2gs_jax.evaluation.scores import ViewResult
-from p2gs_jax.evaluation.unexplained import Residuals, Surface, Unexplained
 from p2gs_jax.render.warp import OPAQUE, project_points
+from p2gs_jax.scene.lens import scale_intrinsics
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.rigid import interpolated, inverse, left_of_way
 from p2gs_jax.scene.visibility import unoccluded
@@ -36,16 +36,34 @@ MOST_POINTS = 20_000
 SHIFTS = (1.0, 2.0, 3.0, -1.0, -2.0, -3.0)
 # Views that are shifted, evenly over all; pixels of each that are looked up, about.
 MOST_SHIFTED, MOST_PIXELS = 6, 15_000
+# What training views show is kept at this width.
+WIDTH = 480
 # A training view sees a surface where its depth agrees within this share in the pixel or its
 # neighbours. What shows no surface is taken to be this far away, scene units.
 AGREES, FAR = 0.05, 1e5
 
 
+class Surface(NamedTuple):
+    """The surface that a view shows."""
+
+    depth: StoredArray  # camera z, 0 where there is none
+    viewmat: Float[np.ndarray, "4 4"]  # world-to-camera
+    K: Float[np.ndarray, "3 3"]  # intrinsics in pixels, at the size of `depth`
+
+    def depths(self) -> Float32[np.ndarray, "h w"]:
+        """Return `depth`, read."""
+        return self.depth.read().astype(np.float32)
+
+    @property
+    def center(self) -> Float[np.ndarray, " 3"]:
+        """Position of the camera in the world."""
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+
 class DriveScores:
     """Collects rendered views of a drive, and judges them together.
 
-    `arrays` keeps what all views need to the end; None: memory does. After `summary`, `unexplained`
-    has what no static scene explains, by row of the view.
+    `arrays` keeps what all views need to the end.
     """
 
     def __init__(
@@ -53,20 +71,17 @@ class DriveScores:
         scene: Scene,
         store: ImageStore,
         render: Callable[[Camera], Render],
-        arrays: ArrayStore | None = None,
+        arrays: ArrayStore,
     ):
-        self._scene, self._store, self._render = scene, store, render
-        self._residuals = Residuals(scene.views, arrays)
+        self._scene, self._store, self._render, self._arrays = scene, store, render, arrays
+        self._surfaces: list[Surface] = []
         self._depths: dict[int, DepthErrors] = {}
-        self.unexplained: dict[int, Unexplained] = {}
 
     def add(self, result: ViewResult, mask: Float32[np.ndarray, "h w"]) -> None:
         """Take a rendered view, and which of its pixels count."""
         index, depth, alpha = result.index, result.depth, result.alpha
         if self._scene.views[index].split == "train":
-            K = self._store.camera(index)[1]
-            surface = _surface(depth, alpha)
-            self._residuals.add(index, result.ldr, result.photograph, mask, surface, K)
+            self._surfaces.append(self._reduced(index, _surface(depth, alpha)))
         if self._scene.lidar is not None:
             given = (self._view(index), depth, alpha, mask)
             found = depth_errors(self._scene.lidar, self._scene.objects, *given)
@@ -75,18 +90,25 @@ class DriveScores:
 
     def summary(self) -> dict:
         """Return the parts of `metrics.json`."""
-        self.unexplained = self._residuals.find()
-        views = self._scene.views
-        shares = {views[row].name: one.share for row, one in self.unexplained.items()}
-        mean = float(np.mean(list(shares.values())))
-        out = {"unexplained": {"share": mean, "per_view": shares}, "novel_views": self._novel()}
+        novel, views = {"novel_views": self._novel()}, self._scene.views
         held_out = [d for row, d in self._depths.items() if views[row].split == "test"]
         depth = {"all": summary(list(self._depths.values())), "held_out": summary(held_out)}
-        return out if not depth["all"] else {**out, "depth": depth}
+        return novel if not depth["all"] else {**novel, "depth": depth}
+
+    def _reduced(self, index: int, depth: Float32[np.ndarray, "h w"]) -> Surface:
+        """Return the surface of a view, small and in half precision: there may be thousands."""
+        height, width = depth.shape
+        shrink = max(1.0, width / WIDTH)
+        size = (max(1, round(width / shrink)), max(1, round(height / shrink)))
+        nearest = cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST)
+        small = np.minimum(nearest, np.finfo(np.float16).max).astype(np.float16)
+        K = scale_intrinsics(self._store.camera(index)[1], size[0] / width, size[1] / height)
+        viewmat = self._scene.views[index].viewmat
+        return Surface(self._arrays.put(small), viewmat, K.astype(np.float32))
 
     def _novel(self) -> list[dict]:
         """Return what views from beside the way show, a row for every distance."""
-        left, known = left_of_way(self._scene.views), self._residuals.surfaces()
+        left = left_of_way(self._scene.views)
         # Where there is a sweep, depth can be judged too.
         pool = sorted(self._depths) or list(range(len(self._scene.views)))
         rows = []
@@ -97,8 +119,9 @@ class DriveScores:
                 viewmat = shifted(view.viewmat, left[index], metres)
                 result = self._render(self._camera(view, viewmat))
                 depth, alpha = np.asarray(result.depth), np.asarray(result.alpha)
-                surface = Surface(_surface(depth, alpha), viewmat, view.K)
-                shares.append(unseen_share(surface, known))
+                kept = _surface(depth, alpha)
+                surface = Surface(StoredArray(kept, kept.shape), viewmat, view.K)
+                shares.append(unseen_share(surface, self._surfaces))
                 if self._scene.lidar is not None:
                     moved = dataclasses.replace(view, viewmat=viewmat)
                     lidar, things = self._scene.lidar, self._scene.objects

@@ -27,21 +27,19 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.evaluation.alignment import fit_capture, with_fitted_exposure
 from p2gs_jax.evaluation.drives import DriveScores
 from p2gs_jax.evaluation.lpips import LpipsWeights
-from p2gs_jax.evaluation.metered import MeteredViews
 from p2gs_jax.evaluation.passes import ArrayStore, StoredArray, map_in_order, most_bytes
 from p2gs_jax.evaluation.radiance import RadianceScores, Truth
 from p2gs_jax.evaluation.references import Reference
 from p2gs_jax.evaluation.scores import (
-    Untold,
     VideoScores,
     ViewResult,
     is_drive,
     masks_of_parts,
     still_mask,
     summary_of,
+    tells_exposure,
     view_scores,
 )
-from p2gs_jax.evaluation.unexplained import Unexplained
 from p2gs_jax.photometry.display import (
     DisplayTransform,
     develop,
@@ -51,7 +49,7 @@ from p2gs_jax.photometry.display import (
     with_capture,
 )
 from p2gs_jax.photometry.formation import exposed_at
-from p2gs_jax.photometry.metering import Metering, Readings, meter
+from p2gs_jax.photometry.metering import BELOW_WHITE, Metering, Readings, fit_metering, meter
 from p2gs_jax.photometry.models import MODELS
 from p2gs_jax.render.capacity import RenderView, make_renderer
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
@@ -62,11 +60,9 @@ class Evaluation(NamedTuple):
     """What an evaluation finds."""
 
     # the `train`, `test`, `consistency`, `reference` and `radiance` parts of `metrics.json`, those
-    # of drives, and the views without scores or exposure (`Untold`)
+    # of drives, and the views without scores or exposure
     metrics: dict[str, Any]
     metering: Metering  # the rule that explains the exposures of the training views
-    # of a drive: what no static scene explains in the training views, by row
-    unexplained: dict[int, Unexplained]
 
 
 class Judge:
@@ -230,18 +226,25 @@ class _Views:
         self._judge, self._arrays = judge, arrays
         scene, store = judge.scene, judge.store
         self._drive = DriveScores(scene, store, seen, arrays) if is_drive(scene) else None
-        self._radiance, self._metered = RadianceScores(arrays), MeteredViews(arrays)
+        self._radiance = RadianceScores(arrays)
         self._rows: dict[str, dict[str, dict]] = defaultdict(dict)
         self._videos = {name: VideoScores() for name in ("per_view", "averaged", "photographs")}
-        self._untold = Untold()
+        # Names of views without scores, and of photographs that tell no exposure.
+        self._untold: dict[str, list[str]] = {"hidden": [], "exposures_unknown": []}
+        # What meters read in training views, by name; their rows; and in held-out views.
+        self._readings: dict[str, Readings] = {}
         self._told: list[int] = []
-        self._references: list[tuple[int, tuple[StoredArray, ...]]] = []
+        self._held_out: list[tuple[Readings, _Kept]] = []
+        self._references: list[_Kept] = []
 
     def add(self, found: _Judged) -> None:
         """Take a view."""
         result, judge = found.result, self._judge
         view = judge.scene.views[result.index]
-        if not self._untold.add(view.name, result.photograph, found.mask, judge.cfg.loss):
+        tells = tells_exposure(result.photograph, found.mask, judge.cfg.loss)
+        if not tells:
+            self._untold["hidden" if tells is None else "exposures_unknown"].append(view.name)
+        if tells is None:
             return
         self._rows[view.split][view.name] = found.scores
         self._rows[f"{view.split} averaged"][view.name] = found.scores_averaged
@@ -250,17 +253,20 @@ class _Views:
         again = found.radiance is not None or found.reference is not None
         linear = self._arrays.put(result.linear) if again else result.linear
         opacity = [] if judge.store.backdrop is None else [result.alpha]
+
+        def kept(target) -> _Kept:
+            images = (linear, target, found.mask, *opacity)
+            return _Kept(result.index, tuple(map(self._arrays.put, images)))
+
         if found.radiance is not None:
             self._radiance.add(view.name, view.split, linear, found.radiance, found.mask)
         if found.reference is not None:
-            images = (linear, found.reference, found.mask, *opacity)
-            self._references.append((result.index, tuple(map(self._arrays.put, images))))
+            self._references.append(kept(found.reference))
         if view.split == "train":
             self._told.append(judge.row_of[result.index])
-            self._metered.add_training(view.name, found.readings)
+            self._readings[view.name] = found.readings
         else:
-            images = (linear, result.photograph, found.mask, *opacity)
-            self._metered.add_held_out(result.index, found.readings, *images)
+            self._held_out.append((found.readings, kept(result.photograph)))
         if self._drive is not None:
             self._drive.add(result, found.mask)
         exposure = result.transform.exposure
@@ -280,47 +286,65 @@ class _Views:
                 "averaged": summary_of(rows["test averaged"]),
                 "exposure_fitted": summary_of(rows["test"]),
             },
-            **self._untold.to_dict(),
+            **{key: names for key, names in self._untold.items() if names},
         }
         metrics["train"]["per_view"] = per_view
         if rows["all"]:
             metrics["test"]["photometry_fitted"] = summary_of(rows["all"])
-        metering = self._metered.fit(exposures[self._told], judge.mean.gamma, tone)
-        if metered := self._metered.scores(metering, self._under_rule):
-            names = {judge.scene.views[index].name: row for index, row in metered.items()}
-            metrics["test"]["metered"] = summary_of(names)
+        logs, gamma = np.log(np.asarray(exposures, float)), judge.mean.gamma
+        names, readings = list(self._readings), list(self._readings.values())
+        metering = fit_metering(
+            names, readings, logs[self._told], exposed_at(BELOW_WHITE, gamma, tone)
+        )
+        if metering.rule.meters and self._held_out:
+            metrics["test"]["metered"] = summary_of(self._metered(metering))
         metrics["consistency"] = {name: video.summary() for name, video in self._videos.items()}
         if self._radiance.views:
-            exposed = exposed_at(judge.cfg.loss.saturation, judge.mean.gamma, tone)
+            exposed = exposed_at(judge.cfg.loss.saturation, gamma, tone)
             typical = float(np.median(exposures))
             metrics["radiance"] = self._radiance.summary(exposed / typical)
         if drive is not None:
             metrics |= drive.summary()
         if self._references:
             metrics["reference"] = _against_reference(self._references, judge)
-        return Evaluation(metrics, metering, {} if drive is None else drive.unexplained)
+        return Evaluation(metrics, metering)
 
-    def _under_rule(self, index, exposure, linear, photograph, mask, alpha=None) -> dict[str, Any]:
-        shown = replace(self._judge.usual(index), exposure=exposure)
-        return self._judge.scorer(index, photograph, mask)(develop(linear, shown, alpha=alpha))
+    def _metered(self, metering: Metering) -> dict[str, dict[str, Any]]:
+        """Return scores of held-out views by name, under the exposures of the rule."""
+        judge = self._judge
+
+        def judged(view: tuple[Readings, _Kept]) -> dict[str, Any]:
+            exposure, index = metering.exposure(view[0]), view[1].row
+            linear, photograph, mask, alpha = view[1].read()
+            ldr = develop(linear, replace(judge.usual(index), exposure=exposure), alpha=alpha)
+            return {**judge.scorer(index, photograph, mask)(ldr), "exposure": exposure}
+
+        names = [judge.scene.views[kept.row].name for _, kept in self._held_out]
+        return dict(zip(names, map_in_order(judged, self._held_out), strict=True))
 
 
-def _against_reference(
-    views: list[tuple[int, tuple[StoredArray, ...]]], judge: Judge
-) -> dict[str, Any]:
+class _Kept(NamedTuple):
+    """A view until all are known, by its row."""
+
+    row: int
+    images: tuple[StoredArray, ...]  # radiance, photograph, mask; over a background opacity
+
+    def read(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
+        """Return these arrays; without a background the last is None."""
+        linear, photograph, mask, *alpha = (kept.read() for kept in self.images)
+        return linear, photograph, mask, next(iter(alpha), None)
+
+
+def _against_reference(views: list[_Kept], judge: Judge) -> dict[str, Any]:
     """Score all views against photographs of one common exposure.
 
     Those are taken to be what no camera in particular sees: without vignetting, and of mean white
-    balance. Views have their row; radiance, reference photograph and mask, kept; over a background
-    also the opacity.
+    balance.
     """
     shown, mean = judge.usual(None), judge.mean
 
-    def images(view):
-        return (kept.read() for kept in view[1])
-
-    def scale(view) -> float:
-        return with_fitted_exposure(shown, *images(view)).exposure
+    def scale(view: _Kept) -> float:
+        return with_fitted_exposure(shown, *view.read()).exposure
 
     scales = list(map_in_order(scale, views))
     protocols = {
@@ -329,20 +353,17 @@ def _against_reference(
         "scale_aligned": float(np.exp(np.median(np.log(scales)))),
     }
 
-    def judged(view):
-        linear, truth, mask, *alpha = images(view)
-        opacity = next(iter(alpha), None)
-        found = {}
-        for name, exposure in protocols.items():
-            ldr = develop(linear, replace(shown, exposure=exposure), alpha=opacity)
-            found[name] = view_scores(judge.lpips_weights, ldr, truth, mask)
-        return found
+    def judged(view: _Kept) -> dict[str, dict[str, Any]]:
+        linear, truth, mask, alpha = view.read()
+        shows = {name: replace(shown, exposure=e) for name, e in protocols.items()}
+        ldr = {name: develop(linear, how, alpha=alpha) for name, how in shows.items()}
+        return {n: view_scores(judge.lpips_weights, x, truth, mask) for n, x in ldr.items()}
 
     parts: dict[str, dict[str, dict]] = {
         name: {"all": {}, "train": {}, "test": {}} for name in protocols
     }
-    for (index, _), rows in zip(views, map_in_order(judged, views), strict=True):
-        view = judge.scene.views[index]
+    for kept, rows in zip(views, map_in_order(judged, views), strict=True):
+        view = judge.scene.views[kept.row]
         for name, row in rows.items():
             for part in ("all", view.split):
                 parts[name][part][view.name] = row

@@ -173,37 +173,19 @@ def still_mask(
     return still if still.any() else mask
 
 
-@dataclass
-class Untold:
-    """Views that cannot be judged, and photographs whose exposure nothing tells."""
+def tells_exposure(
+    photograph: Float32[np.ndarray, "h w 3"], mask: Float32[np.ndarray, "h w"], loss: LossConfig
+) -> bool | None:
+    """Return whether a photograph of display values tells its exposure.
 
-    # names of views of which masks leave nothing: they have no scores
-    hidden: list[str] = field(default_factory=list)
-    # names of views that are black or saturated everywhere: any exposure that is dark or bright
-    # enough explains them
-    exposures: list[str] = field(default_factory=list)
-
-    def add(
-        self,
-        name: str,
-        photograph: Float32[np.ndarray, "h w 3"],
-        mask: Float32[np.ndarray, "h w"],
-        loss: LossConfig,
-    ) -> bool:
-        """Look at a photograph of display values; return whether its view can be judged."""
-        counted = photograph[mask > 0]
-        if not len(counted):
-            self.hidden.append(name)
-            return False
-        tells = ((counted > loss.black) & (counted < loss.saturation)).any(1)
-        if tells.mean() < FEWEST_TELLING:
-            self.exposures.append(name)
-        return True
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the entries of `metrics.json`; empty where every view tells its exposure."""
-        found = {"hidden": self.hidden, "exposures_unknown": self.exposures}
-        return {key: names for key, names in found.items() if names}
+    One that is black or saturated everywhere does not: any exposure that is dark or bright enough
+    explains it. None: masks leave nothing of it, and its view cannot be judged.
+    """
+    counted = photograph[mask > 0]
+    if not len(counted):
+        return None
+    tells = ((counted > loss.black) & (counted < loss.saturation)).any(1)
+    return bool(tells.mean() >= FEWEST_TELLING)
 
 
 def untold_notes(metrics: dict[str, Any]) -> list[str]:

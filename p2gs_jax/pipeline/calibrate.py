@@ -1,19 +1,21 @@
 """Photometry alone: exposures, gammas and tone curve in seconds, without splatting.
 
-From the tracks of a scene, through the rendered depth of a finished run, or from a stack of
-exposures of one fixed viewpoint; `convert.py` does it for somebody else's splats.
+Observations come from the tracks of a scene, through the rendered depth of a finished run, or from
+a stack of exposures of one fixed viewpoint; from there on all go one way (`solved`). `convert.py`
+does it for somebody else's splats.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import no_empty_folders, write_json
@@ -27,6 +29,7 @@ from p2gs_jax.photometry.calibrate import (
     calibrate_observations,
     options_of,
 )
+from p2gs_jax.photometry.candidates import Candidate
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.solution import Agreement, PhotometricSolution, compare
 from p2gs_jax.photometry.sources.points import has_tracks, rendered_colors, surface_colors
@@ -39,11 +42,16 @@ from p2gs_jax.run.read import load_run
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.exposures import check_source, read_known_exposures, stated_ev
 from p2gs_jax.scene.pixels.store import ImageStore
-from p2gs_jax.types import Scene, View
+from p2gs_jax.types import View
 
 STACK_PIVOT = 0.18
 MEAN_GAUGE = "mean log exposure is 0 over each connected group of views"
 STACK_GAUGE = "mean log exposure is 0; exposures and response can be stretched together"
+# Of a solution, what `calibration.json` holds of it under the same names.
+OF_SOLUTION = (
+    *("residual_ev", "view_residual_ev", "view_balance_ev", "outliers", "component"),
+    "observations_per_view",
+)
 
 
 @dataclass(frozen=True)
@@ -59,10 +67,9 @@ class Calibration:
     gauge: str  # what fixes the scale, in words
     pivot: float  # linear value that gammas leave alone
     messages: tuple[str, ...]  # what the user should know, in plain words
-    details: dict[str, Any]  # the content of `calibration.json`
-    observations: int = 0  # how many were used
-    # of `reading` and sampling, and of the `adjustment`
-    seconds: dict[str, float] = field(default_factory=dict)
+    details: dict[str, Any]  # what `calibration.json` holds besides
+    observations: int  # how many were used
+    seconds: dict[str, float]  # of `reading` and sampling, and of the `adjustment`
     # of `calibrate_of`: what `metrics.json` holds; `of` has the scores of the model as it was
     metrics: dict[str, Any] = field(default_factory=dict)
 
@@ -81,20 +88,16 @@ class Calibration:
         """Standard errors of the recovered exposures, stops; infinite where they are unknown."""
         return self.solution.exposure_errors_ev
 
-
-def write_calibration(result: Calibration, out: Path) -> None:
-    """Write `photometry.json`, `calibration.json` and `calibration.png`."""
-    views, pivot = result.views, result.pivot
-    path = out / "photometry.json"
-    write_solution(path, result.solution, views=views, pivot=pivot, gauge=result.gauge)
-    write_json(out / "calibration.json", result.details)
-    write_calibration_plot(
-        out / "calibration.png",
-        result.solution,
-        cameras=[v.camera for v in views],
-        stated_ev=result.stated_ev,
-        pivot=pivot,
-    )
+    def write(self, out: Path) -> Calibration:
+        """Write `photometry.json`, `calibration.json` and `calibration.png`; return this."""
+        views, pivot, solution = self.views, self.pivot, self.solution
+        path = out / "photometry.json"
+        write_solution(path, solution, views=views, pivot=pivot, gauge=self.gauge)
+        write_json(out / "calibration.json", {"messages": self.messages, **self.details})
+        cameras, stated = [v.camera for v in views], self.stated_ev
+        plot = out / "calibration.png"
+        write_calibration_plot(plot, solution, cameras=cameras, stated_ev=stated, pivot=pivot)
+        return self
 
 
 def calibrate(
@@ -132,9 +135,9 @@ def calibrate(
         observations = surface_colors(
             scene, store, cfg.train.seed, lambda i, n: reporter.stage("Sampling colours", i, n)
         )
-    result = solved(scene, observations, cfg, begin, compare_with, reporter)
-    write_calibration(result, out)
-    return result
+    options, views = options_of(cfg, scene), scene.training_views
+    found = solved(views, observations, options, cfg, begin, compare_with, reporter, scene.notes)
+    return found.write(out)
 
 
 def calibrate_run(
@@ -174,61 +177,55 @@ def calibrate_run(
             f"{run.folder}: no pixel of one view is visible in another.",
             fix="fit longer, or calibrate from the scene's tracks",
         )
-    result = solved(run.scene, observations, cfg, begin, compare_with, reporter)
-    write_calibration(result, Path(out))
-    return result
+    options, views, notes = options_of(cfg, run.scene), run.scene.training_views, run.scene.notes
+    found = solved(views, observations, options, cfg, begin, compare_with, reporter, notes)
+    return found.write(Path(out))
 
 
 def solved(
-    scene: Scene,
+    views: Sequence[View],
     observations: Observations,
+    options: CalibrationOptions,
     cfg: FitConfig,
     begin: float,
     compare_with: str | None,
     reporter: Reporter,
+    notes: Sequence[str] = (),
+    *,
+    gauge: str = MEAN_GAUGE,
+    signal: Bool[np.ndarray, " v"] | bool = True,
 ) -> Calibration:
-    """Solve the photometry of the training views, and compare it with stated exposures."""
+    """Solve the photometry of some views, and compare it with stated exposures.
+
+    Reading began at `begin` (`time.monotonic`); `gauge` says what fixes the scale where `cfg` names
+    no known exposures. Views without `signal` are not compared.
+    """
     sampled = time.monotonic()
     reporter.stage("Photometric bundle adjustment")
-    selection = calibrate_observations(observations, options_of(cfg, scene))
+    selection = calibrate_observations(observations, options)
     seconds = {"reading": sampled - begin, "adjustment": time.monotonic() - sampled}
-    views, s, pivot = tuple(scene.training_views), selection.solution, cfg.photometry.pivot
+    s, known = selection.solution, cfg.photometry.known
     stated = stated_ev(compare_with, list(views))
-    agreement = compare(s.exposures_ev, s.exposure_errors_ev, stated)
-    messages = [*scene.notes, *selection.reasons, *s.warnings]
+    agreement = compare(s.exposures_ev, np.where(signal, s.exposure_errors_ev, np.inf), stated)
+    messages = [*notes, *selection.reasons, *s.warnings]
     if agreement.views:
         by = "EXIF" if compare_with in (None, "exif") else Path(str(compare_with)).name
         messages.append(agreement.sentence(by))
-    names = ("residual_ev", "view_residual_ev", "view_balance_ev", "outliers", "component")
     details = {
-        "messages": messages,
         "observations": len(observations.views),
         "seconds": seconds,
         "solution": s.state,
-        **{name: getattr(s, name) for name in (*names, "observations_per_view")},
+        **{name: getattr(s, name) for name in OF_SOLUTION},
         "agreement": agreement._asdict(),
-        "candidates": [
-            {
-                "model": c.form.model,
-                "white_balance": c.form.white_balance,
-                "vignetting": c.form.vignetting,
-                "curve": c.response.name,
-                "parameters": c.parameters,
-                "density": c.density,
-                "behind": c.deficit,
-                "behind_error": c.deficit_error,
-                "codes": c.difference,
-            }
-            for c in selection.candidates
-        ],
+        "candidates": [_row(candidate) for candidate in selection.candidates],
     }
     return Calibration(
-        views=views,
+        views=tuple(views),
         selection=selection,
         stated_ev=stated + agreement.offset_ev,
         agreement=agreement,
-        gauge=_gauge(cfg, MEAN_GAUGE),
-        pivot=pivot,
+        gauge=gauge if known is None else f"known exposures ({known})",
+        pivot=options.pivot,
         messages=tuple(messages),
         details=details,
         observations=len(observations.views),
@@ -236,9 +233,20 @@ def solved(
     )
 
 
-def _gauge(cfg: FitConfig, free: str) -> str:
-    known = cfg.photometry.known
-    return free if known is None else f"known exposures ({known})"
+def _row(candidate: Candidate) -> dict[str, Any]:
+    """Return what `calibration.json` says of a candidate."""
+    form = candidate.form
+    return {
+        "model": form.model,
+        "white_balance": form.white_balance,
+        "vignetting": form.vignetting,
+        "curve": candidate.response.name,
+        "parameters": candidate.parameters,
+        "density": candidate.density,
+        "behind": candidate.deficit,
+        "behind_error": candidate.deficit_error,
+        "codes": candidate.difference,
+    }
 
 
 def calibrate_stack(
@@ -259,46 +267,30 @@ def calibrate_stack(
     Raises:
         UserError: see `read_stack` and `read_known_exposures`.
     """
-    cfg = require_config(cfg)
+    cfg, begin, reporter = require_config(cfg), time.monotonic(), reporter or Silent()
     p, seed = cfg.photometry, cfg.train.seed
-    (reporter or Silent()).stage("Solving the stack")
-    stack = read_stack(Path(folder))
-    views = list(stack.views)
-    given = None
+    check_source(compare_with)
+    stack, known = read_stack(Path(folder)), None
     if p.known is not None:
-        given = KnownExposures(read_known_exposures(p.known, views), p.known_deviation_ev)
-    stated = stated_ev(compare_with, views)
+        values = read_known_exposures(p.known, list(stack.views))
+        known = KnownExposures(values, p.known_deviation_ev)
     found = stack_colors(stack, seed)
-    options = CalibrationOptions(found.black, SATURATED, STACK_PIVOT, given, seed, "one_response")
-    selection = calibrate_observations(found.observations, options)
-    s, problem = selection.solution, options.problem(found.observations)
-    local_ev = regional_ev(problem, s, found.xy, stack.valid.shape, found.signal)
-    errors_ev = np.where(found.signal, s.exposure_errors_ev, np.inf)
-    agreement = compare(s.exposures_ev, errors_ev, stated)
-    messages = [*selection.reasons, *s.warnings, *_stack_messages(stack.views, found, local_ev)]
-    if agreement.views >= 2:
-        messages.append(agreement.sentence("The stated exposures"))
-    result = Calibration(
-        views=stack.views,
-        selection=selection,
-        stated_ev=stated + agreement.offset_ev,
-        agreement=agreement,
-        gauge=_gauge(cfg, STACK_GAUGE),
-        pivot=STACK_PIVOT,
-        messages=tuple(messages),
-        details={
-            "messages": messages,
-            "signal": found.signal,
-            "shifts": found.shifts,
-            "black": found.black,
-            "one_response": local_ev <= LOCAL_EV,
-            "local_ev": local_ev,
-            "residual_ev": s.residual_ev,
-        },
-    )
-    if out is not None:
-        write_calibration(result, Path(out))
-    return result
+    options = CalibrationOptions(found.black, SATURATED, STACK_PIVOT, known, seed, "one_response")
+    given = (stack.views, found.observations, options, cfg, begin, compare_with, reporter)
+    result = solved(*given, gauge=STACK_GAUGE, signal=found.signal)
+    how = (result.solution, found.xy, stack.valid.shape, found.signal)
+    local_ev = regional_ev(options.problem(found.observations), *how)
+    details = {
+        "signal": found.signal,
+        "shifts": found.shifts,
+        "black": found.black,
+        "one_response": local_ev <= LOCAL_EV,
+        "local_ev": local_ev,
+    }
+    messages = (*result.messages, *_stack_messages(stack.views, found, local_ev))
+    details = {**result.details, **details}
+    result = dataclasses.replace(result, messages=messages, details=details)
+    return result if out is None else result.write(Path(out))
 
 
 def _stack_messages(views: tuple[View, ...], found: StackColors, local_ev: float) -> list[str]:

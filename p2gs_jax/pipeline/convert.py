@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import no_empty_folders
+from p2gs_jax.core.clock import CompileCounter, Stopwatch
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.against import score_foreign
@@ -18,15 +18,15 @@ from p2gs_jax.formats.foreign import read_foreign
 from p2gs_jax.gaussians.bake import relit, viewer_config
 from p2gs_jax.gaussians.dense import coverage_of
 from p2gs_jax.gaussians.seeds import cameras_radius
-from p2gs_jax.photometry.calibrate import Selection
+from p2gs_jax.photometry.calibrate import Selection, options_of
 from p2gs_jax.photometry.display import usual_display
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.parameters import initial_photometry
 from p2gs_jax.photometry.sources.points import has_tracks, rendered_colors, track_colors
-from p2gs_jax.pipeline.calibrate import Calibration, solved, write_calibration
+from p2gs_jax.pipeline.calibrate import Calibration, solved
 from p2gs_jax.pipeline.exposures import decide
-from p2gs_jax.pipeline.finish import Account, finish
-from p2gs_jax.pipeline.fit import Optimiser, begun, compact
+from p2gs_jax.pipeline.finish import finish
+from p2gs_jax.pipeline.fit import Optimiser, account_of, begun, compact
 from p2gs_jax.pipeline.preflight import Paths, check_run_dir
 from p2gs_jax.pipeline.prepare import Prepared
 from p2gs_jax.presets import require_config
@@ -63,7 +63,8 @@ def calibrate_of(
     Raises:
         UserError: something the user can mend.
     """
-    begin, cfg = time.monotonic(), converting(require_config(cfg), steps)
+    begin, compiler = time.monotonic(), CompileCounter()
+    cfg = converting(require_config(cfg), steps)
     reporter, folder, scene_dir = reporter or Silent(), RunFolder(Path(out)), Path(scene_dir)
     check_run_dir(folder.root, False, cfg)
     for source in (cfg.photometry.known, compare_with):
@@ -82,50 +83,25 @@ def calibrate_of(
         before, agreement = score_foreign(foreign, scene, store, viewer_config(cfg.render))
         observations = _seen_through(foreign, scene, store, cfg, reporter)
         _check(observations, agreement, Path(model), scene_dir)
-        found = solved(scene, observations, cfg, begin, compare_with, reporter)
+        options, views = options_of(cfg, scene), scene.training_views
+        given = (views, observations, options, cfg, begin, compare_with, reporter)
+        found = solved(*given, scene.notes)
         start = _converted(foreign, scene, store, found.selection, cfg)
         start.notes += [*scene.notes, *found.selection.reasons, *found.solution.warnings]
         if dropped:
             start.notes.append(f"{dropped} Gaussians of the model are not finite: left out.")
         for note in start.notes:
             reporter.message(note)
-        metrics = _refit(start, folder, Paths(scene_dir, folder.root), cfg, found, before, reporter)
-        write_calibration(found, folder.root)
-        store.close()
+        paths = Paths(scene_dir, folder.root)
+        with Optimiser(folder, reporter) as optimiser, begun(folder, paths, cfg, start.decisions):
+            result = optimiser.run(start)
+        params, _ = compact(result)
+        clock = Stopwatch({"reading": found.seconds["reading"]})
+        clock.add("photometry", found.seconds["adjustment"])
+        account = account_of(start, params, result, clock, begin, compiler, of=before)
+        metrics = finish(params, scene, store, start.cfg, folder, account, reporter)
+        found.write(folder.root)
     return dataclasses.replace(found, metrics=metrics)
-
-
-def _refit(
-    start: Prepared,
-    folder: RunFolder,
-    paths: Paths,
-    cfg: FitConfig,
-    found: Calibration,
-    before: dict[str, Any],
-    reporter: Reporter,
-) -> dict[str, Any]:
-    """Fit colours and opacities under the exposures found; return what `metrics.json` holds."""
-    with Optimiser(folder, reporter) as optimiser, begun(folder, paths, cfg, start.decisions):
-        result = optimiser.run(start)
-    params, _ = compact(result)
-    account = Account(
-        counts={
-            "gaussians": params.gaussians.capacity,
-            "train_views": len(start.scene.train_indices),
-            "test_views": len(start.scene.test_indices),
-            "steps": result.host.step,
-        },
-        seconds={
-            "reading": found.seconds["reading"],
-            "photometry": found.seconds["adjustment"],
-            **result.seconds,
-            "optimisation": result.host.elapsed_s,
-        },
-        selection=start.selection,
-        notes=start.notes,
-        of=before,
-    )
-    return finish(params, start.scene, start.store, start.cfg, folder, account, reporter)
 
 
 def _seen_through(

@@ -7,7 +7,6 @@ from them; where nothing is shared, exposures start at 1 and are learned.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +14,12 @@ from jaxtyping import Float32
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.progress import Reporter, Silent
-from p2gs_jax.photometry.calibrate import Selection, calibrate_observations, options_of
+from p2gs_jax.photometry.calibrate import (
+    OnChosen,
+    Selection,
+    calibrate_observations,
+    options_of,
+)
 from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.parameters import initial_photometry
@@ -29,8 +33,6 @@ from p2gs_jax.types import Photometry, Scene
 
 # Exposures that are learned from nothing move this many times faster (docs/photometry.md, 4).
 FROM_NOTHING = 10.0
-
-OnChosen = Callable[[Form, Response], None]
 
 
 @dataclass(frozen=True)
@@ -134,8 +136,11 @@ def decide(
     )
 
 
-def likely(cfg: FitConfig, kept: Decisions | None) -> Decisions | None:
-    """Return what most scenes decide, to compile for it beforehand; None: who knows."""
+def likely(cfg: FitConfig, kept: Decisions | None, near: float | None = None) -> Decisions | None:
+    """Return what most scenes decide, to compile for it beforehand; None: who knows.
+
+    `near` is the near plane, where that is decided.
+    """
     p, relative = cfg.photometry, cfg.loss.relative_exposure
     if p.known is not None or relative.weight is not None or cfg.densify.method != "mcmc":
         return None
@@ -143,7 +148,7 @@ def likely(cfg: FitConfig, kept: Decisions | None) -> Decisions | None:
     solved = p.start == "tracks" and (p.vignetting is not None or p.responses != "all")
     if kept is None and not p.select and solved:
         return None
-    decided = Decisions.as_asked(cfg)
+    decided = dataclasses.replace(Decisions.as_asked(cfg), near=near)
     if kept is not None:
         chosen = ("model", "curve", "spline", "white_balance", "vignetting", "responses", "cameras")
         return dataclasses.replace(decided, **{name: getattr(kept, name) for name in chosen})

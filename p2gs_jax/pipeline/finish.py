@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
-import threading
-from collections.abc import Callable, Collection, Mapping
+import functools
+import shutil
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,7 +21,6 @@ from p2gs_jax.evaluation.scores import ViewResult, is_drive, untold_notes
 from p2gs_jax.photometry.calibrate import Selection
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.folder import RunFolder
-from p2gs_jax.run.plots import write_unexplained
 from p2gs_jax.run.write import summary_rows, write_run, write_view
 from p2gs_jax.scene.pixels.store import ImageStore, size_at
 from p2gs_jax.types import Params, Scene
@@ -39,35 +38,6 @@ class Account:
     # what the user was told; what the evaluation finds is added
     notes: list[str] = field(default_factory=list)
     of: dict | None = None  # scores of the model that was converted, as it was; None: this is a fit
-
-
-class _Shown:
-    """Writes held-out views as they are judged, and keeps those of the summary."""
-
-    def __init__(self, scene: Scene, store: ImageStore, folder: RunFolder, watch: Stopwatch):
-        self._scene, self._store, self._folder, self._watch = scene, store, folder, watch
-        self._summary: dict[int, ViewResult | None] = dict.fromkeys(summary_rows(scene))
-        self._fitted: dict[int, float] = {}
-        _import_ahead("matplotlib.figure")
-
-    def add(self, result: ViewResult) -> None:
-        """Take a view."""
-        view = self._scene.views[result.index]
-        if view.split == "test":
-            self._fitted[result.index] = result.transform.exposure
-            with self._watch("files"):
-                write_view(self._folder.renders, view.name, result, self._store)
-        if result.index in self._summary:
-            self._summary[result.index] = result
-
-    def fitted(self, hidden: Collection[str]) -> dict[int, float]:
-        """Return the exposures of held-out views by row, but those of `hidden` names."""
-        views = self._scene.views
-        return {row: e for row, e in self._fitted.items() if views[row].name not in hidden}
-
-    def summary(self) -> list[ViewResult]:
-        """Return the views of the summary, in its order."""
-        return [result for result in self._summary.values() if result is not None]
 
 
 def finish(
@@ -88,11 +58,13 @@ def finish(
     """Evaluate, write all results and return what `metrics.json` holds.
 
     Gaussians are the live ones, `owner` says which moving object each belongs to, and `cfg` is what
-    the fit computed under; `still_ours` raises where the run folder is no longer this run's.
+    the fit computed under; `still_ours` raises where the run folder is no longer this run's. The
+    store is closed.
     """
-    watch = Stopwatch()
+    still_ours()
     return_freed_memory()
-    views = _Shown(scene, store, folder, watch)
+    watch, exposures = Stopwatch(), {}
+    shown: dict[int, ViewResult | None] = dict.fromkeys(summary_rows(scene))
     with watch("evaluation"):
         found = evaluate(
             params,
@@ -103,13 +75,14 @@ def finish(
             reference=truth,
             radiance=find_radiance(scene, store),
             lpips_weights=lpips_weights,
-            on_view=views.add,
+            on_view=functools.partial(_take, exposures, shown, scene, store, folder, watch),
             on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
         )
     metered = [found.metering.sentence] if found.metering.telling else []
     _tell([*untold_notes(found.metrics), *metered], account, reporter)
     watch.add("evaluation", -watch.seconds.get("files", 0.0))  # views are written meanwhile
     reporter.stage("Writing files")
+    hidden = found.metrics.get("hidden", ())
     with watch("files"):
         write_run(
             folder,
@@ -118,18 +91,38 @@ def finish(
             cfg,
             owner=owner,
             moving=store.moving,
-            fitted=views.fitted(found.metrics.get("hidden", ())),
+            fitted={r: e for r, e in exposures.items() if scene.views[r].name not in hidden},
             unknown=found.metrics.get("exposures_unknown", ()),
             solution=None if account.selection is None else account.selection.solution,
-            shown=views.summary(),
+            shown=[result for result in shown.values() if result is not None],
             metering=found.metering,
             true_exposures=true_exposures,
         )
-        write_unexplained(folder.unexplained, scene, store, found.unexplained)
     metrics = found.metrics | _accounted(account, watch, scene, cfg, reporter)
     still_ours()
     write_json(folder.metrics, metrics)
+    store.close()
+    shutil.rmtree(folder.pixels, ignore_errors=True)
     return metrics
+
+
+def _take(
+    exposures: dict[int, float],
+    shown: dict[int, ViewResult | None],
+    scene: Scene,
+    store: ImageStore,
+    folder: RunFolder,
+    watch: Stopwatch,
+    result: ViewResult,
+) -> None:
+    """Write a held-out view and note its exposure; keep a view of the summary."""
+    view = scene.views[result.index]
+    if view.split == "test":
+        exposures[result.index] = result.transform.exposure
+        with watch("files"):
+            write_view(folder.renders, view.name, result, store)
+    if result.index in shown:
+        shown[result.index] = result
 
 
 def _tell(notes: list[str], account: Account, reporter: Reporter) -> None:
@@ -161,11 +154,6 @@ def _accounted(
     if account.selection is not None:
         entries["photometry"] = account.selection.solution.state
     return entries if account.of is None else {**entries, "of": account.of}
-
-
-def _import_ahead(module: str) -> None:
-    """Import what is needed later in a thread: while programs compile, Python has time for it."""
-    threading.Thread(target=importlib.import_module, args=(module,), daemon=True).start()
 
 
 def seconds_to_finish(

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import shutil
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import numpy as np
@@ -21,16 +20,19 @@ from p2gs_jax.core.clock import CompileCounter, Stopwatch
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.appearance import Formation, exposures_apart
-from p2gs_jax.photometry.calibrate import Selection
+from p2gs_jax.photometry.calibrate import OnChosen, Selection
+from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.parameters import recentre
-from p2gs_jax.pipeline.exposures import kept_choice
+from p2gs_jax.photometry.response import Response
+from p2gs_jax.pipeline.exposures import kept_choice, likely, solve_exposures, with_choice
 from p2gs_jax.pipeline.finish import Account, finish, seconds_to_finish
 from p2gs_jax.pipeline.preflight import Paths, check_run_dir, check_scene, memory_named, preflight
-from p2gs_jax.pipeline.prepare import Prepared, load, prepare
+from p2gs_jax.pipeline.prepare import Prepared, expected, initialise
+from p2gs_jax.pipeline.survey import Survey, load, survey
 from p2gs_jax.presets import require_config
 from p2gs_jax.run.checkpoint import saved_steps
 from p2gs_jax.run.decisions import Decisions
-from p2gs_jax.run.folder import RunFolder, RunLock, locked, require_free
+from p2gs_jax.run.folder import RunFolder, locked
 from p2gs_jax.run.write import write_start
 from p2gs_jax.train.data_parallel import mesh_of
 from p2gs_jax.train.inputs import TrainingViews
@@ -85,42 +87,33 @@ def fit(
         OSError: something cannot be read or written; `filename` names it.
     """
     cfg, reporter = require_config(cfg), reporter or Silent()
-    paths = Paths(Path(scene_dir), Path(run_dir), None if reference is None else Path(reference))
+    paths = Paths.of(scene_dir, run_dir, reference)
     folder, begin = RunFolder(paths.run), time.monotonic() - spent_s
-    require_free(paths.run)
     weights = preflight(cfg, paths, resume=resume)
-    mesh, clock, compiler = mesh_of(cfg, devices), Stopwatch(), CompileCounter()
-    if spent_s:
-        clock.add("starting", spent_s)
-    with no_empty_folders(paths.run), locked(paths.run) as lock, memory_named():
+    clock, compiler = Stopwatch({"starting": spent_s} if spent_s else {}), CompileCounter()
+    optimiser = Optimiser(folder, reporter, mesh_of(cfg, devices), Own(terms, formation, strategy))
+    with no_empty_folders(paths.run), locked(paths.run) as lock, memory_named(), optimiser:
         check_run_dir(paths.run, resume, cfg)  # another may have ended since
-        scene = _read(paths, cfg, reporter, clock)
+        scene = load(paths.scene, paths.run, cfg, reporter, clock)
         truth = check_scene(scene, cfg, paths, weights)
         kept = kept_choice(cfg, folder) if resume else None
-        with Optimiser(folder, reporter, mesh, Own(terms, formation, strategy)) as optimiser:
-            start = prepare(
-                scene, cfg, reporter, clock, optimiser.begin, kept=kept, pixels=folder.pixels
-            )
-            lock.require()
-            reserve_s = seconds_to_finish(scene, cfg, weights, reference=truth is not None)
-            with begun(folder, paths, cfg, start.decisions), memory_named():
-                spent_s = time.monotonic() - begin
-                result = optimiser.run(start, resume=resume, spent_s=spent_s, reserve_s=reserve_s)
+        with clock("photometry"):
+            found = survey(scene, cfg, pixels=folder.pixels)
+            how = {"on_chosen": optimiser.expect(found, kept), "dense": found.dense, "kept": kept}
+            exposures = solve_exposures(scene, found.still, cfg, reporter, **how)
+        with clock("seeds"):
+            start = initialise(found, exposures, reporter)
+        lock.require()
+        left_s = seconds_to_finish(scene, cfg, weights, reference=truth is not None)
+        with begun(folder, paths, cfg, start.decisions):
+            spent_s = time.monotonic() - begin
+            result = optimiser.run(start, resume=resume, spent_s=spent_s, finish_s=left_s)
+        params, owner = fitted(result, cfg)
+        account = account_of(start, params, result, clock, begin, compiler)
+        what = (params, start.scene, start.store, start.cfg, folder, account, reporter)
         known = {"truth": truth, "lpips_weights": weights, "true_exposures": true_exposures}
-        params, metrics = _finished(
-            start, result, cfg, folder, clock, begin, compiler, reporter, lock, **known
-        )
+        metrics = finish(*what, owner=owner, still_ours=lock.require, **known)
     return FitResult(params, scene, metrics, paths.run, start.selection, start.decisions)
-
-
-def _read(paths: Paths, cfg: FitConfig, reporter: Reporter, clock: Stopwatch) -> Scene:
-    """Read the scene and say where the time went."""
-    reading = time.monotonic()
-    scene = load(paths.scene, paths.run, cfg, reporter)
-    # Without a model, nearly all of it is finding and matching features.
-    found = scene.format in ("images", "transforms")
-    clock.add("structure_from_motion" if found else "reading", time.monotonic() - reading)
-    return scene
 
 
 class Optimiser:
@@ -147,13 +140,30 @@ class Optimiser:
     def __exit__(self, *exc) -> None:
         self._programs.close()
 
-    def begin(self, known: Prepared, curve: bool) -> None:
+    def expect(
+        self, found: Survey, kept: Decisions | None = None, given: Decisions | None = None
+    ) -> OnChosen:
         """Begin to compile steps while the exposures are solved, mostly on one core.
 
-        `curve` says whether the tone curve of what is known is chosen.
+        Model and curve are those that checkpoints `kept`, or that are `given` for a whole of which
+        the scene is a part; else most scenes' choice, and what is returned takes the scene's own.
         """
-        trainer = self._trainer(known, Silent())
-        trainer.expect(self._own.among(known.params), known.owner, curve)
+        guess = given or likely(found.cfg, kept, found.near)
+
+        def begin(decisions: Decisions, curve_known: bool) -> None:
+            start = expected(found, decisions)
+            self._trainer(start, Silent()).expect(
+                self._own.among(start.params), start.owner, curve_known
+            )
+
+        def chosen(form: Form, response: Response) -> None:
+            # What cameras do enters the programs, and is only solved now.
+            if guess is not None and form.vignetting is None and response.by == "all":
+                begin(with_choice(guess, form, response), True)
+
+        if guess is not None:
+            begin(guess, bool(kept or given) or not found.cfg.photometry.select)
+        return chosen
 
     def run(
         self,
@@ -161,17 +171,17 @@ class Optimiser:
         *,
         resume: bool = False,
         spent_s: float = 0.0,
-        reserve_s: float = 0.0,
+        finish_s: float = 0.0,
     ) -> TrainResult:
         """Run the optimisation, from the start or from the newest checkpoint.
 
         What the steps have to say is noted in `start` as well. Of the budget, `spent_s` seconds are
-        gone and `reserve_s` are kept for evaluation and files.
+        gone and `finish_s` are kept for evaluation and files.
         """
         alive = np.ones(start.params.gaussians.capacity, bool)
-        params, owner = self._own.among(start.params), start.owner
-        how = {"resume": resume, "spent_s": spent_s, "finish_s": reserve_s}
-        return self._trainer(start, self._reporter).run(params, alive, owner, **how)
+        params, how = self._own.among(start.params), {"spent_s": spent_s, "finish_s": finish_s}
+        trainer = self._trainer(start, self._reporter)
+        return trainer.run(params, alive, start.owner, resume=resume, **how)
 
     def _trainer(self, start: Prepared, reporter: Reporter) -> Trainer:
         def say(text: str) -> None:
@@ -205,6 +215,12 @@ def compact(result: TrainResult) -> tuple[Params, np.ndarray | None]:
     return dataclasses.replace(params, gaussians=gaussians), owner
 
 
+def fitted(result: TrainResult, cfg: FitConfig) -> tuple[Params, np.ndarray | None]:
+    """Return the results of a fit under the options as asked, and whose each Gaussian is."""
+    params, owner = compact(result)
+    return centred(exposures_apart(params), cfg), owner
+
+
 def centred(params: Params, cfg: FitConfig) -> Params:
     """Return parameters in the gauge of results: exposures of mean 1, unless some are known."""
     if cfg.photometry.parameterization == "log" and cfg.photometry.known is None:
@@ -212,26 +228,24 @@ def centred(params: Params, cfg: FitConfig) -> Params:
     return params
 
 
-def _finished(
+def account_of(
     start: Prepared,
+    params: Params,
     result: TrainResult,
-    asked: FitConfig,
-    folder: RunFolder,
     clock: Stopwatch,
     begin: float,
     compiler: CompileCounter,
-    reporter: Reporter,
-    lock: RunLock,
-    **known: Any,
-) -> tuple[Params, dict]:
-    """Judge and write what the steps left; what else is `known` is as for `finish`."""
-    params, owner = compact(result)
-    params = centred(exposures_apart(params), asked)
-    lock.require()
-    account = Account(
+    of: dict | None = None,
+) -> Account:
+    """Return what a fit says of itself; it began at `begin` (`time.monotonic`).
+
+    `of` are the scores of the model that was converted, as it was.
+    """
+    seeds = {} if of is not None else {"seed_points": len(start.scene.points)}
+    return Account(
         counts={
             "gaussians": params.gaussians.capacity,
-            "seed_points": len(start.scene.points),
+            **seeds,
             "train_views": len(start.scene.train_indices),
             "test_views": len(start.scene.test_indices),
             "steps": result.host.step,
@@ -247,12 +261,8 @@ def _finished(
         compiler=compiler,
         selection=start.selection,
         notes=start.notes,
+        of=of,
     )
-    what = (params, start.scene, start.store, start.cfg, folder, account, reporter)
-    metrics = finish(*what, owner=owner, still_ours=lock.require, **known)
-    start.store.close()
-    shutil.rmtree(folder.pixels, ignore_errors=True)
-    return params, metrics
 
 
 @contextlib.contextmanager
@@ -263,7 +273,8 @@ def begun(folder: RunFolder, paths: Paths, cfg: FitConfig, decisions: Decisions)
     """
     write_start(folder, paths.scene, paths.reference, cfg, decisions)
     try:
-        yield
+        with memory_named():
+            yield
     except UserError:
         if not saved_steps(folder.checkpoints):
             for path in (folder.config, folder.decisions):

@@ -9,7 +9,6 @@ decoded. On a GPU Gaussians and the pixels of a view are the device's, and are n
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,15 +19,14 @@ import jax
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import plain
 from p2gs_jax.core.memory import left_to_process, ran_out, resident
-from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.lpips import LpipsWeights, read_lpips_weights
 from p2gs_jax.evaluation.references import Reference, check_reference, load_reference
 from p2gs_jax.gaussians.dense import seed_bound
 from p2gs_jax.gaussians.population import Coverage
-from p2gs_jax.presets import from_dict as config_from_dict
-from p2gs_jax.presets import to_dict as config_to_dict
-from p2gs_jax.run.folder import RunFolder
+from p2gs_jax.presets import flat, to_dict
+from p2gs_jax.run.folder import RunFolder, require_free
+from p2gs_jax.run.read import read_config
 from p2gs_jax.scene.exposures import check_source, read_known_exposures
 from p2gs_jax.scene.pixels.store import size_at
 from p2gs_jax.types import Scene
@@ -38,7 +36,6 @@ OF_PROGRAMS = 0.8e9
 A_PARAMETER = 37  # with its moments, gradient and the copies of a densification
 A_PIXEL = 650
 A_PHOTOGRAPH_PIXEL = 7
-FEWEST_GAUSSIANS = 1000
 OPTIONS = "--gaussians, --max-width or --data.cache-mb"
 
 
@@ -50,6 +47,11 @@ class Paths:
     run: Path
     reference: Path | None = None
 
+    @classmethod
+    def of(cls, scene: str | Path, run: str | Path, reference: str | Path | None = None) -> Paths:
+        """Return paths that a caller may have given as text."""
+        return cls(Path(scene), Path(run), None if reference is None else Path(reference))
+
 
 def preflight(cfg: FitConfig, paths: Paths, *, resume: bool = False) -> LpipsWeights | None:
     """Refuse what can be refused without the scene; nothing is written.
@@ -59,14 +61,15 @@ def preflight(cfg: FitConfig, paths: Paths, *, resume: bool = False) -> LpipsWei
 
     Raises:
         UserError: an option contradicts another, a file it names cannot be used, or the run folder
-            holds another run.
+            holds another run or is in use.
     """
+    require_free(paths.run)
     check_options(cfg)
     check_run_dir(paths.run, resume, cfg)
     check_source(cfg.photometry.known)
     check_reference(paths.reference)
-    path = cfg.evaluation.lpips_weights
-    return None if path is None else read_lpips_weights(path)
+    name = cfg.evaluation.lpips_weights
+    return None if name is None else read_lpips_weights(name)
 
 
 def check_scene(
@@ -149,39 +152,15 @@ def check_run_dir(run_dir: Path, resume: bool, cfg: FitConfig) -> None:
             f"{run_dir} already holds a run.",
             fix="add --resume to continue it, or name another folder with --out",
         )
-    try:
-        saved = plain(config_to_dict(config_from_dict(parse_json(path.read_text())["fit"])))
-    except json.JSONDecodeError as error:
-        raise UserError(
-            f"{path} cannot be read ({error}).",
-            fix="remove it and repeat the options the run was begun with: --resume then goes on",
-        ) from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise UserError(
-            f"{path} cannot be read ({error}).", fix="start again in another folder"
-        ) from error
-    now = plain(config_to_dict(cfg))
-    for options in (saved, now):
-        options.pop("evaluation", None)
-        options.get("data", {}).pop("cache_mb", None)
-    other = _differences(saved, now)
-    if other:
+    saved, now = (flat(plain(to_dict(options))) for options in (read_config(path)[1], cfg))
+    free = [name for name in now if name == "data.cache_mb" or name.startswith("evaluation.")]
+    differ = [name for name in sorted({*saved, *now} - {*free}) if saved.get(name) != now.get(name)]
+    if differ:
+        other = [f"{name} was {saved.get(name)}, now {now.get(name)}" for name in differ]
         raise UserError(
             f"{run_dir} was begun with other options: {'; '.join(other[:6])}.",
             fix="repeat the options it was begun with, or name another folder with --out",
         )
-
-
-def _differences(saved: dict, now: dict, prefix: str = "") -> list[str]:
-    """Return "name: then, now" for every value that differs."""
-    out = []
-    for key in sorted(set(saved) | set(now)):
-        a, b = saved.get(key), now.get(key)
-        if isinstance(a, dict) and isinstance(b, dict):
-            out += _differences(a, b, f"{prefix}{key}.")
-        elif a != b:
-            out.append(f"{prefix}{key} was {a}, now {b}")
-    return out
 
 
 class MemoryNeeded(NamedTuple):
@@ -229,7 +208,7 @@ def require_memory(needed: MemoryNeeded) -> None:
         f"this fit would take about {_gb(needed.total)} of memory at its peak ({needed.population} "
         f"Gaussians {_gb(needed.gaussians)}, photographs {_gb(needed.photographs)}, pixels of a "
         f"view {_gb(needed.view)}, programs {_gb(needed.programs)}), and there are {_gb(room)}.",
-        fix=_way_on(needed, room),
+        fix=f"lower {OPTIONS}, or end other programs",
     )
 
 
@@ -250,25 +229,6 @@ def memory_named() -> Iterator[None]:
             f"memory ran out ({said}).",
             fix=f"lower {OPTIONS}, in a new folder, or end other programs and add --resume",
         ) from error
-
-
-def _way_on(needed: MemoryNeeded, room: float) -> str:
-    """Return which option brings a fit into the room there is, the largest part's first."""
-    ways = (
-        (needed.gaussians, "--gaussians {}", needed.population, FEWEST_GAUSSIANS),
-        (needed.photographs, "--data.cache-mb {}", needed.photographs / 2**20, 1),
-    )
-    for part, option, now, least in sorted(ways, key=lambda way: -way[0]):
-        share = 1 - (needed.total - room) / part if part else 0.0
-        if share * now >= least:
-            return f"add {option.format(_rounded(share * now))}, or end other programs"
-    return f"lower {OPTIONS}, or end other programs"
-
-
-def _rounded(value: float) -> int:
-    """Return a whole number of two digits, not above."""
-    step = 10 ** max(len(str(int(value))) - 2, 0)
-    return int(value) // step * step
 
 
 def _gb(size: float) -> str:

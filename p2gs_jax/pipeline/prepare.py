@@ -1,41 +1,31 @@
-"""Everything before the first optimisation step: scene, exposures, radiances, Gaussians.
-
-`survey` finds what a scene offers without its exposures, `solve_exposures` solves these, and
-`initialise` makes Gaussians of both; `prepare` is the three in a row.
-"""
+"""What the first optimisation step starts from: Gaussians of a scene whose exposures are known."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import Float32
 
 from p2gs_jax.config import FitConfig
-from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.core.runtime import return_freed_memory
 from p2gs_jax.core.streams import Stream
-from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.dense import DenseSeeds, dense_limit, dense_seeds, gaussians_of
 from p2gs_jax.gaussians.matching import Tones, rough_tones
 from p2gs_jax.gaussians.moving import Nodes, node_gaussians, nodes_radiance, with_vibration
 from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.gaussians.seeds import merge, photographed_radiance, subsample, with_colors
-from p2gs_jax.gaussians.shell import Shell, Sphere, black_gaussians, find_shell, shell_gaussians
+from p2gs_jax.gaussians.shell import Shell, black_gaussians, find_shell, shell_gaussians
 from p2gs_jax.photometry.calibrate import Selection
-from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.parameters import initial_appearance, initial_photometry, point_radiance
-from p2gs_jax.photometry.response import Response
-from p2gs_jax.pipeline.exposures import Exposures, likely, solve_exposures, with_choice
-from p2gs_jax.pipeline.survey import Survey, survey
+from p2gs_jax.pipeline.exposures import Exposures
+from p2gs_jax.pipeline.survey import Survey
 from p2gs_jax.run.decisions import Decisions
-from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.train.exposure_loss import ColorPairs, color_pairs
 from p2gs_jax.train.lidar_depths import KeptDepths
@@ -65,81 +55,7 @@ class Prepared:
         return camera_of(self.fitted, index), *self.fitted.get(index)
 
 
-def load(scene_dir: Path, run_dir: Path, cfg: FitConfig, reporter: Reporter) -> Scene:
-    """Read a scene of any known format and check that there is something to fit.
-
-    Raises:
-        UserError: it cannot be read, or has fewer than two training views or no seed points.
-    """
-    reporter.stage("Reading the scene")
-    scene = load_scene(scene_dir, cfg.data, run_dir / "cache", reporter.message)
-    if len(scene.train_indices) < 2:
-        raise UserError(
-            f"{scene_dir} has {len(scene.train_indices)} training view(s); a fit needs two.",
-            fix="add photographs, or hold out fewer with --test-every 0",
-        )
-    if len(scene.points) == 0:
-        raise UserError(
-            f"{scene_dir} has no seed points.",
-            fix="check the poses and that the photographs overlap",
-        )
-    held = len(scene.test_indices)
-    reporter.message(f"Held out: {held} of {len(scene.views)} views ({scene.split_by}).")
-    return scene
-
-
-def prepare(
-    scene: Scene,
-    cfg: FitConfig,
-    reporter: Reporter,
-    clock: Stopwatch | None = None,
-    on_expected: Callable[[Prepared, bool], None] = lambda expected, curve_known: None,
-    *,
-    kept: Decisions | None = None,
-    pixels: Path | None = None,
-    given: Exposures | None = None,
-    sphere: Sphere | None = None,
-) -> Prepared:
-    """Start exposures, radiances and Gaussians from what the scene offers.
-
-    The clock receives the seconds of `photometry` and `seeds`; `on_expected`, what can be told
-    before the exposures are solved, where that is much: parameters of the right shapes, and whether
-    their tone curve is chosen. Model and curve stay that the checkpoints of a resumed run `kept`.
-    The folder `pixels` is for decoded photographs that are more than memory holds. Of a part of a
-    scene, `given` is what was solved for the whole, which puts what lies behind all on `sphere`.
-
-    Raises:
-        UserError: there is not the memory for it, nothing to see, no room on the disk for
-            decoded photographs, or two backgrounds.
-    """
-    clock = clock or Stopwatch()
-    with clock("photometry"):
-        found = survey(scene, cfg, pixels=pixels, sphere=sphere)
-        guess = likely(cfg, kept) if given is None else given.decisions
-        expected: Prepared | None = None
-        if guess is not None:
-            expected = expect(
-                found, guess if given else dataclasses.replace(guess, near=found.near)
-            )
-            on_expected(expected, bool(kept or given) or not cfg.photometry.select)
-
-        def chosen(form: Form, response: Response) -> None:
-            # What cameras do enters the programs, and is only solved now.
-            if expected is not None and form.vignetting is None and response.by == "all":
-                decisions = with_choice(expected.decisions, form, response)
-                on_expected(expect(found, decisions), True)
-
-        exposures = given
-        if exposures is None:
-            exposures = solve_exposures(
-                scene, found.still, cfg, reporter, on_chosen=chosen, dense=found.dense, kept=kept
-            )
-        return_freed_memory()
-    with clock("seeds"):
-        return initialise(found, exposures, reporter)
-
-
-def expect(found: Survey, decisions: Decisions) -> Prepared:
+def expected(found: Survey, decisions: Decisions) -> Prepared:
     """Return what a fit will start from in its shapes: black Gaussians, exposures of 1."""
     scene, cfg, views = found.scene, found.cfg, found.scene.training_views
     black = black_gaussians(scene.points[found.seeds], found.shell, views, cfg)
@@ -151,22 +67,13 @@ def expect(found: Survey, decisions: Decisions) -> Prepared:
             black, found.nodes, np.zeros_like(found.nodes.points), views, cfg
         )
     photometry = initial_photometry(None, [v.camera for v in views], decisions.resolve(cfg))
-    return Prepared(
-        scene=scene,
-        store=found.store,
-        fitted=found.fitted,
-        params=Params(black, photometry, initial_appearance(views, cfg)),
-        extent=found.extent,
-        coverage=found.coverage,
-        decisions=decisions,
-        cfg=decisions.resolve(cfg),
-        owner=owner,
-        measured=found.measured,
-    )
+    params = Params(black, photometry, initial_appearance(views, cfg))
+    return _prepared(found, params, decisions, scene=scene, owner=owner)
 
 
 def initialise(found: Survey, exposures: Exposures, reporter: Reporter | None = None) -> Prepared:
     """Make Gaussians of the seeds of a scene whose exposures are known."""
+    return_freed_memory()  # what solving the exposures took
     reporter, scene, nodes = reporter or Silent(), found.scene, found.nodes
     decisions = exposures.decisions
     if exposures.radiance is None:
@@ -199,21 +106,24 @@ def initialise(found: Survey, exposures: Exposures, reporter: Reporter | None = 
     for note in notes:
         reporter.message(note)
     appearance = initial_appearance(views, cfg, lambda k: found.fitted.get(scene.train_indices[k]))
-    return Prepared(
+    return _prepared(
+        found,
+        Params(gaussians, photometry, appearance),
+        decisions,
         scene=scene,
-        store=found.store,
-        fitted=found.fitted,
-        params=Params(gaussians, photometry, appearance),
-        extent=found.extent,
-        coverage=found.coverage,
-        decisions=decisions,
-        cfg=cfg,
         owner=owner,
         selection=exposures.selection,
         pairs=color_pairs(exposures.observations, cfg),
-        measured=found.measured,
         notes=notes,
     )
+
+
+def _prepared(found: Survey, params: Params, decisions: Decisions, **more: Any) -> Prepared:
+    """Return these with what the survey found."""
+    names = ("store", "fitted", "extent", "coverage", "measured")
+    kept = {name: getattr(found, name) for name in names}
+    cfg = decisions.resolve(found.cfg)
+    return Prepared(params=params, decisions=decisions, cfg=cfg, **kept, **more)
 
 
 def _matched(found: Survey, exposures: Exposures, cfg: FitConfig, reporter: Reporter) -> DenseSeeds:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from p2gs_jax.config import FitConfig, InitConfig
+from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.numerics import evenly_spaced
+from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.dense import coverage_of, wants_dense
 from p2gs_jax.gaussians.moving import Nodes, clock_of, find_nodes, vibrates
@@ -20,6 +23,7 @@ from p2gs_jax.gaussians.seeds import camera_centers, cameras_radius, subsample
 from p2gs_jax.gaussians.shell import Shell, Sphere, find_shell
 from p2gs_jax.pipeline.preflight import memory_needed, require_memory
 from p2gs_jax.render.warp import project_points
+from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.visibility import SHARE_POINTS, SHARE_VIEWS, in_frame
 from p2gs_jax.train.lidar_depths import KeptDepths, measured_depths
@@ -59,10 +63,48 @@ class Survey:
     seed_notes: list[str]
 
 
+def load(
+    scene_dir: Path,
+    run_dir: Path,
+    cfg: FitConfig,
+    reporter: Reporter | None = None,
+    clock: Stopwatch | None = None,
+) -> Scene:
+    """Read a scene of any known format and check that there is something to fit.
+
+    Raises:
+        UserError: it cannot be read, or has fewer than two training views or no seed points.
+    """
+    reporter, begin = reporter or Silent(), time.monotonic()
+    reporter.stage("Reading the scene")
+    scene = load_scene(scene_dir, cfg.data, run_dir / "cache", reporter.message)
+    held, count = len(scene.test_indices), len(scene.train_indices)
+    if count < 2:
+        raise UserError(
+            f"{scene_dir} has {count} training view(s); a fit needs two.",
+            fix="add photographs, or hold out fewer with --test-every 0",
+        )
+    if len(scene.points) == 0:
+        raise UserError(
+            f"{scene_dir} has no seed points.",
+            fix="check the poses and that the photographs overlap",
+        )
+    reporter.message(f"Held out: {held} of {len(scene.views)} views ({scene.split_by}).")
+    if clock is not None:
+        # Without a model, nearly all of it is finding and matching features.
+        found = scene.format in ("images", "transforms")
+        name = "structure_from_motion" if found else "reading"
+        clock.add(name, time.monotonic() - begin)
+    return scene
+
+
 def survey(
     scene: Scene, cfg: FitConfig, *, pixels: Path | None = None, sphere: Sphere | None = None
 ) -> Survey:
-    """Find what a scene offers without its exposures; see `prepare`.
+    """Find what a scene offers without its exposures.
+
+    The folder `pixels` is for decoded photographs that are more than memory holds. What lies behind
+    all goes on `sphere`, where the whole of which the scene is a part has one.
 
     Raises:
         UserError: there is not the memory for a fit, nothing to see, or two backgrounds.

@@ -12,12 +12,13 @@ import numpy as np
 from p2gs_jax.core.atomic import write_text
 from p2gs_jax.core.text import escaped, markdown_table
 from p2gs_jax.errors import UserError
+from p2gs_jax.presets import flat
 from p2gs_jax.report import page as html
 from p2gs_jax.report.findings import DESCRIPTIONS, seconds_of, true_error
 from p2gs_jax.report.page import listed, paragraph, text
 from p2gs_jax.report.pictures import jpeg, read_png, spread
 from p2gs_jax.report.run_files import RunFiles, read_run
-from p2gs_jax.report.run_sections import flat, option_text
+from p2gs_jax.report.run_sections import option_text
 from p2gs_jax.synth.sensor import read_true_exposures
 
 MOST_VIEWS = 4

@@ -51,7 +51,6 @@ def report_page(run: RunFiles, scene: SceneMeasurements) -> str:
     views = pictures.held_out_comparisons(run, MOST_COMPARED, problems) or list(scene.comparisons)
     kind = "Training views" if views and views[0].split == "train" else "Held-out views"
     found = run_warnings(run, scene)
-    unexplained = sections.unexplained_section(run, problems)
     shown = [
         ("watch", "What to watch", _warnings(found, run, [*scene.missing, *problems])),
         ("model", "What was modelled, and why", photometry.model_section(run)),
@@ -62,7 +61,6 @@ def report_page(run: RunFiles, scene: SceneMeasurements) -> str:
         ("vignetting", "Vignetting", photometry.vignetting_section(run)),
         ("seams", "Seams before and after", scenes.seam_section(scene)),
         ("views", kind, pictures.comparison_section(views, len(run.held_out))),
-        ("unexplained", "What no static scene explains", unexplained),
         ("hdr", "Radiance in stops", pictures.hdr_section(run, views)),
         ("scores", "Scores", sections.score_section(run)),
         ("parts", "What stands, and what moves", sections.parts_section(run)),

@@ -11,13 +11,11 @@ import numpy as np
 
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.protocols import PROTOCOLS
-from p2gs_jax.presets import preset, to_dict
+from p2gs_jax.presets import flat, preset, to_dict
 from p2gs_jax.report.charts import training_chart
 from p2gs_jax.report.findings import column, duration, seconds_of
-from p2gs_jax.report.page import figure, folded, paragraph, row, table, text
-from p2gs_jax.report.pictures import jpeg, read_png
+from p2gs_jax.report.page import figure, folded, paragraph, table, text
 from p2gs_jax.report.run_files import RunFiles, number_at, part_at
-from p2gs_jax.run.folder import RunFolder
 
 MOST_TERMS = 3
 SCORES = {"psnr": 2, "ssim": 4, "lpips": 4}
@@ -158,36 +156,6 @@ def novel_section(run: RunFiles) -> str:
     return _numbers([*names, "depth within 10 %"], rows, 1, note)
 
 
-def unexplained_section(run: RunFiles, problems: list[str]) -> str:
-    """Return pixels of training views that no static scene explains.
-
-    `problems` receives a sentence for every picture that could not be read.
-    """
-    share, folder = run.number("unexplained", "share"), RunFolder(run.folder).unexplained
-    if share is None:
-        return ""
-    body = paragraph(
-        f"On average {share:.1%} of the pixels of a training view differ from its render by far "
-        "more than the noise of that view, and more than the same surfaces do at other times. "
-        "That is what moves where nothing follows it, its shadow and its mirror image."
-    )
-    by_view, cells = run.part("unexplained", "per_view"), []
-    shares = {name: number_at(by_view, name) or 0.0 for name in by_view}
-    for path in sorted(folder.rglob("*.png")):
-        name = path.relative_to(folder).with_suffix("").as_posix()
-        try:
-            picture = jpeg(read_png(path), f"{name} with what is unexplained marked")
-        except UserError as error:
-            problems.append(f"{name} is not shown: {error.message}.")
-            continue
-        found = [s for view, s in shares.items() if view.rsplit(".", 1)[0] == name]
-        cells.append((picture, f"{name}: {found[0]:.1%}" if found else name))
-    body += "".join(row(cells[k : k + 2], "two") for k in range(0, len(cells), 2))
-    rows = [[view, f"{s:.2%}"] for view, s in sorted(shares.items(), key=lambda item: -item[1])]
-    every = table(["view", "share"], rows, numbers=(1,), tall=True)
-    return body + (folded("Every training view", every) if rows else "")
-
-
 def training_section(run: RunFiles) -> str:
     """Return loss, PSNR and Gaussians over the steps."""
     log = [r for r in run.log if number_at(r, "gaussians") is not None]
@@ -267,15 +235,6 @@ def configuration_section(run: RunFiles) -> str:
         body += table(["option", "here", "in the preset"], differs) if differs else same
     dump = text(json.dumps(run.options, indent=2))
     return body + folded("The whole configuration (config.json)", f'<pre tabindex="0">{dump}</pre>')
-
-
-def flat(options: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return nested options by dotted names."""
-    out: dict[str, Any] = {}
-    for name, value in options.items():
-        nested = isinstance(value, dict)
-        out |= flat(value, f"{prefix}{name}.") if nested else {prefix + name: value}
-    return out
 
 
 def option_text(value: Any) -> str:

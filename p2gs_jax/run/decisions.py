@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,7 +25,7 @@ from p2gs_jax.config import (
 from p2gs_jax.core.atomic import plain, write_json
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
-from p2gs_jax.presets import camera_formations
+from p2gs_jax.presets import camera_formations, with_values
 
 # Under this name in the metadata of checkpoints.
 KEY = "decided"
@@ -54,7 +55,7 @@ class Decisions:
     @classmethod
     def as_asked(cls, cfg: FitConfig) -> Decisions:
         """Return what the options say before a scene is known."""
-        return cls(**{name: _at(cfg, place) for name, place in _PLACES.items()})
+        return cls(**{name: attrgetter(place)(cfg) for name, place in _PLACES.items()})
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Decisions:
@@ -79,9 +80,7 @@ class Decisions:
         values["photometry.select"] = False
         if self.near is not None:
             values["render.near"] = self.near
-        for place, value in values.items():
-            cfg = _with(cfg, place, value)
-        return cfg
+        return with_values(cfg, values)
 
     def require_same(self, saved: dict[str, Any], folder: Path) -> None:
         """Refuse to continue a run whose checkpoints, in `folder`, have other decisions.
@@ -117,19 +116,6 @@ _PLACES = {
     "responses": "photometry.responses",
     "cameras": "photometry.cameras",
 }
-
-
-def _at(options: Any, place: str) -> Any:
-    for name in place.split("."):
-        options = getattr(options, name)
-    return options
-
-
-def _with(options: Any, place: str, value: Any) -> Any:
-    """Return options with the value at a place, a dotted name, replaced."""
-    name, _, rest = place.partition(".")
-    value = _with(getattr(options, name), rest, value) if rest else value
-    return dataclasses.replace(options, **{name: value})
 
 
 def write_decisions(path: Path, decisions: Decisions) -> None:

@@ -44,7 +44,6 @@ class RunFolder:
         self.against = root / "against.json"
         self.summary = root / "summary.png"
         self.renders = root / "renders"
-        self.unexplained = root / "unexplained"
 
     def appearance(self, kind: Appearance) -> Path:
         """Return where the corrections lie that a baseline of this kind learns."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NotRequired, TypedDict
+from typing import Any, NamedTuple, TypedDict
 
 import jax
 import numpy as np
@@ -31,18 +31,9 @@ from p2gs_jax.types import Params, Photometry, Scene, View
 
 VERSION = 2
 AGAIN = "restore it from a copy, or run `p2gs-jax fit ... --resume` or `calibrate` again"
-# Absent where there was no bundle adjustment, or white balance is not modelled.
-_OPTIONAL = frozenset(
-    {
-        *("exposure_ev_error", "gamma_error", "exposure_ev_start", "observations"),
-        *("exposure_unknown", "white_balance", "white_balance_ev_error"),
-    }
-)
 
 
-class ViewPhotometry(TypedDict):
-    """One view; docs/files.md says what each number is, and where it is null."""
-
+class _EveryView(TypedDict):
     image: str
     camera: str
     exposure: float | None
@@ -51,13 +42,21 @@ class ViewPhotometry(TypedDict):
     exif_ev: float | None
     split: str
     exposure_fitted: float | None
-    exposure_unknown: NotRequired[bool]
-    exposure_ev_error: NotRequired[float | None]
-    gamma_error: NotRequired[float | None]
-    exposure_ev_start: NotRequired[float | None]
-    observations: NotRequired[int | None]
-    white_balance: NotRequired[list[float] | None]
-    white_balance_ev_error: NotRequired[list[float] | None]
+
+
+class ViewPhotometry(_EveryView, total=False):
+    """One view; docs/files.md says what each number is, and where it is null.
+
+    These are absent where there was no bundle adjustment, or white balance is not modelled.
+    """
+
+    exposure_unknown: bool
+    exposure_ev_error: float | None
+    gamma_error: float | None
+    exposure_ev_start: float | None
+    observations: int | None
+    white_balance: list[float] | None
+    white_balance_ev_error: list[float] | None
 
 
 class CameraPhotometry(TypedDict):
@@ -83,16 +82,9 @@ class PhotometryFile(TypedDict):
 
 
 def write_photometry(path: Path, **values: Any) -> None:
-    """Write `photometry.json` atomically; values are the fields of a `PhotometryFile`.
-
-    Raises:
-        ValueError: a field is missing, or a view lacks one.
-    """
+    """Write `photometry.json` atomically; values are the fields of a `PhotometryFile`."""
     given = {"version": VERSION, "cameras": [], **values}
-    data = {name: given[name] for name in PhotometryFile.__annotations__ if name in given}
-    if problem := _problem(data):
-        raise ValueError(problem)
-    write_json(path, data)
+    write_json(path, {name: given[name] for name in PhotometryFile.__annotations__})
 
 
 def read_photometry(path: Path) -> PhotometryFile:
@@ -118,16 +110,14 @@ def _problem(data) -> str | None:
         return f"its version is {data['version']}, and this program reads version {VERSION}"
     if not isinstance(data["views"], list):
         return "views is not a list"
-    for number, view in enumerate(data["views"]):
-        if missing := _missing(view, ViewPhotometry):
-            return f"view {number}: {missing}"
-    return None
+    found = (_missing(view, ViewPhotometry) for view in data["views"])
+    return next((f"view {number}: {words}" for number, words in enumerate(found) if words), None)
 
 
 def _missing(data, kind: Any) -> str | None:
     if not isinstance(data, dict):
         return "not an object"
-    names = [k for k in kind.__annotations__ if k not in data and k not in _OPTIONAL]
+    names = [k for k in kind.__annotations__ if k in kind.__required_keys__ and k not in data]
     return f"{', '.join(names)} missing" if names else None
 
 
@@ -177,20 +167,25 @@ def write_fitted(
     balance = mean.pop("white_balance")
     if balance is not None:
         mean["white_balance"] = np.exp(balance).tolist()
+    own = {index: k for k, index in enumerate(scene.train_indices)}
+    rows = [
+        _fitted_row(params, view, own.get(index), solution, view.name in unknown)
+        | {"exposure_fitted": fitted.get(index)}
+        for index, view in enumerate(scene.views)
+    ]
     write_photometry(
         path,
         model=p.model,
         curve={"name": p.curve, "pivot": p.pivot, "spline": p.spline},
         gauge=gauge,
         mean=mean,
-        views=_fitted_rows(params, scene, fitted, unknown, solution),
+        views=rows,
         cameras=_camera_rows(p.cameras, None if solution is None else solution.corner_errors),
     )
 
 
-def _row(view: View, split: str, values: Sequence[Any]) -> ViewPhotometry:
-    """Return the row of a view: exposure, its logarithm and gamma, and what everything has."""
-    exposure, ev, gamma = (None if v is None else float(v) for v in values)
+def _row(view: View, split: str, exposure, ev, gamma, balance=None) -> ViewPhotometry:
+    """Return the row of a view: what it says itself, and what everything has."""
     return {
         "image": view.name,
         "camera": view.camera,
@@ -200,42 +195,34 @@ def _row(view: View, split: str, values: Sequence[Any]) -> ViewPhotometry:
         "exif_ev": view.exif_ev,
         "split": split,
         "exposure_fitted": None,
-        "white_balance": None,
+        "white_balance": balance,
         "white_balance_ev_error": None,
     }
 
 
-def _fitted_rows(
+def _fitted_row(
     params: Params,
-    scene: Scene,
-    fitted: Mapping[int, float],
-    unknown: Sequence[str],
+    view: View,
+    k: int | None,
     solution: PhotometricSolution | None,
-) -> list[ViewPhotometry]:
-    """Return the `views` of a fit; held-out views have no exposure of their own."""
-    taken: Photometry = jax.tree.map(np.asarray, params.photometry)
-    rows = {index: k for k, index in enumerate(scene.train_indices)}
-    out: list[ViewPhotometry] = []
-    for index, view in enumerate(scene.views):
-        k = rows.get(index)
-        own: tuple[Any, ...] = (None, None, None)
-        if k is not None:
-            e = taken.exposures[k]
-            own = (e, np.log2(float(e)), taken.gammas[k])
-        row = _row(view, view.split, own)
-        row["exposure_fitted"] = fitted.get(index)
-        if k is not None and taken.white_balance is not None:
-            row["white_balance"] = np.exp(taken.white_balance[k]).tolist()
-        if view.name in unknown:
-            row["exposure_unknown"] = True
-        if k is not None and solution is not None and np.isfinite(solution.exposure_errors[k]):
-            row["exposure_ev_error"] = float(solution.exposure_errors_ev[k])
-            row["gamma_error"] = float(solution.gamma_errors[k])
-            row["exposure_ev_start"] = float(solution.exposures_ev[k])
-            row["observations"] = int(solution.observations_per_view[k])
-            row["white_balance_ev_error"] = _balance(solution, k)[1]
-        out.append(row)
-    return out
+    unknown: bool,
+) -> ViewPhotometry:
+    """Return the row of a view of a fit; held-out ones have no exposure of their own, `k` None."""
+    row = _row(view, view.split, None, None, None)
+    if k is not None:
+        taken: Photometry = jax.tree.map(np.asarray, params.photometry)
+        e, balance = float(taken.exposures[k]), taken.white_balance
+        balance = None if balance is None else np.exp(balance[k]).tolist()
+        row = _row(view, view.split, e, float(np.log2(e)), float(taken.gammas[k]), balance)
+    if unknown:
+        row["exposure_unknown"] = True
+    if k is not None and solution is not None and np.isfinite(solution.exposure_errors[k]):
+        row["exposure_ev_error"] = float(solution.exposure_errors_ev[k])
+        row["gamma_error"] = float(solution.gamma_errors[k])
+        row["exposure_ev_start"] = float(solution.exposures_ev[k])
+        row["observations"] = int(solution.observations_per_view[k])
+        row["white_balance_ev_error"] = _balance(solution, k)[1]
+    return row
 
 
 def write_solution(
@@ -249,10 +236,11 @@ def write_solution(
     seen = np.isfinite(s.exposure_errors)
     e = np.exp(s.log_exposures[seen])
     for i, view in enumerate(views):
-        values = (np.exp(s.log_exposures[i]), s.exposures_ev[i], s.gammas[i])
-        row = _row(view, "train", values if seen[i] else (None, None, None))
-        row["exposure_ev_error"] = float(s.exposure_errors_ev[i]) if seen[i] else None
-        row["gamma_error"] = float(s.gamma_errors[i]) if seen[i] else None
+        found = (np.exp(s.log_exposures[i]), s.exposures_ev[i], s.gammas[i])
+        errors = (s.exposure_errors_ev[i], s.gamma_errors[i])
+        values = [float(v) if seen[i] else None for v in (*found, *errors)]
+        row = _row(view, "train", *values[:3])
+        row["exposure_ev_error"], row["gamma_error"] = values[3:]
         row["white_balance"], row["white_balance_ev_error"] = _balance(s, i)
         rows.append(row)
     write_photometry(
@@ -348,36 +336,44 @@ def _rule(data: dict) -> Rule:
     return Rule(tuple(data["meters"]), tuple(data["slopes"]), LN2 * offset, residual, left_out)
 
 
-def write_appearance(path: Path, appearance: Corrections, views: Sequence[View]) -> None:
+class _Layout(NamedTuple):
+    """The fields of a learned correction under their names in its JSON file."""
+
+    cameras: dict[str, str]  # with a row for each camera
+    views: dict[str, str]  # with a row for each view
+    shared: tuple[str, ...] = ()  # of all views, named as in the file
+
+
+_LAYOUTS = {
+    Ppisp: _Layout({"response": "responses", "vignetting": "vignettings"}, {"color": "colors"}),
+    Luminance: _Layout(
+        {},
+        {"axes": "axes", "statistics": "statistics"},
+        ("curve", "hidden", "hidden_bias", "out", "out_bias"),
+    ),
+}
+
+
+def write_appearance(path: Path, learned: Corrections, views: Sequence[View]) -> None:
     """Write what was learned of all training views; exposures lie in `photometry.json`."""
-    if isinstance(appearance, Ppisp):
-        cameras = zip(
-            appearance.names,
-            np.asarray(appearance.responses),
-            np.asarray(appearance.vignettings),
-            strict=True,
-        )
-        colors = zip(views, np.asarray(appearance.colors), strict=True)
-        data: dict[str, Any] = {
-            "cameras": {name: {"response": r, "vignetting": v} for name, r, v in cameras},
-            "views": {view.name: {"camera": view.camera, "color": c} for view, c in colors},
-        }
-        write_json(path, data)
-    elif isinstance(appearance, Luminance):
-        data = {name: np.asarray(getattr(appearance, name)) for name in _SHARED}
-        data["views"] = {
-            view.name: {name: np.asarray(getattr(appearance, name)[k]) for name in _OF_VIEWS}
-            for k, view in enumerate(views)
-        }
-        write_json(path, data)
-    else:
+    appearance: Any = learned
+    layout = _LAYOUTS.get(type(appearance))
+    if layout is None:
         with atomic_write(path) as temporary:
             np.save(temporary, np.asarray(appearance))
+        return
 
+    def row(fields: dict[str, str], k: int) -> dict[str, Any]:
+        return {key: np.asarray(getattr(appearance, name)[k]) for key, name in fields.items()}
 
-# Names in `luminance.json`: parameters of all views, and those of single ones.
-_SHARED = ("curve", "hidden", "hidden_bias", "out", "out_bias")
-_OF_VIEWS = ("axes", "statistics")
+    data: dict[str, Any] = {name: np.asarray(getattr(appearance, name)) for name in layout.shared}
+    if layout.cameras:
+        names = enumerate(appearance.names)
+        data["cameras"] = {name: row(layout.cameras, k) for k, name in names}
+    data["views"] = {
+        view.name: {"camera": view.camera, **row(layout.views, k)} for k, view in enumerate(views)
+    }
+    write_json(path, data)
 
 
 def read_appearance(path: Path, kind: Appearance, views: Sequence[View]) -> Corrections:
@@ -386,47 +382,27 @@ def read_appearance(path: Path, kind: Appearance, views: Sequence[View]) -> Corr
     Raises:
         UserError: it cannot be read, or belongs to other views.
     """
-    like = identity(kind, [view.camera for view in views])
+    like: Any = identity(kind, [view.camera for view in views])
+    layout = _LAYOUTS.get(type(like))
     try:
-        if isinstance(like, Ppisp | Luminance):
-            data = parse_json(path.read_text(encoding="utf-8"))
-            rows = [data["views"][view.name] for view in views]
-            return (
-                _ppisp(like, data, rows)
-                if isinstance(like, Ppisp)
-                else _luminance(like, data, rows)
-            )
-        corrections = np.load(path, allow_pickle=False)
+        if layout is None:
+            found = np.load(path, allow_pickle=False)
+            if found.shape != np.asarray(like).shape:
+                raise KeyError(found.shape)
+            return on_device(found)
+        data = parse_json(path.read_text(encoding="utf-8"))
+        of_cameras = [data["cameras"][name] for name in like.names] if layout.cameras else []
+        of_views = [data["views"][view.name] for view in views]
+        values = {name: data[name] for name in layout.shared}
+        values |= {n: [each[key] for each in of_cameras] for key, n in layout.cameras.items()}
+        values |= {n: [each[key] for each in of_views] for key, n in layout.views.items()}
+        for name, rows in values.items():
+            shape = getattr(like, name).shape
+            values[name] = on_device(np.array(rows, np.float32).reshape(shape))
+        return dataclasses.replace(like, **values)
     except (OSError, ValueError) as error:
         raise UserError(
             f"{path} cannot be read: {error}.", fix="finish the fit again with --resume"
         ) from error
     except (KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{path} does not belong to this run.", fix="fit again") from error
-    if corrections.shape != np.asarray(like).shape:
-        raise UserError(f"{path} does not belong to this run.", fix="fit again")
-    return on_device(corrections)
-
-
-def _ppisp(like: Ppisp, data: dict[str, Any], rows: list[dict]) -> Ppisp:
-    cameras = [data["cameras"][name] for name in like.names]
-
-    def stacked(of: list[dict], key: str, shape: tuple[int, ...]):
-        return on_device(np.array([row[key] for row in of], np.float32).reshape(shape))
-
-    return dataclasses.replace(
-        like,
-        colors=stacked(rows, "color", like.colors.shape),
-        responses=stacked(cameras, "response", like.responses.shape),
-        vignettings=stacked(cameras, "vignetting", like.vignettings.shape),
-    )
-
-
-def _luminance(like: Luminance, data: dict[str, Any], rows: list[dict]) -> Luminance:
-    values = {name: data[name] for name in _SHARED}
-    values |= {name: [row[name] for row in rows] for name in _OF_VIEWS}
-
-    def shaped(name: str):
-        return on_device(np.array(values[name], np.float32).reshape(getattr(like, name).shape))
-
-    return Luminance(**{name: shaped(name) for name in values})

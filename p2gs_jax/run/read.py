@@ -264,7 +264,7 @@ def load_run(folder: str | Path, scene: str | Path | None = None) -> Run:
     """
     files = RunFolder(Path(folder))
     _require_finished(files)
-    saved, asked = _read_config(files.config)
+    saved, asked = read_config(files.config)
     if scene is not None and not Path(scene).exists():
         raise UserError(
             f"{scene} does not exist.", fix="name the folder of the run's scene with --scene"
@@ -336,8 +336,12 @@ def _photometry(
     return Photometry(on_device(exposures), on_device(gammas), p.parameterization, balances, rows)
 
 
-def _read_config(path: Path) -> tuple[dict[str, Any], FitConfig]:
-    """Return `config.json` and the configuration in it."""
+def read_config(path: Path) -> tuple[dict[str, Any], FitConfig]:
+    """Return `config.json` and the configuration in it.
+
+    Raises:
+        UserError: it is broken, or of another version.
+    """
     try:
         saved = parse_json(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import jax
 import numpy as np
 
 from p2gs_jax.config import FitConfig
@@ -18,7 +16,7 @@ from p2gs_jax.formats.frames import write_png
 from p2gs_jax.formats.ply import write_ply, write_radiance
 from p2gs_jax.gaussians.bake import bake, display_comments
 from p2gs_jax.gaussians.posed import posed
-from p2gs_jax.photometry.display import develop, usual_display
+from p2gs_jax.photometry.display import usual_display
 from p2gs_jax.photometry.metering import Metering
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.presets import to_dict as config_to_dict
@@ -98,7 +96,7 @@ def write_run(
     if kind is not None:
         write_appearance(folder.appearance(kind), params.appearance, scene.training_views)
     if shown:
-        _write_summary(folder.summary, shown, params, scene, cfg, true_exposures)
+        write_summary(folder.summary, shown, params, scene, cfg, true_exposures)
 
 
 def write_view(folder: Path, name: str, result: ViewResult, store: ImageStore) -> None:
@@ -143,32 +141,3 @@ def _write_models(
     shown = bake(placed, transform, cfg.render.radiance, MAX_DEGREE)
     write_ply(folder.splats, shown, display_comments(transform))
     write_radiance(folder.radiance, params.gaussians, alive, activation=cfg.render.radiance)
-
-
-def _write_summary(
-    path: Path,
-    shown: Sequence[ViewResult],
-    params: Params,
-    scene: Scene,
-    cfg: FitConfig,
-    true_exposures: Mapping[str, float] | None,
-) -> None:
-    common = usual_display(params, (), None, cfg.photometry)
-    common = dataclasses.replace(common, backdrop=shown[0].transform.backdrop)
-    train = scene.training_views
-    exif = [v.exif_ev for v in train]
-    write_summary(
-        path,
-        photographs=[v.photograph for v in shown],
-        rendered=[v.ldr for v in shown],
-        linear_tonemapped=[develop(v.linear, common, alpha=v.alpha) for v in shown],
-        names=[f"{scene.views[v.index].name} ({scene.views[v.index].split})" for v in shown],
-        exposures_ev=np.log2(jax.tree.map(np.asarray, params.photometry).exposures),
-        cameras=[v.camera for v in train],
-        true_ev=None
-        if true_exposures is None
-        else np.log2([true_exposures[view.name] for view in train]),
-        exif_ev=None
-        if all(e is None for e in exif)
-        else np.array([np.nan if e is None else e for e in exif]),
-    )

@@ -51,12 +51,12 @@ WRONG = [
     ("fit castle --out run --known-deviation-ev 0.1", "add --known-exposures FILE"),
     ("fit castle --out run --known-exposures none.csv", "none.csv cannot be read"),
     ("fit castle --out run --reference nowhere", "give --reference a folder"),
-    ("fit castle --out run --lpips-weights none.npz", "docs/files.md"),
+    ("fit castle --out run --lpips-weights none", "choose alex or vgg"),
     ("fit castle --out file.txt", "name a folder with --out"),
     ("fit castle --out file.txt/run", "check that the path exists"),
     ("fit castle --out begun", "--resume"),
     ("fit castle --out other --resume", "train.seed was 7, now 0"),
-    ("fit castle --out torn --resume", "remove it and repeat the options"),
+    ("fit castle --out torn --resume", "remove it and repeat the"),
     ("fit file.txt --out run", "name the folder of the scene"),
     ("fit nowhere --out run", "check the path of the scene"),
     ("fit empty --out run", "empty"),
@@ -180,8 +180,8 @@ def test_a_resumed_run_may_be_evaluated_otherwise_and_no_more(tmp_path):
         check_run_dir(tmp_path, True, preset(name))
 
     cfg = to_dict(preset("robust"))
-    resume(cfg | {"evaluation": {"lpips_weights": "alex.npz"}})
-    cfg["evaluation"] = {"lpips_weights": "alex.npz"}
+    resume(cfg | {"evaluation": {"lpips_weights": "alex"}})
+    cfg["evaluation"] = {"lpips_weights": "alex"}
     cfg["train"]["seed"] = 7
     with pytest.raises(UserError, match=r"train\.seed") as error:
         resume(cfg)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from tiny_scene import make_scene
+from tiny_scene import make_scene, prepared
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.clock import CompileCounter
@@ -11,7 +11,7 @@ from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.photometry.parameters import recentre
 from p2gs_jax.pipeline.calibrate import calibrate
 from p2gs_jax.pipeline.finish import Account, finish
-from p2gs_jax.pipeline.prepare import load, prepare
+from p2gs_jax.pipeline.survey import load
 from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.run.read import load_run
 
@@ -31,18 +31,17 @@ def test_a_fit_without_its_steps_compiles_few_programs(scene, tmp_path):
     fields = {"data.test_every": 3, "render.sh_degree": 1, "train.budget_s": 1.0}
     cfg = with_fields(FitConfig(), fields)
     counter = CompileCounter()
-    loaded = load(scene, tmp_path, cfg, Silent())
-    prepared = prepare(loaded, cfg, Silent())
+    start = prepared(load(scene, tmp_path, cfg), cfg)
     assert counter.programs == 0
-    params = recentre(prepared.params, cfg.render.radiance)
+    params = recentre(start.params, cfg.render.radiance)
     assert counter.programs == 0
     metrics = finish(
         params,
-        prepared.scene,
-        prepared.store,
-        prepared.cfg,
+        start.scene,
+        start.store,
+        start.cfg,
         RunFolder(tmp_path),
-        Account({}, {"total_until_evaluation": 60.0}, counter, prepared.selection, prepared.notes),
+        Account({}, {"total_until_evaluation": 60.0}, counter, start.selection, start.notes),
         Silent(),
     )
     # Counting tiles, rendering, developing (images; colours of splats), fitting an exposure, PSNR,

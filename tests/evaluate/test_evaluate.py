@@ -8,30 +8,23 @@ import cv2
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from lpips_files import made_arrays, write_weights
+from lpips_files import made_weights
 from splats import random_splats
 from tiny_scene import noise_scene
 
 from p2gs_jax.cli.tables import print_metrics
-from p2gs_jax.config import FitConfig, LossConfig, PhotometryConfig
+from p2gs_jax.config import FitConfig, LossConfig
+from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.evaluation import evaluate as evaluation
 from p2gs_jax.evaluation.evaluate import evaluate
-from p2gs_jax.evaluation.lpips import lpips, read_lpips_weights
-from p2gs_jax.evaluation.metered import MeteredViews
+from p2gs_jax.evaluation.lpips import lpips
 from p2gs_jax.evaluation.passes import ArrayStore
-from p2gs_jax.evaluation.scores import Untold, untold_notes
-from p2gs_jax.photometry.metering import meter
+from p2gs_jax.evaluation.scores import psnr, tells_exposure, untold_notes
 from p2gs_jax.run.read import load_run
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Params, Photometry, Render
 
 HEIGHT, WIDTH = 34, 40
-
-
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("weights")
-    return read_lpips_weights(write_weights(folder / "alex.npz", made_arrays("alex")))
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +54,8 @@ def judged(scene, *, slope=0.0, **options):
     ).metrics
 
 
-def test_every_comparison_has_lpips_where_there_are_weights(scene, weights, tmp_path, capsys):
+def test_every_comparison_has_lpips_where_there_are_weights(scene, tmp_path, capsys):
+    weights = made_weights("alex")
     metrics = judged(scene, lpips_weights=weights)
     parts = [
         (metrics["train"], 2),
@@ -132,27 +126,24 @@ def grey(value):
     return np.full((*SIZE, 3), value, np.float32)
 
 
+LOSS = LossConfig()
+
+
 @pytest.mark.parametrize(
-    ("photograph", "known"),
-    [(grey(0.0), False), (grey(1.0), False), (grey(0.01), False), (grey(0.5), True)],
+    ("value", "known"), [(0.0, False), (1.0, False), (0.01, False), (0.5, True)]
 )
-def test_black_and_saturated_photographs_tell_no_exposure(photograph, known):
-    found = Untold()
-    assert found.add("a.png", photograph, EVERYTHING, LossConfig())
-    assert found.to_dict() == ({} if known else {"exposures_unknown": ["a.png"]})
+def test_black_and_saturated_photographs_tell_no_exposure(value, known):
+    assert tells_exposure(grey(value), EVERYTHING, LOSS) is bool(known)
 
 
 def test_one_channel_and_a_few_pixels_are_enough_and_what_is_masked_tells_nothing():
     few, corner = (slice(0, 1), slice(0, 1), 1), (slice(0, 5), slice(0, 5), slice(None))
     hidden = np.where(np.arange(30) < 6, 0, EVERYTHING)
     for change, mask, known in ((few, EVERYTHING, True), (corner, hidden, False)):
-        photograph, found = grey(0.0), Untold()
+        photograph = grey(0.0)
         photograph[change] = 0.4
-        found.add("a.png", photograph, np.float32(mask), LossConfig())
-        assert (not found.exposures) == known
-    found = Untold()
-    assert not found.add("a.png", grey(0.0), 0 * EVERYTHING, LossConfig())
-    assert found.to_dict() == {"hidden": ["a.png"]}
+        assert tells_exposure(photograph, np.float32(mask), LOSS) is known
+    assert tells_exposure(grey(0.0), 0 * EVERYTHING, LOSS) is None
 
 
 def test_the_notes_name_the_first_views():
@@ -199,23 +190,34 @@ KEY = 0.2
 
 
 @pytest.mark.parametrize("metered", [True, False])
-def test_held_out_views_are_scored_under_the_exposure_of_the_training_views_rule(metered):
-    def picture(level):
-        return np.full((12, 16, 3), level, np.float32), np.ones((12, 16), np.float32)
-
+def test_held_out_views_are_scored_under_the_exposure_of_the_training_views_rule(tmp_path, metered):
+    """The camera held the log average at KEY, or chose exposures by lot."""
     levels = np.exp2(np.random.default_rng(0).normal(-2, 1, 24))
     drawn = np.exp2(np.random.default_rng(3).normal(0, 1, 24))
-    with ArrayStore() as arrays:
-        views = MeteredViews(arrays)
-        for k, level in enumerate(levels):
-            views.add_training(f"{k}.png", meter(*picture(level)))
-        linear, mask = picture(0.4)
-        views.add_held_out(7, meter(linear, mask), linear, linear, mask)
-        exposures = KEY / levels if metered else drawn
-        found = views.fit(exposures, 2.2, PhotometryConfig())
-        scores = views.scores(found, lambda row, e, image, *_: {"level": float(image.mean() * e)})
+    scene = noise_scene(tmp_path, [f"{k:02d}.png" for k in range(24)], ("99.png",))
+    shown = dict(zip(range(25), [*levels, 0.4], strict=True))
+
+    def moved(row, view):
+        pose = view.viewmat.copy()
+        pose[0, 3] = shown[row]
+        return dataclasses.replace(view, viewmat=pose)
+
+    scene = dataclasses.replace(scene, views=tuple(map(moved, shown, scene.views)))
+
+    def render(gaussians, alive, camera):
+        flat = jnp.ones((camera.height, camera.width), jnp.float32)
+        linear = camera.viewmat[0, 3] * jnp.tile(flat[..., None], 3)
+        return Render(linear, flat, flat, jnp.int32(0), jnp.bool_(False), alive)
+
+    logs = jnp.log(jnp.asarray(KEY / levels if metered else drawn))
+    params = Params(random_splats(0, degree=0), Photometry(logs, jnp.zeros(24), "log"), None)
+    store = ImageStore(scene.views, FitConfig().data)
+    test = evaluate(params, scene, store, FitConfig(), render=render).metrics["test"]
     if metered:
-        assert scores[7]["level"] == pytest.approx(KEY, rel=1e-4)
-        assert scores[7]["exposure"] == pytest.approx(KEY / 0.4, rel=1e-4)
+        (row,) = test["metered"]["per_view"].values()
+        assert row["exposure"] == pytest.approx(KEY / 0.4, rel=1e-4)
+        photograph, mask = store.get(24, 1)
+        expected = psnr(srgb_encode(np.full_like(photograph, KEY)), photograph, mask)
+        assert row["psnr"] == pytest.approx(float(expected), abs=0.01)
     else:
-        assert scores == {}
+        assert "metered" not in test

@@ -2,16 +2,21 @@
 
 import json
 import os
+from types import SimpleNamespace
 
 import cv2
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import append_jsonl, atomic_folder, atomic_write, read_jsonl, write_json
 from p2gs_jax.errors import UserError
+from p2gs_jax.evaluation.scores import ViewResult
+from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.run.photometry_files import read_photometry, write_photometry
 from p2gs_jax.run.plots import _lines, _shorten, write_summary
+from p2gs_jax.types import Params, Photometry
 
 
 def test_a_failure_leaves_the_old_file_or_folder_and_success_replaces_it(tmp_path):
@@ -70,13 +75,15 @@ VIEW |= dict.fromkeys(("exposure", "exposure_ev", "gamma"))
 
 def test_photometry_comes_back_and_incomplete_views_are_refused(tmp_path):
     path, common = tmp_path / "photometry.json", {"model": "m", "gauge": "g"}
-    with pytest.raises(ValueError, match=r"view 0: .*gamma"):
-        write_photometry(path, **common, curve={}, mean={}, views=[{"image": "a"}])
-    assert not path.exists()
     write_photometry(path, **common, curve={}, mean={}, views=[VIEW])
     assert read_photometry(path)["views"][0] == VIEW
     whole = json.loads(path.read_text())
-    for content, words in (({}, "incomplete"), (whole | {"views": [3]}, "view 0: not an object")):
+    one = {key: value for key, value in VIEW.items() if key != "gamma"}
+    for content, words in (
+        ({}, "incomplete"),
+        (whole | {"views": [3]}, "view 0: not an object"),
+        (whole | {"views": [VIEW, one]}, "view 1: gamma missing"),
+    ):
         path.write_text(json.dumps(content))
         with pytest.raises(UserError, match=words):
             read_photometry(path)
@@ -88,29 +95,23 @@ HOSTILE = ["\x1b[31mred.png", r"$\nothing$.png", "写真.png"]
 
 @pytest.mark.parametrize("names", [LONG[:1], LONG, HOSTILE], ids=["one", "long", "hostile"])
 def test_a_summary_is_written_in_silence_with_gaps_in_exif_and_odd_names(tmp_path, recwarn, names):
-    images = [np.full((24, 32, 3), 0.5, np.float32)] * len(names)
-    exif = np.arange(9.0)
-    exif[[1, 4, 7, 8]] = np.nan
-    write_summary(
-        tmp_path / "s.png",
-        photographs=images,
-        rendered=images,
-        linear_tonemapped=images,
-        names=names,
-        exposures_ev=np.linspace(-1, 1, 9),
-        cameras=[r"$\nothing$", "\x1b[31m", "写"] * 3,
-        true_ev=np.full(9, np.nan),
-        exif_ev=exif,
-    )
+    image, flat = np.full((24, 32, 3), 0.5, np.float32), np.ones((24, 32), np.float32)
+    exif = [None if k in (1, 4, 7, 8) else float(k) for k in range(9)]
+    cameras = [r"$\nothing$", "\x1b[31m", "写"] * 3
+    train = [SimpleNamespace(exif_ev=e, camera=c) for e, c in zip(exif, cameras, strict=True)]
+    views = [SimpleNamespace(name=name, split="test") for name in names]
+    taken = DisplayTransform(1.0, 2.2, FitConfig().photometry)
+    shown = [ViewResult(k, image, flat, flat, image, image, taken) for k in range(len(names))]
+    params = Params(None, Photometry(jnp.linspace(-1, 1, 9), jnp.zeros(9), "log"))
+    scene = SimpleNamespace(views=views, training_views=train)
+    write_summary(tmp_path / "s.png", shown, params, scene, FitConfig())
     assert cv2.imread(str(tmp_path / "s.png")).shape[1] > 600
     assert not [str(w.message) for w in recwarn]
 
 
 def test_lines_of_the_summary_share_one_level():
     ev, cameras = np.array([1.0, 3.0, 2.0, 6.0]), ["a", "b", "a", "b"]
-    exif = ev + 5
-    exif[0] = np.nan
-    curves = _lines(ev, cameras, None, exif)
+    curves = _lines(ev, cameras, {"true": [None] * 4, "EXIF": [None, *(ev + 5)[1:]]})
     labels = ["recovered, camera a", "recovered, camera b", "EXIF", ""]
     assert [label for *_, label in curves] == labels
     assert curves[0][2]["marker"] != curves[1][2]["marker"]

@@ -5,14 +5,13 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny_scene import make_scene
+from tiny_scene import make_scene, prepared
 
 from p2gs_jax.config import FitConfig, InitConfig
-from p2gs_jax.core.progress import Silent
 from p2gs_jax.gaussians.seeds import cameras_radius, gaussians_from_points, subsample
 from p2gs_jax.gaussians.shell import find_shell
 from p2gs_jax.jobs.configs import with_fields
-from p2gs_jax.pipeline.prepare import load, prepare
+from p2gs_jax.pipeline.survey import load
 from p2gs_jax.presets import preset
 from p2gs_jax.render import view_radiance
 from p2gs_jax.types import Camera, View
@@ -83,8 +82,8 @@ def test_more_seeds_than_the_bound_are_thinned_and_it_is_said(tmp_path):
     fields = {"render.sh_degree": 0, "photometry.select": False, "photometry.start": "random"}
     fields |= {"densify.max_gaussians": 40, "init.shell": "on"}
     cfg = with_fields(preset("robust"), fields)
-    read = load(make_scene(tmp_path / "scene"), tmp_path / "run", cfg, Silent())
+    read = load(make_scene(tmp_path / "scene"), tmp_path / "run", cfg)
     assert len(read.points) > 40
-    prepared = prepare(read, cfg, Silent())
-    assert prepared.params.gaussians.capacity == 40
-    assert any("seed points were thinned to 40 (--gaussians)" in n for n in prepared.notes)
+    start = prepared(read, cfg)
+    assert start.params.gaussians.capacity == 40
+    assert any("seed points were thinned to 40 (--gaussians)" in n for n in start.notes)

@@ -19,7 +19,7 @@ from p2gs_jax.jobs.blocks.plan import check_options, read_plan, write_plan
 from p2gs_jax.jobs.blocks.shared import read_shared
 from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.jobs.job import JobState
-from p2gs_jax.pipeline.prepare import load
+from p2gs_jax.pipeline.survey import load
 
 SMALL = with_fields(
     p2gs_jax.preset("robust"),
@@ -80,7 +80,7 @@ def test_two_blocks_become_one_run(tmp_path, in_this_process):
     opened = p2gs_jax.load_run(run)
     assert opened.params.gaussians.capacity == said["counts"]["gaussians"]
     # The exposures are those of the bundle adjustment, bit for bit, whatever the blocks did.
-    shared, _ = read_shared(run / "blocks", load(scene, run, SMALL, Silent()), SMALL)
+    shared, _ = read_shared(run / "blocks", load(scene, run, SMALL), SMALL)
     solved = shared.photometry.exposures
     np.testing.assert_allclose(
         np.asarray(result.params.photometry.exposures), solved / np.exp(np.log(solved).mean()), 1e-5
@@ -165,7 +165,7 @@ def test_a_broken_plan_is_named(tmp_path):
 
 
 def test_a_plan_is_kept_also_where_its_number_was_chosen(tmp_path):
-    scene = load(make_scene(tmp_path / "scene", views=12), tmp_path, SMALL, Silent())
+    scene = load(make_scene(tmp_path / "scene", views=12), tmp_path, SMALL)
     cut = cut_scene(scene, 3)
     write_plan(tmp_path, cut, "auto")
     for asked in ("auto", "3"):

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import re
 import shutil
 from collections import Counter
 from types import SimpleNamespace
@@ -10,11 +9,10 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from tiny_scene import make_scene
+from tiny_scene import make_scene, prepared
 
 import p2gs_jax
 from p2gs_jax.config import FitConfig
-from p2gs_jax.core.progress import Silent
 from p2gs_jax.errors import DivergenceError, UserError
 from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.jobs.configs import with_fields
@@ -29,7 +27,7 @@ from p2gs_jax.pipeline.preflight import (
     preflight,
     require_memory,
 )
-from p2gs_jax.pipeline.prepare import load, prepare
+from p2gs_jax.pipeline.survey import load
 from p2gs_jax.presets import from_dict
 from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import KEY, Decisions
@@ -75,29 +73,49 @@ def test_options_alone_are_refused_before_the_folder_is_made(tmp_path):
     assert preflight(FitConfig(), Paths(tmp_path, tmp_path / "run")) is None
 
 
-@pytest.mark.parametrize("part", ["prepare", "optimise"])
+@pytest.fixture
+def failing(monkeypatch, tmp_path):
+    """Return a function that lets the steps of a fit raise, perhaps after a checkpoint."""
+    start = SimpleNamespace(cfg=FitConfig(), decisions=Decisions.as_asked(FitConfig()))
+
+    def fails(error, checkpoint):
+        def run(*args, **kwargs):
+            if checkpoint:
+                store = CheckpointStore(tmp_path / "run" / "checkpoints")
+                store.save(3, {"a": np.zeros(2)}, {})
+            raise error
+
+        monkeypatch.setattr(pipeline, "survey", lambda *a, **k: SimpleNamespace(still=0, dense=0))
+        monkeypatch.setattr(pipeline, "solve_exposures", lambda *a, **k: None)
+        monkeypatch.setattr(pipeline, "initialise", lambda *a, **k: start)
+        monkeypatch.setattr(pipeline.Optimiser, "expect", lambda *a, **k: None)
+        monkeypatch.setattr(pipeline.Optimiser, "run", run)
+        return tmp_path / "run"
+
+    return fails
+
+
+class JaxRuntimeError(RuntimeError):
+    """As JAX calls its own."""
+
+
 @pytest.mark.parametrize("checkpoint", [False, True])
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (DivergenceError("Step 1: no.", fix="lower the learning rates"), "Step 1: no."),
+        (MemoryError(), "memory ran out"),
+        (JaxRuntimeError("RESOURCE_EXHAUSTED: 9 bytes\nat f"), "--gaussians"),
+    ],
+)
 def test_a_folder_is_a_runs_once_there_is_something_to_continue(
-    tmp_path, scene, monkeypatch, part, checkpoint
+    scene, run_command, failing, error, said, checkpoint
 ):
-    run, states = tmp_path / "run", []
-
-    def fails(*args, **kwargs):
-        states.append((run / "config.json").exists())
-        if checkpoint:
-            CheckpointStore(run / "checkpoints").save(3, {"a": np.zeros(2)}, {})
-        raise DivergenceError("Step 1: no.", fix="lower the learning rates")
-
-    prepared = SimpleNamespace(cfg=FitConfig(), decisions=Decisions.as_asked(FitConfig()))
-    monkeypatch.setattr(pipeline, "prepare", lambda *a, **k: prepared)
-    place, name = (pipeline, part) if part == "prepare" else (pipeline.Optimiser, "run")
-    monkeypatch.setattr(place, name, fails)
-    with pytest.raises(DivergenceError):
-        p2gs_jax.fit(scene, run, FitConfig())
-    assert states == [part == "optimise"]
-    locked = part == "optimise" and checkpoint
-    assert (run / "config.json").exists() == locked
-    if locked:
+    run = failing(error, checkpoint)
+    code, text = run_command("fit", scene, "--out", run)
+    assert (code, said in text) == (2, True)
+    assert (run / "config.json").exists() == checkpoint
+    if checkpoint:
         with pytest.raises(UserError, match="already holds a run"):
             check_run_dir(run, False, FitConfig())
 
@@ -116,11 +134,12 @@ def test_a_resumed_run_keeps_the_model_and_curve_of_its_checkpoints(tmp_path, sc
     CheckpointStore(run / "checkpoints").save(3, {"a": np.zeros(2)}, meta)
     given = []
 
-    def prepare(scene, cfg, reporter, clock, on_expected, *, kept, pixels):
+    def solve(scene, still, cfg, reporter, *, kept, **how):
         given.append((cfg, kept))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(pipeline, "prepare", prepare)
+    monkeypatch.setattr(pipeline, "solve_exposures", solve)
+    monkeypatch.setattr(pipeline.Optimiser, "expect", lambda *a: None)
     for resume in (True, False):
         with pytest.raises(KeyboardInterrupt):
             p2gs_jax.fit(scene, run, FitConfig(), resume=resume)
@@ -137,8 +156,8 @@ def test_a_resumed_run_keeps_the_model_and_curve_of_its_checkpoints(tmp_path, sc
 
 def test_the_saved_choice_is_solved_and_its_reasons_repeated(tmp_path, scene):
     cfg = with_fields(FitConfig(), {"init.shell": "off", "init.dense": "off"})
-    loaded = load(scene, tmp_path, cfg, Silent())
-    first = prepare(loaded, cfg, Silent())
+    loaded = load(scene, tmp_path, cfg)
+    first = prepared(loaded, cfg)
     assert first.selection is not None
     reasons = first.selection.reasons
     CheckpointStore(tmp_path / "checkpoints").save(
@@ -146,7 +165,7 @@ def test_the_saved_choice_is_solved_and_its_reasons_repeated(tmp_path, scene):
     )
     kept = kept_choice(cfg, RunFolder(tmp_path))
     assert kept == first.decisions
-    again = prepare(loaded, cfg, Silent(), kept=kept)
+    again = prepared(loaded, cfg, kept)
     assert again.selection is not None
     assert again.selection.reasons == reasons
     assert again.notes == first.notes
@@ -258,37 +277,16 @@ def test_every_part_counts(monkeypatch):
     assert on_gpu.photographs == found.photographs
 
 
-@pytest.mark.parametrize(
-    ("needed", "room", "option", "most"),
-    [
-        (MemoryNeeded(GB, 8 * GB, GB, GB, 4_000_000), 3, "--gaussians", 500_000),
-        (MemoryNeeded(GB, GB, 4 * GB, GB, 500_000), 3, "--data.cache-mb", 2**20),
-        (MemoryNeeded(GB, 2 * GB, GB, 9 * GB, 1_000_000), 1, "--max-width", None),
-        (MemoryNeeded(9 * GB, 1, 1, 1, 1_000), 1, "end other programs", None),
-    ],
-)
-def test_what_does_not_fit_is_refused_with_the_option_of_the_largest_part(
-    left, needed, room, option, most
-):
-    left(None)
-    require_memory(needed)
-    left(needed.total - GB)
-    require_memory(needed)
-    left(room * GB)
-    with pytest.raises(UserError, match="would take about") as error:
+def test_what_does_not_fit_is_refused_with_what_helps(left):
+    needed = MemoryNeeded(GB, 8 * GB, GB, GB, 4_000_000)
+    for enough in (None, needed.total - GB):
+        left(enough)
         require_memory(needed)
-    assert option in error.value.fix
-    if most is None:
-        return
-    found = re.search(rf"{option} (\d+)", error.value.fix)
-    # What is asked for instead does fit, and is not far below what would.
-    assert found is not None
-    asked = int(found[1])
-    part = "gaussians" if option == "--gaussians" else "photographs"
-    now = needed.population if part == "gaussians" else needed.photographs / 2**20
-    smaller = needed._replace(**{part: getattr(needed, part) * asked / now})
-    require_memory(smaller)
-    assert smaller.total > (room + 1) * GB * 0.9
+    left(3 * GB)
+    said = r"about 11.0 GB .*4000000 Gaussians 8.0 GB.*are 4.0"
+    with pytest.raises(UserError, match=said) as error:
+        require_memory(needed)
+    assert all(o in error.value.fix for o in ("--gaussians", "--data.cache-mb", "--max-width"))
 
 
 def test_a_fit_is_refused_before_its_exposures_are_solved(tmp_path, scene, left, run_command):
@@ -298,37 +296,6 @@ def test_a_fit_is_refused_before_its_exposures_are_solved(tmp_path, scene, left,
     assert code == 2
     assert "9000000 Gaussians" in text
     assert not (run / "config.json").exists()
-
-
-class JaxRuntimeError(RuntimeError):
-    """As JAX calls its own."""
-
-
-@pytest.mark.parametrize(
-    ("error", "checkpoint"),
-    [(MemoryError(), False), (JaxRuntimeError("RESOURCE_EXHAUSTED: 9 bytes\nat f"), True)],
-)
-def test_memory_that_runs_out_is_named(
-    tmp_path, scene, run_command, monkeypatch, error, checkpoint
-):
-    run = tmp_path / "run"
-    decided = pipeline.Decisions.as_asked(ROBUST)
-    monkeypatch.setattr(
-        pipeline, "prepare", lambda *a, **k: SimpleNamespace(cfg=ROBUST, decisions=decided)
-    )
-
-    def optimise(*args, **options):
-        if checkpoint:
-            CheckpointStore(run / "checkpoints").save(3, {"a": np.zeros(2)}, {})
-        raise error
-
-    monkeypatch.setattr(pipeline.Optimiser, "run", optimise)
-    code, text = run_command("fit", scene, "--out", run)
-    assert code == 2
-    assert "memory ran out" in text
-    assert "--gaussians" in text
-    # Without a checkpoint there is nothing to continue, and other options may be tried.
-    assert (run / "config.json").exists() == checkpoint
 
 
 def test_other_commands_name_it_too(tmp_path, run_command, monkeypatch):

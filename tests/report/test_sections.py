@@ -9,17 +9,11 @@ import numpy as np
 import pytest
 from page_tools import pictures
 
-from p2gs_jax.formats.frames import write_png
 from p2gs_jax.report.charts import SOURCES, VARIABLES, Series, panels_chart, training_chart
 from p2gs_jax.report.photometry_sections import exposure_section
 from p2gs_jax.report.pictures import GAIN, dynamic_range, jpeg, signed_difference, spread
 from p2gs_jax.report.run_files import RunFiles
-from p2gs_jax.report.run_sections import (
-    depth_section,
-    novel_section,
-    parts_section,
-    unexplained_section,
-)
+from p2gs_jax.report.run_sections import depth_section, novel_section, parts_section
 
 
 def grey(values):
@@ -92,18 +86,6 @@ def drive(tmp_path):
     """Return a function that makes a run folder of a drive from the metrics of its sections."""
     empty = RunFiles(tmp_path, tmp_path, None, {}, None, {}, None, [], (), (), ())
     return lambda **metrics: dataclasses.replace(empty, metrics=metrics)
-
-
-def test_unexplained_pixels_are_counted_and_shown(drive, tmp_path):
-    problems = []
-    assert unexplained_section(drive(), problems) == ""
-    shares = {"front/00.jpg": 0.02, "front/01.jpg": 0.04}
-    write_png(tmp_path / "unexplained" / "front" / "01.png", grey(np.full((8, 12), 0.5)))
-    (tmp_path / "unexplained" / "front" / "02.png").write_text("not a picture")
-    body = unexplained_section(drive(unexplained={"share": 0.03, "per_view": shares}), problems)
-    assert all(words in body for words in ("3.0%", "front/01: 4.0%", "2.00%"))
-    assert body.count("<img") == 1
-    assert len(problems) == 1
 
 
 def test_parts_depth_and_shifted_views_are_tables(drive):

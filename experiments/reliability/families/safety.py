@@ -129,7 +129,7 @@ class _Evil:
 
 
 def _pickles() -> Iterator[Trial]:
-    places = ("poses_bounds.npy", "scene.npz", "table.pkl", "table.pkl.gz", "weights.npz")
+    places = ("poses_bounds.npy", "scene.npz", "table.pkl", "table.pkl.gz")
     for place in places:
         yield Trial(f"pickle: {place}", _evil(place), _opened(place), seconds=60)
 
@@ -162,8 +162,6 @@ def _opened(place: str) -> Callable[[Path], int]:
             code = read(root)
         elif place == "scene.npz":
             code = _as_run(root)
-        elif place == "weights.npz":
-            code = command("fit", root, "--out", root.parent / "run", "--lpips-weights", path)
         else:
             code = _table(path)
         return forbidden(Path("unpickled").exists(), "unpickled") or code

@@ -14,7 +14,7 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.memory import text_of
-from p2gs_jax.core.progress import Reporter, Silent
+from p2gs_jax.core.progress import Reporter
 from p2gs_jax.core.runtime import tune_process, use_compile_cache
 from p2gs_jax.formats.ply import write_radiance
 from p2gs_jax.gaussians.population import Coverage, default_max_gaussians
@@ -25,7 +25,8 @@ from p2gs_jax.jobs.job import Job
 from p2gs_jax.pipeline.exposures import Exposures
 from p2gs_jax.pipeline.fit import Optimiser, begun, compact
 from p2gs_jax.pipeline.preflight import Paths
-from p2gs_jax.pipeline.prepare import load, prepare
+from p2gs_jax.pipeline.prepare import initialise
+from p2gs_jax.pipeline.survey import load, survey
 from p2gs_jax.presets import from_dict, to_dict
 from p2gs_jax.run.folder import RunFolder, locked
 from p2gs_jax.scene.pixels.store import size_at
@@ -118,7 +119,7 @@ def fit_block(folder: Path, arguments: dict[str, Any], reporter: Reporter) -> No
     begin = time.monotonic()
     whole, cut = from_dict(arguments["fit"]), Cut.from_dict(arguments["cut"])
     reporter.stage("Reading the scene")
-    scene = load(Path(arguments["scene"]), Path(arguments["run"]), whole, Silent())
+    scene = load(Path(arguments["scene"]), Path(arguments["run"]), whole)
     shared, scene = read_shared(Path(arguments["shared"]), scene, whole)
     number = arguments["number"]
     found, keep, own = whole_of(scene, cut, number)
@@ -140,18 +141,13 @@ def _fit(
     folder: RunFolder, block: BlockScene, cfg: FitConfig, reporter: Reporter, scene: str
 ) -> tuple[dict[str, int], dict[str, float]]:
     """Fit a block's scene and write its Gaussians; return counts and seconds."""
-    clock, mesh = Stopwatch(), mesh_of(cfg)
-    with Optimiser(folder, reporter, mesh) as optimiser:
-        prepared = prepare(
-            block.scene,
-            cfg,
-            reporter,
-            clock,
-            optimiser.begin,
-            pixels=folder.pixels,
-            given=block.exposures,
-            sphere=block.shell,
-        )
+    clock = Stopwatch()
+    with Optimiser(folder, reporter, mesh_of(cfg)) as optimiser:
+        with clock("photometry"):
+            found = survey(block.scene, cfg, pixels=folder.pixels, sphere=block.shell)
+            optimiser.expect(found, given=block.exposures.decisions)
+        with clock("seeds"):
+            prepared = initialise(found, block.exposures, reporter)
         with begun(folder, Paths(Path(scene), folder.root), cfg, prepared.decisions):
             result = optimiser.run(prepared, resume=True)
     params, _ = compact(result)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -46,10 +45,10 @@ from p2gs_jax.pipeline import preflight
 from p2gs_jax.pipeline.finish import Account, finish
 from p2gs_jax.pipeline.fit import FitResult, centred, fit
 from p2gs_jax.pipeline.preflight import Paths, check_run_dir
-from p2gs_jax.pipeline.prepare import load
+from p2gs_jax.pipeline.survey import load
 from p2gs_jax.presets import require_config
 from p2gs_jax.run.decisions import read_decisions
-from p2gs_jax.run.folder import RunFolder, RunLock, locked, require_free
+from p2gs_jax.run.folder import RunFolder, RunLock, locked
 from p2gs_jax.run.write import write_start
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Params, Scene
@@ -95,12 +94,11 @@ def fit_blocks(
     """
     cfg, reporter = require_config(cfg), reporter or Silent()
     asked = Asked(blocks, parallel, engine)
-    paths = Paths(Path(scene_dir), Path(run_dir), None if reference is None else Path(reference))
+    paths = Paths.of(scene_dir, run_dir, reference)
     if isinstance(blocks, str) and blocks != "auto":
         raise UserError(f"--blocks {blocks}.", fix="write a whole number from 1, or auto")
     check_options(cfg)
     check_engine(engine)
-    require_free(paths.run)
     weights = preflight.preflight(cfg, paths, resume=resume)
     begin = time.monotonic()
     with no_empty_folders(paths.run), locked(paths.run) as lock:
@@ -186,7 +184,6 @@ class _Blocks:
         photometry = jax.tree.map(on_device, solved.shared.photometry)
         params = centred(Params(gaussians, photometry), cfg)
         self._tell(seams)
-        self.lock.require()
         account = self._account(scene, solved, gaussians.capacity, time.monotonic() - begin)
         metrics = finish(
             params,
@@ -203,8 +200,6 @@ class _Blocks:
         )
         metrics[KEY] = self._summary(seams, counts)
         write_json(self.folder.metrics, metrics)
-        store.close()
-        shutil.rmtree(self.folder.pixels, ignore_errors=True)
         return FitResult(
             params,
             solved.scene,
