@@ -14,7 +14,7 @@ from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.clock import CompileCounter, Stopwatch, over_budget
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.core.runtime import return_freed_memory
-from p2gs_jax.evaluation.evaluate import evaluate
+from p2gs_jax.evaluation.evaluate import Evaluation, evaluate
 from p2gs_jax.evaluation.lpips import LpipsWeights
 from p2gs_jax.evaluation.references import Reference, find_radiance
 from p2gs_jax.evaluation.scores import ViewResult, is_drive, untold_notes
@@ -57,9 +57,8 @@ def finish(
 ) -> dict:
     """Evaluate, write all results and return what `metrics.json` holds.
 
-    Gaussians are the live ones, `owner` says which moving object each belongs to, and `cfg` is what
-    the fit computed under; `still_ours` raises where the run folder is no longer this run's. The
-    store is closed.
+    Gaussians are the live ones, `owner` has the moving object of each, `cfg` is what the fit was
+    computed under; `still_ours` raises where the folder is another run's. The store is closed.
     """
     still_ours()
     return_freed_memory()
@@ -78,8 +77,6 @@ def finish(
             on_view=functools.partial(_take, exposures, shown, scene, store, folder, watch),
             on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
         )
-    metered = [found.metering.sentence] if found.metering.telling else []
-    _tell([*untold_notes(found.metrics), *metered], account, reporter)
     watch.add("evaluation", -watch.seconds.get("files", 0.0))  # views are written meanwhile
     reporter.stage("Writing files")
     hidden = found.metrics.get("hidden", ())
@@ -98,7 +95,7 @@ def finish(
             metering=found.metering,
             true_exposures=true_exposures,
         )
-    metrics = found.metrics | _accounted(account, watch, scene, cfg, reporter)
+    metrics = found.metrics | _accounted(account, watch, scene, cfg, reporter, found)
     still_ours()
     write_json(folder.metrics, metrics)
     store.close()
@@ -125,14 +122,13 @@ def _take(
         shown[result.index] = result
 
 
-def _tell(notes: list[str], account: Account, reporter: Reporter) -> None:
-    account.notes.extend(notes)
-    for note in notes:
-        reporter.message(note)
-
-
 def _accounted(
-    account: Account, watch: Stopwatch, scene: Scene, cfg: FitConfig, reporter: Reporter
+    account: Account,
+    watch: Stopwatch,
+    scene: Scene,
+    cfg: FitConfig,
+    reporter: Reporter,
+    found: Evaluation,
 ) -> dict:
     """Return what `metrics.json` says of the fit itself."""
     seconds = {
@@ -141,8 +137,12 @@ def _accounted(
         "evaluation_and_files": watch.seconds["evaluation"] + watch.seconds["files"],
         "compiler_in_all_threads": account.compiler.seconds,
     }
+    metered = found.metering.sentence if found.metering.telling else None
     late = over_budget(cfg.train.budget_s, seconds)
-    _tell([] if late is None else [late], account, reporter)
+    notes = [*untold_notes(found.metrics), *(note for note in (metered, late) if note is not None)]
+    account.notes.extend(notes)
+    for note in notes:
+        reporter.message(note)
     steps = max(int(account.counts.get("steps", 0)), 1)
     entries = {
         "split": scene.split_by,

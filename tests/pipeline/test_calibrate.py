@@ -150,7 +150,7 @@ def test_the_command_writes_what_a_stack_says(tmp_path, run_command):
     assert "nan" not in text
     details = json.loads((out / "calibration.json").read_text())
     assert details["one_response"]
-    assert any("The stated exposures of" in m for m in details["messages"])
+    assert any("times.csv of" in m for m in details["messages"])
     assert (out / "calibration.png").stat().st_size > 10_000
 
 
