@@ -55,12 +55,11 @@ def finish(
     true_exposures: Mapping[str, float] | None = None,
     still_ours: Callable[[], None] = lambda: None,
 ) -> dict:
-    """Evaluate, write all results and return what `metrics.json` holds.
+    """Evaluate, write all results, and return what `metrics.json` holds.
 
     Gaussians are the live ones, `owner` has the moving object of each, `cfg` is what the fit was
     computed under; `still_ours` raises where the folder is another run's. The store is closed.
     """
-    still_ours()
     return_freed_memory()
     watch, exposures = Stopwatch(), {}
     shown: dict[int, ViewResult | None] = dict.fromkeys(summary_rows(scene))

@@ -109,6 +109,7 @@ def fit(
             spent_s = time.monotonic() - begin
             result = optimiser.run(start, resume=resume, spent_s=spent_s, finish_s=left_s)
         params, owner = fitted(result, cfg)
+        lock.require()
         account = account_of(start, params, result, clock, begin, compiler)
         what = (params, start.scene, start.store, start.cfg, folder, account, reporter)
         known = {"truth": truth, "lpips_weights": weights, "true_exposures": true_exposures}

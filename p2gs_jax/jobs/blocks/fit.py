@@ -184,6 +184,7 @@ class _Blocks:
         photometry = jax.tree.map(on_device, solved.shared.photometry)
         params = centred(Params(gaussians, photometry), cfg)
         self._tell(seams)
+        self.lock.require()
         account = self._account(scene, solved, gaussians.capacity, time.monotonic() - begin)
         metrics = finish(
             params,
