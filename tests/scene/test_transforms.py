@@ -18,7 +18,7 @@ from scene.helpers import (
 )
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.scene import find_scene, load_scene
+from p2gs_jax.scene import find_scene, load_scene, with_what_lies_beside
 from p2gs_jax.scene.seeds import FEWEST, common_points, depth_range
 from p2gs_jax.scene.sfm import map as sfm
 from p2gs_jax.scene.transforms import load_blender
@@ -49,6 +49,10 @@ def frames(*paths, **extra):
     return [{"file_path": path, "transform_matrix": pose, **extra} for path in paths]
 
 
+def centre_of(view):
+    return -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
+
+
 def test_fox(shared_data):
     scene = find_scene(shared_data("nerf_fox") / "transforms.json", CFG)
     assert len(scene.views) == 50
@@ -56,8 +60,7 @@ def test_fox(shared_data):
     assert (view.name, view.camera, view.width, view.height) == ("0001.jpg", "0", 540, 960)
     assert np.allclose(view.K, np.array([[687.76, 0, 277.279], [0, 687.245, 482.634], [0, 0, 1]]))
     assert view.distortion.coefficients == (0.0578421, -0.0805099, -0.000980296, 0.00015575)
-    centre = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
-    assert centre == pytest.approx([3.168359, -5.479490, -0.979166], abs=1e-5)
+    assert centre_of(view) == pytest.approx([3.168359, -5.479490, -0.979166], abs=1e-5)
     # It looks at the fox, near the origin: that lies in front, z forward.
     assert all(v.viewmat[2, 3] > 0 for v in scene.views)
 
@@ -71,7 +74,7 @@ def test_camera_angle_and_absent_extension(tmp_path):
     assert np.allclose(scene.views[0].viewmat, OPENGL)
 
 
-def test_frames_override_and_cameras_follow_folders(tmp_path):
+def test_frames_override_cameras_follow_folders_and_other_sizes_are_rescaled(tmp_path):
     names = ("images/left/0.png", "images/right/0.png")
     data = {**LENS, "frames": frames(*names)}
     data["frames"][1] |= {"fl_x": 60, "fl_y": 61, "cx": 19, "cy": 14, "k1": 0.1}
@@ -81,9 +84,6 @@ def test_frames_override_and_cameras_follow_folders(tmp_path):
     assert left.K[0, 0] == left.K[1, 1] == 50
     assert np.allclose(right.K, np.array([[60, 0, 19], [0, 61, 14], [0, 0, 1]]))
     assert right.distortion.coefficients == (0.1, 0, 0, 0)
-
-
-def test_other_size_is_rescaled(tmp_path):
     data = {"fl_x": 100, "w": 80, "h": 60, "frames": frames("images/a.png", "images/b.png")}
     scene = find_scene(write(tmp_path, data), CFG)
     assert np.allclose(scene.views[0].K, np.array([[50, 0, 20], [0, 50, 15], [0, 0, 1]]))
@@ -240,23 +240,25 @@ def write_blender(root, **counts):
     return root
 
 
+def find_and_split(root, cfg):
+    return with_what_lies_beside(find_scene(root, cfg), cfg)
+
+
 def held_out(scene):
     return [view.name for view in scene.views if view.split == "test"]
 
 
 def test_lego(shared_data):
     scene = find_scene(shared_data("nerf_synthetic_lego"), CFG)
-    assert scene.format == "blender"
+    assert (scene.format, scene.split_by) == ("blender", "transforms_test.json")
     assert (len(scene.train_indices), len(scene.test_indices)) == (100, 50)
-    assert scene.split_by == "transforms_test.json"
     assert {view.camera for view in scene.views} == {"0"}
     assert all(view.name.startswith(view.split) for view in scene.views)
     K = scene.views[0].K
     assert np.allclose(K, [[1111.111, 0, 400], [0, 1111.111, 400], [0, 0, 1]], atol=1e-3)
-    # The test cameras stand on the upper half sphere of radius 4.03 around the excavator.
+    # The cameras look at the excavator, from 4.03 units away.
     for view in scene.views:
-        centre = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
-        assert np.linalg.norm(centre) == pytest.approx(4.0311, abs=1e-3)
+        assert np.linalg.norm(centre_of(view)) == pytest.approx(4.0311, abs=1e-3)
         assert view.viewmat[2, 3] == pytest.approx(4.0311, abs=1e-3)
 
 
@@ -272,46 +274,40 @@ def test_val_takes_the_place_of_test_only_where_there_is_none(tmp_path):
     assert load_blender(write_blender(tmp_path / "alone", test=0), CFG).split_by is None
 
 
-def test_the_split_of_the_data_set_wins_and_random_seeds_follow(tmp_path):
-    scene = load_scene(write_blender(tmp_path), CFG)
-    assert len(scene.views) == 9
-    assert held_out(scene) == [f"test/r_{k}.png" for k in range(3)]
-    # Nothing matches in grey squares: seeds are drawn where all cameras look.
-    assert scene.random_seeds
-    assert scene.tracks is None
-    assert scene.point_colors is None
-    assert len(scene.points) > 10_000
-    assert "drawn at random" in scene.notes[-1]
-    assert np.linalg.norm(scene.points, axis=1).max() < 3.5
-    assert np.linalg.norm(scene.points.mean(0)) < 0.2
-    assert held_out(load_scene(tmp_path, ALL)) == []
-    every = load_scene(tmp_path, DataConfig(split="every", test_every=3))
-    assert every.split_by == "every 3rd view of each camera"
-    assert len(held_out(every)) == 3
-
-
-@pytest.mark.parametrize("count", [FEWEST - 1, FEWEST])
-def test_a_handful_of_matched_points_is_as_good_as_none(tmp_path, monkeypatch, count):
+@pytest.mark.parametrize("count", [0, FEWEST - 1, FEWEST])
+def test_the_split_of_the_data_set_wins_and_random_seeds_follow(tmp_path, monkeypatch, count):
+    """A handful of matched points is as good as none."""
     matched = np.random.default_rng(0).uniform(-1, 1, (count, 3)).astype(np.float32)
     found = lambda scene, *_, **__: dataclasses.replace(scene, points=matched)  # noqa: E731
-    monkeypatch.setattr(sfm, "triangulate", found)
+    if count:  # Nothing matches in grey squares.
+        monkeypatch.setattr(sfm, "triangulate", found)
     scene = load_scene(write_blender(tmp_path), CFG)
+    assert held_out(scene) == [f"test/r_{k}.png" for k in range(3)]
     assert scene.random_seeds == (count < FEWEST)
-    if scene.random_seeds:
-        assert f"Only {count} points were matched: {len(scene.points)} seeds" in scene.notes[-1]
-    else:
+    if count == FEWEST:
         np.testing.assert_array_equal(scene.points, matched)
-
-
-def test_random_seeds_are_the_same_every_time_and_in_the_views(tmp_path):
-    views = load_blender(write_blender(tmp_path), CFG).training_views
-    near, far = depth_range(views)
-    assert 1.5 < near < 4 < far < 6.5
-    points = common_points(views, near, far, 500)
-    assert np.array_equal(points, common_points(views, near, far, 500))
-    local = points @ views[0].viewmat[:3, :3].T + views[0].viewmat[:3, 3]
+        return
+    said = f"Only {count} points were matched" if count else "Neither points nor matches"
+    assert f"{said}: {len(scene.points)} seeds were drawn at random" in scene.notes[-1]
+    # They are where all cameras look, and the same every time.
+    assert scene.tracks is scene.point_colors is None
+    assert len(scene.points) > 10_000
+    assert np.linalg.norm(scene.points, axis=1).max() < 3.5
+    assert np.linalg.norm(scene.points.mean(0)) < 0.2
+    views = scene.training_views
+    assert np.array_equal(common_points(views, *depth_range(views)), scene.points)
+    local = scene.points @ views[0].viewmat[:3, :3].T + views[0].viewmat[:3, 3]
     assert (local[:, 2] > 0).all()
-    # Cameras that look apart get a range of their own.
+
+
+def test_every_and_none_are_held_out_and_cameras_that_look_apart(tmp_path):
+    write_blender(tmp_path)
+    assert held_out(find_and_split(tmp_path, ALL)) == []
+    every = find_and_split(tmp_path, DataConfig(split="every", test_every=3))
+    assert every.split_by == "every 3rd view of each camera"
+    assert len(held_out(every)) == 3
+    near, far = depth_range(every.training_views)
+    assert 1.5 < near < 4 < far < 6.5
     data = blender(around(6) @ np.diag([-1.0, 1.0, -1.0, 1.0]), "train")
     (tmp_path / "transforms_train.json").write_text(json.dumps(data))
     near, far = depth_range(load_blender(tmp_path, CFG).training_views)
@@ -363,16 +359,13 @@ def write_llff(root, table, count=4, size=(40, 30), folder="images"):
 
 def test_llff_axes_and_lens(tmp_path):
     scene = find_scene(write_llff(tmp_path, rows()), CFG)
-    assert scene.format == "llff"
-    assert scene.depths == (2.0, 6.0)
+    assert (scene.format, scene.depths) == ("llff", (2.0, 6.0))
     for view, pose in zip(scene.views, around(4), strict=True):
         assert np.allclose(view.viewmat, np.linalg.inv(pose @ OPENGL), atol=1e-6)
         assert np.allclose(view.K, [[50, 0, 20], [0, 50, 15], [0, 0, 1]])
     # The middle of the ring lies in the middle of every picture, four units ahead.
     assert np.allclose([view.viewmat[:3, 3] for view in scene.views], [0, 0, 4], atol=1e-6)
-
-
-def test_smaller_llff_photographs_are_named_by_their_folder(tmp_path):
+    # Smaller photographs are named by their folder.
     write_llff(tmp_path, rows(), size=(20, 15), folder="images_2")
     scene = find_scene(tmp_path, DataConfig(images="images_2"))
     assert np.allclose(scene.views[0].K, [[25, 0, 10], [0, 25, 7.5], [0, 0, 1]])

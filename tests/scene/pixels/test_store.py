@@ -23,22 +23,15 @@ def store_of(*views, **options):
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_rgb_order_and_exact_values(tmp_path, dtype):
-    bgr, top = noise(3, dtype=dtype), np.float32(np.iinfo(dtype).max)
-    ldr, mask = store_of(make_view(tmp_path / "a.png", bgr)).get(0)
+@pytest.mark.parametrize("channels", [(), (3,), (4,)])
+def test_rgb_order_exact_values_grey_and_alpha(tmp_path, dtype, channels):
+    raw, top = noise(*channels, dtype=dtype), np.float32(np.iinfo(dtype).max)
+    ldr, mask = store_of(make_view(tmp_path / "a.png", raw)).get(0)
     assert ldr.dtype == mask.dtype == np.float32
-    assert np.array_equal(ldr, bgr[..., ::-1].astype(np.float32) / top)
-    assert mask.shape == (48, 64)
-    assert mask.min() == 1.0
-
-
-def test_grey_and_alpha_as_a_mask(tmp_path):
-    grey, bgra = noise(), noise(4)
-    ldr, _ = store_of(make_view(tmp_path / "a.png", grey)).get(0)
-    assert np.array_equal(ldr, np.repeat(grey[..., None], 3, 2).astype(np.float32) / 255)
-    ldr, mask = store_of(make_view(tmp_path / "a.png", bgra)).get(0)
-    assert np.array_equal(mask, (bgra[..., 3] >= 128).astype(np.float32))
-    assert np.array_equal(ldr, bgra[..., 2::-1].astype(np.float32) / 255)
+    colours = raw[..., 2::-1] if channels else np.repeat(raw[..., None], 3, 2)
+    assert np.array_equal(ldr, colours.astype(np.float32) / top)
+    opaque = raw[..., 3] >= top / 2 if channels == (4,) else np.ones((48, 64))
+    assert np.array_equal(mask, opaque)
 
 
 def test_sizes_and_intrinsics(tmp_path):
