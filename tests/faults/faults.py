@@ -6,21 +6,13 @@ from typing import NamedTuple
 
 
 class Fault(NamedTuple):
-    """A line that is wrong.
+    """A line that is wrong."""
 
-    Attributes:
-        name: what the fault does.
-        file: inside p2gs_jax.
-        right: the text, which occurs there once.
-        wrong: what takes its place.
-        caught_by: test to run, as pytest names it, below tests/.
-    """
-
-    name: str
-    file: str
-    right: str
-    wrong: str
-    caught_by: str
+    name: str  # what the fault does
+    file: str  # inside p2gs_jax
+    right: str  # the text, which occurs there once
+    wrong: str  # what takes its place
+    caught_by: str  # test to run, as pytest names it, below tests/
 
 
 RASTERIZE = "render/test_rasterize.py"

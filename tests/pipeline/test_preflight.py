@@ -45,6 +45,7 @@ def scene(tmp_path_factory):
     [
         (("--preset", "paper", "--known-exposures", "KNOWN"), "starts exposures at random"),
         (("--preset", "3dgs", "--photometry.start", "tracks"), "splats display values"),
+        (("--preset", "ppisp", "--photometry.curve", "srgb"), "a whole camera"),
         (("--known-exposures", "KNOWN"), "names none of the"),
         (("--known-exposures", "exif"), "carries exposure time"),
     ],

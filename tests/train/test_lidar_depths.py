@@ -49,14 +49,11 @@ def test_its_gradient_is_that_of_finite_differences_and_nothing_is_pulled_elsewh
     assert np.count_nonzero(found) == 3
 
 
-def test_where_nothing_is_opaque_or_measured_it_is_zero_and_finite():
-    depth, alpha = np.full((HEIGHT, WIDTH), 10.0), np.zeros((HEIGHT, WIDTH))
-    value, slope = jax.value_and_grad(loss)(jnp.asarray(depth), alpha, measured([(1, 1)], [5.0]))
-    assert float(value) == 0
-    assert not np.asarray(slope).any()
-    value, slope = jax.value_and_grad(loss)(
-        jnp.asarray(depth), alpha + 0.9, measured([(1, 1)], [0.0])
-    )
+@pytest.mark.parametrize(("alpha", "measurement"), [(0.0, 5.0), (0.9, 0.0)])
+def test_where_nothing_is_opaque_or_measured_it_is_zero_and_finite(alpha, measurement):
+    depth, alphas = np.full((HEIGHT, WIDTH), 10.0), np.full((HEIGHT, WIDTH), alpha)
+    m = measured([(1, 1)], [measurement])
+    value, slope = jax.value_and_grad(loss)(jnp.asarray(depth), alphas, m)
     assert float(value) == 0
     assert not np.asarray(slope).any()
 

@@ -35,13 +35,10 @@ def render_of(radiance, alpha):
 
 def batch_of(color, alpha, backdrop, mask=None):
     camera = Camera(jnp.eye(4), jnp.eye(3), SIZE[1], SIZE[0])
-    mask = np.ones(SIZE, np.float32) if mask is None else mask
-    given = (np.float32(color * alpha[..., None]), mask, np.int32(0), None, np.float32(alpha))
-    return Batch(
-        camera,
-        *map(lambda a: None if a is None else jnp.asarray(a), given),
-        jnp.asarray(backdrop, jnp.float32),
-    )
+    mask = np.ones(SIZE) if mask is None else mask
+    arrays = (color * alpha[..., None], mask, alpha, backdrop)
+    ldr, mask, alpha, backdrop = (jnp.asarray(a, jnp.float32) for a in arrays)
+    return Batch(camera, ldr, mask, jnp.int32(0), None, alpha, backdrop)
 
 
 def capture_of(exposure=0.7, gamma=2.2):
@@ -66,8 +63,7 @@ def matted_loss(render, batch, capture, correction, cfg):
 
 
 def config(curve, **loss):
-    cfg = FitConfig(photometry=CURVES[curve])
-    return dataclasses.replace(cfg, loss=dataclasses.replace(LossConfig(), **loss))
+    return FitConfig(photometry=CURVES[curve], loss=LossConfig(**loss))
 
 
 @pytest.mark.parametrize("curve", CURVES)
@@ -96,28 +92,6 @@ def test_without_a_backdrop_nothing_changes(surfaces):
     np.testing.assert_array_equal(develop(linear, plain, alpha=alpha), develop(linear, plain))
     over = dataclasses.replace(plain, backdrop=(1.0, 1.0, 1.0))
     np.testing.assert_array_equal(develop(linear, over), develop(linear, plain))
-
-
-@pytest.mark.parametrize("curve", CURVES)
-def test_gradients_of_the_picture(surfaces, curve):
-    radiance, alpha = surfaces
-    inner = np.clip(alpha, 0.3, 1)
-    batch = batch_of(radiance, inner, (0.2, 0.7, 0.4))
-    weight = jnp.float32(RNG.normal(size=radiance.shape))
-
-    def shown(linear, opacity):
-        render = dataclasses.replace(render_of(radiance, inner), linear=linear, alpha=opacity)
-        return jnp.sum(weight * matted_loss(render, batch, capture_of(), None, config(curve))[0])
-
-    given = (jnp.float32(radiance * inner[..., None]), jnp.float32(inner))
-    for k, gradient in enumerate(jax.grad(shown, (0, 1))(*given)):
-        direction, step = jnp.sign(gradient), 1e-3
-        up, down = (
-            [value + sign * step * direction if i == k else value for i, value in enumerate(given)]
-            for sign in (1, -1)
-        )
-        numeric = float(shown(*up) - shown(*down)) / (2 * step)
-        assert float(jnp.sum(gradient * direction)) == pytest.approx(numeric, rel=0.02)
 
 
 def test_masked_pixels_get_no_gradient(surfaces):

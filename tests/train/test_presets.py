@@ -74,14 +74,6 @@ def test_opacity_resets_empty_the_scene_and_it_grows_back(tmp_path):
     assert max(np.diff(losses)) > 0.01  # the reset
 
 
-@pytest.mark.slow
-def test_the_reading_that_no_preset_uses_runs(tmp_path):
-    reading = {"weight": 0.01, "form": "observed_ldr"}
-    cfg = small("robust", **{f"loss__relative_exposure__{k}": v for k, v in reading.items()})
-    result = p2gs_jax.fit(make_scene(tmp_path / "scene"), tmp_path / "run", cfg)
-    assert "relative_exposure" in check(result, tmp_path / "run")[0]["terms"]
-
-
 # Of 30,000 steps: factor on the rate (arXiv 2601.18336, C.1).
 RATES = {0: 0.01, 250: 0.505, 500: 1.0, 15_500: 0.1, 30_000: 0.01 ** (1 - 1 / 60)}
 BASELINES = (
@@ -118,12 +110,6 @@ def test_baselines_run_and_come_back_as_they_were_saved(tmp_path, name):
         assert min(jax.tree.leaves(moved)) > 1e-3
 
 
-def test_a_learned_camera_takes_the_place_of_the_curve(tmp_path):
-    cfg = small("ppisp", photometry__curve="srgb")
-    with pytest.raises(p2gs_jax.UserError, match="a whole camera"):
-        p2gs_jax.fit(make_scene(tmp_path / "scene"), tmp_path / "run", cfg)
-
-
 def test_a_learned_camera_warms_up_and_decays_as_published():
     cfg = p2gs_jax.preset("ppisp")
     o = cfg.optimizer
@@ -132,9 +118,3 @@ def test_a_learned_camera_warms_up_and_decays_as_published():
     assert at == pytest.approx(expected, rel=1e-4)
     affine = p2gs_jax.preset("3dgs_affine")
     assert float(appearance_rate(jnp.float32(0.0), affine)) == pytest.approx(1e-2)
-
-
-def test_display_values_know_no_track_start(tmp_path):
-    cfg = small("3dgs", photometry__start="tracks")
-    with pytest.raises(p2gs_jax.UserError, match="splats display values"):
-        p2gs_jax.fit(make_scene(tmp_path / "scene"), tmp_path / "run", cfg)

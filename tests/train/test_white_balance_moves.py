@@ -1,14 +1,11 @@
 """White balance is learned like exposures where it varies per view, and nowhere else."""
 
-import json
-
 import cv2
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from tiny_scene import make_scene
 
-from p2gs_jax.cli import main
 from p2gs_jax.config import FitConfig
 from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.photometry.formation import corner, squared_radii
@@ -89,7 +86,7 @@ def photographed_by_a_camera(root, views=8):
 
 
 @pytest.mark.slow
-def test_a_fit_finds_white_balance_and_vignetting(tmp_path):
+def test_a_fit_finds_white_balance_and_vignetting(tmp_path, run_command):
     true = photographed_by_a_camera(tmp_path / "scene")
     argv = [
         *("fit", tmp_path / "scene", "--out", tmp_path / "run", "--steps", 60, "--test-every", 4),
@@ -98,9 +95,7 @@ def test_a_fit_finds_white_balance_and_vignetting(tmp_path):
         *("--photometry.white-balance", "view", "--photometry.vignetting", "camera"),
         *("--photometry.freeze-until", 0.0),
     ]
-    with pytest.raises(SystemExit) as stop:
-        main([str(a) for a in argv])
-    assert stop.value.code == 0
+    assert run_command(*argv)[0] == 0
     run = load_run(tmp_path / "run")
     rows = list(run.scene.train_indices)
     found = np.asarray(run.params.photometry.white_balance)
@@ -108,12 +103,3 @@ def test_a_fit_finds_white_balance_and_vignetting(tmp_path):
     assert np.abs(found - (true[rows] - true[rows].mean(0))).max() < 0.02
     (camera,) = run.cfg.photometry.cameras
     assert corner(camera)[0] == pytest.approx(np.exp(-0.5), abs=0.05)
-    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    test = metrics["test"]
-    assert test["photometry_fitted"]["psnr"] > test["exposure_fitted"]["psnr"] + 0.5
-    fitted = test["photometry_fitted"]["per_view"]
-    for index in run.scene.test_indices:
-        expected = (true[index] - true[rows].mean(0)) / np.log(2)
-        name = run.scene.views[index].name
-        found_ev = [fitted[name][key] for key in ("red_green_ev", "blue_green_ev")]
-        np.testing.assert_allclose(found_ev, expected[::2] - expected[1], atol=0.05)
