@@ -108,24 +108,6 @@ def made():
     )
 
 
-@pytest.fixture(scope="module")
-def wide(made):
-    """Return the step of `made.after`, all of it in float64."""
-
-    def widened(tree):
-        narrow = jax.tree.map(np.asarray, tree)
-        return jax.tree.map(lambda a: a.astype(np.float64) if a.dtype.kind == "f" else a, narrow)
-
-    optimizer = make_optimizer(CFG)
-    state = widened(initial_state(made.params, made.alive, optimizer))
-    controls = Controls(np.float64(PROGRESS), np.int32(DEGREE), np.float64(RATE), np.uint32(0))
-    given = widened((photograph(), Partner(np.int32(0))))
-    with jax.enable_x64(True):
-        state = jax.tree.map(jnp.asarray, state)
-        step = Step(CFG, optimizer, EXTENT)
-        return jax.device_get(step(state, *given, controls, room=made.room, degree=DEGREE))
-
-
 def rows_of(tree, name, rows):
     return np.asarray(getattr(tree, name))[rows]
 
@@ -163,10 +145,22 @@ def test_one_step_is_an_adam_update_of_the_gradient_of_the_loss(made):
         )
 
 
-def test_a_step_agrees_with_one_in_float64_where_nothing_becomes_narrow(made, wide):
-    (state, report), (exact, exact_report) = made.after, wide
+def widened(tree):
+    narrow = jax.tree.map(np.asarray, tree)
+    return jax.tree.map(lambda a: a.astype(np.float64) if a.dtype.kind == "f" else a, narrow)
+
+
+def test_a_step_agrees_with_one_in_float64_where_nothing_becomes_narrow(made):
+    optimizer = make_optimizer(CFG)
+    start = widened(initial_state(made.params, made.alive, optimizer))
+    given = widened((photograph(), Partner(np.int32(0)), CONTROLS))
+    with jax.enable_x64(True):
+        step = Step(CFG, optimizer, EXTENT)
+        found = step(jax.tree.map(jnp.asarray, start), *given, room=made.room, degree=DEGREE)
+        exact, exact_report = found = jax.device_get(found)
+    state, report = made.after
     assert int(exact.fault.kind) == FAULT_NONE
-    for path, leaf in jax.tree_util.tree_leaves_with_path(wide):
+    for path, leaf in jax.tree_util.tree_leaves_with_path(found):
         assert leaf.dtype.kind != "f" or leaf.dtype == np.float64, jax.tree_util.keystr(path)
     assert float(report.loss) == pytest.approx(float(exact_report.loss), rel=1e-6)
     assert float(report.loss) != float(exact_report.loss)  # it is computed otherwise
@@ -224,22 +218,25 @@ def test_a_view_without_room_changes_nothing_but_the_fault(made):
     assert int(state.fault.visible) == made.seen.sum() > made.tight.visible
     assert int(state.fault.needed) > made.tight.entries
     assert int(report.visible) == made.seen.sum()
-    assert int(state.fault.needed) <= made.room.entries
-    assert int(state.fault.visible) <= made.room.visible
     grown = made.after[1]
     assert int(grown.entries) <= made.room.entries
     assert int(grown.visible) <= made.room.visible
-    # Only what did not fit grows.
-    assert made.room.grown(10**6, 1).visible == made.room.visible
-    assert made.room.grown(1, 10**6).entries == made.room.entries
 
 
-@pytest.mark.parametrize(("field", "named"), [("sh", "loss term"), ("quats", "gradient of")])
-def test_what_is_no_number_is_named(made, field, named):
-    row = np.flatnonzero(made.seen)[-1]
-    gaussians = made.params.gaussians
-    changed = {field: getattr(gaussians, field).at[row].set(jnp.nan)}
-    params = dataclasses.replace(made.params, gaussians=dataclasses.replace(gaussians, **changed))
+@pytest.mark.parametrize(
+    ("field", "named"),
+    [
+        ("sh", "loss term"),
+        ("quats", "gradient of"),
+        # Of another view than the step's: only the mean over all views knows it.
+        ("raw_exposures", "loss term log_exposure_mean"),
+    ],
+)
+def test_the_first_that_is_not_finite_is_named(made, field, named):
+    part = "photometry" if field in PHOTOMETRY else "gaussians"
+    before, row = getattr(made.params, part), 0 if field in PHOTOMETRY else np.argmax(made.seen)
+    broken = dataclasses.replace(before, **{field: getattr(before, field).at[row].set(jnp.nan)})
+    params = dataclasses.replace(made.params, **{part: broken})
     state, report = made.step(made.room, params)
     assert int(state.fault.kind) == FAULT_NONFINITE
     assert int(state.step) == 0
@@ -248,13 +245,3 @@ def test_what_is_no_number_is_named(made, field, named):
     if field == "sh":
         fresh = initial_state(params, jnp.asarray(made.alive), make_optimizer(CFG))
         same(dataclasses.replace(state, fault=fresh.fault), fresh)
-
-
-def test_the_first_term_that_is_no_number_is_named(made):
-    """The exposure of another view than the step's: only the mean over all views knows it."""
-    photometry = Photometry(jnp.array([jnp.nan, -0.1]), made.params.photometry.raw_gammas)
-    params = dataclasses.replace(made.params, photometry=photometry)
-    state, report = made.step(made.room, params)
-    assert int(state.fault.kind) == FAULT_NONFINITE
-    names = finite_names(report.terms, state.params)
-    assert names[int(state.fault.term)] == "loss term log_exposure_mean"
