@@ -156,11 +156,10 @@ def test_a_step_agrees_with_one_in_float64_where_nothing_becomes_narrow(made):
     given = widened((photograph(), Partner(np.int32(0)), CONTROLS))
     with jax.enable_x64(True):
         step = Step(CFG, optimizer, EXTENT)
-        found = step(jax.tree.map(jnp.asarray, start), *given, room=made.room, degree=DEGREE)
-        exact, exact_report = found = jax.device_get(found)
-    state, report = made.after
+        wide = step(jax.tree.map(jnp.asarray, start), *given, room=made.room, degree=DEGREE)
+    (state, report), (exact, exact_report) = made.after, jax.device_get(wide)
     assert int(exact.fault.kind) == FAULT_NONE
-    for path, leaf in jax.tree_util.tree_leaves_with_path(found):
+    for path, leaf in jax.tree_util.tree_leaves_with_path(wide):
         assert leaf.dtype.kind != "f" or leaf.dtype == np.float64, jax.tree_util.keystr(path)
     assert float(report.loss) == pytest.approx(float(exact_report.loss), rel=1e-6)
     assert float(report.loss) != float(exact_report.loss)  # it is computed otherwise
