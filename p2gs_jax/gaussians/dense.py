@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.core.streams import Stream, generator
-from p2gs_jax.gaussians.flow import CHECKS, DepthMap, Flows, depth_map, pixel_centers
+from p2gs_jax.gaussians.flow import DepthMap, Flows, depth_map, pixel_centers
 from p2gs_jax.gaussians.matching import MatchImages, Tones, neighbours, visibility
 from p2gs_jax.gaussians.population import Coverage, default_max_gaussians
 from p2gs_jax.gaussians.seeds import gaussians_from_points, neighbour_scales
@@ -64,7 +64,7 @@ class Candidates:
 
     Normals are in camera coordinates, towards the camera, and zero where the surface is not flat;
     radiance is in the gauge of the exposures; texture is the mean gradient about the pixel, display
-    values a pixel; for `counts` see `DepthMap`.
+    values a pixel; `known` is the share of all pixels that have a depth.
     """
 
     row: int
@@ -73,35 +73,29 @@ class Candidates:
     normals: Float32[np.ndarray, "c 3"]
     radiance: Float32[np.ndarray, "c 3"]
     texture: Float32[np.ndarray, " c"]
-    counts: Int[np.ndarray, " n"]
+    known: float
 
 
 @dataclass(frozen=True)
 class DenseSeeds:
     """Seeds from depth maps, scene units; radiance in the gauge of the exposures.
 
-    `scales` are standard deviations along the axes of `quats` (w x y z); `counts` are pixels in
-    all, refused by each of `CHECKS`, accepted; `near_existing` seeds were dropped in favour of an
-    existing one; so many `views` were matched.
+    `scales` are standard deviations along the axes of `quats` (w x y z); `known` is the share of
+    pixels with a depth; so many `views` were matched.
     """
 
     points: Float32[np.ndarray, "n 3"]
     radiance: Float32[np.ndarray, "n 3"]
     scales: Float32[np.ndarray, "n 3"]
     quats: Float32[np.ndarray, "n 4"]
-    counts: Int[np.ndarray, " c"] = field(default_factory=lambda: np.zeros(len(CHECKS) + 2, int))
-    near_existing: int = 0
+    known: float = 0.0
     views: int = 0
 
     def note(self) -> str:
-        """Return a sentence on what was accepted and rejected, and why."""
-        total, *refused, accepted = (int(c) for c in self.counts)
-        total = max(total, 1)
-        said = ", ".join(f"{name} {n / total:.0%}" for name, n in zip(CHECKS, refused, strict=True))
+        """Say what they are and how to do without."""
         return (
             f"{len(self.points)} dense seeds from flow between {self.views} photographs "
-            f"(--init.dense off leaves them out): {accepted / total:.0%} of the pixels have a "
-            f"depth; refused: {said}; {self.near_existing} lay at existing seeds."
+            f"(--init.dense off leaves them out): {self.known:.0%} of the pixels have a depth."
         )
 
 
@@ -170,7 +164,7 @@ def _candidates(row: int, near, flows: Flows, color: Tones, seed: int) -> Candid
         _normals(depth, frame.K, y, x),
         np.exp(color.log_radiance(row, frame.ldr[y, x], places(centers, *shown.shape[::-1]))),
         texture[y, x],
-        depth.counts,
+        float(depth.valid.mean()),
     )
 
 
@@ -206,9 +200,9 @@ def choose_seeds(
     found = [found[k] for k in order]
     plain = float(np.quantile(np.concatenate([c.texture for c in found]), PLAIN))
     tree = KDTree(existing) if len(existing) else None
-    cell, drawn, refused = float(FINEST_CELL), [], 0
+    cell, drawn = float(FINEST_CELL), []
     for _ in range(ATTEMPTS):
-        drawn, refused = _draw(found, images, existing, tree, cell, plain)
+        drawn = _draw(found, images, existing, tree, cell, plain)
         count = sum(len(pick) for pick, _ in drawn)
         # A few too many are left out at random below.
         few = count < (1 - SLACK) * limit and cell > FINEST_CELL
@@ -220,10 +214,8 @@ def choose_seeds(
         np.concatenate(p).astype(np.float32) for p in zip(*parts, strict=True)
     )
     keep = np.sort(rng.permutation(len(points))[:limit])
-    counts = np.sum([c.counts for c in found], axis=0)
-    return DenseSeeds(
-        points[keep], radiance[keep], scales[keep], quats[keep], counts, refused, len(found)
-    )
+    known = float(np.mean([c.known for c in found]))
+    return DenseSeeds(points[keep], radiance[keep], scales[keep], quats[keep], known, len(found))
 
 
 def _world(candidates: Candidates, images: MatchImages, pick) -> Float[np.ndarray, "c 3"]:
@@ -239,8 +231,8 @@ def _cells(xy: Float[np.ndarray, "c 2"], size: float, width: int) -> Int[np.ndar
 
 
 def _draw(found, images: MatchImages, existing, tree, cell: float, plain: float):
-    """Return for each view the chosen candidates and their spacing in pixels; and the refused."""
-    chosen, refused, drawn = [existing], 0, []
+    """Return for each view the chosen candidates and their spacing in pixels."""
+    chosen, drawn = [existing], []
     for candidates in found:
         frame = images[candidates.row]
         height, width = frame.luminance.shape
@@ -276,11 +268,10 @@ def _draw(found, images: MatchImages, existing, tree, cell: float, plain: float)
         if tree is not None and len(points):
             size = spacing * z[pick] / np.mean(np.diag(frame.K)[:2])
             free = np.asarray(tree.query(points)[0]) > size
-            refused += int((~free).sum())
             pick, spacing, points = pick[free], spacing[free], points[free]
         drawn.append((pick, spacing))
         chosen.append(points)
-    return drawn, refused
+    return drawn
 
 
 def _seeds(candidates: Candidates, images: MatchImages, pick, spacing):

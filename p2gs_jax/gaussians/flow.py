@@ -42,22 +42,18 @@ PATCH, STRIDE, DESCENTS = 8, 4, 16
 # Flows kept: those in the other direction serve the neighbours' own depth.
 KEPT_FLOWS = 128
 
-CHECKS = ("unusable", "forward-backward", "epipolar", "parallax", "colour", "third view", "alone")
-
 
 class DepthMap(NamedTuple):
     """Depth of one view: 1 / z, and which pixels passed every check.
 
     `slope` is d(1/z)/dx, d(1/z)/dy per pixel, from the plane through the window; where it is
-    `flat`, the window lies in that plane. `counts` are the pixels that matched at all, those each
-    of CHECKS refused, and the accepted.
+    `flat`, the window lies in that plane.
     """
 
     inverse: Float32[np.ndarray, "h w"]
     valid: Bool[np.ndarray, "h w"]
     slope: Float32[np.ndarray, "h w 2"]
     flat: Bool[np.ndarray, "h w"]
-    counts: Int[np.ndarray, " c"]
 
 
 @dataclass(frozen=True)
@@ -135,12 +131,6 @@ def _sampled(image, xy, how=cv2.INTER_LINEAR):
     return cv2.remap(image, at[..., 0], at[..., 1], how, borderMode=cv2.BORDER_CONSTANT)
 
 
-class _Pair(NamedTuple):
-    inverse: np.ndarray
-    precision: np.ndarray  # of `inverse`; 0 = refused
-    refused: list[np.ndarray]
-
-
 @dataclass
 class Flows:
     """Flows between training views, computed when asked for; from any thread.
@@ -170,8 +160,8 @@ class Flows:
         return _flow(first, second, np.clip(np.nan_to_num(start, nan=0.0), -most, most))
 
 
-def _match(flows: Flows, i: int, j: int) -> _Pair:
-    """Return inverse depth of a view from its flow to another."""
+def _match(flows: Flows, i: int, j: int):
+    """Return inverse depth of a view from its flow to another, and its precision; 0: refused."""
     a, b = flows.images[i], flows.images[j]
     first, second = at_common_exposure(a, b)
     here, to_b = pixel_centers(*a.luminance.shape), _geometry(a, b)
@@ -196,34 +186,22 @@ def _match(flows: Flows, i: int, j: int) -> _Pair:
     apart = ahead & (sensitivity * inverse > DEVIATION / PAIR_ERROR)
     blurred = [cv2.blur(i, (3, 3)).astype(np.float32) for i in (first, second)]
     same = np.abs(blurred[0] - _sampled(blurred[1], match)) < COLOUR
-    refused, left = [], np.ones_like(usable)
-    for passed in (usable, returns, on_line, apart, same):
-        refused.append(left & ~passed)
-        left = left & passed
-    precision = np.where(left, (sensitivity / DEVIATION) ** 2, 0).astype(np.float32)
-    return _Pair(inverse, precision, refused)
+    passed = usable & returns & on_line & apart & same
+    return inverse, np.where(passed, (sensitivity / DEVIATION) ** 2, 0).astype(np.float32)
 
 
 def depth_map(flows: Flows, row: int, near: Sequence[int] | Int[np.ndarray, " k"]) -> DepthMap:
     """Return the depth of a view, where at least two of its neighbours `near` agree on it."""
-    pairs = [_match(flows, row, int(j)) for j in near]
-    inverse = np.stack([p.inverse for p in pairs])
-    precision = np.stack([p.precision for p in pairs])
+    inverse, precision = map(
+        np.stack, zip(*(_match(flows, row, int(j)) for j in near), strict=True)
+    )
     fused, agreeing, total = _fuse(inverse, precision)
-    matched = (precision > 0).any(0)
     with np.errstate(divide="ignore", invalid="ignore"):
         sharp = 1 / np.sqrt(total) < FUSED_ERROR * fused
     third = (agreeing.sum(0) >= 2) & sharp
     smooth, slope, flat, support = plane_fit(fused, third)
     valid = third & (support > SUPPORT)
-    # A rejected pixel counts for the last check that any of its neighbours reached.
-    rank = np.arange(5)[:, None, None]
-    last = np.max([(rank * np.stack(p.refused)).sum(0) for p in pairs], axis=0)
-    refused = [int((~matched & (last == i)).sum()) for i in range(5)]
-    refused += [int((matched & ~third).sum()), int((third & ~valid).sum())]
-    counts = np.array([matched.size, *refused, int(valid.sum())])
-    inverse = np.where(flat, smooth, fused)
-    return DepthMap(inverse, valid, slope, flat & valid, counts)
+    return DepthMap(np.where(flat, smooth, fused), valid, slope, flat & valid)
 
 
 def _fuse(inverse, precision):

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Float32
 
 from p2gs_jax.config import FitConfig, InitConfig
 from p2gs_jax.core.numerics import fibonacci_sphere
-from p2gs_jax.gaussians.seeds import camera_centers, gaussians_from_points, merge, photographed
+from p2gs_jax.gaussians.seeds import camera_centers, gaussians_from_points, photographed
 from p2gs_jax.render.warp import project_points
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.visibility import in_frame
@@ -136,19 +136,6 @@ def find_shell(
         xy[keep],
         empty_fraction,
     )
-
-
-def black_gaussians(
-    points: np.ndarray, shell: Shell | None, views: Sequence[View], cfg: FitConfig
-) -> Gaussians:
-    """Return Gaussians of points and shell without colours: enough to compile for."""
-    black = gaussians_from_points(points, np.zeros_like(points), views, cfg)
-    if shell is None:
-        return black
-    far = gaussians_from_points(
-        shell.points, np.zeros_like(shell.points), views, cfg, scales=shell.scales
-    )
-    return merge(black, far)
 
 
 def shell_gaussians(

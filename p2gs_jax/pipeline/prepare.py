@@ -19,8 +19,14 @@ from p2gs_jax.gaussians.dense import DenseSeeds, dense_limit, dense_seeds, gauss
 from p2gs_jax.gaussians.matching import Tones, rough_tones
 from p2gs_jax.gaussians.moving import Nodes, node_gaussians, nodes_radiance, with_vibration
 from p2gs_jax.gaussians.population import Coverage
-from p2gs_jax.gaussians.seeds import merge, photographed_radiance, subsample, with_colors
-from p2gs_jax.gaussians.shell import Shell, black_gaussians, find_shell, shell_gaussians
+from p2gs_jax.gaussians.seeds import (
+    gaussians_from_points,
+    merge,
+    photographed_radiance,
+    subsample,
+    with_colors,
+)
+from p2gs_jax.gaussians.shell import Shell, find_shell, shell_gaussians
 from p2gs_jax.photometry.calibrate import Selection
 from p2gs_jax.photometry.parameters import initial_appearance, initial_photometry, point_radiance
 from p2gs_jax.pipeline.exposures import Exposures
@@ -58,7 +64,12 @@ class Prepared:
 def expected(found: Survey, decisions: Decisions) -> Prepared:
     """Return what a fit will start from in its shapes: black Gaussians, exposures of 1."""
     scene, cfg, views = found.scene, found.cfg, found.scene.training_views
-    black = black_gaussians(scene.points[found.seeds], found.shell, views, cfg)
+    points = scene.points[found.seeds]
+    black = gaussians_from_points(points, np.zeros_like(points), views, cfg)
+    if found.shell is not None:
+        far, scales = found.shell.points, found.shell.scales
+        shell = gaussians_from_points(far, np.zeros_like(far), views, cfg, scales=scales)
+        black = merge(black, shell)
     if found.vibrating:
         black = with_vibration(black, scene, cfg)
     owner = None

@@ -13,14 +13,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import count_entries, project, render_splats, view_radiance
 from p2gs_jax.render.capacity import PICTURES, bucket
 from p2gs_jax.render.harmonics import coefficient_count
-from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians
 
 MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
@@ -80,9 +78,8 @@ def rasterization(
     arrays, size = (gaussians, each, viewmats, Ks), (width, height)
     if capacity is None:
         capacity = _measured(arrays, size, cfg, sh_degree)
-    traced = any(isinstance(a, Tracer) for a in jax.tree.leaves(arrays))
-    run = _compiled(None if traced else jax.default_backend())
-    rgb, alpha, depth, meta = run(*arrays, size, cfg, capacity, sh_degree, render_mode != "RGB")
+    options = size, cfg, capacity, sh_degree, render_mode != "RGB"
+    rgb, alpha, depth, meta = _render(*arrays, *options)
     meta |= {"capacity": capacity, "width": width, "height": height}
     return _channels(rgb, alpha[..., None], depth, backgrounds, render_mode), alpha[..., None], meta
 
@@ -123,6 +120,7 @@ def _seen(gaussians, each, size, cfg: RenderConfig, sh_degree: int | None):
     return camera, splats, color
 
 
+@functools.partial(jax.jit, static_argnums=(4, 5, 6, 7, 8))
 def _render(gaussians, colors, viewmats, Ks, size, cfg, capacity, sh_degree, with_depth):
     """Return radiance, alpha, depth (c h w) or None, and what is known of each camera."""
 
@@ -141,13 +139,6 @@ def _render(gaussians, colors, viewmats, Ks, size, cfg, capacity, sh_degree, wit
         return result.linear, result.alpha, result.depth, meta
 
     return jax.lax.map(one, (colors, viewmats, Ks))
-
-
-@functools.cache
-def _compiled(backend: str | None):
-    """Return `_render`, compiled; options are only allowed to the outermost program."""
-    options = None if backend is None else compiler_options()
-    return jax.jit(_render, static_argnums=(4, 5, 6, 7, 8), compiler_options=options)
 
 
 @functools.partial(jax.jit, static_argnums=(4, 5, 6))

@@ -9,7 +9,7 @@ import pytest
 from p2gs_jax.config import DataConfig, DensifyConfig, FitConfig
 from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.gaussians.dense import MATCH_SIDE, coverage_of, dense_limit, dense_seeds, wants_dense
-from p2gs_jax.gaussians.flow import CHECKS, Flows, depth_map
+from p2gs_jax.gaussians.flow import Flows, depth_map
 from p2gs_jax.gaussians.matching import (
     MatchImages,
     Tones,
@@ -110,7 +110,6 @@ def test_depths_of_a_slanted_plane_are_right(plane):
     assert found.valid.mean() > 0.7
     assert np.quantile(error[found.valid], 0.95) < 0.01
     assert found.flat[found.valid].mean() > 0.95
-    assert found.counts[0] == found.counts[1:].sum() == WIDTH * HEIGHT
 
 
 def test_what_one_photograph_hides_from_another_is_refused(tmp_path):
@@ -150,7 +149,7 @@ def test_exposures_do_not_matter_once_they_are_solved(tmp_path):
     # Unsolved, the photographs are refused by their colours.
     blind = World(tmp_path / "mixed", exposures=[1.0, 0.25, 4.0, 0.25, 4.0])
     blind.tones = same.tones
-    assert blind.depth()[0].counts[1 + CHECKS.index("colour")] > 0.1 * WIDTH * HEIGHT
+    assert blind.depth()[0].valid.mean() < 0.9 * b.valid.mean()
 
 
 def test_clipped_pixels_carry_no_seed(tmp_path):
@@ -199,7 +198,6 @@ def test_existing_seeds_have_precedence(plane):
     left = seeds.points[:, 0] < -0.1
     assert (~left).sum() > 150
     assert left.sum() < 0.05 * len(left)
-    assert seeds.near_existing > 0
     # Seeds far behind are seeds of something else.
     behind = plane.seeds(limit=400, existing=existing * [1, 1, 3])
     assert (behind.points[:, 0] < -0.1).sum() > 100
