@@ -207,7 +207,8 @@ def check_devices() -> list[Finding]:
     try:
         import jax
 
-        from p2gs_jax.render.tiles import fastest_here
+        from p2gs_jax.core.runtime import keep_freed_memory
+        from p2gs_jax.render.tiles import fastest_here, slow_here
 
         # Tile lists as `render.binning` chooses where the configuration says None.
         cpu = jax.default_backend() == "cpu"
@@ -219,7 +220,13 @@ def check_devices() -> list[Finding]:
         if cpu and (shutil.which("nvidia-smi") or driver.is_file()):
             said += " alone; for the NVIDIA GPU here: pip install 'p2gs-jax[cuda]'"
         lists = f"tile lists by {'counting' if cpu else 'sorting'}"
-        return [Finding("JAX runs on", said), Finding("Rasterizer", f"{fastest_here()}, {lists}")]
+        used = ". ".join(filter(None, [f"{fastest_here()}, {lists}", slow_here()]))
+        kept = "kept between steps" if keep_freed_memory() else "handed back: steps are slower"
+        return [
+            Finding("JAX runs on", said),
+            Finding("Rasterizer", used),
+            Finding("Freed memory", kept),
+        ]
     except Exception as error:  # whatever a broken JAX raises
         return [Finding("JAX runs on", f"{type(error).__name__}: {error}", ok=False)]
 

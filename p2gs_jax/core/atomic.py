@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import errno
 import json
 import math
@@ -101,7 +102,8 @@ def atomic_write(path: Path, *, durable: bool = True) -> Iterator[Path]:
 def atomic_folder(path: Path) -> Iterator[Path]:
     """Yield an empty folder beside `path`; it replaces `path`, or is deleted after an error.
 
-    What lies at `path` is removed once the new folder is whole.
+    What lies at `path` is removed once the new folder is there: whenever the process is killed, one
+    of both is whole and at `path`, if the file system can exchange two names at once.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -109,9 +111,13 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     try:
         yield temporary
         temporary.chmod(0o755)
-        if path.is_dir():
-            shutil.rmtree(path)
-        os.replace(temporary, path)
+        if not path.is_dir():
+            os.replace(temporary, path)
+        elif not _exchanged(temporary, path):
+            former = Path(tempfile.mkdtemp(dir=path.parent, prefix=_BEGUN))
+            os.replace(path, former)
+            os.replace(temporary, path)
+            shutil.rmtree(former)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
@@ -132,6 +138,13 @@ def remove_begun(folder: Path, spare: str) -> None:
             if name.startswith(_BEGUN):
                 with contextlib.suppress(OSError):
                     Path(at, name).unlink()
+
+
+def _exchanged(a: Path, b: Path) -> bool:
+    """Exchange two folders at once; return whether system and file system can (Linux)."""
+    rename = getattr(ctypes.CDLL(None), "renameat2", None)
+    here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
+    return rename is not None and not rename(here, os.fsencode(a), here, os.fsencode(b), exchange)
 
 
 @contextlib.contextmanager

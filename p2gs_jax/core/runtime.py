@@ -34,9 +34,10 @@ def keep_freed_memory() -> bool:
     mallopt = _of_glibc("mallopt")
     if mallopt is None:
         return False
-    wanted = ((_M_MMAP_THRESHOLD, 1 << 30), (_M_TRIM_THRESHOLD, 2**31 - 1), (_M_TOP_PAD, 64 << 20))
-    # A list: a library that refuses the first setting gets the others.
-    return all([mallopt(what, value) == 1 for what, value in wanted])
+    # The largest value that some libraries take comes second; all settings are tried.
+    wanted = ((_M_TRIM_THRESHOLD, 2**31 - 1), (_M_TOP_PAD, 64 << 20))
+    taken = [mallopt(what, value) == 1 for what, value in wanted]
+    return any(mallopt(_M_MMAP_THRESHOLD, 1 << n) == 1 for n in (30, 25)) and all(taken)
 
 
 def return_freed_memory() -> None:

@@ -7,26 +7,29 @@ and tracks are those the fit started from. Neither program has a place for expos
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import pycolmap
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from PIL import Image
 
 from p2gs_jax.core.atomic import atomic_folder, write_json, write_text
 from p2gs_jax.core.ply import header_of
-from p2gs_jax.errors import UserError
 from p2gs_jax.run.photometry_files import ViewPhotometry
 from p2gs_jax.scene import ImageStore
+from p2gs_jax.scene.convert.convert import kept_settings
 from p2gs_jax.types import Scene, View
 
 JPEG_QUALITY = 98
+# What Pillow writes and both programs read; photographs in another format are exported as PNG.
+READABLE = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 # nerfstudio's file of points, and the colour of points without one.
 CLOUD, GREY = "sparse_pc.ply", 128
 RGB = ("red", "green", "blue")
@@ -47,28 +50,34 @@ def write_folder(
     COLMAP reads `sparse/0`; nerfstudio's `splatfacto` reads `transforms.json` and `sparse_pc.ply`.
     The folder is replaced once the new one is whole. The store has cameras at the size of the fit;
     `on_view` receives how many photographs are written, and of how many. A UserError says that a
-    photograph cannot be read, or not be written under its name.
+    photograph cannot be read.
     """
+    names = {view.name: exported_name(view) for view in scene.views}
     with atomic_folder(folder) as temporary:
-        write_text(temporary / "exposures.csv", exposure_table(photometry))
-        masks: dict[str, Bool[np.ndarray, "h w"]] = {}
+        write_text(temporary / "exposures.csv", exposure_table(photometry, names))
+        masked = False
         for index, view in enumerate(scene.views):
             ldr, mask = store.get(index)
-            _write_photograph(temporary / "images" / view.name, view, ldr)
-            masks[view.name] = mask > 0
-            on_view(index + 1, len(scene.views))
-        masked = {name for name, mask in masks.items() if not mask.all()}
-        if program == "nerfstudio":
-            _write_points(temporary / CLOUD, scene)
-            write_json(temporary / "transforms.json", _transforms(scene, store, masked))
-        else:
-            _write_model(temporary / "sparse" / "0", scene, store)
-            masked = set(masks) if masked else masked
-        for name in masked:
-            path = temporary / _place_of_mask(name)
+            _write_photograph(temporary / "images" / names[view.name], view, ldr)
+            path = temporary / _place_of_mask(names[view.name])
             path.parent.mkdir(parents=True, exist_ok=True)
             # 255 where the photograph is to be used.
-            Image.fromarray(255 * masks[name].astype(np.uint8)).save(path)
+            Image.fromarray(np.where(mask > 0, 255, 0).astype(np.uint8)).save(path)
+            masked |= not (mask > 0).all()
+            on_view(index + 1, len(scene.views))
+        # Masks of all photographs or of none: nerfstudio refuses a part.
+        if not masked:
+            shutil.rmtree(temporary / "masks")
+        if program == "nerfstudio":
+            _write_points(temporary / CLOUD, scene)
+            write_json(temporary / "transforms.json", _transforms(scene, store, names, masked))
+        else:
+            _write_model(temporary / "sparse" / "0", scene, store, names)
+
+
+def exported_name(view: View) -> str:
+    """Return the name of an exported photograph: its own, or with .png behind it."""
+    return view.name if Path(view.name).suffix.lower() in READABLE else f"{view.name}.png"
 
 
 def _place_of_mask(name: str) -> str:
@@ -76,16 +85,18 @@ def _place_of_mask(name: str) -> str:
     return (Path("masks") / f"{name}.png").as_posix()
 
 
-def _transforms(scene: Scene, store: ImageStore, masked: set[str]) -> dict[str, Any]:
-    """Return the content of `transforms.json`; some views have masks, by name."""
+def _transforms(
+    scene: Scene, store: ImageStore, exported: Mapping[str, str], masked: bool
+) -> dict[str, Any]:
+    """Return the content of `transforms.json`."""
     frames = []
     names: dict[str, list[str]] = {"train": [], "test": []}
     for index, view in enumerate(scene.views):
-        place = (Path("images") / view.name).as_posix()
+        place = (Path("images") / exported[view.name]).as_posix()
         names[view.split].append(place)
         frames.append(_frame(store, index) | {"file_path": place})
-        if view.name in masked:
-            frames[-1]["mask_path"] = _place_of_mask(view.name)
+        if masked:
+            frames[-1]["mask_path"] = _place_of_mask(exported[view.name])
     content: dict[str, Any] = {"camera_model": "PINHOLE", "ply_file_path": CLOUD}
     if names["test"]:
         content["train_filenames"] = names["train"]
@@ -93,8 +104,8 @@ def _transforms(scene: Scene, store: ImageStore, masked: set[str]) -> dict[str, 
     return {**content, "frames": frames}
 
 
-def exposure_table(photometry: Sequence[ViewPhotometry]) -> str:
-    """Return exposures as CSV; a held-out view's is that fitted to its photograph.
+def exposure_table(photometry: Sequence[ViewPhotometry], names: Mapping[str, str]) -> str:
+    """Return exposures as CSV, under the exported names; a held-out view's is the fitted one.
 
     Where white balance is modelled, its factors follow.
     """
@@ -107,7 +118,7 @@ def exposure_table(photometry: Sequence[ViewPhotometry]) -> str:
         e = v["exposure_fitted"] if v["exposure"] is None else v["exposure"]
         ev = "" if e is None else repr(float(np.log2(e)))
         balance = (v.get("white_balance") or [None] * 3) if balanced else ()
-        table.writerow((v["image"], v["camera"], v["split"], ev, e, v["gamma"], *balance))
+        table.writerow((names[v["image"]], v["camera"], v["split"], ev, e, v["gamma"], *balance))
     return out.getvalue()
 
 
@@ -116,8 +127,13 @@ def _colors(scene: Scene) -> np.ndarray:
     return np.full(scene.points.shape, GREY, np.uint8) if colors is None else colors
 
 
-def _write_model(folder: Path, scene: Scene, store: ImageStore) -> None:
+def _write_model(folder: Path, scene: Scene, store: ImageStore, names: Mapping[str, str]) -> None:
     model = pycolmap.Reconstruction()
+    of_view = [np.zeros(0, int)] * len(scene.views)
+    if scene.tracks is not None:
+        order = np.argsort(scene.tracks.view_indices, kind="stable")
+        ends = np.cumsum(np.bincount(scene.tracks.view_indices, minlength=len(scene.views)))
+        of_view = np.split(order, ends[:-1])
     camera_ids: dict[tuple, int] = {}
     tracks = [pycolmap.Track() for _ in scene.points]
     for index, view in enumerate(scene.views):
@@ -131,10 +147,9 @@ def _write_model(folder: Path, scene: Scene, store: ImageStore) -> None:
             model.add_camera_with_trivial_rig(camera)
         xy, points = np.zeros((0, 2)), np.zeros(0, int)
         if scene.tracks is not None:
-            rows = np.flatnonzero(scene.tracks.view_indices == index)
-            xy, points = scene.tracks.xy[rows], scene.tracks.point_indices[rows]
+            xy, points = (a[of_view[index]] for a in (scene.tracks.xy, scene.tracks.point_indices))
         image = pycolmap.Image(
-            name=view.name,
+            name=names[view.name],
             keypoints=np.asarray(xy * (width / view.width, height / view.height), np.float64),
             camera_id=camera_id,
             image_id=index + 1,
@@ -155,28 +170,22 @@ def _write_model(folder: Path, scene: Scene, store: ImageStore) -> None:
 
 
 def _write_photograph(path: Path, view: View, ldr: Float[np.ndarray, "h w 3"]) -> None:
-    """Copy a photograph that is used as it is; encode a changed one again, EXIF included.
+    """Copy a photograph that is used as it is; encode a changed one again, in sRGB.
 
-    A UserError says that its own format cannot be written.
+    Settings of the camera are kept, marks of another colour space are not.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    height, width = ldr.shape[:2]
-    if view.distortion is None and (width, height) == (view.width, view.height):
+    as_it_is = view.distortion is None and ldr.shape[1::-1] == (view.width, view.height)
+    if as_it_is and view.image_path.suffix.lower() == path.suffix.lower():
         shutil.copyfile(view.image_path, path)
         return
-    picture = Image.fromarray(np.rint(255 * ldr).astype(np.uint8))
-    with Image.open(view.image_path) as original:
-        info = original.info
-        kept: dict[str, Any] = {k: info[k] for k in ("exif", "icc_profile") if info.get(k)}
+    settings = b""
+    with contextlib.suppress(OSError), Image.open(view.image_path) as original:
+        settings = kept_settings(original.getexif())
+    how: dict[str, Any] = {"exif": b"Exif\0\0" + settings} if settings else {}
     if path.suffix.lower() in (".jpg", ".jpeg"):
-        kept |= {"quality": JPEG_QUALITY, "subsampling": 0}
-    try:
-        picture.save(path, **kept)
-    except (OSError, ValueError, KeyError) as error:
-        raise UserError(
-            f"{view.name} cannot be written in its own format: {error}.",
-            fix="convert the photographs to JPEG or PNG and fit again",
-        ) from error
+        how |= {"quality": JPEG_QUALITY, "subsampling": 0}
+    Image.fromarray(np.rint(255 * ldr).astype(np.uint8)).save(path, **how)
 
 
 def _frame(store: ImageStore, index: int) -> dict[str, Any]:

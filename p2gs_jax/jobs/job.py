@@ -15,6 +15,7 @@ from typing import Any, Literal
 
 from p2gs_jax.core.atomic import atomic_write, write_json
 from p2gs_jax.core.progress import LogRecord, Reporter
+from p2gs_jax.core.text import printable
 
 # In the folder of a job that failed.
 REASON = "failure.json"
@@ -125,7 +126,7 @@ class ProgressFile(Reporter):
 
     def message(self, text: str) -> None:
         """Keep a message for the user in the output."""
-        print(text, flush=True)
+        print(printable(text), flush=True)
 
     def stage(self, name: str, done: int = 0, total: int = 0) -> None:
         """Begin or advance a stage."""

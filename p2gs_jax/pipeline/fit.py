@@ -30,6 +30,7 @@ from p2gs_jax.pipeline.preflight import Paths, check_run_dir, check_scene, memor
 from p2gs_jax.pipeline.prepare import Prepared, expected, initialise
 from p2gs_jax.pipeline.survey import Survey, load, survey
 from p2gs_jax.presets import require_config
+from p2gs_jax.render.tiles import slow_here
 from p2gs_jax.run.checkpoint import saved_steps
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.run.folder import RunFolder, locked
@@ -179,6 +180,10 @@ class Optimiser:
         What the steps have to say is noted in `start` as well. Of the budget, `spent_s` seconds are
         gone and `finish_s` are kept for evaluation and files.
         """
+        slow = None if start.cfg.render.implementation else slow_here()
+        if slow is not None:
+            start.notes.append(slow)
+            self._reporter.message(slow)
         alive = np.ones(start.params.gaussians.capacity, bool)
         params, how = self._own.among(start.params), {"spent_s": spent_s, "finish_s": finish_s}
         trainer = self._trainer(start, self._reporter)

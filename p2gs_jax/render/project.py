@@ -29,7 +29,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.config import RenderConfig
-from p2gs_jax.core.numerics import namespace
+from p2gs_jax.core.numerics import matmul, namespace
 from p2gs_jax.render import harmonics
 from p2gs_jax.render.xla_cpu import columns
 from p2gs_jax.types import Camera, Frustum, Gaussians, Placement, Splats2D
@@ -185,7 +185,7 @@ def view_radiance(
 ) -> Float[Array, "n 3"]:
     """Return each Gaussian's linear HDR radiance towards the camera, >= 0."""
     if camera.viewmat.ndim == 2:
-        center = -camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3]
+        center = -matmul(camera.viewmat[:3, :3].T, camera.viewmat[:3, 3])
     else:
         # The camera in the axes of each Gaussian.
         R, t = camera.viewmat[:3, :3], camera.viewmat[:3, 3]

@@ -184,8 +184,21 @@ def fastest_here() -> TileImplementation:
     """
     if jax.default_backend() != "gpu":
         return "xla"
-    capability = getattr(jax.devices()[0], "compute_capability", None)
-    return "pallas" if capability is not None and float(capability) >= AMPERE else "xla"
+    try:
+        capability = float(getattr(jax.devices()[0], "compute_capability", 0))
+    except ValueError:  # AMD's have names
+        capability = 0.0
+    return "pallas" if capability >= AMPERE else "xla"
+
+
+def slow_here() -> str | None:
+    """Say that the GPU here is none that the kernels for GPUs were written for, if so."""
+    if jax.default_backend() == "cpu" or fastest_here() == "pallas":
+        return None
+    return (
+        f"{jax.devices()[0].device_kind} is not an NVIDIA GPU of compute capability {AMPERE} or "
+        "more: it runs the rasterizer for CPUs (xla), and may be slower than a CPU."
+    )
 
 
 def rasterize(

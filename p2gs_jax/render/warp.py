@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from p2gs_jax.core.numerics import namespace
+from p2gs_jax.core.numerics import matmul, namespace
 from p2gs_jax.types import Camera, Render, View
 
 # A pixel has a surface where the render is this opaque, unless the caller asks for more.
@@ -47,7 +47,7 @@ def unproject(depth: Float[Array | np.ndarray, "h w"], camera: Camera) -> Float[
     focal, center = xp.diag(camera.K)[:2], camera.K[:2, 2]
     local = xp.concatenate([(xy - center) / focal, xp.ones((*depth.shape, 1))], -1)
     rotation, translation = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
-    return (local * depth[..., None] - translation) @ rotation
+    return matmul(local * depth[..., None] - translation, rotation)
 
 
 def project_points(
@@ -58,7 +58,7 @@ def project_points(
     NumPy arrays give NumPy results.
     """
     xp = namespace(points, camera.K)
-    local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    local = matmul(points, camera.viewmat[:3, :3].T) + camera.viewmat[:3, 3]
     z = local[..., 2]
     ahead = xp.where(z > 1e-6, z, 1.0)
     return local[..., :2] / ahead[..., None] * xp.diag(camera.K)[:2] + camera.K[:2, 2], z

@@ -21,6 +21,7 @@ import numpy as np
 import viser
 from jaxtyping import Float32
 
+from p2gs_jax.core.text import printable
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.photometry.metering import meter
@@ -59,7 +60,7 @@ def report(client: viser.ClientHandle, what: str, error: Exception) -> None:
     if isinstance(error, UserError):
         text = str(error)
     else:
-        traceback.print_exception(error, file=sys.stderr)
+        print(printable("".join(traceback.format_exception(error))), file=sys.stderr)
         text = f"{type(error).__name__}: {error}"
     client.add_notification(what, text, color="red")
 

@@ -1,13 +1,17 @@
 """What a terminal is given holds nothing that commands it."""
 
 import io
+import re
+from pathlib import Path
 
 import pytest
 from rich.table import Table
 from rich.text import Text
 
+import p2gs_jax
 from p2gs_jax.core.progress import PlainConsole
 from p2gs_jax.core.text import printable
+from p2gs_jax.jobs.job import ProgressFile
 
 
 @pytest.mark.parametrize(
@@ -45,6 +49,14 @@ def test_a_terminal_gets_colours_and_no_control_characters():
 @pytest.mark.parametrize("name", ["[bold]x[/bold]", "[/nothing].png", ":smile:"])
 def test_brackets_are_no_markup(name):
     assert printed(name).strip() == name
+
+
+def test_every_console_is_plain_and_so_is_what_workers_say(tmp_path, capsys):
+    for path in Path(p2gs_jax.__file__).parent.rglob("*.py"):
+        made = re.findall(r"(?<!class )\b\w*Console\(", path.read_text(encoding="utf-8"))
+        assert set(made) <= {"PlainConsole("}, path
+    ProgressFile(tmp_path / "progress.json").message("\x1b[31mred")
+    assert capsys.readouterr().out == "\\x1b[31mred\n"
 
 
 def test_errors_are_printable(run_command, tmp_path):

@@ -6,6 +6,8 @@ import sys
 
 import pytest
 
+from p2gs_jax.core import runtime
+
 SCRIPT = """
 import numpy as np
 from p2gs_jax.core.runtime import keep_freed_memory, return_freed_memory
@@ -37,6 +39,20 @@ def test_freed_memory_is_kept_until_it_is_handed_back():
     assert total == 2**21
     assert kept > 300
     assert left < 40
+
+
+@pytest.mark.parametrize(("largest", "told"), [(2**30, True), (2**25, True), (0, False)])
+def test_a_library_that_refuses_one_setting_gets_the_others(monkeypatch, largest, told):
+    """Older ones take no threshold above 32 MB."""
+    asked = []
+
+    def mallopt(what, value):
+        asked.append(what)
+        return int(what != -3 or value <= largest)
+
+    monkeypatch.setattr(runtime, "_of_glibc", lambda name: mallopt)
+    assert runtime.keep_freed_memory() == told
+    assert set(asked) == {-1, -2, -3}
 
 
 CHILD = """

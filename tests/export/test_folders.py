@@ -9,9 +9,11 @@ import pycolmap
 import pytest
 from PIL import Image
 from plyfile import PlyData
+from scene.convert.made import DISPLAY_P3, save_heic, write_exr
 from tiny_scene import make_scene
 
 from p2gs_jax.config import DataConfig
+from p2gs_jax.core.numerics import srgb_decode
 from p2gs_jax.export.folders import write_folder
 from p2gs_jax.scene import ImageStore, load_scene
 from p2gs_jax.scene.exposures import read_known_exposures
@@ -30,10 +32,10 @@ def rows(scene):
     return out
 
 
-def export(root, cfg):
-    scene = load_scene(root, cfg)
+def export(root, cfg, program="colmap"):
+    scene = load_scene(root, cfg, root / "cache")
     store = ImageStore(scene.views, cfg)
-    write_folder("colmap", root / "out", scene, store, rows(scene))
+    write_folder(program, root / "out", scene, store, rows(scene))
     return scene, store, load_scene(root / "out", DataConfig())
 
 
@@ -142,13 +144,68 @@ def test_points_keep_the_errors_of_their_tracks_and_need_none(tmp_path):
     assert after.tracks is None
 
 
-def test_masks_are_written_for_all_views_once_one_has_any(tmp_path):
+def named(root, suffix, write):
+    """Give the photographs of a scene another format; `write` gets a path and an image."""
+    listed = root / "sparse" / "0" / "images.txt"
+    listed.write_text(listed.read_text().replace(".png", suffix))
+    for path in sorted((root / "images").iterdir()):
+        with Image.open(path) as image:
+            write(path.with_suffix(suffix), image)
+        if suffix != ".png":
+            path.unlink()
+    return root
+
+
+def in_display_p3(path, image):
+    image.save(path, icc_profile=DISPLAY_P3)
+
+
+def in_adobe_rgb(path, image):
+    exif = Image.Exif()
+    exif.get_ifd(0x8769).update({0x829A: 0.1, 0x829D: 4.0, 0x8827: 100, 0xA001: 0xFFFF})
+    exif.get_ifd(0x8769)[0xA005] = {1: "R03"}
+    image.save(path, exif=exif, quality=98)
+
+
+def as_light(path, image):
+    write_exr(path, srgb_decode(np.asarray(image) / 255).astype(np.float32))
+
+
+FORMATS = [(".png", in_display_p3), (".jpg", in_adobe_rgb), (".exr", as_light)]
+FORMATS += [(".heic", lambda path, image: save_heic(path, np.asarray(image)))]
+
+
+@pytest.mark.parametrize("width", [None, 80])
+@pytest.mark.parametrize("program", ["colmap", "nerfstudio"])
+@pytest.mark.parametrize(("suffix", "write"), FORMATS, ids=[name for name, _ in FORMATS])
+def test_every_format_is_read_back_with_its_colours(tmp_path, suffix, write, program, width):
+    root = named(make_scene(tmp_path), suffix, write)
+    scene, ours, after = export(root, DataConfig(max_width=width), program)
+    theirs = ImageStore(after.views, DataConfig())
+    ending = suffix if suffix in (".png", ".jpg") else f"{suffix}.png"
+    for index, view in enumerate(after.views):
+        assert view.name.endswith(ending)
+        with Image.open(view.image_path) as image:
+            image.load()
+        # JPEG twice; elsewhere what 8 bits round.
+        limit = 2 / 255 if suffix == ".jpg" else 1 / 255
+        assert np.abs(theirs.get(index)[0] - ours.get(index)[0]).mean() < limit
+    if suffix == ".jpg":
+        for old, new in zip(scene.views, after.views, strict=True):
+            assert new.exif_ev == pytest.approx(old.exif_ev)
+    if program == "colmap":
+        # Exposures of names that photographs have.
+        read_known_exposures(root / "out" / "exposures.csv", after.views[1:3])
+
+
+@pytest.mark.parametrize("program", ["colmap", "nerfstudio"])
+def test_masks_are_written_for_all_views_once_one_has_any(tmp_path, program):
     root = make_scene(tmp_path)
     (root / "masks").mkdir()
     half = np.full((100, 112), 255, np.uint8)
     half[:50] = 0
     Image.fromarray(half).save(root / "masks" / "2.png")
-    _, store, after = export(root, DataConfig())
+    _, store, after = export(root, DataConfig(), program)
     written = sorted(p.name for p in (root / "out" / "masks").iterdir())
     assert written == [f"{v}.png.png" for v in range(6)]
     again = ImageStore(after.views, DataConfig())

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import FitConfig
+from p2gs_jax.core import atomic
 from p2gs_jax.core.atomic import append_jsonl, atomic_folder, atomic_write, read_jsonl, write_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.scores import ViewResult
@@ -42,6 +43,27 @@ def test_a_failure_leaves_the_old_file_or_folder_and_success_replaces_it(tmp_pat
     assert os.listdir(tmp_path / "out") == ["new"]
     write_json(tmp_path / "a.json", {"a": float("nan"), "b": jnp.float32(2), "c": np.arange(2)})
     assert "NaN" not in (tmp_path / "a.json").read_text()
+
+
+@pytest.mark.parametrize("at_once", [True, False])
+def test_a_folder_is_removed_when_the_new_one_is_there(tmp_path, monkeypatch, at_once):
+    """Whenever the process is killed, one of both is whole."""
+    removed, out = [], tmp_path / "out"
+
+    def remove(path, **options):
+        removed.append((out / "a").read_text())
+        real(path, **options)
+
+    real = atomic.shutil.rmtree
+    monkeypatch.setattr(atomic.shutil, "rmtree", remove)
+    if not at_once:
+        monkeypatch.setattr(atomic, "_exchanged", lambda a, b: False)
+    for text in ("old", "new"):
+        with atomic_folder(out) as folder:
+            (folder / "a").write_text(text)
+    assert set(removed[-2:]) == {"new"}
+    assert os.listdir(tmp_path) == ["out"]
+    assert (out / "a").read_text() == "new"
 
 
 TORN = [b'{"step": 3, "lo', b'{"name": "\xc3', b"\x00\x00\x00", b"{"]

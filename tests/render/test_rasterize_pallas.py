@@ -10,7 +10,7 @@ from scenes import camera, street
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import rasterize_pallas, render_linear
-from p2gs_jax.render.tiles import fastest_here
+from p2gs_jax.render.tiles import fastest_here, slow_here
 
 CFG = RenderConfig(implementation="pallas", binning="sorting")
 CAPACITY = 8000
@@ -63,16 +63,22 @@ def test_the_kernels_lower_to_triton(monkeypatch, deterministic):
 def test_what_runs_here_is_chosen(monkeypatch):
     assert fastest_here() == ("pallas" if jax.default_backend() == "gpu" else "xla")
 
+    assert slow_here() is None or jax.default_backend() != "cpu"
+
     class Device:
-        compute_capability = "9.0"
+        compute_capability, device_kind = "9.0", "Card"
 
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(jax, "devices", lambda: [Device()])
     assert fastest_here() == "pallas"
-    Device.compute_capability = "7.5"
-    assert fastest_here() == "xla"
-    del Device.compute_capability
-    assert fastest_here() == "xla"
+    assert slow_here() is None
+    for other in ("7.5", "gfx90a:sramecc+", None):
+        if other is None:
+            del Device.compute_capability
+        else:
+            Device.compute_capability = other
+        assert fastest_here() == "xla"
+        assert slow_here().startswith("Card is not an NVIDIA GPU of compute capability 8.0")
 
 
 def test_tiles_of_other_sizes_are_refused():

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import re
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,8 @@ import numpy as np
 import pytest
 import splats
 
+from p2gs_jax.config import RenderConfig
+from p2gs_jax.render import view_radiance
 from p2gs_jax.render.warp import (
     project_points,
     sample_bilinear,
@@ -37,6 +40,18 @@ def test_projecting_what_was_unprojected_gives_the_pixel_back(x, yaw, z):
     xy, depth = project_points(points, seen_by)
     np.testing.assert_allclose(xy, np.stack([X, Y], -1), atol=2e-4)
     np.testing.assert_allclose(depth, z, rtol=1e-5)
+
+
+def test_world_coordinates_are_multiplied_in_full_precision():
+    """GPUs would round to three digits: centimetres at a hundred metres."""
+    g = splats.random_splats(4)
+    for program, given in (
+        (lambda z: warp(z, camera(), z, camera()), plane(1.0)),
+        (lambda g: view_radiance(g, camera(), RenderConfig()), g),
+    ):
+        products = re.findall(r"dot_general\[.*?\]", str(jax.make_jaxpr(program)(given)), re.DOTALL)
+        assert products
+        assert all("HIGHEST" in text for text in products)
 
 
 def test_a_sideways_step_is_the_disparity():

@@ -328,7 +328,7 @@ def write_png(
     extra = b""
     if profile:
         extra += _chunk(b"iCCP", b"ICC profile\0\0" + zlib.compress(profile))
-    if settings := _kept_settings(exif):
+    if settings := kept_settings(exif):
         extra += _chunk(b"eXIf", settings)
     whole, at = data.tobytes(), _SIGNATURE_AND_HEADER
     try:
@@ -339,7 +339,7 @@ def write_png(
         raise broken(path, why, _NO_ROOM) from None
 
 
-def _kept_settings(exif: Image.Exif | None) -> bytes:
+def kept_settings(exif: Image.Exif | None) -> bytes:
     """Return the settings that are kept, as a PNG holds them; empty: there are none."""
     out = Image.Exif()
     try:
