@@ -16,6 +16,8 @@ import nox
 nox.options.default_venv_backend = "none"
 nox.options.sessions = ["lint", "tests", "docs"]
 BASELINE = "experiments/bench/baseline.json"
+# Tests that reach most annotations in little time.
+SHAPES = ("tests/render/test_project.py", "tests/render/test_warp.py", "tests/gaussians")
 
 
 @nox.session
@@ -37,6 +39,13 @@ def tests(session: nox.Session) -> None:
 def slow(session: nox.Session) -> None:
     """Run the longer checks."""
     session.run("pytest", "-m", "slow", *session.posargs)
+
+
+@nox.session
+def shapes(session: nox.Session) -> None:
+    """Run some of the tests with every shape and type in annotations checked."""
+    checked = "--jaxtyping-packages=p2gs_jax,beartype.beartype"
+    session.run("pytest", "-n", "0", checked, *(session.posargs or SHAPES))
 
 
 @nox.session

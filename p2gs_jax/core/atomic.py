@@ -114,7 +114,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         if not path.is_dir():
             os.replace(temporary, path)
         elif not _exchanged(temporary, path):
-            former = Path(tempfile.mkdtemp(dir=path.parent, prefix=_BEGUN))
+            former = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".former-{path.name}-"))
             os.replace(path, former)
             os.replace(temporary, path)
             shutil.rmtree(former)
