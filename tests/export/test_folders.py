@@ -25,7 +25,8 @@ def rows(scene):
     """Return photometry of the views: one held out with a fitted exposure, one without."""
     out = []
     for v in scene.views:
-        e, test = EXPOSURES.get(v.name), v.name == "0.png"
+        name = f"{v.name.partition('.')[0]}.png"
+        e, test = EXPOSURES.get(name), name == "0.png"
         fitted = {"exposure": None if test else e, "exposure_fitted": e if test else None}
         common = {"image": v.name, "camera": v.camera, "split": "test" if test else "train"}
         out.append({**common, **fitted, "exposure_ev": None, "gamma": 2.2, "exif_ev": None})
