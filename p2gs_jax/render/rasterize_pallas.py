@@ -190,9 +190,7 @@ def _backward_kernel(rows, ids, offsets, stops, order, *arrays, plan: Plan):
                 place = jnp.where(position + c < end, position + c, target.shape[0] - 1)
                 target[place, :] = values
             else:
-                # Neither padding nor the dummy: many tiles would wait for its one row.
-                used = (column < len(gradient)) & (position + c < end)
-                plt.atomic_add(target, (gaussian, slice(None)), values, mask=used)
+                plt.atomic_add(target, (gaussian, slice(None)), values)
         return jnp.minimum(position + UNROLL, end), transmittance, remaining
 
     state = (start, jnp.ones(plan.pixels, jnp.float32), light)
