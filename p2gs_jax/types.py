@@ -11,12 +11,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, Float64, Int, UInt, UInt8
+
+if not TYPE_CHECKING:
+    # Device records may hold arrays and single numbers of the host; type checkers need not know.
+    Array = Array | np.ndarray | np.generic
 
 Split = Literal["train", "test"]
 AlphaUse = Literal["background", "mask", "ignore"]

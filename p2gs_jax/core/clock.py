@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from typing import Any
 
 from jax import monitoring
 
@@ -50,7 +51,7 @@ LATE = (1.1, 2.0)
 MOST_NAMED = 4
 
 
-def whole_run(seconds: Mapping[str, float]) -> float | None:
+def whole_run(seconds: Mapping[str, Any]) -> float | None:
     """Return how long a run took by the `seconds` of its metrics.json; None where they lack it."""
     parts = [seconds.get(k) for k in ("total_until_evaluation", "evaluation_and_files")]
     known = [p for p in parts if isinstance(p, int | float) and not isinstance(p, bool)]

@@ -62,7 +62,7 @@ def write_gltf(path: Path, gaussians: Gaussians) -> int:
     return gaussians.capacity
 
 
-def _attributes(g: Gaussians) -> dict[str, Float32[np.ndarray, "n k"]]:
+def _attributes(g: Gaussians) -> dict[str, Float32[np.ndarray, "n _"]]:
     sh = np.asarray(g.sh)
     columns = {
         "POSITION": np.asarray(g.means),

@@ -225,7 +225,7 @@ def neighbours(
     seen: Bool[np.ndarray, "v p"],
     log_exposures: Float[np.ndarray, " v"],
     count: int,
-) -> list[Int[np.ndarray, " k"]]:
+) -> list[Int[np.ndarray, " _"]]:
     """Return for every training view the rows of the `count` views to match it with, best first.
 
     `seen` says which view sees which point.

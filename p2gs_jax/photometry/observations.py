@@ -88,7 +88,7 @@ class Observations:
         return kept[self.points]
 
 
-def grouped(labels: Labels, count: int) -> list[Int[np.ndarray, " n"]]:
+def grouped(labels: Labels, count: int) -> list[Int[np.ndarray, " _"]]:
     """Return the places of each of the labels 0, 1, ... below `count`, in order."""
     order = np.argsort(labels, kind="stable")
     return np.split(order, np.searchsorted(labels[order], np.arange(1, count)))

@@ -48,7 +48,7 @@ def degree_of(count: int) -> int:
     return degree
 
 
-def basis(directions: Directions, degree: int) -> list[Float[Array, " n"]]:
+def basis(directions: Directions, degree: int) -> list[Axis]:
     """Return the (degree + 1)^2 basis values of unit directions, as separate vectors."""
     x, y, z = directions
     xx, yy, zz = x * x, y * y, z * z

@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -117,7 +118,7 @@ def take_rows(gaussians: Gaussians, ids: Int[Array, " v"], bands: int) -> Gaussi
     def rows(a):
         return a.at[ids].get(mode="clip")
 
-    rest = jax.tree.map(rows, dataclasses.replace(gaussians, sh=None))
+    rest = jax.tree.map(rows, eqx.tree_at(lambda g: g.sh, gaussians, None))
     return dataclasses.replace(rest, sh=gaussians.sh.at[ids, :bands].get(mode="clip"))
 
 
@@ -130,7 +131,7 @@ def put_rows(gaussians: Gaussians, ids: Int[Array, " v"], new: Gaussians) -> Gau
     def rows(a, b):
         return a.at[ids].set(b, mode="drop", unique_indices=True)
 
-    rest = jax.tree.map(rows, *(dataclasses.replace(g, sh=None) for g in (gaussians, new)))
+    rest = jax.tree.map(rows, *(eqx.tree_at(lambda g: g.sh, g, None) for g in (gaussians, new)))
     sh = gaussians.sh.at[ids, : new.sh.shape[1]].set(new.sh, mode="drop", unique_indices=True)
     return dataclasses.replace(rest, sh=sh)
 

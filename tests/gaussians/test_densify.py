@@ -226,7 +226,9 @@ def test_noise_reaches_only_the_transparent_and_has_their_shape():
 def families(n, alive):
     """Return Gaussians of objects in turn, whose colours tell the object, and their population."""
     owner = np.where(alive, np.arange(n) % 4 - 1, -1)
-    g = dataclasses.replace(made(n), sh=on_device(np.where(alive, owner, -9))[:, None, None])
+    g = dataclasses.replace(
+        made(n), sh=on_device(np.tile(np.where(alive, owner, -9)[:, None, None], 3))
+    )
     return g, fresh_population(jnp.asarray(alive), jnp.asarray(owner, jnp.int32))
 
 

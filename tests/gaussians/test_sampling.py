@@ -71,8 +71,11 @@ def test_what_was_left_out_is_said(street):
 GREY_K = np.array([[50.0, 0, 30], [0, 50, 20], [0, 0, 1]], np.float32)
 
 
-class Grey:
+class Grey(ImageStore):
     """Photographs of one grey."""
+
+    def __init__(self):
+        pass
 
     def get(self, index):
         return np.full((40, 60, 3), 0.5, np.float32), np.ones((40, 60), np.float32)

@@ -191,7 +191,7 @@ def _length(places: Float[np.ndarray, "v 2"]) -> float:
     return float(np.ptp(places, axis=0).max()) if len(places) else 0.0
 
 
-def seen_points(scene: Scene) -> list[Int[np.ndarray, " k"]]:
+def seen_points(scene: Scene) -> list[Int[np.ndarray, " _"]]:
     """Return which points each training view sees: by tracks, else by projection of some points."""
     rows = scene.train_indices
     if scene.tracks is not None and len(scene.tracks.xy):
@@ -207,7 +207,7 @@ def seen_points(scene: Scene) -> list[Int[np.ndarray, " k"]]:
 
 
 def looked_at(
-    scene: Scene, seen: Sequence[Int[np.ndarray, " k"]], centers: Float[np.ndarray, "v 3"]
+    scene: Scene, seen: Sequence[Int[np.ndarray, " _"]], centers: Float[np.ndarray, "v 3"]
 ) -> Float[np.ndarray, "v 3"]:
     """Return where each training view counts: half way from its camera to the points it sees.
 

@@ -92,8 +92,8 @@ def _sample_smooth(smooth, brightest, mask, xy, margin: int) -> Samples:
 def point_colors(
     scene: Scene,
     store: ImageStore,
-    points: list[Int[np.ndarray, " o"]],
-    xy: list[Float[np.ndarray, "o 2"]],
+    points: list[Int[np.ndarray, " _"]],
+    xy: list[Float[np.ndarray, "_ 2"]],
     *,
     uncertainty: float = 1.0,
     on_view: Callable[[int, int], object] | None = None,
@@ -143,8 +143,8 @@ def point_colors(
 
 
 def _at_one_scale(
-    scene: Scene, store: ImageStore, points: list[Int[np.ndarray, " o"]]
-) -> tuple[list[Float[np.ndarray, " o"]], list[Bool[np.ndarray, " o"]]]:
+    scene: Scene, store: ImageStore, points: list[Int[np.ndarray, " _"]]
+) -> tuple[list[Float[np.ndarray, " _"]], list[Bool[np.ndarray, " _"]]]:
     """Return of each view by how much points are averaged wider, and which it samples at all."""
     footprints = []
     for index, mine in zip(scene.train_indices, points, strict=True):

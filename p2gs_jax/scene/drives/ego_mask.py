@@ -64,7 +64,7 @@ def find_ego_masks(
     names: Sequence[str],
     work_dir: Path | None = None,
     report: Report = lambda message: None,
-) -> tuple[dict[str, Bool[np.ndarray, "h w"]], list[str]]:
+) -> tuple[dict[str, Bool[np.ndarray, "_ _"]], list[str]]:
     """Return where the named cameras see their own car, and notes.
 
     Masks are of the photographs as stored, at a lower resolution. All photographs of the drive
@@ -75,7 +75,7 @@ def find_ego_masks(
     poses = np.stack([p.pose for p in recording.photographs])
     up = up_of_drive(inverse(poses), [p.camera for p in recording.photographs])
     report("Looking for the car itself in the photographs")
-    masks: dict[str, Bool[np.ndarray, "h w"]] = {}
+    masks: dict[str, Bool[np.ndarray, "_ _"]] = {}
     standing, without = [], []
     for name in names:
         own = [p for p in recording.photographs if p.camera == name]

@@ -155,7 +155,7 @@ def object_mask(
 
 def outlines(
     view: View, objects: Sequence[TrackedObject], margin: float = MARGIN
-) -> list[Float[np.ndarray, "c 2"]]:
+) -> list[Float[np.ndarray, "_ 2"]]:
     """Return the convex outlines of the boxes in a view, pixels at its full size; see above."""
     if view.time is None:
         return []
@@ -198,7 +198,7 @@ def outline_of(
 
 
 def painted(
-    polygons: Sequence[Float[np.ndarray, "c 2"]], view: View, width: int, height: int
+    polygons: Sequence[Float[np.ndarray, "_ 2"]], view: View, width: int, height: int
 ) -> Bool[np.ndarray, "h w"]:
     """Return which pixel centres lie within convex polygons, in an image of the given size.
 

@@ -179,7 +179,7 @@ class ImageStore:
         """Start decoding in the background, unless the short queue is full; `get` raises errors."""
         self._photographs.prefetch(self._key(index, shrink))
 
-    def expect(self, shrinks: Sequence[float]) -> None:
+    def expect(self, shrinks: Sequence[float | int]) -> None:
         """Begin to decode photographs that memory does not hold, each at all these sizes."""
         rows = range(len(self.views))
         self._photographs.expect([[self._key(row, s) for s in shrinks] for row in rows])
