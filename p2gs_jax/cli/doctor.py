@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from p2gs_jax.core import memory
+from p2gs_jax.core.text import printable
 
 # Import names that differ from the distribution's; pip may write names in lower case.
 MODULES = {
@@ -282,7 +283,7 @@ def _row(name: str, text: str, width: int = 13) -> str:
     """Return a line of at most 80 columns, but for paths and errors."""
     wrapper = textwrap.TextWrapper(80, break_long_words=False, break_on_hyphens=False)
     wrapper.initial_indent, wrapper.subsequent_indent = name.ljust(width), " " * width
-    return wrapper.fill(text)
+    return wrapper.fill(printable(text))
 
 
 def _size(count: int | None) -> str:

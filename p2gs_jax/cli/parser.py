@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
+import io
 import sys
 from typing import Any
 
@@ -19,6 +21,7 @@ from p2gs_jax.cli.pages import Compare, Report, View
 from p2gs_jax.cli.render import Render
 from p2gs_jax.cli.scene import Survey
 from p2gs_jax.cli.shared import check_option_names
+from p2gs_jax.core.text import printable
 from p2gs_jax.errors import UserError
 from p2gs_jax.presets import preset
 
@@ -68,16 +71,20 @@ def _options(name: str, argv: list[str]) -> Any:
     if brief or whole:
         print(help_text.prose(kind) + "\n")
 
+    complaint = io.StringIO()
     try:
-        return tyro.cli(
-            kind,
-            prog=f"p2gs-jax {name}",
-            description="",
-            args=["--help" if a == HELP_ALL else a for a in argv],
-            default=_defaults(name, argv),
-            registry=help_text.registry(brief),
-        )
+        with contextlib.redirect_stderr(complaint):
+            return tyro.cli(
+                kind,
+                prog=f"p2gs-jax {name}",
+                description="",
+                args=["--help" if a == HELP_ALL else a for a in argv],
+                default=_defaults(name, argv),
+                registry=help_text.registry(brief),
+            )
     except SystemExit as end:
+        # It repeats words as they are: names of files that a pattern of the shell found.
+        print(printable(complaint.getvalue()), end="", file=sys.stderr)
         if end.code == 0:
             more = name if brief and name in WITH_CONFIGURATION else ""
             print("\n" + help_text.examples(kind, more))
