@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float, Float32, Float64, Int, UInt, UInt8
 
 if not TYPE_CHECKING:
@@ -29,6 +30,13 @@ AlphaUse = Literal["background", "mask", "ignore"]
 def _namespace(values) -> Any:
     """Return numpy for host arrays, which are computed with before and after a fit; else JAX."""
     return np if isinstance(values, np.ndarray) else jnp
+
+
+def _at_least(values, floor: float) -> Any:
+    """Return values, or the floor where they are below it; the gradient is 1 there as well."""
+    if isinstance(values, np.ndarray):
+        return np.maximum(values, floor)
+    return jnp.where(values > floor, values, floor + (values - lax.stop_gradient(values)))
 
 
 GAMMA_SRGB = 2.2
@@ -107,10 +115,9 @@ class Photometry(eqx.Module):
     @property
     def exposures(self) -> Float[Array, " v"]:
         """Exposures e > 0, dimensionless."""
-        xp = _namespace(self.raw_exposures)
         if self.parameterization == "log":
-            return xp.exp(self.raw_exposures)
-        return xp.maximum(self.raw_exposures, 1e-3)
+            return _namespace(self.raw_exposures).exp(self.raw_exposures)
+        return _at_least(self.raw_exposures, 1e-3)
 
     @property
     def log_exposures(self) -> Float[Array, " v"]:
@@ -122,10 +129,9 @@ class Photometry(eqx.Module):
     @property
     def gammas(self) -> Float[Array, " v"]:
         """Gammas > 0."""
-        xp = _namespace(self.raw_gammas)
         if self.parameterization == "log":
-            return GAMMA_SRGB * xp.exp(self.raw_gammas)
-        return xp.maximum(self.raw_gammas, 1e-3)
+            return GAMMA_SRGB * _namespace(self.raw_gammas).exp(self.raw_gammas)
+        return _at_least(self.raw_gammas, 1e-3)
 
     @property
     def white_balance(self) -> Float[Array, "v 3"] | None:
@@ -310,7 +316,7 @@ class View:
     height: int  # pixels
     distortion: Distortion | None = None  # what to remove on load, or None
     mask_path: Path | None = None  # optional mask (0 = ignore)
-    exif_ev: float | None = None  # log2(time * ISO / N^2) from EXIF, or None where it is incomplete
+    exif_ev: float | None = None  # log2(time * ISO / N^2) from EXIF, up to a constant, or None
     split: Split = "train"  # `train` or `test`
     frame: int | None = None  # its number in a drive, the same for all cameras, or None
     time: float | None = None  # seconds on the clock of `Scene.objects` and `Scene.lidar`, or None

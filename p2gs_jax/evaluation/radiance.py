@@ -117,15 +117,22 @@ class RadianceScores:
     def summary(self, brightest: float) -> dict:
         """Return means over all, training and held-out views, and the alignment.
 
-        From `brightest` on, recovered radiance, at least half of the training photographs are
-        saturated: pixels above it are left out of the stops. `stops_median` and `stops_rms` are
-        after one common scale, `stops_rms_power` after scale and power.
+        From `brightest` on, in units of recovered radiance, at least half of the training
+        photographs are saturated: pixels whose true radiance is above it are left out of the stops.
+        `stops_median` and `stops_rms` are after one common scale, `stops_rms_power` after scale and
+        power.
         """
         if not self.views:
             return {}
-        logs = self._sample(brightest)
-        shift = float(np.median(logs[1] - logs[0])) if logs.size else 0.0
-        power, offset = _power(logs)
+        recovered, true = self._sample()
+        level, shift = float(np.log(brightest)), 0.0
+        kept = recovered.max(-1, initial=-np.inf) < level
+        # What is recovered says which pixels count only until both have a common scale.
+        for _ in range(3):
+            gap = (true - recovered)[kept]
+            shift = float(np.median(gap)) if gap.size else 0.0
+            kept = true.max(-1, initial=-np.inf) < level + shift
+        power, offset = _power(np.stack([recovered[kept].ravel(), true[kept].ravel()]))
         scale = float(np.exp(shift))
 
         def judged(view) -> dict[str, float]:
@@ -151,31 +158,28 @@ class RadianceScores:
             "per_view": rows,
         }
 
-    def _sample(self, brightest: float) -> np.ndarray:
+    def _sample(self) -> Float[np.ndarray, "2 n 3"]:
+        """Return log recovered and true radiance of evenly taken pixels."""
         parts = []
         each = max(1, min(ALIGNMENT_PIXELS, MOST_ALIGNED // len(self.views)))
         for _, _, *images in self.views:
             linear, truth, mask = (kept.read() for kept in images)
-            keep = mask & (truth.min(-1) > 0) & (linear.min(-1) > 0)
-            keep &= linear.max(-1) < brightest
-            pick = np.flatnonzero(keep)
+            pick = np.flatnonzero(mask & (truth.min(-1) > 0) & (linear.min(-1) > 0))
             pick = pick[:: max(1, len(pick) // each)]
-            parts.append(
-                np.stack([np.log(x.reshape(-1, 3)[pick]).ravel() for x in (linear, truth)])
-            )
+            parts.append(np.stack([np.log(x.reshape(-1, 3)[pick]) for x in (linear, truth)]))
         # Single precision is too coarse for a line through half a million points.
-        return np.concatenate(parts, 1).astype(np.float64) if parts else np.zeros((2, 0))
+        return np.concatenate(parts, 1).astype(np.float64)
 
 
 def _view_scores(
     linear, truth, mask, brightest: float, shift: float, power: float, offset: float
 ) -> dict[str, float]:
     """Return the scores of a view; `shift` and `offset` are natural logarithms."""
-    keep = mask & (truth.min(-1) > 0) & (linear.max(-1) < brightest)
+    scale = float(np.exp(shift))
+    keep = mask & (truth.min(-1) > 0) & (truth.max(-1) < brightest * scale)
     a, b = np.log2(np.maximum(linear[keep], 1e-12)), np.log2(truth[keep])
     stops = np.minimum(np.abs(a + shift / LN2 - b), STOPS_CAP)
     bent = np.minimum(np.abs(power * a + offset / LN2 - b), STOPS_CAP)
-    scale = float(np.exp(shift))
     shown = (linear * scale, truth, mask, brightest * scale)
     return {
         "stops_median": float(np.median(stops)) if stops.size else float("nan"),

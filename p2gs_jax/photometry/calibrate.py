@@ -24,7 +24,7 @@ from p2gs_jax.photometry.adjustment.fit import fit_model
 from p2gs_jax.photometry.adjustment.problem import KnownExposures, Problem, make_problem
 from p2gs_jax.photometry.adjustment.solve import MOST_ROUNDS, fit_response
 from p2gs_jax.photometry.candidates import Candidate, Search
-from p2gs_jax.photometry.models import Curve, Form
+from p2gs_jax.photometry.models import MODELS, Curve, Form
 from p2gs_jax.photometry.observations import COARSEST, Observations
 from p2gs_jax.photometry.response import BASES, Response
 from p2gs_jax.photometry.solution import PhotometricSolution
@@ -48,7 +48,7 @@ class CalibrationOptions:
     black: float  # values up to here say nothing
     saturation: float  # values from here on say nothing
     pivot: float  # linear value that gamma leaves alone
-    known: KnownExposures | None = None  # used in the final solution only
+    known: KnownExposures | None = None
     seed: int = 0  # which observations are held out
     # What varies, and the curve: those that predict held-out colours, an exposure per view under
     # one fitted response (stacks), or given ones; of a kind of curve, the splines are fitted.
@@ -81,7 +81,7 @@ def options_of(cfg: FitConfig, scene: Scene) -> CalibrationOptions:
     p = cfg.photometry
     known = None
     if p.known is not None:
-        values = read_known_exposures(p.known, scene.training_views)
+        values = read_known_exposures(p.known, scene.training_views, scene.views)
         known = KnownExposures(values, p.known_deviation_ev)
     return CalibrationOptions(
         black=cfg.loss.black,
@@ -134,13 +134,14 @@ def _given(
     observations: Observations, options: CalibrationOptions, form: Form, curve: Response | Curve
 ) -> Selection:
     """Solve a form under a response, or under a kind of curve whose splines are fitted."""
-    problem, notes = options.problem(observations), ()
+    problem = options.problem(observations)
+    notes = _told(problem, free=isinstance(curve, Curve) or MODELS[form.model].gamma is not None)
     if isinstance(curve, Curve):
         few = problem.part(observations.thinned(RESPONSE_PER_VIEW, options.seed))
         base, beside = Response(curve.base), form._replace(model="view_exposure")
         fitted = fit_response(few, base, form=beside, by=curve.splines or "all")
         if fitted is None:
-            notes = (f"A fitted response collapsed: {curve.base} was used as it is.",)
+            notes += (f"A fitted response collapsed: {curve.base} was used as it is.",)
         curve = fitted or base
     return Selection(fit_model(problem, form, curve), (), notes)
 
@@ -155,7 +156,19 @@ def _by_one_response(problem: Problem) -> Selection:
     if not options:
         collapsed = "A fitted response collapsed: sRGB was used as it is."
         return Selection(fit_model(problem, "view_exposure"), (), (collapsed,))
-    return Selection(min(options, key=lambda s: s.residual_ev), (), ())
+    return Selection(min(options, key=lambda s: s.residual_ev), (), _told(problem))
+
+
+def _told(problem: Problem, *, free: bool = True) -> tuple[str, ...]:
+    """Say what known exposures tell; the power of the curve may be `free`."""
+    if problem.known is None:
+        return ()
+    head = f"The exposures of {np.isfinite(problem.known.log_exposures).sum()} view(s) are known"
+    if not problem.told.size:
+        return (f"{head}: they fix the scale. The tone curve's power takes two that differ.",)
+    if free:
+        return (f"{head}, and tell the tone curve's power, which photographs alone leave open.",)
+    return (f"{head}, and would tell the tone curve's power; it stays as the options say.",)
 
 
 def _subset(observations: Observations, seed: int, most: int) -> Observations:
@@ -176,10 +189,12 @@ def _chosen(
     observations: Observations, options: CalibrationOptions, on_chosen: OnChosen
 ) -> Selection:
     """Choose what varies and the curve on held-out observations, and solve that on all of them."""
-    seed, blind = options.seed, dataclasses.replace(options, known=None)
-    small = blind.problem(_subset(observations, seed, MOST_OBSERVATIONS))
+    seed, problem = options.seed, options.problem(observations)
+    # What fixes the scale alone says nothing of models and curves.
+    told = options if problem.told.size else dataclasses.replace(options, known=None)
+    small = told.problem(_subset(observations, seed, MOST_OBSERVATIONS))
     held = generator(seed, Stream.HELD_OUT).random(len(small.observations.points)) < HELD_OUT
-    training = blind.problem(_subset(small.observations.picked(~held), seed, SPLINE_OBSERVATIONS))
+    training = told.problem(_subset(small.observations.picked(~held), seed, SPLINE_OBSERVATIONS))
     search = Search(small, held, training, known=options.known_response is not None)
     notes = search.first()
     if options.known_response is not None:
@@ -187,6 +202,7 @@ def _chosen(
             f"The tone curve is known ({options.known_response}): none was fitted, and of light "
             "encoded as sRGB it is sRGB's."
         ]
+    notes += _told(problem, free=options.known_response is None)
     chosen = search.rest()
     on_chosen(chosen.form, chosen.response)
     candidates = sorted(search.judged(), key=lambda c: -c.density)
@@ -195,22 +211,19 @@ def _chosen(
             f"{loose} of the {len(candidates)} models compared had not settled after "
             f"{MOST_ROUNDS} rounds; they are judged as they were then."
         )
-    solution = fit_model(options.problem(observations), chosen.form, chosen.response)
+    solution = fit_model(problem, chosen.form, chosen.response)
     return Selection(solution, tuple(candidates), (*notes, *_reasons(chosen, candidates)))
 
 
 def _reasons(chosen: Candidate, candidates: list[Candidate]) -> list[str]:
+    """Compare a choice with others in words; candidates are sorted, the best density first."""
     out = [f"Chosen: {chosen.name} curve."]
-    simpler = [c for c in candidates if c.parameters < chosen.parameters]
-    if simpler:
-        c = max(simpler, key=lambda c: c.density)
+    if c := next((c for c in candidates if c.parameters < chosen.parameters), None):
         out.append(
             f"Simpler ({c.name}) predicts held-out colours worse: log-likelihood lower by "
             f"{chosen.density - c.density:.3f} per observation (0.01 is little, 1 a lot)."
         )
-    richer = [c for c in candidates if c.parameters > chosen.parameters]
-    if richer:
-        c = max(richer, key=lambda c: c.density)
+    if c := next((c for c in candidates if c.parameters > chosen.parameters), None):
         out.append(
             f"Richer ({c.name}) would gain {c.density - chosen.density:.3f} of held-out "
             f"log-likelihood per observation for {c.parameters - chosen.parameters} more "

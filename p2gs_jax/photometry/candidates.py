@@ -15,14 +15,9 @@ from jaxtyping import Bool, Float
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.photometry.adjustment.errors import side_by_side
 from p2gs_jax.photometry.adjustment.problem import Problem
-from p2gs_jax.photometry.adjustment.solve import (
-    EXPOSURES,
-    TOLERANCE_TO_COMPARE,
-    Fit,
-    fit_response,
-    solve_model,
-)
+from p2gs_jax.photometry.adjustment.solve import COMPARED, Fit, fit_response, solve_model
 from p2gs_jax.photometry.models import (
+    EXPOSURES,
     MODELS,
     Choice,
     Curve,
@@ -41,8 +36,6 @@ STANDARD_ERRORS, SMALLEST_GAIN = 2.0, 0.01
 INVISIBLE_DIFFERENCE = 1.0
 # The predictive density is a mixture: outliers exist, and must not decide.
 OUTLIERS, OUTLIER_DEVIATION = 0.1, 1.2
-
-Densities = Float[np.ndarray, " h"]
 
 
 @dataclass(frozen=True)
@@ -91,7 +84,7 @@ def choose(candidates: list[Candidate]) -> Candidate:
 class Predicted(NamedTuple):
     """What a fit says about held-out observations, NaN where it can say nothing."""
 
-    densities: Densities  # log densities
+    densities: Float[np.ndarray, " h"]  # log densities
     errors: Float[np.ndarray, "h 3"]  # photographed minus predicted display values
 
 
@@ -116,17 +109,22 @@ class Search:
         self._spread = float(np.std(self._solve(Choice(EXPOSURES), Response()).theta.b))
         told = self._spread / LN2 >= SPLINE_SPREAD_EV
         cameras = int(o.cameras.max(initial=0)) + 1
-        self._scope = Scope(cameras, o.positions is not None, told, known)
+        power = problem.told.size > 0
+        self._scope = Scope(cameras, o.positions is not None, told, known, power)
+        if not self._scope.allows(Choice(EXPOSURES)):
+            self.fits.clear()
 
     def first(self) -> list[str]:
         """Solve models under curves, and what cameras may do; say which curves were left out."""
         curves = [*(Curve(base) for base in BASES), Curve("srgb", "all")]
         self._try(Choice(Form(model), curve) for curve in curves for model in MODELS)
-        richest = Form("view_exposure", "view", "camera" if self._scope.places else None)
-        self._try(Choice(richest, curve) for curve in curves)
+        models = ("view_exposure", "view_exposure_camera_gamma")[: 1 + self._scope.power]
+        shade = "camera" if self._scope.places else None
+        richest = [Form(model, "view", shade) for model in models]
+        self._try(Choice(form, curve) for curve in curves for form in richest)
         # One response for different cameras may collapse where theirs would not.
         for by in ("camera", "channel"):
-            self._try(Choice(form, Curve("srgb", by)) for form in (EXPOSURES, richest))
+            self._try(Choice(form, Curve("srgb", by)) for form in (EXPOSURES, richest[0]))
         if not self._scope.curves:
             return [
                 f"Exposures differ by {self._spread / LN2:.2f} EV (standard deviation): too little "
@@ -172,7 +170,7 @@ class Search:
 
     def _solve(self, choice: Choice, response: Response) -> Fit:
         """Solve a choice under its curve on what is not held out."""
-        how = {"use": self._use, "tolerance": TOLERANCE_TO_COMPARE}
+        how = {"use": self._use, "tolerance": COMPARED}
         self.fits[choice] = solve_model(self._problem, choice.form, response, **how)[0], response
         return self.fits[choice][0]
 
@@ -197,25 +195,18 @@ class Search:
         """Return the number of free parameters of a choice."""
         o = self._problem.observations
         cameras = int(o.cameras.max(initial=0)) + 1
-        return parameter_count(choice.form, choice.curve.splines, cameras, o.view_count)
+        levels, power = (cameras, o.view_count), self._scope.power
+        return parameter_count(choice.form, choice.curve.splines, *levels, power)
 
     def _candidate(
         self, choice: Choice, density: float, found: Predicted, best: Predicted
     ) -> Candidate:
         # Neighbours in an image err alike, as do its pixels.
-        lower = best.densities - found.densities
-        (deficit, of_views), (_, of_regions) = (
-            _mean_deficit(lower, labels) for labels in (self._views, self._regions)
-        )
-        return Candidate(
-            choice,
-            self.fits[choice][1],
-            self._parameters(choice),
-            density,
-            deficit,
-            max(of_views, of_regions),
-            _largest_difference(best.errors - found.errors, self._views),
-        )
+        lower, labels = best.densities - found.densities, (self._views, self._regions)
+        deficits, errors = zip(*(_mean_deficit(lower, of) for of in labels), strict=True)
+        difference = _largest_difference(best.errors - found.errors, self._views)
+        known = (self.fits[choice][1], self._parameters(choice), density)
+        return Candidate(choice, *known, deficits[0], max(errors), difference)
 
 
 def _predict(
@@ -252,7 +243,7 @@ def _largest_difference(difference: Float[np.ndarray, "h 3"], views: Labels) -> 
     return float(255 * np.sqrt((squares / np.maximum(counts, 1)).max(initial=0.0)))
 
 
-def _mean_deficit(difference: Densities, labels: Labels) -> tuple[float, float]:
+def _mean_deficit(difference: np.ndarray, labels: Labels) -> tuple[float, float]:
     """Return the mean of what is known, and its standard error over views or regions."""
     known, count = np.isfinite(difference), int(labels.max(initial=-1)) + 1
     if not known.any():

@@ -61,23 +61,30 @@ class Form(NamedTuple):
         return said
 
 
-def possible(form: Form, cameras: int) -> bool:
+EXPOSURES = Form("view_exposure")
+
+
+def possible(form: Form, cameras: int, power: bool = False) -> bool:
     """Return whether a form differs from every simpler one, and can be solved.
 
-    With one physical camera, "per camera" means "for all".
+    With one physical camera, "per camera" means "for all": of gammas that is a gauge, unless known
+    exposures tell the `power`.
     """
     varies = MODELS[form.model]
-    levels = (varies.exposure, varies.gamma, form.white_balance)
+    levels = (varies.exposure, None if power else varies.gamma, form.white_balance)
     if cameras < 2 and "camera" in levels:
         return False
     return form.white_balance != "view" or varies.exposure == "view"
 
 
-def parameter_count(form: Form, by: ResponseKind | None, cameras: int, views: int) -> int:
+def parameter_count(
+    form: Form, by: ResponseKind | None, cameras: int, views: int, power: bool = False
+) -> int:
     """Return the number of free parameters, with splines `by` camera or channel, if any.
 
-    Each level loses one to its gauge. Where every channel has exposures of its own, no photograph
-    tells its power: two more are gauges beside that of responses by themselves.
+    Each level loses one to its gauge; that of gammas and curves is none where known exposures tell
+    the `power`. Where every channel has exposures of its own, no photograph tells its power: two
+    more are gauges beside that of responses by themselves.
     """
     size = {None: 0, "camera": cameras - 1, "view": views - 1}
     varies = MODELS[form.model]
@@ -88,6 +95,7 @@ def parameter_count(form: Form, by: ResponseKind | None, cameras: int, views: in
         + cameras * polynomials(form.vignetting) * len(VIGNETTING_POWERS)
         + spline_parameters(by, cameras)
         - 2 * (by == "channel" and form.white_balance == "view")
+        + (power and (by is not None or varies.gamma is not None))
     )
 
 
@@ -123,6 +131,7 @@ class Scope(NamedTuple):
     places: bool  # positions in the images are known: vignetting can be told
     curves: bool  # exposures differ enough to tell a curve by
     known: bool = False  # the curve is known, and sRGB's: no other is compared
+    power: bool = False  # known exposures tell the power of the curve
 
     def allows(self, choice: Choice) -> bool:
         """Return whether a choice differs from simpler ones and can be solved."""
@@ -132,8 +141,14 @@ class Scope(NamedTuple):
             and (by is None or self.curves)
             and (by != "camera" or self.cameras > 1)
             and (choice.form.vignetting is None or self.places)
-            and possible(choice.form, self.cameras)
+            and possible(choice.form, self.cameras, self.power and by is None and not self.known)
+            and (not self.power or self._free(choice))
         )
+
+    def _free(self, choice: Choice) -> bool:
+        """Return whether exposures are as they are known, and a power is free beside them."""
+        varies, by = MODELS[choice.form.model], choice.curve.splines
+        return varies.exposure == "view" and bool(varies.gamma or by or self.known)
 
 
 def neighbours(choice: Choice, scope: Scope) -> list[Choice]:

@@ -79,9 +79,8 @@ def spline_count(by: ResponseKind | None, cameras: int) -> int:
 
 def spline_parameters(by: ResponseKind | None, cameras: int) -> int:
     """Return the number of free parameters of all splines; arguments as for `spline_count`."""
-    # Of several, each with a power and a shape, one power is a gauge.
-    free = len(FREE) if by == "all" else len(FREE_OF_EACH)
-    return spline_count(by, cameras) * free - (by in ("camera", "channel"))
+    # Each has a power and a shape; one power is a gauge.
+    return spline_count(by, cameras) * len(FREE_OF_EACH) - (by is not None)
 
 
 def spline_groups(

@@ -87,7 +87,7 @@ def check_scene(
     if lpips_weights is not None:
         lpips_weights.require_sizes(scene.views, cfg.data.max_width)
     if cfg.photometry.known is not None:
-        read_known_exposures(cfg.photometry.known, training)
+        read_known_exposures(cfg.photometry.known, training, scene.views)
     return None if paths.reference is None else load_reference(paths.reference, scene, cfg)
 
 

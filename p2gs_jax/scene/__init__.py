@@ -11,7 +11,7 @@ from p2gs_jax.errors import UserError, broken
 from p2gs_jax.scene.colmap import find_model, load_colmap
 from p2gs_jax.scene.convert.convert import convert_photographs, converted_views, with_originals
 from p2gs_jax.scene.convert.icc import colour_notes
-from p2gs_jax.scene.convert.readers import read_exif_ev
+from p2gs_jax.scene.convert.readers import exif_evs
 from p2gs_jax.scene.drives import read_drive
 from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.drives.recording import Recording
@@ -85,9 +85,9 @@ def with_what_lies_beside(scene: Scene, cfg: DataConfig) -> Scene:
     Raises UserError: so many views cannot be held out, or a list of those that are is wrong.
     """
     views, mask_notes = attach_masks(scene.views)
-    views = tuple(
-        dataclasses.replace(view, exif_ev=read_exif_ev(view.image_path)) for view in views
-    )
+    evs = exif_evs([view.image_path for view in views], [view.camera for view in views])
+    both = zip(views, evs, strict=True)
+    views = tuple(dataclasses.replace(view, exif_ev=ev) for view, ev in both)
     notes = (*scene.notes, *mask_notes, *colour_notes(v.image_path for v in views))
     scene = dataclasses.replace(scene, views=views, notes=notes)
     return split_scene(scene, cfg)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
-from pathlib import Path
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from jaxtyping import Float
@@ -15,27 +17,50 @@ from p2gs_jax.types import View
 KINDS = ("ev", "exposure", "rel_exposure_ev", "exposure_time_s")
 
 
-def read_known_exposures(source: str, views: list[View]) -> Float[np.ndarray, " v"]:
+def read_known_exposures(
+    source: str, views: Sequence[View], among: Sequence[View] = ()
+) -> Float[np.ndarray, " v"]:
     """Return natural logarithms of known exposures of views, NaN where nothing is known.
 
-    The source is `exif`, or a CSV file with a column `image` or `file` (name of the view, or its
-    last part) and one of `ev`, `rel_exposure_ev` (stops), `exposure` (linear, > 0) or
-    `exposure_time_s` (seconds). Raises UserError: it cannot be used, or holds none of the views.
+    The source is `exif`, or a CSV file with a column `image` or `file` (name of the view, or any
+    end of it) and one of `ev`, `rel_exposure_ev` (stops), `exposure` (linear, > 0) or
+    `exposure_time_s` (seconds). `among` are all views of the scene, if these are some of them.
+    Raises UserError: it cannot be used, holds none of the views, or a name may be several.
     """
     if source == "exif":
         values = _exif_ev(views) * LN2
         if not np.isfinite(values).any():
-            why = "no photograph carries exposure time, f-number and ISO in its EXIF."
+            why = "no photograph carries an exposure time or ISO in its EXIF."
             raise UserError(why, fix="give a CSV file to --known-exposures, or leave it out")
         return values
-    table = _read(Path(source))
-    found = (table.get(view.name, table.get(Path(view.name).name)) for view in views)
-    values = np.array([np.nan if value is None else value for value in found], float)
+    table = _by_view(_read(Path(source)), among or views, source)
+    values = np.array([table.get(view.name, np.nan) for view in views], float)
     if not np.isfinite(values).any():
         example = views[0].name if views else "image.jpg"
         why = f"names none of the {len(views)} training views."
         raise broken(source, why, f"write names as the scene does, for example {example}")
     return values
+
+
+def _by_view(table: dict[str, float], views: Sequence[View], source: str) -> dict[str, float]:
+    """Return the exposures of views by their whole names."""
+    ends: dict[str, set[str]] = defaultdict(set)
+    for name in (view.name for view in views):
+        parts = PurePosixPath(name).parts
+        for end in ("/".join(parts[k:]) for k in range(len(parts))):
+            ends[end].add(name)
+            ends[end.removesuffix(PurePosixPath(name).suffix)].add(name)
+    whole, out = {view.name for view in views}, dict[str, float]()
+    for given, value in table.items():
+        written = PurePosixPath(given.replace("\\", "/")).as_posix()
+        names = {written} if written in whole else ends.get(written, set())
+        if len(names) > 1:
+            why = f"{given} may be {' and '.join(sorted(names)[:2])}"
+            raise broken(f"{source}:", why, "write more of the path into the file")
+        for name in names:
+            if out.setdefault(name, value) != value:
+                raise broken(f"{source}:", f"{name} has two exposures", "take one of them out")
+    return out
 
 
 def check_source(source: str | None) -> None:
@@ -44,14 +69,14 @@ def check_source(source: str | None) -> None:
         _read(Path(source))
 
 
-def stated_ev(source: str | None, views: list[View]) -> Float[np.ndarray, " v"]:
+def stated_ev(source: str | None, views: Sequence[View]) -> Float[np.ndarray, " v"]:
     """Return stated exposures in stops, up to a constant, from a source or, if None, from EXIF."""
     if source is None:
         return _exif_ev(views)
     return read_known_exposures(source, views) / LN2
 
 
-def _exif_ev(views: list[View]) -> Float[np.ndarray, " v"]:
+def _exif_ev(views: Sequence[View]) -> Float[np.ndarray, " v"]:
     return np.array([np.nan if v.exif_ev is None else v.exif_ev for v in views], float)
 
 
@@ -91,5 +116,8 @@ def _read(path: Path) -> dict[str, float]:
         if not np.isfinite(log):
             fix = "write a finite number, above 0 for exposures"
             raise broken(f"{path}, line {number}:", f"{kind} is {text!r}.", fix)
-        out[(row[name] or "").strip()] = log
+        if out.setdefault(image := (row[name] or "").strip(), log) != log:
+            raise broken(
+                f"{path}, line {number}:", f"{image} is named again", "keep one line of it"
+            )
     return out

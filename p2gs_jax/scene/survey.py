@@ -12,7 +12,7 @@ import numpy as np
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene import PhotographsAlone, Video, find_scene, with_what_lies_beside
-from p2gs_jax.scene.convert.readers import read_exif_ev
+from p2gs_jax.scene.convert.readers import exif_evs
 from p2gs_jax.scene.drives.assemble import SWEEP_SLACK_S, assemble
 from p2gs_jax.scene.drives.recording import Recording, chosen_frames
 from p2gs_jax.scene.files import Report, image_size
@@ -126,7 +126,7 @@ def _sizes(found: PhotographsAlone) -> tuple[SurveyedCamera, ...]:
     for path in found.paths:
         by_size[image_size(path)].append(path)
     return tuple(
-        SurveyedCamera("", len(paths), size, ev=_range([read_exif_ev(path) for path in paths]))
+        SurveyedCamera("", len(paths), size, ev=_range(exif_evs(paths)))
         for size, paths in sorted(by_size.items(), key=lambda item: -len(item[1]))
     )
 

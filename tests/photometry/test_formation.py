@@ -126,9 +126,6 @@ def test_loose_pixels_are_those_of_the_image(cfg):
     place = places(np.stack([u, v], 1) + np.float32(0.5), WIDTH, HEIGHT)
     loose = formation(linear[v, u], rows, cfg, positions=place)
     np.testing.assert_allclose(loose, whole[which, v, u], atol=1e-5)
-    back = inverse_formation(loose, rows, cfg, place)
-    seen = (loose < 0.99) & (loose > 2 / 255)
-    np.testing.assert_allclose(back[seen], linear[v, u][seen], rtol=5e-3)
 
 
 def test_vignetting_without_a_place_is_refused():
@@ -265,6 +262,13 @@ def test_parameterisations_never_reach_zero():
     linear = Photometry(jnp.array([-5.0, 2.0]), jnp.array([-1.0, 2.2]), "linear")
     for p in (log, linear):
         assert min(float(p.exposures.min()), float(p.gammas.min())) > 0
+
+    def total(raw):
+        p = Photometry(raw, raw, "linear")
+        return jnp.sum(p.exposures + 2 * p.gammas)
+
+    # What has left the range can come back.
+    np.testing.assert_array_equal(jax.grad(total)(jnp.array([-5.0, 1e-3, 2.0])), 3.0)
 
 
 @pytest.mark.parametrize("kind", ["exp", "linear"])

@@ -7,6 +7,7 @@ import pytest
 from solving import DRIVE, ISO4, PLAIN, adjust, problem_of, rms, select
 from synthetic_drive import make_drive, make_exposures, observe
 
+from p2gs_jax.photometry.adjustment.problem import KnownExposures
 from p2gs_jax.photometry.adjustment.solve import fit_response
 from p2gs_jax.photometry.candidates import Candidate, choose
 from p2gs_jax.photometry.models import (
@@ -142,6 +143,35 @@ def test_what_varies_is_found(exposures, curve, gamma, model, response):
     assert any(r.startswith("Chosen:") for r in s.reasons)
     if exposures == "constant":
         assert any("too little to tell the shape" in r for r in s.reasons)
+
+
+@pytest.mark.parametrize("cameras", [1, 3])
+@pytest.mark.parametrize("known", [2, None])
+def test_known_exposures_that_differ_tell_the_power_of_the_curve(known, cameras):
+    """A camera of gamma 2.8: under sRGB, radiance comes out as its power of 0.8."""
+    truth = make_exposures(SHORT, "iso4")
+    how = {"curve": "power", "gammas": np.full(len(truth), 2.8), "pivot": 0.18}
+    o = observe(SHORT, truth, **how)
+    if cameras == 1:
+        o = dataclasses.replace(o, cameras=0 * o.cameras, camera_names=("front",))
+    given = np.full(len(truth), np.nan)
+    given[:known] = np.log(truth[:known])
+    s = select(o, known=KnownExposures(given))
+    light = s.solution.point_log_radiance
+    seen = np.isfinite(light).all(1)
+    slope = np.polyfit(np.log(SHORT.radiance[seen]).ravel(), light[seen].ravel(), 1)[0]
+    assert slope == pytest.approx(1, abs=0.04)
+    assert s.solution.residual_ev < 0.08
+    assert np.std(s.solution.log_exposures - np.log(truth)) < 0.05
+    assert any("tell the tone curve's power" in r for r in s.reasons)
+
+
+def test_known_exposures_that_are_alike_fix_the_scale_only():
+    truth = make_exposures(SHORT, "constant")
+    o, known = observe(SHORT, truth), KnownExposures(np.full(len(truth), 0.5))
+    s = select(o, known=known)
+    assert any("they fix the scale" in r for r in s.reasons)
+    assert s.solution.model == "constant"
 
 
 def test_a_filmic_camera_gets_a_spline_unless_its_curve_is_known():

@@ -132,3 +132,10 @@ def test_exposures_of_a_drive_are_a_line_a_camera_over_seconds(drive, monkeypatc
     chart = exposure_section(run, {}).split("<details>")[0]
     assert all(f">{camera}<" in chart for camera in cameras)
     assert "seconds" in chart
+    # A photograph that tells no exposure is not one of 0 EV.
+    lost = {**views[0], **unknown, "image": "front/lost.png"}
+    more = dataclasses.replace(run, photometry={"views": [*views, lost]})
+    row, again = (
+        exposure_section(r, {}).split("front/0.png")[1].split("</tr>")[0] for r in (run, more)
+    )
+    assert row == again

@@ -32,6 +32,29 @@ def test_csv(tmp_path, text, expected):
     np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
+def test_names_are_whole_or_ends_and_never_several(tmp_path):
+    path = tmp_path / "e.csv"
+    rig = views(*(f"rig/cam{k}/{n}.png" for k in range(3) for n in "ab"))
+    path.write_text("image,ev\nrig\\cam0\\a.png,1\ncam1/a,2\nrig/cam2/b.png,3\n")
+    found = read_known_exposures(str(path), rig) / np.log(2)
+    np.testing.assert_allclose(found, [1, np.nan, 2, np.nan, np.nan, 3])
+    for rows, words in (
+        ("a.png,1\n", "a.png may be rig/cam0/a.png and rig/cam1/a.png"),
+        ("cam0/a.png,1\nrig/cam0/a.png,2\n", "rig/cam0/a.png has two exposures"),
+        ("cam0/a.png,1\ncam0/a.png,2\n", "line 3: cam0/a.png is named again"),
+    ):
+        path.write_text("image,ev\n" + rows)
+        with refused(words):
+            read_known_exposures(str(path), rig)
+    # Also where all but one of them are held out.
+    path.write_text("image,ev\na.png,1\n")
+    with refused("a.png may be"):
+        read_known_exposures(str(path), rig[:1], among=rig)
+    # A whole name is not the end of another.
+    both = views("a.png", "cam0/a.png")
+    np.testing.assert_allclose(read_known_exposures(str(path), both) / np.log(2), [1, np.nan])
+
+
 def test_exif():
     found = read_known_exposures("exif", [*views("a", exif=1.5), *views("b")])
     np.testing.assert_allclose(found / np.log(2), [1.5, np.nan])

@@ -15,7 +15,7 @@ from scene.helpers import refused, write_image, write_tiny_model
 from p2gs_jax.config import DataConfig
 from p2gs_jax.run.scene_file import read_scene, write_scene
 from p2gs_jax.scene import ImageStore, PhotographsAlone, find_scene, load_scene
-from p2gs_jax.scene.convert.readers import ExifSettings, read_exif_ev, read_exif_settings
+from p2gs_jax.scene.convert.readers import ExifSettings, exif_evs, read_exif_settings
 from p2gs_jax.scene.files import image_size
 from p2gs_jax.scene.masks import background_color, has_alpha
 from p2gs_jax.train.inputs import TrainingViews
@@ -85,6 +85,7 @@ def test_exif_of_sceaux_agrees_with_its_table(shared_data):
 
 
 TIME, F_NUMBER, ISO, TAKEN = 33434, 33437, 34855, 36867
+SHUTTER, APERTURE = 37377, 37378
 FULL = {TIME: 0.01, F_NUMBER: 2.0, ISO: 400}
 
 
@@ -95,20 +96,51 @@ def jpeg_with_exif(path, tags):
     return path
 
 
+@pytest.mark.parametrize(
+    ("shots", "cameras", "expected"),
+    [
+        ([FULL, {**FULL, ISO: 800}], "aa", [0, 1]),
+        # What no photograph states drops out; an ISO is then taken as 100.
+        ([{TIME: 0.01, F_NUMBER: 2.0}, {TIME: 0.02, F_NUMBER: 2.0}], "aa", [-2, -1]),
+        ([{TIME: 0.01, ISO: 400}, {TIME: 0.02, ISO: 400}], "aa", [2, 3]),
+        ([{F_NUMBER: 2.0, ISO: 400}, {F_NUMBER: 4.0, ISO: 400}], "aa", [6.644, 4.644]),
+        # So does what the same camera keeps constant, and nothing else.
+        ([FULL, {TIME: 0.01, ISO: 400}, {TIME: 0.02, F_NUMBER: 2.0}], "aaa", [0, 0, 1]),
+        ([FULL, {**FULL, ISO: 800}, {TIME: 0.01, F_NUMBER: 2.0}], "aaa", [0, 1, None]),
+        ([FULL, {**FULL, ISO: 800}, {TIME: 0.01, ISO: 400}], "aab", [0, 1, None]),
+        ([FULL, {**FULL, TIME: 0.0}, {F_NUMBER: 2.0}, {}], "aaaa", [0, 0, None, None]),
+        # 1/128 s and f/4 in APEX; a lens without contacts writes zeros.
+        (
+            [{SHUTTER: 7.0, APERTURE: 4.0, ISO: 100}, {**FULL, TIME: 1 / 128}],
+            "aa",
+            [-4.356, -0.356],
+        ),
+        ([{**FULL, F_NUMBER: 0.0, APERTURE: 0.0}, {TIME: 0.02, ISO: 400}], "aa", [2, 3]),
+    ],
+)
+def test_exif_rules(tmp_path, shots, cameras, expected):
+    paths = [jpeg_with_exif(tmp_path / f"{k}.jpg", tags) for k, tags in enumerate(shots)]
+    found = exif_evs(paths, cameras)
+    assert [ev if ev is None else pytest.approx(ev, abs=1e-3) for ev in expected] == found
+
+
+def test_smaller_copies_have_the_exif_of_the_photographs(tmp_path):
+    for folder in ("images/cam0", "images_2/cam0"):
+        (tmp_path / folder).mkdir(parents=True)
+    jpeg_with_exif(tmp_path / "images/cam0/a.jpg", FULL)
+    jpeg_with_exif(tmp_path / "images/cam0/b.JPG", {**FULL, ISO: 800})
+    copies = [tmp_path / "images_2/cam0" / name for name in ("a.jpg", "b.png", "c.png")]
+    for path in copies:
+        Image.new("RGB", (4, 4)).save(path)
+    assert exif_evs(copies) == [pytest.approx(0), pytest.approx(1), None]
+
+
 def test_how_a_photograph_was_taken(tmp_path):
     path, taken = tmp_path / "a.jpg", "2010:10:12 14:43:07"
     shot = read_exif_settings(jpeg_with_exif(path, {**FULL, TAKEN: taken}))
     assert shot == ExifSettings(pytest.approx(0.01), 2.0, 400.0, taken)
     for tags in ({TAKEN: "    :  :     :  :  "}, {ISO: 65535, TAKEN: "yesterday"}):
         assert read_exif_settings(jpeg_with_exif(path, tags)) == ExifSettings()
-    for tags, ev in (
-        (FULL, 0.0),
-        ({TIME: 0.01, F_NUMBER: 2.0}, -2.0),
-        ({TIME: 0.01, ISO: 400}, None),
-        ({F_NUMBER: 2.0, ISO: 400}, None),
-        ({**FULL, TIME: 0.0}, None),
-    ):
-        assert read_exif_ev(jpeg_with_exif(path, tags)) == (ev if ev is None else pytest.approx(ev))
     data = bytearray(jpeg_with_exif(path, FULL).read_bytes())
     at = data.find(b"Exif") + 6
     for _ in range(50):
@@ -116,9 +148,9 @@ def test_how_a_photograph_was_taken(tmp_path):
         for i in RNG.integers(at, at + 60, 8):
             broken[i] = RNG.integers(256)
         path.write_bytes(broken)
-        read_exif_ev(path)
+        exif_evs([path])
     path.write_bytes(b"nothing")
-    assert read_exif_ev(path) is read_exif_ev(tmp_path / "absent.jpg") is None
+    assert exif_evs([path, tmp_path / "absent.jpg"]) == [None, None]
 
 
 # ------------------------------------------------------------------ alpha

@@ -159,15 +159,8 @@ def normal_equations(
             if common := [c for c in one.channels if c in other.channels]:
                 values = of_each(w * one.derivative * other.derivative, common)
                 parts.append(Entries(x * u.views + views, y * u.views + views, values))
-    of_pairs = layout.pairs.sums(
-        [(coupled * p.derivative)[:, p.channels] for p in per_view],
-        [
-            [(p.channels.index(c), q.channels.index(c)) for c in p.channels if c in q.channels]
-            for p in per_view
-            for q in per_view
-        ],
-        kind,
-    )
+    factors, channels = [coupled * p.derivative for p in per_view], [p.channels for p in per_view]
+    of_pairs = layout.pairs.sums(factors, channels, kind)
     parts.append(of_pairs._replace(values=-of_pairs.values))
     # Without gammas, a keeps its place in the vector.
     right += [] if u.gammas else [np.zeros(u.views)]

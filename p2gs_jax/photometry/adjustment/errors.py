@@ -16,24 +16,10 @@ import scipy.sparse as sp
 from jaxtyping import Float, Int
 
 from p2gs_jax.core.streams import Stream, generator
-from p2gs_jax.photometry.adjustment.equations import (
-    Weighted,
-    at_places,
-    coupling,
-    of_views,
-    others,
-    over_all,
-    summed,
-    weigh,
-)
+from p2gs_jax.photometry.adjustment import equations
+from p2gs_jax.photometry.adjustment.equations import Weighted, summed, weigh
 from p2gs_jax.photometry.adjustment.matrices import is_small, whole
-from p2gs_jax.photometry.adjustment.parameters import (
-    EMPTY,
-    Forward,
-    Parameters,
-    System,
-    gauge_strength,
-)
+from p2gs_jax.photometry.adjustment.parameters import EMPTY, Forward, Parameters, System
 from p2gs_jax.photometry.adjustment.solve import Balanced, Fit, one_thread
 from p2gs_jax.photometry.observations import Labels, Observations
 
@@ -99,10 +85,10 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
     count = np.maximum(np.bincount(pairs, minlength=layout.view_count), 2)
     few = np.sqrt(count / (count - 1))
     bread = fit.normal * fit.at.curvature + system.priors.normal
-    gauges = np.sqrt(gauge_strength(bread, system.unknowns)) * system.anchors.rows
+    gauges = system.gauges(bread)[1]
     if not is_small(system.basis.shape[1]):  # pyright: ignore
-        drawn = _drawn(bread, gauges, each, system)
-        return Uncertainty(drawn, np.zeros((len(drawn), 0)), few, system.unknowns.split)
+        drawn = _drawn(Balanced(bread, gauges, system.basis), each, system)
+        return Uncertainty(*drawn, few, system.unknowns.split)
     # A prior is itself an observation with variance 1 / precision: it is its own meat.
     meat = each.T @ each + system.priors.normal
     with one_thread():
@@ -125,14 +111,17 @@ def _sandwich(bread, meat, basis) -> tuple[Float[np.ndarray, "d r"], Float[np.nd
     return g @ roots, unknown / np.linalg.norm(unknown, axis=0)
 
 
-def _drawn(bread, gauges, each, system: System) -> Float[np.ndarray, "d r"]:
+def _drawn(
+    bread: Balanced, each, system: System
+) -> tuple[Float[np.ndarray, "d r"], Float[np.ndarray, "d k"]]:
     """Return solutions for clusters and priors with random signs (wild bootstrap)."""
     rng = generator(0, Stream.SCORE_SIGNS)
     priors = system.priors
     own, known = (rng.choice([-1.0, 1.0], (n, DRAWS)) for n in (each.shape[0], len(priors.targets)))
     right = each.T @ own
     right += priors.rows.T @ (np.sqrt(priors.precisions)[:, None] * known)
-    return Balanced(bread, gauges, system.basis).solve(right) / np.sqrt(DRAWS)
+    unknown = bread.unheld(HELD)
+    return bread.solve(right) / np.sqrt(DRAWS), unknown / np.linalg.norm(unknown, axis=0)
 
 
 def regions(
@@ -191,12 +180,14 @@ def _shared_deviation(model: Forward, at: Weighted, labels: Labels) -> float:
 def _shared_scores(model: Forward, theta: Parameters, at: Weighted, labels: Labels) -> sp.csr_array:
     """Return how the right side, points eliminated, moves with errors of regions: (regions, d)."""
     layout, u = model.layout, model.unknowns
-    coupled = coupling(layout, theta, at)
+    coupled = equations.coupling(layout, theta, at)
     taken = [
-        at_places(layout, coupled * p.derivative, layout.views, u.views, p.channels).T
-        for p in of_views(model, at)
+        equations.at_places(layout, coupled * p.derivative, layout.views, u.views, p.channels).T
+        for p in equations.of_views(model, at)
     ]
-    terms, place = others(model, theta), 3 * layout.row[:, None] + np.arange(3)
+    terms, place = equations.others(model, theta), 3 * layout.row[:, None] + np.arange(3)
     more = None if terms is None else terms.sums(coupled, place, 3 * layout.rows)
-    of_points = at_places(layout, coupled, labels, int(labels.max(initial=-1)) + 1)
-    return summed(model, theta, at, at.weight, labels) - of_points @ over_all(u, taken, more)
+    of_points = equations.at_places(layout, coupled, labels, int(labels.max(initial=-1)) + 1)
+    return summed(model, theta, at, at.weight, labels) - of_points @ equations.over_all(
+        u, taken, more
+    )

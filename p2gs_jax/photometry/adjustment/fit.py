@@ -13,7 +13,7 @@ from p2gs_jax.config import CameraFormation
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.photometry.adjustment.equations import weigh
 from p2gs_jax.photometry.adjustment.errors import Uncertainty, uncertainty
-from p2gs_jax.photometry.adjustment.parameters import Parameters, make_forward
+from p2gs_jax.photometry.adjustment.parameters import Forward, Parameters
 from p2gs_jax.photometry.adjustment.problem import Problem
 from p2gs_jax.photometry.adjustment.solve import Fit, solve_model
 from p2gs_jax.photometry.models import Form, ModelName
@@ -70,7 +70,7 @@ def explain(
     for pick, points, part in _blocks(problem):
         mine, usable = part.observations, part.usable
         # At the solution each observation is judged by itself.
-        model = make_forward(part, usable, response, fit.model.unknowns)
+        model = Forward.of(part, usable, response, fit.model.unknowns)
         weight = model.noise_weight
         for loss in ("l1", "l1", "geman_mcclure", "geman_mcclure"):
             at = weigh(model, fit.theta, weight, loss)

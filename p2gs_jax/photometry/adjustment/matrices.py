@@ -113,23 +113,20 @@ class Pairs:
 
     def sums(
         self,
-        factors: list[Float[np.ndarray, "o f"]],
-        shared: list[list[tuple[int, int]]],
+        factors: list[Float[np.ndarray, "o 3"]],
+        channels: list[list[int]],
         kind: type[np.floating] = np.float64,
     ) -> Entries:
         """Return the sum over rows of outer products of per-view vectors: (x V, x V).
 
-        Args:
-            factors: of each of x parameters, what its view contributes, in f components.
-            shared: for every two parameters the components that they have in common, as pairs of
-                places in their factors: `shared[x * len(factors) + y]`.
-            kind: of the products. In the rounds float32: there the matrix decides how fast they
-                converge, never where they end. Standard errors need float64: what joins groups of
-                views by a few dark points is less than the rounding of what joins the views of a
-                group.
+        `factors` are what each of x parameters contributes in the `channels` that it acts in.
+        Products are of a `kind`. In the rounds float32: there the matrix decides how fast they
+        converge, never where they end. Standard errors need float64: what joins groups of views by
+        a few dark points is less than the rounding of what joins the views of a group.
         """
-        count, views = len(factors), self._views
-        parts = [f[self._order].astype(kind) for f in factors]
+        count, views, own = len(factors), self._views, channels
+        parts = [f[:, c][self._order].astype(kind) for f, c in zip(factors, own, strict=True)]
+        shared = [[c for c in one if c in other] for one in own for other in own]
         used = [k for k, common in enumerate(shared) if common]
         totals = np.zeros((len(used), len(self._rows)))
         # Not fewer at once than half of the entries they are added to.
@@ -143,7 +140,7 @@ class Pairs:
             right = [np.take(p, second, 0) for p in parts]
             for total, k in zip(totals, used, strict=True):
                 x, y = divmod(k, count)
-                a, b = zip(*shared[k], strict=True)
+                a, b = ([own[z].index(c) for c in shared[k]] for z in (x, y))
                 products = np.einsum("pf,pf->p", left[x][:, a], right[y][:, b])
                 total += np.bincount(place, products, len(total))
         rows = np.concatenate([self._rows + k // count * views for k in used])

@@ -104,11 +104,12 @@ class Splines:
 
     by: ResponseKind = "all"
     groups: int = 0
+    power: bool = False  # known exposures tell the power
 
     @property
     def free(self) -> np.ndarray:
         """Knots of a spline that are solved for."""
-        return np.array(FREE if self.by == "all" else FREE_OF_EACH)
+        return np.array(FREE if self.by == "all" and not self.power else FREE_OF_EACH)
 
     @property
     def count(self) -> int:
@@ -117,9 +118,7 @@ class Splines:
 
     @property
     def powers(self) -> np.ndarray:
-        """Parameters whose mean is a gauge: how steep the splines are, where they are several."""
-        if self.by == "all":
-            return np.zeros(0, int)
+        """Parameters that say how steep each spline is, where that is solved for."""
         return np.flatnonzero(np.tile(self.free == HELD[1], self.groups))
 
     def values(self, c: Float[np.ndarray, " k"]) -> Float[np.ndarray, "g n"]:
@@ -234,29 +233,20 @@ class Forward(NamedTuple):
         """Weights by the stated noise alone: where robust ones start."""
         return self.weight / self.sigma**2
 
-
-def make_forward(
-    problem: Problem, weight: PerChannel, response: Response, unknowns: Unknowns
-) -> Forward:
-    """Return the observations under a response, with the terms of the model laid out."""
-    layout, o = problem.layout, problem.observations
-    features, splines = unknowns.features, unknowns.splines
-    z, sigma, slope = o.decoded(response)
-    knot, fraction = hat(np.asarray(o.colors, np.float64))
-    group = spline_groups(splines.by, layout.cameras[layout.views], z.shape)
-    return Forward(
-        unknowns,
-        layout,
-        z - problem.log_pivot,
-        sigma,
-        np.asarray(weight, np.float64),
-        knot,
-        fraction,
-        slope,
-        group,
-        features.terms(layout) if features.count else None,
-        splines.terms(knot, fraction, group) if splines.count else None,
-    )
+    @classmethod
+    def of(
+        cls, problem: Problem, weight: PerChannel, response: Response, unknowns: Unknowns
+    ) -> Forward:
+        """Return the observations under a response, with the terms of the model laid out."""
+        layout, o = problem.layout, problem.observations
+        features, splines = unknowns.features, unknowns.splines
+        z, sigma, slope = o.decoded(response)
+        knot, fraction = hat(np.asarray(o.colors, np.float64))
+        group = spline_groups(splines.by, layout.cameras[layout.views], z.shape)
+        seen = (z - problem.log_pivot, sigma, np.asarray(weight, np.float64))
+        more = features.terms(layout) if features.count else None
+        basis = splines.terms(knot, fraction, group) if splines.count else None
+        return cls(unknowns, layout, *seen, knot, fraction, slope, group, more, basis)
 
 
 @dataclass(frozen=True)
@@ -282,7 +272,7 @@ class System(NamedTuple):
 
     unknowns: Unknowns  # what the parameters are
     basis: sp.csr_array  # columns are the free directions
-    anchors: Held  # the gauges; their precisions are relative (`gauge_strength`)
+    anchors: Held  # the gauges; their precisions are relative (`gauges`)
     priors: Held  # what is known
     log_exposure: Float[np.ndarray, " v"]  # prior mean of h: where rounds start
     smoothness: Float[np.ndarray, "k k"]  # its quadratic form keeps a spline smooth
@@ -295,6 +285,15 @@ class System(NamedTuple):
         k, c = (np.zeros(terms.count) for terms in (u.features, u.splines))
         return Parameters(b, np.ones(u.views), k, c)
 
+    def gauges(self, normal: Matrix) -> tuple[float, sp.csr_array]:
+        """Return how hard gauges hold, by the exposures' information, and rows times its root.
+
+        A gauge is a mean over views: over thousands of them its normal matrix would not be sparse.
+        """
+        of_b = normal.diagonal()[: self.unknowns.channels * self.unknowns.views]
+        strength = ANCHOR * float(np.mean(of_b) + EMPTY)
+        return strength, np.sqrt(strength) * self.anchors.rows
+
 
 def make_system(problem: Problem, form: Form, splines: ResponseKind | None = None) -> System:
     """Return free directions, gauges and priors; `splines` is what has one that is solved for."""
@@ -306,7 +305,7 @@ def make_system(problem: Problem, form: Form, splines: ResponseKind | None = Non
         3 if form.white_balance == "view" else 1,
         model.gamma is not None,
         Features(camera_count, form.white_balance == "camera", form.vignetting),
-        Splines(splines or "all", spline_count(splines, camera_count)),
+        Splines(splines or "all", spline_count(splines, camera_count), problem.told.size > 0),
     )
     of_b, of_a = _directions(model.exposure, cameras), _directions(model.gamma, cameras)
     others = sp.eye_array(unknowns.count - unknowns.at.a.stop)
@@ -318,11 +317,15 @@ def make_system(problem: Problem, form: Form, splines: ResponseKind | None = Non
         given = np.isfinite(known.log_exposures)
         log_exposure = np.where(given, known.log_exposures, 0.0)
         precision = given / (max(known.deviation_ev, FIXED_EV) * LN2) ** 2
+    of_gammas = np.full(views, 1 / A_PRIOR**2)
+    if model.gamma == "camera" and problem.told.size:
+        # What is expected of a camera counts once, not in each view.
+        of_gammas /= np.bincount(cameras)[cameras]
     return System(
         unknowns=unknowns,
         basis=sp.csr_array(basis),
         anchors=_anchors(problem, unknowns, log_exposure, precision),
-        priors=_priors(unknowns, log_exposure, precision),
+        priors=_priors(unknowns, log_exposure, precision, of_gammas),
         log_exposure=log_exposure,
         smoothness=_smoothness(unknowns.splines),
     )
@@ -358,7 +361,7 @@ def _anchors(problem: Problem, u: Unknowns, log_exposure, precision) -> Held:
             for channel in (0, 2):
                 both = np.concatenate([channel * u.views + members, u.views + members])
                 hold(both, np.repeat([share, -share], len(members)))
-        if known.sum() < 2 or np.ptp(log_exposure[members]) < 1e-3:
+        if label not in problem.told:
             hold(u.at.a.start + members, share, 1.0)
     if u.features.balance:
         views_of = np.bincount(problem.observations.cameras, minlength=u.features.cameras)
@@ -368,16 +371,18 @@ def _anchors(problem: Problem, u: Unknowns, log_exposure, precision) -> Held:
     powers = u.at.c.start + u.splines.powers
     if u.splines.by == "channel" and u.channels == 3:
         # No photograph tells the power of a channel with exposures of its own.
-        for power in powers:
-            hold(power, 1.0)
-    elif powers.size:
+        alone = [([power], [1.0]) for power in powers]
+        alike = [([one, other], [1.0, -1.0]) for one, other in itertools.pairwise(powers)]
+        for index, weights in alike if u.splines.power else alone:
+            hold(index, weights)
+    elif powers.size and not u.splines.power:
         hold(powers, 1 / u.splines.groups)
     return Held(sp.csr_array(sp.vstack(rows)), np.array(targets), np.ones(len(targets)))
 
 
-def _priors(u: Unknowns, log_exposure, precision) -> Held:
-    """Return what is known: exposures (b - a mu = 0 for h = mu), gammas, lenses."""
-    given, views = np.flatnonzero(precision > 0), np.arange(u.views)
+def _priors(u: Unknowns, log_exposure, precision, of_gammas) -> Held:
+    """Return what is known: exposures (b - a mu = 0 for h = mu), gammas (a precision), lenses."""
+    given = np.flatnonzero(precision > 0)
     at = np.arange(len(given))
     b = [(np.full(len(given), 1 / u.channels), c * u.views + given) for c in range(u.channels)]
     b.append((-log_exposure[given], u.at.a.start + given))
@@ -386,14 +391,14 @@ def _priors(u: Unknowns, log_exposure, precision) -> Held:
         (values, (np.tile(at, u.channels + 1), columns)), shape=(len(given), u.count)
     )
     every = sp.csr_array(sp.eye_array(u.count))
-    of_a = every[u.at.a.start + views] if u.gammas else every[:0]
+    of_gammas = of_gammas if u.gammas else of_gammas[:0]
+    gammas = u.at.a.start + np.arange(len(of_gammas))
     lenses = np.arange(u.at.k.start + u.features.balance_count, u.at.k.stop)
-    counts = [of_a.shape[0], len(lenses)]
-    others = np.repeat([1 / A_PRIOR**2, 1 / VIGNETTING_PRIOR**2], counts)
+    of_lenses = np.full(len(lenses), 1 / VIGNETTING_PRIOR**2)
     return Held(
-        sp.csr_array(sp.vstack([exposures, of_a, every[lenses]])),
-        np.repeat([0.0, 1.0, 0.0], [len(given), *counts]),
-        np.concatenate([precision[given], others]),
+        sp.csr_array(sp.vstack([exposures, every[gammas], every[lenses]])),
+        np.repeat([0.0, 1.0, 0.0], [len(given), len(gammas), len(lenses)]),
+        np.concatenate([precision[given], of_gammas, of_lenses]),
     )
 
 
@@ -406,9 +411,3 @@ def _smoothness(splines: Splines) -> Float[np.ndarray, "k k"]:
     between = 0.5 * (gaps[1:] + gaps[:-1])
     second = second * (KNOT_SPACING**1.5 / np.sqrt(between))[:, None]
     return np.kron(np.eye(splines.groups), SMOOTHNESS * second.T @ second)
-
-
-def gauge_strength(normal: Matrix, unknowns: Unknowns) -> float:
-    """Return how hard the anchors hold, on the scale of the exposures' information."""
-    of_b = normal.diagonal()[: unknowns.channels * unknowns.views]
-    return ANCHOR * float(np.mean(of_b) + EMPTY)

@@ -9,10 +9,12 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Int
 
+from p2gs_jax.core.numerics import LN2
 from p2gs_jax.photometry.adjustment.matrices import Pairs
 from p2gs_jax.photometry.observations import Observations
 
 LONGEST_ROW = 16
+TELLING_EV = 0.1  # known exposures that differ by less, stops, tell the power of no curve
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,16 @@ class Problem:
     def layout(self) -> Layout:
         """Where each observation lies."""
         return Layout(self.observations)
+
+    @functools.cached_property
+    def told(self) -> Int[np.ndarray, " k"]:
+        """Labels of components whose known exposures differ: their power is not a gauge."""
+        if self.known is None:
+            return np.zeros(0, int)
+        known = np.isfinite(self.known.log_exposures)
+        given, label = self.known.log_exposures[known] / LN2, self.component[known]
+        least = max(TELLING_EV, self.known.deviation_ev)
+        return np.array([k for k in np.unique(label) if np.ptp(given[label == k]) >= least], int)
 
     def part(self, pick: np.ndarray | slice) -> Problem:
         """Return some of the observations, chosen by a mask or their rows."""

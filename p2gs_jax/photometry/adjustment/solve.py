@@ -8,7 +8,8 @@ Outliers are weighted away: 0 / 10 / 30 % of them give 0.005 / 0.006 / 0.007 EV 
 from __future__ import annotations
 
 import functools
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -20,28 +21,21 @@ from jaxtyping import Float
 from p2gs_jax.config import ResponseKind
 from p2gs_jax.photometry.adjustment.equations import Loss, Weighted, normal_equations, weigh
 from p2gs_jax.photometry.adjustment.matrices import Matrix, is_small, whole
-from p2gs_jax.photometry.adjustment.parameters import (
-    Forward,
-    Parameters,
-    System,
-    gauge_strength,
-    make_forward,
-    make_system,
-)
+from p2gs_jax.photometry.adjustment.parameters import Forward, Parameters, System, make_system
 from p2gs_jax.photometry.adjustment.problem import Problem
-from p2gs_jax.photometry.models import Form
+from p2gs_jax.photometry.models import EXPOSURES, Form
 from p2gs_jax.photometry.response import Response, rises
 
 # Rounds of both losses together are no more than MOST_ROUNDS.
 L1_ROUNDS, MOST_ROUNDS = 4, 60
 A_RANGE = (0.3, 3.0)
 # Change of a parameter, log units, at which rounds end: for what is kept, and what is compared.
-TOLERANCE, TOLERANCE_TO_COMPARE = 1e-5, 5e-3
+TOLERANCE, COMPARED = 1e-5, 5e-3
 DAMPING = 1e-8  # damping of the balanced matrix, whose diagonal is 1
 GROUPS = 1000  # groups of neighbouring unknowns, whose common changes a coarse system solves
 # Relative residual at which the iteration ends; a round's step need not be exact.
 PRECISION, MOST_ITERATIONS = 1e-7, 2000
-EXPOSURES = Form("view_exposure")
+MOST_UNHELD = 8  # directions that nothing holds are looked for, where unknowns are many
 # A spline may change the spread of exposures by this factor: the power gauge contradicts none.
 LARGEST_STRETCH = 1.6
 
@@ -82,13 +76,32 @@ class Balanced:
         scale = self._scale.reshape(-1, *[1] * (right.ndim - 1))
         return self._directions @ (scale * self._solve(scale * (self._directions.T @ right)))
 
+    def unheld(self, held: float) -> Float[np.ndarray, "d k"]:
+        """Return the directions, some at most, along which less than a share of 1 is held."""
+        count = len(self._scale)
+        inverse = _operator(count, self._solve)
+        # Inverses are known to PRECISION; the start is any that is the same in every run.
+        how = {"tol": 100 * PRECISION, "v0": np.cos(np.arange(count))}
+        some = min(MOST_UNHELD, count - 1)
+        try:
+            value, vector = scipy.sparse.linalg.eigsh(
+                inverse, some, sigma=-DAMPING, OPinv=inverse, **how
+            )
+        except scipy.sparse.linalg.ArpackNoConvergence as found:
+            value, vector = found.eigenvalues, found.eigenvectors
+        return self._directions @ (self._scale[:, None] * vector[:, value <= held])
+
+
+def _operator(count: int, multiply: Callable) -> Any:
+    return scipy.sparse.linalg.LinearOperator((count, count), multiply)  # pyright: ignore
+
 
 def _iterative(sparse: sp.csr_array, low_rank: Float[np.ndarray, "g n"]):
     """Conjugate gradients with a two-level preconditioner.
 
     A long drive is a chain: what is wrong by a little everywhere adds up from its one end to its
     other, and takes as many iterations as there are links. Sums over groups of neighbours are
-    therefore solved exactly.
+    therefore solved exactly; and so is everything where iterations are not enough.
     """
     count = low_rank.shape[1]
     sparse = sp.csr_array(sparse + DAMPING * sp.eye_array(count))
@@ -103,13 +116,20 @@ def _iterative(sparse: sp.csr_array, low_rank: Float[np.ndarray, "g n"]):
     def precondition(residual):
         return residual + coarse @ scipy.linalg.cho_solve(factor, coarse.T @ residual)
 
-    operator = functools.partial(scipy.sparse.linalg.LinearOperator, (count, count))
-    matrix, preconditioner = operator(multiply), operator(precondition)
+    matrix = _operator(count, multiply)
+    how = {"rtol": PRECISION, "maxiter": MOST_ITERATIONS, "M": _operator(count, precondition)}
 
-    how = {"rtol": PRECISION, "maxiter": MOST_ITERATIONS, "M": preconditioner}
+    @functools.cache
+    def exactly():
+        rest = -sp.eye_array(len(low_rank))
+        bordered = sp.block_array([[sparse, low_rank.T], [low_rank, rest]], format="csc")
+        return scipy.sparse.linalg.splu(bordered)
 
     def one(right):
-        return scipy.sparse.linalg.cg(matrix, right, **how)[0]
+        found, unfinished = scipy.sparse.linalg.cg(matrix, right, **how)
+        if unfinished:
+            found = exactly().solve(np.append(right, np.zeros(len(low_rank))))[:count]
+        return found
 
     return functools.partial(np.apply_along_axis, one, 0)
 
@@ -135,9 +155,7 @@ def _step(
     u, vector = system.unknowns, theta.vector()
     normal, right = normal_equations(model, theta, at, np.float32)
     normal = normal + system.priors.normal
-    # A gauge is a mean over views: over thousands of them its normal matrix would not be sparse.
-    strength = gauge_strength(normal, u)
-    gauges = np.sqrt(strength) * system.anchors.rows
+    strength, gauges = system.gauges(normal)
     right = right + system.priors.pull(vector)
     right = right + strength * system.anchors.pull(vector)
     if theta.c.size:
@@ -198,7 +216,7 @@ def solve_model(
     """
     weight = problem.usable if use is None else problem.usable * use[:, None]
     system = make_system(problem, form, splines)
-    model = make_forward(problem, weight, response, system.unknowns)
+    model = Forward.of(problem, weight, response, system.unknowns)
     with one_thread():
         return solve(model, system, tolerance, loss), system
 
@@ -218,15 +236,14 @@ def fit_response(
     The form that varies beside it has no gammas, which bend curves as well. `spread` is the
     standard deviation of log exposures under the base; it is solved if not given.
     """
-    compared = TOLERANCE_TO_COMPARE
-    fit, system = solve_model(problem, form, base, splines=by, tolerance=compared)
+    fit, system = solve_model(problem, form, base, splines=by, tolerance=COMPARED)
     if spread is None:
-        plain, _ = solve_model(problem, form, base, tolerance=compared)
+        plain, _ = solve_model(problem, form, base, tolerance=COMPARED)
         spread = float(np.std(plain.theta.b.mean(1)))
     splines = system.unknowns.splines.values(fit.theta.c)
     mean, *each = (tuple(map(float, values)) for values in (splines.mean(0), *splines))
     response = Response(base.base, mean, by, () if by == "all" else tuple(each))
     stretch = (np.std(fit.theta.b.mean(1)) + 1e-3) / (spread + 1e-3)
-    if problem.known is None and not 1 / LARGEST_STRETCH < stretch < LARGEST_STRETCH:
+    if not problem.told.size and not 1 / LARGEST_STRETCH < stretch < LARGEST_STRETCH:
         return None
     return response if rises(response) else None

@@ -13,7 +13,7 @@ from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.sources.sampling import sample
-from p2gs_jax.scene.convert.readers import read_exif_ev
+from p2gs_jax.scene.convert.readers import exif_evs
 from p2gs_jax.types import View
 
 POINTS, CANDIDATES = 4000, 40_000
@@ -79,7 +79,8 @@ def read_stack(folder: Path) -> Stack:
     blue = np.all([(i[..., 2] > 200) & (i[..., 0] < 60) & (i[..., 1] < 60) for i in images], 0)
     grown = cv2.dilate(blue.astype(np.uint8), np.ones((15, 15), np.uint8)) > 0
     pose, K = np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32)
-    views = (View(p.name, p, "0", pose, K, 1, 1, exif_ev=read_exif_ev(p)) for p in files)
+    both = zip(files, exif_evs(files), strict=True)
+    views = (View(p.name, p, "0", pose, K, 1, 1, exif_ev=ev) for p, ev in both)
     return Stack(tuple(views), images, ~grown)
 
 

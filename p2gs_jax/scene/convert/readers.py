@@ -8,10 +8,11 @@ and WebP come through Pillow, 8 bits whatever the file holds.
 
 from __future__ import annotations
 
+import glob
 import math
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,7 +43,7 @@ CONVERTED_SUFFIXES = frozenset(_KINDS)
 _TIME, _F_NUMBER, _ISO, _FOCAL_LENGTH, _TAKEN = 0x829A, 0x829D, 0x8827, 0x920A, 0x9003
 # PhotographicSensitivity is 16 bits: 65535 there means "see the others".
 _SENSITIVITIES = (_ISO, 0x8833, 0x8832, 0x8831)
-_DEFAULT_ISO = 100.0
+_SHUTTER_SPEED, _APERTURE, _LARGEST_APEX = 0x9201, 0x9202, 32.0
 _MAKE, _MODEL = 0x010F, 0x0110
 # LibRaw's attributes.
 _RAW_SETTINGS = {"shutter_speed": _TIME, "aperture": _F_NUMBER, "iso_speed": _ISO}
@@ -314,28 +315,59 @@ class ExifSettings:
 
 
 def read_exif_settings(path: Path) -> ExifSettings:
-    """Return the settings in the EXIF of an image; where it has none or is broken, all are None."""
+    """Return the settings in the EXIF of an image; where it has none or is broken, all are None.
+
+    Without a time or f-number, APEX values count: log2 of 1 / time, and of the f-number's square.
+    """
     tags = _exif_tags(path)
+    time, aperture = _positive(tags.get(_TIME)), _positive(tags.get(_F_NUMBER))
+    shutter, opening = _finite(tags.get(_SHUTTER_SPEED)), _positive(tags.get(_APERTURE))
+    if time is None and shutter is not None and abs(shutter) < _LARGEST_APEX:
+        time = 2.0**-shutter
+    if aperture is None and opening is not None and opening < _LARGEST_APEX:
+        aperture = 2.0 ** (opening / 2)
     isos = (_positive(tags.get(tag)) for tag in _SENSITIVITIES)
     taken = str(tags.get(_TAKEN, "")).strip("\0 ")
     return ExifSettings(
-        time=_positive(tags.get(_TIME)),
-        aperture=_positive(tags.get(_F_NUMBER)),
+        time=time,
+        aperture=aperture,
         iso=next((value for value in isos if value not in (None, 65535.0)), None),
         taken=taken if re.fullmatch(r"\d{4}:\d\d:\d\d \d\d:\d\d:\d\d", taken) else None,
     )
 
 
-def read_exif_ev(path: Path) -> float | None:
-    """Return log2(time * ISO / N^2) in stops, or None where time or F-number is missing or broken.
+def exif_evs(paths: Sequence[Path], cameras: Sequence[str] = ()) -> list[float | None]:
+    """Return log2(time * ISO / N^2) of photographs, stops; None where EXIF does not tell it.
 
-    A missing ISO counts as 100: only differences between views matter, and cameras that do not
-    record it usually keep it. Exposure bias is ignored; the shutter already contains it.
+    What no photograph states drops out (an ISO is then taken as 100), as does what others of the
+    same camera state and is the same in all: only differences matter. Exposure bias is ignored: the
+    shutter contains it. Smaller copies (`images_2`) mostly lack EXIF: it is that of `images`.
     """
-    shot = read_exif_settings(path)
-    if shot.time is None or shot.aperture is None:
-        return None
-    return math.log2(shot.time * (shot.iso or _DEFAULT_ISO) / shot.aperture**2)
+    shots = [read_exif_settings(path) for path in map(_original, paths)]
+    camera = np.array(list(cameras) or [""] * len(shots))
+    total = np.zeros(len(shots))
+    for name, power, usual in (("time", 1, 1.0), ("iso", 1, 100.0), ("aperture", -2, 1.0)):
+        stated = np.array([getattr(shot, name) or np.nan for shot in shots], float)
+        term, known = power * np.log2(stated), np.isfinite(stated)
+        if not known.any():
+            term[:] = power * np.log2(usual)
+        for own in (camera == one for one in np.unique(camera)):
+            if (own & known).any() and np.ptp(term[own & known]) < 1e-6:
+                term[own] = term[own & known][0]
+        total += term
+    total[[shot.time is None and shot.iso is None for shot in shots]] = np.nan
+    return [float(ev) if np.isfinite(ev) else None for ev in total]
+
+
+def _original(path: Path) -> Path:
+    """Return the photograph that a smaller copy was made of: beside `images_2` lies `images`."""
+    for folder in path.parents:
+        whole = folder.parent / "images"
+        if folder.name.startswith("images_") and whole.is_dir():
+            there = whole / path.relative_to(folder)
+            others = sorted(there.parent.glob(glob.escape(there.stem) + ".*"))
+            return there if there.is_file() else next(iter(others), path)
+    return path
 
 
 def read_exif_camera(path: Path) -> str:
@@ -362,9 +394,14 @@ def _exif_tags(path: Path) -> dict:
         return {}
 
 
-def _positive(value: object) -> float | None:
+def _finite(value: object) -> float | None:
     try:
         number = float(value[0] if isinstance(value, tuple) else value)  # type: ignore[arg-type]
     except (TypeError, ValueError, ZeroDivisionError, IndexError):
         return None
-    return number if math.isfinite(number) and number > 0 else None
+    return number if math.isfinite(number) else None
+
+
+def _positive(value: object) -> float | None:
+    number = _finite(value)
+    return number if number is not None and number > 0 else None

@@ -20,7 +20,7 @@ from p2gs_jax.photometry.calibrate import options_of
 from p2gs_jax.run.scene_file import read_scene, write_scene
 from p2gs_jax.scene import ImageStore, load_scene
 from p2gs_jax.scene.convert.convert import Converted, convert_photographs, with_originals
-from p2gs_jax.scene.convert.readers import read_exif_ev, read_exif_settings
+from p2gs_jax.scene.convert.readers import exif_evs, read_exif_settings
 from p2gs_jax.scene.files import image_size, list_images
 from p2gs_jax.scene.survey import survey
 
@@ -116,7 +116,7 @@ def test_raw_beside_jpeg_is_one_photograph(folder: Path, monkeypatch) -> None:
     assert noted(result, "there twice")
     # Its EXIF reaches the converted file.
     for file in (folder / "a.dng", *result.paths):
-        assert read_exif_ev(file) == pytest.approx(np.log2(1 / 250 * 400 / 2.8**2), abs=1e-3)
+        assert exif_evs([file])[0] == pytest.approx(np.log2(1 / 250 * 400 / 2.8**2), abs=1e-3)
     assert read_exif_settings(result.paths[0]).time == pytest.approx(1 / 250)
     assert image_size(folder / "a.dng") == (96, 64)
     # Without rawpy the JPEG is used, where it is.
@@ -152,7 +152,7 @@ def test_display_values_profile_and_settings_are_kept(folder: Path, kind: str) -
     with Image.open(path) as image:
         assert image.info["icc_profile"] == DISPLAY_P3
     for one in (path, file):
-        assert read_exif_ev(one) == pytest.approx(np.log2(200 / 60 / 2.8**2), abs=1e-3)
+        assert exif_evs([one])[0] == pytest.approx(np.log2(200 / 60 / 2.8**2), abs=1e-3)
     file.write_bytes(file.read_bytes()[: 300 if kind == "avif" else -60])
     with refused(rf"a\.{kind} cannot be decoded"):
         converted(folder)
@@ -198,7 +198,7 @@ def test_exr_grey_alpha_chromaticities_and_no_numbers(folder: Path) -> None:
     assert light_of(a)[4, 4] == pytest.approx(0.3, abs=1e-4)
     assert noted(result, "1 pixels of linear photographs are not numbers")
     np.testing.assert_array_equal(light_of(a)[0, :3], [[0] * 3, [1] * 3, [0] * 3])
-    assert read_exif_ev(a) == pytest.approx(np.log2(0.01 * 100 / 16), abs=1e-3)
+    assert exif_evs([a])[0] == pytest.approx(np.log2(0.01 * 100 / 16), abs=1e-3)
     assert stored(b).shape[2] == 4
     assert light_of(b)[4, 4] == pytest.approx(0.6, abs=1e-3)
     assert stored(b)[4, 4, 3] / 65535 == pytest.approx(0.5, abs=1e-3)
