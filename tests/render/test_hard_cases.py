@@ -3,14 +3,11 @@
 import dataclasses
 import functools
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from benchmarks import hard_cases
 from benchmarks.hard_cases import CASES, VIEW, HardCase, crowd, gap
-from p2gs_jax.render import render_linear
 
 BASE = hard_cases.CONFIG
 IMPLEMENTATIONS = {
@@ -28,15 +25,12 @@ def oracle(name: str):
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 @pytest.mark.parametrize(
     "case",
-    [
-        pytest.param(c, id=c.name, marks=pytest.mark.slow if c.name.startswith("10^5") else ())
-        for c in CASES
-    ],
+    [pytest.param(c, id=c.name, marks=() if c.view is VIEW else pytest.mark.slow) for c in CASES],
 )
 def test_hard_case(case: HardCase, implementation: str):
     cfg = IMPLEMENTATIONS[implementation]
-    if case.view is not VIEW and implementation != "xla, counting":
-        pytest.skip("an image of another size costs a program")
+    if case.name.startswith("10^5") and implementation != "xla, counting":
+        pytest.skip("a minute where kernels are interpreted")
     g = gap(case, cfg, oracle(case.name))
     assert g.finite, case.expect
     assert g.silent == case.unseen, case.expect
@@ -45,14 +39,6 @@ def test_hard_case(case: HardCase, implementation: str):
     assert g.value <= case.value_tolerance + stop, g
     assert g.relative <= 1e-3, g
     assert g.gradient <= case.gradient_tolerance + 4 * stop + g.undecided * cfg.alpha_cutoff, g
-
-
-def test_none_at_all_and_none_alive():
-    empty = jax.tree.map(lambda a: a[:0], crowd(3))
-    for g in (empty, crowd(5)):
-        r = jax.jit(lambda g: render_linear(g, jnp.zeros(g.capacity, bool), VIEW, BASE, 1))(g)
-        assert not np.any(r.linear)
-        assert not bool(r.overflow)
 
 
 def test_relative_error_over_a_high_dynamic_range():

@@ -30,6 +30,7 @@ def largest_gap(a, b):
     return max(float(x) for x in jax.tree.leaves(gaps))
 
 
+@pytest.mark.slow
 def test_views_batch_and_the_ordered_sum_is_the_atomic_one():
     """A batch of cameras by vmap is one launch, and the sum of its views."""
     g, cam = street(n=60, width=24, height=16)
