@@ -296,7 +296,7 @@ class _Views:
         metering = fit_metering(
             names, readings, logs[self._told], exposed_at(BELOW_WHITE, gamma, tone)
         )
-        if metering.rule.meters and self._held_out:
+        if metering.rule.meter is not None and self._held_out:
             metrics["test"]["metered"] = summary_of(self._metered(metering))
         metrics["consistency"] = {name: video.summary() for name, video in self._videos.items()}
         if self._radiance.views:

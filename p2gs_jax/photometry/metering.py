@@ -19,10 +19,8 @@ from p2gs_jax.core.numerics import LN2
 # The meters, and what people call them.
 WORDS: dict[str, str] = {
     "log_average": "log average",
-    "display_average": "average of display values",
     "average": "average",
     "centre_log_average": "centre-weighted log average",
-    "centre_average": "centre-weighted average",
     "highlights": "highlights (99th percentile)",
 }
 METERS = tuple(WORDS)
@@ -44,8 +42,6 @@ FEWEST_VIEWS = 6
 # A rule explains the camera if it leaves at most this share of what a constant leaves, left out.
 EXPLAINS = 0.8
 NEGLIGIBLE_EV = 0.05  # exposures that vary less, stops, are constant whatever predicts them
-# A rule with more free numbers must leave less than this share of what a simpler one leaves.
-WORTH_A_NUMBER = 0.85
 
 
 def meter(linear: Float[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"]) -> dict[str, float]:
@@ -69,38 +65,29 @@ def meter(linear: Float[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"]) -
     top = order[np.searchsorted(below, HIGHLIGHT / 100 * below[-1])]
     return {
         "log_average": float(np.average(logs, weights=weight)),
-        "display_average": 2.2 * float(np.log(np.average(light ** (1 / 2.2), weights=weight))),
         "average": float(np.log(np.average(light, weights=weight))),
         "centre_log_average": float(np.average(logs, weights=central)),
-        "centre_average": float(np.log(np.average(light, weights=central))),
         "highlights": float(logs[top]),
     }
 
 
 @dataclass(frozen=True)
 class Rule:
-    """log e = offset - sum of slope times reading."""
+    """A meter whose reading the camera keeps constant: log e = offset - reading."""
 
-    meters: tuple[str, ...]  # what is read; none: a constant exposure
-    slopes: tuple[float, ...]  # of each meter: 1 keeps its reading constant, 0 ignores it
+    meter: str | None  # what is read; None: the exposure itself is constant
     offset: float  # natural logarithm
-    residual_ev: float = float("nan")  # RMS of the exposures about it, stops
-    # The same where each was predicted by a rule that was fitted without it.
+    # RMS of exposures about it, stops, where each was predicted from the others.
     left_out_ev: float = float("nan")
 
     def log_exposure(self, readings: Readings) -> float:
-        """Return the natural logarithm of the exposure; NaN where a meter read nothing."""
-        taken = zip(self.slopes, self.meters, strict=True)
-        return self.offset - sum(slope * readings[name] for slope, name in taken)
+        """Return the natural logarithm of the exposure; NaN where the meter read nothing."""
+        return self.offset - (0.0 if self.meter is None else readings[self.meter])
 
     @property
     def words(self) -> str:
         """What people call it."""
-        parts = [
-            WORDS.get(name, name) + ("" if slope == 1 else f" (slope {slope:.2f})")
-            for name, slope in zip(self.meters, self.slopes, strict=True)
-        ]
-        return " and ".join(parts) or "constant"
+        return "constant" if self.meter is None else WORDS.get(self.meter, self.meter)
 
 
 @dataclass(frozen=True)
@@ -117,7 +104,7 @@ class Metering:
     @property
     def constant(self) -> Rule:
         """The rule that reads nothing: the geometric mean of the training exposures."""
-        return next(rule for rule in self.candidates if not rule.meters)
+        return next(rule for rule in self.candidates if rule.meter is None)
 
     def exposure_ev(self, readings: Readings, of: ExposureOf = "auto") -> float:
         """Return the exposure of a picture in stops; see `exposure`."""
@@ -158,12 +145,12 @@ class Metering:
     def sentence(self) -> str:
         """Which rule explains the camera's exposures, or that none does."""
         constant = self.constant.left_out_ev
-        rules = [rule for rule in self.candidates if rule.meters]
+        rules = [rule for rule in self.candidates if rule.meter is not None]
         if not rules:
             return f"Metering: {len(self.names)} training view(s) are too few to tell a rule."
         if constant < NEGLIGIBLE_EV:
             return f"Metering: exposures hardly vary ({constant:.2f} EV): constant."
-        if not self.rule.meters:
+        if self.rule.meter is None:
             best = rules[0]
             return (
                 f"Metering: none of {len(rules)} rules explains the exposures (the best, "
@@ -185,61 +172,31 @@ def fit_metering(
 ) -> Metering:
     """Find the metering rule that predicts the exposures of the training views best.
 
-    Every meter competes with slope 1 (the camera kept it constant) and with a free slope, and
-    the log average together with the highlights. Each stretch of views, which are in order, is
-    predicted by rules that were fitted to the others. A constant stays unless a rule leaves
+    Every meter competes: the camera may have kept its reading constant. Each stretch of views,
+    which are in order, is predicted from the others. A constant exposure stays unless a rule leaves
     clearly less. `white` is the exposed radiance that is shown just below white.
     """
     table = np.array([[r[name] for name in METERS] for r in readings]).reshape(-1, len(METERS))
     taken = np.isfinite(table).all(1)
     x, y = table[taken], np.asarray(log_exposures, np.float64)[taken]
-    constant, alone = _fitted((), None, x, y)
     if len(y) < FEWEST_VIEWS:
-        mean = Rule((), (), float(np.mean(log_exposures)), constant.residual_ev)
+        mean = Rule(None, float(np.mean(log_exposures)))
         return Metering(mean, (mean,), white, tuple(names), table)
-    tried = [_fitted((m,), slopes, x, y) for slopes in ((1.0,), None) for m in METERS]
-    tried.append(_fitted(("log_average", "highlights"), None, x, y))
-    tried.sort(key=lambda pair: pair[0].left_out_ev)
-    best, errors = tried[0]
-    simple = next(pair for pair in tried if pair[0].slopes == (1.0,))
-    if WORTH_A_NUMBER * simple[0].left_out_ev < best.left_out_ev:
-        best, errors = simple
-    gain = alone - errors
+    stretches = np.array_split(np.arange(len(y)), min(len(y), FOLDS))
+    rules, errors = [], {}
+    for name, kept in [(None, y), *zip(METERS, (y[:, None] + x).T, strict=True)]:
+        left = [kept[rows] - np.delete(kept, rows).mean() for rows in stretches]
+        errors[name] = np.array([np.mean(one**2) for one in left])
+        rms = float(np.sqrt(np.mean(np.concatenate(left) ** 2))) / LN2
+        rules.append(Rule(name, float(kept.mean()), rms))
+    rules.sort(key=lambda rule: rule.left_out_ev)
+    constant = next(rule for rule in rules if rule.meter is None)
+    best = next(rule for rule in rules if rule.meter is not None)
+    gain = errors[None] - errors[best.meter]
     clear = gain.mean() > 2 * gain.std(ddof=1) / np.sqrt(len(gain))
     varies = constant.left_out_ev >= NEGLIGIBLE_EV
     explains = varies and best.left_out_ev <= EXPLAINS * constant.left_out_ev and clear
-    rule = best if explains else constant
-    candidates = sorted([constant, *(r for r, _ in tried)], key=lambda r: r.left_out_ev)
-    return Metering(rule, tuple(candidates), white, tuple(names), table)
-
-
-def _fitted(
-    meters: tuple[str, ...],
-    slopes: tuple[float, ...] | None,
-    x: Float[np.ndarray, "v k"],
-    y: Float[np.ndarray, " v"],
-) -> tuple[Rule, Float[np.ndarray, " f"]]:
-    """Return a rule fitted to all views, and its mean squared error on every stretch left out."""
-    if not len(y):
-        return Rule(meters, (0.0,) * len(meters), 0.0), np.zeros(0)
-    read = x[:, [METERS.index(m) for m in meters]]
-
-    def solve(rows) -> tuple[np.ndarray, float]:
-        a, b = read[rows] - read[rows].mean(0), y[rows] - y[rows].mean()
-        taken = -np.linalg.lstsq(a, b, rcond=1e-6)[0] if slopes is None else np.asarray(slopes)
-        return taken, float((y[rows] + read[rows] @ taken).mean())
-
-    everything = np.arange(len(y))
-    taken, offset = solve(everything)
-    residual = y - offset + read @ taken
-    left = np.zeros(len(y))
-    errors = []
-    for fold in np.array_split(everything, min(len(y), FOLDS)) if len(y) > 1 else []:
-        s, o = solve(np.setdiff1d(everything, fold))
-        left[fold] = y[fold] - o + read[fold] @ s
-        errors.append(np.mean(left[fold] ** 2))
-    rms = (float(np.sqrt(np.mean(r**2))) / LN2 for r in (residual, left))
-    return Rule(meters, tuple(map(float, taken)), offset, *rms), np.array(errors)
+    return Metering(best if explains else constant, tuple(rules), white, tuple(names), table)
 
 
 def adapted(exposures_ev: Float[np.ndarray, " f"], frames: float) -> Float[np.ndarray, " f"]:

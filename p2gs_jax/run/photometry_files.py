@@ -315,7 +315,7 @@ def read_metering(path: Path) -> Metering:
         values = [[row[name] for name in METERS] for row in readings.values()]
         table = np.array(values, np.float64).reshape(-1, len(METERS)) * LN2
         candidates = tuple(map(_rule, data["candidates"]))
-        if all(rule.meters for rule in candidates):
+        if all(rule.meter is not None for rule in candidates):
             raise ValueError("no candidate is a constant")
         white = float(data["white"])
         return Metering(_rule(data["rule"]), candidates, white, tuple(readings), table)
@@ -331,9 +331,9 @@ def _rule_in_file(rule: Rule) -> dict[str, Any]:
 
 
 def _rule(data: dict) -> Rule:
-    numbers = (data["offset_ev"], data["residual_ev"], data["left_out_ev"])
-    offset, residual, left_out = (float("nan") if v is None else float(v) for v in numbers)
-    return Rule(tuple(data["meters"]), tuple(data["slopes"]), LN2 * offset, residual, left_out)
+    numbers = (data["offset_ev"], data["left_out_ev"])
+    offset, left_out = (float("nan") if v is None else float(v) for v in numbers)
+    return Rule(data["meter"], LN2 * offset, left_out)
 
 
 class _Layout(NamedTuple):

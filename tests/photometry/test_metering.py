@@ -30,7 +30,7 @@ def test_meters_follow_the_light_and_nothing_else():
     assert found["log_average"] == pytest.approx(np.log(PICTURE[..., 0]).mean())
     assert found["average"] == pytest.approx(np.log(PICTURE[..., 0].mean()))
     assert found["highlights"] == pytest.approx(np.log(np.percentile(PICTURE, 99)), abs=0.05)
-    assert found["log_average"] < found["display_average"] < found["average"]
+    assert found["log_average"] < found["average"]
     for name, value in meter(3 * PICTURE, OPAQUE).items():
         assert value == pytest.approx(found[name] + np.log(3)), name
     for name, value in meter(0.5 * PICTURE, 0.5 * OPAQUE).items():
@@ -52,22 +52,17 @@ def test_a_hole_says_nothing_and_takes_the_mean():
 def test_the_rule_of_a_camera_is_found(name):
     noise = 0.05 * np.random.default_rng(1).standard_normal(40)
     metering = fit(0.4 - READ[name] + noise)
-    assert (metering.rule.meters, metering.rule.slopes) == ((name,), (1.0,))
+    assert metering.rule.meter == name
     assert metering.rule.left_out_ev == pytest.approx(0.05 / np.log(2), rel=0.3)
     assert "explains the exposures" in metering.sentence
     assert LN2 * metering.exposure_ev(ROWS[3]) == pytest.approx(0.4 - ROWS[3][name], abs=0.05)
 
 
-def test_a_camera_that_corrects_in_part_has_a_slope():
-    rule = fit(-0.5 * READ["highlights"]).rule
-    assert (rule.meters, rule.slopes) == (("highlights",), (pytest.approx(0.5, abs=1e-6),))
-
-
 def test_drawn_and_constant_exposures_have_no_rule():
     drawn = 0.4 * np.random.default_rng(7).standard_normal(40)
     metering = fit(drawn)
-    assert metering.rule.meters == ()
-    assert "none of 13 rules" in metering.sentence
+    assert metering.rule.meter is None
+    assert "none of 4 rules" in metering.sentence
     assert metering.exposure_ev(ROWS[0]) == pytest.approx(drawn.mean() / LN2)
     assert "hardly vary" in fit(0.01 * drawn).sentence
     assert "too few" in fit(drawn[:3]).sentence

@@ -174,7 +174,7 @@ def test_stacks_must_fit_together(tmp_path):
     with pytest.raises(UserError, match="a stack has one size"):
         read_stack(tmp_path / "s")
     (tmp_path / "s" / "zz.png").write_bytes(b"no image")
-    with pytest.raises(UserError, match="cannot be read"):
+    with pytest.raises(UserError, match="cannot decode"):
         read_stack(tmp_path / "s")
 
 

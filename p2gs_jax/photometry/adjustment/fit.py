@@ -122,14 +122,13 @@ def solution_of(
         active = active | given
     scale, color = (_Gauge(problem.component, active & one) for one in (free, True))
     exposures, shifts, lost = _exposures(fit, known, active, scale, color)
-    errors = exposures["exposure_errors"]
     # Points go the other way, as much as one of their views.
     some_view = np.zeros(o.point_count, int)
     some_view[o.points[seen]] = o.views[seen]
     view_residual, tint = _per_view_ev(o.views, residual, used, o.view_count)
     cameras, corner_errors = _cameras(fit, response, known, o)
     part = o.thinned(UNMODELLED_PER_VIEW, 0)
-    return PhotometricSolution(
+    solution = PhotometricSolution(
         model=form.model,
         response=response,
         **exposures,
@@ -144,15 +143,15 @@ def solution_of(
         moved=fit.moved,
         converged=fit.converged,
         unknown_errors=int(lost.sum()),
-        warnings=(
-            *_warnings(fit, errors, lost, per_view, problem.component[active], tint, o.names),
-            *place_warnings(o.picked(part), residual[part] / LN2, used[part]),
-        ),
+        warnings=(),
         white_balance_level=form.white_balance,
         vignetting=form.vignetting,
         cameras=cameras,
         corner_errors=corner_errors,
     )
+    said = _warnings(fit, solution, lost, active, o.names)
+    said += place_warnings(o.picked(part), residual[part] / LN2, used[part])
+    return replace(solution, warnings=tuple(said))
 
 
 def _exposures(
@@ -262,21 +261,15 @@ def _per_view_ev(
 
 
 def _warnings(
-    fit: Fit,
-    errors: Float[np.ndarray, " v"],
-    lost: Bool[np.ndarray, " v"],
-    per_view: Int[np.ndarray, " v"],
-    component: Int[np.ndarray, " k"],
-    balance: Float[np.ndarray, "v 3"],
-    names: Sequence[str],
+    fit: Fit, s: PhotometricSolution, lost: np.ndarray, active: np.ndarray, names: Sequence[str]
 ) -> list[str]:
     """Say where numbers are not to be trusted, and what observations tell besides or do not tell.
 
-    Views that are `lost` have no errors. `component` is of views that have any observations, or a
-    known exposure. `balance` is the residual of red, green, blue less their mean, stops.
+    Views that are `lost` have no errors; those that are `active` have any observations, or a known
+    exposure.
     """
-    out = []
-    known = errors[np.isfinite(errors)]
+    out, balance = [], s.view_balance_ev
+    known = s.exposure_errors[np.isfinite(s.exposure_errors)]
     typical = float(np.median(known)) if known.size else 0.0
     if not fit.converged and fit.left > NEGLIGIBLE * typical:
         out.append(
@@ -290,13 +283,13 @@ def _warnings(
             f"The standard errors of {lost.sum()} training view(s) cannot be told: what joins them "
             f"to the others is lost in rounding ({_listed(np.flatnonzero(lost), names)})."
         )
-    few = np.flatnonzero(per_view < MIN_OBSERVATIONS)
+    few = np.flatnonzero(s.observations_per_view < MIN_OBSERVATIONS)
     if len(few):
         out.append(
             f"{len(few)} training view(s) have fewer than {MIN_OBSERVATIONS} usable track "
             f"observations; their exposures are uncertain ({_listed(few, names)})."
         )
-    groups = len(set(component.tolist()))
+    groups = len(set(s.component[active].tolist()))
     if groups > 1:
         out.append(
             f"The tracks fall into {groups} groups of views that share no point: exposures can "

@@ -10,10 +10,11 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from p2gs_jax.core.streams import Stream, generator
-from p2gs_jax.errors import UserError
+from p2gs_jax.errors import broken
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.sources.sampling import sample
 from p2gs_jax.scene.convert.readers import exif_evs
+from p2gs_jax.scene.files import undecodable
 from p2gs_jax.types import View
 
 POINTS, CANDIDATES = 4000, 40_000
@@ -56,26 +57,21 @@ def read_stack(folder: Path) -> Stack:
     Raises UserError: fewer than two photographs, unreadable ones, or different sizes.
     """
     if not folder.is_dir():
-        raise UserError(f"{folder} is not a folder.", fix="name the folder of the photographs")
+        raise broken(folder, "is not a folder.", "name the folder of the photographs")
     inner = folder / "images" if (folder / "images").is_dir() else folder
     files = sorted(p for p in inner.iterdir() if p.suffix.lower() in SUFFIXES)
     if len(files) < 2:
-        raise UserError(
-            f"{inner} holds {len(files)} photograph(s); a stack needs two.",
-            fix="name a folder of photographs from one viewpoint at several exposures",
-        )
+        fix = "name a folder of photographs from one viewpoint at several exposures"
+        raise broken(inner, f"holds {len(files)} photograph(s); a stack needs two.", fix)
     images = []
     for path in files:
-        image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-        if image is None:
-            raise UserError(f"{path} cannot be read as an image.", fix="replace or remove it")
-        if images and image.shape != images[0].shape:
-            raise UserError(
-                f"{path} is {image.shape[1]}x{image.shape[0]}, {files[0].name} "
-                f"{images[0].shape[1]}x{images[0].shape[0]}.",
-                fix="a stack has one size",
-            )
+        if (image := cv2.imread(str(path), cv2.IMREAD_COLOR)) is None:
+            raise undecodable(path)
         images.append(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+        size, first = (f"{i.shape[1]}x{i.shape[0]}" for i in (image, images[0]))
+        if size != first:
+            why = f"is {size}, {files[0].name} {first}."
+            raise broken(path, why, "a stack has one size")
     blue = np.all([(i[..., 2] > 200) & (i[..., 0] < 60) & (i[..., 1] < 60) for i in images], 0)
     grown = cv2.dilate(blue.astype(np.uint8), np.ones((15, 15), np.uint8)) > 0
     pose, K = np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32)
