@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import re
 import shlex
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[2]
 OUTSIDE = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")]
@@ -25,25 +25,15 @@ SKIP = re.compile(r"skip \((.+)\)")
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 
 
-@dataclass(frozen=True)
-class Block:
-    """A code block.
-
-    Attributes:
-        page: the file.
-        line: of its first line of code.
-        language: as it is named.
-        code: with replacements made.
-        skip: why it is not tested, or None.
-        run: whether its commands are run.
-    """
+class Block(NamedTuple):
+    """A code block from a line of a page on, with replacements made; why it is skipped, or None."""
 
     page: Path
     line: int
     language: str
     code: str
-    skip: str | None = None
-    run: bool = False
+    skip: str | None
+    run: bool
 
     @property
     def name(self) -> str:
@@ -51,11 +41,7 @@ class Block:
 
 
 def blocks(page: Path) -> list[Block]:
-    """Return the code blocks of a page.
-
-    Raises:
-        ValueError: a fence stays open, or a directive cannot be understood.
-    """
+    """Return the code blocks of a page; a ValueError says what cannot be understood."""
     found, said, inside = [], [], None
     for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), 1):
         if inside is not None:
@@ -76,19 +62,17 @@ def blocks(page: Path) -> list[Block]:
 
 
 def _block(page: Path, line: int, language: str, lines: list[str], said: list[str]) -> Block:
-    code, skip, run = "\n".join(lines) + "\n", None, False
+    code, skip = "\n".join(lines) + "\n", None
     for text in said:
         if match := SKIP.fullmatch(text):
             skip = match[1]
-        elif text == "run":
-            run = True
-        elif match := WRITE.fullmatch(text):
-            if match[1] not in code:
-                raise ValueError(f"{page}:{line}: {match[1]!r} is not in the block")
+        elif (match := WRITE.fullmatch(text)) and match[1] in code:
             code = code.replace(match[1], match[2])
-        else:
-            raise ValueError(f"{page}:{line}: unknown directive {text!r}")
-    return Block(page, line, language, code, skip, run)
+        elif text != "run":
+            raise ValueError(
+                f"{page}:{line}: {text!r} cannot be understood, or is not in the block"
+            )
+    return Block(page, line, language, code, skip, "run" in said)
 
 
 def commands(code: str) -> list[list[str]]:
@@ -99,18 +83,13 @@ def commands(code: str) -> list[list[str]]:
         lexer.whitespace_split = True
         words: list[str] = []
         for word in [*lexer, ";"]:
-            if word[0] in "&|;":
-                if words:
-                    found.append(words)
-                words = []
-            else:
+            if word[0] not in "&|;":
                 words.append(word)
-    return [_without_redirection(words) for words in found]
-
-
-def _without_redirection(words: list[str]) -> list[str]:
-    end = next((i for i, w in enumerate(words) if w[0] in "<>"), len(words))
-    return words[:end]
+                continue
+            end = next((i for i, w in enumerate(words) if w[0] in "<>"), len(words))
+            found += [words[:end]] if words else []
+            words = []
+    return found
 
 
 def prose(page: Path) -> str:
@@ -120,8 +99,7 @@ def prose(page: Path) -> str:
 
 def links(page: Path) -> list[str]:
     """Return what the page links to or shows, but for addresses on the web."""
-    targets = LINK.findall(prose(page))
-    return [t for t in targets if not re.match(r"(https?|mailto):", t)]
+    return [t for t in LINK.findall(prose(page)) if not re.match(r"(https?|mailto):", t)]
 
 
 def anchors(page: Path) -> set[str]:
