@@ -70,11 +70,11 @@ class Opened:
 @pytest.fixture
 def open_page(browser, file):
     """Return a function that opens the page from disk, offline; nothing may go wrong in it."""
-    wrong, asked, contexts = [], [], []
+    wrong, asked, contexts, expected = [], [], [], []
 
-    def opened(link="", size=(800, 600)):
-        viewport = {"width": size[0], "height": size[1]}
-        context = browser.new_context(viewport=viewport, offline=True)
+    def opened(link="", size=(800, 600), ratio=1):
+        options = {"viewport": {"width": size[0], "height": size[1]}, "device_scale_factor": ratio}
+        context = browser.new_context(**options, offline=True)
         contexts.append(context)
         tab = context.new_page()
         tab.set_default_timeout(1e3 * PATIENCE_S)
@@ -83,13 +83,14 @@ def open_page(browser, file):
         tab.on("request", lambda request: asked.append(request.url))
         tab.goto(file.as_uri() + link)
         page = Opened(tab)
+        page.expect = expected.append
         page("1")
         return page
 
     yield opened
     for context in contexts:
         context.close()
-    assert wrong == []
+    assert [said for said in wrong if not any(words in said for words in expected)] == []
     assert [url for url in asked if url.split(":")[0] not in ("file", "blob", "data")] == []
 
 
@@ -165,6 +166,44 @@ def test_split_shows_the_photograph_on_the_left(open_page, fitted):
     shown, left = page.canvas() / 255, slice(0, int(0.9 * embedded.shape[1]))
     assert decibels(shown[:, left], embedded[:, left]) > 40
     assert decibels(embedded, fitted.photograph(index)) > 22
+
+
+def test_a_device_that_was_taken_away_comes_back_with_the_picture(open_page):
+    page = open_page()
+    before = page.canvas()
+    assert before.max() > 100
+    page("(p.loss = p.renderer.gl.getExtension('WEBGL_lose_context')).loseContext()")
+    page.tab.locator("#status", has_text="taken away").wait_for()
+    page("p.loss.restoreContext()")
+    page.tab.locator("#status", has_text="Gaussians").wait_for()
+    np.testing.assert_array_equal(page.canvas(), before)
+
+
+def test_a_device_of_256_bits_a_pixel_draws_the_same(open_page):
+    page = open_page()
+    before = page.canvas()
+    page("p.renderer.projected = p.renderer.projections([[0], [1], [2]])")
+    page("(p.pose = null, p.wake())")
+    np.testing.assert_array_equal(page.canvas(), before)
+
+
+def test_what_cannot_be_drawn_is_said(open_page):
+    page = open_page()
+    page(
+        "(p.renderer.complete = () => false, p.renderer.picture.width = 0, p.pose = null, p.wake())"
+    )
+    page.tab.locator("#status.wrong", has_text="cannot render").wait_for()
+    page.expect("cannot render light")
+
+
+@pytest.mark.parametrize(("ratio", "pixels"), [(1.5, 1.5), (3, 2)])
+def test_nobody_sees_more_than_two_pixels_in_one(open_page, ratio, pixels):
+    page = open_page(ratio=ratio)
+    page.canvas()
+    assert page("[p.renderer.picture.width, p.renderer.picture.height]") == [
+        800 * pixels,
+        600 * pixels,
+    ]
 
 
 def test_clicking_a_camera_goes_there_and_takes_its_exposure(open_page):

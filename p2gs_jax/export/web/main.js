@@ -7,6 +7,8 @@ const CURVE_NAMES = { spline: "fitted", srgb: "sRGB", power: "power 2.2", linear
 const SLOW = 0.06, QUICK = 0.03, SMALLEST = 0.2, REST = 0.25;
 
 const $ = (id) => document.getElementById(id);
+// Pixels of the picture for each of the window's; more than two nobody sees.
+const density = () => Math.min(devicePixelRatio, 2);
 
 class Page {
   constructor(scene, splats) {
@@ -34,6 +36,7 @@ class Page {
     this.choosePhotograph();
     this.show();
     addEventListener("resize", () => this.wake());
+    this.awaitLoss($("picture"));
     addEventListener("hashchange", () => {
       if (location.hash === this.written) return;
       followLink(location.hash, this.state, scene, this.curves);
@@ -49,6 +52,22 @@ class Page {
     });
   }
 
+  // The device may be taken away, as from a phone's page in the background, and come back.
+  awaitLoss(canvas) {
+    canvas.addEventListener("webglcontextlost", (e) => {
+      e.preventDefault();
+      this.lost = true;
+      $("status").textContent = "The graphics device was taken away; the picture returns with it.";
+    });
+    canvas.addEventListener("webglcontextrestored", () => {
+      try { this.renderer.build(this.splats); } catch (error) { complain(error); }
+      this.lost = false;
+      this.pose = this.photographOf = null;
+      this.choosePhotograph();
+      this.wake();
+    });
+  }
+
   measureDepth() {
     const camera = intoWindow(this.state.camera, 800, 600);
     this.depth = this.scene.depth = depthAt(this.splats, camera, 400, 300) || 10;
@@ -58,12 +77,12 @@ class Page {
   get camera() { return this.state.camera; }
 
   windowCamera(share = 1) {
-    const { clientWidth, clientHeight } = $("picture"), pixels = devicePixelRatio * share;
+    const { clientWidth, clientHeight } = $("picture"), pixels = density() * share;
     const size = [clientWidth, clientHeight].map((v) => Math.max(1, Math.round(v * pixels)));
     return { ...intoWindow(this.state.camera, ...size), size };
   }
 
-  focal() { return this.windowCamera(1 / devicePixelRatio).lens[0]; }
+  focal() { return this.windowCamera(1 / density()).lens[0]; }
 
   depthOfPivot() {
     const { R, c } = this.state.camera;
@@ -73,13 +92,13 @@ class Page {
   // What the hands ask for.
   grabbed(x, y) {
     $("hands").focus({ preventScroll: true });
-    const camera = this.windowCamera(1 / devicePixelRatio);
+    const camera = this.windowCamera(1 / density());
     const depth = depthAt(this.splats, camera, x, y);
     if (depth) this.pivot = pointAt(camera, x, y, depth);
   }
 
   clicked(x, y) {
-    const index = this.marks.find(x * devicePixelRatio, y * devicePixelRatio, 16 * devicePixelRatio);
+    const index = this.marks.find(x * density(), y * density(), 16 * density());
     if (index !== null) this.go(index);
   }
 
@@ -289,11 +308,14 @@ class Page {
   wake() {
     if (this.asleep === false) return;
     this.asleep = false;
-    requestAnimationFrame((now) => this.frame(now / 1000));
+    requestAnimationFrame((now) => {
+      try { this.frame(now / 1000); } catch (error) { complain(error); }
+    });
   }
 
   frame(now) {
     this.asleep = true;
+    if (this.lost) return;
     // After a rest nothing is known of the speed.
     const passed = this.lastFrame ? Math.min(now - this.lastFrame, 0.5) : 0;
     const steered = this.hands.steer(passed || 0.016);
@@ -302,7 +324,7 @@ class Page {
       const pace = clamp(Number($("pace").value) || 1, 0.1, 30);
       this.drive((Number($("place").value) + passed * pace) % last);
     }
-    const pose = JSON.stringify([this.state.camera, innerWidth, innerHeight, devicePixelRatio]);
+    const pose = JSON.stringify([this.state.camera, innerWidth, innerHeight, density()]);
     const moved = pose !== this.pose;
     this.pose = pose;
     if (moved) {
@@ -357,7 +379,7 @@ class Page {
     const split = show === "split" && at !== null && this.photographOf === at ? look.split : 0;
     const mode = show === "split" ? 0 : SHOWS.indexOf(show);
     renderer.develop({ ...look, mode, split }, this.frameOf(full.size));
-    if (this.marksShown) this.marks.draw(full, at, devicePixelRatio);
+    if (this.marksShown) this.marks.draw(full, at, density());
     else this.marks.clear();
   }
 

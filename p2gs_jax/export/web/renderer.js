@@ -11,13 +11,19 @@ class Renderer {
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false,
       preserveDrawingBuffer: true, powerPreference: "high-performance" });
     if (!gl) throw new Error("This browser has no WebGL 2.");
+    Object.assign(this, { gl, canvas, scene, precision, count: splats.count, order: null, waiting: null });
+    this.build(splats);
+    this.startSorter(splats.means);
+  }
+
+  // Make all that lies on the graphics device: also again, where a lost device comes back.
+  build(splats) {
+    const { gl, scene } = this;
     const float = gl.getExtension("EXT_color_buffer_float");
     const blends = float && gl.getExtension("EXT_float_blend");
     if (!float && !gl.getExtension("EXT_color_buffer_half_float"))
       throw new Error("This device cannot render to floating-point textures.");
-    this.half = precision === 16 || !blends;
-    canvas.addEventListener("webglcontextlost", () => complain("the graphics device was lost; reload"));
-    Object.assign(this, { gl, canvas, scene, count: splats.count, order: null, waiting: null });
+    this.half = this.precision === 16 || !blends;
     this.extended = this.extendRange();
     this.project = this.program(FULL_SCREEN, PROJECT);
     this.draw = this.program(SPLAT_VERTEX, SPLAT_FRAGMENT);
@@ -29,7 +35,7 @@ class Renderer {
     this.empty = gl.createVertexArray();
     this.picture = this.target(gl.RGBA32F);
     this.measured = this.target(gl.RGBA32F);
-    this.startSorter(splats.means);
+    if (this.order) this.setOrder(this.order);
   }
 
   // More than white, where browser and display offer it.
@@ -91,15 +97,14 @@ class Renderer {
       gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, layer, width, height, 1, gl.RGB, gl.FLOAT, padded);
     });
     // Integers hold the bits of floats: such targets exist on every device.
-    this.projected = gl.createFramebuffer();
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.projected);
-    this.columns = [0, 1, 2].map((k) => {
+    this.columns = [0, 1, 2].map(() => {
       const texture = this.texture(gl.TEXTURE_2D, gl.NEAREST);
       gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32UI, width, height);
-      gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0 + k, gl.TEXTURE_2D, texture, 0);
       return texture;
     });
-    gl.drawBuffers([0, 1, 2].map((k) => gl.COLOR_ATTACHMENT0 + k));
+    // Some devices hold 256 bits a pixel: there each column is projected by itself.
+    this.projected = this.projections([[0, 1, 2]]) || this.projections([[0], [1], [2]]);
+    if (!this.projected) throw new Error("This device cannot render to integers.");
     this.quads = gl.createVertexArray();
     gl.bindVertexArray(this.quads);
     this.indices = gl.createBuffer();
@@ -108,6 +113,27 @@ class Renderer {
     gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
     gl.vertexAttribDivisor(0, 1);
     gl.bindVertexArray(null);
+  }
+
+  // A framebuffer for each group of columns; null where the device cannot have them.
+  projections(groups) {
+    const { gl } = this;
+    const made = groups.map((group) => {
+      const buffer = gl.createFramebuffer();
+      gl.bindFramebuffer(gl.FRAMEBUFFER, buffer);
+      const places = [0, 1, 2].map((k) => (group.includes(k) ? gl.COLOR_ATTACHMENT0 + k : gl.NONE));
+      for (const k of group)
+        gl.framebufferTexture2D(gl.FRAMEBUFFER, places[k], gl.TEXTURE_2D, this.columns[k], 0);
+      gl.drawBuffers(places);
+      return this.complete() ? buffer : null;
+    });
+    return made.every(Boolean) ? made : null;
+  }
+
+  // Whether the framebuffer can be drawn into; a device that was lost knows nothing of it.
+  complete() {
+    const { gl } = this;
+    return gl.isContextLost() || gl.checkFramebufferStatus(gl.FRAMEBUFFER) === gl.FRAMEBUFFER_COMPLETE;
   }
 
   uploadTables(tables) {
@@ -139,6 +165,11 @@ class Renderer {
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.buffer);
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, target.texture, 0);
     Object.assign(target, { width, height });
+    if (this.complete()) return;
+    if (this.half) throw new Error(`This device cannot render light of ${width} × ${height} pixels.`);
+    this.half = true;
+    target.width = 0;
+    this.resize(target, width, height);
   }
 
   startSorter(means) {
@@ -178,7 +209,6 @@ class Renderer {
     const { gl, scene } = this, r = scene.render;
     const [p, d] = [this.project, this.draw];
     gl.disable(gl.BLEND);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.projected);
     gl.viewport(0, 0, ...this.table);
     gl.useProgram(p.program);
     gl.bindVertexArray(this.empty);
@@ -192,7 +222,10 @@ class Renderer {
     gl.uniform2f(p.at.size, width, height);
     for (const name of ["near", "blur", "logCutoff"])
       gl.uniform1f(p.at[name], r[name]);
-    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    for (const buffer of this.projected) {
+      gl.bindFramebuffer(gl.FRAMEBUFFER, buffer);
+      gl.drawArrays(gl.TRIANGLES, 0, 3);
+    }
 
     this.resize(target, width, height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.buffer);

@@ -21,7 +21,7 @@ onmessage = ({ data }) => {
     }
   }
   const order = farthestFirst(new Uint32Array(depths.buffer, 0, seen), rows.subarray(0, seen));
-  postMessage({ order, id: data.id }, [order.buffer]);
+  postMessage({ order }, [order.buffer]);
 };
 
 // Bits of positive floats are in the order of the floats: two passes of 16 bits, each stable.
