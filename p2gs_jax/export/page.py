@@ -21,6 +21,7 @@ from typing import Any
 
 from p2gs_jax.core.atomic import plain, write_text
 from p2gs_jax.core.numerics import evenly_spaced
+from p2gs_jax.core.text import printable
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.page_scene import embedded_photographs, page_scene, rounded, uncorrected
 from p2gs_jax.export.page_splats import PageSplats, TruePicture, fit_into, linear_light, page_error
@@ -97,7 +98,7 @@ def page_text(title: str, known: Mapping[str, Any], data: bytes) -> str:
     )
     parts = {
         "policy": policy,
-        "title": html.escape(title),
+        "title": html.escape(printable(title)),
         "css": _read("page.css"),
         "scene": _json(known),
         "splats": base64.b64encode(data).decode(),

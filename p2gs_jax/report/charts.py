@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullFormatter, StrMethodFormatter
 from scipy.ndimage import median_filter
 
-from p2gs_jax.core.text import names_as_they_are
+from p2gs_jax.core.text import names_as_they_are, printable
 
 # Width of the charts, CSS pixels; one point of matplotlib is one pixel.
 WIDTH = 860
@@ -132,7 +132,9 @@ def _font(match: re.Match[str]) -> str:
 
 def _legend(axes: Axes, labels: Sequence[str]) -> None:
     """Name the lines that have a label, to the right of the axes, in their order."""
-    named = [(line, name) for line, name in zip(axes.containers, labels, strict=True) if name]
+    named = [
+        (line, printable(name)) for line, name in zip(axes.containers, labels, strict=True) if name
+    ]
     if named:
         handles, names = zip(*named, strict=True)
         axes.legend(handles, names, loc="upper left", bbox_to_anchor=(1, 1))
@@ -164,7 +166,7 @@ def panels_chart(
     def draw(rows: list[Axes]) -> None:
         for axes, (title, series) in zip(rows, panels, strict=True):
             _draw(axes, series, float(np.clip(500 / longest, 1.5, 5.5)))
-            axes.set_title(title)
+            axes.set_title(printable(title))
             axes.margins(0.02, 0.08)
             if band is not None:
                 axes.axhline(band, color=MUTED, linewidth=0.8)

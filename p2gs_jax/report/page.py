@@ -9,6 +9,7 @@ from importlib import resources
 from pathlib import Path
 
 from p2gs_jax.core.atomic import write_text
+from p2gs_jax.core.text import printable
 from p2gs_jax.errors import UserError
 
 # The browser loads nothing from elsewhere, whatever the page contains.
@@ -70,7 +71,7 @@ def made_by(command: str) -> str:
 
 def text(value: object) -> str:
     """Return text as HTML."""
-    return html.escape(str(value), quote=True)
+    return html.escape(printable(str(value)), quote=True)
 
 
 def paragraph(sentence: str, kind: str = "") -> str:

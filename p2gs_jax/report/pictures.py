@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -92,7 +91,7 @@ def jpeg(ldr: Float[np.ndarray, "h w 3"], alt: str, longest: int = SMALL) -> str
 
 def picture(url: str, alt: str) -> str:
     """Return an `img` element."""
-    return f'<img src="{url}" alt="{html.escape(alt)}">'
+    return f'<img src="{url}" alt="{text(alt)}">'
 
 
 def signed_difference(

@@ -10,7 +10,7 @@ from rich.text import Text
 
 import p2gs_jax
 from p2gs_jax.core.progress import PlainConsole
-from p2gs_jax.core.text import printable
+from p2gs_jax.core.text import markdown_table, printable
 from p2gs_jax.jobs.job import ProgressFile
 
 
@@ -28,6 +28,14 @@ from p2gs_jax.jobs.job import ProgressFile
 def test_control_characters_are_written_out(text, shown):
     assert printable(text) == shown
     assert printable(shown) == shown
+
+
+def test_cells_of_markdown_are_text():
+    table = markdown_table(["", "a|b"], [["<b>`x`", "![y](http://z)\n| --- |\x1b"]])
+    first, rule, second = table.splitlines()
+    assert first == r"|  | a\|b |"
+    assert rule == "| --- | ---: |"
+    assert second == r"| \<b\>\`x\` | !\[y\](http://z) \| --- \|\\x1b |"
 
 
 def printed(thing) -> str:

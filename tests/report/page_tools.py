@@ -2,6 +2,7 @@
 
 import base64
 import html
+import html.parser
 import json
 import re
 import shutil
@@ -38,6 +39,23 @@ def edit(path: Path, change) -> None:
     value = json.loads(path.read_text())
     change(value)
     path.write_text(json.dumps(value))
+
+
+HOSTILE = '"><img src="http://x/" onerror=alert(1)>|`*[a](javascript:1)</style>&$a${{css}}'
+HOSTILE += "\x1b\u202e\udcff.png"
+
+
+class Markup(html.parser.HTMLParser):
+    """What a page is made of: its elements with their attributes, and where these lead."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.elements, self.targets = set(), []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.elements.add((tag, *sorted(name for name, _ in attrs)))
+        self.targets += [value for name, value in attrs if name in ("src", "href", "xlink:href")]
 
 
 def headings(text: str) -> list[str]:

@@ -1,6 +1,5 @@
 """`p2gs-jax report`: everything on one page that needs nothing else, whatever the run lacks."""
 
-import html
 import itertools
 import re
 import shutil
@@ -8,7 +7,16 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from page_tools import check_in_a_browser, copy_run, edit, headings, pictures, words_of
+from page_tools import (
+    HOSTILE,
+    Markup,
+    check_in_a_browser,
+    copy_run,
+    edit,
+    headings,
+    pictures,
+    words_of,
+)
 
 from p2gs_jax.evaluation.seams import Seam, SeamPicture
 from p2gs_jax.report.measurements import SceneMeasurements, SeamPair
@@ -166,15 +174,26 @@ def test_the_command_reports_broken_files_and_missing_ones(run, tmp_path, run_co
         (broken / "photometry.json").unlink(missing_ok=True)
 
 
-def test_names_are_text_never_markup(run, tmp_path):
+def test_names_are_text_never_markup(run, page, tmp_path):
     odd = copy_run(run, tmp_path / "run")
-    name = '<img src="http://x/">&$a${{css}}.png'
-    edit(odd / "photometry.json", lambda p: p["views"][1].update(image=name, camera=name))
-    edit(odd / "metrics.json", lambda m: m["notes"].append("<b>bold</b>"))
+
+    def views(photometry):
+        for view in photometry["views"][1:3]:
+            view.update(image=HOSTILE + view["image"], camera=HOSTILE)
+        photometry["gauge"] = HOSTILE
+
+    edit(odd / "photometry.json", views)
+    edit(odd / "metrics.json", lambda m: m.update(notes=[HOSTILE], split=HOSTILE))
+    edit(odd / "config.json", lambda c: c.update(scene=f"/gone/{HOSTILE}"))
+    edit(odd / "config.json", lambda c: c["fit"].update(preset=HOSTILE))
     text = write_report(odd, render=False).read_text()
-    assert '<img src="http' not in text
-    assert "<b>" not in text
-    assert html.escape(name, quote=True) in text
+    found, plain = Markup(text), Markup(page)
+    # A second camera brings a second panel, and no element of another kind.
+    assert found.elements <= plain.elements
+    assert all(target.startswith(("data:", "#")) for target in found.targets)
+    assert "<img src=x" not in text
+    assert text.count("onerror=alert(1)") == text.count("onerror=alert(1)&gt;") > 5
+    assert not set("\x1b\u202e") & set(text)
 
 
 def test_truth_and_exif_are_drawn(run):

@@ -261,9 +261,9 @@ def test_where_no_photograph_can_be_shown_the_split_is_the_picture(
     split = replace(common_settings(run), mode="split")
     plain = darkroom.develop(frame, replace(split, mode="display"))
     with monkeypatch.context() as patch:
-        patch.setattr(viewed.store, "get", MagicMock(side_effect=UserError("0.png is torn.")))
+        patch.setattr(viewed.store, "get", MagicMock(side_effect=UserError("<0.png> is torn.")))
         np.testing.assert_array_equal(darkroom.develop(frame, split), plain)
-        assert "0.png is torn." in darkroom.legend(frame, split)
+        assert "&lt;0.png&gt; is torn." in darkroom.legend(frame, split)
     assert np.any(darkroom.develop(frame, split) != plain)
     assert darkroom.legend(frame, split) is None
     away = moved(frame, 2, 0.4)
