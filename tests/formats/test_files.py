@@ -16,7 +16,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.scores import ViewResult
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.run.photometry_files import read_photometry, write_photometry
-from p2gs_jax.run.plots import _lines, _shorten, write_summary
+from p2gs_jax.run.plots import write_summary
 from p2gs_jax.types import Params, Photometry
 
 
@@ -130,21 +130,3 @@ def test_a_summary_is_written_in_silence_with_gaps_in_exif_and_odd_names(tmp_pat
     write_summary(tmp_path / "s.png", shown, params, scene, FitConfig())
     assert cv2.imread(str(tmp_path / "s.png")).shape[1] > 600
     assert not [str(w.message) for w in recwarn]
-
-
-def test_lines_of_the_summary_share_one_level():
-    ev, cameras = np.array([1.0, 3.0, 2.0, 6.0]), ["a", "b", "a", "b"]
-    curves = _lines(ev, cameras, {"true": [None] * 4, "EXIF": [None, *(ev + 5)[1:]]})
-    labels = ["recovered, camera a", "recovered, camera b", "EXIF", ""]
-    assert [label for *_, label in curves] == labels
-    assert curves[0][2]["marker"] != curves[1][2]["marker"]
-    np.testing.assert_allclose(curves[1][1], curves[3][1])
-    np.testing.assert_allclose(curves[0][1][1:], curves[2][1])
-
-
-def test_names_are_cut_to_the_width():
-    assert _shorten("a.jpg", 3.0) == "a.jpg"
-    short = _shorten("x" * 100 + "/b.jpg (test)", 2.0)
-    assert short.startswith("…")
-    assert short.endswith("/b.jpg (test)")
-    assert len(short) < 35
