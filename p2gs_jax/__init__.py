@@ -3,9 +3,14 @@
 The public interface. Everything else may change between releases.
 """
 
+import sys
 from importlib import import_module
-from importlib.metadata import version
 from typing import Any
+
+if sys.argv[:1] == ["-m"]:  # `python -m p2gs_jax...`, which has just looked into the working folder
+    from p2gs_jax.core.processes import leave_out_working_folder
+
+    leave_out_working_folder()
 
 # By module; one is imported when a name of it is used: `--help` needs no JAX.
 _PUBLIC = {
@@ -42,7 +47,7 @@ __all__ = sorted(_MODULES)  # pyright: ignore[reportUnsupportedDunderAll]
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        return version("p2gs-jax")
+        return import_module("importlib.metadata").version("p2gs-jax")
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

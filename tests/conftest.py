@@ -105,6 +105,18 @@ def shared_data():
 
 
 @pytest.fixture
+def hostile(tmp_path, monkeypatch):
+    """Go to a folder on the path with modules of its own; return what they would write."""
+    folder, ran = tmp_path / "hostile", tmp_path / "ran"
+    folder.mkdir()
+    for name in ("cv2", "jax", "numpy", "email", "sitecustomize"):
+        (folder / f"{name}.py").write_text(f"open({str(ran)!r}, 'w')")
+    monkeypatch.chdir(folder)
+    monkeypatch.syspath_prepend(folder)
+    return ran
+
+
+@pytest.fixture
 def run_command(capsys):
     """Return a function from the words of a command line to its exit status and what it printed.
 

@@ -10,6 +10,7 @@ import sys
 
 from p2gs_jax.core import interrupts
 from p2gs_jax.core.memory import ran_out
+from p2gs_jax.core.processes import leave_out_working_folder
 from p2gs_jax.errors import UserError
 
 # Silence the native libraries before they load.
@@ -38,7 +39,9 @@ def main(argv: list[str] | None = None) -> None:
     Codes: 0 done, 1 worse than a baseline or something needed is broken, 2 bad input, 128 + the
     signal's number where one asked for the end (130 Ctrl-C, 143 SIGTERM).
     """
-    argv = sys.argv[1:] if argv is None else argv
+    if argv is None:
+        argv = sys.argv[1:]
+        leave_out_working_folder()
     command = argv[0] if argv else ""
     try:
         with interrupts.raised():

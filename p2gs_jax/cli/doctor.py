@@ -89,7 +89,7 @@ class Doctor:
         found += [Finding("Libraries", good), *(x for x in libraries if not x.ok)]
         features = check_features(broken)
         width = max(len(f.name) for f in features) + 4
-        print("\n".join(_row(f.name, f.text) for f in found))
+        print(printable("\n".join(_row(f.name, f.text) for f in found)))
         print("\n" + "Feature".ljust(width) + "works")
         for feature in features:
             works = "yes" if feature.ok else "no "

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
 # Folders that do not say whose renders they hold.
 COMMON = re.compile(r"renders|rgb|test|ours_\d+|\.")
-# What only a fit can measure.
-KEPT = ("counts", "seconds", "seconds_per_step", "notes", "photometry", "exposures", "of")
+# Views that could not be judged: others may be now.
+UNJUDGED = ("hidden", "exposures_unknown")
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Eval:
             beside = _judged(
                 others, judge, metrics, lambda done, count: reporter.stage("Judging", done, count)
             )
-        metrics |= _kept(folder.metrics)
+        metrics = _kept(folder.metrics) | metrics
         write_json(folder.metrics, metrics)
         print_metrics(metrics, self.run)
         if others:
@@ -127,11 +127,11 @@ def _judged(
 
 
 def _kept(path: Path) -> dict[str, Any]:
-    """Return the metrics that only a fit can measure: counts, times, notes."""
+    """Return what the file has: of the fit, and of references that are not given again."""
     from p2gs_jax.core.text import parse_json
 
     try:
         old = parse_json(path.read_text())
     except (OSError, ValueError):
         return {}
-    return {k: old[k] for k in KEPT if k in old}
+    return {k: v for k, v in old.items() if k not in UNJUDGED}

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from p2gs_jax.cli.shared import parse_duration
+from p2gs_jax.cli.fit import checked
 from p2gs_jax.config import PresetName
 from p2gs_jax.presets import preset
 from p2gs_jax.synth.settings import Layout, Sensor
@@ -30,7 +30,7 @@ class Demo:
     preset: Annotated[PresetName, tyro.conf.arg(metavar="NAME")] = "robust"
     """A preset of `fit`: robust, paper, paper_appendix, 3dgs, 3dgs_published, 3dgs_gain,
     3dgs_affine, 3dgs_bilateral, 3dgs_curve, luminance_gs, ppisp or ppisp_solved."""
-    budget: Annotated[str, tyro.conf.arg(metavar="TIME")] = "125s"
+    budget: Annotated[float, tyro.conf.arg(metavar="TIME")] = 125.0
     """Wall-clock limit of the fit: 90s, 20m or 1h30m."""
     frames: int = 10
     """Frames per camera."""
@@ -48,12 +48,12 @@ class Demo:
         from p2gs_jax.pipeline.demo import run_demo
 
         cfg = preset(self.preset)
-        budget_s = parse_duration(self.budget)
-        train = dataclasses.replace(cfg.train, budget_s=budget_s, seed=self.seed)
+        train = dataclasses.replace(cfg.train, budget_s=self.budget, seed=self.seed)
+        cfg = checked(dataclasses.replace(cfg, train=train))
         with TerminalReporter() as reporter:
             result = run_demo(
                 self.out,
-                dataclasses.replace(cfg, train=train),
+                cfg,
                 frames=self.frames,
                 width=self.width,
                 iso_std=self.iso_std,
@@ -107,15 +107,18 @@ class Synth:
         import time
 
         from p2gs_jax.cli.tables import stdout
+        from p2gs_jax.core.progress import TerminalReporter
         from p2gs_jax.synth.settings import image_height
         from p2gs_jax.synth.write import write_street
 
-        console, begin = stdout(), time.monotonic()
+        begin = time.monotonic()
         options = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         out = options.pop("out")
-        write_street(out, height=image_height(self.width), report=console.print, **options)
+        with TerminalReporter() as reporter:
+            height, report = image_height(self.width), reporter.message
+            write_street(out, height=height, report=report, **options)
         seconds = time.monotonic() - begin
-        console.print(f"{seconds:.0f} s. Fit it: p2gs-jax fit {out} --out RUN")
+        stdout().print(f"{out}, in {seconds:.0f} s. Fit it: p2gs-jax fit {out} --out RUN")
         return 0
 
 

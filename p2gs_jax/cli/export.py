@@ -76,11 +76,9 @@ class Export:
         fitted = load_run(self.run, self.scene)
         if self.without_objects:
             fitted = fitted.without_objects()
-        if fitted.cfg.render.background is not None and {"html", *DISPLAY} & set(self.format):
-            stdout().print(
-                "The radiance behind the splats is in no format of splats: over black there."
-            )
         with TerminalReporter() as reporter:
+            if fitted.cfg.render.background is not None and {"html", *DISPLAY} & set(self.format):
+                reporter.message("Formats of splats have no radiance behind them: black there.")
             written = convert(
                 fitted,
                 tuple(dict.fromkeys(self.format)),

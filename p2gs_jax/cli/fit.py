@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar, Literal
 
 import tyro
 
-from p2gs_jax.cli.shared import SHORT, check
+from p2gs_jax.cli.shared import DURATIONS, SHORT, check
 from p2gs_jax.config import FitConfig, PresetName
 
 Preset = Annotated[PresetName, tyro.conf.arg(metavar="NAME")]
@@ -141,6 +141,13 @@ class Calibrate:
         *("max_width", "known_exposures", "known_deviation_ev", "images", "drive", "cameras"),
         *("frames", "every", "max_frames"),
     )
+    # What is read of the configuration; the rest is no option.
+    FIELDS: ClassVar = (
+        *("data", "loss.black", "loss.saturation", "train.seed", "photometry.known"),
+        *("photometry.known_deviation_ev", "photometry.select", "photometry.model"),
+        *("photometry.curve", "photometry.spline", "photometry.white_balance"),
+        *("photometry.vignetting", "photometry.responses", "photometry.pivot"),
+    )
     scene: Annotated[Path, tyro.conf.Positional]
     """COLMAP model, transforms.json, a folder of photographs, a video (docs/scenes.md), or a
     finished run (correspondences then go through its rendered depth)."""
@@ -187,8 +194,8 @@ class Calibrate:
 
     def checked(self) -> FitConfig:
         """Return the configuration; raise a UserError where a value makes no sense."""
-        scene, is_run = self.scene, self.is_run
-        own_size = self.config.data == FitConfig().data
+        scene, is_run, data, usual = self.scene, self.is_run, self.config.data, FitConfig().data
+        own_size = data == usual
         check(
             not (self.static and self.of),
             "--static and --of exclude each other",
@@ -196,6 +203,12 @@ class Calibrate:
         )
         check(self.steps is None or self.of is not None, "--steps says nothing without --of")
         check(self.steps is None or self.steps >= 1, "--steps must be at least 1")
+        every = (data.test_every, data.split) == (usual.test_every, usual.split)
+        check(
+            self.of is not None or every,
+            "--data.test-every and --data.split say nothing without --of",
+            fix="leave them out: every photograph is calibrated",
+        )
         cfg, leave_out = checked(self.config), "leave out --max-width, --images and --data options"
         check(
             own_size or not self.static,
@@ -223,6 +236,8 @@ def checked(cfg: FitConfig) -> FitConfig:
     check(data.every is None or data.every >= 1, "--every must be at least 1")
     check(data.max_frames >= 2, "--max-frames must be at least 2")
     check(data.test_every >= 0, "--test-every must be 0 or more")
+    timed = train.budget_s is None or 0 < train.budget_s < math.inf
+    check(timed, "--budget leaves no time, or all of it", fix=DURATIONS)
     check(train.steps >= 1, "--steps must be at least 1")
     check(train.batch >= 1, "--train.batch must be at least 1")
     check(not isinstance(most, int) or most >= 1, "--gaussians must be at least 1")

@@ -52,7 +52,9 @@ def registry(brief: bool) -> ConstructorRegistry:
     In `brief` help, nothing of the configuration is shown but the fields that have short names.
     """
     rules = ConstructorRegistry()
-    short: dict[str, str] = {}  # names by field, of the command that is being read
+    # Of the command that is being read: short names by field, and the fields that are options.
+    short: dict[str, str] = {}
+    only: list[str] = []
 
     @rules.struct_rule
     def options(info: StructTypeInfo) -> StructConstructorSpec | None:
@@ -62,14 +64,20 @@ def registry(brief: bool) -> ConstructorRegistry:
         if hasattr(kind, "SHORT_NAMES"):  # a command: tyro reads its configuration next
             short.clear()
             short.update({SHORT[name][0]: name for name in kind.SHORT_NAMES})
+            only[:] = getattr(kind, "FIELDS", ())
             if brief:
                 return StructConstructorSpec(kind, tuple(_brief(kind, default)))
-        if kind is not FitConfig:
+        group = next((f"{n}." for n, hint in _hints(FitConfig).items() if hint is kind), "")
+        if not (group or kind is FitConfig):
             return StructConstructorSpec(kind, tuple(_fields(kind, default, short)))
-        # `preset` is an option of the command.
-        default = default if isinstance(default, FitConfig) else FitConfig()
-        fields = tuple(f for f in _fields(FitConfig, default, short) if f.name != "preset")
-        return StructConstructorSpec(functools.partial(FitConfig, preset=default.preset), fields)
+        # What is no option stays as the preset has it; `preset` is an option of the command.
+        default = default if isinstance(default, kind) else kind()
+        fields = [f for f in _fields(kind, default, short) if f.name != "preset"]
+        if only and group[:-1] not in only:
+            inside = [path.removeprefix(group) for path in only if path.startswith(group)]
+            fields = [f for f in fields if f.name in {path.partition(".")[0] for path in inside}]
+        make = functools.partial(dataclasses.replace, default)
+        return StructConstructorSpec(make, tuple(fields))
 
     rules.primitive_rule(_number_rule)
     return rules
@@ -144,8 +152,8 @@ def _field(
             extras = (*extras, tyro.conf.arg(**shown, name=dashed, prefix_name=False))
         else:
             extras = (*extras, tyro.conf.arg(**shown, aliases=(f"--{dashed}",)))
-    if name == "budget_s":
-        extras = (*extras, DURATION)
+    if name == "budget" or name.endswith("_s"):
+        extras = (*extras, DURATION, tyro.conf.arg(metavar="TIME"))
     return StructFieldSpec(
         name=name,
         type=Annotated[(_plain(hint), *extras)],  # type: ignore

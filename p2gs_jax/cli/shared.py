@@ -39,6 +39,7 @@ SHORT = {
     "lpips_weights": ("evaluation.lpips_weights", "alex|vgg"),
     "seed": ("train.seed", "N"),
 }
+DURATIONS = "write 90s, 5m or 1h30m"
 SCENE = "the scene's folder itself, without an option"
 # Our names for options of 3DGS, gsplat and nerfstudio.
 OTHERS = {
@@ -59,15 +60,21 @@ SYNONYMS = {f"--{theirs}": ours for ours, names in OTHERS.items() for theirs in 
 
 
 def parse_duration(text: str) -> float:
-    """Return the seconds of `90`, `90s`, `5m` or `1h30m`; raise a UserError for anything else."""
-    match = re.fullmatch(r"(?:(\d+)h)?(?:(\d+(?:\.\d+)?)m)?(?:(\d+(?:\.\d+)?)s?)?", text.strip())
-    if match is None or not any(match.groups()):
-        raise UserError(f"--budget {text!r} is not a valid duration.", fix="write 90s, 5m or 1h30m")
-    hours, minutes, seconds = (float(g or 0) for g in match.groups())
-    total = 3600 * hours + 60 * minutes + seconds
-    if total <= 0:
-        raise UserError(f"--budget {text!r} leaves no time.", fix="write 90s, 5m or 1h30m")
-    return total
+    """Return the seconds of `90`, `90s`, `5m`, `1h30m` or `1h30`; UserError: anything else.
+
+    A last number without a unit, below 60, has the unit below that of the number before it.
+    """
+    number = r"([0-9]+(?:\.[0-9]+)?)"
+    match = re.fullmatch(rf"(?:{number}h)?(?:{number}m)?(?:{number}s)?|{number}", text.strip())
+    short = re.fullmatch(r"(?:([0-9]+)h)?(?:([0-9]+)m)?([0-5]?[0-9])", text.strip())
+    if match is not None and match.group():
+        hours, minutes, seconds, bare = (float(n or 0) for n in match.groups())
+    elif short is not None:
+        hours, minutes, bare = (float(n or 0) for n in short.groups())
+        seconds, minutes, bare = (bare, minutes, 0) if short.group(2) else (0, bare, 0)
+    else:
+        raise UserError(f"{text!r} is not a valid duration.", fix=DURATIONS)
+    return 3600 * hours + 60 * minutes + seconds + bare
 
 
 def count_of(number: int, what: str) -> str:

@@ -61,6 +61,9 @@ def names_as_they_are() -> Iterator[None]:
     # Imported here: it takes as long to load as a small scene to read.
     import matplotlib
 
-    with matplotlib.rc_context({"text.parse_math": False}), warnings.catch_warnings():
+    with matplotlib.rc_context(), warnings.catch_warnings():
+        # As nobody has set it: matplotlib reads a `matplotlibrc` of the working folder.
+        matplotlib.rcdefaults()
+        matplotlib.rcParams["text.parse_math"] = False
         warnings.filterwarnings("ignore", message="Glyph", category=UserWarning)
         yield

@@ -8,6 +8,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
+import shlex
+import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor
@@ -15,6 +19,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from p2gs_jax.core.processes import environment
 from p2gs_jax.errors import UserError
 
 LOCAL = "local"
@@ -25,12 +30,15 @@ ANSWER_S = 20
 ASK_S = 1.0
 # Jobs of a cluster that are waited for at a time.
 MOST_JOBS = 1000
-# By their names, so that no engine is imported that is not used: a worker died, or its node.
-_LOST = ("KilledWorker", "UncompletedJobError", "FutureCancelledError", "CommClosedError")
+# By their names, so that no engine is imported that is not used: a worker died, or its node. Not
+# among them is Dask's KilledWorker: several workers died of the job.
+_LOST = ("UncompletedJobError", "FutureCancelledError", "CommClosedError")
 
 
 def is_lost(error: BaseException) -> bool:
     """Return whether a job's worker was lost, rather than the job failed."""
+    if "OUT_OF_MEMORY" in str(error):  # as Slurm calls it
+        return False
     cancelled = CancelledError | asyncio.CancelledError
     return isinstance(error, cancelled) or type(error).__name__ in _LOST
 
@@ -103,20 +111,34 @@ def _dask(name: str) -> Iterator[Executor]:
 
 @contextlib.contextmanager
 def _submitit(kind: str, options: dict[str, int | str], folder: Path) -> Iterator[Executor]:
+    cluster, before = "local" if kind == "submitit-local" else "slurm", dict(os.environ)
+    folder.mkdir(parents=True, exist_ok=True)
+    # A folder of its own: submitit unpickles what lies there under the numbers of its jobs.
+    own = tempfile.mkdtemp(prefix="submitit-", dir=folder)
+    os.environ.update(environment())  # submitit starts `python -m`
+    try:
+        executor = _executor(own, cluster, options)
+        with _Submitit(executor) as jobs:
+            yield jobs
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
+
+
+def _executor(folder: str, cluster: str, options: dict[str, int | str]) -> Any:
     import submitit
 
-    cluster = "local" if kind == "submitit-local" else "slurm"
+    python = f"{shlex.quote(sys.executable)} -P"  # where sbatch exports no environment
     try:
-        executor = submitit.AutoExecutor(folder=folder / "submitit", cluster=cluster)
+        executor = submitit.AutoExecutor(folder, cluster=cluster, slurm_python=python)
         executor.update_parameters(name="p2gs-jax", **options)
     except (RuntimeError, NameError, TypeError, ValueError) as error:
         raise UserError(
-            f"--engine {kind} cannot be used here: {error}.",
+            f"--engine {cluster} cannot be used here: {error}.",
             fix="run this where `srun` is found, and name options as submitit does, for example "
             "slurm:timeout_min=240,slurm_partition=gpu",
         ) from error
-    with _Submitit(executor) as jobs:
-        yield jobs
+    return executor
 
 
 def _options(name: str, text: str) -> dict[str, int | str]:
@@ -145,11 +167,21 @@ class _Submitit(ThreadPoolExecutor):
         self._cluster = cluster
 
     def submit(self, fn, /, *args, **kwargs) -> Future:
-        """Hand a job to the cluster."""
-        return super().submit(_wait_for, self._cluster.submit(fn, *args, **kwargs))
+        """Hand a job to the cluster; to cancel its future takes it out of the queue."""
+        job, future = self._cluster.submit(fn, *args, **kwargs), Future()
+        super().submit(_settle, job, future)
+        return future
 
 
-def _wait_for(job: Any) -> Any:
-    while not job.done():
-        time.sleep(ASK_S)
-    return job.result()
+def _settle(job: Any, future: Future) -> None:
+    try:
+        while not job.done():
+            if future.cancelled():
+                job.cancel(check=False)
+                return
+            time.sleep(ASK_S)
+        result = job.result()
+    except Exception as error:  # its own, or it left no result that can be read
+        future.set_exception(error)
+    else:
+        future.set_result(result)

@@ -73,10 +73,15 @@ def run_jobs(
                 watched[number].look()
             on_look([one.state for one in watched])
     except KeyboardInterrupt:
-        # Wherever the signal came: jobs that were handed over and not yet told are waited for.
+        # Wherever the signal came: jobs that were handed over and not yet told are waited for, but
+        # those that a batch system has not begun.
         stop.touch()
         waited = pending()
-        wait(waited)
+        for future, number in waited.items():
+            watched[number].look()
+            if watched[number].state.status == "waiting":
+                future.cancel()
+        wait([future for future in waited if not future.cancelled()])
         for number in waited.values():
             watched[number].end(None)
             tell(number)

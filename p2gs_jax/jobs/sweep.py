@@ -256,7 +256,11 @@ def _exposures(run: Path, scene: Path) -> dict[str, float]:
     if not truth:
         return {}
     views = parse_json((run / "photometry.json").read_text(encoding="utf-8"))["views"]
-    pairs = [(v["exposure"], truth[v["image"]]) for v in views if v["exposure"] is not None]
+    pairs = [
+        (v["exposure"], truth[v["image"]])
+        for v in views
+        if v["exposure"] is not None and v["image"] in truth
+    ]
     if len(pairs) < 2:
         return {}
     error = exposure_error(*np.array(pairs).T)

@@ -16,6 +16,8 @@ import traceback
 from pathlib import Path
 
 from p2gs_jax.core import interrupts
+from p2gs_jax.core.memory import ran_out
+from p2gs_jax.core.processes import environment
 from p2gs_jax.errors import UserError
 from p2gs_jax.jobs.job import (
     REASON,
@@ -29,6 +31,7 @@ from p2gs_jax.jobs.job import (
 
 # Seconds between looks at the file that asks for the end.
 LOOK_S = 0.2
+LESS = "let fewer run at a time, or lower --gaussians or --max-width"
 # Exit codes of a job that was asked to end and left its checkpoint.
 ASKED = tuple(interrupts.exit_code(interrupts.Interrupted(n)) for n in interrupts.SIGNALS)
 
@@ -50,6 +53,7 @@ def run_in_process(job_path: str) -> tuple[Status, str | None]:
             stdin=subprocess.PIPE,
             stdout=output,
             stderr=subprocess.STDOUT,
+            env=environment(),
             # Ctrl-C reaches the caller of the jobs, who asks each of them once.
             process_group=0,
         )
@@ -60,9 +64,10 @@ def run_in_process(job_path: str) -> tuple[Status, str | None]:
         return "failed", read_reason(folder)
     if stopped:
         return "stopped", None
-    reason = _why(process.returncode, files.output)
-    # Nobody here asked it to end: a batch system takes the node back, or its time is over.
-    if process.returncode < 0 or process.returncode in ASKED:
+    reason, code = _why(process.returncode, files.output), process.returncode
+    # Nobody here asked it to end: a batch system takes the node back, or its time is over. Where
+    # its memory ran out, it would again.
+    if code in ASKED or (code < 0 and code != -signal.SIGKILL):
         return "lost", reason
     write_reason(folder, reason)
     return "failed", reason
@@ -87,10 +92,7 @@ def _wait(process: subprocess.Popen, stop: Path) -> bool:
 
 def _why(code: int, output: Path) -> str:
     if code == -signal.SIGKILL:
-        return (
-            "its process was killed (SIGKILL), often because memory ran out: let fewer run at a "
-            "time, or lower --gaussians or --max-width"
-        )
+        return f"its process was killed (SIGKILL), as where memory runs out: {LESS}"
     by = f"by {signal.Signals(-code).name}" if code < 0 else f"with code {code}"
     lines = output.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     return f"its process ended {by}: {(lines or ['no message'])[-1]}"
@@ -114,8 +116,10 @@ def main(job_path: Path) -> int:
         write_reason(job.folder, str(error))
         return 2
     except Exception as error:
+        reason = f"{type(error).__name__}: {error}"
+        reason += f"; memory ran out: {LESS}" if ran_out(error) else ""
         text = "".join(traceback.format_exception(error))
-        write_reason(job.folder, f"{type(error).__name__}: {error}", traceback=text)
+        write_reason(job.folder, reason, traceback=text)
         return 1
     return 0
 

@@ -109,7 +109,8 @@ def _hook(guard: Guard, inner: Hook | None) -> Hook:
             return connection.respond(http.HTTPStatus.FORBIDDEN, refusal + "\n")
         answer = None if inner is None else inner(connection, request)
         if answer is not None and guard.token is not None:
-            answer.headers["Set-Cookie"] = f"{COOKIE}={guard.token}; HttpOnly; SameSite=Strict"
+            cookie = f"{_cookie(request)}={guard.token}"
+            answer.headers["Set-Cookie"] = f"{cookie}; HttpOnly; SameSite=Strict"
             answer.headers["Referrer-Policy"] = "no-referrer"
         return answer
 
@@ -124,12 +125,18 @@ def _name(host: str) -> str:
         return ""
 
 
+def _cookie(request: Request) -> str:
+    """Return the name of the cookie: a browser sends all cookies of a host to each of its ports."""
+    port = request.headers.get("Host", "").rpartition(":")[2]
+    return f"{COOKIE}_{port}" if port.isdecimal() and port.isascii() else COOKIE
+
+
 def _tokens(request: Request) -> list[str]:
     """Return the tokens that a request carries."""
     found = parse_qs(request.path.partition("?")[2]).get(QUERY, [])
     try:
         for header in request.headers.get_all("Cookie"):
-            cookie = SimpleCookie(header).get(COOKIE)
+            cookie = SimpleCookie(header).get(_cookie(request))
             found = [*found, cookie.value] if cookie is not None else found
     except CookieError:
         pass

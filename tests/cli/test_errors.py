@@ -24,6 +24,7 @@ WRONG = [
     ("fit castle --out run --bugdet 5m", "--budget"),
     ("fit castle --out run --budget soon", "write 90s, 5m or 1h30m"),
     ("fit castle --out run --budget 0s", "leaves no time"),
+    ("fit castle --out run --train.checkpoint-every-s 1h90", "write 90s, 5m or 1h30m"),
     ("fit castle --out run --rendr.tile 8 8", "--render.tile"),
     ("fit castle --out run --steps many", "'many' is not a whole number"),
     ("fit castle --out run --steps 0", "--steps must be"),
@@ -67,6 +68,9 @@ WRONG = [
     ("calibrate castle --out run --static", "several exposures"),
     ("calibrate castle --out run --static --max-width 99", "leave out --max-width"),
     ("calibrate castle --out run --steps 9", "--steps says nothing without --of"),
+    ("calibrate castle --out run --data.test-every 3", "say nothing without --of"),
+    ("calibrate castle --out run --densify.method mcmc", "--densify.method"),
+    ("calibrate castle --out run --photometry.appearance affine", "--photometry.appearance"),
     ("fit castle --out run --iterations 100", "here it is called --steps"),
     ("fit castle --out run --sh_degree=2", "here it is called --render.sh-degree"),
     ("fit --source-path castle --out run", "p2gs-jax fit SCENE"),
@@ -196,8 +200,9 @@ def test_a_resumed_run_may_be_evaluated_otherwise_and_no_more(tmp_path):
 
 
 def test_durations():
-    for text, seconds in (("90", 90), ("90s", 90), ("5m", 300), ("1h30m", 5400), ("1m30s", 90)):
-        assert parse_duration(text) == seconds
-    for text in ("", "m", "-5m", "5 minutes"):
+    right = {"90": 90, "90s": 90, "5m": 300, "1h30m": 5400, "1m30s": 90, "1.5h": 5400, "0.5": 0.5}
+    right |= {"1h30": 5400, "2h15": 8100, "1h05": 3900, "5m30": 330, "1h2m3": 3723, "1h30s": 3630}
+    assert {text: parse_duration(text) for text in right} == right
+    for text in ("", "m", "-5m", "5 minutes", "1h90", "1h30.5", "1.5h30", "30s5", "1:30", "1e3"):
         with pytest.raises(UserError):
             parse_duration(text)

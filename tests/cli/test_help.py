@@ -1,9 +1,11 @@
 """Help that a person can work from: at once, at 80 columns, with examples that are right."""
 
 import os
+import re
 import shlex
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -74,6 +76,16 @@ def test_common_options_come_first_and_the_rest_on_request(capsys, monkeypatch):
     assert paper.count("(default: 30000)") == whole.count("(default: 30000)") + 1
 
 
+def test_calibrate_has_the_options_that_it_reads(capsys, monkeypatch):
+    _, text = shown(capsys, monkeypatch, "calibrate", "--help-all")
+    found = set(re.findall(r"--([a-z]+)\.", text))
+    assert found == {"data", "photometry", "loss", "train"}
+    argv = "calibrate a --out b --preset paper --loss.black 0.1"
+    _, options = parse(argv.split())
+    assert (options.config.loss.black, options.config.loss.dssim_weight) == (0.1, 0.2)
+    assert options.config.train.steps == 30_000
+
+
 def test_a_preset_decides_defaults():
     _, options = parse(["fit", "a", "--out", "b", "--preset=paper", "--render.near", "0.1"])
     assert options.config.preset == "paper"
@@ -131,6 +143,17 @@ def broken(tmp_path):
         return subprocess.run(argv, env=env, capture_output=True, text=True)
 
     return run
+
+
+def test_nothing_is_imported_from_the_working_folder(hostile):
+    """`python -m` would: the scene is often the working folder."""
+    argv, root = [sys.executable, "-m", "p2gs_jax.cli"], str(Path(__file__).parents[2])
+    env = os.environ | {"PYTHONPATH": root}
+    for words in (["scene", "."], ["calibrate", ".", "--out", "new"]):
+        done = subprocess.run([*argv, *words], env=env, capture_output=True, text=True)
+        assert done.returncode == 2, done.stderr
+        assert "no scene in ." in done.stderr
+    assert not hostile.exists()
 
 
 @pytest.mark.parametrize("module", ["jax", "tyro", "cv2"])

@@ -4,13 +4,14 @@ import io
 import re
 from pathlib import Path
 
+import matplotlib
 import pytest
 from rich.table import Table
 from rich.text import Text
 
 import p2gs_jax
 from p2gs_jax.core.progress import PlainConsole
-from p2gs_jax.core.text import markdown_table, printable
+from p2gs_jax.core.text import markdown_table, names_as_they_are, printable
 from p2gs_jax.jobs.job import ProgressFile
 
 
@@ -52,6 +53,15 @@ def test_a_terminal_gets_colours_and_no_control_characters():
         assert "\x1b]0" not in printed(thing)
         assert "\\x1b" in printed(thing)
     assert "\x1b[1m" in printed(Text("bold", style="bold"))
+
+
+def test_pictures_are_drawn_as_nobody_has_set_them():
+    """matplotlib reads a `matplotlibrc` of the working folder, which may be a scene's."""
+    with matplotlib.rc_context({"text.usetex": True, "axes.facecolor": "red"}):
+        with names_as_they_are():
+            drawn = [matplotlib.rcParams[name] for name in ("text.usetex", "text.parse_math")]
+        assert matplotlib.rcParams["text.usetex"]
+    assert drawn == [False, False]
 
 
 @pytest.mark.parametrize("name", ["[bold]x[/bold]", "[/nothing].png", ":smile:"])

@@ -8,20 +8,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from p2gs_jax.core.atomic import plain
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.seeds import camera_centers
 from p2gs_jax.jobs.blocks.cut import (
     DETAIL,
     Cut,
     cut_scene,
-    ground_of,
     seen_points,
     split,
     thinned,
     whole_of,
 )
-from p2gs_jax.jobs.blocks.shared import photometry_of
-from p2gs_jax.types import Photometry, Scene, Tracks, View
+from p2gs_jax.types import Scene, Tracks, View
 
 LENGTH = 100.0
 
@@ -107,16 +106,10 @@ def test_blocks_of_a_road_follow_it(tracks, turned):
 
 def test_a_cut_survives_json():
     cut = cut_scene(make_road(), 3)
-    again = Cut.from_dict(json.loads(json.dumps(_plain(cut.to_dict()))))
+    again = Cut.from_dict(json.loads(json.dumps(plain(cut.to_dict()))))
     assert again.blocks == cut.blocks
     assert again.margin == cut.margin
     np.testing.assert_array_equal(again.ground.axes, cut.ground.axes)
-
-
-def _plain(values):
-    from p2gs_jax.core.atomic import plain
-
-    return plain(values)
 
 
 def test_too_many_blocks_are_refused_with_how_many_there_may_be():
@@ -125,14 +118,6 @@ def test_too_many_blocks_are_refused_with_how_many_there_may_be():
         cut_scene(scene, 5)
     with pytest.raises(UserError, match="whole number"):
         cut_scene(scene, 0)
-
-
-def test_the_ground_is_where_cameras_spread():
-    rng = np.random.default_rng(0)
-    centers = rng.normal(0, 1, (200, 3)) * [10.0, 0.1, 3.0] + 5.0
-    ground = ground_of(centers)
-    assert abs(ground.axes[0][0]) > 0.99
-    assert abs(ground.axes[1][2]) > 0.99
 
 
 @pytest.mark.parametrize("tracks", [False, True])
@@ -174,17 +159,3 @@ def test_points_far_away_are_fewer():
     for k in range(0, len(points), 997):
         assert np.linalg.norm(points[kept] - points[k], axis=1).min() <= max(2 * side[k], 1e-9)
     assert len(thinned(np.zeros((0, 3)), np.zeros(0))) == 0
-
-
-def test_photometry_of_some_views():
-    whole = Photometry(
-        np.arange(5.0), np.arange(5.0) / 10, "log", np.arange(15.0).reshape(5, 3), (0, 1, 0, 1, 0)
-    )
-    some = photometry_of(whole, np.array([3, 1]))
-    assert some.raw_exposures.tolist() == [3, 1]
-    assert some.raw_gammas.tolist() == [0.3, 0.1]
-    assert some.raw_white_balance.tolist() == [[9, 10, 11], [3, 4, 5]]
-    assert some.cameras == (1, 1)
-    bare = photometry_of(Photometry(np.arange(5.0), np.arange(5.0)), np.array([0]))
-    assert bare.raw_white_balance is None
-    assert bare.cameras is None

@@ -76,6 +76,20 @@ def test_a_killed_worker_costs_nothing_but_time(cluster, tmp_path):
     assert (tmp_path / "one" / "tries").read_text() == "xx"
 
 
+def test_jobs_in_the_queue_of_a_scheduler_end_with_those_that_run(cluster, tmp_path):
+    jobs = [Job(name, tmp_path / name, count, {"first": "wait"}) for name in "abc"]
+    ended, folder = [], tmp_path / "jobs"
+
+    def interrupt(states):
+        if sum(state.doing == "Counting" for state in states) == 2:
+            raise KeyboardInterrupt
+
+    told = {"on_end": lambda number, state: ended.append(state.status), "on_look": interrupt}
+    with pytest.raises(KeyboardInterrupt), open_engine(cluster[0], 1, tmp_path) as engine:
+        run_jobs(jobs, engine, folder, **told)
+    assert ended == ["stopped"] * 3
+
+
 def test_a_scheduler_that_is_not_there_is_said(tmp_path, monkeypatch):
     monkeypatch.setattr("p2gs_jax.jobs.engines.ANSWER_S", 1)
     with (

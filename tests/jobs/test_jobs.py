@@ -13,6 +13,7 @@ from job_tasks import count
 from rich.console import Console
 
 from p2gs_jax.errors import UserError
+from p2gs_jax.jobs import engines
 from p2gs_jax.jobs.engines import check_engine, open_engine
 from p2gs_jax.jobs.job import (
     REASON,
@@ -45,8 +46,9 @@ def test_one_that_fails_leaves_its_reason_and_ends_nothing_else(tmp_path):
         stumbled={"first": "stumble", "until": 9},
         left={"first": "leave", "until": 9},
         killed={"first": "kill"},
+        full={"first": "fill"},
         asked={"first": "ask"},
-        doomed={"first": "kill", "until": 9},
+        doomed={"first": "ask", "until": 9},
     )
     ended, looks = [], []
     with open_engine("local", 2, tmp_path) as engine:
@@ -66,18 +68,22 @@ def test_one_that_fails_leaves_its_reason_and_ends_nothing_else(tmp_path):
         "refused": "failed",
         "stumbled": "failed",
         "left": "failed",
-        "killed": "done",
+        "killed": "failed",
+        "full": "failed",
         "asked": "done",
         "doomed": "failed",
     }
     begun = {name: len((tmp_path / name / "tries").read_text()) for name in found}
     assert begun == {name: s.begun for name, s in found.items()}
-    once = dict.fromkeys(("good", "refused", "stumbled", "left"), 1)
-    assert begun == {**once, "killed": 2, "asked": 2, "doomed": 3}
+    once = dict.fromkeys(("good", "refused", "stumbled", "left", "killed", "full"), 1)
+    assert begun == {**once, "asked": 2, "doomed": 3}
     assert "add photographs" in found["refused"].reason
     assert found["stumbled"].reason == "ZeroDivisionError: by zero"
     assert "with code 3: last words" in found["left"].reason
-    assert "memory ran out" in found["doomed"].reason
+    for name in ("killed", "full"):
+        assert "memory r" in found[name].reason
+        assert "--max-width" in found[name].reason
+    assert "lost 3 times" in found["doomed"].reason
     for name, state in found.items():
         kept = tmp_path / name / REASON
         assert kept.exists() == (state.status == "failed")
@@ -86,6 +92,17 @@ def test_one_that_fails_leaves_its_reason_and_ends_nothing_else(tmp_path):
     assert (
         "ZeroDivisionError" in json.loads((tmp_path / "stumbled" / REASON).read_text())["traceback"]
     )
+
+
+@pytest.mark.parametrize("name", ["local", "submitit-local"])
+def test_a_job_imports_nothing_from_the_working_folder(tmp_path, hostile, monkeypatch, name):
+    if name != "local":
+        pytest.importorskip("submitit")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep + os.environ["PYTHONPATH"])
+    with open_engine(name, 1, tmp_path / "jobs") as engine:
+        (state,) = run_jobs(jobs_of(tmp_path, one={}), engine, tmp_path / "jobs")
+    assert (state.status, state.reason) == ("done", None)
+    assert not hostile.exists()
 
 
 def test_what_is_stopped_ends_and_the_same_call_goes_on(tmp_path):
@@ -113,6 +130,53 @@ def test_what_is_stopped_ends_and_the_same_call_goes_on(tmp_path):
     with open_engine("local", 1, tmp_path) as engine:
         states = run_jobs(jobs, engine, tmp_path / "jobs")
     assert [s.status for s in states] == ["done", "done"]
+
+
+class Cluster:
+    """A batch system that never begins anything; or says that memory ran out."""
+
+    def __init__(self, error=None):
+        self.error, self.cancelled, self.begun = error, 0, 0
+
+    def submit(self, *args):
+        self.begun += 1
+        return self
+
+    def done(self):
+        return self.error is not None
+
+    def cancel(self, check):
+        self.cancelled += 1
+
+    def result(self):
+        raise self.error
+
+
+def test_what_a_batch_system_has_not_begun_is_taken_out_of_its_queue(tmp_path):
+    def interrupt(states):
+        raise KeyboardInterrupt
+
+    jobs, cluster, ended = jobs_of(tmp_path, one={}, two={}), Cluster(), {}
+    with pytest.raises(KeyboardInterrupt), engines._Submitit(cluster) as engine:
+        run_jobs(
+            jobs,
+            engine,
+            tmp_path / "jobs",
+            on_end=lambda number, state: ended.update({state.name: state.status}),
+            on_look=interrupt,
+        )
+    assert ended == {"one": "stopped", "two": "stopped"}
+    assert cluster.cancelled == 2
+
+
+@pytest.mark.parametrize(("said", "begun"), [("OUT_OF_MEMORY", 1), ("NODE_FAIL", 3)])
+def test_a_job_whose_memory_ran_out_is_not_begun_again(tmp_path, said, begun):
+    error = type("UncompletedJobError", (Exception,), {})
+    cluster = Cluster(error(f"has not produced any output (state: {said})"))
+    with engines._Submitit(cluster) as engine:
+        (state,) = run_jobs(jobs_of(tmp_path, one={}), engine, tmp_path / "jobs")
+    assert (state.status, cluster.begun) == ("failed", begun)
+    assert not engines.is_lost(type("KilledWorker", (Exception,), {})())
 
 
 def test_a_job_whose_end_was_being_told_as_the_signal_came_is_told(tmp_path):
@@ -215,7 +279,7 @@ def test_a_missing_library_is_named_with_its_extra(monkeypatch):
 
 def test_the_local_executor_of_submitit_runs_jobs(tmp_path):
     pytest.importorskip("submitit")
-    jobs = jobs_of(tmp_path, good={}, killed={"first": "kill"}, refused={"first": "refuse"})
+    jobs = jobs_of(tmp_path, good={}, asked={"first": "ask"}, refused={"first": "refuse"})
     with open_engine("submitit-local:timeout_min=5", 1, tmp_path) as engine:
         states = run_jobs(jobs, engine, tmp_path / "jobs")
         assert [s.status for s in states] == ["done", "done", "failed"]

@@ -17,7 +17,7 @@ from p2gs_jax.core.interrupts import Interrupted
 from p2gs_jax.errors import UserError
 from p2gs_jax.jobs.configs import grid, read_sweep, with_fields
 from p2gs_jax.jobs.job import REASON, JobFiles, read_job
-from p2gs_jax.jobs.sweep import brief, failures, sweep, to_markdown
+from p2gs_jax.jobs.sweep import SweepResult, brief, failures, read_row, sweep, to_markdown
 from p2gs_jax.run.folder import locked
 
 BASE = p2gs_jax.preset("robust")
@@ -65,6 +65,18 @@ def test_fields_are_replaced_by_their_dotted_names():
 def test_wrong_fields_and_values_are_named(field, value, text):
     with pytest.raises(p2gs_jax.UserError, match=text):
         with_fields(BASE, {field: value})
+
+
+def test_photographs_without_truth_do_not_count(tmp_path):
+    scene, run = tmp_path / "scene", tmp_path / "run"
+    for folder in (scene / "truth", run):
+        folder.mkdir(parents=True)
+    lines = ("image,exposure,iso", *(f"{k}.png,{2**k},1" for k in range(3)))
+    (scene / "truth" / "exposures.csv").write_text("\n".join(lines))
+    views = [{"image": f"{k}.png", "exposure": 3.0 * 2**k} for k in range(4)]
+    (run / "photometry.json").write_text(json.dumps({"views": views}))
+    (run / "metrics.json").write_text("{}")
+    assert read_row(run, scene)["ev"] == pytest.approx(0, abs=1e-6)
 
 
 def test_the_printed_table_is_short_and_the_kept_one_says_what_columns_are():
@@ -180,6 +192,27 @@ def test_a_wrong_file_says_what_is_wrong(tmp_path, capsys, text, message):
         main(["sweep", str(path)])
     assert code.value.code == 2
     assert message in capsys.readouterr().err
+
+
+def test_progress_goes_to_stderr_and_names_stay_text(monkeypatch, capsys, tmp_path):
+    def sweep(scene, out, configs, *, report, on_look, **more):
+        report("half \x1b[31mdone")
+        return SweepResult([{"name": "a", "seed": 0, "status": "done"}], out)
+
+    monkeypatch.setattr("p2gs_jax.jobs.sweep.sweep", sweep)
+    monkeypatch.setattr(
+        "p2gs_jax.synth.write.write_street", lambda out, *, report, **_: report("half")
+    )
+    (tmp_path / "s.toml").write_text("scene = 'x'")
+    for argv in (["sweep", str(tmp_path / "s.toml")], ["synth", str(tmp_path / "new")]):
+        with pytest.raises(SystemExit) as code:
+            main(argv)
+        out, err = capsys.readouterr()
+        assert code.value.code == 0
+        assert "half" in err
+        assert "half" not in out
+        assert out
+        assert "\x1b" not in out + err
 
 
 CONFIGS = {name: p2gs_jax.preset("robust") for name in ("a", "b", "c")}

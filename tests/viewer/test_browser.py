@@ -144,19 +144,3 @@ def test_going_to_a_photograph_takes_its_look_and_place_and_cameras_appear(page)
     page.mouse.move(300, 500)
     page.mouse.wheel(0, 400)
     until(page, lambda now: np.abs(now - before).mean() > 0.01)
-
-
-def test_the_picture_follows_keys_and_a_drive_until_it_is_paused(page):
-    before = picture(page)
-    page.mouse.click(300, 500)
-    page.keyboard.down("KeyD")
-    page.wait_for_timeout(400)
-    page.keyboard.up("KeyD")
-    until(page, lambda now: np.abs(now - before).mean() > 0.005)
-    page.get_by_text("Drive", exact=True).click()
-    before = steady(page)
-    page.get_by_role("button", name="Play").click()
-    until(page, lambda now: np.abs(now - before).mean() > 0.005)
-    page.get_by_role("button", name="Pause").click()
-    steady(page)
-    assert page.get_by_role("button", name="Play").count() == 1

@@ -15,7 +15,6 @@ import viser
 from viewer_stubs import CANVAS, SIZES, Client, FakeRenderer, Panel
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.photometry.display import develop
 from p2gs_jax.run.read import load_run
 from p2gs_jax.scene.pixels.store import camera_of
 from p2gs_jax.viewer import live as live_module
@@ -29,7 +28,6 @@ from p2gs_jax.viewer.settings import (
     Settings,
     common_settings,
     display_of,
-    exposures_ev,
     settings_of_view,
 )
 from p2gs_jax.viewer.viewed_run import ViewedRun
@@ -75,6 +73,13 @@ def setup(viewed, client):
     assert viewed.listeners == []
 
 
+@pytest.fixture
+def seen(setup, client):
+    """Start the thread; return how many pictures there were up to the first one at rest."""
+    setup.live.start()
+    return client.wait_sharp()
+
+
 def compiled(viewed):
     for listener in tuple(viewed.listeners):
         listener()
@@ -93,9 +98,7 @@ def shown_at(setup, viewed):
     return -float(setup.live._frame.camera.viewmat[0, 3]) * viewed.space.unit
 
 
-def test_it_sharpens_at_rest(setup, client, viewed):
-    setup.live.start()
-    client.wait_sharp()
+def test_it_sharpens_at_rest(setup, seen, viewed):
     assert [kind for kind, *_ in setup.pictures] == ["jpeg", "png"]
     assert shape(setup.pictures[-1]) == CANVAS
     assert set(setup.renderer.wanted[0]) == set(SIZES)
@@ -104,9 +107,8 @@ def test_it_sharpens_at_rest(setup, client, viewed):
     assert len(setup.pictures) == 2  # nothing changes, nothing is sent
 
 
-def test_a_new_look_renders_nothing(setup, client):
-    setup.live.start()
-    seen, before = client.wait_sharp(), len(setup.renderer.rendered)
+def test_a_new_look_renders_nothing(setup, client, seen):
+    before = len(setup.renderer.rendered)
     for ev in (0.5, 1.0, 2.0):
         setup.panel.now = Settings(gamma=2.2, exposure_ev=ev)
         setup.live.display_changed()
@@ -126,9 +128,7 @@ def test_slow_frames_make_small_pictures_while_moving(setup, client, monkeypatch
     assert shape(setup.pictures[-1]) == CANVAS
 
 
-def test_the_newest_camera_wins(setup, client, viewed):
-    setup.live.start()
-    seen = client.wait_sharp()
+def test_the_newest_camera_wins(setup, client, viewed, seen):
     for step in range(30):
         move(setup, client, 0.02 * step)
     client.wait_sharp(seen)
@@ -209,13 +209,6 @@ def frame(viewed):
 def moved(frame, axis, by):
     viewmat = frame.camera.viewmat.at[axis, 3].add(by)
     return replace(frame, camera=replace(frame.camera, viewmat=viewmat))
-
-
-def test_a_view_looks_as_the_run_says(darkroom, frame, run):
-    for index in (run.scene.train_indices[0], run.scene.test_indices[0]):
-        settings = settings_of_view(run, index, common_settings(run))
-        expected = develop(frame.linear, run.own_display(index))
-        np.testing.assert_allclose(darkroom.develop(frame, settings), expected, atol=1e-5)
 
 
 def test_exposures_count_from_the_mean_whatever_the_gauge(run):

@@ -133,14 +133,6 @@ def test_sizes_rise_to_the_canvas_itself_up_to_a_width():
         assert all(w % 8 == h % 8 == 0 for w, h in sizes[:-1])
 
 
-def test_windows_of_nearly_the_same_shape_share_programs_and_pixels_are_almost_square():
-    shared = {size for width in range(1250, 1350) for size in render_sizes((width, 800))[:-1]}
-    assert len(shared) <= 4
-    for width in range(600, 2000, 50):
-        for w, h in render_sizes((width, 900))[:-1]:
-            assert abs(np.log((width / 900) / (w / h))) < 0.12
-
-
 def ms(size, of, share):
     """Return the time of a frame of one size with which another one takes a share of the target."""
     return share * TARGET_MS * size[0] * size[1] / (of[0] * of[1])

@@ -165,7 +165,8 @@ def test_others_need_the_token(servers):
     for path in ("/", "/?token=", "/?token=wrong", "/?token=secre", "/index.html", "/?t=secret"):
         assert get(server, path) == (403, "")
     assert not connects(server)
-    assert not connects(server, Cookie="p2gs_jax_token=wrong")
+    port = server.get_port()
+    assert not connects(server, Cookie=f"p2gs_jax_token_{port}=wrong")
     status, cookie = get(server, "/?token=secret")
     assert status == 200
     assert "HttpOnly" in cookie
@@ -174,6 +175,9 @@ def test_others_need_the_token(servers):
     assert get(server, "/", Cookie=kept)[0] == 200
     assert connects(server, Cookie=kept)
     assert not connects(server, origin="http://evil.example", Cookie=kept)
+    # A browser keeps cookies by host: those of two viewers lie beside each other.
+    assert kept == f"p2gs_jax_token_{port}=secret"
+    assert connects(server, Cookie=f"p2gs_jax_token_{port + 1}=other; {kept}")
 
 
 def test_other_servers_are_left_alone():

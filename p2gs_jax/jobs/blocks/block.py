@@ -13,7 +13,7 @@ import numpy as np
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.clock import Stopwatch
-from p2gs_jax.core.memory import text_of
+from p2gs_jax.core.processes import peak_bytes
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.core.runtime import tune_process, use_compile_cache
 from p2gs_jax.formats.ply import write_radiance
@@ -34,7 +34,6 @@ from p2gs_jax.scene.visibility import shown_share
 from p2gs_jax.train.data_parallel import mesh_of
 from p2gs_jax.types import Scene
 
-STATUS = Path("/proc/self/status")
 # Gaussians for a coarse point outside a block, which stands for many, to one for a point inside.
 # With 1, cores of a town had 5 % fewer Gaussians than one fit and .18 dB less; with 1.6, on another
 # town, 13 % more and .09 dB less (BUILD_NOTES, "Districts").
@@ -166,13 +165,3 @@ def _fit(
         "steps": result.host.step,
     }
     return counts, {**clock.seconds, **result.seconds, "optimisation": result.host.elapsed_s}
-
-
-def peak_bytes() -> int | None:
-    """Return the most memory that this process has held, or None where the system does not say.
-
-    From /proc: `getrusage` counts what the process was before it became this one.
-    """
-    rows = dict(line.split(":", 1) for line in text_of(STATUS).splitlines() if ":" in line)
-    found = rows.get("VmHWM", "").split()
-    return int(found[0]) * 1024 if found else None

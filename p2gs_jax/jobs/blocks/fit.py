@@ -14,12 +14,13 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import no_empty_folders, write_json
 from p2gs_jax.core.clock import CompileCounter, Stopwatch
 from p2gs_jax.core.numerics import on_device
+from p2gs_jax.core.processes import peak_bytes
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.core.runtime import return_freed_memory
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.references import Reference
 from p2gs_jax.formats.ply import read_ply
-from p2gs_jax.jobs.blocks.block import block_job, peak_bytes
+from p2gs_jax.jobs.blocks.block import block_job
 from p2gs_jax.jobs.blocks.cut import Cut, cut_scene
 from p2gs_jax.jobs.blocks.plan import (
     check_options,
