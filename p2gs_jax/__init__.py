@@ -4,13 +4,14 @@ The public interface. Everything else may change between releases.
 """
 
 import sys
-from importlib import import_module
-from typing import Any
 
 if sys.argv[:1] == ["-m"]:  # `python -m p2gs_jax...`, which has just looked into the working folder
     from p2gs_jax.core.processes import leave_out_working_folder
 
     leave_out_working_folder()
+
+from importlib import import_module
+from typing import Any
 
 # By module; one is imported when a name of it is used: `--help` needs no JAX.
 _PUBLIC = {

@@ -236,8 +236,7 @@ def checked(cfg: FitConfig) -> FitConfig:
     check(data.every is None or data.every >= 1, "--every must be at least 1")
     check(data.max_frames >= 2, "--max-frames must be at least 2")
     check(data.test_every >= 0, "--test-every must be 0 or more")
-    timed = train.budget_s is None or 0 < train.budget_s < math.inf
-    check(timed, "--budget leaves no time, or all of it", fix=DURATIONS)
+    check(train.budget_s is None or train.budget_s > 0, "--budget leaves no time", fix=DURATIONS)
     check(train.steps >= 1, "--steps must be at least 1")
     check(train.batch >= 1, "--train.batch must be at least 1")
     check(not isinstance(most, int) or most >= 1, "--gaussians must be at least 1")

@@ -64,9 +64,9 @@ def parse_duration(text: str) -> float:
 
     A last number without a unit, below 60, has the unit below that of the number before it.
     """
-    number = r"([0-9]+(?:\.[0-9]+)?)"
+    number = r"([0-9]{1,9}(?:\.[0-9]+)?)"
     match = re.fullmatch(rf"(?:{number}h)?(?:{number}m)?(?:{number}s)?|{number}", text.strip())
-    short = re.fullmatch(r"(?:([0-9]+)h)?(?:([0-9]+)m)?([0-5]?[0-9])", text.strip())
+    short = re.fullmatch(r"(?:([0-9]{1,9})h)?(?:([0-9]{1,9})m)?([0-5]?[0-9])", text.strip())
     if match is not None and match.group():
         hours, minutes, seconds, bare = (float(n or 0) for n in match.groups())
     elif short is not None:
