@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import os
 import re
 import resource
 from pathlib import Path
@@ -20,8 +19,6 @@ def memory() -> tuple[int | None, int | None]:
     """Return (total, available) bytes of memory, each None where unknown."""
     found = _numbers(MEMINFO)
     total, available = found.get("MemTotal"), found.get("MemAvailable")
-    if total is None:
-        total, available = _pages("SC_PHYS_PAGES"), _pages("SC_AVPHYS_PAGES")
     limit, used = text_of(CGROUP / "memory.max"), text_of(CGROUP / "memory.current")
     if limit.isdigit() and (total is None or int(limit) < total):
         total = int(limit)
@@ -75,11 +72,3 @@ def _numbers(path: Path) -> dict[str, int]:
     """Return bytes by name of lines such as "MemTotal: 8000000 kB"."""
     rows = (line.split() for line in text_of(path).splitlines())
     return {row[0].rstrip(":"): int(row[1]) * 1024 for row in rows if len(row) == 3}
-
-
-def _pages(name: str) -> int | None:
-    """Return bytes from a count of pages; macOS has the total only."""
-    try:
-        return os.sysconf(name) * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):
-        return None

@@ -17,7 +17,7 @@ def container(monkeypatch, tmp_path):
     return tmp_path
 
 
-def test_memory_of_the_system_and_of_a_container(container, monkeypatch):
+def test_memory_of_the_system_and_of_a_container(container):
     system = (8_000_000 * 1024, 6_000_000 * 1024)
     assert memory.memory() == system
     (container / "memory.max").write_text("1000000000\n")
@@ -29,9 +29,6 @@ def test_memory_of_the_system_and_of_a_container(container, monkeypatch):
     assert memory.memory() == (1_000_000_000, 600_000_000)
     (container / "memory.max").write_text("max\n")
     assert memory.memory() == system
-    (container / "meminfo").unlink()
-    monkeypatch.setattr(memory, "_pages", {"SC_PHYS_PAGES": 5}.get)
-    assert memory.memory() == (5, None)
 
 
 def test_what_is_left_is_the_least_of_machine_and_limit(container, monkeypatch):
@@ -56,7 +53,6 @@ def test_what_is_left_is_the_least_of_machine_and_limit(container, monkeypatch):
 def test_nothing_is_known_without_the_system(container, monkeypatch):
     monkeypatch.setattr(memory, "STATM", container / "statm")
     (container / "meminfo").unlink()
-    monkeypatch.setattr(memory, "_pages", lambda name: None)
     assert (memory.left_to_process(), memory.resident()) == (None, 0)
 
 

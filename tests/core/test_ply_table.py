@@ -212,30 +212,12 @@ def test_no_file_and_a_folder(tmp_path):
     refused(tmp_path, r"is not a valid PLY of points: .*directory")
 
 
-@contextlib.contextmanager
-def below(size):
-    """Let a `with` block take less memory than so many bytes."""
-    tracemalloc.start()
-    try:
-        yield
-        assert tracemalloc.get_traced_memory()[1] < size
-    finally:
-        tracemalloc.stop()
-
-
-@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
-def test_counts_take_no_memory(tmp_path, kind):
-    """400 MB are announced, by a count that is below the bytes of the file."""
-    lines = ["element vertex 100000", *(f"property double p{k}" for k in range(500))]
-    path = written(tmp_path / "a.ply", ply(kind, lines, bytes(100_000)))
-    with below(4e6), pytest.raises(ValueError, match=r"columns|ends before"):
-        read_table(path, "vertex")
-
-
 def test_rows_are_mapped(tmp_path):
     rows = np.zeros(10**6, [("x", "<f8")])
     data = header_of("vertex", rows.dtype, len(rows)) + rows.tobytes()
     path = written(tmp_path / "a.ply", data)
     del data
-    with below(rows.nbytes / 4):
-        assert len(read_table(path, "vertex")) == len(rows)
+    tracemalloc.start()
+    assert len(read_table(path, "vertex")) == len(rows)
+    assert tracemalloc.get_traced_memory()[1] < rows.nbytes / 4
+    tracemalloc.stop()
