@@ -88,10 +88,10 @@ class Capture(eqx.Module):
             camera does anything of its own.
     """
 
-    exposure: Float[Array, ""]
-    gamma: Float[Array, ""]
-    white_balance: Float[Array, " 3"] | None = None
-    camera: Int[Array, ""] | int | None = None
+    exposure: Float[Array, "*m"]
+    gamma: Float[Array, "*m"]
+    white_balance: Float[Array, "*m 3"] | None = None
+    camera: Int[Array, "*m"] | int | None = None
 
 
 class Photometry(eqx.Module):

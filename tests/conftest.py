@@ -201,16 +201,11 @@ def _with_cameras(finished: Path, run: Path) -> None:
 def _fit_small_scene(root: Path) -> None:
     from tiny_scene import make_scene
 
-    from p2gs_jax.cli import main
+    from p2gs_jax import fit, preset, with_fields
 
-    argv = [
-        *("fit", str(make_scene(root / "scene")), "--out", str(root / "run")),
-        *("--steps", "60", "--train.coarse-to-fine", "--test-every", "3"),
-        *("--densify.max-gaussians", "400", "--render.sh-degree", "1", "--init.shell", "off"),
-    ]
-    with pytest.raises(SystemExit) as stop:
-        main(argv)
-    assert stop.value.code == 0
+    fields = {"train.steps": 60, "train.coarse_to_fine": True, "data.test_every": 3}
+    fields |= {"densify.max_gaussians": 400, "render.sh_degree": 1, "init.shell": "off"}
+    fit(make_scene(root / "scene"), root / "run", with_fields(preset("robust"), fields))
 
 
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome")

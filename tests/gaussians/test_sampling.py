@@ -10,6 +10,7 @@ import pytest
 from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 from p2gs_jax.evaluation.alignment import exposure_error
 from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
+from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.observations import Observations, sample_pairs
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.sources.points import MOST_PER_POINT, projected_colors, track_colors
@@ -41,7 +42,7 @@ def test_behind_and_outside_are_invisible():
     assert not unoccluded(xy[1:2], z[1:2], 10, 10).any()
 
 
-CFG, CHOICE = preset("robust"), ("view_exposure", Response())
+CFG, CHOICE = preset("robust"), (Form("view_exposure"), Response())
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from p2gs_jax.config import Level, ResponseKind, VignettingKind
 from p2gs_jax.core.numerics import LN2
@@ -235,7 +235,11 @@ class Forward(NamedTuple):
 
     @classmethod
     def of(
-        cls, problem: Problem, weight: PerChannel, response: Response, unknowns: Unknowns
+        cls,
+        problem: Problem,
+        weight: PerChannel | Bool[np.ndarray, "o 3"],
+        response: Response,
+        unknowns: Unknowns,
     ) -> Forward:
         """Return the observations under a response, with the terms of the model laid out."""
         layout, o = problem.layout, problem.observations

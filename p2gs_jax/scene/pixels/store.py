@@ -31,7 +31,7 @@ OPAQUE = 0.999
 _MAX_PREFETCHED = 4
 
 
-def size_at(view: View, max_width: int | None, shrink: float = 1.0) -> tuple[int, int]:
+def size_at(view: View, max_width: int | None, shrink: float | int = 1.0) -> tuple[int, int]:
     """Return (width, height) in pixels: at most `max_width` across, divided by `shrink` >= 1."""
     width = view.width if max_width is None else min(view.width, max_width)
     scale = width / view.width / max(float(shrink), 1.0)
@@ -39,7 +39,7 @@ def size_at(view: View, max_width: int | None, shrink: float = 1.0) -> tuple[int
 
 
 def camera_at(
-    view: View, max_width: int | None, shrink: float = 1.0
+    view: View, max_width: int | None, shrink: float | int = 1.0
 ) -> tuple[Float32[np.ndarray, "3 3"], int, int]:
     """Return K, width and height at the size of `size_at`; K follows each rounding exactly."""
     width, height = size_at(view, max_width, shrink)
@@ -118,7 +118,7 @@ class ImageStore:
         return self._photographs.cached_bytes
 
     def get(
-        self, index: int, shrink: float = 1.0
+        self, index: int, shrink: float | int = 1.0
     ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
         """Return a photograph, display-encoded in [0, 1] and over the backdrop, and its mask.
 
@@ -133,7 +133,7 @@ class ImageStore:
         return ldr, valid.astype(np.float32)
 
     def stored(
-        self, index: int, shrink: float = 1.0
+        self, index: int, shrink: float | int = 1.0
     ) -> tuple[UInt[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
         """Return what is cached, read-only: integers whose maximum is 1, premultiplied by alpha."""
         entry = self._decoded(index, shrink)
@@ -150,7 +150,7 @@ class ImageStore:
         boxes = painted(self._outlines[index], view, *size_at(view, self._max_width, shrink))
         return entry.pixels, valid & ~boxes
 
-    def alpha(self, index: int, shrink: float = 1.0) -> UInt[np.ndarray, "h w"] | None:
+    def alpha(self, index: int, shrink: float | int = 1.0) -> UInt[np.ndarray, "h w"] | None:
         """Return the opacity that is cached, or None if the scene is shown over no background."""
         if self.backdrop is None:
             return None
@@ -160,7 +160,7 @@ class ImageStore:
         return entry.alpha
 
     def camera(
-        self, index: int, shrink: float = 1.0
+        self, index: int, shrink: float | int = 1.0
     ) -> tuple[Float32[np.ndarray, "4 4"], Float32[np.ndarray, "3 3"], int, int]:
         """Return viewmat, K, width and height of a view at the size that `get` gives it."""
         view = self.views[index]
@@ -175,7 +175,7 @@ class ImageStore:
             self._placements[index] = self.moving.placement(view.viewmat, view.time)
         return self._placements[index]
 
-    def prefetch(self, index: int, shrink: float = 1.0) -> None:
+    def prefetch(self, index: int, shrink: float | int = 1.0) -> None:
         """Start decoding in the background, unless the short queue is full; `get` raises errors."""
         self._photographs.prefetch(self._key(index, shrink))
 
@@ -193,10 +193,10 @@ class ImageStore:
         """Stop the background thread and drop everything that is held; files stay."""
         self._photographs.close()
 
-    def _key(self, index: int, shrink: float) -> Key:
+    def _key(self, index: int, shrink: float | int) -> Key:
         return Key(index, *size_at(self.views[index], self._max_width, shrink))
 
-    def _decoded(self, index: int, shrink: float) -> Decoded:
+    def _decoded(self, index: int, shrink: float | int) -> Decoded:
         return self._photographs.get(self._key(index, shrink))
 
     def _with(self, **changed: Any) -> ImageStore:
@@ -209,7 +209,7 @@ def _moving(objects: Sequence[TrackedObject]) -> tuple[TrackedObject, ...]:
     return tuple(thing for thing in objects if thing.moving)
 
 
-def camera_of(store: ImageStore, index: int, shrink: float = 1.0) -> Camera:
+def camera_of(store: ImageStore, index: int, shrink: float | int = 1.0) -> Camera:
     """Return the camera of view `index`, on the device, at the resolution that `get` gives it."""
     viewmat, K, width, height = store.camera(index, shrink)
     return Camera(on_device(viewmat), on_device(K), width, height, store.placement(index))
