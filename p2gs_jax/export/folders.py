@@ -28,8 +28,8 @@ from p2gs_jax.scene.convert.convert import kept_settings
 from p2gs_jax.types import Scene, View
 
 JPEG_QUALITY = 98
-# What Pillow writes and both programs read; photographs in another format are exported as PNG.
-READABLE = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
+# What both programs read, and Pillow's modes of it; photographs of other kinds become PNG.
+READABLE, MODES = (".jpg", ".jpeg", ".png"), ("L", "RGB", "RGBA")
 # nerfstudio's file of points, and the colour of points without one.
 CLOUD, GREY = "sparse_pc.ply", 128
 RGB = ("red", "green", "blue")
@@ -176,12 +176,12 @@ def _write_photograph(path: Path, view: View, ldr: Float[np.ndarray, "h w 3"]) -
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     as_it_is = view.distortion is None and ldr.shape[1::-1] == (view.width, view.height)
-    if as_it_is and view.image_path.suffix.lower() == path.suffix.lower():
+    settings, readable = b"", False
+    with contextlib.suppress(OSError), Image.open(view.image_path) as original:
+        settings, readable = kept_settings(original.getexif()), original.mode in MODES
+    if as_it_is and readable and view.image_path.suffix.lower() == path.suffix.lower():
         shutil.copyfile(view.image_path, path)
         return
-    settings = b""
-    with contextlib.suppress(OSError), Image.open(view.image_path) as original:
-        settings = kept_settings(original.getexif())
     how: dict[str, Any] = {"exif": b"Exif\0\0" + settings} if settings else {}
     if path.suffix.lower() in (".jpg", ".jpeg"):
         how |= {"quality": JPEG_QUALITY, "subsampling": 0}
