@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 DENSE = 1500  # up to this many unknowns, matrices are kept and factorised as a whole
 CHUNK = 1 << 15  # pairs whose products are formed at once: they stay in the cache
 
-Matrix = np.ndarray | sp.csr_array
+Matrix = np.ndarray | sp.csr_array | sp.csc_array
 
 
 def is_small(size: int) -> bool:
