@@ -179,7 +179,7 @@ def cores() -> int:
     affinity = getattr(os, "sched_getaffinity", None)
     count = len(affinity(0)) if affinity else os.cpu_count() or 1
     quota, _, period = memory.text_of(memory.CGROUP / "cpu.max").partition(" ")
-    if quota.isdigit() and period.strip().isdigit():
+    if quota.isdecimal() and period.strip().isdecimal():
         count = min(count, max(1, int(quota) // int(period)))
     return count
 

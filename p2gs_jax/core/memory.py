@@ -20,12 +20,12 @@ def memory() -> tuple[int | None, int | None]:
     found = _numbers(MEMINFO)
     total, available = found.get("MemTotal"), found.get("MemAvailable")
     limit, used = text_of(CGROUP / "memory.max"), text_of(CGROUP / "memory.current")
-    if limit.isdigit() and (total is None or int(limit) < total):
+    if limit.isdecimal() and (total is None or int(limit) < total):
         total = int(limit)
         # What it holds of files goes when memory is wanted.
         files = re.search(r"^inactive_file (\d+)$", text_of(CGROUP / "memory.stat"), re.MULTILINE)
         cached = int(files[1]) if files else 0
-        left = total - int(used) + cached if used.isdigit() else total
+        left = total - int(used) + cached if used.isdecimal() else total
         available = left if available is None else min(available, left)
     return total, available
 

@@ -77,7 +77,7 @@ def parse_header(head: bytes, size: int) -> Header:
                 continue
             case ["format", kind, "1.0"] if not order and kind in _ORDERS:
                 order = _ORDERS[kind]
-            case ["element", name, count] if order and name not in elements and count.isdigit():
+            case ["element", name, count] if order and name not in elements and count.isdecimal():
                 if int(count) > size:
                     raise PlyError(f"it announces {count[:18]} records and has {size} bytes")
                 columns = {}

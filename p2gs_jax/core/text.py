@@ -18,6 +18,17 @@ def printable(text: str) -> str:
     return _HIDDEN.sub(lambda found: ascii(found.group())[1:-1], text)
 
 
+def first_few(names: Sequence[str]) -> str:
+    """Return the first of some names for a message."""
+    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+
+
+def natural(text: str) -> tuple[list[int | str], str]:
+    """Return what sorts texts by the numbers in them: `a2` before `a10`."""
+    parts = re.split(r"(\d+)", text)
+    return [int(part) if k % 2 else part for k, part in enumerate(parts)], text
+
+
 def parse_json(text: str) -> Any:
     """Return the value of a text of JSON.
 

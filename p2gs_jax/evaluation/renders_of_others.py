@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
+from p2gs_jax.core.text import natural
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.exr import read_exr_with_alpha
 from p2gs_jax.types import Scene
@@ -180,13 +181,8 @@ def orders(scene: Scene) -> list[tuple[int, ...]]:
     order that the files of NeRF-synthetic have.
     """
     rows = sorted(scene.test_indices, key=lambda row: scene.views[row].name)
-    counted = sorted(rows, key=lambda row: _counted(scene.views[row].name))
+    counted = sorted(rows, key=lambda row: natural(scene.views[row].name))
     return list(dict.fromkeys((tuple(rows), tuple(counted))))
-
-
-def _counted(name: str) -> list[tuple[int, str]]:
-    parts = re.findall(r"\d+|\D+", name)
-    return [(int(p), "") if p.isdigit() else (-1, p) for p in parts]
 
 
 def in_order(found: OtherRenders, order: Sequence[int]) -> OtherRenders:

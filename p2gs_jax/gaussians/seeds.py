@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from p2gs_jax.config import FitConfig
@@ -25,6 +25,11 @@ NEIGHBOURS = 3
 # 3DGS: the radius of the camera centres, with ten percent to spare.
 EXTENT_MARGIN = 1.1
 MIN_RADIANCE = 1e-3
+# At most this share of the cameras, each so many times farther off than all others, is misplaced.
+FEW, FARTHER = 0.05, 20.0
+# Seeds and Gaussians lie no farther from the cameras than this, in radii of these or median
+# distances of the points.
+REACH = 1000.0
 # No seed starts wider than this fraction of its distance from the nearest camera.
 MAX_ANGLE = 0.05
 # Values that say nothing of the radiance count only where there are no others.
@@ -39,18 +44,61 @@ def camera_centers(views: Sequence[View]) -> Float[np.ndarray, "v 3"]:
     return np.stack([-v.viewmat[:3, :3].T @ v.viewmat[:3, 3] for v in views])
 
 
+def misplaced(views: Sequence[View], points: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, " v"]:
+    """Return which cameras stand so far from all others, and the points, that they are wrong."""
+    centers = camera_centers(views).astype(np.float64)
+    middle = np.median(centers, axis=0)
+    away = np.linalg.norm(centers - middle, axis=1)
+    order, out = np.argsort(away), np.zeros(len(views), bool)
+    near = float(np.median(np.linalg.norm(points - middle, axis=1))) if len(points) else 0.0
+    for k in range(max(3, len(views) - max(1, int(FEW * len(views)))), len(views)):
+        if away[order[k]] > FARTHER * max(away[order[k - 1]], near) > 0:
+            out[order[k:]] = True
+            break
+    return out
+
+
 def cameras_radius(views: Sequence[View], points: Float[np.ndarray, "p 3"]) -> float:
-    """Return the radius of the cameras (3DGS), scene units.
+    """Return the radius of the cameras (3DGS) but misplaced ones, scene units.
 
     Where all cameras stand in one place, the median distance of the points is used.
     """
-    centers = camera_centers(views)
+    centers = camera_centers(views)[~misplaced(views, points)]
     middle = centers.mean(0)
     radius = float(np.linalg.norm(centers - middle, axis=1).max()) * EXTENT_MARGIN
     if len(points):
         distance = float(np.median(np.linalg.norm(points - middle, axis=1)))
         radius = max(radius, 0.05 * distance)
     return radius if radius > 0 else 1e-3
+
+
+def reach(
+    views: Sequence[View], points: Float[np.ndarray, "p 3"]
+) -> tuple[Float[np.ndarray, " 3"], float]:
+    """Return the middle of the cameras, and how far from it anything may lie, scene units."""
+    middle = camera_centers(views)[~misplaced(views, points)].astype(np.float64).mean(0)
+    far = float(np.median(np.linalg.norm(points - middle, axis=1))) if len(points) else 0.0
+    return middle, REACH * max(cameras_radius(views, points), far)
+
+
+def within_reach(scene: Scene) -> tuple[Scene, list[str]]:
+    """Return a scene whose seed points lie in reach, and a note of those that did not.
+
+    They are moved towards the cameras, which hardly see a difference: wide Gaussians far away would
+    be thrown about by the exploration of MCMC.
+    """
+    if not len(scene.points):
+        return scene, []
+    middle, most = reach(scene.training_views, scene.points)
+    away = np.linalg.norm(scene.points - middle, axis=1)
+    far = away > most
+    if not far.any():
+        return scene, []
+    points = scene.points.copy()
+    points[far] = middle + (points[far] - middle) * (most / away[far])[:, None]
+    note = f"{far.sum()} of {len(points)} seed points lie more than {most:.2g} scene units away, "
+    note += f"{REACH:g} times as far as most: they are moved there."
+    return dataclasses.replace(scene, points=points), [note]
 
 
 def subsample(count: int, limit: int, seed: int, stream: Stream = Stream.SEED_POINTS) -> np.ndarray:

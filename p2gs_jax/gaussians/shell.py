@@ -16,7 +16,12 @@ from jaxtyping import Bool, Float, Float32
 
 from p2gs_jax.config import FitConfig, InitConfig
 from p2gs_jax.core.numerics import fibonacci_sphere
-from p2gs_jax.gaussians.seeds import camera_centers, gaussians_from_points, photographed
+from p2gs_jax.gaussians.seeds import (
+    camera_centers,
+    gaussians_from_points,
+    misplaced,
+    photographed,
+)
 from p2gs_jax.render.warp import project_points
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.visibility import in_frame
@@ -70,7 +75,7 @@ def sphere_behind(
     views: Sequence[View], points: Float[np.ndarray, "p 3"], radius: float, cfg: InitConfig
 ) -> Sphere:
     """Return where the shell of a scene lies: behind its seeds, beyond the cameras' radius."""
-    middle = camera_centers(views).mean(0)
+    middle = camera_centers(views)[~misplaced(views, points)].mean(0)
     radius *= cfg.shell_radius
     if len(points):
         far = float(np.quantile(np.linalg.norm(points - middle, axis=1), 0.98))

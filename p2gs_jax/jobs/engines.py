@@ -48,7 +48,7 @@ def check_engine(name: str) -> None:
     if name == LOCAL:
         return
     if name.startswith("dask://"):
-        if not name.removeprefix("dask://").rpartition(":")[2].isdigit():
+        if not name.removeprefix("dask://").rpartition(":")[2].isdecimal():
             raise UserError(
                 f"--engine {name} names no port.",
                 fix="write where the scheduler listens, as in dask://10.0.0.5:8786",
@@ -150,7 +150,7 @@ def _options(name: str, text: str) -> dict[str, int | str]:
                 f"--engine {name}: {part!r} is not OPTION=VALUE.",
                 fix="write slurm:timeout_min=240,slurm_partition=gpu",
             )
-        found[key] = int(value) if value.isdigit() else value
+        found[key] = int(value) if value.isdecimal() else value
     return found
 
 

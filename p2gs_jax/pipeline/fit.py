@@ -19,6 +19,7 @@ from p2gs_jax.core.atomic import no_empty_folders
 from p2gs_jax.core.clock import CompileCounter, Stopwatch
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
+from p2gs_jax.gaussians.seeds import reach
 from p2gs_jax.photometry.appearance import Formation, exposures_apart
 from p2gs_jax.photometry.calibrate import OnChosen, Selection
 from p2gs_jax.photometry.models import Form
@@ -43,6 +44,9 @@ from p2gs_jax.train.step import StepPrograms
 from p2gs_jax.train.strategies import Strategy
 from p2gs_jax.train.terms import LossTerm
 from p2gs_jax.types import Params, Scene
+
+# Gaussians this many times out of reach are seen by nobody.
+RUNAWAY = 10.0
 
 
 @dataclass(frozen=True)
@@ -109,7 +113,7 @@ def fit(
         with begun(folder, paths, cfg, start.decisions):
             spent_s = time.monotonic() - begin
             result = optimiser.run(start, resume=resume, spent_s=spent_s, finish_s=left_s)
-        params, owner = fitted(result, cfg)
+        params, owner = fitted(result, start.scene, cfg)
         lock.require()
         account = account_of(start, params, result, clock, begin, compiler)
         what = (params, start.scene, start.store, start.cfg, folder, account, reporter)
@@ -212,18 +216,27 @@ class Optimiser:
         )
 
 
-def compact(result: TrainResult) -> tuple[Params, np.ndarray | None]:
-    """Return the parameters with only the live Gaussians, in slot order, and whose they are."""
+def compact(result: TrainResult, scene: Scene | None = None) -> tuple[Params, np.ndarray | None]:
+    """Return the parameters with only the live Gaussians, in slot order, and whose they are.
+
+    Those that exploration threw out of reach of a scene, where nothing sees them, are left out.
+    """
     population, params = result.state.population, result.state.params
-    alive = np.flatnonzero(np.asarray(population.alive))
+    alive = np.asarray(population.alive)
+    owner = None if population.owner is None else np.asarray(population.owner)
+    if scene is not None:
+        middle, most = reach(scene.training_views, scene.points)
+        away = np.linalg.norm(np.asarray(params.gaussians.means) - middle, axis=1)
+        # Of objects means are relative to their boxes.
+        alive = alive & ((away <= RUNAWAY * most) | (False if owner is None else owner >= 0))
     gaussians = jax.tree.map(lambda a: jax.device_put(np.asarray(a)[alive]), params.gaussians)
-    owner = None if population.owner is None else np.asarray(population.owner)[alive]
+    owner = None if owner is None else owner[alive]
     return dataclasses.replace(params, gaussians=gaussians), owner
 
 
-def fitted(result: TrainResult, cfg: FitConfig) -> tuple[Params, np.ndarray | None]:
+def fitted(result: TrainResult, scene: Scene, cfg: FitConfig) -> tuple[Params, np.ndarray | None]:
     """Return the results of a fit under the options as asked, and whose each Gaussian is."""
-    params, owner = compact(result)
+    params, owner = compact(result, scene)
     return centred(exposures_apart(params), cfg), owner
 
 

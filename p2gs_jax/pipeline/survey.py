@@ -15,11 +15,19 @@ from p2gs_jax.config import FitConfig, InitConfig
 from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.core.progress import Reporter, Silent
+from p2gs_jax.core.text import first_few
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.dense import coverage_of, wants_dense
 from p2gs_jax.gaussians.moving import Nodes, clock_of, find_nodes, vibrates
 from p2gs_jax.gaussians.population import Coverage
-from p2gs_jax.gaussians.seeds import camera_centers, cameras_radius, subsample
+from p2gs_jax.gaussians.seeds import (
+    FARTHER,
+    camera_centers,
+    cameras_radius,
+    misplaced,
+    subsample,
+    within_reach,
+)
 from p2gs_jax.gaussians.shell import Shell, Sphere, find_shell
 from p2gs_jax.pipeline.preflight import memory_needed, require_memory
 from p2gs_jax.render.warp import project_points
@@ -109,6 +117,7 @@ def survey(
     Raises:
         UserError: there is not the memory for a fit, nothing to see, or two backgrounds.
     """
+    scene, far_notes = within_reach(scene)
     nodes, vibrating = find_nodes(scene, cfg.dynamics), vibrates(scene, cfg)
     moving = clock_of(scene) if vibrating else None if nodes is None else nodes.moving
     store = ImageStore(scene.views, cfg.data, moving=moving, folder=pixels)
@@ -147,7 +156,7 @@ def survey(
         # Dense seeds cover some of what the points do not.
         shell=None if dense else find_shell(views, scene.points, radius, init, sphere),
         scale_notes=scale_notes(scene, near, cfg, near_depth(depths)),
-        seed_notes=thinned,
+        seed_notes=[*far_notes, *thinned],
     )
 
 
@@ -222,7 +231,15 @@ def scale_notes(scene: Scene, near: float | None, cfg: FitConfig, depth: float |
             f"The near plane is {near:g} scene units instead of {cfg.render.near:g}, which would "
             "cut off what the photographs show."
         )
-    away = float(np.abs(camera_centers(scene.training_views)).max())
+    views, wrong = scene.training_views, misplaced(scene.training_views, scene.points)
+    if wrong.any():
+        names = first_few([view.name for view, apart in zip(views, wrong, strict=True) if apart])
+        out.append(
+            f"{wrong.sum()} of {len(views)} cameras stand {FARTHER:g} times as far away as all "
+            f"others, or farther ({names}): their poses are probably wrong, and do not count for "
+            "the size of the scene. Take these photographs out of it."
+        )
+    away = float(np.abs(camera_centers(views)[~wrong]).max())
     step = away * float(np.finfo(np.float32).eps)
     if depth is not None and step > COARSE * depth:
         out.append(

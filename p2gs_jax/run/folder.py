@@ -166,7 +166,7 @@ def _lock(handle: int, folder: Path) -> bool:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
         pid = os.pread(handle, 32, 0).decode(errors="replace").strip()
-        by = f"process {pid}" if pid.isdigit() else "another process"
+        by = f"process {pid}" if pid.isdecimal() else "another process"
         raise UserError(
             f"{folder} is being written to by {by}.",
             fix="wait until it ends, end it, or name another folder with --out",

@@ -84,7 +84,7 @@ def with_what_lies_beside(scene: Scene, cfg: DataConfig) -> Scene:
 
     Raises UserError: so many views cannot be held out, or a list of those that are is wrong.
     """
-    views, mask_notes = attach_masks(scene.views)
+    views, mask_notes = attach_masks(scene)
     evs = exif_evs([view.image_path for view in views], [view.camera for view in views])
     both = zip(views, evs, strict=True)
     views = tuple(dataclasses.replace(view, exif_ev=ev) for view, ev in both)

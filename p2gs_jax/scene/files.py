@@ -6,13 +6,15 @@ import contextlib
 import hashlib
 import json
 import os
+import re
 import shutil
 import tempfile
 import time
+import unicodedata
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path, PurePath
+from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
 
 import cv2
@@ -22,13 +24,15 @@ from PIL import Image
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.atomic import write_text
-from p2gs_jax.core.text import parse_json
+from p2gs_jax.core.text import first_few, parse_json
 from p2gs_jax.errors import UserError, broken
 from p2gs_jax.scene.convert.readers import CONVERTED_SUFFIXES, size_of
 from p2gs_jax.scene.lens import scale_intrinsics
-from p2gs_jax.scene.masks import first_few
 
 IMAGE_SUFFIXES = CONVERTED_SUFFIXES | {*(".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm")}
+# Folders of masks, and what tells a mask from its photograph: `a_mask`, `a.mask`, `mask_a`, ...
+MASK_FOLDERS = ("masks", "mask")
+_MASK_NAME = re.compile(r"^(dynamic_)?masks?[._-](?=.)|(?<=.)[._-](dynamic_)?masks?$")
 # Ratios of width to height that differ by more than this are different shapes.
 ASPECT_TOLERANCE = 0.01
 # Finite numbers from here on are not finite in float32 arithmetic.
@@ -45,17 +49,48 @@ Report = Callable[[str], None]
 
 
 def list_images(folder: Path, *, recursive: bool = True) -> list[Path]:
-    """Return the images in a folder, which may be absent; hidden ones are left out.
+    """Return the photographs in a folder, which may be absent, sorted by their relative path.
 
-    They are sorted by their relative path.
+    Hidden ones are left out, and so are masks: in a folder of masks, or named after a photograph.
     """
     if not folder.is_dir():
         return []
     files = folder.rglob("*") if recursive else folder.iterdir()
     found = (p for p in files if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
     relative = (p.relative_to(folder) for p in found)
-    visible = (p for p in relative if not any(part.startswith(".") for part in p.parts))
-    return [folder / p for p in sorted(visible, key=lambda p: p.as_posix())]
+    visible = [p for p in relative if not any(part.startswith(".") for part in p.parts)]
+    masked = {*MASK_FOLDERS}
+    outside = [p for p in visible if masked.isdisjoint(map(str.lower, p.parts[:-1]))]
+    named = {p for p in outside if named_as_mask(p.name)}
+    taken = {name_without_mask(p.as_posix()) for p in outside if p not in named}
+    masks = {p for p in named if name_without_mask(p.as_posix()) in taken or _always_mask(p.name)}
+    return [folder / p for p in sorted({*outside} - masks, key=lambda p: p.as_posix())]
+
+
+def named_as_mask(name: str) -> bool:
+    """Return whether the name of a file says that it may be a mask."""
+    return _MASK_NAME.search(_bare(name)) is not None
+
+
+def _always_mask(name: str) -> bool:
+    return name.lower().startswith("dynamic_mask")
+
+
+def name_without_mask(name: str) -> str:
+    """Return what the names of a photograph and of its mask have in common.
+
+    That is the relative path in small letters without suffixes of images and words for masks.
+    """
+    path = PurePosixPath(name)
+    return path.with_name(_bare(_MASK_NAME.sub("", _bare(path.name)))).as_posix().lower()
+
+
+def _bare(name: str) -> str:
+    """Return the name of a file in small letters without its suffixes of images."""
+    name = unicodedata.normalize("NFC", name).lower()
+    while PurePosixPath(name).suffix in IMAGE_SUFFIXES:
+        name = name[: name.rindex(".")]
+    return name
 
 
 def read_json(path: Path, fix: str) -> Any:

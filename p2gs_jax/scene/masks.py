@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,9 @@ from jaxtyping import Float32
 from PIL import Image
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.errors import UserError
+from p2gs_jax.core.text import first_few
+from p2gs_jax.errors import UserError, broken
+from p2gs_jax.scene.files import IMAGE_SUFFIXES, MASK_FOLDERS, name_without_mask, named_as_mask
 from p2gs_jax.types import Scene, View
 
 RANDOM = "random"
@@ -22,32 +25,70 @@ JUDGED = "white"
 _OPAQUE = frozenset({".jpg", ".jpeg", ".ppm"})
 
 
-def attach_masks(views: tuple[View, ...]) -> tuple[tuple[View, ...], list[str]]:
-    """Return views with masks in `masks/` beside the image folder or in it, and a note."""
+def attach_masks(scene: Scene) -> tuple[tuple[View, ...], list[str]]:
+    """Return the views of a scene with the masks that lie beside its photographs, and notes."""
+    found, unused = find_masks(scene.views, scene.root)
     masked = tuple(
-        view if view.mask_path else dataclasses.replace(view, mask_path=mask_of(view))
-        for view in views
+        view if view.mask_path else dataclasses.replace(view, mask_path=mask)
+        for view, mask in zip(scene.views, found, strict=True)
     )
     bare = [view.name for view in masked if view.mask_path is None]
-    if not bare or len(bare) == len(masked):
+    if len(bare) == len(masked):
+        why = "none is of a photograph: name a mask as its photograph"
+        return masked, [f"{folder} holds {count} files, {why}" for folder, count in unused.items()]
+    if not bare:
         return masked, []
     return masked, [f"{len(bare)} of {len(masked)} views have no mask: {first_few(bare)}"]
 
 
-def first_few(names: Sequence[str]) -> str:
-    """Return the first of some names for a message."""
-    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+def find_masks(views: Sequence[View], root: Path) -> tuple[list[Path | None], dict[Path, int]]:
+    """Return the mask of each view, or None, and how many files folders without any hold.
+
+    Masks lie in `masks` or `mask`, beside the folder of the photographs, in it or above it below
+    the scene's root, or beside their photographs. They are called as the photograph, whatever the
+    case and the suffix, perhaps with "mask" before or behind; beside it they must be.
+    """
+    folders: dict[Path, dict[str, Path]] = {}
+    found: list[Path | None] = []
+    for view in views:
+        found.append(None)
+        for folder, name in _places(view, root):
+            if folder not in folders:
+                folders[folder] = _masks_in(folder)
+            if held := folders[folder]:
+                found[-1] = _exact(folder, name) or held.get(name_without_mask(name))
+                if found[-1] is not None:
+                    break
+    return found, {f: len(held) for f, held in folders.items() if held and f.name in MASK_FOLDERS}
 
 
-def mask_of(view: View) -> Path | None:
-    """Return the mask of a photograph where it lies in the folder of the images, or None."""
-    image_folder = image_folder_of(view)
-    for folder in (image_folder.parent / "masks", image_folder / "masks"):
-        path = folder / view.name
-        for p in (path, path.with_suffix(".png"), path.with_name(path.name + ".png")):
-            if p.is_file():
-                return p
-    return None
+def _places(view: View, root: Path) -> Iterator[tuple[Path, str]]:
+    """Yield folders in which the mask of a view may lie, and what it may be called there."""
+    images, path = image_folder_of(view), view.image_path
+    above = images.parents[1:] if root in images.parents else ()
+    for place in (images.parent, images, *(p for p in above if p.is_relative_to(root))):
+        parts = path.relative_to(place).parts
+        for k in range(len(parts) - len(Path(view.name).parts), -1, -1):
+            for folder in MASK_FOLDERS:
+                yield place / folder, "/".join(parts[k:])
+    yield from ((root / folder, view.name) for folder in MASK_FOLDERS)
+    yield path.parent, path.name
+
+
+def _masks_in(folder: Path) -> dict[str, Path]:
+    """Return the masks in a folder by what they share with photographs; others are left out."""
+    apart = folder.name in MASK_FOLDERS
+    files = folder.glob("**/*" if apart else "*")
+    files = (p for p in files if p.suffix.lower() in IMAGE_SUFFIXES and p.name[0] != ".")
+    files = (p for p in files if apart or named_as_mask(p.name))
+    return {name_without_mask(p.relative_to(folder).as_posix()): p for p in sorted(files)[::-1]}
+
+
+def _exact(folder: Path, name: str) -> Path | None:
+    """Return the mask in a folder of masks that is called as its photograph, if there is one."""
+    path = folder / name
+    names = (path, path.with_suffix(".png"), path.with_name(path.name + ".png"))
+    return next((p for p in names if folder.name in MASK_FOLDERS and p.is_file()), None)
 
 
 def image_folder_of(view: View) -> Path:
@@ -84,17 +125,41 @@ def has_alpha(path: Path) -> bool:
         return False
 
 
-def with_alpha(scene: Scene, cfg: DataConfig) -> Scene:
-    """Return a scene whose views know what their alpha channel means.
+def _opacity(paths: Sequence[Path]) -> tuple[int, int]:
+    """Return the least and the most alpha of photographs, 0 to 255, or of the first that has both.
 
-    Raises UserError: the option is not a colour.
+    Where none can be read it is 255, which says nothing.
+    """
+    least, most = 255, 0
+    for path in paths:
+        with contextlib.suppress(Exception), Image.open(path) as image:
+            low, high = image.convert("RGBA").getchannel("A").getextrema()
+            least, most = min(least, low), max(most, high)
+        if least < 255 and most > 0:
+            break
+    return least, max(least, most)
+
+
+def with_alpha(scene: Scene, cfg: DataConfig) -> Scene:
+    """Return a scene whose views know what their alpha channel means; opaque ones mean nothing.
+
+    Raises UserError: the option is not a colour, or all photographs are transparent everywhere.
     """
     background_color(cfg)
     found = [has_alpha(view.image_path) for view in scene.views]
-    if not any(found):
+    channels = [view.image_path for view, there in zip(scene.views, found, strict=True) if there]
+    least, most = _opacity(channels)
+    if most == 0 and all(found) and cfg.alpha != "ignore":
+        why = "is transparent everywhere, as are all photographs of the scene"
+        fix = "export them again without an alpha channel, or add --data.alpha ignore"
+        raise broken(channels[0], why, fix)
+    # Some programs write an alpha channel that is opaque everywhere.
+    if least == 255:
         if cfg.background == DataConfig.background:
             return scene
-        note = f"--background {cfg.background} shows nowhere: no photograph has an alpha channel."
+        note = (
+            f"--background {cfg.background} shows nowhere: no photograph is transparent anywhere."
+        )
         return dataclasses.replace(scene, notes=(*scene.notes, note))
     views = tuple(
         dataclasses.replace(view, alpha=cfg.alpha) if there else view

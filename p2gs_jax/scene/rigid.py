@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 from scipy.spatial.transform import Rotation
 
+from p2gs_jax.core.text import natural
 from p2gs_jax.errors import broken
 from p2gs_jax.types import View
 
@@ -212,9 +213,12 @@ def left_of_way(views: Sequence[View]) -> Float[np.ndarray, "v 3"]:
     return out
 
 
-def time_order(view: View) -> tuple[int, str]:
-    """Return what sorts the views of a camera by time: frames where there are any, else names."""
-    return (-1 if view.frame is None else view.frame, view.name)
+def time_order(view: View) -> tuple[int, tuple]:
+    """Return what sorts the views of a camera by time: frames where there are any, else names.
+
+    Names count by the numbers in them: photograph 2 is before photograph 10.
+    """
+    return (-1 if view.frame is None else view.frame, natural(view.name))
 
 
 def level_ahead(views: Sequence[View], up: Vector3) -> Vector3:

@@ -17,6 +17,7 @@ from jaxtyping import Float32, UInt8
 from p2gs_jax.core.ply import read_table, refusing
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.errors import broken
+from p2gs_jax.render.harmonics import C0
 from p2gs_jax.render.warp import project_points
 from p2gs_jax.scene.rigid import camera_centers
 from p2gs_jax.scene.visibility import in_frame
@@ -32,32 +33,49 @@ APART = (0.5, 10.0)
 # More views than this add nothing.
 MOST_VIEWS = 64
 _ROUNDS = 20
+_COLORS = (
+    ("red", "green", "blue"),
+    ("diffuse_red", "diffuse_green", "diffuse_blue"),
+    ("r", "g", "b"),
+    ("f_dc_0", "f_dc_1", "f_dc_2"),
+)
+# Floats of at most this much have 1 for white.
+_MOST_OF_ONE = 2.0
 _FIX = "write it again with the tool that made it"
 
 
 def read_points(path: Path) -> tuple[Float32[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"] | None]:
     """Return the positions and, where there are any, display colours of the points in a PLY.
 
-    Colours are red, green, blue: 0 to 255, or 0 to 1 as floats. Raises UserError: the file is
-    absent, is not such a PLY, or holds points that are not finite.
+    Colours are red, green, blue of 8 or 16 bits, or floats to 1 or 255, or those of Gaussians
+    (f_dc). Raises UserError: the file is absent, is not such a PLY, or holds points that are not
+    finite.
     """
     if not path.is_file():
         fix = "put the file there, or take its name out of the .json: seeds are then found"
         raise broken(f"the seed points {path}", "do not exist", fix)
     with refusing(path, "points", fix=_FIX):
         vertex = read_table(path, "vertex")
-        names = vertex.dtype.names or ()
         points = np.stack([vertex[axis] for axis in "xyz"], 1).astype(np.float32)
-        colors = None
-        if {"red", "green", "blue"} <= set(names):
-            colors = np.stack([vertex[name] for name in ("red", "green", "blue")], 1)
+        there = next((c for c in _COLORS if set(c) <= set(vertex.dtype.names or ())), None)
+        colors = None if there is None else _display_colors(vertex, there)
     bad = int((~np.isfinite(points).all(axis=1)).sum())
     if bad:
         raise broken(f"{path}:", f"{bad} of {len(points)} points are not finite", _FIX)
-    if colors is not None:
-        scale = 255.0 if colors.dtype.kind == "f" else 1.0
-        colors = np.rint(np.nan_to_num(colors * scale).clip(0, 255)).astype(np.uint8)
     return points, colors
+
+
+def _display_colors(vertex: np.ndarray, names: Sequence[str]) -> UInt8[np.ndarray, "p 3"]:
+    """Return the colours in three columns of a table; what their largest is tells what white is."""
+    values = np.stack([vertex[name] for name in names], 1)
+    floats = values.dtype.kind == "f"
+    values = np.nan_to_num(values.astype(np.float64))
+    if names[0].startswith("f_dc"):
+        white, values = 1.0, 0.5 + C0 * values
+    else:
+        most = values.max(initial=0)
+        white = 1.0 if floats and most <= _MOST_OF_ONE else 255.0 if most <= 255 else 65535.0
+    return np.rint((values * (255 / white)).clip(0, 255)).astype(np.uint8)
 
 
 def with_random_seeds(scene: Scene) -> Scene:

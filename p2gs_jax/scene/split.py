@@ -20,9 +20,10 @@ import numpy as np
 from jaxtyping import Int
 
 from p2gs_jax.config import DataConfig
+from p2gs_jax.core.text import first_few, natural
 from p2gs_jax.errors import UserError, broken
 from p2gs_jax.scene.files import read_json
-from p2gs_jax.scene.masks import first_few, image_folder_of
+from p2gs_jax.scene.masks import image_folder_of
 from p2gs_jax.types import Scene, Tracks, View
 
 EVERY = "every"
@@ -52,9 +53,10 @@ def split_scene(scene: Scene, cfg: DataConfig) -> Scene:
 def assign_split(views: tuple[View, ...], test_every: int) -> tuple[View, ...]:
     """Return the views with `split` set, in the order given.
 
-    Within each camera, sorted by name, views 0, n, 2n, ... are `test`, as in 3DGS; where views have
-    frames, the frames 0, n, 2n, ... among all of them are. A camera that would be left without a
-    training view holds out none, and so does n = 0. Raises UserError: n is negative, or 1.
+    Within each camera, sorted by the numbers in names, views 0, n, 2n, ... are `test`, as in 3DGS;
+    where views have frames, the frames 0, n, 2n, ... among all of them are. A camera that would be
+    left without a training view holds out none, and so does n = 0. Raises UserError: n is negative,
+    or 1.
     """
     if test_every < 0 or test_every == 1:
         why = f"cannot hold out every n-th view with n = {test_every}"
@@ -62,7 +64,7 @@ def assign_split(views: tuple[View, ...], test_every: int) -> tuple[View, ...]:
     test: set[int] = set()
     if test_every:
         by_camera: dict[str, list[int]] = defaultdict(list)
-        for i in sorted(range(len(views)), key=lambda i: views[i].name):
+        for i in sorted(range(len(views)), key=lambda i: natural(views[i].name)):
             by_camera[views[i].camera].append(i)
         frames = sorted({v.frame for v in views if v.frame is not None})
         held = set(frames[::test_every])

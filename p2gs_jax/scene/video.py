@@ -8,6 +8,7 @@ not matter, and a camera that rests gives one photograph.
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -18,6 +19,7 @@ from typing import Any, cast
 import av
 import cv2
 import numpy as np
+from av.filter import Graph
 from av.stream import Disposition
 from jaxtyping import Float, Float32, UInt, UInt8
 
@@ -30,13 +32,16 @@ from p2gs_jax.scene.convert.convert import Converted, cache_of, write_png
 from p2gs_jax.scene.files import Report, cached_folder, file_fingerprints
 
 RECORD = "frames.json"
-_VERSION = 1
+_VERSION = 2
 _TRANSFER_NAMES = {"hlg": "HLG video", "pq": "PQ video"}
 _AGAIN = "copy or export the video again"
 _SHORT = "film while walking around the thing"
 VIDEO_SUFFIXES = frozenset(
-    {".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".ts", ".3gp", ".insv"}
+    {".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".ts", ".3gp"}
+    | {".insv", ".360"}
 )
+# What 360-degree cameras record: two fisheyes, or six sides of a cube, beside each other.
+_ALL_ROUND = frozenset({".insv", ".360"})
 _BT601 = (0.299, 0.114)
 # Weights of red and blue in luma, by matrix.
 _LUMA = {1: (0.2126, 0.0722), 5: _BT601, 6: _BT601, 7: (0.212, 0.087), 9: (0.2627, 0.0593)}
@@ -132,7 +137,7 @@ def frames_of(path: Path) -> Iterator[Frame]:
         square = float(ratio) if ratio else 1.0
         first, begin, number = None, 0.0, 0
         try:
-            for decoded in container.decode(stream):
+            for decoded in _whole_frames(container.decode(stream), stream):
                 size = f"{decoded.width}x{decoded.height}"
                 time = float(decoded.time) if decoded.time is not None else number / rate
                 if first is None:
@@ -148,6 +153,33 @@ def frames_of(path: Path) -> Iterator[Frame]:
             if number < 2:
                 why = f"cannot be decoded: {error.strerror or error}."
                 raise broken(path, why, _AGAIN) from None
+
+
+def _whole_frames(frames: Iterator[av.VideoFrame], stream: Any) -> Iterator[av.VideoFrame]:
+    """Yield frames, from the first interlaced one on without the comb of two moments (bwdif)."""
+    graph = None
+    for frame in frames:
+        if graph is None and frame.interlaced_frame:
+            graph = Graph()
+            graph.link_nodes(
+                graph.add_buffer(template=stream, time_base=stream.time_base),
+                graph.add("bwdif", "mode=send_frame:deint=interlaced"),
+                graph.add("buffersink"),
+            ).configure()
+        if graph is None:
+            yield frame
+            continue
+        graph.push(frame)
+        yield from _pulled(graph)
+    if graph is not None:
+        graph.push(None)
+        yield from _pulled(graph)
+
+
+def _pulled(graph: Graph) -> Iterator[av.VideoFrame]:
+    with contextlib.suppress(av.BlockingIOError, av.EOFError):
+        while True:
+            yield cast(av.VideoFrame, graph.pull())
 
 
 def expected_frames(path: Path) -> int | None:
@@ -176,6 +208,10 @@ def no_frames(path: Path, count: int) -> UserError:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
+    if path.suffix.lower() in _ALL_ROUND:
+        why = "is the recording of a 360-degree camera, which is no picture of one lens."
+        fix = "export a flat (reframed) video of it with the camera's program, and fit that"
+        raise broken(path, why, fix)
     try:
         container = av.open(str(path))
     except (av.FFmpegError, OSError) as error:

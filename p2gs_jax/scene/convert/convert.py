@@ -30,11 +30,11 @@ from p2gs_jax.scene.convert import readers
 from p2gs_jax.scene.convert.icc import encode_16
 from p2gs_jax.scene.convert.readers import Balance, Kind, Picture, kind_of
 from p2gs_jax.scene.files import Report, cached_folder, file_fingerprints
-from p2gs_jax.scene.masks import mask_of
+from p2gs_jax.scene.masks import find_masks
 from p2gs_jax.types import Scene
 
 # Other results: other folders.
-_VERSION = 2
+_VERSION = 3
 _FOLDER, _RECORD = "developed", "photographs.json"
 _NAMES: dict[Kind, str] = {
     "raw": "camera raw",
@@ -104,15 +104,17 @@ def with_originals(scene: Scene, converted: Converted) -> Scene:
 
     Files that were only linked are read where they are, also beside a run that has moved.
     """
-    views = []
+    views, there = [], []
     for view in scene.views:
         original = converted.originals[view.name]
         plain = original.suffix == Path(view.name).suffix
         name = Path(view.name).with_suffix(original.suffix).as_posix()
         path = original if plain else converted.folder / view.name
-        there = dataclasses.replace(view, name=name, image_path=original)
-        mask = view.mask_path or mask_of(there)
-        views.append(dataclasses.replace(there, image_path=path, mask_path=mask))
+        there.append(dataclasses.replace(view, name=name, image_path=original))
+        views.append(dataclasses.replace(view, name=name, image_path=path))
+    # Masks lie beside the photographs as they were taken.
+    masks, _ = find_masks(there, scene.root)
+    views = [dataclasses.replace(v, mask_path=m) for v, m in zip(views, masks, strict=True)]
     notes = (*scene.notes, *converted.notes)
     known = converted.known
     return dataclasses.replace(scene, views=tuple(views), notes=notes, known_response=known)

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, UInt
 from PIL import Image, ImageCms
 
-from p2gs_jax.core.numerics import srgb_encode
+from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 
 Transfer = Literal["linear", "hlg", "pq"]
 
@@ -162,6 +162,17 @@ def to_srgb(pixels: UInt[np.ndarray, "h w 3"], profile: Profile) -> UInt[np.ndar
     return encode_16(light @ profile.matrix.T.astype(np.float32))
 
 
+def coded_profile(code: int) -> Profile | None:
+    """Return the colour space of display values in primaries that HEIC, AVIF and video number.
+
+    None: sRGB's own, or unknown. The curve is sRGB's (ITU-T H.273, table 2).
+    """
+    if code not in PRIMARIES:
+        return None
+    curve = srgb_decode(np.linspace(0, 1, _ENTRIES))[:, None]
+    return Profile("coded", np.repeat(curve, 3, 1), to_srgb_matrix(PRIMARIES[code]))
+
+
 def encode_16(light: Float[np.ndarray, "..."]) -> UInt[np.ndarray, "..."]:
     """Return light in [0, 1] as sRGB in 16 bits; what is outside is clipped."""
     return np.rint(srgb_encode(light) * 65535).astype(np.uint16)
@@ -183,9 +194,15 @@ def with_profile_applied(
         return pixels
     if profile is None or profile.decode is None:
         return pixels
-    colours = to_srgb(pixels[..., 2::-1], profile)[..., ::-1]
-    if pixels.shape[2] == 3:
-        return colours
+    order = [2, 1, 0, 3][: pixels.shape[2]]
+    return brought_to_srgb(pixels[..., order], profile)[..., order]
+
+
+def brought_to_srgb(
+    pixels: UInt[np.ndarray, "h w c"], profile: Profile
+) -> UInt[np.ndarray, "h w c"]:
+    """Return R G B, perhaps with alpha behind, in sRGB as 16 bits; see `to_srgb`."""
+    colours = to_srgb(pixels[..., :3], profile)
     alpha = pixels[..., 3:].astype(np.uint16)
     return np.concatenate([colours, alpha * 257 if pixels.dtype == np.uint8 else alpha], axis=2)
 

@@ -9,14 +9,17 @@ and WebP come through Pillow, 8 bits whatever the file holds.
 from __future__ import annotations
 
 import glob
+import io
 import math
 import re
+import struct
 import warnings
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, BinaryIO, Literal
 
 import numpy as np
 import OpenEXR
@@ -24,7 +27,16 @@ from jaxtyping import Float32, UInt
 from PIL import ExifTags, Image
 
 from p2gs_jax.errors import UserError, broken
-from p2gs_jax.scene.convert.icc import BT709, PRIMARIES, TRANSFERS, to_light, to_srgb_matrix
+from p2gs_jax.scene.convert.icc import (
+    BT709,
+    PRIMARIES,
+    TRANSFERS,
+    Transfer,
+    brought_to_srgb,
+    coded_profile,
+    to_light,
+    to_srgb_matrix,
+)
 
 Kind = Literal["plain", "raw", "heif", "avif", "webp", "exr"]
 Balance = tuple[float, float, float]
@@ -51,6 +63,8 @@ _RAW_SETTINGS |= {"focal_length": _FOCAL_LENGTH}
 # OpenEXR's standard attributes.
 _EXR_SETTINGS = {"expTime": _TIME, "aperture": _F_NUMBER, "isoSpeed": _ISO}
 _EXR_ERRORS = (RuntimeError, KeyError, OSError, ValueError)
+# Canon writes what it says of a photograph at the beginning, bytes.
+_RAW_HEADER = 2**18
 _AGAIN = "copy that photograph again, or remove it from the scene"
 
 
@@ -116,14 +130,33 @@ def read_heif(path: Path) -> Picture:
         exif = None
     if pixels.ndim == 2:
         pixels = pixels[..., None]
-    nclx = info.get("nclx_profile") or {}
-    transfer = TRANSFERS.get(int(nclx.get("transfer_characteristics", 0)))
+    if pixels.dtype == np.uint16:
+        # Codes of 10 and 12 bits come shifted: the largest is to be white.
+        white = pixels.max(initial=0) | (2**16 - 2 ** (16 - int(info.get("bit_depth", 16))))
+        pixels = np.rint(pixels * (65535 / white)).astype(np.uint16)
+    coded, transfer = _code_points(path)
     if transfer is None:
-        return Picture(codes=pixels, exif=exif, profile=info.get("icc_profile"))
+        profile = info.get("icc_profile")
+        own = None if profile or pixels.shape[2] < 3 else coded_profile(coded)
+        codes = pixels if own is None else brought_to_srgb(pixels, own)
+        return Picture(codes=codes, exif=exif, profile=profile)
     light = to_light(pixels[..., :3] / np.iinfo(pixels.dtype).max, transfer)
-    primaries = PRIMARIES.get(int(nclx.get("color_primaries", 0)), BT709)
+    primaries = PRIMARIES.get(coded, BT709)
     light = np.broadcast_to(light, (*light.shape[:2], 3)) @ to_srgb_matrix(primaries).T
     return Picture(light=light.astype(np.float32), exif=exif)
+
+
+def _code_points(path: Path) -> tuple[int, Transfer | None]:
+    """Return the primaries of a HEIC or AVIF (ITU-T H.273), 0: unknown, and its transfer function.
+
+    They stand in its box of colours, which only one of the two libraries tells of.
+    """
+    data = path.read_bytes()
+    at = data.find(b"colrnclx") + len(b"colrnclx")
+    if at < len(b"colrnclx"):
+        return 0, None
+    primaries, transfer = struct.unpack(">HH", data[at : at + 4].ljust(4, b"\0"))
+    return primaries, TRANSFERS.get(transfer)
 
 
 @dataclass(frozen=True)
@@ -148,12 +181,15 @@ def read_facts(path: Path) -> RawFacts:
     with _raw(path) as raw:
         chosen = [float(x) for x in raw.camera_whitebalance[:3]]
         exif = _raw_exif(path, raw)
-        names = (str(exif.get(tag, "")).strip("\0 ") for tag in (_MAKE, _MODEL))
+        names = [str(exif.get(tag, "")).strip("\0 ") for tag in (_MAKE, _MODEL)]
         green = chosen[1]
         balance = (chosen[0] / green, 1.0, chosen[2] / green) if min(chosen) > 0 else None
         matrix = bool(np.any(raw.color_matrix) or np.any(raw.rgb_xyz_matrix))
-        size, camera = (raw.sizes.width, raw.sizes.height), " ".join(n for n in names if n)
-        return RawFacts(size, camera, balance, matrix)
+        size = (raw.sizes.width, raw.sizes.height)
+        # Without a name: cameras of one model have one size, and LibRaw one matrix for them.
+        known = zlib.crc32(np.asarray(raw.rgb_xyz_matrix).tobytes())
+        unnamed = f"unnamed camera {known:08x} of {size[0]}x{size[1]} pixels"
+        return RawFacts(size, " ".join(n for n in names if n) or unnamed, balance, matrix)
 
 
 def read_raw(path: Path, balance: Balance | None) -> Picture:
@@ -206,14 +242,12 @@ def _raw(path: Path) -> Iterator[Any]:
 
 
 def _raw_exif(path: Path, raw: Any) -> Image.Exif:
-    """Return EXIF: the file's where it is laid out as TIFF, completed by what LibRaw found."""
+    """Return EXIF: the file's where it can be found, completed by what LibRaw found."""
     out = Image.Exif()
     try:
         with path.open("rb") as file:
-            if file.read(2) in (b"II", b"MM"):
-                file.seek(0)
-                out.load_from_fp(file)
-                out.get_ifd(ExifTags.IFD.Exif)
+            out = exif_of_raw(file)
+            out.get_ifd(ExifTags.IFD.Exif)
     except Exception:  # malformed EXIF raises many kinds of errors
         out = Image.Exif()
     shot, other = out.get_ifd(ExifTags.IFD.Exif), getattr(raw, "other", None)
@@ -221,6 +255,30 @@ def _raw_exif(path: Path, raw: Any) -> Image.Exif:
         value = getattr(other, name, None)
         if tag not in shot and value:
             shot[tag] = int(value) if tag == _ISO else float(value)
+    return out
+
+
+def exif_of_raw(file: BinaryIO) -> Image.Exif:
+    """Return the EXIF in a raw file: of TIFF and its relatives, Canon's CR3 and Fujifilm's RAF."""
+    out, head = Image.Exif(), file.read(_RAW_HEADER)
+    file.seek(0)
+    if head[:4] in (b"II*\0", b"MM\0*"):
+        out.load_from_fp(file)
+    elif head[:2] in (b"II", b"MM"):
+        # Olympus and Panasonic put marks of their own where TIFF has 42.
+        mark = b"*\0" if head[:2] == b"II" else b"\0*"
+        out.load_from_fp(io.BytesIO(head[:2] + mark + file.read()[4:]))
+    elif head.startswith(b"FUJIFILMCCD-RAW"):
+        # A JPEG of the photograph, whose place stands at byte 84.
+        with Image.open(io.BytesIO(file.read()[int.from_bytes(head[84:88]) :])) as image:
+            out = image.getexif()
+            out.get_ifd(ExifTags.IFD.Exif)
+    elif head[4:8] == b"ftyp" and b"CMT1" in head:
+        # TIFFs of their own: of the file, and of the shot.
+        for name, target in ((b"CMT1", out), (b"CMT2", out.get_ifd(ExifTags.IFD.Exif))):
+            part = Image.Exif()
+            part.load(b"Exif\0\0" + head[head.index(name) + 4 :])
+            target.update(dict(part))
     return out
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Float, Float64
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.core.streams import Stream, generator
-from p2gs_jax.errors import UserError
+from p2gs_jax.errors import UserError, broken
 from p2gs_jax.scene.drives.ego_mask import find_ego_masks
 from p2gs_jax.scene.drives.lidar import MOST_MEASURED, owners, seeds, thinned
 from p2gs_jax.scene.drives.recording import (
@@ -25,12 +25,20 @@ from p2gs_jax.scene.drives.recording import (
     chosen_frames,
 )
 from p2gs_jax.scene.drives.tables import counted
-from p2gs_jax.scene.files import Report, check_missing, require_plain
+from p2gs_jax.scene.files import (
+    Report,
+    at_file_size,
+    check_missing,
+    require_plain,
+    rescaled,
+)
 from p2gs_jax.scene.rigid import inverse
 from p2gs_jax.types import Lidar, Scene, TrackedObject, View
 
 # World coordinates further than this from 0 are moved there: float32 has 7 digits.
 FARTHEST_ORIGIN = 1000.0
+# Principal points lie this near to the middle of photographs, in their sides.
+MOST_OFF = 0.25
 # Sweeps belong to the chosen frames when they are this near to them, seconds.
 SWEEP_SLACK_S = 0.1
 
@@ -55,16 +63,18 @@ def assemble(
     Raises:
         UserError: a camera, frame or photograph is not there, a name a path, a sweep broken.
     """
-    cameras = {c.name: c for c in recording.cameras}
-    for name in cameras:
+    there = [camera.name for camera in recording.cameras]
+    for name in there:
         # What is written of a view lies in a folder of its camera.
         require_plain(name, recording.root)
-    names = chosen_cameras(cfg.cameras, list(cameras))
+    names = chosen_cameras(cfg.cameras, there)
     photographs, notes = _chosen_photographs(recording, names, cfg)
+    cameras, size_notes = _at_sizes(recording, photographs)
     masks, mask_notes = {}, []
     if cfg.own_car:
         masks, mask_notes = find_ego_masks(recording, names, work_dir, report)
-    middle = np.mean([p.pose[:3, 3] for p in photographs], axis=0)
+    centres = np.stack([p.pose[:3, 3] for p in photographs])
+    middle = centres.mean(0)
     origin = np.rint(middle) if np.abs(middle).max() > FARTHEST_ORIGIN else np.zeros(3)
     folder = _embedded_folder(recording.root, work_dir)
     views = [
@@ -80,9 +90,8 @@ def assemble(
     lidar, lidar_notes = None, ["Laser measurements are not used (--data.no-lidar)."]
     if cfg.lidar:
         lidar, lidar_notes = _read_sweeps(recording, photographs, objects, origin, report)
-    centres = np.stack([p.pose[:3, 3] - origin for p in photographs])
-    points, seed_notes = _seeds(lidar, centres)
-    notes += [*mask_notes, *lidar_notes, *seed_notes]
+    points, seed_notes = _seeds(lidar, centres - origin)
+    notes += [*size_notes, *mask_notes, *lidar_notes, *seed_notes]
     return Scene(
         root=recording.root,
         format=recording.format,
@@ -126,6 +135,34 @@ def _chosen_photographs(
             f"of {len(frames)} frames some cameras have fewer photographs: {', '.join(few)}"
         )
     return chosen, notes
+
+
+def _at_sizes(
+    recording: Recording, photographs: Sequence[Photograph]
+) -> tuple[dict[str, RigCamera], list[str]]:
+    """Return the cameras at the size of the photographs, and a note of those of another."""
+    cameras = {c.name: _at_size(c, photographs, recording.root) for c in recording.cameras}
+    resized = {c.name for c in recording.cameras if cameras[c.name] is not c}
+    return cameras, rescaled(sum(p.camera in resized for p in photographs), "the calibration")
+
+
+def _at_size(camera: RigCamera, photographs: Sequence[Photograph], root: Path) -> RigCamera:
+    """Return a camera at the size of its photographs; embedded ones are of that calibrated.
+
+    UserError: they have another shape, or its principal point is far from their middle.
+    """
+    first = next((p for p in photographs if p.camera == camera.name), None)
+    if first is not None and first.embedded is None:
+        size = (camera.width, camera.height)
+        K, width, height = at_file_size(first.path, camera.K, size, root)
+        if (width, height) != size:
+            camera = dataclasses.replace(camera, K=K, width=width, height=height)
+    x, y = camera.K[:2, 2]
+    if max(abs(x / camera.width - 0.5), abs(y / camera.height - 0.5)) > MOST_OFF:
+        why = f"the calibration of {camera.name} has its principal point at {x:.0f}, {y:.0f}, far "
+        why += f"from the middle of photographs of {camera.width}x{camera.height}"
+        raise broken(f"{root}:", why, "use the photographs at the size that was calibrated")
+    return camera
 
 
 def _name(photograph: Photograph) -> str:

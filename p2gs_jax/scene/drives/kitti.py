@@ -80,7 +80,8 @@ def read_kitti_raw(root: Path, cfg: DataConfig) -> Recording:
             notes.append(f"{folder.name} has no photographs: it is left out.")
             continue
         K, back = _rectified_camera(held, folder.name)
-        cameras.append(RigCamera(folder.name, K, *image_size(next(iter(files.values())))))
+        size = _rectified_size(held, next(iter(files.values())), folder.name)
+        cameras.append(RigCamera(folder.name, K, *size))
         found, without = _photographs(folder, files, car, to_car @ back)
         photographs += found
         notes += counted(without, f"photographs of {folder.name} have no pose or time.")
@@ -116,6 +117,9 @@ class _Calibration:
         lines = (line.partition(":") for line in _read_lines(path))
         self.path, self._held = path, {name.strip(): rest.split() for name, _, rest in lines}
 
+    def __contains__(self, name: str) -> bool:
+        return name in self._held
+
     def matrix(self, name: str, *shape: int) -> Float64[np.ndarray, "..."]:
         """Return a matrix; UserError: it is not there, or has not so many finite numbers."""
         words = self._held.get(name, ())
@@ -141,6 +145,24 @@ def _rectified_camera(held: _Calibration, name: str) -> tuple[Float64[np.ndarray
     back[:3, 3] = -np.linalg.solve(K, P[:, 3])
     K[:2, 2] += 0.5
     return K, back
+
+
+def _rectified_size(held: _Calibration, photograph: Path, name: str) -> tuple[int, int]:
+    """Return the size of rectified photographs, or where no file says another, that of one.
+
+    UserError: the photograph has the size of those that are not rectified.
+    """
+    there, number = image_size(photograph), name[-2:]
+    if f"S_rect_{number}" not in held:
+        return there
+    width, height = held.matrix(f"S_rect_{number}", 2).tolist()
+    # Rounding by a pixel or two is no other size.
+    if max(abs(there[0] / width - 1), abs(there[1] / height - 1)) < 0.01:
+        return there
+    if f"S_{number}" in held and there == tuple(held.matrix(f"S_{number}", 2).tolist()):
+        fix = "take the drive whose name ends with _sync: that with _extract is not rectified"
+        raise broken(photograph, f"is not rectified, as its size of {there} says", fix)
+    return int(width), int(height)
 
 
 def _read_stamps(path: Path) -> Float64[np.ndarray, " n"]:

@@ -42,6 +42,8 @@ from p2gs_jax.scene.rigid import from_quaternion, inverse
 from p2gs_jax.types import TrackedObject
 
 MARKER = "camera/*/intrinsics.json"
+# Size of the photographs as published, which its files do not say.
+CALIBRATED = (1920, 1080)
 PICKLES = (".pkl.gz", ".pkl")
 # Seconds a turn of the spinning scanner.
 TURN_S = 0.1
@@ -80,9 +82,12 @@ def _camera(folder: Path, photograph: Path) -> RigCamera:
         fx, fy, cx, cy = finite_numbers(values, path, "fx fy cx cy").tolist()
     except (KeyError, TypeError):
         raise broken(path, "lacks fx, fy, cx or cy") from None
+    size = image_size(photograph)
+    if np.abs([cx / CALIBRATED[0] - 0.5, cy / CALIBRATED[1] - 0.5]).max() < 0.1:
+        size = CALIBRATED
     # The devkit multiplies by K and says nothing of pixel centres. K comes from a calibration
     # with OpenCV's conventions, where centres lie at integers; ours are at +0.5.
-    return RigCamera(folder.name, intrinsics(fx, fy, cx + 0.5, cy + 0.5), *image_size(photograph))
+    return RigCamera(folder.name, intrinsics(fx, fy, cx + 0.5, cy + 0.5), *size)
 
 
 def _photographs(folder: Path, files: dict[int, Path]) -> tuple[list[Photograph], int]:

@@ -39,7 +39,7 @@ _AROUND = re.compile(r"(?:^|_)(?:camera|cam|ring)(?=_|$)")
 
 @dataclass(frozen=True)
 class RigCamera:
-    """One camera of a car, as the data set names it; sizes are pixels.
+    """One camera of a car, as the data set names it; sizes are those of its calibration, pixels.
 
     Attributes:
         K: intrinsics in pixels of the undistorted image, pixel centres at +0.5.

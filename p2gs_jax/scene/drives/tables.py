@@ -110,7 +110,7 @@ def numbered(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
         stems = (path.name.removesuffix(suffix) for suffix in suffixes)
         stem = next((stem for stem in stems if stem != path.name), "")
-        if stem.isdigit():
+        if stem.isdecimal():
             found.setdefault(int(stem), path)
     return dict(sorted(found.items()))
 

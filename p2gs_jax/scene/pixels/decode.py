@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+import sys
+import threading
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt
 from PIL import Image
 
+from p2gs_jax.core.memory import left_to_process
 from p2gs_jax.errors import broken
 from p2gs_jax.scene.convert.icc import with_profile_applied
 from p2gs_jax.scene.files import ASPECT_TOLERANCE, image_size, undecodable
@@ -20,6 +23,9 @@ from p2gs_jax.types import View
 
 _FULL = 0.999  # a pixel is valid only where all of its sources are
 _ALPHA_VALID = 0.5
+# About what decoding, undistorting and shrinking a photograph takes at once, for a pixel of it; and
+# the share of the memory that all threads together may take so.
+BYTES_PER_PIXEL, SHARE = 40, 0.5
 
 
 @dataclass(frozen=True)
@@ -41,6 +47,34 @@ class Decoded:
         return self.pixels.nbytes + self.valid.nbytes + opacity
 
 
+class Room:
+    """Memory, in bytes, for work that threads do at the same time; one is always let in."""
+
+    def __init__(self, most: int | None = None):
+        """Have room for `most`, or for a share of what there is when it is first needed."""
+        self._most, self._taken = most, 0
+        self._changed = threading.Condition()
+
+    @contextlib.contextmanager
+    def taking(self, count: int) -> Iterator[None]:
+        """Wait for room, and hold it."""
+        with self._changed:
+            if self._most is None:
+                self._most = int(SHARE * (left_to_process() or sys.maxsize))
+            most = self._most
+            self._changed.wait_for(lambda: not self._taken or self._taken + count <= most)
+            self._taken += count
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._taken -= count
+                self._changed.notify_all()
+
+
+_ROOM = Room()
+
+
 def floats(pixels: UInt[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:
     """Return stored values in [0, 1]."""
     return pixels.astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
@@ -59,7 +93,8 @@ def decode(view: View, sizes: Sequence[tuple[int, int]]) -> list[Decoded]:
     or there is too little memory for it.
     """
     try:
-        return _decoded(view, sizes)
+        with _ROOM.taking(BYTES_PER_PIXEL * view.width * view.height):
+            return _decoded(view, sizes)
     except (MemoryError, cv2.error) as error:
         why = f"{view.width}x{view.height} pixels need more memory than there is ({error})"
         raise broken(f"{view.image_path}:", why, "make the photographs smaller") from None
@@ -151,9 +186,12 @@ def _decode_mask(view: View) -> Bool[np.ndarray, "h w"]:
         fix = "make the mask at the size of the photograph"
         raise broken(f"wrong size: the mask {view.mask_path}", why, fix)
     raw = _read_raster(view.mask_path)
-    # A mask may carry an opaque alpha channel beside its values.
     colours = raw if raw.ndim == 2 else raw[..., : 3 if raw.shape[2] >= 3 else 1].max(axis=2)
     mask = colours > 0
+    if raw.ndim == 3 and raw.shape[2] in (2, 4):
+        # What is transparent is left out. Of some masks alpha says all, and they are black.
+        opaque = raw[..., -1] > 0
+        mask = mask & opaque if mask.any() or opaque.all() else opaque
     if (w, h) == (view.width, view.height):
         return mask
     how = cv2.INTER_AREA if w > view.width else cv2.INTER_LINEAR

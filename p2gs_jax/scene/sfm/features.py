@@ -7,7 +7,9 @@ more cost only what is new. It is thrown away where a photograph changed or is g
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import sys
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -20,9 +22,12 @@ from jaxtyping import Float
 
 from p2gs_jax.config import Matching
 from p2gs_jax.core.atomic import write_json
+from p2gs_jax.core.memory import left_to_process
+from p2gs_jax.core.text import natural
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.colmap import subfolder
-from p2gs_jax.scene.files import Report, file_fingerprints, stage_progress
+from p2gs_jax.scene.files import Report, file_fingerprints, image_size, stage_progress
+from p2gs_jax.scene.pixels.decode import BYTES_PER_PIXEL, SHARE
 from p2gs_jax.scene.rigid import camera_centers
 
 MAX_IMAGE_SIZE = 1600
@@ -37,6 +42,11 @@ _OVERLAP, _LOOPS_EVERY = 10, 5
 # 71 s and 11,961 points, the nearest 10 292 pairs in 53 s and 12,017 points.
 _NEIGHBOURS = 10
 _EXHAUSTIVE_LIMIT_BY_POSE = _NEIGHBOURS + 5
+
+# In COLMAP's lists of pairs a name ends at a blank, and a line that begins with # is a comment:
+# names have characters for private use instead while images are matched.
+_ONE_WORD = {ord(c): 0xE000 + ord(c) for c in " \t\v\f\r\n#"}
+_AS_THEY_ARE = {there: here for here, there in _ONE_WORD.items()}
 
 Pair = tuple[str, str]
 
@@ -76,6 +86,11 @@ def extract(
     options.sift.max_num_features = MAX_FEATURES
     if not enlarge:
         options.sift.first_octave = 0
+    # COLMAP decodes a photograph in every thread.
+    largest = max(w * h for w, h in (image_size(image_folder / name) for name in names))
+    room = int(SHARE * (left_to_process() or sys.maxsize)) // (BYTES_PER_PIXEL * largest)
+    if room < (os.cpu_count() or 1):
+        options.num_threads = max(1, room)
     reader = pycolmap.ImageReaderOptions()
     if camera is not None:
         reader.existing_camera_id = camera
@@ -101,20 +116,26 @@ def match(database: Path, pairs: Iterable[Pair] | None) -> None:
     if pairs is None:
         pycolmap.match_exhaustive(database, device=cpu)
         return
-    pairs = list(pairs)
-    if not _quotable([name for pair in pairs for name in pair]):
-        pycolmap.match_sequential(database, device=cpu)
-        return
     listing = database.with_name("pairs.txt")
-    listing.write_text("".join(f"{a} {b}\n" for a, b in pairs))
+    lines = (f"{a.translate(_ONE_WORD)} {b.translate(_ONE_WORD)}\n" for a, b in pairs)
+    listing.write_text("".join(lines), encoding="utf-8")
     options = pycolmap.ImportedPairingOptions()
     options.match_list_path = listing
-    pycolmap.match_image_pairs(database, pairing_options=options, device=cpu)
+    _rename(database, _ONE_WORD)
+    try:
+        pycolmap.match_image_pairs(database, pairing_options=options, device=cpu)
+    finally:
+        _rename(database, _AS_THEY_ARE)
 
 
-def _quotable(names: Iterable[str]) -> bool:
-    """Return whether COLMAP can read these names in a list of pairs: blanks separate them there."""
-    return not any(" " in name for name in names)
+def _rename(database: Path, characters: Mapping[int, int]) -> None:
+    """Replace characters in the names of the images in a database."""
+    with opened(database) as db:
+        for image in db.read_all_images():
+            name = image.name.translate(characters)
+            if name != image.name:
+                image.name = name
+                db.update_image(image)
 
 
 def kept_features(
@@ -138,6 +159,9 @@ def kept_features(
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / RECORD, record)
     names = [name for group in groups.values() for name in group]
+    if database.is_file():
+        # A run may have been killed while it matched.
+        _rename(database, _AS_THEY_ARE)
     known = _cameras(database)
     new = [name for name in names if name not in known]
     if len(new) < len(names):
@@ -161,10 +185,6 @@ def match_kept(
 ) -> None:
     """Match what is not matched yet, of these pairs or of all."""
     wanted = list(combinations(sorted(names), 2)) if pairs is None else list(pairs)
-    if not _quotable(names):
-        report(f"matching: {len(wanted)} image pairs")
-        match(database, pairs)
-        return
     with opened(database) as db:
         ids = {image.name: image.image_id for image in db.read_all_images()}
         known = ((a, b) for a, b in wanted if a in ids and b in ids)
@@ -209,7 +229,7 @@ def pairs_by_name(names: Sequence[str], matching: Matching = "auto") -> list[Pai
     if matching == "all" or (matching == "auto" and len(names) <= EXHAUSTIVE_LIMIT):
         return None
     sequences: dict[str | None, list[str]] = defaultdict(list)
-    for name in sorted(names):
+    for name in sorted(names, key=natural):
         sequences[subfolder(name)].append(name)
     steps = [*range(1, _OVERLAP + 1), *(2**k for k in range(4, 10))]
     pairs: list[Pair] = []
