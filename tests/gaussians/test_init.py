@@ -1,5 +1,6 @@
 """Seeds, their bound, and the far shell."""
 
+import dataclasses
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -8,13 +9,20 @@ import pytest
 from tiny_scene import make_scene, prepared
 
 from p2gs_jax.config import FitConfig, InitConfig
-from p2gs_jax.gaussians.seeds import cameras_radius, gaussians_from_points, subsample
-from p2gs_jax.gaussians.shell import find_shell
+from p2gs_jax.gaussians.seeds import (
+    cameras_radius,
+    gaussians_from_points,
+    misplaced,
+    reach,
+    subsample,
+    within_reach,
+)
+from p2gs_jax.gaussians.shell import find_shell, sphere_behind
 from p2gs_jax.jobs.configs import with_fields
-from p2gs_jax.pipeline.survey import load
+from p2gs_jax.pipeline.survey import load, scale_notes
 from p2gs_jax.presets import preset
 from p2gs_jax.render import view_radiance
-from p2gs_jax.types import Camera, View
+from p2gs_jax.types import Camera, Scene, View
 
 
 def view(x=0.0, width=160, height=90, yaw=0.0):
@@ -66,6 +74,35 @@ def test_seeds_carry_their_radiance(name):
     cam = Camera(jnp.eye(4), jnp.eye(3), 8, 8)
     np.testing.assert_allclose(view_radiance(g, cam, cfg.render), radiance, rtol=1e-4, atol=1e-5)
     assert np.all(np.isfinite(g.log_scales))
+
+
+def test_a_camera_far_from_all_others_counts_for_nothing_and_is_named(tmp_path):
+    views = [view(x) for x in (*np.linspace(0, 10, 9), 6e4)]
+    points = street_points(ground_only=True)
+    assert misplaced(views, points).tolist() == [False] * 9 + [True]
+    assert cameras_radius(views, points) == cameras_radius(views[:-1], points)
+    sphere, plain = (sphere_behind(v, points, 5.0, InitConfig()) for v in (views, views[:-1]))
+    assert (sphere.radius, sphere.middle[0]) == (plain.radius, plain.middle[0])
+    scene = Scene(tmp_path, "colmap", tuple(views), points, None)
+    (note,) = scale_notes(scene, None, FitConfig(), 5.0)
+    assert "1 of 10 cameras" in note
+    assert "60000.0.png" in note
+    # Nor where a car waits, or one photograph is from farther away.
+    for xs in ([0.0] * 50 + [1.0, 40.0, 90.0], [*range(9), 100.0]):
+        assert not misplaced([view(x) for x in xs], points).any()
+
+
+def test_seeds_out_of_reach_are_brought_nearer(tmp_path):
+    views, points = [view(0.0), view(2.0)], street_points(ground_only=True)
+    scene = Scene(tmp_path, "colmap", tuple(views), points, None)
+    assert within_reach(scene) == (scene, [])
+    far = np.array([[0, 0, 2e5], [1e8, 0, 0]], np.float32)
+    nearer, (note,) = within_reach(dataclasses.replace(scene, points=np.concatenate([points, far])))
+    assert "2 of 4002 seed points" in note
+    middle, most = reach(views, points)
+    away = np.linalg.norm(nearer.points[-2:] - middle, axis=1)
+    np.testing.assert_allclose(away, most, rtol=0.01)
+    np.testing.assert_array_equal(nearer.points[:-2], points)
 
 
 def test_extent_and_subsample():

@@ -27,6 +27,7 @@ def write_video(
     full: bool = False,
     times: Sequence[float] | None = None,
     quality: int = 10,
+    options: dict[str, str] | None = None,
 ) -> None:
     """Write pictures, uint8 or uint16 R G B, as a video of 30 frames a second or at given times.
 
@@ -34,7 +35,9 @@ def write_video(
     that we counted, whatever its threads.
     """
     with av.open(str(path), "w") as container:
-        stream = container.add_stream(codec, rate=30, options={"crf": str(quality)})
+        stream = container.add_stream(
+            codec, rate=30, options={"crf": str(quality)} | (options or {})
+        )
         stream.pix_fmt = layout
         stream.time_base = Fraction(1, 600)
         context = stream.codec_context

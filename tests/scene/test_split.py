@@ -123,8 +123,11 @@ def studio(root, **extra):
     return root
 
 
-def write_ply(path, points, colors=None):
-    names = () if colors is None else ("red", "green", "blue")
+RGB = ("red", "green", "blue")
+
+
+def write_ply(path, points, colors=None, names=RGB):
+    names = () if colors is None else names
     fields = [(axis, "f4") for axis in "xyz"] + [(name, colors.dtype) for name in names]
     table = np.zeros(len(points), fields)
     for axis, column in zip("xyz", np.asarray(points, np.float32).T, strict=True):
@@ -154,17 +157,23 @@ def test_nerfstudio_lists(tmp_path):
 def test_nerfstudio_seeds(tmp_path):
     points = np.array([[0.0, 0.1, 0.2], [1.0, 1.1, 1.2]])
     studio(tmp_path, ply_file_path="sparse_pc.ply")
-    for colors, expected in (
-        (np.array([10, 200], np.uint8), [[10] * 3, [200] * 3]),
-        (np.array([0.0, 1.0], np.float32), [[0] * 3, [255] * 3]),
-        (None, None),
+    for colors, expected, names in (
+        (np.array([10, 200], np.uint8), [10, 200], RGB),
+        (np.array([0.0, 1.0], np.float32), [0, 255], RGB),
+        # As other programs write them: wider, in other names, as coefficients.
+        (np.array([2570, 51400], np.uint16), [10, 200], RGB),
+        (np.array([10, 200], np.uint16), [10, 200], RGB),
+        (np.array([10.0, 200.0], np.float32), [10, 200], RGB),
+        (np.array([10, 200], np.uint8), [10, 200], [f"diffuse_{name}" for name in RGB]),
+        (np.array([0.0, 1.0], np.float32), [128, 199], [f"f_dc_{k}" for k in range(3)]),
+        (None, None, RGB),
     ):
-        write_ply(tmp_path / "sparse_pc.ply", points, colors)
+        write_ply(tmp_path / "sparse_pc.ply", points, colors, names)
         scene = load_scene(tmp_path, CFG)
         assert np.allclose(scene.points, points)
         assert not scene.random_seeds
         assert (scene.point_colors is None) == (expected is None)
-        assert expected is None or scene.point_colors.tolist() == expected
+        assert expected is None or scene.point_colors.tolist() == [[c] * 3 for c in expected]
 
 
 def test_broken_nerfstudio_seeds(tmp_path):

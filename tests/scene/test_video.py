@@ -108,6 +108,29 @@ def test_a_phone_held_upright_and_the_file_s_times(tmp_path: Path, degrees: int,
     assert codes[-12:, 20:-20].max() < 15
 
 
+def test_two_moments_in_a_frame_are_taken_apart(tmp_path: Path) -> None:
+    path, moments = tmp_path / "a.mts", np.full((25, 96, 128, 3), 20, np.uint8)
+    for k, moment in enumerate(moments):
+        moment[:, 3 * k : 3 * k + 40] = 200
+    frames = moments[:-1:2].copy()
+    frames[:, 1::2] = moments[1::2, 1::2]
+    interlaced = {"flags": "+ildct+ilme", "x264-params": "tff=1:crf=5"}
+    write_video(path, frames, options=interlaced)
+    found = [frame.codes()[..., 0].astype(float) for frame in frames_of(path)]
+    assert len(found) == 12
+    for picture in found[1:]:
+        between = (picture[:-2:2] + picture[2::2]) / 2
+        assert np.abs(picture[1:-1:2] - between).max() < 20
+
+
+@pytest.mark.parametrize("name", ["a.insv", "a.360"])
+def test_recordings_of_360_degree_cameras_are_no_picture_of_one_lens(tmp_path: Path, name) -> None:
+    write_video(tmp_path / "a.mp4", [CARD] * 2)
+    (tmp_path / "a.mp4").rename(tmp_path / name)
+    with refused("a 360-degree camera", "export a flat"):
+        survey(tmp_path / name, DataConfig())
+
+
 def test_what_is_no_video_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     path.write_bytes(b"this is a text file, not a film")

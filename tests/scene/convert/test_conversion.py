@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import sys
 from pathlib import Path
@@ -20,7 +21,7 @@ from p2gs_jax.photometry.calibrate import options_of
 from p2gs_jax.run.scene_file import read_scene, write_scene
 from p2gs_jax.scene import ImageStore, load_scene
 from p2gs_jax.scene.convert.convert import Converted, convert_photographs, with_originals
-from p2gs_jax.scene.convert.readers import exif_evs, read_exif_settings
+from p2gs_jax.scene.convert.readers import exif_evs, exif_of_raw, read_exif_settings
 from p2gs_jax.scene.files import image_size, list_images
 from p2gs_jax.scene.survey import survey
 
@@ -164,6 +165,51 @@ def test_ten_bit_heic_keeps_its_precision(folder: Path) -> None:
     codes = stored(converted(folder).paths[0])
     assert codes.dtype == np.uint16
     assert len(np.unique(codes[32, :, 1])) > 25  # 8 bits have 8 levels here
+
+
+@pytest.mark.parametrize("deep", [False, True], ids=["8 bits", "10 bits"])
+def test_white_is_white_and_coded_primaries_are_brought_to_srgb(folder: Path, deep: bool) -> None:
+    top, kind = (65535, np.uint16) if deep else (255, np.uint8)
+    for name, colour in {"green": (60, 200, 60), "white": (255, 255, 255)}.items():
+        pixels = np.full((64, 96, 3), np.array(colour) * (top // 255), kind)
+        # Display P3 without a profile.
+        coded = {"color_primaries": 12, "transfer_characteristics": 13, "matrix_coefficients": 6}
+        save_heic(folder / f"{name}.heic", pixels, full_range_flag=1, **coded)
+    green, white = (stored(path)[32, 48] / 257 for path in converted(folder).paths)
+    np.testing.assert_allclose(green, (0, 203, 11), atol=1.5)
+    np.testing.assert_allclose(white, 255, atol=0.01)
+
+
+def tiff(tags: dict) -> bytes:
+    exif = Image.Exif()
+    exif.update(tags)
+    return exif.tobytes()[6:]
+
+
+def embedded(kind: str) -> bytes:
+    """Return the beginning of a raw file that is no plain TIFF."""
+    camera, shot = tiff({0x010F: "Made", 0x0110: "One"}), tiff({0x829A: 0.5, 0x829D: 2.0})
+    if kind == "cr3":
+        boxes = ((b"CMT1", camera), (b"CMT2", shot))
+        packed = b"".join((len(d) + 8).to_bytes(4, "big") + n + d for n, d in boxes)
+        return b"\0\0\0\x18ftypcrx \0\0\0\1crx isom" + packed
+    if kind == "raf":
+        data = io.BytesIO()
+        exif = Image.Exif()
+        exif.load(b"Exif\0\0" + camera)
+        Image.new("RGB", (8, 8)).save(data, "JPEG", exif=exif)
+        head = b"FUJIFILMCCD-RAW 0201".ljust(84, b"\0") + (160).to_bytes(4, "big")
+        return head.ljust(160, b"\0") + data.getvalue()
+    mark = {"rw2": b"U\0", "orf": b"RO"}[kind]
+    return camera[:2] + (mark if camera[:2] == b"II" else mark[::-1]) + camera[4:]
+
+
+@pytest.mark.parametrize("kind", ["cr3", "raf", "rw2", "orf"])
+def test_cameras_are_named_in_raw_files_of_every_maker(kind: str) -> None:
+    exif = exif_of_raw(io.BytesIO(embedded(kind)))
+    assert (exif[0x010F], exif[0x0110]) == ("Made", "One")
+    if kind == "cr3":
+        assert exif.get_ifd(0x8769)[0x829D] == 2.0
 
 
 # ------------------------------------------------------------- linear light

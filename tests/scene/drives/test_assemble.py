@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
 
+import cv2
 import numpy as np
 import pytest
 from made_drive import FAR, PERIOD, WALL, camera_pose, make_recording, tracked_car
@@ -92,6 +93,29 @@ def test_every_camera_holds_out_the_same_frames(drive):
     assert any("No LiDAR sweep" in note for note in scene.notes)
     held_out = {(v.camera, v.frame) for v in assign_split(scene.views, 4) if v.split == "test"}
     assert held_out == {("CAM_BACK", 4), ("CAM_FRONT", 0), ("CAM_FRONT", 4)}
+
+
+def test_calibration_is_compared_with_the_photographs(drive):
+    def made(size, camera="CAM_FRONT"):
+        for photograph in drive.photographs:
+            if photograph.camera == camera:
+                cv2.imwrite(str(photograph.path), np.zeros((*size, 3), np.uint8))
+        return assemble(drive, PLAIN)
+
+    scene = made((32, 48))
+    front, back = (
+        next(v for v in scene.views if v.camera == f"CAM_{n}") for n in ("FRONT", "BACK")
+    )
+    assert (front.width, front.height) == (48, 32)
+    np.testing.assert_allclose(front.K[:2], back.K[:2] / 2)
+    assert any("6 images have another size than the calibration says" in n for n in scene.notes)
+    with pytest.raises(UserError, match=r"wrong size: .*is 64x96"):
+        made((96, 64))
+    made((64, 96))
+    aside = np.array([[0, 0, 40], [0, 0, 0], [0, 0, 0]])
+    shifted = [replace(c, K=c.K + aside) for c in drive.cameras]
+    with pytest.raises(UserError, match="principal point at 88, 32, far from the middle"):
+        assemble(replace(drive, cameras=shifted), PLAIN)
 
 
 def test_missing_photographs_stop_or_are_counted(drive):

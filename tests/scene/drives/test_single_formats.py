@@ -12,7 +12,7 @@ from scene.drives import writers_kitti as kitti
 from scene.drives import writers_nuscenes as nuscenes
 from scene.drives import writers_pandaset as pandaset
 from scene.drives import writers_waymo as waymo
-from scene.drives.writers import car_at, cut, inv, jpeg, write_bytes
+from scene.drives.writers import HEIGHT, WIDTH, car_at, cut, inv, jpeg, write_bytes
 
 from p2gs_jax.errors import UserError
 
@@ -306,3 +306,23 @@ def test_what_kitti_lacks_is_counted(write, read, tmp_path):
         "2 boxes are of frames without a LiDAR time: they are left out.",
     ]
     assert {p.frame for p in recording.photographs} == {0, 1, 2, 3, 4}
+
+
+def test_sizes_that_no_photograph_has_are_those_of_the_calibration(copied, read):
+    path = copied("pandaset").root / pandaset.FRONT / "intrinsics.json"
+    pandaset.put(path, {"fx": 1970, "fy": 1970, "cx": 970.0, "cy": 483.3})
+    front, left = read(path.parents[2]).cameras
+    assert (front.width, front.height) == (1920, 1080)
+    assert (left.width, left.height) == (WIDTH, HEIGHT)
+    date = copied("kitti_raw").root
+    path = date / "calib_cam_to_cam.txt"
+    plain = path.read_text()
+    path.write_text(
+        f"{plain}S_rect_02: {2 * WIDTH} {2 * HEIGHT}\nS_rect_03: {WIDTH + 0.4} {HEIGHT}\n"
+    )
+    sizes = {c.name: (c.width, c.height) for c in read(date).cameras}
+    assert sizes == {"image_02": (2 * WIDTH, 2 * HEIGHT), "image_03": (WIDTH, HEIGHT)}
+    path.write_text(f"{plain}S_rect_02: {2 * WIDTH} {HEIGHT}\nS_02: {WIDTH} {HEIGHT}\n")
+    with pytest.raises(UserError, match="is not rectified") as error:
+        read(date)
+    assert "_sync" in error.value.fix
