@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from p2gs_jax.core.text import natural
 from p2gs_jax.errors import UserError
 from p2gs_jax.paths.shots import Pose, Poses, Shot, pose_of
 from p2gs_jax.scene.rigid import camera_centers, inverse, moment_of, up_direction
@@ -73,7 +74,7 @@ def find_rig(shots: Sequence[Shot], views: Sequence[View]) -> Rig:
             moment = moment_of(views[shot.view])
             name = moment if isinstance(moment, str) else f"{moment:06d}"
             steps[name][views[shot.view].camera] = shot
-    common = {name: found for name, found in sorted(steps.items()) if len(found) > 1}
+    common = {name: found for name, found in steps.items() if len(found) > 1}
     if len(cameras) < 2 or not common:
         have = "one camera" if len(cameras) < 2 else "cameras whose file names never agree"
         raise UserError(
@@ -81,6 +82,7 @@ def find_rig(shots: Sequence[Shot], views: Sequence[View]) -> Rig:
             fix="give photographs taken at the same time the same name in a folder per camera, "
             "or leave out --panorama",
         )
+    common = {name: common[name] for name in sorted(common, key=natural)}
     mounts = _mounts(cameras, list(common.values()))
     on_rig = []
     for name, found in common.items():

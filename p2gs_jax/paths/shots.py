@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
+from p2gs_jax.core.text import natural
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.lens import scale_intrinsics
 from p2gs_jax.scene.pixels.store import camera_at
@@ -95,7 +96,7 @@ def of_camera(shots: Sequence[Shot], views: Sequence[View], camera: str | None) 
     if not chosen:
         known = ", ".join(sorted(counts)) or "none"
         raise UserError(f"--camera {camera!r} took none of these views.", fix=f"choose of: {known}")
-    return sorted(chosen, key=lambda s: s.name)
+    return sorted(chosen, key=lambda s: natural(s.name))
 
 
 def common_lens(shots: Sequence[Shot]) -> tuple[Float[np.ndarray, "3 3"], int, int]:

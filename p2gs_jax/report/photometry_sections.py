@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from p2gs_jax.config import PhotometryConfig
+from p2gs_jax.core.text import natural
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.formation import inverse_tone_map
 from p2gs_jax.photometry.models import MODELS
@@ -68,12 +69,13 @@ def _chart(
 
     `curves` returns those of a panel from its views and their places.
     """
-    by_camera = {f"camera {c}": [v for v in run.views if v["camera"] == c] for c in run.cameras}
+    views = sorted(run.views, key=lambda v: natural(v["image"]))
+    by_camera = {f"camera {c}": [v for v in views if v["camera"] == c] for c in run.cameras}
     small = np.median([len(rows) for rows in by_camera.values()]) < FEWEST_VIEWS
     if len(by_camera) > MOST_PANELS or small:
-        by_camera = {"all photographs": run.views}
+        by_camera = {"all photographs": views}
     elif len(by_camera) == 1:
-        by_camera = {"": run.views}
+        by_camera = {"": views}
     panels = [(title, curves(v, np.arange(1.0, len(v) + 1))) for title, v in by_camera.items()]
     order = "photograph, in the order of names"
     chart = panels_chart(panels, y_label=y_label, x_label=order, label=label, band=band)

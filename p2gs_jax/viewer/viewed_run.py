@@ -14,7 +14,7 @@ from p2gs_jax.photometry.display import develop
 from p2gs_jax.render.project import at_time
 from p2gs_jax.run.read import Run
 from p2gs_jax.scene.pixels.store import size_at
-from p2gs_jax.scene.rigid import camera_centers
+from p2gs_jax.scene.rigid import camera_centers, time_order
 from p2gs_jax.types import Camera
 from p2gs_jax.viewer.camera import (
     TYPICAL_DISTANCE,
@@ -121,10 +121,10 @@ class ViewedRun:
         return self._pose_at(viewmat, nearest, aspect), nearest
 
     def frames(self, camera: str) -> tuple[int, ...]:
-        """Return the rows of a physical camera's views, in the order of names."""
+        """Return the rows of a physical camera's views, in the order of time."""
         views = self.run.scene.views
         rows = (row for row, view in enumerate(views) if view.camera == camera)
-        return tuple(sorted(rows, key=lambda row: views[row].name))
+        return tuple(sorted(rows, key=lambda row: time_order(views[row])))
 
     def thumbnail(self, index: int) -> UInt8[np.ndarray, "h w 3"] | None:
         """Return a small picture of a photograph, or None where it cannot be read."""
