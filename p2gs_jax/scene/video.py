@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -208,7 +209,7 @@ def no_frames(path: Path, count: int) -> UserError:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
-    if path.suffix.lower() in _ALL_ROUND:
+    if path.suffix.lower() in _ALL_ROUND or _is_spherical(path):
         why = "is the recording of a 360-degree camera, which is no picture of one lens."
         fix = "export a flat (reframed) video of it with the camera's program, and fit that"
         raise broken(path, why, fix)
@@ -226,6 +227,22 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
             why = f"holds no video, but {', '.join(kinds)}."
             raise broken(path, why, "name the file that holds the pictures")
         yield container, streams[0]
+
+
+def _is_spherical(path: Path) -> bool:
+    """Return whether an .mp4 or .mov says that it shows all around (Google's Spherical Video)."""
+    with contextlib.suppress(OSError), path.open("rb") as file:
+        while len(head := file.read(8)) == 8:
+            size, name = int.from_bytes(head[:4]) - 8, head[4:]
+            if size == 1 - 8:
+                size = int.from_bytes(file.read(8)) - 16
+            if size < 0:
+                return False
+            if name == b"moov":
+                said = file.read(size)
+                return b"GSpherical:Spherical>" in said or b"sv3d" in said
+            file.seek(size, os.SEEK_CUR)
+    return False
 
 
 def _signal(frame: av.VideoFrame) -> Float[np.ndarray, "h w 3"]:

@@ -123,10 +123,17 @@ def test_two_moments_in_a_frame_are_taken_apart(tmp_path: Path) -> None:
         assert np.abs(picture[1:-1:2] - between).max() < 20
 
 
-@pytest.mark.parametrize("name", ["a.insv", "a.360"])
+@pytest.mark.parametrize("name", ["a.insv", "a.360", "a.mp4"])
 def test_recordings_of_360_degree_cameras_are_no_picture_of_one_lens(tmp_path: Path, name) -> None:
-    write_video(tmp_path / "a.mp4", [CARD] * 2)
-    (tmp_path / "a.mp4").rename(tmp_path / name)
+    write_video(tmp_path / "plain.mp4", [CARD] * 2)
+    data = (tmp_path / "plain.mp4").read_bytes()
+    if name == "a.mp4":
+        # As stitching programs mark what they export.
+        at = data.index(b"moov") - 4
+        size = int.from_bytes(data[at : at + 4], "big")
+        mark = b"\0\0\0\x1euuid<GSpherical:Spherical>"
+        data = data[:at] + (size + len(mark)).to_bytes(4, "big") + data[at + 4 : at + size] + mark
+    (tmp_path / name).write_bytes(data)
     with refused("a 360-degree camera", "export a flat"):
         survey(tmp_path / name, DataConfig())
 

@@ -134,7 +134,7 @@ def read_heif(path: Path) -> Picture:
         # Codes of 10 and 12 bits come shifted: the largest is to be white.
         white = pixels.max(initial=0) | (2**16 - 2 ** (16 - int(info.get("bit_depth", 16))))
         pixels = np.rint(pixels * (65535 / white)).astype(np.uint16)
-    coded, transfer = _code_points(path)
+    coded, transfer = _code_points(info.get("nclx_profile"), path)
     if transfer is None:
         profile = info.get("icc_profile")
         own = None if profile or pixels.shape[2] < 3 else coded_profile(coded)
@@ -146,16 +146,17 @@ def read_heif(path: Path) -> Picture:
     return Picture(light=light.astype(np.float32), exif=exif)
 
 
-def _code_points(path: Path) -> tuple[int, Transfer | None]:
+def _code_points(nclx: dict | None, path: Path) -> tuple[int, Transfer | None]:
     """Return the primaries of a HEIC or AVIF (ITU-T H.273), 0: unknown, and its transfer function.
 
-    They stand in its box of colours, which only one of the two libraries tells of.
+    They stand in its box of colours, `nclx`, which Pillow does not tell of.
     """
-    data = path.read_bytes()
-    at = data.find(b"colrnclx") + len(b"colrnclx")
-    if at < len(b"colrnclx"):
-        return 0, None
-    primaries, transfer = struct.unpack(">HH", data[at : at + 4].ljust(4, b"\0"))
+    if nclx:
+        names = ("color_primaries", "transfer_characteristics")
+        primaries, transfer = (int(nclx.get(name, 0)) for name in names)
+    else:
+        _, found, data = path.read_bytes().partition(b"colrnclx")
+        primaries, transfer = struct.unpack(">HH", data[:4].ljust(4, b"\0")) if found else (0, 0)
     return primaries, TRANSFERS.get(transfer)
 
 
