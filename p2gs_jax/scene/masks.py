@@ -48,6 +48,8 @@ def find_masks(views: Sequence[View], root: Path) -> tuple[list[Path | None], di
     the scene's root, or beside their photographs. They are called as the photograph, whatever the
     case and the suffix, perhaps with "mask" before or behind; beside it they must be.
     """
+    # A scene may be named by its .json.
+    root = root if root.is_dir() else root.parent
     folders: dict[Path, dict[str, Path]] = {}
     found: list[Path | None] = []
     for view in views:
