@@ -135,8 +135,8 @@ def _opacity(paths: Sequence[Path]) -> tuple[int, int]:
     least, most = 255, 0
     for path in paths:
         with contextlib.suppress(Exception), Image.open(path) as image:
-            low, high = image.convert("RGBA").getchannel("A").getextrema()
-            least, most = min(least, low), max(most, high)
+            alpha = np.asarray(image.convert("RGBA").getchannel("A"))
+            least, most = min(least, int(alpha.min())), max(most, int(alpha.max()))
         if least < 255 and most > 0:
             break
     return least, max(least, most)
