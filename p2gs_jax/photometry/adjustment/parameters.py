@@ -278,16 +278,8 @@ class System(NamedTuple):
     basis: sp.csr_array  # columns are the free directions
     anchors: Held  # the gauges; their precisions are relative (`gauges`)
     priors: Held  # what is known
-    log_exposure: Float[np.ndarray, " v"]  # prior mean of h: where rounds start
+    start: Parameters  # where rounds begin: at the prior mean of h
     smoothness: Float[np.ndarray, "k k"]  # its quadratic form keeps a spline smooth
-
-    @property
-    def start(self) -> Parameters:
-        """Where rounds begin."""
-        u = self.unknowns
-        b = np.repeat(self.log_exposure[:, None], u.channels, 1)
-        k, c = (np.zeros(terms.count) for terms in (u.features, u.splines))
-        return Parameters(b, np.ones(u.views), k, c)
 
     def gauges(self, normal: Matrix) -> tuple[float, sp.csr_array]:
         """Return how hard gauges hold, by the exposures' information, and rows times its root.
@@ -325,12 +317,14 @@ def make_system(problem: Problem, form: Form, splines: ResponseKind | None = Non
     if model.gamma == "camera" and problem.told.size:
         # What is expected of a camera counts once, not in each view.
         of_gammas /= np.bincount(cameras)[cameras]
+    start = np.repeat(log_exposure[:, None], unknowns.channels, 1)
+    more = (np.zeros(terms.count) for terms in (unknowns.features, unknowns.splines))
     return System(
         unknowns=unknowns,
         basis=sp.csr_array(basis),
         anchors=_anchors(problem, unknowns, log_exposure, precision),
         priors=_priors(unknowns, log_exposure, precision, of_gammas),
-        log_exposure=log_exposure,
+        start=Parameters(start, np.ones(views), *more),
         smoothness=_smoothness(unknowns.splines),
     )
 
