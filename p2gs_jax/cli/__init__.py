@@ -16,6 +16,7 @@ from p2gs_jax.errors import UserError
 # Silence the native libraries before they load.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 os.environ.setdefault("GLOG_minloglevel", "3")
+os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # warnings name files as they are
 # Where Pillow refuses, too (scene/files.py): what a header says is not decoded to find out.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2 * 89_478_485))
 
