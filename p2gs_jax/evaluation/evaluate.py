@@ -19,6 +19,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float32
@@ -84,7 +85,8 @@ class Judge:
         self.scene, self.store, self.cfg = scene, store, cfg
         self.lpips_weights, self.reference = lpips_weights, reference
         # Small arrays stay on the host.
-        self.small: Params = jax.tree.map(np.asarray, replace(params, gaussians=None))
+        without = eqx.tree_at(lambda p: p.gaussians, params, None)
+        self.small: Params = jax.tree.map(np.asarray, without)
         self.mean = mean_parameters(self.small.photometry)
         self.taken_by = [view.camera for view in scene.training_views]
         self.row_of = {index: row for row, index in enumerate(scene.train_indices)}
