@@ -31,10 +31,15 @@ from p2gs_jax.scene.lens import scale_intrinsics
 
 IMAGE_SUFFIXES = CONVERTED_SUFFIXES | {*(".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm")}
 # Folders of masks, and what tells a mask from its photograph: `a_mask`, `a.mask`, `mask_a`, ...
-MASK_FOLDERS = ("masks", "mask")
+MASK_FOLDERS = ("masks", "mask", "dynamic_masks", "dynamic_mask")
+# Folders of pictures that are no photographs.
+OTHER_FOLDERS = {*MASK_FOLDERS, "depth", "depths", "normal", "normals"}
 _MASK_NAME = re.compile(r"^(dynamic_)?masks?[._-](?=.)|(?<=.)[._-](dynamic_)?masks?$")
+_TWICE = re.compile(r"\.(jpe?g|png)\.png$", re.IGNORECASE)
 # Ratios of width to height that differ by more than this are different shapes.
 ASPECT_TOLERANCE = 0.01
+# Principal points lie this near to the middle of photographs, in their sides.
+MOST_OFF = 0.25
 # Finite numbers from here on are not finite in float32 arithmetic.
 HUGE = 1e30
 _MOVED = "move it there; or name the folder of all photographs with --images, and names in it"
@@ -51,7 +56,8 @@ Report = Callable[[str], None]
 def list_images(folder: Path, *, recursive: bool = True) -> list[Path]:
     """Return the photographs in a folder, which may be absent, sorted by their relative path.
 
-    Hidden ones are left out, and so are masks: in a folder of masks, or named after a photograph.
+    Hidden ones are left out, and so are masks, in a folder of masks or named after a photograph,
+    and what lies in a folder of depths or normals.
     """
     if not folder.is_dir():
         return []
@@ -59,8 +65,7 @@ def list_images(folder: Path, *, recursive: bool = True) -> list[Path]:
     found = (p for p in files if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
     relative = (p.relative_to(folder) for p in found)
     visible = [p for p in relative if not any(part.startswith(".") for part in p.parts)]
-    masked = {*MASK_FOLDERS}
-    outside = [p for p in visible if masked.isdisjoint(map(str.lower, p.parts[:-1]))]
+    outside = [p for p in visible if OTHER_FOLDERS.isdisjoint(map(str.lower, p.parts[:-1]))]
     named = {p for p in outside if named_as_mask(p.name)}
     taken = {name_without_mask(p.as_posix()) for p in outside if p not in named}
     masks = {p for p in named if name_without_mask(p.as_posix()) in taken or _always_mask(p.name)}
@@ -68,8 +73,8 @@ def list_images(folder: Path, *, recursive: bool = True) -> list[Path]:
 
 
 def named_as_mask(name: str) -> bool:
-    """Return whether the name of a file says that it may be a mask."""
-    return _MASK_NAME.search(_bare(name)) is not None
+    """Return whether the name of a file says that it may be a mask, also as `a.jpg.png`."""
+    return _MASK_NAME.search(_bare(name)) is not None or _TWICE.search(name) is not None
 
 
 def _always_mask(name: str) -> bool:

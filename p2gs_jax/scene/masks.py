@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Iterator, Sequence
+import functools
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -44,42 +45,56 @@ def attach_masks(scene: Scene) -> tuple[tuple[View, ...], list[str]]:
 def find_masks(views: Sequence[View], root: Path) -> tuple[list[Path | None], dict[Path, int]]:
     """Return the mask of each view, or None, and how many files folders without any hold.
 
-    Masks lie in `masks` or `mask`, beside the folder of the photographs, in it or above it below
+    Masks lie in a folder of `MASK_FOLDERS` beside that of the photographs, in it or above it below
     the scene's root, or beside their photographs. They are called as the photograph, whatever the
     case and the suffix, perhaps with "mask" before or behind; beside it they must be.
     """
     # A scene may be named by its .json.
     root = root if root.is_dir() else root.parent
     folders: dict[Path, dict[str, Path]] = {}
+    folders_of = functools.cache(_mask_folders)
     found: list[Path | None] = []
     for view in views:
         found.append(None)
-        for folder, name in _places(view, root):
+        for folder, name in _places(view, root, folders_of):
             if folder not in folders:
                 folders[folder] = _masks_in(folder)
             if held := folders[folder]:
                 found[-1] = _exact(folder, name) or held.get(name_without_mask(name))
                 if found[-1] is not None:
                     break
-    return found, {f: len(held) for f, held in folders.items() if held and f.name in MASK_FOLDERS}
+    return found, {f: len(held) for f, held in folders.items() if held and _apart(f)}
 
 
-def _places(view: View, root: Path) -> Iterator[tuple[Path, str]]:
+def _apart(folder: Path) -> bool:
+    """Return whether a folder is one of masks, in letters of any size."""
+    return folder.name.lower() in MASK_FOLDERS
+
+
+def _mask_folders(place: Path) -> list[Path]:
+    """Return the folders of masks in a folder, the commonest name first."""
+    found = [p for p in place.iterdir() if _apart(p) and p.is_dir()] if place.is_dir() else []
+    return sorted(found, key=lambda p: (MASK_FOLDERS.index(p.name.lower()), p.name))
+
+
+def _places(
+    view: View, root: Path, folders_of: Callable[[Path], list[Path]]
+) -> Iterator[tuple[Path, str]]:
     """Yield folders in which the mask of a view may lie, and what it may be called there."""
     images, path = image_folder_of(view), view.image_path
     above = images.parents[1:] if root in images.parents else ()
     for place in (images.parent, images, *(p for p in above if p.is_relative_to(root))):
         parts = path.relative_to(place).parts
         for k in range(len(parts) - len(Path(view.name).parts), -1, -1):
-            for folder in MASK_FOLDERS:
-                yield place / folder, "/".join(parts[k:])
-    yield from ((root / folder, view.name) for folder in MASK_FOLDERS)
+            for folder in folders_of(place):
+                yield folder, "/".join(parts[k:])
+    yield from ((folder, view.name) for folder in folders_of(root))
     yield path.parent, path.name
 
 
 def _masks_in(folder: Path) -> dict[str, Path]:
     """Return the masks in a folder by what they share with photographs; others are left out."""
-    apart = folder.name in MASK_FOLDERS
+    apart = _apart(folder)
     files = folder.glob("**/*" if apart else "*")
     files = (p for p in files if p.suffix.lower() in IMAGE_SUFFIXES and p.name[0] != ".")
     files = (p for p in files if apart or named_as_mask(p.name))
@@ -90,7 +105,7 @@ def _exact(folder: Path, name: str) -> Path | None:
     """Return the mask in a folder of masks that is called as its photograph, if there is one."""
     path = folder / name
     names = (path, path.with_suffix(".png"), path.with_name(path.name + ".png"))
-    return next((p for p in names if folder.name in MASK_FOLDERS and p.is_file()), None)
+    return next((p for p in names if _apart(folder) and p.is_file()), None)
 
 
 def image_folder_of(view: View) -> Path:

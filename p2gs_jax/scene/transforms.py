@@ -276,6 +276,10 @@ def _view(frame: _Frame, folder: Path, name: str) -> tuple[View, bool]:
     except (TypeError, ValueError, OverflowError):
         raise broken(f"{path}:", f"{name} has an impossible size w, h", _FIX) from None
     K, distortion = _lens(path, values, name, *size)
+    if not {"w", "h"} <= set(values) and np.abs(K[:2, 2] / size - 0.5).max() > files.MOST_OFF:
+        why = f"{name} has its principal point at {K[0, 2]:.0f}, {K[1, 2]:.0f}, far from the middle"
+        fix = "write w and h, the size to which the lens belongs"
+        raise broken(f"{path}:", f"{why} of its {size[0]}x{size[1]} pixels", fix)
     K, width, height = at_file_size(image_path, K, size, path)
     mask = values.get("mask_path")
     mask_path = _beside(path, mask) if isinstance(mask, str) and mask else None

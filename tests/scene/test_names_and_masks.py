@@ -55,6 +55,7 @@ MASKS = [
     *("masks/im 0.png", "masks/im 0.png.png", "masks/IM 0.PNG", "masks/im 0.jpg"),
     *("masks/im 0_mask.png", "masks/im 0.mask.png", "masks/mask_im 0.png", "mask/im 0.png"),
     *("images/masks/im 0.png", "images/im 0_mask.png", "images/dynamic_mask_im 0.png"),
+    *("Masks/im 0.png", "dynamic_masks/im 0.png", "images/im 0.png.png"),
 ]
 
 

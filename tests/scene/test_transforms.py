@@ -90,6 +90,8 @@ def test_frames_override_cameras_follow_folders_and_other_sizes_are_rescaled(tmp
     assert "2 images have another size" in scene.notes[0]
     with refused("wrong size"):
         find_scene(write(tmp_path, {**data, "h": 80}), CFG)
+    with refused("principal point at 40, 15, far from the middle of its 40x30", "write w and h"):
+        find_scene(write(tmp_path, {"fl_x": 100, "cx": 40, "frames": data["frames"]}), CFG)
 
 
 SINGULAR = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]]

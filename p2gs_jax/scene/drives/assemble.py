@@ -26,6 +26,7 @@ from p2gs_jax.scene.drives.recording import (
 )
 from p2gs_jax.scene.drives.tables import counted
 from p2gs_jax.scene.files import (
+    MOST_OFF,
     Report,
     at_file_size,
     check_missing,
@@ -37,8 +38,6 @@ from p2gs_jax.types import Lidar, Scene, TrackedObject, View
 
 # World coordinates further than this from 0 are moved there: float32 has 7 digits.
 FARTHEST_ORIGIN = 1000.0
-# Principal points lie this near to the middle of photographs, in their sides.
-MOST_OFF = 0.25
 # Sweeps belong to the chosen frames when they are this near to them, seconds.
 SWEEP_SLACK_S = 0.1
 
