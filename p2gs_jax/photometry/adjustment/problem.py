@@ -42,13 +42,12 @@ class Layout:
         lengths = np.bincount(points, minlength=observations.point_count)
         used = lengths[lengths > 0]
         typical = int(np.quantile(used, 0.9)) if len(used) else 2
-        self.slots = int(min(LONGEST_ROW, max(2, 2 ** int(np.ceil(np.log2(max(typical, 2)))))))
+        self.slots = int(min(LONGEST_ROW, 2 ** int(np.ceil(np.log2(max(typical, 2))))))
         split = -(-lengths // self.slots)
         first = np.concatenate([[0], np.cumsum(split)])
         order = np.argsort(points, kind="stable")
-        starts = np.concatenate([[0], np.cumsum(lengths)])
         rank = np.empty(len(points), int)
-        rank[order] = np.arange(len(points)) - starts[points[order]]
+        rank[order] = np.arange(len(points)) - np.searchsorted(points[order], points[order])
         self.row = first[points] + rank % np.maximum(split[points], 1)
         self.rows = int(first[-1])
         self.point_of_row = np.repeat(np.arange(observations.point_count), split)

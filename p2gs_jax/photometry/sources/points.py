@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.streams import Stream, generator
@@ -75,8 +75,10 @@ def projected_colors(
         xy, z = project_points(scene.points, view)
         where.append(xy[chosen])
         seen.append(unoccluded(xy, z, view.width, view.height)[chosen])
-    kept = thinned(np.stack(seen), rng, MOST_PER_POINT)
-    return _sampled_where_seen(scene, store, chosen, where, kept, on_view)
+    picks = thinned(np.stack(seen), rng, MOST_PER_POINT)
+    points, xy = [chosen[p] for p in picks], [at[p] for at, p in zip(where, picks, strict=True)]
+    how = {"uncertainty": PROJECTED_UNCERTAINTY, "on_view": on_view}
+    return point_colors(scene, store, points, xy, **how)
 
 
 def rendered_colors(
@@ -111,33 +113,17 @@ def rendered_colors(
         xy, z = project_points(jnp.asarray(world), camera)
         seen.append(np.asarray(visible(xy, z, depth)))
         where.append(np.asarray(xy) * [view.width / camera.width, view.height / camera.height])
-    kept = thinned(np.stack(seen), rng, RENDERED_PER_POINT)
+    picks = thinned(np.stack(seen), rng, RENDERED_PER_POINT)
+    xy = [at[pick] for at, pick in zip(where, picks, strict=True)]
     warped = dataclasses.replace(scene, points=world)
-    return _sampled_where_seen(warped, store, np.arange(len(world)), where, kept, None)
-
-
-def _sampled_where_seen(
-    scene: Scene,
-    store: ImageStore,
-    chosen: np.ndarray,
-    where: list[np.ndarray],
-    kept: Bool[np.ndarray, "v c"],
-    on_view: OnView,
-) -> Observations:
-    """Sample chosen points in the views that keep them, where they are at full resolution."""
-    picks = [np.flatnonzero(row) for row in kept]
-    points = [chosen[pick] for pick in picks]
-    xy = [where[row][pick] for row, pick in enumerate(picks)]
-    return point_colors(
-        scene, store, points, xy, uncertainty=PROJECTED_UNCERTAINTY, on_view=on_view
-    )
+    return point_colors(warped, store, picks, xy, uncertainty=PROJECTED_UNCERTAINTY)
 
 
 def thinned(
     seen: Bool[np.ndarray, "v p"], rng: np.random.Generator, most: int
-) -> Bool[np.ndarray, "v p"]:
-    """Return at most `most` of the views that see each point, evenly at random."""
+) -> list[Int[np.ndarray, " _"]]:
+    """Return points of each view, each in at most `most` of those that see it, evenly at random."""
     order = rng.random(seen.shape)
     order[~seen] = 2.0
     rank = np.argsort(np.argsort(order, axis=0), axis=0)
-    return seen & (rank < most)
+    return [np.flatnonzero(row) for row in seen & (rank < most)]
