@@ -48,10 +48,11 @@ class Eval:
         from p2gs_jax.evaluation.references import find_radiance, load_reference
         from p2gs_jax.evaluation.renders_of_others import find_renders
         from p2gs_jax.render.capacity import make_renderer
-        from p2gs_jax.run.folder import RunFolder
+        from p2gs_jax.run.folder import RunFolder, require_free
         from p2gs_jax.run.photometry_files import write_metering
         from p2gs_jax.run.read import load_run
 
+        require_free(self.run)
         fitted = load_run(self.run, self.scene)
         fitted.require_photographs()
         scene, store, cfg, folder = fitted.scene, fitted.store, fitted.cfg, RunFolder(self.run)

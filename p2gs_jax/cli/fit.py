@@ -36,7 +36,8 @@ class Fit:
     """Run folder to create."""
     config: Config
     resume: bool = False
-    """Continue an interrupted run; give the options it was started with."""
+    """Continue an interrupted run; give the options it was started with. A larger --steps or
+    --budget also continues one that is finished."""
     preset: Preset = "robust"
     """Initial values: robust; the method as printed, paper or paper_appendix; baselines 3dgs
     (3dgs_published: as printed, 30000 steps), 3dgs_gain, 3dgs_affine, 3dgs_bilateral, 3dgs_curve,

@@ -24,7 +24,8 @@ from p2gs_jax.pipeline.calibrate import Calibration
 WORDS = ("views", "view", "camera", "protocol", "program", "lens", "configuration", "")
 # Parts of a fit, as metrics.json has them under "seconds".
 PARTS = ("starting", "reading", "structure_from_motion", "photometry", "seeds", "compiling")
-PARTS += ("steps", "densification", "looking", "checkpoints", "evaluation", "files")
+PARTS += ("steps", "densification", "looking", "checkpoints", "blocks", "seams")
+PARTS += ("evaluation", "files")
 
 
 def stdout() -> Console:

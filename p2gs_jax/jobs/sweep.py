@@ -80,7 +80,7 @@ def sweep(
     _check(configs, seeds, max_parallel)
     check_engine(engine)
     out.mkdir(parents=True, exist_ok=True)
-    jobs, rows = _planned(scene, out, configs, seeds, reference)
+    jobs, rows, longer = _planned(scene, out, configs, seeds, reference)
 
     def tell(number: int, state: JobState | None) -> None:
         """Note what became of a run; None: it was there before."""
@@ -93,7 +93,7 @@ def sweep(
         write_text(out / TABLE_TEXT, to_markdown(rows))
 
     with locked(out):
-        left = [number for number, job in enumerate(jobs) if not _metrics(job.folder).exists()]
+        left = [k for k, job in enumerate(jobs) if k in longer or not _metrics(job.folder).exists()]
         for number in sorted({*range(len(jobs))} - {*left}):
             tell(number, None)
         if left:
@@ -115,18 +115,22 @@ def _planned(
     configs: Mapping[str, FitConfig],
     seeds: Sequence[int],
     reference: str | Path | None,
-) -> tuple[list[Job], list[dict[str, Any]]]:
-    """Return the jobs of all configurations and seeds, and the beginning of their rows."""
-    jobs, rows = [], []
+) -> tuple[list[Job], list[dict[str, Any]], set[int]]:
+    """Return the jobs of all configurations and seeds, and the beginning of their rows.
+
+    The numbers are of the runs that are planned for longer than they were.
+    """
+    jobs, rows, longer = [], [], set()
     truth = None if reference is None else Path(reference)
     for name, cfg in configs.items():
         for seed in seeds:
             seeded = with_fields(cfg, {"train.seed": seed})
             folder = out / slug(name) / f"seed_{seed}"
-            check_run_dir(folder, True, seeded)
+            if check_run_dir(folder, True, seeded):
+                longer.add(len(jobs))
             jobs.append(fit_job(f"{name}, seed {seed}", scene, folder, seeded, truth))
             rows.append({"name": name, "seed": seed, "run": str(folder), "status": "waiting"})
-    return jobs, rows
+    return jobs, rows, longer
 
 
 def _metrics(run: Path) -> Path:

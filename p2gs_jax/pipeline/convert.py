@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import shutil
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +41,8 @@ from p2gs_jax.types import Gaussians, Params, Scene
 
 # Steps of refitting colours and opacities, one view each.
 STEPS = 600
+# What to do about a run that is there: none is continued here.
+ELSEWHERE = "name another folder with --out"
 # Below this correlation of renders with photographs a model belongs to other poses, most likely.
 LEAST_AGREEMENT = 0.5
 
@@ -66,26 +71,26 @@ def calibrate_of(
     begin, compiler = time.monotonic(), CompileCounter()
     cfg = converting(require_config(cfg), steps)
     reporter, folder, scene_dir = reporter or Silent(), RunFolder(Path(out)), Path(scene_dir)
-    check_run_dir(folder.root, False, cfg)
+    check_run_dir(folder.root, False, cfg, way_on=ELSEWHERE)
     for source in (cfg.photometry.known, compare_with):
         check_source(source)
     reporter.stage("Reading the model")
     foreign, dropped = read_foreign(Path(model))
-    with no_empty_folders(folder.root), locked(folder.root):
+    with no_empty_folders(folder.root), locked(folder.root), _whole_or_nothing(folder) as opened:
+        check_run_dir(folder.root, False, cfg, way_on=ELSEWHERE)
         scene = load_scene(scene_dir, cfg.data, folder.root / "cache", reporter.message)
         if len(scene.train_indices) < 2:
             raise UserError(
                 f"{scene_dir} has {len(scene.train_indices)} training view(s); exposures need two.",
                 fix="add photographs that were posed together with the model",
             )
-        store = ImageStore(scene.views, cfg.data)
+        store = opened.enter_context(contextlib.closing(ImageStore(scene.views, cfg.data)))
         reporter.stage("Judging the model")
         before, agreement = score_foreign(foreign, scene, store, viewer_config(cfg.render))
         observations = _seen_through(foreign, scene, store, cfg, reporter)
         _check(observations, agreement, Path(model), scene_dir)
-        options, views = options_of(cfg, scene), scene.training_views
-        given = (views, observations, options, cfg, begin, compare_with, reporter)
-        found = solved(*given, scene.notes)
+        given = (observations, options_of(cfg, scene), cfg, begin, compare_with, reporter)
+        found = solved(scene.training_views, *given, scene.notes)
         start = _converted(foreign, scene, store, found.selection, cfg)
         start.notes += [*scene.notes, *found.selection.reasons, *found.solution.warnings]
         if dropped:
@@ -102,6 +107,21 @@ def calibrate_of(
         metrics = finish(params, scene, store, start.cfg, folder, account, reporter)
         found.write(folder.root)
     return dataclasses.replace(found, metrics=metrics)
+
+
+@contextlib.contextmanager
+def _whole_or_nothing(folder: RunFolder) -> Iterator[contextlib.ExitStack]:
+    """Leave no run where a conversion fails: nothing could continue it; close what it opened."""
+    before = folder.config.exists()
+    try:
+        with contextlib.ExitStack() as opened:
+            yield opened
+    except BaseException:
+        if not before:
+            for path in (folder.config, folder.decisions, folder.log):
+                path.unlink(missing_ok=True)
+            shutil.rmtree(folder.checkpoints, ignore_errors=True)
+        raise
 
 
 def _seen_through(

@@ -15,6 +15,7 @@ from p2gs_jax.core.progress import Reporter
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.alignment import ExposureError, exposure_error
 from p2gs_jax.pipeline.fit import fit
+from p2gs_jax.run.folder import locked, require_free
 from p2gs_jax.synth.sensor import read_true_exposures
 from p2gs_jax.synth.settings import image_height
 from p2gs_jax.synth.write import write_street
@@ -46,23 +47,26 @@ def run_demo(
     `frames` per camera, pictures `width` pixels wide, and exposures of ISO `iso_std` about 8.
 
     Raises:
-        UserError: `out` holds something that the demo did not make.
+        UserError: `out` holds something that the demo did not make, or that is being written to.
     """
     street, run_dir = out / "street", out / "run"
     marker = out / "demo.json"
     if out.exists() and any(out.iterdir()) and not marker.exists():
         raise UserError(f"{out} holds other files.", fix="name another folder with --out")
     out.mkdir(parents=True, exist_ok=True)
-    for folder in (street, run_dir):
-        shutil.rmtree(folder, ignore_errors=True)
     made: dict[str, Any] = {"frames": frames, "width": width, "iso_std": iso_std, "seed": seed}
-    write_json(marker, made)
-    height = image_height(width, multiple=4)
-    reporter.stage("Making the street")
-    write_street(street, height=height, **made)
-    reporter.message(f"Made a street: 3 cameras, {frames} frames each, {width}x{height}.")
-    truth, reference = read_true_exposures(street), street / "reference"
-    result = fit(street, run_dir, cfg, reference=reference, reporter=reporter, true_exposures=truth)
+    with locked(out):
+        require_free(run_dir)
+        for folder in (street, run_dir):
+            shutil.rmtree(folder, ignore_errors=True)
+        write_json(marker, made)
+        height = image_height(width, multiple=4)
+        reporter.stage("Making the street")
+        write_street(street, height=height, **made)
+        reporter.message(f"Made a street: 3 cameras, {frames} frames each, {width}x{height}.")
+        truth, reference = read_true_exposures(street), street / "reference"
+        given = {"reference": reference, "reporter": reporter, "true_exposures": truth}
+        result = fit(street, run_dir, cfg, **given)
     names = [view.name for view in result.scene.training_views]
     true = np.array([truth[n] for n in names])
     found = np.asarray(result.params.photometry.exposures, np.float64)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
@@ -58,7 +57,7 @@ def finish(
     """Evaluate, write all results, and return what `metrics.json` holds.
 
     Gaussians are the live ones, `owner` has the moving object of each, `cfg` is what the fit was
-    computed under; `still_ours` raises where the folder is another run's. The store is closed.
+    computed under; `still_ours` raises where the folder is another run's.
     """
     return_freed_memory()
     watch, exposures = Stopwatch(), {}
@@ -97,8 +96,6 @@ def finish(
     metrics = found.metrics | _accounted(account, watch, scene, cfg, reporter, found)
     still_ours()
     write_json(folder.metrics, metrics)
-    store.close()
-    shutil.rmtree(folder.pixels, ignore_errors=True)
     return metrics
 
 

@@ -30,12 +30,13 @@ from p2gs_jax.pipeline.finish import Account, finish, seconds_to_finish
 from p2gs_jax.pipeline.preflight import Paths, check_run_dir, check_scene, memory_named, preflight
 from p2gs_jax.pipeline.prepare import Prepared, expected, initialise
 from p2gs_jax.pipeline.survey import Survey, load, survey
-from p2gs_jax.presets import require_config
+from p2gs_jax.presets import require_config, with_values
 from p2gs_jax.render.tiles import slow_here
 from p2gs_jax.run.checkpoint import saved_steps
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.run.folder import RunFolder, locked
-from p2gs_jax.run.write import write_start
+from p2gs_jax.run.write import first_plan, write_start
+from p2gs_jax.scene.pixels.store import decoded_into
 from p2gs_jax.train.data_parallel import mesh_of
 from p2gs_jax.train.inputs import TrainingViews
 from p2gs_jax.train.loop import Trainer, TrainResult
@@ -97,17 +98,16 @@ def fit(
     weights = preflight(cfg, paths, resume=resume)
     clock, compiler = Stopwatch({"starting": spent_s} if spent_s else {}), CompileCounter()
     optimiser = Optimiser(folder, reporter, mesh_of(cfg, devices), Own(terms, formation, strategy))
-    with no_empty_folders(paths.run), locked(paths.run) as lock, memory_named(), optimiser:
+    pixels = decoded_into(folder.pixels)
+    with no_empty_folders(paths.run), locked(paths.run) as lock, pixels, memory_named(), optimiser:
         check_run_dir(paths.run, resume, cfg)  # another may have ended since
         scene = load(paths.scene, paths.run, cfg, reporter, clock)
         truth = check_scene(scene, cfg, paths, weights)
         kept = kept_choice(cfg, folder) if resume else None
-        with clock("photometry"):
-            found = survey(scene, cfg, pixels=folder.pixels)
-            how = {"on_chosen": optimiser.expect(found, kept), "dense": found.dense, "kept": kept}
-            exposures = solve_exposures(scene, found.still, cfg, reporter, **how)
-        with clock("seeds"):
-            start = initialise(found, exposures, reporter)
+        # A run that goes on for longer starts from what it was begun with.
+        asked = with_values(cfg, first_plan(folder))
+        start = _prepared(scene, asked, folder, optimiser, kept, clock, reporter)
+        start.cfg = dataclasses.replace(start.cfg, train=cfg.train)
         lock.require()
         left_s = seconds_to_finish(scene, cfg, weights, reference=truth is not None)
         with begun(folder, paths, cfg, start.decisions):
@@ -120,6 +120,24 @@ def fit(
         known = {"truth": truth, "lpips_weights": weights, "true_exposures": true_exposures}
         metrics = finish(*what, owner=owner, still_ours=lock.require, **known)
     return FitResult(params, scene, metrics, paths.run, start.selection, start.decisions)
+
+
+def _prepared(
+    scene: Scene,
+    cfg: FitConfig,
+    folder: RunFolder,
+    optimiser: Optimiser,
+    kept: Decisions | None,
+    clock: Stopwatch,
+    reporter: Reporter,
+) -> Prepared:
+    """Start exposures, radiances and Gaussians from what a scene offers."""
+    with clock("photometry"):
+        found = survey(scene, cfg, pixels=folder.pixels)
+        how = {"on_chosen": optimiser.expect(found, kept), "dense": found.dense, "kept": kept}
+        exposures = solve_exposures(scene, found.still, cfg, reporter, **how)
+    with clock("seeds"):
+        return initialise(found, exposures, reporter)
 
 
 class Optimiser:

@@ -132,11 +132,17 @@ def check_options(cfg: FitConfig) -> None:
             raise UserError(message, fix=fix)
 
 
-def check_run_dir(run_dir: Path, resume: bool, cfg: FitConfig) -> None:
+def check_run_dir(
+    run_dir: Path,
+    resume: bool,
+    cfg: FitConfig,
+    way_on: str = "add --resume to continue it, or name another folder with --out",
+) -> bool:
     """Refuse to overwrite a run, and to continue one under other options.
 
     Options of the evaluation and the memory for photographs may differ: they do not change the fit.
-    An option that the run's own version did not have counts as its default.
+    Steps and budget may be larger; the result says whether they are. `way_on` tells what to do
+    about a run that is there.
 
     Raises:
         UserError: the folder holds a run and `resume` is not set, is not a folder, or holds a run
@@ -146,21 +152,23 @@ def check_run_dir(run_dir: Path, resume: bool, cfg: FitConfig) -> None:
         raise UserError(f"{run_dir} is a file.", fix="name a folder with --out")
     path = RunFolder(run_dir).config
     if not path.exists():
-        return
+        return False
     if not resume:
-        raise UserError(
-            f"{run_dir} already holds a run.",
-            fix="add --resume to continue it, or name another folder with --out",
-        )
+        raise UserError(f"{run_dir} already holds a run.", fix=way_on)
     saved, now = (flat(plain(to_dict(options))) for options in (read_config(path)[1], cfg))
     free = [name for name in now if name == "data.cache_mb" or name.startswith("evaluation.")]
-    differ = [name for name in sorted({*saved, *now} - {*free}) if saved.get(name) != now.get(name)]
+    plan = [name for name in ("train.steps", "train.budget_s") if now[name] and saved.get(name)]
+    longer = [name for name in plan if now[name] > saved[name]]
+    compared = sorted({*saved, *now} - {*free, *longer})
+    differ = [name for name in compared if saved.get(name) != now.get(name)]
     if differ:
         other = [f"{name} was {saved.get(name)}, now {now.get(name)}" for name in differ]
         raise UserError(
             f"{run_dir} was begun with other options: {'; '.join(other[:6])}.",
-            fix="repeat the options it was begun with, or name another folder with --out",
+            fix="repeat the options it was begun with (--steps and --budget may be larger), or "
+            "name another folder with --out",
         )
+    return bool(longer)
 
 
 class MemoryNeeded(NamedTuple):

@@ -218,8 +218,9 @@ def _on_the_run(run: RunFiles) -> Iterator[RunWarning]:
     if progress is not None and progress < FINISHED:
         yield RunWarning(
             "Ended early",
-            f"The log ends at {progress:.0%} of the schedule: the run was stopped. The command "
-            "that began it, with --resume added, brings it to its end.",
+            f"The log ends at {progress:.0%} of the schedule: the run was stopped, or its budget "
+            "was too short. The command that began it, with --resume added (and a longer --budget, "
+            "if it had one), brings it to its end.",
         )
     # The protocol that fits most of a held-out view's photometry.
     fitted = [run.number("test", name, "psnr") for name in ("photometry_fitted", "exposure_fitted")]
@@ -304,5 +305,5 @@ def _on_more_to_gain(run: RunFiles) -> Iterator[RunWarning]:
             yield RunWarning(
                 "Not finished improving",
                 f"The training PSNR rose by {rise:.1f} dB between the last two tenths of the run. "
-                "A new fit with more --steps, or a longer --budget, would be better.",
+                "--resume with more --steps, or a longer --budget, would still help.",
             )

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.numerics import evenly_spaced
+from p2gs_jax.core.text import parse_json
 from p2gs_jax.evaluation.scores import ViewResult
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.frames import write_png
@@ -37,16 +39,33 @@ SUMMARY_VIEWS = 4
 def write_start(
     folder: RunFolder, scene: Path, reference: Path | None, cfg: FitConfig, decisions: Decisions
 ) -> None:
-    """Write what was asked and what was decided: the folder is a run's from here on."""
+    """Write what was asked and what was decided: from here on the folder is a run's, unfinished."""
+    folder.metrics.unlink(missing_ok=True)
+    begun = first_plan(folder) or {
+        "train.steps": cfg.train.steps,
+        "train.budget_s": cfg.train.budget_s,
+    }
     write_decisions(folder.decisions, decisions)
     write_json(
         folder.config,
         {
+            "begun": begun,
             **remembered("scene", scene, folder.root),
             **remembered("reference", reference, folder.root),
             "fit": config_to_dict(cfg),
         },
     )
+
+
+def first_plan(folder: RunFolder) -> dict[str, Any]:
+    """Return the steps and the budget that a run was begun with, by option; it may be longer now.
+
+    What it starts from depends on them; {}: nothing was begun.
+    """
+    try:
+        return dict(parse_json(folder.config.read_text(encoding="utf-8"))["begun"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
 
 
 def write_run(

@@ -41,6 +41,7 @@ from p2gs_jax.train.state import (
     FitState,
     HostState,
     alive_in,
+    grow_state,
     healed,
     initial_state,
 )
@@ -135,8 +136,12 @@ class Trainer:
         """
         self.slots = strategies.started(self.densification, int(np.sum(np.asarray(alive))))
         state = initial_state(params, alive, self.optimizer, self.slots.slots, owner)
-        host = HostState(pace=1.0 / max(self.cfg.train.steps, 1))
-        state, host = self.records.begin(state, resume) or (state, host)
+        train = self.cfg.train
+        planned = float(train.budget_s or train.steps)
+        host = HostState(planned=planned, pace=1.0 / max(train.steps, 1))
+        state, host = self.records.begin(state, planned, resume) or (state, host)
+        # Planned for longer, a run has room for more Gaussians.
+        state = grow_state(state, self.slots.slots)
         full_step_s = STEP_SECONDS_PER_PIXEL * self.coverage.pixels
         seconds = {"spent_s": spent_s, "finish_s": finish_s, "full_step_s": full_step_s}
         clock = RunClock(self.cfg.train, host, **seconds, now=self.now)
@@ -184,8 +189,8 @@ class Trainer:
             if clock.over(host):
                 if host.progress < NEARLY_DONE:
                     self.on_message(
-                        f"The budget ended the run at {host.progress:.0%} of its schedule: fit "
-                        "again with a longer --budget; what was compiled now is kept."
+                        f"The budget ended the run at {host.progress:.0%} of its schedule: "
+                        "`fit --resume` with a longer --budget goes on from here."
                     )
                 break
             asked = self.asked.arrived
@@ -198,7 +203,7 @@ class Trainer:
             if asked is not None:
                 self.on_message(
                     f"{interrupts.name_of(asked)}: the run stops after step {host.step} "
-                    f"({host.progress:.0%}), where a checkpoint is written; --resume continues it."
+                    f"({host.progress:.0%}), where a checkpoint is written."
                 )
                 self.asked.deliver()
         return state
@@ -229,8 +234,8 @@ class Trainer:
             raise DivergenceError(
                 f"Step {host.step + done + 1}: the {name} is not finite; "
                 f"{self.records.last_good()}.",
-                fix="lower the learning rates (--optimizer.*) or report the scene; "
-                "--resume continues from the last good checkpoint",
+                fix="lower the learning rates (--optimizer.*), in another folder, or report the "
+                "scene",
             )
         if kind == FAULT_OVERFLOW:
             needed, visible = int(state.fault.needed), int(state.fault.visible)

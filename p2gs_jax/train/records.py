@@ -16,7 +16,7 @@ from p2gs_jax.core.atomic import append_jsonl, read_jsonl, write_text
 from p2gs_jax.core.progress import LogRecord
 from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import KEY, Decisions
-from p2gs_jax.train.state import FitState, HostState, grow_state
+from p2gs_jax.train.state import FitState, HostState, shapes_of
 from p2gs_jax.train.update import StepReport
 
 # Share of a run's time that writing checkpoints may take, and by what factor they may come later
@@ -79,15 +79,31 @@ class Records:
         self.cfg, self.on_log, self.on_message = cfg, on_log, on_message
         self._log, self._store, self._decided = run_dir / "log.jsonl", store, decided
 
-    def begin(self, template: FitState, resume: bool) -> tuple[FitState, HostState] | None:
-        """Return what `restore` does, for a run that is resumed; drop what was logged after it."""
+    def begin(
+        self, template: FitState, planned: float, resume: bool
+    ) -> tuple[FitState, HostState] | None:
+        """Return what `restore` does, for a run that is resumed; drop what was logged after it.
+
+        A run that is `planned` for longer than before (`HostState.planned`) goes on as if it always
+        had been.
+        """
         found = self.restore(template) if resume else None
         if found is None:
             self._log.unlink(missing_ok=True)
-        elif self._log.exists():
-            kept = [line for line in read_jsonl(self._log) if line["step"] <= found[1].step]
-            write_text(self._log, "".join(json.dumps(line) + "\n" for line in kept))
-        return found
+            return None
+        state, host = found
+        kept = read_jsonl(self._log) if self._log.exists() else []
+        kept = [line for line in kept if line["step"] <= host.step]
+        if planned > host.planned > 0:
+            host = host.extended(planned)
+            self.on_message(f"The run is planned for longer: {host.progress:.0%} of it is done.")
+            last = kept[-1]["progress"] if kept else 0.0
+            # A session that was killed before its first checkpoint has rewritten them already.
+            if abs(last - host.progress) > 1e-5:
+                share = host.progress / last
+                kept = [line | {"progress": round(share * line["progress"], 6)} for line in kept]
+        write_text(self._log, "".join(json.dumps(line) + "\n" for line in kept))
+        return state, host
 
     def log(self, record: LogRecord) -> None:
         """Write a record down and pass it on."""
@@ -112,8 +128,7 @@ class Records:
             UserError: none can be read, or the scene decides otherwise now.
         """
         found = self._store.restore_latest(
-            lambda meta: jax.eval_shape(lambda: grow_state(template, meta["gaussian_capacity"])),
-            self.on_message,
+            lambda meta: shapes_of(template, meta["gaussian_capacity"]), self.on_message
         )
         if found is None:
             return None

@@ -52,6 +52,9 @@ class HostState:
     """What the host remembers between bursts; saved with every checkpoint."""
 
     step: int = 0  # steps completed, a view each
+    planned: float = (
+        0.0  # steps of the run, or seconds of its budget: what `progress` is a share of
+    )
     progress: float = 0.0  # fraction of the run completed
     pace: float = 0.0  # progress per step
     elapsed_s: float = 0.0  # seconds of earlier sessions and of this one
@@ -69,6 +72,14 @@ class HostState:
     def from_dict(cls, values: dict) -> HostState:
         """Return what a checkpoint holds."""
         return cls(**{**values, "rooms": {k: Room(*room) for k, room in values["rooms"].items()}})
+
+    def extended(self, planned: float) -> HostState:
+        """Return the counters of the same run planned longer: less of it is completed."""
+        share = self.planned / planned
+        times = {
+            k: share * getattr(self, k) for k in ("progress", "pace", "densified_at", "reset_at")
+        }
+        return dataclasses.replace(self, planned=planned, **times)
 
 
 def initial_state(
@@ -113,6 +124,25 @@ def grow_state(state: FitState, capacity: int) -> FitState:
         params=dataclasses.replace(state.params, gaussians=grow(gaussians, empty)),
         opt_state=grow_moments(state.opt_state, empty),
         population=grow(state.population, empty_population(extra, state.population)),
+    )
+
+
+def shapes_of(state: FitState, capacity: int) -> FitState:
+    """Return the shapes of the state if it had room for `capacity` Gaussians."""
+
+    def shapes(tree, rows: tuple[int, ...] = ()):
+        return jax.tree.map(
+            lambda a: jax.ShapeDtypeStruct(rows + a.shape[len(rows) :], a.dtype), tree
+        )
+
+    of_slots = (state.params.gaussians, state.opt_state.gaussians, state.population)
+    gaussians, moments, population = shapes(of_slots, (capacity,))
+    rest = shapes(state)
+    return dataclasses.replace(
+        rest,
+        params=dataclasses.replace(rest.params, gaussians=gaussians),
+        opt_state=rest.opt_state._replace(gaussians=moments),
+        population=population,
     )
 
 

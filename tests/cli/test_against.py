@@ -44,7 +44,15 @@ def judged(run_command, own_run):
 
 def test_what_the_run_rendered_itself_scores_as_the_run(own_run, judged, tmp_path):
     twin = shutil.copytree(own_run / "renders", tmp_path / "twin")
+    before = json.loads((own_run / "metrics.json").read_text()) | {"districts": {"blocks": [1]}}
+    (own_run / "metrics.json").write_text(json.dumps(before))
     (found,), text = judged(twin)
+    # What a fit says of itself stays, whatever it is.
+    after = json.loads((own_run / "metrics.json").read_text())
+    assert before.keys() == after.keys()
+    assert {k: after[k] for k in ("split", "counts", "districts")} == {
+        k: before[k] for k in ("split", "counts", "districts")
+    }
     own = found["run"]["exposure_fitted"]
     assert found["layout"] == "pictures by name"
     # Held-out views are written under the exposure fitted to them, in 8 bits.

@@ -12,6 +12,7 @@ from p2gs_jax.core.atomic import no_empty_folders
 from p2gs_jax.errors import UserError
 from p2gs_jax.pipeline.preflight import check_run_dir
 from p2gs_jax.presets import preset, to_dict
+from p2gs_jax.run.folder import locked
 
 # What was written, and a word of the way on.
 WRONG = [
@@ -92,6 +93,17 @@ WRONG = [
     ("sweep file.txt", "is not valid TOML"),
     ("doctor --skip-selftest", "--skip-self-test"),
 ]
+
+
+def test_a_demo_is_not_replaced_while_it_runs(tmp_path, run_command):
+    (tmp_path / "street").mkdir()
+    (tmp_path / "demo.json").touch()
+    for running in (tmp_path, tmp_path / "run"):
+        running.mkdir(exist_ok=True)
+        with locked(running):
+            code, said = run_command("demo", "--out", tmp_path)
+        assert (code, "is being written to by process" in said) == (2, True)
+        assert (tmp_path / "street").is_dir()
 
 
 @pytest.fixture(scope="module")

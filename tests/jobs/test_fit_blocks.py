@@ -86,6 +86,14 @@ def test_two_blocks_become_one_run(tmp_path, in_this_process):
         np.asarray(result.params.photometry.exposures), solved / np.exp(np.log(solved).mean()), 1e-5
     )
     assert said["test"]["exposure_fitted"]["psnr"] > 15
+    took = [json.loads((run / f"blocks/{k}/metrics.json").read_text())["seconds"] for k in (0, 1)]
+    assert said["seconds"]["optimisation"] == pytest.approx(sum(s["optimisation"] for s in took))
+    assert said["seconds_per_step"] == said["seconds"]["optimisation"] / said["counts"]["steps"]
+    # More steps are more steps of every block.
+    longer = with_fields(SMALL, {"train.steps": 30})
+    again = p2gs_jax.fit_blocks(scene, run, longer, blocks=2, resume=True).metrics
+    assert begun[3:] == ["block 0", "block 1"]
+    assert again["counts"]["steps"] == pytest.approx(1.5 * said["counts"]["steps"], abs=1)
 
 
 def test_one_block_is_an_ordinary_fit(tmp_path, monkeypatch):

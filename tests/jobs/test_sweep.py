@@ -138,9 +138,12 @@ def test_a_sweep_keeps_what_is_done_and_names_what_failed(tmp_path):
     assert [r["status"] for r in again.rows] == ["done", "done"]
     assert said[-1].endswith("kept")
     assert (tmp_path / "out" / "good" / "seed_0" / "metrics.json").stat().st_mtime_ns == stamp
-    other = {"good": with_fields(SMALL, {"train.steps": 13})}
+    other = {"good": with_fields(SMALL, {"train.steps": 11})}
     with pytest.raises(p2gs_jax.UserError, match="other options"):
         sweep(scene, tmp_path / "out", other)
+    longer = {"good": with_fields(SMALL, {"train.steps": 18})}
+    (row,) = sweep(scene, tmp_path / "out", longer).rows
+    assert (row["status"], row["steps"]) == ("done", 18)
     twins = {"a b": SMALL, "a_b": SMALL}
     with pytest.raises(p2gs_jax.UserError, match="share the folder"):
         sweep(scene, tmp_path / "out", twins)

@@ -100,6 +100,7 @@ def test_what_a_small_run_can_say_is_written(finished_run, tmp_path):
     assert (tmp_path / "out" / "calibration.png").is_file()
     # Dense seeds lie on the surfaces: even a short run has depth to warp through.
     assert found.observations > 1000
+    assert found.seconds["reading"] > 0.05
 
 
 def stack(folder, times, response=lambda x: x ** (1 / 2.2), seed=0, drift=None):

@@ -1,5 +1,6 @@
 """`calibrate --of`: a wall photographed at known exposures, by a model that knows none."""
 
+import contextlib
 import dataclasses
 import json
 
@@ -19,8 +20,10 @@ from p2gs_jax.formats.foreign import read_foreign
 from p2gs_jax.formats.ply import read_ply, write_ply
 from p2gs_jax.gaussians.bake import relit
 from p2gs_jax.photometry.display import DisplayTransform, develop
+from p2gs_jax.pipeline.convert import _whole_or_nothing
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.render.harmonics import C0
+from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.run.photometry_files import read_photometry
 from p2gs_jax.run.read import load_run
 from p2gs_jax.types import Camera, Gaussians
@@ -115,6 +118,18 @@ def test_a_model_gives_exposures_and_becomes_radiance(foreign, tmp_path, run_com
     code, text = run_command(*argv)
     assert code == 2
     assert "already holds a run" in text
+    assert "--resume" not in text
+
+
+def test_a_conversion_that_fails_leaves_no_run_and_spares_one_that_was_there(tmp_path):
+    folder = RunFolder(tmp_path)
+    for there in (False, True):
+        with contextlib.suppress(KeyboardInterrupt), _whole_or_nothing(folder):
+            (folder.checkpoints / "3").mkdir(parents=True, exist_ok=True)
+            folder.config.touch()
+            raise KeyboardInterrupt
+        assert folder.config.exists() == folder.checkpoints.exists() == there
+        folder.config.touch()
 
 
 def test_a_model_of_other_poses_is_refused(foreign, tmp_path):

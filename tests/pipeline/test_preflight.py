@@ -32,6 +32,7 @@ from p2gs_jax.presets import from_dict
 from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import KEY, Decisions
 from p2gs_jax.run.folder import RunFolder
+from p2gs_jax.run.write import write_start
 from p2gs_jax.scene.pixels import store as held
 
 
@@ -47,7 +48,7 @@ def scene(tmp_path_factory):
         (("--preset", "3dgs", "--photometry.start", "tracks"), "splats display values"),
         (("--preset", "ppisp", "--photometry.curve", "srgb"), "a whole camera"),
         (("--known-exposures", "KNOWN"), "names none of the"),
-        (("--known-exposures", "exif"), "carries exposure time"),
+        (("--known-exposures", "exif"), "carries an exposure time"),
     ],
 )
 def test_a_refused_option_does_not_lock_the_folder(tmp_path, scene, run_command, options, said):
@@ -233,7 +234,22 @@ def test_a_full_disk_is_exit_2_before_anything_is_fitted(
 
 def test_a_run_may_go_on_with_other_memory(finished_run):
     cfg = from_dict(json.loads((finished_run / "config.json").read_text())["fit"])
-    check_run_dir(finished_run, True, with_fields(cfg, {"data.cache_mb": 17}))
+    assert not check_run_dir(finished_run, True, with_fields(cfg, {"data.cache_mb": 17}))
+
+
+def test_a_run_may_only_become_longer(tmp_path):
+    cfg = with_fields(FitConfig(), {"train.steps": 60, "train.budget_s": 60.0})
+    write_start(RunFolder(tmp_path), tmp_path, None, cfg, Decisions.as_asked(cfg))
+    for name, value in {"steps": 61, "budget_s": 90.0}.items():
+        assert check_run_dir(tmp_path, True, with_fields(cfg, {f"train.{name}": value}))
+    for name, value in {"steps": 59, "budget_s": 30.0, "seed": 7}.items():
+        with pytest.raises(UserError, match=f"train.{name} was"):
+            check_run_dir(tmp_path, True, with_fields(cfg, {f"train.{name}": value}))
+    for before, now in ((60.0, None), (None, 60.0)):
+        cfg = with_fields(cfg, {"train.budget_s": before})
+        write_start(RunFolder(tmp_path), tmp_path, None, cfg, Decisions.as_asked(cfg))
+        with pytest.raises(UserError, match=r"train\.budget_s was"):
+            check_run_dir(tmp_path, True, with_fields(cfg, {"train.budget_s": now}))
 
 
 GB = 1e9

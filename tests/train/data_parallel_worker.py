@@ -105,19 +105,18 @@ def on_devices(count: int) -> dict:
     state = spread(initial_state(start(), alive(), optimizer), mesh)
     inputs = (*map(stacked, zip(*map(view, range(VIEWS)), strict=True)), CONTROLS)
 
-    def taken(state, room):
-        lowered = [step.lowered(n, state, *inputs, room=room, degree=DEGREE) for n in PROGRAMS]
-        return step.chained(*(part.compile() for part in lowered))
-
+    lowered = [step.lowered(n, state, *inputs, room=ROOM, degree=DEGREE) for n in PROGRAMS]
+    show, differentiate, advance = (part.compile() for part in lowered)
     losses, first, found = [], None, {}
     if count == VIEWS:
         before = jax.tree.map(np.asarray, state.params)
-        state, _ = taken(state, Room(64, 4096))(state, *inputs)
+        narrow = step.program("differentiate", Room(64, ROOM.visible), DEGREE)
+        state, _ = step.chained(show, narrow, advance)(state, *inputs)
         found["fault"] = {k: int(getattr(state.fault, k)) for k in ("kind", "needed")}
         found["stopped at"] = int(state.step)
         found["moved"] = distance(before, state.params)
         state = healed(state)
-    run = taken(state, ROOM)
+    run = step.chained(show, differentiate, advance)
     for _ in range(2):
         state, report = run(state, *inputs)
         losses.append(float(report.loss))

@@ -56,6 +56,47 @@ def test_a_resumed_run_keeps_its_pace(harness):
     assert [line["step"] for line in harness.log()] == list(range(5, 101, 5))
 
 
+# Neither the bound on the population nor the slots for it stay.
+GROWING = with_fields(SHORT, {"densify.method": "mcmc", "densify.start": 1.0})
+
+
+@pytest.mark.parametrize("cfg", [SHORT, GROWING], ids=["seeds", "mcmc"])
+def test_a_finished_run_goes_on_where_more_steps_are_asked_for(harness, cfg):
+    before, _ = harness.run(cfg)
+    result, programs = harness.run(with_fields(cfg, {"train.steps": 3000}), resume=True)
+    taken, progress = zip(*((at, along) for at, _, along in programs.taken), strict=True)
+    assert taken == tuple(range(100, 3000))
+    assert (progress[0], progress[-1]) == pytest.approx((100 / 3000, 2999 / 3000))
+    assert result.host.step == 3000
+    logged = [line["progress"] for line in harness.log()]
+    assert logged == pytest.approx([k / 600 for k in range(1, 601)], abs=1e-6)
+    slots = [r.state.params.gaussians.capacity for r in (before, result)]
+    assert (slots[1] > slots[0]) == (cfg is GROWING)
+    again, programs = harness.run(with_fields(cfg, {"train.steps": 3000}), resume=True)
+    assert (again.host.step, programs.taken) == (3000, [])
+
+
+def test_a_longer_run_that_is_killed_before_it_saves_goes_on_as_if_nothing_had_been(harness):
+    harness.run(SHORT)
+    longer = with_fields(SHORT, {"train.steps": 200})
+    programs = Programs(harness.clock)
+    programs.breaks_at = 152
+    with pytest.raises(DivergenceError, match="checkpoint is step 100"):
+        harness.run(longer, programs=programs, resume=True)
+    harness.run(longer, resume=True)
+    logged = [line["progress"] for line in harness.log()]
+    assert logged == pytest.approx([k / 40 for k in range(1, 41)], abs=1e-6)
+
+
+def test_a_run_that_its_budget_ended_goes_on_under_a_larger_one(harness):
+    first, _ = harness.run(BUDGET)
+    asked = with_fields(BUDGET, {"train.budget_s": 120.0})
+    result, programs = harness.run(asked, resume=True)
+    assert programs.taken[0][2] == pytest.approx(first.host.progress / 2)
+    assert result.host.progress == pytest.approx(1.0, abs=0.01)
+    assert 110 < harness.clock.now < 122
+
+
 def test_checkpoints_take_no_more_than_a_hundredth_of_a_run(harness):
     """A hundred steps of .1 s: a save that takes .022 s comes every 2.5 s, not every .5."""
     saved, save = [], harness.checkpoints.save

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import shutil
 import time
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,7 @@ from p2gs_jax.pipeline.prepare import initialise
 from p2gs_jax.pipeline.survey import load, survey
 from p2gs_jax.presets import from_dict, to_dict
 from p2gs_jax.run.folder import RunFolder, locked
-from p2gs_jax.scene.pixels.store import size_at
+from p2gs_jax.scene.pixels.store import decoded_into, size_at
 from p2gs_jax.scene.visibility import shown_share
 from p2gs_jax.train.data_parallel import mesh_of
 from p2gs_jax.types import Scene
@@ -129,7 +128,7 @@ def fit_block(folder: Path, arguments: dict[str, Any], reporter: Reporter) -> No
     cfg = block_config(whole, cut, number, block.scene, block.own, train_views=train_views)
     del scene, shared
     folder.mkdir(parents=True, exist_ok=True)
-    with locked(folder):
+    with locked(folder), decoded_into(RunFolder(folder).pixels):
         counts, seconds = _fit(RunFolder(folder), block, cfg, reporter, arguments["scene"])
     seconds["total"] = time.monotonic() - begin
     metrics = {"counts": counts, "seconds": seconds, "peak_bytes": peak_bytes()}
@@ -155,8 +154,6 @@ def _fit(
     write_radiance(
         folder.radiance, params.gaussians, np.ones(count, bool), activation=cfg.render.radiance
     )
-    prepared.store.close()
-    shutil.rmtree(folder.pixels, ignore_errors=True)
     counts = {
         "gaussians": count,
         "seed_points": len(block.scene.points),

@@ -51,7 +51,7 @@ from p2gs_jax.presets import require_config
 from p2gs_jax.run.decisions import read_decisions
 from p2gs_jax.run.folder import RunFolder, RunLock, locked
 from p2gs_jax.run.write import write_start
-from p2gs_jax.scene.pixels.store import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore, decoded_into
 from p2gs_jax.types import Params, Scene
 
 BLOCKS = "blocks"
@@ -103,14 +103,18 @@ def fit_blocks(
     weights = preflight.preflight(cfg, paths, resume=resume)
     begin = time.monotonic()
     with no_empty_folders(paths.run), locked(paths.run) as lock:
-        check_run_dir(paths.run, resume, cfg)
+        if check_run_dir(paths.run, resume, cfg):
+            # Blocks go on as well; this holds if we end before they begin.
+            for finished in (paths.run / BLOCKS).glob("*/metrics.json"):
+                finished.unlink()
         scene = load(paths.scene, paths.run, cfg, reporter)
         check_scene(scene, cfg)
         truth = preflight.check_scene(scene, cfg, paths, weights)
         cut = _cut(scene, cfg, asked, paths.run / BLOCKS, reporter)
         if cut is not None:
             whole = _Blocks(paths, cfg, asked, cut, lock, reporter, on_look)
-            return whole.fit(scene, truth, weights, begin, true_exposures)
+            with decoded_into(whole.folder.pixels):
+                return whole.fit(scene, truth, weights, begin, true_exposures)
     # One block is no block.
     return fit(
         paths.scene,
@@ -212,17 +216,22 @@ class _Blocks:
         )
 
     def _account(self, scene: Scene, solved: Solved, gaussians: int, seconds: float) -> Account:
-        blocks = range(len(self.cut.blocks))
+        blocks = [self._of_block(k) for k in range(len(self.cut.blocks))]
+        optimisation = sum(found["seconds"]["optimisation"] for found in blocks)
         return Account(
             counts={
                 "gaussians": gaussians,
                 "seed_points": len(scene.points),
                 "train_views": len(scene.train_indices),
                 "test_views": len(scene.test_indices),
-                "steps": sum(self._of_block(k)["counts"]["steps"] for k in blocks),
+                "steps": sum(found["counts"]["steps"] for found in blocks),
                 "blocks": len(blocks),
             },
-            seconds={**self.clock.seconds, "total_until_evaluation": seconds},
+            seconds={
+                **self.clock.seconds,
+                "total_until_evaluation": seconds,
+                "optimisation": optimisation,  # of all blocks, side by side or not
+            },
             compiler=self.compiler,
             selection=solved.selection,
             notes=[*solved.scene.notes, *solved.notes],

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import shutil
 import threading
 import weakref
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,8 @@ _LEVELS = 4 / 3
 # A background shows through what is less opaque.
 OPAQUE = 0.999
 _MAX_PREFETCHED = 4
+# Of stores that were not closed.
+_OPEN: weakref.WeakSet[_DecodedPhotographs] = weakref.WeakSet()
 
 
 def size_at(view: View, max_width: int | None, shrink: float | int = 1.0) -> tuple[int, int]:
@@ -87,7 +90,7 @@ class ImageStore:
                 files.require_room(needed)
             else:  # An earlier start had less memory.
                 shutil.rmtree(folder, ignore_errors=True)
-        self._photographs = _DecodedPhotographs(self.views, limit, files)
+        self._photographs = _DecodedPhotographs(self.views, limit, files, folder)
         self._placements: dict[int, Placement] = {}
         self._objects, self._margin = _moving(objects), MARGIN
         self._outlines: dict[int, list[np.ndarray]] = {}
@@ -215,6 +218,18 @@ def camera_of(store: ImageStore, index: int, shrink: float | int = 1.0) -> Camer
     return Camera(on_device(viewmat), on_device(K), width, height, store.placement(index))
 
 
+@contextlib.contextmanager
+def decoded_into(folder: Path) -> Iterator[Path]:
+    """Let stores keep decoded photographs in a folder; it and they end with the block, always."""
+    try:
+        yield folder
+    finally:
+        for photographs in list(_OPEN):
+            if photographs.folder == folder:
+                photographs.close()
+        shutil.rmtree(folder, ignore_errors=True)
+
+
 class _DecodedPhotographs:
     """Photographs of some views, decoded on demand and kept up to a limit in bytes.
 
@@ -222,8 +237,10 @@ class _DecodedPhotographs:
     mapped again from files, or without files decoded again, when it is needed.
     """
 
-    def __init__(self, views: Sequence[View], limit: int, files: PixelFiles | None):
-        self.views = views
+    def __init__(
+        self, views: Sequence[View], limit: int, files: PixelFiles | None, folder: Path | None
+    ):
+        self.views, self.folder = views, folder
         self.decodings = 0
         self._limit, self._files = limit, files
         self._cache: OrderedDict[Key, Decoded] = OrderedDict()
@@ -232,6 +249,7 @@ class _DecodedPhotographs:
         self._lock = threading.Lock()
         self._ahead: DecodingAhead | None = None
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="decode")
+        _OPEN.add(self)
 
     @property
     def cached_bytes(self) -> int:

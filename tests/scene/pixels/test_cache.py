@@ -1,5 +1,6 @@
 """Photographs that memory does not hold are decoded once, ahead, and read bit for bit."""
 
+import contextlib
 import dataclasses
 import errno
 import os
@@ -15,7 +16,7 @@ from scene.helpers import make_view, refused
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene.pixels import cache, decode
-from p2gs_jax.scene.pixels.store import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore, decoded_into
 from p2gs_jax.types import Distortion
 
 SIZE, SHRINKS = (48, 64), (2, 1)
@@ -171,3 +172,16 @@ def test_threads_end_with_the_store(tmp_path, views, monkeypatch, end):
     del store
     assert not thread.is_alive()
     assert len(list((tmp_path / "pixels").rglob("*.px"))) == 2
+
+
+@pytest.mark.parametrize("ended", [False, True])
+def test_decoded_photographs_go_however_their_run_ends(tmp_path, views, ended):
+    with contextlib.suppress(KeyboardInterrupt), decoded_into(tmp_path / "pixels") as folder:
+        store = ImageStore(views, NONE, folder=folder)
+        store.expect(SHRINKS)
+        store.get(0)
+        assert [*folder.glob("*/*.px")]
+        if not ended:
+            raise KeyboardInterrupt
+    assert not folder.exists()
+    assert store._photographs.cached_bytes == 0
