@@ -46,6 +46,7 @@ SceneFormat = Literal[
 ]
 # How structure from motion finds poses, and which photographs it matches with which.
 Matching = Literal["auto", "all", "sequence"]
+CameraBy = Literal["auto", "folder", "model", "exif", "one"]
 # What the alpha channel of photographs means.
 AlphaUse = Literal["background", "mask", "ignore"]
 # Per what it varies: one physical camera, or one photograph.
@@ -73,6 +74,10 @@ class DataConfig:
     below it, as of cameras that have a folder each."""
     format: SceneFormat | None = None
     """How to read the scene; None takes the first of these that the folder holds."""
+    camera_by: CameraBy = "auto"
+    """Which photographs one camera took: those of one `folder`; of one camera of the `model`
+    (COLMAP's, or the same intrinsics); of one make, model and lens (`exif`); all of them (`one`);
+    `auto`: of one folder, model's camera and EXIF."""
     alpha: AlphaUse = "background"
     """What the alpha channel of photographs means: they and their renders are shown over
     `background`; or `mask`: transparent pixels are left out; or `ignore`: nothing."""

@@ -140,7 +140,7 @@ class Calibrate:
 
     SHORT_NAMES: ClassVar = (
         *("max_width", "known_exposures", "known_deviation_ev", "images", "drive", "cameras"),
-        *("frames", "every", "max_frames"),
+        *("frames", "every", "max_frames", "camera_by"),
     )
     # What is read of the configuration; the rest is no option.
     FIELDS: ClassVar = (

@@ -93,7 +93,7 @@ class Render:
         from p2gs_jax.cli.tables import stdout
         from p2gs_jax.core.progress import TerminalReporter
         from p2gs_jax.formats.frames import open_frames
-        from p2gs_jax.paths.files import read_cameras, write_cameras
+        from p2gs_jax.paths.files import near_scene, read_cameras, write_cameras
 
         begin = time.monotonic()
         for refuse in (_check_picture, _check_path, _check_file):  # before anything is read
@@ -102,6 +102,7 @@ class Render:
         _check_place(out, self.overwrite)
         given = read_cameras(Path(self.path)) if self.path not in PATHS else None
         fitted = _load(self)
+        given = None if given is None else near_scene(given, fitted.scene.origin)
         with TerminalReporter() as reporter:
             job = (
                 panoramas_of(self, fitted)

@@ -28,6 +28,7 @@ SHORT = {
     "split": ("data.split", "FILE|every"),
     "background": ("data.background", "COLOR"),
     "images": ("data.images", "DIR"),
+    "camera_by": ("data.camera_by", None),
     "allow_missing": ("data.allow_missing", None),
     "drive": ("data.drive", "NAME"),
     "cameras": ("data.cameras", "NAME"),

@@ -48,7 +48,8 @@ def write_folder(
     """Write `images`, `exposures.csv`, `masks` where a view has any, and the scene for a program.
 
     COLMAP reads `sparse/0`; nerfstudio's `splatfacto` reads `transforms.json` and `sparse_pc.ply`.
-    The folder is replaced once the new one is whole. The store has cameras at the size of the fit;
+    Coordinates are those of the data set, from which `Scene.origin` was taken off. The folder is
+    replaced once the new one is whole. The store has cameras at the size of the fit;
     `on_view` receives how many photographs are written, and of how many. A UserError says that a
     photograph cannot be read.
     """
@@ -94,7 +95,7 @@ def _transforms(
     for index, view in enumerate(scene.views):
         place = (Path("images") / exported[view.name]).as_posix()
         names[view.split].append(place)
-        frames.append(_frame(store, index) | {"file_path": place})
+        frames.append(_frame(store, index, scene.origin) | {"file_path": place})
         if masked:
             frames[-1]["mask_path"] = _place_of_mask(exported[view.name])
     content: dict[str, Any] = {"camera_model": "PINHOLE", "ply_file_path": CLOUD}
@@ -157,12 +158,13 @@ def _write_model(folder: Path, scene: Scene, store: ImageStore, names: Mapping[s
         pose = np.asarray(viewmat, np.float64)
         # The rotation that the float32 matrix was rounded from, orthonormal in float64.
         u, _, vt = np.linalg.svd(pose[:3, :3])
-        pose_of_image = pycolmap.Rigid3d(pycolmap.Rotation3d(u @ vt), pose[:3, 3])
+        rotation = pycolmap.Rotation3d(u @ vt)
+        pose_of_image = pycolmap.Rigid3d(rotation, pose[:3, 3] - u @ vt @ scene.origin)
         model.add_image_with_trivial_frame(image, pose_of_image)
         for slot, point in enumerate(points):
             tracks[point].add_element(index + 1, slot)
     for xyz, track, color in zip(scene.points, tracks, _colors(scene), strict=True):
-        model.add_point3D(xyz.astype(np.float64), track, color)
+        model.add_point3D(xyz.astype(np.float64) + scene.origin, track, color)
     # Mean distance of a point's projections from its observations: what COLMAP itself writes.
     model.update_point_3d_errors()
     folder.mkdir(parents=True)
@@ -188,18 +190,21 @@ def _write_photograph(path: Path, view: View, ldr: Float[np.ndarray, "h w 3"]) -
     Image.fromarray(np.rint(255 * ldr).astype(np.uint8)).save(path, **how)
 
 
-def _frame(store: ImageStore, index: int) -> dict[str, Any]:
+def _frame(store: ImageStore, index: int, origin: Sequence[float]) -> dict[str, Any]:
     """Return a camera in nerfstudio's words: OpenGL's axes, pixels, corners at whole numbers."""
     viewmat, K, width, height = store.camera(index)
     pose = np.linalg.inv(np.asarray(viewmat, np.float64)) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    pose[:3, 3] += origin
     lens = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
     numbers = {name: float(value) for name, value in lens.items()}
     return {**numbers, "w": width, "h": height, "transform_matrix": pose.tolist()}
 
 
 def _write_points(path: Path, scene: Scene) -> None:
-    fields = [(n, "<f4") for n in "xyz"] + [(n, "u1") for n in RGB]
+    number = "<f8" if any(scene.origin) else "<f4"
+    fields = [(n, number) for n in "xyz"] + [(n, "u1") for n in RGB]
+    points = scene.points + np.array(scene.origin)
     table, colors = np.empty(len(scene.points), fields), _colors(scene)
     for column, (axis, channel) in enumerate(zip("xyz", RGB, strict=True)):
-        table[axis], table[channel] = scene.points[:, column], colors[:, column]
+        table[axis], table[channel] = points[:, column], colors[:, column]
     path.write_bytes(header_of("vertex", table.dtype, len(table)) + table.tobytes())

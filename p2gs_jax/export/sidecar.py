@@ -110,6 +110,7 @@ def linear_sidecar(
         "world": {
             "axes": f"right-handed, those of the scene as it was read ({scene.format})",
             "unit": "scene units: metres where the source is metric",
+            "origin": list(scene.origin),
             "viewmat": "world to camera, for column vectors; camera axes x right, y down, "
             "z forward",
             "K": "pixels; the first pixel covers [0, 1]",

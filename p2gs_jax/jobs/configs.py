@@ -167,7 +167,7 @@ def read_sweep(path: Path) -> SweepFile:
 
 def _parsed(path: Path) -> dict[str, Any]:
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        data = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise UserError(
             f"{path} cannot be read: {error.strerror}.",

@@ -19,7 +19,7 @@ from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.paths.shots import LARGEST, Shot, as_matrix, checked_lens, checked_pose
-from p2gs_jax.scene.rigid import inverse
+from p2gs_jax.scene.rigid import camera_centers, inverse
 
 FIELDS = ("name", "viewmat", "K", "width", "height", "exposure_ev", "gamma", "time")
 MOST_STOPS = 60.0
@@ -39,7 +39,7 @@ def write_cameras(path: Path, shots: Sequence[Shot]) -> None:
 def read_cameras(path: Path) -> list[Shot]:
     """Read a path; a UserError names the entry and the field of a file that is not one."""
     try:
-        data = parse_json(path.read_text(encoding="utf-8"))
+        data = parse_json(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise UserError(
             f"{path} cannot be read: {error.strerror or error}.",
@@ -70,6 +70,16 @@ def read_cameras(path: Path) -> list[Shot]:
             )
         shots[shot.name] = shot
     return list(shots.values())
+
+
+def near_scene(shots: Sequence[Shot], origin: Sequence[float]) -> list[Shot]:
+    """Return shots where the scene is, which may have been moved from there to the origin."""
+    middle = np.median(camera_centers(np.stack([shot.viewmat for shot in shots])), axis=0)
+    if np.linalg.norm(middle - origin) >= np.linalg.norm(middle):
+        return list(shots)
+    moved = np.eye(4)
+    moved[:3, 3] = origin
+    return [replace(shot, viewmat=shot.viewmat @ moved) for shot in shots]
 
 
 def _entry(values: dict, index: int) -> Shot:

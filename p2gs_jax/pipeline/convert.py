@@ -14,6 +14,7 @@ import numpy as np
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import no_empty_folders
 from p2gs_jax.core.clock import CompileCounter, Stopwatch
+from p2gs_jax.core.numerics import on_device
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.against import score_foreign
@@ -80,10 +81,9 @@ def calibrate_of(
         check_run_dir(folder.root, False, cfg, way_on=ELSEWHERE)
         scene = load_scene(scene_dir, cfg.data, folder.root / "cache", reporter.message)
         if len(scene.train_indices) < 2:
-            raise UserError(
-                f"{scene_dir} has {len(scene.train_indices)} training view(s); exposures need two.",
-                fix="add photographs that were posed together with the model",
-            )
+            why = f"{scene_dir} has {len(scene.train_indices)} training view; exposures need two."
+            raise UserError(why, fix="add photographs that were posed together with the model")
+        foreign = _moved(foreign, scene.origin)
         store = opened.enter_context(contextlib.closing(ImageStore(scene.views, cfg.data)))
         reporter.stage("Judging the model")
         before, agreement = score_foreign(foreign, scene, store, viewer_config(cfg.render))
@@ -122,6 +122,14 @@ def _whole_or_nothing(folder: RunFolder) -> Iterator[contextlib.ExitStack]:
                 path.unlink(missing_ok=True)
             shutil.rmtree(folder.checkpoints, ignore_errors=True)
         raise
+
+
+def _moved(foreign: Gaussians, origin: tuple[float, float, float]) -> Gaussians:
+    """Return a model where the scene is, which may have been moved from there to the origin."""
+    means = np.asarray(foreign.means, np.float64)
+    moved = means - np.array(origin)
+    nearer = np.linalg.norm(np.median(moved, axis=0)) < np.linalg.norm(np.median(means, axis=0))
+    return dataclasses.replace(foreign, means=on_device(moved)) if nearer else foreign
 
 
 def _seen_through(

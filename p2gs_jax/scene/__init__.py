@@ -8,24 +8,25 @@ from typing import NamedTuple
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError, broken
-from p2gs_jax.scene.colmap import find_model, load_colmap
+from p2gs_jax.scene.colmap import find_deeper_model, find_model, load_colmap
 from p2gs_jax.scene.convert.convert import convert_photographs, converted_views, with_originals
 from p2gs_jax.scene.convert.icc import colour_notes
 from p2gs_jax.scene.convert.readers import exif_evs
 from p2gs_jax.scene.drives import read_drive
 from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.drives.recording import Recording
-from p2gs_jax.scene.files import Report, image_size, list_images
+from p2gs_jax.scene.files import Report, image_size, list_images, shallow
 from p2gs_jax.scene.masks import attach_masks, with_alpha
 from p2gs_jax.scene.pixels.store import ImageStore, camera_at, size_at
 from p2gs_jax.scene.seeds import FEWEST, with_random_seeds
 from p2gs_jax.scene.split import lists_beside, split_as_listed, split_scene
 from p2gs_jax.scene.transforms import (
-    LLFF_FILE,
     is_blender,
+    llff_table,
     load_blender,
     load_llff,
     load_transforms,
+    stated_exposures,
 )
 from p2gs_jax.scene.video import VIDEO_SUFFIXES, read_video
 from p2gs_jax.types import Scene
@@ -41,11 +42,11 @@ def load_scene(
     In this order, unless `cfg.format` names one: a COLMAP model in `sparse/0`, `sparse` or the
     folder itself; `transforms.json` in it, or `root` itself where that is a .json file;
     `transforms_train.json` with those of the other parts of the split; LLFF's `poses_bounds.npy`; a
-    drive as a data set lays it out (`drives`); photographs in `images/` or the folder itself, or a
-    video, whose cameras are then found by structure from motion. Poses without points get theirs by
-    triangulation, or at random where hardly anything matches. Views are sorted by name. Long
-    computations keep their results in `work_dir` for a resume. Raises UserError: there is no scene,
-    or it is broken; the message names the file.
+    COLMAP model anywhere else below; a drive as a data set lays it out (`drives`); photographs in
+    `images/` or the folder itself, or a video, whose cameras are then found by structure from
+    motion. Poses without points get theirs by triangulation, or at random where hardly anything
+    matches. Views are sorted by name. Long computations keep their results in `work_dir` for a
+    resume. Raises UserError: there is no scene, or it is broken; the message names the file.
     """
     found = find_scene(root, cfg, report)
     if isinstance(found, Recording):
@@ -85,10 +86,11 @@ def with_what_lies_beside(scene: Scene, cfg: DataConfig) -> Scene:
     Raises UserError: so many views cannot be held out, or a list of those that are is wrong.
     """
     views, mask_notes = attach_masks(scene)
-    evs = exif_evs([view.image_path for view in views], [view.camera for view in views])
-    both = zip(views, evs, strict=True)
-    views = tuple(dataclasses.replace(view, exif_ev=ev) for view, ev in both)
-    notes = (*scene.notes, *mask_notes, *colour_notes(v.image_path for v in views))
+    paths = [view.image_path for view in views]
+    both = zip(views, exif_evs(paths, [view.camera for view in views]), strict=True)
+    # What a data set states counts for more.
+    views = tuple(dataclasses.replace(v, exif_ev=ev) if v.exif_ev is None else v for v, ev in both)
+    notes = (*scene.notes, *mask_notes, *colour_notes(paths), *shallow(paths))
     scene = dataclasses.replace(scene, views=views, notes=notes)
     return split_scene(scene, cfg)
 
@@ -125,7 +127,7 @@ def find_scene(
         return load_transforms(root, root, cfg)
     model = find_model(root)
     if model is not None and cfg.format in (None, "colmap"):
-        scene = load_colmap(root, model, cfg)
+        scene = _of_model(root, model, cfg)
         lists = lists_beside(model, root) if cfg.split is None and cfg.test_every else None
         if lists is None:
             return scene
@@ -134,8 +136,11 @@ def find_scene(
         return load_transforms(root, root / "transforms.json", cfg)
     if is_blender(root) and cfg.format in (None, "blender"):
         return load_blender(root, cfg)
-    if (root / LLFF_FILE).is_file() and cfg.format in (None, "llff"):
+    if llff_table(root) and cfg.format in (None, "llff"):
         return load_llff(root, cfg)
+    model = find_deeper_model(root) if cfg.format in (None, "colmap") else None
+    if model is not None:
+        return _of_model(root, model, cfg)
     recording = read_drive(root, cfg, report)
     if recording is not None:
         return recording
@@ -143,6 +148,16 @@ def find_scene(
         fix = "leave out --data.format, or name the folder that holds one"
         raise broken(root, f"holds no scene in the format {cfg.format!r}", fix)
     return _photographs_alone(root, cfg)
+
+
+def _of_model(root: Path, folder: Path, cfg: DataConfig) -> Scene:
+    scene, notes = load_colmap(root, folder, cfg), []
+    if folder not in (root, root / "sparse", root / "sparse" / "0"):
+        notes.append(f"The cameras are those of the COLMAP model in {folder}.")
+    if not len(scene.points):
+        notes.append(f"The COLMAP model {folder} has no points: they are triangulated.")
+    views = stated_exposures(root, scene.views)
+    return dataclasses.replace(scene, views=views, notes=(*scene.notes, *notes))
 
 
 def _photographs_alone(root: Path, cfg: DataConfig) -> PhotographsAlone:

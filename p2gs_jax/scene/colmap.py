@@ -8,6 +8,7 @@ with its own pose. Format: https://colmap.github.io/format.html
 
 from __future__ import annotations
 
+import re
 import struct
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -21,20 +22,27 @@ from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError, broken
+from p2gs_jax.scene.cameras import name_cameras
 from p2gs_jax.scene.files import (
     HUGE,
     at_file_size,
     check_missing,
+    find_names,
     image_folder,
+    image_size,
+    nearly_named,
     require_inside,
     rescaled,
 )
 from p2gs_jax.scene.lens import intrinsics, make_distortion, undistort_points
+from p2gs_jax.scene.rigid import off_origin
+from p2gs_jax.scene.seeds import read_points
 from p2gs_jax.types import Distortion, Scene, Tracks, View
 
 _FIX = "export the model again from COLMAP"
 _FIX_FILES = "copy the model again from where it was made, or export it again from COLMAP"
 _LENGTH = struct.Struct("<Q")
+_NUMBERS = re.compile(r"[-+.\deEnaif\s]*")
 _STEMS = ("cameras", "images", "points3D")
 _POINT = np.dtype([("id", "<i8"), ("xyz", "<f8", 3), ("rgb", "u1", 3)])
 # Behind a point its error, and how many observations of 8 bytes follow.
@@ -42,6 +50,8 @@ _POINT_BYTES, _LENGTH_AT = 51, 43
 _KEYPOINT = np.dtype([("xy", "<f8", 2), ("id", "<i8")])
 # Number of parameters and of focal lengths among them, in the order of COLMAP's model ids; 0: the
 # model is not supported.
+IMAGE_FOLDERS = ("images", "input", "input_images")
+"""Where photographs lie beside a model: as nerfstudio, 3DGS and HDR-NeRF name it."""
 _MODELS = {
     "SIMPLE_PINHOLE": (3, 1),
     "PINHOLE": (4, 2),
@@ -55,13 +65,69 @@ _MODELS = {
     "RADIAL_FISHEYE": (5, 1),
     "THIN_PRISM_FISHEYE": (12, 0),
     "RAD_TAN_THIN_PRISM_FISHEYE": (16, 0),
+    "SIMPLE_DIVISION": (4, 0),
+    "DIVISION": (5, 0),
+    "SIMPLE_FISHEYE": (3, 1),
+    "FISHEYE": (4, 2),
+    "EUCM": (6, 0),
+    "EQUIRECTANGULAR": (2, 0),
 }
 
 
 def find_model(root: Path) -> Path | None:
-    """Return the folder of the COLMAP model of a scene: `sparse/0`, `sparse` or the root itself."""
-    candidates = (root / "sparse" / "0", root / "sparse", root)
-    return next((folder for folder in candidates if is_model(folder)), None)
+    """Return the folder of the COLMAP model of a scene where 3DGS looks for it, and around there.
+
+    That is `sparse/0`, `sparse` or the root itself, or anything in `sparse`; of several numbered
+    ones, parts of which COLMAP knows no common place, the one with most photographs.
+    """
+    usual = (root / "sparse" / "0", root / "sparse", root)
+    return _largest(next((f for f in usual if is_model(f)), None) or _first_below(root / "sparse"))
+
+
+def find_deeper_model(root: Path) -> Path | None:
+    """Return a model up to three folders below a scene, as of `colmap/sparse/0`, or None."""
+    return _largest(_first_below(root))
+
+
+def _first_below(root: Path) -> Path | None:
+    for depth in ("*", "*/*", "*/*/*"):
+        found = [
+            file.parent
+            for file in root.glob(f"{depth}/images.*")
+            if file.suffix in (".bin", ".txt") and file.with_stem("cameras").is_file()
+        ]
+        # Runs may lie below their scenes, and keep models of their own.
+        found = [
+            f
+            for f in found
+            if "cache" not in f.relative_to(root).parts
+            and not any(
+                (above / "photometry.json").exists()
+                for above in {*f.parents} - {root, *root.parents}
+            )
+        ]
+        if found:
+            # 3DGS keeps what it undistorted from under this name.
+            return min(found, key=lambda f: ("distorted" in f.parts, f.as_posix()))
+    return None
+
+
+def _largest(folder: Path | None) -> Path | None:
+    """Return the model with most photographs among those that are numbered as this one is."""
+    if folder is None or not folder.name.isdecimal():
+        return folder
+    beside = [f for f in folder.parent.iterdir() if f.name.isdecimal() and is_model(f)]
+    return max(beside, key=lambda f: (_count(f), f == folder))
+
+
+def _count(folder: Path) -> int:
+    """Return about how many photographs a model has, without reading it."""
+    path = folder / "images.bin"
+    if path.is_file():
+        with path.open("rb") as file:
+            return int.from_bytes(file.read(8), "little")
+    path = folder / "images.txt"
+    return sum(1 for _ in _text_lines(path, blank=True)) // 2 if path.is_file() else 0
 
 
 def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
@@ -73,17 +139,17 @@ def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
     model = read_model(folder)
     _check_model(model)
     images = sorted(model.images, key=lambda image: image.name)
-    place = image_folder(root, cfg) or _find_images(root, folder, images)
+    place = image_folder(root, cfg) or _find_images(root, model)
     for image in images:
         require_inside(PurePosixPath(image.name), place, model.file("images"))
-    missing = [image.name for image in images if not (place / image.name).is_file()]
-    notes = check_missing(missing, len(images), model.file("images"), cfg)
-    skipped = set(missing)
-    images = [image for image in images if image.name not in skipped]
-
-    uses = Counter(image.camera_id for image in images)
-    # A model with one camera per image does not identify the same ones.
-    alone = len(uses) > 1 and max(uses.values()) == 1
+    files = find_names([image.name for image in images], place)
+    missing = [image.name for image in images if image.name not in files]
+    source = model.file("images")
+    notes = check_missing(missing, len(images), source, cfg, place)
+    notes += nearly_named(files, source.name)
+    images = [i._replace(name=files[i.name]) for i in images if i.name in files]
+    images.sort(key=lambda image: image.name)
+    model = model._replace(images=images)
     views, resized = [], 0
     for image in images:
         camera, path = model.cameras[image.camera_id], place / image.name
@@ -91,23 +157,23 @@ def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
         size = (camera.width, camera.height)
         K, width, height = at_file_size(path, K, size, model.file("cameras"))
         resized += (width, height) != size
-        name = subfolder(image.name) or ("0" if alone else str(image.camera_id))
         finite = (np.abs([*image.qvec, *image.tvec]) < HUGE).all()
         norm = np.linalg.norm(image.qvec) if finite else 0.0
         if norm < 1e-6:
-            why = f"the pose of {image.name} is not finite"
-            raise broken(f"{model.file('images')}:", why, _FIX)
+            raise broken(f"{source}:", f"the pose of {image.name} is not finite", _FIX)
         viewmat = np.eye(4)
         viewmat[:3, :3] = Rotation.from_quat(np.roll(image.qvec / norm, -1)).as_matrix()
         viewmat[:3, 3] = image.tvec
-        pose = viewmat.astype(np.float32)
-        views.append(View(image.name, path, name, pose, K, width, height, distortion))
+        number = str(image.camera_id)
+        views.append(View(image.name, path, number, viewmat, K, width, height, distortion))
     notes += rescaled(resized, model.file("cameras").name)
     others = sorted(p.name for p in folder.parent.iterdir() if p != folder and is_model(p))
-    if folder.name == "0" and others:
-        notes.append(f"used the model {folder}; beside it lie {', '.join(others)}, not used")
-    points, tracks = model.xyz.astype(np.float32), tracks_of(model, views)
-    return Scene(root, "colmap", tuple(views), points, model.rgb, tracks, tuple(notes))
+    if folder.name.isdecimal() and others:
+        used = f"used the model {folder} with {len(model.images)} photographs, the largest"
+        notes.append(f"{used}; beside it lie {', '.join(others)}, not used")
+    tracks = tracks_of(model, views)
+    named = name_cameras(views, cfg.camera_by)
+    return off_origin(Scene(root, "colmap", named, model.xyz, model.rgb, tracks, tuple(notes)))
 
 
 def tracks_of(model: Model, views: Sequence[View]) -> Tracks | None:
@@ -116,7 +182,7 @@ def tracks_of(model: Model, views: Sequence[View]) -> Tracks | None:
     Views are matched by name, and keypoints rescaled to their size. Observations of points that the
     model lacks (some tools thin points3D alone) and of other images are left out.
     """
-    if len(model.point_ids) == 0:
+    if not (model.point_ids >= 0).any():
         return None
     rows = {view.name: i for i, view in enumerate(views)}
     view_rows, point_rows, positions = [], [], []
@@ -140,12 +206,6 @@ def tracks_of(model: Model, views: Sequence[View]) -> Tracks | None:
     return Tracks(seen_in, seen_points, np.concatenate(positions))
 
 
-def subfolder(name: str) -> str | None:
-    """Return the top folder of an image's relative name, or None."""
-    parts = PurePosixPath(name).parts
-    return parts[0] if len(parts) > 1 else None
-
-
 def _check_model(model: Model) -> None:
     if not model.cameras:
         raise broken(model.file("cameras"), "holds no cameras", _FIX)
@@ -166,15 +226,25 @@ def _check_model(model: Model) -> None:
         raise broken(f"{model.file('points3D')}:", why, _FIX)
 
 
-def _find_images(root: Path, folder: Path, images: Sequence[ImageRecord]) -> Path:
-    places = [base / "images" for base in dict.fromkeys((root, *list(folder.parents)[:2]))]
-    for place in places:
-        if place.is_dir():
-            return place
-    if any((root / image.name).is_file() for image in images):
-        return root
-    why = f"has no image folder: looked for {', '.join(map(str, places))}"
-    raise broken(f"the COLMAP model {folder}", why, "name the folder with --images")
+def _find_images(root: Path, model: Model) -> Path:
+    """Return the nearest folder that holds photographs of the model, of the size that it says."""
+    above = [f for f in (model.folder, *model.folder.parents) if f.is_relative_to(root)]
+    above += [f for f in list(root.parents)[:2] if model.folder == root]
+    places = [f / name for f in above for name in IMAGE_FOLDERS if (f / name).is_dir()]
+    held = []
+    for place in [*places, root]:
+        image = next((i for i in model.images if (place / i.name).is_file()), None)
+        if image is not None:
+            camera = model.cameras[image.camera_id]
+            same = image_size(place / image.name) == (camera.width, camera.height)
+            held.append((not same, len(held), place))
+    if held:
+        return min(held)[2]
+    if places:
+        return places[-1]
+    looked = ", ".join(str(f / "images") for f in above)
+    why = f"has no image folder: looked for {looked}"
+    raise broken(f"the COLMAP model {model.folder}", why, "name the folder with --images")
 
 
 def _lens(path: Path, camera: CameraRecord) -> tuple[Float[np.ndarray, "3 3"], Distortion | None]:
@@ -227,7 +297,7 @@ class Model(NamedTuple):
     images: tuple[ImageRecord, ...]
     point_ids: Int[np.ndarray, " p"]
     xyz: Float[np.ndarray, "p 3"]
-    rgb: UInt8[np.ndarray, "p 3"]
+    rgb: UInt8[np.ndarray, "p 3"] | None
 
     def file(self, stem: str) -> Path:
         """Return a file of the model, for messages."""
@@ -243,22 +313,31 @@ def is_model(folder: Path) -> bool:
 def read_model(folder: Path) -> Model:
     """Read the model in a folder; binary files win where both kinds are complete.
 
-    Raises UserError: a file is missing, truncated or malformed; the message names it.
+    Points may be absent, or in a PLY, as 3DGS writes them. Raises UserError: another file is
+    missing, or one is truncated or malformed; the message names it.
     """
     files = {ext: [folder / f"{stem}.{ext}" for stem in _STEMS] for ext in ("bin", "txt")}
-    whole = [ext for ext, paths in files.items() if all(path.is_file() for path in paths)]
+    absent = {ext: [p for p in paths if not p.is_file()] for ext, paths in files.items()}
+    whole = [ext for ext in files if {*absent[ext]} <= {files[ext][2]}]
     if not whole:
-        paths = files["txt" if (folder / "cameras.txt").is_file() else "bin"]
-        absent = ", ".join(str(path) for path in paths if not path.is_file())
-        raise broken("incomplete COLMAP model:", f"{absent} does not exist", _FIX_FILES)
-    ext, paths = whole[0], files[whole[0]]
+        ext = "txt" if (folder / "cameras.txt").is_file() else "bin"
+        why = f"{', '.join(map(str, absent[ext]))} does not exist"
+        raise broken("incomplete COLMAP model:", why, _FIX_FILES)
+    ext = min(whole, key=lambda ext: len(absent[ext]))
+    cameras, images, points = files[ext]
     text = (_text_cameras, _text_images, _text_points)
     binary = (_binary_cameras, _binary_images, _binary_points)
-    cameras, images, points = binary if ext == "bin" else text
-    rows = points(paths[2])
-    rows = rows[np.argsort(rows["id"], kind="stable")]
-    ids, xyz, rgb = (np.ascontiguousarray(rows[name]) for name in ("id", "xyz", "rgb"))
-    return Model(folder, ext, cameras(paths[0]), tuple(images(paths[1])), ids, xyz, rgb)
+    read_cameras, read_images, read_them = binary if ext == "bin" else text
+    if points.is_file():
+        rows = read_them(points)
+        rows = rows[np.argsort(rows["id"], kind="stable")]
+        ids, xyz, rgb = (np.ascontiguousarray(rows[name]) for name in ("id", "xyz", "rgb"))
+    elif (folder / "points3D.ply").is_file():
+        xyz, rgb = read_points(folder / "points3D.ply")
+        ids = np.full(len(xyz), -1)
+    else:
+        ids, xyz, rgb = np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    return Model(folder, ext, read_cameras(cameras), tuple(read_images(images)), ids, xyz, rgb)
 
 
 class _Cursor:
@@ -356,7 +435,9 @@ def _text_cameras(path: Path) -> dict[int, CameraRecord]:
 
 def _text_images(path: Path) -> Iterator[ImageRecord]:
     lines = _text_lines(path, blank=True)
-    for number, line in lines:
+    following = next(lines, None)
+    while following is not None:
+        (number, line), following = following, next(lines, None)
         if not line:
             continue
         with _parsing(path, number):
@@ -364,11 +445,13 @@ def _text_images(path: Path) -> Iterator[ImageRecord]:
             values = [float(value) for value in pose]
             if len(values) != 7:
                 raise ValueError("an image line needs 10 fields")
-        # An image without keypoints has an empty second line, which editors may have cut.
-        number, line = next(lines, (number, ""))
+        # An image without keypoints has an empty second line, which tools and editors leave out.
+        keypoints = ""
+        if following is not None and _NUMBERS.fullmatch(following[1]):
+            (number, keypoints), following = following, next(lines, None)
         with _parsing(path, number):
-            keypoints = np.array(line.split(), np.float64).reshape(-1, 3)
-            record = _image(name, int(camera_id), values, keypoints[:, :2], keypoints[:, 2])
+            seen = np.array(keypoints.split(), np.float64).reshape(-1, 3)
+            record = _image(name, int(camera_id), values, seen[:, :2], seen[:, 2])
         yield record
 
 
@@ -386,7 +469,7 @@ def _text_points(path: Path) -> np.ndarray:
 
 def _text_lines(path: Path, *, blank: bool = False) -> Iterator[tuple[int, str]]:
     """Yield (line number, stripped line) without comments."""
-    with path.open(encoding="utf-8", errors="replace") as file:
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
         for number, raw in enumerate(file, 1):
             line = raw.strip()
             if not line.startswith("#") and (line or blank):

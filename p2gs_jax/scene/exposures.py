@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import csv
-from collections import defaultdict
 from collections.abc import Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.errors import UserError, broken
+from p2gs_jax.scene.split import row_finder
 from p2gs_jax.types import View
 
 KINDS = ("ev", "exposure", "rel_exposure_ev", "exposure_time_s")
@@ -44,22 +44,12 @@ def read_known_exposures(
 
 def _by_view(table: dict[str, float], views: Sequence[View], source: str) -> dict[str, float]:
     """Return the exposures of views by their whole names."""
-    ends: dict[str, set[str]] = defaultdict(set)
-    for name in (view.name for view in views):
-        parts = PurePosixPath(name).parts
-        for end in ("/".join(parts[k:]) for k in range(len(parts))):
-            ends[end].add(name)
-            ends[end.removesuffix(PurePosixPath(name).suffix)].add(name)
-    whole, out = {view.name for view in views}, dict[str, float]()
+    row_of, out = row_finder(views, source), dict[str, float]()
     for given, value in table.items():
-        written = PurePosixPath(given.replace("\\", "/")).as_posix()
-        names = {written} if written in whole else ends.get(written, set())
-        if len(names) > 1:
-            why = f"{given} may be {' and '.join(sorted(names)[:2])}"
-            raise broken(f"{source}:", why, "write more of the path into the file")
-        for name in names:
-            if out.setdefault(name, value) != value:
-                raise broken(f"{source}:", f"{name} has two exposures", "take one of them out")
+        row = row_of(given)
+        if row is not None and out.setdefault(views[row].name, value) != value:
+            why = f"{views[row].name} has two exposures"
+            raise broken(f"{source}:", why, "take one of them out")
     return out
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import difflib
 import hashlib
 import json
 import os
@@ -12,7 +13,8 @@ import tempfile
 import time
 import unicodedata
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
@@ -36,8 +38,6 @@ MASK_FOLDERS = ("masks", "mask", "dynamic_masks", "dynamic_mask")
 OTHER_FOLDERS = {*MASK_FOLDERS, "depth", "depths", "normal", "normals"}
 _MASK_NAME = re.compile(r"^(dynamic_)?masks?[._-](?=.)|(?<=.)[._-](dynamic_)?masks?$")
 _TWICE = re.compile(r"\.(jpe?g|png)\.png$", re.IGNORECASE)
-# Ratios of width to height that differ by more than this are different shapes.
-ASPECT_TOLERANCE = 0.01
 # Principal points lie this near to the middle of photographs, in their sides.
 MOST_OFF = 0.25
 # Finite numbers from here on are not finite in float32 arithmetic.
@@ -101,7 +101,7 @@ def _bare(name: str) -> str:
 def read_json(path: Path, fix: str) -> Any:
     """Return what a JSON file holds; UserError: it is absent, not text, or not valid JSON."""
     try:
-        return parse_json(path.read_text(encoding="utf-8"))
+        return parse_json(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise broken(path, "does not exist", fix) from None
     except json.JSONDecodeError as error:
@@ -109,6 +109,47 @@ def read_json(path: Path, fix: str) -> Any:
         raise broken(path, why, fix) from None
     except (OSError, UnicodeDecodeError):
         raise broken(path, "is not a text file", fix) from None
+
+
+def find_names(names: Iterable[str], folder: Path) -> dict[str, str]:
+    """Return the file below a folder that each name means; names that none is like are left out.
+
+    A file may differ in case, in Unicode's form, in its suffix, or lie in the folder itself, where
+    it is the only one that does and no other name means it.
+    """
+    found = {name: name for name in names if (folder / name).is_file()}
+    left = [name for name in dict.fromkeys(names) if name not in found]
+    files = {path.relative_to(folder).as_posix() for path in list_images(folder) if left}
+    for alike in (_folded, _stem, lambda name: _folded(PurePath(name).name)):
+        there: dict[str, list[str]] = defaultdict(list)
+        for file in sorted(files - set(found.values()), key=lambda f: (not f.endswith(".png"), f)):
+            there[alike(file)].append(file)
+        asked = Counter(map(alike, left))
+        for name in left:
+            like = there.get(alike(name), [])
+            # Blender's scenes leave the suffix out.
+            alone = len(like) == 1 or (like and _stem(name) == _folded(name))
+            if alone and asked[alike(name)] == 1:
+                found[name] = like[0]
+        left = [name for name in left if name not in found]
+    return found
+
+
+def nearly_named(files: Mapping[str, str], source: str) -> list[str]:
+    """Return a note about names for which other files were found, by name; or none."""
+    other = [f"{file} for {n}" for n, file in files.items() if PurePath(n).suffix and file != n]
+    note = f"{len(other)} images named by {source} have nearly these names: {first_few(other)}"
+    return [note] if other else []
+
+
+def _folded(name: str) -> str:
+    return unicodedata.normalize("NFC", name).casefold()
+
+
+def _stem(name: str) -> str:
+    """Return a name, folded, without the suffix of an image."""
+    path = PurePath(_folded(name))
+    return (path.with_suffix("") if path.suffix in IMAGE_SUFFIXES else path).as_posix()
 
 
 def require_inside(name: PurePath, folder: Path, source: Path, fix: str = _MOVED) -> None:
@@ -187,15 +228,27 @@ def undecodable(path: Path) -> UserError:
     return broken("cannot decode the image", f"{path} ({size} bytes)", fix)
 
 
-def check_missing(missing: Sequence[str], total: int, source: Path, cfg: DataConfig) -> list[str]:
+def check_missing(
+    missing: Sequence[str],
+    total: int,
+    source: Path,
+    cfg: DataConfig,
+    folder: Path | None = None,
+) -> list[str]:
     """Return notes about images that a model of `total` images names and the disk lacks.
 
-    Raises UserError: images are missing and `allow_missing` is not set, or no image is left.
+    They were looked for in `folder`. Raises UserError: images are missing and `allow_missing` is
+    not set, or no image is left.
     """
     if not missing:
         return []
     message = f"{len(missing)} of the {total} images named by {source} do not exist: "
     message += first_few(missing)
+    if folder is not None:
+        files = [path.relative_to(folder).as_posix() for path in list_images(folder)]
+        nearest = difflib.get_close_matches(missing[0], files, 1, 0.0)
+        near = f", of which {nearest[0]} is the nearest" if nearest else ""
+        message += f"; {folder} holds {len(files)} images{near}"
     if not cfg.allow_missing:
         fix = "add them, name their folder with --images, or skip them with --allow-missing"
         raise UserError(message, fix=fix)
@@ -212,12 +265,35 @@ def at_file_size(
     Raises UserError: the file is not an image, or has another shape than `source` says.
     """
     w, h = image_size(path)
-    sx, sy = w / size[0], h / size[1]
-    if abs(sx / sy - 1.0) > ASPECT_TOLERANCE:
+    if not same_shape((w, h), size):
         why = f"is {w}x{h}, but {source} says {size[0]}x{size[1]}"
         fix = "use the photographs from which the model was made, neither cropped nor rotated"
         raise broken(f"wrong size: {path}", why, fix)
-    return scale_intrinsics(K, sx, sy).astype(np.float32), w, h
+    return scale_intrinsics(K, w / size[0], h / size[1]).astype(np.float32), w, h
+
+
+def same_shape(a: tuple[int, int], b: tuple[int, int]) -> bool:
+    """Return whether a size is the other one resized: each side is rounded by up to a pixel."""
+    sides = np.array(a) / b, 1 / np.array(b)
+    return bool((sides[0] - sides[1]).max() <= (sides[0] + sides[1]).min())
+
+
+def shallow(paths: Sequence[Path]) -> list[str]:
+    """Return a note where 16-bit photographs hold fewer bits, by the first few; or none."""
+    brightest = 0
+    for path in paths[:3]:
+        # What has 8 bits is not decoded.
+        with contextlib.suppress(OSError), path.open("rb") as file:
+            if file.read(25)[24:] != b"\x10" and path.suffix.lower() not in (".tif", ".tiff"):
+                return []
+        pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        if pixels is None or pixels.dtype != np.uint16:
+            return []
+        brightest = max(brightest, int(pixels.max()))
+    bits = brightest.bit_length()
+    note = f"16-bit photographs hold no value above {brightest}: these are {bits} bits, so that "
+    note += f"white is dark ({brightest / 65535:.0%}); multiply them by {2 ** (16 - bits)}"
+    return [note] if 8 <= bits <= 14 else []
 
 
 def rescaled(count: int, source: str) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from p2gs_jax.core.text import natural
 from p2gs_jax.errors import broken
-from p2gs_jax.types import View
+from p2gs_jax.types import Scene, View
 
 Rotation3 = Float64[np.ndarray, "3 3"]
 Vector3 = Float[np.ndarray, " 3"]
@@ -19,6 +20,8 @@ Pose = Float64[np.ndarray, "4 4"]
 Poses = Float64[np.ndarray, "n 4 4"]
 # Singular values of the rotations in driving data sets differ from 1 by rounding only.
 ORTHOGONAL = 1e-3
+# Scenes further from the origin than this, in their own extent, are moved to it.
+FAR = 100.0
 # Poses are continued past the ends of their track by at most this, seconds.
 LONGEST_BEYOND_S = 0.15
 # The right-hand axes of cameras must span a plane this well before its normal counts as up.
@@ -103,6 +106,34 @@ def camera_centers(viewmats: Float[np.ndarray, "n 4 4"]) -> Float64[np.ndarray, 
     """Return the positions of cameras from their world-to-camera matrices, scene units."""
     viewmats = viewmats.astype(np.float64)
     return -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
+
+
+def off_origin(scene: Scene) -> Scene:
+    """Return a scene in float32, of which the poses of views and the points are float64 so far.
+
+    What lies far from the origin, as UTM coordinates do, is first moved to it: float32 would cut
+    off what tells neighbouring places apart. `Scene.origin` keeps what was taken off.
+    """
+    viewmats = np.stack([view.viewmat for view in scene.views])
+    middle = np.median(camera_centers(viewmats), axis=0)
+    reach = float(np.abs(camera_centers(viewmats) - middle).max())
+    if len(scene.points):
+        reach = max(reach, float(np.median(np.abs(scene.points - middle).max(axis=1))))
+    origin = np.zeros(3)
+    if np.abs(middle).max() > FAR * reach > 0:
+        step = min(1.0, 2.0 ** np.floor(np.log2(reach)))
+        origin = np.rint(middle / step) * step
+        viewmats[:, :3, 3] += viewmats[:, :3, :3] @ origin
+    views = tuple(
+        replace(view, viewmat=viewmat.astype(np.float32))
+        for view, viewmat in zip(scene.views, viewmats, strict=True)
+    )
+    points, notes = (scene.points - origin).astype(np.float32), scene.notes
+    if origin.any():
+        x, y, z = (f"{value:.12g}" for value in origin)
+        notes = (*notes, f"Coordinates are relative to ({x}, {y}, {z}), which float32 needs.")
+    x, y, z = map(float, origin)
+    return replace(scene, views=views, points=points, notes=notes, origin=(x, y, z))
 
 
 def interpolated(

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Float64, UInt8
 
 from p2gs_jax.core.ply import read_table, refusing
 from p2gs_jax.core.streams import Stream, generator
@@ -44,7 +44,7 @@ _MOST_OF_ONE = 2.0
 _FIX = "write it again with the tool that made it"
 
 
-def read_points(path: Path) -> tuple[Float32[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"] | None]:
+def read_points(path: Path) -> tuple[Float64[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"] | None]:
     """Return the positions and, where there are any, display colours of the points in a PLY.
 
     Colours are red, green, blue of 8 or 16 bits, or floats to 1 or 255, or those of Gaussians
@@ -56,7 +56,7 @@ def read_points(path: Path) -> tuple[Float32[np.ndarray, "p 3"], UInt8[np.ndarra
         raise broken(f"the seed points {path}", "do not exist", fix)
     with refusing(path, "points", fix=_FIX):
         vertex = read_table(path, "vertex")
-        points = np.stack([vertex[axis] for axis in "xyz"], 1).astype(np.float32)
+        points = np.stack([vertex[axis] for axis in "xyz"], 1).astype(np.float64)
         there = next((c for c in _COLORS if set(c) <= set(vertex.dtype.names or ())), None)
         colors = None if there is None else _display_colors(vertex, there)
     bad = int((~np.isfinite(points).all(axis=1)).sum())

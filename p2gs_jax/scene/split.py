@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
@@ -145,15 +145,9 @@ def split_as_listed(scene: Scene, lists: SplitLists, *, allow_missing: bool = Fa
     in two lists; or nothing is left to train on.
     """
     views, where, name, notes = scene.views, lists.where, lists.where.name, []
-    # The views that each end of a path may mean, with and without its suffix.
-    rows_of: dict[str, set[int]] = defaultdict(set)
-    for row, view in enumerate(views):
-        parts = view.image_path.as_posix().lstrip("/").split("/")
-        for tail in ("/".join(parts[start:]) for start in range(len(parts))):
-            rows_of[tail].add(row)
-            rows_of[tail.removesuffix(view.image_path.suffix)].add(row)
+    row_of = row_finder(views, where)
     found = [
-        None if names is None else {n: _row(n, views, rows_of, where) for n in names}
+        None if names is None else {name: row_of(name) for name in names}
         for names in (lists.train, lists.test)
     ]
     unused = [n for rows in found for n, row in (rows or {}).items() if row is None]
@@ -210,7 +204,7 @@ def only(
 
 def _lines(path: Path) -> tuple[str, ...]:
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError):
         fix = "write one name a line, or a .json with lists"
         raise broken(path, "is not a text file", fix) from None
@@ -225,18 +219,32 @@ def _normal(name: str) -> str:
     return PurePosixPath(name.replace("\\", "/")).as_posix()
 
 
-def _row(name: str, views: Sequence[View], rows_of: dict[str, set[int]], where: Path) -> int | None:
-    """Return the view of a name, or None."""
-    normal = _normal(name)
-    rows = rows_of.get(normal.lstrip("/"), set())
-    whole = {row: views[row].name for row in rows}
-    exact = {row for row, n in whole.items() if normal in (n, n.removesuffix(Path(n).suffix))}
-    rows = exact if len(exact) == 1 else rows
-    if len(rows) > 1:
-        names = " and ".join(views[row].name for row in sorted(rows)[:2])
-        fix = "write more of the path into the list"
-        raise broken(f"{where}:", f"{name} may be {names}", fix)
-    return next(iter(rows), None)
+def row_finder(views: Sequence[View], where: object) -> Callable[[str], int | None]:
+    """Return what finds the view of a name in the file `where`: any end of its photograph's path.
+
+    With or without suffix; None: of no view. Raises UserError: it may be of several.
+    """
+    rows_of: dict[str, set[int]] = defaultdict(set)
+    # A converted photograph lies elsewhere.
+    both = [(row, p) for row, v in enumerate(views) for p in (v.image_path, PurePosixPath(v.name))]
+    for row, path in both:
+        parts = path.as_posix().lstrip("/").split("/")
+        for tail in ("/".join(parts[start:]) for start in range(len(parts))):
+            rows_of[tail].add(row)
+            rows_of[tail.removesuffix(path.suffix)].add(row)
+
+    def find(name: str) -> int | None:
+        normal = _normal(name)
+        rows = rows_of.get(normal.lstrip("/"), set())
+        whole = {row: views[row].name for row in rows}
+        exact = {row for row, n in whole.items() if normal in (n, n.removesuffix(Path(n).suffix))}
+        rows = exact if len(exact) == 1 else rows
+        if len(rows) > 1:
+            names = " and ".join(views[row].name for row in sorted(rows)[:2])
+            raise broken(f"{where}:", f"{name} may be {names}", "write more of the path into it")
+        return next(iter(rows), None)
+
+    return find
 
 
 def _lies_there(name: str, views: Sequence[View]) -> bool:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -28,15 +29,19 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.core.atomic import BROKEN_ARRAYS
 from p2gs_jax.errors import broken
 from p2gs_jax.scene import files
-from p2gs_jax.scene.colmap import subfolder
+from p2gs_jax.scene.axes import require_axes, share_in_view
+from p2gs_jax.scene.cameras import name_cameras, numbered
+from p2gs_jax.scene.colmap import IMAGE_FOLDERS
 from p2gs_jax.scene.files import at_file_size, require_inside
 from p2gs_jax.scene.lens import intrinsics, make_distortion
-from p2gs_jax.scene.rigid import nearest_rotation
+from p2gs_jax.scene.masks import image_folder_of
+from p2gs_jax.scene.rigid import nearest_rotation, off_origin
 from p2gs_jax.scene.seeds import read_points
 from p2gs_jax.scene.split import lists_in, split_as_listed
 from p2gs_jax.types import Distortion, Scene, Split, View
 
-LLFF_FILE = "poses_bounds.npy"
+# HDR-NeRF's has a column more: exposures, seconds.
+LLFF_FILES = ("poses_bounds_exps.npy", "poses_bounds.npy")
 _LLFF_COLUMNS = 17
 # Columns of LLFF's pose that are OpenCV's x, y, z and position, and their signs.
 _LLFF_AXES, _LLFF_SIGNS = [1, 0, 2, 3], np.array([1.0, 1.0, -1.0, 1.0])
@@ -46,6 +51,9 @@ _PINHOLES = frozenset({"PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "
 _FISHEYE = "OPENCV_FISHEYE"
 _FIX = "correct the file, or write it again with the tool that made it"
 _UNDISTORT = "undistort the images to pinhole ones (colmap image_undistorter) and use those"
+_CUT = "cut the panoramas into pinhole photographs: ns-process-data images --camera-type "
+_CUT += "equirectangular, or COLMAP's python/examples/panorama_sfm.py"
+_IMAGES = re.compile(r"images(_\d+)?|input|input_images|rgb")
 _LISTS = {"train": "train_filenames", "test": "test_filenames", "val": "val_filenames"}
 
 
@@ -70,7 +78,12 @@ def load_transforms(root: Path, json_path: Path, cfg: DataConfig) -> Scene:
     supported, images are missing or of another size, or it lists views that it lacks.
     """
     frames, data = _frames(json_path)
+    held_out = data.get("test_frames")  # ScanNet++
+    if held_out:
+        frames += _frames(json_path, "test", "test_frames")[0]
     scene = _assembled(root, "transforms", frames, cfg)
+    if held_out:
+        scene = replace(scene, split_by=f"{json_path.name} (test_frames)")
     name = data.get("ply_file_path")
     if name:
         if not isinstance(name, str):
@@ -80,6 +93,8 @@ def load_transforms(root: Path, json_path: Path, cfg: DataConfig) -> Scene:
         if not len(points):
             note = f"{name} holds no points: seeds are found as if it were not named."
             scene = replace(scene, notes=(*scene.notes, note))
+        require_axes(scene.views, lambda views: share_in_view(points, views), json_path)
+    scene = off_origin(scene)
     lists = lists_in(json_path, data, _LISTS)
     if lists is None or cfg.split is not None or not cfg.test_every:
         return scene
@@ -99,7 +114,7 @@ def load_blender(root: Path, cfg: DataConfig) -> Scene:
     frames, _ = _frames(train)
     if test is not None:
         frames += _frames(test, "test")[0]
-    scene = _assembled(root, "blender", frames, cfg)
+    scene = off_origin(_assembled(root, "blender", frames, cfg))
     return scene if test is None else replace(scene, split_by=test.name)
 
 
@@ -109,9 +124,11 @@ def load_llff(root: Path, cfg: DataConfig) -> Scene:
     Raises UserError: the file is broken, has not a row for each photograph, or photographs have
     another shape than it says.
     """
-    path = root / LLFF_FILE
+    path = llff_table(root)
+    assert path is not None
     rows = _read_llff(path)
-    folder = root / (cfg.images or "images")
+    places = [root / cfg.images] if cfg.images else [root / name for name in IMAGE_FOLDERS]
+    folder = next((place for place in places if place.is_dir()), places[0])
     photographs = files.list_images(folder, recursive=False)
     if len(photographs) != len(rows):
         why = f"has {len(rows)} rows, and {folder} holds {len(photographs)} photographs"
@@ -125,13 +142,31 @@ def load_llff(root: Path, cfg: DataConfig) -> Scene:
         K, w, h = at_file_size(image, intrinsics(focal, focal, width / 2, height / 2), stated, path)
         resized += (w, h) != stated
         viewmat = _viewmat(matrix[:, _LLFF_AXES] * _LLFF_SIGNS, path, what, _LLFF_FIX)
-        views.append(View(image.name, image, "0", viewmat, K, w, h))
+        ev = float(np.log2(row[17])) if len(row) > _LLFF_COLUMNS else None
+        views.append(View(image.name, image, f"{focal:g}", viewmat, K, w, h, exif_ev=ev))
     bounds = (float(rows[:, 15].min()), float(rows[:, 16].max()))
-    return replace(_scene(root, "llff", views, files.rescaled(resized, LLFF_FILE)), depths=bounds)
+    views = name_cameras(numbered(views), cfg.camera_by)
+    scene = _scene(root, "llff", views, files.rescaled(resized, path.name))
+    return replace(off_origin(scene), depths=bounds)
+
+
+def llff_table(root: Path) -> Path | None:
+    """Return LLFF's table in a folder, or HDR-NeRF's, which has exposures, or None."""
+    return next((root / name for name in LLFF_FILES if (root / name).is_file()), None)
+
+
+def stated_exposures(root: Path, views: Sequence[View]) -> tuple[View, ...]:
+    """Return views of another format with the exposures of HDR-NeRF's table, if one is there."""
+    path, photographs = root / LLFF_FILES[0], files.list_images(image_folder_of(views[0]))
+    rows = _read_llff(path) if path.is_file() else ()
+    if len(rows) != len(photographs):
+        return tuple(views)
+    evs = {p: float(np.log2(row[17])) for p, row in zip(photographs, rows, strict=True)}
+    return tuple(replace(view, exif_ev=evs[view.image_path]) for view in views)
 
 
 def _scene(root: Path, name: str, views: Sequence[View], notes: Sequence[str]) -> Scene:
-    points, colors = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    points, colors = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     return Scene(root, name, tuple(views), points, colors, notes=tuple(notes))
 
 
@@ -145,7 +180,7 @@ def _viewmat(
     viewmat = np.eye(4)
     viewmat[:3, :3] = nearest.T
     viewmat[:3, 3] = -viewmat[:3, :3] @ pose[:, 3]
-    return viewmat.astype(np.float32)
+    return viewmat
 
 
 def _read_llff(path: Path) -> Float64[np.ndarray, "v 17"]:
@@ -156,40 +191,39 @@ def _read_llff(path: Path) -> Float64[np.ndarray, "v 17"]:
         raise broken(path, f"cannot be read: {error}", _LLFF_FIX) from None
     if not isinstance(table, np.ndarray) or table.dtype.kind not in "fiu":
         raise broken(path, "holds no numbers", _LLFF_FIX)
-    if table.ndim != 2 or table.shape[1] != _LLFF_COLUMNS or not len(table):
+    columns = _LLFF_COLUMNS + (path.name == LLFF_FILES[0])
+    if table.ndim != 2 or table.shape[1] != columns or not len(table):
         shape = "x".join(map(str, table.shape))
-        raise broken(path, f"holds {shape} numbers, not N x {_LLFF_COLUMNS}", _LLFF_FIX)
+        raise broken(path, f"holds {shape} numbers, not N x {columns}", _LLFF_FIX)
     table = table.astype(np.float64)
-    for k, (*pose, near, far) in enumerate(table):
-        why = None
+    for k, row in enumerate(table):
+        pose, (near, far, *exposures), why = row[:15], row[15:], None
         if not np.isfinite(pose).all():
             why = f"the pose in row {k} is not finite"
         elif not (min(pose[4], pose[9]) >= 1 and pose[14] > 0):
             why = f"row {k} has an impossible height, width or focal length"
         elif not 0 < near < far < math.inf:
             why = f"row {k} has impossible bounds: {near:g} to {far:g}"
+        elif not all(0 < exposure < math.inf for exposure in exposures):
+            why = f"row {k} has the impossible exposure {exposures[0]:g}"
         if why is not None:
             raise broken(f"{path}:", why, _LLFF_FIX)
     return table
 
 
 def _assembled(root: Path, name: str, frames: Sequence[_Frame], cfg: DataConfig) -> Scene:
-    """Return a scene of frames; one camera took all of Blender's scenes."""
+    """Return a scene of frames, float64; one camera took all of Blender's scenes."""
     folder = frames[0].source.parent
-    # Names are relative to the deepest folder that holds all images, as `images/` for COLMAP.
-    common = Path(os.path.commonpath([frame.path.parent for frame in frames]))
-    asked = files.image_folder(folder, cfg)
-    place = folder / common if asked is None else asked
-    for frame in frames:
-        name_of = frame.path if asked is None else frame.path.relative_to(common)
-        require_inside(name_of, asked or folder, frame.source)
-    located = [(_with_suffix(place, f.path.relative_to(common)), f) for f in frames]
+    place, names = _names(folder, frames, files.image_folder(folder, cfg))
+    located = files.find_names(names, place)
     notes: list[str] = []
     for source in dict.fromkeys(frame.source for frame in frames):
-        listed = [(where, frame) for where, frame in located if frame.source == source]
-        missing = [frame.path.as_posix() for where, frame in listed if where is None]
-        notes += files.check_missing(missing, len(listed), source, cfg)
-    found = [(where, frame) for where, frame in located if where is not None]
+        listed = [(n, f.path) for n, f in zip(names, frames, strict=True) if f.source == source]
+        missing = [path.as_posix() for n, path in listed if n not in located]
+        notes += files.check_missing(missing, len(listed), source, cfg, place)
+    sources = " and ".join(dict.fromkeys(frame.source.name for frame in frames))
+    notes += files.nearly_named(located, sources)
+    found = [(located[n], f) for n, f in zip(names, frames, strict=True) if n in located]
     twice = next((n for n, times in Counter(n for n, _ in found).items() if times > 1), None)
     if twice is not None:
         first, *_, last = (frame.source for name, frame in found if name == twice)
@@ -201,11 +235,34 @@ def _assembled(root: Path, name: str, frames: Sequence[_Frame], cfg: DataConfig)
     views, resized = [], 0
     for where, frame in sorted(found, key=lambda item: item[0]):
         view, differs = _view(frame, place, where)
-        views.append(replace(view, camera="0") if name == "blender" else view)
+        views.append(view)
         resized += differs
-    sources = " and ".join(dict.fromkeys(frame.source.name for frame in frames))
     _require_one_shape(views, dict(found))
+    views = name_cameras(numbered(views), "one" if name == "blender" else cfg.camera_by)
     return _scene(root, name, views, [*notes, *files.rescaled(resized, sources)])
+
+
+def _names(folder: Path, frames: Sequence[_Frame], asked: Path | None) -> tuple[Path, list[str]]:
+    """Return the folder of the images and their names relative to it, as of `images/` for COLMAP.
+
+    Without such a folder that is the deepest one that holds all of them. In a folder that the user
+    names they lie as in one of those above.
+    """
+    common = Path(os.path.commonpath([frame.path.parent for frame in frames]))
+    depth = next((k + 1 for k, n in enumerate(common.parts) if _IMAGES.fullmatch(n)), None)
+    depth = len(common.parts) if depth is None else depth
+    below = [
+        [Path(*frame.path.parts[k:]) for frame in frames] for k in range(len(common.parts) + 1)
+    ]
+    for frame, name in zip(frames, below[depth], strict=True):
+        require_inside(frame.path if asked is None else name, asked or folder, frame.source)
+    if asked is not None:
+        order = sorted(range(len(below)), key=lambda k: (k != depth, k))
+        order = [k for k in order if ".." not in common.parts[k:]]
+        held = [sum((asked / name).is_file() for name in below[k]) for k in order]
+        depth = order[int(np.argmax(held))]
+    place = folder.joinpath(*common.parts[:depth]) if asked is None else asked
+    return place, [name.as_posix() for name in below[depth]]
 
 
 def _require_one_shape(views: Sequence[View], frames: Mapping[str, _Frame]) -> None:
@@ -213,8 +270,8 @@ def _require_one_shape(views: Sequence[View], frames: Mapping[str, _Frame]) -> N
     free = [v for v in views if not {"w", "h"} <= set(frames[v.name].values)]
     for view in free:
         first = free[0]
-        shapes = (view.width / view.height) / (first.width / first.height)
-        if abs(shapes - 1) > files.ASPECT_TOLERANCE:
+        sizes = [(v.width, v.height) for v in (view, first)]
+        if not (files.same_shape(*sizes) or files.same_shape(*sizes[::-1])):
             why = f"is {view.width}x{view.height}, {first.name} {first.width}x{first.height}, and "
             why += f"{frames[view.name].source} gives all of them one lens"
             fix = "use the photographs that belong to the poses, neither cropped nor rotated, or "
@@ -222,14 +279,16 @@ def _require_one_shape(views: Sequence[View], frames: Mapping[str, _Frame]) -> N
             raise broken(f"wrong size: {view.image_path}", why, fix)
 
 
-def _frames(path: Path, split: Split = "train") -> tuple[list[_Frame], dict[str, Any]]:
+def _frames(
+    path: Path, split: Split = "train", key: str = "frames"
+) -> tuple[list[_Frame], dict[str, Any]]:
     """Return the frames in a file, and all that it holds."""
     data, frames = files.read_json(path, _FIX), []
-    if not isinstance(data, dict) or not isinstance(data.get("frames"), list):
-        raise broken(path, 'has no list "frames"', _FIX)
-    if not data["frames"]:
+    if not isinstance(data, dict) or not isinstance(data.get(key), list):
+        raise broken(path, f'has no list "{key}"', _FIX)
+    if not data[key]:
         raise broken(path, "lists no frames", _FIX)
-    for i, values in enumerate(data["frames"]):
+    for i, values in enumerate(data[key]):
         name = values.get("file_path") if isinstance(values, dict) else None
         if not isinstance(name, str) or not name:
             raise broken(f"{path}:", f'frame {i} has no "file_path"', _FIX)
@@ -238,10 +297,15 @@ def _frames(path: Path, split: Split = "train") -> tuple[list[_Frame], dict[str,
 
 
 def _relative(source: Path, name: str) -> Path:
-    """Return a path in a file as one from its folder."""
-    normal = os.path.normpath(name.replace("\\", "/"))
-    absolute = os.path.isabs(normal)
-    return Path(os.path.relpath(normal, source.parent.resolve()) if absolute else normal)
+    """Return a path in a file as one from its folder, which either may name through links."""
+    normal, folder = Path(os.path.normpath(name.replace("\\", "/"))), source.parent
+    if not normal.is_absolute():
+        return normal
+    for above in (folder.absolute(), folder.resolve()):
+        for path in (normal, normal.parent.resolve() / normal.name):
+            if path.is_relative_to(above):
+                return path.relative_to(above)
+    return Path(os.path.relpath(normal, folder.resolve()))
 
 
 def _beside(source: Path, name: str) -> Path:
@@ -249,18 +313,6 @@ def _beside(source: Path, name: str) -> Path:
     relative = _relative(source, name)
     require_inside(relative, source.parent, source)
     return source.parent / relative
-
-
-def _with_suffix(folder: Path, relative: Path) -> str | None:
-    """Return the name of the image file; Blender's scenes leave the extension out."""
-    if (folder / relative).is_file():
-        return relative.as_posix()
-    for suffix in (".png", ".jpg", *sorted(files.IMAGE_SUFFIXES)):
-        for candidate in (suffix, suffix.upper()):
-            path = relative.with_name(relative.name + candidate)
-            if (folder / path).is_file():
-                return path.as_posix()
-    return None
 
 
 def _view(frame: _Frame, folder: Path, name: str) -> tuple[View, bool]:
@@ -293,7 +345,8 @@ def _view(frame: _Frame, folder: Path, name: str) -> tuple[View, bool]:
     if c2w.shape != (3, 4) or not (np.abs(c2w) < files.HUGE).all():
         raise broken(f"{path}:", f"{what} is not a finite 4x4 matrix", _FIX)
     viewmat = _viewmat(c2w * _OPENGL_SIGNS, path, what, _FIX)
-    camera = subfolder(name) or "0"
+    # Photographs of one lens are of one camera.
+    camera = f"{values.get('w')} {values.get('h')} {np.round(K, 3).tolist()} {distortion}"
     view = View(name, image_path, camera, viewmat, K, width, height, distortion, mask_path)
     return replace(view, split=frame.split), (width, height) != size
 
@@ -305,7 +358,8 @@ def _lens(
     fisheye = model == _FISHEYE or bool(values.get("is_fisheye"))
     if model not in (*_PINHOLES, _FISHEYE):
         known = ", ".join(sorted((*_PINHOLES, _FISHEYE)))
-        raise broken(path, f"uses the camera model {model}; supported are {known}", _UNDISTORT)
+        fix = _CUT if model == "EQUIRECTANGULAR" else _UNDISTORT
+        raise broken(path, f"uses the camera model {model}; supported are {known}", fix)
 
     def number(key: str, default: float) -> float:
         value = values.get(key, default)
@@ -320,9 +374,14 @@ def _lens(
     def focal(key: str, angle_key: str, size: int) -> float | None:
         if key in values:
             return number(key, 0.0)
-        if angle_key in values and not fisheye:
-            return 0.5 * size / math.tan(0.5 * number(angle_key, 0.0) or math.nan)
-        return None
+        if angle_key not in values or fisheye:
+            return None
+        angle = number(angle_key, 0.0)
+        if not 0 < angle < math.pi:
+            why = f"{angle_key} of {name} is {angle:g}, not an angle between 0 and pi"
+            fix = f"write radians; {math.radians(angle):.6g}, if these are degrees"
+            raise broken(f"{path}:", why, fix)
+        return 0.5 * size / math.tan(0.5 * angle)
 
     fx = focal("fl_x", "camera_angle_x", width)
     fy = focal("fl_y", "camera_angle_y", height)

@@ -57,20 +57,12 @@ def test_lenses_are_undone(lens):
 
 @settings(max_examples=60, deadline=None)
 @given(lenses)
-def test_lenses_grow_up_to_their_fold_and_no_further(lens):
-    limit = _fold_radius(lens)
-    radii = np.linspace(0, min(limit, 20.0), 400)[:-1]
+def test_lenses_grow_up_to_their_fold(lens):
+    radii = np.linspace(0, min(_fold_radius(lens), 20.0), 400)[:-1]
     X = np.stack([radii, np.zeros_like(radii), np.ones_like(radii)], 1)
     terms = list(lens.coefficients)
     terms[2:4] = terms[2:4] if lens.model == "fisheye" else [0.0, 0.0]
-    straight = Distortion(tuple(terms), lens.model)
-    seen = photographed(X, straight)[:, 0]
-    assert (np.diff(seen) > -1e-9).all()
-    if np.isfinite(limit) and limit < 20:
-        x = np.array([[limit * 0.999, 0, 1.0], [limit * 1.001, 0, 1]])
-        before, after = photographed(x, straight)[:, 0]
-        # Either the radius falls, or it jumps through infinity.
-        assert after - before < 1e-3 * abs(before)
+    assert (np.diff(photographed(X, Distortion(tuple(terms), lens.model))[:, 0]) > -1e-9).all()
 
 
 def test_beyond_the_fold_and_at_the_side_of_a_fisheye_there_is_no_ray():

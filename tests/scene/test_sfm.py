@@ -1,5 +1,7 @@
 """Structure from motion: pairs, features that stay, reasons, and scenes of photographs alone."""
 
+import dataclasses
+import functools
 import os
 import shutil
 
@@ -9,11 +11,12 @@ from PIL import Image
 from scene.helpers import refused, reprojection_errors, write_image
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.scene import load_scene
+from p2gs_jax.scene import find_scene, load_scene
+from p2gs_jax.scene.axes import require_axes
 from p2gs_jax.scene.files import cached_folder, stage_progress
 from p2gs_jax.scene.sfm import features
 from p2gs_jax.scene.sfm.features import kept_features, match_kept, pairs_by_name, pairs_by_pose
-from p2gs_jax.scene.sfm.map import reasons, sentence
+from p2gs_jax.scene.sfm.map import agreement, reasons, sentence
 
 CFG = DataConfig()
 
@@ -79,7 +82,7 @@ def names_in(database):
         return {i.name: (i.camera_id, i.image_id) for i in db.read_all_images()}
 
 
-def test_only_what_is_new_is_done(folder, tmp_path):
+def test_only_what_is_new_is_done_and_matches_judge_poses(noisy_street, folder, tmp_path):
     said, names, keep = [], [f"{k}.png" for k in range(5)], tmp_path / "features"
     database = kept_features(keep, folder, {("one",): names[:3]}, said.append)
     match_kept(database, names[:3], None, said.append)
@@ -96,6 +99,16 @@ def test_only_what_is_new_is_done(folder, tmp_path):
     assert "detecting features: 2 images" in said
     assert "matches of 3 image pairs are kept from an earlier run" in said
     assert "matching: 7 image pairs" in said
+
+    scene = find_scene(noisy_street, CFG)
+    by_path = sorted(scene.views, key=lambda view: view.image_path)[:5]
+    views = [dataclasses.replace(v, name=name) for v, name in zip(by_path, names, strict=True)]
+    assert agreement(database, views) > 0.9
+    with refused("street has poses that contradict the photographs", "OpenCV's axes"):
+        turned = [
+            dataclasses.replace(v, viewmat=np.diag([1, -1, -1, 1]) @ v.viewmat) for v in views
+        ]
+        require_axes(turned, functools.partial(agreement, database), "street")
 
     said.clear()
     os.utime(folder / "1.png", ns=(1, 1))

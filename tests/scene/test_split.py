@@ -114,10 +114,8 @@ def studio(root, **extra):
     names = [f"images/f_{k}.png" for k in range(5)]
     for name in names:
         write_rgba(root / name)
-    frames = [
-        {"file_path": name, "transform_matrix": pose.tolist()}
-        for name, pose in zip(names, around(5), strict=True)
-    ]
+    poses = zip(names, around(5).tolist(), strict=True)
+    frames = [{"file_path": name, "transform_matrix": pose} for name, pose in poses]
     data = {"fl_x": 50, "w": 40, "h": 30, "aabb_scale": 16, "frames": frames, **extra}
     (root / "transforms.json").write_text(json.dumps(data))
     return root
@@ -126,11 +124,11 @@ def studio(root, **extra):
 RGB = ("red", "green", "blue")
 
 
-def write_ply(path, points, colors=None, names=RGB):
+def write_ply(path, points, colors=None, names=RGB, kind="f4"):
     names = () if colors is None else names
-    fields = [(axis, "f4") for axis in "xyz"] + [(name, colors.dtype) for name in names]
+    fields = [(axis, kind) for axis in "xyz"] + [(name, colors.dtype) for name in names]
     table = np.zeros(len(points), fields)
-    for axis, column in zip("xyz", np.asarray(points, np.float32).T, strict=True):
+    for axis, column in zip("xyz", np.asarray(points, float).T, strict=True):
         table[axis] = column
     for name in names:
         table[name] = colors

@@ -62,24 +62,29 @@ def test_colours_survive_every_way_of_coding_them(tmp_path, codec, layout, full,
     assert np.abs(seen - COLOURS / 255).max() < 2.5 / 255
 
 
-# Table 4 and 5 of BT.2100: light of the signal, as ITU-R BT.2408 lists it.
-def test_transfer_functions() -> None:
-    hlg = to_light(np.array([0.0, 0.5, 0.75, 1.0]), "hlg")
-    assert hlg == pytest.approx([0.0, 1 / 12, 0.2650, 1.0], abs=2e-4)
-    pq = to_light(np.array([0.508078, 0.580689, 0.751827, 1.0]), "pq")
-    assert pq == pytest.approx([100 / PQ_WHITE, 203 / PQ_WHITE, 1000 / PQ_WHITE, 1], abs=2e-4)
-
-
-@pytest.mark.parametrize(("coding", "name"), [(HLG, "hlg"), (PQ, "pq")])
-def test_hdr_video_becomes_light(tmp_path: Path, coding, name) -> None:
+@pytest.mark.parametrize(
+    ("coding", "name", "signal", "light"),
+    [
+        # BT.2100, tables 4 and 5; values as ITU-R BT.2408 lists them.
+        (HLG, "hlg", [0.0, 0.5, 0.75, 1.0], [0.0, 1 / 12, 0.2650, 1.0]),
+        (
+            PQ,
+            "pq",
+            [0.508078, 0.580689, 0.751827],
+            [100 / PQ_WHITE, 203 / PQ_WHITE, 1000 / PQ_WHITE],
+        ),
+    ],
+)
+def test_hdr_video_becomes_light(tmp_path: Path, coding, name, signal, light) -> None:
+    assert to_light(np.array(signal), name) == pytest.approx(light, abs=2e-4)
     grey = np.repeat(np.repeat(np.linspace(6000, 46000, 8)[None, :, None], 64, 0), 40, 1)
     card, path = np.repeat(grey, 3, 2).astype(np.uint16), tmp_path / "a.mkv"
     write_video(path, [card] * 2, codec="ffv1", layout="yuv422p10le", coding=coding)
     frame = next(iter(frames_of(path)))
     assert frame.transfer == name
-    light = srgb_decode(frame.codes()[32, 20::40] / 65535)
+    found = srgb_decode(frame.codes()[32, 20::40] / 65535)
     expected = to_light(card[32, 20::40] / 65535, name)
-    np.testing.assert_allclose(light, expected, rtol=0.03, atol=1e-3)
+    np.testing.assert_allclose(found, expected, rtol=0.03, atol=1e-3)
 
 
 def test_wide_colours_of_a_phones_hdr_video_are_brought_to_srgb() -> None:

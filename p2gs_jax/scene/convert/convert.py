@@ -53,10 +53,10 @@ _COMPRESSION = 1
 _SIGNATURE_AND_HEADER = 8 + 25
 # Make and model (structure from motion begins with the focal length of the lens).
 _KEPT = (0x010F, 0x0110)
-# Exposure time, f-number, sensitivities, time, focal length, and that for 35 mm film.
+# Exposure time, f-number, sensitivities, time, focal length, that for 35 mm film, camera, lens.
 _KEPT_EXIF = (
     *(0x829A, 0x829D, 0x8827, 0x8830, 0x8831, 0x8832, 0x8833),
-    *(0x9003, 0x9011, 0x9291, 0x920A, 0xA405),
+    *(0x9003, 0x9011, 0x9291, 0x920A, 0xA405, 0xA431, 0xA434),
 )
 _NO_ROOM = "make room on that disk, or name another --out"
 

@@ -56,7 +56,7 @@ _TIME, _F_NUMBER, _ISO, _FOCAL_LENGTH, _TAKEN = 0x829A, 0x829D, 0x8827, 0x920A, 
 # PhotographicSensitivity is 16 bits: 65535 there means "see the others".
 _SENSITIVITIES = (_ISO, 0x8833, 0x8832, 0x8831)
 _SHUTTER_SPEED, _APERTURE, _LARGEST_APEX = 0x9201, 0x9202, 32.0
-_MAKE, _MODEL = 0x010F, 0x0110
+_MAKE, _MODEL, _SERIAL, _LENS = 0x010F, 0x0110, 0xA431, 0xA434
 # LibRaw's attributes.
 _RAW_SETTINGS = {"shutter_speed": _TIME, "aperture": _F_NUMBER, "iso_speed": _ISO}
 _RAW_SETTINGS |= {"focal_length": _FOCAL_LENGTH}
@@ -429,14 +429,18 @@ def _original(path: Path) -> Path:
     return path
 
 
-def read_exif_camera(path: Path) -> str:
-    """Return make, model and focal length as one string; empty without EXIF."""
-    tags = _exif_tags(path)
-    parts = (tags.get(tag) for tag in (_MAKE, _MODEL, _FOCAL_LENGTH))
+def read_exif_camera(path: Path, *, zoom: bool = False) -> str:
+    """Return make, model, serial number and lens as one string; empty without EXIF.
+
+    With `zoom` the focal length as well.
+    """
+    tags = _exif_tags(path, behind=False)
+    wanted = (_MAKE, _MODEL, _SERIAL, _LENS, *([_FOCAL_LENGTH] if zoom else []))
+    parts = (tags.get(tag) for tag in wanted)
     return " ".join(str(part).strip("\0 ") for part in parts if part is not None)
 
 
-def _exif_tags(path: Path) -> dict:
+def _exif_tags(path: Path, *, behind: bool = True) -> dict:
     kind = kind_of(path)
     # Pillow raises many kinds of errors on malformed EXIF (struct, Syntax, Value, OS, ...).
     try:
@@ -447,6 +451,9 @@ def _exif_tags(path: Path) -> dict:
         if kind == "heif":
             pillow_heif(path)
         with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
+            # Pillow decodes a PNG to look for EXIF behind its pixels.
+            if not behind and image.format == "PNG" and "exif" not in image.info:
+                return {}
             exif = image.getexif()
             return {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
     except Exception:

@@ -105,7 +105,7 @@ def read_kitti_raw(root: Path, cfg: DataConfig) -> Recording:
 
 def _read_lines(path: Path) -> list[str]:
     try:
-        return path.read_text(errors="replace").rstrip().splitlines()
+        return path.read_text("utf-8-sig", "replace").rstrip().splitlines()
     except FileNotFoundError:
         raise missing_file(path) from None
 
@@ -213,7 +213,7 @@ def _car(root: Path) -> tuple[Trajectory, list[str]]:
 
 def _oxts(path: Path) -> Float64[np.ndarray, " 6"]:
     """Return latitude and longitude in degrees, altitude in metres, roll, pitch, yaw."""
-    words = path.read_text(errors="replace").split()
+    words = path.read_text("utf-8-sig", "replace").split()
     values = finite_numbers(words[:6], path, "position and angles", 6)
     if abs(values[0]) >= 89:
         raise broken(f"{path}:", f"a latitude of {values[0]} degrees has no Mercator projection")

@@ -133,10 +133,12 @@ def read_rows(path: Path, needs: Kinds, column: str = "", among: Container[Any] 
     try:
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
             if not (
-                re.match(rb"\s*\[\s*[{\]]", text) and re.search(rb"[}\[]\s*]\s*$", text[-999:])
+                re.match(rb"(?:\xef\xbb\xbf)?\s*\[\s*[{\]]", text)
+                and re.search(rb"[}\[]\s*]\s*$", text[-999:])
             ):
                 raise ValueError("it should be a list of objects")
-            rows = list(_found(text, column, among)) if column else parse_json(text[:].decode())
+            whole = "" if column else text[:].decode("utf-8-sig")
+            rows = list(_found(text, column, among)) if column else parse_json(whole)
     except FileNotFoundError:
         raise missing_file(path) from None
     except (ValueError, RecursionError) as error:

@@ -17,7 +17,7 @@ from PIL import Image
 from p2gs_jax.core.memory import left_to_process
 from p2gs_jax.errors import broken
 from p2gs_jax.scene.convert.icc import with_profile_applied
-from p2gs_jax.scene.files import ASPECT_TOLERANCE, image_size, undecodable
+from p2gs_jax.scene.files import image_size, undecodable
 from p2gs_jax.scene.lens import undistortion_maps
 from p2gs_jax.types import View
 
@@ -26,6 +26,8 @@ _ALPHA_VALID = 0.5
 # About what decoding, undistorting and shrinking a photograph takes at once, for a pixel of it; and
 # the share of the memory that all threads together may take so.
 BYTES_PER_PIXEL, SHARE = 40, 0.5
+# Masks are drawn at sizes of their own: their ratio of width to height may differ by this.
+_ASPECT_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True)
@@ -181,7 +183,7 @@ def _decode_mask(view: View) -> Bool[np.ndarray, "h w"]:
     """Return where the mask is not zero, at the view's size."""
     assert view.mask_path is not None
     w, h = image_size(view.mask_path)
-    if abs(w / h / (view.width / view.height) - 1.0) > ASPECT_TOLERANCE:
+    if abs(w / h / (view.width / view.height) - 1.0) > _ASPECT_TOLERANCE:
         why = f"is {w}x{h}, its photograph {view.width}x{view.height}"
         fix = "make the mask at the size of the photograph"
         raise broken(f"wrong size: the mask {view.mask_path}", why, fix)

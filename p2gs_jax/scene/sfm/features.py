@@ -25,7 +25,7 @@ from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.memory import left_to_process
 from p2gs_jax.core.text import natural
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene.colmap import subfolder
+from p2gs_jax.scene.cameras import parent_of
 from p2gs_jax.scene.files import Report, file_fingerprints, image_size, stage_progress
 from p2gs_jax.scene.pixels.decode import BYTES_PER_PIXEL, SHARE
 from p2gs_jax.scene.rigid import camera_centers
@@ -221,16 +221,16 @@ def _cameras(database: Path) -> dict[str, int]:
 def pairs_by_name(names: Sequence[str], matching: Matching = "auto") -> list[Pair] | None:
     """Return the pairs to match by their names alone; None means all.
 
-    Sequences, one a top folder: each image meets the next 10 and those 16, 32, ... 512 later; where
+    Sequences, one a folder: each image meets the next 10 and those 16, 32, ... 512 later; where
     a sequence is asked for, every fifth also meets every other fifth, for who comes back to a
     place; images of different folders meet at the same place in the sequence and next to it. `auto`
     takes long lists for sequences.
     """
     if matching == "all" or (matching == "auto" and len(names) <= EXHAUSTIVE_LIMIT):
         return None
-    sequences: dict[str | None, list[str]] = defaultdict(list)
+    sequences: dict[str, list[str]] = defaultdict(list)
     for name in sorted(names, key=natural):
-        sequences[subfolder(name)].append(name)
+        sequences[parent_of(name)].append(name)
     steps = [*range(1, _OVERLAP + 1), *(2**k for k in range(4, 10))]
     pairs: list[Pair] = []
     lists = list(sequences.values())

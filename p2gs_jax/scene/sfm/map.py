@@ -9,6 +9,7 @@ import shutil
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -16,7 +17,9 @@ import pycolmap
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.errors import UserError, broken
-from p2gs_jax.scene.colmap import load_colmap, read_model, subfolder, tracks_of
+from p2gs_jax.scene.axes import require_axes
+from p2gs_jax.scene.cameras import parent_of
+from p2gs_jax.scene.colmap import load_colmap, read_model, tracks_of
 from p2gs_jax.scene.convert.readers import read_exif_camera
 from p2gs_jax.scene.files import (
     Report,
@@ -25,6 +28,7 @@ from p2gs_jax.scene.files import (
     image_size,
     stage_progress,
 )
+from p2gs_jax.scene.lens import undistort_points
 from p2gs_jax.scene.sfm import features
 from p2gs_jax.scene.sfm.features import opened, quiet_colmap
 from p2gs_jax.types import Scene, View
@@ -32,6 +36,8 @@ from p2gs_jax.types import Scene, View
 KEPT, ACCOUNT = "features", "left_out.json"
 # Fewer features than this seldom give a pose.
 FEW_FEATURES = 100
+# Matches further than this from where poses have them contradict the poses, pixels.
+EPIPOLAR_PX = 4.0
 # COLMAP takes a pair with fewer inliers for unverified.
 LEAST_INLIERS = 15
 # Photographs with at least this many pixels along their longer side are not enlarged for SIFT
@@ -65,8 +71,12 @@ def load_images(
         raise broken(image_folder, why, fix)
     groups: dict[tuple, list[str]] = defaultdict(list)
     for path, name in zip(paths, names, strict=True):
-        groups[(image_size(path), read_exif_camera(path), subfolder(name))].append(name)
-    key = {"pycolmap": pycolmap.__version__, "files": file_fingerprints(paths)}
+        exif = read_exif_camera(path, zoom=True) if cfg.camera_by in ("auto", "exif") else ""
+        folder = parent_of(name) if cfg.camera_by in ("auto", "folder") else ""
+        groups[(image_size(path), exif, folder)].append(name)
+    key: dict[str, Any] = {"pycolmap": pycolmap.__version__, "files": file_fingerprints(paths)}
+    if cfg.camera_by != "auto":
+        key["camera_by"] = cfg.camera_by
 
     def build(folder: Path) -> None:
         kept = (folder if work_dir is None else work_dir) / KEPT
@@ -204,7 +214,7 @@ def triangulate(
             [view.name, view.viewmat.tolist(), view.K.tolist(), *_lens(view)] for view in views
         ],
     }
-    build = functools.partial(_triangulate, views=views, report=report)
+    build = functools.partial(_triangulate, views=views, root=scene.root, report=report)
     with cached_folder(work_dir, "triangulated", key, build) as folder:
         model = read_model(folder)
         tracks = tracks_of(model, scene.views)
@@ -215,7 +225,7 @@ def triangulate(
     return dataclasses.replace(scene, points=points, point_colors=model.rgb, tracks=tracks)
 
 
-def _triangulate(folder: Path, views: Sequence[View], report: Report) -> None:
+def _triangulate(folder: Path, views: Sequence[View], root: Path, report: Report) -> None:
     quiet_colmap()
     names = [view.name for view in views]
     image_folder = _image_folder(views, folder)
@@ -236,6 +246,7 @@ def _triangulate(folder: Path, views: Sequence[View], report: Report) -> None:
     n = len(views) * (len(views) - 1) // 2 if pairs is None else len(pairs)
     report(f"matching {n} image pairs")
     features.match(database, pairs)
+    require_axes(views, functools.partial(agreement, database), root)
     report("triangulating")
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = 0
@@ -265,6 +276,44 @@ def _set_cameras(database: Path, views: Sequence[View]) -> pycolmap.Reconstructi
             posed = pycolmap.Image(name=image.name, **ids)
             reconstruction.add_image_with_trivial_frame(posed, pose)
     return reconstruction
+
+
+def agreement(database: Path, views: Sequence[View]) -> float:
+    """Return the share of verified matches that lie near the epipolar lines of the poses.
+
+    It is 1 where there are too few to tell.
+    """
+    known = {view.name: view for view in views}
+    near: list[np.ndarray] = []
+    with opened(database) as db:
+        views_of = {image.image_id: known[image.name] for image in db.read_all_images()}
+        rays = {i: _rays(view, db.read_keypoints(i)[:, :2]) for i, view in views_of.items()}
+        for pair, found in zip(*db.read_two_view_geometries(), strict=True):
+            a, b = pycolmap.pair_id_to_image_pair(pair)
+            matches = found.inlier_matches
+            if len(matches) < LEAST_INLIERS:
+                continue
+            relative = views_of[b].viewmat @ np.linalg.inv(views_of[a].viewmat.astype(np.float64))
+            x, y, z = relative[:3, 3]
+            E = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ relative[:3, :3]
+            first, second = rays[a][matches[:, 0]], rays[b][matches[:, 1]]
+            line, other = first @ E.T, second @ E
+            # Sampson's distance, focal lengths; behind a camera nothing is seen.
+            across = np.hypot(np.hypot(*line[:, :2].T), np.hypot(*other[:, :2].T))
+            off = np.abs((second * line).sum(1)) / np.maximum(across, 1e-12)
+            turned = first @ relative[:3, :3].T
+            wide, far = np.cross(second, turned), np.cross(relative[:3, 3], second)
+            depth = (wide * far).sum(1) / np.maximum((wide**2).sum(1), 1e-12)
+            ahead = (depth > 0) & (depth * turned[:, 2] + z > 0)
+            near.append(ahead & (off < EPIPOLAR_PX / views_of[a].K[0, 0]))
+    matched = np.concatenate(near) if near else np.zeros(0, bool)
+    return float(matched.mean()) if len(matched) >= FEW_FEATURES else 1.0
+
+
+def _rays(view: View, xy: np.ndarray) -> np.ndarray:
+    """Return rays [n 3] with depth 1 through pixels of a photograph."""
+    straight = undistort_points(xy, view.K, view.distortion).astype(np.float64)
+    return np.c_[(straight - view.K[:2, 2]) / view.K[[0, 1], [0, 1]], np.ones(len(xy))]
 
 
 def camera_of(view: View, camera_id: int) -> pycolmap.Camera:

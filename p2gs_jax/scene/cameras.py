@@ -1,0 +1,57 @@
+"""What is one camera: photographs that share a lens, and what it and the sensor do to light."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import PurePosixPath
+
+from p2gs_jax.config import CameraBy
+from p2gs_jax.scene.convert.readers import read_exif_camera
+from p2gs_jax.types import View
+
+
+def parent_of(name: str) -> str:
+    """Return the folders in the relative name of an image, empty where there are none."""
+    return PurePosixPath(name).parent.as_posix().removeprefix(".")
+
+
+def numbered(views: Sequence[View]) -> list[View]:
+    """Return views with numbers for the words in `View.camera` that say which lens took them."""
+    numbers = {lens: k for k, lens in enumerate(dict.fromkeys(view.camera for view in views))}
+    return [replace(view, camera=str(numbers[view.camera])) for view in views]
+
+
+def name_cameras(views: Sequence[View], by: CameraBy) -> tuple[View, ...]:
+    """Return views with the names of their cameras; `View.camera` is the model's so far.
+
+    `auto` takes photographs apart that differ in folder, in the model's camera, or in make, model
+    and lens by EXIF. Where hardly any of these took two photographs, as in models that have a
+    camera for each, they do not count.
+    """
+    told, nothing = (_shared if by == "auto" else lambda keys, _: keys), [""] * len(views)
+    folders, models, devices = nothing, nothing, nothing
+    if by in ("auto", "folder"):
+        folders = [parent_of(view.name) for view in views]
+    if by in ("auto", "model"):
+        models = told([view.camera for view in views], folders)
+    if by in ("auto", "exif"):
+        devices = told([read_exif_camera(view.image_path) for view in views], folders)
+    named = devices if by == "exif" else models
+    bases = [folder or name or "0" for folder, name in zip(folders, named, strict=True)]
+    keys = list(zip(models, devices, strict=True))
+    parts: dict[str, dict[tuple, int]] = defaultdict(dict)
+    for base, key in zip(bases, keys, strict=True):
+        parts[base].setdefault(key, len(parts[base]) + 1)
+    return tuple(
+        replace(v, camera=base if len(parts[base]) == 1 else f"{base} {parts[base][key]}")
+        for v, base, key in zip(views, bases, keys, strict=True)
+    )
+
+
+def _shared(keys: list[str], folders: Sequence[str]) -> list[str]:
+    """Return keys, or nothing where they do not tell cameras apart: few took two photographs."""
+    counts = Counter(zip(folders, keys, strict=True))
+    shared = sum(n for n in counts.values() if n > 1)
+    return keys if 2 * shared >= len(keys) else [""] * len(keys)

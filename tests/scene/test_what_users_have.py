@@ -1,0 +1,370 @@
+"""Scenes as neighbouring programs and people leave them: other places, names, axes and origins."""
+
+import codecs
+import json
+import shutil
+import unicodedata
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from scene.helpers import (
+    around,
+    make_view,
+    refused,
+    reprojection_errors,
+    write_image,
+    write_tiny_model,
+)
+from scene.test_split import write_ply
+from scene.test_transforms import LENS, OPENGL, frames, rows, write, write_llff
+
+from p2gs_jax.config import DataConfig
+from p2gs_jax.errors import UserError
+from p2gs_jax.export.folders import write_folder
+from p2gs_jax.paths.files import near_scene
+from p2gs_jax.paths.shots import Shot
+from p2gs_jax.scene import ImageStore, find_scene, with_what_lies_beside
+from p2gs_jax.scene.axes import require_axes, share_in_view
+from p2gs_jax.scene.cameras import name_cameras
+from p2gs_jax.scene.files import find_names, same_shape
+
+CFG = DataConfig()
+UTM = np.array([451_234.5, 5_212_345.25, 300.0])
+
+
+# ------------------------------------------------------------------ where and under which names
+
+
+@pytest.mark.parametrize(
+    "place",
+    ["colmap/sparse/0", "dense/0/sparse", "distorted/sparse/0", "sparse/model", "sparse/1", "rec"],
+)
+def test_models_elsewhere_are_read(tmp_path, place):
+    write_tiny_model(tmp_path)
+    (tmp_path / "sparse" / "0").rename(tmp_path / "model")
+    (tmp_path / "sparse").rmdir()
+    (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / "model").rename(tmp_path / place)
+    scene = find_scene(tmp_path, CFG)
+    assert (scene.format, len(scene.views)) == ("colmap", 2)
+    assert place in scene.notes[-1]
+
+
+def test_photographs_beside_an_undistorted_model_are_those_of_its_size(tmp_path):
+    write_tiny_model(tmp_path / "dense" / "0")
+    (tmp_path / "dense" / "0" / "sparse" / "0").rename(tmp_path / "dense" / "0" / "model")
+    for k in range(2):
+        write_image(tmp_path / "images" / f"im {k}.png", size=(80, 60))
+    view = find_scene(tmp_path, CFG).views[0]
+    assert view.image_path == tmp_path / "dense" / "0" / "images" / "im 0.png"
+
+
+def test_the_largest_of_several_models_is_used(tmp_path):
+    write_tiny_model(tmp_path, n=1)
+    write_tiny_model(tmp_path / "other", n=5)
+    shutil.move(tmp_path / "other" / "sparse" / "0", tmp_path / "sparse" / "1")
+    shutil.copytree(tmp_path / "other" / "images", tmp_path / "images", dirs_exist_ok=True)
+    scene = find_scene(tmp_path, CFG)
+    assert len(scene.views) == 5
+    assert "sparse/1 with 5 photographs, the largest; beside it lie 0, not used" in " ".join(
+        scene.notes
+    )
+
+
+@pytest.mark.parametrize(
+    ("names", "files"),
+    [
+        (["a.JPG", "b.JPG"], ["a.png", "b.png"]),
+        (["A.png", "b.PNG"], ["a.png", "b.png"]),
+        (["é.png", "b.png"], [unicodedata.normalize("NFD", "é.png"), "b.png"]),
+        (["left/a.png", "left/b.png"], ["a.png", "b.png"]),
+        (["a.jpg", "a.png"], [None, "a.png"]),
+        (["left/a.png", "right/a.png"], [None, None, "a.png"]),
+    ],
+)
+def test_names_that_are_nearly_right(tmp_path, names, files):
+    for file in filter(None, files):
+        write_image(tmp_path / file)
+    expected = {n: f for n, f in zip(names, files, strict=False) if f is not None}
+    assert find_names(names, tmp_path) == expected
+
+
+def test_other_names_are_said_and_the_nearest_file_is_named(tmp_path):
+    images = write_tiny_model(tmp_path) / "images.txt"
+    images.write_text(images.read_text().replace("im 0.png", "IM 0.JPG"))
+    scene = find_scene(tmp_path, CFG)
+    assert "im 0.png for IM 0.JPG" in scene.notes[0]
+    assert reprojection_errors(scene).max() < 1e-5
+    images.write_text(images.read_text().replace("IM 0.JPG", "img-0.png"))
+    with refused("1 of the 2 images", "holds 2 images, of which im 0.png is the nearest"):
+        find_scene(tmp_path, CFG)
+
+
+def test_a_folder_of_smaller_images_keeps_the_folders_of_cameras(tmp_path):
+    path = write(tmp_path, {**LENS, "frames": frames("images/cam0/a.png")}, names=())
+    for folder in ("images/cam0", "images_2/cam0"):
+        write_image(tmp_path / folder / "a.png")
+    for cfg in (CFG, DataConfig(images="images_2")):
+        (view,) = find_scene(path, cfg).views
+        assert (view.name, view.camera) == ("cam0/a.png", "cam0")
+
+
+def test_byte_order_marks_and_lines_that_are_not_there(tmp_path):
+    model = write_tiny_model(tmp_path)
+    images = model / "images.txt"
+    # Without the second lines, as of tools that export poses alone.
+    images.write_text("".join(images.read_text().splitlines(keepends=True)[::2]))
+    (tmp_path / "test.txt").write_text("im 1.png\n")
+    for path in (*model.iterdir(), tmp_path / "test.txt"):
+        path.write_bytes(codecs.BOM_UTF8 + path.read_bytes())
+    scene = find_scene(tmp_path, CFG)
+    assert [view.split for view in scene.views] == ["train", "test"]
+    path = write(tmp_path / "other", {**LENS, "frames": frames("images/a.png")})
+    path.write_bytes(codecs.BOM_UTF8 + path.read_bytes())
+    assert len(find_scene(path, CFG).views) == 1
+
+
+def test_points_that_are_not_there_or_in_a_ply(tmp_path):
+    model = write_tiny_model(tmp_path)
+    (model / "points3D.txt").unlink()
+    scene = find_scene(tmp_path, CFG)
+    assert (len(scene.points), scene.tracks) == (0, None)
+    assert "has no points: they are triangulated" in scene.notes[-1]
+    write_ply(model / "points3D.ply", [[0, 1, 4], [1, 0, 5]], np.array([10, 20], np.uint8))
+    scene = find_scene(tmp_path, CFG)
+    assert scene.points.tolist() == [[0, 1, 4], [1, 0, 5]]
+    assert scene.point_colors[1].tolist() == [20, 20, 20]
+
+
+def test_absolute_names_through_links(tmp_path):
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    listed = frames(str(tmp_path / "link" / "images" / "a.png"))
+    write(tmp_path / "real", {**LENS, "frames": listed})
+    for root in ("real", "link"):
+        assert find_scene(tmp_path / root, CFG).views[0].name == "a.png"
+
+
+# ------------------------------------------------------------------ lenses and sizes
+
+
+@pytest.mark.parametrize(
+    ("model", "focal"), [("SIMPLE_FISHEYE 40 30 50 20 15", 50), ("FISHEYE 40 30 50 51 20 15", 51)]
+)
+def test_fisheyes_without_coefficients(tmp_path, model, focal):
+    write_tiny_model(tmp_path, cameras=f"1 {model}\n")
+    view = find_scene(tmp_path, CFG).views[0]
+    assert view.distortion.model == "fisheye"
+    assert view.distortion.coefficients == (0, 0, 0, 0)
+    assert view.K[1, 1] == focal
+
+
+def test_a_crop_is_not_another_size():
+    for size in ((5187, 3361), (1297, 840), (1296, 840), (648, 420), (10374, 6722), (5186, 3361)):
+        assert same_shape(size, (5187, 3361))
+    for size in ((5150, 3361), (5187, 3340), (1297, 835), (3361, 5187)):
+        assert not same_shape(size, (5187, 3361))
+
+
+def test_twelve_bits_in_sixteen_are_said(tmp_path):
+    root = tmp_path / "scene"
+    write_tiny_model(root)
+    for top, said in ((4095, True), (65535, False)):
+        for path in (root / "images").iterdir():
+            cv2.imwrite(str(path), np.linspace(0, top, 1200).reshape(30, 40).astype(np.uint16))
+        notes = with_what_lies_beside(find_scene(root, CFG), CFG).notes
+        assert any("no value above 4095: these are 12 bits" in n for n in notes) == said
+
+
+def test_an_angle_in_degrees_is_refused(tmp_path):
+    path = write(tmp_path, {"camera_angle_x": 40.0, "frames": frames("images/a.png")})
+    with refused("camera_angle_x of a.png is 40, not an angle between 0 and pi", "0.698132"):
+        find_scene(path, CFG)
+    data = {"camera_model": "EQUIRECTANGULAR", **LENS, "frames": frames("images/a.png")}
+    with refused("camera model EQUIRECTANGULAR", "pinhole photographs"):
+        find_scene(write(tmp_path, data), CFG)
+
+
+# ------------------------------------------------------------------ far from the origin
+
+
+def test_what_is_far_from_the_origin_keeps_its_places(tmp_path):
+    poses, names = around(6), [f"images/{k}.png" for k in range(6)]
+    poses[:, :3, 3] += UTM
+    listed = [
+        frames(n)[0] | {"transform_matrix": p.tolist()} for n, p in zip(names, poses, strict=True)
+    ]
+    data = {**LENS, "ply_file_path": "seeds.ply", "frames": listed}
+    path = write(tmp_path, data, names=names)
+    points = UTM + np.array([[0.125, 0.25, 0.5], [-0.5, 0.0, 0.25]])
+    write_ply(tmp_path / "seeds.ply", points, kind="f8")
+    scene = find_scene(path, CFG)
+    origin = np.array(scene.origin)
+    assert "Coordinates are relative to" in scene.notes[-1]
+    np.testing.assert_allclose(scene.points + origin, points, atol=1e-6)
+    for view, pose in zip(scene.views, poses, strict=True):
+        assert view.viewmat.dtype == np.float32
+        centre = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
+        np.testing.assert_allclose(centre + origin, pose[:3, 3], atol=2e-6)
+    # Exports are where the data set is.
+    store = ImageStore(scene.views, CFG)
+    for program in ("colmap", "nerfstudio"):
+        write_folder(program, tmp_path / program, scene, store, [])
+        again = find_scene(tmp_path / program, CFG)
+        np.testing.assert_allclose(again.points + np.array(again.origin), points, atol=1e-6)
+        for a, b in zip(again.views, scene.views, strict=True):
+            moved = b.viewmat[:3, 3] + b.viewmat[:3, :3] @ (again.origin - origin)
+            np.testing.assert_allclose(a.viewmat[:3, 3], moved, atol=2e-6)
+
+
+def test_paths_of_cameras_follow_the_scene():
+    near = [Shot("a", np.linalg.inv(pose), np.eye(3), 8, 6) for pose in around(3)]
+    poses = around(3)
+    poses[:, :3, 3] += UTM
+    far = [Shot("a", np.linalg.inv(pose), np.eye(3), 8, 6) for pose in poses]
+    for given in (near, far):
+        for shot, expected in zip(near_scene(given, UTM), near, strict=True):
+            np.testing.assert_allclose(shot.viewmat, expected.viewmat, atol=1e-6)
+
+
+def test_models_and_tables_far_away_and_scenes_near(tmp_path):
+    pose = "1 0 0 0 " + " ".join(str(-v) for v in UTM)
+    where = " ".join(map(str, UTM + np.array([0.1, 0.2, 4])))
+    write_tiny_model(tmp_path / "colmap", pose=pose, points=f"7 {where} 10 20 30 0.5 1 0 2 0\n")
+    scene = find_scene(tmp_path / "colmap", CFG)
+    assert reprojection_errors(scene).max() < 1e-4
+    table = rows()
+    table[:, [3, 8, 13]] += UTM
+    near = find_scene(write_llff(tmp_path / "near", rows()), CFG)
+    far = find_scene(write_llff(tmp_path / "far", table), CFG)
+    assert near.origin == (0, 0, 0)
+    for a, b in zip(near.views, far.views, strict=True):
+        offset = b.viewmat[:3, 3] + b.viewmat[:3, :3] @ (UTM - far.origin)
+        np.testing.assert_allclose(a.viewmat[:3, 3], offset, atol=1e-5)
+
+
+# ------------------------------------------------------------------ axes
+
+
+def test_poses_in_other_axes_are_told(tmp_path):
+    def views(change):
+        named = [make_view(tmp_path / f"{k}.png", f=60.0) for k in range(6)]
+        poses = [change(pose) for pose in around(6)]
+        return [
+            view.__class__(**{**vars(view), "viewmat": np.linalg.inv(pose @ OPENGL)})
+            for view, pose in zip(named, poses, strict=True)
+        ]
+
+    points = np.random.default_rng(0).normal(0, 0.3, (200, 3))
+    agreeing = lambda views: share_in_view(points, views)  # noqa: E731
+    require_axes(views(lambda pose: pose), agreeing, "a.json")
+    for change, words in (
+        (lambda pose: pose @ OPENGL, "OpenCV's axes instead of OpenGL's"),
+        (lambda pose: np.linalg.inv(pose @ OPENGL), "world-to-camera instead of camera-to-world"),
+    ):
+        with refused("a.json has poses that contradict the photographs", words):
+            require_axes(views(change), agreeing, "a.json")
+    # What agrees with no axes is left alone.
+    require_axes(views(lambda pose: pose), lambda views: 0.0, "a.json")
+
+
+# ------------------------------------------------------------------ what is one camera
+
+
+def taken(tmp_path, *names, exif=None, models=None):
+    """Return views by the names of their files, with models' cameras and makers."""
+    out = []
+    for k, name in enumerate(names):
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        kept = Image.Exif()
+        if exif is not None:
+            kept[0x0110] = exif[k]
+        Image.new("RGB", (8, 8)).save(path, exif=kept)
+        view = make_view(path, size=(8, 8))
+        camera = "1" if models is None else models[k]
+        out.append(view.__class__(**{**vars(view), "name": name, "camera": camera}))
+    return out
+
+
+LAYOUTS = {
+    "rig": (
+        {"names": [f"rig1/camera{c}/{k}.jpg" for c in (1, 2) for k in range(3)]},
+        ["rig1/camera1"] * 3 + ["rig1/camera2"] * 3,
+    ),
+    "one folder, two models": (
+        {"names": [f"{k}.jpg" for k in range(6)], "models": list("112211")},
+        list("112211"),
+    ),
+    "one folder, two devices": (
+        {"names": [f"{k}.jpg" for k in range(4)], "exif": ["A", "B", "A", "B"]},
+        ["1 1", "1 2", "1 1", "1 2"],
+    ),
+    "a camera for each photograph": (
+        {"names": [f"{k}.jpg" for k in range(4)], "models": list("1234")},
+        ["0"] * 4,
+    ),
+    "a zoom in one folder of two": (
+        {"names": ["l/a.jpg", "l/b.jpg", "r/a.jpg", "r/b.jpg"], "models": list("1234")},
+        ["l", "l", "r", "r"],
+    ),
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_what_is_one_camera(tmp_path, layout):
+    given, expected = LAYOUTS[layout]
+    views = taken(tmp_path, *given.pop("names"), **given)
+    assert [view.camera for view in name_cameras(views, "auto")] == expected
+
+
+def test_what_is_one_camera_can_be_said(tmp_path):
+    names = ["day1/a.jpg", "day1/b.jpg", "day2/a.jpg", "day2/b.jpg"]
+    views = taken(tmp_path, *names, models=list("1122"), exif=["A", "B", "A", "B"])
+    for by, expected in (
+        ("folder", ["day1", "day1", "day2", "day2"]),
+        ("model", list("1122")),
+        ("exif", ["A", "B", "A", "B"]),
+        ("one", ["0"] * 4),
+    ):
+        assert [view.camera for view in name_cameras(views, by)] == expected
+
+
+def test_lenses_of_frames_and_models_tell_cameras_apart(tmp_path):
+    names = [f"images/{k}.png" for k in range(4)]
+    listed = frames(*names)
+    for k, frame in enumerate(listed):
+        frame["fl_x"] = 50 + 10 * (k % 2)
+    path = write(tmp_path, {**LENS, "frames": listed}, names=names)
+    assert [v.camera for v in find_scene(path, CFG).views] == list("0101")
+    cfg = DataConfig(camera_by="one")
+    assert {v.camera for v in find_scene(path, cfg).views} == {"0"}
+
+
+# ------------------------------------------------------------------ other fields
+
+
+def test_exposures_of_hdr_nerf_and_frames_held_out(tmp_path):
+    root, table = tmp_path / "hdr", np.c_[rows(), [0.25, 1.0, 4.0, 1.0]]
+    write_llff(root, table, folder="input_images")
+    (root / "poses_bounds.npy").rename(root / "poses_bounds_exps.npy")
+    scene = find_scene(root, CFG)
+    assert [view.exif_ev for view in scene.views] == [-2.0, 0.0, 2.0, 0.0]
+    # HDR-GS puts a COLMAP model beside it.
+    write_tiny_model(tmp_path / "gs", n=4)
+    shutil.copy(root / "poses_bounds_exps.npy", tmp_path / "gs")
+    scene = find_scene(tmp_path / "gs", CFG)
+    assert scene.format == "colmap"
+    assert [view.exif_ev for view in scene.views] == [-2.0, 0.0, 2.0, 0.0]
+    np.save(root / "poses_bounds_exps.npy", np.c_[rows(), [1, 1, 0, 1]])
+    with refused("row 2 has the impossible exposure 0"):
+        find_scene(root, CFG)
+    data = {**LENS, "frames": frames("images/a.png"), "test_frames": frames("images/b.png")}
+    scene = find_scene(write(tmp_path, data), CFG)
+    assert [view.split for view in scene.views] == ["train", "test"]
+    assert scene.split_by == "transforms.json (test_frames)"
+    data["test_frames"] = 3
+    with pytest.raises(UserError, match='no list "test_frames"'):
+        find_scene(write(tmp_path, json.loads(json.dumps(data))), CFG)
