@@ -1,17 +1,17 @@
-"""Exposures known beforehand: from a CSV file, or from the EXIF of views."""
+"""Exposures known beforehand, from a CSV file or EXIF; and which view a name in a file means."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
-from pathlib import Path
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.errors import UserError, broken
-from p2gs_jax.scene.split import row_finder
 from p2gs_jax.types import View
 
 KINDS = ("ev", "exposure", "rel_exposure_ev", "exposure_time_s")
@@ -51,6 +51,39 @@ def _by_view(table: dict[str, float], views: Sequence[View], source: str) -> dic
             why = f"{views[row].name} has two exposures"
             raise broken(f"{source}:", why, "take one of them out")
     return out
+
+
+def plain_name(name: str) -> str:
+    """Return a name with slashes and no dots, as all systems write it."""
+    return PurePosixPath(name.replace("\\", "/")).as_posix()
+
+
+def row_finder(views: Sequence[View], where: object) -> Callable[[str], int | None]:
+    """Return what finds the view of a name in the file `where`: any end of its photograph's path.
+
+    With or without suffix; None: of no view. Raises UserError: it may be of several.
+    """
+    rows_of: dict[str, set[int]] = defaultdict(set)
+    # A converted photograph lies elsewhere.
+    both = [(row, p) for row, v in enumerate(views) for p in (v.image_path, PurePosixPath(v.name))]
+    for row, path in both:
+        parts = path.as_posix().lstrip("/").split("/")
+        for tail in ("/".join(parts[start:]) for start in range(len(parts))):
+            rows_of[tail].add(row)
+            rows_of[tail.removesuffix(path.suffix)].add(row)
+
+    def find(name: str) -> int | None:
+        normal = plain_name(name)
+        rows = rows_of.get(normal.lstrip("/"), set())
+        whole = {row: views[row].name for row in rows}
+        exact = {row for row, n in whole.items() if normal in (n, n.removesuffix(Path(n).suffix))}
+        rows = exact if len(exact) == 1 else rows
+        if len(rows) > 1:
+            names = " and ".join(views[row].name for row in sorted(rows)[:2])
+            raise broken(f"{where}:", f"{name} may be {names}", "write more of the path into it")
+        return next(iter(rows), None)
+
+    return find
 
 
 def check_source(source: str | None) -> None:

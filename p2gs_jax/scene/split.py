@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections import defaultdict
-from collections.abc import Callable, Sequence
-from pathlib import Path, PurePosixPath
+from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +22,7 @@ from jaxtyping import Int
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.text import first_few, natural
 from p2gs_jax.errors import UserError, broken
+from p2gs_jax.scene.exposures import plain_name, row_finder
 from p2gs_jax.scene.files import read_json
 from p2gs_jax.scene.masks import image_folder_of
 from p2gs_jax.types import Scene, Tracks, View
@@ -215,39 +216,7 @@ def _lines(path: Path) -> tuple[str, ...]:
     return found
 
 
-def _normal(name: str) -> str:
-    return PurePosixPath(name.replace("\\", "/")).as_posix()
-
-
-def row_finder(views: Sequence[View], where: object) -> Callable[[str], int | None]:
-    """Return what finds the view of a name in the file `where`: any end of its photograph's path.
-
-    With or without suffix; None: of no view. Raises UserError: it may be of several.
-    """
-    rows_of: dict[str, set[int]] = defaultdict(set)
-    # A converted photograph lies elsewhere.
-    both = [(row, p) for row, v in enumerate(views) for p in (v.image_path, PurePosixPath(v.name))]
-    for row, path in both:
-        parts = path.as_posix().lstrip("/").split("/")
-        for tail in ("/".join(parts[start:]) for start in range(len(parts))):
-            rows_of[tail].add(row)
-            rows_of[tail.removesuffix(path.suffix)].add(row)
-
-    def find(name: str) -> int | None:
-        normal = _normal(name)
-        rows = rows_of.get(normal.lstrip("/"), set())
-        whole = {row: views[row].name for row in rows}
-        exact = {row for row, n in whole.items() if normal in (n, n.removesuffix(Path(n).suffix))}
-        rows = exact if len(exact) == 1 else rows
-        if len(rows) > 1:
-            names = " and ".join(views[row].name for row in sorted(rows)[:2])
-            raise broken(f"{where}:", f"{name} may be {names}", "write more of the path into it")
-        return next(iter(rows), None)
-
-    return find
-
-
 def _lies_there(name: str, views: Sequence[View]) -> bool:
     """Return whether a photograph is there of which the scene has no pose."""
-    path = image_folder_of(views[0]) / _normal(name)
+    path = image_folder_of(views[0]) / plain_name(name)
     return path.is_file() or (path.parent.is_dir() and any(path.parent.glob(f"{path.name}.*")))
