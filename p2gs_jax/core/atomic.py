@@ -26,8 +26,6 @@ BROKEN_ARRAYS = (
     *(OSError, ValueError, KeyError, TypeError, IndexError, EOFError, MemoryError, RuntimeError),
     *(zipfile.BadZipFile, zlib.error, struct.error),
 )
-# No room: on the disk, for the user, for a file of a process.
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _BEGUN = ".writing-"
 _PART = 1 << 20
 

@@ -94,14 +94,6 @@ def _project(view: View, points: Float[np.ndarray, "p 3"], shape: tuple[int, int
     return xy, inside, (row, (xy[inside, 0] * shape[1] / view.width).astype(int))
 
 
-def covered_cells(view: View, points: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, "gy gx"]:
-    """Return which cells of a view hold a seed, or touch one that does."""
-    shape = max(1, round(CELLS_ACROSS * view.height / view.width)), CELLS_ACROSS
-    cells = np.zeros(shape, np.uint8)
-    cells[_project(view, points, shape)[2]] = 1
-    return cv2.dilate(cells, np.ones((3, 3), np.uint8)) > 0
-
-
 def find_shell(
     views: Sequence[View],
     points: Float[np.ndarray, "p 3"],
@@ -119,7 +111,12 @@ def find_shell(
     middle, radius = sphere.middle, sphere.radius
     directions = fibonacci_sphere(cfg.shell_count)
     candidates = middle + radius * directions
-    covered = [covered_cells(v, points) for v in views]
+    covered = []
+    for view in views:
+        shape = max(1, round(CELLS_ACROSS * view.height / view.width)), CELLS_ACROSS
+        cells = np.zeros(shape, np.uint8)
+        cells[_project(view, points, shape)[2]] = 1
+        covered.append(cv2.dilate(cells, np.ones((3, 3), np.uint8)) > 0)
     empty_fraction = float(np.mean([1 - c.mean() for c in covered]))
     if cfg.shell == "auto" and empty_fraction < EMPTY_IMAGE_FRACTION:
         return None

@@ -175,18 +175,13 @@ def exponent_scale(alpha_cutoff: float) -> float:
     return float(2 ** max(3, int(np.ceil(np.log2(-np.log(alpha_cutoff) / 0.7)))))
 
 
-@functools.cache
-def _exp_coefficients(degree: int) -> tuple[float, ...]:
-    """Return the polynomial that interpolates exp at the Chebyshev nodes of [-0.7, 0]."""
-    fit = np.polynomial.chebyshev.Chebyshev.interpolate(np.exp, degree, [-0.7, 0.0])
-    return tuple(float(c) for c in fit.convert(kind=np.polynomial.Polynomial).coef)
-
-
 def _scaled_exp(x: Array, plan: Plan) -> Array:
     """Return exp(exponent_scale x) for x in [-0.7, 0]; other values are masked by callers."""
     if plan.cfg.exp_degree is None:
         return jnp.exp(plan.exponent_scale * x)
-    *rest, p = _exp_coefficients(plan.cfg.exp_degree)
+    # The polynomial that interpolates exp at the Chebyshev nodes of the interval.
+    fit = np.polynomial.chebyshev.Chebyshev.interpolate(np.exp, plan.cfg.exp_degree, [-0.7, 0.0])
+    *rest, p = map(float, fit.convert(kind=np.polynomial.Polynomial).coef)
     for c in reversed(rest):
         p = c + x * p
     for _ in range(int(np.log2(plan.exponent_scale))):
