@@ -14,6 +14,7 @@ from p2gs_jax.errors import UserError
 
 if TYPE_CHECKING:
     from p2gs_jax.run.read import Run
+    from p2gs_jax.types import Scene
 
 PATHS = ("views", "drive", "orbit")
 FPS = 24.0
@@ -98,11 +99,11 @@ class Render:
         begin = time.monotonic()
         for refuse in (_check_picture, _check_path, _check_file):  # before anything is read
             refuse(self)
-        out = self.out or self.run / "renders" / _default_name(self)
-        _check_place(out, self.overwrite)
         given = read_cameras(Path(self.path)) if self.path not in PATHS else None
         fitted = _load(self)
         given = None if given is None else near_scene(given, fitted.scene.origin)
+        out = self.out or self.run / "renders" / _default_name(self, fitted.scene)
+        _check_place(out, self.overwrite)
         with TerminalReporter() as reporter:
             job = (
                 panoramas_of(self, fitted)
@@ -158,13 +159,16 @@ def is_video(out: Path) -> bool:
     return out.suffix.lower() == ".mp4"
 
 
-def _default_name(options: Render) -> str:
-    if options.path == "views":
-        return "panorama" if options.panorama else "all"
+def _default_name(options: Render, scene: Scene) -> str:
+    """Return the name of a folder in which a fit writes no held-out view."""
     name = options.path if options.path in PATHS else Path(options.path).stem
+    if options.path == "views":
+        name = "all" if options.split == "all" else options.split
     if options.shift:
         name += f"_{abs(options.shift):g}_{'left' if options.shift > 0 else 'right'}"
-    return f"{name}_panorama" if options.panorama else name
+    if options.panorama:
+        name = "panorama" if name == "all" else f"{name}_panorama"
+    return f"{name}_views" if name in {Path(v.name).parts[0] for v in scene.views} else name
 
 
 def _check_picture(o: Render) -> None:

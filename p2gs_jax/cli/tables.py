@@ -15,7 +15,7 @@ from rich.text import Text
 
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.core.progress import PlainConsole
-from p2gs_jax.evaluation.protocols import PROTOCOLS
+from p2gs_jax.evaluation.scores import PROTOCOLS
 from p2gs_jax.photometry.formation import corner
 from p2gs_jax.photometry.solution import WEAK_GAMMA, PhotometricSolution
 from p2gs_jax.pipeline.calibrate import Calibration

@@ -217,17 +217,12 @@ def score_foreign(
         gained = with_fitted_exposure(AS_IT_IS, linear, photograph, mask)
         for found, how in zip(rows[view.split], (AS_IT_IS, gained), strict=True):
             found[view.name] = view_scores(None, develop(linear, how), photograph, mask)
-        agree.append(_correlation(linear.mean(-1)[mask > 0], photograph.mean(-1)[mask > 0]))
+        grey = linear.mean(-1)[mask > 0], photograph.mean(-1)[mask > 0]
+        with np.errstate(invalid="ignore"):  # where one does not vary
+            agree.append(float(np.nan_to_num(np.corrcoef(*grey)[0, 1])))
     scores = {
         split: {"as_it_is": summary_of(plain), "exposure_fitted": summary_of(gained)}
         for split, (plain, gained) in rows.items()
         if plain
     }
     return scores, float(np.median(agree))
-
-
-def _correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the correlation of two samples; 0 where one does not vary."""
-    a, b = a - a.mean(), b - b.mean()
-    size = float(np.sqrt((a @ a) * (b @ b)))
-    return float(a @ b) / size if size > 0 else 0.0

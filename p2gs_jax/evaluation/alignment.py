@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import TypedDict
+from collections.abc import Iterable, Mapping
+from typing import Any, TypedDict
 
 import jax
 import jax.numpy as jnp
@@ -61,6 +62,18 @@ def exposure_error(
         "ev_scale_power": float(np.sqrt(np.mean((power * a - b) ** 2))),
         "power": power,
     }
+
+
+def error_of_views(
+    views: Iterable[Mapping[str, Any]], truth: Mapping[str, float]
+) -> ExposureError | None:
+    """Return the error of exposures of `photometry.json` over the views whose true one is known.
+
+    None where these are fewer than two.
+    """
+    pairs = [(v["exposure"], truth.get(v["image"])) for v in views if v["exposure"] is not None]
+    known = [(a, b) for a, b in pairs if b is not None and a > 0 and b > 0]
+    return None if len(known) < 2 else exposure_error(*np.array(known).T)
 
 
 @functools.partial(jax.jit, static_argnames="cfg")

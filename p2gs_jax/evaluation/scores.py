@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -34,6 +34,46 @@ _NAMED = 8
 Masks = Mapping[str, Float32[np.ndarray, "h w"]]
 
 ssim = jax.jit(_ssim)
+
+
+class Protocol(NamedTuple):
+    """A way to show views for a score of `metrics.json`."""
+
+    views: str  # which, in words
+    shown: str  # at which exposure, in words
+    path: tuple[str, ...]  # where `metrics.json` has the scores
+
+
+PROTOCOLS = {
+    "train": Protocol("training", "own exposure and gamma", ("train",)),
+    "train_averaged": Protocol("training", "mean exposure and gamma", ("train", "averaged")),
+    "test_averaged": Protocol("held out", "mean exposure and gamma", ("test", "averaged")),
+    "test_fitted": Protocol(
+        "held out", "exposure fitted to each photograph", ("test", "exposure_fitted")
+    ),
+    "test_all_fitted": Protocol(
+        "held out",
+        "all that varies per view fitted to each photograph",
+        ("test", "photometry_fitted"),
+    ),
+    "test_metered": Protocol(
+        "held out", "exposure metered, as the camera would", ("test", "metered")
+    ),
+    "reference_averaged": Protocol(
+        "all", "reference photographs, mean exposure", ("reference", "averaged")
+    ),
+    "reference_geometric": Protocol(
+        "all", "reference photographs, geometric mean exposure", ("reference", "geometric")
+    ),
+    "reference": Protocol(
+        "all", "reference photographs, one scale for all", ("reference", "scale_aligned")
+    ),
+    "reference_test": Protocol(
+        "held out",
+        "reference photographs, one scale for all",
+        ("reference", "scale_aligned", "test"),
+    ),
+}
 
 
 @dataclass(frozen=True)

@@ -138,7 +138,9 @@ def measure_seam(
         return None
     a, b = first.ldr[use], np.asarray(ldr)[use]
     where = [np.argwhere(use)[:, ::-1] + np.float32(0.5), np.asarray(there.xy)[use]]
-    plain = [_decoded(values, common) for values in (a, b)]
+    # As if all were taken alike.
+    gamma, tone = np.float32(common.gamma), common.formation
+    plain = [inverse_tone_map(np.asarray(values, np.float32), gamma, tone) for values in (a, b)]
     radiance = [
         radiance_of(values, view.transform, places(xy, view.camera.width, view.camera.height))
         for values, view, xy in zip((a, b), (first, second), where, strict=True)
@@ -166,12 +168,6 @@ def radiance_of(
     """
     ldr = np.asarray(ldr, np.float32)
     return inverse_formation(ldr, transform.capture, transform.formation, positions)
-
-
-def _decoded(ldr: Float[np.ndarray, "m 3"], common: DisplayTransform):
-    """Return the exposed radiance of a photograph as if all were taken alike."""
-    gamma = np.float32(common.gamma)
-    return inverse_tone_map(np.asarray(ldr, np.float32), gamma, common.formation)
 
 
 def _informative(ldr: Float[np.ndarray, "h w 3"], cfg: LossConfig) -> Bool[np.ndarray, "h w"]:

@@ -17,8 +17,8 @@ from p2gs_jax.core.progress import Reporter
 from p2gs_jax.core.runtime import tune_process, use_compile_cache
 from p2gs_jax.core.text import escaped, markdown_table, parse_json
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluation.alignment import exposure_error
-from p2gs_jax.evaluation.protocols import PROTOCOLS
+from p2gs_jax.evaluation.alignment import error_of_views
+from p2gs_jax.evaluation.scores import PROTOCOLS
 from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.jobs.engines import LOCAL, check_engine, open_engine
 from p2gs_jax.jobs.job import Job, JobState, read_reason, slug
@@ -28,6 +28,7 @@ from p2gs_jax.pipeline.fit import fit
 from p2gs_jax.pipeline.preflight import check_run_dir
 from p2gs_jax.presets import from_dict, to_dict
 from p2gs_jax.run.folder import RunFolder, locked
+from p2gs_jax.run.photometry_files import read_photometry
 from p2gs_jax.synth.sensor import read_true_exposures
 
 TABLE, TABLE_TEXT, JOBS = "sweep.json", "sweep.md", "jobs"
@@ -188,7 +189,7 @@ def _outcome(run: Path, scene: Path, state: JobState | None) -> dict[str, Any]:
         return {"status": "failed", "reason": (state and state.reason) or read_reason(run)}
     try:
         return {"status": "done", **read_row(run, scene)}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (UserError, OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         reason = f"its files cannot be read ({error}): remove {run} and repeat"
         return {"status": "failed", "reason": reason}
 
@@ -256,19 +257,14 @@ def read_row(run: Path, scene: Path) -> dict[str, Any]:
 
 def _exposures(run: Path, scene: Path) -> dict[str, float]:
     """Return errors of the exposures where the scene knows them."""
-    truth = read_true_exposures(scene)
+    try:
+        truth = read_true_exposures(scene)
+    except UserError:
+        truth = {}  # the run is as good without
     if not truth:
         return {}
-    views = parse_json((run / "photometry.json").read_text(encoding="utf-8"))["views"]
-    pairs = [
-        (v["exposure"], truth[v["image"]])
-        for v in views
-        if v["exposure"] is not None and v["image"] in truth
-    ]
-    if len(pairs) < 2:
-        return {}
-    error = exposure_error(*np.array(pairs).T)
-    return {"ev": error["ev"], "ev_power": error["ev_scale_power"]}
+    error = error_of_views(read_photometry(run / "photometry.json")["views"], truth)
+    return {} if error is None else {"ev": error["ev"], "ev_power": error["ev_scale_power"]}
 
 
 def brief(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[str]]]:

@@ -166,7 +166,7 @@ def _scores(runs: Sequence[RunFiles], same: bool) -> list[TableRow]:
 def _true_error(run: RunFiles) -> float | None:
     try:
         error = true_error(run, read_true_exposures(run.scene))
-    except (OSError, KeyError, ValueError):
+    except UserError:
         return None
     return None if error is None else error["ev"]
 

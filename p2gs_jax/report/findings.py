@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from p2gs_jax.core.clock import whole_run
-from p2gs_jax.evaluation.alignment import ExposureError, exposure_error
+from p2gs_jax.evaluation.alignment import ExposureError, error_of_views
 from p2gs_jax.photometry.models import MODELS
 from p2gs_jax.photometry.solution import Agreement, compare
 from p2gs_jax.report.measurements import SceneMeasurements, seam_medians
@@ -99,10 +99,11 @@ def _modelled(run: RunFiles) -> str:
     if curve == "linear" and model == "constant":
         return f"{preset} models no camera: display values are splatted as they are{correction}."
     why = f"as the preset {run.preset} or the options say"
-    if any(note.startswith("Chosen:") for note in notes_of(run)):
+    if run.option("photometry", "select"):
+        # What the bundle adjustment found is there where there was one.
         why = "the simplest choice that predicts held-out colours about as well as any"
-    elif run.option("photometry", "select"):
-        why = "as there were no shared points to choose by"
+        if not run.part("photometry"):
+            why = "as there were no shared points to choose by"
     span = exposure_span(run)
     spans = "" if span is None or model == "constant" else f"; exposures span {span:.1f} stops"
     what, under = DESCRIPTIONS.get(model, model), CURVES.get(curve, curve)
@@ -143,15 +144,7 @@ def exposure_span(run: RunFiles) -> float | None:
 
 def true_error(run: RunFiles, true_exposures: dict[str, float]) -> ExposureError | None:
     """Return the error of the exposures where the scene knows the true ones, by name."""
-    pairs = [
-        (v["exposure"], true_exposures[v["image"]])
-        for v in run.train
-        if v["exposure"] is not None and v["image"] in true_exposures
-    ]
-    if len(pairs) < 2 or any(a <= 0 or b <= 0 for a, b in pairs):
-        return None
-    found, true = np.array(pairs).T
-    return exposure_error(found, true)
+    return error_of_views(run.train, true_exposures)
 
 
 def notes_of(run: RunFiles) -> list[str]:

@@ -63,14 +63,15 @@ class SceneMeasurements:
     """What was measured on the scene; `missing` says in sentences what could not be.
 
     True exposures are by view, where the scene has them. Seams are in the order of the views, of
-    `tried_pairs` that were compared; `shown` is the pair of `picture`, which has the widest one.
+    `tried_pairs` that were compared (None: none was measured); `shown` is the pair of `picture`,
+    which has the widest one.
     `clipped` has shares of pixels by view, for a sample of the training views. Comparisons are
     rendered training views, where the folder has no held-out ones.
     """
 
     true_exposures: dict[str, float] = field(default_factory=dict)
     seams: tuple[SeamPair, ...] = ()
-    tried_pairs: int = 0
+    tried_pairs: int | None = None
     shown: SeamPair | None = None
     picture: SeamPicture | None = None
     clipped: dict[str, float] = field(default_factory=dict)
@@ -86,8 +87,8 @@ def measure_scene(files: RunFiles, reporter: Reporter, *, render: bool = True) -
     out = SceneMeasurements()
     try:
         out.true_exposures = read_true_exposures(files.scene)
-    except (OSError, KeyError, ValueError) as error:
-        out.missing += (f"The scene's true exposures cannot be read ({error!r}).",)
+    except UserError as error:
+        out.missing += (error.message,)
     if not render:
         out.missing += ("Seams were not measured: the page was made without rendering.",)
         return out
@@ -178,9 +179,12 @@ def seam_section(scene: SceneMeasurements) -> str:
     """Return the differences of neighbouring photographs, as taken and developed alike."""
     seams = scene.seams
     if not seams:
-        none = f"{scene.tried_pairs} pairs of training views share enough points, and none of them "
-        none += "enough of the same unsaturated surface to be compared."
-        return paragraph(" ".join(m for m in scene.missing if m.startswith("Seams")) or none)
+        if scene.tried_pairs is None:
+            return ""  # why, stands under what the page lacks
+        return paragraph(
+            f"{scene.tried_pairs} pairs of training views share enough points, and none of them "
+            "enough of the same unsaturated surface to be compared."
+        )
     before, after = seam_medians(seams)
     step = float(np.median([abs(p.seam.step_ev) for p in seams]))
     whole = f"{step:.2f}" if step >= 0.005 else "less than 0.01"

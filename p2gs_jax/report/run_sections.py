@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluation.protocols import PROTOCOLS
+from p2gs_jax.evaluation.scores import PROTOCOLS
 from p2gs_jax.presets import flat, preset, to_dict
 from p2gs_jax.report.charts import training_chart
 from p2gs_jax.report.findings import column, duration, seconds_of
@@ -160,8 +160,7 @@ def training_section(run: RunFiles) -> str:
     """Return loss, PSNR and Gaussians over the steps."""
     log = [r for r in run.log if number_at(r, "gaussians") is not None]
     if len(log) < 2:
-        why = [m for m in run.missing if m.startswith("The training curves")]
-        return "".join(map(paragraph, why))
+        return ""  # why, stands under what the page lacks
 
     def over_steps(*path: str) -> np.ndarray:
         return column(number_at(r, *path) for r in log)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypedDict
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -33,58 +33,19 @@ VERSION = 2
 AGAIN = "restore it from a copy, or run `p2gs-jax fit ... --resume` or `calibrate` again"
 
 
-class _EveryView(TypedDict):
-    image: str
-    camera: str
-    exposure: float | None
-    exposure_ev: float | None
-    gamma: float | None
-    exif_ev: float | None
-    split: str
-    exposure_fitted: float | None
-
-
-class ViewPhotometry(_EveryView, total=False):
-    """One view; docs/files.md says what each number is, and where it is null.
-
-    These are absent where there was no bundle adjustment, or white balance is not modelled.
-    """
-
-    exposure_unknown: bool
-    exposure_ev_error: float | None
-    gamma_error: float | None
-    exposure_ev_start: float | None
-    observations: int | None
-    white_balance: list[float] | None
-    white_balance_ev_error: list[float] | None
-
-
-class CameraPhotometry(TypedDict):
-    """What one physical camera does besides; rows are one for all channels, or one for each."""
-
-    name: str
-    vignetting: list[list[float]] | None
-    corner: list[float] | None
-    corner_ev_error: list[float] | None
-    splines: list[list[float]] | None
-
-
-class PhotometryFile(TypedDict):
-    """The file: version, model, tone curve, gauge, mean parameters, cameras, views."""
-
-    version: int
-    model: str
-    curve: dict
-    gauge: str
-    mean: dict
-    cameras: list[CameraPhotometry]
-    views: list[ViewPhotometry]
+# The file, and its rows; docs/files.md says what each number is, and where it is null or absent.
+PhotometryFile = ViewPhotometry = CameraPhotometry = dict[str, Any]
+FIELDS = ("version", "model", "curve", "gauge", "mean", "cameras", "views")
+OF_VIEWS = (
+    *("image", "camera", "exposure", "exposure_ev", "gamma", "exif_ev", "split"),
+    "exposure_fitted",
+)
 
 
 def write_photometry(path: Path, **values: Any) -> None:
-    """Write `photometry.json` atomically; values are the fields of a `PhotometryFile`."""
+    """Write `photometry.json` atomically; values are its fields."""
     given = {"version": VERSION, "cameras": [], **values}
-    write_json(path, {name: given[name] for name in PhotometryFile.__annotations__})
+    write_json(path, {name: given[name] for name in FIELDS})
 
 
 def read_photometry(path: Path) -> PhotometryFile:
@@ -104,20 +65,20 @@ def read_photometry(path: Path) -> PhotometryFile:
 
 def _problem(data) -> str | None:
     """Return what keeps `data` from being a `PhotometryFile`, or None."""
-    if missing := _missing(data, PhotometryFile):
+    if missing := _missing(data, FIELDS):
         return missing
     if data["version"] != VERSION:
         return f"its version is {data['version']}, and this program reads version {VERSION}"
     if not isinstance(data["views"], list):
         return "views is not a list"
-    found = (_missing(view, ViewPhotometry) for view in data["views"])
+    found = (_missing(view, OF_VIEWS) for view in data["views"])
     return next((f"view {number}: {words}" for number, words in enumerate(found) if words), None)
 
 
-def _missing(data, kind: Any) -> str | None:
+def _missing(data, fields: Sequence[str]) -> str | None:
     if not isinstance(data, dict):
         return "not an object"
-    names = [k for k in kind.__annotations__ if k in kind.__required_keys__ and k not in data]
+    names = [name for name in fields if name not in data]
     return f"{', '.join(names)} missing" if names else None
 
 
@@ -133,7 +94,7 @@ def with_curve_of(cfg: PhotometryConfig, saved: PhotometryFile) -> PhotometryCon
         return dataclasses.replace(
             cfg,
             select=False,
-            model=saved["model"],  # pyright: ignore[reportArgumentType]
+            model=saved["model"],
             curve=curve["name"],
             spline=None if spline is None else tuple(map(float, spline)),
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -84,7 +85,7 @@ def write_summary(
     found = np.log2(jax.tree.map(np.asarray, params.photometry).exposures)
     stated = {"EXIF": [v.exif_ev for v in train]}
     if true_exposures is not None:
-        stated = {"true": np.log2([true_exposures[v.name] for v in train]), **stated}
+        stated = {"true": [_log2(true_exposures.get(v.name)) for v in train], **stated}
     for rows, values, style, label in _lines(found, [v.camera for v in train], stated):
         axis.plot(rows, values, label=label or None, **style)
     axis.set_ylabel("exposure, EV\nfrom the mean", fontsize=TEXT_SIZE)
@@ -97,6 +98,10 @@ def write_summary(
     with atomic_write(path) as temporary:
         # Packing tighter takes longer than drawing, for a tenth of the bytes.
         figure.savefig(temporary, format="png", pil_kwargs={"compress_level": 2})
+
+
+def _log2(value: float | None) -> float | None:
+    return math.log2(value) if value is not None and value > 0 else None
 
 
 def _shorten(name: str, inches: float) -> str:

@@ -160,9 +160,19 @@ def write_true_exposures(root: Path, names: Sequence[str], shots: Shots) -> None
 
 
 def read_true_exposures(root: Path) -> dict[str, float]:
-    """Return image name -> true exposure; empty where the scene folder has no such file."""
+    """Return image name -> true exposure; empty where the scene folder has no such file.
+
+    Raises:
+        UserError: the file lacks a column, or holds what is not a number.
+    """
     path = root / FILE
     if not path.is_file():
         return {}
-    with path.open(newline="", encoding="utf-8") as file:
-        return {row["image"]: float(row["exposure"]) for row in csv.DictReader(file)}
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            return {row["image"]: float(row["exposure"]) for row in csv.DictReader(file)}
+    except (OSError, KeyError, ValueError, TypeError) as error:
+        raise UserError(
+            f"{path} cannot be read ({error!r}).",
+            fix="mend it, or take it away: it is for judging only",
+        ) from error

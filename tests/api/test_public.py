@@ -4,15 +4,13 @@ import ast
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+from docs.pages import ROOT, blocks
 
 import p2gs_jax
 from p2gs_jax import UserError
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_everything_public_is_listed_before_it_is_imported():
@@ -28,22 +26,10 @@ def test_everything_public_is_listed_before_it_is_imported():
         assert getattr(p2gs_jax, name) is not None
 
 
-def blocks(page):
-    text, found, inside = page.read_text(encoding="utf-8"), [], None
-    for line in text.splitlines():
-        if line.startswith("```"):
-            if inside is not None:
-                found.append("\n".join(inside))
-            inside = [] if line == "```python" else None
-        elif inside is not None:
-            inside.append(line)
-    return found
-
-
 @pytest.mark.parametrize("name", ["api.md", "conventions.md", "sweeps.md"])
 def test_examples_import_public_names_only(name):
     modules = {n for n in p2gs_jax.__all__ if type(getattr(p2gs_jax, n)) is type(p2gs_jax)}
-    found = blocks(ROOT / "docs" / name)
+    found = [block.code for block in blocks(ROOT / "docs" / name) if block.language == "python"]
     assert found
     for code in found:
         for node in ast.walk(ast.parse(code)):

@@ -4,12 +4,14 @@ import functools
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import av
 import cv2
 import numpy as np
 import pytest
 
+from p2gs_jax.cli.render import Render, _default_name
 from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.paths.panorama import covering
 from p2gs_jax.paths.rig import find_rig
@@ -263,3 +265,22 @@ def test_a_folder_in_place_of_a_video_is_kept(render, own_run, tmp_path):
     code, text = render(own_run, "--out", tmp_path / "notes")
     assert code == 2
     assert (tmp_path / "notes").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("options", "names", "folder"),
+    [
+        ({}, ("0.png",), "all"),
+        ({"split": "test"}, ("0.png",), "test"),
+        ({"split": "train"}, ("cam/0.png",), "train"),
+        ({"split": "test", "panorama": True}, ("cam/0.png",), "test_panorama"),
+        ({"panorama": True}, ("cam/0.png",), "panorama"),
+        ({"path": "drive", "shift": -2.0}, ("cam/0.png",), "drive_2_right"),
+        # Where the fit keeps its held-out views.
+        ({"split": "test"}, ("test/r_0.png",), "test_views"),
+        ({"path": "drive"}, ("drive/0.png",), "drive_views"),
+    ],
+)
+def test_a_folder_is_named_by_what_is_rendered(tmp_path, options, names, folder):
+    scene = SimpleNamespace(views=[SimpleNamespace(name=name) for name in names])
+    assert _default_name(Render(tmp_path, **options), scene) == folder

@@ -7,6 +7,8 @@ import re
 import pytest
 from pages import ROOT
 
+from p2gs_jax.evaluation.scores import PROTOCOLS
+
 DOCS = ROOT / "docs"
 
 
@@ -40,6 +42,12 @@ def test_pages_name_modules_and_what_they_hold(page):
         for part in name.split(".") if name else []:
             assert hasattr(holder, part), f"{path} has no {name}"
             holder = getattr(holder, part)
+
+
+def test_the_first_page_explains_every_line_that_a_fit_prints():
+    page = (DOCS / "quickstart.md").read_text(encoding="utf-8")
+    printed = [p for p in PROTOCOLS.values() if p.path[0] != "reference"]
+    assert not [p for p in printed if f"| {p.views}, {p.shown} |" not in page]
 
 
 def test_the_reference_has_every_public_name():

@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from p2gs_jax.evaluation import radiance
 from p2gs_jax.evaluation.radiance import (
@@ -37,8 +35,7 @@ def test_pu21_reference_values():
     assert np.all(np.diff(pu21_encode(np.geomspace(0.005, 1e4, 200))) > 0)
 
 
-@settings(max_examples=10, deadline=None)
-@given(c=st.floats(0.05, 20.0))
+@pytest.mark.parametrize("c", [0.05, 1.0, 20.0])
 def test_a_common_factor_costs_nothing(c):
     truth = image()
     result = scores(truth / c, truth, 1e9)
@@ -102,6 +99,10 @@ def test_colour_difference_sees_hue():
     assert pu21_psnr(red, truth, EVERYWHERE, 1.0) < 40
 
 
+TRUTH = np.random.default_rng(0).uniform(0.1, 4.0, (8, 10, 3))
+SOME = np.ones((8, 10), bool)
+
+
 def test_nothing_to_judge_has_no_score():
     assert np.isnan(mu_law_psnr(TRUTH, TRUTH, ~SOME))
     assert np.isnan(mu_law_psnr(TRUTH, 0 * TRUTH, SOME))
@@ -110,10 +111,6 @@ def test_nothing_to_judge_has_no_score():
     s = RadianceScores()
     s.add("a", "train", image(), image(), none)
     assert np.isnan(s.summary(1.0)["stops_rms"])
-
-
-TRUTH = np.random.default_rng(0).uniform(0.1, 4.0, (8, 10, 3))
-SOME = np.ones((8, 10), bool)
 
 
 def test_the_curve_keeps_its_ends_rises_and_lifts_what_is_dark():

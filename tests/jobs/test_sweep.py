@@ -19,6 +19,7 @@ from p2gs_jax.jobs.configs import grid, read_sweep, with_fields
 from p2gs_jax.jobs.job import REASON, JobFiles, read_job
 from p2gs_jax.jobs.sweep import SweepResult, brief, failures, read_row, sweep, to_markdown
 from p2gs_jax.run.folder import locked
+from p2gs_jax.run.photometry_files import read_photometry
 
 BASE = p2gs_jax.preset("robust")
 SMALL = with_fields(
@@ -97,6 +98,27 @@ def test_the_printed_table_is_short_and_the_kept_one_says_what_columns_are():
     assert "ev_power" not in text
     assert "| a | 2 of 3 |" in text
     assert "no seeds" in text
+
+
+@pytest.mark.parametrize(
+    ("rows", "known"),
+    [
+        ("image,exposure\n0.png,1\n1.png,2\n", True),  # not of every photograph
+        ("image,exposure\n0.png,1\n", False),
+        ("image,iso\n0.png,1\n", False),
+        ("image,exposure\n0.png,bright\n1.png,2\n", False),
+        ("image,exposure\n0.png\n1.png,2\n", False),
+    ],
+)
+def test_a_run_is_as_good_where_the_truth_is_not_whole(finished_run, tmp_path, rows, known):
+    (tmp_path / "truth").mkdir()
+    views = read_photometry(finished_run / "photometry.json")["views"]
+    train = [v["image"] for v in views if v["split"] == "train"]
+    text = rows.replace("0.png", train[0]).replace("1.png,", f"{train[1]},")
+    (tmp_path / "truth" / "exposures.csv").write_text(text)
+    row = read_row(finished_run, tmp_path)
+    assert row["train_psnr"] > 0
+    assert ("ev" in row) == known
 
 
 def test_a_grid_has_every_combination():

@@ -12,21 +12,19 @@ from p2gs_jax import calibrate, calibrate_run, calibrate_stack
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.alignment import exposure_error
 from p2gs_jax.photometry.sources.stack import read_stack
-from p2gs_jax.presets import preset
 from p2gs_jax.run.photometry_files import read_photometry
 from p2gs_jax.synth.sensor import read_true_exposures
+from p2gs_jax.synth.write import write_street
 
-AS_GIVEN = ("--photometry.no-select", "--photometry.model", "view_exposure")
 
-
-def test_street(noisy_street, tmp_path):
-    result = calibrate(noisy_street, tmp_path / "out", preset("robust"))
+def test_street(tmp_path):
+    street = tmp_path / "street"
+    write_street(street, frames=3, width=96, height=64, points=1500, iso_std=4.0, seed=3)
+    result = calibrate(street, tmp_path / "out")
     saved = read_photometry(tmp_path / "out" / "photometry.json")
-    found = {v["image"]: v["exposure"] for v in saved["views"]}
-    truth = read_true_exposures(noisy_street)
-    names = sorted(found)
-    error = exposure_error(np.array([found[n] for n in names]), np.array([truth[n] for n in names]))
-    assert error["ev"] < 0.05
+    truth = read_true_exposures(street)
+    pairs = np.array([(v["exposure"], truth[v["image"]]) for v in saved["views"]])
+    assert exposure_error(*pairs.T)["ev"] < 0.05
     assert result.selection.solution.model == "view_exposure"
     assert any(m.startswith("Chosen: ") for m in result.messages)
     assert all(v["exposure_ev_error"] < 0.2 for v in saved["views"])
@@ -42,7 +40,7 @@ def test_command_keeps_known_exposures(noisy_street, tmp_path, run_command):
     path.write_text("image,exposure\n" + "\n".join(f"{k},{5 * v}" for k, v in truth.items()))
     argv = ("calibrate", noisy_street, "--out", tmp_path / "out", "--known-exposures", path)
     # What is chosen without known exposures, `test_street` says.
-    code, text = run_command(*argv, *AS_GIVEN)
+    code, text = run_command(*argv, "--photometry.no-select", "--photometry.model", "view_exposure")
     assert code == 0
     assert "Results: " in text
     for view in read_photometry(tmp_path / "out" / "photometry.json")["views"]:
@@ -51,9 +49,9 @@ def test_command_keeps_known_exposures(noisy_street, tmp_path, run_command):
 
 def test_castle_says_that_exif_and_pixels_disagree(shared_data, tmp_path):
     root = shared_data("sceaux_castle")
-    result = calibrate(
-        root, tmp_path / "out", preset("robust"), compare_with=str(root / "exposures.csv")
-    )
+    given = {"photometry.select": False, "photometry.model": "view_exposure"}
+    cfg = p2gs_jax.with_fields(p2gs_jax.preset("robust"), given)
+    result = calibrate(root, tmp_path / "out", cfg, compare_with=str(root / "exposures.csv"))
     assert result.agreement.correlation > 0.7
     assert result.agreement.disagrees[[v.name for v in result.views].index("100_7109.jpg")]
     assert any("disagrees with the pixels" in m for m in result.messages)
@@ -71,23 +69,6 @@ def test_wrong_input(run_command, tmp_path, scene, options, said):
     code, text = run_command("calibrate", tmp_path / scene, "--out", tmp_path / "o", *options)
     assert code == 2
     assert said in text
-
-
-@pytest.mark.slow
-def test_a_run_gives_its_exposures_again(noisy_street, tmp_path):
-    cfg = p2gs_jax.preset("robust")
-    short = {"train.steps": 80, "train.coarse_to_fine": (), "render.sh_degree": 1}
-    cfg = p2gs_jax.with_fields(cfg, {**short, "data.test_every": 0, "data.max_width": 128})
-    result = p2gs_jax.fit(noisy_street, tmp_path / "run", cfg)
-    started = read_photometry(tmp_path / "run" / "photometry.json")["views"]
-    assert all(0 < v["exposure_ev_error"] < 0.1 for v in started)
-    again = calibrate_run(tmp_path / "run", tmp_path / "out", cfg)
-    assert again.observations > 1000
-    found = np.exp2(again.exposures_ev)
-    known = np.asarray(result.params.photometry.exposures)
-    assert exposure_error(found, known)["ev"] < 0.05
-    saved = read_photometry(tmp_path / "out" / "photometry.json")
-    assert len(saved["views"]) == len(known)
 
 
 def test_what_a_small_run_can_say_is_written(finished_run, tmp_path):

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from tiny_scene import make_scene
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.jobs.configs import with_fields
@@ -21,10 +22,8 @@ from p2gs_jax.types import Scene
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory) -> Scene:
-    from tiny_scene import make_scene
-
-    root = make_scene(tmp_path_factory.mktemp("scale") / "scene", views=4, points=60)
-    return load_scene(root, FitConfig().data, root.parent / "cache", lambda text: None)
+    root = tmp_path_factory.mktemp("scale") / "scene"
+    return load_scene(make_scene(root, views=4, points=60), FitConfig().data)
 
 
 def scaled(scene, factor, offset=0.0):

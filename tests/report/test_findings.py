@@ -37,6 +37,14 @@ def test_a_good_run_has_none(run):
     assert warnings(run) == {}
 
 
+def test_how_the_model_was_chosen_is_told_without_reading_notes(run):
+    run.metrics["notes"] = ["Modell gewählt."]
+    seen = SceneMeasurements()
+    assert "the simplest choice that predicts" in " ".join(summary_sentences(run, seen))
+    del run.metrics["photometry"]
+    assert "no shared points to choose by" in " ".join(summary_sentences(run, seen))
+
+
 def put(value, *path):
     """Return a change of a run: a value at a path that begins with an attribute."""
 

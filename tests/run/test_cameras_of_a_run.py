@@ -12,7 +12,7 @@ import pytest
 from p2gs_jax.config import CameraFormation, FitConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.exr import read_exr
-from p2gs_jax.photometry.display import DisplayTransform, develop
+from p2gs_jax.photometry.display import develop
 from p2gs_jax.presets import from_dict, to_dict
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.run.photometry_files import read_photometry
@@ -90,7 +90,9 @@ def test_a_file_that_does_not_fit_is_refused(camera_run, tmp_path, change, said)
         load_run(folder)
 
 
-def test_render_shows_them_and_leaves_them_out_where_asked(camera_run, tmp_path, run_command):
+def test_render_shows_them_and_leaves_them_out_where_asked(
+    camera_run, finished_run, tmp_path, run_command
+):
     run = load_run(camera_run)
     rows = run.scene.train_indices
     first, last = (run.scene.views[i].name for i in (rows[0], rows[-1]))
@@ -116,19 +118,13 @@ def test_render_shows_them_and_leaves_them_out_where_asked(camera_run, tmp_path,
     balance = np.exp(run.white_balance_of(last))
     np.testing.assert_allclose(header["p2gsWhiteBalance"], balance, rtol=1e-5)
     assert (warm / np.maximum(shown, 0.05))[..., 0].mean() > 1.05
-    code, text = run_command(
-        "render", camera_run, "--white-balance-of", "nobody.png", "--out", tmp_path / "no"
-    )
-    assert code == 2
-    assert "no view 'nobody.png'" in text
-
-
-def test_a_run_without_white_balance_has_none_to_show(finished_run, tmp_path, run_command):
-    name = load_run(finished_run).scene.views[0].name
-    argv = ("render", finished_run, "--white-balance-of", name, "--out", tmp_path / "no")
-    code, text = run_command(*argv)
-    assert code == 2
-    assert "models no white balance" in text
+    for run, name, said in (
+        (camera_run, "nobody.png", "no view 'nobody.png'"),
+        (finished_run, first, "models no white balance"),
+    ):
+        argv = ("render", run, "--white-balance-of", name, "--out", tmp_path / "no")
+        code, text = run_command(*argv)
+        assert (code, said in text) == (2, True)
 
 
 def test_exports_carry_them(camera_run, tmp_path, run_command):
@@ -199,10 +195,3 @@ def test_the_report_shows_them_and_nothing_of_the_kind_elsewhere(
     other = headings(finished_run, "b.html")
     assert "<h2>White balance" not in other
     assert "<h2>Vignetting" not in other
-
-
-def test_a_transform_equals_another_of_the_same_values():
-    cfg = dataclasses.replace(FitConfig().photometry, cameras=CAMERAS)
-    a = DisplayTransform(1.0, 2.2, cfg, None, (0.1, 0.0, -0.1), 0)
-    assert a == dataclasses.replace(a)
-    assert a.vignetting == CAMERAS[0].vignetting

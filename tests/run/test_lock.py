@@ -75,15 +75,12 @@ def test_a_folder_that_was_removed_underneath_is_named(tmp_path, anew):
                 (run / NAME).write_text("1")
             (run / "checkpoints" / "3").stat()  # what the run meets first
 
+    with pytest.raises(FileNotFoundError), locked(tmp_path):
+        (tmp_path / "nowhere").stat()  # other errors stay as they are
     with pytest.raises(UserError, match="was removed or replaced") as error:
         write()
     assert isinstance(error.value.__context__, FileNotFoundError)
     assert run.exists() == anew
-
-
-def test_other_errors_of_the_system_stay_as_they_are(tmp_path):
-    with pytest.raises(FileNotFoundError), locked(tmp_path):
-        (tmp_path / "nowhere").stat()
 
 
 def test_a_fit_into_a_folder_in_use_is_refused(tmp_path, run_command):
