@@ -1,0 +1,424 @@
+"""Small inputs after what users of neighbouring programs report, each with what is right."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from PIL import Image
+from reliability import scenes
+from reliability.family import Family, Report
+from reliability.trials import NONSENSE, REFUSED, Trial, run_trials
+
+from p2gs_jax.config import DataConfig
+from p2gs_jax.core.text import printable
+from p2gs_jax.errors import UserError
+from p2gs_jax.render.warp import project_points
+from p2gs_jax.scene import find_scene, with_what_lies_beside
+from p2gs_jax.scene.exposures import read_known_exposures
+from p2gs_jax.scene.masks import with_alpha
+from p2gs_jax.scene.pixels.store import ImageStore
+from p2gs_jax.types import Scene
+
+NAME = "neighbours"
+ABOUT = """Scenes as users of 3DGS, gsplat, nerfstudio, COLMAP and devkits have them: folders of
+several cameras, models and masks in other places and under other names, poses far from the origin,
+byte-order marks, alpha that says nothing, colours of other types. Each is read with the values that
+are written beside it, or refused by name."""
+SPACING = 4
+NAMES = scenes.names()
+Check = Callable[[Scene], bool]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene, and what is right.
+
+    Attributes:
+        make: writes it into an empty folder.
+        right: what holds of the scene that is read; None: it is refused.
+        says: words of the refusal, or of the notes.
+        data: options of the scene.
+    """
+
+    make: Callable[[Path], object]
+    right: Check | None = None
+    says: tuple[str, ...] = ()
+    data: dict[str, Any] = field(default_factory=dict)
+
+
+def run(quick: bool, out: Path, report: Report) -> Family:
+    """Try all; `quick`: every fourth."""
+    return run_trials(NAME, list(trials())[:: SPACING if quick else 1], out, report)
+
+
+def trials() -> Iterator[Trial]:
+    """Yield all, in their order."""
+    for name, case in CASES.items():
+
+        def make(root: Path, case: Case = case) -> Path:
+            case.make(root)
+            return root
+
+        def act(root: Path, case: Case = case) -> int:
+            return _tried(root, case)
+
+        yield Trial(name, make, act, case.says, case.right is None)
+    for words, seconds in BUDGETS.items():
+
+        def said(root: Path, words: str = words, seconds: float | None = seconds) -> int:
+            return _budget(words, seconds)
+
+        yield Trial(f"--budget {words}", lambda root: root, said, (words,), seconds is None)
+
+
+def _tried(root: Path, case: Case) -> int:
+    """Read a scene as a fit does, but for structure from motion."""
+    cfg = DataConfig(**case.data)
+    try:
+        scene = find_scene(root, cfg)
+        if isinstance(scene, Scene):
+            scene = with_alpha(with_what_lies_beside(scene, cfg), cfg)
+            store = ImageStore(scene.views, cfg)
+            store.get(0)
+            store.close()
+        if case.right is None or case.right(scene):  # pyright: ignore[reportArgumentType]
+            return 0
+    except UserError as error:
+        print(printable(f"p2gs-jax: error: {error}"), file=sys.stderr)
+        return REFUSED
+    print(f"not what is right: {scene}"[:300], file=sys.stderr)
+    return NONSENSE
+
+
+def _budget(words: str, seconds: float | None) -> int:
+    from p2gs_jax.cli.shared import parse_duration
+
+    try:
+        return 0 if parse_duration(words) == seconds else NONSENSE
+    except (UserError, ValueError) as error:
+        print(f"{error} {words} To fix it: {error}", file=sys.stderr)
+        return REFUSED
+
+
+BUDGETS = {"90s": 90.0, "1h30": 5400.0, "2h15": 8100.0, "1h30m": 5400.0, "1.5h": 5400.0, "1x": None}
+
+
+# ------------------------------------------------------------------------------- writers
+
+
+def colmap(
+    root: Path, rename: Callable[[str, int], str] = lambda name, k: name, cameras: bool = False
+) -> dict[str, str]:
+    """Write the text model under other names of photographs; with `cameras`, one for each."""
+    scenes.write_colmap(root, text=True)
+    text = scenes.colmap_text()
+    for k, name in enumerate(NAMES):
+        text["images.txt"] = text["images.txt"].replace(name, rename(name, k))
+        if cameras:
+            text["images.txt"] = text["images.txt"].replace(
+                f" 1 {rename(name, k)}", f" {k + 1} {rename(name, k)}"
+            )
+        _moved(root / "images" / name, root / "images" / rename(name, k))
+    if cameras:
+        row = text["cameras.txt"].splitlines()[-1].split()
+        rows = [" ".join([str(k + 1), *row[1:4], str(40 + k), *row[5:]]) for k in range(len(NAMES))]
+        text["cameras.txt"] = "\n".join(rows) + "\n"
+    for name, content in text.items():
+        (root / "sparse" / "0" / name).write_text(content)
+    return text
+
+
+def _moved(source: Path, place: Path) -> None:
+    place.parent.mkdir(parents=True, exist_ok=True)
+    source.rename(place)
+
+
+def model_at(*places: str) -> Callable[[Path], None]:
+    """Return a writer that puts the model elsewhere; before the last, one of a single view."""
+
+    def make(root: Path) -> None:
+        model = scenes.write_colmap(root, text=True)
+        files = scenes.colmap_text()
+        _moved(model, root / "kept")
+        (root / "sparse").rmdir()
+        for place in places:
+            (root / place).mkdir(parents=True)
+            for name, content in files.items():
+                few = content.splitlines()[:2] if name == "images.txt" else content.splitlines()
+                rows = content.splitlines() if place == places[-1] else few
+                (root / place / name).write_text("\n".join(rows) + "\n")
+
+    return make
+
+
+def transforms(change: Callable[[dict], object]) -> Callable[[Path], None]:
+    """Return a writer of a changed transforms.json."""
+
+    def make(root: Path) -> None:
+        scenes.write_transforms(root)
+        data = scenes.transforms()
+        change(data)
+        (root / "transforms.json").write_text(json.dumps(data))
+
+    return make
+
+
+def per_frame(data: dict) -> None:
+    """Give every frame intrinsics of its own."""
+    for k, frame in enumerate(data["frames"]):
+        frame |= {"fl_x": 40.0 + k, "fl_y": 40.0 + k}
+
+
+def far(*offset: float) -> Callable[[Path], None]:
+    """Return a writer of a COLMAP model whose world is moved."""
+
+    def make(root: Path) -> None:
+        text = colmap(root)
+        at = np.array(offset)
+        lines = text["images.txt"].splitlines()
+        for k in range(0, len(lines), 2):
+            words = lines[k].split()
+            words[5:8] = [repr(float(w) - o) for w, o in zip(words[5:8], at, strict=True)]
+            lines[k] = " ".join(words)
+        points = [line.split() for line in text["points3D.txt"].splitlines()]
+        for words in points:
+            words[1:4] = [repr(float(w) + o) for w, o in zip(words[1:4], at, strict=True)]
+        (root / "sparse/0/images.txt").write_text("\n".join(lines) + "\n")
+        (root / "sparse/0/points3D.txt").write_text("\n".join(map(" ".join, points)) + "\n")
+
+    return make
+
+
+def masked(place: str, suffix: str = "", alpha: bool = False, images: bool = False) -> Callable:
+    """Return a writer of masks under other names, their left halves hidden."""
+
+    def make(root: Path) -> None:
+        if images:
+            scenes.write_photographs(root / "images")
+        else:
+            scenes.write_colmap(root)
+        mask = np.full((scenes.HEIGHT, scenes.WIDTH), 255, np.uint8)
+        mask[:, : scenes.WIDTH // 2] = 0
+        for name in NAMES:
+            pixels = np.dstack([np.full_like(mask, 255)] * 3 + [mask]) if alpha else mask
+            path = root / place / (suffix.format(Path(name).stem) or name)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(path), pixels)
+
+    return make
+
+
+def with_alpha_of(value: int) -> Callable[[Path], None]:
+    """Return a writer of photographs whose alpha is one value everywhere."""
+
+    def make(root: Path) -> None:
+        scenes.write_colmap(root)
+        for name in NAMES:
+            path = root / "images" / name
+            pixels = cv2.imread(str(path))
+            cv2.imwrite(str(path), np.dstack([pixels, np.full(pixels.shape[:2], value, np.uint8)]))
+
+    return make
+
+
+def seeds(kind: str, most: float) -> Callable[[Path], None]:
+    """Return a writer of seed points whose colours reach to `most`."""
+
+    def make(root: Path) -> None:
+        scenes.write_transforms(root)
+        head, rows = scenes.ply().split("end_header\n")
+        for color in ("red", "green", "blue"):
+            head = head.replace(f"property uchar {color}", f"property {kind} {color}")
+        lines = [line.split() for line in rows.splitlines()]
+        scaled = [[*w[:3], *(f"{float(c) * most / 255:.0f}" for c in w[3:])] for w in lines]
+        if most == 1.0:
+            scaled = [[*w[:3], *(f"{float(c) / 255:.4f}" for c in w[3:])] for w in lines]
+        rows = "\n".join(map(" ".join, scaled)) + "\n"
+        (root / "points.ply").write_text(head + "end_header\n" + rows)
+
+    return make
+
+
+def exif(tags: dict[int, Any]) -> Callable[[Path], None]:
+    """Return a writer of JPEGs that carry these tags, exposure times a stop apart."""
+
+    def make(root: Path) -> None:
+        colmap(root, lambda name, k: name.replace(".png", ".jpg"))
+        for k, path in enumerate(sorted((root / "images").iterdir())):
+            image = Image.open(path).convert("RGB")
+            found = image.getexif()
+            found.get_ifd(0x8769).update({t: v(k) if callable(v) else v for t, v in tags.items()})
+            image.save(path, "JPEG", exif=found)
+
+    return make
+
+
+def with_mark(*places: str) -> Callable[[Path], None]:
+    """Return a writer of both kinds of scene whose text begins with a byte-order mark."""
+
+    def make(root: Path) -> None:
+        if places[0].startswith("transforms"):
+            scenes.write_transforms(root)
+        else:
+            scenes.write_colmap(root, text=True)
+        for place in places:
+            path = root / place
+            path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+
+    return make
+
+
+def without_points(root: Path) -> None:
+    """Write a model without its points, and these as a PLY beside it."""
+    model = scenes.write_colmap(root, text=True)
+    (model / "points3D.txt").unlink()
+    (model / "points3D.ply").write_text(scenes.ply())
+
+
+def linked(root: Path) -> None:
+    """Write a transforms.json with absolute paths through a link."""
+    (root / "there").mkdir()
+    scenes.write_transforms(root / "there")
+    os.symlink(root / "there", root / "here")
+    data = scenes.transforms()
+    for frame in data["frames"]:
+        frame["file_path"] = str(root / "here" / frame["file_path"])
+    data.pop("train_filenames"), data.pop("test_filenames")
+    (root / "there" / "transforms.json").write_text(json.dumps(data))
+
+
+# ---------------------------------------------------------------------- what is right of a scene
+
+
+def cameras(count: int) -> Check:
+    """So many physical cameras."""
+    return lambda scene: len({view.camera for view in scene.views}) == count
+
+
+def whole(scene: Scene) -> bool:
+    """All views and points."""
+    return (len(scene.views), len(scene.points)) == (len(NAMES), scenes.POINTS)
+
+
+def sharp(scene: Scene) -> bool:
+    """Points are where the photographs show them, to a tenth of a pixel."""
+    t = scene.tracks
+    assert t is not None
+    return all(
+        np.abs(
+            project_points(scene.points[t.point_indices[t.view_indices == k]], view)[0]
+            - t.xy[t.view_indices == k]
+        ).max()
+        < 0.1
+        for k, view in enumerate(scene.views)
+    )
+
+
+def half_hidden(scene: Scene) -> bool:
+    """Every view hides its left half."""
+    store = ImageStore(scene.views, DataConfig())
+    shown = [store.get(k)[1].mean() for k in range(len(scene.views))]
+    store.close()
+    return bool(np.allclose(shown, 0.5, atol=0.05))
+
+
+def photographs(count: int) -> Callable[[Any], bool]:
+    """So many photographs and nothing else."""
+    return lambda found: len(found.paths) == count
+
+
+def no_alpha(scene: Scene) -> bool:
+    """No backdrop: the photographs are opaque."""
+    return ImageStore(scene.views, DataConfig()).backdrop is None
+
+
+def same_colors(scene: Scene) -> bool:
+    """Colours of the seeds as they are as bytes."""
+    expected = [line.split()[3:] for line in scenes.ply().split("end_header\n")[1].splitlines()]
+    assert scene.point_colors is not None
+    return bool(
+        np.abs(np.asarray(scene.point_colors, float) - np.array(expected, float)).max() <= 1
+    )
+
+
+def a_stop_apart(scene: Scene) -> bool:
+    """EXIF says that each view is a stop brighter than the one before."""
+    found = [view.exif_ev for view in scene.views]
+    return None not in found and bool(np.allclose(np.diff(np.array(found, float)), 1, atol=0.02))
+
+
+def in_order(scene: Scene) -> bool:
+    """Frames in the order of their numbers."""
+    numbers = [int("".join(filter(str.isdigit, Path(v.name).stem))) for v in scene.views]
+    return numbers == sorted(numbers)
+
+
+def one_row(scene: Scene) -> bool:
+    """Exposures known by the name alone, of which there are several."""
+    path = scene.root / "known.csv"
+    path.write_text("image,exposure\na.png,1\n")
+    read_known_exposures(str(path), list(scene.views))
+    return False
+
+
+SECONDS = {0x829A: lambda k: 2.0**k / 500}
+CASES: dict[str, Case] = {
+    "T1 rig1/cameraN": Case(
+        lambda r: colmap(r, lambda n, k: f"rig1/camera{k % 2}/{n}", cameras=True), cameras(4)
+    ),
+    "T1 dayN of one camera": Case(lambda r: colmap(r, lambda n, k: f"day{k % 2}/{n}"), cameras(1)),
+    "T1 intrinsics a frame": Case(transforms(per_frame), cameras(4)),
+    "T2 UTM": Case(far(4.5e5, 5.2e6, 100.0), sharp),
+    "T2 the other hemisphere": Case(far(-6.3e6, 1.2e6, -3e6), sharp),
+    "T4 masks/NAME_mask.png": Case(masked("masks", "{}_mask.png"), half_hidden),
+    "T4 masks/NAME.mask.png": Case(masked("masks", "{}.mask.png"), half_hidden),
+    "T4 masks/NAME.png.png": Case(masked("masks", "{}.png.png"), half_hidden),
+    "T4 masks/NAME.PNG": Case(masked("masks", "{}.PNG"), half_hidden),
+    "T4 masks/NAME.jpg": Case(masked("masks", "{}.jpg"), half_hidden),
+    "T4 mask/": Case(masked("mask"), half_hidden),
+    "T4 alpha is the mask": Case(masked("masks", alpha=True), half_hidden),
+    "T4 of no photograph": Case(masked("masks", "other{}.png"), says=("masks",)),
+    "T5 images/masks/": Case(masked("images/masks", images=True), photographs(4)),
+    "T5 images/NAME_mask.png": Case(masked("images", "{}_mask.png", images=True), photographs(4)),
+    "T6 opaque alpha": Case(with_alpha_of(255), no_alpha),
+    "T7 alpha of nothing": Case(with_alpha_of(0), says=("images",)),
+    **{
+        f"T8 {place}": Case(model_at(place), whole)
+        for place in ("colmap/sparse/0", "dense/0/sparse", "distorted/sparse/0", "sparse/model")
+    },
+    "T8 sparse/1 alone": Case(model_at("sparse/1"), whole),
+    "T9 the larger is 1": Case(model_at("sparse/0", "sparse/1"), whole),
+    "T10 another case": Case(
+        lambda r: (colmap(r), [p.rename(p.with_suffix(".PNG")) for p in (r / "images").iterdir()]),
+        whole,
+    ),
+    "T12 ushort colours": Case(seeds("ushort", 65535.0), same_colors),
+    "T12 float colours": Case(seeds("float", 1.0), same_colors),
+    "T13 time alone": Case(exif(SECONDS), a_stop_apart),
+    "T13 no f-number": Case(exif(SECONDS | {0x8827: 200}), a_stop_apart),
+    "T13 APEX": Case(exif({0x9201: lambda k: math.log2(500) - k, 0x9202: 3.0}), a_stop_apart),
+    "T14 COLMAP": Case(with_mark(*(f"sparse/0/{n}" for n in scenes.colmap_text())), whole),
+    "T14 transforms": Case(with_mark("transforms.json"), whole),
+    "T15 names of several": Case(
+        lambda r: colmap(r, lambda n, k: f"cam{k}/a.png"), one_row, ("known.csv",)
+    ),
+    "T17 points as PLY": Case(without_points, whole),
+    "T18 degrees": Case(
+        transforms(lambda d: (d.update(camera_angle_x=50.0), d.pop("fl_x"), d.pop("fl_y"))),
+        says=("transforms.json",),
+    ),
+    "S5 frame_2 before frame_10": Case(
+        lambda r: colmap(r, lambda n, k: f"frame_{[1, 2, 10, 11][k]}.png"), in_order
+    ),
+    "S10 through a link": Case(linked, whole),
+    "S14 blanks": Case(lambda r: colmap(r, lambda n, k: f"IMG ({k}).png"), whole),
+}
