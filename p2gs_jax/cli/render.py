@@ -163,7 +163,9 @@ def _default_name(options: Render, scene: Scene) -> str:
     """Return the name of a folder in which a fit writes no held-out view."""
     name = options.path if options.path in PATHS else Path(options.path).stem
     if options.path == "views":
-        name = "all" if options.split == "all" else options.split
+        name = options.split
+        if options.camera is not None:
+            name += "_" + options.camera.replace("/", "_")
     if options.shift:
         name += f"_{abs(options.shift):g}_{'left' if options.shift > 0 else 'right'}"
     if options.panorama:

@@ -272,6 +272,7 @@ def test_a_folder_in_place_of_a_video_is_kept(render, own_run, tmp_path):
     [
         ({}, ("0.png",), "all"),
         ({"split": "test"}, ("0.png",), "test"),
+        ({"camera": "rig/left"}, ("rig/left/0.png",), "all_rig_left"),
         ({"split": "train"}, ("cam/0.png",), "train"),
         ({"split": "test", "panorama": True}, ("cam/0.png",), "test_panorama"),
         ({"panorama": True}, ("cam/0.png",), "panorama"),
