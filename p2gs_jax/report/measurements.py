@@ -180,7 +180,7 @@ def seam_section(scene: SceneMeasurements) -> str:
     seams = scene.seams
     if not seams:
         if scene.tried_pairs is None:
-            return ""  # why, stands under what the page lacks
+            return paragraph("None was measured; the list of what this page lacks says why.")
         return paragraph(
             f"{scene.tried_pairs} pairs of training views share enough points, and none of them "
             "enough of the same unsaturated surface to be compared."

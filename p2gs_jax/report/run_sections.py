@@ -160,7 +160,7 @@ def training_section(run: RunFiles) -> str:
     """Return loss, PSNR and Gaussians over the steps."""
     log = [r for r in run.log if number_at(r, "gaussians") is not None]
     if len(log) < 2:
-        return ""  # why, stands under what the page lacks
+        return paragraph("There are no curves; the list of what this page lacks says why.")
 
     def over_steps(*path: str) -> np.ndarray:
         return column(number_at(r, *path) for r in log)
