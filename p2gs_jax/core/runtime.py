@@ -1,9 +1,7 @@
 """How the process of a command runs JAX; programs that import the package decide alone.
 
-Large arrays are made and freed in every step. By default the C library hands each back to the
-system and takes it, page by page, anew: a fifth of a step (BUILD_NOTES, "Memory is kept"). What one
-part of a run needed and the next does not is handed back between them. Compiled programs are kept
-on disk, so that only the first run of a kind waits for the compiler.
+By default the C library hands the large arrays of every step back to the system and takes them
+anew: a fifth of a step (BUILD_NOTES, "Memory is kept"). Compiled programs are kept on disk.
 """
 
 from __future__ import annotations

@@ -1,12 +1,7 @@
 """The random streams of fits and synthetic scenes, by name: users of one would be correlated.
 
-Numbers are what they were before they had names, so that seeds mean what they meant; only streams
-that shared one got another (BUILD_NOTES, "Risks of the review").
-
 The order of views is the exception: its stream is the number of the epoch, and epoch 7 therefore
-has the words of `HELD_OUT`. They order views, everything else draws points, pixels or exposures,
-and nothing that is computed depends on both; numbers of its own would make every fit another one.
-Likewise scenes: what they are made with is data to a fit, whatever its seed.
+has the words of `HELD_OUT`; nothing that is computed depends on both.
 """
 
 from __future__ import annotations

@@ -1,10 +1,8 @@
 """Display colours for ordinary 3DGS viewers, the error of their pictures, and radiance from them.
 
 A viewer composites display values; the true picture composites radiance and then applies the tone
-curve, which is not linear. Display colours computed for each Gaussian by itself are therefore wrong
-by many codes where translucent ones overlap (BUILD_NOTES, "Display PLY"). `refine` optimises
-colours and opacities so that a viewer's pictures of given views agree with the true ones; means and
-shapes stay.
+curve. Display colours computed for each Gaussian by itself are therefore wrong by many codes where
+translucent ones overlap (BUILD_NOTES, "Display PLY"); `refine` optimises colours and opacities.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Dense starts: seeds from depth maps of the photographs, where points are too few.
 
 After EDGS (arXiv 2504.13204), which triangulates dense matches instead of growing splats; the
-depth maps are those of `flow.py`. Of all pixels with a depth so many are drawn as the bound
-allows, evenly: an image is cut into cells, a cell gives one seed, where there is little texture
-four cells together give one, and a cell that shows a seed already gives none.
+depth maps are those of `flow.py`. Pixels with a depth are drawn evenly: an image is cut into cells,
+a cell gives one seed, where there is little texture four cells together give one, and a cell that
+shows a seed already gives none.
 """
 
 from __future__ import annotations

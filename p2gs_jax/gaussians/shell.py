@@ -1,7 +1,6 @@
 """A far shell of Gaussians, where views look past every seed point: sky, hills, far facades.
 
-Pixels without any seed nearby could only be covered by stretching distant splats over them. So
-directions that views look into, but in which no seed lies, get a Gaussian each, far behind the
+Directions that views look into, but in which no seed lies, get a Gaussian each, far behind the
 seeds. Scenes whose views are covered by seeds get none.
 """
 

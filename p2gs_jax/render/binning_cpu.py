@@ -1,11 +1,9 @@
 """Binning by counting: linear time, exact, on loops that XLA's CPU backend compiles whole.
 
 A radix sort of the depths; then, from front to back, splats are expanded into the rows of tiles
-they touch and rows into tiles; then a counting sort by tile. Between the two expansions the
-columns that an ellipse covers in a row of tiles are solved in closed form, for all rows at once,
-so that no bounding box is ever expanded and the list holds exactly what is composited.
-
-Time depends on what a view needs, not on the capacity of its list: capacities may be generous.
+they touch and rows into tiles; then a counting sort by tile. The columns that an ellipse covers in
+a row of tiles are solved in closed form, so that the list holds exactly what is composited. Time
+depends on what a view needs, not on the capacity of its list.
 """
 
 from __future__ import annotations

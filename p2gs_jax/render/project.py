@@ -2,10 +2,9 @@
 
 The local affine approximation of EWA splatting. What is around it concerns drives:
 
-Moving objects. Gaussians stay in the frame of their box, and the camera moves: what a Gaussian
-looks like depends on where the camera is in its own frame alone. So a Gaussian of an object is
-projected with the view matrix from that object's box to the camera, and nothing else in the
-renderer knows of objects.
+Moving objects. Gaussians stay in the frame of their box, and the camera moves: a Gaussian of an
+object is projected with the view matrix from that object's box to the camera, and nothing else in
+the renderer knows of objects.
 
 Vibration (PVG, arXiv 2311.18561, section 3.2). Gaussians may come, move and go:
 

@@ -1,18 +1,14 @@
 """Tile compositing for NVIDIA GPUs through Pallas and Triton, forward and backward.
 
-One block of threads owns one tile and walks its list front to back; a thread owns a few pixels and
-keeps their transmittance and channels in registers. Rows are read by all threads of a block from
-one address, a broadcast, `UNROLL` of them ahead of their use. Blocks are started longest lists
-first, so that no long one is left alone at the end.
+One block of threads owns one tile and walks its list front to back; a thread owns a few pixels.
+Rows are read by all threads of a block from one address, `UNROLL` of them ahead of their use.
+Blocks are started longest lists first, so that no long one is left alone at the end.
 
-Backward. As on the CPU (rasterize_xla.py): the same walk, front to back; the light still to come
-is what the image holds less what has passed, so that nothing is divided by transmittance. Six
-moments and the channels are summed over the tile and added to the Gaussian's gradient atomically,
-or, where runs must repeat bit for bit, written per entry and summed per Gaussian in the order of
-the list.
+Backward. The same walk and the same moments as on the CPU (rasterize_xla.py). They are added to the
+Gaussian's gradient atomically or, where runs must repeat bit for bit, written per entry and summed
+per Gaussian in the order of the list.
 
-On a CPU the kernels are interpreted, so that the shared tests run on them. Measurements:
-BUILD_NOTES, "The GPU kernel".
+On a CPU the kernels are interpreted. Measurements: BUILD_NOTES, "The GPU kernel".
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
 """Which Gaussians a view can show, a compact list of them, and their splats, block by block.
 
 One view of a drive sees a fifth of the population. Everything that is done per Gaussian
-(projection, spherical harmonics, their gradients, the optimiser) is done for that list only. The
-list has a static length and a dynamic count. The time of a loop over blocks follows the count, and
-a block fits a core's cache: gathering 48 spherical-harmonics coefficients of 57k Gaussians at once
-took as long as projecting them (BUILD_NOTES, "The step costs what a view shows").
+(projection, spherical harmonics, their gradients, the optimiser) is done for that list only. It has
+a static length and a dynamic count, which the time of a loop over blocks follows; a block fits a
+core's cache (BUILD_NOTES, "The step costs what a view shows").
 """
 
 from __future__ import annotations

@@ -26,14 +26,13 @@ SMALL_CALL = "xla_cpu_small_call"
 def compiled_loop(f: F) -> F:
     """Return `f` compiled as one sequential native function where XLA runs on a CPU.
 
-    A `lax.while_loop` on the CPU normally runs as a list of kernel launches per iteration, about
-    300 ns each: hopeless for an algorithm that is sequential by nature, such as a counting sort.
-    XLA outlines loops that it considers small and compiles them whole. The attribute set here asks
-    for that whatever the size: a counting sort then takes 6 ns an entry where `lax.sort` takes 54.
+    A `lax.while_loop` on the CPU normally launches kernels in every iteration, about 300 ns each.
+    XLA compiles loops whole that it considers small; the attribute set here asks for that whatever
+    the size: a counting sort then takes 6 ns an entry where `lax.sort` takes 54.
 
     `sequential_vmap` makes vmap a loop over calls, since batched scatters cannot be compiled so,
-    and keeps the call whole under differentiation: partial evaluation would hoist its constants
-    into a call without arguments, which XLA 0.10 turns into invalid code.
+    and keeps the call whole under differentiation: its constants in a call without arguments would
+    become invalid code (XLA 0.10).
 
     `f` is a pure function of arrays, without matrix products, sorts or convolutions; it cannot be
     differentiated.

@@ -9,7 +9,6 @@ import pytest
 from benchmarks import gate
 from benchmarks.hard_cases import splats
 from benchmarks.oracle import Truth, trimmed_errors
-from benchmarks.run import options_of
 from p2gs_jax.errors import UserError
 
 ROWS = {"default": {"both": 1.0, "numerics psnr": 90.0}}
@@ -63,20 +62,6 @@ def test_accuracy_counts_as_measured_first(baseline, step):
 
     (text,) = gate.settle(baseline, {"town 1/4": {"step": step, "numerics gradient": 1.0}}, measure)
     assert "gradient" in text
-
-
-@pytest.mark.parametrize(
-    ("words", "way_on"),
-    [
-        ("sped", "choose speed_error"),
-        ("speed_error --baseline none.json", "--write-baseline"),
-        ("levels --set chunks=3", "no field 'chunks'"),
-    ],
-)
-def test_wrong_arguments_end_with_2_and_a_remedy(words, way_on, capsys):
-    with pytest.raises(SystemExit, match="2"):
-        options_of(words.split())
-    assert way_on in capsys.readouterr().err
 
 
 def test_a_contribution_on_the_cutoff_does_not_hide_the_others():

@@ -50,12 +50,6 @@ def test_what_is_left_is_the_least_of_machine_and_limit(container, monkeypatch):
         assert memory.left_to_process() == left
 
 
-def test_nothing_is_known_without_the_system(container, monkeypatch):
-    monkeypatch.setattr(memory, "STATM", container / "statm")
-    (container / "meminfo").unlink()
-    assert (memory.left_to_process(), memory.resident()) == (None, 0)
-
-
 class JaxRuntimeError(RuntimeError):
     """As JAX names its own."""
 

@@ -16,7 +16,6 @@ from p2gs_jax.gaussians.bake import (
     display_sh,
     refine,
     true_target,
-    viewer_config,
 )
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render.capacity import make_renderer
@@ -138,17 +137,3 @@ def test_the_error_of_a_known_difference():
     assert error["psnr"] == pytest.approx(20 * np.log10(5))
     assert error["mean_codes"] == error["max_codes"] == 51
     assert error["psnr_on_white"] == pytest.approx(20 * np.log10(5 / 4))
-
-
-def test_a_viewer_is_measured_as_3dgs_renders(targets):
-    """Colours max(0, sh + 1/2), composited as they are."""
-    g = random_splats(1, degree=0)
-    one = replace(
-        g,
-        means=jnp.array([[0.0, 0.0, 2.0]]),
-        log_scales=jnp.full((1, 3), 3.0),
-        opacity_logits=jnp.array([0.0]),
-        sh=jnp.array([[[0.5, 0.0, -2.0]]]) / C0,
-    )
-    linear = make_renderer(viewer_config(CFG))(one, jnp.ones(1, bool), camera()).linear
-    np.testing.assert_allclose(linear[16, 20], [0.5, 0.25, 0.0], atol=1e-3)

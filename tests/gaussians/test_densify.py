@@ -12,7 +12,6 @@ from p2gs_jax.config import DensifyConfig
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.gaussians import adaptive, mcmc
 from p2gs_jax.gaussians.population import (
-    bucket_for,
     empty_gaussians,
     fresh_population,
     grow,
@@ -56,12 +55,6 @@ def test_place_fills_empty_slots_in_order_and_counts_the_rest():
     slot, refused = place(requests, alive)
     assert slot.tolist() == [1, 5, 3, 5, 5]
     assert int(refused) == 1
-
-
-def test_buckets_hold_what_is_needed():
-    assert bucket_for(10, 20, None) == 20
-    assert bucket_for(50, 20, None) >= 50
-    assert 90 <= bucket_for(90, 20, 95) <= 95
 
 
 def hot_population(n, hot):
