@@ -28,7 +28,6 @@ from p2gs_jax.pipeline.fit import fit
 from p2gs_jax.pipeline.preflight import check_run_dir
 from p2gs_jax.presets import from_dict, to_dict
 from p2gs_jax.run.folder import RunFolder, locked
-from p2gs_jax.run.photometry_files import read_photometry
 from p2gs_jax.synth.sensor import read_true_exposures
 
 TABLE, TABLE_TEXT, JOBS = "sweep.json", "sweep.md", "jobs"
@@ -263,7 +262,8 @@ def _exposures(run: Path, scene: Path) -> dict[str, float]:
         truth = {}  # the run is as good without
     if not truth:
         return {}
-    error = error_of_views(read_photometry(run / "photometry.json")["views"], truth)
+    views = parse_json((run / "photometry.json").read_text(encoding="utf-8"))["views"]
+    error = error_of_views(views, truth)
     return {} if error is None else {"ev": error["ev"], "ev_power": error["ev_scale_power"]}
 
 
