@@ -203,7 +203,7 @@ def _fit_small_scene(root: Path) -> None:
 
     from p2gs_jax import fit, preset, with_fields
 
-    fields = {"train.steps": 60, "train.coarse_to_fine": True, "data.test_every": 3}
+    fields = {"train.steps": 60, "train.coarse_to_fine": (), "data.test_every": 3}
     fields |= {"densify.max_gaussians": 400, "render.sh_degree": 1, "init.shell": "off"}
     fit(make_scene(root / "scene"), root / "run", with_fields(preset("robust"), fields))
 
