@@ -45,7 +45,7 @@ LUMINANCE = (0.299, 0.587, 0.114)
 
 
 class Vibration(eqx.Module):
-    """How Gaussians come, move and go (render/vibration.py)."""
+    """How Gaussians come, move and go (render/project.py)."""
 
     velocities: Float[Array, "n 3"]  # at the peak, scene units per second
     peaks: Float[Array, " n"]  # when each is most opaque, seconds from the middle of the drive

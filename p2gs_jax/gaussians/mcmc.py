@@ -54,7 +54,7 @@ def relocate_and_grow(
 ) -> Outcome:
     """Move transparent Gaussians onto opaque ones and add `births` new ones there.
 
-    Targets are drawn in proportion to opacity times demand (`train/demand.py`; None: alike
+    Targets are drawn in proportion to opacity times demand (`train/strategies.py`; None: alike
     everywhere). All Gaussians in one place get the opacity and scale of `share`, and they are moved
     apart by `cfg.spread` of their extent: in exactly one place they would have the same gradients,
     and opaque ones, which no noise reaches, would never separate (BUILD_NOTES, "Twins"). Births
