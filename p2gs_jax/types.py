@@ -309,7 +309,7 @@ class View:
     name: str  # path relative to the image folder; views are sorted by it
     image_path: Path  # where the pixels are
     camera: str  # name of the physical camera that took it ("0", "front_left")
-    viewmat: Float32[np.ndarray, "4 4"]  # world-to-camera, OpenCV axes
+    viewmat: Float[np.ndarray, "4 4"]  # world-to-camera, OpenCV axes
     # pinhole intrinsics of the *undistorted* image, at `width` x `height`
     K: Float32[np.ndarray, "3 3"]
     width: int  # pixels

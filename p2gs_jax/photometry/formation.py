@@ -31,7 +31,7 @@ EXPOSED_FLOOR, EXPOSED_CEILING = 1e-6, 10.0  # paper, Tone-mapping estimation
 SRGB_LINEAR_END, SRGB_ENCODED_END = 0.0031308, 0.04045
 LEAST_ALPHA = 1e-3  # opacities below this count as this where radiance is divided by them
 # A row of `PhotometryConfig.cameras`, one for every pixel, or None where it makes no difference.
-CameraRow = Int[Array, "..."] | int | None
+CameraRow = Int[Array, "..."] | np.integer | int | None
 # Of loose pixels in their images, from the centre in units of half the diagonal.
 Positions = Float[Array, "*n 2"] | Float[np.ndarray, "*n 2"] | None
 
@@ -74,7 +74,7 @@ def vignetting_table(cfg: PhotometryConfig) -> Float[np.ndarray, "c k n"]:
     return table
 
 
-def squared_radii(height: int, width: int, xp: Any = np) -> Float[np.ndarray, "h w"]:
+def squared_radii(height: int, width: int, xp: Any = np) -> Float[Any, "h w"]:
     """Return r^2 of the pixels of an image: 0 in its centre, 1 in its corners.
 
     With JAX as `xp`, a compiled program holds a row and a column of them, not the image.
@@ -92,7 +92,7 @@ def places(xy: Values, width: int, height: int) -> Values:
 
 
 def log_vignetting(
-    squared: Values, camera: Int[Array, "..."] | int, cfg: PhotometryConfig
+    squared: Values, camera: Int[Array, "..."] | np.integer | int, cfg: PhotometryConfig
 ) -> Values:
     """Return log V at r^2, with an axis of one or three channels appended, of a row or of each."""
     xp = namespace(squared, camera)
