@@ -104,7 +104,7 @@ def test_options_are_read_as_what_they_are():
 VALUES = {"budget": ("90s", 90.0), "cameras": ("front", ("front",)), "known_deviation_ev": ("2", 2)}
 VALUES |= {name: ("a", "a") for name in ("split", "background", "images", "drive", "frames")}
 VALUES |= {name: ("a", "a") for name in ("known_exposures", "lpips_weights")}
-VALUES["allow_missing"] = ("", True)
+VALUES |= {"allow_missing": ("", True), "camera_by": ("folder", "folder")}
 
 
 @pytest.mark.parametrize("which", ["short", "long"])
