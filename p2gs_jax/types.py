@@ -392,7 +392,7 @@ class Scene:
     root: Path
     format: str
     views: tuple[View, ...]
-    points: Float32[np.ndarray, "p 3"]
+    points: Float[np.ndarray, "p 3"]
     point_colors: UInt8[np.ndarray, "p 3"] | None
     tracks: Tracks | None = None
     notes: tuple[str, ...] = field(default_factory=tuple)

@@ -17,14 +17,14 @@ from typing import Protocol, runtime_checkable
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from p2gs_jax.config import Appearance
 from p2gs_jax.core.numerics import LN2, on_device
 from p2gs_jax.photometry import luminance, ppisp
 from p2gs_jax.photometry.luminance import Curves, Luminance
 from p2gs_jax.photometry.ppisp import OneView, Ppisp
-from p2gs_jax.types import LUMINANCE, Capture, Params
+from p2gs_jax.types import LUMINANCE, Array, Capture, Params
 
 
 @runtime_checkable

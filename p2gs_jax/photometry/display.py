@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float, Float32
+from jaxtyping import Float, Float32
 
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.core.numerics import LN2, on_host
@@ -27,7 +27,7 @@ from p2gs_jax.photometry.formation import (
     uncovered,
 )
 from p2gs_jax.photometry.response import by_camera
-from p2gs_jax.types import Capture, Params, Photometry
+from p2gs_jax.types import Array, Capture, Params, Photometry
 
 Curve = Literal["power", "srgb", "spline", "linear"]
 CURVES: tuple[Curve, ...] = get_args(Curve)

@@ -19,19 +19,19 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from p2gs_jax.config import CameraFormation, PhotometryConfig
 from p2gs_jax.core.numerics import Scalar, Values, namespace, positive_pow, safe_log
 from p2gs_jax.photometry.appearance import Correction, Formation, corrected
 from p2gs_jax.photometry.response import DARKEST, UNKNOWN, decode, encode
-from p2gs_jax.types import GAMMA_SRGB, Capture
+from p2gs_jax.types import GAMMA_SRGB, Array, Capture
 
 EXPOSED_FLOOR, EXPOSED_CEILING = 1e-6, 10.0  # paper, Tone-mapping estimation
 SRGB_LINEAR_END, SRGB_ENCODED_END = 0.0031308, 0.04045
 LEAST_ALPHA = 1e-3  # opacities below this count as this where radiance is divided by them
 # A row of `PhotometryConfig.cameras`, one for every pixel, or None where it makes no difference.
-CameraRow = Int[Array, "..."] | np.integer | int | None
+CameraRow = Int[Array, "..."] | int | None
 # Of loose pixels in their images, from the centre in units of half the diagonal.
 Positions = Float[Array, "*n 2"] | Float[np.ndarray, "*n 2"] | None
 
@@ -92,7 +92,7 @@ def places(xy: Values, width: int, height: int) -> Values:
 
 
 def log_vignetting(
-    squared: Values, camera: Int[Array, "..."] | np.integer | int, cfg: PhotometryConfig
+    squared: Values, camera: Int[Array, "..."] | int, cfg: PhotometryConfig
 ) -> Values:
     """Return log V at r^2, with an axis of one or three channels appended, of a row or of each."""
     xp = namespace(squared, camera)

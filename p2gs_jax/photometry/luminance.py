@@ -14,10 +14,11 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.core.streams import Stream, generator
+from p2gs_jax.types import Array
 
 ENTRIES = 255  # entries of a curve, as published
 HIDDEN = 32  # width of the network (ours)

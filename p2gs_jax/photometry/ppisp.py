@@ -14,9 +14,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from p2gs_jax.core.numerics import on_device, unit_clip
+from p2gs_jax.types import Array
 
 # Vignetting of a channel: the centre's x and y, and the coefficients of r^2, r^4, r^6.
 COEFFICIENTS = 5

@@ -13,10 +13,11 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from p2gs_jax.config import PhotometryConfig, ResponseKind
 from p2gs_jax.core.numerics import Values, namespace
+from p2gs_jax.types import Array
 
 Base = Literal["srgb", "power"]
 BASES: tuple[Base, ...] = get_args(Base)

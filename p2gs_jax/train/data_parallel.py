@@ -18,7 +18,7 @@ import numpy as np
 from jax import lax
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.streams import noise_key
@@ -42,7 +42,7 @@ from p2gs_jax.train.optimizer import learning_rates, means_rate
 from p2gs_jax.train.state import FitState
 from p2gs_jax.train.step import Step, static_sizes
 from p2gs_jax.train.update import StepReport, concluded, is_healthy, update_listed
-from p2gs_jax.types import Batch, Frustum, Gaussians
+from p2gs_jax.types import Array, Batch, Frustum, Gaussians
 
 VIEWS = "views"
 EVERYWHERE, OF_VIEWS = P(), P(VIEWS)

@@ -11,14 +11,14 @@ from __future__ import annotations
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from p2gs_jax.config import FitConfig, LossConfig, PhotometryConfig
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.formation import darkens, gain, inverse_formation, tone_map
 from p2gs_jax.photometry.observations import Observations, sample_pairs
-from p2gs_jax.types import Photometry
+from p2gs_jax.types import Array, Photometry
 
 # Where less than this share of the pairs is valid, the mean is taken as if that many were.
 FEWEST_VALID = 0.01

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.photometry.appearance import Correction, Corrections, correction_of
@@ -20,7 +20,7 @@ from p2gs_jax.render.project import camera_of_each
 from p2gs_jax.render.visible import Shown, compact, in_view, splat, splat_listed, whole_blocks
 from p2gs_jax.train.exposure_loss import Partner
 from p2gs_jax.train.terms import Aux, LossTerm, Rendered, Target, censor
-from p2gs_jax.types import Batch, Frustum, Gaussians, Params, Photometry, Render
+from p2gs_jax.types import Array, Batch, Frustum, Gaussians, Params, Photometry, Render
 
 # Photographed colours of pixels that are less opaque are black.
 LEAST_SEEN = 0.5 / 255

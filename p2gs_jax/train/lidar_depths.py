@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import on_host
@@ -17,7 +17,7 @@ from p2gs_jax.evaluation.passes import ArrayStore, most_bytes
 from p2gs_jax.render.warp import project_points
 from p2gs_jax.scene.drives.objects import object_mask
 from p2gs_jax.scene.visibility import unoccluded
-from p2gs_jax.types import Measured, Scene
+from p2gs_jax.types import Array, Measured, Scene
 
 # Errors of log depth beyond this pull no harder: the measurement missed or hit what is behind.
 CLIP = 0.2

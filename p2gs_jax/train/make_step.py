@@ -13,7 +13,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, UInt
+from jaxtyping import Bool, Float, UInt
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import on_device
@@ -38,7 +38,7 @@ from p2gs_jax.train.step import Step
 from p2gs_jax.train.strategies import Strategy
 from p2gs_jax.train.terms import LossTerm
 from p2gs_jax.train.update import StepReport, finite_names
-from p2gs_jax.types import Batch, Camera, Gaussians, Params, Photometry
+from p2gs_jax.types import Array, Batch, Camera, Gaussians, Params, Photometry
 
 # Without a bound in `cfg`, populations are bounded as in a fit of views of this many pixels.
 PIXELS = 640 * 480

@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.gaussians.population import grow
 from p2gs_jax.photometry.models import MODELS
-from p2gs_jax.types import Gaussians, Params, Photometry, Vibration
+from p2gs_jax.types import Array, Gaussians, Params, Photometry, Vibration
 
 # Of a rate that warms up, what it starts from (PPISP: 0.01).
 WARMUP_START = 0.01

@@ -13,12 +13,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Bool, Int
 
 from p2gs_jax.gaussians.population import empty_gaussians, empty_population, fresh_population, grow
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.train.optimizer import Optimizer, OptState, grow_moments
-from p2gs_jax.types import Params, Population
+from p2gs_jax.types import Array, Params, Population
 
 FAULT_NONE, FAULT_OVERFLOW, FAULT_NONFINITE = 0, 1, 2
 

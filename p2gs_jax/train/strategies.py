@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
 from p2gs_jax.config import DensifyConfig, FitConfig
 from p2gs_jax.core.streams import densification_key, device_seed
@@ -34,7 +34,7 @@ from p2gs_jax.gaussians.population import (
 from p2gs_jax.train.optimizer import AdamState, zero_moments, zero_opacity_moments
 from p2gs_jax.train.schedule import Levels, shrinks_left
 from p2gs_jax.train.state import FitState, HostState, alive_in, grow_state
-from p2gs_jax.types import Gaussians, Population
+from p2gs_jax.types import Array, Gaussians, Population
 
 SLOTS = 1024
 # Steps at full size cost about twice the present ones, at a coarse level.

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from p2gs_jax.config import FitConfig, LossConfig
 from p2gs_jax.evaluation.ssim import one_less_ssim
@@ -27,7 +27,7 @@ from p2gs_jax.photometry.appearance import Correction, Corrections, regularisati
 from p2gs_jax.photometry.luminance import ENTRIES, Curves, cumulative, enhanced, pseudo_curve
 from p2gs_jax.train.exposure_loss import ColorPairs, relative_exposure_loss
 from p2gs_jax.train.lidar_depths import lidar_loss
-from p2gs_jax.types import GAMMA_SRGB, Capture, Measured, Photometry
+from p2gs_jax.types import GAMMA_SRGB, Array, Capture, Measured, Photometry
 
 # Published weights of Luminance-GS.
 ENHANCED, CURVE = 0.5, 10.0

@@ -18,7 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, UInt32
+from jaxtyping import Bool, Float, Int, UInt32
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.streams import noise_key
@@ -35,7 +35,7 @@ from p2gs_jax.train.optimizer import (
     means_rate,
 )
 from p2gs_jax.train.state import FAULT_NONE, FAULT_NONFINITE, FAULT_OVERFLOW, Fault, FitState
-from p2gs_jax.types import Frustum, Gaussians, Params, Photometry, Population, Vibration
+from p2gs_jax.types import Array, Frustum, Gaussians, Params, Photometry, Population, Vibration
 
 
 class Controls(eqx.Module):
