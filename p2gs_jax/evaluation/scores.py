@@ -168,7 +168,7 @@ def summary_of(rows: dict[str, dict[str, Any]]) -> dict[str, Any]:
     return {**means, **mean_of_parts(listed), "per_view": rows}
 
 
-def mean_of_parts(rows: Sequence[Mapping[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
+def mean_of_parts(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float]]:
     """Return the means of the views that have each part, and how many these are."""
     out = {}
     for name in PARTS:

@@ -18,7 +18,7 @@ from p2gs_jax.render.capacity import Room
 from p2gs_jax.render.project import LOG_SCALE_RANGE, TANGENT_LIMIT, at_time, camera_of_each
 from p2gs_jax.render.visible import in_view
 from p2gs_jax.train.inputs import TrainingViews
-from p2gs_jax.types import Camera, Gaussians
+from p2gs_jax.types import Array, Camera, Gaussians
 
 # Views of one size that are counted, evenly spread.
 SAMPLED_VIEWS = 32
@@ -108,10 +108,10 @@ def allocate(
     views: TrainingViews,
     shrinks: Iterable[int],
     gaussians: Gaussians,
-    alive: Bool[np.ndarray, " n"],
+    alive: Bool[Array, " n"],
     limit: int,
     cfg: RenderConfig,
-    owner: Int[np.ndarray, " n"] | None = None,
+    owner: Int[Array, " n"] | None = None,
 ) -> Rooms:
     """Return rooms for every image size to come.
 
