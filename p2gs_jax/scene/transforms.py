@@ -29,13 +29,12 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.core.atomic import BROKEN_ARRAYS
 from p2gs_jax.errors import broken
 from p2gs_jax.scene import files
-from p2gs_jax.scene.axes import require_axes, share_in_view
 from p2gs_jax.scene.cameras import name_cameras, numbered
 from p2gs_jax.scene.colmap import IMAGE_FOLDERS
 from p2gs_jax.scene.files import at_file_size, require_inside
 from p2gs_jax.scene.lens import intrinsics, make_distortion
 from p2gs_jax.scene.masks import image_folder_of
-from p2gs_jax.scene.rigid import nearest_rotation, off_origin
+from p2gs_jax.scene.rigid import nearest_rotation, off_origin, require_axes, share_in_view
 from p2gs_jax.scene.seeds import read_points
 from p2gs_jax.scene.split import lists_in, split_as_listed
 from p2gs_jax.types import Distortion, Scene, Split, View

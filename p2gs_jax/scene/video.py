@@ -316,17 +316,6 @@ def _keep(path: Path, cfg: DataConfig, folder: Path, report: Report) -> dict[str
         why = f"{len(kept)} of {seen} frames would be used; a scene needs several, taken from "
         fix = f"{_SHORT}, or take frames by number with --every"
         raise broken(f"{path}:", why + "different places.", fix)
-    records, transfers = _write(path, kept, folder, report)
-    if len(transfers) > 1 and None in transfers:
-        notes.append("The transfer function changes within the video: its curve is not known.")
-    known = None if None in transfers else ", ".join(_TRANSFER_NAMES[t] for t in sorted(transfers))  # type: ignore[index, type-var]
-    return {"known": known, "notes": notes, "frames": records}
-
-
-def _write(
-    path: Path, kept: list[int], folder: Path, report: Report
-) -> tuple[list[dict[str, Any]], set[str | None]]:
-    """Write frames as PNG; return a record of each, and their transfer functions."""
     records: list[dict[str, Any]] = []
     transfers: set[str | None] = set()
     for frame in frames_of(path):
@@ -340,7 +329,10 @@ def _write(
         records.append({"file": name, "frame": frame.number, "time": round(frame.time, 6)})
         if len(records) == len(kept):
             break
-    return records, transfers
+    if len(transfers) > 1 and None in transfers:
+        notes.append("The transfer function changes within the video: its curve is not known.")
+    known = None if None in transfers else ", ".join(_TRANSFER_NAMES[t] for t in sorted(transfers))  # type: ignore[index, type-var]
+    return {"known": known, "notes": notes, "frames": records}
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from scene.helpers import refused, reprojection_errors, write_image
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene import find_scene, load_scene
-from p2gs_jax.scene.axes import require_axes
 from p2gs_jax.scene.files import cached_folder, stage_progress
+from p2gs_jax.scene.rigid import require_axes
 from p2gs_jax.scene.sfm import features
 from p2gs_jax.scene.sfm.features import kept_features, match_kept, pairs_by_name, pairs_by_pose
 from p2gs_jax.scene.sfm.map import agreement, reasons, sentence

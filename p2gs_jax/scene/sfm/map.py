@@ -17,7 +17,6 @@ import pycolmap
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.errors import UserError, broken
-from p2gs_jax.scene.axes import require_axes
 from p2gs_jax.scene.cameras import parent_of
 from p2gs_jax.scene.colmap import load_colmap, read_model, tracks_of
 from p2gs_jax.scene.convert.readers import read_exif_camera
@@ -29,6 +28,7 @@ from p2gs_jax.scene.files import (
     stage_progress,
 )
 from p2gs_jax.scene.lens import undistort_points
+from p2gs_jax.scene.rigid import require_axes
 from p2gs_jax.scene.sfm import features
 from p2gs_jax.scene.sfm.features import opened, quiet_colmap
 from p2gs_jax.types import Scene, View
@@ -115,7 +115,18 @@ def _build(
     features.match_kept(database, names, features.pairs_by_name(names, cfg.matching), report)
     models_folder = folder / "models"
     models_folder.mkdir()
-    found = _map(database, image_folder, models_folder, len(names), report)
+    registered, progress = 2, stage_progress(report, "mapping", len(names), "images")
+
+    def on_next_image() -> None:
+        nonlocal registered
+        registered += 1
+        progress(registered)
+
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = 0
+    found = pycolmap.incremental_mapping(
+        database, image_folder, models_folder, options=options, next_image_callback=on_next_image
+    ).values()
     models = sorted(found, key=lambda m: (m.num_reg_images(), m.num_points3D()), reverse=True)
     why = reasons(database, names, models)
     if not models:
@@ -125,24 +136,6 @@ def _build(
     models[0].write(folder / "model")
     write_json(folder / ACCOUNT, why)
     shutil.rmtree(models_folder)
-
-
-def _map(
-    database: Path, image_folder: Path, output: Path, count: int, report: Report
-) -> list[pycolmap.Reconstruction]:
-    registered, progress = 2, stage_progress(report, "mapping", count, "images")
-
-    def on_next_image() -> None:
-        nonlocal registered
-        registered += 1
-        progress(registered)
-
-    options = pycolmap.IncrementalPipelineOptions()
-    options.random_seed = 0
-    models = pycolmap.incremental_mapping(
-        database, image_folder, output, options=options, next_image_callback=on_next_image
-    )
-    return list(models.values())
 
 
 def reasons(
