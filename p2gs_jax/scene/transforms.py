@@ -31,7 +31,7 @@ from p2gs_jax.errors import broken
 from p2gs_jax.scene import files
 from p2gs_jax.scene.cameras import name_cameras, numbered
 from p2gs_jax.scene.colmap import IMAGE_FOLDERS
-from p2gs_jax.scene.files import at_file_size, require_inside
+from p2gs_jax.scene.files import HUGE, at_file_size, require_inside
 from p2gs_jax.scene.lens import intrinsics, make_distortion
 from p2gs_jax.scene.masks import image_folder_of
 from p2gs_jax.scene.rigid import nearest_rotation, off_origin, require_axes, share_in_view
@@ -341,7 +341,7 @@ def _view(frame: _Frame, folder: Path, name: str) -> tuple[View, bool]:
         c2w = np.array(values.get("transform_matrix"), np.float64)[:3]
     except (TypeError, ValueError, IndexError):
         c2w = np.zeros(0)
-    if c2w.shape != (3, 4) or not (np.abs(c2w) < files.HUGE).all():
+    if c2w.shape != (3, 4) or not (np.abs(c2w) < HUGE).all():
         raise broken(f"{path}:", f"{what} is not a finite 4x4 matrix", _FIX)
     viewmat = _viewmat(c2w * _OPENGL_SIGNS, path, what, _FIX)
     # Photographs of one lens are of one camera.
@@ -362,11 +362,7 @@ def _lens(
 
     def number(key: str, default: float) -> float:
         value = values.get(key, default)
-        if (
-            isinstance(value, bool)
-            or not isinstance(value, int | float)
-            or not abs(value) < files.HUGE
-        ):
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < HUGE:
             raise broken(f"{path}:", f"{key} of {name} is {value!r}, not a number", _FIX)
         return float(value)
 
