@@ -85,7 +85,9 @@ class Judge:
         self.scene, self.store, self.cfg = scene, store, cfg
         self.lpips_weights, self.reference = lpips_weights, reference
         # Small arrays stay on the host.
-        without = eqx.tree_at(lambda p: p.gaussians, params, None)
+        without = eqx.tree_at(
+            lambda p: p.gaussians, params, None, is_leaf=lambda leaf: leaf is None
+        )
         self.small: Params = jax.tree.map(np.asarray, without)
         self.mean = mean_parameters(self.small.photometry)
         self.taken_by = [view.camera for view in scene.training_views]
