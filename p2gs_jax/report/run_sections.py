@@ -167,7 +167,10 @@ def training_section(run: RunFiles) -> str:
 
     terms = sorted({name for r in log for name in r.get("terms") or {}})
     values = {n: v for n in terms if np.isfinite(v := over_steps("terms", n)).any()}
-    ranked = sorted(values, key=lambda n: -np.nanmedian(values[n]))[:MOST_TERMS]
+    size = {n: float(np.nanmedian(v)) for n, v in values.items()}
+    # What is as good as nothing would only stretch the axis.
+    large = [n for n in size if size[n] > 1e-3 * max(size.values())]
+    ranked = sorted(large, key=lambda n: -size[n])[:MOST_TERMS]
     losses = {"loss": over_steps("loss")} | {n.replace("_", " "): values[n] for n in ranked}
     losses = {n: np.where(v > 0, v, np.nan) for n, v in losses.items()}
     steps, psnr, gaussians = (over_steps(name) for name in ("step", "psnr", "gaussians"))
