@@ -85,15 +85,15 @@ def find_model(root: Path) -> Path | None:
 
 
 def find_deeper_model(root: Path) -> Path | None:
-    """Return a model up to three folders below a scene, as of `colmap/sparse/0`, or None."""
+    """Return a model up to four folders below a scene, as of `colmap/sparse/0`, or None."""
     return _largest(_first_below(root))
 
 
 def _first_below(root: Path) -> Path | None:
-    for depth in ("*", "*/*", "*/*/*"):
+    for depth in range(1, 5):
         found = [
             file.parent
-            for file in root.glob(f"{depth}/images.*")
+            for file in root.glob("*/" * depth + "images.*")
             if file.suffix in (".bin", ".txt") and file.with_stem("cameras").is_file()
         ]
         # Runs may lie below their scenes, and keep models of their own.
