@@ -39,7 +39,15 @@ UTM = np.array([451_234.5, 5_212_345.25, 300.0])
 
 @pytest.mark.parametrize(
     "place",
-    ["colmap/sparse/0", "dense/0/sparse", "distorted/sparse/0", "sparse/model", "sparse/1", "rec", "a/dense/sparse/0"],
+    [
+        "colmap/sparse/0",
+        "dense/0/sparse",
+        "distorted/sparse/0",
+        "sparse/model",
+        "sparse/1",
+        "rec",
+        "a/dense/sparse/0",
+    ],
 )
 def test_models_elsewhere_are_read(tmp_path, place):
     write_tiny_model(tmp_path)
