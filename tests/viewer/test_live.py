@@ -27,6 +27,7 @@ from p2gs_jax.viewer.session import BrowserSession
 from p2gs_jax.viewer.settings import (
     Settings,
     common_settings,
+    exposures_ev,
     display_of,
     settings_of_view,
 )
