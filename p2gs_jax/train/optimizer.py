@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from p2gs_jax.config import FitConfig
 from p2gs_jax.gaussians.population import grow
 from p2gs_jax.photometry.models import MODELS
-from p2gs_jax.types import Array, Gaussians, Params, Photometry, Vibration
+from p2gs_jax.types import Array, Gaussians, Params
 
 # Of a rate that warms up, what it starts from (PPISP: 0.01).
 WARMUP_START = 0.01
@@ -142,27 +142,20 @@ def learning_rates(
     # Colours gain by their full rates in long fits too (BUILD_NOTES, "Length").
     sh = jnp.full((bands, 1), o.sh_rest).at[0].set(o.sh_dc) * final
     gate = photometry_gate(progress, cfg)
-    varies, balance = MODELS[cfg.photometry.model], like.photometry.raw_white_balance
-    by_view = cfg.photometry.white_balance == "view"
+    varies = MODELS[cfg.photometry.model]
+    # In the order of the fields, not in their shapes.
+    of_gaussians = [means_rate(progress, rate, extent, cfg), o.quats * decay, o.scales * decay]
+    of_gaussians += [o.opacities * decay, sh]
+    if like.gaussians.vibration is not None:
+        of_gaussians += [o.velocities * decay, o.peaks * decay, o.lives * decay]
+    of_photometry = [o.exposures * gate * (varies.exposure == "view")]
+    of_photometry += [o.gammas * gate * (varies.gamma == "view")]
+    if like.photometry.raw_white_balance is not None:
+        of_photometry += [o.exposures * gate * (cfg.photometry.white_balance == "view")]
     return Params(
-        gaussians=Gaussians(
-            means=means_rate(progress, rate, extent, cfg),
-            quats=o.quats * decay,
-            log_scales=o.scales * decay,
-            opacity_logits=o.opacities * decay,
-            sh=sh,
-            vibration=None
-            if like.gaussians.vibration is None
-            else Vibration(o.velocities * decay, o.peaks * decay, o.lives * decay),
-        ),
-        photometry=Photometry(
-            o.exposures * gate * (varies.exposure == "view"),
-            o.gammas * gate * (varies.gamma == "view"),
-            like.photometry.parameterization,
-            None if balance is None else o.exposures * gate * by_view,
-            like.photometry.cameras,
-        ),
-        appearance=jax.tree.map(lambda _: appearance_rate(progress, cfg), like.appearance),
+        jax.tree.unflatten(jax.tree.structure(like.gaussians), of_gaussians),
+        jax.tree.unflatten(jax.tree.structure(like.photometry), of_photometry),
+        jax.tree.map(lambda _: appearance_rate(progress, cfg), like.appearance),
     )
 
 

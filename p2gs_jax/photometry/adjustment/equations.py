@@ -254,7 +254,9 @@ def summed(
 
 
 def over_all(
-    u: Unknowns, per_view: list[sp.csr_array], more: Float[np.ndarray, "n k"] | None
+    u: Unknowns,
+    per_view: Sequence[sp.csr_array | sp.csc_array],
+    more: Float[np.ndarray, "n k"] | None,
 ) -> sp.csr_array:
     """Return columns for all parameters: those of views, then those of k and c, if any."""
     parts = [*per_view]
