@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import namespace
@@ -29,7 +29,7 @@ from p2gs_jax.render.project import (
     view_radiance,
 )
 from p2gs_jax.render.xla_cpu import compiled_loop
-from p2gs_jax.types import Camera, Frustum, Gaussians, Splats2D
+from p2gs_jax.types import Array, Camera, Frustum, Gaussians, Splats2D
 
 # Pixels of slack for rounding.
 SLACK = 1.0
