@@ -196,7 +196,7 @@ def from_dict(values: Mapping[str, Any], kind: Any = FitConfig) -> Any:
     """Rebuild a configuration, or a record of one, from `to_dict`'s result.
 
     Raises:
-        TypeError: a field is unknown to this version.
+        TypeError: a field is unknown to this version, or a group of fields is not an object.
     """
     kinds = {f.name: f.default_factory for f in dataclasses.fields(kind)}
     unknown = sorted(set(values) - set(kinds))
@@ -204,6 +204,8 @@ def from_dict(values: Mapping[str, Any], kind: Any = FitConfig) -> Any:
         raise TypeError(f"unknown field(s) in {kind.__name__}: {', '.join(unknown)}")
     made = {}
     for name, value in values.items():
+        if dataclasses.is_dataclass(kinds[name]) != isinstance(value, dict):
+            raise TypeError(f"{kind.__name__}.{name} cannot be {value!r}")
         if isinstance(value, dict):
             value = from_dict(value, kinds[name])
         elif (kind, name) == (PhotometryConfig, "cameras"):

@@ -34,9 +34,11 @@ def on_device(values: ArrayLike, dtype: DTypeLike = np.float32) -> Array:
     return jax.device_put(np.asarray(values, dtype))
 
 
-def matmul(a: Values, b: Values) -> Values:
+def matmul(a: Array | np.ndarray, b: Array | np.ndarray) -> Any:
     """Return a @ b in full precision: GPUs would round float32 to three digits (TF32)."""
-    return a @ b if namespace(a, b) is np else jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)
+    if namespace(a, b) is np:
+        return a @ b
+    return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)
 
 
 def safe_log(x: Values, floor: float) -> Values:

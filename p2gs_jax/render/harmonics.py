@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, cast
 
 import jax
 import jax.numpy as jnp
@@ -124,7 +124,7 @@ def evaluate(
             c if d == 0 else jnp.where(active_degree >= d, c, 0.0)
             for d, c in zip(degrees, columns, strict=True)
         ]
-    return _combine(stack_columns(columns), sh)
+    return _combine(stack_columns(cast(list[Array], columns)), sh)
 
 
 def radiance_activation(value: Values, kind: RadianceKind) -> Values:

@@ -7,7 +7,7 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -71,7 +71,7 @@ def write_summary(
     heights = (3 * width * aspect + 0.5, PLOT)
     size = (columns * width + 1.3, sum(heights))
     figure = Figure(figsize=size, dpi=110, layout="constrained")
-    above, below = np.ravel(figure.subfigures(2, 1, height_ratios=heights))
+    above, below = cast(np.ndarray, figure.subfigures(2, 1, height_ratios=heights))
     axes = above.subplots(3, columns, squeeze=False)
     for r, images in enumerate(pictures):
         axes[r, 0].set_ylabel(ROWS[r], fontsize=TEXT_SIZE, rotation=0, ha="right", va="center")

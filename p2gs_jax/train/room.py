@@ -119,12 +119,13 @@ def allocate(
     where they suffice. `limit` is the largest population to come; for the rest see `count_view`.
     """
     found = dict(rooms)
-    gaussians, alive, owner = jax.tree.map(np.asarray, (gaussians, alive, owner))
+    gaussians, host_alive = jax.tree.map(np.asarray, (gaussians, alive))
+    host_owner = None if owner is None else np.asarray(owner)
     for shrink in shrinks:
         for size, cameras in cameras_by_size(views, shrink).items():
             name = size_name(size)
             if name not in found:
-                room = room_for(gaussians, alive, cameras, limit, cfg, owner)
+                room = room_for(gaussians, host_alive, cameras, limit, cfg, host_owner)
                 made = begun.get(name, room)
                 found[name] = made if made.holds(room) else room
     return _sharing_visible(found)

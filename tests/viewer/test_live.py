@@ -27,8 +27,8 @@ from p2gs_jax.viewer.session import BrowserSession
 from p2gs_jax.viewer.settings import (
     Settings,
     common_settings,
-    exposures_ev,
     display_of,
+    exposures_ev,
     settings_of_view,
 )
 from p2gs_jax.viewer.viewed_run import ViewedRun

@@ -228,8 +228,9 @@ def with_alpha_of(value: int) -> Callable[[Path], None]:
         scenes.write_colmap(root)
         for name in NAMES:
             path = root / "images" / name
-            pixels = cv2.imread(str(path))
-            cv2.imwrite(str(path), np.dstack([pixels, np.full(pixels.shape[:2], value, np.uint8)]))
+            pixels = np.asarray(Image.open(path).convert("RGBA")).copy()
+            pixels[..., 3] = value
+            Image.fromarray(pixels).save(path, "PNG")
 
     return make
 

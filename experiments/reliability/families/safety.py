@@ -77,7 +77,7 @@ def _viewer() -> Iterator[Trial]:
         "outside, empty token": (True, "/?token=", {}, False),
         "outside, wrong token": (True, "/?token=secreT", {}, False),
         "outside, token": (True, f"/?token={SECRET}", {}, True),
-        "outside, cookie": (True, "/", {"Cookie": f"p2gs_jax_token={SECRET}"}, True),
+        "outside, cookie": (True, "/", {"Cookie": f"p2gs_jax_token_{{port}}={SECRET}"}, True),
         "outside, token and another site": (
             *(True, f"/?token={SECRET}", {"Origin": "http://evil.example"}, False),
         ),
@@ -97,8 +97,9 @@ def _asks(outside: bool, path: str, headers: dict[str, str], served: bool) -> Ca
         guard = Guard(None, SECRET) if outside else guard_of(LOOPBACK)
         with guarded(guard):
             server = viser.ViserServer(host=LOOPBACK, port=0, verbose=False)
-        own = f"{LOOPBACK}:{server.get_port()}"
-        sent = {key: value.format(own=own) for key, value in headers.items()}
+        port = server.get_port()
+        own = f"{LOOPBACK}:{port}"
+        sent = {key: value.format(own=own, port=port) for key, value in headers.items()}
         request = urllib.request.Request(f"http://{own}{path}", headers=sent)
         try:
             with urllib.request.urlopen(request, timeout=20) as answer:
