@@ -139,9 +139,10 @@ def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
     model = read_model(folder)
     _check_model(model)
     images = sorted(model.images, key=lambda image: image.name)
-    place = image_folder(root, cfg) or _find_images(root, model)
-    for image in images:
-        require_inside(PurePosixPath(image.name), place, model.file("images"))
+    place = image_folder(root, cfg)
+    for image in images:  # before any of these files is opened
+        require_inside(PurePosixPath(image.name), place or root / "images", model.file("images"))
+    place = place or _find_images(root, model)
     files = find_names([image.name for image in images], place)
     missing = [image.name for image in images if image.name not in files]
     source = model.file("images")
@@ -318,6 +319,11 @@ def read_model(folder: Path) -> Model:
     """
     files = {ext: [folder / f"{stem}.{ext}" for stem in _STEMS] for ext in ("bin", "txt")}
     absent = {ext: [p for p in paths if not p.is_file()] for ext, paths in files.items()}
+    other = next(
+        (p for p in [*files["bin"], *files["txt"]] if p.exists() and not p.is_file()), None
+    )
+    if other is not None:
+        raise broken(other, "is not a file", _FIX_FILES)
     whole = [ext for ext in files if {*absent[ext]} <= {files[ext][2]}]
     if not whole:
         ext = "txt" if (folder / "cameras.txt").is_file() else "bin"

@@ -1,5 +1,7 @@
 """COLMAP models, binary and text: against pycolmap, and broken copies."""
 
+import os
+
 import numpy as np
 import pycolmap
 import pytest
@@ -75,6 +77,9 @@ def test_damaged_binary_names_the_file(shared_data, tmp_path, stem):
     if stem != "points3D":
         with refused(f"{stem}.bin does not exist"):
             load_scene(tmp_path, CFG)
+    os.mkfifo(file)
+    with refused(f"{stem}.bin is not a file"):
+        load_scene(tmp_path, CFG)
 
 
 def test_tiny_model_and_names_with_blanks(tmp_path):
