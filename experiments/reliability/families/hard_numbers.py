@@ -107,7 +107,9 @@ CASES: dict[str, Case] = {
     "millimetres": Case(Made(scale=1e-3), least_db=DOTS),
     "units of a kilometre": Case(Made(scale=1e3), least_db=DOTS),
     "scale 1e-6": Case(Made(scale=1e-6), least_db=DOTS),
-    "10^6 m from the origin": Case(Made(origin=(1e6, -1e6, 0)), says=("from the origin",)),
+    "10^6 m from the origin": Case(
+        Made(origin=(1e6, -1e6, 0)), says=("relative to",), least_db=DOTS
+    ),
     "two views": Case(Made(views=2), options={"data.test_every": 0}, least_db=10.0),
     "one Gaussian": Case(Made(), options={"densify.max_gaussians": 1}, says=("thinned to 1",)),
     "one point": Case(Made(points=1)),
