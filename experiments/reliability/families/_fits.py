@@ -129,7 +129,8 @@ def lines(run: Path) -> int:
 def content(run: Path) -> tuple:
     """Return what a run promises to repeat: log without times, Gaussians, photometry, scores."""
     log = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
-    timeless = [{k: v for k, v in r.items() if k not in ("seconds", "step_seconds")} for r in log]
+    times = ("seconds", "step_seconds", "left_s")
+    timeless = [{k: v for k, v in r.items() if k not in times} for r in log]
     metrics = json.loads((run / "metrics.json").read_text())
     return (
         timeless,
