@@ -250,6 +250,7 @@ def test_broken_or_foreign_owners_are_said(run, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 def test_rigid_beats_mask_inside_the_box_and_equals_it_elsewhere(folder, tmp_path):
     # With 3,000 the box's 700 are missing elsewhere, which costs .7 of 44 dB.
     longer = {"train.steps": 400, "train.log_every": 10, "densify.max_gaussians": 6000}
