@@ -30,14 +30,15 @@ def name_cameras(views: Sequence[View], by: CameraBy) -> tuple[View, ...]:
     and lens by EXIF. Where hardly any of these took two photographs, as in models that have a
     camera for each, they do not count.
     """
-    told, nothing = (_shared if by == "auto" else lambda keys, _: keys), [""] * len(views)
-    folders, models, devices = nothing, nothing, nothing
+    folders = models = devices = [""] * len(views)
     if by in ("auto", "folder"):
         folders = [parent_of(view.name) for view in views]
     if by in ("auto", "model"):
-        models = told([view.camera for view in views], folders)
+        models = [view.camera for view in views]
     if by in ("auto", "exif"):
-        devices = told([read_exif_camera(view.image_path) for view in views], folders)
+        devices = [read_exif_camera(view.image_path) for view in views]
+    if by == "auto":
+        models, devices = _shared(models, folders), _shared(devices, folders)
     named = devices if by == "exif" else models
     bases = [folder or name or "0" for folder, name in zip(folders, named, strict=True)]
     keys = list(zip(models, devices, strict=True))

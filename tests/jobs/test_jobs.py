@@ -38,6 +38,10 @@ def jobs_of(root, **todo):
     return [Job(name, root / name, count, arguments) for name, arguments in todo.items()]
 
 
+def note_end(ended):
+    return lambda number, state: ended.update({state.name: state.status})
+
+
 def test_one_that_fails_leaves_its_reason_and_ends_nothing_else(tmp_path):
     jobs = jobs_of(
         tmp_path,
@@ -117,13 +121,7 @@ def test_what_is_stopped_ends_and_the_same_call_goes_on(tmp_path):
         pytest.raises(KeyboardInterrupt),
         open_engine("local", 1, tmp_path) as engine,
     ):
-        run_jobs(
-            jobs,
-            engine,
-            tmp_path / "jobs",
-            on_end=lambda number, state: ended.update({state.name: state.status}),
-            on_look=interrupt,
-        )
+        run_jobs(jobs, engine, tmp_path / "jobs", on_end=note_end(ended), on_look=interrupt)
     assert ended == {"running": "stopped", "waiting": "stopped"}
     assert not list(tmp_path.rglob(REASON))
     assert not (tmp_path / "waiting").exists()
@@ -158,13 +156,7 @@ def test_what_a_batch_system_has_not_begun_is_taken_out_of_its_queue(tmp_path):
 
     jobs, cluster, ended = jobs_of(tmp_path, one={}, two={}), Cluster(), {}
     with pytest.raises(KeyboardInterrupt), engines._Submitit(cluster) as engine:
-        run_jobs(
-            jobs,
-            engine,
-            tmp_path / "jobs",
-            on_end=lambda number, state: ended.update({state.name: state.status}),
-            on_look=interrupt,
-        )
+        run_jobs(jobs, engine, tmp_path / "jobs", on_end=note_end(ended), on_look=interrupt)
     assert ended == {"one": "stopped", "two": "stopped"}
     assert cluster.cancelled == 2
 
