@@ -33,6 +33,7 @@ from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import KEY, Decisions
 from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.run.write import write_start
+from p2gs_jax.scene.pixels import cache
 from p2gs_jax.scene.pixels import store as held
 
 
@@ -212,7 +213,8 @@ def test_a_fit_from_files_is_the_same(finished_run, tmp_path, run_command, monke
         decoded.update((view.name, size) for size in sizes)
         return plain(view, sizes)
 
-    monkeypatch.setattr(held, "decode", counted)
+    for module in (held, cache):  # who asks, and who decodes ahead
+        monkeypatch.setattr(module, "decode", counted)
     run, scene = tmp_path / "run", finished_run.parent / "scene"
     code, said = run_command("fit", scene, "--out", run, *FIT, "--data.cache-mb", "0")
     assert code == 0, said

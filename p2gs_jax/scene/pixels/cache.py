@@ -37,13 +37,17 @@ class Key(NamedTuple):
 
 
 class PixelFiles:
-    """Files of decoded photographs in `folder`. All methods may be called from any thread."""
+    """Files of decoded photographs in `folder`. All methods may be called from any thread.
+
+    Who looks for a photograph in order to decode it holds its view's lock: nobody decodes it twice.
+    """
 
     def __init__(self, folder: Path, views: Sequence[View]):
         """Open a folder, and remove what none of the photographs can use."""
         self.folder = folder
         bonnets: dict[int, str] = {}
         self._names = tuple(_digest(view, bonnets) for view in views)
+        self.locks = tuple(threading.Lock() for _ in views)
         known = {f"{name}.px" for name in self._names}
         # Those that were being written when a run was killed have other names, too.
         for path in folder.glob("*/*"):
@@ -162,8 +166,8 @@ def _decode(jobs: list[tuple[View, Sequence[Key]]], files: PixelFiles) -> None:
             view, keys = jobs.pop()
         except IndexError:
             return
-        lacking = [key for key in keys if not files.path(key).exists()]
-        with contextlib.suppress(UserError):
+        with contextlib.suppress(UserError), files.locks[keys[0].view]:
+            lacking = [key for key in keys if not files.path(key).exists()]
             found = decode(view, [key[1:] for key in lacking]) if lacking else []
             for key, photograph in zip(lacking, found, strict=True):
                 files.write(key, photograph)

@@ -288,12 +288,14 @@ class _DecodedPhotographs:
             self._bytes = 0
 
     def _load(self, key: Key) -> Decoded:
-        entry = None if self._files is None else self._files.read(key)
-        decoded = entry is None
-        if entry is None:
-            (entry,) = decode(self.views[key.view], [(key.width, key.height)])
-            if self._files is not None:
-                entry = self._files.write(key, entry)
+        files = self._files
+        with contextlib.nullcontext() if files is None else files.locks[key.view]:
+            entry = None if files is None else files.read(key)
+            decoded = entry is None
+            if entry is None:
+                (entry,) = decode(self.views[key.view], [(key.width, key.height)])
+                if files is not None:
+                    entry = files.write(key, entry)
         with self._lock:
             self.decodings += decoded
             if key not in self._cache:
