@@ -213,8 +213,8 @@ def test_a_fit_from_files_is_the_same(finished_run, tmp_path, run_command, monke
         decoded.update((view.name, size) for size in sizes)
         return plain(view, sizes)
 
-    for module in (held, cache):  # who asks, and who decodes ahead
-        monkeypatch.setattr(module, "decode", counted)
+    for place in (held, cache):  # who asks, and who decodes ahead
+        monkeypatch.setattr(place, "decode", counted)
     run, scene = tmp_path / "run", finished_run.parent / "scene"
     code, said = run_command("fit", scene, "--out", run, *FIT, "--data.cache-mb", "0")
     assert code == 0, said
