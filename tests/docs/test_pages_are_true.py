@@ -1,11 +1,11 @@
-"""Pages that list things list all of them, and nothing else."""
+"""Pages that list things list all of them, links lead somewhere, licences are those installed."""
 
 import importlib
 import json
 import re
 
 import pytest
-from pages import ROOT
+from pages import PAGES, ROOT, anchors, links
 
 from p2gs_jax.evaluation.scores import PROTOCOLS
 
@@ -24,10 +24,10 @@ def test_files_page_knows_what_a_run_folder_holds(finished_run):
     assert not missing, "docs/files.md does not speak of them"
 
 
-PAGES = [ROOT / "CONTRIBUTING.md", ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
+NAMING = [ROOT / "CONTRIBUTING.md", ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+@pytest.mark.parametrize("page", NAMING, ids=lambda page: str(page.relative_to(ROOT)))
 def test_pages_name_modules_and_what_they_hold(page):
     """`folder/file.py:name`, relative to the package but for tests and experiments."""
     found = re.findall(r"`((?:\w+/)*\w+\.py)(?::([\w.]+))?`", page.read_text(encoding="utf-8"))
@@ -83,3 +83,51 @@ def test_drawings_are_what_their_script_draws(tmp_path, monkeypatch):
         drawing().save(tmp_path / name)
         drawn, kept = (tmp_path / name).read_text(), (DOCS / "images" / f"{name}.svg").read_text()
         assert drawn == kept, "run `python docs/images/draw.py`"
+
+
+LINKED = [*PAGES, ROOT / "BUILD_NOTES.md", *sorted((ROOT / "experiments").rglob("*.md"))]
+
+
+@pytest.mark.parametrize("page", LINKED, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_resolve(page):
+    for target in links(page):
+        path, _, anchor = target.partition("#")
+        found = (page.parent / path).resolve() if path else page
+        assert found.exists(), f"{page.name} links to {target}, which is not there"
+        if anchor:
+            assert anchor in anchors(found), f"{found.name} has no heading for #{anchor}"
+
+
+@pytest.mark.parametrize("folder", ["docs", "experiments/results"])
+def test_the_index_leads_to_every_page(folder):
+    index = ROOT / folder / "README.md"
+    reached = {(index.parent / target.partition("#")[0]).resolve() for target in links(index)}
+    missing = set((ROOT / folder).rglob("*.md")) - reached - {index}
+    assert not missing, f"{index} does not lead to them"
+
+
+@pytest.fixture
+def licences(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    return importlib.import_module("licences")
+
+
+def test_the_page_is_what_its_script_writes(licences):
+    text = licences.PAGE.read_text(encoding="utf-8")
+    assert text == licences.page(), "run python docs/licences.py"
+    assert all(f"| {name} |" in text for name in licences.declared())
+
+
+def test_nothing_that_users_install_is_under_the_gpl_and_what_carries_it_is_named(licences):
+    rows = licences.rows()
+    assert [name for name, (_, said, _) in rows.items() if licences.is_gpl(said)] == []
+    marked = {name for name, (_, _, carried) in rows.items() if licences.is_gpl(carried)}
+    assert marked == set(licences.WHY)
+    assert licences.is_gpl("GNU General Public License v3 (GPLv3+)")
+    assert not licences.is_gpl("GNU Lesser General Public License")
+
+
+def test_the_program_imports_nothing_of_the_tests():
+    imported = re.compile(r"^\s*(?:from|import) plyfile\b", re.MULTILINE)
+    for path in (ROOT / "p2gs_jax").rglob("*.py"):
+        assert not imported.search(path.read_text(encoding="utf-8")), path

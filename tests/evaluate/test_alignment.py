@@ -7,12 +7,7 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import PhotometryConfig
-from p2gs_jax.evaluation.alignment import (
-    error_of_views,
-    exposure_error,
-    fit_capture,
-    fit_exposure,
-)
+from p2gs_jax.evaluation import alignment
 from p2gs_jax.evaluation.scores import psnr
 from p2gs_jax.photometry.formation import display, formation
 from p2gs_jax.types import Capture
@@ -22,26 +17,26 @@ USUAL = Capture(jnp.float32(1.0), jnp.float32(2.2))
 
 def test_exposure_error_ignores_scale_and_reports_power():
     e = np.exp(np.random.default_rng(0).normal(0, 0.5, 20))
-    error = exposure_error(3 * e, e)
+    error = alignment.exposure_error(3 * e, e)
     assert error["ev"] == pytest.approx(0, abs=1e-12)
-    bent = exposure_error(2 * e**0.8, e)
+    bent = alignment.exposure_error(2 * e**0.8, e)
     assert bent["ev"] > 0.05
     assert bent["ev_scale_power"] == pytest.approx(0, abs=1e-9)
     assert bent["power"] == pytest.approx(1 / 0.8)
     one_off = e.copy()
     one_off[3] *= 2
-    assert exposure_error(one_off, e)["ev_max"] == pytest.approx(0.95, abs=0.01)
+    assert alignment.exposure_error(one_off, e)["ev_max"] == pytest.approx(0.95, abs=0.01)
     with pytest.raises(ValueError, match="positive"):
-        exposure_error(np.array([1.0, 0.0]), e[:2])
+        alignment.exposure_error(np.array([1.0, 0.0]), e[:2])
 
 
 def test_views_without_a_truth_are_left_out():
     found = [1.0, 2.0, 4.0, None, 8.0, 16.0]
     views = [{"image": f"{k}.png", "exposure": e} for k, e in enumerate(found)]
     truth = {"0.png": 3.0, "1.png": 6.0, "2.png": 12.0, "3.png": 9.0, "4.png": 0.0}
-    assert error_of_views(views, truth)["ev"] == pytest.approx(0, abs=1e-12)
-    assert error_of_views(views, {"0.png": 3.0, "3.png": 1.0}) is None
-    assert error_of_views(views, {}) is None
+    assert alignment.error_of_views(views, truth)["ev"] == pytest.approx(0, abs=1e-12)
+    assert alignment.error_of_views(views, {"0.png": 3.0, "3.png": 1.0}) is None
+    assert alignment.error_of_views(views, {}) is None
 
 
 def light(seed=0):
@@ -56,7 +51,7 @@ def test_fit_exposure_finds_the_exposure(true, curve):
     cfg, linear = PhotometryConfig(curve=curve), light()
     photo = display(formation(linear, USUAL, cfg)).at[:4].set(1.0)
     mask = jnp.ones((20, 30)).at[:4].set(0.0)
-    found = fit_exposure(linear / true, photo, mask, USUAL, cfg)
+    found = alignment.fit_exposure(linear / true, photo, mask, USUAL, cfg)
     assert float(found) == pytest.approx(true, rel=2e-3)
 
 
@@ -79,8 +74,8 @@ def test_exposure_gamma_and_white_balance_are_found_together(true, gamma, balanc
     mask = jnp.ones((20, 30)).at[:4].set(0.0)
     photo = display(formation(linear, true, cfg)).at[:4].set(1.0)
     start = replace(USUAL, white_balance=given)
-    start = replace(start, exposure=fit_exposure(linear, photo, mask, start, cfg))
-    found = fit_capture(linear, photo, mask, start, cfg, **asked)
+    start = replace(start, exposure=alignment.fit_exposure(linear, photo, mask, start, cfg))
+    found = alignment.fit_capture(linear, photo, mask, start, cfg, **asked)
     assert float(found.exposure) == pytest.approx(float(true.exposure), rel=5e-3)
     assert float(found.gamma) == pytest.approx(float(true.gamma), rel=5e-3)
     if balance is None:

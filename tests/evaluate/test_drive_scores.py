@@ -10,22 +10,13 @@ from splats import random_splats
 
 from p2gs_jax.config import DataConfig, FitConfig
 from p2gs_jax.core.atomic import plain
-from p2gs_jax.evaluation import seams
-from p2gs_jax.evaluation.drives import (
-    Surface,
-    at_time,
-    depth_errors,
-    picked,
-    shifted,
-    summary,
-    unseen_share,
-)
+from p2gs_jax.evaluation import drives
 from p2gs_jax.evaluation.evaluate import evaluate
 from p2gs_jax.evaluation.passes import StoredArray
 from p2gs_jax.evaluation.scores import mean_of_parts, parts_of, region_scores
 from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.pixels.store import ImageStore
-from p2gs_jax.scene.rigid import headings, left_of_way, moment_of, up_of_drive
+from p2gs_jax.scene.rigid import headings
 from p2gs_jax.scene.split import assign_split
 from p2gs_jax.types import Lidar, Params, Photometry, Render, View
 
@@ -118,11 +109,11 @@ def test_points_on_moving_boxes_go_along(scene):
     lidar = scene.lidar
     rows = np.flatnonzero((lidar.objects >= 0) & (np.abs(lidar.times - 0.2) < 1e-6))
     assert len(rows) > 20
-    later = at_time(lidar, scene.objects, rows, 0.25)
+    later = drives.at_time(lidar, scene.objects, rows, 0.25)
     np.testing.assert_allclose(later - lidar.points[rows], [[1.5 * SPEED * 0.05, 0, 0]] * len(rows),
                                atol=1e-4)  # fmt: skip
     still = np.flatnonzero(lidar.objects < 0)[:10]
-    np.testing.assert_array_equal(at_time(lidar, (), still, 9.0), lidar.points[still])
+    np.testing.assert_array_equal(drives.at_time(lidar, (), still, 9.0), lidar.points[still])
 
 
 def test_what_shows_no_surface_is_infinitely_wrong():
@@ -131,17 +122,17 @@ def test_what_shows_no_surface_is_infinitely_wrong():
     K = np.array([[10.0, 0, 8], [0, 10, 6], [0, 0, 1]], np.float32)
     view = View("a", None, "a", np.eye(4, dtype=np.float32), K, 16, 12, time=0.01)
     nothing = np.zeros((12, 16), np.float32)
-    found = depth_errors(lidar, (), view, nothing, nothing)
+    found = drives.depth_errors(lidar, (), view, nothing, nothing)
     assert np.isinf(found.error).all()
-    assert summary([found])["static"]["missing"] == 1.0
-    right = depth_errors(lidar, (), view, nothing + 5.2, nothing + 1)
-    assert summary([right])["static"]["median_m"] == pytest.approx(0.2, abs=1e-5)
-    assert summary([right])["static"]["median_relative"] == pytest.approx(0.04, abs=1e-5)
+    assert drives.summary([found])["static"]["missing"] == 1.0
+    right = drives.depth_errors(lidar, (), view, nothing + 5.2, nothing + 1)
+    assert drives.summary([right])["static"]["median_m"] == pytest.approx(0.2, abs=1e-5)
+    assert drives.summary([right])["static"]["median_relative"] == pytest.approx(0.04, abs=1e-5)
     assert not len(
-        depth_errors(lidar, (), dataclasses.replace(view, time=1.0), nothing, nothing)[0]
+        drives.depth_errors(lidar, (), dataclasses.replace(view, time=1.0), nothing, nothing)[0]
     )
-    assert summary([]) == {}
-    masked = depth_errors(lidar, (), view, nothing, nothing, nothing)
+    assert drives.summary([]) == {}
+    masked = drives.depth_errors(lidar, (), view, nothing, nothing, nothing)
     assert not len(masked.error)
 
 
@@ -149,23 +140,23 @@ def plane(z=5.0, viewmat=None):
     K = np.array([[20.0, 0, 16], [0, 20, 12], [0, 0, 1]])
     depth = np.full((24, 32), z, np.float32)
     depth = StoredArray(depth, depth.shape)
-    return Surface(depth, np.eye(4) if viewmat is None else viewmat, K)
+    return drives.Surface(depth, np.eye(4) if viewmat is None else viewmat, K)
 
 
 def test_unseen_is_what_no_other_view_shows():
-    assert unseen_share(plane(), [plane()]) == 0.0
-    assert unseen_share(plane(), []) == 1.0
+    assert drives.unseen_share(plane(), [plane()]) == 0.0
+    assert drives.unseen_share(plane(), []) == 1.0
     # A wall 5 away is 8 wide in this view: moved by 2, a quarter is new.
-    moved = shifted(np.eye(4), np.array([-1.0, 0, 0]), 2.0)
-    assert unseen_share(plane(viewmat=moved), [plane()]) == pytest.approx(0.25, abs=0.05)
+    moved = drives.shifted(np.eye(4), np.array([-1.0, 0, 0]), 2.0)
+    assert drives.unseen_share(plane(viewmat=moved), [plane()]) == pytest.approx(0.25, abs=0.05)
     # Nearer or farther than what is known: not seen.
-    assert unseen_share(plane(4.0), [plane(5.0)]) == 1.0
-    assert unseen_share(plane(6.0), [plane(5.0)]) == 1.0
+    assert drives.unseen_share(plane(4.0), [plane(5.0)]) == 1.0
+    assert drives.unseen_share(plane(6.0), [plane(5.0)]) == 1.0
     # Sky is seen where the other sees none either.
-    assert unseen_share(plane(0.0), [plane(0.0)]) == 0.0
-    assert unseen_share(plane(0.0), [plane(5.0)]) == 1.0
-    assert list(picked(3)) == [0, 1, 2]
-    assert list(picked(60, 3)) == [10, 30, 50]
+    assert drives.unseen_share(plane(0.0), [plane(0.0)]) == 0.0
+    assert drives.unseen_share(plane(0.0), [plane(5.0)]) == 1.0
+    assert list(drives.picked(3)) == [0, 1, 2]
+    assert list(drives.picked(60, 3)) == [10, 30, 50]
 
 
 def test_parts_with_too_few_pixels_are_left_out():
@@ -186,17 +177,6 @@ def test_parts_with_too_few_pixels_are_left_out():
     assert mean["moving"]["views"] == 1
 
 
-def test_left_is_left_of_the_way(scene):
-    viewmats = np.stack([view.viewmat for view in scene.views])
-    up = up_of_drive(viewmats, [view.camera for view in scene.views])
-    np.testing.assert_allclose(up, UP, atol=1e-6)
-    np.testing.assert_allclose(left_of_way(scene.views), [[0, 1, 0]] * len(scene.views), atol=1e-5)
-    viewmat = shifted(scene.views[0].viewmat, np.array([0, 1.0, 0]), 2.0)
-    moved = -viewmat[:3, :3].T @ viewmat[:3, 3]
-    before = scene.views[0].viewmat
-    np.testing.assert_allclose(moved + before[:3, :3].T @ before[:3, 3], [0, 2, 0], atol=1e-4)
-
-
 def test_a_car_that_stands_keeps_its_heading():
     there = np.array([[0.0, 0, 0]] * 5 + [[1.0, 0, 0], [2.0, 0, 0], [2.0, 1, 0.5], [2, 2, 1.0]])
     found = headings(there, UP, np.array([0.0, 1, 0]))
@@ -205,18 +185,3 @@ def test_a_car_that_stands_keeps_its_heading():
     assert found[-1] @ [0, 1, 0] > 0.9
     still = headings(np.zeros((3, 3)), UP, np.array([0.0, 2, 0]))
     np.testing.assert_allclose(still, [[0, 1, 0]] * 3)
-
-
-def test_cameras_are_paired_by_frame(tmp_path, monkeypatch):
-    # Few points are seen by both: the walls are sparse, and hide each other.
-    monkeypatch.setattr(seams, "FEWEST_SHARED", 1)
-    recording = make_recording(tmp_path, ("front", "front_left"))
-    scene = assemble(recording, DataConfig(own_car=False))
-    # Files of one moment have different names.
-    pairs = seams.neighbouring_pairs(scene, 100)
-    assert pairs
-    for a, b in pairs:
-        assert scene.views[a].frame == scene.views[b].frame
-        assert scene.views[a].camera != scene.views[b].camera
-    assert moment_of(scene.views[2]) == 2
-    assert moment_of(dataclasses.replace(scene.views[2], frame=None)) == "000200"

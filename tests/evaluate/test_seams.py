@@ -1,32 +1,23 @@
 """Seams on a scene that can be written down: a textured plane before two cameras."""
 
-import dataclasses
+import functools
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import splats
 
 from p2gs_jax.config import LossConfig, PhotometryConfig
-from p2gs_jax.evaluation.seams import (
-    Photographed,
-    camera_between,
-    measure_seam,
-    neighbouring_pairs,
-    seam_picture,
-)
+from p2gs_jax.evaluation import seams
 from p2gs_jax.photometry.display import DisplayTransform, develop
-from p2gs_jax.types import Camera, Render, Scene, Tracks, View
+from p2gs_jax.types import Render, Scene, Tracks, View
 
 SIZE, FOCAL, DEPTH = 64, 60.0, 4.0
 TONE = PhotometryConfig()
 COMMON = DisplayTransform(1.0, 2.2, TONE)
 
 
-def camera(x: float) -> Camera:
-    viewmat = np.eye(4, dtype=np.float32)
-    viewmat[0, 3] = -x
-    K = np.array([[FOCAL, 0, SIZE / 2], [0, FOCAL, SIZE / 2], [0, 0, 1]], np.float32)
-    return Camera(jnp.asarray(viewmat), jnp.asarray(K), SIZE, SIZE)
+camera = functools.partial(splats.camera, width=SIZE, height=SIZE, focal=FOCAL)
 
 
 def radiance(x: float) -> np.ndarray:
@@ -38,7 +29,7 @@ def radiance(x: float) -> np.ndarray:
 
 def photographed(x: float, exposure: float, gamma: float = 2.2, claimed: float | None = None):
     ldr = np.rint(255 * develop(radiance(x), DisplayTransform(exposure, gamma, TONE))) / 255
-    return Photographed(
+    return seams.Photographed(
         ldr.astype(np.float32),
         np.ones((SIZE, SIZE), np.float32),
         camera(x),
@@ -57,7 +48,9 @@ def photographed(x: float, exposure: float, gamma: float = 2.2, claimed: float |
     ids=["a stop", "a wrong exposure", "a gamma of its own"],
 )
 def test_what_was_done_to_light_goes_when_photographs_are_developed_alike(second, before, left):
-    found = measure_seam(photographed(0.0, 0.8), photographed(0.5, **second), COMMON, LossConfig())
+    found = seams.measure_seam(
+        photographed(0.0, 0.8), photographed(0.5, **second), COMMON, LossConfig()
+    )
     assert found is not None
     assert found.before_ev > 0.1
     if before is not None:
@@ -70,17 +63,17 @@ def test_what_was_done_to_light_goes_when_photographs_are_developed_alike(second
     # The plane moves by FOCAL * 0.5 / DEPTH = 7.5 pixels: the rest is common.
     assert found.pixels == pytest.approx((SIZE - 7.5) * SIZE, rel=0.02)
     apart = photographed(9.0, 1.0)
-    assert measure_seam(photographed(0.0, 1.0), apart, COMMON, LossConfig()) is None
+    assert seams.measure_seam(photographed(0.0, 1.0), apart, COMMON, LossConfig()) is None
 
 
 def test_saturated_masked_and_hidden_pixels_do_not_count():
     first, second = photographed(0.0, 1.0), photographed(0.0, 1.0)
-    full = measure_seam(first, second, COMMON, LossConfig())
+    full = seams.measure_seam(first, second, COMMON, LossConfig())
     assert full is not None
     assert full.pixels == SIZE * SIZE
     ldr, mask, depth = first.ldr.copy(), second.mask.copy(), second.depth.copy()
     ldr[:8], mask[16:24], depth[40:48] = 1.0, 0.0, 0.5
-    some = measure_seam(
+    some = seams.measure_seam(
         first._replace(ldr=ldr), second._replace(mask=mask, depth=depth), COMMON, LossConfig()
     )
     assert some is not None
@@ -96,9 +89,9 @@ def test_halves_lie_on_the_side_of_their_camera_and_match_when_developed_alike()
         return Render(black, ones, DEPTH * ones, jnp.int32(0), jnp.array(False), dead)
 
     # The second photograph reaches farther left.
-    picture = seam_picture(first, second, COMMON, render)
+    picture = seams.seam_picture(first, second, COMMON, render)
     assert not picture.left_first
-    assert np.array_equal(seam_picture(second, first, COMMON, render).before, picture.before)
+    assert np.array_equal(seams.seam_picture(second, first, COMMON, render).before, picture.before)
     middle = radiance(0.0)
     edge = SIZE // 2
     inner = slice(8, -8)
@@ -112,65 +105,51 @@ def test_halves_lie_on_the_side_of_their_camera_and_match_when_developed_alike()
 
 
 def test_halfway_turns_and_moves_half_as_far():
-    c, s = np.cos(0.8), np.sin(0.8)
-    turned = np.eye(4, dtype=np.float32)
-    turned[:3, :3] = [[c, 0, -s], [0, 1, 0], [s, 0, c]]
-    turned[:3, 3] = -turned[:3, :3] @ [2, 0, 0]
-    between = camera_between(
-        camera(0.0), dataclasses.replace(camera(0.0), viewmat=jnp.asarray(turned))
-    )
-    viewmat = np.asarray(between.viewmat)
+    viewmat = np.asarray(seams.camera_between(camera(0.0), camera(2.0, yaw=0.8)).viewmat)
     np.testing.assert_allclose(-viewmat[:3, :3].T @ viewmat[:3, 3], [1, 0, 0], atol=1e-5)
     assert np.arctan2(viewmat[2, 0], viewmat[0, 0]) == pytest.approx(0.4, abs=1e-5)
 
 
-def scene_of(names, cameras, seen, split=None):
-    """Views of which each sees the points listed for it, by its tracks."""
+RIG = ("a/0.png", "a/1.png", "b/0.png", "b/1.png", "c/0.png")
+ALONE = ("0.png", "1.png", "2.png", "3.png")
+OVERLAP = ((0, 100), (10, 110), (60, 160), (900, 910))
+
+
+@pytest.mark.parametrize(
+    ("names", "seen", "held_out", "most", "pairs"),
+    [
+        # A rig pairs cameras at the same time.
+        (RIG, [(0, 100)] * 4 + [(200, 300)], None, 9, [(0, 2), (1, 3)]),
+        (RIG, [(0, 100)] * 4 + [(200, 300)], None, 1, [(0, 2)]),
+        # Elsewhere views are paired with those that they share most with.
+        (ALONE, OVERLAP, None, 9, [(0, 1), (1, 2)]),
+        (ALONE, [(0, 100)] * 4, None, 9, [(0, 1), (1, 2), (2, 3)]),
+        (ALONE, OVERLAP, 1, 9, [(0, 2)]),
+    ],
+)
+def test_neighbours_are_those_of_a_moment_or_share_most_points(names, seen, held_out, most, pairs):
+    pose, K = np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32)
+    splits = ["test" if row == held_out else "train" for row in range(len(names))]
     views = tuple(
-        View(name, None, cam, np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32), 8, 8)
-        for name, cam in zip(names, cameras, strict=True)
+        View(name, None, name.rpartition("/")[0], pose, K, 8, 8, split=split)
+        for name, split in zip(names, splits, strict=True)
     )
-    if split:
-        views = tuple(dataclasses.replace(v, split=s) for v, s in zip(views, split, strict=True))
-    rows = np.concatenate([np.full(len(points), i) for i, points in enumerate(seen)])
-    tracks = Tracks(rows, np.concatenate(seen).astype(int), np.zeros((len(rows), 2), np.float32))
-    count = 1 + max(map(max, seen))
-    colors = np.zeros((count, 3), np.uint8)
-    return Scene(None, "test", views, np.zeros((count, 3), np.float32), colors, tracks)
-
-
-def test_a_rig_pairs_cameras_at_the_same_time():
-    near, far = np.arange(0, 100), np.arange(200, 300)
-    names = ["a/0.png", "a/1.png", "b/0.png", "b/1.png", "c/0.png"]
-    scene = scene_of(names, list("aabbc"), [near, near, near, near, far])
-    assert neighbouring_pairs(scene, 9) == [(0, 2), (1, 3)]
-    assert neighbouring_pairs(scene, 1) == [(0, 2)]
-
-
-def test_elsewhere_views_are_paired_with_those_they_share_most_with():
-    seen = [np.arange(0, 100), np.arange(10, 110), np.arange(60, 160), np.arange(900, 910)]
-    scene = scene_of(["0.png", "1.png", "2.png", "3.png"], ["x"] * 4, seen)
-    assert neighbouring_pairs(scene, 9) == [(0, 1), (1, 2)]
-    alike = scene_of(["0.png", "1.png", "2.png", "3.png"], ["x"] * 4, [np.arange(100)] * 4)
-    assert neighbouring_pairs(alike, 9) == [(0, 1), (1, 2), (2, 3)]
-    held_out = scene_of(
-        ["0.png", "1.png", "2.png", "3.png"], ["x"] * 4, seen, ["train", "test", "train", "train"]
-    )
-    assert neighbouring_pairs(held_out, 9) == [(0, 2)]
+    rows = np.concatenate([np.full(end - start, i) for i, (start, end) in enumerate(seen)])
+    points = np.concatenate([np.arange(*ends) for ends in seen])
+    tracks = Tracks(rows, points, np.zeros((len(rows), 2), np.float32))
+    place = np.zeros((1000, 3), np.float32)
+    scene = Scene(None, "test", views, place, place.astype(np.uint8), tracks)
+    assert seams.neighbouring_pairs(scene, most) == pairs
 
 
 def test_without_tracks_points_are_projected():
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.uniform(-1, 1, (400, 2)), np.full((400, 1), 5.0)], 1)
-    K = np.array([[60, 0, 32], [0, 60, 32], [0, 0, 1]], np.float32)
-
-    def view(name, x):
-        viewmat = np.eye(4, dtype=np.float32)
-        viewmat[0, 3] = -x
-        return View(name, None, "x", viewmat, K, 64, 64)
-
-    views = (view("0.png", 0.0), view("1.png", 3.65), view("2.png", 0.3))
-    colors = np.zeros((400, 3), np.uint8)
-    scene = Scene(None, "test", views, points.astype(np.float32), colors)
-    assert (0, 2) in neighbouring_pairs(scene, 9)
-    assert (0, 1) not in neighbouring_pairs(scene, 9)
+    seen = [camera(x) for x in (0.0, 3.65, 0.3)]
+    views = tuple(
+        View(f"{k}.png", None, "x", np.asarray(c.viewmat), np.asarray(c.K), SIZE, SIZE)
+        for k, c in enumerate(seen)
+    )
+    scene = Scene(None, "test", views, points.astype(np.float32), np.zeros((400, 3), np.uint8))
+    assert (0, 2) in seams.neighbouring_pairs(scene, 9)
+    assert (0, 1) not in seams.neighbouring_pairs(scene, 9)

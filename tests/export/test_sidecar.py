@@ -1,13 +1,13 @@
 """A foreign program can render from `linear.ply` and `linear.json` alone."""
 
 import json
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from plyfile import PlyData
 from splats import random_splats
+from tiny_scene import noise_scene
 
 from p2gs_jax.config import DataConfig, FitConfig, PhotometryConfig, RenderConfig
 from p2gs_jax.core.atomic import write_json
@@ -17,7 +17,6 @@ from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.response import FREE, KNOTS
 from p2gs_jax.render.harmonics import evaluate, radiance_activation
 from p2gs_jax.scene.pixels.store import ImageStore
-from p2gs_jax.types import Scene, View
 
 ROW = {"camera": "0", "exif_ev": None}
 VIEWS = [
@@ -30,30 +29,17 @@ SPLINE = tuple(np.where(np.isin(np.arange(len(KNOTS)), FREE), 0.05, 0.0))
 def sidecar(folder, *, activation="exp", degree=3, **photometry):
     """Write both files; return the JSON as read and the Gaussians."""
     g = random_splats(degree=degree)
-    K = np.array([[50, 0, 20], [0, 50, 15], [0, 0, 1]], np.float32)
-    views = tuple(
-        View(v["image"], Path(v["image"]), "0", np.eye(4, dtype=np.float32), K, 40, 30)
-        for v in VIEWS
-    )
-    empty = np.zeros((0, 3))
-    scene = Scene(folder, "colmap", views, empty.astype(np.float32), empty.astype(np.uint8))
-    cfg = FitConfig(
-        render=RenderConfig(radiance=activation), photometry=PhotometryConfig(**photometry)
-    )
-    content = linear_sidecar(
-        g,
-        cfg,
-        scene,
-        ImageStore(views, DataConfig(max_width=20)),
-        {
-            "model": "view_exposure_gamma",
-            "curve": {"name": cfg.photometry.curve, "pivot": cfg.photometry.pivot, "spline": None},
-            "gauge": "in words",
-            "mean": {"exposure": 2.0, "exposure_geometric": 2.0, "gamma": 2.4},
-            "views": [{**ROW, **v, "exposure_fitted": 1.5} for v in VIEWS],
-        },
-    )
-    write_json(folder / "linear.json", content)
+    scene, tone = noise_scene(folder, ("a.png",), ("b.png",)), PhotometryConfig(**photometry)
+    cfg = FitConfig(render=RenderConfig(radiance=activation), photometry=tone)
+    known = {
+        "model": "view_exposure_gamma",
+        "curve": {"name": tone.curve, "pivot": tone.pivot, "spline": None},
+        "gauge": "in words",
+        "mean": {"exposure": 2.0, "exposure_geometric": 2.0, "gamma": 2.4},
+        "views": [{**ROW, **v, "exposure_fitted": 1.5} for v in VIEWS],
+    }
+    store = ImageStore(scene.views, DataConfig(max_width=20))
+    write_json(folder / "linear.json", linear_sidecar(g, cfg, scene, store, known))
     write_radiance(folder / "linear.ply", g, np.ones(50, bool), activation=activation)
     return json.loads((folder / "linear.json").read_text()), g, cfg
 
@@ -103,8 +89,8 @@ def test_views_have_cameras_at_the_size_of_the_fit_and_their_exposures(tmp_path)
     a, b = said["views"]
     assert (a["image"], a["exposure"], a["gamma"]) == ("a.png", 2.0, 2.4)
     assert (b["exposure"], b["exposure_fitted"]) == (None, 1.5)
-    assert (a["width"], a["height"]) == (20, 15)
-    assert a["K"] == [[25, 0, 10], [0, 25, 7.5], [0, 0, 1]]
+    assert (a["width"], a["height"]) == (20, 17)
+    assert a["K"] == [[20, 0, 10], [0, 20, 8.5], [0, 0, 1]]
     assert said["mean"]["exposure_geometric"] == 2.0
     assert said["tone"]["correction"] is None
     said, *_ = sidecar(tmp_path, appearance="affine")

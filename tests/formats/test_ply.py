@@ -68,13 +68,6 @@ def test_fields_and_bytes_are_the_reference_ones(tmp_path, monkeypatch):
     assert (tmp_path / "ours.ply").read_bytes() == (tmp_path / "theirs.ply").read_bytes()
 
 
-def test_comments_may_name_any_file(tmp_path):
-    g = population(5)
-    write_ply(tmp_path / "a.ply", g, ["worst: Straße/夜\n1.jpg"])
-    assert PlyData.read(str(tmp_path / "a.ply")).comments == [r"worst: Stra\xdfe/\u591c\n1.jpg"]
-    np.testing.assert_array_equal(read_ply(tmp_path / "a.ply").sh, g.sh)
-
-
 def test_memory_does_not_grow_with_the_file(tmp_path, monkeypatch):
     """Beside the population: a few chunks while writing, a copy of its largest part while reading.
 

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from p2gs_jax.report.findings import (
-    count,
-    duration,
     run_warnings,
     summary_sentences,
 )
@@ -149,8 +147,3 @@ def test_the_summary_is_three_sentences(run):
     assert "models no camera" in summary_sentences(run, SceneMeasurements())[1]
     run.metrics.clear()
     assert "metrics.json is missing" in summary_sentences(run, SceneMeasurements())[2]
-
-
-def test_counts_and_durations():
-    assert [count(n, "view") for n in (1, 1200)] == ["1 view", "1,200 views"]
-    assert [duration(s) for s in (12.4, 125, 7300)] == ["12 s", "2 min 5 s", "2 h 1 min"]

@@ -4,12 +4,12 @@ import json
 import shutil
 from dataclasses import replace
 
-import cv2
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from scene.helpers import make_view
 
 from p2gs_jax.config import DataConfig, FitConfig, RenderConfig
+from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.core.progress import Silent
 from p2gs_jax.formats.ply import write_radiance
 from p2gs_jax.report.measurements import measure_scene
@@ -19,8 +19,7 @@ from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.run.photometry_files import write_photometry
 from p2gs_jax.run.scene_file import write_scene
 from p2gs_jax.run.write import write_start
-from p2gs_jax.scene import load_scene
-from p2gs_jax.types import Gaussians
+from p2gs_jax.types import Gaussians, Scene
 
 WIDTH, HEIGHT, FOCAL, WALL = 96, 64, 80.0, 4.0
 EXPOSURES = (0.5, 1.0, 2.0)
@@ -34,65 +33,44 @@ def wall(x):
     return np.repeat(grey[..., None], 3, -1)
 
 
-def write_photographs(scene, points):
-    """Write photographs of the wall from a row of cameras, and a COLMAP model of them."""
-    model = scene / "sparse" / "0"
-    model.mkdir(parents=True)
-    (scene / "images").mkdir()
-    lines = []
-    for i, e in enumerate(EXPOSURES):
-        x = 0.3 * i
-        linear = np.clip(e * wall(x), 0, 1)
-        encoded = np.where(linear < 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-        cv2.imwrite(str(scene / "images" / f"{i}.png"), np.rint(255 * encoded).astype(np.uint8))
-        xy = (points[:, :2] - [x, 0]) / WALL * FOCAL + [WIDTH / 2, HEIGHT / 2]
-        found = " ".join(f"{a:.3f} {b:.3f} {k + 1}" for k, (a, b) in enumerate(xy))
-        lines += [f"{i + 1} 1 0 0 0 {-x} 0 0 1 {i}.png", found]
-    (model / "images.txt").write_text("\n".join(lines) + "\n")
-    (model / "cameras.txt").write_text(
-        f"1 PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} {WIDTH / 2} {HEIGHT / 2}\n"
-    )
-    rows = [
-        f"{k + 1} {p[0]} {p[1]} {p[2]} 90 90 90 0.5 1 {k} 2 {k} 3 {k}" for k, p in enumerate(points)
-    ]
-    (model / "points3D.txt").write_text("\n".join(rows) + "\n")
-
-
 @pytest.fixture(scope="module")
 def wall_run(tmp_path_factory):
     """A finished run whose Gaussians are the wall and whose exposures are right."""
     root = tmp_path_factory.mktemp("wall")
-    scene, run = root / "scene", root / "run"
+    run = root / "run"
     run.mkdir()
-    grid = np.stack(np.meshgrid(np.linspace(-3, 3, 40), np.linspace(-2, 2, 28)), -1).reshape(-1, 2)
-    points = np.concatenate([grid, np.full((len(grid), 1), WALL)], 1)
-    write_photographs(scene, points)
+    views, rows = [], []
+    for i, e in enumerate(EXPOSURES):
+        codes = np.rint(255 * srgb_encode(np.clip(e * wall(0.3 * i), 0, 1)))
+        viewmat = np.eye(4, dtype=np.float32)
+        viewmat[0, 3] = -0.3 * i
+        view = make_view(root / f"{i}.png", codes.astype(np.uint8), f=FOCAL)
+        views.append(replace(view, viewmat=viewmat))
+        rows.append({"image": view.name, "exposure": e, "exposure_ev": float(np.log2(e))})
+    across, up = np.meshgrid(np.linspace(-3, 3, 40), np.linspace(-2, 2, 28))
+    points = np.stack([across, up, np.full_like(up, WALL)], -1).reshape(-1, 3).astype(np.float32)
+    n = len(points)
     cfg = FitConfig(data=DataConfig(test_every=0), render=RenderConfig(sh_degree=0))
     decisions = replace(Decisions.as_asked(cfg), model="view_exposure")
-    write_start(RunFolder(run), scene, None, cfg, decisions)
-    write_scene(run, load_scene(scene, cfg.data))
-    n = len(points)
+    write_start(RunFolder(run), root, None, cfg, decisions)
+    write_scene(run, Scene(root, "colmap", tuple(views), points, np.zeros((n, 3), np.uint8)))
     gaussians = Gaussians(
-        jnp.asarray(points, jnp.float32),
-        jnp.tile(jnp.array([1.0, 0, 0, 0]), (n, 1)),
-        jnp.tile(jnp.log(jnp.array([0.2, 0.2, 0.01])), (n, 1)),
-        jnp.full(n, 4.0),
-        jnp.zeros((n, 1, 3)),
+        points,
+        np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
+        np.tile(np.log(np.float32([0.2, 0.2, 0.01])), (n, 1)),
+        np.full(n, 4, np.float32),
+        np.zeros((n, 1, 3), np.float32),
     )
     write_radiance(run / "radiance.ply", gaussians, np.ones(n, bool), activation="exp")
-    common = {"camera": "1", "gamma": 2.2, "split": "train"}
+    common = {"camera": "0", "gamma": 2.2, "split": "train"}
     common |= dict.fromkeys(("exif_ev", "exposure_fitted"))
-    views = [
-        {**common, "image": f"{i}.png", "exposure": e, "exposure_ev": float(np.log2(e))}
-        for i, e in enumerate(EXPOSURES)
-    ]
     write_photometry(
         run / "photometry.json",
         model="view_exposure",
         curve={"name": "srgb", "pivot": 0.18, "spline": None},
         gauge="known",
         mean={"exposure": 1.2, "exposure_geometric": 1.0, "gamma": 2.2},
-        views=views,
+        views=[common | row for row in rows],
     )
     return run
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from page_tools import pictures
 
-from p2gs_jax.report.charts import SOURCES, VARIABLES, Series, panels_chart, training_chart
+from p2gs_jax.report.charts import SOURCES, VARIABLES, Series, panels_chart
 from p2gs_jax.report.photometry_sections import exposure_section
-from p2gs_jax.report.pictures import GAIN, dynamic_range, jpeg, signed_difference, spread
+from p2gs_jax.report.pictures import GAIN, dynamic_range, jpeg, signed_difference
 from p2gs_jax.report.run_files import RunFiles
 from p2gs_jax.report.run_sections import depth_section, novel_section, parts_section
 
@@ -38,29 +38,13 @@ def test_the_dynamic_range_is_in_stops():
     assert dynamic_range(np.zeros((4, 4, 3))) == 0.0
 
 
-def test_spread_takes_both_ends():
-    assert spread([1, 2, 3], 5) == [1, 2, 3]
-    assert spread(list(range(11)), 3) == [0, 5, 10]
-
-
-def chart_of(error=None, second=None):
-    x = np.arange(1.0, 7.0)
-    series = [Series("found", x, np.sin(x), SOURCES["found"], error)]
-    if second is not None:
-        series.append(Series("true", x, second, SOURCES["true"]))
-    return panels_chart([("a", series)], y_label="y", x_label="x", label="l")
-
-
-def test_error_bars_are_drawn_and_missing_values_break_the_line():
-    # Two caps at each of six values, and in the legend.
-    assert chart_of(np.full(6, 0.2)).count("<use") == chart_of().count("<use") + 14
-    values = np.array([0.0, 1, np.nan, 1, 0, np.nan])
-    line = re.findall(r'd="([^"]*)"[^>]*stroke-dasharray', chart_of(second=values))
+def test_charts_are_in_the_page_s_colours_and_missing_values_break_a_line():
+    x, values = np.arange(1.0, 7.0), np.array([0.0, 1, np.nan, 1, 0, np.nan])
+    found = Series("found", x, np.sin(x), SOURCES["found"])
+    series = [found, Series("true", x, values, SOURCES["true"])]
+    text = panels_chart([("a", series)], y_label="y", x_label="x", label="l")
+    line = re.findall(r'd="([^"]*)"[^>]*stroke-dasharray', text)
     assert any(path.count("M") == 2 for path in line)
-
-
-def test_charts_are_in_the_page_s_colours():
-    text = chart_of(second=np.zeros(6))
     assert text.count('role="img" aria-label="l"') == 1
     assert not any(placeholder in text for placeholder in VARIABLES)
     assert "var(--first)" in text
@@ -68,17 +52,6 @@ def test_charts_are_in_the_page_s_colours():
     tree = ElementTree.fromstring(svg.replace("xlink:href", "href"))
     words = ["".join(t.itertext()) for t in tree.iter("text")]
     assert {"found", "true", "a", "x", "y"} <= set(words)
-
-
-def test_what_changes_in_a_run_is_marked():
-    steps = np.arange(0.0, 1000, 10)
-
-    def draw(marks):
-        psnr, losses = 20 + steps / 100, {"loss": 1 / (1 + steps)}
-        return training_chart(steps, psnr, losses, steps + 5, marks, label="l")
-
-    # A line in each of three panels.
-    assert draw([500.0]).count("stroke-dasharray") == draw([]).count("stroke-dasharray") + 3
 
 
 @pytest.fixture

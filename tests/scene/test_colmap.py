@@ -14,14 +14,6 @@ CFG = DataConfig()
 SETS = ("sceaux_castle", "sceaux_castle/undistorted", "bundler_et", "kitti_stereo_a")
 
 
-def test_kitti_cameras_are_named_after_their_folders(shared_data):
-    scene = load_scene(shared_data("kitti_stereo_a"), CFG)
-    assert {v.camera for v in scene.views} == {"left", "right"}
-    for camera in ("left", "right"):
-        views = [v for v in scene.views if v.camera == camera]
-        assert [i for i, v in enumerate(views) if v.split == "test"] == [0, 8, 16, 24, 32]
-
-
 @pytest.mark.parametrize("name", SETS)
 def test_reader_agrees_with_pycolmap(shared_data, name):
     folder = shared_data(name)

@@ -213,19 +213,6 @@ def test_alpha_is_always_noted_and_remembered(cutouts, tmp_path_factory):
     assert [has_alpha(folder / name) for name in names] == [True, False, False]
 
 
-def test_scenes_without_alpha_are_as_they_were(tmp_path):
-    write_tiny_model(tmp_path, n=3)
-    scene = load_scene(tmp_path, CFG)
-    store = ImageStore(scene.views, CFG)
-    assert not any("alpha" in note or "--background" in note for note in scene.notes)
-    assert store.only_opaque() is store
-    batch = TrainingViews(store, range(3), 0).batch(0, 1, 5)
-    assert batch.alpha is batch.backdrop is store.backdrop is None
-    assert batch.ldr.dtype == np.uint8
-    scene = load_scene(tmp_path, DataConfig(background="black"))
-    assert "--background black shows nowhere" in scene.notes[-1]
-
-
 def test_random_backgrounds_follow_from_seed_and_step(cutouts):
     root, _ = cutouts
     store = store_of(root, background="random")

@@ -114,7 +114,9 @@ def test_alpha_says_something_where_it_varies(tmp_path):
     write(255)
     scene = load_scene(tmp_path, CFG)
     assert ImageStore(scene.views, CFG).backdrop is None
-    assert not any("alpha" in note for note in scene.notes)
+    assert not any("alpha" in note or "--background" in note for note in scene.notes)
+    scene = load_scene(tmp_path, DataConfig(background="black"))
+    assert "--background black shows nowhere" in scene.notes[-1]
     write(0)
     with refused("im 0.png is transparent everywhere", "--data.alpha ignore"):
         load_scene(tmp_path, CFG)

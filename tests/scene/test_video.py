@@ -14,19 +14,9 @@ from scene.made_videos import HLG, PQ, room, turn, write_video
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.numerics import srgb_decode
-from p2gs_jax.scene import find_scene
+from p2gs_jax.scene import find_scene, video
 from p2gs_jax.scene.convert.icc import PQ_WHITE, to_light
 from p2gs_jax.scene.survey import survey
-from p2gs_jax.scene.video import (
-    RECORD,
-    Tracker,
-    choose_frames,
-    expected_frames,
-    frames_of,
-    normalised,
-    read_video,
-    video_size,
-)
 
 COLOURS = np.array(
     [
@@ -54,7 +44,7 @@ CARD = np.repeat(np.repeat(COLOURS[None], 64, 0), 40, 1)
 def test_colours_survive_every_way_of_coding_them(tmp_path, codec, layout, full, matrix) -> None:
     path, coding = tmp_path / "a.mkv", (matrix, 1, 1)
     write_video(path, [CARD] * 2, codec=codec, layout=layout, coding=coding, full=full, quality=1)
-    frame = next(iter(frames_of(path)))
+    frame = next(iter(video.frames_of(path)))
     codes = frame.codes()
     assert frame.transfer is None
     assert codes.dtype == (np.uint16 if "10" in layout else np.uint8)
@@ -80,8 +70,9 @@ def test_hdr_video_becomes_light(tmp_path: Path, coding, name, signal, light) ->
     grey = np.repeat(np.repeat(np.linspace(6000, 46000, 8)[None, :, None], 64, 0), 40, 1)
     card, path = np.repeat(grey, 3, 2).astype(np.uint16), tmp_path / "a.mkv"
     write_video(path, [card] * 2, codec="ffv1", layout="yuv422p10le", coding=coding)
-    frame = next(iter(frames_of(path)))
+    frame = next(iter(video.frames_of(path)))
     assert frame.transfer == name
+    assert read(path, tmp_path, every=1).known == f"{name.upper()} video"
     found = srgb_decode(frame.codes()[32, 20::40] / 65535)
     expected = to_light(card[32, 20::40] / 65535, name)
     np.testing.assert_allclose(found, expected, rtol=0.03, atol=1e-3)
@@ -90,7 +81,7 @@ def test_hdr_video_becomes_light(tmp_path: Path, coding, name, signal, light) ->
 def test_wide_colours_of_a_phones_hdr_video_are_brought_to_srgb() -> None:
     # BT.2020's coordinates of sRGB red at half of HLG's range, as HEVC of 10 bits in an .mp4.
     # The file is kept since libx265 in PyAV 18.1 fails on every other call (write_video's note).
-    light = srgb_decode(next(iter(frames_of(PHONE))).codes()[32, 32] / 65535)
+    light = srgb_decode(next(iter(video.frames_of(PHONE))).codes()[32, 32] / 65535)
     assert light == pytest.approx((1 / 12, 0, 0), abs=3e-3)
 
 
@@ -102,11 +93,11 @@ def test_a_phone_held_upright_and_the_file_s_times(tmp_path: Path, degrees: int,
     path, times = tmp_path / "a.mp4", [0, 0.1, 0.15, 0.9, 0.95]
     write_video(path, [card] * 5, quality=1, times=times)
     turn(path, degrees)
-    frame, *others = frames_of(path)
+    frame, *others = video.frames_of(path)
     assert [one.time for one in (frame, *others)] == pytest.approx(times, abs=2e-3)
-    assert expected_frames(path) == 5
+    assert video.expected_frames(path) == 5
     codes = frame.codes()
-    assert frame.size == video_size(path) == (codes.shape[1], codes.shape[0])
+    assert frame.size == video.video_size(path) == (codes.shape[1], codes.shape[0])
     assert codes.shape[:2] == ((64, 96) if degrees == 180 else (96, 64))
     # Turned clockwise, what was on the left is above.
     assert codes[4:8, 20:-20].min() > 240
@@ -121,7 +112,7 @@ def test_two_moments_in_a_frame_are_taken_apart(tmp_path: Path) -> None:
     frames[:, 1::2] = moments[1::2, 1::2]
     interlaced = {"flags": "+ildct+ilme", "x264-params": "tff=1:crf=5"}
     write_video(path, frames, options=interlaced)
-    found = [frame.codes()[..., 0].astype(float) for frame in frames_of(path)]
+    found = [frame.codes()[..., 0].astype(float) for frame in video.frames_of(path)]
     assert len(found) == 12
     for picture in found[1:]:
         between = (picture[:-2:2] + picture[2::2]) / 2
@@ -147,7 +138,7 @@ def test_what_is_no_video_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     path.write_bytes(b"this is a text file, not a film")
     with refused("cannot be opened as a video"):
-        list(frames_of(path))
+        list(video.frames_of(path))
     with av.open(str(path), "w") as container:
         stream = container.add_stream("aac", rate=48000)
         sound = av.AudioFrame.from_ndarray(np.zeros((1, 2048), np.float32), "fltp", "mono")
@@ -155,7 +146,7 @@ def test_what_is_no_video_is_refused(tmp_path: Path) -> None:
         container.mux(stream.encode(sound))
         container.mux(stream.encode(None))
     with refused("holds no video, but audio"):
-        list(frames_of(path))
+        list(video.frames_of(path))
     parts = []
     for name, size in (("a", (64, 96)), ("b", (96, 128))):
         part = tmp_path / f"{name}.ts"
@@ -163,7 +154,7 @@ def test_what_is_no_video_is_refused(tmp_path: Path) -> None:
         parts.append(part.read_bytes())
     (tmp_path / "c.ts").write_bytes(b"".join(parts))
     with refused(r"changes its size: frame 8 is 128x96.* 96x64"):
-        list(frames_of(tmp_path / "c.ts"))
+        list(video.frames_of(tmp_path / "c.ts"))
 
 
 # ------------------------------------------------------------------ the choice
@@ -179,7 +170,7 @@ def chosen(path: list[tuple[float, float]], blurred: int | None = None) -> list[
     frames = [grey(*place) for place in path]
     if blurred is not None:
         frames[blurred] = cv2.GaussianBlur(frames[blurred], (15, 15), 4)
-    return choose_frames(enumerate(frames))
+    return video.choose_frames(enumerate(frames))
 
 
 def test_walking_gives_frames_at_even_distances_at_any_speed() -> None:
@@ -194,14 +185,14 @@ def test_walking_gives_frames_at_even_distances_at_any_speed() -> None:
     assert len(chosen([(0.0, 0.0)] * 30)) == 1
     # Automatic exposure is no motion.
     frames = [grey(0.0, 0.0, gain) for gain in np.linspace(0.3, 1.0, 40)]
-    assert len(choose_frames(enumerate(frames))) == 1
+    assert len(video.choose_frames(enumerate(frames))) == 1
 
 
 def test_turning_on_the_spot_shows_no_parallax() -> None:
     def way(position: float, yaw: float):
-        tracker = Tracker(normalised(grey(0, 0)))
+        tracker = video.Tracker(video.normalised(grey(0, 0)))
         for k in range(1, 11):
-            found = tracker.follow(normalised(grey(position * k / 10, yaw * k / 10)))
+            found = tracker.follow(video.normalised(grey(position * k / 10, yaw * k / 10)))
         return found
 
     turned, walked = way(0, 0.08), way(0.16, 0)
@@ -227,7 +218,7 @@ def test_of_neighbours_the_sharp_one_is_taken() -> None:
 
 
 def read(path: Path, work: Path, **options):
-    return read_video(path, DataConfig(**options), work, lambda message: None)
+    return video.read_video(path, DataConfig(**options), work, lambda message: None)
 
 
 @pytest.fixture(scope="module")
@@ -239,7 +230,7 @@ def film(tmp_path_factory) -> Path:
 
 def test_frames_are_kept_in_the_cache(film: Path, tmp_path: Path) -> None:
     found = read(film, tmp_path)
-    record = json.loads((tmp_path / "video" / RECORD).read_text())
+    record = json.loads((tmp_path / "video" / video.RECORD).read_text())
     assert [frame["file"] for frame in record["frames"]] == [path.name for path in found.paths]
     assert found.known is None
     note = f"Of 50 frames of the video {len(found.paths)} are used: sharp"
@@ -278,14 +269,3 @@ def test_one_frame_no_motion_or_half_a_file(tmp_path: Path) -> None:
     data = path.read_bytes()
     path.write_bytes(data[: len(data) * 2 // 3])
     assert len(read(path, tmp_path).paths) >= 3
-
-
-def test_hdr_and_rotation_reach_the_photographs(tmp_path: Path) -> None:
-    path = tmp_path / "a.mp4"
-    pictures = [room(*place).astype(np.uint16) * 257 for place in WALK[::4]]
-    write_video(path, pictures, codec="libx264", layout="yuv420p10le", coding=HLG)
-    turn(path, 90)
-    found = read(path, tmp_path)
-    assert found.known == "HLG video"
-    stored = cv2.imread(str(found.paths[0]), cv2.IMREAD_UNCHANGED)
-    assert (stored.dtype, stored.shape) == (np.uint16, (240, 136, 3))

@@ -112,12 +112,6 @@ def test_what_pandas_pickles(tmp_path, protocol, variant):
     assert_same(read_pickled(tmp_path / "t.pkl"), VARIANTS[variant])
 
 
-def test_the_real_files_of_an_old_pandas(shared_data):
-    root = shared_data("pandaset_002")
-    for path in [*sorted(root.glob("annotations/cuboids/*.gz"))[:5], root / "lidar/00.pkl.gz"]:
-        assert_same(read_pickled(path), pd.read_pickle(path))
-
-
 class Malicious:
     def __init__(self, *call):
         self.call = call

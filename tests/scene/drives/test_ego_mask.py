@@ -77,22 +77,16 @@ def test_the_bonnet_is_found_whatever_the_exposures():
     assert (mask & BONNET).sum() / (mask | BONNET).sum() > 0.93
 
 
-def test_a_road_alone_holds_no_car():
+def test_a_road_and_the_sky_in_turns_are_no_car_and_one_that_stands_says_nothing():
     found = find_ego_mask(CAMERA, pictures(DRIVEN, own=False), DRIVEN, UP)
     assert found is not None
     assert not found.any()
-
-
-def test_a_bonnet_is_told_from_sky_in_turns():
-    poses = np.array([pose_at(0.7 * k, 0.01 * k) for k in range(12)])
-    mask = find_ego_mask(CAMERA, pictures(poses), poses, UP)
-    assert mask is not None
-    assert not mask[: H // 2].any()
-
-
-def test_a_car_that_stands_says_nothing():
-    poses = np.array([pose_at(0.001 * k) for k in range(12)])
-    assert find_ego_mask(CAMERA, pictures(poses), poses, UP) is None
+    turning = np.array([pose_at(0.7 * k, 0.01 * k) for k in range(12)])
+    found = find_ego_mask(CAMERA, pictures(turning), turning, UP)
+    assert found is not None
+    assert not found[: H // 2].any()
+    standing = np.array([pose_at(0.001 * k) for k in range(12)])
+    assert find_ego_mask(CAMERA, pictures(standing), standing, UP) is None
     assert find_ego_mask(CAMERA, pictures(DRIVEN[:3]), DRIVEN[:3], UP) is None
 
 

@@ -129,6 +129,8 @@ def test_what_argoverse_lacks_is_counted(copied, read):
 def test_photographs_of_waymo_come_out_of_the_table_one_at_a_time(copied, read):
     root = copied("waymo").root
     drive = read(root)
+    for camera in drive.cameras:
+        assert camera.distortion.coefficients == (0.05, -0.02, 1e-3, -1e-3, 0.0)
     numbers = {name: number for number, name in waymo.NAMES.items()}
     for photograph in drive.photographs:
         expected = jpeg(10 * photograph.frame + numbers[photograph.camera])
@@ -143,11 +145,6 @@ def test_photographs_of_waymo_come_out_of_the_table_one_at_a_time(copied, read):
     waymo.write_rows(root, "camera_image", rows)
     with pytest.raises(UserError, match="row 1 holds no image"):
         read(root).photographs[0].embedded()
-
-
-def test_the_lens_of_waymo_is_removed(kept, read):
-    for camera in read(kept("waymo").root).cameras:
-        assert camera.distortion.coefficients == (0.05, -0.02, 1e-3, -1e-3, 0.0)
 
 
 def test_points_of_waymo_have_the_time_when_the_upper_scanner_passed(kept, read):
