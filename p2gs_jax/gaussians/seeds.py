@@ -130,7 +130,7 @@ def gaussians_from_points(
     views: Sequence[View],
     cfg: FitConfig,
     *,
-    scales: Float[np.ndarray, "p #3"] | Float[np.ndarray, " p"] | None = None,
+    scales: Float[np.ndarray, " p #3"] | Float[np.ndarray, " p"] | None = None,
     opacity: Float[np.ndarray, " p"] | float | None = None,
     quats: Float[np.ndarray, "p 4"] | None = None,
 ) -> Gaussians:
