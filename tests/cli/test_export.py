@@ -136,6 +136,11 @@ def test_a_look_changes_the_display_colours(exported, finished_run, run_command,
         ("--format gltf --curve wavy", "wavy"),
         ("--format exr colmap --gamma 2", "--gamma says nothing"),
         ("--format exr --size-mb 2", "--size-mb says nothing"),
+        ("--format html --size-mb 0", "--size-mb"),
+        ("--format html --size-mb 0.02", "--size-mb"),
+        ("--format html --photographs -1", "--photographs"),
+        ("--format html --bake-steps 3", "--bake-steps"),
+        ("--format exr --photographs 3", "--photographs"),
     ],
 )
 def test_senseless_options(finished_run, run_command, tmp_path, options, said):

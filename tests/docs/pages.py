@@ -93,7 +93,6 @@ def commands(code: str) -> list[list[str]]:
 
 
 def prose(page: Path) -> str:
-    """Return the page without its code blocks."""
     return re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
 
 

@@ -53,7 +53,6 @@ def quick_presets(monkeypatch):
 
 @pytest.fixture
 def place(tmp_path, monkeypatch, finished_run):
-    """Go to a folder with a scene and a finished run."""
     make_scene(tmp_path / "scene")
     make_scene(tmp_path / "street")
     for name in ("RUN", "runs/street"):

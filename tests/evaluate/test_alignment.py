@@ -1,4 +1,4 @@
-"""Gauges are removed before scoring, and only gauges."""
+"""Gauges are removed before scoring, and only gauges; metrics of radiance have known values."""
 
 from dataclasses import replace
 
@@ -7,8 +7,15 @@ import numpy as np
 import pytest
 
 from p2gs_jax.config import PhotometryConfig
-from p2gs_jax.evaluation import alignment
-from p2gs_jax.evaluation.scores import psnr
+from p2gs_jax.evaluation import alignment, radiance
+from p2gs_jax.evaluation.radiance import (
+    RadianceScores,
+    delta_e_itp,
+    mu_law,
+    mu_law_psnr,
+    pu21_encode,
+    pu21_psnr,
+)
 from p2gs_jax.photometry.formation import display, formation
 from p2gs_jax.types import Capture
 
@@ -28,15 +35,6 @@ def test_exposure_error_ignores_scale_and_reports_power():
     assert alignment.exposure_error(one_off, e)["ev_max"] == pytest.approx(0.95, abs=0.01)
     with pytest.raises(ValueError, match="positive"):
         alignment.exposure_error(np.array([1.0, 0.0]), e[:2])
-
-
-def test_views_without_a_truth_are_left_out():
-    found = [1.0, 2.0, 4.0, None, 8.0, 16.0]
-    views = [{"image": f"{k}.png", "exposure": e} for k, e in enumerate(found)]
-    truth = {"0.png": 3.0, "1.png": 6.0, "2.png": 12.0, "3.png": 9.0, "4.png": 0.0}
-    assert alignment.error_of_views(views, truth)["ev"] == pytest.approx(0, abs=1e-12)
-    assert alignment.error_of_views(views, {"0.png": 3.0, "3.png": 1.0}) is None
-    assert alignment.error_of_views(views, {}) is None
 
 
 def light(seed=0):
@@ -84,7 +82,105 @@ def test_exposure_gamma_and_white_balance_are_found_together(true, gamma, balanc
         np.testing.assert_allclose(found.white_balance, balance, atol=2e-3)
 
 
-def test_psnr_is_masked():
-    a = jnp.zeros((4, 4, 3))
-    mask = jnp.ones((4, 4)).at[0].set(0)
-    assert float(psnr(a.at[0].set(9.0), a + 0.1, mask)) == pytest.approx(20, abs=1e-3)
+EVERYWHERE = np.ones((24, 32), bool)
+
+
+def image(seed=0):
+    rng = np.random.default_rng(seed)
+    return np.exp(rng.normal(-1, 1, (24, 32, 3)))
+
+
+def scores(linear, truth, brightest=1e9):
+    s = RadianceScores()
+    s.add("a", "train", linear, truth, EVERYWHERE)
+    s.add("b", "test", linear, truth, EVERYWHERE)
+    return s.summary(brightest)
+
+
+def test_pu21_reference_values():
+    # The published encoding maps 100 cd/m^2 to 256 and its darkest value to 0.
+    assert pu21_encode(np.array(100.0)) == pytest.approx(256, abs=0.5)
+    assert pu21_encode(np.array(0.005)) == pytest.approx(0, abs=1e-3)
+    assert np.all(np.diff(pu21_encode(np.geomspace(0.005, 1e4, 200))) > 0)
+
+
+@pytest.mark.parametrize(("c", "power"), [(0.05, 1.0), (20.0, 1.0), (1.0, 0.8)])
+def test_a_common_factor_costs_nothing_and_a_power_until_it_is_aligned(c, power):
+    truth = image()
+    result = scores(truth**power / c, truth)
+    assert result["stops_rms_power"] < 1e-4
+    assert result["power"] == pytest.approx(1 / power, rel=1e-4)
+    if power == 1:
+        assert result["stops_rms"] < 1e-6
+        assert result["scale"] == pytest.approx(c, rel=1e-6)
+        assert result["train"]["pu21_psnr"] > 100
+    else:
+        assert result["stops_rms"] > 0.1
+
+
+def test_errors_are_in_stops_and_pixels_count_by_what_is_true_of_them():
+    truth = image()
+    wrong = truth * np.exp2(np.random.default_rng(1).normal(0, 0.5, truth.shape))
+    assert scores(wrong, truth)["stops_rms"] == pytest.approx(0.5, abs=0.03)
+    black = truth.copy()
+    black[:2] = 1e-9
+    assert scores(black, truth)["stops_rms"] < 3
+    # What is recovered too bright is an error; what is saturated and too dark is none.
+    truth = image()
+    wrong = truth / 4
+    wrong[truth.max(-1) < 0.3] *= 30
+    found = scores(wrong, truth, brightest=0.5)
+    assert found["scale"] == pytest.approx(4, rel=1e-6)
+    assert found["stops_rms"] > 0.5
+    dim = np.where(truth.max(-1, keepdims=True) > 2, 0.01, truth / 4)
+    assert scores(dim, truth, brightest=0.5)["stops_rms"] < 1e-6
+
+
+def test_what_is_aligned_does_not_grow_with_the_views(monkeypatch):
+    monkeypatch.setattr(radiance, "MOST_ALIGNED", 1000)
+    s, truth = RadianceScores(), image()
+    for k in range(10):
+        s.add(str(k), "train", truth / 2, truth, EVERYWHERE)
+    assert 1000 <= s._sample().shape[1] <= 2 * 1000
+    assert s.summary(1e9)["scale"] == pytest.approx(2, rel=1e-6)
+
+
+def test_colour_difference_sees_hue():
+    truth = image()
+    assert delta_e_itp(truth, truth, EVERYWHERE, 1.0) == pytest.approx(0, abs=1e-9)
+    red = truth * [1.2, 1.0, 0.9]
+    assert delta_e_itp(red, truth, EVERYWHERE, 1.0) > 3
+    assert pu21_psnr(red, truth, EVERYWHERE, 1.0) < 40
+
+
+TRUTH = np.random.default_rng(0).uniform(0.1, 4.0, (8, 10, 3))
+SOME = np.ones((8, 10), bool)
+
+
+def test_nothing_to_judge_has_no_score():
+    assert np.isnan(mu_law_psnr(TRUTH, TRUTH, ~SOME))
+    assert np.isnan(mu_law_psnr(TRUTH, 0 * TRUTH, SOME))
+    assert RadianceScores().summary(1.0) == {}
+    none = np.zeros((24, 32), bool)
+    s = RadianceScores()
+    s.add("a", "train", image(), image(), none)
+    assert np.isnan(s.summary(1.0)["stops_rms"])
+
+
+def test_a_constant_step_after_the_curve_is_its_psnr_without_masked_pixels():
+    assert mu_law(np.array([0.0, 1.0, 7.0, -1.0])) == pytest.approx([0, 1, 1, 0])
+    assert (np.diff(mu_law(np.linspace(0, 1, 100))) > 0).all()
+    assert mu_law(np.array(0.01)) == pytest.approx(np.log(51) / np.log(5001))
+    brightest = TRUTH.max()
+    shown = mu_law(TRUTH / brightest)
+    low = shown - 0.1
+    linear = (np.exp(low * np.log1p(5000.0)) - 1) / 5000.0 * brightest
+    assert (low > 0).all()
+    assert mu_law_psnr(linear, TRUTH, SOME) == pytest.approx(20.0, abs=1e-6)
+    mask = SOME.copy()
+    mask[0, 0] = False
+    wrong, truth = TRUTH * 0.9, TRUTH.copy()
+    before = mu_law_psnr(wrong, truth, mask)
+    wrong[0, 0], truth[0, 0] = 1e6, 1e4
+    assert mu_law_psnr(wrong, truth, mask) == before
+    assert before < mu_law_psnr(TRUTH, TRUTH, SOME)

@@ -1,7 +1,9 @@
-"""Every protocol of an evaluation: LPIPS where there are weights, views that tell nothing."""
+"""Every protocol of an evaluation; LPIPS where there are weights, views that tell nothing."""
 
 import dataclasses
 import json
+import threading
+import time
 
 import chex
 import cv2
@@ -18,7 +20,7 @@ from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.evaluation import evaluate as evaluation
 from p2gs_jax.evaluation.evaluate import evaluate
 from p2gs_jax.evaluation.lpips import lpips
-from p2gs_jax.evaluation.passes import ArrayStore
+from p2gs_jax.evaluation.passes import MOST_WORKERS, ArrayStore, map_in_order
 from p2gs_jax.evaluation.scores import psnr, tells_exposure, untold_notes
 from p2gs_jax.run.read import load_run
 from p2gs_jax.scene.pixels.store import ImageStore
@@ -88,17 +90,6 @@ def test_every_comparison_has_lpips_where_there_are_weights(scene, tmp_path, cap
     assert "n/a" not in printed
 
 
-def test_nothing_is_said_without_weights(scene, tmp_path, capsys):
-    metrics = judged(scene)
-    assert "lpips" not in str(metrics)
-    assert metrics["train"]["psnr"] > 0
-    print_metrics(metrics, tmp_path)
-    printed = capsys.readouterr().out
-    rows = [line for line in printed.splitlines() if "training" in line or "held out" in line]
-    assert len(rows) == 6
-    assert all("n/a" in line for line in rows)
-
-
 def test_an_evaluation_keeps_no_view_beyond_the_bound(scene, monkeypatch):
     made = []
 
@@ -129,14 +120,9 @@ def grey(value):
 LOSS = LossConfig()
 
 
-@pytest.mark.parametrize(
-    ("value", "known"), [(0.0, False), (1.0, False), (0.01, False), (0.5, True)]
-)
-def test_black_and_saturated_photographs_tell_no_exposure(value, known):
-    assert tells_exposure(grey(value), EVERYTHING, LOSS) is bool(known)
-
-
-def test_one_channel_and_a_few_pixels_are_enough_and_what_is_masked_tells_nothing():
+def test_black_and_saturated_photographs_tell_no_exposure_but_a_few_pixels_are_enough():
+    for value, known in ((0.0, False), (1.0, False), (0.01, False), (0.5, True)):
+        assert tells_exposure(grey(value), EVERYTHING, LOSS) is known
     few, corner = (slice(0, 1), slice(0, 1), 1), (slice(0, 5), slice(0, 5), slice(None))
     hidden = np.where(np.arange(30) < 6, 0, EVERYTHING)
     for change, mask, known in ((few, EVERYTHING, True), (corner, hidden, False)):
@@ -221,3 +207,44 @@ def test_held_out_views_are_scored_under_the_exposure_of_the_training_views_rule
         assert row["psnr"] == pytest.approx(float(expected), abs=0.01)
     else:
         assert "metered" not in test
+
+
+def test_results_keep_their_order_and_an_error_ends_the_rest():
+    def slow_if_even(k):
+        time.sleep(0.01 * (k % 2 == 0))
+        return k * k
+
+    assert list(map_in_order(slow_if_even, range(20))) == [k * k for k in range(20)]
+    assert list(map_in_order(slow_if_even, [])) == []
+    seen = []
+
+    def failing(k):
+        seen.append(k)
+        if k == 3:
+            raise ValueError("no such view")
+        return k
+
+    with pytest.raises(ValueError, match="no such view"):
+        list(map_in_order(failing, range(1000)))
+    assert len(seen) < 1000
+
+
+def test_the_first_item_is_computed_alone_and_few_results_wait():
+    running, done = [], []
+    lock = threading.Lock()
+
+    def counted(k):
+        with lock:
+            running.append(k)
+        done.append(k)
+        return k
+
+    results = map_in_order(counted, range(100))
+    assert running == []
+    assert next(results) == 0
+    assert running == [0]
+    assert next(results) == 1
+    time.sleep(0.05)
+    assert len(running) <= 2 * MOST_WORKERS + 2
+    results.close()
+    assert len(done) < 100

@@ -146,19 +146,3 @@ def test_the_command_writes_it_once(finished_run, run_command, tmp_path):
         status, printed = run_command(*argv)
         assert (status, word in printed) == (expected, True)
     assert (tmp_path / "scene.html").stat().st_size < 20 * MEGABYTE
-
-
-REFUSED = [
-    *("html --size-mb 0", "html --size-mb 0.02", "html --photographs -1", "html --bake-steps 3"),
-    *("gltf --size-mb 3", "exr --photographs 3"),
-]
-
-
-@pytest.mark.parametrize("words", REFUSED)
-def test_options_that_make_no_sense_are_refused(finished_run, run_command, tmp_path, words):
-    kind, option, value = words.split()
-    argv = ("export", finished_run, "--format", kind, option, value, "--out", tmp_path)
-    status, said = run_command(*argv)
-    assert status == 2
-    assert option in said
-    assert list(tmp_path.iterdir()) == []

@@ -166,13 +166,20 @@ def grey(values):
     return np.repeat(np.asarray(values, np.float32)[None, :, None], 3, axis=-1)
 
 
-def test_colours_step_at_whole_stops_grow_lighter_and_end():
+def test_colours_step_at_whole_stops_and_near_is_bright():
     np.testing.assert_allclose(stops(grey([0.5, 1, 2, 4]), middle=1.0)[0], [-1, 0, 1, 2], atol=1e-5)
     np.testing.assert_allclose(luminance(np.array([0.0, 1, 0])), 0.7152)
     levels = [0, 2.0**-20, 2.0**-5.5, 1.0, 1.9, 2.1, 30, 2.0**5.5, 1e30]
     shown = luminance(false_color(grey(levels), middle=1.0)[0])
     rises = np.diff(shown) > 0
     assert rises.tolist() == [False, False, True, False, True, True, True, False]
+    depth, alpha = np.array([[2.0, 8.0, 0.0]]), np.array([[1.0, 1.0, 0.0]])
+    shown = depth_color(depth, alpha)
+    assert luminance(shown)[0, 0] > luminance(shown)[0, 1] > 0
+    assert not shown[0, 2].any()
+    # The same surface, half covered: the expected depth counts.
+    half = depth_color(depth * 0.6, alpha * 0.6)
+    np.testing.assert_allclose(half, shown)
 
 
 def test_what_clips_in_eight_bits_is_striped_and_nothing_else():
@@ -190,16 +197,6 @@ def test_what_clips_in_eight_bits_is_striped_and_nothing_else():
         assert np.all(part[~striped] == value)
 
 
-def test_near_is_bright_and_nothing_is_black():
-    depth, alpha = np.array([[2.0, 8.0, 0.0]]), np.array([[1.0, 1.0, 0.0]])
-    shown = depth_color(depth, alpha)
-    assert luminance(shown)[0, 0] > luminance(shown)[0, 1] > 0
-    assert not shown[0, 2].any()
-    # The same surface, half covered: the expected depth counts.
-    half = depth_color(depth * 0.6, alpha * 0.6)
-    np.testing.assert_allclose(half, shown)
-
-
 def frames_of(path):
     with av.open(str(path)) as container:
         frames = [f.to_ndarray(format="rgb24") for f in container.decode(video=0)]
@@ -207,7 +204,7 @@ def frames_of(path):
         return frames, stream.codec_context, float(stream.average_rate or 0)
 
 
-def test_frames_keep_their_number_order_and_colours(tmp_path):
+def test_frames_keep_their_order_and_colours_and_odd_sizes_are_cut(tmp_path):
     colours = np.array([[1, 0, 0], [0, 0.5, 0], [0.2, 0.2, 0.9], [0.5, 0.5, 0.5]], np.float32)
     with open_video(tmp_path / "v.mp4", 64, 48, 30) as add:
         for k in range(5):
@@ -217,9 +214,6 @@ def test_frames_keep_their_number_order_and_colours(tmp_path):
     assert (context.name, rate) == ("h264", 30)
     for k, frame in enumerate(frames):
         np.testing.assert_allclose(frame[24, 8::16] / 255, np.roll(colours, k, axis=0), atol=0.03)
-
-
-def test_odd_sizes_are_cut_and_smaller_frames_centred(tmp_path):
     with open_video(tmp_path / "v.mp4", 65, 49, 24) as add:
         add(np.ones((49, 65, 3), np.float32))
         add(np.ones((24, 32, 3), np.float32))

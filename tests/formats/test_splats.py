@@ -1,29 +1,30 @@
-"""Splats for other programs: read by their readers, or decoded here from published layouts.
-
-Packed ones: errors stay within half a step of each column.
-"""
+"""Splats for other programs: read by their readers, or decoded here from published layouts."""
 
 import gzip
 import itertools
 import struct
+import tracemalloc
 from dataclasses import replace
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pygltflib
 import pytest
+from plyfile import PlyData, PlyElement
 from scipy.spatial.transform import Rotation
 from splats import random_splats
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.formats import gsply_files
+from p2gs_jax.formats import gsply_files, ply
 from p2gs_jax.formats.foreign import read_foreign
 from p2gs_jax.formats.gltf import EXTENSION, write_gltf
 from p2gs_jax.formats.packed import CHUNK, column_bits, morton_order, pack, unpack
-from p2gs_jax.formats.ply import write_ply
+from p2gs_jax.formats.ply import field_names, read_ply, write_ply, write_radiance
 from p2gs_jax.formats.usd import CAMERAS, SPLATS, NamedCamera, write_usd
 from p2gs_jax.render.harmonics import evaluate
+from p2gs_jax.types import Gaussians, Vibration
 
 FLIP = np.array([1.0, -1.0, -1.0])
 
@@ -128,7 +129,6 @@ def test_usd_is_read_by_pxr(tmp_path):
 
 
 def by_x(records, x):
-    """Return the order that sorts the records as the Gaussians."""
     return np.argsort(records)[np.argsort(np.argsort(x))]
 
 
@@ -215,8 +215,6 @@ def test_every_kind_of_foreign_file_is_known_by_its_end(tmp_path, with_gsply, de
         assert np.abs(turned).max() < 0.05 * np.exp(2 * np.asarray(g.log_scales)).max()
 
 
-# ------------------------------------------------------------------ packed, as the page holds them
-
 PLACES = np.array([10, 1, 300])
 
 
@@ -243,22 +241,89 @@ def test_every_number_comes_back_within_half_a_step_of_its_chunk(count):
                 assert error <= 0.501 * step + 1e-6 * np.abs(values).max(), (name, column)
 
 
-def test_rotations_change_but_ellipsoids_do_not():
+def test_ellipsoids_stay_as_they_were_where_rotations_change():
     g = cloud(1000)
     order = morton_order(np.asarray(g.means))
     given, read = ours(g)[0][order], ours(unpack(pack(g)))[0]
     size = np.trace(given, axis1=1, axis2=2)
     assert (np.abs(read - given).max((1, 2)) / size).max() < 0.02
-
-
-def test_a_rotation_of_length_zero_is_none_at_all_and_nothing_can_be_packed():
     g = cloud(3)
     g = replace(g, quats=jnp.zeros((3, 4)))
     np.testing.assert_allclose(np.asarray(unpack(pack(g)).quats), [[1, 0, 0, 0]] * 3, atol=1e-3)
     assert unpack(pack(cloud(0))).capacity == 0
 
 
-def test_neighbours_in_the_order_are_neighbours_in_space():
-    means = np.asarray(cloud(2000).means) / PLACES
-    steps = np.linalg.norm(np.diff(means[morton_order(means)], axis=0), axis=1)
-    assert np.median(steps) < 0.25 * np.median(np.linalg.norm(np.diff(means, axis=0), axis=1))
+def population(n, degree=1, *, moves=False):
+    rng = np.random.default_rng(n)
+
+    def draw(*shape):
+        return rng.normal(size=(n, *shape)).astype(np.float32)
+
+    vibration = Vibration(draw(3), draw(), draw()) if moves else None
+    shapes = ((3,), (4,), (3,), (), ((degree + 1) ** 2, 3))
+    return Gaussians(*(draw(*shape) for shape in shapes), vibration=vibration)
+
+
+@pytest.mark.parametrize("moves", [False, True])
+@pytest.mark.parametrize("count", [0, 1, 9, 10, 11, 25])
+def test_every_row_comes_back_whatever_the_chunk(tmp_path, monkeypatch, count, moves):
+    monkeypatch.setattr(ply, "CHUNK", 10)
+    g = population(count, degree=2, moves=moves)
+    assert write_ply(tmp_path / "a.ply", g, ["line"]) == count
+    for a, b in zip(jax.tree.leaves(read_ply(tmp_path / "a.ply")), jax.tree.leaves(g), strict=True):
+        assert np.asarray(a).tobytes() == b.tobytes()
+
+
+def test_fields_and_bytes_are_the_reference_ones(tmp_path, monkeypatch):
+    monkeypatch.setattr(ply, "CHUNK", 4)
+    g, alive = population(23, degree=3), np.arange(23) % 5 != 2
+    names = field_names(16)
+    assert names[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    assert names[9:54] == [f"f_rest_{i}" for i in range(45)]
+    rest = [f"scale_{i}" for i in range(3)], [f"rot_{i}" for i in range(4)]
+    assert names[54:] == ["opacity", *rest[0], *rest[1]]
+    comments = ["p2gs-jax: linear HDR radiance", "p2gs-jax: radiance activation exp"]
+    write_radiance(tmp_path / "ours.ply", g, alive, activation="exp")
+    # Red's coefficients come first, all of them.
+    bands = g.sh[:, 1:].transpose(0, 2, 1).reshape(23, -1)
+    zero, logits = np.zeros((23, 3), np.float32), g.opacity_logits[:, None]
+    columns = [g.means, zero, g.sh[:, 0], bands, logits, g.log_scales, g.quats]
+    table = np.ascontiguousarray(np.concatenate(columns, 1)[alive])
+    rows = table.view([(name, "<f4") for name in names]).reshape(-1)
+    element = PlyElement.describe(rows, "vertex")
+    PlyData([element], byte_order="<", comments=comments).write(str(tmp_path / "theirs.ply"))
+    assert (tmp_path / "ours.ply").read_bytes() == (tmp_path / "theirs.ply").read_bytes()
+    moving = population(23, moves=True)
+    write_radiance(tmp_path / "moving.ply", moving, alive, activation="exp")
+    back = jax.tree.leaves(read_ply(tmp_path / "moving.ply"))
+    for one, other in zip(back, jax.tree.leaves(moving), strict=True):
+        np.testing.assert_array_equal(one, other[alive])
+
+
+def test_memory_does_not_grow_with_the_file(tmp_path, monkeypatch):
+    """Beside the population: a few chunks while writing, a copy of its largest part while reading.
+
+    tracemalloc counts NumPy's arrays; those of the device are not among them.
+    """
+    monkeypatch.setattr(ply, "CHUNK", 1000)
+    g = population(40_000, degree=3)
+    size = sum(leaf.nbytes for leaf in jax.tree.leaves(g))
+    tracemalloc.start()
+    try:
+        write_ply(tmp_path / "a.ply", g, [])
+        assert tracemalloc.get_traced_memory()[1] < size / 8
+        tracemalloc.reset_peak()
+        read_ply(tmp_path / "a.ply")
+        assert tracemalloc.get_traced_memory()[1] < 1.2 * size
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("kept", [0.3, 0.99, None])
+def test_a_file_that_was_cut_and_another_one_are_refused(tmp_path, kept):
+    path = tmp_path / "a.ply"
+    write_ply(path, population(100), [])
+    content = path.read_bytes()
+    path.write_bytes(b"hello" if kept is None else content[: int(kept * len(content))])
+    with pytest.raises(UserError, match=r"a\.ply is not a valid PLY of Gaussians"):
+        read_ply(path)

@@ -30,12 +30,10 @@ LOOK = """() => ({
 
 
 def copy_run(source: Path, target: Path) -> Path:
-    """Copy a run without what the tests never read."""
     return shutil.copytree(source, target, ignore=shutil.ignore_patterns("checkpoints", "*.html"))
 
 
 def edit(path: Path, change) -> None:
-    """Change a JSON file in place."""
     value = json.loads(path.read_text())
     change(value)
     path.write_text(json.dumps(value))
@@ -63,7 +61,6 @@ def headings(text: str) -> list[str]:
 
 
 def words_of(text: str) -> str:
-    """Return the text of a page."""
     return " ".join(html.unescape(re.sub(r"<[^>]*>", " ", text)).split())
 
 

@@ -1,16 +1,36 @@
-"""Warnings appear when they should, in plain words, and not otherwise; a summary in sentences."""
+"""Warnings, summaries, charts and pictures say what a run says; seams are measured on a wall."""
 
 import copy
+import dataclasses
+import itertools
+import json
+import re
+import shutil
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from page_tools import pictures
+from scene.helpers import make_view
 
-from p2gs_jax.report.findings import (
-    run_warnings,
-    summary_sentences,
-)
-from p2gs_jax.report.measurements import SceneMeasurements
-from p2gs_jax.report.run_files import read_run
+from p2gs_jax.config import DataConfig, FitConfig, RenderConfig
+from p2gs_jax.core.numerics import srgb_encode
+from p2gs_jax.core.progress import Silent
+from p2gs_jax.formats.ply import write_radiance
+from p2gs_jax.report import findings
+from p2gs_jax.report.charts import SOURCES, VARIABLES, Series, panels_chart
+from p2gs_jax.report.measurements import SceneMeasurements, measure_scene
+from p2gs_jax.report.photometry_sections import exposure_section
+from p2gs_jax.report.pictures import GAIN, dynamic_range, jpeg, signed_difference
+from p2gs_jax.report.run_files import RunFiles, read_run
+from p2gs_jax.report.run_sections import depth_section, novel_section, parts_section
+from p2gs_jax.run.decisions import Decisions
+from p2gs_jax.run.folder import RunFolder
+from p2gs_jax.run.photometry_files import write_photometry
+from p2gs_jax.run.scene_file import write_scene
+from p2gs_jax.run.write import write_start
+from p2gs_jax.types import Gaussians, Scene
 
 
 @pytest.fixture
@@ -28,19 +48,7 @@ def run(finished_run):
 
 
 def warnings(run, clipped=None):
-    return dict(run_warnings(run, SceneMeasurements(clipped=clipped or {})))
-
-
-def test_a_good_run_has_none(run):
-    assert warnings(run) == {}
-
-
-def test_how_the_model_was_chosen_is_told_without_reading_notes(run):
-    run.metrics["notes"] = ["Modell gewählt."]
-    seen = SceneMeasurements()
-    assert "the simplest choice that predicts" in " ".join(summary_sentences(run, seen))
-    del run.metrics["photometry"]
-    assert "no shared points to choose by" in " ".join(summary_sentences(run, seen))
+    return dict(findings.run_warnings(run, SceneMeasurements(clipped=clipped or {})))
 
 
 def put(value, *path):
@@ -105,6 +113,7 @@ def test_each_warning_appears_alone_and_names_what_it_means(run, change, title, 
 
 
 UNPROVEN = {
+    "nothing": lambda run: None,
     "noise": lambda run: rising(run, slope=0, noise=3),
     "EXIF that agrees": lambda run: exif(run, off=0),
     "uncertain drift": lambda run: run.train[3].update(
@@ -127,23 +136,196 @@ def test_clipped_photographs_are_named_and_many_are_counted(run):
     assert "and 4 more" in many
 
 
-def test_a_fit_records_where_it_started(finished_run):
-    for view in read_run(finished_run).train:
-        assert view["exposure_ev_start"] == pytest.approx(view["exposure_ev"], abs=0.1)
-        assert view["observations"] > 15
-
-
 def test_the_summary_is_three_sentences(run):
-    what, model, good = summary_sentences(run, SceneMeasurements())
+    what, model, good = findings.summary_sentences(run, SceneMeasurements())
     split = run.metrics.pop("split")
     assert what.startswith(f"4 photographs of scene by 1 camera (2 more were held out: {split})")
-    assert "(2 more were held out)" in summary_sentences(run, SceneMeasurements())[0]
+    assert "(2 more were held out)" in findings.summary_sentences(run, SceneMeasurements())[0]
     assert "an exposure per view under the sRGB tone curve" in model
-    assert "simplest" in model
+    assert "the simplest choice that predicts" in model
+    del run.metrics["photometry"]
+    assert (
+        "no shared points to choose by" in findings.summary_sentences(run, SceneMeasurements())[1]
+    )
+    assert [findings.duration(s) for s in (12.4, 125, 7300)] == ["12 s", "2 min 5 s", "2 h 1 min"]
     assert good == "Held-out photographs are met at 28.0 dB (training photographs at 30.0 dB)."
     run.photometry["curve"]["name"] = "linear"
     run.photometry["model"] = "constant"
     run.options["preset"] = "3dgs"
-    assert "models no camera" in summary_sentences(run, SceneMeasurements())[1]
+    assert "models no camera" in findings.summary_sentences(run, SceneMeasurements())[1]
     run.metrics.clear()
-    assert "metrics.json is missing" in summary_sentences(run, SceneMeasurements())[2]
+    assert "metrics.json is missing" in findings.summary_sentences(run, SceneMeasurements())[2]
+
+
+def grey(values):
+    return np.repeat(np.asarray(values, np.float32)[..., None], 3, -1)
+
+
+def test_pictures_are_differences_in_grey_shrunk_and_measured_in_stops():
+    shown = signed_difference(grey([[0.5, 0.6, 0.4, 0.5 + 1 / GAIN]]), grey([[0.5] * 4]))
+    np.testing.assert_allclose(shown[0, :, 0], [0.5, 0.7, 0.3, 1.0], atol=1e-5)
+    shown = pictures(jpeg(np.full((40, 1200, 3), np.nan, np.float32), "a", longest=600))["a"]
+    assert shown.shape == (20, 600, 3)
+    assert shown.max() == 0
+    assert 'alt="&quot;&lt;&amp;"' in jpeg(grey([[0.0]]), '"<&')
+    values = np.repeat(2.0 ** np.arange(0, 8.0), 100).reshape(8, 100)
+    assert dynamic_range(grey(values)) == pytest.approx(7.0, abs=0.01)
+    assert dynamic_range(np.zeros((4, 4, 3))) == 0.0
+
+
+def test_charts_are_in_the_page_s_colours_and_missing_values_break_a_line():
+    x, values = np.arange(1.0, 7.0), np.array([0.0, 1, np.nan, 1, 0, np.nan])
+    found = Series("found", x, np.sin(x), SOURCES["found"])
+    series = [found, Series("true", x, values, SOURCES["true"])]
+    text = panels_chart([("a", series)], y_label="y", x_label="x", label="l")
+    line = re.findall(r'd="([^"]*)"[^>]*stroke-dasharray', text)
+    assert any(path.count("M") == 2 for path in line)
+    assert text.count('role="img" aria-label="l"') == 1
+    assert not any(placeholder in text for placeholder in VARIABLES)
+    assert "var(--first)" in text
+    svg = re.search(r"<svg.*?</svg>", text, flags=re.DOTALL)[0]
+    tree = ElementTree.fromstring(svg.replace("xlink:href", "href"))
+    words = ["".join(t.itertext()) for t in tree.iter("text")]
+    assert {"found", "true", "a", "x", "y"} <= set(words)
+
+
+@pytest.fixture
+def drive(tmp_path):
+    """Return a function that makes a run folder of a drive from the metrics of its sections."""
+    empty = RunFiles(tmp_path, tmp_path, None, {}, None, {}, None, [], (), (), ())
+    return lambda **metrics: dataclasses.replace(empty, metrics=metrics)
+
+
+def test_parts_depth_and_shifted_views_are_tables(drive):
+    part = {"psnr": 30.0, "ssim": 0.9, "lpips": 0.1, "views": 4}
+    moving = {"psnr": 20.0, "ssim": 0.6, "lpips": 0.3, "views": 2}
+    scores = {"psnr": 29.0, "ssim": 0.8, "whole": part, "static": part, "moving": moving}
+    body = parts_section(drive(train=scores, test={"exposure_fitted": scores}))
+    assert body.count(">what moves<") == 2
+    assert "20.00" in body
+    assert "0.3000" in body
+    seen = {"median_m": 0.123, "median_relative": 0.02, "within_10_percent": 0.9}
+    seen |= {"missing": 0.01, "points": 12345}
+    # More than half of the points that move have no surface: their median is infinite, so null.
+    unseen = {**seen, "median_m": None, "median_relative": None, "missing": 0.6}
+    depth = {"static": seen, "moving": unseen, "views": 3}
+    body = depth_section(drive(depth={"all": depth, "held_out": {}}))
+    assert all(words in body for words in ("0.12 m", "none", "12,345"))
+    views = [
+        {"shift_m": -2.0, "unseen": 0.25, "views": 6, "depth": {"static": seen}},
+        {"shift_m": 2.0, "unseen": 0.125, "views": 6, "depth": {}},
+    ]
+    body = novel_section(drive(novel_views=views))
+    assert body.index("2 m to the left") < body.index("2 m to the right")
+    assert "25.0%" in body
+    assert "0.12 m" in body
+    views[0]["depth"] = {}
+    assert "depth error" not in novel_section(drive(novel_views=views))
+    for section in (parts_section, depth_section, novel_section):
+        assert section(drive()) == ""
+
+
+def test_exposures_of_a_drive_are_a_line_a_camera_over_seconds(drive, monkeypatch):
+    cameras = ("front", "front_left", "front_right", "left", "right", "back", "roof")
+    unknown = dict.fromkeys(("exposure", "exposure_ev", "exposure_fitted", "exif_ev", "gamma"))
+    views = []
+    for camera, k in itertools.product(cameras, range(5)):
+        known = {"exposure": 1.0 + k, "exposure_ev": float(np.log2(1.0 + k)), "split": "train"}
+        known = {"exposure_fitted": 1.5, "split": "test"} if k == 2 else known
+        views.append({**unknown, **known, "image": f"{camera}/{k}.png", "camera": camera})
+        views[-1]["exposure_ev_error"] = 0.05
+    times = {v["image"]: k / 10 for k, v in enumerate(views)}
+    monkeypatch.setattr("p2gs_jax.report.photometry_sections.read_times", lambda folder: times)
+    run = dataclasses.replace(drive(), photometry={"views": views})
+    chart = exposure_section(run, {}).split("<details>")[0]
+    assert all(f">{camera}<" in chart for camera in cameras)
+    assert "seconds" in chart
+    # A photograph that tells no exposure is not one of 0 EV.
+    lost = {**views[0], **unknown, "image": "front/lost.png"}
+    more = dataclasses.replace(run, photometry={"views": [*views, lost]})
+    row, again = (
+        exposure_section(r, {}).split("front/0.png")[1].split("</tr>")[0] for r in (run, more)
+    )
+    assert row == again
+
+
+WIDTH, HEIGHT, FOCAL, WALL = 96, 64, 80.0, 4.0
+EXPOSURES = (0.5, 1.0, 2.0)
+
+
+def wall(x):
+    v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5 - np.array([HEIGHT / 2, WIDTH / 2])[:, None, None]
+    u, v = u / FOCAL * WALL + x, v / FOCAL * WALL
+    grey = 0.12 + 0.05 * np.sin(2 * u) + 0.04 * np.cos(3 * v)
+    return np.repeat(grey[..., None], 3, -1)
+
+
+@pytest.fixture(scope="module")
+def wall_run(tmp_path_factory):
+    """A finished run whose Gaussians are the wall and whose exposures are right."""
+    root = tmp_path_factory.mktemp("wall")
+    run = root / "run"
+    run.mkdir()
+    views, rows = [], []
+    for i, e in enumerate(EXPOSURES):
+        codes = np.rint(255 * srgb_encode(np.clip(e * wall(0.3 * i), 0, 1)))
+        viewmat = np.eye(4, dtype=np.float32)
+        viewmat[0, 3] = -0.3 * i
+        view = make_view(root / f"{i}.png", codes.astype(np.uint8), f=FOCAL)
+        views.append(replace(view, viewmat=viewmat))
+        rows.append({"image": view.name, "exposure": e, "exposure_ev": float(np.log2(e))})
+    across, up = np.meshgrid(np.linspace(-3, 3, 40), np.linspace(-2, 2, 28))
+    points = np.stack([across, up, np.full_like(up, WALL)], -1).reshape(-1, 3).astype(np.float32)
+    n = len(points)
+    cfg = FitConfig(data=DataConfig(test_every=0), render=RenderConfig(sh_degree=0))
+    decisions = replace(Decisions.as_asked(cfg), model="view_exposure")
+    write_start(RunFolder(run), root, None, cfg, decisions)
+    write_scene(run, Scene(root, "colmap", tuple(views), points, np.zeros((n, 3), np.uint8)))
+    gaussians = Gaussians(
+        points,
+        np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
+        np.tile(np.log(np.float32([0.2, 0.2, 0.01])), (n, 1)),
+        np.full(n, 4, np.float32),
+        np.zeros((n, 1, 3), np.float32),
+    )
+    write_radiance(run / "radiance.ply", gaussians, np.ones(n, bool), activation="exp")
+    common = {"camera": "0", "gamma": 2.2, "split": "train"}
+    common |= dict.fromkeys(("exif_ev", "exposure_fitted"))
+    write_photometry(
+        run / "photometry.json",
+        model="view_exposure",
+        curve={"name": "srgb", "pivot": 0.18, "spline": None},
+        gauge="known",
+        mean={"exposure": 1.2, "exposure_geometric": 1.0, "gamma": 2.2},
+        views=[common | row for row in rows],
+    )
+    return run
+
+
+def test_pairs_a_stop_apart_meet_when_developed_alike_also_in_the_picture(wall_run):
+    found = measure_scene(read_run(wall_run), Silent())
+    assert [(p.first, p.second) for p in found.seams] == [("0.png", "1.png"), ("1.png", "2.png")]
+    for pair in found.seams:
+        assert pair.seam.before_ev == pytest.approx(1.0, abs=0.05)
+        assert pair.seam.after_ev < 0.05
+        assert abs(pair.seam.step_ev) < 0.02
+    assert found.tried_pairs == 2
+    assert found.missing == ()
+    assert found.clipped == {f"{i}.png": 0.0 for i in range(3)}
+    # Nothing was held out, so training views are rendered.
+    assert [s.split for s in found.comparisons] == ["train"] * 3
+    for image, limits in ((found.picture.before, (0.1, 1)), (found.picture.after, (0, 0.02))):
+        inner, middle = image[8:-8], image.shape[1] // 2
+        step = abs(float(np.median(inner[:, middle] - inner[:, middle - 1])))
+        assert limits[0] <= step <= limits[1]
+
+
+def test_presets_with_corrections_have_no_seams_and_say_so(wall_run, tmp_path):
+    run = shutil.copytree(wall_run, tmp_path / "run")
+    saved = json.loads((run / "config.json").read_text())
+    saved["fit"]["photometry"]["appearance"] = "affine"
+    (run / "config.json").write_text(json.dumps(saved))
+    np.save(run / "appearance.npy", np.zeros((3, 3, 4), np.float32))
+    found = measure_scene(read_run(run), Silent())
+    assert found.seams == ()
+    assert any("corrections of display values" in m for m in found.missing)

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pycolmap
 import pytest
 
 from p2gs_jax.errors import UserError
@@ -38,17 +37,13 @@ def reprojection_errors(scene: Scene) -> np.ndarray:
     return np.linalg.norm(image[:, :2] / image[:, 2:] - tracks.xy, axis=1)
 
 
-def copy_model(source: Path, target: Path, *, text: bool = False) -> Path:
+def copy_model(source: Path, target: Path) -> Path:
     """Copy `sparse/0` and link the images, writable; return the model's folder."""
     model = target / "sparse" / "0"
     model.mkdir(parents=True)
-    if text:
-        pycolmap.Reconstruction(source / "sparse" / "0").write_text(model)
-    else:
-        for file in (source / "sparse" / "0").iterdir():
-            shutil.copyfile(file, model / file.name)
-    if not (target / "images").exists():
-        (target / "images").symlink_to(source / "images")
+    for file in (source / "sparse" / "0").iterdir():
+        shutil.copyfile(file, model / file.name)
+    (target / "images").symlink_to(source / "images")
     return model
 
 
@@ -76,7 +71,6 @@ def write_tiny_model(
 
 
 def write_image(path: Path, value: int = 100, size: tuple[int, int] = (40, 30)) -> None:
-    """Write a grey image of a width and a height."""
     path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), np.full(size[::-1], value, np.uint8))
 

@@ -38,22 +38,6 @@ def test_reader_agrees_with_pycolmap(shared_data, name):
         assert mine == {p.point3D_id for p in image.points2D if p.has_point3D()}
 
 
-@pytest.mark.parametrize("with_rigs", [True, False])
-def test_text_equals_binary(shared_data, tmp_path, with_rigs):
-    source = shared_data("bundler_et")
-    model = copy_model(source, tmp_path, text=True)
-    if not with_rigs:
-        for stem in ("rigs", "frames"):
-            (model / f"{stem}.txt").unlink()
-    a, b = load_scene(source, CFG), load_scene(model, CFG)  # or in the folder itself
-    assert np.array_equal(a.points, b.points)
-    assert np.array_equal(a.tracks.xy, b.tracks.xy)
-    assert np.array_equal(a.tracks.point_indices, b.tracks.point_indices)
-    for x, y in zip(a.views, b.views, strict=True):
-        assert np.allclose(x.viewmat, y.viewmat, atol=1e-6)
-        assert np.allclose(x.K, y.K)
-
-
 @pytest.mark.parametrize("stem", ["cameras", "images", "points3D"])
 def test_damaged_binary_names_the_file(shared_data, tmp_path, stem):
     file = copy_model(shared_data("bundler_et"), tmp_path) / f"{stem}.bin"

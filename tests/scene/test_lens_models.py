@@ -29,14 +29,12 @@ fisheye = st.tuples(*[st.floats(-0.1, 0.1)] * 4)
 
 
 def rays(limit: float) -> np.ndarray:
-    """Return rays through all of a picture, up to a radius at depth 1."""
     rng = np.random.default_rng(0)
     radius, angle = np.linspace(0, limit, 300), rng.uniform(0, 2 * np.pi, 300)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.ones(300)], 1)
 
 
 def photographed(X: np.ndarray, lens: Distortion) -> np.ndarray:
-    """Return where OpenCV sees points."""
     c = np.array(lens.coefficients)
     if lens.model == "fisheye":
         return cv2.fisheye.projectPoints(X[:, None], ZERO, ZERO, K, c)[0][:, 0]

@@ -62,9 +62,6 @@ def test_nothing_registers_or_opens(tmp_path):
         load_scene(tmp_path, CFG)
 
 
-# ------------------------------------------------------------------ kept features
-
-
 @pytest.fixture
 def folder(noisy_street, tmp_path):
     """Return a folder with five photographs of a street, those of one camera, and a blank one."""
@@ -163,10 +160,7 @@ def test_cache_survives_interruption(tmp_path):
     assert (value, folder.exists()) == ("t", False)
 
 
-# ------------------------------------------------------------------ pairs
-
-
-def test_pairs_of_long_sequences():
+def test_pairs_are_of_neighbours_by_name_and_by_pose():
     left, right = ([f"{side}/{i:03d}.png" for i in range(40)] for side in ("left", "right"))
     pairs = pairs_by_name(left + right)
     assert len(pairs) == len(set(pairs))
@@ -180,9 +174,6 @@ def test_pairs_of_long_sequences():
     assert ("left/001.png", "left/036.png") not in pairs
     assert pairs_by_name(left) is None
     assert pairs_by_name(left * 2, "all") is None
-
-
-def test_pairs_by_pose_prefer_neighbours_that_look_the_same_way():
     names = [f"{i:03d}" for i in range(100)]
     viewmats = np.tile(np.eye(4, dtype=np.float32), (100, 1, 1))
     viewmats[:, 0, 3] = -np.arange(100)  # a walk along x

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
 from scene.helpers import around, make_view, refused, write_rgba, write_tiny_model
+from scene.test_transforms import LENS, frames, write
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene import find_scene, load_scene
@@ -27,7 +28,6 @@ def model(tmp_path):
 
 
 def split_by(model, text, name="mine.json"):
-    """Load a model with a file that says how to split it."""
     path = model.parent / name
     path.write_text(text if isinstance(text, str) else json.dumps(text))
     return load_scene(model, DataConfig(split=str(path)))
@@ -107,18 +107,12 @@ def test_photographs_that_colmap_did_not_register_are_only_noted(model):
     assert "lists 1 photographs that are not views of the scene: lost.png" in scene.notes[-1]
 
 
-# ------------------------------------------------------------------ nerfstudio
-
-
 def studio(root, **extra):
     names = [f"images/f_{k}.png" for k in range(5)]
-    for name in names:
-        write_rgba(root / name)
-    poses = zip(names, around(5).tolist(), strict=True)
-    frames = [{"file_path": name, "transform_matrix": pose} for name, pose in poses]
-    data = {"fl_x": 50, "w": 40, "h": 30, "aabb_scale": 16, "frames": frames, **extra}
-    (root / "transforms.json").write_text(json.dumps(data))
-    return root
+    listed = frames(*names)
+    for frame, pose in zip(listed, around(5).tolist(), strict=True):
+        frame["transform_matrix"] = pose
+    return write(root, {**LENS, "frames": listed, **extra}, names=names).parent
 
 
 RGB = ("red", "green", "blue")
@@ -152,9 +146,11 @@ def test_nerfstudio_lists(tmp_path):
         find_scene(studio(tmp_path, **lists), CFG)
 
 
-def test_nerfstudio_seeds(tmp_path):
+def test_nerfstudio_seeds_are_read_or_named(tmp_path):
     points = np.array([[0.0, 0.1, 0.2], [1.0, 1.1, 1.2]])
-    studio(tmp_path, ply_file_path="sparse_pc.ply")
+    path = studio(tmp_path, ply_file_path="sparse_pc.ply") / "sparse_pc.ply"
+    with refused(r"seed points .*sparse_pc.ply do not exist"):
+        find_scene(tmp_path, CFG)
     for colors, expected, names in (
         (np.array([10, 200], np.uint8), [10, 200], RGB),
         (np.array([0.0, 1.0], np.float32), [0, 255], RGB),
@@ -166,19 +162,12 @@ def test_nerfstudio_seeds(tmp_path):
         (np.array([0.0, 1.0], np.float32), [128, 199], [f"f_dc_{k}" for k in range(3)]),
         (None, None, RGB),
     ):
-        write_ply(tmp_path / "sparse_pc.ply", points, colors, names)
+        write_ply(path, points, colors, names)
         scene = load_scene(tmp_path, CFG)
         assert np.allclose(scene.points, points)
         assert not scene.random_seeds
         assert (scene.point_colors is None) == (expected is None)
         assert expected is None or scene.point_colors.tolist() == [[c] * 3 for c in expected]
-
-
-def test_broken_nerfstudio_seeds(tmp_path):
-    studio(tmp_path, ply_file_path="sparse_pc.ply")
-    path = tmp_path / "sparse_pc.ply"
-    with refused(r"seed points .*sparse_pc.ply do not exist"):
-        find_scene(tmp_path, CFG)
     write_ply(path, np.array([[0.0, 0.0, np.nan]]))
     with refused(r"sparse_pc.ply: 1 of 1 points are not finite"):
         find_scene(tmp_path, CFG)

@@ -37,7 +37,6 @@ def write(folder, data, *, names=("images/a.png", "images/b.png")):
 
 
 def edit(path, change):
-    """Let a function change what a .json holds."""
     data = json.loads(path.read_text())
     change(data)
     path.write_text(json.dumps(data))
@@ -46,22 +45,6 @@ def edit(path, change):
 def frames(*paths, **extra):
     pose = np.eye(4).tolist()
     return [{"file_path": path, "transform_matrix": pose, **extra} for path in paths]
-
-
-def centre_of(view):
-    return -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
-
-
-def test_fox(shared_data):
-    scene = find_scene(shared_data("nerf_fox") / "transforms.json", CFG)
-    assert len(scene.views) == 50
-    view = scene.views[0]
-    assert (view.name, view.camera, view.width, view.height) == ("0001.jpg", "0", 540, 960)
-    assert np.allclose(view.K, np.array([[687.76, 0, 277.279], [0, 687.245, 482.634], [0, 0, 1]]))
-    assert view.distortion.coefficients == (0.0578421, -0.0805099, -0.000980296, 0.00015575)
-    assert centre_of(view) == pytest.approx([3.168359, -5.479490, -0.979166], abs=1e-5)
-    # It looks at the fox, near the origin: that lies in front, z forward.
-    assert all(v.viewmat[2, 3] > 0 for v in scene.views)
 
 
 def test_camera_angle_and_absent_extension(tmp_path):
@@ -76,13 +59,13 @@ def test_camera_angle_and_absent_extension(tmp_path):
 def test_frames_override_cameras_follow_folders_and_other_sizes_are_rescaled(tmp_path):
     names = ("images/left/0.png", "images/right/0.png")
     data = {**LENS, "frames": frames(*names)}
-    data["frames"][1] |= {"fl_x": 60, "fl_y": 61, "cx": 19, "cy": 14, "k1": 0.1}
+    data["frames"][1] |= {"fl_x": 60, "fl_y": 61, "cx": 19, "cy": 14, "k1": 0.1, "p1": 0.01}
     left, right = find_scene(write(tmp_path, data, names=names), CFG).views
     assert (left.camera, right.camera) == ("left", "right")
     assert (left.name, right.name) == ("left/0.png", "right/0.png")
     assert left.K[0, 0] == left.K[1, 1] == 50
     assert np.allclose(right.K, np.array([[60, 0, 19], [0, 61, 14], [0, 0, 1]]))
-    assert right.distortion.coefficients == (0.1, 0, 0, 0)
+    assert right.distortion.coefficients == (0.1, 0, 0.01, 0)
     data = {"fl_x": 100, "w": 80, "h": 60, "frames": frames("images/a.png", "images/b.png")}
     scene = find_scene(write(tmp_path, data), CFG)
     assert np.allclose(scene.views[0].K, np.array([[50, 0, 20], [0, 50, 15], [0, 0, 1]]))
@@ -134,9 +117,6 @@ def test_broken_files(tmp_path, change, message):
         find_scene(path, CFG)
 
 
-# ------------------------------------------------------------------ triangulation
-
-
 def test_two_photographs_are_triangulated(tmp_path):
     shift, focal, baseline = 12, 200.0, 0.3
     blocks = np.random.default_rng(0).integers(0, 256, (20, 30, 3), np.uint8)
@@ -161,8 +141,6 @@ def test_one_blank_view_cannot_be_triangulated(tmp_path):
         load_scene(tmp_path, CFG)
 
 
-# ------------------------------------------------------------------ names that lead elsewhere
-
 OUTSIDE = ("../../secret.png", "a/../../../secret.png", "ABSOLUTE")
 
 
@@ -186,10 +164,12 @@ def test_names_stay_in_the_scene(tmp_path, key, name):
 
 
 def test_absolute_names_inside_and_a_folder_that_the_user_names_are_read(tmp_path):
-    scene = tmp_path / "scene"
-    listed = frames(str(scene / "images" / "a.png"))
+    scene, link = tmp_path / "scene", tmp_path / "link"
+    listed = frames(str(link / "images" / "a.png"))
     path = write(scene, {**LENS, "ply_file_path": "", "frames": listed})
-    assert find_scene(path, ALL).views[0].name == "a.png"
+    link.symlink_to(scene)
+    for root in (path, link):
+        assert find_scene(root, ALL).views[0].name == "a.png"
     (scene / "images").rename(tmp_path / "photographs")
     edit(path, lambda data: data["frames"][0].update(file_path="../photographs/a.png"))
     with refused("outside"):
@@ -204,9 +184,6 @@ def test_a_name_that_is_not_utf_8_is_refused(tmp_path):
         file.write(data)
     with refused("is not UTF-8"):
         load_scene(tmp_path, CFG)
-
-
-# ------------------------------------------------------------------ Blender
 
 
 def write_blender(root, **counts):
@@ -226,20 +203,6 @@ def find_and_split(root, cfg):
 
 def held_out(scene):
     return [view.name for view in scene.views if view.split == "test"]
-
-
-def test_lego(shared_data):
-    scene = find_scene(shared_data("nerf_synthetic_lego"), CFG)
-    assert (scene.format, scene.split_by) == ("blender", "transforms_test.json")
-    assert (len(scene.train_indices), len(scene.test_indices)) == (100, 50)
-    assert {view.camera for view in scene.views} == {"0"}
-    assert all(view.name.startswith(view.split) for view in scene.views)
-    K = scene.views[0].K
-    assert np.allclose(K, [[1111.111, 0, 400], [0, 1111.111, 400], [0, 0, 1]], atol=1e-3)
-    # The cameras look at the excavator, from 4.03 units away.
-    for view in scene.views:
-        assert np.linalg.norm(centre_of(view)) == pytest.approx(4.0311, abs=1e-3)
-        assert view.viewmat[2, 3] == pytest.approx(4.0311, abs=1e-3)
 
 
 def test_val_takes_the_place_of_test_only_where_there_is_none(tmp_path):
@@ -314,9 +277,6 @@ def test_broken_parts(tmp_path):
     (tmp_path / TEST).write_text((tmp_path / TEST).read_text()[:-40])
     with refused(rf"{TEST} is not valid JSON"):
         load_scene(tmp_path, CFG)
-
-
-# ------------------------------------------------------------------ LLFF
 
 
 def rows(count=4, focal=50.0):

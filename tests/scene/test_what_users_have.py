@@ -33,9 +33,6 @@ CFG = DataConfig()
 UTM = np.array([451_234.5, 5_212_345.25, 300.0])
 
 
-# ------------------------------------------------------------------ where and under which names
-
-
 @pytest.mark.parametrize(
     "place",
     [
@@ -103,15 +100,6 @@ def test_other_names_are_said_and_the_nearest_file_is_named(tmp_path):
         find_scene(tmp_path, CFG)
 
 
-def test_a_folder_of_smaller_images_keeps_the_folders_of_cameras(tmp_path):
-    path = write(tmp_path, {**LENS, "frames": frames("images/cam0/a.png")}, names=())
-    for folder in ("images/cam0", "images_2/cam0"):
-        write_image(tmp_path / folder / "a.png")
-    for cfg in (CFG, DataConfig(images="images_2")):
-        (view,) = find_scene(path, cfg).views
-        assert (view.name, view.camera) == ("cam0/a.png", "cam0")
-
-
 def test_byte_order_marks_and_lines_that_are_not_there(tmp_path):
     model = write_tiny_model(tmp_path)
     images = model / "images.txt"
@@ -139,18 +127,6 @@ def test_points_that_are_not_there_or_in_a_ply(tmp_path):
     assert scene.point_colors[1].tolist() == [20, 20, 20]
 
 
-def test_absolute_names_through_links(tmp_path):
-    (tmp_path / "real").mkdir()
-    (tmp_path / "link").symlink_to(tmp_path / "real")
-    listed = frames(str(tmp_path / "link" / "images" / "a.png"))
-    write(tmp_path / "real", {**LENS, "frames": listed})
-    for root in ("real", "link"):
-        assert find_scene(tmp_path / root, CFG).views[0].name == "a.png"
-
-
-# ------------------------------------------------------------------ lenses and sizes
-
-
 def test_a_crop_is_not_another_size():
     for size in ((5187, 3361), (1297, 840), (1296, 840), (648, 420), (10374, 6722), (5186, 3361)):
         assert same_shape(size, (5187, 3361))
@@ -166,9 +142,6 @@ def test_twelve_bits_in_sixteen_are_said(tmp_path):
             cv2.imwrite(str(path), np.linspace(0, top, 1200).reshape(30, 40).astype(np.uint16))
         notes = with_what_lies_beside(find_scene(root, CFG), CFG).notes
         assert any("no value above 4095: these are 12 bits" in n for n in notes) == said
-
-
-# ------------------------------------------------------------------ far from the origin
 
 
 def test_what_is_far_from_the_origin_keeps_its_places(tmp_path):
@@ -226,9 +199,6 @@ def test_models_and_tables_far_away_and_scenes_near(tmp_path):
         np.testing.assert_allclose(a.viewmat[:3, 3], offset, atol=1e-5)
 
 
-# ------------------------------------------------------------------ axes
-
-
 def test_poses_in_other_axes_are_told(tmp_path):
     def views(change):
         view, poses = make_view(tmp_path / "0.png"), map(change, around(6))
@@ -245,9 +215,6 @@ def test_poses_in_other_axes_are_told(tmp_path):
             require_axes(views(change), agreeing, "a.json")
     # What agrees with no axes is left alone.
     require_axes(views(lambda pose: pose), lambda views: 0.0, "a.json")
-
-
-# ------------------------------------------------------------------ what is one camera
 
 
 def taken(tmp_path, *names, exif=None, models="111111"):
@@ -296,9 +263,6 @@ def test_lenses_of_frames_and_models_tell_cameras_apart(tmp_path):
     assert [v.camera for v in find_scene(path, CFG).views] == list("0101")
     cfg = DataConfig(camera_by="one")
     assert {v.camera for v in find_scene(path, cfg).views} == {"0"}
-
-
-# ------------------------------------------------------------------ other fields
 
 
 def test_exposures_of_hdr_nerf_and_frames_held_out(tmp_path):

@@ -122,11 +122,6 @@ def test_a_photograph_lines_up_with_a_turned_camera(size):
     assert within.any()
 
 
-def test_codes_are_rounded_and_kept_in_range():
-    values = np.array([[[0.0, 1.4 / 255, 1.6 / 255], [1.0, 1.2, 0.5]]], np.float32)
-    np.testing.assert_array_equal(pictures.to_uint8_fast(values)[0], [[0, 1, 2], [255, 255, 128]])
-
-
 def test_vignetting_is_where_the_photograph_has_it():
     """The window's shape is not the photograph's; beyond its corners nothing darkens further."""
     K = np.array([[50.0, 0, 40], [0, 50.0, 30], [0, 0, 1]], np.float32)

@@ -61,9 +61,6 @@ def client():
     return Client()
 
 
-# ------------------------------------------------------------------ the live picture
-
-
 @pytest.fixture
 def setup(viewed, client):
     panel = Panel()
@@ -176,9 +173,7 @@ def test_a_first_view_that_cannot_be_rendered_waits(setup, client, viewed, state
 
 @pytest.mark.parametrize("error", [UserError("no photo"), RuntimeError("no photo")])
 @pytest.mark.parametrize("part", ["render", "develop"])
-def test_what_fails_is_said_once_and_the_next_request_is_served(
-    setup, client, monkeypatch, error, part
-):
+def test_what_fails_is_said_once_and_the_next_is_served(setup, client, monkeypatch, error, part):
     with monkeypatch.context() as patch:
         if part == "render":
             patch.setattr(setup.renderer, "broken", error)
@@ -192,9 +187,6 @@ def test_what_fails_is_said_once_and_the_next_request_is_served(
     setup.live.camera_moved()
     client.wait_sharp()
     assert len(client.said) == said
-
-
-# ------------------------------------------------------------------ the darkroom
 
 
 @pytest.fixture
@@ -248,9 +240,7 @@ def test_the_split_shows_the_photograph_in_its_place(darkroom, viewed, frame, ru
     assert np.mean(np.abs(rendered[left] - photo[left])) < 0.15
 
 
-def test_where_no_photograph_can_be_shown_the_split_is_the_picture(
-    darkroom, viewed, frame, run, monkeypatch
-):
+def test_without_a_photograph_the_split_is_the_picture(darkroom, viewed, frame, run, monkeypatch):
     assert viewed.view_at(frame.camera) == 1
     split = replace(common_settings(run), mode="split")
     plain = darkroom.develop(frame, replace(split, mode="display"))
@@ -290,9 +280,6 @@ def test_a_metered_exposure_follows_the_picture(darkroom, viewed, frame, run):
     assert min(here, there) <= adapting <= max(here, there)
     assert darkroom.transform(other, settings).exposure == pytest.approx(there, rel=1e-4)
     assert darkroom.metered_exposure == pytest.approx(there, rel=1e-4)
-
-
-# ------------------------------------------------------------------ the session
 
 
 @pytest.fixture

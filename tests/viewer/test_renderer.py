@@ -1,16 +1,18 @@
 """Programs compiled ahead: the renderer's picture, no wait for longer tile lists, and sizes."""
 
 import threading
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from splats import random_splats
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.render.capacity import make_renderer
-from p2gs_jax.types import Camera, Gaussians
+from p2gs_jax.types import Camera
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 
@@ -32,14 +34,10 @@ SIZES = ((320, 200), (480, 300), (1280, 800))
 
 
 def gaussians(count=200, scale=-3.0):
-    rng = np.random.default_rng(0)
-    return Gaussians(
-        means=jnp.asarray(rng.uniform((-1, -1, 3), (1, 1, 5), (count, 3)), jnp.float32),
-        quats=jnp.asarray(rng.normal(size=(count, 4)), jnp.float32),
-        log_scales=jnp.full((count, 3), scale),
-        opacity_logits=jnp.zeros(count),
-        sh=jnp.asarray(rng.normal(size=(count, 1, 3)), jnp.float32),
-    )
+    means = np.random.default_rng(0).uniform((-1, -1, 3), (1, 1, 5), (count, 3))
+    g, zeros = random_splats(count, degree=0), jnp.zeros(count)
+    scales = jnp.full((count, 3), scale)
+    return replace(g, means=jnp.float32(means), log_scales=scales, opacity_logits=zeros)
 
 
 def camera(size, z=0.0):

@@ -213,7 +213,7 @@ def served(monkeypatch):
     return found
 
 
-def test_a_browser_that_leaves_is_stopped_once(served):
+def test_a_browser_that_leaves_is_stopped_once_also_while_its_session_is_made(served):
     clients = [SimpleNamespace(client_id=k) for k in range(3)]
     for client in clients:
         served.connect(client)
@@ -221,11 +221,8 @@ def test_a_browser_that_leaves_is_stopped_once(served):
     served.disconnect(clients[1])
     assert sorted(served.sessions) == [0, 2]
     assert served.stopped == [1]
-
-
-def test_a_browser_that_leaves_while_its_session_is_made_leaves_nothing(served):
     served.on_made = served.disconnect
     for number in (5, 6):
         served.connect(SimpleNamespace(client_id=number))
-    assert served.made == served.stopped == [5, 6]
-    assert served.sessions == {}
+    assert served.made[3:] == served.stopped[1:] == [5, 6]
+    assert sorted(served.sessions) == [0, 2]

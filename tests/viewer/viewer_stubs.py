@@ -39,8 +39,6 @@ class FakeRenderer:
 
 
 class Client:
-    """A browser."""
-
     def __init__(self):
         self.pictures, self.said, self.files = [], [], []
         self.came = threading.Condition()
@@ -75,8 +73,6 @@ class Client:
 
 
 class Panel:
-    """Controls that hold what they are set to."""
-
     def __init__(self, start=None):
         self.now, self.at = start or Settings(gamma=2.2), None
         self.locked = SimpleNamespace(value=False)

@@ -109,14 +109,12 @@ ADOBE_RGB = icc_profile("Adobe RGB (1998)", ADOBE_RGB_XYZ, parametric(563 / 256)
 
 
 def write_exr(path: Path, light: np.ndarray, names: str = "RGB", **header) -> None:
-    """Write channels of light as an OpenEXR."""
     channels = {c: np.ascontiguousarray(light[..., i]) for i, c in enumerate(names)}
     with OpenEXR.File({"type": OpenEXR.scanlineimage, **header}, channels) as file:
         file.write(str(path))
 
 
 def save_heic(path: Path, pixels: np.ndarray, **options) -> None:
-    """Write pixels of 8 or 16 bits as a HEIC."""
     mode = "RGB;16" if pixels.dtype == np.uint16 else "RGB"
     data = np.ascontiguousarray(pixels).tobytes()
     image = pillow_heif.from_bytes(mode, pixels.shape[1::-1], data)
@@ -124,7 +122,6 @@ def save_heic(path: Path, pixels: np.ndarray, **options) -> None:
 
 
 def settings(time: float = 1 / 60, aperture: float = 2.8, iso: int = 200) -> Image.Exif:
-    """Return EXIF with exposure time, f-number and ISO."""
     exif = Image.Exif()
     exif[0x010F], exif[0x0110] = "Made", "One"
     exif.get_ifd(ExifTags.IFD.Exif).update({0x829A: time, 0x829D: aperture, 0x8827: iso})

@@ -1,4 +1,4 @@
-"""HEIC, raw and linear light, from their files to what the store gives and the user is told."""
+"""HEIC, raw, linear light and colour profiles, from files to what the store gives."""
 
 from __future__ import annotations
 
@@ -11,9 +11,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from PIL import Image, features
-from scene.convert.made import DISPLAY_P3, patches, save_heic, settings, write_dng, write_exr
-from scene.helpers import refused, write_image, write_tiny_model
+from PIL import Image, ImageCms, features
+from scene.convert.made import (
+    ADOBE_RGB,
+    DISPLAY_P3,
+    patches,
+    save_heic,
+    settings,
+    write_dng,
+    write_exr,
+)
+from scene.helpers import make_view, refused, write_image, write_tiny_model
 
 from p2gs_jax.config import DataConfig, FitConfig
 from p2gs_jax.core.numerics import srgb_decode, srgb_encode
@@ -21,6 +29,7 @@ from p2gs_jax.photometry.calibrate import options_of
 from p2gs_jax.run.scene_file import read_scene, write_scene
 from p2gs_jax.scene import ImageStore, load_scene
 from p2gs_jax.scene.convert.convert import Converted, convert_photographs, with_originals
+from p2gs_jax.scene.convert.icc import adobe_rgb, colour_notes, profile_of, read_profile, to_srgb
 from p2gs_jax.scene.convert.readers import exif_evs, exif_of_raw, read_exif_settings
 from p2gs_jax.scene.files import image_size, list_images
 from p2gs_jax.scene.survey import survey
@@ -36,7 +45,6 @@ def converted(folder: Path) -> Converted:
 
 
 def stored(path: Path) -> np.ndarray:
-    """Return the codes in a file, R G B (A)."""
     codes = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     return codes[..., [2, 1, 0, 3][: codes.shape[2]]]
 
@@ -59,9 +67,6 @@ def noted(result: Converted, words: str) -> bool:
 def folder(tmp_path: Path) -> Path:
     (tmp_path / "photos").mkdir()
     return tmp_path / "photos"
-
-
-# ---------------------------------------------------------------------- raw
 
 
 def test_raw_is_linear_above_its_black_level(folder: Path) -> None:
@@ -125,9 +130,6 @@ def test_raw_beside_jpeg_is_one_photograph(folder: Path, monkeypatch) -> None:
     result = converted(folder)
     assert list(result.originals.values()) == result.paths == [folder / "a.jpg"]
     assert (result.folder, result.known) == (folder, None)
-
-
-# ------------------------------------------------------ HEIC, AVIF and WebP
 
 
 def save(path: Path, pixels: np.ndarray, **options) -> None:
@@ -212,9 +214,6 @@ def test_cameras_are_named_in_raw_files_of_every_maker(kind: str) -> None:
         assert exif.get_ifd(0x8769)[0x829D] == 2.0
 
 
-# ------------------------------------------------------------- linear light
-
-
 def test_exr_keeps_light_between_photographs(folder: Path) -> None:
     light = (0.001 + 6 * patches() ** 3).astype(np.float32)
     write_exr(folder / "a.exr", light)
@@ -251,29 +250,22 @@ def test_exr_grey_alpha_chromaticities_and_no_numbers(folder: Path) -> None:
     assert light_of(c)[4, 4] == pytest.approx((0, 0.521, 0), abs=2e-3)
 
 
-@pytest.mark.parametrize(
-    ("name", "data", "words"),
-    [
-        ("a.nef", b"II*\0" + bytes(range(256)) * 40, [r"does not know .*a\.nef", "DNG Converter"]),
-        ("a.exr", b"\x76\x2f\x31\x01 and nothing", [r"a\.exr is not a readable OpenEXR"]),
-        ("a.dng", None, [r"a\.dng"]),
-        ("b.exr", None, ["has the channels Z"]),
-    ],
-)
-def test_files_that_are_refused(folder: Path, name: str, data, words: list[str]) -> None:
-    path = folder / name
-    if data is not None:
-        path.write_bytes(data)
-    elif name == "b.exr":
-        write_exr(path, np.ones((8, 8, 1), np.float32), "Z")
-    else:
-        write_dng(path, GREY)
-        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    with refused(*words):
-        converted(folder)
+def test_files_that_are_refused(folder: Path) -> None:
+    def refuse(name: str, *words: str) -> None:
+        with refused(*words):
+            converted(folder)
+        (folder / name).unlink()
 
-
-# -------------------------------------------------------------------- mixed
+    (folder / "a.nef").write_bytes(b"II*\0" + bytes(range(256)) * 40)
+    refuse("a.nef", r"does not know .*a\.nef", "DNG Converter")
+    (folder / "a.exr").write_bytes(b"\x76\x2f\x31\x01 and nothing")
+    refuse("a.exr", r"a\.exr is not a readable OpenEXR")
+    write_exr(folder / "b.exr", np.ones((8, 8, 1), np.float32), "Z")
+    refuse("b.exr", "has the channels Z")
+    write_dng(folder / "a.dng", GREY)
+    data = (folder / "a.dng").read_bytes()
+    (folder / "a.dng").write_bytes(data[: len(data) // 2])
+    refuse("a.dng", r"a\.dng")
 
 
 def test_kinds_beside_each_other_are_converted_once(folder: Path) -> None:
@@ -289,9 +281,6 @@ def test_kinds_beside_each_other_are_converted_once(folder: Path) -> None:
     assert converted(folder).paths[1].stat().st_mtime_ns == before
     write_dng(folder / "sub" / "a.dng", 2 * GREY)
     assert light_of(converted(folder).paths[1])[32, 48, 1] == pytest.approx(0.6, abs=5e-3)
-
-
-# ------------------------------------------------------------------- scenes
 
 
 def renamed(root: Path, suffix: str) -> None:
@@ -354,3 +343,81 @@ def test_names_paths_and_masks_are_the_users_own(tmp_path: Path) -> None:
     raw = survey(folder, dataclasses.replace(CFG, images=".")).cameras[0]
     assert raw.size == (96, 64)
     assert raw.ev is not None
+
+
+SRGB = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+TABLES = DISPLAY_P3.replace(b"rXYZ", b"A2B0")
+PIXELS = (40 + 150 * patches()).astype(np.uint8)
+
+
+@pytest.mark.parametrize(("data", "name"), [(DISPLAY_P3, "Display P3"), (ADOBE_RGB, "Adobe RGB")])
+def test_colours_are_those_of_littlecms(data: bytes, name: str) -> None:
+    profile = read_profile(data)
+    assert profile is not None
+    assert profile.name.startswith(name)
+    source, target = ImageCms.ImageCmsProfile(io.BytesIO(data)), ImageCms.createProfile("sRGB")
+    how = ImageCms.Intent.RELATIVE_COLORIMETRIC
+    image = ImageCms.profileToProfile(Image.fromarray(PIXELS), source, target, how)
+    theirs = np.asarray(image, float)
+    inside = (theirs > 0) & (theirs < 255)
+    assert inside.mean() > 0.9
+    assert np.abs(to_srgb(PIXELS, profile) / 257 - theirs)[inside].max() < 1.5
+    # It is a change that matters, or nothing would be tested.
+    assert np.abs(theirs - PIXELS).max() > 10
+    # Grey stays grey.
+    grey = np.repeat(np.array([[30, 128, 255]], np.uint8)[..., None], 3, 2)
+    out = to_srgb(grey, profile).astype(float)
+    assert np.ptp(out, axis=2).max() < 0.004 * 65535
+    assert out[0, 2].min() > 0.998 * 65535
+
+
+def test_srgb_broken_and_tabulated_profiles() -> None:
+    for data in (SRGB, b"", DISPLAY_P3[:200]):
+        assert read_profile(data) is None
+    profile = read_profile(TABLES)
+    assert profile is not None
+    assert profile.decode is None
+    assert to_srgb(PIXELS, profile) is PIXELS
+
+
+def test_a_store_converts_and_the_user_is_told(tmp_path: Path) -> None:
+    profiles = {"a.png": None, "b.png": DISPLAY_P3, "c.png": TABLES}
+    views = [make_view(tmp_path / name, size=(96, 64)) for name in profiles]
+    for view, data in zip(views, profiles.values(), strict=True):
+        Image.fromarray(PIXELS).save(view.image_path, **({"icc_profile": data} if data else {}))
+    kept, changed, tabulated = (ImageStore(views, DataConfig()).stored(k)[0] for k in range(3))
+    assert kept.dtype == np.uint8  # what needs no precision takes no memory for it
+    assert changed.dtype == np.uint16
+    profile = read_profile(DISPLAY_P3)
+    assert profile is not None
+    np.testing.assert_array_equal(changed, to_srgb(PIXELS, profile))
+    np.testing.assert_array_equal(tabulated, PIXELS)
+    notes = colour_notes(view.image_path for view in views)
+    assert notes[0] == "1 photographs are in Display P3; they are converted to sRGB."
+    assert "not applied" in notes[1]
+
+
+def test_alpha_beside_a_profile_is_kept_and_grey_has_none(tmp_path: Path) -> None:
+    pixels = np.full((8, 8, 4), 100, np.uint8)
+    pixels[:, :4, 3], pixels[:, 4:, 3] = 255, 0
+    Image.fromarray(pixels).save(tmp_path / "a.png", icc_profile=DISPLAY_P3)
+    write_image(tmp_path / "g.png", 77, (8, 8))
+    views = [make_view(tmp_path / name, size=(8, 8)) for name in ("a.png", "g.png")]
+    store = ImageStore(views, DataConfig())
+    np.testing.assert_array_equal(store.stored(0)[1], pixels[..., 3] > 0)
+    assert (store.stored(1)[0] == 77).all()
+
+
+def test_adobe_rgb_marked_by_exif_alone() -> None:
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA005] = {1: "R03"}
+    data = io.BytesIO()
+    Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(data, "JPEG", exif=exif)
+    with Image.open(data) as image:
+        profile = profile_of(image)
+    assert profile is not None
+    assert profile.name == adobe_rgb().name
+    icc = read_profile(ADOBE_RGB)
+    assert icc is not None
+    assert icc.matrix is not None
+    assert adobe_rgb().matrix == pytest.approx(icc.matrix, abs=2e-3)

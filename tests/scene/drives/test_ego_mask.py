@@ -24,7 +24,6 @@ CLOUDS = cv2.GaussianBlur(RNG.random((512, 1024)).astype(np.float32), (0, 0), 6)
 
 
 def pose_at(way, turned=0.0):
-    """Camera to world: `way` metres ahead (z), `turned` radians to the right."""
     pose = np.eye(4)
     pose[:3, :3] = cv2.Rodrigues(np.array([0.0, turned, 0.0]))[0]
     pose[2, 3] = way

@@ -1,6 +1,5 @@
 """Real recordings: one keyframe of nuScenes, a sequence of PandaSet, stills of KITTI."""
 
-import json
 import shutil
 
 import cv2
@@ -9,8 +8,6 @@ import pytest
 from scene.drives import writers_kitti as kitti
 from scene.drives.writers import applied
 
-from p2gs_jax.config import DataConfig
-from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.drives.lidar import owners
 from p2gs_jax.scene.drives.tables import read_pickled
 from p2gs_jax.scene.rigid import inverse
@@ -27,33 +24,17 @@ def sequence(shared_data, read):
 
 
 def project(points, to_camera, K):
-    """Return pixels, and depths."""
     local = applied(to_camera, points)
     with np.errstate(divide="ignore"):
         return (local @ K.T)[:, :2] / local[:, 2:], local[:, 2]
 
 
-def test_poses_are_those_of_the_flat_calibration(keyframe, read):
-    drive = read(keyframe)
-    flat = json.loads((keyframe / "calib_flat.json").read_text())
-    assert len(drive.photographs) == 6
-    assert drive.notes[0] == "scene.json counts 39 samples, sample.json holds 1."
-    for photograph in drive.photographs:
-        known = flat[photograph.camera]
-        pose = np.array(known["ego_to_global"]) @ np.array(known["sensor_to_ego"])
-        np.testing.assert_allclose(photograph.pose, pose, atol=1e-6)
-        seconds = (known["timestamp_us"] - flat["LIDAR_TOP"]["timestamp_us"]) * 1e-6
-        assert photograph.time == pytest.approx(seconds, abs=1e-9)
-        assert photograph.path.is_file()
-    scene = assemble(drive, DataConfig())
-    assert len(scene.views) == 6
-    assert len(scene.points) > 10_000
-
-
 def test_laser_points_land_in_the_images_when_those_were_taken(keyframe, read):
     drive = read(keyframe)
+    assert drive.notes[0] == "scene.json counts 39 samples, sample.json holds 1."
     points, times = drive.sweeps[0].read()
     assert len(points) == 34688
+    assert len(drive.photographs) == 6
     cameras = {c.name: c for c in drive.cameras}
     for photograph in drive.photographs:
         camera, to_camera = cameras[photograph.camera], inverse(photograph.pose)

@@ -98,7 +98,6 @@ def write_bytes(path: Path, data: bytes | str | None = None) -> None:
 
 
 def cut(path: Path) -> None:
-    """Leave the first half of a file."""
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 

@@ -117,7 +117,6 @@ def scan(scanner, beams, poses) -> np.ndarray:
 
 
 def six(pose) -> list[float]:
-    """Return roll, pitch, yaw and the position of a pose."""
     return [*Rotation.from_matrix(pose[:3, :3]).as_euler("ZYX")[::-1], *pose[:3, 3]]
 
 
