@@ -1,19 +1,17 @@
 """Lenses: OpenCV's formulas forwards, ours backwards, in rasters and through the readers."""
 
-import json
-
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scene.helpers import write_image, write_tiny_model
+from scene.helpers import write_tiny_model
+from scene.test_transforms import LENS, frames, write
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.scene import load_scene
+from p2gs_jax.scene import find_scene, load_scene
 from p2gs_jax.scene.lens import _fold_radius, intrinsics, undistort_points, undistortion_maps
 from p2gs_jax.scene.sfm.map import camera_of
-from p2gs_jax.scene.transforms import load_transforms
 from p2gs_jax.types import Distortion
 
 K = intrinsics(400.0, 410.0, 500.0, 300.0)
@@ -121,10 +119,7 @@ def test_colmap_lenses(tmp_path, camera, model, coefficients):
 
 @pytest.mark.parametrize("extra", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
 def test_transforms_with_fisheyes(tmp_path, extra):
-    write_image(tmp_path / "a.png")
-    lens = {"k1": 0.1, "k2": 0.02, "k3": -0.01, "k4": 0.003}
-    frames = [{"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}]
-    data = {"fl_x": 50, "fl_y": 51, "w": 40, "h": 30, **lens, **extra, "frames": frames}
-    (tmp_path / "transforms.json").write_text(json.dumps(data))
-    scene = load_transforms(tmp_path, tmp_path / "transforms.json", DataConfig())
-    assert scene.views[0].distortion == Distortion((0.1, 0.02, -0.01, 0.003), "fisheye")
+    lens = {"k1": 0.1, "k2": 0.02, "k3": -0.01, "k4": 0.003, **extra}
+    path = write(tmp_path, {**LENS, **lens, "frames": frames("images/a.png")})
+    view = find_scene(path, DataConfig()).views[0]
+    assert view.distortion == Distortion((0.1, 0.02, -0.01, 0.003), "fisheye")

@@ -184,26 +184,21 @@ def test_photographs_are_composited(cutouts, background, color):
     assert np.allclose(shrunk, premultiplied.reshape(15, 2, 20, 2, 3).mean((1, 3)), atol=2e-5)
 
 
-@pytest.mark.parametrize("alpha", ["mask", "ignore"])
-def test_alpha_as_a_mask_and_not_at_all(cutouts, alpha):
-    root, held = cutouts
-    store = store_of(root, alpha=alpha)
-    assert store.backdrop is store.alpha(0) is None
-    ldr, mask = store.get(0)
-    expected = held[0][..., 3] >= (0.5 if alpha == "mask" else 0)
-    assert np.array_equal(mask, expected.astype(np.float32))
-    assert np.allclose(ldr, held[0][..., :3])
-
-
 def test_alpha_is_always_noted_and_remembered(cutouts, tmp_path_factory):
-    for options, note in (
-        ({}, "3 of 4 photographs have an alpha channel: photographs and renders are shown"),
-        ({"background": "random"}, "shown over a random colour at every step, and white to judge"),
-        ({"alpha": "mask"}, "transparent pixels are left out"),
-        ({"alpha": "ignore"}, "it is ignored"),
+    for options, least, note in (
+        ({}, None, "3 of 4 photographs have an alpha channel: photographs and renders are shown"),
+        ({"background": "random"}, None, "over a random colour at every step, and white to judge"),
+        ({"alpha": "mask"}, 0.5, "transparent pixels are left out"),
+        ({"alpha": "ignore"}, 0, "it is ignored"),
     ):
         scene = load_scene(cutouts[0], DataConfig(**options))
         assert note in scene.notes[-1]
+        if least is not None:
+            store = ImageStore(scene.views, DataConfig(**options))
+            assert store.backdrop is store.alpha(0) is None
+            ldr, mask = store.get(0)
+            assert np.array_equal(mask, np.float32(cutouts[1][0][..., 3] >= least))
+            assert np.allclose(ldr, cutouts[1][0][..., :3])
     run = tmp_path_factory.mktemp("run")
     write_scene(run, scene)
     again = read_scene(run, cutouts[0])

@@ -137,18 +137,13 @@ def test_embedded_photographs_are_written_once(drive, tmp_path):
     assert scene.views[0].image_path.is_relative_to(tmp_path / "work")
 
 
-@pytest.mark.parametrize(
-    ("asked", "found"),
-    [(None, [3, 4, 5, 7]), ("1:3", [4, 5]), ("::2", [3, 5]), ("-1:", [7])],
-)
-def test_frames_are_sliced_by_their_place(asked, found):
-    assert chosen_frames(asked, [3, 4, 5, 7]) == found
-
-
-@pytest.mark.parametrize("asked", ["3", "a:b", "1:2:3:4", "9:12", "::0"])
-def test_frames_that_make_no_sense_are_refused(asked):
-    with refused("--frames"):
-        chosen_frames(asked, [3, 4, 5, 7])
+def test_frames_are_sliced_by_their_place_and_what_makes_no_sense_is_refused():
+    there = [3, 4, 5, 7]
+    for asked, found in ((None, there), ("1:3", [4, 5]), ("::2", [3, 5]), ("-1:", [7])):
+        assert chosen_frames(asked, there) == found
+    for asked in ("3", "a:b", "1:2:3:4", "9:12", "::0"):
+        with refused("--frames"):
+            chosen_frames(asked, there)
 
 
 def test_what_is_not_a_rotation_is_refused():

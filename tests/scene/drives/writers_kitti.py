@@ -64,12 +64,9 @@ def local_when_passed(place: np.ndarray, forward: float) -> np.ndarray:
     return local[:3]
 
 
-def stamp(seconds: float) -> str:
-    return str(START + np.timedelta64(round(seconds * 1e9), "ns")).replace("T", " ")
-
-
 def write_stamps(path: Path, times) -> None:
-    w.write_bytes(path, "".join(stamp(t) + "\n" for t in times))
+    stamps = [START + np.timedelta64(round(t * 1e9), "ns") for t in times]
+    w.write_bytes(path, "".join(f"{stamp}\n".replace("T", " ") for stamp in stamps))
 
 
 def numbers(values) -> str:

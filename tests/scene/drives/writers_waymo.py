@@ -82,14 +82,14 @@ def image_row(k, camera, **changes) -> dict:
     return row | changes
 
 
-def lens_row(camera, **changes) -> dict:
+def lens_row(camera) -> dict:
     numbers = {"f_u": 50.0, "f_v": 51.0, "c_u": 32.0, "c_v": 24.0, "k1": 0.05, "k2": -0.02}
     numbers |= {"p1": 1e-3, "p2": -1e-3, "k3": 0.0}
     row = {"key.camera_name": camera}
     row |= {f"{LENS}intrinsic.{name}": value for name, value in numbers.items()}
     row |= {f"{LENS}extrinsic.transform": mount(camera)}
     row |= {f"{LENS}width": w.WIDTH, f"{LENS}height": w.HEIGHT}
-    return row | {f"{LENS}rolling_shutter_direction": 2} | changes
+    return row | {f"{LENS}rolling_shutter_direction": 2}
 
 
 def off_walls(points: np.ndarray) -> np.ndarray:
@@ -116,10 +116,6 @@ def scan(scanner, beams, poses) -> np.ndarray:
     return image
 
 
-def six(pose) -> list[float]:
-    return [*Rotation.from_matrix(pose[:3, :3]).as_euler("ZYX")[::-1], *pose[:3, 3]]
-
-
 def ranged(prefix, k, laser, image) -> dict:
     return {
         "key.frame_timestamp_micros": stamp(k),
@@ -135,7 +131,10 @@ def write_lidar(root, count, segment) -> None:
     for k in range(count):
         turning = [w.car_at(TURN * (k + (c + 0.5) / WIDE)) for c in range(WIDE)]
         upper = scan(UPPER, BEAMS, turning)
-        own = np.tile(np.array([six(pose) for pose in turning], np.float32), (len(BEAMS), 1, 1))
+        # Roll, pitch, yaw and the position of a pose.
+        turns = [Rotation.from_matrix(p[:3, :3]).as_euler("ZYX")[::-1] for p in turning]
+        six = np.hstack([turns, [p[:3, 3] for p in turning]]).astype(np.float32)
+        own = np.tile(six, (len(BEAMS), 1, 1))
         # Nothing was measured here, and there is no pose.
         upper[0, :5, 0], own[0, :5] = -1, 0
         still = [w.car_at(TURN * k + MIDDLE)] * NARROW
