@@ -25,7 +25,7 @@ class Eval:
     """Evaluate a finished run again, also against a reference, or beside other programs.
 
     p2gs-jax eval runs/castle --reference castle/iso8
-    p2gs-jax eval runs/castle --against gaussian-splatting/output/castle
+    p2gs-jax eval runs/castle --against gaussian-splatting/output/castle/test/ours_30000/renders
     """
 
     run: RunPath
@@ -63,7 +63,7 @@ class Eval:
         reference = self.reference or fitted.reference
         truth = None if reference is None else load_reference(reference, scene, cfg)
         others = {
-            label: check_renders(find_renders(place, scene), scene, store)
+            label: check_renders(find_renders(place, scene), store)
             for label, place in _labelled(self.against).items()
         }
         with TerminalReporter() as reporter:
@@ -89,7 +89,7 @@ class Eval:
         print_metrics(metrics, self.run)
         if others:
             write_json(folder.against, beside)
-            remarks = [remark for renders in others.values() for remark in renders.remarks]
+            remarks = [renders.remark for renders in others.values() if renders.remark]
             print_against(beside, self.run, metrics, remarks, folder.against)
         return 0
 

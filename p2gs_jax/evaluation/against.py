@@ -19,7 +19,7 @@ from p2gs_jax.config import PhotometryConfig, RenderConfig
 from p2gs_jax.evaluation.alignment import with_fitted_exposure
 from p2gs_jax.evaluation.evaluate import Judge
 from p2gs_jax.evaluation.passes import map_in_order
-from p2gs_jax.evaluation.renders_of_others import OtherRenders, Rendered, in_order, orders
+from p2gs_jax.evaluation.renders_of_others import OtherRenders, Rendered
 from p2gs_jax.evaluation.scores import still_mask, summary_of, view_scores
 from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
 from p2gs_jax.photometry.formation import LEAST_ALPHA
@@ -30,41 +30,18 @@ from p2gs_jax.types import GAMMA_SRGB, Gaussians, Scene
 
 # Protocols of a run that are set beside those of other programs.
 OWN = ("averaged", "exposure_fitted")
-# How many pictures are looked at to tell two orders of views apart.
-MOST_LOOKED_AT = 8
 AS_IT_IS = DisplayTransform(1.0, GAMMA_SRGB, PhotometryConfig(curve="linear"))
 
 
-def check_renders(found: OtherRenders, scene: Scene, store: ImageStore) -> OtherRenders:
+def check_renders(found: OtherRenders, store: ImageStore) -> OtherRenders:
     """Read all renders once, so that what is wrong with them is said before anything long.
-
-    Returns:
-        The same; numbered ones in that order of `orders` in which they are nearer to the
-        photographs.
 
     Raises:
         UserError: see `OtherRenders.read`.
     """
     for row in found.files:
         found.read(row, _size(store, row), over=store.backdrop is not None)
-    possible = orders(scene) if found.numbered else []
-    if len(possible) < 2:
-        return found
-    # Only places where the orders differ tell anything.
-    where = [k for k in range(len(found.files)) if len({order[k] for order in possible}) > 1]
-    where = where[:MOST_LOOKED_AT]
-
-    def distance(order: tuple[int, ...]) -> float:
-        """Return the summed mean squared distances of renders from photographs."""
-        as_views, total = in_order(found, order), 0.0
-        for row in (order[k] for k in where):
-            photograph, mask = store.get(row)
-            pixels = as_views.read(row, _size(store, row)).pixels
-            total += float(np.mean(mask[..., None] * (pixels - photograph) ** 2))
-        return total
-
-    sizes = {_size(store, row) for row in found.files}
-    return in_order(found, min(possible, key=distance)) if len(sizes) == 1 else found
+    return found
 
 
 def _size(store: ImageStore, row: int) -> tuple[int, int]:

@@ -26,7 +26,7 @@ from jaxtyping import Float32
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.evaluation.alignment import fit_capture, with_fitted_exposure
-from p2gs_jax.evaluation.drives import DriveScores
+from p2gs_jax.evaluation.drives import DepthScores
 from p2gs_jax.evaluation.lpips import LpipsWeights
 from p2gs_jax.evaluation.passes import ArrayStore, StoredArray, map_in_order, most_bytes
 from p2gs_jax.evaluation.radiance import RadianceScores, Truth
@@ -34,7 +34,6 @@ from p2gs_jax.evaluation.references import Reference
 from p2gs_jax.evaluation.scores import (
     VideoScores,
     ViewResult,
-    is_drive,
     masks_of_parts,
     still_mask,
     summary_of,
@@ -139,7 +138,7 @@ def evaluate(
     living = jax.device_put(np.ones(params.gaussians.capacity, bool))
     seen = functools.partial(render or make_renderer(cfg.render), gaussians, living)
     with ArrayStore(most_bytes(cfg.data.cache_mb)) as arrays:
-        views = _Views(judge, seen, arrays)
+        views = _Views(judge, arrays)
         judged = functools.partial(_judged, judge, seen, radiance)
         # In the order of names: the frames of a camera are then in sequence.
         for found in map_in_order(judged, range(len(scene.views))):
@@ -226,10 +225,9 @@ def _all_fitted(
 class _Views:
     """Collects judged views, and what needs all of them."""
 
-    def __init__(self, judge: Judge, seen: Callable[[Camera], Render], arrays: ArrayStore):
+    def __init__(self, judge: Judge, arrays: ArrayStore):
         self._judge, self._arrays = judge, arrays
-        scene, store = judge.scene, judge.store
-        self._drive = DriveScores(scene, store, seen, arrays) if is_drive(scene) else None
+        self._depths = DepthScores(judge.scene, judge.store)
         self._radiance = RadianceScores(arrays)
         self._rows: dict[str, dict[str, dict]] = defaultdict(dict)
         self._videos = {name: VideoScores() for name in ("per_view", "averaged", "photographs")}
@@ -271,8 +269,7 @@ class _Views:
             self._readings[view.name] = found.readings
         else:
             self._held_out.append((found.readings, kept(result.photograph)))
-        if self._drive is not None:
-            self._drive.add(result, found.mask)
+        self._depths.add(result, found.mask)
         exposure = result.transform.exposure
         self._videos["per_view"].add(view.camera, result.ldr, exposure)
         self._videos["averaged"].add(view.camera, found.averaged, judge.mean.exposure)
@@ -280,7 +277,7 @@ class _Views:
 
     def evaluation(self) -> Evaluation:
         """Return all scores."""
-        judge, rows, drive = self._judge, self._rows, self._drive
+        judge, rows = self._judge, self._rows
         exposures = np.asarray(judge.small.photometry.exposures)
         train, tone = summary_of(rows["train"]), judge.cfg.photometry
         per_view = train.pop("per_view", {})
@@ -307,8 +304,7 @@ class _Views:
             exposed = exposed_at(judge.cfg.loss.saturation, gamma, tone)
             typical = float(np.median(exposures))
             metrics["radiance"] = self._radiance.summary(exposed / typical)
-        if drive is not None:
-            metrics |= drive.summary()
+        metrics |= self._depths.summary()
         if self._references:
             metrics["reference"] = _against_reference(self._references, judge)
         return Evaluation(metrics, metering)
@@ -353,7 +349,6 @@ def _against_reference(views: list[_Kept], judge: Judge) -> dict[str, Any]:
     scales = list(map_in_order(scale, views))
     protocols = {
         "averaged": mean.exposure,
-        "geometric": mean.exposure_geometric,
         "scale_aligned": float(np.exp(np.median(np.log(scales)))),
     }
 

@@ -5,9 +5,7 @@ docs/comparing.md describes the layouts.
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,19 +13,13 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from p2gs_jax.core.text import natural
+from p2gs_jax.core.text import first_few
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.exr import read_exr_with_alpha
 from p2gs_jax.types import Scene
 
 # Display values come first: a program that writes both developed them itself.
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
-# Where pictures by name lie below the folder given: here, nerfstudio's `ns-render dataset`, others.
-PLACES = (".", "rgb", "test/rgb", "renders", "test/renders", "test")
-# Luminance-GS, whose views are in that order as well; beside these pictures are dark ones.
-LUMINANCE_GS = re.compile(r"val_(?P<step>)(?P<k>\d+)_enh")
-# gsplat's trainer writes photograph and render side by side, in the order of held-out views.
-GSPLAT = re.compile(r"(?:val|test)_step(?P<step>\d+)_(?P<k>\d+)")
 
 
 class Rendered(NamedTuple):
@@ -46,28 +38,17 @@ class OtherRenders:
     layout: str  # in words
     files: dict[int, Path]
     missing: tuple[str, ...] = ()  # names of held-out views that no file shows
-    of_training: int = 0  # files that show training views
-    unknown: int = 0  # files that show no view
-    numbered: bool = False  # in the order of held-out views; their names say no more
-    right_half: bool = False  # the photograph is to the left of the render in each file
 
     @property
-    def remarks(self) -> tuple[str, ...]:
-        """What is to be said of it, in sentences."""
-        said = []
-        if self.missing:
-            shown = ", ".join(self.missing[:5]) + (", ..." if len(self.missing) > 5 else "")
-            said.append(
-                f"{self.folder} lacks {len(self.missing)} of "
-                f"{len(self.missing) + len(self.files)} held-out views ({shown}): this run is "
-                f"judged over the other {len(self.files)} as well."
-            )
-        if self.of_training or self.unknown:
-            said.append(
-                f"{self.folder}: {self.of_training} files show training views and {self.unknown} "
-                "no view of the scene; they are not judged."
-            )
-        return tuple(said)
+    def remark(self) -> str | None:
+        """What is to be said of it, if anything."""
+        if not self.missing:
+            return None
+        return (
+            f"{self.folder} lacks {len(self.missing)} of {len(self.missing) + len(self.files)} "
+            f"held-out views ({first_few(self.missing)}): this run is judged over the other "
+            f"{len(self.files)} as well."
+        )
 
     def read(self, row: int, size: tuple[int, int], over: bool = False) -> Rendered:
         """Return the render of a view, which must have a size of (width, height) pixels.
@@ -84,8 +65,6 @@ class OtherRenders:
         else:
             pixels = _read_display(path)
         height, width = pixels.shape[:2]
-        if self.right_half and width == 2 * size[0]:
-            pixels, width = pixels[:, size[0] :], size[0]
         if (width, height) != size:
             raise UserError(
                 f"{path} is {width}x{height}, the run's view {size[0]}x{size[1]}.",
@@ -129,9 +108,7 @@ def _read_display(path: Path) -> Float32[np.ndarray, "h w 3"]:
 def find_renders(folder: str | Path, scene: Scene) -> OtherRenders:
     """Return which files of a folder show which held-out views.
 
-    Looked for in this order: pictures with the names of views, here or in one of `PLACES`; those
-    of the 3DGS code (`test/ours_N/renders`, the largest N; before pictures by name), of gsplat's
-    trainer or Luminance-GS, or bare numbers here: all the held-out views in the order of names.
+    Pictures have the names of views; or bare numbers: all held-out views in the order of names.
 
     Raises:
         UserError: the scene holds nothing out, the folder holds no render, or numbered ones whose
@@ -145,116 +122,39 @@ def find_renders(folder: str | Path, scene: Scene) -> OtherRenders:
             "the run holds no view out, and renders are compared on held-out views.",
             fix="fit with --test-every 8",
         )
-    numbered = _of_3dgs(folder)
-    if numbered is None:
-        by_name = (_by_name(folder, folder / place, scene) for place in PLACES)
-        found = next(filter(None, by_name), None)
-        if found is not None:
-            return found
-        numbered = _of_trainers(folder)
-        if numbered is None and (bare := _numbers(folder)):
-            numbered = ("numbered pictures", bare, False)
-    if numbered is None:
+    names, named = {row: scene.views[row].name for row in scene.test_indices}, _by_name(folder)
+    files: dict[int, Path] = {}
+    for row, name in names.items():
+        stem = Path(name).with_suffix("").as_posix()
+        found = [stem + suffix for suffix in (".render.png", *SUFFIXES) if stem + suffix in named]
+        if found:
+            files[row] = named[found[0]]
+    if files:
+        missing = tuple(name for row, name in names.items() if row not in files)
+        return OtherRenders(folder, "pictures by name", files, missing)
+    numbered = sorted((p for p in named.values() if p.stem.isdecimal()), key=lambda p: int(p.stem))
+    if not numbered:
         raise UserError(
             f"{folder} holds no render of a held-out view (for example "
-            f"{Path(scene.views[scene.test_indices[0]].name).with_suffix('.png')}).",
-            fix="name pictures as the scene's views, or keep the folder as the 3DGS code or gsplat "
-            "wrote it (docs/comparing.md)",
+            f"{Path(min(names.values())).with_suffix('.png')}).",
+            fix="name pictures as the scene's views, or number them in the order of these names",
         )
-    layout, files, right_half = numbered
-    if len(files) != len(scene.test_indices):
+    if len(numbered) != len(names):
         raise UserError(
-            f"{files[0].parent} holds {len(files)} numbered renders, the run holds "
-            f"{len(scene.test_indices)} views out.",
+            f"{folder} holds {len(numbered)} numbered renders, the run holds {len(names)} views "
+            "out.",
             fix="hold out the same views in both programs (--test-every), or name the renders as "
             "the views",
         )
-    rows = orders(scene)[0]
-    by_row = dict(zip(rows, files, strict=True))
-    return OtherRenders(folder, layout, by_row, numbered=True, right_half=right_half)
+    rows = sorted(names, key=lambda row: names[row])
+    return OtherRenders(folder, "numbered pictures", dict(zip(rows, numbered, strict=True)))
 
 
-def orders(scene: Scene) -> list[tuple[int, ...]]:
-    """Return the orders in which programs number held-out views, without doubles.
-
-    As text, as 3DGS and gsplat do; and with numbers in names counted (2 before 10), which is the
-    order that the files of NeRF-synthetic have.
-    """
-    rows = sorted(scene.test_indices, key=lambda row: scene.views[row].name)
-    counted = sorted(rows, key=lambda row: natural(scene.views[row].name))
-    return list(dict.fromkeys((tuple(rows), tuple(counted))))
-
-
-def in_order(found: OtherRenders, order: Sequence[int]) -> OtherRenders:
-    """Return numbered renders as views in another order."""
-    return replace(found, files=dict(zip(order, found.files.values(), strict=True)))
-
-
-def _by_name(folder: Path, place: Path, scene: Scene) -> OtherRenders | None:
-    if not place.is_dir():
-        return None
-    files = {
-        p.relative_to(place).as_posix(): p
-        for p in sorted(place.rglob("*"))
-        if p.is_file() and p.suffix.lower() in SUFFIXES and not p.name.startswith(".")
+def _by_name(folder: Path) -> dict[str, Path]:
+    """Return the pictures below a folder, by their names from there, suffixes in lower case."""
+    found = (p for p in sorted(folder.rglob("*")) if p.suffix.lower() in SUFFIXES and p.is_file())
+    return {
+        p.relative_to(folder).with_suffix(p.suffix.lower()).as_posix(): p
+        for p in found
+        if not p.name.startswith(".")
     }
-    claimed: dict[int, list[str]] = {}
-    for row, view in enumerate(scene.views):
-        stem = Path(view.name).with_suffix("").as_posix()
-        names = [f"{stem}.render.png", *(stem + s for s in SUFFIXES), view.name]
-        names += [stem + s.upper() for s in SUFFIXES]
-        claimed[row] = [n for n in dict.fromkeys(names) if n in files]
-    held_out = {row: files[claimed[row][0]] for row in scene.test_indices if claimed[row]}
-    if not held_out:
-        return None
-    stems = {Path(v.name).with_suffix("").as_posix() for v in scene.views}
-    # What p2gs-jax writes beside a render.
-    beside = {f"{s}.photograph.png" for s in stems} | {
-        n for names in claimed.values() for n in names
-    }
-    return OtherRenders(
-        folder,
-        "pictures by name",
-        held_out,
-        tuple(scene.views[row].name for row in scene.test_indices if not claimed[row]),
-        sum(bool(claimed[row]) for row in scene.train_indices),
-        len(files.keys() - beside),
-    )
-
-
-_Numbered = tuple[str, list[Path], bool]
-
-
-def _of_3dgs(folder: Path) -> _Numbered | None:
-    """Return the pictures that `render.py` of the 3DGS code wrote last, if it wrote any."""
-    runs = [folder, *folder.glob("ours_*"), *folder.glob("test/ours_*")]
-    if folder.name == "renders":
-        runs.append(folder.parent)
-    runs = [r for r in runs if re.fullmatch(r"ours_\d+", r.name) and (r / "renders").is_dir()]
-    if not runs:
-        return None
-    last = max(runs, key=lambda r: int(r.name[5:]))
-    files = _numbers(last / "renders")
-    return (f"3DGS, {last.name}", files, False) if files else None
-
-
-def _of_trainers(folder: Path) -> _Numbered | None:
-    """Return the pictures of gsplat's last evaluation, or of Luminance-GS, if there are any."""
-    for pattern, layout, beside in (
-        (GSPLAT, "gsplat, step {}", True),
-        (LUMINANCE_GS, "Luminance-GS, enhanced", False),
-    ):
-        found: dict[int, list[tuple[int, Path]]] = {}
-        for place in (folder, folder / "renders"):
-            for path in place.glob("*.png"):
-                if match := pattern.fullmatch(path.stem):
-                    found.setdefault(int(match["step"] or 0), []).append((int(match["k"]), path))
-        if found:
-            last = max(found)
-            return layout.format(last), [path for _, path in sorted(found[last])], beside
-    return None
-
-
-def _numbers(folder: Path) -> list[Path]:
-    named = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.stem.isdecimal()]
-    return sorted(named, key=lambda p: int(p.stem))

@@ -62,9 +62,6 @@ PROTOCOLS = {
     "reference_averaged": Protocol(
         "all", "reference photographs, mean exposure", ("reference", "averaged")
     ),
-    "reference_geometric": Protocol(
-        "all", "reference photographs, geometric mean exposure", ("reference", "geometric")
-    ),
     "reference": Protocol(
         "all", "reference photographs, one scale for all", ("reference", "scale_aligned")
     ),

@@ -170,7 +170,7 @@ def seconds_to_finish(
     per_view, per_pixel = (0.13, 0.35e-6) if reference else (0.09, 0.25e-6)
     start, times = 6.0, 5 if reference else 2
     if is_drive(scene):
-        # Parts of every view, and views from beside the way; LPIPS of static and moving pixels.
+        # Parts of every view, and depth against LiDAR; LPIPS of static and moving pixels.
         start, per_view, times = start + 6.0, per_view + 0.1, 3 * times
     if lpips_weights is not None:
         # Under two protocols (three where views have gammas), and three more against a reference.

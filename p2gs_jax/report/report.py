@@ -65,7 +65,6 @@ def report_page(run: RunFiles, scene: SceneMeasurements) -> str:
         ("scores", "Scores", sections.score_section(run)),
         ("parts", "What stands, and what moves", sections.parts_section(run)),
         ("depth", "Depth against LiDAR", sections.depth_section(run)),
-        ("novel", "From beside the way", sections.novel_section(run)),
         ("training", "Training", sections.training_section(run)),
         ("timings", "Timings and counts", sections.timing_section(run)),
         ("configuration", "Configuration", sections.configuration_section(run)),

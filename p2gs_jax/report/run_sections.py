@@ -15,14 +15,13 @@ from p2gs_jax.presets import flat, preset, to_dict
 from p2gs_jax.report.charts import training_chart
 from p2gs_jax.report.findings import column, duration, seconds_of
 from p2gs_jax.report.page import figure, folded, paragraph, table, text
-from p2gs_jax.report.run_files import RunFiles, number_at, part_at
+from p2gs_jax.report.run_files import RunFiles, number_at
 
 MOST_TERMS = 3
 SCORES = {"psnr": 2, "ssim": 4, "lpips": 4}
 RADIANCE = {
     "pu21_psnr": "PU21 PSNR {:.2f} dB",
     "pu21_ssim": "PU21 SSIM {:.4f}",
-    "delta_e_itp": "colour difference {:.1f} ΔE ITP",
     "mu_law_psnr": "mu-law PSNR {:.2f} dB",
 }
 VIDEOS = {
@@ -135,25 +134,6 @@ def _depth(found: dict[str, Any], name: str) -> str:
     if value is None:  # infinite: more than half of the points have no surface
         return "none"
     return f"{value:.2f} m" if name == "median_m" else f"{value:.1%}"
-
-
-def novel_section(run: RunFiles) -> str:
-    """Return views from beside the way."""
-    items, rows = run.metrics.get("novel_views"), []
-    shifts = [(number_at(item, "shift_m"), item) for item in items or ()]
-    for shift, item in sorted(((s, i) for s, i in shifts if s is not None), key=lambda p: -p[0]):
-        found, unseen = part_at(item, "depth", "static"), number_at(item, "unseen")
-        known = number_at(found, "points") is not None
-        depth = [_depth(found, n) if known else "" for n in ("median_m", "within_10_percent")]
-        side = "left" if shift > 0 else "right"
-        rows.append([f"{abs(shift):g} m to the {side}", f"{unseen or 0:.1%}", *depth])
-    names = ["camera", "pixels that no training view shows", "median depth error"]
-    note = (
-        "Some views moved sideways, seen from the driving direction. There are no photographs to "
-        "compare with: the first number is what must be invented there, by the rendered depth; "
-        "depth is held against LiDAR as above, what stands only."
-    )
-    return _numbers([*names, "depth within 10 %"], rows, 1, note)
 
 
 def training_section(run: RunFiles) -> str:

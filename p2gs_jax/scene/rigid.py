@@ -247,24 +247,6 @@ def headings(
     return out[nearest]
 
 
-def left_of_way(views: Sequence[View]) -> Float[np.ndarray, "v 3"]:
-    """Return left of the driving direction at each view, level, of length 1.
-
-    The order of each camera's frames, or of its names, must be that of time.
-    """
-    viewmats = np.stack([view.viewmat for view in views]).astype(np.float64)
-    cameras = [view.camera for view in views]
-    up = up_of_drive(viewmats, cameras)
-    centers = camera_centers(viewmats)
-    otherwise = level_ahead(views, up)
-    out = np.zeros((len(views), 3))
-    for name in set(cameras):
-        rows = [k for k, camera in enumerate(cameras) if camera == name]
-        rows.sort(key=lambda k: time_order(views[k]))
-        out[rows] = np.cross(up, headings(centers[rows], up, otherwise))
-    return out
-
-
 def time_order(view: View) -> tuple[int, tuple]:
     """Return what sorts the views of a camera by time: frames where there are any, else names.
 

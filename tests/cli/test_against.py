@@ -71,20 +71,13 @@ def test_what_the_run_rendered_itself_scores_as_the_run(own_run, judged, tmp_pat
     assert found["as_rendered"]["psnr"] == pytest.approx(averaged, abs=0.01)
 
 
-def test_folders_of_3dgs_and_gsplat_are_read(held_out, judged, tmp_path):
-    pictures = [held_out[name] for name in sorted(held_out)]
-    for k, image in enumerate(pictures):
-        write(tmp_path / f"a/test/ours_7000/renders/{k:05d}.png", 255 - image)
-        write(tmp_path / f"a/test/ours_30000/renders/{k:05d}.png", image)
-        write(tmp_path / f"b/renders/val_step6999_{k:04d}.png", np.hstack([image, 255 - image]))
-        write(tmp_path / f"b/renders/val_step29999_{k:04d}.png", np.hstack([image, image // 2]))
+def test_an_exposure_a_view_undoes_what_is_a_matter_of_exposure(held_out, judged, tmp_path):
+    for k, name in enumerate(sorted(held_out)):
+        write(tmp_path / f"a/{k:05d}.png", held_out[name])
+        write(tmp_path / f"b/{k:05d}.png", held_out[name] // 2)
     (a, b), _ = judged(tmp_path / "a", tmp_path / "b")
-    assert [a["layout"], b["layout"]] == ["3DGS, ours_30000", "gsplat, step 29999"]
+    assert a["layout"] == "numbered pictures"
     assert a["as_rendered"]["psnr"] > 100
-    half = np.mean(((pictures[0] - pictures[0] // 2) / 255.0) ** 2)
-    first = b["as_rendered"]["per_view"][min(held_out)]["psnr"]
-    assert first == pytest.approx(-10 * np.log10(half), abs=1e-3)
-    # One scalar a view undoes most of what is a matter of exposure.
     assert b["exposure_fitted"]["psnr"] > b["as_rendered"]["psnr"] + 10
 
 
@@ -99,7 +92,6 @@ def test_views_that_are_missing_are_said_and_left_out_of_both(own_run, held_out,
     assert list(found["run"]["averaged"]["per_view"]) == [kept]
     said = " ".join(text.split())
     assert f"lacks 1 of 2 held-out views ({lost})" in said
-    assert "1 files show training views and 1 no view" in said
 
 
 def test_a_common_exposure_is_judged_too(held_out, judged, tmp_path):

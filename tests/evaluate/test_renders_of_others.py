@@ -12,7 +12,7 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.against import check_renders, judge_renders
 from p2gs_jax.evaluation.evaluate import Judge
-from p2gs_jax.evaluation.renders_of_others import find_renders, orders
+from p2gs_jax.evaluation.renders_of_others import find_renders
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Params, Photometry
 
@@ -38,20 +38,13 @@ def photograph(scene, name):
     return image
 
 
-def test_numbered_renders_follow_the_order_that_fits_the_photographs(tmp_path):
-    names = ("r_2.png", "r_10.png", "r_30.png")
-    scene, store = made_scene(tmp_path / "scene", names)
-    as_text, counted = ([scene.views[row].name for row in order] for order in orders(scene))
-    assert as_text == ["r_10.png", "r_2.png", "r_30.png"]
-    assert counted == ["r_2.png", "r_10.png", "r_30.png"]
-    for label, order in (("text", as_text), ("counted", counted)):
-        folder = tmp_path / label
-        folder.mkdir()
-        for k, name in enumerate(order):
-            cv2.imwrite(str(folder / f"{k:05d}.png"), photograph(scene, name))
-        found = check_renders(find_renders(folder, scene), scene, store)
-        shown = {scene.views[row].name: path.name for row, path in found.files.items()}
-        assert shown == {name: f"{k:05d}.png" for k, name in enumerate(order)}
+def test_numbered_renders_are_in_the_order_of_names(tmp_path):
+    scene, store = made_scene(tmp_path / "scene", ("r_2.png", "r_10.png", "r_30.png"))
+    (tmp_path / "other").mkdir()
+    for k, name in enumerate(("r_10.png", "r_2.png", "r_30.png")):
+        cv2.imwrite(str(tmp_path / "other" / f"{k:05d}.PNG"), photograph(scene, name))
+    found = check_renders(find_renders(tmp_path / "other", scene), store)
+    assert judge_renders(found, judge(scene, store))["as_rendered"]["psnr"] > 100
 
 
 def test_masked_pixels_do_not_count(tmp_path):
@@ -86,25 +79,3 @@ def test_a_scene_without_held_out_views_cannot_be_compared(tmp_path):
     scene, _ = made_scene(tmp_path / "scene", ())
     with pytest.raises(UserError, match="holds no view out"):
         find_renders(tmp_path, scene)
-
-
-def test_pictures_by_name_may_lie_where_programs_put_them(tmp_path):
-    scene, _ = made_scene(tmp_path / "scene", ("a.png",))
-    for place in ("test/rgb", "renders"):
-        folder = tmp_path / place.replace("/", "_")
-        (folder / place).mkdir(parents=True)
-        cv2.imwrite(str(folder / place / "a.jpg"), photograph(scene, "a.png"))
-        found = find_renders(folder, scene)
-        assert [p.name for p in found.files.values()] == ["a.jpg"]
-        assert not found.missing
-
-
-def test_the_enhanced_pictures_of_luminance_gs_are_taken(tmp_path):
-    scene, store = made_scene(tmp_path / "scene", ("a.png", "b.png"))
-    folder = tmp_path / "bike" / "renders"
-    folder.mkdir(parents=True)
-    for k, name in enumerate(("a.png", "b.png")):
-        cv2.imwrite(str(folder / f"val_{k:04d}_enh.png"), photograph(scene, name))
-        cv2.imwrite(str(folder / f"val_{k:04d}_low.png"), photograph(scene, name) // 2)
-    found = check_renders(find_renders(tmp_path / "bike", scene), scene, store)
-    assert [p.name for p in found.files.values()] == ["val_0000_enh.png", "val_0001_enh.png"]

@@ -93,7 +93,7 @@ def twin(ball, tmp_path):
     shutil.copytree(run.folder / "renders", tmp_path / "twin")
 
     def judged():
-        found = check_renders(find_renders(tmp_path / "twin", run.scene), run.scene, run.store)
+        found = check_renders(find_renders(tmp_path / "twin", run.scene), run.store)
         return judge_renders(found, Judge(run.scene, run.store, run.params, run.cfg))
 
     return tmp_path / "twin", judged, result.metrics["test"]
