@@ -28,8 +28,8 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.evaluation.alignment import fit_capture, with_fitted_exposure
 from p2gs_jax.evaluation.drives import DepthScores
 from p2gs_jax.evaluation.lpips import LpipsWeights
-from p2gs_jax.evaluation.passes import ArrayStore, StoredArray, map_in_order, most_bytes
-from p2gs_jax.evaluation.radiance import RadianceScores, Truth
+from p2gs_jax.evaluation.passes import map_in_order
+from p2gs_jax.evaluation.radiance import Alignment, Truth, sampled
 from p2gs_jax.evaluation.references import Reference
 from p2gs_jax.evaluation.scores import (
     VideoScores,
@@ -137,19 +137,18 @@ def evaluate(
     gaussians = jax.device_put(params.gaussians)
     living = jax.device_put(np.ones(params.gaussians.capacity, bool))
     seen = functools.partial(render or make_renderer(cfg.render), gaussians, living)
-    with ArrayStore(most_bytes(cfg.data.cache_mb)) as arrays:
-        views = _Views(judge, arrays)
-        judged = functools.partial(_judged, judge, seen, radiance)
-        # In the order of names: the frames of a camera are then in sequence.
-        for found in map_in_order(judged, range(len(scene.views))):
-            on_progress(found.result.index + 1, len(scene.views))
-            views.add(found)
-            on_view(found.result)
-        return views.evaluation()
+    views = _Views(judge)
+    judged = functools.partial(_judged, judge, seen, radiance)
+    # In the order of names: the frames of a camera are then in sequence.
+    for found in map_in_order(judged, range(len(scene.views))):
+        on_progress(found.result.index + 1, len(scene.views))
+        views.add(found)
+        on_view(found.result)
+    return views.evaluation(seen, radiance)
 
 
 class _Judged(NamedTuple):
-    """A view with its scores, and the references that need all views to compare with."""
+    """A view with its scores, and what of it tells with all others how to compare them."""
 
     result: ViewResult
     averaged: Float32[np.ndarray, "h w 3"]  # display values with the mean parameters
@@ -157,8 +156,8 @@ class _Judged(NamedTuple):
     scores: dict[str, Any]  # of `result.ldr`
     scores_averaged: dict[str, Any]
     scores_all: dict[str, Any] | None  # of a held-out view with all fitted that varies per view
-    radiance: np.ndarray | None  # true, linear
-    reference: np.ndarray | None  # photograph under the common exposure
+    sample: np.ndarray | None  # of its radiance and the true one, where there is one
+    scale: float | None  # exposure under which it fits its reference, where there is one
     readings: Readings
 
 
@@ -186,6 +185,14 @@ def _judged(
         everything = _all_fitted(linear, photograph, still, transform, score, alpha)
     ldr = develop(linear, transform, alpha=alpha)
     depth = np.asarray(rendered.depth)
+    truth = None if radiance is None else radiance(index)
+    aligned = None if judge.reference is None else judge.reference(index)
+    scale = sample = None
+    if aligned is not None:
+        shown = judge.usual(None)
+        scale = with_fitted_exposure(shown, linear, aligned, mask, alpha).exposure
+    if truth is not None:
+        sample = sampled(linear, truth, mask > 0.5, len(scene.views))
     return _Judged(
         ViewResult(index, linear, alpha, depth, ldr, photograph, transform),
         averaged,
@@ -193,8 +200,8 @@ def _judged(
         {**score(ldr), **extra},
         score(averaged),
         everything,
-        None if radiance is None else radiance(index),
-        None if judge.reference is None else judge.reference(index),
+        sample,
+        scale,
         meter(linear, alpha),
     )
 
@@ -225,24 +232,24 @@ def _all_fitted(
 class _Views:
     """Collects judged views, and what needs all of them."""
 
-    def __init__(self, judge: Judge, arrays: ArrayStore):
-        self._judge, self._arrays = judge, arrays
+    def __init__(self, judge: Judge):
+        self._judge = judge
         self._depths = DepthScores(judge.scene, judge.store)
-        self._radiance = RadianceScores(arrays)
         self._rows: dict[str, dict[str, dict]] = defaultdict(dict)
         self._videos = {name: VideoScores() for name in ("per_view", "averaged", "photographs")}
         # Names of views without scores, and of photographs that tell no exposure.
         self._untold: dict[str, list[str]] = {"hidden": [], "exposures_unknown": []}
-        # What meters read in training views, by name; their rows; and in held-out views.
+        # What meters read in training views, by name; their rows; and in held-out views, by row.
         self._readings: dict[str, Readings] = {}
         self._told: list[int] = []
-        self._held_out: list[tuple[Readings, _Kept]] = []
-        self._references: list[_Kept] = []
+        self._held_out: dict[int, Readings] = {}
+        self._scales: dict[int, float] = {}
+        self._samples: dict[int, np.ndarray] = {}
 
     def add(self, found: _Judged) -> None:
         """Take a view."""
         result, judge = found.result, self._judge
-        view = judge.scene.views[result.index]
+        view, index = judge.scene.views[result.index], result.index
         tells = tells_exposure(result.photograph, found.mask, judge.cfg.loss)
         if not tells:
             self._untold["hidden" if tells is None else "exposures_unknown"].append(view.name)
@@ -252,31 +259,25 @@ class _Views:
         self._rows[f"{view.split} averaged"][view.name] = found.scores_averaged
         if found.scores_all is not None:
             self._rows["all"][view.name] = found.scores_all
-        again = found.radiance is not None or found.reference is not None
-        linear = self._arrays.put(result.linear) if again else result.linear
-        opacity = [] if judge.store.backdrop is None else [result.alpha]
-
-        def kept(target) -> _Kept:
-            images = (linear, target, found.mask, *opacity)
-            return _Kept(result.index, tuple(map(self._arrays.put, images)))
-
-        if found.radiance is not None:
-            self._radiance.add(view.name, view.split, linear, found.radiance, found.mask)
-        if found.reference is not None:
-            self._references.append(kept(found.reference))
+        if found.sample is not None:
+            self._samples[index] = found.sample
+        if found.scale is not None:
+            self._scales[index] = found.scale
         if view.split == "train":
-            self._told.append(judge.row_of[result.index])
+            self._told.append(judge.row_of[index])
             self._readings[view.name] = found.readings
         else:
-            self._held_out.append((found.readings, kept(result.photograph)))
+            self._held_out[index] = found.readings
         self._depths.add(result, found.mask)
         exposure = result.transform.exposure
         self._videos["per_view"].add(view.camera, result.ldr, exposure)
         self._videos["averaged"].add(view.camera, found.averaged, judge.mean.exposure)
         self._videos["photographs"].add(view.camera, result.photograph, exposure)
 
-    def evaluation(self) -> Evaluation:
-        """Return all scores."""
+    def evaluation(
+        self, seen: Callable[[Camera], Render], radiance: Truth | None = None
+    ) -> Evaluation:
+        """Return all scores; what all views decide is scored in a second pass over some."""
         judge, rows = self._judge, self._rows
         exposures = np.asarray(judge.small.photometry.exposures)
         train, tone = summary_of(rows["train"]), judge.cfg.photometry
@@ -297,81 +298,83 @@ class _Views:
         metering = fit_metering(
             names, readings, logs[self._told], exposed_at(BELOW_WHITE, gamma, tone)
         )
-        if metering.rule.meter is not None and self._held_out:
-            metrics["test"]["metered"] = summary_of(self._metered(metering))
         metrics["consistency"] = {name: video.summary() for name, video in self._videos.items()}
-        if self._radiance.views:
-            exposed = exposed_at(judge.cfg.loss.saturation, gamma, tone)
-            typical = float(np.median(exposures))
-            metrics["radiance"] = self._radiance.summary(exposed / typical)
+        exposed = exposed_at(judge.cfg.loss.saturation, gamma, tone)
+        brightest = exposed / float(np.median(exposures))
+        self._again(metrics, metering, brightest, seen, radiance)
         metrics |= self._depths.summary()
-        if self._references:
-            metrics["reference"] = _against_reference(self._references, judge)
         return Evaluation(metrics, metering)
 
-    def _metered(self, metering: Metering) -> dict[str, dict[str, Any]]:
-        """Return scores of held-out views by name, under the exposures of the rule."""
-        judge = self._judge
+    def _again(
+        self,
+        metrics: dict[str, Any],
+        metering: Metering,
+        brightest: float,
+        seen: Callable[[Camera], Render],
+        radiance: Truth | None,
+    ) -> None:
+        """Render views that are compared once all are known, and add their scores.
 
-        def judged(view: tuple[Readings, _Kept]) -> dict[str, Any]:
-            exposure, index = metering.exposure(view[0]), view[1].row
-            linear, photograph, mask, alpha = view[1].read()
-            ldr = develop(linear, replace(judge.usual(index), exposure=exposure), alpha=alpha)
-            return {**judge.scorer(index, photograph, mask)(ldr), "exposure": exposure}
+        Held-out views are shown under the exposure of the metering rule; others are compared with
+        references of one common exposure and with their true radiance.
+        """
+        judge, common = self._judge, {}
+        if self._scales:
+            scale = float(np.exp(np.median(np.log(list(self._scales.values())))))
+            common = {"averaged": judge.mean.exposure, "scale_aligned": scale}
+        metered = self._held_out if metering.rule.meter is not None else {}
+        aligned = None
+        if self._samples:
+            aligned = Alignment.of(list(self._samples.values()), brightest)
 
-        names = [judge.scene.views[kept.row].name for _, kept in self._held_out]
-        return dict(zip(names, map_in_order(judged, self._held_out), strict=True))
+        def judged(index: int) -> dict[str, dict[str, Any]]:
+            photograph, mask = judge.store.get(index)
+            rendered, found = seen(camera_of(judge.store, index)), {}
+            linear, alpha = np.asarray(rendered.linear), np.asarray(rendered.alpha)
+            if index in metered:
+                exposure = metering.exposure(metered[index])
+                ldr = develop(linear, replace(judge.usual(index), exposure=exposure), alpha=alpha)
+                score = judge.scorer(index, photograph, mask)
+                found["metered"] = {**score(ldr), "exposure": exposure}
+            if index in self._scales:
+                found |= _against_reference(judge, index, linear, alpha, mask, common)
+            if aligned is not None and index in self._samples and radiance is not None:
+                found["radiance"] = aligned.scores(linear, radiance(index), mask > 0.5)
+            return found
+
+        indices = sorted({*metered, *self._scales, *self._samples})
+        rows: dict[str, dict[str, dict]] = defaultdict(dict)
+        for index, found in zip(indices, map_in_order(judged, indices), strict=True):
+            for name, row in found.items():
+                rows[name][judge.scene.views[index].name] = row
+        splits = {view.name: view.split for view in judge.scene.views}
+        if rows["metered"]:
+            metrics["test"]["metered"] = summary_of(rows["metered"])
+        if aligned is not None:
+            metrics["radiance"] = aligned.summary(rows["radiance"], splits)
+        if common:
+            metrics["reference"] = {
+                name: {**summary_of(rows[name]), "exposure": exposure}
+                | {
+                    part: summary_of({n: row for n, row in rows[name].items() if splits[n] == part})
+                    for part in ("train", "test")
+                }
+                for name, exposure in common.items()
+            }
 
 
-class _Kept(NamedTuple):
-    """A view until all are known, by its row."""
+def _against_reference(
+    judge: Judge, index: int, linear, alpha, mask, exposures: dict[str, float]
+) -> dict[str, dict[str, Any]]:
+    """Score a view against its photograph of the common exposure, under exposures by protocol.
 
-    row: int
-    images: tuple[StoredArray, ...]  # radiance, photograph, mask; over a background opacity
-
-    def read(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
-        """Return these arrays; without a background the last is None."""
-        linear, photograph, mask, *alpha = (kept.read() for kept in self.images)
-        return linear, photograph, mask, next(iter(alpha), None)
-
-
-def _against_reference(views: list[_Kept], judge: Judge) -> dict[str, Any]:
-    """Score all views against photographs of one common exposure.
-
-    Those are taken to be what no camera in particular sees: without vignetting, and of mean white
-    balance.
+    Those photographs are taken to be what no camera in particular sees: without vignetting, and of
+    mean white balance.
     """
-    shown, mean = judge.usual(None), judge.mean
-
-    def scale(view: _Kept) -> float:
-        return with_fitted_exposure(shown, *view.read()).exposure
-
-    scales = list(map_in_order(scale, views))
-    protocols = {
-        "averaged": mean.exposure,
-        "scale_aligned": float(np.exp(np.median(np.log(scales)))),
-    }
-
-    def judged(view: _Kept) -> dict[str, dict[str, Any]]:
-        linear, truth, mask, alpha = view.read()
-        shows = {name: replace(shown, exposure=e) for name, e in protocols.items()}
-        ldr = {name: develop(linear, how, alpha=alpha) for name, how in shows.items()}
-        return {n: view_scores(judge.lpips_weights, x, truth, mask) for n, x in ldr.items()}
-
-    parts: dict[str, dict[str, dict]] = {
-        name: {"all": {}, "train": {}, "test": {}} for name in protocols
-    }
-    for kept, rows in zip(views, map_in_order(judged, views), strict=True):
-        view = judge.scene.views[kept.row]
-        for name, row in rows.items():
-            for part in ("all", view.split):
-                parts[name][part][view.name] = row
+    assert judge.reference is not None
+    truth, usual = judge.reference(index), judge.usual(None)
+    shown = {name: replace(usual, exposure=exposure) for name, exposure in exposures.items()}
     return {
-        name: {
-            **summary_of(parts[name]["all"]),
-            "exposure": exposure,
-            "train": summary_of(parts[name]["train"]),
-            "test": summary_of(parts[name]["test"]),
-        }
-        for name, exposure in protocols.items()
+        name: view_scores(judge.lpips_weights, develop(linear, how, alpha=alpha), truth, mask)
+        for name, how in shown.items()
     }

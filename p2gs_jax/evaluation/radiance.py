@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from p2gs_jax.core.numerics import LN2
-from p2gs_jax.evaluation.passes import ArrayStore, StoredArray, map_in_order
 from p2gs_jax.evaluation.scores import ssim
 
 Truth = Callable[[int], Float[np.ndarray, "h w 3"] | None]
@@ -76,34 +75,32 @@ def mu_law_psnr(
     return float(-10 * np.log10(max(float(np.mean((a - b) ** 2)), 1e-12)))
 
 
-@dataclass
-class RadianceScores:
-    """Collects views, then scores them under one common alignment.
+def sampled(linear, truth, mask: Bool[np.ndarray, "h w"], views: int) -> Float[np.ndarray, "2 n 3"]:
+    """Return log recovered and true radiance of evenly taken pixels of one of so many views."""
+    pick = np.flatnonzero(mask & (truth.min(-1) > 0) & (linear.min(-1) > 0))
+    each = max(1, min(ALIGNMENT_PIXELS, MOST_ALIGNED // views))
+    pick = pick[:: max(1, len(pick) // each)]
+    return np.stack([np.log(x.reshape(-1, 3)[pick]) for x in (linear, truth)])
 
-    `views` has (name, split, recovered, truth, mask) of each view.
+
+class Alignment(NamedTuple):
+    """What is common to all views when recovered radiance is compared with the truth.
+
+    From `brightest` on, in units of recovered radiance, at least half of the training photographs
+    are saturated: pixels whose true radiance is above it are left out of the stops. The truth is
+    `exp(shift)` times what was recovered, or `exp(offset)` times its `power`.
     """
 
-    arrays: ArrayStore = field(default_factory=ArrayStore)
-    views: list[tuple[str, str, StoredArray, StoredArray, StoredArray]] = field(
-        default_factory=list
-    )
+    brightest: float
+    shift: float
+    power: float
+    offset: float
 
-    def add(self, name: str, split: str, linear, truth, mask) -> None:
-        """Keep one view; images that the store holds already are not copied."""
-        linear, truth = self.arrays.put(linear), self.arrays.put(truth)
-        self.views.append((name, split, linear, truth, self.arrays.put(np.asarray(mask) > 0.5)))
-
-    def summary(self, brightest: float) -> dict:
-        """Return means over all, training and held-out views, and the alignment.
-
-        From `brightest` on, in units of recovered radiance, at least half of the training
-        photographs are saturated: pixels whose true radiance is above it are left out of the stops.
-        `stops_median` and `stops_rms` are after one common scale, `stops_rms_power` after scale and
-        power.
-        """
-        if not self.views:
-            return {}
-        recovered, true = self._sample()
+    @classmethod
+    def of(cls, samples: Sequence[Float[np.ndarray, "2 _ 3"]], brightest: float) -> Alignment:
+        """Return the alignment of samples from all views."""
+        # Single precision is too coarse for a line through half a million points.
+        recovered, true = np.concatenate(samples, 1).astype(np.float64)
         level, shift = float(np.log(brightest)), 0.0
         kept = recovered.max(-1, initial=-np.inf) < level
         # What is recovered says which pixels count only until both have a common scale.
@@ -111,63 +108,46 @@ class RadianceScores:
             gap = (true - recovered)[kept]
             shift = float(np.median(gap)) if gap.size else 0.0
             kept = true.max(-1, initial=-np.inf) < level + shift
-        power, offset = _power(np.stack([recovered[kept].ravel(), true[kept].ravel()]))
-        scale = float(np.exp(shift))
+        logs = np.stack([recovered[kept].ravel(), true[kept].ravel()])
+        return cls(brightest, shift, *_power(logs))
 
-        def judged(view) -> dict[str, float]:
-            linear, truth, mask = (kept.read() for kept in view[2:])
-            return _view_scores(linear, truth, mask, brightest, shift, power, offset)
+    @property
+    def scale(self) -> float:
+        """True radiance over what was recovered."""
+        return float(np.exp(self.shift))
 
-        found = map_in_order(judged, self.views)
-        rows = {name: row for (name, *_), row in zip(self.views, found, strict=True)}
-        splits = {name: split for name, split, *_ in self.views}
+    def scores(self, linear, truth, mask: Bool[np.ndarray, "h w"]) -> dict[str, float]:
+        """Return the scores of a view.
+
+        `stops_median` and `stops_rms` are after the scale, `stops_rms_power` after scale and power.
+        """
+        scale, brightest = self.scale, self.brightest
+        keep = mask & (truth.min(-1) > 0) & (truth.max(-1) < brightest * scale)
+        a, b = np.log2(np.maximum(linear[keep], 1e-12)), np.log2(truth[keep])
+        stops = np.minimum(np.abs(a + self.shift / LN2 - b), STOPS_CAP)
+        bent = np.minimum(np.abs(self.power * a + self.offset / LN2 - b), STOPS_CAP)
+        shown = (linear * scale, truth, mask, brightest * scale)
+        return {
+            "stops_median": float(np.median(stops)) if stops.size else float("nan"),
+            "stops_rms": float(np.sqrt(np.mean(stops**2))) if stops.size else float("nan"),
+            "stops_rms_power": float(np.sqrt(np.mean(bent**2))) if bent.size else float("nan"),
+            "pu21_psnr": pu21_psnr(*shown),
+            "pu21_ssim": pu21_ssim(*shown),
+            "mu_law_psnr": mu_law_psnr(*shown[:3]),
+        }
+
+    def summary(self, rows: dict[str, dict[str, float]], splits: dict[str, str]) -> dict:
+        """Return means of the scores of views by name: over all, training and held-out views."""
         parts = {
             part: {
                 k: _mean([rows[n][k] for n in rows if part in ("all", splits[n])])
                 for k in next(iter(rows.values()))
             }
             for part in ("all", "train", "test")
-            if part == "all" or part in splits.values()
+            if part == "all" or part in [splits[n] for n in rows]
         }
-        return {
-            **parts["all"],
-            **{k: v for k, v in parts.items() if k != "all"},
-            "scale": scale,
-            "power": power,
-            "per_view": rows,
-        }
-
-    def _sample(self) -> Float[np.ndarray, "2 n 3"]:
-        """Return log recovered and true radiance of evenly taken pixels."""
-        parts = []
-        each = max(1, min(ALIGNMENT_PIXELS, MOST_ALIGNED // len(self.views)))
-        for _, _, *images in self.views:
-            linear, truth, mask = (kept.read() for kept in images)
-            pick = np.flatnonzero(mask & (truth.min(-1) > 0) & (linear.min(-1) > 0))
-            pick = pick[:: max(1, len(pick) // each)]
-            parts.append(np.stack([np.log(x.reshape(-1, 3)[pick]) for x in (linear, truth)]))
-        # Single precision is too coarse for a line through half a million points.
-        return np.concatenate(parts, 1).astype(np.float64)
-
-
-def _view_scores(
-    linear, truth, mask, brightest: float, shift: float, power: float, offset: float
-) -> dict[str, float]:
-    """Return the scores of a view; `shift` and `offset` are natural logarithms."""
-    scale = float(np.exp(shift))
-    keep = mask & (truth.min(-1) > 0) & (truth.max(-1) < brightest * scale)
-    a, b = np.log2(np.maximum(linear[keep], 1e-12)), np.log2(truth[keep])
-    stops = np.minimum(np.abs(a + shift / LN2 - b), STOPS_CAP)
-    bent = np.minimum(np.abs(power * a + offset / LN2 - b), STOPS_CAP)
-    shown = (linear * scale, truth, mask, brightest * scale)
-    return {
-        "stops_median": float(np.median(stops)) if stops.size else float("nan"),
-        "stops_rms": float(np.sqrt(np.mean(stops**2))) if stops.size else float("nan"),
-        "stops_rms_power": float(np.sqrt(np.mean(bent**2))) if bent.size else float("nan"),
-        "pu21_psnr": pu21_psnr(*shown),
-        "pu21_ssim": pu21_ssim(*shown),
-        "mu_law_psnr": mu_law_psnr(*shown[:3]),
-    }
+        whole = parts.pop("all")
+        return {**whole, **parts, "scale": self.scale, "power": self.power, "per_view": rows}
 
 
 def _mean(values: list[float]) -> float:

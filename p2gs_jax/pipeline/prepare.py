@@ -34,8 +34,7 @@ from p2gs_jax.pipeline.survey import Survey
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.train.exposure_loss import ColorPairs, color_pairs
-from p2gs_jax.train.lidar_depths import KeptDepths
-from p2gs_jax.types import Camera, Gaussians, Params, Scene, View
+from p2gs_jax.types import Camera, Gaussians, Measured, Params, Scene, View
 
 
 @dataclass
@@ -53,7 +52,7 @@ class Prepared:
     owner: np.ndarray | None = None  # moving object of each Gaussian (`Population.owner`)
     selection: Selection | None = None  # model, exposures and their errors from the tracks
     pairs: ColorPairs | None = None  # corresponding observations
-    measured: KeptDepths | None = None  # depths of every training view for the loss
+    measured: list[Measured] | None = None  # depths of every training view for the loss
     notes: list[str] = field(default_factory=list)  # what the user should know
 
     def view(self, index: int) -> tuple[Camera, Float32[np.ndarray, "h w 3"], np.ndarray]:

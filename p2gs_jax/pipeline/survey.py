@@ -34,9 +34,9 @@ from p2gs_jax.render.warp import project_points
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.visibility import SHARE_POINTS, SHARE_VIEWS, in_frame
-from p2gs_jax.train.lidar_depths import KeptDepths, measured_depths
+from p2gs_jax.train.lidar_depths import measured_depths
 from p2gs_jax.train.schedule import shrinks
-from p2gs_jax.types import Scene, View
+from p2gs_jax.types import Measured, Scene, View
 
 # The near plane is not farther than this share of the depth of near points (their percentile).
 NEAR_SHARE, NEAR_PERCENTILE = 0.2, 1.0
@@ -61,7 +61,7 @@ class Survey:
     extent: float  # what rates of the means are shares of
     near: float | None  # near plane, where the one asked for would cut the scene
     coverage: Coverage  # how much of the scene the views show
-    measured: KeptDepths | None  # depths of every training view for the loss
+    measured: list[Measured] | None  # depths of every training view for the loss
     dense: bool  # seeds come from matching photographs as well
     seeds: Int[np.ndarray, " s"]  # rows of the scene's points that become Gaussians
     init: InitConfig  # without a shell where a background lies behind everything

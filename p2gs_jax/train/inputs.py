@@ -19,9 +19,8 @@ from p2gs_jax.core.streams import Stream, device_seed, generator, view_order
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.train import schedule
 from p2gs_jax.train.exposure_loss import ColorPairs, Partner
-from p2gs_jax.train.lidar_depths import KeptDepths
 from p2gs_jax.train.update import Controls
-from p2gs_jax.types import Batch, Camera
+from p2gs_jax.types import Batch, Camera, Measured
 
 Tree = TypeVar("Tree")
 
@@ -41,7 +40,7 @@ class TrainingViews:
         store: ImageStore,
         rows: Sequence[int],
         seed: int,
-        measured: KeptDepths | None = None,
+        measured: Sequence[Measured] | None = None,
     ):
         self.store, self.rows = store, tuple(rows)
         self.seed, self.measured = seed, measured

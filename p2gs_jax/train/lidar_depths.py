@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -13,7 +10,6 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluation.passes import ArrayStore, most_bytes
 from p2gs_jax.render.warp import project_points
 from p2gs_jax.scene.drives.objects import object_mask
 from p2gs_jax.scene.visibility import unoccluded
@@ -27,8 +23,6 @@ LEAST_ALPHA = 0.05
 MOST_PER_VIEW = 8192
 # Measurements this near in time tell what hides what; further off, things have moved.
 NEAR_S = 1.0
-# They may take this share of the memory that photographs may.
-DEPTHS_SHARE = 0.125
 
 
 def lidar_loss(
@@ -50,18 +44,7 @@ def lidar_loss(
     return jnp.sum(jnp.where(known, huber, 0.0)) / jnp.maximum(jnp.sum(known), 1)
 
 
-class KeptDepths:
-    """The measured depths of some views by number, in memory up to a bound and on disk beyond."""
-
-    def __init__(self, views: Iterable[Measured], most_bytes: int):
-        self.arrays = ArrayStore(most_bytes)
-        self._kept = [jax.tree.map(self.arrays.put, view) for view in views]
-
-    def __getitem__(self, number: int) -> Measured:
-        return jax.tree.map(lambda stored: stored.read(), self._kept[number])
-
-
-def measured_depths(scene: Scene, cfg: FitConfig) -> KeptDepths | None:
+def measured_depths(scene: Scene, cfg: FitConfig) -> list[Measured] | None:
     """Return the measured depths of every training view; None where the loss asks for none.
 
     Only what stands still counts, so that every sweep serves all views; what a nearer measurement
@@ -80,8 +63,7 @@ def measured_depths(scene: Scene, cfg: FitConfig) -> KeptDepths | None:
     rng = generator(cfg.train.seed, Stream.MEASURED_DEPTHS)
     static = scene.lidar.objects < 0
     points, times = scene.lidar.points[static], scene.lidar.times[static]
-    found = (_of_view(points, times, v, scene.objects, rng) for v in scene.training_views)
-    return KeptDepths(found, most_bytes(cfg.data.cache_mb, DEPTHS_SHARE))
+    return [_of_view(points, times, v, scene.objects, rng) for v in scene.training_views]
 
 
 def _of_view(points, times, view, objects, rng) -> Measured:

@@ -9,12 +9,12 @@ import pytest
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.evaluation import alignment, radiance
 from p2gs_jax.evaluation.radiance import (
-    RadianceScores,
-    delta_e_itp,
+    Alignment,
     mu_law,
     mu_law_psnr,
     pu21_encode,
     pu21_psnr,
+    sampled,
 )
 from p2gs_jax.photometry.formation import display, formation
 from p2gs_jax.types import Capture
@@ -91,10 +91,9 @@ def image(seed=0):
 
 
 def scores(linear, truth, brightest=1e9):
-    s = RadianceScores()
-    s.add("a", "train", linear, truth, EVERYWHERE)
-    s.add("b", "test", linear, truth, EVERYWHERE)
-    return s.summary(brightest)
+    aligned = Alignment.of([sampled(linear, truth, EVERYWHERE, 2)] * 2, brightest)
+    rows = {name: aligned.scores(linear, truth, EVERYWHERE) for name in "ab"}
+    return aligned.summary(rows, {"a": "train", "b": "test"})
 
 
 def test_pu21_reference_values():
@@ -138,19 +137,15 @@ def test_errors_are_in_stops_and_pixels_count_by_what_is_true_of_them():
 
 def test_what_is_aligned_does_not_grow_with_the_views(monkeypatch):
     monkeypatch.setattr(radiance, "MOST_ALIGNED", 1000)
-    s, truth = RadianceScores(), image()
-    for k in range(10):
-        s.add(str(k), "train", truth / 2, truth, EVERYWHERE)
-    assert 1000 <= s._sample().shape[1] <= 2 * 1000
-    assert s.summary(1e9)["scale"] == pytest.approx(2, rel=1e-6)
-
-
-def test_colour_difference_sees_hue():
     truth = image()
-    assert delta_e_itp(truth, truth, EVERYWHERE, 1.0) == pytest.approx(0, abs=1e-9)
-    red = truth * [1.2, 1.0, 0.9]
-    assert delta_e_itp(red, truth, EVERYWHERE, 1.0) > 3
-    assert pu21_psnr(red, truth, EVERYWHERE, 1.0) < 40
+    samples = [sampled(truth / 2, truth, EVERYWHERE, 10) for _ in range(10)]
+    assert 1000 <= sum(sample.shape[1] for sample in samples) <= 2 * 1000
+    assert Alignment.of(samples, 1e9).scale == pytest.approx(2, rel=1e-6)
+
+
+def test_perceptual_scores_see_hue():
+    truth = image()
+    assert pu21_psnr(truth * [1.2, 1.0, 0.9], truth, EVERYWHERE, 1.0) < 40
 
 
 TRUTH = np.random.default_rng(0).uniform(0.1, 4.0, (8, 10, 3))
@@ -160,11 +155,9 @@ SOME = np.ones((8, 10), bool)
 def test_nothing_to_judge_has_no_score():
     assert np.isnan(mu_law_psnr(TRUTH, TRUTH, ~SOME))
     assert np.isnan(mu_law_psnr(TRUTH, 0 * TRUTH, SOME))
-    assert RadianceScores().summary(1.0) == {}
     none = np.zeros((24, 32), bool)
-    s = RadianceScores()
-    s.add("a", "train", image(), image(), none)
-    assert np.isnan(s.summary(1.0)["stops_rms"])
+    aligned = Alignment.of([sampled(image(), image(), none, 1)], 1.0)
+    assert np.isnan(aligned.scores(image(), image(), none)["stops_rms"])
 
 
 def test_a_constant_step_after_the_curve_is_its_psnr_without_masked_pixels():

@@ -24,7 +24,7 @@ from p2gs_jax.report.measurements import SceneMeasurements, measure_scene
 from p2gs_jax.report.photometry_sections import exposure_section
 from p2gs_jax.report.pictures import GAIN, dynamic_range, jpeg, signed_difference
 from p2gs_jax.report.run_files import RunFiles, read_run
-from p2gs_jax.report.run_sections import depth_section, novel_section, parts_section
+from p2gs_jax.report.run_sections import depth_section, parts_section
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.run.photometry_files import write_photometry
@@ -196,7 +196,7 @@ def drive(tmp_path):
     return lambda **metrics: dataclasses.replace(empty, metrics=metrics)
 
 
-def test_parts_depth_and_shifted_views_are_tables(drive):
+def test_parts_and_depth_are_tables(drive):
     part = {"psnr": 30.0, "ssim": 0.9, "lpips": 0.1, "views": 4}
     moving = {"psnr": 20.0, "ssim": 0.6, "lpips": 0.3, "views": 2}
     scores = {"psnr": 29.0, "ssim": 0.8, "whole": part, "static": part, "moving": moving}
@@ -211,17 +211,7 @@ def test_parts_depth_and_shifted_views_are_tables(drive):
     depth = {"static": seen, "moving": unseen, "views": 3}
     body = depth_section(drive(depth={"all": depth, "held_out": {}}))
     assert all(words in body for words in ("0.12 m", "none", "12,345"))
-    views = [
-        {"shift_m": -2.0, "unseen": 0.25, "views": 6, "depth": {"static": seen}},
-        {"shift_m": 2.0, "unseen": 0.125, "views": 6, "depth": {}},
-    ]
-    body = novel_section(drive(novel_views=views))
-    assert body.index("2 m to the left") < body.index("2 m to the right")
-    assert "25.0%" in body
-    assert "0.12 m" in body
-    views[0]["depth"] = {}
-    assert "depth error" not in novel_section(drive(novel_views=views))
-    for section in (parts_section, depth_section, novel_section):
+    for section in (parts_section, depth_section):
         assert section(drive()) == ""
 
 
