@@ -80,8 +80,7 @@ def print_metrics(metrics: dict[str, Any], out: Path) -> None:
     seconds = {k: v for k, v in metrics.get("seconds", {}).items() if k in PARTS and v >= 0.5}
     if seconds:
         spent = ", ".join(f"{k.replace('_', ' ')} {v:.0f}" for k, v in seconds.items())
-        programs = f" ({counts['programs']} programs)" if "programs" in counts else ""
-        console.print(f"Seconds: {spent}{programs}.")
+        console.print(f"Seconds: {spent}.")
     console.print(f"Results: {out} (open {out / 'summary.png'} first)")
 
 

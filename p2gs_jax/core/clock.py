@@ -1,4 +1,4 @@
-"""Seconds by name, and the compiler's share of them."""
+"""Seconds by name, and whether a budget was kept."""
 
 from __future__ import annotations
 
@@ -7,10 +7,6 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
-
-from jax import monitoring
-
-_COMPILED = "/jax/core/compile/backend_compile_duration"
 
 
 class Stopwatch:
@@ -40,12 +36,7 @@ class Stopwatch:
 
 
 # Sums and views of the others in the `seconds` of metrics.json: no parts of a run.
-NO_PARTS = (
-    "total_until_evaluation",
-    "optimisation",
-    "evaluation_and_files",
-    "compiler_in_all_threads",
-)
+NO_PARTS = ("total_until_evaluation", "optimisation", "evaluation_and_files")
 # What a budget may be exceeded by before that is said: a share, and seconds.
 LATE = (1.1, 2.0)
 MOST_NAMED = 4
@@ -72,36 +63,3 @@ def over_budget(budget_s: float | None, seconds: Mapping[str, float]) -> str | N
         f"The budget of {budget_s:.0f} s was exceeded: the run took {total:.0f} s ({named}). Only "
         "steps are cut short; what comes before and after them takes its time."
     )
-
-
-class CompileCounter:
-    """What XLA compiled since this counter was made, in all threads of the process.
-
-    JAX offers listeners but no counter. One listener collects for the whole process, and counters
-    remember where they began: none needs an end, and threads cannot miss one.
-    """
-
-    def __init__(self):
-        self._begin = len(_compiled)
-
-    @property
-    def programs(self) -> int:
-        """Programs compiled, or read back from the cache on disk."""
-        return len(_compiled) - self._begin
-
-    @property
-    def seconds(self) -> float:
-        """Seconds that threads spent in the compiler or reading the cache, summed over threads."""
-        return sum(_compiled[self._begin :], 0.0)
-
-
-# Seconds of every program since this module was loaded.
-_compiled: list[float] = []
-
-
-def _on_duration(event: str, duration_secs: float, **_) -> None:
-    if event == _COMPILED:
-        _compiled.append(duration_secs)
-
-
-monitoring.register_event_duration_secs_listener(_on_duration)

@@ -13,7 +13,7 @@ import numpy as np
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import no_empty_folders
-from p2gs_jax.core.clock import CompileCounter, Stopwatch
+from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
@@ -69,7 +69,7 @@ def calibrate_of(
     Raises:
         UserError: something the user can mend.
     """
-    begin, compiler = time.monotonic(), CompileCounter()
+    begin = time.monotonic()
     cfg = converting(require_config(cfg), steps)
     reporter, folder, scene_dir = reporter or Silent(), RunFolder(Path(out)), Path(scene_dir)
     check_run_dir(folder.root, False, cfg, way_on=ELSEWHERE)
@@ -103,7 +103,7 @@ def calibrate_of(
         params, _ = compact(result)
         clock = Stopwatch({"reading": found.seconds["reading"]})
         clock.add("photometry", found.seconds["adjustment"])
-        account = account_of(start, params, result, clock, begin, compiler, of=before)
+        account = account_of(start, params, result, clock, begin, of=before)
         metrics = finish(params, scene, store, start.cfg, folder, account, reporter)
         found.write(folder.root)
     return dataclasses.replace(found, metrics=metrics)

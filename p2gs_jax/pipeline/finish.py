@@ -10,7 +10,7 @@ import numpy as np
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import write_json
-from p2gs_jax.core.clock import CompileCounter, Stopwatch, over_budget
+from p2gs_jax.core.clock import Stopwatch, over_budget
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.core.runtime import return_freed_memory
 from p2gs_jax.evaluation.evaluate import Evaluation, evaluate
@@ -31,8 +31,6 @@ class Account:
 
     counts: dict[str, int]  # numbers
     seconds: dict[str, float]  # times, by name
-    # counts what was compiled for this fit
-    compiler: CompileCounter = field(default_factory=CompileCounter)
     selection: Selection | None = None  # what the bundle adjustment found, or None
     # what the user was told; what the evaluation finds is added
     notes: list[str] = field(default_factory=list)
@@ -131,7 +129,6 @@ def _accounted(
         **account.seconds,
         **watch.seconds,
         "evaluation_and_files": watch.seconds["evaluation"] + watch.seconds["files"],
-        "compiler_in_all_threads": account.compiler.seconds,
     }
     metered = found.metering.sentence if found.metering.telling else None
     late = over_budget(cfg.train.budget_s, seconds)
@@ -142,7 +139,7 @@ def _accounted(
     steps = max(int(account.counts.get("steps", 0)), 1)
     entries = {
         "split": scene.split_by,
-        "counts": {**account.counts, "programs": account.compiler.programs},
+        "counts": account.counts,
         "seconds": seconds,
         "seconds_per_step": account.seconds.get("optimisation", 0.0) / steps,
         "notes": account.notes,

@@ -16,7 +16,7 @@ from jax.sharding import Mesh
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import no_empty_folders
-from p2gs_jax.core.clock import CompileCounter, Stopwatch
+from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.seeds import reach
@@ -96,7 +96,7 @@ def fit(
     paths = Paths.of(scene_dir, run_dir, reference)
     folder, begin = RunFolder(paths.run), time.monotonic() - spent_s
     weights = preflight(cfg, paths, resume=resume)
-    clock, compiler = Stopwatch({"starting": spent_s} if spent_s else {}), CompileCounter()
+    clock = Stopwatch({"starting": spent_s} if spent_s else {})
     optimiser = Optimiser(folder, reporter, mesh_of(cfg, devices), Own(terms, formation, strategy))
     pixels = decoded_into(folder.pixels)
     with no_empty_folders(paths.run), locked(paths.run) as lock, pixels, memory_named(), optimiser:
@@ -115,7 +115,7 @@ def fit(
             result = optimiser.run(start, resume=resume, spent_s=spent_s, finish_s=left_s)
         params, owner = fitted(result, start.scene, cfg)
         lock.require()
-        account = account_of(start, params, result, clock, begin, compiler)
+        account = account_of(start, params, result, clock, begin)
         what = (params, start.scene, start.store, start.cfg, folder, account, reporter)
         known = {"truth": truth, "lpips_weights": weights, "true_exposures": true_exposures}
         metrics = finish(*what, owner=owner, still_ours=lock.require, **known)
@@ -271,7 +271,6 @@ def account_of(
     result: TrainResult,
     clock: Stopwatch,
     begin: float,
-    compiler: CompileCounter,
     of: dict | None = None,
 ) -> Account:
     """Return what a fit says of itself; it began at `begin` (`time.monotonic`).
@@ -295,7 +294,6 @@ def account_of(
             "total_until_evaluation": time.monotonic() - begin,
             "optimisation": result.host.elapsed_s,
         },
-        compiler=compiler,
         selection=start.selection,
         notes=start.notes,
         of=of,

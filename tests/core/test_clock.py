@@ -1,15 +1,13 @@
-"""Named seconds, counted compilations, and a budget that was not kept."""
+"""Named seconds, and a budget that was not kept."""
 
 import io
 import time
 
-import jax
-import numpy as np
 import pytest
 from rich.console import Console
 
 from p2gs_jax.core import progress
-from p2gs_jax.core.clock import CompileCounter, Stopwatch, over_budget, whole_run
+from p2gs_jax.core.clock import Stopwatch, over_budget, whole_run
 from p2gs_jax.core.progress import LogRecord, TerminalReporter
 
 
@@ -27,22 +25,6 @@ def test_seconds_of_a_name_add_up_in_the_order_of_first_use():
     assert 2.0 <= watch.seconds["steps"] < 2.01
 
 
-def test_programs_are_counted_once_each():
-    counter = CompileCounter()
-    shift = np.random.default_rng().integers(1 << 30).item()
-    program = jax.jit(lambda x: x + shift)
-    program(np.float32(1))
-    program(np.float32(2))
-    assert counter.programs == 1
-    assert counter.seconds > 0
-    program(np.zeros(3, np.float32))
-    assert counter.programs == 2
-    later = CompileCounter()
-    program(np.zeros(3, np.float32))
-    assert later.programs == 0
-    assert later.seconds == 0
-
-
 SECONDS = {
     "starting": 2.0,
     "photometry": 12.0,
@@ -52,7 +34,6 @@ SECONDS = {
     "total_until_evaluation": 21.0,
     "optimisation": 6.0,
     "evaluation_and_files": 13.0,
-    "compiler_in_all_threads": 40.0,
 }
 
 
@@ -66,7 +47,6 @@ def test_a_budget_that_was_exceeded_is_said_with_the_reasons():
     text = over_budget(5.0, SECONDS)
     assert text.startswith("The budget of 5 s was exceeded: the run took 34 s (photometry 12, ")
     assert "evaluation 10, steps 5" in text
-    assert "compiler" not in text
     for kept in (None, 34.0, 31.0):
         assert over_budget(kept, SECONDS) is None
     assert over_budget(29.0, SECONDS) is not None

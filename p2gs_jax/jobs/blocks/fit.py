@@ -12,7 +12,7 @@ import jax
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import no_empty_folders, write_json
-from p2gs_jax.core.clock import CompileCounter, Stopwatch
+from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.core.processes import peak_bytes
 from p2gs_jax.core.progress import Reporter, Silent
@@ -166,7 +166,7 @@ class _Blocks:
 
     def __post_init__(self):
         self.folder, self.blocks = RunFolder(self.paths.run), self.paths.run / BLOCKS
-        self.clock, self.compiler = Stopwatch(), CompileCounter()
+        self.clock = Stopwatch()
 
     def fit(
         self, scene: Scene, truth: Reference | None, weights, begin: float, true_exposures
@@ -232,7 +232,6 @@ class _Blocks:
                 "total_until_evaluation": seconds,
                 "optimisation": optimisation,  # of all blocks, side by side or not
             },
-            compiler=self.compiler,
             selection=solved.selection,
             notes=[*solved.scene.notes, *solved.notes],
         )
