@@ -118,7 +118,7 @@ def advance(
     key = noise_key(controls.seed, state.step)
     noise_rate = (noise or 0.0) * means_rate(progress, rate, extent, cfg)
 
-    def exploring(block, _, moved, on):
+    def exploring(block, moved, on):
         return exploration_noise(jax.random.fold_in(key, block), moved, on, noise_rate)
 
     updated = update_listed(
@@ -168,7 +168,7 @@ def update_listed(
         bands: spherical-harmonics coefficients that are looked at and moved.
         seen: (Gaussians, alive, owner) of a block -> what the image is made of, per Gaussian.
         v_seen: gradient of the loss to that, for the whole list.
-        noise: (number of a block, ids, Gaussians, alive) -> what to add to their means, or None.
+        noise: (number of a block, Gaussians, alive) -> what to add to their means, or None.
         owner: the moving object that each Gaussian belongs to, or None.
     """
     n, size = gaussians.capacity, block_size(ids.shape[0])
@@ -188,7 +188,7 @@ def update_listed(
         )
         moved, new = adam.update(grads, before, old, rates)
         if noise is not None:
-            moved = dataclasses.replace(moved, means=moved.means + noise(k, here, moved, shown))
+            moved = dataclasses.replace(moved, means=moved.means + noise(k, moved, shown))
         where = jnp.where(healthy & jnp.all(finite), here, n)
         return Updated(
             put_rows(state.gaussians, where, moved),
@@ -221,13 +221,11 @@ def concluded(
     *,
     cfg: FitConfig,
     optimizer: Optimizer,
-    views: int = 1,
 ) -> tuple[FitState, StepReport]:
     """Move the rest, and return the state after a step with what became of it.
 
     `moved` are the Gaussians after it, and the population with its statistics. `fits` says that
-    everything found room, `count` how many Gaussians a view may show, `views` how many the step
-    took.
+    everything found room, `count` how many Gaussians a view may show.
     """
     updated, population = moved
     first = state.fault.kind == FAULT_NONE
@@ -261,7 +259,7 @@ def concluded(
         Params(updated.gaussians, photometry, appearance),
         OptState(updated.moments, rest_moments),
         population,
-        state.step + views * (fault.kind == FAULT_NONE),
+        state.step + (fault.kind == FAULT_NONE),
         fault,
     )
     report = StepReport(gradient.loss, gradient.terms, gradient.psnr, gradient.entries, count)

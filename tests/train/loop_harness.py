@@ -38,8 +38,8 @@ class Views:
     def __len__(self):
         return VIEWS
 
-    def indices_at(self, step, count):
-        return tuple((step + k) % VIEWS for k in range(count))
+    def index_at(self, step):
+        return step % VIEWS
 
     def prefetch(self, index, shrink):
         pass

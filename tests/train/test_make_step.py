@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from data_parallel_worker import DEGREE, EXTENT, config, start, view
+from noise_views import DEGREE, EXTENT, config, start, view
 
 import p2gs_jax
 from p2gs_jax.config import FitConfig
@@ -15,7 +15,7 @@ from p2gs_jax.errors import DivergenceError
 from p2gs_jax.train.image_gradient import total_loss
 from p2gs_jax.train.terms import loss_terms
 
-CFG = config(1)
+CFG = config()
 
 
 def bright(rendered, target, aux):

@@ -1,0 +1,54 @@
+"""Noise photographed from four places, and Gaussians that each view shows or does not."""
+
+import numpy as np
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.core.numerics import on_host
+from p2gs_jax.presets import with_values
+from p2gs_jax.train.exposure_loss import Partner
+from p2gs_jax.types import Batch, Camera, Gaussians, Params, Photometry
+
+COUNT, VIEWS = 500, 4
+WIDTH, HEIGHT, FOCAL = 48, 32, 45.0
+EXTENT, DEGREE = 2.0, 1
+
+
+def config(method: str | None = "mcmc") -> FitConfig:
+    fields = {
+        "render.sh_degree": DEGREE,
+        "render.pixels_in_flight": 2048,
+        "densify.method": method,
+        # It would only cost compiling here.
+        "loss.dssim_weight": None,
+        # With an epsilon of about the gradient's size, updates are as smooth as the gradient.
+        "optimizer.eps": 1e-5,
+    }
+    return with_values(FitConfig(), fields)
+
+
+def start() -> Params:
+    """Some Gaussians that each view shows and others that it does not."""
+    rng = np.random.default_rng(0)
+    z = rng.uniform(3, 8, COUNT)
+    xy = rng.uniform(-0.9, 0.9, (COUNT, 2)) * z[:, None] * [WIDTH / FOCAL, HEIGHT / FOCAL]
+    values = (
+        np.concatenate([xy, z[:, None]], 1),
+        rng.normal(size=(COUNT, 4)),
+        rng.normal(-3, 0.4, (COUNT, 3)),
+        rng.normal(-1, 2, COUNT),
+        rng.normal(0, 0.3, (COUNT, (DEGREE + 1) ** 2, 3)),
+    )
+    zeros = np.zeros(VIEWS, np.float32)
+    gaussians = on_host(Gaussians, *(a.astype(np.float32) for a in values))
+    return on_host(Params, gaussians, on_host(Photometry, zeros + 0.1, zeros))
+
+
+def view(row: int) -> tuple[Batch, Partner]:
+    """A photograph of noise, from its own place."""
+    K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]], np.float32)
+    pose = np.eye(4, dtype=np.float32)
+    pose[0, 3] = 1.5 * row - 2
+    camera = on_host(Camera, pose, K, WIDTH, HEIGHT)
+    ldr = np.random.default_rng(row).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+    batch = on_host(Batch, camera, ldr, np.ones((HEIGHT, WIDTH), bool), np.int32(row))
+    return batch, on_host(Partner, np.int32(0))
