@@ -26,7 +26,6 @@ _PUBLIC = {
     "paths.shots": ("make_camera",),
     "photometry.display": ("DisplayTransform", "develop"),
     "pipeline.calibrate": ("calibrate", "calibrate_run", "calibrate_stack"),
-    "pipeline.convert": ("calibrate_of",),
     "pipeline.exposures": ("solve_exposures",),
     "pipeline.fit": ("fit",),
     "pipeline.prepare": ("initialise",),

@@ -125,7 +125,6 @@ class Calibrate:
         p2gs-jax calibrate castle --out photometry
         p2gs-jax calibrate castle --out photometry --known-exposures exif
         p2gs-jax calibrate stack --out photometry --static
-        p2gs-jax calibrate castle --out runs/relit --of splats.ply
     """
 
     SHORT_NAMES: ClassVar = (
@@ -149,29 +148,20 @@ class Calibrate:
     """Stated exposures to compare with; default: EXIF."""
     static: bool = False
     """The folder holds photographs from one fixed viewpoint at several exposures."""
-    of: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Somebody's splats of the scene (.ply, .spz, .compressed.ply; display colours): exposures are
-    solved, and it is written as linear radiance into --out, a run folder."""
-    steps: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """With --of: steps in which its colours and opacities are fitted again; default: 600."""
     preset: Preset = "robust"
     """Initial values; see `fit`."""
 
     def execute(self) -> int:
         """Solve the photometry alone; print it as a table."""
-        from p2gs_jax.cli.tables import print_calibration, print_calibration_of, print_stack
+        from p2gs_jax.cli.tables import print_calibration, print_stack
         from p2gs_jax.core.progress import TerminalReporter
         from p2gs_jax.pipeline.calibrate import calibrate, calibrate_run, calibrate_stack
-        from p2gs_jax.pipeline.convert import STEPS, calibrate_of
 
-        scene, out, cfg, steps = self.scene, self.out, self.checked(), self.steps or STEPS
+        scene, out, cfg = self.scene, self.out, self.checked()
         with TerminalReporter() as reporter:
             how = {"compare_with": self.compare_with, "reporter": reporter}
             if self.static:
                 show, found = print_stack, calibrate_stack(scene, out, cfg, **how)
-            elif self.of is not None:
-                show = print_calibration_of
-                found = calibrate_of(scene, out, cfg, model=self.of, steps=steps, **how)
             else:
                 show, solve = print_calibration, calibrate_run if self.is_run else calibrate
                 found = solve(scene, out, cfg, **how)
@@ -188,16 +178,8 @@ class Calibrate:
         scene, is_run, data, usual = self.scene, self.is_run, self.config.data, FitConfig().data
         own_size = data == usual
         check(
-            not (self.static and self.of),
-            "--static and --of exclude each other",
-            fix="leave one out",
-        )
-        check(self.steps is None or self.of is not None, "--steps says nothing without --of")
-        check(self.steps is None or self.steps >= 1, "--steps must be at least 1")
-        every = (data.test_every, data.split) == (usual.test_every, usual.split)
-        check(
-            self.of is not None or every,
-            "--data.test-every and --data.split say nothing without --of",
+            (data.test_every, data.split) == (usual.test_every, usual.split),
+            "--data.test-every and --data.split say nothing here",
             fix="leave them out: every photograph is calibrated",
         )
         cfg, leave_out = checked(self.config), "leave out --max-width, --images and --data options"
@@ -205,11 +187,6 @@ class Calibrate:
             own_size or not self.static,
             "--static reads every photograph of the folder at its own size",
             fix=leave_out,
-        )
-        check(
-            self.of is None or not is_run,
-            f"{scene} is a finished run; --of needs the photographs with their poses",
-            fix="name the scene that the run was fitted to",
         )
         check(
             own_size or not is_run,

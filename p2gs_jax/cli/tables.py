@@ -96,23 +96,6 @@ def print_calibration(result: Calibration, out: Path) -> None:
     stdout().print(f"Results: {out} (open {out / 'calibration.png'} first)")
 
 
-def print_calibration_of(found: Calibration, out: Path) -> None:
-    """Print the same, and how well somebody's splats fit before and after."""
-    _print_solution(found, _tone_columns(found))
-    for split, name in (("train", "training"), ("test", "held-out")):
-        if split not in found.metrics["of"]:
-            continue
-        old, new = found.metrics["of"][split], found.metrics[split]
-        by_view = new["exposure_fitted"] if split == "test" else new
-        how = "fitted to each" if split == "test" else "as solved"
-        stdout().print(
-            f"PSNR of {name} views: {old['as_it_is']['psnr']:.2f} dB as the model was, "
-            f"{old['exposure_fitted']['psnr']:.2f} with a gain fitted to each; now "
-            f"{by_view['psnr']:.2f} with exposures {how}."
-        )
-    stdout().print(f"Results: {out} (a run folder: view, render, export, report read it)")
-
-
 def print_stack(result: Calibration, out: Path) -> None:
     """Print the solved exposures of a stack from one viewpoint, and its response."""
     s = result.solution

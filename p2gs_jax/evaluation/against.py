@@ -1,4 +1,4 @@
-"""Renders and models of other programs, judged as a run is: the same views, masks and scores.
+"""Renders of other programs, judged as a run is: the same views, masks and scores.
 
 A program that knows no exposures is compared by `as_rendered`, as the field does it, and by
 `exposure_fitted`, which gives it what held-out views of a run get: one scalar a view, applied to
@@ -11,11 +11,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float32
 
-from p2gs_jax.config import PhotometryConfig, RenderConfig
 from p2gs_jax.evaluation.alignment import with_fitted_exposure
 from p2gs_jax.evaluation.evaluate import Judge
 from p2gs_jax.evaluation.passes import map_in_order
@@ -23,14 +21,11 @@ from p2gs_jax.evaluation.renders_of_others import OtherRenders, Rendered
 from p2gs_jax.evaluation.scores import still_mask, summary_of, view_scores
 from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
 from p2gs_jax.photometry.formation import LEAST_ALPHA
-from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.scene.pixels.decode import floats
-from p2gs_jax.scene.pixels.store import ImageStore, camera_of
-from p2gs_jax.types import GAMMA_SRGB, Gaussians, Scene
+from p2gs_jax.scene.pixels.store import ImageStore
 
 # Protocols of a run that are set beside those of other programs.
 OWN = ("averaged", "exposure_fitted")
-AS_IT_IS = DisplayTransform(1.0, GAMMA_SRGB, PhotometryConfig(curve="linear"))
 
 
 def check_renders(found: OtherRenders, store: ImageStore) -> OtherRenders:
@@ -173,33 +168,3 @@ def light_of(rendered: Rendered, shown: DisplayTransform, store: ImageStore, row
     behind = (pixels - alpha[..., None] * own) / free
     shown = replace(shown, backdrop=behind)
     return Light(covered * undevelop(own, shown), shown, pixels, alpha)
-
-
-def score_foreign(
-    gaussians: Gaussians, scene: Scene, store: ImageStore, cfg: RenderConfig
-) -> tuple[dict[str, Any], float]:
-    """Render and judge a model of display colours in all views of a scene.
-
-    Returns:
-        `test` and `train`, each with `as_it_is` and `exposure_fitted` (one gain on display values,
-        solved from the photograph), as in `metrics.json`; and the median over the views of the
-        correlation of the grey values of render and photograph, which no gain changes.
-    """
-    render, alive = make_renderer(cfg), jnp.ones(gaussians.capacity, bool)
-    rows = {split: ({}, {}) for split in ("train", "test")}
-    agree = []
-    for index, view in enumerate(scene.views):
-        photograph, mask = store.get(index, 1)
-        linear = np.asarray(render(gaussians, alive, camera_of(store, index)).linear)
-        gained = with_fitted_exposure(AS_IT_IS, linear, photograph, mask)
-        for found, how in zip(rows[view.split], (AS_IT_IS, gained), strict=True):
-            found[view.name] = view_scores(None, develop(linear, how), photograph, mask)
-        grey = linear.mean(-1)[mask > 0], photograph.mean(-1)[mask > 0]
-        with np.errstate(invalid="ignore"):  # where one does not vary
-            agree.append(float(np.nan_to_num(np.corrcoef(*grey)[0, 1])))
-    scores = {
-        split: {"as_it_is": summary_of(plain), "exposure_fitted": summary_of(gained)}
-        for split, (plain, gained) in rows.items()
-        if plain
-    }
-    return scores, float(np.median(agree))

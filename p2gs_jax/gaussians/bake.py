@@ -1,4 +1,4 @@
-"""Display colours for ordinary 3DGS viewers, the error of their pictures, and radiance from them.
+"""Display colours for ordinary 3DGS viewers, and the error of their pictures.
 
 A viewer composites display values; the true picture composites radiance and then applies the tone
 curve. Display colours computed for each Gaussian by itself are therefore wrong by many codes where
@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, UInt8
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import fibonacci_sphere, on_device
-from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
+from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render import harmonics, render_linear
 from p2gs_jax.render.capacity import (
     PICTURES,
@@ -39,8 +39,6 @@ DIRECTIONS = 64
 CHUNK = 8192
 # Variance that viewers add to the 2D covariance, pixels^2, as 3DGS does.
 VIEWER_BLUR = 0.3
-# Display values beyond which a splat of another program counts as saturated.
-BRIGHTEST = 250.0 / 255.0
 # Adam's rates per step for colours of degree 0, of the others, and for opacity logits; they decay
 # to a tenth. Measured on two runs (BUILD_NOTES, "Display PLY").
 COLOR_RATE, BANDS_RATE, OPACITY_RATE, DECAY = 0.05, 0.0025, 0.3, 0.1
@@ -229,16 +227,3 @@ def _difference(target: Target, render: Render) -> dict[str, float]:
 
 def _all(gaussians: Gaussians) -> Array:
     return on_device(np.ones(gaussians.capacity), bool)
-
-
-def relit(gaussians: Gaussians, shown: DisplayTransform, cfg: RenderConfig) -> Gaussians:
-    """Return Gaussians of 3DGS's display colours, max(0, sh + 1/2), with their radiance.
-
-    What depends on the direction begins at nothing: in a model that knows no exposures it mostly
-    tells one photograph's exposure from another's. `shown` is how the photographs were taken on
-    average, without what depends on the place.
-    """
-    colors = np.clip(0.5 + C0 * np.asarray(gaussians.sh[:, 0]), 0.0, BRIGHTEST)
-    sh = np.zeros((len(colors), coefficient_count(cfg.sh_degree), 3), np.float32)
-    sh[:, 0] = harmonics.radiance_preactivation(undevelop(colors, shown), cfg.radiance) / C0
-    return replace(gaussians, sh=on_device(sh))

@@ -1,8 +1,7 @@
 """Photometry alone: exposures, gammas and tone curve in seconds, without splatting.
 
 Observations come from the tracks of a scene, through the rendered depth of a finished run, or from
-a stack of exposures of one fixed viewpoint; from there on all go one way (`solved`). `convert.py`
-does it for somebody else's splats.
+a stack of exposures of one fixed viewpoint; from there on all go one way (`solved`).
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -70,8 +69,6 @@ class Calibration:
     details: dict[str, Any]  # what `calibration.json` holds besides
     observations: int  # how many were used
     seconds: dict[str, float]  # of `reading` and sampling, and of the `adjustment`
-    # of `calibrate_of`: what `metrics.json` holds; `of` has the scores of the model as it was
-    metrics: dict[str, Any] = field(default_factory=dict)
 
     @property
     def solution(self) -> PhotometricSolution:

@@ -34,7 +34,6 @@ class Account:
     selection: Selection | None = None  # what the bundle adjustment found, or None
     # what the user was told; what the evaluation finds is added
     notes: list[str] = field(default_factory=list)
-    of: dict | None = None  # scores of the model that was converted, as it was; None: this is a fit
 
 
 def finish(
@@ -146,7 +145,7 @@ def _accounted(
     }
     if account.selection is not None:
         entries["photometry"] = account.selection.solution.state
-    return entries if account.of is None else {**entries, "of": account.of}
+    return entries
 
 
 def seconds_to_finish(

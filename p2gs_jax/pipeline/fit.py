@@ -262,17 +262,12 @@ def account_of(
     result: TrainResult,
     clock: Stopwatch,
     begin: float,
-    of: dict | None = None,
 ) -> Account:
-    """Return what a fit says of itself; it began at `begin` (`time.monotonic`).
-
-    `of` are the scores of the model that was converted, as it was.
-    """
-    seeds = {} if of is not None else {"seed_points": len(start.scene.points)}
+    """Return what a fit says of itself; it began at `begin` (`time.monotonic`)."""
     return Account(
         counts={
             "gaussians": params.gaussians.capacity,
-            **seeds,
+            "seed_points": len(start.scene.points),
             "train_views": len(start.scene.train_indices),
             "test_views": len(start.scene.test_indices),
             "steps": result.host.step,
@@ -287,7 +282,6 @@ def account_of(
         },
         selection=start.selection,
         notes=start.notes,
-        of=of,
     )
 
 

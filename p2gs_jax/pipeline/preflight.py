@@ -132,17 +132,11 @@ def check_options(cfg: FitConfig) -> None:
             raise UserError(message, fix=fix)
 
 
-def check_run_dir(
-    run_dir: Path,
-    resume: bool,
-    cfg: FitConfig,
-    way_on: str = "add --resume to continue it, or name another folder with --out",
-) -> bool:
+def check_run_dir(run_dir: Path, resume: bool, cfg: FitConfig) -> bool:
     """Refuse to overwrite a run, and to continue one under other options.
 
     Options of the evaluation and the memory for photographs may differ: they do not change the fit.
-    Steps and budget may be larger; the result says whether they are. `way_on` tells what to do
-    about a run that is there.
+    Steps and budget may be larger; the result says whether they are.
 
     Raises:
         UserError: the folder holds a run and `resume` is not set, is not a folder, or holds a run
@@ -154,7 +148,10 @@ def check_run_dir(
     if not path.exists():
         return False
     if not resume:
-        raise UserError(f"{run_dir} already holds a run.", fix=way_on)
+        raise UserError(
+            f"{run_dir} already holds a run.",
+            fix="add --resume to continue it, or name another folder with --out",
+        )
     saved, now = (flat(plain(to_dict(options))) for options in (read_config(path)[1], cfg))
     free = [name for name in now if name == "data.cache_mb" or name.startswith("evaluation.")]
     plan = [name for name in ("train.steps", "train.budget_s") if now[name] and saved.get(name)]

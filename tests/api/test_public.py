@@ -85,7 +85,6 @@ BAD = {
     "load_run, scene": lambda: p2gs_jax.load_run("nowhere", "elsewhere"),
     "calibrate_stack": lambda: p2gs_jax.calibrate_stack("nowhere"),
     "calibrate_run": lambda: p2gs_jax.calibrate_run("nowhere", "out"),
-    "calibrate_of": lambda: p2gs_jax.calibrate_of("nowhere", "out", model="nowhere.ply"),
     "calibrate": lambda: p2gs_jax.calibrate("nowhere", "out"),
     "fit": lambda: p2gs_jax.fit("nowhere", "run"),
     "fit, configuration": lambda: p2gs_jax.fit("nowhere", "run", "robust"),
