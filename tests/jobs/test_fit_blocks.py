@@ -80,8 +80,8 @@ def test_two_blocks_become_one_run(tmp_path, in_this_process):
     opened = p2gs_jax.load_run(run)
     assert opened.params.gaussians.capacity == said["counts"]["gaussians"]
     # The exposures are those of the bundle adjustment, bit for bit, whatever the blocks did.
-    shared, _ = read_shared(run / "blocks", load(scene, run, SMALL), SMALL)
-    solved = shared.photometry.exposures
+    shared = read_shared(run / "blocks", load(scene, run, SMALL), SMALL)
+    solved = shared.exposures.photometry.exposures
     np.testing.assert_allclose(
         np.asarray(result.params.photometry.exposures), solved / np.exp(np.log(solved).mean()), 1e-5
     )

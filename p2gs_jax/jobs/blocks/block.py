@@ -17,11 +17,9 @@ from p2gs_jax.core.progress import Reporter
 from p2gs_jax.core.runtime import tune_process, use_compile_cache
 from p2gs_jax.formats.ply import write_radiance
 from p2gs_jax.gaussians.population import Coverage, default_max_gaussians
-from p2gs_jax.gaussians.shell import Sphere
-from p2gs_jax.jobs.blocks.cut import Cut, whole_of
-from p2gs_jax.jobs.blocks.shared import photometry_of, read_shared
+from p2gs_jax.jobs.blocks.cut import Cut
+from p2gs_jax.jobs.blocks.shared import Shared, block_of, read_shared
 from p2gs_jax.jobs.job import Job
-from p2gs_jax.pipeline.exposures import Exposures
 from p2gs_jax.pipeline.fit import Optimiser, begun, compact
 from p2gs_jax.pipeline.preflight import Paths
 from p2gs_jax.pipeline.prepare import initialise
@@ -36,16 +34,6 @@ from p2gs_jax.types import Scene
 # With 1, cores of a town had 5 % fewer Gaussians than one fit and .18 dB less; with 1.6, on another
 # town, 13 % more and .09 dB less (BUILD_NOTES, "Districts").
 OUTSIDE = 1.6
-
-
-@dataclasses.dataclass(frozen=True)
-class BlockScene:
-    """A block as a scene of its own."""
-
-    scene: Scene  # its training views, its points first
-    exposures: Exposures  # with radiances, as solved for all blocks
-    shell: Sphere  # where what lies behind everything is
-    own: int  # how many of the points lie in the block; the others are coarse
 
 
 def block_job(scene: Path, run: Path, folder: Path, cut: Cut, number: int, cfg: FitConfig) -> Job:
@@ -117,25 +105,20 @@ def fit_block(folder: Path, arguments: dict[str, Any], reporter: Reporter) -> No
     whole, cut = from_dict(arguments["fit"]), Cut.from_dict(arguments["cut"])
     reporter.stage("Reading the scene")
     scene = load(Path(arguments["scene"]), Path(arguments["run"]), whole)
-    shared, scene = read_shared(Path(arguments["shared"]), scene, whole)
-    number = arguments["number"]
-    found, keep, own = whole_of(scene, cut, number)
-    photometry = photometry_of(shared.photometry, np.array(cut.blocks[number].views))
-    exposures = Exposures(photometry, shared.decisions, radiance=shared.radiance[keep])
-    block = BlockScene(found, exposures, shared.shell, own)
-    train_views = len(scene.train_indices)
-    cfg = block_config(whole, cut, number, block.scene, block.own, train_views=train_views)
-    del scene, shared
+    number, train_views = arguments["number"], len(scene.train_indices)
+    block, own = block_of(read_shared(Path(arguments["shared"]), scene, whole), cut, number)
+    cfg = block_config(whole, cut, number, block.scene, own, train_views=train_views)
+    del scene
     folder.mkdir(parents=True, exist_ok=True)
     with locked(folder), decoded_into(RunFolder(folder).pixels):
-        counts, seconds = _fit(RunFolder(folder), block, cfg, reporter, arguments["scene"])
+        counts, seconds = _fit(RunFolder(folder), block, own, cfg, reporter, arguments["scene"])
     seconds["total"] = time.monotonic() - begin
     metrics = {"counts": counts, "seconds": seconds, "peak_bytes": peak_bytes()}
     write_json(RunFolder(folder).metrics, metrics)
 
 
 def _fit(
-    folder: RunFolder, block: BlockScene, cfg: FitConfig, reporter: Reporter, scene: str
+    folder: RunFolder, block: Shared, own: int, cfg: FitConfig, reporter: Reporter, scene: str
 ) -> tuple[dict[str, int], dict[str, float]]:
     """Fit a block's scene and write its Gaussians; return counts and seconds."""
     clock = Stopwatch()
@@ -156,7 +139,7 @@ def _fit(
     counts = {
         "gaussians": count,
         "seed_points": len(block.scene.points),
-        "seed_points_outside": len(block.scene.points) - block.own,
+        "seed_points_outside": len(block.scene.points) - own,
         "train_views": len(block.scene.views),
         "steps": result.host.step,
     }

@@ -34,7 +34,7 @@ from p2gs_jax.jobs.blocks.seams import Seam, level_seams, merge_cores
 from p2gs_jax.jobs.blocks.shared import (
     ARRAYS,
     DECISIONS,
-    Solved,
+    Shared,
     read_shared,
     solve_shared,
     write_shared,
@@ -178,7 +178,8 @@ class _Blocks:
             self._fit_blocks()
         self.reporter.stage("Merging blocks")
         store = ImageStore(solved.scene.views, self.cfg.data, folder=self.folder.pixels)
-        cfg = solved.shared.decisions.resolve(self.cfg)
+        decisions = solved.exposures.decisions
+        cfg = decisions.resolve(self.cfg)
         fitted = [
             read_ply(RunFolder(self.blocks / str(k)).radiance) for k in range(len(self.cut.blocks))
         ]
@@ -186,7 +187,7 @@ class _Blocks:
             fitted, seams = level_seams(solved.scene, store, self.cut, fitted, cfg.render)
         gaussians, counts = merge_cores(self.cut, fitted)
         fitted.clear()
-        photometry = jax.tree.map(on_device, solved.shared.photometry)
+        photometry = jax.tree.map(on_device, solved.exposures.photometry)
         params = centred(Params(gaussians, photometry), cfg)
         self._tell(seams)
         self.lock.require()
@@ -211,11 +212,11 @@ class _Blocks:
             solved.scene,
             metrics,
             self.paths.run,
-            solved.selection,
-            solved.shared.decisions,
+            solved.exposures.selection,
+            decisions,
         )
 
-    def _account(self, scene: Scene, solved: Solved, gaussians: int, seconds: float) -> Account:
+    def _account(self, scene: Scene, solved: Shared, gaussians: int, seconds: float) -> Account:
         blocks = [self._of_block(k) for k in range(len(self.cut.blocks))]
         optimisation = sum(found["seconds"]["optimisation"] for found in blocks)
         return Account(
@@ -232,27 +233,29 @@ class _Blocks:
                 "total_until_evaluation": seconds,
                 "optimisation": optimisation,  # of all blocks, side by side or not
             },
-            selection=solved.selection,
-            notes=[*solved.scene.notes, *solved.notes],
+            selection=solved.exposures.selection,
+            notes=[*solved.scene.notes, *solved.exposures.notes],
         )
 
-    def _solve(self, scene: Scene) -> Solved:
+    def _solve(self, scene: Scene) -> Shared:
         store = ImageStore(scene.views, self.cfg.data, folder=self.folder.pixels)
         kept = read_decisions(self.blocks / DECISIONS)
         solved = solve_shared(scene, store, self.cfg, self.reporter, kept=kept)
         store.close()
         return_freed_memory()
-        for note in (*scene.notes, *solved.notes):
+        for note in (*scene.notes, *solved.exposures.notes):
             self.reporter.message(note)
         self.lock.require()
-        shared = solved.shared
-        write_start(self.folder, self.paths.scene, self.paths.reference, self.cfg, shared.decisions)
+        found, paths = solved.exposures, self.paths
+        write_start(self.folder, paths.scene, paths.reference, self.cfg, found.decisions)
         if (self.blocks / ARRAYS).exists():
             # What blocks were fitted under stays, to the digit.
-            shared, scene = read_shared(self.blocks, scene, self.cfg)
-            return dataclasses.replace(solved, shared=shared, scene=scene)
+            before = read_shared(self.blocks, scene, self.cfg)
+            told = {"selection": found.selection, "notes": found.notes}
+            exposures = dataclasses.replace(before.exposures, **told)
+            return dataclasses.replace(before, exposures=exposures)
         write_plan(self.blocks, self.cut, str(self.asked.blocks))
-        write_shared(self.blocks, shared, solved.scene)
+        write_shared(self.blocks, solved)
         return solved
 
     def _fit_blocks(self) -> None:

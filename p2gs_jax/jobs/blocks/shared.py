@@ -7,7 +7,6 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from jaxtyping import Float32, Int
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import atomic_write
@@ -15,9 +14,9 @@ from p2gs_jax.core.progress import Reporter
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.seeds import cameras_radius, photographed_radiance, with_colors
 from p2gs_jax.gaussians.shell import Sphere, sphere_behind
-from p2gs_jax.photometry.calibrate import Selection
+from p2gs_jax.jobs.blocks.cut import Cut, whole_of
 from p2gs_jax.photometry.parameters import point_radiance
-from p2gs_jax.pipeline.exposures import solve_exposures
+from p2gs_jax.pipeline.exposures import Exposures, solve_exposures
 from p2gs_jax.pipeline.survey import near_depth, near_plane, scale_notes, seen_depths
 from p2gs_jax.run.decisions import Decisions, read_decisions, write_decisions
 from p2gs_jax.scene.pixels.store import ImageStore
@@ -28,22 +27,11 @@ ARRAYS, DECISIONS = "shared.npz", "decisions.json"
 
 @dataclasses.dataclass(frozen=True)
 class Shared:
-    """What all blocks share: one gauge of radiance."""
-
-    photometry: Photometry  # of all training views, on the host
-    decisions: Decisions  # what the scene settled; exposures stay
-    radiance: Float32[np.ndarray, "p 3"]  # of all points, linear
-    shell: Sphere  # where what lies behind everything is
-
-
-@dataclasses.dataclass(frozen=True)
-class Solved:
-    """A scene whose exposures are solved."""
+    """A scene, or a block of it, with what all blocks share: one gauge of radiance."""
 
     scene: Scene  # with colours of the points
-    shared: Shared  # what the blocks are given
-    selection: Selection  # exposures with their errors
-    notes: tuple[str, ...]  # what the user should know
+    exposures: Exposures  # of its training views, on the host, as they stay; with radiances
+    shell: Sphere  # where what lies behind everything is
 
 
 def solve_shared(
@@ -53,7 +41,7 @@ def solve_shared(
     reporter: Reporter,
     *,
     kept: Decisions | None = None,
-) -> Solved:
+) -> Shared:
     """Solve the photometry of a scene; `kept` is what a run that is resumed decided before.
 
     UserError: no point is seen twice.
@@ -73,41 +61,42 @@ def solve_shared(
         solved.decisions, freeze_until=1.0, log_exposure_mean=None, near=near
     )
     resolved = decisions.resolve(cfg)
-    notes = [*scale_notes(scene, near, cfg, depth), *solved.notes]
-    photometry = solved.photometry
     if scene.point_colors is None:
-        scene = with_colors(scene, photographed_radiance(scene, still, photometry, resolved))
-    shared = Shared(
-        photometry=jax.tree.map(np.asarray, photometry),
+        scene = with_colors(scene, photographed_radiance(scene, still, solved.photometry, resolved))
+    exposures = dataclasses.replace(
+        solved,
+        photometry=jax.tree.map(np.asarray, solved.photometry),
         decisions=decisions,
+        observations=None,
         radiance=point_radiance(scene, solved.selection.solution, resolved),
-        shell=sphere_behind(views, scene.points, cameras_radius(views, scene.points), cfg.init),
+        notes=(*scale_notes(scene, near, cfg, depth), *solved.notes),
     )
-    return Solved(scene, shared, solved.selection, tuple(notes))
+    radius = cameras_radius(views, scene.points)
+    return Shared(scene, exposures, sphere_behind(views, scene.points, radius, cfg.init))
 
 
-def write_shared(folder: Path, shared: Shared, scene: Scene) -> None:
-    """Write what the blocks share; the scene's points gain colours on the way."""
-    write_decisions(folder / DECISIONS, shared.decisions)
-    p = shared.photometry
+def write_shared(folder: Path, shared: Shared) -> None:
+    """Write what the blocks share."""
+    write_decisions(folder / DECISIONS, shared.exposures.decisions)
+    p, colors = shared.exposures.photometry, shared.scene.point_colors
     arrays = {
         "exposures": p.raw_exposures,
         "gammas": p.raw_gammas,
-        "radiance": shared.radiance,
+        "radiance": shared.exposures.radiance,
         "shell": np.array([*shared.shell.middle, shared.shell.radius]),
     }
     if p.raw_white_balance is not None:
         arrays["white_balance"] = p.raw_white_balance
     if p.cameras is not None:
         arrays["cameras"] = np.array(p.cameras, np.int64)
-    if scene.point_colors is not None:
-        arrays["point_colors"] = scene.point_colors
+    if colors is not None:
+        arrays["point_colors"] = colors
     with atomic_write(folder / ARRAYS) as temporary:
         np.savez(temporary, **arrays)
 
 
-def read_shared(folder: Path, scene: Scene, cfg: FitConfig) -> tuple[Shared, Scene]:
-    """Return what the blocks share, and the scene, read again, with the colours of its points.
+def read_shared(folder: Path, scene: Scene, cfg: FitConfig) -> Shared:
+    """Return what the blocks share; `scene` was read again, and its points gain colours.
 
     UserError: the files are broken, or of another scene.
     """
@@ -142,16 +131,24 @@ def read_shared(folder: Path, scene: Scene, cfg: FitConfig) -> tuple[Shared, Sce
         )
     if "point_colors" in a:
         scene = dataclasses.replace(scene, point_colors=a["point_colors"])
-    return Shared(photometry, decisions, radiance, shell), scene
+    return Shared(scene, Exposures(photometry, decisions, radiance=radiance), shell)
 
 
-def photometry_of(photometry: Photometry, rows: Int[np.ndarray, " k"]) -> Photometry:
-    """Return the photometry of some training views."""
-    balance, cameras = photometry.raw_white_balance, photometry.cameras
-    return dataclasses.replace(
-        photometry,
-        raw_exposures=photometry.raw_exposures[rows],
-        raw_gammas=photometry.raw_gammas[rows],
-        raw_white_balance=None if balance is None else balance[rows],
-        cameras=None if cameras is None else tuple(cameras[k] for k in rows),
+def block_of(shared: Shared, cut: Cut, number: int) -> tuple[Shared, int]:
+    """Return a block as a scene of its own: its training views, its points first, coarse ones.
+
+    Also how many of the points lie in the block.
+    """
+    scene, keep, own = whole_of(shared.scene, cut, number)
+    given, rows = shared.exposures, np.array(cut.blocks[number].views)
+    cameras = given.photometry.cameras
+    assert given.radiance is not None
+    exposures = dataclasses.replace(
+        given,
+        photometry=dataclasses.replace(
+            jax.tree.map(lambda a: a[rows], given.photometry),
+            cameras=None if cameras is None else tuple(cameras[k] for k in rows),
+        ),
+        radiance=given.radiance[keep],
     )
+    return Shared(scene, exposures, shared.shell), own
