@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float32
 
 from p2gs_jax.config import LossConfig
+from p2gs_jax.core.text import first_few
 from p2gs_jax.evaluation.lpips import LpipsWeights, lpips
 from p2gs_jax.evaluation.ssim import ssim as _ssim
 from p2gs_jax.evaluation.ssim import ssim_map
@@ -29,7 +30,6 @@ PARTS = ("whole", "static", "moving")
 FEWEST_PIXELS = 64
 # A photograph tells its exposure where at least this share lies between black and saturation.
 FEWEST_TELLING = 1e-3
-_NAMED = 8
 
 Masks = Mapping[str, Float32[np.ndarray, "h w"]]
 
@@ -231,18 +231,14 @@ def untold_notes(metrics: dict[str, Any]) -> list[str]:
     if hidden := metrics.get("hidden"):
         out.append(
             f"{len(hidden)} view(s) are hidden by their masks altogether and have no scores "
-            f"({_listed(hidden)})."
+            f"({first_few(hidden)})."
         )
     if unknown := metrics.get("exposures_unknown"):
         out.append(
             f"{len(unknown)} photograph(s) are black or saturated everywhere: their exposures are "
-            f"unknown, whatever photometry.json holds ({_listed(unknown)})."
+            f"unknown, whatever photometry.json holds ({first_few(unknown)})."
         )
     return out
-
-
-def _listed(names: list[str]) -> str:
-    return ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")
 
 
 @dataclass

@@ -112,7 +112,9 @@ def advance(
     gaussians, population = state.params.gaussians, state.population
     n, bands = gaussians.capacity, coefficient_count(degree)
     fits = ~gradient.overflow & (count <= ids.shape[0])
-    healthy = is_healthy(state, gradient, fits)
+    # No fault before it, room, and a finite loss: else the step writes nothing.
+    unbroken = jnp.all(_finite((gradient.terms, gradient.v_rest)))
+    healthy = (state.fault.kind == FAULT_NONE) & fits & unbroken
     progress, rate = controls.progress, controls.rate
     rates = learning_rates(progress, rate, extent, state.params, cfg, bands)
     key = noise_key(controls.seed, state.step)
@@ -141,8 +143,8 @@ def advance(
     if noise is None:
         where = jnp.where(healthy, ids, n)
         population = _observed(population, where, gradient, frustum)
-    moved = (updated, population)
-    return concluded(state, moved, gradient, fits, count, rates, cfg=cfg, optimizer=optimizer)
+    moved, told = (updated, population), (fits, healthy, count)
+    return _concluded(state, moved, gradient, told, rates, cfg=cfg, optimizer=optimizer)
 
 
 def update_listed(
@@ -205,18 +207,11 @@ def update_listed(
     return lax.fori_loop(0, -(-used // size), body, start)
 
 
-def is_healthy(state: FitState, gradient: ImageGradient, fits: Array) -> Bool[Array, ""]:
-    """Return whether a step may write: no fault before it, room, and a finite loss."""
-    first = state.fault.kind == FAULT_NONE
-    return first & fits & jnp.all(_finite((gradient.terms, gradient.v_rest)))
-
-
-def concluded(
+def _concluded(
     state: FitState,
     moved: tuple[Updated, Population],
     gradient: ImageGradient,
-    fits: Bool[Array, ""],
-    count: Int[Array, ""],
+    told: tuple[Bool[Array, ""], Bool[Array, ""], Int[Array, ""]],
     rates: Params,
     *,
     cfg: FitConfig,
@@ -224,12 +219,11 @@ def concluded(
 ) -> tuple[FitState, StepReport]:
     """Move the rest, and return the state after a step with what became of it.
 
-    `moved` are the Gaussians after it, and the population with its statistics. `fits` says that
-    everything found room, `count` how many Gaussians a view may show.
+    `moved` are the Gaussians after it, and the population with its statistics. `told` are whether
+    everything found room, whether the step is healthy, and how many Gaussians the view may show.
     """
-    updated, population = moved
+    (updated, population), (fits, healthy, count) = moved, told
     first = state.fault.kind == FAULT_NONE
-    healthy = is_healthy(state, gradient, fits)
     old_rest = (state.params.photometry, state.params.appearance)
     (photometry, appearance), rest_moments = optimizer.rest.update(
         gradient.v_rest, state.opt_state.rest, old_rest, (rates.photometry, rates.appearance)

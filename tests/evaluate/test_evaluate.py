@@ -125,7 +125,7 @@ def test_the_notes_name_the_first_views():
     assert "1 view(s) are hidden" in hidden
     assert "(a.png)" in hidden
     assert "10 photograph(s)" in unknown
-    assert "7.png, ...)" in unknown
+    assert "4.png, ...)" in unknown
     assert untold_notes({"train": {}}) == []
 
 
