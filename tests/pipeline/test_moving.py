@@ -10,7 +10,6 @@ from moving_box import SIZE, drive_format, pose_at, write_photographs
 
 from p2gs_jax import FitConfig, UserError, fit, load_run, make_camera, with_fields
 from p2gs_jax.core.atomic import read_jsonl
-from p2gs_jax.evaluation import drives as drive_scores
 from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.formats.ply import read_ply
 from p2gs_jax.photometry.display import develop
@@ -48,8 +47,6 @@ METHODS = {
 def _reader():
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(drives.FORMATS, "pandaset", drive_format())
-        # Each shift costs every evaluation six renders; tests/evaluate has them all.
-        patch.setattr(drive_scores, "SHIFTS", (1.0,))
         yield
 
 
