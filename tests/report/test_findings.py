@@ -136,6 +136,12 @@ def test_clipped_photographs_are_named_and_many_are_counted(run):
     assert "and 4 more" in many
 
 
+def test_a_fit_records_where_it_started(finished_run):
+    for view in read_run(finished_run).train:
+        assert view["exposure_ev_start"] == pytest.approx(view["exposure_ev"], abs=0.1)
+        assert view["observations"] > 15
+
+
 def test_the_summary_is_three_sentences(run):
     what, model, good = findings.summary_sentences(run, SceneMeasurements())
     split = run.metrics.pop("split")

@@ -100,6 +100,15 @@ def test_other_names_are_said_and_the_nearest_file_is_named(tmp_path):
         find_scene(tmp_path, CFG)
 
 
+def test_a_folder_of_smaller_images_keeps_the_folders_of_cameras(tmp_path):
+    path = write(tmp_path, {**LENS, "frames": frames("images/cam0/a.png")}, names=())
+    for folder in ("images/cam0", "images_2/cam0"):
+        write_image(tmp_path / folder / "a.png")
+    for cfg in (CFG, DataConfig(images="images_2")):
+        (view,) = find_scene(path, cfg).views
+        assert (view.name, view.camera) == ("cam0/a.png", "cam0")
+
+
 def test_byte_order_marks_and_lines_that_are_not_there(tmp_path):
     model = write_tiny_model(tmp_path)
     images = model / "images.txt"
