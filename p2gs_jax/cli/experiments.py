@@ -93,10 +93,11 @@ class Synth:
     width: int = 480
     """Image width, pixels (paper: 1920); the height follows as 1300 / 1920 of it."""
     layout: Layout = "town"
-    """town: with an underpass and a sun of its own for every seed; street: the demo's; long:
-    streets one behind another, as long as the drive."""
-    supersample: int = 2
-    """Samples a pixel along each axis."""
+    """town: with an underpass and a sun of its own for every seed; matte: the same without gloss,
+    for clean experiments on exposures; street: the demo's; long: streets one behind another, as
+    long as the drive."""
+    supersample: int | None = None
+    """Samples a pixel along each axis (default: 2, of a matte town 8)."""
     points: int = 60_000
     """Seed points sampled for the COLMAP model; those seen once are dropped."""
     seed: int = 0

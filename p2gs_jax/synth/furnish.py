@@ -42,18 +42,19 @@ _PAINTS: list[Vec3] = [
 def build_town(seed: int = 0, layout: Layout = "street", reach: float = 0.0) -> Town:
     """Return one street with a crossing, houses, trees, parked cars, lamps and signs.
 
-    `town` adds an underpass, deep in shadow, and draws the place of the sun; `long` puts streets
-    one behind another as far as the cameras drive, `reach`, m.
+    `town` adds an underpass, deep in shadow, and draws the place of the sun; `matte` is the town
+    without gloss; `long` puts streets one behind another as far as the cameras drive, `reach`, m.
     """
     if layout == "long":
         count = 1 + max(0, math.ceil((reach - t.STREET_END) / STREET_M))
         return t.pack(_streets(seed, count), seed, _light(seed))
-    clear = t.UNDERPASS if layout == "town" else None
+    clear = None if layout == "street" else t.UNDERPASS
     build = Builder(generator(seed, SceneStream.BUILDINGS), clear)
     _furnish(build)
-    if layout == "town":
-        _underpass(build)
-    return t.pack(build, seed, _light(seed) if layout == "town" else Light())
+    if layout == "street":
+        return t.pack(build, seed, Light())
+    _underpass(build)
+    return t.pack(build, seed, _light(seed), 0.0 if layout == "matte" else 1.0)
 
 
 def _furnish(build: Builder, *, closed: bool = True) -> None:

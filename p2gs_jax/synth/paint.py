@@ -30,6 +30,7 @@ from p2gs_jax.synth.town import Material, Town
 # Wavelengths of noise by material, m; others have the defaults of `_point`.
 _FINE = {Material.ROAD: 0.07, Material.PAVEMENT: 0.08, Material.FOLIAGE: 0.16, Material.BARK: 0.05}
 _COARSE = {Material.ROAD: 2.7, Material.FOLIAGE: 0.55, Material.CAR_BODY: 0.6}
+_MEAN_WEAR = 0.1046  # of road marks, over 3 million draws
 
 
 def sky(town: Town, view: Float[Array, "3 r"], *, clouds: bool) -> Float[Array, "3 r"]:
@@ -78,7 +79,7 @@ def paint(
     bent = s.normal + relief * (s.fine + 0.5 * s.coarse)
     bent = bent / jnp.sqrt(jnp.sum(bent**2, 0) + 1e-9)
     bent = jnp.where(gloss > 0.3, s.normal, bent)
-    return Surface(jnp.clip(albedo, 0.002, 0.9), emission, gloss, s.normal, bent)
+    return Surface(jnp.clip(albedo, 0.002, 0.9), emission, town.gloss * gloss, s.normal, bent)
 
 
 def _point(
@@ -99,11 +100,13 @@ def _point(
     waves = jnp.stack([fine, 4.0 * fine, coarse])
     x, y, z = p[:, None] / waves
     noise = value_noise(x, y, z, (town.seed + 1, town.seed + 2, town.seed + 3))
-    noise = noise * detail(footprint, waves)
-    fine, coarse = 0.7 * noise[:, 0] + 0.55 * noise[:, 1], noise[:, 2]
+    # Light and colour of leaves are not linear in their noise, so that it must not fade.
+    fade = jnp.where(material == Material.FOLIAGE, 1.0, detail(footprint, waves[:2]))
+    rough, coarse = 0.7 * noise[:, 0] + 0.55 * noise[:, 1], noise[:, 2]
+    fine = 0.7 * fade[0] * noise[:, 0] + 0.55 * fade[1] * noise[:, 1]
     places = (rows[0:3], rows[3:6], rows[6:9], rows[9:12])
     params = (rows[12], rows[13], rows[14], rows[15])
-    return Point(p, normal, *places, *params, index, footprint, fine, coarse)
+    return Point(p, normal, *places, *params, index, footprint, fine, coarse, rough)
 
 
 def _brushes(
@@ -139,22 +142,21 @@ def _road(s: Point, seed: int) -> Array:
     edge = s.grid(x, 3.1, 0.85) * s.grid(y, 1.9, 0.7)
     tone = tone * (1.0 - 0.42 * (patch > 0.86) * edge)
     seam = 1.0 - s.grid(x + 0.35 * s.coarse[1], 7.3, 3.63)
-    tone = tone * (1.0 - 0.45 * seam * detail(s.footprint, jnp.float32(0.05)))
+    tone = tone * (1.0 - 0.45 * seam)
     hole = (x - 8.7) ** 2 + (y - 0.95) ** 2
     tone = jnp.where(hole < 0.16, 0.05 + 0.03 * (jnp.sin(26.0 * x) * jnp.sin(26.0 * y) > 0), tone)
     dash = s.bar(y, 0.075) * s.grid(x, 6.0, 1.5)
     side = s.bar(across - 3.4, 0.05) * (1.0 - s.grid(x, 6.3, 0.35))
-    bays = s.grid(x - 3.1, 6.5, 0.05) * s.bar(across - 4.5, 1.1)
-    lines = jnp.maximum(jnp.maximum(dash, side), bays) * (~crossing)
+    bays = s.grid(x - 3.1, 6.5, 0.05) * s.span(across, 3.45, t.ROAD_HALF_WIDTH)
+    lines = (dash + side + bays) * (~crossing)
     zebra = 0.0 * x
-    for start in (t.CROSS_STREET[0] - 5.2, t.CROSS_STREET[1] + 1.4):
-        stripes = s.grid(y, 1.0, 0.25) * s.bar(across, 5.3)
-        band = s.bar(x - start - 1.8, 1.8)
-        lines = lines * (1.0 - s.bar(x - start - 1.8, 3.4))
-        zebra = jnp.maximum(zebra, stripes * band)
+    for middle in (t.CROSS_STREET[0] - 3.4, t.CROSS_STREET[1] + 3.2):
+        lines = lines * (jnp.abs(x - middle) > 3.4)
+        zebra = zebra + s.grid(y, 1.0, 0.25) * (across < 5.0) * s.bar(x - middle, 1.8)
     stop = s.bar(x - t.CROSS_STREET[0] + 6.4, 0.2) * s.bar(y + 2.0, 1.75)
-    marks = jnp.maximum(jnp.maximum(lines, zebra), stop)
-    marks = marks * (0.88 - 0.5 * smooth(0.25, 0.75, s.fine[1] + 0.5 * s.coarse[2]))
+    wear = smooth(0.25, 0.75, s.rough[1] + 0.5 * s.coarse[2]) - _MEAN_WEAR
+    wear = _MEAN_WEAR + wear * detail(s.footprint, jnp.float32(4.0 * _FINE[Material.ROAD]))
+    marks = (lines + zebra + stop) * (0.88 - 0.5 * wear)
     gutter = s.bar(across - t.ROAD_HALF_WIDTH, 0.25) * (~crossing)
     tone = tone * (1.0 - 0.35 * gutter)
     asphalt = tone * as_column((1.0, 0.985, 0.96))
@@ -164,10 +166,10 @@ def _road(s: Point, seed: int) -> Array:
 def _pavement(s: Point, seed: int) -> Array:
     x, y = s.p[0], s.p[1]
     shade = hash1(jnp.floor(x / 0.9), jnp.floor(y / 0.6), 0.0 * x, seed + 6)
-    joint = jnp.minimum(s.grid(x, 0.9, 0.435), s.grid(y, 0.6, 0.285))
-    visible = detail(s.footprint, jnp.float32(0.6))
+    solid = s.grid(x, 0.9, 0.435) * s.grid(y, 0.6, 0.285)
     kerb = jnp.abs(y) < t.ROAD_HALF_WIDTH + 0.25
-    slabs = 1.0 + visible * (0.26 * (shade - 0.5) - 0.35 * (1.0 - joint))
+    shade = (shade - 0.5) * detail(s.footprint, jnp.float32(0.6))
+    slabs = 1.0 + 0.26 * shade - 0.35 * (1.0 - solid)
     tone = jnp.where(kerb, 1.25 + 0.12 * s.fine[1], slabs)
     return s.color * tone * (1.0 + 0.14 * s.coarse[0] + 0.14 * s.fine[0])
 
@@ -183,9 +185,8 @@ def _sign(s: Point) -> Array:
     middle = (s.lo + s.hi) / 2
     y, z = s.p[1] - middle[1], s.p[2] - middle[2]
     border = 1.0 - s.bar(y, 0.31) * s.bar(z, 0.31)
-    arrow = s.bar(y, 0.05) * s.bar(z + 0.04, 0.18)
-    head = s.bar(y, jnp.maximum(0.24 - z, 0.0) * 0.9) * s.bar(z - 0.14, 0.09)
-    mark = jnp.clip(border + arrow + head, 0.0, 1.0)
+    arrow = s.bar(y, 0.05) * s.span(z, -0.22, 0.05)
+    mark = border + arrow + s.bar(y, jnp.maximum(0.24 - z, 0.0) * 0.9) * s.span(z, 0.05, 0.23)
     back = s.normal[0] > 0.5
     return jnp.where(back, 0.30, s.color + mark * (s.accent - s.color))
 
@@ -254,10 +255,10 @@ def _facade(s: Point, seed: int) -> tuple[Array, Array, Array]:
     dz0 = z - 2.0
     window = s.bar(du, half) * s.bar(dz0, 0.85) * house
     band = s.bar(du, half + 0.15) * s.bar(dz0, 1.0) * house
-    sash = jnp.maximum(1.0 - s.bar(du, half - 0.06) * s.bar(dz0, 0.79), s.bar(du, 0.035))
-    albedo = albedo + band * (s.accent - albedo)
-    albedo = albedo + window * (0.03 + sash * (frame - 0.03) - albedo)
-    gloss = jnp.where(house, window * (1.0 - sash), gloss)
+    glass = (s.bar(du, half - 0.06) - s.bar(du, 0.035)) * s.bar(dz0, 0.79) * house
+    albedo = albedo + band * (s.accent - albedo) + window * (frame - s.accent)
+    albedo = albedo + glass * (0.03 - frame)
+    gloss = jnp.where(house, glass, gloss)
     top = jnp.abs(s.normal[2]) > 0.5
     roof = as_column((0.16, 0.155, 0.15)) * (1.0 + 0.2 * s.coarse[0])
     return jnp.where(top, roof, albedo), jnp.where(top, 0.0, emission), jnp.where(top, 0.0, gloss)
@@ -273,23 +274,28 @@ def _windows(s: Point, bay: _Bay, seed: int) -> tuple[Array, Array, Array]:
     upper = (z > t.GROUND_FLOOR_HEIGHT) & (z < s.hi[2] - 0.55)
     opening = s.bar(du, half_w) * s.bar(dz, half_h) * upper
     trim = s.bar(du, half_w + 0.15) * s.bar(dz, half_h + 0.17) * upper
-    sill = s.bar(du, half_w + 0.24) * s.bar(dz + half_h + 0.08, 0.08) * upper
-    bars = jnp.maximum(s.bar(du, 0.035), s.bar(dz - 0.3, 0.035))
-    sash = jnp.maximum(1.0 - s.bar(du, half_w - 0.06) * s.bar(dz, half_h - 0.06), bars)
-    reveal = 1.0 - 0.65 * s.bar(dz - half_h + 0.08, 0.1)
-    curtain = draw[0] < 0.45
-    drape = jnp.abs(du) > half_w * (0.35 + 0.4 * draw[1])
+    ends = s.bar(du, half_w + 0.24) - s.bar(du, half_w + 0.15)  # of the sill
+    trim = trim + ends * s.span(dz, -half_h - 0.16, -half_h) * upper
+    edge, bar = half_h - 0.06, s.bar(du, 0.035)
+
+    def above(low: Array | float, reveal: float) -> Array:
+        """Share of panes above a height, between bars, less what the reveal takes at the top."""
+        cross = s.span(dz, jnp.maximum(low, 0.265), 0.335)
+        dark = reveal * s.span(dz, jnp.maximum(low, half_h - 0.18), edge)
+        return (s.span(dz, low, edge) - cross - dark) * upper
+
+    curtain, blind, low = draw[0] < 0.45, draw[0] > 0.72, half_h * (1.0 - 1.6 * draw[1])
+    across = s.bar(du, half_w - 0.06) - bar
+    drape = (across + bar - s.bar(du, half_w * (0.35 + 0.4 * draw[1]))) * curtain
     folds = 0.34 + 0.12 * jnp.sin(36.0 * bay.u) * detail(s.footprint, jnp.float32(0.17))
-    blind = (draw[0] > 0.72) & (dz > half_h * (1.0 - 1.6 * draw[1]))
-    inside = jnp.where(curtain & drape, folds, jnp.where(blind, 0.42, 0.022))
-    pane = inside * reveal * (1.0 - 0.12 * s.coarse[1])
-    lamp = (draw[2] > 0.94) & (inside < 0.3) & upper
-    albedo = wall + jnp.maximum(trim, sill) * (s.accent * (1.0 + 0.1 * s.fine[0]) - wall)
-    glass = opening * (1.0 - sash)
-    albedo = albedo + opening * (pane + sash * (bay.frame - pane) - albedo)
-    warm = as_column((1.0, 0.62, 0.26))
-    emission = glass * lamp * (2.6 + 3.5 * draw[1]) * (1.0 + 0.35 * s.coarse[0]) * warm
-    return albedo, emission, glass * (1.0 - 0.3 * curtain)
+    inside = (0.022 * across + (folds - 0.022) * drape) * above(-edge, 0.65)
+    inside = inside + 0.398 * across * blind * above(low, 0.65)
+    glass, frame = across * above(-edge, 0.0), s.accent * (1.0 + 0.1 * s.fine[0])
+    albedo = wall + trim * (frame - wall) + opening * (bay.frame - frame)
+    albedo = albedo - glass * bay.frame + inside * (1.0 - 0.12 * s.coarse[1])
+    lamp = (across - drape) * above(-edge, 0.0) - across * blind * above(low, 0.0)
+    lamp = lamp * (draw[2] > 0.94) * (2.6 + 3.5 * draw[1]) * (1.0 + 0.35 * s.coarse[0])
+    return albedo, lamp * as_column((1.0, 0.62, 0.26)), glass * (1.0 - 0.3 * curtain)
 
 
 def _shop(s: Point, bay: _Bay, shop: Array, seed: int) -> tuple[Array, Array, Array]:
@@ -298,33 +304,31 @@ def _shop(s: Point, bay: _Bay, shop: Array, seed: int) -> tuple[Array, Array, Ar
     gate = shop & (draw[0] > 0.86)
     door = shop & (draw[0] < 0.22) & ~gate
     wide = jnp.where(door, 0.55, 0.5 * bay.cell - 0.2)
-    low, high = jnp.where(door | gate, 0.0, 0.62), 3.05
-    middle, half = (low + high) / 2, (high - low) / 2
-    hole = s.bar(du, wide) * s.bar(z - middle, half) * shop
-    rim = 1.0 - s.bar(du, wide - 0.08) * s.bar(z - middle, half - 0.08)
-    rim = jnp.maximum(rim, s.bar(z - 2.45, 0.04)) * (~gate)
+    # Doors go on below the ground: no light comes from there.
+    low, high, rim = jnp.where(door | gate, -1.0, 0.62), 3.05, jnp.where(gate, 0.0, 0.08)
+    hole = s.bar(du, wide) * s.span(z, low, high) * shop
+    across = s.bar(du, wide - rim) * shop
+    glass = across * (s.span(z, low + rim, high - rim) - s.span(z, 2.41, 2.49) * (~gate))
     goods = hash1(jnp.floor(u / 0.42), jnp.floor(z / 0.36), seen, seed + 30)
     tint = hash3(jnp.floor(u / 0.42), jnp.floor(z / 0.36), seen, seed + 31)
-    shelf = s.grid(u, 0.42, 0.16) * s.grid(z, 0.36, 0.13) * (goods > 0.35) * (z < 2.4)
-    shelf = shelf * (~(door | gate))
-    show = 0.03 + shelf * 0.30 * (0.35 + 0.45 * tint[:1] + 0.3 * tint)
-    show = jnp.where(gate, 0.004, show)
+    shelf = s.grid(u, 0.42, 0.16) * s.grid(z, 0.36, 0.13) * (goods > 0.35)
+    shelf = shelf * across * s.span(z, low + rim, 2.4) * (~(door | gate))
+    show = glass * jnp.where(gate, 0.004, 0.03)
+    show = show + shelf * 0.30 * (0.35 + 0.45 * tint[:1] + 0.3 * tint)
     bright = jnp.where(draw[1] > 0.55, 1.1 * draw[2] + 0.35, 0.06) * (~gate)
     # A wooden front in one of four deep colours, by the house's random number.
     colors = [(0.05, 0.13, 0.10), (0.30, 0.05, 0.04), (0.06, 0.09, 0.20), (0.34, 0.28, 0.18)]
     colors = jnp.asarray(colors, jnp.float32)
     front = colors[jnp.clip((s.random * 4).astype(jnp.int32), 0, 3)].T
-    board = s.bar(z - 3.42, 0.30) * shop
-    letters = s.grid(u, 0.34, 0.11) * s.bar(z - 3.42, 0.15)
+    letters = s.grid(u, 0.34, 0.11) * s.bar(z - 3.42, 0.15) * shop
     letters = letters * (hash1(jnp.floor(u / 0.34), 0.0 * u, seen, seed + 40) > 0.25)
     letters = letters * (jnp.abs(u - 0.5 * bay.length) < 0.28 * bay.length)
     front = front * (1.0 + 0.1 * s.fine[0])
-    base = front + board * letters * (as_column((0.72, 0.66, 0.48)) - front)
-    base = base + hole * (show + rim * (0.6 * front + 0.02 - show) - base)
+    base = front + letters * (as_column((0.72, 0.66, 0.48)) - front)
+    base = base + hole * (0.02 - 0.4 * front) - glass * (0.6 * front + 0.02) + show
     warm, ambient = as_column((1.0, 0.80, 0.55)), 0.35 + 0.65 * smooth(0.4, 3.0, z)
-    lit = 0.12 + shelf * (0.5 + 0.45 * tint[:1] + 0.3 * tint)
-    light = hole * (1.0 - rim) * bright * ambient * warm * lit
-    return base, light, hole * (1.0 - rim) * (~gate)
+    lit = 0.12 * glass + shelf * (0.5 + 0.45 * tint[:1] + 0.3 * tint)
+    return base, bright * ambient * warm * lit, glass * (~gate)
 
 
 def _masonry(s: Point, u: Array, z: Array, seed: int) -> Array:
@@ -336,7 +340,7 @@ def _masonry(s: Point, u: Array, z: Array, seed: int) -> Array:
         shifted = u + 0.5 * w * (course % 2)
         shade = hash1(jnp.floor(shifted / w), course, seen, seed + k) - 0.5
         solid = s.grid(shifted, w, (w - joint) / 2) * s.grid(z, h, (h - joint) / 2)
-        return shade * detail(f, jnp.float32(h)), (1.0 - solid) * detail(f, jnp.float32(h))
+        return shade * detail(f, jnp.float32(h)), 1.0 - solid
 
     shade, mortar = courses(0.36, 0.14, 0.022, 50)
     brick = 1.0 + 0.62 * shade + 0.38 * mortar
@@ -354,8 +358,8 @@ def _tiles(s: Point, seed: int) -> Array:
     row = jnp.floor(s.p[2] / 0.28)
     shade = hash1(jnp.floor(u / 0.3), row, 0.0 * u, seed + 60) - 0.5
     lip = 1.0 - s.grid(s.p[2], 0.28, 0.11)
-    visible = detail(s.footprint, jnp.float32(0.28))
-    return s.color * (1.0 + visible * (0.5 * shade - 0.35 * lip) + 0.18 * s.coarse[0])
+    shade = shade * detail(s.footprint, jnp.float32(0.28))
+    return s.color * (1.0 + 0.5 * shade - 0.35 * lip + 0.18 * s.coarse[0])
 
 
 def _awning(s: Point) -> Array:
@@ -374,23 +378,19 @@ def _car_body(s: Point) -> Array:
     flank = jnp.abs(s.normal[1]) > 0.5
     ends = jnp.abs(s.normal[0]) > 0.5
     deck = s.lo[2] < 0.5
-    seams = jnp.maximum(s.bar(u - 0.75, 0.012), s.bar(u + 0.42, 0.012)) * (z > 0.36)
-    seams = jnp.maximum(seams, s.bar(z - 0.33, 0.03)) * flank
-    arches = jnp.minimum((jnp.abs(u) - half + 0.78) ** 2 + (z - 0.33) ** 2, jnp.full_like(u, 1.0))
-    arch = (arches < 0.40**2) * flank
+    seams = (s.bar(u - 0.75, 0.012) + s.bar(u + 0.42, 0.012)) * (z > 0.36)
+    seams = (seams + s.bar(z - 0.33, 0.03)) * flank
+    arch = ((jnp.abs(u) - half + 0.78) ** 2 + (z - 0.33) ** 2 < 0.40**2) * flank
     handle = (s.bar(u + 0.25, 0.08) + s.bar(u + 1.2, 0.08)) * s.bar(z - 0.74, 0.02) * flank
     plate = s.bar(v, 0.26) * s.bar(z - 0.47, 0.06) * ends
     lights = s.bar(v - 0.64, 0.15) * s.bar(z - 0.68, 0.08) * ends
     grille = s.bar(v, 0.42) * s.bar(z - 0.66, 0.07) * ends * (u > 0)
-    bumper = s.bar(z - 0.30, 0.06) * ends
-    dark = jnp.clip(seams + arch + grille + bumper, 0.0, 1.0) * deck
+    bumper = s.span(z, 0.0, 0.36) * ends
+    dark = (jnp.where(arch, 1.0, seams) + grille + bumper) * deck
     lens = jnp.where(u > 0, as_column((0.75, 0.75, 0.72)), as_column((0.50, 0.02, 0.02)))
     tone = s.color * (1.0 + 0.06 * s.coarse[0])
-    tone = tone + dark * (0.012 - tone)
-    tone = tone + jnp.clip(handle, 0.0, 1.0) * deck * (0.35 - tone)
-    tone = tone + plate * deck * (0.62 - tone)
-    tone = tone + lights * deck * (lens - tone)
-    return tone
+    rest = 1.0 - dark - (handle + plate + lights) * deck
+    return rest * tone + 0.012 * dark + (0.35 * handle + 0.62 * plate + lens * lights) * deck
 
 
 def _car_glass(s: Point) -> tuple[Array, Array, Array]:
@@ -401,14 +401,14 @@ def _car_glass(s: Point) -> tuple[Array, Array, Array]:
     half = (s.hi[0] - s.lo[0]) / 2
     flank = jnp.abs(s.normal[1]) > 0.5
     slope = jnp.where(u > 0, 0.75, 0.28) * height
-    pillars = s.bar(u + 0.15, 0.05) + (1.0 - s.bar(jnp.abs(u) + slope, half - 0.22))
-    corner = 1.0 - s.bar(jnp.abs(s.p[1] - middle[1]) + 0.16 * height, 0.74)
-    rim = 1.0 - slab(height - 0.53, 0.41, s.footprint / jnp.maximum(s.hi[2] - s.lo[2], 0.1))
-    body = jnp.clip(jnp.where(flank, pillars, corner) + rim, 0.0, 1.0)
-    body = jnp.where(s.normal[2] > 0.9, 1.0, body)
-    seats = 0.018 + 0.03 * s.bar(height - 0.25, 0.25) * (jnp.abs(s.coarse[0]) > 0.2)
-    paint = seats + body * (s.color - seats)
-    return paint, jnp.zeros_like(paint), 1.0 - 0.3 * body
+    side = s.bar(jnp.abs(u) + slope, half - 0.22) - s.bar(u + 0.15, 0.05)
+    screen = s.bar(jnp.abs(s.p[1] - middle[1]) + 0.16 * height, 0.74)
+    across = jnp.where(flank, side, screen) * (s.normal[2] < 0.9)
+    relative = s.footprint / jnp.maximum(s.hi[2] - s.lo[2], 0.1)
+    glass = across * slab(height - 0.53, 0.41, relative)
+    seats = across * slab(height - 0.31, 0.19, relative) * (jnp.abs(s.coarse[0]) > 0.2)
+    paint = s.color + glass * (0.018 - s.color) + 0.03 * seats
+    return paint, jnp.zeros_like(paint), 0.7 + 0.3 * glass
 
 
 def _wheel(s: Point) -> Array:

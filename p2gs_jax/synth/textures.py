@@ -1,7 +1,9 @@
 """Building blocks of procedural textures: points on surfaces, noise, hashes, soft edges.
 
-Texture finer than a pixel fades to its mean (`detail`). Arrays are channel-first over R rays:
-points and colours are [3 R].
+Texture finer than a pixel becomes its mean: shapes are averaged over half a pixel (`slab`), noise
+and hashes about zero fade (`detail`). Materials are linear in both, sums of disjoint shapes, so
+that their means are the same from every distance. Arrays are channel-first over R rays: points and
+colours are [3 R].
 """
 
 from __future__ import annotations
@@ -39,16 +41,28 @@ class Point(NamedTuple):
     row: Array
     footprint: Array  # a pixel's width on the surface, m
     fine: Array  # [3 R] noise in [-1, 1], wavelength by material
-    coarse: Array  # [3 R]
+    coarse: Array  # [3 R], which does not fade
+    rough: Array  # [3 R] `fine` before it fades
 
     def bar(self, x: Array, half: Array | float) -> Array:
-        """Return 1 where |x| < half, with the edge of a pixel; see `slab`."""
+        """Return the share of half a pixel about x where |x| < half; see `slab`."""
         return slab(x, half, self.footprint)
 
+    def span(self, x: Array, low: Array | float, high: Array | float) -> Array:
+        """Return the share where low < x < high; 0 if low > high."""
+        return slab(x - (low + high) / 2, (high - low) / 2, self.footprint)
+
     def grid(self, x: Array, period: float, half: Array | float) -> Array:
-        """Return bars in every cell of a periodic pattern, about its middle."""
+        """Return the share of bars in the cells of a periodic pattern, about their middles."""
+        width = 0.5 * self.footprint + 1e-6
         offset = x - (jnp.floor(x / period) + 0.5) * period
-        return slab(offset, half, self.footprint)
+
+        def covered(y: Array) -> Array:
+            """Length of the bars between the middle of the cell and y."""
+            cell = jnp.round(y / period)
+            return 2 * half * cell + jnp.clip(y - cell * period, -half, half)
+
+        return (covered(offset + width / 2) - covered(offset - width / 2)) / width
 
 
 def detail(footprint: Array, wavelength: Array) -> Array:
@@ -57,8 +71,9 @@ def detail(footprint: Array, wavelength: Array) -> Array:
 
 
 def slab(x: Array, half: Array | float, footprint: Array) -> Array:
-    """Return 1 for |x| < half, with an edge half a pixel wide."""
-    return jnp.clip(0.5 + (half - jnp.abs(x)) / (0.5 * footprint + 1e-6), 0.0, 1.0)
+    """Return the share of |x| < half in a box about x, half a pixel wide (a pixel has samples)."""
+    width = 0.5 * footprint + 1e-6
+    return (jnp.clip(x + width / 2, -half, half) - jnp.clip(x - width / 2, -half, half)) / width
 
 
 def smooth(low: float, high: float, x: Array) -> Array:

@@ -66,6 +66,7 @@ class Town:
     light: Light
     seed: int
     underpass: tuple[float, float] | None = None
+    gloss: float = 1.0  # scale of every mirror reflection
 
     @property
     def size(self) -> int:
@@ -157,7 +158,7 @@ def _taper_planes(solid: Solid) -> np.ndarray:
     return np.concatenate([normals, (normals * anchors).sum(1, keepdims=True)], axis=1)
 
 
-def pack(build: Builder, seed: int, light: Light) -> Town:
+def pack(build: Builder, seed: int, light: Light, gloss: float = 1.0) -> Town:
     """Return the town of all solids, ordered boxes, tapered boxes, ellipsoids."""
     solids = sorted(build.solids, key=lambda s: s.kind)
     tapered = [s for s in solids if s.kind == 1]
@@ -171,5 +172,6 @@ def pack(build: Builder, seed: int, light: Light) -> Town:
         light=light,
         underpass=build.clear,
         seed=seed,
+        gloss=gloss,
         **columns,
     )

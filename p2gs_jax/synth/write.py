@@ -36,7 +36,7 @@ from p2gs_jax.synth.settings import Layout, Sensor
 from p2gs_jax.synth.town import STREET_END, Town
 from p2gs_jax.synth.tracer import Tracer
 
-FORMAT = "p2gs-jax street, version 2"
+FORMAT = "p2gs-jax street, version 3"
 
 
 def write_street(
@@ -47,7 +47,7 @@ def write_street(
     height: int = 216,
     iso_std: float = 4.0,
     seed: int = 0,
-    supersample: int = 2,
+    supersample: int | None = None,
     step: float = 0.9,
     points: int = 24_000,
     hold_out: int = 8,
@@ -63,15 +63,16 @@ def write_street(
         width: pixels (paper: 1920), as is the height (1300).
         iso_std: spread of the ISO (paper: 2 and 4); 0 writes ISO-Const. `sensor` replaces it.
         seed: of the town, the ISO and the points.
-        supersample: samples a pixel along each axis.
+        supersample: samples a pixel along each axis; 8 in a `matte` town, else 2, if not given.
         points: seed points to sample; those seen once are dropped.
         hold_out: no points are sampled in every n-th frame, as they may be held out; 0: in all.
         sensor: what the cameras do to the light.
-        layout: `town` adds an underpass and draws the sun; `long` is as many streets as it takes.
+        layout: `town` adds an underpass and draws the sun; `matte` has no gloss; `long` no end.
 
     UserError: a parameter is impossible, or `out` is in the way.
     """
     out, sensor = Path(out), sensor or Sensor(iso_std=iso_std)
+    supersample = (8 if layout == "matte" else 2) if supersample is None else supersample
     asked = {
         **{"seed": seed, "frames": frames, "width": width, "height": height},
         **{"supersample": supersample, "step_m": step, "layout": layout},
@@ -92,8 +93,7 @@ def write_street(
         card = {
             **{"format": FORMAT, **asked, **observed, "iso_reference": ISO_REFERENCE},
             **{"K": views.K.tolist(), "solids": town.size, "sensor": asdict(sensor)},
-            "cameras": {name: asdict(mount) for name, mount in MOUNTS.items()},
-            "light": asdict(town.light),
+            **{"cameras": {k: asdict(m) for k, m in MOUNTS.items()}, "light": asdict(town.light)},
         }
         (temporary / "dataset.json").write_text(json.dumps(card, indent=2) + "\n")
         _require_free(out)
