@@ -82,10 +82,11 @@ if "XLA_FLAGS" not in os.environ:
 
 
 def pytest_configure():
-    """Compile what asks for options of its own with the same effort."""
-    from p2gs_jax.render import xla_cpu
+    """Compile what asks for options of its own with the same effort, and for few sizes of lists."""
+    from p2gs_jax.render import capacity, xla_cpu
 
     xla_cpu._CPU_OPTIONS = EFFORT
+    capacity.SMALLEST = 2**15
 
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -134,6 +135,30 @@ def run_command(capsys):
     return run
 
 
+@pytest.fixture
+def succeeded(run_command):
+    """Return a function from a command line that succeeds to what it printed."""
+
+    def run(*argv):
+        code, text = run_command(*argv)
+        assert code == 0, text
+        return text
+
+    return run
+
+
+@pytest.fixture
+def refused(run_command):
+    """Return a function from a command line that cannot be followed to the message."""
+
+    def run(*argv):
+        code, text = run_command(*argv)
+        assert code == 2, text
+        return text
+
+    return run
+
+
 @pytest.fixture(scope="session")
 def made_once(tmp_path_factory, request):
     """Return a function that makes a folder once for all processes of a test run.
@@ -160,7 +185,7 @@ def noisy_street(made_once) -> Path:
     """Return a small street whose cameras chose different ISO values; only to be read."""
     from p2gs_jax.synth.write import write_street
 
-    size = {"frames": 5, "width": 192, "height": 128, "points": 6000}
+    size = {"frames": 5, "width": 192, "height": 128, "points": 6000, "supersample": 1}
     return made_once("noisy_street", lambda root: write_street(root, **size, iso_std=4.0, seed=3))
 
 
@@ -205,6 +230,7 @@ def _fit_small_scene(root: Path) -> None:
 
     fields = {"train.steps": 60, "train.coarse_to_fine": (), "data.test_every": 3}
     fields |= {"densify.max_gaussians": 400, "render.sh_degree": 1, "init.shell": "off"}
+    fields |= {"render.pixels_in_flight": 2048}
     fit(make_scene(root / "scene"), root / "run", with_fields(preset("robust"), fields))
 
 

@@ -10,6 +10,7 @@ import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
+from splats import gaussians_of
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import srgb_encode
@@ -39,10 +40,8 @@ class World(NamedTuple):
 
 def splats(means, log_scales, radiance) -> Gaussians:
     """Return opaque Gaussians of degree 0."""
-    n = len(means)
     sh = np.log(np.asarray(radiance))[:, None] / 0.28209479177387814
-    values = (means, np.tile(np.eye(1, 4), (n, 1)), log_scales, np.full(n, 4.0), sh)
-    return Gaussians(*(jnp.asarray(a, jnp.float32) for a in values))
+    return gaussians_of(means, [1, 0, 0, 0], log_scales, 4.0, sh)
 
 
 def pose_at(time: float) -> np.ndarray:

@@ -10,11 +10,19 @@ from p2gs_jax.types import Camera, Gaussians
 SRGB = DisplayTransform(1.0, 2.2, PhotometryConfig())
 
 
+def gaussians_of(means, quats, log_scales, opacity_logits, sh):
+    """Return Gaussians of arrays of the host; one row may stand for all."""
+    n, values = len(means), (means, quats, log_scales, opacity_logits, sh)
+    shapes = (n, 3), (n, 4), (n, 3), (n,), (n, *np.shape(sh)[-2:])
+    pairs = zip(values, shapes, strict=True)
+    return Gaussians(*(jnp.asarray(np.broadcast_to(a, s), jnp.float32) for a, s in pairs))
+
+
 def random_splats(n=50, degree=3, seed=0):
     """Return Gaussians whose every parameter is drawn from a normal distribution."""
     rng = np.random.default_rng(seed)
     shapes = [(n, 3), (n, 4), (n, 3), (n,), (n, (degree + 1) ** 2, 3)]
-    return Gaussians(*(jnp.asarray(rng.normal(size=s), jnp.float32) for s in shapes))
+    return gaussians_of(*(rng.normal(size=s) for s in shapes))
 
 
 def haze(n=120, degree=1, seed=0):
@@ -25,13 +33,9 @@ def haze(n=120, degree=1, seed=0):
     sh[:, 0] = rng.normal(-4, 6, (n, 1))
     log_scales = rng.normal(-1.5, 0.3, (n, 3))
     means[-1], log_scales[-1], sh[-1, 0] = (0, 0, 6), (2, 2, -3), -12
-    return Gaussians(
-        jnp.asarray(means, jnp.float32),
-        jnp.asarray(rng.normal(size=(n, 4)), jnp.float32).at[-1].set(jnp.array([1.0, 0, 0, 0])),
-        jnp.asarray(log_scales, jnp.float32),
-        jnp.asarray(rng.normal(-1, 1, n), jnp.float32),
-        jnp.asarray(sh, jnp.float32),
-    )
+    quats, logits = rng.normal(size=(n, 4)), rng.normal(-1, 1, n)
+    quats[-1] = 1, 0, 0, 0
+    return gaussians_of(means, quats, log_scales, logits, sh)
 
 
 def camera(x=0.0, width=40, height=32, focal=30.0, yaw=0.0):

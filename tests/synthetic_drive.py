@@ -160,17 +160,9 @@ def observe(
     ldr = np.clip(ldr, 0, 1)
     if bits is not None:
         ldr = np.round(ldr * (2**bits - 1)) / (2**bits - 1)
-    return Observations(
-        views=v,
-        points=p,
-        colors=ldr,
-        spread=np.zeros_like(ldr),
-        view_count=len(drive.cameras),
-        point_count=len(drive.radiance),
-        cameras=drive.cameras,
-        positions=drive.positions,
-        camera_names=CAMERA_NAMES,
-    )
+    known = {"view_count": len(drive.cameras), "point_count": len(drive.radiance)}
+    known |= {"cameras": drive.cameras, "positions": drive.positions, "camera_names": CAMERA_NAMES}
+    return Observations(views=v, points=p, colors=ldr, spread=np.zeros_like(ldr), **known)
 
 
 def falloff(

@@ -30,12 +30,11 @@ def write(path, image):
 
 
 @pytest.fixture
-def judged(run_command, own_run):
+def judged(succeeded, own_run):
     """Return a function from folders of renders to what is found of each, and what was printed."""
 
     def judge(*folders, options=()):
-        code, text = run_command("eval", own_run, "--against", *folders, *options)
-        assert code == 0, text
+        text = succeeded("eval", own_run, "--against", *folders, *options)
         found = json.loads((own_run / "against.json").read_text())["programs"]
         return [*found.values()], text
 
@@ -138,15 +137,14 @@ def renamed(path, image):
     ],
 )
 def test_what_is_wrong_is_said_before_anything_is_judged(
-    own_run, held_out, run_command, tmp_path, spoil, said
+    own_run, held_out, refused, tmp_path, spoil, said
 ):
     folder, image = tmp_path / "other", next(iter(held_out.values()))
     for name in held_out:
         write(folder / name, image)
     spoil(folder / max(held_out), image)
     before = (own_run / "metrics.json").stat().st_mtime_ns
-    code, text = run_command("eval", own_run, "--against", folder)
-    assert code == 2
+    text = refused("eval", own_run, "--against", folder)
     assert said in " ".join(text.split())
     assert "To fix it" in text
     assert (own_run / "metrics.json").stat().st_mtime_ns == before

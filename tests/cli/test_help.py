@@ -9,19 +9,17 @@ from pathlib import Path
 
 import pytest
 
-from p2gs_jax.cli import main
 from p2gs_jax.cli.parser import COMMANDS, GROUPS, parse
 from p2gs_jax.cli.shared import SHORT
 
 HEAVY = ("jax", "numpy", "cv2", "equinox", "rich")
 
 
-def shown(capsys, monkeypatch, *argv, columns=80):
-    monkeypatch.setenv("COLUMNS", str(columns))
-    with pytest.raises(SystemExit) as stop:
-        main(list(argv))
-    out = capsys.readouterr()
-    return stop.value.code, out.out + out.err
+@pytest.fixture
+def shown(run_command, monkeypatch):
+    """Return a function from the words of a command line to its exit status and its help."""
+    monkeypatch.setenv("COLUMNS", "80")
+    return run_command
 
 
 def wide(text):
@@ -30,8 +28,8 @@ def wide(text):
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_help_of_every_command(capsys, monkeypatch, name):
-    code, text = shown(capsys, monkeypatch, name, "--help")
+def test_help_of_every_command(shown, name):
+    code, text = shown(name, "--help")
     assert code == 0
     options, _, examples = text.partition("Examples:")
     assert not wide(options)
@@ -45,24 +43,24 @@ def test_help_of_every_command(capsys, monkeypatch, name):
         assert parse(words[1:])[0] == name
 
 
-def test_overview_names_every_command_once_and_in_order(capsys, monkeypatch):
-    code, text = shown(capsys, monkeypatch, "--help")
+def test_overview_names_every_command_once_and_in_order(shown):
+    code, text = shown("--help")
     assert code == 0
     assert not wide(text)
     names = [line.split()[0] for line in text.splitlines() if line.startswith("  ")]
     wanted = [name for group in GROUPS.values() for name in group]
     assert [n for n in names if n in COMMANDS] == wanted
     assert set(wanted) == set(COMMANDS)
-    assert shown(capsys, monkeypatch) == (2, text)
-    code, text = shown(capsys, monkeypatch, "--version")
+    assert shown() == (2, text)
+    code, text = shown("--version")
     assert code == 0
     assert text.startswith("p2gs-jax ")
     assert text.split()[1][0].isdigit()
 
 
-def test_common_options_come_first_and_the_rest_on_request(capsys, monkeypatch):
-    _, brief = shown(capsys, monkeypatch, "fit", "--help")
-    _, whole = shown(capsys, monkeypatch, "fit", "--help-all")
+def test_common_options_come_first_and_the_rest_on_request(shown):
+    _, brief = shown("fit", "--help")
+    _, whole = shown("fit", "--help-all")
     for option in ("--out DIR", "--budget TIME", "--preset NAME", "--gaussians N"):
         assert option in brief
         assert option in whole
@@ -72,12 +70,12 @@ def test_common_options_come_first_and_the_rest_on_request(capsys, monkeypatch):
         assert option in whole
     assert not wide(whole.partition("Examples:")[0])
     assert brief.index("--budget") < brief.index("--seed")
-    _, paper = shown(capsys, monkeypatch, "fit", "--preset", "paper", "--help-all")
+    _, paper = shown("fit", "--preset", "paper", "--help-all")
     assert paper.count("(default: 30000)") == whole.count("(default: 30000)") + 1
 
 
-def test_calibrate_has_the_options_that_it_reads(capsys, monkeypatch):
-    _, text = shown(capsys, monkeypatch, "calibrate", "--help-all")
+def test_calibrate_has_the_options_that_it_reads(shown):
+    _, text = shown("calibrate", "--help-all")
     found = set(re.findall(r"--([a-z]+)\.", text))
     assert found == {"data", "photometry", "loss", "train"}
     argv = "calibrate a --out b --preset paper --loss.black 0.1"
@@ -149,10 +147,10 @@ def test_nothing_is_imported_from_the_working_folder(hostile):
     """`python -m` would: the scene is often the working folder."""
     argv, root = [sys.executable, "-m", "p2gs_jax.cli"], str(Path(__file__).parents[2])
     env = os.environ | {"PYTHONPATH": root}
-    for words in (["scene", "."], ["calibrate", ".", "--out", "new"]):
-        done = subprocess.run([*argv, *words], env=env, capture_output=True, text=True)
-        assert done.returncode == 2, done.stderr
-        assert "no scene in ." in done.stderr
+    words = ("calibrate", ".", "--out", "new")
+    done = subprocess.run([*argv, *words], env=env, capture_output=True, text=True)
+    assert done.returncode == 2, done.stderr
+    assert "no scene in ." in done.stderr
     assert not hostile.exists()
 
 

@@ -22,10 +22,9 @@ def drive(tmp_path, monkeypatch):
     return recording
 
 
-def test_a_drive_is_counted(drive, run_command, monkeypatch):
+def test_a_drive_is_counted(drive, succeeded, monkeypatch):
     monkeypatch.setenv("COLUMNS", "140")
-    code, said = run_command("scene", drive.root, "--data.no-own-car")
-    assert code == 0
+    said = succeeded("scene", drive.root, "--data.no-own-car")
     for text in (
         "31 photographs of 4 cameras in 8 frames, 0.7 s, 7.0 m driven.",
         "1 photograph missing in these frames.",
@@ -36,28 +35,25 @@ def test_a_drive_is_counted(drive, run_command, monkeypatch):
         "90 degrees",
     ):
         assert text in said
-    code, said = run_command("scene", drive.root, "--cameras", "front", "--frames", "0:4")
-    assert code == 0
+    said = succeeded("scene", drive.root, "--cameras", "front", "--frames", "0:4")
     said = " ".join(said.split())
     assert "3 photographs of 1 camera in 4 frames" in said
     assert "own car: not seen by front" in said
 
 
-def test_other_scenes_are_counted(tmp_path, run_command):
+def test_other_scenes_are_counted(tmp_path, succeeded):
     root = make_scene(tmp_path / "写", views=3)
-    code, said = run_command("scene", root)
-    assert code == 0
+    said = succeeded("scene", root)
     assert "(colmap): 3 photographs of 1 camera." in said
     assert "150 points." in said
     found = survey(root, DataConfig())
     assert (found.frames, labels_of(found.scene)) == (None, [])
 
 
-def test_photographs_alone_start_no_structure_from_motion(tmp_path, run_command, monkeypatch):
+def test_photographs_alone_start_no_structure_from_motion(tmp_path, succeeded, monkeypatch):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     for k, width in enumerate((40, 40, 50)):
         cv2.imwrite(str(tmp_path / f"{k}.png"), np.zeros((30, width, 3), np.uint8))
-    code, said = run_command("scene", tmp_path)
-    assert code == 0
+    said = succeeded("scene", tmp_path)
     for text in ("3 photographs, and nothing else", "40 x 30", "It has no cameras, no points."):
         assert text in said

@@ -2,19 +2,12 @@
 
 import contextlib
 import errno
-import json
 import resource
 
 import numpy as np
 import pytest
 
-from p2gs_jax.core.atomic import (
-    append_jsonl,
-    atomic_write,
-    naming,
-    read_jsonl,
-    write_text,
-)
+from p2gs_jax.core.atomic import append_jsonl, atomic_write, naming, read_jsonl, write_text
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.frames import write_png
 from p2gs_jax.run.checkpoint import CheckpointStore
@@ -89,17 +82,3 @@ def test_errors_that_have_nothing_to_do_with_room_stay_as_they_are(tmp_path):
     with pytest.raises(RuntimeError, match="why"), naming(tmp_path / "a"):
         raise RuntimeError("why")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_the_command_line_ends_with_the_reason_and_the_path(tmp_path, run_command, monkeypatch):
-    from p2gs_jax.cli.experiments import Synth
-
-    def run(options):
-        with room_for(100):
-            write_text(tmp_path / "out.json", json.dumps(list(range(999))))
-
-    monkeypatch.setattr(Synth, "execute", run)
-    code, text = run_command("synth", tmp_path / "new")
-    assert code == 2
-    assert f"{tmp_path / 'out.json'}: File too large" in text
-    assert "disk has room" in text

@@ -77,11 +77,10 @@ def test_every_console_is_plain_and_so_is_what_workers_say(tmp_path, capsys):
     assert capsys.readouterr().out == "\\x1b[31mred\n"
 
 
-def test_errors_are_printable(run_command, tmp_path):
+def test_errors_are_printable(refused, tmp_path):
     red = tmp_path / "\x1b[31mred"
     # The second is a word too many, as a pattern of the shell may find.
     for words, shown in (([red], "red does not exist"), ([tmp_path, "\x1b[31mred"], "red")):
-        code, text = run_command("scene", *words)
-        assert code == 2
+        text = refused("scene", *words)
         assert f"\\x1b[31m{shown}" in text
         assert "\x1b" not in text

@@ -35,27 +35,17 @@ def test_a_fit_without_its_steps_compiles_few_programs(scene, tmp_path):
     assert counter.programs == 0
     params = recentre(start.params, cfg.render.radiance)
     assert counter.programs == 0
-    metrics = finish(
-        params,
-        start.scene,
-        start.store,
-        start.cfg,
-        RunFolder(tmp_path),
-        Account({}, {"total_until_evaluation": 60.0}, start.selection, start.notes),
-        Silent(),
-    )
+    account = Account({}, {"total_until_evaluation": 60.0}, start.selection, start.notes)
+    given = (params, start.scene, start.store, start.cfg, RunFolder(tmp_path), account)
+    metrics = finish(*given, Silent())
     # Counting tiles, rendering, developing (images; colours of splats), fitting an exposure, PSNR,
     # SSIM, and the basis of spherical harmonics.
     assert counter.programs <= 8
     assert metrics["photometry"]["converged"]
     assert metrics["photometry"]["unknown_errors"] == 0
     seconds = metrics["seconds"]
-    assert list(seconds) == [
-        "total_until_evaluation",
-        "files",
-        "evaluation",
-        "evaluation_and_files",
-    ]
+    named = ["total_until_evaluation", "files", "evaluation", "evaluation_and_files"]
+    assert list(seconds) == named
     assert min(seconds.values()) > 0
     assert any(n.startswith("The budget of 1 s was exceeded") for n in metrics["notes"])
 

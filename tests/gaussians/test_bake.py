@@ -2,21 +2,13 @@
 
 from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from splats import SRGB, camera, haze, random_splats
 
 from p2gs_jax.config import PhotometryConfig, RenderConfig
-from p2gs_jax.gaussians.bake import (
-    Target,
-    bake,
-    baking_error,
-    display_sh,
-    refine,
-    true_target,
-)
+from p2gs_jax.gaussians.bake import Target, bake, baking_error, display_sh, refine, true_target
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.render.harmonics import C0, basis
@@ -115,8 +107,8 @@ def test_refining_brings_viewers_closer_to_unseen_views_as_well(targets):
 
 def test_what_is_dark_by_transparency_becomes_opaque():
     """Over black nothing tells a translucent black wall from an opaque one; over white it shows."""
-    wall = jax.tree.map(lambda a: a[-1:], haze())
-    wall = replace(wall, opacity_logits=jnp.zeros(1), sh=wall.sh - 60.0)
+    wall, logits = haze(), jnp.full(120, -100.0).at[-1].set(0.0)
+    wall = replace(wall, opacity_logits=logits, sh=wall.sh - 60.0)
     target = true_target("wall", wall, camera(), SRGB, make_renderer(CFG))
     assert target.picture.max() == 0
     plain = bake(wall, SRGB, "exp", 1)

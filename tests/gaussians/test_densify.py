@@ -7,20 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from splats import gaussians_of
 
 from p2gs_jax.config import DensifyConfig
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.gaussians import adaptive, mcmc
-from p2gs_jax.gaussians.population import (
-    empty_gaussians,
-    fresh_population,
-    grow,
-    opacities,
-    place,
-)
+from p2gs_jax.gaussians.population import empty_gaussians, fresh_population, grow, opacities, place
 from p2gs_jax.train.optimizer import AdamState
 from p2gs_jax.train.strategies import demand
-from p2gs_jax.types import Gaussians
 
 CFG = DensifyConfig()
 # As strategies call them: one program a shape, where eager calls make one an operation.
@@ -33,13 +27,9 @@ exploration_noise = jax.jit(mcmc.exploration_noise)
 
 def made(n=8, seed=0, opacity=0.6):
     rng = np.random.default_rng(seed)
-    return Gaussians(
-        means=on_device(rng.normal(0, 0.5, (n, 3)) + np.array([0, 0, 4])),
-        quats=on_device(rng.normal(size=(n, 4))),
-        log_scales=on_device(np.full((n, 3), -2.0)),
-        opacity_logits=on_device(np.full((n,), np.log(opacity / (1 - opacity)))),
-        sh=on_device(rng.normal(size=(n, 1, 3))),
-    )
+    means, quats = rng.normal(0, 0.5, (n, 3)) + np.array([0, 0, 4]), rng.normal(size=(n, 4))
+    logit = np.log(opacity / (1 - opacity))
+    return gaussians_of(means, quats, -2.0, logit, rng.normal(size=(n, 1, 3)))
 
 
 def with_room(g, slots):

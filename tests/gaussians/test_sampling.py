@@ -152,16 +152,10 @@ def test_exposures_are_right_where_a_surface_has_highlights():
     xy = rng.uniform(5, 115, (3000, 2))
     mask, gains = np.ones((120, 120), np.float32), (1.0, 4.0)
     seen = [sample(np.repeat(encoded(np.minimum(g * radiance, 1)), 3, 2), mask, xy) for g in gains]
-    observations = Observations(
-        np.repeat([0, 1], 3000),
-        np.tile(np.arange(3000), 2),
-        np.concatenate([s.colors for s in seen]),
-        np.concatenate([s.spread for s in seen]),
-        2,
-        3000,
-        np.zeros(2, int),
-        brightest=np.concatenate([s.brightest for s in seen]),
-    )
+    parts = (np.concatenate([getattr(s, n) for s in seen]) for n in ("colors", "spread"))
+    rows = (np.repeat([0, 1], 3000), np.tile(np.arange(3000), 2))
+    brightest = np.concatenate([s.brightest for s in seen])
+    observations = Observations(*rows, *parts, 2, 3000, np.zeros(2, int), brightest=brightest)
     for kept, right in (
         (observations, True),
         (dataclasses.replace(observations, brightest=None), False),

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
+from splats import gaussians_of
 
 from p2gs_jax.config import DataConfig, RenderConfig
 from p2gs_jax.errors import UserError
@@ -16,7 +17,7 @@ from p2gs_jax.jobs.blocks.cut import OVERLAP, Block, Cut, Ground
 from p2gs_jax.jobs.blocks.seams import INWARDS, level_seams, measure_seams, merge_cores, shifts
 from p2gs_jax.render.harmonics import C0
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
-from p2gs_jax.types import Gaussians, Scene, View
+from p2gs_jax.types import Scene, View
 
 GROUND = Ground(np.zeros(3), np.eye(3)[:2])
 INF = np.inf
@@ -48,14 +49,8 @@ def wall(log_radiance=0.0, depth=4.0, width=41):
     x, y = np.meshgrid(np.linspace(-3, 3, width), np.linspace(-2, 2, 27))
     count = x.size
     means = np.stack([x.ravel(), y.ravel(), np.full(count, depth)], 1)
-    sh = np.full((count, 1, 3), log_radiance / C0)
-    return Gaussians(
-        means=jnp.asarray(means, jnp.float32),
-        quats=jnp.tile(jnp.eye(1, 4), (count, 1)),
-        log_scales=jnp.full((count, 3), np.log(0.15)),
-        opacity_logits=jnp.full((count,), 4.0),
-        sh=jnp.asarray(sh, jnp.float32),
-    )
+    sh = np.full((1, 3), log_radiance / C0)
+    return gaussians_of(means, [1, 0, 0, 0], np.log(0.15), 4.0, sh)
 
 
 def test_every_gaussian_is_kept_by_the_block_whose_core_holds_it():

@@ -11,15 +11,7 @@ from hypothesis import strategies as st
 from p2gs_jax.core.atomic import plain
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.seeds import camera_centers
-from p2gs_jax.jobs.blocks.cut import (
-    DETAIL,
-    Cut,
-    cut_scene,
-    seen_points,
-    split,
-    thinned,
-    whole_of,
-)
+from p2gs_jax.jobs.blocks.cut import DETAIL, Cut, cut_scene, seen_points, split, thinned, whole_of
 from p2gs_jax.types import Scene, Tracks, View
 
 LENGTH = 100.0
@@ -56,11 +48,7 @@ def make_road(views=40, points=4000, seed=0, tracks=False, turned=0.0):
 
 
 @settings(max_examples=40, deadline=None)
-@given(
-    count=st.integers(1, 9),
-    seed=st.integers(0, 99),
-    height=st.sampled_from([0.0, 1.0, 100.0]),
-)
+@given(count=st.integers(1, 9), seed=st.integers(0, 99), height=st.sampled_from([0.0, 1.0, 100.0]))
 def test_cells_cover_the_plane_once_and_are_as_full(count, seed, height):
     rng = np.random.default_rng(seed)
     places = rng.uniform(0, 1, (90, 2)) * [100.0, height]

@@ -19,13 +19,14 @@ from p2gs_jax.jobs.run import run_jobs
 pytest.importorskip("distributed")
 
 
-@pytest.fixture
-def cluster(tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory):
     """Return the engine of a scheduler that has two workers, and these."""
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), *sys.path]))
-    said = tmp_path / "scheduler.json"
+    tmp_path = tmp_path_factory.mktemp("cluster")
+    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    said, env = tmp_path / "scheduler.json", os.environ | {"PYTHONPATH": path}
     here = ["--scheduler-file", str(said), "--no-dashboard"]
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": env}
     listen = ["--host", "127.0.0.1", "--port", "0"]
     begun = [subprocess.Popen([*_tool("dask_scheduler"), *listen, *here], **quiet)]
     one = ["--no-nanny", "--nthreads", "1", "--host", "127.0.0.1"]
@@ -57,6 +58,20 @@ def _parent(pid: int) -> int:
     return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
 
 
+def test_jobs_in_the_queue_of_a_scheduler_end_with_those_that_run(cluster, tmp_path):
+    jobs = [Job(name, tmp_path / name, count, {"first": "wait"}) for name in "abc"]
+    ended, folder = [], tmp_path / "jobs"
+
+    def interrupt(states):
+        if sum(state.doing == "Counting" for state in states) == 2:
+            raise KeyboardInterrupt
+
+    told = {"on_end": lambda number, state: ended.append(state.status), "on_look": interrupt}
+    with pytest.raises(KeyboardInterrupt), open_engine(cluster[0], 1, tmp_path) as engine:
+        run_jobs(jobs, engine, folder, **told)
+    assert ended == ["stopped"] * 3
+
+
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="parents are read from /proc")
 def test_a_killed_worker_costs_nothing_but_time(cluster, tmp_path):
     engine_name, workers = cluster
@@ -74,20 +89,6 @@ def test_a_killed_worker_costs_nothing_but_time(cluster, tmp_path):
     assert (state.status, state.reason) == ("done", None)
     # The other worker began it again.
     assert (tmp_path / "one" / "tries").read_text() == "xx"
-
-
-def test_jobs_in_the_queue_of_a_scheduler_end_with_those_that_run(cluster, tmp_path):
-    jobs = [Job(name, tmp_path / name, count, {"first": "wait"}) for name in "abc"]
-    ended, folder = [], tmp_path / "jobs"
-
-    def interrupt(states):
-        if sum(state.doing == "Counting" for state in states) == 2:
-            raise KeyboardInterrupt
-
-    told = {"on_end": lambda number, state: ended.append(state.status), "on_look": interrupt}
-    with pytest.raises(KeyboardInterrupt), open_engine(cluster[0], 1, tmp_path) as engine:
-        run_jobs(jobs, engine, folder, **told)
-    assert ended == ["stopped"] * 3
 
 
 def test_a_scheduler_that_is_not_there_is_said(tmp_path, monkeypatch):

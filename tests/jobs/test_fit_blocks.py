@@ -21,18 +21,10 @@ from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.jobs.job import JobState
 from p2gs_jax.pipeline.survey import load
 
-SMALL = with_fields(
-    p2gs_jax.preset("robust"),
-    {
-        "train.steps": 20,
-        "train.coarse_to_fine": [],
-        "data.test_every": 4,
-        "densify.max_gaussians": 400,
-        "render.sh_degree": 0,
-        "init.dense": "off",
-        "init.shell": "off",
-    },
-)
+FIELDS = {"train.steps": 20, "train.coarse_to_fine": [], "data.test_every": 4}
+FIELDS |= {"densify.max_gaussians": 400, "init.dense": "off", "init.shell": "off"}
+FIELDS |= {"render.sh_degree": 0, "render.pixels_in_flight": 2048}
+SMALL = with_fields(p2gs_jax.preset("robust"), FIELDS)
 
 
 @pytest.fixture

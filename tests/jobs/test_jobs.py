@@ -43,44 +43,23 @@ def note_end(ended):
 
 
 def test_one_that_fails_leaves_its_reason_and_ends_nothing_else(tmp_path):
-    jobs = jobs_of(
-        tmp_path,
-        good={},
-        refused={"first": "refuse", "until": 9},
-        stumbled={"first": "stumble", "until": 9},
-        left={"first": "leave", "until": 9},
-        killed={"first": "kill"},
-        full={"first": "fill"},
-        asked={"first": "ask"},
-        doomed={"first": "ask", "until": 9},
-    )
+    ends = {"refused": "refuse", "stumbled": "stumble", "left": "leave", "doomed": "ask"}
+    todo = {name: {"first": first, "until": 9} for name, first in ends.items()}
+    todo |= {"good": {}, "killed": {"first": "kill"}, "full": {"first": "fill"}}
+    jobs = jobs_of(tmp_path, **todo, asked={"first": "ask"})
     ended, looks = [], []
     with open_engine("local", 2, tmp_path) as engine:
-        states = run_jobs(
-            jobs,
-            engine,
-            tmp_path / "jobs",
-            on_end=lambda number, state: ended.append(state.name),
-            on_look=lambda states: looks.append([s.status for s in states]),
-        )
+        told = {"on_end": lambda number, state: ended.append(state.name)}
+        told |= {"on_look": lambda states: looks.append([s.status for s in states])}
+        states = run_jobs(jobs, engine, tmp_path / "jobs", **told)
     assert sorted(ended) == sorted(job.name for job in jobs)
     assert looks
     found = {s.name: s for s in states}
-    statuses = {name: s.status for name, s in found.items()}
-    assert statuses == {
-        "good": "done",
-        "refused": "failed",
-        "stumbled": "failed",
-        "left": "failed",
-        "killed": "failed",
-        "full": "failed",
-        "asked": "done",
-        "doomed": "failed",
-    }
-    begun = {name: len((tmp_path / name / "tries").read_text()) for name in found}
-    assert begun == {name: s.begun for name, s in found.items()}
-    once = dict.fromkeys(("good", "refused", "stumbled", "left", "killed", "full"), 1)
-    assert begun == {**once, "asked": 2, "doomed": 3}
+    once = dict.fromkeys(("refused", "stumbled", "left", "killed", "full"), ("failed", 1))
+    expected = {"good": ("done", 1), "asked": ("done", 2), "doomed": ("failed", 3), **once}
+    assert {name: (s.status, s.begun) for name, s in found.items()} == expected
+    for name, state in found.items():
+        assert len((tmp_path / name / "tries").read_text()) == state.begun
     assert "add photographs" in found["refused"].reason
     assert found["stumbled"].reason == "ZeroDivisionError: by zero"
     assert "with code 3: last words" in found["left"].reason
@@ -117,10 +96,7 @@ def test_what_is_stopped_ends_and_the_same_call_goes_on(tmp_path):
             raise KeyboardInterrupt
 
     ended = {}
-    with (
-        pytest.raises(KeyboardInterrupt),
-        open_engine("local", 1, tmp_path) as engine,
-    ):
+    with pytest.raises(KeyboardInterrupt), open_engine("local", 1, tmp_path) as engine:
         run_jobs(jobs, engine, tmp_path / "jobs", on_end=note_end(ended), on_look=interrupt)
     assert ended == {"running": "stopped", "waiting": "stopped"}
     assert not list(tmp_path.rglob(REASON))
@@ -180,10 +156,7 @@ def test_a_job_whose_end_was_being_told_as_the_signal_came_is_told(tmp_path):
         if len(told) == 1:
             raise KeyboardInterrupt
 
-    with (
-        pytest.raises(KeyboardInterrupt),
-        open_engine("local", 1, tmp_path) as engine,
-    ):
+    with pytest.raises(KeyboardInterrupt), open_engine("local", 1, tmp_path) as engine:
         run_jobs([job], engine, tmp_path / "jobs", on_end=interrupted_once)
     assert told == ["done", "done"]
 

@@ -37,14 +37,9 @@ def write_ball(root, count, part):
         assert cv2.imwrite(str(root / part / f"r_{k}.png"), image)
 
 
-SHORT = {
-    "data.background": "0.1,0.9,0.1",
-    "init.dense": "off",
-    "densify.max_gaussians": 1500,
-    "train.steps": 100,
-    "train.coarse_to_fine": (),
-    "render.sh_degree": 1,
-}
+SHORT = {"data.background": "0.1,0.9,0.1", "init.dense": "off", "densify.method": None}
+SHORT |= {"train.steps": 60, "train.coarse_to_fine": ()}
+SHORT |= {"render.sh_degree": 0, "render.pixels_in_flight": 2048}
 
 
 @pytest.fixture(scope="module")

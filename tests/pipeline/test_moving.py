@@ -19,24 +19,14 @@ from p2gs_jax.run.scene_file import read_objects
 from p2gs_jax.scene import drives
 from p2gs_jax.scene.drives.objects import object_mask
 
-SHORT = with_fields(
-    FitConfig(),
-    {
-        "data.format": "pandaset",
-        "data.own_car": False,
-        "train.steps": 40,
-        "train.log_every": 5,
-        "train.coarse_to_fine": (),
-        "train.checkpoint_every_s": 0.0,
-        "render.sh_degree": 0,
-        "densify.max_gaussians": 3000,
-        "densify.min_every_steps": 5,
-        "init.dense": "off",
-        "init.shell": "off",
-        "photometry.select": False,
-        "photometry.model": "view_exposure",
-    },
-)
+FIELDS = {"data.format": "pandaset", "data.own_car": False, "data.frames": "::2"}
+FIELDS |= {"data.test_every": 4, "train.steps": 20, "train.log_every": 5}
+FIELDS |= {"train.coarse_to_fine": (), "train.checkpoint_every_s": 0.0}
+FIELDS |= {"render.sh_degree": 0, "render.pixels_in_flight": 2048}
+FIELDS |= {"densify.max_gaussians": 2000, "densify.min_every_steps": 5}
+FIELDS |= {"init.dense": "off", "init.shell": "off"}
+FIELDS |= {"photometry.select": False, "photometry.model": "view_exposure"}
+SHORT = with_fields(FitConfig(), FIELDS)
 METHODS = {
     "rigid": SHORT,
     "vibration": with_fields(SHORT, {"dynamics.method": "vibration", "dynamics.vibrating": 600}),
@@ -100,11 +90,7 @@ def test_views_are_rendered_at_their_own_time(run):
         plain = dataclasses.replace(camera, objects=None)
         np.testing.assert_array_equal(without, run.render(plain).linear)
         np.testing.assert_allclose(run.render(plain, view.time).linear, with_box, atol=1e-5)
-        # As one picture of Gaussians that are taken along, and by a camera of one's own.
-        there = dataclasses.replace(run.params, gaussians=run.as_of(view.time))
-        explicit = dataclasses.replace(run, params=there, owner=None, moving=None)
-        shown = np.asarray(explicit.render(camera).linear)
-        assert np.abs(with_box - shown).max() < 1e-4 * max(1.0, float(shown.max()))
+        # And by a camera of one's own.
         viewmat, K, width, height = run.store.camera(index)
         own = make_camera(K, viewmat, width, height)
         np.testing.assert_array_equal(run.render(own).linear, without)
@@ -136,24 +122,19 @@ def test_only_objects_and_moved_ones(run):
         dataclasses.replace(run, owner=None, moving=None).only_objects()
 
 
-def test_the_command_renders_what_moves(run, tmp_path, run_command):
+def test_the_command_renders_what_moves(run, tmp_path, succeeded, refused):
     base = ("render", run.folder, "--split", "test", "--camera", "cam0")
-    options = {
-        "all": (),
-        "without": ("--without-objects",),
-        "only": ("--only-objects",),
-        "moved": ("--move-object", "box-1", "-0.5", "0", "0"),
-        "drive": ("--path", "drive", "--frames", "3"),
-        # The cameras of a path can be rendered again, as they were.
-        "again": ("--path", tmp_path / "drive" / "cameras.json"),
-        "wide": ("--panorama", "--path", "drive", "--frames", "2", "--width", "120"),
-    }
+    options = {"all": (), "without": ("--without-objects",), "only": ("--only-objects",)}
+    options |= {"moved": ("--move-object", "box-1", "-0.5", "0", "0")}
+    # The cameras of a path can be rendered again, as they were.
+    options |= {"drive": ("--path", "drive", "--frames", "3")}
+    options |= {"again": ("--path", tmp_path / "drive" / "cameras.json")}
+    options["wide"] = ("--panorama", "--path", "drive", "--frames", "2", "--width", "120")
     options["bare"] = (*options["wide"], "--without-objects")
     contents = {}
     for name, extra in options.items():
         words = base if name in ("all", "without", "only", "moved", "drive") else base[:2]
-        code, said = run_command(*words, *extra, "--out", tmp_path / name)
-        assert code == 0, said
+        succeeded(*words, *extra, "--out", tmp_path / name)
         contents[name] = [p.read_bytes() for p in sorted((tmp_path / name).rglob("*.exr"))]
         assert contents[name]
     assert len({contents[name][0] for name in ("all", "without", "only", "moved")}) == 4
@@ -162,17 +143,14 @@ def test_the_command_renders_what_moves(run, tmp_path, run_command):
     shots = json.loads((tmp_path / "drive" / "cameras.json").read_text())
     assert [s["time"] for s in shots] == sorted(s["time"] for s in shots)
     assert shots[0]["time"] == 0.0
-    for wrong in (
-        ("--without-objects", "--only-objects"),
-        ("--move-object", "box-1", "nan", "0", "0"),
-    ):
-        assert run_command(*base, *wrong, "--out", tmp_path / "x")[0] == 2
+    refused(*base, "--without-objects", "--only-objects", "--out", tmp_path / "x")
+    refused(*base, "--move-object", "box-1", "nan", "0", "0", "--out", tmp_path / "x")
 
 
-def test_exports_hold_the_middle_of_the_drive(run, tmp_path, run_command):
+def test_exports_hold_the_middle_of_the_drive(run, tmp_path, succeeded):
     command = ("export", run.folder, "--format", "linear-ply", "--out")
-    assert run_command(*command, tmp_path / "all")[0] == 0
-    assert run_command(*command, tmp_path / "still", "--without-objects")[0] == 0
+    succeeded(*command, tmp_path / "all")
+    succeeded(*command, tmp_path / "still", "--without-objects")
     everything = read_ply(tmp_path / "all" / "linear.ply")
     still = read_ply(tmp_path / "still" / "linear.ply")
     assert everything.capacity == run.params.gaussians.capacity
@@ -185,19 +163,18 @@ def test_exports_hold_the_middle_of_the_drive(run, tmp_path, run_command):
     np.testing.assert_allclose(shown.means, everything.means, atol=1e-5)
 
 
-def test_scores_can_be_computed_again(run, tmp_path, run_command):
+def test_scores_can_be_computed_again(run, tmp_path, succeeded):
     before = json.loads((run.folder / "metrics.json").read_text())
     again = tmp_path / "run"
     shutil.copytree(run.folder, again)
-    assert run_command("eval", again)[0] == 0
+    succeeded("eval", again)
     after = json.loads((again / "metrics.json").read_text())
     for part in (lambda m: m["train"], lambda m: m["test"]["exposure_fitted"]):
-        assert part(after)["moving"]["psnr"] == pytest.approx(
-            part(before)["moving"]["psnr"], abs=1e-3
-        )
+        found, expected = (part(scores)["moving"]["psnr"] for scores in (after, before))
+        assert found == pytest.approx(expected, abs=1e-3)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", ["rigid", pytest.param("vibration", marks=pytest.mark.slow)])
 def test_a_resumed_run_is_the_one_that_was_never_stopped(fitted, folder, tmp_path, method):
     whole, out = fitted(method), tmp_path / "run"
     shutil.copytree(whole, out)

@@ -1,6 +1,5 @@
 """Small made-up scenes that several rendering tests share."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -21,22 +20,13 @@ def street(n=1500, width=72, height=53, seed=3, radius=6.0, degree=1, dtype=np.f
     sigma = radius * np.exp(rng.normal(0, 0.8, n)) / reach * z / focal
     sh = rng.normal(0, 0.4, (n, (degree + 1) ** 2, 3))
     sh[:, 0] += rng.normal(-1, 1, (n, 3))
-    gaussians = Gaussians(
-        means=np.stack([dx * z, dy * z, z], -1),
-        quats=rng.normal(size=(n, 4)),
-        log_scales=np.log(sigma)[:, None] + rng.normal(0, 0.5, (n, 3)),
-        opacity_logits=logits,
-        sh=sh,
-    )
-    gaussians = jax.tree.map(lambda a: jnp.asarray(a, dtype), gaussians)
+    quats, means = rng.normal(size=(n, 4)), np.stack([dx * z, dy * z, z], -1)
+    values = means, quats, np.log(sigma)[:, None] + rng.normal(0, 0.5, (n, 3)), logits, sh
+    gaussians = Gaussians(*(jnp.asarray(a, dtype) for a in values))
     return gaussians, camera(width, height, focal, dtype=dtype)
 
 
 def camera(width=72, height=53, focal=54.0, viewmat=None, dtype=np.float32):
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    return Camera(
-        viewmat=jnp.asarray(np.eye(4) if viewmat is None else viewmat, dtype),
-        K=jnp.asarray(K, dtype),
-        width=width,
-        height=height,
-    )
+    pose = np.eye(4) if viewmat is None else viewmat
+    return Camera(jnp.asarray(pose, dtype), jnp.asarray(K, dtype), width, height)

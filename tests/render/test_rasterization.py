@@ -24,15 +24,10 @@ def arguments(n=300, dtype=np.float32, seed=4):
     g, cam = street(n=n, width=WIDTH, height=HEIGHT, degree=0, dtype=dtype)
     viewmats = np.tile(np.eye(4), (2, 1, 1))
     viewmats[1, 0, 3] = 0.3
-    return {
-        "means": g.means,
-        "quats": g.quats,
-        "scales": jnp.exp(g.log_scales),
-        "opacities": jax.nn.sigmoid(g.opacity_logits),
-        "colors": jnp.asarray(np.exp(rng.normal(-1, 1, (n, 3))), dtype),
-        "viewmats": jnp.asarray(viewmats, dtype),
-        "Ks": jnp.tile(cam.K, (2, 1, 1)),
-    }
+    given = {"means": g.means, "quats": g.quats, "scales": jnp.exp(g.log_scales)}
+    given |= {"opacities": jax.nn.sigmoid(g.opacity_logits), "Ks": jnp.tile(cam.K, (2, 1, 1))}
+    colors = jnp.asarray(np.exp(rng.normal(-1, 1, (n, 3))), dtype)
+    return given | {"colors": colors, "viewmats": jnp.asarray(viewmats, dtype)}
 
 
 def draw(given, **options):

@@ -15,8 +15,8 @@ from p2gs_jax.render.xla_cpu import SMALL_CALL
 CFG = RenderConfig(pixels_in_flight=2048, binning="counting")
 SCENE = street(2000, 64, 48, radius=3.0)
 ALIVE = jnp.ones(2000, bool)
-VIEWS = np.tile(np.eye(4, dtype=np.float32), (3, 1, 1))
-VIEWS[:, 0, 3] = [0.0, 0.2, -0.1]
+VIEWS = np.tile(np.eye(4, dtype=np.float32), (2, 1, 1))
+VIEWS[:, 0, 3] = [0.0, 0.2]
 # Large, because XLA treats small constants and loops in another way.
 CAPACITY = 300_000
 

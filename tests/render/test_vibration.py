@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from splats import camera
+from splats import camera, gaussians_of
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render.project import CYCLE, STILL, at_time
 from p2gs_jax.render.visible import in_view, splat
-from p2gs_jax.types import Gaussians, Placement, Vibration
+from p2gs_jax.types import Placement, Vibration
 
 LIFE, PEAK = 0.4, 0.2
 CFG = RenderConfig(sh_degree=0)
@@ -20,14 +20,8 @@ ALIVE = jnp.ones(1, bool)
 
 def gaussian(velocity=(2.0, 0.0, 0.0), life=LIFE):
     moves = Vibration(jnp.array([velocity]), jnp.full(1, PEAK), jnp.full(1, float(np.log(life))))
-    return Gaussians(
-        means=jnp.array([[0.0, 0.0, 5.0]]),
-        quats=jnp.eye(1, 4),
-        log_scales=jnp.full((1, 3), -1.0),
-        opacity_logits=jnp.ones(1),
-        sh=jnp.ones((1, 1, 3)),
-        vibration=moves,
-    )
+    g = gaussians_of([[0.0, 0.0, 5.0]], [1, 0, 0, 0], -1.0, 1.0, np.ones((1, 3)))
+    return dataclasses.replace(g, vibration=moves)
 
 
 def placement(time):

@@ -39,11 +39,8 @@ def test_options_and_decisions_survive_json(tmp_path):
     saved = json.loads(json.dumps(decided.to_dict()))
     assert Decisions.from_dict(saved) == decided
     found = decided.resolve(FitConfig()).photometry
-    assert (found.white_balance, found.vignetting, found.responses) == (
-        "view",
-        "channel",
-        "channel",
-    )
+    chosen = (found.white_balance, found.vignetting, found.responses)
+    assert chosen == ("view", "channel", "channel")
     assert found.cameras == CAMERAS
     decided.require_same(saved, tmp_path)
     saved["cameras"][0]["vignetting"][0][0] = -0.31
@@ -91,7 +88,7 @@ def test_a_file_that_does_not_fit_is_refused(camera_run, tmp_path, change, said)
 
 
 def test_render_shows_them_and_leaves_them_out_where_asked(
-    camera_run, finished_run, tmp_path, run_command
+    camera_run, finished_run, tmp_path, succeeded, refused
 ):
     run = load_run(camera_run)
     rows = run.scene.train_indices
@@ -99,8 +96,7 @@ def test_render_shows_them_and_leaves_them_out_where_asked(
 
     def rendered(folder, *options):
         out = tmp_path / folder
-        code, text = run_command("render", camera_run, "--split", "train", "--out", out, *options)
-        assert code == 0, text
+        succeeded("render", camera_run, "--split", "train", "--out", out, *options)
         stem = first.removesuffix(".png")
         linear, header = read_exr(out / f"{stem}.exr")
         return picture(out / f"{stem}.render.png"), linear, header
@@ -118,23 +114,20 @@ def test_render_shows_them_and_leaves_them_out_where_asked(
     balance = np.exp(run.white_balance_of(last))
     np.testing.assert_allclose(header["p2gsWhiteBalance"], balance, rtol=1e-5)
     assert (warm / np.maximum(shown, 0.05))[..., 0].mean() > 1.05
-    for run, name, said in (
-        (camera_run, "nobody.png", "no view 'nobody.png'"),
-        (finished_run, first, "models no white balance"),
-    ):
-        argv = ("render", run, "--white-balance-of", name, "--out", tmp_path / "no")
-        code, text = run_command(*argv)
-        assert (code, said in text) == (2, True)
+    balance, out = "--white-balance-of", tmp_path / "no"
+    said = refused("render", camera_run, balance, "nobody.png", "--out", out)
+    assert "no view 'nobody.png'" in said
+    said = refused("render", finished_run, balance, first, "--out", out)
+    assert "models no white balance" in said
 
 
-def test_exports_carry_them(camera_run, tmp_path, run_command):
+def test_exports_carry_them(camera_run, tmp_path, succeeded):
     run = load_run(camera_run)
     rows = run.scene.train_indices
     last = run.scene.views[rows[-1]].name
     formats = ("linear-ply", "display-ply", "colmap", "exr")
     argv = ["export", camera_run, "--format", *formats, "--out", tmp_path]
-    code, text = run_command(*argv, "--bake-steps", 0, "--white-balance-of", last)
-    assert code == 0, text
+    succeeded(*argv, "--bake-steps", 0, "--white-balance-of", last)
     said = json.loads((tmp_path / "linear.json").read_text())
     assert len(said["tone"]["cameras"][0]["vignetting"]) == 3
     view = said["views"][rows[1]]
@@ -180,12 +173,11 @@ def test_the_viewer_s_settings_hold_them(camera_run):
 
 
 def test_the_report_shows_them_and_nothing_of_the_kind_elsewhere(
-    camera_run, finished_run, tmp_path, run_command
+    camera_run, finished_run, tmp_path, succeeded
 ):
     def headings(folder, name):
         out = tmp_path / name
-        code, text = run_command("report", folder, "--no-render", "--out", out)
-        assert code == 0, text
+        succeeded("report", folder, "--no-render", "--out", out)
         return out.read_text()
 
     page = headings(camera_run, "a.html")

@@ -70,15 +70,10 @@ def test_a_grown_population_is_rebuilt_from_the_values(tmp_path):
 
 
 def test_unusual_leaves_and_values(tmp_path):
-    tree = {
-        "nan": jnp.array([jnp.nan, -0.0, jnp.inf, 1e-42]),
-        "none": None,
-        "empty": jnp.zeros((0, 3)),
-        "scalar": jnp.int32(7),
-        "bool": jnp.array([True, False]),
-        "bfloat16": jnp.ones((2, 2), jnp.bfloat16),
-        "schedule": optax.ScaleByScheduleState(jnp.int32(3)),
-    }
+    odd = jnp.array([jnp.nan, -0.0, jnp.inf, 1e-42])
+    tree = {"nan": odd, "none": None, "empty": jnp.zeros((0, 3)), "scalar": jnp.int32(7)}
+    tree |= {"bool": jnp.array([True, False]), "bfloat16": jnp.ones((2, 2), jnp.bfloat16)}
+    tree |= {"schedule": optax.ScaleByScheduleState(jnp.int32(3))}
     store = CheckpointStore(tmp_path / "c")
     store.save(0, tree, {"e": np.float64(0.1), "n": jnp.int32(3), "a": np.arange(2), "s": [None]})
     back, meta = store.restore(0, tree)

@@ -23,7 +23,8 @@ from p2gs_jax.synth.town import Material
 from p2gs_jax.synth.write import write_street
 
 # Those of `noisy_street`, which several tests share.
-SIZE = {"frames": 5, "width": 192, "height": 128, "points": 6000, "seed": 3}
+SIZE = {"frames": 5, "width": 192, "height": 128, "points": 6000}
+SIZE |= {"supersample": 1, "seed": 3}
 
 
 def read_png(path: Path) -> np.ndarray:

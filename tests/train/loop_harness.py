@@ -19,17 +19,9 @@ from p2gs_jax.train.update import StepReport
 from p2gs_jax.types import Batch, Camera, Gaussians, Params, Photometry
 
 VIEWS, SEEDS = 4, 10
-SHORT = with_fields(
-    FitConfig(),
-    {
-        "train.steps": 100,
-        "train.log_every": 5,
-        "train.coarse_to_fine": [],
-        "train.checkpoint_every_s": 1e9,
-        "densify.min_every_steps": 5,
-        "densify.method": None,
-    },
-)
+FIELDS = {"train.steps": 100, "train.log_every": 5, "train.coarse_to_fine": []}
+FIELDS |= {"train.checkpoint_every_s": 1e9, "densify.min_every_steps": 5, "densify.method": None}
+SHORT = with_fields(FitConfig(), FIELDS)
 
 
 class Views:
@@ -113,19 +105,9 @@ class Harness:
     def run(self, cfg=SHORT, *, resume=False, programs=None, **options):
         """Run to the end; return the result and the programs."""
         programs = programs or Programs(self.clock)
-        trainer = loop.Trainer(
-            cfg,
-            Views(),
-            1.0,
-            None,
-            Coverage(400 * 300, 1.0),
-            self.folder,
-            programs,
-            Decisions.as_asked(cfg),
-            on_message=self.said.append,
-            now=lambda: self.clock.now,
-            store=self.checkpoints,
-        )
+        given = (cfg, Views(), 1.0, None, Coverage(400 * 300, 1.0), self.folder, programs)
+        told = {"on_message": self.said.append, "now": lambda: self.clock.now}
+        trainer = loop.Trainer(*given, Decisions.as_asked(cfg), **told, store=self.checkpoints)
         result = trainer.run(params(), np.ones(SEEDS, bool), resume=resume, **options)
         return result, programs
 

@@ -14,29 +14,25 @@ EXTENT, DEGREE = 2.0, 1
 
 
 def config(method: str | None = "mcmc") -> FitConfig:
-    fields = {
-        "render.sh_degree": DEGREE,
-        "render.pixels_in_flight": 2048,
-        "densify.method": method,
-        # It would only cost compiling here.
-        "loss.dssim_weight": None,
-        # With an epsilon of about the gradient's size, updates are as smooth as the gradient.
-        "optimizer.eps": 1e-5,
-    }
+    # DSSIM would only cost compiling; with an epsilon of about the gradient's size, updates are as
+    # smooth as the gradient.
+    fields = {"loss.dssim_weight": None, "optimizer.eps": 1e-5, "densify.method": method}
+    fields |= {"render.sh_degree": DEGREE, "render.pixels_in_flight": 2048}
     return with_values(FitConfig(), fields)
 
 
-def start() -> Params:
-    """Some Gaussians that each view shows and others that it does not."""
+def start(count: int = COUNT, spread: float = 0.9, behind: int = 0) -> Params:
+    """Some Gaussians that each view shows and others that it does not, or that are behind it."""
     rng = np.random.default_rng(0)
-    z = rng.uniform(3, 8, COUNT)
-    xy = rng.uniform(-0.9, 0.9, (COUNT, 2)) * z[:, None] * [WIDTH / FOCAL, HEIGHT / FOCAL]
+    z = rng.uniform(3, 8, count)
+    xy = rng.uniform(-spread, spread, (count, 2)) * z[:, None] * [WIDTH / FOCAL, HEIGHT / FOCAL]
+    z[:behind] *= -1
     values = (
         np.concatenate([xy, z[:, None]], 1),
-        rng.normal(size=(COUNT, 4)),
-        rng.normal(-3, 0.4, (COUNT, 3)),
-        rng.normal(-1, 2, COUNT),
-        rng.normal(0, 0.3, (COUNT, (DEGREE + 1) ** 2, 3)),
+        rng.normal(size=(count, 4)),
+        rng.normal(-3, 0.4, (count, 3)),
+        rng.normal(-1, 2, count),
+        rng.normal(0, 0.3, (count, (DEGREE + 1) ** 2, 3)),
     )
     zeros = np.zeros(VIEWS, np.float32)
     gaussians = on_host(Gaussians, *(a.astype(np.float32) for a in values))

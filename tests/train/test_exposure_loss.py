@@ -102,16 +102,10 @@ def test_pairs_of_tracks_have_places_where_they_count():
     count = 60
     rng = np.random.default_rng(0)
     views, points = np.repeat(np.arange(3), 20), np.tile(np.arange(20), 3)
-    observations = Observations(
-        views=views,
-        points=points,
-        colors=rng.uniform(0.2, 0.8, (count, 3)).astype(np.float32),
-        spread=np.zeros((count, 3), np.float32),
-        view_count=3,
-        point_count=20,
-        cameras=np.zeros(3, int),
-        positions=rng.uniform(-0.5, 0.5, (count, 2)).astype(np.float32),
-    )
+    colors = rng.uniform(0.2, 0.8, (count, 3)).astype(np.float32)
+    places = rng.uniform(-0.5, 0.5, (count, 2)).astype(np.float32)
+    seen = (views, points, colors, np.zeros_like(colors), 3, 20, np.zeros(3, int))
+    observations = Observations(*seen, positions=places)
     cfg = FitConfig(loss=OBSERVED)
     plain = color_pairs(observations, cfg)
     assert plain is not None

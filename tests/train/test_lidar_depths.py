@@ -20,6 +20,7 @@ def measured(pixels, depths) -> Measured:
     return Measured(jnp.asarray(places, jnp.float32), jnp.asarray(depths, jnp.float32))
 
 
+@jax.jit
 def loss(depth, alpha, m):
     alpha = jnp.asarray(alpha, jnp.float32)
     return lidar_loss(alpha, jnp.asarray(depth * alpha, jnp.float32), m)

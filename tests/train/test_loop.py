@@ -180,10 +180,7 @@ def test_a_signal_ends_the_run_after_a_checkpoint_and_it_goes_on_as_if_nothing_h
 
 def test_the_first_burst_and_a_second_signal_wait_for_nothing(harness):
     twice = (signal.SIGTERM, signal.SIGINT)
-    for programs in (
-        signalled(harness, signal.SIGTERM, at=2),
-        signalled(harness, *twice, at=52),
-    ):
+    for programs in (signalled(harness, signal.SIGTERM, at=2), signalled(harness, *twice, at=52)):
         with pytest.raises(Interrupted):
             harness.run(programs=programs)
         assert harness.checkpoints.latest_step() is None

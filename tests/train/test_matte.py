@@ -1,6 +1,7 @@
 """Photographs with alpha and renders over one background: they agree wherever they should."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -53,6 +54,7 @@ def surfaces():
     return RNG.uniform(0.05, 0.9, (*SIZE, 3)), alpha
 
 
+@functools.partial(jax.jit, static_argnames="cfg")
 def matted_loss(render, batch, capture, correction, cfg):
     """Return the picture over the background and the terms that compare it."""
     taken = Photometry(capture.exposure[None], capture.gamma[None], "linear")

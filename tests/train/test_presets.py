@@ -13,17 +13,12 @@ from p2gs_jax.photometry.appearance import identity
 from p2gs_jax.render.visible import BLOCK
 from p2gs_jax.train.optimizer import appearance_rate
 
-SMALL = {
-    "render.sh_degree": 1,
-    "train.steps": 40,
-    "train.coarse_to_fine": (),
-    "densify.min_every_steps": 10,
-    "densify.max_gaussians": 400,
-}
+SMALL = {"render.sh_degree": 1, "train.steps": 40, "train.coarse_to_fine": ()}
+SMALL |= {"densify.min_every_steps": 10, "densify.max_gaussians": 400}
 
 
-def small(name, **fields):
-    changed = {k.replace("__", "."): v for k, v in fields.items()}
+def small(name, **densify):
+    changed = {f"densify.{field}": value for field, value in densify.items()}
     return with_fields(p2gs_jax.preset(name), SMALL | changed)
 
 
@@ -38,14 +33,8 @@ def check(result, run):
 
 @pytest.mark.slow
 def test_the_paper_runs_as_printed(tmp_path):
-    cfg = small(
-        "paper",
-        train__steps=60,
-        train__log_every=5,
-        densify__grad_threshold=0.0,
-        densify__min_every_steps=4,
-        densify__max_gaussians=None,
-    )
+    cfg = small("paper", grad_threshold=0.0, min_every_steps=4, max_gaussians=None)
+    cfg = with_fields(cfg, {"train.steps": 60, "train.log_every": 5})
     result = p2gs_jax.fit(make_scene(tmp_path / "scene"), tmp_path / "run", cfg)
     log = check(result, tmp_path / "run")
     assert {"l1", "dssim", "relative_exposure", "exposure_variance"} <= set(log[0]["terms"])
@@ -62,13 +51,8 @@ def test_the_appendix_differs_from_the_main_text_in_one_weight():
 
 @pytest.mark.slow
 def test_opacity_resets_empty_the_scene_and_it_grows_back(tmp_path):
-    cfg = small(
-        "paper",
-        train__steps=160,
-        densify__reset_every=0.4,
-        densify__min_reset_steps=10,
-        densify__prune_scale=10.0,
-    )
+    cfg = small("paper", reset_every=0.4, min_reset_steps=10, prune_scale=10.0)
+    cfg = with_fields(cfg, {"train.steps": 160})
     result = p2gs_jax.fit(make_scene(tmp_path / "scene"), tmp_path / "run", cfg)
     losses = [r["loss"] for r in check(result, tmp_path / "run")]
     assert max(np.diff(losses)) > 0.01  # the reset

@@ -3,13 +3,14 @@
 import dataclasses
 from types import SimpleNamespace
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from noise_views import DEGREE, EXTENT, HEIGHT, WIDTH, config, start, view
 
-from p2gs_jax.config import FitConfig
 from p2gs_jax.presets import with_values
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.render.visible import BLOCK, in_view, splat
@@ -20,59 +21,26 @@ from p2gs_jax.train.state import FAULT_NONE, FAULT_NONFINITE, FAULT_OVERFLOW, in
 from p2gs_jax.train.step import Step, per_gaussian
 from p2gs_jax.train.terms import loss_terms
 from p2gs_jax.train.update import Controls, finite_names
-from p2gs_jax.types import Batch, Camera, Gaussians, Params, Photometry
+from p2gs_jax.types import Batch
 
 COUNT, HIDDEN = 6000, 600
-WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
-EXTENT, DEGREE, PROGRESS, RATE = 2.0, 1, 0.3, 0.7
+PROGRESS, RATE = 0.3, 0.7
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
 PHOTOMETRY = ("raw_exposures", "raw_gammas")
-
-
-CFG = with_values(
-    FitConfig(),
-    {
-        "render.sh_degree": DEGREE,
-        "render.pixels_in_flight": 2048,
-        "densify.method": None,
-        # Its gradient is checked by itself (`test_image_loss.py`), and it costs compiling.
-        "loss.dssim_weight": None,
-        # With an epsilon of about the gradient's size, updates are as smooth as the gradient.
-        "optimizer.eps": 1e-5,
-    },
-)
+CFG = config(method=None)
 CONTROLS = Controls(np.float32(PROGRESS), np.int32(DEGREE), np.float32(RATE), np.uint32(0))
 
 
-def start() -> Params:
-    """More Gaussians in view than fit into a block, and some behind the camera."""
-    rng = np.random.default_rng(0)
-    z = rng.uniform(3, 8, COUNT)
-    xy = rng.uniform(-0.5, 0.5, (COUNT, 2)) * z[:, None] * [WIDTH / FOCAL, HEIGHT / FOCAL]
-    means = np.concatenate([xy, z[:, None]], 1)
-    means[rng.permutation(COUNT)[:HIDDEN], 2] *= -1
-    values = (
-        means,
-        rng.normal(size=(COUNT, 4)),
-        rng.normal(-3, 0.4, (COUNT, 3)),
-        rng.normal(0, 1, COUNT),
-        rng.normal(0, 0.3, (COUNT, (DEGREE + 1) ** 2, 3)) - [[[1.0], *[[0.0]] * 3]],
-    )
-    gaussians = Gaussians(*(jnp.asarray(a, jnp.float32) for a in values))
-    return Params(gaussians, Photometry(jnp.array([0.1, -0.1]), jnp.array([0.02, 0.0])))
-
-
 def photograph() -> Batch:
-    K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]], np.float32)
-    camera = Camera(jnp.eye(4), jnp.asarray(K), WIDTH, HEIGHT)
-    ldr = np.random.default_rng(1).uniform(0, 1, (HEIGHT, WIDTH, 3)).astype(np.float32)
-    return Batch(camera, jnp.asarray(ldr), jnp.ones((HEIGHT, WIDTH)), jnp.int32(1))
+    return view(1)[0]
 
 
 @pytest.fixture(scope="module")
 def made():
     """Return steps from one start, with and without room, and the gradient they should follow."""
-    params, batch, optimizer = start(), photograph(), make_optimizer(CFG)
+    # More are in view than fit into a block, and some are behind the camera.
+    params, batch = jax.tree.map(jnp.asarray, (start(COUNT, 0.45, HIDDEN), photograph()))
+    optimizer = make_optimizer(CFG)
     # A tenth of the slots are empty.
     alive = jnp.arange(COUNT) % 10 != 0
     run, partner = Step(CFG, optimizer, EXTENT), Partner(jnp.int32(0))
@@ -93,19 +61,10 @@ def made():
     refused = step(tight)
     fault = refused[0].fault
     room = tight.grown(int(fault.needed), int(fault.visible))
-    return SimpleNamespace(
-        params=params,
-        alive=np.asarray(alive),
-        seen=np.asarray(in_view(params.gaussians, alive, batch.camera, CFG.render)),
-        gradient=gradient,
-        probe=probe,
-        loss=float(loss),
-        tight=tight,
-        refused=refused,
-        room=room,
-        step=step,
-        after=step(room),
-    )
+    seen = np.asarray(in_view(params.gaussians, alive, batch.camera, CFG.render))
+    expected = {"gradient": gradient, "probe": probe, "loss": float(loss), "seen": seen}
+    steps = {"tight": tight, "refused": refused, "room": room, "step": step, "after": step(room)}
+    return SimpleNamespace(params=params, alive=np.asarray(alive), **expected, **steps)
 
 
 def rows_of(tree, name, rows):
@@ -204,15 +163,10 @@ def test_the_statistic_is_the_screen_space_gradient(made):
     np.testing.assert_array_equal(state.population.seen_count, norm > 0)
 
 
-def same(a, b):
-    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-        assert np.asarray(x).tobytes() == np.asarray(y).tobytes()
-
-
 def test_a_view_without_room_changes_nothing_but_the_fault(made):
     state, report = made.refused
     fresh = initial_state(made.params, jnp.asarray(made.alive), make_optimizer(CFG))
-    same(dataclasses.replace(state, fault=fresh.fault), fresh)
+    chex.assert_trees_all_equal(dataclasses.replace(state, fault=fresh.fault), fresh)
     assert int(state.fault.kind) == FAULT_OVERFLOW
     assert int(state.fault.visible) == made.seen.sum() > made.tight.visible
     assert int(state.fault.needed) > made.tight.entries
@@ -243,4 +197,4 @@ def test_the_first_that_is_not_finite_is_named(made, field, named):
     assert names[int(state.fault.term)].startswith(named)
     if field == "sh":
         fresh = initial_state(params, jnp.asarray(made.alive), make_optimizer(CFG))
-        same(dataclasses.replace(state, fault=fresh.fault), fresh)
+        chex.assert_trees_all_equal(dataclasses.replace(state, fault=fresh.fault), fresh)

@@ -57,12 +57,8 @@ def test_faults_name_what_there_is():
 
 
 def test_without_a_solution_only_views_learn():
-    asked = {
-        "photometry.select": False,
-        "photometry.start": "random",
-        "photometry.white_balance": "view",
-        "photometry.vignetting": "camera",
-    }
+    asked = {"photometry.select": False, "photometry.start": "random"}
+    asked |= {"photometry.white_balance": "view", "photometry.vignetting": "camera"}
     cfg = with_fields(FitConfig(), asked)
     decided = decide(cfg, None)
     assert (decided.white_balance, decided.vignetting) == ("view", None)
