@@ -30,6 +30,22 @@ def pytest_sessionstart(session):
                 path.unlink(missing_ok=True)
 
 
+# What takes the longest begins first: at the end no process waits for another.
+LONGEST = (
+    *("pipeline/test_moving", "cli/test_against", "render/test_rasterize", "jobs/test_fit_blocks"),
+    *("train/test_data_parallel", "train/test_step_blocks", "pipeline/test_calibrate_of"),
+    *("gaussians/test_bake", "pipeline/test_cutouts", "pipeline/test_calibrate"),
+    *("synth/test_street", "pipeline/test_preflight", "render/test_transformations"),
+    *("render/test_hard_cases", "viewer/test_browser", "export/test_page_browser"),
+)
+
+
+def pytest_collection_modifyitems(items):
+    """Let the files that take the longest come first, each in one piece."""
+    places = {f"tests/{name}.py": place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: places.get(item.nodeid.partition("::")[0], len(places)))
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _signals_as_in_a_terminal():
     """Let signals arrive that a shell in the background, or nohup, has told processes to ignore."""

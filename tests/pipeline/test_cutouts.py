@@ -37,7 +37,7 @@ def write_ball(root, count, part):
         assert cv2.imwrite(str(root / part / f"r_{k}.png"), image)
 
 
-SHORT = {"data.background": "0.1,0.9,0.1", "init.dense": "off", "densify.method": None}
+SHORT = {"data.background": "0.1,0.9,0.1", "init.dense": "off", "densify.max_gaussians": 600}
 SHORT |= {"train.steps": 60, "train.coarse_to_fine": ()}
 SHORT |= {"render.sh_degree": 0, "render.pixels_in_flight": 2048}
 
