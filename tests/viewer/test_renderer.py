@@ -47,8 +47,9 @@ def camera(size, z=0.0):
 
 
 @pytest.fixture
-def made():
+def made(monkeypatch):
     """Return a function that makes a renderer and the event that it compiled something."""
+    monkeypatch.setattr("p2gs_jax.render.capacity.SMALLEST", 4096)
     every = []
 
     def make(scene, z=0.0, alive=True):
