@@ -33,8 +33,8 @@ def pytest_sessionstart(session):
 # What takes the longest begins first: at the end no process waits for another.
 LONGEST = (
     *("pipeline/test_moving", "cli/test_against", "render/test_rasterize", "jobs/test_fit_blocks"),
-    *("train/test_data_parallel", "train/test_step_blocks", "pipeline/test_calibrate_of"),
-    *("gaussians/test_bake", "pipeline/test_cutouts", "pipeline/test_calibrate"),
+    *("train/test_step_blocks", "gaussians/test_bake", "pipeline/test_cutouts"),
+    *("pipeline/test_calibrate", "train/test_make_step"),
     *("synth/test_street", "pipeline/test_preflight", "render/test_transformations"),
     *("render/test_hard_cases", "viewer/test_browser", "export/test_page_browser"),
 )
