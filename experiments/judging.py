@@ -15,14 +15,15 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import matplotlib
 import numpy as np
 from jaxtyping import Float
+from PIL import Image, ImageDraw, ImageFont
 
 import p2gs_jax
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import LN2
-from p2gs_jax.formats.frames import write_png
-from p2gs_jax.paths.pictures import titled
+from p2gs_jax.formats.frames import to_uint8, write_png
 from p2gs_jax.photometry.luminance import Luminance
 from p2gs_jax.photometry.ppisp import Ppisp, falloff, recolored
 
@@ -98,11 +99,16 @@ def contact_sheet(path: Path, rows: Sequence[tuple[str, Sequence[tuple[str, np.n
         path: PNG file.
         rows: of each its title, and its pictures, display values, with what they are.
     """
-    images = []
+    file, parts = Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf", []
     for title, columns in rows:
         texts, pictures = zip(*columns, strict=True)
-        images.append((f"{title}: {'; '.join(texts)}", np.concatenate(pictures, axis=1)))
-    write_png(path, titled(images))
+        image = np.concatenate(pictures, axis=1)
+        font = ImageFont.truetype(file, max(11, image.shape[1] // 60))
+        head = Image.new("RGB", (image.shape[1], round(1.7 * font.size)), "white")
+        text = f"{title}: {'; '.join(texts)}"
+        ImageDraw.Draw(head).text((2, head.height / 2), text, (30, 30, 30), font, anchor="lm")
+        parts += [np.asarray(head), to_uint8(image)]
+    write_png(path, np.concatenate(parts).astype(np.float32) / 255)
 
 
 def mean_of_rows(run: p2gs_jax.Run, rows: Sequence[int]) -> p2gs_jax.Run:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import importlib
 import importlib.metadata
 import importlib.util
-import os
 import platform
 import shutil
 import sys
@@ -19,7 +18,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from p2gs_jax.core import memory
 from p2gs_jax.core.text import printable
 
 # Import names that differ from the distribution's; pip may write names in lower case.
@@ -63,9 +61,8 @@ class Finding(NamedTuple):
 class Doctor:
     """Say what works here, and what to install for what does not.
 
-    Versions, devices, cores, memory, disk, the cache of compiled programs, which rasterizer a fit
-    would use, and a self-test: three Gaussians rendered, with gradients. Exit code 1 where
-    something that everything needs is broken.
+    Versions, devices, which rasterizer a fit would use, and a self-test: three Gaussians rendered,
+    with gradients. Exit code 1 where something that everything needs is broken.
 
         p2gs-jax doctor
         p2gs-jax doctor --skip-self-test
@@ -80,7 +77,6 @@ class Doctor:
             print("Trying every library, then three Gaussians ...", file=sys.stderr)
         version = f"{installed('p2gs-jax')}, Python {platform.python_version()}"
         found = [Finding("p2gs-jax", f"{version}, {platform.platform()}"), *check_devices()]
-        found += [*check_machine(Path.cwd()), check_cache()]
         found += [Finding("Self-test", "skipped") if self.skip_self_test else check_render()]
         libraries = check_libraries()
         broken = [x.name for x in libraries if not x.ok]
@@ -160,73 +156,22 @@ def check_features(broken: Sequence[str]) -> list[Finding]:
     return rows
 
 
-def check_machine(folder: Path) -> list[Finding]:
-    """Return cores, memory, and the room on the disk of a folder."""
-    free = None
-    with suppress(OSError):
-        free = shutil.disk_usage(folder).free
-    total, available = (_size(count) for count in memory.memory())
-    return [
-        Finding("Cores", str(cores())),
-        Finding("Memory", f"{total}, {available} of it available"),
-        Finding("Disk", f"{_size(free)} free in {folder}"),
-    ]
-
-
-def cores() -> int:
-    """Return how many cores this process may use: its affinity, and a container's quota."""
-    affinity = getattr(os, "sched_getaffinity", None)
-    count = len(affinity(0)) if affinity else os.cpu_count() or 1
-    quota, _, period = memory.text_of(memory.CGROUP / "cpu.max").partition(" ")
-    if quota.isdecimal() and period.strip().isdecimal():
-        count = min(count, max(1, int(quota) // int(period)))
-    return count
-
-
-def check_cache() -> Finding:
-    """Set up JAX's compile cache; return its folder and size, or what is wrong with it."""
-    try:
-        from p2gs_jax.core.runtime import MOST_BYTES, cache_folder, use_compile_cache
-
-        use_compile_cache()
-        folder = cache_folder()
-    except Exception as error:  # whatever a broken JAX raises
-        return Finding("Compiled", f"unknown ({type(error).__name__}: {error})")
-    if folder is None:
-        text = "nothing is kept: every run compiles anew (about a minute longer)"
-        return Finding("Compiled", text)
-    size = sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
-    text = f"{size / 1e6:.0f} MB of at most {MOST_BYTES / 1e6:.0f} in {folder}"
-    if not os.access(folder, os.W_OK):
-        text += "; NOT writable: set JAX_COMPILATION_CACHE_DIR to a folder that is"
-    return Finding("Compiled", text)
-
-
 def check_devices() -> list[Finding]:
     """Return JAX's devices, and the implementations that a fit would use."""
     try:
         import jax
 
-        from p2gs_jax.core.runtime import keep_freed_memory
         from p2gs_jax.render.tiles import fastest_here, slow_here
 
-        # Tile lists as `render.binning` chooses where the configuration says None.
-        cpu = jax.default_backend() == "cpu"
         names = [device.device_kind for device in jax.devices()]
         with suppress(Exception):  # CPUs and some plugins do not tell
             limits = [d.memory_stats()["bytes_limit"] / 2**30 for d in jax.devices()]
             names = [f"{n} ({limit:.1f} GiB)" for n, limit in zip(names, limits, strict=True)]
         said, driver = ", ".join(names), Path("/proc/driver/nvidia/version")
-        if cpu and (shutil.which("nvidia-smi") or driver.is_file()):
+        if jax.default_backend() == "cpu" and (shutil.which("nvidia-smi") or driver.is_file()):
             said += " alone; for the NVIDIA GPU here: pip install 'p2gs-jax[cuda]'"
-        lists = f"tile lists by {'counting' if cpu else 'sorting'}"
-        used = ". ".join(filter(None, [f"{fastest_here()}, {lists}", slow_here()]))
-        kept = "kept between steps" if keep_freed_memory() else "handed back: steps are slower"
-        return [
-            Finding("JAX runs on", said),
-            Finding("Rasterizer", used),
-            Finding("Freed memory", kept),
-        ]
+        used = ". ".join(filter(None, [fastest_here(), slow_here()]))
+        return [Finding("JAX runs on", said), Finding("Rasterizer", used)]
     except Exception as error:  # whatever a broken JAX raises
         return [Finding("JAX runs on", f"{type(error).__name__}: {error}", ok=False)]
 
@@ -283,7 +228,3 @@ def _row(name: str, text: str, width: int = 13) -> str:
     wrapper = textwrap.TextWrapper(80, break_long_words=False, break_on_hyphens=False)
     wrapper.initial_indent, wrapper.subsequent_indent = name.ljust(width), " " * width
     return wrapper.fill(printable(text))
-
-
-def _size(count: int | None) -> str:
-    return "unknown" if count is None else f"{count / 2**30:.1f} GiB"

@@ -112,10 +112,8 @@ def display_transform(fitted: Run, options: Export) -> DisplayTransform:
     try:
         return transform.with_curve(options.curve)
     except ValueError as error:
-        raise UserError(
-            f"--curve {options.curve}: {error}.",
-            fix=f"leave it out for the run's own ({transform.formation.curve})",
-        ) from error
+        fix = f"leave it out for the run's own ({transform.formation.curve})"
+        raise UserError(f"--curve {options.curve}: {error}.", fix=fix) from error
 
 
 def check_export(args: Export) -> None:
@@ -136,7 +134,5 @@ def check_export(args: Export) -> None:
         given = [n for n in names if getattr(args, n) is not None]
         if given and not set(args.format) & set(formats):
             which = formats[0] if len(formats) == 1 else f"one of {', '.join(formats)}"
-            raise UserError(
-                f"--{given[0].replace('_', '-')} says nothing without {what}.",
-                fix=f"leave it out, or add {which} to --format",
-            )
+            fix = f"leave it out, or add {which} to --format"
+            raise UserError(f"--{given[0].replace('_', '-')} says nothing without {what}.", fix=fix)

@@ -56,63 +56,39 @@ class Fit:
     def execute(self) -> int:
         """Fit the scene; print the place and the scores of the results."""
         import time
+        from functools import partial
 
         from p2gs_jax.cli.tables import print_metrics
         from p2gs_jax.core.progress import TerminalReporter
         from p2gs_jax.pipeline.fit import fit
 
         self._check()
-        if self.blocks is not None:
-            return self._execute_in_blocks(self.blocks)
         with TerminalReporter() as reporter:
-            result = fit(
-                self.scene,
-                self.out,
-                checked(self.config),
-                reference=self.reference,
-                resume=self.resume,
-                reporter=reporter,
+            cfg = checked(self.config)
+            common = {"reference": self.reference, "resume": self.resume, "reporter": reporter}
+            if self.blocks is None:
                 # Starting the interpreter and loading libraries is processor time throughout.
-                spent_s=time.process_time(),
-            )
+                common["spent_s"] = time.process_time()
+                result = fit(self.scene, self.out, cfg, **common)
+            else:
+                from p2gs_jax.jobs.blocks.fit import fit_blocks
+                from p2gs_jax.jobs.table import show
+
+                common |= {"blocks": self.blocks, "parallel": self.jobs, "engine": self.engine}
+                show_jobs = partial(show, reporter)
+                result = fit_blocks(self.scene, self.out, cfg, **common, on_look=show_jobs)
         print_metrics(result.metrics, self.out)
         return 0
 
     def _check(self) -> None:
         count = self.blocks
-        check(
-            count is not None or (self.jobs == 1 and self.engine == "local"),
-            "--jobs and --engine say nothing without --blocks",
-            fix="add --blocks auto, or a number",
-        )
+        why = "--jobs and --engine say nothing without --blocks"
+        fix = "add --blocks auto, or a number"
+        check(count is not None or (self.jobs == 1 and self.engine == "local"), why, fix=fix)
         right = not isinstance(count, int) or count >= 1
         fix = "write a whole number from 1 on, or auto"
         check(right, f"--blocks {count} is not a number of blocks", fix=fix)
         check(self.jobs >= 1, "--jobs must be at least 1")
-
-    def _execute_in_blocks(self, count: int | str) -> int:
-        from functools import partial
-
-        from p2gs_jax.cli.tables import print_metrics
-        from p2gs_jax.core.progress import TerminalReporter
-        from p2gs_jax.jobs.blocks.fit import fit_blocks
-        from p2gs_jax.jobs.table import show
-
-        with TerminalReporter() as reporter:
-            result = fit_blocks(
-                self.scene,
-                self.out,
-                checked(self.config),
-                blocks=count,
-                parallel=self.jobs,
-                engine=self.engine,
-                reference=self.reference,
-                resume=self.resume,
-                reporter=reporter,
-                on_look=partial(show, reporter),
-            )
-        print_metrics(result.metrics, self.out)
-        return 0
 
 
 @dataclass(frozen=True)
@@ -177,22 +153,14 @@ class Calibrate:
         """Return the configuration; raise a UserError where a value makes no sense."""
         scene, is_run, data, usual = self.scene, self.is_run, self.config.data, FitConfig().data
         own_size = data == usual
-        check(
-            (data.test_every, data.split) == (usual.test_every, usual.split),
-            "--data.test-every and --data.split say nothing here",
-            fix="leave them out: every photograph is calibrated",
-        )
+        why = "--data.test-every and --data.split say nothing here"
+        fix = "leave them out: every photograph is calibrated"
+        check((data.test_every, data.split) == (usual.test_every, usual.split), why, fix=fix)
         cfg, leave_out = checked(self.config), "leave out --max-width, --images and --data options"
-        check(
-            own_size or not self.static,
-            "--static reads every photograph of the folder at its own size",
-            fix=leave_out,
-        )
-        check(
-            own_size or not is_run,
-            f"{scene} is a finished run: it keeps its own image size and folder",
-            fix=leave_out,
-        )
+        why = "--static reads every photograph of the folder at its own size"
+        check(own_size or not self.static, why, fix=leave_out)
+        why = f"{scene} is a finished run: it keeps its own image size and folder"
+        check(own_size or not is_run, why, fix=leave_out)
         return cfg
 
 
@@ -207,14 +175,10 @@ def checked(cfg: FitConfig) -> FitConfig:
     check(train.budget_s is None or train.budget_s > 0, "--budget leaves no time", fix=DURATIONS)
     check(train.steps >= 1, "--steps must be at least 1")
     check(not isinstance(most, int) or most >= 1, "--gaussians must be at least 1")
-    check(
-        all(math.isfinite(x) and x >= 0 for x in behind or ()),
-        "--render.background must be linear radiance, three numbers that are not negative",
-    )
+    why = "--render.background must be linear radiance, three numbers that are not negative"
+    check(all(math.isfinite(x) and x >= 0 for x in behind or ()), why)
     check(known.known_deviation_ev >= 0, "--known-deviation-ev must be 0 or more")
-    check(
-        known.known_deviation_ev == 0 or known.known is not None,
-        "--known-deviation-ev says nothing without --known-exposures",
-        fix="add --known-exposures FILE, or exif",
-    )
+    why = "--known-deviation-ev says nothing without --known-exposures"
+    fix = "add --known-exposures FILE, or exif"
+    check(known.known_deviation_ev == 0 or known.known is not None, why, fix=fix)
     return cfg

@@ -12,16 +12,10 @@ from jaxtyping import Float32
 from p2gs_jax.cli.render import FPS, Render
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.frames import OutputFrame
+from p2gs_jax.paths import pictures
 from p2gs_jax.paths.drive import PosePath, beside, beside_shots, drive, frame_count, interpolated
 from p2gs_jax.paths.orbit import find_orbit, orbit
 from p2gs_jax.paths.panorama import covering
-from p2gs_jax.paths.pictures import (
-    comparison_frames,
-    comparison_size,
-    metered_shots,
-    shot_frames,
-    wide_frames,
-)
 from p2gs_jax.paths.rig import find_rig
 from p2gs_jax.paths.shots import Shot, of_camera, view_shots
 from p2gs_jax.photometry.display import DisplayTransform
@@ -105,17 +99,16 @@ def shots_of(
         else:
             circle = find_orbit(chosen, own, np.asarray(fitted.scene.points, np.float64))
             shots = orbit(circle, own, options.frames)
-            notes = [circle.description()]
     if options.width is not None:
         shots = [shot.resized(options.width) for shot in shots]
     if options.exposure_of is not None:
         added = options.exposure_ev if isinstance(options.exposure_ev, float | int) else 0.0
         frames_s = ADAPT_S * (options.fps or FPS) if options.path != "views" else 0.0
-        shots = metered_shots(fitted, shots, options.exposure_of, added, frames_s)
+        shots = pictures.metered_shots(fitted, shots, options.exposure_of, added, frames_s)
         if options.exposure_of == "auto":
             notes = [*notes, fitted.metering.sentence]
     size = (max(s.width for s in shots), max(s.height for s in shots))
-    frames = shot_frames(
+    frames = pictures.shot_frames(
         fitted, shots, lambda shot: _display_transform(fitted, options, shot), photograph
     )
     return Job(frames, len(shots), size, shots, notes)
@@ -156,35 +149,26 @@ def panoramas_of(options: Render, fitted: Run) -> Job:
     cylinder = covering(rig.mounts.values(), np.eye(4))
     if options.width is not None:
         cylinder = cylinder.resized(options.width)
-    transform = _display_transform(fitted, options)
+    notes = []
     if options.path == "drive":
         if len(rig.steps) < 2:
-            raise UserError(
-                "A drive needs at least two time steps; the rig has one.", fix="use --path views"
-            )
+            fix = "use --path views"
+            raise UserError("A drive needs at least two time steps; the rig has one.", fix=fix)
         path = PosePath(rig.poses)
         along = path.evenly(frame_count(len(rig.steps), options.frames))
         poses = path(along)
         times = interpolated(path.times, [step.time for step in rig.steps], along)
         if options.shift is not None:
             poses = beside(poses, views, options.shift)
-        size = (cylinder.width, cylinder.height)
-        return Job(wide_frames(fitted, cylinder, poses, transform, times), len(poses), size)
-    allowed = {shot.view for shot in _chosen(options, fitted)}
-    steps = [
-        replace(step, shots={c: s for c, s in step.shots.items() if s.view in allowed})
-        for step in rig.steps
-    ]
-    steps = [step for step in steps if step.shots]
-    if not steps:
-        raise UserError(f"--split {options.split}: the rig has no such time step.")
-    notes = []
-    alone = len(views) - sum(len(step.shots) for step in rig.steps)
-    if alone:
-        notes.append(f"{alone} views have no other camera's at their time: they are left out.")
-    if fitted.params.appearance is not None:
-        notes.append("Corrections of display values that this run learned stay in the photographs.")
-    taken = [shot.view for step in steps for shot in step.shots.values() if shot.view is not None]
-    fitted.require_photographs(taken)
-    frames = comparison_frames(fitted, rig, steps, cylinder, transform, fitted.store)
-    return Job(frames, len(steps), comparison_size(cylinder), (), notes)
+        steps = list(zip([f"{k:05d}" for k in range(len(poses))], poses, times, strict=True))
+    else:
+        allowed = {shot.view for shot in _chosen(options, fitted)}
+        shown = [s for s in rig.steps if any(shot.view in allowed for shot in s.shots.values())]
+        if not shown:
+            raise UserError(f"--split {options.split}: the rig has no such time step.")
+        steps = [(step.name, step.pose, step.time) for step in shown]
+        alone = len(views) - sum(len(step.shots) for step in rig.steps)
+        if alone:
+            notes.append(f"{alone} views have no other camera's at their time: they are left out.")
+    frames = pictures.wide_frames(fitted, cylinder, steps, _display_transform(fitted, options))
+    return Job(frames, len(steps), (cylinder.width, cylinder.height), (), notes)

@@ -34,11 +34,8 @@ class View:
         from p2gs_jax.cli.tables import stdout
         from p2gs_jax.run.read import load_run
 
-        check(
-            find_spec("viser") is not None,
-            "the viewer needs viser, which is not installed",
-            fix="pip install 'p2gs-jax[viewer]'",
-        )
+        why = "the viewer needs viser, which is not installed"
+        check(find_spec("viser") is not None, why, fix="pip install 'p2gs-jax[viewer]'")
         from p2gs_jax.viewer.server import check_address, serve
 
         check(self.max_width >= 64, "--max-width must be at least 64")
@@ -87,24 +84,23 @@ class Report:
 
 @dataclass(frozen=True)
 class Compare:
-    """Compare finished runs: one table, one page.
+    """Compare finished runs: scores, options that differ, exposures.
 
-    p2gs-jax compare runs/robust runs/paper --out compare.html
+    p2gs-jax compare runs/robust runs/paper --out compare.md
     """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN ...]")]
     """Run folders; the first is the one that others are held against."""
-    out: Path = Path("compare.html")
-    """The page; the table lies beside it as Markdown, under the same name with .md."""
+    out: Path | None = None
+    """A file for the tables as Markdown (default: none)."""
 
     def execute(self) -> int:
-        """Print the runs side by side and write the page."""
+        """Print the runs side by side."""
         from p2gs_jax.cli.tables import make_table, stdout
-        from p2gs_jax.report.compare import compare_runs, starred, write_comparison
+        from p2gs_jax.core.atomic import write_text
+        from p2gs_jax.report.compare import compare_runs, starred, to_markdown
 
-        found = compare_runs(self.runs)
-        page, table = write_comparison(found, self.out)
-        console = stdout()
+        found, console = compare_runs(self.runs), stdout()
         for remark in found.remarks:
             console.print(remark)
         for title, rows in found.tables.items():
@@ -113,5 +109,6 @@ class Compare:
             console.print(make_table(("", *found.labels), cells, title + best))
         for sentence in found.sentences:
             console.print(sentence)
-        console.print(f"Results: {page}, {table}")
+        if self.out is not None:
+            write_text(self.out, to_markdown(found))
         return 0

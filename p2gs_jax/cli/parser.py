@@ -109,9 +109,8 @@ def _unknown(word: str) -> UserError:
         return UserError(f"{word} comes before any command.", fix="write p2gs-jax COMMAND OPTIONS")
     near = difflib.get_close_matches(word, COMMANDS, n=2, cutoff=0.5)
     guess = f"did you mean {' or '.join(near)}? " if near else ""
-    return UserError(
-        f"there is no command {word!r}.", fix=f"{guess}`p2gs-jax --help` lists all commands"
-    )
+    fix = f"{guess}`p2gs-jax --help` lists all commands"
+    return UserError(f"there is no command {word!r}.", fix=fix)
 
 
 def _print_and_exit(text: str, code: int) -> None:

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from p2gs_jax.cli.shared import MeteringRule, RunPath, SceneFolder, check, count_of
+from p2gs_jax.cli.shared import MeteringRule, RunPath, SceneFolder, check
+from p2gs_jax.core.text import count_of
 from p2gs_jax.errors import UserError
 
 if TYPE_CHECKING:
@@ -45,8 +46,8 @@ class Render:
     camera: str | None = None
     """Only the views of this camera; drive and orbit default to that with the most views."""
     panorama: bool = False
-    """One wide image of all cameras of a rig. With views, at every time step: the photographs
-    stitched as taken, the same developed to one exposure, and the field. With drive: the field."""
+    """One wide image around a rig of cameras: with views at every time step, with drive along the
+    way."""
     exposure_ev: float | Literal["own"] | None = None
     """Exposure in stops from the geometric mean of the training exposures; own: as photographed
     (on a drive interpolated). Default: own for views, 0 for other paths."""
@@ -67,12 +68,6 @@ class Render:
     """Leave out what moves."""
     only_objects: bool = False
     """Show only what moves."""
-    move_object: Annotated[
-        tuple[tuple[str, float, float, float], ...],
-        tyro.conf.arg(metavar="NAME X Y Z [NAME X Y Z ...]"),
-    ] = ()
-    """Show objects this far forward, left and up of where they are (metres, in the frame of their
-    box); of a track's name its beginning will do."""
     shift: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None
     """Move a drive sideways, seen from the driving direction: so many metres (scene units) to the
     left; negative ones to the right."""
@@ -131,14 +126,10 @@ def _load(options: Render) -> Run:
     fitted = load_run(options.run, options.scene)
     curve = fitted.cfg.photometry.curve
     if options.curve == "spline" and curve != "spline":
-        raise UserError(
-            f"--curve spline: {options.run} has none; its curve is {curve}.",
-            fix="choose run, srgb, power or linear",
-        )
+        fix = "choose run, srgb, power or linear"
+        raise UserError(f"--curve spline: {options.run} has none; its curve is {curve}.", fix=fix)
     if options.white_balance_of is not None:
         fitted.white_balance_of(options.white_balance_of)
-    for name, *offset in options.move_object:
-        fitted = fitted.with_moved(name, offset)
     if options.without_objects:
         return fitted.without_objects()
     return fitted.only_objects() if options.only_objects else fitted
@@ -149,9 +140,8 @@ def _check_place(out: Path, overwrite: bool) -> None:
     there = out.is_file() or (out.is_dir() and any(out.iterdir()))
     if there and not overwrite:
         what = f"{out} exists already" if out.is_file() else f"{out} holds files already"
-        raise UserError(
-            f"{what}.", fix="add --overwrite to replace them, or choose another place with --out"
-        )
+        fix = "add --overwrite to replace them, or choose another place with --out"
+        raise UserError(f"{what}.", fix=fix)
 
 
 def is_video(out: Path) -> bool:
@@ -177,38 +167,19 @@ def _check_picture(o: Render) -> None:
     from p2gs_jax.paths.files import LARGEST, MOST_STOPS
 
     ev, one = o.exposure_ev, "leave one of them out"
-    check(
-        o.path in PATHS or o.path.lower().endswith(".json"),
-        f"--path {o.path!r} is unknown",
-        fix="choose views, drive, orbit or a FILE.json",
-    )
-    check(
-        o.exposure_of is None or not (o.panorama or ev == "own"),
-        "--exposure-of meters pictures of single cameras, instead of --exposure-ev own",
-        fix=one,
-    )
-    check(
-        not isinstance(ev, float | int) or abs(ev) <= MOST_STOPS,
-        f"--exposure-ev {ev} is not a number of stops",
-        fix="write 0, 1 or -2.5",
-    )
-    check(
-        ev != "own" or (o.path in ("views", "drive") and not o.panorama),
-        "--exposure-ev own is for views and drives, and not for panoramas",
-        fix="write a number of stops, or leave it out",
-    )
-    check(
-        not o.without_objects or not (o.only_objects or o.move_object),
-        "--without-objects leaves nothing to show or to move",
-        fix=one,
-    )
-    moved = [x for _, *offset in o.move_object for x in offset]
-    check(all(map(math.isfinite, moved)), "--move-object wants finite numbers of metres")
-    check(
-        o.gamma is None or 0 < o.gamma < math.inf,
-        "--gamma must be positive",
-        fix="write 2.2 for the tone curve as it is, more for less contrast",
-    )
+    right = o.path in PATHS or o.path.lower().endswith(".json")
+    check(right, f"--path {o.path!r} is unknown", fix="choose views, drive, orbit or a FILE.json")
+    why = "--exposure-of meters pictures of single cameras, instead of --exposure-ev own"
+    check(o.exposure_of is None or not (o.panorama or ev == "own"), why, fix=one)
+    why = f"--exposure-ev {ev} is not a number of stops"
+    check(not isinstance(ev, float | int) or abs(ev) <= MOST_STOPS, why, fix="write 0, 1 or -2.5")
+    why = "--exposure-ev own is for views and drives, and not for panoramas"
+    fix = "write a number of stops, or leave it out"
+    check(ev != "own" or (o.path in ("views", "drive") and not o.panorama), why, fix=fix)
+    why = "--without-objects leaves nothing to show"
+    check(not (o.without_objects and o.only_objects), why, fix=one)
+    fix = "write 2.2 for the tone curve as it is, more for less contrast"
+    check(o.gamma is None or 0 < o.gamma < math.inf, "--gamma must be positive", fix=fix)
     width_fits = o.width is None or 16 <= o.width <= LARGEST
     check(width_fits, f"--width must be between 16 and {LARGEST}")
 
@@ -221,11 +192,9 @@ def _check_path(o: Render) -> None:
     near = o.shift is None or abs(o.shift) <= MOST_SHIFT
     check(near, f"--shift must be at most {MOST_SHIFT:g} to either side")
     check(o.frames is None or o.frames >= 2, "--frames must be 2 or more")
-    check(
-        not o.panorama or o.path in ("views", "drive"),
-        "--panorama is for --path views and drive",
-        fix="choose one of them, or leave it out",
-    )
+    why = "--panorama is for --path views and drive"
+    fix = "choose one of them, or leave it out"
+    check(not o.panorama or o.path in ("views", "drive"), why, fix=fix)
     single = own and not o.panorama
     check(o.camera is None or single, "--camera is for single cameras of the scene", fix=leave)
     check(o.split == "all" or own, "--split is for the scene's own views", fix=leave)
@@ -234,11 +203,8 @@ def _check_path(o: Render) -> None:
 def _check_file(o: Render) -> None:
     out = o.out
     if out is not None:
-        check(
-            out.suffix.lower() not in OTHER_FILES,
-            f"--out {out}: {out.suffix} files are not written",
-            fix="name a folder, or NAME.mp4",
-        )
+        why = f"--out {out}: {out.suffix} files are not written"
+        check(out.suffix.lower() not in OTHER_FILES, why, fix="name a folder, or NAME.mp4")
         kind = "a folder" if out.is_dir() else "a file"
         right = not out.exists() or out.is_dir() != is_video(out)
         check(right, f"--out {out} is {kind}", fix="choose another name")

@@ -78,11 +78,6 @@ def parse_duration(text: str) -> float:
     return 3600 * hours + 60 * minutes + seconds + bare
 
 
-def count_of(number: int, what: str) -> str:
-    """Return a number of things in words: 1 frame, 2 frames."""
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
-
-
 def check(condition: bool, text: str, *, fix: str | None = None) -> None:
     """Raise a UserError unless the condition holds."""
     if not condition:

@@ -63,13 +63,6 @@ def tune_process() -> None:
     jax.config.update("jax_cpu_enable_async_dispatch", False)
 
 
-def cache_folder() -> Path | None:
-    """Return where JAX keeps compiled programs, or None where it keeps none."""
-    values = jax.config.values
-    folder = values["jax_compilation_cache_dir"]
-    return Path(folder) if folder and values["jax_enable_compilation_cache"] else None
-
-
 def use_compile_cache() -> None:
     """Let JAX keep compiled programs in the user's cache folder.
 

@@ -23,6 +23,11 @@ def first_few(names: Sequence[str]) -> str:
     return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
 
 
+def count_of(number: float, noun: str) -> str:
+    """Return a number of things in words: "1 view" or "1,200 views"."""
+    return f"{number:,.0f} {noun}{'' if number == 1 else 's'}"
+
+
 def natural(text: str) -> tuple[list[int | str], str]:
     """Return what sorts texts by the numbers in them: `a2` before `a10`."""
     parts = re.split(r"(\d+)", text)

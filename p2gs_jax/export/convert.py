@@ -124,10 +124,8 @@ def _check_places(folder: Path, places: Sequence[Path], overwrite: bool) -> None
         raise UserError(f"{folder} is a file.", fix="name a folder with --out")
     there = [path for path in places if path.exists()]
     if there and not overwrite:
-        raise UserError(
-            f"{there[0]} exists already.",
-            fix="add --overwrite to replace it, or name another folder with --out",
-        )
+        fix = "add --overwrite to replace it, or name another folder with --out"
+        raise UserError(f"{there[0]} exists already.", fix=fix)
 
 
 def _check_names(fitted: Run) -> None:
@@ -135,10 +133,8 @@ def _check_names(fitted: Run) -> None:
     for view in fitted.scene.views:
         name = PurePosixPath(view.name)
         if name.is_absolute() or ".." in name.parts:
-            raise UserError(
-                f"the view {view.name} lies outside the image folder.",
-                fix="move its photograph into the image folder and fit again",
-            )
+            fix = "move its photograph into the image folder and fit again"
+            raise UserError(f"the view {view.name} lies outside the image folder.", fix=fix)
 
 
 def _linear_ply(ply: Path, fitted: Run) -> str:

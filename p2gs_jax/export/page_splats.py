@@ -130,10 +130,8 @@ def fit_into(
         if smaller is not None:
             found.append(judged(smaller))
     if not found:
-        raise UserError(
-            f"of {whole.capacity} Gaussians less than {LEAST_SHARE:.0%} would fit into the page.",
-            fix="allow a larger page with --size-mb, or embed fewer --photographs",
-        )
+        why = f"of {whole.capacity} Gaussians less than {LEAST_SHARE:.0%} would fit into the page."
+        raise UserError(why, fix="allow a larger page with --size-mb, or embed fewer --photographs")
     return max(found, key=lambda splats: splats.error.psnr_median)
 
 

@@ -130,7 +130,5 @@ def read_exr_with_alpha(
             alpha = channels["A"].pixels.astype(np.float32) if "A" in channels else None
             return linear, alpha, dict(file.header())
     except (RuntimeError, KeyError, OSError, ValueError) as error:
-        raise UserError(
-            f"{path} is not a readable RGB OpenEXR file: {error}.",
-            fix="copy or render it again, or remove it",
-        ) from error
+        fix = "copy or render it again, or remove it"
+        raise UserError(f"{path} is not a readable RGB OpenEXR file: {error}.", fix=fix) from error

@@ -1,4 +1,4 @@
-"""False colours: luminance in stops, clipping, depth.
+"""False colours: luminance in stops, and depth.
 
 The lightness of all colour maps rises evenly, so that they can be read without colour as well.
 """
@@ -7,14 +7,12 @@ from __future__ import annotations
 
 import matplotlib
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Float, Float32
 
 # Weights of BT.709 primaries in luminance (the linear radiance's primaries).
 BT709 = (0.2126, 0.7152, 0.0722)
 STOPS = (-6.0, 6.0)
 STOPS_MAP, DEPTH_MAP = "viridis", "cividis"
-OVER, UNDER = (1.0, 0.15, 0.15), (0.15, 0.35, 1.0)
-STRIPE = 6
 
 
 def luminance(linear: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "..."]:
@@ -41,47 +39,18 @@ def false_color(
     return _mapped((whole + 0.5 - low) / (high - low), STOPS_MAP)
 
 
-Mask = Bool[np.ndarray, "h w"]
-
-
-def clipping(ldr: Float[np.ndarray, "h w 3"]) -> tuple[Mask, Mask]:
-    """Return where any channel is at the top, and where all are at the bottom, of 8 bits."""
-    # One channel at a time: reductions over an axis of three are 20 times slower.
-    r, g, b = (255 * ldr[..., channel] for channel in range(3))
-    over = (r > 254.5) | (g > 254.5) | (b > 254.5)
-    return over, (r <= 0.5) & (g <= 0.5) & (b <= 0.5)
-
-
-def clipping_overlay(ldr: Float[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
-    """Return the picture with overexposed pixels striped red one way, black ones blue the other."""
-    over, under = clipping(ldr)
-    rows, columns = np.ogrid[: over.shape[0], : over.shape[1]]
-    rising = (rows + columns) // STRIPE % 2 == 0
-    falling = (rows - columns) // STRIPE % 2 == 0
-    out = np.array(np.clip(ldr, 0, 1), np.float32)
-    out[over & rising] = OVER
-    out[under & falling] = UNDER
-    return out
-
-
 def depth_color(
     depth: Float[np.ndarray, "h w"],
     alpha: Float[np.ndarray, "h w"],
-    limits: tuple[float, float] | None = None,
+    limits: tuple[float, float],
 ) -> Float32[np.ndarray, "h w 3"]:
     """Return expected depth as colour, near bright, evenly in 1 / depth; black where there is none.
 
-    `depth` is alpha-weighted. `limits` are the nearest and the farthest depth; None takes the 1st
-    and the 99th percentile.
+    `depth` is alpha-weighted; `limits` are the nearest and the farthest depth.
     """
     there = alpha > 0.5
     inverse = np.where(there, alpha / np.maximum(depth, 1e-9), 0)
-    if limits is not None:
-        high, low = 1 / limits[0], 1 / limits[1]
-    elif there.any():
-        low, high = np.percentile(inverse[there], (1, 99))
-    else:
-        low, high = 0.0, 1.0
+    high, low = 1 / limits[0], 1 / limits[1]
     scaled = (inverse - low) / max(high - low, 1e-12)
     return np.where(there[..., None], _mapped(scaled, DEPTH_MAP), 0).astype(np.float32)
 

@@ -123,15 +123,11 @@ def open_video(
 
     size = (width // 2 * 2, height // 2 * 2)
     if min(size) < SMALLEST:
-        raise UserError(
-            f"{path}: {width}x{height} pixels are too few for a video.",
-            fix=f"choose a larger --width, so that both are at least {SMALLEST}",
-        )
+        fix = f"choose a larger --width, so that both are at least {SMALLEST}"
+        raise UserError(f"{path}: {width}x{height} pixels are too few for a video.", fix=fix)
     if "libx264" not in av.codecs_available:
-        raise UserError(
-            "This build of PyAV cannot encode H.264.",
-            fix="install the wheel of `av` from PyPI, or write frames into a folder",
-        )
+        fix = "install the wheel of `av` from PyPI, or write frames into a folder"
+        raise UserError("This build of PyAV cannot encode H.264.", fix=fix)
     # The index comes first, so that browsers can play a file while it loads.
     options = {"movflags": "+faststart"}
     with (

@@ -31,11 +31,10 @@ def require_gsply() -> ModuleType:
     try:
         import gsply
     except ImportError as error:
-        raise UserError(
-            f"SPZ and compressed PLY need the package gsply, which cannot be imported ({error}).",
-            fix="pip install 'p2gs-jax[spz]', or convert display.ply with another tool "
-            "(docs/exports.md)",
-        ) from error
+        why = f"SPZ and compressed PLY need the package gsply, which cannot be imported ({error})."
+        fix = "pip install 'p2gs-jax[spz]', or convert display.ply with another tool "
+        fix += "(docs/exports.md)"
+        raise UserError(why, fix=fix) from error
     return gsply
 
 
@@ -100,10 +99,8 @@ def fractional_bits(means: np.ndarray) -> int:
     farthest = max(float(np.abs(means).max(initial=0.0)), 1e-12)
     bits = int(np.floor(np.log2(LARGEST_INTEGER / farthest)))
     if bits < 1:
-        raise UserError(
-            f"SPZ holds no position as far as {farthest:.3g} scene units from the origin.",
-            fix="move or shrink the scene, or export display-ply",
-        )
+        why = f"SPZ holds no position as far as {farthest:.3g} scene units from the origin."
+        raise UserError(why, fix="move or shrink the scene, or export display-ply")
     return min(bits, MOST_FRACTIONAL_BITS)
 
 

@@ -49,15 +49,11 @@ def require_pxr() -> tuple[Any, ...]:
     try:
         found = [importlib.import_module(f"pxr.{name}") for name in MODULES]
     except ImportError as error:
-        raise UserError(
-            f"--format usd needs OpenUSD, which cannot be imported ({error}).",
-            fix="pip install 'p2gs-jax[usd]', or export gltf",
-        ) from error
+        why = f"--format usd needs OpenUSD, which cannot be imported ({error})."
+        raise UserError(why, fix="pip install 'p2gs-jax[usd]', or export gltf") from error
     if not hasattr(found[3], "ParticleField3DGaussianSplat"):
-        raise UserError(
-            "this OpenUSD knows no Gaussian splats; 26.03 was the first that does.",
-            fix="pip install --upgrade 'usd-core>=26.3'",
-        )
+        why = "this OpenUSD knows no Gaussian splats; 26.03 was the first that does."
+        raise UserError(why, fix="pip install --upgrade 'usd-core>=26.3'")
     return tuple(found)
 
 

@@ -11,8 +11,8 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.paths.shots import Poses, Shot, common_lens, pose_of
-from p2gs_jax.scene.rigid import headings, inverse, level_ahead, up_of_drive
+from p2gs_jax.paths.shots import Poses, Shot, common_lens
+from p2gs_jax.scene.rigid import headings, inverse, level_ahead, pose_of, up_of_drive
 from p2gs_jax.types import View
 
 # Default number of frames from one pose to the next.
@@ -63,10 +63,8 @@ def drive(knots: Sequence[Shot], frames: int | None = None) -> list[Shot]:
     that there are fewer than two knots.
     """
     if len(knots) < 2:
-        raise UserError(
-            f"A drive needs at least two views of a camera; here there are {len(knots)}.",
-            fix="choose another --camera or --split, or --path orbit",
-        )
+        why = f"A drive needs at least two views of a camera; here there are {len(knots)}."
+        raise UserError(why, fix="choose another --camera or --split, or --path orbit")
     path = PosePath(inverse(np.stack([s.viewmat for s in knots])))
     times = path.evenly(frame_count(len(knots), frames))
     logs = [None if s.gamma is None else float(np.log(s.gamma)) for s in knots]

@@ -1,15 +1,10 @@
-"""Files of cameras: our own list (docs/rendering.md) and nerfstudio's camera paths.
-
-nerfstudio (cameras/camera_paths.py of its repository): `render_width`, `render_height` and a list
-`camera_path` of `camera_to_world` (16 numbers by rows or 4x4, OpenGL axes) and `fov` (vertical,
-degrees), principal point in the middle.
-"""
+"""Files of cameras (docs/rendering.md)."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
@@ -18,8 +13,8 @@ import numpy as np
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
-from p2gs_jax.paths.shots import LARGEST, Shot, as_matrix, checked_lens, checked_pose
-from p2gs_jax.scene.rigid import camera_centers, inverse
+from p2gs_jax.paths.shots import LARGEST, Shot, checked_lens, checked_pose
+from p2gs_jax.scene.rigid import camera_centers
 
 FIELDS = ("name", "viewmat", "K", "width", "height", "exposure_ev", "gamma", "time")
 MOST_STOPS = 60.0
@@ -27,7 +22,6 @@ MOST_STOPS = 60.0
 LIMITS = {"exposure_ev": (-MOST_STOPS, MOST_STOPS), "gamma": (1e-3, 1e3)}
 LIMITS["time"] = (-math.inf, math.inf)
 _FIX = "correct the file; docs/rendering.md has the format"
-_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def write_cameras(path: Path, shots: Sequence[Shot]) -> None:
@@ -41,33 +35,24 @@ def read_cameras(path: Path) -> list[Shot]:
     try:
         data = parse_json(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
-        raise UserError(
-            f"{path} cannot be read: {error.strerror or error}.",
-            fix="name a file of cameras, or choose --path views, drive or orbit",
-        ) from None
+        fix = "name a file of cameras, or choose --path views, drive or orbit"
+        raise UserError(f"{path} cannot be read: {error.strerror or error}.", fix=fix) from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise UserError(f"{path} is not valid JSON: {error}.", fix=_FIX) from None
-    entry = _entry
-    if isinstance(data, dict) and "camera_path" in data:
-        entry, data = _nerfstudio(path, data), data["camera_path"]
     if not isinstance(data, list) or not data:
-        raise UserError(
-            f"{path} is neither a list of cameras nor a nerfstudio camera path.", fix=_FIX
-        )
+        raise UserError(f"{path} is not a list of cameras.", fix=_FIX)
     shots: dict[str, Shot] = {}
     for index, values in enumerate(data):
         try:
             if not isinstance(values, dict):
                 raise ValueError("is not an object with fields")
-            shot = entry(values, index)
+            shot = _entry(values, index)
         except ValueError as error:
             raise UserError(f"{path}: camera {index} {error}.", fix=_FIX) from None
         if shot.name in shots:
             first = list(shots).index(shot.name)
-            raise UserError(
-                f"{path}: cameras {first} and {index} have the same name {shot.name!r}.",
-                fix="name every picture differently, or leave the names out",
-            )
+            why = f"{path}: cameras {first} and {index} have the same name {shot.name!r}."
+            raise UserError(why, fix="name every picture differently, or leave the names out")
         shots[shot.name] = shot
     return list(shots.values())
 
@@ -91,30 +76,6 @@ def _entry(values: dict, index: int) -> Shot:
     shot = Shot(name, viewmat, K, _pixels(values, "width"), _pixels(values, "height"))
     more = {key: _number(values, key, *limits) for key, limits in LIMITS.items() if key in values}
     return replace(shot, **more)
-
-
-def _nerfstudio(path: Path, data: dict) -> Callable[[dict, int], Shot]:
-    """Return what reads one entry of a nerfstudio path."""
-    kind = str(data.get("camera_type", "perspective")).lower()
-    if kind != "perspective":
-        raise UserError(
-            f"{path}: its camera_type is {kind!r}; only perspective cameras can be rendered.",
-            fix="export the path with perspective cameras",
-        )
-    try:
-        width, height = _pixels(data, "render_width"), _pixels(data, "render_height")
-    except ValueError as error:
-        raise UserError(f"{path} {error}.", fix=_FIX) from None
-
-    def entry(values: dict, index: int) -> Shot:
-        pose = as_matrix(_given(values, "camera_to_world"), "camera_to_world", 4) @ _OPENGL
-        fov = _number(values, "fov", 0.1, 179.0)
-        f = 0.5 * height / math.tan(0.5 * math.radians(fov))
-        K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]])
-        viewmat = inverse(checked_pose(pose, "camera_to_world"))
-        return Shot(f"{index:05d}", viewmat, K, width, height)
-
-    return entry
 
 
 def _given(values: dict, key: str):

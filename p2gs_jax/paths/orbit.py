@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from p2gs_jax.paths.shots import Pose, Shot, common_lens, pose_of
-from p2gs_jax.scene.rigid import camera_centers, up_direction
+from p2gs_jax.paths.shots import Pose, Shot, common_lens
+from p2gs_jax.scene.rigid import camera_centers, pose_of, up_direction
 
 FRAMES = 120
 # Optical axes meet where they spread at least this much (sine squared) ...
@@ -26,7 +26,7 @@ HIGHEST = np.deg2rad(85)
 class Orbit:
     """A circle, or an arc that is followed back and forth.
 
-    The camera looks at the focus, where the optical axes `met`; else it lies in front of one
+    The camera looks at the focus, where the optical axes meet; else it lies in front of one
     camera. `up` and the horizontal `forward`, azimuth 0 as seen from the focus, are unit vectors.
     The radius is in scene units, angles in radians: elevation of the camera above the focus,
     azimuth of the middle of the arc, and `sway`, half the arc (pi for a circle).
@@ -39,19 +39,6 @@ class Orbit:
     elevation: float
     middle: float
     sway: float
-    met: bool
-
-    def description(self) -> str:
-        """Return a sentence on the shape of the orbit, and the reason for it."""
-        degrees = f"{np.rad2deg(self.sway):.0f} degrees to either side"
-        if not self.met:
-            return (
-                "The cameras look at no common point, as on a vehicle: the orbit sways "
-                f"{degrees} of the middle view, about the median depth before it."
-            )
-        if self.sway < np.pi:
-            return f"No camera went all around: the orbit sways {degrees}, as far as they did."
-        return "A full circle around the point where the optical axes meet."
 
     def center(self, azimuth: float) -> Float[np.ndarray, " 3"]:
         """Return the camera's centre at an azimuth."""
@@ -105,8 +92,8 @@ def find_orbit(
         middle = own[len(own) // 2]
         distance = _median_depth(middle, points, centers)
         center = camera_centers(middle.viewmat[None])[0]
-        return _around(center + distance * middle.viewmat[2, :3], center[None], up, met=False)
-    return _around(focus, centers, up, met=True)
+        return _around(center + distance * middle.viewmat[2, :3], center[None], up)
+    return _around(focus, centers, up)
 
 
 def meeting_point(
@@ -126,7 +113,7 @@ def meeting_point(
     return focus
 
 
-def _around(focus, centers, up, *, met: bool) -> Orbit:
+def _around(focus, centers, up) -> Orbit:
     """Return the orbit that goes where cameras are."""
     away = centers - focus
     distances = np.linalg.norm(away, axis=1)
@@ -145,7 +132,7 @@ def _around(focus, centers, up, *, met: bool) -> Orbit:
     radius, elevation = np.median(distances), np.clip(np.median(heights), -HIGHEST, HIGHEST)
     numbers = radius, elevation, begin + arc / 2, sway
     radius, elevation, middle, sway = map(float, numbers)
-    return Orbit(focus, up, forward, radius, elevation, middle, sway, met)
+    return Orbit(focus, up, forward, radius, elevation, middle, sway)
 
 
 def _median_depth(shot: Shot, points, centers) -> float:

@@ -1,21 +1,19 @@
 """Panoramas: pinhole images around a common centre, reprojected to a cylinder.
 
-Photographs are stitched with hard edges, so that their seams show. A wide view of the radiance
-field is stitched the same way, from narrow slices around one centre.
+A wide view of the radiance field is stitched from narrow slices around one centre.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float32
 
-from p2gs_jax.paths.shots import Pose, Shot, pose_of
-from p2gs_jax.scene.rigid import camera_centers
+from p2gs_jax.paths.shots import Pose, Shot
+from p2gs_jax.scene.rigid import pose_of
 
 # Coverage is judged at this many directions per radian, up to this height (tangent of elevation).
 PROBES, HIGHEST = 2 * 180 / np.pi, 3.0
@@ -24,8 +22,6 @@ FULL_COLUMN = 0.75
 # Angle of a slice: the affine approximation of splats is off far from the axis; in narrow slices it
 # is nearly the same on both sides of an edge.
 WIDEST_SLICE = np.deg2rad(20)
-# Opacity from which on expected depth is used; below it the surface counts as infinitely far.
-OPAQUE = 0.5
 
 # Linear radiance [h w 3], alpha [h w] and alpha-weighted depth [h w].
 Layers = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -105,48 +101,27 @@ def _without_largest_gap(good: Bool[np.ndarray, " n"]) -> tuple[int, int]:
     return int(there[(widest + 1) % len(there)]), int(len(good) - gaps[widest])
 
 
-class Stitched(NamedTuple):
-    """A cylindrical image, 0 where no camera sees, and the row of each pixel's camera, else -1."""
-
-    image: Float32[np.ndarray, "h w c"]
-    source: Int[np.ndarray, "h w"]
-
-
 def stitch(
-    images: Sequence[Float32[np.ndarray, "h w c"]],
-    shots: Sequence[Shot],
-    cylinder: Cylinder,
-    nearness: Float[np.ndarray, "h w"] | None = None,
-    masks: Sequence[Float32[np.ndarray, "h w"]] | None = None,
-) -> Stitched:
+    images: Sequence[Float32[np.ndarray, "h w c"]], shots: Sequence[Shot], cylinder: Cylinder
+) -> Float32[np.ndarray, "h w c"]:
     """Reproject images to a cylinder: every pixel from the one camera that sees it most centrally.
 
-    Nothing is blended, so that differences show. Images have at most 4 channels; masks are 1 where
-    an image is used. `nearness` is 1 / distance from the cylinder's axis; None reprojects at
-    infinity, which is exact for cameras with a common centre. A ValueError says that an image has
-    another size than its camera.
+    Images have at most 4 channels, and their cameras a common centre; what none sees is 0. A
+    ValueError says that an image has another size than its camera.
     """
     rays = cylinder.rays()
-    origin = camera_centers(cylinder.viewmat[None])[0]
     out = np.zeros((*rays.shape[:2], images[0].shape[2]), np.float32)
-    source = np.full(rays.shape[:2], -1)
     best = np.full(rays.shape[:2], -np.inf)
     for k, (image, shot) in enumerate(zip(images, shots, strict=True)):
         if image.shape[:2] != (shot.height, shot.width):
             raise ValueError(f"image {k} is {image.shape[:2]}, its camera not")
-        R = shot.viewmat[:3, :3]
-        local = rays @ R.T
-        if nearness is not None:
-            local = local + nearness[..., None] * (R @ origin + shot.viewmat[:3, 3])
+        local = rays @ shot.viewmat[:3, :3].T
         xy, inside = shot.project(local)
         cosine = local[..., 2] / np.maximum(np.linalg.norm(local, axis=-1), 1e-12)
-        at = (xy - 0.5).astype(np.float32)
         better = inside & (cosine > best)
-        if masks is not None:
-            better &= _sample(masks[k], at) > 0.99
-        out[better] = _sample(image, at)[better]
-        source[better], best[better] = k, cosine[better]
-    return Stitched(out, source)
+        out[better] = _sample(image, (xy - 0.5).astype(np.float32))[better]
+        best[better] = cosine[better]
+    return out
 
 
 def _sample(image: np.ndarray, at: Float32[np.ndarray, "h w 2"]) -> np.ndarray:
@@ -180,27 +155,15 @@ def slices(cylinder: Cylinder) -> list[Shot]:
     return out
 
 
-class Wide(NamedTuple):
-    """A wide view of the field: radiance, premultiplied by alpha; opacity; and nearness.
+def render_wide(
+    render: Callable[[Shot], Layers], cylinder: Cylinder
+) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
+    """Return a wide view of the field: radiance, premultiplied by alpha, and opacity.
 
-    Nearness is 1 / distance from the cylinder's axis, 0 where nothing opaque is seen.
+    `render` returns the layers of a pinhole camera.
     """
-
-    linear: Float32[np.ndarray, "h w 3"]
-    alpha: Float32[np.ndarray, "h w"]
-    nearness: Float32[np.ndarray, "h w"]
-
-
-def render_wide(render: Callable[[Shot], Layers], cylinder: Cylinder) -> Wide:
-    """Return a wide view; `render` returns the layers of a pinhole camera."""
     shots = slices(cylinder)
-    layers = []
-    for shot in shots:
-        linear, alpha, depth = render(shot)
-        # From depth along the slice's axis to distance from the cylinder's.
-        x = (np.arange(shot.width) + 0.5 - shot.K[0, 2]) / shot.K[0, 0]
-        z = np.where(alpha > OPAQUE, depth / np.maximum(alpha, OPAQUE), np.inf)
-        near = 1 / (np.maximum(z, 1e-9) * np.sqrt(1 + x**2))
-        layers.append((np.concatenate([linear, alpha[..., None]], -1), near[..., None]))
-    colours, nearness = (stitch(part, shots, cylinder).image for part in zip(*layers, strict=True))
-    return Wide(colours[..., :3], colours[..., 3], nearness[..., 0])
+    layers = [render(shot)[:2] for shot in shots]
+    images = [np.concatenate([linear, alpha[..., None]], -1) for linear, alpha in layers]
+    wide = stitch(images, shots, cylinder)
+    return wide[..., :3], wide[..., 3]

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from p2gs_jax.core.text import natural
 from p2gs_jax.errors import UserError
-from p2gs_jax.paths.shots import Pose, Poses, Shot, pose_of
-from p2gs_jax.scene.rigid import camera_centers, inverse, moment_of, up_direction
+from p2gs_jax.paths.shots import Pose, Poses, Shot
+from p2gs_jax.scene.rigid import camera_centers, inverse, moment_of, pose_of, up_direction
 from p2gs_jax.types import View
 
 # Largest median angle between the cameras' relative rotations over time.
@@ -77,11 +77,10 @@ def find_rig(shots: Sequence[Shot], views: Sequence[View]) -> Rig:
     common = {name: found for name, found in steps.items() if len(found) > 1}
     if len(cameras) < 2 or not common:
         have = "one camera" if len(cameras) < 2 else "cameras whose file names never agree"
-        raise UserError(
-            f"A panorama needs photographs of several cameras on one rig; this scene has {have}.",
-            fix="give photographs taken at the same time the same name in a folder per camera, "
-            "or leave out --panorama",
-        )
+        why = f"A panorama needs photographs of several cameras on one rig; this scene has {have}."
+        fix = "give photographs taken at the same time the same name in a folder per camera, "
+        fix += "or leave out --panorama"
+        raise UserError(why, fix=fix)
     common = {name: common[name] for name in sorted(common, key=natural)}
     mounts = _mounts(cameras, list(common.values()))
     on_rig = []
@@ -105,20 +104,17 @@ def _mounts(cameras: list[str], steps: list[dict[str, Shot]]) -> dict[str, Shot]
     for camera in cameras:
         pairs = [f for f in steps if camera in f and anchor in f]
         if not pairs:
-            raise UserError(
-                f"No photograph of the camera {camera!r} has the name of one of {anchor!r}.",
-                fix="give photographs taken at the same time the same name, or leave out "
-                "--panorama",
-            )
+            why = f"No photograph of the camera {camera!r} has the name of one of {anchor!r}."
+            fix = "give photographs taken at the same time the same name, or leave out "
+            fix += "--panorama"
+            raise UserError(why, fix=fix)
         relative = np.stack([f[camera].viewmat @ inverse(f[anchor].viewmat) for f in pairs])
         from_anchor[camera], lenses[camera] = _mean_pose(relative), pairs[0][camera]
         turns = Rotation.from_matrix(relative[:, :3, :3] @ from_anchor[camera][:3, :3].T)
         if np.median(turns.magnitude()) > LEAST_RIGID:
-            raise UserError(
-                f"The cameras {anchor!r} and {camera!r} turn against each other: they do not sit "
-                "on a common rig.",
-                fix="leave out --panorama",
-            )
+            why = f"The cameras {anchor!r} and {camera!r} turn against each other: they do not sit "
+            why += "on a common rig."
+            raise UserError(why, fix="leave out --panorama")
     from_rig = _level(np.stack(list(from_anchor.values())), list(from_anchor))
     mounts = ((c, lens, from_anchor[c] @ from_rig) for c, lens in lenses.items())
     return {c: replace(lens, name=c, viewmat=at, view=None) for c, lens, at in mounts}

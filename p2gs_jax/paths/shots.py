@@ -19,7 +19,7 @@ from p2gs_jax.core.text import natural
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.lens import scale_intrinsics
 from p2gs_jax.scene.pixels.store import camera_at
-from p2gs_jax.scene.rigid import nearest_rotation
+from p2gs_jax.scene.rigid import nearest_rotation, pose_of
 from p2gs_jax.types import Camera, View
 
 Pose = Float[np.ndarray, "4 4"]
@@ -104,13 +104,6 @@ def common_lens(shots: Sequence[Shot]) -> tuple[Float[np.ndarray, "3 3"], int, i
     (width, height), _ = Counter((s.width, s.height) for s in shots).most_common(1)[0]
     same = [s.K for s in shots if (s.width, s.height) == (width, height)]
     return np.median(same, axis=0), width, height
-
-
-def pose_of(rotation: Float[np.ndarray, "... 3 3"], translation: Float[np.ndarray, "... 3"]):
-    """Return 4x4 matrices of rotations and translations."""
-    out = np.zeros((*rotation.shape[:-2], 4, 4))
-    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = rotation, translation, 1
-    return out
 
 
 def make_camera(K: ArrayLike, viewmat: ArrayLike, width: int, height: int) -> Camera:

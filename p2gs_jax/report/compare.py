@@ -1,4 +1,4 @@
-"""Several runs in one table and on one page: `compare.html`, and its tables as Markdown."""
+"""Several runs in one table, also as Markdown."""
 
 from __future__ import annotations
 
@@ -9,19 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from p2gs_jax.core.atomic import write_text
 from p2gs_jax.core.text import escaped, markdown_table
 from p2gs_jax.errors import UserError
 from p2gs_jax.presets import flat
-from p2gs_jax.report import page as html
 from p2gs_jax.report.findings import DESCRIPTIONS, seconds_of, true_error
-from p2gs_jax.report.page import listed, paragraph, text
-from p2gs_jax.report.pictures import jpeg, read_png, spread
+from p2gs_jax.report.pictures import read_png
 from p2gs_jax.report.run_files import RunFiles, read_run
 from p2gs_jax.report.run_sections import option_text
 from p2gs_jax.synth.sensor import read_true_exposures
-
-MOST_VIEWS = 4
 
 
 class TableRow(NamedTuple):
@@ -92,10 +87,8 @@ BETTER |= dict.fromkeys(("lpips", "stops_median", "stops_rms", "ev"), min)
 def compare_runs(folders: Sequence[str | Path]) -> Comparison:
     """Read and compare runs; a UserError says that there is but one, or which is not a run."""
     if len(folders) < 2:
-        raise UserError(
-            f"there {'is one run' if folders else 'are no runs'} to compare.",
-            fix="name two run folders or more: p2gs-jax compare RUN_A RUN_B",
-        )
+        fix = "name two run folders or more: p2gs-jax compare RUN_A RUN_B"
+        raise UserError(f"there {'is one run' if folders else 'are no runs'} to compare.", fix=fix)
     runs = tuple(read_run(Path(folder)) for folder in folders)
     labels = tuple(_labels([run.folder for run in runs]))
     same = all(_same_scene(runs[0], run) for run in runs[1:])
@@ -201,57 +194,3 @@ def to_markdown(found: Comparison) -> str:
 def starred(row: TableRow) -> list[str]:
     """Return the cells of a row; a star follows those of the best runs."""
     return [f"{c} *" if i in row.best else c or "-" for i, c in enumerate(row.cells)]
-
-
-def write_comparison(found: Comparison, out: Path) -> tuple[Path, Path]:
-    """Write the page and, beside it, its tables as Markdown; return both paths."""
-    markdown = out.with_suffix(".md")
-    html.write_page(out, comparison_page(found))
-    write_text(markdown, to_markdown(found))
-    return out, markdown
-
-
-def comparison_page(found: Comparison) -> str:
-    """Return the page."""
-    count = len(found.runs)
-    names = dict.fromkeys(run.scene.name or "an unnamed scene" for run in found.runs)
-    head = f"<h1>{text(count)} runs of {text(' and '.join(names))}</h1>\n"
-    head += paragraph(", ".join(found.labels), "quiet") + listed(found.remarks)
-    sections = [(title.split()[0].lower(), title, _table(found, title)) for title in found.tables]
-    if not found.options:
-        sections.append(("options", "Options", paragraph("All options are the same.")))
-    sections += [
-        ("exposures", "Exposures against each other", listed(found.sentences)),
-        ("views", "The same held-out views", _view_body(found)),
-    ]
-    return html.page(f"{count} runs compared · p2gs-jax", head, sections, html.made_by("compare"))
-
-
-def _table(found: Comparison, title: str) -> str:
-    rows, names = found.tables[title], ["", *found.labels]
-    best = [frozenset(i + 1 for i in r.best) for r in rows]
-    cells = [[r.name, *r.cells] for r in rows]
-    body = html.table(names, cells, numbers=range(1, len(names)), best=best)
-    return body + (paragraph("Bold: the best of a line.", "note") if any(best) else "")
-
-
-def _view_body(found: Comparison) -> str:
-    """Return held-out views that every run shows, in turn."""
-    by_run = [{h.name: h for h in run.held_out} for run in found.runs]
-    names = sorted(set.intersection(*map(set, by_run))) if found.same_scene else []
-    body = ""
-    for name in spread(names, MOST_VIEWS):
-        files = [by_name[name] for by_name in by_run]
-        try:
-            cells = [(jpeg(read_png(files[0].photograph), f"Photograph {name}"), "Photograph")]
-            for run, label, file in zip(found.runs, found.labels, files, strict=True):
-                psnr = run.part("test", "exposure_fitted", "per_view", name).get("psnr")
-                score = f": {psnr:.1f} dB" if isinstance(psnr, int | float) else ""
-                picture = jpeg(read_png(file.render), f"Render of {name} by {label}")
-                cells.append((picture, f"{label}{score}"))
-            body += f"<h3>{text(name)}</h3>{html.row(cells, 'many')}"
-        except UserError as error:
-            body += paragraph(f"{name} is not shown: {error.message}.")
-    if body:
-        body = paragraph("Each is rendered at the exposure fitted to its photograph.") + body
-    return body

@@ -1,4 +1,4 @@
-"""The results of a run in sentences: a summary, and warnings that say what to do."""
+"""The results of a run in sentences: what it modelled, and warnings that say what to do."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from p2gs_jax.core.clock import whole_run
+from p2gs_jax.core.text import count_of
 from p2gs_jax.evaluation.alignment import ExposureError, error_of_views
 from p2gs_jax.photometry.models import MODELS
 from p2gs_jax.photometry.solution import Agreement, compare
-from p2gs_jax.report.measurements import SceneMeasurements, seam_medians
 from p2gs_jax.report.run_files import RunFiles, number_at
 
 CURVES = {
@@ -29,20 +29,12 @@ CORRECTIONS = {
 }
 # Least gap between the PSNR of training and held-out views, dB.
 WIDE_GAP = 4.0
-# Least standard error of an exposure, and least drift from its start, stops; a drift must exceed
-# three standard errors as well.
-WEAK_EV, DRIFT_EV = 0.1, 0.1
-# Least share of clipped pixels of a photograph.
-CLIPPED = 0.25
+# Least standard error of an exposure, stops.
+WEAK_EV = 0.1
 # Least rise of the PSNR between the last two tenths of a run, dB.
 STILL_RISING = 0.3
 FINISHED = 0.99
 MOST_NAMES = 5
-
-
-def count(number: float, noun: str) -> str:
-    """Return "1 view" or "1,200 views"."""
-    return f"{number:,.0f} {noun}{'' if number == 1 else 's'}"
 
 
 def duration(seconds: float) -> str:
@@ -64,28 +56,8 @@ def seconds_of(run: RunFiles) -> float | None:
     return whole_run(run.part("seconds"))
 
 
-def summary_sentences(run: RunFiles, scene: SceneMeasurements) -> list[str]:
-    """Return three sentences: what was fitted, what was modelled, how good it is."""
-    return [_what(run), _modelled(run), _how_good(run, scene)]
-
-
-def _what(run: RunFiles) -> str:
-    train, cameras = len(run.train), len(run.cameras)
-    held_out = len(run.views) - train
-    name = run.scene.name or "an unnamed scene"
-    if not train:
-        return f"A fit of {name} with the preset {run.preset}; it left no list of its views."
-    split = run.metrics.get("split")
-    how = f": {split}" if isinstance(split, str) else ""
-    rest = f" ({held_out} more were held out{how})" if held_out else ""
-    gaussians, took = run.number("counts", "gaussians"), seconds_of(run)
-    made = "" if gaussians is None else f" with {count(gaussians, 'Gaussian')}"
-    when = "" if took is None else f" in {duration(took)}"
-    by = count(cameras, "camera")
-    return f"{count(train, 'photograph')} of {name} by {by}{rest} were fitted{made}{when}."
-
-
-def _modelled(run: RunFiles) -> str:
+def modelled(run: RunFiles) -> str:
+    """Return a sentence on what was modelled of the cameras."""
     if run.photometry is None:
         return "What was modelled of the cameras is not known: photometry.json is missing."
     model, curve = run.photometry["model"], run.photometry["curve"].get("name", "")
@@ -108,32 +80,6 @@ def _modelled(run: RunFiles) -> str:
     spans = "" if span is None or model == "constant" else f"; exposures span {span:.1f} stops"
     what, under = DESCRIPTIONS.get(model, model), CURVES.get(curve, curve)
     return f"It models {what} under {under}{correction}, {why}{spans}."
-
-
-def _how_good(run: RunFiles, scene: SceneMeasurements) -> str:
-    parts, train = [], run.number("train", "psnr")
-    held_out = run.number("test", "exposure_fitted", "psnr")
-    if held_out is not None:
-        against = "" if train is None else f" (training photographs at {train:.1f} dB)"
-        parts.append(f"Held-out photographs are met at {held_out:.1f} dB{against}")
-    elif train is not None:
-        parts.append(
-            f"Training photographs are met at {train:.1f} dB; none was held out, so nothing tells "
-            "how good new views are (--test-every 8 would)"
-        )
-    if scene.seams:
-        before, after = seam_medians(scene.seams)
-        parts.append(
-            f"neighbouring photographs differ by {before:.2f} stops as taken and by {after:.2f} "
-            "developed alike"
-        )
-    error = true_error(run, scene.true_exposures)
-    if error is not None:
-        parts.append(f"exposures are within {error['ev']:.3f} stops (RMS) of the true ones")
-    if not parts:
-        return "How good it is cannot be said: metrics.json is missing."
-    text = "; ".join(parts)
-    return text[0].upper() + text[1:] + "."
 
 
 def exposure_span(run: RunFiles) -> float | None:
@@ -169,11 +115,11 @@ class RunWarning(NamedTuple):
     text: str
 
 
-def run_warnings(run: RunFiles, scene: SceneMeasurements) -> list[RunWarning]:
+def run_warnings(run: RunFiles) -> list[RunWarning]:
     """Return all warnings, the most serious first."""
     named = [
-        RunWarning(title, said.format(count=count(len(found), "view"), names=_named(found)))
-        for title, found, said in _on_views(run, scene)
+        RunWarning(title, said.format(count=count_of(len(found), "view"), names=_named(found)))
+        for title, found, said in _on_views(run)
         if found
     ]
     return [*_on_the_run(run), *named, *_on_more_to_gain(run)]
@@ -229,7 +175,7 @@ def _on_the_run(run: RunFiles) -> Iterator[RunWarning]:
         )
 
 
-def _on_views(run: RunFiles, scene: SceneMeasurements) -> Iterator[ViewWarning]:
+def _on_views(run: RunFiles) -> Iterator[ViewWarning]:
     yield (
         "Views without an exposure",
         [v["image"] for v in run.train if v["exposure"] is None],
@@ -254,29 +200,6 @@ def _on_views(run: RunFiles, scene: SceneMeasurements) -> Iterator[ViewWarning]:
         f"{{count}} with a standard error above {WEAK_EV:g} stops: {{names}}. They share few "
         "points with the others; more overlap would help.",
     )
-    yield (
-        "Exposures left their start",
-        _worst(_drifts(run), "+.2f"),
-        f"In {{count}} the fit moved the exposure by more than {DRIFT_EV:g} stops and three "
-        "standard errors from what the shared points said ({names}). One of the two is wrong; "
-        "p2gs-jax calibrate RUN solves them anew through the rendered depth.",
-    )
-    yield (
-        "Clipped photographs",
-        _worst(((n, s) for n, s in scene.clipped.items() if s > CLIPPED), ".0%"),
-        f"More than {CLIPPED:.0%} of the pixels are clipped in {{count}} of the "
-        f"{len(scene.clipped)} looked at ({{names}}). There the radiance is only known to be at "
-        "least that bright, unless a darker photograph shows the same place.",
-    )
-
-
-def _drifts(run: RunFiles) -> Iterator[tuple[str, float]]:
-    """Yield views whose exposure left its start, and by how many stops."""
-    for v in run.train:
-        start, end = v.get("exposure_ev_start"), v["exposure_ev"]
-        enough = max(DRIFT_EV, 3 * (v.get("exposure_ev_error") or 0))
-        if start is not None and end is not None and abs(end - start) > enough:
-            yield v["image"], end - start
 
 
 def _on_more_to_gain(run: RunFiles) -> Iterator[RunWarning]:

@@ -1,4 +1,4 @@
-"""What a page measures on the scene: seams, which it shows here, clipping, and renders."""
+"""What a page measures on the scene: seams, which it shows here."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluation.scores import psnr
 from p2gs_jax.evaluation.seams import (
     Photographed,
     Seam,
@@ -19,16 +18,15 @@ from p2gs_jax.evaluation.seams import (
     neighbouring_pairs,
     seam_picture,
 )
-from p2gs_jax.photometry.display import develop
 from p2gs_jax.render.warp import surface_depth
 from p2gs_jax.report.page import figure, paragraph, row, table
-from p2gs_jax.report.pictures import LARGE, ViewComparison, jpeg, spread, without_suffix
+from p2gs_jax.report.pictures import LARGE, jpeg, without_suffix
 from p2gs_jax.report.run_files import RunFiles
 from p2gs_jax.run.read import Run, load_run
 from p2gs_jax.scene.pixels.store import camera_of
 from p2gs_jax.synth.sensor import read_true_exposures
 
-MOST_PAIRS, MOST_CLIPPED, MOST_RENDERED = 12, 24, 3
+MOST_PAIRS = 12
 # Seams are measured on images of at most this many pixels across.
 SEAM_WIDTH = 960
 # The pair for the picture of a seam has at least this share of the median overlap.
@@ -65,8 +63,6 @@ class SceneMeasurements:
     True exposures are by view, where the scene has them. Seams are in the order of the views, of
     `tried_pairs` that were compared (None: none was measured); `shown` is the pair of `picture`,
     which has the widest one.
-    `clipped` has shares of pixels by view, for a sample of the training views. Comparisons are
-    rendered training views, where the folder has no held-out ones.
     """
 
     true_exposures: dict[str, float] = field(default_factory=dict)
@@ -74,8 +70,6 @@ class SceneMeasurements:
     tried_pairs: int | None = None
     shown: SeamPair | None = None
     picture: SeamPicture | None = None
-    clipped: dict[str, float] = field(default_factory=dict)
-    comparisons: tuple[ViewComparison, ...] = ()
     missing: tuple[str, ...] = ()
 
 
@@ -97,10 +91,6 @@ def measure_scene(files: RunFiles, reporter: Reporter, *, render: bool = True) -
         run = load_run(files.folder, files.given)
         run.require_photographs()
         _measure_seams(run, out, reporter)
-        if not files.held_out:
-            out.comparisons = _comparisons(run, reporter)
-        reporter.stage("Looking for clipped pixels")
-        out.clipped = _clipped(run)
     except UserError as error:
         why = f"Seams were not measured, and nothing was rendered: {error.message}"
         return SceneMeasurements(out.true_exposures, missing=(*out.missing, why))
@@ -143,30 +133,6 @@ def _measure_seams(run: Run, out: SceneMeasurements, reporter: Reporter) -> None
         first, second = map(photographed, shown)
         out.shown = named[shown]
         out.picture = seam_picture(first, second, run.common_display(), run.render)
-
-
-def _comparisons(run: Run, reporter: Reporter) -> tuple[ViewComparison, ...]:
-    """Return some training views beside their renders."""
-    out = []
-    for index in spread(run.scene.train_indices, MOST_RENDERED):
-        reporter.stage("Rendering views", len(out), MOST_RENDERED)
-        photograph, mask = run.store.get(index)
-        rendered = run.render(camera_of(run.store, index))
-        linear = np.asarray(rendered.linear)
-        shown = develop(linear, run.own_display(index), alpha=rendered.alpha)
-        score, view = float(psnr(shown, photograph, mask)), run.scene.views[index]
-        out.append(ViewComparison(view.name, view.split, photograph, shown, linear, score))
-    return tuple(out)
-
-
-def _clipped(run: Run) -> dict[str, float]:
-    """Return the share of pixels with a clipped channel, for a sample of the training views."""
-    out, store = {}, run.store.only_opaque()
-    for index in spread(run.scene.train_indices, MOST_CLIPPED):
-        ldr, mask = store.get(index)
-        clipped = np.any(ldr >= run.cfg.loss.saturation, axis=-1) & (mask > 0)
-        out[run.scene.views[index].name] = float(clipped.sum() / max(float(mask.sum()), 1.0))
-    return out
 
 
 def seam_medians(seams: Sequence[SeamPair]) -> tuple[float, float]:

@@ -45,9 +45,8 @@ def _read(name: str) -> str:
 def check_place(path: Path) -> None:
     """Raise a UserError where a page cannot have this name: a folder, or not an .html file."""
     if path.suffix.lower() not in (".html", ".htm") or path.is_dir():
-        raise UserError(
-            f"{path} is not a valid name for a page.", fix="name a file that ends in .html"
-        )
+        fix = "name a file that ends in .html"
+        raise UserError(f"{path} is not a valid name for a page.", fix=fix)
 
 
 def write_page(path: Path, html_text: str) -> None:
@@ -56,10 +55,8 @@ def write_page(path: Path, html_text: str) -> None:
     try:
         write_text(path, html_text)
     except OSError as error:
-        raise UserError(
-            f"{path} cannot be written: {error.strerror or error}.",
-            fix="name another place with --out",
-        ) from error
+        fix = "name another place with --out"
+        raise UserError(f"{path} cannot be written: {error.strerror or error}.", fix=fix) from error
 
 
 def made_by(command: str) -> str:
@@ -106,26 +103,23 @@ def table(
     *,
     numbers: Iterable[int] = (),
     tall: bool = False,
-    best: Sequence[frozenset[int]] = (),
 ) -> str:
     """Return a table of text, with a scroll bar where it is too wide, or `tall`.
 
-    `numbers` are the columns that hold numbers. `best` has, for each row, the columns that are
-    marked; the first column then stays in sight.
+    `numbers` are the columns that hold numbers.
     """
     numbers = set(numbers)
 
-    def cells(values: Sequence[str], tag: str, marked: frozenset[int] = frozenset()) -> str:
-        kinds = [" n" * (i in numbers) + " best" * (i in marked) for i in range(len(values))]
+    def cells(values: Sequence[str], tag: str) -> str:
+        kinds = ["n" * (i in numbers) for i in range(len(values))]
         each = zip(kinds, values, strict=True)
-        inner = "".join(f'<{tag} class="{kind[1:]}">{text(v)}</{tag}>' for kind, v in each)
+        inner = "".join(f'<{tag} class="{kind}">{text(v)}</{tag}>' for kind, v in each)
         return f"<tr>{inner}</tr>"
 
-    marks = best or [frozenset[int]()] * len(rows)
-    body = "\n".join(cells(v, "td", marked) for v, marked in zip(rows, marks, strict=True))
+    body = "\n".join(cells(values, "td") for values in rows)
     return (
-        f'<div class="scroll{" tall" * tall}" tabindex="0"><table class="{"compare" * bool(best)}">'
-        f"\n<thead>{cells(names, 'th')}</thead>\n<tbody>\n{body}\n</tbody></table></div>"
+        f'<div class="scroll{" tall" * tall}" tabindex="0"><table>\n'
+        f"<thead>{cells(names, 'th')}</thead>\n<tbody>\n{body}\n</tbody></table></div>"
     )
 
 

@@ -6,12 +6,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from p2gs_jax.core.progress import Reporter, Silent
+from p2gs_jax.core.text import count_of
 from p2gs_jax.report import findings, pictures
 from p2gs_jax.report import measurements as scenes
 from p2gs_jax.report import page as html
 from p2gs_jax.report import photometry_sections as photometry
 from p2gs_jax.report import run_sections as sections
-from p2gs_jax.report.findings import RunWarning, count, duration, run_warnings
+from p2gs_jax.report.findings import RunWarning, duration, run_warnings
 from p2gs_jax.report.measurements import SceneMeasurements
 from p2gs_jax.report.page import check_place, listed, page, paragraph, text
 from p2gs_jax.report.run_files import RunFiles, read_run
@@ -48,31 +49,27 @@ def report_page(run: RunFiles, scene: SceneMeasurements) -> str:
     """Return the page of a run from what its folder holds and what was measured on its scene."""
     problems: list[str] = []
     truth = scene.true_exposures
-    views = pictures.held_out_comparisons(run, MOST_COMPARED, problems) or list(scene.comparisons)
-    kind = "Training views" if views and views[0].split == "train" else "Held-out views"
-    found = run_warnings(run, scene)
+    views = pictures.held_out_section(run, MOST_COMPARED, problems)
+    found = run_warnings(run)
     shown = [
         ("watch", "What to watch", _warnings(found, run, [*scene.missing, *problems])),
         ("model", "What was modelled, and why", photometry.model_section(run)),
         ("exposures", "Exposures", photometry.exposure_section(run, truth)),
         ("white-balance", "White balance", photometry.white_balance_section(run)),
-        ("gamma", "Gamma", photometry.gamma_section(run)),
         ("response", "Tone curve", photometry.response_section(run)),
         ("vignetting", "Vignetting", photometry.vignetting_section(run)),
         ("seams", "Seams before and after", scenes.seam_section(scene)),
-        ("views", kind, pictures.comparison_section(views, len(run.held_out))),
-        ("hdr", "Radiance in stops", pictures.hdr_section(run, views)),
+        ("views", "Held-out views", views),
         ("scores", "Scores", sections.score_section(run)),
         ("parts", "What stands, and what moves", sections.parts_section(run)),
         ("depth", "Depth against LiDAR", sections.depth_section(run)),
         ("training", "Training", sections.training_section(run)),
-        ("timings", "Timings and counts", sections.timing_section(run)),
         ("configuration", "Configuration", sections.configuration_section(run)),
     ]
     folder = run.folder.resolve().name
     name, under = run.scene.name or folder, f"A fit with the preset {run.preset}, in {folder}/"
     head = f"<h1>{text(name)}</h1>\n{paragraph(under, 'quiet')}"
-    head += "".join(paragraph(s, "lead") for s in findings.summary_sentences(run, scene))
+    head += paragraph(findings.modelled(run), "lead")
     head += html.key_numbers(list(_key_numbers(run, scene, found)))
     return page(f"{name} · p2gs-jax", head, shown, html.made_by("report"))
 
@@ -92,7 +89,7 @@ def _key_numbers(
             yield name, form.format(value), remark
     if scene.seams:
         before, after = scenes.seam_medians(scene.seams)
-        pairs = count(len(scene.seams), "pair")
+        pairs = count_of(len(scene.seams), "pair")
         yield "Seams", f"{before:.2f} → {after:.2f}", f"stops, median of {pairs}"
     gaussians, steps = run.number("counts", "gaussians"), run.number("counts", "steps")
     if gaussians is not None:

@@ -17,7 +17,7 @@ from p2gs_jax.run.photometry_files import PhotometryFile, ViewPhotometry, read_p
 
 
 class HeldOutFiles(NamedTuple):
-    """Files of a held-out view: photograph, render fitted to it, and radiance or None.
+    """Files of a held-out view: photograph, and render fitted to it.
 
     The name is that of `metrics.json`; without suffix where it does not know the view.
     """
@@ -25,7 +25,6 @@ class HeldOutFiles(NamedTuple):
     name: str
     photograph: Path
     render: Path
-    exr: Path | None
 
 
 @dataclass(frozen=True)
@@ -109,10 +108,8 @@ def read_run(folder: Path, scene: Path | None = None) -> RunFiles:
     """
     path = folder / "config.json"
     if not path.is_file():
-        raise UserError(
-            f"{folder} is not a run folder: {path.name} is missing.",
-            fix="name the folder that was given to `p2gs-jax fit --out`",
-        )
+        fix = "name the folder that was given to `p2gs-jax fit --out`"
+        raise UserError(f"{folder} is not a run folder: {path.name} is missing.", fix=fix)
     missing: list[str] = []
     saved = _read_object(path, "the configuration", missing)
     options, cfg, photometry = part_at(saved, "fit"), None, None
@@ -169,9 +166,7 @@ def _find_held_out(folder: Path, names: list[str]) -> tuple[HeldOutFiles, ...]:
         short = (render.parent.relative_to(folder) / stem).as_posix()
         # What `p2gs-jax render` wrote into renders/all is not a held-out view.
         if photograph.is_file() and (short in whole or not whole):
-            exr = render.with_name(f"{stem}.exr")
-            files = photograph, render, exr if exr.is_file() else None
-            out.append(HeldOutFiles(whole.get(short, short), *files))
+            out.append(HeldOutFiles(whole.get(short, short), photograph, render))
     return tuple(out)
 
 

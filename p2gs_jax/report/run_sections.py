@@ -1,4 +1,4 @@
-"""Sections on scores and on the run itself: protocols, drives, training, timings, options."""
+"""Sections on scores and on the run itself: protocols, drives, training, options."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.scores import PROTOCOLS
 from p2gs_jax.presets import flat, preset, to_dict
 from p2gs_jax.report.charts import training_chart
-from p2gs_jax.report.findings import column, duration, seconds_of
+from p2gs_jax.report.findings import column, duration
 from p2gs_jax.report.page import figure, folded, paragraph, table, text
 from p2gs_jax.report.run_files import RunFiles, number_at
 
@@ -24,22 +24,11 @@ RADIANCE = {
     "pu21_ssim": "PU21 SSIM {:.4f}",
     "mu_law_psnr": "mu-law PSNR {:.2f} dB",
 }
-VIDEOS = {
-    "photographs": "photographs",
-    "per_view": "renders, own exposures",
-    "averaged": "renders, mean exposure",
-}
 # Protocols of scores by part, parts of a view, and splits of depth, as `metrics.json` has them.
 BY_PART = ("train", "test_averaged", "test_fitted", "test_metered")
 PARTS = {"whole": "all", "static": "what stands", "moving": "what moves"}
 SPLITS = {"all": "all", "held_out": "held out"}
 DEPTH = ("median_m", "median_relative", "within_10_percent", "missing")
-COUNTS = {
-    "seed_points": "Seed points",
-    "gaussians": "Gaussians",
-    "refused_densifications": "Gaussians that found no room",
-    "tile_lists_grown": "Times a tile list grew",
-}
 
 
 def _shown(value: float | None, digits: int) -> str:
@@ -66,7 +55,7 @@ def score_section(run: RunFiles) -> str:
     rows = [[p.views, p.shown, *_scores(run, *p.path)] for p in PROTOCOLS.values()]
     names = ["views", "shown with", "PSNR, dB", "SSIM", "LPIPS"]
     body = _numbers(names, [r for r in rows if r[2] or r[3]], 2)
-    return body + _radiance(run) + _steadiness(run)
+    return body + _radiance(run)
 
 
 def _radiance(run: RunFiles) -> str:
@@ -79,20 +68,6 @@ def _radiance(run: RunFiles) -> str:
         f"Against the scene's true radiance, after one common scale: {median:.3f} stops median, "
         f"{rms:.3f} RMS{more}."
     )
-
-
-def _steadiness(run: RunFiles) -> str:
-    found = {n: run.part("consistency", key) for key, n in VIDEOS.items()}
-    keys = ("his", "std_luminance_relative")
-    rows = [[n, *(_shown(number_at(part, k), 3) for k in keys)] for n, part in found.items()]
-    note = (
-        "HIS: change of exposure-free radiance from frame to frame, relative; deviation: of the "
-        "mean brightness of the frames, relative. Both contain the scene's own motion, so compare "
-        "them with the photographs'; lower is steadier."
-    )
-    names = ["video", "HIS", "brightness, deviation"]
-    body = _numbers(names, [r for r in rows if r[1]], 1, note)
-    return f"<h3>Steadiness of the views played as a video</h3>{body}" if body else ""
 
 
 def parts_section(run: RunFiles) -> str:
@@ -178,24 +153,6 @@ def _marks(log: Sequence[dict[str, Any]]) -> list[tuple[float, str]]:
             size = "full-size images" if b == 1 else f"images at 1/{b:.0f}"
             out.append((number_at(now, "step") or 0.0, size))
     return out
-
-
-def timing_section(run: RunFiles) -> str:
-    """Return where the time went, and how much there was."""
-    until, step = run.number("seconds", "total_until_evaluation"), run.number("seconds_per_step")
-    optimisation, steps = run.number("seconds", "optimisation"), run.number("counts", "steps")
-    spent = {
-        "Until the evaluation": until,
-        "of it optimisation, with compiling": optimisation,
-        "Judging and writing files": run.number("seconds", "evaluation_and_files"),
-        "In all": seconds_of(run),
-    }
-    rows = [[name, duration(s)] for name, s in spent.items() if s is not None]
-    if step is not None and steps is not None:
-        rows.append(["Steps", f"{steps:,.0f}, {1e3 * step:.0f} ms each"])
-    counts = {name: run.number("counts", key) for key, name in COUNTS.items()}
-    rows += [[name, f"{value:,.0f}"] for name, value in counts.items() if value is not None]
-    return table(["", ""], rows, numbers=(1,)) if rows else ""
 
 
 def configuration_section(run: RunFiles) -> str:

@@ -138,10 +138,9 @@ class CheckpointStore:
             raise
         except BROKEN_ARRAYS as error:
             reason = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
-            raise UserError(
-                f"The checkpoint {self.folder / str(step)} cannot be read ({reason}).",
-                fix="remove that folder, or start again without --resume",
-            ) from error
+            why = f"The checkpoint {self.folder / str(step)} cannot be read ({reason})."
+            fix = "remove that folder, or start again without --resume"
+            raise UserError(why, fix=fix) from error
 
     def _check_structure(self, step: int, table: dict[str, list], like) -> None:
         named = _named_leaves(like)
@@ -151,12 +150,11 @@ class CheckpointStore:
         if differing:
             name = differing[0]
             found, expected = held.get(name, "absent"), wanted.get(name, "absent")
-            raise UserError(
-                f"The checkpoint {self.folder / str(step)} belongs to another version or "
-                f"configuration: {name} is {found}, not {expected}.",
-                fix="resume with the version and the configuration of the run, or start again "
-                "without --resume",
-            )
+            why = f"The checkpoint {self.folder / str(step)} belongs to another version or "
+            why += f"configuration: {name} is {found}, not {expected}."
+            fix = "resume with the version and the configuration of the run, or start again "
+            fix += "without --resume"
+            raise UserError(why, fix=fix)
 
 
 def _named_leaves(tree) -> dict[str, Any]:

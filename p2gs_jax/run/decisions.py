@@ -14,14 +14,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal
 
-from p2gs_jax.config import (
-    CameraFormation,
-    FitConfig,
-    Level,
-    PhotometricModel,
-    ResponseKind,
-    VignettingKind,
-)
+from p2gs_jax import config
 from p2gs_jax.core.atomic import plain, write_json
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
@@ -35,7 +28,7 @@ KEY = "decided"
 class Decisions:
     """Values that the scene settles where the options leave them open."""
 
-    model: PhotometricModel  # photometric model
+    model: config.PhotometricModel  # photometric model
     curve: Literal["power", "srgb", "spline", "linear"]  # base of the tone curve
     spline: tuple[float, ...] | None  # its correction, or None
     freeze_until: float  # share of the run during which exposures and gammas keep still
@@ -43,17 +36,17 @@ class Decisions:
     exposure_rate: float  # learning rate of the exposures
     gamma_rate: float  # learning rate of the gammas
     reasons: tuple[str, ...] = ()  # for the model and the curve, in words
-    white_balance: Level | None = None  # per what it varies, or None
+    white_balance: config.Level | None = None  # per what it varies, or None
     # whether cameras have it, and per what it varies, or None
-    vignetting: VignettingKind | None = None
-    responses: ResponseKind = "all"  # what has a spline of its own
+    vignetting: config.VignettingKind | None = None
+    responses: config.ResponseKind = "all"  # what has a spline of its own
     # what each physical camera does; empty: nothing of its own
-    cameras: tuple[CameraFormation, ...] = ()
+    cameras: tuple[config.CameraFormation, ...] = ()
     # near plane, scene units, where the one asked for would cut the scene; None elsewhere
     near: float | None = None
 
     @classmethod
-    def as_asked(cls, cfg: FitConfig) -> Decisions:
+    def as_asked(cls, cfg: config.FitConfig) -> Decisions:
         """Return what the options say before a scene is known."""
         return cls(**{name: attrgetter(place)(cfg) for name, place in _PLACES.items()})
 
@@ -74,7 +67,7 @@ class Decisions:
         """Return plain values."""
         return plain(dataclasses.asdict(self))
 
-    def resolve(self, cfg: FitConfig) -> FitConfig:
+    def resolve(self, cfg: config.FitConfig) -> config.FitConfig:
         """Return the options that a fit computes under: as asked, with these values filled in."""
         values = {place: getattr(self, name) for name, place in _PLACES.items()}
         values["photometry.select"] = False
@@ -94,12 +87,11 @@ class Decisions:
         del now["reasons"]
         other = [f"{k} was {saved.get(k)}, now {v}" for k, v in now.items() if saved.get(k) != v]
         if other:
-            raise UserError(
-                f"The checkpoints in {folder} were made under other decisions than this scene "
-                f"leads to now: {'; '.join(other)}.",
-                fix="restore the scene as it was when the run began, or start again in another "
-                "folder with --out",
-            )
+            why = f"The checkpoints in {folder} were made under other decisions than this scene "
+            why += f"leads to now: {'; '.join(other)}."
+            fix = "restore the scene as it was when the run began, or start again in another "
+            fix += "folder with --out"
+            raise UserError(why, fix=fix)
 
 
 # Options that the scene settles, by the names of the decisions.
@@ -134,7 +126,5 @@ def read_decisions(path: Path) -> Decisions | None:
     try:
         return Decisions.from_dict(parse_json(path.read_text(encoding="utf-8")))
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(
-            f"{path} cannot be read ({error}).",
-            fix="restore it from a copy, or finish the fit again with --resume, which writes it",
-        ) from error
+        fix = "restore it from a copy, or finish the fit again with --resume, which writes it"
+        raise UserError(f"{path} cannot be read ({error}).", fix=fix) from error

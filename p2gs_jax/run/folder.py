@@ -93,10 +93,8 @@ class RunLock:
             UserError: the folder was removed while the run went on.
         """
         if self._handle is not None and not _is_at(self._handle, self.folder / NAME):
-            raise UserError(
-                f"{self.folder} was removed or replaced while the run was writing to it.",
-                fix="start again; what was in the folder is lost",
-            )
+            why = f"{self.folder} was removed or replaced while the run was writing to it."
+            raise UserError(why, fix="start again; what was in the folder is lost")
 
 
 @contextlib.contextmanager
@@ -167,10 +165,8 @@ def _lock(handle: int, folder: Path) -> bool:
     except BlockingIOError as error:
         pid = os.pread(handle, 32, 0).decode(errors="replace").strip()
         by = f"process {pid}" if pid.isdecimal() else "another process"
-        raise UserError(
-            f"{folder} is being written to by {by}.",
-            fix="wait until it ends, end it, or name another folder with --out",
-        ) from error
+        fix = "wait until it ends, end it, or name another folder with --out"
+        raise UserError(f"{folder} is being written to by {by}.", fix=fix) from error
     except OSError:
         return False
     return True

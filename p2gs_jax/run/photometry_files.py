@@ -281,9 +281,8 @@ def read_metering(path: Path) -> Metering:
         white = float(data["white"])
         return Metering(_rule(data["rule"]), candidates, white, tuple(readings), table)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise UserError(
-            f"{path} cannot be read: {error!r}.", fix="write it again with `p2gs-jax eval RUN`"
-        ) from error
+        fix = "write it again with `p2gs-jax eval RUN`"
+        raise UserError(f"{path} cannot be read: {error!r}.", fix=fix) from error
 
 
 def _rule_in_file(rule: Rule) -> dict[str, Any]:
@@ -362,8 +361,7 @@ def read_appearance(path: Path, kind: Appearance, views: Sequence[View]) -> Corr
             values[name] = on_device(np.array(rows, np.float32).reshape(shape))
         return dataclasses.replace(like, **values)
     except (OSError, ValueError) as error:
-        raise UserError(
-            f"{path} cannot be read: {error}.", fix="finish the fit again with --resume"
-        ) from error
+        fix = "finish the fit again with --resume"
+        raise UserError(f"{path} cannot be read: {error}.", fix=fix) from error
     except (KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{path} does not belong to this run.", fix="fit again") from error

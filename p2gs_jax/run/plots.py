@@ -24,7 +24,7 @@ from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.types import GAMMA_SRGB, Params, Scene
 
 MARKERS = "osD^vPX*"
-STATED = {"true": "--", "EXIF": ":"}
+STATED = {"true": "--", "EXIF": ":", "EXIF or file": ":"}
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 
 ROWS = ("photograph", "render,\nits own\nexposure", "render,\none exposure\nfor all")
@@ -115,7 +115,7 @@ def _lines(exposures_ev, cameras: Sequence[str], stated: Mapping[str, Any]) -> l
 
     Stated exposures, by who says so, are stops up to a constant; None or NaN where unknown.
     """
-    centered = np.asarray(exposures_ev, float) - np.mean(exposures_ev)
+    centered = np.asarray(exposures_ev, float) - np.nanmean(exposures_ev)
     order, owner, out = dict.fromkeys(cameras), np.array(list(cameras)), []
     for k, camera in enumerate(order):
         rows = np.flatnonzero(owner == camera)
@@ -128,7 +128,7 @@ def _lines(exposures_ev, cameras: Sequence[str], stated: Mapping[str, Any]) -> l
         out.append((rows, centered[rows], style, f"recovered, camera {printable(camera)}"))
     for label, given in stated.items():
         values = np.array(given, float)
-        known = np.isfinite(values)
+        known = np.isfinite(values) & np.isfinite(centered)
         if not known.any():
             continue
         values = values - np.mean(values[known] - centered[known])
@@ -151,7 +151,7 @@ def write_calibration_plot(
     stated_ev: Float[np.ndarray, " v"],
     pivot: float,
 ) -> None:
-    """Draw exposures with error bars, residuals, and tone curves of a calibration.
+    """Draw exposures with error bars, and tone curves of a calibration.
 
     Stated exposures (EXIF or a file) are laid over the recovered ones, NaN where unknown; `pivot`
     is the linear value that gammas leave alone.
@@ -160,18 +160,19 @@ def write_calibration_plot(
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
-    figure = Figure(figsize=(13, 4), layout="constrained")
-    left, middle, right = figure.subplots(1, 3, width_ratios=(2.2, 1.1, 1.1))
-    _plot_recovered(left, middle, solution, cameras, stated_ev)
-    left.set_title("Exposure", loc="left", fontsize=10)
+    figure = Figure(figsize=(11, 4), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=(2, 1))
+    seen = np.isfinite(solution.exposure_errors)
+    found = np.where(seen, solution.exposures_ev, np.nan)
+    bars = np.where(seen, 2 * solution.exposure_errors_ev, np.nan)
+    for rows, values, style, label in _lines(found, cameras, {"EXIF or file": stated_ev}):
+        error = None if label in STATED or not label else bars[rows]
+        left.errorbar(rows, values, error, label=label or None, **style)
+    left.set_title("Exposure, and two standard errors", loc="left", fontsize=10)
     left.set_ylabel("stops from the mean")
-    middle.set_title("Residual of an observation", loc="left", fontsize=10)
-    middle.set_ylabel("stops")
-    middle.set_ylim(bottom=0)
-    for axis in (left, middle):
-        axis.set_xlabel("view")
-        axis.xaxis.set_major_locator(MaxNLocator(integer=True))
-        axis.grid(alpha=0.25)
+    left.set_xlabel("view")
+    left.xaxis.set_major_locator(MaxNLocator(integer=True))
+    left.grid(alpha=0.25)
     if len(set(cameras)) <= 12:
         left.legend(fontsize=7)
     y = np.linspace(0.02, 1, 300)
@@ -189,33 +190,6 @@ def write_calibration_plot(
     right.legend(fontsize=7)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=110, format="png")
-
-
-def _plot_recovered(left, middle, s: PhotometricSolution, cameras, stated_ev) -> None:
-    """Draw exposures with their errors, and residuals, camera by camera."""
-    seen = np.isfinite(s.exposure_errors)
-    exposures_ev = np.where(seen, s.exposures_ev, np.nan)
-    errors_ev = np.where(seen, s.exposure_errors_ev, np.nan)
-    names = list(dict.fromkeys(cameras))
-    for i, name in enumerate(names):
-        mine = np.array([c == name for c in cameras])
-        at = np.flatnonzero(mine)
-        color, marker = COLORS[i % len(COLORS)], MARKERS[i % len(MARKERS)]
-        left.errorbar(
-            at,
-            exposures_ev[mine],
-            yerr=2 * errors_ev[mine],
-            fmt=f"{marker}-",
-            ms=4,
-            lw=0.8,
-            capsize=2,
-            color=color,
-            label=f"camera {printable(name)}" if len(names) > 1 else "recovered, 2 standard errors",
-        )
-        middle.plot(at, s.view_residual_ev[mine], marker, ms=4, color=color)
-        if np.isfinite(stated_ev[mine]).any():
-            label = "EXIF or file" if i == 0 else None
-            left.plot(at, stated_ev[mine], "k_", ms=9, mew=1.6, label=label)
 
 
 def curves_to_draw(s: PhotometricSolution) -> list[tuple[str, Response, float]]:

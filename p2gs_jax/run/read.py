@@ -18,13 +18,7 @@ from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.ply import read_ply
 from p2gs_jax.gaussians.posed import chosen, posed, standing
-from p2gs_jax.photometry.display import (
-    DisplayTransform,
-    MeanParameters,
-    display_of_view,
-    mean_parameters,
-    usual_display,
-)
+from p2gs_jax.photometry import display
 from p2gs_jax.photometry.formation import camera_rows
 from p2gs_jax.photometry.metering import ExposureOf, Metering, meter
 from p2gs_jax.presets import from_dict
@@ -113,29 +107,14 @@ class Run:
         mine = self.owner >= 0
         return self._of(chosen(self.params.gaussians, mine), self.owner[mine])
 
-    def with_moved(self, name: str, offset: Sequence[float]) -> Run:
-        """Return the run with one object elsewhere, at all times.
-
-        The object is named by its track (`Scene.objects`), or how that begins; the offset is
-        forward, left and up in the frame of its box, scene units.
-
-        Raises:
-            UserError: nothing moves, or no object has this name.
-        """
-        self._require_objects()
-        assert self.moving is not None
-        return replace(self, moving=self.moving.moved(name, offset))
-
     def _of(self, gaussians: Gaussians, owner: Int[np.ndarray, " n"] | None) -> Run:
         return replace(self, params=replace(self.params, gaussians=gaussians), owner=owner)
 
     def _require_objects(self) -> None:
         if self.owner is None:
-            raise UserError(
-                f"{self.folder} has no object with Gaussians of its own.",
-                fix="leave the option out; a drive with boxes has some, fitted with "
-                "--dynamics.method rigid",
-            )
+            fix = "leave the option out; a drive with boxes has some, fitted with "
+            fix += "--dynamics.method rigid"
+            raise UserError(f"{self.folder} has no object with Gaussians of its own.", fix=fix)
 
     def as_of(self, time: float | None = None) -> Gaussians:
         """Return all Gaussians in world coordinates, for programs that know no motion.
@@ -170,11 +149,9 @@ class Run:
             if self.scene.root.exists()
             else f"the scene of this run, {self.scene.root}, is not there"
         )
-        raise UserError(
-            f"this needs the photographs of the run: {what}.",
-            fix="put them back, or say where the scene is (--scene of view, render, export, eval "
-            "and report; in Python load_run(folder, scene))",
-        )
+        fix = "put them back, or say where the scene is (--scene of view, render, export, eval "
+        fix += "and report; in Python load_run(folder, scene))"
+        raise UserError(f"this needs the photographs of the run: {what}.", fix=fix)
 
     @property
     def alive(self) -> Bool[Array, " n"]:
@@ -182,11 +159,11 @@ class Run:
         return on_device(np.ones(self.params.gaussians.capacity), bool)
 
     @property
-    def mean(self) -> MeanParameters:
+    def mean(self) -> display.MeanParameters:
         """Exposure and gamma of a view that has none of its own."""
-        return mean_parameters(self.params.photometry)
+        return display.mean_parameters(self.params.photometry)
 
-    def own_display(self, index: int) -> DisplayTransform:
+    def own_display(self, index: int) -> display.DisplayTransform:
         """Return how the view in a row of `scene.views` was taken.
 
         The exposure of a held-out view is that fitted to its photograph, all else is as usual for
@@ -194,14 +171,14 @@ class Run:
         """
         if index in self.scene.train_indices:
             row = self.scene.train_indices.index(index)
-            own = display_of_view(self.params, row, self.cfg.photometry)
+            own = display.display_of_view(self.params, row, self.cfg.photometry)
             return replace(own, backdrop=self.store.backdrop_values)
         view = self.scene.views[index]
         usual = self._usual(view.camera)
         fitted = {v["image"]: v["exposure_fitted"] for v in self.photometry["views"]}.get(view.name)
         return usual if fitted is None else replace(usual, exposure=fitted)
 
-    def common_display(self, exposure_ev: float = 0.0) -> DisplayTransform:
+    def common_display(self, exposure_ev: float = 0.0) -> display.DisplayTransform:
         """Return one look for all views: of no camera in particular, without vignetting.
 
         Its exposure is in stops from the geometric mean of the training views' exposures.
@@ -218,20 +195,17 @@ class Run:
         names = [view.name for view in self.scene.views]
         if name not in names:
             near = difflib.get_close_matches(name, names, 1) or names[:1]
-            raise UserError(
-                f"the run has no view {name!r}.", fix=f"name one as photometry.json does: {near[0]}"
-            )
+            fix = f"name one as photometry.json does: {near[0]}"
+            raise UserError(f"the run has no view {name!r}.", fix=fix)
         balance = self.own_display(names.index(name)).white_balance
         if balance is None:
-            raise UserError(
-                "this run models no white balance: all its photographs have the same.",
-                fix="leave --white-balance-of out",
-            )
+            why = "this run models no white balance: all its photographs have the same."
+            raise UserError(why, fix="leave --white-balance-of out")
         return balance
 
-    def _usual(self, camera: str | None) -> DisplayTransform:
+    def _usual(self, camera: str | None) -> display.DisplayTransform:
         taken_by = [view.camera for view in self.scene.training_views]
-        usual = usual_display(self.params, taken_by, camera, self.cfg.photometry)
+        usual = display.usual_display(self.params, taken_by, camera, self.cfg.photometry)
         return replace(usual, backdrop=self.store.backdrop_values)
 
     @cached_property
@@ -241,7 +215,7 @@ class Run:
 
     def metered_display(
         self, rendered: Render, of: ExposureOf = "auto", exposure_ev: float = 0.0
-    ) -> DisplayTransform:
+    ) -> display.DisplayTransform:
         """Return the display transform of a new picture (`render`), with its exposure metered.
 
         `of` says how: `auto`: as the camera that took the photographs would have chosen, where a
@@ -266,18 +240,15 @@ def load_run(folder: str | Path, scene: str | Path | None = None) -> Run:
     _require_finished(files)
     saved, asked = read_config(files.config)
     if scene is not None and not Path(scene).exists():
-        raise UserError(
-            f"{scene} does not exist.", fix="name the folder of the run's scene with --scene"
-        )
+        fix = "name the folder of the run's scene with --scene"
+        raise UserError(f"{scene} does not exist.", fix=fix)
     root = find(saved, "scene", files.root) if scene is None else Path(scene)
     found = read_scene(files.root, root or files.root / "scene")
     decisions = read_decisions(files.decisions)
     if decisions is None:
-        raise UserError(
-            f"{files.root} has no {files.decisions.name}: it was made by a version that this one "
-            "cannot read, or the file was removed.",
-            fix="restore it from a copy, or fit again",
-        )
+        why = f"{files.root} has no {files.decisions.name}: it was made by a version that this one "
+        why += "cannot read, or the file was removed."
+        raise UserError(why, fix="restore it from a copy, or fit again")
     cfg = decisions.resolve(asked)
     gaussians = read_ply(files.radiance)
     owner, moving = read_objects(files.objects, found, gaussians.capacity)
@@ -299,16 +270,12 @@ def load_run(folder: str | Path, scene: str | Path | None = None) -> Run:
 
 def _require_finished(files: RunFolder) -> None:
     if not files.config.is_file():
-        raise UserError(
-            f"{files.root} is not a run folder: {files.config.name} is missing.",
-            fix="name the folder that was given to `p2gs-jax fit --out`",
-        )
+        why = f"{files.root} is not a run folder: {files.config.name} is missing."
+        raise UserError(why, fix="name the folder that was given to `p2gs-jax fit --out`")
     for path in (files.radiance, files.photometry):
         if not path.is_file():
-            raise UserError(
-                f"{files.root} is unfinished: {path.name} is missing.",
-                fix="finish it with `p2gs-jax fit ... --resume`",
-            )
+            fix = "finish it with `p2gs-jax fit ... --resume`"
+            raise UserError(f"{files.root} is unfinished: {path.name} is missing.", fix=fix)
 
 
 def _photometry(
@@ -318,11 +285,9 @@ def _photometry(
     by_name = {v["image"]: v for v in saved["views"] if v["exposure"] is not None}
     train = [by_name[v.name] for v in scene.training_views if v.name in by_name]
     if len(train) < len(scene.train_indices):
-        raise UserError(
-            f"{files.photometry} does not belong to the scene {scene.root}: its training views "
-            "differ.",
-            fix="restore the scene folder as it was during the fit",
-        )
+        why = f"{files.photometry} does not belong to the scene {scene.root}: its training views "
+        why += "differ."
+        raise UserError(why, fix="restore the scene folder as it was during the fit")
     exposures, gammas = (np.array([v[name] for v in train]) for name in ("exposure", "gamma"))
     p, balances = cfg.photometry, None
     if p.parameterization == "log":
@@ -351,7 +316,6 @@ def read_config(path: Path) -> tuple[dict[str, Any], FitConfig]:
     try:
         return saved, from_dict(saved["fit"])
     except (ValueError, KeyError, TypeError) as error:
-        raise UserError(
-            f"{path} is of another version of this program: {error}.",
-            fix="open the run with the version that made it, or fit again with this one",
-        ) from error
+        why = f"{path} is of another version of this program: {error}."
+        fix = "open the run with the version that made it, or fit again with this one"
+        raise UserError(why, fix=fix) from error

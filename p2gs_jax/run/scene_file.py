@@ -97,9 +97,8 @@ def read_scene(folder: Path, root: Path) -> Scene:
             a = dict(file)
         return _scene_from(a, parse_json(str(a["json"])), folder, root)
     except BROKEN_ARRAYS as error:
-        raise UserError(
-            f"{path} cannot be read: {error}.", fix="restore it from a copy, or fit again"
-        ) from error
+        fix = "restore it from a copy, or fit again"
+        raise UserError(f"{path} cannot be read: {error}.", fix=fix) from error
 
 
 def _scene_from(a: Mapping[str, np.ndarray], table: dict, folder: Path, root: Path) -> Scene:
@@ -211,9 +210,8 @@ def read_objects(
             return None, MovingObjects((), middle=float(a["middle"]))
         fits = len(owner) == count and owner.max(initial=-1) < len(objects)
     except BROKEN_ARRAYS as error:
-        raise UserError(
-            f"{path} cannot be read: {error}.", fix="finish the fit again with --resume"
-        ) from error
+        fix = "finish the fit again with --resume"
+        raise UserError(f"{path} cannot be read: {error}.", fix=fix) from error
     if not fits:
         raise UserError(f"{path} does not belong to this run.", fix="fit again")
     return owner, MovingObjects(objects)

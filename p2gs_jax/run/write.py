@@ -13,8 +13,7 @@ from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.evaluation.scores import ViewResult
-from p2gs_jax.formats.exr import write_exr
-from p2gs_jax.formats.frames import write_png
+from p2gs_jax.formats.frames import OutputFrame, write_frame
 from p2gs_jax.formats.ply import write_ply, write_radiance
 from p2gs_jax.gaussians.bake import bake, display_comments
 from p2gs_jax.gaussians.posed import posed
@@ -120,18 +119,9 @@ def write_run(
 
 def write_view(folder: Path, name: str, result: ViewResult, store: ImageStore) -> None:
     """Write one view as EXR, PNG and its photograph, under the photograph's own name."""
-    stem = folder / Path(name).with_suffix("")
-    stem.parent.mkdir(parents=True, exist_ok=True)
-    write_exr(
-        stem.with_suffix(".exr"),
-        result.linear,
-        depth=result.depth,
-        alpha=result.alpha,
-        taken=result.transform,
-        camera=camera_of(store, result.index),
-    )
-    write_png(stem.with_name(f"{stem.name}.render.png"), result.ldr)
-    write_png(stem.with_name(f"{stem.name}.photograph.png"), result.photograph)
+    stem, camera = Path(name).with_suffix("").as_posix(), camera_of(store, result.index)
+    shown = (result.linear, result.alpha, result.ldr, result.transform, result.depth)
+    write_frame(folder, OutputFrame(stem, *shown, camera, result.photograph))
 
 
 def summary_rows(scene: Scene) -> list[int]:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError, broken
+from p2gs_jax.scene import transforms
 from p2gs_jax.scene.colmap import find_deeper_model, find_model, load_colmap
 from p2gs_jax.scene.convert.convert import convert_photographs, converted_views, with_originals
 from p2gs_jax.scene.convert.icc import colour_notes
@@ -15,19 +16,11 @@ from p2gs_jax.scene.convert.readers import exif_evs
 from p2gs_jax.scene.drives import read_drive
 from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.drives.recording import Recording
-from p2gs_jax.scene.files import Report, image_size, list_images, shallow
+from p2gs_jax.scene.files import Report, image_size, list_images
 from p2gs_jax.scene.masks import attach_masks, with_alpha
 from p2gs_jax.scene.pixels.store import ImageStore, camera_at, size_at
 from p2gs_jax.scene.seeds import FEWEST, with_random_seeds
 from p2gs_jax.scene.split import lists_beside, split_as_listed, split_scene
-from p2gs_jax.scene.transforms import (
-    is_blender,
-    llff_table,
-    load_blender,
-    load_llff,
-    load_transforms,
-    stated_exposures,
-)
 from p2gs_jax.scene.video import VIDEO_SUFFIXES, read_video
 from p2gs_jax.types import Scene
 
@@ -90,7 +83,7 @@ def with_what_lies_beside(scene: Scene, cfg: DataConfig) -> Scene:
     both = zip(views, exif_evs(paths, [view.camera for view in views]), strict=True)
     # What a data set states counts for more.
     views = tuple(dataclasses.replace(v, exif_ev=ev) if v.exif_ev is None else v for v, ev in both)
-    notes = (*scene.notes, *mask_notes, *colour_notes(paths), *shallow(paths))
+    notes = (*scene.notes, *mask_notes, *colour_notes(paths))
     scene = dataclasses.replace(scene, views=views, notes=notes)
     return split_scene(scene, cfg)
 
@@ -124,7 +117,7 @@ def find_scene(
         if root.suffix.lower() != ".json":
             fix = "name the folder of the scene, its transforms.json, or a video"
             raise broken(root, "is neither a transforms.json nor a video", fix)
-        return load_transforms(root, root, cfg)
+        return transforms.load_transforms(root, root, cfg)
     model = find_model(root)
     if model is not None and cfg.format in (None, "colmap"):
         scene = _of_model(root, model, cfg)
@@ -133,11 +126,11 @@ def find_scene(
             return scene
         return split_as_listed(scene, lists, allow_missing=cfg.allow_missing)
     if (root / "transforms.json").is_file() and cfg.format in (None, "transforms"):
-        return load_transforms(root, root / "transforms.json", cfg)
-    if is_blender(root) and cfg.format in (None, "blender"):
-        return load_blender(root, cfg)
-    if llff_table(root) and cfg.format in (None, "llff"):
-        return load_llff(root, cfg)
+        return transforms.load_transforms(root, root / "transforms.json", cfg)
+    if transforms.is_blender(root) and cfg.format in (None, "blender"):
+        return transforms.load_blender(root, cfg)
+    if transforms.llff_table(root) and cfg.format in (None, "llff"):
+        return transforms.load_llff(root, cfg)
     model = find_deeper_model(root) if cfg.format in (None, "colmap") else None
     if model is not None:
         return _of_model(root, model, cfg)
@@ -156,7 +149,7 @@ def _of_model(root: Path, folder: Path, cfg: DataConfig) -> Scene:
         notes.append(f"The cameras are those of the COLMAP model in {folder}.")
     if not len(scene.points):
         notes.append(f"The COLMAP model {folder} has no points: they are triangulated.")
-    views = stated_exposures(root, scene.views)
+    views = transforms.stated_exposures(root, scene.views)
     return dataclasses.replace(scene, views=views, notes=(*scene.notes, *notes))
 
 
@@ -177,10 +170,8 @@ def _photographs_alone(root: Path, cfg: DataConfig) -> PhotographsAlone:
         if below:
             fix += f"; photographs are in its folder(s) {', '.join(below[:3])}"
             fix += ": if these are cameras, add --data.images ."
-    raise UserError(
-        f"no scene in {root}: there is no COLMAP model (cameras, images and points3D as .bin or "
-        f".txt, in sparse/0, sparse or the folder itself), no transforms.json or "
-        f"transforms_train.json, no poses_bounds.npy, no drive of a known data set, and no "
-        f"photographs (looked in {looked})",
-        fix=fix,
-    )
+    why = f"no scene in {root}: there is no COLMAP model (cameras, images and points3D as .bin or "
+    why += ".txt, in sparse/0, sparse or the folder itself), no transforms.json or "
+    why += "transforms_train.json, no poses_bounds.npy, no drive of a known data set, and no "
+    why += f"photographs (looked in {looked})"
+    raise UserError(why, fix=fix)

@@ -22,20 +22,10 @@ from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError, broken
+from p2gs_jax.scene import files
 from p2gs_jax.scene.cameras import name_cameras
-from p2gs_jax.scene.files import (
-    HUGE,
-    at_file_size,
-    check_missing,
-    find_names,
-    image_folder,
-    image_size,
-    nearly_named,
-    require_inside,
-    rescaled,
-)
 from p2gs_jax.scene.lens import intrinsics, make_distortion, undistort_points
-from p2gs_jax.scene.rigid import off_origin
+from p2gs_jax.scene.rigid import off_origin, pose_of
 from p2gs_jax.scene.seeds import read_points
 from p2gs_jax.types import Distortion, Scene, Tracks, View
 
@@ -139,16 +129,18 @@ def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
     model = read_model(folder)
     _check_model(model)
     images = sorted(model.images, key=lambda image: image.name)
-    place = image_folder(root, cfg)
+    place = files.image_folder(root, cfg)
     for image in images:  # before any of these files is opened
-        require_inside(PurePosixPath(image.name), place or root / "images", model.file("images"))
+        files.require_inside(
+            PurePosixPath(image.name), place or root / "images", model.file("images")
+        )
     place = place or _find_images(root, model)
-    files = find_names([image.name for image in images], place)
-    missing = [image.name for image in images if image.name not in files]
+    found = files.find_names([image.name for image in images], place)
+    missing = [image.name for image in images if image.name not in found]
     source = model.file("images")
-    notes = check_missing(missing, len(images), source, cfg, place)
-    notes += nearly_named(files, source.name)
-    images = [i._replace(name=files[i.name]) for i in images if i.name in files]
+    notes = files.check_missing(missing, len(images), source, cfg, place)
+    notes += files.nearly_named(found, source.name)
+    images = [i._replace(name=found[i.name]) for i in images if i.name in found]
     images.sort(key=lambda image: image.name)
     model = model._replace(images=images)
     views, resized = [], 0
@@ -156,18 +148,17 @@ def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
         camera, path = model.cameras[image.camera_id], place / image.name
         K, distortion = _lens(model.file("cameras"), camera)
         size = (camera.width, camera.height)
-        K, width, height = at_file_size(path, K, size, model.file("cameras"))
+        K, width, height = files.at_file_size(path, K, size, model.file("cameras"))
         resized += (width, height) != size
-        finite = (np.abs([*image.qvec, *image.tvec]) < HUGE).all()
+        finite = (np.abs([*image.qvec, *image.tvec]) < files.HUGE).all()
         norm = np.linalg.norm(image.qvec) if finite else 0.0
         if norm < 1e-6:
             raise broken(f"{source}:", f"the pose of {image.name} is not finite", _FIX)
-        viewmat = np.eye(4)
-        viewmat[:3, :3] = Rotation.from_quat(np.roll(image.qvec / norm, -1)).as_matrix()
-        viewmat[:3, 3] = image.tvec
+        turn = Rotation.from_quat(np.roll(image.qvec / norm, -1)).as_matrix()
+        viewmat = pose_of(turn, image.tvec)
         number = str(image.camera_id)
         views.append(View(image.name, path, number, viewmat, K, width, height, distortion))
-    notes += rescaled(resized, model.file("cameras").name)
+    notes += files.rescaled(resized, model.file("cameras").name)
     others = sorted(p.name for p in folder.parent.iterdir() if p != folder and is_model(p))
     if folder.name.isdecimal() and others:
         used = f"used the model {folder} with {len(model.images)} photographs, the largest"
@@ -193,7 +184,9 @@ def tracks_of(model: Model, views: Sequence[View]) -> Tracks | None:
             continue
         view, camera = views[row], model.cameras[image.camera_id]
         at = np.searchsorted(model.point_ids, image.point_ids).clip(max=len(model.point_ids) - 1)
-        known = (model.point_ids[at] == image.point_ids) & (np.abs(image.xy) < HUGE).all(axis=1)
+        known = (model.point_ids[at] == image.point_ids) & (np.abs(image.xy) < files.HUGE).all(
+            axis=1
+        )
         scale = (view.width / camera.width, view.height / camera.height)
         xy = undistort_points(image.xy[known] * scale, view.K, view.distortion)
         # What a wide lens sees at its sides is in no pinhole picture.
@@ -221,7 +214,7 @@ def _check_model(model: Model) -> None:
             why = f"{image.name} was taken by camera {image.camera_id}, which "
             why += f"{model.file('cameras')} does not have"
             raise broken(f"{model.file('images')}:", why, _FIX)
-    bad = int((~(np.abs(model.xyz) < HUGE).all(axis=1)).sum())
+    bad = int((~(np.abs(model.xyz) < files.HUGE).all(axis=1)).sum())
     if bad:
         why = f"{bad} of {len(model.xyz)} points are not finite"
         raise broken(f"{model.file('points3D')}:", why, _FIX)
@@ -237,7 +230,7 @@ def _find_images(root: Path, model: Model) -> Path:
         image = next((i for i in model.images if (place / i.name).is_file()), None)
         if image is not None:
             camera = model.cameras[image.camera_id]
-            same = image_size(place / image.name) == (camera.width, camera.height)
+            same = files.image_size(place / image.name) == (camera.width, camera.height)
             held.append((not same, len(held), place))
     if held:
         return min(held)[2]
@@ -254,7 +247,9 @@ def _lens(path: Path, camera: CameraRecord) -> tuple[Float[np.ndarray, "3 3"], D
     if not focals:
         raise _unsupported(path, camera.model)
     fx, fy, (cx, cy) = p[0], p[focals - 1], p[focals : focals + 2]
-    if not ((np.abs(p) < HUGE).all() and fx > 0 and fy > 0 and camera.width and camera.height):
+    if not (
+        (np.abs(p) < files.HUGE).all() and fx > 0 and fy > 0 and camera.width and camera.height
+    ):
         why = f"a {camera.model} camera of {camera.width}x{camera.height} pixels has "
         raise broken(f"{path}:", f"{why}impossible parameters {p}", _FIX)
     terms = p[focals + 2 :]
@@ -317,20 +312,20 @@ def read_model(folder: Path) -> Model:
     Points may be absent, or in a PLY, as 3DGS writes them. Raises UserError: another file is
     missing, or one is truncated or malformed; the message names it.
     """
-    files = {ext: [folder / f"{stem}.{ext}" for stem in _STEMS] for ext in ("bin", "txt")}
-    absent = {ext: [p for p in paths if not p.is_file()] for ext, paths in files.items()}
+    parts = {ext: [folder / f"{stem}.{ext}" for stem in _STEMS] for ext in ("bin", "txt")}
+    absent = {ext: [p for p in paths if not p.is_file()] for ext, paths in parts.items()}
     other = next(
-        (p for p in [*files["bin"], *files["txt"]] if p.exists() and not p.is_file()), None
+        (p for p in [*parts["bin"], *parts["txt"]] if p.exists() and not p.is_file()), None
     )
     if other is not None:
         raise broken(other, "is not a file", _FIX_FILES)
-    whole = [ext for ext in files if {*absent[ext]} <= {files[ext][2]}]
+    whole = [ext for ext in parts if {*absent[ext]} <= {parts[ext][2]}]
     if not whole:
         ext = "txt" if (folder / "cameras.txt").is_file() else "bin"
         why = f"{', '.join(map(str, absent[ext]))} does not exist"
         raise broken("incomplete COLMAP model:", why, _FIX_FILES)
     ext = min(whole, key=lambda ext: len(absent[ext]))
-    cameras, images, points = files[ext]
+    cameras, images, points = parts[ext]
     text = (_text_cameras, _text_images, _text_points)
     binary = (_binary_cameras, _binary_images, _binary_points)
     read_cameras, read_images, read_them = binary if ext == "bin" else text

@@ -140,7 +140,6 @@ def _read(path: Path) -> dict[str, float]:
             fix = "write a finite number, above 0 for exposures"
             raise broken(f"{path}, line {number}:", f"{kind} is {text!r}.", fix)
         if out.setdefault(image := (row[name] or "").strip(), log) != log:
-            raise broken(
-                f"{path}, line {number}:", f"{image} is named again", "keep one line of it"
-            )
+            fix = "keep one line of it"
+            raise broken(f"{path}, line {number}:", f"{image} is named again", fix)
     return out

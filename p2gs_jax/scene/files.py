@@ -278,24 +278,6 @@ def same_shape(a: tuple[int, int], b: tuple[int, int]) -> bool:
     return bool((sides[0] - sides[1]).max() <= (sides[0] + sides[1]).min())
 
 
-def shallow(paths: Sequence[Path]) -> list[str]:
-    """Return a note where 16-bit photographs hold fewer bits, by the first few; or none."""
-    brightest = 0
-    for path in paths[:3]:
-        # What has 8 bits is not decoded.
-        with contextlib.suppress(OSError), path.open("rb") as file:
-            if file.read(25)[24:] != b"\x10" and path.suffix.lower() not in (".tif", ".tiff"):
-                return []
-        pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        if pixels is None or pixels.dtype != np.uint16:
-            return []
-        brightest = max(brightest, int(pixels.max()))
-    bits = brightest.bit_length()
-    note = f"16-bit photographs hold no value above {brightest}: these are {bits} bits, so that "
-    note += f"white is dark ({brightest / 65535:.0%}); multiply them by {2 ** (16 - bits)}"
-    return [note] if 8 <= bits <= 14 else []
-
-
 def rescaled(count: int, source: str) -> list[str]:
     """Return a note about so many images, or none."""
     note = f"{count} images have another size than {source} says: intrinsics were rescaled"

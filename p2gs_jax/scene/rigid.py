@@ -10,11 +10,8 @@ import numpy as np
 from jaxtyping import Float, Float64
 from scipy.spatial.transform import Rotation
 
-from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.core.text import natural
 from p2gs_jax.errors import broken
-from p2gs_jax.render.warp import project_points
-from p2gs_jax.scene.visibility import SHARE_POINTS, SHARE_VIEWS, in_frame
 from p2gs_jax.types import Scene, View
 
 Rotation3 = Float64[np.ndarray, "3 3"]
@@ -78,9 +75,7 @@ def rigid(rotation: Rotation3, position: Vector3, source: Path, what: str) -> Po
             fix = "write rotations of determinant 1"
             raise broken(f"{source}:", f"the pose of {what} mirrors", fix)
         raise broken(f"{source}:", f"the pose of {what} is not a rotation and a position")
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = nearest, position
-    return out
+    return pose_of(nearest, position)
 
 
 def from_quaternions(
@@ -95,11 +90,9 @@ def from_quaternions(
     if bad.any():
         where = f"{what} number {np.argmax(bad) + 1}"
         raise broken(f"{source}:", f"{where} is not a unit quaternion and position")
-    out = np.tile(np.eye(4), (len(wxyz), 1, 1))
-    if len(wxyz):
-        out[:, :3, :3] = Rotation.from_quat(wxyz, scalar_first=True).as_matrix()
-        out[:, :3, 3] = positions
-    return out
+    if not len(wxyz):
+        return np.zeros((0, 4, 4))
+    return pose_of(Rotation.from_quat(wxyz, scalar_first=True).as_matrix(), positions)
 
 
 def from_quaternion(
@@ -113,14 +106,20 @@ def from_quaternion(
     return rigid(rotation.as_matrix(), position, source, what)
 
 
+def pose_of(
+    rotation: Float[np.ndarray, "*n 3 3"], position: Float[np.ndarray, "*n 3"]
+) -> Float64[np.ndarray, "*n 4 4"]:
+    """Return the matrices of rotations and positions."""
+    out = np.zeros((*rotation.shape[:-2], 4, 4))
+    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = rotation, position, 1
+    return out
+
+
 def inverse(poses: Float64[np.ndarray, "*n 4 4"]) -> Float64[np.ndarray, "*n 4 4"]:
     """Return the inverses of rigid matrices."""
-    out = np.zeros_like(poses)
     turned = np.swapaxes(poses[..., :3, :3], -1, -2)
-    out[..., :3, :3] = turned
-    out[..., :3, 3] = -np.einsum("...ij,...j->...i", turned, poses[..., :3, 3])
-    out[..., 3, 3] = 1.0
-    return out
+    position = -np.einsum("...ij,...j->...i", turned, poses[..., :3, 3])
+    return pose_of(turned, position).astype(poses.dtype, copy=False)
 
 
 def camera_centers(viewmats: Float[np.ndarray, "n 4 4"]) -> Float64[np.ndarray, "n 3"]:
@@ -260,14 +259,6 @@ def level_ahead(views: Sequence[View], up: Vector3) -> Vector3:
     ahead = next((view for view in views if "front" in view.camera.lower()), views[0])
     axis = ahead.viewmat[2, :3].astype(np.float64)
     return axis - up * (up @ axis)
-
-
-def share_in_view(points: Float[np.ndarray, "p 3"], views: Sequence[View]) -> float:
-    """Return the share of points that lie in a view's picture, on average over some of both."""
-    sample = points[:: max(1, len(points) // SHARE_POINTS)]
-    some = [views[row] for row in evenly_spaced(len(views), SHARE_VIEWS)]
-    seen = (in_frame(*project_points(sample, view), view.width, view.height) for view in some)
-    return float(np.mean([one.mean() for one in seen])) if len(points) else 1.0
 
 
 def require_axes(

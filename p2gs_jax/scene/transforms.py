@@ -34,9 +34,10 @@ from p2gs_jax.scene.colmap import IMAGE_FOLDERS
 from p2gs_jax.scene.files import HUGE, at_file_size, require_inside
 from p2gs_jax.scene.lens import intrinsics, make_distortion
 from p2gs_jax.scene.masks import image_folder_of
-from p2gs_jax.scene.rigid import nearest_rotation, off_origin, require_axes, share_in_view
+from p2gs_jax.scene.rigid import nearest_rotation, off_origin, pose_of, require_axes
 from p2gs_jax.scene.seeds import read_points
 from p2gs_jax.scene.split import lists_in, split_as_listed
+from p2gs_jax.scene.visibility import share_in_view
 from p2gs_jax.types import Distortion, Scene, Split, View
 
 # HDR-NeRF's has a column more: exposures, seconds.
@@ -176,10 +177,8 @@ def _viewmat(
     nearest = nearest_rotation(pose[:, :3])
     if nearest is None:
         raise broken(f"{path}:", f"{what} is not a rotation and a translation", fix)
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = nearest.T
-    viewmat[:3, 3] = -viewmat[:3, :3] @ pose[:, 3]
-    return viewmat
+    turn = np.ascontiguousarray(nearest.T)
+    return pose_of(turn, -turn @ pose[:, 3])
 
 
 def _read_llff(path: Path) -> Float64[np.ndarray, "v 17"]:

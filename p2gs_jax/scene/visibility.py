@@ -27,20 +27,22 @@ def in_frame(
     return (z > 1e-6) & (xy >= 0).all(1) & (xy < [width, height]).all(1)
 
 
+def share_in_view(points: Float[np.ndarray, "p 3"], views: Sequence[View]) -> float:
+    """Return the share of points that lie in a view's picture, on average over some of both."""
+    if not len(points):
+        return 1.0
+    sample = points[:: max(1, len(points) // SHARE_POINTS)]
+    some = [views[row] for row in evenly_spaced(len(views), SHARE_VIEWS)]
+    seen = (in_frame(*project_points(sample, view), view.width, view.height) for view in some)
+    return float(np.mean([one.mean() for one in seen]))
+
+
 def shown_share(points: Float[np.ndarray, "p 3"], views: Sequence[View]) -> float:
     """Return the share of the points that lies in a view's frustum, on average; 1 without points.
 
     Not below 1 / views: together the views show all that matters.
     """
-    if not len(points):
-        return 1.0
-    picked = evenly_spaced(len(views), SHARE_VIEWS)
-    sample = points[:: max(1, len(points) // SHARE_POINTS)]
-    shares = []
-    for view in (views[i] for i in picked):
-        xy, z = project_points(sample, view)
-        shares.append(np.mean(in_frame(xy, z, view.width, view.height)))
-    return float(max(np.mean(shares), 1 / len(views)))
+    return max(share_in_view(points, views), 1 / len(views))
 
 
 def unoccluded(

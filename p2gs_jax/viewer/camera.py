@@ -1,4 +1,4 @@
-"""Cameras of the browser and ours: conversion, the scene's scale, drives, and what marks them.
+"""Cameras of the browser and ours: conversion, the scene's scale, and what marks them.
 
 Both kinds look along z with x right and y down (OpenCV). viser's poses are camera-to-world; it has
 a vertical field of view instead of K, and lengths in the viewer's own unit.
@@ -6,11 +6,8 @@ a vertical field of view instead of K, and lengths in the viewer's own unit.
 
 from __future__ import annotations
 
-import threading
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -19,15 +16,15 @@ import viser
 from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
-from p2gs_jax.scene.rigid import camera_centers, interpolated, inverse, up_direction
+from p2gs_jax.scene.rigid import camera_centers, up_direction
 from p2gs_jax.types import Camera, Scene, View
 
 Size = tuple[int, int]
 # Typical distance from a camera to what it sees, viewer units: viser's keys move 2 units a second.
 TYPICAL_DISTANCE = 10.0
 SMALLEST_FOV, LARGEST_FOV = 0.05, 2.8
-# Poses sent to the browser per second while a drive is played.
-RATE = 25.0
+# Size of the frusta that mark cameras, viewer units.
+FRUSTUM = 0.3
 # Frusta closer to the camera than this, in sizes of a frustum, are hidden.
 TOO_CLOSE = 2.5
 LINE = 2.0
@@ -144,66 +141,6 @@ def fov_that_holds(view: View, aspect: float) -> float:
     return float(np.clip(fov, SMALLEST_FOV, LARGEST_FOV))
 
 
-def viewmat_between(viewmats: Float[np.ndarray, "k 4 4"], place: float) -> Float[np.ndarray, "4 4"]:
-    """Return the matrix at a place along recorded poses: 0 is the first, 1 the second.
-
-    Beyond the ends it stays there.
-    """
-    last = len(viewmats) - 1
-    poses = inverse(np.asarray(viewmats, np.float64))
-    between, _ = interpolated(np.arange(last + 1.0), poses, np.clip([place], 0, last))
-    return inverse(between)[0]
-
-
-class Player:
-    """Moves a place along a drive at a steady speed, in a thread of its own."""
-
-    def __init__(self, move: Callable[[float], None]):
-        """Begin stopped; `move` is called with the place, in frames, `RATE` times a second."""
-        self._move = move
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
-
-    def play(self, start: float, last: float, speed: Callable[[], float]) -> None:
-        """Play from a place to the last frame, then from the first one, in a loop.
-
-        `speed` returns frames per second, and is called at every step.
-        """
-        self.stop()
-        self._stop = stop = threading.Event()
-
-        def run() -> None:
-            place, before = start, time.monotonic()
-            while not stop.wait(1 / RATE):
-                now = time.monotonic()
-                place, before = place + (now - before) * speed(), now
-                if place > last:
-                    place = 0.0
-                self._move(place)
-
-        self._thread = threading.Thread(target=run, name="play", daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Stop playing, and wait for the thread to end."""
-        self._stop.set()
-        if self._thread is not None and self._thread is not threading.current_thread():
-            self._thread.join()
-        self._thread = None
-
-
-def frustum_size(views: Sequence[View], space: ViewerSpace) -> float:
-    """Return a size at which frusta of neighbouring views hardly touch, viewer units."""
-    names: dict[str, list[View]] = {}
-    for view in views:
-        names.setdefault(view.camera, []).append(view)
-    centers = [camera_centers(viewmats_of(rows)) for rows in names.values()]
-    steps = [np.linalg.norm(a - b) for places in centers for a, b in pairwise(places)]
-    moved = [step for step in steps if step > 0]
-    step = float(np.median(moved)) * space.unit if moved else 1.0
-    return float(np.clip(0.35 * step, 0.02, 1.5))
-
-
 class Frusta:
     """The photographs' cameras that one browser shows, coloured by exposure."""
 
@@ -220,8 +157,7 @@ class Frusta:
         `on_click` is called with the row of a view whose frustum was clicked.
         """
         self._positions = camera_centers(viewmats_of(views)) * space.unit
-        self._size, self._visible = frustum_size(views, space), False
-        self._usual_size = self._size
+        self._visible = False
         self._near = np.zeros(len(views), bool)
         self._handles = []
         for index, view in enumerate(views):
@@ -232,7 +168,7 @@ class Frusta:
                 f"/cameras/{index}",
                 fov,
                 aspect,
-                scale=self._size,
+                scale=FRUSTUM,
                 thickness=LINE,
                 thickness_units="screen",
                 color=colors[index],
@@ -245,23 +181,17 @@ class Frusta:
             handle.on_click(lambda event, index=index: on_click(index))
             self._handles.append(handle)
 
-    def show(self, visible: bool, scale: float) -> None:
-        """Show or hide all of them, times their usual size."""
-        self._visible, self._size = visible, scale * self._usual_size
-        for handle in self._handles:
-            handle.scale = self._size
+    def show(self, visible: bool) -> None:
+        """Show or hide all of them."""
+        self._visible = visible
         self._apply()
 
     def keep_clear(self, position: Float[np.ndarray, " 3"]) -> None:
         """Hide the frusta that are too close to a camera at a place in viewer units."""
-        near = np.linalg.norm(self._positions - position, axis=1) < TOO_CLOSE * self._size
+        near = np.linalg.norm(self._positions - position, axis=1) < TOO_CLOSE * FRUSTUM
         if (near != self._near).any():
             self._near = near
             self._apply()
-
-    def set_thumbnail(self, index: int, image: UInt8[np.ndarray, "h w 3"]) -> None:
-        """Set the picture of a view's frustum."""
-        self._handles[index].image = image
 
     def _apply(self) -> None:
         for handle, near in zip(self._handles, self._near, strict=True):

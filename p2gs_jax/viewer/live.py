@@ -9,12 +9,10 @@ once, and nothing is tried again before a request or a newly compiled program.
 from __future__ import annotations
 
 import html
-import math
 import sys
 import threading
 import time
 import traceback
-from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -23,24 +21,11 @@ from jaxtyping import Float32
 
 from p2gs_jax.core.text import printable
 from p2gs_jax.errors import UserError
-from p2gs_jax.photometry.display import DisplayTransform
-from p2gs_jax.photometry.metering import meter
 from p2gs_jax.scene.pixels.store import camera_of
 from p2gs_jax.types import Camera
+from p2gs_jax.viewer import pictures
 from p2gs_jax.viewer.camera import BrowserView, Size, browser_view, camera_of_browser
 from p2gs_jax.viewer.panel import Panel
-from p2gs_jax.viewer.pictures import (
-    RenderedFrame,
-    WarpedPhotograph,
-    clipping_legend,
-    depth_legend,
-    limits_of_depth,
-    note,
-    picture_of,
-    stops_legend,
-    to_uint8_fast,
-    warp_photograph,
-)
 from p2gs_jax.viewer.renderer import compilation_order, full_size, next_size, render_sizes
 from p2gs_jax.viewer.settings import Settings, display_of
 from p2gs_jax.viewer.viewed_run import ViewedRun
@@ -48,8 +33,6 @@ from p2gs_jax.viewer.viewed_run import ViewedRun
 # Nothing has changed for this long: at rest, seconds.
 REST_S = 0.3
 JPEG_QUALITY = 85
-# A metered exposure comes this close (1/e) to what is seen within this time, seconds.
-ADAPT_S = 0.5
 NO_PHOTOGRAPH = "No photograph was taken from here: choose one under Camera, Go to."
 
 Request = Literal["look", "camera", "rest"]
@@ -74,52 +57,28 @@ class Darkroom:
     def __init__(self, viewed: ViewedRun, depth_limits: tuple[float, float] | None = None):
         """Begin without a photograph."""
         self.depth_limits = depth_limits
-        self.metered_exposure: float | None = None
         self.photograph_error: str | None = None  # why the last one could not be shown
         self._viewed = viewed
-        self._photograph: tuple[int, Camera, WarpedPhotograph] | None = None
-        # The frame that was metered last, when, and the log exposure that had been reached.
-        self._metered: tuple[RenderedFrame, float, float] | None = None
-
-    def transform(
-        self, frame: RenderedFrame, settings: Settings, *, settled: bool = True
-    ) -> DisplayTransform:
-        """Return a frame's display transform; a metered exposure follows what the frame shows.
-
-        Unless `settled`, the exposure takes its time to adapt.
-        """
-        run = self._viewed.run
-        shown = display_of(run, settings)
-        if not settings.metered:
-            return shown
-        before, now = self._metered, time.monotonic()
-        if before is None or before[0] is not frame or settled:
-            stops = run.metering.exposure_ev(meter(np.asarray(frame.linear), frame.alpha))
-            if before is not None and not settled:
-                share = 1 - math.exp(-(now - before[1]) / ADAPT_S)
-                stops = before[2] + share * (stops - before[2])
-            self._metered = before = (frame, now, stops)
-        self.metered_exposure = 2 ** (before[2] + settings.exposure_ev)
-        return replace(shown, exposure=self.metered_exposure)
+        self._photograph: tuple[int, Camera, pictures.WarpedPhotograph] | None = None
 
     def develop(
-        self, frame: RenderedFrame, settings: Settings, *, settled: bool = True
+        self, frame: pictures.RenderedFrame, settings: Settings
     ) -> Float32[np.ndarray, "h w 3"]:
-        """Return display values of a frame; `settled` as of `transform`."""
+        """Return display values of a frame."""
         if settings.mode == "depth" and self.depth_limits is None:
-            self.depth_limits = limits_of_depth(frame)
+            self.depth_limits = pictures.limits_of_depth(frame)
         taken_as = settings.taken_as
-        return picture_of(
+        return pictures.picture_of(
             frame,
             settings.mode,
-            self.transform(frame, settings, settled=settled),
+            display_of(self._viewed.run, settings),
             depth_limits=self.depth_limits,
             photograph=self._photograph_of(frame) if settings.mode == "split" else None,
             split=settings.split,
             taken_by=None if taken_as is None else camera_of(self._viewed.store, taken_as),
         )
 
-    def _photograph_of(self, frame: RenderedFrame) -> WarpedPhotograph | None:
+    def _photograph_of(self, frame: pictures.RenderedFrame) -> pictures.WarpedPhotograph | None:
         self.photograph_error = None
         index = self._viewed.view_at(frame.camera)
         if index is None:
@@ -131,22 +90,22 @@ class Darkroom:
             except UserError as error:
                 self.photograph_error = error.message
                 return None
-            seen = warp_photograph(ldr, mask, camera_of(store, index), frame.camera)
+            seen = pictures.warp_photograph(ldr, mask, camera_of(store, index), frame.camera)
             self._photograph = kept = (index, frame.camera, seen)
         return kept[2]
 
-    def legend(self, frame: RenderedFrame, settings: Settings) -> str | None:
+    def legend(self, frame: pictures.RenderedFrame, settings: Settings) -> str | None:
         """Return the legend of the last picture as HTML."""
         if settings.mode == "stops":
-            return stops_legend()
-        if settings.mode == "clipping":
-            return clipping_legend()
+            return pictures.stops_legend()
         if settings.mode == "depth" and self.depth_limits is not None:
-            return depth_legend(*self.depth_limits)
+            return pictures.depth_legend(*self.depth_limits)
         if settings.mode == "split" and self._viewed.view_at(frame.camera) is None:
-            return note(NO_PHOTOGRAPH)
+            return pictures.note(NO_PHOTOGRAPH)
         if settings.mode == "split" and self.photograph_error is not None:
-            return note(html.escape(f"The photograph cannot be shown: {self.photograph_error}"))
+            return pictures.note(
+                html.escape(f"The photograph cannot be shown: {self.photograph_error}")
+            )
         return None
 
 
@@ -161,7 +120,7 @@ class LivePicture:
         self._request: Request | None = "camera"
         self._rest_at: float | None = None  # when a picture at rest is due
         self._stopping = False
-        self._frame: RenderedFrame | None = None
+        self._frame: pictures.RenderedFrame | None = None
         self._stale = True  # whether the frame is of an older camera
         self._sharp = False  # whether it was shown at rest, and nothing has changed since
         self._moving: tuple[Size | None, float] = (None, 0.0)  # size and time of the last frame
@@ -245,7 +204,7 @@ class LivePicture:
         if self._frame is None:
             return
         if at_rest:  # done for every frame, the scale would flicker
-            self.darkroom.depth_limits = limits_of_depth(self._frame)
+            self.darkroom.depth_limits = pictures.limits_of_depth(self._frame)
         self._show(self._frame, settings, sharp=at_rest)
         self._sharp = at_rest
         milliseconds = 1e3 * (time.perf_counter() - begin)
@@ -268,8 +227,8 @@ class LivePicture:
         """Return the camera that renders a browser's view."""
         return camera_of_browser(view, view.aspect, size, self._viewed.space)
 
-    def _show(self, frame: RenderedFrame, settings: Settings, *, sharp: bool) -> None:
-        image = to_uint8_fast(self.darkroom.develop(frame, settings, settled=sharp))
+    def _show(self, frame: pictures.RenderedFrame, settings: Settings, *, sharp: bool) -> None:
+        image = pictures.to_uint8_fast(self.darkroom.develop(frame, settings))
         kind = "png" if sharp else "jpeg"
         self._client.scene.set_background_image(image, kind, jpeg_quality=JPEG_QUALITY)
         self._client.flush()
@@ -284,4 +243,4 @@ class LivePicture:
             parts.append(f"compiling {busy[0]} x {busy[1]} ...")
         if failure is not None:
             parts.append(html.escape(failure[:200]))
-        self._panel.set_status(note(" &middot; ".join(parts) or "starting ..."))
+        self._panel.set_status(pictures.note(" &middot; ".join(parts) or "starting ..."))

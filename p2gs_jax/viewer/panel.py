@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 MODES: dict[str, Mode] = {
     "picture": "display",
     "stops (false colour)": "stops",
-    "clipping": "clipping",
     "depth": "depth",
     "split: photo | render": "split",
 }
@@ -30,22 +29,13 @@ NOWHERE = "choose ..."
 KEYS = "Drag to orbit, right-drag to pan, scroll to approach; W A S D Q E fly, arrows turn."
 HINTS = {
     "Show": "The split needs a camera that stands where a photograph was taken.",
-    "Split": "Share of the photograph, from the left.",
     "Exposure": "Stops (EV) from the mean exposure of the training photographs.",
-    "Auto exposure": "The exposure follows what is seen, as the camera's did; the slider adds.",
-    "Gamma": "2.2 is the curve itself; middle grey stays where it is.",
-    "Red / green": "White balance: gain over green in stops (EV).",
-    "Blue / green": "White balance: gain over green in stops (EV).",
     "Vignetting": "Darkens towards the corners as the camera of the matched photo does.",
     "Curve": "The tone curve from exposed light to display values.",
     "Match photo": "Sets all of this as a photograph was taken.",
     "Go to": "Stands where a photograph was taken, and matches its exposure and gamma.",
     "Lock exposure": "Go to, previous, next and split leave exposure, gamma and curve as they are.",
-    "FOV": "Vertical field of view, degrees.",
     "Cameras": "Where photographs were taken; click one to go there.",
-    "Camera size": "Times the usual.",
-    "Speed": "Photographs per second.",
-    "Each photo's exposure": "Plays with the exposure of every photograph, instead of one for all.",
     "Width": "Pixels across, {} to {}; the height follows the window.".format(*SAVED_WIDTHS),
 }
 
@@ -53,8 +43,7 @@ HINTS = {
 class Panel:
     """The controls of one browser.
 
-    Public ones: `speed` of playing, photographs per second; `locked`, whether moving to a view
-    leaves the display transform as it is; `own_exposures`, whether every photograph's is played.
+    `locked` says whether moving to a view leaves the display transform as it is.
     """
 
     def __init__(self, gui: viser.GuiApi, viewed: ViewedRun, actions: BrowserSession):
@@ -69,8 +58,6 @@ class Panel:
             self._add_picture()
         with gui.add_folder("Camera"):
             self._add_camera()
-        with gui.add_folder("Drive", expand_by_default=False):
-            self._add_drive()
         with gui.add_folder("Save", expand_by_default=False):
             self._add_save()
         self.put(start)
@@ -98,19 +85,16 @@ class Panel:
         reach = float(max(8, math.ceil(max(map(abs, evs))) + 2))
         marks = ((-reach, f"{-reach:+g}"), (0.0, "0"), (reach, f"{reach:+g}"))
         self._exposure = self._slider("Exposure", -reach, reach, 0.05, 0.0, marks=marks)
-        self._metered = self._checkbox("Auto exposure", False)
         low = min(1.0, math.floor(10 * min(gammas)) / 10)
         high = max(4.0, math.ceil(10 * max(gammas)) / 10)
         marks = ((low, f"{low:g}"), (2.2, "2.2"), (high, f"{high:g}"))
         self._gamma = self._slider("Gamma", low, high, 0.01, 2.2, marks=marks)
         self._balance: tuple[viser.GuiInputHandle[float], ...] = ()
         if (balance := run.params.photometry.white_balance) is not None:
-            stops = np.asarray(balance) / LN2
-            largest = float(np.abs(stops[:, ::2] - stops[:, 1:2]).max())  # over green
-            most = float(max(2, math.ceil(largest) + 1))
-            marks = ((-most, f"{-most:+g}"), (0.0, "0"), (most, f"{most:+g}"))
+            largest = float(np.abs(np.asarray(balance)).max()) / LN2
+            most = float(math.ceil(2 * largest) + 1)
             self._balance = tuple(
-                self._slider(name, -most, most, 0.01, 0.0, marks=marks)
+                self._slider(name, -most, most, 0.01, 0.0)
                 for name in ("Red / green", "Blue / green")
             )
         self._vignetting = self._checkbox("Vignetting", True, visible=darkens(run.cfg.photometry))
@@ -121,7 +105,6 @@ class Panel:
         look = (self._exposure, self._gamma, self._curve, self._split, self._vignetting)
         for handle in (*look, *self._balance):
             self._when_chosen(handle, lambda _: actions.display_changed())
-        self._when_chosen(self._metered, actions.set_metered)
         self._when_chosen(self._mode, lambda _: actions.mode_changed())
         self._when_chosen(self._match, lambda name: actions.take_display_of(self._index(name)))
 
@@ -133,7 +116,6 @@ class Panel:
         self.locked = self._checkbox("Lock exposure", False)
         fov = self._slider("FOV", 5.0, 150.0, 0.5, 60.0)
         cameras = self._checkbox("Cameras", False)
-        size = self._slider("Camera size", 0.2, 8.0, 0.1, 1.0, visible=False)
         legend = gui.add_html(exposure_legend(min(evs), max(evs)), visible=False)
         self._fov = fov
 
@@ -147,40 +129,13 @@ class Panel:
             actions.go_to((0 if by > 0 else count - 1) if now is None else (now + by) % count)
 
         def show(_: object) -> None:
-            size.visible = legend.visible = cameras.value
-            actions.show_cameras(cameras.value, size.value)
+            legend.visible = cameras.value
+            actions.show_cameras(cameras.value)
 
         self._when_chosen(self._go_to, choose)
         steps.on_click(lambda event: step(event.target.value))
         self._when_chosen(fov, actions.set_fov)
-        for handle in (cameras, size):
-            self._when_chosen(handle, show)
-
-    def _add_drive(self) -> None:
-        viewed, actions = self._viewed, self._actions
-        names = list(dict.fromkeys(view.camera for view in viewed.run.scene.views))
-        ends = {name: float(max(len(viewed.frames(name)) - 1, 1)) for name in names}
-        last = ends[names[0]]
-        self._drive = self._dropdown("Along", names, visible=len(names) > 1)
-        marks = ((0.0, "0"), (last, f"{last:g}"))
-        self._place = self._slider("Frame", 0.0, last, 0.01, 0.0, marks=marks)
-        self.speed = self._slider("Speed", 0.2, 30.0, 0.1, 2.0)
-        self.own_exposures = self._checkbox("Each photo's exposure", False)
-        self._play = self._gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY)
-        self._playing = False
-
-        def choose(name: str) -> None:
-            self._place.value = 0.0
-            self._place.max = ends[name]  # type: ignore
-            actions.set_place(name, 0.0)
-
-        def toggle(_: object) -> None:
-            self.set_playing(not self._playing)
-            actions.play(self._playing)
-
-        self._when_chosen(self._drive, choose)
-        self._when_chosen(self._place, lambda at: actions.set_place(self._drive.value, at))
-        self._play.on_click(toggle)
+        self._when_chosen(cameras, show)
 
     def _add_save(self) -> None:
         low, high = SAVED_WIDTHS
@@ -215,13 +170,11 @@ class Panel:
             vignetting=self._vignetting.value,
             mode=MODES[self._mode.value],
             split=self._split.value,
-            metered=self._metered.value,
         )
 
     def put(self, settings: Settings) -> None:
         """Set the controls to a display transform; the mode stays."""
         index = self._taken_as = settings.taken_as
-        self._metered.value = settings.metered
         self._exposure.value = settings.exposure_ev
         self._gamma.value = settings.gamma
         for handle, ev in zip(self._balance, settings.balance_ev or (), strict=False):
@@ -234,21 +187,6 @@ class Panel:
         """Set the controls to the camera of a view."""
         self._go_to.value = self._names[index]
         self._fov.value = degrees
-
-    def put_place(self, place: float) -> None:
-        """Set the slider to a place on the drive."""
-        self._place.value = min(place, self._place.max)  # type: ignore
-
-    @property
-    def drive(self) -> tuple[str, float]:
-        """Name of the camera whose drive is played, and the place on it."""
-        return self._drive.value, self._place.value
-
-    def set_playing(self, playing: bool) -> None:
-        """Set the button to `Pause` or `Play`."""
-        self._playing = playing
-        self._play.label = "Pause" if playing else "Play"
-        self._play.icon = viser.Icon.PLAYER_PAUSE if playing else viser.Icon.PLAYER_PLAY
 
     def set_status(self, html: str) -> None:
         """Show a status line."""

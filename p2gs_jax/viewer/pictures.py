@@ -16,11 +16,8 @@ from jaxtyping import Array, Bool, Float, Float32, UInt8
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.false_color import (
     DEPTH_MAP,
-    OVER,
     STOPS,
     STOPS_MAP,
-    UNDER,
-    clipping_overlay,
     depth_color,
     false_color,
 )
@@ -29,7 +26,7 @@ from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import places
 from p2gs_jax.types import Camera
 
-Mode = Literal["display", "stops", "clipping", "depth", "split"]
+Mode = Literal["display", "stops", "depth", "split"]
 # Exposed radiance at 0 stops.
 MIDDLE_GREY = 0.18
 # Percentiles of depth at the ends of the colour scale.
@@ -90,8 +87,6 @@ def picture_of(
     if taken_by is not None and transform.vignetting:
         positions = places_in(taken_by, frame.camera)
     ldr = develop(frame.linear, transform, positions, frame.alpha)
-    if mode == "clipping":
-        return clipping_overlay(ldr)
     return ldr if mode == "display" or photograph is None else split_picture(photograph, ldr, split)
 
 
@@ -216,13 +211,6 @@ def stops_legend() -> str:
     ]
     text = "stops from middle grey at this exposure; a box holds the stop above its number"
     return note(f'<div style="display:flex">{"".join(cells)}</div>', text)
-
-
-def clipping_legend() -> str:
-    """Return the legend of the clipping stripes as HTML."""
-    style = "display:inline-block;width:1em;height:0.8em;background:"
-    over, under = (f'<span style="{style}{_css(color)}"></span>' for color in (OVER, UNDER))
-    return note(f"{over} a channel is at its top &ensp; {under} all are at the bottom")
 
 
 def depth_legend(near: float, far: float) -> str:

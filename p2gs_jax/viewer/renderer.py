@@ -19,13 +19,7 @@ from jaxtyping import Array, Bool
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.errors import UserError
-from p2gs_jax.render.capacity import (
-    ANYWHERE,
-    bucket,
-    compiled_renderer,
-    count_needed,
-    make_renderer,
-)
+from p2gs_jax.render import capacity
 from p2gs_jax.types import Camera, Gaussians, Render
 from p2gs_jax.viewer.camera import Size
 from p2gs_jax.viewer.pictures import RenderedFrame
@@ -68,7 +62,7 @@ class Renderer:
         """
         self._scene, self._cfg, self._probes = (gaussians, alive), cfg, probes
         self._on_change, self._warm_up = on_change, warm_up
-        self._render_any = make_renderer(cfg)
+        self._render_any = capacity.make_renderer(cfg)
         self._jobs: dict[Size, Future[Callable[..., Render]]] = {}
         self._lock, self._one_frame = threading.RLock(), threading.Lock()
         self._compiler = ThreadPoolExecutor(1, "compile")
@@ -137,11 +131,9 @@ class Renderer:
 
         Raises a UserError where it would need more memory than is reasonable.
         """
-        if int(count_needed(*self._scene, camera, cfg=self._cfg)) > MOST_ENTRIES:
-            raise UserError(
-                f"{camera.width} x {camera.height} pixels from here need too much memory.",
-                fix="move away from what is close, or choose a smaller width",
-            )
+        if int(capacity.count_needed(*self._scene, camera, cfg=self._cfg)) > MOST_ENTRIES:
+            why = f"{camera.width} x {camera.height} pixels from here need too much memory."
+            raise UserError(why, fix="move away from what is close, or choose a smaller width")
         with self._one_frame:
             return _frame(self._render_any(*self._scene, camera), camera)
 
@@ -156,10 +148,10 @@ class Renderer:
         """Return the program of a size, with room for what probes and a given view need."""
         self._on_change()
         cameras = [probe(size) for probe in self._probes]
-        counts = [int(count_needed(*self._scene, c, cfg=self._cfg)) for c in cameras]
-        entries = bucket(max(needed, *counts), ANYWHERE.first)
+        counts = [int(capacity.count_needed(*self._scene, c, cfg=self._cfg)) for c in cameras]
+        entries = capacity.bucket(max(needed, *counts), capacity.ANYWHERE.first)
         static = {"cfg": self._cfg, "capacity": entries}
-        run = compiled_renderer().lower(*self._scene, cameras[0], **static).compile()
+        run = capacity.compiled_renderer().lower(*self._scene, cameras[0], **static).compile()
         with self._one_frame:
             result = jax.block_until_ready(run(*self._scene, cameras[0]))
         self._warm_up(result)

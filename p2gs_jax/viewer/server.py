@@ -152,19 +152,17 @@ def check_address(host: str, port: int) -> None:
             host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
         )[0]
     except (OSError, UnicodeError) as error:
-        raise UserError(
-            f"--host {host!r} is not a valid address: {error}.", fix="leave it out"
-        ) from None
+        fix = "leave it out"
+        raise UserError(f"--host {host!r} is not a valid address: {error}.", fix=fix) from None
     with socket.socket(family, kind, protocol) as probe:
         if os.name == "posix":
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind(address)
         except OSError as error:
-            raise UserError(
-                f"cannot listen on {host}, port {port}: {error.strerror or error}.",
-                fix=f"choose another with --port, such as --port {port + 1}, or 0 for any free one",
-            ) from None
+            why = f"cannot listen on {host}, port {port}: {error.strerror or error}."
+            fix = f"choose another with --port, such as --port {port + 1}, or 0 for any free one"
+            raise UserError(why, fix=fix) from None
 
 
 @contextmanager

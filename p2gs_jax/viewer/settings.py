@@ -23,14 +23,13 @@ class Settings:
     """
 
     gamma: float
-    exposure_ev: float = 0.0  # stops from the mean training exposure, or from the metered one
+    exposure_ev: float = 0.0  # stops from the mean training exposure
     curve: ChosenCurve = "run"  # what the fit chose
     taken_as: int | None = None
     balance_ev: tuple[float, float] | None = None  # of red and blue over green, where modelled
     vignetting: bool = True  # whether that camera's is shown
     mode: Mode = "display"
     split: float = 0.5  # share of the photograph in `split`
-    metered: bool = False  # whether the exposure follows what is seen
 
 
 def common_settings(run: Run, before: Settings | None = None) -> Settings:
@@ -49,12 +48,7 @@ def settings_of_view(run: Run, index: int, before: Settings) -> Settings:
 def _taken(before: Settings, shown: DisplayTransform, ev: float, view: int | None) -> Settings:
     balance = None if shown.white_balance is None else shown.white_balance_ev
     new = {"gamma": shown.gamma, "exposure_ev": ev, "taken_as": view, "balance_ev": balance}
-    return replace(before, curve="run", metered=False, **new)
-
-
-def same_display(a: Settings, b: Settings) -> bool:
-    """Return whether two settings have the same display transform, whatever their mode."""
-    return replace(a, mode=b.mode, split=b.split) == b
+    return replace(before, curve="run", **new)
 
 
 def display_of(run: Run, settings: Settings) -> DisplayTransform:

@@ -14,7 +14,6 @@ from packaging.requirements import Requirement
 import p2gs_jax.render as rendering
 from p2gs_jax.cli import doctor
 from p2gs_jax.cli.doctor import Doctor
-from p2gs_jax.core import runtime
 
 PROJECT = Path(__file__).resolve().parents[2] / "pyproject.toml"
 
@@ -24,7 +23,6 @@ def test_everything_here_is_well(capsys):
     text = capsys.readouterr().out
     assert "All that a fit needs is there." in text
     assert "Self-test    ok: three Gaussians" in text
-    assert re.search(r"Cores +\d+\nMemory +\d+\.\d GiB, \d+\.\d GiB of it available\n", text)
     assert re.search(r"\bjax \d", text)
     assert "BROKEN" not in text
 
@@ -94,23 +92,3 @@ def test_features_say_what_to_install(monkeypatch):
     assert "p2gs-jax[viewer]" in found["view"].text
     monkeypatch.setattr(doctor.shutil, "which", lambda name: f"/usr/bin/{name}")
     assert "p2gs-jax[cuda]" in doctor.check_devices()[0].text
-
-
-def test_cores_of_a_container(tmp_path, monkeypatch):
-    monkeypatch.setattr(doctor.memory, "CGROUP", tmp_path)
-    free = doctor.cores()
-    (tmp_path / "cpu.max").write_text("100000 100000\n")
-    assert doctor.cores() == 1
-    (tmp_path / "cpu.max").write_text("max 100000\n")
-    assert doctor.cores() == free
-
-
-def test_an_unwritable_cache_is_said(monkeypatch, tmp_path):
-    monkeypatch.setattr(runtime, "use_compile_cache", lambda: None)
-    monkeypatch.setattr(runtime, "cache_folder", lambda: tmp_path)
-    (tmp_path / "program").write_bytes(b"x" * 2_000_000)
-    assert doctor.check_cache().text.startswith("2 MB of at most")
-    monkeypatch.setattr(doctor.os, "access", lambda folder, mode: False)
-    assert "JAX_COMPILATION_CACHE_DIR" in doctor.check_cache().text
-    monkeypatch.setattr(runtime, "cache_folder", lambda: None)
-    assert "nothing is kept" in doctor.check_cache().text

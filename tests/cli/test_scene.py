@@ -8,9 +8,7 @@ import pytest
 from made_drive import make_recording
 from tiny_scene import make_scene
 
-from p2gs_jax.config import DataConfig
 from p2gs_jax.scene import survey as surveys
-from p2gs_jax.scene.survey import labels_of, survey
 
 
 @pytest.fixture
@@ -26,18 +24,19 @@ def test_a_drive_is_counted(drive, succeeded, monkeypatch):
     monkeypatch.setenv("COLUMNS", "140")
     said = succeeded("scene", drive.root, "--data.no-own-car")
     for text in (
-        "31 photographs of 4 cameras in 8 frames, 0.7 s, 7.0 m driven.",
+        "31 photographs of 4 cameras.",
+        "8 frames, 0.7 s, 7.0 m driven.",
         "1 photograph missing in these frames.",
-        "8 LiDAR sweeps.",
+        "LiDAR: ",
         "Boxes: 2 tracked, 1 moving: 2 Car (1 moving).",
-        "It has no exposures in EXIF.",
+        "No exposures in EXIF.",
         "96 x 64",
-        "90 degrees",
     ):
         assert text in said
     said = succeeded("scene", drive.root, "--cameras", "front", "--frames", "0:4")
     said = " ".join(said.split())
-    assert "3 photographs of 1 camera in 4 frames" in said
+    assert "3 photographs of 1 camera. " in said
+    assert " 4 frames, " in said
     assert "own car: not seen by front" in said
 
 
@@ -46,8 +45,7 @@ def test_other_scenes_are_counted(tmp_path, succeeded):
     said = succeeded("scene", root)
     assert "(colmap): 3 photographs of 1 camera." in said
     assert "150 points." in said
-    found = survey(root, DataConfig())
-    assert (found.frames, labels_of(found.scene)) == (None, [])
+    assert "frames" not in said
 
 
 def test_photographs_alone_start_no_structure_from_motion(tmp_path, succeeded, monkeypatch):
@@ -55,5 +53,5 @@ def test_photographs_alone_start_no_structure_from_motion(tmp_path, succeeded, m
     for k, width in enumerate((40, 40, 50)):
         cv2.imwrite(str(tmp_path / f"{k}.png"), np.zeros((30, width, 3), np.uint8))
     said = succeeded("scene", tmp_path)
-    for text in ("3 photographs, and nothing else", "40 x 30", "It has no cameras, no points."):
+    for text in ("(images): 3 photographs", "40 x 30", "There is nothing else"):
         assert text in said

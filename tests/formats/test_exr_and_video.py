@@ -14,10 +14,6 @@ from p2gs_jax.config import CameraFormation, PhotometryConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.exr import read_exr, write_exr
 from p2gs_jax.formats.false_color import (
-    OVER,
-    UNDER,
-    clipping,
-    clipping_overlay,
     depth_color,
     false_color,
     luminance,
@@ -174,27 +170,13 @@ def test_colours_step_at_whole_stops_and_near_is_bright():
     rises = np.diff(shown) > 0
     assert rises.tolist() == [False, False, True, False, True, True, True, False]
     depth, alpha = np.array([[2.0, 8.0, 0.0]]), np.array([[1.0, 1.0, 0.0]])
-    shown = depth_color(depth, alpha)
+    limits = (2.0, 10.0)
+    shown = depth_color(depth, alpha, limits)
     assert luminance(shown)[0, 0] > luminance(shown)[0, 1] > 0
     assert not shown[0, 2].any()
     # The same surface, half covered: the expected depth counts.
-    half = depth_color(depth * 0.6, alpha * 0.6)
+    half = depth_color(depth * 0.6, alpha * 0.6, limits)
     np.testing.assert_allclose(half, shown)
-
-
-def test_what_clips_in_eight_bits_is_striped_and_nothing_else():
-    ldr = np.array([[[0, 0, 0], [0, 0, 0.01], [0.5, 0.5, 0.999], [1, 0.2, 0.2]]])
-    over, under = clipping(ldr)
-    assert over.tolist() == [[False, False, True, True]]
-    assert under.tolist() == [[True, False, False, False]]
-    ldr = np.full((24, 36, 3), 0.5, np.float32)
-    ldr[:, :12], ldr[:, 24:] = 1, 0
-    shown = clipping_overlay(ldr)
-    np.testing.assert_array_equal(shown[:, 12:24], ldr[:, 12:24])
-    for part, color, value in ((shown[:, :12], OVER, 1), (shown[:, 24:], UNDER, 0)):
-        striped = np.all(np.isclose(part, color), axis=-1)
-        assert 0.3 < striped.mean() < 0.7
-        assert np.all(part[~striped] == value)
 
 
 def frames_of(path):

@@ -6,7 +6,6 @@ from cameras import shot, turned
 
 from p2gs_jax.errors import UserError
 from p2gs_jax.paths.files import read_cameras, write_cameras
-from p2gs_jax.scene.rigid import inverse
 
 GOOD = {
     "viewmat": np.eye(4).tolist(),
@@ -80,39 +79,3 @@ def test_other_files_missing_ones_and_equal_names_are_refused(tmp_path):
     twice = [{**GOOD, "name": "x"}, GOOD, {**GOOD, "name": "x"}]
     with pytest.raises(UserError, match="0 and 2"):
         read_cameras(save(path, twice))
-
-
-def nerfstudio(**change):
-    pose = inverse(turned(30, (1, 2, 3))) @ np.diag([1.0, -1, -1, 1])
-    entry = {"camera_to_world": pose.ravel().tolist(), "fov": 60, "aspect": 1.5}
-    data = {
-        "camera_type": "perspective",
-        "render_height": 100,
-        "render_width": 150,
-        "camera_path": [entry, {**entry, **change.pop("second", {})}],
-        "fps": 24,
-    }
-    return {**data, **change}
-
-
-def test_a_nerfstudio_path_is_read(tmp_path):
-    shots = read_cameras(save(tmp_path / "camera_path.json", nerfstudio()))
-    assert len(shots) == 2
-    np.testing.assert_allclose(shots[0].viewmat, turned(30, (1, 2, 3)), atol=1e-12)
-    f = 50 / np.tan(np.deg2rad(30))
-    np.testing.assert_allclose(shots[0].K, [[f, 0, 75], [0, f, 50], [0, 0, 1]])
-    assert (shots[0].width, shots[0].height) == (150, 100)
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"camera_type": "equirectangular"}, "equirectangular"),
-        ({"render_width": None}, "render_width"),
-        ({"second": {"fov": 0}}, "camera 1 has no fov"),
-        ({"second": {"camera_to_world": [1, 2]}}, "camera 1 has a camera_to_world"),
-    ],
-)
-def test_errors_of_a_nerfstudio_path(tmp_path, change, words):
-    with pytest.raises(UserError, match=words):
-        read_cameras(save(tmp_path / "p.json", nerfstudio(**change)))

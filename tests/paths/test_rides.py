@@ -97,7 +97,7 @@ def test_a_circle_around_what_all_cameras_look_at_upright():
     cameras = around(np.arange(0, 360, 30))
     circle = find_orbit(cameras, cameras, NO_POINTS)
     np.testing.assert_allclose(circle.focus, FOCUS, atol=1e-9)
-    assert "full circle" in circle.description().lower()
+    assert circle.sway == pytest.approx(np.pi)
     shots = orbit(circle, cameras, 36)
     radius, azimuth = seen_from(FOCUS, shots)
     np.testing.assert_allclose(radius, 5)
@@ -117,7 +117,7 @@ def test_cameras_on_one_side_give_an_arc_over_what_they_cover():
     _, azimuth = seen_from(FOCUS, orbit(circle, cameras, 40))
     assert (azimuth % 360).min() == pytest.approx(150)
     assert (azimuth % 360).max() == pytest.approx(250)
-    assert "50 degrees" in circle.description()
+    assert np.rad2deg(circle.sway) == pytest.approx(50)
 
 
 @pytest.mark.parametrize("yaws", [(0,), (-45, 0, 45)])
@@ -125,7 +125,6 @@ def test_a_vehicle_sways_about_its_middle_view(yaws):
     rig = {y: [shot(turned(y, (0, 0, z))) for z in range(9)] for y in yaws}
     points = np.array([[0.1, 0, 24.0], [-0.2, 0, 14], [0, 0, 34], [0, 0, -50]])
     circle = find_orbit([s for shots in rig.values() for s in shots], rig[0], points)
-    assert not circle.met
     np.testing.assert_allclose(circle.focus, [0, 0, 24], atol=1e-6)
     shots = orbit(circle, rig[0], 8)
     np.testing.assert_allclose(inverse(shots[0].viewmat)[:3, 3], [0, 0, 4], atol=1e-6)
@@ -134,7 +133,6 @@ def test_a_vehicle_sways_about_its_middle_view(yaws):
     aside = [inverse(s.viewmat)[0, 3] for s in shots]
     assert max(aside) == pytest.approx(20 * np.sin(np.deg2rad(10)), rel=1e-6)
     assert min(aside) == pytest.approx(-max(aside))
-    assert "no common point" in circle.description()
 
 
 def test_odd_cameras_still_give_an_orbit():

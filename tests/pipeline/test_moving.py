@@ -101,7 +101,7 @@ def test_views_are_rendered_at_their_own_time(run):
         assert (changed & ~inside).sum() < 0.1 * changed.sum()
 
 
-def test_only_objects_and_moved_ones(run):
+def test_only_objects(run):
     camera = run.camera(4)
     alone = run.only_objects()
     assert alone.params.gaussians.capacity == (run.owner == 0).sum()
@@ -109,15 +109,6 @@ def test_only_objects_and_moved_ones(run):
     inside = object_mask(run.scene.views[4], run.scene.objects, camera.width, camera.height, 0.4)
     assert alpha[inside].max() > 0.5
     assert alpha[~inside].mean() < 0.02
-    # Forward is to the right of these cameras.
-    elsewhere = alone.with_moved("box", (1.0, 0, 0))
-    moved = np.asarray(elsewhere.render(elsewhere.camera(4)).alpha)
-    columns = np.arange(camera.width) + 0.5
-    shift = np.average(columns, weights=moved.sum(0)) - np.average(columns, weights=alpha.sum(0))
-    depth = pose_at(run.scene.views[4].time)[2, 3]
-    assert shift == pytest.approx(110.0 / depth, rel=0.25)
-    with pytest.raises(UserError, match="box-1"):
-        run.with_moved("lorry", (0, 0, 0))
     with pytest.raises(UserError, match="no object"):
         dataclasses.replace(run, owner=None, moving=None).only_objects()
 
@@ -125,7 +116,6 @@ def test_only_objects_and_moved_ones(run):
 def test_the_command_renders_what_moves(run, tmp_path, succeeded, refused):
     base = ("render", run.folder, "--split", "test", "--camera", "cam0")
     options = {"all": (), "without": ("--without-objects",), "only": ("--only-objects",)}
-    options |= {"moved": ("--move-object", "box-1", "-0.5", "0", "0")}
     # The cameras of a path can be rendered again, as they were.
     options |= {"drive": ("--path", "drive", "--frames", "3")}
     options |= {"again": ("--path", tmp_path / "drive" / "cameras.json")}
@@ -133,18 +123,17 @@ def test_the_command_renders_what_moves(run, tmp_path, succeeded, refused):
     options["bare"] = (*options["wide"], "--without-objects")
     contents = {}
     for name, extra in options.items():
-        words = base if name in ("all", "without", "only", "moved", "drive") else base[:2]
+        words = base if name in ("all", "without", "only", "drive") else base[:2]
         succeeded(*words, *extra, "--out", tmp_path / name)
         contents[name] = [p.read_bytes() for p in sorted((tmp_path / name).rglob("*.exr"))]
         assert contents[name]
-    assert len({contents[name][0] for name in ("all", "without", "only", "moved")}) == 4
+    assert len({contents[name][0] for name in ("all", "without", "only")}) == 3
     assert contents["again"] == contents["drive"]
     assert contents["wide"][0] != contents["bare"][0]
     shots = json.loads((tmp_path / "drive" / "cameras.json").read_text())
     assert [s["time"] for s in shots] == sorted(s["time"] for s in shots)
     assert shots[0]["time"] == 0.0
     refused(*base, "--without-objects", "--only-objects", "--out", tmp_path / "x")
-    refused(*base, "--move-object", "box-1", "nan", "0", "0", "--out", tmp_path / "x")
 
 
 def test_exports_hold_the_middle_of_the_drive(run, tmp_path, succeeded):

@@ -1,12 +1,12 @@
-"""`p2gs-jax compare`: one table, one page."""
+"""`p2gs-jax compare`: one table."""
 
 import re
 
 import pytest
-from page_tools import HOSTILE, Markup, check_in_a_browser, copy_run, edit, headings
+from page_tools import HOSTILE, copy_run, edit
 
 from p2gs_jax.report import compare
-from p2gs_jax.report.compare import compare_runs, comparison_page, to_markdown
+from p2gs_jax.report.compare import compare_runs, to_markdown
 
 
 @pytest.fixture(scope="module")
@@ -55,31 +55,18 @@ def test_tables_hold_every_run_and_mark_the_best(runs):
     assert rms == pytest.approx(0.1, abs=1e-6)
 
 
-def test_command_page_and_markdown(runs, tmp_path, monkeypatch, run_command):
-    out = tmp_path / "pages" / "compare.html"
+def test_command_and_markdown(runs, tmp_path, monkeypatch, run_command):
+    out = tmp_path / "tables" / "compare.md"
     code, printed = run_command("compare", *runs, "--out", out)
     assert code == 0
     assert all(words in printed for words in ("training PSNR", "train.seed", "* best"))
-    text = out.read_text()
-    assert headings(text) == [
-        *("Scores", "Options that differ", "Exposures against each other"),
-        "The same held-out views",
-    ]
-    assert text.count("data:image/jpeg") == 2 * 3
-    table = out.with_suffix(".md").read_text()
+    table = out.read_text()
     assert "| preset | robust | paper |" in table
     assert re.search(r"\| training PSNR, dB \| [\d.]+ \\\* \| [\d.]+ \|", table)
     assert "differ by 0.100 stops" in table
     # No star is announced where scores do not compare.
     monkeypatch.setattr(compare, "_same_scene", lambda first, other: False)
     assert "* best" not in run_command("compare", *runs, "--out", out)[1]
-
-
-@pytest.mark.parametrize("width", [300, 1600])
-def test_in_a_browser(browser, runs, tmp_path, width):
-    path = tmp_path / "compare.html"
-    path.write_text(comparison_page(compare_runs([*runs, runs[0]])), encoding="utf-8")
-    check_in_a_browser(browser, path, width)
 
 
 def test_runs_of_different_scenes_get_a_table_and_a_sentence(runs, tmp_path):
@@ -94,8 +81,6 @@ def test_runs_of_different_scenes_get_a_table_and_a_sentence(runs, tmp_path):
     assert "different scenes" in found.remarks[0]
     assert found.apart == ()
     assert all(r.best == frozenset() for r in found.scores)
-    assert "different scenes" in comparison_page(found)
-    assert "data:image" not in comparison_page(found)
 
 
 def test_an_unfinished_run_has_empty_cells_and_runs_of_one_name_are_told_apart(runs, tmp_path):
@@ -118,14 +103,12 @@ def test_one_run_is_not_enough(runs, run_command):
         assert "to compare" in printed
 
 
-def test_names_are_text_in_the_page_and_in_markdown(runs, tmp_path):
+def test_names_are_text_in_markdown(runs, tmp_path):
     odd = copy_run(runs[1], tmp_path / "run|<b>`x`")
     edit(odd / "config.json", lambda c: c.update(scene=f"/gone/{HOSTILE}"))
     edit(odd / "config.json", lambda c: c["fit"].update(preset=HOSTILE))
     edit(odd / "photometry.json", lambda p: p["curve"].update(name=HOSTILE))
     found = compare_runs([runs[0], odd])
-    plain = comparison_page(compare_runs(runs))
-    assert Markup(comparison_page(found)).elements <= Markup(plain).elements
     text = to_markdown(found)
     # Of what Markdown would read, every sign is escaped.
     assert not re.search(r"(?<!\\)[<`\[]", text)

@@ -20,9 +20,9 @@ from p2gs_jax.core.progress import Silent
 from p2gs_jax.formats.ply import write_radiance
 from p2gs_jax.report import findings
 from p2gs_jax.report.charts import SOURCES, VARIABLES, Series, panels_chart
-from p2gs_jax.report.measurements import SceneMeasurements, measure_scene
+from p2gs_jax.report.measurements import measure_scene
 from p2gs_jax.report.photometry_sections import exposure_section
-from p2gs_jax.report.pictures import GAIN, dynamic_range, jpeg, signed_difference
+from p2gs_jax.report.pictures import GAIN, jpeg, signed_difference
 from p2gs_jax.report.run_files import RunFiles, read_run
 from p2gs_jax.report.run_sections import depth_section, parts_section
 from p2gs_jax.run.decisions import Decisions
@@ -47,8 +47,8 @@ def run(finished_run):
     return files
 
 
-def warnings(run, clipped=None):
-    return dict(findings.run_warnings(run, SceneMeasurements(clipped=clipped or {})))
+def warnings(run):
+    return dict(findings.run_warnings(run))
 
 
 def put(value, *path):
@@ -98,7 +98,6 @@ WARNINGS = [
     (first(exposure=None, exposure_ev=None), "Views without an exposure", (NAME,)),
     (exif, "EXIF disagrees with the pixels", ("{2} -0.80", "In 1 view of 4")),
     (first(exposure_ev_error=0.4), "Exposures are only roughly known", ("{0} 0.40",)),
-    (first(exposure_ev_start=9.0), "Exposures left their start", ("{0} -",)),
     (put(1200, *CROWDED), "The Gaussians ran out of room", ("1,200",)),
     (rising, "Not finished improving", ("rose by 1.0 dB",)),
 ]
@@ -116,9 +115,6 @@ UNPROVEN = {
     "nothing": lambda run: None,
     "noise": lambda run: rising(run, slope=0, noise=3),
     "EXIF that agrees": lambda run: exif(run, off=0),
-    "uncertain drift": lambda run: run.train[3].update(
-        exposure_ev_start=run.train[3]["exposure_ev"] - 0.2, exposure_ev_error=0.09
-    ),
 }
 
 
@@ -128,55 +124,30 @@ def test_what_proves_nothing_gives_no_warning(run, change):
     assert warnings(run) == {}
 
 
-def test_clipped_photographs_are_named_and_many_are_counted(run):
-    found = warnings(run, {"a": 0.4, "b": 0.01})["Clipped photographs"]
-    assert "a 40%" in found
-    assert "1 view of the 2" in found
-    many = warnings(run, {f"{i}.png": 0.5 for i in range(9)})["Clipped photographs"]
-    assert "and 4 more" in many
-
-
-def test_a_fit_records_where_it_started(finished_run):
-    for view in read_run(finished_run).train:
-        assert view["exposure_ev_start"] == pytest.approx(view["exposure_ev"], abs=0.1)
-        assert view["observations"] > 15
-
-
-def test_the_summary_is_three_sentences(run):
-    what, model, good = findings.summary_sentences(run, SceneMeasurements())
-    split = run.metrics.pop("split")
-    assert what.startswith(f"4 photographs of scene by 1 camera (2 more were held out: {split})")
-    assert "(2 more were held out)" in findings.summary_sentences(run, SceneMeasurements())[0]
+def test_a_sentence_says_what_was_modelled(run):
+    model = findings.modelled(run)
     assert "an exposure per view under the sRGB tone curve" in model
     assert "the simplest choice that predicts" in model
     del run.metrics["photometry"]
-    assert (
-        "no shared points to choose by" in findings.summary_sentences(run, SceneMeasurements())[1]
-    )
+    assert "no shared points to choose by" in findings.modelled(run)
     assert [findings.duration(s) for s in (12.4, 125, 7300)] == ["12 s", "2 min 5 s", "2 h 1 min"]
-    assert good == "Held-out photographs are met at 28.0 dB (training photographs at 30.0 dB)."
     run.photometry["curve"]["name"] = "linear"
     run.photometry["model"] = "constant"
     run.options["preset"] = "3dgs"
-    assert "models no camera" in findings.summary_sentences(run, SceneMeasurements())[1]
-    run.metrics.clear()
-    assert "metrics.json is missing" in findings.summary_sentences(run, SceneMeasurements())[2]
+    assert "models no camera" in findings.modelled(run)
 
 
 def grey(values):
     return np.repeat(np.asarray(values, np.float32)[..., None], 3, -1)
 
 
-def test_pictures_are_differences_in_grey_shrunk_and_measured_in_stops():
+def test_pictures_are_differences_in_grey_and_shrunk():
     shown = signed_difference(grey([[0.5, 0.6, 0.4, 0.5 + 1 / GAIN]]), grey([[0.5] * 4]))
     np.testing.assert_allclose(shown[0, :, 0], [0.5, 0.7, 0.3, 1.0], atol=1e-5)
     shown = pictures(jpeg(np.full((40, 1200, 3), np.nan, np.float32), "a", longest=600))["a"]
     assert shown.shape == (20, 600, 3)
     assert shown.max() == 0
     assert 'alt="&quot;&lt;&amp;"' in jpeg(grey([[0.0]]), '"<&')
-    values = np.repeat(2.0 ** np.arange(0, 8.0), 100).reshape(8, 100)
-    assert dynamic_range(grey(values)) == pytest.approx(7.0, abs=0.01)
-    assert dynamic_range(np.zeros((4, 4, 3))) == 0.0
 
 
 def test_charts_are_in_the_page_s_colours_and_missing_values_break_a_line():
@@ -307,9 +278,6 @@ def test_pairs_a_stop_apart_meet_when_developed_alike_also_in_the_picture(wall_r
         assert abs(pair.seam.step_ev) < 0.02
     assert found.tried_pairs == 2
     assert found.missing == ()
-    assert found.clipped == {f"{i}.png": 0.0 for i in range(3)}
-    # Nothing was held out, so training views are rendered.
-    assert [s.split for s in found.comparisons] == ["train"] * 3
     for image, limits in ((found.picture.before, (0.1, 1)), (found.picture.after, (0, 0.02))):
         inner, middle = image[8:-8], image.shape[1] // 2
         step = abs(float(np.median(inner[:, middle] - inner[:, middle - 1])))

@@ -24,9 +24,8 @@ from p2gs_jax.report.report import report_page, write_report
 from p2gs_jax.report.run_files import read_run
 
 HEADINGS = [
-    *("What to watch", "What was modelled, and why", "Exposures", "Gamma", "Tone curve"),
-    *("Seams before and after", "Held-out views", "Radiance in stops", "Scores", "Training"),
-    *("Timings and counts", "Configuration"),
+    *("What to watch", "What was modelled, and why", "Exposures", "Tone curve"),
+    *("Seams before and after", "Held-out views", "Scores", "Training", "Configuration"),
 ]
 
 
@@ -66,7 +65,6 @@ def full_page(run, tmp_path_factory):
         tried_pairs=len(pairs),
         shown=pairs[0],
         picture=SeamPicture(dark, light, left_first=False),
-        clipped={names[0]: 0.5},
     )
     path = tmp_path_factory.mktemp("full") / "report.html"
     path.write_text(report_page(files, scene), encoding="utf-8")
@@ -82,8 +80,6 @@ def test_every_section_is_there_says_what_the_run_says_and_fetches_nothing(page,
     assert "<script" not in page
     assert len(page) < 3e6
     text, files = words_of(page), read_run(run)
-    held_out = f"2 more were held out: {files.metrics['split']}"
-    assert f"4 photographs of scene by 1 camera ({held_out}) were fitted" in text
     assert f"{files.number('test', 'exposure_fitted', 'psnr'):.1f} dB" in text
     assert f"{files.number('train', 'psnr'):.2f}" in text
     assert f"{int(files.number('counts', 'gaussians')):,}" in text
@@ -104,14 +100,13 @@ def test_pictures_are_the_run_s(page, run):
         assert np.mean(np.abs(grey[0] - grey[1])) < 4
         difference = shown[f"Difference at {files.name}"]
         assert np.ptp(difference.astype(int), axis=-1).max() <= 2  # grey
-    assert any(alt.endswith("in stops") for alt in shown)
 
 
 @pytest.mark.parametrize("width", [300, 760, 1600])
 def test_in_a_browser(browser, full_page, width):
     found = check_in_a_browser(browser, full_page, width)
     assert found["headings"] == HEADINGS
-    assert len(found["images"]) >= 9
+    assert len(found["images"]) >= 8
 
 
 def test_seams_are_shown_with_their_numbers(full_page, run):
@@ -144,13 +139,7 @@ def test_what_is_missing_is_reported_and_not_fatal(run, tmp_path, lost):
     assert f"{lost} is missing" in words_of(page.read_text())
 
 
-def test_without_held_out_files_training_views_are_rendered(run, tmp_path):
-    poor = copy_run(run, tmp_path / "run")
-    shutil.rmtree(poor / "renders")
-    text = write_report(poor).read_text()
-    assert {"Training views", "Radiance in stops"} <= set(headings(text))
-    assert any(f"Render of {v['image']}" in pictures(text) for v in read_run(run).train)
-    # A configuration alone gives a page.
+def test_a_configuration_alone_gives_a_page(run, tmp_path):
     shutil.copy(run / "config.json", tmp_path / "config.json")
     assert {"What to watch", "Configuration"} <= set(headings(write_report(tmp_path).read_text()))
 
@@ -203,14 +192,14 @@ def test_what_a_run_knows_is_drawn(full_page):
     for said in (
         *("RMS error 0.000 stops", "Crosses, dotted: EXIF", "EXIF disagrees with the pixels"),
         *("two standard errors, at most ±0.08 stops", "camera front", "camera rear"),
-        *("turns the tone curve", "γ 2.10", "γ 2.50"),
+        *("γ 2.10", "γ 2.50"),
         *("images at 1/2 from step 250", "full-size images from step 500"),
     ):
         assert said in text
     assert "all photographs" not in text
 
 
-def test_cameras_of_one_photograph_share_a_panel_and_what_was_not_modelled_is_said(run):
+def test_cameras_of_one_photograph_share_a_panel(run):
     files = read_run(run)
     files.photometry["model"] = "view_exposure"
     for view, camera in zip(files.views, "012345", strict=True):
@@ -219,8 +208,8 @@ def test_cameras_of_one_photograph_share_a_panel_and_what_was_not_modelled_is_sa
         view.update(gamma=2.2, exposure_ev_error=None)
     text = words_of(report_page(files, SceneMeasurements()))
     assert "camera 0" not in text
-    for said in ("all photographs", "no error bars", "Gamma was not modelled"):
-        assert said in text
+    assert "all photographs" in text
+    assert "no error bars" in text
 
 
 @pytest.mark.parametrize("name", ["page.pdf", "page", "folder.html", "file/page.html"])

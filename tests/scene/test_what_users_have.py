@@ -27,7 +27,8 @@ from p2gs_jax.paths.shots import Shot
 from p2gs_jax.scene import ImageStore, find_scene, with_what_lies_beside
 from p2gs_jax.scene.cameras import name_cameras
 from p2gs_jax.scene.files import find_names, same_shape
-from p2gs_jax.scene.rigid import require_axes, share_in_view
+from p2gs_jax.scene.rigid import require_axes
+from p2gs_jax.scene.visibility import share_in_view
 
 CFG = DataConfig()
 UTM = np.array([451_234.5, 5_212_345.25, 300.0])

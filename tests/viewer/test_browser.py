@@ -115,7 +115,7 @@ def test_one_stop_on_the_slider_doubles_the_brightness(page):
 
 def test_every_mode_shows_something_else_and_saved_files_arrive(page):
     shown = [picture(page)]
-    for mode in ("stops (false colour)", "clipping", "depth", "split: photo | render"):
+    for mode in ("stops (false colour)", "depth", "split: photo | render"):
         choose(page, "Show", mode)
         shown.append(until(page, lambda now: all(np.abs(now - s).mean() > 2e-4 for s in shown)))
     assert page.get_by_text("depth, scene units").count() == 0

@@ -85,19 +85,3 @@ def test_up_is_what_cameras_hold_up_and_distances_are_typical():
         cameras.distance_seen(np.eye(4), np.array([[0, 0, -3.0], [5, 0, 1.0], [0, 0, 7.0]])) == 7.0
     )
     assert cameras.distance_seen(np.eye(4), np.array([[0, 0, -3.0]])) == 1.0
-
-
-def test_poses_between_poses():
-    recorded = [([0, 0, 0], [0, 0, 0]), ([0, 0.8, 0], [2, 0, 4]), ([0, 0, 1], [3, 0, 4])]
-    poses = np.stack([viewmat(*pose) for pose in recorded])
-    places = dict(zip((0.0, 1.0, 2.0), recorded, strict=True))
-    places |= {-1.0: recorded[0], 9.0: recorded[2], 0.25: ([0, 0.2, 0], [0.5, 0, 1])}
-    for place, pose in places.items():
-        np.testing.assert_allclose(cameras.viewmat_between(poses, place), viewmat(*pose), atol=1e-9)
-    np.testing.assert_allclose(cameras.viewmat_between(poses[1:2], 0.7), poses[1], atol=1e-12)
-
-
-def test_frusta_of_neighbours_hardly_touch():
-    views = [a_view(viewmat([0, 0, 0], [k, 0, 0])) for k in range(4)]
-    assert cameras.frustum_size(views, SPACE._replace(unit=1.0)) == pytest.approx(0.35)
-    assert cameras.frustum_size(views[:1], SPACE) == pytest.approx(0.35)

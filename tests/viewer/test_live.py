@@ -266,22 +266,6 @@ def test_depth_colours_stay_until_they_are_set_anew(darkroom, frame):
     assert "depth, scene units" in darkroom.legend(frame, settings)
 
 
-def test_a_metered_exposure_follows_the_picture(darkroom, viewed, frame, run):
-    settings = replace(common_settings(run), metered=True)
-    here = darkroom.transform(frame, settings).exposure
-    assert here == pytest.approx(run.metered_display(run.render(frame.camera)).exposure, rel=1e-4)
-    more = darkroom.transform(frame, replace(settings, exposure_ev=1.0)).exposure
-    assert more == pytest.approx(2 * here)
-    plain = darkroom.transform(frame, replace(settings, metered=False)).exposure
-    assert plain == pytest.approx(run.mean.exposure_geometric, rel=1e-5)
-    other = viewed.renderer.render_now(camera_of(viewed.store, 2))
-    there = run.metered_display(run.render(other.camera)).exposure
-    adapting = darkroom.transform(other, settings, settled=False).exposure
-    assert min(here, there) <= adapting <= max(here, there)
-    assert darkroom.transform(other, settings).exposure == pytest.approx(there, rel=1e-4)
-    assert darkroom.metered_exposure == pytest.approx(there, rel=1e-4)
-
-
 @pytest.fixture
 def session(viewed, client, monkeypatch):
     """Return a session at the photograph in row 1, with +1 EV of the person's own."""
@@ -298,20 +282,11 @@ def show(session, mode):
     session.mode_changed()
 
 
-def test_a_split_gives_the_look_back(session, run):
-    before = session._panel.now
+def test_a_split_takes_the_look_of_the_photograph(session, run):
+    own = settings_of_view(run, 1, session._panel.now)
     show(session, "split")
-    own = settings_of_view(run, 1, before)
     assert session._panel.now.exposure_ev == pytest.approx(own.exposure_ev)
     assert session._panel.now.exposure_ev != 1.0
-    session.go_to(2)
-    show(session, "display")
-    assert session._panel.now == before
-    show(session, "split")  # a look chosen meanwhile stays
-    session._panel.now = replace(session._panel.now, exposure_ev=2.5)
-    for mode in ("display", "depth"):
-        show(session, mode)
-        assert session._panel.now.exposure_ev == 2.5
 
 
 def test_the_exposure_can_be_locked(session):
@@ -325,23 +300,6 @@ def test_the_exposure_can_be_locked(session):
     session._panel.locked.value = False
     session.go_to(2)
     assert session._panel.now.taken_as == 2
-
-
-def test_a_metered_exposure_stays_where_it_was_when_switched_off(session, run, client, monkeypatch):
-    session.set_metered(True)
-    assert session._panel.now.metered
-    assert session._panel.now.exposure_ev == 0
-    session._live.darkroom.metered_exposure = 4 * run.mean.exposure_geometric
-    session.set_metered(False)
-    assert session._panel.now.exposure_ev == pytest.approx(2)
-
-    def fail(run):
-        raise UserError("no photographs")
-
-    monkeypatch.setattr(type(run), "metering", property(fail))
-    session.set_metered(True)
-    assert "no photographs" in client.said
-    assert not session._panel.now.metered
 
 
 def test_a_view_is_saved_also_after_a_failure(session, viewed, client):
@@ -369,12 +327,9 @@ def test_the_panel_holds_what_it_is_set_to(viewed, run):
         wanted = settings_of_view(run, 1, panel.settings())
         panel.put(wanted)
         panel.put_view(2, 50.0)
-        panel.put_place(1.0)
-        panel.set_playing(True)
         panel.set_legend("legend")
         assert panel.settings() == replace(wanted, exposure_ev=pytest.approx(wanted.exposure_ev))
-        assert panel.drive == (run.scene.views[0].camera, 1.0)
-        assert (panel.speed.value, panel.locked.value) == (2.0, False)
+        assert not panel.locked.value
     finally:
         server.stop()
     assert not actions.method_calls  # these are a person's alone

@@ -87,9 +87,6 @@ class Panel:
     def put_view(self, index, degrees):
         self.at = index
 
-    def set_playing(self, playing):
-        pass
-
     def set_status(self, html):
         self.status = html
 

@@ -27,16 +27,7 @@ from jaxtyping import Float32, UInt
 from PIL import ExifTags, Image
 
 from p2gs_jax.errors import UserError, broken
-from p2gs_jax.scene.convert.icc import (
-    BT709,
-    PRIMARIES,
-    TRANSFERS,
-    Transfer,
-    brought_to_srgb,
-    coded_profile,
-    to_light,
-    to_srgb_matrix,
-)
+from p2gs_jax.scene.convert import icc
 
 Kind = Literal["plain", "raw", "heif", "avif", "webp", "exr"]
 Balance = tuple[float, float, float]
@@ -137,16 +128,16 @@ def read_heif(path: Path) -> Picture:
     coded, transfer = _code_points(info.get("nclx_profile"), path)
     if transfer is None:
         profile = info.get("icc_profile")
-        own = None if profile or pixels.shape[2] < 3 else coded_profile(coded)
-        codes = pixels if own is None else brought_to_srgb(pixels, own)
+        own = None if profile or pixels.shape[2] < 3 else icc.coded_profile(coded)
+        codes = pixels if own is None else icc.brought_to_srgb(pixels, own)
         return Picture(codes=codes, exif=exif, profile=profile)
-    light = to_light(pixels[..., :3] / np.iinfo(pixels.dtype).max, transfer)
-    primaries = PRIMARIES.get(coded, BT709)
-    light = np.broadcast_to(light, (*light.shape[:2], 3)) @ to_srgb_matrix(primaries).T
+    light = icc.to_light(pixels[..., :3] / np.iinfo(pixels.dtype).max, transfer)
+    primaries = icc.PRIMARIES.get(coded, icc.BT709)
+    light = np.broadcast_to(light, (*light.shape[:2], 3)) @ icc.to_srgb_matrix(primaries).T
     return Picture(light=light.astype(np.float32), exif=exif)
 
 
-def _code_points(nclx: dict | None, path: Path) -> tuple[int, Transfer | None]:
+def _code_points(nclx: dict | None, path: Path) -> tuple[int, icc.Transfer | None]:
     """Return the primaries of a HEIC or AVIF (ITU-T H.273), 0: unknown, and its transfer function.
 
     They stand in its box of colours, `nclx`, which Pillow does not tell of.
@@ -157,7 +148,7 @@ def _code_points(nclx: dict | None, path: Path) -> tuple[int, Transfer | None]:
     else:
         _, found, data = path.read_bytes().partition(b"colrnclx")
         primaries, transfer = struct.unpack(">HH", data[:4].ljust(4, b"\0")) if found else (0, 0)
-    return primaries, TRANSFERS.get(transfer)
+    return primaries, icc.TRANSFERS.get(transfer)
 
 
 @dataclass(frozen=True)
@@ -231,11 +222,10 @@ def _raw(path: Path) -> Iterator[Any]:
         with rawpy.imread(str(path)) as raw:
             yield raw
     except rawpy.LibRawFileUnsupportedError:
-        raise UserError(
-            f"LibRaw {'.'.join(map(str, rawpy.libraw_version))} does not know {path}: it is of a "
-            "newer camera, or not a raw file.",
-            fix="pip install --upgrade rawpy, or convert it with Adobe's DNG Converter",
-        ) from None
+        why = f"LibRaw {'.'.join(map(str, rawpy.libraw_version))} does not know {path}: it is of a "
+        why += "newer camera, or not a raw file."
+        fix = "pip install --upgrade rawpy, or convert it with Adobe's DNG Converter"
+        raise UserError(why, fix=fix) from None
     except (rawpy.LibRawError, rawpy.NotSupportedError) as error:
         why = error.args[0] if error.args else error
         text = why.decode("latin-1") if isinstance(why, bytes) else str(why)
@@ -326,7 +316,7 @@ def read_exr(path: Path) -> Picture:
         raise broken(path, why, "photographs need R, G and B, or Y")
     primaries = header.get("chromaticities")
     if primaries is not None and len(np.ravel(primaries)) == 8:
-        matrix = to_srgb_matrix(tuple(np.ravel(primaries)))
+        matrix = icc.to_srgb_matrix(tuple(np.ravel(primaries)))
         if np.abs(matrix - np.eye(3)).max() > 1e-3:
             light = light @ matrix.T.astype(np.float32)
     alpha = channels.get(f"{layer}A")

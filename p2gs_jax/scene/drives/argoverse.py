@@ -25,15 +25,8 @@ from jaxtyping import Float64, Int, Int64
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import broken
+from p2gs_jax.scene.drives import recording
 from p2gs_jax.scene.drives.objects import Box, Pose, tracks
-from p2gs_jax.scene.drives.recording import (
-    Photograph,
-    Recording,
-    RigCamera,
-    Sweep,
-    SweepPoints,
-    Trajectory,
-)
 from p2gs_jax.scene.drives.tables import Columns, counted, drive_folder, numbered, read_feather
 from p2gs_jax.scene.lens import intrinsics
 from p2gs_jax.scene.rigid import from_quaternions
@@ -51,7 +44,7 @@ SIZE = ("length_m", "width_m", "height_m")
 GREY = "stereo"
 
 
-def read_argoverse(root: Path, cfg: DataConfig) -> Recording:
+def read_argoverse(root: Path, cfg: DataConfig) -> recording.Recording:
     """Read a log; `cfg.cameras` may ask for the stereo pair; UserError: a table is broken."""
     log = drive_folder(root, cfg.drive, MARKER)
     cameras, files, notes = _cameras(log, cfg)
@@ -63,7 +56,7 @@ def read_argoverse(root: Path, cfg: DataConfig) -> Recording:
     sweeps, sweep_notes = _sweeps(car)
     objects, box_notes = _objects(car)
     notes += [*photograph_notes, *sweep_notes, *box_notes]
-    return Recording(log, "argoverse", cameras, photographs, sweeps, objects, notes)
+    return recording.Recording(log, "argoverse", cameras, photographs, sweeps, objects, notes)
 
 
 class _Car:
@@ -77,7 +70,7 @@ class _Car:
             raise broken(path, "holds no pose")
         stamps, rows = np.unique(stamps, return_index=True)
         self.log, self.moments, self.start = log, moments, stamps[0]
-        self.way = Trajectory(self.seconds(stamps), _poses(table, "pose")[rows])
+        self.way = recording.Trajectory(self.seconds(stamps), _poses(table, "pose")[rows])
 
     def seconds(self, stamps: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
         """Return time stamps in seconds since the first pose."""
@@ -96,7 +89,7 @@ def _poses(table: Columns, what: str) -> Float64[np.ndarray, "n 4 4"]:
 
 def _cameras(
     log: Path, cfg: DataConfig
-) -> tuple[list[RigCamera], dict[str, dict[int, Path]], list[str]]:
+) -> tuple[list[recording.RigCamera], dict[str, dict[int, Path]], list[str]]:
     """Return cameras that have photographs, these by time stamp, and notes."""
     path = log / INTRINSICS
     table = read_feather(path, [*LENS, "sensor_name"])
@@ -122,13 +115,13 @@ def _cameras(
         fx, fy, cx, cy, width, height = lenses[name].tolist()
         # The API takes projections from 0 to width - 1 as inside: pixel centres at integers.
         K = intrinsics(fx, fy, cx + 0.5, cy + 0.5)
-        cameras.append(RigCamera(name, K, int(width), int(height)))
+        cameras.append(recording.RigCamera(name, K, int(width), int(height)))
     return cameras, found, notes
 
 
 def _photographs(
-    car: _Car, cameras: list[RigCamera], files: dict[str, dict[int, Path]]
-) -> tuple[list[Photograph], list[str]]:
+    car: _Car, cameras: list[recording.RigCamera], files: dict[str, dict[int, Path]]
+) -> tuple[list[recording.Photograph], list[str]]:
     """Return photographs with poses, and notes."""
     if not cameras:
         return [], []
@@ -145,27 +138,31 @@ def _photographs(
         without += int((~known).sum())
         for k in np.flatnonzero(known):
             pose, file = poses[k] @ mounts[name], files[name][int(stamps[k])]
-            photographs.append(Photograph(name, int(frames[k]), float(times[k]), file, pose))
+            photographs.append(
+                recording.Photograph(name, int(frames[k]), float(times[k]), file, pose)
+            )
     return photographs, counted(without, f"photographs are outside {POSES}: they are left out.")
 
 
-def _sweeps(car: _Car) -> tuple[list[Sweep], list[str]]:
+def _sweeps(car: _Car) -> tuple[list[recording.Sweep], list[str]]:
     files = numbered(car.log / "sensors" / "lidar", (".feather",))
     stamps = np.array(list(files), np.int64)
     times, frames = car.seconds(stamps), car.frames(stamps)
     poses, known = car.way.at(times)
     sweeps = [
-        Sweep(int(frames[k]), float(times[k]), partial(_read_sweep, path, poses[k], times[k]))
+        recording.Sweep(
+            int(frames[k]), float(times[k]), partial(_read_sweep, path, poses[k], times[k])
+        )
         for k, path in enumerate(files.values())
         if known[k]
     ]
     return sweeps, counted(int((~known).sum()), f"LiDAR sweeps are outside {POSES}.")
 
 
-def _read_sweep(path: Path, pose: Pose, start: float) -> SweepPoints:
+def _read_sweep(path: Path, pose: Pose, start: float) -> recording.SweepPoints:
     table = read_feather(path, ["x", "y", "z", "offset_ns"])
     times = start + table.numbers("offset_ns") * 1e-9
-    return SweepPoints(table.stacked("xyz") @ pose[:3, :3].T + pose[:3, 3], times)
+    return recording.SweepPoints(table.stacked("xyz") @ pose[:3, :3].T + pose[:3, 3], times)
 
 
 def _objects(car: _Car) -> tuple[tuple[TrackedObject, ...], list[str]]:

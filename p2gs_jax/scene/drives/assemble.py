@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import platformdirs
 from jaxtyping import Float, Float64
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.errors import UserError, broken
+from p2gs_jax.scene import files
+from p2gs_jax.scene.convert.convert import cache_of
 from p2gs_jax.scene.drives.ego_mask import find_ego_masks
 from p2gs_jax.scene.drives.lidar import MOST_MEASURED, owners, seeds, thinned
 from p2gs_jax.scene.drives.recording import (
@@ -25,14 +25,6 @@ from p2gs_jax.scene.drives.recording import (
     chosen_frames,
 )
 from p2gs_jax.scene.drives.tables import counted
-from p2gs_jax.scene.files import (
-    MOST_OFF,
-    Report,
-    at_file_size,
-    check_missing,
-    require_plain,
-    rescaled,
-)
 from p2gs_jax.scene.rigid import inverse
 from p2gs_jax.types import Lidar, Scene, TrackedObject, View
 
@@ -46,7 +38,7 @@ def assemble(
     recording: Recording,
     cfg: DataConfig,
     work_dir: Path | None = None,
-    report: Report = lambda message: None,
+    report: files.Report = lambda message: None,
     *,
     write_embedded: bool = True,
 ) -> Scene:
@@ -65,7 +57,7 @@ def assemble(
     there = [camera.name for camera in recording.cameras]
     for name in there:
         # What is written of a view lies in a folder of its camera.
-        require_plain(name, recording.root)
+        files.require_plain(name, recording.root)
     names = chosen_cameras(cfg.cameras, there)
     photographs, notes = _chosen_photographs(recording, names, cfg)
     cameras, size_notes = _at_sizes(recording, photographs)
@@ -75,7 +67,8 @@ def assemble(
     centres = np.stack([p.pose[:3, 3] for p in photographs])
     middle = centres.mean(0)
     origin = np.rint(middle) if np.abs(middle).max() > FARTHEST_ORIGIN else np.zeros(3)
-    folder = _embedded_folder(recording.root, work_dir)
+    # Where embedded photographs are kept as files.
+    folder = cache_of(recording.root, None) if work_dir is None else work_dir / "photographs"
     views = [
         dataclasses.replace(
             _view(p, cameras[p.camera], origin),
@@ -110,22 +103,18 @@ def _chosen_photographs(
     """Return the photographs of the chosen cameras and frames, by camera and frame, and notes."""
     every = sorted({p.frame for p in recording.photographs})
     if not every:
-        raise UserError(
-            f"{recording.root} holds no photograph with a pose",
-            fix="name the folder that holds the images of the drive as well",
-        )
+        fix = "name the folder that holds the images of the drive as well"
+        raise UserError(f"{recording.root} holds no photograph with a pose", fix=fix)
     frames = chosen_frames(cfg.frames, every)
     among = set(frames)
     chosen = [p for p in recording.photographs if p.frame in among and p.camera in names]
     if not chosen:
-        raise UserError(
-            f"{recording.root} has no photograph of the cameras and frames that were asked for",
-            fix="name other --cameras, or leave out --frames",
-        )
+        why = f"{recording.root} has no photograph of the cameras and frames that were asked for"
+        raise UserError(why, fix="name other --cameras, or leave out --frames")
     chosen.sort(key=lambda p: (p.camera, p.frame))
     there = [p for p in chosen if p.embedded is not None or p.path.is_file()]
     missing = sorted({_name(p) for p in chosen} - {_name(p) for p in there})
-    notes = [*recording.notes, *check_missing(missing, len(chosen), recording.root, cfg)]
+    notes = [*recording.notes, *files.check_missing(missing, len(chosen), recording.root, cfg)]
     chosen = there
     counts = {name: sum(p.camera == name for p in chosen) for name in names}
     few = [f"{name} {count}" for name, count in counts.items() if count < len(frames)]
@@ -142,7 +131,7 @@ def _at_sizes(
     """Return the cameras at the size of the photographs, and a note of those of another."""
     cameras = {c.name: _at_size(c, photographs, recording.root) for c in recording.cameras}
     resized = {c.name for c in recording.cameras if cameras[c.name] is not c}
-    return cameras, rescaled(sum(p.camera in resized for p in photographs), "the calibration")
+    return cameras, files.rescaled(sum(p.camera in resized for p in photographs), "the calibration")
 
 
 def _at_size(camera: RigCamera, photographs: Sequence[Photograph], root: Path) -> RigCamera:
@@ -153,11 +142,11 @@ def _at_size(camera: RigCamera, photographs: Sequence[Photograph], root: Path) -
     first = next((p for p in photographs if p.camera == camera.name), None)
     if first is not None and first.embedded is None:
         size = (camera.width, camera.height)
-        K, width, height = at_file_size(first.path, camera.K, size, root)
+        K, width, height = files.at_file_size(first.path, camera.K, size, root)
         if (width, height) != size:
             camera = dataclasses.replace(camera, K=K, width=width, height=height)
     x, y = camera.K[:2, 2]
-    if max(abs(x / camera.width - 0.5), abs(y / camera.height - 0.5)) > MOST_OFF:
+    if max(abs(x / camera.width - 0.5), abs(y / camera.height - 0.5)) > files.MOST_OFF:
         why = f"the calibration of {camera.name} has its principal point at {x:.0f}, {y:.0f}, far "
         why += f"from the middle of photographs of {camera.width}x{camera.height}"
         raise broken(f"{root}:", why, "use the photographs at the size that was calibrated")
@@ -189,14 +178,6 @@ def _moved(poses: Float64[np.ndarray, "*n 4 4"], origin: Float[np.ndarray, " 3"]
     return out
 
 
-def _embedded_folder(root: Path, work_dir: Path | None) -> Path:
-    """Return where embedded photographs are kept as files."""
-    if work_dir is not None:
-        return work_dir / "photographs"
-    drive = hashlib.sha256(str(root.resolve()).encode()).hexdigest()[:16]
-    return platformdirs.user_cache_path("p2gs-jax") / "photographs" / drive
-
-
 def _file_of(photograph: Photograph, folder: Path, write_embedded: bool) -> Path:
     """Return the file of a photograph; an embedded one is written once, if at all."""
     if photograph.embedded is None:
@@ -226,7 +207,7 @@ def _read_sweeps(
     photographs: Sequence[Photograph],
     objects: Sequence[TrackedObject],
     origin: Float[np.ndarray, " 3"],
-    report: Report,
+    report: files.Report,
 ) -> tuple[Lidar | None, list[str]]:
     """Return the measurements between the first photograph and the last, and notes."""
     times = [p.time for p in photographs]

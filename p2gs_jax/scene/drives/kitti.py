@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import broken
+from p2gs_jax.scene.drives import tables
 from p2gs_jax.scene.drives.lidar import turned
 from p2gs_jax.scene.drives.objects import Box, Pose, tracks
 from p2gs_jax.scene.drives.recording import (
@@ -33,15 +34,8 @@ from p2gs_jax.scene.drives.recording import (
     SweepPoints,
     Trajectory,
 )
-from p2gs_jax.scene.drives.tables import (
-    counted,
-    drive_folder,
-    finite_numbers,
-    missing_file,
-    numbered,
-)
 from p2gs_jax.scene.files import image_size
-from p2gs_jax.scene.rigid import inverse, rigid
+from p2gs_jax.scene.rigid import inverse, pose_of, rigid
 from p2gs_jax.types import TrackedObject
 
 MARKER = "oxts/data"
@@ -60,7 +54,7 @@ _STAMP = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(\.\d+)?|")
 
 def read_kitti_raw(root: Path, cfg: DataConfig) -> Recording:
     """Read a drive, from its folder or that of its date; UserError: a table is broken."""
-    root = drive_folder(root, cfg.drive, MARKER)
+    root = tables.drive_folder(root, cfg.drive, MARKER)
     # Calibration is that of a date, but some copy it beside the images; links to a drive may lead
     # elsewhere.
     places = (root, root.absolute().parent, root.resolve().parent)
@@ -75,7 +69,7 @@ def read_kitti_raw(root: Path, cfg: DataConfig) -> Recording:
     to_car = inverse(imu_to_velo) @ inverse(velo_to_cam) @ inverse(rectified)
     cameras, photographs = [], []
     for folder in sorted(root.glob("image_0[0-3]")):
-        files = numbered(folder / "data", PHOTOGRAPHS)
+        files = tables.numbered(folder / "data", PHOTOGRAPHS)
         if not files:
             notes.append(f"{folder.name} has no photographs: it is left out.")
             continue
@@ -84,12 +78,12 @@ def read_kitti_raw(root: Path, cfg: DataConfig) -> Recording:
         cameras.append(RigCamera(folder.name, K, *size))
         found, without = _photographs(folder, files, car, to_car @ back)
         photographs += found
-        notes += counted(without, f"photographs of {folder.name} have no pose or time.")
+        notes += tables.counted(without, f"photographs of {folder.name} have no pose or time.")
     named = {camera.name for camera in cameras}
     if named & set(GREY) and named - set(GREY):
         notes.append("image_00 and image_01 are grey: --cameras image_02 image_03 omits them.")
     forward, lengths = _turns(root)
-    scans = numbered(root / "velodyne_points" / "data", (".bin",))
+    scans = tables.numbered(root / "velodyne_points" / "data", (".bin",))
     known = scanner.at(forward)[1] if len(forward) else forward
     sweeps = [
         Sweep(k, float(forward[k]), partial(_read_sweep, path, forward[k], lengths[k], scanner))
@@ -97,7 +91,7 @@ def read_kitti_raw(root: Path, cfg: DataConfig) -> Recording:
         if k < len(forward) and known[k]
     ]
     absent = len(forward) - len(sweeps)
-    notes += counted(absent, f"of {len(forward)} LiDAR sweeps are missing.")
+    notes += tables.counted(absent, f"of {len(forward)} LiDAR sweeps are missing.")
     objects, box_notes = _objects(root, forward, lengths, scanner)
     notes += box_notes
     return Recording(root, "kitti_raw", cameras, photographs, sweeps, objects, notes)
@@ -107,7 +101,7 @@ def _read_lines(path: Path) -> list[str]:
     try:
         return path.read_text("utf-8-sig", "replace").rstrip().splitlines()
     except FileNotFoundError:
-        raise missing_file(path) from None
+        raise tables.missing_file(path) from None
 
 
 class _Calibration:
@@ -123,7 +117,7 @@ class _Calibration:
     def matrix(self, name: str, *shape: int) -> Float64[np.ndarray, "..."]:
         """Return a matrix; UserError: it is not there, or has not so many finite numbers."""
         words = self._held.get(name, ())
-        return finite_numbers(words, self.path, name, int(np.prod(shape))).reshape(shape)
+        return tables.finite_numbers(words, self.path, name, int(np.prod(shape))).reshape(shape)
 
 
 def _rigid_file(path: Path) -> Pose:
@@ -190,7 +184,7 @@ def _car(root: Path) -> tuple[Trajectory, list[str]]:
     The world is metric at the first latitude (Mercator), x east, y north, z up, the origin where
     the drive begins.
     """
-    files = numbered(root / "oxts" / "data", (".txt",))
+    files = tables.numbered(root / "oxts" / "data", (".txt",))
     stamps = _read_stamps(root / "oxts" / "timestamps.txt")
     used = [k for k in files if k < len(stamps) and np.isfinite(stamps[k])]
     used.sort(key=lambda k: stamps[k])
@@ -203,18 +197,16 @@ def _car(root: Path) -> tuple[Trajectory, list[str]]:
     east = scale * EARTH_RADIUS_M * np.radians(longitude)
     north = scale * EARTH_RADIUS_M * np.log(np.tan(np.pi / 4 + np.radians(latitude) / 2))
     position = np.stack([east, north, altitude], axis=1)
-    poses = np.tile(np.eye(4), (len(times), 1, 1))
-    turns = Rotation.from_euler("ZYX", np.stack([yaw, pitch, roll], 1))
-    poses[:, :3, :3] = turns.as_matrix()
-    poses[:, :3, 3] = position - position[0]
+    turns = Rotation.from_euler("ZYX", np.stack([yaw, pitch, roll], 1)).as_matrix()
+    poses = pose_of(turns, position - position[0])
     words = f"of {len(stamps)} frames have no GPS measurement."
-    return Trajectory(times, poses), counted(len(stamps) - len(used), words)
+    return Trajectory(times, poses), tables.counted(len(stamps) - len(used), words)
 
 
 def _oxts(path: Path) -> Float64[np.ndarray, " 6"]:
     """Return latitude and longitude in degrees, altitude in metres, roll, pitch, yaw."""
     words = path.read_text("utf-8-sig", "replace").split()
-    values = finite_numbers(words[:6], path, "position and angles", 6)
+    values = tables.finite_numbers(words[:6], path, "position and angles", 6)
     if abs(values[0]) >= 89:
         raise broken(f"{path}:", f"a latitude of {values[0]} degrees has no Mercator projection")
     return values
@@ -282,9 +274,9 @@ def _objects(
         return (), ["There are no boxes of moving things (tracklet_labels.xml)."]
     boxes, empty = _tracklets(path)
     timed = [b for b in boxes if 0 <= b.time < len(forward) and np.isfinite(forward[int(b.time)])]
-    notes = counted(empty, "tracklets have no boxes: they are left out.")
+    notes = tables.counted(empty, "tracklets have no boxes: they are left out.")
     lost = len(boxes) - len(timed)
-    notes += counted(lost, "boxes are of frames without a LiDAR time: they are left out.")
+    notes += tables.counted(lost, "boxes are of frames without a LiDAR time: they are left out.")
     if not timed:
         return (), notes
     local = np.stack([box.pose for box in timed])
@@ -307,7 +299,7 @@ def _tracklets(path: Path) -> tuple[list[Box], int]:
 
     def numbers(node: ElementTree.Element, names: str) -> list[float]:
         texts = (node.findtext(name) for name in names.split())
-        return finite_numbers(texts, path, f"{names} of a box").tolist()
+        return tables.finite_numbers(texts, path, f"{names} of a box").tolist()
 
     found, empty = [], 0
     for number, item in enumerate(root.findall("./tracklets/item")):
@@ -319,9 +311,8 @@ def _tracklets(path: Path) -> tuple[list[Box], int]:
         label = (item.findtext("objectType") or "unknown").strip()
         for frame, box in enumerate(boxes, int(first)):
             *position, roll, pitch, yaw = numbers(box, "tx ty tz rx ry rz")
-            pose = np.eye(4)
-            pose[:3, :3] = Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix()
+            turn = Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix()
             # Theirs is the middle of the bottom.
-            pose[:3, 3] = position + pose[:3, 2] * height / 2
+            pose = pose_of(turn, position + turn[:, 2] * height / 2)
             found.append(Box(str(number), label, (length, width, height), frame, pose))
     return found, empty

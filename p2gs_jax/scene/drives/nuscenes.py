@@ -80,21 +80,7 @@ def _chosen_scene(root: Path, asked: str | None) -> tuple[Path, Row]:
     for tables in reversed(versions):
         rows = read_rows(tables / "scene.json", {"name": str, "token": str})
         there |= {row["name"]: (tables, row) for row in rows}
-    names = list(there)
-    if asked is None and len(names) > 1:
-        # Tables are of the whole set, also where photographs of a few drives were unpacked.
-        photographed = {token for tables in versions for token in _photographed(root, tables)}
-        names = [name for name in names if there[name][1]["token"] in photographed] or names
-    return there[chosen_drive(asked, names, root)]
-
-
-def _photographed(root: Path, tables: Path) -> set[str]:
-    """Return the tokens of drives that have photographs on disk."""
-    there = {path.relative_to(root).as_posix() for path in root.glob("samples/CAM_*/*")}
-    data = read_rows(tables / "sample_data.json", {"sample_token": str}, "filename", there)
-    of = {row["sample_token"] for row in data}
-    samples = read_rows(tables / "sample.json", {"scene_token": str}, "token", of)
-    return {row["scene_token"] for row in samples}
+    return there[chosen_drive(asked, list(there), root)]
 
 
 class _Sensor(NamedTuple):

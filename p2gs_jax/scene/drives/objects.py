@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -12,7 +11,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64
 
 from p2gs_jax.core.numerics import on_host
-from p2gs_jax.errors import UserError
 from p2gs_jax.render.project import HIDDEN
 from p2gs_jax.scene.rigid import interpolated
 from p2gs_jax.types import Placement, Scene, TrackedObject, View
@@ -21,7 +19,6 @@ from p2gs_jax.types import Placement, Scene, TrackedObject, View
 Pose = Float64[np.ndarray, "4 4"]
 # Boxes of parked cars jump by a few decimetres from frame to frame; what gets further moves.
 STANDS_WITHIN_M = 1.0
-MOST_LISTED = 12
 # Boxes are cut off this near to the camera, scene units.
 NEAR = 0.1
 # Boxes are widened by this much to every side: they are drawn tightly, and a photograph is not
@@ -80,12 +77,10 @@ class MovingObjects:
     """The objects that Gaussians belong to, in the order of `Population.owner`.
 
     Attributes:
-        offsets: by which somebody moved them, in the frame of each box, scene units; None: nobody.
         middle: of the drive, where Gaussians vibrate: the zero of `Placement.time`, seconds.
     """
 
     objects: tuple[TrackedObject, ...]
-    offsets: Float[np.ndarray, "k 3"] | None = None
     middle: float | None = None
 
     def __len__(self) -> int:
@@ -98,30 +93,7 @@ class MovingObjects:
         for row, thing in enumerate(self.objects):
             poses, covered = interpolated(thing.times, thing.poses, np.array([time]))
             out[row], there[row] = poses[0], covered[0]
-        if self.offsets is not None:
-            out[:, :3, 3] += np.einsum("kij,kj->ki", out[:, :3, :3], self.offsets)
         return out, there
-
-    def moved(self, name: str, offset: Sequence[float]) -> MovingObjects:
-        """Return the objects with one of them, named by how its track begins, moved.
-
-        `offset` is forward, left and up in the frame of its box, scene units. UserError: no object
-        has this name, or several.
-        """
-        names = [thing.name for thing in self.objects]
-        exact = [row for row, known in enumerate(names) if known == name]
-        found = exact or [row for row, known in enumerate(names) if known.startswith(name)]
-        if len(found) != 1 or not name:
-            what = "no object" if not found else f"{len(found)} objects"
-            listed = ", ".join(f"{o.name} ({o.label})" for o in self.objects[:MOST_LISTED])
-            rest = len(self.objects) - MOST_LISTED
-            raise UserError(
-                f"{what} with Gaussians of its own has a name that begins with {name!r}.",
-                fix=f"choose one of {listed}" + (f" and {rest} others" if rest > 0 else ""),
-            )
-        offsets = np.zeros((len(self), 3)) if self.offsets is None else self.offsets.copy()
-        offsets[found[0]] += np.asarray(offset, float)
-        return dataclasses.replace(self, offsets=offsets)
 
     def placement(self, viewmat: Float[np.ndarray, "4 4"], time: float) -> Placement:
         """Return where the objects are in a view (world-to-camera) at a time, on the host."""

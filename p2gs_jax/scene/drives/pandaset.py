@@ -25,17 +25,10 @@ from jaxtyping import Float64
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import broken
+from p2gs_jax.scene.drives import tables
 from p2gs_jax.scene.drives.lidar import turned
 from p2gs_jax.scene.drives.objects import Box, Pose, tracks
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
-from p2gs_jax.scene.drives.tables import (
-    UNPACK,
-    counted,
-    drive_folder,
-    finite_numbers,
-    numbered,
-    read_pickled,
-)
 from p2gs_jax.scene.files import image_size, read_json
 from p2gs_jax.scene.lens import intrinsics
 from p2gs_jax.scene.rigid import from_quaternion, inverse
@@ -57,17 +50,17 @@ SIZE = ("dimensions.y", "dimensions.x", "dimensions.z")
 
 def read_pandaset(root: Path, cfg: DataConfig) -> Recording:
     """Read a sequence, with `camera` and `lidar` in its folder; UserError: a table is broken."""
-    root = drive_folder(root, cfg.drive, MARKER)
+    root = tables.drive_folder(root, cfg.drive, MARKER)
     cameras, photographs, notes = [], [], []
     for folder in sorted(p.parent for p in root.glob(MARKER)):
-        files = numbered(folder, (".jpg", ".png"))
+        files = tables.numbered(folder, (".jpg", ".png"))
         if not files:
             notes.append(f"{folder.name} has no photographs: it is left out.")
             continue
         cameras.append(_camera(folder, next(iter(files.values()))))
         taken, without = _photographs(folder, files)
         photographs += taken
-        notes += counted(without, f"photographs of {folder.name} have no pose or time.")
+        notes += tables.counted(without, f"photographs of {folder.name} have no pose or time.")
     sweeps, sweep_notes = _sweeps(root)
     objects, box_notes = _objects(root)
     notes += [*sweep_notes, *box_notes]
@@ -76,10 +69,10 @@ def read_pandaset(root: Path, cfg: DataConfig) -> Recording:
 
 def _camera(folder: Path, photograph: Path) -> RigCamera:
     path = folder / "intrinsics.json"
-    held = read_json(path, UNPACK)
+    held = read_json(path, tables.UNPACK)
     try:
         values = (held[name] for name in ("fx", "fy", "cx", "cy"))
-        fx, fy, cx, cy = finite_numbers(values, path, "fx fy cx cy").tolist()
+        fx, fy, cx, cy = tables.finite_numbers(values, path, "fx fy cx cy").tolist()
     except (KeyError, TypeError):
         raise broken(path, "lacks fx, fy, cx or cy") from None
     size = image_size(photograph)
@@ -100,7 +93,9 @@ def _photographs(folder: Path, files: dict[int, Path]) -> tuple[list[Photograph]
         if frame >= count or None in (poses[frame], times[frame]):
             without += 1
             continue
-        time = finite_numbers([times[frame]], folder / "timestamps.json", f"entry {frame}")[0]
+        time = tables.finite_numbers([times[frame]], folder / "timestamps.json", f"entry {frame}")[
+            0
+        ]
         pose = _pose(poses[frame], folder / "poses.json", frame)
         path = files.get(frame, folder / f"{frame:02d}.jpg")
         photographs.append(Photograph(folder.name, frame, float(time), path, pose))
@@ -108,7 +103,7 @@ def _photographs(folder: Path, files: dict[int, Path]) -> tuple[list[Photograph]
 
 
 def _read_list(path: Path) -> list[Any]:
-    held = read_json(path, UNPACK)
+    held = read_json(path, tables.UNPACK)
     if not isinstance(held, list):
         raise broken(path, "should hold a list with an entry for each frame")
     return held
@@ -117,8 +112,8 @@ def _read_list(path: Path) -> list[Any]:
 def _pose(held: Any, path: Path, frame: int) -> Pose:
     what = f"frame {frame}"
     try:
-        wxyz = finite_numbers((held["heading"][k] for k in "wxyz"), path, what)
-        position = finite_numbers((held["position"][k] for k in "xyz"), path, what)
+        wxyz = tables.finite_numbers((held["heading"][k] for k in "wxyz"), path, what)
+        position = tables.finite_numbers((held["position"][k] for k in "xyz"), path, what)
     except (KeyError, TypeError):
         raise broken(f"{path}:", f"the pose of {what} lacks position or heading") from None
     return from_quaternion(wxyz, position, path, what)
@@ -126,24 +121,26 @@ def _pose(held: Any, path: Path, frame: int) -> Pose:
 
 def _sweep_times(root: Path) -> Float64[np.ndarray, " k"]:
     path = root / "lidar" / "timestamps.json"
-    return finite_numbers(_read_list(path), path, "times of sweeps")
+    return tables.finite_numbers(_read_list(path), path, "times of sweeps")
 
 
 def _sweeps(root: Path) -> tuple[list[Sweep], list[str]]:
-    files = numbered(root / "lidar", PICKLES)
+    files = tables.numbered(root / "lidar", PICKLES)
     if not files:
         return [], []
     times = _sweep_times(root)
     timed = {frame: path for frame, path in files.items() if frame < len(times)}
     sweeps = [Sweep(k, float(times[k]), partial(_read_sweep, path)) for k, path in timed.items()]
     absent = len(times) - len(timed)
-    notes = counted(absent, f"of {len(times)} LiDAR sweeps are missing.")
-    notes += counted(len(files) - len(timed), "LiDAR sweeps have no time: they are left out.")
+    notes = tables.counted(absent, f"of {len(times)} LiDAR sweeps are missing.")
+    notes += tables.counted(
+        len(files) - len(timed), "LiDAR sweeps have no time: they are left out."
+    )
     return sweeps, notes
 
 
 def _read_sweep(path: Path) -> SweepPoints:
-    table = read_pickled(path)
+    table = tables.read_pickled(path)
     return SweepPoints(table.stacked("xyz"), table.numbers("t"))
 
 
@@ -157,7 +154,7 @@ class _Cuboid(NamedTuple):
 
 def _objects(root: Path) -> tuple[tuple[TrackedObject, ...], list[str]]:
     """Return what was followed through the sequence, once each, and notes."""
-    files = numbered(root / "annotations" / "cuboids", PICKLES)
+    files = tables.numbered(root / "annotations" / "cuboids", PICKLES)
     if not files:
         return (), ["There are no boxes of moving things."]
     times = _sweep_times(root)
@@ -173,17 +170,17 @@ def _objects(root: Path) -> tuple[tuple[TrackedObject, ...], list[str]]:
     doubled = _doubled(of)
     alone = [name for name, own in of.items() if own[0].forward and name not in doubled]
     notes = [
-        *counted(known - len(used), f"of {known} frames have no boxes."),
-        *counted(len(files) - len(used), "tables of boxes are of frames without a time."),
-        *counted(nameless, "boxes belong to no track: they are left out."),
-        *counted(len(alone), ALONE),
+        *tables.counted(known - len(used), f"of {known} frames have no boxes."),
+        *tables.counted(len(files) - len(used), "tables of boxes are of frames without a time."),
+        *tables.counted(nameless, "boxes belong to no track: they are left out."),
+        *tables.counted(len(alone), ALONE),
     ]
     return tracks(c.box for name in of if name not in doubled for c in of[name]), notes
 
 
 def _cuboids(path: Path, time: float, scanner: Pose) -> Iterator[_Cuboid]:
     """Yield the boxes of a frame, whose turn of the scanner ended at a time, seconds."""
-    table = read_pickled(path)
+    table = tables.read_pickled(path)
     position, size = table.stacked(POSITION), table.stacked(SIZE)
     # 0 looks along y, counterclockwise; our boxes look along x.
     yaw = table.numbers("yaw") + np.pi / 2

@@ -163,10 +163,8 @@ def chosen_frames(asked: str | None, there: Sequence[int]) -> list[int]:
             raise ValueError(asked)
         found = list(there)[slice(*numbers)]
     except ValueError:
-        raise UserError(
-            f"--frames {asked!r} is not a valid slice",
-            fix="write FIRST:END or FIRST:END:STEP, as 0:30:2",
-        ) from None
+        fix = "write FIRST:END or FIRST:END:STEP, as 0:30:2"
+        raise UserError(f"--frames {asked!r} is not a valid slice", fix=fix) from None
     if not found:
         fix = f"it has {len(there)}, from 0 on"
         raise UserError(f"--frames {asked} holds no frame of this drive", fix=fix)

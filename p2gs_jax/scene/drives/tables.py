@@ -242,10 +242,8 @@ def _reading(path: Path) -> Iterator[None]:
     try:
         import pyarrow
     except ImportError:
-        raise UserError(
-            "Argoverse 2 and Waymo write Arrow's files, and pyarrow is not installed",
-            fix="pip install 'p2gs-jax[drives]'",
-        ) from None
+        why = "Argoverse 2 and Waymo write Arrow's files, and pyarrow is not installed"
+        raise UserError(why, fix="pip install 'p2gs-jax[drives]'") from None
     if not path.is_file():
         raise missing_file(path)
     try:

@@ -17,16 +17,10 @@ import pycolmap
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.errors import UserError, broken
+from p2gs_jax.scene import files
 from p2gs_jax.scene.cameras import parent_of
 from p2gs_jax.scene.colmap import load_colmap, read_model, tracks_of
 from p2gs_jax.scene.convert.readers import read_exif_camera
-from p2gs_jax.scene.files import (
-    Report,
-    cached_folder,
-    file_fingerprints,
-    image_size,
-    stage_progress,
-)
 from p2gs_jax.scene.lens import undistort_points
 from p2gs_jax.scene.rigid import require_axes
 from p2gs_jax.scene.sfm import features
@@ -56,7 +50,7 @@ def load_images(
     paths: Sequence[Path],
     cfg: DataConfig,
     work_dir: Path | None,
-    report: Report,
+    report: files.Report,
 ) -> Scene:
     """Run COLMAP's structure from motion on the photographs in a folder; read the largest model.
 
@@ -73,8 +67,11 @@ def load_images(
     for path, name in zip(paths, names, strict=True):
         exif = read_exif_camera(path, zoom=True) if cfg.camera_by in ("auto", "exif") else ""
         folder = parent_of(name) if cfg.camera_by in ("auto", "folder") else ""
-        groups[(image_size(path), exif, folder)].append(name)
-    key: dict[str, Any] = {"pycolmap": pycolmap.__version__, "files": file_fingerprints(paths)}
+        groups[(files.image_size(path), exif, folder)].append(name)
+    key: dict[str, Any] = {
+        "pycolmap": pycolmap.__version__,
+        "files": files.file_fingerprints(paths),
+    }
     if cfg.camera_by != "auto":
         key["camera_by"] = cfg.camera_by
 
@@ -82,7 +79,7 @@ def load_images(
         kept = (folder if work_dir is None else work_dir) / KEPT
         _build(folder, kept, image_folder, groups, cfg, report)
 
-    with cached_folder(work_dir, "sfm", key, build) as folder:
+    with files.cached_folder(work_dir, "sfm", key, build) as folder:
         images = str(image_folder.resolve())
         scene = load_colmap(root, folder / "model", dataclasses.replace(cfg, images=images))
         why = json.loads((folder / ACCOUNT).read_text())
@@ -103,7 +100,7 @@ def _build(
     image_folder: Path,
     groups: Mapping[tuple, Sequence[str]],
     cfg: DataConfig,
-    report: Report,
+    report: files.Report,
 ) -> None:
     """Fill the folder with the largest model, and why photographs are not in it.
 
@@ -115,7 +112,7 @@ def _build(
     features.match_kept(database, names, features.pairs_by_name(names, cfg.matching), report)
     models_folder = folder / "models"
     models_folder.mkdir()
-    registered, progress = 2, stage_progress(report, "mapping", len(names), "images")
+    registered, progress = 2, files.stage_progress(report, "mapping", len(names), "images")
 
     def on_next_image() -> None:
         nonlocal registered
@@ -188,7 +185,7 @@ def _why(name: str, count: int, met: Mapping[str, int], parts: Sequence[set[str]
 
 
 def triangulate(
-    scene: Scene, work_dir: Path | None, report: Report, *, only_training: bool = False
+    scene: Scene, work_dir: Path | None, report: files.Report, *, only_training: bool = False
 ) -> Scene:
     """Return the scene of posed views with points and tracks, none where nothing matches.
 
@@ -202,13 +199,13 @@ def triangulate(
         raise UserError(why, fix=fix + "are theirs")
     key = {
         "pycolmap": pycolmap.__version__,
-        "files": file_fingerprints([view.image_path for view in views]),
+        "files": files.file_fingerprints([view.image_path for view in views]),
         "cameras": [
             [view.name, view.viewmat.tolist(), view.K.tolist(), *_lens(view)] for view in views
         ],
     }
     build = functools.partial(_triangulate, views=views, root=scene.root, report=report)
-    with cached_folder(work_dir, "triangulated", key, build) as folder:
+    with files.cached_folder(work_dir, "triangulated", key, build) as folder:
         model = read_model(folder)
         tracks = tracks_of(model, scene.views)
     if tracks is None:
@@ -218,7 +215,7 @@ def triangulate(
     return dataclasses.replace(scene, points=points, point_colors=model.rgb, tracks=tracks)
 
 
-def _triangulate(folder: Path, views: Sequence[View], root: Path, report: Report) -> None:
+def _triangulate(folder: Path, views: Sequence[View], root: Path, report: files.Report) -> None:
     quiet_colmap()
     names = [view.name for view in views]
     image_folder = _image_folder(views, folder)
@@ -230,11 +227,10 @@ def _triangulate(folder: Path, views: Sequence[View], root: Path, report: Report
     features.extract(database, image_folder, names, mode=mode, enlarge=enlarge)
     prior = _set_cameras(database, views)
     if unread := sorted({*names} - {image.name for image in prior.images.values()}):
-        raise UserError(
-            f"COLMAP reads {len(views) - len(unread)} of {len(views)} photographs; one that it "
-            f"cannot read is {image_folder / unread[0]}.",
-            fix="export those photographs again as PNG or JPEG, or remove them from the scene",
-        )
+        why = f"COLMAP reads {len(views) - len(unread)} of {len(views)} photographs; one that it "
+        why += f"cannot read is {image_folder / unread[0]}."
+        fix = "export those photographs again as PNG or JPEG, or remove them from the scene"
+        raise UserError(why, fix=fix)
     pairs = features.pairs_by_pose(names, np.stack([view.viewmat for view in views]))
     n = len(views) * (len(views) - 1) // 2 if pairs is None else len(pairs)
     report(f"matching {n} image pairs")
