@@ -158,9 +158,8 @@ def test_a_drive_can_be_metered(rendered, own_run, tmp_path):
     assert "Metering:" in said
 
 
-def test_an_orbit_says_what_it_does(rendered, own_run, tmp_path):
-    text = rendered(own_run, "--path", "orbit", "--frames", "3", "--out", tmp_path)
-    assert "orbit sways" in text
+def test_an_orbit_has_the_frames_asked_for(rendered, own_run, tmp_path):
+    rendered(own_run, "--path", "orbit", "--frames", "3", "--out", tmp_path)
     assert len(list(tmp_path.glob("*.png"))) == 3
 
 

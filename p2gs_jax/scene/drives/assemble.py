@@ -67,7 +67,6 @@ def assemble(
     centres = np.stack([p.pose[:3, 3] for p in photographs])
     middle = centres.mean(0)
     origin = np.rint(middle) if np.abs(middle).max() > FARTHEST_ORIGIN else np.zeros(3)
-    # Where embedded photographs are kept as files.
     folder = cache_of(recording.root, None) if work_dir is None else work_dir / "photographs"
     views = [
         dataclasses.replace(
