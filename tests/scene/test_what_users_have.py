@@ -5,7 +5,6 @@ import shutil
 import unicodedata
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -24,7 +23,7 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.export.folders import write_folder
 from p2gs_jax.paths.files import near_scene
 from p2gs_jax.paths.shots import Shot
-from p2gs_jax.scene import ImageStore, find_scene, with_what_lies_beside
+from p2gs_jax.scene import ImageStore, find_scene
 from p2gs_jax.scene.cameras import name_cameras
 from p2gs_jax.scene.files import find_names, same_shape
 from p2gs_jax.scene.rigid import require_axes
@@ -142,16 +141,6 @@ def test_a_crop_is_not_another_size():
         assert same_shape(size, (5187, 3361))
     for size in ((5150, 3361), (5187, 3340), (1297, 835), (3361, 5187)):
         assert not same_shape(size, (5187, 3361))
-
-
-def test_twelve_bits_in_sixteen_are_said(tmp_path):
-    root = tmp_path / "scene"
-    write_tiny_model(root)
-    for top, said in ((4095, True), (65535, False)):
-        for path in (root / "images").iterdir():
-            cv2.imwrite(str(path), np.linspace(0, top, 1200).reshape(30, 40).astype(np.uint16))
-        notes = with_what_lies_beside(find_scene(root, CFG), CFG).notes
-        assert any("no value above 4095: these are 12 bits" in n for n in notes) == said
 
 
 def test_what_is_far_from_the_origin_keeps_its_places(tmp_path):
