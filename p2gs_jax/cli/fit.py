@@ -52,6 +52,8 @@ class Fit:
     engine: Annotated[str, tyro.conf.arg(metavar="NAME")] = "local"
     """Where blocks are fitted: local, dask://HOST:PORT, or slurm:OPTION=VALUE,...
     (docs/sweeps.md)."""
+    devices: int | Literal["all"] = 1
+    """Devices of a step, each with its own views (--train.batch; default then: one view each)."""
 
     def execute(self) -> int:
         """Fit the scene; print the place and the scores of the results."""
@@ -61,6 +63,7 @@ class Fit:
         from p2gs_jax.cli.tables import print_metrics
         from p2gs_jax.core.progress import TerminalReporter
         from p2gs_jax.pipeline.fit import fit
+        from p2gs_jax.train.data_parallel import with_a_view_each
 
         self._check()
         with TerminalReporter() as reporter:
@@ -68,7 +71,8 @@ class Fit:
             common = {"reference": self.reference, "resume": self.resume, "reporter": reporter}
             if self.blocks is None:
                 # Starting the interpreter and loading libraries is processor time throughout.
-                common["spent_s"] = time.process_time()
+                common |= {"spent_s": time.process_time(), "devices": self.devices}
+                cfg = with_a_view_each(cfg, self.devices)
                 result = fit(self.scene, self.out, cfg, **common)
             else:
                 from p2gs_jax.jobs.blocks.fit import fit_blocks
@@ -81,14 +85,18 @@ class Fit:
         return 0
 
     def _check(self) -> None:
-        count = self.blocks
+        count, whole = self.blocks, "write a whole number from 1 on, or"
         why = "--jobs and --engine say nothing without --blocks"
         fix = "add --blocks auto, or a number"
         check(count is not None or (self.jobs == 1 and self.engine == "local"), why, fix=fix)
         right = not isinstance(count, int) or count >= 1
-        fix = "write a whole number from 1 on, or auto"
-        check(right, f"--blocks {count} is not a number of blocks", fix=fix)
+        check(right, f"--blocks {count} is not a number of blocks", fix=f"{whole} auto")
         check(self.jobs >= 1, "--jobs must be at least 1")
+        why = "--blocks fits every block on one device"
+        fix = "leave out --devices; blocks have --jobs and --engine"
+        check(count is None or self.devices == 1, why, fix=fix)
+        right = not isinstance(self.devices, int) or self.devices >= 1
+        check(right, f"--devices {self.devices} is not a number of devices", fix=f"{whole} all")
 
 
 @dataclass(frozen=True)
@@ -174,6 +182,7 @@ def checked(cfg: FitConfig) -> FitConfig:
     check(data.test_every >= 0, "--test-every must be 0 or more")
     check(train.budget_s is None or train.budget_s > 0, "--budget leaves no time", fix=DURATIONS)
     check(train.steps >= 1, "--steps must be at least 1")
+    check(train.batch >= 1, "--train.batch must be at least 1")
     check(not isinstance(most, int) or most >= 1, "--gaussians must be at least 1")
     why = "--render.background must be linear radiance, three numbers that are not negative"
     check(all(math.isfinite(x) and x >= 0 for x in behind or ()), why)

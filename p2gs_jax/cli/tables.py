@@ -69,6 +69,7 @@ def print_metrics(metrics: dict[str, Any], out: Path) -> None:
         console.print(
             f"Radiance against HDR truth: {hdr['stops_median']:.3f} stops median, "
             f"{hdr['stops_rms']:.3f} RMS; PU21 {hdr['pu21_psnr']:.2f} dB / {hdr['pu21_ssim']:.4f}; "
+            f"colour difference {hdr['delta_e_itp']:.1f} Delta E ITP; "
             f"mu-law PSNR {hdr['mu_law_psnr']:.2f} dB."
         )
     counts = metrics.get("counts", {})

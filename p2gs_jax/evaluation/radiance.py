@@ -1,4 +1,4 @@
-"""Recovered radiance against HDR truth: stops, PU21, mu law (docs/photometry.md, 6)."""
+"""Recovered radiance against HDR truth: stops, PU21, colour, mu law (docs/photometry.md, 6)."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ PU21_PEAK = 256.0
 WHITE_NITS = 100.0
 # GaussHDR (CVPR 2025) and HDR-NeRF (CVPR 2022): log(1 + mu x) / log(1 + mu), mu = 5000.
 MU = 5000.0
-# Least number of evenly spaced pixels of a view for the alignment. The other bounds, up to a factor
-# of two, what is aligned of all views together: a line needs no more, and 900 views of 160 pixels
-# took 4 GB.
-ALIGNMENT_PIXELS, MOST_ALIGNED = 10_000, 1_000_000
+# Least number of evenly spaced pixels of a view for alignment and colour difference. The third
+# bounds, up to a factor of two, what is aligned of all views together: a line needs no more, and
+# 900 views of 160 pixels took 4 GB.
+ALIGNMENT_PIXELS, COLOR_PIXELS, MOST_ALIGNED = 10_000, 20_000, 1_000_000
 STOPS_CAP = 3.0
 
 
@@ -50,6 +50,27 @@ def pu21_ssim(linear, truth, mask: Bool[np.ndarray, "h w"], white: float) -> flo
         for x in (linear, truth)
     )
     return float(ssim(a, b, np.asarray(mask, np.float32)))
+
+
+def delta_e_itp(linear, truth, mask: Bool[np.ndarray, "h w"], white: float) -> float:
+    """Return the mean colour difference of BT.2124 (1 = just noticeable), sRGB primaries.
+
+    A mean over evenly taken pixels, at least twenty thousand where there are so many.
+    """
+    if not mask.any():
+        return float("nan")
+    shown = np.flatnonzero(mask)
+    shown = shown[:: max(1, len(shown) // COLOR_PIXELS)]
+
+    # Imported here: colour-science is slow to load.
+    import colour
+
+    def encoded(x):
+        nits = np.clip(x.reshape(-1, 3)[shown] / white * WHITE_NITS, 0, PU21_RANGE[1])
+        wide = colour.RGB_to_RGB(nits, "sRGB", "ITU-R BT.2020")
+        return colour.RGB_to_ICtCp(np.maximum(wide, 0))
+
+    return float(np.mean(colour.difference.delta_E_ITP(encoded(linear), encoded(truth))))
 
 
 def mu_law(x: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
@@ -133,6 +154,7 @@ class Alignment(NamedTuple):
             "stops_rms_power": float(np.sqrt(np.mean(bent**2))) if bent.size else float("nan"),
             "pu21_psnr": pu21_psnr(*shown),
             "pu21_ssim": pu21_ssim(*shown),
+            "delta_e_itp": delta_e_itp(*shown),
             "mu_law_psnr": mu_law_psnr(*shown[:3]),
         }
 

@@ -126,6 +126,13 @@ def exploration_noise(
     """
     # The same numbers in any precision.
     normal = jax.random.normal(key, gaussians.means.shape, jnp.float32)
+    return shaped_noise(normal, gaussians, alive, rate)
+
+
+def shaped_noise(
+    normal: Float[Array, "n 3"], gaussians: Gaussians, alive: Bool[Array, " n"], rate
+) -> Float[Array, "n 3"]:
+    """Return the noise that independent normal numbers give; see `exploration_noise`."""
     gate = jax.nn.sigmoid(NOISE_STEEPNESS * (NOISE_OPACITY - opacities(gaussians)))
     R = rotation_matrices(gaussians.quats)
     variance = jnp.exp(2 * gaussians.log_scales)

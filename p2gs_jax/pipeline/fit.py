@@ -8,9 +8,11 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import no_empty_folders
@@ -35,6 +37,7 @@ from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.run.folder import RunFolder, locked
 from p2gs_jax.run.write import first_plan, write_start
 from p2gs_jax.scene.pixels.store import decoded_into
+from p2gs_jax.train.data_parallel import mesh_of
 from p2gs_jax.train.inputs import TrainingViews
 from p2gs_jax.train.loop import Trainer, TrainResult
 from p2gs_jax.train.make_step import AS_CONFIGURED, Own
@@ -69,6 +72,7 @@ def fit(
     reporter: Reporter | None = None,
     true_exposures: Mapping[str, float] | None = None,
     spent_s: float = 0.0,
+    devices: int | Literal["all"] = 1,
     terms: Mapping[str, LossTerm | None] | None = None,
     formation: Formation | None = None,
     strategy: Strategy | None = None,
@@ -78,9 +82,10 @@ def fit(
     The scene is a COLMAP model, a transforms.json or a folder of photographs; `reference` has
     photographs of the same views under one common exposure. Without `cfg` the preset is `robust`.
     Of the budget, `spent_s` seconds were gone before the call. True exposures by image name are for
-    the plot. Loss terms (by name), formation and densification of yours are as for `make_step`. The
-    run folder does not remember them: `resume` needs them again, and `load_run` shows pictures
-    through the tone curve of `cfg`.
+    the plot. Several `devices` share the views of a step; `train.batch` is a multiple of them.
+    Loss terms (by name), formation and densification of yours are as for `make_step`. The run
+    folder does not remember them: `resume` needs them again, and `load_run` shows pictures through
+    the tone curve of `cfg`.
 
     Raises:
         UserError: something the user can mend.
@@ -92,7 +97,7 @@ def fit(
     folder, begin = RunFolder(paths.run), time.monotonic() - spent_s
     weights = preflight(cfg, paths, resume=resume)
     clock = Stopwatch({"starting": spent_s} if spent_s else {})
-    optimiser = Optimiser(folder, reporter, Own(terms, formation, strategy))
+    optimiser = Optimiser(folder, reporter, mesh_of(cfg, devices), Own(terms, formation, strategy))
     pixels = decoded_into(folder.pixels)
     with no_empty_folders(paths.run), locked(paths.run) as lock, pixels, memory_named(), optimiser:
         check_run_dir(paths.run, resume, cfg)  # another may have ended since
@@ -138,17 +143,20 @@ def _prepared(
 class Optimiser:
     """Compiles and runs the steps of a fit; as a context manager it ends the compilers.
 
-    The log and checkpoints go into `folder`; `own` is what the caller of `fit` brought.
+    The log and checkpoints go into `folder`; `mesh` has the devices of a step of several views, and
+    `own` what the caller of `fit` brought.
     """
 
     def __init__(
         self,
         folder: RunFolder,
         reporter: Reporter | None = None,
+        mesh: Mesh | None = None,
         own: Own = AS_CONFIGURED,
     ):
         self._folder, self._reporter = folder, reporter or Silent()
-        self._own, self._programs = own, StepPrograms()
+        self._mesh, self._own = mesh, own
+        self._programs = StepPrograms()
 
     def __enter__(self) -> Optimiser:
         return self
@@ -220,6 +228,7 @@ class Optimiser:
             start.decisions,
             on_log=reporter.log,
             on_message=say,
+            mesh=self._mesh,
             terms=self._own.terms,
             strategy=self._own.strategy,
         )

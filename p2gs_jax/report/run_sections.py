@@ -22,6 +22,7 @@ SCORES = {"psnr": 2, "ssim": 4, "lpips": 4}
 RADIANCE = {
     "pu21_psnr": "PU21 PSNR {:.2f} dB",
     "pu21_ssim": "PU21 SSIM {:.4f}",
+    "delta_e_itp": "colour difference {:.1f} ΔE ITP",
     "mu_law_psnr": "mu-law PSNR {:.2f} dB",
 }
 # Protocols of scores by part, parts of a view, and splits of depth, as `metrics.json` has them.

@@ -6,8 +6,8 @@ All of it follows from the seed and the step number.
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Hashable, Sequence
+from typing import NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -21,6 +21,8 @@ from p2gs_jax.train import schedule
 from p2gs_jax.train.exposure_loss import ColorPairs, Partner
 from p2gs_jax.train.update import Controls
 from p2gs_jax.types import Batch, Camera, Measured
+
+Tree = TypeVar("Tree")
 
 # Observations that a step compares.
 PAIRS_PER_STEP = 4096
@@ -42,18 +44,23 @@ class TrainingViews:
     ):
         self.store, self.rows = store, tuple(rows)
         self.seed, self.measured = seed, measured
-        self._order = functools.lru_cache(4)(self._of_epoch)
+        self._batches = functools.lru_cache(4)(self._epoch)
 
     def __len__(self) -> int:
         return len(self.rows)
 
-    def index_at(self, step: int) -> int:
-        """Return the row in `Photometry` of the view that a step takes."""
-        epoch, position = divmod(step, len(self))
-        return int(self._order(epoch)[position])
+    def indices_at(self, step: int, count: int) -> tuple[int, ...]:
+        """Return the rows in `Photometry` of the views that a step of `count` views takes.
 
-    def _of_epoch(self, epoch: int) -> Int[np.ndarray, " v"]:
-        return view_order(self.seed, epoch, len(self.rows))
+        They have images of one size. `step` counts the views taken before it.
+        """
+        epoch, position = divmod(step // count, len(self._batches(0, count)))
+        return self._batches(epoch, count)[position]
+
+    def _epoch(self, epoch: int, count: int) -> list[tuple[int, ...]]:
+        views = [self.store.views[row] for row in self.rows]
+        kinds = [(v.width, v.height) for v in views]
+        return batches_of(view_order(self.seed, epoch, len(self.rows)), kinds, count)
 
     def partner_at(self, step: int, index: int) -> int:
         """Return a second view, different from that of the step where there are two."""
@@ -87,8 +94,40 @@ class TrainingViews:
         return generator(self.seed, Stream.BACKDROP, step).random(3).astype(np.float32)
 
 
+def batches_of(
+    order: Int[np.ndarray, " v"], kinds: Sequence[Hashable], count: int
+) -> list[tuple[int, ...]]:
+    """Return an epoch as batches of views that one program can take, each view once at least.
+
+    Views of a kind have images of one size and stay in their order. What is left over of a kind is
+    filled up from its beginning; batches take the turn of their first view.
+    """
+    by_kind: dict[Hashable, list[int]] = {}
+    for view in order:
+        by_kind.setdefault(kinds[view], []).append(int(view))
+    place = {int(view): at for at, view in enumerate(order)}
+    batches: list[tuple[int, ...]] = []
+    for views in by_kind.values():
+        whole = np.resize(views, -(-len(views) // count) * count)
+        batches += [tuple(row.tolist()) for row in whole.reshape(-1, count)]
+    return sorted(batches, key=lambda batch: place[batch[0]])
+
+
+def stacked(trees: Sequence[Tree]) -> Tree:
+    """Return host records as one, along a new first axis; photographs keep the finer type."""
+    return jax.tree.map(lambda *arrays: np.stack(_of_one_type(arrays)), *trees)
+
+
+def _of_one_type(arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return pixels of 8 bits as of 16 where others are: 255 and 65535 both stand for 1."""
+    arrays = [np.asarray(a) for a in arrays]
+    if {a.dtype for a in arrays} == {np.dtype(np.uint8), np.dtype(np.uint16)}:
+        return [a.astype(np.uint16) * 257 if a.dtype == np.uint8 else a for a in arrays]
+    return arrays
+
+
 class Inputs(NamedTuple):
-    """Arguments of a step, all on the host."""
+    """Arguments of a step, all on the host; those of several views are stacked."""
 
     batch: Batch
     partner: Partner
@@ -121,13 +160,21 @@ def inputs_at(
 ) -> Inputs:
     """Return the inputs of a step.
 
-    `step` counts those before it, `shrink` is the factor by which images are shrunk, `pairs` are
-    corresponding observations, where the relative-exposure loss compares photographs.
+    `step` counts the views taken before it, `shrink` is the factor by which images are shrunk,
+    `pairs` are corresponding observations, where the relative-exposure loss compares photographs.
     """
-    row = views.index_at(step)
-    return Inputs(
-        views.batch(row, shrink, step), partner_at(step, row, views, pairs, cfg), controls
-    )
+    rows = views.indices_at(step, cfg.train.batch)
+    each = [
+        (
+            views.batch(row, shrink, step + k),
+            partner_at(step + k, row, views, pairs, cfg),
+        )
+        for k, row in enumerate(rows)
+    ]
+    if len(each) == 1:
+        return Inputs(*each[0], controls)
+    batches, partners = zip(*each, strict=True)
+    return Inputs(stacked(batches), stacked(partners), controls)
 
 
 def partner_at(

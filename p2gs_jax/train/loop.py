@@ -17,6 +17,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core import interrupts
@@ -28,6 +29,7 @@ from p2gs_jax.gaussians.population import STEP_SECONDS_PER_PIXEL, Coverage
 from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.train import room, schedule, strategies
+from p2gs_jax.train.data_parallel import ParallelStep, spread, whole
 from p2gs_jax.train.exposure_loss import ColorPairs
 from p2gs_jax.train.inputs import Inputs, TrainingViews, controls_at, inputs_at
 from p2gs_jax.train.optimizer import make_optimizer
@@ -85,6 +87,7 @@ class Trainer:
     decided: Decisions  # what the scene settled; a resumed run must have settled the same
     on_log: Callable[[LogRecord], None] = lambda record: None
     on_message: Callable[[str], None] = lambda text: None  # told what the user must know
+    mesh: Mesh | None = None  # the devices of a step of several views; None: it takes one view
     # loss terms to add to those of `cfg`, or to replace; None takes one away
     terms: Mapping[str, LossTerm | None] | None = None
     strategy: Strategy | None = None  # how the population changes; None: as `cfg` says
@@ -105,7 +108,9 @@ class Trainer:
         chosen = strategies.make_strategy(cfg, self.coverage, self.levels)
         self.densification = self.strategy or chosen
         noise = getattr(self.densification, "noise", None)
-        self.step = Step(cfg, self.optimizer, self.extent, noise, self.terms or {})
+        given = (cfg, self.optimizer, self.extent, noise, self.terms or {})
+        mesh = self.mesh
+        self.step = Step(*given) if mesh is None else ParallelStep(*given, mesh)
 
     def run(
         self,
@@ -141,9 +146,11 @@ class Trainer:
         clock = RunClock(self.cfg.train, host, **seconds, now=self.now)
         population = state.population
         self._allocate(state.params.gaussians, population.alive, population.owner, host)
+        state = spread(state, self.mesh)
         self._expect(state, host)
         with interrupts.held() as self.asked:
             state = self._loop(state, host, clock)
+            state = whole(state, self.mesh)
             self._save(state, host)
         seconds = {"compiling": self.programs.waited_s, **self.stopwatch.seconds}
         return TrainResult(state, host, seconds)
@@ -188,7 +195,7 @@ class Trainer:
             asked = self.asked.arrived
             if asked is not None or host.elapsed_s - saved > pause:
                 begun = host.elapsed_s
-                self._save(state, host)
+                self._save(whole(state, self.mesh), host)
                 clock.tick(host)
                 saved = host.elapsed_s
                 pause = pause_between(every_s, saved - begun)
@@ -218,10 +225,11 @@ class Trainer:
         state, reports, sizes = self._dispatched(state, host)
         kind = int(state.fault.kind)
         done = int(state.step) - host.step
+        taken = done // self.cfg.train.batch
         seconds = self.now() - begin - (self.programs.waited_s - waited)
         self.stopwatch.add("steps", seconds)
         if kind == FAULT_NONFINITE:
-            name = finite_names(reports[done].terms, state.params)[int(state.fault.term)]
+            name = finite_names(reports[taken].terms, state.params)[int(state.fault.term)]
             raise DivergenceError(
                 f"Step {host.step + done + 1}: the {name} is not finite; "
                 f"{self.records.last_good()}.",
@@ -230,7 +238,7 @@ class Trainer:
             )
         if kind == FAULT_OVERFLOW:
             needed, visible = int(state.fault.needed), int(state.fault.visible)
-            host.rooms = room.grown(host.rooms, sizes[done], needed, visible)
+            host.rooms = room.grown(host.rooms, sizes[taken], needed, visible)
             host.overflows += 1
             state = healed(state)
         elif done:
@@ -239,27 +247,29 @@ class Trainer:
         host.step += done
         for _ in range(done):
             host.progress += host.pace
-        return state, reports[:done]
+        return state, reports[:taken]
 
     def _dispatched(
         self, state: FitState, host: HostState
     ) -> tuple[FitState, list[StepReport], list[tuple[int, int]]]:
         """Dispatch the steps of a burst; return the state, and report and image size of each."""
         progress, reports, sizes = host.progress, [], []
-        every = self.cfg.train.log_every
+        every, views = self.cfg.train.log_every, self.cfg.train.batch
         end = host.step + min(every - host.step % every, MAX_BURST)
-        for step in range(host.step, end):
+        for step in range(host.step, end, views):
             if schedule.is_over(progress, host.pace):
                 break
             if schedule.shrink_at(progress, self.levels) != host.shrink:
                 break
-            self.views.prefetch(self.views.index_at(step + 1), host.shrink)
+            for row in self.views.indices_at(step + views, views):
+                self.views.prefetch(row, host.shrink)
             inputs = self._inputs(step, progress, host.pace, host.shrink)
             key = self._key(state, inputs, host, host.shrink)
             state, report = self.programs.get(self.step, key, state, *inputs)(state, *inputs)
             reports.append(report)
             sizes.append(inputs.size)
-            progress = progress + host.pace
+            for _ in range(views):
+                progress = progress + host.pace
         return state, reports, sizes
 
     def _inputs(self, step: int, progress: float, pace: float, shrink: int) -> Inputs:
@@ -275,15 +285,16 @@ class Trainer:
             if self.densification is None or not due:
                 return state
             host.densified_at = host.progress
-            return strategies.densified(
+            state = strategies.densified(
                 self.densification,
-                state,
+                whole(state, self.mesh),
                 host,
                 self.cfg,
                 self.extent,
                 self.slots.limit,
                 self.on_message,
             )
+            return spread(state, self.mesh)
 
     def _save(self, state: FitState, host: HostState) -> None:
         with self.stopwatch("checkpoints"):

@@ -149,6 +149,8 @@ class Step:
         moved = (state, listed.ids, listed.visible, gradient, frustum, controls)
         return program(name).lower(*moved)
 
+    # What a step of several views on several devices does otherwise (`data_parallel.py`).
+
     def program(self, name: str, room: Room, degree: int) -> Any:
         """Return one of the three programs, jitted."""
         return compiled(name, **self.settings(name), **static_sizes(name, room, degree))
@@ -207,15 +209,15 @@ class StepPrograms:
         self._worker = ThreadPoolExecutor(WORKERS, thread_name_prefix="compile")
         self.waited_s = 0.0
 
-    def expect(self, step: Step, key: Key, *arguments: Any, images: bool = True) -> None:
+    def expect(self, step: Any, key: Key, *arguments: Any, images: bool = True) -> None:
         """Begin to compile a step in the background.
 
-        `arguments` are those of the step, or their shapes. Without `images`, the program between
-        waits, which knows the tone curve.
+        `step` is a `Step`, or one of several views; `arguments` are its own, or their shapes.
+        Without `images`, the program between waits, which knows the tone curve.
         """
         self._parts(step, key, arguments, images)
 
-    def _parts(self, step: Step, key: Key, arguments, images: bool = True) -> list[Future]:
+    def _parts(self, step: Any, key: Key, arguments, images: bool = True) -> list[Future]:
         """Return the programs of a step in their order, those yet unknown on their way."""
         visible_only = step.settings("show")["cfg"].optimizer.visible_only
         rows = min(key.room.visible, key.slots) if visible_only else key.slots
@@ -251,7 +253,7 @@ class StepPrograms:
         future = self._made[key]
         return lambda *given: self._wait(future)(*given)
 
-    def get(self, step: Step, key: Key, *arguments: Any):
+    def get(self, step: Any, key: Key, *arguments: Any):
         """Return a compiled step, `(state, batch, partner, controls) -> (state, report)`."""
         if (step, key) not in self._ready:
             parts = self._parts(step, key, arguments)

@@ -112,15 +112,13 @@ def advance(
     gaussians, population = state.params.gaussians, state.population
     n, bands = gaussians.capacity, coefficient_count(degree)
     fits = ~gradient.overflow & (count <= ids.shape[0])
-    # No fault before it, room, and a finite loss: else the step writes nothing.
-    unbroken = jnp.all(_finite((gradient.terms, gradient.v_rest)))
-    healthy = (state.fault.kind == FAULT_NONE) & fits & unbroken
+    healthy = is_healthy(state, gradient, fits)
     progress, rate = controls.progress, controls.rate
     rates = learning_rates(progress, rate, extent, state.params, cfg, bands)
     key = noise_key(controls.seed, state.step)
     noise_rate = (noise or 0.0) * means_rate(progress, rate, extent, cfg)
 
-    def exploring(block, moved, on):
+    def exploring(block, _, moved, on):
         return exploration_noise(jax.random.fold_in(key, block), moved, on, noise_rate)
 
     updated = update_listed(
@@ -144,7 +142,7 @@ def advance(
         where = jnp.where(healthy, ids, n)
         population = _observed(population, where, gradient, frustum)
     moved, told = (updated, population), (fits, healthy, count)
-    return _concluded(state, moved, gradient, told, rates, cfg=cfg, optimizer=optimizer)
+    return concluded(state, moved, gradient, told, rates, cfg=cfg, optimizer=optimizer)
 
 
 def update_listed(
@@ -170,7 +168,7 @@ def update_listed(
         bands: spherical-harmonics coefficients that are looked at and moved.
         seen: (Gaussians, alive, owner) of a block -> what the image is made of, per Gaussian.
         v_seen: gradient of the loss to that, for the whole list.
-        noise: (number of a block, Gaussians, alive) -> what to add to their means, or None.
+        noise: (number of a block, ids, Gaussians, alive) -> what to add to their means, or None.
         owner: the moving object that each Gaussian belongs to, or None.
     """
     n, size = gaussians.capacity, block_size(ids.shape[0])
@@ -190,7 +188,7 @@ def update_listed(
         )
         moved, new = adam.update(grads, before, old, rates)
         if noise is not None:
-            moved = dataclasses.replace(moved, means=moved.means + noise(k, moved, shown))
+            moved = dataclasses.replace(moved, means=moved.means + noise(k, here, moved, shown))
         where = jnp.where(healthy & jnp.all(finite), here, n)
         return Updated(
             put_rows(state.gaussians, where, moved),
@@ -207,7 +205,13 @@ def update_listed(
     return lax.fori_loop(0, -(-used // size), body, start)
 
 
-def _concluded(
+def is_healthy(state: FitState, gradient: ImageGradient, fits: Array) -> Bool[Array, ""]:
+    """Return whether a step may write: no fault before it, room, and a finite loss."""
+    unbroken = jnp.all(_finite((gradient.terms, gradient.v_rest)))
+    return (state.fault.kind == FAULT_NONE) & fits & unbroken
+
+
+def concluded(
     state: FitState,
     moved: tuple[Updated, Population],
     gradient: ImageGradient,
@@ -216,11 +220,13 @@ def _concluded(
     *,
     cfg: FitConfig,
     optimizer: Optimizer,
+    views: int = 1,
 ) -> tuple[FitState, StepReport]:
     """Move the rest, and return the state after a step with what became of it.
 
     `moved` are the Gaussians after it, and the population with its statistics. `told` are whether
-    everything found room, whether the step is healthy, and how many Gaussians the view may show.
+    everything found room, whether the step is healthy, and how many Gaussians a view may show.
+    `views` is how many the step took.
     """
     (updated, population), (fits, healthy, count) = moved, told
     first = state.fault.kind == FAULT_NONE
@@ -253,7 +259,7 @@ def _concluded(
         Params(updated.gaussians, photometry, appearance),
         OptState(updated.moments, rest_moments),
         population,
-        state.step + (fault.kind == FAULT_NONE),
+        state.step + views * (fault.kind == FAULT_NONE),
         fault,
     )
     report = StepReport(gradient.loss, gradient.terms, gradient.psnr, gradient.entries, count)

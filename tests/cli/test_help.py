@@ -66,7 +66,7 @@ def test_common_options_come_first_and_the_rest_on_request(shown):
         assert option in whole
     assert "--help-all" in brief
     assert "--render.tile" not in brief
-    for option in ("--render.tile N N", "--loss.dssim-weight", "--densify.method"):
+    for option in ("--render.tile N N", "--loss.dssim-weight", "--densify.method", "--train.batch"):
         assert option in whole
     assert not wide(whole.partition("Examples:")[0])
     assert brief.index("--budget") < brief.index("--seed")

@@ -10,6 +10,7 @@ from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.evaluation import alignment, radiance
 from p2gs_jax.evaluation.radiance import (
     Alignment,
+    delta_e_itp,
     mu_law,
     mu_law_psnr,
     pu21_encode,
@@ -145,7 +146,10 @@ def test_what_is_aligned_does_not_grow_with_the_views(monkeypatch):
 
 def test_perceptual_scores_see_hue():
     truth = image()
-    assert pu21_psnr(truth * [1.2, 1.0, 0.9], truth, EVERYWHERE, 1.0) < 40
+    assert delta_e_itp(truth, truth, EVERYWHERE, 1.0) == pytest.approx(0, abs=1e-9)
+    red = truth * [1.2, 1.0, 0.9]
+    assert delta_e_itp(red, truth, EVERYWHERE, 1.0) > 3
+    assert pu21_psnr(red, truth, EVERYWHERE, 1.0) < 40
 
 
 TRUTH = np.random.default_rng(0).uniform(0.1, 4.0, (8, 10, 3))

@@ -30,8 +30,8 @@ class Views:
     def __len__(self):
         return VIEWS
 
-    def index_at(self, step):
-        return step % VIEWS
+    def indices_at(self, step, count):
+        return tuple((step + k) % VIEWS for k in range(count))
 
     def prefetch(self, index, shrink):
         pass

@@ -13,11 +13,11 @@ WIDTH, HEIGHT, FOCAL = 48, 32, 45.0
 EXTENT, DEGREE = 2.0, 1
 
 
-def config(method: str | None = "mcmc") -> FitConfig:
+def config(method: str | None = "mcmc", batch: int = 1) -> FitConfig:
     # DSSIM would only cost compiling; with an epsilon of about the gradient's size, updates are as
     # smooth as the gradient.
     fields = {"loss.dssim_weight": None, "optimizer.eps": 1e-5, "densify.method": method}
-    fields |= {"render.sh_degree": DEGREE, "render.pixels_in_flight": 2048}
+    fields |= {"render.sh_degree": DEGREE, "render.pixels_in_flight": 2048, "train.batch": batch}
     return with_values(FitConfig(), fields)
 
 

@@ -28,6 +28,7 @@ from p2gs_jax.presets import from_dict, to_dict
 from p2gs_jax.run.folder import RunFolder, locked
 from p2gs_jax.scene.pixels.store import decoded_into, size_at
 from p2gs_jax.scene.visibility import shown_share
+from p2gs_jax.train.data_parallel import mesh_of
 from p2gs_jax.types import Scene
 
 # Gaussians for a coarse point outside a block, which stands for many, to one for a point inside.
@@ -122,7 +123,7 @@ def _fit(
 ) -> tuple[dict[str, int], dict[str, float]]:
     """Fit a block's scene and write its Gaussians; return counts and seconds."""
     clock = Stopwatch()
-    with Optimiser(folder, reporter) as optimiser:
+    with Optimiser(folder, reporter, mesh_of(cfg)) as optimiser:
         with clock("photometry"):
             found = survey(block.scene, cfg, pixels=folder.pixels, sphere=block.shell)
             optimiser.expect(found, given=block.exposures.decisions)

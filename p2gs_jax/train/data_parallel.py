@@ -1,0 +1,338 @@
+"""Steps of several views, whose views are shared out among devices that each hold the whole scene.
+
+Within a device everything is as in a step of one view, view by view; between devices only sums of
+gradients travel. The loss is the mean over the views; learning rates are those of one view times
+the root of their number, so that as many views move a Gaussian about as far (Krizhevsky 2014;
+Grendel-GS, arXiv 2406.18533; docs/scaling.md).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any, Literal, NamedTuple, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+from jaxtyping import Float, Int
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.core.streams import noise_key
+from p2gs_jax.errors import UserError
+from p2gs_jax.gaussians.mcmc import shaped_noise
+from p2gs_jax.render.capacity import Room
+from p2gs_jax.render.harmonics import coefficient_count
+from p2gs_jax.render.visible import (
+    block_size,
+    compact,
+    owners_at,
+    slice_of,
+    splat,
+    take_rows,
+    whole_blocks,
+)
+from p2gs_jax.render.xla_cpu import compiler_options
+from p2gs_jax.train import image_gradient
+from p2gs_jax.train.image_gradient import ImageGradient, Listed, differentiable
+from p2gs_jax.train.optimizer import learning_rates, means_rate
+from p2gs_jax.train.state import FitState
+from p2gs_jax.train.step import Step, static_sizes
+from p2gs_jax.train.update import StepReport, concluded, is_healthy, update_listed
+from p2gs_jax.types import Array, Batch, Frustum, Gaussians
+
+VIEWS = "views"
+EVERYWHERE, OF_VIEWS = P(), P(VIEWS)
+
+Count = int | Literal["all"]
+
+
+def default_mesh(count: int = 1) -> Mesh:
+    """Return a mesh of the first devices."""
+    return Mesh(np.array(jax.devices()[:count]), (VIEWS,))
+
+
+def _counted(devices: Count) -> int:
+    there = jax.device_count()
+    if devices == "all":
+        return there
+    if not 1 <= devices <= there:
+        raise UserError(
+            f"--devices {devices} is not between 1 and the {there} that JAX sees here "
+            f"({jax.default_backend()}).",
+            fix="give one of these, or all; on a CPU, XLA_FLAGS="
+            f"--xla_force_host_platform_device_count={devices} makes as many of its cores",
+        )
+    return devices
+
+
+def with_a_view_each(cfg: FitConfig, devices: Count) -> FitConfig:
+    """Return a configuration that gives every device a view where it says nothing of batches.
+
+    Raises:
+        UserError: there are not so many devices.
+    """
+    count = _counted(devices)
+    if count == 1 or cfg.train.batch > 1:
+        return cfg
+    return dataclasses.replace(cfg, train=dataclasses.replace(cfg.train, batch=count))
+
+
+def mesh_of(cfg: FitConfig, devices: Count = 1) -> Mesh | None:
+    """Return the mesh of a fit; None for one view a step on one device.
+
+    Raises:
+        UserError: there are not so many devices, or the batch cannot be shared out among them.
+    """
+    count, batch = _counted(devices), cfg.train.batch
+    if batch < 1:
+        raise UserError(f"--train.batch is {batch}.", fix="give 1 or more")
+    if batch == 1 and count == 1:
+        return None
+    if batch % count:
+        raise UserError(
+            f"--train.batch {batch} cannot be shared out among {count} devices.",
+            fix=f"give a multiple of {count}, such as --train.batch {-(-batch // count) * count}",
+        )
+    return default_mesh(count)
+
+
+def spread(state: FitState, mesh: Mesh | None) -> FitState:
+    """Return a state as steps take it: whole on each of the devices; None: where it is."""
+    if mesh is None:
+        return state
+    return jax.device_put(jax.device_get(state), NamedSharding(mesh, EVERYWHERE))
+
+
+def whole(state: FitState, mesh: Mesh | None) -> FitState:
+    """Return a state of steps on the default device, for what looks at all Gaussians."""
+    return state if mesh is None else jax.tree.map(jnp.asarray, jax.device_get(state))
+
+
+# ------------------------------------------------- what each device does, with its own views
+
+
+def _show(gaussians, alive, frusta, active_degree, owner, **given) -> Listed:
+    """List and project what each view may show; everything is stacked, `visible` as [b, 1]."""
+
+    def one(frustum):
+        return image_gradient.show(gaussians, alive, frustum, active_degree, owner, **given)
+
+    listed = lax.map(one, frusta)
+    return listed._replace(visible=listed.visible[:, None])
+
+
+def _differentiate(
+    shown, photometry, appearance, batch, partner, *, views: int, **given
+) -> ImageGradient:
+    """Return the mean loss of all `views` of the step, and its gradient.
+
+    Gradients by splats are those of the device's views, each of its own loss.
+    """
+
+    def one(own):
+        mine, photograph, second = own
+        return image_gradient.differentiate(
+            mine, photometry, appearance, photograph, second, **given
+        )
+
+    each = lax.map(one, (shown, batch, partner))
+
+    def mean(name):
+        return jax.tree.map(lambda a: lax.psum(jnp.sum(a, 0), VIEWS) / views, getattr(each, name))
+
+    return each._replace(
+        **{name: mean(name) for name in ("loss", "terms", "v_rest", "psnr")},
+        entries=lax.pmax(jnp.max(each.entries), VIEWS),
+        overflow=lax.pmax(jnp.max(each.overflow.astype(jnp.int32)), VIEWS) > 0,
+    )
+
+
+class Sums(NamedTuple):
+    """What the views of a step add up to."""
+
+    gradient: Gaussians  # of the sum of the views' losses
+    shown: Int[Array, " n"]  # views that may show each
+    # norms of the gradients by the place on the screen, in units of half the image
+    grad2d: Float[Array, " n"]
+    pulled: Float[Array, " n"]  # views in which that was not zero
+
+
+def _advance(
+    state: FitState,
+    ids: Int[Array, "b v"],
+    visible: Int[Array, "b 1"],
+    gradient: ImageGradient,
+    frusta,
+    controls,
+    *,
+    cfg: FitConfig,
+    optimizer,
+    extent: float,
+    noise: float | None,
+    degree: int,
+    views: int,
+) -> tuple[FitState, StepReport]:
+    """Move everything by one step, on each device alike; see `update.advance`."""
+    gaussians, population = state.params.gaussians, state.population
+    alive, n, bands = population.alive, gaussians.capacity, coefficient_count(degree)
+    most = lax.pmax(jnp.max(visible), VIEWS)
+    fits = ~gradient.overflow & (most <= ids.shape[1])
+    healthy = is_healthy(state, gradient, fits)
+    sums = _sums(state, ids, visible, gradient, frusta, controls, cfg, bands)
+    seen, count = compact((sums.shown > 0) & alive, whole_blocks(n))
+    progress, rate = controls.progress, controls.rate
+    rates = learning_rates(progress, rate, extent, state.params, cfg, bands)
+    rates = jax.tree.map(lambda r: r * views**0.5, rates)
+    noise_rate = (noise or 0.0) * means_rate(progress, rate, extent, cfg) * views**0.5
+    key = noise_key(controls.seed, state.step)
+
+    def exploring(block, rows, moved, on):
+        # Each Gaussian's noise is its own, whatever else is listed.
+        keys = jax.vmap(functools.partial(jax.random.fold_in, key))(rows)
+        normal = jax.vmap(lambda k: jax.random.normal(k, (3,)))(keys)
+        return shaped_noise(normal, moved, on, noise_rate)
+
+    updated = update_listed(
+        gaussians,
+        state.opt_state.gaussians,
+        alive,
+        seen,
+        count,
+        healthy,
+        bands=bands,
+        # Their gradient is known: a Gaussian is what it is made of.
+        seen=lambda block, on, owner: block,
+        v_seen=jax.tree.map(lambda g: g / views, take_rows(sums.gradient, seen, bands)),
+        adam=optimizer.gaussians,
+        rates=rates.gaussians,
+        noise=None if noise is None else exploring,
+        owner=population.owner,
+    )
+    if noise is None:
+        population = dataclasses.replace(
+            population,
+            grad2d_sum=population.grad2d_sum + jnp.where(healthy, sums.grad2d, 0),
+            seen_count=population.seen_count + jnp.where(healthy, sums.pulled, 0),
+        )
+    options = {"cfg": cfg, "optimizer": optimizer, "views": views}
+    moved, told = (updated, population), (fits, healthy, most)
+    return concluded(state, moved, gradient, told, rates, **options)
+
+
+def _sums(state, ids, visible, gradient, frusta, controls, cfg, bands: int) -> Sums:
+    """Return the sums over all views, one after the other and then over the devices."""
+    gaussians, alive = state.params.gaussians, state.population.alive
+    owner, n = state.population.owner, gaussians.capacity
+
+    def add(sums: Sums, view) -> tuple[Sums, None]:
+        here, count, v_view, image, frustum = view
+        size = block_size(here.shape[0])
+
+        def body(k, sums: Sums) -> Sums:
+            rows = slice_of(here, k, size)
+            on = alive.at[rows].get(mode="fill", fill_value=False)
+            mine = owners_at(owner, rows)
+
+            def seen(block):
+                degree = controls.active_degree
+                return differentiable(splat(block, on, frustum, cfg.render, degree, mine))
+
+            _, pull = jax.vjp(seen, take_rows(gaussians, rows, bands))
+            v_block = slice_of(v_view, k, size)
+            (v_rows,) = pull(v_block)
+            half = jnp.stack([frustum.width / 2, frustum.height / 2])
+            on_screen = v_block[0] * half
+            pulled = slice_of(image, k, size) & (jnp.sum(jnp.abs(on_screen), -1) > 0)
+            added = Sums(
+                v_rows,
+                jnp.ones(size, jnp.int32),
+                jnp.linalg.norm(on_screen, axis=-1),
+                pulled.astype(jnp.float32),
+            )
+            return jax.tree.map(
+                lambda a, b: a.at[rows].add(b, mode="drop", unique_indices=True), sums, added
+            )
+
+        used = jnp.minimum(count, here.shape[0])
+        return lax.fori_loop(0, -(-used // size), body, sums), None
+
+    none = dataclasses.replace(gaussians, sh=gaussians.sh[:, :bands])
+    blank = jax.tree.map(jnp.zeros_like, none)
+    zeros = [jnp.zeros(n, kind) for kind in (jnp.int32, jnp.float32, jnp.float32)]
+    given = (ids, visible[:, 0], gradient.v_shown, gradient.visible, frusta)
+    sums, _ = lax.scan(add, Sums(blank, *zeros), given)
+    return lax.psum(sums, VIEWS)
+
+
+# ---------------------------------------------------------------------------- the step
+
+GRADIENT: Any = cast(Any, ImageGradient)(
+    **{name: EVERYWHERE for name in ImageGradient._fields}
+    | {"v_shown": OF_VIEWS, "visible": OF_VIEWS}
+)
+# Each program, and along which axis its arguments and its results are divided.
+PROGRAMS: dict[str, tuple[Any, Any, Any]] = {
+    "show": (_show, (EVERYWHERE, EVERYWHERE, OF_VIEWS, EVERYWHERE, EVERYWHERE), OF_VIEWS),
+    "differentiate": (
+        _differentiate,
+        (OF_VIEWS, EVERYWHERE, EVERYWHERE, OF_VIEWS, OF_VIEWS),
+        GRADIENT,
+    ),
+    "advance": (
+        _advance,
+        (EVERYWHERE, OF_VIEWS, OF_VIEWS, GRADIENT, OF_VIEWS, EVERYWHERE),
+        EVERYWHERE,
+    ),
+}
+
+
+@functools.cache
+def _compiled(name: str, *, mesh: Mesh, **static: Any) -> Any:
+    """Return a part of a step, divided over the mesh and jitted; it takes arrays of the host."""
+    part, *specs = PROGRAMS[name]
+    into, out = jax.tree.map(
+        lambda spec: NamedSharding(mesh, spec), specs, is_leaf=lambda spec: isinstance(spec, P)
+    )
+    body = jax.shard_map(
+        functools.partial(part, **static),
+        mesh=mesh,
+        in_specs=specs[0],
+        out_specs=specs[1],
+        check_vma=False,
+    )
+    return jax.jit(
+        body,
+        in_shardings=into,
+        out_shardings=out,
+        compiler_options=compiler_options(),
+        donate_argnums=(0,) if name == "advance" else (),
+    )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ParallelStep(Step):
+    """The step of several views; `train.batch` is a multiple of the devices.
+
+    Batches and partners come stacked, states by `spread`.
+    """
+
+    mesh: Mesh = dataclasses.field(default_factory=default_mesh)
+
+    def settings(self, name: str) -> dict[str, Any]:
+        """Return what one of the three programs takes from the configuration, by argument."""
+        views = {} if name == "show" else {"views": self.cfg.train.batch}
+        return super().settings(name) | views | {"mesh": self.mesh}
+
+    def program(self, name: str, room: Room, degree: int) -> Any:
+        """Return one of the three programs, divided over the mesh and jitted."""
+        return _compiled(name, **self.settings(name), **static_sizes(name, room, degree))
+
+    def frustum(self, batch: Batch) -> Frustum:
+        """Return the views of a step, stacked."""
+        one, every = super().frustum(batch), (self.cfg.train.batch,)
+        width, height = (np.full(every, size) for size in (one.width, one.height))
+        return dataclasses.replace(one, width=width, height=height)

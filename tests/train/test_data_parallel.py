@@ -1,0 +1,75 @@
+"""A step of several views is one step, however many devices share its views."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.errors import UserError
+from p2gs_jax.jobs.configs import with_fields
+from p2gs_jax.train.data_parallel import mesh_of, with_a_view_each
+from p2gs_jax.train.state import FAULT_OVERFLOW
+
+HERE = Path(__file__).parent
+
+
+@pytest.fixture(scope="module")
+def found():
+    paths = [*map(str, (HERE, HERE.parent)), os.environ.get("PYTHONPATH", "")]
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=4"
+    env = {"PYTHONPATH": os.pathsep.join(paths), "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
+    done = subprocess.run(
+        [sys.executable, str(HERE / "data_parallel_worker.py")],
+        env=os.environ | env,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("devices", ["1", "4"])
+def test_a_step_takes_the_mean_over_views_wherever_they_are(found, devices):
+    """Loss and gradient are means; devices change neither losses nor noise; views are counted."""
+    made = found[devices]
+    assert made["losses"][0] == pytest.approx(found["one view"]["loss"], rel=1e-6)
+    assert made["of one view"] < 1e-6
+    assert made["of one device"] < 2e-7
+    assert made["losses"] == pytest.approx(found["1"]["losses"], rel=1e-6)
+    assert made["step"] == 8
+
+
+def test_a_view_that_finds_no_room_stops_all_devices_until_there_is_some(found):
+    made = found["4"]
+    assert made["fault"]["kind"] == FAULT_OVERFLOW
+    assert made["fault"]["needed"] > 64
+    assert made["moved"] == 0
+    assert made["stopped at"] == 0
+
+
+def test_one_view_on_one_device_needs_no_mesh():
+    assert mesh_of(FitConfig()) is None
+    assert with_a_view_each(FitConfig(), 1) == FitConfig()
+    assert mesh_of(with_fields(FitConfig(), {"train.batch": 3})).size == 1
+
+
+@pytest.mark.parametrize(
+    ("devices", "batch", "words"),
+    [(1000, 1, "not between 1 and"), (0, 1, "not between"), (1, 0, "--train.batch is 0")],
+)
+def test_what_cannot_be_is_refused_by_name(devices, batch, words):
+    with pytest.raises(UserError, match=words) as refused:
+        mesh_of(with_fields(FitConfig(), {"train.batch": batch}), devices)
+    assert refused.value.fix
+
+
+def test_the_command_line_refuses_what_is_no_number(run_command, tmp_path):
+    code, said = run_command("fit", tmp_path, "--out", tmp_path / "run", "--devices", "two")
+    assert code == 2
+    assert "--devices" in said
+    assert "two" in said
+    assert not (tmp_path / "run").exists()
