@@ -17,9 +17,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Bool
 
 from p2gs_jax.config import FitConfig, PhotometryConfig
 from p2gs_jax.core.streams import Stream, generator
+from p2gs_jax.photometry.adjustment.errors import SHARED_REGION, regions
 from p2gs_jax.photometry.adjustment.fit import fit_model
 from p2gs_jax.photometry.adjustment.problem import KnownExposures, Problem, make_problem
 from p2gs_jax.photometry.adjustment.solve import MOST_ROUNDS, fit_response
@@ -185,6 +187,19 @@ def _subset(observations: Observations, seed: int, most: int) -> Observations:
     return o.picked(chosen[o.points])
 
 
+def _held_out(o: Observations, seed: int) -> Bool[np.ndarray, " o"]:
+    """Return which observations to hold out: whole regions of images, in which errors are shared.
+
+    Held out one by one, each would be predicted by neighbours that err alike, and parameters that
+    explain such errors would look right (BUILD_NOTES, "Whole regions").
+    """
+    rng = generator(seed, Stream.HELD_OUT)
+    if o.positions is None:
+        return rng.random(len(o.points)) < HELD_OUT
+    region = regions(o.positions, o.views, SHARED_REGION)
+    return (rng.random(int(region.max(initial=-1)) + 1) < HELD_OUT)[region]
+
+
 def _chosen(
     observations: Observations, options: CalibrationOptions, on_chosen: OnChosen
 ) -> Selection:
@@ -193,7 +208,7 @@ def _chosen(
     # What fixes the scale alone says nothing of models and curves.
     told = options if problem.told.size else dataclasses.replace(options, known=None)
     small = told.problem(_subset(observations, seed, MOST_OBSERVATIONS))
-    held = generator(seed, Stream.HELD_OUT).random(len(small.observations.points)) < HELD_OUT
+    held = _held_out(small.observations, seed)
     training = told.problem(_subset(small.observations.picked(~held), seed, SPLINE_OBSERVATIONS))
     search = Search(small, held, training, known=options.known_response is not None)
     notes = search.first()

@@ -76,9 +76,10 @@ class Candidate:
 def choose(candidates: list[Candidate]) -> Candidate:
     """Return the simplest candidate that is not clearly worse than the best."""
     simplest = min((c for c in candidates if c.good), key=lambda c: c.parameters)
-    # Curves cost nothing within a form.
+    # Curves cost nothing within a form, but another than the standard one has to be clearly better.
     as_simple = [c for c in candidates if c.parameters <= simplest.parameters]
-    return max(as_simple, key=lambda c: c.density)
+    standard = [c for c in as_simple if c.choice.curve == Curve() and c.good]
+    return max(standard or as_simple, key=lambda c: c.density)
 
 
 class Predicted(NamedTuple):

@@ -6,19 +6,20 @@ into views with a visibility test, or from pixels warped through the depth of a 
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 
+import cv2
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.photometry.observations import Observations, grouped
+from p2gs_jax.photometry.sources.patches import Surfaces, surfaces_of
 from p2gs_jax.photometry.sources.sampling import PROJECTED_UNCERTAINTY, point_colors
 from p2gs_jax.render.capacity import make_renderer
-from p2gs_jax.render.warp import project_points, surface_depth, unproject, visible
+from p2gs_jax.render.warp import DEPTH_TOLERANCE, project_points, surface_depth, unproject, visible
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.scene.visibility import unoccluded
 from p2gs_jax.types import Gaussians, Scene
@@ -48,13 +49,14 @@ def has_tracks(scene: Scene) -> bool:
 
 
 def track_colors(scene: Scene, store: ImageStore, on_view: OnView = None) -> Observations:
-    """Sample every track in every training view, at its training resolution."""
+    """Sample every track in every training view."""
     assert scene.tracks is not None
     of_view = grouped(scene.tracks.view_indices, len(scene.views))
     picks = [of_view[i] for i in scene.train_indices]
     points = [scene.tracks.point_indices[pick] for pick in picks]
     xy = [scene.tracks.xy[pick] for pick in picks]
-    return point_colors(scene, store, points, xy, on_view=on_view)
+    surfaces = surfaces_of(scene.points)
+    return point_colors(scene, store, surfaces, points, xy, on_view=on_view)
 
 
 def projected_colors(
@@ -62,7 +64,7 @@ def projected_colors(
 ) -> Observations:
     """Sample a scene's points (LiDAR or others) in every training view that sees them.
 
-    The views have their training resolution; `seed` chooses among points, and views of a point.
+    `seed` chooses among points, and views of a point.
     """
     rng = generator(seed, Stream.SURFACE_COLORS)
     chosen = np.arange(len(scene.points))
@@ -78,7 +80,7 @@ def projected_colors(
     picks = thinned(np.stack(seen), rng, MOST_PER_POINT)
     points, xy = [chosen[p] for p in picks], [at[p] for at, p in zip(where, picks, strict=True)]
     how = {"uncertainty": PROJECTED_UNCERTAINTY, "on_view": on_view}
-    return point_colors(scene, store, points, xy, **how)
+    return point_colors(scene, store, surfaces_of(scene.points), points, xy, **how)
 
 
 def rendered_colors(
@@ -91,19 +93,21 @@ def rendered_colors(
 ) -> Observations:
     """Warp pixels of each training view, chosen by `seed`, into the others through rendered depth.
 
-    Points that a view hides are left out. Photographs are sampled at the resolution of the fit.
+    Points that a view hides are left out.
     """
     rng = generator(seed, Stream.RENDERED_PIXELS)
     render = make_renderer(cfg)
     alive = jnp.ones(gaussians.capacity, bool)
     cameras = [camera_of(store, index) for index in scene.train_indices]
-    depths, points = [], []
+    depths, points, normals = [], [], []
     each = RENDERED_POINTS // len(scene.train_indices)
     for done, camera in enumerate(cameras):
         depth = surface_depth(render(gaussians, alive, camera), OPAQUE)
         depths.append(depth)
         pick = rng.permutation(np.flatnonzero(np.asarray(depth) > 0))[:each]
-        points.append(np.asarray(unproject(depth, camera)).reshape(-1, 3)[pick])
+        places = np.asarray(unproject(depth, camera))
+        points.append(places.reshape(-1, 3)[pick])
+        normals.append(_slopes(places, np.asarray(depth)).reshape(-1, 3)[pick])
         if on_view is not None:
             on_view(done + 1, len(cameras))
     world = np.concatenate(points)
@@ -115,8 +119,22 @@ def rendered_colors(
         where.append(np.asarray(xy) * [view.width / camera.width, view.height / camera.height])
     picks = thinned(np.stack(seen), rng, RENDERED_PER_POINT)
     xy = [at[pick] for at, pick in zip(where, picks, strict=True)]
-    warped = dataclasses.replace(scene, points=world)
-    return point_colors(warped, store, picks, xy, uncertainty=PROJECTED_UNCERTAINTY)
+    surfaces = Surfaces(world.astype(np.float64), np.concatenate(normals))
+    return point_colors(scene, store, surfaces, picks, xy, uncertainty=PROJECTED_UNCERTAINTY)
+
+
+def _slopes(
+    places: Float[np.ndarray, "h w 3"], depth: Float[np.ndarray, "h w"]
+) -> Float[np.ndarray, "h w 3"]:
+    """Return unit normals of a surface that pixels show; NaN where its depth jumps or ends."""
+    across, down = (np.gradient(places.astype(np.float64), axis=axis) for axis in (1, 0))
+    normals = np.cross(across, down)
+    size = np.linalg.norm(normals, axis=2, keepdims=True)
+    near = cv2.erode(depth, np.ones((3, 3)))
+    jump = cv2.dilate(depth, np.ones((3, 3))) - near > DEPTH_TOLERANCE * depth
+    return np.where(
+        ((near <= 0) | jump)[..., None] | (size <= 0), np.nan, normals / np.where(size > 0, size, 1)
+    )
 
 
 def thinned(

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Float, Float32, Int
 
 from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 from p2gs_jax.photometry.formation import places
 from p2gs_jax.photometry.observations import COARSEST, Observations
-from p2gs_jax.render.warp import project_points
+from p2gs_jax.photometry.sources import patches
+from p2gs_jax.photometry.sources.patches import Grid, Surfaces, Symmetric
 from p2gs_jax.scene.pixels.store import ImageStore
-from p2gs_jax.types import Scene
+from p2gs_jax.types import Scene, View
 
-PATCH = 3  # averaging a few pixels quiets noise and hides the misplacement of a fraction of a pixel
-# A track's position is uncertain by this much, in pixels of the sampled image; where the image is
-# steep, so is its colour.
-POSITION_DEVIATION = 0.5
+# A track's position is uncertain by this share of the smallest patch; where the image is steep, so
+# is its colour.
+POSITION_DEVIATION = 1 / 6
 # Positions that come from calibration or rendered depth, not from matching, are less certain than
 # tracks by this factor.
 PROJECTED_UNCERTAINTY = 2.0
@@ -32,110 +34,136 @@ class Samples(NamedTuple):
     # Standard deviation of `colors` from uncertain positions: gradient times that.
     spread: Float32[np.ndarray, "o 3"]
     brightest: Float32[np.ndarray, "o 3"]  # largest display values of the pixels that were averaged
-    valid: Bool[np.ndarray, " o"]  # inside the image and its mask
+    valid: np.ndarray  # [o] whether the whole patch is inside the image and its mask
 
 
 def sample(
     ldr: Float32[np.ndarray, "h w 3"],
     mask: Float32[np.ndarray, "h w"],
     xy: Float[np.ndarray, "o 2"],
-    wider: Float[np.ndarray, " o"] | None = None,
 ) -> Samples:
-    """Sample an image, where its mask is 1, at positions; patches are wider by factors."""
-    factors = np.ones(len(xy)) if wider is None else wider
-    # Odd, so that patches are centred.
-    widths = 2 * np.rint((PATCH * factors - 1) / 2).astype(int) + 1
-    colors, spread, brightest = (np.zeros((len(xy), 3), np.float32) for _ in range(3))
-    out = Samples(colors, spread, brightest, np.zeros(len(xy), bool))
-    linear = srgb_decode(ldr)  # light averages linearly, whatever the exposure
-    for width in np.unique(widths).tolist():
-        pick = np.flatnonzero(widths == width)
-        smooth = cv2.blur(linear, (width, width), borderType=cv2.BORDER_REFLECT)
-        largest = cv2.dilate(ldr, np.ones((width, width), np.uint8))
-        found = _sample_smooth(smooth, largest, mask, xy[pick], width // 2)
-        for everything, part in zip(out, found, strict=True):
-            everything[pick] = part
+    """Sample an image, where its mask is 1, at positions: squares of `patches.PATCH` pixels."""
+    steps = np.arange(-1.0, 2.0)
+    around = np.stack(np.meshgrid(steps, steps, indexing="ij"), -1)[..., ::-1]
+    grid = Grid(np.arange(len(xy)), xy[:, None, None] + around)
+    return sample_patches(ldr, mask, [grid], len(xy), POSITION_DEVIATION * patches.PATCH)
+
+
+def sample_patches(
+    ldr: Float32[np.ndarray, "h w 3"],
+    mask: Float32[np.ndarray, "h w"],
+    grids: Iterable[Grid],
+    count: int,
+    deviation: float,
+) -> Samples:
+    """Average an image over patches, of which there are `count`, each in one of the grids.
+
+    Light averages linearly, whatever the exposure. A patch is misplaced by `deviation` pixels.
+    """
+    linear = srgb_decode(ldr)
+    # Of the pixels that are interpolated, and their neighbours.
+    largest, inside = cv2.dilate(ldr, np.ones((3, 3))), cv2.erode(mask, np.ones((3, 3)))
+    colors, spread, brightest = (np.zeros((count, 3), np.float32) for _ in range(3))
+    valid = np.zeros(count, bool)
+    height, width = mask.shape
+    for rows, xy in grids:
+        position = (xy - 0.5).astype(np.float32)
+        nearest = np.rint(position).astype(int)
+        here = ((nearest >= 0) & (nearest < [width, height])).all((1, 2, 3))
+        rows, position, nearest = rows[here], position[here], nearest[here]
+        x, y = nearest[..., 0], nearest[..., 1]
+        light = _between(linear, position)
+        colors[rows] = srgb_encode(light.mean((1, 2)))
+        spread[rows] = deviation * _steepness(light, position)
+        brightest[rows] = largest[y, x].max((1, 2))
+        valid[rows] = inside[y, x].min((1, 2)) > 0.99
+    return Samples(colors, spread, brightest, valid)
+
+
+def _between(linear: Float32[np.ndarray, "h w 3"], position: np.ndarray) -> np.ndarray:
+    """Return values between pixels, at positions [g a b 2]."""
+    out = np.empty((*position.shape[:3], 3), np.float32)
+    # OpenCV takes fewer than 2^15 rows.
+    for begin in range(0, len(position), 2**14):
+        part = position[begin : begin + 2**14]
+        flat = part.reshape(len(part), -1, 2)
+        found = cv2.remap(linear, flat, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        out[begin : begin + 2**14] = found.reshape(*part.shape[:3], 3)
     return out
 
 
-def _sample_smooth(smooth, brightest, mask, xy, margin: int) -> Samples:
-    """Sample a linear image that is smooth already; `margin` pixels of its border are not used.
+def _steepness(light: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Return the RMS of how display values of patches move along x and y, per pixel."""
+    change, way = (np.stack([_across(v), _across(v.swapaxes(1, 2))], 1) for v in (light, position))
+    # Display values of both ends of a patch, and their distance.
+    gradient = (
+        np.linalg.pinv(way[:, :, 0] - way[:, :, 1]) @ np.diff(srgb_encode(change), axis=2)[:, :, 0]
+    )
+    return np.sqrt((gradient**2).sum(1))
 
-    Display values are interpolated. Only the pixels around the samples are encoded: a large
-    photograph has many more.
-    """
-    height, width = mask.shape
-    position = (xy - 0.5).astype(np.float32)
-    last = [width - 1 - margin, height - 1 - margin]
-    inside = ((position >= margin) & (position <= last)).all(1)
-    safe = np.where(inside[:, None], position, 1.0).astype(np.float32)
-    corner = np.floor(safe).astype(int)
-    part = safe - corner.astype(np.float32)
-    share_x, share_y = (np.stack([1 - f, f], 1) for f in part.T)
-    around = np.arange(-1, 3)
-    columns = np.clip(corner[:, :1] + around, 0, width - 1)[:, None, :]
-    rows = np.clip(corner[:, 1:] + around, 0, height - 1)[:, :, None]
 
-    def between(values):
-        """Interpolate values at the four pixels about each position."""
-        return np.einsum("oi,oj,oij...->o...", share_y, share_x, values)
-
-    shown = srgb_encode(smooth[rows, columns])
-    slope_x = 0.5 * (shown[:, 1:3, 2:] - shown[:, 1:3, :2])
-    slope_y = 0.5 * (shown[:, 2:, 1:3] - shown[:, :2, 1:3])
-    spread = POSITION_DEVIATION * np.sqrt(between(slope_x**2 + slope_y**2))
-    valid = inside & (between(mask[rows, columns][:, 1:3, 1:3]) > 0.99)
-    around_it = brightest[rows[:, 1:3], columns[:, :, 1:3]].max((1, 2))
-    return Samples(between(shown[:, 1:3, 1:3]), spread, around_it, valid)
+def _across(values: np.ndarray) -> np.ndarray:
+    """Return the means of the last and the first samples along a side of patches [g a b c]."""
+    return np.stack([values[:, -1].mean(1), values[:, 0].mean(1)], 1)
 
 
 def point_colors(
     scene: Scene,
     store: ImageStore,
+    surfaces: Surfaces,
     points: list[Int[np.ndarray, " _"]],
     xy: list[Float[np.ndarray, "_ 2"]],
     *,
     uncertainty: float = 1.0,
     on_view: Callable[[int, int], object] | None = None,
 ) -> Observations:
-    """Sample points in training views, all at the scale of the coarsest view that is used.
+    """Sample points in training views at full size: the same patch of surface in all of them.
 
-    A surface seen from afar shows less contrast, because a pixel averages more of it; compared
-    pixel for pixel, that looks like a gamma (BUILD_NOTES). So closer views are averaged over
-    the same patch of surface. For each training view, `points` are rows in `scene.points` and
-    `xy` their positions at full resolution, whose uncertainty is in units of
-    POSITION_DEVIATION.
+    For each training view, `points` are rows in `surfaces` and `xy` their positions in pixels of
+    the whole photograph, whose uncertainty is in units of POSITION_DEVIATION. Photographs are
+    decoded for this and dropped, so that the solution does not depend on the size of a fit, and
+    that clipped pixels are seen before anything is averaged.
     """
-    wider, keep = _at_one_scale(scene, store, points)
+    views = [scene.views[i] for i in scene.train_indices]
+    wrong = patches.two_sided(surfaces, points, views)
+    surfaces = surfaces._replace(normals=np.where(wrong[:, None], np.nan, surfaces.normals))
+    moments, keep = _at_one_scale(surfaces, points, views)
+
+    def read(row: int):
+        view, kept = views[row], keep[row]
+        mine, there = points[row][kept], xy[row][kept]
+        if not len(mine):
+            return None
+        plane = patches.plane_in(surfaces, mine, view)
+        within = patches.metric(plane, view)
+        grids = patches.grids(plane, moments[mine], view, there, within)
+        deviation = POSITION_DEVIATION * np.sqrt(12 * patches.smallest_moments(view.width))
+        ldr, mask = store.whole(scene.train_indices[row])
+        found = sample_patches(ldr, mask, grids, len(mine), deviation)
+        good = found.valid
+        at = places(there[good], view.width, view.height).astype(np.float32)
+        return (np.full(len(at), row), mine[good], *(values[good] for values in found[:3]), at)
+
     nothing, none = np.zeros((0, 3), np.float32), np.zeros(0, int)
     parts: list[tuple[np.ndarray, ...]] = [(none, none, *[nothing] * 3, nothing[:, :2])]
-    for row, (index, kept) in enumerate(zip(scene.train_indices, keep, strict=True)):
-        mine = points[row][kept]
-        if len(mine):
-            view, (_, _, width, height) = scene.views[index], store.camera(index)
-            there = xy[row][kept] * [width / view.width, height / view.height]
-            ldr, mask = store.get(index)
-            found = sample(ldr, mask, there, wider[row][kept])
-            good = found.valid
-            shown = (values[good] for values in found[:3])
-            at = places(there[good], width, height).astype(np.float32)
-            parts.append((np.full(len(at), row), mine[good], *shown, at))
-        if on_view is not None:
-            on_view(row + 1, len(scene.train_indices))
-    views, seen, colors, spread, brightest, positions = map(
-        np.concatenate, zip(*parts, strict=True)
-    )
-    cameras = [scene.views[i].camera for i in scene.train_indices]
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as threads:
+        for row, found in enumerate(threads.map(read, range(len(views)))):
+            if found is not None:
+                parts.append(found)
+            if on_view is not None:
+                on_view(row + 1, len(views))
+    rows, seen, colors, spread, brightest, positions = map(np.concatenate, zip(*parts, strict=True))
+    cameras = [view.camera for view in views]
     return Observations(
-        views=views,
+        views=rows,
         points=seen,
         colors=colors,
         spread=np.float32(uncertainty) * spread,
-        view_count=len(scene.train_indices),
-        point_count=len(scene.points),
+        view_count=len(views),
+        point_count=len(surfaces.points),
         cameras=np.unique(cameras, return_inverse=True)[1],
         too_coarse=int(sum((~kept).sum() for kept in keep)),
-        names=tuple(scene.views[i].name for i in scene.train_indices),
+        names=tuple(view.name for view in views),
         positions=positions,
         brightest=brightest,
         camera_names=tuple(sorted(set(cameras))),
@@ -143,22 +171,29 @@ def point_colors(
 
 
 def _at_one_scale(
-    scene: Scene, store: ImageStore, points: list[Int[np.ndarray, " _"]]
-) -> tuple[list[Float[np.ndarray, " _"]], list[Bool[np.ndarray, " _"]]]:
-    """Return of each view by how much points are averaged wider, and which it samples at all."""
-    footprints = []
-    for index, mine in zip(scene.train_indices, points, strict=True):
-        z = project_points(scene.points[mine], scene.views[index])[1]
-        K = store.camera(index)[1]
-        # A track behind its camera is wrong, not close.
-        footprints.append(np.where(z > 0, z, np.inf) / np.mean(np.diag(K)[:2]))
-    finest, coarsest = np.full(len(scene.points), np.inf), np.zeros(len(scene.points))
-    for mine, footprint in zip(points, footprints, strict=True):
-        np.minimum.at(finest, mine, footprint)
-    keep = [
-        np.isfinite(f) & (f <= COARSEST * finest[mine])
-        for mine, f in zip(points, footprints, strict=True)
+    surfaces: Surfaces, points: list[Int[np.ndarray, " _"]], views: list[View]
+) -> tuple[Symmetric, list[np.ndarray]]:
+    """Return the moments of every point's patch, and which points each view samples at all."""
+    within = [
+        patches.metric(patches.plane_in(surfaces, mine, view), view)
+        for mine, view in zip(points, views, strict=True)
     ]
-    for mine, footprint, kept in zip(points, footprints, keep, strict=True):
-        np.maximum.at(coarsest, mine[kept], footprint[kept])
-    return [coarsest[mine] / f for mine, f in zip(points, footprints, strict=True)], keep
+    # Pixels per length, the mean of both directions. A track behind its camera is wrong, not close.
+    scales = [np.maximum(patches.determinant(m), 0.0) ** 0.25 for m in within]
+    finest = np.zeros(len(surfaces.points))
+    for mine, scale in zip(points, scales, strict=True):
+        np.maximum.at(finest, mine, scale)
+    keep = [
+        (scale > 0) & (COARSEST * scale >= finest[mine])
+        for mine, scale in zip(points, scales, strict=True)
+    ]
+    moments = np.zeros((len(surfaces.points), 3))
+    for mine, metric, kept, view in zip(points, within, keep, views, strict=True):
+        few = mine[kept]
+        pixel = patches.smallest_moments(view.width) + patches.BLUR
+        here = pixel * patches.inverse(metric[kept])
+        new = ~moments[few].any(1)
+        moments[few] = np.where(
+            new[:, None], here, patches.joined(np.where(new[:, None], here, moments[few]), here)
+        )
+    return moments, keep

@@ -129,29 +129,43 @@ class ImageStore:
         is left out, or outside the photograph after undistortion. Raises UserError: the file or its
         mask is missing, broken or of another size than the model's.
         """
-        pixels, valid = self.stored(index, shrink)
-        ldr, alpha = floats(pixels), self._decoded(index, shrink).alpha
-        if alpha is not None and self.backdrop is not None:
-            ldr += (1 - floats(alpha)[..., None]) * self.backdrop
-        return ldr, valid.astype(np.float32)
+        return self._shown(index, self._decoded(index, shrink))
+
+    def whole(self, index: int) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
+        """Return what `get` does, at the photograph's full size; nothing of it is kept."""
+        view = self.views[index]
+        size = view.width, view.height
+        if size_at(view, self._max_width) == size:
+            return self.get(index)
+        return self._shown(index, *decode(view, [size]))
 
     def stored(
         self, index: int, shrink: float | int = 1.0
     ) -> tuple[UInt[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
         """Return what is cached, read-only: integers whose maximum is 1, premultiplied by alpha."""
         entry = self._decoded(index, shrink)
+        return entry.pixels, self._counted(index, entry)
+
+    def _shown(
+        self, index: int, entry: Decoded
+    ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
+        ldr = floats(entry.pixels)
+        if entry.alpha is not None and self.backdrop is not None:
+            ldr += (1 - floats(entry.alpha)[..., None]) * self.backdrop
+        return ldr, self._counted(index, entry).astype(np.float32)
+
+    def _counted(self, index: int, entry: Decoded) -> Bool[np.ndarray, "h w"]:
         valid = entry.valid
         if self._only_opaque and entry.alpha is not None:
             valid = valid & (entry.alpha >= OPAQUE * np.iinfo(entry.alpha.dtype).max)
         if not self._objects:
-            return entry.pixels, valid
+            return valid
         view = self.views[index]
         if index not in self._outlines:
             self._outlines[index] = outlines(view, self._objects, self._margin)
         if not self._outlines[index]:
-            return entry.pixels, valid
-        boxes = painted(self._outlines[index], view, *size_at(view, self._max_width, shrink))
-        return entry.pixels, valid & ~boxes
+            return valid
+        return valid & ~painted(self._outlines[index], view, *valid.shape[::-1])
 
     def alpha(self, index: int, shrink: float | int = 1.0) -> UInt[np.ndarray, "h w"] | None:
         """Return the opacity that is cached, or None if the scene is shown over no background."""

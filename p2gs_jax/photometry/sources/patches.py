@@ -1,0 +1,206 @@
+"""The same patch of surface in every view that shows a point.
+
+A pixel averages light over what it covers of a surface. The mean of a logarithm depends on how much
+is averaged, so that views which average different patches differ as if their exposures did: by
+0.002 EV along a drive over a matte road, always with one sign (BUILD_NOTES, "The same patch").
+So a point's patch is as large as its coarsest view demands, and lies on its surface: on the plane
+of its neighbours, or, where these tell no plane, facing each camera.
+
+A patch is described by the second moments of the surface that it averages, in m^2 of the plane,
+or by their inverse, for one pixel: a metric, in pixels squared per scene unit squared. Moments of
+pixels and of interpolation between them count as part of what a view averages.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+
+from p2gs_jax.types import View
+
+# Width of the patch in the coarsest view, in pixels, and as a share of the image's width: averages
+# quiet noise, and hide that a point is misplaced by a fraction of a pixel.
+PATCH, PATCH_SHARE = 3.0, 1 / 213
+# Second moments along each axis that sampling adds, pixels squared: of the pixel itself, and of
+# bilinear interpolation at places that are spread evenly.
+BLUR = 1 / 12 + 1 / 6
+# Neighbours that a normal is fitted to, the point itself included; and how flat they have to lie:
+# extent across their plane over the smaller one along it.
+NEIGHBOURS, FLAT = 9, 0.25
+# Samples along an axis of a patch are apart by no more pixels than this, if so many suffice.
+SPACING, SAMPLES = 1.5, (3, 6, 12, 24)
+
+# Symmetric 2x2 matrices as their entries (xx, xy, yy), in the last axis.
+Symmetric = Float[np.ndarray, "n 3"]
+
+
+class Surfaces(NamedTuple):
+    """Points of a scene, and the planes on which they lie."""
+
+    points: Float[np.ndarray, "p 3"]
+    normals: Float[np.ndarray, "p 3"]  # unit; NaN where the plane is not known
+
+
+def surfaces_of(points: Float[np.ndarray, "p 3"]) -> Surfaces:
+    """Return points with the normals of the planes through their neighbours."""
+    where = np.asarray(points, np.float64)
+    normals = np.full((len(where), 3), np.nan)
+    if len(where) >= NEIGHBOURS:
+        near = cKDTree(where).query(where, NEIGHBOURS, workers=-1)[1]
+        around = where[near] - where[near].mean(1, keepdims=True)
+        extent, axes = np.linalg.eigh(np.einsum("pni,pnj->pij", around, around))
+        flat = extent[:, 0] <= FLAT**2 * extent[:, 1]
+        normals[flat] = axes[flat, :, 0]
+    return Surfaces(where, normals)
+
+
+class Plane(NamedTuple):
+    """Points in a camera's axes, and the directions along which their patches extend."""
+
+    at: Float[np.ndarray, "n 3"]
+    across: Float[np.ndarray, "n 3"]
+    along: Float[np.ndarray, "n 3"]
+
+
+def plane_in(surfaces: Surfaces, pick: Int[np.ndarray, " n"], view: View) -> Plane:
+    """Return picked points in a view; their patches face the camera where no normal is known."""
+    rotation = np.asarray(view.viewmat[:3, :3], np.float64)
+    at = surfaces.points[pick] @ rotation.T + view.viewmat[:3, 3]
+    normal = surfaces.normals[pick]
+    # Both directions follow from the normal alone: a patch lies alike in all views.
+    helper = np.eye(3)[np.argmin(np.abs(np.nan_to_num(normal)), axis=1)]
+    across = np.cross(normal, helper)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    along = np.cross(normal, across)
+    faces = np.isnan(normal[:, :1])
+    across = np.where(faces, np.eye(3)[0], across @ rotation.T)
+    return Plane(at, across, np.where(faces, np.eye(3)[1], along @ rotation.T))
+
+
+def metric(plane: Plane, view: View) -> Symmetric:
+    """Return squared pixels per squared length along a patch; 0 behind the camera."""
+    focal = np.diag(view.K)[:2].astype(np.float64)
+    ahead = plane.at[:, 2] > 1e-6
+    z = np.where(ahead, plane.at[:, 2], 1.0)[:, None]
+    slope = plane.at[:, :2] / z
+
+    def moved(direction):
+        return focal * (direction[:, :2] - slope * direction[:, 2:]) / z * ahead[:, None]
+
+    x, y = moved(plane.across), moved(plane.along)
+    return np.stack([(x * x).sum(1), (x * y).sum(1), (y * y).sum(1)], 1)
+
+
+def determinant(m: Symmetric) -> Float[np.ndarray, " n"]:
+    """Return determinants."""
+    return m[:, 0] * m[:, 2] - m[:, 1] ** 2
+
+
+def inverse(m: Symmetric) -> Symmetric:
+    """Return inverses; infinite where there is none."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.stack([m[:, 2], -m[:, 1], m[:, 0]], 1) / determinant(m)[:, None]
+
+
+def joined(a: Symmetric, b: Symmetric) -> Symmetric:
+    """Return moments that are no smaller than `a` and `b` in any direction.
+
+    Where both are diagonal, each axis has the larger of the two. All moments are positive definite.
+    """
+    size = determinant(a)
+    middle = (a[:, 0] * b[:, 2] + a[:, 2] * b[:, 0] - 2 * a[:, 1] * b[:, 1]) / size / 2
+    apart = np.sqrt(np.maximum(middle**2 - determinant(b) / size, 0.0))
+    # In the axes in which `a` is 1, `b` has these.
+    high, low = middle + apart, middle - apart
+    larger, smaller = np.maximum(high, 1), np.maximum(low, 1)
+    same = apart <= 1e-9 * middle
+    of_b = np.where(same, high > 1, (larger - smaller) / np.where(same, 1, high - low))
+    of_a = np.where(same, high <= 1, smaller - of_b * low)
+    return of_a[:, None] * a + of_b[:, None] * b
+
+
+def root(m: Symmetric) -> Symmetric:
+    """Return the symmetric square roots."""
+    size = np.sqrt(np.maximum(determinant(m), 0.0))
+    total = np.sqrt(m[:, 0] + m[:, 2] + 2 * size)
+    return (m + size[:, None] * [1, 0, 1]) / total[:, None]
+
+
+def smallest_moments(width: int) -> float:
+    """Return the moments of a patch in its coarsest view, pixels squared, without blur."""
+    return max(PATCH, PATCH_SHARE * width) ** 2 / 12
+
+
+class Grid(NamedTuple):
+    """Where patches of the same number of samples are read."""
+
+    rows: Int[np.ndarray, " g"]  # which of the patches these are
+    xy: Float[np.ndarray, "g a b 2"]  # pixels, centres at +0.5
+
+
+def grids(
+    plane: Plane,
+    moments: Symmetric,
+    view: View,
+    xy: Float[np.ndarray, "n 2"],
+    within: Symmetric,
+) -> Iterator[Grid]:
+    """Yield where to sample patches so that with pixels and interpolation they have `moments`.
+
+    `xy` are the pixels of their middles, `within` the metric. A patch is a parallelogram of the
+    plane, its samples spaced evenly.
+    """
+    own = moments - BLUR * inverse(within)
+    sides = np.sqrt(12) * root(own)
+    # The patch's sides, in lengths of the plane and in pixels.
+    first, second = sides[:, [0, 1]], sides[:, [1, 2]]
+
+    def pixels(side):
+        square = (within * np.stack([side[:, 0] ** 2, 2 * side.prod(1), side[:, 1] ** 2], 1)).sum(1)
+        return np.sqrt(np.maximum(square, 0.0))
+
+    counts = [
+        np.searchsorted(SPACING * np.array(SAMPLES[:-1]), pixels(side)) for side in (first, second)
+    ]
+    for a, fine in enumerate(SAMPLES):
+        for b, broad in enumerate(SAMPLES):
+            rows = np.flatnonzero((counts[0] == a) & (counts[1] == b))
+            if len(rows):
+                i, j = _offsets(fine)[:, None, None], _offsets(broad)[:, None]
+                lengths = i * first[rows, None, None] + j * second[rows, None, None]
+                yield Grid(rows, _placed(plane, view, xy, rows, lengths))
+
+
+def _offsets(count: int) -> Float[np.ndarray, " k"]:
+    """Return evenly spaced places whose second moment is that of an interval of length 1."""
+    return ((np.arange(count) + 0.5) / count - 0.5) / np.sqrt(1 - 1 / count**2)
+
+
+def _placed(
+    plane: Plane, view: View, xy: np.ndarray, rows: np.ndarray, lengths: np.ndarray
+) -> Float[np.ndarray, "g a b 2"]:
+    """Return pixels at `lengths` along the planes from their middles."""
+    focal, middle = np.diag(view.K)[:2].astype(np.float64), view.K[:2, 2].astype(np.float64)
+    at, across, along = (v[rows, None, None] for v in plane)
+    there = at + lengths[..., :1] * across + lengths[..., 1:] * along
+    # A plane does not reach behind the camera within a patch that is seen from afar.
+    z = np.maximum(there[..., 2:], 0.25 * at[..., 2:])
+    centre = focal * at[..., :2] / at[..., 2:] + middle
+    return focal * there[..., :2] / z + middle + (xy[rows, None, None] - centre)
+
+
+def two_sided(
+    surfaces: Surfaces, points: list[Int[np.ndarray, " _"]], views: list[View]
+) -> Bool[np.ndarray, " p"]:
+    """Return which normals are wrong: views see their points from both sides of the plane."""
+    sides = np.zeros((2, len(surfaces.points)), bool)
+    for mine, view in zip(points, views, strict=True):
+        centre = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
+        facing = ((centre - surfaces.points[mine]) * surfaces.normals[mine]).sum(1)
+        sides[0, mine[facing > 0]] = True
+        sides[1, mine[facing < 0]] = True
+    return sides.all(0)
