@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from p2gs_jax.config import Level
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.photometry.adjustment.errors import side_by_side
 from p2gs_jax.photometry.adjustment.problem import Problem
@@ -30,6 +31,7 @@ from p2gs_jax.photometry.observations import Labels
 from p2gs_jax.photometry.response import BASES, Response
 
 SPLINE_SPREAD_EV = 0.2  # a response needs this spread of exposures, stops
+HOPELESS = 1.0  # nat per observation by which no tone curve makes up for missing exposures
 MOST_COMPARED = 80  # choices that are compared at most
 STANDARD_ERRORS, SMALLEST_GAIN = 2.0, 0.01
 # Predictions that differ by no more than this in any view are as good as equal, 8-bit levels.
@@ -76,10 +78,9 @@ class Candidate:
 def choose(candidates: list[Candidate]) -> Candidate:
     """Return the simplest candidate that is not clearly worse than the best."""
     simplest = min((c for c in candidates if c.good), key=lambda c: c.parameters)
-    # Curves cost nothing within a form, but another than the standard one has to be clearly better.
+    # Curves cost nothing within a form.
     as_simple = [c for c in candidates if c.parameters <= simplest.parameters]
-    standard = [c for c in as_simple if c.choice.curve == Curve() and c.good]
-    return max(standard or as_simple, key=lambda c: c.density)
+    return max(as_simple, key=lambda c: c.density)
 
 
 class Predicted(NamedTuple):
@@ -105,6 +106,7 @@ class Search:
         self._regions = side_by_side(o, problem.layout.row)[self._where]
         self._predicted: dict[Choice, Predicted] = {}
         self._scale = np.inf
+        self._hopeless: set[Level | None] = set()
         self._fitted: dict[tuple[Form, Curve], Response | None] = {}
         # Standard deviation of the exposures under sRGB, log units.
         self._spread = float(np.std(self._solve(Choice(EXPOSURES), Response()).theta.b))
@@ -117,6 +119,8 @@ class Search:
 
     def first(self) -> list[str]:
         """Solve models under curves, and what cameras may do; say which curves were left out."""
+        self._try(Choice(Form(model)) for model in MODELS)
+        self._rule_out()
         curves = [*(Curve(base) for base in BASES), Curve("srgb", "all")]
         self._try(Choice(Form(model), curve) for curve in curves for model in MODELS)
         models = ("view_exposure", "view_exposure_camera_gamma")[: 1 + self._scope.power]
@@ -151,12 +155,21 @@ class Search:
         """Solve choices that are possible and not solved yet; return whether there were any."""
         found = False
         for choice in choices:
-            if choice in self.fits or not self._scope.allows(choice):
+            exposure = MODELS[choice.form.model].exposure
+            if choice in self.fits or exposure in self._hopeless or not self._scope.allows(choice):
                 continue
             if (response := self._response(choice)) is not None:
                 self._solve(choice, response)
                 found = True
         return found
+
+    def _rule_out(self) -> None:
+        """Find exposures of which no curve can make anything: their best predicts far worse."""
+        best: dict[Level | None, float] = {}
+        for candidate in self.judged():
+            level = MODELS[candidate.form.model].exposure
+            best[level] = max(candidate.density, best.get(level, -np.inf))
+        self._hopeless = {k for k, d in best.items() if d < max(best.values()) - HOPELESS}
 
     def _response(self, choice: Choice) -> Response | None:
         """Return the curve of a choice, fitted beside what cameras do; None: it collapsed."""
@@ -171,9 +184,20 @@ class Search:
 
     def _solve(self, choice: Choice, response: Response) -> Fit:
         """Solve a choice under its curve on what is not held out."""
-        how = {"use": self._use, "tolerance": COMPARED}
+        how = {"use": self._use, "tolerance": COMPARED, "near": self._nearest(choice)}
         self.fits[choice] = solve_model(self._problem, choice.form, response, **how)[0], response
         return self.fits[choice][0]
+
+    def _nearest(self, choice: Choice) -> Fit | None:
+        """Return the solution of the choice that has most in common; exposures count most."""
+        exposure = MODELS[choice.form.model].exposure
+
+        def common(other: Choice) -> int:
+            pairs = zip((*choice.form, choice.curve), (*other.form, other.curve), strict=True)
+            alike = exposure == MODELS[other.form.model].exposure
+            return 5 * alike + sum(one == two for one, two in pairs)
+
+        return self.fits[max(self.fits, key=common)][0] if self.fits else None
 
     def judged(self) -> list[Candidate]:
         """Return every solution with how well it predicts."""

@@ -6,7 +6,6 @@ The points are eliminated from the equations: the Schur complement.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -187,15 +186,10 @@ def of_views(model: Forward, at: Weighted) -> list[OfView]:
 
 def others(model: Forward, theta: Parameters) -> Terms | None:
     """Return the derivatives of predictions by k and c."""
-    features, basis = model.features, model.basis
-    if features is not None:
-        a = theta.a[model.layout.views][:, None, None]
-        features = replace(features, factor=a * features.factor)
-    if basis is not None:
-        basis = replace(basis, factor=-basis.factor)
-    if features is None or basis is None:
-        return features or basis
-    return features.joined(basis)
+    if model.terms is None or not model.unknowns.gammas:
+        return model.terms
+    a = theta.a[model.layout.views][:, None]
+    return model.terms.scaled(a, model.unknowns.features.terms_each)
 
 
 def _with_others(
@@ -216,8 +210,8 @@ def _with_others(
         across = block(x * u.views, first, side)
         parts += [across, Entries(across.columns, across.rows, across.values)]
     corner = terms.products(at.weight) - through.T @ through
-    pulled = terms.sums(at.weight * at.residual, np.zeros_like(place), 1)[0]
-    if model.basis is not None:
+    pulled = terms.total(at.weight * at.residual)
+    if u.splines.count:
         share = at.weight * at.sigma**2 * at.scale**2
         gradient, curvature = u.splines.log_slope_terms(model, share, at.slope)
         pulled[-len(gradient) :] += gradient

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -47,47 +47,78 @@ def whole(matrix: Matrix) -> Float[np.ndarray, "n n"]:
     return matrix if isinstance(matrix, np.ndarray) else matrix.toarray()
 
 
+class Alike(NamedTuple):
+    """Values that depend on the same parameters: their products are small and dense."""
+
+    where: Int[np.ndarray, " n"]  # among all values, channels of an observation in turn
+    columns: Int[np.ndarray, " m"]  # parameter of each term; `Terms.count` where there is no term
+    factors: Float[np.ndarray, "m n"]  # of that parameter
+
+
 @dataclass(frozen=True)
 class Terms:
-    """What every value depends on linearly, in a fixed number of terms."""
+    """What every value depends on linearly, in a fixed number of terms.
 
-    index: Int[np.ndarray, "o 3 m"]  # parameter of each term; `count` where there is no term
-    factor: Float[np.ndarray, "o 3 m"]  # of that parameter
+    Few of all combinations of parameters occur; `groups` holds each with its values.
+    """
+
+    groups: tuple[Alike, ...]
     count: int  # number of parameters
+    values: int  # number of values
+
+    @classmethod
+    def of_index(
+        cls, index: Int[np.ndarray, "o 3 m"], factor: Float[np.ndarray, "o 3 m"], count: int
+    ) -> Terms:
+        """Lay out terms by their parameters, `count` where there is none, and by their factors."""
+        index, factor = (part.reshape(-1, part.shape[-1]) for part in (index, factor))
+        # One number for each combination.
+        keys = index @ (count + 1) ** np.arange(index.shape[1])
+        order = np.argsort(keys, kind="stable")
+        groups = np.split(order, np.flatnonzero(np.diff(keys[order])) + 1)
+        alike = (Alike(g, index[g[0]], factor[g].T.copy()) for g in groups if len(g))
+        return cls(tuple(alike), count, len(index))
 
     def of(self, parameters: Float[np.ndarray, " k"]) -> Float[np.ndarray, "o 3"]:
         """Return the sums at some parameters."""
-        return (np.append(parameters, 0.0)[self.index] * self.factor).sum(-1)
+        parameters, out = np.append(parameters, 0.0), np.zeros(self.values)
+        for where, columns, factors in self.groups:
+            out[where] = parameters[columns] @ factors
+        return out.reshape(-1, 3)
 
-    def joined(self, other: Terms) -> Terms:
-        """Return the terms of two sets of parameters, these first."""
-        count = self.count + other.count
-        mine = np.where(self.index == self.count, count, self.index)
-        index = np.concatenate([mine, other.index + self.count], -1)
-        return Terms(index, np.concatenate([self.factor, other.factor], -1), count)
+    def scaled(self, by: Float[np.ndarray, "o 1"], terms: int) -> Terms:
+        """Return these with the first of all terms multiplied by a number an observation."""
+        by, groups = np.repeat(by, 3), []
+        for where, columns, factors in self.groups:
+            scaled = np.concatenate([by[where] * factors[:terms], factors[terms:]])
+            groups.append(Alike(where, columns, scaled))
+        return replace(self, groups=tuple(groups))
 
     def sums(
         self, values: Float[np.ndarray, "o 3"], place: Int[np.ndarray, "o 3"], places: int
     ) -> Float[np.ndarray, "places k"]:
         """Return sums of values times factors at each of `places` places, for each parameter."""
-        width = self.count + 1
-        at = place[..., None] * width + self.index
-        total = np.bincount(at.ravel(), (values[..., None] * self.factor).ravel(), places * width)
-        return total.reshape(places, width)[:, :-1]
+        total, values, place = np.zeros((self.count + 1, places)), values.ravel(), place.ravel()
+        for where, columns, factors in self.groups:
+            here, weights = place[where], values[where]
+            for column, factor in zip(columns, factors, strict=True):
+                total[column] += np.bincount(here, weights * factor, places)
+        return total[:-1].T
+
+    def total(self, values: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, " k"]:
+        """Return the sum of values times factors for each parameter."""
+        total, values = np.zeros(self.count + 1), values.ravel()
+        for where, columns, factors in self.groups:
+            np.add.at(total, columns, factors @ values[where])
+        return total[:-1]
 
     def products(self, values: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, "k k"]:
         """Return the sum of values times the outer products of factors."""
-        width, terms = self.count + 1, range(self.index.shape[-1])
-        own, mixed = np.zeros(width**2), np.zeros(width**2)
-        for x in terms:
-            left = values * self.factor[..., x]
-            for y in range(x + 1):
-                at = self.index[..., x] * width + self.index[..., y]
-                found = np.bincount(at.ravel(), (left * self.factor[..., y]).ravel(), width**2)
-                total = own if x == y else mixed
-                total += found
-        half = mixed.reshape(width, width)
-        return (own.reshape(width, width) + half + half.T)[:-1, :-1]
+        total, values = np.zeros((self.count + 1,) * 2), values.ravel()
+        for where, columns, factors in self.groups:
+            # No term may stand more than once.
+            np.add.at(total, np.ix_(columns, columns), (factors * values[where]) @ factors.T)
+        return total[:-1, :-1]
 
 
 class Pairs:

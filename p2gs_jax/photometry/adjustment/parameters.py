@@ -23,7 +23,6 @@ from p2gs_jax.photometry.adjustment.problem import Layout, Problem
 from p2gs_jax.photometry.models import MODELS, VIGNETTING_POWERS, Form, polynomials
 from p2gs_jax.photometry.observations import PerChannel
 from p2gs_jax.photometry.response import (
-    FLOOR,
     FREE,
     FREE_OF_EACH,
     HELD,
@@ -69,8 +68,13 @@ class Features:
         each = polynomials(self.vignetting) * len(VIGNETTING_POWERS)
         return self.balance_count + self.cameras * each
 
-    def terms(self, layout: Layout) -> Terms:
-        """Return the features of every value."""
+    @property
+    def terms_each(self) -> int:
+        """Features that a value depends on."""
+        return len(CHROMA) * self.balance + len(VIGNETTING_POWERS) * (self.vignetting is not None)
+
+    def terms(self, layout: Layout) -> tuple[Int[np.ndarray, "o 3 m"], Float[np.ndarray, "o 3 m"]]:
+        """Return parameters and values of the features at every value."""
         camera = layout.cameras[layout.views][:, None]
         index, factor = [], []
         if self.balance:
@@ -82,9 +86,12 @@ class Features:
             for k, power in enumerate(VIGNETTING_POWERS):
                 index.append(self.balance_count + polynomial * len(VIGNETTING_POWERS) + k)
                 factor.append(layout.radius2[:, None] ** (power // 2))
-        shape = (len(camera), 3)
-        index, factor = ([np.broadcast_to(p, shape) for p in part] for part in (index, factor))
-        return Terms(np.stack(index, -1), np.stack(factor, -1), self.count)
+        index, factor = (
+            [np.broadcast_to(p, (len(camera), 3))[..., None] for p in part]
+            for part in (index, factor)
+        )
+        none = np.zeros((len(camera), 3, 0), int)
+        return np.concatenate([none, *index], -1), np.concatenate([none, *factor], -1)
 
     def balance_of(self, k: Float[np.ndarray, " k"]) -> Float[np.ndarray, "c 3"]:
         """Return the log factors of each camera on the channels."""
@@ -129,13 +136,13 @@ class Splines:
 
     def terms(
         self, knot: Int[np.ndarray, "o 3"], fraction: PerChannel, group: Int[np.ndarray, "o 3"]
-    ) -> Terms:
-        """Return the basis at every value; knots that are held have no parameter."""
+    ) -> tuple[Int[np.ndarray, "o 3 m"], Float[np.ndarray, "o 3 m"]]:
+        """Return parameters and values of the basis; `count` stands for a knot that is held."""
         place = np.full(len(KNOTS), -1)
         place[self.free] = np.arange(len(self.free))
         place = place[np.stack([knot, knot + 1], -1)]
         index = np.where(place < 0, self.count, group[..., None] * len(self.free) + place)
-        return Terms(index, np.stack([1 - fraction, fraction], -1), self.count)
+        return index, np.stack([1 - fraction, fraction], -1)
 
     def decode(
         self, model: Forward, c: Float[np.ndarray, " k"]
@@ -146,8 +153,7 @@ class Splines:
         z = model.z + (1 - model.fraction) * low + model.fraction * high
         steeper = (high - low) / np.diff(KNOTS)[model.knot]
         slope = np.maximum(model.slope + steeper, SMALLEST_SLOPE * model.slope)
-        of_pixel = np.maximum(model.sigma**2 - FLOOR**2, 0) * (slope / model.slope) ** 2
-        return z, np.sqrt(of_pixel + FLOOR**2), slope
+        return z, model.sigma * slope / model.slope, slope
 
     def log_slope_terms(
         self, model: Forward, share: PerChannel, slope: PerChannel
@@ -226,7 +232,7 @@ class Forward(NamedTuple):
     slope: PerChannel  # dz/dy under the base curve
     group: Int[np.ndarray, "o 3"]  # which spline decodes a value, where they are solved for
     features: Terms | None  # what cameras do, at every value
-    basis: Terms | None  # of the splines, at every value; None where the response is given
+    terms: Terms | None  # derivatives of predictions by k and c, while a is 1
 
     @property
     def noise_weight(self) -> PerChannel:
@@ -248,9 +254,14 @@ class Forward(NamedTuple):
         knot, fraction = hat(np.asarray(o.colors, np.float64))
         group = spline_groups(splines.by, layout.cameras[layout.views], z.shape)
         seen = (z - problem.log_pivot, sigma, np.asarray(weight, np.float64))
-        more = features.terms(layout) if features.count else None
-        basis = splines.terms(knot, fraction, group) if splines.count else None
-        return cls(unknowns, layout, *seen, knot, fraction, slope, group, more, basis)
+        index, factor = features.terms(layout)
+        more = terms = Terms.of_index(index, factor, features.count) if features.count else None
+        if splines.count:
+            there, steep = splines.terms(knot, fraction, group)
+            index = np.concatenate([index, features.count + there], -1)
+            factor = np.concatenate([factor, -steep], -1)
+            terms = Terms.of_index(index, factor, features.count + splines.count)
+        return cls(unknowns, layout, *seen, knot, fraction, slope, group, more, terms)
 
 
 @dataclass(frozen=True)
@@ -280,6 +291,21 @@ class System(NamedTuple):
     priors: Held  # what is known
     start: Parameters  # where rounds begin: at the prior mean of h
     smoothness: Float[np.ndarray, "k k"]  # its quadratic form keeps a spline smooth
+
+    def near(self, theta: Parameters, of: Unknowns) -> Parameters:
+        """Return what comes closest to other parameters among those that are free here."""
+        mine = self.unknowns
+        h = theta.b / theta.a[:, None]
+        if of.channels != mine.channels:
+            h = np.repeat(h.mean(1, keepdims=True), mine.channels, 1)
+        start = self.start
+        # Of what moves together, the mean.
+        moved = Parameters(h - start.b, theta.a - start.a, 0 * start.k, 0 * start.c).vector()
+        size = np.asarray(self.basis.sum(0)).ravel()
+        b, a, *_ = mine.split(self.basis @ (self.basis.T @ moved / size))
+        a = start.a + a
+        same = of.features == mine.features
+        return Parameters((start.b + b) * a[:, None], a, theta.k if same else start.k, start.c)
 
     def gauges(self, normal: Matrix) -> tuple[float, sp.csr_array]:
         """Return how hard gauges hold, by the exposures' information, and rows times its root.

@@ -171,20 +171,23 @@ def _step(
     return new, float(np.max([np.abs(x - y).max(initial=0.0) for x, y in changes]))
 
 
-def solve(model: Forward, system: System, tolerance: float, loss: Loss) -> Fit:
+def solve(
+    model: Forward, system: System, tolerance: float, loss: Loss, near: Parameters | None = None
+) -> Fit:
     """Adjust exposures, gammas, cameras and response to observations (float64).
 
     A largest change of a parameter below the tolerance, log units, counts as none. `loss` is of the
-    rounds after those under L1.
+    rounds after those under L1, of which a start `near` the solution needs one.
     """
-    theta, weight = system.start, model.noise_weight
+    theta, weight = system.start if near is None else near, model.noise_weight
+    robust = L1_ROUNDS if near is None else 1
     moved, before, count = np.inf, np.inf, 0
     for count in range(1, MOST_ROUNDS + 1):
-        at = weigh(model, theta, weight, "l1" if count <= L1_ROUNDS else loss)
+        at = weigh(model, theta, weight, "l1" if count <= robust else loss)
         weight, before = at.weight, moved
         theta, moved = _step(model, system, theta, at)
         # The first round of another loss says nothing of the next.
-        if count > L1_ROUNDS + 1 and moved < tolerance:
+        if count > robust + 1 and moved < tolerance:
             break
     at = weigh(model, theta, weight, loss)
     return Fit(
@@ -208,17 +211,20 @@ def solve_model(
     splines: ResponseKind | None = None,
     tolerance: float = TOLERANCE,
     loss: Loss = "geman_mcclure",
+    near: Fit | None = None,
 ) -> tuple[Fit, System]:
     """Solve one form under a response; `use` is 0 for observations that are kept out.
 
     `splines` says what gets a spline over the response's base that is solved for as well (None:
-    nothing). The tolerance and the loss are those of `solve`.
+    nothing). The tolerance and the loss are those of `solve`, which begins `near` the solution of
+    another form or response.
     """
     weight = problem.usable if use is None else problem.usable * use[:, None]
     system = make_system(problem, form, splines)
     model = Forward.of(problem, weight, response, system.unknowns)
+    begin = None if near is None else system.near(near.theta, near.model.unknowns)
     with one_thread():
-        return solve(model, system, tolerance, loss), system
+        return solve(model, system, tolerance, loss, begin), system
 
 
 def fit_response(
