@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 
 from p2gs_jax.config import Level
 from p2gs_jax.core.numerics import LN2
+from p2gs_jax.photometry.adjustment.equations import SMALLEST_SCALE
 from p2gs_jax.photometry.adjustment.errors import side_by_side
 from p2gs_jax.photometry.adjustment.problem import Problem
 from p2gs_jax.photometry.adjustment.solve import COMPARED, Fit, fit_response, solve_model
@@ -28,7 +29,7 @@ from p2gs_jax.photometry.models import (
     parameter_count,
 )
 from p2gs_jax.photometry.observations import Labels
-from p2gs_jax.photometry.response import BASES, Response
+from p2gs_jax.photometry.response import BASES, Response, base_log
 
 SPLINE_SPREAD_EV = 0.2  # a response needs this spread of exposures, stops
 HOPELESS = 1.0  # nat per observation by which no tone curve makes up for missing exposures
@@ -38,6 +39,7 @@ STANDARD_ERRORS, SMALLEST_GAIN = 2.0, 0.01
 INVISIBLE_DIFFERENCE = 1.0
 # The predictive density is a mixture: outliers exist, and must not decide.
 OUTLIERS, OUTLIER_DEVIATION = 0.1, 1.2
+RANGES = 8  # of brightness, as many values in each, in which errors of predictions are measured
 
 
 @dataclass(frozen=True)
@@ -105,7 +107,6 @@ class Search:
         self._views = o.views[self._where]
         self._regions = side_by_side(o, problem.layout.row)[self._where]
         self._predicted: dict[Choice, Predicted] = {}
-        self._scale = np.inf
         self._hopeless: set[Level | None] = set()
         self._fitted: dict[tuple[Form, Curve], Response | None] = {}
         # Standard deviation of the exposures under sRGB, log units.
@@ -201,13 +202,9 @@ class Search:
 
     def judged(self) -> list[Candidate]:
         """Return every solution with how well it predicts."""
-        scale = min(float(fit.at.scale) for fit, _ in self.fits.values())
-        if scale < self._scale:
-            self._scale, self._predicted = scale, {}
-        for choice, (fit, response) in self.fits.items():
+        for choice, fit in self.fits.items():
             if choice not in self._predicted:
-                predicted = _predict(self._problem, fit, response, self._where, scale)
-                self._predicted[choice] = predicted
+                self._predicted[choice] = _predict(self._problem, *fit, self._where)
         # Where nothing is known, no solution predicts anything.
         density = {
             k: -np.inf if np.isnan(p.densities).all() else float(np.nanmean(p.densities))
@@ -234,29 +231,41 @@ class Search:
         return Candidate(choice, *known, deficits[0], max(errors), difference)
 
 
-def _predict(
-    problem: Problem, fit: Fit, response: Response, held: np.ndarray, scale: float
-) -> Predicted:
-    """Return what a fit says about rows that were held out; `scale` is of the stated deviations."""
+def _predict(problem: Problem, fit: Fit, response: Response, held: np.ndarray) -> Predicted:
+    """Return what a fit says about rows that were held out.
+
+    Curves differ in what they call noise, and must not be chosen for that: noise is that of sRGB,
+    and how far predictions are off is measured in units of it, in ranges of brightness.
+    """
     o, layout = problem.observations, problem.layout
     sigma, slope = (a[held] for a in o.decoded(response)[1:])
-    residual = fit.at.residual[held]
-    precision = fit.at.precision[layout.row[held]]
+    y, precision = o.colors[held], fit.at.precision[layout.row[held]]
     known = problem.usable[held] & (precision > 1e-3)
     a = fit.theta.a[o.views[held]][:, None]
-    variance = (scale * sigma) ** 2 + (scale * a) ** 2 / np.maximum(precision, 1e-9)
+    error = fit.at.residual[held] / slope
+    standard, noise = base_log(y, "srgb")[1], o.picked(held).decoded(Response())[1]
+    # Points are as uncertain as what they are seen by.
+    known_by = 1 + a**2 / np.maximum(precision * sigma**2, 1e-9)
+    variance = (noise / standard) ** 2 * known_by
+    if known.any():
+        ranges = np.quantile(y[known], np.arange(1, RANGES) / RANGES)
+        at = np.where(known, np.searchsorted(ranges, y), -1)
+        for k in np.unique(at[known]):
+            mine = at == k
+            scale = 1.4826 * np.median(np.abs(error[mine]) / np.sqrt(variance[mine]))
+            variance[mine] *= max(scale, SMALLEST_SCALE) ** 2
 
     def normal(v):
-        return -0.5 * residual**2 / v - 0.5 * np.log(2 * np.pi * v)
+        return -0.5 * error**2 / v - 0.5 * np.log(2 * np.pi * v)
 
     inlier = np.log(1 - OUTLIERS) + normal(variance)
-    outlier = np.log(OUTLIERS) + normal(variance + OUTLIER_DEVIATION**2)
-    density = np.logaddexp(inlier, outlier) + np.log(np.maximum(slope, 1e-3))
+    wide = variance + (OUTLIER_DEVIATION / standard) ** 2
+    density = np.logaddexp(inlier, np.log(OUTLIERS) + normal(wide))
     # Channels are correlated: an observation counts once, as their mean.
     count = known.sum(1)
     return Predicted(
         np.where(count > 0, (density * known).sum(1) / np.maximum(count, 1), np.nan),
-        np.where(known, residual / slope, np.nan),
+        np.where(known, error, np.nan),
     )
 
 

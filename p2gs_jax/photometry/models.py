@@ -170,4 +170,7 @@ def neighbours(choice: Choice, scope: Scope) -> list[Choice]:
     forms += [form._replace(white_balance=level) for level in _LEVELS]
     forms += [form._replace(vignetting=kind) for kind in _VIGNETTING]
     near = [Choice(f, curve) for f in forms] + [Choice(form, c) for c in _CURVES[curve.splines]]
+    if curve.splines == "camera" and (name := _BY_LEVELS.get((exposure, "camera"))):
+        # Gammas per camera are the simplest curves of their own.
+        near += [Choice(form._replace(model=name), plain) for plain in _PLAIN]
     return [c for c in dict.fromkeys(near) if c != choice and scope.allows(c)]

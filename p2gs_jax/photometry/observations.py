@@ -44,7 +44,7 @@ class Observations:
         """Return log exposed radiance, its stated standard deviation and dz/dy."""
         y = np.asarray(self.colors, np.float64)
         z, slope = log_exposed(y, response, self.cameras[self.views])
-        return z, deviation(y, slope, self.spread), slope
+        return z, deviation(y, slope, self.spread, response.base), slope
 
     def usable(self, black: float, saturation: float) -> Bool[np.ndarray, "o 3"]:
         """Return whether a value is neither near black nor saturated and its point is shared.

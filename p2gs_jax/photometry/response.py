@@ -128,18 +128,18 @@ def log_exposed(
     return z + (1 - t) * low + t * high, np.maximum(slope + steeper, SMALLEST_SLOPE * slope)
 
 
-def deviation(y: Numbers, slope: Numbers, spread: Numbers | float = 0.0) -> Numbers:
+def deviation(
+    y: Numbers, slope: Numbers, spread: Numbers | float = 0.0, base: Base = "srgb"
+) -> Numbers:
     """Return the standard deviation of z.
 
-    `slope` is dz/dy, `spread` the standard deviation in display values from misplacement and blur.
-    All of it is judged in display values, by sRGB: curves that differ in what they call noise could
-    not be compared by how well they predict.
+    `slope` is dz/dy, `spread` the standard deviation in display values from misplacement and
+    blur; photon noise is judged by the base curve.
     """
-    logs, standard = base_log(y, "srgb")
+    logs, base_slope = base_log(y, base)
     exposed = np.exp(logs)
-    shot = (SHOT_NOISE * exposed + READ_NOISE) / exposed**2
-    rounding = 1 / (255 * np.sqrt(12))
-    return slope * np.sqrt(rounding**2 + (shot + FLOOR**2) / standard**2 + spread**2)
+    shot = np.sqrt(SHOT_NOISE * exposed + READ_NOISE) / exposed * slope / base_slope
+    return np.sqrt((slope / (255 * np.sqrt(12))) ** 2 + shot**2 + (slope * spread) ** 2 + FLOOR**2)
 
 
 def rises(response: Response) -> bool:

@@ -78,11 +78,8 @@ class Grey(ImageStore):
     def __init__(self):
         pass
 
-    def get(self, index):
+    def whole(self, index):
         return np.full((40, 60, 3), 0.5, np.float32), np.ones((40, 60), np.float32)
-
-    def camera(self, index):
-        return np.eye(4, dtype=np.float32), GREY_K, 60, 40
 
 
 def seen_from(distances):
@@ -116,32 +113,15 @@ def encoded(linear):
     return srgb_encode(linear).astype(np.float32)
 
 
-def test_a_surface_has_the_same_colour_from_near_and_from_far():
-    """Near, far (a pixel covers 3x3 of the near ones) and far at a quarter of the exposure."""
-    fine = np.exp(0.5 * np.random.default_rng(0).standard_normal((240, 240, 3))) * 0.1
-    fine = np.minimum(fine, 1.0).astype(np.float32)
-    coarse = fine.reshape(80, 3, 80, 3, 3).mean((1, 3))
-    far_xy = np.stack(np.meshgrid(*[np.arange(10, 70) + 0.5] * 2), -1).reshape(-1, 2)
-    near, far = np.ones((240, 240), np.float32), np.ones((80, 80), np.float32)
-    wide = sample(encoded(fine), near, 3 * far_xy, np.full(len(far_xy), 3.0))
-    narrow = sample(encoded(fine), near, 3 * far_xy)
-    dark = sample(encoded(0.25 * coarse), far, far_xy)
-    expected = 4 * srgb_decode(dark.colors)
-    np.testing.assert_allclose(srgb_decode(wide.colors), expected, rtol=1e-4)
-    gap = np.log(srgb_decode(narrow.colors) / expected)
-    assert np.std(gap) > 0.1
-    assert np.std(np.log(expected)) < 0.5 * np.std(np.log(srgb_decode(narrow.colors)))
-
-
-@pytest.mark.parametrize("wider", [1.0, 2.0])
-def test_the_brightest_pixel_of_a_patch_is_known(wider):
+def test_the_brightest_pixel_of_a_patch_is_known():
     image = np.random.default_rng(0).uniform(0, 1, (24, 30, 3)).astype(np.float32)
     xy = np.random.default_rng(1).uniform(6, 18, (50, 2))
-    found = sample(image, np.ones((24, 30), np.float32), xy, np.full(50, wider))
-    reach = 1 if wider == 1 else 2  # patches of 3 and 5 pixels
+    found = sample(image, np.ones((24, 30), np.float32), xy)
     for k, (x, y) in enumerate(np.floor(xy - 0.5).astype(int)):
-        patch = image[y - reach : y + reach + 2, x - reach : x + reach + 2]
-        np.testing.assert_array_equal(found.brightest[k], patch.max((0, 1)))
+        # Every pixel that was interpolated counts, and no farther one than their neighbours.
+        inner, outer = image[y - 1 : y + 3, x - 1 : x + 3], image[y - 2 : y + 4, x - 2 : x + 4]
+        assert np.all(found.brightest[k] >= inner.max((0, 1)))
+        assert np.all(found.brightest[k] <= outer.max((0, 1)))
 
 
 def test_exposures_are_right_where_a_surface_has_highlights():
@@ -178,18 +158,16 @@ def test_samples_sit_at_pixel_centres():
     light = 0.2 + 0.8 * (xy[:, 0] - 0.5) / 49
     # Half a pixel of misplacement on a ramp of 0.8/49 a pixel.
     slope = (srgb_encode(light + 1e-4) - srgb_encode(light - 1e-4)) / 2e-4
-    for wider in (None, np.full(100, 2.0), np.full(100, 4.0)):
-        colors, spread, _, valid = sample(image, np.ones((40, 50), np.float32), xy, wider)
-        assert valid.all()
-        np.testing.assert_allclose(colors[:, 0], srgb_encode(light), atol=2e-4)
-        np.testing.assert_allclose(spread[:, 0], 0.5 * slope * 0.8 / 49, rtol=5e-3)
+    colors, spread, _, valid = sample(image, np.ones((40, 50), np.float32), xy)
+    assert valid.all()
+    np.testing.assert_allclose(colors[:, 0], srgb_encode(light), atol=2e-4)
+    np.testing.assert_allclose(spread[:, 0], 0.5 * slope * 0.8 / 49, rtol=5e-3)
 
 
-def test_samples_outside_and_masked_and_wide_patches_at_the_border_are_invalid():
+def test_samples_outside_and_masked_and_at_the_border_are_invalid():
     image, ones = np.zeros((40, 50, 3), np.float32), np.ones((40, 50), np.float32)
-    xy = np.array([[3.5, 10.0], [10.0, 10.0]])
-    assert sample(image, ones, xy).valid.tolist() == [True, True]
-    assert sample(image, ones, xy, np.full(2, 4.0)).valid.tolist() == [False, True]
+    xy = np.array([[0.5, 10.0], [3.5, 10.0]])
+    assert sample(image, ones, xy).valid.tolist() == [False, True]
     mask = np.ones((40, 50), np.float32)
     mask[:20] = 0
     xy = np.array([[-3.0, 30], [25, 10], [25, 30], [60, 30], [25, 20.4]])

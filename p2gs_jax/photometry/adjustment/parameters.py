@@ -23,6 +23,7 @@ from p2gs_jax.photometry.adjustment.problem import Layout, Problem
 from p2gs_jax.photometry.models import MODELS, VIGNETTING_POWERS, Form, polynomials
 from p2gs_jax.photometry.observations import PerChannel
 from p2gs_jax.photometry.response import (
+    FLOOR,
     FREE,
     FREE_OF_EACH,
     HELD,
@@ -153,7 +154,8 @@ class Splines:
         z = model.z + (1 - model.fraction) * low + model.fraction * high
         steeper = (high - low) / np.diff(KNOTS)[model.knot]
         slope = np.maximum(model.slope + steeper, SMALLEST_SLOPE * model.slope)
-        return z, model.sigma * slope / model.slope, slope
+        of_pixel = np.maximum(model.sigma**2 - FLOOR**2, 0) * (slope / model.slope) ** 2
+        return z, np.sqrt(of_pixel + FLOOR**2), slope
 
     def log_slope_terms(
         self, model: Forward, share: PerChannel, slope: PerChannel

@@ -1,0 +1,110 @@
+"""The same patch of surface in every view: what a matte road must not do to exposures."""
+
+from pathlib import Path
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.interpolate import RegularGridInterpolator
+
+from p2gs_jax.core.numerics import srgb_encode
+from p2gs_jax.photometry.adjustment.fit import fit_model
+from p2gs_jax.photometry.adjustment.problem import make_problem
+from p2gs_jax.photometry.sources import patches
+from p2gs_jax.photometry.sources.points import track_colors
+from p2gs_jax.render.warp import project_points
+from p2gs_jax.scene.pixels.store import ImageStore
+from p2gs_jax.types import Scene, Tracks, View
+
+
+class Road(ImageStore):
+    """Photographs of a matte road, its pixels integrated exactly; cameras are 1.5 m above it."""
+
+    K = np.array([[200.0, 0, 80], [0, 200, 20], [0, 0, 1]], np.float32)
+    width, height, above, cell = 160, 110, 1.5, 0.02
+
+    def __init__(self, contrast=0.35):
+        rng, shape = np.random.default_rng(0), (2000, 500)
+        across, along = np.fft.rfftfreq(shape[1]), np.fft.fftfreq(shape[0])
+        frequency = np.hypot(along[:, None], across).clip(1 / 200)
+        drawn = np.exp(2j * np.pi * rng.random(frequency.shape)) / frequency
+        texture = np.fft.irfft2(drawn, s=shape)
+        light = 0.12 * np.exp(contrast * texture / texture.std())
+        sums = np.pad(light, ((1, 0), (1, 0))).cumsum(0).cumsum(1)
+        places = np.arange(shape[0] + 1), np.arange(shape[1] + 1)
+        self._integral = RegularGridInterpolator(places, sums)
+
+    def whole(self, index):
+        rows = np.arange(22, self.height)
+        far, near = (200 * self.above / (rows + offset - 20) for offset in (0, 1))
+        x = np.arange(self.width + 1) - 80
+        across = (x * (2 * far * near / (far + near))[:, None] / 200 / self.cell) + 250
+        ends = np.stack([near, far]) + 0.8 * index
+        along = np.clip(ends / self.cell, 0, 2000)[..., None] + 0 * across
+        across = np.clip(across, 0, 500)
+        (near, far) = (self._integral(np.stack([z, across], -1)) for z in along)
+        total = np.diff(far - near, axis=1)
+        area = np.diff(across, axis=1) * (along[1] - along[0])[:, :-1]
+        light = np.full((self.height, self.width), 0.5)
+        light[22:] = total / np.maximum(area, 1e-9)
+        seen = np.zeros(light.shape, np.float32)
+        seen[22:] = (np.abs(across[:, :-1] - 250) < 240) & (along[1, :, :-1] < 1990)
+        ldr = np.rint(255 * srgb_encode(light)).astype(np.float32) / 255
+        return np.repeat(ldr[..., None], 3, 2), seen
+
+
+def test_exposures_do_not_drift_along_a_matte_road():
+    """A view averages more of the road the farther it looks: patches have to be alike."""
+    rng = np.random.default_rng(1)
+    points = np.stack([rng.uniform(-4, 4, 4000), np.full(4000, 1.5), rng.uniform(3, 38, 4000)], 1)
+    views, which, seen, places = [], [], [], []
+    for k in range(12):
+        pose = np.eye(4, dtype=np.float32)
+        pose[2, 3] = -0.8 * k
+        views.append(View(f"{k:02}", Path(f"{k}"), "0", pose, Road.K, Road.width, Road.height))
+        xy, z = project_points(points, views[-1])
+        inside = np.flatnonzero((z > 2) & (xy > 0).all(1) & (xy < [Road.width, Road.height]).all(1))
+        which.append(np.full(len(inside), k))
+        seen.append(inside)
+        places.append(xy[inside])
+    tracks = Tracks(*(np.concatenate(part) for part in (which, seen, places)))
+    grey = np.full((len(points), 3), 128, np.uint8)
+    scene = Scene(Path("."), "made", tuple(views), points, grey, tracks)
+    problem = make_problem(
+        track_colors(scene, Road()), black=4 / 255, saturation=250 / 255, pivot=0.18
+    )
+    solved = fit_model(problem, "view_exposure")
+    ev = solved.exposures_ev - solved.exposures_ev.mean()
+    # Squares in the image left 0.005 EV, all of it a drift.
+    assert np.std(ev) < 0.0015
+    assert abs(np.polyfit(0.8 * np.arange(12), ev, 1)[0]) < 2e-4
+
+
+def test_normals_are_those_of_neighbours_or_unknown():
+    rng = np.random.default_rng(0)
+    flat = np.concatenate([rng.uniform(-1, 1, (400, 2)), 0.001 * rng.standard_normal((400, 1))], 1)
+    turn, _ = np.linalg.qr(rng.standard_normal((3, 3)))
+    found = patches.surfaces_of(flat @ turn.T + 5).normals
+    assert np.all(np.abs(found @ turn[:, 2]) > 0.99)
+    cloud = patches.surfaces_of(rng.standard_normal((400, 3))).normals
+    assert np.isnan(cloud).all(1).mean() > 0.7
+    assert np.isnan(patches.surfaces_of(np.zeros((3, 3))).normals).all()
+
+
+def symmetric(values):
+    return np.stack([values[:, [0, 1]], values[:, [1, 2]]], 1)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_joined_moments_are_no_smaller_than_either(seed):
+    rng = np.random.default_rng(seed)
+    roots = rng.standard_normal((2, 5, 2, 2)) * np.exp(rng.uniform(-3, 3, (2, 5, 1, 1)))
+    a, b = (r @ r.swapaxes(1, 2) + 1e-3 * np.eye(2) for r in roots)
+    parts = [np.stack([m[:, 0, 0], m[:, 0, 1], m[:, 1, 1]], 1) for m in (a, b)]
+    both = symmetric(patches.joined(*parts))
+    for one in (a, b):
+        assert np.all(np.linalg.eigvalsh(both - one) > -1e-6 * np.trace(both.T).max())
+    root = symmetric(patches.root(parts[0]))
+    np.testing.assert_allclose(root @ root, a, rtol=1e-6, atol=1e-9 * np.abs(a).max())
+    again = patches.inverse(patches.inverse(parts[0]))
+    np.testing.assert_allclose(again, parts[0], rtol=1e-6, atol=1e-9 * np.abs(a).max())
