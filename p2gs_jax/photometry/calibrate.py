@@ -187,7 +187,7 @@ def _subset(observations: Observations, seed: int, most: int) -> Observations:
     return o.picked(chosen[o.points])
 
 
-def _held_out(o: Observations, seed: int) -> Bool[np.ndarray, " o"]:
+def held_out(o: Observations, seed: int) -> Bool[np.ndarray, " o"]:
     """Return which observations to hold out: whole regions of images, in which errors are shared.
 
     Held out one by one, each would be predicted by neighbours that err alike, and parameters that
@@ -208,7 +208,7 @@ def _chosen(
     # What fixes the scale alone says nothing of models and curves.
     told = options if problem.told.size else dataclasses.replace(options, known=None)
     small = told.problem(_subset(observations, seed, MOST_OBSERVATIONS))
-    held = _held_out(small.observations, seed)
+    held = held_out(small.observations, seed)
     training = told.problem(_subset(small.observations.picked(~held), seed, SPLINE_OBSERVATIONS))
     search = Search(small, held, training, known=options.known_response is not None)
     notes = search.first()

@@ -3,13 +3,20 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import RegularGridInterpolator
 
 from p2gs_jax.core.numerics import srgb_encode
+from p2gs_jax.photometry.adjustment.errors import SHARED_REGION, regions
 from p2gs_jax.photometry.adjustment.fit import fit_model
-from p2gs_jax.photometry.adjustment.problem import make_problem
+from p2gs_jax.photometry.calibrate import (
+    CalibrationOptions,
+    calibrate_observations,
+    held_out,
+)
+from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.sources import patches
 from p2gs_jax.photometry.sources.points import track_colors
 from p2gs_jax.render.warp import project_points
@@ -53,8 +60,9 @@ class Road(ImageStore):
         return np.repeat(ldr[..., None], 3, 2), seen
 
 
-def test_exposures_do_not_drift_along_a_matte_road():
-    """A view averages more of the road the farther it looks: patches have to be alike."""
+@pytest.fixture(scope="module")
+def road():
+    """Return what twelve views of the road, 0.8 m apart, show at 4,000 of its points."""
     rng = np.random.default_rng(1)
     points = np.stack([rng.uniform(-4, 4, 4000), np.full(4000, 1.5), rng.uniform(3, 38, 4000)], 1)
     views, which, seen, places = [], [], [], []
@@ -69,15 +77,42 @@ def test_exposures_do_not_drift_along_a_matte_road():
         places.append(xy[inside])
     tracks = Tracks(*(np.concatenate(part) for part in (which, seen, places)))
     grey = np.full((len(points), 3), 128, np.uint8)
-    scene = Scene(Path("."), "made", tuple(views), points, grey, tracks)
-    problem = make_problem(
-        track_colors(scene, Road()), black=4 / 255, saturation=250 / 255, pivot=0.18
-    )
-    solved = fit_model(problem, "view_exposure")
+    return track_colors(Scene(Path("."), "made", tuple(views), points, grey, tracks), Road())
+
+
+OPTIONS = CalibrationOptions(black=4 / 255, saturation=250 / 255, pivot=0.18)
+
+
+def test_exposures_do_not_drift_along_a_matte_road(road):
+    """A view averages more of the road the farther it looks: patches have to be alike."""
+    solved = fit_model(OPTIONS.problem(road), "view_exposure")
     ev = solved.exposures_ev - solved.exposures_ev.mean()
     # Squares in the image left 0.005 EV, all of it a drift.
     assert np.std(ev) < 0.0015
     assert abs(np.polyfit(0.8 * np.arange(12), ev, 1)[0]) < 2e-4
+
+
+def test_equal_exposures_of_a_matte_road_are_found_equal(road):
+    """What predicts neighbours is not chosen, nor what a curve takes for noise."""
+    chosen = calibrate_observations(road, OPTIONS)
+    assert chosen.solution.model == "constant"
+    density = {
+        c.choice.curve.base: c.density
+        for c in chosen.candidates
+        if c.form == Form("constant") and c.choice.curve.splines is None
+    }
+    # Equal exposures tell no curve. Each under its own noise, they differed by 0.035.
+    assert abs(density["srgb"] - density["power"]) < 0.003
+
+
+def test_whole_regions_are_held_out(road):
+    held = held_out(road, 0)
+    assert 0.1 < held.mean() < 0.3
+    region = regions(road.positions, road.views, SHARED_REGION)
+    of_region = np.bincount(region, held) / np.bincount(region)
+    assert set(of_region) == {0.0, 1.0}
+    np.testing.assert_array_equal(held, held_out(road, 0))
+    assert np.any(held != held_out(road, 1))
 
 
 def test_normals_are_those_of_neighbours_or_unknown():

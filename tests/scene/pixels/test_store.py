@@ -56,6 +56,15 @@ def test_sizes_and_intrinsics(tmp_path):
     assert (K[0, 0] / w, K[1, 1] / h) == pytest.approx((60 / 1000, 60 / 751))
 
 
+def test_a_whole_photograph_does_not_depend_on_the_width_of_a_fit(tmp_path):
+    view = make_view(tmp_path / "a.png", noise(3))
+    small = store_of(view, max_width=16)
+    for one, other in zip(small.whole(0), store_of(view).get(0), strict=True):
+        np.testing.assert_array_equal(one, other)
+    # Calibration asks for each once.
+    assert small.cached_bytes == 0
+
+
 def test_shrinking_averages_and_masks_conservatively(tmp_path):
     bgr, mask = noise(3), np.full((48, 64), 255, np.uint8)
     mask[5, 9] = 0
