@@ -119,11 +119,11 @@ def test_normals_are_those_of_neighbours_or_unknown():
     rng = np.random.default_rng(0)
     flat = np.concatenate([rng.uniform(-1, 1, (400, 2)), 0.001 * rng.standard_normal((400, 1))], 1)
     turn, _ = np.linalg.qr(rng.standard_normal((3, 3)))
-    found = patches.surfaces_of(flat @ turn.T + 5).normals
+    found = patches.surfaces_of(flat @ turn.T + 5, np.arange(400)).normals
     assert np.all(np.abs(found @ turn[:, 2]) > 0.99)
-    cloud = patches.surfaces_of(rng.standard_normal((400, 3))).normals
+    cloud = patches.surfaces_of(rng.standard_normal((400, 3)), np.arange(400)).normals
     assert np.isnan(cloud).all(1).mean() > 0.7
-    assert np.isnan(patches.surfaces_of(np.zeros((3, 3))).normals).all()
+    assert np.isnan(patches.surfaces_of(np.zeros((3, 3)), np.arange(3)).normals).all()
 
 
 def symmetric(values):

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from p2gs_jax.types import View
 
@@ -45,16 +45,16 @@ class Surfaces(NamedTuple):
     normals: Float[np.ndarray, "p 3"]  # unit; NaN where the plane is not known
 
 
-def surfaces_of(points: Float[np.ndarray, "p 3"]) -> Surfaces:
-    """Return points with the normals of the planes through their neighbours."""
+def surfaces_of(points: Float[np.ndarray, "p 3"], rows: Int[np.ndarray, " n"]) -> Surfaces:
+    """Return points; those of `rows` with the normals of the planes through their neighbours."""
     where = np.asarray(points, np.float64)
     normals = np.full((len(where), 3), np.nan)
-    if len(where) >= NEIGHBOURS:
-        near = cKDTree(where).query(where, NEIGHBOURS, workers=-1)[1]
+    if len(where) >= NEIGHBOURS and len(rows):
+        near = KDTree(where).query(where[rows], NEIGHBOURS, workers=-1)[1]
         around = where[near] - where[near].mean(1, keepdims=True)
         extent, axes = np.linalg.eigh(np.einsum("pni,pnj->pij", around, around))
         flat = extent[:, 0] <= FLAT**2 * extent[:, 1]
-        normals[flat] = axes[flat, :, 0]
+        normals[rows[flat]] = axes[flat, :, 0]
     return Surfaces(where, normals)
 
 
@@ -197,10 +197,10 @@ def two_sided(
     surfaces: Surfaces, points: list[Int[np.ndarray, " _"]], views: list[View]
 ) -> Bool[np.ndarray, " p"]:
     """Return which normals are wrong: views see their points from both sides of the plane."""
-    sides = np.zeros((2, len(surfaces.points)), bool)
+    front, back = (np.zeros(len(surfaces.points), bool) for _ in range(2))
     for mine, view in zip(points, views, strict=True):
         centre = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
         facing = ((centre - surfaces.points[mine]) * surfaces.normals[mine]).sum(1)
-        sides[0, mine[facing > 0]] = True
-        sides[1, mine[facing < 0]] = True
-    return sides.all(0)
+        front[mine[facing > 0]] = True
+        back[mine[facing < 0]] = True
+    return front & back

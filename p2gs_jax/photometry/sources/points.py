@@ -55,7 +55,7 @@ def track_colors(scene: Scene, store: ImageStore, on_view: OnView = None) -> Obs
     picks = [of_view[i] for i in scene.train_indices]
     points = [scene.tracks.point_indices[pick] for pick in picks]
     xy = [scene.tracks.xy[pick] for pick in picks]
-    surfaces = surfaces_of(scene.points)
+    surfaces = surfaces_of(scene.points, np.unique(scene.tracks.point_indices))
     return point_colors(scene, store, surfaces, points, xy, on_view=on_view)
 
 
@@ -80,7 +80,7 @@ def projected_colors(
     picks = thinned(np.stack(seen), rng, MOST_PER_POINT)
     points, xy = [chosen[p] for p in picks], [at[p] for at, p in zip(where, picks, strict=True)]
     how = {"uncertainty": PROJECTED_UNCERTAINTY, "on_view": on_view}
-    return point_colors(scene, store, surfaces_of(scene.points), points, xy, **how)
+    return point_colors(scene, store, surfaces_of(scene.points, chosen), points, xy, **how)
 
 
 def rendered_colors(

@@ -86,8 +86,8 @@ def _between(linear: Float32[np.ndarray, "h w 3"], position: np.ndarray) -> np.n
     # OpenCV takes fewer than 2^15 rows.
     for begin in range(0, len(position), 2**14):
         part = position[begin : begin + 2**14]
-        flat = part.reshape(len(part), -1, 2)
-        found = cv2.remap(linear, flat, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        x, y = (np.ascontiguousarray(part[..., k].reshape(len(part), -1)) for k in range(2))
+        found = cv2.remap(linear, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         out[begin : begin + 2**14] = found.reshape(*part.shape[:3], 3)
     return out
 
@@ -192,8 +192,6 @@ def _at_one_scale(
         few = mine[kept]
         pixel = patches.smallest_moments(view.width) + patches.BLUR
         here = pixel * patches.inverse(metric[kept])
-        new = ~moments[few].any(1)
-        moments[few] = np.where(
-            new[:, None], here, patches.joined(np.where(new[:, None], here, moments[few]), here)
-        )
+        new = moments[few, 0] == 0
+        moments[few] = patches.joined(np.where(new[:, None], here, moments[few]), here)
     return moments, keep
