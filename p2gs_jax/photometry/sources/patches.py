@@ -142,18 +142,20 @@ class Grid(NamedTuple):
     xy: Float[np.ndarray, "g a b 2"]  # pixels, centres at +0.5
 
 
-def grids(
-    plane: Plane,
-    moments: Symmetric,
+def grids_in(
     view: View,
+    surfaces: Surfaces,
+    points: Int[np.ndarray, " n"],
+    moments: Symmetric,
     xy: Float[np.ndarray, "n 2"],
-    within: Symmetric,
 ) -> Iterator[Grid]:
-    """Yield where to sample patches so that with pixels and interpolation they have `moments`.
+    """Yield where to sample patches of points so that with all blur they have `moments`.
 
-    `xy` are the pixels of their middles, `within` the metric. A patch is a parallelogram of the
-    plane, its samples spaced evenly.
+    `xy` are the pixels of their middles. A patch is a parallelogram of the plane, its samples
+    spaced evenly.
     """
+    plane = plane_in(surfaces, points, view)
+    within = metric(plane, view)
     own = moments - BLUR * inverse(within)
     sides = np.sqrt(12) * root(own)
     # The patch's sides, in lengths of the plane and in pixels.

@@ -130,32 +130,29 @@ def point_colors(
     moments, keep = _at_one_scale(surfaces, points, views)
 
     def read(row: int):
-        view, kept = views[row], keep[row]
-        mine, there = points[row][kept], xy[row][kept]
-        if not len(mine):
-            return None
-        plane = patches.plane_in(surfaces, mine, view)
-        within = patches.metric(plane, view)
-        grids = patches.grids(plane, moments[mine], view, there, within)
-        deviation = POSITION_DEVIATION * np.sqrt(12 * patches.smallest_moments(view.width))
+        mine, there = points[row][keep[row]], xy[row][keep[row]]
+        grids = patches.grids_in(views[row], surfaces, mine, moments[mine], there)
+        deviation = POSITION_DEVIATION * np.sqrt(12 * patches.smallest_moments(views[row].width))
         ldr, mask = store.whole(scene.train_indices[row])
         found = sample_patches(ldr, mask, grids, len(mine), deviation)
         good = found.valid
-        at = places(there[good], view.width, view.height).astype(np.float32)
+        at = places(there[good], *mask.shape[::-1]).astype(np.float32)
         return (np.full(len(at), row), mine[good], *(values[good] for values in found[:3]), at)
 
+    rows = [row for row, kept in enumerate(keep) if kept.any()]
     nothing, none = np.zeros((0, 3), np.float32), np.zeros(0, int)
     parts: list[tuple[np.ndarray, ...]] = [(none, none, *[nothing] * 3, nothing[:, :2])]
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as threads:
-        for row, found in enumerate(threads.map(read, range(len(views)))):
-            if found is not None:
-                parts.append(found)
+    with ThreadPoolExecutor(os.cpu_count()) as threads:
+        for done, found in enumerate(threads.map(read, rows)):
+            parts.append(found)
             if on_view is not None:
-                on_view(row + 1, len(views))
-    rows, seen, colors, spread, brightest, positions = map(np.concatenate, zip(*parts, strict=True))
+                on_view(done + 1, len(rows))
+    of_view, seen, colors, spread, brightest, positions = map(
+        np.concatenate, zip(*parts, strict=True)
+    )
     cameras = [view.camera for view in views]
     return Observations(
-        views=rows,
+        views=of_view,
         points=seen,
         colors=colors,
         spread=np.float32(uncertainty) * spread,
