@@ -127,9 +127,8 @@ def preset(name: PresetName) -> FitConfig:
         UserError: there is no such preset.
     """
     if name not in PRESETS:
-        raise UserError(
-            f"there is no preset {name!r}.", fix=f"choose {', '.join(get_args(PresetName))}"
-        )
+        fix = f"choose {', '.join(get_args(PresetName))}"
+        raise UserError(f"there is no preset {name!r}.", fix=fix)
     return with_values(FitConfig(preset=name), PRESETS[name])
 
 
@@ -142,10 +141,8 @@ def require_config(cfg: FitConfig | None) -> FitConfig:
     if cfg is None:
         return FitConfig()
     if not isinstance(cfg, FitConfig):
-        raise UserError(
-            f"{cfg!r} is no configuration.",
-            fix='give a FitConfig, for example p2gs_jax.preset("robust")',
-        )
+        fix = 'give a FitConfig, for example p2gs_jax.preset("robust")'
+        raise UserError(f"{cfg!r} is no configuration.", fix=fix)
     return cfg
 
 

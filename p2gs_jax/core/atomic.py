@@ -233,8 +233,6 @@ def read_jsonl(path: Path) -> list[dict]:
                 records.append(json.loads(line.decode()))
         except ValueError as error:
             if number < len(lines):
-                raise UserError(
-                    f"{path}, line {number}, is not JSON: {error}.",
-                    fix="remove that line, or the file: it is a log",
-                ) from error
+                fix = "remove that line, or the file: it is a log"
+                raise UserError(f"{path}, line {number}, is not JSON: {error}.", fix=fix) from error
     return records

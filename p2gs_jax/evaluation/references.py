@@ -26,9 +26,8 @@ def check_reference(folder: str | Path | None) -> None:
         UserError: there is no such folder.
     """
     if folder is not None and not Path(folder).is_dir():
-        raise UserError(
-            f"{folder} is not a folder.", fix="give --reference a folder of photographs"
-        )
+        fix = "give --reference a folder of photographs"
+        raise UserError(f"{folder} is not a folder.", fix=fix)
 
 
 def load_reference(folder: str | Path, scene: Scene, cfg: FitConfig) -> Reference:
@@ -46,11 +45,9 @@ def load_reference(folder: str | Path, scene: Scene, cfg: FitConfig) -> Referenc
         if found is not None:
             rows[row] = dataclasses.replace(view, image_path=found, mask_path=None)
     if not rows:
-        raise UserError(
-            f"{folder} holds no photograph with the name of a view (for example "
-            f"{scene.views[0].name}).",
-            fix="name the reference photographs as the scene's images",
-        )
+        why = f"{folder} holds no photograph with the name of a view (for example "
+        why += f"{scene.views[0].name})."
+        raise UserError(why, fix="name the reference photographs as the scene's images")
     order = sorted(rows)
     # Each is looked at once: none is kept beside the photographs.
     store = ImageStore(tuple(rows[r] for r in order), dataclasses.replace(cfg.data, cache_mb=0))

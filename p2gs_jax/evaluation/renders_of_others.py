@@ -66,22 +66,19 @@ class OtherRenders:
             pixels = _read_display(path)
         height, width = pixels.shape[:2]
         if (width, height) != size:
-            raise UserError(
-                f"{path} is {width}x{height}, the run's view {size[0]}x{size[1]}.",
-                fix="render it at the size that the run was fitted at, or fit the run at that of "
-                "the renders (--max-width)",
-            )
+            why = f"{path} is {width}x{height}, the run's view {size[0]}x{size[1]}."
+            fix = "render it at the size that the run was fitted at, or fit the run at that of "
+            fix += "the renders (--max-width)"
+            raise UserError(why, fix=fix)
         if linear and over and alpha is None:
-            raise UserError(
-                f"{path} has no channel A, and the scene's photographs are shown over a "
-                "background.",
-                fix="write the opacity of the render as well, or pictures over that background",
-            )
+            why = f"{path} has no channel A, and the scene's photographs are shown over a "
+            why += "background."
+            fix = "write the opacity of the render as well, or pictures over that background"
+            raise UserError(why, fix=fix)
         if not np.isfinite(pixels).all():
             bad = int((~np.isfinite(pixels)).any(-1).sum())
-            raise UserError(
-                f"{path} has {bad} pixels that are infinite or not a number.", fix="render it again"
-            )
+            fix = "render it again"
+            raise UserError(f"{path} has {bad} pixels that are infinite or not a number.", fix=fix)
         return Rendered(pixels, linear, alpha)
 
 
@@ -91,17 +88,14 @@ def _read_display(path: Path) -> Float32[np.ndarray, "h w 3"]:
     except (OSError, cv2.error):
         pixels = None
     if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
-        raise UserError(
-            f"{path} cannot be read as a picture of 8 or 16 bits.",
-            fix="write it again as PNG or JPEG",
-        )
+        fix = "write it again as PNG or JPEG"
+        raise UserError(f"{path} cannot be read as a picture of 8 or 16 bits.", fix=fix)
     most = np.iinfo(pixels.dtype).max
     if pixels.ndim == 2:
         pixels = np.repeat(pixels[..., None], 3, -1)
     if pixels.shape[-1] == 4 and (pixels[..., 3] < most).any():
-        raise UserError(
-            f"{path} is transparent in places.", fix="write it over the background that was meant"
-        )
+        fix = "write it over the background that was meant"
+        raise UserError(f"{path} is transparent in places.", fix=fix)
     return pixels[..., 2::-1].astype(np.float32) / most
 
 
@@ -118,10 +112,8 @@ def find_renders(folder: str | Path, scene: Scene) -> OtherRenders:
     if not folder.is_dir():
         raise UserError(f"{folder} is not a folder.", fix="give --against a folder of renders")
     if not scene.test_indices:
-        raise UserError(
-            "the run holds no view out, and renders are compared on held-out views.",
-            fix="fit with --test-every 8",
-        )
+        why = "the run holds no view out, and renders are compared on held-out views."
+        raise UserError(why, fix="fit with --test-every 8")
     names, named = {row: scene.views[row].name for row in scene.test_indices}, _by_name(folder)
     files: dict[int, Path] = {}
     for row, name in names.items():
@@ -134,18 +126,16 @@ def find_renders(folder: str | Path, scene: Scene) -> OtherRenders:
         return OtherRenders(folder, "pictures by name", files, missing)
     numbered = sorted((p for p in named.values() if p.stem.isdecimal()), key=lambda p: int(p.stem))
     if not numbered:
-        raise UserError(
-            f"{folder} holds no render of a held-out view (for example "
-            f"{Path(min(names.values())).with_suffix('.png')}).",
-            fix="name pictures as the scene's views, or number them in the order of these names",
-        )
+        why = f"{folder} holds no render of a held-out view (for example "
+        why += f"{Path(min(names.values())).with_suffix('.png')})."
+        fix = "name pictures as the scene's views, or number them in the order of these names"
+        raise UserError(why, fix=fix)
     if len(numbered) != len(names):
-        raise UserError(
-            f"{folder} holds {len(numbered)} numbered renders, the run holds {len(names)} views "
-            "out.",
-            fix="hold out the same views in both programs (--test-every), or name the renders as "
-            "the views",
-        )
+        why = f"{folder} holds {len(numbered)} numbered renders, the run holds {len(names)} views "
+        why += "out."
+        fix = "hold out the same views in both programs (--test-every), or name the renders as "
+        fix += "the views"
+        raise UserError(why, fix=fix)
     rows = sorted(names, key=lambda row: names[row])
     return OtherRenders(folder, "numbered pictures", dict(zip(rows, numbered, strict=True)))
 

@@ -38,10 +38,8 @@ def _checked(cfg: FitConfig, whole: str, value: Any) -> Any:
         _require_field(record, name, whole)
         record = getattr(record, name)
         if not dataclasses.is_dataclass(record):
-            raise UserError(
-                f"the configuration field {whole!r} goes too deep.",
-                fix=f"{name!r} is a value itself: leave out what follows it",
-            )
+            fix = f"{name!r} is a value itself: leave out what follows it"
+            raise UserError(f"the configuration field {whole!r} goes too deep.", fix=fix)
     _require_field(record, last, whole)
     hint = typing.get_type_hints(type(record))[last]
     value = tuple(value) if isinstance(value, list) else value
@@ -55,10 +53,8 @@ def _checked(cfg: FitConfig, whole: str, value: Any) -> Any:
 def _require_field(record: Any, name: str, whole: str) -> None:
     names = [f.name for f in dataclasses.fields(record)]
     if name not in names:
-        raise UserError(
-            f"there is no configuration field {whole!r}.",
-            fix=f"beside {name!r} there are: {', '.join(names)}",
-        )
+        fix = f"beside {name!r} there are: {', '.join(names)}"
+        raise UserError(f"there is no configuration field {whole!r}.", fix=fix)
 
 
 def _fits(value: Any, hint: Any) -> bool:
@@ -169,15 +165,11 @@ def _parsed(path: Path) -> dict[str, Any]:
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
-        raise UserError(
-            f"{path} cannot be read: {error.strerror}.",
-            fix="name a TOML file; docs/sweeps.md shows one",
-        ) from error
+        fix = "name a TOML file; docs/sweeps.md shows one"
+        raise UserError(f"{path} cannot be read: {error.strerror}.", fix=fix) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UserError(
-            f"{path} is not valid TOML: {error}.",
-            fix="mend that line; docs/sweeps.md shows an example",
-        ) from error
+        fix = "mend that line; docs/sweeps.md shows an example"
+        raise UserError(f"{path} is not valid TOML: {error}.", fix=fix) from error
     unknown = [key for key in data if key not in KEYS]
     if unknown:
         raise UserError(f"{path}: unknown key {unknown[0]!r}.", fix=f"known: {', '.join(KEYS)}")
@@ -203,9 +195,8 @@ def _configs(data: Mapping[str, Any], path: Path) -> dict[str, FitConfig]:
         fields = _nulls(case)
         name = str(fields.pop("name", f"case {number}"))
         if name in configs:
-            raise UserError(
-                f"{path}: two configurations are called {name!r}.", fix="give each case its name"
-            )
+            fix = "give each case its name"
+            raise UserError(f"{path}: two configurations are called {name!r}.", fix=fix)
         configs[name] = with_fields(start(fields.pop("preset", usual)), fields)
     return configs
 

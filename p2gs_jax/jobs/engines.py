@@ -49,10 +49,8 @@ def check_engine(name: str) -> None:
         return
     if name.startswith("dask://"):
         if not name.removeprefix("dask://").rpartition(":")[2].isdecimal():
-            raise UserError(
-                f"--engine {name} names no port.",
-                fix="write where the scheduler listens, as in dask://10.0.0.5:8786",
-            )
+            fix = "write where the scheduler listens, as in dask://10.0.0.5:8786"
+            raise UserError(f"--engine {name} names no port.", fix=fix)
         _require("distributed", "dask", name)
         return
     kind, _, options = name.partition(":")
@@ -95,17 +93,13 @@ def _dask(name: str) -> Iterator[Executor]:
     try:
         client = Client(address, timeout=ANSWER_S, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
-        raise UserError(
-            f"no Dask scheduler answers at {address} ({error}).",
-            fix="start one with `dask scheduler` and workers with `dask worker HOST:PORT "
-            "--nthreads 1`, each in this environment",
-        ) from error
+        fix = "start one with `dask scheduler` and workers with `dask worker HOST:PORT "
+        fix += "--nthreads 1`, each in this environment"
+        raise UserError(f"no Dask scheduler answers at {address} ({error}).", fix=fix) from error
     with client:
         if not client.scheduler_info()["workers"]:
-            raise UserError(
-                f"the Dask scheduler at {address} has no workers.",
-                fix="start some with `dask worker HOST:PORT --nthreads 1`",
-            )
+            fix = "start some with `dask worker HOST:PORT --nthreads 1`"
+            raise UserError(f"the Dask scheduler at {address} has no workers.", fix=fix)
         yield client.get_executor(pure=False)
 
 
@@ -133,11 +127,9 @@ def _executor(folder: str, cluster: str, options: dict[str, int | str]) -> Any:
         executor = submitit.AutoExecutor(folder, cluster=cluster, slurm_python=python)
         executor.update_parameters(name="p2gs-jax", **options)
     except (RuntimeError, NameError, TypeError, ValueError) as error:
-        raise UserError(
-            f"--engine {cluster} cannot be used here: {error}.",
-            fix="run this where `srun` is found, and name options as submitit does, for example "
-            "slurm:timeout_min=240,slurm_partition=gpu",
-        ) from error
+        fix = "run this where `srun` is found, and name options as submitit does, for example "
+        fix += "slurm:timeout_min=240,slurm_partition=gpu"
+        raise UserError(f"--engine {cluster} cannot be used here: {error}.", fix=fix) from error
     return executor
 
 
@@ -146,10 +138,8 @@ def _options(name: str, text: str) -> dict[str, int | str]:
     for part in filter(None, text.split(",")):
         key, equals, value = part.partition("=")
         if not (key.isidentifier() and equals and value):
-            raise UserError(
-                f"--engine {name}: {part!r} is not OPTION=VALUE.",
-                fix="write slurm:timeout_min=240,slurm_partition=gpu",
-            )
+            fix = "write slurm:timeout_min=240,slurm_partition=gpu"
+            raise UserError(f"--engine {name}: {part!r} is not OPTION=VALUE.", fix=fix)
         found[key] = int(value) if value.isdecimal() else value
     return found
 

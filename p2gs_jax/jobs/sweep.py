@@ -139,19 +139,15 @@ def _metrics(run: Path) -> Path:
 
 def _check(configs: Mapping[str, FitConfig], seeds: Sequence[int], max_parallel: int) -> None:
     if not configs or not seeds:
-        raise UserError(
-            "a sweep needs at least one configuration and one seed.",
-            fix="see docs/sweeps.md for an example",
-        )
+        fix = "see docs/sweeps.md for an example"
+        raise UserError("a sweep needs at least one configuration and one seed.", fix=fix)
     if max_parallel < 1:
         raise UserError(f"max_parallel is {max_parallel}.", fix="let at least 1 run at a time")
     folders = [slug(name) for name in configs]
     if len(set(folders)) < len(folders):
         twice = sorted({f for f in folders if folders.count(f) > 1})
-        raise UserError(
-            f"several configurations would share the folder {', '.join(twice)}.",
-            fix="give them names that differ in letters or digits",
-        )
+        why = f"several configurations would share the folder {', '.join(twice)}."
+        raise UserError(why, fix="give them names that differ in letters or digits")
 
 
 def fit_job(name: str, scene: Path, run: Path, cfg: FitConfig, reference: Path | None) -> Job:

@@ -170,10 +170,8 @@ def calibrate_run(
         lambda i, n: reporter.stage("Rendering depth", i, n),
     )
     if not len(observations.views):
-        raise UserError(
-            f"{run.folder}: no pixel of one view is visible in another.",
-            fix="fit longer, or calibrate from the scene's tracks",
-        )
+        fix = "fit longer, or calibrate from the scene's tracks"
+        raise UserError(f"{run.folder}: no pixel of one view is visible in another.", fix=fix)
     options, views, notes = options_of(cfg, run.scene), run.scene.training_views, run.scene.notes
     found = solved(views, observations, options, cfg, begin, compare_with, reporter, notes)
     return found.write(Path(out))

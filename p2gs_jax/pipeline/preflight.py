@@ -148,10 +148,8 @@ def check_run_dir(run_dir: Path, resume: bool, cfg: FitConfig) -> bool:
     if not path.exists():
         return False
     if not resume:
-        raise UserError(
-            f"{run_dir} already holds a run.",
-            fix="add --resume to continue it, or name another folder with --out",
-        )
+        fix = "add --resume to continue it, or name another folder with --out"
+        raise UserError(f"{run_dir} already holds a run.", fix=fix)
     saved, now = (flat(plain(to_dict(options))) for options in (read_config(path)[1], cfg))
     free = [name for name in now if name == "data.cache_mb" or name.startswith("evaluation.")]
     plan = [name for name in ("train.steps", "train.budget_s") if now[name] and saved.get(name)]
@@ -160,11 +158,9 @@ def check_run_dir(run_dir: Path, resume: bool, cfg: FitConfig) -> bool:
     differ = [name for name in compared if saved.get(name) != now.get(name)]
     if differ:
         other = [f"{name} was {saved.get(name)}, now {now.get(name)}" for name in differ]
-        raise UserError(
-            f"{run_dir} was begun with other options: {'; '.join(other[:6])}.",
-            fix="repeat the options it was begun with (--steps and --budget may be larger), or "
-            "name another folder with --out",
-        )
+        fix = "repeat the options it was begun with (--steps and --budget may be larger), or "
+        fix += "name another folder with --out"
+        raise UserError(f"{run_dir} was begun with other options: {'; '.join(other[:6])}.", fix=fix)
     return bool(longer)
 
 
@@ -230,10 +226,8 @@ def memory_named() -> Iterator[None]:
         if not ran_out(error):
             raise
         said = str(error).splitlines()[0][:160] if str(error) else "an allocation failed"
-        raise UserError(
-            f"memory ran out ({said}).",
-            fix=f"lower {OPTIONS}, in a new folder, or end other programs and add --resume",
-        ) from error
+        fix = f"lower {OPTIONS}, in a new folder, or end other programs and add --resume"
+        raise UserError(f"memory ran out ({said}).", fix=fix) from error
 
 
 def _gb(size: float) -> str:

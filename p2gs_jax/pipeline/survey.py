@@ -88,15 +88,11 @@ def load(
     scene = load_scene(scene_dir, cfg.data, run_dir / "cache", reporter.message)
     held, count = len(scene.test_indices), len(scene.train_indices)
     if count < 2:
-        raise UserError(
-            f"{scene_dir} has {count} training view(s); a fit needs two.",
-            fix="add photographs, or hold out fewer with --test-every 0",
-        )
+        fix = "add photographs, or hold out fewer with --test-every 0"
+        raise UserError(f"{scene_dir} has {count} training view(s); a fit needs two.", fix=fix)
     if len(scene.points) == 0:
-        raise UserError(
-            f"{scene_dir} has no seed points.",
-            fix="check the poses and that the photographs overlap",
-        )
+        fix = "check the poses and that the photographs overlap"
+        raise UserError(f"{scene_dir} has no seed points.", fix=fix)
     reporter.message(f"Held out: {held} of {len(scene.views)} views ({scene.split_by}).")
     if clock is not None:
         # Without a model, nearly all of it is finding and matching features.
@@ -163,21 +159,19 @@ def survey(
 def _require_something_to_see(scene: Scene, store: ImageStore) -> None:
     """Refuse masks that hide everything; of most scenes the first photograph is looked at."""
     if not any(store.stored(index)[1].any() for index in scene.train_indices):
-        raise UserError(
-            f"the masks hide every pixel of all {len(scene.train_indices)} training views.",
-            fix="masks are black where pixels are to be ignored: invert them, or take them away",
-        )
+        why = f"the masks hide every pixel of all {len(scene.train_indices)} training views."
+        fix = "masks are black where pixels are to be ignored: invert them, or take them away"
+        raise UserError(why, fix=fix)
 
 
 def _shell_options(store: ImageStore, cfg: FitConfig) -> InitConfig:
     """Return the options of seeds: what lies behind everything is the background, or a shell."""
     behind = cfg.render.background is not None
     if store.backdrop is not None and behind:
-        raise UserError(
-            "render.background is light behind the splats, and the photographs' alpha shows "
-            "data.background there.",
-            fix="leave one of them out: --render.background None, or --data.alpha mask",
-        )
+        why = "render.background is light behind the splats, and the photographs' alpha shows "
+        why += "data.background there."
+        fix = "leave one of them out: --render.background None, or --data.alpha mask"
+        raise UserError(why, fix=fix)
     if (store.backdrop is not None or behind) and cfg.init.shell == "auto":
         return dataclasses.replace(cfg.init, shell="off")
     return cfg.init

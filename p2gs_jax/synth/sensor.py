@@ -73,10 +73,8 @@ def draw_iso(shape: tuple[int, ...], std: float, seed: int) -> Int[np.ndarray, "
 def draw_shots(sensor: Sensor, frames: int, cameras: int, seed: int) -> Shots:
     """Return how all photographs are taken, camera by camera, frame by frame."""
     if len(sensor.curves) not in (0, cameras):
-        raise UserError(
-            f"there are {cameras} cameras, but {len(sensor.curves)} curves.",
-            fix=f"name {cameras} curves, or none",
-        )
+        fix = f"name {cameras} curves, or none"
+        raise UserError(f"there are {cameras} cameras, but {len(sensor.curves)} curves.", fix=fix)
     iso = draw_iso((frames, cameras), sensor.iso_std, seed).T.ravel()
     rng = generator(seed, SceneStream.CAMERAS)
     gain = sensor.camera_gain_ev * rng.standard_normal(cameras)
@@ -172,7 +170,5 @@ def read_true_exposures(root: Path) -> dict[str, float]:
         with path.open(newline="", encoding="utf-8-sig") as file:
             return {row["image"]: float(row["exposure"]) for row in csv.DictReader(file)}
     except (OSError, KeyError, ValueError, TypeError) as error:
-        raise UserError(
-            f"{path} cannot be read ({error!r}).",
-            fix="mend it, or take it away: it is for judging only",
-        ) from error
+        fix = "mend it, or take it away: it is for judging only"
+        raise UserError(f"{path} cannot be read ({error!r}).", fix=fix) from error

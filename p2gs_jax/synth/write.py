@@ -150,19 +150,17 @@ def _check(out: Path, asked: dict[str, Any]) -> None:
         asked[name] for name in ("frames", "width", "height", "supersample", "iso_std", "step_m")
     )
     if frames < 1 or width < 16 or height < 16 or std < 0 or samples < 1:
-        raise UserError(
-            f"cannot render {frames} frames of {width}x{height} with {samples} samples a side "
-            f"and ISO std {std}",
-            fix="use at least 1 frame, 16x16 pixels, 1 sample, and a spread of 0 or more",
-        )
+        why = f"cannot render {frames} frames of {width}x{height} with {samples} samples a side "
+        why += f"and ISO std {std}"
+        fix = "use at least 1 frame, 16x16 pixels, 1 sample, and a spread of 0 or more"
+        raise UserError(why, fix=fix)
     _require_free(out)
     way = (frames - 1) * step
     if asked["layout"] != "long" and way > STREET_END:
-        raise UserError(
-            f"{frames} frames of {step:g} m go on for {way:.0f} m; the street ends after "
-            f"{STREET_END:.0f}.",
-            fix="use --layout long, which is as many streets as the drive is long, or fewer frames",
-        )
+        why = f"{frames} frames of {step:g} m go on for {way:.0f} m; the street ends after "
+        why += f"{STREET_END:.0f}."
+        fix = "use --layout long, which is as many streets as the drive is long, or fewer frames"
+        raise UserError(why, fix=fix)
 
 
 def _require_free(out: Path) -> None:

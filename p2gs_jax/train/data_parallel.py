@@ -60,12 +60,11 @@ def _counted(devices: Count) -> int:
     if devices == "all":
         return there
     if not 1 <= devices <= there:
-        raise UserError(
-            f"--devices {devices} is not between 1 and the {there} that JAX sees here "
-            f"({jax.default_backend()}).",
-            fix="give one of these, or all; on a CPU, XLA_FLAGS="
-            f"--xla_force_host_platform_device_count={devices} makes as many of its cores",
-        )
+        why = f"--devices {devices} is not between 1 and the {there} that JAX sees here "
+        why += f"({jax.default_backend()})."
+        fix = "give one of these, or all; on a CPU, XLA_FLAGS="
+        fix += f"--xla_force_host_platform_device_count={devices} makes as many of its cores"
+        raise UserError(why, fix=fix)
     return devices
 
 
@@ -93,10 +92,9 @@ def mesh_of(cfg: FitConfig, devices: Count = 1) -> Mesh | None:
     if batch == 1 and count == 1:
         return None
     if batch % count:
-        raise UserError(
-            f"--train.batch {batch} cannot be shared out among {count} devices.",
-            fix=f"give a multiple of {count}, such as --train.batch {-(-batch // count) * count}",
-        )
+        why = f"--train.batch {batch} cannot be shared out among {count} devices."
+        fix = f"give a multiple of {count}, such as --train.batch {-(-batch // count) * count}"
+        raise UserError(why, fix=fix)
     return default_mesh(count)
 
 

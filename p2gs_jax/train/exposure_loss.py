@@ -117,11 +117,10 @@ def color_pairs(tracks: Observations | None, cfg: FitConfig) -> ColorPairs | Non
     if relative.weight is None or relative.form != "observed_ldr":
         return None
     if tracks is None or not len(tracks.points):
-        raise UserError(
-            "the relative-exposure loss was to compare photographs at tracks, and this scene has "
-            "none.",
-            fix="use --loss.relative-exposure.form literal_same_pose, or a scene with tracks",
-        )
+        why = "the relative-exposure loss was to compare photographs at tracks, and this scene has "
+        why += "none."
+        fix = "use --loss.relative-exposure.form literal_same_pose, or a scene with tracks"
+        raise UserError(why, fix=fix)
     first, second = sample_pairs(tracks, PAIR_POOL, cfg.train.seed)
     places = ()
     if darkens(cfg.photometry):

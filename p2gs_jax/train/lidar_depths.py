@@ -56,10 +56,8 @@ def measured_depths(scene: Scene, cfg: FitConfig) -> list[Measured] | None:
     if cfg.loss.lidar is None:
         return None
     if scene.lidar is None:
-        raise UserError(
-            f"{scene.root} has no laser measurements for --loss.lidar.",
-            fix="leave the option out, or name a drive with LiDAR sweeps",
-        )
+        fix = "leave the option out, or name a drive with LiDAR sweeps"
+        raise UserError(f"{scene.root} has no laser measurements for --loss.lidar.", fix=fix)
     rng = generator(cfg.train.seed, Stream.MEASURED_DEPTHS)
     static = scene.lidar.objects < 0
     points, times = scene.lidar.points[static], scene.lidar.times[static]

@@ -284,8 +284,6 @@ def densified(
     params = dataclasses.replace(state.params, gaussians=outcome.gaussians)
     state = FitState(params, opt_state, outcome.population, state.step, state.fault)
     if alive_in(state.population) == 0:
-        raise UserError(
-            f"Step {host.step}: densification removed every Gaussian.",
-            fix="lower --densify.prune-opacity or raise --densify.prune-scale",
-        )
+        fix = "lower --densify.prune-opacity or raise --densify.prune-scale"
+        raise UserError(f"Step {host.step}: densification removed every Gaussian.", fix=fix)
     return state

@@ -126,11 +126,10 @@ def cut_scene(scene: Scene, count: int) -> Cut:
         raise UserError(f"--blocks {count}.", fix="write a whole number from 1, or auto")
     distinct = len(np.unique(np.round(places, 9), axis=0))
     if count * FEWEST_VIEWS > len(places) or count > distinct:
-        raise UserError(
-            f"{len(places)} training photographs from {distinct} places are too few for {count} "
-            "blocks.",
-            fix=f"use --blocks {max(1, min(len(places) // FEWEST_VIEWS, distinct))} or fewer",
-        )
+        why = f"{len(places)} training photographs from {distinct} places are too few for {count} "
+        why += "blocks."
+        fix = f"use --blocks {max(1, min(len(places) // FEWEST_VIEWS, distinct))} or fewer"
+        raise UserError(why, fix=fix)
     cells = split(places, count)
     margin = OVERLAP * min(_length(places[cell.holds(places)]) for cell in cells)
     inside = [cell.holds(ground.place(scene.points), margin) for cell in cells]
@@ -141,10 +140,8 @@ def cut_scene(scene: Scene, count: int) -> Cut:
         blocks.append(Block(cell.lower, cell.upper, tuple(np.flatnonzero(belongs).tolist())))
     few = [len(b.views) for b in blocks if len(b.views) < FEWEST_VIEWS]
     if few:
-        raise UserError(
-            f"cut into {count} blocks, one is shown by {few[0]} photograph(s); a fit needs two.",
-            fix=f"use --blocks {count - 1} or fewer",
-        )
+        why = f"cut into {count} blocks, one is shown by {few[0]} photograph(s); a fit needs two."
+        raise UserError(why, fix=f"use --blocks {count - 1} or fewer")
     return Cut(ground, float(margin), tuple(blocks))
 
 
@@ -170,11 +167,9 @@ def _split(places: Float[np.ndarray, "v 2"], count: int, cell: Block) -> list[Bl
     values = np.sort(places[:, axis])
     edges = np.flatnonzero(np.diff(values) > 0)
     if not len(edges):
-        raise UserError(
-            f"the photographs of a part of the scene show one place, which {count} blocks would "
-            "share.",
-            fix="use fewer --blocks",
-        )
+        why = f"the photographs of a part of the scene show one place, which {count} blocks would "
+        why += "share."
+        raise UserError(why, fix="use fewer --blocks")
     wanted = less / count * len(values) - 1
     at = edges[np.abs(edges - wanted).argmin()]
     edge = float((values[at] + values[at + 1]) / 2)

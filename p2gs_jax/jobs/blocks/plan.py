@@ -30,11 +30,10 @@ def check_options(cfg: FitConfig) -> None:
             fix="use --preset robust, or fit without --blocks",
         )
     if cfg.loss.relative_exposure.weight is not None:
-        raise UserError(
-            "--blocks keeps exposures as they are solved: the relative-exposure loss has nothing "
-            "to move.",
-            fix="add --loss.relative-exposure.weight None, or fit without --blocks",
-        )
+        why = "--blocks keeps exposures as they are solved: the relative-exposure loss has nothing "
+        why += "to move."
+        fix = "add --loss.relative-exposure.weight None, or fit without --blocks"
+        raise UserError(why, fix=fix)
     if cfg.dynamics.method == "vibration":
         raise UserError(
             "--blocks fits what stands still: Gaussians that move would cross from block to block.",
@@ -45,10 +44,9 @@ def check_options(cfg: FitConfig) -> None:
 def check_scene(scene: Scene, cfg: FitConfig) -> None:
     """Raise a UserError where moving objects of a scene are to be fitted."""
     if cfg.dynamics.method != "mask" and any(thing.moving for thing in scene.objects):
-        raise UserError(
-            f"--blocks fits what stands still, and things move in {scene.root}.",
-            fix="add --dynamics.method mask, which leaves them out, or fit without --blocks",
-        )
+        why = f"--blocks fits what stands still, and things move in {scene.root}."
+        fix = "add --dynamics.method mask, which leaves them out, or fit without --blocks"
+        raise UserError(why, fix=fix)
 
 
 def write_plan(folder: Path, cut: Cut, asked: str) -> None:
@@ -68,15 +66,11 @@ def read_plan(folder: Path, asked: str) -> Cut | None:
         saved: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         before, cut = saved["asked"], Cut.from_dict(saved["cut"])
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(
-            f"{path} cannot be read ({error}).",
-            fix="start again in another folder with --out",
-        ) from error
+        fix = "start again in another folder with --out"
+        raise UserError(f"{path} cannot be read ({error}).", fix=fix) from error
     if before != asked and asked != str(len(cut.blocks)):
-        raise UserError(
-            f"{folder.parent} was begun with --blocks {before} ({len(cut.blocks)} blocks).",
-            fix=f"repeat --blocks {before}, or name another folder with --out",
-        )
+        why = f"{folder.parent} was begun with --blocks {before} ({len(cut.blocks)} blocks)."
+        raise UserError(why, fix=f"repeat --blocks {before}, or name another folder with --out")
     return cut
 
 

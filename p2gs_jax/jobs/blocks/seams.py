@@ -193,9 +193,8 @@ def merge_cores(cut: Cut, fitted: Sequence[Gaussians]) -> tuple[Gaussians, list[
     ]
     counts = [len(rows) for rows in kept]
     if not sum(counts):
-        raise UserError(
-            "no block has a Gaussian in its core.", fix="use fewer --blocks, or more --steps"
-        )
+        fix = "use fewer --blocks, or more --steps"
+        raise UserError("no block has a Gaussian in its core.", fix=fix)
 
     def joined(*arrays) -> jax.Array:
         parts = [np.asarray(a)[rows] for a, rows in zip(arrays, kept, strict=True)]

@@ -49,11 +49,9 @@ def solve_shared(
     still = store.leaving_out(scene.objects, cfg.dynamics.margin).only_opaque()
     solved = solve_exposures(scene, still, cfg, reporter, kept=kept)
     if solved.selection is None:
-        raise UserError(
-            f"{scene.root}: no point is seen by two photographs, so that blocks would share no "
-            "exposures.",
-            fix="fit it without --blocks, or with a structure-from-motion model",
-        )
+        why = f"{scene.root}: no point is seen by two photographs, so that blocks would share no "
+        why += "exposures."
+        raise UserError(why, fix="fit it without --blocks, or with a structure-from-motion model")
     views = scene.training_views
     depth = near_depth(seen_depths(scene.points, views))
     near = near_plane(depth, cfg)
@@ -117,18 +115,15 @@ def read_shared(folder: Path, scene: Scene, cfg: FitConfig) -> Shared:
         shell = Sphere(a["shell"][:3], float(a["shell"][3]))
         radiance = a["radiance"]
     except (OSError, ValueError, KeyError) as error:
-        raise UserError(
-            f"{path} cannot be read ({error}).",
-            fix=f"remove {folder} and fit again: exposures are solved anew",
-        ) from error
+        fix = f"remove {folder} and fit again: exposures are solved anew"
+        raise UserError(f"{path} cannot be read ({error}).", fix=fix) from error
     held = (len(radiance), len(a["exposures"]))
     now = (len(scene.points), len(scene.train_indices))
     if held != now:
-        raise UserError(
-            f"{scene.root} has {now[0]} points and {now[1]} training photographs, and had "
-            f"{held[0]} and {held[1]} when its exposures were solved.",
-            fix="restore the scene as it was, or start again in another folder with --out",
-        )
+        why = f"{scene.root} has {now[0]} points and {now[1]} training photographs, and had "
+        why += f"{held[0]} and {held[1]} when its exposures were solved."
+        fix = "restore the scene as it was, or start again in another folder with --out"
+        raise UserError(why, fix=fix)
     if "point_colors" in a:
         scene = dataclasses.replace(scene, point_colors=a["point_colors"])
     return Shared(scene, Exposures(photometry, decisions, radiance=radiance), shell)
