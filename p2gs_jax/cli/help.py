@@ -20,16 +20,7 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import tyro
-from tyro.constructors import (
-    MISSING,
-    MISSING_NONPROP,
-    ConstructorRegistry,
-    PrimitiveConstructorSpec,
-    PrimitiveTypeInfo,
-    StructConstructorSpec,
-    StructFieldSpec,
-    StructTypeInfo,
-)
+from tyro import constructors
 
 from p2gs_jax.cli.shared import SHORT, parse_duration
 from p2gs_jax.config import DataConfig, FitConfig
@@ -37,7 +28,7 @@ from p2gs_jax.config import DataConfig, FitConfig
 PLACEHOLDERS = {int: "N", float: "X", str: "TEXT", Path: "PATH"}
 EXAMPLE = "p2gs-jax "
 INDENT = "    "
-DURATION = PrimitiveConstructorSpec(
+DURATION = constructors.PrimitiveConstructorSpec(
     nargs=1,
     metavar="TIME",
     instance_from_str=lambda words: None if words[0] == "None" else parse_duration(words[0]),
@@ -46,18 +37,18 @@ DURATION = PrimitiveConstructorSpec(
 )
 
 
-def registry(brief: bool) -> ConstructorRegistry:
+def registry(brief: bool) -> constructors.ConstructorRegistry:
     """Return the rules by which tyro reads our option classes.
 
     In `brief` help, nothing of the configuration is shown but the fields that have short names.
     """
-    rules = ConstructorRegistry()
+    rules = constructors.ConstructorRegistry()
     # Of the command that is being read: short names by field, and the fields that are options.
     short: dict[str, str] = {}
     only: list[str] = []
 
     @rules.struct_rule
-    def options(info: StructTypeInfo) -> StructConstructorSpec | None:
+    def options(info: constructors.StructTypeInfo) -> constructors.StructConstructorSpec | None:
         kind, default = info.type, info.default
         if not dataclasses.is_dataclass(kind) or not kind.__module__.startswith("p2gs_jax."):
             return None
@@ -66,10 +57,10 @@ def registry(brief: bool) -> ConstructorRegistry:
             short.update({SHORT[name][0]: name for name in kind.SHORT_NAMES})
             only[:] = getattr(kind, "FIELDS", ())
             if brief:
-                return StructConstructorSpec(kind, tuple(_brief(kind, default)))
+                return constructors.StructConstructorSpec(kind, tuple(_brief(kind, default)))
         group = next((f"{n}." for n, hint in _hints(FitConfig).items() if hint is kind), "")
         if not (group or kind is FitConfig):
-            return StructConstructorSpec(kind, tuple(_fields(kind, default, short)))
+            return constructors.StructConstructorSpec(kind, tuple(_fields(kind, default, short)))
         # What is no option stays as the preset has it; `preset` is an option of the command.
         default = default if isinstance(default, kind) else kind()
         fields = [f for f in _fields(kind, default, short) if f.name != "preset"]
@@ -77,13 +68,15 @@ def registry(brief: bool) -> ConstructorRegistry:
             inside = [path.removeprefix(group) for path in only if path.startswith(group)]
             fields = [f for f in fields if f.name in {path.partition(".")[0] for path in inside}]
         make = functools.partial(dataclasses.replace, default)
-        return StructConstructorSpec(make, tuple(fields))
+        return constructors.StructConstructorSpec(make, tuple(fields))
 
     rules.primitive_rule(_number_rule)
     return rules
 
 
-def _number_rule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+def _number_rule(
+    info: constructors.PrimitiveTypeInfo,
+) -> constructors.PrimitiveConstructorSpec | None:
     """Return the parser of a number, a few words, or None, with plain error messages."""
     kinds = set(get_args(info.type)) if _is_union(info.type) else {info.type}
     words = [word for k in kinds if get_origin(k) is Literal for word in get_args(k)]
@@ -107,7 +100,7 @@ def _number_rule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
     def fits(value: Any) -> bool:
         return value in values.values() or type(value) is kind
 
-    return PrimitiveConstructorSpec(
+    return constructors.PrimitiveConstructorSpec(
         nargs=1,
         metavar="|".join([*known, PLACEHOLDERS[kind]]),
         instance_from_str=read,
@@ -116,7 +109,7 @@ def _number_rule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
     )
 
 
-def _brief(kind: type, default: Any) -> Iterator[StructFieldSpec]:
+def _brief(kind: type, default: Any) -> Iterator[constructors.StructFieldSpec]:
     """Yield a command's options, with the short names in place of the whole configuration."""
     for spec in _fields(kind, default, {}):
         if not isinstance(spec.default, FitConfig | DataConfig):
@@ -128,7 +121,9 @@ def _brief(kind: type, default: Any) -> Iterator[StructFieldSpec]:
             yield _field(type(parent), field, parent, short)
 
 
-def _fields(kind: type, default: Any, short: Mapping[str, str]) -> Iterator[StructFieldSpec]:
+def _fields(
+    kind: type, default: Any, short: Mapping[str, str]
+) -> Iterator[constructors.StructFieldSpec]:
     group = next((n for n, hint in _hints(FitConfig).items() if hint is kind), None)
     for name, hint in _hints(kind).items():
         if get_origin(hint) is tuple and any(map(dataclasses.is_dataclass, get_args(hint))):
@@ -138,7 +133,7 @@ def _fields(kind: type, default: Any, short: Mapping[str, str]) -> Iterator[Stru
 
 def _field(
     kind: type, name: str, parent: Any, short: str | None, *, brief: bool = True
-) -> StructFieldSpec:
+) -> constructors.StructFieldSpec:
     """Return the rule of the option of a field, whose class has the default `parent`.
 
     In `brief` help a short name is the only one.
@@ -154,7 +149,7 @@ def _field(
             extras = (*extras, tyro.conf.arg(**shown, aliases=(f"--{dashed}",)))
     if name == "budget" or name.endswith("_s"):
         extras = (*extras, DURATION, tyro.conf.arg(metavar="TIME"))
-    return StructFieldSpec(
+    return constructors.StructFieldSpec(
         name=name,
         type=Annotated[(_plain(hint), *extras)],  # type: ignore
         default=default,
@@ -163,14 +158,14 @@ def _field(
 
 
 def _default(kind: type, name: str, parent: Any) -> Any:
-    if parent is MISSING:
-        return MISSING
-    if parent is not MISSING_NONPROP and hasattr(parent, name):
+    if parent is constructors.MISSING:
+        return constructors.MISSING
+    if parent is not constructors.MISSING_NONPROP and hasattr(parent, name):
         return getattr(parent, name)
     field = next(f for f in dataclasses.fields(kind) if f.name == name)
     if field.default_factory is not dataclasses.MISSING:
         return field.default_factory()
-    return MISSING_NONPROP if field.default is dataclasses.MISSING else field.default
+    return constructors.MISSING_NONPROP if field.default is dataclasses.MISSING else field.default
 
 
 def _settings(kind: type, name: str, hint: Any, default: Any, brief: bool) -> tuple[Any, ...]:

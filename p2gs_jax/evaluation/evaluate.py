@@ -40,14 +40,7 @@ from p2gs_jax.evaluation.scores import (
     tells_exposure,
     view_scores,
 )
-from p2gs_jax.photometry.display import (
-    DisplayTransform,
-    develop,
-    display_of_view,
-    mean_parameters,
-    usual_display,
-    with_capture,
-)
+from p2gs_jax.photometry import display
 from p2gs_jax.photometry.formation import exposed_at
 from p2gs_jax.photometry.metering import BELOW_WHITE, Metering, Readings, fit_metering, meter
 from p2gs_jax.photometry.models import MODELS
@@ -88,17 +81,17 @@ class Judge:
             lambda p: p.gaussians, params, None, is_leaf=lambda leaf: leaf is None
         )
         self.small: Params = jax.tree.map(np.asarray, without)
-        self.mean = mean_parameters(self.small.photometry)
+        self.mean = display.mean_parameters(self.small.photometry)
         self.taken_by = [view.camera for view in scene.training_views]
         self.row_of = {index: row for row, index in enumerate(scene.train_indices)}
 
-    def usual(self, index: int | None) -> DisplayTransform:
+    def usual(self, index: int | None) -> display.DisplayTransform:
         """Return how a view is shown by the mean parameters; None: one of no camera."""
         camera = None if index is None else self.scene.views[index].camera
-        shown = usual_display(self.small, self.taken_by, camera, self.cfg.photometry)
+        shown = display.usual_display(self.small, self.taken_by, camera, self.cfg.photometry)
         return self.over(shown)
 
-    def over(self, transform: DisplayTransform) -> DisplayTransform:
+    def over(self, transform: display.DisplayTransform) -> display.DisplayTransform:
         """Return a display transform that puts renders over what the photographs are over."""
         return replace(transform, backdrop=self.store.backdrop_values)
 
@@ -171,10 +164,10 @@ def _judged(
     rendered = seen(camera_of(store, index))
     linear, alpha = np.asarray(rendered.linear), np.asarray(rendered.alpha)
     usual = judge.usual(index)
-    averaged = develop(linear, replace(usual, exposure=judge.mean.exposure), alpha=alpha)
+    averaged = display.develop(linear, replace(usual, exposure=judge.mean.exposure), alpha=alpha)
     extra, everything = {}, None
     if scene.views[index].split == "train":
-        own = display_of_view(judge.small, judge.row_of[index], judge.cfg.photometry)
+        own = display.display_of_view(judge.small, judge.row_of[index], judge.cfg.photometry)
         transform = judge.over(own)
     elif not mask.any():
         transform = usual
@@ -183,7 +176,7 @@ def _judged(
         transform = with_fitted_exposure(usual, linear, photograph, still, alpha)
         extra = {"exposure": transform.exposure}
         everything = _all_fitted(linear, photograph, still, transform, score, alpha)
-    ldr = develop(linear, transform, alpha=alpha)
+    ldr = display.develop(linear, transform, alpha=alpha)
     depth = np.asarray(rendered.depth)
     truth = None if radiance is None else radiance(index)
     aligned = None if judge.reference is None else judge.reference(index)
@@ -207,7 +200,7 @@ def _judged(
 
 
 def _all_fitted(
-    linear, photograph, still, start: DisplayTransform, score, alpha
+    linear, photograph, still, start: display.DisplayTransform, score, alpha
 ) -> dict[str, Any] | None:
     """Score a held-out view with all solved that varies per view; None: that is one scalar.
 
@@ -220,8 +213,8 @@ def _all_fitted(
     given = (linear, photograph, still)
     how = (start.capture, tone, start.correction, start.matte(alpha))
     found = fit_capture(*given, *how, gamma=gamma, white_balance=balance)
-    transform = with_capture(start, found)
-    row = {**score(develop(linear, transform, alpha=alpha)), "exposure": transform.exposure}
+    transform = display.with_capture(start, found)
+    row = {**score(display.develop(linear, transform, alpha=alpha)), "exposure": transform.exposure}
     if gamma:
         row["gamma"] = transform.gamma
     if balance:
@@ -333,7 +326,9 @@ class _Views:
             linear, alpha = np.asarray(rendered.linear), np.asarray(rendered.alpha)
             if index in metered:
                 exposure = metering.exposure(metered[index])
-                ldr = develop(linear, replace(judge.usual(index), exposure=exposure), alpha=alpha)
+                ldr = display.develop(
+                    linear, replace(judge.usual(index), exposure=exposure), alpha=alpha
+                )
                 score = judge.scorer(index, photograph, mask)
                 found["metered"] = {**score(ldr), "exposure": exposure}
             if index in self._scales:
@@ -375,6 +370,8 @@ def _against_reference(
     truth, usual = judge.reference(index), judge.usual(None)
     shown = {name: replace(usual, exposure=exposure) for name, exposure in exposures.items()}
     return {
-        name: view_scores(judge.lpips_weights, develop(linear, how, alpha=alpha), truth, mask)
+        name: view_scores(
+            judge.lpips_weights, display.develop(linear, how, alpha=alpha), truth, mask
+        )
         for name, how in shown.items()
     }

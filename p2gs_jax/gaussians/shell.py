@@ -15,12 +15,7 @@ from jaxtyping import Bool, Float, Float32
 
 from p2gs_jax.config import FitConfig, InitConfig
 from p2gs_jax.core.numerics import fibonacci_sphere
-from p2gs_jax.gaussians.seeds import (
-    camera_centers,
-    gaussians_from_points,
-    misplaced,
-    photographed,
-)
+from p2gs_jax.gaussians import seeds
 from p2gs_jax.render.warp import project_points
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.visibility import in_frame
@@ -74,7 +69,7 @@ def sphere_behind(
     views: Sequence[View], points: Float[np.ndarray, "p 3"], radius: float, cfg: InitConfig
 ) -> Sphere:
     """Return where the shell of a scene lies: behind its seeds, beyond the cameras' radius."""
-    middle = camera_centers(views)[~misplaced(views, points)].mean(0)
+    middle = seeds.camera_centers(views)[~seeds.misplaced(views, points)].mean(0)
     radius *= cfg.shell_radius
     if len(points):
         far = float(np.quantile(np.linalg.norm(points - middle, axis=1), 0.98))
@@ -154,10 +149,10 @@ def shell_gaussians(
         return seen, shell.xy[seen, row]
 
     total, weight = np.zeros((len(shell.points), 3)), np.zeros(len(shell.points))
-    for at, _, found in photographed(seen_in, scene, store, photometry, cfg, SHELL_SHRINK):
+    for at, _, found in seeds.photographed(seen_in, scene, store, photometry, cfg, SHELL_SHRINK):
         total[at] += found
         weight[at] += 1
     seen = weight > 0
     radiance = (total[seen] / weight[seen, None]).astype(np.float32)
     own = {"scales": shell.scales[seen], "opacity": SHELL_OPACITY}
-    return gaussians_from_points(shell.points[seen], radiance, views, cfg, **own)
+    return seeds.gaussians_from_points(shell.points[seen], radiance, views, cfg, **own)

@@ -14,12 +14,7 @@ from jaxtyping import Float32
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.progress import Reporter, Silent
-from p2gs_jax.photometry.calibrate import (
-    OnChosen,
-    Selection,
-    calibrate_observations,
-    options_of,
-)
+from p2gs_jax.photometry import calibrate
 from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.parameters import initial_photometry
@@ -43,7 +38,7 @@ class Exposures:
     decisions: Decisions  # what the scene settled
     observations: Observations | None = None  # colours of shared points, or None
     # model, exposures and their errors, or None where nothing was solved here
-    selection: Selection | None = None
+    selection: calibrate.Selection | None = None
     # linear, of the scene's points; None: it follows from the selection
     radiance: Float32[np.ndarray, "p 3"] | None = None
     notes: tuple[str, ...] = ()  # what the user should know
@@ -60,7 +55,7 @@ def solve_exposures(
     cfg: FitConfig,
     reporter: Reporter | None = None,
     *,
-    on_chosen: OnChosen = lambda form, response: None,
+    on_chosen: calibrate.OnChosen = lambda form, response: None,
     dense: bool = False,
     kept: Decisions | None = None,
 ) -> Exposures:
@@ -74,7 +69,9 @@ def solve_exposures(
     selection, under = None, cfg if kept is None else kept.resolve(cfg)
     if found is not None and len(found.points) and cfg.photometry.start == "tracks":
         (reporter or Silent()).stage("Photometric bundle adjustment")
-        selection = calibrate_observations(found, options_of(under, scene), on_chosen)
+        selection = calibrate.calibrate_observations(
+            found, calibrate.options_of(under, scene), on_chosen
+        )
         if kept is not None:
             selection = dataclasses.replace(selection, reasons=kept.reasons)
         notes += [*selection.reasons, *selection.solution.warnings]
@@ -109,7 +106,7 @@ def _sampled(
 
 
 def decide(
-    cfg: FitConfig, selection: Selection | None, *, kept: Decisions | None = None
+    cfg: FitConfig, selection: calibrate.Selection | None, *, kept: Decisions | None = None
 ) -> Decisions:
     """Return what the photographs decided.
 

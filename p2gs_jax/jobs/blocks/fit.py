@@ -20,25 +20,10 @@ from p2gs_jax.core.runtime import return_freed_memory
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.references import Reference
 from p2gs_jax.formats.ply import read_ply
+from p2gs_jax.jobs.blocks import plan, shared
 from p2gs_jax.jobs.blocks.block import block_job
 from p2gs_jax.jobs.blocks.cut import Cut, cut_scene
-from p2gs_jax.jobs.blocks.plan import (
-    check_options,
-    check_scene,
-    fewest_blocks,
-    read_plan,
-    require_room,
-    write_plan,
-)
 from p2gs_jax.jobs.blocks.seams import Seam, level_seams, merge_cores
-from p2gs_jax.jobs.blocks.shared import (
-    ARRAYS,
-    DECISIONS,
-    Shared,
-    read_shared,
-    solve_shared,
-    write_shared,
-)
 from p2gs_jax.jobs.engines import LOCAL, check_engine, open_engine
 from p2gs_jax.jobs.job import JobState
 from p2gs_jax.jobs.run import run_jobs
@@ -98,7 +83,7 @@ def fit_blocks(
     paths = Paths.of(scene_dir, run_dir, reference)
     if isinstance(blocks, str) and blocks != "auto":
         raise UserError(f"--blocks {blocks}.", fix="write a whole number from 1, or auto")
-    check_options(cfg)
+    plan.check_options(cfg)
     check_engine(engine)
     weights = preflight.preflight(cfg, paths, resume=resume)
     begin = time.monotonic()
@@ -108,7 +93,7 @@ def fit_blocks(
             for finished in (paths.run / BLOCKS).glob("*/metrics.json"):
                 finished.unlink()
         scene = load(paths.scene, paths.run, cfg, reporter)
-        check_scene(scene, cfg)
+        plan.check_scene(scene, cfg)
         truth = preflight.check_scene(scene, cfg, paths, weights)
         cut = _cut(scene, cfg, asked, paths.run / BLOCKS, reporter)
         if cut is not None:
@@ -132,18 +117,18 @@ def _cut(
     scene: Scene, cfg: FitConfig, asked: Asked, folder: Path, reporter: Reporter
 ) -> Cut | None:
     """Return how the scene is cut, as before where it was; None: one block holds all."""
-    cut = read_plan(folder, str(asked.blocks))
+    cut = plan.read_plan(folder, str(asked.blocks))
     if cut is None:
         count = asked.blocks
         if isinstance(count, str):
-            count = fewest_blocks(scene, cfg, asked.parallel)
+            count = plan.fewest_blocks(scene, cfg, asked.parallel)
         if count == 1:
             reporter.message("One block: memory holds the scene whole.")
             return None
         cut = cut_scene(scene, count)
     # Elsewhere there is other memory.
     if asked.engine == LOCAL:
-        require_room(scene, cfg, cut, asked.parallel)
+        plan.require_room(scene, cfg, cut, asked.parallel)
     sizes = [len(block.views) for block in cut.blocks]
     reporter.message(
         f"{len(sizes)} blocks of {min(sizes)} to {max(sizes)} of {len(scene.train_indices)} "
@@ -216,7 +201,9 @@ class _Blocks:
             decisions,
         )
 
-    def _account(self, scene: Scene, solved: Shared, gaussians: int, seconds: float) -> Account:
+    def _account(
+        self, scene: Scene, solved: shared.Shared, gaussians: int, seconds: float
+    ) -> Account:
         blocks = [self._of_block(k) for k in range(len(self.cut.blocks))]
         optimisation = sum(found["seconds"]["optimisation"] for found in blocks)
         return Account(
@@ -237,10 +224,10 @@ class _Blocks:
             notes=[*solved.scene.notes, *solved.exposures.notes],
         )
 
-    def _solve(self, scene: Scene) -> Shared:
+    def _solve(self, scene: Scene) -> shared.Shared:
         store = ImageStore(scene.views, self.cfg.data, folder=self.folder.pixels)
-        kept = read_decisions(self.blocks / DECISIONS)
-        solved = solve_shared(scene, store, self.cfg, self.reporter, kept=kept)
+        kept = read_decisions(self.blocks / shared.DECISIONS)
+        solved = shared.solve_shared(scene, store, self.cfg, self.reporter, kept=kept)
         store.close()
         return_freed_memory()
         for note in (*scene.notes, *solved.exposures.notes):
@@ -248,14 +235,14 @@ class _Blocks:
         self.lock.require()
         found, paths = solved.exposures, self.paths
         write_start(self.folder, paths.scene, paths.reference, self.cfg, found.decisions)
-        if (self.blocks / ARRAYS).exists():
+        if (self.blocks / shared.ARRAYS).exists():
             # What blocks were fitted under stays, to the digit.
-            before = read_shared(self.blocks, scene, self.cfg)
+            before = shared.read_shared(self.blocks, scene, self.cfg)
             told = {"selection": found.selection, "notes": found.notes}
             exposures = dataclasses.replace(before.exposures, **told)
             return dataclasses.replace(before, exposures=exposures)
-        write_plan(self.blocks, self.cut, str(self.asked.blocks))
-        write_shared(self.blocks, solved)
+        plan.write_plan(self.blocks, self.cut, str(self.asked.blocks))
+        shared.write_shared(self.blocks, solved)
         return solved
 
     def _fit_blocks(self) -> None:
