@@ -25,21 +25,13 @@ import numpy as np
 from jaxtyping import Float32
 
 from p2gs_jax.config import FitConfig
+from p2gs_jax.evaluation import scores as scoring
 from p2gs_jax.evaluation.alignment import fit_capture, with_fitted_exposure
 from p2gs_jax.evaluation.drives import DepthScores
 from p2gs_jax.evaluation.lpips import LpipsWeights
 from p2gs_jax.evaluation.passes import map_in_order
 from p2gs_jax.evaluation.radiance import Alignment, Truth, sampled
 from p2gs_jax.evaluation.references import Reference
-from p2gs_jax.evaluation.scores import (
-    VideoScores,
-    ViewResult,
-    masks_of_parts,
-    still_mask,
-    summary_of,
-    tells_exposure,
-    view_scores,
-)
 from p2gs_jax.photometry import display
 from p2gs_jax.photometry.formation import exposed_at
 from p2gs_jax.photometry.metering import BELOW_WHITE, Metering, Readings, fit_metering, meter
@@ -97,8 +89,8 @@ class Judge:
 
     def scorer(self, index: int, photograph, mask) -> Callable[[np.ndarray], dict[str, Any]]:
         """Return a function from display images of a view to scores, of a drive also by part."""
-        parts = masks_of_parts(self.scene, index, mask)
-        return lambda ldr: view_scores(self.lpips_weights, ldr, photograph, mask, parts)
+        parts = scoring.masks_of_parts(self.scene, index, mask)
+        return lambda ldr: scoring.view_scores(self.lpips_weights, ldr, photograph, mask, parts)
 
 
 def evaluate(
@@ -111,7 +103,7 @@ def evaluate(
     reference: Reference | None = None,
     radiance: Truth | None = None,
     lpips_weights: LpipsWeights | None = None,
-    on_view: Callable[[ViewResult], None] = lambda result: None,
+    on_view: Callable[[scoring.ViewResult], None] = lambda result: None,
     on_progress: Callable[[int, int], None] = lambda done, count: None,
 ) -> Evaluation:
     """Render and judge all views.
@@ -143,7 +135,7 @@ def evaluate(
 class _Judged(NamedTuple):
     """A view with its scores, and what of it tells with all others how to compare them."""
 
-    result: ViewResult
+    result: scoring.ViewResult
     averaged: Float32[np.ndarray, "h w 3"]  # display values with the mean parameters
     mask: Float32[np.ndarray, "h w"]
     scores: dict[str, Any]  # of `result.ldr`
@@ -172,7 +164,7 @@ def _judged(
     elif not mask.any():
         transform = usual
     else:
-        still = still_mask(scene, index, mask)
+        still = scoring.still_mask(scene, index, mask)
         transform = with_fitted_exposure(usual, linear, photograph, still, alpha)
         extra = {"exposure": transform.exposure}
         everything = _all_fitted(linear, photograph, still, transform, score, alpha)
@@ -187,7 +179,7 @@ def _judged(
     if truth is not None:
         sample = sampled(linear, truth, mask > 0.5, len(scene.views))
     return _Judged(
-        ViewResult(index, linear, alpha, depth, ldr, photograph, transform),
+        scoring.ViewResult(index, linear, alpha, depth, ldr, photograph, transform),
         averaged,
         mask,
         {**score(ldr), **extra},
@@ -229,7 +221,9 @@ class _Views:
         self._judge = judge
         self._depths = DepthScores(judge.scene, judge.store)
         self._rows: dict[str, dict[str, dict]] = defaultdict(dict)
-        self._videos = {name: VideoScores() for name in ("per_view", "averaged", "photographs")}
+        self._videos = {
+            name: scoring.VideoScores() for name in ("per_view", "averaged", "photographs")
+        }
         # Names of views without scores, and of photographs that tell no exposure.
         self._untold: dict[str, list[str]] = {"hidden": [], "exposures_unknown": []}
         # What meters read in training views, by name; their rows; and in held-out views, by row.
@@ -243,7 +237,7 @@ class _Views:
         """Take a view."""
         result, judge = found.result, self._judge
         view, index = judge.scene.views[result.index], result.index
-        tells = tells_exposure(result.photograph, found.mask, judge.cfg.loss)
+        tells = scoring.tells_exposure(result.photograph, found.mask, judge.cfg.loss)
         if not tells:
             self._untold["hidden" if tells is None else "exposures_unknown"].append(view.name)
         if tells is None:
@@ -273,19 +267,19 @@ class _Views:
         """Return all scores; what all views decide is scored in a second pass over some."""
         judge, rows = self._judge, self._rows
         exposures = np.asarray(judge.small.photometry.exposures)
-        train, tone = summary_of(rows["train"]), judge.cfg.photometry
+        train, tone = scoring.summary_of(rows["train"]), judge.cfg.photometry
         per_view = train.pop("per_view", {})
         metrics: dict[str, Any] = {
-            "train": {**train, "averaged": summary_of(rows["train averaged"])},
+            "train": {**train, "averaged": scoring.summary_of(rows["train averaged"])},
             "test": {
-                "averaged": summary_of(rows["test averaged"]),
-                "exposure_fitted": summary_of(rows["test"]),
+                "averaged": scoring.summary_of(rows["test averaged"]),
+                "exposure_fitted": scoring.summary_of(rows["test"]),
             },
             **{key: names for key, names in self._untold.items() if names},
         }
         metrics["train"]["per_view"] = per_view
         if rows["all"]:
-            metrics["test"]["photometry_fitted"] = summary_of(rows["all"])
+            metrics["test"]["photometry_fitted"] = scoring.summary_of(rows["all"])
         logs, gamma = np.log(np.asarray(exposures, float)), judge.mean.gamma
         names, readings = list(self._readings), list(self._readings.values())
         metering = fit_metering(
@@ -344,14 +338,16 @@ class _Views:
                 rows[name][judge.scene.views[index].name] = row
         splits = {view.name: view.split for view in judge.scene.views}
         if rows["metered"]:
-            metrics["test"]["metered"] = summary_of(rows["metered"])
+            metrics["test"]["metered"] = scoring.summary_of(rows["metered"])
         if aligned is not None:
             metrics["radiance"] = aligned.summary(rows["radiance"], splits)
         if common:
             metrics["reference"] = {
-                name: {**summary_of(rows[name]), "exposure": exposure}
+                name: {**scoring.summary_of(rows[name]), "exposure": exposure}
                 | {
-                    part: summary_of({n: row for n, row in rows[name].items() if splits[n] == part})
+                    part: scoring.summary_of(
+                        {n: row for n, row in rows[name].items() if splits[n] == part}
+                    )
                     for part in ("train", "test")
                 }
                 for name, exposure in common.items()
@@ -370,7 +366,7 @@ def _against_reference(
     truth, usual = judge.reference(index), judge.usual(None)
     shown = {name: replace(usual, exposure=exposure) for name, exposure in exposures.items()}
     return {
-        name: view_scores(
+        name: scoring.view_scores(
             judge.lpips_weights, display.develop(linear, how, alpha=alpha), truth, mask
         )
         for name, how in shown.items()

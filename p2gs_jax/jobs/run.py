@@ -8,17 +8,8 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from pathlib import Path
 
+from p2gs_jax.jobs import job as records
 from p2gs_jax.jobs.engines import is_lost
-from p2gs_jax.jobs.job import (
-    REASON,
-    Job,
-    JobFiles,
-    JobState,
-    Status,
-    read_progress,
-    write_job,
-    write_reason,
-)
 from p2gs_jax.jobs.worker import run_in_process
 
 # A job whose worker was lost so many times is not begun again.
@@ -26,18 +17,18 @@ MOST_BEGUN = 3
 # Seconds between looks at the progress of all.
 LOOK_S = 0.5
 # Runs the job of a file: how it ended, and why it failed.
-Runner = Callable[[str], tuple[Status, str | None]]
+Runner = Callable[[str], tuple[records.Status, str | None]]
 
 
 def run_jobs(
-    jobs: Sequence[Job],
+    jobs: Sequence[records.Job],
     engine: Executor,
     folder: Path,
     *,
-    on_end: Callable[[int, JobState], None] = lambda number, state: None,
-    on_look: Callable[[Sequence[JobState]], None] = lambda states: None,
+    on_end: Callable[[int, records.JobState], None] = lambda number, state: None,
+    on_look: Callable[[Sequence[records.JobState]], None] = lambda states: None,
     run: Runner = run_in_process,
-) -> list[JobState]:
+) -> list[records.JobState]:
     """Run jobs of different names; one that fails leaves its reason and ends nothing else.
 
     The folder is for job files, progress and output; all machines see it. `run` is what the engine
@@ -50,9 +41,9 @@ def run_jobs(
     """
     folder = folder.absolute()
     folder.mkdir(parents=True, exist_ok=True)
-    stop = JobFiles(folder / "any").stop
+    stop = records.JobFiles(folder / "any").stop
     stop.unlink(missing_ok=True)
-    watched = [_Watched(job, write_job(folder, job), run) for job in jobs]
+    watched = [_Watched(job, records.write_job(folder, job), run) for job in jobs]
 
     def pending() -> dict[Future, int]:
         return {one.future: n for n, one in enumerate(watched) if one.future is not None}
@@ -92,9 +83,9 @@ def run_jobs(
 class _Watched:
     """A job that was handed to an engine."""
 
-    def __init__(self, job: Job, files: JobFiles, run: Runner):
+    def __init__(self, job: records.Job, files: records.JobFiles, run: Runner):
         self.job, self.files, self.run = job, files, run
-        self.state = JobState(job.name)
+        self.state = records.JobState(job.name)
         self.future: Future | None = None  # None before, and once its end was told
         self._since: float | None = None
 
@@ -128,14 +119,14 @@ class _Watched:
         elif state.status == "lost":
             state.status = "failed"
             state.reason = f"its worker was lost {state.begun} times, at last: {state.reason}"
-        if state.status == "failed" and not (self.job.folder / REASON).exists():
-            write_reason(self.job.folder, state.reason)
+        if state.status == "failed" and not (self.job.folder / records.REASON).exists():
+            records.write_reason(self.job.folder, state.reason)
         return True
 
     def look(self) -> None:
         """Read how far the job is."""
         state = self.state
-        found = read_progress(self.files.progress)
+        found = records.read_progress(self.files.progress)
         if state.status in ("waiting", "running") and found is not None:
             state.status, state.doing, state.progress = "running", found["doing"], found["progress"]
             self._since = self._since or time.monotonic()

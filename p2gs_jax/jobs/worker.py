@@ -19,15 +19,7 @@ from p2gs_jax.core import interrupts
 from p2gs_jax.core.memory import ran_out
 from p2gs_jax.core.processes import environment
 from p2gs_jax.errors import UserError
-from p2gs_jax.jobs.job import (
-    REASON,
-    JobFiles,
-    ProgressFile,
-    Status,
-    read_job,
-    read_reason,
-    write_reason,
-)
+from p2gs_jax.jobs import job as records
 
 # Seconds between looks at the file that asks for the end.
 LOOK_S = 0.2
@@ -36,16 +28,16 @@ LESS = "let fewer run at a time, or lower --gaussians or --max-width"
 ASKED = tuple(interrupts.exit_code(interrupts.Interrupted(n)) for n in interrupts.SIGNALS)
 
 
-def run_in_process(job_path: str) -> tuple[Status, str | None]:
+def run_in_process(job_path: str) -> tuple[records.Status, str | None]:
     """Run the job of a file in a process and wait for it: what engines call.
 
     Returns how it ended, and why it failed; `lost` where a signal from elsewhere ended its process.
     """
-    files = JobFiles(Path(job_path))
-    folder = read_job(files.path).folder
+    files = records.JobFiles(Path(job_path))
+    folder = records.read_job(files.path).folder
     if files.stop.exists():
         return "stopped", None
-    (folder / REASON).unlink(missing_ok=True)  # of an earlier try
+    (folder / records.REASON).unlink(missing_ok=True)  # of an earlier try
     files.progress.unlink(missing_ok=True)
     with files.output.open("wb") as output:
         process = subprocess.Popen(
@@ -60,8 +52,8 @@ def run_in_process(job_path: str) -> tuple[Status, str | None]:
         stopped = _wait(process, files.stop)
     if process.returncode == 0:
         return "done", None
-    if (folder / REASON).exists():
-        return "failed", read_reason(folder)
+    if (folder / records.REASON).exists():
+        return "failed", records.read_reason(folder)
     if stopped:
         return "stopped", None
     reason, code = _why(process.returncode, files.output), process.returncode
@@ -69,7 +61,7 @@ def run_in_process(job_path: str) -> tuple[Status, str | None]:
     # its memory ran out, it would again.
     if code in ASKED or (code < 0 and code != -signal.SIGKILL):
         return "lost", reason
-    write_reason(folder, reason)
+    records.write_reason(folder, reason)
     return "failed", reason
 
 
@@ -104,8 +96,8 @@ def main(job_path: Path) -> int:
     A failure leaves its reason in the job's folder; a signal that asks for the end does not.
     """
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    job = read_job(job_path)
-    progress = ProgressFile(JobFiles(job_path).progress)
+    job = records.read_job(job_path)
+    progress = records.ProgressFile(records.JobFiles(job_path).progress)
     progress.stage("Starting")
     try:
         with interrupts.raised():
@@ -113,13 +105,13 @@ def main(job_path: Path) -> int:
     except KeyboardInterrupt as error:
         return interrupts.exit_code(error)
     except UserError as error:
-        write_reason(job.folder, str(error))
+        records.write_reason(job.folder, str(error))
         return 2
     except Exception as error:
         reason = f"{type(error).__name__}: {error}"
         reason += f"; memory ran out: {LESS}" if ran_out(error) else ""
         text = "".join(traceback.format_exception(error))
-        write_reason(job.folder, reason, traceback=text)
+        records.write_reason(job.folder, reason, traceback=text)
         return 1
     return 0
 

@@ -15,17 +15,11 @@ from p2gs_jax.core.numerics import on_device
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.core.runtime import return_freed_memory
 from p2gs_jax.core.streams import Stream
+from p2gs_jax.gaussians import seeds as seeding
 from p2gs_jax.gaussians.dense import DenseSeeds, dense_limit, dense_seeds, gaussians_of
 from p2gs_jax.gaussians.matching import Tones, rough_tones
 from p2gs_jax.gaussians.moving import Nodes, node_gaussians, nodes_radiance, with_vibration
 from p2gs_jax.gaussians.population import Coverage
-from p2gs_jax.gaussians.seeds import (
-    gaussians_from_points,
-    merge,
-    photographed_radiance,
-    subsample,
-    with_colors,
-)
 from p2gs_jax.gaussians.shell import Shell, find_shell, shell_gaussians
 from p2gs_jax.photometry.calibrate import Selection
 from p2gs_jax.photometry.parameters import initial_appearance, initial_photometry, point_radiance
@@ -64,11 +58,11 @@ def expected(found: Survey, decisions: Decisions) -> Prepared:
     """Return what a fit will start from in its shapes: black Gaussians, exposures of 1."""
     scene, cfg, views = found.scene, found.cfg, found.scene.training_views
     points = scene.points[found.seeds]
-    black = gaussians_from_points(points, np.zeros_like(points), views, cfg)
+    black = seeding.gaussians_from_points(points, np.zeros_like(points), views, cfg)
     if found.shell is not None:
         far, scales = found.shell.points, found.shell.scales
-        shell = gaussians_from_points(far, np.zeros_like(far), views, cfg, scales=scales)
-        black = merge(black, shell)
+        shell = seeding.gaussians_from_points(far, np.zeros_like(far), views, cfg, scales=scales)
+        black = seeding.merge(black, shell)
     if found.vibrating:
         black = with_vibration(black, scene, cfg)
     owner = None
@@ -96,7 +90,9 @@ def initialise(found: Survey, exposures: Exposures, reporter: Reporter | None = 
         covering = np.concatenate([scene.points, added.points])
         shell = find_shell(views, covering, found.radius, found.init, found.sphere)
     if scene.point_colors is None:
-        scene = with_colors(scene, photographed_radiance(scene, found.still, photometry, cfg))
+        scene = seeding.with_colors(
+            scene, seeding.photographed_radiance(scene, found.still, photometry, cfg)
+        )
     radiance = exposures.radiance
     if radiance is None:
         solution = None if exposures.selection is None else exposures.selection.solution
@@ -105,7 +101,7 @@ def initialise(found: Survey, exposures: Exposures, reporter: Reporter | None = 
     gaussians = gaussians_of(scene.points[seeds], radiance[seeds], added, views, cfg)
     if shell is not None:
         far = shell_gaussians(shell, scene, found.still, photometry, views, cfg)
-        gaussians = merge(gaussians, far)
+        gaussians = seeding.merge(gaussians, far)
     if found.vibrating:
         gaussians = with_vibration(gaussians, scene, cfg)
     if nodes is not None:
@@ -178,7 +174,7 @@ def _with_nodes(
         return gaussians, None
     world = np.full(gaussians.capacity, -1, np.int32)
     owner = np.concatenate([world, nodes.owner])
-    return merge(gaussians, node_gaussians(nodes, radiance, views, cfg)), owner
+    return seeding.merge(gaussians, node_gaussians(nodes, radiance, views, cfg)), owner
 
 
 def _bounded(
@@ -188,7 +184,7 @@ def _bounded(
     bound = cfg.densify.max_gaussians
     if bound is None or gaussians.capacity <= bound:
         return gaussians, owner, []
-    kept = subsample(gaussians.capacity, bound, cfg.train.seed, Stream.SEED_GAUSSIANS)
+    kept = seeding.subsample(gaussians.capacity, bound, cfg.train.seed, Stream.SEED_GAUSSIANS)
     note = f"{gaussians.capacity} Gaussians were thinned to {bound} (--gaussians)."
     gaussians = jax.tree.map(lambda a: on_device(np.asarray(a)[kept]), gaussians)
     return gaussians, None if owner is None else owner[kept], [note]

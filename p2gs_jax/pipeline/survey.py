@@ -17,17 +17,10 @@ from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.core.text import first_few
 from p2gs_jax.errors import UserError
+from p2gs_jax.gaussians import seeds as seeding
 from p2gs_jax.gaussians.dense import coverage_of, wants_dense
 from p2gs_jax.gaussians.moving import Nodes, clock_of, find_nodes, vibrates
 from p2gs_jax.gaussians.population import Coverage
-from p2gs_jax.gaussians.seeds import (
-    FARTHER,
-    camera_centers,
-    cameras_radius,
-    misplaced,
-    subsample,
-    within_reach,
-)
 from p2gs_jax.gaussians.shell import Shell, Sphere, find_shell
 from p2gs_jax.pipeline.preflight import memory_needed, require_memory
 from p2gs_jax.render.warp import project_points
@@ -113,7 +106,7 @@ def survey(
     Raises:
         UserError: there is not the memory for a fit, nothing to see, or two backgrounds.
     """
-    scene, far_notes = within_reach(scene)
+    scene, far_notes = seeding.within_reach(scene)
     nodes, vibrating = find_nodes(scene, cfg.dynamics), vibrates(scene, cfg)
     moving = clock_of(scene) if vibrating else None if nodes is None else nodes.moving
     store = ImageStore(scene.views, cfg.data, moving=moving, folder=pixels)
@@ -124,7 +117,7 @@ def survey(
         left = () if nodes is None else nodes.left
         fitted = store.leaving_out(left, cfg.dynamics.margin)
     _require_something_to_see(scene, fitted)
-    radius = cameras_radius(scene.training_views, scene.points)
+    radius = seeding.cameras_radius(scene.training_views, scene.points)
     depths = seen_depths(scene.points, scene.training_views)
     near = near_plane(near_depth(depths), cfg)
     coverage = coverage_of(scene, store)
@@ -182,7 +175,7 @@ def _choose_points(scene: Scene, cfg: FitConfig) -> tuple[np.ndarray, list[str]]
     bound, most, option = cfg.densify.max_gaussians, cfg.init.max_seeds, "--init.max-seeds"
     if bound is not None and bound <= most:
         most, option = bound, "--gaussians"
-    keep = subsample(len(scene.points), most, cfg.train.seed)
+    keep = seeding.subsample(len(scene.points), most, cfg.train.seed)
     if len(keep) == len(scene.points):
         return keep, []
     return keep, [f"{len(scene.points)} seed points were thinned to {len(keep)} ({option})."]
@@ -225,15 +218,15 @@ def scale_notes(scene: Scene, near: float | None, cfg: FitConfig, depth: float |
             f"The near plane is {near:g} scene units instead of {cfg.render.near:g}, which would "
             "cut off what the photographs show."
         )
-    views, wrong = scene.training_views, misplaced(scene.training_views, scene.points)
+    views, wrong = scene.training_views, seeding.misplaced(scene.training_views, scene.points)
     if wrong.any():
         names = first_few([view.name for view, apart in zip(views, wrong, strict=True) if apart])
         out.append(
-            f"{wrong.sum()} of {len(views)} cameras stand {FARTHER:g} times as far away as all "
-            f"others, or farther ({names}): their poses are probably wrong, and do not count for "
+            f"{wrong.sum()} of {len(views)} cameras stand {seeding.FARTHER:g} times as far away as "
+            f"all others, or farther ({names}): their poses are probably wrong, and do not count for "
             "the size of the scene. Take these photographs out of it."
         )
-    away = float(np.abs(camera_centers(views)[~wrong]).max())
+    away = float(np.abs(seeding.camera_centers(views)[~wrong]).max())
     step = away * float(np.finfo(np.float32).eps)
     if depth is not None and step > COARSE * depth:
         out.append(

@@ -24,17 +24,9 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.streams import noise_key
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.mcmc import shaped_noise
+from p2gs_jax.render import visible as visibility
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.render.harmonics import coefficient_count
-from p2gs_jax.render.visible import (
-    block_size,
-    compact,
-    owners_at,
-    slice_of,
-    splat,
-    take_rows,
-    whole_blocks,
-)
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.train import image_gradient
 from p2gs_jax.train.image_gradient import ImageGradient, Listed, differentiable
@@ -181,7 +173,7 @@ def _advance(
     fits = ~gradient.overflow & (most <= ids.shape[1])
     healthy = is_healthy(state, gradient, fits)
     sums = _sums(state, ids, visible, gradient, frusta, controls, cfg, bands)
-    seen, count = compact((sums.shown > 0) & alive, whole_blocks(n))
+    seen, count = visibility.compact((sums.shown > 0) & alive, visibility.whole_blocks(n))
     progress, rate = controls.progress, controls.rate
     rates = learning_rates(progress, rate, extent, state.params, cfg, bands)
     rates = jax.tree.map(lambda r: r * views**0.5, rates)
@@ -204,7 +196,7 @@ def _advance(
         bands=bands,
         # Their gradient is known: a Gaussian is what it is made of.
         seen=lambda block, on, owner: block,
-        v_seen=jax.tree.map(lambda g: g / views, take_rows(sums.gradient, seen, bands)),
+        v_seen=jax.tree.map(lambda g: g / views, visibility.take_rows(sums.gradient, seen, bands)),
         adam=optimizer.gaussians,
         rates=rates.gaussians,
         noise=None if noise is None else exploring,
@@ -228,23 +220,25 @@ def _sums(state, ids, visible, gradient, frusta, controls, cfg, bands: int) -> S
 
     def add(sums: Sums, view) -> tuple[Sums, None]:
         here, count, v_view, image, frustum = view
-        size = block_size(here.shape[0])
+        size = visibility.block_size(here.shape[0])
 
         def body(k, sums: Sums) -> Sums:
-            rows = slice_of(here, k, size)
+            rows = visibility.slice_of(here, k, size)
             on = alive.at[rows].get(mode="fill", fill_value=False)
-            mine = owners_at(owner, rows)
+            mine = visibility.owners_at(owner, rows)
 
             def seen(block):
                 degree = controls.active_degree
-                return differentiable(splat(block, on, frustum, cfg.render, degree, mine))
+                return differentiable(
+                    visibility.splat(block, on, frustum, cfg.render, degree, mine)
+                )
 
-            _, pull = jax.vjp(seen, take_rows(gaussians, rows, bands))
-            v_block = slice_of(v_view, k, size)
+            _, pull = jax.vjp(seen, visibility.take_rows(gaussians, rows, bands))
+            v_block = visibility.slice_of(v_view, k, size)
             (v_rows,) = pull(v_block)
             half = jnp.stack([frustum.width / 2, frustum.height / 2])
             on_screen = v_block[0] * half
-            pulled = slice_of(image, k, size) & (jnp.sum(jnp.abs(on_screen), -1) > 0)
+            pulled = visibility.slice_of(image, k, size) & (jnp.sum(jnp.abs(on_screen), -1) > 0)
             added = Sums(
                 v_rows,
                 jnp.ones(size, jnp.int32),

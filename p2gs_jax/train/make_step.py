@@ -21,19 +21,12 @@ from p2gs_jax.errors import DivergenceError
 from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.photometry.appearance import Formation
 from p2gs_jax.render.capacity import Room
+from p2gs_jax.train import state as states
 from p2gs_jax.train import strategies
 from p2gs_jax.train.exposure_loss import Partner
 from p2gs_jax.train.inputs import controls_at
 from p2gs_jax.train.optimizer import make_optimizer
 from p2gs_jax.train.room import room_for
-from p2gs_jax.train.state import (
-    FAULT_NONFINITE,
-    FAULT_OVERFLOW,
-    FitState,
-    HostState,
-    healed,
-    initial_state,
-)
 from p2gs_jax.train.step import Step
 from p2gs_jax.train.strategies import Strategy
 from p2gs_jax.train.terms import LossTerm
@@ -74,26 +67,26 @@ class TrainingStep:
         self.optimizer = make_optimizer(cfg)
         noise = getattr(self.strategy, "noise", None)
         self._step = Step(cfg, self.optimizer, extent, noise, own.terms or {})
-        self._host = HostState(pace=1.0 / max(cfg.train.steps, 1))
+        self._host = states.HostState(pace=1.0 / max(cfg.train.steps, 1))
         self._rooms: dict[tuple[int, int], Room] = {}
 
-    def start(self, gaussians: Gaussians, photometry: Photometry) -> FitState:
+    def start(self, gaussians: Gaussians, photometry: Photometry) -> states.FitState:
         """Return the state before the first step; the Gaussians are the seeds."""
         self._slots = strategies.started(self.strategy, gaussians.capacity)
         params = self.own.among(Params(gaussians, photometry))
         alive = jnp.ones(gaussians.capacity, bool)
-        return initial_state(params, alive, self.optimizer, self._slots.slots)
+        return states.initial_state(params, alive, self.optimizer, self._slots.slots)
 
     def __call__(
         self,
-        state: FitState,
+        state: states.FitState,
         camera: Camera,
         photograph: Float[Array, "h w 3"] | UInt[Array, "h w 3"],
         view: int = 0,
         *,
         mask: Bool[Array, "h w"] | None = None,
         progress: float = 0.0,
-    ) -> tuple[FitState, StepReport]:
+    ) -> tuple[states.FitState, StepReport]:
         """Return the state after a step of one view, and its report; the state is donated.
 
         Args:
@@ -126,19 +119,19 @@ class TrainingStep:
                 degree=cfg.render.sh_degree,
             )
             kind = int(state.fault.kind)
-            if kind == FAULT_NONFINITE:
+            if kind == states.FAULT_NONFINITE:
                 name = finite_names(report.terms, state.params)[int(state.fault.term)]
                 raise DivergenceError(
                     f"Step {int(state.step) + 1}: the {name} is not finite.",
                     fix="lower the learning rates (optimizer.*)",
                 )
-            if kind != FAULT_OVERFLOW:
+            if kind != states.FAULT_OVERFLOW:
                 return state, report
             needed = int(state.fault.needed), int(state.fault.visible)
             self._rooms[size] = self._rooms[size].grown(*needed)
-            state = healed(state)
+            state = states.healed(state)
 
-    def densify(self, state: FitState, progress: float) -> FitState:
+    def densify(self, state: states.FitState, progress: float) -> states.FitState:
         """Return the state with the population that the strategy gives; the state is donated."""
         if self.strategy is None:
             return state

@@ -25,15 +25,8 @@ from p2gs_jax.core.streams import noise_key
 from p2gs_jax.gaussians.mcmc import exploration_noise
 from p2gs_jax.render.harmonics import coefficient_count
 from p2gs_jax.render.visible import block_size, owners_at, put_rows, slice_of, splat, take_rows
+from p2gs_jax.train import optimizer as optimizers
 from p2gs_jax.train.image_gradient import ImageGradient, differentiable
-from p2gs_jax.train.optimizer import (
-    Adam,
-    AdamState,
-    Optimizer,
-    OptState,
-    learning_rates,
-    means_rate,
-)
 from p2gs_jax.train.state import FAULT_NONE, FAULT_NONFINITE, FAULT_OVERFLOW, Fault, FitState
 from p2gs_jax.types import Array, Frustum, Gaussians, Params, Photometry, Population, Vibration
 
@@ -67,7 +60,7 @@ class Updated(NamedTuple):
     """
 
     gaussians: Gaussians
-    moments: AdamState
+    moments: optimizers.AdamState
     finite: Bool[Array, " f"]
 
 
@@ -97,7 +90,7 @@ def advance(
     controls: Controls,
     *,
     cfg: FitConfig,
-    optimizer: Optimizer,
+    optimizer: optimizers.Optimizer,
     extent: float,
     noise: float | None,
     degree: int,
@@ -114,9 +107,9 @@ def advance(
     fits = ~gradient.overflow & (count <= ids.shape[0])
     healthy = is_healthy(state, gradient, fits)
     progress, rate = controls.progress, controls.rate
-    rates = learning_rates(progress, rate, extent, state.params, cfg, bands)
+    rates = optimizers.learning_rates(progress, rate, extent, state.params, cfg, bands)
     key = noise_key(controls.seed, state.step)
-    noise_rate = (noise or 0.0) * means_rate(progress, rate, extent, cfg)
+    noise_rate = (noise or 0.0) * optimizers.means_rate(progress, rate, extent, cfg)
 
     def exploring(block, _, moved, on):
         return exploration_noise(jax.random.fold_in(key, block), moved, on, noise_rate)
@@ -147,7 +140,7 @@ def advance(
 
 def update_listed(
     gaussians: Gaussians,
-    moments: AdamState,
+    moments: optimizers.AdamState,
     alive: Bool[Array, " n"],
     ids: Int[Array, " v"],
     count: Int[Array, ""],
@@ -156,7 +149,7 @@ def update_listed(
     bands: int,
     seen: Callable[[Gaussians, Bool[Array, " b"], Any], Any],
     v_seen: Any,
-    adam: Adam,
+    adam: optimizers.Adam,
     rates: Gaussians,
     noise: Callable[..., Float[Array, "b 3"]] | None,
     owner: Int[Array, " n"] | None = None,
@@ -181,7 +174,7 @@ def update_listed(
         _, pull = jax.vjp(lambda block: seen(block, shown, mine), old)
         (grads,) = pull(slice_of(v_seen, k, size))
         finite = jnp.stack([jnp.all(jnp.isfinite(g)) for g in jax.tree.leaves(grads)])
-        before = AdamState(
+        before = optimizers.AdamState(
             state.moments.counts.at[here].get(mode="clip"),
             take_rows(state.moments.mu, here, bands),
             take_rows(state.moments.nu, here, bands),
@@ -192,7 +185,7 @@ def update_listed(
         where = jnp.where(healthy & jnp.all(finite), here, n)
         return Updated(
             put_rows(state.gaussians, where, moved),
-            AdamState(
+            optimizers.AdamState(
                 state.moments.counts.at[where].set(new.counts, mode="drop", unique_indices=True),
                 put_rows(state.moments.mu, where, new.mu),
                 put_rows(state.moments.nu, where, new.nu),
@@ -219,7 +212,7 @@ def concluded(
     rates: Params,
     *,
     cfg: FitConfig,
-    optimizer: Optimizer,
+    optimizer: optimizers.Optimizer,
     views: int = 1,
 ) -> tuple[FitState, StepReport]:
     """Move the rest, and return the state after a step with what became of it.
@@ -257,7 +250,7 @@ def concluded(
     )
     state = FitState(
         Params(updated.gaussians, photometry, appearance),
-        OptState(updated.moments, rest_moments),
+        optimizers.OptState(updated.moments, rest_moments),
         population,
         state.step + views * (fault.kind == FAULT_NONE),
         fault,
