@@ -223,8 +223,8 @@ def scale_notes(scene: Scene, near: float | None, cfg: FitConfig, depth: float |
         names = first_few([view.name for view, apart in zip(views, wrong, strict=True) if apart])
         out.append(
             f"{wrong.sum()} of {len(views)} cameras stand {seeding.FARTHER:g} times as far away as "
-            f"all others, or farther ({names}): their poses are probably wrong, and do not count for "
-            "the size of the scene. Take these photographs out of it."
+            f"all others, or farther ({names}): their poses are probably wrong, and do not count "
+            "for the size of the scene. Take these photographs out of it."
         )
     away = float(np.abs(seeding.camera_centers(views)[~wrong]).max())
     step = away * float(np.finfo(np.float32).eps)
