@@ -196,16 +196,6 @@ def test_what_cannot_be_drawn_is_said(open_page):
     page.expect("cannot render light")
 
 
-@pytest.mark.parametrize(("ratio", "pixels"), [(1.5, 1.5), (3, 2)])
-def test_nobody_sees_more_than_two_pixels_in_one(open_page, ratio, pixels):
-    page = open_page(ratio=ratio)
-    page.canvas()
-    assert page("[p.renderer.picture.width, p.renderer.picture.height]") == [
-        800 * pixels,
-        600 * pixels,
-    ]
-
-
 def test_clicking_a_camera_goes_there_and_takes_its_exposure(open_page):
     page = open_page()
     page("(p.hands.approach(0.4), p.marksShown = true, p.show())")

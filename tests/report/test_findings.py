@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from page_tools import pictures
 from scene.helpers import make_view
 
 from p2gs_jax.config import DataConfig, FitConfig, RenderConfig
@@ -22,7 +21,6 @@ from p2gs_jax.report import findings
 from p2gs_jax.report.charts import SOURCES, VARIABLES, Series, panels_chart
 from p2gs_jax.report.measurements import measure_scene
 from p2gs_jax.report.photometry_sections import exposure_section
-from p2gs_jax.report.pictures import GAIN, jpeg, signed_difference
 from p2gs_jax.report.run_files import RunFiles, read_run
 from p2gs_jax.report.run_sections import depth_section, parts_section
 from p2gs_jax.run.decisions import Decisions
@@ -135,19 +133,6 @@ def test_a_sentence_says_what_was_modelled(run):
     run.photometry["model"] = "constant"
     run.options["preset"] = "3dgs"
     assert "models no camera" in findings.modelled(run)
-
-
-def grey(values):
-    return np.repeat(np.asarray(values, np.float32)[..., None], 3, -1)
-
-
-def test_pictures_are_differences_in_grey_and_shrunk():
-    shown = signed_difference(grey([[0.5, 0.6, 0.4, 0.5 + 1 / GAIN]]), grey([[0.5] * 4]))
-    np.testing.assert_allclose(shown[0, :, 0], [0.5, 0.7, 0.3, 1.0], atol=1e-5)
-    shown = pictures(jpeg(np.full((40, 1200, 3), np.nan, np.float32), "a", longest=600))["a"]
-    assert shown.shape == (20, 600, 3)
-    assert shown.max() == 0
-    assert 'alt="&quot;&lt;&amp;"' in jpeg(grey([[0.0]]), '"<&')
 
 
 def test_charts_are_in_the_page_s_colours_and_missing_values_break_a_line():

@@ -2,7 +2,6 @@
 
 import dataclasses
 import struct
-import tracemalloc
 import zlib
 
 import cv2
@@ -135,14 +134,6 @@ def test_how_a_photograph_was_taken(tmp_path):
     assert shot == ExifSettings(pytest.approx(0.01), 2.0, 400.0, taken)
     for tags in ({TAKEN: "    :  :     :  :  "}, {ISO: 65535, TAKEN: "yesterday"}):
         assert read_exif_settings(jpeg_with_exif(path, tags)) == ExifSettings()
-    data = bytearray(jpeg_with_exif(path, FULL).read_bytes())
-    at = data.find(b"Exif") + 6
-    for _ in range(50):
-        broken = data.copy()
-        for i in RNG.integers(at, at + 60, 8):
-            broken[i] = RNG.integers(256)
-        path.write_bytes(broken)
-        exif_evs([path])
     path.write_bytes(b"nothing")
     assert exif_evs([path, tmp_path / "absent.jpg"]) == [None, None]
 
@@ -233,40 +224,21 @@ def test_colours_that_are_none(text):
         background_color(DataConfig(background=text))
 
 
-SIDE = 20_000
-HUGE = r".png has more than 179 million pixels"
-
-
-@pytest.fixture(scope="module")
-def bomb() -> bytes:
-    """Return a black picture of one bit a pixel: 50 KB."""
-
-    def chunk(kind, data):
-        crc = zlib.crc32(kind + data)
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", crc)
-
-    header = struct.pack(">IIBBBBB", SIDE, SIDE, 1, 0, 0, 0, 0)
-    data = zlib.compress(bytes(SIDE * (1 + SIDE // 8)), 1)
-    parts = chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
-    return b"\x89PNG\r\n\x1a\n" + parts
-
-
-def test_what_is_too_large_is_refused_by_its_header(tmp_path, bomb):
+def test_what_is_too_large_is_refused_by_its_header(tmp_path):
     write_tiny_model(tmp_path)
+    bomb = bytearray((tmp_path / "images" / "im 1.png").read_bytes())
+    bomb[16:24] = struct.pack(">II", 20_000, 20_000)
+    bomb[29:33] = struct.pack(">I", zlib.crc32(bomb[12:29]))
+    huge = r"im 1.png has more than 179 million pixels"
     (tmp_path / "masks").mkdir()
     (tmp_path / "masks" / "im 1.png").write_bytes(bomb)
-    with refused(f"im 1{HUGE}"):
+    with refused(huge):
         store_of(tmp_path).get(1)
     (tmp_path / "images" / "im 1.png").write_bytes(bomb)
-    tracemalloc.start()
-    try:
-        # Photographs alone are looked at before their features are.
-        for root in (tmp_path, tmp_path / "images"):
-            with refused(f"im 1{HUGE}"):
-                load_scene(root, CFG)
-        assert tracemalloc.get_traced_memory()[1] < SIDE * SIDE / 4
-    finally:
-        tracemalloc.stop()
+    # Photographs alone are looked at before their features are.
+    for root in (tmp_path, tmp_path / "images"):
+        with refused(huge):
+            load_scene(root, CFG)
     with refused("cannot decode"):
         image_size(tmp_path / "images")
 
@@ -342,16 +314,6 @@ def test_masks_that_are_of_nothing_are_named_and_a_mask_may_be_a_photograph(tmp_
     # Nothing there is called as this would be without the word.
     write_image(tmp_path / "images" / "venetian_mask.png")
     assert len(list_images(tmp_path / "images")) == 3
-
-
-def test_the_alpha_of_a_mask_counts(tmp_path):
-    write_tiny_model(tmp_path)
-    for value in (0, 90):
-        write_rgba(tmp_path / "masks" / "im 0.png", value)
-        valid = ImageStore(load_scene(tmp_path, ALL).views, ALL).get(0)[1]
-        inside = np.zeros((30, 40))
-        inside[7:-7, 10:-10] = 1
-        np.testing.assert_array_equal(valid, inside)
 
 
 def test_alpha_says_something_where_it_varies(tmp_path):

@@ -10,7 +10,7 @@ from scene.helpers import make_view
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene import ImageStore
-from p2gs_jax.scene.drives.objects import MovingObjects, object_mask
+from p2gs_jax.scene.drives.objects import object_mask
 from p2gs_jax.types import TrackedObject
 
 SIZE, WHOLE = (4.0, 2.0, 1.5), (160, 96)
@@ -89,15 +89,3 @@ def test_stores_share_photographs_and_leave_out_boxes(tmp_path):
     for store in (without, ImageStore([view], DataConfig(), [box])):
         np.testing.assert_array_equal(store.get(0)[1], ~mask)
         np.testing.assert_array_equal(store.stored(0)[1], ~mask)
-
-
-def test_cameras_of_a_store_know_where_objects_are(tmp_path):
-    views = [view_at(tmp_path, 0.5), view_at(tmp_path, None, "b.png")]
-    box = thing((-2, 0, 8.0), step=(4.0, 0, 0), times=(0.0, 0.5))
-    store, moving = ImageStore(views, DataConfig()), MovingObjects((box,))
-    assert store.placement(0) is None
-    store = store.placing(moving)
-    np.testing.assert_allclose(store.placement(0).viewmats[0], box.poses[1], atol=1e-6)
-    assert store.placement(1) is None
-    # Half a second after its last pose it is gone.
-    assert moving.placement(np.eye(4), 1.0).viewmats[0, 2, 3] == -1

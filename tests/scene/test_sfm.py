@@ -12,7 +12,7 @@ from scene.helpers import refused, reprojection_errors, write_image
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene import find_scene, load_scene
-from p2gs_jax.scene.files import cached_folder, stage_progress
+from p2gs_jax.scene.files import cached_folder
 from p2gs_jax.scene.rigid import require_axes
 from p2gs_jax.scene.sfm import features
 from p2gs_jax.scene.sfm.features import kept_features, match_kept, pairs_by_name, pairs_by_pose
@@ -122,19 +122,6 @@ def test_only_what_is_new_is_done_and_matches_judge_poses(noisy_street, folder, 
     assert why["blank.png"].startswith("no features")
     assert why["0.png"] == why["1.png"] == "matches only photographs that did not register either"
     assert "0.png, 1.png (matches only" in sentence(why)
-
-
-def test_progress_tells_what_is_left():
-    now, said = [0.0], []
-    progress = stage_progress(said.append, "matching", 100, "pairs", clock=lambda: now[0])
-    for seconds, done in ((1, 5), (20, 25), (21, 26), (3600, 50), (3700, 100)):
-        now[0] = seconds
-        progress(done)
-    assert said == [
-        "matching: 100 pairs",
-        "matching: 25 of 100 pairs, about 1:00 left at this pace",
-        "matching: 50 of 100 pairs, about 1:00:00 left at this pace",
-    ]
 
 
 def test_cache_survives_interruption(tmp_path):

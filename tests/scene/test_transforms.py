@@ -72,6 +72,8 @@ def test_frames_override_cameras_follow_folders_and_other_sizes_are_rescaled(tmp
     assert "2 images have another size" in scene.notes[0]
     with refused("wrong size"):
         find_scene(write(tmp_path, {**data, "h": 80}), CFG)
+    with refused("no point could be triangulated"):
+        load_scene(write(tmp_path, {"fl_x": 50, "frames": data["frames"][:1]}).parent, CFG)
     with refused("principal point at 40, 15, far from the middle of its 40x30", "write w and h"):
         find_scene(write(tmp_path, {"fl_x": 100, "cx": 40, "frames": data["frames"]}), CFG)
 
@@ -88,14 +90,11 @@ POSE = "transform_matrix of a.png"
         ({"frames": 3}, 'no list "frames"'),
         ({"frames": [{}]}, 'frame 0 has no "file_path"'),
         ({"frames": [{"file_path": "images/a.png"}]}, POSE),
-        ({"frames": frames("images/a.png", transform_matrix="x")}, POSE),
-        ({"frames": frames("images/a.png", transform_matrix=[[1]])}, POSE),
         ({"frames": frames("images/a.png", transform_matrix=NAN)}, f"{POSE} is not a finite"),
         ({"frames": frames("images/a.png", transform_matrix=SINGULAR)}, "not a rotation and a tr"),
         ({"frames": frames("images/a.png", "./images/a.png")}, "a.png more than once"),
         ({"frames": frames("images/a.png", mask_path="m.png")}, "mask .*m.png of a.png"),
         ({"fl_x": 1e300}, "fl_x of a.png is 1e[+]300, not a number"),
-        ({"fl_x": None}, "fl_x of a.png is None"),
         ({"fl_x": 0}, "no focal length for a.png"),
         ({"w": "wide"}, "impossible size"),
         ({"cx": float("nan")}, "cx of a.png is nan"),
@@ -103,8 +102,6 @@ POSE = "transform_matrix of a.png"
         ({"camera_model": "EQUIRECTANGULAR"}, "model EQUIRECTANGULAR.*\n.*pinhole photographs"),
         ({"camera_angle_y": 40.0}, "camera_angle_y of a.png is 40, not an .* pi\n.*0.698132"),
         ({"is_fisheye": True, "fl_x": 0, "camera_angle_x": 2.0}, "it needs a positive fl_x\n"),
-        ("[" * 100_000, "is not valid JSON.* line 1"),
-        ('{"frames": ' + "1" * 10_000 + "}", "is not valid JSON.* line 1"),
         ('{\n "a": 5,\n "frames": [,]\n}', "is not valid JSON.* line 3"),
     ],
     ids=lambda value: str(value)[:40],
@@ -135,24 +132,12 @@ def test_two_photographs_are_triangulated(tmp_path):
     assert np.median(scene.points[:, 2]) == pytest.approx(focal * baseline / shift, rel=0.02)
 
 
-def test_one_blank_view_cannot_be_triangulated(tmp_path):
-    write(tmp_path, {"fl_x": 50, "frames": frames("images/a.png")})
-    with refused("no point could be triangulated"):
-        load_scene(tmp_path, CFG)
-
-
-OUTSIDE = ("../../secret.png", "a/../../../secret.png", "ABSOLUTE")
-
-
 @pytest.mark.parametrize("key", ["images.txt", "file_path", "mask_path", "ply_file_path"])
-@pytest.mark.parametrize("name", OUTSIDE)
-def test_names_stay_in_the_scene(tmp_path, key, name):
-    scene = tmp_path / "scene"
+def test_names_stay_in_the_scene(tmp_path, key):
+    scene, name = tmp_path / "scene", "a/../../../secret.png"
     images = write_tiny_model(scene) / "images.txt"
     # It is there, but not in the scene, and nothing opens it.
-    for folder in (scene, tmp_path):
-        (folder / "secret.png").write_text("secret")
-    name = str(tmp_path / "secret.png") if name == "ABSOLUTE" else name
+    (tmp_path / "secret.png").write_text("secret")
     if key == "images.txt":
         path, root = images, scene
         images.write_text(images.read_text().replace("im 1.png", name))
@@ -316,7 +301,6 @@ def test_llff_axes_and_lens(tmp_path):
     ("row", "columns", "values", "message"),
     [
         (1, 16, np.nan, "row 1 has impossible bounds: 2 to nan"),
-        (1, [15, 16], [6, 2], "row 1 has impossible bounds: 6 to 2"),
         (2, 3, np.inf, "the pose in row 2 is not finite"),
         (0, 14, 0, "row 0 has an impossible height, width or focal length"),
         (3, [0, 5, 10], -rows()[3, [0, 5, 10]], "row 3 is not a rotation"),

@@ -188,18 +188,6 @@ def test_walking_gives_frames_at_even_distances_at_any_speed() -> None:
     assert len(video.choose_frames(enumerate(frames))) == 1
 
 
-def test_turning_on_the_spot_shows_no_parallax() -> None:
-    def way(position: float, yaw: float):
-        tracker = video.Tracker(video.normalised(grey(0, 0)))
-        for k in range(1, 11):
-            found = tracker.follow(video.normalised(grey(position * k / 10, yaw * k / 10)))
-        return found
-
-    turned, walked = way(0, 0.08), way(0.16, 0)
-    assert turned.displacement > 0.05
-    assert walked.parallax > 4 * turned.parallax
-
-
 def test_of_neighbours_the_sharp_one_is_taken() -> None:
     numbers = chosen(WALK)
     middle = numbers[len(numbers) // 2]

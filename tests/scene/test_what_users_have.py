@@ -182,22 +182,6 @@ def test_paths_of_cameras_follow_the_scene():
             np.testing.assert_allclose(shot.viewmat, expected.viewmat, atol=1e-6)
 
 
-def test_models_and_tables_far_away_and_scenes_near(tmp_path):
-    pose = "1 0 0 0 " + " ".join(str(-v) for v in UTM)
-    where = " ".join(map(str, UTM + np.array([0.1, 0.2, 4])))
-    write_tiny_model(tmp_path / "colmap", pose=pose, points=f"7 {where} 10 20 30 0.5 1 0 2 0\n")
-    scene = find_scene(tmp_path / "colmap", CFG)
-    assert reprojection_errors(scene).max() < 1e-4
-    table = rows()
-    table[:, [3, 8, 13]] += UTM
-    near = find_scene(write_llff(tmp_path / "near", rows()), CFG)
-    far = find_scene(write_llff(tmp_path / "far", table), CFG)
-    assert near.origin == (0, 0, 0)
-    for a, b in zip(near.views, far.views, strict=True):
-        offset = b.viewmat[:3, 3] + b.viewmat[:3, :3] @ (UTM - far.origin)
-        np.testing.assert_allclose(a.viewmat[:3, 3], offset, atol=1e-5)
-
-
 def test_poses_in_other_axes_are_told(tmp_path):
     def views(change):
         view, poses = make_view(tmp_path / "0.png"), map(change, around(6))

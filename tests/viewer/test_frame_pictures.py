@@ -55,45 +55,6 @@ def test_every_mode_shows_what_it_says(frame):
     assert np.any(brighter != wanted["stops"])
 
 
-def test_the_limits_of_depth_hold_almost_everything(frame):
-    near, far = pictures.limits_of_depth(frame)
-    assert 2 <= near < 3
-    assert 8 < far <= 9
-    near, far = pictures.limits_of_depth(
-        replace(frame, alpha=0 * frame.alpha, depth=0 * frame.depth)
-    )
-    assert 0 < near < far
-
-
-def test_photograph_left_render_right():
-    inside = np.zeros(SIZE, bool)
-    inside[4:20, 10:30] = True
-    photo = pictures.WarpedPhotograph(np.full((*SIZE, 3), 0.25, np.float32), inside)
-    render = np.full((*SIZE, 3), 0.75, np.float32)
-    out = pictures.split_picture(photo, render, 0.5)
-    assert np.all(out[4:20, 10:19] == 0.25)
-    assert np.all(out[:, 21:] == 0.75)
-    assert np.all(out[:, :10] == 0.75)
-    assert np.all(out[:4, :19] == 0.75)
-    assert np.all(out[:, 19:21] == 1)
-    assert np.all(pictures.split_picture(photo, render, 1.0)[inside] == 0.25)
-    assert np.all(pictures.split_picture(photo, render, 0.0) == 0.75)
-
-
-def test_a_photograph_in_its_own_camera_stays_as_it_is_and_nothing_is_seen_behind():
-    ldr = np.random.default_rng(0).uniform(0, 1, (*SIZE, 3)).astype(np.float32)
-    mask = np.ones(SIZE, np.float32)
-    seen = pictures.warp_photograph(ldr, mask, camera(), camera())
-    np.testing.assert_allclose(seen.ldr, ldr, atol=1e-4)
-    assert seen.inside[1:-1, 1:-1].all()
-    back = camera(rotation=(0, np.pi, 0))
-    assert not pictures.warp_photograph(ldr, mask, camera(), back).inside.any()
-    mask[:, :20] = 0
-    seen = pictures.warp_photograph(ldr, mask, camera(), camera())
-    assert not seen.inside[:, :19].any()
-    assert seen.inside[2:-2, 21:-2].all()
-
-
 @pytest.mark.parametrize("size", [(120, 90), (33, 21)])
 def test_a_photograph_lines_up_with_a_turned_camera(size):
     # The photograph shows where each of its pixels looks; so must every pixel of the frame.

@@ -22,7 +22,6 @@ from p2gs_jax.viewer import panel as panels
 from p2gs_jax.viewer import renderer as renderer_module
 from p2gs_jax.viewer import session as sessions
 from p2gs_jax.viewer.live import Darkroom, LivePicture
-from p2gs_jax.viewer.pictures import limits_of_depth
 from p2gs_jax.viewer.session import BrowserSession
 from p2gs_jax.viewer.settings import (
     Settings,
@@ -255,15 +254,6 @@ def test_without_a_photograph_the_split_is_the_picture(darkroom, viewed, frame, 
     assert viewed.nearest_view(moved(frame, 0, 0.05).camera) == 1
     np.testing.assert_array_equal(darkroom.develop(away, split), plain)
     assert "No photograph" in darkroom.legend(away, split)
-
-
-def test_depth_colours_stay_until_they_are_set_anew(darkroom, frame):
-    settings = Settings(gamma=2.2, mode="depth")
-    darkroom.develop(frame, settings)
-    limits = limits_of_depth(frame)
-    darkroom.develop(replace(frame, depth=2 * frame.depth), settings)
-    assert darkroom.depth_limits == limits
-    assert "depth, scene units" in darkroom.legend(frame, settings)
 
 
 @pytest.fixture

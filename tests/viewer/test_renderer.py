@@ -3,7 +3,6 @@
 import threading
 from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -110,13 +109,6 @@ def test_what_cannot_be_compiled_is_said_and_the_next_size_is(made, monkeypatch)
     renderer.request([LARGE, SIZE])
     wait_for(renderer, changed, SIZE)
     assert renderer.failure.startswith("160 x 120 cannot be compiled")
-
-
-def test_dead_gaussians_and_empty_scenes_are_black(made):
-    dead, _ = made(gaussians(), alive=False)
-    assert float(dead.render_now(camera(SIZE)).alpha.max()) == 0
-    empty, _ = made(jax.tree.map(lambda leaf: leaf[:0], gaussians()))
-    assert not np.asarray(empty.render_now(camera(SIZE)).linear).any()
 
 
 def test_sizes_rise_to_the_canvas_itself_up_to_a_width():

@@ -168,13 +168,6 @@ def test_others_need_the_token(servers):
     assert connects(server, Cookie=f"p2gs_jax_token_{port + 1}=other; {kept}")
 
 
-def test_other_servers_are_left_alone():
-    before = websockets.asyncio.server.serve
-    with guarded(Guard(None)):
-        assert websockets.asyncio.server.serve is not before
-    assert websockets.asyncio.server.serve is before
-
-
 @pytest.fixture
 def served(monkeypatch):
     """Return a server's hooks, its sessions, and the ids of those that were made and stopped."""

@@ -7,15 +7,14 @@ from unittest.mock import Mock
 import cv2
 import numpy as np
 import pytest
-from made_drive import FAR, PERIOD, WALL, camera_pose, make_recording, tracked_car
+from made_drive import FAR, PERIOD, WALL, camera_pose, make_recording
 from scene.helpers import refused
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene.drives.assemble import assemble
-from p2gs_jax.scene.drives.lidar import owners, seeds
+from p2gs_jax.scene.drives.lidar import seeds
 from p2gs_jax.scene.drives.objects import Box, tracks
 from p2gs_jax.scene.drives.recording import SweepPoints, chosen_cameras, chosen_frames, short_name
-from p2gs_jax.scene.rigid import from_quaternion, rigid
 from p2gs_jax.scene.split import assign_split
 from p2gs_jax.types import Lidar
 
@@ -155,22 +154,6 @@ def test_frames_are_sliced_by_their_place_and_what_makes_no_sense_is_refused():
             chosen_frames(asked, there)
 
 
-def test_what_is_not_a_rotation_is_refused():
-    source, zero = Path("poses.json"), np.zeros(3)
-    for rotation, position, words in (
-        (1.1 * np.eye(3), zero, r"poses.json: the pose of frame 3 is no"),
-        (np.diag([1.0, 1, -1]), zero, "mirrors"),
-        (np.eye(3), np.array([0, np.nan, 0]), "rotation and a position"),
-    ):
-        with refused(words):
-            rigid(rotation, position, source, "frame 3")
-    with refused("unit quaternion"):
-        from_quaternion(np.zeros(4), zero, source, "frame 3")
-    half = np.sqrt(0.5)
-    turned = from_quaternion(np.array([half, 0, 0, half]), np.ones(3), source, "frame 3")
-    np.testing.assert_allclose(turned[:3, 0], [0, 1, 0], atol=1e-12)
-
-
 def test_seeds_are_dense_near_the_path_and_sparse_far_from_it():
     rng = np.random.default_rng(1)
     near, far = rng.uniform(-5, 5, (2, 20_000, 3))
@@ -183,15 +166,6 @@ def test_seeds_are_dense_near_the_path_and_sparse_far_from_it():
     assert 0 < len(few) <= 500
     assert angle > 0.01
     assert not len(seeds(Lidar(points, np.zeros(40_000), np.zeros(40_000, int)), kept)[0])
-
-
-def test_nothing_is_owned_where_nothing_is_tracked():
-    car = tracked_car(FRAMES)
-    points = car.poses[:1, :3, 3]
-    assert owners(points, np.array([0.0]), [car]).tolist() == [0]
-    # The same place, two seconds after the track ended.
-    assert owners(points, np.array([2.5]), [car]).tolist() == [-1]
-    assert owners(points[:0], np.zeros(0), [car]).shape == (0,)
 
 
 @pytest.mark.parametrize(

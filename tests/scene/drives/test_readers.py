@@ -20,7 +20,7 @@ from scene.helpers import refused
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene import load_scene
-from p2gs_jax.scene.drives import FORMATS, read_drive
+from p2gs_jax.scene.drives import FORMATS
 
 EVERY = pytest.mark.parametrize("name", FORMATS)
 
@@ -127,43 +127,6 @@ def test_reading_decodes_nothing_and_a_broken_sweep_is_named_when_it_is_read(cop
         assert any(scan.name in error.value.message for scan in made.scans)
 
 
-@EVERY
-def test_damaged_files_end_in_a_recording_or_a_complaint(copied, read, name):
-    """Files are cut, changed or shortened; a recording that is read nevertheless is sound."""
-    root = copied(name).root
-    rng = np.random.default_rng(1)
-    pictures = (".png", ".jpg")
-    files = sorted(p for p in root.rglob("*") if p.is_file() and p.suffix not in pictures)
-    complaints = 0
-    for _ in range(40):
-        path = files[rng.integers(len(files))]
-        whole = path.read_bytes()
-        damaged, at = bytearray(whole), rng.integers(len(whole))
-        match rng.integers(4):
-            case 0:
-                damaged = damaged[:at]
-            case 1:
-                damaged[at] = rng.integers(256)
-            case 2:
-                del damaged[at : at + rng.integers(1, 30)]
-            case _:
-                damaged = damaged.replace(b"0", b"nan", 2)
-        path.write_bytes(damaged)
-        try:
-            if (recording := read_drive(root, DataConfig())) is None:
-                continue
-            for sweep in recording.sweeps:
-                sweep.read()
-            assert all(np.isfinite(shot.pose).all() for shot in recording.photographs)
-            assert all(np.isfinite(thing.poses).all() for thing in recording.objects)
-            assert all((np.diff(thing.times) > 0).all() for thing in recording.objects)
-        except UserError:
-            complaints += 1
-        finally:
-            path.write_bytes(whole)
-    assert complaints > 4
-
-
 def first(**changes):
     return lambda rows: [{**rows[0], **changes}, *rows[1:]]
 
@@ -199,7 +162,6 @@ def tokens(table):
 REFUSED = {
     "nuscenes": [
         (tokens("calibrated_sensor"), first(rotation=[2, 0, 0, 0]), "not a unit quaternion"),
-        (tokens("calibrated_sensor"), first(rotation=[1, 0, 0]), "should be 4 finite numbers"),
         (tokens("calibrated_sensor"), first(camera_intrinsic=[[1, 2], [3]]), "9 finite numbers"),
         (tokens("calibrated_sensor"), first(camera_intrinsic=[[0] * 3] * 3), "a camera matrix"),
         (tokens("calibrated_sensor"), lambda rows: rows[1:], "no sensor calibrated CAM_FRONT"),
@@ -207,10 +169,8 @@ REFUSED = {
         (tokens("sample"), first(timestamp="now"), "no valid 'timestamp'"),
         (tokens("sample"), lambda rows: [], "no sample of scene-0001"),
         (tokens("sample_data"), every(width=None), "the size of samples/CAM_FRONT"),
-        (tokens("ego_pose"), first(rotation=[float("nan")] * 4), "finite numbers"),
         (tokens("sample_annotation"), first(size=[1, 0, 1]), "has no size"),
         (tokens("sample_annotation"), first(rotation="up"), "no valid 'rotation'"),
-        (tokens("scene"), lambda rows: [1], "is not a valid table"),
     ],
     "argoverse": [
         (argoverse.EXTRINSICS, every(qw=9.0), "sensor number 1 is not a unit quaternion"),
@@ -223,9 +183,7 @@ REFUSED = {
     ],
     "waymo": [
         (LENSES, every(**{MOUNT: [2.0] * 16}), "the pose of FRONT is not a rotation"),
-        (LENSES, every(**{MOUNT: [1.0] * 9}), "not a rotation"),
         (LENSES, first(**{FOCAL: 0.0}), "the lens of FRONT"),
-        (LENSES, first(**{FOCAL: float("nan")}), "the lens of FRONT"),
         (LENSES, every(**{FOCAL: "50"}), "should hold numbers"),
         (LENSES, every(**{"key.camera_name": 8}), "has no camera SIDE_RIGHT"),
         (LENSES, first(**{"key.camera_name": None}), "without gaps"),
@@ -248,8 +206,8 @@ REFUSED = {
     ],
     "kitti_raw": [
         ("calib_imu_to_velo.txt", given("R: 1 0 0 0 1 0 0 0 2\nT: 0 0 0\n"), "not a rotation"),
+        ("calib_imu_to_velo.txt", given("R: 1 0 0 0 1 0 0 0 -1\nT: 0 0 0\n"), "mirrors"),
         ("calib_cam_to_cam.txt", given("R_rect_00: 1 0 0 0 1 0 0 0 1\n"), "P_rect_02 should be 12"),
-        ("calib_cam_to_cam.txt", given("R_rect_00: 1 0 0\n"), "R_rect_00 should be 9"),
         (f"{SHOTS}/timestamps.txt", given("yesterday\n"), "'yesterday' is not a date"),
         (OXTS, given("49 8.4 110"), "should be 6 finite"),
         (OXTS, given("a b c d e f\n"), "position"),

@@ -66,15 +66,9 @@ def test_what_nuscenes_lacks_is_counted(copied, read):
 
 
 @pytest.mark.parametrize("name", ["/etc/passwd", "../elsewhere.jpg", "samples/../../x.jpg"])
-@pytest.mark.parametrize("modality", ["CAM_FRONT", "LIDAR_TOP"])
-def test_files_outside_the_set_are_refused(copied, read, name, modality):
-    def moved(rows):
-        row = next(r for r in rows if f"/{modality}/" in r["filename"] and r["is_key_frame"])
-        row["filename"] = name
-        return rows
-
+def test_files_outside_the_set_are_refused(copied, read, name):
     root = copied("nuscenes").root
-    edit(root, "sample_data", moved)
+    edit(root, "sample_data", lambda rows: [{**row, "filename": name} for row in rows])
     with refused(r"sample_data\.json names .* outside of"):
         read(root)
 
