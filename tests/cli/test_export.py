@@ -49,16 +49,6 @@ def test_the_linear_ply_is_the_run_bit_for_bit(exported):
     assert said["mean"]["gamma"] == pytest.approx(fitted.mean.gamma)
 
 
-def test_the_display_ply_holds_the_same_gaussians_in_colours_that_8_bits_hold(exported):
-    fitted, out = exported
-    shown, g = read_ply(out / "display.ply"), fitted.params.gaussians
-    np.testing.assert_array_equal(shown.means, g.means)
-    np.testing.assert_allclose(shown.log_scales, g.log_scales, atol=1e-3)
-    colors, _ = colors_of(out)
-    assert colors.min() >= -1e-6
-    assert colors.max() <= 1 + 1e-6
-
-
 def test_the_baking_error_is_written_and_true(exported):
     fitted, out = exported
     said = json.loads((out / "display.ply.json").read_text())
@@ -122,19 +112,15 @@ def test_a_look_changes_the_display_colours(exported, finished_run, succeeded, t
     [
         ("--format obj", "obj"),
         ("", "format"),
-        ("--format", "format"),
-        ("--format gltf --exposure-ev nan", "--exposure-ev"),
         ("--format gltf --exposure-ev bright", "exposure-ev"),
         ("--format gltf --exposure-ev 99", "--exposure-ev"),
         ("--format gltf --gamma 0", "--gamma"),
-        ("--format gltf --gamma inf", "--gamma"),
         ("--format gltf --bake-steps -1", "--bake-steps"),
         ("--format gltf --curve spline", "no spline"),
         ("--format gltf --curve wavy", "wavy"),
         ("--format exr colmap --gamma 2", "--gamma says nothing"),
         ("--format exr --size-mb 2", "--size-mb says nothing"),
         ("--format html --size-mb 0", "--size-mb"),
-        ("--format html --size-mb 0.02", "--size-mb"),
         ("--format html --photographs -1", "--photographs"),
         ("--format html --bake-steps 3", "--bake-steps"),
         ("--format exr --photographs 3", "--photographs"),

@@ -84,16 +84,12 @@ def test_calibrate_has_the_options_that_it_reads(shown):
     assert options.config.train.steps == 30_000
 
 
-def test_a_preset_decides_defaults():
-    _, options = parse(["fit", "a", "--out", "b", "--preset=paper", "--render.near", "0.1"])
+def test_a_preset_decides_defaults_and_options_are_read_as_what_they_are():
+    argv = "fit a --out b --preset=paper --render.near 0.1 --render.stop-error None"
+    _, options = parse([*argv.split(), *["--train.coarse-to-fine", ".1", ".2", "--resume"]])
     assert options.config.preset == "paper"
     assert options.config.train.steps == 30_000
     assert options.config.render.near == 0.1
-
-
-def test_options_are_read_as_what_they_are():
-    argv = "fit a --out b --render.stop-error None --train.coarse-to-fine .1 .2 --resume"
-    _, options = parse(argv.split())
     assert options.resume
     assert options.config.render.stop_error is None
     assert options.config.train.coarse_to_fine == (0.1, 0.2)

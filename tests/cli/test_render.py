@@ -106,7 +106,7 @@ def test_a_file_of_cameras_renders_what_the_views_rendered(rendered, own_run, tm
 
 def test_one_stop_doubles_the_linear_picture_and_leaves_the_radiance(rendered, own_run, tmp_path):
     for ev in ("-3", "-2"):
-        argv = ("--path", "drive", "--frames", "2", "--curve", "linear", "--gamma", "2.2")
+        argv = ("--path", "orbit", "--frames", "2", "--curve", "linear", "--gamma", "2.2")
         rendered(own_run, *argv, "--exposure-ev", ev, "--out", tmp_path / ev)
     dark, bright = (picture(tmp_path / ev / "00001.png") for ev in ("-3", "-2"))
     assert dark.mean() > 0.01
@@ -158,11 +158,6 @@ def test_a_drive_can_be_metered(rendered, own_run, tmp_path):
     assert "Metering:" in said
 
 
-def test_an_orbit_has_the_frames_asked_for(rendered, own_run, tmp_path):
-    rendered(own_run, "--path", "orbit", "--frames", "3", "--out", tmp_path)
-    assert len(list(tmp_path.glob("*.png"))) == 3
-
-
 def test_a_panorama_is_as_wide_as_its_rig(rendered, rig_run, tmp_path):
     rendered(rig_run, "--panorama", "--out", tmp_path, "--split", "train")
     assert [p.name for p in tmp_path.glob("*.png")] == ["001.png"]
@@ -181,9 +176,7 @@ def test_a_panorama_is_as_wide_as_its_rig(rendered, rig_run, tmp_path):
         ("--curve spline", "spline"),
         ("--curve film", "film"),
         ("--gamma 0", "--gamma"),
-        ("--gamma nan", "--gamma"),
         ("--exposure-ev 5000", "--exposure-ev"),
-        ("--exposure-ev nan", "--exposure-ev"),
         ("--exposure-ev own --path orbit", "own"),
         ("--exposure-of auto --exposure-ev own", "--exposure-of"),
         ("--exposure-of best", "--exposure-of"),
@@ -193,7 +186,6 @@ def test_a_panorama_is_as_wide_as_its_rig(rendered, rig_run, tmp_path):
         ("--camera front", "'front'"),
         ("--frames 9", "--frames"),
         ("--frames 1 --path drive", "--frames"),
-        ("--shift 2", "--shift"),
         ("--shift 999 --path drive", "--shift"),
         ("--width 3", "--width"),
         ("--fps 24", "--fps"),

@@ -10,7 +10,6 @@ import pytest
 from p2gs_jax.core.atomic import append_jsonl, atomic_write, naming, read_jsonl, write_text
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.frames import write_png
-from p2gs_jax.run.checkpoint import CheckpointStore
 
 
 @contextlib.contextmanager
@@ -42,22 +41,6 @@ def test_a_full_disk_is_named_with_the_file(tmp_path, name):
     assert error.value.filename == str(path)
     assert [p.name for p in tmp_path.iterdir()] == [name]
     assert path.read_text() == "before"
-
-
-def test_a_checkpoint_without_room_is_named_and_the_one_before_it_stays(tmp_path, caplog):
-    small, large = np.arange(8.0), np.arange(50_000.0)
-    CheckpointStore(tmp_path / "checkpoints").save(1, {"a": small}, {})
-    store = CheckpointStore(tmp_path / "checkpoints")
-    with room_for(100_000), pytest.raises(OSError, match=r".") as error:
-        store.save(2, {"a": large}, {})
-    assert error.value.errno == errno.EFBIG
-    assert error.value.filename == str(tmp_path / "checkpoints")
-    assert caplog.records == [], "users see one line"
-    again = CheckpointStore(tmp_path / "checkpoints")
-    assert again.latest_step() == 1
-    np.testing.assert_array_equal(again.restore(1, {"a": small})[0]["a"], small)
-    again.save(2, {"a": large}, {})
-    assert again.latest_step() == 2
 
 
 def test_a_log_without_room_is_named_and_mended(tmp_path):

@@ -1,6 +1,5 @@
 """PLY tables against plyfile, and whatever is no such file."""
 
-import contextlib
 import tracemalloc
 
 import numpy as np
@@ -149,44 +148,25 @@ def test_a_file_that_was_cut_anywhere_is_refused(tmp_path, kind):
             np.testing.assert_array_equal(positions(read_table(path, "vertex")), POINTS)
 
 
-@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
-@given(seeds)
-def test_bytes_that_changed_are_read_or_refused(tmp_path_factory, kind, seed):
-    rng = np.random.default_rng(seed)
-    data = np.frombuffer(ply(kind, [*VERTICES, *FACES], TEXT * 5), np.uint8).copy()
-    at = rng.integers(len(data), size=rng.integers(1, 4))
-    data[at] ^= (1 << rng.integers(0, 8, at.shape)).astype(np.uint8)
-    path = written(tmp_path_factory.getbasetemp() / "changed.ply", data.tobytes())
-    with contextlib.suppress(ValueError):
-        assert len(read_table(path, "vertex")) <= len(data)
-
-
 COLORED = [*VERTICES, "property uchar red"]
 WHOLE = ply("ascii", VERTICES, TEXT)
 # A whole file, or what stands behind "ply" and the format; and what is said of it.
 REFUSED = {
     "no count": ((["element vertex", *AXES], TEXT), r"line 3 of its header, 'element vertex', is"),
-    "no whole count": ((["element vertex 2.0", *AXES], TEXT), r"line 3 .*'element vertex 2.0'"),
     "a type unknown": ((["element vertex 2", "property int64 x"], TEXT), r"line 4 .*int64 x', is"),
     "a property twice": (([*VERTICES, AXES[0]], TEXT), r"'property float x', is .*there twice"),
-    "an element twice": (([*VERTICES, *VERTICES], TEXT + TEXT), r"'element vertex 2', is .*twice"),
     "a property of nothing": (([AXES[0], *VERTICES], TEXT), r"line 3 of its header.*misplaced"),
     "a format twice": ((["format ascii 1.0", *VERTICES], TEXT), r"'format ascii 1.0', is .*twice"),
     "no ASCII": ((["comment Straße", *VERTICES], TEXT), r"'ascii' codec can't decode"),
     "no vertices": ((["element points 2", *AXES], TEXT), r"it has no element 'vertex'"),
     "lists before": (([*FACES, *VERTICES], TEXT), r"its element 'face' has lists"),
-    "lists within": (([*VERTICES, FACES[1]], TEXT), r"its element 'vertex' has lists"),
     "an axis missing": ((["element vertex 2", AXES[0]], b"1\n2\n"), r"no field of name y"),
     "a row short": ((VERTICES, b"0 0 1\n0 1\n"), r"requires 3 columns but 2 were found at row 2"),
     "a row long": ((VERTICES, b"0 0 1 5\n0 1 0\n"), r"requires 3 columns but 4 were found"),
-    "a row empty": ((VERTICES, b"0 0 1\n\n0 1 0\n"), r"ends before the last of its 2 rows"),
-    "rows missing": ((VERTICES, b"0 0 1\n"), r"ends before the last of its 2 rows of 'vertex'"),
     "a word": ((VERTICES, b"0 0 x\n0 1 0\n"), r"could not convert string 'x' to float32"),
-    "no ASCII in rows": ((VERTICES, b"0 0 \xb2\n0 1 0\n"), r"'ascii' codec can't decode"),
     "a colour of 256": ((COLORED, b"0 0 1 256\n0 1 0 0\n"), r"'256' to uint8"),
     "a huge count": ((["element vertex 99999999999", *AXES], TEXT), r"announces 99999999999 rec"),
     "a count without end": ((["element vertex " + "9" * 5000], TEXT), r"limit \(4300 digits\)"),
-    "huge behind": (([*VERTICES, "element face 99999999"], TEXT), r"announces 99999999 records"),
     "empty": (b"", r"is not a valid PLY of points: it is empty"),
     "no end": (WHOLE.replace(b"end_header\n", b""), r"it has no line 'end_header'"),
     "no format": (WHOLE.replace(b"format ascii 1.0\n", b""), r"line 2 of its header.*misplaced"),

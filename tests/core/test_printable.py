@@ -53,6 +53,8 @@ def test_a_terminal_gets_colours_and_no_control_characters():
         assert "\x1b]0" not in printed(thing)
         assert "\\x1b" in printed(thing)
     assert "\x1b[1m" in printed(Text("bold", style="bold"))
+    for name in ("[bold]x[/bold]", "[/nothing].png", ":smile:"):
+        assert printed(name).strip() == name
 
 
 def test_pictures_are_drawn_as_nobody_has_set_them():
@@ -62,11 +64,6 @@ def test_pictures_are_drawn_as_nobody_has_set_them():
             drawn = [matplotlib.rcParams[name] for name in ("text.usetex", "text.parse_math")]
         assert matplotlib.rcParams["text.usetex"]
     assert drawn == [False, False]
-
-
-@pytest.mark.parametrize("name", ["[bold]x[/bold]", "[/nothing].png", ":smile:"])
-def test_brackets_are_no_markup(name):
-    assert printed(name).strip() == name
 
 
 def test_every_console_is_plain_and_so_is_what_workers_say(tmp_path, capsys):

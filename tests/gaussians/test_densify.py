@@ -12,7 +12,7 @@ from splats import gaussians_of
 from p2gs_jax.config import DensifyConfig
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.gaussians import adaptive, mcmc
-from p2gs_jax.gaussians.population import empty_gaussians, fresh_population, grow, opacities, place
+from p2gs_jax.gaussians.population import empty_gaussians, fresh_population, grow, opacities
 from p2gs_jax.train.optimizer import AdamState
 from p2gs_jax.train.strategies import demand
 
@@ -37,14 +37,6 @@ def with_room(g, slots):
     return grow(g, empty_gaussians(slots, g)), fresh_population(
         jnp.arange(g.capacity + slots) < g.capacity
     )
-
-
-def test_place_fills_empty_slots_in_order_and_counts_the_rest():
-    alive = jnp.array([True, False, True, False, True])
-    requests = jnp.array([True, False, True, False, True])
-    slot, refused = place(requests, alive)
-    assert slot.tolist() == [1, 5, 3, 5, 5]
-    assert int(refused) == 1
 
 
 def hot_population(n, hot):

@@ -14,7 +14,6 @@ from p2gs_jax.gaussians.seeds import (
     gaussians_from_points,
     misplaced,
     reach,
-    subsample,
     within_reach,
 )
 from p2gs_jax.gaussians.shell import find_shell, sphere_behind
@@ -103,16 +102,6 @@ def test_seeds_out_of_reach_are_brought_nearer(tmp_path):
     away = np.linalg.norm(nearer.points[-2:] - middle, axis=1)
     np.testing.assert_allclose(away, most, rtol=0.01)
     np.testing.assert_array_equal(nearer.points[:-2], points)
-
-
-def test_extent_and_subsample():
-    views = [view(x) for x in (0.0, 10.0)]
-    assert cameras_radius(views, np.zeros((0, 3), np.float32)) == pytest.approx(5.5)
-    assert cameras_radius([view(0.0)], np.full((5, 3), 10, np.float32)) > 0.5
-    kept = subsample(1000, 100, 0)
-    assert len(kept) == 100
-    assert np.all(np.diff(kept) > 0)
-    assert FitConfig() == preset("robust")
 
 
 def test_more_seeds_than_the_bound_are_thinned_and_it_is_said(tmp_path):

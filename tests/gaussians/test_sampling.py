@@ -11,7 +11,7 @@ from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 from p2gs_jax.evaluation.alignment import exposure_error
 from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
 from p2gs_jax.photometry.models import Form
-from p2gs_jax.photometry.observations import Observations, sample_pairs
+from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.sources.points import MOST_PER_POINT, projected_colors, track_colors
 from p2gs_jax.photometry.sources.sampling import sample
@@ -45,28 +45,19 @@ def test_behind_and_outside_are_invisible():
 CFG, CHOICE = preset("robust"), (Form("view_exposure"), Response())
 
 
-@pytest.fixture
-def street(noisy_street, tmp_path):
-    return load_scene(noisy_street, CFG.data, tmp_path, lambda text: None)
-
-
-def test_exposures_without_tracks(street, noisy_street):
-    scene = dataclasses.replace(street, tracks=None)
+def test_exposures_without_tracks_and_what_was_left_out_is_said(noisy_street, tmp_path):
+    scene = load_scene(noisy_street, CFG.data, tmp_path, lambda text: None)
+    scene = dataclasses.replace(scene, tracks=None)
     observations = projected_colors(scene, ImageStore(scene.views, CFG.data))
+    observations = dataclasses.replace(observations, too_coarse=7)
     assert np.bincount(observations.points).max() <= MOST_PER_POINT
     options = dataclasses.replace(options_of(CFG, scene), choice=CHOICE)
-    solved = calibrate_observations(observations, options).solution
+    found = calibrate_observations(observations, options)
+    assert found.reasons[0].startswith("7 of ")
     with (noisy_street / "truth" / "exposures.csv").open(newline="") as file:
         truth = {r["image"]: float(r["exposure"]) for r in csv.DictReader(file)}
     expected = np.array([truth[scene.views[i].name] for i in scene.train_indices])
-    assert exposure_error(np.exp(solved.log_exposures), expected)["ev"] < 0.03
-
-
-def test_what_was_left_out_is_said(street):
-    observations = track_colors(street, ImageStore(street.views, CFG.data))
-    options = dataclasses.replace(options_of(CFG, street), choice=CHOICE)
-    some = dataclasses.replace(observations, too_coarse=7)
-    assert calibrate_observations(some, options).reasons[0].startswith("7 of ")
+    assert exposure_error(np.exp(found.solution.log_exposures), expected)["ev"] < 0.03
 
 
 GREY_K = np.array([[50.0, 0, 30], [0, 50, 20], [0, 0, 1]], np.float32)
@@ -111,17 +102,6 @@ def test_observations_from_too_far_away_are_left_out_and_counted(distances, kept
 
 def encoded(linear):
     return srgb_encode(linear).astype(np.float32)
-
-
-def test_the_brightest_pixel_of_a_patch_is_known():
-    image = np.random.default_rng(0).uniform(0, 1, (24, 30, 3)).astype(np.float32)
-    xy = np.random.default_rng(1).uniform(6, 18, (50, 2))
-    found = sample(image, np.ones((24, 30), np.float32), xy)
-    for k, (x, y) in enumerate(np.floor(xy - 0.5).astype(int)):
-        # Every pixel that was interpolated counts, and no farther one than their neighbours.
-        inner, outer = image[y - 1 : y + 3, x - 1 : x + 3], image[y - 2 : y + 4, x - 2 : x + 4]
-        assert np.all(found.brightest[k] >= inner.max((0, 1)))
-        assert np.all(found.brightest[k] <= outer.max((0, 1)))
 
 
 def test_exposures_are_right_where_a_surface_has_highlights():
@@ -172,18 +152,3 @@ def test_samples_outside_and_masked_and_at_the_border_are_invalid():
     mask[:20] = 0
     xy = np.array([[-3.0, 30], [25, 10], [25, 30], [60, 30], [25, 20.4]])
     assert sample(image, mask, xy).valid.tolist() == [False, False, True, False, False]
-
-
-def observations(views, points):
-    colors = np.zeros((len(views), 3))
-    return Observations(views, points, colors, colors, 20, 50, np.zeros(20, int))
-
-
-def test_pairs_are_two_views_of_one_point():
-    rng = np.random.default_rng(0)
-    tracks = observations(rng.permutation(200) % 20, np.repeat(np.arange(50), 4))
-    i, j = sample_pairs(tracks, 1000, 0)
-    assert np.all(tracks.points[i] == tracks.points[j])
-    assert np.all(i != j)
-    lonely = observations(np.arange(5), np.arange(5))
-    assert len(sample_pairs(lonely, 10, 0)[0]) == 0

@@ -1,17 +1,15 @@
 """A cut covers space once, shares photographs out evenly, and gives each block what sees it."""
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from p2gs_jax.core.atomic import plain
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.seeds import camera_centers
-from p2gs_jax.jobs.blocks.cut import DETAIL, Cut, cut_scene, seen_points, split, thinned, whole_of
+from p2gs_jax.jobs.blocks.cut import DETAIL, cut_scene, seen_points, split, thinned, whole_of
 from p2gs_jax.types import Scene, Tracks, View
 
 LENGTH = 100.0
@@ -90,14 +88,6 @@ def test_blocks_of_a_road_follow_it(tracks, turned):
     assert max(sizes) <= 1.5 * min(sizes)
     names = {scene.training_views[k].name for block in cut.blocks for k in block.views}
     assert names == {view.name for view in scene.training_views}
-
-
-def test_a_cut_survives_json():
-    cut = cut_scene(make_road(), 3)
-    again = Cut.from_dict(json.loads(json.dumps(plain(cut.to_dict()))))
-    assert again.blocks == cut.blocks
-    assert again.margin == cut.margin
-    np.testing.assert_array_equal(again.ground.axes, cut.ground.axes)
 
 
 def test_too_many_blocks_are_refused_with_how_many_there_may_be():

@@ -30,7 +30,9 @@ SHORT = with_fields(FitConfig(), FIELDS)
 METHODS = {
     "rigid": SHORT,
     "vibration": with_fields(SHORT, {"dynamics.method": "vibration", "dynamics.vibrating": 600}),
+    "adaptive": with_fields(SHORT, {"densify.method": "adaptive", "densify.grad_threshold": 0.0}),
 }
+SLOWLY = [pytest.param(name, marks=pytest.mark.slow) for name in ("vibration", "adaptive")]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -163,7 +165,7 @@ def test_scores_can_be_computed_again(run, tmp_path, succeeded):
         assert found == pytest.approx(expected, abs=1e-3)
 
 
-@pytest.mark.parametrize("method", ["rigid", pytest.param("vibration", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("method", ["rigid", *SLOWLY])
 def test_a_resumed_run_is_the_one_that_was_never_stopped(fitted, folder, tmp_path, method):
     whole, out = fitted(method), tmp_path / "run"
     shutil.copytree(whole, out)

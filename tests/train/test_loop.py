@@ -178,15 +178,9 @@ def test_a_signal_ends_the_run_after_a_checkpoint_and_it_goes_on_as_if_nothing_h
     assert result.host.step == 100
 
 
-def test_the_first_burst_and_a_second_signal_wait_for_nothing(harness):
-    twice = (signal.SIGTERM, signal.SIGINT)
-    for programs in (signalled(harness, signal.SIGTERM, at=2), signalled(harness, *twice, at=52)):
+def test_the_first_burst_and_a_second_signal_wait_for_nothing_and_the_last_burst_ends(harness):
+    once, twice = (signal.SIGTERM,), (signal.SIGTERM, signal.SIGINT)
+    for numbers, at, saved in ((once, 2, None), (twice, 52, None), (once, 97, 100)):
         with pytest.raises(Interrupted):
-            harness.run(programs=programs)
-        assert harness.checkpoints.latest_step() is None
-
-
-def test_a_signal_in_the_last_burst_ends_a_run_that_is_complete(harness):
-    with pytest.raises(Interrupted):
-        harness.run(programs=signalled(harness, signal.SIGTERM, at=97))
-    assert harness.checkpoints.latest_step() == 100
+            harness.run(programs=signalled(harness, *numbers, at=at))
+        assert harness.checkpoints.latest_step() == saved

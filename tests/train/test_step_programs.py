@@ -9,7 +9,7 @@ import pytest
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.jobs.configs import with_fields
-from p2gs_jax.presets import narrowed, preset
+from p2gs_jax.presets import preset
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.train.optimizer import make_optimizer
 from p2gs_jax.train.step import PROGRAMS, Key, Step, StepPrograms
@@ -32,15 +32,6 @@ def test_a_program_that_reads_what_it_was_not_given_raises():
         _ = step.settings("differentiate")["cfg"].photometry.model
     with pytest.raises(AttributeError, match="curve"):
         _ = step.settings("advance")["cfg"].photometry.curve
-
-
-def test_what_was_taken_is_equal_where_the_values_are():
-    cfg = FitConfig()
-    other = with_fields(cfg, {"photometry.curve": "power", "train.seed": 3})
-    for taken, same in (({"render": None}, True), ({"photometry": ("curve", "pivot")}, False)):
-        a, b = narrowed(cfg, taken), narrowed(other, taken)
-        assert (a == b, hash(a) == hash(b)) == (same, same)
-        assert isinstance(a, FitConfig)
 
 
 class Traced:

@@ -13,7 +13,7 @@ from p2gs_jax.pipeline.exposures import decide, likely, unsolved
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.run.read import load_run
 from p2gs_jax.train.optimizer import learning_rates
-from p2gs_jax.train.update import _recentered, finite_names
+from p2gs_jax.train.update import _recentered
 from p2gs_jax.types import Gaussians, Params, Photometry
 
 GAUSSIANS = Gaussians(
@@ -47,13 +47,6 @@ def test_the_gauge_of_every_channel_is_kept():
         found = _recentered(photometry, cfg)
         np.testing.assert_allclose(np.mean(found.raw_white_balance, 0), 0, atol=1e-6)
         assert (float(jnp.mean(found.raw_exposures)) == 0) == (weight is not None)
-
-
-def test_faults_name_what_there_is():
-    assert finite_names({"l1": 0}, params(None))[-1] == "gradient of gammas"
-    names = finite_names({"l1": 0}, params(jnp.zeros((2, 3))))
-    assert names[-1] == "gradient of white balances"
-    assert len(names) == len(finite_names({"l1": 0}, params(None))) + 1
 
 
 def test_without_a_solution_only_views_learn():
