@@ -3,7 +3,6 @@
 import json
 import re
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.export.page import MEGABYTE, RESERVE, page_text, write_page
 from p2gs_jax.export.page_scene import embedded_photographs, page_scene
 from p2gs_jax.export.page_splats import ever_drawn, fit_into, weights
-from p2gs_jax.formats.packed import pack
 from p2gs_jax.render import project
 from p2gs_jax.render.tiles import rasterize_reference
 from p2gs_jax.run.read import load_run
@@ -76,22 +74,6 @@ def test_too_small_a_page_drops_what_weighs_least_or_is_refused(whole, fitted, t
         with pytest.raises(UserError, match=r"--size-mb|would fit"):
             write_page(tmp_path / "s.html", fitted, fitted.common_display(), size_mb=size)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_of_all_degrees_that_fit_the_best_is_taken(fitted):
-    g, cfg = fitted.params.gaussians, fitted.cfg.render
-    cameras = [fitted.camera(i) for i in fitted.scene.train_indices]
-    asked = []
-
-    def judge(shown):
-        asked.append(shown)
-        return SimpleNamespace(psnr_median=30.0 if shown.sh.shape[1] == 1 else 20.0)
-
-    room = len(pack(g).data) // 2
-    found = fit_into(room, g, cfg, cameras, judge)
-    assert found.kept_degree == 0
-    assert {s.sh.shape[1] for s in asked} == {1, 4}
-    assert len(found.packed.data) <= room
 
 
 def test_weights_are_sums_of_blending_weights(fitted):

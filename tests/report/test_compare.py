@@ -3,7 +3,7 @@
 import re
 
 import pytest
-from page_tools import HOSTILE, copy_run, edit
+from page_tools import copy_run, edit
 
 from p2gs_jax.report import compare
 from p2gs_jax.report.compare import compare_runs, to_markdown
@@ -101,16 +101,3 @@ def test_one_run_is_not_enough(runs, run_command):
         code, printed = run_command(*argv)
         assert code == 2
         assert "to compare" in printed
-
-
-def test_names_are_text_in_markdown(runs, tmp_path):
-    odd = copy_run(runs[1], tmp_path / "run|<b>`x`")
-    edit(odd / "config.json", lambda c: c.update(scene=f"/gone/{HOSTILE}"))
-    edit(odd / "config.json", lambda c: c["fit"].update(preset=HOSTILE))
-    edit(odd / "photometry.json", lambda p: p["curve"].update(name=HOSTILE))
-    found = compare_runs([runs[0], odd])
-    text = to_markdown(found)
-    # Of what Markdown would read, every sign is escaped.
-    assert not re.search(r"(?<!\\)[<`\[]", text)
-    assert len({len(re.findall(r"(?<!\\)\|", line)) for line in text.splitlines() if line}) <= 2
-    assert not set("\x1b\u202e\udcff") & set(text)

@@ -199,19 +199,6 @@ def test_what_a_run_knows_is_drawn(full_page):
     assert "all photographs" not in text
 
 
-def test_cameras_of_one_photograph_share_a_panel(run):
-    files = read_run(run)
-    files.photometry["model"] = "view_exposure"
-    for view, camera in zip(files.views, "012345", strict=True):
-        view["camera"] = camera
-    for view in files.train:
-        view.update(gamma=2.2, exposure_ev_error=None)
-    text = words_of(report_page(files, SceneMeasurements()))
-    assert "camera 0" not in text
-    assert "all photographs" in text
-    assert "no error bars" in text
-
-
 @pytest.mark.parametrize("name", ["page.pdf", "page", "folder.html", "file/page.html"])
 def test_where_no_page_can_be_written(run, tmp_path, run_command, name):
     (tmp_path / "folder.html").mkdir()

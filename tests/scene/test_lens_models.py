@@ -10,7 +10,7 @@ from scene.test_transforms import LENS, frames, write
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene import find_scene, load_scene
-from p2gs_jax.scene.lens import _fold_radius, intrinsics, undistort_points, undistortion_maps
+from p2gs_jax.scene.lens import _fold_radius, intrinsics, undistort_points
 from p2gs_jax.scene.sfm.map import camera_of
 from p2gs_jax.types import Distortion
 
@@ -61,25 +61,6 @@ def test_beyond_the_fold_and_at_the_side_of_a_fisheye_there_is_no_ray():
         assert np.isfinite(xy[1]).all()
         assert xy[1, 0] > (1e5 if one is fisheye else x)
         assert np.isnan(xy[2]).all()
-
-
-@pytest.mark.parametrize(
-    "lens",
-    [
-        Distortion((-0.25, 0.05, 0.001, -0.002)),
-        Distortion((0.3, 0.1, 0.001, -0.002, 0.02, 0.6, 0.2, 0.05)),
-        Distortion((0.05, -0.02, 0.01, -0.004), "fisheye"),
-    ],
-    ids=["radial", "rational", "fisheye"],
-)
-def test_maps_are_where_points_come_from(lens):
-    map_x, map_y = undistortion_maps(K, lens, 1000, 600)
-    valid = map_x > -5
-    assert valid.mean() > 0.9
-    rows, columns = np.nonzero(valid)
-    at = np.stack([map_x[valid], map_y[valid]], 1) + 0.5
-    expected = np.stack([columns, rows], 1) + 0.5
-    np.testing.assert_allclose(undistort_points(at, K, lens), expected, atol=0.01)
 
 
 @pytest.mark.parametrize(

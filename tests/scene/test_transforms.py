@@ -250,17 +250,11 @@ def test_broken_parts(tmp_path):
     edit(write_blender(tmp_path) / TEST, lambda d: d["frames"][0].update(file_path="train/r_0"))
     with refused(BOTH):
         load_scene(tmp_path, CFG)
-    edit(write_blender(tmp_path) / TRAIN, lambda d: d.pop("camera_angle_x"))
-    with refused(rf"{TRAIN}: no focal length for train/r_0.png"):
-        load_scene(tmp_path, CFG)
     (write_blender(tmp_path) / "test" / "r_1.png").unlink()
     with refused(rf"1 of the 3 images named by .*{TEST} do not exist: test/r_1"):
         load_scene(tmp_path, CFG)
     write_rgba(write_blender(tmp_path) / "train" / "r_3.png", size=(40, 20))
     with refused(rf"wrong size: .*train/r_3.png is 40x20, .* 40x30.*{TRAIN}"):
-        load_scene(tmp_path, CFG)
-    (tmp_path / TEST).write_text((tmp_path / TEST).read_text()[:-40])
-    with refused(rf"{TEST} is not valid JSON"):
         load_scene(tmp_path, CFG)
 
 

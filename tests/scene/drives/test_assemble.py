@@ -14,7 +14,7 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.drives.lidar import seeds
 from p2gs_jax.scene.drives.objects import Box, tracks
-from p2gs_jax.scene.drives.recording import SweepPoints, chosen_cameras, chosen_frames, short_name
+from p2gs_jax.scene.drives.recording import SweepPoints, chosen_frames
 from p2gs_jax.scene.split import assign_split
 from p2gs_jax.types import Lidar
 
@@ -134,15 +134,6 @@ def test_embedded_photographs_are_written_once(drive, tmp_path):
     assert embedded.call_count == 3
     assert all(view.image_path.is_file() for view in scene.views)
     assert scene.views[0].image_path.is_relative_to(tmp_path / "work")
-
-
-def test_cameras_are_named_as_people_say_them():
-    assert short_name("CAM_FRONT_LEFT") == short_name("front_left_camera") == "front_left"
-    assert short_name("ring_front_center") == "front_center"
-    assert short_name("camera") == "camera"
-    there = ["front_camera", "front_left_camera", "back_camera"]
-    assert chosen_cameras(["front", "back_camera", "Front"], there) == [there[0], there[2]]
-    assert chosen_cameras([], there) == there
 
 
 def test_frames_are_sliced_by_their_place_and_what_makes_no_sense_is_refused():

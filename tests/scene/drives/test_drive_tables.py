@@ -12,8 +12,7 @@ import pytest
 from scene.drives.writers_pandaset import as_published
 from scene.helpers import refused
 
-from p2gs_jax.errors import UserError
-from p2gs_jax.scene.drives.tables import chosen_drive, read_feather, read_pickled, read_rows
+from p2gs_jax.scene.drives.tables import read_feather, read_pickled, read_rows
 
 ROWS = [
     {"token": "a", "of": "x", "values": [1, 2.5, [3]]},
@@ -46,25 +45,6 @@ def test_what_is_not_a_table_of_rows_is_named(tmp_path, text):
     for column in ("", "of"):
         with refused(r"table\.json is not a valid table"):
             read_rows(path, {}, column, {"x"})
-
-
-@pytest.mark.parametrize(
-    ("asked", "there", "words"),
-    [
-        (None, ["b-1", "b-2", "a"], "holds 3 drives: a, b-1, b-2"),
-        ("b", ["b-1", "b-2", "a"], "2 drives of set begin with 'b'"),
-        ("other", ["a"], "no drive 'other'; there are a"),
-        ("other", [], "there are none"),
-        (None, [str(i) for i in range(9)], "0, 1, 2, 3, 4, ..."),
-    ],
-)
-def test_a_drive_is_chosen_by_how_its_name_begins(tmp_path, asked, there, words):
-    with pytest.raises(UserError, match="--drive NAME") as error:
-        chosen_drive(asked, there, tmp_path / "set")
-    assert words in error.value.message.replace(str(tmp_path) + "/", "")
-    assert chosen_drive(None, ["a"], tmp_path) == "a"
-    assert chosen_drive("a", ["a", "ab"], tmp_path) == "a"
-    assert chosen_drive("ab", ["a", "abc"], tmp_path) == "abc"
 
 
 def test_without_pyarrow_the_command_is_said(tmp_path, monkeypatch):

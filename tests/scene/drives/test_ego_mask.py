@@ -9,7 +9,7 @@ import pytest
 from p2gs_jax.config import DataConfig
 from p2gs_jax.run.scene_file import read_scene, write_scene
 from p2gs_jax.scene.drives.assemble import assemble
-from p2gs_jax.scene.drives.ego_mask import find_ego_mask, find_ego_masks, spread_over_the_way
+from p2gs_jax.scene.drives.ego_mask import find_ego_mask, find_ego_masks
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera
 from p2gs_jax.scene.pixels.store import ImageStore
 
@@ -87,13 +87,6 @@ def test_a_road_and_the_sky_in_turns_are_no_car_and_one_that_stands_says_nothing
     standing = np.array([pose_at(0.001 * k) for k in range(12)])
     assert find_ego_mask(CAMERA, pictures(standing), standing, UP) is None
     assert find_ego_mask(CAMERA, pictures(DRIVEN[:3]), DRIVEN[:3], UP) is None
-
-
-def test_photographs_are_spread_over_the_way_not_over_time(tmp_path):
-    waits = [pose_at(way) for way in [0.0] * 20 + [1.0, 2.0, 3.0]]
-    taken = [Photograph("front", k, 0.1 * k, tmp_path, pose) for k, pose in enumerate(waits)]
-    assert [p.frame for p in spread_over_the_way(taken, 4)] == [0, 20, 21, 22]
-    assert spread_over_the_way(taken[:1], 4) == taken[:1]
 
 
 @pytest.fixture

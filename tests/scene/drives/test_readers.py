@@ -84,6 +84,10 @@ def test_one_of_several_drives_has_to_be_named(copied, read, name, part):
     shutil.copytree(first, first.with_name(f"{part}_other"))
     with refused(f"holds 2 drives: {part}, {part}_other"):
         read(first.parent)
+    with refused(f"2 drives of .* begin with '{part[:-1]}'", "--drive NAME"):
+        read(first.parent, drive=part[:-1])
+    with refused(f"no drive 'other'; there are {part}, {part}_other"):
+        read(first.parent, drive="other")
     other = read(first.parent, drive=f"{part}_o")
     assert len(other.photographs) == len(made.photographs)
     assert all(f"{part}_other" in str(p.path) for p in other.photographs)

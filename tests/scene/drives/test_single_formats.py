@@ -29,20 +29,16 @@ def test_points_of_nuscenes_were_measured_in_the_order_of_firing(kept, read):
         assert times[-1] < sweep.time
 
 
-def test_a_drive_of_nuscenes_is_named(write, read, tmp_path):
-    root = write("nuscenes", tmp_path, frames=2, scenes=("scene-0001", "scene-0002")).root
-    with refused("holds 2 drives: scene-0001, scene-0002"):
-        read(root)
-    drive = read(root, drive="scene-0002")
-    assert len(drive.photographs) == 4
-    assert all("scene-0002" in p.path.name for p in drive.photographs)
-
-
-def test_one_of_several_versions_of_nuscenes_serves(write, read, tmp_path):
+def test_a_drive_of_nuscenes_is_named_and_one_of_several_versions_serves(write, read, tmp_path):
     write("nuscenes", tmp_path, frames=1)
     cut(tmp_path / nuscenes.TABLES / "sample_data.json")
-    write("nuscenes", tmp_path, frames=1, version=Path("v1.0-a"))
-    assert len(read(tmp_path).photographs) == 2
+    scenes = ("scene-0001", "scene-0002")
+    write("nuscenes", tmp_path, frames=2, scenes=scenes, version=Path("v1.0-a"))
+    with refused("holds 2 drives: scene-0001, scene-0002"):
+        read(tmp_path)
+    photographs = read(tmp_path, drive="scene-0002").photographs
+    assert len(photographs) == 4
+    assert all("scene-0002" in p.path.name for p in photographs)
 
 
 def test_what_nuscenes_lacks_is_counted(copied, read):
@@ -173,17 +169,13 @@ def test_what_waymo_lacks_is_counted(copied, read):
     ]
 
 
-def image(prefix, *shape):
-    return {f"{prefix}values": [1.0] * int(np.prod(shape)), f"{prefix}shape": list(shape)}
-
-
 @pytest.mark.parametrize(
     ("component", "changes", "words"),
     [
         ("lidar", {f"{waymo.RANGES}shape": [5, 7, 4]}, "holds no range image"),
         ("lidar", {"key.laser_name": 4}, "has no scanner 4"),
-        ("lidar", image(waymo.RANGES, 2, 12, 4), "2 rows"),
-        ("lidar_pose", image(waymo.PIXELS, 1, 1, 6), "does not fit its range image"),
+        ("lidar", waymo.ranged(waymo.RANGES, 0, 3, np.ones((2, 12, 4))), "2 rows"),
+        ("lidar_pose", waymo.ranged(waymo.PIXELS, 0, 1, np.ones((1, 1, 6))), "does not fit its"),
     ],
 )
 def test_senseless_range_images_are_named(copied, read, component, changes, words):
