@@ -75,4 +75,4 @@ def test_other_files_missing_ones_and_equal_names_are_refused(tmp_path):
         read_cameras(tmp_path / "nowhere.json")
     twice = [{**GOOD, "name": "x"}, GOOD, {**GOOD, "name": "x"}]
     with pytest.raises(UserError, match="0 and 2"):
-        read_cameras(save(path, twice))
+        read_cameras(save(tmp_path / "c.json", twice))
