@@ -146,10 +146,7 @@ class Photometry(eqx.Module):
         if self.cameras is not None:
             camera = _namespace(self.raw_exposures).asarray(self.cameras)[row]
         return Capture(
-            self.exposures[row],
-            self.gammas[row],
-            None if balance is None else balance[row],
-            camera,
+            self.exposures[row], self.gammas[row], None if balance is None else balance[row], camera
         )
 
 

@@ -40,9 +40,7 @@ def false_color(
 
 
 def depth_color(
-    depth: Float[np.ndarray, "h w"],
-    alpha: Float[np.ndarray, "h w"],
-    limits: tuple[float, float],
+    depth: Float[np.ndarray, "h w"], alpha: Float[np.ndarray, "h w"], limits: tuple[float, float]
 ) -> Float32[np.ndarray, "h w 3"]:
     """Return expected depth as colour, near bright, evenly in 1 / depth; black where there is none.
 

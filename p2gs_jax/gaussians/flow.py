@@ -256,9 +256,5 @@ def plane_fit(inverse: Float[np.ndarray, "h w"], valid: Bool[np.ndarray, "h w"])
     smooth = mv + sx * (x - mx) + sy * (y - my)
     flat = (np.sqrt(left) < FLAT * smooth) & (share > SUPPORT) & (smooth > 0)
     flat &= np.abs(smooth - inverse) < 2 * FLAT * smooth
-    return (
-        smooth.astype(np.float32),
-        np.stack([sx, sy], -1).astype(np.float32),
-        flat,
-        share,
-    )
+    slope = np.stack([sx, sy], -1).astype(np.float32)
+    return smooth.astype(np.float32), slope, flat, share

@@ -221,10 +221,7 @@ def visibility(scene: Scene, seed: int) -> Bool[np.ndarray, "v p"]:
 
 
 def neighbours(
-    scene: Scene,
-    seen: Bool[np.ndarray, "v p"],
-    log_exposures: Float[np.ndarray, " v"],
-    count: int,
+    scene: Scene, seen: Bool[np.ndarray, "v p"], log_exposures: Float[np.ndarray, " v"], count: int
 ) -> list[Int[np.ndarray, " _"]]:
     """Return for every training view the rows of the `count` views to match it with, best first.
 

@@ -190,12 +190,7 @@ class Optimiser:
         return chosen
 
     def run(
-        self,
-        start: Prepared,
-        *,
-        resume: bool = False,
-        spent_s: float = 0.0,
-        finish_s: float = 0.0,
+        self, start: Prepared, *, resume: bool = False, spent_s: float = 0.0, finish_s: float = 0.0
     ) -> TrainResult:
         """Run the optimisation, from the start or from the newest checkpoint.
 
@@ -266,11 +261,7 @@ def centred(params: Params, cfg: FitConfig) -> Params:
 
 
 def account_of(
-    start: Prepared,
-    params: Params,
-    result: TrainResult,
-    clock: Stopwatch,
-    begin: float,
+    start: Prepared, params: Params, result: TrainResult, clock: Stopwatch, begin: float
 ) -> Account:
     """Return what a fit says of itself; it began at `begin` (`time.monotonic`)."""
     return Account(

@@ -106,8 +106,7 @@ class Room(NamedTuple):
     def grown(self, entries: int, visible: int) -> Room:
         """Return room for a view that needs this, with some to spare; only what was short grows."""
         return Room(
-            _grown(self.entries, entries, TRAINING),
-            _grown(self.visible, visible, TRAINING_VISIBLE),
+            _grown(self.entries, entries, TRAINING), _grown(self.visible, visible, TRAINING_VISIBLE)
         )
 
 

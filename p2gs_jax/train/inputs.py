@@ -165,10 +165,7 @@ def inputs_at(
     """
     rows = views.indices_at(step, cfg.train.batch)
     each = [
-        (
-            views.batch(row, shrink, step + k),
-            partner_at(step + k, row, views, pairs, cfg),
-        )
+        (views.batch(row, shrink, step + k), partner_at(step + k, row, views, pairs, cfg))
         for k, row in enumerate(rows)
     ]
     if len(each) == 1:

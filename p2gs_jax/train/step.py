@@ -125,12 +125,7 @@ class Step:
         if name == "differentiate":
             known = dataclasses.replace(self.cfg, photometry=cfg.photometry)
             return {"cfg": cfg, "terms": tuple(loss_terms(known, self.terms).items())}
-        return {
-            "cfg": cfg,
-            "optimizer": self.optimizer,
-            "extent": self.extent,
-            "noise": self.noise,
-        }
+        return {"cfg": cfg, "optimizer": self.optimizer, "extent": self.extent, "noise": self.noise}
 
     def lowered(
         self, name: str, state: FitState, batch, partner, controls, *, room: Room, degree: int

@@ -239,9 +239,7 @@ def concluded(
     kind = jnp.where(fits, broken, FAULT_OVERFLOW).astype(jnp.int32)
     term = jnp.argmin(checked).astype(jnp.int32)
     fault = jax.tree.map(
-        lambda a, b: jnp.where(first, a, b),
-        Fault(kind, gradient.entries, count, term),
-        state.fault,
+        lambda a, b: jnp.where(first, a, b), Fault(kind, gradient.entries, count, term), state.fault
     )
     (photometry, appearance), rest_moments = jax.tree.map(
         lambda new, old: jnp.where(healthy, new, old),

@@ -193,12 +193,7 @@ class _Blocks:
         metrics[KEY] = self._summary(seams, counts)
         write_json(self.folder.metrics, metrics)
         return FitResult(
-            params,
-            solved.scene,
-            metrics,
-            self.paths.run,
-            solved.exposures.selection,
-            decisions,
+            params, solved.scene, metrics, self.paths.run, solved.exposures.selection, decisions
         )
 
     def _account(

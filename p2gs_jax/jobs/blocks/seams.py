@@ -152,10 +152,7 @@ def level_seams(
 
 
 def shifts(
-    cut: Cut,
-    number: int,
-    means: Float[np.ndarray, "n 3"],
-    steps: Mapping[tuple[int, int], float],
+    cut: Cut, number: int, means: Float[np.ndarray, "n 3"], steps: Mapping[tuple[int, int], float]
 ) -> Float[np.ndarray, " n"]:
     """Return by how many stops a block's radiance is to grow at some places (scene units).
 
