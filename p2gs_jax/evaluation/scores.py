@@ -25,6 +25,8 @@ from p2gs_jax.photometry.formation import eotf
 from p2gs_jax.scene.drives.objects import object_mask
 from p2gs_jax.types import LUMINANCE, Scene
 
+Image = Float[Array, "h w 3"]
+
 PARTS = ("whole", "static", "moving")
 # Parts of fewer pixels get no scores.
 FEWEST_PIXELS = 64
@@ -91,9 +93,7 @@ class ViewResult:
 
 
 @jax.jit
-def psnr(
-    ldr: Float[Array, "h w 3"], target: Float[Array, "h w 3"], mask: Float[Array, "h w"]
-) -> Float[Array, ""]:
+def psnr(ldr: Image, target: Image, mask: Float[Array, "h w"]) -> Float[Array, ""]:
     """Return the peak signal-to-noise ratio over valid pixels, dB, peak 1."""
     squared = jnp.sum(mask[..., None] * (ldr - target) ** 2)
     mse = squared / jnp.maximum(3 * jnp.sum(mask), 1)
@@ -144,9 +144,7 @@ def region_scores(
 
 
 @jax.jit
-def _similarity(
-    ldr: Float[Array, "h w 3"], target: Float[Array, "h w 3"], mask: Float[Array, "h w"]
-) -> Float[Array, "h w"]:
+def _similarity(ldr: Image, target: Image, mask: Float[Array, "h w"]) -> Float[Array, "h w"]:
     """Return the SSIM of each pixel; pixels that do not count are alike."""
     seen = jnp.where(mask[..., None] > 0, ldr, target)
     return ssim_map(seen.transpose(2, 0, 1), target.transpose(2, 0, 1)).mean(0)

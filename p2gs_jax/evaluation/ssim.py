@@ -18,6 +18,8 @@ from jaxtyping import Array, Bool, Float
 
 from p2gs_jax.render.xla_cpu import materialize, opaque_true
 
+Image = Float[Array, "h w 3"]
+
 WINDOW, SIGMA = 11, 1.5
 C1, C2 = 0.01**2, 0.03**2
 
@@ -120,16 +122,12 @@ def _masked_sum_bwd(residuals, v):
 _masked_sum.defvjp(_masked_sum_fwd, _masked_sum_bwd)
 
 
-def one_less_ssim(
-    ldr: Float[Array, "h w 3"], target: Float[Array, "h w 3"], mask: Float[Array, "h w"]
-) -> Float[Array, ""]:
+def one_less_ssim(ldr: Image, target: Image, mask: Float[Array, "h w"]) -> Float[Array, ""]:
     """Return 1 - SSIM, mean over valid pixels; 0 without any. Invalid ones are black in both."""
     x, y = ((a * mask[..., None]).transpose(2, 0, 1) for a in (ldr, target))
     return _masked_sum(x, y, mask) / jnp.maximum(3 * jnp.sum(mask), 1.0)
 
 
-def ssim(
-    ldr: Float[Array, "h w 3"], target: Float[Array, "h w 3"], mask: Float[Array, "h w"]
-) -> Float[Array, ""]:
+def ssim(ldr: Image, target: Image, mask: Float[Array, "h w"]) -> Float[Array, ""]:
     """Return the mean SSIM over valid pixels; invalid ones are black in both images."""
     return 1 - one_less_ssim(ldr, target, mask)

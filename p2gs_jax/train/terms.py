@@ -29,6 +29,9 @@ from p2gs_jax.train.exposure_loss import ColorPairs, relative_exposure_loss
 from p2gs_jax.train.lidar_depths import lidar_loss
 from p2gs_jax.types import GAMMA_SRGB, Array, Capture, Measured, Photometry
 
+Image = Float[Array, "h w 3"]
+Layer = Float[Array, "h w"]
+
 # Published weights of Luminance-GS.
 ENHANCED, CURVE = 0.5, 10.0
 # Published: 1 in the first three of ten thousand steps, then 0.1; ours: 0.1 throughout.
@@ -41,25 +44,25 @@ CONTRAST_LEVEL, POOL = 0.5, 4
 class Rendered(NamedTuple):
     """A training view as it was rendered."""
 
-    linear: Float[Array, "h w 3"]  # linear HDR radiance, premultiplied by alpha
-    alpha: Float[Array, "h w"]  # accumulated opacity
+    linear: Image  # linear HDR radiance, premultiplied by alpha
+    alpha: Layer  # accumulated opacity
     # alpha-weighted camera z, scene units; None where no term has `needs_depth`
-    depth: Float[Array, "h w"] | None
+    depth: Layer | None
     # display values, over the photograph's background where it has one; not clamped
-    ldr: Float[Array, "h w 3"]
+    ldr: Image
     # the same where a saturated photograph can contradict it, and elsewhere the photograph itself,
     # from which no gradient comes (`LossConfig.censored`)
-    judged: Float[Array, "h w 3"]
+    judged: Image
     # `ldr` without the learned correction; None unless Luminance-GS learns one
-    uncorrected: Float[Array, "h w 3"] | None
+    uncorrected: Image | None
 
 
 class Target(NamedTuple):
     """The photograph of the view."""
 
-    ldr: Float[Array, "h w 3"]  # display values in [0, 1], over its background where it has one
-    mask: Float[Array, "h w"]  # 1 = use, 0 = ignore
-    alpha: Float[Array, "h w"] | None  # its opacity, or None
+    ldr: Image  # display values in [0, 1], over its background where it has one
+    mask: Layer  # 1 = use, 0 = ignore
+    alpha: Layer | None  # its opacity, or None
     measured: Measured | None  # depths that a laser scanner measured, or None
 
 
@@ -133,9 +136,7 @@ def loss_terms(
 # ------------------------------------------------------------- photographs against renders
 
 
-def censor(
-    ldr: Float[Array, "h w 3"], target: Float[Array, "h w 3"], saturation: float
-) -> Float[Array, "h w 3"]:
+def censor(ldr: Image, target: Image, saturation: float) -> Image:
     """Replace predictions that a saturated photograph cannot contradict by the photograph.
 
     Where the photograph is at or above `saturation` it only says "at least this bright": a
@@ -146,9 +147,9 @@ def censor(
 
 
 def absolute_error(
-    ldr: Float[Array, "h w 3"],
-    target: Float[Array, "h w 3"],
-    mask: Float[Array, "h w"],
+    ldr: Image,
+    target: Image,
+    mask: Layer,
     weight: float = 1.0,
 ) -> Float[Array, ""]:
     """Return the weighted mean absolute difference over valid pixels; 0 without any."""
@@ -158,9 +159,9 @@ def absolute_error(
 
 
 def photometric_loss(
-    ldr: Float[Array, "h w 3"],
-    target: Float[Array, "h w 3"],
-    mask: Float[Array, "h w"],
+    ldr: Image,
+    target: Image,
+    mask: Layer,
     cfg: LossConfig,
 ) -> dict[str, Float[Array, ""]]:
     """Return the weighted terms `l1` and `dssim` (paper, eq. 8) of a prediction, censored if asked.
@@ -176,9 +177,7 @@ def photometric_loss(
     return terms
 
 
-def dissimilarity(
-    ldr: Float[Array, "h w 3"], target: Float[Array, "h w 3"], mask: Float[Array, "h w"]
-) -> Float[Array, ""]:
+def dissimilarity(ldr: Image, target: Image, mask: Layer) -> Float[Array, ""]:
     """Return 1 - SSIM over valid pixels."""
     return one_less_ssim(jnp.where(mask[..., None] > 0, ldr, 0.0), target, mask)
 
@@ -211,9 +210,9 @@ PRIORS: dict[str, Callable[[Photometry], Float[Array, ""]]] = {
 
 
 def enhanced_loss(
-    rendered: Float[Array, "h w 3"],
-    photograph: Float[Array, "h w 3"],
-    mask: Float[Array, "h w"],
+    rendered: Image,
+    photograph: Image,
+    mask: Layer,
     view: Curves,
     cfg: LossConfig,
 ) -> Float[Array, ""]:
@@ -222,9 +221,7 @@ def enhanced_loss(
     return ENHANCED * sum(compared.values(), jnp.zeros(()))
 
 
-def curve_prior(
-    view: Curves, photograph: Float[Array, "h w 3"], mask: Float[Array, "h w"]
-) -> Float[Array, ""]:
+def curve_prior(view: Curves, photograph: Image, mask: Layer) -> Float[Array, ""]:
     """Return how far a curve is from histogram equalisation and its pseudo curve, and how rough.
 
     The histogram is the photograph's, over pixels of mask 1.
@@ -243,9 +240,7 @@ def curve_prior(
     )
 
 
-def contrast_loss(
-    rendered: Float[Array, "h w 3"], photograph: Float[Array, "h w 3"], mask: Float[Array, "h w"]
-) -> Float[Array, ""]:
+def contrast_loss(rendered: Image, photograph: Image, mask: Layer) -> Float[Array, ""]:
     """Return how far steps between neighbouring squares are from the photograph's, brightened.
 
     `rendered` are enhanced display values. Squares with a masked pixel do not count.
@@ -265,15 +260,13 @@ def _both(whole, axis: int):
     return whole[1:] & whole[:-1] if axis == 0 else whole[:, 1:] & whole[:, :-1]
 
 
-def _pooled(image: Float[Array, "h w"]) -> Float[Array, "y x"]:
+def _pooled(image: Layer) -> Float[Array, "y x"]:
     height, width = (n // POOL * POOL for n in image.shape)
     squares = image[:height, :width].reshape(height // POOL, POOL, width // POOL, POOL)
     return squares.mean((1, 3))
 
 
-def opacity_error(
-    alpha: Float[Array, "h w"], target: Float[Array, "h w"], mask: Float[Array, "h w"]
-) -> Float[Array, ""]:
+def opacity_error(alpha: Layer, target: Layer, mask: Layer) -> Float[Array, ""]:
     """Return the mean difference of opacities over valid pixels."""
     apart = jnp.sum(mask * jnp.abs(alpha - target))
     return apart / jnp.maximum(jnp.sum(mask), 1.0)
