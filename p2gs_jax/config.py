@@ -10,40 +10,16 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 Appearance = Literal["affine", "bilateral", "curve", "ppisp", "luminance"]
-PresetName = Literal[
-    "paper",
-    "paper_appendix",
-    "robust",
-    "3dgs",
-    "3dgs_published",
-    "3dgs_gain",
-    "3dgs_affine",
-    "3dgs_bilateral",
-    "3dgs_curve",
-    "ppisp",
-    "ppisp_solved",
-    "luminance_gs",
-]
-PhotometricModel = Literal[
-    "constant",
-    "camera_exposure",
-    "camera_exposure_gamma",
-    "view_exposure",
-    "view_exposure_camera_gamma",
-    "view_exposure_gamma",
-]
-SceneFormat = Literal[
-    "colmap",
-    "transforms",
-    "blender",
-    "llff",
-    "pandaset",
-    "nuscenes",
-    "waymo",
-    "argoverse",
-    "kitti_raw",
-    "images",
-]
+OwnPreset = Literal["paper", "paper_appendix", "robust"]
+Baseline = Literal["3dgs", "3dgs_published", "3dgs_gain"]
+Correction = Literal["3dgs_affine", "3dgs_bilateral", "3dgs_curve"]
+CameraModel = Literal["ppisp", "ppisp_solved", "luminance_gs"]
+PresetName = Literal[OwnPreset, Baseline, Correction, CameraModel]
+ExposureByCamera = Literal["constant", "camera_exposure", "camera_exposure_gamma"]
+ExposureByView = Literal["view_exposure", "view_exposure_camera_gamma", "view_exposure_gamma"]
+PhotometricModel = Literal[ExposureByCamera, ExposureByView]
+RecordingFormat = Literal["pandaset", "nuscenes", "waymo", "argoverse", "kitti_raw"]
+SceneFormat = Literal["colmap", "transforms", "blender", "llff", RecordingFormat, "images"]
 # How structure from motion finds poses, and which photographs it matches with which.
 Matching = Literal["auto", "all", "sequence"]
 CameraBy = Literal["auto", "folder", "model", "exif", "one"]

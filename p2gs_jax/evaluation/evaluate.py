@@ -341,17 +341,12 @@ class _Views:
             metrics["test"]["metered"] = scoring.summary_of(rows["metered"])
         if aligned is not None:
             metrics["radiance"] = aligned.summary(rows["radiance"], splits)
-        if common:
-            metrics["reference"] = {
-                name: {**scoring.summary_of(rows[name]), "exposure": exposure}
-                | {
-                    part: scoring.summary_of(
-                        {n: row for n, row in rows[name].items() if splits[n] == part}
-                    )
-                    for part in ("train", "test")
-                }
-                for name, exposure in common.items()
-            }
+        for name, exposure in common.items():
+            scored = {**scoring.summary_of(rows[name]), "exposure": exposure}
+            for part in ("train", "test"):
+                of_part = {n: row for n, row in rows[name].items() if splits[n] == part}
+                scored[part] = scoring.summary_of(of_part)
+            metrics.setdefault("reference", {})[name] = scored
 
 
 def _against_reference(
@@ -365,9 +360,5 @@ def _against_reference(
     assert judge.reference is not None
     truth, usual = judge.reference(index), judge.usual(None)
     shown = {name: replace(usual, exposure=exposure) for name, exposure in exposures.items()}
-    return {
-        name: scoring.view_scores(
-            judge.lpips_weights, display.develop(linear, how, alpha=alpha), truth, mask
-        )
-        for name, how in shown.items()
-    }
+    score = functools.partial(scoring.view_scores, judge.lpips_weights, target=truth, mask=mask)
+    return {n: score(display.develop(linear, how, alpha=alpha)) for n, how in shown.items()}

@@ -46,32 +46,22 @@ class Protocol(NamedTuple):
     path: tuple[str, ...]  # where `metrics.json` has the scores
 
 
+MEAN, FITTED = "mean exposure and gamma", "exposure fitted to each photograph"
+ALL_FITTED = "all that varies per view fitted to each photograph"
+METERED = "exposure metered, as the camera would"
+ONE_SCALE = "reference photographs, one scale for all"
+ALIGNED = ("reference", "scale_aligned")
+REFERENCE = "reference photographs, mean exposure"
 PROTOCOLS = {
     "train": Protocol("training", "own exposure and gamma", ("train",)),
-    "train_averaged": Protocol("training", "mean exposure and gamma", ("train", "averaged")),
-    "test_averaged": Protocol("held out", "mean exposure and gamma", ("test", "averaged")),
-    "test_fitted": Protocol(
-        "held out", "exposure fitted to each photograph", ("test", "exposure_fitted")
-    ),
-    "test_all_fitted": Protocol(
-        "held out",
-        "all that varies per view fitted to each photograph",
-        ("test", "photometry_fitted"),
-    ),
-    "test_metered": Protocol(
-        "held out", "exposure metered, as the camera would", ("test", "metered")
-    ),
-    "reference_averaged": Protocol(
-        "all", "reference photographs, mean exposure", ("reference", "averaged")
-    ),
-    "reference": Protocol(
-        "all", "reference photographs, one scale for all", ("reference", "scale_aligned")
-    ),
-    "reference_test": Protocol(
-        "held out",
-        "reference photographs, one scale for all",
-        ("reference", "scale_aligned", "test"),
-    ),
+    "train_averaged": Protocol("training", MEAN, ("train", "averaged")),
+    "test_averaged": Protocol("held out", MEAN, ("test", "averaged")),
+    "test_fitted": Protocol("held out", FITTED, ("test", "exposure_fitted")),
+    "test_all_fitted": Protocol("held out", ALL_FITTED, ("test", "photometry_fitted")),
+    "test_metered": Protocol("held out", METERED, ("test", "metered")),
+    "reference_averaged": Protocol("all", REFERENCE, ("reference", "averaged")),
+    "reference": Protocol("all", ONE_SCALE, ALIGNED),
+    "reference_test": Protocol("held out", ONE_SCALE, (*ALIGNED, "test")),
 }
 
 

@@ -83,14 +83,8 @@ def slug(name: str) -> str:
 def write_job(folder: Path, job: Job) -> JobFiles:
     """Write a job file into an absolute folder."""
     files = JobFiles(folder / f"{slug(job.name)}.json")
-    write_json(
-        files.path,
-        {
-            "task": f"{job.task.__module__}:{job.task.__qualname__}",
-            "folder": str(job.folder.absolute()),
-            "arguments": job.arguments,
-        },
-    )
+    task, place = f"{job.task.__module__}:{job.task.__qualname__}", str(job.folder.absolute())
+    write_json(files.path, {"task": task, "folder": place, "arguments": job.arguments})
     files.progress.unlink(missing_ok=True)
     return files
 

@@ -99,37 +99,23 @@ def check_options(cfg: FitConfig) -> None:
     """
     p, share = cfg.photometry, cfg.densify.spread
     curved, random = p.curve != "linear", "--photometry.curve linear --photometry.start random"
-    refused = [
-        (
-            not 0 <= share < 1,
-            f"--densify.spread {share:g} is not between 0 and 1 (1 excluded).",
-            "give a share of a Gaussian's own extent, for example 0.5",
-        ),
-        (
-            p.known is not None and p.start != "tracks",
-            f"the preset {cfg.preset!r} starts exposures at random: known ones would be ignored.",
-            "leave out --known-exposures, or add --photometry.start tracks",
-        ),
-        (
-            p.appearance == "ppisp" and curved,
-            f"ppisp learns a whole camera: the curve {p.curve!r} would come before it.",
-            f"use --preset ppisp, or add {random}",
-        ),
-        (
-            p.appearance == "luminance" and curved,
-            f"Luminance-GS maps display values to display values: it knows no curve {p.curve!r}.",
-            f"use --preset luminance_gs, or add {random}",
-        ),
-        (
-            not curved and p.start == "tracks",
-            "the curve 'linear' splats display values; the tracks' bundle adjustment does not know "
-            "it.",
-            "add --photometry.start random, or use the preset ppisp or one of 3dgs*",
-        ),
-    ]
-    for wrong, message, fix in refused:
-        if wrong:
-            raise UserError(message, fix=fix)
+    if not 0 <= share < 1:
+        why = f"--densify.spread {share:g} is not between 0 and 1 (1 excluded)."
+        raise UserError(why, fix="give a share of a Gaussian's own extent, for example 0.5")
+    if p.known is not None and p.start != "tracks":
+        why = f"the preset {cfg.preset!r} starts exposures at random: known ones would be ignored."
+        raise UserError(why, fix="leave out --known-exposures, or add --photometry.start tracks")
+    if p.appearance == "ppisp" and curved:
+        why = f"ppisp learns a whole camera: the curve {p.curve!r} would come before it."
+        raise UserError(why, fix=f"use --preset ppisp, or add {random}")
+    if p.appearance == "luminance" and curved:
+        why = f"Luminance-GS maps display values to display values: it knows no curve {p.curve!r}."
+        raise UserError(why, fix=f"use --preset luminance_gs, or add {random}")
+    if not curved and p.start == "tracks":
+        why = "the curve 'linear' splats display values; the tracks' bundle adjustment does not "
+        why += "know it."
+        fix = "add --photometry.start random, or use the preset ppisp or one of 3dgs*"
+        raise UserError(why, fix=fix)
 
 
 def check_run_dir(run_dir: Path, resume: bool, cfg: FitConfig) -> bool:
