@@ -20,21 +20,17 @@ def luminance(linear: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "..."]:
     return np.asarray(linear) @ np.asarray(BT709, np.float32)
 
 
-def stops(
-    linear: Float[np.ndarray, "... 3"], middle: float, floor: float = 1e-12
-) -> Float[np.ndarray, "..."]:
+def stops(linear: Float[np.ndarray, "... 3"], middle: float) -> Float[np.ndarray, "..."]:
     """Return luminance in stops above `middle`, a luminance > 0."""
-    return np.log2(np.maximum(luminance(linear), floor) / middle)
+    return np.log2(np.maximum(luminance(linear), 1e-12) / middle)
 
 
-def false_color(
-    linear: Float[np.ndarray, "h w 3"], middle: float, limits: tuple[float, float] = STOPS
-) -> Float32[np.ndarray, "h w 3"]:
+def false_color(linear: Float[np.ndarray, "h w 3"], middle: float) -> Float32[np.ndarray, "h w 3"]:
     """Return luminance as colour, one step of the map for each whole stop from `middle`.
 
-    The stops of `limits` are the ends of the map; beyond them it stays at its ends.
+    `STOPS` are the ends of the map; beyond them it stays at its ends.
     """
-    low, high = limits
+    low, high = STOPS
     whole = np.clip(np.floor(stops(linear, middle)), low, high - 1)
     return _mapped((whole + 0.5 - low) / (high - low), STOPS_MAP)
 

@@ -17,10 +17,10 @@ from p2gs_jax.photometry.luminance import Curves
 from p2gs_jax.render import render_splats
 from p2gs_jax.render.harmonics import coefficient_count
 from p2gs_jax.render.project import camera_of_each
-from p2gs_jax.render.visible import Shown, compact, in_view, splat, splat_listed, whole_blocks
+from p2gs_jax.render.visible import Shown, compact, in_view, splat_listed, whole_blocks
 from p2gs_jax.train.exposure_loss import Partner
 from p2gs_jax.train.terms import Aux, LossTerm, Rendered, Target, censor
-from p2gs_jax.types import Array, Batch, Frustum, Gaussians, Params, Photometry, Render
+from p2gs_jax.types import Array, Batch, Frustum, Gaussians, Photometry, Render
 
 # Photographed colours of pixels that are less opaque are black.
 LEAST_SEEN = 0.5 / 255
@@ -176,28 +176,6 @@ def image_loss(
     found = {name: term(rendered, target, aux) for name, term in terms.items()}
     values = {name: value for name, value in found.items() if value is not None}
     return jax.tree.reduce(jnp.add, values), LossAux(values, render, rendered.ldr)
-
-
-def total_loss(
-    params: Params,
-    alive: Bool[Array, " n"],
-    batch: Batch,
-    partner: Partner,
-    cfg: FitConfig,
-    terms: Mapping[str, LossTerm],
-    *,
-    capacity: int,
-    active_degree: Int[Array, ""] | int,
-    owner: Int[Array, " n"] | None = None,
-) -> tuple[Float[Array, ""], LossAux]:
-    """Return the loss of one view and its terms, as one function of the parameters.
-
-    The step computes the same in blocks (train/step.py). Arguments are those of `image_loss`,
-    `show`.
-    """
-    shown = splat(params.gaussians, alive, batch.camera, cfg.render, active_degree, owner)
-    given = (params.photometry, params.appearance, batch, partner, cfg, terms, capacity)
-    return image_loss(shown, *given)
 
 
 def differentiate(

@@ -74,7 +74,7 @@ class Step:
     """The step `(state, batch, partner, controls, room=..., degree=...)` of a fit.
 
     It gives the next state and a report; the state before is donated. Randomness follows from the
-    seed and the step number alone. The loss is that of `total_loss`. What is done per Gaussian is
+    seed and the step number alone. The loss is that of `image_loss`. What is done per Gaussian is
     done in blocks, for those that the view may show; the others rest
     (`OptimizerConfig.visible_only`). What happens where something does not fit or is not finite:
     `train/update.py`.

@@ -12,7 +12,8 @@ from noise_views import DEGREE, EXTENT, config, start, view
 import p2gs_jax
 from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import DivergenceError
-from p2gs_jax.train.image_gradient import total_loss
+from p2gs_jax.render.visible import splat
+from p2gs_jax.train.image_gradient import image_loss
 from p2gs_jax.train.terms import loss_terms
 
 CFG = config()
@@ -74,8 +75,13 @@ def test_terms_are_added_taken_away_and_summed_under_their_names(made):
     params, (batch, partner) = start(), view(0)
     params = dataclasses.replace(params, appearance=Gain(np.float32(0.2)))
     alive, terms = np.ones(params.gaussians.capacity, bool), loss_terms(CFG, TERMS)
-    sizes = {"capacity": 2**15, "active_degree": DEGREE}
-    loss = jax.jit(lambda params: total_loss(params, alive, batch, partner, CFG, terms, **sizes))
+
+    @jax.jit
+    def loss(params):
+        shown = splat(params.gaussians, alive, batch.camera, CFG.render, DEGREE)
+        views = params.photometry, params.appearance
+        return image_loss(shown, *views, batch, partner, CFG, terms, 2**15)
+
     expected, aux = loss(params)
     assert float(report.loss) == pytest.approx(float(expected), rel=1e-5)
     for name, value in aux.terms.items():
