@@ -74,7 +74,7 @@ def test_terms_are_added_taken_away_and_summed_under_their_names(made):
     assert set(report.terms) == {"l1", "bright", "deep"}
     params, (batch, partner) = start(), view(0)
     params = dataclasses.replace(params, appearance=Gain(np.float32(0.2)))
-    alive, terms = np.ones(params.gaussians.capacity, bool), loss_terms(CFG, TERMS)
+    alive, terms = jnp.ones(params.gaussians.capacity, bool), loss_terms(CFG, TERMS)
 
     @jax.jit
     def loss(params):
