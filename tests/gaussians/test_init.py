@@ -24,13 +24,11 @@ from p2gs_jax.render import view_radiance
 from p2gs_jax.types import Camera, Scene, View
 
 
-def view(x=0.0, width=160, height=90, yaw=0.0):
-    c, s = np.cos(yaw), np.sin(yaw)
+def view(x=0.0):
     viewmat = np.eye(4, dtype=np.float32)
-    viewmat[:3, :3] = [[c, 0, -s], [0, 1, 0], [s, 0, c]]
-    viewmat[:3, 3] = -viewmat[:3, :3] @ [x, 0, 0]
+    viewmat[0, 3] = -x
     K = np.array([[100, 0, 80], [0, 100, 45], [0, 0, 1]], np.float32)
-    return View(f"{x}.png", Path("none"), "0", viewmat, K, width, height)
+    return View(f"{x}.png", Path("none"), "0", viewmat, K, 160, 90)
 
 
 def street_points(ground_only):

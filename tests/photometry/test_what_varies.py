@@ -17,7 +17,6 @@ from p2gs_jax.photometry.models import (
     Scope,
     neighbours,
     parameter_count,
-    possible,
 )
 from p2gs_jax.photometry.response import FREE, HELD, Response, log_exposed
 
@@ -112,18 +111,12 @@ def test_choices_one_step_apart():
     } <= set(near)
     assert not {plain, Choice(Form("view_exposure"), Curve("srgb", "camera"))} & set(near)
     assert all(plain in neighbours(choice, scope) for choice in near)
+    apart = neighbours(Choice(Form("camera_exposure")), scope)
+    assert Choice(Form("camera_exposure", "view")) not in apart
     nowhere = Scope(cameras=1, places=False, curves=False)
     for form, curve in neighbours(plain, nowhere):
         assert form.vignetting is curve.splines is None
         assert "camera" not in form.model
-
-
-def test_a_white_balance_per_view_needs_exposures_per_view():
-    assert possible(Form("view_exposure", "view"), 3)
-    assert not possible(Form("camera_exposure", "view"), 3)
-    assert not possible(Form("view_exposure", "camera"), 1)
-    count = parameter_count(Form("view_exposure", "view", "channel"), None, 3, 10)
-    assert count == 9 + 2 * 9 + 27
 
 
 @pytest.mark.parametrize(

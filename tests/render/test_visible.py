@@ -12,8 +12,8 @@ from splats import gaussians_of
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import bin_tiles, project, required_capacity
-from p2gs_jax.render.capacity import FEWEST_ENTRIES, SMALLEST, Room, bucket, until_it_fits
-from p2gs_jax.render.visible import BLOCK, compact, in_view
+from p2gs_jax.render.capacity import SMALLEST, bucket, until_it_fits
+from p2gs_jax.render.visible import compact, in_view
 from p2gs_jax.train.room import count_view
 from p2gs_jax.types import Camera, Gaussians
 
@@ -107,18 +107,3 @@ def test_a_view_is_drawn_again_until_it_fits():
     result, found = until_it_fits(draw, SMALLEST)
     assert drawn == [SMALLEST, bucket(40_000, 1.1), bucket(90_000, 1.1)]
     assert result == f"{found}" == f"{drawn[-1]}"
-
-
-def test_room_of_a_run_foresees_growth_within_its_bound():
-    now = Room.allocate(40_000, 9000, 1.0, 10**6)
-    later = Room.allocate(40_000, 9000, 4.0, 10**6)
-    assert now == (bucket(60_000), 3 * BLOCK)
-    # Four times as many Gaussians are smaller: their lists are twice as long.
-    assert later == (bucket(4 * int(9000 * 1.1 * 4.0)), 10 * BLOCK)
-    assert Room.allocate(40_000, 9000, 4.0, 5000).visible == 2 * BLOCK
-    assert Room.allocate(1, 1, 1.0, 100) == (bucket(FEWEST_ENTRIES), BLOCK)
-    assert later.holds(now)
-    assert not now.holds(later)
-    # Only what was short grows.
-    assert now.grown(80_000, 1) == (bucket(80_000, 1.5), now.visible)
-    assert now.grown(1, 20_000) == (now.entries, bucket(20_000, 1.2))

@@ -17,10 +17,8 @@ from p2gs_jax.photometry.adjustment.solve import fit_response
 from p2gs_jax.photometry.appearance import identity
 from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.response import Response
-from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.run.photometry_files import read_appearance, write_appearance
 from p2gs_jax.run.plots import curves_to_draw, write_calibration_plot
-from p2gs_jax.run.read import load_run
 from p2gs_jax.run.scene_file import SCENE_FILE, read_scene
 from p2gs_jax.types import View
 
@@ -78,12 +76,6 @@ def test_what_cannot_belong_is_refused(tmp_path, kind):
     other = [*views(), View("new.png", Path(), "left", *(np.eye(4), np.eye(3)), 4, 4)]
     with pytest.raises(UserError, match="does not belong"):
         read_appearance(path, kind, other)
-
-
-def test_a_run_has_its_metering(finished_run):
-    saved = load_run(finished_run)
-    assert RunFolder(finished_run).metering.is_file()
-    assert saved.metering.names == tuple(v.name for v in saved.scene.training_views)
 
 
 def test_a_broken_scene_file_is_refused(tmp_path):
