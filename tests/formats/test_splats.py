@@ -167,8 +167,7 @@ def test_spz_follows_its_specification(tmp_path, with_gsply):
 
 
 def test_spz_never_clips_positions():
-    assert gsply_files.fractional_bits(np.array([[0.0, 0.0, 0.0]])) == 24
-    for farthest in (0.4, 1.0, 2047.0, 3000.0, 1e6):
+    for farthest in (0.4, 2047.0, 1e6):
         bits = gsply_files.fractional_bits(np.array([[0.0, -farthest, 1e-3]]))
         assert farthest * 2**bits <= 2**23 - 1 < farthest * 2 ** (bits + 1) or bits == 24
     with pytest.raises(UserError, match="1e\\+07"):

@@ -6,7 +6,6 @@ import itertools
 import json
 import re
 import shutil
-import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 
 import numpy as np
@@ -145,10 +144,6 @@ def test_charts_are_in_the_page_s_colours_and_missing_values_break_a_line():
     assert text.count('role="img" aria-label="l"') == 1
     assert not any(placeholder in text for placeholder in VARIABLES)
     assert "var(--first)" in text
-    svg = re.search(r"<svg.*?</svg>", text, flags=re.DOTALL)[0]
-    tree = ElementTree.fromstring(svg.replace("xlink:href", "href"))
-    words = ["".join(t.itertext()) for t in tree.iter("text")]
-    assert {"found", "true", "a", "x", "y"} <= set(words)
 
 
 @pytest.fixture

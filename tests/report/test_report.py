@@ -2,7 +2,6 @@
 
 import itertools
 import re
-import shutil
 
 import cv2
 import numpy as np
@@ -137,11 +136,6 @@ def test_what_is_missing_is_reported_and_not_fatal(run, tmp_path, lost):
     (poor / lost).unlink()
     page = write_report(poor, render=lost == "radiance.ply")
     assert f"{lost} is missing" in words_of(page.read_text())
-
-
-def test_a_configuration_alone_gives_a_page(run, tmp_path):
-    shutil.copy(run / "config.json", tmp_path / "config.json")
-    assert {"What to watch", "Configuration"} <= set(headings(write_report(tmp_path).read_text()))
 
 
 @pytest.mark.parametrize("names", ["config.json", "metrics.json photometry.json log.jsonl"])

@@ -211,11 +211,6 @@ def test_random_backgrounds_follow_from_seed_and_step(cutouts):
     assert len({tuple(color) for color in drawn}) == 20
     assert 0 <= np.min(drawn) < 0.3
     assert 0.7 < np.max(drawn) <= 1
-    # A fixed one is premultiplied, with the alpha beside it.
-    batch = TrainingViews(store_of(root), range(3), 0).batch(0, 1, 3)
-    assert np.array_equal(batch.backdrop, [1, 1, 1])
-    assert batch.ldr.dtype == batch.alpha.dtype == np.uint16
-    assert (batch.ldr.astype(int) <= batch.alpha[..., None].astype(int) + 1).all()
 
 
 @pytest.mark.parametrize("text", ["blue", "1,1", "0.5,0.5,1.5", "0,0,nan", "", "1,1,1,1"])

@@ -26,11 +26,6 @@ def pixel(camera, point):
     return xy[:2] / xy[2]
 
 
-def a_view(viewmat, name="a"):
-    K = np.array([[100, 0, 60], [0, 100, 40], [0, 0, 1.0]], np.float32)
-    return View(name, None, "0", viewmat.astype(np.float32), K, 120, 80)
-
-
 @pytest.mark.parametrize("size", [(340, 200), (1280, 800), (480, 480)])
 def test_a_point_is_where_the_browser_draws_it_at_any_size(size):
     # What three.js does: camera-to-world with y up and z backwards, vertical field of view, the
@@ -65,7 +60,8 @@ def test_a_whole_photograph_is_seen(aspect):
 def test_up_is_what_cameras_hold_up_and_distances_are_typical():
     rolls = [viewmat([0, 0, roll], [0, 0, 0]) for roll in (-0.3, 0.1, 0.2)]
     points = np.random.default_rng(0).uniform([-0.1, -0.1, 4.9], [0.1, 0.1, 5.1], (50, 3))
-    scene = Scene(None, "test", tuple(map(a_view, rolls)), points, np.zeros((0, 3)))
+    views = tuple(View("a", None, "0", pose, np.eye(3), 120, 80) for pose in rolls)
+    scene = Scene(None, "test", views, points, np.zeros((0, 3)))
     space = cameras.make_viewer_space(scene, points)
     np.testing.assert_allclose(space.up, [0, -1, 0], atol=0.02)
     np.testing.assert_allclose(space.unit, cameras.TYPICAL_DISTANCE / 5, rtol=0.03)

@@ -137,13 +137,10 @@ def ms(size, of, share):
         # One step at a time, where the next is clearly fast enough.
         (SIZES, SIZES[0], ms(SIZES[0], SIZES[1], ENLARGE_WITHIN - 0.01), SIZES[1]),
         (SIZES, SIZES[0], ms(SIZES[0], SIZES[1], ENLARGE_WITHIN + 0.01), SIZES[0]),
-        (SIZES, SIZES[0], 0.1, SIZES[1]),
-        (SIZES, SIZES[1], 0.1, SIZES[2]),
         (SIZES, SIZES[2], 0.1, SIZES[2]),
         # A size is kept until it is clearly too slow, and left for the largest that keeps up.
         (SIZES, SIZES[2], (SHRINK_BEYOND - 0.01) * TARGET_MS, SIZES[2]),
         (SIZES, SIZES[2], 2 * TARGET_MS, SIZES[1]),
-        (SIZES, SIZES[2], 1e5, SIZES[0]),
         # What is not compiled is not chosen; programs of another window serve until then.
         (SIZES[1:2], SIZES[1], 0.1, SIZES[1]),
         ((), None, 0.0, None),

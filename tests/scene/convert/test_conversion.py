@@ -33,6 +33,7 @@ from p2gs_jax.scene.convert.icc import adobe_rgb, colour_notes, profile_of, read
 from p2gs_jax.scene.convert.readers import exif_evs, exif_of_raw, read_exif_settings
 from p2gs_jax.scene.files import image_size, list_images
 from p2gs_jax.scene.survey import survey
+from p2gs_jax.types import Scene
 
 CFG = DataConfig(test_every=0)
 LIGHT = np.full((30, 40, 3), (0.1, 0.3, 0.5), np.float32)
@@ -328,13 +329,9 @@ def test_names_paths_and_masks_are_the_users_own(tmp_path: Path) -> None:
         write_image(mask, 255, (96, 64))
     paths = [folder / "a.jpg", folder / "b.dng"]
     photographs = convert_photographs(folder, paths, tmp_path / "work", lambda message: None)
-    write_tiny_model(tmp_path / "tiny")
-    found = load_scene(tmp_path / "tiny", CFG)
-    views = tuple(
-        dataclasses.replace(view, name=path.name, image_path=path, mask_path=None)
-        for view, path in zip(found.views, photographs.paths, strict=True)
-    )
-    scene = with_originals(dataclasses.replace(found, views=views), photographs)
+    views = tuple(make_view(path, size=(96, 64)) for path in photographs.paths)
+    found = Scene(photographs.folder, "images", views, np.zeros((0, 3), np.float32), None)
+    scene = with_originals(found, photographs)
     assert [view.name for view in scene.views] == ["a.jpg", "b.dng"]
     files = [view.image_path for view in scene.views]
     assert files == [folder / "a.jpg", photographs.folder / "b.png"]

@@ -153,10 +153,8 @@ def test_seeds_are_dense_near_the_path_and_sparse_far_from_it():
     kept, _ = seeds(lidar, np.zeros((1, 3)))
     close = (kept[:, 0] < 40).sum()
     assert close > 5 * (len(kept) - close) > 0
-    few, angle = seeds(lidar, np.zeros((1, 3)), most=500)
+    few, _ = seeds(lidar, np.zeros((1, 3)), most=500)
     assert 0 < len(few) <= 500
-    assert angle > 0.01
-    assert not len(seeds(Lidar(points, np.zeros(40_000), np.zeros(40_000, int)), kept)[0])
 
 
 @pytest.mark.parametrize(

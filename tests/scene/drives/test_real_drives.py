@@ -13,24 +13,14 @@ from p2gs_jax.scene.drives.tables import read_pickled
 from p2gs_jax.scene.rigid import inverse
 
 
-@pytest.fixture
-def keyframe(shared_data):
-    return shared_data("nuscenes_one_frame")
-
-
-@pytest.fixture
-def sequence(shared_data, read):
-    return read(shared_data("pandaset_002"))
-
-
 def project(points, to_camera, K):
     local = applied(to_camera, points)
     with np.errstate(divide="ignore"):
         return (local @ K.T)[:, :2] / local[:, 2:], local[:, 2]
 
 
-def test_laser_points_land_in_the_images_when_those_were_taken(keyframe, read):
-    drive = read(keyframe)
+def test_laser_points_land_in_the_images_when_those_were_taken(shared_data, read):
+    drive = read(shared_data("nuscenes_one_frame"))
     assert drive.notes[0] == "scene.json counts 39 samples, sample.json holds 1."
     points, times = drive.sweeps[0].read()
     assert len(points) == 34688
@@ -49,9 +39,9 @@ def test_laser_points_land_in_the_images_when_those_were_taken(keyframe, read):
         assert photograph.time - passed == pytest.approx(0.002, abs=0.0006)
 
 
-def test_the_scanner_passed_boxes_when_it_is_said_to(sequence):
+def test_the_scanner_passed_boxes_when_it_is_said_to(shared_data, read):
     """Points of the spinning scanner carry times; those in a box are of the box's time."""
-    apart = []
+    sequence, apart = read(shared_data("pandaset_002")), []
     for sweep in sequence.sweeps:
         table = read_pickled(sequence.root / f"lidar/{sweep.frame:02d}.pkl.gz")
         spinning = table["d"] == 0

@@ -74,8 +74,7 @@ def numbers(values) -> str:
 
 
 def rigid(pose: np.ndarray) -> str:
-    head = "calib_time: 25-May-2012 16:47:16\n"
-    return f"{head}R: {numbers(pose[:3, :3])}\nT: {numbers(pose[:3, 3])}\n"
+    return f"R: {numbers(pose[:3, :3])}\nT: {numbers(pose[:3, 3])}\n"
 
 
 def oxts(seconds: float) -> str:
@@ -94,13 +93,12 @@ def tracklet(label: str, first: int, rows) -> str:
     """Return a tracklet of rows x y z yaw: the middle of the bottom, in the scanner's axes."""
     poses = "".join(
         f"<item><tx>{x:.9f}</tx><ty>{y:.9f}</ty><tz>{z:.9f}</tz><rx>0</rx><ry>0</ry>"
-        f"<rz>{yaw:.9f}</rz><state>2</state></item>"
+        f"<rz>{yaw:.9f}</rz></item>"
         for x, y, z, yaw in rows
     )
     return (
         f"<item><objectType>{label}</objectType><h>1.5</h><w>1.8</w><l>4.2</l>"
-        f"<first_frame>{first}</first_frame><poses><count>{len(rows)}</count>"
-        f"<item_version>2</item_version>{poses}</poses><finished>1</finished></item>"
+        f"<first_frame>{first}</first_frame><poses>{poses}</poses></item>"
     )
 
 
@@ -108,9 +106,7 @@ def tracklets(*items: str) -> str:
     return (
         '<?xml version="1.0" encoding="UTF-8" standalone="yes" ?>\n'
         "<!DOCTYPE boost_serialization>\n"
-        '<boost_serialization signature="serialization::archive" version="9">\n'
-        f"<tracklets><count>{len(items)}</count><item_version>1</item_version>{''.join(items)}"
-        "</tracklets></boost_serialization>\n"
+        f"<boost_serialization><tracklets>{''.join(items)}</tracklets></boost_serialization>\n"
     )
 
 
@@ -122,8 +118,7 @@ def write(root: Path, frames=3) -> w.Made:
     """Write a drive below the folder of a date."""
     date = root / DATE
     drive = date / DRIVE
-    lines = ["calib_time: 09-Jan-2012 13:57:47", "corner_dist: 9.950000e-02"]
-    lines += [f"R_rect_00: {numbers(R_RECT[:3, :3])}"]
+    lines = ["calib_time: 09-Jan-2012 13:57:47", f"R_rect_00: {numbers(R_RECT[:3, :3])}"]
     lines += [f"P_rect_{name}: {numbers(P)}" for name, P in P_RECT.items()]
     w.write_bytes(date / "calib_cam_to_cam.txt", "\n".join(lines) + "\n")
     w.write_bytes(date / "calib_velo_to_cam.txt", rigid(VELO_TO_CAM))

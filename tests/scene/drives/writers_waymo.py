@@ -72,7 +72,6 @@ def image_row(k, camera, **changes) -> dict:
         f"{IMAGE}image": w.jpeg(10 * k + camera),
         f"{IMAGE}pose.transform": pose,
         f"{IMAGE}pose_timestamp": START * 1e-6 + at,
-        f"{shutter}shutter": 0.004,
         f"{shutter}camera_trigger_time": START * 1e-6 + at - 0.003,
         f"{shutter}camera_readout_done_time": START * 1e-6 + at + 0.043,
     }
@@ -88,8 +87,7 @@ def lens_row(camera) -> dict:
     row = {"key.camera_name": camera}
     row |= {f"{LENS}intrinsic.{name}": value for name, value in numbers.items()}
     row |= {f"{LENS}extrinsic.transform": mount(camera)}
-    row |= {f"{LENS}width": w.WIDTH, f"{LENS}height": w.HEIGHT}
-    return row | {f"{LENS}rolling_shutter_direction": 2}
+    return row | {f"{LENS}width": w.WIDTH, f"{LENS}height": w.HEIGHT}
 
 
 def off_walls(points: np.ndarray) -> np.ndarray:

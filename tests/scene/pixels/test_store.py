@@ -161,9 +161,7 @@ NONE = DataConfig(cache_mb=0)
 
 
 def noisy_view(folder, name, channels=3, dtype=np.uint8, **fields):
-    rng = np.random.default_rng(len(name) + sum(name.encode()))
-    pixels = rng.integers(0, np.iinfo(dtype).max, (*SIZE, channels), dtype=dtype, endpoint=True)
-    return make_view(folder / name, pixels, f=50, **fields)
+    return make_view(folder / name, noise(channels, dtype=dtype), f=50, **fields)
 
 
 @pytest.fixture
