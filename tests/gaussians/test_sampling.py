@@ -33,9 +33,7 @@ def test_a_wall_hides_what_is_behind_it():
     outer = np.any((far[:, :2] < 10) | (far[:, :2] > 70), 1)
     assert visible[600:][inner].mean() < 0.02
     assert visible[600:][outer].mean() > 0.98
-
-
-def test_behind_and_outside_are_invisible():
+    # Nor is anything behind or outside.
     xy = np.array([[5.0, 5.0], [5.0, 5.0], [-1.0, 5.0], [5.0, 11.0]])
     z = np.array([2.0, -2.0, 2.0, 2.0])
     assert unoccluded(xy, z, 10, 10).tolist() == [True, False, False, False]

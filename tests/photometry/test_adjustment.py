@@ -189,16 +189,6 @@ def test_nothing_to_go_by(model):
         assert np.all(np.isfinite(s.gammas))
 
 
-def test_gammas_per_camera_are_recovered():
-    cameras = np.array([2.0, 2.2, 2.42])[DRIVE.cameras]
-    o = observe(DRIVE, ISO4, curve="power", gammas=cameras, pivot=0.18)
-    s = adjust(o, "view_exposure_camera_gamma", Response("power"))
-    # The power gauge holds the mean of 2.2 / gamma at 1.
-    np.testing.assert_allclose(s.gammas, cameras * np.mean(2.2 / cameras), atol=0.02)
-    assert exposure_error(np.exp(s.log_exposures), ISO4)["ev_scale_power"] < 0.015
-    assert np.ptp(s.gammas[DRIVE.cameras == 0]) < 1e-9
-
-
 def test_known_exposures_are_kept_and_set_the_gauge():
     truth = 3.7 * ISO4
     known = np.full(len(truth), np.nan)

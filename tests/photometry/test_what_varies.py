@@ -7,6 +7,7 @@ import pytest
 from solving import DRIVE, ISO4, PLAIN, adjust, problem_of, rms, select
 from synthetic_drive import make_drive, make_exposures, observe
 
+from p2gs_jax.evaluation.alignment import exposure_error
 from p2gs_jax.photometry.adjustment.problem import KnownExposures
 from p2gs_jax.photometry.adjustment.solve import fit_response
 from p2gs_jax.photometry.candidates import Candidate, choose
@@ -130,9 +131,15 @@ def test_choices_one_step_apart():
 )
 def test_what_varies_is_found(exposures, curve, gamma, model, response):
     gammas = None if gamma is None else np.array([2.0, 2.2, 2.45])[SHORT.cameras]
-    s = select(observe(SHORT, make_exposures(SHORT, exposures), curve=curve, gammas=gammas))
+    truth = make_exposures(SHORT, exposures)
+    s = select(observe(SHORT, truth, curve=curve, gammas=gammas, pivot=0.18))
     assert s.solution.model == model
     assert response is None or s.solution.response.name == response
+    if gamma is not None:
+        # The power gauge holds the mean of 2.2 / gamma at 1.
+        np.testing.assert_allclose(s.solution.gammas, gammas * np.mean(2.2 / gammas), atol=0.03)
+        found = np.exp(s.solution.log_exposures)
+        assert exposure_error(found, truth)["ev_scale_power"] < 0.015
     assert any(r.startswith("Chosen:") for r in s.reasons)
     if exposures == "constant":
         assert any("too little to tell the shape" in r for r in s.reasons)
