@@ -74,21 +74,17 @@ _TEXTURES = [
 
 
 @functools.cache
-def room(position: float, yaw: float = 0.0, size: tuple[int, int] = (240, 136)) -> np.ndarray:
-    """Return what a camera sees that moves sideways, metres, and turns, radians, in a made room.
+def room(position: float) -> np.ndarray:
+    """Return what a camera sees that moves sideways, metres, in a made room.
 
     A textured wall stands at 4 m, and textured posts before it at 2 m.
     """
-    width, height = size
+    width, height = 240, 136
     focal = 0.85 * width
     x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
-    ray = np.stack([x, y, np.full_like(x, focal)], -1) / focal
-    c, s = np.cos(yaw), np.sin(yaw)
-    ray = ray @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
     out = np.zeros((height, width, 3), np.float32)
     for depth, texture in ((4.0, _TEXTURES[0]), (2.0, _TEXTURES[1])):
-        at = ray / ray[..., 2:] * depth
-        across, up = at[..., 0] + position, at[..., 1]
+        across, up = x / focal * depth + position, y / focal * depth
         u, v = (across + 6) * 200, (up + 1.5) * 200
         seen = cv2.remap(
             texture, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR,

@@ -21,13 +21,9 @@ from p2gs_jax.scene.sfm.map import agreement, reasons, sentence
 CFG = DataConfig()
 
 
-def copied(shared_data, folder):
-    shutil.copytree(shared_data("bundler_et") / "images", folder, copy_function=shutil.copyfile)
-    return folder
-
-
 def test_bare_folder_with_a_stranger_and_its_cache(shared_data, tmp_path):
-    folder = copied(shared_data, tmp_path / "scene")
+    source, folder = shared_data("bundler_et") / "images", tmp_path / "scene"
+    shutil.copytree(source, folder, copy_function=shutil.copyfile)
     stranger = sorted((shared_data("sceaux_castle") / "images").iterdir())[0]
     shutil.copyfile(stranger, folder / "stranger.jpg")
     said = []

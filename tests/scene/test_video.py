@@ -158,16 +158,16 @@ def test_what_is_no_video_is_refused(tmp_path: Path) -> None:
         list(video.frames_of(tmp_path / "c.ts"))
 
 
-WALK = tuple((0.03 * k, 0.0) for k in range(50))
+WALK = tuple(0.03 * k for k in range(50))
 
 
-def grey(position: float, yaw: float = 0.0, gain: float = 1.0) -> np.ndarray:
-    return cv2.cvtColor((room(position, yaw) * gain).astype(np.uint8), cv2.COLOR_RGB2GRAY)
+def grey(position: float, gain: float = 1.0) -> np.ndarray:
+    return cv2.cvtColor((room(position) * gain).astype(np.uint8), cv2.COLOR_RGB2GRAY)
 
 
 @functools.cache
-def chosen(path: tuple[tuple[float, float], ...], blurred: int | None = None) -> list[int]:
-    frames = [grey(*place) for place in path]
+def chosen(path: tuple[float, ...], blurred: int | None = None) -> list[int]:
+    frames = [grey(place) for place in path]
     if blurred is not None:
         frames[blurred] = cv2.GaussianBlur(frames[blurred], (15, 15), 4)
     return video.choose_frames(enumerate(frames))
@@ -178,13 +178,13 @@ def test_walking_gives_frames_at_even_distances_at_any_speed() -> None:
     assert 5 <= len(numbers) <= 30
     steps = np.diff(numbers[:-1])
     assert steps.max() <= 2.5 * steps.min()
-    slow = chosen(tuple((0.015 * k, 0.0) for k in range(100)))
+    slow = chosen(tuple(0.015 * k for k in range(100)))
     assert abs(len(slow) - len(numbers)) <= 2
     resting = (*WALK[:25], *([WALK[24]] * 15), *WALK[25:])
     assert abs(len(chosen(resting)) - len(numbers)) <= 1
-    assert len(chosen(((0.0, 0.0),) * 12)) == 1
+    assert len(chosen((0.0,) * 12)) == 1
     # Automatic exposure is no motion.
-    frames = [grey(0.0, 0.0, gain) for gain in np.linspace(0.3, 1.0, 15)]
+    frames = [grey(0.0, gain) for gain in np.linspace(0.3, 1.0, 15)]
     assert len(video.choose_frames(enumerate(frames))) == 1
 
 
@@ -195,7 +195,7 @@ def test_of_neighbours_the_sharp_one_is_taken() -> None:
     assert middle not in other
     assert min(abs(n - middle) for n in other) <= 6
     # A blurred frame is waited out: every frame is due once the camera walks.
-    steps = (*([(0.0, 0.0)] * 6), *((0.13 * k, 0.0) for k in range(1, 6)))
+    steps = (*([0.0] * 6), *(0.13 * k for k in range(1, 6)))
     assert 8 in chosen(steps)
     other = chosen(steps, blurred=8)
     assert 8 not in other
@@ -209,7 +209,7 @@ def read(path: Path, work: Path, **options):
 @pytest.fixture(scope="module")
 def film(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("film") / "walk.mp4"
-    write_video(path, [room(*place) for place in WALK])
+    write_video(path, [room(place) for place in WALK])
     return path
 
 
@@ -223,7 +223,7 @@ def test_frames_are_kept_and_may_be_chosen_by_number(film: Path, tmp_path: Path)
     second = record["frames"][1]
     stored = cv2.imread(str(found.paths[1]))[..., ::-1].astype(float)
     near = range(second["frame"] - 2, second["frame"] + 3)
-    errors = {n: np.abs(stored - room(*WALK[n])).mean() for n in near}
+    errors = {n: np.abs(stored - room(WALK[n])).mean() for n in near}
     assert min(errors, key=lambda n: errors[n]) == second["frame"]
     assert second["time"] == pytest.approx(second["frame"] / 30, abs=1e-3)
     before = found.paths[0].stat().st_mtime_ns
@@ -247,7 +247,7 @@ def test_one_frame_no_motion_or_half_a_file(tmp_path: Path) -> None:
     with refused("1 of 30 frames would be used", "--every"):
         read(tmp_path / "still.mp4", tmp_path)
     path = tmp_path / "cut.mkv"
-    write_video(path, [room(*place) for place in WALK])
+    write_video(path, [room(place) for place in WALK])
     data = path.read_bytes()
     path.write_bytes(data[: len(data) * 2 // 3])
     assert len(read(path, tmp_path).paths) >= 3

@@ -9,7 +9,7 @@ import pytest
 from p2gs_jax.config import DataConfig
 from p2gs_jax.run.scene_file import read_scene, write_scene
 from p2gs_jax.scene.drives.assemble import assemble
-from p2gs_jax.scene.drives.ego_mask import find_ego_mask, find_ego_masks
+from p2gs_jax.scene.drives.ego_mask import find_ego_mask
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera
 from p2gs_jax.scene.pixels.store import ImageStore
 
@@ -103,7 +103,7 @@ def recording(tmp_path):
     return Recording(tmp_path, "pandaset", cameras, tuple(photographs))
 
 
-def test_drives_leave_it_out_and_runs_remember(recording, tmp_path):
+def test_drives_leave_it_out_and_runs_remember(recording, tmp_path, monkeypatch):
     scene = assemble(recording, DataConfig(frames="0:4"), tmp_path / "work")
     seen, unseen = [note for note in scene.notes if note.startswith("own car")]
     assert "front 1" in seen
@@ -123,14 +123,8 @@ def test_drives_leave_it_out_and_runs_remember(recording, tmp_path):
         assert mask[: H // 2].all()
         assert store.get(by_camera["back"])[1].all()
         store.close()
+    # What was found is kept.
+    monkeypatch.setattr("p2gs_jax.scene.drives.ego_mask.find_ego_mask", None)
+    assert assemble(recording, DataConfig(frames="0:4"), tmp_path / "work").notes == scene.notes
     without = assemble(recording, DataConfig(own_car=False))
     assert all(view.own_car is None for view in without.views)
-
-
-def test_what_was_found_is_kept(recording, tmp_path, monkeypatch):
-    work = tmp_path / "work"
-    masks, notes = find_ego_masks(recording, ["front"], work)
-    monkeypatch.setattr("p2gs_jax.scene.drives.ego_mask.find_ego_mask", None)
-    again, same = find_ego_masks(recording, ["front"], work)
-    np.testing.assert_array_equal(masks["front"], again["front"])
-    assert same == notes

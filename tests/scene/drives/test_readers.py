@@ -190,13 +190,9 @@ REFUSED = {
         (LENSES, first(**{FOCAL: 0.0}), "the lens of FRONT"),
         (LENSES, every(**{FOCAL: "50"}), "should hold numbers"),
         (LENSES, every(**{"key.camera_name": 8}), "has no camera SIDE_RIGHT"),
-        (LENSES, first(**{"key.camera_name": None}), "without gaps"),
         (BOXES, first(**{SIDE: 0.0}), "positive sizes"),
         (BOXES, first(**{TURN: float("nan")}), "finite positions"),
-        *(
-            (SEGMENT(name), lambda rows: [{"other": 1}], "has no column")
-            for name in ("lidar", "lidar_pose", "vehicle_pose")
-        ),
+        (SEGMENT("lidar_pose"), lambda rows: [{"other": 1}], "has no column"),
     ],
     "pandaset": [
         (FRONT / "poses.json", lambda held: {}, "should hold a list"),
@@ -205,7 +201,6 @@ REFUSED = {
         (FRONT / "intrinsics.json", lambda held: {"fx": 60}, "lacks"),
         (FRONT / "timestamps.json", lambda held: ["now", "a", "b"], "entry 0 should be finite"),
         (CUBOIDS, lambda rows: [{"uuid": "a"}], "no column 'position.x'"),
-        (CUBOIDS, every(**{"dimensions.x": "wide"}), "'dimensions.x' should hold numbers"),
         (CUBOIDS, every(**{"dimensions.x": 0.0}), "positive sizes"),
     ],
     "kitti_raw": [
@@ -214,7 +209,6 @@ REFUSED = {
         ("calib_cam_to_cam.txt", given("R_rect_00: 1 0 0 0 1 0 0 0 1\n"), "P_rect_02 should be 12"),
         (f"{SHOTS}/timestamps.txt", given("yesterday\n"), "'yesterday' is not a date"),
         (OXTS, given("49 8.4 110"), "should be 6 finite"),
-        (OXTS, given("a b c d e f\n"), "position"),
         (OXTS, given("90 0 0 0 0 0\n"), "no Mercator"),
         (TRACKLETS, lambda held: held[:80], "is not valid XML"),
         (TRACKLETS, item("<h>1.5</h>"), "l w h first_frame of a box"),
