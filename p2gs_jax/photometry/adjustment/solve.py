@@ -177,17 +177,17 @@ def solve(
     """Adjust exposures, gammas, cameras and response to observations (float64).
 
     A largest change of a parameter below the tolerance, log units, counts as none. `loss` is of the
-    rounds after those under L1, of which a start `near` the solution needs one.
+    rounds after those under L1; these are needed `near` a solution as well, of a form that lacked
+    what now explains what it took for outliers.
     """
     theta, weight = system.start if near is None else near, model.noise_weight
-    robust = L1_ROUNDS if near is None else 1
     moved, before, count = np.inf, np.inf, 0
     for count in range(1, MOST_ROUNDS + 1):
-        at = weigh(model, theta, weight, "l1" if count <= robust else loss)
+        at = weigh(model, theta, weight, "l1" if count <= L1_ROUNDS else loss)
         weight, before = at.weight, moved
         theta, moved = _step(model, system, theta, at)
         # The first round of another loss says nothing of the next.
-        if count > robust + 1 and moved < tolerance:
+        if count > L1_ROUNDS + 1 and moved < tolerance:
             break
     at = weigh(model, theta, weight, loss)
     return Fit(

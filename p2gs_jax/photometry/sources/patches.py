@@ -32,7 +32,7 @@ BLUR = 1 / 12 + 1 / 6
 # extent across their plane over the smaller one along it.
 NEIGHBOURS, FLAT = 9, 0.25
 # Samples along an axis of a patch are apart by no more pixels than this, if so many suffice.
-SPACING, SAMPLES = 1.5, (3, 6, 12, 24)
+SPACING, SAMPLES = 2.0, (3, 6, 12)
 
 # Symmetric 2x2 matrices as their entries (xx, xy, yy), in the last axis.
 Symmetric = Float[np.ndarray, "n 3"]
