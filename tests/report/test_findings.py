@@ -3,13 +3,13 @@
 import copy
 import dataclasses
 import itertools
-import json
 import re
 import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from page_tools import edit
 from scene.helpers import make_view
 
 from p2gs_jax.config import DataConfig, FitConfig, RenderConfig
@@ -266,9 +266,7 @@ def test_pairs_a_stop_apart_meet_when_developed_alike_also_in_the_picture(wall_r
 
 def test_presets_with_corrections_have_no_seams_and_say_so(wall_run, tmp_path):
     run = shutil.copytree(wall_run, tmp_path / "run")
-    saved = json.loads((run / "config.json").read_text())
-    saved["fit"]["photometry"]["appearance"] = "affine"
-    (run / "config.json").write_text(json.dumps(saved))
+    edit(run / "config.json", lambda c: c["fit"]["photometry"].update(appearance="affine"))
     np.save(run / "appearance.npy", np.zeros((3, 3, 4), np.float32))
     found = measure_scene(read_run(run), Silent())
     assert found.seams == ()

@@ -70,12 +70,11 @@ def folder(noisy_street, tmp_path):
     return tmp_path / "photos"
 
 
-def names_in(database):
-    with features.opened(database) as db:
-        return {i.name: (i.camera_id, i.image_id) for i in db.read_all_images()}
-
-
 def test_only_what_is_new_is_done_and_matches_judge_poses(noisy_street, folder, tmp_path):
+    def names_in(database):
+        with features.opened(database) as db:
+            return {i.name: (i.camera_id, i.image_id) for i in db.read_all_images()}
+
     said, names, keep = [], [f"{k}.png" for k in range(5)], tmp_path / "features"
     database = kept_features(keep, folder, {("one",): names[:3]}, said.append)
     match_kept(database, names[:3], None, said.append)
