@@ -197,7 +197,14 @@ def held_out(o: Observations, seed: int) -> Bool[np.ndarray, " o"]:
     if o.positions is None:
         return rng.random(len(o.points)) < HELD_OUT
     region = regions(o.positions, o.views, SHARED_REGION)
-    return (rng.random(int(region.max(initial=-1)) + 1) < HELD_OUT)[region]
+    view_of = np.zeros(int(region.max(initial=-1)) + 1, int)
+    view_of[region] = o.views
+    # Of every view a share of its regions: at least one, if it keeps two.
+    order = np.lexsort((rng.random(len(view_of)), view_of))
+    count, first = np.bincount(view_of), np.searchsorted(view_of[order], view_of)
+    rank = np.argsort(order) - first
+    taken = np.maximum(np.rint(HELD_OUT * count), count >= 3)
+    return (rank < taken[view_of])[region]
 
 
 def _chosen(

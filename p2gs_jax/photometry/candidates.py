@@ -35,6 +35,7 @@ SPLINE_SPREAD_EV = 0.2  # a response needs this spread of exposures, stops
 HOPELESS = 1.0  # nat per observation by which no tone curve makes up for missing exposures
 MOST_COMPARED = 80  # choices that are compared at most
 STANDARD_ERRORS, SMALLEST_GAIN = 2.0, 0.01
+LARGEST_CHANCE = 0.25  # nat per observation that no standard error of few regions excuses
 # Predictions that differ by no more than this in any view are as good as equal, 8-bit levels.
 INVISIBLE_DIFFERENCE = 1.0
 # The predictive density is a mixture: outliers exist, and must not decide.
@@ -68,7 +69,8 @@ class Candidate:
     @property
     def likely(self) -> bool:
         """Whether it predicts about as well as the best."""
-        return self.deficit <= max(STANDARD_ERRORS * self.deficit_error, SMALLEST_GAIN)
+        chance = min(STANDARD_ERRORS * self.deficit_error, LARGEST_CHANCE)
+        return self.deficit <= max(chance, SMALLEST_GAIN)
 
     @property
     def good(self) -> bool:

@@ -107,7 +107,8 @@ def test_equal_exposures_of_a_matte_road_are_found_equal(road):
 
 def test_whole_regions_are_held_out(road):
     held = held_out(road, 0)
-    assert 0.1 < held.mean() < 0.3
+    assert 0.05 < held.mean() < 0.4
+    assert np.all(np.bincount(road.views, held) > 0)
     region = regions(road.positions, road.views, SHARED_REGION)
     of_region = np.bincount(region, held) / np.bincount(region)
     assert set(of_region) == {0.0, 1.0}
