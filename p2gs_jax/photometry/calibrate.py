@@ -35,7 +35,7 @@ from p2gs_jax.types import Scene
 
 # Points of a view that a given kind of curve is fitted to.
 RESPONSE_PER_VIEW = 200
-HELD_OUT = 0.2
+HELD_OUT = 0.4
 # Candidates are compared on at most this many observations; the chosen one is solved on all.
 MOST_OBSERVATIONS = 40_000
 SPLINE_OBSERVATIONS = 12_000  # a curve has few parameters; its basis is the most expensive one

@@ -40,6 +40,7 @@ LARGEST_CHANCE = 0.25  # nat per observation that no standard error of few regio
 INVISIBLE_DIFFERENCE = 1.0
 # The predictive density is a mixture: outliers exist, and must not decide.
 OUTLIERS, OUTLIER_DEVIATION = 0.1, 1.2
+RANGES = 8  # of brightness, as many values in each, in which errors of predictions are measured
 
 
 @dataclass(frozen=True)
@@ -236,7 +237,7 @@ def _predict(problem: Problem, fit: Fit, response: Response, held: np.ndarray) -
     """Return what a fit says about rows that were held out.
 
     Curves differ in what they call noise, and must not be chosen for that: noise is that of sRGB,
-    and how far predictions are off is measured in units of it.
+    and how far predictions are off is measured in units of it, in ranges of brightness.
     """
     o, layout = problem.observations, problem.layout
     sigma, slope = (a[held] for a in o.decoded(response)[1:])
@@ -248,8 +249,12 @@ def _predict(problem: Problem, fit: Fit, response: Response, held: np.ndarray) -
     # Points are as uncertain as what they are seen by.
     known_by = 1 + a**2 / np.maximum(precision * sigma**2, 1e-9)
     variance = (noise / standard) ** 2 * known_by
-    off = np.abs(error[known]) / np.sqrt(variance[known])
-    variance *= max(1.4826 * np.median(off), SMALLEST_SCALE) ** 2 if off.size else 1.0
+    if known.any():
+        ranges = np.quantile(y[known], np.arange(1, RANGES) / RANGES)
+        at = np.where(known, np.searchsorted(ranges, y), -1)
+        for mine in (at == k for k in np.unique(at[known])):
+            scale = 1.4826 * np.median(np.abs(error[mine]) / np.sqrt(variance[mine]))
+            variance[mine] *= max(scale, SMALLEST_SCALE) ** 2
 
     def normal(v):
         return -0.5 * error**2 / v - 0.5 * np.log(2 * np.pi * v)

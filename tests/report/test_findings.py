@@ -123,7 +123,7 @@ def test_what_proves_nothing_gives_no_warning(run, change):
 
 def test_a_sentence_says_what_was_modelled(run):
     model = findings.modelled(run)
-    assert "an exposure per view under a power-law tone curve" in model
+    assert "an exposure per view under the sRGB tone curve" in model
     assert "the simplest choice that predicts" in model
     del run.metrics["photometry"]
     assert "no shared points to choose by" in findings.modelled(run)
