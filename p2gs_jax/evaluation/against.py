@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float32
 
+from p2gs_jax.core.threads import map_in_order
 from p2gs_jax.evaluation.alignment import with_fitted_exposure
 from p2gs_jax.evaluation.evaluate import Judge
-from p2gs_jax.evaluation.passes import map_in_order
 from p2gs_jax.evaluation.renders_of_others import OtherRenders, Rendered
 from p2gs_jax.evaluation.scores import still_mask, summary_of, view_scores
 from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop

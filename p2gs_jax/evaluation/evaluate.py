@@ -25,11 +25,11 @@ import numpy as np
 from jaxtyping import Float32
 
 from p2gs_jax.config import FitConfig
+from p2gs_jax.core.threads import map_in_order
 from p2gs_jax.evaluation import scores as scoring
 from p2gs_jax.evaluation.alignment import fit_capture, with_fitted_exposure
 from p2gs_jax.evaluation.drives import DepthScores
 from p2gs_jax.evaluation.lpips import LpipsWeights
-from p2gs_jax.evaluation.passes import map_in_order
 from p2gs_jax.evaluation.radiance import Alignment, Truth, sampled
 from p2gs_jax.evaluation.references import Reference
 from p2gs_jax.photometry import display

@@ -15,9 +15,9 @@ from tiny_scene import noise_scene
 from p2gs_jax.cli.tables import print_metrics
 from p2gs_jax.config import FitConfig, LossConfig
 from p2gs_jax.core.numerics import srgb_encode
+from p2gs_jax.core.threads import MOST_WORKERS, map_in_order
 from p2gs_jax.evaluation.evaluate import evaluate
 from p2gs_jax.evaluation.lpips import lpips
-from p2gs_jax.evaluation.passes import MOST_WORKERS, map_in_order
 from p2gs_jax.evaluation.scores import psnr, tells_exposure, untold_notes
 from p2gs_jax.run.read import load_run
 from p2gs_jax.scene.pixels.store import ImageStore

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import cv2
@@ -12,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 
 from p2gs_jax.core.numerics import srgb_decode, srgb_encode
+from p2gs_jax.core.threads import map_in_order
 from p2gs_jax.photometry.formation import places
 from p2gs_jax.photometry.observations import COARSEST, Observations
 from p2gs_jax.photometry.sources import patches
@@ -142,11 +141,10 @@ def point_colors(
     rows = [row for row, kept in enumerate(keep) if kept.any()]
     nothing, none = np.zeros((0, 3), np.float32), np.zeros(0, int)
     parts: list[tuple[np.ndarray, ...]] = [(none, none, *[nothing] * 3, nothing[:, :2])]
-    with ThreadPoolExecutor(os.cpu_count()) as threads:
-        for done, found in enumerate(threads.map(read, rows)):
-            parts.append(found)
-            if on_view is not None:
-                on_view(done + 1, len(rows))
+    for done, found in enumerate(map_in_order(read, rows)):
+        parts.append(found)
+        if on_view is not None:
+            on_view(done + 1, len(rows))
     of_view, seen, colors, spread, brightest, positions = map(
         np.concatenate, zip(*parts, strict=True)
     )

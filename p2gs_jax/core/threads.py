@@ -1,4 +1,4 @@
-"""What passes over all views need: a map in threads."""
+"""A map in threads, in order, that holds few results at once: what passes over all views need."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TypeVar
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-# A bound on the rendered images held at once.
+# A bound on the images held at once.
 MOST_WORKERS = 4
 
 
@@ -28,7 +28,7 @@ def map_in_order(function: Callable[[Item], Result], items: Iterable[Item]) -> I
         yield function(first)
         break
     waiting: deque[Future[Result]] = deque()
-    with ThreadPoolExecutor(workers, thread_name_prefix="evaluate") as pool:
+    with ThreadPoolExecutor(workers, thread_name_prefix="views") as pool:
         try:
             for item in rest:
                 waiting.append(pool.submit(function, item))
