@@ -1,6 +1,7 @@
 """Exposures from shared points: right where the pixels say so, honest where they do not."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -74,6 +75,32 @@ def test_saturation_must_be_masked():
         for p in (problem_of(saturation=1.1), problem_of())
     )
     assert np.std(alone) > 2 * np.std(masked)
+
+
+def test_terms_of_many_cameras_are_products_with_their_matrix():
+    """Of 1,023 parameters, seven a value: powers of their number exceed 64-bit integers."""
+    rng, count, scaled, places = np.random.default_rng(0), 1023, 5, 40
+    index = np.broadcast_to(np.arange(7), (300, 3, 7)).copy()
+    index[..., 6] = rng.integers(6, count + 1, (300, 3))
+    factor, parameters = rng.normal(size=index.shape), rng.normal(size=count)
+    by, values = rng.normal(size=(300, 1)), rng.normal(size=(300, 3))
+    place = rng.integers(0, places, (300, 3))
+
+    def check(terms, factor):
+        dense = np.zeros((900, count + 1))
+        np.put_along_axis(dense, index.reshape(900, 7), factor.reshape(900, 7), 1)
+        dense = dense[:, :count]
+        at_places = (place.ravel() == np.arange(places)[:, None]) * values.ravel()
+        close = functools.partial(np.testing.assert_allclose, rtol=0, atol=1e-11)
+        close(terms.of(parameters), (dense @ parameters).reshape(300, 3))
+        close(terms.sums(values, place, places), at_places @ dense)
+        close(terms.total(values), dense.T @ values.ravel())
+        close(terms.products(values), dense.T @ (values.ravel()[:, None] * dense))
+
+    terms = matrices.Terms.of_index(index, factor, count)
+    check(terms, factor)
+    first = np.arange(7) < scaled
+    check(terms.scaled(by, scaled), np.where(first, by[:, :, None] * factor, factor))
 
 
 @pytest.mark.parametrize("case", ["exposures", "gammas", "neighbours err alike"])

@@ -72,10 +72,10 @@ class Terms:
     ) -> Terms:
         """Lay out terms by their parameters, `count` where there is none, and by their factors."""
         index, factor = (part.reshape(-1, part.shape[-1]) for part in (index, factor))
-        # One number for each combination.
-        keys = index @ (count + 1) ** np.arange(index.shape[1])
-        order = np.argsort(keys, kind="stable")
-        groups = np.split(order, np.flatnonzero(np.diff(keys[order])) + 1)
+        short = index.astype(np.min_scalar_type(count))  # sorted faster
+        order = np.lexsort(short.T)
+        differs = (short[order[1:]] != short[order[:-1]]).any(1)
+        groups = np.split(order, np.flatnonzero(differs) + 1)
         alike = (Alike(g, index[g[0]], factor[g].T.copy()) for g in groups if len(g))
         return cls(tuple(alike), count, len(index))
 
@@ -102,7 +102,8 @@ class Terms:
         for where, columns, factors in self.groups:
             here, weights = place[where], values[where]
             for column, factor in zip(columns, factors, strict=True):
-                total[column] += np.bincount(here, weights * factor, places)
+                # `bincount` would go through all places for each of many groups.
+                np.add.at(total[column], here, weights * factor)
         return total[:-1].T
 
     def total(self, values: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, " k"]:
