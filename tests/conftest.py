@@ -151,28 +151,22 @@ def run_command(capsys):
     return run
 
 
-@pytest.fixture
-def succeeded(run_command):
-    """Return a function from a command line that succeeds to what it printed."""
+def _ending_with(status):
+    """Return a fixture: a function from a command line to what it printed before that status."""
 
-    def run(*argv):
-        code, text = run_command(*argv)
-        assert code == 0, text
-        return text
+    @pytest.fixture
+    def ended(run_command):
+        def run(*argv):
+            code, text = run_command(*argv)
+            assert code == status, text
+            return text
 
-    return run
+        return run
+
+    return ended
 
 
-@pytest.fixture
-def refused(run_command):
-    """Return a function from a command line that cannot be followed to the message."""
-
-    def run(*argv):
-        code, text = run_command(*argv)
-        assert code == 2, text
-        return text
-
-    return run
+succeeded, refused = _ending_with(0), _ending_with(2)
 
 
 @pytest.fixture(scope="session")
