@@ -1,14 +1,14 @@
 """The same patch of surface in every view that shows a point.
 
-A pixel averages light over what it covers of a surface. The mean of a logarithm depends on how much
-is averaged, so that views which average different patches differ as if their exposures did: by
-0.002 EV along a drive over a matte road, always with one sign (BUILD_NOTES, "The same patch").
-So a point's patch is as large as its coarsest view demands, and lies on its surface: on the plane
-of its neighbours, or, where these tell no plane, facing each camera.
+A pixel averages the light of what it covers. The mean of a logarithm depends on how much is
+averaged, so two views that average different patches differ as if their exposures did. Along a
+drive over a matte road that made 0.002 EV and more, always with one sign (BUILD_NOTES, "The same
+patch"). So a point's patch is as large as its coarsest view demands. It lies on the plane of the
+point's neighbours; where these tell no plane, it faces each camera.
 
-A patch is described by the second moments of the surface that it averages, in m^2 of the plane,
-or by their inverse, for one pixel: a metric, in pixels squared per scene unit squared. Moments of
-pixels and of interpolation between them count as part of what a view averages.
+A patch is described by its second moments in squared scene units, along two directions of its
+plane. A pixel is described by a metric: squared pixels per squared scene unit. The blur of pixels
+and of interpolation counts as a part of what a view averages.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ PATCH, PATCH_SHARE = 3.0, 1 / 213
 # Second moments along each axis that sampling adds, pixels squared: of the pixel itself, and of
 # bilinear interpolation at places that are spread evenly.
 BLUR = 1 / 12 + 1 / 6
-# Neighbours that a normal is fitted to, the point itself included; and how flat they have to lie:
-# extent across their plane over the smaller one along it.
+# A normal is fitted to so many neighbours, the point itself included. They have to lie flat: their
+# extent across the plane is at most this share of the smaller one along it.
 NEIGHBOURS, FLAT = 9, 0.25
 # Samples along an axis of a patch are apart by no more pixels than this, if so many suffice.
 SPACING, SAMPLES = 2.0, (3, 6, 12)

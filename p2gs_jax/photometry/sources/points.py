@@ -130,11 +130,9 @@ def _slopes(
     across, down = (np.gradient(places.astype(np.float64), axis=axis) for axis in (1, 0))
     normals = np.cross(across, down)
     size = np.linalg.norm(normals, axis=2, keepdims=True)
-    near = cv2.erode(depth, np.ones((3, 3)))
-    jump = cv2.dilate(depth, np.ones((3, 3))) - near > DEPTH_TOLERANCE * depth
-    return np.where(
-        ((near <= 0) | jump)[..., None] | (size <= 0), np.nan, normals / np.where(size > 0, size, 1)
-    )
+    near, far = cv2.erode(depth, np.ones((3, 3))), cv2.dilate(depth, np.ones((3, 3)))
+    lost = (near <= 0) | (far - near > DEPTH_TOLERANCE * depth) | (size[..., 0] <= 0)
+    return np.where(lost[..., None], np.nan, normals / np.where(size > 0, size, 1))
 
 
 def thinned(

@@ -93,17 +93,14 @@ def _between(linear: Float32[np.ndarray, "h w 3"], position: np.ndarray) -> np.n
 
 def _steepness(light: np.ndarray, position: np.ndarray) -> np.ndarray:
     """Return the RMS of how display values of patches move along x and y, per pixel."""
-    change, way = (np.stack([_across(v), _across(v.swapaxes(1, 2))], 1) for v in (light, position))
-    # Display values of both ends of a patch, and their distance.
-    gradient = (
-        np.linalg.pinv(way[:, :, 0] - way[:, :, 1]) @ np.diff(srgb_encode(change), axis=2)[:, :, 0]
-    )
-    return np.sqrt((gradient**2).sum(1))
+    seen, at = (np.stack([_ends(v), _ends(v.swapaxes(1, 2))], 1) for v in (light, position))
+    rise, way = (np.diff(v, axis=2)[:, :, 0] for v in (srgb_encode(seen), at))
+    return np.sqrt(((np.linalg.pinv(way) @ rise) ** 2).sum(1))
 
 
-def _across(values: np.ndarray) -> np.ndarray:
-    """Return the means of the last and the first samples along a side of patches [g a b c]."""
-    return np.stack([values[:, -1].mean(1), values[:, 0].mean(1)], 1)
+def _ends(values: np.ndarray) -> np.ndarray:
+    """Return the means of the first and the last samples along a side of patches [g a b c]."""
+    return np.stack([values[:, 0].mean(1), values[:, -1].mean(1)], 1)
 
 
 def point_colors(
