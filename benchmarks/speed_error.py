@@ -15,8 +15,8 @@ from benchmarks.gate import ACCURACY, METRICS, Rows
 from benchmarks.oracle import errors, truth, untruncated
 from benchmarks.scenes import BenchScene, street
 from p2gs_jax.config import RenderConfig
-from p2gs_jax.render import render_linear, required_capacity
-from p2gs_jax.render.capacity import bucket
+from p2gs_jax.render import render_linear
+from p2gs_jax.render.capacity import bucket, count_needed
 from p2gs_jax.render.xla_cpu import compiler_options
 
 REFERENCE = "reference workload"
@@ -144,7 +144,7 @@ def programs(scene: BenchScene, variant: Variant, base: RenderConfig, weights: n
     """
     cfg = dataclasses.replace(base, **dict(variant.changes))
     gaussians, alive = scene.gaussians, jnp.ones(scene.gaussians.capacity, bool)
-    need = int(required_capacity(gaussians, alive, scene.camera, cfg))
+    need = int(count_needed(gaussians, alive, scene.camera, cfg=cfg))
     capacity = bucket(need)
 
     def linear(g):

@@ -9,6 +9,7 @@ core's cache (BUILD_NOTES, "The step costs what a view shows").
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -148,6 +149,16 @@ def slice_of(tree, block: Int[Array, ""] | int, size: int):
     return jax.tree.map(lambda a: lax.dynamic_slice_in_dim(a, block * size, size), tree)
 
 
+def over_blocks(body: Callable, used: Int[Array, ""], size: int, length: int, start):
+    """Return the state after `body(block, state)` for every block that holds listed rows.
+
+    One block that holds all rows is no loop: its dynamic count would be read by the host.
+    """
+    if size == length:
+        return body(jnp.int32(0), start)
+    return lax.fori_loop(0, -(-used // size), body, start)
+
+
 def splat(
     gaussians: Gaussians,
     alive: Bool[Array, " v"],
@@ -199,5 +210,4 @@ def splat_listed(
     blank = jax.tree.map(
         lambda s: jnp.zeros((length, *s.shape[1:]), s.dtype), jax.eval_shape(block, jnp.int32(0))
     )
-    used = jnp.minimum(count, length)
-    return lax.fori_loop(0, -(-used // size), body, blank)
+    return over_blocks(body, jnp.minimum(count, length), size, length, blank)

@@ -1,6 +1,7 @@
 """Idioms that XLA's CPU backend compiles well, each measured (BUILD_NOTES, "The kernel").
 
-None of them changes a result; on other backends they are harmless.
+None of them changes a result. On other backends they leave nothing in a program: there, a
+conditional or a loop with a dynamic count stops the device until the host has read a flag.
 """
 
 from __future__ import annotations
@@ -64,6 +65,8 @@ def materialize(always: Bool[Array, ""], compute):
     each consumer (1155 against 421 CPU ms, docs/kernel.md); a conditional survives. `always` is
     true, but computed from data, so that XLA cannot know: `opaque_true`.
     """
+    if jax.default_backend() != "cpu":
+        return compute()
     shapes = jax.eval_shape(compute)
     return lax.cond(
         always, compute, lambda: jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)

@@ -17,14 +17,21 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Bool, Float, Int, UInt32
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.streams import noise_key
 from p2gs_jax.gaussians.mcmc import exploration_noise
 from p2gs_jax.render.harmonics import coefficient_count
-from p2gs_jax.render.visible import block_size, owners_at, put_rows, slice_of, splat, take_rows
+from p2gs_jax.render.visible import (
+    block_size,
+    over_blocks,
+    owners_at,
+    put_rows,
+    slice_of,
+    splat,
+    take_rows,
+)
 from p2gs_jax.train import optimizer as optimizers
 from p2gs_jax.train.image_gradient import ImageGradient, differentiable
 from p2gs_jax.train.state import FAULT_NONE, FAULT_NONFINITE, FAULT_OVERFLOW, Fault, FitState
@@ -195,7 +202,7 @@ def update_listed(
 
     start = Updated(gaussians, moments, jnp.ones(len(jax.tree.leaves(gaussians)), bool))
     used = jnp.minimum(count, ids.shape[0])
-    return lax.fori_loop(0, -(-used // size), body, start)
+    return over_blocks(body, used, size, ids.shape[0], start)
 
 
 def is_healthy(state: FitState, gradient: ImageGradient, fits: Array) -> Bool[Array, ""]:
