@@ -42,7 +42,8 @@ CFG = dataclasses.replace(RenderConfig(), blur=0.3, radiance="linear")
 
 def milliseconds(job: Callable[[], Any], wait: Callable[[Any], Any], repeats: int = 7) -> float:
     """Return the median time of a job that keeps the device busy, ten calls at a time."""
-    wait(job())
+    out = job()
+    wait(out)
     times = []
     for _ in range(repeats):
         start = time.perf_counter()
@@ -58,8 +59,8 @@ def beside(scene: BenchScene, weights: np.ndarray) -> tuple[Callable, Callable, 
 
     Backward gives the image (H, W, 3) and the gradient as `Gaussians` of NumPy arrays.
     """
-    import gsplat
-    import torch
+    import gsplat  # pyright: ignore[reportMissingImports]
+    import torch  # pyright: ignore[reportMissingImports]
 
     names = [f.name for f in dataclasses.fields(Gaussians) if f.name != "vibration"]
     leaves = {
@@ -118,8 +119,9 @@ def measured(count: int, error: bool) -> dict[str, Any]:
         found["gsplat"] = image.detach().cpu().numpy().astype(np.float64), Gaussians(*arrays)
     except ImportError as missing:
         row["gsplat"] = f"not measured: {missing}"
-    for name, pair in found.items() if exact is not None else ():
-        row[f"{name} errors"] = errors(*pair, exact) | trimmed_errors(*pair, exact)
+    if exact is not None:
+        for name, pair in found.items():
+            row[f"{name} errors"] = errors(*pair, exact) | trimmed_errors(*pair, exact)
     return row
 
 

@@ -52,8 +52,8 @@ def empty_gaussians(count: int, like: Gaussians) -> Gaussians:
     )
 
 
-# Time of a step, seconds per pixel (ours; two cores of 2025).
-STEP_SECONDS_PER_PIXEL = 5e-7
+# Time of a step, seconds per pixel, and at least: two cores of 2025; an H200 (2026-11-26).
+STEP_SECONDS = {"cpu": (5e-7, 0.0), "gpu": (4e-9, 4e-3)}
 # Gaussians shown per pixel of a view: from the first to the second with the steps of a run (ours:
 # BUILD_NOTES, "Population").
 SMALLEST_SHARE, LARGEST_SHARE, STEPS_PER_SHARE = 0.1, 0.3, 15_000
@@ -72,6 +72,12 @@ class Coverage(NamedTuple):
         return int(share * self.pixels / self.shown)
 
 
+def step_seconds(pixels: int) -> float:
+    """Return about how long a step takes on the default device for a view of so many pixels."""
+    each, least = STEP_SECONDS.get(jax.default_backend(), STEP_SECONDS["cpu"])
+    return max(each * pixels, least)
+
+
 def default_max_gaussians(seeds: int, coverage: Coverage, train: TrainConfig) -> int:
     """Return the population limit where none is configured.
 
@@ -80,7 +86,7 @@ def default_max_gaussians(seeds: int, coverage: Coverage, train: TrainConfig) ->
     """
     steps = train.steps
     if train.budget_s is not None:
-        steps = train.budget_s / (STEP_SECONDS_PER_PIXEL * coverage.pixels)
+        steps = train.budget_s / step_seconds(coverage.pixels)
     wanted = min(coverage.gaussians(steps), MOST_BY_DEFAULT)
     return max(int(1.25 * seeds), wanted, 1000)
 

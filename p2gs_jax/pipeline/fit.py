@@ -27,11 +27,17 @@ from p2gs_jax.photometry.parameters import recentre
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.pipeline.exposures import kept_choice, likely, solve_exposures, with_choice
 from p2gs_jax.pipeline.finish import Account, finish, seconds_to_finish
-from p2gs_jax.pipeline.preflight import Paths, check_run_dir, check_scene, memory_named, preflight
+from p2gs_jax.pipeline.preflight import (
+    Paths,
+    check_run_dir,
+    check_scene,
+    memory_named,
+    preflight,
+    suited,
+)
 from p2gs_jax.pipeline.prepare import Prepared, expected, initialise
 from p2gs_jax.pipeline.survey import Survey, load, survey
 from p2gs_jax.presets import require_config, with_values
-from p2gs_jax.render.tiles import slow_here
 from p2gs_jax.run.checkpoint import saved_steps
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.run.folder import RunFolder, locked
@@ -106,7 +112,12 @@ def fit(
         kept = kept_choice(cfg, folder) if resume else None
         # A run that goes on for longer starts from what it was begun with.
         asked = with_values(cfg, first_plan(folder))
+        render, note = suited(asked.render)
+        asked = dataclasses.replace(asked, render=render)
         start = _prepared(scene, asked, folder, optimiser, kept, clock, reporter)
+        if note is not None:
+            start.notes.append(note)
+            reporter.message(note)
         start.cfg = dataclasses.replace(start.cfg, train=cfg.train)
         lock.require()
         left_s = seconds_to_finish(scene, cfg, weights, reference=truth is not None)
@@ -197,10 +208,6 @@ class Optimiser:
         What the steps have to say is noted in `start` as well. Of the budget, `spent_s` seconds are
         gone and `finish_s` are kept for evaluation and files.
         """
-        slow = None if start.cfg.render.implementation else slow_here()
-        if slow is not None:
-            start.notes.append(slow)
-            self._reporter.message(slow)
         alive = np.ones(start.params.gaussians.capacity, bool)
         params, how = self._own.among(start.params), {"spent_s": spent_s, "finish_s": finish_s}
         trainer = self._trainer(start, self._reporter)

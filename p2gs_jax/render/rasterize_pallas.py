@@ -25,12 +25,15 @@ from jax.experimental.pallas import triton as plt
 from p2gs_jax.render.binning import longest_first
 from p2gs_jax.render.tiles import DARKEST, GEOMETRY, Plan, geometry_gradient
 
-# Entries whose rows are loaded together; the stop rule is looked at once for each such group.
-UNROLL = 4
+# Entries whose rows are loaded together, forward and backward; the stop rule is looked at once for
+# each such group (H200, 2026-11-26: fastest of 2, 4, 8).
+UNROLL, UNROLL_BACK = 4, 2
 # Pixels per thread: sums over a tile cost a shuffle per halving of the threads, and nothing
 # within a thread. One warp per 128 pixels also needs no shared memory to sum.
 PIXELS_PER_THREAD = 4
-# Gradient columns, padded to what one vectorised atomic addition of a block takes.
+# Gradient columns that one vectorised atomic addition takes, a power of two; the rest go singly.
+TOGETHER = 8
+# Columns of an entry where gradients are stored.
 COLUMNS = 16
 # Gaussians that one block of the ordered sum owns.
 SUMMED = 32
@@ -62,13 +65,13 @@ class _Tile:
         self.x = (pixel % tile_x).astype(jnp.float32) - (tile_x - 1) / 2
         self.y = (pixel // tile_x).astype(jnp.float32) - (tile_y - 1) / 2
 
-    def load(self, rows_ref, ids_ref, position, end) -> list[list]:
-        """Return id and row of the next `UNROLL` entries, the dummy's beyond the end."""
+    def load(self, rows_ref, ids_ref, position, end, count: int) -> list[list]:
+        """Return id and row of the next `count` entries, the dummy's beyond the end."""
         ids = [
             jnp.where(
                 position + c < end, ids_ref[jnp.minimum(position + c, end - 1)], self.plan.gaussians
             )
-            for c in range(UNROLL)
+            for c in range(count)
         ]
         return [[i, *(rows_ref[i, k] for k in range(rows_ref.shape[1]))] for i in ids]
 
@@ -98,7 +101,7 @@ def _forward_kernel(rows, ids, offsets, order, brightest, *outputs, plan: Plan):
 
     def body(state):
         position, _, transmittance, *channels = state
-        for _, *row in pixels.load(rows, ids, position, end):
+        for _, *row in pixels.load(rows, ids, position, end, UNROLL):
             weight = pixels.alpha(row, pixels.center(row)) * transmittance
             channels = [a + weight * row[GEOMETRY + k] for k, a in enumerate(channels)]
             transmittance = transmittance - weight
@@ -149,6 +152,14 @@ def forward(rows, ids, offsets, plan: Plan):
     return tuple(image), (offsets, stops)
 
 
+def _row(values, width: int):
+    """Return scalars as one vector, zeros behind them."""
+    column, row = lax.broadcasted_iota(jnp.int32, (width,), 0), jnp.zeros(width, jnp.float32)
+    for k, value in enumerate(values):
+        row = jnp.where(column == k, value, row)
+    return row
+
+
 def _backward_kernel(rows, ids, offsets, stops, order, *arrays, plan: Plan):
     """Walk a tile; `arrays` are the image, its gradient, the blank output and the output."""
     channels = plan.channels
@@ -159,12 +170,11 @@ def _backward_kernel(rows, ids, offsets, stops, order, *arrays, plan: Plan):
     start, end = offsets[tile], stops[tile]
     v_out = [v[tile, :] for v in v_image]
     light = sum(a[tile, :] * v for a, v in zip(image, v_out, strict=True))
-    column = lax.broadcasted_iota(jnp.int32, (COLUMNS,), 0)
     x, y = pixels.x, pixels.y
 
     def body(state):
         position, transmittance, remaining = state
-        for c, (gaussian, *row) in enumerate(pixels.load(rows, ids, position, end)):
+        for c, (gaussian, *row) in enumerate(pixels.load(rows, ids, position, end, UNROLL_BACK)):
             center = pixels.center(row)
             alpha = pixels.alpha(row, center)
             weight = alpha * transmittance
@@ -178,16 +188,16 @@ def _backward_kernel(rows, ids, offsets, stops, order, *arrays, plan: Plan):
                 *geometry_gradient(moments, row[2:5], center, plan.exponent_scale),
                 *(jnp.sum(weight * v_out[k]) for k in range(channels)),
             )
-            values = jnp.zeros(COLUMNS, jnp.float32)
-            for k, value in enumerate(gradient):
-                values = jnp.where(column == k, value, values)
             if plan.cfg.deterministic:
                 # Entries beyond the end write to the place behind the list.
                 place = jnp.where(position + c < end, position + c, target.shape[0] - 1)
-                target[place, :] = values
+                target[place, :] = _row(gradient, COLUMNS)
             else:
-                plt.atomic_add(target, (gaussian, slice(None)), values)
-        return jnp.minimum(position + UNROLL, end), transmittance, remaining
+                together = _row(gradient[:TOGETHER], TOGETHER)
+                plt.atomic_add(target, (gaussian, pl.ds(0, TOGETHER)), together)
+                for k, value in enumerate(gradient[TOGETHER:], TOGETHER):
+                    plt.atomic_add(target, (gaussian, jnp.int32(k)), value)
+        return jnp.minimum(position + UNROLL_BACK, end), transmittance, remaining
 
     state = (start, jnp.ones(plan.pixels, jnp.float32), light)
     lax.while_loop(lambda s: s[0] < end, body, state)

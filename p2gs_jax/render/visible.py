@@ -99,7 +99,8 @@ def compact(seen: Bool[Array, " n"], room: int) -> tuple[Int[Array, " v"], Int[A
     n = seen.shape[0]
     # One more place than `room` receives what does not fit.
     blank = jnp.full(room + 1, n, jnp.int32)
-    count, ids = lax.platform_dependent(seen, blank, cpu=_list, default=_list_in_parallel)
+    listed = _list if jax.default_backend() == "cpu" else _list_in_parallel
+    count, ids = listed(seen, blank)
     used = jnp.arange(room, dtype=jnp.int32) < count
     return jnp.where(used, ids[:room], n), count
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Hashable, Sequence
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -26,6 +26,19 @@ Tree = TypeVar("Tree")
 
 # Observations that a step compares.
 PAIRS_PER_STEP = 4096
+# Share of a GPU's memory that photographs of one level may take; others are uploaded in every step.
+RESIDENT = 0.25
+
+
+# Pixels, mask, and alpha where there is one.
+Photograph = tuple[Any, Any, Any]
+
+
+def device_bytes() -> int:
+    """Return the memory of the default device; 0 where that is the host's, or nobody tells."""
+    if jax.default_backend() == "cpu":
+        return 0
+    return (jax.devices()[0].memory_stats() or {}).get("bytes_limit", 0)
 
 
 class TrainingViews:
@@ -45,6 +58,8 @@ class TrainingViews:
         self.store, self.rows = store, tuple(rows)
         self.seed, self.measured = seed, measured
         self._batches = functools.lru_cache(4)(self._epoch)
+        self._room = RESIDENT * device_bytes()
+        self._resident: dict[tuple[int, int], Photograph] = {}
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -69,24 +84,37 @@ class TrainingViews:
         return (index + int(rng.integers(1, max(count, 2)))) % count
 
     def prefetch(self, index: int, shrink: int) -> None:
-        """Begin decoding a view in the background."""
-        self.store.prefetch(self.rows[index], shrink)
+        """Begin decoding a view in the background, unless it is on the device."""
+        if (self.rows[index], shrink) not in self._resident:
+            self.store.prefetch(self.rows[index], shrink)
 
     def camera(self, index: int, shrink: int) -> Camera:
         """Return the camera of a training view at a level, on the host."""
         row = self.rows[index]
         return on_host(Camera, *self.store.camera(row, shrink), self.store.placement(row))
 
-    def batch(self, index: int, shrink: int, step: int = 0) -> Batch:
+    def batch(self, index: int, shrink: int, step: int = 0, kept: bool = True) -> Batch:
         """Return a training view, on the host: a compiled step takes it from there.
 
-        `step` draws the background, where every step has another.
+        On a GPU pixels that are `kept` stay on the device, as long as those of a level find room
+        there. `step` draws the background, where every step has another.
         """
-        row = self.rows[index]
-        ldr, mask = self.store.stored(row, shrink)
+        ldr, mask, alpha = self._photograph(self.rows[index], shrink, kept)
         measured = None if self.measured is None else self.measured[index]
         given = (self.camera(index, shrink), ldr, mask, np.int32(index), measured)
-        return on_host(Batch, *given, self.store.alpha(row, shrink), self._backdrop(step))
+        return on_host(Batch, *given, alpha, self._backdrop(step))
+
+    def _photograph(self, row: int, shrink: int, kept: bool) -> Photograph:
+        """Return the pixels, mask and alpha of a view as they are stored."""
+        if (row, shrink) in self._resident:
+            return self._resident[row, shrink]
+        pixels = (*self.store.stored(row, shrink), self.store.alpha(row, shrink))
+        if any(level != shrink for _, level in self._resident):
+            self._resident.clear()
+        size = sum(a.nbytes for a in jax.tree.leaves((pixels, self._resident)))
+        if kept and size <= self._room:
+            pixels = self._resident[row, shrink] = jax.device_put(pixels)
+        return pixels
 
     def _backdrop(self, step: int) -> Float32[np.ndarray, " 3"] | None:
         if not self.store.random_backdrop:
@@ -164,8 +192,9 @@ def inputs_at(
     `pairs` are corresponding observations, where the relative-exposure loss compares photographs.
     """
     rows = views.indices_at(step, cfg.train.batch)
+    kept = len(rows) == 1  # several are stacked on the host
     each = [
-        (views.batch(row, shrink, step + k), partner_at(step + k, row, views, pairs, cfg))
+        (views.batch(row, shrink, step + k, kept), partner_at(step + k, row, views, pairs, cfg))
         for k, row in enumerate(rows)
     ]
     if len(each) == 1:

@@ -25,7 +25,7 @@ from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.progress import LogRecord
 from p2gs_jax.core.runtime import return_freed_memory
 from p2gs_jax.errors import DivergenceError
-from p2gs_jax.gaussians.population import STEP_SECONDS_PER_PIXEL, Coverage
+from p2gs_jax.gaussians.population import Coverage, step_seconds
 from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.train import room, schedule, strategies
@@ -141,7 +141,7 @@ class Trainer:
         state, host = self.records.begin(state, planned, resume) or (state, host)
         # Planned for longer, a run has room for more Gaussians.
         state = grow_state(state, self.slots.slots)
-        full_step_s = STEP_SECONDS_PER_PIXEL * self.coverage.pixels
+        full_step_s = step_seconds(self.coverage.pixels)
         seconds = {"spent_s": spent_s, "finish_s": finish_s, "full_step_s": full_step_s}
         clock = RunClock(self.cfg.train, host, **seconds, now=self.now)
         population = state.population

@@ -32,6 +32,7 @@ def record_of(
     `reports` are those of its steps, `host` and `gaussians` the counters and the population after
     it. `left_s` are the seconds that optimisation still takes, about; None: not known yet.
     """
+    reports = jax.device_get(list(reports))  # at once: each read of its own is a round trip
     last = reports[-1]
     return LogRecord(
         step=host.step,

@@ -1,6 +1,7 @@
 """One step in blocks is one Adam update of the loss; what cannot be taken changes nothing."""
 
 import dataclasses
+import functools
 from types import SimpleNamespace
 
 import chex
@@ -12,8 +13,10 @@ import pytest
 from noise_views import DEGREE, EXTENT, HEIGHT, WIDTH, config, start, view
 
 from p2gs_jax.presets import with_values
+from p2gs_jax.render import rasterize_pallas, tiles
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.render.visible import BLOCK, in_view, splat
+from p2gs_jax.train import step as steps
 from p2gs_jax.train.exposure_loss import Partner
 from p2gs_jax.train.image_gradient import image_loss
 from p2gs_jax.train.optimizer import learning_rates, make_optimizer
@@ -63,8 +66,8 @@ def made():
     room = tight.grown(int(fault.needed), int(fault.visible))
     seen = np.asarray(in_view(params.gaussians, alive, batch.camera, CFG.render))
     expected = {"gradient": gradient, "probe": probe, "loss": float(loss), "seen": seen}
-    steps = {"tight": tight, "refused": refused, "room": room, "step": step, "after": step(room)}
-    return SimpleNamespace(params=params, alive=np.asarray(alive), **expected, **steps)
+    given = {"tight": tight, "refused": refused, "room": room, "step": step, "after": step(room)}
+    return SimpleNamespace(params=params, alive=np.asarray(alive), **expected, **given)
 
 
 def rows_of(tree, name, rows):
@@ -198,3 +201,33 @@ def test_the_first_that_is_not_finite_is_named(made, field, named):
     if field == "sh":
         fresh = initial_state(params, jnp.asarray(made.alive), make_optimizer(CFG))
         chex.assert_trees_all_equal(dataclasses.replace(state, fault=fresh.fault), fresh)
+
+
+class ForCuda:
+    """A program that is lowered for NVIDIA GPUs."""
+
+    def __init__(self, name, **static):
+        self.jitted = jax.jit(functools.partial(steps.PROGRAMS[name], **static))
+
+    def lower(self, *args):
+        return self.jitted.trace(*args).lower(lowering_platforms=("cuda",))
+
+    def eval_shape(self, *args):
+        return self.jitted.eval_shape(*args)
+
+
+@pytest.mark.parametrize("name", list(steps.PROGRAMS))
+def test_a_step_on_a_gpu_never_waits_for_the_host(monkeypatch, name):
+    """XLA's GPU runtime stops at conditionals and loops until the host has read a flag."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(rasterize_pallas, "_interpreted", lambda: False)
+    monkeypatch.setattr(tiles, "fastest_here", lambda: "pallas")
+    monkeypatch.setattr(steps, "compiled", ForCuda)
+    params, optimizer = start(), make_optimizer(CFG)
+    state = initial_state(params, np.ones(params.gaussians.capacity, bool), optimizer)
+    step, room = Step(CFG, optimizer, EXTENT, noise=1.0), Room(4096, BLOCK)
+    lowered = step.lowered(name, state, *view(0), CONTROLS, room=room, degree=DEGREE)
+    text = lowered.as_text()
+    assert "stablehlo" in text
+    for waits in ("stablehlo.case", "stablehlo.if", "stablehlo.while", "callback"):
+        assert waits not in text, waits

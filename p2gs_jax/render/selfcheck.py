@@ -1,0 +1,93 @@
+"""Whether the rasterizer that runs here is right: image and gradient against float64.
+
+Three scenes of one shape, so that one program checks them: a crowd, needles, and radiance over
+thirteen stops. A kernel for a GPU is compiled by that machine's libraries, which no test has seen.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import p2gs_jax.render as rendering
+from p2gs_jax.config import RenderConfig
+from p2gs_jax.core.numerics import on_host
+from p2gs_jax.render.xla_cpu import compiler_options
+from p2gs_jax.types import Camera, Gaussians
+
+WIDTH, HEIGHT, COUNT, ENTRIES = 32, 24, 64, 1024
+# Largest errors: of the image over its brightest value, of gradients in the relative L2 norm. The
+# stop rule explains 5e-4 and 5e-3, a wrong kernel is off by everything.
+IMAGE, GRADIENT = 1e-3, 1e-2
+
+
+class SelfCheck(NamedTuple):
+    """The largest errors that were found; NaN where a value was not finite."""
+
+    image: float
+    gradient: float
+
+    @property
+    def fault(self) -> str | None:
+        """What is wrong, in words; None where nothing is."""
+        if not self.image <= IMAGE:
+            return f"the image is wrong by {self.image:.0e} of its brightest value"
+        if not self.gradient <= GRADIENT:
+            return f"the gradient is wrong by {self.gradient:.0e}"
+        return None
+
+
+def scenes() -> Iterator[Gaussians]:
+    """Yield Gaussians that are hard for a rasterizer, in front of `camera`; float64."""
+    rng = np.random.default_rng(0)
+    for needle, stops in ((1.0, 2.0), (5.0, 2.0), (1.0, 13.0)):
+        z = rng.uniform(2, 9, COUNT)
+        aside = rng.uniform(-0.6, 0.6, (COUNT, 2)) * z[:, None]
+        scales = np.log(0.06 * z)[:, None] + rng.normal(0, 0.4, (COUNT, 3))
+        scales[:, 0] += needle
+        light = np.log(2) * stops * rng.uniform(-0.5, 0.5, (COUNT, 1, 3))
+        quats, logits = rng.normal(size=(COUNT, 4)), rng.normal(0, 2, COUNT)
+        yield on_host(Gaussians, np.c_[aside, z], quats, scales, logits, light)
+
+
+def _checked(gaussians: Gaussians, kind: np.dtype, cfg: RenderConfig):
+    """Return image and gradient of its weighted sum, in a precision."""
+    gaussians = jax.tree.map(lambda a: jnp.asarray(a, kind), gaussians)
+    K = np.array([[WIDTH, 0, WIDTH / 2], [0, WIDTH, HEIGHT / 2], [0, 0, 1]])
+    camera = Camera(jnp.eye(4, dtype=kind), jnp.asarray(K, kind), WIDTH, HEIGHT)
+    weights = jnp.asarray(np.random.default_rng(1).normal(size=(HEIGHT, WIDTH, 3)), kind)
+    alive = jnp.ones(COUNT, bool)
+
+    def loss(g):
+        image = rendering.render_linear(g, alive, camera, cfg, ENTRIES).linear
+        return jnp.sum(weights * image), image
+
+    return jax.grad(loss, has_aux=True)(gaussians)
+
+
+def self_check(cfg: RenderConfig | None = None) -> SelfCheck:
+    """Compare the rasterizer of `cfg` with the float64 reference, in seconds of compiling."""
+    cfg = RenderConfig() if cfg is None else cfg
+    exact_cfg = RenderConfig(implementation="reference", alpha_cutoff=cfg.alpha_cutoff)
+    program = functools.partial(jax.jit, compiler_options=compiler_options())
+    own = program(lambda g: _checked(g, np.dtype(np.float32), cfg))
+    reference = jax.jit(lambda g: _checked(g, np.dtype(np.float64), exact_cfg))
+    image_errors, gradient_errors = [], []
+    for scene in scenes():
+        gradient, image = jax.tree.map(np.asarray, own(_single(scene)))
+        with jax.enable_x64(True):
+            exact = reference(scene)
+        true_gradient, true_image = jax.tree.map(np.asarray, exact)
+        image_errors.append(np.abs(image - true_image).max() / true_image.max())
+        for a, b in zip(*map(jax.tree.leaves, (gradient, true_gradient)), strict=True):
+            gradient_errors.append(np.linalg.norm(a - b) / np.linalg.norm(b))
+    return SelfCheck(float(np.max(image_errors)), float(np.max(gradient_errors)))
+
+
+def _single(gaussians: Gaussians) -> Gaussians:
+    return jax.tree.map(lambda a: np.asarray(a, np.float32), gaussians)
