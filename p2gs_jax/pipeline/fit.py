@@ -218,10 +218,12 @@ class Optimiser:
             start.notes.append(text)
             reporter.message(text)
 
-        rows, seed = start.scene.train_indices, start.cfg.train.seed
+        rows, train = start.scene.train_indices, start.cfg.train
         return Trainer(
             start.cfg,
-            TrainingViews(start.fitted, rows, seed, start.measured),
+            TrainingViews(
+                start.fitted, rows, train.seed, start.measured, resident=train.batch == 1
+            ),
             start.extent,
             start.pairs,
             start.coverage,

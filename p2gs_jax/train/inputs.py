@@ -45,7 +45,8 @@ class TrainingViews:
     """Photographs of the training views at any level of the coarse-to-fine schedule.
 
     `rows` are rows in the scene, in the order of `Photometry`; `seed` decides the order of every
-    epoch; `measured` are the depths that the loss compares each view with, or None.
+    epoch; `measured` are the depths that the loss compares each view with, or None. A step of
+    several views stacks their photographs on the host, where they must not be `resident`.
     """
 
     def __init__(
@@ -54,11 +55,12 @@ class TrainingViews:
         rows: Sequence[int],
         seed: int,
         measured: Sequence[Measured] | None = None,
+        resident: bool = True,
     ):
         self.store, self.rows = store, tuple(rows)
         self.seed, self.measured = seed, measured
         self._batches = functools.lru_cache(4)(self._epoch)
-        self._room = RESIDENT * device_bytes()
+        self._room = RESIDENT * device_bytes() if resident else 0
         self._resident: dict[tuple[int, int], Photograph] = {}
 
     def __len__(self) -> int:
@@ -93,18 +95,18 @@ class TrainingViews:
         row = self.rows[index]
         return on_host(Camera, *self.store.camera(row, shrink), self.store.placement(row))
 
-    def batch(self, index: int, shrink: int, step: int = 0, kept: bool = True) -> Batch:
+    def batch(self, index: int, shrink: int, step: int = 0) -> Batch:
         """Return a training view, on the host: a compiled step takes it from there.
 
-        On a GPU pixels that are `kept` stay on the device, as long as those of a level find room
-        there. `step` draws the background, where every step has another.
+        On a GPU the pixels stay on the device, as long as those of a level find room there. `step`
+        draws the background, where every step has another.
         """
-        ldr, mask, alpha = self._photograph(self.rows[index], shrink, kept)
+        ldr, mask, alpha = self._photograph(self.rows[index], shrink)
         measured = None if self.measured is None else self.measured[index]
         given = (self.camera(index, shrink), ldr, mask, np.int32(index), measured)
         return on_host(Batch, *given, alpha, self._backdrop(step))
 
-    def _photograph(self, row: int, shrink: int, kept: bool) -> Photograph:
+    def _photograph(self, row: int, shrink: int) -> Photograph:
         """Return the pixels, mask and alpha of a view as they are stored."""
         if (row, shrink) in self._resident:
             return self._resident[row, shrink]
@@ -112,7 +114,7 @@ class TrainingViews:
         if any(level != shrink for _, level in self._resident):
             self._resident.clear()
         size = sum(a.nbytes for a in jax.tree.leaves((pixels, self._resident)))
-        if kept and size <= self._room:
+        if size <= self._room:
             pixels = self._resident[row, shrink] = jax.device_put(pixels)
         return pixels
 
@@ -192,9 +194,8 @@ def inputs_at(
     `pairs` are corresponding observations, where the relative-exposure loss compares photographs.
     """
     rows = views.indices_at(step, cfg.train.batch)
-    kept = len(rows) == 1  # several are stacked on the host
     each = [
-        (views.batch(row, shrink, step + k, kept), partner_at(step + k, row, views, pairs, cfg))
+        (views.batch(row, shrink, step + k), partner_at(step + k, row, views, pairs, cfg))
         for k, row in enumerate(rows)
     ]
     if len(each) == 1:
