@@ -112,12 +112,7 @@ def fit(
         kept = kept_choice(cfg, folder) if resume else None
         # A run that goes on for longer starts from what it was begun with.
         asked = with_values(cfg, first_plan(folder))
-        render, note = suited(asked.render)
-        asked = dataclasses.replace(asked, render=render)
         start = _prepared(scene, asked, folder, optimiser, kept, clock, reporter)
-        if note is not None:
-            start.notes.append(note)
-            reporter.message(note)
         start.cfg = dataclasses.replace(start.cfg, train=cfg.train)
         lock.require()
         left_s = seconds_to_finish(scene, cfg, weights, reference=truth is not None)
@@ -143,12 +138,18 @@ def _prepared(
     reporter: Reporter,
 ) -> Prepared:
     """Start exposures, radiances and Gaussians from what a scene offers."""
+    render, note = suited(cfg.render)
+    cfg = dataclasses.replace(cfg, render=render)
     with clock("photometry"):
         found = survey(scene, cfg, pixels=folder.pixels)
         how = {"on_chosen": optimiser.expect(found, kept), "dense": found.dense, "kept": kept}
         exposures = solve_exposures(scene, found.still, cfg, reporter, **how)
     with clock("seeds"):
-        return initialise(found, exposures, reporter)
+        start = initialise(found, exposures, reporter)
+    if note is not None:
+        start.notes.append(note)
+        reporter.message(note)
+    return start
 
 
 class Optimiser:
