@@ -31,9 +31,8 @@ UNROLL, UNROLL_BACK = 4, 2
 # Pixels per thread: sums over a tile cost a shuffle per halving of the threads, and nothing
 # within a thread. One warp per 128 pixels also needs no shared memory to sum.
 PIXELS_PER_THREAD = 4
-# Gradient columns that one vectorised atomic addition takes, a power of two; the rest go singly.
-TOGETHER = 8
-# Columns of an entry where gradients are stored.
+# Gradient columns, padded to what one vectorised atomic addition takes: eight together and the rest
+# singly took 0.8 ms more of 3.6.
 COLUMNS = 16
 # Gaussians that one block of the ordered sum owns.
 SUMMED = 32
@@ -152,9 +151,9 @@ def forward(rows, ids, offsets, plan: Plan):
     return tuple(image), (offsets, stops)
 
 
-def _row(values, width: int):
+def _row(values):
     """Return scalars as one vector, zeros behind them."""
-    column, row = lax.broadcasted_iota(jnp.int32, (width,), 0), jnp.zeros(width, jnp.float32)
+    column, row = lax.broadcasted_iota(jnp.int32, (COLUMNS,), 0), jnp.zeros(COLUMNS, jnp.float32)
     for k, value in enumerate(values):
         row = jnp.where(column == k, value, row)
     return row
@@ -188,15 +187,13 @@ def _backward_kernel(rows, ids, offsets, stops, order, *arrays, plan: Plan):
                 *geometry_gradient(moments, row[2:5], center, plan.exponent_scale),
                 *(jnp.sum(weight * v_out[k]) for k in range(channels)),
             )
+            values = _row(gradient)
             if plan.cfg.deterministic:
                 # Entries beyond the end write to the place behind the list.
                 place = jnp.where(position + c < end, position + c, target.shape[0] - 1)
-                target[place, :] = _row(gradient, COLUMNS)
+                target[place, :] = values
             else:
-                together = _row(gradient[:TOGETHER], TOGETHER)
-                plt.atomic_add(target, (gaussian, pl.ds(0, TOGETHER)), together)
-                for k, value in enumerate(gradient[TOGETHER:], TOGETHER):
-                    plt.atomic_add(target, (gaussian, jnp.int32(k)), value)
+                plt.atomic_add(target, (gaussian, slice(None)), values)
         return jnp.minimum(position + UNROLL_BACK, end), transmittance, remaining
 
     state = (start, jnp.ones(plan.pixels, jnp.float32), light)

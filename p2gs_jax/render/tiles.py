@@ -220,7 +220,8 @@ def rasterize(
     Raises:
         ValueError: no such implementation, or one of tiles without a tile list.
     """
-    name = cfg.implementation or fastest_here()
+    # The kernels for GPUs know single precision only.
+    name = cfg.implementation or (fastest_here() if radiance.dtype == jnp.float32 else "xla")
     if name == "reference":
         linear, alpha, depth = rasterize_reference(splats, radiance, width, height, cfg)
         return linear, alpha, depth if with_depth else None

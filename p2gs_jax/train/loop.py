@@ -10,6 +10,7 @@ their sums repeat (`RenderConfig.deterministic`).
 from __future__ import annotations
 
 import functools
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -141,7 +142,9 @@ class Trainer:
         state, host = self.records.begin(state, planned, resume) or (state, host)
         # Planned for longer, a run has room for more Gaussians.
         state = grow_state(state, self.slots.slots)
-        full_step_s = step_seconds(self.coverage.pixels)
+        # On GPUs the host decides the pace of short steps, which tells nothing of evaluation.
+        here = jax.default_backend() == "cpu"
+        full_step_s = step_seconds(self.coverage.pixels) if here else math.inf
         seconds = {"spent_s": spent_s, "finish_s": finish_s, "full_step_s": full_step_s}
         clock = RunClock(self.cfg.train, host, **seconds, now=self.now)
         population = state.population

@@ -50,6 +50,10 @@ def test_views_batch_and_the_ordered_sum_is_the_atomic_one():
     assert largest_gap(v_a, v_b) < 1e-5
 
 
+@pytest.mark.skipif(
+    jax.__version_info__ >= (0, 11) and jax.default_backend() != "gpu",
+    reason="from JAX 0.11 on Pallas lowers only for a GPU that is there",
+)
 @pytest.mark.parametrize("deterministic", [False, True])
 def test_the_kernels_lower_to_triton(monkeypatch, deterministic):
     """Without a GPU the program for one can still be lowered: forward, backward, ordered sum."""
