@@ -6,6 +6,7 @@ import importlib.metadata
 import os
 import shutil
 import signal
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,6 +18,9 @@ from filelock import FileLock
 COMPILED = Path(__file__).parents[1] / ".pytest_cache" / "xla"
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(COMPILED))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+# Nor is Python compiled anew by every process of a test run.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 # The cache is cut to this between sessions: JAX's own bound looks at every file at every write.
 MOST_CACHED_GB = 2.0
 
@@ -33,6 +37,7 @@ def pytest_sessionstart(session):
 
 # What takes the longest begins first: at the end no process waits for another.
 LONGEST = (
+    *("train/test_presets", "faults/test_faults", "docs/test_code_blocks", "jobs/test_sweep"),
     *("pipeline/test_moving", "cli/test_against", "render/test_rasterize", "jobs/test_fit_blocks"),
     *("train/test_step_blocks", "gaussians/test_bake", "pipeline/test_cutouts"),
     *("pipeline/test_calibrate", "train/test_make_step"),
@@ -101,11 +106,13 @@ if "XLA_FLAGS" not in os.environ:
 
 
 def pytest_configure():
-    """Compile what asks for options of its own with the same effort, and for few sizes of lists."""
+    """Compile everything with the same effort, few sizes of lists and no copies of loops."""
     from p2gs_jax.render import capacity, xla_cpu
+    from p2gs_jax.synth import tracer
 
     xla_cpu._CPU_OPTIONS = EFFORT
     capacity.SMALLEST = 2**15
+    tracer._UNROLL = 1
 
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"

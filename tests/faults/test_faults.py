@@ -26,9 +26,8 @@ def test_the_fault_fits_the_code(fault):
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda f: f.name)
 def test_the_fault_is_noticed(fault, tmp_path):
-    ignored = shutil.ignore_patterns("__pycache__")
     for name in ("p2gs_jax", "tests"):
-        shutil.copytree(ROOT / name, tmp_path / name, ignore=ignored)
+        shutil.copytree(ROOT / name, tmp_path / name)
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
     path = tmp_path / "p2gs_jax" / fault.file
     text = path.read_text(encoding="utf-8")

@@ -145,8 +145,7 @@ def test_what_varies_is_found(exposures, curve, gamma, model, response):
         assert any("too little to tell the shape" in r for r in s.reasons)
 
 
-@pytest.mark.parametrize("cameras", [1, 3])
-@pytest.mark.parametrize("known", [2, None])
+@pytest.mark.parametrize(("known", "cameras"), [(None, 1), (2, 3)])
 def test_known_exposures_that_differ_tell_the_power_of_the_curve(known, cameras):
     """A camera of gamma 2.8: under sRGB, radiance comes out as its power of 0.8."""
     truth = make_exposures(SHORT, "iso4")
@@ -212,7 +211,7 @@ def test_the_simplest_that_is_not_clearly_worse_wins():
 
 def test_sharp_images_do_not_earn_parameters_for_invisible_differences():
     """Noise-free, many observations, exposures a hundredth of a stop apart."""
-    drive = make_drive(10, 4000, 1)
+    drive = make_drive(10, 2500, 1)
     cameras = np.array([1.0, 1.006, 0.995])[drive.cameras]
     wobble = np.exp2(0.004 * np.sin(np.arange(len(drive.cameras))))
     found = select(observe(drive, cameras * wobble, noise=0.0, outliers=0.0, bits=None))

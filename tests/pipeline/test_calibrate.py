@@ -14,15 +14,12 @@ from p2gs_jax.evaluation.alignment import exposure_error
 from p2gs_jax.photometry.sources.stack import read_stack
 from p2gs_jax.run.photometry_files import read_photometry
 from p2gs_jax.synth.sensor import read_true_exposures
-from p2gs_jax.synth.write import write_street
 
 
-def test_street(tmp_path):
-    size = {"frames": 3, "width": 96, "height": 64, "points": 1500, "supersample": 1}
-    street = write_street(tmp_path / "street", **size, iso_std=4.0, seed=3)
-    result = calibrate(street, tmp_path / "out")
+def test_street(noisy_street, tmp_path):
+    result = calibrate(noisy_street, tmp_path / "out")
     saved = read_photometry(tmp_path / "out" / "photometry.json")
-    truth = read_true_exposures(street)
+    truth = read_true_exposures(noisy_street)
     pairs = np.array([(v["exposure"], truth[v["image"]]) for v in saved["views"]])
     assert exposure_error(*pairs.T)["ev"] < 0.05
     assert result.selection.solution.model == "view_exposure"

@@ -23,12 +23,14 @@ FIELDS = {"data.format": "pandaset", "data.own_car": False, "data.frames": "::2"
 FIELDS |= {"data.test_every": 4, "train.steps": 20, "train.log_every": 5}
 FIELDS |= {"train.coarse_to_fine": (), "train.checkpoint_every_s": 0.0}
 FIELDS |= {"render.sh_degree": 0, "render.pixels_in_flight": 2048}
-FIELDS |= {"densify.max_gaussians": 2000, "densify.min_every_steps": 5}
+FIELDS |= {"densify.max_gaussians": 3000, "densify.min_every_steps": 5}
 FIELDS |= {"init.dense": "off", "init.shell": "off"}
 FIELDS |= {"photometry.select": False, "photometry.model": "view_exposure"}
 SHORT = with_fields(FitConfig(), FIELDS)
 METHODS = {
     "rigid": SHORT,
+    "mask": with_fields(SHORT, {"dynamics.method": "mask"}),
+    "off": with_fields(SHORT, {"dynamics.method": "off"}),
     "vibration": with_fields(SHORT, {"dynamics.method": "vibration", "dynamics.vibrating": 600}),
     "adaptive": with_fields(SHORT, {"densify.method": "adaptive", "densify.grad_threshold": 0.0}),
 }
@@ -186,6 +188,7 @@ def test_a_resumed_run_is_the_one_that_was_never_stopped(fitted, folder, tmp_pat
     assert steps == list(range(5, SHORT.train.steps + 1, 5))
 
 
+@pytest.mark.slow
 def test_gaussians_that_vibrate_are_shown_at_the_time_of_each_view(fitted):
     run = load_run(fitted("vibration"))
     moves = run.params.gaussians.vibration
@@ -216,14 +219,10 @@ def test_broken_or_foreign_owners_are_said(run, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1200)
-def test_rigid_beats_mask_inside_the_box_and_equals_it_elsewhere(folder, tmp_path):
-    # With 3,000 the box's 700 are missing elsewhere, which costs .7 of 44 dB.
-    longer = {"train.steps": 400, "train.log_every": 10, "densify.max_gaussians": 6000}
+def test_rigid_beats_mask_inside_the_box_and_equals_it_elsewhere(fitted):
     inside, outside = {}, {}
     for method in ("rigid", "mask", "off"):
-        cfg = with_fields(SHORT, {**longer, "dynamics.method": method})
-        done, errors = load_run(fit(folder, tmp_path / method, cfg).run_dir), ([], [])
+        done, errors = load_run(fitted(method)), ([], [])
         for index in done.scene.test_indices:
             camera, view = done.camera(index), done.scene.views[index]
             shown = develop(done.render(camera).linear, done.own_display(index))
