@@ -107,7 +107,7 @@ def test_refining_brings_viewers_closer_to_unseen_views_as_well(targets):
 
 def test_what_is_dark_by_transparency_becomes_opaque():
     """Over black nothing tells a translucent black wall from an opaque one; over white it shows."""
-    wall, logits = haze(), jnp.full(120, -100.0).at[-1].set(0.0)
+    wall, logits = haze(), jnp.full(120, -100.0, jnp.float32).at[-1].set(0.0)
     wall = replace(wall, opacity_logits=logits, sh=wall.sh - 60.0)
     target = true_target("wall", wall, camera(), SRGB, make_renderer(CFG))
     assert target.picture.max() == 0

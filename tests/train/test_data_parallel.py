@@ -32,6 +32,7 @@ def found():
     return json.loads(done.stdout)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("devices", ["1", "4"])
 def test_a_step_takes_the_mean_over_views_wherever_they_are(found, devices):
     """Loss and gradient are means; devices change neither losses nor noise; views are counted."""
@@ -43,6 +44,7 @@ def test_a_step_takes_the_mean_over_views_wherever_they_are(found, devices):
     assert made["step"] == 8
 
 
+@pytest.mark.slow
 def test_a_view_that_finds_no_room_stops_all_devices_until_there_is_some(found):
     made = found["4"]
     assert made["fault"]["kind"] == FAULT_OVERFLOW
