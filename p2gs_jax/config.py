@@ -100,7 +100,7 @@ class RenderConfig:
     radiance: Literal["exp", "linear"] = "exp"
     """Activation from spherical harmonics to radiance; `linear` is 3DGS's max(0, sh + 1/2)."""
     near: float = 0.05
-    """Near plane, scene units; nearer in scenes that it would cut (ours: pipeline/scale.py)."""
+    """Near plane, scene units; nearer in scenes that it would cut (ours: pipeline/survey.py)."""
     blur: float = 0.05
     """Variance added to the 2D covariance, pixels^2 (3DGS: 0.3; Mip-Splatting's filter: 0.1; ours:
     BUILD_NOTES, "Blur")."""

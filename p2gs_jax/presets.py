@@ -36,8 +36,10 @@ PAPER: Fields = {
     "loss.regularizers.log_exposure_mean": None,
     "loss.regularizers.gamma_mean_variance": None,
 }
-# The schedule and the rates that P2GS took over from 3DGS.
+# The schedule, the rates and the renderer's limits that P2GS took over from 3DGS.
 PUBLISHED: Fields = {
+    "render.near": 0.2,
+    "render.alpha_max": 0.99,
     "optimizer.means": 1.6e-4,
     "optimizer.means_final": 1.6e-6,
     "optimizer.scales": 5e-3,

@@ -39,6 +39,9 @@ class Observations:
     positions: Float[np.ndarray, "o 2"] | None = None
     camera_names: tuple[str, ...] = ()  # empty: their rows
     brightest: PerChannel | None = None  # largest of the pixels that `colors` are means of
+    # Part of the scene in which each point lies: what is not modelled of a surface is shared there.
+    # None where nobody knows.
+    cells: Labels | None = None
 
     def decoded(self, response: Response) -> tuple[PerChannel, PerChannel, PerChannel]:
         """Return log exposed radiance, its stated standard deviation and dz/dy."""
@@ -69,7 +72,7 @@ class Observations:
 
     def picked(self, pick: np.ndarray | slice) -> Observations:
         """Return some of them, chosen by a mask or by their rows."""
-        names = ("views", "points", "colors", "spread", "positions", "brightest")
+        names = ("views", "points", "colors", "spread", "positions", "brightest", "cells")
         kept = {k: v[pick] for k in names if (v := getattr(self, k)) is not None}
         return replace(self, **kept)
 

@@ -103,7 +103,18 @@ def test_terms_of_many_cameras_are_products_with_their_matrix():
     check(terms.scaled(by, scaled), np.where(first, by[:, :, None] * factor, factor))
 
 
-@pytest.mark.parametrize("case", ["exposures", "gammas", "neighbours err alike"])
+def with_surfaces(o, frames, seed):
+    """Return observations whose points change alike along a drive where they share a surface."""
+    rng = np.random.default_rng(seed)
+    cell = rng.integers(0, 40, o.point_count)[o.points]
+    change = 0.05 * rng.standard_normal((40, frames)).cumsum(1)[cell, o.views % frames]
+    colors = np.clip(o.colors * np.exp(change / 2.2)[:, None], 0, 1)
+    return dataclasses.replace(o, colors=colors, cells=cell)
+
+
+@pytest.mark.parametrize(
+    "case", ["exposures", "gammas", "neighbours err alike", "surfaces err alike"]
+)
 def test_standard_errors_have_the_size_of_the_errors(case):
     ratios = []
     for seed in range(5):
@@ -114,6 +125,8 @@ def test_standard_errors_have_the_size_of_the_errors(case):
         how = {"gammas": true_gammas if case == "gammas" else None, "pivot": 0.18, "seed": seed}
         shared = 0.1 if case == "neighbours err alike" else 0.0
         o = observe(drive, truth, curve="power", shared_texture=shared, **how)
+        if case == "surfaces err alike":
+            o = with_surfaces(o, 8, seed)
         model = "view_exposure_gamma" if case == "gammas" else "view_exposure"
         s = adjust(o, model, Response("power"))
         gap = s.log_exposures - np.log(truth)

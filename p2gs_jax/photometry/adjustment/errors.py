@@ -69,7 +69,9 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
     image share besides is added to it.
     """
     layout = fit.model.layout
-    clusters = side_by_side(observations, layout.row)
+    clusters = observations.cells
+    if clusters is None:
+        clusters = side_by_side(observations, layout.row)
     each = summed(fit.model, fit.theta, fit.at, fit.at.weight * fit.at.residual, clusters)
     if observations.positions is not None and len(layout.row):
         labels = regions(observations.positions, observations.views, SHARED_REGION)

@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32, Int
 from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 from p2gs_jax.core.threads import map_in_order
 from p2gs_jax.photometry.formation import places
-from p2gs_jax.photometry.observations import COARSEST, Observations
+from p2gs_jax.photometry.observations import COARSEST, Labels, Observations
 from p2gs_jax.photometry.sources import patches
 from p2gs_jax.photometry.sources.patches import Grid, Surfaces, Symmetric
 from p2gs_jax.scene.pixels.store import ImageStore
@@ -24,6 +24,11 @@ POSITION_DEVIATION = 1 / 6
 # Positions that come from calibration or rendered depth, not from matching, are less certain than
 # tracks by this factor.
 PROJECTED_UNCERTAINTY = 2.0
+# Side of the cells of a scene whose points err alike, over the median distance of what is seen.
+# Errors over stated errors of a town of 100 frames: 2.5 by regions of images, 1.9 in cells of a
+# tenth, 1.5 of a quarter, 1.7 of a half; 0.9 on a matte plane and a short town, as before. Too few
+# cells do not tell how much they differ; then their sides are halved.
+CELL, FEWEST_CELLS, MOST_HALVINGS = 0.25, 64, 4
 
 
 class Samples(NamedTuple):
@@ -159,7 +164,25 @@ def point_colors(
         positions=positions,
         brightest=brightest,
         camera_names=tuple(sorted(set(cameras))),
+        cells=_cells(surfaces.points, seen, of_view, views),
     )
+
+
+def _cells(
+    points: Float[np.ndarray, "p 3"], seen: Labels, of_view: Labels, views: list[View]
+) -> Labels:
+    """Return the cell of the scene in which each observed point lies."""
+    if not len(seen):
+        return seen
+    centres = np.stack([-v.viewmat[:3, :3].T @ v.viewmat[:3, 3] for v in views])
+    side = CELL * np.median(np.linalg.norm(points[seen] - centres[of_view], axis=1))
+    used, row = np.unique(seen, return_inverse=True)
+    for halvings in range(MOST_HALVINGS + 1):
+        corners = np.floor(points[used] / side * 2**halvings).astype(np.int64)
+        label = np.unique(corners, axis=0, return_inverse=True)[1].reshape(-1)
+        if label.max() + 1 >= FEWEST_CELLS:
+            break
+    return label[row]
 
 
 def _at_one_scale(
