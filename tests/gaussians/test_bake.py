@@ -80,6 +80,7 @@ def test_the_true_picture_is_light_composited_then_developed(targets):
     assert 20 < expected.mean() < 235
 
 
+@pytest.mark.slow
 def test_refining_brings_viewers_closer_to_unseen_views_as_well(targets):
     """Also over white; what no view shows stays as it is."""
     seen, unseen = [targets[i] for i in (0, 2, 4)], [targets[i] for i in (1, 3)]
@@ -105,6 +106,7 @@ def test_refining_brings_viewers_closer_to_unseen_views_as_well(targets):
     assert np.abs(np.asarray(refined.opacity_logits - plain.opacity_logits)).max() > 0.1
 
 
+@pytest.mark.slow
 def test_what_is_dark_by_transparency_becomes_opaque():
     """Over black nothing tells a translucent black wall from an opaque one; over white it shows."""
     wall, logits = haze(), jnp.full(120, -100.0, jnp.float32).at[-1].set(0.0)

@@ -51,6 +51,7 @@ def in_this_process(monkeypatch):
     return begun, fail
 
 
+@pytest.mark.slow
 def test_two_blocks_become_one_run(tmp_path, in_this_process):
     begun, fail = in_this_process
     scene, run = make_scene(tmp_path / "scene", views=8), tmp_path / "run"
