@@ -38,6 +38,7 @@ class Stream(IntEnum):
     BACKDROP = 71  # what a step composites a photograph with alpha over
     VIBRATING = 73  # laser points that start as Gaussians that vibrate
     NETWORK = 79  # first weights of the network that reads photographs (Luminance-GS)
+    SELF_CHECK = 83  # Gaussians that the rasterizer is checked with
     SCORE_SIGNS = 47  # signs of residuals, from which standard errors of many views are drawn
 
 

@@ -17,6 +17,7 @@ import numpy as np
 import p2gs_jax.render as rendering
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import on_host
+from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians
 
@@ -44,7 +45,7 @@ class SelfCheck(NamedTuple):
 
 def scenes() -> Iterator[Gaussians]:
     """Yield Gaussians that are hard for a rasterizer, in front of `camera`; float64."""
-    rng = np.random.default_rng(0)
+    rng = generator(0, Stream.SELF_CHECK)
     for needle, stops in ((1.0, 2.0), (5.0, 2.0), (1.0, 13.0)):
         z = rng.uniform(2, 9, COUNT)
         aside = rng.uniform(-0.6, 0.6, (COUNT, 2)) * z[:, None]
@@ -60,7 +61,7 @@ def _checked(gaussians: Gaussians, kind: np.dtype, cfg: RenderConfig):
     gaussians = jax.tree.map(lambda a: jnp.asarray(a, kind), gaussians)
     K = np.array([[WIDTH, 0, WIDTH / 2], [0, WIDTH, HEIGHT / 2], [0, 0, 1]])
     camera = Camera(jnp.eye(4, dtype=kind), jnp.asarray(K, kind), WIDTH, HEIGHT)
-    weights = jnp.asarray(np.random.default_rng(1).normal(size=(HEIGHT, WIDTH, 3)), kind)
+    weights = jnp.asarray(generator(1, Stream.SELF_CHECK).normal(size=(HEIGHT, WIDTH, 3)), kind)
     alive = jnp.ones(COUNT, bool)
 
     def loss(g):

@@ -126,7 +126,9 @@ class CheckpointStore:
     def _read(self, step: int, like: Any = None) -> tuple[dict, list[np.ndarray]]:
         """Return the plain values, and the leaves of a structure where one is given."""
         try:
-            with np.load(self.folder / str(step) / FILE, allow_pickle=False) as file:
+            # NumPy leaves the file open where it is broken.
+            path = self.folder / str(step) / FILE
+            with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
                 values = json.loads(str(file[TABLE]))
                 meta, table = values["meta"], values["leaves"]
                 if like is not None:

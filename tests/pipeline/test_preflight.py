@@ -11,7 +11,7 @@ import pytest
 from tiny_scene import make_scene, prepared
 
 import p2gs_jax
-from p2gs_jax.config import FitConfig
+from p2gs_jax.config import FitConfig, RenderConfig
 from p2gs_jax.errors import DivergenceError, UserError
 from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.jobs.configs import with_fields
@@ -23,8 +23,10 @@ from p2gs_jax.pipeline.preflight import (
     check_run_dir,
     memory_needed,
     require_memory,
+    suited,
 )
 from p2gs_jax.pipeline.survey import load
+from p2gs_jax.render.selfcheck import SelfCheck
 from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import KEY, Decisions
 from p2gs_jax.run.folder import RunFolder
@@ -281,3 +283,21 @@ def test_a_fit_is_refused_before_its_exposures_are_solved(tmp_path, scene, left,
     text = refused("fit", scene, "--out", run, "--gaussians", 9_000_000)
     assert "9000000 Gaussians" in text
     assert not (run / "config.json").exists()
+
+
+@pytest.mark.parametrize("found", [SelfCheck(0.5, 0.0), SelfCheck(0.0, float("nan")), OSError("x")])
+def test_a_rasterizer_that_is_wrong_on_a_gpu_gives_way(monkeypatch, found):
+    def check(cfg):
+        if isinstance(found, OSError):
+            raise found
+        return found
+
+    assert suited(RenderConfig()) == (RenderConfig(), None)
+    monkeypatch.setattr(module.jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(module, "slow_here", lambda: None)
+    monkeypatch.setattr(module, "self_check", lambda cfg: SelfCheck(1e-6, 1e-5))
+    assert suited(RenderConfig()) == (RenderConfig(), None)
+    monkeypatch.setattr(module, "self_check", check)
+    cfg, note = suited(RenderConfig())
+    assert cfg.implementation == "xla"
+    assert "failed its self-check" in note

@@ -1,12 +1,14 @@
 """Inputs of a step: photographs as they are stored, and batches of views of one size."""
 
 import chex
+import jax
 import numpy as np
 from tiny_scene import make_scene
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.pixels.store import ImageStore
+from p2gs_jax.train import inputs
 from p2gs_jax.train.image_gradient import decoded
 from p2gs_jax.train.inputs import TrainingViews, batches_of, stacked
 
@@ -42,3 +44,17 @@ def test_pixels_of_8_and_16_bits_become_one_type_of_the_same_values():
     fine = stacked([np.array([0, 255], np.uint8), np.array([7, 65535], np.uint16)])
     assert fine.dtype == np.uint16
     assert fine.tolist() == [[0, 65535], [7, 65535]]
+
+
+def test_on_a_gpu_photographs_of_one_level_stay_there(tmp_path, monkeypatch):
+    monkeypatch.setattr(inputs, "device_bytes", lambda: 1 << 30)
+    scene = load_scene(make_scene(tmp_path / "scene", views=3, points=30), DataConfig())
+    views = TrainingViews(ImageStore(scene.views, DataConfig()), scene.train_indices, 0)
+    first, again = (views.batch(0, 2).ldr for _ in range(2))
+    assert isinstance(first, jax.Array)
+    assert again is first
+    views.batch(0, 1)
+    assert views.batch(0, 2).ldr is not first
+    monkeypatch.setattr(inputs, "device_bytes", lambda: first.nbytes)
+    views = TrainingViews(views.store, scene.train_indices, 0)
+    assert isinstance(views.batch(0, 2).ldr, np.ndarray)
