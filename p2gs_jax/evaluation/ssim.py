@@ -37,10 +37,11 @@ def _blur(maps: Float[Array, "m h w"], always: Bool[Array, ""]) -> Float[Array, 
     height, width = maps.shape[-2:]
     margin = WINDOW // 2
     padded = materialize(always, lambda: jnp.pad(maps, ((0, 0), (margin,) * 2, (margin,) * 2)))
+    weights = list(enumerate(_kernel()))
     across = materialize(
-        always, lambda: sum(k * padded[:, :, i : i + width] for i, k in enumerate(_kernel()))
+        always, lambda: jnp.asarray(sum(k * padded[:, :, i : i + width] for i, k in weights))
     )
-    return jnp.asarray(sum(k * across[:, i : i + height] for i, k in enumerate(_kernel())))
+    return jnp.asarray(sum(k * across[:, i : i + height] for i, k in weights))
 
 
 class _Parts(NamedTuple):

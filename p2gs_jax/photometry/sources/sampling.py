@@ -177,12 +177,14 @@ def _cells(
     centres = np.stack([-v.viewmat[:3, :3].T @ v.viewmat[:3, 3] for v in views])
     side = CELL * np.median(np.linalg.norm(points[seen] - centres[of_view], axis=1))
     used, row = np.unique(seen, return_inverse=True)
-    for halvings in range(MOST_HALVINGS + 1):
-        corners = np.floor(points[used] / side * 2**halvings).astype(np.int64)
-        label = np.unique(corners, axis=0, return_inverse=True)[1].reshape(-1)
-        if label.max() + 1 >= FEWEST_CELLS:
-            break
-    return label[row]
+
+    def cells(side):
+        corners = np.floor(points[used] / side).astype(np.int64)
+        return np.unique(corners, axis=0, return_inverse=True)[1].reshape(-1)
+
+    sides = side * 0.5 ** np.arange(MOST_HALVINGS + 1)
+    enough = (label for each in sides if (label := cells(each)).max() + 1 >= FEWEST_CELLS)
+    return next(enough, cells(sides[-1]))[row]
 
 
 def _at_one_scale(
