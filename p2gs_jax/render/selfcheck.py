@@ -6,7 +6,9 @@ thirteen stops. A kernel for a GPU is compiled by that machine's libraries, whic
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -18,10 +20,11 @@ import p2gs_jax.render as rendering
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.core.streams import Stream, generator
+from p2gs_jax.render.binning import grid_size
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians
 
-WIDTH, HEIGHT, COUNT, ENTRIES = 32, 24, 64, 1024
+WIDTH, HEIGHT, COUNT = 32, 24, 64
 # Largest errors: of the image over its brightest value, of gradients in the relative L2 norm. The
 # stop rule explains 5e-4 and 5e-3, a wrong kernel is off by everything.
 IMAGE, GRADIENT = 1e-3, 1e-2
@@ -62,10 +65,10 @@ def _checked(gaussians: Gaussians, kind: np.dtype, cfg: RenderConfig):
     K = np.array([[WIDTH, 0, WIDTH / 2], [0, WIDTH, HEIGHT / 2], [0, 0, 1]])
     camera = Camera(jnp.eye(4, dtype=kind), jnp.asarray(K, kind), WIDTH, HEIGHT)
     weights = jnp.asarray(generator(1, Stream.SELF_CHECK).normal(size=(HEIGHT, WIDTH, 3)), kind)
-    alive = jnp.ones(COUNT, bool)
+    alive, tiles = jnp.ones(COUNT, bool), math.prod(grid_size(WIDTH, HEIGHT, cfg.tile))
 
     def loss(g):
-        image = rendering.render_linear(g, alive, camera, cfg, ENTRIES).linear
+        image = rendering.render_linear(g, alive, camera, cfg, COUNT * tiles).linear
         return jnp.sum(weights * image), image
 
     return jax.grad(loss, has_aux=True)(gaussians)
@@ -74,7 +77,7 @@ def _checked(gaussians: Gaussians, kind: np.dtype, cfg: RenderConfig):
 def self_check(cfg: RenderConfig | None = None) -> SelfCheck:
     """Compare the rasterizer of `cfg` with the float64 reference, in seconds of compiling."""
     cfg = RenderConfig() if cfg is None else cfg
-    exact_cfg = RenderConfig(implementation="reference", alpha_cutoff=cfg.alpha_cutoff)
+    exact_cfg = dataclasses.replace(cfg, implementation="reference")
     program = functools.partial(jax.jit, compiler_options=compiler_options())
     own = program(lambda g: _checked(g, np.dtype(np.float32), cfg))
     reference = jax.jit(lambda g: _checked(g, np.dtype(np.float64), exact_cfg))

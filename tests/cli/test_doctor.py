@@ -15,6 +15,8 @@ from packaging.requirements import Requirement
 import p2gs_jax.render as rendering
 from p2gs_jax.cli import doctor
 from p2gs_jax.cli.doctor import Doctor
+from p2gs_jax.presets import preset
+from p2gs_jax.render.selfcheck import self_check
 
 PROJECT = Path(__file__).resolve().parents[2] / "pyproject.toml"
 
@@ -26,6 +28,7 @@ def test_everything_here_is_well(capsys):
     assert "Self-test    ok: three small scenes" in text
     assert re.search(r"\bjax \d", text)
     assert "BROKEN" not in text
+    assert self_check(preset("paper").render).fault is None
 
 
 def test_every_dependency_can_be_tried(monkeypatch):
