@@ -1,7 +1,7 @@
 """Beside gsplat on a GPU: the same Gaussians, camera, blur and cutoff, forward and backward.
 
 python benchmarks/gpu.py --out runs/gpu
-python benchmarks/gpu.py --sizes 100 --error
+python benchmarks/gpu.py --thousands 50 --pixels 480 270 --error
 
 gsplat (Ye et al., arXiv 2409.06765) is measured where it and torch are installed. A table goes to
 OUT/gpu.md, figures to OUT/gpu.json.
@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.levels import whole_step
 from benchmarks.oracle import errors, trimmed_errors, truth
-from benchmarks.run import stamp
+from benchmarks.run import section, stamp
 from benchmarks.scenes import BenchScene, street
 from benchmarks.speed_error import DEFAULT, cotangent, programs
 from p2gs_jax.config import RenderConfig
@@ -34,7 +34,6 @@ from p2gs_jax.presets import preset
 from p2gs_jax.render.capacity import bucket
 from p2gs_jax.types import Gaussians
 
-SIZE = (1920, 1080)
 DEGREE = 3
 # gsplat's blur, pixels^2, and its colours: linear in the harmonics, not negative.
 CFG = dataclasses.replace(RenderConfig(), blur=0.3, radiance="linear")
@@ -57,7 +56,7 @@ def milliseconds(job: Callable[[], Any], wait: Callable[[Any], Any], repeats: in
 def beside(scene: BenchScene, weights: np.ndarray) -> tuple[Callable, Callable, Callable]:
     """Return gsplat's forward, its forward and backward, and how to wait for it.
 
-    Backward gives the image (H, W, 3) and the gradient as `Gaussians` of NumPy arrays.
+    Backward gives the image (H, W, 3) and the gradients by all fields of `Gaussians`, as tensors.
     """
     import gsplat  # pyright: ignore[reportMissingImports]
     import torch  # pyright: ignore[reportMissingImports]
@@ -81,7 +80,8 @@ def beside(scene: BenchScene, weights: np.ndarray) -> tuple[Callable, Callable, 
             leaves["sh"],
             viewmat[None],
             K[None],
-            *SIZE,
+            scene.camera.width,
+            scene.camera.height,
             sh_degree=DEGREE,
             eps2d=CFG.blur,
             packed=False,
@@ -95,9 +95,9 @@ def beside(scene: BenchScene, weights: np.ndarray) -> tuple[Callable, Callable, 
     return forward, both, lambda _: torch.cuda.synchronize()
 
 
-def measured(count: int, error: bool) -> dict[str, Any]:
-    """Return times of one size, and errors against float64 where they are asked for."""
-    scene = street(count, *SIZE, degree=DEGREE)
+def measured(count: int, pixels: tuple[int, int], error: bool) -> dict[str, Any]:
+    """Return times of so many Gaussians, and errors against float64 where they are asked for."""
+    scene = street(count, *pixels, degree=DEGREE)
     weights = cotangent(scene)
     forward, both, entries, _ = programs(scene, DEFAULT, CFG, weights)
     row: dict[str, Any] = {"Gaussians": count, "entries": entries}
@@ -129,20 +129,22 @@ def main() -> None:
     """Measure, write and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("runs/gpu"))
-    parser.add_argument("--sizes", type=int, nargs="+", default=[100, 1000, 3000])
+    parser.add_argument("--thousands", type=int, nargs="+", default=[100, 1000, 3000])
+    parser.add_argument("--pixels", type=int, nargs=2, default=[1920, 1080])
     parser.add_argument("--error", action="store_true", help="errors against float64, slow")
     options = parser.parse_args()
     rows = []
-    for size in options.sizes:
-        rows.append(measured(size * 1000, options.error and size <= 100))
+    for thousands in options.thousands:
+        rows.append(measured(thousands * 1000, options.pixels, options.error))
         print(rows[-1], flush=True)
         write_json(options.out / "gpu.json", {"stamp": stamp(), "rows": rows})
-    columns = ("Gaussians", "entries", "forward", "both", "step", "gsplat forward", "gsplat both")
-    lines = [columns, ("---:",) * len(columns)]
-    for row in rows:
-        values = (row.get(name, "") for name in columns)
-        lines.append(tuple(f"{v:.2f}" if isinstance(v, float) else f"{v:,}" for v in values))
-    text = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    header = ["Gaussians", "entries", "forward", "both", "step", "gsplat forward", "gsplat both"]
+    values = [[row.get(name, "") for name in header] for row in rows]
+    cells = [
+        [f"{v:.2f}" if isinstance(v, float) else f"{v:,}" if v else "" for v in row]
+        for row in values
+    ]
+    text = section("Milliseconds beside gsplat", header, cells)
     write_text(options.out / "gpu.md", text + "\n")
     print(text)
 

@@ -45,7 +45,7 @@ def stamp() -> dict:
     }
 
 
-def _section(title: str, header: list[str], rows: list[list[str]]) -> str:
+def section(title: str, header: list[str], rows: list[list[str]]) -> str:
     """Return a Markdown table below its title, the first column left, the others right."""
     lines = ["| " + " | ".join(r) + " |" for r in (header, *rows)]
     return "\n".join([f"## {title}\n", lines[0], "|---|" + "---:|" * (len(header) - 1), *lines[1:]])
@@ -85,13 +85,13 @@ def run(options: argparse.Namespace, on_progress) -> tuple[str, list[str]]:
     gated: gate.Rows = {}
     if "speed_error" in parts:
         points = of_variants(variants)
-        sections.append(_section("Speed against error", *speed_error.table(points)))
+        sections.append(section("Speed against error", *speed_error.table(points)))
         data["speed_error"] = [p._asdict() | {"variant": p.variant.name} for p in points]
         gated |= speed_error.gate_rows(points)
     if "levels" in parts:
         found = of_levels(list(fits))
         title = "Levels of a fit: rendering and the whole step"
-        sections.append(_section(title, *levels.table(found)))
+        sections.append(section(title, *levels.table(found)))
         data["levels"] = [level._asdict() | {"lists": level.lists._asdict()} for level in found]
         gated |= levels.gate_rows(found)
     if options.write_baseline:

@@ -34,6 +34,13 @@ def on_device(values: ArrayLike, dtype: DTypeLike = np.float32) -> Array:
     return jax.device_put(np.asarray(values, dtype))
 
 
+def device_bytes() -> int:
+    """Return the memory of the default device; 0 where that is the host's, or nobody tells."""
+    if jax.default_backend() == "cpu":
+        return 0
+    return (jax.devices()[0].memory_stats() or {}).get("bytes_limit", 0)
+
+
 def matmul(a: Array | np.ndarray, b: Array | np.ndarray) -> Any:
     """Return a @ b in full precision: GPUs would round float32 to three digits (TF32)."""
     if namespace(a, b) is np:

@@ -52,7 +52,7 @@ def empty_gaussians(count: int, like: Gaussians) -> Gaussians:
     )
 
 
-# Time of a step, seconds per pixel, and at least: two cores of 2025; an H200 (2026-11-26).
+# Seconds of a step per pixel, and of the shortest step: two cores of 2025; an H200 (2026-11-26).
 STEP_SECONDS = {"cpu": (5e-7, 0.0), "gpu": (4e-9, 4e-3)}
 # Gaussians shown per pixel of a view: from the first to the second with the steps of a run (ours:
 # BUILD_NOTES, "Population").

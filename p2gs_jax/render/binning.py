@@ -11,7 +11,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, UInt32
+from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import binning_cpu
@@ -42,18 +42,14 @@ def _choose(counting, sorting, splats: Splats2D, cfg: RenderConfig, *static):
     return function(jax.tree.map(lax.stop_gradient, splats), *static, cfg)
 
 
-def sort_payloads(keys: UInt32[Array, " n"], payload_bits: int) -> Int[Array, " n"]:
-    """Sort keys that carry a payload in their low bits; return the payloads in order."""
-    mask = jnp.uint32(2**payload_bits - 1)
-    return (lax.sort(keys, is_stable=False) & mask).astype(jnp.int32)
-
-
 def longest_first(lengths: Int[Array, " n"]) -> Int[Array, " n"]:
     """Return the indices of lengths, largest first; of very long ones the index decides."""
     bits = bits_for(lengths.shape[0])
     limit = 2 ** (32 - bits) - 1
     key = jnp.uint32(limit) - jnp.minimum(lengths, limit).astype(jnp.uint32)
-    return sort_payloads(key << bits | jnp.arange(lengths.shape[0], dtype=jnp.uint32), bits)
+    # The index travels in the low bits: one operand sorts five times faster on CPUs.
+    key = lax.sort(key << bits | jnp.arange(lengths.shape[0], dtype=jnp.uint32), is_stable=False)
+    return (key & jnp.uint32(2**bits - 1)).astype(jnp.int32)
 
 
 def depth_order(depths: Float[Array, " n"], visible: Bool[Array, " n"]) -> Int[Array, " n"]:

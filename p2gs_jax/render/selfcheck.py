@@ -7,7 +7,6 @@ thirteen stops. A kernel for a GPU is compiled by that machine's libraries, whic
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -78,12 +77,12 @@ def self_check(cfg: RenderConfig | None = None) -> SelfCheck:
     """Compare the rasterizer of `cfg` with the float64 reference, in seconds of compiling."""
     cfg = RenderConfig() if cfg is None else cfg
     exact_cfg = dataclasses.replace(cfg, implementation="reference")
-    program = functools.partial(jax.jit, compiler_options=compiler_options())
-    own = program(lambda g: _checked(g, np.dtype(np.float32), cfg))
+    options = compiler_options()
+    own = jax.jit(lambda g: _checked(g, np.dtype(np.float32), cfg), compiler_options=options)
     reference = jax.jit(lambda g: _checked(g, np.dtype(np.float64), exact_cfg))
     image_errors, gradient_errors = [], []
     for scene in scenes():
-        gradient, image = jax.tree.map(np.asarray, own(_single(scene)))
+        gradient, image = jax.tree.map(np.asarray, own(scene))
         with jax.enable_x64(True):
             exact = reference(scene)
         true_gradient, true_image = jax.tree.map(np.asarray, exact)
@@ -91,7 +90,3 @@ def self_check(cfg: RenderConfig | None = None) -> SelfCheck:
         for a, b in zip(*map(jax.tree.leaves, (gradient, true_gradient)), strict=True):
             gradient_errors.append(np.linalg.norm(a - b) / np.linalg.norm(b))
     return SelfCheck(float(np.max(image_errors)), float(np.max(gradient_errors)))
-
-
-def _single(gaussians: Gaussians) -> Gaussians:
-    return jax.tree.map(lambda a: np.asarray(a, np.float32), gaussians)

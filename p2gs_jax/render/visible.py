@@ -150,14 +150,16 @@ def slice_of(tree, block: Int[Array, ""] | int, size: int):
     return jax.tree.map(lambda a: lax.dynamic_slice_in_dim(a, block * size, size), tree)
 
 
-def over_blocks(body: Callable, used: Int[Array, ""], size: int, length: int, start):
-    """Return the state after `body(block, state)` for every block that holds listed rows.
+def over_blocks(body: Callable, count: Int[Array, ""], length: int, start):
+    """Return the state after `body(block, state)` for every block of a list that is used.
 
-    One block that holds all rows is no loop: its dynamic count would be read by the host.
+    The list has a `length`, of which `count` rows are listed, or more where there was no room. One
+    block that holds all rows needs no loop, whose dynamic count the host of a GPU would read.
     """
+    size = block_size(length)
     if size == length:
         return body(jnp.int32(0), start)
-    return lax.fori_loop(0, -(-used // size), body, start)
+    return lax.fori_loop(0, -(-jnp.minimum(count, length) // size), body, start)
 
 
 def splat(
@@ -211,4 +213,4 @@ def splat_listed(
     blank = jax.tree.map(
         lambda s: jnp.zeros((length, *s.shape[1:]), s.dtype), jax.eval_shape(block, jnp.int32(0))
     )
-    return over_blocks(body, jnp.minimum(count, length), size, length, blank)
+    return over_blocks(body, count, length, blank)

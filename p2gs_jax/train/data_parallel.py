@@ -249,8 +249,7 @@ def _sums(state, ids, visible, gradient, frusta, controls, cfg, bands: int) -> S
                 lambda a, b: a.at[rows].add(b, mode="drop", unique_indices=True), sums, added
             )
 
-        length = here.shape[0]
-        return visibility.over_blocks(body, jnp.minimum(count, length), size, length, sums), None
+        return visibility.over_blocks(body, count, here.shape[0], sums), None
 
     none = dataclasses.replace(gaussians, sh=gaussians.sh[:, :bands])
     blank = jax.tree.map(jnp.zeros_like, none)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float32, Int
 
 from p2gs_jax.config import FitConfig
-from p2gs_jax.core.numerics import on_host
+from p2gs_jax.core.numerics import device_bytes, on_host
 from p2gs_jax.core.streams import Stream, device_seed, generator, view_order
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.train import schedule
@@ -29,16 +29,8 @@ PAIRS_PER_STEP = 4096
 # Share of a GPU's memory that photographs of one level may take; others are uploaded in every step.
 RESIDENT = 0.25
 
-
 # Pixels, mask, and alpha where there is one.
 Photograph = tuple[Any, Any, Any]
-
-
-def device_bytes() -> int:
-    """Return the memory of the default device; 0 where that is the host's, or nobody tells."""
-    if jax.default_backend() == "cpu":
-        return 0
-    return (jax.devices()[0].memory_stats() or {}).get("bytes_limit", 0)
 
 
 class TrainingViews:
@@ -60,8 +52,10 @@ class TrainingViews:
         self.store, self.rows = store, tuple(rows)
         self.seed, self.measured = seed, measured
         self._batches = functools.lru_cache(4)(self._epoch)
-        self._room = RESIDENT * device_bytes() if resident else 0
-        self._resident: dict[tuple[int, int], Photograph] = {}
+        self._room = RESIDENT * device_bytes() if resident else 0.0
+        # Photographs on the device by row, their level, and the bytes that are left for others.
+        self._resident: dict[int, Photograph] = {}
+        self._level, self._left = 0, 0.0
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -87,7 +81,7 @@ class TrainingViews:
 
     def prefetch(self, index: int, shrink: int) -> None:
         """Begin decoding a view in the background, unless it is on the device."""
-        if (self.rows[index], shrink) not in self._resident:
+        if shrink != self._level or self.rows[index] not in self._resident:
             self.store.prefetch(self.rows[index], shrink)
 
     def camera(self, index: int, shrink: int) -> Camera:
@@ -108,14 +102,16 @@ class TrainingViews:
 
     def _photograph(self, row: int, shrink: int) -> Photograph:
         """Return the pixels, mask and alpha of a view as they are stored."""
-        if (row, shrink) in self._resident:
-            return self._resident[row, shrink]
-        pixels = (*self.store.stored(row, shrink), self.store.alpha(row, shrink))
-        if any(level != shrink for _, level in self._resident):
+        if shrink != self._level:
             self._resident.clear()
-        size = sum(a.nbytes for a in jax.tree.leaves((pixels, self._resident)))
-        if size <= self._room:
-            pixels = self._resident[row, shrink] = jax.device_put(pixels)
+            self._level, self._left = shrink, self._room
+        if row in self._resident:
+            return self._resident[row]
+        pixels = (*self.store.stored(row, shrink), self.store.alpha(row, shrink))
+        size = sum(a.nbytes for a in jax.tree.leaves(pixels))
+        if size <= self._left:
+            self._left -= size
+            pixels = self._resident[row] = jax.device_put(pixels)
         return pixels
 
     def _backdrop(self, step: int) -> Float32[np.ndarray, " 3"] | None:

@@ -201,8 +201,7 @@ def update_listed(
         )
 
     start = Updated(gaussians, moments, jnp.ones(len(jax.tree.leaves(gaussians)), bool))
-    used = jnp.minimum(count, ids.shape[0])
-    return over_blocks(body, used, size, ids.shape[0], start)
+    return over_blocks(body, count, ids.shape[0], start)
 
 
 def is_healthy(state: FitState, gradient: ImageGradient, fits: Array) -> Bool[Array, ""]:

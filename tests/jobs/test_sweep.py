@@ -118,23 +118,24 @@ def test_a_sweep_keeps_what_is_done_and_names_what_failed(tmp_path):
         "bad": with_fields(p2gs_jax.preset("paper"), {"photometry.known": "exif"}),
     }
     said = []
-    result = sweep(scene, tmp_path / "out", configs, seeds=[0], report=said.append)
+    result = sweep(scene, tmp_path / "out", configs, seeds=[0, 1], report=said.append)
     status = [(r["name"], r["seed"], r["status"]) for r in result.rows]
-    assert status == [("good", 0, "done"), ("bad", 0, "failed")]
+    assert status[:2] == [("good", 0, "done"), ("good", 1, "done")]
+    assert status[2:] == [("bad", 0, "failed"), ("bad", 1, "failed")]
     good = result.rows[0]
     assert good["steps"] == 12
     assert good["train_psnr"] > 5
     metrics = json.loads((tmp_path / "out" / "good" / "seed_0" / "metrics.json").read_text())
     assert good["seconds"] == whole_run(metrics["seconds"]) > metrics["seconds"]["optimisation"]
     assert said[0].endswith(f"{good['seconds']:.0f} s")
-    assert "starts exposures at random" in result.rows[1]["reason"]
+    assert "starts exposures at random" in result.rows[2]["reason"]
     assert json.loads((tmp_path / "out" / "sweep.json").read_text()) == result.rows
     table = (tmp_path / "out" / "sweep.md").read_text()
-    assert "| good | 1 of 1 |" in table
+    assert "| good | 2 of 2 |" in table
     assert "bad, seed 0: failed" in table
     stamp = (tmp_path / "out" / "good" / "seed_0" / "metrics.json").stat().st_mtime_ns
-    again = sweep(scene, tmp_path / "out", {"good": SMALL}, seeds=[0], report=said.append)
-    assert [r["status"] for r in again.rows] == ["done"]
+    again = sweep(scene, tmp_path / "out", {"good": SMALL}, seeds=[0, 1], report=said.append)
+    assert [r["status"] for r in again.rows] == ["done", "done"]
     assert said[-1].endswith("kept")
     assert (tmp_path / "out" / "good" / "seed_0" / "metrics.json").stat().st_mtime_ns == stamp
     other = {"good": with_fields(SMALL, {"train.steps": 11})}

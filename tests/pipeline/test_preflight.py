@@ -4,6 +4,7 @@ import dataclasses
 import shutil
 from collections import Counter
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -287,17 +288,12 @@ def test_a_fit_is_refused_before_its_exposures_are_solved(tmp_path, scene, left,
 
 @pytest.mark.parametrize("found", [SelfCheck(0.5, 0.0), SelfCheck(0.0, float("nan")), OSError("x")])
 def test_a_rasterizer_that_is_wrong_on_a_gpu_gives_way(monkeypatch, found):
-    def check(cfg):
-        if isinstance(found, OSError):
-            raise found
-        return found
-
     assert suited(RenderConfig()) == (RenderConfig(), None)
     monkeypatch.setattr(module.jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(module, "slow_here", lambda: None)
     monkeypatch.setattr(module, "self_check", lambda cfg: SelfCheck(1e-6, 1e-5))
     assert suited(RenderConfig()) == (RenderConfig(), None)
-    monkeypatch.setattr(module, "self_check", check)
+    monkeypatch.setattr(module, "self_check", Mock(side_effect=[found]))
     cfg, note = suited(RenderConfig())
     assert cfg.implementation == "xla"
     assert "failed its self-check" in note

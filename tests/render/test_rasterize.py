@@ -55,7 +55,7 @@ def oracle():
     ("implementation", "tile", "stop"),
     [
         (None, (16, 8), 1e-4),
-        # With the tile and the stop rule of a fit: `test_hard_cases`.
+        pytest.param("pallas", (16, 8), 1e-4, marks=pytest.mark.slow),
         pytest.param("pallas", (16, 16), None, marks=pytest.mark.slow),
         pytest.param("xla", (8, 8), None, marks=pytest.mark.slow),
         pytest.param("pallas", (32, 4), None, marks=pytest.mark.slow),

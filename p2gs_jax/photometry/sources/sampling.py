@@ -16,6 +16,7 @@ from p2gs_jax.photometry.observations import COARSEST, Labels, Observations
 from p2gs_jax.photometry.sources import patches
 from p2gs_jax.photometry.sources.patches import Grid, Surfaces, Symmetric
 from p2gs_jax.scene.pixels.store import ImageStore
+from p2gs_jax.scene.rigid import camera_centers
 from p2gs_jax.types import Scene, View
 
 # A track's position is uncertain by this share of the smallest patch; where the image is steep, so
@@ -174,8 +175,8 @@ def _cells(
     """Return the cell of the scene in which each observed point lies."""
     if not len(seen):
         return seen
-    centres = np.stack([-v.viewmat[:3, :3].T @ v.viewmat[:3, 3] for v in views])
-    side = CELL * np.median(np.linalg.norm(points[seen] - centres[of_view], axis=1))
+    centers = camera_centers(np.stack([view.viewmat for view in views]))
+    side = CELL * np.median(np.linalg.norm(points[seen] - centers[of_view], axis=1))
     used, row = np.unique(seen, return_inverse=True)
 
     def cells(side):
