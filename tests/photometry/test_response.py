@@ -41,8 +41,7 @@ def test_knots_and_held_ones():
     assert np.all(np.diff(KNOTS) > 0)
     assert set(FREE) | set(HELD) == set(range(len(KNOTS)))
     assert rises(BENT)
-    falling = Response("srgb", tuple(np.where(KNOTS > 0.6, -3.0, 0.0)))
-    assert not rises(falling)
+    assert not rises(Response("srgb", tuple(np.where(KNOTS > 0.6, -3.0, 0.0))))  # falling
     assert not rises(Response("srgb", tuple(-2.2 * np.log(KNOTS))))  # flat
 
 

@@ -23,6 +23,7 @@ GEMAN_MCCLURE = 3.0  # width of the Geman-McClure loss in robust standard deviat
 PRIOR_SPREAD = 3.0
 SMALLEST_SCALE = 0.3
 MEDIAN_ROWS = 4096
+LEAST_BENT = 0.2
 
 PerObservation = Float[np.ndarray, " o"]
 
@@ -57,13 +58,17 @@ def weigh(model: Forward, theta: Parameters, weight: PerChannel, loss: Loss) -> 
     scale = max(1.4826 * _median(model, np.abs(u)), SMALLEST_SCALE)
     # One weight for the whole observation: an outlier is wrong in all channels.
     used = model.weight.sum(1)
-    square = (u**2 * model.weight).sum(1) / np.maximum(used, 1) / (GEMAN_MCCLURE * scale) ** 2
+    size, width = np.maximum(used, 1), GEMAN_MCCLURE * scale
+    square = (u**2 * model.weight).sum(1) / size / width**2
+    # An exposure moves all channels together: only what they share bends its loss.
+    common = ((u * model.weight).sum(1) / size / width) ** 2
     if loss == "l1":
         factor, curvature = 1 / np.maximum(np.abs(u) / scale, 0.5), 1.0
     else:
         of = _whole_points if loss == "whole_points" else _geman_mcclure
-        of_observation, curvature = of(square, used / 3, layout)
-        factor = of_observation[:, None]
+        robust, second = of(square, common, used / 3, layout)
+        curvature = _curvature(robust, second, (model.weight / sigma**2).sum(1), layout)
+        factor = robust[:, None]
     weight = model.weight / sigma**2 * factor
     radiance, precision = _radiance(layout, a, z_of_point, weight)
     of_point = radiance[layout.row]
@@ -72,39 +77,56 @@ def weigh(model: Forward, theta: Parameters, weight: PerChannel, loss: Loss) -> 
 
 
 def _geman_mcclure(
-    square: PerObservation, share: PerObservation, layout: Layout
-) -> tuple[PerObservation, float]:
-    """Return weights of squares in widths of the loss, and its mean curvature over them."""
-    robust, second = _derivatives(square)
-    seen = share > 0
-    return robust, float(second[seen].sum() / max(robust[seen].sum(), 1e-9))
+    square: PerObservation, common: PerObservation, share: PerObservation, layout: Layout
+) -> tuple[PerObservation, PerObservation]:
+    """Return weights of squares in widths of the loss, and its second derivative like them."""
+    return _derivatives(square, common)
 
 
 def _whole_points(
-    square: PerObservation, share: PerObservation, layout: Layout
-) -> tuple[PerObservation, float]:
-    """Return weights and curvature where every point has a spread of its own.
+    square: PerObservation, common: PerObservation, share: PerObservation, layout: Layout
+) -> tuple[PerObservation, PerObservation]:
+    """Return weights and second derivatives where every point has a spread of its own.
 
     Gloss and silhouettes make all that a point shows uncertain, and by different amounts. So the
     Geman-McClure losses of a point's observations are summed as the squares of Student's t are,
     whose scale is the point's own: it counts the less, the more its views differ.
     """
-    alone, curved = _derivatives(square)
+    alone, curved = _derivatives(square, common)
     bound = GEMAN_MCCLURE**2
     losses = layout.by_row @ (share * bound * square / (1 + square))
     # A point's radiance takes one observation away.
     freedom = np.maximum(layout.by_row @ share - 1, 0)
-    of_row = (PRIOR_SPREAD + freedom) / (PRIOR_SPREAD + losses)
-    robust = alone * of_row[layout.row]
-    second = share * curved * of_row[layout.row]
-    pulls = layout.by_row @ (share**2 * bound * square * alone**2)
-    along = 2 * of_row / (PRIOR_SPREAD + losses) * pulls
-    return robust, float((second.sum() - along.sum()) / max((share * robust).sum(), 1e-9))
+    of_row = ((PRIOR_SPREAD + freedom) / (PRIOR_SPREAD + losses))[layout.row]
+    along = 2 * share * bound * common * alone**2 / (PRIOR_SPREAD + losses)[layout.row]
+    return alone * of_row, (curved - along) * of_row
 
 
-def _derivatives(square: PerObservation) -> tuple[PerObservation, PerObservation]:
-    """Return slope over residual and curvature of the Geman-McClure loss, of one observation."""
-    return 1 / (1 + square) ** 2, (1 - 3 * square) / (1 + square) ** 3
+def _curvature(
+    robust: PerObservation, second: PerObservation, known: PerObservation, layout: Layout
+) -> float:
+    """Return the second derivative of the loss over its weight, points eliminated, on average.
+
+    Observations are `known` with inverse variances.
+    """
+
+    weight, curved = known * robust, known * second
+    of_row, bent = layout.by_row @ weight, layout.by_row @ curved
+    whole = float((of_row - layout.by_row @ weight**2 / np.maximum(of_row, EMPTY)).sum())
+    # Where outliers of few observations bend a point's loss downwards, it is held nevertheless.
+    bent = np.maximum(bent, LEAST_BENT * of_row)
+    left = curved.sum() - (layout.by_row @ curved**2 / np.maximum(bent, EMPTY)).sum()
+    return float(left) / max(whole, EMPTY)
+
+
+def _derivatives(
+    square: PerObservation, common: PerObservation
+) -> tuple[PerObservation, PerObservation]:
+    """Return slope over residual and curvature of the Geman-McClure loss, of one observation.
+
+    `square` is the mean over its channels of squared residuals, `common` the square of their mean.
+    """
+    return 1 / (1 + square) ** 2, (1 + square - 4 * common) / (1 + square) ** 3
 
 
 def _radiance(layout: Layout, a, z, weight):

@@ -86,13 +86,14 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
     pairs = np.unique(np.stack([layout.views[seen], clusters[seen]]), axis=1)[0]
     count = np.maximum(np.bincount(pairs, minlength=layout.view_count), 2)
     few = np.sqrt(count / (count - 1))
-    bread = fit.normal * fit.at.curvature + system.priors.normal
+    held = system.priors.normal + system.smooth(fit.normal)
+    bread = fit.normal * fit.at.curvature + held
     gauges = system.gauges(bread)[1]
     if not is_small(system.basis.shape[1]):  # pyright: ignore
         drawn = _drawn(Balanced(bread, gauges, system.basis), each, system)
         return Uncertainty(*drawn, few, system.unknowns.split)
     # A prior is itself an observation with variance 1 / precision: it is its own meat.
-    meat = each.T @ each + system.priors.normal
+    meat = each.T @ each + held
     with one_thread():
         everything = whole(bread + gauges.T @ gauges)
         return Uncertainty(*_sandwich(everything, meat, system.basis), few, system.unknowns.split)
@@ -174,8 +175,12 @@ def _shared_deviation(model: Forward, at: Weighted, labels: Labels) -> float:
     excess = (1.4826 * np.median(np.abs(mean[good]))) ** 2 - np.median(own)
     used = weight > 0
     seen_by = np.bincount(layout.row[used])
-    per_view = good.sum() / max(len(np.unique(layout.views[used])), 1)
-    kept = (1 - 1 / np.mean(seen_by[seen_by > 0])) * (1 - 1 / max(per_view, 2))
+    view = np.zeros(count, int)
+    view[labels] = layout.views
+    # Regions of unequal weight are worth fewer equal ones.
+    of_view, squares = (np.bincount(view, v, layout.view_count) for v in (size, size**2))
+    per_view = of_view[of_view > 0] ** 2 / squares[of_view > 0]
+    kept = (1 - 1 / np.mean(seen_by[seen_by > 0])) * (1 - 1 / max(np.mean(per_view), 2))
     return float(np.sqrt(max(excess, 0.0) / kept))
 
 

@@ -15,7 +15,7 @@ from p2gs_jax.photometry.adjustment.equations import weigh
 from p2gs_jax.photometry.adjustment.errors import Uncertainty, uncertainty
 from p2gs_jax.photometry.adjustment.parameters import Forward, Parameters
 from p2gs_jax.photometry.adjustment.problem import Problem
-from p2gs_jax.photometry.adjustment.solve import Fit, solve_model
+from p2gs_jax.photometry.adjustment.solve import Fit, solve_model, with_free_curve
 from p2gs_jax.photometry.models import Form, ModelName
 from p2gs_jax.photometry.observations import Labels, Observations, PerChannel, grouped
 from p2gs_jax.photometry.response import Response
@@ -51,7 +51,8 @@ def fit_model(
     pick = o.thinned(most, 0)
     few = problem if pick.all() else problem.part(pick)
     fit, system = solve_model(few, form, response, loss="whole_points")
-    return solution_of(problem, form, response, fit, uncertainty(fit, system, few.observations))
+    free = (fit, system) if response.spline is None else with_free_curve(few, form, response, fit)
+    return solution_of(problem, form, response, fit, uncertainty(*free, few.observations))
 
 
 def explain(

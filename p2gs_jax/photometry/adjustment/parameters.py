@@ -318,6 +318,13 @@ class System(NamedTuple):
         strength = ANCHOR * float(np.mean(of_b) + EMPTY)
         return strength, np.sqrt(strength) * self.anchors.rows
 
+    def smooth(self, normal: Matrix) -> sp.csr_array:
+        """Return what keeps a spline smooth, by its mean information, as a normal matrix of all."""
+        start = self.unknowns.at.c.start
+        stiffness = float(np.mean(normal.diagonal()[start:])) if len(self.smoothness) else 0.0
+        parts = [sp.csr_array((start, start)), stiffness * self.smoothness]
+        return sp.csr_array(sp.block_diag(parts, format="csr"))
+
 
 def make_system(problem: Problem, form: Form, splines: ResponseKind | None = None) -> System:
     """Return free directions, gauges and priors; `splines` is what has one that is solved for."""

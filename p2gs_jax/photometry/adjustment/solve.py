@@ -159,11 +159,10 @@ def _step(
     right = right + system.priors.pull(vector)
     right = right + strength * system.anchors.pull(vector)
     if theta.c.size:
-        stiffness = float(np.mean(normal.diagonal()[u.at.c]))
-        smooth = stiffness * system.smoothness
-        before = sp.csr_array((u.at.c.start,) * 2)
-        normal = normal + sp.block_diag([before, smooth], format="csr")
-        right = right - np.concatenate([np.zeros(u.at.c.start), smooth @ theta.c])
+        smooth = system.smooth(normal)
+        normal = normal + smooth
+        of_c = smooth[u.at.c, u.at.c].toarray() @ theta.c
+        right = right - np.concatenate([np.zeros(u.at.c.start), of_c])
     step = u.split(Balanced(normal, gauges, system.basis).solve(right))
     new = Parameters(*(x + dx for x, dx in zip(theta, step, strict=True)))
     new = new._replace(a=np.clip(new.a, *A_RANGE))
@@ -225,6 +224,20 @@ def solve_model(
     begin = None if near is None else system.near(near.theta, near.model.unknowns)
     with one_thread():
         return solve(model, system, tolerance, loss, begin), system
+
+
+def with_free_curve(
+    problem: Problem, form: Form, response: Response, fit: Fit
+) -> tuple[Fit, System]:
+    """Return a solution as one that might also move its curve, of which c is the change.
+
+    A response with splines was fitted as exposures were, and is as uncertain.
+    """
+    system = make_system(problem, form, response.by)
+    model = Forward.of(problem, problem.usable, response, system.unknowns)
+    theta = fit.theta._replace(c=system.start.c)
+    normal = normal_equations(model, theta, fit.at)[0]
+    return fit._replace(model=model, theta=theta, normal=normal), system
 
 
 def fit_response(
