@@ -77,7 +77,8 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
         labels = regions(observations.positions, observations.views, SHARED_REGION)
         # In all points, also those that count for little: what matte ones share is less.
         alike = weigh(fit.model, fit.theta, fit.at.weight, "geman_mcclure")
-        deviation = _shared_deviation(fit.model, alike, labels)
+        parts = layout.row if observations.cells is None else clusters
+        deviation = _shared_deviation(fit.model, alike, labels, parts)
         if deviation > 0:
             shared = deviation * _shared_scores(fit.model, fit.theta, fit.at, labels)
             each = sp.csr_array(sp.vstack([each, shared]))
@@ -151,26 +152,31 @@ def side_by_side(observations: Observations, row: Labels) -> Labels:
     return label[row]
 
 
-def _shared_deviation(model: Forward, at: Weighted, labels: Labels) -> float:
+def _shared_deviation(model: Forward, at: Weighted, labels: Labels, parts: Labels) -> float:
     """Return the standard deviation of what observations of a region share, log units.
 
-    Means of regions vary by more than their own observations explain. Exposures and radiances take
-    a part of that away, which is put back. Medians: a region may show something that moved.
+    Means of regions vary by more than what each of their `parts` does by itself explains. Exposures
+    and radiances take a part of that away, which is put back. Medians: a region may show something
+    that moved.
     """
     layout, weight = model.layout, at.weight.sum(1)
     count = int(labels.max(initial=-1)) + 1
 
-    def total(values):
-        return np.bincount(labels, values, count)
+    pairs = labels * np.int64(parts.max(initial=-1) + 1) + parts
+    _, first, part = np.unique(pairs, return_index=True, return_inverse=True)
+    region, share = labels[first], np.bincount(part, weight)
+    of_part = np.bincount(part, (at.weight * at.residual).sum(1)) / np.maximum(share, EMPTY)
 
-    of_pixel = (at.weight * at.residual).sum(1) / np.maximum(weight, EMPTY)
-    size, members = total(weight), total((weight > 0).astype(float))
-    effective = size**2 / np.maximum(total(weight**2), EMPTY)
+    def total(values):
+        return np.bincount(region, values, count)
+
+    size, members = total(share), total((share > 0).astype(float))
+    effective = size**2 / np.maximum(total(share**2), EMPTY)
     good = (members >= FEWEST) & (effective >= FEWEST_EFFECTIVE)
     if not good.any():
         return 0.0
-    mean = total(weight * of_pixel) / np.maximum(size, EMPTY)
-    spread = total(weight * (of_pixel - mean[labels]) ** 2) / np.maximum(size, EMPTY)
+    mean = total(share * of_part) / np.maximum(size, EMPTY)
+    spread = total(share * (of_part - mean[region]) ** 2) / np.maximum(size, EMPTY)
     own = (spread / np.maximum(effective - 1, 1))[good]
     excess = (1.4826 * np.median(np.abs(mean[good]))) ** 2 - np.median(own)
     used = weight > 0
