@@ -98,7 +98,7 @@ def _whole_points(
     # A point's radiance takes one observation away.
     freedom = np.maximum(layout.by_row @ share - 1, 0)
     of_row = ((PRIOR_SPREAD + freedom) / (PRIOR_SPREAD + losses))[layout.row]
-    along = 2 * share * bound * common * alone**2 / (PRIOR_SPREAD + losses)[layout.row]
+    along = 2 * share * bound * common * alone**2 / (PRIOR_SPREAD + losses[layout.row])
     return alone * of_row, (curved - along) * of_row
 
 
