@@ -4,6 +4,7 @@ import json
 import re
 from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 
@@ -79,11 +80,12 @@ def test_too_small_a_page_drops_what_weighs_least_or_is_refused(whole, fitted, t
 def test_weights_are_sums_of_blending_weights(fitted):
     g, cfg, camera = fitted.params.gaussians, fitted.cfg.render, fitted.camera(0)
     found = weights(g, [camera], cfg)
-    splats = project(g, on_device(np.ones(g.capacity), bool), camera, cfg)
+    splats = jax.jit(project, static_argnums=3)(g, np.ones(g.capacity, bool), camera, cfg)
     one = int(np.argmax(found))
     light = on_device(np.eye(g.capacity)[one][:, None] * np.ones(3))
-    linear, _, _ = rasterize_reference(splats, light, camera.width, camera.height, cfg)
-    assert found[one] == pytest.approx(float(linear[..., 0].sum()), rel=0.01)
+    reference = jax.jit(rasterize_reference, static_argnums=(2, 3, 4))
+    linear, _, _ = reference(splats, light, camera.width, camera.height, cfg)
+    assert found[one] == pytest.approx(float(np.asarray(linear)[..., 0].sum()), rel=0.01)
 
 
 def test_gaussians_that_nobody_can_see_are_left_out_and_counted(fitted):

@@ -161,7 +161,7 @@ def test_the_fixed_point_minimises_the_robust_loss(loss):
             weight = (prior + np.maximum(seen - 1, 0)) * 1.5 * fit.at.scale**2
             return jnp.sum(weight * jnp.log(prior + of_row))
 
-        gradient = np.asarray(jax.grad(total)(jnp.asarray(fit.theta.b[:, 0])))
+        gradient = np.asarray(jax.jit(jax.grad(total))(fit.theta.b[:, 0]))
         curvature = fit.normal.diagonal()[: len(gradient)]
     # What a Newton step would still move, stops.
     assert np.abs(gradient / curvature).max() < 1e-4

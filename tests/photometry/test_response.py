@@ -8,9 +8,10 @@ from solving import problem_of
 from synthetic_drive import make_drive, make_exposures, observe
 
 from p2gs_jax.config import PhotometryConfig
+from p2gs_jax.photometry import formation
 from p2gs_jax.photometry.adjustment.parameters import Splines
 from p2gs_jax.photometry.adjustment.solve import fit_response
-from p2gs_jax.photometry.formation import eotf, inverse_tone_map, tone_map
+from p2gs_jax.photometry.formation import eotf
 from p2gs_jax.photometry.response import (
     FREE,
     HELD,
@@ -27,6 +28,9 @@ from p2gs_jax.synth.sensor import encode
 
 BENT = Response("srgb", tuple(0.3 * np.sin(3 * KNOTS) - 0.1))
 CFG = PhotometryConfig(curve="spline", spline=BENT.spline)
+tone_map, inverse_tone_map = (
+    jax.jit(f, static_argnums=2) for f in (formation.tone_map, formation.inverse_tone_map)
+)
 
 
 @pytest.mark.parametrize("response", [Response("srgb"), Response("power"), BENT])
@@ -80,7 +84,8 @@ def test_formation_follows_the_spline_and_is_never_dead():
         back = inverse_tone_map(y, jnp.float32(gamma), CFG)
         np.testing.assert_allclose(tone_map(back, jnp.float32(gamma), CFG), y, atol=2e-4)
     x = jnp.asarray(np.geomspace(2e-6, 50, 500), jnp.float32)
-    value, slope = jax.vmap(jax.value_and_grad(lambda v: tone_map(v, jnp.float32(2.2), CFG)))(x)
+    both = jax.vmap(jax.value_and_grad(lambda v: tone_map(v, jnp.float32(2.2), CFG)))
+    value, slope = jax.jit(both)(x)
     assert np.all(np.diff(value) > 0)
     assert np.all(np.isfinite(slope) & (np.asarray(slope) > 0))
 

@@ -12,14 +12,17 @@ from splats import random_splats
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.gaussians.posed import posed
 from p2gs_jax.render import required_capacity
+from p2gs_jax.render import visible as visibility
 from p2gs_jax.render.project import HIDDEN, camera_of_each
-from p2gs_jax.render.visible import BLOCK, compact, in_view, splat, splat_listed
+from p2gs_jax.render.visible import BLOCK, compact, splat
 from p2gs_jax.train.room import count_view
 from p2gs_jax.types import Camera, Placement
 
 WIDTH, HEIGHT = 48, 40
 CFG = RenderConfig(sh_degree=3, stop_error=None)
 COUNT = 60
+splat_listed = jax.jit(visibility.splat_listed, static_argnums=(5, 6, 7))
+in_view = jax.jit(visibility.in_view, static_argnums=3)
 
 
 def pose(seed: int, at=(0.0, 0.0, 4.0)) -> np.ndarray:
@@ -94,7 +97,7 @@ def test_what_is_not_there_leaves_the_picture_as_if_it_were_removed(known):
         splats, _ = seen_by(g, alive, camera, owner)
         return splats.means2d.sum() + splats.conic_factor.sum() + splats.log_opacities.sum()
 
-    gradient = jax.grad(total)(g)
+    gradient = jax.jit(jax.grad(total))(g)
     for leaf in jax.tree.leaves(gradient):
         assert np.isfinite(leaf).all()
         assert not np.asarray(leaf)[gone].any()
@@ -104,7 +107,7 @@ def test_bounds_and_capacities_know_where_objects_are():
     g, owner = scene()
     alive = jnp.ones(COUNT, bool)
     camera = view()
-    each = camera_of_each(camera, jnp.asarray(owner))
+    each = jax.jit(camera_of_each)(camera, jnp.asarray(owner))
     seen = np.asarray(in_view(g, alive, each, CFG))
     shown = np.asarray(seen_by(g, alive, camera, jnp.asarray(owner))[0].visible)
     assert seen.any()
@@ -113,7 +116,7 @@ def test_bounds_and_capacities_know_where_objects_are():
         *jax.tree.map(np.asarray, (g, alive, camera)), CFG, np.asarray(owner)
     )
     assert visible == seen.sum()
-    needed = int(required_capacity(g, alive, camera, CFG, jnp.asarray(owner)))
+    needed = jax.jit(required_capacity, static_argnums=3)(g, alive, camera, CFG, jnp.asarray(owner))
     assert 0 < needed <= 1.01 * entries + 8
     assert shown.sum() >= seen.sum() > 0
 
@@ -122,7 +125,7 @@ def test_blocks_take_each_gaussian_to_its_own_box():
     g, owner = scene()
     alive = jnp.ones(COUNT, bool)
     camera = view()
-    ids, count = compact(alive, BLOCK)
+    ids, count = jax.jit(compact, static_argnums=1)(alive, BLOCK)
     listed = splat_listed(g, alive, ids, count, camera, CFG, 3, 16, jnp.asarray(owner))
     whole = seen_by(g, alive, camera, jnp.asarray(owner))
     for a, b in zip(jax.tree.leaves(listed), jax.tree.leaves(whole), strict=True):

@@ -9,13 +9,15 @@ import pytest
 from splats import camera, gaussians_of
 
 from p2gs_jax.config import RenderConfig
+from p2gs_jax.render import visible
 from p2gs_jax.render.project import CYCLE, STILL, at_time
-from p2gs_jax.render.visible import in_view, splat
+from p2gs_jax.render.visible import splat
 from p2gs_jax.types import Placement, Vibration
 
 LIFE, PEAK = 0.4, 0.2
 CFG = RenderConfig(sh_degree=0)
 ALIVE = jnp.ones(1, bool)
+at, in_view = jax.jit(at_time), jax.jit(visible.in_view, static_argnums=3)
 
 
 def gaussian(velocity=(2.0, 0.0, 0.0), life=LIFE):
@@ -44,14 +46,14 @@ def same(found, expected, **tolerance):
 def test_it_is_where_and_as_opaque_as_the_formula_says():
     g, still = gaussian(), np.exp(-LIFE / (2 * CYCLE))
     for time in (-0.5, 0.0, 0.2, 0.3, 0.9):
-        now = at_time(g, placement(time))
+        now = at(g, placement(time))
         along = 2 * still * np.sin(2 * np.pi * (time - PEAK) / CYCLE) * CYCLE / (2 * np.pi)
         np.testing.assert_allclose(now.means[0], [along, 0, 5], atol=1e-6)
         shown = opacity(g) * np.exp(-((time - PEAK) ** 2) / (2 * LIFE**2))
         assert opacity(now) == pytest.approx(shown, rel=1e-4)
         assert now.vibration is None
     # About the peak it moves at its velocity.
-    a, b = (at_time(g, placement(PEAK + d)).means[0, 0] for d in (-0.01, 0.01))
+    a, b = (at(g, placement(PEAK + d)).means[0, 0] for d in (-0.01, 0.01))
     assert float(b - a) / 0.02 == pytest.approx(2 * still, rel=1e-2)
     standing = dataclasses.replace(g, vibration=None)
     assert at_time(standing, placement(0.3)) is standing
@@ -60,11 +62,11 @@ def test_it_is_where_and_as_opaque_as_the_formula_says():
 def test_it_is_the_same_on_the_host_and_without_a_time_in_the_middle_of_the_drive():
     g = gaussian()
     for objects in (None, dataclasses.replace(placement(0.7), time=None)):
-        same(at_time(g, objects), at_time(g, placement(0.0)), rtol=0)
+        same(at(g, objects), at(g, placement(0.0)), rtol=0)
     host = at_time(*jax.tree.map(np.asarray, (g, placement(0.35))))
     assert isinstance(host.means, np.ndarray)
     assert host.means.dtype == host.opacity_logits.dtype == np.float32
-    same(host, at_time(g, placement(0.35)), rtol=1e-5, atol=1e-6)
+    same(host, at(g, placement(0.35)), rtol=1e-5, atol=1e-6)
 
 
 def test_what_lives_for_ever_stands_and_no_gradient_moves_it():
@@ -74,7 +76,7 @@ def test_what_lives_for_ever_stands_and_no_gradient_moves_it():
         now = at_time(dataclasses.replace(g, vibration=moves), placement(0.6))
         return jnp.sum(now.means) + jnp.sum(now.opacity_logits), now
 
-    gradient, now = jax.grad(shown, has_aux=True)(g.vibration)
+    gradient, now = jax.jit(jax.grad(shown, has_aux=True))(g.vibration)
     np.testing.assert_array_equal(now.means, g.means)
     assert opacity(now) == pytest.approx(opacity(g), rel=1e-6)
     for leaf in jax.tree.leaves(gradient):

@@ -11,18 +11,15 @@ import splats
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import view_radiance
-from p2gs_jax.render.warp import (
-    project_points,
-    sample_bilinear,
-    surface_depth,
-    unproject,
-    visible,
-    warp,
-)
+from p2gs_jax.render import warp as warping
 from p2gs_jax.types import Render
 
 WIDTH, HEIGHT = 24, 16
 Y, X = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+# One program a shape, where eager calls make one an operation.
+project_points, sample_bilinear = jax.jit(warping.project_points), jax.jit(warping.sample_bilinear)
+surface_depth, unproject = jax.jit(warping.surface_depth), jax.jit(warping.unproject)
+visible, warp = jax.jit(warping.visible), jax.jit(warping.warp)
 camera = functools.partial(splats.camera, width=WIDTH, height=HEIGHT, focal=20.0)
 
 
@@ -34,7 +31,7 @@ def plane(z):
 def test_projecting_what_was_unprojected_gives_the_pixel_back(x, yaw, z):
     seen_by = camera(x, yaw=yaw)
     points = unproject(plane(float(z)), seen_by)
-    host = unproject(np.full(X.shape, float(z)), jax.tree.map(np.asarray, seen_by))
+    host = warping.unproject(np.full(X.shape, float(z)), jax.tree.map(np.asarray, seen_by))
     np.testing.assert_allclose(points, host, rtol=1e-4, atol=1e-4)
     xy, depth = project_points(points, seen_by)
     np.testing.assert_allclose(xy, np.stack([X, Y], -1), atol=2e-4)

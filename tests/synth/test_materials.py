@@ -1,5 +1,6 @@
 """Materials keep their means from every distance, however wide a pixel is on them."""
 
+import functools
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -120,7 +121,7 @@ def test_a_matte_town_is_the_town_without_gloss():
     assert matte.light == town.light
     middles, rows = jnp.asarray((town.lo + town.hi).T / 2), jnp.arange(town.size)
     gloss = [
-        paint(t, middles, jnp.asarray(-TO_SUN), rows, jnp.full(t.size, 0.01)).gloss
+        jax.jit(functools.partial(paint, t))(middles, -TO_SUN, rows, np.full(t.size, 0.01)).gloss
         for t in (matte, town)
     ]
     assert float(gloss[0].max()) == 0.0 < 0.5 < float(gloss[1].max())

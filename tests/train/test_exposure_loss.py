@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from p2gs_jax.config import (
     PhotometryConfig,
     RelativeExposureConfig,
 )
-from p2gs_jax.photometry.formation import formation
+from p2gs_jax.photometry import formation as forming
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import KNOTS
 from p2gs_jax.train import exposure_loss as rel
@@ -21,6 +22,9 @@ from p2gs_jax.train.exposure_loss import color_pairs
 from p2gs_jax.types import Photometry
 
 WIDTH, HEIGHT = 48, 32
+# One program a shape, where eager calls make one an operation.
+formation = jax.jit(forming.formation, static_argnames="cfg")
+observed_ldr = jax.jit(rel.observed_ldr, static_argnums=(2, 3))
 OBSERVED = LossConfig(relative_exposure=RelativeExposureConfig(1.0, "observed_ldr"))
 CAMERAS = (
     CameraFormation("a", ((-0.5, 0.1, 0.0),), (tuple(0.2 * np.sin(4 * KNOTS)),)),
@@ -45,7 +49,7 @@ def observed(photometry, cfg, count=400) -> rel.ColorPairs:
     rows = rng.integers(0, 4, (2, count)).astype(np.int32)
     at = [jnp.asarray(rng.uniform(-0.6, 0.6, (count, 2)), jnp.float32) for _ in rows]
     colors = [
-        formation(radiance, photometry.capture(jnp.asarray(r)), cfg, positions=p)
+        formation(radiance, photometry.capture(jnp.asarray(r)), cfg=cfg, positions=p)
         for r, p in zip(rows, at, strict=True)
     ]
     return rel.ColorPairs(*colors, *map(jnp.asarray, rows), jnp.ones(count), *at)
@@ -55,7 +59,7 @@ def observed(photometry, cfg, count=400) -> rel.ColorPairs:
 def test_zero_at_the_truth_and_only_there(cfg):
     right = truth()
     pairs = observed(right, cfg)
-    at_truth = float(rel.observed_ldr(pairs, right, OBSERVED, cfg))
+    at_truth = float(observed_ldr(pairs, right, OBSERVED, cfg))
     assert at_truth < 2e-4
     wrong = {
         "white balance": (dataclasses.replace(right, raw_white_balance=jnp.zeros((4, 3))), cfg),
@@ -65,9 +69,9 @@ def test_zero_at_the_truth_and_only_there(cfg):
     if cfg is CURVED:
         wrong["responses"] = (right, dataclasses.replace(cfg, curve="srgb"))
     for name, (photometry, under) in wrong.items():
-        assert float(rel.observed_ldr(pairs, photometry, OBSERVED, under)) > max(
-            2e-3, 20 * at_truth
-        ), name
+        assert float(observed_ldr(pairs, photometry, OBSERVED, under)) > max(2e-3, 20 * at_truth), (
+            name
+        )
 
 
 def _without(cfg, name):
@@ -79,9 +83,10 @@ def test_the_literal_reading_takes_the_whole_gain():
     right = dataclasses.replace(truth(), raw_gammas=jnp.zeros(4))
     linear, views = jnp.full((HEIGHT, WIDTH, 3), 0.2), (jnp.int32(0), jnp.int32(1))
     cfg = LossConfig(relative_exposure=RelativeExposureConfig(1.0))
-    found = float(rel.relative_exposure_loss(linear, views, None, right, cfg, SHADED))
+    literal = jax.jit(rel.relative_exposure_loss, static_argnums=(4, 5))
+    found = float(literal(linear, views, None, right, cfg, SHADED))
     uncurved = dataclasses.replace(SHADED, curve="linear", pivot=1.0)
-    first, second = (np.asarray(formation(linear, right.capture(i), uncurved)) for i in views)
+    first, second = (np.asarray(formation(linear, right.capture(i), cfg=uncurved)) for i in views)
     expected = np.abs((second / first - 1) * 0.2).sum(-1).mean()
     assert found == pytest.approx(expected, rel=1e-4)
 

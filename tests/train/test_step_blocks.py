@@ -81,12 +81,12 @@ def test_one_step_is_an_adam_update_of_the_gradient_of_the_loss(made):
     assert int(state.step) == 1
     assert float(report.loss) == pytest.approx(made.loss, rel=1e-6)
     assert int(report.visible) == made.seen.sum()
-    rates = learning_rates(
-        jnp.float32(PROGRESS), jnp.float32(RATE), EXTENT, made.params, CFG, (DEGREE + 1) ** 2
-    )
+    rates_at = jax.jit(learning_rates, static_argnums=(2, 4, 5))
+    rates = rates_at(PROGRESS, RATE, EXTENT, made.params, CFG, (DEGREE + 1) ** 2)
     o = CFG.optimizer
     adam = optax.scale_by_adam(o.b1, o.b2, o.eps)
-    updates, _ = adam.update(made.gradient, adam.init(made.params))
+    start = jax.jit(adam.init)(made.params)
+    updates, _ = jax.jit(adam.update)(made.gradient, start)
     moments = state.opt_state.gaussians
     for name in FIELDS:
         g = rows_of(made.gradient.gaussians, name, made.seen)
