@@ -35,10 +35,11 @@ def pytest_sessionstart(session):
                 path.unlink(missing_ok=True)
 
 
-# What takes the longest begins first: at the end no process waits for another.
+# What takes the longest begins first: at the end no process waits for another. Nor at the start:
+# the second file does not need the run that the first fits for all.
 LONGEST = (
-    *("train/test_presets", "faults/test_faults", "docs/test_code_blocks", "jobs/test_sweep"),
-    *("pipeline/test_moving", "cli/test_against", "render/test_rasterize", "jobs/test_fit_blocks"),
+    *("train/test_presets", "faults/test_faults", "jobs/test_sweep", "pipeline/test_moving"),
+    *("docs/test_code_blocks", "cli/test_against", "render/test_rasterize", "jobs/test_fit_blocks"),
     *("train/test_step_blocks", "gaussians/test_bake", "pipeline/test_cutouts"),
     *("pipeline/test_calibrate", "train/test_make_step"),
     *("synth/test_street", "pipeline/test_preflight", "render/test_transformations"),

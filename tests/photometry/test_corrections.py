@@ -15,7 +15,6 @@ from p2gs_jax.photometry import luminance as gs
 from p2gs_jax.photometry.appearance import GRID, exposures_apart, identity, regularisation
 from p2gs_jax.photometry.formation import formation
 from p2gs_jax.train import terms
-from p2gs_jax.train.terms import curve_prior, enhanced_loss
 from p2gs_jax.types import LUMINANCE, Capture, Params, Photometry
 
 RNG = np.random.default_rng(0)
@@ -259,7 +258,7 @@ def test_a_dark_photograph_asks_for_a_curve_that_brightens():
     def prior(curve, power=1.0):
         out_bias = start.out_bias.at[gs.ENTRIES].set((power - 1) / gs.POWER_UNIT)
         moved = replace(start, curve=curve, out_bias=out_bias)
-        return curve_prior(moved.view(0), 0.1 * PICTURE, MASK)
+        return terms.curve_prior(moved.view(0), 0.1 * PICTURE, MASK)
 
     assert float(jax.grad(prior)(start.curve)[10:80].max()) < 0
     # The pseudo curve, which follows, holds it back.
@@ -299,7 +298,7 @@ def test_masked_pixels_get_no_gradient():
     mask, view = MASK.at[:4].set(0), learned(0.05).view(0)
 
     def f(render):
-        compared = enhanced_loss(render, PICTURE, mask, view, LossConfig())
+        compared = terms.enhanced_loss(render, PICTURE, mask, view, LossConfig())
         return compared + contrast_loss(render, PICTURE, mask)
 
     slope = jax.jit(jax.grad(f))(PICTURE * 0.5)

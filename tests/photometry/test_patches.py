@@ -11,11 +11,7 @@ from scipy.interpolate import RegularGridInterpolator
 from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.photometry.adjustment.errors import SHARED_REGION, regions
 from p2gs_jax.photometry.adjustment.fit import fit_model
-from p2gs_jax.photometry.calibrate import (
-    CalibrationOptions,
-    calibrate_observations,
-    held_out,
-)
+from p2gs_jax.photometry.calibrate import CalibrationOptions, calibrate_observations, held_out
 from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.sources import patches
 from p2gs_jax.photometry.sources.points import track_colors

@@ -11,14 +11,7 @@ from p2gs_jax.evaluation.alignment import exposure_error
 from p2gs_jax.photometry.adjustment.problem import KnownExposures
 from p2gs_jax.photometry.adjustment.solve import fit_response
 from p2gs_jax.photometry.candidates import Candidate, choose
-from p2gs_jax.photometry.models import (
-    Choice,
-    Curve,
-    Form,
-    Scope,
-    neighbours,
-    parameter_count,
-)
+from p2gs_jax.photometry.models import Choice, Curve, Form, Scope, neighbours, parameter_count
 from p2gs_jax.photometry.response import FREE, HELD, Response, log_exposed
 
 # Log factors on red, green, blue: dark photographs are bluer; each camera has its own.

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from p2gs_jax.config import LossConfig, PhotometryConfig, RelativeExposureConfig
 from p2gs_jax.evaluation.scores import VideoScores
 from p2gs_jax.photometry import formation as forming
-from p2gs_jax.photometry.formation import eotf
 from p2gs_jax.presets import preset
 from p2gs_jax.train import exposure_loss as rel
 from p2gs_jax.train.terms import PRIORS, photometric_loss
@@ -31,10 +30,9 @@ SEEDS = st.integers(0, 2**31 - 1)
 SCALES = st.floats(0.2, 5.0)
 GAMMAS = st.floats(1.4, 3.2)
 # One program a shape, where eager calls make one an operation.
-formation, tone_map, inverse_tone_map = (
-    jax.jit(f, static_argnums=2)
-    for f in (forming.formation, forming.tone_map, forming.inverse_tone_map)
-)
+formation = jax.jit(forming.formation, static_argnums=2)
+tone_map = jax.jit(forming.tone_map, static_argnums=2)
+inverse_tone_map = jax.jit(forming.inverse_tone_map, static_argnums=2)
 
 
 def radiance(seed, n=64, low=-6.0, high=-0.5):
@@ -198,7 +196,7 @@ def test_15_and_16_his_and_luminance_of_videos(seed, c):
         return found.summary()
 
     one, of_frames = scores(video, e), e[:, None, None, None]
-    linear, levels = eotf(video, "srgb"), (video @ LUMINANCE).mean((1, 2))
+    linear, levels = forming.eotf(video, "srgb"), (video @ LUMINANCE).mean((1, 2))
     whole = {
         "his_paper": mean_rms(linear * of_frames),
         "his": mean_rms(linear / of_frames) / np.mean(linear / of_frames),

@@ -21,6 +21,7 @@ from p2gs_jax.types import Camera, Placement
 WIDTH, HEIGHT = 48, 40
 CFG = RenderConfig(sh_degree=3, stop_error=None)
 COUNT = 60
+# One program a shape, where eager calls make one an operation.
 splat_listed = jax.jit(visibility.splat_listed, static_argnums=(5, 6, 7))
 in_view = jax.jit(visibility.in_view, static_argnums=3)
 
@@ -104,9 +105,7 @@ def test_what_is_not_there_leaves_the_picture_as_if_it_were_removed(known):
 
 
 def test_bounds_and_capacities_know_where_objects_are():
-    g, owner = scene()
-    alive = jnp.ones(COUNT, bool)
-    camera = view()
+    (g, owner), alive, camera = scene(), jnp.ones(COUNT, bool), view()
     each = jax.jit(camera_of_each)(camera, jnp.asarray(owner))
     seen = np.asarray(in_view(g, alive, each, CFG))
     shown = np.asarray(seen_by(g, alive, camera, jnp.asarray(owner))[0].visible)
@@ -122,9 +121,7 @@ def test_bounds_and_capacities_know_where_objects_are():
 
 
 def test_blocks_take_each_gaussian_to_its_own_box():
-    g, owner = scene()
-    alive = jnp.ones(COUNT, bool)
-    camera = view()
+    (g, owner), alive, camera = scene(), jnp.ones(COUNT, bool), view()
     ids, count = jax.jit(compact, static_argnums=1)(alive, BLOCK)
     listed = splat_listed(g, alive, ids, count, camera, CFG, 3, 16, jnp.asarray(owner))
     whole = seen_by(g, alive, camera, jnp.asarray(owner))

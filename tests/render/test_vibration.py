@@ -11,7 +11,6 @@ from splats import camera, gaussians_of
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import visible
 from p2gs_jax.render.project import CYCLE, STILL, at_time
-from p2gs_jax.render.visible import splat
 from p2gs_jax.types import Placement, Vibration
 
 LIFE, PEAK = 0.4, 0.2
@@ -89,7 +88,7 @@ def test_far_from_its_peak_it_is_out_of_view_and_all_stays_finite():
     assert [bool(in_view(g, ALIVE, seen(t), CFG)[0]) for t in (0.2, 0.9)] == [True, False]
 
     def total(g):
-        splats, radiance = splat(g, ALIVE, seen(0.9), CFG)
+        splats, radiance = visible.splat(g, ALIVE, seen(0.9), CFG)
         return jnp.sum(splats.log_opacities) + jnp.sum(splats.means2d) + jnp.sum(radiance)
 
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(jax.jit(jax.grad(total))(g)))

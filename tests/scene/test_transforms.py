@@ -7,14 +7,7 @@ import os
 import cv2
 import numpy as np
 import pytest
-from scene.helpers import (
-    around,
-    blender,
-    refused,
-    write_image,
-    write_rgba,
-    write_tiny_model,
-)
+from scene.helpers import around, blender, refused, write_image, write_rgba, write_tiny_model
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene import find_scene, load_scene, with_what_lies_beside

@@ -69,9 +69,8 @@ def test_zero_at_the_truth_and_only_there(cfg):
     if cfg is CURVED:
         wrong["responses"] = (right, dataclasses.replace(cfg, curve="srgb"))
     for name, (photometry, under) in wrong.items():
-        assert float(observed_ldr(pairs, photometry, OBSERVED, under)) > max(2e-3, 20 * at_truth), (
-            name
-        )
+        loss = float(observed_ldr(pairs, photometry, OBSERVED, under))
+        assert loss > max(2e-3, 20 * at_truth), name
 
 
 def _without(cfg, name):

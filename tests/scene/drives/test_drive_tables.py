@@ -108,7 +108,7 @@ REFUSED = {
     "cut gzip": (gzip.compress(pickle.dumps(TABLE))[:300], UNREADABLE),
     "noise": (b"\x17" * 500, UNREADABLE),
     "categories": (pickle.dumps(pd.DataFrame({"c": pd.Categorical(["a"])})), "it holds a pandas"),
-    "bomb": (gzip.compress(bytes(2**28 + 1), 1), "unpacks to more than 256 MiB"),
+    "bomb": (65 * gzip.compress(bytes(2**22), 1), "unpacks to more than 256 MiB"),
 }
 
 
