@@ -18,7 +18,7 @@ PerChannel = Float[np.ndarray, "o 3"]
 
 # Sources sample a point in its coarsest view, which is at most this many times coarser than its
 # finest: what is still farther away mixes in neighbours (BUILD_NOTES).
-COARSEST = 4.0
+COARSEST = 3.0
 
 
 @dataclass(frozen=True)
