@@ -45,8 +45,10 @@ class Demo:
         """Make a street, fit it, and print recovered against true exposures."""
         from p2gs_jax.cli.tables import make_table, print_metrics, stdout
         from p2gs_jax.core.progress import TerminalReporter
+        from p2gs_jax.core.runtime import use_cores
         from p2gs_jax.pipeline.demo import run_demo
 
+        use_cores()
         cfg = preset(self.preset)
         train = dataclasses.replace(cfg.train, budget_s=self.budget, seed=self.seed)
         cfg = checked(dataclasses.replace(cfg, train=train))

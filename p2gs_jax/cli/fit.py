@@ -52,6 +52,9 @@ class Fit:
     engine: Annotated[str, tyro.conf.arg(metavar="NAME")] = "local"
     """Where blocks are fitted: local, dask://HOST:PORT, or slurm:OPTION=VALUE,...
     (docs/sweeps.md)."""
+    threads: int | None = None
+    """Cores of the CPU that a view is divided over. Default: those it may use, at most 4. Results
+    repeat bit for bit with the same number."""
     devices: int | Literal["all"] = 1
     """Devices of a step, each with its own views (--train.batch; default then: one view each)."""
 
@@ -62,10 +65,13 @@ class Fit:
 
         from p2gs_jax.cli.tables import print_metrics
         from p2gs_jax.core.progress import TerminalReporter
+        from p2gs_jax.core.runtime import use_cores
         from p2gs_jax.pipeline.fit import fit
         from p2gs_jax.train.data_parallel import with_a_view_each
 
         self._check()
+        # Blocks are fitted side by side, each on one core.
+        use_cores(self.threads if self.blocks is None else 1)
         with TerminalReporter() as reporter:
             cfg = checked(self.config)
             common = {"reference": self.reference, "resume": self.resume, "reporter": reporter}
@@ -92,6 +98,8 @@ class Fit:
         right = not isinstance(count, int) or count >= 1
         check(right, f"--blocks {count} is not a number of blocks", fix=f"{whole} auto")
         check(self.jobs >= 1, "--jobs must be at least 1")
+        right = self.threads is None or self.threads >= 1
+        check(right, f"--threads {self.threads} is not a number of cores", fix="give 1 or more")
         why = "--blocks fits every block on one device"
         fix = "leave out --devices; blocks have --jobs and --engine"
         check(count is None or self.devices == 1, why, fix=fix)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
+import os
 import platform
 import sys
 from pathlib import Path
@@ -16,8 +17,13 @@ from typing import Any
 import jax
 import platformdirs
 
+from p2gs_jax.core.threads import available_cores
+
 # Numbers of mallopt(3).
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD = -1, -2, -3
+# Above this, cores wait for each other more than they gain (of 16, a step took 1,580 ms on one, 321
+# divided over 4, 337 over 8, 666 over 16; experiments/results/2026-11-27-cores.md).
+MOST_CORES = 4
 # Shorter compilations are not worth a file.
 SHORTEST_S = 0.5
 # The least recently used programs go first.
@@ -61,6 +67,23 @@ def tune_process() -> None:
     """
     keep_freed_memory()
     jax.config.update("jax_cpu_enable_async_dispatch", False)
+
+
+def use_cores(count: int | None = None) -> None:
+    """Let fits divide a view over so many cores; None: over those there are, at most `MOST_CORES`.
+
+    To be called before JAX computes anything: each core becomes a device. Fewer than that, or one,
+    is what programs have that do not call this. It leaves alone what the environment says of it
+    (JAX_NUM_CPU_DEVICES, or XLA_FLAGS with xla_force_host_platform_device_count).
+
+    Raises:
+        RuntimeError: JAX has computed something already.
+    """
+    stated = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
+    if stated or jax.config.values["jax_num_cpu_devices"] != -1:
+        return
+    cores = min(available_cores(), MOST_CORES) if count is None else count
+    jax.config.update("jax_num_cpu_devices", cores)
 
 
 def use_compile_cache() -> None:

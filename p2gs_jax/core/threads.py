@@ -1,4 +1,4 @@
-"""A map in threads, in order, that holds few results at once: what passes over all views need."""
+"""Cores that this process may use, and a map in threads that holds few results at once."""
 
 from __future__ import annotations
 
@@ -8,11 +8,23 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
+from p2gs_jax.core.memory import CGROUP, text_of
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 # A bound on the images held at once.
 MOST_WORKERS = 4
+
+
+def available_cores() -> int:
+    """Return how many cores this process may use: its affinity, or the limit of its container."""
+    there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    # "QUOTA PERIOD", microseconds, or "max PERIOD".
+    quota, _, period = text_of(CGROUP / "cpu.max").strip().partition(" ")
+    if quota.isdecimal() and period.isdecimal():
+        there = min(there or 1, int(quota) // max(int(period), 1))
+    return max(there or 1, 1)
 
 
 def map_in_order(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
@@ -22,7 +34,7 @@ def map_in_order(function: Callable[[Item], Result], items: Iterable[Item]) -> I
     so that programs compile once. `Executor.map` would submit all items at once; here at most one
     result more than there are threads is held.
     """
-    workers = min(os.cpu_count() or 1, MOST_WORKERS)
+    workers = min(available_cores(), MOST_WORKERS)
     rest = iter(items)
     for first in rest:
         yield function(first)

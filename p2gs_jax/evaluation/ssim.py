@@ -17,6 +17,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from p2gs_jax.render.cores import cores, gather, this_core, total
 from p2gs_jax.render.xla_cpu import materialize, opaque_true
 
 Image = Float[Array, "h w 3"]
@@ -99,7 +100,19 @@ def _masked_sum(
 
 
 def _masked_sum_fwd(x, y, mask):
-    always = opaque_true(mask[0, 0])
+    # Each core takes a strip of rows, with those around it that reach into its gradient.
+    height, reach = mask.shape[0], 2 * (WINDOW // 2) if cores() > 1 else 0
+    rows = -(-height // cores())
+    mine = slice(reach, reach + rows)
+
+    def strip(a):
+        if cores() == 1:
+            return a
+        beyond = (reach, cores() * rows - height + reach)
+        a = jnp.pad(a, (*[(0, 0)] * (a.ndim - 2), beyond, (0, 0)))
+        return lax.dynamic_slice_in_dim(a, this_core() * rows, rows + 2 * reach, -2)
+
+    weights, always = strip(mask), opaque_true(mask[0, 0])
 
     def channel(pair):
         p = _parts(pair[0], pair[1], always)
@@ -109,11 +122,12 @@ def _masked_sum_fwd(x, y, mask):
         d_m = d_m + by_b * (p.md * (p.B - 2) + p.ms * p.B) / p.b2
         d_dd = by_b * (1 - p.B / 2) / p.b2
         d_ss = -by_b * p.B / (2 * p.b2)
-        back = _blur(mask * jnp.stack([d_m, d_dd, d_ss]), always)
-        return jnp.sum(p.unlike * mask), back[0] + 2 * p.d * back[1] + 2 * p.s * back[2]
+        back = _blur(weights * jnp.stack([d_m, d_dd, d_ss]), always)
+        gradient = back[0] + 2 * p.d * back[1] + 2 * p.s * back[2]
+        return jnp.sum((p.unlike * weights)[mine]), gradient[mine]
 
-    total, gradient = lax.map(channel, (x, y))
-    return jnp.sum(total), (gradient, mask)
+    sums, gradient = lax.map(channel, (strip(x), strip(y)))
+    return total(jnp.sum(sums)), (gather(gradient, 1)[:, :height], mask)
 
 
 def _masked_sum_bwd(residuals, v):

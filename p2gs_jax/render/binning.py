@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import binning_cpu
 from p2gs_jax.render.binning_cpu import bits_for, boxes, depth_keys, grid_size
+from p2gs_jax.render.cores import cores
 from p2gs_jax.types import Splats2D, TileList
 
 
@@ -38,6 +39,7 @@ def bin_tiles(
 
 def _choose(counting, sorting, splats: Splats2D, cfg: RenderConfig, *static):
     kind = cfg.binning or ("counting" if jax.default_backend() == "cpu" else "sorting")
+    kind = "counting" if cores() > 1 else kind
     function = {"counting": counting, "sorting": sorting}[kind]
     return function(jax.tree.map(lax.stop_gradient, splats), *static, cfg)
 

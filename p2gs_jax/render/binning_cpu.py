@@ -16,6 +16,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.config import RenderConfig
+from p2gs_jax.render.cores import cores, this_core
 from p2gs_jax.render.xla_cpu import compiled_loop
 from p2gs_jax.types import Splats2D, TileList
 
@@ -231,9 +232,17 @@ def _span(e: _Ellipses, row: Int[Array, " m"], width: int, tile: tuple[int, int]
 
 
 def _tile_rows(box: Boxes, tile_y: int):
-    """Return (first row of tiles, number of rows) of every box."""
+    """Return (first row of tiles, number of rows) of every box, among the rows of this core."""
     first, last = box.first[:, 1] // tile_y, box.last[:, 1] // tile_y
+    if cores() > 1:
+        first = (first - this_core() + cores() - 1) // cores()
+        last = (last - this_core()) // cores()
     return first, jnp.where(box.visible, last - first + 1, 0)
+
+
+def _of_image(row: Int[Array, " m"]) -> Int[Array, " m"]:
+    """Return which rows of the image's tiles the rows of this core are."""
+    return row * cores() + this_core() if cores() > 1 else row
 
 
 def count_entries(splats: Splats2D, width: int, height: int, cfg: RenderConfig) -> Int[Array, ""]:
@@ -243,7 +252,7 @@ def count_entries(splats: Splats2D, width: int, height: int, cfg: RenderConfig) 
     first, rows = _tile_rows(box, cfg.tile[1])
 
     def body(k, total):
-        lengths = _span(ellipses, first + k, width, cfg.tile)[1]
+        lengths = _span(ellipses, _of_image(first + k), width, cfg.tile)[1]
         here = jnp.sum(jnp.where(k < rows, lengths, 0).astype(jnp.float32))
         # Each step is exact below 2^24 and the sum saturates.
         return jnp.minimum(total + here.astype(jnp.int32), MOST_ENTRIES)
@@ -257,11 +266,12 @@ def bin_tiles(
 ) -> TileList:
     """Return the lists, see `p2gs_jax.render.binning.bin_tiles`."""
     across, down = grid_size(width, height, cfg.tile)
-    tile_count = across * down
+    tile_count = across * -(-down // cores())
     box = boxes(splats, width, height, cfg)
-    order = depth_order(splats.depths, box.visible)
-    first, rows = (a[order] for a in _tile_rows(box, cfg.tile[1]))
-    visible = jnp.sum(box.visible, dtype=jnp.int32)
+    first, rows = _tile_rows(box, cfg.tile[1])
+    order = depth_order(splats.depths, rows > 0)
+    first, rows = first[order], rows[order]
+    visible = jnp.sum(rows > 0, dtype=jnp.int32)
     row_count, row, owner = _expand(first, rows, visible, capacity)
 
     used_rows = jnp.minimum(row_count, capacity)
@@ -293,7 +303,7 @@ def _solve_rows(row, owner, order, ellipses: _Ellipses, used, width: int, tile: 
         ids = order[lax.dynamic_slice(owner, here, (size,))]
         block = table.at[ids].get(mode="promise_in_bounds")
         mine = _Ellipses(*(block[:, i] for i in range(len(_Ellipses._fields))))
-        first, lengths = _span(mine, lax.dynamic_slice(row, here, (size,)), width, tile)
+        first, lengths = _span(mine, _of_image(lax.dynamic_slice(row, here, (size,))), width, tile)
         return tuple(
             lax.dynamic_update_slice(a, b, here)
             for a, b in zip(state, (ids, first, lengths), strict=True)

@@ -28,6 +28,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from p2gs_jax.render.binning import longest_first
+from p2gs_jax.render.cores import cores, this_core
 from p2gs_jax.render.tiles import DARKEST, GEOMETRY, Plan, geometry_gradient
 from p2gs_jax.render.xla_cpu import compiled_loop, materialize
 
@@ -139,7 +140,7 @@ class Queue(NamedTuple):
         lengths = ends - segments.starts
         parked = jnp.zeros(lanes, jnp.int32)
         tiles = jnp.concatenate([segments.tiles, parked])
-        column, line = tiles % plan.across, tiles // plan.across
+        column, line = tiles % plan.across, tiles // plan.across * cores() + this_core()
         centers = jnp.stack([column * tile_x + tile_x / 2, line * tile_y + tile_y / 2], -1)
         return cls(
             jnp.concatenate([longest_first(lengths), count + lane]),

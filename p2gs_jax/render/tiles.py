@@ -27,6 +27,7 @@ from jaxtyping import Array, Float
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render.binning import grid_size
+from p2gs_jax.render.cores import cores, gather_rows
 from p2gs_jax.types import Splats2D, TileList
 
 TileImplementation = Literal["xla", "pallas"]
@@ -72,7 +73,7 @@ def rasterize_reference(
 
 
 class Plan(NamedTuple):
-    """Static shape of one compositing run; the cutoff is one of exponents."""
+    """Static shape of one compositing run, by one core; the cutoff is one of exponents."""
 
     across: int
     down: int
@@ -230,6 +231,7 @@ def rasterize(
     if tiles is None:
         raise ValueError(f"the {name} rasterizer needs a tile list: pass bin_tiles(...)")
     across, down = grid_size(width, height, cfg.tile)
+    down = -(-down // cores())
     pixels, scale = cfg.tile[0] * cfg.tile[1], _module(name).exponent_scale(cfg.alpha_cutoff)
     plan = Plan(
         across=across,
@@ -243,6 +245,8 @@ def rasterize(
     )
     rows = pack_rows(splats, radiance, plan)
     tiled: tuple[Array, ...] = _composite(rows, tiles.gaussian_ids, tiles.offsets, plan, name)
-    *channels, transmittance = (_untile(a, plan)[:height, :width] for a in tiled)
+    whole = plan._replace(down=down * cores())
+    tiled = tuple(gather_rows(a, across) for a in tiled)
+    *channels, transmittance = (_untile(a, whole)[:height, :width] for a in tiled)
     depth = channels[3] if with_depth else None
     return jnp.stack(channels[:3], -1), 1 - transmittance, depth

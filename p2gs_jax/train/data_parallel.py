@@ -27,12 +27,12 @@ from p2gs_jax.gaussians.mcmc import shaped_noise
 from p2gs_jax.render import visible as visibility
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.render.harmonics import coefficient_count
-from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.train import image_gradient
+from p2gs_jax.train.divided import mesh_of_cores
 from p2gs_jax.train.image_gradient import ImageGradient, Listed, differentiable
 from p2gs_jax.train.optimizer import learning_rates, means_rate
 from p2gs_jax.train.state import FitState
-from p2gs_jax.train.step import Step, static_sizes
+from p2gs_jax.train.step import Step, compiled_over, static_sizes
 from p2gs_jax.train.update import StepReport, concluded, is_healthy, update_listed
 from p2gs_jax.types import Array, Batch, Frustum, Gaussians
 
@@ -54,8 +54,7 @@ def _counted(devices: Count) -> int:
     if not 1 <= devices <= there:
         why = f"--devices {devices} is not between 1 and the {there} that JAX sees here "
         why += f"({jax.default_backend()})."
-        fix = "give one of these, or all; on a CPU, XLA_FLAGS="
-        fix += f"--xla_force_host_platform_device_count={devices} makes as many of its cores"
+        fix = f"give one of these, or all; on a CPU, --threads {devices} makes as many of its cores"
         raise UserError(why, fix=fix)
     return devices
 
@@ -75,6 +74,8 @@ def with_a_view_each(cfg: FitConfig, devices: Count) -> FitConfig:
 def mesh_of(cfg: FitConfig, devices: Count = 1) -> Mesh | None:
     """Return the mesh of a fit; None for one view a step on one device.
 
+    Views are shared out among devices, and one view is divided over cores of a CPU.
+
     Raises:
         UserError: there are not so many devices, or the batch cannot be shared out among them.
     """
@@ -82,24 +83,12 @@ def mesh_of(cfg: FitConfig, devices: Count = 1) -> Mesh | None:
     if batch < 1:
         raise UserError(f"--train.batch is {batch}.", fix="give 1 or more")
     if batch == 1 and count == 1:
-        return None
+        return mesh_of_cores()
     if batch % count:
         why = f"--train.batch {batch} cannot be shared out among {count} devices."
         fix = f"give a multiple of {count}, such as --train.batch {-(-batch // count) * count}"
         raise UserError(why, fix=fix)
     return default_mesh(count)
-
-
-def spread(state: FitState, mesh: Mesh | None) -> FitState:
-    """Return a state as steps take it: whole on each of the devices; None: where it is."""
-    if mesh is None:
-        return state
-    return jax.device_put(jax.device_get(state), NamedSharding(mesh, EVERYWHERE))
-
-
-def whole(state: FitState, mesh: Mesh | None) -> FitState:
-    """Return a state of steps on the default device, for what looks at all Gaussians."""
-    return state if mesh is None else jax.tree.map(jnp.asarray, jax.device_get(state))
 
 
 # ------------------------------------------------- what each device does, with its own views
@@ -283,32 +272,16 @@ PROGRAMS: dict[str, tuple[Any, Any, Any]] = {
 
 @functools.cache
 def _compiled(name: str, *, mesh: Mesh, **static: Any) -> Any:
-    """Return a part of a step, divided over the mesh and jitted; it takes arrays of the host."""
-    part, *specs = PROGRAMS[name]
-    into, out = jax.tree.map(
-        lambda spec: NamedSharding(mesh, spec), specs, is_leaf=lambda spec: isinstance(spec, P)
-    )
-    body = jax.shard_map(
-        functools.partial(part, **static),
-        mesh=mesh,
-        in_specs=specs[0],
-        out_specs=specs[1],
-        check_vma=False,
-    )
-    return jax.jit(
-        body,
-        in_shardings=into,
-        out_shardings=out,
-        compiler_options=compiler_options(),
-        donate_argnums=(0,) if name == "advance" else (),
-    )
+    """Return a part of a step, divided over the mesh and jitted."""
+    part, into, out = PROGRAMS[name]
+    return compiled_over(mesh, name, functools.partial(part, **static), into, out)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ParallelStep(Step):
     """The step of several views; `train.batch` is a multiple of the devices.
 
-    Batches and partners come stacked, states by `spread`.
+    Batches and partners come stacked, states whole on each of the devices.
     """
 
     mesh: Mesh = dataclasses.field(default_factory=default_mesh)
@@ -327,3 +300,11 @@ class ParallelStep(Step):
         one, every = super().frustum(batch), (self.cfg.train.batch,)
         width, height = (np.full(every, size) for size in (one.width, one.height))
         return dataclasses.replace(one, width=width, height=height)
+
+    def spread(self, state: FitState) -> FitState:
+        """Return a state whole on each of the devices."""
+        return jax.device_put(jax.device_get(state), NamedSharding(self.mesh, EVERYWHERE))
+
+    def whole(self, state: FitState) -> FitState:
+        """Return a state on the default device."""
+        return jax.tree.map(jnp.asarray, jax.device_get(state))

@@ -27,10 +27,12 @@ from p2gs_jax.core.progress import LogRecord
 from p2gs_jax.core.runtime import return_freed_memory
 from p2gs_jax.errors import DivergenceError
 from p2gs_jax.gaussians.population import Coverage, step_seconds
+from p2gs_jax.render.cores import CORES
 from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.train import room, schedule, strategies
-from p2gs_jax.train.data_parallel import ParallelStep, spread, whole
+from p2gs_jax.train.data_parallel import VIEWS, ParallelStep
+from p2gs_jax.train.divided import DividedStep
 from p2gs_jax.train.exposure_loss import ColorPairs
 from p2gs_jax.train.inputs import Inputs, TrainingViews, controls_at, inputs_at
 from p2gs_jax.train.optimizer import make_optimizer
@@ -88,7 +90,7 @@ class Trainer:
     decided: Decisions  # what the scene settled; a resumed run must have settled the same
     on_log: Callable[[LogRecord], None] = lambda record: None
     on_message: Callable[[str], None] = lambda text: None  # told what the user must know
-    mesh: Mesh | None = None  # the devices of a step of several views; None: it takes one view
+    mesh: Mesh | None = None  # the devices of a step, from `mesh_of`
     # loss terms to add to those of `cfg`, or to replace; None takes one away
     terms: Mapping[str, LossTerm | None] | None = None
     strategy: Strategy | None = None  # how the population changes; None: as `cfg` says
@@ -110,8 +112,10 @@ class Trainer:
         self.densification = self.strategy or chosen
         noise = getattr(self.densification, "noise", None)
         given = (cfg, self.optimizer, self.extent, noise, self.terms or {})
-        mesh = self.mesh
-        self.step = Step(*given) if mesh is None else ParallelStep(*given, mesh)
+        kinds = {VIEWS: ParallelStep, CORES: DividedStep}
+        self.step = Step(*given)
+        if self.mesh is not None:
+            self.step = kinds[self.mesh.axis_names[0]](*given, mesh=self.mesh)
 
     def run(
         self,
@@ -141,7 +145,7 @@ class Trainer:
         host = HostState(planned=planned, pace=1.0 / max(train.steps, 1))
         state, host = self.records.begin(state, planned, resume) or (state, host)
         # Planned for longer, a run has room for more Gaussians.
-        state = grow_state(state, self.slots.slots)
+        state = grow_state(state, self.step.slots(self.slots.slots))
         # On GPUs the host decides the pace of short steps, which tells nothing of evaluation.
         here = jax.default_backend() == "cpu"
         full_step_s = step_seconds(self.coverage.pixels) if here else math.inf
@@ -149,11 +153,11 @@ class Trainer:
         clock = RunClock(self.cfg.train, host, **seconds, now=self.now)
         population = state.population
         self._allocate(state.params.gaussians, population.alive, population.owner, host)
-        state = spread(state, self.mesh)
+        state = self.step.spread(state)
         self._expect(state, host)
         with interrupts.held() as self.asked:
             state = self._loop(state, host, clock)
-            state = whole(state, self.mesh)
+            state = self.step.whole(state)
             self._save(state, host)
         seconds = {"compiling": self.programs.waited_s, **self.stopwatch.seconds}
         return TrainResult(state, host, seconds)
@@ -169,7 +173,8 @@ class Trainer:
         alive, host = np.ones(seeds, bool), HostState(rooms=dict(self.programs.rooms))
         self._allocate(params.gaussians, alive, owner, host)
         self.programs.rooms = dict(host.rooms)
-        start = functools.partial(initial_state, optimizer=self.optimizer, slots=self.slots.slots)
+        slots = self.step.slots(self.slots.slots)
+        start = functools.partial(initial_state, optimizer=self.optimizer, slots=slots)
         self._expect(jax.eval_shape(start, params, alive, owner=owner), host, images)
 
     # ------------------------------------------------------------------ bursts of steps
@@ -198,7 +203,7 @@ class Trainer:
             asked = self.asked.arrived
             if asked is not None or host.elapsed_s - saved > pause:
                 begun = host.elapsed_s
-                self._save(whole(state, self.mesh), host)
+                self._save(self.step.whole(state), host)
                 clock.tick(host)
                 saved = host.elapsed_s
                 pause = pause_between(every_s, saved - begun)
@@ -290,14 +295,14 @@ class Trainer:
             host.densified_at = host.progress
             state = strategies.densified(
                 self.densification,
-                whole(state, self.mesh),
+                self.step.whole(state),
                 host,
                 self.cfg,
                 self.extent,
                 self.slots.limit,
                 self.on_message,
             )
-            return spread(state, self.mesh)
+            return self.step.spread(state)
 
     def _save(self, state: FitState, host: HostState) -> None:
         with self.stopwatch("checkpoints"):

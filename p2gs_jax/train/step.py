@@ -9,16 +9,18 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import os
 import time
 from collections.abc import Callable, Hashable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import on_host
+from p2gs_jax.core.threads import available_cores
 from p2gs_jax.presets import narrowed
 from p2gs_jax.render.capacity import Room
 from p2gs_jax.render.xla_cpu import compiler_options
@@ -50,7 +52,7 @@ TAKEN: dict[str, dict[str, Any]] = {
 
 # The first step waits for two programs of about equal size; but XLA itself compiles on several
 # cores, and two at once on two cores take three times as long each (ours: BUILD_NOTES).
-WORKERS = 1 if (os.cpu_count() or 1) <= 2 else 2
+WORKERS = 1 if available_cores() <= 2 else 2
 
 
 PROGRAMS: dict[str, Callable[..., Any]] = {
@@ -67,6 +69,26 @@ def compiled(name: str, **static: Any) -> Any:
     body = functools.partial(PROGRAMS[name], **static)
     donated = (0,) if name == "advance" else ()
     return jax.jit(body, compiler_options=compiler_options(), donate_argnums=donated)
+
+
+def compiled_over(mesh: Mesh, name: str, body: Callable, into: Any, out: Any) -> Any:
+    """Return a part of a step, divided over the devices of a mesh, jitted.
+
+    `body` is what each device does; `into` and `out` say how its arguments and its results are
+    divided. It takes arrays of the host.
+    """
+    placed = jax.tree.map(
+        lambda spec: NamedSharding(mesh, spec),
+        (into, out),
+        is_leaf=lambda spec: isinstance(spec, P),
+    )
+    return jax.jit(
+        jax.shard_map(body, mesh=mesh, in_specs=into, out_specs=out, check_vma=False),
+        in_shardings=placed[0],
+        out_shardings=placed[1],
+        compiler_options=compiler_options(),
+        donate_argnums=(0,) if name == "advance" else (),
+    )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -144,7 +166,7 @@ class Step:
         moved = (state, listed.ids, listed.visible, gradient, frustum, controls)
         return program(name).lower(*moved)
 
-    # What a step of several views on several devices does otherwise (`data_parallel.py`).
+    # What steps on several devices do otherwise: `divided.py`, `data_parallel.py`.
 
     def program(self, name: str, room: Room, degree: int) -> Any:
         """Return one of the three programs, jitted."""
@@ -155,6 +177,18 @@ class Step:
         c = batch.camera
         width, height = map(c.K.dtype.type, (c.width, c.height))
         return on_host(Frustum, c.viewmat, c.K, width, height, c.objects)
+
+    def slots(self, count: int) -> int:
+        """Return how many slots a population has that is to have `count` or more."""
+        return count
+
+    def spread(self, state: FitState) -> FitState:
+        """Return a state as steps take it."""
+        return state
+
+    def whole(self, state: FitState) -> FitState:
+        """Return a state of steps on the default device, for what looks at all Gaussians."""
+        return state
 
 
 def static_sizes(name: str, room: Room, degree: int) -> dict[str, int]:

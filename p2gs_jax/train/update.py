@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float, Int, UInt32
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.streams import noise_key
 from p2gs_jax.gaussians.mcmc import exploration_noise
+from p2gs_jax.render.cores import all_true, cores, most, this_core
 from p2gs_jax.render.harmonics import coefficient_count
 from p2gs_jax.render.visible import (
     block_size,
@@ -116,6 +117,8 @@ def advance(
     progress, rate = controls.progress, controls.rate
     rates = optimizers.learning_rates(progress, rate, extent, state.params, cfg, bands)
     key = noise_key(controls.seed, state.step)
+    if cores() > 1:
+        key = jax.random.fold_in(key, this_core())
     noise_rate = (noise or 0.0) * optimizers.means_rate(progress, rate, extent, cfg)
 
     def exploring(block, _, moved, on):
@@ -138,10 +141,11 @@ def advance(
         noise=None if noise is None else exploring,
         owner=population.owner,
     )
+    updated = updated._replace(finite=all_true(updated.finite))
     if noise is None:
         where = jnp.where(healthy, ids, n)
         population = _observed(population, where, gradient, frustum)
-    moved, told = (updated, population), (fits, healthy, count)
+    moved, told = (updated, population), (fits, healthy, most(count))
     return concluded(state, moved, gradient, told, rates, cfg=cfg, optimizer=optimizer)
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import os
 import shutil
 import threading
 from collections.abc import Sequence
@@ -18,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from p2gs_jax.core.atomic import BROKEN_ARRAYS, atomic_write
+from p2gs_jax.core.threads import available_cores
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.files import file_fingerprints
 from p2gs_jax.scene.pixels.decode import Decoded, decode, resamples
@@ -147,7 +147,7 @@ class DecodingAhead:
     def __init__(self, views: Sequence[View], files: PixelFiles, keys: Sequence[Sequence[Key]]):
         """Begin; `keys` are for every view the sizes that will be asked for."""
         self._jobs = list(zip(reversed(views), reversed(keys), strict=True))
-        count = min(max(1, (os.cpu_count() or 1) // 2), MOST_THREADS)
+        count = min(max(1, available_cores() // 2), MOST_THREADS)
         given = (self._jobs, files)
         self._threads = [threading.Thread(target=_decode, args=given) for _ in range(count)]
         for thread in self._threads:

@@ -7,7 +7,6 @@ more cost only what is new. It is thrown away where a photograph changed or is g
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import sys
 from collections import defaultdict
@@ -24,6 +23,7 @@ from p2gs_jax.config import Matching
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.memory import left_to_process
 from p2gs_jax.core.text import natural
+from p2gs_jax.core.threads import available_cores
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.cameras import parent_of
 from p2gs_jax.scene.files import Report, file_fingerprints, image_size, stage_progress
@@ -89,7 +89,7 @@ def extract(
     # COLMAP decodes a photograph in every thread.
     largest = max(w * h for w, h in (image_size(image_folder / name) for name in names))
     room = int(SHARE * (left_to_process() or sys.maxsize)) // (BYTES_PER_PIXEL * largest)
-    if room < (os.cpu_count() or 1):
+    if room < available_cores():
         options.num_threads = max(1, room)
     reader = pycolmap.ImageReaderOptions()
     if camera is not None:

@@ -1,0 +1,91 @@
+"""One view divided over the cores of a CPU, each a device of JAX (docs/scaling.md).
+
+A program that `jax.shard_map` divides along the axis `CORES` is traced once for all cores. Where
+it is, the rasterizer composites every N-th row of tiles on each core, SSIM takes a strip of the
+image, and both give every core the whole result. Everywhere else there is one core, and nothing
+here leaves anything in a program.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+CORES = "cores"
+Tree = TypeVar("Tree")
+
+
+def cores() -> int:
+    """Return the number of cores that the program being traced is divided over."""
+    return jax.sharding.get_abstract_mesh().shape.get(CORES, 1)
+
+
+def this_core() -> Int[Array, ""] | int:
+    """Return the number of the core, from 0."""
+    return lax.axis_index(CORES) if cores() > 1 else 0
+
+
+def gather(tree: Tree, axis: int = 0) -> Tree:
+    """Return arrays of all cores, one after the other along an axis."""
+    if cores() == 1:
+        return tree
+    return jax.tree.map(lambda a: lax.all_gather(a, CORES, axis=axis, tiled=True), tree)
+
+
+def scatter_sum(tree: Tree) -> Tree:
+    """Return the core's part of the sum over all cores, along the first axis."""
+    if cores() == 1:
+        return tree
+    return jax.tree.map(lambda a: lax.psum_scatter(a, CORES, tiled=True), tree)
+
+
+def part(a: Array) -> Array:
+    """Return the core's part of an array that all cores have, along the first axis."""
+    size = a.shape[0] // cores()
+    return lax.dynamic_slice_in_dim(a, this_core() * size, size) if cores() > 1 else a
+
+
+def total(a: Array) -> Array:
+    """Return the sum over all cores."""
+    return lax.psum(a, CORES) if cores() > 1 else a
+
+
+def most(count: Int[Array, ""]) -> Int[Array, ""]:
+    """Return as many times the largest count of a core as there are cores."""
+    return lax.pmax(count, CORES) * cores() if cores() > 1 else count
+
+
+def all_true(flags: Bool[Array, "..."]) -> Bool[Array, "..."]:
+    """Return which flags are set on every core."""
+    return lax.pmin(flags.astype(jnp.int32), CORES) > 0 if cores() > 1 else flags
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
+def gather_rows(tiles: Float[Array, "t p"], across: int) -> Float[Array, "a p"]:
+    """Return the tiles of all cores in the order of the image; core k has rows k, k + N, ... of it.
+
+    `across` is the number of tiles of a row. What follows is done by every core alike, so that each
+    knows its whole gradient and takes its rows of it.
+    """
+    if cores() == 1:
+        return tiles
+    each = lax.all_gather(tiles.reshape(-1, across, tiles.shape[-1]), CORES, axis=1)
+    return each.reshape(-1, tiles.shape[-1])
+
+
+def _gather_rows_fwd(tiles, across: int):
+    return gather_rows(tiles, across), None
+
+
+def _gather_rows_bwd(across: int, _, v_tiles):
+    rows = v_tiles.reshape(-1, cores(), across, v_tiles.shape[-1])
+    mine = lax.dynamic_index_in_dim(rows, this_core(), 1, keepdims=False)
+    return (mine.reshape(-1, v_tiles.shape[-1]),)
+
+
+gather_rows.defvjp(_gather_rows_fwd, _gather_rows_bwd)
