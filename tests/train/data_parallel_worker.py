@@ -1,4 +1,4 @@
-"""Steps of several views on virtual devices, in a process of its own: prints JSON.
+"""Steps on virtual devices, of several views and of one, in a process of its own: prints JSON.
 
 JAX counts its devices once, so a test run cannot have both one and four: four are wanted here
 (XLA_FLAGS=--xla_force_host_platform_device_count=4).
@@ -9,12 +9,16 @@ import sys
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 from noise_views import COUNT, DEGREE, EXTENT, VIEWS, config, start, view
 
 from p2gs_jax.core.numerics import on_host
+from p2gs_jax.presets import with_values
 from p2gs_jax.render import xla_cpu
 from p2gs_jax.render.capacity import Room
-from p2gs_jax.train.data_parallel import ParallelStep, default_mesh, spread, whole
+from p2gs_jax.render.cores import CORES
+from p2gs_jax.train.data_parallel import ParallelStep, default_mesh
+from p2gs_jax.train.divided import DividedStep
 from p2gs_jax.train.inputs import stacked
 from p2gs_jax.train.optimizer import make_optimizer
 from p2gs_jax.train.state import healed, initial_state
@@ -54,7 +58,7 @@ def on_devices(count: int) -> dict:
     cfg = config(batch=VIEWS)
     optimizer, mesh = make_optimizer(cfg), default_mesh(count)
     step = ParallelStep(cfg, optimizer, EXTENT, cfg.densify.noise, mesh=mesh)
-    state = spread(initial_state(start(), alive(), optimizer), mesh)
+    state = step.spread(initial_state(start(), alive(), optimizer))
     inputs = (*map(stacked, zip(*map(view, range(VIEWS)), strict=True)), CONTROLS)
 
     lowered = [step.lowered(n, state, *inputs, room=ROOM, degree=DEGREE) for n in PROGRAMS]
@@ -72,10 +76,35 @@ def on_devices(count: int) -> dict:
     for _ in range(2):
         state, report = run(state, *inputs)
         losses.append(float(report.loss))
-        first = first or jax.tree.map(np.asarray, first_moments(whole(state, mesh)))
-    state = whole(state, mesh)
+        first = first or jax.tree.map(np.asarray, first_moments(step.whole(state)))
+    state = step.whole(state)
     params = jax.tree.map(np.asarray, state.params)
     return found | {"losses": losses, "moments": first, "params": params, "step": int(state.step)}
+
+
+def over_cores(count: int) -> dict:
+    """Two steps of one view divided over cores, and how far what comes of them is from one core's.
+
+    Before them is one that finds no room, of which nothing may come.
+    """
+    cfg = with_values(config(method=None), {"loss.dssim_weight": 0.2})
+    optimizer, mesh = make_optimizer(cfg), Mesh(np.array(jax.devices()[:count]), (CORES,))
+    steps = (Step(cfg, optimizer, EXTENT), DividedStep(cfg, optimizer, EXTENT, mesh=mesh))
+    ends, reports, found = [], [], {}
+    for step in steps:
+        state = step.spread(initial_state(start(), alive(), optimizer))
+        show, differentiate, advance = (step.program(name, ROOM, DEGREE) for name in PROGRAMS)
+        narrow = step.program("differentiate", Room(64, ROOM.visible), DEGREE)
+        state, _ = step.chained(show, narrow, advance)(state, *view(0), CONTROLS)
+        fault = {k: int(getattr(state.fault, k)) for k in ("kind", "needed")}
+        found = {"fault": fault, "stopped at": int(state.step)}
+        state = healed(state)
+        for row in (0, 1):
+            state, report = step.chained(show, differentiate, advance)(state, *view(row), CONTROLS)
+        end = jax.tree.map(lambda a: a[:COUNT] * 1.0 if a.ndim else a, step.whole(state))
+        ends.append((end.params, end.opt_state, end.population))
+        reports.append(float(report.loss))
+    return found | {"of one core": distance(*ends), "losses": reports}
 
 
 def distance(tree, other) -> float:
@@ -100,6 +129,8 @@ def main() -> None:
             "of one device": distance(whole["params"], made["params"]),
             **{k: v for k, v in made.items() if k not in ("moments", "params")},
         }
+    # Neither Gaussians nor rows of tiles are a multiple of three.
+    found["cores"] = over_cores(3)
     json.dump(found, sys.stdout)
 
 

@@ -1,4 +1,4 @@
-"""A step of several views is one step, however many devices share its views."""
+"""A step is one step, however many devices share its views, or cores its one view."""
 
 import json
 import os
@@ -51,6 +51,17 @@ def test_a_view_that_finds_no_room_stops_all_devices_until_there_is_some(found):
     assert made["fault"]["needed"] > 64
     assert made["moved"] == 0
     assert made["stopped at"] == 0
+
+
+@pytest.mark.slow
+def test_a_view_divided_over_cores_moves_everything_as_one_core_does(found):
+    """Gaussians, moments, photometry and statistics; a view that finds no room moves nothing."""
+    made = found["cores"]
+    assert made["fault"]["kind"] == FAULT_OVERFLOW
+    assert made["fault"]["needed"] > 64
+    assert made["stopped at"] == 0
+    assert made["losses"][1] == pytest.approx(made["losses"][0], rel=1e-6)
+    assert made["of one core"] < 2e-6
 
 
 def test_one_view_on_one_device_needs_no_mesh():
