@@ -16,6 +16,7 @@ from typing import Any
 # By module; one is imported when a name of it is used: `--help` needs no JAX.
 _PUBLIC = {
     "config": ("FitConfig", "RenderConfig"),
+    "core.runtime": ("use_cores",),
     "errors": ("DivergenceError", "UserError"),
     "evaluation.alignment": ("exposure_error",),
     "evaluation.evaluate": ("evaluate",),

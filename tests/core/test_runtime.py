@@ -1,4 +1,4 @@
-"""Memory that a process keeps and hands back, and compiled programs that it keeps on disk."""
+"""Memory that a process keeps and hands back, programs that it keeps on disk, and its cores."""
 
 import os
 import subprocess
@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from p2gs_jax.core import runtime
+from p2gs_jax.core import runtime, threads
 
 SCRIPT = """
 import numpy as np
@@ -60,8 +60,14 @@ import jax, jax.numpy as jnp
 from p2gs_jax.core import runtime
 runtime.SHORTEST_S = 0.0
 runtime.use_compile_cache()
+runtime.use_cores(3)
 print(jax.config.values["jax_compilation_cache_dir"])
 jax.jit(lambda x: jnp.sin(x) @ x)(jnp.ones((8, 8))).block_until_ready()
+from p2gs_jax.train.divided import mesh_of_cores
+mesh = mesh_of_cores()
+assert jax.device_count() == (3 if mesh else 1)
+assert mesh is None or (mesh.size, mesh.axis_names) == (3, ("cores",))
+print(mesh is not None)
 """
 
 
@@ -74,7 +80,9 @@ def run(**variables) -> str:
         text=True,
         check=True,
     )
-    return done.stdout.strip()
+    folder, divided = done.stdout.splitlines()
+    assert divided == str("JAX_NUM_CPU_DEVICES" not in variables)
+    return folder
 
 
 def test_programs_are_kept_for_this_machine_where_they_can_be(tmp_path):
@@ -85,4 +93,17 @@ def test_programs_are_kept_for_this_machine_where_they_can_be(tmp_path):
     assert run(XDG_CACHE_HOME=str(tmp_path / "xdg"), JAX_COMPILATION_CACHE_DIR=chosen) == chosen
     assert not (tmp_path / "xdg").exists()
     (tmp_path / "file").write_text("in the way")
-    assert run(XDG_CACHE_HOME=str(tmp_path / "file")) == "None"
+    # What the environment says of cores stays as well.
+    assert run(XDG_CACHE_HOME=str(tmp_path / "file"), JAX_NUM_CPU_DEVICES="1") == "None"
+
+
+@pytest.mark.parametrize(
+    ("limit", "cores"), [("max 100000", 4), ("250000 100000", 2), ("50000 100000", 1), ("", 4)]
+)
+def test_a_process_has_the_cores_of_its_affinity_and_its_container(
+    monkeypatch, tmp_path, limit, cores
+):
+    (tmp_path / "cpu.max").write_text(limit)
+    monkeypatch.setattr(threads, "CGROUP", tmp_path)
+    monkeypatch.setattr(threads.os, "sched_getaffinity", lambda process: {0, 1, 2, 5})
+    assert threads.available_cores() == cores
