@@ -102,7 +102,8 @@ def black_level(stack: Stack) -> float:
     """Return the value up to which the darkest frame shows nothing but its black level.
 
     A frame that is mostly black has a spike in its histogram there, whatever the offset (film
-    scans: 13-16 of 255); one that is not is trusted down to its darkest percent.
+    scans: 13-16 of 255); one that is not is trusted down to its darkest percent. A value less than
+    twice that level is more offset than signal.
     """
     darkest = min(stack.images, key=lambda i: float(np.mean(i)))
     values = darkest[stack.valid]
@@ -112,7 +113,7 @@ def black_level(stack: Stack) -> float:
         spike = int(np.argmax(counts))
         if counts[max(spike - 2, 0) : spike + 3].sum() > SPIKE:
             level = max(level, float(spike + 2))
-    return level / 255 + ABOVE_BLACK
+    return level / 255 + max(ABOVE_BLACK, level / 255)
 
 
 def choose_points(stack: Stack, black: float, seed: int) -> Float[np.ndarray, "p 2"]:
