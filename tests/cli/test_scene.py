@@ -4,23 +4,17 @@ import sys
 
 import cv2
 import numpy as np
-import pytest
 from made_drive import make_recording
 from tiny_scene import make_scene
 
 from p2gs_jax.scene import survey as surveys
 
 
-@pytest.fixture
-def drive(tmp_path, monkeypatch):
-    """A drive that the readers know, with one photograph missing."""
-    recording = make_recording(tmp_path / "drive")
-    recording.photographs[3].path.unlink()
-    monkeypatch.setattr(surveys, "find_scene", lambda *args: recording)
-    return recording
-
-
-def test_a_drive_is_counted(drive, succeeded, monkeypatch):
+def test_a_drive_is_counted(tmp_path, succeeded, monkeypatch):
+    # One photograph of a drive is missing.
+    drive = make_recording(tmp_path / "drive")
+    drive.photographs[3].path.unlink()
+    monkeypatch.setattr(surveys, "find_scene", lambda *args: drive)
     monkeypatch.setenv("COLUMNS", "140")
     said = succeeded("scene", drive.root, "--data.no-own-car")
     for text in (

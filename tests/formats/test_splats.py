@@ -127,10 +127,6 @@ def test_usd_is_read_by_pxr(tmp_path):
         np.testing.assert_allclose(seen, expected, atol=1e-3)
 
 
-def by_x(records, x):
-    return np.argsort(records)[np.argsort(np.argsort(x))]
-
-
 @pytest.fixture
 def with_gsply():
     pytest.importorskip("gsply", reason="the extra `spz` is not installed")
@@ -201,7 +197,8 @@ def test_what_gsply_wrote_is_read_back(tmp_path, with_gsply, degree):
     for number, (write, read) in enumerate(ways):
         assert write(tmp_path / str(number), g) == 50
         found = read(tmp_path / str(number))
-        order = by_x(np.asarray(found.means[:, 0]), np.asarray(g.means[:, 0]))
+        by_x = [np.argsort(np.asarray(splats.means[:, 0])) for splats in (found, g)]
+        order = by_x[0][np.argsort(by_x[1])]
         np.testing.assert_allclose(found.means[order], g.means, atol=0.02)
         np.testing.assert_allclose(found.log_scales[order], g.log_scales, atol=0.05)
         np.testing.assert_allclose(ours(found)[1][order], ours(g)[1], atol=0.003)

@@ -98,10 +98,6 @@ def test_observations_from_too_far_away_are_left_out_and_counted(distances, kept
     assert found.too_coarse == left_out
 
 
-def encoded(linear):
-    return srgb_encode(linear).astype(np.float32)
-
-
 def test_exposures_are_right_where_a_surface_has_highlights():
     """Means of patches with clipped pixels are too dark: as if the exposure were shorter."""
     rng = np.random.default_rng(0)
@@ -109,7 +105,8 @@ def test_exposures_are_right_where_a_surface_has_highlights():
     radiance[rng.uniform(size=radiance.shape) < 0.01] = 0.8
     xy = rng.uniform(5, 115, (3000, 2))
     mask, gains = np.ones((120, 120), np.float32), (1.0, 4.0)
-    seen = [sample(np.repeat(encoded(np.minimum(g * radiance, 1)), 3, 2), mask, xy) for g in gains]
+    shown = [srgb_encode(np.minimum(g * radiance, 1)).astype(np.float32) for g in gains]
+    seen = [sample(np.repeat(grey, 3, 2), mask, xy) for grey in shown]
     parts = (np.concatenate([getattr(s, n) for s in seen]) for n in ("colors", "spread"))
     rows = (np.repeat([0, 1], 3000), np.tile(np.arange(3000), 2))
     brightest = np.concatenate([s.brightest for s in seen])

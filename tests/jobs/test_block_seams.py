@@ -101,15 +101,10 @@ def test_a_boundary_meets_half_way_and_nothing_jumps_or_reaches_far():
     assert np.all(merged[x > REACH] == 0.4)
 
 
-def quarters():
-    """Return four blocks that meet in one corner."""
+def test_blocks_around_a_corner_agree_there():
     ranges = (-INF, 0.0), (0.0, INF)
     blocks = [Block((u[0], v[0]), (u[1], v[1]), (0, 1)) for u in ranges for v in ranges]
-    return Cut(GROUND, 1.0, tuple(blocks))
-
-
-def test_blocks_around_a_corner_agree_there():
-    cut, offsets = quarters(), np.array([0.0, 0.3, -0.2, 0.7])
+    cut, offsets = Cut(GROUND, 1.0, tuple(blocks)), np.array([0.0, 0.3, -0.2, 0.7])
     pairs = cut.neighbours()
     # Those that only touch in the corner as well.
     assert pairs == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]

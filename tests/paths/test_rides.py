@@ -130,14 +130,10 @@ MOUNTS = {
 }
 
 
-def vehicle(step):
-    """Return vehicle-to-world on a curved road."""
-    return inverse(turned(8 * step, (0.3 * step**2, 0, 2.0 * step)))
-
-
 def photographs(steps=4, mounts=MOUNTS, leave_out=()):
+    """Return views of a vehicle on a curved road."""
     out = [
-        view(f"{camera}/{k:06d}.png", mount @ inverse(vehicle(k)))
+        view(f"{camera}/{k:06d}.png", mount @ turned(8 * k, (0.3 * k**2, 0, 2.0 * k)))
         for camera, mount in mounts.items()
         for k in range(steps)
         if (camera, k) not in leave_out

@@ -25,10 +25,6 @@ cut_here = jax.jit(lambda offsets: cut(offsets, PLAN))
 merge_here = jax.jit(lambda composited, segments: merge(composited, segments, PLAN))
 
 
-def offsets_of(lengths):
-    return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
-
-
 def composite(colors, alphas):
     """Return the colour and the transmittance of entries from front to back."""
     color, transmittance = np.zeros(PIXELS), np.ones(PIXELS)
@@ -42,7 +38,7 @@ def composite(colors, alphas):
 @example(GIANT, 0)
 def test_merging_is_compositing(lengths, seed):
     rng = np.random.default_rng(seed)
-    offsets = offsets_of(lengths)
+    offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
     total = int(offsets[-1])
     colors = rng.uniform(0, 4, (total, PIXELS))
     alphas = rng.uniform(0, 0.1, (total, PIXELS)) * (rng.random((total, 1)) < 0.5)

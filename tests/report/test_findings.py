@@ -44,10 +44,6 @@ def run(finished_run):
     return files
 
 
-def warnings(run):
-    return dict(findings.run_warnings(run))
-
-
 def put(value, *path):
     """Return a change of a run: a value at a path that begins with an attribute."""
 
@@ -103,7 +99,7 @@ WARNINGS = [
 @pytest.mark.parametrize(("change", "title", "words"), WARNINGS, ids=[w[1] for w in WARNINGS])
 def test_each_warning_appears_alone_and_names_what_it_means(run, change, title, words):
     change(run)
-    found, names = warnings(run), [v["image"] for v in run.train]
+    found, names = dict(findings.run_warnings(run)), [v["image"] for v in run.train]
     assert set(found) == {title}
     assert all(word.format(*names) in found[title] for word in words)
 
@@ -118,7 +114,7 @@ UNPROVEN = {
 @pytest.mark.parametrize("change", UNPROVEN.values(), ids=UNPROVEN)
 def test_what_proves_nothing_gives_no_warning(run, change):
     change(run)
-    assert warnings(run) == {}
+    assert dict(findings.run_warnings(run)) == {}
 
 
 def test_a_sentence_says_what_was_modelled(run):

@@ -7,6 +7,7 @@ import os
 import cv2
 import numpy as np
 import pytest
+from report.page_tools import edit
 from scene.helpers import around, blender, refused, write_image, write_rgba, write_tiny_model
 
 from p2gs_jax.config import DataConfig
@@ -27,12 +28,6 @@ def write(folder, data, *, names=("images/a.png", "images/b.png")):
     path = folder / "transforms.json"
     path.write_text(data if isinstance(data, str) else json.dumps(data))
     return path
-
-
-def edit(path, change):
-    data = json.loads(path.read_text())
-    change(data)
-    path.write_text(json.dumps(data))
 
 
 def frames(*paths, **extra):
@@ -175,10 +170,6 @@ def write_blender(root, **counts):
     return root
 
 
-def find_and_split(root, cfg):
-    return with_what_lies_beside(find_scene(root, cfg), cfg)
-
-
 def held_out(scene):
     return [view.name for view in scene.views if view.split == "test"]
 
@@ -223,8 +214,9 @@ def test_the_split_of_the_data_set_wins_and_random_seeds_follow(tmp_path, monkey
 
 def test_every_and_none_are_held_out_and_cameras_that_look_apart(tmp_path):
     write_blender(tmp_path)
-    assert held_out(find_and_split(tmp_path, ALL)) == []
-    every = find_and_split(tmp_path, DataConfig(split="every", test_every=3))
+    cfg = DataConfig(split="every", test_every=3)
+    none, every = (with_what_lies_beside(find_scene(tmp_path, c), c) for c in (ALL, cfg))
+    assert held_out(none) == []
     assert every.split_by == "every 3rd view of each camera"
     assert len(held_out(every)) == 3
     near, far = depth_range(every.training_views)

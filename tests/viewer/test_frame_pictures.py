@@ -27,17 +27,12 @@ def camera(width=40, height=24, focal=50.0, rotation=(0, 0, 0), K=None):
     return Camera(jnp.asarray(viewmat), jnp.asarray(K), width, height)
 
 
-@pytest.fixture
-def frame():
+def test_every_mode_shows_what_it_says():
     rng = np.random.default_rng(0)
     linear = np.exp2(rng.uniform(-8, 3, (*SIZE, 3))).astype(np.float32)
     alpha = rng.uniform(0, 1, SIZE).astype(np.float32)
     depth = alpha * rng.uniform(2, 9, SIZE).astype(np.float32)
-    return pictures.RenderedFrame(jnp.asarray(linear), alpha, depth, camera())
-
-
-def test_every_mode_shows_what_it_says(frame):
-    linear = np.asarray(frame.linear)
+    frame = pictures.RenderedFrame(jnp.asarray(linear), alpha, depth, camera())
     shown, limits = develop(linear, TRANSFORM), (2.0, 9.0)
     wanted = {
         "display": shown,

@@ -189,11 +189,6 @@ def test_what_fails_is_said_once_and_the_next_is_served(setup, client, monkeypat
 
 
 @pytest.fixture
-def darkroom(viewed):
-    return Darkroom(viewed)
-
-
-@pytest.fixture
 def frame(viewed):
     return viewed.renderer.render_now(camera_of(viewed.store, 1))
 
@@ -227,7 +222,8 @@ def test_corrections_hold_under_the_curve_they_were_learned_with(run):
     assert display_of(corrected, replace(own, curve="linear")).correction is None
 
 
-def test_the_split_shows_the_photograph_in_its_place(darkroom, viewed, frame, run):
+def test_the_split_shows_the_photograph_in_its_place(viewed, frame, run):
+    darkroom = Darkroom(viewed)
     settings = settings_of_view(run, 1, Settings(gamma=2.2, mode="split", split=0.5))
     shown, photo = darkroom.develop(frame, settings), viewed.store.get(1)[0]
     width = photo.shape[1]
@@ -239,7 +235,8 @@ def test_the_split_shows_the_photograph_in_its_place(darkroom, viewed, frame, ru
     assert np.mean(np.abs(rendered[left] - photo[left])) < 0.15
 
 
-def test_without_a_photograph_the_split_is_the_picture(darkroom, viewed, frame, run, monkeypatch):
+def test_without_a_photograph_the_split_is_the_picture(viewed, frame, run, monkeypatch):
+    darkroom = Darkroom(viewed)
     assert viewed.view_at(frame.camera) == 1
     split = replace(common_settings(run), mode="split")
     plain = darkroom.develop(frame, replace(split, mode="display"))

@@ -284,17 +284,12 @@ def test_kinds_beside_each_other_are_converted_once(folder: Path) -> None:
     assert light_of(converted(folder).paths[1])[32, 48, 1] == pytest.approx(0.6, abs=5e-3)
 
 
-def renamed(root: Path, suffix: str) -> None:
-    """Write a model whose photographs have another suffix; they are written afterwards."""
-    model = write_tiny_model(root) / "images.txt"
-    model.write_text(model.read_text().replace(".png", suffix))
-    for path in (root / "images").iterdir():
-        path.unlink()
-
-
 def test_a_model_of_exr_photographs(tmp_path: Path) -> None:
     root = tmp_path / "scene"
-    renamed(root, ".exr")
+    model = write_tiny_model(root) / "images.txt"
+    model.write_text(model.read_text().replace(".png", ".exr"))
+    for path in (root / "images").iterdir():
+        path.unlink()
     (root / "masks").mkdir()
     for k in range(2):
         write_exr(root / "images" / f"im {k}.exr", LIGHT / (1 + k), expTime=0.01, aperture=2.0)

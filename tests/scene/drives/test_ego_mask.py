@@ -4,7 +4,6 @@ import dataclasses
 
 import cv2
 import numpy as np
-import pytest
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.run.scene_file import read_scene, write_scene
@@ -89,9 +88,8 @@ def test_a_road_and_the_sky_in_turns_are_no_car_and_one_that_stands_says_nothing
     assert find_ego_mask(CAMERA, pictures(DRIVEN[:3]), DRIVEN[:3], UP) is None
 
 
-@pytest.fixture
-def recording(tmp_path):
-    """Two cameras; one sees a bonnet."""
+def test_drives_leave_it_out_and_runs_remember(tmp_path, monkeypatch):
+    # Of two cameras one sees a bonnet.
     photographs = []
     for name in ("front", "back"):
         (tmp_path / name).mkdir()
@@ -100,10 +98,7 @@ def recording(tmp_path):
             cv2.imwrite(str(path), picture)
             photographs.append(Photograph(name, k, 0.1 * k, path, DRIVEN[k]))
     cameras = (CAMERA, dataclasses.replace(CAMERA, name="back"))
-    return Recording(tmp_path, "pandaset", cameras, tuple(photographs))
-
-
-def test_drives_leave_it_out_and_runs_remember(recording, tmp_path, monkeypatch):
+    recording = Recording(tmp_path, "pandaset", cameras, tuple(photographs))
     scene = assemble(recording, DataConfig(frames="0:4"), tmp_path / "work")
     seen, unseen = [note for note in scene.notes if note.startswith("own car")]
     assert "front 1" in seen
