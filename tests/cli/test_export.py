@@ -149,36 +149,26 @@ def test_what_is_there_is_replaced_only_when_asked_and_exports_lie_in_the_run(
     assert (copied / "exports" / "linear.ply").is_file()
 
 
-@pytest.fixture
-def changed_run(monkeypatch):
-    """Return a function that lets a command read runs with a change."""
-
-    def let(change):
-        monkeypatch.setattr(read, "load_run", lambda folder, scene=None: change(load_run(folder)))
-
-    return let
-
-
-def test_names_that_lead_outside_are_refused(finished_run, refused, tmp_path, changed_run):
+def test_names_that_lead_outside_are_refused(finished_run, refused, tmp_path, monkeypatch):
     def outside(fitted):
         views = (replace(fitted.scene.views[0], name="../0.png"), *fitted.scene.views[1:])
         return replace(fitted, scene=replace(fitted.scene, views=views))
 
-    changed_run(outside)
+    monkeypatch.setattr(read, "load_run", lambda folder, scene=None: outside(load_run(folder)))
     for name in ("exr", "colmap"):
         argv = ("export", finished_run, "--format", name, "--out", tmp_path / name)
         assert "../0.png" in refused(*argv)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_corrections_travel_with_the_linear_ply(finished_run, succeeded, tmp_path, changed_run):
+def test_corrections_travel_with_the_linear_ply(finished_run, succeeded, tmp_path, monkeypatch):
     def corrected(fitted):
         appearance = jnp.full((len(fitted.scene.train_indices), 3, 4), 0.1)
         photometry = replace(fitted.cfg.photometry, appearance="affine")
         params = replace(fitted.params, appearance=appearance)
         return replace(fitted, params=params, cfg=replace(fitted.cfg, photometry=photometry))
 
-    changed_run(corrected)
+    monkeypatch.setattr(read, "load_run", lambda folder, scene=None: corrected(load_run(folder)))
     succeeded("export", finished_run, "--format", "linear-ply", "--out", tmp_path)
     said = json.loads((tmp_path / "linear.json").read_text())
     np.testing.assert_allclose(np.load(tmp_path / said["tone"]["correction"]["file"]), 0.1)

@@ -34,9 +34,7 @@ def video(path):
 
 @pytest.fixture(scope="module")
 def own_run(finished_run, tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("render") / "run"
-    shutil.copytree(finished_run, folder)
-    return folder
+    return shutil.copytree(finished_run, tmp_path_factory.mktemp("render") / "run")
 
 
 def test_a_file_of_cameras_renders_what_the_views_rendered(rendered, own_run, tmp_path):

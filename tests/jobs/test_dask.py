@@ -54,10 +54,6 @@ def _tool(name: str) -> list[str]:
     return [sys.executable, "-m", f"distributed.cli.{name}"]
 
 
-def _parent(pid: int) -> int:
-    return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
-
-
 def test_jobs_in_the_queue_of_a_scheduler_end_with_those_that_run(cluster, tmp_path):
     jobs = [Job(name, tmp_path / name, count, {"first": "wait"}) for name in "abc"]
     ended, folder = [], tmp_path / "jobs"
@@ -80,7 +76,8 @@ def test_a_killed_worker_costs_nothing_but_time(cluster, tmp_path):
 
     def kill_its_worker(states):
         if not killed and states[0].doing == "Counting":
-            killed.append(_parent(read_progress(files.progress)["pid"]))
+            stat = Path(f"/proc/{read_progress(files.progress)['pid']}/stat").read_text()
+            killed.append(int(stat.rpartition(")")[2].split()[1]))  # the parent
             assert killed[0] in [w.pid for w in workers]
             os.kill(killed[0], signal.SIGKILL)
 

@@ -9,6 +9,7 @@ from unittest.mock import Mock
 import cv2
 import numpy as np
 import pytest
+from jax.errors import JaxRuntimeError
 from tiny_scene import make_scene, prepared
 
 import p2gs_jax
@@ -62,32 +63,6 @@ def test_a_refused_option_does_not_lock_the_folder(tmp_path, scene, refused, opt
     check_run_dir(run, False, FitConfig())
 
 
-@pytest.fixture
-def failing(monkeypatch, tmp_path):
-    """Return a function that lets the steps of a fit raise, perhaps after a checkpoint."""
-    start = SimpleNamespace(cfg=FitConfig(), decisions=Decisions.as_asked(FitConfig()))
-
-    def fails(error, checkpoint):
-        def run(*args, **kwargs):
-            if checkpoint:
-                store = CheckpointStore(tmp_path / "run" / "checkpoints")
-                store.save(3, {"a": np.zeros(2)}, {})
-            raise error
-
-        monkeypatch.setattr(pipeline, "survey", lambda *a, **k: SimpleNamespace(still=0, dense=0))
-        monkeypatch.setattr(pipeline, "solve_exposures", lambda *a, **k: None)
-        monkeypatch.setattr(pipeline, "initialise", lambda *a, **k: start)
-        monkeypatch.setattr(pipeline.Optimiser, "expect", lambda *a, **k: None)
-        monkeypatch.setattr(pipeline.Optimiser, "run", run)
-        return tmp_path / "run"
-
-    return fails
-
-
-class JaxRuntimeError(RuntimeError):
-    """As JAX calls its own."""
-
-
 @pytest.mark.parametrize("checkpoint", [False, True])
 @pytest.mark.parametrize(
     ("error", "said"),
@@ -98,9 +73,21 @@ class JaxRuntimeError(RuntimeError):
     ],
 )
 def test_a_folder_is_a_runs_once_there_is_something_to_continue(
-    scene, refused, failing, error, said, checkpoint
+    tmp_path, scene, refused, monkeypatch, error, said, checkpoint
 ):
-    run = failing(error, checkpoint)
+    run = tmp_path / "run"
+    start = SimpleNamespace(cfg=FitConfig(), decisions=Decisions.as_asked(FitConfig()))
+
+    def fail(*args, **kwargs):
+        if checkpoint:
+            CheckpointStore(run / "checkpoints").save(3, {"a": np.zeros(2)}, {})
+        raise error
+
+    monkeypatch.setattr(pipeline, "survey", lambda *a, **k: SimpleNamespace(still=0, dense=0))
+    monkeypatch.setattr(pipeline, "solve_exposures", lambda *a, **k: None)
+    monkeypatch.setattr(pipeline, "initialise", lambda *a, **k: start)
+    monkeypatch.setattr(pipeline.Optimiser, "expect", lambda *a, **k: None)
+    monkeypatch.setattr(pipeline.Optimiser, "run", fail)
     assert said in refused("fit", scene, "--out", run)
     assert (run / "config.json").exists() == checkpoint
     if checkpoint:
@@ -239,18 +226,15 @@ def left(monkeypatch):
     return there_are
 
 
-def sized(views=4, size=(1000, 500), points=100):
-    one = SimpleNamespace(width=size[0], height=size[1], size=size, name="a", image=None)
-    return SimpleNamespace(views=[one] * views, points=np.zeros((points, 3)))
-
-
 def test_every_part_counts(monkeypatch):
     monkeypatch.setattr(module, "size_at", lambda view, width: view.size)
     coverage = Coverage(500_000, 1.0)
+    view = SimpleNamespace(width=1000, height=500, size=(1000, 500), name="a", image=None)
 
-    def parts(cfg=None, **more):
+    def parts(cfg=None, views=4):
         cfg = with_fields(ROBUST, {"densify.max_gaussians": 50_000} | (cfg or {}))
-        return memory_needed(sized(**more), cfg, coverage)
+        scene = SimpleNamespace(views=[view] * views, points=np.zeros((100, 3)))
+        return memory_needed(scene, cfg, coverage)
 
     found = parts()
     assert found.population == 50_000

@@ -194,12 +194,9 @@ def test_what_a_run_knows_is_drawn(full_page):
 
 
 @pytest.mark.parametrize("name", ["page.pdf", "page", "folder.html", "file/page.html"])
-def test_where_no_page_can_be_written(run, tmp_path, run_command, name):
+def test_where_no_page_can_be_written(run, tmp_path, refused, name):
     (tmp_path / "folder.html").mkdir()
     (tmp_path / "file").write_text("")
-    code, printed = run_command("report", run, "--no-render", "--out", tmp_path / name)
-    assert code == 2
+    printed = refused("report", run, "--no-render", "--out", tmp_path / name)
     assert name in printed.replace("\n", "")
-    code, printed = run_command("report", tmp_path)
-    assert code == 2
-    assert "config.json is missing" in printed
+    assert "config.json is missing" in refused("report", tmp_path)

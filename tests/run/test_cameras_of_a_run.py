@@ -25,10 +25,6 @@ CAMERAS = (
 )
 
 
-def picture(path):
-    return cv2.imread(str(path))[..., ::-1] / 255.0
-
-
 def test_options_and_decisions_survive_json(tmp_path):
     photometry = dataclasses.replace(
         FitConfig().photometry, white_balance="view", vignetting="channel", cameras=CAMERAS
@@ -99,7 +95,7 @@ def test_render_shows_them_and_leaves_them_out_where_asked(
         succeeded("render", camera_run, "--split", "train", "--out", out, *options)
         stem = first.removesuffix(".png")
         linear, header = read_exr(out / f"{stem}.exr")
-        return picture(out / f"{stem}.render.png"), linear, header
+        return cv2.imread(str(out / f"{stem}.render.png"))[..., ::-1] / 255.0, linear, header
 
     own = run.own_display(rows[0])
     shown, linear, header = rendered("own")

@@ -204,14 +204,9 @@ def read(path: Path, work: Path, **options):
     return video.read_video(path, DataConfig(**options), work, lambda message: None)
 
 
-@pytest.fixture(scope="module")
-def film(tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("film") / "walk.mp4"
-    write_video(path, [room(place) for place in WALK])
-    return path
-
-
-def test_frames_are_kept_and_may_be_chosen_by_number(film: Path, tmp_path: Path) -> None:
+def test_frames_are_kept_and_may_be_chosen_by_number(tmp_path: Path) -> None:
+    film = tmp_path / "walk.mp4"
+    write_video(film, [room(place) for place in WALK])
     found = read(film, tmp_path)
     record = json.loads((tmp_path / "video" / video.RECORD).read_text())
     assert [frame["file"] for frame in record["frames"]] == [path.name for path in found.paths]

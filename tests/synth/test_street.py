@@ -43,11 +43,6 @@ def truth(street, name):
 
 
 @pytest.fixture(scope="module")
-def card(street):
-    return json.loads((street / "dataset.json").read_text())
-
-
-@pytest.fixture(scope="module")
 def street(noisy_street):
     return noisy_street
 
@@ -121,7 +116,8 @@ def test_photographs_are_the_exposed_truth_of_three_orders_and_masks_agree_with_
     assert ((linear > 0.02) & (linear < 1.0)).mean() > 0.6
 
 
-def test_colmap_model_is_what_pycolmap_reads(street, scene, card):
+def test_colmap_model_is_what_pycolmap_reads(street, scene):
+    card = json.loads((street / "dataset.json").read_text())
     model = pycolmap.Reconstruction(str(street / "sparse" / "0"))
     assert model.is_valid()
     assert model.num_cameras() == 3
@@ -205,7 +201,8 @@ def test_what_cannot_be_made_is_refused(street, tmp_path, asked, words):
         write_street(street)
 
 
-def test_the_card_and_the_table_say_what_was_done(street, card, tmp_path):
+def test_the_card_and_the_table_say_what_was_done(street, tmp_path):
+    card = json.loads((street / "dataset.json").read_text())
     assert (card["seed"], card["sensor"]["iso_std"]) == (SIZE["seed"], 4.0)
     sensor = Sensor(iso_std=2.0, camera_gain_ev=0.3, white_balance_ev=0.1, vignetting=0.2)
     shots = draw_shots(sensor, SIZE["frames"], 3, seed=5)
