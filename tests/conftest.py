@@ -18,6 +18,8 @@ from filelock import FileLock
 COMPILED = Path(__file__).parents[1] / ".pytest_cache" / "xla"
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(COMPILED))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+# Tests run side by side already; `fit` would divide a view over all cores.
+os.environ.setdefault("JAX_NUM_CPU_DEVICES", "1")
 # Nor is Python compiled anew by every process of a test run.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False

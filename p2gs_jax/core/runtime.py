@@ -18,6 +18,7 @@ import jax
 import platformdirs
 
 from p2gs_jax.core.threads import available_cores
+from p2gs_jax.errors import UserError
 
 # Numbers of mallopt(3).
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD = -1, -2, -3
@@ -72,18 +73,26 @@ def tune_process() -> None:
 def use_cores(count: int | None = None) -> None:
     """Let fits divide a view over so many cores; None: over those there are, at most `MOST_CORES`.
 
-    To be called before JAX computes anything: each core becomes a device. Fewer than that, or one,
-    is what programs have that do not call this. It leaves alone what the environment says of it
-    (JAX_NUM_CPU_DEVICES, or XLA_FLAGS with xla_force_host_platform_device_count).
+    To be called before JAX computes anything: each core becomes a device. Programs that do not call
+    this have one. Without a count, what the environment says of it stays (JAX_NUM_CPU_DEVICES, or
+    XLA_FLAGS with xla_force_host_platform_device_count), and so does what JAX already has.
 
     Raises:
+        UserError: XLA_FLAGS says how many.
         RuntimeError: JAX has computed something already.
     """
     stated = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
-    if stated or jax.config.values["jax_num_cpu_devices"] != -1:
+    if count is not None and stated:
+        why = "XLA_FLAGS has xla_force_host_platform_device_count, which says how many cores there are."
+        raise UserError(why, fix="leave it out, or say nothing else of cores (--threads)")
+    if count is None and (stated or jax.config.values["jax_num_cpu_devices"] != -1):
         return
     cores = min(available_cores(), MOST_CORES) if count is None else count
-    jax.config.update("jax_num_cpu_devices", cores)
+    try:
+        jax.config.update("jax_num_cpu_devices", cores)
+    except RuntimeError:
+        if count is not None:
+            raise
 
 
 def use_compile_cache() -> None:

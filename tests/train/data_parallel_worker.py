@@ -1,7 +1,7 @@
 """Steps on virtual devices, of several views and of one, in a process of its own: prints JSON.
 
 JAX counts its devices once, so a test run cannot have both one and four: four are wanted here
-(XLA_FLAGS=--xla_force_host_platform_device_count=4).
+(JAX_NUM_CPU_DEVICES=4).
 """
 
 import json

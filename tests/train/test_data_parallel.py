@@ -20,8 +20,8 @@ HERE = Path(__file__).parent
 @pytest.fixture(scope="module")
 def found():
     paths = [*map(str, (HERE, HERE.parent)), os.environ.get("PYTHONPATH", "")]
-    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=4"
-    env = {"PYTHONPATH": os.pathsep.join(paths), "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
+    env = {"PYTHONPATH": os.pathsep.join(paths), "JAX_PLATFORMS": "cpu"}
+    env["JAX_NUM_CPU_DEVICES"] = "4"
     done = subprocess.run(
         [sys.executable, str(HERE / "data_parallel_worker.py")],
         env=os.environ | env,
