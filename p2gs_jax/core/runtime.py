@@ -83,7 +83,7 @@ def use_cores(count: int | None = None) -> None:
     """
     stated = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
     if count is not None and stated:
-        why = "XLA_FLAGS has xla_force_host_platform_device_count, which says how many cores there are."
+        why = "XLA_FLAGS has xla_force_host_platform_device_count, which states the cores."
         raise UserError(why, fix="leave it out, or say nothing else of cores (--threads)")
     if count is None and (stated or jax.config.values["jax_num_cpu_devices"] != -1):
         return
