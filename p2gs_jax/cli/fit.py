@@ -53,8 +53,8 @@ class Fit:
     """Where blocks are fitted: local, dask://HOST:PORT, or slurm:OPTION=VALUE,...
     (docs/sweeps.md)."""
     threads: int | None = None
-    """Cores of the CPU that a view is divided over. Default: those it may use, at most 4. Results
-    repeat bit for bit with the same number."""
+    """Cores of the CPU that a view is divided over. Default: 4 where there are as many; XLA makes
+    as good a use of fewer. Results repeat bit for bit with the same number."""
     devices: int | Literal["all"] = 1
     """Devices of a step, each with its own views (--train.batch; default then: one view each)."""
 

@@ -22,9 +22,9 @@ from p2gs_jax.errors import UserError
 
 # Numbers of mallopt(3).
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD = -1, -2, -3
-# Above this, cores wait for each other more than they gain (of 16, a step took 1,580 ms on one, 321
-# divided over 4, 337 over 8, 666 over 16; experiments/results/2026-11-27-cores.md).
-MOST_CORES = 4
+# Of 16 cores a step took 741 ms as XLA divides it, 321 divided over 4, 337 over 8, 666 over 16; two
+# are as fast either way (experiments/results/2026-11-27-cores.md).
+WORTH_DIVIDING = 4
 # Shorter compilations are not worth a file.
 SHORTEST_S = 0.5
 # The least recently used programs go first.
@@ -71,7 +71,7 @@ def tune_process() -> None:
 
 
 def use_cores(count: int | None = None) -> None:
-    """Let fits divide a view over so many cores; None: over those there are, at most `MOST_CORES`.
+    """Let fits divide a view over so many cores; None: over four, where there are as many.
 
     To be called before JAX computes anything: each core becomes a device. Programs that do not call
     this have one. Without a count, what the environment says of it stays (JAX_NUM_CPU_DEVICES, or
@@ -87,7 +87,10 @@ def use_cores(count: int | None = None) -> None:
         raise UserError(why, fix="leave it out, or say nothing else of cores (--threads)")
     if count is None and (stated or jax.config.values["jax_num_cpu_devices"] != -1):
         return
-    cores = min(available_cores(), MOST_CORES) if count is None else count
+    if count is None:
+        cores = WORTH_DIVIDING if available_cores() >= WORTH_DIVIDING else 1
+    else:
+        cores = count
     try:
         jax.config.update("jax_num_cpu_devices", cores)
     except RuntimeError:

@@ -82,7 +82,8 @@ def run(**variables) -> str:
     )
     folder, cores = done.stdout.splitlines()
     stated = variables.get("CORES") or variables.get("JAX_NUM_CPU_DEVICES")
-    assert int(cores) == int(stated or min(threads.available_cores(), runtime.MOST_CORES))
+    default = runtime.WORTH_DIVIDING
+    assert int(cores) == int(stated or (default if threads.available_cores() >= default else 1))
     return folder
 
 

@@ -109,7 +109,6 @@ def _curvature(
 
     Observations are `known` with inverse variances.
     """
-
     weight, curved = known * robust, known * second
     of_row, bent = layout.by_row @ weight, layout.by_row @ curved
     whole = float((of_row - layout.by_row @ weight**2 / np.maximum(of_row, EMPTY)).sum())
