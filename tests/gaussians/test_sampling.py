@@ -87,7 +87,7 @@ def seen_from(distances):
 @pytest.mark.parametrize(
     ("distances", "kept", "left_out"),
     [
-        ([2.0, 7.9, 8.1, 30.0], [0, 1], 2),  # too far away
+        ([2.0, 5.9, 6.1, 30.0], [0, 1], 2),  # too far away
         ([-1.0, 3.0, 5.0], [1, 2], 1),  # a track behind its camera is not the closest
         ([-1.0, -3.0], [], 2),  # behind all of its cameras
     ],
