@@ -70,8 +70,8 @@ class Fit:
         from p2gs_jax.train.data_parallel import with_a_view_each
 
         self._check()
-        # Blocks are fitted side by side, each on one core.
-        use_cores(self.threads if self.blocks is None else 1)
+        if self.blocks is None:
+            use_cores(self.threads)
         with TerminalReporter() as reporter:
             cfg = checked(self.config)
             common = {"reference": self.reference, "resume": self.resume, "reporter": reporter}
@@ -100,9 +100,10 @@ class Fit:
         check(self.jobs >= 1, "--jobs must be at least 1")
         right = self.threads is None or self.threads >= 1
         check(right, f"--threads {self.threads} is not a number of cores", fix="give 1 or more")
-        why = "--blocks fits every block on one device"
-        fix = "leave out --devices; blocks have --jobs and --engine"
-        check(count is None or self.devices == 1, why, fix=fix)
+        why = "--blocks fits every block on one device, and on a CPU on one core"
+        fix = "leave out --devices and --threads; blocks have --jobs and --engine"
+        alone = self.devices == 1 and self.threads is None
+        check(count is None or alone, why, fix=fix)
         right = not isinstance(self.devices, int) or self.devices >= 1
         check(right, f"--devices {self.devices} is not a number of devices", fix=f"{whole} all")
 

@@ -39,15 +39,13 @@ def gather(tree: Tree, axis: int = 0) -> Tree:
 
 def scatter_sum(tree: Tree) -> Tree:
     """Return the core's part of the sum over all cores, along the first axis."""
-    if cores() == 1:
-        return tree
     return jax.tree.map(lambda a: lax.psum_scatter(a, CORES, tiled=True), tree)
 
 
 def part(a: Array) -> Array:
     """Return the core's part of an array that all cores have, along the first axis."""
     size = a.shape[0] // cores()
-    return lax.dynamic_slice_in_dim(a, this_core() * size, size) if cores() > 1 else a
+    return lax.dynamic_slice_in_dim(a, this_core() * size, size)
 
 
 def total(a: Array) -> Array:

@@ -116,8 +116,7 @@ class DividedStep(Step):
         state = grow_state(state, self.slots(state.params.gaussians.capacity))
 
         def put(a, spec):
-            if spec == DIVIDED:
-                a = a.reshape(-1, self.mesh.size, *a.shape[1:]).swapaxes(0, 1).reshape(a.shape)
+            a = _dealt(a, self.mesh.size) if spec == DIVIDED else a
             return jax.device_put(a, NamedSharding(self.mesh, spec))
 
         return _placed(put, jax.device_get(state))
@@ -126,11 +125,14 @@ class DividedStep(Step):
         """Return a state on the default device, its slots in order."""
 
         def put(a, spec):
-            if spec == DIVIDED:
-                a = a.reshape(self.mesh.size, -1, *a.shape[1:]).swapaxes(0, 1).reshape(a.shape)
-            return jnp.asarray(a)
+            return jnp.asarray(_dealt(a, len(a) // self.mesh.size) if spec == DIVIDED else a)
 
         return _placed(put, jax.device_get(state))
+
+
+def _dealt(a: np.ndarray, count: int) -> np.ndarray:
+    """Return rows 0, count, 2 count, ... of an array, then rows 1, count + 1, ..., and so on."""
+    return a.reshape(-1, count, *a.shape[1:]).swapaxes(0, 1).reshape(a.shape)
 
 
 def _placed(put: Callable, state: FitState) -> FitState:

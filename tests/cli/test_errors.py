@@ -41,6 +41,8 @@ WRONG = [
     ("fit castle --out run --blocks 0", "a whole number from 1 on, or auto"),
     ("fit castle --out run --blocks 2 --jobs 0", "--jobs must be at least 1"),
     ("fit castle --out run --blocks 2 --devices 2", "on one device"),
+    ("fit castle --out run --blocks 2 --threads 2", "leave out --devices and --threads"),
+    ("fit castle --out run --threads 0", "--threads 0 is not a number of cores"),
     ("fit castle --out run --blocks 2 --engine ray", "no engine 'ray'"),
     ("fit castle --out run --blocks 2 --preset 3dgs", "learns them"),
     ("fit castle --out run --jobs 2", "add --blocks auto, or a number"),

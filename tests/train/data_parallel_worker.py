@@ -65,13 +65,7 @@ def on_devices(count: int) -> dict:
     show, differentiate, advance = (part.compile() for part in lowered)
     losses, first, found = [], None, {}
     if count == VIEWS:
-        before = jax.tree.map(np.asarray, state.params)
-        narrow = step.program("differentiate", Room(64, ROOM.visible), DEGREE)
-        state, _ = step.chained(show, narrow, advance)(state, *inputs)
-        found["fault"] = {k: int(getattr(state.fault, k)) for k in ("kind", "needed")}
-        found["stopped at"] = int(state.step)
-        found["moved"] = distance(before, state.params)
-        state = healed(state)
+        state, found = without_room(step, state, inputs, show, advance)
     run = step.chained(show, differentiate, advance)
     for _ in range(2):
         state, report = run(state, *inputs)
@@ -80,6 +74,16 @@ def on_devices(count: int) -> dict:
     state = step.whole(state)
     params = jax.tree.map(np.asarray, state.params)
     return found | {"losses": losses, "moments": first, "params": params, "step": int(state.step)}
+
+
+def without_room(step: Step, state, inputs, show, advance):
+    """The state after a step that finds no room, its fault mended, and what became of the step."""
+    before = jax.tree.map(np.asarray, state.params)
+    narrow = step.program("differentiate", Room(64, ROOM.visible), DEGREE)
+    state, _ = step.chained(show, narrow, advance)(state, *inputs)
+    fault = {k: int(getattr(state.fault, k)) for k in ("kind", "needed")}
+    moved = distance(before, state.params)
+    return healed(state), {"fault": fault, "stopped at": int(state.step), "moved": moved}
 
 
 def over_cores(count: int) -> dict:
@@ -94,11 +98,7 @@ def over_cores(count: int) -> dict:
     for step in steps:
         state = step.spread(initial_state(start(), alive(), optimizer))
         show, differentiate, advance = (step.program(name, ROOM, DEGREE) for name in PROGRAMS)
-        narrow = step.program("differentiate", Room(64, ROOM.visible), DEGREE)
-        state, _ = step.chained(show, narrow, advance)(state, *view(0), CONTROLS)
-        fault = {k: int(getattr(state.fault, k)) for k in ("kind", "needed")}
-        found = {"fault": fault, "stopped at": int(state.step)}
-        state = healed(state)
+        state, found = without_room(step, state, (*view(0), CONTROLS), show, advance)
         for row in (0, 1):
             state, report = step.chained(show, differentiate, advance)(state, *view(row), CONTROLS)
         end = jax.tree.map(lambda a: a[:COUNT] * 1.0 if a.ndim else a, step.whole(state))

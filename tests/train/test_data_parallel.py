@@ -45,8 +45,9 @@ def test_a_step_takes_the_mean_over_views_wherever_they_are(found, devices):
 
 
 @pytest.mark.slow
-def test_a_view_that_finds_no_room_stops_all_devices_until_there_is_some(found):
-    made = found["4"]
+@pytest.mark.parametrize("devices", ["4", "cores"])
+def test_a_view_that_finds_no_room_stops_all_devices_until_there_is_some(found, devices):
+    made = found[devices]
     assert made["fault"]["kind"] == FAULT_OVERFLOW
     assert made["fault"]["needed"] > 64
     assert made["moved"] == 0
@@ -55,11 +56,8 @@ def test_a_view_that_finds_no_room_stops_all_devices_until_there_is_some(found):
 
 @pytest.mark.slow
 def test_a_view_divided_over_cores_moves_everything_as_one_core_does(found):
-    """Gaussians, moments, photometry and statistics; a view that finds no room moves nothing."""
+    """Gaussians, moments, photometry and statistics."""
     made = found["cores"]
-    assert made["fault"]["kind"] == FAULT_OVERFLOW
-    assert made["fault"]["needed"] > 64
-    assert made["stopped at"] == 0
     assert made["losses"][1] == pytest.approx(made["losses"][0], rel=1e-6)
     assert made["of one core"] < 2e-6
 

@@ -65,8 +65,10 @@ def weigh(model: Forward, theta: Parameters, weight: PerChannel, loss: Loss) -> 
     if loss == "l1":
         factor, curvature = 1 / np.maximum(np.abs(u) / scale, 0.5), 1.0
     else:
-        of = _whole_points if loss == "whole_points" else _geman_mcclure
-        robust, second = of(square, common, used / 3, layout)
+        if loss == "whole_points":
+            robust, second = _whole_points(square, common, used / 3, layout)
+        else:
+            robust, second = _derivatives(square, common)
         curvature = _curvature(robust, second, (model.weight / sigma**2).sum(1), layout)
         factor = robust[:, None]
     weight = model.weight / sigma**2 * factor
@@ -74,13 +76,6 @@ def weigh(model: Forward, theta: Parameters, weight: PerChannel, loss: Loss) -> 
     of_point = radiance[layout.row]
     known = z_of_point - a * of_point, radiance, of_point + added, precision
     return Weighted(weight, sigma, slope, *known, scale, curvature)
-
-
-def _geman_mcclure(
-    square: PerObservation, common: PerObservation, share: PerObservation, layout: Layout
-) -> tuple[PerObservation, PerObservation]:
-    """Return weights of squares in widths of the loss, and its second derivative like them."""
-    return _derivatives(square, common)
 
 
 def _whole_points(
