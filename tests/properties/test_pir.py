@@ -148,7 +148,9 @@ def test_11_observed_reading(cfg, seed, c):
     e = truth.exposures
     reading = jax.jit(rel.observed_ldr, static_argnums=(2, 3))
     assert float(reading(pairs, truth, LOSS, cfg)) < 1e-5
-    assert float(reading(pairs, exposed(jnp.ones_like(e)), LOSS, cfg)) > 0.01
+    # Where the true ones are all about one (seed 775), ones are no error.
+    if float(jnp.std(jnp.log(e))) > 0.12:
+        assert float(reading(pairs, exposed(jnp.ones_like(e)), LOSS, cfg)) > 0.01
     a, b = (float(reading(pairs, exposed(s * jnp.sqrt(e)), LOSS, cfg)) for s in (1.0, c))
     assert a == pytest.approx(b, rel=1e-6, abs=1e-6)
     pairs, truth = observed(seed, cfg, noise_free=False)
