@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any, Literal, NamedTuple, cast
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,24 +25,23 @@ from p2gs_jax.core.streams import noise_key
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.mcmc import shaped_noise
 from p2gs_jax.render import visible as visibility
-from p2gs_jax.render.capacity import Room
 from p2gs_jax.render.harmonics import coefficient_count
 from p2gs_jax.train import image_gradient
-from p2gs_jax.train.divided import mesh_of_cores
+from p2gs_jax.train.divided import ALIKE, mesh_of_cores
 from p2gs_jax.train.image_gradient import ImageGradient, Listed, differentiable
 from p2gs_jax.train.optimizer import learning_rates, means_rate
 from p2gs_jax.train.state import FitState
-from p2gs_jax.train.step import Step, compiled_over, static_sizes
+from p2gs_jax.train.step import MeshStep
 from p2gs_jax.train.update import StepReport, concluded, is_healthy, update_listed
 from p2gs_jax.types import Array, Batch, Frustum, Gaussians
 
 VIEWS = "views"
-EVERYWHERE, OF_VIEWS = P(), P(VIEWS)
+OF_VIEWS: Any = P(VIEWS)
 
 Count = int | Literal["all"]
 
 
-def default_mesh(count: int = 1) -> Mesh:
+def default_mesh(count: int) -> Mesh:
     """Return a mesh of the first devices."""
     return Mesh(np.array(jax.devices()[:count]), (VIEWS,))
 
@@ -250,50 +249,27 @@ def _sums(state, ids, visible, gradient, frusta, controls, cfg, bands: int) -> S
 
 # ---------------------------------------------------------------------------- the step
 
-GRADIENT: Any = cast(Any, ImageGradient)(
-    **{name: EVERYWHERE for name in ImageGradient._fields}
-    | {"v_shown": OF_VIEWS, "visible": OF_VIEWS}
-)
-# Each program, and along which axis its arguments and its results are divided.
-PROGRAMS: dict[str, tuple[Any, Any, Any]] = {
-    "show": (_show, (EVERYWHERE, EVERYWHERE, OF_VIEWS, EVERYWHERE, EVERYWHERE), OF_VIEWS),
-    "differentiate": (
-        _differentiate,
-        (OF_VIEWS, EVERYWHERE, EVERYWHERE, OF_VIEWS, OF_VIEWS),
-        GRADIENT,
-    ),
-    "advance": (
-        _advance,
-        (EVERYWHERE, OF_VIEWS, OF_VIEWS, GRADIENT, OF_VIEWS, EVERYWHERE),
-        EVERYWHERE,
-    ),
-}
-
-
-@functools.cache
-def _compiled(name: str, *, mesh: Mesh, **static: Any) -> Any:
-    """Return a part of a step, divided over the mesh and jitted."""
-    part, into, out = PROGRAMS[name]
-    return compiled_over(mesh, name, functools.partial(part, **static), into, out)
+GRADIENT = ImageGradient(*(ALIKE for _ in ImageGradient._fields))
+GRADIENT = GRADIENT._replace(v_shown=OF_VIEWS, visible=OF_VIEWS)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class ParallelStep(Step):
+class ParallelStep(MeshStep):
     """The step of several views; `train.batch` is a multiple of the devices.
 
     Batches and partners come stacked, states whole on each of the devices.
     """
 
-    mesh: Mesh = dataclasses.field(default_factory=default_mesh)
+    programs: ClassVar = {
+        "show": (_show, (ALIKE, ALIKE, OF_VIEWS, ALIKE, ALIKE), OF_VIEWS),
+        "differentiate": (_differentiate, (OF_VIEWS, ALIKE, ALIKE, OF_VIEWS, OF_VIEWS), GRADIENT),
+        "advance": (_advance, (ALIKE, OF_VIEWS, OF_VIEWS, GRADIENT, OF_VIEWS, ALIKE), ALIKE),
+    }
 
     def settings(self, name: str) -> dict[str, Any]:
         """Return what one of the three programs takes from the configuration, by argument."""
         views = {} if name == "show" else {"views": self.cfg.train.batch}
-        return super().settings(name) | views | {"mesh": self.mesh}
-
-    def program(self, name: str, room: Room, degree: int) -> Any:
-        """Return one of the three programs, divided over the mesh and jitted."""
-        return _compiled(name, **self.settings(name), **static_sizes(name, room, degree))
+        return super().settings(name) | views
 
     def frustum(self, batch: Batch) -> Frustum:
         """Return the views of a step, stacked."""
@@ -303,7 +279,7 @@ class ParallelStep(Step):
 
     def spread(self, state: FitState) -> FitState:
         """Return a state whole on each of the devices."""
-        return jax.device_put(jax.device_get(state), NamedSharding(self.mesh, EVERYWHERE))
+        return jax.device_put(jax.device_get(state), NamedSharding(self.mesh, ALIKE))
 
     def whole(self, state: FitState) -> FitState:
         """Return a state on the default device."""

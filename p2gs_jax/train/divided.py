@@ -10,9 +10,8 @@ for its Gaussians.
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +26,7 @@ from p2gs_jax.train import image_gradient, update
 from p2gs_jax.train.image_gradient import ImageGradient, Listed
 from p2gs_jax.train.optimizer import OptState
 from p2gs_jax.train.state import FitState, grow_state
-from p2gs_jax.train.step import Step, compiled_over, static_sizes
+from p2gs_jax.train.step import MeshStep
 from p2gs_jax.types import Params
 
 ALIKE: Any = P()
@@ -68,19 +67,6 @@ STATE = FitState(
     step=ALIKE,
     fault=ALIKE,
 )
-# Each program, and how its arguments and its results are divided.
-PROGRAMS: dict[str, tuple[Any, Any, Any]] = {
-    "show": (_show, (DIVIDED, DIVIDED, ALIKE, ALIKE, DIVIDED), LISTED),
-    "differentiate": (_differentiate, (DIVIDED, ALIKE, ALIKE, ALIKE, ALIKE), GRADIENT),
-    "advance": (_advance, (STATE, DIVIDED, DIVIDED, GRADIENT, ALIKE, ALIKE), (STATE, ALIKE)),
-}
-
-
-@functools.cache
-def _compiled(name: str, *, mesh: Mesh, **static: Any) -> Any:
-    """Return a part of a step, divided over the mesh and jitted."""
-    each, into, out = PROGRAMS[name]
-    return compiled_over(mesh, name, functools.partial(each, **static), into, out)
 
 
 def mesh_of_cores() -> Mesh | None:
@@ -91,21 +77,21 @@ def mesh_of_cores() -> Mesh | None:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class DividedStep(Step):
+class DividedStep(MeshStep):
     """The step of one view over the cores of a mesh; core k has the slots k, k + N, ..."""
 
-    mesh: Mesh = dataclasses.field(kw_only=True)
-
-    def settings(self, name: str) -> dict[str, Any]:
-        """Return what one of the three programs takes from the configuration, by argument."""
-        return super().settings(name) | {"mesh": self.mesh}
+    programs: ClassVar = {
+        "show": (_show, (DIVIDED, DIVIDED, ALIKE, ALIKE, DIVIDED), LISTED),
+        "differentiate": (_differentiate, (DIVIDED, ALIKE, ALIKE, ALIKE, ALIKE), GRADIENT),
+        "advance": (_advance, (STATE, DIVIDED, DIVIDED, GRADIENT, ALIKE, ALIKE), (STATE, ALIKE)),
+    }
 
     def program(self, name: str, room: Room, degree: int) -> Any:
-        """Return one of the three programs, divided over the mesh and jitted."""
+        """Return one of the three programs, for a core's share of the room."""
         count = self.mesh.size
         visible = whole_blocks(int(SPARE * room.visible / count))
         mine = Room(int(SPARE_ENTRIES * room.entries / count), visible)
-        return _compiled(name, **self.settings(name), **static_sizes(name, mine, degree))
+        return super().program(name, mine, degree)
 
     def slots(self, count: int) -> int:
         """Return as many slots as give every core the same number."""

@@ -12,7 +12,7 @@ import functools
 import time
 from collections.abc import Callable, Hashable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 from jax.sharding import Mesh, NamedSharding
@@ -71,19 +71,21 @@ def compiled(name: str, **static: Any) -> Any:
     return jax.jit(body, compiler_options=compiler_options(), donate_argnums=donated)
 
 
-def compiled_over(mesh: Mesh, name: str, body: Callable, into: Any, out: Any) -> Any:
+@functools.cache
+def compiled_over(kind: type[MeshStep], name: str, *, mesh: Mesh, **static: Any) -> Any:
     """Return a part of a step, divided over the devices of a mesh, jitted.
 
-    `body` is what each device does; `into` and `out` say how its arguments and its results are
-    divided. It takes arrays of the host.
+    It takes arrays of the host.
     """
+    body, into, out = kind.programs[name]
+    each = functools.partial(body, **static)
     placed = jax.tree.map(
         lambda spec: NamedSharding(mesh, spec),
         (into, out),
         is_leaf=lambda spec: isinstance(spec, P),
     )
     return jax.jit(
-        jax.shard_map(body, mesh=mesh, in_specs=into, out_specs=out, check_vma=False),
+        jax.shard_map(each, mesh=mesh, in_specs=into, out_specs=out, check_vma=False),
         in_shardings=placed[0],
         out_shardings=placed[1],
         compiler_options=compiler_options(),
@@ -191,6 +193,24 @@ class Step:
         return state
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class MeshStep(Step):
+    """A step whose programs are divided over the devices of a mesh."""
+
+    # Of each program: what each device does, and how its arguments and its results are divided.
+    programs: ClassVar[dict[str, tuple[Any, Any, Any]]]
+    mesh: Mesh = dataclasses.field(kw_only=True)
+
+    def settings(self, name: str) -> dict[str, Any]:
+        """Return what one of the three programs takes from the configuration, by argument."""
+        return super().settings(name) | {"mesh": self.mesh}
+
+    def program(self, name: str, room: Room, degree: int) -> Any:
+        """Return one of the three programs, divided over the mesh and jitted."""
+        static = self.settings(name) | static_sizes(name, room, degree)
+        return compiled_over(type(self), name, **static)
+
+
 def static_sizes(name: str, room: Room, degree: int) -> dict[str, int]:
     """Return the static sizes of one of the three programs, by argument."""
     if name == "show":
@@ -238,16 +258,13 @@ class StepPrograms:
         self._worker = ThreadPoolExecutor(WORKERS, thread_name_prefix="compile")
         self.waited_s = 0.0
 
-    def expect(self, step: Any, key: Key, *arguments: Any, images: bool = True) -> None:
+    def expect(self, step: Any, key: Key, *arguments: Any, images: bool = True) -> list[Future]:
         """Begin to compile a step in the background.
 
         `step` is a `Step`, or one of several views; `arguments` are its own, or their shapes.
-        Without `images`, the program between waits, which knows the tone curve.
+        Without `images`, the program between waits, which knows the tone curve. Returned are the
+        programs in their order.
         """
-        self._parts(step, key, arguments, images)
-
-    def _parts(self, step: Any, key: Key, arguments, images: bool = True) -> list[Future]:
-        """Return the programs of a step in their order, those yet unknown on their way."""
         visible_only = step.settings("show")["cfg"].optimizer.visible_only
         rows = min(key.room.visible, key.slots) if visible_only else key.slots
         of_gaussians = (key.slots, rows, key.degree)
@@ -285,7 +302,7 @@ class StepPrograms:
     def get(self, step: Any, key: Key, *arguments: Any):
         """Return a compiled step, `(state, batch, partner, controls) -> (state, report)`."""
         if (step, key) not in self._ready:
-            parts = self._parts(step, key, arguments)
+            parts = self.expect(step, key, *arguments)
             self._ready[step, key] = step.chained(*(self._wait(part) for part in parts))
         return self._ready[step, key]
 
