@@ -33,15 +33,13 @@ def exit_code(error: KeyboardInterrupt) -> int:
     return 128 + (error.number if isinstance(error, Interrupted) else int(signal.SIGINT))
 
 
-@contextlib.contextmanager
-def raised() -> Iterator[None]:
+def raised() -> contextlib.AbstractContextManager[None]:
     """Let signals that ask for the end raise `Interrupted` within a `with` block.
 
     Raises:
         Interrupted: such a signal came.
     """
-    with _handled_by(_raise):
-        yield
+    return _handled_by(_raise)
 
 
 class Held:

@@ -13,7 +13,7 @@ from rich.live import Live
 from rich.segment import Segment
 from rich.text import Text
 
-from p2gs_jax.core.text import printable
+from p2gs_jax.core.text import as_clock, printable
 
 # Seconds between lines of progress where there is no terminal.
 EVERY_S = 15.0
@@ -54,7 +54,7 @@ class LogRecord:
 
     def summary(self) -> str:
         """Return where the run is, as text."""
-        left = "" if self.left_s is None else f", {clock(self.left_s)} left"
+        left = "" if self.left_s is None else f", {as_clock(self.left_s)} left"
         return f"step {self.step}, PSNR {self.psnr:.2f} dB, {self.gaussians} Gaussians{left}"
 
 
@@ -72,13 +72,6 @@ class Reporter:
 
 
 Silent = Reporter
-
-
-def clock(seconds: float) -> str:
-    """Return m:ss or h:mm:ss."""
-    whole = max(int(seconds), 0)
-    hours, minutes, rest = whole // 3600, whole // 60 % 60, whole % 60
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
 class TerminalReporter(Reporter):

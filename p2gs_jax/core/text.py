@@ -28,6 +28,13 @@ def count_of(number: float, noun: str) -> str:
     return f"{number:,.0f} {noun}{'' if number == 1 else 's'}"
 
 
+def as_clock(seconds: float) -> str:
+    """Return seconds as m:ss or h:mm:ss."""
+    minutes, rest = divmod(max(int(seconds), 0), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
 def natural(text: str) -> tuple[list[int | str], str]:
     """Return what sorts texts by the numbers in them: `a2` before `a10`."""
     parts = re.split(r"(\d+)", text)

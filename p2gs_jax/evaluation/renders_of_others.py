@@ -63,7 +63,7 @@ class OtherRenders:
         if linear:
             pixels, alpha, _ = read_exr_with_alpha(path)
         else:
-            pixels = _read_display(path)
+            pixels = read_display(path)
         height, width = pixels.shape[:2]
         if (width, height) != size:
             why = f"{path} is {width}x{height}, the run's view {size[0]}x{size[1]}."
@@ -82,7 +82,8 @@ class OtherRenders:
         return Rendered(pixels, linear, alpha)
 
 
-def _read_display(path: Path) -> Float32[np.ndarray, "h w 3"]:
+def read_display(path: Path) -> Float32[np.ndarray, "h w 3"]:
+    """Return display values of an opaque PNG or JPEG; a UserError says that it cannot be read."""
     try:
         pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
     except (OSError, cv2.error):

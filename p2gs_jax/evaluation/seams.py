@@ -31,7 +31,7 @@ from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import inverse_formation, inverse_tone_map, places
 from p2gs_jax.render.warp import project_points, sample_bilinear, surface_depth, unproject, warp
-from p2gs_jax.scene.rigid import moment_of
+from p2gs_jax.scene.rigid import camera_centers, moment_of, pose_of
 from p2gs_jax.scene.visibility import unoccluded
 from p2gs_jax.types import Camera, Render, Scene
 
@@ -231,9 +231,6 @@ def seam_picture(
 def camera_between(first: Camera, second: Camera) -> Camera:
     """Return a camera halfway between two, with the size of the first."""
     viewmats = np.stack([np.asarray(c.viewmat, np.float64) for c in (first, second)])
-    turns, shifts = viewmats[:, :3, :3], viewmats[:, :3, 3]
-    center = np.mean([-r.T @ t for r, t in zip(turns, shifts, strict=True)], 0)
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = Rotation.from_matrix(turns).mean().as_matrix()
-    viewmat[:3, 3] = -viewmat[:3, :3] @ center
+    turn = Rotation.from_matrix(viewmats[:, :3, :3]).mean().as_matrix()
+    viewmat = pose_of(turn, -turn @ camera_centers(viewmats).mean(0))
     return Camera(jnp.asarray(viewmat, jnp.float32), first.K, first.width, first.height)

@@ -141,7 +141,7 @@ def _linear_ply(ply: Path, fitted: Run) -> str:
     g, kind = at_time(fitted.as_of(), None), fitted.cfg.photometry.appearance
     sidecar = ply.with_suffix(".json")
     activation = fitted.cfg.render.radiance
-    count = write_radiance(ply, g, np.ones(g.capacity, bool), activation=activation)
+    count = write_radiance(ply, g, activation=activation)
     content = linear_sidecar(g, fitted.cfg, fitted.scene, fitted.store, fitted.photometry)
     write_json(sidecar, content)
     if kind is not None:

@@ -12,7 +12,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.core.numerics import on_device
@@ -45,29 +45,22 @@ def unit_quats(gaussians: Gaussians) -> Float[np.ndarray, "n 4"]:
     return quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)
 
 
-def write_ply(
-    path: Path,
-    gaussians: Gaussians,
-    comments: Sequence[str],
-    rows: Int[np.ndarray, " k"] | None = None,
-) -> int:
-    """Write Gaussians, all or some rows of them, as they are; return how many.
+def write_ply(path: Path, gaussians: Gaussians, comments: Sequence[str]) -> int:
+    """Write Gaussians as they are; return how many.
 
     Comments are header lines: a PLY header is ASCII, other characters are escaped.
     """
     g = jax.tree.map(np.asarray, gaussians)
     names = [*field_names(g.sh.shape[1]), *(() if g.vibration is None else VIBRATION)]
-    count = g.capacity if rows is None else len(rows)
     row = np.dtype([(name, "<f4") for name in names])
     with atomic_write(path) as temporary, temporary.open("wb") as file:
-        file.write(header_of("vertex", row, count, comments))
-        for first in range(0, count, CHUNK):
-            those = slice(first, first + CHUNK)
-            file.write(_columns(g, those if rows is None else rows[those]).tobytes())
-    return count
+        file.write(header_of("vertex", row, g.capacity, comments))
+        for first in range(0, g.capacity, CHUNK):
+            file.write(_columns(g, slice(first, first + CHUNK)).tobytes())
+    return g.capacity
 
 
-def _columns(g: Gaussians, rows: slice | Int[np.ndarray, " k"]) -> Float[np.ndarray, "k c"]:
+def _columns(g: Gaussians, rows: slice) -> Float[np.ndarray, "k c"]:
     """Return some Gaussians as rows of the table."""
     sh = g.sh[rows]
     count = len(sh)
@@ -89,28 +82,21 @@ def _columns(g: Gaussians, rows: slice | Int[np.ndarray, " k"]) -> Float[np.ndar
     return np.concatenate(columns, axis=1).astype("<f4")
 
 
-def write_radiance(
-    path: Path, gaussians: Gaussians, alive: Bool[np.ndarray, " n"], *, activation: RadianceKind
-) -> int:
-    """Write live Gaussians with their linear coefficients; return how many."""
-    alive = np.asarray(alive)
-    return write_ply(
-        path,
-        gaussians,
-        ["p2gs-jax: linear HDR radiance", f"p2gs-jax: radiance activation {activation}"],
-        None if alive.all() else np.flatnonzero(alive),
-    )
+def write_radiance(path: Path, gaussians: Gaussians, *, activation: RadianceKind) -> int:
+    """Write Gaussians with their linear coefficients; return how many."""
+    kind = f"p2gs-jax: radiance activation {activation}"
+    return write_ply(path, gaussians, ["p2gs-jax: linear HDR radiance", kind])
 
 
 RESTORE = "restore it from a copy, or write it again with `p2gs-jax fit ... --resume`"
 
 
-def read_ply(path: Path, *, fix: str = RESTORE) -> Gaussians:
+def read_ply(path: Path) -> Gaussians:
     """Read Gaussians back, bit for bit. Normals, which mean nothing, may be missing.
 
-    A UserError says that the file is not such a PLY, and with `fix` what to do.
+    A UserError says that the file is not such a PLY.
     """
-    with refusing(path, "Gaussians", fix=fix):
+    with refusing(path, "Gaussians", fix=RESTORE):
         return _read(read_table(path, "vertex"))
 
 

@@ -26,7 +26,7 @@ from p2gs_jax.gaussians.matching import MatchImages, Tones, neighbours, visibili
 from p2gs_jax.gaussians.population import Coverage, default_max_gaussians
 from p2gs_jax.gaussians.seeds import gaussians_from_points, neighbour_scales
 from p2gs_jax.photometry.formation import places
-from p2gs_jax.scene.pixels.store import ImageStore
+from p2gs_jax.scene.pixels.store import ImageStore, size_at
 from p2gs_jax.scene.visibility import shown_share
 from p2gs_jax.types import Gaussians, Scene, View
 
@@ -329,9 +329,9 @@ def gaussians_of(
     return gaussians_from_points(everything, colors, views, cfg, **own)
 
 
-def coverage_of(scene: Scene, store: ImageStore) -> Coverage:
+def coverage_of(scene: Scene, max_width: int | None) -> Coverage:
     """Return how much of a scene its training views show; the largest counts."""
-    sizes = [store.camera(i)[2:] for i in scene.train_indices]
+    sizes = [size_at(view, max_width) for view in scene.training_views]
     return Coverage(max(w * h for w, h in sizes), shown_share(scene.points, scene.training_views))
 
 

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from rich.table import Table
 from rich.text import Text
 
-from p2gs_jax.core.progress import TerminalReporter, clock
+from p2gs_jax.core.progress import TerminalReporter
+from p2gs_jax.core.text import as_clock
 from p2gs_jax.jobs.job import JobState
 
 # Rows that a terminal has room for; of more, those that run come first.
@@ -25,7 +26,7 @@ def table_of(states: Sequence[JobState]) -> Table:
     table = Table.grid(padding=(0, 2))
     rows = sorted(states, key=lambda s: _ORDER.index(s.status))
     for state in rows[:MOST_ROWS]:
-        table.add_row(Text(state.name), state.status, Text(_what(state)), clock(state.seconds))
+        table.add_row(Text(state.name), state.status, Text(_what(state)), as_clock(state.seconds))
     if len(rows) > MOST_ROWS:
         table.add_row(f"and {len(rows) - MOST_ROWS} more", "", line_of(rows[MOST_ROWS:]), "")
     return table

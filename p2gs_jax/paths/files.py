@@ -14,7 +14,7 @@ from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.paths.shots import LARGEST, Shot, checked_lens, checked_pose
-from p2gs_jax.scene.rigid import camera_centers
+from p2gs_jax.scene.rigid import camera_centers, pose_of
 
 FIELDS = ("name", "viewmat", "K", "width", "height", "exposure_ev", "gamma", "time")
 MOST_STOPS = 60.0
@@ -62,8 +62,7 @@ def near_scene(shots: Sequence[Shot], origin: Sequence[float]) -> list[Shot]:
     middle = np.median(camera_centers(np.stack([shot.viewmat for shot in shots])), axis=0)
     if np.linalg.norm(middle - origin) >= np.linalg.norm(middle):
         return list(shots)
-    moved = np.eye(4)
-    moved[:3, 3] = origin
+    moved = pose_of(np.eye(3), np.asarray(origin))
     return [replace(shot, viewmat=shot.viewmat @ moved) for shot in shots]
 
 

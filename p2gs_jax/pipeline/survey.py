@@ -120,7 +120,7 @@ def survey(
     radius = seeding.cameras_radius(scene.training_views, scene.points)
     depths = seen_depths(scene.points, scene.training_views)
     near = near_plane(near_depth(depths), cfg)
-    coverage = coverage_of(scene, store)
+    coverage = coverage_of(scene, cfg.data.max_width)
     require_memory(memory_needed(scene, cfg, coverage))
     seeds, thinned = _choose_points(scene, cfg)
     dense, init = wants_dense(scene, coverage, cfg), _shell_options(store, cfg)

@@ -11,9 +11,9 @@ import numpy as np
 
 from p2gs_jax.core.text import escaped, markdown_table
 from p2gs_jax.errors import UserError
+from p2gs_jax.evaluation.renders_of_others import read_display
 from p2gs_jax.presets import flat
 from p2gs_jax.report.findings import DESCRIPTIONS, seconds_of, true_error
-from p2gs_jax.report.pictures import read_png
 from p2gs_jax.report.run_files import RunFiles, read_run
 from p2gs_jax.report.run_sections import option_text
 from p2gs_jax.synth.sensor import read_true_exposures
@@ -123,7 +123,7 @@ def _same_scene(first: RunFiles, other: RunFiles) -> bool:
     for mine in first.held_out:
         if mine.name in there:
             try:
-                a, b = read_png(mine.photograph), read_png(there[mine.name])
+                a, b = read_display(mine.photograph), read_display(there[mine.name])
             except UserError:
                 continue
             return a.shape == b.shape and np.array_equal(a, b)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.errors import UserError
+from p2gs_jax.evaluation.renders_of_others import read_display
 from p2gs_jax.formats.false_color import luminance
 from p2gs_jax.formats.frames import data_url, shrunk
 from p2gs_jax.report.page import paragraph, row, text
@@ -26,17 +25,6 @@ GAIN = 4.0
 def spread(items: Sequence, most: int) -> list:
     """Return at most `most` items, evenly spaced, the first and the last included."""
     return [items[i] for i in evenly_spaced(len(items), most)]
-
-
-def read_png(path: Path) -> Float32[np.ndarray, "h w 3"]:
-    """Return display values of a PNG or JPEG; a UserError says that it cannot be read."""
-    try:
-        raw = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
-    except (OSError, cv2.error):
-        raw = None
-    if raw is None:
-        raise UserError(f"{path} cannot be read")
-    return raw[..., ::-1].astype(np.float32) / 255
 
 
 def jpeg(ldr: Float[np.ndarray, "h w 3"], alt: str, longest: int = SMALL) -> str:
@@ -81,9 +69,9 @@ def held_out_section(run: RunFiles, most: int, problems: list[str]) -> str:
     total, body, shown = len(run.held_out), "", 0
     for files in spread(sorted(run.held_out, key=lambda h: rank(h.name)), most):
         try:
-            photograph, render = read_png(files.photograph), read_png(files.render)
+            photograph, render = read_display(files.photograph), read_display(files.render)
         except UserError as error:
-            problems.append(f"{files.name} is not shown: {error.message}.")
+            problems.append(f"{files.name} is not shown: {error.message}")
             continue
         score = psnr[files.name]
         dB = "" if score is None else f" · {score:.1f} dB"

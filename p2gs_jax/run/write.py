@@ -141,7 +141,6 @@ def _write_models(
     cfg: FitConfig,
 ) -> None:
     """Write `splats.ply` (display colours) and `radiance.ply` (linear)."""
-    alive = np.ones(params.gaussians.capacity, bool)
     transform = usual_display(params, (), None, cfg.photometry).without_place()
     placed = params.gaussians
     if owner is not None and moving is not None:
@@ -149,4 +148,4 @@ def _write_models(
     placed = at_time(placed, None)
     shown = bake(placed, transform, cfg.render.radiance, MAX_DEGREE)
     write_ply(folder.splats, shown, display_comments(transform))
-    write_radiance(folder.radiance, params.gaussians, alive, activation=cfg.render.radiance)
+    write_radiance(folder.radiance, params.gaussians, activation=cfg.render.radiance)

@@ -26,7 +26,7 @@ from PIL import Image
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.atomic import write_text
-from p2gs_jax.core.text import first_few, parse_json
+from p2gs_jax.core.text import as_clock, first_few, parse_json
 from p2gs_jax.errors import UserError, broken
 from p2gs_jax.scene.convert.readers import CONVERTED_SUFFIXES, size_of
 from p2gs_jax.scene.lens import scale_intrinsics
@@ -333,9 +333,7 @@ def stage_progress(
         if now - last < EVERY_S or not 0 < done < total:
             return
         last = now
-        minutes, seconds = divmod(round((now - begin) / done * max(total - done, 0)), 60)
-        hours, minutes = divmod(minutes, 60)
-        left = f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
+        left = as_clock(round((now - begin) / done * (total - done)))
         report(f"{stage}: {done} of {total} {unit}, about {left} left at this pace")
 
     return progress

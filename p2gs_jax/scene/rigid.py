@@ -152,8 +152,7 @@ def off_origin(scene: Scene) -> Scene:
     if origin.any():
         x, y, z = (f"{value:.12g}" for value in origin)
         notes = (*notes, f"Coordinates are relative to ({x}, {y}, {z}), which float32 needs.")
-    x, y, z = map(float, origin)
-    return replace(scene, views=views, points=points, notes=notes, origin=(x, y, z))
+    return replace(scene, views=views, points=points, notes=notes, origin=tuple(origin.tolist()))
 
 
 def interpolated(
@@ -176,12 +175,11 @@ def interpolated(
     before = np.clip(np.searchsorted(times, held, side="right") - 1, 0, len(times) - 2)
     share = (held - times[before]) / (times[before + 1] - times[before])
     first, second = poses[before], poses[before + 1]
-    out = np.tile(np.eye(4), (len(at), 1, 1))
-    out[:, :3, 3] = first[:, :3, 3] + share[:, None] * (second[:, :3, 3] - first[:, :3, 3])
+    positions = first[:, :3, 3] + share[:, None] * (second[:, :3, 3] - first[:, :3, 3])
     start = Rotation.from_matrix(first[:, :3, :3])
     turn = (start.inv() * Rotation.from_matrix(second[:, :3, :3])).as_rotvec()
-    out[:, :3, :3] = (start * Rotation.from_rotvec(share[:, None] * turn)).as_matrix()
-    return out, covered
+    turned = start * Rotation.from_rotvec(share[:, None] * turn)
+    return pose_of(turned.as_matrix(), positions), covered
 
 
 def moment_of(view: View) -> int | str:

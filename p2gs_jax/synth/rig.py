@@ -15,6 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from p2gs_jax.scene.rigid import pose_of
+
 FOV_DEGREES = 60.0
 # y of the middle of the lane.
 LANE = -1.75
@@ -59,9 +61,7 @@ def camera_viewmat(
     forward, right, up = (_FLIP @ carla_rotation(*mount.rotation)).T
     R = np.stack([right, -up, forward])
     center = np.asarray(vehicle) + _FLIP @ np.asarray(mount.location)
-    viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = R, -R @ center
-    return viewmat
+    return pose_of(R, -R @ center)
 
 
 def intrinsics(width: int, height: int) -> Float[np.ndarray, "3 3"]:

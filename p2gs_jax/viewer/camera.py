@@ -16,6 +16,7 @@ import viser
 from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
+from p2gs_jax.scene import rigid
 from p2gs_jax.scene.rigid import camera_centers, up_direction
 from p2gs_jax.types import Camera, Scene, View
 
@@ -119,9 +120,8 @@ def camera_of_browser(
     Pixels are not square where the aspect of `size`, the pixels to render, is another.
     """
     rotation = Rotation.from_quat(np.asarray(view.wxyz, float), scalar_first=True).as_matrix()
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = rotation.T
-    viewmat[:3, 3] = -rotation.T @ (np.asarray(view.position, float) / space.unit)
+    position = np.asarray(view.position, float) / space.unit
+    viewmat = rigid.pose_of(rotation.T, -rotation.T @ position)
     width, height = size
     tangent = np.tan(np.clip(view.fov, SMALLEST_FOV, LARGEST_FOV) / 2)
     focal = width / (2 * tangent * aspect), height / (2 * tangent)

@@ -219,7 +219,7 @@ def sidecar(folder, *, activation="exp", degree=3, **photometry):
     }
     store = ImageStore(scene.views, DataConfig(max_width=20))
     write_json(folder / "linear.json", linear_sidecar(g, cfg, scene, store, known))
-    write_radiance(folder / "linear.ply", g, np.ones(50, bool), activation=activation)
+    write_radiance(folder / "linear.ply", g, activation=activation)
     return json.loads((folder / "linear.json").read_text()), g, cfg
 
 

@@ -242,28 +242,28 @@ def test_every_row_comes_back_whatever_the_chunk(tmp_path, monkeypatch, count, m
 
 def test_fields_and_bytes_are_the_reference_ones(tmp_path, monkeypatch):
     monkeypatch.setattr(ply, "CHUNK", 4)
-    g, alive = population(23, degree=3), np.arange(23) % 5 != 2
+    g = population(23, degree=3)
     names = field_names(16)
     assert names[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     assert names[9:54] == [f"f_rest_{i}" for i in range(45)]
     rest = [f"scale_{i}" for i in range(3)], [f"rot_{i}" for i in range(4)]
     assert names[54:] == ["opacity", *rest[0], *rest[1]]
     comments = ["p2gs-jax: linear HDR radiance", "p2gs-jax: radiance activation exp"]
-    write_radiance(tmp_path / "ours.ply", g, alive, activation="exp")
+    write_radiance(tmp_path / "ours.ply", g, activation="exp")
     # Red's coefficients come first, all of them.
     bands = g.sh[:, 1:].transpose(0, 2, 1).reshape(23, -1)
     zero, logits = np.zeros((23, 3), np.float32), g.opacity_logits[:, None]
     columns = [g.means, zero, g.sh[:, 0], bands, logits, g.log_scales, g.quats]
-    table = np.ascontiguousarray(np.concatenate(columns, 1)[alive])
+    table = np.ascontiguousarray(np.concatenate(columns, 1))
     rows = table.view([(name, "<f4") for name in names]).reshape(-1)
     element = PlyElement.describe(rows, "vertex")
     PlyData([element], byte_order="<", comments=comments).write(str(tmp_path / "theirs.ply"))
     assert (tmp_path / "ours.ply").read_bytes() == (tmp_path / "theirs.ply").read_bytes()
     moving = population(23, moves=True)
-    write_radiance(tmp_path / "moving.ply", moving, alive, activation="exp")
+    write_radiance(tmp_path / "moving.ply", moving, activation="exp")
     back = jax.tree.leaves(read_ply(tmp_path / "moving.ply"))
     for one, other in zip(back, jax.tree.leaves(moving), strict=True):
-        np.testing.assert_array_equal(one, other[alive])
+        np.testing.assert_array_equal(one, other)
 
 
 def test_memory_does_not_grow_with_the_file(tmp_path, monkeypatch):

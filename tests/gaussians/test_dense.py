@@ -243,7 +243,7 @@ def test_dense_seeds_leave_room_to_grow():
 
 
 def test_dense_starts_where_seeds_are_few(plane):
-    scene, coverage = plane.scene, coverage_of(plane.scene, plane.store)
+    scene, coverage = plane.scene, coverage_of(plane.scene, None)
     many = {name: np.repeat(getattr(scene, name), 200, 0) for name in ("points", "point_colors")}
     lidar = dataclasses.replace(scene, **many)
     for given, cfg, wanted in (

@@ -10,10 +10,11 @@ from tiny_scene import make_scene
 import p2gs_jax
 from p2gs_jax.core.progress import Silent
 from p2gs_jax.errors import UserError
+from p2gs_jax.gaussians.dense import coverage_of
 from p2gs_jax.gaussians.population import default_max_gaussians
 from p2gs_jax.jobs.blocks import fit as module
 from p2gs_jax.jobs.blocks import plan as room
-from p2gs_jax.jobs.blocks.block import block_config, shown_by
+from p2gs_jax.jobs.blocks.block import block_config
 from p2gs_jax.jobs.blocks.cut import cut_scene
 from p2gs_jax.jobs.blocks.plan import check_options, read_plan, write_plan
 from p2gs_jax.jobs.blocks.shared import read_shared
@@ -112,7 +113,8 @@ def test_a_block_has_the_population_of_the_whole_and_more_for_what_is_outside():
         cfg = with_fields(whole, {f"densify.{name}": value for name, value in densify.items()})
         return block_config(cfg, cut, 0, scene, own, train_views=views).densify.max_gaussians
 
-    assert most(count) == default_max_gaussians(count, shown_by(scene, whole), whole.train)
+    coverage = coverage_of(scene, whole.data.max_width)
+    assert most(count) == default_max_gaussians(count, coverage, whole.train)
     assert most(count // 2) > most(count)
     share = len(cut.blocks[0].views) / views
     assert (

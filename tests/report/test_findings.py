@@ -231,7 +231,7 @@ def wall_run(tmp_path_factory):
         np.full(n, 4, np.float32),
         np.zeros((n, 1, 3), np.float32),
     )
-    write_radiance(run / "radiance.ply", gaussians, np.ones(n, bool), activation="exp")
+    write_radiance(run / "radiance.ply", gaussians, activation="exp")
     common = {"camera": "0", "gamma": 2.2, "split": "train"}
     common |= dict.fromkeys(("exif_ev", "exposure_fitted"))
     write_photometry(

@@ -7,8 +7,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.clock import Stopwatch
@@ -16,7 +14,8 @@ from p2gs_jax.core.processes import peak_bytes
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.core.runtime import tune_process, use_compile_cache
 from p2gs_jax.formats.ply import write_radiance
-from p2gs_jax.gaussians.population import Coverage, default_max_gaussians
+from p2gs_jax.gaussians.dense import coverage_of
+from p2gs_jax.gaussians.population import default_max_gaussians
 from p2gs_jax.jobs.blocks.cut import Cut
 from p2gs_jax.jobs.blocks.shared import Shared, block_of, read_shared
 from p2gs_jax.jobs.job import Job
@@ -26,8 +25,7 @@ from p2gs_jax.pipeline.prepare import initialise
 from p2gs_jax.pipeline.survey import load, survey
 from p2gs_jax.presets import from_dict, to_dict
 from p2gs_jax.run.folder import RunFolder, locked
-from p2gs_jax.scene.pixels.store import decoded_into, size_at
-from p2gs_jax.scene.visibility import shown_share
+from p2gs_jax.scene.pixels.store import decoded_into
 from p2gs_jax.train.data_parallel import mesh_of
 from p2gs_jax.types import Scene
 
@@ -70,29 +68,15 @@ def block_config(
     if isinstance(most, int):
         most = max(1, round(share * most))
     elif most is None and densify.method == "mcmc":
-        most = _population(cfg, block, own)
+        # As dense as the whole would be, whose steps see a Gaussian as often as the block's do.
+        # What lies outside grows as well, and is thrown away: its share is beside the block's.
+        seeds = own + round(OUTSIDE * (len(block.points) - own))
+        most = default_max_gaussians(seeds, coverage_of(block, cfg.data.max_width), train)
     return dataclasses.replace(
         cfg,
         train=dataclasses.replace(train, steps=steps, budget_s=budget),
         densify=dataclasses.replace(densify, max_gaussians=most),
     )
-
-
-def _population(cfg: FitConfig, block: Scene, own: int) -> int:
-    """Return how many Gaussians a block may have, so that it is as dense as the whole would be.
-
-    The whole's steps see a Gaussian as often as the block's do. What lies outside the block grows
-    as well, and is thrown away: its share is beside the block's.
-    """
-    seeds = own + round(OUTSIDE * (len(block.points) - own))
-    return default_max_gaussians(seeds, shown_by(block, cfg), cfg.train)
-
-
-def shown_by(scene: Scene, cfg: FitConfig) -> Coverage:
-    """Return how much of a scene its training views show, without their photographs."""
-    views = scene.training_views
-    pixels = max(w * h for w, h in (size_at(v, cfg.data.max_width) for v in views))
-    return Coverage(pixels, shown_share(scene.points, views))
 
 
 def fit_block(folder: Path, arguments: dict[str, Any], reporter: Reporter) -> None:
@@ -134,9 +118,7 @@ def _fit(
     params, _ = compact(result)
     count = params.gaussians.capacity
     reporter.stage("Writing files")
-    write_radiance(
-        folder.radiance, params.gaussians, np.ones(count, bool), activation=cfg.render.radiance
-    )
+    write_radiance(folder.radiance, params.gaussians, activation=cfg.render.radiance)
     counts = {
         "gaussians": count,
         "seed_points": len(block.scene.points),

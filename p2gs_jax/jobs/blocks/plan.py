@@ -10,7 +10,8 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.memory import left_to_process
 from p2gs_jax.errors import UserError
-from p2gs_jax.jobs.blocks.block import block_config, shown_by
+from p2gs_jax.gaussians.dense import coverage_of
+from p2gs_jax.jobs.blocks.block import block_config
 from p2gs_jax.jobs.blocks.cut import Cut, cut_scene, whole_of
 from p2gs_jax.pipeline.preflight import memory_needed
 from p2gs_jax.types import Scene
@@ -76,7 +77,7 @@ def read_plan(folder: Path, asked: str) -> Cut | None:
 
 def bytes_needed(scene: Scene, cfg: FitConfig) -> float:
     """Return what a fit of a scene, or of a block as a scene, takes at its peak."""
-    return memory_needed(scene, cfg, shown_by(scene, cfg)).total
+    return memory_needed(scene, cfg, coverage_of(scene, cfg.data.max_width)).total
 
 
 def largest_block(scene: Scene, cfg: FitConfig, cut: Cut) -> float:

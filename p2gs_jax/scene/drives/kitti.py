@@ -135,8 +135,7 @@ def _rectified_camera(held: _Calibration, name: str) -> tuple[Float64[np.ndarray
     if not (P[0, 0] > 0 and P[1, 1] > 0 and P[2, 2] > 0):
         raise broken(f"{held.path}:", f"the projection of {name} has no focal lengths")
     K = P[:, :3].copy()
-    back = np.eye(4)
-    back[:3, 3] = -np.linalg.solve(K, P[:, 3])
+    back = pose_of(np.eye(3), -np.linalg.solve(K, P[:, 3]))
     K[:2, 2] += 0.5
     return K, back
 

@@ -42,7 +42,7 @@ from p2gs_jax.scene.drives.objects import Box, Pose, tracks
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
 from p2gs_jax.scene.drives.tables import ParquetTable, chosen_drive, counted
 from p2gs_jax.scene.lens import intrinsics, make_distortion
-from p2gs_jax.scene.rigid import LONGEST_BEYOND_S, rigid
+from p2gs_jax.scene.rigid import LONGEST_BEYOND_S, pose_of, rigid
 from p2gs_jax.types import TrackedObject
 
 MARKER = "camera_image/*.parquet"
@@ -196,10 +196,8 @@ def _carried(pose: Pose, motion: Float[np.ndarray, " 6"], lag: float) -> Pose:
     Velocities are in world axes, turns about the car's, as the set's camera model takes them
     (dataset.proto has turns in world axes; cars turn about z, where both agree).
     """
-    out = pose.copy()
-    out[:3, 3] += lag * motion[:3]
-    out[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(lag * motion[3:]).as_matrix()
-    return out
+    turn = Rotation.from_rotvec(lag * motion[3:]).as_matrix()
+    return pose_of(pose[:3, :3] @ turn, pose[:3, 3] + lag * motion[:3])
 
 
 def _jpeg(images: ParquetTable, row: int) -> bytes:

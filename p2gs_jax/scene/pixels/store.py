@@ -99,17 +99,10 @@ class ImageStore:
         """Return a store of the same photographs without the boxes of other objects that move."""
         return self._with(_objects=_moving(objects), _margin=margin, _outlines={})
 
-    def placing(self, moving: MovingObjects | None) -> ImageStore:
-        """Return a store of the same photographs whose cameras see moving objects."""
-        return self._with(moving=moving, _placements={})
-
     @property
     def backdrop_values(self) -> tuple[float, float, float] | None:
         """The backdrop as a display transform has it."""
-        if self.backdrop is None:
-            return None
-        red, green, blue = map(float, self.backdrop)
-        return red, green, blue
+        return None if self.backdrop is None else tuple(self.backdrop.tolist())
 
     def only_opaque(self) -> ImageStore:
         """Return a store of the same photographs without pixels that a background shows through."""
