@@ -107,13 +107,7 @@ def display_transform(fitted: Run, options: Export) -> DisplayTransform:
         transform = replace(transform, white_balance=balance)
     if options.gamma is not None:
         transform = replace(transform, gamma=options.gamma)
-    if options.curve is None:
-        return transform
-    try:
-        return transform.with_curve(options.curve)
-    except ValueError as error:
-        fix = f"leave it out for the run's own ({transform.formation.curve})"
-        raise UserError(f"--curve {options.curve}: {error}.", fix=fix) from error
+    return transform if options.curve is None else transform.with_curve(options.curve)
 
 
 def check_export(args: Export) -> None:

@@ -124,10 +124,8 @@ def _load(options: Render) -> Run:
     from p2gs_jax.run.read import load_run
 
     fitted = load_run(options.run, options.scene)
-    curve = fitted.cfg.photometry.curve
-    if options.curve == "spline" and curve != "spline":
-        fix = "choose run, srgb, power or linear"
-        raise UserError(f"--curve spline: {options.run} has none; its curve is {curve}.", fix=fix)
+    if options.curve == "spline":
+        fitted.common_display(0.0).with_curve("spline")
     if options.white_balance_of is not None:
         fitted.white_balance_of(options.white_balance_of)
     if options.without_objects:

@@ -31,6 +31,19 @@ _PART = 1 << 20
 
 
 @contextlib.contextmanager
+def readable(path: Path, fix: str) -> Iterator[None]:
+    """Turn what reading a broken file of ours raises in a `with` block into one error.
+
+    Raises:
+        UserError: the file is missing, or not what was written; `fix` says what to do.
+    """
+    try:
+        yield
+    except (*BROKEN_ARRAYS, AttributeError) as error:
+        raise UserError(f"{path} cannot be read ({error}).", fix=fix) from error
+
+
+@contextlib.contextmanager
 def naming(path: Path, *, begun: Path | None = None, size: int = _PART) -> Iterator[None]:
     """Let a write that fails in a `with` block for want of room or rights say so, with its path.
 

@@ -16,6 +16,7 @@ from jaxtyping import Float, Float32
 
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.core.numerics import LN2, on_host
+from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.appearance import Correction, correction_of, mean_correction, without_place
 from p2gs_jax.photometry.formation import (
     Matte,
@@ -104,12 +105,13 @@ class DisplayTransform:
     def with_curve(self, curve: Curve) -> DisplayTransform:
         """Return the transform under another base curve; a correction belongs to the old one.
 
-        Raises ValueError: `spline` where the run has none.
+        Raises UserError: `spline` where the run has none.
         """
         if curve == self.formation.curve:
             return self
         if curve == "spline" and self.formation.spline is None and not by_camera(self.formation):
-            raise ValueError("the run has no spline")
+            fix = f"leave it out for the run's own ({self.formation.curve})"
+            raise UserError("--curve spline: the run has no spline.", fix=fix)
         return replace(self, formation=replace(self.formation, curve=curve), correction=None)
 
 

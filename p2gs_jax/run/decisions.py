@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from p2gs_jax import config
-from p2gs_jax.core.atomic import plain, write_json
+from p2gs_jax.core.atomic import plain, readable, write_json
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.presets import camera_formations, with_values
@@ -123,8 +123,6 @@ def read_decisions(path: Path) -> Decisions | None:
     """
     if not path.exists():
         return None
-    try:
+    fix = "restore it from a copy, or finish the fit again with --resume, which writes it"
+    with readable(path, fix):
         return Decisions.from_dict(parse_json(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        fix = "restore it from a copy, or finish the fit again with --resume, which writes it"
-        raise UserError(f"{path} cannot be read ({error}).", fix=fix) from error

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.config import Appearance, CameraFormation, FitConfig, PhotometryConfig
-from p2gs_jax.core.atomic import atomic_write, write_json
+from p2gs_jax.core.atomic import atomic_write, readable, write_json
 from p2gs_jax.core.numerics import LN2, on_device
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
@@ -54,10 +54,8 @@ def read_photometry(path: Path) -> PhotometryFile:
     Raises:
         UserError: it cannot be read, lacks a field, or has another version.
     """
-    try:
+    with readable(path, AGAIN):
         data = parse_json(Path(path).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path} cannot be read: {error}.", fix=AGAIN) from error
     if problem := _problem(data):
         raise UserError(f"{path} is incomplete: {problem}.", fix=AGAIN)
     return data
@@ -270,7 +268,7 @@ def read_metering(path: Path) -> Metering:
     Raises:
         UserError: it is missing or broken.
     """
-    try:
+    with readable(path, "write it again with `p2gs-jax eval RUN`"):
         data = parse_json(path.read_text(encoding="utf-8"))
         readings = data["readings"]
         values = [[row[name] for name in METERS] for row in readings.values()]
@@ -280,9 +278,6 @@ def read_metering(path: Path) -> Metering:
             raise ValueError("no candidate is a constant")
         white = float(data["white"])
         return Metering(_rule(data["rule"]), candidates, white, tuple(readings), table)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        fix = "write it again with `p2gs-jax eval RUN`"
-        raise UserError(f"{path} cannot be read: {error!r}.", fix=fix) from error
 
 
 def _rule_in_file(rule: Rule) -> dict[str, Any]:

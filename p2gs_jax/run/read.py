@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float32, Int
 
 from p2gs_jax.config import FitConfig
+from p2gs_jax.core.atomic import readable
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
@@ -307,10 +308,8 @@ def read_config(path: Path) -> tuple[dict[str, Any], FitConfig]:
     Raises:
         UserError: it is broken, or of another version.
     """
-    try:
+    with readable(path, CONFIG_AGAIN):
         saved = parse_json(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path} cannot be read: {error}.", fix=CONFIG_AGAIN) from error
     if not isinstance(saved, dict) or not isinstance(saved.get("fit"), dict):
         raise UserError(f"{path} is incomplete: it holds no options.", fix=CONFIG_AGAIN)
     try:

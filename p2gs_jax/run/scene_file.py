@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from p2gs_jax.core.atomic import BROKEN_ARRAYS, atomic_write
+from p2gs_jax.core.atomic import BROKEN_ARRAYS, atomic_write, readable
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.drives.objects import MovingObjects
@@ -85,20 +85,15 @@ def read_scene(folder: Path, root: Path) -> Scene:
     Raises:
         UserError: the file is missing or broken.
     """
-    path = folder / SCENE_FILE
+    path, fix = folder / SCENE_FILE, "restore it from a copy, or fit again"
     if not path.is_file():
-        raise UserError(
-            f"{folder} has no {SCENE_FILE}: it was made by a version that this one cannot read, or "
-            "the file was removed.",
-            fix="restore it from a copy, or fit again",
-        )
-    try:
+        why = f"{folder} has no {SCENE_FILE}: it was made by a version that this one cannot read, "
+        why += "or the file was removed."
+        raise UserError(why, fix=fix)
+    with readable(path, fix):
         with np.load(path, allow_pickle=False) as file:
             a = dict(file)
         return _scene_from(a, parse_json(str(a["json"])), folder, root)
-    except BROKEN_ARRAYS as error:
-        fix = "restore it from a copy, or fit again"
-        raise UserError(f"{path} cannot be read: {error}.", fix=fix) from error
 
 
 def _scene_from(a: Mapping[str, np.ndarray], table: dict, folder: Path, root: Path) -> Scene:
@@ -201,7 +196,7 @@ def read_objects(
     """
     if not path.is_file():
         return None, None
-    try:
+    with readable(path, "finish the fit again with --resume"):
         with np.load(path, allow_pickle=False) as file:
             a = dict(file)
         objects = tuple(scene.objects[row] for row in a["rows"].tolist())
@@ -209,9 +204,6 @@ def read_objects(
         if "middle" in a:
             return None, MovingObjects((), middle=float(a["middle"]))
         fits = len(owner) == count and owner.max(initial=-1) < len(objects)
-    except BROKEN_ARRAYS as error:
-        fix = "finish the fit again with --resume"
-        raise UserError(f"{path} cannot be read: {error}.", fix=fix) from error
     if not fits:
         raise UserError(f"{path} does not belong to this run.", fix="fit again")
     return owner, MovingObjects(objects)

@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from p2gs_jax.core.atomic import readable
 from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.core.streams import SceneStream, generator
 from p2gs_jax.errors import UserError
@@ -166,9 +167,8 @@ def read_true_exposures(root: Path) -> dict[str, float]:
     path = root / FILE
     if not path.is_file():
         return {}
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            return {row["image"]: float(row["exposure"]) for row in csv.DictReader(file)}
-    except (OSError, KeyError, ValueError, TypeError) as error:
-        fix = "mend it, or take it away: it is for judging only"
-        raise UserError(f"{path} cannot be read ({error!r}).", fix=fix) from error
+    with (
+        readable(path, "mend it, or take it away: it is for judging only"),
+        path.open(newline="", encoding="utf-8-sig") as file,
+    ):
+        return {row["image"]: float(row["exposure"]) for row in csv.DictReader(file)}

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from p2gs_jax.config import FitConfig
-from p2gs_jax.core.atomic import write_json
+from p2gs_jax.core.atomic import readable, write_json
 from p2gs_jax.core.memory import left_to_process
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.dense import coverage_of
@@ -63,12 +63,9 @@ def read_plan(folder: Path, asked: str) -> Cut | None:
     path = folder / PLAN
     if not path.exists():
         return None
-    try:
+    with readable(path, "start again in another folder with --out"):
         saved: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         before, cut = saved["asked"], Cut.from_dict(saved["cut"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        fix = "start again in another folder with --out"
-        raise UserError(f"{path} cannot be read ({error}).", fix=fix) from error
     if before != asked and asked != str(len(cut.blocks)):
         why = f"{folder.parent} was begun with --blocks {before} ({len(cut.blocks)} blocks)."
         raise UserError(why, fix=f"repeat --blocks {before}, or name another folder with --out")

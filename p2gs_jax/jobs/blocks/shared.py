@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from p2gs_jax.config import FitConfig
-from p2gs_jax.core.atomic import atomic_write
+from p2gs_jax.core.atomic import atomic_write, readable
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.seeds import cameras_radius, photographed_radiance, with_colors
@@ -100,7 +100,7 @@ def read_shared(folder: Path, scene: Scene, cfg: FitConfig) -> Shared:
     """
     path = folder / ARRAYS
     decisions = read_decisions(folder / DECISIONS)
-    try:
+    with readable(path, f"remove {folder} and fit again: exposures are solved anew"):
         with np.load(path, allow_pickle=False) as file:
             a = dict(file)
         if decisions is None:
@@ -114,9 +114,6 @@ def read_shared(folder: Path, scene: Scene, cfg: FitConfig) -> Shared:
         )
         shell = Sphere(a["shell"][:3], float(a["shell"][3]))
         radiance = a["radiance"]
-    except (OSError, ValueError, KeyError) as error:
-        fix = f"remove {folder} and fit again: exposures are solved anew"
-        raise UserError(f"{path} cannot be read ({error}).", fix=fix) from error
     held = (len(radiance), len(a["exposures"]))
     now = (len(scene.points), len(scene.train_indices))
     if held != now:

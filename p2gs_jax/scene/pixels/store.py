@@ -108,11 +108,6 @@ class ImageStore:
         """Return a store of the same photographs without pixels that a background shows through."""
         return self if self.backdrop is None else self._with(_only_opaque=True)
 
-    @property
-    def cached_bytes(self) -> int:
-        """Bytes of decoded photographs held now."""
-        return self._photographs.cached_bytes
-
     def get(
         self, index: int, shrink: float | int = 1.0
     ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
@@ -194,11 +189,6 @@ class ImageStore:
         rows = range(len(self.views))
         self._photographs.expect([[self._key(row, s) for s in shrinks] for row in rows])
 
-    @property
-    def decodings(self) -> int:
-        """How many photographs this process decoded so far, each size of each counted."""
-        return self._photographs.decodings
-
     def close(self) -> None:
         """Stop the background thread and drop everything that is held; files stay."""
         self._photographs.close()
@@ -248,7 +238,7 @@ class _DecodedPhotographs:
         self, views: Sequence[View], limit: int, files: PixelFiles | None, folder: Path | None
     ):
         self.views, self.folder = views, folder
-        self.decodings = 0
+        self.decodings = 0  # photographs decoded so far, each size of each counted
         self._limit, self._files = limit, files
         self._cache: OrderedDict[Key, Decoded] = OrderedDict()
         self._bytes = 0

@@ -70,7 +70,7 @@ def test_shrinking_averages_and_masks_conservatively(tmp_path):
     # A whole photograph does not depend on the width of a fit, and is not kept.
     small = store_of(view, max_width=16)
     np.testing.assert_array_equal(small.whole(0)[0], bgr[..., ::-1] / np.float32(255))
-    assert small.cached_bytes == 0
+    assert small._photographs.cached_bytes == 0
 
 
 def _pattern(x, y):
@@ -108,7 +108,7 @@ def test_cache_is_bounded_and_reused(tmp_path):
     store = store_of(*views, cache_mb=3)
     for i in range(6):
         assert store.get(i)[0].max() == np.float32(i / 255)
-        assert store.cached_bytes <= 3 * 2**20
+        assert store._photographs.cached_bytes <= 3 * 2**20
     for view in views[3:]:
         view.image_path.unlink()
     for i in (3, 4, 5):
@@ -130,7 +130,7 @@ def test_prefetch_from_many_threads(tmp_path):
     with ThreadPoolExecutor(4) as threads:
         np.testing.assert_array_equal([*threads.map(work, asked)], np.float32(asked / 255))
     store.close()
-    assert store.cached_bytes == 0
+    assert store._photographs.cached_bytes == 0
     gone = store_of(make_view(tmp_path / "gone.png"))
     gone.prefetch(0)
     with refused(r"gone.png"):
@@ -210,11 +210,11 @@ def test_every_kind_comes_back_bit_for_bit(tmp_path, kinds, shrink):
     store = in_files(tmp_path, kinds)
     for _ in range(2):
         same(store, kinds, [shrink])
-    assert store.decodings == len(kinds)
+    assert store._photographs.decodings == len(kinds)
     # Another start decodes nothing; one with more memory clears what was written.
     again = in_files(tmp_path, kinds)
     stored(again, len(kinds), shrink)
-    assert again.decodings == 0
+    assert again._photographs.decodings == 0
     assert any((tmp_path / "pixels").rglob("*.px"))
     in_files(tmp_path, kinds, DataConfig()).expect(SHRINKS)
     assert not (tmp_path / "pixels").exists()
@@ -234,7 +234,7 @@ def test_what_pixels_depend_on_makes_them_anew(tmp_path, what):
     store = in_files(tmp_path, changed)
     assert not first.exists()
     same(store, changed, [1])
-    assert store.decodings == 1
+    assert store._photographs.decodings == 1
 
 
 @pytest.mark.parametrize("damage", [lambda d: d[:100], lambda d: d[:-64], lambda d: b"x" * len(d)])
@@ -272,7 +272,7 @@ def test_threads_decode_all_sizes_and_the_caller_none(tmp_path, views):
         store.stored(5)
     for row in {*range(12)} - {5}:
         assert [len(store.stored(row, s)[0]) for s in SHRINKS] == [24, 48]
-    assert store.decodings == 0
+    assert store._photographs.decodings == 0
     store.close()
 
 
