@@ -122,7 +122,7 @@ def fit(
         params, owner = fitted(result, start.scene, cfg)
         lock.require()
         account = account_of(start, params, result, clock, begin)
-        what = (params, start.scene, start.store, start.cfg, folder, account, reporter)
+        what = (params, start.scene, start.survey.store, start.cfg, folder, account, reporter)
         known = {"truth": truth, "lpips_weights": weights, "true_exposures": true_exposures}
         metrics = finish(*what, owner=owner, still_ours=lock.require, **known)
     return FitResult(params, scene, metrics, paths.run, start.selection, start.decisions)
@@ -219,15 +219,14 @@ class Optimiser:
             start.notes.append(text)
             reporter.message(text)
 
-        rows, train = start.scene.train_indices, start.cfg.train
+        rows, train, found = start.scene.train_indices, start.cfg.train, start.survey
+        alone = train.batch == 1
         return Trainer(
             start.cfg,
-            TrainingViews(
-                start.fitted, rows, train.seed, start.measured, resident=train.batch == 1
-            ),
-            start.extent,
+            TrainingViews(found.fitted, rows, train.seed, found.measured, resident=alone),
+            found.extent,
             start.pairs,
-            start.coverage,
+            found.coverage,
             self._folder.root,
             self._programs,
             start.decisions,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import Any
 
 import jax
 import numpy as np
@@ -19,39 +18,34 @@ from p2gs_jax.gaussians import seeds as seeding
 from p2gs_jax.gaussians.dense import DenseSeeds, dense_limit, dense_seeds, gaussians_of
 from p2gs_jax.gaussians.matching import Tones, rough_tones
 from p2gs_jax.gaussians.moving import Nodes, node_gaussians, nodes_radiance, with_vibration
-from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.gaussians.shell import Shell, find_shell, shell_gaussians
 from p2gs_jax.photometry.calibrate import Selection
 from p2gs_jax.photometry.parameters import initial_appearance, initial_photometry, point_radiance
 from p2gs_jax.pipeline.exposures import Exposures
 from p2gs_jax.pipeline.survey import Survey
 from p2gs_jax.run.decisions import Decisions
-from p2gs_jax.scene.pixels.store import ImageStore, camera_of
+from p2gs_jax.scene.pixels.store import camera_of
 from p2gs_jax.train.exposure_loss import ColorPairs, color_pairs
-from p2gs_jax.types import Camera, Gaussians, Measured, Params, Scene, View
+from p2gs_jax.types import Camera, Gaussians, Params, Scene, View
 
 
 @dataclass
 class Prepared:
     """Everything known before the first optimisation step."""
 
-    scene: Scene
-    store: ImageStore  # photographs, whole; its cameras see what moves
-    fitted: ImageStore  # the same without the pixels that are left out of the fit
+    survey: Survey  # what was known before the exposures
+    scene: Scene  # the same, and its points have colours
     params: Params  # initial parameters
-    extent: float  # what rates of the means are shares of, scene units
-    coverage: Coverage  # how much of the scene the views show
     decisions: Decisions  # what the scene settled
     cfg: FitConfig  # what the fit computes under: as asked, with `decisions` filled in
     owner: np.ndarray | None = None  # moving object of each Gaussian (`Population.owner`)
     selection: Selection | None = None  # model, exposures and their errors from the tracks
     pairs: ColorPairs | None = None  # corresponding observations
-    measured: list[Measured] | None = None  # depths of every training view for the loss
     notes: list[str] = field(default_factory=list)  # what the user should know
 
     def view(self, index: int) -> tuple[Camera, Float32[np.ndarray, "h w 3"], np.ndarray]:
         """Return the camera, the photograph (display values) and the mask that a step takes."""
-        return camera_of(self.fitted, index), *self.fitted.get(index)
+        return camera_of(self.survey.fitted, index), *self.survey.fitted.get(index)
 
 
 def expected(found: Survey, decisions: Decisions) -> Prepared:
@@ -70,9 +64,10 @@ def expected(found: Survey, decisions: Decisions) -> Prepared:
         black, owner = _with_nodes(
             black, found.nodes, np.zeros_like(found.nodes.points), views, cfg
         )
-    photometry = initial_photometry(None, [v.camera for v in views], decisions.resolve(cfg))
+    resolved = decisions.resolve(cfg)
+    photometry = initial_photometry(None, [v.camera for v in views], resolved)
     params = Params(black, photometry, initial_appearance(views, cfg))
-    return _prepared(found, params, decisions, scene=scene, owner=owner)
+    return Prepared(found, scene, params, decisions, resolved, owner)
 
 
 def initialise(found: Survey, exposures: Exposures, reporter: Reporter | None = None) -> Prepared:
@@ -112,24 +107,17 @@ def initialise(found: Survey, exposures: Exposures, reporter: Reporter | None = 
     for note in notes:
         reporter.message(note)
     appearance = initial_appearance(views, cfg, lambda k: found.fitted.get(scene.train_indices[k]))
-    return _prepared(
+    return Prepared(
         found,
+        scene,
         Params(gaussians, photometry, appearance),
         decisions,
-        scene=scene,
-        owner=owner,
+        cfg,
+        owner,
         selection=exposures.selection,
         pairs=color_pairs(exposures.observations, cfg),
         notes=notes,
     )
-
-
-def _prepared(found: Survey, params: Params, decisions: Decisions, **more: Any) -> Prepared:
-    """Return these with what the survey found."""
-    names = ("store", "fitted", "extent", "coverage", "measured")
-    kept = {name: getattr(found, name) for name in names}
-    cfg = decisions.resolve(found.cfg)
-    return Prepared(params=params, decisions=decisions, cfg=cfg, **kept, **more)
 
 
 def _matched(found: Survey, exposures: Exposures, cfg: FitConfig, reporter: Reporter) -> DenseSeeds:

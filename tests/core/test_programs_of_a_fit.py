@@ -36,7 +36,7 @@ def test_a_fit_without_its_steps_compiles_few_programs(scene, tmp_path):
     params = recentre(start.params, cfg.render.radiance)
     assert counter.programs == 0
     account = Account({}, {"total_until_evaluation": 60.0}, start.selection, start.notes)
-    given = (params, start.scene, start.store, start.cfg, RunFolder(tmp_path), account)
+    given = (params, start.scene, start.survey.store, start.cfg, RunFolder(tmp_path), account)
     metrics = finish(*given, Silent())
     # Counting tiles, rendering, developing (images; colours of splats), fitting an exposure, PSNR,
     # SSIM, and the basis of spherical harmonics.
