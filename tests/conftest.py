@@ -53,6 +53,8 @@ def pytest_collection_modifyitems(items):
     """Let the files that take the longest come first, each in one piece."""
     places = {f"tests/{name}.py": place for place, name in enumerate(LONGEST)}
     items.sort(key=lambda item: places.get(item.nodeid.partition("::")[0], len(places)))
+    # What was imported and collected stays: the collector need not look at it again and again.
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,10 @@ from p2gs_jax.jobs.engines import open_engine
 from p2gs_jax.jobs.job import Job, JobFiles, read_progress
 from p2gs_jax.jobs.run import run_jobs
 
-pytest.importorskip("distributed")
+# Looked for, not imported: every process of a test run collects this file.
+pytestmark = pytest.mark.skipif(
+    find_spec("distributed") is None, reason="the extra `dask` is not installed"
+)
 
 
 @pytest.fixture(scope="module")
