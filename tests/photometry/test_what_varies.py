@@ -184,6 +184,14 @@ def test_a_filmic_camera_gets_a_spline_unless_its_curve_is_known():
     assert "The tone curve is known (camera raw)" in s.reasons[0]
 
 
+@pytest.mark.slow
+def test_equal_exposures_stay_equal_where_corners_tell_the_curve():
+    drive = make_drive(20, 1200)
+    o = observe(drive, make_exposures(drive, "constant"), curve="filmic", corner_loss=LOST)
+    s = select(o).solution
+    assert (s.model, s.vignetting) == ("constant", "camera")
+
+
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("value", [0.0, 1.0])
 def test_photographs_that_tell_nothing_choose_something_and_know_no_exposure(value):

@@ -240,6 +240,15 @@ def with_free_curve(
     return fit._replace(model=model, theta=theta, normal=normal), system
 
 
+def light_spread(fit: Fit) -> float:
+    """Return by how much the light of one surface varies between views and places in the image.
+
+    The standard deviation of exposures and of what cameras do besides, log units.
+    """
+    added = 0.0 if fit.model.features is None else fit.model.features.of(fit.theta.k)
+    return float(np.hypot(np.std(fit.theta.b.mean(1)), np.std(added)))
+
+
 def fit_response(
     problem: Problem,
     base: Response,
@@ -252,17 +261,17 @@ def fit_response(
 
     None where one collapsed: it falls somewhere, is flat over mid tones, or stretches the
     exposures by more than LARGEST_STRETCH (which no photograph contradicts: the power gauge).
-    The form that varies beside it has no gammas, which bend curves as well. `spread` is the
-    standard deviation of log exposures under the base; it is solved if not given.
+    The form that varies beside it has no gammas, which bend curves as well. `spread` is
+    `light_spread` under the base; it is solved if not given.
     """
     fit, system = solve_model(problem, form, base, splines=by, tolerance=COMPARED)
     if spread is None:
         plain, _ = solve_model(problem, form, base, tolerance=COMPARED)
-        spread = float(np.std(plain.theta.b.mean(1)))
+        spread = light_spread(plain)
     splines = system.unknowns.splines.values(fit.theta.c)
     mean, *each = (tuple(map(float, values)) for values in (splines.mean(0), *splines))
     response = Response(base.base, mean, by, () if by == "all" else tuple(each))
-    stretch = (np.std(fit.theta.b.mean(1)) + 1e-3) / (spread + 1e-3)
+    stretch = (light_spread(fit) + 1e-3) / (spread + 1e-3)
     if not problem.told.size and not 1 / LARGEST_STRETCH < stretch < LARGEST_STRETCH:
         return None
     return response if rises(response) else None
