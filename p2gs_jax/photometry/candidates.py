@@ -128,8 +128,7 @@ class Search:
             shaded = self._solve(Choice(EXPOSURES._replace(vignetting="camera")), Response())
             told, self._spread = light_spread(shaded) / LN2 >= SHADED_SPREAD_EV, None
         cameras = int(o.cameras.max(initial=0)) + 1
-        power = problem.told.size > 0
-        self._scope = Scope(cameras, places, told, known, power)
+        self._scope = Scope(cameras, places, told, known, problem.told.size > 0)
         if not self._scope.allows(Choice(EXPOSURES)):
             self.fits.clear()
 

@@ -266,8 +266,7 @@ def fit_response(
     """
     fit, system = solve_model(problem, form, base, splines=by, tolerance=COMPARED)
     if spread is None:
-        plain, _ = solve_model(problem, form, base, tolerance=COMPARED)
-        spread = light_spread(plain)
+        spread = light_spread(solve_model(problem, form, base, tolerance=COMPARED)[0])
     splines = system.unknowns.splines.values(fit.theta.c)
     mean, *each = (tuple(map(float, values)) for values in (splines.mean(0), *splines))
     response = Response(base.base, mean, by, () if by == "all" else tuple(each))
