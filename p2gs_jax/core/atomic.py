@@ -40,7 +40,8 @@ def readable(path: Path, fix: str) -> Iterator[None]:
     try:
         yield
     except (*BROKEN_ARRAYS, AttributeError) as error:
-        raise UserError(f"{path} cannot be read ({error}).", fix=fix) from error
+        why = f"it has no {error}" if isinstance(error, KeyError) else error
+        raise UserError(f"{path} cannot be read ({why}).", fix=fix) from error
 
 
 @contextlib.contextmanager

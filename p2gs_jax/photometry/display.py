@@ -110,8 +110,8 @@ class DisplayTransform:
         if curve == self.formation.curve:
             return self
         if curve == "spline" and self.formation.spline is None and not by_camera(self.formation):
-            fix = f"leave it out for the run's own ({self.formation.curve})"
-            raise UserError("--curve spline: the run has no spline.", fix=fix)
+            fix = f"choose another, or leave it out for the run's own ({self.formation.curve})"
+            raise UserError("The curve cannot be spline: the run has no spline.", fix=fix)
         return replace(self, formation=replace(self.formation, curve=curve), correction=None)
 
 

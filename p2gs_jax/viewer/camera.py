@@ -17,7 +17,6 @@ from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax.scene import rigid
-from p2gs_jax.scene.rigid import camera_centers, up_direction
 from p2gs_jax.types import Camera, Scene, View
 
 Size = tuple[int, int]
@@ -82,7 +81,7 @@ def make_viewer_space(scene: Scene, points: Float[np.ndarray, "n 3"]) -> ViewerS
     viewmats = viewmats_of(scene.views)
     every = max(1, len(viewmats) // 16)
     distance = np.median([distance_seen(m, points) for m in viewmats[::every]])
-    up = up_direction(viewmats)
+    up = rigid.up_direction(viewmats)
     upright = np.linalg.norm(up) > 1e-6
     return ViewerSpace(
         TYPICAL_DISTANCE / float(distance), up if upright else np.array([0.0, -1.0, 0.0])
@@ -106,7 +105,7 @@ def pose_of(
     radians.
     """
     rotation = viewmat[:3, :3].T.astype(float)
-    position = camera_centers(viewmat[None])[0] * space.unit
+    position = rigid.camera_centers(viewmat[None])[0] * space.unit
     look_at = position + rotation[:, 2] * distance * space.unit
     wxyz = Rotation.from_matrix(rotation).as_quat(scalar_first=True)
     return Pose(wxyz, position, look_at, fov)
@@ -156,7 +155,7 @@ class Frusta:
 
         `on_click` is called with the row of a view whose frustum was clicked.
         """
-        self._positions = camera_centers(viewmats_of(views)) * space.unit
+        self._positions = rigid.camera_centers(viewmats_of(views)) * space.unit
         self._visible = False
         self._near = np.zeros(len(views), bool)
         self._handles = []
