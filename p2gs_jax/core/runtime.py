@@ -87,12 +87,9 @@ def use_cores(count: int | None = None) -> None:
         raise UserError(why, fix="leave it out, or say nothing else of cores (--threads)")
     if count is None and (stated or jax.config.values["jax_num_cpu_devices"] != -1):
         return
-    if count is None:
-        cores = WORTH_DIVIDING if available_cores() >= WORTH_DIVIDING else 1
-    else:
-        cores = count
+    usual = WORTH_DIVIDING if available_cores() >= WORTH_DIVIDING else 1
     try:
-        jax.config.update("jax_num_cpu_devices", cores)
+        jax.config.update("jax_num_cpu_devices", usual if count is None else count)
     except RuntimeError:
         if count is not None:
             raise

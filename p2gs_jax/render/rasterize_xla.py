@@ -78,18 +78,16 @@ def cut(offsets: Int[Array, " t1"], plan: Plan) -> Segments:
     )
 
 
+@compiled_loop
 def merge(
-    composited: tuple[Float[Array, "s p"], ...], segments: Segments, plan: Plan
+    composited: tuple[Float[Array, "s p"], ...], tiles: Int[Array, " e"], extra: Int[Array, ""]
 ) -> tuple[tuple[Float[Array, "t p"], ...], tuple[Float[Array, "e p"], ...]]:
     """Return the channels and transmittance of every tile, and in front of each extra slot.
 
-    `composited` are the channels and, last, the transmittance of every slot.
+    `composited` are the channels and, last, the transmittance of every slot; `tiles` are those of
+    extra slots, of which there are `extra`.
     """
-    return _merge(composited, segments.tiles[plan.tile_count :], segments.extra)
 
-
-@compiled_loop
-def _merge(composited, tiles, extra):
     def at(a, i):
         return lax.dynamic_slice_in_dim(a, i, 1)
 
@@ -286,7 +284,7 @@ def forward(rows, ids_list, offsets, plan: Plan):
     state = (*begin, sums, image, stops)
     state = lax.while_loop(lambda s: jnp.any(s[1] < slots), body, state)
     composited, stops = tuple(a[:slots] for a in state[5]), state[6][:slots]
-    image, before = merge(composited, segments, plan)
+    image, before = merge(composited, segments.tiles[plan.tile_count :], segments.extra)
     if plan.cfg.stop_error is not None:
         hidden = _opaque(before[:-1], before[-1], brightest, plan)
         starts = segments.starts[plan.tile_count :]

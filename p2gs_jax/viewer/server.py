@@ -18,6 +18,7 @@ import os
 import secrets
 import socket
 import threading
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -30,6 +31,7 @@ import websockets.asyncio.server as websocket_server
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
+from p2gs_jax.core import interrupts
 from p2gs_jax.errors import UserError
 from p2gs_jax.run.read import Run
 from p2gs_jax.viewer.renderer import compilation_order, full_size, render_sizes
@@ -239,14 +241,17 @@ def _set_up_server(
 
 
 def serve(run: Run, *, host: str, port: int, max_width: int, say: Callable[[str], None]) -> None:
-    """Serve a run until Ctrl-C or SIGTERM, which have to raise (`core.interrupts`).
+    """Serve a run until Ctrl-C or SIGTERM.
 
     `say` prints a line. Raises a UserError where nothing can listen there.
     """
     with open_viewer(run, host=host, port=port, max_width=max_width) as address:
         who = "only this machine" if is_loopback(host) else "any machine with this address"
         count = run.params.gaussians.capacity
-        with contextlib.suppress(KeyboardInterrupt):
+        with contextlib.suppress(KeyboardInterrupt), interrupts.held() as asked:
+            # Signals are noted, not raised: Python drops what is raised while it collects garbage.
+            asked.begin()
             say(f"{count} Gaussians at {address} (open to {who}; Ctrl-C ends)")
-            threading.Event().wait()
+            while asked.arrived is None:
+                time.sleep(0.1)
         say("Ending, once what is being compiled is done.")

@@ -22,7 +22,7 @@ LENGTHS = st.lists(
 GIANT = [0, 0, 4000, 0, 1, 0]
 
 cut_here = jax.jit(lambda offsets: cut(offsets, PLAN))
-merge_here = jax.jit(lambda composited, segments: merge(composited, segments, PLAN))
+merge_here = jax.jit(lambda c, segments: merge(c, segments.tiles[TILES:], segments.extra))
 
 
 def composite(colors, alphas):

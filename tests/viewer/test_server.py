@@ -8,6 +8,7 @@ import subprocess
 import sys
 import urllib.error
 import urllib.request
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import MagicMock
@@ -21,6 +22,7 @@ import viser
 import websockets
 import websockets.sync.client
 
+from p2gs_jax.core import interrupts
 from p2gs_jax.viewer import server as module
 from p2gs_jax.viewer.server import Guard, guard_of, guarded, is_loopback
 
@@ -72,6 +74,25 @@ def test_ctrl_c_ends_it_cleanly(finished_run):
     out, err = process.communicate(timeout=120)
     assert process.returncode == 0, err
     assert "Traceback" not in out + err
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_signal_that_comes_where_nothing_can_be_raised_ends_it(monkeypatch):
+    class Collected:
+        def __del__(self):
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(module, "open_viewer", lambda run, **options: nullcontext("an address"))
+    said, garbage = [], [Collected()]
+
+    def say(line):
+        garbage.clear()
+        said.append(line)
+
+    run = SimpleNamespace(params=SimpleNamespace(gaussians=SimpleNamespace(capacity=3)))
+    with interrupts.raised():
+        module.serve(run, host="127.0.0.1", port=0, max_width=64, say=say)
+    assert len(said) == 2
 
 
 def test_only_loopback_needs_no_token():
