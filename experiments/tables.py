@@ -50,10 +50,9 @@ from towns import (
 from p2gs_jax.config import FitConfig
 from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.photometry.models import MODELS
-from p2gs_jax.pipeline.exposures import without_tracks
 from p2gs_jax.presets import preset
 from p2gs_jax.render.capacity import make_renderer
-from p2gs_jax.run.decisions import Decisions
+from p2gs_jax.run.decisions import Decisions, without_tracks
 from p2gs_jax.run.read import load_run
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 

@@ -25,7 +25,7 @@ from p2gs_jax.photometry.calibrate import OnChosen, Selection
 from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.parameters import recentre
 from p2gs_jax.photometry.response import Response
-from p2gs_jax.pipeline.exposures import kept_choice, likely, solve_exposures, with_choice
+from p2gs_jax.pipeline.exposures import solve_exposures
 from p2gs_jax.pipeline.finish import Account, finish, seconds_to_finish
 from p2gs_jax.pipeline.preflight import (
     Paths,
@@ -33,13 +33,13 @@ from p2gs_jax.pipeline.preflight import (
     check_scene,
     memory_named,
     preflight,
-    suited,
 )
 from p2gs_jax.pipeline.prepare import Prepared, expected, initialise
 from p2gs_jax.pipeline.survey import Survey, load, survey
 from p2gs_jax.presets import require_config, with_values
+from p2gs_jax.render.selfcheck import suited
 from p2gs_jax.run.checkpoint import saved_steps
-from p2gs_jax.run.decisions import Decisions
+from p2gs_jax.run.decisions import Decisions, kept_choice, likely, with_choice
 from p2gs_jax.run.folder import RunFolder, locked
 from p2gs_jax.run.write import first_plan, write_start
 from p2gs_jax.scene.pixels.store import decoded_into

@@ -9,7 +9,6 @@ decoded. On a GPU Gaussians and the pixels of a view are the device's, and are n
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from typing import NamedTuple
 
 import jax
 
-from p2gs_jax.config import FitConfig, RenderConfig
+from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import plain
 from p2gs_jax.core.memory import left_to_process, ran_out, resident
 from p2gs_jax.errors import UserError
@@ -26,8 +25,6 @@ from p2gs_jax.evaluation.references import Reference, check_reference, load_refe
 from p2gs_jax.gaussians.dense import seed_bound
 from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.presets import flat, to_dict
-from p2gs_jax.render.selfcheck import self_check
-from p2gs_jax.render.tiles import slow_here
 from p2gs_jax.run.folder import RunFolder, require_free
 from p2gs_jax.run.read import read_config
 from p2gs_jax.scene.exposures import check_source, read_known_exposures
@@ -151,29 +148,6 @@ def check_run_dir(run_dir: Path, resume: bool, cfg: FitConfig) -> bool:
         fix += "name another folder with --out"
         raise UserError(f"{run_dir} was begun with other options: {'; '.join(other[:6])}.", fix=fix)
     return bool(longer)
-
-
-def suited(render: RenderConfig) -> tuple[RenderConfig, str | None]:
-    """Return options whose rasterizer is right on this device, and what the user must know of it.
-
-    On a GPU the rasterizer is checked first: nobody has seen that card, driver and compiler.
-    """
-    if render.implementation is not None or jax.default_backend() == "cpu":
-        return render, None
-    slow = slow_here()
-    if slow is not None:
-        return render, slow
-    try:
-        fault = self_check(render).fault
-    except Exception as error:  # whatever compilers raise
-        fault = f"{type(error).__name__}: {error}"
-    if fault is None:
-        return render, None
-    note = (
-        f"The rasterizer for GPUs failed its self-check on this device ({fault}): the portable one "
-        "is used, which is much slower. Please report this with what `p2gs-jax doctor` prints."
-    )
-    return dataclasses.replace(render, implementation="xla"), note
 
 
 class MemoryNeeded(NamedTuple):

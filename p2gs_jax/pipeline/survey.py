@@ -119,11 +119,12 @@ def survey(
     _require_something_to_see(scene, fitted)
     radius = seeding.cameras_radius(scene.training_views, scene.points)
     depths = seen_depths(scene.points, scene.training_views)
-    near = near_plane(near_depth(depths), cfg)
-    coverage = coverage_of(scene, cfg.data.max_width)
-    require_memory(memory_needed(scene, cfg, coverage))
+    near, extent = near_plane(near_depth(depths), cfg), extent_of_rates(radius, depths, cfg)
+    notes, init = scale_notes(scene, near, cfg, near_depth(depths)), _shell_options(store, cfg)
     seeds, thinned = _choose_points(scene, cfg)
-    dense, init = wants_dense(scene, coverage, cfg), _shell_options(store, cfg)
+    coverage = coverage_of(scene, cfg.data.max_width)
+    dense = wants_dense(scene, coverage, cfg)
+    require_memory(memory_needed(scene, cfg, coverage))
     views = scene.training_views
     return Survey(
         scene=scene,
@@ -134,7 +135,7 @@ def survey(
         nodes=nodes,
         vibrating=vibrating,
         radius=radius,
-        extent=extent_of_rates(radius, depths, cfg),
+        extent=extent,
         near=near,
         coverage=coverage,
         measured=measured_depths(scene, cfg),
@@ -144,7 +145,7 @@ def survey(
         sphere=sphere,
         # Dense seeds cover some of what the points do not.
         shell=None if dense else find_shell(views, scene.points, radius, init, sphere),
-        scale_notes=scale_notes(scene, near, cfg, near_depth(depths)),
+        scale_notes=notes,
         seed_notes=[*far_notes, *thinned],
     )
 

@@ -20,6 +20,7 @@ from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.render.binning import grid_size
+from p2gs_jax.render.tiles import slow_here
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians
 
@@ -90,3 +91,26 @@ def self_check(cfg: RenderConfig | None = None) -> SelfCheck:
         for a, b in zip(*map(jax.tree.leaves, (gradient, true_gradient)), strict=True):
             gradient_errors.append(np.linalg.norm(a - b) / np.linalg.norm(b))
     return SelfCheck(float(np.max(image_errors)), float(np.max(gradient_errors)))
+
+
+def suited(render: RenderConfig) -> tuple[RenderConfig, str | None]:
+    """Return options whose rasterizer is right on this device, and what the user must know of it.
+
+    On a GPU the rasterizer is checked first: nobody has seen that card, driver and compiler.
+    """
+    if render.implementation is not None or jax.default_backend() == "cpu":
+        return render, None
+    slow = slow_here()
+    if slow is not None:
+        return render, slow
+    try:
+        fault = self_check(render).fault
+    except Exception as error:  # whatever compilers raise
+        fault = f"{type(error).__name__}: {error}"
+    if fault is None:
+        return render, None
+    note = (
+        f"The rasterizer for GPUs failed its self-check on this device ({fault}): the portable one "
+        "is used, which is much slower. Please report this with what `p2gs-jax doctor` prints."
+    )
+    return dataclasses.replace(render, implementation="xla"), note

@@ -1,4 +1,4 @@
-"""What a fit decided from its scene, as one record: `decisions.json`, and in every checkpoint.
+"""What a fit decides from its scene, as one record: `decisions.json`, and in every checkpoint.
 
 The options stay as they were asked for (`config.json`). Model and curve are chosen from the
 photographs, in numpy and threads: another machine may break a near tie the other way, and a state
@@ -18,10 +18,17 @@ from p2gs_jax import config
 from p2gs_jax.core.atomic import plain, readable, write_json
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
+from p2gs_jax.photometry.calibrate import Selection
+from p2gs_jax.photometry.models import Form
+from p2gs_jax.photometry.response import Response
 from p2gs_jax.presets import camera_formations, with_values
+from p2gs_jax.run.checkpoint import CheckpointStore
+from p2gs_jax.run.folder import RunFolder
 
 # Under this name in the metadata of checkpoints.
 KEY = "decided"
+# Exposures that are learned from nothing move this many times faster (docs/photometry.md, 4).
+FROM_NOTHING = 10.0
 
 
 @dataclass(frozen=True)
@@ -126,3 +133,99 @@ def read_decisions(path: Path) -> Decisions | None:
     fix = "restore it from a copy, or finish the fit again with --resume, which writes it"
     with readable(path, fix):
         return Decisions.from_dict(parse_json(path.read_text(encoding="utf-8")))
+
+
+def decide(
+    cfg: config.FitConfig, selection: Selection | None, *, kept: Decisions | None = None
+) -> Decisions:
+    """Return what the photographs decided.
+
+    Where the checkpoints of a run that is resumed are `kept`, what its cameras do stays to the
+    digit.
+    """
+    decided = Decisions.as_asked(cfg)
+    if selection is None:
+        decided = unsolved(decided)
+        return without_tracks(decided) if cfg.photometry.start == "tracks" else decided
+    s = selection.solution
+    form = Form(s.model, s.white_balance_level, s.vignetting)
+    decided = dataclasses.replace(
+        with_choice(decided, form, s.response),
+        reasons=tuple(selection.reasons),
+        cameras=s.cameras if kept is None else kept.cameras,
+    )
+    if cfg.photometry.known is None:
+        return decided
+    # Known exposures that are to be kept are not learned, and nothing pulls at their mean.
+    keep = cfg.photometry.known_deviation_ev == 0
+    return dataclasses.replace(
+        decided, log_exposure_mean=None, freeze_until=1.0 if keep else decided.freeze_until
+    )
+
+
+def likely(
+    cfg: config.FitConfig, kept: Decisions | None, near: float | None = None
+) -> Decisions | None:
+    """Return what most scenes decide, to compile for it beforehand; None: who knows.
+
+    `near` is the near plane, where that is decided.
+    """
+    p, relative = cfg.photometry, cfg.loss.relative_exposure
+    if p.known is not None or relative.weight is not None or cfg.densify.method != "mcmc":
+        return None
+    # What cameras do enters the programs, and is not solved yet.
+    solved = p.start == "tracks" and (p.vignetting is not None or p.responses != "all")
+    if kept is None and not p.select and solved:
+        return None
+    decided = dataclasses.replace(Decisions.as_asked(cfg), near=near)
+    if kept is not None:
+        chosen = ("model", "curve", "spline", "white_balance", "vignetting", "responses", "cameras")
+        return dataclasses.replace(decided, **{name: getattr(kept, name) for name in chosen})
+    if p.start != "tracks":
+        return unsolved(decided)
+    if p.select:
+        return dataclasses.replace(
+            decided, model="view_exposure", white_balance=None, vignetting=None, responses="all"
+        )
+    return decided
+
+
+def with_choice(decided: Decisions, form: Form, response: Response) -> Decisions:
+    """Return the decisions under a form and a curve; what cameras do follows from the solution."""
+    return dataclasses.replace(
+        decided,
+        model=form.model,
+        curve=response.curve,
+        spline=response.spline,
+        white_balance=form.white_balance,
+        vignetting=form.vignetting,
+        responses=response.by,
+    )
+
+
+def unsolved(decided: Decisions) -> Decisions:
+    """Return the decisions without what only a solution can give; views may still learn theirs."""
+    by_view = decided.white_balance == "view"
+    return dataclasses.replace(
+        decided, white_balance="view" if by_view else None, vignetting=None, responses="all"
+    )
+
+
+def without_tracks(decided: Decisions) -> Decisions:
+    """Return the decisions for exposures learned from nothing: from the first step, and fast."""
+    return dataclasses.replace(
+        decided,
+        freeze_until=0.0,
+        exposure_rate=FROM_NOTHING * decided.exposure_rate,
+        gamma_rate=FROM_NOTHING * decided.gamma_rate,
+    )
+
+
+def kept_choice(cfg: config.FitConfig, folder: RunFolder) -> Decisions | None:
+    """Return what the checkpoints of a run remember; None: nothing was found, or there are none."""
+    p = cfg.photometry
+    solved = p.vignetting is not None or p.responses != "all"
+    if not ((p.select or solved) and p.start == "tracks"):
+        return None
+    saved = (CheckpointStore(folder.checkpoints).latest_meta() or {}).get(KEY)
+    return None if saved is None else Decisions.from_dict(saved)

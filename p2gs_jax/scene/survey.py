@@ -14,8 +14,8 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.core.text import count_of
 from p2gs_jax.scene import PhotographsAlone, Video, find_scene, with_what_lies_beside
 from p2gs_jax.scene.convert.readers import exif_evs
-from p2gs_jax.scene.drives.assemble import assemble
-from p2gs_jax.scene.drives.recording import Recording, chosen_frames
+from p2gs_jax.scene.drives.assemble import assemble, chosen_frames
+from p2gs_jax.scene.drives.recording import Recording
 from p2gs_jax.scene.files import Report, image_size
 from p2gs_jax.scene.rigid import camera_centers, time_order
 from p2gs_jax.scene.video import expected_frames, video_size

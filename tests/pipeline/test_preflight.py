@@ -19,18 +19,17 @@ from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.pipeline import fit as pipeline
 from p2gs_jax.pipeline import preflight as module
-from p2gs_jax.pipeline.exposures import kept_choice
 from p2gs_jax.pipeline.preflight import (
     MemoryNeeded,
     check_run_dir,
     memory_needed,
     require_memory,
-    suited,
 )
 from p2gs_jax.pipeline.survey import load
-from p2gs_jax.render.selfcheck import SelfCheck
+from p2gs_jax.render import selfcheck
+from p2gs_jax.render.selfcheck import SelfCheck, suited
 from p2gs_jax.run.checkpoint import CheckpointStore
-from p2gs_jax.run.decisions import KEY, Decisions
+from p2gs_jax.run.decisions import KEY, Decisions, kept_choice
 from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.run.write import write_start
 from p2gs_jax.scene.pixels import cache
@@ -273,11 +272,11 @@ def test_a_fit_is_refused_before_its_exposures_are_solved(tmp_path, scene, left,
 @pytest.mark.parametrize("found", [SelfCheck(0.5, 0.0), SelfCheck(0.0, float("nan")), OSError("x")])
 def test_a_rasterizer_that_is_wrong_on_a_gpu_gives_way(monkeypatch, found):
     assert suited(RenderConfig()) == (RenderConfig(), None)
-    monkeypatch.setattr(module.jax, "default_backend", lambda: "gpu")
-    monkeypatch.setattr(module, "slow_here", lambda: None)
-    monkeypatch.setattr(module, "self_check", lambda cfg: SelfCheck(1e-6, 1e-5))
+    monkeypatch.setattr(selfcheck.jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(selfcheck, "slow_here", lambda: None)
+    monkeypatch.setattr(selfcheck, "self_check", lambda cfg: SelfCheck(1e-6, 1e-5))
     assert suited(RenderConfig()) == (RenderConfig(), None)
-    monkeypatch.setattr(module, "self_check", Mock(side_effect=[found]))
+    monkeypatch.setattr(selfcheck, "self_check", Mock(side_effect=[found]))
     cfg, note = suited(RenderConfig())
     assert cfg.implementation == "xla"
     assert "failed its self-check" in note

@@ -9,8 +9,7 @@ from tiny_scene import make_scene
 from p2gs_jax.config import FitConfig
 from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.photometry.formation import corner, squared_radii
-from p2gs_jax.pipeline.exposures import decide, likely, unsolved
-from p2gs_jax.run.decisions import Decisions
+from p2gs_jax.run.decisions import Decisions, decide, likely, unsolved
 from p2gs_jax.run.read import load_run
 from p2gs_jax.train.optimizer import learning_rates
 from p2gs_jax.train.update import _recentered

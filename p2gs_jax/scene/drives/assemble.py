@@ -17,13 +17,7 @@ from p2gs_jax.scene import files
 from p2gs_jax.scene.convert.convert import cache_of
 from p2gs_jax.scene.drives.ego_mask import find_ego_masks
 from p2gs_jax.scene.drives.lidar import MOST_MEASURED, owners, seeds, thinned
-from p2gs_jax.scene.drives.recording import (
-    Photograph,
-    Recording,
-    RigCamera,
-    chosen_cameras,
-    chosen_frames,
-)
+from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, short_name
 from p2gs_jax.scene.drives.tables import counted
 from p2gs_jax.scene.rigid import inverse
 from p2gs_jax.types import Lidar, Scene, TrackedObject, View
@@ -229,3 +223,41 @@ def _read_sweeps(
         parts.append((part.points, part.times, owners(part.points, part.times, objects)))
     notes = counted(broken, "LiDAR points are not finite numbers and are left out.")
     return Lidar(*map(np.concatenate, zip(*parts, strict=True))), notes
+
+
+def chosen_cameras(asked: Sequence[str], there: Sequence[str]) -> list[str]:
+    """Return the cameras asked for by (short) names, none: all; UserError: one is unknown."""
+    if not asked:
+        return list(there)
+    found = []
+    for name in asked:
+        short = short_name(name)
+        fits = [c for c in there if c == name] or [c for c in there if short_name(c) == short]
+        if not fits:
+            listed = ", ".join(map(short_name, there))
+            raise UserError(f"there is no camera {name!r}", fix=f"choose one of {listed}")
+        found += [c for c in fits if c not in found]
+    return found
+
+
+def chosen_frames(asked: str | None, there: Sequence[int]) -> list[int]:
+    """Return the frames in a slice FIRST:END[:STEP] of those that are there; nothing asked: all.
+
+    As in Python a part may be empty, and negative numbers count from the end. UserError: this is
+    not a slice, or it holds no frame.
+    """
+    if asked is None:
+        return list(there)
+    parts = asked.split(":")
+    try:
+        numbers = [int(part) if part.strip() else None for part in parts]
+        if len(numbers) not in (2, 3):
+            raise ValueError(asked)
+        found = list(there)[slice(*numbers)]
+    except ValueError:
+        fix = "write FIRST:END or FIRST:END:STEP, as 0:30:2"
+        raise UserError(f"--frames {asked!r} is not a valid slice", fix=fix) from None
+    if not found:
+        fix = f"it has {len(there)}, from 0 on"
+        raise UserError(f"--frames {asked} holds no frame of this drive", fix=fix)
+    return found

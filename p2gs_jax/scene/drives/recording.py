@@ -29,7 +29,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from p2gs_jax.errors import UserError
 from p2gs_jax.scene.rigid import interpolated
 from p2gs_jax.types import Distortion, TrackedObject
 
@@ -131,41 +130,3 @@ class Recording:
 def short_name(camera: str) -> str:
     """Return a camera's name without the words around it: `front_left` for `CAM_FRONT_LEFT`."""
     return _AROUND.sub("", camera.lower()).strip("_") or camera.lower()
-
-
-def chosen_cameras(asked: Sequence[str], there: Sequence[str]) -> list[str]:
-    """Return the cameras asked for by (short) names, none: all; UserError: one is unknown."""
-    if not asked:
-        return list(there)
-    found = []
-    for name in asked:
-        short = short_name(name)
-        fits = [c for c in there if c == name] or [c for c in there if short_name(c) == short]
-        if not fits:
-            listed = ", ".join(map(short_name, there))
-            raise UserError(f"there is no camera {name!r}", fix=f"choose one of {listed}")
-        found += [c for c in fits if c not in found]
-    return found
-
-
-def chosen_frames(asked: str | None, there: Sequence[int]) -> list[int]:
-    """Return the frames in a slice FIRST:END[:STEP] of those that are there; nothing asked: all.
-
-    As in Python a part may be empty, and negative numbers count from the end. UserError: this is
-    not a slice, or it holds no frame.
-    """
-    if asked is None:
-        return list(there)
-    parts = asked.split(":")
-    try:
-        numbers = [int(part) if part.strip() else None for part in parts]
-        if len(numbers) not in (2, 3):
-            raise ValueError(asked)
-        found = list(there)[slice(*numbers)]
-    except ValueError:
-        fix = "write FIRST:END or FIRST:END:STEP, as 0:30:2"
-        raise UserError(f"--frames {asked!r} is not a valid slice", fix=fix) from None
-    if not found:
-        fix = f"it has {len(there)}, from 0 on"
-        raise UserError(f"--frames {asked} holds no frame of this drive", fix=fix)
-    return found

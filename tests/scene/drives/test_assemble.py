@@ -11,10 +11,10 @@ from made_drive import FAR, PERIOD, WALL, camera_pose, make_recording
 from scene.helpers import refused
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.scene.drives.assemble import assemble
+from p2gs_jax.scene.drives.assemble import assemble, chosen_frames
 from p2gs_jax.scene.drives.lidar import seeds
 from p2gs_jax.scene.drives.objects import Box, tracks
-from p2gs_jax.scene.drives.recording import SweepPoints, chosen_frames
+from p2gs_jax.scene.drives.recording import SweepPoints
 from p2gs_jax.scene.split import assign_split
 from p2gs_jax.types import Lidar
 
