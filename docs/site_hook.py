@@ -20,7 +20,6 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS, PROJECT = "docs/", "project/"
 OUTSIDE = (
     "README.md",
-    "BUILD_NOTES.md",
     "CHANGELOG.md",
     "CONTRIBUTING.md",
     "experiments/README.md",

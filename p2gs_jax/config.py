@@ -279,7 +279,7 @@ class OptimizerConfig:
     appearance: float = 1e-2
     """Corrections of display values (3DGS's exposure compensation starts at 1e-2). Adam moves a
     view by this times the root of the number of views at each visit: of hundreds, lower rates suit
-    where exposures differ little (ours: docs/photometry.md, "Rates of corrections")."""
+    where exposures differ little (ours: docs/baselines.md, "Learning rates of corrections")."""
     appearance_final: float = 0.1
     """They decay exponentially to this fraction (3DGS: 0.1)."""
     appearance_warmup: float = 0.0

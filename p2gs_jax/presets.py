@@ -123,7 +123,7 @@ def preset(name: PresetName) -> FitConfig:
     """Return the configuration of a preset.
 
     `robust`; `paper` (as printed, lambda_exp 0.01) or `paper_appendix` (0.1); baselines that splat
-    display values (`3dgs...`, `ppisp`, `luminance_gs`); `ppisp_solved` (docs/fitting.md).
+    display values (`3dgs...`, `ppisp`, `luminance_gs`); `ppisp_solved` (docs/baselines.md).
 
     Raises:
         UserError: there is no such preset.
