@@ -33,7 +33,7 @@ class Eval:
     reference: Path | None = None
     """Photographs of the same views under one common exposure."""
     against: tuple[Path, ...] = ()
-    """Folders of renders of the held-out views, by other programs (docs/comparing.md)."""
+    """Folders of renders of the held-out views, by other programs (docs/report.md)."""
     lpips_weights: str | None = None
     """Evaluate with LPIPS: alex, vgg, or none (default: as the run was)."""
 

@@ -46,7 +46,7 @@ class Fit:
     """Photographs of the same views under one common exposure, for evaluation."""
     blocks: int | Literal["auto"] | None = None
     """Cut the scene into N blocks that are fitted apart and merged; auto: into as few as memory
-    allows (docs/districts.md). Default: one fit."""
+    allows (docs/scaling.md). Default: one fit."""
     jobs: int = 1
     """Blocks at a time on this machine."""
     engine: Annotated[str, tyro.conf.arg(metavar="NAME")] = "local"

@@ -1,6 +1,6 @@
 """Renders of held-out views that any program wrote: which file shows which view, and its pixels.
 
-docs/comparing.md describes the layouts.
+docs/report.md describes the layouts.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""One HTML file that is the scene: linear light, developed in the browser (docs/page.md).
+"""One HTML file that is the scene: linear light, developed in the browser (docs/rendering.md).
 
 The browser draws with `web/*.js`, by the formulas of our renderer. Nothing is loaded from
 elsewhere, and no other script than this one runs, whatever names the views have: the policy in the

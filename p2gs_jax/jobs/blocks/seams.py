@@ -4,7 +4,7 @@ The same views are rendered by each block along a boundary. A difference in one 
 one both ways is what two fits of anything differ by. Exposures drift along a drive by thousandths
 of a stop a block, and each block's radiance follows its photographs. The step is spread over the
 blocks beside it, less and less inwards, as seams of textures are levelled (Lempitsky and Ivanov
-2007; Waechter et al. 2014); docs/districts.md says what that does and does not do.
+2007; Waechter et al. 2014); docs/scaling.md says what that does and does not do.
 """
 
 from __future__ import annotations
