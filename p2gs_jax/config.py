@@ -109,11 +109,11 @@ class RenderConfig:
     black. Where early stopping leaves transmittance T it is off by T times this. Photographs with
     alpha are shown over `data.background`, which is no light."""
     tile: tuple[int, int] = (16, 8)
-    """Tile width and height in pixels (ours: docs/kernel.md)."""
+    """Tile width and height in pixels (ours: docs/architecture.md)."""
     chunk: int = 16
-    """Splats composited per loop iteration; affects speed only (ours: docs/kernel.md)."""
+    """Splats composited per loop iteration; affects speed only (ours: docs/architecture.md)."""
     pixels_in_flight: int = 32768
-    """Pixels composited in parallel; affects speed and memory only (ours: docs/kernel.md)."""
+    """Pixels composited in parallel; affects speed and memory only (ours: docs/architecture.md)."""
     alpha_cutoff: float = 1.0 / 255.0
     """Contributions below this opacity are skipped (3DGS: 1/255). The error in a pixel is at most
     the cutoff times the sum of the skipped radiances."""

@@ -136,13 +136,13 @@ class Sweep:
     """
 
     file: Annotated[Path, tyro.conf.Positional]
-    """TOML file; docs/sweeps.md says what it may contain."""
+    """TOML file; docs/api.md says what it may contain."""
     out: Path | None = None
     """Folder of the runs and the table (default: the file's, or its name)."""
     max_parallel: int | None = None
     """Fits at a time on this machine (default: the file's, or 1)."""
     engine: Annotated[str, tyro.conf.arg(metavar="NAME")] = "local"
-    """Where fits run: local, dask://HOST:PORT, or slurm:OPTION=VALUE,... (docs/sweeps.md)."""
+    """Where fits run: local, dask://HOST:PORT, or slurm:OPTION=VALUE,... (docs/api.md)."""
 
     def execute(self) -> int:
         """Run the sweep and print its table; 1 where a run failed."""

@@ -51,7 +51,7 @@ class Fit:
     """Blocks at a time on this machine."""
     engine: Annotated[str, tyro.conf.arg(metavar="NAME")] = "local"
     """Where blocks are fitted: local, dask://HOST:PORT, or slurm:OPTION=VALUE,...
-    (docs/sweeps.md)."""
+    (docs/api.md)."""
     threads: int | None = None
     """Cores of the CPU that a view is divided over. Default: 4 where there are as many; XLA makes
     as good a use of fewer. Results repeat bit for bit with the same number."""

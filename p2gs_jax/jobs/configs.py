@@ -165,10 +165,10 @@ def _parsed(path: Path) -> dict[str, Any]:
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
-        fix = "name a TOML file; docs/sweeps.md shows one"
+        fix = "name a TOML file; docs/api.md shows one"
         raise UserError(f"{path} cannot be read: {error.strerror}.", fix=fix) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        fix = "mend that line; docs/sweeps.md shows an example"
+        fix = "mend that line; docs/api.md shows an example"
         raise UserError(f"{path} is not valid TOML: {error}.", fix=fix) from error
     unknown = [key for key in data if key not in KEYS]
     if unknown:

@@ -139,7 +139,7 @@ def _metrics(run: Path) -> Path:
 
 def _check(configs: Mapping[str, FitConfig], seeds: Sequence[int], max_parallel: int) -> None:
     if not configs or not seeds:
-        fix = "see docs/sweeps.md for an example"
+        fix = "see docs/api.md for an example"
         raise UserError("a sweep needs at least one configuration and one seed.", fix=fix)
     if max_parallel < 1:
         raise UserError(f"max_parallel is {max_parallel}.", fix="let at least 1 run at a time")

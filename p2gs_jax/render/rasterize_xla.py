@@ -14,7 +14,7 @@ Backward. The same segments, front to back, each from the transmittance and ligh
 R the gradient-weighted light still to come, q = w (radiance . g) and R -= q after each entry, the
 gradient to the exponent of one entry is q - R alpha / (1 - alpha): no division by transmittance.
 The geometry gradients follow in closed form from six moments of it over the tile. Source and
-measurements: docs/kernel.md.
+measurements: docs/architecture.md.
 """
 
 from __future__ import annotations

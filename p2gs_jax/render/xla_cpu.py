@@ -62,7 +62,7 @@ def materialize(always: Bool[Array, ""], compute):
     """Force the arrays that `compute()`, without arguments, returns into memory.
 
     XLA's CPU backend fuses through `optimization_barrier` and then recomputes the whole chain in
-    each consumer (1155 against 421 CPU ms, docs/kernel.md); a conditional survives. `always` is
+    each consumer (1155 against 421 CPU ms); a conditional survives. `always` is
     true, but computed from data, so that XLA cannot know: `opaque_true`.
     """
     if jax.default_backend() != "cpu":

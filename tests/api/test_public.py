@@ -26,7 +26,7 @@ def test_everything_public_is_listed_before_it_is_imported():
         assert getattr(p2gs_jax, name) is not None
 
 
-@pytest.mark.parametrize("name", ["api.md", "conventions.md", "sweeps.md"])
+@pytest.mark.parametrize("name", ["api.md", "conventions.md"])
 def test_examples_import_public_names_only(name):
     modules = {n for n in p2gs_jax.__all__ if type(getattr(p2gs_jax, n)) is type(p2gs_jax)}
     found = [block.code for block in blocks(ROOT / "docs" / name) if block.language == "python"]

@@ -78,7 +78,7 @@ WRONG = [
     ("demo --frames 0", "at least 1 frame"),
     ("demo --out castle", "other files"),
     ("synth file.txt", "name another folder"),
-    ("sweep none.toml", "docs/sweeps.md"),
+    ("sweep none.toml", "docs/api.md"),
     ("sweep file.txt", "is not valid TOML"),
     ("doctor --skip-selftest", "--skip-self-test"),
 ]

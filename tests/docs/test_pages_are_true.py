@@ -66,7 +66,7 @@ FIELD = re.compile(r"`((?:data|render|photometry|loss|optimizer|densify|init|tra
 def test_the_paper_map_has_every_equation_and_names_fields_that_exist():
     from p2gs_jax import FitConfig
 
-    text = (DOCS / "paper_to_code.md").read_text(encoding="utf-8")
+    text = (DOCS / "conventions.md").read_text(encoding="utf-8")
     rows = {int(n) for n in re.findall(r"^\| \((\d+)\)", text, flags=re.M)}
     assert rows == set(range(1, 20))
     for name in FIELD.findall(text):

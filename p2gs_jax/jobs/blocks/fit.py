@@ -71,7 +71,7 @@ def fit_blocks(
 
     The blocks are in the run's folder `blocks`: so many, or `auto`, as few as memory allows; with
     one, this is `fit`. So many are fitted in parallel on this machine, or on an engine: local,
-    dask://HOST:PORT or slurm (docs/sweeps.md). Finished blocks stay where a run is resumed;
+    dask://HOST:PORT or slurm (docs/api.md). Finished blocks stay where a run is resumed;
     `on_look` receives how far all are, twice a second.
 
     Raises:
