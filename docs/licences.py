@@ -28,10 +28,11 @@ BUNDLED = {
 HEAD = """\
 # Licences
 
-The program is under [Apache-2.0](../LICENSE). It is handed on without its dependencies: pip
-installs them, each under its own licence. Who hands on both together, as an image of a container
-for instance, has to keep all of these, and those marked **GPL** then decide for the whole. Written
-by `python docs/licences.py` from what is installed; a test compares.
+This page lists what the package depends on, under which licences. The program itself is under
+[Apache-2.0](../LICENSE) and is distributed without its dependencies: pip installs them, each under
+its licence. Whoever distributes both together, for example as a container image, must comply with
+all of these, and those marked **GPL** then apply to the whole. `python docs/licences.py` generates
+the page from what is installed; a test compares.
 
 | package | needed by | licence | what its wheel carries |
 |---|---|---|---|
@@ -41,9 +42,9 @@ TAIL = """
 
 {parts}
 
-None of them is copied or changed here, and no file of this project is under the GPL.
+This project neither copies nor changes them, and none of its files is under the GPL.
 
-The tests hold PLY files against plyfile (GPL-3.0-or-later), which comes with the extra `test`; the
+The tests compare PLY files with plyfile (GPL-3.0-or-later), which comes with the extra `test`; the
 program neither imports nor requires it.
 """
 WHY = {

@@ -193,7 +193,7 @@ def draw_lanes(d: Drawing, x: float, y: float) -> None:
 
 
 def kernel() -> Drawing:
-    d = Drawing(980, 700, "How the splatter works")
+    d = Drawing(980, 700, "How the renderer works")
     d.text(24, 34, "1  Project", 16, bold=True)
     d.lines(
         24,
@@ -283,7 +283,7 @@ def kernel() -> Drawing:
         594,
         [
             "The same queue again, front to back, with g the gradient of the image. R begins as",
-            "the gradient-weighted light of the whole pixel and loses what is passed:",
+            "the gradient-weighted radiance of the pixel and decreases with every entry:",
         ],
     )
     for k, formula in enumerate(
@@ -363,9 +363,9 @@ def axes() -> Drawing:
         ("linear", "radiance L, no exposure", COLORS[0]),
         ("exposed", "e L: what reaches the sensor", COLORS[0]),
         ("ldr", "T(e L), may exceed 1", COLORS[4]),
-        ("display", "what 8 bits can hold", COLORS[4]),
+        ("display", "values of an 8-bit file", COLORS[4]),
     )
-    between = ("times the view's exposure e", "tone curve T, bent by the view's gamma", "clamp")
+    between = ("times the view's exposure e", "tone curve T with the view's gamma", "clamp")
     for k, (name, meaning, color) in enumerate(boxes):
         top = y + k * 64
         d.rect(656, top, 300, 36, color, INK, 0.16)
@@ -402,7 +402,7 @@ def described(name: str) -> str:
 def architecture() -> Drawing:
     rows = layers()
     count = sum(map(len, rows))
-    d = Drawing(980, 60 + 24 * count + 14 * len(rows), "What the package is made of")
+    d = Drawing(980, 60 + 24 * count + 14 * len(rows), "The packages of p2gs_jax")
     d.text(24, 34, "Imports run downwards", 16, bold=True)
     y = 50.0
     for k, row in enumerate(rows):
