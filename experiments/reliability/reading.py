@@ -39,7 +39,7 @@ def read(root: Path) -> int:
 
     Nothing is triangulated: what is read of scenes without points is poses and photographs.
     """
-    code = command("scene", root)
+    code = command("inspect", root)
     if code:
         return code
     try:

@@ -53,7 +53,7 @@ def main(argv: list[str] | None = None) -> None:
         code = _missing(error, argv)
     except (OSError, MemoryError, RuntimeError) as error:
         if ran_out(error):
-            fix = "end other programs, or ask for less: smaller pictures, fewer Gaussians"
+            fix = "end other programs, or choose smaller pictures or fewer Gaussians"
             code = _complain(UserError(f"memory ran out ({error}).", fix=fix))
         elif isinstance(error, OSError):
             code = _from_the_system(error)
@@ -86,7 +86,7 @@ def _missing(error: ImportError, argv: list[str]) -> int:
         from p2gs_jax.cli.doctor import Doctor
 
         return Doctor().execute()
-    fix = "`p2gs-jax doctor` says what is missing for what"
+    fix = "`p2gs-jax doctor` lists missing libraries"
     return _complain(UserError(f"a library cannot be imported: {error}.", fix=fix))
 
 
@@ -97,5 +97,5 @@ def _from_the_system(error: OSError) -> int:
         return 0
     where = f"{error.filename}: " if error.filename else ""
     reason = error.strerror or str(error)
-    fix = "check that the path exists, may be read or written, and that the disk has room"
+    fix = "check that the path exists and may be read or written, and that the disk has room"
     return _complain(UserError(f"{where}{reason}.", fix=fix))

@@ -1,4 +1,4 @@
-"""`doctor`: what works on this machine, and what to install for what does not.
+"""`doctor`: what works on this machine, and what to install for missing features.
 
 Every library is imported inside a check, as it may be the broken one; no check raises.
 """
@@ -30,8 +30,6 @@ MODULES = {
     "pillow-heif": "pillow_heif",
     "usd-core": "pxr",
 }
-# Checked where pip has no metadata of p2gs-jax: a copy that was never installed.
-CORE = ("jax", "optax", "optimistix", "equinox", "jaxtyping", "numpy", "tyro", "rich", "pycolmap")
 # Features, the distribution that each needs, and our extra that installs it, if one does.
 FEATURES = (
     ("photographs without poses", "pycolmap", None),
@@ -58,22 +56,22 @@ class Finding(NamedTuple):
 
 @dataclass(frozen=True)
 class Doctor:
-    """Say what works here, and what to install for what does not.
+    """Check this installation, and name what to install for missing features.
 
-    Versions, devices, which rasterizer a fit would use, and a self-test: small scenes rendered,
-    with gradients. Exit code 1 where something that everything needs is broken.
+    The command lists versions, devices and the rasterizer of a fit. A self-test renders small
+    scenes, with gradients. The exit code is 1 where a fit cannot run.
 
         p2gs-jax doctor
         p2gs-jax doctor --skip-self-test
     """
 
     skip_self_test: bool = False
-    """Render nothing: the self-test waits for the compiler, up to half a minute."""
+    """Leave out the self-test, which compiles for up to 30 s."""
 
     def execute(self) -> int:
-        """Print what works here; 1 where something that everything needs is broken."""
+        """Print what works; return 1 where a fit cannot run."""
         if sys.stderr.isatty():
-            print("Trying every library, then three Gaussians ...", file=sys.stderr)
+            print("Checking libraries and rendering small scenes ...", file=sys.stderr)
         version = f"{installed('p2gs-jax')}, Python {platform.python_version()}"
         found = [Finding("p2gs-jax", f"{version}, {platform.platform()}"), *check_devices()]
         found += [Finding("Self-test", "skipped") if self.skip_self_test else check_render()]
@@ -89,9 +87,9 @@ class Doctor:
             works = "yes" if feature.ok else "no "
             print(_row(f"  {feature.name}", f"{works}   {feature.text}", width))
         if all(f.ok for f in found):
-            print("\nAll that a fit needs is there.")
+            print("\nThis installation can fit.")
             return 0
-        print("\nSomething that every fit needs is broken; see above.")
+        print("\nThis installation cannot fit; see above.")
         if broken:
             print(f"Try: pip install --upgrade --force-reinstall {' '.join(map(repr, broken))}")
         return 1
@@ -137,11 +135,11 @@ def requirements() -> dict[str, Any]:
         needed = [r for r in map(Requirement, lines) if r.marker is None]
         return {r.name: r.specifier for r in needed} | {"jaxlib": None}
     except Exception:  # p2gs-jax is not installed, or packaging is not
-        return dict.fromkeys((*CORE, "jaxlib"))
+        return dict.fromkeys(("jax", "jaxlib", "numpy", "tyro", "pycolmap"))
 
 
 def check_features(broken: Sequence[str]) -> list[Finding]:
-    """Return of each feature whether it is ready, and what it uses, or what to install.
+    """Return for each feature whether it is ready, and what it uses, or what to install.
 
     The names are those of broken libraries.
     """
@@ -166,11 +164,11 @@ def check_devices() -> list[Finding]:
         with suppress(Exception):  # CPUs and some plugins do not tell
             limits = [d.memory_stats()["bytes_limit"] / 2**30 for d in jax.devices()]
             names = [f"{n} ({limit:.1f} GiB)" for n, limit in zip(names, limits, strict=True)]
-        said, driver = ", ".join(names), Path("/proc/driver/nvidia/version")
+        text, driver = ", ".join(names), Path("/proc/driver/nvidia/version")
         if jax.default_backend() == "cpu" and (shutil.which("nvidia-smi") or driver.is_file()):
-            said += " alone; for the NVIDIA GPU here: pip install 'p2gs-jax[cuda]'"
+            text += " alone; for the NVIDIA GPU: pip install 'p2gs-jax[cuda]'"
         used = ". ".join(filter(None, [fastest_here(), slow_here()]))
-        return [Finding("JAX runs on", said), Finding("Rasterizer", used)]
+        return [Finding("JAX runs on", text), Finding("Rasterizer", used)]
     except Exception as error:  # whatever a broken JAX raises
         return [Finding("JAX runs on", f"{type(error).__name__}: {error}", ok=False)]
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from p2gs_jax.evaluation.evaluate import Judge
     from p2gs_jax.evaluation.renders_of_others import OtherRenders
 
-# Folders that do not say whose renders they hold.
+# Names of folders that do not tell the program.
 COMMON = re.compile(r"renders|rgb|test|ours_\d+|\.")
 # Views that could not be judged: others may be now.
 UNJUDGED = ("hidden", "exposures_unknown")
@@ -22,7 +22,7 @@ UNJUDGED = ("hidden", "exposures_unknown")
 
 @dataclass(frozen=True)
 class Eval:
-    """Evaluate a finished run again, also against a reference, or beside other programs.
+    """Evaluate a finished run again, against a reference or beside other programs.
 
     p2gs-jax eval runs/castle --reference castle/iso8
     p2gs-jax eval runs/castle --against gaussian-splatting/output/castle/test/ours_30000/renders
@@ -33,13 +33,13 @@ class Eval:
     reference: Path | None = None
     """Photographs of the same views under one common exposure."""
     against: tuple[Path, ...] = ()
-    """Folders of renders of the held-out views, by other programs (docs/report.md)."""
+    """Folders of renders of the held-out views by other programs (docs/report.md)."""
     lpips_weights: str | None = None
-    """Evaluate with LPIPS: alex, vgg, or none (default: as the run was)."""
+    """Weights of LPIPS: alex, vgg, or none (default: those of the run)."""
 
     def execute(self) -> int:
         """Evaluate the run and rewrite its metrics; options replace those of the run."""
-        from p2gs_jax.cli.tables import print_against, print_metrics
+        from p2gs_jax.cli.tables import print_against, print_metrics, stdout
         from p2gs_jax.core.atomic import write_json
         from p2gs_jax.core.progress import TerminalReporter
         from p2gs_jax.evaluation.against import check_renders
@@ -86,7 +86,8 @@ class Eval:
             )
         metrics = _kept(folder.metrics) | metrics
         write_json(folder.metrics, metrics)
-        print_metrics(metrics, self.run)
+        print_metrics(metrics)
+        stdout().print(f"Results: {folder.metrics}", soft_wrap=True)
         if others:
             write_json(folder.against, beside)
             remarks = [renders.remark for renders in others.values() if renders.remark]

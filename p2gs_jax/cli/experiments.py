@@ -1,4 +1,4 @@
-"""`demo`, `synth` and `sweep`: data with truth, and many fits."""
+"""`demo`, `synth` and `sweep`: data with known exposures, and many fits."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from p2gs_jax.synth.settings import Layout, Sensor
 class Demo:
     """Make a small street with known exposures, fit it, and compare.
 
-    Takes three minutes on two cores; open its summary.png first.
+    The demo takes three minutes on two cores; open its summary.png first.
 
         p2gs-jax demo
         p2gs-jax demo --out runs/paper --preset paper --budget 5m
@@ -28,22 +28,21 @@ class Demo:
     out: Path = Path("runs/demo")
     """Folder for the street and the run."""
     preset: Annotated[PresetName, tyro.conf.arg(metavar="NAME")] = "robust"
-    """A preset of `fit`: robust, paper, paper_appendix, 3dgs, 3dgs_published, 3dgs_gain,
-    3dgs_affine, 3dgs_bilateral, 3dgs_curve, luminance_gs, ppisp or ppisp_solved."""
+    """Preset of `fit` (p2gs-jax fit --help)."""
     budget: Annotated[float, tyro.conf.arg(metavar="TIME")] = 125.0
     """Wall-clock limit of the fit: 90s, 20m or 1h30m."""
     frames: int = 10
-    """Frames per camera."""
+    """Number of frames per camera."""
     width: int = 320
     """Image width, pixels."""
     iso_std: float = 4.0
-    """Standard deviation of the ISO about 8."""
+    """Standard deviation of the ISO, whose mean is 8."""
     seed: int = 0
-    """Seeds the street, its exposures and the fit."""
+    """Random seed of the street, its exposures and the fit."""
 
     def execute(self) -> int:
-        """Make a street, fit it, and print recovered against true exposures."""
-        from p2gs_jax.cli.tables import make_table, print_metrics, stdout
+        """Make a street, fit it, and compare the recovered exposures with the true ones."""
+        from p2gs_jax.cli.tables import print_headline, stdout
         from p2gs_jax.core.progress import TerminalReporter
         from p2gs_jax.core.runtime import use_cores
         from p2gs_jax.pipeline.demo import run_demo
@@ -62,17 +61,13 @@ class Demo:
                 seed=self.seed,
                 reporter=reporter,
             )
-        rows = [
-            (name, f"{true:+.2f}", f"{found:+.2f}", f"{found - true:+.3f}")
-            for name, true, found in result.rows
-        ]
-        columns = ("view", "true", "recovered", "error")
-        stdout().print(make_table(columns, rows, "Exposures, in stops from their mean"))
+        _, true, found = zip(*result.rows, strict=True)
         stdout().print(
-            f"Exposure error: {result.error['ev']:.3f} EV RMS after scale alignment "
-            f"(largest {result.error['ev_max']:.3f})."
+            f"Exposures of {len(true)} views, EV from their mean: true {min(true):+.2f} to "
+            f"{max(true):+.2f}, recovered {min(found):+.2f} to {max(found):+.2f}, error "
+            f"{result.error['ev']:.3f} RMS and at most {result.error['ev_max']:.3f}."
         )
-        print_metrics(result.metrics, result.run_dir)
+        print_headline(result.metrics, result.run_dir)
         return 0
 
 
@@ -80,7 +75,7 @@ class Demo:
 class Synth:
     """Make a data set by the paper's protocol, with linear HDR truth.
 
-    A drive through a procedural town by three cameras and a LiDAR (docs/scenes.md).
+    Three cameras and a LiDAR drive through a procedural town (docs/scenes.md).
 
         p2gs-jax synth town --seed 1
         p2gs-jax synth constant --sensor.iso-std 0 --frames 20 --width 240
@@ -89,21 +84,20 @@ class Synth:
     out: Annotated[Path, tyro.conf.Positional]
     """Folder to create."""
     sensor: Sensor = field(default_factory=Sensor)
-    """What the cameras do to the light."""
+    """Image formation of the cameras."""
     frames: int = 100
-    """Frames per camera (paper: 100, at 10 Hz)."""
+    """Number of frames per camera (paper: 100, at 10 Hz)."""
     width: int = 480
     """Image width, pixels (paper: 1920); the height follows as 1300 / 1920 of it."""
     layout: Layout = "town"
-    """town: with an underpass and a sun of its own for every seed; matte: the same without gloss,
-    for clean experiments on exposures; street: the demo's; long: streets one behind another, as
-    long as the drive."""
+    """Layout of the town. town: an underpass, and another sun for every seed; matte: the same
+    without gloss; street: that of the demo; long: streets one behind another."""
     supersample: int | None = None
-    """Samples a pixel along each axis (default: 2, of a matte town 8)."""
+    """Samples per pixel along each axis (default: 2; 8 for a matte town)."""
     points: int = 60_000
-    """Seed points sampled for the COLMAP model; those seen once are dropped."""
+    """Number of seed points of the COLMAP model; points that one view sees are dropped."""
     seed: int = 0
-    """Seeds the town, the ISO and the points."""
+    """Random seed of the town, the ISO and the points."""
 
     def execute(self) -> int:
         """Make the data set."""
@@ -121,7 +115,7 @@ class Synth:
             height, report = image_height(self.width), reporter.message
             write_street(out, height=height, report=report, **options)
         seconds = time.monotonic() - begin
-        stdout().print(f"{out}, in {seconds:.0f} s. Fit it: p2gs-jax fit {out} --out RUN")
+        stdout().print(f"{out}, in {seconds:.0f} s. Next: p2gs-jax fit {out}")
         return 0
 
 
@@ -129,18 +123,18 @@ class Synth:
 class Sweep:
     """Fit a scene under many configurations and seeds, into one table.
 
-    Run it again to continue: finished runs are kept.
+    The same command continues an interrupted sweep; finished runs are kept.
 
         p2gs-jax sweep sweep.toml
-        p2gs-jax sweep sweep.toml --out runs/sweep --max-parallel 2
+        p2gs-jax sweep sweep.toml --out runs/sweep --jobs 2
     """
 
     file: Annotated[Path, tyro.conf.Positional]
-    """TOML file; docs/api.md says what it may contain."""
+    """TOML file of the sweep (docs/api.md)."""
     out: Path | None = None
-    """Folder of the runs and the table (default: the file's, or its name)."""
-    max_parallel: int | None = None
-    """Fits at a time on this machine (default: the file's, or 1)."""
+    """Folder of the runs and the table (default: `out` of the file, or the file's name)."""
+    jobs: int | None = None
+    """Number of fits at a time on this machine (default: `max_parallel` of the file, or 1)."""
     engine: Annotated[str, tyro.conf.arg(metavar="NAME")] = "local"
     """Where fits run: local, dask://HOST:PORT, or slurm:OPTION=VALUE,... (docs/api.md)."""
 
@@ -155,7 +149,7 @@ class Sweep:
         from p2gs_jax.jobs.table import show
 
         console, wanted = stdout(), dict(vars(read_sweep(self.file)))
-        own = {"out": self.out, "max_parallel": self.max_parallel}
+        own = {"out": self.out, "max_parallel": self.jobs}
         wanted |= {name: value for name, value in own.items() if value is not None}
         with TerminalReporter() as reporter:
             result = sweep(
@@ -168,7 +162,7 @@ class Sweep:
         for line in failures(result.rows):
             console.print(f"Not finished: {line}")
         console.print(
-            "Means over seeds; seconds of whole runs; held-out views with the exposure fitted to "
-            f"each. Every column, and what it means: {result.out / 'sweep.md'} (and sweep.json)."
+            "Scores are means over seeds, and seconds those of whole runs; held-out views have a "
+            f"fitted exposure each. All columns are in {result.out / 'sweep.md'} (and sweep.json)."
         )
         return 0 if all(row["status"] == "done" for row in result.rows) else 1

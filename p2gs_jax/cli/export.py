@@ -31,38 +31,32 @@ class Export:
 
     run: RunPath
     format: tuple[Format, ...]
-    """One or more: linear-ply (radiance, with a JSON file that explains it), display-ply, spz,
-    compressed-ply, gltf and usd (display colours, for viewers and other programs), colmap and
-    nerfstudio (undistorted photographs, model, exposures), exr (linear renders of all views), html
-    (one page that is the scene: linear light, developed in the browser)."""
+    """Formats: linear-ply (radiance); display-ply, spz, compressed-ply, gltf, usd (display
+    colours); colmap, nerfstudio (photographs, model); exr (renders); html (the scene)."""
     out: Path | None = None
     """Folder to write into (default: RUN/exports)."""
     exposure_ev: float | None = None
-    """Display colours, and what html opens with: exposure in stops relative to the mean (default:
-    0)."""
-    exposure_of: MeteringRule | None = None
-    """The same: exposure metered in the training views, one for all: their mean of what the
-    rule of `p2gs-jax render` gives; --exposure-ev then adds stops."""
+    """Exposure of display colours and html, stops from the mean (default: 0)."""
+    meter: MeteringRule | None = None
+    """Exposure metered in the training views (rules of `render`); --exposure-ev adds stops."""
     gamma: float | None = None
-    """The same: gamma (default: the run's mean)."""
+    """Gamma of display colours and html (default: the run's mean)."""
     curve: Literal["power", "srgb", "spline", "linear"] | None = None
-    """The same: base tone curve (default: the run's)."""
+    """Tone curve of display colours and html (default: the run's)."""
     white_balance_of: str | None = None
-    """The same: white balance of this view (default: neutral), where views differ in it."""
+    """View whose white balance display colours and html have (default: neutral)."""
     bake_steps: int | None = None
-    """Display colours: steps that bring a viewer's pictures closer to the true ones; 0 takes every
-    Gaussian by itself (default: 240, or one for every training view if that is more)."""
+    """Number of steps that bring display colours closer to the true pictures (default: 240, or the
+    number of training views if larger); 0: none."""
     without_objects: bool = False
-    """Leave out what moves; files of Gaussians otherwise hold it as of the middle of the drive."""
+    """Leave out moving objects; else files of Gaussians hold the middle of the drive."""
     size_mb: float | None = None
-    """html: largest size of the page, millions of bytes (default: 20). What does not fit is left
-    out, least visible first, and the page says what that costs."""
+    """Largest size of the html page, MB (default: 20); the least visible Gaussians are left out."""
     photographs: int | None = None
-    """html: how many photographs to embed, evenly spread, for the split view (default: none;
-    whoever has the page has them, with all they show)."""
+    """Number of photographs that the html page embeds (default: 0); readers can copy them."""
     scene: SceneFolder = None
     overwrite: bool = False
-    """Replace what an earlier export wrote."""
+    """Replace the files of an earlier export."""
 
     def execute(self) -> int:
         """Write every requested format."""
@@ -78,7 +72,7 @@ class Export:
             fitted = fitted.without_objects()
         with TerminalReporter() as reporter:
             if fitted.cfg.render.background is not None and {"html", *DISPLAY} & set(self.format):
-                reporter.message("Formats of splats have no radiance behind them: black there.")
+                reporter.message("Formats of Gaussians have no background: it is black there.")
             written = convert(
                 fitted,
                 tuple(dict.fromkeys(self.format)),
@@ -99,8 +93,8 @@ def display_transform(fitted: Run, options: Export) -> DisplayTransform:
     """Return the display transform; UserError: the run has no such curve or white balance."""
     ev = options.exposure_ev or 0.0
     transform = fitted.common_display(ev)
-    if options.exposure_of is not None:
-        typical = fitted.metering.typical_exposure(options.exposure_of)
+    if options.meter is not None:
+        typical = fitted.metering.typical_exposure(options.meter)
         transform = replace(transform, exposure=typical * 2**ev)
     if options.white_balance_of is not None:
         balance = fitted.white_balance_of(options.white_balance_of)
@@ -113,20 +107,20 @@ def display_transform(fitted: Run, options: Export) -> DisplayTransform:
 def check_export(args: Export) -> None:
     """Raise a UserError for values that make no sense."""
     ev, gamma, size = args.exposure_ev, args.gamma, args.size_mb
-    check(bool(args.format), "--format names nothing", fix=f"choose from {', '.join(FORMATS)}")
-    check(ev is None or abs(ev) <= 32, "--exposure-ev must be a number of stops from -32 to 32")
+    check(bool(args.format), "--format needs a format", fix=f"choose from {', '.join(FORMATS)}")
+    check(ev is None or abs(ev) <= 32, "--exposure-ev must be from -32 to 32 stops")
     check(gamma is None or (math.isfinite(gamma) and gamma > 0), "--gamma must be positive")
-    check(args.bake_steps is None or args.bake_steps >= 0, "--bake-steps must be 0 or more")
+    check(args.bake_steps is None or args.bake_steps >= 0, "--bake-steps must be at least 0")
     check(size is None or (math.isfinite(size) and size > 0), "--size-mb must be positive")
-    check(args.photographs is None or args.photographs >= 0, "--photographs must be 0 or more")
-    look = ("exposure_ev", "exposure_of", "gamma", "curve", "white_balance_of")
+    check(args.photographs is None or args.photographs >= 0, "--photographs must be at least 0")
+    look = ("exposure_ev", "meter", "gamma", "curve", "white_balance_of")
     for names, formats, what in (
-        (look, (*DISPLAY, "html"), "a format that is developed"),
-        (("bake_steps",), DISPLAY, "a format that holds display colours"),
+        (look, (*DISPLAY, "html"), "a format of display colours, or html"),
+        (("bake_steps",), DISPLAY, "a format of display colours"),
         (("size_mb", "photographs"), ("html",), "the format html"),
     ):
         given = [n for n in names if getattr(args, n) is not None]
         if given and not set(args.format) & set(formats):
-            which = formats[0] if len(formats) == 1 else f"one of {', '.join(formats)}"
-            fix = f"leave it out, or add {which} to --format"
-            raise UserError(f"--{given[0].replace('_', '-')} says nothing without {what}.", fix=fix)
+            fix = f"leave it out, or add one of these to --format: {', '.join(formats)}"
+            name = given[0].replace("_", "-")
+            raise UserError(f"--{name} has no effect without {what}.", fix=fix)

@@ -1,30 +1,51 @@
-"""`fit` and `calibrate`: from photographs to a run folder, or to exposures alone."""
+"""`inspect`, `fit` and `calibrate`: from photographs to a run folder, or to exposures alone."""
 
 from __future__ import annotations
 
+import datetime
+import glob
+import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 
 from p2gs_jax.cli.shared import DURATIONS, SHORT, check
-from p2gs_jax.config import FitConfig, PresetName
+from p2gs_jax.config import DataConfig, FitConfig, PresetName
+from p2gs_jax.core.text import count_of
+
+if TYPE_CHECKING:
+    from p2gs_jax.scene.survey import Survey
 
 Preset = Annotated[PresetName, tyro.conf.arg(metavar="NAME")]
 Config = Annotated[FitConfig, tyro.conf.arg(name="")]
-Folder = Annotated[Path, tyro.conf.arg(metavar="DIR")]
 
 
 @dataclass(frozen=True)
+class Cluster:
+    """A large scene is cut into blocks, which one machine or a cluster (Dask, Slurm) fits."""
+
+    blocks: int | Literal["auto"] | None = None
+    """Number of blocks that are fitted apart and merged; auto: as few as memory allows."""
+    jobs: int = 1
+    """Number of blocks at a time on this machine."""
+    engine: Annotated[str, tyro.conf.arg(metavar="NAME")] = "local"
+    """Place of the fits: local, dask://HOST:PORT, or slurm:OPTION=VALUE,... (docs/api.md)."""
+    devices: int | Literal["all"] = 1
+    """Number of devices that share a step (--train.batch) of a fit without blocks."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Fit:
-    """Fit linear HDR radiance, exposures and gammas to photographs.
+    """Fit linear HDR radiance, exposures and tone curves to photographs.
 
-    Writes a run folder; open its summary.png first. An interrupted run goes on with --resume.
+    The command writes a run folder; open its summary.png first. --resume continues an interrupted
+    run.
 
-        p2gs-jax fit castle --out runs/castle --max-width 960 --budget 20m
-        p2gs-jax fit castle --out runs/castle --resume
+        p2gs-jax fit castle --max-width 960 --budget 20m
+        p2gs-jax fit castle --resume
         p2gs-jax fit castle --out runs/paper --preset paper --steps 7000
     """
 
@@ -32,88 +53,98 @@ class Fit:
     scene: Annotated[Path, tyro.conf.Positional]
     """COLMAP model, transforms.json, Blender's or LLFF's folder, a drive of a data set (PandaSet,
     nuScenes, ...), a folder of photographs, or a video (docs/scenes.md)."""
-    out: Folder
-    """Run folder to create."""
-    config: Config
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Run folder (default: runs/SCENE-DATE; with --resume the newest of these)."""
     resume: bool = False
-    """Continue an interrupted run; give the options it was started with. A larger --steps or
-    --budget also continues one that is finished."""
+    """Continue an interrupted run; larger --steps or --budget also continue a finished one."""
+    config: Config
     preset: Preset = "robust"
-    """Initial values: robust; the method as printed, paper or paper_appendix; baselines 3dgs
-    (3dgs_published: as printed, 30000 steps), 3dgs_gain, 3dgs_affine, 3dgs_bilateral, 3dgs_curve,
-    luminance_gs or ppisp; or ppisp_solved."""
+    """Initial values: robust; paper or paper_appendix (the method as printed); 3dgs,
+    3dgs_published (as printed, 30,000 steps), 3dgs_gain, 3dgs_affine, 3dgs_bilateral, 3dgs_curve,
+    luminance_gs, ppisp or ppisp_solved (baselines)."""
     reference: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Photographs of the same views under one common exposure, for evaluation."""
-    blocks: int | Literal["auto"] | None = None
-    """Cut the scene into N blocks that are fitted apart and merged; auto: into as few as memory
-    allows (docs/scaling.md). Default: one fit."""
-    jobs: int = 1
-    """Blocks at a time on this machine."""
-    engine: Annotated[str, tyro.conf.arg(metavar="NAME")] = "local"
-    """Where blocks are fitted: local, dask://HOST:PORT, or slurm:OPTION=VALUE,...
-    (docs/api.md)."""
     threads: int | None = None
-    """Cores of the CPU that a view is divided over. Default: 4 where there are as many; XLA makes
-    as good a use of fewer. Results repeat bit for bit with the same number."""
-    devices: int | Literal["all"] = 1
-    """Devices of a step, each with its own views (--train.batch; default then: one view each)."""
+    """CPU cores that share a view (default: at most 4); results repeat for the same number."""
+    verbose: bool = False
+    """Print all scores, and the seconds of each part of the fit."""
+    cluster: Annotated[Cluster, tyro.conf.OmitArgPrefixes] = Cluster()
 
     def execute(self) -> int:
-        """Fit the scene; print the place and the scores of the results."""
+        """Fit the scene; print the scores and the place of the results."""
         import time
         from functools import partial
 
-        from p2gs_jax.cli.tables import print_metrics
+        from p2gs_jax.cli.tables import print_headline, print_metrics
         from p2gs_jax.core.progress import TerminalReporter
         from p2gs_jax.core.runtime import use_cores
         from p2gs_jax.pipeline.fit import fit
         from p2gs_jax.train.data_parallel import with_a_view_each
 
         self._check()
-        if self.blocks is None:
+        cfg, out, cluster = checked(self.config), self.run_folder(), self.cluster
+        if cluster.blocks is None:
             use_cores(self.threads)
         with TerminalReporter() as reporter:
-            cfg = checked(self.config)
+            reporter.message(f"Run folder: {out}")
             common = {"reference": self.reference, "resume": self.resume, "reporter": reporter}
-            if self.blocks is None:
+            if cluster.blocks is None:
                 # Starting the interpreter and loading libraries is processor time throughout.
-                common |= {"spent_s": time.process_time(), "devices": self.devices}
-                cfg = with_a_view_each(cfg, self.devices)
-                result = fit(self.scene, self.out, cfg, **common)
+                common |= {"spent_s": time.process_time(), "devices": cluster.devices}
+                cfg = with_a_view_each(cfg, cluster.devices)
+                result = fit(self.scene, out, cfg, **common)
             else:
                 from p2gs_jax.jobs.blocks.fit import fit_blocks
                 from p2gs_jax.jobs.table import show
 
-                common |= {"blocks": self.blocks, "parallel": self.jobs, "engine": self.engine}
-                show_jobs = partial(show, reporter)
-                result = fit_blocks(self.scene, self.out, cfg, **common, on_look=show_jobs)
-        print_metrics(result.metrics, self.out)
+                common |= {"blocks": cluster.blocks, "parallel": cluster.jobs}
+                common |= {"engine": cluster.engine, "on_look": partial(show, reporter)}
+                result = fit_blocks(self.scene, out, cfg, **common)
+        if self.verbose:
+            print_metrics(result.metrics)
+        print_headline(result.metrics, out)
         return 0
 
+    def run_folder(self) -> Path:
+        """Return --out, or a new folder of today, or the newest that can be continued."""
+        if self.out is not None:
+            return self.out
+        scene, runs = self.scene.resolve(), Path("runs")
+        name = scene.stem if scene.is_file() else scene.name or "scene"
+        if self.resume:
+            dated = runs.glob(f"{glob.escape(name)}-20[0-9][0-9]-[01][0-9]-[0-3][0-9]*")
+            found = [folder for folder in dated if (folder / "config.json").is_file()]
+            fix = "leave out --resume, or name the run with --out"
+            check(bool(found), f"there is no run {runs / name}-DATE to continue", fix=fix)
+            return max(found, key=lambda folder: (folder / "config.json").stat().st_mtime)
+        first = f"{name}-{datetime.date.today()}"
+        names = itertools.chain([first], (f"{first}-{k}" for k in itertools.count(2)))
+        return next(runs / name for name in names if not (runs / name).exists())
+
     def _check(self) -> None:
-        count, whole = self.blocks, "write a whole number from 1 on, or"
-        why = "--jobs and --engine say nothing without --blocks"
+        cluster, whole = self.cluster, "write a whole number from 1 on, or"
+        count, devices = cluster.blocks, cluster.devices
+        why = "--jobs and --engine have no effect without --blocks"
         fix = "add --blocks auto, or a number"
-        check(count is not None or (self.jobs == 1 and self.engine == "local"), why, fix=fix)
+        check(count is not None or (cluster.jobs == 1 and cluster.engine == "local"), why, fix=fix)
         right = not isinstance(count, int) or count >= 1
         check(right, f"--blocks {count} is not a number of blocks", fix=f"{whole} auto")
-        check(self.jobs >= 1, "--jobs must be at least 1")
+        check(cluster.jobs >= 1, "--jobs must be at least 1")
         right = self.threads is None or self.threads >= 1
         check(right, f"--threads {self.threads} is not a number of cores", fix="give 1 or more")
         why = "--blocks fits every block on one device, and on a CPU on one core"
-        fix = "leave out --devices and --threads; blocks have --jobs and --engine"
-        alone = self.devices == 1 and self.threads is None
-        check(count is None or alone, why, fix=fix)
-        right = not isinstance(self.devices, int) or self.devices >= 1
-        check(right, f"--devices {self.devices} is not a number of devices", fix=f"{whole} all")
+        fix = "leave out --devices and --threads; --jobs and --engine are for blocks"
+        check(count is None or (devices == 1 and self.threads is None), why, fix=fix)
+        right = not isinstance(devices, int) or devices >= 1
+        check(right, f"--devices {devices} is not a number of devices", fix=f"{whole} all")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Calibrate:
-    """Solve exposures, gammas and tone curve alone, in seconds.
+    """Solve exposures and tone curves alone, in seconds.
 
-    From the colours of shared points, without splatting, and with standard errors. Prints a table
-    and writes photometry.json; open calibration.png first.
+    The colours of shared points give them without splatting, and with standard errors. The command
+    prints a table and writes photometry.json; open calibration.png first.
 
         p2gs-jax calibrate castle --out photometry
         p2gs-jax calibrate castle --out photometry --known-exposures exif
@@ -121,10 +152,10 @@ class Calibrate:
     """
 
     SHORT_NAMES: ClassVar = (
-        *("max_width", "known_exposures", "known_deviation_ev", "images", "drive", "cameras"),
+        *("max_width", "known_exposures", "exposure_sigma", "images", "drive", "cameras"),
         *("frames", "every", "max_frames", "camera_by"),
     )
-    # What is read of the configuration; the rest is no option.
+    # The fields of the configuration that are options.
     FIELDS: ClassVar = (
         *("data", "loss.black", "loss.saturation", "train.seed", "photometry.known"),
         *("photometry.known_deviation_ev", "photometry.select", "photometry.model"),
@@ -133,20 +164,20 @@ class Calibrate:
     )
     scene: Annotated[Path, tyro.conf.Positional]
     """COLMAP model, transforms.json, a folder of photographs, a video (docs/scenes.md), or a
-    finished run (correspondences then go through its rendered depth)."""
-    out: Folder
+    finished run (its rendered depth then gives the correspondences)."""
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
     """Folder for photometry.json and calibration.png."""
-    config: Config
     compare_with: Annotated[str | None, tyro.conf.arg(metavar="FILE|exif")] = None
-    """Stated exposures to compare with; default: EXIF."""
+    """Stated exposures for comparison (default: EXIF)."""
     static: bool = False
-    """The folder holds photographs from one fixed viewpoint at several exposures."""
+    """Read photographs from one fixed viewpoint at several exposures."""
+    config: Config
     preset: Preset = "robust"
-    """Initial values; see `fit`."""
+    """Initial values (p2gs-jax fit --help)."""
 
     def execute(self) -> int:
         """Solve the photometry alone; print it as a table."""
-        from p2gs_jax.cli.tables import print_calibration, print_stack
+        from p2gs_jax.cli.tables import print_calibration
         from p2gs_jax.core.progress import TerminalReporter
         from p2gs_jax.pipeline.calibrate import calibrate, calibrate_run, calibrate_stack
 
@@ -154,11 +185,10 @@ class Calibrate:
         with TerminalReporter() as reporter:
             how = {"compare_with": self.compare_with, "reporter": reporter}
             if self.static:
-                show, found = print_stack, calibrate_stack(scene, out, cfg, **how)
+                found = calibrate_stack(scene, out, cfg, **how)
             else:
-                show, solve = print_calibration, calibrate_run if self.is_run else calibrate
-                found = solve(scene, out, cfg, **how)
-        show(found, out)
+                found = (calibrate_run if self.is_run else calibrate)(scene, out, cfg, **how)
+        print_calibration(found, out)
         return 0
 
     @property
@@ -170,33 +200,87 @@ class Calibrate:
         """Return the configuration; raise a UserError where a value makes no sense."""
         scene, is_run, data, usual = self.scene, self.is_run, self.config.data, FitConfig().data
         own_size = data == usual
-        why = "--data.test-every and --data.split say nothing here"
+        why = "--data.test-every and --data.split have no effect here"
         fix = "leave them out: every photograph is calibrated"
         check((data.test_every, data.split) == (usual.test_every, usual.split), why, fix=fix)
         cfg, leave_out = checked(self.config), "leave out --max-width, --images and --data options"
         why = "--static reads every photograph of the folder at its own size"
         check(own_size or not self.static, why, fix=leave_out)
-        why = f"{scene} is a finished run: it keeps its own image size and folder"
+        why = f"{scene} is a finished run, whose image size and folder stay"
         check(own_size or not is_run, why, fix=leave_out)
         return cfg
+
+
+@dataclass(frozen=True)
+class Inspect:
+    """Inspect a scene without fitting it: cameras, frames, LiDAR, boxes, missing files.
+
+    The command reads every format that `fit` reads, and starts no structure from motion.
+
+        p2gs-jax inspect drive
+        p2gs-jax inspect drive --cameras front front_left --frames 0:40
+    """
+
+    SHORT_NAMES: ClassVar = ("drive", "cameras", "frames")
+    scene: Annotated[Path, tyro.conf.Positional]
+    """Scene, as for `fit`."""
+    data: DataConfig = field(default_factory=DataConfig)
+
+    def execute(self) -> int:
+        """Print the contents of the scene."""
+        from p2gs_jax.cli.tables import stdout
+        from p2gs_jax.core.progress import TerminalReporter
+        from p2gs_jax.scene.survey import survey
+
+        with TerminalReporter() as reporter:
+            reporter.stage("Reading the scene")
+            found = survey(self.scene, self.data, reporter.message)
+        console, cameras = stdout(), count_of(len(found.cameras), "camera")
+        photographs = count_of(found.photographs, "photograph")
+        console.print(f"{self.scene} ({found.format}): {photographs} of {cameras}.", soft_wrap=True)
+        console.print(_cameras(found))
+        for line in found.sentences:
+            console.print(line, soft_wrap=True)
+        return 0
+
+
+def _cameras(found: Survey):
+    """Return a table of the cameras, without empty columns."""
+    from p2gs_jax.cli.tables import make_table
+
+    columns = {
+        "camera": [c.name for c in found.cameras],
+        "photographs": [str(c.photographs) for c in found.cameras],
+        "size": [f"{c.size[0]} x {c.size[1]}" for c in found.cameras],
+        "focal length, px": ["" if c.focal is None else f"{c.focal:.0f}" for c in found.cameras],
+        "lens": [c.lens for c in found.cameras],
+        "EXIF, EV": [f"{c.ev[0]:.1f} to {c.ev[1]:.1f}" if c.ev else "" for c in found.cameras],
+        "own car": ["" if c.own_car is None else f"{c.own_car:.1%}" for c in found.cameras],
+    }
+    shown = {name: cells for name, cells in columns.items() if any(cells)}
+    return make_table(tuple(shown), zip(*shown.values(), strict=True), plain=True)
 
 
 def checked(cfg: FitConfig) -> FitConfig:
     """Return the configuration; raise a UserError where a value makes no sense."""
     data, train, known, behind = cfg.data, cfg.train, cfg.photometry, cfg.render.background
     most = cfg.densify.max_gaussians
-    check(data.max_width is None or data.max_width >= 16, "--max-width must be at least 16")
+    check(data.max_width is None or data.max_width >= 16, "--max-width must be at least 16 pixels")
     check(data.every is None or data.every >= 1, "--every must be at least 1")
     check(data.max_frames >= 2, "--max-frames must be at least 2")
-    check(data.test_every >= 0, "--test-every must be 0 or more")
-    check(train.budget_s is None or train.budget_s > 0, "--budget leaves no time", fix=DURATIONS)
+    check(data.test_every >= 0, "--test-every must be at least 0")
+    check(
+        train.budget_s is None or train.budget_s > 0,
+        "--budget must be longer than 0 s",
+        fix=DURATIONS,
+    )
     check(train.steps >= 1, "--steps must be at least 1")
     check(train.batch >= 1, "--train.batch must be at least 1")
     check(not isinstance(most, int) or most >= 1, "--gaussians must be at least 1")
     why = "--render.background must be linear radiance, three numbers that are not negative"
     check(all(math.isfinite(x) and x >= 0 for x in behind or ()), why)
-    check(known.known_deviation_ev >= 0, "--known-deviation-ev must be 0 or more")
-    why = "--known-deviation-ev says nothing without --known-exposures"
+    check(known.known_deviation_ev >= 0, "--exposure-sigma must be at least 0 stops")
+    why = "--exposure-sigma has no effect without --known-exposures"
     fix = "add --known-exposures FILE, or exif"
     check(known.known_deviation_ev == 0 or known.known is not None, why, fix=fix)
     return cfg

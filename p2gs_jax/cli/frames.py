@@ -1,4 +1,4 @@
-"""The frames that `render` is asked for: which cameras, and how each is developed."""
+"""The frames of `render`: their cameras, and how each is developed."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def _display_transform(fitted: Run, options: Render, shot: Shot | None = None) -
     else:
         ev = None if shot is None else shot.exposure_ev
         transform = fitted.common_display(0.0 if ev is None else ev)
-    if options.exposure_of is not None and shot is not None and shot.exposure_ev is not None:
+    if options.meter is not None and shot is not None and shot.exposure_ev is not None:
         metered = fitted.common_display(shot.exposure_ev)  # with --exposure-ev already
         transform = replace(transform, exposure=metered.exposure)
     elif isinstance(options.exposure_ev, float | int):
@@ -69,7 +69,7 @@ def _chosen(options: Render, fitted: Run) -> list[Shot]:
     pairs = zip(shots, fitted.scene.views, strict=True)
     chosen = [shot for shot, view in pairs if options.split in ("all", view.split)]
     if not chosen:
-        raise UserError(f"--split {options.split}: the scene has no such view.")
+        raise UserError(f"The scene has no view of --split {options.split}.")
     return chosen
 
 
@@ -85,14 +85,14 @@ def shots_of(
     views = fitted.scene.views
     if given is not None:
         shots = given
-    elif options.path == "views":
+    elif options.trajectory == "views":
         chosen = _chosen(options, fitted)
         shots = chosen if options.camera is None else of_camera(chosen, views, options.camera)
         photograph = _photographs(fitted, say)
     else:
         chosen = _chosen(options, fitted)
         own = of_camera(chosen, views, options.camera)
-        if options.path == "drive":
+        if options.trajectory == "drive":
             shots = drive(_recorded(own, options, fitted), options.frames)
             if options.shift is not None:
                 shots = beside_shots(shots, views, options.shift)
@@ -101,11 +101,11 @@ def shots_of(
             shots = orbit(circle, own, options.frames)
     if options.width is not None:
         shots = [shot.resized(options.width) for shot in shots]
-    if options.exposure_of is not None:
+    if options.meter is not None:
         added = options.exposure_ev if isinstance(options.exposure_ev, float | int) else 0.0
-        frames_s = ADAPT_S * (options.fps or FPS) if options.path != "views" else 0.0
-        shots = pictures.metered_shots(fitted, shots, options.exposure_of, added, frames_s)
-        if options.exposure_of == "auto":
+        frames_s = ADAPT_S * (options.fps or FPS) if options.trajectory != "views" else 0.0
+        shots = pictures.metered_shots(fitted, shots, options.meter, added, frames_s)
+        if options.meter == "auto":
             notes = [*notes, fitted.metering.sentence]
     size = (max(s.width for s in shots), max(s.height for s in shots))
     frames = pictures.shot_frames(
@@ -150,9 +150,9 @@ def panoramas_of(options: Render, fitted: Run) -> Job:
     if options.width is not None:
         cylinder = cylinder.resized(options.width)
     notes = []
-    if options.path == "drive":
+    if options.trajectory == "drive":
         if len(rig.steps) < 2:
-            fix = "use --path views"
+            fix = "use --trajectory views"
             raise UserError("A drive needs at least two time steps; the rig has one.", fix=fix)
         path = PosePath(rig.poses)
         along = path.evenly(frame_count(len(rig.steps), options.frames))
@@ -165,10 +165,10 @@ def panoramas_of(options: Render, fitted: Run) -> Job:
         allowed = {shot.view for shot in _chosen(options, fitted)}
         shown = [s for s in rig.steps if any(shot.view in allowed for shot in s.shots.values())]
         if not shown:
-            raise UserError(f"--split {options.split}: the rig has no such time step.")
+            raise UserError(f"The rig has no time step of --split {options.split}.")
         steps = [(step.name, step.pose, step.time) for step in shown]
         alone = len(views) - sum(len(step.shots) for step in rig.steps)
         if alone:
-            notes.append(f"{alone} views have no other camera's at their time: they are left out.")
+            notes.append(f"{alone} views without another camera's at their time are left out.")
     frames = pictures.wide_frames(fitted, cylinder, steps, _display_transform(fitted, options))
     return Job(frames, len(steps), (cylinder.width, cylinder.height), (), notes)

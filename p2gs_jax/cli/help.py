@@ -61,13 +61,17 @@ def registry(brief: bool) -> constructors.ConstructorRegistry:
         group = next((f"{n}." for n, hint in _hints(FitConfig).items() if hint is kind), "")
         if not (group or kind is FitConfig):
             return constructors.StructConstructorSpec(kind, tuple(_fields(kind, default, short)))
-        # What is no option stays as the preset has it; `preset` is an option of the command.
+        # Fields that are not options stay as the preset has them; the command has `preset`.
         default = default if isinstance(default, kind) else kind()
         fields = [f for f in _fields(kind, default, short) if f.name != "preset"]
         if only and group[:-1] not in only:
             inside = [path.removeprefix(group) for path in only if path.startswith(group)]
             fields = [f for f in fields if f.name in {path.partition(".")[0] for path in inside}]
-        make = functools.partial(dataclasses.replace, default)
+
+        def make(**values: Any) -> Any:
+            return dataclasses.replace(default, **values)
+
+        make.__doc__ = kind.__doc__
         return constructors.StructConstructorSpec(make, tuple(fields))
 
     rules.primitive_rule(_number_rule)
@@ -110,10 +114,14 @@ def _number_rule(
 
 
 def _brief(kind: type, default: Any) -> Iterator[constructors.StructFieldSpec]:
-    """Yield a command's options, with the short names in place of the whole configuration."""
+    """Yield a command's options, with the short names in place of the whole configuration.
+
+    Groups of options are left out.
+    """
     for spec in _fields(kind, default, {}):
         if not isinstance(spec.default, FitConfig | DataConfig):
-            yield spec
+            if not dataclasses.is_dataclass(spec.default):
+                yield spec
             continue
         for short in kind.SHORT_NAMES:  # type: ignore
             group, field = SHORT[short][0].split(".")
@@ -127,7 +135,7 @@ def _fields(
     group = next((n for n, hint in _hints(FitConfig).items() if hint is kind), None)
     for name, hint in _hints(kind).items():
         if get_origin(hint) is tuple and any(map(dataclasses.is_dataclass, get_args(hint))):
-            continue  # Records that a scene decides: they are not options.
+            continue  # These are records that a scene decides, and not options.
         yield _field(kind, name, default, short.get(f"{group}.{name}"), brief=False)
 
 
@@ -247,8 +255,8 @@ def overview(groups: Mapping[str, Mapping[str, type]]) -> str:
     """Return what `p2gs-jax --help` prints of commands, whose names stand under headings."""
     indent = 2 + 2 + max(len(name) for commands in groups.values() for name in commands)
     about = (
-        "One linear HDR radiance field, and an exposure and a gamma for every view, from ordinary "
-        "photographs."
+        "p2gs-jax fits one linear HDR radiance field, and an exposure and a tone curve for each "
+        "photograph."
     )
     lines = ["usage: p2gs-jax COMMAND [OPTIONS]", "", *_wrapped(about)]
     for heading, commands in groups.items():
@@ -259,9 +267,9 @@ def overview(groups: Mapping[str, Mapping[str, type]]) -> str:
     lines += [
         "",
         "p2gs-jax COMMAND --help   options and examples of one command",
-        "p2gs-jax --version        which version this is",
+        "p2gs-jax --version        version of p2gs-jax",
         "",
-        "Read on in docs/README.md; docs/quickstart.md begins with your photographs.",
+        "Documentation: docs/README.md; docs/quickstart.md begins with your photographs.",
     ]
     return "\n".join(lines)
 
@@ -280,7 +288,7 @@ def examples(kind: type, name: str) -> str:
     if below:
         below.insert(0, "Examples:")
     if name:
-        more = "Every other number of the method, with its unit and source:"
+        more = "All options, with units and sources:"
         below = [more, f"{INDENT}p2gs-jax {name} --help-all", "", *below]
     return "\n".join(below)
 

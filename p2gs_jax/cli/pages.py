@@ -22,12 +22,11 @@ class View:
     run: RunPath
     scene: SceneFolder = None
     port: int = 8080
-    """Port to listen on; 0 takes any free one."""
+    """Port to listen on; 0: any free port."""
     host: str = "127.0.0.1"
-    """Address to listen on. Other machines reach it only where this is changed, to 0.0.0.0 for
-    instance; whoever has the printed address with its token may then look, over plain HTTP."""
+    """Address to listen on (plain HTTP); 0.0.0.0 admits whoever has the printed address."""
     max_width: int = 1920
-    """Widest picture that is rendered, pixels; wider windows enlarge it."""
+    """Largest width of rendered pictures, pixels; wider windows enlarge them."""
 
     def execute(self) -> int:
         """Show the run in the browser until Ctrl-C."""
@@ -59,10 +58,10 @@ class Report:
 
     run: RunPath
     out: Path | None = None
-    """The page (default: RUN/report.html)."""
+    """File of the page (default: RUN/report.html)."""
     scene: SceneFolder = None
     render: bool = True
-    """Load the scene and render for the seams; without, only what the run folder holds."""
+    """Load the scene and render it for the seams; without it, the run folder gives all."""
 
     def execute(self) -> int:
         """Write the page; 1 where a file of the run is broken."""
@@ -90,9 +89,9 @@ class Compare:
     """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN ...]")]
-    """Run folders; the first is the one that others are held against."""
+    """Run folders; the others are compared with the first."""
     out: Path | None = None
-    """A file for the tables as Markdown (default: none)."""
+    """Markdown file of the tables (default: none)."""
 
     def execute(self) -> int:
         """Print the runs side by side."""

@@ -16,30 +16,29 @@ from p2gs_jax.cli.doctor import Doctor
 from p2gs_jax.cli.evaluate import Eval
 from p2gs_jax.cli.experiments import Demo, Sweep, Synth
 from p2gs_jax.cli.export import Export
-from p2gs_jax.cli.fit import Calibrate, Fit
+from p2gs_jax.cli.fit import Calibrate, Fit, Inspect
 from p2gs_jax.cli.pages import Compare, Report, View
 from p2gs_jax.cli.render import Render
-from p2gs_jax.cli.scene import Survey
-from p2gs_jax.cli.shared import check_option_names
+from p2gs_jax.cli.shared import COMMANDS_OF_OTHERS, RENAMED, check_option_names
 from p2gs_jax.core.text import printable
 from p2gs_jax.errors import UserError
 from p2gs_jax.presets import preset
 
-# Every class holds the options of a command and does what the command does: `execute` returns the
-# exit code. The order is that of `p2gs-jax --help`: as a new user needs them.
+# A class holds the options of a command, and its `execute` runs the command and returns the exit
+# code. The order is that of `p2gs-jax --help`: as a new user needs them.
 GROUPS: dict[str, dict[str, type]] = {
     "First": {"doctor": Doctor, "demo": Demo},
-    "From photographs": {"scene": Survey, "fit": Fit, "calibrate": Calibrate},
+    "From photographs": {"inspect": Inspect, "fit": Fit, "calibrate": Calibrate},
     "With a finished run": {
         **{"view": View, "report": Report, "render": Render},
         **{"export": Export, "eval": Eval, "compare": Compare},
     },
-    "Data with truth, and many fits": {"synth": Synth, "sweep": Sweep},
+    "Data with known exposures, and many fits": {"synth": Synth, "sweep": Sweep},
 }
 COMMANDS = {name: kind for group in GROUPS.values() for name, kind in group.items()}
 WITH_PRESET = ("fit", "calibrate")
-# Their `--help` is short, and `--help-all` is not.
-WITH_CONFIGURATION = (*WITH_PRESET, "scene")
+# Commands whose `--help` is short; their `--help-all` lists the whole configuration.
+WITH_CONFIGURATION = (*WITH_PRESET, "inspect")
 HELP, HELP_ALL, VERSION = ("-h", "--help"), "--help-all", ("-V", "--version")
 
 
@@ -50,6 +49,7 @@ def parse(argv: list[str]) -> tuple[str, Any]:
         UserError: there is no such command or preset.
         SystemExit: 0 after help was asked for and printed, 2 after a complaint about options.
     """
+    argv = _with_new_names(argv)
     first = argv[0] if argv else ""
     if first in HELP or first in (HELP_ALL, ""):
         _print_and_exit(help_text.overview(GROUPS), 0 if first else 2)
@@ -60,6 +60,19 @@ def parse(argv: list[str]) -> tuple[str, Any]:
     if first not in COMMANDS:
         raise _unknown(first)
     return first, _options(first, argv[1:])
+
+
+def _with_new_names(argv: list[str]) -> list[str]:
+    """Return the words with today's names of commands and options; old ones get a hint."""
+    out = []
+    for k, word in enumerate(argv):
+        old, equals, value = word.partition("=")
+        new = RENAMED.get(old.replace("_", "-")) if k == 0 or old.startswith("--") else None
+        if new is not None:
+            print(f"p2gs-jax: {old} is now called {new}.", file=sys.stderr)
+            word = new + equals + value
+        out.append(word)
+    return out
 
 
 def _options(name: str, argv: list[str]) -> Any:
@@ -83,7 +96,7 @@ def _options(name: str, argv: list[str]) -> Any:
                 registry=help_text.registry(brief),
             )
     except SystemExit as end:
-        # It repeats words as they are: names of files that a pattern of the shell found.
+        # tyro repeats words as they are: names of files that a pattern of the shell found.
         print(printable(complaint.getvalue()), end="", file=sys.stderr)
         if end.code == 0:
             more = name if brief and name in WITH_CONFIGURATION else ""
@@ -101,12 +114,16 @@ def _defaults(name: str, argv: list[str]) -> Any:
             name_of_preset = argv[i + 1]
         elif arg.startswith("--preset="):
             name_of_preset = arg.split("=", 1)[1]
-    return COMMANDS[name](tyro.MISSING, tyro.MISSING, preset(name_of_preset))
+    given = {} if name == "fit" else {"out": tyro.MISSING}
+    return COMMANDS[name](scene=tyro.MISSING, config=preset(name_of_preset), **given)
 
 
 def _unknown(word: str) -> UserError:
     if word.startswith("-"):
         return UserError(f"{word} comes before any command.", fix="write p2gs-jax COMMAND OPTIONS")
+    if word in COMMANDS_OF_OTHERS:
+        fix = f"write p2gs-jax {COMMANDS_OF_OTHERS[word]}"
+        return UserError(f"there is no command {word!r}.", fix=fix)
     near = difflib.get_close_matches(word, COMMANDS, n=2, cutoff=0.5)
     guess = f"did you mean {' or '.join(near)}? " if near else ""
     fix = f"{guess}`p2gs-jax --help` lists all commands"

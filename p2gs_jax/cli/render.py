@@ -19,67 +19,63 @@ if TYPE_CHECKING:
 
 PATHS = ("views", "drive", "orbit")
 FPS = 24.0
-# Sideways, scene units.
+# Largest shift, scene units.
 MOST_SHIFT = 100.0
 OTHER_FILES = (".mov", ".avi", ".mkv", ".webm", ".gif", ".png", ".jpg", ".exr", ".json")
 
 
 @dataclass(frozen=True)
 class Render:
-    """Render views or a camera path of a run at any exposure.
+    """Render the views of a run, or a camera path, at any exposure.
 
     p2gs-jax render runs/street --exposure-ev 1 --gamma 2.2 --out brighter
-    p2gs-jax render runs/street --path drive --out drive.mp4
-    p2gs-jax render runs/street --path drive --shift 2 --out left_lane.mp4
+    p2gs-jax render runs/street --trajectory drive --out drive.mp4
+    p2gs-jax render runs/street --trajectory drive --shift 2 --out left_lane.mp4
     p2gs-jax render runs/street --panorama --split test --width 1400 --out wide
     """
 
     run: RunPath
-    path: str = "views"
-    """views: the scene's own. drive: smoothly through the views of one camera. orbit: around what
-    the cameras look at. FILE.json: a list of cameras (docs/rendering.md)."""
+    trajectory: str = "views"
+    """Camera path. views: the cameras of the scene; drive: a smooth path through the views of one
+    camera; orbit: a circle around the scene; FILE.json: a list of cameras (docs/rendering.md)."""
     out: Path | None = None
-    """A folder, for linear EXR and PNG of every frame, or a video, NAME.mp4 (default: a folder
-    in RUN/renders)."""
+    """Folder for linear EXR and PNG files, or a video NAME.mp4 (default: below RUN/renders)."""
     split: Literal["all", "train", "test"] = "all"
-    """Which of the scene's views: held-out ones are test."""
+    """Subset of the scene's views; test: the held-out views."""
     camera: str | None = None
-    """Only the views of this camera; drive and orbit default to that with the most views."""
+    """Camera whose views are rendered (default for drive and orbit: that with the most)."""
     panorama: bool = False
-    """One wide image around a rig of cameras: with views at every time step, with drive along the
-    way."""
+    """Render one wide image of a rig of cameras, at every time step or along a drive."""
     exposure_ev: float | Literal["own"] | None = None
-    """Exposure in stops from the geometric mean of the training exposures; own: as photographed
-    (on a drive interpolated). Default: own for views, 0 for other paths."""
-    exposure_of: MeteringRule | None = None
-    """Exposure metered from each picture, smoothly along a path: auto: as the camera would have
-    chosen it, where a rule explains the photographs; log_average, centre: to mid-grey; highlights:
-    to just below white; protected: mid-grey, highlights kept. --exposure-ev then adds stops."""
+    """Exposure in stops from the geometric mean of the training exposures; own: that of each
+    photograph, interpolated on a drive (default: own for views, 0 for other trajectories)."""
+    meter: MeteringRule | None = None
+    """Exposure metered from each picture, smoothly along a trajectory. auto: the camera's rule,
+    where one explains the photographs; log_average, centre: to mid-grey; highlights: to just below
+    white; protected: to mid-grey, highlights kept. --exposure-ev then adds stops."""
     gamma: float | None = None
-    """Gamma; default: each view's own, or the training views' mean for other paths."""
+    """Gamma (default: that of each view; the mean of the training views for other trajectories)."""
     curve: Literal["run", "srgb", "power", "linear", "spline"] = "run"
-    """Tone curve; run: the one that was fitted."""
+    """Tone curve; run: the fitted one."""
     white_balance_of: str | None = None
-    """Name of the view whose white balance is shown, where views differ in it (default: each
-    view's own; neutral where an exposure is given, and for other paths)."""
+    """View whose white balance is used (default: that of each view, or neutral)."""
     no_vignetting: bool = False
-    """Leave out the darkening towards the corners that the cameras of this run have."""
+    """Leave out the vignetting of the run's cameras."""
     without_objects: bool = False
-    """Leave out what moves."""
+    """Leave out moving objects."""
     only_objects: bool = False
-    """Show only what moves."""
+    """Show moving objects alone."""
     shift: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None
-    """Move a drive sideways, seen from the driving direction: so many metres (scene units) to the
-    left; negative ones to the right."""
+    """Shift of a drive to the left, metres (scene units); a negative shift is to the right."""
     frames: int | None = None
-    """Frames of a drive (default: 8 from one view to the next) or an orbit (default: 120)."""
+    """Number of frames of a drive (default: 8 per view) or an orbit (default: 120)."""
     width: int | None = None
-    """Image width, pixels; the height follows (default: as the photographs)."""
+    """Image width, pixels; the height follows (default: that of the photographs)."""
     fps: float | None = None
     """Frames per second of a video (default: 24)."""
     scene: SceneFolder = None
     overwrite: bool = False
-    """Replace what an earlier render wrote."""
+    """Replace the files of an earlier render."""
 
     def execute(self) -> int:
         """Render the run along the path, into a folder or a video."""
@@ -94,7 +90,7 @@ class Render:
         begin = time.monotonic()
         for refuse in (_check_picture, _check_path, _check_file):  # before anything is read
             refuse(self)
-        given = read_cameras(Path(self.path)) if self.path not in PATHS else None
+        given = read_cameras(Path(self.trajectory)) if self.trajectory not in PATHS else None
         fitted = _load(self)
         given = None if given is None else near_scene(given, fitted.scene.origin)
         out = self.out or self.run / "renders" / _default_name(self, fitted.scene)
@@ -134,7 +130,7 @@ def _load(options: Render) -> Run:
 
 
 def _check_place(out: Path, overwrite: bool) -> None:
-    """Refuse to overwrite files, unless asked to."""
+    """Refuse to overwrite files without --overwrite."""
     there = out.is_file() or (out.is_dir() and any(out.iterdir()))
     if there and not overwrite:
         what = f"{out} exists already" if out.is_file() else f"{out} holds files already"
@@ -149,8 +145,9 @@ def is_video(out: Path) -> bool:
 
 def _default_name(options: Render, scene: Scene) -> str:
     """Return the name of a folder in which a fit writes no held-out view."""
-    name = options.path if options.path in PATHS else Path(options.path).stem
-    if options.path == "views":
+    path = options.trajectory
+    name = path if path in PATHS else Path(path).stem
+    if path == "views":
         name = options.split
         if options.camera is not None:
             name += "_" + options.camera.replace("/", "_")
@@ -164,38 +161,40 @@ def _default_name(options: Render, scene: Scene) -> str:
 def _check_picture(o: Render) -> None:
     from p2gs_jax.paths.files import LARGEST, MOST_STOPS
 
-    ev, one = o.exposure_ev, "leave one of them out"
-    right = o.path in PATHS or o.path.lower().endswith(".json")
-    check(right, f"--path {o.path!r} is unknown", fix="choose views, drive, orbit or a FILE.json")
-    why = "--exposure-of meters pictures of single cameras, instead of --exposure-ev own"
-    check(o.exposure_of is None or not (o.panorama or ev == "own"), why, fix=one)
+    path, ev, one = o.trajectory, o.exposure_ev, "leave one of them out"
+    right = path in PATHS or path.lower().endswith(".json")
+    fix = "choose views, drive, orbit or a FILE.json"
+    check(right, f"--trajectory {path!r} is not a valid trajectory", fix=fix)
+    why = "--meter is for pictures of single cameras, instead of --exposure-ev own"
+    check(o.meter is None or not (o.panorama or ev == "own"), why, fix=one)
     why = f"--exposure-ev {ev} is not a number of stops"
     check(not isinstance(ev, float | int) or abs(ev) <= MOST_STOPS, why, fix="write 0, 1 or -2.5")
     why = "--exposure-ev own is for views and drives, and not for panoramas"
     fix = "write a number of stops, or leave it out"
-    check(ev != "own" or (o.path in ("views", "drive") and not o.panorama), why, fix=fix)
+    check(ev != "own" or (path in ("views", "drive") and not o.panorama), why, fix=fix)
     why = "--without-objects leaves nothing to show"
     check(not (o.without_objects and o.only_objects), why, fix=one)
-    fix = "write 2.2 for the tone curve as it is, more for less contrast"
+    fix = "write 2.2 for the fitted tone curve, and a larger number for less contrast"
     check(o.gamma is None or 0 < o.gamma < math.inf, "--gamma must be positive", fix=fix)
     width_fits = o.width is None or 16 <= o.width <= LARGEST
-    check(width_fits, f"--width must be between 16 and {LARGEST}")
+    check(width_fits, f"--width must be from 16 to {LARGEST} pixels")
 
 
 def _check_path(o: Render) -> None:
-    own, leave = o.path in PATHS, "leave it out"
-    moves = o.path in ("drive", "orbit")
-    check(o.frames is None or moves, "--frames is for --path drive and orbit", fix=leave)
-    check(o.shift is None or o.path == "drive", "--shift is for --path drive", fix=leave)
+    path, leave = o.trajectory, "leave it out"
+    moves, only = path in ("drive", "orbit"), "is for --trajectory"
+    check(o.frames is None or moves, f"--frames {only} drive and orbit", fix=leave)
+    check(o.shift is None or path == "drive", f"--shift {only} drive", fix=leave)
     near = o.shift is None or abs(o.shift) <= MOST_SHIFT
-    check(near, f"--shift must be at most {MOST_SHIFT:g} to either side")
-    check(o.frames is None or o.frames >= 2, "--frames must be 2 or more")
-    why = "--panorama is for --path views and drive"
+    check(near, f"--shift must be from {-MOST_SHIFT:g} to {MOST_SHIFT:g} metres")
+    check(o.frames is None or o.frames >= 2, "--frames must be at least 2")
     fix = "choose one of them, or leave it out"
-    check(not o.panorama or o.path in ("views", "drive"), why, fix=fix)
-    single = own and not o.panorama
+    right = not o.panorama or path in ("views", "drive")
+    check(right, f"--panorama {only} views and drive", fix=fix)
+    single = path in PATHS and not o.panorama
     check(o.camera is None or single, "--camera is for single cameras of the scene", fix=leave)
-    check(o.split == "all" or own, "--split is for the scene's own views", fix=leave)
+    right = o.split == "all" or path in PATHS
+    check(right, "--split is for the cameras of the scene", fix=leave)
 
 
 def _check_file(o: Render) -> None:
@@ -209,4 +208,4 @@ def _check_file(o: Render) -> None:
     video = out is not None and is_video(out)
     fix = "write --out NAME.mp4, or leave it out"
     check(o.fps is None or video, "--fps is for videos", fix=fix)
-    check(o.fps is None or 1 <= o.fps <= 240, "--fps must be between 1 and 240")
+    check(o.fps is None or 1 <= o.fps <= 240, "--fps must be from 1 to 240")

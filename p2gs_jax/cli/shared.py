@@ -15,7 +15,7 @@ MeteringRule = Literal["auto", "log_average", "centre", "highlights", "protected
 RunPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(help="Run folder.")]
 SceneFolder = Annotated[
     Path | None,
-    tyro.conf.arg(metavar="DIR", help="Where the run's scene lies now, if it is not where it was."),
+    tyro.conf.arg(metavar="DIR", help="Scene of the run, where it has moved since the fit."),
 ]
 # Short names of fields of the configuration: the field, and the placeholder of its value. A command
 # that has any lists them as `SHORT_NAMES`.
@@ -36,28 +36,37 @@ SHORT = {
     "every": ("data.every", "N"),
     "max_frames": ("data.max_frames", "N"),
     "known_exposures": ("photometry.known", "FILE|exif"),
-    "known_deviation_ev": ("photometry.known_deviation_ev", "STOPS"),
+    "exposure_sigma": ("photometry.known_deviation_ev", "STOPS"),
     "lpips_weights": ("evaluation.lpips_weights", "alex|vgg"),
     "seed": ("train.seed", "N"),
 }
 DURATIONS = "write 90s, 5m or 1h30m"
-SCENE = "the scene's folder itself, without an option"
-# Our names for options of 3DGS, gsplat and nerfstudio.
-OTHERS = {
-    "--steps": ("iterations", "iters", "max-steps", "max-num-iterations", "num-iterations"),
-    "--gaussians": ("cap-max", "max-gaussians", "num-gaussians"),
-    "--max-width": ("resolution", "downscale-factor", "data-factor"),
-    "--out": ("output", "output-dir", "output-path", "result-dir", "model-path"),
-    "--test-every": ("eval", "llffhold"),
-    "--render.sh-degree": ("sh-degree",),
-    "--background": ("white-background", "background-color", "random-background"),
-    "--budget": ("timeout", "time-limit"),
-    "--images": ("image-dir",),
-    "--overwrite": ("force",),
-    "--exposure-ev": ("exposure", "ev"),
-    SCENE: ("source-path", "data", "data-dir"),
+# Earlier names of our commands and options; they are still understood.
+RENAMED = {
+    "scene": "inspect",
+    "--exposure-of": "--meter",
+    "--path": "--trajectory",
+    "--known-deviation-ev": "--exposure-sigma",
+    "--max-parallel": "--jobs",
 }
-SYNONYMS = {f"--{theirs}": ours for ours, names in OTHERS.items() for theirs in names}
+SCENE = "the scene's folder itself, without an option"
+# Our names for commands and options of 3DGS, gsplat and nerfstudio.
+COMMANDS_OF_OTHERS = {"train": "fit SCENE", "viewer": "view RUN", "metrics": "eval RUN"}
+OTHERS = {
+    "--steps": "--iterations --iters --max-steps --max-num-iterations --num-iterations",
+    "--gaussians": "--cap-max --max-gaussians --num-gaussians",
+    "--max-width": "--resolution --downscale-factor --data-factor -r",
+    "--out": "--output --output-dir --output-path --result-dir --model-path -m -o",
+    "--test-every": "--eval --llffhold",
+    "--render.sh-degree": "--sh-degree",
+    "--background": "--white-background --background-color --random-background -w",
+    "--budget": "--timeout --time-limit",
+    "--images": "--image-dir -i",
+    "--overwrite": "--force",
+    "--exposure-ev": "--exposure --ev",
+    SCENE: "--source-path --data --data-dir -s",
+}
+SYNONYMS = {theirs: ours for ours, names in OTHERS.items() for theirs in names.split()}
 
 
 def parse_duration(text: str) -> float:
@@ -85,14 +94,14 @@ def check(condition: bool, text: str, *, fix: str | None = None) -> None:
 
 
 def check_option_names(command: str, argv: Sequence[str], options: Collection[str]) -> None:
-    """Raise a UserError that names ours for options of other programs that are not in `options`."""
+    """Raise a UserError that gives our name of an option of other programs, unless in `options`."""
     for word in argv:
         name = word.split("=", 1)[0].replace("_", "-")
         ours = SYNONYMS.get(name)
         if ours is None or name in options:
             continue
         if ours is SCENE and command == "fit":
-            fix = f"name {SCENE}: p2gs-jax fit SCENE --out RUN"
+            fix = f"name {SCENE}: p2gs-jax fit SCENE"
         elif ours in options or (ours.startswith("--render.") and "--config" in options):
             fix = f"here it is called {ours}"
         else:

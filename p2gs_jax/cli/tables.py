@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,19 +14,18 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from p2gs_jax.core.clock import NO_PARTS, whole_run
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.core.progress import PlainConsole
+from p2gs_jax.core.text import count_of
 from p2gs_jax.evaluation.scores import PROTOCOLS
 from p2gs_jax.photometry.formation import corner
 from p2gs_jax.photometry.solution import WEAK_GAMMA, PhotometricSolution
 from p2gs_jax.pipeline.calibrate import Calibration
+from p2gs_jax.report.findings import duration
 
 # Columns of words; all others hold numbers.
 WORDS = ("views", "view", "camera", "protocol", "program", "lens", "configuration", "")
-# Parts of a fit, as metrics.json has them under "seconds".
-PARTS = ("starting", "reading", "structure_from_motion", "photometry", "seeds", "compiling")
-PARTS += ("steps", "densification", "looking", "checkpoints", "blocks", "seams")
-PARTS += ("evaluation", "files")
 
 
 def stdout() -> Console:
@@ -55,12 +55,33 @@ def scores(part: Mapping[str, Any]) -> tuple[str, str, str]:
     return f"{part['psnr']:.2f}", f"{part['ssim']:.4f}", lpips
 
 
-def print_metrics(metrics: dict[str, Any], out: Path) -> None:
-    """Print the scores of a run as a table."""
+def print_headline(metrics: dict[str, Any], run: Path) -> None:
+    """Print the main score of a fit, and the commands that come next."""
+    facts, where = [], shlex.quote(str(run))
+    for name in ("test_fitted", "train"):
+        part, fitted = _part(metrics, name), " (exposures fitted)" if name != "train" else ""
+        if "psnr" in part and not facts:
+            views = count_of(len(part["per_view"]), "view") + fitted
+            facts = [f"{PROTOCOLS[name].views.capitalize()} {part['psnr']:.1f} dB over {views}"]
+    facts.append(count_of(metrics["counts"]["gaussians"], "Gaussian"))
+    facts.append(duration(whole_run(metrics["seconds"]) or 0.0))
+    next_ones = ("view {}", "report {}", "export {} --format display-ply")
+    lines = [f"{', '.join(facts)}.", "Next:"]
+    lines += [f"  p2gs-jax {command.format(where)}" for command in next_ones]
+    lines.append(f"Run folder: {run} (open {run / 'summary.png'} first)")
+    stdout().print("\n".join(lines), soft_wrap=True)
+
+
+def _part(metrics: dict[str, Any], name: str) -> dict[str, Any]:
+    """Return the part of metrics.json of a protocol; empty where there is none."""
+    return functools.reduce(lambda at, key: at.get(key, {}), PROTOCOLS[name].path, metrics)
+
+
+def print_metrics(metrics: dict[str, Any]) -> None:
+    """Print all scores of a run, and its seconds."""
     console, rows = stdout(), []
-    for protocol in PROTOCOLS.values():
-        part = functools.reduce(lambda at, key: at.get(key, {}), protocol.path, metrics)
-        if "psnr" in part:
+    for name, protocol in PROTOCOLS.items():
+        if "psnr" in (part := _part(metrics, name)):
             rows.append((protocol.views, protocol.shown, *scores(part)))
     columns = ("views", "protocol", "PSNR dB", "SSIM", "LPIPS")
     console.print(make_table(columns, rows, "How well it fits"))
@@ -78,32 +99,28 @@ def print_metrics(metrics: dict[str, Any], out: Path) -> None:
             f"{counts['gaussians']} Gaussians, {counts['steps']} steps, "
             f"{1e3 * metrics['seconds_per_step']:.0f} ms a step."
         )
-    seconds = {k: v for k, v in metrics.get("seconds", {}).items() if k in PARTS and v >= 0.5}
-    if seconds:
-        spent = ", ".join(f"{k.replace('_', ' ')} {v:.0f}" for k, v in seconds.items())
-        console.print(f"Seconds: {spent}.")
-    console.print(f"Results: {out} (open {out / 'summary.png'} first)")
+    seconds = metrics.get("seconds", {}).items()
+    spent = [f"{k.replace('_', ' ')} {v:.0f}" for k, v in seconds if k not in NO_PARTS and v >= 0.5]
+    if spent:
+        console.print(f"Seconds: {', '.join(spent)}.")
 
 
 def print_calibration(result: Calibration, out: Path) -> None:
-    """Print solved exposures, gammas and cameras, with their errors."""
+    """Print solved exposures with their errors; gammas and cameras, or the response of a stack."""
     s, seconds = result.solution, result.seconds
-    _print_solution(result, _tone_columns(result))
-    stdout().print(
-        f"{result.observations} observations, {100 * s.outliers:.0f} % ignored as outliers; "
-        f"residual {s.residual_ev:.2f} EV; {seconds['reading']:.1f} s reading, "
-        f"{seconds['adjustment']:.1f} s adjusting."
-    )
-    stdout().print(f"Results: {out} (open {out / 'calibration.png'} first)")
-
-
-def print_stack(result: Calibration, out: Path) -> None:
-    """Print the solved exposures of a stack from one viewpoint, and its response."""
-    s = result.solution
-    points = [str(count) for count in s.observations_per_view]
-    signal = ["yes" if signal else "little" for signal in result.details["signal"]]
-    _print_solution(result, {"usable points": points, "signal": signal})
-    stdout().print(f"Response: {s.response.name}; residual {s.residual_ev:.2f} EV. Results: {out}")
+    if "signal" in result.details:
+        points = [str(count) for count in s.observations_per_view]
+        signal = ["yes" if signal else "little" for signal in result.details["signal"]]
+        _print_solution(result, {"usable points": points, "signal": signal})
+        found = f"response {s.response.name}; residual {s.residual_ev:.2f} EV"
+    else:
+        _print_solution(result, _tone_columns(result))
+        found = (
+            f"{result.observations} observations, {100 * s.outliers:.0f} % ignored as outliers; "
+            f"residual {s.residual_ev:.2f} EV; {seconds['reading']:.1f} s reading, "
+            f"{seconds['adjustment']:.1f} s adjusting"
+        )
+    stdout().print(f"Solved: {found}.\nResults: {out} (open {out / 'calibration.png'} first)")
 
 
 def _print_solution(result: Calibration, more: Mapping[str, list[str]]) -> None:

@@ -16,7 +16,7 @@ from rich.text import Text
 from p2gs_jax.core.text import as_clock, printable
 
 # Seconds between lines of progress where there is no terminal.
-EVERY_S = 15.0
+EVERY_S = 5.0
 
 
 class PlainConsole(Console):
@@ -53,16 +53,18 @@ class LogRecord:
     terms: dict[str, float]
 
     def summary(self) -> str:
-        """Return where the run is, as text."""
+        """Return how far the run is, as text."""
+        total = max(round(self.step / self.progress), self.step) if self.progress else "?"
         left = "" if self.left_s is None else f", {as_clock(self.left_s)} left"
-        return f"step {self.step}, PSNR {self.psnr:.2f} dB, {self.gaussians} Gaussians{left}"
+        scores = f"loss {self.loss:.4f}, PSNR {self.psnr:.2f} dB"
+        return f"step {self.step} of {total}, {scores}{left}, {self.gaussians} Gaussians"
 
 
 class Reporter:
     """Receives the progress and the messages of a fit; this one ignores them."""
 
     def message(self, text: str) -> None:
-        """Say something the user must know."""
+        """Receive a sentence that the user must know."""
 
     def stage(self, name: str, done: int = 0, total: int = 0) -> None:
         """Begin or advance a stage."""
@@ -75,9 +77,9 @@ Silent = Reporter
 
 
 class TerminalReporter(Reporter):
-    """Messages as lines; progress as one live line in a terminal, elsewhere as a line now and then.
+    """Prints messages as lines; progress is a live bar in a terminal, elsewhere a line at times.
 
-    Use as a context manager.
+    It is a context manager.
     """
 
     def __init__(self, console: Console | None = None):
@@ -113,9 +115,7 @@ class TerminalReporter(Reporter):
             self.console.print(Text(line), soft_wrap=True)
 
     def log(self, record: LogRecord) -> None:
-        """Show how far the optimisation is and, in a terminal, its loss and views per second."""
-        rate = 1 / record.step_seconds if record.step_seconds else 0.0
-        bar = f"{'█' * int(24 * record.progress):<24} {record.progress:4.0%}"
-        more = f"loss {record.loss:.4f}, {rate:.1f} views/s"
-        text = f"{record.progress:.0%}, {record.summary()}"
-        self.show(Text(f"{bar}  {record.summary()}, {more}"), text)
+        """Show how far the optimisation is."""
+        text = f"{record.progress:4.0%}  {record.summary()}"
+        bar = f"{'█' * int(12 * record.progress):<12} {text}"
+        self.show(Text(bar, no_wrap=True, overflow="ellipsis"), text.strip())

@@ -64,7 +64,7 @@ def drive(knots: Sequence[Shot], frames: int | None = None) -> list[Shot]:
     """
     if len(knots) < 2:
         why = f"A drive needs at least two views of a camera; here there are {len(knots)}."
-        raise UserError(why, fix="choose another --camera or --split, or --path orbit")
+        raise UserError(why, fix="choose another --camera or --split, or --trajectory orbit")
     path = PosePath(inverse(np.stack([s.viewmat for s in knots])))
     times = path.evenly(frame_count(len(knots), frames))
     logs = [None if s.gamma is None else float(np.log(s.gamma)) for s in knots]

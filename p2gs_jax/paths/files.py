@@ -35,7 +35,7 @@ def read_cameras(path: Path) -> list[Shot]:
     try:
         data = parse_json(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
-        fix = "name a file of cameras, or choose --path views, drive or orbit"
+        fix = "name a file of cameras, or choose --trajectory views, drive or orbit"
         raise UserError(f"{path} cannot be read: {error.strerror or error}.", fix=fix) from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise UserError(f"{path} is not valid JSON: {error}.", fix=_FIX) from None

@@ -41,6 +41,9 @@ MOST_OBSERVATIONS = 40_000
 SPLINE_OBSERVATIONS = 12_000  # a curve has few parameters; its basis is the most expensive one
 
 OnChosen = Callable[[Form, Response], None]
+# Where a run's notes give the numbers behind a choice, and the gain from which it is clear, nat.
+NUMBERS = "Held-out log-likelihood per observation beside the model kept (0.01 is little, 1 a lot)"
+CLEARLY = 0.1
 
 
 @dataclass(frozen=True)
@@ -238,22 +241,20 @@ def _chosen(
 
 
 def _reasons(chosen: Candidate, candidates: list[Candidate]) -> list[str]:
-    """Compare a choice with others in words; candidates are sorted, the best density first."""
-    out = [f"Chosen: {chosen.name} curve."]
+    """Return why a model was kept, and the numbers; candidates are sorted, the best density first.
+
+    What begins with `NUMBERS` is for the report.
+    """
+    why, numbers = "", []
     if c := next((c for c in candidates if c.parameters < chosen.parameters), None):
-        out.append(
-            f"Simpler ({c.name}) predicts held-out colours worse: log-likelihood lower by "
-            f"{chosen.density - c.density:.3f} per observation (0.01 is little, 1 a lot)."
-        )
+        gain = chosen.density - c.density
+        why = f" ({'clearly' if gain >= CLEARLY else 'slightly'} better than {c.name})"
+        numbers.append(f"{-gain:+.3f} for {c.name}")
     if c := next((c for c in candidates if c.parameters > chosen.parameters), None):
-        out.append(
-            f"Richer ({c.name}) would gain {c.density - chosen.density:.3f} of held-out "
-            f"log-likelihood per observation for {c.parameters - chosen.parameters} more "
-            "parameters."
-        )
+        more = c.parameters - chosen.parameters
+        numbers.append(f"{c.density - chosen.density:+.3f} for {c.name} ({more} more parameters)")
     if not chosen.likely:
-        out.append(
-            f"What predicts best ({candidates[0].name}) differs by at most "
-            f"{chosen.difference:.1f} 8-bit levels in any view."
-        )
-    return out
+        levels = f"{chosen.difference:.1f} 8-bit levels"
+        numbers.append(f"the best, {candidates[0].name}, differs by at most {levels} in any view")
+    out = [f"Model kept: {chosen.name} curve{why}."]
+    return [*out, f"{NUMBERS}: {'; '.join(numbers)}."] if numbers else out

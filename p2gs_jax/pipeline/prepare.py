@@ -19,7 +19,7 @@ from p2gs_jax.gaussians.dense import DenseSeeds, dense_limit, dense_seeds, gauss
 from p2gs_jax.gaussians.matching import Tones, rough_tones
 from p2gs_jax.gaussians.moving import Nodes, node_gaussians, nodes_radiance, with_vibration
 from p2gs_jax.gaussians.shell import Shell, find_shell, shell_gaussians
-from p2gs_jax.photometry.calibrate import Selection
+from p2gs_jax.photometry.calibrate import NUMBERS, Selection
 from p2gs_jax.photometry.parameters import initial_appearance, initial_photometry, point_radiance
 from p2gs_jax.pipeline.exposures import Exposures
 from p2gs_jax.pipeline.survey import Survey
@@ -105,7 +105,8 @@ def initialise(found: Survey, exposures: Exposures, reporter: Reporter | None = 
     gaussians, owner, thinned = _bounded(gaussians, owner, found.cfg)
     notes = _notes(found, exposures, added, shell, thinned)
     for note in notes:
-        reporter.message(note)
+        if not note.startswith(NUMBERS):
+            reporter.message(note)
     appearance = initial_appearance(views, cfg, lambda k: found.fitted.get(scene.train_indices[k]))
     return Prepared(
         found,

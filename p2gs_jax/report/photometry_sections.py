@@ -46,10 +46,8 @@ def model_section(run: RunFiles) -> str:
     return (
         paragraph(f"Model: {what}. Tone curve: {under}. Scale: {run.photometry['gauge']}.")
         + paragraph(
-            "Where models and curves were compared, they competed on colours of shared surface "
-            "points that were held out, by their log-likelihood: 0.01 per observation is little, 1 "
-            "is a lot. The simplest that predicts about as well as the best one is taken. The fit "
-            "remarked:",
+            "Models and curves compete on held-out colours of shared surface points. The simplest "
+            "that predicts about as well as the best one is kept. The fit remarked:",
             "note",
         )
         + listed(notes_of(run))

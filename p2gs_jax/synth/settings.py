@@ -25,8 +25,7 @@ class Sensor:
     curve: Curve = "srgb"
     """Response; `filmic` bends it into an S before sRGB."""
     curves: tuple[Curve, ...] = ()
-    """Responses of the cameras in turn, sorted by name; none: `curve` for all. References keep
-    `curve`."""
+    """Responses of the cameras in turn, sorted by name; none: `curve` for all."""
     camera_gain_ev: float = 0.0
     """Standard deviation of a fixed gain per camera, stops."""
     drift_ev: float = 0.0

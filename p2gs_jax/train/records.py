@@ -36,7 +36,7 @@ def record_of(
     last = reports[-1]
     return LogRecord(
         step=host.step,
-        progress=round(host.progress, 6),
+        progress=round(host.progress, 9),
         loss=_mean(r.loss for r in reports),
         psnr=_mean(r.psnr for r in reports),
         gaussians=gaussians,

@@ -5,6 +5,7 @@ import re
 import shlex
 import subprocess
 import sys
+from datetime import date
 from pathlib import Path
 
 import pytest
@@ -95,7 +96,7 @@ def test_a_preset_decides_defaults_and_options_are_read_as_what_they_are():
     assert options.config.train.coarse_to_fine == (0.1, 0.2)
 
 
-VALUES = {"budget": ("90s", 90.0), "cameras": ("front", ("front",)), "known_deviation_ev": ("2", 2)}
+VALUES = {"budget": ("90s", 90.0), "cameras": ("front", ("front",)), "exposure_sigma": ("2", 2)}
 VALUES |= {name: ("a", "a") for name in ("split", "background", "images", "drive", "frames")}
 VALUES |= {name: ("a", "a") for name in ("known_exposures", "lpips_weights")}
 VALUES |= {"allow_missing": ("", True), "camera_by": ("folder", "folder")}
@@ -111,6 +112,25 @@ def test_short_names_and_long_ones_are_one_option(which):
     for name, (path, _) in SHORT.items():
         group, field = path.split(".")
         assert getattr(getattr(cfg, group), field) == VALUES.get(name, ("64", 64))[1], name
+
+
+def test_old_names_are_read_with_a_hint_and_the_last_spelling_counts(capsys):
+    name, _ = parse(["scene", "drive"])
+    _, options = parse(["render", "run", "--path=orbit", "--exposure_of", "auto"])
+    assert (name, options.trajectory, options.meter) == ("inspect", "orbit", "auto")
+    assert capsys.readouterr().err.count("is now called") == 3
+    _, options = parse(["fit", "a", "--max-width", "64", "--data.max-width", "32"])
+    assert options.config.data.max_width == 32
+
+
+def test_a_run_folder_has_the_name_of_the_scene_and_the_date(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("", "-2", "-3"):
+        run = parse(["fit", "data/castle"])[1].run_folder()
+        assert run == Path(f"runs/castle-{date.today()}{name}")
+        run.mkdir(parents=True)
+    (tmp_path / f"runs/castle-{date.today()}-2/config.json").touch()
+    assert parse(["fit", "castle", "--resume"])[1].run_folder().name.endswith("-2")
 
 
 def test_help_imports_nothing_heavy():

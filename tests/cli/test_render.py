@@ -43,7 +43,7 @@ def test_a_file_of_cameras_renders_what_the_views_rendered(rendered, own_run, tm
     data = json.loads(cameras.read_text())[:2]
     data[1].update(exposure_ev=1.0, name="far/brighter")
     cameras.write_text(json.dumps(data))
-    rendered(own_run, "--path", cameras, "--out", tmp_path / "b", "--gamma", "2.2")
+    rendered(own_run, "--trajectory", cameras, "--out", tmp_path / "b", "--gamma", "2.2")
     first = picture(tmp_path / "a" / "0.render.png")
     np.testing.assert_allclose(picture(tmp_path / "b" / "0.png"), first, atol=1 / 255)
     second = picture(tmp_path / "a" / "1.render.png")
@@ -56,7 +56,7 @@ def test_a_file_of_cameras_renders_what_the_views_rendered(rendered, own_run, tm
 
 def test_one_stop_doubles_the_linear_picture_and_leaves_the_radiance(rendered, own_run, tmp_path):
     for ev in ("-3", "-2"):
-        argv = ("--path", "orbit", "--frames", "2", "--curve", "linear", "--gamma", "2.2")
+        argv = ("--trajectory", "orbit", "--frames", "2", "--curve", "linear", "--gamma", "2.2")
         rendered(own_run, *argv, "--exposure-ev", ev, "--out", tmp_path / ev)
     dark, bright = (picture(tmp_path / ev / "00001.png") for ev in ("-3", "-2"))
     assert dark.mean() > 0.01
@@ -68,7 +68,7 @@ def test_one_stop_doubles_the_linear_picture_and_leaves_the_radiance(rendered, o
 
 def test_a_drive_becomes_a_video_that_is_not_replaced(refused, rendered, own_run, tmp_path):
     out = tmp_path / "new" / "drive.mp4"
-    argv = (own_run, "--path", "drive", "--frames", 7, "--fps", 12, "--width", 64, "--out", out)
+    argv = (own_run, "--trajectory=drive", "--frames", 7, "--fps", 12, "--width", 64, "--out", out)
     rendered(*argv)
     assert [p.name for p in out.parent.iterdir()] == ["drive.mp4"]
     frames = video(out)
@@ -80,7 +80,7 @@ def test_a_drive_becomes_a_video_that_is_not_replaced(refused, rendered, own_run
 
 def test_a_drive_can_be_exposed_as_photographed(rendered, own_run, tmp_path):
     fitted = load_run(own_run)
-    argv = ("--path", "drive", "--frames", "6", "--split", "all")
+    argv = ("--trajectory", "drive", "--frames", "6", "--split", "all")
     rendered(own_run, *argv, "--exposure-ev", "own", "--out", tmp_path)
     first, last = (json.loads((tmp_path / "cameras.json").read_text())[k] for k in (0, -1))
     for entry, index in ((first, 0), (last, 5)):
@@ -91,9 +91,9 @@ def test_a_drive_can_be_exposed_as_photographed(rendered, own_run, tmp_path):
 
 
 def test_a_drive_can_be_metered(rendered, own_run, tmp_path):
-    bare = ["--path", "drive", "--frames", 5, "--width", 64]
+    bare = ["--trajectory", "drive", "--frames", 5, "--width", 64]
     for name, more in (("of", []), ("more", ["--exposure-ev", 1])):
-        argv = [own_run, *bare, "--exposure-of", "log_average", *more, "--out", tmp_path / name]
+        argv = [own_run, *bare, "--meter", "log_average", *more, "--out", tmp_path / name]
         rendered(*argv)
     metered, brighter = (
         [shot["exposure_ev"] for shot in json.loads((tmp_path / n / "cameras.json").read_text())]
@@ -104,29 +104,29 @@ def test_a_drive_can_be_metered(rendered, own_run, tmp_path):
     light = linear @ [0.2126, 0.7152, 0.0722]
     exposed = load_run(own_run).common_display(metered[2]).exposure * light
     assert np.exp(np.log(exposed[exposed > 0]).mean()) == pytest.approx(0.18, rel=0.3)
-    said = rendered(own_run, *bare, "--exposure-of", "auto", "--out", tmp_path / "auto")
+    said = rendered(own_run, *bare, "--meter", "auto", "--out", tmp_path / "auto")
     assert "Metering:" in said
 
 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ("--path spiral", "--path"),
-        ("--path nowhere.json", "nowhere.json"),
+        ("--trajectory spiral", "--trajectory"),
+        ("--trajectory nowhere.json", "nowhere.json"),
         ("--curve spline", "spline"),
         ("--curve film", "film"),
         ("--gamma 0", "--gamma"),
         ("--exposure-ev 5000", "--exposure-ev"),
-        ("--exposure-ev own --path orbit", "own"),
-        ("--exposure-of auto --exposure-ev own", "--exposure-of"),
-        ("--exposure-of best", "--exposure-of"),
+        ("--exposure-ev own --trajectory orbit", "own"),
+        ("--meter auto --exposure-ev own", "--meter"),
+        ("--meter best", "--meter"),
         ("--without-objects --only-objects", "--without-objects"),
         ("--panorama", "one camera"),
-        ("--panorama --path orbit", "--panorama"),
+        ("--panorama --trajectory orbit", "--panorama"),
         ("--camera front", "'front'"),
         ("--frames 9", "--frames"),
-        ("--frames 1 --path drive", "--frames"),
-        ("--shift 999 --path drive", "--shift"),
+        ("--frames 1 --trajectory drive", "--frames"),
+        ("--shift 999 --trajectory drive", "--shift"),
         ("--width 3", "--width"),
         ("--fps 24", "--fps"),
         ("--out film.mov", "film.mov"),
@@ -141,7 +141,7 @@ def test_senseless_requests_end_with_one_message(refused, own_run, options, said
 
 
 def test_what_is_there_is_replaced_only_when_asked_for(refused, rendered, own_run, tmp_path):
-    argv = (own_run, "--path", "drive", "--frames", 2, "--width", 64, "--out", tmp_path)
+    argv = (own_run, "--trajectory", "drive", "--frames", 2, "--width", 64, "--out", tmp_path)
     rendered(*argv)
     before = [p.stat().st_mtime_ns for p in tmp_path.iterdir()]
     assert "--overwrite" in refused("render", *argv)
@@ -167,10 +167,10 @@ def test_a_folder_in_place_of_a_video_is_kept(refused, own_run, tmp_path):
         ({"split": "train"}, ("cam/0.png",), "train"),
         ({"split": "test", "panorama": True}, ("cam/0.png",), "test_panorama"),
         ({"panorama": True}, ("cam/0.png",), "panorama"),
-        ({"path": "drive", "shift": -2.0}, ("cam/0.png",), "drive_2_right"),
+        ({"trajectory": "drive", "shift": -2.0}, ("cam/0.png",), "drive_2_right"),
         # Where the fit keeps its held-out views.
         ({"split": "test"}, ("test/r_0.png",), "test_views"),
-        ({"path": "drive"}, ("drive/0.png",), "drive_views"),
+        ({"trajectory": "drive"}, ("drive/0.png",), "drive_views"),
     ],
 )
 def test_a_folder_is_named_by_what_is_rendered(tmp_path, options, names, folder):

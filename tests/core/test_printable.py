@@ -78,6 +78,6 @@ def test_errors_are_printable(refused, tmp_path):
     red = tmp_path / "\x1b[31mred"
     # The second is a word too many, as a pattern of the shell may find.
     for words, shown in (([red], "red does not exist"), ([tmp_path, "\x1b[31mred"], "red")):
-        text = refused("scene", *words)
+        text = refused("inspect", *words)
         assert f"\\x1b[31m{shown}" in text
         assert "\x1b" not in text

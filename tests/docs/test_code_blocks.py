@@ -20,7 +20,7 @@ from tiny_scene import make_scene
 from p2gs_jax import config
 from p2gs_jax.cli import main
 from p2gs_jax.cli.fit import Calibrate, Fit, checked
-from p2gs_jax.cli.parser import COMMANDS, parse
+from p2gs_jax.cli.parser import COMMANDS, RENAMED, parse
 from p2gs_jax.jobs.configs import read_sweep
 
 BLOCKS = [block for page in PAGES for block in blocks(page)]
@@ -111,7 +111,7 @@ def check_command(words, where):
 
 
 def check_ours(argv, where):
-    if len(argv) == 1 and argv[0] in COMMANDS:  # the command as such is spoken of
+    if len(argv) == 1 and argv[0] in (*COMMANDS, *RENAMED):  # the command as such is spoken of
         return
     try:
         name, options = parse(argv)
@@ -172,6 +172,6 @@ def test_options_in_the_text_exist(page, options):
         if span.startswith("p2gs-jax ") and "..." not in span and "COMMAND" not in span:
             check_command(span.split(), page.name)
         for option in re.findall(r"(?<!\S)--[a-z][\w.-]*", span):
-            known = option.replace("*", "") in options | OTHERS
+            known = option.replace("*", "") in options | OTHERS | set(RENAMED)
             group = option.endswith(".") and any(o.startswith(option) for o in options)
             assert known or group, f"{page.name} speaks of {option}, which does not exist"

@@ -81,7 +81,7 @@ def test_every_comparison_has_lpips_where_there_are_weights(scene, tmp_path, cap
     averaged, fitted = (metrics["test"][name]["lpips"] for name in ("averaged", "exposure_fitted"))
     assert fitted != pytest.approx(averaged, rel=1e-2)
 
-    print_metrics(metrics, tmp_path)
+    print_metrics(metrics)
     printed = capsys.readouterr().out
     assert f"{metrics['test']['averaged']['lpips']:.4f}" in printed
     assert "n/a" not in printed

@@ -133,7 +133,7 @@ def test_what_varies_is_found(exposures, curve, gamma, model, response):
         np.testing.assert_allclose(s.solution.gammas, gammas * np.mean(2.2 / gammas), atol=0.03)
         found = np.exp(s.solution.log_exposures)
         assert exposure_error(found, truth)["ev_scale_power"] < 0.015
-    assert any(r.startswith("Chosen:") for r in s.reasons)
+    assert any(r.startswith("Model kept:") for r in s.reasons)
     if exposures == "constant":
         assert any("too little to tell the shape" in r for r in s.reasons)
 

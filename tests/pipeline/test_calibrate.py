@@ -23,7 +23,7 @@ def test_street(noisy_street, tmp_path):
     pairs = np.array([(v["exposure"], truth[v["image"]]) for v in saved["views"]])
     assert exposure_error(*pairs.T)["ev"] < 0.05
     assert result.selection.solution.model == "view_exposure"
-    assert any(m.startswith("Chosen: ") for m in result.messages)
+    assert any(m.startswith("Model kept: ") for m in result.messages)
     assert all(v["exposure_ev_error"] < 0.2 for v in saved["views"])
     assert (tmp_path / "out" / "calibration.png").stat().st_size > 10_000
     candidates = json.loads((tmp_path / "out" / "calibration.json").read_text())["candidates"]
@@ -105,7 +105,7 @@ def test_the_command_writes_what_a_stack_says(tmp_path, succeeded):
     out = tmp_path / "out"
     argv = ("calibrate", tmp_path / "s", "--static", "--out", out)
     text = succeeded(*argv, "--compare-with", listed)
-    assert all(word in text for word in ("00.png", "stated", "signal", "Response: "))
+    assert all(word in text for word in ("00.png", "stated", "signal", "response "))
     saved = read_photometry(out / "photometry.json")
     assert [v["image"] for v in saved["views"]] == [f"{i:02d}.png" for i in range(len(times))]
     assert "stretched together" in saved["gauge"]

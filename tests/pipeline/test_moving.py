@@ -121,10 +121,10 @@ def test_the_command_renders_what_moves(run, tmp_path, succeeded, refused):
     base = ("render", run.folder, "--split", "test", "--camera", "cam0")
     options = {"all": (), "without": ("--without-objects",), "only": ("--only-objects",)}
     # The cameras of a path can be rendered again, as they were.
-    options |= {"drive": ("--path", "drive", "--frames", "3")}
-    options |= {"again": ("--path", tmp_path / "drive" / "cameras.json")}
+    options |= {"drive": ("--trajectory", "drive", "--frames", "3")}
+    options |= {"again": ("--trajectory", tmp_path / "drive" / "cameras.json")}
     options["views"] = ("--panorama", "--split", "train", "--width", "120")
-    options["wide"] = ("--panorama", "--path", "drive", "--frames", "2", "--width", "120")
+    options["wide"] = ("--panorama", "--trajectory", "drive", "--frames", "2", "--width", "120")
     options["bare"] = (*options["wide"], "--without-objects")
     contents = {}
     for name, extra in options.items():

@@ -82,7 +82,7 @@ def test_every_section_is_there_says_what_the_run_says_and_fetches_nothing(page,
     assert f"{files.number('test', 'exposure_fitted', 'psnr'):.1f} dB" in text
     assert f"{files.number('train', 'psnr'):.2f}" in text
     assert f"{int(files.number('counts', 'gaussians')):,}" in text
-    assert "Chosen:" in text
+    assert "Model kept:" in text
     assert all(note in text for note in files.metrics["notes"])
     assert all(view["image"] in text for view in files.views)
     assert "train.steps 60 2000" in text

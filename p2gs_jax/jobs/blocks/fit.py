@@ -27,6 +27,7 @@ from p2gs_jax.jobs.blocks.seams import Seam, level_seams, merge_cores
 from p2gs_jax.jobs.engines import LOCAL, check_engine, open_engine
 from p2gs_jax.jobs.job import JobState
 from p2gs_jax.jobs.run import run_jobs
+from p2gs_jax.photometry.calibrate import NUMBERS
 from p2gs_jax.pipeline import preflight
 from p2gs_jax.pipeline.finish import Account, finish
 from p2gs_jax.pipeline.fit import FitResult, centred, fit
@@ -226,7 +227,8 @@ class _Blocks:
         store.close()
         return_freed_memory()
         for note in (*scene.notes, *solved.exposures.notes):
-            self.reporter.message(note)
+            if not note.startswith(NUMBERS):
+                self.reporter.message(note)
         self.lock.require()
         found, paths = solved.exposures, self.paths
         write_start(self.folder, paths.scene, paths.reference, self.cfg, found.decisions)

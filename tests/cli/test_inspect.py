@@ -1,4 +1,4 @@
-"""`p2gs-jax scene` says what there is, of every format."""
+"""`p2gs-jax inspect` says what there is, of every format."""
 
 import sys
 
@@ -16,7 +16,7 @@ def test_a_drive_is_counted(tmp_path, succeeded, monkeypatch):
     drive.photographs[3].path.unlink()
     monkeypatch.setattr(surveys, "find_scene", lambda *args: drive)
     monkeypatch.setenv("COLUMNS", "140")
-    said = succeeded("scene", drive.root, "--data.no-own-car")
+    said = succeeded("inspect", drive.root, "--data.no-own-car")
     for text in (
         "31 photographs of 4 cameras.",
         "8 frames, 0.7 s, 7.0 m driven.",
@@ -27,7 +27,7 @@ def test_a_drive_is_counted(tmp_path, succeeded, monkeypatch):
         "96 x 64",
     ):
         assert text in said
-    said = succeeded("scene", drive.root, "--cameras", "front", "--frames", "0:4")
+    said = succeeded("inspect", drive.root, "--cameras", "front", "--frames", "0:4")
     said = " ".join(said.split())
     assert "3 photographs of 1 camera. " in said
     assert " 4 frames, " in said
@@ -36,7 +36,7 @@ def test_a_drive_is_counted(tmp_path, succeeded, monkeypatch):
 
 def test_other_scenes_are_counted(tmp_path, succeeded):
     root = make_scene(tmp_path / "写", views=3)
-    said = succeeded("scene", root)
+    said = succeeded("inspect", root)
     assert "(colmap): 3 photographs of 1 camera." in said
     assert "150 points." in said
     assert "frames" not in said
@@ -46,6 +46,6 @@ def test_photographs_alone_start_no_structure_from_motion(tmp_path, succeeded, m
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     for k, width in enumerate((40, 40, 50)):
         cv2.imwrite(str(tmp_path / f"{k}.png"), np.zeros((30, width, 3), np.uint8))
-    said = succeeded("scene", tmp_path)
+    said = succeeded("inspect", tmp_path)
     for text in ("(images): 3 photographs", "40 x 30", "There is nothing else"):
         assert text in said
