@@ -16,25 +16,28 @@ from p2gs_jax.core.atomic import write_text
 OUT = HERE.parent / "PUBLISHED.md"
 HEAD = """# Beside published figures
 
-Written by `python experiments/published/write_page.py` from [rows.json](published/rows.json) and
-[published.json](published/published.json): each figure beside the published one, with the command,
-the seconds of the whole fit, and the commit. Scripts, and what is not run here:
-[published](published/README.md). A row is one run and one seed. Machine: that of
-[results](results/README.md). Splats are blurred by .05 pixels^2 where nothing is said. Until
-057bc06 (2026-11-25) .3, the blur of 3DGS, was the default: rows of LOM and nerf_fox from before
-need `--render.blur 0.3` to be made again; those of lego name it. Rows of lego and nerf_fox are of
-before 05f3698 (2026-11-26), when colours were slowed in long fits like all else
-([length](results/2026-11-25-length.md)).
+This page has our figures beside published ones. Each row is one run with one seed, and has its
+command, the seconds of the whole fit, and the commit. `python
+experiments/published/write_page.py` writes the page from [rows.json](published/rows.json) and
+[published.json](published/published.json). [The README of the scripts](published/README.md) says
+how rows are made and which systems were not run. The machine is that of [the
+records](results/README.md).
+
+Splats are blurred by 0.05 pixels^2 unless the row says otherwise. Until commit 057bc06
+(2026-11-25) the default was the blur of 3DGS, 0.3 pixels^2. Rows of LOM and nerf_fox from before
+that commit need `--render.blur 0.3` to be repeated; rows of lego name their blur. Rows of lego
+and nerf_fox are older than commit 05f3698 (2026-11-26); until then long fits slowed the learning
+of colours as well ([length](results/2026-11-25-length.md)).
 """
 NOT_RUN = "Not run yet."
 AT_SIZE, HDR = HERE.parent / "at_size.json", "mu_law_novel"
 HDR_HEAD = """## HDR radiance, as GaussHDR and HDR-NeRF judge it
 
-PSNR of radiance after log(1 + 5000 x) / log(5001); 1 is the brightest true value of the view, one
-scale for all views (`p2gs_jax/evaluation/radiance.py`). Their scenes are not at hand, so no
-published figure stands beside these: a town of 300 photographs whose true radiance is known
-([at size](RESULTS.md#at-size-300-photographs-of-480x325-7000-steps)). Photographs of one exposure
-(ISO-Const) do not tell the curve.
+The score is the PSNR of radiance after log(1 + 5000 x) / log(5001). The brightest true value of a
+view is 1, and one scale is fitted to all views (`p2gs_jax/evaluation/radiance.py`). We do not have
+their scenes, so no published figure stands beside ours. The rows are of a town of 300 photographs
+whose true radiance is known ([at size](RESULTS.md#at-size-300-photographs-of-480x325-7000-steps)).
+Photographs of one exposure (ISO-Const) do not determine the tone curve.
 """
 
 
