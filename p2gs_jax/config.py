@@ -46,7 +46,7 @@ class DataConfig:
     max_width: int | None = None
     """Largest image width, pixels; wider images are shrunk; None keeps all sizes."""
     images: str | None = None
-    """Image folder (default: `images/` beside the model); `.` is the whole scene's folder."""
+    """Image folder (default: `images/` beside the model); `.` is the scene's folder itself."""
     format: SceneFormat | None = None
     """Format of the scene; None takes the first that the folder holds."""
     camera_by: CameraBy = "auto"

@@ -52,16 +52,9 @@ class Demo:
         train = dataclasses.replace(cfg.train, budget_s=self.budget, seed=self.seed)
         cfg = checked(dataclasses.replace(cfg, train=train))
         with TerminalReporter() as reporter:
-            result = run_demo(
-                self.out,
-                cfg,
-                frames=self.frames,
-                width=self.width,
-                iso_std=self.iso_std,
-                seed=self.seed,
-                reporter=reporter,
-            )
-        _, true, found = zip(*result.rows, strict=True)
+            street = {"frames": self.frames, "width": self.width, "iso_std": self.iso_std}
+            result = run_demo(self.out, cfg, seed=self.seed, reporter=reporter, **street)
+        true, found = zip(*result.rows, strict=True)
         stdout().print(
             f"Exposures of {len(true)} views, EV from their mean: true {min(true):+.2f} to "
             f"{max(true):+.2f}, recovered {min(found):+.2f} to {max(found):+.2f}, error "
@@ -152,12 +145,8 @@ class Sweep:
         own = {"out": self.out, "max_parallel": self.jobs}
         wanted |= {name: value for name, value in own.items() if value is not None}
         with TerminalReporter() as reporter:
-            result = sweep(
-                **wanted,
-                engine=self.engine,
-                report=reporter.message,
-                on_look=partial(show, reporter),
-            )
+            shown = {"report": reporter.message, "on_look": partial(show, reporter)}
+            result = sweep(**wanted, engine=self.engine, **shown)
         console.print(make_table(*brief(result.rows)))
         for line in failures(result.rows):
             console.print(f"Not finished: {line}")

@@ -59,9 +59,9 @@ class Fit:
     """Continue an interrupted run; larger --steps or --budget also continue a finished one."""
     config: Config
     preset: Preset = "robust"
-    """Initial values: robust; paper or paper_appendix (the method as printed); 3dgs,
-    3dgs_published (as printed, 30,000 steps), 3dgs_gain, 3dgs_affine, 3dgs_bilateral, 3dgs_curve,
-    luminance_gs, ppisp or ppisp_solved (baselines)."""
+    """Initial values: robust; paper or paper_appendix (as printed); or one of the baselines 3dgs,
+    3dgs_published, 3dgs_gain, 3dgs_affine, 3dgs_bilateral, 3dgs_curve, luminance_gs, ppisp,
+    ppisp_solved."""
     reference: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Photographs of the same views under one common exposure, for evaluation."""
     threads: int | None = None

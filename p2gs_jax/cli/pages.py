@@ -39,13 +39,9 @@ class View:
 
         check(self.max_width >= 64, "--max-width must be at least 64")
         check_address(self.host, self.port)
-        serve(
-            load_run(self.run, self.scene),
-            host=self.host,
-            port=self.port,
-            max_width=self.max_width,
-            say=lambda text: stdout().print(text, highlight=False, soft_wrap=True),
-        )
+        fitted, console = load_run(self.run, self.scene), stdout()
+        place = {"host": self.host, "port": self.port, "max_width": self.max_width}
+        serve(fitted, say=lambda text: console.print(text, soft_wrap=True), **place)
         return 0
 
 

@@ -121,8 +121,9 @@ def _defaults(name: str, argv: list[str]) -> Any:
 def _unknown(word: str) -> UserError:
     if word.startswith("-"):
         return UserError(f"{word} comes before any command.", fix="write p2gs-jax COMMAND OPTIONS")
-    if word in COMMANDS_OF_OTHERS:
-        fix = f"write p2gs-jax {COMMANDS_OF_OTHERS[word]}"
+    ours = COMMANDS_OF_OTHERS.get(word.removeprefix("ns-").removesuffix(".py"))
+    if ours is not None:
+        fix = f"write p2gs-jax {ours}"
         return UserError(f"there is no command {word!r}.", fix=fix)
     near = difflib.get_close_matches(word, COMMANDS, n=2, cutoff=0.5)
     guess = f"did you mean {' or '.join(near)}? " if near else ""

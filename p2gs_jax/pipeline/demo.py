@@ -23,9 +23,9 @@ from p2gs_jax.synth.write import write_street
 
 @dataclass(frozen=True)
 class DemoResult:
-    """What the demo found: rows of (view, true stops, recovered stops), each from its mean."""
+    """What the demo found: rows of (true stops, recovered stops), each from their mean."""
 
-    rows: list[tuple[str, float, float]]
+    rows: list[tuple[float, float]]
     error: ExposureError
     metrics: dict
     run_dir: Path
@@ -67,12 +67,11 @@ def run_demo(
         truth, reference = read_true_exposures(street), street / "reference"
         given = {"reference": reference, "reporter": reporter, "true_exposures": truth}
         result = fit(street, run_dir, cfg, **given)
-    names = [view.name for view in result.scene.training_views]
-    true = np.array([truth[n] for n in names])
+    true = np.array([truth[view.name] for view in result.scene.training_views])
     found = np.asarray(result.params.photometry.exposures, np.float64)
     error = exposure_error(found, true)
     recovered, given = (np.log2(e) - np.log2(e).mean() for e in (found, true))
-    rows = list(zip(names, given.tolist(), recovered.tolist(), strict=True))
+    rows = list(zip(given.tolist(), recovered.tolist(), strict=True))
     result.metrics["exposures"] = dict(error)
     write_json(run_dir / "metrics.json", result.metrics)
     return DemoResult(rows, error, result.metrics, run_dir)
