@@ -282,6 +282,8 @@ class Batch(eqx.Module):
     # is shown over no background
     alpha: Float[Array, "h w"] | UInt[Array, "h w"] | None = None
     backdrop: Float[Array, " 3"] | None = None  # display values of that background, or None
+    # width and height of the photograph, which fills the upper left of a larger canvas; None: all
+    size: Float[Array, " 2"] | None = None
 
 
 # ------------------------------------------------------------------ host records

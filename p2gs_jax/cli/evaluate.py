@@ -72,7 +72,7 @@ class Eval:
                 scene,
                 store,
                 cfg,
-                render=make_renderer(cfg.render, fitted.owner),
+                render=make_renderer(cfg.render, fitted.owner, store.sizes),
                 reference=truth,
                 radiance=find_radiance(scene, store),
                 lpips_weights=weights,

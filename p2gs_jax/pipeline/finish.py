@@ -65,7 +65,7 @@ def finish(
             scene,
             store,
             cfg,
-            render=make_renderer(cfg.render, owner),
+            render=make_renderer(cfg.render, owner, store.sizes),
             reference=truth,
             radiance=find_radiance(scene, store),
             lpips_weights=lpips_weights,

@@ -220,10 +220,12 @@ class Optimiser:
             reporter.message(text)
 
         rows, train, found = start.scene.train_indices, start.cfg.train, start.survey
-        alone = train.batch == 1
+        # What corrects display values knows places in an image.
+        plain = start.cfg.photometry.appearance is None and self._own.formation is None
+        how = {"resident": train.batch == 1, "padded": plain}
         return Trainer(
             start.cfg,
-            TrainingViews(found.fitted, rows, train.seed, found.measured, resident=alone),
+            TrainingViews(found.fitted, rows, train.seed, found.measured, **how),
             found.extent,
             start.pairs,
             found.coverage,

@@ -6,8 +6,11 @@ and memory"). So capacities are generous, and overflows, which cost a compilatio
 
 from __future__ import annotations
 
+import dataclasses
 import functools
-from collections.abc import Callable
+import itertools
+from collections import Counter
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -46,8 +49,33 @@ ANYWHERE = Margins(1.5, 1.5)
 TRAINING = Margins(1.5, 1.5)
 # Gaussians that a training view shows: only views between the sampled ones may show more.
 TRAINING_VISIBLE = Margins(1.1, 1.2)
+# Sizes that images of many sizes are compiled at; more only differ by a share of their pixels.
+MOST_CANVASES, LEAST_PADDING = 3, 0.01
 # Lists of training are not shorter than this, whatever was counted.
 ENTRIES_PER_GAUSSIAN, FEWEST_ENTRIES = 4, 16_384
+
+
+def canvases(sizes: Iterable[tuple[int, int]]) -> dict[tuple[int, int], tuple[int, int]]:
+    """Return for every image size (width, height) the size that it is compiled at.
+
+    Photographs of the internet have a size each, and every size would be compiled: those are
+    joined that add least, until there are MOST_CANVASES, and any that add next to nothing.
+    """
+    counts = Counter(sizes)
+    groups = [[size] for size in sorted(counts)]
+
+    def area(group: list[tuple[int, int]]) -> int:
+        width, height = np.max(group, 0)
+        return int(width * height) * sum(counts[size] for size in group)
+
+    while len(groups) > 1:
+        pairs = itertools.combinations(groups, 2)
+        added, one, other = min((area(a + b) - area(a) - area(b), a, b) for a, b in pairs)
+        if len(groups) <= MOST_CANVASES and added > LEAST_PADDING * area(one + other):
+            break
+        groups = [group for group in groups if group not in (one, other)] + [one + other]
+    joined = {size: tuple(map(int, np.max(group, 0))) for group in groups for size in group}
+    return joined  # pyright: ignore[reportReturnType]
 
 
 def bucket(needed: int, margin: float = 1.0) -> int:
@@ -124,12 +152,18 @@ def compiled_renderer() -> Any:
     return jax.jit(render_linear, static_argnames=static, compiler_options=compiler_options())
 
 
-def make_renderer(cfg: RenderConfig, owners: Int[np.ndarray, " n"] | None = None) -> RenderView:
+def make_renderer(
+    cfg: RenderConfig,
+    owners: Int[np.ndarray, " n"] | None = None,
+    sizes: Iterable[tuple[int, int]] = (),
+) -> RenderView:
     """Return a function that renders one view, and grows its tile lists after an overflow.
 
-    `owners` are what `owner` is where it is not given.
+    `owners` are what `owner` is where it is not given. Views of many `sizes`, where these are
+    known, are rendered on `canvases`.
     """
     known = None if owners is None else on_device(owners, np.int32)
+    on = canvases(sizes)
     capacities: dict[tuple[int, int], int] = {}
 
     def render_view(
@@ -139,7 +173,9 @@ def make_renderer(cfg: RenderConfig, owners: Int[np.ndarray, " n"] | None = None
         owner: Int[Array, " n"] | None = None,
     ) -> Render:
         owner = known if owner is None else owner
-        size = (camera.width, camera.height)
+        width, height = camera.width, camera.height
+        size = on.get((width, height), (width, height))
+        camera = dataclasses.replace(camera, width=size[0], height=size[1])
         if size not in capacities:
             needed = int(count_needed(gaussians, alive, camera, cfg=cfg, owner=owner))
             capacities[size] = bucket(needed, PICTURES.first)
@@ -150,6 +186,10 @@ def make_renderer(cfg: RenderConfig, owners: Int[np.ndarray, " n"] | None = None
             return result, result.count, result.overflow
 
         result, capacities[size] = until_it_fits(draw, capacities[size])
-        return result
+        if size == (width, height):
+            return result
+        images = {k: getattr(result, k) for k in ("linear", "alpha", "depth")}
+        cut = jax.tree.map(lambda image: np.asarray(image)[:height, :width], images)
+        return dataclasses.replace(result, **cut)
 
     return render_view

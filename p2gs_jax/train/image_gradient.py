@@ -105,6 +105,15 @@ def unit(stored: Array) -> Float[Array, "..."]:
     return stored.astype(jnp.float32) / scale
 
 
+def pixel_places(shape: tuple[int, ...], size: Float[Array, " 2"]) -> Float[Array, "h w 2"]:
+    """Return where the pixels of a canvas lie in the image of `size` in its upper left.
+
+    Positions are as of `formation`: from the centre, in units of half the diagonal.
+    """
+    y, x = (jnp.arange(n, dtype=size.dtype) + 0.5 for n in shape)
+    return (2 * jnp.stack(jnp.meshgrid(x, y), -1) - size) / jnp.linalg.norm(size)
+
+
 def compared(
     render: Render,
     batch: Batch,
@@ -119,10 +128,11 @@ def compared(
     """
     capture = photometry.capture(batch.view_index)
     loss, formed = cfg.loss, cfg.photometry
+    where = None if batch.size is None else pixel_places(render.alpha.shape, batch.size)
     if batch.alpha is None:
         target = Target(*decoded(batch), None, batch.measured)
         matte, there = None, render.linear
-        own = formation(there, capture, formed, correction)
+        own = formation(there, capture, formed, correction, where)
         ldr, held = own, target.ldr
     else:
         assert batch.backdrop is not None
@@ -131,7 +141,7 @@ def compared(
         target = Target(photograph, batch.mask.astype(jnp.float32), alpha, batch.measured)
         matte = Matte(render.alpha, batch.backdrop)
         there = uncovered(render.linear, matte)
-        own = formation(there, capture, formed, correction)
+        own = formation(there, capture, formed, correction, where)
         ldr = composited(own, matte)
         seen = alpha[..., None] > LEAST_SEEN
         held = jnp.where(seen, pixels / jnp.maximum(alpha, LEAST_SEEN)[..., None], 0.0)
@@ -140,7 +150,7 @@ def compared(
         judged = composited(censor(own, held, loss.saturation), matte)
     uncorrected = None
     if isinstance(correction, Curves):
-        uncorrected = composited(formation(there, capture, formed), matte)
+        uncorrected = composited(formation(there, capture, formed, None, where), matte)
     rendered = Rendered(render.linear, render.alpha, render.depth, ldr, judged, uncorrected)
     return rendered, target
 

@@ -5,6 +5,7 @@ All of it follows from the seed and the step number.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Hashable, Sequence
 from typing import Any, NamedTuple, TypeVar
@@ -16,6 +17,7 @@ from jaxtyping import Float32, Int
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import device_bytes, on_host
 from p2gs_jax.core.streams import Stream, device_seed, generator, view_order
+from p2gs_jax.render.capacity import canvases
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.train import schedule
 from p2gs_jax.train.exposure_loss import ColorPairs, Partner
@@ -38,7 +40,8 @@ class TrainingViews:
 
     `rows` are rows in the scene, in the order of `Photometry`; `seed` decides the order of every
     epoch; `measured` are the depths that the loss compares each view with, or None. A step of
-    several views stacks their photographs on the host, where they must not be `resident`.
+    several views stacks their photographs on the host, where they must not be `resident`. Of many
+    sizes, photographs lie on `canvases`, unless `padded` is off: learned corrections know places.
     """
 
     def __init__(
@@ -48,10 +51,19 @@ class TrainingViews:
         seed: int,
         measured: Sequence[Measured] | None = None,
         resident: bool = True,
+        padded: bool = True,
     ):
         self.store, self.rows = store, tuple(rows)
         self.seed, self.measured = seed, measured
         self._batches = functools.lru_cache(4)(self._epoch)
+        every = store.sizes
+        sizes = [every[row] for row in rows]
+        on = canvases(sizes) if padded else {size: size for size in sizes}
+        self._kinds = [on[size] for size in sizes]
+        # A row of every size, by the canvas.
+        self._alike: dict[tuple[int, int], dict[tuple[int, int], int]] = {}
+        for size, kind, row in zip(sizes, self._kinds, rows, strict=True):
+            self._alike.setdefault(kind, {})[size] = row
         self._room = RESIDENT * device_bytes() if resident else 0.0
         # Photographs on the device by row, their level, and the bytes that are left for others.
         self._resident: dict[int, Photograph] = {}
@@ -69,9 +81,13 @@ class TrainingViews:
         return self._batches(epoch, count)[position]
 
     def _epoch(self, epoch: int, count: int) -> list[tuple[int, ...]]:
-        views = [self.store.views[row] for row in self.rows]
-        kinds = [(v.width, v.height) for v in views]
-        return batches_of(view_order(self.seed, epoch, len(self.rows)), kinds, count)
+        return batches_of(view_order(self.seed, epoch, len(self.rows)), self._kinds, count)
+
+    def first_of_sizes(self, step: int, count: int) -> list[int]:
+        """Return the next step, from this one on, for every size that images are compiled at."""
+        steps = range(step, step + count * len(self._batches(0, count)), count)
+        kinds = [self._kinds[self.indices_at(k, count)[0]] for k in steps]
+        return [steps[kinds.index(kind)] for kind in dict.fromkeys(kinds)]
 
     def partner_at(self, step: int, index: int) -> int:
         """Return a second view, different from that of the step where there are two."""
@@ -85,9 +101,16 @@ class TrainingViews:
             self.store.prefetch(self.rows[index], shrink)
 
     def camera(self, index: int, shrink: int) -> Camera:
-        """Return the camera of a training view at a level, on the host."""
+        """Return the camera of a training view at a level, on the host, over its whole canvas."""
         row = self.rows[index]
-        return on_host(Camera, *self.store.camera(row, shrink), self.store.placement(row))
+        viewmat, K = self.store.camera(row, shrink)[:2]
+        return on_host(Camera, viewmat, K, *self._canvas(index, shrink), self.store.placement(row))
+
+    def _canvas(self, index: int, shrink: int) -> tuple[int, int]:
+        """Return the width and height that a view is compiled at, at a level."""
+        rows = self._alike[self._kinds[index]].values()
+        widths, heights = zip(*(self.store.camera(row, shrink)[2:] for row in rows), strict=True)
+        return max(widths), max(heights)
 
     def batch(self, index: int, shrink: int, step: int = 0) -> Batch:
         """Return a training view, on the host: a compiled step takes it from there.
@@ -95,19 +118,29 @@ class TrainingViews:
         On a GPU the pixels stay on the device, as long as those of a level find room there. `step`
         draws the background, where every step has another.
         """
-        ldr, mask, alpha = self._photograph(self.rows[index], shrink)
-        measured = None if self.measured is None else self.measured[index]
-        given = (self.camera(index, shrink), ldr, mask, np.int32(index), measured)
-        return on_host(Batch, *given, alpha, self._backdrop(step))
+        camera, measured, size = self.camera(index, shrink), None, None
+        ldr, mask, alpha = self._photograph(index, camera, shrink)
+        if self.measured is not None:
+            measured = self.measured[index]
+        if len(self._alike[self._kinds[index]]) > 1:
+            size = np.array(self.store.camera(self.rows[index], shrink)[2:], np.float32)
+            if measured is not None:
+                places = measured.places * (size / [camera.width, camera.height])
+                measured = dataclasses.replace(measured, places=places.astype(np.float32))
+        given = (camera, ldr, mask, np.int32(index), measured, alpha, self._backdrop(step), size)
+        return on_host(Batch, *given)
 
-    def _photograph(self, row: int, shrink: int) -> Photograph:
-        """Return the pixels, mask and alpha of a view as they are stored."""
+    def _photograph(self, index: int, camera: Camera, shrink: int) -> Photograph:
+        """Return the pixels, mask and alpha of a view on its canvas, as they are stored."""
+        row = self.rows[index]
         if shrink != self._level:
             self._resident.clear()
             self._level, self._left = shrink, self._room
         if row in self._resident:
             return self._resident[row]
         pixels = (*self.store.stored(row, shrink), self.store.alpha(row, shrink))
+        canvas = (camera.height, camera.width)
+        pixels = jax.tree.map(lambda a: _laid_on(canvas, a), pixels)
         size = sum(a.nbytes for a in jax.tree.leaves(pixels))
         if size <= self._left:
             self._left -= size
@@ -118,6 +151,12 @@ class TrainingViews:
         if not self.store.random_backdrop:
             return self.store.backdrop
         return generator(self.seed, Stream.BACKDROP, step).random(3).astype(np.float32)
+
+
+def _laid_on(canvas: tuple[int, int], image: np.ndarray) -> np.ndarray:
+    """Return an image with zeros to its right and below, where a canvas (h, w) is larger."""
+    wider = [(0, most - n) for most, n in zip(canvas, image.shape, strict=False)]
+    return np.pad(image, wider + [(0, 0)] * (image.ndim - 2)) if np.any(wider) else image
 
 
 def batches_of(

@@ -10,6 +10,7 @@ their sums repeat (`RenderConfig.deterministic`).
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -27,6 +28,7 @@ from p2gs_jax.core.progress import LogRecord
 from p2gs_jax.core.runtime import return_freed_memory
 from p2gs_jax.errors import DivergenceError
 from p2gs_jax.gaussians.population import Coverage, step_seconds
+from p2gs_jax.render.capacity import MOST_CANVASES
 from p2gs_jax.render.cores import CORES
 from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import Decisions
@@ -325,14 +327,14 @@ class Trainer:
     def _expect(self, state: FitState, host: HostState, images: bool = True) -> None:
         """Begin to compile what is known of the steps to come; `state` may be its shapes.
 
-        Levels with images of several sizes are left out: it is not known which comes first.
+        Images of more sizes than MOST_CANVASES are left out: not all of them may come.
         """
-        if not getattr(self.densification, "slots_stay", True):
+        steps = self.views.first_of_sizes(host.step, self.cfg.train.batch)
+        if not getattr(self.densification, "slots_stay", True) or len(steps) > MOST_CANVASES:
             return
         left = schedule.shrinks_left(host.progress, self.levels)
-        ahead = [shrink for shrink in left if len(room.cameras_by_size(self.views, shrink)) == 1]
-        for number, shrink in enumerate(ahead):
-            inputs = self._inputs(host.step, 0.0, host.pace, shrink)
+        for number, (shrink, step) in enumerate(itertools.product(left, steps)):
+            inputs = self._inputs(step, 0.0, host.pace, shrink)
             key = self._key(state, inputs, host, shrink)
             self.programs.expect(self.step, key, state, *inputs, images=images)
             expect = getattr(self.densification, "expect", None)

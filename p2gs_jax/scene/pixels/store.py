@@ -164,6 +164,11 @@ class ImageStore:
             return np.full(entry.valid.shape, np.iinfo(np.uint16).max, np.uint16)
         return entry.alpha
 
+    @property
+    def sizes(self) -> list[tuple[int, int]]:
+        """Width and height of every view at full size, pixels."""
+        return [size_at(view, self._max_width) for view in self.views]
+
     def camera(
         self, index: int, shrink: float | int = 1.0
     ) -> tuple[Float32[np.ndarray, "4 4"], Float32[np.ndarray, "3 3"], int, int]:
