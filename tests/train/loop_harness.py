@@ -33,6 +33,9 @@ class Views:
     def indices_at(self, step, count):
         return tuple((step + k) % VIEWS for k in range(count))
 
+    def first_of_sizes(self, step, count):
+        return [step]
+
     def prefetch(self, index, shrink):
         pass
 
