@@ -17,11 +17,11 @@ OUT = HERE.parent / "PUBLISHED.md"
 HEAD = """# Beside published figures
 
 This page has our figures beside published ones. Each row is one run with one seed, and has its
-command, the seconds of the whole fit, and the commit. `python
-experiments/published/write_page.py` writes the page from [rows.json](published/rows.json) and
-[published.json](published/published.json). [The README of the scripts](published/README.md) says
-how rows are made and which systems were not run. The machine is that of [the
-records](results/README.md).
+command, the seconds of the whole fit, and the commit.
+`python experiments/published/write_page.py` writes the page from [rows.json](published/rows.json)
+and [published.json](published/published.json). [The README of the scripts](published/README.md)
+says how rows are made and which systems were not run. The machine is that of
+[the records](results/README.md).
 
 Splats are blurred by 0.05 pixels^2 unless the row says otherwise. Until commit 057bc06
 (2026-11-25) the default was the blur of 3DGS, 0.3 pixels^2. Rows of LOM and nerf_fox from before
