@@ -81,25 +81,20 @@ def find_deeper_model(root: Path) -> Path | None:
 
 def _first_below(root: Path) -> Path | None:
     for depth in range(1, 5):
-        found = [
-            file.parent
-            for file in root.glob("*/" * depth + "images.*")
-            if file.suffix in (".bin", ".txt") and file.with_stem("cameras").is_file()
-        ]
-        # Runs may lie below their scenes, and keep models of their own.
-        found = [
-            f
-            for f in found
-            if "cache" not in f.relative_to(root).parts
-            and not any(
-                (above / "photometry.json").exists()
-                for above in {*f.parents} - {root, *root.parents}
-            )
-        ]
+        images = (f for f in root.glob("*/" * depth + "images.*") if f.suffix in (".bin", ".txt"))
+        folders = {f.parent for f in images if f.with_stem("cameras").is_file()}
+        found = [folder for folder in folders if not _is_of_run(folder, root)]
         if found:
             # 3DGS keeps what it undistorted from under this name.
             return min(found, key=lambda f: ("distorted" in f.parts, f.as_posix()))
     return None
+
+
+def _is_of_run(folder: Path, root: Path) -> bool:
+    """Return whether a model belongs to a run: these may lie below their scenes, and keep some."""
+    above = {*folder.parents} - {root, *root.parents}
+    kept = "cache" in folder.relative_to(root).parts
+    return kept or any((place / "photometry.json").exists() for place in above)
 
 
 def _largest(folder: Path | None) -> Path | None:
@@ -130,14 +125,12 @@ def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
     _check_model(model)
     images = sorted(model.images, key=lambda image: image.name)
     place = files.image_folder(root, cfg)
+    source, inside = model.file("images"), place or root / "images"
     for image in images:  # before any of these files is opened
-        files.require_inside(
-            PurePosixPath(image.name), place or root / "images", model.file("images")
-        )
+        files.require_inside(PurePosixPath(image.name), inside, source)
     place = place or _find_images(root, model)
     found = files.find_names([image.name for image in images], place)
     missing = [image.name for image in images if image.name not in found]
-    source = model.file("images")
     notes = files.check_missing(missing, len(images), source, cfg, place)
     notes += files.nearly_named(found, source.name)
     images = [i._replace(name=found[i.name]) for i in images if i.name in found]
@@ -184,9 +177,7 @@ def tracks_of(model: Model, views: Sequence[View]) -> Tracks | None:
             continue
         view, camera = views[row], model.cameras[image.camera_id]
         at = np.searchsorted(model.point_ids, image.point_ids).clip(max=len(model.point_ids) - 1)
-        known = (model.point_ids[at] == image.point_ids) & (np.abs(image.xy) < files.HUGE).all(
-            axis=1
-        )
+        known = (model.point_ids[at] == image.point_ids) & (np.abs(image.xy) < files.HUGE).all(1)
         scale = (view.width / camera.width, view.height / camera.height)
         xy = undistort_points(image.xy[known] * scale, view.K, view.distortion)
         # What a wide lens sees at its sides is in no pinhole picture.
@@ -247,9 +238,7 @@ def _lens(path: Path, camera: CameraRecord) -> tuple[Float[np.ndarray, "3 3"], D
     if not focals:
         raise _unsupported(path, camera.model)
     fx, fy, (cx, cy) = p[0], p[focals - 1], p[focals : focals + 2]
-    if not (
-        (np.abs(p) < files.HUGE).all() and fx > 0 and fy > 0 and camera.width and camera.height
-    ):
+    if not ((np.abs(p) < files.HUGE).all() and min(fx, fy, camera.width, camera.height) > 0):
         why = f"a {camera.model} camera of {camera.width}x{camera.height} pixels has "
         raise broken(f"{path}:", f"{why}impossible parameters {p}", _FIX)
     terms = p[focals + 2 :]
@@ -314,9 +303,8 @@ def read_model(folder: Path) -> Model:
     """
     parts = {ext: [folder / f"{stem}.{ext}" for stem in _STEMS] for ext in ("bin", "txt")}
     absent = {ext: [p for p in paths if not p.is_file()] for ext, paths in parts.items()}
-    other = next(
-        (p for p in [*parts["bin"], *parts["txt"]] if p.exists() and not p.is_file()), None
-    )
+    every = [*parts["bin"], *parts["txt"]]
+    other = next((path for path in every if path.exists() and not path.is_file()), None)
     if other is not None:
         raise broken(other, "is not a file", _FIX_FILES)
     whole = [ext for ext in parts if {*absent[ext]} <= {parts[ext][2]}]

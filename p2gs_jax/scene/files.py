@@ -229,11 +229,7 @@ def undecodable(path: Path) -> UserError:
 
 
 def check_missing(
-    missing: Sequence[str],
-    total: int,
-    source: Path,
-    cfg: DataConfig,
-    folder: Path | None = None,
+    missing: Sequence[str], total: int, source: Path, cfg: DataConfig, folder: Path | None = None
 ) -> list[str]:
     """Return notes about images that a model of `total` images names and the disk lacks.
 
@@ -316,20 +312,18 @@ def file_fingerprints(paths: Sequence[Path]) -> list[tuple[str, int, int]]:
     return [(str(path.resolve()), stat.st_size, stat.st_mtime_ns) for path, stat in stats]
 
 
-def stage_progress(
-    report: Report, stage: str, total: int, unit: str, clock: Callable[[], float] = time.monotonic
-) -> Callable[[int], None]:
+def stage_progress(report: Report, stage: str, total: int, unit: str) -> Callable[[int], None]:
     """Begin a stage, such as "matching" 100 "image pairs"; return what reports how many are done.
 
     The first message comes at once, others now and then.
     """
-    begin = last = clock()
+    begin = last = time.monotonic()
     if total:
         report(f"{stage}: {total} {unit}")
 
     def progress(done: int) -> None:
         nonlocal last
-        now = clock()
+        now = time.monotonic()
         if now - last < EVERY_S or not 0 < done < total:
             return
         last = now

@@ -156,22 +156,20 @@ def off_origin(scene: Scene) -> Scene:
 
 
 def interpolated(
-    times: Float[np.ndarray, " k"],
-    poses: Float64[np.ndarray, "k 4 4"],
-    at: Float[np.ndarray, " n"],
-    beyond_s: float = LONGEST_BEYOND_S,
+    times: Float[np.ndarray, " k"], poses: Float64[np.ndarray, "k 4 4"], at: Float[np.ndarray, " n"]
 ) -> tuple[Float64[np.ndarray, "n 4 4"], np.ndarray]:
     """Return poses at times, and which of these times [n] the track covers.
 
     Positions are linear in time, rotations turn evenly. Past an end the motion of the nearest two
-    poses goes on for `beyond_s`; uncovered times get the pose there. Times are seconds, those of
-    the track rising.
+    poses goes on for `LONGEST_BEYOND_S`; uncovered times get the pose there. Times are seconds,
+    those of the track rising.
     """
     times, at = np.asarray(times, np.float64), np.asarray(at, np.float64)
-    covered = (at >= times[0] - beyond_s) & (at <= times[-1] + beyond_s)
+    begin, end = times[0] - LONGEST_BEYOND_S, times[-1] + LONGEST_BEYOND_S
+    covered = (at >= begin) & (at <= end)
     if len(times) == 1:
         return np.repeat(poses, len(at), 0), covered
-    held = np.clip(at, times[0] - beyond_s, times[-1] + beyond_s)
+    held = np.clip(at, begin, end)
     before = np.clip(np.searchsorted(times, held, side="right") - 1, 0, len(times) - 2)
     share = (held - times[before]) / (times[before + 1] - times[before])
     first, second = poses[before], poses[before + 1]

@@ -40,9 +40,7 @@ FORMATS: dict[SceneFormat, DriveFormat] = {
 }
 
 
-def read_drive(
-    root: Path, cfg: DataConfig, report: Report = lambda message: None
-) -> Recording | None:
+def read_drive(root: Path, cfg: DataConfig, report: Report) -> Recording | None:
     """Return the recording in a folder, or None where it holds no drive of a known format.
 
     `cfg.format` may name the reader, `cfg.drive` one of several drives in the folder. UserError:

@@ -48,16 +48,16 @@ def assemble(
     Raises:
         UserError: a camera, frame or photograph is not there, a name a path, a sweep broken.
     """
-    there = [camera.name for camera in recording.cameras]
-    for name in there:
+    for camera in recording.cameras:
         # What is written of a view lies in a folder of its camera.
-        files.require_plain(name, recording.root)
-    names = chosen_cameras(cfg.cameras, there)
+        files.require_plain(camera.name, recording.root)
+    names = chosen_cameras(cfg.cameras, [camera.name for camera in recording.cameras])
     photographs, notes = _chosen_photographs(recording, names, cfg)
-    cameras, size_notes = _at_sizes(recording, photographs)
-    masks, mask_notes = {}, []
-    if cfg.own_car:
-        masks, mask_notes = find_ego_masks(recording, names, work_dir, report)
+    cameras = {c.name: _at_size(c, photographs, recording.root) for c in recording.cameras}
+    resized = {c.name for c in recording.cameras if cameras[c.name] is not c}
+    notes += files.rescaled(sum(p.camera in resized for p in photographs), "the calibration")
+    given = (recording, names, work_dir, report)
+    masks, mask_notes = find_ego_masks(*given) if cfg.own_car else ({}, [])
     centres = np.stack([p.pose[:3, 3] for p in photographs])
     middle = centres.mean(0)
     origin = np.rint(middle) if np.abs(middle).max() > FARTHEST_ORIGIN else np.zeros(3)
@@ -76,7 +76,7 @@ def assemble(
     if cfg.lidar:
         lidar, lidar_notes = _read_sweeps(recording, photographs, objects, origin, report)
     points, seed_notes = _seeds(lidar, centres - origin)
-    notes += [*size_notes, *mask_notes, *lidar_notes, *seed_notes]
+    notes += [*mask_notes, *lidar_notes, *seed_notes]
     return Scene(
         root=recording.root,
         format=recording.format,
@@ -116,15 +116,6 @@ def _chosen_photographs(
             f"of {len(frames)} frames some cameras have fewer photographs: {', '.join(few)}"
         )
     return chosen, notes
-
-
-def _at_sizes(
-    recording: Recording, photographs: Sequence[Photograph]
-) -> tuple[dict[str, RigCamera], list[str]]:
-    """Return the cameras at the size of the photographs, and a note of those of another."""
-    cameras = {c.name: _at_size(c, photographs, recording.root) for c in recording.cameras}
-    resized = {c.name for c in recording.cameras if cameras[c.name] is not c}
-    return cameras, files.rescaled(sum(p.camera in resized for p in photographs), "the calibration")
 
 
 def _at_size(camera: RigCamera, photographs: Sequence[Photograph], root: Path) -> RigCamera:

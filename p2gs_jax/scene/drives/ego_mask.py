@@ -60,10 +60,7 @@ _CAPACITY = 1000
 
 
 def find_ego_masks(
-    recording: Recording,
-    names: Sequence[str],
-    work_dir: Path | None = None,
-    report: Report = lambda message: None,
+    recording: Recording, names: Sequence[str], work_dir: Path | None, report: Report
 ) -> tuple[dict[str, Bool[np.ndarray, "_ _"]], list[str]]:
     """Return where the named cameras see their own car, and notes.
 

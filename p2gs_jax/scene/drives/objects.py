@@ -111,11 +111,7 @@ def middle_time(scene: Scene) -> float:
 
 
 def object_mask(
-    view: View,
-    objects: Sequence[TrackedObject],
-    width: int,
-    height: int,
-    margin: float = MARGIN,
+    view: View, objects: Sequence[TrackedObject], width: int, height: int, margin: float = MARGIN
 ) -> Bool[np.ndarray, "h w"]:
     """Return which pixels of a view the boxes of moving objects cover at its time.
 

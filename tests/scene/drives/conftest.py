@@ -30,7 +30,7 @@ def read():
     """Return a function that reads the drive in a folder, of whatever format it is."""
 
     def get(root, **choice):
-        recording = read_drive(root, DataConfig(**choice))
+        recording = read_drive(root, DataConfig(**choice), print)
         assert recording is not None
         return recording
 
