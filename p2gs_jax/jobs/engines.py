@@ -61,9 +61,10 @@ def check_engine(name: str) -> None:
     raise UserError(f"there is no engine {name!r}.", fix=f"use {KNOWN}")
 
 
-@contextlib.contextmanager
-def open_engine(name: str, parallel: int, folder: Path) -> Iterator[Executor]:
-    """Yield an engine; when the block ends it waits for what still runs.
+def open_engine(
+    name: str, parallel: int, folder: Path
+) -> contextlib.AbstractContextManager[Executor]:
+    """Return an engine for a `with` block; when that ends it waits for what still runs.
 
     OPTIONs of Slurm are those of submitit's `update_parameters` (timeout_min, slurm_partition,
     gpus_per_node, ...); its files go into `folder`, which all machines see. On this machine
@@ -74,15 +75,11 @@ def open_engine(name: str, parallel: int, folder: Path) -> Iterator[Executor]:
     if parallel < 1:
         raise UserError(f"{parallel} jobs at a time.", fix="let at least 1 run at a time")
     if name == LOCAL:
-        with ThreadPoolExecutor(parallel) as threads:
-            yield threads
-    elif name.startswith("dask://"):
-        with _dask(name) as workers:
-            yield workers
-    else:
-        kind, _, options = name.partition(":")
-        with _submitit(kind, _options(name, options), folder) as cluster:
-            yield cluster
+        return ThreadPoolExecutor(parallel)
+    if name.startswith("dask://"):
+        return _dask(name)
+    kind, _, options = name.partition(":")
+    return _submitit(kind, _options(name, options), folder)
 
 
 @contextlib.contextmanager

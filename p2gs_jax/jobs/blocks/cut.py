@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.seeds import camera_centers
+from p2gs_jax.photometry.observations import grouped
 from p2gs_jax.render.warp import project_points
 from p2gs_jax.scene.split import only
 from p2gs_jax.scene.visibility import in_frame
@@ -190,13 +191,8 @@ def seen_points(scene: Scene) -> list[Int[np.ndarray, " _"]]:
     """Return which points each training view sees: by tracks, else by projection of some points."""
     rows = scene.train_indices
     if scene.tracks is not None and len(scene.tracks.xy):
-        row_of = np.full(len(scene.views), len(rows))
-        row_of[list(rows)] = np.arange(len(rows))
-        row = row_of[scene.tracks.view_indices]
-        order = np.argsort(row, kind="stable")
-        starts = np.searchsorted(row[order], np.arange(len(rows) + 1))
-        points = scene.tracks.point_indices[order]
-        return [points[starts[k] : starts[k + 1]] for k in range(len(rows))]
+        of_view = grouped(scene.tracks.view_indices, len(scene.views))
+        return [scene.tracks.point_indices[of_view[i]] for i in rows]
     picked = np.arange(0, len(scene.points), max(1, len(scene.points) // MOST_PROJECTED))
     return [picked[shows(scene.views[i], scene.points[picked])] for i in rows]
 

@@ -223,7 +223,7 @@ class _Blocks:
     def _solve(self, scene: Scene) -> shared.Shared:
         store = ImageStore(scene.views, self.cfg.data, folder=self.folder.pixels)
         kept = read_decisions(self.blocks / shared.DECISIONS)
-        solved = shared.solve_shared(scene, store, self.cfg, self.reporter, kept=kept)
+        solved = shared.solve_shared(scene, store, self.cfg, self.reporter, kept)
         store.close()
         return_freed_memory()
         for note in (*scene.notes, *solved.exposures.notes):

@@ -35,12 +35,7 @@ class Shared:
 
 
 def solve_shared(
-    scene: Scene,
-    store: ImageStore,
-    cfg: FitConfig,
-    reporter: Reporter,
-    *,
-    kept: Decisions | None = None,
+    scene: Scene, store: ImageStore, cfg: FitConfig, reporter: Reporter, kept: Decisions | None
 ) -> Shared:
     """Solve the photometry of a scene; `kept` is what a run that is resumed decided before.
 
