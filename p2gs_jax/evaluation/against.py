@@ -35,13 +35,8 @@ def check_renders(found: OtherRenders, store: ImageStore) -> OtherRenders:
         UserError: see `OtherRenders.read`.
     """
     for row in found.files:
-        found.read(row, _size(store, row), over=store.backdrop is not None)
+        found.read(row, store.camera(row)[2:], over=store.backdrop is not None)
     return found
-
-
-def _size(store: ImageStore, row: int) -> tuple[int, int]:
-    width, height = store.camera(row)[2:]
-    return width, height
 
 
 def judge_renders(
@@ -61,7 +56,7 @@ def judge_renders(
 
     def light(row: int, shown: DisplayTransform) -> Light:
         over = judge.store.backdrop is not None
-        rendered = found.read(row, _size(judge.store, row), over=over)
+        rendered = found.read(row, judge.store.camera(row)[2:], over=over)
         if rendered.linear:
             shown = replace(shown, exposure=judge.mean.exposure)
         return light_of(rendered, shown, judge.store, row)

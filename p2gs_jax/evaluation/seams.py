@@ -28,8 +28,8 @@ from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import LossConfig
 from p2gs_jax.core.numerics import evenly_spaced
-from p2gs_jax.photometry.display import DisplayTransform, develop
-from p2gs_jax.photometry.formation import inverse_formation, inverse_tone_map, places
+from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
+from p2gs_jax.photometry.formation import inverse_tone_map, places
 from p2gs_jax.render.warp import project_points, sample_bilinear, surface_depth, unproject, warp
 from p2gs_jax.scene.rigid import camera_centers, moment_of, pose_of
 from p2gs_jax.scene.visibility import unoccluded
@@ -142,7 +142,7 @@ def measure_seam(
     gamma, tone = np.float32(common.gamma), common.formation
     plain = [inverse_tone_map(np.asarray(values, np.float32), gamma, tone) for values in (a, b)]
     radiance = [
-        radiance_of(values, view.transform, places(xy, view.camera.width, view.camera.height))
+        undevelop(values, view.transform, places(xy, view.camera.width, view.camera.height))
         for values, view, xy in zip((a, b), (first, second), where, strict=True)
     ]
     shown = [develop(linear, common) for linear in radiance]
@@ -154,20 +154,6 @@ def measure_seam(
         float(np.median(np.log2(radiance[0]) - np.log2(radiance[1]))),
         int(use.sum()),
     )
-
-
-def radiance_of(
-    ldr: Float[np.ndarray, "... 3"],
-    transform: DisplayTransform,
-    positions: Float[np.ndarray, "... 2"] | None = None,
-) -> Float32[np.ndarray, "... 3"]:
-    """Return the radiance that a photograph shows: what was done to light undone, on the host.
-
-    Loose pixels of an image need their `positions` where vignetting counts
-    (photometry/formation.py:places).
-    """
-    ldr = np.asarray(ldr, np.float32)
-    return inverse_formation(ldr, transform.capture, transform.formation, positions)
 
 
 def _informative(ldr: Float[np.ndarray, "h w 3"], cfg: LossConfig) -> Bool[np.ndarray, "h w"]:
@@ -211,7 +197,7 @@ def seam_picture(
         inside = np.asarray((z > 1e-6) & jnp.all((xy >= 0) & (xy < size), axis=-1))
         ldr = np.asarray(sample_bilinear(jnp.asarray(photograph.ldr), xy))
         # Saturated pixels stay at the value of its white.
-        alike = develop(radiance_of(ldr, photograph.transform), common)
+        alike = develop(undevelop(ldr, photograph.transform), common)
         reached.append(inside)
         before.append(np.where(inside[..., None], ldr, BLANK))
         after.append(np.where(inside[..., None], alike, BLANK))

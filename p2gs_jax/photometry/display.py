@@ -138,17 +138,13 @@ def _develop(linear, capture, correction, positions, matte, cfg: PhotometryConfi
 def undevelop(
     ldr: Pixels, transform: DisplayTransform, positions: Positions = None
 ) -> Float32[np.ndarray, "... 3"]:
-    """Return the linear radiance that a photograph shows: the inverse of `develop`.
+    """Return the linear radiance that a photograph shows: the inverse of `develop`, on the host.
 
     Saturated values count as the radiance at which they saturate, values below half a code as that;
     corrections of display values are not undone. `positions` as for `develop`.
     """
-    return np.asarray(_undevelop(ldr, transform.capture, positions, transform.formation))
-
-
-@functools.partial(jax.jit, static_argnames="cfg")
-def _undevelop(ldr, capture, positions, cfg: PhotometryConfig):
-    return inverse_formation(ldr, capture, cfg, positions)
+    shown = np.asarray(ldr, np.float32)
+    return inverse_formation(shown, transform.capture, transform.formation, positions)
 
 
 def display_of_view(params: Params, row: int, cfg: PhotometryConfig) -> DisplayTransform:
