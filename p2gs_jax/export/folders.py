@@ -22,10 +22,11 @@ from PIL import Image
 
 from p2gs_jax.core.atomic import atomic_folder, write_json, write_text
 from p2gs_jax.core.ply import header_of
+from p2gs_jax.photometry.observations import grouped
 from p2gs_jax.run.photometry_files import ViewPhotometry
 from p2gs_jax.scene import ImageStore
 from p2gs_jax.scene.convert.convert import kept_settings
-from p2gs_jax.types import Scene, View
+from p2gs_jax.types import Scene, Tracks, View
 
 JPEG_QUALITY = 98
 # What both programs read, and Pillow's modes of it; photographs of other kinds become PNG.
@@ -130,11 +131,9 @@ def _colors(scene: Scene) -> np.ndarray:
 
 def _write_model(folder: Path, scene: Scene, store: ImageStore, names: Mapping[str, str]) -> None:
     model = pycolmap.Reconstruction()
-    of_view = [np.zeros(0, int)] * len(scene.views)
-    if scene.tracks is not None:
-        order = np.argsort(scene.tracks.view_indices, kind="stable")
-        ends = np.cumsum(np.bincount(scene.tracks.view_indices, minlength=len(scene.views)))
-        of_view = np.split(order, ends[:-1])
+    none = np.zeros(0, np.int32)
+    seen = scene.tracks or Tracks(none, none, np.zeros((0, 2), np.float32))
+    of_view = grouped(seen.view_indices, len(scene.views))
     camera_ids: dict[tuple, int] = {}
     tracks = [pycolmap.Track() for _ in scene.points]
     for index, view in enumerate(scene.views):
@@ -146,9 +145,7 @@ def _write_model(folder: Path, scene: Scene, store: ImageStore, names: Mapping[s
         if camera_id not in model.cameras:
             camera = pycolmap.Camera(model="PINHOLE", params=params, camera_id=camera_id, **size)
             model.add_camera_with_trivial_rig(camera)
-        xy, points = np.zeros((0, 2)), np.zeros(0, int)
-        if scene.tracks is not None:
-            xy, points = (a[of_view[index]] for a in (scene.tracks.xy, scene.tracks.point_indices))
+        xy, points = seen.xy[of_view[index]], seen.point_indices[of_view[index]]
         image = pycolmap.Image(
             name=names[view.name],
             keypoints=np.asarray(xy * (width / view.width, height / view.height), np.float64),

@@ -6,6 +6,7 @@ docs/exports.md describes the fields; a change of their meaning raises VERSION.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from p2gs_jax.formats.exr import BT709
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import EXPOSED_CEILING, EXPOSED_FLOOR
 from p2gs_jax.render.harmonics import C0, C1, C2, C3, LOG_RADIANCE_LIMIT, degree_of
+from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.run.photometry_files import PhotometryFile, ViewPhotometry
 from p2gs_jax.scene import ImageStore
 from p2gs_jax.types import GAMMA_SRGB, Gaussians, Scene
@@ -61,8 +63,7 @@ DARKEST_EV, BRIGHTEST_EV, SAMPLES = -14.0, 4.0, 433
 
 def corrections_name(kind: Appearance) -> str:
     """Return the name of the file beside it that holds learned corrections."""
-    names = {"ppisp": "linear.ppisp.json", "luminance": "linear.luminance.json"}
-    return names.get(kind, "linear.appearance.npy")
+    return f"linear.{RunFolder(Path()).appearance(kind).name}"
 
 
 def linear_sidecar(

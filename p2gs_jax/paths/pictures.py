@@ -28,11 +28,7 @@ def _layers(run: Run, shot: Shot, at: float | None) -> Layers:
 
 
 def metered_shots(
-    run: Run,
-    shots: Sequence[Shot],
-    of: ExposureOf,
-    exposure_ev: float = 0.0,
-    frames: float = 0.0,
+    run: Run, shots: Sequence[Shot], of: ExposureOf, exposure_ev: float = 0.0, frames: float = 0.0
 ) -> list[Shot]:
     """Return shots with the exposures that a metering rule gives small pictures of them.
 

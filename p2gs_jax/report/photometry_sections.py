@@ -60,7 +60,6 @@ def _chart(
     y_label: str,
     label: str,
     caption: str,
-    band: float = 0.0,
 ) -> str:
     """Return a panel for each camera, or one for all where there are many or small ones.
 
@@ -75,7 +74,7 @@ def _chart(
         by_camera = {"": views}
     panels = [(title, curves(v, np.arange(1.0, len(v) + 1))) for title, v in by_camera.items()]
     order = "photograph, in the order of names"
-    chart = panels_chart(panels, y_label=y_label, x_label=order, label=label, band=band)
+    chart = panels_chart(panels, y_label=y_label, x_label=order, label=label, band=0.0)
     return figure(chart, caption)
 
 

@@ -142,15 +142,8 @@ class LivePicture:
             self._viewed.listeners.remove(self._renderer_changed)
         self._thread.join()
 
-    def camera_moved(self) -> None:
-        """Render again: the camera has moved."""
-        self._post("camera")
-
-    def display_changed(self) -> None:
-        """Develop the frame again: the display settings have changed."""
-        self._post("look")
-
-    def _post(self, request: Request) -> None:
+    def post(self, request: Request) -> None:
+        """Ask for a frame: of another camera, or with another look of the present one."""
         with self._changed:
             self._request = "camera" if "camera" in (request, self._request) else request
             self._changed.notify_all()

@@ -14,13 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, UInt8
 
 from p2gs_jax.formats.exr import write_exr
-from p2gs_jax.formats.false_color import (
-    DEPTH_MAP,
-    STOPS,
-    STOPS_MAP,
-    depth_color,
-    false_color,
-)
+from p2gs_jax.formats.false_color import DEPTH_MAP, STOPS, STOPS_MAP, depth_color, false_color
 from p2gs_jax.formats.frames import to_uint8
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import places

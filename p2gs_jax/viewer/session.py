@@ -39,7 +39,7 @@ class BrowserSession:
     def _camera_moved(self, camera: viser.CameraHandle) -> None:
         if self._frusta is not None:
             self._frusta.keep_clear(camera.position)
-        self._live.camera_moved()
+        self._live.post("camera")
 
     def _move(self, pose: Pose) -> None:
         camera = self._client.camera
@@ -51,7 +51,7 @@ class BrowserSession:
 
     def display_changed(self) -> None:
         """Show the frame under the new settings."""
-        self._live.display_changed()
+        self._live.post("look")
 
     def mode_changed(self) -> None:
         """Show another mode; `split` moves to the nearest photograph and takes its settings."""
@@ -59,14 +59,14 @@ class BrowserSession:
             camera = self._live.camera(browser_view(self._client), (64, 64))
             here = self._viewed.view_at(camera)
             self.go_to(self._viewed.nearest_view(camera) if here is None else here)
-        self._live.camera_moved()
+        self._live.post("camera")
 
     def take_display_of(self, index: int | None) -> None:
         """Take all that a view was taken with, or the mean."""
         now, run = self._panel.settings(), self._run
         same = common_settings(run, now) if index is None else settings_of_view(run, index, now)
         self._panel.put(same)
-        self._live.display_changed()
+        self.display_changed()
 
     def go_to(self, index: int) -> None:
         """Move to the camera of a view, and take its display transform unless that is locked."""

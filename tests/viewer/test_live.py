@@ -88,7 +88,7 @@ def shape(picture):
 
 def move(setup, client, x):
     client.camera.position = np.array([x, 0, 0])
-    setup.live.camera_moved()
+    setup.live.post("camera")
 
 
 def shown_at(setup, viewed):
@@ -108,7 +108,7 @@ def test_a_new_look_renders_nothing(setup, client, seen):
     before = len(setup.renderer.rendered)
     for ev in (0.5, 1.0, 2.0):
         setup.panel.now = Settings(gamma=2.2, exposure_ev=ev)
-        setup.live.display_changed()
+        setup.live.post("look")
     client.wait_sharp(seen)
     assert len(setup.renderer.rendered) == before
     assert setup.pictures[-1][1].mean() > setup.pictures[seen - 1][1].mean()
@@ -183,7 +183,7 @@ def test_what_fails_is_said_once_and_the_next_is_served(setup, client, monkeypat
         said = len(client.said)
         assert 1 <= said <= 2  # for the request, and at rest
         assert all("no photo" in text for text in client.said)
-    setup.live.camera_moved()
+    setup.live.post("camera")
     client.wait_sharp()
     assert len(client.said) == said
 
