@@ -5,7 +5,7 @@ The public interface. Everything else may change between releases.
 
 import sys
 
-if sys.argv[:1] == ["-m"]:  # `python -m p2gs_jax...`, which has just looked into the working folder
+if sys.argv[:1] == ["-m"]:  # `python -m p2gs_jax...` imports from the working folder first
     from p2gs_jax.core.processes import leave_out_working_folder
 
     leave_out_working_folder()
@@ -13,7 +13,8 @@ if sys.argv[:1] == ["-m"]:  # `python -m p2gs_jax...`, which has just looked int
 from importlib import import_module
 from typing import Any
 
-# By module; one is imported when a name of it is used: `--help` needs no JAX.
+# Public names by module; a module is imported when one of its names is used, because `--help` must
+# not import JAX.
 _PUBLIC = {
     "config": ("FitConfig", "RenderConfig"),
     "core.runtime": ("use_cores",),

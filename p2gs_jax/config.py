@@ -1,7 +1,7 @@
-"""Every number of a fit, with its unit, its default and where it comes from.
+"""Every option of a fit, with its unit, its default and its source.
 
 Sources: "paper" is P2GS (CVPR 2026) by section; "3DGS" is the official configuration of Kerbl et
-al. 2023; "ours" is measured, see BUILD_NOTES.md. A weight or option set to None leaves the trace.
+al. 2023; "ours" was measured (BUILD_NOTES.md). A weight of None removes its term from the program.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ ExposureByView = Literal["view_exposure", "view_exposure_camera_gamma", "view_ex
 PhotometricModel = Literal[ExposureByCamera, ExposureByView]
 RecordingFormat = Literal["pandaset", "nuscenes", "waymo", "argoverse", "kitti_raw"]
 SceneFormat = Literal["colmap", "transforms", "blender", "llff", RecordingFormat, "images"]
-# How structure from motion finds poses, and which photographs it matches with which.
+# Pairs of photographs that structure from motion matches.
 Matching = Literal["auto", "all", "sequence"]
 CameraBy = Literal["auto", "folder", "model", "exif", "one"]
-# What the alpha channel of photographs means.
+# Meaning of the alpha channel of photographs.
 AlphaUse = Literal["background", "mask", "ignore"]
-# Per what it varies: one physical camera, or one photograph.
+# A parameter differs between physical cameras, or between photographs.
 Level = Literal["camera", "view"]
-# Vignetting per camera: the same for all channels, or one for each.
+# Vignetting of a camera: the same for all channels, or one for each channel.
 VignettingKind = Literal["camera", "channel"]
-# What has a response of its own.
+# All cameras share one response, or every camera or colour channel has one.
 ResponseKind = Literal["all", "camera", "channel"]
 
 
@@ -46,39 +46,39 @@ class DataConfig:
     max_width: int | None = None
     """Largest image width, pixels; wider images are shrunk; None keeps all sizes."""
     images: str | None = None
-    """Image folder (default: `images/` beside the model); `.` is the scene's folder itself."""
+    """Image folder (default: `images/` beside the model); `.` is the scene folder itself."""
     format: SceneFormat | None = None
-    """Format of the scene; None takes the first that the folder holds."""
+    """Format of the scene; None chooses the first format that the folder holds."""
     camera_by: CameraBy = "auto"
-    """Photographs that share a camera: those of one `folder`, one camera of the `model`, one make
+    """Photographs of one camera: those in one `folder`, of one camera of the `model`, of one make
     and lens in `exif`, or all (`one`); `auto` combines folder, model and EXIF."""
     alpha: AlphaUse = "background"
     """Alpha channel of photographs: `background` shows them and their renders over a colour, `mask`
     leaves out transparent pixels, `ignore` does nothing."""
     background: str = "white"
     """Display colour behind photographs with alpha: white (3DGS), black or R,G,B from 0 to 1;
-    `random` draws one per step, and white is used in evaluation."""
+    `random` draws one per step, and evaluation uses white."""
     drive: str | None = None
     """Name of a drive in a folder of several drives, or the beginning of its name."""
     cameras: tuple[str, ...] = ()
-    """Cameras of a drive; `camera_`, `cam_` and `ring_` may be left out of names; none: all."""
+    """Cameras of a drive; the prefixes `camera_`, `cam_` and `ring_` are optional; none: all."""
     frames: str | None = None
     """Frames of a drive that are used, as a Python slice: FIRST:END[:STEP]."""
     every: int | None = None
-    """Interval between the frames of a video; None chooses sharp frames at different places."""
+    """Use every n-th frame of a video; None chooses sharp frames at different places."""
     max_frames: int = 150
-    """Largest number of frames of a video; more frames are thinned evenly."""
+    """Largest number of frames of a video; longer videos are thinned evenly."""
     matching: Matching = "auto"
     """Pairs of photographs that are matched: `all`, or neighbours by name (`sequence`); `auto`: all
     pairs of up to 60 photographs, and a sequence for videos and larger sets."""
     lidar: bool = True
-    """Use the LiDAR of a drive for seeds and depth errors; else photographs give the seeds."""
+    """Use the LiDAR of a drive for seeds and depth errors; otherwise photographs give the seeds."""
     own_car: bool = True
-    """Leave out the car itself in photographs of a drive: the parts that never move."""
+    """Leave out the pixels that show the recording car itself."""
     allow_missing: bool = False
-    """Skip frames whose image file is missing instead of stopping."""
+    """Skip frames whose image file is missing; otherwise the command stops."""
     cache_mb: int = 2048
-    """Memory for decoded photographs, MB; a temporary file holds those of larger sets."""
+    """Memory for decoded photographs, MB; larger sets go into a temporary file."""
 
 
 @dataclass(frozen=True)
@@ -86,15 +86,15 @@ class RenderConfig:
     """Projection, tiling and compositing."""
 
     implementation: Literal["reference", "xla", "pallas"] | None = None
-    """Rasterizer; None: `pallas` on NVIDIA GPUs from Ampere on, `xla` on other devices."""
+    """Rasterizer; None: `pallas` on NVIDIA GPUs since Ampere, `xla` on other devices."""
     binning: Literal["counting", "sorting"] | None = None
-    """Construction of tile lists; None: counting on CPUs, else sorting (ours: BUILD_NOTES)."""
+    """Construction of tile lists; None: counting on CPUs, otherwise sorting (ours: BUILD_NOTES)."""
     sh_degree: int = 3
     """Highest spherical-harmonics degree (3DGS: 3)."""
     radiance: Literal["exp", "linear"] = "exp"
     """Activation from spherical harmonics to radiance; `linear` is 3DGS's max(0, sh + 1/2)."""
     near: float = 0.05
-    """Near plane, scene units; nearer in scenes that it would cut (ours: pipeline/survey.py)."""
+    """Near plane, scene units; moved closer where it would cut the scene (pipeline/survey.py)."""
     blur: float = 0.05
     """Variance added to the 2D covariance, pixels^2 (3DGS: 0.3; ours: BUILD_NOTES, "Blur")."""
     background: tuple[float, float, float] | None = None
@@ -108,24 +108,23 @@ class RenderConfig:
     alpha_cutoff: float = 1.0 / 255.0
     """Opacity below which splats are skipped (3DGS: 1/255)."""
     deterministic: bool = False
-    """Sum gradients in a fixed order: runs repeat bit for bit on GPUs too (`pallas`)."""
+    """Sum gradients in a fixed order, so that runs repeat bit for bit on GPUs too (`pallas`)."""
     alpha_max: float = 0.999
     """Largest opacity of one splat at one pixel (keeps 1 - alpha invertible)."""
     stop_error: float | None = 5e-4
-    """Error that stopping early may cause in a channel, as a share of the pixel's brightest channel
-    or, if that is more, of 1e-4 of the view's largest radiance; None composites everything. A tile
-    stops once T L <= stop_error max(c, 1e-4 L) in all its pixels: T is the transmittance, L the
-    largest radiance, c the brightest channel. Alpha is off by at most T."""
+    """Largest relative error of a channel from stopping early; None composites all splats. A tile
+    stops once T L <= stop_error max(c, 1e-4 L) in all its pixels, where T is the transmittance, L
+    the view's largest radiance and c the pixel's brightest channel. Alpha is off by at most T."""
     exp_degree: int | None = 5
     """Degree of the polynomial for exp (5: error 1e-6); None calls exp (ours: BUILD_NOTES)."""
 
 
 @dataclass(frozen=True)
 class CameraFormation:
-    """What one physical camera does to light besides exposing it; solved, never learned.
+    """Vignetting and response of one physical camera; they are solved, never learned.
 
     Attributes:
-        name: of the camera, as in `View.camera`.
+        name: name of the camera, as in `View.camera`.
         vignetting: coefficients k of log V(r) = k1 r^2 + k2 r^4 + k3 r^6 with r = 1 in the corners
             of the image: one row for all channels, or a row for each; empty: none.
         splines: log exposure added to sRGB's at the knots, as `PhotometryConfig.spline`: one row
@@ -144,29 +143,29 @@ class PhotometryConfig:
     select: bool = True
     """Choose `model` and `curve` on held-out observations (ours: docs/photometry.md, 5)."""
     model: PhotometricModel = "view_exposure_gamma"
-    """Parameters that differ between views; the others are not learned."""
+    """Exposures and gammas that differ between views or cameras; the others are fixed."""
     curve: Literal["power", "srgb", "spline", "linear"] = "srgb"
     """Base tone curve; `power` with pivot 1: x^(1/gamma) (paper), `linear`: no curve (3DGS)."""
     spline: tuple[float, ...] | None = None
-    """Log exposure that `spline` adds to sRGB's at its knots (photometry/response.py)."""
+    """Log exposure that the curve `spline` adds to sRGB's at its knots (photometry/response.py)."""
     white_balance: Level | None = None
-    """White balance per camera or per view (with `select`: chosen)."""
+    """White balance per camera or per view; `select` chooses it."""
     vignetting: VignettingKind | None = None
-    """Vignetting per camera, or per camera and channel (with `select`: chosen)."""
+    """Vignetting per camera, or per camera and channel; `select` chooses it."""
     responses: ResponseKind = "all"
-    """Cameras or channels that share a response of the curve `spline` (with `select`: chosen)."""
+    """Cameras or channels that share a response of the curve `spline`; `select` chooses it."""
     cameras: tuple[CameraFormation, ...] = ()
-    """What each camera does besides; the photographs decide, and no option sets it."""
+    """Vignetting and response of each camera; they are solved, and no option sets them."""
     known: str | None = None
     """Known exposures: a CSV file (image, exposure or ev), or `exif`."""
     known_deviation_ev: float = 0.0
     """Standard deviation of the known exposures, stops; 0 keeps them fixed."""
     pivot: float = 0.18
-    """Linear value that a change of gamma leaves alone: y = OETF(x0 (eL/x0)^(2.2/gamma))
-    (ours: mid-grey beats white 2.5-5x in EV, docs/photometry.md, 3; the paper's is 1)."""
+    """Linear value x0 that gamma does not change: y = OETF(x0 (eL/x0)^(2.2/gamma)) (paper: 1;
+    ours: mid-grey, whose errors in EV are 2.5 to 5 times smaller: docs/photometry.md, 3)."""
     clamp: bool = False
     """Clamp exposed radiance to [1e-6, 10] and display values to [0, 1] (paper, Tone-mapping
-    estimation); the loss is censored instead without (ours)."""
+    estimation); ours does not clamp and censors the loss."""
     parameterization: Literal["log", "linear"] = "log"
     """Parameters of the optimiser: logarithms (ours), or e and gamma themselves (paper)."""
     start: Literal["tracks", "random"] = "tracks"
@@ -177,25 +176,25 @@ class PhotometryConfig:
     """Learned correction of display values per view: a colour matrix (3DGS), a bilateral grid, a
     `curve`, a whole camera (`ppisp`) or an enhancing curve (`luminance`)."""
     freeze_until: float = 0.6
-    """Fraction of the run that keeps the exposures of tracks (ours: docs/photometry.md, 4)."""
+    """Fraction of the run that fixes the exposures from tracks (ours: docs/photometry.md, 4)."""
 
 
 @dataclass(frozen=True)
 class RelativeExposureConfig:
-    """The relative-exposure loss L_exp (paper, eq. 9) and its readings (docs/photometry.md, 3)."""
+    """The relative-exposure loss L_exp (paper, eq. 9); docs/photometry.md, 3."""
 
     weight: float | None = None
     """lambda_exp (paper: 0.01 in the main text, 0.1 in the appendix)."""
     form: Literal["literal_same_pose", "observed_ldr"] = "literal_same_pose"
-    """Reading of the printed formula."""
+    """Interpretation of the printed formula."""
     huber_delta: float = 0.05
-    """Transition of the Huber loss of `observed_ldr`, which compares photographs, LDR units."""
+    """Transition of the Huber loss of `observed_ldr`, which compares photographs; LDR units."""
 
 
 @dataclass(frozen=True)
 class RegularizerConfig:
-    """Regularisers of the common scale and contrast, which photographs leave open (paper, eq. 10;
-    docs/photometry.md, 4)."""
+    """Regularisers of the common scale and contrast, which photographs do not determine (paper,
+    eq. 10; docs/photometry.md, 4)."""
 
     exposure_scale: float | None = None
     """lambda_escale E[(e - 1)^2] (paper: 0.01)."""
@@ -208,7 +207,8 @@ class RegularizerConfig:
     gamma_mean_variance: float | None = 0.1
     """(mean gamma - 2.2)^2 + Var gamma: fixes the common contrast (ours)."""
     appearance: float | None = 10.0
-    """Roughness of bilateral grids (bilateral-guided radiance fields: 10); for PPISP a factor."""
+    """Weight of the roughness of bilateral grids (bilateral-guided radiance fields: 10), or factor
+    on PPISP's regularisers."""
 
 
 @dataclass(frozen=True)
@@ -218,13 +218,13 @@ class LossConfig:
     dssim_weight: float | None = 0.2
     """lambda_dssim (paper, Photometric reconstruction: 0.2)."""
     censored: bool = True
-    """Where the photograph is saturated, penalise only predictions below the threshold (ours)."""
+    """Penalise only predictions below the threshold where the photograph is saturated (ours)."""
     saturation: float = 250.0 / 255.0
-    """Display value from which photographs count as saturated (ours: docs/photometry.md, 3)."""
+    """Display value from which pixels count as saturated (ours: docs/photometry.md, 3)."""
     black: float = 4.0 / 255.0
-    """Display value up to which the exposure is unknown (ours: docs/photometry.md, 3)."""
+    """Display value up to which pixels do not constrain exposures (ours: docs/photometry.md, 3)."""
     alpha: float | None = None
-    """Weight of the opacity error against photographs with alpha over a background (ours)."""
+    """Weight of the opacity error in photographs with alpha over a background (ours)."""
     lidar: float | None = None
     """Weight of the error of log depth at LiDAR points (ours)."""
     relative_exposure: RelativeExposureConfig = field(default_factory=RelativeExposureConfig)
@@ -238,14 +238,14 @@ class OptimizerConfig:
     """Adam and its learning rates; all rates are per step."""
 
     means: float = 2.4e-3
-    """Rate of the means, scene extents (3DGS: 1.6e-4 over 30k steps that move all Gaussians; ours:
-    a few thousand steps that move the visible ones: BUILD_NOTES, "Rates")."""
+    """Rate of the means, scene extents (3DGS: 1.6e-4 for 30k steps of all Gaussians; ours: for a
+    few thousand steps of visible Gaussians: BUILD_NOTES, "Rates")."""
     means_final: float = 2.4e-5
     """Rate of the means at the end, after exponential decay (3DGS: 1.6e-6)."""
     sh_dc: float = 1.2e-1
-    """Rate of degree 0 (3DGS: 2.5e-3 for LDR colours; log radiance takes 8 times that)."""
+    """Rate of spherical harmonics of degree 0 (3DGS: 2.5e-3; ours: BUILD_NOTES, "Rates")."""
     sh_rest: float = 6e-3
-    """Rate of degrees 1-3 (3DGS: 2.5e-3 / 20)."""
+    """Rate of spherical harmonics of degrees 1 to 3 (3DGS: 2.5e-3 / 20)."""
     opacities: float = 3e-1
     """Rate of the logits of opacities (3DGS: 5e-2)."""
     scales: float = 1.2e-1
@@ -253,41 +253,41 @@ class OptimizerConfig:
     quats: float = 6e-3
     """Rate of the quaternions (3DGS: 1e-3)."""
     exposures: float = 1e-3
-    """Rate of the raw exposures (ours: docs/photometry.md, 4; 10 times this without tracks)."""
+    """Rate of the raw exposures (ours: docs/photometry.md, 4); 10 times higher without tracks."""
     gammas: float = 1e-4
-    """Rate of the raw gammas (ours: likewise)."""
+    """Rate of the raw gammas; 10 times higher without tracks (ours)."""
     appearance: float = 1e-2
-    """Rate of the corrections of display values (3DGS's exposure compensation: 1e-2); hundreds of
-    similar views suit lower ones (ours: docs/baselines.md, "Learning rates of corrections")."""
+    """Rate of the corrections of display values (3DGS's exposure compensation: 1e-2); lower rates
+    suit hundreds of similar views (docs/baselines.md, "Learning rates of corrections")."""
     appearance_final: float = 0.1
     """Fraction to which the rate of the corrections decays exponentially (3DGS: 0.1)."""
     appearance_warmup: float = 0.0
-    """Fraction of the run in which that rate rises from a hundredth (PPISP: 500 steps of 30k)."""
+    """Fraction of the run in which that rate rises from 1 % of it (PPISP: 500 steps of 30k)."""
     velocities: float = 0.3
     """Rate of the velocities of vibrating Gaussians, scene units per second (ours: BUILD_NOTES)."""
     peaks: float = 0.03
-    """Rate of the times of their largest opacity, seconds (ours)."""
+    """Rate of the times at which vibrating Gaussians are most opaque, seconds (ours)."""
     lives: float = 0.05
-    """Rate of the logarithms of their lives, log seconds (ours)."""
+    """Rate of the logarithms of the lives of vibrating Gaussians, log seconds (ours)."""
     photometry_final: float = 0.01
     """Fraction to which the rates of exposure and gamma decay exponentially (ours)."""
     final: float = 0.1
     """Fraction to which all other rates decay exponentially (3DGS: no decay; ours: BUILD_NOTES)."""
     settled: float | None = 600.0
-    """Updates of a Gaussian above which all its rates but those of colours shrink, by the root of
-    the ratio; None: never (ours: BUILD_NOTES, "Length")."""
+    """Number of updates n0 of a Gaussian after which its rates, except those of colours, shrink by
+    sqrt(n0 / updates); None: never (ours: BUILD_NOTES, "Length")."""
     extent: Literal["cameras", "near"] = "near"
     """Scene extent in rates of the means and thresholds: the radius of the cameras (3DGS), or the
-    depth near them where that is smaller (ours: BUILD_NOTES, "Extent")."""
+    depth of near points if it is smaller (ours: BUILD_NOTES, "Extent")."""
     eps: float = 1e-15
     """Adam's epsilon (3DGS: 1e-15)."""
     b1: float = 0.6
-    """Adam's b1 of Gaussians (3DGS: 0.9; ours: BUILD_NOTES, "Momentum"); the others keep 0.9."""
+    """Adam's b1 of Gaussians (3DGS: 0.9; ours: BUILD_NOTES, "Momentum"); other parameters: 0.9."""
     b2: float = 0.999
     """Adam's b2 (3DGS: 0.999)."""
     visible_only: bool = True
-    """Update the Gaussians that a view may show, and no others (as gsplat's selective Adam; ours:
-    BUILD_NOTES, "The step costs what a view shows"); off: all Gaussians in every step (3DGS)."""
+    """Update only the Gaussians that a view may show (as gsplat's selective Adam; BUILD_NOTES, "The
+    step costs what a view shows"); otherwise all Gaussians in every step (3DGS)."""
 
 
 @dataclass(frozen=True)
@@ -295,9 +295,9 @@ class DensifyConfig:
     """Growth of the population. Times are fractions of the run (3DGS's are of 30k steps)."""
 
     method: Literal["mcmc", "adaptive"] | None = "mcmc"
-    """`mcmc`: relocation within a bound; `adaptive`: the 3DGS schedule (paper); None: seeds."""
+    """`mcmc`: relocation within a bound; `adaptive`: the 3DGS schedule (paper); None: no growth."""
     max_gaussians: int | None = None
-    """Largest number of Gaussians; None chooses from pixels, seeds and the length of the run."""
+    """Largest number of Gaussians; None derives it from pixels, seeds and length of the run."""
     start: float = 1.0 / 60.0
     """Time of the first densification (3DGS: step 500)."""
     stop: float = 0.5
@@ -305,7 +305,7 @@ class DensifyConfig:
     every: float = 1.0 / 300.0
     """Interval of densification (3DGS: 100 steps)."""
     min_every_steps: int = 25
-    """Smallest number of steps between densifications (ours: statistics need views)."""
+    """Smallest number of steps between densifications (ours: statistics need several views)."""
     reset_every: float = 0.1
     """Interval of opacity resets, `adaptive` only (3DGS: 3000 steps)."""
     min_reset_steps: int = 300
@@ -313,17 +313,18 @@ class DensifyConfig:
     grad_threshold: float = 2e-4
     """Mean screen-space gradient norm above which a Gaussian is cloned or split (3DGS)."""
     clone_scale: float = 0.01
-    """Scale, scene extents, that parts clones (below) from splits (3DGS: percent_dense)."""
+    """Scale, scene extents, below which Gaussians are cloned, not split (3DGS: percent_dense)."""
     prune_opacity: float = 0.005
     """Opacity below which Gaussians are removed or relocated (3DGS)."""
     prune_scale: float = 0.1
-    """Scale, in scene extents, above which Gaussians are removed after the first reset (3DGS)."""
+    """Scale, scene extents, above which Gaussians are removed after the first reset (3DGS)."""
     growth: float = 1.0
-    """Smallest factor of growth of `mcmc` (3DGS-MCMC: 1.05); 1: even growth (ours: BUILD_NOTES)."""
+    """Smallest growth factor of `mcmc` (3DGS-MCMC: 1.05); 1: even growth (ours: BUILD_NOTES)."""
     noise: float = 5e5
     """Scale of the MCMC noise on the means, times their learning rate (3DGS-MCMC)."""
     spread: float = 0.5
-    """Distance of relocated twins of `mcmc`, standard deviations (3DGS-MCMC: 0)."""
+    """Distance between a Gaussian and its relocated copy in `mcmc`, standard deviations (3DGS-MCMC:
+    0)."""
 
 
 @dataclass(frozen=True)
@@ -331,25 +332,25 @@ class DynamicsConfig:
     """Moving objects, in scenes with tracked boxes."""
 
     method: Literal["rigid", "mask", "vibration", "off"] = "rigid"
-    """`rigid`: each moving object has its own Gaussians and moves rigidly; `mask`: its pixels are
-    left out; `off`: boxes are ignored; `vibration`: Gaussians that come, move and go are learned
-    without boxes (PVG, arXiv 2311.18561). Exposures come from static points."""
+    """`rigid`: each moving object is a set of Gaussians that moves rigidly; `mask`: its pixels are
+    left out; `off`: boxes are ignored; `vibration`: Gaussians that appear, move and vanish are
+    learned without boxes (PVG, arXiv 2311.18561). Exposures come from static points."""
     margin: float = 0.15
-    """Width that boxes of left-out pixels gain on every side, scene units."""
+    """Margin around boxes whose pixels are left out, scene units."""
     least_views: int = 4
-    """Smallest number of training views of an object; the pixels of others are left out."""
+    """Smallest number of training views of an object; pixels of objects with fewer are left out."""
     least_points: int = 10
     """Smallest number of LiDAR points on an object, where the scene has LiDAR (ours)."""
     few_points: int = 300
-    """Smallest number of points of an object; else its box's surface gets as many (ours)."""
+    """Number of points below which an object gets as many more on the faces of its box (ours)."""
     voxel: float = 0.08
-    """Side of the cubes that keep one point of an object each, scene units (ours)."""
+    """Side of the cubes that each keep one point of an object, scene units (ours)."""
     most_points: int = 8000
     """Largest number of points of one object; the cubes grow as needed (ours)."""
     vibrating: int = 30_000
-    """Number of Gaussians that may move at the start, with `vibration` (ours)."""
+    """Number of vibrating Gaussians at the start of `vibration` (ours)."""
     vibration_life: float = 0.3
-    """Initial life of these before and after their peak, seconds (ours)."""
+    """Initial life of vibrating Gaussians before and after their peak, seconds (ours)."""
 
 
 @dataclass(frozen=True)
@@ -363,15 +364,15 @@ class InitConfig:
     shell: Literal["auto", "on", "off"] = "auto"
     """Far shell of Gaussians where views look past every seed point."""
     shell_count: int = 4000
-    """Number of directions on the whole sphere from which the shell is drawn."""
+    """Number of directions on the whole sphere from which Gaussians of the shell are chosen."""
     shell_radius: float = 30.0
-    """Radius of the shell, in radii of the cameras."""
+    """Radius of the shell, radii of the cameras."""
     dense: Literal["auto", "on", "off"] = "auto"
     """Seeds from optical flow (after EDGS, arXiv 2504.13204); `auto`: where seeds are few."""
     dense_points: int | None = None
-    """Largest number of these seeds; None leaves 40 % of the bound on the population for growth."""
+    """Largest number of seeds from optical flow; None: 60 % of the bound on the population."""
     dense_opacity: float = 0.5
-    """Initial peak opacity of these seeds (ours: BUILD_NOTES)."""
+    """Initial peak opacity of seeds from optical flow (ours: BUILD_NOTES)."""
 
 
 @dataclass(frozen=True)
@@ -381,9 +382,9 @@ class TrainConfig:
     steps: int = 2000
     """Number of optimisation steps, counted in views: a batch of B views is B steps."""
     batch: int = 1
-    """Number of views of an update; learning rates grow with its root (as Grendel-GS)."""
+    """Number of views of an update; learning rates grow with its square root (as Grendel-GS)."""
     budget_s: float | None = None
-    """Wall-clock limit of the whole run, as 90s, 20m or 1h30m; it decides the steps."""
+    """Wall-clock limit of the whole run, as 90s, 20m or 1h30m; it determines the steps."""
     seed: int = 0
     """Seed of all random choices."""
     coarse_to_fine: tuple[float, ...] = (0.25, 0.5)
@@ -391,9 +392,9 @@ class TrainConfig:
     sh_every: float = 1.0 / 30.0
     """Fraction of the run per spherical-harmonics degree (3DGS: 1000 steps of 30k)."""
     log_every: int = 10
-    """Number of steps between lines of the log; the host looks at the device as often."""
+    """Number of steps between lines of the log; the host reads the device's results as often."""
     checkpoint_every_s: float = 30.0
-    """Seconds between checkpoints; up to 20 times as many where they take over 1 % of the run."""
+    """Interval between checkpoints, s; up to 20 times longer if they take over 1 % of the run."""
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,10 @@
-"""Errors that a person can act on; the command line prints them without a traceback and exits 2."""
+"""Errors that the user can fix; the command line prints them without a traceback and exits 2."""
 
 
 class UserError(Exception):
     """Bad input or an impossible request.
 
-    The `message` says what is wrong with which file or option, `fix` what the person can do.
+    The `message` names the file or option and its fault, `fix` names the remedy.
     """
 
     def __init__(self, message: str, *, fix: str | None = None):
@@ -18,7 +18,7 @@ class UserError(Exception):
 
 
 class DivergenceError(UserError):
-    """A loss or a gradient stopped being finite; names the step, the term and the checkpoint."""
+    """A loss or a gradient is not finite; the message names step, term and checkpoint."""
 
 
 def broken(
@@ -26,5 +26,5 @@ def broken(
     why: object,
     fix: str = "get the file again: it is damaged or of another version",
 ) -> UserError:
-    """Return the error for a file that does not hold what it should; `why` follows its name."""
+    """Return the error for a damaged file; the fault `why` follows the name of the file."""
     return UserError(f"{source} {why}", fix=fix)

@@ -1,6 +1,6 @@
-"""Configurations made of others: presets, other values by name, some fields only, from JSON.
+"""Presets, and configurations with other values, with some fields only, or from JSON.
 
-A preset is a table of the fields in which it differs from `robust`, which is `FitConfig()`.
+A preset is a table of the fields that differ from `robust`, which is `FitConfig()`.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from p2gs_jax.errors import UserError
 Record = TypeVar("Record")
 Fields = dict[str, Any]
 
-# The method exactly as printed; BUILD_NOTES.md says what it does. The paper prints no rates for e
-# and gamma: 1e-2 is the best of 1e-3, 1e-2 and 3e-2 (24.4, 26.5 and 25.4 dB on training views).
+# The method exactly as printed (results: BUILD_NOTES.md). The paper prints no rates for e and
+# gamma: 1e-2 is the best of 1e-3, 1e-2 and 3e-2 (24.4, 26.5 and 25.4 dB on training views).
 PAPER: Fields = {
     "render.radiance": "linear",
     "render.blur": 0.3,
@@ -36,7 +36,7 @@ PAPER: Fields = {
     "loss.regularizers.log_exposure_mean": None,
     "loss.regularizers.gamma_mean_variance": None,
 }
-# The schedule, the rates and the renderer's limits that P2GS took over from 3DGS.
+# The schedule, the rates and the renderer's limits that P2GS shares with 3DGS.
 PUBLISHED: Fields = {
     "render.near": 0.2,
     "render.alpha_max": 0.99,
@@ -74,8 +74,8 @@ DISPLAY: Fields = {
     "photometry.freeze_until": 0.0,
     "loss.censored": False,
 }
-# The same under the schedule, renderer and budget of `robust`. Rates of the colours: the best of
-# three (BUILD_NOTES, "LDR splatting"), times four, unmeasured (BUILD_NOTES, "Rates").
+# The same with the schedule, renderer and budget of `robust`. Rates of colours are 4 times the best
+# of three (BUILD_NOTES, "LDR splatting"); the factor 4 was not measured (BUILD_NOTES, "Rates").
 LDR: Fields = DISPLAY | {
     "optimizer.sh_dc": 2e-2,
     "optimizer.sh_rest": 1e-3,
@@ -89,12 +89,12 @@ PRESETS: dict[PresetName, Fields] = {
     "3dgs_published": PUBLISHED | {"render.blur": 0.3} | DISPLAY,
     "3dgs_gain": LDR | {"photometry.model": "view_exposure"},
     "3dgs_affine": LDR | {"photometry.appearance": "affine"},
-    # The published rate of 2e-3 over 30,000 steps leaves grids short of exposures that spread wide
-    # (BUILD_NOTES, "Learned corrections at size"): they keep 1e-2.
+    # Published rate: 2e-3 over 30,000 steps, at which grids do not reach widely spread exposures
+    # (BUILD_NOTES, "Learned corrections at size"); ours is 1e-2.
     "3dgs_bilateral": LDR | {"photometry.appearance": "bilateral"},
     "3dgs_curve": LDR | {"photometry.appearance": "curve"},
-    # PPISP without its controller. Published rate: 2e-3 over 30,000 steps; ours: for fits of some
-    # hundred to some thousand (BUILD_NOTES, "PPISP").
+    # PPISP without its controller. Published rate: 2e-3 over 30,000 steps; ours suits fits of a few
+    # hundred to a few thousand steps (BUILD_NOTES, "PPISP").
     "ppisp": LDR
     | {
         "photometry.appearance": "ppisp",
@@ -103,7 +103,7 @@ PRESETS: dict[PresetName, Fields] = {
         "optimizer.appearance_final": 0.01,
         "optimizer.appearance_warmup": 500 / 30_000,
     },
-    # What PPISP models, solved beforehand: neither chosen nor learned from nothing.
+    # PPISP's effects of a camera, solved before the fit in our model; no model is chosen.
     "ppisp_solved": {
         "photometry.select": False,
         "photometry.model": "view_exposure",
@@ -112,8 +112,8 @@ PRESETS: dict[PresetName, Fields] = {
         "photometry.vignetting": "channel",
         "photometry.responses": "camera",
     },
-    # Luminance-GS's curves. Published: 10,000 steps, rates that decay to a hundredth. The rate is
-    # ours: ten times the published one of the curve, for fits of some hundred to some thousand.
+    # Luminance-GS's curves. Published: 10,000 steps, rates that decay to 1 %. Our rate is 10 times
+    # the published rate of the curve, for fits of a few hundred to a few thousand steps.
     "luminance_gs": LDR
     | {"photometry.appearance": "luminance", "optimizer.appearance_final": 0.01},
 }
@@ -122,8 +122,9 @@ PRESETS: dict[PresetName, Fields] = {
 def preset(name: PresetName) -> FitConfig:
     """Return the configuration of a preset.
 
-    `robust`; `paper` (as printed, lambda_exp 0.01) or `paper_appendix` (0.1); baselines that splat
-    display values (`3dgs...`, `ppisp`, `luminance_gs`); `ppisp_solved` (docs/baselines.md).
+    The presets are `robust`; `paper` (as printed, lambda_exp 0.01) and `paper_appendix` (0.1);
+    baselines on display values (`3dgs...`, `ppisp`, `luminance_gs`); `ppisp_solved`
+    (docs/baselines.md).
 
     Raises:
         UserError: there is no such preset.
@@ -135,42 +136,42 @@ def preset(name: PresetName) -> FitConfig:
 
 
 def require_config(cfg: FitConfig | None) -> FitConfig:
-    """Return a configuration as it was given; None takes `robust`.
+    """Return the configuration, or `robust` for None.
 
     Raises:
-        UserError: it is something else, such as the name of a preset.
+        UserError: `cfg` is something else, such as the name of a preset.
     """
     if cfg is None:
         return FitConfig()
     if not isinstance(cfg, FitConfig):
         fix = 'give a FitConfig, for example p2gs_jax.preset("robust")'
-        raise UserError(f"{cfg!r} is no configuration.", fix=fix)
+        raise UserError(f"{cfg!r} is not a FitConfig.", fix=fix)
     return cfg
 
 
-def narrowed(record: Record, taken: Mapping[str, Any]) -> Record:
+def narrowed(record: Record, fields: Mapping[str, Any]) -> Record:
     """Return a configuration with some of its fields only; reading another raises AttributeError.
 
-    What is compiled for them is shared by all configurations that agree in these fields, and
-    nothing can depend on one that was forgotten. `taken` says by the name of a field what of it is
-    taken: None for all, the names of its fields, or again a mapping like this.
+    All configurations that agree in these fields share one compiled program, which cannot depend
+    on any other field. `fields` maps the name of a field to None (all of it), to the names of its
+    fields, or to another such mapping.
     """
-    values = {name: getattr(record, name) for name in taken}
-    for name, inner in taken.items():
+    values = {name: getattr(record, name) for name in fields}
+    for name, inner in fields.items():
         if inner is not None:
             inner = inner if isinstance(inner, Mapping) else dict.fromkeys(inner)
             values[name] = narrowed(values[name], inner)
     kind: Any = type(record)
     hidden = {f.name: property() for f in dataclasses.fields(kind) if f.name not in values}
-    # As a tuple it is equal to another where the fields are.
+    # A named tuple compares by its fields.
     bases = (namedtuple(kind.__name__, values), kind)
     return type(kind.__name__, bases, hidden | {"__init__": object.__init__})(**values)
 
 
 def with_values(record: Record, values: Mapping[str, Any]) -> Record:
-    """Return a configuration with other values, by dotted names of fields; nothing is checked."""
-    for place, value in values.items():
-        name, _, inner = place.partition(".")
+    """Return a configuration with other values, by dotted names of fields, without checks."""
+    for path, value in values.items():
+        name, _, inner = path.partition(".")
         if inner:
             value = with_values(getattr(record, name), {inner: value})
         record = dataclasses.replace(record, **{name: value})  # pyright: ignore
@@ -178,12 +179,12 @@ def with_values(record: Record, values: Mapping[str, Any]) -> Record:
 
 
 def to_dict(config: FitConfig) -> dict:
-    """Return nested plain values, as saved in `config.json`."""
+    """Return the configuration as nested plain values, as in `config.json`."""
     return dataclasses.asdict(config)
 
 
 def flat(options: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return nested values by dotted names."""
+    """Return nested values as one dictionary by dotted names."""
     out: dict[str, Any] = {}
     for name, value in options.items():
         nested = isinstance(value, dict)
@@ -214,10 +215,10 @@ def from_dict(values: Mapping[str, Any], kind: Any = FitConfig) -> Any:
 
 
 def camera_formations(values: Sequence[dict]) -> tuple[CameraFormation, ...]:
-    """Return cameras as `dataclasses.asdict` and JSON left them.
+    """Rebuild cameras from the result of `dataclasses.asdict`, also after JSON.
 
     Raises:
-        KeyError, TypeError, ValueError: something is missing or of another kind.
+        KeyError, TypeError, ValueError: a field is missing or of another type.
     """
     return tuple(
         CameraFormation(

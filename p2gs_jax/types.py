@@ -1,9 +1,9 @@
-"""Every record that travels through the program, on one page.
+"""Every record that several packages share, on one page.
 
 Device records are `equinox.Module` pytrees; host records are frozen dataclasses of numpy arrays.
 
 Conventions (docs/conventions.md): OpenCV camera axes (x right, y down, z forward), world-to-camera
-`viewmats`, pixel centres at +0.5 as COLMAP, lengths in scene units (metres where the source is
+`viewmats`, pixel centres at +0.5 as in COLMAP, lengths in scene units (metres where the source is
 metric), radiance linear and relative to the gauge of `Photometry`, LDR in [0, 1].
 """
 
@@ -20,7 +20,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Float32, Float64, Int, UInt, UInt8
 
 if not TYPE_CHECKING:
-    # Device records may hold arrays and single numbers of the host; type checkers need not know.
+    # Device records may also hold host arrays and scalars; type checkers see only device arrays.
     Array = Array | np.ndarray | np.generic
 
 Split = Literal["train", "test"]
@@ -28,12 +28,12 @@ AlphaUse = Literal["background", "mask", "ignore"]
 
 
 def _namespace(values) -> Any:
-    """Return numpy for host arrays, which are computed with before and after a fit; else JAX."""
+    """Return numpy for host arrays, as used before and after a fit, and JAX for all others."""
     return np if isinstance(values, np.ndarray) else jnp
 
 
 def _at_least(values, floor: float) -> Any:
-    """Return values, or the floor where they are below it; the gradient is 1 there as well."""
+    """Return the larger of each value and the floor; the gradient is 1 in both cases."""
     if isinstance(values, np.ndarray):
         return np.maximum(values, floor)
     return jnp.where(values > floor, values, floor + (values - lax.stop_gradient(values)))
@@ -45,10 +45,10 @@ LUMINANCE = (0.299, 0.587, 0.114)
 
 
 class Vibration(eqx.Module):
-    """How Gaussians come, move and go (render/project.py)."""
+    """Motion and lifetime of Gaussians (render/project.py)."""
 
-    velocities: Float[Array, "n 3"]  # at the peak, scene units per second
-    peaks: Float[Array, " n"]  # when each is most opaque, seconds from the middle of the drive
+    velocities: Float[Array, "n 3"]  # velocity at the peak, scene units per second
+    peaks: Float[Array, " n"]  # time of the largest opacity, seconds from the middle of the drive
     log_lives: Float[Array, " n"]  # log standard deviations of the opacity over time, log seconds
 
 
@@ -61,7 +61,7 @@ class Gaussians(eqx.Module):
         log_scales: log standard deviations along the rotated axes, log scene units.
         opacity_logits: logits of the peak opacity.
         sh: spherical-harmonics coefficients, K = (degree + 1)^2, of pre-activation radiance.
-        vibration: how they change with time; None: they do not, and nothing is paid for it.
+        vibration: motion and lifetime; None: the Gaussians are static.
     """
 
     means: Float[Array, "n 3"]
@@ -78,14 +78,14 @@ class Gaussians(eqx.Module):
 
 
 class Capture(eqx.Module):
-    """What one photograph did to the light; of loose pixels, what each one's photograph did.
+    """Photometric parameters of one photograph, or of the photograph of each of some pixels.
 
     Attributes:
         exposure: e > 0.
         gamma: > 0.
-        white_balance: log factors on red, green, blue beside e, mean 0; None: all 1.
-        camera: row in `PhotometryConfig.cameras`, -1 for a camera that is not there; None where no
-            camera does anything of its own.
+        white_balance: log factors on red, green, blue beside e, mean 0; None: all factors are 1.
+        camera: row in `PhotometryConfig.cameras`, -1 for a camera without a row; None where no
+            camera has vignetting or a response curve.
     """
 
     exposure: Float[Array, "*m"]
@@ -95,15 +95,15 @@ class Capture(eqx.Module):
 
 
 class Photometry(eqx.Module):
-    """What each camera did to the light: an exposure and a gamma for every training view.
+    """Photometric parameters of the training views: exposure, gamma and white balance.
 
     Attributes:
-        raw_exposures: exposures as the optimiser sees them: log e (`log`) or e (`linear`).
-        raw_gammas: gammas likewise: log(gamma / 2.2) (`log`) or gamma (`linear`).
+        raw_exposures: parameters of the optimiser: log e (`log`) or e (`linear`).
+        raw_gammas: parameters of the optimiser: log(gamma / 2.2) (`log`) or gamma (`linear`).
         parameterization: `log` keeps both positive by construction; `linear` is the paper's.
-        raw_white_balance: log factors on the channels; their mean does not count (exposures hold
-            it). None where the white balance does not vary: it then costs nothing.
-        cameras: the row of each view in `PhotometryConfig.cameras`; None where that is empty.
+        raw_white_balance: log factors on the channels; their mean has no effect, because exposures
+            hold it. None where the white balance does not vary.
+        cameras: row of each view in `PhotometryConfig.cameras`; None where that is empty.
     """
 
     raw_exposures: Float[Array, " v"]
@@ -121,7 +121,7 @@ class Photometry(eqx.Module):
 
     @property
     def log_exposures(self) -> Float[Array, " v"]:
-        """Logarithms of the exposures, also of those that are no normal numbers of float32."""
+        """Logarithms of the exposures, also of those outside the normal range of float32."""
         if self.parameterization == "log":
             return self.raw_exposures
         return _namespace(self.raw_exposures).log(self.exposures)
@@ -140,7 +140,7 @@ class Photometry(eqx.Module):
         return None if raw is None else raw - raw.mean(axis=1, keepdims=True)
 
     def capture(self, row: Int[Array, "..."] | int) -> Capture:
-        """Return what the training view in a row did to the light; rows give it for each."""
+        """Return the photometric parameters of the training view in a row, or in several rows."""
         balance = self.white_balance
         camera = None
         if self.cameras is not None:
@@ -160,11 +160,11 @@ class Params(eqx.Module):
 
 
 class Placement(eqx.Module):
-    """Where the moving objects are in one view."""
+    """Poses of the moving objects in one view, and its time."""
 
-    # box-to-camera of each, OpenCV axes; what is not there is behind the camera
+    # box-to-camera of each object, OpenCV axes; absent objects are behind the camera
     viewmats: Float[Array, "k 4 4"]
-    # of the view, seconds from the middle of the drive, where Gaussians vibrate
+    # time of the view, seconds from the middle of the drive; None where no Gaussian vibrates
     time: Float[Array, ""] | None = None
 
 
@@ -172,11 +172,11 @@ class Camera(eqx.Module):
     """A pinhole camera.
 
     Attributes:
-        viewmat: world-to-camera, OpenCV axes; or of each Gaussian its own, from `camera_of_each`.
+        viewmat: world-to-camera, OpenCV axes; or one matrix per Gaussian, from `camera_of_each`.
         K: intrinsics in pixels, pixel centres at +0.5.
         width: pixels, static.
         height: pixels, static.
-        objects: where moving objects are; None: it shows none of them.
+        objects: poses of moving objects; None: the camera shows none.
     """
 
     viewmat: Float[Array, "4 4"] | Float[Array, "4 4 n"]
@@ -187,7 +187,7 @@ class Camera(eqx.Module):
 
 
 class Frustum(eqx.Module):
-    """A camera whose image size is data: what is done per Gaussian is compiled once for all sizes.
+    """A camera whose image size is traced: per-Gaussian programs compile once for all sizes.
 
     Attributes are those of `Camera`.
     """
@@ -208,7 +208,7 @@ class Splats2D(eqx.Module):
 
     means2d: Float[Array, "n 2"]  # projected centres, pixels
     conic_factor: Float[Array, "n 3"]  # (a11, a12, a22), 1 / pixels
-    # (Sxx, Syy) of the 2D covariance, pixels^2: the extent of the box
+    # (Sxx, Syy) of the 2D covariance, pixels^2; they give the extent of the bounding box
     cov_diagonal: Float[Array, "n 2"]
     log_opacities: Float[Array, " n"]  # log peak opacity (-100 where not visible)
     depths: Float[Array, " n"]  # z in the camera, scene units
@@ -216,12 +216,12 @@ class Splats2D(eqx.Module):
 
 
 class TileList(eqx.Module):
-    """Which Gaussians each tile composites, in depth order, as one flat list."""
+    """The Gaussians that each tile composites, in depth order, as one flat list."""
 
     gaussian_ids: Int[Array, " m"]  # ids sorted by (tile, depth), padded to the capacity M
     # start of every tile in `gaussian_ids`; the last is the number of entries used
     offsets: Int[Array, " t1"]
-    count: Int[Array, ""]  # what the capacity must hold for the list to be complete
+    count: Int[Array, ""]  # number of entries of the complete list
     # count > M; the list is then incomplete and the result must be discarded
     overflow: Bool[Array, ""]
 
@@ -232,11 +232,11 @@ class Render(eqx.Module):
     Attributes:
         linear: linear HDR radiance, premultiplied by alpha, before `RenderConfig.background`.
         alpha: accumulated opacity in [0, 1].
-        depth: alpha-weighted camera z; divide by alpha for the expected depth. None if it was
-            not asked for.
-        count: tile-list entries this view needed.
-        overflow: the tile list did not fit: discard this render and grow the capacity.
-        visible: which Gaussians were in the image.
+        depth: alpha-weighted camera z; divided by alpha it is the expected depth. None if it was
+            not requested.
+        count: number of tile-list entries that this view needs.
+        overflow: the tile list did not fit: discard this render and increase the capacity.
+        visible: which Gaussians are in the image.
     """
 
     linear: Float[Array, "h w 3"]
@@ -248,21 +248,21 @@ class Render(eqx.Module):
 
 
 class Population(eqx.Module):
-    """Which slots are alive, and the statistics densification needs; never differentiated."""
+    """Slots in use and the statistics for densification; never differentiated."""
 
     alive: Bool[Array, " n"]  # slots in use
-    # summed norms of the screen-space mean gradients, in units of half the image
+    # summed norms of the screen-space mean gradients, units of half the image
     grad2d_sum: Float[Array, " n"]
     seen_count: Float[Array, " n"]  # number of views that contributed to `grad2d_sum`
-    # row of the moving object in whose box frame a Gaussian lives, -1: in the world; None where
-    # nothing moves
+    # row of the moving object to whose box a Gaussian is attached, -1: none; None where nothing
+    # moves
     owner: Int[Array, " n"] | None = None
 
 
 class Measured(eqx.Module):
-    """Depths that a laser scanner measured in a view: camera z, scene units, 0 fills the list up.
+    """Depths of LiDAR points in a view: camera z, scene units; padding is 0.
 
-    `places` say where in the image, as shares of its width and height.
+    `places` are positions in the image, as shares of its width and height.
     """
 
     places: Float[Array, "k 2"]
@@ -273,16 +273,16 @@ class Batch(eqx.Module):
     """One training view on the device."""
 
     camera: Camera  # its camera, at the resolution of `ldr`
-    # the photograph, display-encoded: in [0, 1], or integers of which the largest is 1
+    # the photograph, display-encoded: floats in [0, 1], or integers whose largest value is 1
     ldr: Float[Array, "h w 3"] | UInt[Array, "h w 3"]
     mask: Float[Array, "h w"] | Bool[Array, "h w"]  # 1 = use, 0 = ignore
     view_index: Int[Array, ""]  # its row in `Photometry`
-    measured: Measured | None = None  # depths for the loss, or None where it asks for none
-    # opacity of the photograph, stored as `ldr`, which is then premultiplied by it; None: the scene
-    # is shown over no background
+    measured: Measured | None = None  # depths for the loss, or None where the loss has no such term
+    # opacity of the photograph, stored as `ldr`, which is then premultiplied by it; None: there is
+    # no background
     alpha: Float[Array, "h w"] | UInt[Array, "h w"] | None = None
-    backdrop: Float[Array, " 3"] | None = None  # display values of that background, or None
-    # width and height of the photograph, which fills the upper left of a larger canvas; None: all
+    backdrop: Float[Array, " 3"] | None = None  # display values of the background, or None
+    # width and height of the photograph in the upper left of a larger canvas; None: it fills it
     size: Float[Array, " 2"] | None = None
 
 
@@ -303,48 +303,48 @@ class Distortion:
 
 @dataclass(frozen=True)
 class View:
-    """One photograph and how it was taken."""
+    """One photograph, its file and its camera."""
 
     name: str  # path relative to the image folder; views are sorted by it
-    image_path: Path  # where the pixels are
-    camera: str  # name of the physical camera that took it ("0", "front_left")
+    image_path: Path  # file with the pixels
+    camera: str  # name of the physical camera ("0", "front_left")
     viewmat: Float[np.ndarray, "4 4"]  # world-to-camera, OpenCV axes
     # pinhole intrinsics of the *undistorted* image, at `width` x `height`
     K: Float32[np.ndarray, "3 3"]
     width: int  # pixels
     height: int  # pixels
-    distortion: Distortion | None = None  # what to remove on load, or None
+    distortion: Distortion | None = None  # distortion that is removed on load, or None
     mask_path: Path | None = None  # optional mask (0 = ignore)
     exif_ev: float | None = None  # log2(time * ISO / N^2) from EXIF, up to a constant, or None
     split: Split = "train"  # `train` or `test`
     frame: int | None = None  # its number in a drive, the same for all cameras, or None
     time: float | None = None  # seconds on the clock of `Scene.objects` and `Scene.lidar`, or None
-    # where the photograph shows the car that carries the camera, at any resolution; the same for
-    # all photographs of a camera; None: nowhere that is known of
+    # pixels that show the car with the camera, at any resolution; the same for all photographs of
+    # a camera; None: no such pixels are known
     own_car: Bool[np.ndarray, "a b"] | None = None
-    alpha: AlphaUse = "mask"  # what its alpha channel means, if it has one (`DataConfig.alpha`)
+    alpha: AlphaUse = "mask"  # meaning of its alpha channel, if it has one (`DataConfig.alpha`)
 
 
 @dataclass(frozen=True)
 class TrackedObject:
-    """A rigid thing that somebody followed through a drive, as a box."""
+    """A rigid object that a data set tracks through a drive as a box."""
 
-    name: str  # of its track in the data set
-    label: str  # what it is, in the data set's words ("Car")
+    name: str  # name of its track in the data set
+    label: str  # its class in the data set ("Car")
     # length (x, forward), width (y, left), height (z, up) of the box, scene units
     size: tuple[float, float, float]
-    times: Float64[np.ndarray, " k"]  # seconds, rising
-    # box to world at these times; the origin is the middle of the box
+    times: Float64[np.ndarray, " k"]  # seconds, ascending
+    # box to world at these times; the origin is the centre of the box
     poses: Float64[np.ndarray, "k 4 4"]
-    moving: bool  # it moves at some time
+    moving: bool  # the object moves at some time
 
 
 @dataclass(frozen=True)
 class Lidar:
-    """What laser scanners measured, as it was measured: not thinned to one point a place.
+    """All measurements of the laser scanners of a drive.
 
-    Points are in world coordinates at their own time, seconds; `objects` is the row in
-    `Scene.objects` of the moving object that a point lies on, -1: on none.
+    Points are in world coordinates at the time of their measurement, seconds; `objects` is the row
+    in `Scene.objects` of the moving object that a point lies on, -1: on none.
     """
 
     points: Float32[np.ndarray, "l 3"]
@@ -366,26 +366,26 @@ class Tracks:
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything a fit starts from.
+    """The input of a fit, as read from any format.
 
     Attributes:
-        root: the folder the user named.
-        format: which reader produced it.
+        root: folder that the user named.
+        format: name of the format.
         views: sorted by name.
         points: seed points, scene units.
-        point_colors: their display-encoded colours; None: photographs have to tell.
+        point_colors: their display-encoded colours; None: they are sampled from photographs.
         tracks: observations of the points, or None.
         notes: messages of the reader for the user (skipped frames, unregistered images, ...).
-        objects: tracked things, moving or not.
+        objects: tracked objects, moving or not.
         lidar: measurements with their times, or None.
-        origin: position of our origin in the data set's world, scene units: float32 needs the
-            drive near it.
-        split_by: what decided which views are held out, in words; readers name the file where the
-            data set decides, or None.
-        random_seeds: the points were drawn at random: they say nothing of surfaces.
+        origin: position of our origin in the data set's world, scene units; it is near the drive,
+            because float32 is coarse far away.
+        split_by: source of the held-out views, in words; readers name the file if the data set has
+            a split, or None.
+        random_seeds: the points were drawn at random and do not lie on surfaces.
         depths: nearest and farthest camera z that the data set states, scene units, or None.
-        known_response: what the photographs are, where display values are known to be light encoded
-            as sRGB (`camera raw`); None: a camera's own curve is in them.
+        known_response: kind of the photographs if display values are known to be light encoded as
+            sRGB (`camera raw`); None: the camera's tone curve is unknown.
     """
 
     root: Path
