@@ -1,7 +1,7 @@
 """Charts of the pages: matplotlib's SVG in the font and the colours of the page.
 
-Series differ by marker and line as well as by colour. matplotlib draws in placeholder colours; in
-the page they are variables of the style sheet, so that charts follow its light or dark theme.
+Curves differ by marker and line style as well as by colour. matplotlib draws in placeholder
+colours. The page replaces them by variables of its style sheet, so that charts follow its theme.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from p2gs_jax.core.text import names_as_they_are, printable
 
 # Width of the charts, CSS pixels; one point of matplotlib is one pixel.
 WIDTH = 860
-# Half of the window of a running median, in shares of the run.
+# Half the window of a running median, as a share of the run.
 SMOOTHING = 0.01
-# Placeholders that matplotlib draws with, and the variables that the page has for them.
+# Placeholder colours of matplotlib, and the variables of the style sheet that replace them.
 INK, MUTED, GRID, PAPER = "#100001", "#100002", "#100003", "#100008"
 FIRST, SECOND, THIRD, FOURTH = COLORS = ("#100004", "#100005", "#100006", "#100007")
 VARIABLES = {INK: "--ink", MUTED: "--muted", GRID: "--grid", PAPER: "--paper"}
@@ -55,21 +55,21 @@ for _axis in ("xtick", "ytick"):
     RC |= {f"{_axis}.color": MUTED, f"{_axis}.labelcolor": MUTED, f"{_axis}.major.size": 0}
 
 _NUMBERS = itertools.count(1)
-# Keywords of matplotlib for exposures, by their source.
+# Keywords of matplotlib for exposures, by their source. Line styles are as in `summary.png`.
 OPEN = {"linestyle": "", "markerfacecolor": PAPER}
 SOURCES: dict[str, dict[str, Any]] = {
-    "found": {"color": FIRST, "marker": "o", "zorder": 4},
-    "held out": {"color": FIRST, "marker": "D", "zorder": 3, **OPEN},
+    "recovered": {"color": FIRST, "marker": "o", "zorder": 4},
+    "held-out view": {"color": FIRST, "marker": "D", "zorder": 3, **OPEN},
     "EXIF": {"color": SECOND, "marker": "x", "linestyle": ":"},
-    "true": {"color": THIRD, "marker": "+", "linestyle": "--", "zorder": 5},
+    "true": {"color": INK, "marker": "+", "linestyle": "--", "zorder": 5},
 }
 
 
 @dataclass(frozen=True)
 class Series:
-    """A named curve; `y` is NaN where there is no value, `error` has half lengths of error bars.
+    """A named curve: `y` is NaN where a value is missing, `error` holds half lengths of error bars.
 
-    `style` are keywords of matplotlib's lines.
+    `style` holds keywords of matplotlib's lines.
     """
 
     label: str
@@ -90,8 +90,7 @@ def _chart(
 ) -> str:
     """Return a chart as HTML: `draw` fills its axes, each `height` CSS pixels high.
 
-    The panels have a common x axis, and, where it is `shared`, y axis; `label` is the text
-    alternative.
+    All panels have one x axis, and one y axis if `shared`. `label` is the text alternative.
     """
     with names_as_they_are(), matplotlib.rc_context(RC):
         size = (WIDTH / 72, (rows * height + 40) / 72)
@@ -104,7 +103,7 @@ def _chart(
 
 
 def _markup(figure: Figure, label: str) -> str:
-    """Return the SVG element, with ids that no other chart has and the page's colours and font."""
+    """Return the SVG element with unique ids and with the colours and the font of the page."""
     buffer = io.StringIO()
     metadata = {"Date": None, "Creator": None, "Format": None, "Type": None}
     figure.savefig(buffer, format="svg", metadata=metadata)
@@ -122,7 +121,7 @@ def _markup(figure: Figure, label: str) -> str:
     view_box = re.search(r'viewBox="[^"]*"', opening)
     assert view_box is not None
     named = f'role="img" aria-label="{html.escape(label, quote=True)}"'
-    # No width and height: the style sheet gives it the width of its column.
+    # The style sheet sets the width, so the element has neither width nor height.
     return f"<svg {view_box[0]} {named}>" + re.sub(r"\n\s*", "\n", rest)
 
 
@@ -131,7 +130,7 @@ def _font(match: re.Match[str]) -> str:
 
 
 def _legend(axes: Axes, labels: Sequence[str]) -> None:
-    """Name the lines that have a label, to the right of the axes, in their order."""
+    """Draw a legend of the labelled lines, in their order, to the right of the axes."""
     named = [
         (line, printable(name)) for line, name in zip(axes.containers, labels, strict=True) if name
     ]
@@ -141,7 +140,7 @@ def _legend(axes: Axes, labels: Sequence[str]) -> None:
 
 
 def _draw(axes: Axes, series: Sequence[Series], size: float) -> None:
-    """Draw curves with markers of a size; lines break where a value is missing."""
+    """Draw curves with markers of `size` points; lines break where a value is missing."""
     for s in series:
         axes.errorbar(s.x, s.y, s.error, **{"markersize": size, "linewidth": 1.5, **s.style})
     _legend(axes, [s.label for s in series])
@@ -156,10 +155,10 @@ def panels_chart(
     band: float | None = None,
     height: float = 150,
 ) -> str:
-    """Return panels above each other, each with a title and curves, on common axes.
+    """Return a column of panels, each with a title and curves, on common axes.
 
-    Labels of axes have their units; `label` is the text alternative; `band` a horizontal line. A
-    panel is `height` CSS pixels high.
+    Axis labels contain their units. `label` is the text alternative. `band` is the height of a
+    horizontal line. Each panel is `height` CSS pixels high.
     """
     longest = max((len(s.x) for _, series in panels for s in series), default=1)
 
@@ -185,9 +184,9 @@ def training_chart(
     *,
     label: str,
 ) -> str:
-    """Return PSNR (dB), losses by name, and numbers of Gaussians over the steps.
+    """Return curves of PSNR (dB), losses (by name), and the number of Gaussians over the steps.
 
-    `marks` are steps at which something changes.
+    `marks` are the steps with a dotted vertical line.
     """
     window = max(3, 2 * round(SMOOTHING * len(steps)) + 1)
 
@@ -202,7 +201,7 @@ def training_chart(
     ]
 
     def draw(rows: list[Axes]) -> None:
-        titles = ("PSNR on the training views, dB", "Loss and its largest terms", "Gaussians")
+        titles = ("PSNR on training views, dB", "Loss and its largest terms", "Number of Gaussians")
         rows[0].plot(steps, psnr, color=FIRST, alpha=0.35, linewidth=0.8)
         rows[0].plot(steps, smooth(psnr), color=FIRST, linewidth=2)
         rows[1].set_yscale("log")

@@ -20,7 +20,7 @@ from p2gs_jax.synth.sensor import read_true_exposures
 
 
 class TableRow(NamedTuple):
-    """A name with its unit; text for every run, empty where it has none; the runs that are best."""
+    """A row: its name with unit, a text (or "") for each run, and the indices of the best runs."""
 
     name: str
     cells: tuple[str, ...]
@@ -29,11 +29,12 @@ class TableRow(NamedTuple):
 
 @dataclass(frozen=True)
 class Comparison:
-    """Several runs, in the order given, side by side, each with a short label of its own.
+    """Several runs side by side, in the given order, each with a short unique label.
 
-    Remarks are sentences on what cannot be compared; scores compare where the scene is the same.
-    Options are those that differ. Of later runs `apart` has the label, the RMS difference of their
-    exposures from the first run's, stops, means removed, and the number of views that both have.
+    `remarks` are sentences on results that cannot be compared. Scores compare only if the scene is
+    the same. `options` holds the options that differ. `apart` has an entry for each later run: its
+    label, the RMS difference of its exposures from the first run's after removing the means
+    (stops), and the number of common views.
     """
 
     runs: tuple[RunFiles, ...]
@@ -52,15 +53,15 @@ class Comparison:
 
     @property
     def sentences(self) -> list[str]:
-        """What is said about exposures of the later runs."""
+        """Sentences on the exposures of the later runs."""
         return [
-            f"Exposures of {label} and {self.labels[0]} differ by {rms:.3f} stops (RMS over "
+            f"The exposures of {label} and {self.labels[0]} differ by {rms:.3f} stops (RMS over "
             f"{count} views, means removed)."
             for label, rms, count in self.apart
         ]
 
 
-# Where `metrics.json` has the numbers of the table; the last part says how they are shown.
+# Paths in `metrics.json` of the numbers of the table; the last part determines their digits.
 NUMBERS: dict[str, tuple[str, ...]] = {
     "Gaussians": ("counts", "gaussians"),
     "steps": ("counts", "steps"),
@@ -71,9 +72,9 @@ NUMBERS: dict[str, tuple[str, ...]] = {
     "held-out PSNR, fitted exposure, dB": ("test", "exposure_fitted", "psnr"),
     "held-out SSIM, fitted exposure": ("test", "exposure_fitted", "ssim"),
     "held-out LPIPS, fitted exposure": ("test", "exposure_fitted", "lpips"),
-    "held-out PSNR, all fitted that varies per view, dB": ("test", "photometry_fitted", "psnr"),
+    "held-out PSNR, fitted photometry, dB": ("test", "photometry_fitted", "psnr"),
     "reference PSNR, one scale, dB": ("reference", "scale_aligned", "psnr"),
-    "reference PSNR, held out, one scale, dB": ("reference", "scale_aligned", "test", "psnr"),
+    "held-out reference PSNR, one scale, dB": ("reference", "scale_aligned", "test", "psnr"),
     "radiance error, median, stops": ("radiance", "stops_median"),
     "radiance error, RMS, stops": ("radiance", "stops_rms"),
     "HDR inconsistency (HIS) of the renders": ("consistency", "per_view", "his"),
@@ -85,28 +86,28 @@ BETTER |= dict.fromkeys(("lpips", "stops_median", "stops_rms", "ev"), min)
 
 
 def compare_runs(folders: Sequence[str | Path]) -> Comparison:
-    """Read and compare runs; a UserError says that there is but one, or which is not a run."""
+    """Read and compare runs; a UserError reports fewer than two runs, or a folder without a run."""
     if len(folders) < 2:
-        fix = "name two run folders or more: p2gs-jax compare RUN_A RUN_B"
+        fix = "name at least two run folders: p2gs-jax compare RUN_A RUN_B"
         raise UserError(f"there {'is one run' if folders else 'are no runs'} to compare.", fix=fix)
     runs = tuple(read_run(Path(folder)) for folder in folders)
     labels = tuple(_labels([run.folder for run in runs]))
     same = all(_same_scene(runs[0], run) for run in runs[1:])
-    remarks = [f"{n}: {why}" for n, run in zip(labels, runs, strict=True) for why in run.missing]
+    remarks = [f"{n}: {text}" for n, run in zip(labels, runs, strict=True) for text in run.missing]
     if not same:
         names = ", ".join(dict.fromkeys(str(run.scene) for run in runs))
-        why = (
-            f"The runs are of different scenes ({names}): their scores do not compare, and "
-            "exposures and views are not held against each other."
+        remark = (
+            f"The runs are of different scenes ({names}). Their scores are not comparable, and "
+            "their exposures are not compared."
         )
-        remarks.insert(0, why)
+        remarks.insert(0, remark)
     apart = tuple(_apart(runs, labels)) if same else ()
     scores, options = tuple(_scores(runs, same)), tuple(_options(runs))
     return Comparison(runs, labels, tuple(remarks), same, scores, options, apart)
 
 
 def _labels(folders: list[Path]) -> list[str]:
-    """Return the last parts of paths, as many as it takes to tell them apart."""
+    """Return the last parts of the paths, as many as make them distinct."""
     parts = [folder.resolve().parts for folder in folders]
     for depth in range(1, max(map(len, parts)) + 1):
         names = ["/".join(p[-depth:]).replace("//", "/") for p in parts]
@@ -116,14 +117,14 @@ def _labels(folders: list[Path]) -> list[str]:
 
 
 def _same_scene(first: RunFiles, other: RunFiles) -> bool:
-    """Return whether two runs are of one scene: one folder, or the same held-out photograph."""
+    """Return whether two runs share the scene folder or have the same held-out photograph."""
     if first.scene.resolve() == other.scene.resolve():
         return True
-    there = {h.name: h.photograph for h in other.held_out}
-    for mine in first.held_out:
-        if mine.name in there:
+    others = {h.name: h.photograph for h in other.held_out}
+    for view in first.held_out:
+        if view.name in others:
             try:
-                a, b = read_display(mine.photograph), read_display(there[mine.name])
+                a, b = read_display(view.photograph), read_display(others[view.name])
             except UserError:
                 continue
             return a.shape == b.shape and np.array_equal(a, b)
@@ -132,7 +133,7 @@ def _same_scene(first: RunFiles, other: RunFiles) -> bool:
 
 def _scores(runs: Sequence[RunFiles], same: bool) -> list[TableRow]:
     def numbers(name: str, values: Sequence[float | None], key: str) -> list[TableRow]:
-        """Return a line, or none where no run has the number."""
+        """Return one row, or no row if no run has the number."""
         known = [v for v in values if v is not None]
         form = f",.{DIGITS.get(key, 0)}f"
         cells = tuple("" if v is None else format(v, form) for v in values)
@@ -183,7 +184,7 @@ def _apart(runs: Sequence[RunFiles], labels: Sequence[str]) -> Iterator[tuple[st
 
 
 def to_markdown(found: Comparison) -> str:
-    """Return the tables as Markdown, the best scores starred."""
+    """Return the tables as Markdown, with a star behind the best scores."""
     parts = [escaped(remark) for remark in found.remarks]
     for title, rows in found.tables.items():
         cells = [[r.name, *starred(r)] for r in rows]
@@ -192,5 +193,5 @@ def to_markdown(found: Comparison) -> str:
 
 
 def starred(row: TableRow) -> list[str]:
-    """Return the cells of a row; a star follows those of the best runs."""
+    """Return the cells of a row, with a star behind those of the best runs."""
     return [f"{c} *" if i in row.best else c or "-" for i, c in enumerate(row.cells)]

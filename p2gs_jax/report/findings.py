@@ -1,4 +1,4 @@
-"""The results of a run in sentences: what it modelled, and warnings that say what to do."""
+"""The results of a run in sentences: the photometric model, and warnings with remedies."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CURVES = {
     "srgb": "the sRGB tone curve",
     "power": "a power-law tone curve",
     "spline": "a tone curve fitted to this camera",
-    "linear": "no tone curve: display values are splatted as they are",
+    "linear": "no tone curve: the splats hold display values",
 }
 DESCRIPTIONS: dict[str, str] = {name: model.description for name, model in MODELS.items()}
 CORRECTIONS = {
@@ -27,11 +27,11 @@ CORRECTIONS = {
     "curve": "a curve",
     "luminance": "colour axes and an enhancing curve",
 }
-# Least gap between the PSNR of training and held-out views, dB.
+# Smallest reported gap between the PSNR of training and held-out views, dB.
 WIDE_GAP = 4.0
-# Least standard error of an exposure, stops.
+# Smallest reported standard error of an exposure, stops.
 WEAK_EV = 0.1
-# Least rise of the PSNR between the last two tenths of a run, dB.
+# Smallest reported rise of the PSNR between the last two tenths of a run, dB.
 STILL_RISING = 0.3
 FINISHED = 0.99
 MOST_NAMES = 5
@@ -47,39 +47,39 @@ def duration(seconds: float) -> str:
 
 
 def column(values: Iterable, missing: float = np.nan) -> np.ndarray:
-    """Return numbers as an array, with a number in place of each None."""
+    """Return numbers as an array, with `missing` in place of each None."""
     return np.array([missing if v is None else v for v in values], float)
 
 
 def seconds_of(run: RunFiles) -> float | None:
-    """Return the seconds that the run took, or None where they are unknown."""
+    """Return the duration of the run, seconds, or None if it is unknown."""
     return whole_run(run.part("seconds"))
 
 
 def modelled(run: RunFiles) -> str:
-    """Return a sentence on what was modelled of the cameras."""
+    """Return a sentence on the photometric model of the run."""
     if run.photometry is None:
-        return "What was modelled of the cameras is not known: photometry.json is missing."
+        return "The photometric model is unknown because photometry.json is missing."
     model, curve = run.photometry["model"], run.photometry["curve"].get("name", "")
     kind, preset = run.option("photometry", "appearance"), f"The preset {run.preset}"
     if kind == "ppisp":
         return (
-            f"{preset} learns cameras beside the splats: exposure and colours of every view, "
-            "vignetting and response of every camera."
+            f"{preset} fits a camera model together with the splats: exposure and colours of every "
+            "view, vignetting and tone curve of every camera."
         )
-    correction = f", with {CORRECTIONS.get(kind, kind)} learned for every view" if kind else ""
+    correction = f", with {CORRECTIONS.get(kind, kind)} fitted to every view" if kind else ""
     if curve == "linear" and model == "constant":
-        return f"{preset} models no camera: display values are splatted as they are{correction}."
-    why = f"as the preset {run.preset} or the options say"
+        return f"{preset} models no camera: the splats hold display values{correction}."
+    reason = f"The preset {run.preset} or the options set this model."
     if run.option("photometry", "select"):
-        # What the bundle adjustment found is there where there was one.
-        why = "the simplest choice that predicts held-out colours about as well as any"
+        # `metrics.json` has this part only after a photometric bundle adjustment.
+        reason = "This is the simplest model that predicts held-out colours about as well as any."
         if not run.part("photometry"):
-            why = "as there were no shared points to choose by"
+            reason = "This is the default, because no shared points were available for a choice."
     span = exposure_span(run)
-    spans = "" if span is None or model == "constant" else f"; exposures span {span:.1f} stops"
-    what, under = DESCRIPTIONS.get(model, model), CURVES.get(curve, curve)
-    return f"It models {what} under {under}{correction}, {why}{spans}."
+    spans = "" if span is None or model == "constant" else f" The exposures span {span:.1f} stops."
+    description, tone_curve = DESCRIPTIONS.get(model, model), CURVES.get(curve, curve)
+    return f"The run models {description} under {tone_curve}{correction}. {reason}{spans}"
 
 
 def exposure_span(run: RunFiles) -> float | None:
@@ -89,18 +89,18 @@ def exposure_span(run: RunFiles) -> float | None:
 
 
 def true_error(run: RunFiles, true_exposures: dict[str, float]) -> ExposureError | None:
-    """Return the error of the exposures where the scene knows the true ones, by name."""
+    """Return the error of the exposures; None without true exposures (by the name of the view)."""
     return error_of_views(run.train, true_exposures)
 
 
 def notes_of(run: RunFiles) -> list[str]:
-    """Return what the fit remarked, and why it chose its photometric model, in its own words."""
+    """Return the notes of the fit, which include the reason for its photometric model."""
     notes = run.metrics.get("notes")
     return [str(n) for n in notes] if isinstance(notes, list) else []
 
 
 def against_exif(run: RunFiles) -> Agreement | None:
-    """Return how the exposures agree with EXIF; None where fewer than two views carry it."""
+    """Return the agreement of the exposures with EXIF; None if fewer than two views have EXIF."""
     views = [v for v in run.train if v["exposure_ev"] is not None]
     if sum(v["exif_ev"] is not None for v in views) < 2:
         return None
@@ -109,7 +109,7 @@ def against_exif(run: RunFiles) -> Agreement | None:
 
 
 class RunWarning(NamedTuple):
-    """A warning about a run: its title in a few words, and what was found and what to do."""
+    """A warning about a run: its title, and a text with the finding and the remedy."""
 
     title: str
     text: str
@@ -118,26 +118,26 @@ class RunWarning(NamedTuple):
 def run_warnings(run: RunFiles) -> list[RunWarning]:
     """Return all warnings, the most serious first."""
     named = [
-        RunWarning(title, said.format(count=count_of(len(found), "view"), names=_named(found)))
-        for title, found, said in _on_views(run)
+        RunWarning(title, form.format(count=count_of(len(found), "view"), names=_named(found)))
+        for title, found, form in _on_views(run)
         if found
     ]
     return [*_on_the_run(run), *named, *_on_more_to_gain(run)]
 
 
-# A warning about views: its title; the views, the worst first; and what it says, with a place for
-# their `{count}` and for their `{names}`.
+# A warning about views: its title, the views from the worst on, and its text with placeholders for
+# their `{count}` and their `{names}`.
 ViewWarning = tuple[str, list[str], str]
 
 
 def _named(names: Sequence[str]) -> str:
-    """Return the first few names, and how many more there are."""
+    """Return the first few names and the number of the others."""
     rest = len(names) - MOST_NAMES
     return ", ".join(names[:MOST_NAMES]) + (f" and {rest} more" if rest > 0 else "")
 
 
 def _worst(pairs: Iterable[tuple[str, float]], form: str) -> list[str]:
-    """Return names with their numbers, those of the largest size first."""
+    """Return names with their numbers, from the largest absolute value on."""
     return [f"{name} {value:{form}}" for name, value in sorted(pairs, key=lambda p: -abs(p[1]))]
 
 
@@ -150,27 +150,27 @@ def _on_the_run(run: RunFiles) -> Iterator[RunWarning]:
     if where:
         yield RunWarning(
             "Not finite",
-            f"{' and '.join(where).capitalize()} are not finite numbers. Do not trust this run; "
-            "fit again with lower learning rates (--optimizer.*).",
+            f"{' and '.join(where).capitalize()} are not finite numbers. Do not trust this run. "
+            "Repeat the fit with lower learning rates (--optimizer.*).",
         )
     progress = number_at(run.log[-1], "progress") if run.log else None
     if progress is not None and progress < FINISHED:
         yield RunWarning(
             "Ended early",
             f"The log ends at {progress:.0%} of the schedule: the run was stopped, or its budget "
-            "was too short. The command that began it, with --resume added (and a longer --budget, "
-            "if it had one), brings it to its end.",
+            "was too short. To complete it, repeat the command of the fit with --resume (and with "
+            "a longer --budget, if it had one).",
         )
-    # The protocol that fits most of a held-out view's photometry.
+    # The protocol that fits the most photometry of a held-out view comes first.
     fitted = [run.number("test", name, "psnr") for name in ("photometry_fitted", "exposure_fitted")]
     held_out = next((score for score in fitted if score is not None), None)
     train = run.number("train", "psnr")
     if train is not None and held_out is not None and train - held_out >= WIDE_GAP:
         yield RunWarning(
             "New views are worse than training views",
-            f"Training photographs are met at {train:.1f} dB, held-out ones at {held_out:.1f} dB, "
-            "even with their photometry fitted. Either the held-out views look where few others "
-            "do, or there are too few photographs for this many Gaussians: add photographs, or "
+            f"The PSNR is {train:.1f} dB on training views, and {held_out:.1f} dB on held-out "
+            "views although their exposures were fitted. Either few training views show the same "
+            "places, or there are too few photographs for this many Gaussians. Add photographs, or "
             "lower --gaussians.",
         )
 
@@ -179,8 +179,8 @@ def _on_views(run: RunFiles) -> Iterator[ViewWarning]:
     yield (
         "Views without an exposure",
         [v["image"] for v in run.train if v["exposure"] is None],
-        "{count} got no exposure ({names}): nothing ties them to the others. They are shown at the "
-        "mean of the rest.",
+        "{count} got no exposure ({names}) because no surface points connect them with the others. "
+        "They are rendered at the mean exposure of the others.",
     )
     agreement = against_exif(run)
     if agreement is not None:
@@ -190,15 +190,15 @@ def _on_views(run: RunFiles) -> Iterator[ViewWarning]:
             "EXIF disagrees with the pixels",
             _worst(off, "+.2f"),
             f"In {{count}} of {agreement.views} the exposure recovered from the pixels differs "
-            "from EXIF's by more than 0.2 stops ({names}). EXIF knows nothing of flare, "
-            "vignetting, or what the camera did after the exposure; the fit used the pixels.",
+            "from that of EXIF by more than 0.2 stops ({names}). EXIF does not include flare, "
+            "vignetting, or processing in the camera, so the fit used the pixels.",
         )
     errors = [(v["image"], v.get("exposure_ev_error") or 0.0) for v in run.train]
     yield (
         "Exposures are only roughly known",
         _worst((pair for pair in errors if pair[1] > WEAK_EV), ".2f"),
-        f"{{count}} with a standard error above {WEAK_EV:g} stops: {{names}}. They share few "
-        "points with the others; more overlap would help.",
+        f"The standard error exceeds {WEAK_EV:g} stops in {{count}}: {{names}}. They share few "
+        "surface points with the others. Add photographs with more overlap.",
     )
 
 
@@ -206,9 +206,9 @@ def _on_more_to_gain(run: RunFiles) -> Iterator[RunWarning]:
     refused = run.number("counts", "refused_densifications") or 0
     if refused > 0:
         yield RunWarning(
-            "The Gaussians ran out of room",
-            f"{refused:,.0f} times a Gaussian wanted to split and the limit was reached. Raise "
-            "--gaussians if memory allows.",
+            "The limit on Gaussians was reached",
+            f"{refused:,.0f} splits of Gaussians were refused at the limit. Raise --gaussians if "
+            "memory allows.",
         )
     both = [(number_at(r, "progress"), number_at(r, "psnr")) for r in run.log]
     rows = [(p, q) for p, q in both if p is not None and q is not None]
@@ -219,7 +219,7 @@ def _on_more_to_gain(run: RunFiles) -> Iterator[RunWarning]:
         noise = float(np.sqrt(np.var(last) / len(last) + np.var(before) / len(before)))
         if rise >= max(STILL_RISING, 3 * noise):
             yield RunWarning(
-                "Not finished improving",
+                "Still improving at the end",
                 f"The training PSNR rose by {rise:.1f} dB between the last two tenths of the run. "
-                "--resume with more --steps, or a longer --budget, would still help.",
+                "Continue with --resume and more --steps or a longer --budget.",
             )

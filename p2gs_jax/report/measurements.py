@@ -1,4 +1,4 @@
-"""What a page measures on the scene: seams, which it shows here."""
+"""Measurements on the scene for the report, and its section on seams."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ from p2gs_jax.scene.pixels.store import camera_of
 from p2gs_jax.synth.sensor import read_true_exposures
 
 MOST_PAIRS = 12
-# Seams are measured on images of at most this many pixels across.
+# Seams are measured on images at most this wide, pixels.
 SEAM_WIDTH = 960
-# The pair for the picture of a seam has at least this share of the median overlap.
+# The pair in the picture of a seam has at least this share of the median overlap.
 LEAST_OVERLAP = 0.5
-# Columns of the table of seams: number, head and format of each.
+# Columns of the table of seams: field, heading and format.
 COLUMNS = (
-    ("before_ev", "as taken, stops", ".3f"),
-    ("after_ev", "developed alike, stops", ".3f"),
+    ("before_ev", "as recorded, stops", ".3f"),
+    ("after_ev", "at one exposure, stops", ".3f"),
     ("step_ev", "step after, stops", "+.3f"),
-    ("before_codes", "as taken, 8-bit levels", ".1f"),
-    ("after_codes", "developed alike, 8-bit levels", ".1f"),
+    ("before_codes", "as recorded, 8-bit levels", ".1f"),
+    ("after_codes", "at one exposure, 8-bit levels", ".1f"),
     ("pixels", "pixels", ","),
 )
 
@@ -58,11 +58,11 @@ class SeamPair:
 
 @dataclass
 class SceneMeasurements:
-    """What was measured on the scene; `missing` says in sentences what could not be.
+    """Measurements on the scene; `missing` holds sentences on those that failed.
 
-    True exposures are by view, where the scene has them. Seams are in the order of the views, of
-    `tried_pairs` that were compared (None: none was measured); `shown` is the pair of `picture`,
-    which has the widest one.
+    True exposures are by view, if the scene has them. Seams are in the order of the views;
+    `tried_pairs` counts the pairs compared (None: nothing was measured). `shown` is the pair in
+    `picture`, which has the widest seam.
     """
 
     true_exposures: dict[str, float] = field(default_factory=dict)
@@ -74,9 +74,9 @@ class SceneMeasurements:
 
 
 def measure_scene(files: RunFiles, reporter: Reporter, *, render: bool = True) -> SceneMeasurements:
-    """Load the scene and measure what the page needs; without a scene, say so in `missing`.
+    """Load the scene and measure exposures and seams; failures are listed in `missing`.
 
-    Where `render` is False, only the true exposures are read.
+    If `render` is False, only the true exposures are read.
     """
     out = SceneMeasurements()
     try:
@@ -102,14 +102,14 @@ def _measure_seams(run: Run, out: SceneMeasurements, reporter: Reporter) -> None
     if run.cfg.photometry.appearance is not None:
         out.missing += (
             "Seams were not measured: this preset learns corrections of display values, which "
-            "cannot be undone in a photograph.",
+            "cannot be removed from a photograph.",
         )
         return
     store, names = run.store.leaving_out(run.scene.objects), [v.name for v in run.scene.views]
 
     @functools.cache
     def photographed(index: int) -> Photographed:
-        """Return a photograph with rendered depth, rendered once."""
+        """Return a photograph with its rendered depth; each view is rendered once."""
         shrink = max(1.0, store.camera(index)[2] / SEAM_WIDTH)
         camera = camera_of(store, index, shrink)
         depth = np.asarray(surface_depth(run.render(camera)))
@@ -136,31 +136,30 @@ def _measure_seams(run: Run, out: SceneMeasurements, reporter: Reporter) -> None
 
 
 def seam_medians(seams: Sequence[SeamPair]) -> tuple[float, float]:
-    """Return the median over pairs of the seams before and after, stops."""
+    """Return the medians over pairs of the seams before and after, stops."""
     before = float(np.median([p.seam.before_ev for p in seams]))
     return before, float(np.median([p.seam.after_ev for p in seams]))
 
 
 def seam_section(scene: SceneMeasurements) -> str:
-    """Return the differences of neighbouring photographs, as taken and developed alike."""
+    """Return the seams between neighbouring photographs, as recorded and at one exposure."""
     seams = scene.seams
     if not seams:
         if scene.tried_pairs is None:
-            return paragraph("None was measured; the list of what this page lacks says why.")
+            return paragraph("No seam was measured; the list of missing parts gives the reason.")
         return paragraph(
-            f"{scene.tried_pairs} pairs of training views share enough points, and none of them "
-            "enough of the same unsaturated surface to be compared."
+            f"{scene.tried_pairs} pairs of training views share enough points, but no pair shows "
+            "enough of the same unsaturated surface for a comparison."
         )
     before, after = seam_medians(seams)
     step = float(np.median([abs(p.seam.step_ev) for p in seams]))
     whole = f"{step:.2f}" if step >= 0.005 else "less than 0.01"
     pairs = "1 pair" if len(seams) == 1 else f"{len(seams)} pairs"
     body = paragraph(
-        f"The same surfaces in neighbouring photographs differ by {before:.2f} stops as taken, and "
-        f"by {after:.2f} once each photograph is decoded, divided by its exposure and developed "
-        f"alike (medians over {pairs}). Of what is left, {whole} stops are a step that runs "
-        "through the whole pair; the rest is texture that does not meet exactly, shine, and what "
-        "the formation model leaves out."
+        "The brightness of the same surfaces in neighbouring photographs differs by "
+        f"{before:.2f} stops as recorded, and by {after:.2f} stops after conversion to one "
+        f"exposure (medians over {pairs}). The visible step between two photographs is then "
+        f"{whole} stops. The rest is misaligned texture, gloss, and effects outside the model."
     )
     if scene.picture is not None and scene.shown is not None:
         body += _seam_picture(scene.shown, scene.picture)
@@ -169,8 +168,8 @@ def seam_section(scene: SceneMeasurements) -> str:
         [p.name, *(format(getattr(p.seam, name), form) for name, _, form in COLUMNS)] for p in seams
     ]
     note = (
-        "Median absolute differences over all pixels that both photographs show, found through the "
-        "rendered depth; saturated and black pixels are left out."
+        "The numbers are median absolute differences over all pixels that both photographs show "
+        "according to the rendered depth. Saturated and black pixels do not count."
     )
     return body + table(heads, rows, numbers=range(1, 7), tall=True) + paragraph(note, "note")
 
@@ -180,17 +179,18 @@ def _seam_picture(pair: SeamPair, picture: SeamPicture) -> str:
     left, right = names if picture.left_first else names[::-1]
     cells = [
         (
-            jpeg(image, f"{left} beside {right}, {how}", LARGE),
-            f"{how.capitalize()}: {ev:.2f} stops, {codes:.0f} 8-bit levels apart",
+            jpeg(image, f"{left} beside {right}, {kind}", LARGE),
+            f"{kind.capitalize()}: a difference of {ev:.2f} stops, or {codes:.0f} 8-bit levels",
         )
-        for image, how, ev, codes in (
-            (picture.before, "as taken", pair.seam.before_ev, pair.seam.before_codes),
-            (picture.after, "developed alike", pair.seam.after_ev, pair.seam.after_codes),
+        for image, kind, ev, codes in (
+            (picture.before, "as recorded", pair.seam.before_ev, pair.seam.before_codes),
+            (picture.after, "at one exposure", pair.seam.after_ev, pair.seam.after_codes),
         )
     ]
     caption = (
-        f"Left half: {left}. Right half: {right}. Both as a camera halfway between them would see "
-        "them, with a hard edge in the middle: the widest seam among pairs with a good overlap. "
-        "Clipped skies stay at the value of their white; grey was out of the photograph's sight."
+        f"Left half: {left}. Right half: {right}. Both are warped to a camera halfway between "
+        "them, with a hard edge in the middle. This pair has the widest seam of all pairs with "
+        "enough overlap. Clipped skies keep the value of white; grey pixels are outside the "
+        "photograph."
     )
     return figure(row(cells, "two"), caption)

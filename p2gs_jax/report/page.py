@@ -12,14 +12,14 @@ from p2gs_jax.core.atomic import write_text
 from p2gs_jax.core.text import printable
 from p2gs_jax.errors import UserError
 
-# The browser loads nothing from elsewhere, whatever the page contains.
+# This policy stops the browser from loading anything from elsewhere, whatever the page contains.
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
 
 def page(title: str, head: str, sections: Sequence[tuple[str, str, str]], foot: str) -> str:
     """Return the whole page; `head` and `foot` are HTML above and below the sections.
 
-    A section is its anchor, its heading, and HTML; those without HTML are left out.
+    A section is its anchor, its heading, and its HTML; sections without HTML are left out.
     """
     shown = [(key, text(heading), body) for key, heading, body in sections if body]
     parts = {
@@ -34,7 +34,7 @@ def page(title: str, head: str, sections: Sequence[tuple[str, str, str]], foot: 
         ),
         "foot": foot,
     }
-    # All at once: what is put in is never searched for places to put something.
+    # One pass replaces all placeholders, so that inserted text is never searched for placeholders.
     return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], _read("page.html"))
 
 
@@ -43,24 +43,24 @@ def _read(name: str) -> str:
 
 
 def check_place(path: Path) -> None:
-    """Raise a UserError where a page cannot have this name: a folder, or not an .html file."""
+    """Raise a UserError if the path is a folder or does not end in .html."""
     if path.suffix.lower() not in (".html", ".htm") or path.is_dir():
         fix = "name a file that ends in .html"
         raise UserError(f"{path} is not a valid name for a page.", fix=fix)
 
 
 def write_page(path: Path, html_text: str) -> None:
-    """Write a page; a UserError says why it cannot be written."""
+    """Write a page; a UserError gives the reason if it cannot be written."""
     check_place(path)
     try:
         write_text(path, html_text)
     except OSError as error:
-        fix = "name another place with --out"
+        fix = "name another file with --out"
         raise UserError(f"{path} cannot be written: {error.strerror or error}.", fix=fix) from error
 
 
 def made_by(command: str) -> str:
-    """Return the foot of a page."""
+    """Return the footer of a page."""
     from p2gs_jax import __version__
 
     return text(f"Made by p2gs-jax {command}, version {__version__}.")
@@ -72,26 +72,26 @@ def text(value: object) -> str:
 
 
 def paragraph(sentence: str, kind: str = "") -> str:
-    """Return a paragraph of text, of a class of the style sheet."""
-    of = f' class="{kind}"' if kind else ""
-    return f"<p{of}>{text(sentence)}</p>"
+    """Return a paragraph of text; `kind` is its class in the style sheet."""
+    attribute = f' class="{kind}"' if kind else ""
+    return f"<p{attribute}>{text(sentence)}</p>"
 
 
 def listed(sentences: Iterable[str]) -> str:
-    """Return a list of sentences; empty where there are none."""
+    """Return a list of sentences; empty if there are none."""
     items = "".join(f"<li>{text(s)}</li>" for s in sentences)
     return f'<ul class="plain">{items}</ul>' if items else ""
 
 
 def figure(content: str, caption: str) -> str:
-    """Return HTML with a caption, which is text."""
+    """Return HTML with a caption (text)."""
     return f"<figure>\n{content}\n<figcaption>{text(caption)}</figcaption></figure>"
 
 
 def row(cells: Sequence[tuple[str, str]], columns: str) -> str:
-    """Return pictures (HTML) with captions beside each other; above each other on narrow screens.
+    """Return a row of pictures (HTML) with captions, which becomes a column on narrow screens.
 
-    The columns are `two`, `three`, or `many` where there may be more.
+    `columns` is `two`, `three`, or `many`.
     """
     inner = "".join(f"<div>{picture}<span>{text(under)}</span></div>" for picture, under in cells)
     return f'<div class="row {columns}">{inner}</div>'
@@ -104,9 +104,9 @@ def table(
     numbers: Iterable[int] = (),
     tall: bool = False,
 ) -> str:
-    """Return a table of text, with a scroll bar where it is too wide, or `tall`.
+    """Return a table of text, with a scroll bar if it is too wide or `tall`.
 
-    `numbers` are the columns that hold numbers.
+    `numbers` holds the indices of columns with numbers.
     """
     numbers = set(numbers)
 
@@ -124,7 +124,7 @@ def table(
 
 
 def key_numbers(items: Sequence[tuple[str, str, str]]) -> str:
-    """Return the key numbers at the top of a page: name, value and remark of each."""
+    """Return the key numbers at the top of a page from their names, values and remarks."""
     inner = "".join(
         f"<div><dt>{text(name)}</dt><dd>{text(value)}<small>{text(remark)}</small></dd></div>"
         for name, value, remark in items

@@ -38,16 +38,16 @@ VALUES = np.linspace(0.02, 1.0, 240)
 
 
 def model_section(run: RunFiles) -> str:
-    """Return what varies between views, and why."""
+    """Return the photometric model and the reasons for it."""
     if run.photometry is None:
         return listed(notes_of(run))
     model, curve = run.photometry["model"], str(run.photometry["curve"].get("name"))
-    what, under = findings.DESCRIPTIONS.get(model, model), findings.CURVES.get(curve, curve)
+    what, tone_curve = findings.DESCRIPTIONS.get(model, model), findings.CURVES.get(curve, curve)
     return (
-        paragraph(f"Model: {what}. Tone curve: {under}. Scale: {run.photometry['gauge']}.")
+        paragraph(f"Model: {what}. Tone curve: {tone_curve}. Scale: {run.photometry['gauge']}.")
         + paragraph(
-            "Models and curves compete on held-out colours of shared surface points. The simplest "
-            "that predicts about as well as the best one is kept. The fit remarked:",
+            "Models and curves are scored by their errors on held-out colours of surface points. "
+            "The fit keeps the simplest one that is about as good as the best. Its notes:",
             "note",
         )
         + listed(notes_of(run))
@@ -61,9 +61,9 @@ def _chart(
     label: str,
     caption: str,
 ) -> str:
-    """Return a panel for each camera, or one for all where there are many or small ones.
+    """Return a panel for each camera, or one for all cameras if they are many or have few views.
 
-    `curves` returns those of a panel from its views and their places.
+    `curves` returns the curves of a panel from its views and their positions on the x axis.
     """
     views = sorted(run.views, key=lambda v: natural(v["image"]))
     by_camera = {f"camera {c}": [v for v in views if v["camera"] == c] for c in run.cameras}
@@ -73,23 +73,23 @@ def _chart(
     elif len(by_camera) == 1:
         by_camera = {"": views}
     panels = [(title, curves(v, np.arange(1.0, len(v) + 1))) for title, v in by_camera.items()]
-    order = "photograph, in the order of names"
+    order = "photographs in the order of their names"
     chart = panels_chart(panels, y_label=y_label, x_label=order, label=label, band=0.0)
     return figure(chart, caption)
 
 
-# Exposures of views from the mean, stops, by source; NaN where unknown.
+# Exposures of views relative to the mean, stops, by source; NaN if unknown.
 Stops = Callable[[list[ViewPhotometry]], dict[str, np.ndarray]]
 
 
 def exposure_section(run: RunFiles, truth: dict[str, float]) -> str:
-    """Return exposures over time for each camera, with what EXIF and the truth say."""
+    """Return exposures over time for each camera, with those of EXIF and the true ones."""
     if all(v["exposure"] is None and v["exposure_fitted"] is None for v in run.views):
         return ""
     stops = _stops_by_source(run, truth)
 
     def curves(rows: list[ViewPhotometry], x: np.ndarray) -> list[Series]:
-        errors = {"found": 2 * _errors(rows)}
+        errors = {"recovered": 2 * _errors(rows)}
         return [
             Series(name, x, y, SOURCES[name], errors.get(name))
             for name, y in stops(rows).items()
@@ -100,21 +100,21 @@ def exposure_section(run: RunFiles, truth: dict[str, float]) -> str:
     body = _chart(run, curves, STOPS, label, " ".join(_exposure_caption(run, truth)))
     times = read_times(run.folder)
     if times:
-        body = _over_time(run, times, stops) + folded("Each camera by itself", body)
+        body = _over_time(run, times, stops) + folded("One panel per camera", body)
     more, rows = [name for name in stops([]) if name in ("EXIF", "true")], []
     for v, found, fitted, *others in zip(run.views, *stops(run.views).values(), strict=True):
         held_out = np.isfinite(fitted)
-        error = "held out" if held_out else _shown(v.get("exposure_ev_error"), ".3f")
-        ev = _shown(fitted if held_out else found, "+.2f")
-        stated = [_shown(value, "+.2f") for value in others]
-        rows.append([v["image"], v["camera"], ev, error, _shown(v["gamma"], ".2f"), *stated])
-    names = ["photograph", "camera", "stops", "error", "gamma", *more]
+        error = "held out" if held_out else _cell(v.get("exposure_ev_error"), ".3f")
+        ev = _cell(fitted if held_out else found, "+.2f")
+        stated = [_cell(value, "+.2f") for value in others]
+        rows.append([v["image"], v["camera"], ev, error, _cell(v["gamma"], ".2f"), *stated])
+    names = ["photograph", "camera", "exposure, stops", "standard error, stops", "gamma", *more]
     numbers = table(names, rows, numbers=range(2, len(names)), tall=True)
     return body + folded("Every photograph in numbers", numbers)
 
 
 def _stops_by_source(run: RunFiles, truth: dict[str, float]) -> Stops:
-    """Return a function that returns exposures; EXIF and truth are laid over what was found."""
+    """Return a function for exposures; EXIF and true ones are shifted to the mean of the fit's."""
     found = column(v["exposure_ev"] for v in run.train)
     center = float(np.mean(found[np.isfinite(found)])) if np.isfinite(found).any() else 0.0
     agreement, gap = against_exif(run), found - _true_stops(run.train, truth)
@@ -124,7 +124,7 @@ def _stops_by_source(run: RunFiles, truth: dict[str, float]) -> Stops:
         found = column(v["exposure_ev"] for v in rows) - center
         with np.errstate(divide="ignore"):
             fitted = np.log2(column(v["exposure_fitted"] for v in rows)) - center
-        out = {"found": found, "held out": np.where(np.isfinite(found), np.nan, fitted)}
+        out = {"recovered": found, "held-out view": np.where(np.isfinite(found), np.nan, fitted)}
         if agreement is not None:
             out["EXIF"] = column(v["exif_ev"] for v in rows) + agreement.offset_ev - center
         if known.any():
@@ -134,7 +134,7 @@ def _stops_by_source(run: RunFiles, truth: dict[str, float]) -> Stops:
     return stops
 
 
-def _shown(value: float | None, form: str) -> str:
+def _cell(value: float | None, form: str) -> str:
     return format(value, form) if value is not None and np.isfinite(value) else ""
 
 
@@ -143,47 +143,46 @@ def _errors(rows: list[ViewPhotometry]) -> np.ndarray:
 
 
 def _true_stops(rows: list[ViewPhotometry], truth: dict[str, float]) -> np.ndarray:
-    """Return true exposures in stops, NaN where unknown."""
+    """Return true exposures in stops, NaN if unknown."""
     known = (truth.get(v["image"], 0.0) for v in rows)
     return np.array([np.log2(e) if e > 0 else np.nan for e in known])
 
 
 def _over_time(run: RunFiles, times: dict[str, float], stops: Stops) -> str:
-    """Return exposures of a drive over its seconds, a line a camera."""
+    """Return the exposures of a drive over its seconds, with one line per camera."""
     start, series = min(times.values()), []
-    looks = zip(cycle(CAMERA_COLORS), cycle(CAMERA_MARKERS), strict=False)
-    for name, (color, marker) in zip(run.cameras, looks, strict=False):
+    styles = zip(cycle(CAMERA_COLORS), cycle(CAMERA_MARKERS), strict=False)
+    for name, (color, marker) in zip(run.cameras, styles, strict=False):
         rows = [v for v in run.views if v["camera"] == name and v["image"] in times]
         rows.sort(key=lambda v: times[v["image"]])
         seconds, found = np.array([times[v["image"]] - start for v in rows]), stops(rows)
-        style, known = {"color": color, "marker": marker}, np.isfinite(found["found"])
-        y, errors = found["found"][known], 2 * _errors(rows)[known]
+        style, known = {"color": color, "marker": marker}, np.isfinite(found["recovered"])
+        y, errors = found["recovered"][known], 2 * _errors(rows)[known]
         series.append(Series(short_name(name), seconds[known], y, style, errors))
-        empty = SOURCES["held out"] | style
-        series.append(Series("", seconds, found["held out"], empty))
+        empty = SOURCES["held-out view"] | style
+        series.append(Series("", seconds, found["held-out view"], empty))
     label = "Exposures of every camera over the seconds of the drive, in stops"
-    caption = "A line a camera; error bars: two standard errors; empty marks: held-out photographs."
+    caption = "Error bars are two standard errors. Empty markers are held-out views."
     chart = panels_chart(
-        [("", series)], y_label=STOPS, x_label="seconds", label=label, band=0.0, height=260
+        [("", series)], y_label=STOPS, x_label="time, seconds", label=label, band=0.0, height=260
     )
     return figure(chart, caption)
 
 
 def _exposure_caption(run: RunFiles, truth: dict[str, float]) -> list[str]:
-    out = ["Filled circles: found by the fit."]
+    out = ["Filled circles are exposures recovered by the fit."]
     errors = [e for v in run.train if (e := v.get("exposure_ev_error")) is not None]
     if errors:
-        most = f"at most ±{2 * max(errors):.2g} stops here"
-        out.append(f"Error bars: two standard errors, {most}, where larger than the marks.")
+        out.append(f"Error bars are two standard errors, at most ±{2 * max(errors):.2g} stops.")
     else:
-        out.append("There are no error bars: nothing was solved beforehand from shared points.")
+        out.append("Error bars are missing because no exposures were solved from shared points.")
     if any(v["split"] == "test" for v in run.views):
-        out.append("Open diamonds: fitted to held-out photographs after the run.")
+        out.append("Open diamonds are exposures fitted to held-out photographs after the run.")
     agreement, error = against_exif(run), findings.true_error(run, truth)
     if agreement is not None:
-        out.append(f"Crosses, dotted: EXIF, laid over them; RMS {agreement.rms_ev:.2f} stops.")
+        out.append(f"Crosses are EXIF, shifted to one mean (RMS {agreement.rms_ev:.2f} stops).")
     if error is not None:
-        out.append(f"Pluses, dashed: the true exposures; RMS error {error['ev']:.3f} stops.")
+        out.append(f"Pluses are the true exposures (RMS error {error['ev']:.3f} stops).")
     return out
 
 
@@ -195,17 +194,17 @@ def white_balance_section(run: RunFiles) -> str:
     def curves(rows: list[ViewPhotometry], x: np.ndarray) -> list[Series]:
         y = np.log2(_triples(v.get("white_balance") for v in rows))
         errors = 2 * _triples(v.get("white_balance_ev_error") for v in rows)
-        looks = enumerate(zip(CHANNELS, MARKED, strict=True))
-        return [Series(name, x, y[:, c], look, errors[:, c]) for c, (name, look) in looks]
+        styles = enumerate(zip(CHANNELS, MARKED, strict=True))
+        return [Series(name, x, y[:, c], style, errors[:, c]) for c, (name, style) in styles]
 
     return _chart(
         run,
         curves,
-        "gain beside the exposure, stops",
+        "gain of the channel, stops",
         "White balance of the photographs of each camera, in stops",
-        "Gains of the channels beside the exposure. In every photograph they average to 0, and so "
-        "does each channel over the photographs: only differences can be known. Error bars: two "
-        "standard errors.",
+        "Gains of channels relative to the exposure: their means are 0, over each photograph and "
+        "each channel, because only differences can be measured. Error bars are two standard "
+        "errors.",
     )
 
 
@@ -214,7 +213,7 @@ def _triples(values: Iterable) -> np.ndarray:
 
 
 def response_section(run: RunFiles) -> str:
-    """Return the tone curve, or those of cameras and channels, against sRGB."""
+    """Return the tone curve, or the curves of cameras and channels, against sRGB."""
     if run.photometry is None:
         return ""
     try:
@@ -227,34 +226,34 @@ def response_section(run: RunFiles) -> str:
     apart = max(float(np.abs(c.x - srgb)[inner].max()) for c in curves)
     chart = panels_chart(
         [("", [*curves, Series("sRGB", srgb, VALUES, SRGB)])],
-        y_label="photographed value, 1 is white",
+        y_label="value in the photograph (1 is white)",
         x_label="exposed radiance, stops from mid-grey",
         label="Tone curves of this run against sRGB",
         height=260,
     )
-    far = f"At values above 0.05 they differ from sRGB, dashed, by at most {apart:.2f} stops."
-    return figure(chart, f"How exposed radiance becomes a value in the photograph. {caption} {far}")
+    far = f"For values above 0.05 it differs from sRGB (dashed) by at most {apart:.2f} stops."
+    return figure(chart, f"The tone curve maps radiance times exposure to a value. {caption} {far}")
 
 
 def _curves(run: RunFiles) -> tuple[list[Series], str]:
-    """Return the curve of all cameras at the smallest, the median and the largest gamma."""
+    """Return the common curve of all cameras at the smallest, the median and the largest gamma."""
     assert run.photometry is not None
     cfg = PhotometryConfig() if run.cfg is None else run.cfg.photometry
     cfg = with_curve_of(cfg, run.photometry)
     gammas = [v["gamma"] for v in run.train if v["gamma"] is not None] or [GAMMA_SRGB]
     ends = [(min(gammas), "-."), (max(gammas), ":")] if np.ptp(gammas) > 0.02 else []
     curves = [
-        Series(f"γ {g:.2f}", _exposed(VALUES, cfg, g), VALUES, {"color": COLORS[1], "ls": line})
+        Series(f"gamma {g:.2f}", _exposed(VALUES, cfg, g), VALUES, {"color": COLORS[1], "ls": line})
         for g, line in ends
     ]
-    own = {"color": FIRST, "linewidth": 5, "alpha": 0.45}
+    style = {"color": FIRST, "linewidth": 5, "alpha": 0.45}
     middle = _exposed(VALUES, cfg, float(np.median(gammas)))
-    curves.append(Series("this run", middle, VALUES, own))
-    return curves, "γ: the smallest and the largest gamma of a view." if ends else ""
+    curves.append(Series("this run", middle, VALUES, style))
+    return curves, "Thin curves have the smallest and the largest gamma of a view." if ends else ""
 
 
 def _camera_curves(run: RunFiles, curved: list[CameraPhotometry]) -> tuple[list[Series], str]:
-    """Return the curves of cameras and channels that have their own."""
+    """Return the separate curves of cameras and channels."""
     assert run.photometry is not None
     formations = camera_formations(
         [{"name": c["name"], "vignetting": (), "splines": c["splines"]} for c in curved]
@@ -274,8 +273,8 @@ def _camera_curves(run: RunFiles, curved: list[CameraPhotometry]) -> tuple[list[
             color, line = ((1, 2, 0)[c], k) if several else (k, 0)
             style = {"color": COLORS[color % len(COLORS)], "linestyle": DASHES[line % len(DASHES)]}
             curves.append(Series(name, stops[:, c], VALUES, style))
-    what = "cameras" if len(formations) > 1 else "channels"
-    return curves, f"Each of the {what} has a response of its own."
+    owner = "camera" if len(formations) > 1 else "channel"
+    return curves, f"Each {owner} has a separate curve."
 
 
 def _exposed(
@@ -287,7 +286,7 @@ def _exposed(
 
 
 def vignetting_section(run: RunFiles) -> str:
-    """Return how cameras darken towards their corners; empty where it is not modelled."""
+    """Return the loss of light in the corners per camera; empty if it is not modelled."""
     cells = []
     for camera in [] if run.photometry is None else run.photometry["cameras"]:
         corners, errors = camera["corner"] or [], camera["corner_ev_error"] or []
@@ -298,8 +297,8 @@ def vignetting_section(run: RunFiles) -> str:
             cells.append([camera["name"], which, f"{100 * (1 - left):.0f} %", stops])
     if not cells:
         return ""
-    names = ["camera", "channels", "lost in the corners", "that is, stops"]
+    names = ["camera", "channels", "loss in the corners", "brightness in the corners, stops"]
     return paragraph(
-        "What lenses take of the light in the corners. It is divided out of what the photographs "
-        "say of the radiance."
+        "Lenses lose light towards the corners of a photograph. The fit models this loss, so the "
+        "radiance of the splats is free of it."
     ) + table(names, cells, numbers=range(2, 4))

@@ -15,10 +15,10 @@ from p2gs_jax.formats.frames import data_url, shrunk
 from p2gs_jax.report.page import paragraph, row, text
 from p2gs_jax.report.run_files import RunFiles, number_at
 
-# Longest side, pixels: a third of the page on a screen of twice its resolution, and all of it.
+# Longest side of a picture, pixels: a third of the page at double resolution, or the whole page.
 SMALL, LARGE = 560, 900
 JPEG_QUALITY = 84
-# A difference of 1 / GAIN of the display's range is shown as white or black.
+# A difference of 1 / GAIN of the display's range becomes white or black.
 GAIN = 4.0
 
 
@@ -41,23 +41,23 @@ def picture(url: str, alt: str) -> str:
 def signed_difference(
     render: Float[np.ndarray, "h w 3"], photograph: Float[np.ndarray, "h w 3"]
 ) -> Float32[np.ndarray, "h w 3"]:
-    """Return render minus photograph in luminance: grey where they agree, lighter where the render
-    is too bright."""
+    """Return render minus photograph in luminance: grey is no difference, lighter pixels have a
+    render that is too bright."""
     bright, there = (luminance(np.nan_to_num(p).clip(0, 1)) for p in (render, photograph))
     shown = np.clip(0.5 + 0.5 * GAIN * (bright - there), 0, 1)
     return np.repeat(shown[..., None], 3, -1).astype(np.float32)
 
 
 def without_suffix(name: str) -> str:
-    """Return the name of a view without what stands behind its last dot."""
+    """Return the name of a view without its last dot and the text behind it."""
     return name.rsplit(".", 1)[0]
 
 
 def held_out_section(run: RunFiles, most: int, problems: list[str]) -> str:
-    """Return at most so many held-out views from files: evenly over all, the worst first.
+    """Return at most `most` held-out views from files, evenly spaced from the worst to the best.
 
-    Each has its photograph, its render at the exposure fitted to it, and their difference;
-    `problems` receives why a view is not shown.
+    Each view has its photograph, its render at the fitted exposure, and their difference;
+    `problems` receives a sentence for each view that cannot be read.
     """
     scores = run.part("test", "exposure_fitted", "per_view")
     psnr = {h.name: number_at(scores, h.name, "psnr") for h in run.held_out}
@@ -71,7 +71,7 @@ def held_out_section(run: RunFiles, most: int, problems: list[str]) -> str:
         try:
             photograph, render = read_display(files.photograph), read_display(files.render)
         except UserError as error:
-            problems.append(f"{files.name} is not shown: {error.message}")
+            problems.append(f"{files.name} cannot be displayed: {error.message}")
             continue
         score = psnr[files.name]
         dB = "" if score is None else f" · {score:.1f} dB"
@@ -86,8 +86,8 @@ def held_out_section(run: RunFiles, most: int, problems: list[str]) -> str:
         return ""
     some = "" if shown == total else f" ({shown} of {total}, evenly from the worst to the best)"
     note = (
-        f"The fit never saw these photographs{some}; each is rendered at the exposure fitted to "
-        "it. Difference: in luminance; grey where both agree, lighter where the render is too "
-        f"bright, darker where it is too dark, white and black from {128 / GAIN * 2:.0f} of 255 on."
+        f"The fit did not use these photographs{some}. Each render has the exposure fitted to its "
+        "photograph. The difference is in luminance: grey means equal, lighter that the render is "
+        f"too bright, darker too dark, white and black at least {256 / GAIN:.0f} of 255 levels."
     )
     return paragraph(note) + body

@@ -30,9 +30,9 @@ def write_report(
 ) -> Path:
     """Write one page about a run, which needs no other file and no network; return its path.
 
-    The page is `report.html` in the folder unless `out` names another. `scene` is where the run's
-    scene lies now (None: where it was). Without `render` the page has only what the folder holds,
-    and no seams. A UserError says that it is not a run folder, or that the page cannot be written.
+    The page is `report.html` in the folder unless `out` names another file. `scene` is the current
+    folder of the scene (None: as in the run). Without `render` the page uses only the run folder,
+    and has no seams. A UserError reports a folder without a run, or a page that cannot be written.
     """
     reporter = reporter or Silent()
     folder = Path(folder)
@@ -46,22 +46,22 @@ def write_report(
 
 
 def report_page(run: RunFiles, scene: SceneMeasurements) -> str:
-    """Return the page of a run from what its folder holds and what was measured on its scene."""
+    """Return the page of a run from the files of its folder and measurements on its scene."""
     problems: list[str] = []
     truth = scene.true_exposures
     views = pictures.held_out_section(run, MOST_COMPARED, problems)
     found = run_warnings(run)
     shown = [
-        ("watch", "What to watch", _warnings(found, run, [*scene.missing, *problems])),
-        ("model", "What was modelled, and why", photometry.model_section(run)),
+        ("warnings", "Warnings", _warnings(found, run, [*scene.missing, *problems])),
+        ("model", "Photometric model", photometry.model_section(run)),
         ("exposures", "Exposures", photometry.exposure_section(run, truth)),
         ("white-balance", "White balance", photometry.white_balance_section(run)),
         ("response", "Tone curve", photometry.response_section(run)),
         ("vignetting", "Vignetting", photometry.vignetting_section(run)),
-        ("seams", "Seams before and after", scenes.seam_section(scene)),
+        ("seams", "Seams between photographs", scenes.seam_section(scene)),
         ("views", "Held-out views", views),
         ("scores", "Scores", sections.score_section(run)),
-        ("parts", "What stands, and what moves", sections.parts_section(run)),
+        ("parts", "Static and moving pixels", sections.parts_section(run)),
         ("depth", "Depth against LiDAR", sections.depth_section(run)),
         ("training", "Training", sections.training_section(run)),
         ("configuration", "Configuration", sections.configuration_section(run)),
@@ -80,31 +80,31 @@ def _key_numbers(
     held_out, train = run.number("test", "exposure_fitted", "psnr"), run.number("train", "psnr")
     error = findings.true_error(run, scene.true_exposures)
     for name, value, form, remark in (
-        ("Held-out PSNR", held_out, "{:.1f} dB", "exposure fitted to each"),
-        ("Training PSNR", train, "{:.1f} dB", "own exposures"),
-        ("Exposures span", findings.exposure_span(run), "{:.1f}", "stops, training views"),
-        ("Exposure error", error and error["ev"], "{:.3f}", "stops RMS, truth known"),
+        ("Held-out PSNR", held_out, "{:.1f} dB", "with the exposure fitted to each view"),
+        ("Training PSNR", train, "{:.1f} dB", "with the exposure of each view"),
+        ("Exposure range", findings.exposure_span(run), "{:.1f} stops", "of the training views"),
+        ("Exposure error", error and error["ev"], "{:.3f} stops", "RMS against true exposures"),
     ):
         if value is not None:
             yield name, form.format(value), remark
     if scene.seams:
         before, after = scenes.seam_medians(scene.seams)
         pairs = count_of(len(scene.seams), "pair")
-        yield "Seams", f"{before:.2f} → {after:.2f}", f"stops, median of {pairs}"
+        yield "Seams", f"{before:.2f} → {after:.2f} stops", f"before and after, median of {pairs}"
     gaussians, steps = run.number("counts", "gaussians"), run.number("counts", "steps")
     if gaussians is not None:
         yield "Gaussians", f"{gaussians:,.0f}", "" if steps is None else f"{steps:,.0f} steps"
     seconds = findings.seconds_of(run)
     if seconds is not None:
-        yield "Time", duration(seconds), "in all"
-    yield "To watch", str(len(found)), "see below" if found else "nothing stands out"
+        yield "Time", duration(seconds), "for the whole run"
+    yield "Warnings", str(len(found)), "listed below" if found else "no check found a problem"
 
 
 def _warnings(found: list[RunWarning], run: RunFiles, missing: list[str]) -> str:
     items = "".join(
         f"<li><p><strong>{text(c.title)}.</strong> {text(c.text)}</p></li>" for c in found
     )
-    body = f'<ul class="warnings">{items}</ul>' if found else paragraph("Nothing stands out.")
+    body = f'<ul class="warnings">{items}</ul>' if found else paragraph("There are no warnings.")
     if run.missing or missing:
-        body += f"<h3>What this page lacks</h3>{listed([*run.missing, *missing])}"
+        body += f"<h3>Missing parts of this page</h3>{listed([*run.missing, *missing])}"
     return body

@@ -1,4 +1,4 @@
-"""The files of a run folder, read without its scene; missing ones are listed, not fatal."""
+"""The files of a run folder, read without its scene; missing files are listed, not fatal."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from p2gs_jax.run.photometry_files import PhotometryFile, ViewPhotometry, read_p
 
 
 class HeldOutFiles(NamedTuple):
-    """Files of a held-out view: photograph, and render fitted to it.
+    """The files of a held-out view: its photograph, and the render at the fitted exposure.
 
-    The name is that of `metrics.json`; without suffix where it does not know the view.
+    The name is as in `metrics.json`, or without suffix if that file does not contain the view.
     """
 
     name: str
@@ -29,12 +29,12 @@ class HeldOutFiles(NamedTuple):
 
 @dataclass(frozen=True)
 class RunFiles:
-    """A run folder, and what its files hold; what is missing is empty or None.
+    """A run folder and the contents of its files; missing contents are empty or None.
 
-    The scene is where it lies, or lay; `given` is its place as the caller gave it. The options are
-    nested values of `config.json`, and `cfg` the same as this version reads them, or None where it
-    cannot. The log has the lines that hold a step. `missing` are sentences on what could not be
-    read, `broken` the names of files that exist but cannot be read.
+    `scene` is the folder of the scene, which may no longer exist; `given` is the folder from the
+    caller. `options` are nested values of `config.json`; `cfg` is made from them, or None if this
+    version cannot read them. The log has the lines that hold a step. `missing` holds sentences on
+    unreadable files, `broken` the names of those that exist.
     """
 
     folder: Path
@@ -51,7 +51,7 @@ class RunFiles:
 
     @property
     def preset(self) -> str:
-        """The preset that the options started from."""
+        """The preset on which the options are based."""
         return str(self.options.get("preset", "unknown"))
 
     @property
@@ -66,19 +66,19 @@ class RunFiles:
 
     @property
     def cameras(self) -> list[str]:
-        """Physical cameras, in the order of their first views."""
+        """The physical cameras in the order of their first views."""
         return list(dict.fromkeys(v["camera"] for v in self.views))
 
     def number(self, *path: str) -> float | None:
-        """Return a number of `metrics.json`, or None where there is none."""
+        """Return a number of `metrics.json`, or None if it is missing."""
         return number_at(self.metrics, *path)
 
     def part(self, *path: str) -> dict[str, Any]:
-        """Return a part of `metrics.json`; empty where it is missing or has no parts."""
+        """Return a part of `metrics.json`; empty if it is missing or has no parts."""
         return part_at(self.metrics, *path)
 
     def option(self, *path: str) -> Any:
-        """Return a value of the configuration, or None where it is missing."""
+        """Return a value of the configuration, or None if it is missing."""
         return part_at(self.options, *path[:-1]).get(path[-1])
 
 
@@ -102,9 +102,9 @@ def number_at(values: Any, *path: str) -> float | None:
 
 
 def read_run(folder: Path, scene: Path | None = None) -> RunFiles:
-    """Read everything that a run folder holds; a UserError says that it is not one.
+    """Read all files of a run folder; a UserError reports a folder without a run.
 
-    The scene is looked for where it was, unless the caller says where it lies now.
+    The scene is searched in the folder of the fit, unless the caller names its current folder.
     """
     path = folder / "config.json"
     if not path.is_file():
@@ -116,14 +116,14 @@ def read_run(folder: Path, scene: Path | None = None) -> RunFiles:
     try:
         cfg = from_dict(options) if options else None
     except (TypeError, ValueError) as error:
-        missing.append(f"config.json is of another version of this program ({error}).")
+        missing.append(f"config.json was written by another version of this program ({error}).")
     metrics = _read_object(folder / "metrics.json", "the scores", missing)
     try:
         photometry = read_photometry(folder / "photometry.json")
     except UserError as error:
-        there = (folder / "photometry.json").exists()
-        why = error.message if there else "photometry.json is missing"
-        missing.append(f"The exposures are not shown: {why}.".replace("..", "."))
+        exists = (folder / "photometry.json").exists()
+        reason = error.message if exists else "photometry.json is missing"
+        missing.append(f"The exposures cannot be displayed: {reason}.".replace("..", "."))
     log = _read_log(folder / "log.jsonl", missing)
     names = [] if photometry is None else [v["image"] for v in photometry["views"]]
     read = {path.name: saved, "metrics.json": metrics, "log.jsonl": log}
@@ -144,43 +144,43 @@ def read_run(folder: Path, scene: Path | None = None) -> RunFiles:
 
 
 def _read_log(path: Path, missing: list[str]) -> list[dict[str, Any]]:
-    """Return the lines of the log that hold a step; `missing` receives why there are none."""
+    """Return the lines of the log that hold a step; `missing` receives the reason for none."""
     try:
         records = read_jsonl(path)
     except (UserError, OSError) as error:
-        missing.append(f"The training curves are not shown: {error}")
+        missing.append(f"The training curves cannot be displayed: {error}")
         return []
     kept = [r for r in records if isinstance(r, dict) and number_at(r, "step") is not None]
     if not kept:
-        missing.append("The training curves are not shown: log.jsonl is missing or empty.")
+        missing.append("The training curves cannot be displayed: log.jsonl is missing or empty.")
     return kept
 
 
 def _find_held_out(folder: Path, names: list[str]) -> tuple[HeldOutFiles, ...]:
-    """Return the held-out views that `fit` wrote into `renders/`, by the names of all views."""
+    """Return the held-out views that `fit` wrote into `renders/`; `names`: of all views."""
     whole = {str(Path(name).with_suffix("")): name for name in names}
     out = []
     for render in sorted(folder.rglob("*.render.png")):
         stem = render.name.removesuffix(".render.png")
         photograph = render.with_name(f"{stem}.photograph.png")
         short = (render.parent.relative_to(folder) / stem).as_posix()
-        # What `p2gs-jax render` wrote into renders/all is not a held-out view.
+        # Files that `p2gs-jax render` wrote into renders/all are not held-out views.
         if photograph.is_file() and (short in whole or not whole):
             out.append(HeldOutFiles(whole.get(short, short), photograph, render))
     return tuple(out)
 
 
-def _read_object(path: Path, what: str, missing: list[str]) -> dict[str, Any]:
-    """Return a JSON object; `missing` receives why there is none."""
+def _read_object(path: Path, content: str, missing: list[str]) -> dict[str, Any]:
+    """Return a JSON object; `missing` receives a sentence if there is none."""
+    effect = f"{content} cannot be displayed"
     try:
         value = parse_json(path.read_text(encoding="utf-8"))
-        why = f"{path.name} does not hold an object: {what} cannot be shown."
+        problem = f"{path.name} does not contain a JSON object: {effect}."
     except FileNotFoundError:
-        value = None
-        why = f"{path.name} is missing: {what} cannot be shown. The run is not finished."
+        value, problem = None, f"{path.name} is missing: {effect}. The run is not finished."
     except (OSError, ValueError) as error:
-        value, why = None, f"{path.name} cannot be read: {what} cannot be shown ({error})."
+        value, problem = None, f"{path.name} cannot be read: {effect} ({error})."
     if isinstance(value, dict):
         return value
-    missing.append(why)
+    missing.append(problem)
     return {}

@@ -1,4 +1,4 @@
-"""Sections on scores and on the run itself: protocols, drives, training, options."""
+"""Sections on scores (by protocol, and of drives), on training, and on options."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ RADIANCE = {
 }
 # Protocols of scores by part, parts of a view, and splits of depth, as `metrics.json` has them.
 BY_PART = ("train", "test_averaged", "test_fitted", "test_metered")
-PARTS = {"whole": "all", "static": "what stands", "moving": "what moves"}
+PARTS = {"whole": "all", "static": "static", "moving": "moving"}
 SPLITS = {"all": "all", "held_out": "held out"}
 DEPTH = ("median_m", "median_relative", "within_10_percent", "missing")
 
 
-def _shown(value: float | None, digits: int) -> str:
+def _cell(value: float | None, digits: int) -> str:
     return "" if value is None else f"{value:.{digits}f}"
 
 
 def _scores(run: RunFiles, *path: str) -> list[str]:
-    """Return PSNR, SSIM and LPIPS at a path of `metrics.json`; empty where there are none."""
-    return [_shown(run.number(*path, name), digits) for name, digits in SCORES.items()]
+    """Return PSNR, SSIM and LPIPS at a path of `metrics.json`; empty if they are missing."""
+    return [_cell(run.number(*path, name), digits) for name, digits in SCORES.items()]
 
 
 def _numbers(names: list[str], rows: list[list[str]], first: int, note: str = "") -> str:
-    """Return a table with numbers from column `first` on, without empty columns, and a note."""
+    """Return a table without empty columns, and a note; columns from `first` on hold numbers."""
     if not rows:
         return ""
     kept = [i for i in range(len(names)) if i < first or any(r[i] for r in rows)]
@@ -52,9 +52,9 @@ def _numbers(names: list[str], rows: list[list[str]], first: int, note: str = ""
 
 
 def score_section(run: RunFiles) -> str:
-    """Return every score, by protocol."""
+    """Return all scores by protocol."""
     rows = [[p.views, p.shown, *_scores(run, *p.path)] for p in PROTOCOLS.values()]
-    names = ["views", "shown with", "PSNR, dB", "SSIM", "LPIPS"]
+    names = ["views", "rendered with", "PSNR, dB", "SSIM", "LPIPS"]
     body = _numbers(names, [r for r in rows if r[2] or r[3]], 2)
     return body + _radiance(run)
 
@@ -66,8 +66,8 @@ def _radiance(run: RunFiles) -> str:
     known = {form: run.number("radiance", name) for name, form in RADIANCE.items()}
     more = "".join("; " + form.format(v) for form, v in known.items() if v is not None)
     return paragraph(
-        f"Against the scene's true radiance, after one common scale: {median:.3f} stops median, "
-        f"{rms:.3f} RMS{more}."
+        f"The error against the true radiance of the scene, after one common scale: {median:.3f} "
+        f"stops (median), {rms:.3f} stops (RMS){more}."
     )
 
 
@@ -79,10 +79,10 @@ def parts_section(run: RunFiles) -> str:
         scores, seen = _scores(run, *path, part), run.number(*path, part, "views")
         if scores[0] and seen is not None:
             rows.append([views, shown, what, *scores, f"{seen:.0f}"])
-    names = ["views", "shown with", "pixels", "PSNR, dB", "SSIM", "LPIPS", "views that show any"]
+    names = ["views", "rendered with", "pixels", "PSNR, dB", "SSIM", "LPIPS", "number of views"]
     note = (
-        "Moving: within the boxes of what moves at some time. SSIM is the mean of the whole "
-        "image's map over the part."
+        "Moving pixels are in the boxes of objects that move at some time. SSIM is computed on the "
+        "whole image and averaged over the pixels. The last column counts views that have any."
     )
     return _numbers(names, rows, 3, note)
 
@@ -98,16 +98,16 @@ def depth_section(run: RunFiles) -> str:
             rows.append([views, PARTS[part], *cells, f"{points:,.0f}"])
     names = ["views", "points", "median error", "relative", "within 10 %", "no surface", "count"]
     note = (
-        "Rendered depth at the points of the sweep nearest in time to each view, without those "
-        "that nearer points hide; points on moving boxes are carried to the time of the view. "
-        "Where the render shows no surface, the error counts as infinite."
+        "The rendered depth is compared at the LiDAR points of the sweep nearest in time to each "
+        "view. Points hidden by nearer points do not count. Points in moving boxes are moved to "
+        "the time of the view. If the render has no surface at a point, the error is infinite."
     )
     return _numbers(names, rows, 2, note)
 
 
 def _depth(found: dict[str, Any], name: str) -> str:
     value = number_at(found, name)
-    if value is None:  # infinite: more than half of the points have no surface
+    if value is None:  # an infinite median: more than half of the points have no surface
         return "none"
     return f"{value:.2f} m" if name == "median_m" else f"{value:.1%}"
 
@@ -116,7 +116,7 @@ def training_section(run: RunFiles) -> str:
     """Return loss, PSNR and Gaussians over the steps."""
     log = [r for r in run.log if number_at(r, "gaussians") is not None]
     if len(log) < 2:
-        return paragraph("There are no curves; the list of what this page lacks says why.")
+        return paragraph("There are no curves; the list of missing parts gives the reason.")
 
     def over_steps(*path: str) -> np.ndarray:
         return column(number_at(r, *path) for r in log)
@@ -124,7 +124,7 @@ def training_section(run: RunFiles) -> str:
     terms = sorted({name for r in log for name in r.get("terms") or {}})
     values = {n: v for n in terms if np.isfinite(v := over_steps("terms", n)).any()}
     size = {n: float(np.nanmedian(v)) for n, v in values.items()}
-    # What is as good as nothing would only stretch the axis.
+    # Very small terms would only stretch the axis.
     large = [n for n in size if size[n] > 1e-3 * max(size.values())]
     ranked = sorted(large, key=lambda n: -size[n])[:MOST_TERMS]
     losses = {"loss": over_steps("loss")} | {n.replace("_", " "): values[n] for n in ranked}
@@ -134,19 +134,19 @@ def training_section(run: RunFiles) -> str:
     at = [step for step, _ in marks]
     chart = training_chart(steps, psnr, losses, gaussians, at, label=label)
     caption = (
-        "From log.jsonl; lines are running medians, the pale one is each entry. Entries average a "
-        "few training views, so they scatter with how hard these are."
+        "The numbers are from log.jsonl. Strong lines are running medians; the pale line has every "
+        "entry. An entry is the mean of a few training views, some of which are harder to fit."
     )
     if marks:
-        caption += f" Dotted: {'; '.join(f'{what} from step {at:.0f}' for at, what in marks)}."
+        caption += f" Dotted: {'; '.join(f'{size} from step {step:.0f}' for step, size in marks)}."
     seconds = number_at(log[-1], "seconds")
     if seconds is not None:
-        caption += f" The last step came after {duration(seconds)}."
+        caption += f" The last step ended after {duration(seconds)}."
     return figure(chart, caption)
 
 
 def _marks(log: Sequence[dict[str, Any]]) -> list[tuple[float, str]]:
-    """Return the steps at which images grow, and to what."""
+    """Return the steps at which training images grow, and the new sizes in words."""
     out = []
     for before, now in itertools.pairwise(log):
         a, b = number_at(before, "shrink"), number_at(now, "shrink")
@@ -157,7 +157,7 @@ def _marks(log: Sequence[dict[str, Any]]) -> list[tuple[float, str]]:
 
 
 def configuration_section(run: RunFiles) -> str:
-    """Return the options, first those that differ from the preset's."""
+    """Return the options; those that differ from the preset come first."""
     if not run.options:
         return ""
     try:
@@ -169,16 +169,16 @@ def configuration_section(run: RunFiles) -> str:
         for name, value in flat(run.options).items()
         if option_text(value) != option_text(base.get(name))
     ]
-    body = paragraph(f"Preset {run.preset}. Scene: {run.scene}.")
+    body = paragraph(f"Preset: {run.preset}. Scene: {run.scene}.")
     if base:
-        same = paragraph("All options are the preset's.")
-        body += table(["option", "here", "in the preset"], differs) if differs else same
+        same = paragraph("All options are as in the preset.")
+        body += table(["option", "this run", "preset"], differs) if differs else same
     dump = text(json.dumps(run.options, indent=2))
     return body + folded("The whole configuration (config.json)", f'<pre tabindex="0">{dump}</pre>')
 
 
 def option_text(value: Any) -> str:
-    """Return the value of an option as people write it."""
+    """Return the value of an option as text."""
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(option_text, value)) + "]"
     return "none" if value is None else str(value)

@@ -91,8 +91,8 @@ WARNINGS = [
     (first(exposure=None, exposure_ev=None), "Views without an exposure", (NAME,)),
     (exif, "EXIF disagrees with the pixels", ("{2} -0.80", "In 1 view of 4")),
     (first(exposure_ev_error=0.4), "Exposures are only roughly known", ("{0} 0.40",)),
-    (put(1200, *CROWDED), "The Gaussians ran out of room", ("1,200",)),
-    (rising, "Not finished improving", ("rose by 1.0 dB",)),
+    (put(1200, *CROWDED), "The limit on Gaussians was reached", ("1,200",)),
+    (rising, "Still improving at the end", ("rose by 1.0 dB",)),
 ]
 
 
@@ -120,9 +120,9 @@ def test_what_proves_nothing_gives_no_warning(run, change):
 def test_a_sentence_says_what_was_modelled(run):
     model = findings.modelled(run)
     assert "an exposure per view under the sRGB tone curve" in model
-    assert "the simplest choice that predicts" in model
+    assert "the simplest model that predicts" in model
     del run.metrics["photometry"]
-    assert "no shared points to choose by" in findings.modelled(run)
+    assert "no shared points were available" in findings.modelled(run)
     assert [findings.duration(s) for s in (12.4, 125, 7300)] == ["12 s", "2 min 5 s", "2 h 1 min"]
     run.photometry["curve"]["name"] = "linear"
     run.photometry["model"] = "constant"
@@ -132,7 +132,7 @@ def test_a_sentence_says_what_was_modelled(run):
 
 def test_charts_are_in_the_page_s_colours_and_missing_values_break_a_line():
     x, values = np.arange(1.0, 7.0), np.array([0.0, 1, np.nan, 1, 0, np.nan])
-    found = Series("found", x, np.sin(x), SOURCES["found"])
+    found = Series("recovered", x, np.sin(x), SOURCES["recovered"])
     series = [found, Series("true", x, values, SOURCES["true"])]
     text = panels_chart([("a", series)], y_label="y", x_label="x", label="l")
     line = re.findall(r'd="([^"]*)"[^>]*stroke-dasharray', text)
@@ -154,7 +154,7 @@ def test_parts_and_depth_are_tables(drive):
     moving = {"psnr": 20.0, "ssim": 0.6, "lpips": 0.3, "views": 2}
     scores = {"psnr": 29.0, "ssim": 0.8, "whole": part, "static": part, "moving": moving}
     body = parts_section(drive(train=scores, test={"exposure_fitted": scores}))
-    assert body.count(">what moves<") == 2
+    assert body.count(">moving<") == 2
     assert "20.00" in body
     assert "0.3000" in body
     seen = {"median_m": 0.123, "median_relative": 0.02, "within_10_percent": 0.9}

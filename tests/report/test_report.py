@@ -23,8 +23,8 @@ from p2gs_jax.report.report import report_page, write_report
 from p2gs_jax.report.run_files import read_run
 
 HEADINGS = [
-    *("What to watch", "What was modelled, and why", "Exposures", "Tone curve"),
-    *("Seams before and after", "Held-out views", "Scores", "Training", "Configuration"),
+    *("Warnings", "Photometric model", "Exposures", "Tone curve"),
+    *("Seams between photographs", "Held-out views", "Scores", "Training", "Configuration"),
 ]
 
 
@@ -111,10 +111,10 @@ def test_in_a_browser(browser, full_page, width):
 def test_seams_are_shown_with_their_numbers(full_page, run):
     text = full_page.read_text()
     first, second = (v["image"].removesuffix(".png") for v in read_run(run).train[:2])
-    assert "differ by 1.25 stops as taken, and by 0.07 once" in words_of(text)
+    assert "differs by 1.25 stops as recorded, and by 0.07 stops after" in words_of(text)
     assert f"Left half: {second}. Right half: {first}." in words_of(text)
-    assert "As taken: 1.25 stops, 40 8-bit levels apart" in words_of(text)
-    for kind, level in (("as taken", 64), ("developed alike", 191)):
+    assert "As recorded: a difference of 1.25 stops, or 40 8-bit levels" in words_of(text)
+    for kind, level in (("as recorded", 64), ("at one exposure", 191)):
         picture = pictures(text)[f"{second} beside {first}, {kind}"]
         assert np.median(picture) == pytest.approx(level, abs=1)
 
@@ -145,7 +145,7 @@ def test_broken_files_do_not_break_the_page(run, tmp_path, names, content):
     for name in names.split():
         (broken / name).write_text(content, encoding="latin-1")
     text = write_report(broken, render=False).read_text()
-    assert "What this page lacks" in text or content.startswith('{"train"')
+    assert "Missing parts of this page" in text or content.startswith('{"train"')
 
 
 def test_the_command_reports_broken_files_and_missing_ones(run, tmp_path, run_command):
@@ -182,11 +182,11 @@ def test_names_are_text_never_markup(run, page, tmp_path):
 
 def test_what_a_run_knows_is_drawn(full_page):
     text = words_of(full_page.read_text())
-    assert all(f" {label} " in text for label in ("found", "held out", "EXIF", "true"))
+    assert all(f" {label} " in text for label in ("recovered", "held-out view", "EXIF", "true"))
     for said in (
-        *("RMS error 0.000 stops", "Crosses, dotted: EXIF", "EXIF disagrees with the pixels"),
+        *("RMS error 0.000 stops", "Crosses are EXIF", "EXIF disagrees with the pixels"),
         *("two standard errors, at most ±0.08 stops", "camera front", "camera rear"),
-        *("γ 2.10", "γ 2.50"),
+        *("gamma 2.10", "gamma 2.50"),
         *("images at 1/2 from step 250", "full-size images from step 500"),
     ):
         assert said in text
