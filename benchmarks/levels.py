@@ -27,7 +27,7 @@ from benchmarks.speed_error import (
 )
 from p2gs_jax.config import FitConfig
 from p2gs_jax.render import bin_tiles, project, required_capacity
-from p2gs_jax.render.capacity import Room, bucket
+from p2gs_jax.render.capacity import Capacity, bucket
 from p2gs_jax.render.visible import whole_blocks
 from p2gs_jax.train.exposure_loss import Partner
 from p2gs_jax.train.optimizer import make_optimizer
@@ -117,7 +117,7 @@ def whole_step(scene: BenchScene, cfg: FitConfig, linear: np.ndarray, entries: i
     """Return a function that takes a training step and returns its loss, and one for the fault.
 
     The photograph is the scene's image `linear` (H, W, 3) at half the exposure, near what a fit
-    compares with; the lists have room for so many `entries`. After a fault, steps do nothing.
+    compares with; the tile lists hold `entries` entries. After a fault, steps do nothing.
     """
     ldr = jnp.asarray(np.clip(0.5 * linear, 0, 1) ** (1 / 2.2), jnp.float32)
     batch = Batch(scene.camera, ldr, jnp.ones(linear.shape[:2]), jnp.int32(0))
@@ -129,10 +129,10 @@ def whole_step(scene: BenchScene, cfg: FitConfig, linear: np.ndarray, entries: i
     degree = cfg.render.sh_degree
     controls = Controls(jnp.float32(0.5), jnp.int32(degree), jnp.float32(1), jnp.uint32(0))
     partner, step = Partner(jnp.int32(0)), Step(cfg, optimizer, 1.0, cfg.densify.noise)
-    room = Room(entries, whole_blocks(scene.gaussians.capacity))
+    static = {"capacity": Capacity(entries, whole_blocks(scene.gaussians.capacity))}
 
     def run():
-        holder[0], report = step(holder[0], batch, partner, controls, room=room, degree=degree)
+        holder[0], report = step(holder[0], batch, partner, controls, **static, degree=degree)
         return report.loss
 
     return run, lambda: int(holder[0].fault.kind)

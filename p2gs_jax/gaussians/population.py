@@ -1,4 +1,4 @@
-"""Slots: allocation, growth and the moves that all densification methods share.
+"""Slots for Gaussians: allocation, growth, and helpers that all densification methods share.
 
 The arrays keep their shape inside jit; only `grow`, on the host and between steps, enlarges them.
 """
@@ -26,36 +26,36 @@ class Outcome(NamedTuple):
     gaussians: Gaussians
     population: Population
     reset_moments: Bool[Array, " n"]  # slots whose optimiser moments must be zeroed
-    refused: Int[Array, ""]  # requests for which there was no slot: counted, never silent
+    refused: Int[Array, ""]  # requests for which there was no free slot
 
 
 def fresh_population(alive: Bool[Array, " n"], owner: Int[Array, " n"] | None = None) -> Population:
     """Return a population with empty statistics; `owner` is the moving object of each Gaussian."""
-    # Two arrays, not one twice: the step donates its input, and a buffer can be donated once only.
-    none = [jnp.zeros(alive.shape, jnp.float32) for _ in range(2)]
-    return Population(alive, *none, owner=owner)
+    # Two separate arrays: a step donates its input, and a buffer can be donated only once.
+    zeros = [jnp.zeros(alive.shape, jnp.float32) for _ in range(2)]
+    return Population(alive, *zeros, owner=owner)
 
 
 def empty_population(count: int, like: Population) -> Population:
-    """Return the population of `count` empty slots, which are nobody's."""
+    """Return the population of `count` empty slots, which belong to no moving object."""
     owner = None if like.owner is None else jnp.full(count, -1, like.owner.dtype)
     return fresh_population(jnp.zeros(count, bool), owner)
 
 
 def empty_gaussians(count: int, like: Gaussians) -> Gaussians:
-    """Return harmless contents for `count` empty slots."""
-    shape = jax.tree.map(lambda a: jnp.zeros((count, *a.shape[1:]), a.dtype), like)
+    """Return invisible Gaussians for `count` empty slots."""
+    zeros = jax.tree.map(lambda a: jnp.zeros((count, *a.shape[1:]), a.dtype), like)
     return dataclasses.replace(
-        shape,
-        quats=shape.quats.at[:, 0].set(1.0),
+        zeros,
+        quats=zeros.quats.at[:, 0].set(1.0),
         opacity_logits=jnp.full((count,), EMPTY_LOGIT, like.opacity_logits.dtype),
     )
 
 
-# Seconds of a step per pixel, and of the shortest step: two cores of 2025; an H200 (2026-11-26).
+# Seconds of a step per pixel, and its least seconds: on two cores of 2025; on an H200 (2026-11-26).
 STEP_SECONDS = {"cpu": (5e-7, 0.0), "gpu": (4e-9, 4e-3)}
-# Gaussians shown per pixel of a view: from the first to the second with the steps of a run (ours:
-# BUILD_NOTES, "Population").
+# Visible Gaussians per pixel of a view; the share grows with the steps of a run, within these
+# bounds (ours: BUILD_NOTES, "Population").
 SMALLEST_SHARE, LARGEST_SHARE, STEPS_PER_SHARE = 0.1, 0.3, 15_000
 MOST_BY_DEFAULT = 400_000
 
@@ -64,25 +64,25 @@ class Coverage(NamedTuple):
     """Pixels of one view, and the share of the scene that a view shows on average."""
 
     pixels: int
-    shown: float
+    visible_share: float
 
     def gaussians(self, steps: float | int) -> int:
-        """Return how many Gaussians so many steps can fit."""
+        """Return the number of Gaussians that a run of `steps` steps can fit."""
         share = min(max(steps / STEPS_PER_SHARE, SMALLEST_SHARE), LARGEST_SHARE)
-        return int(share * self.pixels / self.shown)
+        return int(share * self.pixels / self.visible_share)
 
 
 def step_seconds(pixels: int) -> float:
-    """Return about how long a step takes on the default device for a view of so many pixels."""
-    each, least = STEP_SECONDS.get(jax.default_backend(), STEP_SECONDS["cpu"])
-    return max(each * pixels, least)
+    """Return the estimated seconds of a step on the default device, for a view of `pixels`."""
+    per_pixel, least = STEP_SECONDS.get(jax.default_backend(), STEP_SECONDS["cpu"])
+    return max(per_pixel * pixels, least)
 
 
 def default_max_gaussians(seeds: int, coverage: Coverage, train: TrainConfig) -> int:
-    """Return the population limit where none is configured.
+    """Return the limit of the population if the configuration sets none.
 
-    A long run can fit more Gaussians than a short one, and a scene of which a view shows little
-    needs more. The limit is never below the seeds and a quarter.
+    A longer run can fit more Gaussians. A scene needs more Gaussians if a view shows a smaller
+    share of it. The limit is at least 1.25 times the number of seeds, and 1,000.
     """
     steps = train.steps
     if train.budget_s is not None:
@@ -107,25 +107,24 @@ def grow(tree, fill):
 def place(
     requests: Bool[Array, " n"], alive: Bool[Array, " n"]
 ) -> tuple[Int[Array, " n"], Int[Array, ""]]:
-    """Assign an empty slot to each request, in order; count the requests that found none.
+    """Assign an empty slot to each request, in order; count the requests without a slot.
 
-    A request without a slot gets n, out of bounds.
+    A request without a slot gets n, which is out of bounds.
     """
     n = alive.shape[0]
     rank = jnp.cumsum(requests) - 1
-    room = n - jnp.sum(alive)
-    granted = requests & (rank < room)
+    granted = requests & (rank < n - jnp.sum(alive))
     free = jnp.argsort(alive, stable=True).astype(jnp.int32)  # empty slots first, in order
     slot = jnp.where(granted, free[jnp.clip(rank, 0, n - 1)], n)
     return slot, jnp.sum(requests) - jnp.sum(granted)
 
 
 def opacities(gaussians: Gaussians) -> Float[Array, " n"]:
-    """Return peak opacities in (0, 1)."""
+    """Return the opacities, in (0, 1)."""
     return jax.nn.sigmoid(gaussians.opacity_logits)
 
 
 def logit(p: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Return log(p / (1 - p)), with p kept off 0 and 1."""
+    """Return log(p / (1 - p)), with p clipped away from 0 and 1."""
     p = jnp.clip(p, 1e-6, 1 - 1e-6)
     return jnp.log(p) - jnp.log1p(-p)

@@ -46,7 +46,7 @@ from p2gs_jax.scene.pixels.store import decoded_into
 from p2gs_jax.train.data_parallel import mesh_of
 from p2gs_jax.train.inputs import TrainingViews
 from p2gs_jax.train.loop import Trainer, TrainResult
-from p2gs_jax.train.make_step import AS_CONFIGURED, Own
+from p2gs_jax.train.make_step import AS_CONFIGURED, Custom
 from p2gs_jax.train.step import StepPrograms
 from p2gs_jax.train.strategies import Strategy
 from p2gs_jax.train.terms import LossTerm
@@ -103,7 +103,8 @@ def fit(
     folder, begin = RunFolder(paths.run), time.monotonic() - spent_s
     weights = preflight(cfg, paths, resume=resume)
     clock = Stopwatch({"starting": spent_s} if spent_s else {})
-    optimiser = Optimiser(folder, reporter, mesh_of(cfg, devices), Own(terms, formation, strategy))
+    mesh, custom = mesh_of(cfg, devices), Custom(terms, formation, strategy)
+    optimiser = Optimiser(folder, reporter, mesh, custom)
     pixels = decoded_into(folder.pixels)
     with no_empty_folders(paths.run), locked(paths.run) as lock, pixels, memory_named(), optimiser:
         check_run_dir(paths.run, resume, cfg)  # another may have ended since
@@ -155,8 +156,8 @@ def _prepared(
 class Optimiser:
     """Compiles and runs the steps of a fit; as a context manager it ends the compilers.
 
-    The log and checkpoints go into `folder`; `mesh` has the devices of a step of several views, and
-    `own` what the caller of `fit` brought.
+    The log and checkpoints go into `folder`. `mesh` has the devices of a step of several views, and
+    `custom` the parts that the caller of `fit` passed.
     """
 
     def __init__(
@@ -164,10 +165,10 @@ class Optimiser:
         folder: RunFolder,
         reporter: Reporter | None = None,
         mesh: Mesh | None = None,
-        own: Own = AS_CONFIGURED,
+        custom: Custom = AS_CONFIGURED,
     ):
         self._folder, self._reporter = folder, reporter or Silent()
-        self._mesh, self._own = mesh, own
+        self._mesh, self._custom = mesh, custom
         self._programs = StepPrograms()
 
     def __enter__(self) -> Optimiser:
@@ -189,7 +190,7 @@ class Optimiser:
         def begin(decisions: Decisions, curve_known: bool) -> None:
             start = expected(found, decisions)
             self._trainer(start, Silent()).expect(
-                self._own.among(start.params), start.owner, curve_known
+                self._custom.among(start.params), start.owner, curve_known
             )
 
         def chosen(form: Form, response: Response) -> None:
@@ -210,7 +211,7 @@ class Optimiser:
         gone and `finish_s` are kept for evaluation and files.
         """
         alive = np.ones(start.params.gaussians.capacity, bool)
-        params, how = self._own.among(start.params), {"spent_s": spent_s, "finish_s": finish_s}
+        params, how = self._custom.among(start.params), {"spent_s": spent_s, "finish_s": finish_s}
         trainer = self._trainer(start, self._reporter)
         return trainer.run(params, alive, start.owner, resume=resume, **how)
 
@@ -221,7 +222,7 @@ class Optimiser:
 
         rows, train, found = start.scene.train_indices, start.cfg.train, start.survey
         # What corrects display values knows places in an image.
-        plain = start.cfg.photometry.appearance is None and self._own.formation is None
+        plain = start.cfg.photometry.appearance is None and self._custom.formation is None
         how = {"resident": train.batch == 1, "padded": plain}
         return Trainer(
             start.cfg,
@@ -235,8 +236,8 @@ class Optimiser:
             on_log=reporter.log,
             on_message=say,
             mesh=self._mesh,
-            terms=self._own.terms,
-            strategy=self._own.strategy,
+            terms=self._custom.terms,
+            strategy=self._custom.strategy,
         )
 
 

@@ -1,7 +1,8 @@
 """Capacities of the static arrays of a view: allocate outside jit, check for overflow, grow.
 
-Time depends on what a view needs, memory on the capacity: 54 bytes per entry (BUILD_NOTES, "Growth
-and memory"). So capacities are generous, and overflows, which cost a compilation, are rare.
+Time depends on the entries that a view uses, memory on the capacity: 54 bytes per entry
+(BUILD_NOTES, "Growth and memory"). So capacities are generous, and overflows, each of which costs a
+compilation, are rare.
 """
 
 from __future__ import annotations
@@ -28,38 +29,41 @@ STEP = 1.25
 SMALLEST = 4096
 
 Result = TypeVar("Result")
-# Renders one view: (gaussians, alive, camera, owner=None), as of `render_linear`.
+# Renders one view: (gaussians, alive, camera, owner=None), the arguments of `render_linear`.
 RenderView = Callable[..., Render]
 
 
 class Margins(NamedTuple):
-    """Factors by which a list is longer than needed: when allocated, and after an overflow."""
+    """Ratios of a list's length to the length needed, at first and after an overflow."""
 
     first: float
     grown: float
 
 
-# Pictures on demand: the first view of a size is counted exactly, and one that needs more is
+# Pictures on demand: the first view of a size is counted exactly, and a view that needs more is
 # rendered again at once.
 PICTURES = Margins(1.2, 1.1)
-# Interactive: a few typical views are counted, and the user may go anywhere; an overflow shows a
-# smaller picture until another program is compiled.
+# Viewer: a few typical views are counted, and the user may go anywhere. After an overflow the
+# viewer shows a smaller picture until another program is compiled.
 ANYWHERE = Margins(1.5, 1.5)
-# Training: splats widen before they settle, and an overflow compiles the largest program of a fit.
+# Training: splats widen before they converge, and an overflow compiles the largest program of a
+# fit.
 TRAINING = Margins(1.5, 1.5)
 # Gaussians that a training view shows: only views between the sampled ones may show more.
 TRAINING_VISIBLE = Margins(1.1, 1.2)
-# Sizes that images of many sizes are compiled at; more only differ by a share of their pixels.
+# The most canvas sizes for images of many sizes; further sizes join a canvas if that pads less than
+# this share of its pixels.
 MOST_CANVASES, LEAST_PADDING = 3, 0.01
-# Lists of training are not shorter than this, whatever was counted.
+# Tile lists of training are at least this long, whatever the count.
 ENTRIES_PER_GAUSSIAN, FEWEST_ENTRIES = 4, 16_384
 
 
 def canvases(sizes: Iterable[tuple[int, int]]) -> dict[tuple[int, int], tuple[int, int]]:
-    """Return for every image size (width, height) the size that it is compiled at.
+    """Return for every image size (width, height) the canvas size for which programs are compiled.
 
-    Photographs of the internet have a size each, and every size would be compiled: those are
-    joined that add least, until there are MOST_CANVASES, and any that add next to nothing.
+    Photographs from the internet have many sizes, and each size would need a compilation. Pairs
+    that add the fewest pixels join first, until MOST_CANVASES are left. Further pairs join if they
+    pad less than LEAST_PADDING.
     """
     counts = Counter(sizes)
     groups = [[size] for size in sorted(counts)]
@@ -79,7 +83,7 @@ def canvases(sizes: Iterable[tuple[int, int]]) -> dict[tuple[int, int], tuple[in
 
 
 def bucket(needed: int, margin: float = 1.0) -> int:
-    """Return the length for `needed`: a power of 1.25, so that few programs exist."""
+    """Return a list length of at least `needed * margin`, in steps of 1.25: few programs exist."""
     length = SMALLEST
     while length < needed * margin:
         length = int(length * STEP) + 1
@@ -89,10 +93,9 @@ def bucket(needed: int, margin: float = 1.0) -> int:
 def until_it_fits(
     draw: Callable[[int], tuple[Result, Any, Any]], entries: int
 ) -> tuple[Result, int]:
-    """Draw a picture, with a longer tile list as long as it overflows.
+    """Return a picture and the capacity that sufficed; the tile list grows while it overflows.
 
-    `draw` goes from a static number of entries to (result, entries needed, whether they
-    overflowed). The number that sufficed is returned with the result.
+    `draw` maps a static number of entries to (result, entries needed, whether they overflowed).
     """
     while True:
         result, needed, overflow = draw(entries)
@@ -102,23 +105,23 @@ def until_it_fits(
 
 
 def _grown(length: int, needed: int, margins: Margins) -> int:
-    """Return the length of a list that was too short, if it was."""
+    """Return a longer length if the list was too short, else the same."""
     return length if needed <= length else bucket(needed, margins.grown)
 
 
-class Room(NamedTuple):
-    """Static sizes of a training step: tile-list entries, and Gaussians that one view may show."""
+class Capacity(NamedTuple):
+    """Static sizes of a training step."""
 
-    entries: int
-    visible: int
+    entries: int  # of the tile list
+    visible: int  # Gaussians that one view may show
 
     @classmethod
-    def allocate(cls, entries: int, visible: int, growth: float, limit: int) -> Room:
-        """Return room for all views of one image size, to the end of a run.
+    def allocate(cls, entries: int, visible: int, growth: float, limit: int) -> Capacity:
+        """Return the capacity that suffices all views of one image size until the run ends.
 
-        So many entries a view needs at most now, as counted, and so many Gaussians it shows. The
-        population may still grow by a factor, at most to `limit`: a view goes on to show the same
-        share of it, and Gaussians that share a place are smaller.
+        `entries` and `visible` are the largest counts of a view now. The population may still grow
+        by the factor `growth`, at most to `limit`. A view then shows the same share of it, and
+        denser Gaussians are smaller.
         """
         wanted = int(visible * TRAINING_VISIBLE.first * growth)
         lists = int(TRAINING.first * entries * growth**0.5)
@@ -127,13 +130,13 @@ class Room(NamedTuple):
             min(whole_blocks(wanted), whole_blocks(limit)),
         )
 
-    def holds(self, other: Room) -> bool:
-        """Return whether every view that fits the other fits this."""
+    def holds(self, other: Capacity) -> bool:
+        """Return whether every view that fits the other capacity fits this one."""
         return self.entries >= other.entries and self.visible >= other.visible
 
-    def grown(self, entries: int, visible: int) -> Room:
-        """Return room for a view that needs this, with some to spare; only what was short grows."""
-        return Room(
+    def grown(self, entries: int, visible: int) -> Capacity:
+        """Return a capacity that fits a view with these counts; only a size too small grows."""
+        return Capacity(
             _grown(self.entries, entries, TRAINING), _grown(self.visible, visible, TRAINING_VISIBLE)
         )
 
@@ -144,9 +147,10 @@ count_needed = jax.jit(required_capacity, static_argnames="cfg")
 
 @functools.cache
 def compiled_renderer() -> Any:
-    """Return `render_linear`, compiled; static are `cfg`, `capacity` and `with_depth`.
+    """Return `render_linear`, compiled; `cfg`, `capacity` and `with_depth` are static.
 
-    On first use: its options depend on the backend, which an import should not start.
+    It is made on first use, because its options depend on the backend, which an import should not
+    start.
     """
     static = ("cfg", "capacity", "with_depth")
     return jax.jit(render_linear, static_argnames=static, compiler_options=compiler_options())
@@ -159,11 +163,11 @@ def make_renderer(
 ) -> RenderView:
     """Return a function that renders one view, and grows its tile lists after an overflow.
 
-    `owners` are what `owner` is where it is not given. Views of many `sizes`, where these are
-    known, are rendered on `canvases`.
+    `owners` is the default of its argument `owner`. Views of the image `sizes` are rendered on
+    their `canvases`, views of other sizes on their exact size.
     """
-    known = None if owners is None else on_device(owners, np.int32)
-    on = canvases(sizes)
+    default_owner = None if owners is None else on_device(owners, np.int32)
+    canvas_of = canvases(sizes)
     capacities: dict[tuple[int, int], int] = {}
 
     def render_view(
@@ -172,9 +176,9 @@ def make_renderer(
         camera: Camera,
         owner: Int[Array, " n"] | None = None,
     ) -> Render:
-        owner = known if owner is None else owner
+        owner = default_owner if owner is None else owner
         width, height = camera.width, camera.height
-        size = on.get((width, height), (width, height))
+        size = canvas_of.get((width, height), (width, height))
         camera = dataclasses.replace(camera, width=size[0], height=size[1])
         if size not in capacities:
             needed = int(count_needed(gaussians, alive, camera, cfg=cfg, owner=owner))

@@ -1,8 +1,8 @@
-"""Steps of several views, whose views are shared out among devices that each hold the whole scene.
+"""Steps of several views, divided over devices that each hold the whole scene.
 
-Within a device everything is as in a step of one view, view by view; between devices only sums of
-gradients travel. The loss is the mean over the views; learning rates are those of one view times
-the root of their number, so that as many views move a Gaussian about as far (Krizhevsky 2014;
+Each device computes its views one by one, as in a step of one view; devices exchange only sums of
+gradients. The loss is the mean over the views. Learning rates are those of one view times the root
+of the number of views, so that the same views move a Gaussian about as far (Krizhevsky 2014;
 Grendel-GS, arXiv 2406.18533; docs/scaling.md).
 """
 
@@ -32,7 +32,7 @@ from p2gs_jax.train.image_gradient import ImageGradient, Listed, differentiable
 from p2gs_jax.train.optimizer import learning_rates, means_rate
 from p2gs_jax.train.state import FitState
 from p2gs_jax.train.step import MeshStep
-from p2gs_jax.train.update import StepReport, concluded, is_healthy, update_listed
+from p2gs_jax.train.update import StepReport, finished, is_healthy, update_listed
 from p2gs_jax.types import Array, Batch, Frustum, Gaussians
 
 VIEWS = "views"
@@ -47,22 +47,23 @@ def default_mesh(count: int) -> Mesh:
 
 
 def _counted(devices: Count) -> int:
-    there = jax.device_count()
+    available = jax.device_count()
     if devices == "all":
-        return there
-    if not 1 <= devices <= there:
-        why = f"--devices {devices} is not between 1 and the {there} that JAX sees here "
-        why += f"({jax.default_backend()})."
-        fix = f"give one of these, or all; on a CPU, --threads {devices} makes as many of its cores"
+        return available
+    if not 1 <= devices <= available:
+        why = f"--devices {devices} is not between 1 and {available}, the number of devices that "
+        why += f"JAX sees here ({jax.default_backend()})."
+        fix = "give a number in this range, or all; on a CPU, "
+        fix += f"--threads {devices} makes {devices} devices from its cores"
         raise UserError(why, fix=fix)
     return devices
 
 
 def with_a_view_each(cfg: FitConfig, devices: Count) -> FitConfig:
-    """Return a configuration that gives every device a view where it says nothing of batches.
+    """Return a configuration with one view per device, unless it sets a batch size already.
 
     Raises:
-        UserError: there are not so many devices.
+        UserError: JAX sees fewer devices.
     """
     count = _counted(devices)
     if count == 1 or cfg.train.batch > 1:
@@ -71,50 +72,50 @@ def with_a_view_each(cfg: FitConfig, devices: Count) -> FitConfig:
 
 
 def mesh_of(cfg: FitConfig, devices: Count = 1) -> Mesh | None:
-    """Return the mesh of a fit; None for one view a step on one device.
+    """Return the mesh of a fit; None for steps of one view on one device.
 
-    Views are shared out among devices, and one view is divided over cores of a CPU.
+    A batch is divided over devices by views; a single view is divided over the cores of a CPU.
 
     Raises:
-        UserError: there are not so many devices, or the batch cannot be shared out among them.
+        UserError: JAX sees fewer devices, or the batch is not a multiple of their number.
     """
     count, batch = _counted(devices), cfg.train.batch
     if batch < 1:
-        raise UserError(f"--train.batch is {batch}.", fix="give 1 or more")
+        raise UserError(f"--train.batch is {batch}, but it must be positive.", fix="give 1 or more")
     if batch == 1 and count == 1:
         return mesh_of_cores()
     if batch % count:
-        why = f"--train.batch {batch} cannot be shared out among {count} devices."
+        why = f"--train.batch {batch} is not a multiple of the {count} devices."
         fix = f"give a multiple of {count}, such as --train.batch {-(-batch // count) * count}"
         raise UserError(why, fix=fix)
     return default_mesh(count)
 
 
-# ------------------------------------------------- what each device does, with its own views
+# ------------------------------------------------- programs of one device, for its b views
 
 
-def _show(gaussians, alive, frusta, active_degree, owner, **given) -> Listed:
-    """List and project what each view may show; everything is stacked, `visible` as [b, 1]."""
+def _show(gaussians, alive, frusta, active_degree, owner, **static) -> Listed:
+    """List and project the Gaussians of each view; results are stacked, `visible` as [b, 1]."""
 
     def one(frustum):
-        return image_gradient.show(gaussians, alive, frustum, active_degree, owner, **given)
+        return image_gradient.show(gaussians, alive, frustum, active_degree, owner, **static)
 
     listed = lax.map(one, frusta)
     return listed._replace(visible=listed.visible[:, None])
 
 
 def _differentiate(
-    shown, photometry, appearance, batch, partner, *, views: int, **given
+    shown, photometry, appearance, batch, partner, *, views: int, **static
 ) -> ImageGradient:
     """Return the mean loss of all `views` of the step, and its gradient.
 
-    Gradients by splats are those of the device's views, each of its own loss.
+    Gradients by splats are those of each view's loss, for the views of this device.
     """
 
-    def one(own):
-        mine, photograph, second = own
+    def one(view):
+        splats, photograph, second = view
         return image_gradient.differentiate(
-            mine, photometry, appearance, photograph, second, **given
+            splats, photometry, appearance, photograph, second, **static
         )
 
     each = lax.map(one, (shown, batch, partner))
@@ -130,13 +131,13 @@ def _differentiate(
 
 
 class Sums(NamedTuple):
-    """What the views of a step add up to."""
+    """Sums over the views of a step."""
 
-    gradient: Gaussians  # of the sum of the views' losses
-    shown: Int[Array, " n"]  # views that may show each
-    # norms of the gradients by the place on the screen, in units of half the image
+    gradient: Gaussians  # gradient of the sum of the views' losses
+    shown: Int[Array, " n"]  # number of views that may show each Gaussian
+    # sum of the norms of the gradients by position on the screen, in units of half the image
     grad2d: Float[Array, " n"]
-    pulled: Float[Array, " n"]  # views in which that was not zero
+    pulled: Float[Array, " n"]  # number of views in which this gradient is not zero
 
 
 def _advance(
@@ -154,7 +155,7 @@ def _advance(
     degree: int,
     views: int,
 ) -> tuple[FitState, StepReport]:
-    """Move everything by one step, on each device alike; see `update.advance`."""
+    """Move all parameters by one step, equally on each device; see `update.advance`."""
     gaussians, population = state.params.gaussians, state.population
     alive, n, bands = population.alive, gaussians.capacity, coefficient_count(degree)
     most = lax.pmax(jnp.max(visible), VIEWS)
@@ -169,7 +170,7 @@ def _advance(
     key = noise_key(controls.seed, state.step)
 
     def exploring(block, rows, moved, on):
-        # Each Gaussian's noise is its own, whatever else is listed.
+        # The key depends on the Gaussian, so its noise does not depend on the rest of the list.
         keys = jax.vmap(functools.partial(jax.random.fold_in, key))(rows)
         normal = jax.vmap(lambda k: jax.random.normal(k, (3,)))(keys)
         return shaped_noise(normal, moved, on, noise_rate)
@@ -182,7 +183,7 @@ def _advance(
         count,
         healthy,
         bands=bands,
-        # Their gradient is known: a Gaussian is what it is made of.
+        # `sums` already holds the gradient by the Gaussians, so the function is the identity.
         seen=lambda block, on, owner: block,
         v_seen=jax.tree.map(lambda g: g / views, visibility.take_rows(sums.gradient, seen, bands)),
         adam=optimizer.gaussians,
@@ -197,12 +198,12 @@ def _advance(
             seen_count=population.seen_count + jnp.where(healthy, sums.pulled, 0),
         )
     options = {"cfg": cfg, "optimizer": optimizer, "views": views}
-    moved, told = (updated, population), (fits, healthy, most)
-    return concluded(state, moved, gradient, told, rates, **options)
+    moved, checks = (updated, population), (fits, healthy, most)
+    return finished(state, moved, gradient, checks, rates, **options)
 
 
 def _sums(state, ids, visible, gradient, frusta, controls, cfg, bands: int) -> Sums:
-    """Return the sums over all views, one after the other and then over the devices."""
+    """Return the sums over all views: first over the views of a device, then over devices."""
     gaussians, alive = state.params.gaussians, state.population.alive
     owner, n = state.population.owner, gaussians.capacity
 
@@ -213,12 +214,12 @@ def _sums(state, ids, visible, gradient, frusta, controls, cfg, bands: int) -> S
         def body(k, sums: Sums) -> Sums:
             rows = visibility.slice_of(here, k, size)
             on = alive.at[rows].get(mode="fill", fill_value=False)
-            mine = visibility.owners_at(owner, rows)
+            owners = visibility.owners_at(owner, rows)
 
             def seen(block):
                 degree = controls.active_degree
                 return differentiable(
-                    visibility.splat(block, on, frustum, cfg.render, degree, mine)
+                    visibility.splat(block, on, frustum, cfg.render, degree, owners)
                 )
 
             _, pull = jax.vjp(seen, visibility.take_rows(gaussians, rows, bands))
@@ -239,11 +240,11 @@ def _sums(state, ids, visible, gradient, frusta, controls, cfg, bands: int) -> S
 
         return visibility.over_blocks(body, count, here.shape[0], sums), None
 
-    none = dataclasses.replace(gaussians, sh=gaussians.sh[:, :bands])
-    blank = jax.tree.map(jnp.zeros_like, none)
+    used = dataclasses.replace(gaussians, sh=gaussians.sh[:, :bands])
+    blank = jax.tree.map(jnp.zeros_like, used)
     zeros = [jnp.zeros(n, kind) for kind in (jnp.int32, jnp.float32, jnp.float32)]
-    given = (ids, visible[:, 0], gradient.v_shown, gradient.visible, frusta)
-    sums, _ = lax.scan(add, Sums(blank, *zeros), given)
+    views = (ids, visible[:, 0], gradient.v_shown, gradient.visible, frusta)
+    sums, _ = lax.scan(add, Sums(blank, *zeros), views)
     return lax.psum(sums, VIEWS)
 
 
@@ -255,9 +256,9 @@ GRADIENT = GRADIENT._replace(v_shown=OF_VIEWS, visible=OF_VIEWS)
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ParallelStep(MeshStep):
-    """The step of several views; `train.batch` is a multiple of the devices.
+    """The step of several views; `train.batch` is a multiple of the number of devices.
 
-    Batches and partners come stacked, states whole on each of the devices.
+    Batches and partners are stacked; each device holds the whole state.
     """
 
     programs: ClassVar = {
@@ -267,20 +268,20 @@ class ParallelStep(MeshStep):
     }
 
     def settings(self, name: str) -> dict[str, Any]:
-        """Return what one of the three programs takes from the configuration, by argument."""
+        """Return the static arguments of one of the three programs, and the number of views."""
         views = {} if name == "show" else {"views": self.cfg.train.batch}
         return super().settings(name) | views
 
     def frustum(self, batch: Batch) -> Frustum:
         """Return the views of a step, stacked."""
-        one, every = super().frustum(batch), (self.cfg.train.batch,)
-        width, height = (np.full(every, size) for size in (one.width, one.height))
+        one, shape = super().frustum(batch), (self.cfg.train.batch,)
+        width, height = (np.full(shape, size) for size in (one.width, one.height))
         return dataclasses.replace(one, width=width, height=height)
 
     def spread(self, state: FitState) -> FitState:
-        """Return a state whole on each of the devices."""
+        """Return the state copied to each device."""
         return jax.device_put(jax.device_get(state), NamedSharding(self.mesh, ALIKE))
 
     def whole(self, state: FitState) -> FitState:
-        """Return a state on the default device."""
+        """Return the state on the default device."""
         return jax.tree.map(jnp.asarray, jax.device_get(state))

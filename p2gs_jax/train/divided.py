@@ -1,10 +1,10 @@
 """The step of one view, divided over the cores of a CPU (docs/scaling.md, "Cores").
 
-Each core holds every N-th Gaussian, lists and projects those of them that the view may show, and
-moves them. All cores then know all splats, composite every N-th row of tiles, and know the whole
-image; `render/cores.py` says what is divided there. One view a step stays one view a step: the
-result is that of one core up to the order of sums, and of exploration noise, which every core draws
-for its Gaussians.
+Each of N cores holds every N-th Gaussian; it lists, projects and moves those that the view may
+show. The cores exchange splats, so that each knows all of them, and each composites every N-th row
+of tiles; then they exchange the rows of the image (`render/cores.py`). A step still has one view.
+Its result differs from that of one core only by the order of sums and by the exploration noise,
+which every core draws for its Gaussians.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from p2gs_jax.render.capacity import Room
+from p2gs_jax.render.capacity import Capacity
 from p2gs_jax.render.cores import CORES, gather, most, part, scatter_sum
 from p2gs_jax.render.visible import whole_blocks
 from p2gs_jax.train import image_gradient, update
@@ -31,18 +31,18 @@ from p2gs_jax.types import Params
 
 ALIKE: Any = P()
 DIVIDED: Any = P(CORES)
-# Room of a core over its fair share of a view's Gaussians, and of its entries.
+# Capacity of a core as a multiple of its fair share of a view's Gaussians, and of its entries.
 SPARE, SPARE_ENTRIES = 1.05, 1.25
 
 
-def _show(gaussians, alive, frustum, active_degree, owner, **given) -> Listed:
-    listed = image_gradient.show(gaussians, alive, frustum, active_degree, owner, **given)
+def _show(gaussians, alive, frustum, active_degree, owner, **static) -> Listed:
+    listed = image_gradient.show(gaussians, alive, frustum, active_degree, owner, **static)
     return listed._replace(visible=listed.visible[None])
 
 
-def _differentiate(shown, photometry, appearance, batch, partner, **given) -> ImageGradient:
+def _differentiate(shown, photometry, appearance, batch, partner, **static) -> ImageGradient:
     whole = (gather(shown), photometry, appearance, batch, partner)
-    gradient = image_gradient.differentiate(*whole, **given)
+    gradient = image_gradient.differentiate(*whole, **static)
     return gradient._replace(
         v_shown=scatter_sum(gradient.v_shown),
         visible=part(gradient.visible),
@@ -51,10 +51,10 @@ def _differentiate(shown, photometry, appearance, batch, partner, **given) -> Im
     )
 
 
-def _advance(state, ids, visible, gradient, frustum, controls, **given):
+def _advance(state, ids, visible, gradient, frustum, controls, **static):
     full = most((visible[0] > ids.shape[0]).astype(jnp.int32)) > 0
     gradient = gradient._replace(overflow=gradient.overflow | full)
-    return update.advance(state, ids, visible[0], gradient, frustum, controls, **given)
+    return update.advance(state, ids, visible[0], gradient, frustum, controls, **static)
 
 
 LISTED = Listed(*(DIVIDED for _ in Listed._fields))
@@ -70,7 +70,7 @@ STATE = FitState(
 
 
 def mesh_of_cores() -> Mesh | None:
-    """Return the cores that a fit divides a view over; None for one (`core.runtime.use_cores`)."""
+    """Return the mesh of cores of a CPU; None for a single core (`core.runtime.use_cores`)."""
     if jax.default_backend() != "cpu" or jax.device_count() == 1:
         return None
     return Mesh(np.array(jax.devices()), (CORES,))
@@ -86,19 +86,19 @@ class DividedStep(MeshStep):
         "advance": (_advance, (STATE, DIVIDED, DIVIDED, GRADIENT, ALIKE, ALIKE), (STATE, ALIKE)),
     }
 
-    def program(self, name: str, room: Room, degree: int) -> Any:
-        """Return one of the three programs, for a core's share of the room."""
+    def program(self, name: str, capacity: Capacity, degree: int) -> Any:
+        """Return one of the three programs, for a core's share of the capacity."""
         count = self.mesh.size
-        visible = whole_blocks(int(SPARE * room.visible / count))
-        mine = Room(int(SPARE_ENTRIES * room.entries / count), visible)
-        return super().program(name, mine, degree)
+        visible = whole_blocks(int(SPARE * capacity.visible / count))
+        of_core = Capacity(int(SPARE_ENTRIES * capacity.entries / count), visible)
+        return super().program(name, of_core, degree)
 
     def slots(self, count: int) -> int:
-        """Return as many slots as give every core the same number."""
+        """Return the smallest multiple of the number of cores that is at least `count`."""
         return -(-count // self.mesh.size) * self.mesh.size
 
     def spread(self, state: FitState) -> FitState:
-        """Return a state divided over the cores."""
+        """Return the state divided over the cores."""
         state = grow_state(state, self.slots(state.params.gaussians.capacity))
 
         def put(a, spec):
@@ -108,7 +108,7 @@ class DividedStep(MeshStep):
         return _placed(put, jax.device_get(state))
 
     def whole(self, state: FitState) -> FitState:
-        """Return a state on the default device, its slots in order."""
+        """Return the state on the default device, with slots in their original order."""
 
         def put(a, spec):
             return jnp.asarray(_dealt(a, len(a) // self.mesh.size) if spec == DIVIDED else a)
@@ -122,7 +122,7 @@ def _dealt(a: np.ndarray, count: int) -> np.ndarray:
 
 
 def _placed(put: Callable, state: FitState) -> FitState:
-    """Return a state of which every array was put where its specification says."""
+    """Return the state after `put(array, specification)` for every array, by STATE."""
 
     def tree(spec, part):
         return jax.tree.map(lambda a: put(a, spec), part)

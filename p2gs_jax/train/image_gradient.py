@@ -1,4 +1,4 @@
-"""The image's side of a step: which Gaussians a view may show, and the gradient of its loss."""
+"""The image part of a step: the Gaussians that a view may show, and the gradient of its loss."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from p2gs_jax.train.exposure_loss import Partner
 from p2gs_jax.train.terms import Aux, LossTerm, Rendered, Target, censor
 from p2gs_jax.types import Array, Batch, Frustum, Gaussians, Photometry, Render
 
-# Photographed colours of pixels that are less opaque are black.
+# Photographed colours of pixels with a lower alpha are black.
 LEAST_SEEN = 0.5 / 255
 
 
@@ -30,12 +30,12 @@ class Listed(NamedTuple):
     """The Gaussians that the view of a step may show."""
 
     ids: Int[Array, " v"]  # from `compact`
-    visible: Int[Array, ""]  # how many there are; more than `ids` hold where there was no room
+    visible: Int[Array, ""]  # their number; larger than the length of `ids` after an overflow
     shown: Shown  # splats and radiance of the listed ones
 
 
 class LossAux(NamedTuple):
-    """What a step reports beside the loss."""
+    """Results of a view besides the loss."""
 
     terms: dict[str, Float[Array, ""]]
     render: Render
@@ -43,15 +43,15 @@ class LossAux(NamedTuple):
 
 
 class ImageGradient(NamedTuple):
-    """The loss of the images and its gradients."""
+    """The loss of a view and its gradients."""
 
     loss: Float[Array, ""]  # sum of the terms
-    terms: dict[str, Float[Array, ""]]  # by name, weighted
-    v_shown: Any  # gradient by what `differentiable` takes of the splats
-    v_rest: Any  # by photometry and appearance
-    entries: Int[Array, ""]  # tile-list entries that were needed; `overflow`: they did not fit
-    overflow: Bool[Array, ""]
-    visible: Bool[Array, " v"]  # which of the listed Gaussians are in the training view
+    terms: dict[str, Float[Array, ""]]  # weighted terms by name
+    v_shown: Any  # gradient by the arrays of `differentiable`
+    v_rest: Any  # gradient by photometry and appearance
+    entries: Int[Array, ""]  # tile-list entries needed
+    overflow: Bool[Array, ""]  # whether the tile list was too short
+    visible: Bool[Array, " v"]  # flags of the listed Gaussians that are in the view
     psnr: Float[Array, ""]  # of the view, dB
 
 
@@ -63,20 +63,19 @@ def show(
     owner: Int[Array, " n"] | None = None,
     *,
     cfg: FitConfig,
-    room: int,
+    capacity: int,
     degree: int,
 ) -> Listed:
-    """List what the view of a step may show, and project it.
+    """List the Gaussians that the view of a step may show, and project them.
 
-    Only what it may show is listed, unless `cfg.optimizer.visible_only` is off. What finds no
-    place in a list of length `room` is counted, not listed. `degree` is the highest
-    spherical-harmonics degree that is evaluated, `owner` the moving object that each Gaussian
-    belongs to.
+    If `cfg.optimizer.visible_only` is off, it lists all Gaussians. Gaussians beyond the list's
+    length `capacity` are counted, not listed. `degree` is the highest spherical-harmonics degree
+    that is evaluated; `owner` is the moving object of each Gaussian.
     """
     n, render = gaussians.capacity, cfg.render
     if cfg.optimizer.visible_only:
         may = in_view(gaussians, alive, camera_of_each(frustum, owner), render)
-        ids, count = compact(may, whole_blocks(min(room, n)))
+        ids, count = compact(may, whole_blocks(min(capacity, n)))
     else:
         index = jnp.arange(whole_blocks(n), dtype=jnp.int32)
         ids, count = jnp.minimum(index, n), jnp.int32(n)
@@ -86,9 +85,9 @@ def show(
 
 
 def decoded(batch: Batch) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
-    """Return a photograph in [0, 1] and its mask as floats; they travel as they are stored.
+    """Return a photograph in [0, 1] and its mask, converted from their stored types to floats.
 
-    One with alpha is put over its backdrop. Both have the precision of the camera.
+    A photograph with alpha is composited over its backdrop. Both have the precision of the camera.
     """
     kind = batch.camera.K.dtype
     ldr = batch.ldr.astype(kind)
@@ -100,15 +99,16 @@ def decoded(batch: Batch) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
 
 
 def unit(stored: Array) -> Float[Array, "..."]:
-    """Return stored integers as floats, the largest as 1; floats as they are."""
+    """Return stored unsigned integers as floats in [0, 1]; floats stay unchanged."""
     scale = float(jnp.iinfo(stored.dtype).max) if stored.dtype.kind == "u" else 1.0
     return stored.astype(jnp.float32) / scale
 
 
 def pixel_places(shape: tuple[int, ...], size: Float[Array, " 2"]) -> Float[Array, "h w 2"]:
-    """Return where the pixels of a canvas lie in the image of `size` in its upper left.
+    """Return the positions of the pixels of a canvas in the image in its upper left corner.
 
-    Positions are as of `formation`: from the centre, in units of half the diagonal.
+    `size` is the width and height of the image, pixels. Positions are those of `formation`: from
+    the image centre, in units of half the diagonal.
     """
     y, x = (jnp.arange(n, dtype=size.dtype) + 0.5 for n in shape)
     return (2 * jnp.stack(jnp.meshgrid(x, y), -1) - size) / jnp.linalg.norm(size)
@@ -121,36 +121,36 @@ def compared(
     correction: Correction | None,
     cfg: FitConfig,
 ) -> tuple[Rendered, Target]:
-    """Return a view as it is rendered and its photograph, as loss terms take them.
+    """Return the render of a view and its photograph, as inputs of loss terms.
 
-    A photograph with alpha and the render are put over one background. What a saturated photograph
-    cannot contradict is decided before that: a white background saturates nothing.
+    A photograph with alpha and the render are composited over the same background. Values are
+    censored before that, because a white background does not saturate a photograph.
     """
     capture = photometry.capture(batch.view_index)
     loss, formed = cfg.loss, cfg.photometry
     where = None if batch.size is None else pixel_places(render.alpha.shape, batch.size)
     if batch.alpha is None:
         target = Target(*decoded(batch), None, batch.measured)
-        matte, there = None, render.linear
-        own = formation(there, capture, formed, correction, where)
-        ldr, held = own, target.ldr
+        matte, radiance = None, render.linear
+        display = formation(radiance, capture, formed, correction, where)
+        ldr, photographed = display, target.ldr
     else:
         assert batch.backdrop is not None
         pixels, alpha = unit(batch.ldr), unit(batch.alpha)
         photograph = pixels + (1 - alpha[..., None]) * batch.backdrop
         target = Target(photograph, batch.mask.astype(jnp.float32), alpha, batch.measured)
         matte = Matte(render.alpha, batch.backdrop)
-        there = uncovered(render.linear, matte)
-        own = formation(there, capture, formed, correction, where)
-        ldr = composited(own, matte)
+        radiance = uncovered(render.linear, matte)
+        display = formation(radiance, capture, formed, correction, where)
+        ldr = composited(display, matte)
         seen = alpha[..., None] > LEAST_SEEN
-        held = jnp.where(seen, pixels / jnp.maximum(alpha, LEAST_SEEN)[..., None], 0.0)
+        photographed = jnp.where(seen, pixels / jnp.maximum(alpha, LEAST_SEEN)[..., None], 0.0)
     judged = ldr
     if loss.censored:
-        judged = composited(censor(own, held, loss.saturation), matte)
+        judged = composited(censor(display, photographed, loss.saturation), matte)
     uncorrected = None
     if isinstance(correction, Curves):
-        uncorrected = composited(formation(there, capture, formed, None, where), matte)
+        uncorrected = composited(formation(radiance, capture, formed, None, where), matte)
     rendered = Rendered(render.linear, render.alpha, render.depth, ldr, judged, uncorrected)
     return rendered, target
 
@@ -167,8 +167,8 @@ def image_loss(
 ) -> tuple[Float[Array, ""], LossAux]:
     """Return the loss of one view and its terms.
 
-    `shown` are splats and radiance in the view; `photometry` and `appearance` are those of all
-    views; `capacity` is the length of the tile lists.
+    `shown` holds splats and radiance in the view; `photometry` and `appearance` belong to all
+    views; `capacity` is the length of the tile list.
     """
     deep = any(getattr(term, "needs_depth", False) for term in terms.values())
     render = render_splats(*shown, batch.camera, cfg.render, capacity, with_depth=deep)
@@ -197,15 +197,15 @@ def differentiate(
     *,
     cfg: FitConfig,
     terms: tuple[tuple[str, LossTerm], ...],
-    room: int,
+    capacity: int,
 ) -> ImageGradient:
     """Composite a view, compare it with its photograph and return the gradient of the loss.
 
-    Arguments are those of `image_loss`; `room` is the length of the tile lists.
+    The arguments are those of `image_loss`.
     """
     (loss, aux), (v_shown, *v_rest) = jax.value_and_grad(
         image_loss, argnums=(0, 1, 2), has_aux=True, allow_int=True
-    )(shown, photometry, appearance, batch, partner, cfg, dict(terms), room)
+    )(shown, photometry, appearance, batch, partner, cfg, dict(terms), capacity)
     photograph, mask = decoded(batch)
     squared = mask[..., None] * (jnp.clip(aux.ldr, 0, 1) - photograph) ** 2
     mse = jnp.sum(squared) / jnp.maximum(3 * jnp.sum(mask), 1)
@@ -222,6 +222,6 @@ def differentiate(
 
 
 def differentiable(shown: Shown) -> tuple[Array, ...]:
-    """Return what the image is made of, without flags and what only bins."""
+    """Return the arrays by which the image is differentiable, without the inputs of binning."""
     splats, radiance = shown
     return splats.means2d, splats.conic_factor, splats.log_opacities, splats.depths, radiance

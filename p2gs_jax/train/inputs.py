@@ -1,6 +1,6 @@
-"""What a step is given beside its state: photographs, a second view, the schedule.
+"""Inputs of a step besides its state: photographs, a second view, settings from the schedule.
 
-All of it follows from the seed and the step number.
+All of them depend only on the seed and the step number.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ from p2gs_jax.types import Batch, Camera, Measured
 
 Tree = TypeVar("Tree")
 
-# Observations that a step compares.
+# Number of pairs that the relative-exposure loss compares in a step.
 PAIRS_PER_STEP = 4096
-# Share of a GPU's memory that photographs of one level may take; others are uploaded in every step.
+# Share of a GPU's memory that photographs of one level may use; others are uploaded in each step.
 RESIDENT = 0.25
 
-# Pixels, mask, and alpha where there is one.
+# Pixels, mask, and alpha or None.
 Photograph = tuple[Any, Any, Any]
 
 
 class TrainingViews:
     """Photographs of the training views at any level of the coarse-to-fine schedule.
 
-    `rows` are rows in the scene, in the order of `Photometry`; `seed` decides the order of every
-    epoch; `measured` are the depths that the loss compares each view with, or None. A step of
-    several views stacks their photographs on the host, where they must not be `resident`. Of many
-    sizes, photographs lie on `canvases`, unless `padded` is off: learned corrections know places.
+    `rows` are rows in the scene, in the order of `Photometry`; `seed` sets the order of every
+    epoch; `measured` holds the measured depths of each view, or None. A step of several views
+    stacks photographs on the host, so `resident` must be off. Photographs of different sizes are
+    padded to `canvases`, unless `padded` is off: learned corrections depend on pixel positions.
     """
 
     def __init__(
@@ -56,16 +56,16 @@ class TrainingViews:
         self.store, self.rows = store, tuple(rows)
         self.seed, self.measured = seed, measured
         self._batches = functools.lru_cache(4)(self._epoch)
-        every = store.sizes
-        sizes = [every[row] for row in rows]
-        on = canvases(sizes) if padded else {size: size for size in sizes}
-        self._kinds = [on[size] for size in sizes]
-        # A row of every size, by the canvas.
+        all_sizes = store.sizes
+        sizes = [all_sizes[row] for row in rows]
+        canvas_of = canvases(sizes) if padded else {size: size for size in sizes}
+        self._kinds = [canvas_of[size] for size in sizes]
+        # One row of every size, by its canvas.
         self._alike: dict[tuple[int, int], dict[tuple[int, int], int]] = {}
         for size, kind, row in zip(sizes, self._kinds, rows, strict=True):
             self._alike.setdefault(kind, {})[size] = row
-        self._room = RESIDENT * device_bytes() if resident else 0.0
-        # Photographs on the device by row, their level, and the bytes that are left for others.
+        self._budget = RESIDENT * device_bytes() if resident else 0.0
+        # Photographs on the device by row, their level, and the bytes left for others.
         self._resident: dict[int, Photograph] = {}
         self._level, self._left = 0, 0.0
 
@@ -73,9 +73,9 @@ class TrainingViews:
         return len(self.rows)
 
     def indices_at(self, step: int, count: int) -> tuple[int, ...]:
-        """Return the rows in `Photometry` of the views that a step of `count` views takes.
+        """Return the rows in `Photometry` of the `count` views of a step.
 
-        They have images of one size. `step` counts the views taken before it.
+        Their images have one size. `step` is the number of earlier views.
         """
         epoch, position = divmod(step // count, len(self._batches(0, count)))
         return self._batches(epoch, count)[position]
@@ -84,39 +84,39 @@ class TrainingViews:
         return batches_of(view_order(self.seed, epoch, len(self.rows)), self._kinds, count)
 
     def first_of_sizes(self, step: int, count: int) -> list[int]:
-        """Return the next step, from this one on, for every size that images are compiled at."""
+        """Return the next step, from this one on, for every canvas size."""
         steps = range(step, step + count * len(self._batches(0, count)), count)
         kinds = [self._kinds[self.indices_at(k, count)[0]] for k in steps]
         return [steps[kinds.index(kind)] for kind in dict.fromkeys(kinds)]
 
     def partner_at(self, step: int, index: int) -> int:
-        """Return a second view, different from that of the step where there are two."""
+        """Return a second view, drawn at random; it differs from the first if there are two."""
         rng = generator(self.seed, Stream.PARTNER, step)
         count = len(self.rows)
         return (index + int(rng.integers(1, max(count, 2)))) % count
 
     def prefetch(self, index: int, shrink: int) -> None:
-        """Begin decoding a view in the background, unless it is on the device."""
+        """Begin to decode a view in the background, unless it is on the device."""
         if shrink != self._level or self.rows[index] not in self._resident:
             self.store.prefetch(self.rows[index], shrink)
 
     def camera(self, index: int, shrink: int) -> Camera:
-        """Return the camera of a training view at a level, on the host, over its whole canvas."""
+        """Return the camera of a training view at a level, on the host, for its whole canvas."""
         row = self.rows[index]
         viewmat, K = self.store.camera(row, shrink)[:2]
         return on_host(Camera, viewmat, K, *self._canvas(index, shrink), self.store.placement(row))
 
     def _canvas(self, index: int, shrink: int) -> tuple[int, int]:
-        """Return the width and height that a view is compiled at, at a level."""
+        """Return the width and height of the canvas of a view at a level, pixels."""
         rows = self._alike[self._kinds[index]].values()
         widths, heights = zip(*(self.store.camera(row, shrink)[2:] for row in rows), strict=True)
         return max(widths), max(heights)
 
     def batch(self, index: int, shrink: int, step: int = 0) -> Batch:
-        """Return a training view, on the host: a compiled step takes it from there.
+        """Return a training view on the host, from which a compiled step reads it.
 
-        On a GPU the pixels stay on the device, as long as those of a level find room there. `step`
-        draws the background, where every step has another.
+        On a GPU, pixels of a level stay on the device up to a share of its memory (RESIDENT).
+        `step` seeds the random background, if there is one.
         """
         camera, measured, size = self.camera(index, shrink), None, None
         ldr, mask, alpha = self._photograph(index, camera, shrink)
@@ -127,20 +127,20 @@ class TrainingViews:
             if measured is not None:
                 places = measured.places * (size / [camera.width, camera.height])
                 measured = dataclasses.replace(measured, places=places.astype(np.float32))
-        given = (camera, ldr, mask, np.int32(index), measured, alpha, self._backdrop(step), size)
-        return on_host(Batch, *given)
+        fields = (camera, ldr, mask, np.int32(index), measured, alpha, self._backdrop(step), size)
+        return on_host(Batch, *fields)
 
     def _photograph(self, index: int, camera: Camera, shrink: int) -> Photograph:
-        """Return the pixels, mask and alpha of a view on its canvas, as they are stored."""
+        """Return the pixels, mask and alpha of a view on its canvas, in their stored types."""
         row = self.rows[index]
         if shrink != self._level:
             self._resident.clear()
-            self._level, self._left = shrink, self._room
+            self._level, self._left = shrink, self._budget
         if row in self._resident:
             return self._resident[row]
         pixels = (*self.store.stored(row, shrink), self.store.alpha(row, shrink))
         canvas = (camera.height, camera.width)
-        pixels = jax.tree.map(lambda a: _laid_on(canvas, a), pixels)
+        pixels = jax.tree.map(lambda a: _padded(canvas, a), pixels)
         size = sum(a.nbytes for a in jax.tree.leaves(pixels))
         if size <= self._left:
             self._left -= size
@@ -153,19 +153,20 @@ class TrainingViews:
         return generator(self.seed, Stream.BACKDROP, step).random(3).astype(np.float32)
 
 
-def _laid_on(canvas: tuple[int, int], image: np.ndarray) -> np.ndarray:
-    """Return an image with zeros to its right and below, where a canvas (h, w) is larger."""
-    wider = [(0, most - n) for most, n in zip(canvas, image.shape, strict=False)]
-    return np.pad(image, wider + [(0, 0)] * (image.ndim - 2)) if np.any(wider) else image
+def _padded(canvas: tuple[int, int], image: np.ndarray) -> np.ndarray:
+    """Return an image padded with zeros on the right and below to the canvas (h, w)."""
+    widths = [(0, most - n) for most, n in zip(canvas, image.shape, strict=False)]
+    return np.pad(image, widths + [(0, 0)] * (image.ndim - 2)) if np.any(widths) else image
 
 
 def batches_of(
     order: Int[np.ndarray, " v"], kinds: Sequence[Hashable], count: int
 ) -> list[tuple[int, ...]]:
-    """Return an epoch as batches of views that one program can take, each view once at least.
+    """Return an epoch as batches of `count` views of one kind, with each view at least once.
 
-    Views of a kind have images of one size and stay in their order. What is left over of a kind is
-    filled up from its beginning; batches take the turn of their first view.
+    Views of a kind have images of one size, so one program serves them; they keep their order. A
+    last incomplete batch is filled with the first views of its kind. Batches are in the order of
+    their first views.
     """
     by_kind: dict[Hashable, list[int]] = {}
     for view in order:
@@ -179,12 +180,12 @@ def batches_of(
 
 
 def stacked(trees: Sequence[Tree]) -> Tree:
-    """Return host records as one, along a new first axis; photographs keep the finer type."""
+    """Return host records stacked along a new first axis; photographs keep the finer type."""
     return jax.tree.map(lambda *arrays: np.stack(_of_one_type(arrays)), *trees)
 
 
 def _of_one_type(arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return pixels of 8 bits as of 16 where others are: 255 and 65535 both stand for 1."""
+    """Return arrays of one type: 8-bit pixels become 16-bit if others are, with 255 as 65535."""
     arrays = [np.asarray(a) for a in arrays]
     if {a.dtype for a in arrays} == {np.dtype(np.uint8), np.dtype(np.uint16)}:
         return [a.astype(np.uint16) * 257 if a.dtype == np.uint8 else a for a in arrays]
@@ -192,7 +193,7 @@ def _of_one_type(arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
 
 
 class Inputs(NamedTuple):
-    """Arguments of a step, all on the host; those of several views are stacked."""
+    """Arguments of a step, on the host; arguments of several views are stacked."""
 
     batch: Batch
     partner: Partner
@@ -204,15 +205,16 @@ class Inputs(NamedTuple):
         return self.batch.camera.width, self.batch.camera.height
 
 
-def controls_at(progress: float, pace: float, shown: float, cfg: FitConfig) -> Controls:
-    """Return what the schedule says at this point of a run.
+def controls_at(progress: float, per_step: float, visible_share: float, cfg: FitConfig) -> Controls:
+    """Return the settings of the schedule at this progress.
 
-    `pace` is the progress of one step, `shown` the share of the scene that a view shows.
+    `per_step` is the progress of one step; `visible_share` is the share of the scene that a view
+    shows.
     """
     degree = schedule.sh_degree_at(progress, cfg.train, cfg.render.sh_degree)
-    rate = schedule.rate_factor(pace, shown, cfg.optimizer.settled)
-    given = (np.float32(progress), np.int32(degree), np.float32(rate))
-    return on_host(Controls, *given, device_seed(cfg.train.seed))
+    rate = schedule.rate_factor(per_step, visible_share, cfg.optimizer.settled)
+    values = (np.float32(progress), np.int32(degree), np.float32(rate))
+    return on_host(Controls, *values, device_seed(cfg.train.seed))
 
 
 def inputs_at(
@@ -225,8 +227,8 @@ def inputs_at(
 ) -> Inputs:
     """Return the inputs of a step.
 
-    `step` counts the views taken before it, `shrink` is the factor by which images are shrunk,
-    `pairs` are corresponding observations, where the relative-exposure loss compares photographs.
+    `step` is the number of earlier views; `shrink` is the factor by which images are shrunk;
+    `pairs` are colours of the same points in two views, for the relative-exposure loss, or None.
     """
     rows = views.indices_at(step, cfg.train.batch)
     each = [
@@ -242,9 +244,9 @@ def inputs_at(
 def partner_at(
     step: int, index: int, views: TrainingViews, pairs: ColorPairs | None, cfg: FitConfig
 ) -> Partner:
-    """Return the partner of a step's view, as much of it as the reading of the loss needs.
+    """Return the partner of a step's view, with the parts that the form of the loss needs.
 
-    `index` is the row of the view; for the others see `inputs_at`.
+    `index` is the row of the view; for the other arguments see `inputs_at`.
     """
     if cfg.loss.relative_exposure.weight is None:
         return on_host(Partner, np.int32(0))

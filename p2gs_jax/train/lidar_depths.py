@@ -1,4 +1,4 @@
-"""Depths of laser measurements: which each view is compared with, and the loss (ours)."""
+"""Depths of laser measurements: their selection for each view, and the loss (ours)."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from p2gs_jax.scene.drives.objects import object_mask
 from p2gs_jax.scene.visibility import unoccluded
 from p2gs_jax.types import Array, Measured, Scene
 
-# Errors of log depth beyond this pull no harder: the measurement missed or hit what is behind.
+# Threshold of the Huber loss in log depth: larger errors mean that the laser hit another surface.
 CLIP = 0.2
-# Less opaque pixels have no depth to speak of; the image decides there.
+# Pixels of a lower alpha have no reliable depth, so the loss leaves them out.
 LEAST_ALPHA = 0.05
-# Most measurements of a view that count.
+# Largest number of measurements used per view.
 MOST_PER_VIEW = 8192
-# Measurements this near in time tell what hides what; further off, things have moved.
+# Measurements within this many seconds of a view decide which points are hidden in it.
 NEAR_S = 1.0
 
 
@@ -45,13 +45,13 @@ def lidar_loss(
 
 
 def measured_depths(scene: Scene, cfg: FitConfig) -> list[Measured] | None:
-    """Return the measured depths of every training view; None where the loss asks for none.
+    """Return the measured depths of every training view; None if the loss needs none.
 
-    Only what stands still counts, so that every sweep serves all views; what a nearer measurement
-    or a moving object hides is left out.
+    Only static points are used, so that every sweep serves all views. Points behind a nearer
+    measurement or a moving object are left out.
 
     Raises:
-        UserError: the loss wants them and the scene has none.
+        UserError: the loss needs measurements, and the scene has none.
     """
     if cfg.loss.lidar is None:
         return None

@@ -1,10 +1,10 @@
-"""The host loop: bursts of jitted steps, and between them everything that changes shapes.
+"""The host loop: bursts of jitted steps, and between them all operations that change shapes.
 
-Within a burst the host only dispatches. After it the host reads the fault flag and the reports,
-logs, lets the strategy densify, replans the pace and checkpoints. All decisions follow from the
-seed and the step number (and, under a time budget, from paces that the checkpoint remembers), so a
-resumed run takes the same path as an uninterrupted one: bit for bit on a CPU, and on GPUs as far as
-their sums repeat (`RenderConfig.deterministic`).
+Within a burst the host only dispatches steps. Afterwards it reads the fault flag and the reports,
+logs, lets the strategy densify, replans the progress per step and writes checkpoints. All decisions
+depend on the seed and the step number; under a time budget they also depend on the progress per
+step, which checkpoints hold. So a resumed run computes the same as an uninterrupted run: bit for
+bit on a CPU, and on GPUs if sums are repeatable (`RenderConfig.deterministic`).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from p2gs_jax.render.capacity import MOST_CANVASES
 from p2gs_jax.render.cores import CORES
 from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import Decisions
-from p2gs_jax.train import room, schedule, strategies
+from p2gs_jax.train import capacities, schedule, strategies
 from p2gs_jax.train.data_parallel import VIEWS, ParallelStep
 from p2gs_jax.train.divided import DividedStep
 from p2gs_jax.train.exposure_loss import ColorPairs
@@ -58,15 +58,15 @@ from p2gs_jax.types import Gaussians, Params
 
 NEARLY_DONE = 0.99
 MAX_BURST = 50
-# Share of a new pace in its running estimate.
+# Weight of a new measurement in the running mean of the seconds per step.
 PACE_SHARE = 0.3
 
 
 @dataclass(frozen=True)
 class TrainResult:
-    """The end of a run: state, counters, and the seconds of this session.
+    """The result of a run: state, counters, and the seconds of this session.
 
-    They are, by name: compiling (waited for), steps, densification, checkpoints.
+    `seconds` has the keys compiling (waiting only), steps, densification and checkpoints.
     """
 
     state: FitState
@@ -78,26 +78,26 @@ class TrainResult:
 class Trainer:
     """Runs one fit from its initial parameters to its final ones.
 
-    A formation of yours is passed as `params.appearance` of `run`.
+    A custom image formation is passed as `params.appearance` of `run`.
     """
 
     cfg: FitConfig
     views: TrainingViews
     extent: float  # scene extent, scene units
-    # corresponding observations, where the relative-exposure loss compares photographs
+    # colours of the same points in two views, if the relative-exposure loss compares photographs
     pairs: ColorPairs | None
-    coverage: Coverage  # how much of the scene the views show
-    run_dir: Path  # where `log.jsonl` and `checkpoints/` go
-    programs: StepPrograms  # compiled steps, some of them perhaps begun
-    decided: Decisions  # what the scene settled; a resumed run must have settled the same
+    coverage: Coverage  # pixels of a view, and the share of the scene that it shows
+    run_dir: Path  # folder of `log.jsonl` and `checkpoints/`
+    programs: StepPrograms  # compiled steps; some compilations may have begun
+    decided: Decisions  # options chosen from the scene; a resumed run must choose the same
     on_log: Callable[[LogRecord], None] = lambda record: None
-    on_message: Callable[[str], None] = lambda text: None  # told what the user must know
+    on_message: Callable[[str], None] = lambda text: None  # receives messages to the user
     mesh: Mesh | None = None  # the devices of a step, from `mesh_of`
-    # loss terms to add to those of `cfg`, or to replace; None takes one away
+    # loss terms to add to those of `cfg`, to replace, or (None) to remove
     terms: Mapping[str, LossTerm | None] | None = None
-    strategy: Strategy | None = None  # how the population changes; None: as `cfg` says
-    now: Callable[[], float] = time.monotonic  # seconds on a clock that never goes back
-    store: CheckpointStore | None = None  # of checkpoints; None: `checkpoints/`
+    strategy: Strategy | None = None  # densification; None: the strategy that `cfg` names
+    now: Callable[[], float] = time.monotonic  # monotonic clock, seconds
+    store: CheckpointStore | None = None  # of checkpoints; None: in `run_dir/checkpoints`
 
     def __post_init__(self):
         cfg, views = self.cfg, self.views
@@ -106,18 +106,18 @@ class Trainer:
         self.levels = schedule.levels(cfg.train, width, height)
         self.stopwatch = Stopwatch()
         store = self.store or CheckpointStore(self.run_dir / "checkpoints")
-        given = (self.run_dir, store, cfg, self.decided, self.on_log, self.on_message)
-        self.records = Records(*given)
-        self.asked = interrupts.Held()
+        sinks = (self.on_log, self.on_message)
+        self.records = Records(self.run_dir, store, cfg, self.decided, *sinks)
+        self.signals = interrupts.Held()
         self.optimizer = make_optimizer(cfg)
-        chosen = strategies.make_strategy(cfg, self.coverage, self.levels)
-        self.densification = self.strategy or chosen
+        configured = strategies.make_strategy(cfg, self.coverage, self.levels)
+        self.densification = self.strategy or configured
         noise = getattr(self.densification, "noise", None)
-        given = (cfg, self.optimizer, self.extent, noise, self.terms or {})
+        step_args = (cfg, self.optimizer, self.extent, noise, self.terms or {})
         kinds = {VIEWS: ParallelStep, CORES: DividedStep}
-        self.step = Step(*given)
+        self.step = Step(*step_args)
         if self.mesh is not None:
-            self.step = kinds[self.mesh.axis_names[0]](*given, mesh=self.mesh)
+            self.step = kinds[self.mesh.axis_names[0]](*step_args, mesh=self.mesh)
 
     def run(
         self,
@@ -131,14 +131,14 @@ class Trainer:
     ) -> TrainResult:
         """Optimise until the run is complete, from initial parameters or the newest checkpoint.
 
-        `alive` says which Gaussians exist, `owner` which moving object each belongs to. `spent_s`
-        are the seconds of a time budget that are gone, `finish_s` those to leave for what follows,
-        on an unloaded machine.
+        `alive` flags the Gaussians that exist; `owner` is the moving object of each Gaussian. A
+        time budget loses `spent_s` seconds used before the run. It also reserves `finish_s` seconds
+        for evaluation and export, as measured on an unloaded machine.
 
         Raises:
             DivergenceError: a loss term or gradient is not finite.
-            UserError: no Gaussian is left, or checkpoints cannot be continued from.
-            Interrupted: a signal asked for the end; a checkpoint is written first.
+            UserError: no Gaussian is left, or no checkpoint can be resumed.
+            Interrupted: a signal ended the run; a checkpoint is written first.
         """
         self.slots = strategies.started(self.densification, int(np.sum(np.asarray(alive))))
         state = initial_state(params, alive, self.optimizer, self.slots.slots, owner)
@@ -146,18 +146,18 @@ class Trainer:
         planned = float(train.budget_s or train.steps)
         host = HostState(planned=planned, pace=1.0 / max(train.steps, 1))
         state, host = self.records.begin(state, planned, resume) or (state, host)
-        # Planned for longer, a run has room for more Gaussians.
+        # A resumed run with a longer plan may need more slots than its checkpoint has.
         state = grow_state(state, self.step.slots(self.slots.slots))
-        # On GPUs the host decides the pace of short steps, which tells nothing of evaluation.
-        here = jax.default_backend() == "cpu"
-        full_step_s = step_seconds(self.coverage.pixels) if here else math.inf
+        # On GPUs the host limits the speed of short steps, which says nothing about evaluation.
+        on_cpu = jax.default_backend() == "cpu"
+        full_step_s = step_seconds(self.coverage.pixels) if on_cpu else math.inf
         seconds = {"spent_s": spent_s, "finish_s": finish_s, "full_step_s": full_step_s}
         clock = RunClock(self.cfg.train, host, **seconds, now=self.now)
         population = state.population
         self._allocate(state.params.gaussians, population.alive, population.owner, host)
         state = self.step.spread(state)
         self._expect(state, host)
-        with interrupts.held() as self.asked:
+        with interrupts.held() as self.signals:
             state = self._loop(state, host, clock)
             state = self.step.whole(state)
             self._save(state, host)
@@ -167,14 +167,14 @@ class Trainer:
     def expect(self, params: Params, owner, images: bool) -> None:
         """Begin to compile the steps of a run before its colours and exposures are known.
 
-        `params` are as the run will have them, as far as they are known; `images`: so is the tone
-        curve.
+        `params` have the shapes of the run's parameters. `images` is true if the tone curve is
+        known: then the middle program of each step can be compiled, too.
         """
         seeds = params.gaussians.capacity
         self.slots = strategies.started(self.densification, seeds)
-        alive, host = np.ones(seeds, bool), HostState(rooms=dict(self.programs.rooms))
+        alive, host = np.ones(seeds, bool), HostState(rooms=dict(self.programs.capacities))
         self._allocate(params.gaussians, alive, owner, host)
-        self.programs.rooms = dict(host.rooms)
+        self.programs.capacities = dict(host.rooms)
         slots = self.step.slots(self.slots.slots)
         start = functools.partial(initial_state, optimizer=self.optimizer, slots=slots)
         self._expect(jax.eval_shape(start, params, alive, owner=owner), host, images)
@@ -182,7 +182,7 @@ class Trainer:
     # ------------------------------------------------------------------ bursts of steps
 
     def _loop(self, state: FitState, host: HostState, clock: RunClock) -> FitState:
-        """Take bursts until the run is complete, or its time over."""
+        """Run bursts until the run is complete or its time is over."""
         every_s = self.cfg.train.checkpoint_every_s
         saved, pause = host.elapsed_s, every_s
         while not schedule.is_over(host.progress, host.pace):
@@ -191,38 +191,37 @@ class Trainer:
             if reports:
                 alive, left_s = alive_in(state.population), clock.left(host, self.levels)
                 self.records.log(record_of(reports, host, alive, left_s))
-                # From here on a signal waits for the next place to continue from.
-                self.asked.begin()
+                # From here on a signal waits until a checkpoint can be written.
+                self.signals.begin()
                 state = self._densified(state, host)
             clock.replan(host)
             if clock.over(host):
                 if host.progress < NEARLY_DONE:
                     self.on_message(
                         f"The budget ended the run at {host.progress:.0%} of its schedule: "
-                        "`fit --resume` with a longer --budget goes on from here."
+                        "`fit --resume` with a longer --budget continues it."
                     )
                 break
-            asked = self.asked.arrived
-            if asked is not None or host.elapsed_s - saved > pause:
+            signal = self.signals.arrived
+            if signal is not None or host.elapsed_s - saved > pause:
                 begun = host.elapsed_s
                 self._save(self.step.whole(state), host)
                 clock.tick(host)
                 saved = host.elapsed_s
                 pause = pause_between(every_s, saved - begun)
-            if asked is not None:
+            if signal is not None:
                 self.on_message(
-                    f"{interrupts.name_of(asked)}: the run stops after step {host.step} "
+                    f"{interrupts.name_of(signal)}: the run stops after step {host.step} "
                     f"({host.progress:.0%}), where a checkpoint is written."
                 )
-                self.asked.deliver()
+                self.signals.deliver()
         return state
 
     def _take_burst(self, state: FitState, host: HostState) -> tuple[FitState, list[StepReport]]:
-        """Dispatch steps up to the next line of the log, then read how they went.
+        """Dispatch steps up to the next log record, then read the fault; return completed reports.
 
-        Where a view finds no room, the steps that the device refused do not count, and the room
-        grows. The state is donated, the counters of `host` change. A report of every step that was
-        taken is returned.
+        After an overflow, the steps that changed nothing do not count, and the capacity grows. The
+        state is donated, and the counters of `host` change.
 
         Raises:
             DivergenceError: a loss term or gradient is not finite.
@@ -235,11 +234,11 @@ class Trainer:
         state, reports, sizes = self._dispatched(state, host)
         kind = int(state.fault.kind)
         done = int(state.step) - host.step
-        taken = done // self.cfg.train.batch
+        completed = done // self.cfg.train.batch
         seconds = self.now() - begin - (self.programs.waited_s - waited)
         self.stopwatch.add("steps", seconds)
         if kind == FAULT_NONFINITE:
-            name = finite_names(reports[taken].terms, state.params)[int(state.fault.term)]
+            name = finite_names(reports[completed].terms, state.params)[int(state.fault.term)]
             raise DivergenceError(
                 f"Step {host.step + done + 1}: the {name} is not finite; "
                 f"{self.records.last_good()}.",
@@ -248,21 +247,21 @@ class Trainer:
             )
         if kind == FAULT_OVERFLOW:
             needed, visible = int(state.fault.needed), int(state.fault.visible)
-            host.rooms = room.grown(host.rooms, sizes[taken], needed, visible)
+            host.rooms = capacities.grown(host.rooms, sizes[completed], needed, visible)
             host.overflows += 1
             state = healed(state)
         elif done:
-            pace, known = seconds / done, host.step_s > 0
-            host.step_s = (1 - PACE_SHARE) * host.step_s + PACE_SHARE * pace if known else pace
+            new_s, known = seconds / done, host.step_s > 0
+            host.step_s = (1 - PACE_SHARE) * host.step_s + PACE_SHARE * new_s if known else new_s
         host.step += done
         for _ in range(done):
             host.progress += host.pace
-        return state, reports[:taken]
+        return state, reports[:completed]
 
     def _dispatched(
         self, state: FitState, host: HostState
     ) -> tuple[FitState, list[StepReport], list[tuple[int, int]]]:
-        """Dispatch the steps of a burst; return the state, and report and image size of each."""
+        """Dispatch a burst; return the state, and the report and image size of every step."""
         progress, reports, sizes = host.progress, [], []
         every, views = self.cfg.train.log_every, self.cfg.train.batch
         end = host.step + min(every - host.step % every, MAX_BURST)
@@ -282,14 +281,14 @@ class Trainer:
                 progress = progress + host.pace
         return state, reports, sizes
 
-    def _inputs(self, step: int, progress: float, pace: float, shrink: int) -> Inputs:
-        controls = controls_at(progress, pace, self.coverage.shown, self.cfg)
+    def _inputs(self, step: int, progress: float, per_step: float, shrink: int) -> Inputs:
+        controls = controls_at(progress, per_step, self.coverage.visible_share, self.cfg)
         return inputs_at(step, controls, shrink, self.views, self.pairs, self.cfg)
 
     # ---------------------------------------------------------------- between the bursts
 
     def _densified(self, state: FitState, host: HostState) -> FitState:
-        """Return the state with another population, where it is time to change it."""
+        """Return the state after a densification if one is due, else the same state."""
         with self.stopwatch("densification"):
             due = strategies.is_due(self.cfg.densify, host)
             if self.densification is None or not due:
@@ -311,10 +310,10 @@ class Trainer:
             self.records.save(state, host)
 
     def _allocate(self, gaussians: Gaussians, alive, owner, host: HostState) -> None:
-        """Make room for the image sizes to come."""
-        host.rooms = room.allocate(
+        """Allocate capacities for the image sizes of the levels that are left."""
+        host.rooms = capacities.allocate(
             host.rooms,
-            self.programs.rooms,
+            self.programs.capacities,
             self.views,
             schedule.shrinks_left(host.progress, self.levels),
             gaussians,
@@ -325,9 +324,9 @@ class Trainer:
         )
 
     def _expect(self, state: FitState, host: HostState, images: bool = True) -> None:
-        """Begin to compile what is known of the steps to come; `state` may be its shapes.
+        """Begin to compile the steps that are left; `state` may consist of shapes.
 
-        Images of more sizes than MOST_CANVASES are left out: not all of them may come.
+        It does nothing for more image sizes than MOST_CANVASES, not all of which may be needed.
         """
         steps = self.views.first_of_sizes(host.step, self.cfg.train.batch)
         if not getattr(self.densification, "slots_stay", True) or len(steps) > MOST_CANVASES:
@@ -339,18 +338,18 @@ class Trainer:
             self.programs.expect(self.step, key, state, *inputs, images=images)
             expect = getattr(self.densification, "expect", None)
             if number == 0 and expect is not None:
-                expect(self.programs, state)  # wanted soon after the first step
+                expect(self.programs, state)  # needed soon after the first step
 
     def _key(self, state: FitState, inputs: Inputs, host: HostState, shrink: int) -> Key:
-        """Return what a step of a level is compiled for."""
+        """Return the sizes and types for which a step of a level is compiled."""
         batch, cfg = inputs.batch, self.cfg
         degree = schedule.highest_degree(shrink, self.levels, cfg.train, cfg.render.sh_degree)
-        comes_with = (batch.measured, batch.alpha, batch.camera.objects, inputs.partner.pairs)
+        optional = (batch.measured, batch.alpha, batch.camera.objects, inputs.partner.pairs)
         return Key(
             inputs.size,
             state.params.gaussians.capacity,
-            host.rooms[room.size_name(inputs.size)],
+            host.rooms[capacities.size_name(inputs.size)],
             degree,
             str(batch.ldr.dtype),
-            jax.tree.structure((state, comes_with)),
+            jax.tree.structure((state, optional)),
         )

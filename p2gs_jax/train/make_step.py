@@ -1,7 +1,7 @@
-"""The training step for loops of your own, with your own loss, image formation and densification.
+"""The training step for custom loops, with a custom loss, image formation and densification.
 
-None of these needs a change of this package; the same arguments go to `fit`, which does everything
-else. docs/api.md, "Ablations", has examples.
+No such change needs a change of this package. `fit`, a complete fit, takes the same arguments.
+docs/api.md, "Ablations", has examples.
 """
 
 from __future__ import annotations
@@ -20,60 +20,60 @@ from p2gs_jax.core.numerics import on_device
 from p2gs_jax.errors import DivergenceError
 from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.photometry.appearance import Formation
-from p2gs_jax.render.capacity import Room
+from p2gs_jax.render.capacity import Capacity
 from p2gs_jax.train import state as states
 from p2gs_jax.train import strategies
+from p2gs_jax.train.capacities import capacity_for
 from p2gs_jax.train.exposure_loss import Partner
 from p2gs_jax.train.inputs import controls_at
 from p2gs_jax.train.optimizer import make_optimizer
-from p2gs_jax.train.room import room_for
 from p2gs_jax.train.step import Step
 from p2gs_jax.train.strategies import Strategy
 from p2gs_jax.train.terms import LossTerm
 from p2gs_jax.train.update import StepReport, finite_names
 from p2gs_jax.types import Array, Batch, Camera, Gaussians, Params, Photometry
 
-# Without a bound in `cfg`, populations are bounded as in a fit of views of this many pixels.
+# If `cfg` sets no bound, the population is bounded as in a fit of views of this many pixels.
 PIXELS = 640 * 480
 
 
-class Own(NamedTuple):
-    """What a caller brings to a fit, in the place of what its configuration says (`make_step`)."""
+class Custom(NamedTuple):
+    """Parts of a fit that replace those of its configuration (`make_step`)."""
 
     terms: Mapping[str, LossTerm | None] | None = None  # loss terms by name
     formation: Formation | None = None  # an image formation, or None
     strategy: Strategy | None = None  # a densification, or None
 
     def among(self, params: Params) -> Params:
-        """Return parameters with those of the formation, if there is one."""
+        """Return the parameters, including those of the custom formation if there is one."""
         if self.formation is None:
             return params
         return dataclasses.replace(params, appearance=jax.tree.map(on_device, self.formation))
 
 
-AS_CONFIGURED = Own()
+AS_CONFIGURED = Custom()
 
 
 class TrainingStep:
-    """A step of a view, and a densification; made by `make_step`.
+    """A training step of one view, and a densification; `make_step` makes it.
 
-    Tile lists get room when a view of a new size comes, and more where one overflows.
+    A new image size gets its capacity at its first view, and more after an overflow.
     """
 
-    def __init__(self, cfg: FitConfig, own: Own, extent: float):
-        self.cfg, self.extent, self.own = cfg, extent, own
-        chosen = strategies.make_strategy(cfg, Coverage(PIXELS, 1.0), ((1.0, 1),))
-        self.strategy = own.strategy or chosen
+    def __init__(self, cfg: FitConfig, custom: Custom, extent: float):
+        self.cfg, self.extent, self.custom = cfg, extent, custom
+        configured = strategies.make_strategy(cfg, Coverage(PIXELS, 1.0), ((1.0, 1),))
+        self.strategy = custom.strategy or configured
         self.optimizer = make_optimizer(cfg)
         noise = getattr(self.strategy, "noise", None)
-        self._step = Step(cfg, self.optimizer, extent, noise, own.terms or {})
+        self._step = Step(cfg, self.optimizer, extent, noise, custom.terms or {})
         self._host = states.HostState(pace=1.0 / max(cfg.train.steps, 1))
-        self._rooms: dict[tuple[int, int], Room] = {}
+        self._capacities: dict[tuple[int, int], Capacity] = {}
 
     def start(self, gaussians: Gaussians, photometry: Photometry) -> states.FitState:
-        """Return the state before the first step; the Gaussians are the seeds."""
+        """Return the state before the first step, with the Gaussians as seeds."""
         self._slots = strategies.started(self.strategy, gaussians.capacity)
-        params = self.own.among(Params(gaussians, photometry))
+        params = self.custom.among(Params(gaussians, photometry))
         alive = jnp.ones(gaussians.capacity, bool)
         return states.initial_state(params, alive, self.optimizer, self._slots.slots)
 
@@ -90,12 +90,12 @@ class TrainingStep:
         """Return the state after a step of one view, and its report; the state is donated.
 
         Args:
-            state: before.
-            camera: of the view.
-            photograph: display values in [0, 1], or integers of which the largest is 1.
+            state: the state before the step.
+            camera: camera of the view.
+            photograph: display values in [0, 1], or unsigned integers whose largest value means 1.
             view: row in `Photometry`.
             mask: 1 = use; None: all pixels.
-            progress: fraction of the run completed, for the schedules of rates and harmonics.
+            progress: fraction of the run completed, for the schedules of learning rates and degree.
 
         Raises:
             DivergenceError: a loss term or gradient is not finite.
@@ -104,18 +104,18 @@ class TrainingStep:
         mask = jnp.ones(size[::-1], bool) if mask is None else jnp.asarray(mask)
         batch = Batch(camera, jnp.asarray(photograph), mask, jnp.int32(view))
         controls = controls_at(progress, self._host.pace, 1.0, cfg)
-        if size not in self._rooms:
-            given = (state.params.gaussians, state.population.alive, camera)
-            gaussians, alive, seen = jax.tree.map(np.asarray, given)
-            most = self._slots.most
-            self._rooms[size] = room_for(gaussians, alive, [seen], most, cfg.render)
+        if size not in self._capacities:
+            on_device = (state.params.gaussians, state.population.alive, camera)
+            gaussians, alive, at = jax.tree.map(np.asarray, on_device)
+            scene = (gaussians, alive, [at], self._slots.most)
+            self._capacities[size] = capacity_for(*scene, cfg.render)
         while True:
             state, report = self._step(
                 state,
                 batch,
                 Partner(jnp.int32(0)),
                 controls,
-                room=self._rooms[size],
+                capacity=self._capacities[size],
                 degree=cfg.render.sh_degree,
             )
             kind = int(state.fault.kind)
@@ -128,11 +128,11 @@ class TrainingStep:
             if kind != states.FAULT_OVERFLOW:
                 return state, report
             needed = int(state.fault.needed), int(state.fault.visible)
-            self._rooms[size] = self._rooms[size].grown(*needed)
+            self._capacities[size] = self._capacities[size].grown(*needed)
             state = states.healed(state)
 
     def densify(self, state: states.FitState, progress: float) -> states.FitState:
-        """Return the state with the population that the strategy gives; the state is donated."""
+        """Return the state with the population that the strategy returns; the state is donated."""
         if self.strategy is None:
             return state
         self._host.step, self._host.progress = int(state.step), progress
@@ -158,13 +158,13 @@ def make_step(
     """Return the training step of a configuration.
 
     Args:
-        cfg: everything that is not replaced below.
-        terms: loss terms by name, added to those of `cfg` or in their place; None takes one away.
-            A term is a function of (Rendered, Target, Aux); see `train/terms.py`.
-        formation: an image formation in the place of the tone curve: a pytree with
+        cfg: configuration of all parts that are not replaced below.
+        terms: loss terms by name, which are added to those of `cfg` or replace them; None removes
+            a term. A term is a function of (Rendered, Target, Aux); see `train/terms.py`.
+        formation: an image formation that replaces the tone curve: a pytree with
             `apply(radiance, capture)`, whose arrays are learned.
         strategy: densification: an object with `start(seeds)` and `densify(gaussians, population,
             now)`; see `train/strategies.py`.
-        extent: of the scene, scene units: rates of the means are shares of it.
+        extent: scene extent, scene units; the learning rate of the means is a multiple of it.
     """
-    return TrainingStep(cfg, Own(terms, formation, strategy), extent)
+    return TrainingStep(cfg, Custom(terms, formation, strategy), extent)

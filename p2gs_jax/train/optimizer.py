@@ -1,8 +1,8 @@
 """Adam with a learning rate per group over the single parameter pytree.
 
-A step sees some Gaussians only: the moments of all others rest, and so do their parameters. Each
-Gaussian counts its own updates, so its bias correction is that of an Adam that has run as often as
-it was seen. Everything else has one count.
+A step updates only the Gaussians that it sees; moments and parameters of the others do not change.
+Updates are counted per Gaussian, and bias correction uses this count. All other parameters share
+one count.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from p2gs_jax.gaussians.population import grow
 from p2gs_jax.photometry.models import MODELS
 from p2gs_jax.types import Array, Gaussians, Params
 
-# Of a rate that warms up, what it starts from (PPISP: 0.01).
+# Initial share of a learning rate with a warm-up (PPISP: 0.01).
 WARMUP_START = 0.01
 
 
 class AdamState(NamedTuple):
-    """Moments, and counts of updates: one number, or one per row of the parameters."""
+    """Moments, and counts of updates: one count, or one per row of the parameters."""
 
     counts: Int[Array, "..."]
     mu: Any
@@ -32,19 +32,18 @@ class AdamState(NamedTuple):
 
 
 class OptState(NamedTuple):
-    """The optimiser's state; updates of the Gaussians are counted one by one."""
+    """The optimiser's state."""
 
-    gaussians: AdamState
-    rest: AdamState
-    """Of (photometry, appearance)."""
+    gaussians: AdamState  # with one count per Gaussian
+    rest: AdamState  # for (photometry, appearance), with one count
 
 
 class Adam(NamedTuple):
     """Adam (Kingma and Ba 2015), as a static argument of compiled functions.
 
-    `b1` and `b2` are the shares of the old means of the gradients and of their squares, `eps` is
-    added to the root of the second moment. With `by_row`, updates of every row are counted, which
-    the first axes of all parameters share.
+    `b1` and `b2` are the decay rates of the first and second moment; `eps` is added to the root of
+    the second moment. With `by_row`, updates are counted per row, along the first axis that all
+    parameters share.
     """
 
     b1: float = 0.9
@@ -79,7 +78,7 @@ class Adam(NamedTuple):
 
 
 class Optimizer(NamedTuple):
-    """Adam for any rows of the Gaussians, and for (photometry, appearance)."""
+    """Adam for the Gaussians, by row, and Adam for (photometry, appearance)."""
 
     gaussians: Adam
     rest: Adam
@@ -91,7 +90,7 @@ class Optimizer(NamedTuple):
 
 
 def make_optimizer(cfg: FitConfig) -> Optimizer:
-    """Return the optimiser of a fit; exposures, gammas and corrections keep Adam's own betas."""
+    """Return the optimiser of a fit; exposures, gammas and corrections use Adam's default betas."""
     o = cfg.optimizer
     return Optimizer(Adam(o.b1, o.b2, o.eps, by_row=True), Adam(eps=o.eps))
 
@@ -99,15 +98,16 @@ def make_optimizer(cfg: FitConfig) -> Optimizer:
 def means_rate(progress: Array, rate: Array, extent: float, cfg: FitConfig) -> Float[Array, ""]:
     """Return the learning rate of the means, scene units per step (3DGS: exponential decay)."""
     o = cfg.optimizer
-    if o.means == 0:  # they stay where they are
+    if o.means == 0:  # the means are fixed
         return 0.0 * rate
     return rate * extent * o.means * (o.means_final / o.means) ** progress
 
 
 def photometry_gate(progress: Array, cfg: FitConfig) -> Float[Array, ""]:
-    """Return the factor on exposure, white balance and gamma rates: 0 while frozen, then decaying.
+    """Return the factor on the learning rates of exposure, white balance and gamma.
 
-    Only a start from tracks is worth freezing; a random one must move from the first step.
+    It is 0 while they are frozen, then decays. Only a start from tracks is frozen, because other
+    starts must move from the first step.
     """
     frozen = cfg.photometry.freeze_until if cfg.photometry.start == "tracks" else 0.0
     if frozen >= 1.0:
@@ -118,7 +118,7 @@ def photometry_gate(progress: Array, cfg: FitConfig) -> Float[Array, ""]:
 
 
 def appearance_rate(progress: Array, cfg: FitConfig) -> Float[Array, ""]:
-    """Return the rate of corrections: rising where there is a warm-up, then decaying."""
+    """Return the learning rate of corrections: it rises during a warm-up, then decays."""
     o = cfg.optimizer
     if o.appearance_warmup == 0:
         return jnp.asarray(o.appearance * o.appearance_final**progress)
@@ -131,19 +131,20 @@ def appearance_rate(progress: Array, cfg: FitConfig) -> Float[Array, ""]:
 def learning_rates(
     progress: Array, rate: Array, extent: float, like: Params, cfg: FitConfig, bands: int
 ) -> Params:
-    """Return the rate of every parameter, shaped to broadcast against `like`.
+    """Return the learning rate of every parameter, with shapes that broadcast against `like`.
 
-    `rate` is the factor on those of Gaussians but for colours (`schedule.rate_factor`), `extent`
-    that of the scene in scene units, `bands` the number of spherical-harmonics coefficients in use.
+    `rate` is the factor on the rates of Gaussians except colours (`schedule.rate_factor`). `extent`
+    is the scene extent in scene units; `bands` is the number of spherical-harmonics coefficients in
+    use.
     """
     o = cfg.optimizer
     final = o.final**progress
     decay = rate * final
-    # Colours gain by their full rates in long fits too (BUILD_NOTES, "Length").
+    # Colours keep their full learning rates in long fits (BUILD_NOTES, "Length").
     sh = jnp.full((bands, 1), o.sh_rest).at[0].set(o.sh_dc) * final
     gate = photometry_gate(progress, cfg)
     varies = MODELS[cfg.photometry.model]
-    # In the order of the fields, not in their shapes.
+    # The order is that of the fields.
     of_gaussians = [means_rate(progress, rate, extent, cfg), o.quats * decay, o.scales * decay]
     of_gaussians += [o.opacities * decay, sh]
     if like.gaussians.vibration is not None:
@@ -160,14 +161,14 @@ def learning_rates(
 
 
 def grow_moments(opt_state: OptState, empty: Gaussians) -> OptState:
-    """Append zero moments for new slots, as many as `empty` has."""
+    """Append zero moments for the slots of `empty`."""
     zeros = jax.tree.map(jnp.zeros_like, empty)
-    none = AdamState(jnp.zeros(empty.capacity, opt_state.gaussians.counts.dtype), zeros, zeros)
-    return opt_state._replace(gaussians=grow(opt_state.gaussians, none))
+    new = AdamState(jnp.zeros(empty.capacity, opt_state.gaussians.counts.dtype), zeros, zeros)
+    return opt_state._replace(gaussians=grow(opt_state.gaussians, new))
 
 
 def zero_moments(opt_state: OptState, where: Bool[Array, " n"]) -> OptState:
-    """Forget the moments of the given slots."""
+    """Set the moments and counts of the flagged slots to zero."""
 
     def zero(moment: Gaussians) -> Gaussians:
         return jax.tree.map(
@@ -180,7 +181,7 @@ def zero_moments(opt_state: OptState, where: Bool[Array, " n"]) -> OptState:
 
 
 def zero_opacity_moments(opt_state: OptState) -> OptState:
-    """Forget the opacity moments of all slots (3DGS, at an opacity reset)."""
+    """Set the opacity moments of all slots to zero (3DGS, at an opacity reset)."""
 
     def zero(m: Gaussians) -> Gaussians:
         return dataclasses.replace(m, opacity_logits=jnp.zeros_like(m.opacity_logits))

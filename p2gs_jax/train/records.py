@@ -1,4 +1,4 @@
-"""What a run writes while it is optimised: the lines of `log.jsonl`, and checkpoints."""
+"""Files that a run writes during optimisation: `log.jsonl` and checkpoints."""
 
 from __future__ import annotations
 
@@ -19,20 +19,21 @@ from p2gs_jax.run.decisions import KEY, Decisions
 from p2gs_jax.train.state import FitState, HostState, shapes_of
 from p2gs_jax.train.update import StepReport
 
-# Share of a run's time that writing checkpoints may take, and by what factor they may come later
-# for it.
+# Share of a run's time that writing checkpoints may take, and the largest factor by which this may
+# lengthen the pause between them.
 SHARE, LATEST = 0.01, 20.0
 
 
 def record_of(
     reports: Sequence[StepReport], host: HostState, gaussians: int, left_s: float | None
 ) -> LogRecord:
-    """Return what is logged of a burst.
+    """Return the log record of a burst.
 
-    `reports` are those of its steps, `host` and `gaussians` the counters and the population after
-    it. `left_s` are the seconds that optimisation still takes, about; None: not known yet.
+    `reports` are the reports of its steps; `host` and `gaussians` are the counters and the
+    population after it. `left_s` is the estimated time of optimisation left, seconds; None: not
+    known yet.
     """
-    reports = jax.device_get(list(reports))  # at once: each read of its own is a round trip
+    reports = jax.device_get(list(reports))  # in one transfer, because each costs a round trip
     last = reports[-1]
     return LogRecord(
         step=host.step,
@@ -54,18 +55,19 @@ def _mean(values) -> float:
 
 
 def pause_between(every_s: float, took_s: float) -> float:
-    """Return how long a run goes on after a checkpoint, seconds.
+    """Return the seconds between a checkpoint and the next one.
 
-    `every_s` is what was asked (`train.checkpoint_every_s`), `took_s` what the last one took.
+    `every_s` is the option `train.checkpoint_every_s`; `took_s` is the time that writing the last
+    checkpoint took, seconds.
     """
     return max(every_s, min(took_s / SHARE, LATEST * every_s))
 
 
 class Records:
-    """The log of a run, its checkpoints, and how it continues from them.
+    """The log of a run and its checkpoints, and the resumption from them.
 
-    `run_dir` is for `log.jsonl`, every record of which goes to `on_log` as well; `store` is for
-    state, counters and what the scene `decided`, which must be the same in a run that is resumed.
+    `run_dir` holds `log.jsonl`; every record also goes to `on_log`. `store` holds state, counters
+    and the options `decided` from the scene, which must be the same when a run is resumed.
     """
 
     def __init__(
@@ -83,23 +85,23 @@ class Records:
     def begin(
         self, template: FitState, planned: float, resume: bool
     ) -> tuple[FitState, HostState] | None:
-        """Return what `restore` does, for a run that is resumed; drop what was logged after it.
+        """Return the restored state and counters of a resumed run, else None.
 
-        A run that is `planned` for longer than before (`HostState.planned`) goes on as if it always
-        had been.
+        It drops log records after the checkpoint. If the run is `planned` for longer than before
+        (`HostState.planned`), it continues as if this had always been its plan.
         """
-        found = self.restore(template) if resume else None
-        if found is None:
+        restored = self.restore(template) if resume else None
+        if restored is None:
             self._log.unlink(missing_ok=True)
             return None
-        state, host = found
+        state, host = restored
         kept = read_jsonl(self._log) if self._log.exists() else []
         kept = [line for line in kept if line["step"] <= host.step]
         if planned > host.planned > 0:
             host = host.extended(planned)
             self.on_message(f"The run is planned for longer: {host.progress:.0%} of it is done.")
             last = kept[-1]["progress"] if kept else 0.0
-            # A session that was killed before its first checkpoint has rewritten them already.
+            # A session that ended before its first checkpoint may have rewritten them already.
             if abs(last - host.progress) > 1e-5:
                 share = host.progress / last
                 kept = [line | {"progress": round(share * line["progress"], 6)} for line in kept]
@@ -107,7 +109,7 @@ class Records:
         return state, host
 
     def log(self, record: LogRecord) -> None:
-        """Write a record down and pass it on."""
+        """Append a record to the log and pass it on."""
         append_jsonl(self._log, dataclasses.asdict(record))
         self.on_log(record)
 
@@ -121,35 +123,35 @@ class Records:
         self._store.save(host.step, state, meta)
 
     def restore(self, template: FitState) -> tuple[FitState, HostState] | None:
-        """Return the newest checkpoint, or None where there is none; what is newer is removed.
+        """Return the newest readable checkpoint, or None; newer ones are deleted.
 
-        `template` is a state of the same structure, of any population.
+        `template` is a state of the same structure with any number of slots.
 
         Raises:
-            UserError: none can be read, or the scene decides otherwise now.
+            UserError: no checkpoint can be read, or the scene now leads to other options.
         """
         found = self._store.restore_latest(
             lambda meta: shapes_of(template, meta["gaussian_capacity"]), self.on_message
         )
         if found is None:
             return None
-        self._decided.require_same(found[1][KEY], self._store.folder)
-        state = jax.tree.map(jnp.asarray, found[0])
-        host = HostState.from_dict(found[1]["host"])
+        state, meta = jax.tree.map(jnp.asarray, found[0]), found[1]
+        self._decided.require_same(meta[KEY], self._store.folder)
+        host = HostState.from_dict(meta["host"])
         self._store.discard_after(host.step)
         self.on_message(f"Resuming after step {host.step} ({host.progress:.0%}).")
-        # The same steps give the same bits only where sums come in a fixed order.
+        # Equal steps give equal bits only if sums have a fixed order.
         if jax.default_backend() != "cpu" and not self.cfg.render.deterministic:
             self.on_message(
-                "Sums on this device come in no fixed order: the rest of the run is as good as "
+                "Sums on this device have no fixed order: the rest of the run is as good as "
                 "without the interruption, but not the same bit for bit "
-                "(--render.deterministic from the start fixes the order of the renderer's)."
+                "(--render.deterministic from the start fixes the order in the renderer)."
             )
         return state, host
 
     def last_good(self) -> str:
-        """Return in words where the newest checkpoint is."""
+        """Return a phrase that names the newest checkpoint."""
         latest = self._store.latest_step()
         if latest is None:
-            return "no checkpoint was written yet"
+            return "the run has no checkpoint yet"
         return f"the last good checkpoint is step {latest} in {self._store.folder}"

@@ -1,7 +1,7 @@
-"""What changes as a run proceeds, as functions of the fraction completed; and the time budget.
+"""Schedules of a run as functions of the fraction completed, and its time budget.
 
-Every schedule reads `progress` in [0, 1] instead of a step number, so a run can be fitted to a
-wall-clock budget by changing only how much progress one step makes.
+Every schedule reads `progress` in [0, 1] instead of a step number. So a run meets a wall-clock
+budget by changing only the progress per step.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from p2gs_jax.train.state import HostState
 MIN_LEVEL_PIXELS = 96
 MIN_STEPS_LEFT = 8
 MAX_SPEED_UP = 1.5
-# Seconds of a step over those at half the width, late in it (ours: 1.6 to 2.8 on photographs).
+# Time of a step relative to one at half the image width (ours: 1.6 to 2.8 on photographs).
 COST_OF_A_LEVEL = 2.0
-# How many times slower than an unloaded machine this one may be taken for.
+# Upper bound of the estimated slowdown relative to an unloaded machine.
 MOST_SLOWNESS = 3.0
 
-# End of each level as a progress, and the factor by which its images are shrunk; in order.
+# Progress at the end of each level, and the factor by which it shrinks images; in order.
 Levels = tuple[tuple[float, int], ...]
 
 
 def shrinks(cfg: TrainConfig) -> tuple[int, ...]:
-    """Return the factors by which images are shrunk, level by level; the last is 1."""
+    """Return the factors by which the levels shrink images, in order; the last is 1."""
     return tuple(2**k for k in range(len(cfg.coarse_to_fine), -1, -1))
 
 
 def levels(cfg: TrainConfig, width: int, height: int) -> Levels:
-    """Return the levels of the schedule.
+    """Return the levels of the schedule, for images of this width and height in pixels.
 
-    Those that would make images smaller than 96 pixels across are left out.
+    It leaves out levels whose images would be smaller than 96 pixels across.
     """
     kept = [
         (end, shrink)
@@ -44,20 +44,20 @@ def levels(cfg: TrainConfig, width: int, height: int) -> Levels:
 
 
 def shrink_at(progress: float, plan: Levels) -> int:
-    """Return the factor by which images are shrunk at this point of the run."""
+    """Return the factor by which images are shrunk at this progress."""
     return next((shrink for end, shrink in plan if progress < end), 1)
 
 
 def shrinks_left(progress: float, plan: Levels) -> list[int]:
-    """Return the factors of the levels that are not over, in order."""
+    """Return the shrink factors of the levels that are not over, in order."""
     return [shrink for end, shrink in plan if end > progress]
 
 
 def seconds_left(progress: float, per_step: float, step_s: float, plan: Levels) -> float:
-    """Return about how many seconds the steps to come take.
+    """Return an estimate of the seconds that the remaining steps take.
 
-    Steps of every level count as a multiple of the present ones, which take `step_s` seconds: finer
-    ones cost more. `per_step` is the progress of one step.
+    Steps at the present level take `step_s` seconds; at finer levels they take COST_OF_A_LEVEL
+    times as long per level. `per_step` is the progress of one step.
     """
     present, total = shrink_at(progress, plan), 0.0
     for end, shrink in plan:
@@ -68,12 +68,12 @@ def seconds_left(progress: float, per_step: float, step_s: float, plan: Levels) 
 
 
 def is_over(progress: float, per_step: float) -> bool:
-    """Return whether a run is complete, up to half a step; `per_step` is the progress of one."""
+    """Return whether a run is complete, up to half a step; `per_step` is the progress of a step."""
     return progress >= 1.0 - 0.5 * per_step
 
 
 def sh_degree_at(progress: float, cfg: TrainConfig, highest: int) -> int:
-    """Return the spherical-harmonics degree in use (3DGS: one more every 1000 of 30k steps)."""
+    """Return the spherical-harmonics degree in use (3DGS: one more every 1,000 of 30,000 steps)."""
     return min(highest, int(progress / cfg.sh_every + 1e-9))
 
 
@@ -83,28 +83,28 @@ def highest_degree(shrink: int, plan: Levels, cfg: TrainConfig, highest: int) ->
     return sh_degree_at(end, cfg, highest)
 
 
-def rate_factor(per_step: float, shown: float, settled: float | None) -> float:
-    """Return the factor on rates of Gaussians but for colours in a fit of this length, at most 1.
+def rate_factor(per_step: float, visible_share: float, most_updates: float | None) -> float:
+    """Return the factor, at most 1, on the learning rates of Gaussians except colours.
 
-    Near an optimum the noise of Adam's steps adds up as their number times the squared rate: so
-    long fits take rates lower by the root of their length (ours: BUILD_NOTES, "Length"). `shown` is
-    the share of the Gaussians that one step updates, `settled` the updates of a Gaussian up to
-    which the configured rates hold; None: any number.
+    Near an optimum the noise of Adam's steps grows with their number times the squared learning
+    rate. So long fits divide rates by the root of their length (ours: BUILD_NOTES, "Length").
+    `visible_share` is the share of the Gaussians that one step updates. Up to `most_updates`
+    updates of a Gaussian the configured rates hold; None: always.
     """
-    if settled is None:
+    if most_updates is None:
         return 1.0
-    return min(1.0, (settled * per_step / shown) ** 0.5)
+    return min(1.0, (most_updates * per_step / visible_share) ** 0.5)
 
 
 def replanned(per_step: float, progress: float, left_s: float, step_s: float) -> float:
-    """Return the progress of a step with which the run ends on time.
+    """Return the progress per step with which the run ends on time.
 
-    Under a budget, progress is the share of time: every level of the schedule gets its share of the
-    seconds, whatever its steps cost, and compilation counts like any other second. Until now a step
-    made `per_step` and takes `step_s` seconds; the deadline is in `left_s` seconds.
+    Under a budget, progress is the share of time. Every level gets its share of the seconds,
+    whatever its steps cost, and compilation counts as time. Steps have made `per_step` progress so
+    far and take `step_s` seconds; the deadline is in `left_s` seconds.
     """
     wanted = (1.0 - progress) * step_s / max(left_s, 1e-3)
-    # One slow burst (another program, a page fault) must not use up the schedule.
+    # One slow burst, for example with a page fault, must not use up the schedule.
     bounded = min(wanted, MAX_SPEED_UP * per_step, (1.0 - progress) / MIN_STEPS_LEFT)
     return max(bounded, 1e-9)
 
@@ -112,10 +112,10 @@ def replanned(per_step: float, progress: float, left_s: float, step_s: float) ->
 class RunClock:
     """The clock of one session, and the deadline of the run that it continues.
 
-    Of a budget `spent_s` seconds were gone before the run, and `finish_s` are left for what
-    follows, on an unloaded machine, where a step at full size takes `full_step_s`. `now` gives
-    seconds on a clock that never goes back. `deadline_s` are the seconds into the run at which
-    optimisation must end; None without a budget.
+    A budget loses `spent_s` seconds used before the run. It reserves `finish_s` seconds for
+    evaluation and export on an unloaded machine, where a step at full size takes `full_step_s`
+    seconds. `now` is a monotonic clock in seconds. `deadline_s` is the time since the start of the
+    run at which optimisation must end, seconds; None without a budget.
     """
 
     def __init__(
@@ -135,18 +135,18 @@ class RunClock:
         self._before, self._begun = host.elapsed_s, now()
 
     def tick(self, host: HostState) -> None:
-        """Write down how much time has passed."""
+        """Store the elapsed time in the counters."""
         host.elapsed_s = self._before + self.now() - self._begun
 
     def replan(self, host: HostState) -> None:
-        """Set the pace with which the run ends on time; without a budget it stays."""
+        """Set the progress per step with which the run ends on time, if there is a budget."""
         if self.deadline_s is None or host.step_s <= 0:
             return
         left = self.deadline_s - self._passed(host)
         host.pace = replanned(host.pace, host.progress, left, host.step_s)
 
     def left(self, host: HostState, plan: Levels) -> float | None:
-        """Return about how many seconds optimisation still takes, None where no step was timed."""
+        """Return an estimate of the seconds of optimisation left; None before a step is timed."""
         if self.deadline_s is not None:
             return max(self.deadline_s - self._passed(host), 0.0)
         if host.step_s <= 0:
@@ -154,18 +154,18 @@ class RunClock:
         return seconds_left(host.progress, host.pace, host.step_s, plan)
 
     def over(self, host: HostState) -> bool:
-        """Return whether the time that optimisation may take is used up."""
+        """Return whether the time for optimisation is used up."""
         return self._passed(host) > (self.deadline_s or math.inf)
 
     def _passed(self, host: HostState) -> float:
-        """Return the seconds so far, and by how much what follows will exceed its reserve.
+        """Return the elapsed seconds, plus the time that the final work needs beyond its reserve.
 
-        Evaluation is taken to be as much slower than expected as the steps are.
+        The estimate assumes that evaluation is slowed down by the same factor as the steps.
         """
         return host.elapsed_s + self._finish_s * (self._slowness(host) - 1)
 
     def _slowness(self, host: HostState) -> float:
-        """Return how many times slower than expected full-size steps are, from 1 to 3."""
+        """Return the slowdown of full-size steps relative to the expected time, from 1 to 3."""
         if host.shrink != 1 or host.step_s <= 0:
             return 1.0
         return min(max(host.step_s / self._full_step_s, 1.0), MOST_SLOWNESS)

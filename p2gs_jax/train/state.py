@@ -1,4 +1,4 @@
-"""The state of a fit: what a step maps to its successor, and what the host remembers beside it.
+"""The state of a fit: the arrays that a step changes, and the counters that the host keeps.
 
 A checkpoint holds both.
 """
@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from p2gs_jax.gaussians.population import empty_gaussians, empty_population, fresh_population, grow
-from p2gs_jax.render.capacity import Room
+from p2gs_jax.render.capacity import Capacity
 from p2gs_jax.train.optimizer import Optimizer, OptState, grow_moments
 from p2gs_jax.types import Array, Params, Population
 
@@ -24,16 +24,16 @@ FAULT_NONE, FAULT_OVERFLOW, FAULT_NONFINITE = 0, 1, 2
 
 
 class Fault(eqx.Module):
-    """Why the state stopped advancing; sticky, so the host need not look after every step."""
+    """Why the state stopped advancing; it stays set, so the host need not look after every step."""
 
-    kind: Int[Array, ""]  # 0 none, 1 a view needs more room, 2 something is not finite
+    kind: Int[Array, ""]  # 0 none, 1 a list was too short, 2 a value is not finite
     needed: Int[Array, ""]  # entries that the tile list needed
-    visible: Int[Array, ""]  # Gaussians that the view showed
-    term: Int[Array, ""]  # index into the names of loss terms and gradients that was not finite
+    visible: Int[Array, ""]  # Gaussians that the view may show
+    term: Int[Array, ""]  # index in `finite_names` of the first value that is not finite
 
     @classmethod
     def none(cls) -> Fault:
-        """Return the state of health."""
+        """Return the record of a state without a fault."""
         return cls(*(jnp.int32(0) for _ in range(4)))
 
 
@@ -49,32 +49,30 @@ class FitState(eqx.Module):
 
 @dataclass
 class HostState:
-    """What the host remembers between bursts; saved with every checkpoint."""
+    """The counters that the host keeps between bursts; every checkpoint holds them."""
 
-    step: int = 0  # steps completed, a view each
-    planned: float = (
-        0.0  # steps of the run, or seconds of its budget: what `progress` is a share of
-    )
+    step: int = 0  # views completed
+    planned: float = 0.0  # length of the run: steps, or seconds of its time budget
     progress: float = 0.0  # fraction of the run completed
     pace: float = 0.0  # progress per step
-    elapsed_s: float = 0.0  # seconds of earlier sessions and of this one
+    elapsed_s: float = 0.0  # seconds of this session and of earlier ones
     densified_at: float = 0.0  # progress of the last densification
     reset_at: float = 0.0  # progress of the last opacity reset
-    refused: int = 0  # densification requests that found no slot, summed
-    overflows: int = 0  # tile lists grown
-    rooms: dict[str, Room] = field(default_factory=dict)  # room of a view for every "WxH"
-    shrink: int = 0  # factor by which images are shrunk at the present level
-    # running estimate of the seconds a step takes at this level, compiling apart; 0: none was timed
-    # yet
+    refused: int = 0  # sum of densification requests that found no free slot
+    overflows: int = 0  # how many times a capacity grew
+    # capacity of a view for every image size "WxH"; checkpoints hold it by this name
+    rooms: dict[str, Capacity] = field(default_factory=dict)
+    shrink: int = 0  # factor by which the present level shrinks images
+    # running mean of the seconds per step at this level, without compilation; 0: not timed yet
     step_s: float = 0.0
 
     @classmethod
     def from_dict(cls, values: dict) -> HostState:
-        """Return what a checkpoint holds."""
-        return cls(**{**values, "rooms": {k: Room(*room) for k, room in values["rooms"].items()}})
+        """Return the counters from the dictionary that a checkpoint holds."""
+        return cls(**{**values, "rooms": {k: Capacity(*c) for k, c in values["rooms"].items()}})
 
     def extended(self, planned: float) -> HostState:
-        """Return the counters of the same run planned longer: less of it is completed."""
+        """Return the counters for a longer plan, in units of `planned`; progress shrinks."""
         share = self.planned / planned
         times = {
             k: share * getattr(self, k) for k in ("progress", "pace", "densified_at", "reset_at")
@@ -89,11 +87,11 @@ def initial_state(
     slots: int = 0,
     owner: Int[Array, " n"] | Int[np.ndarray, " n"] | None = None,
 ) -> FitState:
-    """Return the state before the first step, with room for `slots` Gaussians at least.
+    """Return the state before the first step, with at least `slots` slots for Gaussians.
 
-    `alive` says which of `params` exist, `owner` which moving object each belongs to.
+    `alive` flags the rows of `params` that exist; `owner` is the moving object of each row.
     """
-    # The step donates its state: the caller keeps its parameters.
+    # A step donates its state. The copy lets the caller keep `params`.
     return jax.tree.map(jnp.asarray, _initial_state(params, alive, optimizer, slots, owner))
 
 
@@ -113,7 +111,7 @@ _sum = jax.jit(jnp.sum)
 
 
 def grow_state(state: FitState, capacity: int) -> FitState:
-    """Return the state with room for `capacity` Gaussians; the new slots are empty."""
+    """Return the state with at least `capacity` slots for Gaussians; new slots are empty."""
     gaussians = state.params.gaussians
     extra = capacity - gaussians.capacity
     if extra <= 0:
@@ -128,7 +126,7 @@ def grow_state(state: FitState, capacity: int) -> FitState:
 
 
 def shapes_of(state: FitState, capacity: int) -> FitState:
-    """Return the shapes of the state if it had room for `capacity` Gaussians."""
+    """Return the shapes that the state would have with `capacity` slots for Gaussians."""
 
     def shapes(tree, rows: tuple[int, ...] = ()):
         return jax.tree.map(
@@ -147,5 +145,5 @@ def shapes_of(state: FitState, capacity: int) -> FitState:
 
 
 def healed(state: FitState) -> FitState:
-    """Return the state without its fault, which lies where it lay."""
+    """Return the state without its fault; the arrays stay on their devices."""
     return dataclasses.replace(state, fault=jax.tree.map(jnp.zeros_like, state.fault))

@@ -1,8 +1,8 @@
 """One optimisation step: three pure jitted functions, one after the other, compiled ahead.
 
-The first and the last work per Gaussian and know no image size, so all levels of a fit share them;
-the one between knows neither the population nor the optimiser. In one program, every level compiled
-all of it (BUILD_NOTES, "A step is three programs").
+The first and the last program work per Gaussian and depend on no image size, so all levels of a
+fit share them. The middle program depends neither on the population nor on the optimiser. With a
+single program, every level would compile all of it (BUILD_NOTES, "A step is three programs").
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.core.threads import available_cores
 from p2gs_jax.presets import narrowed
-from p2gs_jax.render.capacity import Room
+from p2gs_jax.render.capacity import Capacity
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.train.exposure_loss import Partner
 from p2gs_jax.train.image_gradient import differentiate, show
@@ -32,14 +32,14 @@ from p2gs_jax.train.terms import LossTerm, loss_terms
 from p2gs_jax.train.update import Controls, StepReport, advance
 from p2gs_jax.types import Batch, Frustum
 
-# What each program takes of the configuration; None: all of it. Fits that differ elsewhere share
-# the program, and a program that reads anything else raises AttributeError.
-FORMED = ("curve", "spline", "pivot", "clamp", "cameras", "appearance")
-TAKEN: dict[str, dict[str, Any]] = {
+# The options that each program reads; None: all of a group. Fits that differ in other options share
+# the program, and a program that reads another option raises AttributeError.
+FORMATION_OPTIONS = ("curve", "spline", "pivot", "clamp", "cameras", "appearance")
+OPTIONS_READ: dict[str, dict[str, Any]] = {
     "show": {"render": None, "optimizer": ("visible_only",)},
     "differentiate": {
         "render": None,
-        "photometry": FORMED,
+        "photometry": FORMATION_OPTIONS,
         "loss": ("censored", "saturation"),
     },
     "advance": {
@@ -50,8 +50,8 @@ TAKEN: dict[str, dict[str, Any]] = {
     },
 }
 
-# The first step waits for two programs of about equal size; but XLA itself compiles on several
-# cores, and two at once on two cores take three times as long each (ours: BUILD_NOTES).
+# The first step waits for two programs of about equal size. XLA itself compiles on several cores:
+# on two cores, two compilations at once take three times as long each (ours: BUILD_NOTES).
 WORKERS = 1 if available_cores() <= 2 else 2
 
 
@@ -64,8 +64,8 @@ PROGRAMS: dict[str, Callable[..., Any]] = {
 
 @functools.cache
 def compiled(name: str, **static: Any) -> Any:
-    """Return a part of a step, jitted; the same where what is static is."""
-    # On first use: the options depend on the backend.
+    """Return a program of a step, jitted; equal static arguments give the same function."""
+    # Created on first use, because the compiler options depend on the backend.
     body = functools.partial(PROGRAMS[name], **static)
     donated = (0,) if name == "advance" else ()
     return jax.jit(body, compiler_options=compiler_options(), donate_argnums=donated)
@@ -73,21 +73,21 @@ def compiled(name: str, **static: Any) -> Any:
 
 @functools.cache
 def compiled_over(kind: type[MeshStep], name: str, *, mesh: Mesh, **static: Any) -> Any:
-    """Return a part of a step, divided over the devices of a mesh, jitted.
+    """Return a program of a step, divided over the devices of a mesh, jitted.
 
-    It takes arrays of the host.
+    Its arguments may be host arrays.
     """
-    body, into, out = kind.programs[name]
-    each = functools.partial(body, **static)
-    placed = jax.tree.map(
+    body, in_specs, out_specs = kind.programs[name]
+    on_each = functools.partial(body, **static)
+    shardings = jax.tree.map(
         lambda spec: NamedSharding(mesh, spec),
-        (into, out),
+        (in_specs, out_specs),
         is_leaf=lambda spec: isinstance(spec, P),
     )
     return jax.jit(
-        jax.shard_map(each, mesh=mesh, in_specs=into, out_specs=out, check_vma=False),
-        in_shardings=placed[0],
-        out_shardings=placed[1],
+        jax.shard_map(on_each, mesh=mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False),
+        in_shardings=shardings[0],
+        out_shardings=shardings[1],
         compiler_options=compiler_options(),
         donate_argnums=(0,) if name == "advance" else (),
     )
@@ -95,20 +95,20 @@ def compiled_over(kind: type[MeshStep], name: str, *, mesh: Mesh, **static: Any)
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Step:
-    """The step `(state, batch, partner, controls, room=..., degree=...)` of a fit.
+    """The step `(state, batch, partner, controls, capacity=..., degree=...)` of a fit.
 
-    It gives the next state and a report; the state before is donated. Randomness follows from the
-    seed and the step number alone. The loss is that of `image_loss`. What is done per Gaussian is
-    done in blocks, for those that the view may show; the others rest
-    (`OptimizerConfig.visible_only`). What happens where something does not fit or is not finite:
-    `train/update.py`.
+    It returns the next state and a report; the previous state is donated. Random numbers depend on
+    the seed and the step number alone. The loss is that of `image_loss`. Work per Gaussian runs in
+    blocks, and only for Gaussians that the view may show; the others do not change
+    (`OptimizerConfig.visible_only`). `train/update.py` describes how a step treats overflows and
+    values that are not finite.
     """
 
-    cfg: FitConfig  # everything
+    cfg: FitConfig
     optimizer: Optimizer  # from `make_optimizer`
     extent: float  # scene extent, scene units
     noise: float | None = None  # scale of the exploration noise, or None (`strategies.Strategy`)
-    # loss terms that differ from those of `cfg`; see `loss_terms`
+    # loss terms to add to those of `cfg`, to replace, or (None) to remove; see `loss_terms`
     terms: Mapping[str, LossTerm | None] = dataclasses.field(default_factory=dict)
     _ready: dict[Any, Callable] = dataclasses.field(default_factory=dict, init=False)
 
@@ -119,17 +119,17 @@ class Step:
         partner: Partner,
         controls: Controls,
         *,
-        room: Room,
+        capacity: Capacity,
         degree: int,
     ) -> tuple[FitState, StepReport]:
         """Take a step, compiling it on first use."""
-        if (room, degree) not in self._ready:
-            parts = (self.program(name, room, degree) for name in PROGRAMS)
-            self._ready[room, degree] = self.chained(*parts)
-        return self._ready[room, degree](state, batch, partner, controls)
+        if (capacity, degree) not in self._ready:
+            parts = (self.program(name, capacity, degree) for name in PROGRAMS)
+            self._ready[capacity, degree] = self.chained(*parts)
+        return self._ready[capacity, degree](state, batch, partner, controls)
 
     def chained(self, show, differentiate, advance):
-        """Return the step made of its three programs, compiled or not."""
+        """Return the step that calls its three programs, compiled or not."""
 
         def step(state: FitState, batch: Batch, partner: Partner, controls: Controls):
             params, frustum = state.params, self.frustum(batch)
@@ -142,20 +142,20 @@ class Step:
         return step
 
     def settings(self, name: str) -> dict[str, Any]:
-        """Return what one of the three programs takes from the configuration, by argument."""
-        cfg = narrowed(self.cfg, TAKEN[name])
+        """Return the static arguments of one of the three programs, from the configuration."""
+        cfg = narrowed(self.cfg, OPTIONS_READ[name])
         if name == "show":
             return {"cfg": cfg}
         if name == "differentiate":
-            known = dataclasses.replace(self.cfg, photometry=cfg.photometry)
-            return {"cfg": cfg, "terms": tuple(loss_terms(known, self.terms).items())}
+            full = dataclasses.replace(self.cfg, photometry=cfg.photometry)
+            return {"cfg": cfg, "terms": tuple(loss_terms(full, self.terms).items())}
         return {"cfg": cfg, "optimizer": self.optimizer, "extent": self.extent, "noise": self.noise}
 
     def lowered(
-        self, name: str, state: FitState, batch, partner, controls, *, room: Room, degree: int
+        self, name: str, state, batch, partner, controls, *, capacity: Capacity, degree: int
     ):
-        """Return one of the three programs, by its name, traced for arguments of these shapes."""
-        program = functools.partial(self.program, room=room, degree=degree)
+        """Return the program of this name, lowered for arguments of these shapes."""
+        program = functools.partial(self.program, capacity=capacity, degree=degree)
         frustum, params = jax.eval_shape(self.frustum, batch), state.params
         arguments = per_gaussian(state, frustum, controls)
         if name == "show":
@@ -165,31 +165,31 @@ class Step:
         if name == "differentiate":
             return program(name).lower(*image)
         gradient = program("differentiate").eval_shape(*image)
-        moved = (state, listed.ids, listed.visible, gradient, frustum, controls)
-        return program(name).lower(*moved)
+        update = (state, listed.ids, listed.visible, gradient, frustum, controls)
+        return program(name).lower(*update)
 
-    # What steps on several devices do otherwise: `divided.py`, `data_parallel.py`.
+    # Steps on several devices override these methods: `divided.py`, `data_parallel.py`.
 
-    def program(self, name: str, room: Room, degree: int) -> Any:
+    def program(self, name: str, capacity: Capacity, degree: int) -> Any:
         """Return one of the three programs, jitted."""
-        return compiled(name, **self.settings(name), **static_sizes(name, room, degree))
+        return compiled(name, **self.settings(name), **static_sizes(name, capacity, degree))
 
     def frustum(self, batch: Batch) -> Frustum:
-        """Return the view of a step, for the programs that know no image size."""
+        """Return the view of a step, for the programs that depend on no image size."""
         c = batch.camera
         width, height = map(c.K.dtype.type, (c.width, c.height))
         return on_host(Frustum, c.viewmat, c.K, width, height, c.objects)
 
     def slots(self, count: int) -> int:
-        """Return how many slots a population has that is to have `count` or more."""
+        """Return the smallest allowed number of slots that is at least `count`."""
         return count
 
     def spread(self, state: FitState) -> FitState:
-        """Return a state as steps take it."""
+        """Return the state laid out on the devices as steps need it."""
         return state
 
     def whole(self, state: FitState) -> FitState:
-        """Return a state of steps on the default device, for what looks at all Gaussians."""
+        """Return the state on the default device, as densification and checkpoints need it."""
         return state
 
 
@@ -197,25 +197,25 @@ class Step:
 class MeshStep(Step):
     """A step whose programs are divided over the devices of a mesh."""
 
-    # Of each program: what each device does, and how its arguments and its results are divided.
+    # For each program: the function of one device, the specs of its arguments and of its results.
     programs: ClassVar[dict[str, tuple[Any, Any, Any]]]
     mesh: Mesh = dataclasses.field(kw_only=True)
 
     def settings(self, name: str) -> dict[str, Any]:
-        """Return what one of the three programs takes from the configuration, by argument."""
+        """Return the static arguments of one of the three programs, and the mesh."""
         return super().settings(name) | {"mesh": self.mesh}
 
-    def program(self, name: str, room: Room, degree: int) -> Any:
+    def program(self, name: str, capacity: Capacity, degree: int) -> Any:
         """Return one of the three programs, divided over the mesh and jitted."""
-        static = self.settings(name) | static_sizes(name, room, degree)
+        static = self.settings(name) | static_sizes(name, capacity, degree)
         return compiled_over(type(self), name, **static)
 
 
-def static_sizes(name: str, room: Room, degree: int) -> dict[str, int]:
-    """Return the static sizes of one of the three programs, by argument."""
+def static_sizes(name: str, capacity: Capacity, degree: int) -> dict[str, int]:
+    """Return the static sizes of one of the three programs, by argument name."""
     if name == "show":
-        return {"room": room.visible, "degree": degree}
-    return {"room": room.entries} if name == "differentiate" else {"degree": degree}
+        return {"capacity": capacity.visible, "degree": degree}
+    return {"capacity": capacity.entries} if name == "differentiate" else {"degree": degree}
 
 
 def per_gaussian(state: FitState, frustum: Frustum, controls: Controls) -> tuple:
@@ -228,76 +228,73 @@ def per_gaussian(state: FitState, frustum: Frustum, controls: Controls) -> tuple
 
 
 class Key(NamedTuple):
-    """What a step is compiled for."""
+    """The sizes and types for which a step is compiled."""
 
     size: tuple[int, int]  # image width and height, pixels
-    slots: int  # room of the population
-    room: Room  # of a view
+    slots: int  # of the population
+    capacity: Capacity  # of a view
     degree: int  # highest spherical-harmonics degree in use
-    pixels: str  # type of the photograph as it is stored
-    structure: Hashable = None  # what the state, and what comes with a photograph, consist of
+    pixels: str  # data type of the stored photograph
+    structure: Hashable = None  # tree structure of the state and of the optional inputs of a view
 
 
 class StepPrograms:
-    """The compiled steps of a fit, made in the background ahead of their turn.
+    """The compiled steps of a fit, which threads compile in the background before they are needed.
 
-    XLA holds no lock of Python's while it compiles, so the program of the next level is made while
-    the present one runs. Levels and populations share those of the three programs of a step that
-    they can, and so do a step that was made before the exposures were known and the one that was
-    made after.
+    XLA releases Python's lock while it compiles, so the programs of the next level compile while
+    the present level runs. Levels and populations share programs of equal arguments. So do the
+    steps before and after the exposures are known.
 
     Attributes:
-        rooms: of the image sizes, by name, for which programs were begun before the start.
-        waited_s: seconds for which a program was waited for; they never count as pace.
+        capacities: capacities by the name of the image size, from before the exposures are known.
+        waited_s: seconds spent waiting for compilation; they do not count as time of steps.
     """
 
     def __init__(self):
-        self.rooms: dict[str, Room] = {}
+        self.capacities: dict[str, Capacity] = {}
         self._made: dict[Hashable, Future] = {}
         self._ready: dict[tuple[Any, Key], Callable] = {}
         self._worker = ThreadPoolExecutor(WORKERS, thread_name_prefix="compile")
         self.waited_s = 0.0
 
     def expect(self, step: Any, key: Key, *arguments: Any, images: bool = True) -> list[Future]:
-        """Begin to compile a step in the background.
+        """Begin to compile a step in the background; return its programs in their order.
 
-        `step` is a `Step`, or one of several views; `arguments` are its own, or their shapes.
-        Without `images`, the program between waits, which knows the tone curve. Returned are the
-        programs in their order.
+        `arguments` are those of the `step`, or their shapes. Without `images`, the middle program,
+        which depends on the tone curve, is left out.
         """
         visible_only = step.settings("show")["cfg"].optimizer.visible_only
-        rows = min(key.room.visible, key.slots) if visible_only else key.slots
-        of_gaussians = (key.slots, rows, key.degree)
+        rows = min(key.capacity.visible, key.slots) if visible_only else key.slots
+        per_gaussian = (key.slots, rows, key.degree)
         shapes = {
-            "show": of_gaussians,
-            "differentiate": (key.size, key.room.entries, rows, key.pixels),
-            "advance": of_gaussians,
+            "show": per_gaussian,
+            "differentiate": (key.size, key.capacity.entries, rows, key.pixels),
+            "advance": per_gaussian,
         }
         keys = {
             name: (name, tuple(step.settings(name).values()), shape, key.structure)
             for name, shape in shapes.items()
         }
-        # The longest first.
+        static = {"capacity": key.capacity, "degree": key.degree}
+        # The program that compiles longest comes first.
         wanted = ("differentiate", "show", "advance") if images else ("advance", "show")
         for name in wanted:
             if keys[name] not in self._made:
-                lowered = functools.partial(step.lowered, name, *_shapes(arguments))
-                self._made[keys[name]] = self._worker.submit(
-                    lambda lowered=lowered: lowered(room=key.room, degree=key.degree).compile()
-                )
+                trace = functools.partial(step.lowered, name, *_shapes(arguments), **static)
+                self._made[keys[name]] = self._worker.submit(lambda trace=trace: trace().compile())
         return [self._made[keys[name]] for name in shapes if name in wanted]
 
     def ahead(self, key: Hashable, program, *arguments: Any, **static: Any) -> Callable:
-        """Begin to compile another program in the background, and return it.
+        """Begin to compile another program in the background; return a function that calls it.
 
-        `key` tells it from others; the returned function is called without the static arguments.
+        `key` identifies the program. The returned function takes the arguments that are not static.
         """
         if key not in self._made:
             self._made[key] = self._worker.submit(
                 lambda: program.lower(*_shapes(arguments), **static).compile()
             )
         future = self._made[key]
-        return lambda *given: self._wait(future)(*given)
+        return lambda *dynamic: self._wait(future)(*dynamic)
 
     def get(self, step: Any, key: Key, *arguments: Any):
         """Return a compiled step, `(state, batch, partner, controls) -> (state, report)`."""
@@ -316,7 +313,7 @@ class StepPrograms:
             self.waited_s += time.monotonic() - begin
 
     def close(self) -> None:
-        """Forget programs whose compilation has not begun."""
+        """Cancel the compilations that have not begun."""
         self._worker.shutdown(wait=False, cancel_futures=True)
 
 

@@ -1,8 +1,8 @@
-"""Densification: when the population changes, and how (gsplat's word is strategy).
+"""Densification: when the population changes, and how (gsplat calls this a strategy).
 
-A strategy is any object with the methods of `Strategy`; yours is passed to `make_step` or `fit`. It
-is asked within the time and at the interval of `DensifyConfig`. What decides who is born and who
-dies is pure: Gaussians and population in, an `Outcome` out.
+A strategy is any object with the methods of `Strategy`; pass a custom one to `make_step` or `fit`.
+`DensifyConfig` sets the period and the interval of densification. The functions that add and remove
+Gaussians are pure: they map Gaussians and population to an `Outcome`.
 """
 
 from __future__ import annotations
@@ -37,84 +37,84 @@ from p2gs_jax.train.state import FitState, HostState, alive_in, grow_state
 from p2gs_jax.types import Array, Gaussians, Population
 
 SLOTS = 1024
-# Steps at full size cost about twice the present ones, at a coarse level.
+# A step at full size takes about twice as long as one at the coarse level before it.
 FULL_SIZE_COST = 2.0
 
 
 class Slots(NamedTuple):
-    """How large a population may become."""
+    """The bound on the population, and its number of slots at the start."""
 
-    limit: int | None  # bound on it, or None where there is none
-    slots: int  # room to begin with
+    limit: int | None  # bound on the population; None: no bound
+    slots: int  # slots at the start
 
     @property
     def most(self) -> int:
-        """The largest population to make room for."""
+        """The largest population for which capacities are allocated."""
         return max(self.limit or 0, self.slots)
 
 
 class Moment(NamedTuple):
-    """What a strategy is told when it is asked."""
+    """Inputs of a densification besides Gaussians and population."""
 
-    key: PRNGKeyArray  # randomness of this densification
-    moments: AdamState  # Adam's of the Gaussians
+    key: PRNGKeyArray  # random key of this densification
+    moments: AdamState  # Adam's moments of the Gaussians
     extent: float  # scene extent, scene units
     interval: float  # progress between two densifications
     limit: int | None  # bound on the population, or None
-    # step, progress, pace and counters; a strategy that resets opacities sets `reset_at`
+    # counters of the run; a strategy that resets opacities sets `reset_at`
     host: HostState
 
 
 @runtime_checkable
 class Strategy(Protocol):
-    """When asked, gives another population.
+    """A rule that adds and removes Gaussians.
 
-    Two attributes are looked at where they are there. `noise`: scale of the exploration noise that
-    steps add to the means; None (default): none, and `Population` sums screen-space gradients
-    instead. `slots_stay`: the number of slots never changes, so that steps can be compiled ahead
-    (default: True).
+    Two attributes are optional. `noise` is the scale of the exploration noise that steps add to the
+    means; with None (default), `Population` sums screen-space gradients instead. `slots_stay`
+    (default: True) means that the number of slots never changes, so that steps can be compiled
+    ahead.
     """
 
     def start(self, seeds: int) -> int | Slots:
-        """Return room for the population, at least as many as there are seeds."""
+        """Return the number of slots at the start, at least the number of seeds."""
         ...
 
     def densify(self, gaussians: Gaussians, population: Population, now: Moment) -> Outcome:
-        """Return the population from here on, with as many slots or more.
+        """Return the new population, with at least as many slots.
 
-        Moments of slots in `Outcome.reset_moments` begin anew; statistics of the population do
-        where it returns `fresh_population`.
+        Moments of the slots in `Outcome.reset_moments` become zero. A strategy that returns
+        `fresh_population` resets the statistics, too.
         """
         ...
 
 
 def demand(gaussians: Gaussians, moments: AdamState, b2: float) -> Float[Array, " n"]:
-    """Return how much the loss still pulls at each Gaussian; 0 for those that no step has seen.
+    """Return the demand for more Gaussians at each Gaussian; 0 for those that no step has seen.
 
-    The root mean square, over the views that showed it, of the loss's gradient by a move in units
-    of its own largest extent: where views pull a Gaussian to and fro, one is too few. 3DGS splits
-    by the mean length of the same gradient on the screen (ours: BUILD_NOTES, "Births where they
-    are needed"). `b2` is Adam's share of the old mean of the squares.
+    It is the root mean square, over the views that showed a Gaussian, of the gradient of the loss
+    by its mean, in units of its largest scale. If views pull a Gaussian in different directions,
+    one Gaussian is too few. 3DGS splits by the mean length of the same gradient on the screen
+    (ours: BUILD_NOTES, "Births where they are needed"). `b2` is Adam's decay of the second moment.
     """
     square = jnp.sum(moments.nu.means, -1)
     share = 1 - b2 ** moments.counts.astype(jnp.float32)
     seen = moments.counts > 0
     mean_square = jnp.where(seen, square / jnp.where(seen, share, 1.0), 0.0)
-    found = jnp.sqrt(mean_square) * jnp.exp(jnp.max(gaussians.log_scales, -1))
-    return jnp.where(jnp.isfinite(found), found, 0.0)
+    value = jnp.sqrt(mean_square) * jnp.exp(jnp.max(gaussians.log_scales, -1))
+    return jnp.where(jnp.isfinite(value), value, 0.0)
 
 
 @functools.partial(jax.jit, static_argnames=("cfg", "b2"))
 def relocate(key, gaussians, population, moments, births, *, cfg: DensifyConfig, b2: float):
-    """Relocate, and grow by `births` where the loss pulls most (`mcmc.relocate_and_grow`)."""
-    asked = demand(gaussians, moments, b2)
-    return mcmc.relocate_and_grow(key, gaussians, population, births, cfg, asked)
+    """Relocate, and add `births` Gaussians by their `demand` (`mcmc.relocate_and_grow`)."""
+    weight = demand(gaussians, moments, b2)
+    return mcmc.relocate_and_grow(key, gaussians, population, births, cfg, weight)
 
 
 class Mcmc:
-    """`densify.method` mcmc: Kheradmand et al. 2024, with births where they are needed.
+    """`densify.method` mcmc: Kheradmand et al. 2024, with births chosen by `demand` (ours).
 
-    Relocates what is transparent, and grows by a factor towards a bound.
+    It relocates transparent Gaussians, and grows the population by a factor up to a bound.
     """
 
     slots_stay = True
@@ -126,16 +126,16 @@ class Mcmc:
         self._relocate: Callable[..., Outcome] = functools.partial(relocate, **self._static)
 
     def start(self, seeds: int) -> Slots:
-        """Return the bound, configured or chosen, and slots for as many."""
+        """Return the bound, configured or chosen from the scene, and as many slots."""
         limit = self.cfg.densify.max_gaussians
         if limit is None:
             limit = default_max_gaussians(seeds, self.coverage, self.cfg.train)
         limit = max(limit, seeds)
-        # Rounded: a seed more or less, known late, should not be another program.
+        # Rounded up, so that a late change in the number of seeds needs no other program.
         return Slots(limit, -(-limit // SLOTS) * SLOTS)
 
     def expect(self, programs: Any, state: FitState) -> None:
-        """Begin to compile the relocation of a state of these shapes; `programs` compiles ahead."""
+        """Begin to compile the relocation for these shapes; `programs` is a `StepPrograms`."""
         gaussians = state.params.gaussians
         key = compiled_key.eval_shape(np.uint32(0), np.int32(0))
         self._relocate = programs.ahead(
@@ -150,7 +150,7 @@ class Mcmc:
         )
 
     def densify(self, gaussians: Gaussians, population: Population, now: Moment) -> Outcome:
-        """Relocate, and grow on the way to the bound."""
+        """Relocate, and grow towards the bound."""
         alive = alive_in(population)
         births = np.int32(max(self._target(alive, now) - alive, 0))
         return self._relocate(now.key, gaussians, population, now.moments, births)
@@ -158,16 +158,16 @@ class Mcmc:
     def _target(self, alive: int, now: Moment) -> int:
         """Return the population after the next relocation."""
         limit = self._affordable(alive, now)
-        room = max((limit or alive) / max(alive, 1), 1.0)
-        # The limit is reached at the last event: what is born earlier costs more steps.
+        growth_left = max((limit or alive) / max(alive, 1), 1.0)
+        # The last event reaches the limit: a Gaussian born earlier would cost time in more steps.
         events = (self.cfg.densify.stop - now.host.progress) / now.interval
-        factor = max(self.cfg.densify.growth, room ** (1 / max(events, 1.0)))
+        factor = max(self.cfg.densify.growth, growth_left ** (1 / max(events, 1.0)))
         return min(math.ceil(alive * factor), limit or alive)
 
     def _affordable(self, alive: int, now: Moment) -> int | None:
-        """Return the bound on the population that the pace of this machine allows.
+        """Return the bound on the population that the speed of this machine allows.
 
-        Where the bound was chosen for a time budget, it was chosen for an unloaded machine.
+        A bound chosen for a time budget assumes an unloaded machine, so it is checked again here.
         """
         cfg, limit, host = self.cfg, now.limit, now.host
         chosen = cfg.densify.max_gaussians is None and cfg.train.budget_s is not None
@@ -186,7 +186,7 @@ _apply = jax.jit(adaptive.apply)
 class Adaptive:
     """`densify.method` adaptive: clones, splits, pruning and opacity resets (Kerbl et al. 2023).
 
-    The paper's. Slots follow the population.
+    This is the paper's method. The number of slots grows with the population.
     """
 
     noise = None
@@ -196,11 +196,11 @@ class Adaptive:
         self.cfg = cfg.densify
 
     def start(self, seeds: int) -> Slots:
-        """Return slots for the seeds."""
+        """Return the configured bound, and a slot per seed."""
         return Slots(self.cfg.max_gaussians, seeds)
 
     def densify(self, gaussians: Gaussians, population: Population, now: Moment) -> Outcome:
-        """Prune, clone and split; reset opacities where it is time to."""
+        """Prune, clone and split; reset opacities if a reset is due."""
         d, host = self.cfg, now.host
         proposal = _propose(gaussians, population, now.extent, host.reset_at > 0, cfg=d)
         before = gaussians.capacity
@@ -221,14 +221,14 @@ class Adaptive:
 
 
 def make_strategy(cfg: FitConfig, coverage: Coverage, levels: Levels) -> Strategy | None:
-    """Return the strategy that `DensifyConfig` asks for; None: nothing is born, nothing dies."""
+    """Return the strategy of `DensifyConfig`; with None the population never changes."""
     if cfg.densify.method == "mcmc":
         return Mcmc(cfg, coverage, levels)
     return None if cfg.densify.method is None else Adaptive(cfg)
 
 
 def started(strategy: Strategy | None, seeds: int) -> Slots:
-    """Return the slots of a strategy, which may have given a number only."""
+    """Return the bound and slots of a strategy, whose `start` may return a number only."""
     found = Slots(None, seeds) if strategy is None else strategy.start(seeds)
     return found if isinstance(found, Slots) else Slots(found, found)
 
@@ -239,7 +239,7 @@ def interval(d: DensifyConfig, host: HostState) -> float:
 
 
 def is_due(d: DensifyConfig, host: HostState) -> bool:
-    """Return whether it is time for a densification."""
+    """Return whether a densification is due."""
     within = d.start <= host.progress < d.stop
     return within and host.progress - host.densified_at >= interval(d, host)
 
@@ -259,8 +259,8 @@ def densified(
 ) -> FitState:
     """Return the state after a densification; moments of new Gaussians are zero.
 
-    The state is donated, the counters of `host` change. `on_message` is told of the first Gaussians
-    that found no slot.
+    The state is donated, and the counters of `host` change. `on_message` reports the first time
+    that Gaussians find no free slot.
 
     Raises:
         UserError: no Gaussian is left.
@@ -273,8 +273,8 @@ def densified(
     if refused > 0:
         if host.refused == 0:
             on_message(
-                f"Step {host.step}: {refused} Gaussians wanted to grow but the limit is "
-                "reached; raise --densify.max-gaussians to let them. Counted from here on."
+                f"Step {host.step}: {refused} Gaussians could not grow because the limit is "
+                "reached; raise --densify.max-gaussians. Later ones are only counted."
             )
         host.refused += refused
     state = grow_state(state, outcome.gaussians.capacity)

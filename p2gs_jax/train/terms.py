@@ -1,14 +1,14 @@
 """The composed loss (paper, eq. 7) as a dictionary of terms, each a function of one rendered view.
 
-The loss is the sum of the dictionary. A term that is a function of yours is passed by name to
-`make_step` or `fit`, and is logged, checked for NaN and drawn like the built-in ones:
+The loss is the sum of the terms. A custom term is a function that you pass by name to `make_step`
+or `fit`. It is logged, checked for NaN and plotted like the built-in terms:
 
     def dark(rendered, target, aux):
         return 0.1 * jnp.mean(rendered.linear)
 
     step = make_step(cfg, terms={"dark": dark})
 
-Terms are called while a step is traced, so they are pure and see shapes, not values.
+JAX calls terms while it traces a step, so they must be pure and see shapes instead of values.
 """
 
 from __future__ import annotations
@@ -34,90 +34,90 @@ Layer = Float[Array, "h w"]
 
 # Published weights of Luminance-GS.
 ENHANCED, CURVE = 0.5, 10.0
-# Published: 1 in the first three of ten thousand steps, then 0.1; ours: 0.1 throughout.
+# Published: 1 in the first 3 of 10,000 steps, then 0.1. Ours: 0.1 in all steps.
 EQUALIZED = 0.1
 PSEUDO, PSEUDO_EQUALIZED, SMOOTH = 0.5, 0.01, 0.1
-# Mean brightness that contrast is raised to, and the side of the squares, pixels.
+# Mean brightness to which the contrast term scales photographs; side of its squares, pixels.
 CONTRAST_LEVEL, POOL = 0.5, 4
 
 
 class Rendered(NamedTuple):
-    """A training view as it was rendered."""
+    """The render of a training view."""
 
     linear: Image  # linear HDR radiance, premultiplied by alpha
     alpha: Layer  # accumulated opacity
     # alpha-weighted camera z, scene units; None where no term has `needs_depth`
     depth: Layer | None
-    # display values, over the photograph's background where it has one; not clamped
+    # display values, not clamped; over the photograph's background if it has one
     ldr: Image
-    # the same where a saturated photograph can contradict it, and elsewhere the photograph itself,
-    # from which no gradient comes (`LossConfig.censored`)
+    # `ldr`, except where a saturated photograph cannot contradict it: there the photograph itself,
+    # so that no gradient arises (`LossConfig.censored`)
     judged: Image
-    # `ldr` without the learned correction; None unless Luminance-GS learns one
+    # `ldr` without the learned correction; None unless Luminance-GS learns a correction
     uncorrected: Image | None
 
 
 class Target(NamedTuple):
     """The photograph of the view."""
 
-    ldr: Image  # display values in [0, 1], over its background where it has one
+    ldr: Image  # display values in [0, 1], over its background if it has one
     mask: Layer  # 1 = use, 0 = ignore
     alpha: Layer | None  # its opacity, or None
-    measured: Measured | None  # depths that a laser scanner measured, or None
+    measured: Measured | None  # depths measured by a laser scanner, or None
 
 
 class Aux(NamedTuple):
-    """What else a term may know."""
+    """Further inputs of a term."""
 
     view: Int[Array, ""]  # row of the view in `Photometry`
-    capture: Capture  # what its camera did to the light
+    capture: Capture  # exposure, gamma, white balance and camera of the view
     photometry: Photometry  # of all training views
     appearance: Corrections | None  # learned corrections of all training views, or None
-    correction: Correction | None  # that of this view, or None
+    correction: Correction | None  # learned correction of this view, or None
     other_view: Int[Array, ""]  # row of a second view, drawn at random
-    # photographed colours of the same points in two views, where `relative_exposure` compares them
+    # photographed colours of the same points in two views, if `relative_exposure` compares them
     pairs: ColorPairs | None
 
 
 LossTerm = Callable[[Rendered, Target, Aux], Float[Array, ""] | None]
-"""A weighted term of the loss of one view; None where it says nothing of a view like this.
+"""A weighted loss term of one view; it returns None if it does not apply to such a view.
 
-The attribute `needs_depth = True` on it makes `Rendered.depth` known.
+If the function has the attribute `needs_depth = True`, `Rendered.depth` is computed.
 """
 
 
 @dataclass(frozen=True)
 class Term:
-    """A built-in term: `weight` times `BUILT_IN[name]`, which is given what else it needs.
+    """A built-in term: `weight` times the function `BUILT_IN[name]`.
 
-    It is equal to another where its parts are, so that fits share programs.
+    Terms of equal fields are equal, so that fits share programs.
     """
 
     name: str
     weight: float = 1.0
-    given: tuple[Any, ...] = ()
+    options: tuple[Any, ...] = ()  # further arguments of the function
     needs_depth: bool = False  # see `LossTerm`
 
     def __call__(self, rendered: Rendered, target: Target, aux: Aux) -> Float[Array, ""] | None:
         """Return the weighted value."""
-        value = BUILT_IN[self.name](rendered, target, aux, *self.given)
+        value = BUILT_IN[self.name](rendered, target, aux, *self.options)
         return value if value is None or self.weight == 1.0 else self.weight * value
 
 
 def loss_terms(
     cfg: FitConfig, changed: Mapping[str, LossTerm | None] | None = None
 ) -> dict[str, LossTerm]:
-    """Return the terms that a configuration asks for, by name; a weight of None leaves a term out.
+    """Return the terms of a configuration by name; a weight of None leaves a term out.
 
-    Those in `changed` are added, or take the place of those of the same name; None takes one away.
+    Terms in `changed` are added or replace the term of the same name; None removes a term.
     """
     loss, photometry, kind = cfg.loss, cfg.photometry, cfg.photometry.appearance
     relative, priors = loss.relative_exposure.weight, loss.regularizers
-    found = [Term("l1", given=(1 - (loss.dssim_weight or 0.0),))]
+    found = [Term("l1", options=(1 - (loss.dssim_weight or 0.0),))]
     if loss.dssim_weight is not None:
         found.append(Term("dssim", loss.dssim_weight))
     if kind == "luminance":
-        found += [Term("enhanced", given=(loss,)), Term("contrast"), Term("curve", CURVE)]
+        found += [Term("enhanced", options=(loss,)), Term("contrast"), Term("curve", CURVE)]
     if loss.alpha is not None:
         found.append(Term("alpha", loss.alpha))
     if loss.lidar is not None:
@@ -139,8 +139,8 @@ def loss_terms(
 def censor(ldr: Image, target: Image, saturation: float) -> Image:
     """Replace predictions that a saturated photograph cannot contradict by the photograph.
 
-    Where the photograph is at or above `saturation` it only says "at least this bright": a
-    prediction at least that bright is right and gets no gradient.
+    A photographed value at or above `saturation` is only a lower bound of the brightness. A
+    prediction at or above `saturation` agrees with it and gets no gradient.
     """
     agrees = (target >= saturation) & (ldr >= saturation)
     return jnp.where(agrees, target, ldr)
@@ -152,7 +152,7 @@ def absolute_error(
     mask: Layer,
     weight: float = 1.0,
 ) -> Float[Array, ""]:
-    """Return the weighted mean absolute difference over valid pixels; 0 without any."""
+    """Return the weighted mean absolute difference over valid pixels; 0 without valid pixels."""
     valid = jnp.maximum(3 * jnp.sum(mask), 1.0)
     absolute = jnp.where(mask[..., None] > 0, jnp.abs(ldr - target), 0.0)
     return weight * jnp.sum(absolute * mask[..., None]) / valid
@@ -164,9 +164,9 @@ def photometric_loss(
     mask: Layer,
     cfg: LossConfig,
 ) -> dict[str, Float[Array, ""]]:
-    """Return the weighted terms `l1` and `dssim` (paper, eq. 8) of a prediction, censored if asked.
+    """Return the weighted terms `l1` and `dssim` (paper, eq. 8), censored with `cfg.censored`.
 
-    `ldr` may exceed 1; pixels with mask 0 get exactly zero gradient.
+    The prediction `ldr` may exceed 1. Pixels of mask 0 get exactly zero gradient.
     """
     if cfg.censored:
         ldr = censor(ldr, target, cfg.saturation)
@@ -186,12 +186,12 @@ def dissimilarity(ldr: Image, target: Image, mask: Layer) -> Float[Array, ""]:
 
 
 def variance(x: Float[Array, " v"]) -> Float[Array, ""]:
-    """Return the population variance in two passes: exact at large means, smooth at zero."""
+    """Return the variance (divided by v) in two passes: exact at large means, smooth at zero."""
     return jnp.mean((x - jnp.mean(x)) ** 2)
 
 
-# The paper's three (eq. 10) resolve: global scale; spread (which also shrinks true spread, see
-# docs/photometry.md, 3); tone. Ours resolve: the scale gauge alone; the power gauge.
+# The paper's three priors (eq. 10) fix the global scale, the spread of exposures (and shrink it:
+# docs/photometry.md, 3) and the tone. Ours fix the scale gauge alone and the power gauge.
 PRIORS: dict[str, Callable[[Photometry], Float[Array, ""]]] = {
     "exposure_scale": lambda p: jnp.mean((p.exposures - 1) ** 2),
     "exposure_variance": lambda p: variance(p.exposures),
@@ -203,10 +203,10 @@ PRIORS: dict[str, Callable[[Photometry], Float[Array, ""]]] = {
 
 # ------------------------------------------------------------------------- Luminance-GS
 #
-# As published: half the photometric loss between the render and the enhanced photograph, a
-# contrast term between neighbouring squares of 4x4 pixels, and ten times the prior on the curve.
-# Ours: the render meets the photograph itself through the inverse curve, through which nothing is
-# learned of it (published: a second colour per Gaussian), and D-SSIM moves the Gaussians only.
+# As published: 0.5 times the photometric loss between the render and the enhanced photograph, a
+# contrast term between neighbouring squares of 4x4 pixels, and 10 times the prior on the curve.
+# Ours: the render is compared with the photograph itself through the inverse curve, which gets no
+# gradient from this (published: a second colour per Gaussian). D-SSIM moves the Gaussians only.
 
 
 def enhanced_loss(
@@ -216,43 +216,44 @@ def enhanced_loss(
     view: Curves,
     cfg: LossConfig,
 ) -> Float[Array, ""]:
-    """Return the weighted photometric loss of enhanced display values against the photograph's."""
+    """Return the weighted photometric loss of a render against the enhanced photograph."""
     compared = photometric_loss(rendered, enhanced(photograph, view), mask, cfg)
     return ENHANCED * sum(compared.values(), jnp.zeros(()))
 
 
 def curve_prior(view: Curves, photograph: Image, mask: Layer) -> Float[Array, ""]:
-    """Return how far a curve is from histogram equalisation and its pseudo curve, and how rough.
+    """Return the curve's weighted distances from histogram equalisation and from its pseudo curve.
 
-    The histogram is the photograph's, over pixels of mask 1.
+    A third summand is its roughness. The histogram is the photograph's, over pixels of mask 1.
     """
     grey = photograph[::4, ::4].mean(-1).reshape(-1)
     equalized = lax.stop_gradient(cumulative(grey, mask[::4, ::4].reshape(-1), ENTRIES))
     pseudo = pseudo_curve(view.shape)
 
-    def apart(a, b):
+    def mean_square(a, b):
         return jnp.mean((a - b) ** 2)
 
     return (
-        EQUALIZED * apart(view.curve, equalized)
+        EQUALIZED * mean_square(view.curve, equalized)
         + SMOOTH * jnp.mean(jnp.diff(view.curve) ** 2)
-        + PSEUDO * (apart(pseudo, view.curve) + PSEUDO_EQUALIZED * apart(pseudo, equalized))
+        + PSEUDO
+        * (mean_square(pseudo, view.curve) + PSEUDO_EQUALIZED * mean_square(pseudo, equalized))
     )
 
 
 def contrast_loss(rendered: Image, photograph: Image, mask: Layer) -> Float[Array, ""]:
-    """Return how far steps between neighbouring squares are from the photograph's, brightened.
+    """Return the error of steps between neighbouring squares, against the brightened photograph.
 
-    `rendered` are enhanced display values. Squares with a masked pixel do not count.
+    `rendered` holds enhanced display values. Squares with a masked pixel do not count.
     """
     whole = _pooled(mask) > 1.0 - 1e-3
     mean = (mask[..., None] * photograph).sum() / jnp.maximum(3 * mask.sum(), 1.0)
     raised = CONTRAST_LEVEL / jnp.maximum(mean, 1e-3)
-    apart = jnp.where(whole, _pooled((raised * photograph - rendered).mean(-1)), 0.0)
+    error = jnp.where(whole, _pooled((raised * photograph - rendered).mean(-1)), 0.0)
     total = jnp.zeros(())
     for axis in (0, 1):
         both = _both(whole, axis)
-        total += 2 * jnp.sum(jnp.where(both, jnp.diff(apart, axis=axis) ** 2, 0.0))
+        total += 2 * jnp.sum(jnp.where(both, jnp.diff(error, axis=axis) ** 2, 0.0))
     return total / jnp.maximum(whole.sum(), 1)
 
 
@@ -267,12 +268,11 @@ def _pooled(image: Layer) -> Float[Array, "y x"]:
 
 
 def opacity_error(alpha: Layer, target: Layer, mask: Layer) -> Float[Array, ""]:
-    """Return the mean difference of opacities over valid pixels."""
-    apart = jnp.sum(mask * jnp.abs(alpha - target))
-    return apart / jnp.maximum(jnp.sum(mask), 1.0)
+    """Return the mean absolute difference of opacities over valid pixels."""
+    return jnp.sum(mask * jnp.abs(alpha - target)) / jnp.maximum(jnp.sum(mask), 1.0)
 
 
-# Functions of (rendered, target, aux) and what else a term is given.
+# Functions of (rendered, target, aux, *options).
 BUILT_IN: dict[str, Callable[..., Any]] = {
     "l1": lambda r, t, a, weight: absolute_error(r.judged, t.ldr, t.mask, weight),
     "dssim": lambda r, t, a: dissimilarity(r.judged, t.ldr, t.mask),

@@ -1,11 +1,11 @@
-"""The parameters' side of a step: the optimiser moves what was seen, or a fault keeps everything.
+"""The parameter update of a step: Adam moves the listed Gaussians, or a fault keeps all parameters.
 
-Gaussians are moved block by block: each block is read, differentiated, updated and written once,
-while it lies in the cache; nothing of the size of the population is ever made.
+Gaussians are moved block by block. Each block is read, differentiated, updated and written once,
+while the cache holds it; no temporary array is as large as the population.
 
-A step that finds no room or whose loss is not finite changes nothing but `state.fault`, and so do
-all steps after it, until the host has dealt with it. Where only the gradient of some Gaussians is
-not finite, the whole block that holds them keeps its place, and the fault ends the run.
+A step that overflows, or whose loss is not finite, changes nothing but `state.fault`. Later steps
+change nothing until the host clears the fault. If only the gradients of some Gaussians are not
+finite, the whole block that holds them stays unchanged, and the fault ends the run.
 """
 
 from __future__ import annotations
@@ -40,31 +40,29 @@ from p2gs_jax.types import Array, Frustum, Gaussians, Params, Photometry, Popula
 
 
 class Controls(eqx.Module):
-    """What the host says about this step."""
+    """The host's settings of one step."""
 
     progress: Float[Array, ""]  # fraction of the run completed
     active_degree: Int[Array, ""]  # spherical-harmonics degree in use
-    # factor on the rates of Gaussians but for colours, from the length of the fit
+    # factor on the learning rates of Gaussians except colours, from the length of the fit
     rate: Float[Array, ""]
-    seed: UInt32[Array, ""]  # of the fit, from `device_seed`
+    seed: UInt32[Array, ""]  # seed of the fit, from `device_seed`
 
 
 class StepReport(NamedTuple):
-    """What a step tells the host: the weighted terms of the loss and their sum, PSNR of the view in
-    dB, tile-list entries that it needed, and Gaussians that it showed.
-    """
+    """The report of a step to the host."""
 
-    loss: Float[Array, ""]
-    terms: dict[str, Float[Array, ""]]
-    psnr: Float[Array, ""]
-    entries: Int[Array, ""]
-    visible: Int[Array, ""]
+    loss: Float[Array, ""]  # sum of the terms
+    terms: dict[str, Float[Array, ""]]  # weighted loss terms by name
+    psnr: Float[Array, ""]  # of the view, dB
+    entries: Int[Array, ""]  # tile-list entries needed
+    visible: Int[Array, ""]  # Gaussians that the view may show
 
 
 class Updated(NamedTuple):
-    """Gaussians and their moments after a step, with the listed ones moved.
+    """Gaussians and their moments after a step.
 
-    `finite` says of the gradient of each array, in the order of `Gaussians`, whether it was finite.
+    `finite` flags, in the order of the fields of `Gaussians`, the arrays with a finite gradient.
     """
 
     gaussians: Gaussians
@@ -78,15 +76,15 @@ OF_VIBRATION = tuple(f.name for f in dataclasses.fields(Vibration))
 
 def finite_names(terms: dict, params: Params) -> tuple[str, ...]:
     """Return the names of loss terms and gradients, in the order of `Fault.term`."""
-    given = {
+    optional = {
         "gradient of white balances": params.photometry.raw_white_balance,
         "gradient of appearance": params.appearance,
     }
-    rest = (name for name, value in given.items() if value is not None)
+    rest = (name for name, value in optional.items() if value is not None)
     vibration = () if params.gaussians.vibration is None else OF_VIBRATION
     always = (*OF_GAUSSIANS, *vibration, "exposures", "gammas")
-    of = (f"gradient of {name}" for name in always)
-    return (*(f"loss term {k}" for k in terms), *of, *rest)
+    gradients = (f"gradient of {name}" for name in always)
+    return (*(f"loss term {k}" for k in terms), *gradients, *rest)
 
 
 def advance(
@@ -105,10 +103,10 @@ def advance(
 ) -> tuple[FitState, StepReport]:
     """Move the listed Gaussians, photometry and corrections by one step; the state is donated.
 
-    `ids` are those of the listed Gaussians and `count` is how many the view may show, both from
-    `show`. `extent` is the scene's, scene units; `degree` the highest spherical-harmonics degree
-    that moves; `noise` the scale of the exploration noise on the means: None adds none, and sums
-    statistics for densification instead.
+    `ids` lists the Gaussians and `count` is the number that the view may show, both from `show`.
+    `extent` is the scene extent in scene units; `degree` is the highest spherical-harmonics degree
+    that moves. `noise` is the scale of the exploration noise on the means. If it is None, the step
+    adds statistics for densification instead.
     """
     gaussians, population = state.params.gaussians, state.population
     n, bands = gaussians.capacity, coefficient_count(degree)
@@ -145,8 +143,8 @@ def advance(
     if noise is None:
         where = jnp.where(healthy, ids, n)
         population = _observed(population, where, gradient, frustum)
-    moved, told = (updated, population), (fits, healthy, most(count))
-    return concluded(state, moved, gradient, told, rates, cfg=cfg, optimizer=optimizer)
+    moved, checks = (updated, population), (fits, healthy, most(count))
+    return finished(state, moved, gradient, checks, rates, cfg=cfg, optimizer=optimizer)
 
 
 def update_listed(
@@ -168,12 +166,12 @@ def update_listed(
     """Move the listed Gaussians by one step; nothing is written unless the step is `healthy`.
 
     Args:
-        ids: from `compact`, whole blocks, of which `count` are listed.
-        bands: spherical-harmonics coefficients that are looked at and moved.
-        seen: (Gaussians, alive, owner) of a block -> what the image is made of, per Gaussian.
-        v_seen: gradient of the loss to that, for the whole list.
-        noise: (number of a block, ids, Gaussians, alive) -> what to add to their means, or None.
-        owner: the moving object that each Gaussian belongs to, or None.
+        ids: from `compact`, in whole blocks; the first `count` are listed.
+        bands: number of spherical-harmonics coefficients that are read and moved.
+        seen: (Gaussians, alive, owner) of a block -> the differentiable inputs of the image.
+        v_seen: gradient of the loss by these inputs, for the whole list.
+        noise: (number of the block, ids, Gaussians, alive) -> noise on their means; or None.
+        owner: moving object of each Gaussian, or None.
     """
     n, size = gaussians.capacity, block_size(ids.shape[0])
 
@@ -209,29 +207,29 @@ def update_listed(
 
 
 def is_healthy(state: FitState, gradient: ImageGradient, fits: Array) -> Bool[Array, ""]:
-    """Return whether a step may write: no fault before it, room, and a finite loss."""
+    """Return whether a step may write: no earlier fault, no overflow, and a finite loss."""
     unbroken = jnp.all(_finite((gradient.terms, gradient.v_rest)))
     return (state.fault.kind == FAULT_NONE) & fits & unbroken
 
 
-def concluded(
+def finished(
     state: FitState,
     moved: tuple[Updated, Population],
     gradient: ImageGradient,
-    told: tuple[Bool[Array, ""], Bool[Array, ""], Int[Array, ""]],
+    checks: tuple[Bool[Array, ""], Bool[Array, ""], Int[Array, ""]],
     rates: Params,
     *,
     cfg: FitConfig,
     optimizer: optimizers.Optimizer,
     views: int = 1,
 ) -> tuple[FitState, StepReport]:
-    """Move the rest, and return the state after a step with what became of it.
+    """Move photometry and corrections; return the state after the step, and its report.
 
-    `moved` are the Gaussians after it, and the population with its statistics. `told` are whether
-    everything found room, whether the step is healthy, and how many Gaussians a view may show.
-    `views` is how many the step took.
+    `moved` holds the Gaussians after the step and the population with its statistics. `checks`
+    holds whether the lists were long enough, whether the step is healthy, and how many Gaussians a
+    view may show. `views` is the number of views of the step.
     """
-    (updated, population), (fits, healthy, count) = moved, told
+    (updated, population), (fits, healthy, count) = moved, checks
     first = state.fault.kind == FAULT_NONE
     old_rest = (state.params.photometry, state.params.appearance)
     (photometry, appearance), rest_moments = optimizer.rest.update(
@@ -268,7 +266,7 @@ def concluded(
 
 
 def _recentered(photometry: Photometry, cfg: FitConfig) -> Photometry:
-    """Project the scale gauges: mean log e = 0 and mean log W = 0 (docs/photometry.md, 2, 4)."""
+    """Fix the scale gauges: mean log e = 0 and mean log W = 0 (docs/photometry.md, 2, 4)."""
     balance = photometry.raw_white_balance
     if balance is not None:
         balance = balance - jnp.mean(balance, 0)
@@ -282,9 +280,9 @@ def _recentered(photometry: Photometry, cfg: FitConfig) -> Photometry:
 
 
 def _observed(population: Population, ids, image: ImageGradient, frustum: Frustum) -> Population:
-    """Add this view to the densification statistics of what it shows.
+    """Add this view to the densification statistics of the Gaussians that it shows.
 
-    Gradients are in units of half the image, as 3DGS has them.
+    Gradients are in units of half the image, as in 3DGS.
     """
     v_means2d = image.v_shown[0]
     gradient = v_means2d * jnp.stack([frustum.width / 2, frustum.height / 2])
@@ -301,6 +299,6 @@ def _observed(population: Population, ids, image: ImageGradient, frustum: Frustu
 
 
 def _finite(values) -> Bool[Array, " k"]:
-    """Return whether each array of a tree is finite; a formation may have none."""
+    """Return whether each array of a tree is finite; a formation may have no arrays."""
     found = [jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(values)]
     return jnp.stack(found) if found else jnp.ones(1, bool)

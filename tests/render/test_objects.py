@@ -15,7 +15,7 @@ from p2gs_jax.render import required_capacity
 from p2gs_jax.render import visible as visibility
 from p2gs_jax.render.project import HIDDEN, camera_of_each
 from p2gs_jax.render.visible import BLOCK, compact, splat
-from p2gs_jax.train.room import count_view
+from p2gs_jax.train.capacities import count_view
 from p2gs_jax.types import Camera, Placement
 
 WIDTH, HEIGHT = 48, 40

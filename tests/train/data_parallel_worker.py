@@ -15,7 +15,7 @@ from noise_views import COUNT, DEGREE, EXTENT, VIEWS, config, start, view
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.presets import with_values
 from p2gs_jax.render import xla_cpu
-from p2gs_jax.render.capacity import Room
+from p2gs_jax.render.capacity import Capacity
 from p2gs_jax.render.cores import CORES
 from p2gs_jax.train.data_parallel import ParallelStep, default_mesh
 from p2gs_jax.train.divided import DividedStep
@@ -25,7 +25,7 @@ from p2gs_jax.train.state import healed, initial_state
 from p2gs_jax.train.step import PROGRAMS, Step
 from p2gs_jax.train.update import Controls
 
-ROOM = Room(16_384, 4096)
+CAPACITY = Capacity(16_384, 4096)
 CONTROLS = on_host(Controls, np.float32(0.3), np.int32(DEGREE), np.float32(0.7), np.uint32(0))
 
 
@@ -45,7 +45,7 @@ def of_one_view() -> dict:
     losses, moments = [], []
     for row in range(VIEWS):
         state = initial_state(start(), alive(), optimizer)
-        state, report = step(state, *view(row), CONTROLS, room=ROOM, degree=DEGREE)
+        state, report = step(state, *view(row), CONTROLS, capacity=CAPACITY, degree=DEGREE)
         assert int(state.fault.kind) == 0
         losses.append(float(report.loss))
         moments.append(jax.tree.map(np.asarray, first_moments(state)))
@@ -54,18 +54,18 @@ def of_one_view() -> dict:
 
 
 def on_devices(count: int) -> dict:
-    """A step without room, then two with it: losses, fault, moments and parameters."""
+    """A step that overflows, then two that fit: losses, fault, moments and parameters."""
     cfg = config(batch=VIEWS)
     optimizer, mesh = make_optimizer(cfg), default_mesh(count)
     step = ParallelStep(cfg, optimizer, EXTENT, cfg.densify.noise, mesh=mesh)
     state = step.spread(initial_state(start(), alive(), optimizer))
     inputs = (*map(stacked, zip(*map(view, range(VIEWS)), strict=True)), CONTROLS)
 
-    lowered = [step.lowered(n, state, *inputs, room=ROOM, degree=DEGREE) for n in PROGRAMS]
+    lowered = [step.lowered(n, state, *inputs, capacity=CAPACITY, degree=DEGREE) for n in PROGRAMS]
     show, differentiate, advance = (part.compile() for part in lowered)
     losses, first, found = [], None, {}
     if count == VIEWS:
-        state, found = without_room(step, state, inputs, show, advance)
+        state, found = overflowing(step, state, inputs, show, advance)
     run = step.chained(show, differentiate, advance)
     for _ in range(2):
         state, report = run(state, *inputs)
@@ -76,10 +76,10 @@ def on_devices(count: int) -> dict:
     return found | {"losses": losses, "moments": first, "params": params, "step": int(state.step)}
 
 
-def without_room(step: Step, state, inputs, show, advance):
-    """The state after a step that finds no room, its fault mended, and what became of the step."""
+def overflowing(step: Step, state, inputs, show, advance):
+    """The state after a step that overflows, with the fault cleared; and what the step changed."""
     before = jax.tree.map(np.asarray, state.params)
-    narrow = step.program("differentiate", Room(64, ROOM.visible), DEGREE)
+    narrow = step.program("differentiate", Capacity(64, CAPACITY.visible), DEGREE)
     state, _ = step.chained(show, narrow, advance)(state, *inputs)
     fault = {k: int(getattr(state.fault, k)) for k in ("kind", "needed")}
     moved = distance(before, state.params)
@@ -89,7 +89,7 @@ def without_room(step: Step, state, inputs, show, advance):
 def over_cores(count: int) -> dict:
     """Two steps of one view divided over cores, and how far what comes of them is from one core's.
 
-    Before them is one that finds no room, of which nothing may come.
+    Before them comes a step that overflows, which must change nothing.
     """
     cfg = with_values(config(method=None), {"loss.dssim_weight": 0.2})
     optimizer, mesh = make_optimizer(cfg), Mesh(np.array(jax.devices()[:count]), (CORES,))
@@ -97,8 +97,8 @@ def over_cores(count: int) -> dict:
     ends, reports, found = [], [], {}
     for step in steps:
         state = step.spread(initial_state(start(), alive(), optimizer))
-        show, differentiate, advance = (step.program(name, ROOM, DEGREE) for name in PROGRAMS)
-        state, found = without_room(step, state, (*view(0), CONTROLS), show, advance)
+        show, differentiate, advance = (step.program(name, CAPACITY, DEGREE) for name in PROGRAMS)
+        state, found = overflowing(step, state, (*view(0), CONTROLS), show, advance)
         for row in (0, 1):
             state, report = step.chained(show, differentiate, advance)(state, *view(row), CONTROLS)
         end = jax.tree.map(lambda a: a[:COUNT] * 1.0 if a.ndim else a, step.whole(state))

@@ -53,7 +53,7 @@ class Programs:
 
     def __init__(self, clock, compile_s=5.0, step_s=lambda width: 0.1):
         self.clock, self.compile_s, self.step_s = clock, compile_s, step_s
-        self.rooms, self.waited_s = {}, 0.0
+        self.capacities, self.waited_s = {}, 0.0
         self.made, self.taken = [], []
         self.overflows_at, self.breaks_at = None, None
 
@@ -74,7 +74,7 @@ class Programs:
                 return state, REPORT
             self.clock.now += self.step_s(key.size[0])
             at, kind = int(state.step), 0
-            if at == self.overflows_at and key.room.entries < 10**6:
+            if at == self.overflows_at and key.capacity.entries < 10**6:
                 kind = FAULT_OVERFLOW
             if at == self.breaks_at:
                 kind = FAULT_NONFINITE

@@ -110,5 +110,5 @@ def test_pairs_of_tracks_are_two_views_of_a_point_and_have_places_where_they_cou
     assert np.all(points[pairs[0]] == points[pairs[1]])
     assert np.all(views[pairs[0]] != views[pairs[1]])
     unplaced = dataclasses.replace(observations, positions=None)
-    with pytest.raises(ValueError, match="no places in the images"):
+    with pytest.raises(ValueError, match="positions in the images are not known"):
         color_pairs(unplaced, dataclasses.replace(cfg, photometry=SHADED))

@@ -15,7 +15,7 @@ from noise_views import DEGREE, EXTENT, HEIGHT, WIDTH, config, start, view
 
 from p2gs_jax.presets import with_values
 from p2gs_jax.render import rasterize_pallas, tiles
-from p2gs_jax.render.capacity import Room
+from p2gs_jax.render.capacity import Capacity
 from p2gs_jax.render.visible import BLOCK, in_view, splat
 from p2gs_jax.train import step as steps
 from p2gs_jax.train.exposure_loss import Partner
@@ -41,7 +41,7 @@ def photograph() -> Batch:
 
 @pytest.fixture(scope="module")
 def made():
-    """Return steps from one start, with and without room, and the gradient they should follow."""
+    """Return steps from one start that fit and overflow, and the gradient they should follow."""
     # More are in view than fit into a block, and some are behind the camera.
     params, batch = jax.tree.map(jnp.asarray, (start(COUNT, 0.45, HIDDEN), photograph()))
     optimizer = make_optimizer(CFG)
@@ -49,9 +49,9 @@ def made():
     alive = jnp.arange(COUNT) % 10 != 0
     run, partner = Step(CFG, optimizer, EXTENT), Partner(jnp.int32(0))
 
-    def step(room, params=params):
+    def step(capacity, params=params):
         state = initial_state(params, alive, optimizer)
-        return run(state, batch, partner, CONTROLS, room=room, degree=DEGREE)
+        return run(state, batch, partner, CONTROLS, capacity=capacity, degree=DEGREE)
 
     def objective(params, probe):
         splats, radiance = splat(params.gaussians, alive, batch.camera, CFG.render, DEGREE)
@@ -61,13 +61,14 @@ def made():
 
     slope = jax.jit(jax.value_and_grad(objective, argnums=(0, 1)))
     loss, (gradient, probe) = jax.device_get(slope(params, jnp.zeros((COUNT, 2))))
-    tight = Room(64, BLOCK)
+    tight = Capacity(64, BLOCK)
     refused = step(tight)
     fault = refused[0].fault
-    room = tight.grown(int(fault.needed), int(fault.visible))
+    capacity = tight.grown(int(fault.needed), int(fault.visible))
     seen = np.asarray(in_view(params.gaussians, alive, batch.camera, CFG.render))
     expected = {"gradient": gradient, "probe": probe, "loss": float(loss), "seen": seen}
-    given = {"tight": tight, "refused": refused, "room": room, "step": step, "after": step(room)}
+    after = step(capacity)
+    given = {"tight": tight, "refused": refused, "capacity": capacity, "step": step, "after": after}
     return SimpleNamespace(params=params, alive=np.asarray(alive), **expected, **given)
 
 
@@ -119,7 +120,7 @@ def test_a_step_agrees_with_one_in_float64_where_nothing_becomes_narrow(made):
     given = widened((photograph(), Partner(np.int32(0)), CONTROLS))
     with jax.enable_x64(True):
         step = Step(CFG, optimizer, EXTENT)
-        wide = step(jax.tree.map(jnp.asarray, start), *given, room=made.room, degree=DEGREE)
+        wide = step(jax.tree.map(jnp.asarray, start), *given, capacity=made.capacity, degree=DEGREE)
     (state, report), (exact, exact_report) = made.after, jax.device_get(wide)
     assert int(exact.fault.kind) == FAULT_NONE
     for path, leaf in jax.tree_util.tree_leaves_with_path(wide):
@@ -150,8 +151,8 @@ def test_out_of_view_nothing_is_touched(made):
 
 def test_where_every_gaussian_moves_all_are_listed(made):
     cfg = with_values(CFG, {"optimizer.visible_only": False})
-    step, room, state = Step(cfg, make_optimizer(cfg), EXTENT), made.room, made.after[0]
-    listed = step.program("show", room, DEGREE)(
+    step, capacity, state = Step(cfg, make_optimizer(cfg), EXTENT), made.capacity, made.after[0]
+    listed = step.program("show", capacity, DEGREE)(
         *per_gaussian(state, step.frustum(photograph()), CONTROLS)
     )
     assert int(listed.visible) == COUNT
@@ -167,7 +168,7 @@ def test_the_statistic_is_the_screen_space_gradient(made):
     np.testing.assert_array_equal(state.population.seen_count, norm > 0)
 
 
-def test_a_view_without_room_changes_nothing_but_the_fault(made):
+def test_a_view_that_overflows_changes_nothing_but_the_fault(made):
     state, report = made.refused
     fresh = initial_state(made.params, jnp.asarray(made.alive), make_optimizer(CFG))
     chex.assert_trees_all_equal(dataclasses.replace(state, fault=fresh.fault), fresh)
@@ -176,8 +177,8 @@ def test_a_view_without_room_changes_nothing_but_the_fault(made):
     assert int(state.fault.needed) > made.tight.entries
     assert int(report.visible) == made.seen.sum()
     grown = made.after[1]
-    assert int(grown.entries) <= made.room.entries
-    assert int(grown.visible) <= made.room.visible
+    assert int(grown.entries) <= made.capacity.entries
+    assert int(grown.visible) <= made.capacity.visible
 
 
 @pytest.mark.parametrize(
@@ -194,7 +195,7 @@ def test_the_first_that_is_not_finite_is_named(made, field, named):
     before, row = getattr(made.params, part), 0 if field in PHOTOMETRY else np.argmax(made.seen)
     broken = dataclasses.replace(before, **{field: getattr(before, field).at[row].set(jnp.nan)})
     params = dataclasses.replace(made.params, **{part: broken})
-    state, report = made.step(made.room, params)
+    state, report = made.step(made.capacity, params)
     assert int(state.fault.kind) == FAULT_NONFINITE
     assert int(state.step) == 0
     names = finite_names(report.terms, state.params)
@@ -230,8 +231,8 @@ def test_a_step_on_a_gpu_never_waits_for_the_host(monkeypatch, name):
     monkeypatch.setattr(steps, "compiled", ForCuda)
     params, optimizer = start(), make_optimizer(CFG)
     state = initial_state(params, np.ones(params.gaussians.capacity, bool), optimizer)
-    step, room = Step(CFG, optimizer, EXTENT, noise=1.0), Room(4096, BLOCK)
-    lowered = step.lowered(name, state, *view(0), CONTROLS, room=room, degree=DEGREE)
+    step, capacity = Step(CFG, optimizer, EXTENT, noise=1.0), Capacity(4096, BLOCK)
+    lowered = step.lowered(name, state, *view(0), CONTROLS, capacity=capacity, degree=DEGREE)
     text = lowered.as_text()
     assert "stablehlo" in text
     for waits in ("stablehlo.case", "stablehlo.if", "callback"):

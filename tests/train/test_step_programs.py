@@ -10,12 +10,12 @@ import pytest
 from p2gs_jax.config import FitConfig
 from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.presets import preset
-from p2gs_jax.render.capacity import Room
+from p2gs_jax.render.capacity import Capacity
 from p2gs_jax.train.optimizer import make_optimizer
 from p2gs_jax.train.step import PROGRAMS, Key, Step, StepPrograms
 
-COARSE = Key((120, 80), 500, Room(4096, 4096), 3, "uint16")
-FULL = COARSE._replace(size=(240, 160), room=Room(8192, 4096), pixels="uint8")
+COARSE = Key((120, 80), 500, Capacity(4096, 4096), 3, "uint16")
+FULL = COARSE._replace(size=(240, 160), capacity=Capacity(8192, 4096), pixels="uint8")
 SHAPES = tuple(np.zeros(k) for k in range(1, 5))
 
 
@@ -42,7 +42,7 @@ class Traced:
         self.settings, self.made, self.gate = real.settings, [], threading.Event()
         self.gate.set()
 
-    def lowered(self, name, *arguments, room, degree):
+    def lowered(self, name, *arguments, capacity, degree):
         def compile():
             self.gate.wait(10)
             self.made.append(name)

@@ -76,7 +76,7 @@ def test_fits_share_the_relocation_and_count_what_found_no_slot(monkeypatch):
         assert alive_in(grown.population) == SEEDS
         assert host.refused == SEEDS
         assert len(said) == 1
-        assert "Step 7: 50 Gaussians wanted to grow" in said[0]
+        assert "Step 7: 50 Gaussians could not grow" in said[0]
 
 
 def test_a_population_that_dies_is_said():

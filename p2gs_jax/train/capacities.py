@@ -1,6 +1,6 @@
-"""How much room the views of a run need, estimated on the host from above.
+"""Upper estimates, made on the host, of the capacities that the views of a run need.
 
-It is done in numpy: counting exactly would be one more program to compile for every image size.
+NumPy makes them, because an exact count would be one more program to compile per image size.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from jaxtyping import Bool, Int
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.gaussians.posed import rotations
-from p2gs_jax.render.capacity import Room
+from p2gs_jax.render.capacity import Capacity
 from p2gs_jax.render.project import LOG_SCALE_RANGE, TANGENT_LIMIT, at_time, camera_of_each
 from p2gs_jax.render.visible import in_view
 from p2gs_jax.train.inputs import TrainingViews
 from p2gs_jax.types import Array, Camera, Gaussians
 
-# Views of one size that are counted, evenly spread.
+# Number of views counted per image size, evenly spaced.
 SAMPLED_VIEWS = 32
 
 
@@ -31,10 +31,10 @@ def count_view(
     cfg: RenderConfig,
     owner: Int[np.ndarray, " n"] | None = None,
 ) -> tuple[int, int]:
-    """Return (tile-list entries, visible Gaussians) that a view needs at most, up to rounding.
+    """Return upper bounds, up to rounding, of a view's (tile-list entries, visible Gaussians).
 
-    Entries are the tiles of all bounding boxes, visible is the count of `in_view`. Everything is on
-    the host; `owner` is the moving object that each Gaussian belongs to.
+    Entries are the tiles of all bounding boxes; visible Gaussians are those that `in_view` accepts.
+    All arrays are on the host; `owner` is the moving object of each Gaussian.
     """
     gaussians = at_time(gaussians, camera.objects)
     camera = camera_of_each(camera, owner)  # pyright: ignore[reportArgumentType]
@@ -65,27 +65,27 @@ def count_view(
     return int(tiles[boxed].sum()), int(seen.sum())
 
 
-def room_for(
+def capacity_for(
     gaussians: Gaussians,
     alive: Bool[np.ndarray, " n"],
     cameras: Sequence[Camera],
     limit: int,
     cfg: RenderConfig,
     owner: Int[np.ndarray, " n"] | None = None,
-) -> Room:
-    """Return room for all views of one image size, to the end of a run.
+) -> Capacity:
+    """Return the capacity that suffices all views of one image size until the run ends.
 
-    Some of the cameras are counted. `limit` is the largest population to come; the share of it that
-    a view shows is taken to stay.
+    It counts SAMPLED_VIEWS of the cameras. `limit` is the largest later population; the estimate
+    assumes that a view's share of the Gaussians stays constant.
     """
     picks = evenly_spaced(len(cameras), SAMPLED_VIEWS)
     counts = [count_view(gaussians, alive, cameras[i], cfg, owner) for i in picks]
     entries, visible = (max(c[k] for c in counts) for k in (0, 1))
     growth = max(max(limit, 1) / max(int(alive.sum()), 1), 1.0)
-    return Room.allocate(entries, visible, growth, limit)
+    return Capacity.allocate(entries, visible, growth, limit)
 
 
-Rooms = dict[str, Room]  # room of a view for every image size, by its name
+Capacities = dict[str, Capacity]  # capacity of a view by the name of its image size
 
 
 def size_name(size: tuple[int, int]) -> str:
@@ -94,7 +94,7 @@ def size_name(size: tuple[int, int]) -> str:
 
 
 def cameras_by_size(views: TrainingViews, shrink: int) -> dict[tuple[int, int], list[Camera]]:
-    """Return the cameras of a level by the size of their images."""
+    """Return the cameras of the level with this shrink factor, by image width and height."""
     cameras: dict[tuple[int, int], list[Camera]] = {}
     for index in range(len(views)):
         camera = views.camera(index, shrink)
@@ -103,8 +103,8 @@ def cameras_by_size(views: TrainingViews, shrink: int) -> dict[tuple[int, int], 
 
 
 def allocate(
-    rooms: Mapping[str, Room],
-    begun: Mapping[str, Room],
+    capacities: Mapping[str, Capacity],
+    begun: Mapping[str, Capacity],
     views: TrainingViews,
     shrinks: Iterable[int],
     gaussians: Gaussians,
@@ -112,32 +112,35 @@ def allocate(
     limit: int,
     cfg: RenderConfig,
     owner: Int[Array, " n"] | None = None,
-) -> Rooms:
-    """Return rooms for every image size to come.
+) -> Capacities:
+    """Return capacities for all image sizes of the levels `shrinks`.
 
-    Those in `rooms` stay. Those in `begun`, for which programs are compiled already, are taken
-    where they suffice. `limit` is the largest population to come; for the rest see `count_view`.
+    The sizes in `capacities` keep theirs. A capacity in `begun`, for which programs are compiled
+    already, is used if it suffices. `limit` is the largest later population; for `owner` see
+    `count_view`.
     """
-    found = dict(rooms)
+    found = dict(capacities)
     gaussians, host_alive = jax.tree.map(np.asarray, (gaussians, alive))
     host_owner = None if owner is None else np.asarray(owner)
     for shrink in shrinks:
         for size, cameras in cameras_by_size(views, shrink).items():
             name = size_name(size)
             if name not in found:
-                room = room_for(gaussians, host_alive, cameras, limit, cfg, host_owner)
-                made = begun.get(name, room)
-                found[name] = made if made.holds(room) else room
+                capacity = capacity_for(gaussians, host_alive, cameras, limit, cfg, host_owner)
+                compiled = begun.get(name, capacity)
+                found[name] = compiled if compiled.holds(capacity) else capacity
     return _sharing_visible(found)
 
 
-def grown(rooms: Mapping[str, Room], size: tuple[int, int], entries: int, visible: int) -> Rooms:
-    """Return rooms after a view of this size found none for its entries or visible Gaussians."""
+def grown(
+    capacities: Mapping[str, Capacity], size: tuple[int, int], entries: int, visible: int
+) -> Capacities:
+    """Return capacities after an overflow in a view of this size, which needed these counts."""
     name = size_name(size)
-    return _sharing_visible({**rooms, name: rooms[name].grown(entries, visible)})
+    return _sharing_visible({**capacities, name: capacities[name].grown(entries, visible)})
 
 
-def _sharing_visible(rooms: Rooms) -> Rooms:
-    """Give all sizes the same room for Gaussians: what is done per Gaussian is shared."""
-    most = max((room.visible for room in rooms.values()), default=0)
-    return {name: room._replace(visible=most) for name, room in rooms.items()}
+def _sharing_visible(capacities: Capacities) -> Capacities:
+    """Return capacities with one common `visible`: all sizes share the programs per Gaussian."""
+    most = max((capacity.visible for capacity in capacities.values()), default=0)
+    return {name: capacity._replace(visible=most) for name, capacity in capacities.items()}
