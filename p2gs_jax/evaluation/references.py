@@ -68,7 +68,7 @@ def find_radiance(scene: Scene, store: ImageStore) -> Truth | None:
         path = (folder / scene.views[row].name).with_suffix(".exr")
         if not path.is_file():
             return None
-        linear, _ = read_exr(path)
+        linear, *_ = read_exr(path)
         camera = camera_of(store, row)
         if linear.shape[:2] == (camera.height, camera.width):
             return linear

@@ -15,7 +15,7 @@ from jaxtyping import Float32
 
 from p2gs_jax.core.text import first_few
 from p2gs_jax.errors import UserError
-from p2gs_jax.formats.exr import read_exr_with_alpha
+from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.types import Scene
 
 # Display values come first: a program that writes both developed them itself.
@@ -61,7 +61,7 @@ class OtherRenders:
         path = self.files[row]
         linear, alpha = path.suffix.lower() == ".exr", None
         if linear:
-            pixels, alpha, _ = read_exr_with_alpha(path)
+            pixels, alpha, _ = read_exr(path)
         else:
             pixels = read_display(path)
         height, width = pixels.shape[:2]

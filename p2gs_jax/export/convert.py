@@ -24,11 +24,10 @@ from p2gs_jax.formats import gsply_files as gsply
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.gltf import write_gltf
 from p2gs_jax.formats.ply import write_ply, write_radiance
-from p2gs_jax.formats.usd import NamedCamera, require_pxr, write_usd
+from p2gs_jax.formats.usd import require_pxr, write_usd
 from p2gs_jax.gaussians import bake as baking
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.render.capacity import make_renderer
-from p2gs_jax.render.harmonics import MAX_DEGREE
 from p2gs_jax.render.project import at_time
 from p2gs_jax.run.photometry_files import write_appearance
 from p2gs_jax.run.read import Run
@@ -193,7 +192,7 @@ class DisplayFiles:
             self.targets[index] = baking.true_target(name, g, camera, transform, render)
             reporter.stage("Rendering true pictures", done + 1, len(rows))
         reporter.stage("Baking")
-        start = baking.bake(g, transform, cfg.render.radiance, MAX_DEGREE)
+        start = baking.bake(g, transform, cfg.render.radiance)
         aims = [self.targets[i] for i in scene.train_indices if i in self.targets]
         order = {"steps": self.steps, "seed": cfg.train.seed}
         on_step = functools.partial(reporter.stage, "Baking")
@@ -208,8 +207,8 @@ class DisplayFiles:
             notes = [f"p2gs-jax: {sentence}" for sentence in _sentences(error)]
             more = ([*baking.display_comments(self.transform), *notes],)
         elif name == "usd":
-            views, camera = self.fitted.scene.views, self.fitted.store.camera
-            more = ([NamedCamera(v.name, *camera(index)) for index, v in enumerate(views)],)
+            views, store = self.fitted.scene.views, self.fitted.store
+            more = ({view.name: camera_of(store, index) for index, view in enumerate(views)},)
         write(path, self.baked, *more)
         if read is not None:
             error = self._error(read(path))

@@ -110,13 +110,7 @@ def _display_attributes(taken: DisplayTransform) -> dict:
     return out
 
 
-def read_exr(path: Path) -> tuple[Float32[np.ndarray, "h w 3"], dict]:
-    """Return linear radiance and the header; a UserError says that there is no readable R, G, B."""
-    linear, _, header = read_exr_with_alpha(path)
-    return linear, header
-
-
-def read_exr_with_alpha(
+def read_exr(
     path: Path,
 ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"] | None, dict]:
     """Return linear radiance, premultiplied by the opacity; that, or None; and the header.

@@ -7,13 +7,11 @@ along their -z with y up, as USD's do; their lengths are in tenths of a scene un
 from __future__ import annotations
 
 import importlib
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 from scipy.special import expit
 
 from p2gs_jax.core.atomic import atomic_write
@@ -21,24 +19,13 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.formats.ply import unit_quats
 from p2gs_jax.gaussians.posed import FLIP, half_turn
 from p2gs_jax.render.harmonics import degree_of
-from p2gs_jax.types import Gaussians
+from p2gs_jax.types import Camera, Gaussians
 
 # Width of a 35 mm film, to which focal lengths are usually related.
 APERTURE_MM = 36.0
 TENTHS_PER_MM = 0.01
 MODULES = ("Gf", "Usd", "UsdGeom", "UsdVol", "Vt")
 SPLATS, CAMERAS = "/scene/splats", "/scene/cameras"
-
-
-@dataclass(frozen=True)
-class NamedCamera:
-    """The pinhole camera of a photograph: world-to-camera with OpenCV axes; the rest in pixels."""
-
-    name: str
-    viewmat: Float[np.ndarray, "4 4"]
-    K: Float[np.ndarray, "3 3"]
-    width: int
-    height: int
 
 
 def require_pxr() -> tuple[Any, ...]:
@@ -57,8 +44,11 @@ def require_pxr() -> tuple[Any, ...]:
     return tuple(found)
 
 
-def write_usd(path: Path, gaussians: Gaussians, cameras: Sequence[NamedCamera] = ()) -> int:
-    """Write Gaussians with display colours and COLMAP's axes, and cameras; return how many."""
+def write_usd(path: Path, gaussians: Gaussians, cameras: Mapping[str, Camera]) -> int:
+    """Write Gaussians with display colours, and cameras by the names of their photographs.
+
+    Both have COLMAP's axes. Returns how many Gaussians there are.
+    """
     _, Usd, UsdGeom, UsdVol, Vt = require_pxr()
     g = half_turn(gaussians)
 
@@ -88,8 +78,8 @@ def write_usd(path: Path, gaussians: Gaussians, cameras: Sequence[NamedCamera] =
         }
         for name, value in values.items():
             field.GetPrim().GetAttribute(name).Set(value)
-        for index, camera in enumerate(cameras):
-            _define_camera(stage, f"{CAMERAS}/view_{index:04d}", camera)
+        for index, (name, camera) in enumerate(cameras.items()):
+            _define_camera(stage, f"{CAMERAS}/view_{index:04d}", name, camera)
         stage.GetRootLayer().Save()
     return gaussians.capacity
 
@@ -102,12 +92,12 @@ def _extent(means: np.ndarray, scales: np.ndarray) -> np.ndarray:
     return np.stack([(means - reach).min(0), (means + reach).max(0)]).astype(np.float32)
 
 
-def _define_camera(stage: Any, path: str, camera: NamedCamera) -> None:
+def _define_camera(stage: Any, path: str, name: str, camera: Camera) -> None:
     Gf, _, UsdGeom, *_ = require_pxr()
     turn = np.diag([*FLIP, 1.0])
     # Both worlds and both cameras differ by the same half turn.
     pose = turn @ np.linalg.inv(np.asarray(camera.viewmat, np.float64)) @ turn
-    K, width, height = camera.K, camera.width, camera.height
+    K, width, height = np.asarray(camera.K), camera.width, camera.height
     aperture = APERTURE_MM * TENTHS_PER_MM
     across = aperture / width
     along = across * K[0, 0] / K[1, 1]
@@ -119,4 +109,4 @@ def _define_camera(stage: Any, path: str, camera: NamedCamera) -> None:
     prim.CreateVerticalApertureAttr(float(height * along))
     prim.CreateHorizontalApertureOffsetAttr(float((width / 2 - K[0, 2]) * across))
     prim.CreateVerticalApertureOffsetAttr(float((K[1, 2] - height / 2) * along))
-    prim.GetPrim().SetMetadata("comment", camera.name)
+    prim.GetPrim().SetMetadata("comment", name)

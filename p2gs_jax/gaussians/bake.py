@@ -30,7 +30,7 @@ from p2gs_jax.render.capacity import (
     make_renderer,
     until_it_fits,
 )
-from p2gs_jax.render.harmonics import C0, RadianceKind, coefficient_count, degree_of
+from p2gs_jax.render.harmonics import C0, RadianceKind, degree_of
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians, Render
 
@@ -75,13 +75,10 @@ def display_comments(transform: DisplayTransform) -> list[str]:
     return said
 
 
-def bake(
-    gaussians: Gaussians, transform: DisplayTransform, activation: RadianceKind, degree: int
-) -> Gaussians:
-    """Return linear Gaussians with display colours of a degree, computed for each by itself."""
+def bake(gaussians: Gaussians, transform: DisplayTransform, activation: RadianceKind) -> Gaussians:
+    """Return linear Gaussians with display colours, computed for each by itself."""
     sh = np.asarray(gaussians.sh)
-    degree = min(degree, degree_of(sh.shape[1]))
-    shown = display_sh(sh, lambda linear: develop(linear, transform), activation, degree)
+    shown = display_sh(sh, lambda linear: develop(linear, transform), activation)
     return replace(gaussians, sh=on_device(shown))
 
 
@@ -89,18 +86,15 @@ def display_sh(
     sh: Float[np.ndarray, "n k 3"],
     tone: Callable[[np.ndarray], np.ndarray],
     activation: RadianceKind,
-    degree: int | None = None,
-) -> Float[np.ndarray, "n k2 3"]:
+) -> Float[np.ndarray, "n k 3"]:
     """Return coefficients whose value + 1/2 is the display colour, least squares over directions.
 
-    Exact for degree 0. `tone` takes radiance to display values, clamped to [0, 1] here; `degree`
-    is that of the result, None keeps the radiance's.
+    Exact for degree 0. `tone` takes radiance to display values, clamped to [0, 1] here.
     """
     directions = fibonacci_sphere(DIRECTIONS)
     table = harmonics.table(directions, degree_of(sh.shape[1]))
-    kept = table if degree is None else table[:, : coefficient_count(degree)]
-    inverse = np.linalg.pinv(kept)
-    out = np.empty((len(sh), kept.shape[1], 3), np.float32)
+    inverse = np.linalg.pinv(table)
+    out = np.empty(sh.shape, np.float32)
     for start in range(0, len(sh), CHUNK):
         part = sh[start : start + CHUNK]
         values = np.zeros((CHUNK, DIRECTIONS, 3), np.float32)

@@ -37,13 +37,6 @@ def share(
     return new, opacity / denominator
 
 
-def transparent(
-    gaussians: Gaussians, population: Population, cfg: DensifyConfig
-) -> Bool[Array, " n"]:
-    """Return which live Gaussians are transparent enough to be relocated."""
-    return population.alive & (opacities(gaussians) <= cfg.prune_opacity)
-
-
 def relocate_and_grow(
     key: PRNGKeyArray,
     gaussians: Gaussians,
@@ -61,7 +54,7 @@ def relocate_and_grow(
     without a free slot are counted in `refused`.
     """
     n = population.alive.shape[0]
-    dead = transparent(gaussians, population, cfg)
+    dead = population.alive & (opacities(gaussians) <= cfg.prune_opacity)
     healthy = population.alive & ~dead
     # Births go to the first `births` empty slots.
     order = jnp.cumsum(~population.alive) - 1

@@ -68,7 +68,7 @@ def solve_exposures(
         if kept is not None:
             selection = dataclasses.replace(selection, reasons=kept.reasons)
         notes += [*selection.reasons, *selection.solution.warnings]
-    decisions = decide(cfg, selection, kept=kept)
+    decisions = decide(cfg, selection, kept)
     resolved = decisions.resolve(cfg)
     solution = None if selection is None else selection.solution
     taken_by = [view.camera for view in scene.training_views]

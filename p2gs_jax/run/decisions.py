@@ -135,9 +135,7 @@ def read_decisions(path: Path) -> Decisions | None:
         return Decisions.from_dict(parse_json(path.read_text(encoding="utf-8")))
 
 
-def decide(
-    cfg: config.FitConfig, selection: Selection | None, *, kept: Decisions | None = None
-) -> Decisions:
+def decide(cfg: config.FitConfig, selection: Selection | None, kept: Decisions | None) -> Decisions:
     """Return what the photographs decided.
 
     Where the checkpoints of a run that is resumed are `kept`, what its cameras do stays to the
@@ -163,9 +161,7 @@ def decide(
     )
 
 
-def likely(
-    cfg: config.FitConfig, kept: Decisions | None, near: float | None = None
-) -> Decisions | None:
+def likely(cfg: config.FitConfig, kept: Decisions | None, near: float | None) -> Decisions | None:
     """Return what most scenes decide, to compile for it beforehand; None: who knows.
 
     `near` is the near plane, where that is decided.

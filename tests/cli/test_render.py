@@ -48,8 +48,8 @@ def test_a_file_of_cameras_renders_what_the_views_rendered(rendered, own_run, tm
     np.testing.assert_allclose(picture(tmp_path / "b" / "0.png"), first, atol=1 / 255)
     second = picture(tmp_path / "a" / "1.render.png")
     assert picture(tmp_path / "b" / "far" / "brighter.png").mean() > second.mean() + 0.05
-    _, dark = read_exr(tmp_path / "b" / "0.exr")
-    _, bright = read_exr(tmp_path / "b" / "far" / "brighter.exr")
+    *_, dark = read_exr(tmp_path / "b" / "0.exr")
+    *_, bright = read_exr(tmp_path / "b" / "far" / "brighter.exr")
     ratio = bright["p2gsExposure"] / dark["p2gsExposure"]
     assert ratio == pytest.approx(2, rel=1e-5)
 
@@ -100,7 +100,7 @@ def test_a_drive_can_be_metered(rendered, own_run, tmp_path):
         for n in ("of", "more")
     )
     np.testing.assert_allclose(np.subtract(brighter, metered), 1.0, atol=1e-5)
-    linear, _ = read_exr(tmp_path / "of" / "00002.exr")
+    linear, *_ = read_exr(tmp_path / "of" / "00002.exr")
     light = linear @ [0.2126, 0.7152, 0.0722]
     exposed = load_run(own_run).common_display(metered[2]).exposure * light
     assert np.exp(np.log(exposed[exposed > 0]).mean()) == pytest.approx(0.18, rel=0.3)

@@ -21,9 +21,9 @@ from p2gs_jax.formats import gsply_files, ply
 from p2gs_jax.formats.gltf import EXTENSION, write_gltf
 from p2gs_jax.formats.packed import morton_order, pack, unpack
 from p2gs_jax.formats.ply import field_names, read_ply, write_ply, write_radiance
-from p2gs_jax.formats.usd import CAMERAS, SPLATS, NamedCamera, write_usd
+from p2gs_jax.formats.usd import CAMERAS, SPLATS, write_usd
 from p2gs_jax.render.harmonics import evaluate
-from p2gs_jax.types import Gaussians, Vibration
+from p2gs_jax.types import Camera, Gaussians, Vibration
 
 FLIP = np.array([1.0, -1.0, -1.0])
 
@@ -97,8 +97,7 @@ def test_usd_is_read_by_pxr(tmp_path):
     pose[:3, :3] = Rotation.from_euler("yxz", [20, -10, 5], degrees=True).as_matrix()
     pose[:3, 3] = 0.3, -0.2, 0.5
     K = np.array([[300.0, 0, 170.0], [0, 330.0, 118.0], [0, 0, 1]])
-    camera = NamedCamera("left/1.jpg", pose, K, 320, 240)
-    write_usd(tmp_path / "a.usdc", g, [camera])
+    write_usd(tmp_path / "a.usdc", g, {"left/1.jpg": Camera(pose, K, 320, 240)})
 
     stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
     assert UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y

@@ -35,18 +35,6 @@ def test_colours_are_exact_for_degree_0_and_close_for_3():
     assert np.abs(np.einsum("k,nkc->nc", table, shown) + 0.5 - expected).max() < 0.03
 
 
-def test_a_lower_degree_keeps_the_mean_over_directions():
-    sh = np.asarray(random_splats(degree=2).sh) * 0.2
-    low = display_sh(sh, tone, "exp", degree=0)
-    assert low.shape == (50, 1, 3)
-    z, azimuth = np.meshgrid(np.linspace(-0.995, 0.995, 200), np.linspace(0, 6.2832, 100)[:-1])
-    r = np.sqrt(1 - z**2)
-    axes = [jnp.asarray(a.ravel()) for a in (r * np.cos(azimuth), r * np.sin(azimuth), z)]
-    table = np.stack(basis(tuple(axes), 2), 1)
-    mean = tone(np.exp(np.einsum("dk,nkc->ndc", table, sh))).mean(1)
-    np.testing.assert_allclose(C0 * low[:, 0] + 0.5, mean, atol=5e-3)
-
-
 def test_a_correction_by_place_in_the_image_is_left_out():
     grid = DisplayTransform(
         1.0, 2.2, PhotometryConfig(appearance="bilateral"), jnp.ones((12, 8, 16, 16))
@@ -57,7 +45,7 @@ def test_a_correction_by_place_in_the_image_is_left_out():
     )
     assert matrix.without_place() is matrix
     g = random_splats(degree=0)
-    shown = bake(g, matrix, "exp", 3).sh
+    shown = bake(g, matrix, "exp").sh
     plain = develop(np.exp(C0 * np.asarray(g.sh[:, 0])), replace(matrix, correction=None))
     np.testing.assert_allclose(
         C0 * shown[:, 0] + 0.5,
@@ -84,7 +72,7 @@ def test_the_true_picture_is_light_composited_then_developed(targets):
 def test_refining_brings_viewers_closer_to_unseen_views_as_well(targets):
     """Also over white; what no view shows stays as it is."""
     seen, unseen = [targets[i] for i in (0, 2, 4)], [targets[i] for i in (1, 3)]
-    plain = bake(haze(), SRGB, "exp", 1)
+    plain = bake(haze(), SRGB, "exp")
     plain = replace(plain, means=plain.means.at[0, 2].set(-3.0))
     refined = refine(plain, seen, CFG, steps=60)
     assert baking_error(plain, [], CFG) is None
@@ -113,7 +101,7 @@ def test_what_is_dark_by_transparency_becomes_opaque():
     wall = replace(wall, opacity_logits=logits, sh=wall.sh - 60.0)
     target = true_target("wall", wall, camera(), SRGB, make_renderer(CFG))
     assert target.picture.max() == 0
-    plain = bake(wall, SRGB, "exp", 1)
+    plain = bake(wall, SRGB, "exp")
     assert refine(plain, [target], CFG, steps=0) is plain
     assert refine(plain, [], CFG, steps=9) is plain
     refined = refine(plain, [target], CFG, steps=40)
@@ -125,7 +113,7 @@ def test_what_is_dark_by_transparency_becomes_opaque():
 
 
 def test_the_error_of_a_known_difference():
-    nothing = replace(bake(haze(), SRGB, "exp", 1), opacity_logits=jnp.full(120, -100.0))
+    nothing = replace(bake(haze(), SRGB, "exp"), opacity_logits=jnp.full(120, -100.0))
     picture = np.full((32, 40, 3), 51, np.uint8)
     error = baking_error(nothing, [Target("grey", camera(), picture)], CFG)["per_view"]["grey"]
     assert error["psnr"] == pytest.approx(20 * np.log10(5))

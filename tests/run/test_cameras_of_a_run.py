@@ -94,7 +94,7 @@ def test_render_shows_them_and_leaves_them_out_where_asked(
         out = tmp_path / folder
         succeeded("render", camera_run, "--split", "train", "--out", out, *options)
         stem = first.removesuffix(".png")
-        linear, header = read_exr(out / f"{stem}.exr")
+        linear, _, header = read_exr(out / f"{stem}.exr")
         return cv2.imread(str(out / f"{stem}.render.png"))[..., ::-1] / 255.0, linear, header
 
     own = run.own_display(rows[0])
@@ -130,7 +130,7 @@ def test_exports_carry_them(camera_run, tmp_path, succeeded):
     factors = np.array(view["white_balance"])
     np.testing.assert_allclose(factors, np.exp(run.own_display(rows[1]).white_balance), rtol=1e-6)
     # The formula of linear.json, followed to the letter, gives the picture.
-    linear, header = read_exr((tmp_path / "exr" / view["image"]).with_suffix(".exr"))
+    linear, _, header = read_exr((tmp_path / "exr" / view["image"]).with_suffix(".exr"))
     height, width = linear.shape[:2]
     y, x = np.mgrid[:height, :width] + 0.5
     r2 = ((x - width / 2) ** 2 + (y - height / 2) ** 2) / ((width**2 + height**2) / 4)

@@ -52,9 +52,9 @@ def test_without_a_solution_only_views_learn():
     asked = {"photometry.select": False, "photometry.start": "random"}
     asked |= {"photometry.white_balance": "view", "photometry.vignetting": "camera"}
     cfg = with_fields(FitConfig(), asked)
-    decided = decide(cfg, None)
+    decided = decide(cfg, None, None)
     assert (decided.white_balance, decided.vignetting) == ("view", None)
-    assert likely(cfg, None) == decided
+    assert likely(cfg, None, None) == decided
     by_camera = with_fields(cfg, {"photometry.white_balance": "camera"})
     assert unsolved(Decisions.as_asked(by_camera)).white_balance is None
 
