@@ -76,7 +76,7 @@ def test_a_seam_is_measured_as_it_was_made(two_views, stops, farther):
     store = ImageStore(two_views.views, DataConfig())
     first = wall(0.3)
     second = wall(0.3 + stops * np.log(2), depth=4.0 * (1 + farther))
-    (seam,) = measure_seams(two_views, store, halves(), [first, second], CFG)
+    (seam,) = measure_seams(two_views, store, halves(), [first, second], CFG, slice(None))
     assert seam.blocks == (0, 1)
     assert seam.views == 2
     assert seam.pixels > 100

@@ -9,8 +9,9 @@ blocks beside it, less and less inwards, as seams of textures are levelled (Lemp
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import jax
 import numpy as np
@@ -20,11 +21,11 @@ from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import evenly_spaced, on_device
 from p2gs_jax.errors import UserError
 from p2gs_jax.jobs.blocks.cut import OVERLAP, Cut
-from p2gs_jax.render.capacity import RenderView, make_renderer
+from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.render.harmonics import scaled
 from p2gs_jax.render.warp import unproject
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
-from p2gs_jax.types import Gaussians, Scene
+from p2gs_jax.types import Camera, Gaussians, Render, Scene
 
 # Views of a boundary that are rendered at most. With 12 a step was .018 stop, with 48 .005.
 MOST_VIEWS = 48
@@ -60,60 +61,41 @@ def measure_seams(
     cut: Cut,
     fitted: Sequence[Gaussians],
     cfg: RenderConfig,
-    *,
-    which: slice = slice(None),
+    which: slice,
 ) -> list[Seam]:
     """Compare neighbouring blocks, by all Gaussians of each, in training views of both.
 
     Of the photographs only the cameras are used; `which` selects among the views that two blocks
     share, in the order of the scene.
     """
-    return [
-        _seam(scene, store, cut, (a, b), (fitted[a], fitted[b]), cfg, which)
-        for a, b in cut.neighbours()
-    ]
+    seams = []
+    for pair in cut.neighbours():
+        first, second = (cut.blocks[k] for k in pair)
+        both = sorted(set(first.views) & set(second.views))[which]
+        renderers = [_rendering(fitted[k], cfg) for k in pair]
+        rows = (scene.train_indices[both[k]] for k in evenly_spaced(len(both), MOST_VIEWS))
+        found = [_compared(camera_of(store, index), cut, pair, renderers) for index in rows]
+        found = [parts for parts in found if len(parts[0]) >= FEWEST_PIXELS]
+        if not found:
+            seams.append(Seam(pair, 0, 0))
+            continue
+        ratio, depth = map(np.concatenate, zip(*found, strict=True))
+        medians = (float(np.median(x)) for x in (ratio, np.abs(ratio), depth, np.abs(depth)))
+        seams.append(Seam(pair, len(found), len(ratio), *medians))
+    return seams
 
 
-def _seam(
-    scene: Scene,
-    store: ImageStore,
-    cut: Cut,
-    pair: tuple[int, int],
-    fitted: tuple[Gaussians, Gaussians],
-    cfg: RenderConfig,
-    which: slice,
-) -> Seam:
-    first, second = (cut.blocks[k] for k in pair)
-    both = sorted(set(first.views) & set(second.views))[which]
-    renderers = make_renderer(cfg), make_renderer(cfg)
-    stops, depths, views = [], [], 0
-    for row in (both[k] for k in evenly_spaced(len(both), MOST_VIEWS)):
-        index = scene.train_indices[row]
-        found = _compared(store, index, cut, pair, fitted, renderers)
-        if len(found[0]) >= FEWEST_PIXELS:
-            views += 1
-            stops.append(found[0])
-            depths.append(found[1])
-    if not views:
-        return Seam(pair, 0, 0)
-    ratio, depth = np.concatenate(stops), np.concatenate(depths)
-    medians = (float(np.median(x)) for x in (ratio, np.abs(ratio), depth, np.abs(depth)))
-    return Seam(pair, views, len(ratio), *medians)
+def _rendering(gaussians: Gaussians, cfg: RenderConfig) -> Callable[[Camera], Render]:
+    return partial(make_renderer(cfg), gaussians, jax.numpy.ones(gaussians.capacity, bool))
 
 
 def _compared(
-    store: ImageStore,
-    index: int,
-    cut: Cut,
-    pair: tuple[int, int],
-    fitted: tuple[Gaussians, Gaussians],
-    renderers: tuple[RenderView, RenderView],
+    camera: Camera, cut: Cut, pair: tuple[int, int], renderers: list[Callable[[Camera], Render]]
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
     """Return log2 ratios of radiance and relative ones of depth where a view shows the strip."""
-    camera = camera_of(store, index)
     shown = []
-    for gaussians, render in zip(fitted, renderers, strict=True):
-        drawn = render(gaussians, jax.numpy.ones(gaussians.capacity, bool), camera)
+    for render in renderers:
+        drawn = render(camera)
         linear, alpha = np.asarray(drawn.linear), np.asarray(drawn.alpha)
         assert drawn.depth is not None
         opaque = np.maximum(alpha, 1e-6)
@@ -140,14 +122,14 @@ def level_seams(
     Every second view of a boundary tells the step, the others judge: what is left is measured where
     nothing was fitted to. Arguments are those of `measure_seams`.
     """
-    told = measure_seams(scene, store, cut, fitted, cfg, which=slice(0, None, 2))
+    told = measure_seams(scene, store, cut, fitted, cfg, slice(0, None, 2))
     steps = {s.blocks: s.step_stops for s in told if s.step_stops is not None}
     levelled = []
     for number, gaussians in enumerate(fitted):
         shift = shifts(cut, number, np.asarray(gaussians.means), steps) * np.log(2)
         sh = scaled(np.asarray(gaussians.sh), shift[:, None], cfg.radiance)
         levelled.append(replace(gaussians, sh=on_device(sh)))
-    left = measure_seams(scene, store, cut, levelled, cfg, which=slice(1, None, 2))
+    left = measure_seams(scene, store, cut, levelled, cfg, slice(1, None, 2))
     return levelled, [replace(s, levelled_stops=steps.get(s.blocks)) for s in left]
 
 
