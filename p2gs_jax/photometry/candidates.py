@@ -225,18 +225,15 @@ class Search:
             for k, p in self._predicted.items()
         }
         best = self._predicted[max(density, key=lambda k: density[k])]
-        return [self._candidate(k, density[k], p, best) for k, p in self._predicted.items()]
+        return [self._candidate(choice, d, best) for choice, d in density.items()]
 
     def _parameters(self, choice: Choice) -> int:
         """Return the number of free parameters of a choice."""
-        o = self._problem.observations
-        cameras = int(o.cameras.max(initial=0)) + 1
-        levels, power = (cameras, o.view_count), self._scope.power
-        return parameter_count(choice.form, choice.curve.splines, *levels, power)
+        levels = (self._scope.cameras, self._problem.observations.view_count)
+        return parameter_count(choice.form, choice.curve.splines, *levels, self._scope.power)
 
-    def _candidate(
-        self, choice: Choice, density: float, found: Predicted, best: Predicted
-    ) -> Candidate:
+    def _candidate(self, choice: Choice, density: float, best: Predicted) -> Candidate:
+        found = self._predicted[choice]
         # Neighbours in an image err alike, as do its pixels.
         lower, labels = best.densities - found.densities, (self._views, self._regions)
         deficits, errors = zip(*(_mean_deficit(lower, of) for of in labels), strict=True)

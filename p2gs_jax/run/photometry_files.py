@@ -88,14 +88,9 @@ def with_curve_of(cfg: PhotometryConfig, saved: PhotometryFile) -> PhotometryCon
     """
     curve = saved["curve"]
     try:
-        spline = curve["spline"]
-        return dataclasses.replace(
-            cfg,
-            select=False,
-            model=saved["model"],
-            curve=curve["name"],
-            spline=None if spline is None else tuple(map(float, spline)),
-        )
+        spline = None if curve["spline"] is None else tuple(map(float, curve["spline"]))
+        found = {"model": saved["model"], "curve": curve["name"], "spline": spline}
+        return dataclasses.replace(cfg, select=False, **found)
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"photometry.json names no tone curve ({error}).", fix=AGAIN) from error
 
@@ -160,11 +155,7 @@ def _row(view: View, split: str, exposure, ev, gamma, balance=None) -> ViewPhoto
 
 
 def _fitted_row(
-    params: Params,
-    view: View,
-    k: int | None,
-    solution: PhotometricSolution | None,
-    unknown: bool,
+    params: Params, view: View, k: int | None, solution: PhotometricSolution | None, unknown: bool
 ) -> ViewPhotometry:
     """Return the row of a view of a fit; held-out ones have no exposure of their own, `k` None."""
     row = _row(view, view.split, None, None, None)

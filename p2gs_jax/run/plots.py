@@ -6,6 +6,7 @@ import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import cycle
 from pathlib import Path
 from typing import Any, cast
 
@@ -117,14 +118,9 @@ def _lines(exposures_ev, cameras: Sequence[str], stated: Mapping[str, Any]) -> l
     """
     centered = np.asarray(exposures_ev, float) - np.nanmean(exposures_ev)
     order, owner, out = dict.fromkeys(cameras), np.array(list(cameras)), []
-    for k, camera in enumerate(order):
+    for camera, marker, color in zip(order, cycle(MARKERS), cycle(COLORS), strict=False):
         rows = np.flatnonzero(owner == camera)
-        style = {
-            "marker": MARKERS[k % len(MARKERS)],
-            "color": COLORS[k % len(COLORS)],
-            "markersize": 4.5,
-            "linewidth": 1,
-        }
+        style = {"marker": marker, "color": color, "markersize": 4.5, "linewidth": 1}
         out.append((rows, centered[rows], style, f"recovered, camera {printable(camera)}"))
     for label, given in stated.items():
         values = np.array(given, float)

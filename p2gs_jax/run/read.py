@@ -24,15 +24,9 @@ from p2gs_jax.photometry.formation import camera_rows
 from p2gs_jax.photometry.metering import ExposureOf, Metering, meter
 from p2gs_jax.presets import from_dict
 from p2gs_jax.render.capacity import RenderView, make_renderer
+from p2gs_jax.run import photometry_files
 from p2gs_jax.run.decisions import read_decisions
 from p2gs_jax.run.folder import RunFolder, find
-from p2gs_jax.run.photometry_files import (
-    AGAIN,
-    PhotometryFile,
-    read_appearance,
-    read_metering,
-    read_photometry,
-)
 from p2gs_jax.run.scene_file import read_objects, read_scene
 from p2gs_jax.scene.drives.objects import MovingObjects, middle_time
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
@@ -56,7 +50,7 @@ class Run:
     reference: Path | None  # photographs under one common exposure, or None
     # `photometry.json`, with what `params` does not hold: standard errors, EXIF, exposures fitted
     # to held-out photographs
-    photometry: PhotometryFile
+    photometry: photometry_files.PhotometryFile
     # the moving object that each Gaussian belongs to, -1: none; None: nothing moves
     owner: Int[np.ndarray, " n"] | None = None
     moving: MovingObjects | None = None  # these objects
@@ -212,7 +206,7 @@ class Run:
     @cached_property
     def metering(self) -> Metering:
         """The rule that explains the training exposures."""
-        return read_metering(RunFolder(self.folder).metering)
+        return photometry_files.read_metering(RunFolder(self.folder).metering)
 
     def metered_display(
         self, rendered: Render, of: ExposureOf = "auto", exposure_ev: float = 0.0
@@ -253,10 +247,14 @@ def load_run(folder: str | Path, scene: str | Path | None = None) -> Run:
     cfg = decisions.resolve(asked)
     gaussians = read_ply(files.radiance)
     owner, moving = read_objects(files.objects, found, gaussians.capacity)
-    photometry_file = read_photometry(files.photometry)
+    photometry_file = photometry_files.read_photometry(files.photometry)
     photometry = _photometry(photometry_file, found, cfg, files)
     kind, views = cfg.photometry.appearance, found.training_views
-    appearance = None if kind is None else read_appearance(files.appearance(kind), kind, views)
+    appearance = (
+        None
+        if kind is None
+        else photometry_files.read_appearance(files.appearance(kind), kind, views)
+    )
     return Run(
         files.root,
         Params(gaussians, photometry, appearance),
@@ -280,7 +278,7 @@ def _require_finished(files: RunFolder) -> None:
 
 
 def _photometry(
-    saved: PhotometryFile, scene: Scene, cfg: FitConfig, files: RunFolder
+    saved: photometry_files.PhotometryFile, scene: Scene, cfg: FitConfig, files: RunFolder
 ) -> Photometry:
     """Return exposures, gammas and white balances of the training views."""
     by_name = {v["image"]: v for v in saved["views"] if v["exposure"] is not None}
@@ -296,7 +294,9 @@ def _photometry(
     if p.white_balance is not None:
         factors = [v.get("white_balance") for v in train]
         if None in factors:
-            raise UserError(f"{files.photometry} lacks the white balance of a view.", fix=AGAIN)
+            raise UserError(
+                f"{files.photometry} lacks the white balance of a view.", fix=photometry_files.AGAIN
+            )
         balances = on_device(np.log(np.array(factors, float)))
     rows = camera_rows([view.camera for view in scene.training_views], p)
     return Photometry(on_device(exposures), on_device(gammas), p.parameterization, balances, rows)

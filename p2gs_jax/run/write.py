@@ -21,7 +21,6 @@ from p2gs_jax.photometry.display import usual_display
 from p2gs_jax.photometry.metering import Metering
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.presets import to_dict as config_to_dict
-from p2gs_jax.render.harmonics import MAX_DEGREE
 from p2gs_jax.render.project import at_time
 from p2gs_jax.run.decisions import Decisions, write_decisions
 from p2gs_jax.run.folder import RunFolder, remembered
@@ -99,7 +98,13 @@ def write_run(
     write_scene(folder.root, scene)
     if moving is not None and (owner is not None or moving.middle is not None):
         write_objects(folder.objects, owner, moving, scene)
-    _write_models(folder, params, owner, moving, scene, cfg)
+    transform = usual_display(params, (), None, cfg.photometry).without_place()
+    placed = params.gaussians
+    if owner is not None and moving is not None:
+        placed = posed(placed, owner, *moving.poses(middle_time(scene)))
+    shown_at_rest = bake(at_time(placed, None), transform, cfg.render.radiance)
+    write_ply(folder.splats, shown_at_rest, display_comments(transform))
+    write_radiance(folder.radiance, params.gaussians, activation=cfg.render.radiance)
     write_fitted(
         folder.photometry,
         params,
@@ -130,22 +135,3 @@ def summary_rows(scene: Scene) -> list[int]:
     if len(pool) < SUMMARY_VIEWS:
         pool += [i for i in scene.train_indices if i not in pool]
     return [pool[i] for i in evenly_spaced(len(pool), SUMMARY_VIEWS)]
-
-
-def _write_models(
-    folder: RunFolder,
-    params: Params,
-    owner: np.ndarray | None,
-    moving: MovingObjects | None,
-    scene: Scene,
-    cfg: FitConfig,
-) -> None:
-    """Write `splats.ply` (display colours) and `radiance.ply` (linear)."""
-    transform = usual_display(params, (), None, cfg.photometry).without_place()
-    placed = params.gaussians
-    if owner is not None and moving is not None:
-        placed = posed(placed, owner, *moving.poses(middle_time(scene)))
-    placed = at_time(placed, None)
-    shown = bake(placed, transform, cfg.render.radiance, MAX_DEGREE)
-    write_ply(folder.splats, shown, display_comments(transform))
-    write_radiance(folder.radiance, params.gaussians, activation=cfg.render.radiance)

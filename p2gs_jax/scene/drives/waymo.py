@@ -349,18 +349,15 @@ class _Source(NamedTuple):
         six = pixels[at].astype(np.float64)
         # Pixels that nothing was measured in have no pose.
         known = six.any(1)
-        world[known] = _rotated(local[known], *six[known][:, :3].T) + six[known][:, 3:]
+        world[known] = _rotated(local[known], six[known, :3]) + six[known, 3:]
         return world, (at[1] + 0.5) / distances.shape[1]
 
 
 def _rotated(
-    points: Float[np.ndarray, "n 3"],
-    roll: Float[np.ndarray, " n"],
-    pitch: Float[np.ndarray, " n"],
-    yaw: Float[np.ndarray, " n"],
+    points: Float[np.ndarray, "n 3"], angles: Float[np.ndarray, "n 3"]
 ) -> Float64[np.ndarray, "n 3"]:
     """Turn each point about x, then y, then z by its own angles; scipy takes ten times longer."""
-    x, y, z = points.T
+    (x, y, z), (roll, pitch, yaw) = points.T, angles.T
     y, z = np.cos(roll) * y - np.sin(roll) * z, np.sin(roll) * y + np.cos(roll) * z
     z, x = np.cos(pitch) * z - np.sin(pitch) * x, np.sin(pitch) * z + np.cos(pitch) * x
     x, y = np.cos(yaw) * x - np.sin(yaw) * y, np.sin(yaw) * x + np.cos(yaw) * y
