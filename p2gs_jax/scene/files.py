@@ -31,7 +31,8 @@ from p2gs_jax.errors import UserError, broken
 from p2gs_jax.scene.convert.readers import CONVERTED_SUFFIXES, size_of
 from p2gs_jax.scene.lens import scale_intrinsics
 
-IMAGE_SUFFIXES = CONVERTED_SUFFIXES | {*(".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm")}
+IMAGE_SUFFIXES = CONVERTED_SUFFIXES | {".jpg", ".jpeg", ".jfif", ".jp2", ".png", ".tif", ".tiff"}
+IMAGE_SUFFIXES |= {".bmp", ".pgm", ".ppm"}
 # Folders of masks, and what tells a mask from its photograph: `a_mask`, `a.mask`, `mask_a`, ...
 MASK_FOLDERS = ("masks", "mask", "dynamic_masks", "dynamic_mask")
 # Folders of pictures that are no photographs.

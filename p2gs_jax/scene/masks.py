@@ -23,7 +23,7 @@ NAMED = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 # Where training draws a colour for every step, photographs are judged over what 3DGS shows.
 JUDGED = "white"
 # These never have an alpha channel.
-_OPAQUE = frozenset({".jpg", ".jpeg", ".ppm"})
+_OPAQUE = frozenset({".jpg", ".jpeg", ".jfif", ".pgm", ".ppm"})
 
 
 def attach_masks(scene: Scene) -> tuple[tuple[View, ...], list[str]]:

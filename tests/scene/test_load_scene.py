@@ -241,6 +241,19 @@ def test_what_is_too_large_is_refused_by_its_header(tmp_path):
 ALL = DataConfig(test_every=0)
 
 
+@pytest.mark.parametrize(
+    ("suffix", "kind"), [(".jfif", ".jpg"), (".jp2", ".jp2"), (".pgm", ".pgm")]
+)
+def test_seldom_formats_are_read_as_any_other(tmp_path, suffix, kind):
+    gray = np.tile(np.linspace(20, 230, 64, dtype=np.uint8), (48, 1))
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(cv2.imencode(kind, gray)[1].tobytes())
+    assert list_images(tmp_path) == [path]
+    pixels, mask = ImageStore((make_view(path),), CFG).get(0)
+    np.testing.assert_allclose(pixels, np.repeat(gray[..., None] / 255.0, 3, -1), atol=4 / 255)
+    assert mask.all()
+
+
 def test_numbers_in_names_count(tmp_path):
     names = [f"frame_{k}.jpg" for k in range(1, 101)]
     assert sorted(sorted(names), key=natural) == names
