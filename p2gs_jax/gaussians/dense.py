@@ -9,7 +9,6 @@ shows a seed already gives none.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -21,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.core.streams import Stream, generator
+from p2gs_jax.core.threads import map_in_order
 from p2gs_jax.gaussians.flow import DepthMap, Flows, depth_map, pixel_centers
 from p2gs_jax.gaussians.matching import MatchImages, Tones, neighbours, visibility
 from p2gs_jax.gaussians.population import Coverage, default_max_gaussians
@@ -37,7 +37,6 @@ MOST_VIEWS = 40
 NEIGHBOURS = 5
 # Longest side of the photographs that are matched, pixels.
 MATCH_SIDE = 640
-WORKERS = 2
 # Stride of the candidates over pixels, along each axis.
 FINEST_CELL = 3
 # Standard deviation of a seed over the spacing of seeds, along the surface and across it.
@@ -134,11 +133,13 @@ def dense_seeds(
     wanted = [int(r) for r in evenly_spaced(len(rows), most_views) if len(near[r]) >= 2]
     flows = Flows(images, scene.points, seen)
     found: list[Candidates] = []
-    with ThreadPoolExecutor(WORKERS, thread_name_prefix="dense") as pool:
-        made = pool.map(lambda r: _candidates(r, near[r], flows, color, cfg.train.seed), wanted)
-        for done, candidates in enumerate(made):
-            found.append(candidates)
-            on_view(done + 1, len(wanted))
+
+    def made(row: int) -> Candidates:
+        return _candidates(row, near[row], flows, color, cfg.train.seed)
+
+    for done, candidates in enumerate(map_in_order(made, wanted)):
+        found.append(candidates)
+        on_view(done + 1, len(wanted))
     if not sum(len(c.xy) for c in found):
         return nothing
     return choose_seeds(found, images, np.asarray(existing, np.float64), limit, cfg.train.seed)

@@ -5,6 +5,7 @@ NumPy makes them, because an exact count would be one more program to compile pe
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 
 import jax
@@ -39,7 +40,9 @@ def count_view(
     gaussians = at_time(gaussians, camera.objects)
     camera = camera_of_each(camera, owner)  # pyright: ignore[reportArgumentType]
     seen = in_view(gaussians, alive, camera, cfg)  # pyright: ignore[reportArgumentType]
-    shown = jax.tree.map(lambda a: a[seen], gaussians)
+    # Harmonics are most of a Gaussian and count for nothing here.
+    bare = dataclasses.replace(gaussians, sh=gaussians.sh[:, :0])
+    shown = jax.tree.map(lambda a: a[seen], bare)
     viewmat = np.asarray(camera.viewmat)
     R, t = viewmat[:3, :3], viewmat[:3, 3]
     if owner is None:

@@ -32,6 +32,7 @@ from p2gs_jax.render.capacity import MOST_CANVASES
 from p2gs_jax.render.cores import CORES
 from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import Decisions
+from p2gs_jax.scene.pixels.store import DECODERS
 from p2gs_jax.train import capacities, schedule, strategies
 from p2gs_jax.train.data_parallel import VIEWS, ParallelStep
 from p2gs_jax.train.divided import DividedStep
@@ -270,8 +271,9 @@ class Trainer:
                 break
             if schedule.shrink_at(progress, self.levels) != host.shrink:
                 break
-            for row in self.views.indices_at(step + views, views):
-                self.views.prefetch(row, host.shrink)
+            for later in range(1, DECODERS + 1):
+                for row in self.views.indices_at(step + later * views, views):
+                    self.views.prefetch(row, host.shrink)
             inputs = self._inputs(step, progress, host.pace, host.shrink)
             key = self._key(state, inputs, host, host.shrink)
             state, report = self.programs.get(self.step, key, state, *inputs)(state, *inputs)

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float32, UInt
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.numerics import on_device
+from p2gs_jax.core.threads import available_cores
 from p2gs_jax.scene.drives.objects import MARGIN, MovingObjects, outlines, painted
 from p2gs_jax.scene.lens import scale_intrinsics
 from p2gs_jax.scene.masks import RANDOM, background_color
@@ -29,7 +30,9 @@ from p2gs_jax.types import Camera, Placement, TrackedObject, View
 _LEVELS = 4 / 3
 # A background shows through what is less opaque.
 OPAQUE = 0.999
-_MAX_PREFETCHED = 4
+# Threads that decode ahead of a fit's steps, and so many steps ahead of the present one.
+DECODERS = max(available_cores() - 1, 1)
+MOST_PENDING = 4 * DECODERS
 # Of stores that were not closed.
 _OPEN: weakref.WeakSet[_DecodedPhotographs] = weakref.WeakSet()
 
@@ -250,7 +253,7 @@ class _DecodedPhotographs:
         self._pending: dict[Key, Future[Decoded]] = {}
         self._lock = threading.Lock()
         self._ahead: DecodingAhead | None = None
-        self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="decode")
+        self._worker = ThreadPoolExecutor(DECODERS, thread_name_prefix="decode")
         _OPEN.add(self)
 
     @property
@@ -269,7 +272,11 @@ class _DecodedPhotographs:
 
     def prefetch(self, key: Key) -> None:
         with self._lock:
-            if key in self._cache or key in self._pending or len(self._pending) >= _MAX_PREFETCHED:
+            if (
+                key in self._cache
+                or key in self._pending
+                or len(self._pending) >= MOST_PENDING * DECODERS
+            ):
                 return
             pending = self._pending[key] = self._worker.submit(self._load, key)
         pending.add_done_callback(lambda _: self._pending.pop(key, None))
