@@ -19,8 +19,7 @@ WALL = 6.0
 def camera_pose(camera, frame):
     """Camera to world: the car drives along x."""
     pose = np.eye(4)
-    turn = Rotation.from_euler("z", AZIMUTHS[camera], degrees=True).as_matrix()
-    pose[:3, :3] = turn @ FORWARD
+    pose[:3, :3] = Rotation.from_euler("z", AZIMUTHS[camera], degrees=True).as_matrix() @ FORWARD
     pose[:3, 3] = FAR + np.array([SPEED * PERIOD * frame, 0, 1.6])
     return pose
 

@@ -113,8 +113,7 @@ def write_photographs(root: Path) -> None:
         shown = np.asarray(render(both, jnp.ones(both.capacity, bool), view).linear)
         encoded = srgb_encode(shown * world.exposures[photograph.frame])
         photograph.path.parent.mkdir(parents=True, exist_ok=True)
-        pixels = np.rint(255 * encoded).astype(np.uint8)
-        cv2.imwrite(str(photograph.path), pixels[..., ::-1])
+        cv2.imwrite(str(photograph.path), np.rint(255 * encoded).astype(np.uint8)[..., ::-1])
 
 
 def recording(root: Path) -> Recording:
@@ -126,8 +125,7 @@ def recording(root: Path) -> Recording:
         rng = np.random.default_rng((0, frame))
         time = frame * INTERVAL
         box = np.asarray(moved(world.box, pose_at(time)).means)
-        still = np.asarray(world.wall.means)
-        found = np.concatenate([still, box[rng.permutation(len(box))[:60]]])
+        found = np.concatenate([np.asarray(world.wall.means), box[rng.permutation(len(box))[:60]]])
         found = found + rng.normal(0, 0.01, found.shape)
         return SweepPoints(found.astype(np.float64), np.full(len(found), time))
 

@@ -33,8 +33,7 @@ def test_memory_of_the_system_and_of_a_container(container):
 
 def test_what_is_left_is_the_least_of_machine_and_limit(container, monkeypatch):
     monkeypatch.setattr(memory, "STATM", container / "statm")
-    swap = (container / "meminfo").read_text() + "SwapFree: 1000 kB\n"
-    (container / "meminfo").write_text(swap)
+    (container / "meminfo").write_text((container / "meminfo").read_text() + "SwapFree: 1000 kB\n")
     free = 6_001_000 * 1024
     assert memory.left_to_process() == free
     (container / "statm").write_text("500 200 5 1 0 9 0")

@@ -79,8 +79,7 @@ def test_every_table_is_what_plyfile_reads(tmp_path_factory, elements, kind, see
 
 
 def test_comments_are_one_line_of_ascii():
-    row = np.dtype([("x", "<f4")])
-    lines = header_of("vertex", row, 0, ["Straße\nend_header"]).splitlines()
+    lines = header_of("vertex", np.dtype([("x", "<f4")]), 0, ["Straße\nend_header"]).splitlines()
     assert lines[2] == rb"comment Stra\xdfe\nend_header"
     with pytest.raises(KeyError):
         header_of("vertex", np.dtype([("x", "<i8")]), 0)

@@ -52,6 +52,5 @@ def test_a_fit_without_its_steps_compiles_few_programs(scene, tmp_path):
 
 def test_reading_a_run_compiles_nothing(finished_run):
     counter = CompileCounter()
-    run = load_run(finished_run)
-    assert np.asarray(run.alive).all()
+    assert np.asarray(load_run(finished_run).alive).all()
     assert counter.programs == 0

@@ -88,8 +88,7 @@ def run(**variables) -> str:
 
 
 def test_programs_are_kept_for_this_machine_where_they_can_be(tmp_path):
-    folder = run(XDG_CACHE_HOME=str(tmp_path))
-    assert folder.startswith(str(tmp_path / "p2gs-jax"))
+    assert run(XDG_CACHE_HOME=str(tmp_path)).startswith(str(tmp_path / "p2gs-jax"))
     assert list((tmp_path / "p2gs-jax").rglob("*-cache"))
     chosen = str(tmp_path / "chosen")
     set_otherwise = {"JAX_COMPILATION_CACHE_DIR": chosen, "JAX_NUM_CPU_DEVICES": "2", "CORES": "3"}

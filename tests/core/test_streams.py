@@ -36,8 +36,7 @@ def test_every_stream_has_one_user():
             uses.setdefault((kind, stream), set()).add(name)
     named = {("Stream", s.name) for s in Stream} | {("SceneStream", s.name) for s in SceneStream}
     assert set(uses) == named
-    shared = {s: names for s, names in uses.items() if len(names) > 1}
-    assert not shared
+    assert not {s: names for s, names in uses.items() if len(names) > 1}
 
 
 def test_seeds_mean_what_they_meant():

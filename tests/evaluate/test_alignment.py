@@ -25,8 +25,7 @@ USUAL = Capture(jnp.float32(1.0), jnp.float32(2.2))
 
 def test_exposure_error_ignores_scale_and_reports_power():
     e = np.exp(np.random.default_rng(0).normal(0, 0.5, 20))
-    error = alignment.exposure_error(3 * e, e)
-    assert error["ev"] == pytest.approx(0, abs=1e-12)
+    assert alignment.exposure_error(3 * e, e)["ev"] == pytest.approx(0, abs=1e-12)
     bent = alignment.exposure_error(2 * e**0.8, e)
     assert bent["ev"] > 0.05
     assert bent["ev_scale_power"] == pytest.approx(0, abs=1e-9)
@@ -87,8 +86,7 @@ EVERYWHERE = np.ones((24, 32), bool)
 
 
 def image(seed=0):
-    rng = np.random.default_rng(seed)
-    return np.exp(rng.normal(-1, 1, (24, 32, 3)))
+    return np.exp(np.random.default_rng(seed).normal(-1, 1, (24, 32, 3)))
 
 
 def scores(linear, truth, brightest=1e9):
@@ -169,8 +167,7 @@ def test_a_constant_step_after_the_curve_is_its_psnr_without_masked_pixels():
     assert (np.diff(mu_law(np.linspace(0, 1, 100))) > 0).all()
     assert mu_law(np.array(0.01)) == pytest.approx(np.log(51) / np.log(5001))
     brightest = TRUTH.max()
-    shown = mu_law(TRUTH / brightest)
-    low = shown - 0.1
+    low = mu_law(TRUTH / brightest) - 0.1
     linear = (np.exp(low * np.log1p(5000.0)) - 1) / 5000.0 * brightest
     assert (low > 0).all()
     assert mu_law_psnr(linear, TRUTH, SOME) == pytest.approx(20.0, abs=1e-6)

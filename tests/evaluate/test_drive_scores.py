@@ -28,8 +28,7 @@ UP = np.array([0.0, 0.0, 1.0])
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     """A drive between two walls; frames 0 and 4 are held out."""
-    recording = make_recording(tmp_path_factory.mktemp("drive"))
-    scene = assemble(recording, DataConfig(own_car=False))
+    scene = assemble(make_recording(tmp_path_factory.mktemp("drive")), DataConfig(own_car=False))
     return dataclasses.replace(scene, views=assign_split(scene.views, 4))
 
 
@@ -60,8 +59,7 @@ def metrics(scene):
 
     def render(gaussians, alive, camera, *args):
         depth, alpha = corridor(camera)
-        linear = 0.16 * np.ones((*depth.shape, 3), np.float32)
-        arrays = map(jnp.asarray, (linear, alpha, depth))
+        arrays = map(jnp.asarray, (0.16 * np.ones((*depth.shape, 3), np.float32), alpha, depth))
         return Render(*arrays, jnp.int32(0), jnp.bool_(False), alive)
 
     zeros = jnp.zeros(len(scene.train_indices))
@@ -126,8 +124,7 @@ def test_what_shows_no_surface_is_infinitely_wrong():
         drives.depth_errors(lidar, (), dataclasses.replace(view, time=1.0), nothing, nothing)[0]
     )
     assert drives.summary([]) == {}
-    masked = drives.depth_errors(lidar, (), view, nothing, nothing, nothing)
-    assert not len(masked.error)
+    assert not len(drives.depth_errors(lidar, (), view, nothing, nothing, nothing).error)
 
 
 def test_parts_with_too_few_pixels_are_left_out():

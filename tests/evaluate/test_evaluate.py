@@ -139,8 +139,7 @@ def test_hidden_views_are_left_out_of_the_scores(tmp_path, finished_run):
         hidden = view.name in (trained[0], held_out[0])
         cv2.imwrite(str(mask), np.full((view.height, view.width), 0 if hidden else 255, np.uint8))
         cv2.imwrite(str(black), np.zeros((view.height, view.width, 3), np.uint8))
-        dark = view.name == trained[1]
-        image = black if dark else view.image_path
+        image = black if view.name == trained[1] else view.image_path
         return dataclasses.replace(view, mask_path=mask, image_path=image)
 
     scene = dataclasses.replace(run.scene, views=tuple(map(changed, run.scene.views)))

@@ -54,8 +54,7 @@ def test_masked_pixels_do_not_count(tmp_path):
     (tmp_path / "other").mkdir()
     cv2.imwrite(str(tmp_path / "other" / "a.png"), image)
     found = find_renders(tmp_path / "other", scene)
-    scores = judge_renders(found, judge(scene, store))
-    assert scores["as_rendered"]["psnr"] > 100
+    assert judge_renders(found, judge(scene, store))["as_rendered"]["psnr"] > 100
     whole, everywhere = made_scene(tmp_path / "whole", ("a.png",))
     found = find_renders(tmp_path / "other", whole)
     assert judge_renders(found, judge(whole, everywhere))["as_rendered"]["psnr"] < 20

@@ -103,8 +103,7 @@ def test_gaussians_that_nobody_can_see_are_left_out_and_counted(fitted):
 def test_hostile_names_stay_text(fitted):
     views = tuple(replace(v, name=HOSTILE + v.name) for v in fitted.scene.views)
     named = replace(fitted, scene=replace(fitted.scene, views=views))
-    known = page_scene(named, fitted.common_display(), {})
-    text = page_text(HOSTILE, known, b"")
+    text = page_text(HOSTILE, page_scene(named, fitted.common_display(), {}), b"")
     assert text.count("<script") == 4
     assert "<img" not in text
     assert json.loads(element(text, "scene"))["views"][0]["name"] == views[0].name

@@ -15,8 +15,7 @@ FAILED = 1  # pytest: tests were collected and run, and some failed
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda f: f.name)
 def test_the_fault_fits_the_code(fault):
-    text = (ROOT / "p2gs_jax" / fault.file).read_text(encoding="utf-8")
-    assert text.count(fault.right) == 1
+    assert (ROOT / "p2gs_jax" / fault.file).read_text(encoding="utf-8").count(fault.right) == 1
     path = ROOT / "tests" / fault.caught_by.split("::")[0]
     assert path.is_file()
     if "::" in fault.caught_by:

@@ -29,15 +29,13 @@ def camera():
 
 
 def written(path, **kwargs):
-    linear = np.full((HEIGHT, WIDTH, 3), 0.25, np.float32)
-    write_exr(path, linear, camera=camera(), **kwargs)
+    write_exr(path, np.full((HEIGHT, WIDTH, 3), 0.25, np.float32), camera=camera(), **kwargs)
     with OpenEXR.File(str(path)) as file:
         return dict(file.header())
 
 
 def test_exr_holds_radiance_exposure_and_depth(tmp_path):
-    rng = np.random.default_rng(0)
-    linear = np.exp2(rng.uniform(-10, 6, (7, 9, 3))).astype(np.float32)
+    linear = np.exp2(np.random.default_rng(0).uniform(-10, 6, (7, 9, 3))).astype(np.float32)
     depth, alpha = np.full((7, 9), 4.0, np.float32), np.full((7, 9), 0.5, np.float32)
     path = tmp_path / "a.exr"
     taken = DisplayTransform(2.0, 2.1, PhotometryConfig())
@@ -123,8 +121,7 @@ def test_exr_switches_to_float_where_half_ends(tmp_path, value, pixel):
 
 
 def test_png_rounds_and_keeps_the_channel_order(tmp_path):
-    ldr = np.array([[[1.0, 0.5, 0.0], [2.0, -1.0, np.nan]]], np.float32)
-    write_png(tmp_path / "a.png", ldr)
+    write_png(tmp_path / "a.png", np.array([[[1.0, 0.5, 0.0], [2.0, -1.0, np.nan]]], np.float32))
     back = cv2.imread(str(tmp_path / "a.png"))[..., ::-1]
     np.testing.assert_array_equal(back, [[[255, 128, 0], [255, 0, 0]]])
 
@@ -138,16 +135,14 @@ def test_colours_step_at_whole_stops_and_near_is_bright():
     np.testing.assert_allclose(luminance(np.array([0.0, 1, 0])), 0.7152)
     levels = [0, 2.0**-20, 2.0**-5.5, 1.0, 1.9, 2.1, 30, 2.0**5.5, 1e30]
     shown = luminance(false_color(grey(levels), middle=1.0)[0])
-    rises = np.diff(shown) > 0
-    assert rises.tolist() == [False, False, True, False, True, True, True, False]
+    assert (np.diff(shown) > 0).tolist() == [False, False, True, False, True, True, True, False]
     depth, alpha = np.array([[2.0, 8.0, 0.0]]), np.array([[1.0, 1.0, 0.0]])
     limits = (2.0, 10.0)
     shown = depth_color(depth, alpha, limits)
     assert luminance(shown)[0, 0] > luminance(shown)[0, 1] > 0
     assert not shown[0, 2].any()
     # The same surface, half covered: the expected depth counts.
-    half = depth_color(depth * 0.6, alpha * 0.6, limits)
-    np.testing.assert_allclose(half, shown)
+    np.testing.assert_allclose(depth_color(depth * 0.6, alpha * 0.6, limits), shown)
 
 
 def frames_of(path):

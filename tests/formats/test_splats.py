@@ -82,8 +82,7 @@ def test_gltf_is_read_by_pygltflib(tmp_path, degree):
     np.testing.assert_allclose(turned, cov * np.outer(FLIP, FLIP), rtol=1e-4, atol=1e-3)
     np.testing.assert_allclose(np.linalg.norm(found[f"{EXTENSION}:ROTATION"], axis=1), 1, atol=1e-6)
     np.testing.assert_allclose(found[f"{EXTENSION}:OPACITY"][:, 0], opacities, rtol=1e-5)
-    names = [n for n in found if "SH_DEGREE" in n]
-    assert len(names) == (degree + 1) ** 2
+    assert len([n for n in found if "SH_DEGREE" in n]) == (degree + 1) ** 2
     orders = ((d, k) for d in range(degree + 1) for k in range(2 * d + 1))
     ordered = [f"{EXTENSION}:SH_DEGREE_{d}_COEF_{k}" for d, k in orders]
     assert_same_colors(np.stack([found[n] for n in ordered], 1), g)

@@ -160,8 +160,7 @@ def test_clipped_pixels_carry_no_seed(tmp_path):
         linear[(np.abs(place) < 0.5).all(-1)] = 3.0
         return linear
 
-    world = World(tmp_path, change=lamp)
-    points = world.seeds().points
+    points = World(tmp_path, change=lamp).seeds().points
     in_lamp = (np.abs(points[:, :2]) < 0.5).all(1) & (np.abs(points[:, 2] - BACK) < 0.5)
     assert len(points) > 200
     assert not in_lamp.any()
@@ -173,8 +172,7 @@ def test_the_bound_binds_and_seeds_are_spread_and_the_same_again(plane):
         np.testing.assert_array_equal(getattr(few, field), getattr(plane.seeds(limit=150), field))
     assert len(many.points) > 1000
     assert 100 <= len(few.points) <= 150
-    on_plane = np.abs(few.points[:, 2] - BACK - 0.5 * few.points[:, 0])
-    assert np.quantile(on_plane, 0.95) < 0.1
+    assert np.quantile(np.abs(few.points[:, 2] - BACK - 0.5 * few.points[:, 0]), 0.95) < 0.1
     for low, high in ((-2, -0.7), (-0.7, 0.7), (0.7, 2)):
         assert ((few.points[:, 0] > low) & (few.points[:, 0] < high)).sum() > 15
     # Fewer seeds stand for larger patches.
@@ -194,8 +192,7 @@ def test_seeds_lie_flat_on_their_surface(plane):
 def test_existing_seeds_have_precedence(plane):
     x, y = (g.ravel() for g in np.meshgrid(np.linspace(-2.5, 0, 40), np.linspace(-2, 2, 60)))
     existing = np.stack([x, y, BACK + 0.5 * x], 1)
-    seeds = plane.seeds(limit=400, existing=existing)
-    left = seeds.points[:, 0] < -0.1
+    left = plane.seeds(limit=400, existing=existing).points[:, 0] < -0.1
     assert (~left).sum() > 150
     assert left.sum() < 0.05 * len(left)
     # Seeds far behind are seeds of something else.
@@ -208,8 +205,7 @@ def test_pairs_see_the_same_from_different_places(plane):
     near = neighbours(scene, visibility(scene, 0), even, 2)
     assert all(len(n) == 2 and k not in n for k, n in enumerate(near))
     # The first two only differ from the rest in their exposure.
-    apart = np.array([3.0, 3.0, -3.0, -3.0, -3.0])
-    near = neighbours(scene, visibility(scene, 0), apart, 2)
+    near = neighbours(scene, visibility(scene, 0), np.array([3.0, 3.0, -3.0, -3.0, -3.0]), 2)
     assert near[0][0] == 1
     assert near[1][0] == 0
 

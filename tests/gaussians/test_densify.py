@@ -91,8 +91,7 @@ def test_reset_lowers_only():
 def test_shares_look_like_the_whole(copies, opacity):
     """N equal Gaussians composited at their centre, and over their plane, match the one."""
     new, factor = share(jnp.array([opacity]), jnp.array([float(copies)]))
-    together = 1 - (1 - float(new[0])) ** copies
-    assert together == pytest.approx(opacity, rel=2e-3)
+    assert 1 - (1 - float(new[0])) ** copies == pytest.approx(opacity, rel=2e-3)
     # The factor is defined by equal integrals over a line through the centre.
     t = np.linspace(-12, 12, 20001)
     s = float(factor[0])
@@ -121,8 +120,7 @@ def test_relocation_moves_the_transparent_and_adds_births():
         # Moved apart, each still lies within a few deviations of one that was healthy.
         distance = np.linalg.norm(healthy - np.asarray(out.gaussians.means[i]), axis=1)
         assert distance.min() < 3 * widest
-    more = relocate_and_grow(jax.random.key(1), grown, p, jnp.int32(9), CFG)
-    assert int(more.refused) == 3
+    assert int(relocate_and_grow(jax.random.key(1), grown, p, jnp.int32(9), CFG).refused) == 3
 
 
 def test_two_that_share_a_place_part_about_its_centre_and_keep_its_extent():
@@ -220,8 +218,7 @@ def test_gaussians_belong_to_the_object_of_their_parents():
     index = np.arange(120)
     g, population = families(120, index < 90)
     g = dataclasses.replace(g, opacity_logits=jnp.where(index % 5 == 0, -9.0, 2.0))
-    born = relocate_and_grow(jax.random.key(0), g, population, jnp.int32(20), CFG)
-    check_families(born, 110)
+    check_families(relocate_and_grow(jax.random.key(0), g, population, jnp.int32(20), CFG), 110)
     g, population = families(120, index < 30)
     hot, even = (index < 30) & (index % 3 == 0), index % 2 == 0
     none, *chosen = (jnp.asarray(c) for c in (index < 0, hot & even, hot & ~even))

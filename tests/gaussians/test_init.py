@@ -66,8 +66,7 @@ def test_seeds_carry_their_radiance(name):
     rng = np.random.default_rng(0)
     points = rng.normal(0, 1, (100, 3)).astype(np.float32) + np.array([0, 0, 6], np.float32)
     radiance = np.exp(rng.normal(-1, 1, (100, 3))).astype(np.float32)
-    views = [view(0.0), view(1.0)]
-    g = gaussians_from_points(points, radiance, views, cfg)
+    g = gaussians_from_points(points, radiance, [view(0.0), view(1.0)], cfg)
     cam = Camera(jnp.eye(4), jnp.eye(3), 8, 8)
     np.testing.assert_allclose(view_radiance(g, cam, cfg.render), radiance, rtol=1e-4, atol=1e-5)
     assert np.all(np.isfinite(g.log_scales))

@@ -75,15 +75,13 @@ def test_what_few_views_show_is_left_to_the_mask(scene):
     )
     scene = dataclasses.replace(scene, views=views)
     for least, left in ((CFG.least_views, 0), (5, 1)):
-        nodes = find_nodes(scene, dataclasses.replace(CFG, least_views=least))
-        assert len(nodes.left) == left
+        assert len(find_nodes(scene, dataclasses.replace(CFG, least_views=least)).left) == left
 
 
 def test_other_methods_and_scenes_in_which_nothing_moves_have_no_nodes(scene):
     for method in ("mask", "off"):
         assert find_nodes(scene, dataclasses.replace(CFG, method=method)) is None
-    stand = tuple(dataclasses.replace(o, moving=False) for o in scene.objects)
-    for objects in ((), stand):
+    for objects in ((), tuple(dataclasses.replace(o, moving=False) for o in scene.objects)):
         assert find_nodes(dataclasses.replace(scene, objects=objects), CFG) is None
 
 
@@ -102,12 +100,10 @@ def test_points_get_the_colours_that_photographs_show(scene):
     """Of radiance, whatever the exposures: those of the frames differ by a stop."""
     cfg = with_fields(FitConfig(), {"photometry.model": "view_exposure"})
     nodes = find_nodes(scene, CFG)
-    taken_by = [v.camera for v in scene.training_views]
-    start = initial_photometry(None, taken_by, cfg)
+    start = initial_photometry(None, [v.camera for v in scene.training_views], cfg)
     logs = np.log(make_world().exposures)[[v.frame for v in scene.training_views]]
     photometry = Photometry(logs.astype(np.float32), np.asarray(start.raw_gammas), "log")
-    store = ImageStore(scene.views, cfg.data)
-    radiance = nodes_radiance(nodes, scene, store, photometry, cfg)
+    radiance = nodes_radiance(nodes, scene, ImageStore(scene.views, cfg.data), photometry, cfg)
     checks = np.floor(nodes.points / 0.4 + 1e-6).astype(int).sum(1) % 2 == 1
     within = np.abs(nodes.points / 0.4 - np.rint(nodes.points / 0.4)).min(1) > 0.2
     towards = nodes.points[:, 1] < -0.55
@@ -120,8 +116,7 @@ def test_points_get_the_colours_that_photographs_show(scene):
     g = node_gaussians(nodes, radiance, scene.training_views, cfg)
     assert g.capacity == len(nodes.points)
     np.testing.assert_allclose(g.means, nodes.points, atol=1e-6)
-    scales = np.exp(np.asarray(g.log_scales))
-    assert 0.01 < np.median(scales) < 0.2
+    assert 0.01 < np.median(np.exp(np.asarray(g.log_scales))) < 0.2
 
 
 def rows(values):
@@ -141,8 +136,7 @@ def test_laser_points_begin_at_their_own_times(scene):
     )
     np.testing.assert_allclose(1 / (1 + np.exp(-g.opacity_logits[n:])), OPACITY, rtol=1e-5)
     assert not np.any(moves.velocities)
-    middle = clock_of(scene).middle
-    times = np.asarray(moves.peaks[n:]) + middle
+    times = np.asarray(moves.peaks[n:]) + clock_of(scene).middle
     for point, time in list(zip(np.asarray(g.means[n:]), times, strict=True))[::50]:
         (row,) = np.flatnonzero((scene.lidar.points == point).all(1))
         assert scene.lidar.times[row] == pytest.approx(time, abs=1e-5)

@@ -45,8 +45,7 @@ def halves(margin=1.0, views=(0, 1)):
 def wall(log_radiance=0.0, depth=4.0, width=41):
     """Return a wall of Gaussians across x, all of one radiance."""
     x, y = np.meshgrid(np.linspace(-3, 3, width), np.linspace(-2, 2, 27))
-    count = x.size
-    means = np.stack([x.ravel(), y.ravel(), np.full(count, depth)], 1)
+    means = np.stack([x.ravel(), y.ravel(), np.full(x.size, depth)], 1)
     sh = np.full((1, 3), log_radiance / C0)
     return gaussians_of(means, [1, 0, 0, 0], np.log(0.15), 4.0, sh)
 
@@ -60,8 +59,7 @@ def test_every_gaussian_is_kept_by_the_block_whose_core_holds_it():
     assert sum(counts) == merged.capacity == first.capacity
     means, tone = np.asarray(merged.means), np.asarray(merged.sh)[:, 0, 0] * C0
     np.testing.assert_allclose(tone, np.where(means[:, 0] < 0, 1.0, 2.0), rtol=1e-6)
-    places = {tuple(m) for m in means}
-    assert places == {tuple(m) for m in np.asarray(first.means)}
+    assert {tuple(m) for m in means} == {tuple(m) for m in np.asarray(first.means)}
 
 
 def test_nothing_in_any_core_is_said():
@@ -137,8 +135,7 @@ def test_what_is_left_is_measured_in_other_views(two_views, monkeypatch, radianc
     merged, _ = merge_cores(halves(), levelled)
     values = np.asarray(merged.sh)[:, 0, 0] * C0
     tone = np.log2(values + 0.5) if radiance == "linear" else values / np.log(2)
-    x = np.asarray(merged.means)[:, 0]
-    order = np.argsort(x)
+    order = np.argsort(np.asarray(merged.means)[:, 0])
     assert np.abs(np.diff(tone[order])).max() < 0.02
     assert np.ptp(tone) > 0.15
 

@@ -71,8 +71,7 @@ def test_two_blocks_become_one_run(tmp_path, in_this_process):
     assert sum(b["gaussians_in_core"] for b in blocks) == said["counts"]["gaussians"]
     (seam,) = said["districts"]["seams"]
     assert seam["blocks"] == [0, 1]
-    opened = p2gs_jax.load_run(run)
-    assert opened.params.gaussians.capacity == said["counts"]["gaussians"]
+    assert p2gs_jax.load_run(run).params.gaussians.capacity == said["counts"]["gaussians"]
     # The exposures are those of the bundle adjustment, bit for bit, whatever the blocks did.
     shared = read_shared(run / "blocks", load(scene, run, SMALL), SMALL)
     solved = shared.exposures.photometry.exposures
@@ -168,8 +167,7 @@ def test_a_broken_plan_is_named(tmp_path):
 
 
 def test_a_plan_is_kept_also_where_its_number_was_chosen(tmp_path):
-    scene = load(make_scene(tmp_path / "scene", views=12), tmp_path, SMALL)
-    cut = cut_scene(scene, 3)
+    cut = cut_scene(load(make_scene(tmp_path / "scene", views=12), tmp_path, SMALL), 3)
     write_plan(tmp_path, cut, "auto")
     for asked in ("auto", "3"):
         assert read_plan(tmp_path, asked).blocks == cut.blocks

@@ -210,8 +210,7 @@ def test_the_table_names_every_job_that_runs():
     states[17] = JobState("block 17", "running", 1, None, "step 12", 0.25, 70.0)
     states[3] = JobState("block 3", "failed", 1, "no seeds\n  To fix it: add points")
     states[4] = JobState("block 4", "waiting", 2, "killed")
-    line = line_of(states)
-    assert line == "1 running, 28 waiting, 1 failed; block 17: 25% step 12"
+    assert line_of(states) == "1 running, 28 waiting, 1 failed; block 17: 25% step 12"
     console = Console(width=100, file=io.StringIO())
     console.print(table_of(states))
     shown = console.file.getvalue().splitlines()

@@ -95,8 +95,7 @@ def test_the_printed_table_is_short_and_the_kept_one_says_what_columns_are():
 def test_a_run_is_as_good_where_the_truth_is_not_whole(finished_run, tmp_path, rows, known):
     (tmp_path / "truth").mkdir()
     views = read_photometry(finished_run / "photometry.json")["views"]
-    train = [v["image"] for v in views if v["split"] == "train"]
-    text = rows.format(*train)
+    text = rows.format(*[v["image"] for v in views if v["split"] == "train"])
     (tmp_path / "truth" / "exposures.csv").write_text(text)
     row = read_row(finished_run, tmp_path)
     assert row["train_psnr"] > 0

@@ -30,8 +30,7 @@ def test_every_pixel_comes_from_the_camera_that_looks_there():
     edges = np.flatnonzero(np.diff(source[cylinder.height // 2])) + 1
     edges = cylinder.left + edges / cylinder.focal
     np.testing.assert_allclose(np.rad2deg(edges), [-22.5, 22.5], atol=0.7)
-    alone = stitch(flat[:1], shots[:1], cylinder)
-    assert (alone[:, -1] == 0).all()
+    assert (stitch(flat[:1], shots[:1], cylinder)[:, -1] == 0).all()
 
 
 def test_the_cylinder_is_cut_to_what_the_cameras_see():

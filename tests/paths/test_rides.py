@@ -89,8 +89,7 @@ def test_a_circle_around_what_all_cameras_look_at_upright():
     shots = orbit(circle, cameras, 36)
     radius, azimuth = seen_from(FOCUS, shots)
     np.testing.assert_allclose(radius, 5)
-    steps = (np.diff(azimuth) + 180) % 360 - 180
-    np.testing.assert_allclose(np.abs(steps), 10)
+    np.testing.assert_allclose(np.abs((np.diff(azimuth) + 180) % 360 - 180), 10)
     for s in shots[::6]:
         local = s.viewmat[:3, :3] @ FOCUS + s.viewmat[:3, 3]
         np.testing.assert_allclose(local, [0, 0, 5], atol=1e-9)
@@ -194,8 +193,7 @@ def straight(camera, yaw, steps=5, speed=1.0):
 def test_left_is_left_of_the_way_wherever_a_camera_looks(camera):
     views = [v for name, yaw in AROUND.items() for v in straight(name, yaw)]
     shots = [s for s in view_shots(views) if s.name.startswith(f"{camera}/")]
-    moved = beside_shots(shots, views, 2.0)
-    for before, after in zip(shots, moved, strict=True):
+    for before, after in zip(shots, beside_shots(shots, views, 2.0), strict=True):
         shift = inverse(after.viewmat)[:3, 3] - inverse(before.viewmat)[:3, 3]
         # x is right of z.
         np.testing.assert_allclose(shift, [-2, 0, 0], atol=1e-5)

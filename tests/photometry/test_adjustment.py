@@ -141,8 +141,7 @@ def test_exposures_are_as_uncertain_as_the_curve_that_was_fitted_beside_them():
 
 @pytest.mark.parametrize("loss", ["geman_mcclure", "whole_points"])
 def test_the_fixed_point_minimises_the_robust_loss(loss):
-    problem = problem_of()
-    fit, _ = solve.solve_model(problem, Form("view_exposure_gamma"), Response(), loss=loss)
+    fit, _ = solve.solve_model(problem_of(), Form("view_exposure_gamma"), Response(), loss=loss)
     with jax.enable_x64(True):
         rows, layout = fit.model, fit.model.layout
         row, views = layout.row, layout.views

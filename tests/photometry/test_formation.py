@@ -78,8 +78,7 @@ def by_hand(linear, cfg, camera, exposure=1.7, gamma=2.0):
             r = from_centre / (np.hypot(WIDTH, HEIGHT) / 2)
             log_v = k[0] * r**2 + k[1] * r**4 + k[2] * r**6
             x = exposure * np.exp(BALANCE[c] + log_v) * float(linear[v, u, c])
-            bent = np.log(0.18) + np.log(x / 0.18) * 2.2 / gamma
-            out[v, u, c] = np.interp(bent, z, y)
+            out[v, u, c] = np.interp(np.log(0.18) + np.log(x / 0.18) * 2.2 / gamma, z, y)
     return out
 
 

@@ -50,8 +50,7 @@ def test_a_hole_says_nothing_and_takes_the_mean():
 
 @pytest.mark.parametrize("name", METERS)
 def test_the_rule_of_a_camera_is_found(name):
-    noise = 0.05 * np.random.default_rng(1).standard_normal(40)
-    metering = fit(0.4 - READ[name] + noise)
+    metering = fit(0.4 - READ[name] + 0.05 * np.random.default_rng(1).standard_normal(40))
     assert metering.rule.meter == name
     assert metering.rule.left_out_ev == pytest.approx(0.05 / np.log(2), rel=0.3)
     assert "explains the exposures" in metering.sentence

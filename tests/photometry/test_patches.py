@@ -106,8 +106,7 @@ def test_whole_regions_are_held_out(road):
     assert 0.05 < held.mean() < 0.4
     assert np.all(np.bincount(road.views, held) > 0)
     region = regions(road.positions, road.views, SHARED_REGION)
-    of_region = np.bincount(region, held) / np.bincount(region)
-    assert set(of_region) == {0.0, 1.0}
+    assert set(np.bincount(region, held) / np.bincount(region)) == {0.0, 1.0}
     np.testing.assert_array_equal(held, held_out(road, 0))
     assert np.any(held != held_out(road, 1))
 

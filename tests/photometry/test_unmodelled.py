@@ -29,8 +29,7 @@ def scene():
 
 def said(scene, change):
     observations, noise, _ = scene
-    usable = np.ones(noise.shape, bool)
-    return place_warnings(observations, noise + change[:, None], usable)
+    return place_warnings(observations, noise + change[:, None], np.ones(noise.shape, bool))
 
 
 def test_noise_and_values_say_nothing(scene):

@@ -87,8 +87,7 @@ def test_channels_with_exposures_of_their_own_have_no_powers_of_their_own():
     response = fit_response(problem_of(o), Response(), form=form, by="channel")
     assert response is not None
     np.testing.assert_allclose(np.array(response.splines)[:, HELD[1]], 0, atol=1e-3)
-    s = adjust(o, form, response)
-    assert rms(s.white_balance - of_balance(DARK)) / np.log(2) < 0.02
+    assert rms(adjust(o, form, response).white_balance - of_balance(DARK)) / np.log(2) < 0.02
     apart = parameter_count(form, "channel", 3, 36) - parameter_count(form, None, 3, 36)
     assert apart == 3 * len(FREE)
 
@@ -107,8 +106,7 @@ def test_choices_one_step_apart():
     assert all(plain in neighbours(choice, scope) for choice in near)
     apart = neighbours(Choice(Form("camera_exposure")), scope)
     assert Choice(Form("camera_exposure", "view")) not in apart
-    nowhere = Scope(cameras=1, places=False, curves=False)
-    for form, curve in neighbours(plain, nowhere):
+    for form, curve in neighbours(plain, Scope(cameras=1, places=False, curves=False)):
         assert form.vignetting is curve.splines is None
         assert "camera" not in form.model
 
@@ -131,8 +129,7 @@ def test_what_varies_is_found(exposures, curve, gamma, model, response):
     if gamma is not None:
         # The power gauge holds the mean of 2.2 / gamma at 1.
         np.testing.assert_allclose(s.solution.gammas, gammas * np.mean(2.2 / gammas), atol=0.03)
-        found = np.exp(s.solution.log_exposures)
-        assert exposure_error(found, truth)["ev_scale_power"] < 0.015
+        assert exposure_error(np.exp(s.solution.log_exposures), truth)["ev_scale_power"] < 0.015
     assert any(r.startswith("Model kept:") for r in s.reasons)
     if exposures == "constant":
         assert any("too little to tell the shape" in r for r in s.reasons)

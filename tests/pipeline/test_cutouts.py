@@ -48,8 +48,7 @@ def ball(tmp_path_factory):
     root = tmp_path_factory.mktemp("ball")
     write_ball(root, 12, "train")
     write_ball(root, 4, "test")
-    cfg = with_fields(preset("robust"), SHORT)
-    result = fit(root, root / "run", cfg)
+    result = fit(root, root / "run", with_fields(preset("robust"), SHORT))
     return result, load_run(root / "run")
 
 
@@ -62,8 +61,7 @@ def test_held_out_views_are_the_data_set_s_and_scores_over_the_background(ball):
     assert any("over 0.1,0.9,0.1" in note for note in result.metrics["notes"])
     # The bare background scores 9.5 dB.
     assert result.metrics["test"]["averaged"]["psnr"] > 20
-    store = run.store
-    photograph, mask = store.get(0)
+    photograph, mask = run.store.get(0)
     assert mask.min() == 1.0
     assert np.allclose(photograph[0, 0], [0.1, 0.9, 0.1], atol=1e-4)
     assert np.allclose(photograph[SIZE // 2, SIZE // 2], COLOR, atol=3e-3)

@@ -264,8 +264,7 @@ def test_what_does_not_fit_is_refused_with_what_helps(left):
 def test_a_fit_is_refused_before_its_exposures_are_solved(tmp_path, scene, left, refused):
     run = tmp_path / "run"
     left(0.1 * GB)
-    text = refused("fit", scene, "--out", run, "--gaussians", 9_000_000)
-    assert "9000000 Gaussians" in text
+    assert "9000000 Gaussians" in refused("fit", scene, "--out", run, "--gaussians", 9_000_000)
     assert not (run / "config.json").exists()
 
 

@@ -49,6 +49,5 @@ def test_relative_error_over_a_high_dynamic_range():
     radiance = np.where(np.arange(n) < n // 2, 1.0, 1e4)[:, None] * rng.uniform(0.5, 1, (n, 3))
     mean = np.c_[rng.uniform(-1, 1, (n, 2)) * depth[:, None] * 0.5, depth]
     values = {"mean": mean, "radiance": radiance, "logit": np.full(n, -1.5), "scales": 1.0}
-    case = HardCase("bright behind dark", "", lambda: crowd(n, **values))
-    g = gap(case, cfg)
+    g = gap(HardCase("bright behind dark", "", lambda: crowd(n, **values)), cfg)
     assert g.relative < 1e-3, g

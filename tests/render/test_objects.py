@@ -98,8 +98,7 @@ def test_what_is_not_there_leaves_the_picture_as_if_it_were_removed(known):
         splats, _ = seen_by(g, alive, camera, owner)
         return splats.means2d.sum() + splats.conic_factor.sum() + splats.log_opacities.sum()
 
-    gradient = jax.jit(jax.grad(total))(g)
-    for leaf in jax.tree.leaves(gradient):
+    for leaf in jax.tree.leaves(jax.jit(jax.grad(total))(g)):
         assert np.isfinite(leaf).all()
         assert not np.asarray(leaf)[gone].any()
 

@@ -58,8 +58,7 @@ def test_splats_are_the_definition():
 
 
 def test_the_basis_is_scipys_in_the_signs_of_3dgs():
-    rng = np.random.default_rng(0)
-    d = rng.normal(size=(50, 3))
+    d = np.random.default_rng(0).normal(size=(50, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     polar, azimuth = np.arccos(d[:, 2]), np.arctan2(d[:, 1], d[:, 0])
     found = basis(tuple(d.astype(np.float32).T), MAX_DEGREE)

@@ -166,8 +166,7 @@ def test_tile_lists_match_brute_force_and_overflow_is_said(shown):
     across = -(-cam.width // CFG.tile[0])
     for t in range(len(offsets) - 1):
         listed = ids[offsets[t] : offsets[t + 1]]
-        depths = np.asarray(splats.depths)[listed]
-        assert np.all(np.diff(depths) >= 0)
+        assert np.all(np.diff(np.asarray(splats.depths)[listed]) >= 0)
         row, col = divmod(t, across)
         block = e[:, row * 8 : row * 8 + 8, col * 16 : col * 16 + 16]
         needed = set(np.nonzero((block > np.log(1 / 255)).any((1, 2)))[0])

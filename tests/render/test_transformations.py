@@ -23,11 +23,9 @@ CAPACITY = 300_000
 
 def binned(gaussians, viewmat):
     """Return splats and tile lists, which are made by loops that are compiled whole."""
-    camera = dataclasses.replace(SCENE.camera, viewmat=viewmat)
-    splats = project(gaussians, ALIVE, camera, CFG)
+    splats = project(gaussians, ALIVE, dataclasses.replace(SCENE.camera, viewmat=viewmat), CFG)
     tiles = bin_tiles(splats, 64, 48, CAPACITY, CFG)
-    used = jnp.arange(CAPACITY) < tiles.offsets[-1]
-    return splats, jnp.where(used, tiles.gaussian_ids, -1)
+    return splats, jnp.where(jnp.arange(CAPACITY) < tiles.offsets[-1], tiles.gaussian_ids, -1)
 
 
 def listed(gaussians, viewmat):
@@ -75,5 +73,4 @@ def test_loops_are_compiled_whole():
     """Losing the attribute on the way through XLA would cost a factor of ten, silently."""
 
     text = jax.jit(listed).lower(SCENE.gaussians, VIEWS[0]).compile().as_text()
-    calls = [line for line in text.splitlines() if " call(" in line and SMALL_CALL in line]
-    assert len(calls) >= 4
+    assert len([line for line in text.splitlines() if " call(" in line and SMALL_CALL in line]) >= 4

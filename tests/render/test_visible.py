@@ -45,8 +45,7 @@ def view(seed: int, focal: float) -> Camera:
 def seen_and_listed(gaussians, alive, camera, cfg):
     splats = project(gaussians, alive, camera, cfg)
     tiles = bin_tiles(splats, camera.width, camera.height, CAPACITY, cfg)
-    used = jnp.arange(CAPACITY) < tiles.offsets[-1]
-    ids = jnp.where(used, tiles.gaussian_ids, COUNT)
+    ids = jnp.where(jnp.arange(CAPACITY) < tiles.offsets[-1], tiles.gaussian_ids, COUNT)
     listed = jnp.zeros(COUNT, bool).at[ids].set(True, mode="drop")
     seen = in_view(gaussians, alive, camera, cfg)
     return seen, listed, required_capacity(gaussians, alive, camera, cfg)

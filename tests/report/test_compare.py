@@ -89,8 +89,7 @@ def test_an_unfinished_run_has_empty_cells_and_runs_of_one_name_are_told_apart(r
     assert row(found, "training PSNR, dB").cells[1] == ""
     assert any(r.startswith("poor: metrics.json is missing") for r in found.remarks)
     assert "| - |" in to_markdown(found)
-    twin = copy_run(runs[0], tmp_path / "plain")
-    labels = compare_runs([runs[0], twin]).labels
+    labels = compare_runs([runs[0], copy_run(runs[0], tmp_path / "plain")]).labels
     assert len(set(labels)) == 2
     assert all(label.endswith("/plain") for label in labels)
 

@@ -60,8 +60,7 @@ def test_a_run_is_read_back_with_its_cameras(camera_run):
 
 
 def _without_balance(saved):
-    train = [view for view in saved["views"] if view["split"] == "train"]
-    train[1]["white_balance"] = None
+    [view for view in saved["views"] if view["split"] == "train"][1]["white_balance"] = None
 
 
 @pytest.mark.parametrize(

@@ -71,8 +71,7 @@ def test_what_cannot_belong_is_refused(tmp_path, kind):
     path.write_text("{]", encoding="utf-8")
     with pytest.raises(UserError, match="cannot be read"):
         read_appearance(path, kind, views())
-    saved = learned(kind)
-    write_appearance(path, saved, views())
+    write_appearance(path, learned(kind), views())
     other = [*views(), View("new.png", Path(), "left", *(np.eye(4), np.eye(3)), 4, 4)]
     with pytest.raises(UserError, match="does not belong"):
         read_appearance(path, kind, other)

@@ -257,8 +257,7 @@ def test_seldom_formats_are_read_as_any_other(tmp_path, suffix, kind):
 def test_numbers_in_names_count(tmp_path):
     names = [f"frame_{k}.jpg" for k in range(1, 101)]
     assert sorted(sorted(names), key=natural) == names
-    pairs = pairs_by_name(sorted(names))
-    assert {(names[k], names[k + 1]) for k in range(99)} <= {*pairs}
+    assert {(names[k], names[k + 1]) for k in range(99)} <= {*pairs_by_name(sorted(names))}
     views = tuple(dataclasses.replace(make_view(tmp_path / n), name=n) for n in sorted(names))
     held = [v.name for v in assign_split(views, 8) if v.split == "test"]
     assert sorted(held, key=natural) == names[::8]
@@ -297,8 +296,7 @@ def test_masks_are_found_as_others_call_them(tmp_path, place):
     scene = load_scene(tmp_path, ALL)
     assert [view.mask_path for view in scene.views] == [tmp_path / place, None]
     # What is a mask is no photograph.
-    found = [p.name for p in list_images(tmp_path / "images")]
-    assert found == ["im 0.png", "im 1.png"]
+    assert [p.name for p in list_images(tmp_path / "images")] == ["im 0.png", "im 1.png"]
 
 
 def test_masks_of_several_cameras_are_not_mixed_up(tmp_path):

@@ -63,8 +63,7 @@ def folder(noisy_street, tmp_path):
     """Return a folder with five photographs of a street, those of one camera, and a blank one."""
     features.quiet_colmap()
     (tmp_path / "photos").mkdir()
-    photographs = sorted((noisy_street / "images").rglob("*.png"))[:5]
-    for k, path in enumerate(photographs):
+    for k, path in enumerate(sorted((noisy_street / "images").rglob("*.png"))[:5]):
         shutil.copyfile(path, tmp_path / "photos" / f"{k}.png")
     Image.new("RGB", (192, 128), (90, 90, 90)).save(tmp_path / "photos" / "blank.png")
     return tmp_path / "photos"
@@ -92,8 +91,7 @@ def test_only_what_is_new_is_done_and_matches_judge_poses(noisy_street, folder, 
     assert "matches of 3 image pairs are kept from an earlier run" in said
     assert "matching: 7 image pairs" in said
 
-    scene = find_scene(noisy_street, CFG)
-    by_path = sorted(scene.views, key=lambda view: view.image_path)[:5]
+    by_path = sorted(find_scene(noisy_street, CFG).views, key=lambda view: view.image_path)[:5]
     views = [dataclasses.replace(v, name=name) for v, name in zip(by_path, names, strict=True)]
     assert agreement(database, views) > 0.9
     with refused("street has poses that contradict the photographs", "OpenCV's axes"):

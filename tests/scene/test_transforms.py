@@ -163,8 +163,7 @@ def write_blender(root, **counts):
     for part, count in {"train": 6, "test": 3, "val": 0, **counts}.items():
         if count:
             root.mkdir(exist_ok=True)
-            data = blender(around(count), part)
-            (root / f"transforms_{part}.json").write_text(json.dumps(data))
+            (root / f"transforms_{part}.json").write_text(json.dumps(blender(around(count), part)))
         for k in range(count):
             write_rgba(root / part / f"r_{k}.png")
     return root

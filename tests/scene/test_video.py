@@ -111,8 +111,7 @@ def test_two_moments_in_a_frame_are_taken_apart(tmp_path: Path) -> None:
         moment[:, 3 * k : 3 * k + 40] = 200
     frames = moments[:-1:2].copy()
     frames[:, 1::2] = moments[1::2, 1::2]
-    interlaced = {"flags": "+ildct+ilme", "x264-params": "tff=1:crf=5"}
-    write_video(path, frames, options=interlaced)
+    write_video(path, frames, options={"flags": "+ildct+ilme", "x264-params": "tff=1:crf=5"})
     found = [frame.codes()[..., 0].astype(float) for frame in video.frames_of(path)]
     assert len(found) == 12
     for picture in found[1:]:

@@ -149,8 +149,7 @@ def test_what_is_far_from_the_origin_keeps_its_places(tmp_path):
     listed = [
         frames(n)[0] | {"transform_matrix": p.tolist()} for n, p in zip(names, poses, strict=True)
     ]
-    data = {**LENS, "ply_file_path": "seeds.ply", "frames": listed}
-    path = write(tmp_path, data, names=names)
+    path = write(tmp_path, {**LENS, "ply_file_path": "seeds.ply", "frames": listed}, names=names)
     points = UTM + np.array([[0.125, 0.25, 0.5], [-0.5, 0.0, 0.25]])
     write_ply(tmp_path / "seeds.ply", points, kind="f8")
     scene = find_scene(path, CFG)

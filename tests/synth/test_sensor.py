@@ -92,8 +92,7 @@ def test_what_is_off_changes_no_draw():
 def test_noise_has_the_stated_size_and_needs_a_generator():
     flat = np.full((100, 100, 3), 0.2)
     noisy = photograph(flat, 1.0, Sensor(noise=1.0), rng=np.random.default_rng(0))
-    expected = np.sqrt(2e-4 * 0.2 + 1e-6)
-    assert srgb_decode(noisy / 255.0).std() == pytest.approx(expected, rel=0.1)
+    assert srgb_decode(noisy / 255.0).std() == pytest.approx(np.sqrt(2e-4 * 0.2 + 1e-6), rel=0.1)
     assert photograph(flat, 1.0).std() == 0
     with pytest.raises(AssertionError):
         photograph(flat, 1.0, Sensor(noise=1.0))

@@ -139,8 +139,7 @@ def test_tracks_land_on_their_points_and_see_one_radiance(street, scene):
     for i, view in enumerate(scene.views):
         rows = np.flatnonzero(tracks.view_indices == i)
         p = scene.points[tracks.point_indices[rows]] @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
-        xy = (p / p[:, 2:]) @ view.K.T
-        np.testing.assert_allclose(xy[:, :2], tracks.xy[rows], atol=0.02)
+        np.testing.assert_allclose(((p / p[:, 2:]) @ view.K.T)[:, :2], tracks.xy[rows], atol=0.02)
         reference = srgb_decode(read_png(street / "reference" / view.name) / 255.0)
         u, v = tracks.xy[rows].T - 0.5
         value = map_coordinates(reference[..., 1], [v, u], order=1, mode="nearest")
@@ -177,8 +176,7 @@ def test_a_long_town_goes_on_as_far_as_the_drive_and_ends_behind_it(way):
     assert np.diff(reached).max() < 25, "no hole but the side streets"
     x = np.linspace(0, way + 3, 200)
     eyes = np.stack([x, np.full_like(x, -1.75), np.full_like(x, 3.845)], 1)[:, None]
-    inside = (eyes > town.lo[houses]) & (eyes < town.hi[houses])
-    assert not inside.all(-1).any()
+    assert not ((eyes > town.lo[houses]) & (eyes < town.hi[houses])).all(-1).any()
     if way > 2 * STREET_M:
         # No two streets are alike.
         first = town.color[houses & (town.lo[:, 0] < STREET_M - 22)]

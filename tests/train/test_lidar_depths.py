@@ -57,13 +57,11 @@ def wall_scene(**lidar) -> Scene:
 def test_views_get_what_stands_still_near_in_time_and_is_not_hidden():
     rng = np.random.default_rng(0)
     wall = np.column_stack([rng.uniform(-4, 4, (500, 2)), np.full(500, 10.0)])
-    behind = wall * [1, 1, 3]
-    points = np.concatenate([wall, behind, wall - np.array([0, 0, 5])]).astype(np.float32)
+    points = np.concatenate([wall, wall * [1, 1, 3], wall - np.array([0, 0, 5])]).astype(np.float32)
     # In front of the wall something moves.
     owner = np.repeat([-1, -1, 0], 500).astype(np.int32)
     scene = wall_scene(points=points, times=np.zeros(1500), objects=owner)
-    cfg = FitConfig(loss=LossConfig(lidar=0.1))
-    found = measured_depths(scene, cfg)
+    found = measured_depths(scene, FitConfig(loss=LossConfig(lidar=0.1)))
     assert found is not None
     first, second = found
     depths = np.asarray(first.depths)

@@ -34,8 +34,7 @@ def test_compiling_is_never_pace(harness, cfg):
     assert result.host.overflows == 1
     assert pace_of(harness.log()) == pytest.approx([0.1] * len(harness.log()))
     assert result.seconds["compiling"] == 14
-    taken = len(programs.taken)
-    assert result.seconds["steps"] == pytest.approx(0.1 * (taken + 1))
+    assert result.seconds["steps"] == pytest.approx(0.1 * (len(programs.taken) + 1))
     if cfg is BUDGET:
         # Compiling is time all the same.
         assert 50 < harness.clock.now < 62
@@ -90,8 +89,7 @@ def test_a_longer_run_that_is_killed_before_it_saves_goes_on_as_if_nothing_had_b
 
 def test_a_run_that_its_budget_ended_goes_on_under_a_larger_one(harness):
     first, _ = harness.run(BUDGET)
-    asked = with_fields(BUDGET, {"train.budget_s": 120.0})
-    result, programs = harness.run(asked, resume=True)
+    result, programs = harness.run(with_fields(BUDGET, {"train.budget_s": 120.0}), resume=True)
     assert programs.taken[0][2] == pytest.approx(first.host.progress / 2)
     assert result.host.progress == pytest.approx(1.0, abs=0.01)
     assert 110 < harness.clock.now < 122

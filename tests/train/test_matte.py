@@ -76,8 +76,7 @@ def test_they_agree_at_every_opacity(surfaces, curve, backdrop):
     color = np.asarray(formation(jnp.float32(radiance), capture, cfg.photometry)).clip(0, 1)
     mask = np.ones(SIZE)
     mask[3:6] = 0
-    hidden = mask[..., None] == 0
-    photograph = np.where(hidden, 1 - color, color), np.where(mask == 0, 0.4, alpha)
+    photograph = np.where(mask[..., None] == 0, 1 - color, color), np.where(mask == 0, 0.4, alpha)
     batch = batch_of(*photograph, backdrop, mask)
     ldr, terms = matted_loss(render_of(radiance, alpha), batch, capture, None, cfg)
     expected = alpha[..., None] * color + (1 - alpha[..., None]) * np.array(backdrop)

@@ -54,8 +54,7 @@ def test_opacity_resets_empty_the_scene_and_it_grows_back(tmp_path):
     cfg = small("paper", reset_every=0.4, min_reset_steps=10, prune_scale=10.0)
     cfg = with_fields(cfg, {"train.steps": 160})
     result = p2gs_jax.fit(make_scene(tmp_path / "scene"), tmp_path / "run", cfg)
-    losses = [r["loss"] for r in check(result, tmp_path / "run")]
-    assert max(np.diff(losses)) > 0.01  # the reset
+    assert max(np.diff([r["loss"] for r in check(result, tmp_path / "run")])) > 0.01  # the reset
 
 
 # Of 30,000 steps: factor on the rate (arXiv 2601.18336, C.1).
@@ -69,8 +68,7 @@ BASELINES = (
 @pytest.mark.slow
 @pytest.mark.parametrize("name", BASELINES)
 def test_baselines_run_and_come_back_as_they_were_saved(tmp_path, name):
-    scene = make_scene(tmp_path / "scene")
-    result = p2gs_jax.fit(scene, tmp_path / "run", small(name))
+    result = p2gs_jax.fit(make_scene(tmp_path / "scene"), tmp_path / "run", small(name))
     check(result, tmp_path / "run")
     again = p2gs_jax.load_run(tmp_path / "run").params
     saved = result.params.appearance

@@ -20,8 +20,7 @@ def test_levels_and_degrees():
     assert plan == ((0.25, 4), (0.5, 2), (1.0, 1))
     assert [schedule.shrink_at(p, plan) for p in (0.0, 0.24, 0.25, 0.6, 1.0)] == [4, 4, 2, 1, 1]
     assert schedule.levels(cfg, 300, 200) == ((0.5, 2), (1.0, 1))
-    degrees = [schedule.sh_degree_at(p, cfg, 3) for p in (0.0, 1 / 30, 0.09, 0.5)]
-    assert degrees == [0, 1, 2, 3]
+    assert [schedule.sh_degree_at(p, cfg, 3) for p in (0.0, 1 / 30, 0.09, 0.5)] == [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize("step_s", [0.02, 0.1, 0.5])

@@ -86,8 +86,7 @@ def test_one_step_is_an_adam_update_of_the_gradient_of_the_loss(made):
     rates = rates_at(PROGRESS, RATE, EXTENT, made.params, CFG, (DEGREE + 1) ** 2)
     o = CFG.optimizer
     adam = optax.scale_by_adam(o.b1, o.b2, o.eps)
-    start = jax.jit(adam.init)(made.params)
-    updates, _ = jax.jit(adam.update)(made.gradient, start)
+    updates, _ = jax.jit(adam.update)(made.gradient, jax.jit(adam.init)(made.params))
     moments = state.opt_state.gaussians
     for name in FIELDS:
         g = rows_of(made.gradient.gaussians, name, made.seen)
@@ -100,8 +99,7 @@ def test_one_step_is_an_adam_update_of_the_gradient_of_the_loss(made):
         new = rows_of(state.params.gaussians, name, made.seen)
         expected = old - rate * rows_of(updates.gaussians, name, made.seen)
         np.testing.assert_allclose(new, expected, rtol=1e-6, atol=2e-3 * rate.max())
-        moved = np.abs(new - old).max()
-        assert moved > 0.5 * rate.max(), name
+        assert np.abs(new - old).max() > 0.5 * rate.max(), name
     got, v = state.opt_state.rest.mu[0], made.gradient.photometry
     for name in PHOTOMETRY:
         np.testing.assert_allclose(
@@ -198,8 +196,7 @@ def test_the_first_that_is_not_finite_is_named(made, field, named):
     state, report = made.step(made.capacity, params)
     assert int(state.fault.kind) == FAULT_NONFINITE
     assert int(state.step) == 0
-    names = finite_names(report.terms, state.params)
-    assert names[int(state.fault.term)].startswith(named)
+    assert finite_names(report.terms, state.params)[int(state.fault.term)].startswith(named)
     if field == "sh":
         fresh = initial_state(params, jnp.asarray(made.alive), make_optimizer(CFG))
         chex.assert_trees_all_equal(dataclasses.replace(state, fault=fresh.fault), fresh)

@@ -65,8 +65,7 @@ def control(page, label):
 
 
 def choose(page, label, option):
-    box = page.get_by_label(label, exact=True)
-    box.click()
+    page.get_by_label(label, exact=True).click()
     page.get_by_role("option", name=option, exact=True).click()
 
 

@@ -53,8 +53,7 @@ def test_a_whole_photograph_is_seen(aspect):
     assert at.min() > -1
     assert np.all(at.max(0) < np.array(size) + 1)
     # ... and as large as that allows: it touches an edge.
-    gaps = np.abs(np.concatenate([at, at - size])).min()
-    assert gaps < 1.5
+    assert np.abs(np.concatenate([at, at - size])).min() < 1.5
 
 
 def test_up_is_what_cameras_hold_up_and_distances_are_typical():

@@ -90,14 +90,12 @@ def test_a_view_that_overflows_comes_as_soon_as_there_is_room(made):
     wait_for(renderer, changed, LARGE)
     assert renderer.render(camera(LARGE)) is None
     wait_for(renderer, changed, LARGE)
-    shown = renderer.render(camera(LARGE))
-    assert float(shown.alpha.max()) > 0.5
+    assert float(renderer.render(camera(LARGE)).alpha.max()) > 0.5
 
 
 def test_a_view_to_save_waits_for_its_program(made, monkeypatch):
     renderer, _ = made(gaussians(scale=-0.5), z=-100.0)
-    shown = renderer.render_now(camera(LARGE))
-    assert float(shown.alpha.max()) > 0.5
+    assert float(renderer.render_now(camera(LARGE)).alpha.max()) > 0.5
     monkeypatch.setattr(module, "MOST_ENTRIES", 5000)
     with pytest.raises(UserError, match="memory"):
         renderer.render_now(camera(LARGE))

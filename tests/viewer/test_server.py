@@ -59,17 +59,15 @@ def test_busy_port(refused, tmp_path):
 
 
 def test_ctrl_c_ends_it_cleanly(finished_run):
-    argv = [sys.executable, "-m", "p2gs_jax.cli", "view", str(finished_run), "--port", "0"]
     process = subprocess.Popen(
-        argv,
+        [sys.executable, "-m", "p2gs_jax.cli", "view", str(finished_run), "--port", "0"],
         cwd=ROOT,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
     )
-    line = process.stdout.readline()
-    assert re.search(r"http://127\.0\.0\.1:\d+ ", line)
+    assert re.search(r"http://127\.0\.0\.1:\d+ ", process.stdout.readline())
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=120)
     assert process.returncode == 0, err
@@ -120,8 +118,7 @@ def servers():
 
 def get(server, path="/", **headers):
     """Return the status of a page, and the cookie that is set."""
-    url = f"http://127.0.0.1:{server.get_port()}{path}"
-    request = urllib.request.Request(url, headers=headers)
+    request = urllib.request.Request(f"http://127.0.0.1:{server.get_port()}{path}", headers=headers)
     try:
         with urllib.request.urlopen(request, timeout=20) as answer:
             return answer.status, answer.headers.get("Set-Cookie", "")

@@ -130,6 +130,5 @@ def settings(time: float = 1 / 60, aperture: float = 2.8, iso: int = 200) -> Ima
 
 def patches(size: tuple[int, int] = (96, 64), *, seed: int = 0) -> np.ndarray:
     """Return a smooth coloured picture, float in [0, 1]."""
-    rng = np.random.default_rng(seed)
-    small = rng.random((4, 6, 3)).astype(np.float32)
+    small = np.random.default_rng(seed).random((4, 6, 3)).astype(np.float32)
     return np.clip(cv2.resize(small, size, interpolation=cv2.INTER_CUBIC), 0, 1)

@@ -64,8 +64,7 @@ def test_laser_points_are_told_apart_by_what_they_lie_on(drive):
     assert (scene.lidar.objects == -1).sum() == 800 * FRAMES
     assert np.isfinite(scene.lidar.points).all()
     assert len(scene.points)
-    off_walls = np.abs(np.abs(scene.points[:, 1] + scene.origin[1] - FAR[1]) - WALL)
-    assert off_walls.max() < 1e-3
+    assert np.abs(np.abs(scene.points[:, 1] + scene.origin[1] - FAR[1]) - WALL).max() < 1e-3
     assert scene.point_colors is None
     assert f"{FRAMES} LiDAR points are not finite numbers and are left out." in scene.notes
 
@@ -146,8 +145,7 @@ def test_frames_are_sliced_by_their_place_and_what_makes_no_sense_is_refused():
 
 
 def test_seeds_are_dense_near_the_path_and_sparse_far_from_it():
-    rng = np.random.default_rng(1)
-    near, far = rng.uniform(-5, 5, (2, 20_000, 3))
+    near, far = np.random.default_rng(1).uniform(-5, 5, (2, 20_000, 3))
     points = np.concatenate([near, far + np.array([80, 0, 0])]).astype(np.float32)
     lidar = Lidar(points, np.zeros(40_000), np.full(40_000, -1))
     kept, _ = seeds(lidar, np.zeros((1, 3)))

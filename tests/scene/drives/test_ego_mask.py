@@ -43,15 +43,13 @@ def road(pose):
     # Finer than a pixel far away: there it is one grey.
     tiles = (30 * at[..., [0, 2]]).astype(np.float32) % 512
     soil = cv2.remap(SOIL, tiles[..., 0], tiles[..., 1], cv2.INTER_LINEAR)
-    near = np.clip(12 * ahead, 0, 1)
-    ground = 0.25 + near * (soil - 0.25)
+    ground = 0.25 + np.clip(12 * ahead, 0, 1) * (soil - 0.25)
     # A marking that runs with the car: structure that stays, and is no part of it.
     ground[np.abs(at[..., 0] + 1.2) < 0.08] = 0.6
     azimuth = np.arctan2(rays[..., 0], rays[..., 2])
     height = rays[..., 1] / np.hypot(rays[..., 0], rays[..., 2])
     where = [(F * a + 500).astype(np.float32) for a in (azimuth, height)]
-    clouds = 0.2 + cv2.remap(CLOUDS, *where, cv2.INTER_LINEAR)
-    return np.where(rays[..., 1] > 0, ground, clouds)
+    return np.where(rays[..., 1] > 0, ground, 0.2 + cv2.remap(CLOUDS, *where, cv2.INTER_LINEAR))
 
 
 def pictures(poses, *, own=True, exposures=None):

@@ -70,8 +70,7 @@ def test_scans_agree_with_the_disparity_of_the_real_photographs(shared_data, rea
         for camera in ("2", "3"):
             link = drive / f"image_0{camera}/data/{k:010d}.png"
             link.symlink_to(source / f"image_{camera}/{still}.png")
-        scan = source / f"velodyne/{still}.bin"
-        (drive / f"velodyne_points/data/{k:010d}.bin").symlink_to(scan)
+        (drive / f"velodyne_points/data/{k:010d}.bin").symlink_to(source / f"velodyne/{still}.bin")
         (drive / f"oxts/data/{k:010d}.txt").write_text("49 8.4 110 0.01 -0.02 0.7 " + "0 " * 24)
     recording = read(drive)
     assert recording.format == "kitti_raw"

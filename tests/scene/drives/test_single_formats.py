@@ -110,8 +110,7 @@ def test_photographs_of_waymo_come_out_of_the_table_one_at_a_time(copied, read):
         assert camera.distortion.coefficients == (0.05, -0.02, 1e-3, -1e-3, 0.0)
     numbers = {name: number for number, name in waymo.NAMES.items()}
     for photograph in drive.photographs:
-        expected = jpeg(10 * photograph.frame + numbers[photograph.camera])
-        assert photograph.embedded() == expected
+        assert photograph.embedded() == jpeg(10 * photograph.frame + numbers[photograph.camera])
     assert len({p.path.name for p in drive.photographs}) == 3
     drive = read(root)
     path = root / waymo.file("camera_image")

@@ -37,14 +37,12 @@ def car_at(seconds: float) -> np.ndarray:
     turn = Rotation.from_euler("ZYX", [yaw, 0.02, -0.01])
     # A circle: at all times along the car's own x.
     centre, radius = np.array([1200.0, -700.0, 12.0]), 30.0
-    position = centre + radius * np.array([np.sin(yaw), -np.cos(yaw), 0.0])
-    return matrix(turn, position)
+    return matrix(turn, centre + radius * np.array([np.sin(yaw), -np.cos(yaw), 0.0]))
 
 
 def mounted(azimuth: float, position=(1.5, 0.2, 1.6)) -> np.ndarray:
     """Return camera to car, OpenCV axes, of a camera that looks in a direction."""
-    turn = Rotation.from_euler("z", azimuth) * Rotation.from_matrix(FORWARD)
-    return matrix(turn, position)
+    return matrix(Rotation.from_euler("z", azimuth) * Rotation.from_matrix(FORWARD), position)
 
 
 def box(place, yaw: float, height: float = 0.8) -> np.ndarray:

@@ -100,12 +100,11 @@ def write(root: Path, frames=3, scenes=("scene-0001",), version=TABLES) -> w.Mad
         w.write_bytes(root / version / f"{name}.json", json.dumps(rows, indent=1).encode())
     ats = 0.5 * np.arange(frames)
     # The turn begins at the scanner's left; a sweep's stamp is its end.
-    late = {"ahead": -0.75 * TURN, "right": -0.5 * TURN}
     return w.Made(
         root=root,
         photographs=w.shots(CAMERAS, LAG, ats),
         sweeps=[t for at in ats for t in (at - TURN, at)],
-        boxes=w.tracks(ats, late, w.beside),
+        boxes=w.tracks(ats, {"ahead": -0.75 * TURN, "right": -0.5 * TURN}, w.beside),
         tables=[
             version / f"{name}.json"
             for name in ("scene", "sample", "ego_pose", "sensor", "calibrated_sensor")

@@ -89,12 +89,11 @@ def write(folder: Path, frames=3) -> w.Made:
     put(folder / "lidar/poses.json", [placed(w.car_at(at) @ w.SCANNER) for at in ats])
     put(folder / "lidar/timestamps.json", list(BEGIN + ats))
     # A turn begins at the back; the sweep's stamp is its end.
-    late = {"ahead": -0.5 * TURN, "right": -0.25 * TURN}
     return w.Made(
         root=folder,
         photographs=w.shots(CAMERAS, LAG, ats, BEGIN),
         sweeps=list(BEGIN + ats),
-        boxes=w.tracks(ats, late, beside, BEGIN),
+        boxes=w.tracks(ats, {"ahead": -0.5 * TURN, "right": -0.25 * TURN}, beside, BEGIN),
         tables=[
             Path(place, f"{name}.json")
             for place in (FRONT, "lidar")

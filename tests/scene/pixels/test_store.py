@@ -94,8 +94,7 @@ def test_undistortion_puts_pixels_where_the_pinhole_expects_them(tmp_path, lens)
     # Points are held to OpenCV's formulas in test_lens_models.py.
     rays = undistort_points(centres.reshape(-1, 2), K, lens).reshape(h, w, 2)
     image = np.round(_pattern(rays[..., 0], rays[..., 1]) * 65535).astype(np.uint16)
-    view = make_view(tmp_path / "a.png", image, f=f, distortion=lens)
-    ldr, mask = store_of(view).get(0)
+    ldr, mask = store_of(make_view(tmp_path / "a.png", image, f=f, distortion=lens)).get(0)
     truth = _pattern(centres[..., 0], centres[..., 1])
     inside = mask > 0
     assert inside.mean() > 0.5
@@ -255,8 +254,7 @@ def test_a_disk_without_room_is_refused_at_once_or_names_the_option(tmp_path, ki
         with refused("No space left on device", "--data.cache-mb"):
             in_files(tmp_path, kinds).stored(0)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=1000))
-    message = r"8 decoded photographs take 1 MB of disk.*1 MB left"
-    with refused(message, "--data.cache-mb 1"):
+    with refused(r"8 decoded photographs take 1 MB of disk.*1 MB left", "--data.cache-mb 1"):
         in_files(tmp_path, kinds)
     in_files(tmp_path, kinds, DataConfig())
 
