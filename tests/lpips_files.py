@@ -32,7 +32,6 @@ def made_arrays(net, seed=0):
 
 
 def made_weights(net, seed=0):
-    """Return a network with such weights."""
     return LpipsWeights.of(NETWORKS[net], *made_arrays(net, seed))
 
 

@@ -5,6 +5,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
+from p2gs_jax.scene.rigid import pose_of
 from p2gs_jax.types import TrackedObject
 
 WIDTH, HEIGHT, FOCAL = 96, 64, 48.0
@@ -18,10 +19,8 @@ WALL = 6.0
 
 def camera_pose(camera, frame):
     """Camera to world: the car drives along x."""
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_euler("z", AZIMUTHS[camera], degrees=True).as_matrix() @ FORWARD
-    pose[:3, 3] = FAR + np.array([SPEED * PERIOD * frame, 0, 1.6])
-    return pose
+    turn = Rotation.from_euler("z", AZIMUTHS[camera], degrees=True).as_matrix()
+    return pose_of(turn @ FORWARD, FAR + np.array([SPEED * PERIOD * frame, 0, 1.6]))
 
 
 def tracked_car(frames, moving=True):

@@ -17,6 +17,7 @@ from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.scene.drives import DriveFormat
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
+from p2gs_jax.scene.rigid import pose_of
 from p2gs_jax.types import Camera, Gaussians, TrackedObject
 
 WIDTH, HEIGHT, FOCAL = 160, 96, 110.0
@@ -47,11 +48,10 @@ def splats(means, log_scales, radiance) -> Gaussians:
 def pose_at(time: float) -> np.ndarray:
     """Return where the box is: it crosses to the right, and turns a little."""
     # Never along an axis: depths that are equal have no order.
-    turn, out = 0.1 + 0.15 * time, np.eye(4)
+    turn = 0.1 + 0.15 * time
     c, s = np.cos(turn), np.sin(turn)
-    out[:3, :3] = BOX_TO_WORLD @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    out[:3, 3] = [-2.6 + 3.5 * time, 0.5, 6.0 - 0.4 * time]
-    return out
+    rotation = BOX_TO_WORLD @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    return pose_of(rotation, [-2.6 + 3.5 * time, 0.5, 6.0 - 0.4 * time])
 
 
 def make_world() -> World:
@@ -89,9 +89,7 @@ def moved(gaussians: Gaussians, pose: np.ndarray) -> Gaussians:
 
 def camera_pose(frame: int, camera: int) -> np.ndarray:
     """Return camera-to-world of one of two cameras that drive forward."""
-    pose = np.eye(4)
-    pose[:3, 3] = [STEREO * (camera - 0.5), 0, 0.04 * frame]
-    return pose
+    return pose_of(np.eye(3), [STEREO * (camera - 0.5), 0, 0.04 * frame])
 
 
 def taken(root: Path) -> list[Photograph]:

@@ -15,17 +15,16 @@ from p2gs_jax.formats.false_color import depth_color, false_color, luminance, st
 from p2gs_jax.formats.frames import open_video, write_png
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.scene.convert.readers import ExifSettings
+from p2gs_jax.scene.rigid import pose_of
 from p2gs_jax.types import Camera
 
 WIDTH, HEIGHT = 90, 70
 
 
 def camera():
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = Rotation.from_euler("xyz", [0.2, -0.4, 0.1]).as_matrix()
-    viewmat[:3, 3] = [0.5, -1.0, 2.5]
+    turn = Rotation.from_euler("xyz", [0.2, -0.4, 0.1]).as_matrix()
     K = np.array([[80.0, 0, 41.0], [0, 84.0, 37.0], [0, 0, 1]])
-    return Camera(jnp.asarray(viewmat), jnp.asarray(K), WIDTH, HEIGHT)
+    return Camera(jnp.asarray(pose_of(turn, [0.5, -1.0, 2.5])), jnp.asarray(K), WIDTH, HEIGHT)
 
 
 def written(path, **kwargs):

@@ -7,6 +7,7 @@ import tracemalloc
 from dataclasses import replace
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,6 +24,7 @@ from p2gs_jax.formats.packed import morton_order, pack, unpack
 from p2gs_jax.formats.ply import field_names, read_ply, write_ply, write_radiance
 from p2gs_jax.formats.usd import CAMERAS, SPLATS, write_usd
 from p2gs_jax.render.harmonics import evaluate
+from p2gs_jax.scene.rigid import pose_of
 from p2gs_jax.types import Camera, Gaussians, Vibration
 
 FLIP = np.array([1.0, -1.0, -1.0])
@@ -92,9 +94,8 @@ def test_usd_is_read_by_pxr(tmp_path):
     modules = ("Gf", "Usd", "UsdGeom", "UsdVol")
     Gf, Usd, UsdGeom, UsdVol = (pytest.importorskip(f"pxr.{name}") for name in modules)
     g = random_splats(degree=2)
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_euler("yxz", [20, -10, 5], degrees=True).as_matrix()
-    pose[:3, 3] = 0.3, -0.2, 0.5
+    turn = Rotation.from_euler("yxz", [20, -10, 5], degrees=True).as_matrix()
+    pose = pose_of(turn, (0.3, -0.2, 0.5))
     K = np.array([[300.0, 0, 170.0], [0, 330.0, 118.0], [0, 0, 1]])
     write_usd(tmp_path / "a.usdc", g, {"left/1.jpg": Camera(pose, K, 320, 240)})
 
@@ -259,9 +260,7 @@ def test_fields_and_bytes_are_the_reference_ones(tmp_path, monkeypatch):
     assert (tmp_path / "ours.ply").read_bytes() == (tmp_path / "theirs.ply").read_bytes()
     moving = population(23, moves=True)
     write_radiance(tmp_path / "moving.ply", moving, activation="exp")
-    back = jax.tree.leaves(read_ply(tmp_path / "moving.ply"))
-    for one, other in zip(back, jax.tree.leaves(moving), strict=True):
-        np.testing.assert_array_equal(one, other)
+    chex.assert_trees_all_equal(read_ply(tmp_path / "moving.ply"), moving)
 
 
 def test_memory_does_not_grow_with_the_file(tmp_path, monkeypatch):

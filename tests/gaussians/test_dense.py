@@ -5,6 +5,7 @@ import dataclasses
 import cv2
 import numpy as np
 import pytest
+from scene.helpers import make_view
 
 from p2gs_jax.config import DataConfig, DensifyConfig, FitConfig
 from p2gs_jax.core.numerics import srgb_encode
@@ -22,10 +23,12 @@ from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.presets import preset
 from p2gs_jax.scene.pixels.store import ImageStore
-from p2gs_jax.types import Scene, View
+from p2gs_jax.types import Scene
 
 WIDTH, HEIGHT, FOCAL = 192, 144, 180.0
 CENTERS = np.array([[0, 0, 0], [0.4, 0, 0], [-0.4, 0.1, 0], [0.1, 0.4, 0], [0, -0.4, 0.1]])
+Y, X = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+RAYS = np.stack([(X - WIDTH / 2) / FOCAL, (Y - HEIGHT / 2) / FOCAL], -1)
 BACK, FRONT = 5.0, 4.0
 # The foreground square, scene units.
 SQUARE = 0.8
@@ -47,13 +50,11 @@ def look_up(image, x, y):
 
 def render(center, square, tilt, paint):
     """Return radiance and depth of a plane z = BACK + tilt x, and of a square before it."""
-    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    ray = np.stack([(x - WIDTH / 2) / FOCAL, (y - HEIGHT / 2) / FOCAL], -1)
-    z = (BACK + tilt * center[0] - center[2]) / (1 - tilt * ray[..., 0])
-    place = center[:2] + ray * z[..., None]
+    z = (BACK + tilt * center[0] - center[2]) / (1 - tilt * RAYS[..., 0])
+    place = center[:2] + RAYS * z[..., None]
     image = look_up(paint[0], place[..., 0], place[..., 1])
     if square:
-        place = center[:2] + ray * (FRONT - center[2])
+        place = center[:2] + RAYS * (FRONT - center[2])
         hit = (np.abs(place) < SQUARE).all(-1)
         image[hit] = look_up(paint[1], place[..., 0], place[..., 1])[hit]
         z = np.where(hit, FRONT - center[2], z)
@@ -68,17 +69,13 @@ class World:
         exposures = np.ones(len(CENTERS)) if exposures is None else np.asarray(exposures)
         paint, other = (texture(1), texture(2)), (texture(3), texture(4))
         views, self.depths = [], []
-        K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]], np.float32)
         for k, center in enumerate(CENTERS):
             linear, z = render(center, square, tilt, other if k in spoil else paint)
             if change is not None:
                 linear = change(k, linear)
             shown = srgb_encode(np.clip(linear * exposures[k], 0, 1).astype(np.float32))
-            name = path / f"{k}.png"
-            cv2.imwrite(str(name), np.rint(255 * shown[..., ::-1]).astype(np.uint8))
-            viewmat = np.eye(4, dtype=np.float32)
-            viewmat[:3, 3] = -center
-            views.append(View(name.name, name, "0", viewmat, K, WIDTH, HEIGHT))
+            codes = np.rint(255 * shown[..., ::-1]).astype(np.uint8)
+            views.append(make_view(path / f"{k}.png", codes, FOCAL, at=center))
             self.depths.append(z)
         x, y = (g.ravel() for g in np.meshgrid(np.linspace(-2, 2, 5), np.linspace(-1.5, 1.5, 4)))
         points = np.stack([x, y, BACK + tilt * x], 1).astype(np.float32)
@@ -154,9 +151,7 @@ def test_exposures_do_not_matter_once_they_are_solved(tmp_path):
 
 def test_clipped_pixels_carry_no_seed(tmp_path):
     def lamp(k, linear):
-        y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-        ray = np.stack([(x - WIDTH / 2) / FOCAL, (y - HEIGHT / 2) / FOCAL], -1)
-        place = CENTERS[k, :2] + ray * (BACK - CENTERS[k, 2])
+        place = CENTERS[k, :2] + RAYS * (BACK - CENTERS[k, 2])
         linear[(np.abs(place) < 0.5).all(-1)] = 3.0
         return linear
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scene.helpers import make_view
 from tiny_scene import make_scene, prepared
 
 from p2gs_jax.config import FitConfig, InitConfig
@@ -21,14 +22,11 @@ from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.pipeline.survey import load, scale_notes
 from p2gs_jax.presets import preset
 from p2gs_jax.render import view_radiance
-from p2gs_jax.types import Camera, Scene, View
+from p2gs_jax.types import Camera, Scene
 
 
 def view(x=0.0):
-    viewmat = np.eye(4, dtype=np.float32)
-    viewmat[0, 3] = -x
-    K = np.array([[100, 0, 80], [0, 100, 45], [0, 0, 1]], np.float32)
-    return View(f"{x}.png", Path("none"), "0", viewmat, K, 160, 90)
+    return make_view(Path(f"{x}.png"), f=100.0, at=(x, 0, 0), size=(160, 90))
 
 
 def street_points(ground_only):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scene.helpers import make_view
 
 from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 from p2gs_jax.evaluation.alignment import exposure_error
@@ -19,7 +20,7 @@ from p2gs_jax.presets import preset
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.visibility import unoccluded
-from p2gs_jax.types import Scene, Tracks, View
+from p2gs_jax.types import Scene, Tracks
 
 
 def test_a_wall_hides_what_is_behind_it():
@@ -58,9 +59,6 @@ def test_exposures_without_tracks_and_what_was_left_out_is_said(noisy_street, tm
     assert exposure_error(np.exp(found.solution.log_exposures), expected)["ev"] < 0.03
 
 
-GREY_K = np.array([[50.0, 0, 30], [0, 50, 20], [0, 0, 1]], np.float32)
-
-
 class Grey(ImageStore):
     """Photographs of one grey."""
 
@@ -73,11 +71,10 @@ class Grey(ImageStore):
 
 def seen_from(distances):
     """Return a scene of one point and a view at every distance from it; behind where negative."""
-    views = []
-    for k, distance in enumerate(distances):
-        viewmat = np.eye(4, dtype=np.float32)
-        viewmat[2, 3] = distance
-        views.append(View(f"{k}.png", Path(f"{k}.png"), "0", viewmat, GREY_K, 60, 40))
+    views = [
+        make_view(Path(f"{k}.png"), f=50.0, at=(0, 0, -distance), size=(60, 40))
+        for k, distance in enumerate(distances)
+    ]
     count = len(distances)
     tracks = Tracks(np.arange(count), np.zeros(count, int), np.full((count, 2), 20.0, np.float32))
     points = np.zeros((1, 3), np.float32)

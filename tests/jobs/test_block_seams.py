@@ -5,7 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from PIL import Image
+from scene.helpers import make_view
 from splats import gaussians_of
 
 from p2gs_jax.config import DataConfig, RenderConfig
@@ -15,7 +15,7 @@ from p2gs_jax.jobs.blocks.cut import OVERLAP, Block, Cut, Ground
 from p2gs_jax.jobs.blocks.seams import INWARDS, level_seams, measure_seams, merge_cores, shifts
 from p2gs_jax.render.harmonics import C0
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
-from p2gs_jax.types import Scene, View
+from p2gs_jax.types import Scene
 
 GROUND = Ground(np.zeros(3), np.eye(3)[:2])
 INF = np.inf
@@ -26,14 +26,8 @@ REACH = INWARDS / OVERLAP  # of a margin of one
 @pytest.fixture(scope="module")
 def two_views(tmp_path_factory):
     root = tmp_path_factory.mktemp("seams")
-    K = np.array([[40, 0, 32], [0, 40, 24], [0, 0, 1]], np.float32)
-    views = []
-    for k in range(2):
-        path = root / f"{k}.png"
-        Image.new("RGB", (64, 48)).save(path)
-        viewmat = np.eye(4, dtype=np.float32)
-        viewmat[0, 3] = 0.3 * k
-        views.append(View(path.name, path, "0", viewmat, K, 64, 48))
+    black, places = np.zeros((48, 64, 3), np.uint8), [(-0.3 * k, 0, 0) for k in range(2)]
+    views = (make_view(root / f"{k}.png", black, 40.0, at=at) for k, at in enumerate(places))
     return Scene(root, "made", tuple(views), np.zeros((1, 3), np.float32), None)
 
 

@@ -15,6 +15,7 @@ from p2gs_jax.render import required_capacity
 from p2gs_jax.render import visible as visibility
 from p2gs_jax.render.project import HIDDEN, camera_of_each
 from p2gs_jax.render.visible import BLOCK, compact, splat
+from p2gs_jax.scene.rigid import pose_of
 from p2gs_jax.train.capacities import count_view
 from p2gs_jax.types import Camera, Placement
 
@@ -27,10 +28,7 @@ in_view = jax.jit(visibility.in_view, static_argnums=3)
 
 
 def pose(seed: int, at=(0.0, 0.0, 4.0)) -> np.ndarray:
-    out = np.eye(4)
-    out[:3, :3] = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
-    out[:3, 3] = at
-    return out
+    return pose_of(Rotation.random(rng=np.random.default_rng(seed)).as_matrix(), at)
 
 
 POSES = np.stack([pose(1, (0.4, 0.2, 4.0)), pose(2, (-0.6, -0.3, 5.0)), pose(3)])
@@ -51,8 +49,8 @@ def scene():
 
 def view(objects: bool = True) -> Camera:
     K = jnp.array([[40.0, 0, WIDTH / 2], [0, 42.0, HEIGHT / 2], [0, 0, 1]])
-    viewmat = pose(0, (0.1, -0.2, 0.3)).astype(np.float32)
-    viewmat[:3, :3] = Rotation.from_euler("xyz", [0.05, -0.1, 0.2]).as_matrix()
+    turn = Rotation.from_euler("xyz", [0.05, -0.1, 0.2]).as_matrix()
+    viewmat = pose_of(turn, (0.1, -0.2, 0.3)).astype(np.float32)
     placement = None
     if objects:
         viewmats = (viewmat.astype(np.float64) @ POSES).astype(np.float32)
@@ -63,7 +61,6 @@ def view(objects: bool = True) -> Camera:
 
 @jax.jit
 def seen_by(g, alive, camera, owner=None):
-    """Return the splats in a view and their radiance."""
     return splat(g, alive, camera, CFG, 3, owner)
 
 

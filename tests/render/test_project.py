@@ -13,6 +13,7 @@ from scipy.special import sph_harm_y
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import project
 from p2gs_jax.render.harmonics import MAX_DEGREE, basis
+from p2gs_jax.scene.rigid import pose_of
 
 CFG = RenderConfig()
 
@@ -35,9 +36,7 @@ def by_definition(g, cam, i):
 def test_splats_are_the_definition():
     with jax.enable_x64(True):
         g, cam = street(dtype=np.float64)
-        viewmat = np.eye(4)
-        viewmat[:3, :3] = rotation(np.array([1, 0.05, -0.1, 0.2]))
-        viewmat[:3, 3] = 0.3, -0.2, 0.5
+        viewmat = pose_of(rotation(np.array([1, 0.05, -0.1, 0.2])), (0.3, -0.2, 0.5))
         cam = dataclasses.replace(cam, viewmat=jnp.asarray(viewmat))
         n = g.capacity
         splats = jax.jit(lambda g: project(g, jnp.ones(n, bool), cam, CFG))(g)

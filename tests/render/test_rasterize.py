@@ -111,7 +111,6 @@ def test_oracle_gradient_matches_finite_differences():
 
 @pytest.fixture(scope="module")
 def shown():
-    """A street and its image."""
     g, cam = street()
     return g, cam, slope(g, cam)[1].linear
 

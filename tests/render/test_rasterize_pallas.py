@@ -23,7 +23,6 @@ def loss(g, cam, cfg):
 
 @pytest.mark.slow
 def test_views_batch_and_the_ordered_sum_is_the_atomic_one():
-    """A batch of cameras by vmap is one launch, and the sum of its views."""
     g, cam = street(n=60, width=24, height=16)
     ordered = dataclasses.replace(CFG, deterministic=True)
     viewmats = jnp.stack([jnp.eye(4).at[0, 3].set(0.3 * i) for i in range(3)])
@@ -59,7 +58,6 @@ def test_the_kernels_lower_to_triton(monkeypatch, deterministic):
 
 def test_what_runs_here_is_chosen(monkeypatch):
     assert fastest_here() == ("pallas" if jax.default_backend() == "gpu" else "xla")
-
     assert slow_here() is None or jax.default_backend() != "cpu"
 
     class Device:

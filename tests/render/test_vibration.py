@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -37,11 +38,6 @@ def opacity(g):
     return float(jax.nn.sigmoid(g.opacity_logits)[0])
 
 
-def same(found, expected, **tolerance):
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-        np.testing.assert_allclose(a, b, **tolerance)
-
-
 def test_it_is_where_and_as_opaque_as_the_formula_says():
     g, still = gaussian(), np.exp(-LIFE / (2 * CYCLE))
     for time in (-0.5, 0.0, 0.2, 0.3, 0.9):
@@ -61,11 +57,11 @@ def test_it_is_where_and_as_opaque_as_the_formula_says():
 def test_it_is_the_same_on_the_host_and_without_a_time_in_the_middle_of_the_drive():
     g = gaussian()
     for objects in (None, dataclasses.replace(placement(0.7), time=None)):
-        same(at(g, objects), at(g, placement(0.0)), rtol=0)
+        chex.assert_trees_all_close(at(g, objects), at(g, placement(0.0)), rtol=0)
     host = at_time(*jax.tree.map(np.asarray, (g, placement(0.35))))
     assert isinstance(host.means, np.ndarray)
     assert host.means.dtype == host.opacity_logits.dtype == np.float32
-    same(host, at(g, placement(0.35)), rtol=1e-5, atol=1e-6)
+    chex.assert_trees_all_close(host, at(g, placement(0.35)), rtol=1e-5, atol=1e-6)
 
 
 def test_what_lives_for_ever_stands_and_no_gradient_moves_it():

@@ -212,11 +212,9 @@ def wall_run(tmp_path_factory):
     views, rows = [], []
     for i, e in enumerate(EXPOSURES):
         codes = np.rint(255 * srgb_encode(np.clip(e * wall(0.3 * i), 0, 1)))
-        viewmat = np.eye(4, dtype=np.float32)
-        viewmat[0, 3] = -0.3 * i
-        view = make_view(root / f"{i}.png", codes.astype(np.uint8), f=FOCAL)
-        views.append(replace(view, viewmat=viewmat))
-        rows.append({"image": view.name, "exposure": e, "exposure_ev": float(np.log2(e))})
+        path, at = root / f"{i}.png", (0.3 * i, 0, 0)
+        views.append(make_view(path, codes.astype(np.uint8), f=FOCAL, at=at))
+        rows.append({"image": path.name, "exposure": e, "exposure_ev": float(np.log2(e))})
     across, up = np.meshgrid(np.linspace(-3, 3, 40), np.linspace(-2, 2, 28))
     points = np.stack([across, up, np.full_like(up, WALL)], -1).reshape(-1, 3).astype(np.float32)
     n = len(points)

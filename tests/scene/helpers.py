@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from p2gs_jax.errors import UserError
+from p2gs_jax.scene.rigid import pose_of
 from p2gs_jax.types import Scene, View
 
 
@@ -84,14 +85,17 @@ def write_rgba(path: Path, value: int = 90, size: tuple[int, int] = (40, 30)) ->
     assert cv2.imwrite(str(path), image)
 
 
-def make_view(path: Path, image: np.ndarray | None = None, f: float = 60.0, **fields) -> View:
-    """Return a view of a file, written first where an image is given; its lens is a pinhole."""
-    size = fields.pop("size", (64, 48))
+def make_view(
+    path: Path, image: np.ndarray | None = None, f: float = 60.0, *, at=(0.0, 0.0, 0.0), **fields
+) -> View:
+    """Return a pinhole's view of a file that looks along z; an image given is written first."""
+    size, viewmat = fields.pop("size", (64, 48)), np.eye(4, dtype=np.float32)
+    viewmat[:3, 3] -= at
     if image is not None:
         assert cv2.imwrite(str(path), image)
         size = image.shape[1::-1]
     K = np.array([[f, 0, size[0] / 2], [0, f, size[1] / 2], [0, 0, 1]], np.float32)
-    return View(path.name, path, "0", np.eye(4, dtype=np.float32), K, *size, **fields)
+    return View(path.name, path, "0", viewmat, K, *size, **fields)
 
 
 def around(count: int, distance: float = 4.0) -> np.ndarray:
@@ -102,10 +106,7 @@ def around(count: int, distance: float = 4.0) -> np.ndarray:
         back /= np.linalg.norm(back)
         right = np.cross([0.0, 0.0, 1.0], back)
         right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3, :3] = np.stack([right, np.cross(back, right), back], 1)
-        pose[:3, 3] = distance * back
-        poses.append(pose)
+        poses.append(pose_of(np.stack([right, np.cross(back, right), back], 1), distance * back))
     return np.stack(poses)
 
 

@@ -51,11 +51,13 @@ class Views:
 class Programs:
     """Programs that take `compile_s` to wait for and `step_s(width)` to run, on the given clock."""
 
-    def __init__(self, clock, compile_s=5.0, step_s=lambda width: 0.1):
+    def __init__(
+        self, clock, compile_s=5.0, step_s=lambda width: 0.1, *, overflows_at=None, breaks_at=None
+    ):
         self.clock, self.compile_s, self.step_s = clock, compile_s, step_s
         self.capacities, self.waited_s = {}, 0.0
         self.made, self.taken = [], []
-        self.overflows_at, self.breaks_at = None, None
+        self.overflows_at, self.breaks_at = overflows_at, breaks_at
 
     def expect(self, *arguments, **options):
         pass
@@ -106,7 +108,6 @@ class Harness:
         self.folder, self.said = folder, []
 
     def run(self, cfg=SHORT, *, resume=False, programs=None, **options):
-        """Run to the end; return the result and the programs."""
         programs = programs or Programs(self.clock)
         given = (cfg, Views(), 1.0, None, Coverage(400 * 300, 1.0), self.folder, programs)
         told = {"on_message": self.said.append, "now": lambda: self.clock.now}

@@ -6,11 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scene.helpers import make_view
 
 from p2gs_jax.config import FitConfig, LossConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.train.lidar_depths import CLIP, MOST_PER_VIEW, lidar_loss, measured_depths
-from p2gs_jax.types import Lidar, Measured, Scene, View
+from p2gs_jax.types import Lidar, Measured, Scene
 
 HEIGHT, WIDTH = 4, 6
 
@@ -43,11 +44,7 @@ def test_where_nothing_is_opaque_or_measured_it_is_zero_and_finite(alpha, measur
 
 
 def wall_scene(**lidar) -> Scene:
-    K = np.array([[50, 0, 32], [0, 50, 24], [0, 0, 1]], np.float32)
-    views = tuple(
-        View(f"{k}.png", Path("none"), "0", np.eye(4, dtype=np.float32), K, 64, 48, time=float(k))
-        for k in range(2)
-    )
+    views = tuple(make_view(Path(f"{k}.png"), f=50.0, time=float(k)) for k in range(2))
     points = np.zeros((0, 3), np.float32)
     return Scene(
         Path("drive"), "test", views, points, None, lidar=Lidar(**lidar) if lidar else None

@@ -27,8 +27,7 @@ def pace_of(lines):
 @pytest.mark.parametrize("cfg", [SHORT, BUDGET])
 def test_compiling_is_never_pace(harness, cfg):
     """Neither the first program, nor one after an overflow, nor those of a resumed run."""
-    programs = Programs(harness.clock, compile_s=7.0)
-    programs.overflows_at = 23
+    programs = Programs(harness.clock, compile_s=7.0, overflows_at=23)
     result, _ = harness.run(cfg, programs=programs)
     assert len(programs.made) == 2
     assert result.host.overflows == 1
@@ -42,10 +41,8 @@ def test_compiling_is_never_pace(harness, cfg):
 
 def test_a_resumed_run_keeps_its_pace(harness):
     cut = with_fields(SHORT, {"train.checkpoint_every_s": 0.0})
-    programs = Programs(harness.clock, compile_s=7.0)
-    programs.breaks_at = 52
     with pytest.raises(DivergenceError, match=r"Step 53: .* checkpoint is step 50"):
-        harness.run(cut, programs=programs)
+        harness.run(cut, programs=Programs(harness.clock, compile_s=7.0, breaks_at=52))
     assert harness.checkpoints.latest_step() == 50
     before = len(harness.log())
     result, programs = harness.run(cut, resume=True)
@@ -78,10 +75,8 @@ def test_a_finished_run_goes_on_where_more_steps_are_asked_for(harness, cfg):
 def test_a_longer_run_that_is_killed_before_it_saves_goes_on_as_if_nothing_had_been(harness):
     harness.run(SHORT)
     longer = with_fields(SHORT, {"train.steps": 200})
-    programs = Programs(harness.clock)
-    programs.breaks_at = 152
     with pytest.raises(DivergenceError, match="checkpoint is step 100"):
-        harness.run(longer, programs=programs, resume=True)
+        harness.run(longer, programs=Programs(harness.clock, breaks_at=152), resume=True)
     harness.run(longer, resume=True)
     logged = [line["progress"] for line in harness.log()]
     assert logged == pytest.approx([k / 40 for k in range(1, 41)], abs=1e-6)
@@ -116,8 +111,8 @@ def test_checkpoints_take_no_more_than_a_hundredth_of_a_run(harness):
 def test_a_level_begins_a_new_estimate_of_the_pace_and_the_log_names_the_level_of_its_steps(
     harness,
 ):
-    programs = Programs(harness.clock, step_s={200: 0.1, 400: 0.4}.get)
-    harness.run(LEVELS, programs=programs)
+    costs = {200: 0.1, 400: 0.4}
+    _, programs = harness.run(LEVELS, programs=Programs(harness.clock, step_s=costs.get))
     lines, last = harness.log(), 0
     assert {line["shrink"] for line in lines} == {1, 2}
     for line in lines:

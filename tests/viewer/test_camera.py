@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from p2gs_jax.scene.rigid import pose_of
 from p2gs_jax.types import Scene, View
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
@@ -14,10 +15,8 @@ SPACE = cameras.ViewerSpace(2.5, np.array([0.0, -1.0, 0.0]))
 
 
 def viewmat(turn, at):
-    out = np.eye(4)
-    out[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
-    out[:3, 3] = -out[:3, :3] @ at
-    return out
+    rotation = Rotation.from_rotvec(turn).as_matrix()
+    return pose_of(rotation, -rotation @ at)
 
 
 def pixel(camera, point):

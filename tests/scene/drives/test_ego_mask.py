@@ -11,6 +11,7 @@ from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.drives.ego_mask import find_ego_mask
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera
 from p2gs_jax.scene.pixels.store import ImageStore
+from p2gs_jax.scene.rigid import pose_of
 
 W, H, F, HEIGHT = 480, 270, 400.0, 1.6
 K = np.array([[F, 0, W / 2], [0, F, 0.45 * H], [0, 0, 1.0]])
@@ -23,10 +24,7 @@ CLOUDS = cv2.GaussianBlur(RNG.random((512, 1024)).astype(np.float32), (0, 0), 6)
 
 
 def pose_at(way, turned=0.0):
-    pose = np.eye(4)
-    pose[:3, :3] = cv2.Rodrigues(np.array([0.0, turned, 0.0]))[0]
-    pose[2, 3] = way
-    return pose
+    return pose_of(cv2.Rodrigues(np.array([0.0, turned, 0.0]))[0], [0, 0, way])
 
 
 # Where the bonnet is: an arch at the bottom.

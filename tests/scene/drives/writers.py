@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from p2gs_jax.scene.rigid import pose_of
+
 WIDTH, HEIGHT = 64, 48
 # Of every camera: fx, fy, cx, cy with pixel centres at +0.5.
 K = (50, 51, 32, 24)
@@ -21,9 +23,7 @@ LENGTH, BREADTH, TALL = SIZE = (4.2, 1.8, 1.5)
 
 
 def matrix(turn: Rotation, position) -> np.ndarray:
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = turn.as_matrix(), position
-    return out
+    return pose_of(turn.as_matrix(), np.asarray(position))
 
 
 inv = np.linalg.inv
