@@ -122,14 +122,14 @@ def evaluate(
     gaussians = jax.device_put(params.gaussians)
     living = jax.device_put(np.ones(params.gaussians.capacity, bool))
     seen = functools.partial(render or make_renderer(cfg.render), gaussians, living)
-    views = _Views(judge)
+    views = _Views(judge, seen, radiance)
     judged = functools.partial(_judged, judge, seen, radiance)
     # In the order of names: the frames of a camera are then in sequence.
     for found in map_in_order(judged, range(len(scene.views))):
         on_progress(found.result.index + 1, len(scene.views))
         views.add(found)
         on_view(found.result)
-    return views.evaluation(seen, radiance)
+    return views.evaluation()
 
 
 class _Judged(NamedTuple):
@@ -217,8 +217,8 @@ def _all_fitted(
 class _Views:
     """Collects judged views, and what needs all of them."""
 
-    def __init__(self, judge: Judge):
-        self._judge = judge
+    def __init__(self, judge: Judge, seen: Callable[[Camera], Render], radiance: Truth | None):
+        self._judge, self._seen, self._radiance = judge, seen, radiance
         self._depths = DepthScores(judge.scene, judge.store)
         self._rows: dict[str, dict[str, dict]] = defaultdict(dict)
         self._videos = {
@@ -261,9 +261,7 @@ class _Views:
         self._videos["averaged"].add(view.camera, found.averaged, judge.mean.exposure)
         self._videos["photographs"].add(view.camera, result.photograph, exposure)
 
-    def evaluation(
-        self, seen: Callable[[Camera], Render], radiance: Truth | None = None
-    ) -> Evaluation:
+    def evaluation(self) -> Evaluation:
         """Return all scores; what all views decide is scored in a second pass over some."""
         judge, rows = self._judge, self._rows
         exposures = np.asarray(judge.small.photometry.exposures)
@@ -288,24 +286,17 @@ class _Views:
         metrics["consistency"] = {name: video.summary() for name, video in self._videos.items()}
         exposed = exposed_at(judge.cfg.loss.saturation, gamma, tone)
         brightest = exposed / float(np.median(exposures))
-        self._again(metrics, metering, brightest, seen, radiance)
+        self._again(metrics, metering, brightest)
         metrics |= self._depths.summary()
         return Evaluation(metrics, metering)
 
-    def _again(
-        self,
-        metrics: dict[str, Any],
-        metering: Metering,
-        brightest: float,
-        seen: Callable[[Camera], Render],
-        radiance: Truth | None,
-    ) -> None:
+    def _again(self, metrics: dict[str, Any], metering: Metering, brightest: float) -> None:
         """Render views that are compared once all are known, and add their scores.
 
         Held-out views are shown under the exposure of the metering rule; others are compared with
         references of one common exposure and with their true radiance.
         """
-        judge, common = self._judge, {}
+        judge, radiance, common = self._judge, self._radiance, {}
         if self._scales:
             scale = float(np.exp(np.median(np.log(list(self._scales.values())))))
             common = {"averaged": judge.mean.exposure, "scale_aligned": scale}
@@ -316,7 +307,7 @@ class _Views:
 
         def judged(index: int) -> dict[str, dict[str, Any]]:
             photograph, mask = judge.store.get(index)
-            rendered, found = seen(camera_of(judge.store, index)), {}
+            rendered, found = self._seen(camera_of(judge.store, index)), {}
             linear, alpha = np.asarray(rendered.linear), np.asarray(rendered.alpha)
             if index in metered:
                 exposure = metering.exposure(metered[index])
