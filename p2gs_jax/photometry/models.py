@@ -64,19 +64,6 @@ class Form(NamedTuple):
 EXPOSURES = Form("view_exposure")
 
 
-def possible(form: Form, cameras: int, power: bool = False) -> bool:
-    """Return whether a form differs from every simpler one, and can be solved.
-
-    With one physical camera, "per camera" means "for all": of gammas that is a gauge, unless known
-    exposures tell the `power`.
-    """
-    varies = MODELS[form.model]
-    levels = (varies.exposure, None if power else varies.gamma, form.white_balance)
-    if cameras < 2 and "camera" in levels:
-        return False
-    return form.white_balance != "view" or varies.exposure == "view"
-
-
 def parameter_count(
     form: Form, by: ResponseKind | None, cameras: int, views: int, power: bool = False
 ) -> int:
@@ -134,14 +121,21 @@ class Scope(NamedTuple):
     power: bool = False  # known exposures tell the power of the curve
 
     def allows(self, choice: Choice) -> bool:
-        """Return whether a choice differs from simpler ones and can be solved."""
-        by = choice.curve.splines
+        """Return whether a choice differs from simpler ones and can be solved.
+
+        With one physical camera, "per camera" means "for all": of gammas that is a gauge, unless
+        known exposures tell the power.
+        """
+        form, by = choice.form, choice.curve.splines
+        exposure, gamma, _ = MODELS[form.model]
+        told = self.power and by is None and not self.known
+        levels = (exposure, None if told else gamma, form.white_balance, by)
         return (
-            (choice.curve == Curve() or not self.known)
+            (self.cameras > 1 or "camera" not in levels)
+            and (form.white_balance != "view" or exposure == "view")
+            and (choice.curve == Curve() or not self.known)
             and (by is None or self.curves)
-            and (by != "camera" or self.cameras > 1)
-            and (choice.form.vignetting is None or self.places)
-            and possible(choice.form, self.cameras, self.power and by is None and not self.known)
+            and (form.vignetting is None or self.places)
             and (not self.power or self._free(choice))
         )
 
