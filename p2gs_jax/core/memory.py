@@ -9,7 +9,7 @@ from pathlib import Path
 
 CGROUP = Path("/sys/fs/cgroup")
 MEMINFO = Path("/proc/meminfo")
-STATM = Path("/proc/self/statm")
+STATM, STATUS = Path("/proc/self/statm"), Path("/proc/self/status")
 # How JAX names its errors, and what it says where memory ran out.
 _OF_JAX = ("XlaRuntimeError", "JaxRuntimeError")
 _SAID = ("RESOURCE_EXHAUSTED", "Out of memory", "out of memory")
@@ -51,6 +51,14 @@ def resident() -> int:
     return int(pages[1]) * resource.getpagesize() if len(pages) > 1 else 0
 
 
+def peak_bytes() -> int | None:
+    """Return the most memory that this process has held, or None where the system does not say.
+
+    From /proc: `getrusage` counts what the process was before it became this one.
+    """
+    return _numbers(STATUS).get("VmHWM")
+
+
 def ran_out(error: BaseException) -> bool:
     """Return whether an error says that memory ran out: Python's, the system's, or JAX's."""
     if isinstance(error, MemoryError) or "can't start new thread" in str(error):
@@ -69,6 +77,6 @@ def text_of(path: Path) -> str:
 
 
 def _numbers(path: Path) -> dict[str, int]:
-    """Return bytes by name of lines such as "MemTotal: 8000000 kB"."""
-    rows = (line.split() for line in text_of(path).splitlines())
-    return {row[0].rstrip(":"): int(row[1]) * 1024 for row in rows if len(row) == 3}
+    """Return bytes by name of lines such as "MemTotal: 8000000 kB"; others are passed over."""
+    found = re.findall(r"^(\S+):\s+(\d+) kB$", text_of(path), re.MULTILINE)
+    return {name: int(kilobytes) * 1024 for name, kilobytes in found}

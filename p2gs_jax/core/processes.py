@@ -1,4 +1,4 @@
-"""This process and those that it starts: where they import from, and what they held of memory.
+"""This process and those that it starts: where they import from.
 
 A working folder holds somebody's scene: a `cv2.py` beside the photographs would run where Python
 looks for modules there. `python -m` does, and so does an empty part of PYTHONPATH.
@@ -11,7 +11,6 @@ import sys
 
 # The folder that holds the package: an uninstalled checkout may be the working folder.
 _OWN = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-_STATUS = "/proc/self/status"
 
 
 def leave_out_working_folder() -> None:
@@ -35,16 +34,3 @@ def _search_path() -> list[str]:
         return [place for place in sys.path if place]
     kept = [place for place in sys.path if place and os.path.realpath(place) != here]
     return [_OWN, *kept] if here == os.path.realpath(_OWN) else kept
-
-
-def peak_bytes() -> int | None:
-    """Return the most memory that this process has held, or None where the system does not say.
-
-    From /proc: `getrusage` counts what the process was before it became this one.
-    """
-    try:
-        with open(_STATUS, encoding="ascii") as file:
-            rows = dict(line.split(":", 1) for line in file if ":" in line)
-        return int(rows["VmHWM"].split()[0]) * 1024
-    except (OSError, ValueError, LookupError):
-        return None

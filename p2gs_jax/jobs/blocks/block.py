@@ -10,7 +10,7 @@ from typing import Any
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.clock import Stopwatch
-from p2gs_jax.core.processes import peak_bytes
+from p2gs_jax.core.memory import peak_bytes
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.core.runtime import tune_process, use_compile_cache
 from p2gs_jax.formats.ply import write_radiance

@@ -13,8 +13,8 @@ import jax
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import no_empty_folders, write_json
 from p2gs_jax.core.clock import Stopwatch
+from p2gs_jax.core.memory import peak_bytes
 from p2gs_jax.core.numerics import on_device
-from p2gs_jax.core.processes import peak_bytes
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.core.runtime import return_freed_memory
 from p2gs_jax.errors import UserError
