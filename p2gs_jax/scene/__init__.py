@@ -44,12 +44,12 @@ def load_scene(
     found = find_scene(root, cfg, report)
     if isinstance(found, Recording):
         scene = assemble(found, cfg, work_dir, report)
-    elif isinstance(found, PhotographsAlone | Video):
+    elif isinstance(found, PhotographsAlone | Path):
         # Imported here as below: scenes with cameras and points do not need COLMAP.
         from p2gs_jax.scene.sfm.map import load_images
 
-        if isinstance(found, Video):
-            photographs = read_video(found.path, cfg, work_dir, report)
+        if isinstance(found, Path):
+            photographs = read_video(found, cfg, work_dir, report)
             if cfg.matching == "auto":
                 cfg = dataclasses.replace(cfg, matching="sequence")
         else:
@@ -95,16 +95,12 @@ class PhotographsAlone(NamedTuple):
     paths: list[Path]
 
 
-class Video(NamedTuple):
-    """A video of which nothing else is known."""
-
-    path: Path
-
-
 def find_scene(
     root: Path, cfg: DataConfig, report: Report = lambda message: None
-) -> Scene | Recording | PhotographsAlone | Video:
+) -> Scene | Recording | PhotographsAlone | Path:
     """Return what a folder holds, as `load_scene` finds it; nothing long is computed.
+
+    A video, of which nothing else is known, is its path.
 
     Raises UserError: there is no scene, or it is broken; the message names the file.
     """
@@ -113,7 +109,7 @@ def find_scene(
         raise broken(root, "does not exist", "check the path of the scene")
     if root.is_file():
         if root.suffix.lower() in VIDEO_SUFFIXES:
-            return Video(root)
+            return root
         if root.suffix.lower() != ".json":
             fix = "name the folder of the scene, its transforms.json, or a video"
             raise broken(root, "is neither a transforms.json nor a video", fix)

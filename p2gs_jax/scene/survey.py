@@ -12,7 +12,7 @@ import numpy as np
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.text import count_of
-from p2gs_jax.scene import PhotographsAlone, Video, find_scene, with_what_lies_beside
+from p2gs_jax.scene import PhotographsAlone, find_scene, with_what_lies_beside
 from p2gs_jax.scene.convert.readers import exif_evs
 from p2gs_jax.scene.drives.assemble import assemble, chosen_frames
 from p2gs_jax.scene.drives.recording import Recording
@@ -66,8 +66,8 @@ def survey(root: Path, cfg: DataConfig, report: Report = lambda message: None) -
     alone = ("There is nothing else: structure from motion finds the cameras when a fit starts.",)
     if isinstance(found, PhotographsAlone):
         return Survey("images", _sizes(found), alone)
-    if isinstance(found, Video):
-        camera = SurveyedCamera("", expected_frames(found.path) or 0, video_size(found.path))
+    if isinstance(found, Path):  # of a video
+        camera = SurveyedCamera("", expected_frames(found) or 0, video_size(found))
         return Survey("video", (camera,), alone)
     if isinstance(found, Recording):
         scene = with_what_lies_beside(assemble(found, cfg, None, report, write_embedded=False), cfg)

@@ -225,7 +225,7 @@ def test_frames_are_kept_and_may_be_chosen_by_number(tmp_path: Path) -> None:
     few = read(film, tmp_path, every=10, max_frames=3)
     assert [path.name for path in few.paths] == ["000000.png", "000020.png", "000040.png"]
     assert "thinned from 5 (--max-frames)" in few.notes[0]
-    assert find_scene(film, DataConfig()) == (film,)
+    assert find_scene(film, DataConfig()) == film
     surveyed = survey(film, DataConfig())
     assert surveyed.format == "video"
     assert (surveyed.cameras[0].photographs, surveyed.cameras[0].size) == (50, (240, 136))
