@@ -1,7 +1,7 @@
-"""OpenEXR: linear radiance with the photometry and the camera that belong to it.
+"""OpenEXR: linear radiance with its photometry and its camera.
 
 Standard attributes follow https://openexr.com/en/latest/StandardAttributes.html: matrices act on
-row vectors, as Imath's; camera space is left-handed with x right, y up and z forward; NDC runs
+row vectors, as in Imath; camera space is left-handed with x right, y up and z forward; NDC range
 from (0, 0) at the upper left of the display window to (1, 1) at its lower right.
 """
 
@@ -73,11 +73,11 @@ def camera_attributes(camera: Camera) -> dict:
     """Return the header attributes that describe a camera."""
     viewmat, K = np.asarray(camera.viewmat, np.float64), np.asarray(camera.K, np.float64)
     to_y_up = np.diag([1.0, -1.0, 1.0, 1.0])
-    # Half the image less the principal point, over the focal length: camera space at z = 1.
-    # Of column vectors in OpenCV's camera space; the third row gives 1 / z.
+    # This matrix acts on column vectors in OpenCV's camera space; its third row gives 1 / z.
     to_ndc = np.zeros((4, 4))
     to_ndc[:2, :3] = K[:2] / np.array([[camera.width], [camera.height]])
     to_ndc[2, 3] = to_ndc[3, 2] = 1.0
+    # The centre of the image in camera space at z = 1.
     right = (camera.width / 2 - K[0, 2]) / K[0, 0]
     up = (K[1, 2] - camera.height / 2) / K[1, 1]
     return {
@@ -91,12 +91,12 @@ def camera_attributes(camera: Camera) -> dict:
 
 
 def _for_rows(matrix: Float[np.ndarray, "4 4"]) -> Float32[np.ndarray, "4 4"]:
-    """Return the matrix for row vectors, laid out as OpenEXR reads it: it ignores strides."""
+    """Return the matrix for row vectors, contiguous because OpenEXR ignores strides."""
     return np.ascontiguousarray(matrix.T, np.float32)
 
 
 def _display_attributes(taken: DisplayTransform) -> dict:
-    """Return exposure, gamma, and white balance and vignetting where they are modelled."""
+    """Return exposure and gamma, and white balance and vignetting if they are modelled."""
     out: dict[str, Any] = {
         "p2gsExposure": float(taken.exposure),
         "p2gsExposureEV": float(np.log2(taken.exposure)),
@@ -113,9 +113,9 @@ def _display_attributes(taken: DisplayTransform) -> dict:
 def read_exr(
     path: Path,
 ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"] | None, dict]:
-    """Return linear radiance, premultiplied by the opacity; that, or None; and the header.
+    """Return linear radiance, premultiplied by opacity, the opacity or None, and the header.
 
-    A UserError says that the file cannot be read or has no R, G, B.
+    Raises UserError: the file cannot be read or has no R, G, B.
     """
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:

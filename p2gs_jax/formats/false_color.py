@@ -1,6 +1,6 @@
 """False colours: luminance in stops, and depth.
 
-The lightness of all colour maps rises evenly, so that they can be read without colour as well.
+The lightness of both colour maps rises evenly, so that they can be read without colour.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def stops(linear: Float[np.ndarray, "... 3"], middle: float) -> Float[np.ndarray
 def false_color(linear: Float[np.ndarray, "h w 3"], middle: float) -> Float32[np.ndarray, "h w 3"]:
     """Return luminance as colour, one step of the map for each whole stop from `middle`.
 
-    `STOPS` are the ends of the map; beyond them it stays at its ends.
+    `STOPS` are the ends of the map; values beyond are clamped.
     """
     low, high = STOPS
     whole = np.clip(np.floor(stops(linear, middle)), low, high - 1)
@@ -38,15 +38,15 @@ def false_color(linear: Float[np.ndarray, "h w 3"], middle: float) -> Float32[np
 def depth_color(
     depth: Float[np.ndarray, "h w"], alpha: Float[np.ndarray, "h w"], limits: tuple[float, float]
 ) -> Float32[np.ndarray, "h w 3"]:
-    """Return expected depth as colour, near bright, evenly in 1 / depth; black where there is none.
+    """Return expected depth as colour, near bright, linear in 1 / depth; black for transparency.
 
-    `depth` is alpha-weighted; `limits` are the nearest and the farthest depth.
+    `depth` is alpha-weighted; `limits` are the nearest and the farthest depth, scene units.
     """
-    there = alpha > 0.5
-    inverse = np.where(there, alpha / np.maximum(depth, 1e-9), 0)
+    opaque = alpha > 0.5
+    inverse = np.where(opaque, alpha / np.maximum(depth, 1e-9), 0)
     high, low = 1 / limits[0], 1 / limits[1]
     scaled = (inverse - low) / max(high - low, 1e-12)
-    return np.where(there[..., None], _mapped(scaled, DEPTH_MAP), 0).astype(np.float32)
+    return np.where(opaque[..., None], _mapped(scaled, DEPTH_MAP), 0).astype(np.float32)
 
 
 def _mapped(values: Float[np.ndarray, "h w"], name: str) -> Float32[np.ndarray, "h w 3"]:

@@ -19,7 +19,7 @@ from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.types import Camera
 
-# Constant quality of videos: at 16 compression is hardly visible.
+# Constant rate factor of videos; at 16 compression is hardly visible.
 QUALITY = "16"
 # Least width and height of a video, pixels.
 SMALLEST = 16
@@ -29,9 +29,9 @@ SMALLEST = 16
 class OutputFrame:
     """A rendered picture: radiance without exposure, opacity, and display values in [0, 1].
 
-    The name is that of its files, without suffix, and may name subfolders. The transform leads from
-    `linear` to `ldr`; depth is alpha-weighted; `photograph` has display values of what was
-    photographed there.
+    `name` is the name of its files without suffix, possibly with subfolders. `transform` converts
+    `linear` to `ldr`; `depth` is alpha-weighted; `photograph` has the display values of the
+    photograph at this pose.
     """
 
     name: str
@@ -50,7 +50,7 @@ def to_uint8(ldr: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
 
 
 def write_png(path: Path, ldr: Float32[np.ndarray, "h w 3"]) -> None:
-    """Write display values as 8 bits, NaN as black; an OSError says that this failed."""
+    """Write display values as 8 bits, NaN as black; OSError: the file cannot be written."""
     codes = to_uint8(ldr)
     with atomic_write(Path(path)) as temporary:
         if not cv2.imwrite(str(temporary), codes[..., ::-1]):
@@ -58,7 +58,7 @@ def write_png(path: Path, ldr: Float32[np.ndarray, "h w 3"]) -> None:
 
 
 def write_frame(folder: Path, frame: OutputFrame) -> None:
-    """Write `NAME.exr` and `NAME.png`; beside a photograph, `NAME.render.png` and its own."""
+    """Write `NAME.exr` and `NAME.png`, or `NAME.render.png` and `NAME.photograph.png`."""
     stem = folder / frame.name
     write_exr(
         stem.with_name(f"{stem.name}.exr"),
@@ -76,7 +76,7 @@ def write_frame(folder: Path, frame: OutputFrame) -> None:
 
 
 def data_url(kind: str, ldr: Float[np.ndarray, "h w 3"], quality: int | None = None) -> str:
-    """Return display values as the address of a picture (png, jpeg, webp) that holds it all."""
+    """Return display values as the data URL of a picture (png, jpeg, webp)."""
     flags = {"jpeg": cv2.IMWRITE_JPEG_QUALITY, "webp": cv2.IMWRITE_WEBP_QUALITY}
     options = [] if quality is None else [flags[kind], quality]
     done, data = cv2.imencode(f".{kind}", to_uint8(ldr)[..., ::-1], options)
@@ -85,7 +85,7 @@ def data_url(kind: str, ldr: Float[np.ndarray, "h w 3"], quality: int | None = N
 
 
 def shrunk(image: Float[np.ndarray, "h w c"], longest: int) -> Float[np.ndarray, "h2 w2 c"]:
-    """Return an image whose longer side has at most so many pixels."""
+    """Return an image whose longer side has at most `longest` pixels."""
     share = longest / max(image.shape[:2])
     if share >= 1:
         return image
@@ -96,9 +96,9 @@ def shrunk(image: Float[np.ndarray, "h w c"], longest: int) -> Float[np.ndarray,
 def open_frames(
     out: Path, size: tuple[int, int], fps: float
 ) -> Iterator[Callable[[OutputFrame], None]]:
-    """Yield a function that takes frames in order: into a video (.mp4), or into a folder.
+    """Yield a function that writes frames in order to a video (.mp4) or to a folder.
 
-    `size` is (width, height) of the largest frame, pixels. Errors are those of `open_video`.
+    `size` is (width, height) of the largest frame, pixels. Errors are as in `open_video`.
     """
     if out.suffix.lower() == ".mp4":
         with open_video(out, *size, fps) as add:
@@ -115,9 +115,9 @@ def open_video(
 
     Smaller frames than `width` by `height` pixels are centred on black. The size is rounded down to
     even numbers, as the codec requires. Display values are tagged as BT.709 primaries with the sRGB
-    curve. A UserError says that the size is too small, or that PyAV has no encoder.
+    curve. Raises UserError: the size is too small, or PyAV has no encoder.
     """
-    # Imported here: a fit writes pictures, but no video.
+    # The import is here: a fit writes pictures, but no video.
     import av
     from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 

@@ -1,7 +1,7 @@
 """Binary glTF with KHR_gaussian_splatting (Khronos): a point primitive whose attributes are splats.
 
-Attributes as the extension names them: scales are lengths, opacities shares, rotations x y z w,
-harmonics those of 3DGS. glTF's world is right-handed with y up; COLMAP's is turned into it.
+Attributes follow the extension: scales are lengths, opacities are in [0, 1], rotations are x y z w,
+harmonics are those of 3DGS. glTF's world is right-handed with y up; COLMAP's is rotated to it.
 https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting
 """
 
@@ -29,12 +29,12 @@ MAGIC, VERSION, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 
 
 def write_gltf(path: Path, gaussians: Gaussians) -> int:
-    """Write Gaussians with display colours and COLMAP's axes as `.glb`; return how many.
+    """Write Gaussians with display colours and COLMAP's axes as `.glb`; return their number.
 
-    A ValueError says that there is none: glTF holds no empty list.
+    Raises ValueError: there are no Gaussians, because glTF forbids an empty accessor.
     """
     if gaussians.capacity == 0:
-        raise ValueError("glTF holds no empty accessor")
+        raise ValueError("glTF cannot hold an empty accessor")
     columns = _attributes(half_turn(gaussians))
     data = [np.ascontiguousarray(c, "<f4").tobytes() for c in columns.values()]
     starts = np.cumsum([0, *map(len, data)]).tolist()

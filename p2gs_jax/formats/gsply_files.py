@@ -1,10 +1,10 @@
 """SPZ and compressed PLY, both through the package gsply.
 
-SPZ (https://github.com/nianticlabs/spz) is some ten times smaller than PLY. Its axes are right, up,
-back; splats from COLMAP's world count as right, down, forward. gsply leaves that to its caller, as
-it does the number of fractional bits of positions, beyond which it would clip them. Compressed PLY
-is the format of PlayCanvas and SuperSplat: 16 bytes a Gaussian and its harmonics; blocks of 256
-Gaussians share the ranges that positions, scales and colours are quantised over.
+SPZ (https://github.com/nianticlabs/spz) is about 10 times smaller than PLY. Its axes are right, up,
+back; COLMAP's world has right, down, forward. The caller of gsply converts the axes, and chooses
+the number of fractional bits so that no position is clipped. Compressed PLY is the format of
+PlayCanvas and SuperSplat: a Gaussian has 16 bytes and its harmonics; blocks of 256 Gaussians share
+the ranges in which positions, scales and colours are quantised.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from p2gs_jax.formats.ply import unit_quats
 from p2gs_jax.gaussians.posed import half_turn
 from p2gs_jax.types import Gaussians
 
-# Positions are integers of 24 bits with a sign; more than 24 fractional bits are not allowed.
+# Positions are signed integers with 24 bits; more than 24 fractional bits are not allowed.
 LARGEST_INTEGER, MOST_FRACTIONAL_BITS = 2**23 - 1, 24
 
 
 def require_gsply() -> ModuleType:
-    """Return the package that writes both formats; a UserError says that it is not installed."""
+    """Return the package that writes both formats; UserError: it is not installed."""
     try:
         import gsply
     except ImportError as error:
@@ -59,7 +59,7 @@ def _from_gsply(data: Any) -> Gaussians:
 
 
 def write_compressed_ply(path: Path, gaussians: Gaussians) -> int:
-    """Write Gaussians with display colours into a file `.compressed.ply`; return how many."""
+    """Write Gaussians with display colours into a file `.compressed.ply`; return their number."""
     content = require_gsply().compress_to_bytes(_to_gsply(gaussians))
     with atomic_write(path) as temporary:
         temporary.write_bytes(content)
@@ -67,7 +67,7 @@ def write_compressed_ply(path: Path, gaussians: Gaussians) -> int:
 
 
 def read_compressed_ply(path: Path) -> Gaussians:
-    """Read Gaussians back, in the order of the file; a UserError says that they cannot be read."""
+    """Read Gaussians in the order of the file; UserError: they cannot be read."""
     gsply = require_gsply()
     try:
         data = gsply.decompress_from_bytes(path.read_bytes())
@@ -77,9 +77,9 @@ def read_compressed_ply(path: Path) -> Gaussians:
 
 
 def write_spz(path: Path, gaussians: Gaussians) -> int:
-    """Write Gaussians with display colours; return how many.
+    """Write Gaussians with display colours; return their number.
 
-    A UserError says that a position does not fit the format.
+    Raises UserError: a position does not fit the format.
     """
     require_gsply()
     from gsply.spz import write_spz as write
@@ -92,20 +92,20 @@ def write_spz(path: Path, gaussians: Gaussians) -> int:
 
 
 def fractional_bits(means: np.ndarray) -> int:
-    """Return the most fractional bits with which every coordinate fits.
+    """Return the largest number of fractional bits with which every coordinate fits.
 
-    A UserError says that a coordinate fits with none.
+    Raises UserError: a coordinate does not fit with any.
     """
     farthest = max(float(np.abs(means).max(initial=0.0)), 1e-12)
     bits = int(np.floor(np.log2(LARGEST_INTEGER / farthest)))
     if bits < 1:
-        why = f"SPZ holds no position as far as {farthest:.3g} scene units from the origin."
+        why = f"SPZ cannot hold a position {farthest:.3g} scene units from the origin."
         raise UserError(why, fix="move or shrink the scene, or export display-ply")
     return min(bits, MOST_FRACTIONAL_BITS)
 
 
 def read_spz(path: Path) -> Gaussians:
-    """Read Gaussians back, as the file holds them; a UserError says that they cannot be read."""
+    """Read Gaussians as the file holds them; UserError: they cannot be read."""
     require_gsply()
     from gsply.spz import read_spz as read
 

@@ -1,9 +1,9 @@
 """Gaussians in few bytes: columns of small integers between the bounds of their neighbourhood.
 
-Neighbours in space come after each other (Morton order) and form chunks; every column of a chunk
-is stored as integers between its least and its largest value there, low bytes and high bytes apart,
-and deflated. Lengths, opacities and, under the activation `exp`, radiance are logarithms, so that
-an error is a factor whatever the dynamic range. `p2gs_jax/export/web/decode.js` reads the same.
+Neighbours in space follow each other (Morton order) and form chunks. Every column of a chunk is
+stored as integers between its least and its largest value, with separate low and high bytes, and
+deflated. Lengths, opacities and, under the activation `exp`, radiance are logarithms, so that
+errors are factors at any dynamic range. `p2gs_jax/export/web/decode.js` reads this format.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from p2gs_jax.render.project import LOG_SCALE_RANGE
 from p2gs_jax.types import Gaussians
 
 CHUNK = 256
-# Bits of each coordinate of centres, lengths, rotations and of opacity; of the harmonics of degree
-# 0 and of the others (ours; a page states the error they cause).
+# Bits of centres, lengths, rotations (each coordinate), opacity, harmonics of degree 0, and other
+# harmonics (our choice; a page states the resulting error).
 MEANS, SCALES, ROTATIONS, OPACITY, BASE, BANDS = 16, 10, 11, 10, 12, 8
-# Columns before the harmonics: 3 of centres, lengths and rotations each, 1 of opacity.
+# Columns before the harmonics: 3 each for centres, lengths and rotations, and 1 for opacity.
 GEOMETRY = 10
-# Logits beyond are opaque, or transparent, to 7 digits.
+# Logits beyond this limit are opaque or transparent to 7 digits.
 LOGIT_LIMIT = 16.0
 
 
 @dataclass(frozen=True)
 class Packed:
-    """Bytes, the number of Gaussians, and of coefficients of the harmonics of each channel.
+    """Bytes, the number of Gaussians, and the number of harmonic coefficients of each channel.
 
-    The bytes are deflated (zlib): least and largest values as float32, by column and chunk; then of
-    each column its low bytes, and where it has more than 8 bits its high bytes.
+    The bytes are deflated (zlib): least and largest values as float32, by column and chunk; then
+    the low bytes of each column, followed by its high bytes if it has more than 8 bits.
     """
 
     count: int
@@ -43,7 +43,7 @@ class Packed:
 
     @property
     def header(self) -> dict[str, Any]:
-        """Return what is needed to read the bytes, as plain values."""
+        """Return the header for reading the bytes, as plain values."""
         sizes = {"count": self.count, "chunk": CHUNK, "coefficients": self.coefficients}
         return {**sizes, "bits": column_bits(self.coefficients)}
 
@@ -55,10 +55,10 @@ def column_bits(coefficients: int) -> list[int]:
 
 
 def morton_order(means: Float32[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
-    """Return an order in which neighbours in space come after each other.
+    """Return an order in which neighbours in space follow each other.
 
-    Cells halve the Gaussians along each axis, not the lengths: a far sky takes nothing from the
-    street.
+    Cells halve the number of Gaussians along each axis, not the length, so that a far sky does not
+    coarsen the street.
     """
     count = max(len(means), 1)
     code = np.zeros(len(means), np.int64)
@@ -72,7 +72,7 @@ def morton_order(means: Float32[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
 
 
 def pack(gaussians: Gaussians) -> Packed:
-    """Return finite Gaussians as bytes, in another order."""
+    """Return finite Gaussians as bytes, in Morton order."""
     columns = _columns(gaussians)
     columns = columns[:, morton_order(np.asarray(gaussians.means))]
     count, coefficients = gaussians.capacity, gaussians.sh.shape[1]
@@ -94,7 +94,7 @@ def pack(gaussians: Gaussians) -> Packed:
 
 
 def unpack(packed: Packed) -> Gaussians:
-    """Return the Gaussians as a reader of the bytes sees them."""
+    """Return the Gaussians that a reader of the bytes gets."""
     raw, count, bits = zlib.decompress(packed.data), packed.count, column_bits(packed.coefficients)
     chunks = -(-count // CHUNK)
     bounds = np.frombuffer(raw, "<f4", 2 * len(bits) * chunks).reshape(len(bits), 2, chunks)
@@ -134,8 +134,8 @@ def _columns(g: Gaussians) -> Float32[np.ndarray, "c n"]:
 def _small_rotations(quats: np.ndarray) -> Float32[np.ndarray, "n 3"]:
     """Return x, y, z of a unit quaternion with the largest w that gives the same ellipsoids.
 
-    A half turn about one of its own axes leaves an ellipsoid as it is; it is the product with i, j
-    or k, which brings any component to the place of w.
+    A half turn about one of its axes does not change an ellipsoid. It is the product with i, j or
+    k, which moves any component to the place of w.
     """
     q = quats.astype(np.float64)
     length = np.linalg.norm(q, axis=1, keepdims=True)

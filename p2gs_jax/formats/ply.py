@@ -1,7 +1,7 @@
 """Gaussians as PLY in the field order of the reference implementation (Inria).
 
 Common viewers show files with display colours (gaussians/bake.py) correctly; `radiance.ply` holds
-the linear pre-activation coefficients, unchanged.
+the linear coefficients before the activation.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ def field_names(coefficients: int) -> list[str]:
     ]
 
 
-# Behind the fields of the reference implementation, where Gaussians vibrate.
+# Fields of vibrating Gaussians, after those of the reference implementation.
 VIBRATION = ("velocity_x", "velocity_y", "velocity_z", "peak_time", "log_life")
-# Rows that are written or read at a time: 16 MB of them, and a population may have gigabytes.
+# Rows that are written or read at a time, about 16 MB; a whole file may have gigabytes.
 CHUNK = 65536
 
 
@@ -46,9 +46,9 @@ def unit_quats(gaussians: Gaussians) -> Float[np.ndarray, "n 4"]:
 
 
 def write_ply(path: Path, gaussians: Gaussians, comments: Sequence[str]) -> int:
-    """Write Gaussians as they are; return how many.
+    """Write Gaussians without conversion; return their number.
 
-    Comments are header lines: a PLY header is ASCII, other characters are escaped.
+    Comments are header lines, with all characters except ASCII escaped.
     """
     g = jax.tree.map(np.asarray, gaussians)
     names = [*field_names(g.sh.shape[1]), *(() if g.vibration is None else VIBRATION)]
@@ -72,7 +72,7 @@ def _columns(g: Gaussians, rows: slice) -> Float[np.ndarray, "k c"]:
         g.means[rows],
         np.zeros((count, 3), np.float32),
         sh[:, 0],
-        # All coefficients of red, then green, then blue.
+        # The file has all coefficients of red, then green, then blue.
         sh[:, 1:].transpose(0, 2, 1).reshape(count, -1),
         g.opacity_logits[rows][:, None],
         g.log_scales[rows],
@@ -83,7 +83,7 @@ def _columns(g: Gaussians, rows: slice) -> Float[np.ndarray, "k c"]:
 
 
 def write_radiance(path: Path, gaussians: Gaussians, *, activation: RadianceKind) -> int:
-    """Write Gaussians with their linear coefficients; return how many."""
+    """Write Gaussians with their linear coefficients; return their number."""
     kind = f"p2gs-jax: radiance activation {activation}"
     return write_ply(path, gaussians, ["p2gs-jax: linear HDR radiance", kind])
 
@@ -92,16 +92,16 @@ RESTORE = "restore it from a copy, or write it again with `p2gs-jax fit ... --re
 
 
 def read_ply(path: Path) -> Gaussians:
-    """Read Gaussians back, bit for bit. Normals, which mean nothing, may be missing.
+    """Read Gaussians, bit for bit. Normals, which are not used, may be missing.
 
-    A UserError says that the file is not such a PLY.
+    Raises UserError: the file is not such a PLY.
     """
     with refusing(path, "Gaussians", fix=RESTORE):
         return _read(read_table(path, "vertex"))
 
 
 def _read(vertex: np.ndarray) -> Gaussians:
-    """Return the Gaussians of a table, which is gone through once, some rows at a time."""
+    """Return the Gaussians of a table, which is read once, `CHUNK` rows at a time."""
     names = vertex.dtype.names or ()
     bands = sum(n.startswith("f_rest_") for n in names) // 3
     harmonics = [[f"f_dc_{c}" for c in range(3)]]
@@ -122,6 +122,6 @@ def _read(vertex: np.ndarray) -> Gaussians:
         for part, array in zip(fields, arrays, strict=True):
             for place, name in np.ndenumerate(part):
                 array[(rows, *place)] = vertex[rows][str(name)]
-    # One after another: each is let go where the device has a copy.
+    # Each array is released once the device has a copy.
     found = [on_device(arrays.pop(0)) for _ in range(len(arrays))]
     return Gaussians(*found[:5], vibration=Vibration(*found[5:]) if found[5:] else None)

@@ -1,7 +1,7 @@
 """OpenUSD: a ParticleField3DGaussianSplat and a camera for every photograph, through Pixar's pxr.
 
-The stage is right-handed with y up, in units of the scene, which it calls metres. Cameras look
-along their -z with y up, as USD's do; their lengths are in tenths of a scene unit, as USD has them.
+The stage is right-handed with y up, and one scene unit is stated as one metre. Cameras look along
+-z with y up, as USD requires; their lengths are in tenths of a scene unit.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from p2gs_jax.gaussians.posed import FLIP, half_turn
 from p2gs_jax.render.harmonics import degree_of
 from p2gs_jax.types import Camera, Gaussians
 
-# Width of a 35 mm film, to which focal lengths are usually related.
+# Width of 35 mm film, the usual reference of focal lengths.
 APERTURE_MM = 36.0
 TENTHS_PER_MM = 0.01
 MODULES = ("Gf", "Usd", "UsdGeom", "UsdVol", "Vt")
@@ -31,7 +31,7 @@ SPLATS, CAMERAS = "/scene/splats", "/scene/cameras"
 def require_pxr() -> tuple[Any, ...]:
     """Return pxr's Gf, Usd, UsdGeom, UsdVol and Vt, which have no types.
 
-    A UserError says that OpenUSD is not installed, or too old for splats.
+    Raises UserError: OpenUSD is not installed, or too old for splats.
     """
     try:
         found = [importlib.import_module(f"pxr.{name}") for name in MODULES]
@@ -39,7 +39,7 @@ def require_pxr() -> tuple[Any, ...]:
         why = f"--format usd needs OpenUSD, which cannot be imported ({error})."
         raise UserError(why, fix="pip install 'p2gs-jax[usd]', or export gltf") from error
     if not hasattr(found[3], "ParticleField3DGaussianSplat"):
-        why = "this OpenUSD knows no Gaussian splats; 26.03 was the first that does."
+        why = "this OpenUSD does not support Gaussian splats, which need version 26.03 or later."
         raise UserError(why, fix="pip install --upgrade 'usd-core>=26.3'")
     return tuple(found)
 
@@ -47,7 +47,7 @@ def require_pxr() -> tuple[Any, ...]:
 def write_usd(path: Path, gaussians: Gaussians, cameras: Mapping[str, Camera]) -> int:
     """Write Gaussians with display colours, and cameras by the names of their photographs.
 
-    Both have COLMAP's axes. Returns how many Gaussians there are.
+    Both have COLMAP's axes. Returns the number of Gaussians.
     """
     _, Usd, UsdGeom, UsdVol, Vt = require_pxr()
     g = half_turn(gaussians)

@@ -1,4 +1,4 @@
-"""From a folder on disk to a `Scene`: which format it is, and everything every format needs."""
+"""From a folder on disk to a `Scene`: the format is recognised, and masks, EXIF and split added."""
 
 from __future__ import annotations
 
@@ -30,22 +30,23 @@ __all__ = ["ImageStore", "camera_at", "load_scene", "size_at"]
 def load_scene(
     root: Path, cfg: DataConfig, work_dir: Path | None = None, report: Report = lambda message: None
 ) -> Scene:
-    """Read a scene; the format is found from what lies in the folder.
+    """Read a scene; the files in the folder tell its format.
 
-    In this order, unless `cfg.format` names one: a COLMAP model in `sparse/0`, `sparse` or the
-    folder itself; `transforms.json` in it, or `root` itself where that is a .json file;
-    `transforms_train.json` with those of the other parts of the split; LLFF's `poses_bounds.npy`; a
-    COLMAP model anywhere else below; a drive as a data set lays it out (`drives`); photographs in
-    `images/` or the folder itself, or a video, whose cameras are then found by structure from
-    motion. Poses without points get theirs by triangulation, or at random where hardly anything
-    matches. Views are sorted by name. Long computations keep their results in `work_dir` for a
-    resume. Raises UserError: there is no scene, or it is broken; the message names the file.
+    `cfg.format` names the format, or the first of these is read: a COLMAP model in `sparse/0`,
+    `sparse` or the folder itself; `transforms.json` (`root` may be this file);
+    `transforms_train.json` with one file for each other part of the split; LLFF's
+    `poses_bounds.npy`; a COLMAP model in a deeper folder; a drive of a known data set (`drives`);
+    photographs in `images/` or the folder itself, or a video. Structure from motion then finds the
+    cameras of photographs and videos. If poses come without points, points are triangulated, or
+    random where hardly anything matches. Views are sorted by name. `work_dir` keeps the results of
+    long computations for a resume. Raises UserError: there is no scene, or a file is broken; the
+    message names the file.
     """
     found = find_scene(root, cfg, report)
     if isinstance(found, Recording):
         scene = assemble(found, cfg, work_dir, report)
     elif isinstance(found, PhotographsAlone | Path):
-        # Imported here as below: scenes with cameras and points do not need COLMAP.
+        # The import is here, as below: scenes with cameras and points do not need COLMAP.
         from p2gs_jax.scene.sfm.map import load_images
 
         if isinstance(found, Path):
@@ -60,13 +61,13 @@ def load_scene(
     else:
         scene = found
     listed = scene.split_by is not None or cfg.split is not None
-    # Masks and EXIF belong to the photographs as they were taken, alpha to what is read.
+    # Masks and EXIF belong to the original photographs, alpha to the converted ones.
     scene = converted_views(with_what_lies_beside(scene, cfg), work_dir, report)
     scene = with_alpha(scene, cfg)
     if len(scene.points) == 0:
         from p2gs_jax.scene.sfm.map import triangulate
 
-        # Where somebody says what is held out, it gives no seeds either.
+        # If the user or the data set lists the held-out views, these give no seeds either.
         scene = triangulate(scene, work_dir, report, only_training=listed)
         if len(scene.points) < FEWEST:
             scene = with_random_seeds(scene)
@@ -76,12 +77,12 @@ def load_scene(
 def with_what_lies_beside(scene: Scene, cfg: DataConfig) -> Scene:
     """Return a scene with masks, EXIF exposures and split.
 
-    Raises UserError: so many views cannot be held out, or a list of those that are is wrong.
+    Raises UserError: so many views cannot be held out, or a list of held-out views is wrong.
     """
     views, mask_notes = attach_masks(scene)
     paths = [view.image_path for view in views]
     both = zip(views, exif_evs(paths, [view.camera for view in views]), strict=True)
-    # What a data set states counts for more.
+    # Exposures that a data set states take precedence.
     views = tuple(dataclasses.replace(v, exif_ev=ev) if v.exif_ev is None else v for v, ev in both)
     notes = (*scene.notes, *mask_notes, *colour_notes(paths))
     scene = dataclasses.replace(scene, views=views, notes=notes)
@@ -89,7 +90,7 @@ def with_what_lies_beside(scene: Scene, cfg: DataConfig) -> Scene:
 
 
 class PhotographsAlone(NamedTuple):
-    """Photographs of which nothing else is known: the folder of their names, and sorted paths."""
+    """Photographs without cameras: the folder that names are relative to, and sorted paths."""
 
     folder: Path
     paths: list[Path]
@@ -98,11 +99,10 @@ class PhotographsAlone(NamedTuple):
 def find_scene(
     root: Path, cfg: DataConfig, report: Report = lambda message: None
 ) -> Scene | Recording | PhotographsAlone | Path:
-    """Return what a folder holds, as `load_scene` finds it; nothing long is computed.
+    """Return the scene of a folder in the order of `load_scene`, without long computations.
 
-    A video, of which nothing else is known, is its path.
-
-    Raises UserError: there is no scene, or it is broken; the message names the file.
+    A Path stands for a video without cameras. Raises UserError: there is no scene, or a file is
+    broken; the message names the file.
     """
     root = Path(root)
     if not root.exists():
@@ -116,7 +116,7 @@ def find_scene(
         return transforms.load_transforms(root, root, cfg)
     model = find_model(root)
     if model is not None and cfg.format in (None, "colmap"):
-        scene = _of_model(root, model, cfg)
+        scene = _read_colmap(root, model, cfg)
         lists = lists_beside(model, root) if cfg.split is None and cfg.test_every else None
         if lists is None:
             return scene
@@ -129,7 +129,7 @@ def find_scene(
         return transforms.load_llff(root, cfg)
     model = find_deeper_model(root) if cfg.format in (None, "colmap") else None
     if model is not None:
-        return _of_model(root, model, cfg)
+        return _read_colmap(root, model, cfg)
     recording = read_drive(root, cfg, report)
     if recording is not None:
         return recording
@@ -139,12 +139,12 @@ def find_scene(
     return _photographs_alone(root, cfg)
 
 
-def _of_model(root: Path, folder: Path, cfg: DataConfig) -> Scene:
+def _read_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
     scene, notes = load_colmap(root, folder, cfg), []
     if folder not in (root, root / "sparse", root / "sparse" / "0"):
-        notes.append(f"The cameras are those of the COLMAP model in {folder}.")
+        notes.append(f"The cameras come from the COLMAP model in {folder}.")
     if not len(scene.points):
-        notes.append(f"The COLMAP model {folder} has no points: they are triangulated.")
+        notes.append(f"The COLMAP model {folder} has no points: points are triangulated.")
     views = transforms.stated_exposures(root, scene.views)
     return dataclasses.replace(scene, views=views, notes=(*scene.notes, *notes))
 
@@ -152,8 +152,8 @@ def _of_model(root: Path, folder: Path, cfg: DataConfig) -> Scene:
 def _photographs_alone(root: Path, cfg: DataConfig) -> PhotographsAlone:
     folders = [root / cfg.images] if cfg.images is not None else [root / "images", root]
     for folder in folders:
-        # Subfolders of the root may hold anything, masks or results of other runs, unless it is
-        # asked for.
+        # Subfolders of the root may hold masks or results of other runs: they are searched only if
+        # the user names the root.
         paths = list_images(folder, recursive=folder != root or cfg.images is not None)
         for path in paths:
             image_size(path)
@@ -165,7 +165,7 @@ def _photographs_alone(root: Path, cfg: DataConfig) -> PhotographsAlone:
         below = sorted(d.name for d in root.iterdir() if list_images(d, recursive=False))
         if below:
             fix += f"; photographs are in its folder(s) {', '.join(below[:3])}"
-            fix += ": if these are cameras, add --data.images ."
+            fix += ": if each folder is a camera, add --data.images ."
     why = f"no scene in {root}: there is no COLMAP model (cameras, images and points3D as .bin or "
     why += ".txt, in sparse/0, sparse or the folder itself), no transforms.json or "
     why += "transforms_train.json, no poses_bounds.npy, no drive of a known data set, and no "

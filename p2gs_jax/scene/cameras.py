@@ -1,4 +1,4 @@
-"""What is one camera: photographs that share a lens, and what it and the sensor do to light."""
+"""Which photographs count as one camera: they share a lens, and an effect on light."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from p2gs_jax.types import View
 
 
 def parent_of(name: str) -> str:
-    """Return the folders in the relative name of an image, empty where there are none."""
+    """Return the folders in the relative name of an image, or an empty text."""
     return PurePosixPath(name).parent.as_posix().removeprefix(".")
 
 
 def numbered(views: Sequence[View]) -> list[View]:
-    """Return views with numbers for the words in `View.camera` that say which lens took them."""
+    """Return views with a number instead of the text in `View.camera` that describes the lens."""
     numbers = {lens: k for k, lens in enumerate(dict.fromkeys(view.camera for view in views))}
     return [replace(view, camera=str(numbers[view.camera])) for view in views]
 
 
 def name_cameras(views: Sequence[View], by: CameraBy) -> tuple[View, ...]:
-    """Return views with the names of their cameras; `View.camera` is the model's so far.
+    """Return views with the names of their cameras; `View.camera` is still the model's camera.
 
-    `auto` takes photographs apart that differ in folder, in the model's camera, or in make, model
-    and lens by EXIF. Where hardly any of these took two photographs, as in models that have a
-    camera for each, they do not count.
+    `auto` separates photographs by folder, by the model's camera, and by make, model and lens in
+    EXIF. The last two do not count if hardly any value is shared by two photographs, as in models
+    with one camera for each photograph.
     """
     folders = models = devices = [""] * len(views)
     if by in ("auto", "folder"):
@@ -52,7 +52,7 @@ def name_cameras(views: Sequence[View], by: CameraBy) -> tuple[View, ...]:
 
 
 def _shared(keys: list[str], folders: Sequence[str]) -> list[str]:
-    """Return keys, or nothing where they do not tell cameras apart: few took two photographs."""
+    """Return keys, or empty ones if most belong to one photograph: these are not cameras."""
     counts = Counter(zip(folders, keys, strict=True))
     shared = sum(n for n in counts.values() if n > 1)
     return keys if 2 * shared >= len(keys) else [""] * len(keys)

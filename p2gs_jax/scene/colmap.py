@@ -1,9 +1,9 @@
 """A COLMAP model, binary or text, and its photographs as a Scene.
 
-Why not `pycolmap.Reconstruction`: version 4.2.1 accepts a truncated `cameras.bin` and never returns
-from a truncated `points3D.bin`. Here every count is checked against the size of the file. Newer
-models' `rigs.bin` and `frames.bin` are not needed: `images.bin` still holds every registered image
-with its own pose. Format: https://colmap.github.io/format.html
+This reader replaces `pycolmap.Reconstruction`: version 4.2.1 accepts a truncated `cameras.bin` and
+never returns from a truncated `points3D.bin`. Here every count is checked against the size of the
+file. `rigs.bin` and `frames.bin` of newer models are not needed: `images.bin` holds the pose of
+every registered image. Format: https://colmap.github.io/format.html
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ _LENGTH = struct.Struct("<Q")
 _NUMBERS = re.compile(r"[-+.\deEnaif\s]*")
 _STEMS = ("cameras", "images", "points3D")
 _POINT = np.dtype([("id", "<i8"), ("xyz", "<f8", 3), ("rgb", "u1", 3)])
-# Behind a point its error, and how many observations of 8 bytes follow.
+# A point is followed by its error and by the number of observations, which have 8 bytes each.
 _POINT_BYTES, _LENGTH_AT = 51, 43
 _KEYPOINT = np.dtype([("xy", "<f8", 2), ("id", "<i8")])
-# Number of parameters and of focal lengths among them, in the order of COLMAP's model ids; 0: the
-# model is not supported.
 IMAGE_FOLDERS = ("images", "input", "input_images")
-"""Where photographs lie beside a model: as nerfstudio, 3DGS and HDR-NeRF name it."""
+"""Folders of photographs beside a model, as nerfstudio, 3DGS and HDR-NeRF name them."""
+# The number of parameters and the number of focal lengths among them, in the order of COLMAP's
+# model ids. The model is not supported if the latter is 0.
 _MODELS = {
     "SIMPLE_PINHOLE": (3, 1),
     "PINHOLE": (4, 2),
@@ -65,17 +65,17 @@ _MODELS = {
 
 
 def find_model(root: Path) -> Path | None:
-    """Return the folder of the COLMAP model of a scene where 3DGS looks for it, and around there.
+    """Return the folder of a scene's COLMAP model, or None.
 
-    That is `sparse/0`, `sparse` or the root itself, or anything in `sparse`; of several numbered
-    ones, parts of which COLMAP knows no common place, the one with most photographs.
+    It is `sparse/0`, `sparse`, the root, or a folder below `sparse`. Numbered models are parts that
+    COLMAP could not join: the one with most photographs is used.
     """
     usual = (root / "sparse" / "0", root / "sparse", root)
     return _largest(next((f for f in usual if is_model(f)), None) or _first_below(root / "sparse"))
 
 
 def find_deeper_model(root: Path) -> Path | None:
-    """Return a model up to four folders below a scene, as of `colmap/sparse/0`, or None."""
+    """Return a model up to four folders below a scene, such as `colmap/sparse/0`, or None."""
     return _largest(_first_below(root))
 
 
@@ -85,20 +85,20 @@ def _first_below(root: Path) -> Path | None:
         folders = {f.parent for f in images if f.with_stem("cameras").is_file()}
         found = [folder for folder in folders if not _is_of_run(folder, root)]
         if found:
-            # 3DGS keeps what it undistorted from under this name.
+            # 3DGS keeps the original of an undistorted model in a folder of this name.
             return min(found, key=lambda f: ("distorted" in f.parts, f.as_posix()))
     return None
 
 
 def _is_of_run(folder: Path, root: Path) -> bool:
-    """Return whether a model belongs to a run: these may lie below their scenes, and keep some."""
+    """Return whether a model belongs to a run folder, which may lie below its scene."""
     above = {*folder.parents} - {root, *root.parents}
     kept = "cache" in folder.relative_to(root).parts
     return kept or any((place / "photometry.json").exists() for place in above)
 
 
 def _largest(folder: Path | None) -> Path | None:
-    """Return the model with most photographs among those that are numbered as this one is."""
+    """Return the model with most photographs among the numbered ones in the same folder."""
     if folder is None or not folder.name.isdecimal():
         return folder
     beside = [f for f in folder.parent.iterdir() if f.name.isdecimal() and is_model(f)]
@@ -106,7 +106,7 @@ def _largest(folder: Path | None) -> Path | None:
 
 
 def _count(folder: Path) -> int:
-    """Return about how many photographs a model has, without reading it."""
+    """Return the approximate number of photographs in a model, without reading it."""
     path = folder / "images.bin"
     if path.is_file():
         with path.open("rb") as file:
@@ -118,8 +118,8 @@ def _count(folder: Path) -> int:
 def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
     """Read the COLMAP model in a folder; views have no split, masks or EXIF yet.
 
-    Raises UserError: a file is broken, images are missing or of another size, the camera model is
-    not supported, or there is nothing in the model.
+    Raises UserError: a file is broken, images are missing or have another size, the camera model is
+    not supported, or the model is empty.
     """
     model = read_model(folder)
     _check_model(model)
@@ -147,15 +147,15 @@ def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
         norm = np.linalg.norm(image.qvec) if finite else 0.0
         if norm < 1e-6:
             raise broken(f"{source}:", f"the pose of {image.name} is not finite", _FIX)
-        turn = Rotation.from_quat(np.roll(image.qvec / norm, -1)).as_matrix()
-        viewmat = pose_of(turn, image.tvec)
+        rotation = Rotation.from_quat(np.roll(image.qvec / norm, -1)).as_matrix()
+        viewmat = pose_of(rotation, image.tvec)
         number = str(image.camera_id)
         views.append(View(image.name, path, number, viewmat, K, width, height, distortion))
     notes += files.rescaled(resized, model.file("cameras").name)
     others = sorted(p.name for p in folder.parent.iterdir() if p != folder and is_model(p))
     if folder.name.isdecimal() and others:
         used = f"used the model {folder} with {len(model.images)} photographs, the largest"
-        notes.append(f"{used}; beside it lie {', '.join(others)}, not used")
+        notes.append(f"{used}; the models beside it ({', '.join(others)}) are not used")
     tracks = tracks_of(model, views)
     named = name_cameras(views, cfg.camera_by)
     return off_origin(Scene(root, "colmap", named, model.xyz, model.rgb, tracks, tuple(notes)))
@@ -164,8 +164,8 @@ def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
 def tracks_of(model: Model, views: Sequence[View]) -> Tracks | None:
     """Return every observation of the model's points, in undistorted pixels of the views.
 
-    Views are matched by name, and keypoints rescaled to their size. Observations of points that the
-    model lacks (some tools thin points3D alone) and of other images are left out.
+    Views are matched by name, and keypoints rescaled to the size of the view. Observations in other
+    images are left out, and those of points that the model lacks (some tools thin points3D alone).
     """
     if not (model.point_ids >= 0).any():
         return None
@@ -177,14 +177,14 @@ def tracks_of(model: Model, views: Sequence[View]) -> Tracks | None:
             continue
         view, camera = views[row], model.cameras[image.camera_id]
         at = np.searchsorted(model.point_ids, image.point_ids).clip(max=len(model.point_ids) - 1)
-        known = (model.point_ids[at] == image.point_ids) & (np.abs(image.xy) < files.HUGE).all(1)
+        usable = (model.point_ids[at] == image.point_ids) & (np.abs(image.xy) < files.HUGE).all(1)
         scale = (view.width / camera.width, view.height / camera.height)
-        xy = undistort_points(image.xy[known] * scale, view.K, view.distortion)
-        # What a wide lens sees at its sides is in no pinhole picture.
-        seen = np.isfinite(xy).all(axis=1)
-        positions.append(xy[seen])
-        point_rows.append(at[known][seen])
-        view_rows.append(np.full(int(seen.sum()), row))
+        xy = undistort_points(image.xy[usable] * scale, view.K, view.distortion)
+        # Points at the sides of a wide lens are outside every pinhole image.
+        inside = np.isfinite(xy).all(axis=1)
+        positions.append(xy[inside])
+        point_rows.append(at[usable][inside])
+        view_rows.append(np.full(int(inside.sum()), row))
     if not positions:
         return None
     seen_in, seen_points = (np.concatenate(at).astype(np.int32) for at in (view_rows, point_rows))
@@ -202,8 +202,8 @@ def _check_model(model: Model) -> None:
         raise broken(model.file("images"), f"lists {name} more than once", _FIX)
     for image in model.images:
         if image.camera_id not in model.cameras:
-            why = f"{image.name} was taken by camera {image.camera_id}, which "
-            why += f"{model.file('cameras')} does not have"
+            why = f"{image.name} has camera {image.camera_id}, which is not in "
+            why += f"{model.file('cameras')}"
             raise broken(f"{model.file('images')}:", why, _FIX)
     bad = int((~(np.abs(model.xyz) < files.HUGE).all(axis=1)).sum())
     if bad:
@@ -212,19 +212,19 @@ def _check_model(model: Model) -> None:
 
 
 def _find_images(root: Path, model: Model) -> Path:
-    """Return the nearest folder that holds photographs of the model, of the size that it says."""
+    """Return the nearest folder with photographs of the model, if possible at the model's size."""
     above = [f for f in (model.folder, *model.folder.parents) if f.is_relative_to(root)]
     above += [f for f in list(root.parents)[:2] if model.folder == root]
     places = [f / name for f in above for name in IMAGE_FOLDERS if (f / name).is_dir()]
-    held = []
+    candidates = []
     for place in [*places, root]:
         image = next((i for i in model.images if (place / i.name).is_file()), None)
         if image is not None:
             camera = model.cameras[image.camera_id]
             same = files.image_size(place / image.name) == (camera.width, camera.height)
-            held.append((not same, len(held), place))
-    if held:
-        return min(held)[2]
+            candidates.append((not same, len(candidates), place))
+    if candidates:
+        return min(candidates)[2]
     if places:
         return places[-1]
     looked = ", ".join(str(f / "images") for f in above)
@@ -233,7 +233,7 @@ def _find_images(root: Path, model: Model) -> Path:
 
 
 def _lens(path: Path, camera: CameraRecord) -> tuple[Float[np.ndarray, "3 3"], Distortion | None]:
-    """Return K and distortion: COLMAP's terms are OpenCV's, and absent ones are 0."""
+    """Return K and distortion: COLMAP's terms are OpenCV's, and absent terms are 0."""
     focals, p = _MODELS.get(camera.model, (0, 0))[1], camera.params
     if not focals:
         raise _unsupported(path, camera.model)
@@ -247,7 +247,7 @@ def _lens(path: Path, camera: CameraRecord) -> tuple[Float[np.ndarray, "3 3"], D
 
 
 class CameraRecord(NamedTuple):
-    """One entry of `cameras`: COLMAP's model name, size in pixels, parameters in its order."""
+    """One entry of `cameras`: model name, size in pixels, parameters in COLMAP's order."""
 
     model: str
     width: int
@@ -258,8 +258,8 @@ class CameraRecord(NamedTuple):
 class ImageRecord(NamedTuple):
     """One entry of `images`, its name relative to the image folder.
 
-    Pose (wxyz and scene units) are world-to-camera; `xy` are the keypoints that have a 3D point,
-    pixels of the photograph with centres at +0.5, and `point_ids` their points' ids.
+    The pose (quaternion wxyz, translation in scene units) is world-to-camera. `xy` are the
+    keypoints with a 3D point, in pixels with centres at +0.5; `point_ids` are the points' ids.
     """
 
     name: str
@@ -273,7 +273,7 @@ class ImageRecord(NamedTuple):
 class Model(NamedTuple):
     """A COLMAP model: cameras by id, images in the file's order, ascending `point_ids`.
 
-    `xyz` are scene units, `rgb` display-encoded, `kind` is the suffix of the files.
+    `xyz` is in scene units, `rgb` is display-encoded, and `kind` is the suffix of the files.
     """
 
     folder: Path
@@ -296,29 +296,29 @@ def is_model(folder: Path) -> bool:
 
 
 def read_model(folder: Path) -> Model:
-    """Read the model in a folder; binary files win where both kinds are complete.
+    """Read the model in a folder; binary files are preferred if both kinds are complete.
 
     Points may be absent, or in a PLY, as 3DGS writes them. Raises UserError: another file is
-    missing, or one is truncated or malformed; the message names it.
+    missing, or a file is truncated or malformed; the message names it.
     """
     parts = {ext: [folder / f"{stem}.{ext}" for stem in _STEMS] for ext in ("bin", "txt")}
     absent = {ext: [p for p in paths if not p.is_file()] for ext, paths in parts.items()}
     every = [*parts["bin"], *parts["txt"]]
-    other = next((path for path in every if path.exists() and not path.is_file()), None)
-    if other is not None:
-        raise broken(other, "is not a file", _FIX_FILES)
-    whole = [ext for ext in parts if {*absent[ext]} <= {parts[ext][2]}]
-    if not whole:
+    not_file = next((path for path in every if path.exists() and not path.is_file()), None)
+    if not_file is not None:
+        raise broken(not_file, "is not a file", _FIX_FILES)
+    complete = [ext for ext in parts if {*absent[ext]} <= {parts[ext][2]}]
+    if not complete:
         ext = "txt" if (folder / "cameras.txt").is_file() else "bin"
         why = f"{', '.join(map(str, absent[ext]))} does not exist"
         raise broken("incomplete COLMAP model:", why, _FIX_FILES)
-    ext = min(whole, key=lambda ext: len(absent[ext]))
+    ext = min(complete, key=lambda ext: len(absent[ext]))
     cameras, images, points = parts[ext]
     text = (_text_cameras, _text_images, _text_points)
     binary = (_binary_cameras, _binary_images, _binary_points)
-    read_cameras, read_images, read_them = binary if ext == "bin" else text
+    read_cameras, read_images, read_points3d = binary if ext == "bin" else text
     if points.is_file():
-        rows = read_them(points)
+        rows = read_points3d(points)
         rows = rows[np.argsort(rows["id"], kind="stable")]
         ids, xyz, rgb = (np.ascontiguousarray(rows[name]) for name in ("id", "xyz", "rgb"))
     elif (folder / "points3D.ply").is_file():
@@ -359,7 +359,7 @@ class _Cursor:
         """Read a number of records that need at least `record_size` bytes each."""
         (n,) = self.unpack("<Q")
         if n * record_size > len(self.data) - self.position:
-            why = f"is truncated: it announces {n} entries and has {len(self.data)} bytes in all"
+            why = f"is truncated: it announces {n} entries but has only {len(self.data)} bytes"
             raise broken(self.path, why, _FIX_FILES)
         return n
 
@@ -434,7 +434,7 @@ def _text_images(path: Path) -> Iterator[ImageRecord]:
             values = [float(value) for value in pose]
             if len(values) != 7:
                 raise ValueError("an image line needs 10 fields")
-        # An image without keypoints has an empty second line, which tools and editors leave out.
+        # An image without keypoints has an empty second line, which some tools leave out.
         keypoints = ""
         if following is not None and _NUMBERS.fullmatch(following[1]):
             (number, keypoints), following = following, next(lines, None)

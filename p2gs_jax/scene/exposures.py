@@ -1,4 +1,4 @@
-"""Exposures known beforehand, from a CSV file or EXIF; and which view a name in a file means."""
+"""Known exposures from a CSV file or EXIF, and the view that a name in a file means."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ KINDS = ("ev", "exposure", "rel_exposure_ev", "exposure_time_s")
 def read_known_exposures(
     source: str, views: Sequence[View], among: Sequence[View] = ()
 ) -> Float[np.ndarray, " v"]:
-    """Return natural logarithms of known exposures of views, NaN where nothing is known.
+    """Return natural logarithms of known exposures of views, and NaN for unknown ones.
 
     The source is `exif`, or a CSV file with a column `image` or `file` (name of the view, or any
     end of it) and one of `ev`, `rel_exposure_ev` (stops), `exposure` (linear, > 0) or
-    `exposure_time_s` (seconds). `among` are all views of the scene, if these are some of them.
-    Raises UserError: it cannot be used, holds none of the views, or a name may be several.
+    `exposure_time_s` (seconds). `among` are all views of the scene, if `views` are some of them.
+    Raises UserError: the source cannot be used, names none of the views, or a name is ambiguous.
     """
     if source == "exif":
         values = _exif_ev(views) * LN2
@@ -45,23 +45,24 @@ def read_known_exposures(
 def _by_view(table: dict[str, float], views: Sequence[View], source: str) -> dict[str, float]:
     """Return the exposures of views by their whole names."""
     row_of, out = row_finder(views, source), dict[str, float]()
-    for given, value in table.items():
-        row = row_of(given)
+    for name, value in table.items():
+        row = row_of(name)
         if row is not None and out.setdefault(views[row].name, value) != value:
             why = f"{views[row].name} has two exposures"
-            raise broken(f"{source}:", why, "take one of them out")
+            raise broken(f"{source}:", why, "remove one of them")
     return out
 
 
 def plain_name(name: str) -> str:
-    """Return a name with slashes and no dots, as all systems write it."""
+    """Return a name with forward slashes and without `.` parts, the same on every system."""
     return PurePosixPath(name.replace("\\", "/")).as_posix()
 
 
-def row_finder(views: Sequence[View], where: object) -> Callable[[str], int | None]:
-    """Return what finds the view of a name in the file `where`: any end of its photograph's path.
+def row_finder(views: Sequence[View], source: object) -> Callable[[str], int | None]:
+    """Return a function that maps a name in the file `source` to the row of its view, or None.
 
-    With or without suffix; None: of no view. Raises UserError: it may be of several.
+    A name is any end of the photograph's path, with or without the suffix. The function raises
+    UserError if a name is ambiguous.
     """
     rows_of: dict[str, set[int]] = defaultdict(set)
     # A converted photograph lies elsewhere.
@@ -80,20 +81,20 @@ def row_finder(views: Sequence[View], where: object) -> Callable[[str], int | No
         rows = exact if len(exact) == 1 else rows
         if len(rows) > 1:
             names = " and ".join(views[row].name for row in sorted(rows)[:2])
-            raise broken(f"{where}:", f"{name} may be {names}", "write more of the path into it")
+            raise broken(f"{source}:", f"{name} may be {names}", "write more of its path")
         return next(iter(rows), None)
 
     return find
 
 
 def check_source(source: str | None) -> None:
-    """Raise UserError where a source of `read_known_exposures` cannot be used; None can."""
+    """Raise UserError if a source of `read_known_exposures` cannot be used; None is accepted."""
     if source not in (None, "exif"):
         _read(Path(source))
 
 
 def stated_ev(source: str | None, views: Sequence[View]) -> Float[np.ndarray, " v"]:
-    """Return stated exposures in stops, up to a constant, from a source or, if None, from EXIF."""
+    """Return exposures in stops, up to a constant, from a source or, if None, from EXIF."""
     if source is None:
         return _exif_ev(views)
     return read_known_exposures(source, views) / LN2
@@ -109,7 +110,7 @@ def _read(path: Path) -> dict[str, float]:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         why = f"cannot be read: {getattr(error, 'strerror', None) or error}."
-        fix = "name a CSV file with the columns image and ev, or say exif"
+        fix = "name a CSV file with the columns image and ev, or exif"
         raise broken(path, why, fix) from error
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     reader = csv.DictReader(lines)
@@ -140,6 +141,6 @@ def _read(path: Path) -> dict[str, float]:
             fix = "write a finite number, above 0 for exposures"
             raise broken(f"{path}, line {number}:", f"{kind} is {text!r}.", fix)
         if out.setdefault(image := (row[name] or "").strip(), log) != log:
-            fix = "keep one line of it"
-            raise broken(f"{path}, line {number}:", f"{image} is named again", fix)
+            fix = "keep only one of its lines"
+            raise broken(f"{path}, line {number}:", f"{image} has two exposures", fix)
     return out

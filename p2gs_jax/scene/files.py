@@ -1,4 +1,4 @@
-"""Files of scenes: images, names and sizes that models give, JSON; and results that are kept."""
+"""Files of scenes: lists, names and sizes of images, JSON, and folders of cached results."""
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ from p2gs_jax.scene.lens import scale_intrinsics
 
 IMAGE_SUFFIXES = CONVERTED_SUFFIXES | {".jpg", ".jpeg", ".jfif", ".jp2", ".png", ".tif", ".tiff"}
 IMAGE_SUFFIXES |= {".bmp", ".pgm", ".ppm"}
-# Folders of masks, and what tells a mask from its photograph: `a_mask`, `a.mask`, `mask_a`, ...
+# Folders of masks. Masks beside photographs are recognised by names: `a_mask`, `a.mask`, `mask_a`.
 MASK_FOLDERS = ("masks", "mask", "dynamic_masks", "dynamic_mask")
-# Folders of pictures that are no photographs.
+# Folders of pictures that are not photographs.
 OTHER_FOLDERS = {*MASK_FOLDERS, "depth", "depths", "normal", "normals"}
 _MASK_NAME = re.compile(r"^(dynamic_)?masks?[._-](?=.)|(?<=.)[._-](dynamic_)?masks?$")
 _TWICE = re.compile(r"\.(jpe?g|png)\.png$", re.IGNORECASE)
-# Principal points lie this near to the middle of photographs, in their sides.
+# The farthest principal point from the middle of a photograph, as a fraction of its sides.
 MOST_OFF = 0.25
-# Finite numbers from here on are not finite in float32 arithmetic.
+# Finite numbers from this size on overflow in float32 arithmetic.
 HUGE = 1e30
-_MOVED = "move it there; or name the folder of all photographs with --images, and names in it"
-# Where Pillow takes a picture for an attack.
+_MOVED = "move it there, or name the folder of all photographs with --images"
+# Pillow refuses larger pictures as an attack.
 MOST_PIXELS = 2 * (Image.MAX_IMAGE_PIXELS or 2**26)
 _MARKER = "finished"
-# Seconds between two messages.
+# Time between two progress messages, seconds.
 EVERY_S = 10.0
 
 Report = Callable[[str], None]
@@ -57,8 +57,8 @@ Report = Callable[[str], None]
 def list_images(folder: Path, *, recursive: bool = True) -> list[Path]:
     """Return the photographs in a folder, which may be absent, sorted by their relative path.
 
-    Hidden ones are left out, and so are masks, in a folder of masks or named after a photograph,
-    and what lies in a folder of depths or normals.
+    Hidden files are left out, and so are masks (in a folder of masks, or named after a photograph),
+    depth maps and normal maps.
     """
     if not folder.is_dir():
         return []
@@ -68,13 +68,13 @@ def list_images(folder: Path, *, recursive: bool = True) -> list[Path]:
     visible = [p for p in relative if not any(part.startswith(".") for part in p.parts)]
     outside = [p for p in visible if OTHER_FOLDERS.isdisjoint(map(str.lower, p.parts[:-1]))]
     named = {p for p in outside if named_as_mask(p.name)}
-    taken = {name_without_mask(p.as_posix()) for p in outside if p not in named}
-    masks = {p for p in named if name_without_mask(p.as_posix()) in taken or _always_mask(p.name)}
+    photos = {name_without_mask(p.as_posix()) for p in outside if p not in named}
+    masks = {p for p in named if name_without_mask(p.as_posix()) in photos or _always_mask(p.name)}
     return [folder / p for p in sorted({*outside} - masks, key=lambda p: p.as_posix())]
 
 
 def named_as_mask(name: str) -> bool:
-    """Return whether the name of a file says that it may be a mask, also as `a.jpg.png`."""
+    """Return whether a file may be a mask by its name, `a.jpg.png` included."""
     return _MASK_NAME.search(_bare(name)) is not None or _TWICE.search(name) is not None
 
 
@@ -83,16 +83,16 @@ def _always_mask(name: str) -> bool:
 
 
 def name_without_mask(name: str) -> str:
-    """Return what the names of a photograph and of its mask have in common.
+    """Return the part that the names of a photograph and its mask share.
 
-    That is the relative path in small letters without suffixes of images and words for masks.
+    It is the relative path in lower case without image suffixes and words for masks.
     """
     path = PurePosixPath(name)
     return path.with_name(_bare(_MASK_NAME.sub("", _bare(path.name)))).as_posix().lower()
 
 
 def _bare(name: str) -> str:
-    """Return the name of a file in small letters without its suffixes of images."""
+    """Return the name of a file in lower case without its image suffixes."""
     name = unicodedata.normalize("NFC", name).lower()
     while PurePosixPath(name).suffix in IMAGE_SUFFIXES:
         name = name[: name.rindex(".")]
@@ -100,7 +100,7 @@ def _bare(name: str) -> str:
 
 
 def read_json(path: Path, fix: str) -> Any:
-    """Return what a JSON file holds; UserError: it is absent, not text, or not valid JSON."""
+    """Return the content of a JSON file; UserError: it is absent, not text, or not valid JSON."""
     try:
         return parse_json(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
@@ -113,10 +113,10 @@ def read_json(path: Path, fix: str) -> Any:
 
 
 def find_names(names: Iterable[str], folder: Path) -> dict[str, str]:
-    """Return the file below a folder that each name means; names that none is like are left out.
+    """Return the file below a folder for each name; names without such a file are left out.
 
-    A file may differ in case, in Unicode's form, in its suffix, or lie in the folder itself, where
-    it is the only one that does and no other name means it.
+    A file may differ from the name in case, Unicode form or suffix, or lie in the folder itself, if
+    it is the only such file and no other name fits it.
     """
     found = {name: name for name in names if (folder / name).is_file()}
     left = [name for name in dict.fromkeys(names) if name not in found]
@@ -125,19 +125,19 @@ def find_names(names: Iterable[str], folder: Path) -> dict[str, str]:
         there: dict[str, list[str]] = defaultdict(list)
         for file in sorted(files - set(found.values()), key=lambda f: (not f.endswith(".png"), f)):
             there[alike(file)].append(file)
-        asked = Counter(map(alike, left))
+        wanted = Counter(map(alike, left))
         for name in left:
             like = there.get(alike(name), [])
             # Blender's scenes leave the suffix out.
             alone = len(like) == 1 or (like and _stem(name) == _folded(name))
-            if alone and asked[alike(name)] == 1:
+            if alone and wanted[alike(name)] == 1:
                 found[name] = like[0]
         left = [name for name in left if name not in found]
     return found
 
 
 def nearly_named(files: Mapping[str, str], source: str) -> list[str]:
-    """Return a note about names for which other files were found, by name; or none."""
+    """Return a note about names whose file has a slightly different name, or no note."""
     other = [f"{file} for {n}" for n, file in files.items() if PurePath(n).suffix and file != n]
     note = f"{len(other)} images named by {source} have nearly these names: {first_few(other)}"
     return [note] if other else []
@@ -148,25 +148,25 @@ def _folded(name: str) -> str:
 
 
 def _stem(name: str) -> str:
-    """Return a name, folded, without the suffix of an image."""
+    """Return a case-folded name without its image suffix."""
     path = PurePath(_folded(name))
     return (path.with_suffix("") if path.suffix in IMAGE_SUFFIXES else path).as_posix()
 
 
 def require_inside(name: PurePath, folder: Path, source: Path, fix: str = _MOVED) -> None:
-    """Refuse a name in the file `source` that leads out of the folder it is relative to.
+    """Raise UserError if a name in the file `source` leads out of the folder it is relative to.
 
-    Links below the folder are followed: whoever made it put them there.
+    Symbolic links below the folder are followed: the owner of the folder made them.
     """
     normal = os.path.normpath(name.as_posix())
     if os.path.isabs(normal) or normal.split("/")[0] == "..":
-        raise broken(source, f"names {name}, which lies outside of {folder}", fix)
+        raise broken(source, f"names {name}, which lies outside {folder}", fix)
 
 
 def require_plain(name: str, source: Path) -> None:
-    """Refuse a name of a camera, found in the file `source`, that is a path."""
+    """Raise UserError if the name of a camera in the file `source` is a path."""
     if name in ("", ".", "..") or any(c in name for c in "/\\\0"):
-        why = f"has a camera by the name of {name!r}, which is no name of a folder"
+        why = f"names a camera {name!r}, which is not a valid folder name"
         raise broken(source, why, "get its tables again, or rename the camera in all of them")
 
 
@@ -184,7 +184,7 @@ def image_size(path: Path) -> tuple[int, int]:
     Raises UserError: it is not an image, or too large; its name is not UTF-8; a package is missing.
     """
     try:
-        str(path).encode()  # no other name can be written into the files of a run
+        str(path).encode()  # the files of a run hold names in UTF-8
     except UnicodeEncodeError:
         raise UserError(f"the name of {path} is not UTF-8", fix="rename it") from None
     try:
@@ -215,7 +215,7 @@ def _size_in_header(path: Path) -> tuple[int, int]:
 def decode_grey(data: bytes, shrink: int) -> UInt8[np.ndarray, "h w"] | None:
     """Return the photograph in the bytes of a file in grey as stored, or None if it is broken.
 
-    It is shrunk by up to the factor `shrink` where that saves time; JPEG does.
+    It is shrunk by up to the factor `shrink` if that saves time, as it does for JPEG.
     """
     flags = {2: cv2.IMREAD_REDUCED_GRAYSCALE_2, 4: cv2.IMREAD_REDUCED_GRAYSCALE_4}
     flag = flags.get(2 ** min(int(np.log2(max(shrink, 1))), 2), cv2.IMREAD_GRAYSCALE)
@@ -232,10 +232,10 @@ def undecodable(path: Path) -> UserError:
 def check_missing(
     missing: Sequence[str], total: int, source: Path, cfg: DataConfig, folder: Path | None = None
 ) -> list[str]:
-    """Return notes about images that a model of `total` images names and the disk lacks.
+    """Return notes about missing images of a model that names `total` images.
 
-    They were looked for in `folder`. Raises UserError: images are missing and `allow_missing` is
-    not set, or no image is left.
+    `folder` is where they were searched. Raises UserError: images are missing and `allow_missing`
+    is not set, or no image is left.
     """
     if not missing:
         return []
@@ -244,7 +244,7 @@ def check_missing(
     if folder is not None:
         files = [path.relative_to(folder).as_posix() for path in list_images(folder)]
         nearest = difflib.get_close_matches(missing[0], files, 1, 0.0)
-        near = f", of which {nearest[0]} is the nearest" if nearest else ""
+        near = f"; the nearest name is {nearest[0]}" if nearest else ""
         message += f"; {folder} holds {len(files)} images{near}"
     if not cfg.allow_missing:
         fix = "add them, name their folder with --images, or skip them with --allow-missing"
@@ -257,9 +257,9 @@ def check_missing(
 def at_file_size(
     path: Path, K: Float[np.ndarray, "3 3"], size: tuple[int, int], source: Path
 ) -> tuple[Float32[np.ndarray, "3 3"], int, int]:
-    """Return K, width and height of an image file; K and size (pixels) are the model's.
+    """Return K, width and height of an image file, given the model's K and size (pixels).
 
-    Raises UserError: the file is not an image, or has another shape than `source` says.
+    Raises UserError: the file is not an image, or has another shape than `source` states.
     """
     w, h = image_size(path)
     if not same_shape((w, h), size):
@@ -270,14 +270,14 @@ def at_file_size(
 
 
 def same_shape(a: tuple[int, int], b: tuple[int, int]) -> bool:
-    """Return whether a size is the other one resized: each side is rounded by up to a pixel."""
+    """Return whether two sizes have one aspect ratio; each side may be rounded by a pixel."""
     sides = np.array(a) / b, 1 / np.array(b)
     return bool((sides[0] - sides[1]).max() <= (sides[0] + sides[1]).min())
 
 
 def rescaled(count: int, source: str) -> list[str]:
-    """Return a note about so many images, or none."""
-    note = f"{count} images have another size than {source} says: intrinsics were rescaled"
+    """Return a note about the number of resized images, or no note."""
+    note = f"{count} images have another size than {source} states: intrinsics were rescaled"
     return [note] if count else []
 
 
@@ -287,9 +287,9 @@ def cached_folder(
 ) -> Iterator[Path]:
     """Provide a folder that `build` has filled, now or in an earlier run.
 
-    It counts as finished once a marker with the hash of `key`, JSON of everything the result
-    depends on, has been moved into it; one that was interrupted half-way, or made from other
-    inputs, is emptied and filled again. A `work_dir` of None makes it a temporary folder.
+    `key` holds everything the result depends on, as JSON. A folder is finished if it has a marker
+    with the hash of `key`; otherwise it is emptied and filled again. If `work_dir` is None, the
+    folder is temporary.
     """
     if work_dir is None:
         with tempfile.TemporaryDirectory(prefix="p2gs_") as temporary:
@@ -314,9 +314,9 @@ def file_fingerprints(paths: Sequence[Path]) -> list[tuple[str, int, int]]:
 
 
 def stage_progress(report: Report, stage: str, total: int, unit: str) -> Callable[[int], None]:
-    """Begin a stage, such as "matching" 100 "image pairs"; return what reports how many are done.
+    """Begin a stage, such as "matching" 100 "image pairs"; return a function that reports progress.
 
-    The first message comes at once, others now and then.
+    It takes the number done. The first message comes at once, then one every `EVERY_S` seconds.
     """
     begin = last = time.monotonic()
     if total:
@@ -329,6 +329,6 @@ def stage_progress(report: Report, stage: str, total: int, unit: str) -> Callabl
             return
         last = now
         left = as_clock(round((now - begin) / done * (total - done)))
-        report(f"{stage}: {done} of {total} {unit}, about {left} left at this pace")
+        report(f"{stage}: {done} of {total} {unit}, about {left} left")
 
     return progress

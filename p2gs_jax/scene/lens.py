@@ -1,8 +1,8 @@
 """Lenses and intrinsics, shared by the readers and the image store.
 
-Pixel centres are at +0.5. The algebra of a pinhole with OpenCV's distortion does not depend on
-where centres lie, so points need no shift; only OpenCV's *rasters* (remap) do, and
-`undistortion_maps` is the one place that converts.
+Pixel centres are at +0.5. Projection and OpenCV's distortion do not depend on the position of
+centres, so points need no shift. Only OpenCV's *rasters* (remap) do, and only `undistortion_maps`
+converts them.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from numpy.polynomial import Polynomial
 
 from p2gs_jax.types import Distortion
 
-# Lenses are inverted by a table of this many angles and Newton steps from there. OpenCV's
+# Lenses are inverted by a table of `_TABLE` angles and `_POLISHING` Newton steps. OpenCV's
 # iteration does not converge for strong rational lenses.
 _TABLE, _POLISHING = 4096, 3
-_MOST_ROUNDS, _SETTLED = 20, 1e-10
-# No picture reaches further from its middle, focal lengths; smaller terms there count as zero.
-_FARTHEST, _NOTHING = 100.0, 1e-9
+_MOST_ROUNDS, _CONVERGED = 20, 1e-10
+# The largest distance from the principal point, focal lengths; smaller terms there count as 0.
+_FARTHEST, _NEGLIGIBLE = 100.0, 1e-9
 
 
 def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:
@@ -37,7 +37,7 @@ def scale_intrinsics(K: Float[np.ndarray, "3 3"], sx: float, sy: float) -> Float
 def make_distortion(
     coefficients: tuple[float, ...], model: Literal["radial", "fisheye"] = "radial"
 ) -> Distortion | None:
-    """Return the distortion of `Distortion`'s coefficients, or None where they make a pinhole."""
+    """Return the distortion with `Distortion`'s coefficients, or None for a pinhole."""
     # A fisheye without coefficients still maps angles, not tangents, to distances.
     if model == "radial" and not any(coefficients):
         return None
@@ -47,10 +47,10 @@ def make_distortion(
 def undistort_points(
     xy: Float[np.ndarray, "n 2"], K: Float[np.ndarray, "3 3"], distortion: Distortion | None
 ) -> Float32[np.ndarray, "n 2"]:
-    """Move pixel positions from the photograph to its undistorted version with the same K.
+    """Return pixel positions of the photograph in its undistorted version with the same K.
 
-    They are NaN where no pinhole ray comes: beyond where the lens model is monotonic, and at the
-    sides of a fisheye.
+    They are NaN if no pinhole ray belongs to them: outside the range in which the lens model is
+    monotonic, and at the sides of a fisheye.
     """
     if distortion is None or len(xy) == 0:
         return np.asarray(xy, np.float32).reshape(-1, 2)
@@ -60,26 +60,26 @@ def undistort_points(
     untilted = distorted
     if distortion.model == "radial" and any(distortion.coefficients[2:4]):
         p1, p2 = distortion.coefficients[2:4]
-        # Tangential terms are small: taken off where they were found last, they settle at once.
+        # Tangential terms are small: a fixed-point iteration that subtracts them converges fast.
         for _ in range(_MOST_ROUNDS):
-            before, (x, y) = untilted, _radially_undone(untilted, distortion, rough=True).T
+            previous, (x, y) = untilted, _without_radial(untilted, distortion, rough=True).T
             square = x * x + y * y
             along = 2 * p1 * x * y + p2 * (square + 2 * x * x)
             across = p1 * (square + 2 * y * y) + 2 * p2 * x * y
             untilted = distorted - np.stack([along, across], axis=1)
-            if np.abs(untilted - before).max() < _SETTLED:
+            if np.abs(untilted - previous).max() < _CONVERGED:
                 break
-    straight = _radially_undone(untilted, distortion)
+    straight = _without_radial(untilted, distortion)
     return (straight * focal + center).astype(np.float32)
 
 
 def undistortion_maps(
     K: Float[np.ndarray, "3 3"], distortion: Distortion, width: int, height: int
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-    """Return where each undistorted pixel lies in the photograph, for `cv2.remap`.
+    """Return the position of each undistorted pixel in the photograph, for `cv2.remap`.
 
-    Positions are in OpenCV's convention (pixel centres at integers), -10 where the lens model is
-    not monotonic any more. K has centres at +0.5.
+    Positions have OpenCV's pixel centres at integers, and are -10 where the lens model is not
+    monotonic. K has centres at +0.5.
     """
     shifted = np.asarray(K, np.float64).copy()
     shifted[:2, 2] -= 0.5
@@ -101,9 +101,9 @@ def undistortion_maps(
 
 
 def _profile(distortion: Distortion) -> tuple[Polynomial, Polynomial, float]:
-    """Return n and d of a lens along a radius, n(x) / d(x), and up to which x it grows.
+    """Return n and d of the distorted radius n(x) / d(x), and the x up to which it grows.
 
-    The x is the radius, or the angle of a fisheye.
+    x is the undistorted radius, or the angle for a fisheye.
     """
     x, one = Polynomial([0.0, 1.0]), Polynomial([1.0])
     if distortion.model == "fisheye":
@@ -114,45 +114,45 @@ def _profile(distortion: Distortion) -> tuple[Polynomial, Polynomial, float]:
         c[: len(distortion.coefficients)] = distortion.coefficients
         n = x * Polynomial([1.0, 0.0, c[0], 0.0, c[1], 0.0, c[4]])
         d = Polynomial([1.0, 0.0, c[5], 0.0, c[6], 0.0, c[7]])
-    # The slope's sign is that of its numerator; where d vanishes the radius is infinite.
+    # The numerator has the sign of the slope; the radius is infinite at a root of d.
     return n, d, min(_first_root(n.deriv() * d - n * d.deriv()), _first_root(d))
 
 
 def _first_root(polynomial: Polynomial) -> float:
-    """Return the smallest positive root, infinite where there is none within pictures."""
+    """Return the smallest positive root below `_FARTHEST`, or infinity."""
     terms = np.array(polynomial.coef, np.float64)
     scaled = Polynomial(terms * _FARTHEST ** np.arange(len(terms)))
-    roots = np.array(scaled.trim(_NOTHING).roots(), np.complex128) * _FARTHEST
+    roots = np.array(scaled.trim(_NEGLIGIBLE).roots(), np.complex128) * _FARTHEST
     found = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
     first = float(found.min(initial=np.inf))
     return first if first < _FARTHEST else float("inf")
 
 
 def _fold_radius(distortion: Distortion) -> float:
-    """Return the undistorted radius at which the distorted one stops growing."""
+    """Return the undistorted radius at which the distorted radius stops growing."""
     _, _, limit = _profile(distortion)
     if distortion.model == "radial":
         return limit
     return float(np.tan(limit)) if limit < np.pi / 2 else float("inf")
 
 
-def _radially_undone(
+def _without_radial(
     distorted: Float[np.ndarray, "n 2"], distortion: Distortion, *, rough: bool = False
 ) -> Float[np.ndarray, "n 2"]:
-    """Return normalised positions without the radial part of a lens.
+    """Return normalised positions without the radial distortion of a lens.
 
-    They are exact, and NaN where there is no ray; `rough`: as the table has them, and positions
-    without a ray are put at the last one.
+    They are exact, and NaN without a ray. If `rough`, they are interpolated from the table, and
+    positions without a ray get the last ray.
     """
     n, d, limit = _profile(distortion)
     fisheye = distortion.model == "fisheye"
     last = min(limit, np.pi / 2) if fisheye else np.arctan(min(limit, _FARTHEST))
     table = np.linspace(0.0, last, _TABLE)[:-1]
     x = table if fisheye else np.tan(table)
-    grown = n(x) / d(x)
+    distorted_radius = n(x) / d(x)
     radius = np.linalg.norm(distorted, axis=1)
-    within = radius <= grown[-1]
-    found = np.interp(radius, grown, x, right=None if rough else np.nan)
+    within = radius <= distorted_radius[-1]
+    found = np.interp(radius, distorted_radius, x, right=None if rough else np.nan)
     dn, dd = n.deriv(), d.deriv()
     for _ in range(0 if rough else _POLISHING):
         at = found[within]

@@ -1,4 +1,4 @@
-"""Which pixels of photographs count: masks that lie beside them, and their alpha channels."""
+"""Masks of photographs, which pixels count: files beside the photographs, and alpha channels."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from p2gs_jax.types import Scene, View
 
 RANDOM = "random"
 NAMED = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
-# Where training draws a colour for every step, photographs are judged over what 3DGS shows.
+# If training draws a random background, scores use this one, as 3DGS does.
 JUDGED = "white"
 # These never have an alpha channel.
 _OPAQUE = frozenset({".jpg", ".jpeg", ".jfif", ".pgm", ".ppm"})
@@ -35,7 +35,7 @@ def attach_masks(scene: Scene) -> tuple[tuple[View, ...], list[str]]:
     )
     bare = [view.name for view in masked if view.mask_path is None]
     if len(bare) == len(masked):
-        why = "none is of a photograph: name a mask as its photograph"
+        why = "but none has the name of a photograph: name each mask like its photograph"
         return masked, [f"{folder} holds {count} files, {why}" for folder, count in unused.items()]
     if not bare:
         return masked, []
@@ -43,13 +43,13 @@ def attach_masks(scene: Scene) -> tuple[tuple[View, ...], list[str]]:
 
 
 def find_masks(views: Sequence[View], root: Path) -> tuple[list[Path | None], dict[Path, int]]:
-    """Return the mask of each view, or None, and how many files folders without any hold.
+    """Return the mask of each view, or None, and the number of files in every folder of masks.
 
-    Masks lie in a folder of `MASK_FOLDERS` beside that of the photographs, in it or above it below
-    the scene's root, or beside their photographs. They are called as the photograph, whatever the
-    case and the suffix, perhaps with "mask" before or behind; beside it they must be.
+    A folder of masks (`MASK_FOLDERS`) lies beside the folder of the photographs, in it, or above it
+    within the scene's root. A mask has the name of its photograph, in any case and with any suffix,
+    and may have "mask" before or after it. A mask beside its photograph must have this word.
     """
-    # A scene may be named by its .json.
+    # The root may be the scene's .json.
     root = root if root.is_dir() else root.parent
     folders: dict[Path, dict[str, Path]] = {}
     folders_of = functools.cache(_mask_folders)
@@ -59,28 +59,28 @@ def find_masks(views: Sequence[View], root: Path) -> tuple[list[Path | None], di
         for folder, name in _places(view, root, folders_of):
             if folder not in folders:
                 folders[folder] = _masks_in(folder)
-            if held := folders[folder]:
-                found[-1] = _exact(folder, name) or held.get(name_without_mask(name))
+            if masks := folders[folder]:
+                found[-1] = _exact(folder, name) or masks.get(name_without_mask(name))
                 if found[-1] is not None:
                     break
-    return found, {f: len(held) for f, held in folders.items() if held and _apart(f)}
+    return found, {f: len(masks) for f, masks in folders.items() if masks and _for_masks(f)}
 
 
-def _apart(folder: Path) -> bool:
-    """Return whether a folder is one of masks, in letters of any size."""
+def _for_masks(folder: Path) -> bool:
+    """Return whether a folder has the name of a folder of masks, in any case."""
     return folder.name.lower() in MASK_FOLDERS
 
 
 def _mask_folders(place: Path) -> list[Path]:
     """Return the folders of masks in a folder, the commonest name first."""
-    found = [p for p in place.iterdir() if _apart(p) and p.is_dir()] if place.is_dir() else []
+    found = [p for p in place.iterdir() if _for_masks(p) and p.is_dir()] if place.is_dir() else []
     return sorted(found, key=lambda p: (MASK_FOLDERS.index(p.name.lower()), p.name))
 
 
 def _places(
     view: View, root: Path, folders_of: Callable[[Path], list[Path]]
 ) -> Iterator[tuple[Path, str]]:
-    """Yield folders in which the mask of a view may lie, and what it may be called there."""
+    """Yield folders in which the mask of a view may lie, and its possible names there."""
     images, path = image_folder_of(view), view.image_path
     above = images.parents[1:] if root in images.parents else ()
     for place in (images.parent, images, *(p for p in above if p.is_relative_to(root))):
@@ -93,19 +93,19 @@ def _places(
 
 
 def _masks_in(folder: Path) -> dict[str, Path]:
-    """Return the masks in a folder by what they share with photographs; others are left out."""
-    apart = _apart(folder)
-    files = folder.glob("**/*" if apart else "*")
+    """Return the masks in a folder by `name_without_mask`; other files are left out."""
+    all_masks = _for_masks(folder)
+    files = folder.glob("**/*" if all_masks else "*")
     files = (p for p in files if p.suffix.lower() in IMAGE_SUFFIXES and p.name[0] != ".")
-    files = (p for p in files if apart or named_as_mask(p.name))
+    files = (p for p in files if all_masks or named_as_mask(p.name))
     return {name_without_mask(p.relative_to(folder).as_posix()): p for p in sorted(files)[::-1]}
 
 
 def _exact(folder: Path, name: str) -> Path | None:
-    """Return the mask in a folder of masks that is called as its photograph, if there is one."""
+    """Return the mask in a folder of masks that has the name of its photograph, or None."""
     path = folder / name
     names = (path, path.with_suffix(".png"), path.with_name(path.name + ".png"))
-    return next((p for p in names if _apart(folder) and p.is_file()), None)
+    return next((p for p in names if _for_masks(folder) and p.is_file()), None)
 
 
 def image_folder_of(view: View) -> Path:
@@ -114,7 +114,7 @@ def image_folder_of(view: View) -> Path:
 
 
 def background_color(cfg: DataConfig) -> Float32[np.ndarray, " 3"]:
-    """Return the display values that photographs with alpha are shown and judged over.
+    """Return the background, display values, of photographs with alpha in pictures and scores.
 
     Raises UserError: the option is not a colour.
     """
@@ -132,20 +132,20 @@ def background_color(cfg: DataConfig) -> Float32[np.ndarray, " 3"]:
 
 
 def has_alpha(path: Path) -> bool:
-    """Return whether an image file carries an alpha channel; a broken file has none."""
+    """Return whether an image file has an alpha channel; a broken file has none."""
     if path.suffix.lower() in _OPAQUE:
         return False
     try:
         with Image.open(path) as image:
             return image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
-    except Exception:  # PIL's error types are not a closed set; decoding will complain
+    except Exception:  # PIL's error types are not a closed set; decoding reports the error
         return False
 
 
 def _opacity(paths: Sequence[Path]) -> tuple[int, int]:
-    """Return the least and the most alpha of photographs, 0 to 255, or of the first that has both.
+    """Return the least and the most alpha of photographs, 0 to 255.
 
-    Where none can be read it is 255, which says nothing.
+    Reading stops once transparent and other pixels are found; unreadable photographs count as 255.
     """
     least, most = 255, 0
     for path in paths:
@@ -158,13 +158,13 @@ def _opacity(paths: Sequence[Path]) -> tuple[int, int]:
 
 
 def with_alpha(scene: Scene, cfg: DataConfig) -> Scene:
-    """Return a scene whose views know what their alpha channel means; opaque ones mean nothing.
+    """Return a scene whose views state the use of their alpha channel; opaque channels have none.
 
     Raises UserError: the option is not a colour, or all photographs are transparent everywhere.
     """
     background_color(cfg)
     found = [has_alpha(view.image_path) for view in scene.views]
-    channels = [view.image_path for view, there in zip(scene.views, found, strict=True) if there]
+    channels = [view.image_path for view, has in zip(scene.views, found, strict=True) if has]
     least, most = _opacity(channels)
     if most == 0 and all(found) and cfg.alpha != "ignore":
         why = "is transparent everywhere, as are all photographs of the scene"
@@ -174,15 +174,13 @@ def with_alpha(scene: Scene, cfg: DataConfig) -> Scene:
     if least == 255:
         if cfg.background == DataConfig.background:
             return scene
-        note = (
-            f"--background {cfg.background} shows nowhere: no photograph is transparent anywhere."
-        )
+        note = f"--background {cfg.background} has no effect: no photograph has transparent pixels."
         return dataclasses.replace(scene, notes=(*scene.notes, note))
     views = tuple(
-        dataclasses.replace(view, alpha=cfg.alpha) if there else view
-        for view, there in zip(scene.views, found, strict=True)
+        dataclasses.replace(view, alpha=cfg.alpha) if has else view
+        for view, has in zip(scene.views, found, strict=True)
     )
-    over = "a random colour at every step, and white to judge"
+    over = "a random colour at every step, and over white for scores"
     over = over if cfg.background == RANDOM else cfg.background
     use = {
         "background": f"photographs and renders are shown over {over} (--background)",

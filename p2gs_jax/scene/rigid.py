@@ -1,4 +1,4 @@
-"""Rigid poses: checked, inverted, interpolated, held against photographs; a drive's directions."""
+"""Rigid poses: checks, inverses, interpolation, agreement with photographs, drive directions."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ Pose = Float64[np.ndarray, "4 4"]
 Poses = Float64[np.ndarray, "n 4 4"]
 # Singular values of the rotations in driving data sets differ from 1 by rounding only.
 ORTHOGONAL = 1e-3
-# Scenes further from the origin than this, in their own extent, are moved to it.
+# Scenes farther from the origin than this, in multiples of their extent, are moved to it.
 FAR = 100.0
-# Poses are continued past the ends of their track by at most this, seconds.
+# Poses are extrapolated beyond the ends of their track by at most this time, seconds.
 LONGEST_BEYOND_S = 0.15
-# The right-hand axes of cameras must span a plane this well before its normal counts as up.
+# The normal of the cameras' right-hand axes counts as up from this ratio of singular values on.
 PLANE_RATIO = 0.1
-# A direction over less than this is noise, metres.
+# A direction over a shorter distance is noise, metres.
 SHORTEST_WAY = 0.3
-# Driving directions are taken over this length of the way, where it is so long, metres.
+# The distance over which driving directions are measured, if the drive is that long, metres.
 HEADING_WAY = 2.0
-# What tools write most often where a format has OpenGL's camera-to-world matrices.
+# The usual errors of tools in formats with OpenGL's camera-to-world matrices are in `_OTHERS`.
 _TURN = np.diag([1.0, -1.0, -1.0, 1.0])
-# Poses are wrong if this share at most agrees with them, and the other share with other axes.
+# Poses are wrong if at most this share agrees with them, and at least the other with other axes.
 _CONTRADICTS, _AGREES = 0.2, 0.6
 _OTHERS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "the second and third column of every matrix negated (OpenCV's axes instead of OpenGL's)": (
@@ -62,10 +62,10 @@ def nearest_rotation(matrix: Rotation3, tolerance: float = 0.01) -> Rotation3 | 
 
 
 def rigid(rotation: Rotation3, position: Vector3, source: Path, what: str) -> Pose:
-    """Return the matrix of a rotation and a position; rounding is taken out of the rotation.
+    """Return the matrix of a rotation and a position, with the nearest exact rotation.
 
-    `source` and `what` name the file and the thing that has this pose. Raises UserError: it is not
-    finite, or not a rotation.
+    `source` and `what` name the file and the object of the pose in messages. Raises UserError: the
+    pose is not finite, or not a rotation.
     """
     rotation, position = np.asarray(rotation, np.float64), np.asarray(position, np.float64)
     finite = np.isfinite(rotation).all() and np.isfinite(position).all()
@@ -73,7 +73,7 @@ def rigid(rotation: Rotation3, position: Vector3, source: Path, what: str) -> Po
     if nearest is None:
         if finite and nearest_rotation(-rotation, ORTHOGONAL) is not None:
             fix = "write rotations of determinant 1"
-            raise broken(f"{source}:", f"the pose of {what} mirrors", fix)
+            raise broken(f"{source}:", f"the pose of {what} is a reflection", fix)
         raise broken(f"{source}:", f"the pose of {what} is not a rotation and a position")
     return pose_of(nearest, position)
 
@@ -83,13 +83,13 @@ def from_quaternions(
 ) -> Poses:
     """Return the matrices of quaternions (w x y z) and positions.
 
-    Raises UserError: a quaternion has not length 1 within a hundredth, or something is not finite.
+    Raises UserError: the length of a quaternion differs from 1 by 0.01, or a number is not finite.
     """
     wxyz = np.asarray(wxyz, np.float64)
     bad = ~(np.abs(np.linalg.norm(wxyz, axis=1) - 1) < 1e-2) | ~np.isfinite(positions).all(1)
     if bad.any():
-        where = f"{what} number {np.argmax(bad) + 1}"
-        raise broken(f"{source}:", f"{where} is not a unit quaternion and position")
+        name = f"{what} number {np.argmax(bad) + 1}"
+        raise broken(f"{source}:", f"{name} is not a unit quaternion and position")
     if not len(wxyz):
         return np.zeros((0, 4, 4))
     return pose_of(Rotation.from_quat(wxyz, scalar_first=True).as_matrix(), positions)
@@ -98,7 +98,7 @@ def from_quaternions(
 def from_quaternion(
     wxyz: Float[np.ndarray, " 4"], position: Vector3, source: Path, what: str
 ) -> Pose:
-    """Return the matrix of one quaternion and a position; errors are as of `from_quaternions`."""
+    """Return the matrix of one quaternion and a position; errors as in `from_quaternions`."""
     wxyz = np.asarray(wxyz, np.float64)
     if wxyz.shape != (4,) or not abs(np.linalg.norm(wxyz) - 1) < 1e-2:
         raise broken(f"{source}:", f"the rotation of {what} is not a unit quaternion")
@@ -129,10 +129,10 @@ def camera_centers(viewmats: Float[np.ndarray, "n 4 4"]) -> Float64[np.ndarray, 
 
 
 def off_origin(scene: Scene) -> Scene:
-    """Return a scene in float32, of which the poses of views and the points are float64 so far.
+    """Return a scene in float32 from one with poses and points in float64.
 
-    What lies far from the origin, as UTM coordinates do, is first moved to it: float32 would cut
-    off what tells neighbouring places apart. `Scene.origin` keeps what was taken off.
+    A scene far from the origin, for example in UTM coordinates, is first moved to it: float32 is
+    too coarse there. `Scene.origin` records the shift.
     """
     viewmats = np.stack([view.viewmat for view in scene.views])
     middle = np.median(camera_centers(viewmats), axis=0)
@@ -151,7 +151,7 @@ def off_origin(scene: Scene) -> Scene:
     points, notes = (scene.points - origin).astype(np.float32), scene.notes
     if origin.any():
         x, y, z = (f"{value:.12g}" for value in origin)
-        notes = (*notes, f"Coordinates are relative to ({x}, {y}, {z}), which float32 needs.")
+        notes = (*notes, f"Coordinates are relative to ({x}, {y}, {z}), as float32 requires.")
     return replace(scene, views=views, points=points, notes=notes, origin=tuple(origin.tolist()))
 
 
@@ -160,18 +160,18 @@ def interpolated(
 ) -> tuple[Float64[np.ndarray, "n 4 4"], np.ndarray]:
     """Return poses at times, and which of these times [n] the track covers.
 
-    Positions are linear in time, rotations turn evenly. Past an end the motion of the nearest two
-    poses goes on for `LONGEST_BEYOND_S`; uncovered times get the pose there. Times are seconds,
-    those of the track rising.
+    Positions are linear in time, and rotations have a constant rate. Beyond an end the motion of
+    the nearest two poses continues for `LONGEST_BEYOND_S`, and then stops. Times are in seconds,
+    and those of the track rise.
     """
     times, at = np.asarray(times, np.float64), np.asarray(at, np.float64)
     begin, end = times[0] - LONGEST_BEYOND_S, times[-1] + LONGEST_BEYOND_S
     covered = (at >= begin) & (at <= end)
     if len(times) == 1:
         return np.repeat(poses, len(at), 0), covered
-    held = np.clip(at, begin, end)
-    before = np.clip(np.searchsorted(times, held, side="right") - 1, 0, len(times) - 2)
-    share = (held - times[before]) / (times[before + 1] - times[before])
+    clipped = np.clip(at, begin, end)
+    before = np.clip(np.searchsorted(times, clipped, side="right") - 1, 0, len(times) - 2)
+    share = (clipped - times[before]) / (times[before + 1] - times[before])
     first, second = poses[before], poses[before + 1]
     positions = first[:, :3, 3] + share[:, None] * (second[:, :3, 3] - first[:, :3, 3])
     start = Rotation.from_matrix(first[:, :3, :3])
@@ -181,15 +181,15 @@ def interpolated(
 
 
 def moment_of(view: View) -> int | str:
-    """Return what views of one time step share: the frame of a drive, else the file's stem."""
+    """Return the key that views of one moment share: the frame of a drive, or the file's stem."""
     return PurePosixPath(view.name).stem if view.frame is None else view.frame
 
 
 def up_direction(viewmats: Float[np.ndarray, "n 4 4"]) -> Vector3:
-    """Return up from world-to-camera matrices: what level cameras that look different ways share.
+    """Return the up direction from world-to-camera matrices of level cameras.
 
-    That is the normal of the plane that their right-hand axes span; pitch does not disturb it.
-    Where all look the same way, it is the mean of the cameras' up axes.
+    It is the normal of the plane that their right-hand axes span, whatever their pitch. If all
+    cameras look in one direction, it is the mean of their up axes.
     """
     mean = -np.mean(viewmats[:, 1, :3], axis=0)
     _, sizes, axes = np.linalg.svd(viewmats[:, 0, :3], full_matrices=True)
@@ -201,7 +201,7 @@ def up_direction(viewmats: Float[np.ndarray, "n 4 4"]) -> Vector3:
 
 
 def up_of_drive(viewmats: Float[np.ndarray, "n 4 4"], cameras: Sequence[str]) -> Vector3:
-    """Return up, away from the road: square to the way that the cameras went, where they did.
+    """Return the up direction, away from the road and perpendicular to a straight trajectory.
 
     Poses are world-to-camera; `cameras` names the camera of each.
     """
@@ -211,7 +211,7 @@ def up_of_drive(viewmats: Float[np.ndarray, "n 4 4"], cameras: Sequence[str]) ->
     for name in set(cameras):
         centers[names == name] -= centers[names == name].mean(0)
     _, sizes, axes = np.linalg.svd(centers, full_matrices=False)
-    # Where they drove around, the way is not a line, and the cameras' up axes must do.
+    # If the trajectory is not a line, only the cameras' axes are used.
     if sizes[0] / np.sqrt(len(centers)) > SHORTEST_WAY / 4 and sizes[1] < sizes[0] / 3:
         up = up - axes[0] * (axes[0] @ up)
     return up / np.linalg.norm(up)
@@ -220,60 +220,60 @@ def up_of_drive(viewmats: Float[np.ndarray, "n 4 4"], cameras: Sequence[str]) ->
 def headings(
     centers: Float[np.ndarray, "n 3"], up: Vector3, otherwise: Vector3
 ) -> Float[np.ndarray, "n 3"]:
-    """Return the level direction, of length 1, in which a camera drives at each of its places.
+    """Return the level direction, of length 1, in which a camera drives at each position.
 
-    It is taken over at least `HEADING_WAY` where the way is so long: at a stop poses jitter.
-    Centers are in the order of time; a camera that goes nowhere drives `otherwise`.
+    It is measured over `HEADING_WAY` if the trajectory is that long: poses jitter at a stop.
+    Centers are in the order of time; a camera that does not move gets the direction `otherwise`.
     """
     level = centers - np.outer(centers @ up, up)
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(level, axis=0), axis=1))])
-    first = np.searchsorted(way, way - HEADING_WAY / 2, side="right") - 1
-    last = np.searchsorted(way, way + HEADING_WAY / 2)
-    first, last = np.maximum(first, 0), np.minimum(last, len(way) - 1)
+    distance = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(level, axis=0), axis=1))])
+    first = np.searchsorted(distance, distance - HEADING_WAY / 2, side="right") - 1
+    last = np.searchsorted(distance, distance + HEADING_WAY / 2)
+    first, last = np.maximum(first, 0), np.minimum(last, len(distance) - 1)
     out = level[last] - level[first]
     lengths = np.linalg.norm(out, axis=1)
     far = lengths > SHORTEST_WAY / 2
     if not far.any():
         return np.tile(otherwise / np.linalg.norm(otherwise), (len(centers), 1))
     out[far] /= lengths[far, None]
-    # Where it stands, the direction of the nearest place where it moves.
+    # A standing camera gets the direction of the nearest position at which it moves.
     moving = np.flatnonzero(far)
-    nearest = moving[np.abs(np.arange(len(way))[:, None] - moving).argmin(1)]
+    nearest = moving[np.abs(np.arange(len(distance))[:, None] - moving).argmin(1)]
     return out[nearest]
 
 
 def time_order(view: View) -> tuple[int, tuple]:
-    """Return what sorts the views of a camera by time: frames where there are any, else names.
+    """Return a sort key of a camera's views by time: the frame if there is one, then the name.
 
-    Names count by the numbers in them: photograph 2 is before photograph 10.
+    Names sort by the numbers in them: photograph 2 comes before photograph 10.
     """
     return (-1 if view.frame is None else view.frame, natural(view.name))
 
 
 def level_ahead(views: Sequence[View], up: Vector3) -> Vector3:
-    """Return where the first camera, or one called "front", looks, without up and down."""
-    ahead = next((view for view in views if "front" in view.camera.lower()), views[0])
-    axis = ahead.viewmat[2, :3].astype(np.float64)
+    """Return the level viewing direction of a camera with "front" in its name, or of the first."""
+    front = next((view for view in views if "front" in view.camera.lower()), views[0])
+    axis = front.viewmat[2, :3].astype(np.float64)
     return axis - up * (up @ axis)
 
 
 def require_axes(
     views: Sequence[View], agreeing: Callable[[Sequence[View]], float], source: object
 ) -> None:
-    """Refuse poses that hardly anything agrees with, where with other axes most would.
+    """Raise UserError if photographs contradict the poses and agree with them in other axes.
 
-    `agreeing` gives the share of what photographs show, or of seed points, that agrees with poses;
-    `source` is the file of the poses.
+    `agreeing` returns the share of matches between photographs, or of seed points, that agrees with
+    the poses of views; `source` is the file of the poses.
     """
-    own = agreeing(views)
-    if own > _CONTRADICTS:
+    stated = agreeing(views)
+    if stated > _CONTRADICTS:
         return
     found = {}
-    for what, change in _OTHERS.items():
+    for axes, change in _OTHERS.items():
         changed = (replace(v, viewmat=change(v.viewmat.astype(np.float64))) for v in views)
-        found[what] = agreeing(list(changed))
-    best = max(found, key=lambda what: found[what])
+        found[axes] = agreeing(list(changed))
+    best = max(found, key=lambda axes: found[axes])
     if found[best] >= _AGREES:
-        why = f"has poses that contradict the photographs: {own:.0%} of what they show agrees, "
-        why += f"and {found[best]:.0%} with {best}"
-        raise broken(source, why, "change the matrices so")
+        why = f"has poses that contradict the photographs: {stated:.0%} of the data agree with "
+        why += f"them, but {found[best]:.0%} with {best}"
+        raise broken(source, why, "change the matrices in this way")

@@ -1,8 +1,8 @@
-"""Seed points: from a PLY that a scene names, or at random where nothing matches.
+"""Seed points: from a PLY that a scene names, or random if photographs do not match.
 
-3DGS begins NeRF's synthetic scenes with 100,000 points in a cube that is known to hold them. Here
-the volume follows from the cameras: the pixels of all training views between the nearest and the
-farthest depth, as far as half as many views as possible see it.
+3DGS starts NeRF's synthetic scenes with 100,000 points in a known cube. Here the volume follows
+from the cameras: it contains the points between the nearest and the farthest depth of training
+views that at least half as many views see as see the most visible point.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from p2gs_jax.scene.visibility import in_frame
 from p2gs_jax.types import Scene, View
 
 COUNT = 100_000
-# Fewer matched points than this are as good as none.
+# Fewer matched points than this count as none.
 FEWEST = 50
-# A point is kept if it is seen by this share of the views that see the most seen one.
+# A point is kept if this share of the number of views that see the most visible point see it.
 COMMON = 0.5
-# Where the cameras look at no common place: nearest and farthest depth, in their extent.
+# Nearest and farthest depth of cameras without a common focus, in multiples of their extent.
 APART = (0.5, 10.0)
-# More views than this add nothing.
+# The largest number of views that count visibility.
 MOST_VIEWS = 64
 _ROUNDS = 20
 _COLORS = (
@@ -39,26 +39,26 @@ _COLORS = (
     ("r", "g", "b"),
     ("f_dc_0", "f_dc_1", "f_dc_2"),
 )
-# Floats of at most this much have 1 for white.
+# Float colours up to this value have 1 for white.
 _MOST_OF_ONE = 2.0
 _FIX = "write it again with the tool that made it"
 
 
 def read_points(path: Path) -> tuple[Float64[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"] | None]:
-    """Return the positions and, where there are any, display colours of the points in a PLY.
+    """Return the positions and the display colours, if there are any, of the points in a PLY.
 
-    Colours are red, green, blue of 8 or 16 bits, or floats to 1 or 255, or those of Gaussians
+    Colours are red, green, blue with 8 or 16 bits, floats up to 1 or 255, or those of Gaussians
     (f_dc). Raises UserError: the file is absent, is not such a PLY, or holds points that are not
     finite.
     """
     if not path.is_file():
-        fix = "put the file there, or take its name out of the .json: seeds are then found"
+        fix = "put the file there, or remove its name from the .json: points are then triangulated"
         raise broken(f"the seed points {path}", "do not exist", fix)
     with refusing(path, "points", fix=_FIX):
         vertex = read_table(path, "vertex")
         points = np.stack([vertex[axis] for axis in "xyz"], 1).astype(np.float64)
-        there = next((c for c in _COLORS if set(c) <= set(vertex.dtype.names or ())), None)
-        colors = None if there is None else _display_colors(vertex, there)
+        names = next((c for c in _COLORS if set(c) <= set(vertex.dtype.names or ())), None)
+        colors = None if names is None else _display_colors(vertex, names)
     bad = int((~np.isfinite(points).all(axis=1)).sum())
     if bad:
         raise broken(f"{path}:", f"{bad} of {len(points)} points are not finite", _FIX)
@@ -66,7 +66,7 @@ def read_points(path: Path) -> tuple[Float64[np.ndarray, "p 3"], UInt8[np.ndarra
 
 
 def _display_colors(vertex: np.ndarray, names: Sequence[str]) -> UInt8[np.ndarray, "p 3"]:
-    """Return the colours in three columns of a table; what their largest is tells what white is."""
+    """Return the colours in three columns of a table; the largest value decides which is white."""
     values = np.stack([vertex[name] for name in names], 1)
     floats = values.dtype.kind == "f"
     values = np.nan_to_num(values.astype(np.float64))
@@ -79,12 +79,12 @@ def _display_colors(vertex: np.ndarray, names: Sequence[str]) -> UInt8[np.ndarra
 
 
 def with_random_seeds(scene: Scene) -> Scene:
-    """Return a split scene with points drawn in the common volume of its training views.
+    """Return a split scene with random points in the common volume of its training views.
 
-    Their colours are left to the photographs, and they count as no observations of anything.
+    The photographs give their colours later; the points have no observations.
     """
     few = len(scene.points)
-    why = f"Only {few} points were matched" if few else "Neither points nor matches"
+    why = f"Only {few} points were matched" if few else "There are neither points nor matches"
     views = scene.training_views
     near, far = depth_range(views) if scene.depths is None else scene.depths
     points = common_points(views, near, far)
@@ -96,7 +96,7 @@ def with_random_seeds(scene: Scene) -> Scene:
 
 
 def depth_range(views: Sequence[View]) -> tuple[float, float]:
-    """Return the depths between which what two or more views look at must lie, scene units."""
+    """Return the nearest and farthest depth of the volume that views share, scene units."""
     viewmats = np.stack([view.viewmat for view in views]).astype(np.float64)
     forward = viewmats[:, 2, :3]
     centers = camera_centers(viewmats)
@@ -117,7 +117,7 @@ def depth_range(views: Sequence[View]) -> tuple[float, float]:
 def common_points(
     views: Sequence[View], near: float, far: float, count: int = COUNT
 ) -> Float32[np.ndarray, "p 3"]:
-    """Return at most `count` points that many views see, evenly in pixels and in 1 / depth.
+    """Return at most `count` points that many views see, uniform in pixels and in 1 / depth.
 
     Depths are between `near` and `far`, scene units.
     """
@@ -130,7 +130,7 @@ def common_points(
     kept: list[np.ndarray] = []
     best, found = 0, 0
     for _ in range(_ROUNDS):
-        # Random points in front of random views.
+        # Points are drawn in front of random views.
         rows = rng.integers(len(views), size=count)
         share = rng.random((count, 2))
         depth = 1 / rng.uniform(1 / far, 1 / near, count)

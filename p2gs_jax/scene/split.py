@@ -1,11 +1,11 @@
-"""Which views are held out: as the user or the data set lists them, else every n-th of each camera.
+"""Held-out views: those that the user or the data set lists, or else every n-th of each camera.
 
-    FILE.json            {"train": ["a.png", ...], "test": ["b.png", ...]}; one of them may be
-                         missing: it is then the rest. `val` is held out where there is no `test`
-    test.txt, train.txt  names, a line each (3DGS reads test.txt beside a COLMAP model); empty lines
-                         and those that begin with # do not count
+    FILE.json            {"train": ["a.png", ...], "test": ["b.png", ...]}; a missing list is the
+                         rest of the views; `val` is held out if there is no `test`
+    test.txt, train.txt  one name a line (3DGS reads test.txt beside a COLMAP model); empty lines
+                         and lines that begin with # do not count
 
-A name is that of the view, or any end of the path of its photograph, with or without the suffix.
+A name is the view's name, or any end of the path of its photograph, with or without the suffix.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ _INSTEAD = "--split every holds out every n-th view instead"
 
 
 def split_scene(scene: Scene, cfg: DataConfig) -> Scene:
-    """Return a scene whose views are split, and that says by what.
+    """Return a scene with held-out views and the rule that chose them (`split_by`).
 
-    A file that the user names comes first, then what the data set says (`split_by` and the views),
-    then every n-th view; `test_every` 0 holds out none in any case. Raises UserError: the file is
-    broken or names what is not there, or so many cannot be held out.
+    A file that the user names comes first, then the data set's split (`split_by` and the views),
+    then every n-th view. If `test_every` is 0, no view is held out. Raises UserError: the file is
+    broken or names a photograph that is not there, or so many views cannot be held out.
     """
     if cfg.split is not None and cfg.split != EVERY and cfg.test_every:
         lists = read_split(Path(cfg.split))
@@ -45,19 +45,18 @@ def split_scene(scene: Scene, cfg: DataConfig) -> Scene:
         return scene
     n = cfg.test_every
     views = assign_split(scene.views, n)
-    what = "frame" if any(view.frame is not None for view in views) else "view of each camera"
+    unit = "frame" if any(view.frame is not None for view in views) else "view of each camera"
     ending = "th" if 10 <= n % 100 <= 20 else {1: "st", 2: "nd", 3: "rd"}.get(n % 10, "th")
-    by = f"every {n}{ending} {what}" if n else "--test-every 0"
+    by = f"every {n}{ending} {unit}" if n else "--test-every 0"
     return dataclasses.replace(scene, views=views, split_by=by)
 
 
 def assign_split(views: tuple[View, ...], test_every: int) -> tuple[View, ...]:
     """Return the views with `split` set, in the order given.
 
-    Within each camera, sorted by the numbers in names, views 0, n, 2n, ... are `test`, as in 3DGS;
-    where views have frames, the frames 0, n, 2n, ... among all of them are. A camera that would be
-    left without a training view holds out none, and so does n = 0. Raises UserError: n is negative,
-    or 1.
+    Views 0, n, 2n, ... of each camera, sorted by the numbers in names, are `test`, as in 3DGS. If
+    views have frames, the frames 0, n, 2n, ... of the scene are. No view is held out if n is 0, or
+    if its camera would have no training view. Raises UserError: n is negative, or 1.
     """
     if test_every < 0 or test_every == 1:
         why = f"cannot hold out every n-th view with n = {test_every}"
@@ -68,9 +67,9 @@ def assign_split(views: tuple[View, ...], test_every: int) -> tuple[View, ...]:
         for i in sorted(range(len(views)), key=lambda i: natural(views[i].name)):
             by_camera[views[i].camera].append(i)
         frames = sorted({v.frame for v in views if v.frame is not None})
-        held = set(frames[::test_every])
+        picked = set(frames[::test_every])
         for rows in by_camera.values():
-            chosen = {i for i in rows if views[i].frame in held} if frames else rows[::test_every]
+            chosen = {i for i in rows if views[i].frame in picked} if frames else rows[::test_every]
             if len(chosen) < len(rows):
                 test.update(chosen)
     return _with_test(views, test)
@@ -83,9 +82,9 @@ def _with_test(views: Sequence[View], test: set[int]) -> tuple[View, ...]:
 
 
 class SplitLists(NamedTuple):
-    """Names of photographs that are trained on or held out; None: the rest.
+    """Names of photographs that are trained on or held out; None stands for the rest.
 
-    `where` is the file; of several, their folder and names.
+    `where` is the file with the lists, or the folder and the names of several files.
     """
 
     where: Path
@@ -94,9 +93,9 @@ class SplitLists(NamedTuple):
 
 
 def read_split(path: Path) -> SplitLists:
-    """Read the lists that a user names: .json, or text with the names of what is held out.
+    """Read a user's lists: .json, or a text file with the names of held-out photographs.
 
-    Raises UserError: it is absent, or holds no such lists.
+    Raises UserError: the file is absent, or holds no such lists.
     """
     if not path.exists():
         raise broken(path, "does not exist", "correct the option --split")
@@ -111,22 +110,22 @@ def read_split(path: Path) -> SplitLists:
 
 
 def lists_in(path: Path, data: object, keys: dict[str, str]) -> SplitLists | None:
-    """Return the lists in the data of a .json, or None where it holds none.
+    """Return the lists in the data of a .json, or None if it holds none.
 
-    `keys` are what `train`, `test` and `val` are called in it; `val` is held out where `test` is
-    absent or empty, and else left out. Raises UserError: one of them is not a list of names.
+    `keys` maps `train`, `test` and `val` to the file's keys. `val` is held out if `test` is absent
+    or empty, and left out otherwise. Raises UserError: a value is not a list of names.
     """
     lists: dict[str, list[str]] = {}
     for name, key in keys.items():
-        given = data.get(key) if isinstance(data, dict) else None
-        if given is None:
+        names = data.get(key) if isinstance(data, dict) else None
+        if names is None:
             continue
-        if not isinstance(given, list) or not all(isinstance(n, str) and n for n in given):
+        if not isinstance(names, list) or not all(isinstance(n, str) and n for n in names):
             raise broken(f"{path}:", f'"{key}" is not a list of names', "correct the file")
-        lists[name] = given
-    # Tools write empty lists for what they lack.
-    held = lists.get("test") or lists.get("val") or None
-    return SplitLists(path, lists.get("train"), held) if lists else None
+        lists[name] = names
+    # Tools write empty lists for parts of the split that they lack.
+    held_out = lists.get("test") or lists.get("val") or None
+    return SplitLists(path, lists.get("train"), held_out) if lists else None
 
 
 def lists_beside(*folders: Path) -> SplitLists | None:
@@ -140,10 +139,10 @@ def lists_beside(*folders: Path) -> SplitLists | None:
 
 
 def split_as_listed(scene: Scene, lists: SplitLists, *, allow_missing: bool = False) -> Scene:
-    """Return a scene whose views are split as lists say; what is in none of them is left out.
+    """Return a scene whose views are split by lists; views in neither list are left out.
 
     Raises UserError: a name belongs to no photograph (unless `allow_missing`) or to several, or is
-    in two lists; or nothing is left to train on.
+    in both lists; or no training view is left.
     """
     views, where, name, notes = scene.views, lists.where, lists.where.name, []
     row_of = row_finder(views, where)
@@ -153,39 +152,39 @@ def split_as_listed(scene: Scene, lists: SplitLists, *, allow_missing: bool = Fa
     ]
     unused = [n for rows in found for n, row in (rows or {}).items() if row is None]
     if unused:
-        absent = [n for n in unused if not _lies_there(n, views)]
+        absent = [n for n in unused if not _exists_without_pose(n, views)]
         if absent and not allow_missing:
             why = f"lists {absent[0]}, which the scene does not have"
             raise broken(where, why, f"correct the name, or add the photograph; {_INSTEAD}")
         why = f"{name} lists {len(unused)} photographs that are not views of the scene"
         notes.append(f"{why}: {first_few(unused)}")
-    everything = set(range(len(views)))
+    all_rows = set(range(len(views)))
     train, test = (
         None if rows is None else {row for row in rows.values() if row is not None}
         for rows in found
     )
-    train = everything - (test or set()) if train is None else train
-    test = everything - train if test is None else test
+    train = all_rows - (test or set()) if train is None else train
+    test = all_rows - train if test is None else test
     if both := sorted(train & test):
         why = f"{views[both[0]].name} is both trained on and held out"
-        raise broken(f"{where}:", why, f"take it out of one of the lists; {_INSTEAD}")
+        raise broken(f"{where}:", why, f"remove it from one of the lists; {_INSTEAD}")
     if not train:
         raise broken(where, "leaves no view to train on", f"correct the lists; {_INSTEAD}")
     scene = dataclasses.replace(scene, views=_with_test(views, test), split_by=name)
-    if left := sorted(everything - train - test):
+    if left := sorted(all_rows - train - test):
         why = f"{len(left)} views are neither trained on nor held out by {name}"
         notes.append(f"{why}: they are not used")
         scene = only(scene, sorted(train | test))
     if not test:
-        why = f"{name} holds no view out: nothing says how good views are that are not trained on."
-        notes.append(f"{why} --split every holds out every n-th.")
+        why = f"{name} holds out no view, so the quality of new views is not measured."
+        notes.append(f"{why} --split every holds out every n-th view.")
     return dataclasses.replace(scene, notes=(*scene.notes, *notes))
 
 
 def only(
     scene: Scene, rows: Sequence[int] | np.ndarray, points: Int[np.ndarray, " k"] | None = None
 ) -> Scene:
-    """Return a scene with some of its views and points (None: all), and observations among them."""
+    """Return a scene with some views and points (None: all points), and their observations."""
     points = np.arange(len(scene.points)) if points is None else points
     view, point = (np.full(len(a), -1, np.int32) for a in (scene.views, scene.points))
     view[rows], point[points] = np.arange(len(rows)), np.arange(len(points))
@@ -216,7 +215,7 @@ def _lines(path: Path) -> tuple[str, ...]:
     return found
 
 
-def _lies_there(name: str, views: Sequence[View]) -> bool:
-    """Return whether a photograph is there of which the scene has no pose."""
+def _exists_without_pose(name: str, views: Sequence[View]) -> bool:
+    """Return whether a photograph without a pose exists under this name."""
     path = image_folder_of(views[0]) / plain_name(name)
     return path.is_file() or (path.parent.is_dir() and any(path.parent.glob(f"{path.name}.*")))

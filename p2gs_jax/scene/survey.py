@@ -1,4 +1,4 @@
-"""What there is to fit, without fitting: counted, for every format. Nothing long is computed."""
+"""Facts about a scene folder before a fit, for every format, without long computations."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from p2gs_jax.scene.rigid import camera_centers, time_order
 from p2gs_jax.scene.video import expected_frames, video_size
 from p2gs_jax.types import Scene, View
 
-# Labels of boxes that are named; the rest is counted.
+# The largest number of labels of boxes that are listed; the others are counted together.
 MOST_LABELS = 8
 
 
 @dataclass(frozen=True)
 class SurveyedCamera:
-    """One physical camera, or photographs of one size where nothing else is known.
+    """One physical camera, or photographs of one size if their cameras are unknown.
 
-    Sizes and focal lengths are pixels, `own_car` is the share of the picture that shows the car
-    itself, `ev` the range of log2(time ISO / N^2), stops.
+    Sizes and focal lengths are in pixels. `own_car` is the share of the picture that shows the car,
+    `ev` the range of log2(time ISO / N^2) in stops.
     """
 
     name: str
@@ -44,7 +44,7 @@ class SurveyedCamera:
 
 @dataclass(frozen=True)
 class Survey:
-    """What there is: its format as in `DataConfig`, its cameras, and the rest in sentences."""
+    """Facts about a scene: its format as in `DataConfig`, its cameras, and sentences."""
 
     format: str
     cameras: tuple[SurveyedCamera, ...]
@@ -52,34 +52,34 @@ class Survey:
 
     @property
     def photographs(self) -> int:
-        """How many there are."""
+        """Number of photographs."""
         return sum(camera.photographs for camera in self.cameras)
 
 
 def survey(root: Path, cfg: DataConfig, report: Report = lambda message: None) -> Survey:
-    """Return what a folder holds, with the options of a fit; missing photographs are counted.
+    """Return facts about a folder, with the options of a fit; missing photographs are counted.
 
-    Raises UserError as `find_scene` does, and where an image is broken or a table malformed.
+    Raises UserError as `find_scene` does, and if an image is broken or a table malformed.
     """
     cfg = dataclasses.replace(cfg, allow_missing=True)
     found = find_scene(root, cfg, report)
-    alone = ("There is nothing else: structure from motion finds the cameras when a fit starts.",)
+    alone = ("There are no cameras: structure from motion finds them when a fit starts.",)
     if isinstance(found, PhotographsAlone):
         return Survey("images", _sizes(found), alone)
-    if isinstance(found, Path):  # of a video
+    if isinstance(found, Path):  # a video
         camera = SurveyedCamera("", expected_frames(found) or 0, video_size(found))
         return Survey("video", (camera,), alone)
     if isinstance(found, Recording):
         scene = with_what_lies_beside(assemble(found, cfg, None, report, write_embedded=False), cfg)
-        facts = _of_drive(scene, found, cfg)
+        facts = _drive_facts(scene, found, cfg)
     else:
         scene = with_what_lies_beside(found, cfg)
         facts = [f"{len(scene.points):,} points."] if len(scene.points) else []
         if scene.tracks is not None:
             facts.append(f"{len(scene.tracks.xy):,} observations of points.")
     if all(view.exif_ev is None for view in scene.views):
-        facts.append("No exposures in EXIF.")
-    cameras = tuple(_camera(name, taken) for name, taken in _by_camera(scene).items())
+        facts.append("EXIF has no exposures.")
+    cameras = tuple(_camera(name, views) for name, views in _by_camera(scene).items())
     return Survey(scene.format, cameras, (*facts, *scene.notes))
 
 
@@ -89,28 +89,28 @@ def _by_camera(scene: Scene) -> dict[str, list[View]]:
     return {n: sorted((v for v in scene.views if v.camera == n), key=time_order) for n in names}
 
 
-def _camera(name: str, taken: Sequence[View]) -> SurveyedCamera:
-    view, ev = taken[0], _range([v.exif_ev for v in taken])
+def _camera(name: str, views: Sequence[View]) -> SurveyedCamera:
+    view, ev = views[0], _range([v.exif_ev for v in views])
     lens = "" if view.distortion is None else view.distortion.model
-    bonnet = None if view.own_car is None else float(view.own_car.mean())
+    car_share = None if view.own_car is None else float(view.own_car.mean())
     size = (view.width, view.height)
-    return SurveyedCamera(name, len(taken), size, float(view.K[0, 0]), lens, bonnet, ev)
+    return SurveyedCamera(name, len(views), size, float(view.K[0, 0]), lens, car_share, ev)
 
 
-def _of_drive(scene: Scene, found: Recording, cfg: DataConfig) -> list[str]:
-    """Return sentences on the frames, the way, the sweeps and the boxes of a drive."""
+def _drive_facts(scene: Scene, found: Recording, cfg: DataConfig) -> list[str]:
+    """Return sentences on the frames, the distance and the boxes of a drive."""
     frames = len(chosen_frames(cfg.frames, sorted({p.frame for p in found.photographs})))
     by_camera = _by_camera(scene)
     longest = camera_centers(np.stack([v.viewmat for v in max(by_camera.values(), key=len)]))
-    way = float(np.linalg.norm(np.diff(longest, axis=0), axis=1).sum())
+    total = float(np.linalg.norm(np.diff(longest, axis=0), axis=1).sum())
     times = [view.time for view in scene.views if view.time is not None]
     missing = frames * len(by_camera) - len(scene.views)
-    facts = [f"{count_of(frames, 'frame')}, {max(times) - min(times):.1f} s, {way:.1f} m driven."]
+    facts = [f"{count_of(frames, 'frame')}, {max(times) - min(times):.1f} s, {total:.1f} m driven."]
     if missing:
         facts.append(f"{count_of(missing, 'photograph')} missing in these frames.")
     labels = Counter(thing.label for thing in scene.objects)
     if not labels:
-        return [*facts, "No boxes."]
+        return [*facts, "There are no boxes."]
     moving = Counter(thing.label for thing in scene.objects if thing.moving)
     listed = [
         f"{count} {label}" + (f" ({moving[label]} moving)" if moving[label] else "")
@@ -128,7 +128,7 @@ def _range(values: Sequence[float | None]) -> tuple[float, float] | None:
 
 
 def _sizes(found: PhotographsAlone) -> tuple[SurveyedCamera, ...]:
-    """Return photographs by size: more is not known before their cameras are."""
+    """Return one camera for each size of photographs, before their cameras are found."""
     by_size: dict[tuple[int, int], list[Path]] = defaultdict(list)
     for path in found.paths:
         by_size[image_size(path)].append(path)

@@ -1,13 +1,14 @@
 """Poses in one file beside the photographs: `transforms.json`, and LLFF's `poses_bounds.npy`.
 
-nerfstudio and instant-ngp write one `transforms.json`, Blender's scenes one for each part of the
-split. Poses are camera-to-world with OpenGL axes (x right, y up, z backwards); intrinsics follow
-COLMAP (pixel centres at +0.5). Of nerfstudio's other fields `ply_file_path` names seed points in
-the axes of the poses, `train_filenames`, `test_filenames` and `val_filenames` the split.
+nerfstudio and instant-ngp write one `transforms.json`, Blender's scenes have one for each part of
+the split. Poses are camera-to-world with OpenGL axes (x right, y up, z backwards); intrinsics
+follow COLMAP (pixel centres at +0.5). Two further fields of nerfstudio are read: `ply_file_path`
+names seed points in the axes of the poses; `train_filenames`, `test_filenames` and `val_filenames`
+list the split.
 
 LLFF's table has a row for each photograph, in the order of their names: a 3x5 matrix, row by row,
-and the nearest and the farthest depth. The matrix is the camera-to-world pose with the axes (down,
-right, backwards), and beside it height, width and focal length in pixels
+and the nearest and the farthest depth. Four columns of the matrix are the camera-to-world pose with
+axes (down, right, backwards); the fifth is height, width and focal length in pixels
 (github.com/Fyusion/LLFF, "Using your own poses").
 """
 
@@ -40,10 +41,10 @@ from p2gs_jax.scene.split import lists_in, split_as_listed
 from p2gs_jax.scene.visibility import share_in_view
 from p2gs_jax.types import Distortion, Scene, Split, View
 
-# HDR-NeRF's has a column more: exposures, seconds.
+# HDR-NeRF's table has one more column: exposure times in seconds.
 LLFF_FILES = ("poses_bounds_exps.npy", "poses_bounds.npy")
 _LLFF_COLUMNS = 17
-# Columns of LLFF's pose that are OpenCV's x, y, z and position, and their signs.
+# The columns of LLFF's pose in the order of OpenCV's x, y, z and position, and their signs.
 _LLFF_AXES, _LLFF_SIGNS = [1, 0, 2, 3], np.array([1.0, 1.0, -1.0, 1.0])
 _OPENGL_SIGNS = np.array([1.0, -1.0, -1.0, 1.0])
 _LLFF_FIX = "write it again with LLFF's imgs2poses.py, or remove it"
@@ -67,15 +68,16 @@ class _Frame(NamedTuple):
 
 
 def is_blender(root: Path) -> bool:
-    """Return whether a folder carries one transforms.json for each part of the split."""
+    """Return whether a folder has one transforms.json for each part of the split."""
     return (root / "transforms_train.json").is_file()
 
 
 def load_transforms(root: Path, json_path: Path, cfg: DataConfig) -> Scene:
-    """Read the poses and intrinsics; the scene has no tracks yet, and points if the file names any.
+    """Read poses and intrinsics; the scene has no tracks yet, and points if the file names any.
 
-    Raises UserError: the file is malformed (the line or the frame is named), its lens model is not
-    supported, images are missing or of another size, or it lists views that it lacks.
+    Raises UserError: the file is malformed (the message names the line or the frame), the lens
+    model is not supported, images are missing or have another size, or the split lists a name that
+    is not a view.
     """
     frames, data = _frames(json_path)
     held_out = data.get("test_frames")  # ScanNet++
@@ -91,7 +93,7 @@ def load_transforms(root: Path, json_path: Path, cfg: DataConfig) -> Scene:
         points, colors = read_points(_beside(json_path, name))
         scene = replace(scene, points=points, point_colors=colors)
         if not len(points):
-            note = f"{name} holds no points: seeds are found as if it were not named."
+            note = f"{name} holds no points: the scene is read as if the file were not named."
             scene = replace(scene, notes=(*scene.notes, note))
         require_axes(scene.views, lambda views: share_in_view(points, views), json_path)
     scene = off_origin(scene)
@@ -102,11 +104,11 @@ def load_transforms(root: Path, json_path: Path, cfg: DataConfig) -> Scene:
 
 
 def load_blender(root: Path, cfg: DataConfig) -> Scene:
-    """Read the views of NeRF's synthetic scenes, and of all that are laid out as they are.
+    """Read the views of NeRF's synthetic scenes, and of all scenes with the same layout.
 
-    `transforms_train.json` is trained on and `transforms_test.json` held out; `transforms_val.json`
-    takes its place where there is none. One camera took all views. Raises UserError: as of
-    `load_transforms`; or a photograph is listed in both.
+    Views in `transforms_train.json` are trained on, views in `transforms_test.json` (or else
+    `transforms_val.json`) are held out. One camera took all views. Raises UserError: as
+    `load_transforms` does, or if both files list a photograph.
     """
     train = root / "transforms_train.json"
     others = [root / f"transforms_{name}.json" for name in ("test", "val")]
@@ -121,8 +123,8 @@ def load_blender(root: Path, cfg: DataConfig) -> Scene:
 def load_llff(root: Path, cfg: DataConfig) -> Scene:
     """Read LLFF's poses, intrinsics and bounds; the scene has no points and no tracks yet.
 
-    Raises UserError: the file is broken, has not a row for each photograph, or photographs have
-    another shape than it says.
+    Raises UserError: the file is broken, does not have one row for each photograph, or states
+    another shape than the photographs have.
     """
     path = llff_table(root)
     assert path is not None
@@ -131,17 +133,17 @@ def load_llff(root: Path, cfg: DataConfig) -> Scene:
     folder = next((place for place in places if place.is_dir()), places[0])
     photographs = files.list_images(folder, recursive=False)
     if len(photographs) != len(rows):
-        why = f"has {len(rows)} rows, and {folder} holds {len(photographs)} photographs"
+        why = f"has {len(rows)} rows, but {folder} holds {len(photographs)} photographs"
         fix = "put all photographs of the poses there and no others, or name their folder with "
         raise broken(path, why, fix + "--images")
     views, resized = [], 0
     for k, (image, row) in enumerate(zip(photographs, rows, strict=True)):
-        matrix, what = row[:15].reshape(3, 5), f"row {k}"
+        matrix, row_name = row[:15].reshape(3, 5), f"row {k}"
         height, width, focal = matrix[:, 4]
         stated = (round(width), round(height))
         K, w, h = at_file_size(image, intrinsics(focal, focal, width / 2, height / 2), stated, path)
         resized += (w, h) != stated
-        viewmat = _viewmat(matrix[:, _LLFF_AXES] * _LLFF_SIGNS, path, what, _LLFF_FIX)
+        viewmat = _viewmat(matrix[:, _LLFF_AXES] * _LLFF_SIGNS, path, row_name, _LLFF_FIX)
         ev = float(np.log2(row[17])) if len(row) > _LLFF_COLUMNS else None
         views.append(View(image.name, image, f"{focal:g}", viewmat, K, w, h, exif_ev=ev))
     bounds = (float(rows[:, 15].min()), float(rows[:, 16].max()))
@@ -151,7 +153,7 @@ def load_llff(root: Path, cfg: DataConfig) -> Scene:
 
 
 def llff_table(root: Path) -> Path | None:
-    """Return LLFF's table in a folder, or HDR-NeRF's, which has exposures, or None."""
+    """Return the path of HDR-NeRF's table (with exposures) or LLFF's in a folder, or None."""
     return next((root / name for name in LLFF_FILES if (root / name).is_file()), None)
 
 
@@ -177,12 +179,12 @@ def _viewmat(
     nearest = nearest_rotation(pose[:, :3])
     if nearest is None:
         raise broken(f"{path}:", f"{what} is not a rotation and a translation", fix)
-    turn = np.ascontiguousarray(nearest.T)
-    return pose_of(turn, -turn @ pose[:, 3])
+    rotation = np.ascontiguousarray(nearest.T)
+    return pose_of(rotation, -rotation @ pose[:, 3])
 
 
 def _read_llff(path: Path) -> Float64[np.ndarray, "v 17"]:
-    """Return the table; nothing in the file is run."""
+    """Return the table, without running any code in the file."""
     try:
         table = np.load(path, allow_pickle=False)
     except BROKEN_ARRAYS as error:
@@ -210,7 +212,7 @@ def _read_llff(path: Path) -> Float64[np.ndarray, "v 17"]:
 
 
 def _assembled(root: Path, name: str, frames: Sequence[_Frame], cfg: DataConfig) -> Scene:
-    """Return a scene of frames, float64; one camera took all of Blender's scenes."""
+    """Return the scene of frames, float64; a Blender scene has one camera."""
     folder = frames[0].source.parent
     place, names = _names(folder, frames, files.image_folder(folder, cfg))
     located = files.find_names(names, place)
@@ -222,17 +224,17 @@ def _assembled(root: Path, name: str, frames: Sequence[_Frame], cfg: DataConfig)
     sources = " and ".join(dict.fromkeys(frame.source.name for frame in frames))
     notes += files.nearly_named(located, sources)
     found = [(located[n], f) for n, f in zip(names, frames, strict=True) if n in located]
-    twice = next((n for n, times in Counter(n for n, _ in found).items() if times > 1), None)
-    if twice is not None:
-        first, *_, last = (frame.source for name, frame in found if name == twice)
+    repeated = next((n for n, times in Counter(n for n, _ in found).items() if times > 1), None)
+    if repeated is not None:
+        first, *_, last = (frame.source for name, frame in found if name == repeated)
         if first == last:
-            raise broken(first, f"lists {twice} more than once", _FIX)
-        why = f"both list {twice}: it cannot be both trained on and held out"
-        fix = f"take it out of one of them, or name {first} itself for every 8th view"
+            raise broken(first, f"lists {repeated} more than once", _FIX)
+        why = f"both list {repeated}: a view is either trained on or held out"
+        fix = f"remove it from one of them, or name {first} itself to hold out every 8th view"
         raise broken(f"{first} and {last.name}", why, fix)
     views, resized = [], 0
-    for where, frame in sorted(found, key=lambda item: item[0]):
-        view, differs = _view(frame, place, where)
+    for image_name, frame in sorted(found, key=lambda item: item[0]):
+        view, differs = _view(frame, place, image_name)
         views.append(view)
         resized += differs
     _require_one_shape(views, dict(found))
@@ -241,10 +243,10 @@ def _assembled(root: Path, name: str, frames: Sequence[_Frame], cfg: DataConfig)
 
 
 def _names(folder: Path, frames: Sequence[_Frame], asked: Path | None) -> tuple[Path, list[str]]:
-    """Return the folder of the images and their names relative to it, as of `images/` for COLMAP.
+    """Return the image folder, such as `images/`, and the names of the images relative to it.
 
-    Without such a folder that is the deepest one that holds all of them. In a folder that the user
-    names they lie as in one of those above.
+    If no folder has such a name, the deepest common folder is returned. If the user names a folder
+    (`asked`), the names that most files there have are used.
     """
     common = Path(os.path.commonpath([frame.path.parent for frame in frames]))
     depth = next((k + 1 for k, n in enumerate(common.parts) if _IMAGES.fullmatch(n)), None)
@@ -257,30 +259,30 @@ def _names(folder: Path, frames: Sequence[_Frame], asked: Path | None) -> tuple[
     if asked is not None:
         order = sorted(range(len(below)), key=lambda k: (k != depth, k))
         order = [k for k in order if ".." not in common.parts[k:]]
-        held = [sum((asked / name).is_file() for name in below[k]) for k in order]
-        depth = order[int(np.argmax(held))]
+        counts = [sum((asked / name).is_file() for name in below[k]) for k in order]
+        depth = order[int(np.argmax(counts))]
     place = folder.joinpath(*common.parts[:depth]) if asked is None else asked
     return place, [name.as_posix() for name in below[depth]]
 
 
 def _require_one_shape(views: Sequence[View], frames: Mapping[str, _Frame]) -> None:
-    """Refuse photographs of several shapes where only the photographs say which is right."""
-    free = [v for v in views if not {"w", "h"} <= set(frames[v.name].values)]
-    for view in free:
-        first = free[0]
+    """Raise UserError if frames without a size share a lens but not a shape."""
+    unsized = [v for v in views if not {"w", "h"} <= set(frames[v.name].values)]
+    for view in unsized:
+        first = unsized[0]
         sizes = [(v.width, v.height) for v in (view, first)]
         if not (files.same_shape(*sizes) or files.same_shape(*sizes[::-1])):
-            why = f"is {view.width}x{view.height}, {first.name} {first.width}x{first.height}, and "
-            why += f"{frames[view.name].source} gives all of them one lens"
+            why = f"is {view.width}x{view.height}, but {first.name} is {first.width}x"
+            why += f"{first.height}, and {frames[view.name].source} gives them one lens"
             fix = "use the photographs that belong to the poses, neither cropped nor rotated, or "
-            fix += 'give frames their own "w", "h" and "fl_x"'
+            fix += 'give every frame its "w", "h" and "fl_x"'
             raise broken(f"wrong size: {view.image_path}", why, fix)
 
 
 def _frames(
     path: Path, split: Split = "train", key: str = "frames"
 ) -> tuple[list[_Frame], dict[str, Any]]:
-    """Return the frames in a file, and all that it holds."""
+    """Return the frames in a file, and the whole content of the file."""
     data, frames = files.read_json(path, _FIX), []
     if not isinstance(data, dict) or not isinstance(data.get(key), list):
         raise broken(path, f'has no list "{key}"', _FIX)
@@ -295,7 +297,7 @@ def _frames(
 
 
 def _relative(source: Path, name: str) -> Path:
-    """Return a path in a file as one from its folder, which either may name through links."""
+    """Return a path in a file relative to the file's folder; both may contain symbolic links."""
     normal, folder = Path(os.path.normpath(name.replace("\\", "/"))), source.parent
     if not normal.is_absolute():
         return normal
@@ -307,14 +309,14 @@ def _relative(source: Path, name: str) -> Path:
 
 
 def _beside(source: Path, name: str) -> Path:
-    """Return the path of something else that a file names; it lies in its folder."""
+    """Return the path of another file that `source` names, which must lie in its folder."""
     relative = _relative(source, name)
     require_inside(relative, source.parent, source)
     return source.parent / relative
 
 
 def _view(frame: _Frame, folder: Path, name: str) -> tuple[View, bool]:
-    """Return the view of a frame, and whether its image has another size than its file says."""
+    """Return the view of a frame, and whether the image has another size than the JSON states."""
     path, values = frame.source, frame.values
     image_path = folder / name
     try:
@@ -328,22 +330,22 @@ def _view(frame: _Frame, folder: Path, name: str) -> tuple[View, bool]:
     K, distortion = _lens(path, values, name, *size)
     if not {"w", "h"} <= set(values) and np.abs(K[:2, 2] / size - 0.5).max() > files.MOST_OFF:
         why = f"{name} has its principal point at {K[0, 2]:.0f}, {K[1, 2]:.0f}, far from the middle"
-        fix = "write w and h, the size to which the lens belongs"
+        fix = "write w and h, the size of the photographs that the intrinsics belong to"
         raise broken(f"{path}:", f"{why} of its {size[0]}x{size[1]} pixels", fix)
     K, width, height = at_file_size(image_path, K, size, path)
     mask = values.get("mask_path")
     mask_path = _beside(path, mask) if isinstance(mask, str) and mask else None
     if mask_path is not None and not mask_path.is_file():
         raise broken(f"{path}:", f"the mask {mask_path} of {name} does not exist", _FIX)
-    what = f"the transform_matrix of {name}"
+    matrix_name = f"the transform_matrix of {name}"
     try:
         c2w = np.array(values.get("transform_matrix"), np.float64)[:3]
     except (TypeError, ValueError, IndexError):
         c2w = np.zeros(0)
     if c2w.shape != (3, 4) or not (np.abs(c2w) < HUGE).all():
-        raise broken(f"{path}:", f"{what} is not a finite 4x4 matrix", _FIX)
-    viewmat = _viewmat(c2w * _OPENGL_SIGNS, path, what, _FIX)
-    # Photographs of one lens are of one camera.
+        raise broken(f"{path}:", f"{matrix_name} is not a finite 4x4 matrix", _FIX)
+    viewmat = _viewmat(c2w * _OPENGL_SIGNS, path, matrix_name, _FIX)
+    # Photographs with the same lens come from one camera.
     camera = f"{values.get('w')} {values.get('h')} {np.round(K, 3).tolist()} {distortion}"
     view = View(name, image_path, camera, viewmat, K, width, height, distortion, mask_path)
     return replace(view, split=frame.split), (width, height) != size
@@ -373,7 +375,7 @@ def _lens(
         angle = number(angle_key, 0.0)
         if not 0 < angle < math.pi:
             why = f"{angle_key} of {name} is {angle:g}, not an angle between 0 and pi"
-            fix = f"write radians; {math.radians(angle):.6g}, if these are degrees"
+            fix = f"write radians: {math.radians(angle):.6g}, if the angle is in degrees"
             raise broken(f"{path}:", why, fix)
         return 0.5 * size / math.tan(0.5 * angle)
 
@@ -388,6 +390,6 @@ def _lens(
         return K, make_distortion(tuple(number(f"k{i}", 0.0) for i in (1, 2, 3, 4)), "fisheye")
     lens = tuple(number(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3"))
     if number("k4", 0.0) != 0.0:
-        why = f"{name} has a k4, which no supported lens model knows"
+        why = f"{name} has k4, which no supported lens model has"
         raise broken(f"{path}:", why, _UNDISTORT)
     return K, make_distortion(lens if lens[4] else lens[:4])

@@ -1,9 +1,9 @@
-"""From a video to a folder of photographs: its frames, their colours, and which are kept.
+"""From a video to a folder of photographs: its frames, their colours, and the choice of frames.
 
-Corners are followed from frame to frame. Parallax is what the best rotation leaves of their motion:
-turning on the spot shows nothing new of depth. A frame is due once the camera has come far enough
-since the last chosen one; the sharpest of those about then is chosen. So frame rate and speed do
-not matter, and a camera that rests gives one photograph.
+Corners are tracked from frame to frame. Parallax is the part of their motion that no rotation
+explains: a rotating camera shows no depth. A frame is due if the camera has moved far enough since
+the last chosen frame; the sharpest frame around that time is chosen. So frame rate and speed do not
+matter, and a camera that rests gives one photograph.
 """
 
 from __future__ import annotations
@@ -36,47 +36,47 @@ RECORD = "frames.json"
 _VERSION = 2
 _TRANSFER_NAMES = {"hlg": "HLG video", "pq": "PQ video"}
 _AGAIN = "copy or export the video again"
-_SHORT = "film while walking around the thing"
+_SHORT = "film while walking around the object"
 VIDEO_SUFFIXES = frozenset(
     {".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".ts", ".3gp"}
     | {".insv", ".360"}
 )
-# What 360-degree cameras record: two fisheyes, or six sides of a cube, beside each other.
+# Files of 360-degree cameras, with two fisheye images or six sides of a cube in a frame.
 _ALL_ROUND = frozenset({".insv", ".360"})
 _BT601 = (0.299, 0.114)
 # Weights of red and blue in luma, by matrix.
 _LUMA = {1: (0.2126, 0.0722), 5: _BT601, 6: _BT601, 7: (0.212, 0.087), 9: (0.2627, 0.0593)}
 _FULL_RANGE = 2
 _SMALLEST_HD = 720
-# Longer side of the frames that are compared, pixels.
+# Longer side of the frames for tracking, pixels.
 WIDTH = 640
 _CORNERS, _FEWEST = 400, 30
-# Focal length of most cameras that film, in longer sides; a wrong one leaves some of a rotation
-# over as parallax: a tenth of a turn of 10 degrees if it is wrong by a third.
+# The usual focal length of video, in longer sides. An error of a third turns a tenth of a rotation
+# of 10 degrees into parallax.
 _FOCAL = 0.85
-_BACK = 1.0  # pixels by which a corner may miss its start when followed back
+_BACK = 1.0  # the largest distance from its start of a corner that is tracked back, pixels
 _MID, _CONTRAST = 128.0, 48.0
 _ROUNDS = 4
-# A frame is due at one of these (BUILD_NOTES, "Videos").
+# A frame is due at one of these thresholds (BUILD_NOTES, "Videos").
 PARALLAX, DISPLACEMENT, LOST = 0.012, 0.10, 0.5
-# From this share of the way on, frames are candidates.
+# Frames are candidates from this fraction of a threshold on.
 _CANDIDATE = 0.6
-# The sharpest is chosen among at most so many: a camera that hovers must not fill the memory.
+# The largest number of candidates: the frames of a hovering camera must not fill the memory.
 _MOST_CANDIDATES = 48
-# Where all candidates are blurred, frames up to this share of the way are waited for.
+# If all candidates are blurred, the choice waits up to this multiple of a threshold.
 _LATEST = 1.5
-# Blurred: below this share of the sharpness of the frame chosen before.
+# A frame is blurred below this fraction of the sharpness of the last chosen frame.
 _BLURRED = 0.7
-# The first photograph is one of the first frames.
+# The first photograph is chosen among this number of first frames.
 _FIRST = 6
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A decoded frame, `turn` quarter turns against the clock from upright.
+    """A decoded frame, which `turn` counterclockwise quarter turns make upright.
 
-    Numbers count from 0 in the order in which frames are shown, `time` is seconds from the
-    beginning, and `square` the width over height of a pixel.
+    Numbers count from 0 in display order, `time` is in seconds from the beginning, and `square` is
+    the ratio of width to height of a pixel.
     """
 
     number: int
@@ -93,20 +93,20 @@ class Frame:
 
     @property
     def transfer(self) -> icc.Transfer | None:
-        """Transfer function, where it is one that gives light; None: a camera's own curve."""
+        """Transfer function if it gives light; None: the camera's tone curve."""
         return icc.TRANSFERS.get(int(self._decoded.color_trc))
 
     def grey(self, width: int) -> UInt8[np.ndarray, "h w"]:
-        """Return it small and grey, not turned; its longer side has at most `width` pixels."""
+        """Return a small grey picture, not rotated; its longer side has at most `width` pixels."""
         frame = self._decoded
         scale = min(1.0, width / max(frame.width, frame.height))
-        # swscale wants even widths.
+        # swscale needs even widths.
         size = [max(2, round(n * scale / 2) * 2) for n in (frame.width, frame.height)]
         small = frame.reformat(width=size[0], height=size[1], format="gray")
         return small.to_ndarray()
 
     def codes(self) -> UInt[np.ndarray, "h w 3"]:
-        """Return display values in sRGB, upright: of more than 8 bits, and of light, 16."""
+        """Return upright display values in sRGB, with 16 bits for deep colour and for light."""
         signal = _signal(self._decoded)
         primaries = icc.PRIMARIES.get(int(self._decoded.color_primaries), icc.BT709)
         if self.transfer is not None:
@@ -121,15 +121,16 @@ class Frame:
             codes = np.rint(np.clip(signal, 0, 1) * np.iinfo(kind).max).astype(kind)
         if self.square != 1:
             width = round(codes.shape[1] * self.square)
-            how = cv2.INTER_AREA if self.square < 1 else cv2.INTER_LINEAR
-            codes = cv2.resize(codes, (width, codes.shape[0]), interpolation=how)
+            method = cv2.INTER_AREA if self.square < 1 else cv2.INTER_LINEAR
+            codes = cv2.resize(codes, (width, codes.shape[0]), interpolation=method)
         return np.ascontiguousarray(np.rot90(codes, self.turn))
 
 
 def frames_of(path: Path) -> Iterator[Frame]:
     """Yield all frames of a video.
 
-    Raises UserError: it is not one, holds none, changes its size, or breaks off before two frames.
+    Raises UserError: the file is not a video, has no frame, changes its size, or has only one
+    readable frame.
     """
     with _opened(path) as (container, stream):
         stream.thread_type = "AUTO"
@@ -144,20 +145,20 @@ def frames_of(path: Path) -> Iterator[Frame]:
                 if first is None:
                     first, begin = size, time
                 if size != first:
-                    why = f"changes its size: frame {number} is {size}, those before are {first}."
+                    why = f"changes its size: frame {number} is {size}, earlier ones are {first}."
                     raise broken(path, why, "cut it into parts of one size and fit one of them")
                 turn = round(decoded.rotation / 90) % 4
                 yield Frame(number, time - begin, turn, square, decoded)
                 number += 1
         except av.FFmpegError as error:
-            # The rest of a broken file is lost, what came before is fine: the caller says how many.
+            # The frames before the fault of a broken file are used, and the caller counts them.
             if number < 2:
                 why = f"cannot be decoded: {error.strerror or error}."
                 raise broken(path, why, _AGAIN) from None
 
 
 def _whole_frames(frames: Iterator[av.VideoFrame], stream: Any) -> Iterator[av.VideoFrame]:
-    """Yield frames, from the first interlaced one on without the comb of two moments (bwdif)."""
+    """Yield frames, deinterlaced (bwdif) from the first interlaced one on."""
     graph = None
     for frame in frames:
         if graph is None and frame.interlaced_frame:
@@ -171,20 +172,20 @@ def _whole_frames(frames: Iterator[av.VideoFrame], stream: Any) -> Iterator[av.V
             yield frame
             continue
         graph.push(frame)
-        yield from _pulled(graph)
+        yield from _filtered(graph)
     if graph is not None:
         graph.push(None)
-        yield from _pulled(graph)
+        yield from _filtered(graph)
 
 
-def _pulled(graph: Graph) -> Iterator[av.VideoFrame]:
+def _filtered(graph: Graph) -> Iterator[av.VideoFrame]:
     with contextlib.suppress(av.BlockingIOError, av.EOFError):
         while True:
             yield cast(av.VideoFrame, graph.pull())
 
 
 def expected_frames(path: Path) -> int | None:
-    """Return how many frames the file claims to hold, or None."""
+    """Return the number of frames that the file states, or None."""
     with _opened(path) as (container, stream):
         if stream.frames:
             return int(stream.frames)
@@ -194,7 +195,7 @@ def expected_frames(path: Path) -> int | None:
 
 
 def video_size(path: Path) -> tuple[int, int]:
-    """Return (width, height) of the first frame, upright; errors are those of `frames_of`."""
+    """Return (width, height) of the first frame, upright; errors as in `frames_of`."""
     for frame in frames_of(path):
         return frame.size
     raise no_frames(path, 0)
@@ -202,15 +203,15 @@ def video_size(path: Path) -> tuple[int, int]:
 
 def no_frames(path: Path, count: int) -> UserError:
     """Return the error for a video that is too short."""
-    held = "no frame" if count == 0 else "one frame" if count == 1 else f"{count} frames"
-    why = f"holds {held}; a scene needs several, taken from different places."
+    frames = "no frame" if count == 0 else "one frame" if count == 1 else f"{count} frames"
+    why = f"holds {frames}; a scene needs several from different positions."
     return broken(path, why, _SHORT)
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
     if path.suffix.lower() in _ALL_ROUND or _is_spherical(path):
-        why = "is the recording of a 360-degree camera, which is no picture of one lens."
+        why = "is the recording of a 360-degree camera, whose frames are not pinhole images."
         fix = "export a flat (reframed) video of it with the camera's program, and fit that"
         raise broken(path, why, fix)
     try:
@@ -219,18 +220,18 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
         why = f"cannot be opened as a video: {error.strerror or error}."
         raise broken(path, why, f"{_AGAIN}, as .mp4 or .mov") from None
     with container:
-        # Covers of music are video streams of one picture.
+        # Album covers are video streams of one picture.
         cover = int(Disposition.attached_pic)
         streams = [s for s in container.streams.video if not int(s.disposition) & cover]
         if not streams:
             kinds = sorted({s.type for s in container.streams}) or ["nothing"]
             why = f"holds no video, but {', '.join(kinds)}."
-            raise broken(path, why, "name the file that holds the pictures")
+            raise broken(path, why, "name the file that holds the video")
         yield container, streams[0]
 
 
 def _is_spherical(path: Path) -> bool:
-    """Return whether an .mp4 or .mov says that it shows all around (Google's Spherical Video)."""
+    """Return whether an .mp4 or .mov states that it is spherical (Google's Spherical Video)."""
     with contextlib.suppress(OSError), path.open("rb") as file:
         while len(head := file.read(8)) == 8:
             size, name = int.from_bytes(head[:4]) - 8, head[4:]
@@ -239,16 +240,16 @@ def _is_spherical(path: Path) -> bool:
             if size < 0:
                 return False
             if name == b"moov":
-                said = file.read(size)
-                return b"GSpherical:Spherical>" in said or b"sv3d" in said
+                metadata = file.read(size)
+                return b"GSpherical:Spherical>" in metadata or b"sv3d" in metadata
             file.seek(size, os.SEEK_CUR)
     return False
 
 
 def _signal(frame: av.VideoFrame) -> Float[np.ndarray, "h w 3"]:
-    """Return red, green and blue as coded, 0 to 1 where they are in range.
+    """Return coded red, green and blue, 0 to 1 for values in range.
 
-    swscale only brings the chroma to full size: its RGB is off by up to 3 of 255 levels.
+    swscale only enlarges the chroma: its conversion to RGB errs by up to 3 of 255 levels.
     """
     if frame.format.is_rgb:
         return frame.reformat(format="rgb48le").to_ndarray().astype(np.float32) / 65535
@@ -268,9 +269,9 @@ def _signal(frame: av.VideoFrame) -> Float[np.ndarray, "h w 3"]:
 
 
 def read_video(path: Path, cfg: DataConfig, work_dir: Path | None, report: Report) -> Converted:
-    """Return the chosen frames of a video as photographs, kept in `work_dir` or the user's cache.
+    """Return the chosen frames of a video as photographs in `work_dir` or the user's cache.
 
-    Raises UserError: it is not a video, holds none, changes its size, or shows too little.
+    Raises UserError: as `frames_of` does, or fewer than two frames would be used.
     """
     key = {"version": _VERSION, "file": file_fingerprints([path])}
     key |= {"every": cfg.every, "max_frames": cfg.max_frames}
@@ -287,42 +288,42 @@ def read_video(path: Path, cfg: DataConfig, work_dir: Path | None, report: Repor
 
 
 def _keep(path: Path, cfg: DataConfig, folder: Path, report: Report) -> dict[str, Any]:
-    """Choose frames and write them; return a record of it."""
+    """Choose frames and write them; return the record."""
     expected, seen = expected_frames(path), 0
 
-    def watched() -> Iterator[tuple[int, np.ndarray]]:
+    def small_frames() -> Iterator[tuple[int, np.ndarray]]:
         nonlocal seen
         for frame in frames_of(path):
             if seen % 100 == 0:
                 total = "" if expected is None else f" of {expected}"
-                report(f"looking through the video: frame {frame.number}{total}")
+                report(f"reading the video: frame {frame.number}{total}")
             seen += 1
             yield frame.number, frame.grey(WIDTH)
 
     if cfg.every is None:
-        found = choose_frames(watched())
-        how = "sharp ones, each from a new place"
+        found = choose_frames(small_frames())
+        rule = "sharp ones, each from a new position"
     else:
-        found = [n for n, _ in watched() if n % cfg.every == 0]
-        how = "all of them" if cfg.every == 1 else f"every {cfg.every}th"
+        found = [n for n, _ in small_frames() if n % cfg.every == 0]
+        rule = "all of them" if cfg.every == 1 else f"every {cfg.every}th"
     if seen < 2:
         raise no_frames(path, seen)
     kept = [found[row] for row in evenly_spaced(len(found), cfg.max_frames)]
     thin = f", thinned from {len(found)} (--max-frames)" if len(kept) < len(found) else ""
-    notes = [f"Of {seen} frames of the video {len(kept)} are used: {how}{thin}."]
+    notes = [f"{len(kept)} of {seen} frames of the video are used: {rule}{thin}."]
     if expected is not None and seen < expected - 2:
         notes.append(f"The video breaks off: {seen} of {expected} frames could be decoded.")
     if len(kept) < 2:
-        why = f"{len(kept)} of {seen} frames would be used; a scene needs several, taken from "
-        fix = f"{_SHORT}, or take frames by number with --every"
-        raise broken(f"{path}:", why + "different places.", fix)
+        why = f"{len(kept)} of {seen} frames would be used; a scene needs several from "
+        fix = f"{_SHORT}, or choose frames by number with --every"
+        raise broken(f"{path}:", why + "different positions.", fix)
     records: list[dict[str, Any]] = []
     transfers: set[str | None] = set()
     for frame in frames_of(path):
         if frame.number not in kept:
             continue
         if len(records) % 10 == 0:
-            report(f"keeping frames: {len(records)} of {len(kept)}")
+            report(f"writing frames: {len(records)} of {len(kept)}")
         name = f"{frame.number:06d}.png"
         write_png(folder / name, frame.codes())
         transfers.add(frame.transfer)
@@ -337,10 +338,10 @@ def _keep(path: Path, cfg: DataConfig, folder: Path, report: Report) -> dict[str
 
 @dataclass(frozen=True)
 class Motion:
-    """How far a frame is from the reference, in longer sides of the picture.
+    """The motion of a frame relative to the reference, in longer sides of the picture.
 
-    `displacement` is the median of the corners', `parallax` the upper quartile of what the best
-    rotation leaves of it, `kept` the share of the reference's corners that are still seen.
+    `displacement` is the median over corners, `parallax` the upper quartile of the displacement
+    after the best rotation, and `kept` the share of the reference's corners that are still tracked.
     """
 
     displacement: float
@@ -349,14 +350,14 @@ class Motion:
 
 
 def normalised(grey: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
-    """Return a frame of fixed mean and contrast: automatic exposure must not look like motion."""
+    """Return a frame with fixed mean and contrast, so that exposure does not look like motion."""
     values = grey.astype(np.float32)
     gain = _CONTRAST / max(float(values.std()), 1.0)
     return np.clip((values - values.mean()) * gain + _MID, 0, 255).astype(np.uint8)
 
 
 class Tracker:
-    """Follows corners of a normalised reference frame."""
+    """Tracks corners of a normalised reference frame."""
 
     def __init__(self, grey: UInt8[np.ndarray, "h w"]):
         corners = cv2.goodFeaturesToTrack(grey, _CORNERS, 0.01, 7)
@@ -365,32 +366,32 @@ class Tracker:
         self._count = max(len(self._start), 1)
 
     def follow(self, grey: UInt8[np.ndarray, "h w"]) -> Motion:
-        """Return how far the next frame is, normalised as the reference."""
+        """Return the motion of the next frame, which is normalised like the reference."""
         if len(self._now) >= _FEWEST:
-            there, found, _ = cv2.calcOpticalFlowPyrLK(
+            ahead, found, _ = cv2.calcOpticalFlowPyrLK(
                 self._last, grey, self._now, np.empty_like(self._now)
             )
             back, found_back, _ = cv2.calcOpticalFlowPyrLK(
-                grey, self._last, there, np.empty_like(there)
+                grey, self._last, ahead, np.empty_like(ahead)
             )
-            missed = np.linalg.norm(back - self._now, axis=1)
-            good = (found[:, 0] == 1) & (found_back[:, 0] == 1) & (missed < _BACK)
+            error = np.linalg.norm(back - self._now, axis=1)
+            good = (found[:, 0] == 1) & (found_back[:, 0] == 1) & (error < _BACK)
             height, width = grey.shape
-            good &= ((there >= 0) & (there < [width, height])).all(1)
-            self._start, self._now = self._start[good], there[good]
+            good &= ((ahead >= 0) & (ahead < [width, height])).all(1)
+            self._start, self._now = self._start[good], ahead[good]
         self._last = grey
         if len(self._now) < _FEWEST:
             return Motion(1.0, 1.0, 0.0)
         side = max(grey.shape)
-        way = float(np.median(np.linalg.norm(self._now - self._start, axis=1))) / side
+        displacement = float(np.median(np.linalg.norm(self._now - self._start, axis=1))) / side
         parallax = _parallax(self._start, self._now, grey.shape)
-        return Motion(way, parallax, len(self._now) / self._count)
+        return Motion(displacement, parallax, len(self._now) / self._count)
 
 
 def _parallax(
     start: Float32[np.ndarray, "n 2"], now: Float32[np.ndarray, "n 2"], shape: tuple[int, ...]
 ) -> float:
-    """Return what remains after the best rotation, in longer sides."""
+    """Return the upper quartile of motion after the best rotation, in longer sides."""
     side = max(shape)
     focal = _FOCAL * side
     middle = np.array([shape[1] / 2, shape[0] / 2])
@@ -406,42 +407,42 @@ def _parallax(
         u, _, vt = np.linalg.svd(b[use].T @ a[use])
         rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
         turned = a @ rotation.T
-        landed = turned[:, :2] / np.maximum(turned[:, 2:], 1e-3) * focal + middle
-        rest = np.linalg.norm(landed - now, axis=1) / side
+        predicted = turned[:, :2] / np.maximum(turned[:, 2:], 1e-3) * focal + middle
+        rest = np.linalg.norm(predicted - now, axis=1) / side
         use = rest <= max(2 * float(np.median(rest)), 1e-4)
     return float(np.percentile(rest, 75))
 
 
 def choose_frames(frames: Iterable[tuple[int, UInt8[np.ndarray, "h w"]]]) -> list[int]:
-    """Return which frames are worth keeping, in order, from numbers and small grey pictures."""
+    """Return the numbers of the chosen frames, in order, from numbers and small grey pictures."""
     chosen: list[tuple[float, int]] = []
     tracker: Tracker | None = None
-    # Sharpness, number and picture of candidates.
+    # Each candidate is its sharpness, number and picture.
     waiting: list[tuple[float, int, UInt8[np.ndarray, "h w"]]] = []
 
     def take() -> Tracker:
-        """Choose the sharpest candidate; follow from it to the newest frame."""
+        """Choose the sharpest candidate; track from it to the newest frame."""
         best = max(range(len(waiting)), key=lambda k: waiting[k][0])
         (sharp, number, grey), later = waiting[best], waiting[best + 1 :]
         chosen.append((sharp, number))
         waiting.clear()
-        begun = Tracker(grey)
+        started = Tracker(grey)
         for candidate in later:
-            consider(begun, *candidate)
-        return begun
+            consider(started, *candidate)
+        return started
 
     def consider(tracker: Tracker, sharp: float, number: int, grey: np.ndarray) -> float:
-        """Keep a frame that may be chosen; return the share of the way; 1: one is due."""
-        way = tracker.follow(grey)
-        lost = (1 - way.kept) / LOST
-        share = max(way.parallax / PARALLAX, way.displacement / DISPLACEMENT, lost)
+        """Add a frame to the candidates; return its fraction of a threshold; 1: a frame is due."""
+        motion = tracker.follow(grey)
+        lost = (1 - motion.kept) / LOST
+        share = max(motion.parallax / PARALLAX, motion.displacement / DISPLACEMENT, lost)
         if share >= _CANDIDATE:
             waiting.append((sharp, number, grey))
         return share
 
     for number, grey in frames:
         grey = normalised(grey)
-        # The power of the finest details.
+        # The variance of the Laplacian measures the finest details.
         sharp = float(cv2.Laplacian(grey, cv2.CV_32F).var())
         if tracker is None:
             waiting.append((sharp, number, grey))

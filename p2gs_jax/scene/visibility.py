@@ -12,11 +12,11 @@ from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.render.warp import project_points
 from p2gs_jax.types import View
 
-# A point is hidden where a nearer one lies within about this many point spacings in the image.
+# A point is hidden by a point within about this many point spacings in the image ...
 SPACINGS = 1.5
-# ... and nearer by more than this share of its depth.
+# ... that is nearer by more than this share of its depth.
 DEPTH_MARGIN = 0.05
-# Evenly taken where there are more.
+# The largest numbers of views and points for a share, sampled evenly.
 SHARE_VIEWS, SHARE_POINTS = 32, 20_000
 
 
@@ -28,19 +28,19 @@ def in_frame(
 
 
 def share_in_view(points: Float[np.ndarray, "p 3"], views: Sequence[View]) -> float:
-    """Return the share of points that lie in a view's picture, on average over some of both."""
+    """Return the mean share of points inside a view's image, for a sample of points and views."""
     if not len(points):
         return 1.0
     sample = points[:: max(1, len(points) // SHARE_POINTS)]
-    some = [views[row] for row in evenly_spaced(len(views), SHARE_VIEWS)]
-    seen = (in_frame(*project_points(sample, view), view.width, view.height) for view in some)
+    views_used = [views[row] for row in evenly_spaced(len(views), SHARE_VIEWS)]
+    seen = (in_frame(*project_points(sample, view), view.width, view.height) for view in views_used)
     return float(np.mean([one.mean() for one in seen]))
 
 
 def shown_share(points: Float[np.ndarray, "p 3"], views: Sequence[View]) -> float:
-    """Return the share of the points that lies in a view's frustum, on average; 1 without points.
+    """Return the mean share of points in a view's frustum; 1 without points.
 
-    Not below 1 / views: together the views show all that matters.
+    It is at least 1 / views, because all views together show the whole scene.
     """
     return max(share_in_view(points, views), 1 / len(views))
 
@@ -50,7 +50,7 @@ def unoccluded(
 ) -> Bool[np.ndarray, " p"]:
     """Return which projected points no nearer point hides.
 
-    A coarse depth buffer of the points themselves, its cells as wide as their spacing.
+    A coarse depth buffer of the points decides, with cells about as wide as their spacing.
     """
     inside = in_frame(xy, z, width, height)
     count = int(inside.sum())

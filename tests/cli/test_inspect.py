@@ -23,7 +23,7 @@ def test_a_drive_is_counted(tmp_path, succeeded, monkeypatch):
         "1 photograph missing in these frames.",
         "LiDAR: ",
         "Boxes: 2 tracked, 1 moving: 2 Car (1 moving).",
-        "No exposures in EXIF.",
+        "EXIF has no exposures.",
         "96 x 64",
     ):
         assert text in said
@@ -47,5 +47,5 @@ def test_photographs_alone_start_no_structure_from_motion(tmp_path, succeeded, m
     for k, width in enumerate((40, 40, 50)):
         cv2.imwrite(str(tmp_path / f"{k}.png"), np.zeros((30, width, 3), np.uint8))
     said = succeeded("inspect", tmp_path)
-    for text in ("(images): 3 photographs", "40 x 30", "There is nothing else"):
+    for text in ("(images): 3 photographs", "40 x 30", "There are no cameras"):
         assert text in said

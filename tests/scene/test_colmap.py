@@ -77,7 +77,7 @@ def test_tiny_model_and_names_with_blanks(tmp_path):
         ({"cameras": "1 FOV 40 30 50 50 20 15 0.1\n"}, "cameras.txt uses the camera model FOV"),
         ({"cameras": "1 PINHOLE 40 30 50 50 20\n"}, "cameras.txt is malformed in line 2"),
         ({"cameras": "1 PINHOLE 40 30 0 50 20 15\n"}, "cameras.txt: .* impossible parameters"),
-        ({"cameras": "2 PINHOLE 40 30 50 50 20 15\n"}, "taken by camera 1"),
+        ({"cameras": "2 PINHOLE 40 30 50 50 20 15\n"}, "has camera 1, which is not in"),
         ({"cameras": "1 PINHOLE 30 40 50 50 15 20\n"}, "wrong size: .*im 0.png is 40x30"),
     ],
 )

@@ -178,7 +178,11 @@ def test_photographs_are_composited(cutouts, background, color):
 def test_alpha_is_always_noted_and_remembered(cutouts, tmp_path_factory):
     for options, least, note in (
         ({}, None, "3 of 4 photographs have an alpha channel: photographs and renders are shown"),
-        ({"background": "random"}, None, "over a random colour at every step, and white to judge"),
+        (
+            {"background": "random"},
+            None,
+            "over a random colour at every step, and over white for scores",
+        ),
         ({"alpha": "mask"}, 0.5, "transparent pixels are left out"),
         ({"alpha": "ignore"}, 0, "it is ignored"),
     ):
@@ -315,7 +319,8 @@ def test_masks_that_are_of_nothing_are_named_and_a_mask_may_be_a_photograph(tmp_
     write_image(tmp_path / "masks" / "other.png")
     (note,) = load_scene(tmp_path, ALL).notes
     assert note.endswith(
-        "masks holds 1 files, none is of a photograph: name a mask as its photograph"
+        "masks holds 1 files, but none has the name of a photograph: "
+        "name each mask like its photograph"
     )
     # Nothing there is called as this would be without the word.
     write_image(tmp_path / "images" / "venetian_mask.png")
@@ -335,7 +340,7 @@ def test_alpha_says_something_where_it_varies(tmp_path):
     assert ImageStore(scene.views, ALL).backdrop is None
     assert not any("alpha" in note or "--background" in note for note in scene.notes)
     scene = load_scene(tmp_path, DataConfig(background="black"))
-    assert "--background black shows nowhere" in scene.notes[-1]
+    assert "--background black has no effect" in scene.notes[-1]
     write(0)
     with refused("im 0.png is transparent everywhere", "--data.alpha ignore"):
         load_scene(tmp_path, ALL)

@@ -86,9 +86,9 @@ def test_only_what_is_new_is_done_and_matches_judge_poses(noisy_street, folder, 
     after = names_in(database)
     assert {n: after[n] for n in before} == before
     assert len({camera for camera, _ in after.values()}) == 1, "still one camera"
-    assert "features of 3 images are kept from an earlier run" in said
+    assert "features of 3 images come from an earlier run" in said
     assert "detecting features: 2 images" in said
-    assert "matches of 3 image pairs are kept from an earlier run" in said
+    assert "matches of 3 image pairs come from an earlier run" in said
     assert "matching: 7 image pairs" in said
 
     by_path = sorted(find_scene(noisy_street, CFG).views, key=lambda view: view.image_path)[:5]

@@ -72,7 +72,7 @@ def test_a_list_of_the_user_wins(model):
     assert held_out(split_by(model, {"test": [], "val": ["im 2.png"]})) == ["im 2.png"]
     scene = split_by(model, {"train": [f"im {k}.png" for k in range(4)], "test": []})
     assert held_out(scene) == []
-    assert "mine.json holds no view out" in scene.notes[-1]
+    assert "mine.json holds out no view" in scene.notes[-1]
 
 
 @pytest.mark.parametrize(

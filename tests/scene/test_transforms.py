@@ -198,7 +198,7 @@ def test_the_split_of_the_data_set_wins_and_random_seeds_follow(tmp_path, monkey
     if count == FEWEST:
         np.testing.assert_array_equal(scene.points, matched)
         return
-    said = f"Only {count} points were matched" if count else "Neither points nor matches"
+    said = f"Only {count} points were matched" if count else "There are neither points nor matches"
     assert f"{said}: {len(scene.points)} seeds were drawn at random" in scene.notes[-1]
     # They are where all cameras look, and the same every time.
     assert scene.tracks is scene.point_colors is None
@@ -302,7 +302,7 @@ def test_broken_llff_files(tmp_path):
         (np.array([{"a": 1}], dtype=object), r"poses_bounds.npy cannot be read"),
         (np.array(["a"]), "holds no numbers"),
         (rows()[:, :15], "holds 4x15 numbers, not N x 17"),
-        (rows(3), r"has 3 rows, and .*images holds 4 photographs"),
+        (rows(3), r"has 3 rows, but .*images holds 4 photographs"),
     ):
         np.save(path, table, allow_pickle=True)
         with refused(message):

@@ -210,7 +210,7 @@ def test_frames_are_kept_and_may_be_chosen_by_number(tmp_path: Path) -> None:
     record = json.loads((tmp_path / "video" / video.RECORD).read_text())
     assert [frame["file"] for frame in record["frames"]] == [path.name for path in found.paths]
     assert found.known is None
-    note = f"Of 50 frames of the video {len(found.paths)} are used: sharp"
+    note = f"{len(found.paths)} of 50 frames of the video are used: sharp"
     assert found.notes[0].startswith(note)
     second = record["frames"][1]
     stored = cv2.imread(str(found.paths[1]))[..., ::-1].astype(float)

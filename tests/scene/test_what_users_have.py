@@ -67,7 +67,7 @@ def test_the_largest_of_several_models_is_used(tmp_path):
     shutil.copytree(tmp_path / "other" / "images", tmp_path / "images", dirs_exist_ok=True)
     scene = find_scene(tmp_path, CFG)
     assert len(scene.views) == 5
-    said = "sparse/1 with 5 photographs, the largest; beside it lie 0, not used"
+    said = "sparse/1 with 5 photographs, the largest; the models beside it (0) are not used"
     assert said in " ".join(scene.notes)
 
 
@@ -96,7 +96,7 @@ def test_other_names_are_said_and_the_nearest_file_is_named(tmp_path):
     assert "im 0.png for IM 0.JPG" in scene.notes[0]
     assert reprojection_errors(scene).max() < 1e-5
     images.write_text(images.read_text().replace("IM 0.JPG", "img-0.png"))
-    with refused("1 of the 2 images", "holds 2 images, of which im 0.png is the nearest"):
+    with refused("1 of the 2 images", "holds 2 images; the nearest name is im 0.png"):
         find_scene(tmp_path, CFG)
 
 
@@ -129,7 +129,7 @@ def test_points_that_are_not_there_or_in_a_ply(tmp_path):
     (model / "points3D.txt").unlink()
     scene = find_scene(tmp_path, CFG)
     assert (len(scene.points), scene.tracks) == (0, None)
-    assert "has no points: they are triangulated" in scene.notes[-1]
+    assert "has no points: points are triangulated" in scene.notes[-1]
     write_ply(model / "points3D.ply", [[0, 1, 4], [1, 0, 5]], np.array([10, 20], np.uint8))
     scene = find_scene(tmp_path, CFG)
     assert scene.points.tolist() == [[0, 1, 4], [1, 0, 5]]

@@ -1,4 +1,4 @@
-"""HEIC, camera raw and files of linear light become PNG in the run's cache, once."""
+"""HEIC, camera raw and files of linear light, converted once to PNG in the run's cache."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from p2gs_jax.scene.files import Report, cached_folder, file_fingerprints
 from p2gs_jax.scene.masks import find_masks
 from p2gs_jax.types import Scene
 
-# Other results: other folders.
+# The version is part of the key of the cached folder: raise it whenever results change.
 _VERSION = 3
 _FOLDER, _RECORD = "developed", "photographs.json"
 _NAMES: dict[Kind, str] = {
@@ -43,30 +43,30 @@ _NAMES: dict[Kind, str] = {
     "webp": "WebP",
     "exr": "linear EXR",
 }
-# Where one shot has two files, the first of these kinds is used: it holds most of the light.
+# If one photograph has two files, the first of these kinds is used: it holds most of the light.
 _RANK: tuple[Kind, ...] = ("exr", "raw", "heif", "avif", "webp", "plain")
-# In light of files without a white of their own, what fewer pixels exceed is saturated, percent.
+# Linear files without a white point saturate above this percentile of their pixels, percent.
 _BRIGHT = 99.9
 _DARK = 0.25
-# Fast; a better compression saves a tenth of the space and takes five times as long.
+# Fast: a better compression saves 10 % of the space and takes 5 times as long.
 _COMPRESSION = 1
 _SIGNATURE_AND_HEADER = 8 + 25
-# Make and model (structure from motion begins with the focal length of the lens).
+# Make and model; structure from motion starts from the focal length.
 _KEPT = (0x010F, 0x0110)
-# Exposure time, f-number, sensitivities, time, focal length, that for 35 mm film, camera, lens.
+# Exposure time, f-number, sensitivities, date, focal length, its 35 mm equivalent, camera, lens.
 _KEPT_EXIF = (
     *(0x829A, 0x829D, 0x8827, 0x8830, 0x8831, 0x8832, 0x8833),
     *(0x9003, 0x9011, 0x9291, 0x920A, 0xA405, 0xA431, 0xA434),
 )
-_NO_ROOM = "make room on that disk, or name another --out"
+_NO_ROOM = "free space on that disk, or name another --out"
 
 
 @dataclass(frozen=True)
 class Converted:
     """Photographs in a folder that structure from motion can read, sorted.
 
-    `originals` are the user's files, by path relative to `folder`; `known` is why the response of
-    all photographs is known, or None.
+    `originals` are the user's files, by path relative to `folder`; `known` is the reason why the
+    response of all photographs is known, or None.
     """
 
     folder: Path
@@ -79,10 +79,10 @@ class Converted:
 def convert_photographs(
     folder: Path, paths: Sequence[Path], work_dir: Path | None, report: Report
 ) -> Converted:
-    """Return the photographs of a folder as files that everything can read.
+    """Return the photographs of a folder as files that every module can read.
 
-    If all are, they stay where they are; else they are kept in `work_dir`, or the user's cache.
-    Raises UserError: one cannot be decoded, or a package for it is missing.
+    If a file needs conversion, all are written to `work_dir`, or the user's cache. Raises
+    UserError: a photograph cannot be decoded, or a package for it is missing.
     """
     kinds, notes = _without_twins({path: kind_of(path) for path in paths})
     names = {path: path.relative_to(folder).as_posix() for path in kinds}
@@ -102,18 +102,18 @@ def convert_photographs(
 def with_originals(scene: Scene, converted: Converted) -> Scene:
     """Return a scene of converted photographs with the names and notes of the user's files.
 
-    Files that were only linked are read where they are, also beside a run that has moved.
+    Linked files are read at their original place, so that a run folder can move.
     """
-    views, there = [], []
+    views, originals = [], []
     for view in scene.views:
         original = converted.originals[view.name]
         plain = original.suffix == Path(view.name).suffix
         name = Path(view.name).with_suffix(original.suffix).as_posix()
         path = original if plain else converted.folder / view.name
-        there.append(dataclasses.replace(view, name=name, image_path=original))
+        originals.append(dataclasses.replace(view, name=name, image_path=original))
         views.append(dataclasses.replace(view, name=name, image_path=path))
-    # Masks lie beside the photographs as they were taken.
-    masks, _ = find_masks(there, scene.root)
+    # Masks lie beside the original photographs.
+    masks, _ = find_masks(originals, scene.root)
     views = [dataclasses.replace(v, mask_path=m) for v, m in zip(views, masks, strict=True)]
     notes = (*scene.notes, *converted.notes)
     known = converted.known
@@ -121,13 +121,13 @@ def with_originals(scene: Scene, converted: Converted) -> Scene:
 
 
 def converted_views(scene: Scene, work_dir: Path | None, report: Report) -> Scene:
-    """Return a scene whose views show converted photographs, where a model names others.
+    """Return a scene whose views show converted photographs if its files need conversion.
 
-    They are kept in `work_dir`, or the user's cache. Raises UserError: one cannot be decoded, or a
-    package for it is missing.
+    These are cached in `work_dir`, or the user's cache. Raises UserError: a photograph cannot be
+    decoded, or a package for it is missing.
     """
     kinds: dict[Path, Kind] = {v.image_path: kind_of(v.image_path) for v in scene.views}
-    # A suffix more keeps photographs apart that differ in theirs.
+    # The second suffix distinguishes photographs whose names differ only in the first.
     places = {v.image_path: v.name + ".png" for v in scene.views if kinds[v.image_path] != "plain"}
     if not places:
         return scene
@@ -142,7 +142,7 @@ def converted_views(scene: Scene, work_dir: Path | None, report: Report) -> Scen
 
 
 def cache_of(root: Path, work_dir: Path | None) -> Path:
-    """Return where files of a scene may be kept: the run's cache, or else the user's."""
+    """Return the folder for cached files of a scene: the run's cache, or else the user's."""
     if work_dir is not None:
         return work_dir
     scene = hashlib.sha256(str(root.resolve()).encode()).hexdigest()[:16]
@@ -154,7 +154,7 @@ def _listed(names: Iterable[str]) -> str:
 
 
 def _without_twins(kinds: dict[Path, Kind]) -> tuple[dict[Path, Kind], list[str]]:
-    """Leave out all but one file of each shot that was written twice, as raw and JPEG."""
+    """Return one file for each photograph, even if it was written twice, as raw and JPEG."""
     shots: dict[Path, list[Path]] = defaultdict(list)
     for path in kinds:
         shots[path.with_suffix("")].append(path)
@@ -167,8 +167,8 @@ def _without_twins(kinds: dict[Path, Kind]) -> tuple[dict[Path, Kind], list[str]
             dropped.update(path for path in files if path != best)
     if not dropped:
         return kinds, []
-    note = f"{len(dropped)} photograph(s) are there twice, as several kinds of file "
-    note += f"({min(dropped).name}, ...); one file is used for each shot."
+    note = f"{len(dropped)} photograph(s) exist twice, as several kinds of file "
+    note += f"({min(dropped).name}, ...); one file is used for each photograph."
     return {path: kind for path, kind in kinds.items() if path not in dropped}, [note]
 
 
@@ -179,9 +179,9 @@ def _converted(
     work_dir: Path | None,
     report: Report,
 ) -> tuple[Path, list[str], str | None]:
-    """Fill a folder with photographs at their places, and return it.
+    """Write photographs to their places in a cached folder.
 
-    With it come notes, and why the response of all photographs is known, or None.
+    Returns the folder, notes, and the reason why the response of all photographs is known, or None.
     """
     names = list(places.values())
     key = {"version": _VERSION, "files": file_fingerprints(list(places)), "places": names}
@@ -195,12 +195,12 @@ def _converted(
     if not record["known"] or "plain" not in kinds.values():
         return folder, record["notes"], record["known"]
     listed = _listed(_NAMES.get(kind, "others") for kind in kinds.values())
-    note = f"Photographs are of several kinds ({listed}): the tone curve is not known for all, "
-    return folder, [*record["notes"], note + "and is chosen for all."], None
+    note = f"Photographs are of several kinds ({listed}): the tone curve is not known for all and "
+    return folder, [*record["notes"], note + "is therefore solved."], None
 
 
 class _Converter:
-    """Converts photographs that belong together: their white balance and white are common."""
+    """Converts photographs of one scene with a common white balance and white point."""
 
     def __init__(self, kinds: Mapping[Path, Kind]):
         self._kinds = kinds
@@ -209,7 +209,7 @@ class _Converter:
         for facts in self._facts.values():
             if facts.balance is not None:
                 self._chosen[facts.camera].append(facts.balance)
-        # One for each camera: the median of what it chose.
+        # Each camera gets the median of its white balances.
         self._balances: dict[str, Balance] = {
             camera: tuple(np.exp(np.median(np.log(balances), axis=0)).tolist())
             for camera, balances in self._chosen.items()
@@ -217,7 +217,7 @@ class _Converter:
         self._scale = self._common_scale()
 
     def fill(self, folder: Path, places: Mapping[Path, str], report: Report) -> dict[str, Any]:
-        """Write all photographs; return a record of what was done."""
+        """Write all photographs; return the record of the conversion."""
         records: list[dict[str, Any]] = []
         total = sum(self._kinds[path] != "plain" for path in places)
         for path, place in places.items():
@@ -234,7 +234,7 @@ class _Converter:
         return {"known": known, "notes": self._notes(records), "photographs": records}
 
     def _common_scale(self) -> float:
-        """Return the factor on files of light that have no white of their own, a power of 2."""
+        """Return the factor, a power of 2, on linear files without a white point."""
         brightest = 0.0
         for path, kind in self._kinds.items():
             if kind == "exr":
@@ -280,28 +280,28 @@ class _Converter:
             spread = float(np.ptp(chosen - chosen[:, 1:2], axis=0).max())
             out.append(
                 f"White balance of {count} raw photographs ({camera or 'camera unknown'}): "
-                f"red {balance[0]:.3f}, blue {balance[2]:.3f} for all, the median of what the "
-                f"camera chose, which varied by {spread:.2f} EV."
+                f"red {balance[0]:.3f}, blue {balance[2]:.3f} for all, the median of the camera's "
+                f"choices, which vary by {spread:.2f} EV."
             )
         counted = {
-            "raw photographs record no white balance: LibRaw's for daylight.": sum(
+            "raw photographs record no white balance: LibRaw's daylight balance is used.": sum(
                 f.balance is None for f in self._facts.values()
             ),
-            "raw photographs are of a camera whose colours LibRaw does not know: they stay in the "
-            "camera's own primaries.": sum(not f.matrix for f in self._facts.values()),
+            "raw photographs come from a camera whose colours LibRaw does not know: they stay in "
+            "the camera's primaries.": sum(not f.matrix for f in self._facts.values()),
             "pixels of linear photographs are not numbers; they count as black.": sum(
                 r.get("invalid", 0) for r in records
             ),
         }
-        out += [f"{n} {what}" for what, n in counted.items() if n]
+        out += [f"{n} {text}" for text, n in counted.items() if n]
         if self._scale != 1:
-            note = f"Linear photographs were multiplied by {self._scale:g}, all alike, so that "
-            out.append(f"{note}{_BRIGHT:g} % of each are below white.")
+            note = f"All linear photographs were multiplied by {self._scale:g}, so that "
+            out.append(f"{note}{_BRIGHT:g} % of the pixels of each are below white.")
         return out
 
 
 def _link(source: Path, target: Path) -> None:
-    """Make a file appear at another place; file systems without links copy it."""
+    """Link a file to another place, or copy it on file systems without symbolic links."""
     try:
         with contextlib.suppress(OSError):
             os.symlink(source, target)
@@ -320,8 +320,8 @@ def write_png(
 ) -> None:
     """Write a converted photograph, uint8 or uint16 in the order R G B (A), or one channel.
 
-    Settings are taken from `exif`, but not the orientation: poses belong to the stored raster. The
-    ICC profile says which colours, if not sRGB. Raises UserError: the disk cannot be written.
+    The settings in `exif` are copied without the orientation: poses belong to the stored raster.
+    `profile` is the ICC profile, None for sRGB. Raises UserError: the disk cannot be written.
     """
     order = {3: [2, 1, 0], 4: [2, 1, 0, 3]}.get(pixels.shape[2], [0])
     raster = np.ascontiguousarray(pixels[..., order])
@@ -342,7 +342,7 @@ def write_png(
 
 
 def kept_settings(exif: Image.Exif | None) -> bytes:
-    """Return the settings that are kept, as a PNG holds them; empty: there are none."""
+    """Return the copied EXIF settings in the format of PNG, empty if there are none."""
     out = Image.Exif()
     try:
         shot = {} if exif is None else exif.get_ifd(ExifTags.IFD.Exif)

@@ -1,8 +1,8 @@
-"""Colours: transfer functions, primaries and ICC profiles, brought to light or to sRGB.
+"""Colours: transfer functions, primaries and ICC profiles, converted to light or to sRGB.
 
 Sources: ITU-R BT.2100-2 (HLG and PQ, tables 4 and 5), BT.2020, IEC 61966-2-1, ICC.1:2022. Only
-profiles made of a matrix and a curve per channel are applied (ICC.1:2022, 8.3.3): all that cameras
-and phones write are. A photograph with another profile is used as it is, which `fit` reports.
+profiles with a matrix and a curve per channel are applied (ICC.1:2022, 8.3.3), as all cameras and
+phones write them. A photograph with another profile is used without it, and a note says so.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 Transfer = Literal["linear", "hlg", "pq"]
 
 PQ_WHITE = 1000.0
-"""Luminance that becomes 1, cd/m^2: what phones and most masters reach; above, it is saturated."""
+"""Luminance that becomes 1, cd/m^2, the peak of phones and most masters; more is saturated."""
 _HLG_A = 0.17883277
 _HLG_B, _HLG_C = 1 - 4 * _HLG_A, 0.5 - _HLG_A * np.log(4 * _HLG_A)
 _M1, _M2 = 2610 / 16384, 2523 / 4096 * 128
@@ -38,7 +38,7 @@ BT709: Primaries = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, *_D65)
 BT2020: Primaries = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, *_D65)
 DISPLAY_P3: Primaries = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, *_D65)
 ADOBE_RGB: Primaries = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, *_D65)
-# By the codes of ITU-T H.273; others are a camera's own curve, and sRGB's primaries.
+# Codes of ITU-T H.273. Other codes stand for the camera's tone curve and for sRGB's primaries.
 TRANSFERS: dict[int, Transfer] = {16: "pq", 18: "hlg"}
 PRIMARIES: dict[int, Primaries] = {9: BT2020, 12: DISPLAY_P3}
 
@@ -46,21 +46,21 @@ PRIMARIES: dict[int, Primaries] = {9: BT2020, 12: DISPLAY_P3}
 _BRADFORD = np.array(
     [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]]
 )
-# The white of the profile connection space, D50.
+# The white point of the profile connection space, D50.
 _PCS_WHITE = np.array([0.9642, 1.0, 0.8249])
-# Colours that move by less than this, display values, are sRGB's.
+# A profile that changes colours by less than this, display values, counts as sRGB.
 _INVISIBLE = 0.004
 _INTEROPERABILITY, _INTEROP_INDEX = 0xA005, 1
-# How DCF marks Adobe RGB where there is no profile.
+# DCF's mark of Adobe RGB in files without a profile.
 _DCF_OPTION = "R03"
 _ENTRIES = 1024
 
 
 def to_light(signal: Float[np.ndarray, "..."], transfer: Transfer) -> Float[np.ndarray, "..."]:
-    """Return light in [0, 1] of a signal in [0, 1], red, green and blue as coded.
+    """Return light in [0, 1] of a coded signal in [0, 1], for red, green and blue alike.
 
-    HLG gives the light of the scene, 1 being the brightest the code can hold; PQ that of the
-    reference display, 1 being `PQ_WHITE`.
+    HLG gives the light of the scene, with 1 for the largest code; PQ gives the light of the
+    reference display, with 1 for `PQ_WHITE`.
     """
     x = np.clip(signal, 0.0, 1.0)
     if transfer == "hlg":
@@ -73,7 +73,7 @@ def to_light(signal: Float[np.ndarray, "..."], transfer: Transfer) -> Float[np.n
 
 
 def rgb_to_xyz(primaries: Primaries) -> Float[np.ndarray, "3 3"]:
-    """Return the matrix from linear colours to XYZ, white having Y = 1."""
+    """Return the matrix from linear colours to XYZ, with Y = 1 for white."""
     xy = np.array(primaries).reshape(4, 2)
     columns = np.stack([xy[:, 0] / xy[:, 1], np.ones(4), (1 - xy.sum(1)) / xy[:, 1]])
     scale = np.linalg.solve(columns[:, :3], columns[:, 3])
@@ -83,23 +83,23 @@ def rgb_to_xyz(primaries: Primaries) -> Float[np.ndarray, "3 3"]:
 def adapted(
     from_white: Float[np.ndarray, " 3"], to_white: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, "3 3"]:
-    """Return the matrix that carries XYZ from one white to another (Bradford)."""
+    """Return the matrix that adapts XYZ from one white point to another (Bradford)."""
     gain = (_BRADFORD @ to_white) / (_BRADFORD @ from_white)
     return np.linalg.inv(_BRADFORD) @ np.diag(gain) @ _BRADFORD
 
 
 def to_srgb_matrix(primaries: Primaries) -> Float[np.ndarray, "3 3"]:
-    """Return the matrix from linear colours in other primaries to those in sRGB's."""
-    own, srgb = rgb_to_xyz(primaries), rgb_to_xyz(BT709)
-    return np.linalg.inv(srgb) @ adapted(own.sum(1), srgb.sum(1)) @ own
+    """Return the matrix from linear colours in these primaries to linear sRGB."""
+    other, srgb = rgb_to_xyz(primaries), rgb_to_xyz(BT709)
+    return np.linalg.inv(srgb) @ adapted(other.sum(1), srgb.sum(1)) @ other
 
 
 @dataclass(frozen=True)
 class Profile:
     """A colour space of photographs other than sRGB.
 
-    `decode` is the light of `_ENTRIES` evenly spaced values from 0 to 1 by channel, and `matrix`
-    leads from it to linear sRGB; a profile made of tables has neither.
+    `decode` is the light at `_ENTRIES` evenly spaced values from 0 to 1 for each channel, and
+    `matrix` converts it to linear sRGB. Both are None for a profile made of tables.
     """
 
     name: str
@@ -148,9 +148,9 @@ def read_profile(data: bytes) -> Profile | None:
 
 
 def to_srgb(pixels: UInt[np.ndarray, "h w 3"], profile: Profile) -> UInt[np.ndarray, "h w 3"]:
-    """Return RGB colours in sRGB as 16 bits; a profile made of tables leaves them alone.
+    """Return RGB colours in sRGB as 16 bits, or unchanged for a profile made of tables.
 
-    What sRGB cannot show is clipped, as if the camera had written sRGB.
+    Colours outside sRGB are clipped, as if the camera had written sRGB.
     """
     if profile.decode is None or profile.matrix is None:
         return pixels
@@ -163,9 +163,9 @@ def to_srgb(pixels: UInt[np.ndarray, "h w 3"], profile: Profile) -> UInt[np.ndar
 
 
 def coded_profile(code: int) -> Profile | None:
-    """Return the colour space of display values in primaries that HEIC, AVIF and video number.
+    """Return the colour space of display values by its code in HEIC, AVIF and video.
 
-    None: sRGB's own, or unknown. The curve is sRGB's (ITU-T H.273, table 2).
+    None: sRGB's primaries, or an unknown code. The curve is sRGB's (ITU-T H.273, table 2).
     """
     if code not in PRIMARIES:
         return None
@@ -174,7 +174,7 @@ def coded_profile(code: int) -> Profile | None:
 
 
 def encode_16(light: Float[np.ndarray, "..."]) -> UInt[np.ndarray, "..."]:
-    """Return light in [0, 1] as sRGB in 16 bits; what is outside is clipped."""
+    """Return light in [0, 1] as sRGB in 16 bits; values outside are clipped."""
     return np.rint(srgb_encode(light) * 65535).astype(np.uint16)
 
 
@@ -183,14 +183,14 @@ def with_profile_applied(
 ) -> UInt[np.ndarray, "h w c"]:
     """Return a photograph in sRGB, by the profile in the bytes of its file.
 
-    Pixels are as OpenCV decodes them: B G R, perhaps with alpha behind.
+    Pixels are in OpenCV's order B G R, or B G R A.
     """
     if pixels.ndim != 3 or pixels.shape[2] < 3 or pixels.dtype not in (np.uint8, np.uint16):
         return pixels
     try:
         with Image.open(io.BytesIO(data)) as image:
             profile = profile_of(image)
-    except Exception:  # nothing is known of what Pillow cannot open
+    except Exception:  # the profile of a file that Pillow cannot open is unknown
         return pixels
     if profile is None or profile.decode is None:
         return pixels
@@ -201,7 +201,7 @@ def with_profile_applied(
 def brought_to_srgb(
     pixels: UInt[np.ndarray, "h w c"], profile: Profile
 ) -> UInt[np.ndarray, "h w c"]:
-    """Return R G B, perhaps with alpha behind, in sRGB as 16 bits; see `to_srgb`."""
+    """Return R G B or R G B A in sRGB as 16 bits; see `to_srgb`."""
     colours = to_srgb(pixels[..., :3], profile)
     alpha = pixels[..., 3:].astype(np.uint16)
     return np.concatenate([colours, alpha * 257 if pixels.dtype == np.uint8 else alpha], axis=2)
@@ -214,7 +214,7 @@ def _tags(data: bytes) -> dict[bytes, bytes]:
 
 
 def _curve(tag: bytes) -> Float[np.ndarray, " n"]:
-    """Return the light of evenly spaced values."""
+    """Return the light at `_ENTRIES` evenly spaced values from 0 to 1."""
     x = np.linspace(0, 1, _ENTRIES)
     if tag[:4] == b"curv":
         (count,) = struct.unpack(">I", tag[8:12])
@@ -232,7 +232,7 @@ def _curve(tag: bytes) -> Float[np.ndarray, " n"]:
     if kind == 0:
         return x ** p[0]
     g, a, b = p[:3]
-    # Below `start` a line, above it a power.
+    # The curve is a line below `start` and a power above.
     slope, start = (0.0, -b / a) if kind <= 2 else p[3:5]
     lift = {1: 0.0, 2: p[-1], 3: 0.0, 4: p[-2]}[kind]
     foot = {1: 0.0, 2: p[-1], 3: 0.0, 4: p[-1]}[kind]
@@ -240,10 +240,10 @@ def _curve(tag: bytes) -> Float[np.ndarray, " n"]:
 
 
 def colour_notes(paths: Iterable[Path]) -> tuple[str, ...]:
-    """Return what the user should know of colour profiles; headers are read, no pixels."""
+    """Return notes on colour profiles; only headers are read."""
     found = Counter[tuple[str, bool]]()
     for path in paths:
-        with contextlib.suppress(Exception), Image.open(path) as image:  # who decodes it complains
+        with contextlib.suppress(Exception), Image.open(path) as image:  # decoding reports errors
             if (profile := profile_of(image)) is not None:
                 found[profile.name, profile.decode is None] += 1
     return tuple(

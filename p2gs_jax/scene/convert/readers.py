@@ -1,9 +1,9 @@
-"""How photographs were taken, and those that OpenCV does not read: raw, HEIC, AVIF, WebP, OpenEXR.
+"""EXIF, and readers for files that OpenCV cannot read: raw, HEIC, AVIF, WebP, OpenEXR.
 
-LibRaw subtracts the black level of raw, makes white 1, interpolates the colour filter, and goes to
-sRGB's primaries with the camera's matrix. A camera's automatic white balance differs between
-photographs, but a sensor does not: all photographs of one camera model get the same factors. AVIF
-and WebP come through Pillow, 8 bits whatever the file holds.
+LibRaw subtracts the black level of raw, scales white to 1, interpolates the colour filter, and
+converts to sRGB's primaries with the camera's matrix. Automatic white balance differs between
+photographs, but the sensor does not: all photographs of one camera model get the same factors. AVIF
+and WebP are read through Pillow, always with 8 bits.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ _KINDS: dict[str, Kind] = {
     **{".avif": "avif", ".webp": "webp", ".exr": "exr"},
 }
 CONVERTED_SUFFIXES = frozenset(_KINDS)
-"""What cannot be used before it is converted."""
+"""Suffixes of files that must be converted."""
 _TIME, _F_NUMBER, _ISO, _FOCAL_LENGTH, _TAKEN = 0x829A, 0x829D, 0x8827, 0x920A, 0x9003
-# PhotographicSensitivity is 16 bits: 65535 there means "see the others".
+# PhotographicSensitivity has 16 bits: 65535 means that another tag holds the value.
 _SENSITIVITIES = (_ISO, 0x8833, 0x8832, 0x8831)
 _SHUTTER_SPEED, _APERTURE, _LARGEST_APEX = 0x9201, 0x9202, 32.0
 _MAKE, _MODEL, _SERIAL, _LENS = 0x010F, 0x0110, 0xA431, 0xA434
@@ -54,17 +54,17 @@ _RAW_SETTINGS |= {"focal_length": _FOCAL_LENGTH}
 # OpenEXR's standard attributes.
 _EXR_SETTINGS = {"expTime": _TIME, "aperture": _F_NUMBER, "isoSpeed": _ISO}
 _EXR_ERRORS = (RuntimeError, KeyError, OSError, ValueError)
-# Canon writes what it says of a photograph at the beginning, bytes.
+# The first bytes of a file, in which Canon writes the settings.
 _RAW_HEADER = 2**18
 _AGAIN = "copy that photograph again, or remove it from the scene"
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A decoded photograph, of display values (`codes`, `profile`) or of light.
+    """A decoded photograph: display values (`codes`, `profile`) or light.
 
-    Codes are unsigned integers of which the largest is 1: R G B, perhaps with alpha behind, or one
-    channel. Light is linear in the primaries of sRGB; `invalid` pixels, not numbers, are black.
+    The largest unsigned integer in `codes` stands for 1; channels are R G B, R G B A or one. Light
+    is linear in sRGB's primaries. `invalid` counts pixels that are not numbers, which are black.
     """
 
     codes: UInt[np.ndarray, "h w c"] | None = None
@@ -81,7 +81,7 @@ def kind_of(path: Path) -> Kind:
 
 
 def pillow_heif(path: Path) -> Any:
-    """Return the library that reads HEIC, with which Pillow opens it from now on.
+    """Return the library that reads HEIC, and register it with Pillow.
 
     Raises UserError: it is not installed.
     """
@@ -102,7 +102,7 @@ def read_heif(path: Path) -> Picture:
     """
     try:
         if kind_of(path) == "heif":
-            # Pillow's opener has no 16 bits of colour.
+            # Pillow's opener does not support 16 bits.
             image = pillow_heif(path).open_heif(path, convert_hdr_to_8bit=False)
             pixels = np.asarray(image)
         else:
@@ -122,14 +122,14 @@ def read_heif(path: Path) -> Picture:
     if pixels.ndim == 2:
         pixels = pixels[..., None]
     if pixels.dtype == np.uint16:
-        # Codes of 10 and 12 bits come shifted: the largest is to be white.
+        # Codes of 10 and 12 bits come shifted: the largest one must become white.
         white = pixels.max(initial=0) | (2**16 - 2 ** (16 - int(info.get("bit_depth", 16))))
         pixels = np.rint(pixels * (65535 / white)).astype(np.uint16)
     coded, transfer = _code_points(info.get("nclx_profile"), path)
     if transfer is None:
         profile = info.get("icc_profile")
-        own = None if profile or pixels.shape[2] < 3 else icc.coded_profile(coded)
-        codes = pixels if own is None else icc.brought_to_srgb(pixels, own)
+        coded_space = None if profile or pixels.shape[2] < 3 else icc.coded_profile(coded)
+        codes = pixels if coded_space is None else icc.brought_to_srgb(pixels, coded_space)
         return Picture(codes=codes, exif=exif, profile=profile)
     light = icc.to_light(pixels[..., :3] / np.iinfo(pixels.dtype).max, transfer)
     primaries = icc.PRIMARIES.get(coded, icc.BT709)
@@ -138,9 +138,9 @@ def read_heif(path: Path) -> Picture:
 
 
 def _code_points(nclx: dict | None, path: Path) -> tuple[int, icc.Transfer | None]:
-    """Return the primaries of a HEIC or AVIF (ITU-T H.273), 0: unknown, and its transfer function.
+    """Return the primaries of a HEIC or AVIF (ITU-T H.273; 0: unknown) and its transfer function.
 
-    They stand in its box of colours, `nclx`, which Pillow does not tell of.
+    They are in the file's colour box, `nclx`, which Pillow does not report.
     """
     if nclx:
         names = ("color_primaries", "transfer_characteristics")
@@ -153,10 +153,10 @@ def _code_points(nclx: dict | None, path: Path) -> tuple[int, icc.Transfer | Non
 
 @dataclass(frozen=True)
 class RawFacts:
-    """What a raw file states about itself; the size is pixels, as the sensor lies.
+    """The metadata of a raw file; the size is in pixels, in the orientation of the sensor.
 
-    `balance` are the factors on red, green (1) and blue that the camera chose, None where it is not
-    recorded. Without a `matrix` the camera's colours are unknown, and its primaries are kept.
+    `balance` are the camera's factors on red, green (1) and blue, None if they are not recorded.
+    `matrix` is False if the camera's colours are unknown; its primaries are kept then.
     """
 
     size: tuple[int, int]
@@ -166,9 +166,9 @@ class RawFacts:
 
 
 def read_facts(path: Path) -> RawFacts:
-    """Return what a raw file states about itself; pixels are not read.
+    """Return the metadata of a raw file without reading pixels.
 
-    Raises UserError: rawpy is not installed, or LibRaw does not know this file.
+    Raises UserError: rawpy is not installed, or LibRaw does not support this file.
     """
     with _raw(path) as raw:
         chosen = [float(x) for x in raw.camera_whitebalance[:3]]
@@ -178,7 +178,7 @@ def read_facts(path: Path) -> RawFacts:
         balance = (chosen[0] / green, 1.0, chosen[2] / green) if min(chosen) > 0 else None
         matrix = bool(np.any(raw.color_matrix) or np.any(raw.rgb_xyz_matrix))
         size = (raw.sizes.width, raw.sizes.height)
-        # Without a name: cameras of one model have one size, and LibRaw one matrix for them.
+        # A camera without a name gets one from its size and LibRaw's matrix for its model.
         known = zlib.crc32(np.asarray(raw.rgb_xyz_matrix).tobytes())
         unnamed = f"unnamed camera {known:08x} of {size[0]}x{size[1]} pixels"
         return RawFacts(size, " ".join(n for n in names if n) or unnamed, balance, matrix)
@@ -195,7 +195,7 @@ def read_raw(path: Path, balance: Balance | None) -> Picture:
             user_wb=None if balance is None else [*balance, balance[1]],
             gamma=(1, 1),
             no_auto_bright=True,
-            # White would follow the brightest pixel of each photograph.
+            # Otherwise white would follow the brightest pixel of each photograph.
             adjust_maximum_thr=0.0,
             output_bps=16,
             user_flip=0,
@@ -205,7 +205,7 @@ def read_raw(path: Path, balance: Balance | None) -> Picture:
 
 
 def read_raw_exif(path: Path) -> Image.Exif:
-    """Return how a raw photograph was taken; errors are as of `read_facts`."""
+    """Return the EXIF of a raw photograph; errors as in `read_facts`."""
     with _raw(path) as raw:
         return _raw_exif(path, raw)
 
@@ -222,8 +222,8 @@ def _raw(path: Path) -> Iterator[Any]:
         with rawpy.imread(str(path)) as raw:
             yield raw
     except rawpy.LibRawFileUnsupportedError:
-        why = f"LibRaw {'.'.join(map(str, rawpy.libraw_version))} does not know {path}: it is of a "
-        why += "newer camera, or not a raw file."
+        why = f"LibRaw {'.'.join(map(str, rawpy.libraw_version))} does not support {path}: the "
+        why += "camera is newer, or this is not a raw file."
         fix = "pip install --upgrade rawpy, or convert it with Adobe's DNG Converter"
         raise UserError(why, fix=fix) from None
     except (rawpy.LibRawError, rawpy.NotSupportedError) as error:
@@ -233,7 +233,7 @@ def _raw(path: Path) -> Iterator[Any]:
 
 
 def _raw_exif(path: Path, raw: Any) -> Image.Exif:
-    """Return EXIF: the file's where it can be found, completed by what LibRaw found."""
+    """Return the file's EXIF if it can be read, completed by LibRaw's metadata."""
     out = Image.Exif()
     try:
         with path.open("rb") as file:
@@ -250,22 +250,22 @@ def _raw_exif(path: Path, raw: Any) -> Image.Exif:
 
 
 def exif_of_raw(file: BinaryIO) -> Image.Exif:
-    """Return the EXIF in a raw file: of TIFF and its relatives, Canon's CR3 and Fujifilm's RAF."""
+    """Return the EXIF in a raw file: TIFF and its variants, Canon's CR3 and Fujifilm's RAF."""
     out, head = Image.Exif(), file.read(_RAW_HEADER)
     file.seek(0)
     if head[:4] in (b"II*\0", b"MM\0*"):
         out.load_from_fp(file)
     elif head[:2] in (b"II", b"MM"):
-        # Olympus and Panasonic put marks of their own where TIFF has 42.
+        # Olympus and Panasonic replace TIFF's number 42.
         mark = b"*\0" if head[:2] == b"II" else b"\0*"
         out.load_from_fp(io.BytesIO(head[:2] + mark + file.read()[4:]))
     elif head.startswith(b"FUJIFILMCCD-RAW"):
-        # A JPEG of the photograph, whose place stands at byte 84.
+        # Byte 84 holds the position of a JPEG of the photograph.
         with Image.open(io.BytesIO(file.read()[int.from_bytes(head[84:88]) :])) as image:
             out = image.getexif()
             out.get_ifd(ExifTags.IFD.Exif)
     elif head[4:8] == b"ftyp" and b"CMT1" in head:
-        # TIFFs of their own: of the file, and of the shot.
+        # Two TIFF blocks hold the tags of the file and of the photograph.
         for name, target in ((b"CMT1", out), (b"CMT2", out.get_ifd(ExifTags.IFD.Exif))):
             part = Image.Exif()
             part.load(b"Exif\0\0" + head[head.index(name) + 4 :])
@@ -291,16 +291,16 @@ def exr_size(path: Path) -> tuple[int, int]:
 
 
 def read_exr_exif(path: Path) -> Image.Exif | None:
-    """Return how an OpenEXR was taken, from its standard attributes; errors as of `exr_size`."""
+    """Return the EXIF of an OpenEXR, from its standard attributes; errors as in `exr_size`."""
     with _exr(path, header_only=True) as file:
         return _exr_exif(dict(file.header()))
 
 
 def read_exr(path: Path) -> Picture:
-    """Return the light of an OpenEXR: channels R, G, B (of its only layer, too) or Y.
+    """Return the light of an OpenEXR: channels R, G, B (even in a layer) or Y.
 
-    Chromaticities in the header are converted. What is premultiplied by A is divided by it again.
-    Raises UserError: the file is not a readable OpenEXR, or has no such channels.
+    Colours are converted from the header's chromaticities, and divided by A, which premultiplies
+    them. Raises UserError: the file is not a readable OpenEXR, or has no such channels.
     """
     with _exr(path, separate_channels=True) as file:
         channels: dict[str, Any] = {k: c.pixels for k, c in file.channels().items()}
@@ -323,7 +323,7 @@ def read_exr(path: Path) -> Picture:
     if alpha is not None:
         alpha = np.clip(np.nan_to_num(alpha.astype(np.float32)), 0, 1)
         light = light / np.maximum(alpha, 1e-6)[..., None]
-    # Infinite light is saturated; what is not a number is nothing.
+    # Infinite light is saturated; NaN is black.
     invalid = int(np.isnan(light).any(2).sum())
     light = np.nan_to_num(light, nan=0.0, posinf=float(np.finfo(np.float32).max), neginf=0.0)
     return Picture(light=light, alpha=alpha, exif=_exr_exif(header), invalid=invalid)
@@ -341,7 +341,7 @@ def _exr_exif(header: dict) -> Image.Exif | None:
 
 
 def size_of(path: Path) -> tuple[int, int] | None:
-    """Return (width, height) of raw and OpenEXR; None: Pillow opens it.
+    """Return (width, height) of raw and OpenEXR; None: Pillow opens the file.
 
     Raises UserError: the file is broken, or a package for it is missing.
     """
@@ -355,7 +355,7 @@ def size_of(path: Path) -> tuple[int, int] | None:
 
 @dataclass(frozen=True)
 class ExifSettings:
-    """Exposure time in seconds, f-number, sensitivity and local date, as far as EXIF has them."""
+    """Exposure time (seconds), f-number, sensitivity (ISO) and local date; None: not in EXIF."""
 
     time: float | None = None
     aperture: float | None = None
@@ -364,9 +364,9 @@ class ExifSettings:
 
 
 def read_exif_settings(path: Path) -> ExifSettings:
-    """Return the settings in the EXIF of an image; where it has none or is broken, all are None.
+    """Return the settings in the EXIF of an image; without readable EXIF all are None.
 
-    Without a time or f-number, APEX values count: log2 of 1 / time, and of the f-number's square.
+    A missing time or f-number comes from APEX values: log2 of 1 / time and of f-number^2.
     """
     tags = _exif_tags(path)
     time, aperture = _positive(tags.get(_TIME)), _positive(tags.get(_F_NUMBER))
@@ -386,11 +386,11 @@ def read_exif_settings(path: Path) -> ExifSettings:
 
 
 def exif_evs(paths: Sequence[Path], cameras: Sequence[str] = ()) -> list[float | None]:
-    """Return log2(time * ISO / N^2) of photographs, stops; None where EXIF does not tell it.
+    """Return log2(time * ISO / N^2) of photographs, stops; None where EXIF does not give it.
 
-    What no photograph states drops out (an ISO is then taken as 100), as does what others of the
-    same camera state and is the same in all: only differences matter. Exposure bias is ignored: the
-    shutter contains it. Smaller copies (`images_2`) mostly lack EXIF: it is that of `images`.
+    Only differences matter. A setting that no photograph states is a constant (ISO 100). A missing
+    setting gets the value of the same camera if all other photographs of it have the same value.
+    Exposure bias is ignored: the shutter contains it. For `images_2` the EXIF of `images` counts.
     """
     shots = [read_exif_settings(path) for path in map(_original, paths)]
     camera = np.array(list(cameras) or [""] * len(shots))
@@ -400,29 +400,29 @@ def exif_evs(paths: Sequence[Path], cameras: Sequence[str] = ()) -> list[float |
         term, known = power * np.log2(stated), np.isfinite(stated)
         if not known.any():
             term[:] = power * np.log2(usual)
-        for own in (camera == one for one in np.unique(camera)):
-            if (own & known).any() and np.ptp(term[own & known]) < 1e-6:
-                term[own] = term[own & known][0]
+        for rows in (camera == one for one in np.unique(camera)):
+            if (rows & known).any() and np.ptp(term[rows & known]) < 1e-6:
+                term[rows] = term[rows & known][0]
         total += term
     total[[shot.time is None and shot.iso is None for shot in shots]] = np.nan
     return [float(ev) if np.isfinite(ev) else None for ev in total]
 
 
 def _original(path: Path) -> Path:
-    """Return the photograph that a smaller copy was made of: beside `images_2` lies `images`."""
+    """Return the original of a smaller copy: the folder `images` beside `images_2`."""
     for folder in path.parents:
-        whole = folder.parent / "images"
-        if folder.name.startswith("images_") and whole.is_dir():
-            there = whole / path.relative_to(folder)
-            others = sorted(there.parent.glob(glob.escape(there.stem) + ".*"))
-            return there if there.is_file() else next(iter(others), path)
+        full_size = folder.parent / "images"
+        if folder.name.startswith("images_") and full_size.is_dir():
+            original = full_size / path.relative_to(folder)
+            others = sorted(original.parent.glob(glob.escape(original.stem) + ".*"))
+            return original if original.is_file() else next(iter(others), path)
     return path
 
 
 def read_exif_camera(path: Path, *, zoom: bool = False) -> str:
     """Return make, model, serial number and lens as one string; empty without EXIF.
 
-    With `zoom` the focal length as well.
+    With `zoom`, the focal length is added.
     """
     tags = _exif_tags(path, behind=False)
     wanted = (_MAKE, _MODEL, _SERIAL, _LENS, *([_FOCAL_LENGTH] if zoom else []))
@@ -435,13 +435,13 @@ def _exif_tags(path: Path, *, behind: bool = True) -> dict:
     # Pillow raises many kinds of errors on malformed EXIF (struct, Syntax, Value, OS, ...).
     try:
         if kind in ("raw", "exr"):
-            # One of settings alone has length 0.
+            # The length of an Exif with settings alone is 0: test for None.
             exif = read_raw_exif(path) if kind == "raw" else read_exr_exif(path)
             return {} if exif is None else {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
         if kind == "heif":
             pillow_heif(path)
         with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
-            # Pillow decodes a PNG to look for EXIF behind its pixels.
+            # Pillow would decode a PNG to find EXIF after its pixels.
             if not behind and image.format == "PNG" and "exif" not in image.info:
                 return {}
             exif = image.getexif()

@@ -1,4 +1,4 @@
-"""Readers of driving data sets as their authors lay them out; `recording` states their contract."""
+"""Readers of driving data sets in their original layout; `recording` states their contract."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from p2gs_jax.scene.files import Report
 
 
 class DriveFormat(NamedTuple):
-    """A reader: files (globs) by which a folder is recognised, and what reads it.
+    """A reader: files (globs) by which a folder is recognised, and the function that reads it.
 
     `read` raises UserError: the folder holds several drives, or a file is missing or broken.
     """
@@ -27,7 +27,7 @@ class DriveFormat(NamedTuple):
 
 
 def _in_folders(marker: str) -> tuple[str, ...]:
-    """Return the markers of a format whose drives may lie in folders below the one named."""
+    """Return the markers of a format whose drives may lie in subfolders."""
     return marker, f"*/{marker}"
 
 
@@ -41,7 +41,7 @@ FORMATS: dict[SceneFormat, DriveFormat] = {
 
 
 def read_drive(root: Path, cfg: DataConfig, report: Report) -> Recording | None:
-    """Return the recording in a folder, or None where it holds no drive of a known format.
+    """Return the recording in a folder, or None if it holds no drive of a known format.
 
     `cfg.format` may name the reader, `cfg.drive` one of several drives in the folder. UserError:
     there are several drives, or a file is missing or broken; the message names it.

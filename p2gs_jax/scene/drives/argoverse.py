@@ -1,8 +1,8 @@
-"""Argoverse 2, the sensor data set: seven ring cameras, laser sweeps and boxes at 10 Hz.
+"""Argoverse 2, the sensor data set: seven ring cameras, LiDAR sweeps and boxes at 10 Hz.
 
     city_SE3_egovehicle.feather                poses of the car
     calibration/intrinsics.feather             fx fy cx cy, sizes
-    calibration/egovehicle_SE3_sensor.feather  where the sensors are on the car
+    calibration/egovehicle_SE3_sensor.feather  poses of the sensors on the car
     sensors/cameras/NAME/TIME.jpg              photographs, nanoseconds
     sensors/lidar/TIME.feather                 x y z of both scanners in the car's axes
     annotations.feather                        boxes in the car's axes
@@ -10,9 +10,9 @@
 Schema: https://github.com/argoverse/av2-api/blob/main/src/av2/datasets/sensor/README.md, and
 src/av2/structures/{sweep,cuboid}.py there.
 
-Photographs are undistorted already: k1, k2, k3 in intrinsics.feather are those of the lens
-(https://github.com/argoverse/av2-api/issues/219 and 226; the API projects with K alone).
-Sweeps are moved to where the car was at their first point, which is their time; boxes are of then.
+Photographs are undistorted already: k1, k2, k3 in intrinsics.feather describe the original lens
+(https://github.com/argoverse/av2-api/issues/219 and 226; the API projects with K alone). The time
+of a sweep is that of its first point; all its points, and the boxes, are in the car's axes then.
 """
 
 from __future__ import annotations
@@ -40,16 +40,16 @@ LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
 QUATERNION = ("qw", "qx", "qy", "qz")
 POSITION = ("tx_m", "ty_m", "tz_m")
 SIZE = ("length_m", "width_m", "height_m")
-# The stereo pair is grey: used only where it is asked for.
+# The stereo pair is grey: it is used only if the user names it.
 GREY = "stereo"
 
 
 def read_argoverse(root: Path, cfg: DataConfig) -> recording.Recording:
-    """Read a log; `cfg.cameras` may ask for the stereo pair; UserError: a table is broken."""
+    """Read a log; `cfg.cameras` may name the stereo pair; UserError: a table is broken."""
     log = drive_folder(root, cfg.drive, MARKER)
     cameras, files, notes = _cameras(log, cfg)
-    # Frames are the photographs of the camera that has most: cameras are triggered twice in a turn
-    # of the scanners, so that a sweep's number would name two of each.
+    # The camera with most photographs defines the frames: cameras trigger twice in a turn of the
+    # scanners, so that a sweep's number would stand for two photographs.
     most = max((files[camera.name] for camera in cameras), key=len, default={})
     car = _Car(log, np.array(sorted(most), np.int64))
     photographs, photograph_notes = _photographs(car, cameras, files)
@@ -60,7 +60,7 @@ def read_argoverse(root: Path, cfg: DataConfig) -> recording.Recording:
 
 
 class _Car:
-    """The way of a car, the clock of its log, and the time stamps of its frames."""
+    """The trajectory of a car, the clock of its log, and the time stamps of its frames."""
 
     def __init__(self, log: Path, moments: Int64[np.ndarray, " m"]):
         path = log / POSES
@@ -90,7 +90,7 @@ def _poses(table: Columns, what: str) -> Float64[np.ndarray, "n 4 4"]:
 def _cameras(
     log: Path, cfg: DataConfig
 ) -> tuple[list[recording.RigCamera], dict[str, dict[int, Path]], list[str]]:
-    """Return cameras that have photographs, these by time stamp, and notes."""
+    """Return cameras with photographs, the photographs by time stamp, and notes."""
     path = log / INTRINSICS
     table = read_feather(path, [*LENS, "sensor_name"])
     lenses = dict(zip(map(str, table["sensor_name"]), table.stacked(LENS), strict=True))
@@ -99,7 +99,7 @@ def _cameras(
     notes = []
     grey = [name for name in found if name.startswith(GREY)]
     if grey and not any(GREY in name for name in cfg.cameras):
-        notes.append(f"The stereo cameras are grey and left out; --cameras {grey[0]} takes one.")
+        notes.append(f"The stereo cameras are grey and left out; --cameras {grey[0]} adds one.")
         found = {name: files for name, files in found.items() if name not in grey}
     unknown = [name for name in found if name not in lenses]
     if unknown:
@@ -110,10 +110,10 @@ def _cameras(
     cameras = []
     for name in (n for n in found if n in lenses):
         if not np.isfinite(lenses[name]).all() or (lenses[name][[0, 1, 4, 5]] <= 0).any():
-            why = f"focal lengths and sizes of {name} should be positive numbers"
+            why = f"focal lengths and sizes of {name} are not positive numbers"
             raise broken(f"{path}:", why)
         fx, fy, cx, cy, width, height = lenses[name].tolist()
-        # The API takes projections from 0 to width - 1 as inside: pixel centres at integers.
+        # In the API projections from 0 to width - 1 are inside: pixel centres are at integers.
         K = intrinsics(fx, fy, cx + 0.5, cy + 0.5)
         cameras.append(recording.RigCamera(name, K, int(width), int(height)))
     return cameras, found, notes
@@ -128,20 +128,20 @@ def _photographs(
     path = car.log / EXTRINSICS
     table = read_feather(path, [*QUATERNION, *POSITION, "sensor_name"])
     mounts = dict(zip(map(str, table["sensor_name"]), _poses(table, "sensor"), strict=True))
-    photographs, without = [], 0
+    photographs, unplaced = [], 0
     for name in (camera.name for camera in cameras):
         if name not in mounts:
-            raise broken(path, f"does not say where {name} is")
+            raise broken(path, f"has no pose of {name}")
         stamps = np.array(list(files[name]), np.int64)
         times, frames = car.seconds(stamps), car.frames(stamps)
-        poses, known = car.way.at(times)
-        without += int((~known).sum())
-        for k in np.flatnonzero(known):
+        poses, covered = car.way.at(times)
+        unplaced += int((~covered).sum())
+        for k in np.flatnonzero(covered):
             pose, file = poses[k] @ mounts[name], files[name][int(stamps[k])]
             photographs.append(
                 recording.Photograph(name, int(frames[k]), float(times[k]), file, pose)
             )
-    return photographs, counted(without, f"photographs are outside {POSES}: they are left out.")
+    return photographs, counted(unplaced, f"photographs are outside {POSES}: they are left out.")
 
 
 def _sweeps(car: _Car) -> tuple[list[recording.Sweep], list[str]]:
@@ -168,7 +168,7 @@ def _read_sweep(path: Path, pose: Pose, start: float) -> recording.SweepPoints:
 def _objects(car: _Car) -> tuple[tuple[TrackedObject, ...], list[str]]:
     path = car.log / "annotations.feather"
     if not path.is_file():
-        return (), [f"{path.name} is missing: what moves is not known."]
+        return (), [f"{path.name} is missing: moving objects are not known."]
     columns = [STAMP, *SIZE, *QUATERNION, *POSITION, "track_uuid", "category"]
     table = read_feather(path, columns)
     times, size = car.seconds(table.whole(STAMP)), table.stacked(SIZE)

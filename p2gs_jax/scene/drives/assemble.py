@@ -1,4 +1,4 @@
-"""From a recording to the scene of a fit: cameras and frames chosen, laser points sorted out."""
+"""From a recording to the scene of a fit: chosen cameras and frames, LiDAR points and seeds."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from p2gs_jax.scene.drives.tables import counted
 from p2gs_jax.scene.rigid import inverse
 from p2gs_jax.types import Lidar, Scene, TrackedObject, View
 
-# World coordinates further than this from 0 are moved there: float32 has 7 digits.
+# Farther scenes are moved to the origin, metres: float32 has 7 digits.
 FARTHEST_ORIGIN = 1000.0
-# Sweeps belong to the chosen frames when they are this near to them, seconds.
+# LiDAR sweeps within this time of the chosen frames are used, seconds.
 SWEEP_SLACK_S = 0.1
 
 
@@ -36,20 +36,20 @@ def assemble(
     *,
     write_embedded: bool = True,
 ) -> Scene:
-    """Return the scene of a recording: the chosen photographs, laser points, tracked things.
+    """Return the scene of a recording: the chosen photographs, LiDAR points, tracked objects.
 
     Seed points have no colours yet; there are no feature tracks.
 
     Args:
         cfg: cameras and frames, and whether photographs may be missing.
         work_dir: embedded photographs are written below it; None: below the user's cache folder.
-        write_embedded: False only names the files of embedded photographs: they cannot be read.
+        write_embedded: False: embedded photographs get file names, but are not written.
 
     Raises:
-        UserError: a camera, frame or photograph is not there, a name a path, a sweep broken.
+        UserError: a camera, frame or photograph is missing, or a camera name or sweep is invalid.
     """
     for camera in recording.cameras:
-        # What is written of a view lies in a folder of its camera.
+        # The files of a view lie in a folder with the name of its camera.
         files.require_plain(camera.name, recording.root)
     names = chosen_cameras(cfg.cameras, [camera.name for camera in recording.cameras])
     photographs, notes = _chosen_photographs(recording, names, cfg)
@@ -72,7 +72,7 @@ def assemble(
     ]
     things = recording.objects
     objects = tuple(dataclasses.replace(o, poses=_moved(o.poses, origin)) for o in things)
-    lidar, lidar_notes = None, ["Laser measurements are not used (--data.no-lidar)."]
+    lidar, lidar_notes = None, ["LiDAR measurements are not used (--data.no-lidar)."]
     if cfg.lidar:
         lidar, lidar_notes = _read_sweeps(recording, photographs, objects, origin, report)
     points, seed_notes = _seeds(lidar, centres - origin)
@@ -96,32 +96,32 @@ def _chosen_photographs(
     """Return the photographs of the chosen cameras and frames, by camera and frame, and notes."""
     every = sorted({p.frame for p in recording.photographs})
     if not every:
-        fix = "name the folder that holds the images of the drive as well"
+        fix = "name a folder that holds the photographs of the drive as well"
         raise UserError(f"{recording.root} holds no photograph with a pose", fix=fix)
     frames = chosen_frames(cfg.frames, every)
     among = set(frames)
     chosen = [p for p in recording.photographs if p.frame in among and p.camera in names]
     if not chosen:
-        why = f"{recording.root} has no photograph of the cameras and frames that were asked for"
+        why = f"{recording.root} has no photograph of the chosen cameras and frames"
         raise UserError(why, fix="name other --cameras, or leave out --frames")
     chosen.sort(key=lambda p: (p.camera, p.frame))
-    there = [p for p in chosen if p.embedded is not None or p.path.is_file()]
-    missing = sorted({_name(p) for p in chosen} - {_name(p) for p in there})
+    existing = [p for p in chosen if p.embedded is not None or p.path.is_file()]
+    missing = sorted({_name(p) for p in chosen} - {_name(p) for p in existing})
     notes = [*recording.notes, *files.check_missing(missing, len(chosen), recording.root, cfg)]
-    chosen = there
+    chosen = existing
     counts = {name: sum(p.camera == name for p in chosen) for name in names}
     few = [f"{name} {count}" for name, count in counts.items() if count < len(frames)]
     if few:
         notes.append(
-            f"of {len(frames)} frames some cameras have fewer photographs: {', '.join(few)}"
+            f"some cameras have fewer photographs than the {len(frames)} frames: {', '.join(few)}"
         )
     return chosen, notes
 
 
 def _at_size(camera: RigCamera, photographs: Sequence[Photograph], root: Path) -> RigCamera:
-    """Return a camera at the size of its photographs; embedded ones are of that calibrated.
+    """Return a camera at the size of its photographs; embedded ones have the calibrated size.
 
-    UserError: they have another shape, or its principal point is far from their middle.
+    UserError: photographs have another shape, or the principal point is far from their middle.
     """
     first = next((p for p in photographs if p.camera == camera.name), None)
     if first is not None and first.embedded is None:
@@ -133,7 +133,7 @@ def _at_size(camera: RigCamera, photographs: Sequence[Photograph], root: Path) -
     if max(abs(x / camera.width - 0.5), abs(y / camera.height - 0.5)) > files.MOST_OFF:
         why = f"the calibration of {camera.name} has its principal point at {x:.0f}, {y:.0f}, far "
         why += f"from the middle of photographs of {camera.width}x{camera.height}"
-        raise broken(f"{root}:", why, "use the photographs at the size that was calibrated")
+        raise broken(f"{root}:", why, "use the photographs at the calibrated size")
     return camera
 
 
@@ -175,14 +175,14 @@ def _file_of(photograph: Photograph, folder: Path, write_embedded: bool) -> Path
 
 
 def _seeds(lidar: Lidar | None, cameras: Float64[np.ndarray, "v 3"]):
-    """Return seeds [s 3] of what does not move, float32, and notes."""
+    """Return seeds [s 3] on what does not move, float32, and notes."""
     if lidar is None:
         return np.zeros((0, 3), np.float32), []
     points, angle = seeds(lidar, cameras)
     moving = np.mean(lidar.objects >= 0)
     return points, [
-        f"LiDAR: {len(lidar.points)} points, {moving:.1%} on moving things; {len(points)} seeds, "
-        f"one in {angle:.3f} of its distance from the cameras."
+        f"LiDAR: {len(lidar.points)} points, {moving:.1%} on moving objects; {len(points)} seeds "
+        f"at a spacing of {angle:.3f} times the distance from the cameras."
     ]
 
 
@@ -198,9 +198,9 @@ def _read_sweeps(
     first, last = min(times) - SWEEP_SLACK_S, max(times) + SWEEP_SLACK_S
     sweeps = [s for s in recording.sweeps if first <= s.time <= last]
     if not sweeps:
-        return None, ["No LiDAR sweep in these frames: seeds come from the photographs."]
+        return None, ["There is no LiDAR sweep in these frames: photographs give the seeds."]
     report(f"Reading {len(sweeps)} LiDAR sweeps")
-    each = max(1, MOST_MEASURED // len(sweeps))
+    most_each = max(1, MOST_MEASURED // len(sweeps))
     rng = generator(0, Stream.LIDAR)
     parts, broken = [], 0
     for sweep in sweeps:
@@ -210,14 +210,14 @@ def _read_sweeps(
         finite = np.isfinite(local).all(1)
         broken += int((~finite).sum())
         local, at = local[finite], np.asarray(at, np.float64)[finite]
-        part = thinned(Lidar(local, at, np.full(len(local), -1, np.int32)), each, rng)
+        part = thinned(Lidar(local, at, np.full(len(local), -1, np.int32)), most_each, rng)
         parts.append((part.points, part.times, owners(part.points, part.times, objects)))
     notes = counted(broken, "LiDAR points are not finite numbers and are left out.")
     return Lidar(*map(np.concatenate, zip(*parts, strict=True))), notes
 
 
 def chosen_cameras(asked: Sequence[str], there: Sequence[str]) -> list[str]:
-    """Return the cameras asked for by (short) names, none: all; UserError: one is unknown."""
+    """Return cameras by their (short) names, all if none is asked; UserError: one is unknown."""
     if not asked:
         return list(there)
     found = []
@@ -232,10 +232,10 @@ def chosen_cameras(asked: Sequence[str], there: Sequence[str]) -> list[str]:
 
 
 def chosen_frames(asked: str | None, there: Sequence[int]) -> list[int]:
-    """Return the frames in a slice FIRST:END[:STEP] of those that are there; nothing asked: all.
+    """Return the frames in a slice FIRST:END[:STEP] of the existing frames, or all for None.
 
-    As in Python a part may be empty, and negative numbers count from the end. UserError: this is
-    not a slice, or it holds no frame.
+    As in Python a part may be empty, and negative numbers count from the end. UserError: the text
+    is not a slice, or the slice holds no frame.
     """
     if asked is None:
         return list(there)
@@ -249,6 +249,6 @@ def chosen_frames(asked: str | None, there: Sequence[int]) -> list[int]:
         fix = "write FIRST:END or FIRST:END:STEP, as 0:30:2"
         raise UserError(f"--frames {asked!r} is not a valid slice", fix=fix) from None
     if not found:
-        fix = f"it has {len(there)}, from 0 on"
+        fix = f"the drive has {len(there)} frames, from 0 on"
         raise UserError(f"--frames {asked} holds no frame of this drive", fix=fix)
     return found

@@ -1,11 +1,12 @@
-"""The ego mask: the car itself in the photographs of its cameras, found once a camera and kept.
+"""The ego mask: the car in the photographs of its cameras, found once for each camera and cached.
 
-The car is what never moves while it drives. Structure that stays where it is says so only where the
-world would have moved: the farthest surface that a pixel can show, the road (above the horizon:
-nothing), is moved by the camera's own motion. Motion counts across an edge, not along it: a lane
-marking that runs with the car stays too. Structure that changes speaks for the world. Smooth
-bonnets, sky and asphalt show no structure and go with their surroundings: a minimal cut through
-the pixels, cheap along edges that stay. Gradients are of logarithms, so exposure does not matter.
+Pixels of the car never change while it drives. An edge that stays is evidence for the car only if
+the world would have moved at its pixel. The least motion is that of the farthest visible surface,
+the road (above the horizon there is none). Motion counts across an edge, not along it: a lane
+marking parallel to the car stays too. An edge that changes is evidence for the world. Smooth
+bonnets, sky and asphalt have no edges and count like the pixels around them: the mask is a minimal
+cut through the pixels, cheap along edges that stay. Gradients are of logarithms, so exposure does
+not matter.
 """
 
 from __future__ import annotations
@@ -28,32 +29,32 @@ from p2gs_jax.scene.lens import scale_intrinsics, undistort_points
 from p2gs_jax.scene.rigid import inverse, up_of_drive
 from p2gs_jax.types import Distortion
 
-# Photographs of a camera that are looked at, spread evenly over its way; fewer say too little.
+# The most photographs of a camera that are used, and the fewest that suffice.
 MOST_LOOKED_AT, FEWEST_LOOKED_AT = 24, 6
-# A turn by one radian counts as this way, metres.
+# A turn by 1 radian counts like this distance, metres.
 TURN_AS_WAY = 10.0
-# The version is part of the key of kept results: raise it with every change of what is found.
+# The version is part of the key of cached results: raise it whenever results change.
 _VERSION = 2
-_SAID = "own car"
-# Lengths in the picture are in pixels at this width; so are all thresholds (BUILD_NOTES).
+_NOTE = "own car"
+# All lengths and thresholds in pictures are in pixels at this width (BUILD_NOTES).
 WIDTH = 480
-# Display values below this are noise; also the blur before gradients, pixels.
+# Display values below `DARK` are noise; `BLUR` is the blur before gradients, pixels.
 DARK, BLUR = 0.02, 1.0
-# An edge stays if in four frames of five its gradient (of logarithms, per pixel) is at least this,
-# and half as strong as it is in the strongest fifth.
+# An edge stays if its gradient (of logarithms, per pixel) is at least `LEAST_GRADIENT` in 80 % of
+# the frames, and there at least 0.5 times the gradient of the strongest 20 %.
 LEAST_GRADIENT, STEADY = 0.012, (20, 80, 0.5)
-# The road lies this far below the camera at most, metres; what is farther than that counts as so.
+# The largest height of the camera above the road, and the largest distance of the road, metres.
 LOWEST_ROAD, FARTHEST = 2.5, 1e4
-# World that moves this far, pixels, shows something else; an edge that stays says nothing before
-# that happened so often, and all that it can say after so often. Motion along an edge within the
-# angle of this sine does not count.
+# The world counts as moved after `APART` pixels. An edge that stays is evidence once this happened
+# more than `FEWEST` times, full evidence after `ENOUGH` times. Motion along an edge, within an
+# angle of sine `ALONG`, does not count.
 APART, FEWEST, ENOUGH, ALONG = 3.0, 1.5, 5.5, 0.1
-# Weights of the cut: evidence for the car, for the world; the length of its outline; its area.
+# Weights of the cut: evidence for the car, length of the outline, its least share on edges, area.
 OWN, OUTLINE, THROUGH_EDGES, AREA = 3.0, 2.0, 0.02, 0.004
-# Least change of a gradient that speaks for the world, and where it says all that it can.
+# The change of a gradient from which on it is evidence for the world, and full evidence.
 CHANGE = (0.006, 0.018)
-# Parts are kept that are this wide, whose outline is an edge that stays for this share, with this
-# much evidence a pixel of it, and this share of the picture. Gaps up to the last are closed.
+# A part of the mask needs this width (pixels), this share of its outline on edges that stay, this
+# much evidence for each pixel of it, and this share of the picture. Gaps up to `GAP` are closed.
 NARROWEST, EDGE_SHARE, EDGE_EVIDENCE, LEAST_SHARE, GAP = 7, 0.5, 0.3, 0.002, 13
 _MOTION_STEP = 8
 _CAPACITY = 1000
@@ -62,45 +63,45 @@ _CAPACITY = 1000
 def find_ego_masks(
     recording: Recording, names: Sequence[str], work_dir: Path | None, report: Report
 ) -> tuple[dict[str, Bool[np.ndarray, "_ _"]], list[str]]:
-    """Return where the named cameras see their own car, and notes.
+    """Return the ego masks of the named cameras that see their car, and notes.
 
-    Masks are of the photographs as stored, at a lower resolution. All photographs of the drive
-    serve, whatever frames are used. Results are kept as pictures below `work_dir` for a resume;
-    None keeps nothing.
+    Masks are in the geometry of the stored photographs, at a lower resolution. All photographs of
+    the drive are used, whatever frames are chosen. Masks are cached as pictures below `work_dir`
+    for a resume; None caches nothing.
     """
     cameras = {c.name: c for c in recording.cameras}
     poses = np.stack([p.pose for p in recording.photographs])
     up = up_of_drive(inverse(poses), [p.camera for p in recording.photographs])
-    report("Looking for the car itself in the photographs")
+    report("Finding the car in its photographs")
     masks: dict[str, Bool[np.ndarray, "_ _"]] = {}
-    standing, without = [], []
+    undecided, unseen = [], []
     for name in names:
-        own = [p for p in recording.photographs if p.camera == name]
-        there = [p for p in own if p.embedded is not None or p.path.is_file()]
-        spread = spread_over_the_way(sorted(there, key=lambda p: p.frame), MOST_LOOKED_AT)
-        mask = _kept(cameras[name], spread, up, work_dir)
+        photographs = [p for p in recording.photographs if p.camera == name]
+        existing = [p for p in photographs if p.embedded is not None or p.path.is_file()]
+        spread = spread_over_the_way(sorted(existing, key=lambda p: p.frame), MOST_LOOKED_AT)
+        mask = _cached_mask(cameras[name], spread, up, work_dir)
         if mask is None:
-            standing.append(name)
+            undecided.append(name)
         elif mask.any():
             masks[name] = mask
         else:
-            without.append(name)
+            unseen.append(name)
     shares = [f"{name} {mask.mean():.1%}" for name, mask in masks.items()]
-    notes = [f"{_SAID}: {', '.join(shares)} of the picture, left out of the fit"] if shares else []
-    if without:
-        notes.append(f"{_SAID}: not seen by {', '.join(without)}")
-    if standing:
+    notes = [f"{_NOTE}: {', '.join(shares)} of the picture, left out of the fit"] if shares else []
+    if unseen:
+        notes.append(f"{_NOTE}: not seen by {', '.join(unseen)}")
+    if undecided:
         notes.append(
-            f"{_SAID}: {', '.join(standing)} took too few photographs, or hardly moved, so "
-            "nothing can be told from them; give masks if they show it"
+            f"{_NOTE}: cannot be found by {', '.join(undecided)}, with too few photographs or "
+            "hardly any motion; add masks if the car is visible"
         )
     return masks, notes
 
 
-def _kept(
+def _cached_mask(
     camera: RigCamera, shots: Sequence[Photograph], up: np.ndarray, work_dir: Path | None
 ) -> Bool[np.ndarray, "h w"] | None:
-    """Return where a camera sees its car, from an earlier run if that found it."""
+    """Return the ego mask of a camera, or that of an earlier run; None: it cannot be found."""
 
     def build(folder: Path) -> None:
         pictures = np.array([_picture(p, camera) for p in shots])
@@ -133,7 +134,7 @@ def _picture(photograph: Photograph, camera: RigCamera) -> UInt8[np.ndarray, "h 
 def spread_over_the_way(photographs: Sequence[Photograph], most: int) -> list[Photograph]:
     """Return at most `most` photographs of one camera, given in the order of time.
 
-    They are spread evenly over its way, not over time: cars wait.
+    They are spread evenly over the distance, not over time: cars wait.
     """
     if len(photographs) < 2:
         return list(photographs)
@@ -141,9 +142,9 @@ def spread_over_the_way(photographs: Sequence[Photograph], most: int) -> list[Ph
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     turned = np.einsum("nij,nij->n", poses[1:, :3, :3], poses[:-1, :3, :3])
     steps += TURN_AS_WAY * np.arccos(np.clip((turned - 1) / 2, -1, 1))
-    way = np.concatenate([[0.0], np.cumsum(steps)])
-    stops = np.linspace(0, way[-1], most)
-    rows = sorted({int(np.abs(way - stop).argmin()) for stop in stops})
+    distance = np.concatenate([[0.0], np.cumsum(steps)])
+    stops = np.linspace(0, distance[-1], most)
+    rows = sorted({int(np.abs(distance - stop).argmin()) for stop in stops})
     return [photographs[row] for row in rows]
 
 
@@ -153,25 +154,31 @@ def find_ego_mask(
     poses: Float[np.ndarray, "n 4 4"],
     up: Float[np.ndarray, " 3"],
 ) -> Bool[np.ndarray, "h w"] | None:
-    """Return where a camera sees its own car; None: it hardly moves, and nothing can be told.
+    """Return the ego mask of a camera; None: the camera hardly moves.
 
     Pictures are grey, `WIDTH` pixels wide and in the order of the drive; poses are camera to world;
-    `up` leads away from the road and has length 1.
+    `up` is a unit vector away from the road.
     """
     if len(pictures) < FEWEST_LOOKED_AT:
         return None
     height = pictures.shape[1]
     K = scale_intrinsics(camera.K, WIDTH / camera.width, height / camera.height)
     motion = expected_motion(poses, up, K, camera.distortion, WIDTH, height)
-    # How often the world has moved on at each pixel.
+    # The sum counts how often the world has moved at each pixel.
     if np.minimum(np.linalg.norm(motion, axis=-1) / APART, 1).sum(0).max() < FEWEST:
         return None
     return cut(weigh(pictures, motion))
 
 
 class Evidence(NamedTuple):
-    """What frames say of every pixel: whether an edge is there in nearly all of them, its strength,
-    log units a pixel, how much it speaks for the car, 0 to 1, and the change of gradients."""
+    """Evidence at every pixel from all frames.
+
+    Attributes:
+        stays: whether an edge is there in nearly all frames.
+        strength: gradient of this edge, natural logarithms per pixel.
+        own: evidence for the car, 0 to 1.
+        change: median change of the gradient.
+    """
 
     stays: Bool[np.ndarray, "h w"]
     strength: Float32[np.ndarray, "h w"]
@@ -187,41 +194,41 @@ def expected_motion(
     width: int,
     height: int,
 ) -> Float32[np.ndarray, "n-1 h w 2"]:
-    """Return how far the farthest surface that a pixel can show moves from frame to frame, pixels.
+    """Return the motion of the farthest visible surface between frames, pixels.
 
-    Poses are camera to world, in the order of the frames; `up` leads away from the road and has
-    length 1; K is in pixels of the undistorted image of that size.
+    Poses are camera to world, in the order of the frames; `up` is a unit vector away from the road;
+    K is in pixels of the undistorted image of that size.
     """
     columns = np.arange(_MOTION_STEP / 2, width, _MOTION_STEP)
     rows = np.arange(_MOTION_STEP / 2, height, _MOTION_STEP)
     xs, ys = np.meshgrid(columns, rows)
     straight = undistort_points(np.stack([xs, ys], -1).reshape(-1, 2), K, distortion)
     straight = straight.reshape(*xs.shape, 2).astype(np.float64)
-    # Pixels of the photograph for pixels of the undistorted image.
+    # The derivative of undistorted pixels by pixels of the photograph.
     jacobian = np.stack([np.gradient(straight, _MOTION_STEP, axis=k) for k in (1, 0)], -1)
-    seen = np.isfinite(jacobian).all((-2, -1)) & (np.linalg.det(jacobian) > 1e-3)
-    jacobian[~seen] = np.eye(2)
+    valid = np.isfinite(jacobian).all((-2, -1)) & (np.linalg.det(jacobian) > 1e-3)
+    jacobian[~valid] = np.eye(2)
     back = np.linalg.inv(jacobian)
     focal, centre = K[[0, 1], [0, 1]], K[:2, 2]
     rays = np.concatenate([(straight - centre) / focal, np.ones((*xs.shape, 1))], -1)
     out = []
-    for here, there in pairwise(poses):
-        towards = rays @ here[:3, :3].T
+    for pose, next_pose in pairwise(poses):
+        towards = rays @ pose[:3, :3].T
         drop = np.maximum(-(towards @ up), LOWEST_ROAD / FARTHEST)
         distance = LOWEST_ROAD / drop
-        points = here[:3, 3] + towards * distance[..., None]
-        local = (points - there[:3, 3]) @ there[:3, :3]
-        # Behind the other camera: far out of its image.
+        points = pose[:3, 3] + towards * distance[..., None]
+        local = (points - next_pose[:3, 3]) @ next_pose[:3, :3]
+        # Points behind the other camera are far outside its image.
         z = np.maximum(local[..., 2:], 0.05 * distance[..., None])
         moved = local[..., :2] / z * focal + centre - straight
         moved = np.einsum("hwij,hwj->hwi", back, moved)
-        moved[~seen] = 0
+        moved[~valid] = 0
         out.append(cv2.resize(moved.astype(np.float32), (width, height)))
     return np.array(out)
 
 
 def weigh(frames: UInt8[np.ndarray, "n h w"], motion: Float32[np.ndarray, "m h w 2"]) -> Evidence:
-    """Return what grey pictures and the `expected_motion` between them say of every pixel."""
+    """Return the evidence in grey pictures and the `expected_motion` between them."""
     gradients = np.array([_gradient(picture) for picture in frames])
     usual = np.median(gradients, axis=0)
     across = usual / np.maximum(np.linalg.norm(usual, axis=-1, keepdims=True), 1e-6)
@@ -230,20 +237,20 @@ def weigh(frames: UInt8[np.ndarray, "n h w"], motion: Float32[np.ndarray, "m h w
     stays = (least > LEAST_GRADIENT) & (least > share * most)
     away = np.abs((motion * across).sum(-1)) - ALONG * np.linalg.norm(motion, axis=-1)
     apart = np.clip(away / APART, 0, 1).sum(0)
-    said = np.clip((apart - FEWEST) / (ENOUGH - FEWEST), 0, 1)
+    evidence = np.clip((apart - FEWEST) / (ENOUGH - FEWEST), 0, 1)
     change = np.sqrt(np.median(((gradients - usual) ** 2).sum(-1), axis=0))
-    return Evidence(stays, np.where(stays, least, 0), np.where(stays, said, 0), change)
+    return Evidence(stays, np.where(stays, least, 0), np.where(stays, evidence, 0), change)
 
 
 def _gradient(picture: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w 2"]:
-    """Return the gradient of the logarithm, per pixel."""
+    """Return the gradient of the natural logarithm, per pixel."""
     logs = cv2.GaussianBlur(np.log(picture.astype(np.float32) / 255 + DARK), (0, 0), BLUR)
     sides = [cv2.Sobel(logs, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8) for dx in (1, 0)]
     return np.stack(sides, -1)
 
 
 def cut(evidence: Evidence) -> Bool[np.ndarray, "h w"]:
-    """Return the parts of a picture that never move, cleaned; they touch its border."""
+    """Return the parts of a picture that never move and touch its border, without small gaps."""
     least, most = CHANGE
     moves = np.clip((evidence.change - least) / (most - least), 0, 1)
     gain = OWN * evidence.own - np.where(evidence.stays, 0, moves) - AREA
@@ -252,9 +259,10 @@ def cut(evidence: Evidence) -> Bool[np.ndarray, "h w"]:
 
 
 def _minimal_cut(gain: np.ndarray, passage: np.ndarray) -> Bool[np.ndarray, "h w"]:
-    """Return the pixels of largest gain less outline; the border of the picture costs nothing.
+    """Return the pixels with the largest gain minus the price of their outline.
 
-    `passage` is the share of the full price that an outline through a pixel costs.
+    The border of the picture costs nothing. `passage` is the share of the full price for an outline
+    through a pixel.
     """
     h, w = gain.shape
     count = h * w
@@ -286,7 +294,7 @@ def _minimal_cut(gain: np.ndarray, passage: np.ndarray) -> Bool[np.ndarray, "h w
 
 
 def _solid_parts(found: Bool[np.ndarray, "h w"], evidence: Evidence) -> Bool[np.ndarray, "h w"]:
-    """Return the parts that are not lines, touch the border, and end at edges that stay."""
+    """Return the parts that are wide, touch the border, and end at edges that stay."""
     opened = _morphology(found, cv2.MORPH_OPEN, NARROWEST)
     parts, count = _labelled(opened)
     near = cv2.dilate(evidence.stays.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
@@ -305,7 +313,7 @@ def _solid_parts(found: Bool[np.ndarray, "h w"], evidence: Evidence) -> Bool[np.
         if evidence.own[part].sum() >= EDGE_EVIDENCE * length:
             kept |= part
     closed = _morphology(kept, cv2.MORPH_CLOSE, GAP)
-    # Holes too, also those that only the border below closes.
+    # Holes are filled, even those that only the lower border closes.
     holes, _ = _labelled(~closed)
     around = np.unique(np.concatenate([holes[0], holes[:, 0], holes[:, -1]]))
     return ~np.isin(holes, around[around > 0])

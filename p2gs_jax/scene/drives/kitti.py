@@ -2,9 +2,9 @@
 
     DATE/calib_{cam_to_cam,velo_to_cam,imu_to_velo}.txt
     DATE/DATE_drive_NNNN_sync/image_0K/{data/NNNNNNNNNN.png,timestamps.txt}
-    DATE/DATE_drive_NNNN_sync/oxts/{data/NNNNNNNNNN.txt,timestamps.txt}    GPS and inertia
+    DATE/DATE_drive_NNNN_sync/oxts/{data/NNNNNNNNNN.txt,timestamps.txt}    GPS and inertial unit
     DATE/DATE_drive_NNNN_sync/velodyne_points/{data/NNNNNNNNNN.bin,timestamps*.txt}
-    DATE/DATE_drive_NNNN_sync/tracklet_labels.xml    boxes, of some drives
+    DATE/DATE_drive_NNNN_sync/tracklet_labels.xml    boxes, for some drives only
 
 Schema: https://www.cvlibs.net/datasets/kitti/raw_data.php (readme.txt of its devkit, and
 matlab/convertOxtsToPose.m for the poses).
@@ -43,29 +43,29 @@ EARTH_RADIUS_M = 6378137.0
 CALIBRATION = "calib_cam_to_cam.txt"
 GREY = ("image_00", "image_01")
 PHOTOGRAPHS = (".png", ".jpg", ".jpeg")
-# Seconds of a turn of the scanner, where no file says when it began and ended.
+# The time of a turn of the scanner, seconds, if no file states its begin and end.
 TURN_S = 0.1
-# It turns clockwise from its back (x forward, y left), and triggers the cameras when it looks
-# forward. KITTI's readme says counterclockwise; the authors' own correction of moving scans
-# (kitti360scripts/helpers/curlVelodyneData_impl.c) takes points on the left as the earlier ones.
+# The scanner turns clockwise from its back (x forward, y left), and triggers the cameras when it
+# looks forward. KITTI's readme states counterclockwise, but the authors' code for moving scans
+# (kitti360scripts/helpers/curlVelodyneData_impl.c) treats points on the left as the earlier ones.
 BACK = np.pi
 _STAMP = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(\.\d+)?|")
 
 
 def read_kitti_raw(root: Path, cfg: DataConfig) -> Recording:
-    """Read a drive, from its folder or that of its date; UserError: a table is broken."""
+    """Read a drive, from its folder or the folder of its date; UserError: a table is broken."""
     root = tables.drive_folder(root, cfg.drive, MARKER)
-    # Calibration is that of a date, but some copy it beside the images; links to a drive may lead
-    # elsewhere.
+    # The calibration lies in the folder of the date, or beside the images in some copies. Symbolic
+    # links to a drive may lead elsewhere.
     places = (root, root.absolute().parent, root.resolve().parent)
-    calibration = next((p for p in places if (p / CALIBRATION).is_file()), places[1])
-    velo_to_cam = _rigid_file(calibration / "calib_velo_to_cam.txt")
-    imu_to_velo = _rigid_file(calibration / "calib_imu_to_velo.txt")
+    calibration_folder = next((p for p in places if (p / CALIBRATION).is_file()), places[1])
+    velo_to_cam = _rigid_file(calibration_folder / "calib_velo_to_cam.txt")
+    imu_to_velo = _rigid_file(calibration_folder / "calib_imu_to_velo.txt")
     car, notes = _car(root)
     scanner = Trajectory(car.times, car.poses @ inverse(imu_to_velo))
-    held = _Calibration(calibration / CALIBRATION)
-    R = held.matrix("R_rect_00", 3, 3)
-    rectified = rigid(R, np.zeros(3), held.path, "camera 00 (R_rect_00)")
+    calibration_file = _Calibration(calibration_folder / CALIBRATION)
+    R = calibration_file.matrix("R_rect_00", 3, 3)
+    rectified = rigid(R, np.zeros(3), calibration_file.path, "camera 00 (R_rect_00)")
     to_car = inverse(imu_to_velo) @ inverse(velo_to_cam) @ inverse(rectified)
     cameras, photographs = [], []
     for folder in sorted(root.glob("image_0[0-3]")):
@@ -73,15 +73,15 @@ def read_kitti_raw(root: Path, cfg: DataConfig) -> Recording:
         if not files:
             notes.append(f"{folder.name} has no photographs: it is left out.")
             continue
-        K, back = _rectified_camera(held, folder.name)
-        size = _rectified_size(held, next(iter(files.values())), folder.name)
+        K, to_reference = _rectified_camera(calibration_file, folder.name)
+        size = _rectified_size(calibration_file, next(iter(files.values())), folder.name)
         cameras.append(RigCamera(folder.name, K, *size))
-        found, without = _photographs(folder, files, car, to_car @ back)
+        found, unplaced = _photographs(folder, files, car, to_car @ to_reference)
         photographs += found
-        notes += tables.counted(without, f"photographs of {folder.name} have no pose or time.")
+        notes += tables.counted(unplaced, f"photographs of {folder.name} have no pose or time.")
     named = {camera.name for camera in cameras}
     if named & set(GREY) and named - set(GREY):
-        notes.append("image_00 and image_01 are grey: --cameras image_02 image_03 omits them.")
+        notes.append("image_00 and image_01 are grey: --cameras image_02 image_03 omits these.")
     forward, lengths = _turns(root)
     scans = tables.numbered(root / "velodyne_points" / "data", (".bin",))
     known = scanner.at(forward)[1] if len(forward) else forward
@@ -115,54 +115,54 @@ class _Calibration:
         return name in self._held
 
     def matrix(self, name: str, *shape: int) -> Float64[np.ndarray, "..."]:
-        """Return a matrix; UserError: it is not there, or has not so many finite numbers."""
+        """Return a matrix; UserError: it is missing, or has another number of finite numbers."""
         words = self._held.get(name, ())
         return tables.finite_numbers(words, self.path, name, int(np.prod(shape))).reshape(shape)
 
 
 def _rigid_file(path: Path) -> Pose:
-    held = _Calibration(path)
-    return rigid(held.matrix("R", 3, 3), held.matrix("T", 3), path, "a sensor")
+    calibration = _Calibration(path)
+    return rigid(calibration.matrix("R", 3, 3), calibration.matrix("T", 3), path, "a sensor")
 
 
-def _rectified_camera(held: _Calibration, name: str) -> tuple[Float64[np.ndarray, "3 3"], Pose]:
-    """Return K (pixel centres at +0.5) and this camera to the reference camera.
+def _rectified_camera(calib: _Calibration, name: str) -> tuple[Float64[np.ndarray, "3 3"], Pose]:
+    """Return K (pixel centres at +0.5), and the pose from this camera to the reference camera.
 
     UserError: the projection of the camera is missing or has no focal lengths.
     """
-    # From the rectified reference camera, with pixel centres at integers.
-    P = held.matrix(f"P_rect_{name[-2:]}", 3, 4)
+    # P projects from the rectified reference camera, with pixel centres at integers.
+    P = calib.matrix(f"P_rect_{name[-2:]}", 3, 4)
     if not (P[0, 0] > 0 and P[1, 1] > 0 and P[2, 2] > 0):
-        raise broken(f"{held.path}:", f"the projection of {name} has no focal lengths")
+        raise broken(f"{calib.path}:", f"the projection of {name} has no focal lengths")
     K = P[:, :3].copy()
-    back = pose_of(np.eye(3), -np.linalg.solve(K, P[:, 3]))
+    to_reference = pose_of(np.eye(3), -np.linalg.solve(K, P[:, 3]))
     K[:2, 2] += 0.5
-    return K, back
+    return K, to_reference
 
 
-def _rectified_size(held: _Calibration, photograph: Path, name: str) -> tuple[int, int]:
-    """Return the size of rectified photographs, or where no file says another, that of one.
+def _rectified_size(calib: _Calibration, photograph: Path, name: str) -> tuple[int, int]:
+    """Return the calibrated size of rectified photographs, or the photograph's if none is stated.
 
-    UserError: the photograph has the size of those that are not rectified.
+    UserError: the photograph has the size of photographs that are not rectified.
     """
-    there, number = image_size(photograph), name[-2:]
-    if f"S_rect_{number}" not in held:
-        return there
-    width, height = held.matrix(f"S_rect_{number}", 2).tolist()
-    # Rounding by a pixel or two is no other size.
-    if max(abs(there[0] / width - 1), abs(there[1] / height - 1)) < 0.01:
-        return there
-    if f"S_{number}" in held and there == tuple(held.matrix(f"S_{number}", 2).tolist()):
-        fix = "take the drive whose name ends with _sync: that with _extract is not rectified"
-        raise broken(photograph, f"is not rectified, as its size of {there} says", fix)
+    size, number = image_size(photograph), name[-2:]
+    if f"S_rect_{number}" not in calib:
+        return size
+    width, height = calib.matrix(f"S_rect_{number}", 2).tolist()
+    # Sizes that differ by one or two pixels are rounded.
+    if max(abs(size[0] / width - 1), abs(size[1] / height - 1)) < 0.01:
+        return size
+    if f"S_{number}" in calib and size == tuple(calib.matrix(f"S_{number}", 2).tolist()):
+        fix = "use the drive whose name ends with _sync: drives with _extract are not rectified"
+        raise broken(photograph, f"is not rectified, by its size {size}", fix)
     return int(width), int(height)
 
 
 def _read_stamps(path: Path) -> Float64[np.ndarray, " n"]:
-    """Return the times in lines `YYYY-MM-DD HH:MM:SS.nnnnnnnnn`, seconds, to about a microsecond.
+    """Return the times in lines `YYYY-MM-DD HH:MM:SS.nnnnnnnnn`, seconds, to about 1 microsecond.
 
-    There is a line a frame; an empty one is NaN. UserError: the file is missing, or a line is not a
-    time.
+    Each frame has a line; an empty line gives NaN. UserError: the file is missing, or a line is not
+    a time.
     """
     times = []
     for number, line in enumerate(_read_lines(path), 1):
@@ -178,10 +178,10 @@ def _read_stamps(path: Path) -> Float64[np.ndarray, " n"]:
 
 
 def _car(root: Path) -> tuple[Trajectory, list[str]]:
-    """Return the way of the GPS unit (x forward, y left, z up), and notes.
+    """Return the trajectory of the GPS unit (x forward, y left, z up), and notes.
 
-    The world is metric at the first latitude (Mercator), x east, y north, z up, the origin where
-    the drive begins.
+    The world is metric at the first latitude (Mercator): x east, y north, z up. Its origin is the
+    begin of the drive.
     """
     files = tables.numbered(root / "oxts" / "data", (".txt",))
     stamps = _read_stamps(root / "oxts" / "timestamps.txt")
@@ -203,7 +203,7 @@ def _car(root: Path) -> tuple[Trajectory, list[str]]:
 
 
 def _oxts(path: Path) -> Float64[np.ndarray, " 6"]:
-    """Return latitude and longitude in degrees, altitude in metres, roll, pitch, yaw."""
+    """Return latitude and longitude (degrees), altitude (metres), roll, pitch, yaw (radians)."""
     words = path.read_text("utf-8-sig", "replace").split()
     values = tables.finite_numbers(words[:6], path, "position and angles", 6)
     if abs(values[0]) >= 89:
@@ -214,7 +214,7 @@ def _oxts(path: Path) -> Float64[np.ndarray, " 6"]:
 def _photographs(
     folder: Path, files: dict[int, Path], car: Trajectory, to_car: Pose
 ) -> tuple[list[Photograph], int]:
-    """Return the photographs of a camera, and how many have no pose or time."""
+    """Return the photographs of a camera, and the number without a pose or time."""
     stamps = _read_stamps(folder / "timestamps.txt")
     placed, covered = car.at(stamps)
     photographs = []
@@ -226,7 +226,7 @@ def _photographs(
 
 
 def _turns(root: Path) -> tuple[Float64[np.ndarray, " f"], Float64[np.ndarray, " f"]]:
-    """Return when the scanner looked forward in each frame, and how long a turn took, seconds."""
+    """Return when the scanner looked forward, and the time of a turn, by frame, seconds."""
     folder = root / "velodyne_points"
     if not (folder / "timestamps.txt").is_file() and not (folder / "data").is_dir():
         return np.zeros(0), np.zeros(0)
@@ -242,7 +242,7 @@ def _turns(root: Path) -> tuple[Float64[np.ndarray, " f"], Float64[np.ndarray, "
 
 
 def _read_sweep(path: Path, forward_s: float, turn_s: float, scanner: Trajectory) -> SweepPoints:
-    """Return the points of a scan in the world, each from where the scanner was at its time."""
+    """Return the points of a scan in the world, by the scanner's pose at the time of each point."""
     values = np.fromfile(path, "<f4")
     if values.size % 4 or path.stat().st_size % 16:
         raise broken(path, "is not a LiDAR scan of float32 x y z reflectance: its size is wrong")
@@ -256,7 +256,10 @@ def _read_sweep(path: Path, forward_s: float, turn_s: float, scanner: Trajectory
 def _passed(
     points: Float64[np.ndarray, "n 3"], forward_s: float, turn_s: float
 ) -> Float64[np.ndarray, " n"]:
-    """Return when the scanner looked at points in its axes, seconds; NaN counts as forward."""
+    """Return the times at which the scanner measured points in its axes, seconds.
+
+    NaN counts as forward.
+    """
     azimuth = np.nan_to_num(np.arctan2(points[:, 1], points[:, 0]))
     return forward_s + turn_s * (turned(azimuth, start=BACK) - 0.5)
 
@@ -267,15 +270,15 @@ def _objects(
     lengths: Float64[np.ndarray, " f"],
     scanner: Trajectory,
 ) -> tuple[tuple[TrackedObject, ...], list[str]]:
-    """Return the tracklets in the world, each box as of when the scanner passed it."""
+    """Return the tracklets in the world; a box has the time at which the scanner passed it."""
     path = root / "tracklet_labels.xml"
     if not path.is_file():
-        return (), ["There are no boxes of moving things (tracklet_labels.xml)."]
+        return (), ["There are no boxes of moving objects (tracklet_labels.xml)."]
     boxes, empty = _tracklets(path)
     timed = [b for b in boxes if 0 <= b.time < len(forward) and np.isfinite(forward[int(b.time)])]
     notes = tables.counted(empty, "tracklets have no boxes: they are left out.")
     lost = len(boxes) - len(timed)
-    notes += tables.counted(lost, "boxes are of frames without a LiDAR time: they are left out.")
+    notes += tables.counted(lost, "boxes have frames without a LiDAR time: they are left out.")
     if not timed:
         return (), notes
     local = np.stack([box.pose for box in timed])
@@ -287,7 +290,7 @@ def _objects(
 
 
 def _tracklets(path: Path) -> tuple[list[Box], int]:
-    """Return boxes, and how many things have none: times are frames, poses lead to the scanner.
+    """Return boxes (times are frames, poses lead to the scanner), and the count of empty tracklets.
 
     UserError: the file is broken.
     """
@@ -310,8 +313,8 @@ def _tracklets(path: Path) -> tuple[list[Box], int]:
         label = (item.findtext("objectType") or "unknown").strip()
         for frame, box in enumerate(boxes, int(first)):
             *position, roll, pitch, yaw = numbers(box, "tx ty tz rx ry rz")
-            turn = Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix()
-            # Theirs is the middle of the bottom.
-            pose = pose_of(turn, position + turn[:, 2] * height / 2)
+            rotation = Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix()
+            # The origin of KITTI's boxes is the middle of the bottom.
+            pose = pose_of(rotation, position + rotation[:, 2] * height / 2)
             found.append(Box(str(number), label, (length, width, height), frame, pose))
     return found, empty

@@ -1,5 +1,4 @@
-"""Laser points of a drive: when a scanner looked where, on which moving thing each point lies, and
-which points become seeds."""
+"""LiDAR points of a drive: times within a sweep, the moving object of each point, and seeds."""
 
 from __future__ import annotations
 
@@ -12,18 +11,18 @@ from scipy.spatial import KDTree
 from p2gs_jax.scene.rigid import interpolated, inverse
 from p2gs_jax.types import Lidar, TrackedObject
 
-# Boxes are drawn tightly and scanners scatter: points this near to a box are in it, metres.
+# Boxes are tight and measurements noisy: points this near to a box count as inside, metres.
 BOX_MARGIN = 0.15
-# Points kept from all sweeps together, evenly.
+# The largest number of points from all sweeps, the same from each sweep.
 MOST_MEASURED = 2_000_000
-# Seeds: one a voxel, whose side grows with the distance from the nearest camera.
+# Seeds: one for each voxel, whose side grows with the distance from the nearest camera.
 MOST_SEEDS, FINEST_VOXEL, VOXEL_ANGLE, VOXEL_GROWTH = 200_000, 0.05, 0.01, 1.3
 
 
 def turned(azimuth: Float[np.ndarray, "*n"] | float, start: float) -> Float[np.ndarray, "*n"]:
     """Return the share of a turn, in [0, 1), after which a spinning scanner looks in a direction.
 
-    Things that move are measured, and their boxes drawn, where they were at that time.
+    Points and boxes of moving objects lie where the object was at that time.
 
     Args:
         azimuth: directions, radians counterclockwise as seen from above; scanners on cars turn
@@ -40,34 +39,34 @@ def owners(
 ) -> Int[np.ndarray, " n"]:
     """Return the row of the moving object whose box holds each point, -1 for none.
 
-    Points are world coordinates, each at its own time.
+    Points are world coordinates, each at its measurement time (seconds).
     """
     found = np.full(len(points), -1, np.int32)
     if not len(points):
         return found
     tree = KDTree(points)
-    for row, thing in enumerate(objects):
-        if not thing.moving:
+    for row, tracked in enumerate(objects):
+        if not tracked.moving:
             continue
-        half = np.asarray(thing.size) / 2 + BOX_MARGIN
+        half = np.asarray(tracked.size) / 2 + BOX_MARGIN
         first, last = times.min(), times.max()
-        inside = (thing.times >= first - 1) & (thing.times <= last + 1)
+        inside = (tracked.times >= first - 1) & (tracked.times <= last + 1)
         if not inside.any():
             continue
         reach = float(np.linalg.norm(half)) + 2.0
-        centres = thing.poses[inside, :3, 3]
+        centres = tracked.poses[inside, :3, 3]
         balls = tree.query_ball_point(centres, reach)
         near = np.unique(np.concatenate([np.asarray(ball, int) for ball in balls]))
         if not len(near):
             continue
-        poses, covered = interpolated(thing.times, thing.poses, times[near])
+        poses, covered = interpolated(tracked.times, tracked.poses, times[near])
         local = np.einsum("nij,nj->ni", inverse(poses)[:, :3, :3], points[near] - poses[:, :3, 3])
         found[near[covered & (np.abs(local) <= half).all(1)]] = row
     return found
 
 
 def thinned(lidar: Lidar, most: int, rng: np.random.Generator) -> Lidar:
-    """Return at most `most` measurements, drawn evenly."""
+    """Return at most `most` measurements, drawn with equal probability."""
     if len(lidar.points) <= most:
         return lidar
     keep = np.sort(rng.choice(len(lidar.points), most, replace=False))
@@ -77,10 +76,10 @@ def thinned(lidar: Lidar, most: int, rng: np.random.Generator) -> Lidar:
 def seeds(
     lidar: Lidar, cameras: Float[np.ndarray, "v 3"], most: int = MOST_SEEDS
 ) -> tuple[Float32[np.ndarray, "s 3"], float]:
-    """Return points of what does not move: one a voxel, near the cameras' path finer than far off.
+    """Return static points, one for each voxel; voxels are smaller near the cameras.
 
-    Voxels grow until at most `most` points are left. The second result is the side of a voxel over
-    its distance from the nearest camera.
+    Voxels grow until at most `most` points are left. The second result is the side of a voxel
+    divided by its distance from the nearest camera.
     """
     points = lidar.points[lidar.objects < 0]
     angle = VOXEL_ANGLE
@@ -95,10 +94,10 @@ def seeds(
 
 
 def _one_per_voxel(points: Float32[np.ndarray, "n 3"], side: Float[np.ndarray, " n"]):
-    """Return rows of the first point in every voxel; sides are rounded to powers of 2."""
+    """Return the row of the first point in each voxel; sides are rounded to powers of 2."""
     level = np.clip(np.rint(np.log2(side / FINEST_VOXEL)), 0, 15).astype(np.uint64)
     cell = np.floor((points - points.min(0)) / np.ldexp(FINEST_VOXEL, level.astype(int))[:, None])
-    # Four bits of level, twenty for each axis: 52 km at the finest.
+    # 4 bits hold the level and 20 bits each axis: 52 km at the finest level.
     key = level
     for axis in range(3):
         key = (key << np.uint64(20)) | np.minimum(cell[:, axis], 2**20 - 1).astype(np.uint64)

@@ -2,14 +2,14 @@
 
     v1.0-VERSION/*.json      tables of all drives, linked by tokens
     samples/CHANNEL/*        photographs and sweeps of the annotated moments ("keyframes")
-    sweeps/CHANNEL/*         what was recorded between them; of these, laser sweeps are used
+    sweeps/CHANNEL/*         recordings between keyframes, of which LiDAR sweeps are used
 
 Schema: https://github.com/nutonomy/nuscenes-devkit/blob/master/docs/schema_nuscenes.md
 
-Photographs are undistorted. Their stamps are when exposure is triggered, as the scanner passes the
-middle of the image; a sweep's is when its turn is complete (https://www.nuscenes.org/nuscenes,
-"Sensor setup"). Measured on a sweep of scene-0061: its points lie in the order of firing, and the
-turn begins and ends at azimuth 180 degrees of the scanner's axes (x right, y forward).
+Photographs are undistorted. Their time is the trigger of the exposure, when the scanner passes the
+middle of the image; the time of a sweep is the end of its turn (https://www.nuscenes.org/nuscenes,
+"Sensor setup"). A sweep of scene-0061 shows that points are in the order of firing, and that a turn
+begins and ends at azimuth 180 degrees of the scanner's axes (x right, y forward).
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ from p2gs_jax.types import TrackedObject
 
 MARKER = "v1.0-*/sample_data.json"
 NUMBER = (int, float)
-# The scanner: seconds a turn (20 Hz), and where a turn begins.
+# The scanner: time of a turn, seconds (20 Hz), and the azimuth where a turn begins.
 TURN_S, TURN_START = 0.05, np.pi
-# Numbers a laser point: x y z intensity ring.
+# The numbers of a LiDAR point: x y z intensity ring.
 POINT = 5
 PLACED: Kinds = {"translation": list, "rotation": list}
 RECORDED: Kinds = {
@@ -57,8 +57,8 @@ _FIX = "get the tables again, all of one version"
 def read_nuscenes(root: Path, cfg: DataConfig) -> Recording:
     """Read one drive ("scene") of a folder with `v1.0-...` and `samples`.
 
-    `cfg.drive` has to name it only where photographs of several are there. UserError: a table is
-    missing or broken, or a pose in it.
+    `cfg.drive` must name the drive if there are photographs of several. UserError: a table is
+    missing, or a table or a pose is broken.
     """
     tables, scene = _chosen_scene(root, cfg.drive)
     drive = _Drive(root, tables, scene)
@@ -67,14 +67,14 @@ def read_nuscenes(root: Path, cfg: DataConfig) -> Recording:
     objects, notes = _objects(drive)
     claimed, count = scene.get("nbr_samples"), len(drive.moments)
     if claimed not in (None, count):
-        notes.insert(0, f"scene.json counts {claimed} samples, sample.json holds {count}.")
+        notes.insert(0, f"scene.json counts {claimed} samples, but sample.json holds {count}.")
     notes += counted(left_out, "photographs have no pose in ego_pose.json: they are left out.")
     notes += counted(absent, "LiDAR sweeps of the keyframes are missing, or have no pose.")
     return Recording(root, "nuscenes", cameras, photographs, sweeps, objects, notes)
 
 
 def _chosen_scene(root: Path, asked: str | None) -> tuple[Path, Row]:
-    """Return the tables' folder and the row of the drive; the first version that has it counts."""
+    """Return the folder of tables and the drive's row, from the first version that has it."""
     versions = sorted(path.parent for path in root.glob(MARKER))
     there: dict[str, tuple[Path, Row]] = {}
     for tables in reversed(versions):
@@ -117,7 +117,7 @@ class _Drive:
         return read_rows(self.path(table), needs, column, among)
 
     def by_token(self, table: str, needs: Kinds, wanted: Container[Any] = ()) -> dict[str, Row]:
-        """Return rows by their tokens: those wanted, or all."""
+        """Return the wanted rows, or all, by their tokens."""
         rows = self.rows(table, {"token": str, **needs}, "token" if wanted else "", wanted)
         return {row["token"]: row for row in rows}
 
@@ -126,7 +126,7 @@ class _Drive:
         return (timestamp - self.start) * 1e-6
 
     def sensor(self, row: Row) -> _Sensor:
-        """Return what recorded a row of sample_data."""
+        """Return the sensor that recorded a row of sample_data."""
         token = row["calibrated_sensor_token"]
         if token not in self._sensors:
             why = f"has no sensor {token}, which recorded {row['filename']}"
@@ -134,19 +134,19 @@ class _Drive:
         return self._sensors[token]
 
     def pose(self, row: Row) -> Pose | None:
-        """Return the pose, sensor to world, of a row of sample_data when it was recorded."""
+        """Return the pose, sensor to world, at the time of a row of sample_data, or None."""
         ego = self._egos.get(row["ego_pose_token"])
         return None if ego is None else _pose(ego, self.path("ego_pose")) @ self.sensor(row).to_ego
 
     def file(self, row: Row) -> Path:
-        """Return the file of a row of sample_data; UserError: it lies outside of the set."""
+        """Return the file of a row of sample_data; UserError: it lies outside the data set."""
         name = PurePosixPath(row["filename"])
-        fix = "get the tables again; files of a drive lie below the folder of its set"
+        fix = "get the tables again; files of a drive lie below the folder of its data set"
         require_inside(name, self.root, self.path("sample_data"), fix=fix)
         return self.root / name
 
     def of(self, modality: str) -> list[Row]:
-        """Return the rows of all sensors of a kind, in the order of time."""
+        """Return the rows of all sensors of a modality, in the order of time."""
         return [row for row in self.data if self.sensor(row).modality == modality]
 
     def _read_sensors(self) -> dict[str, _Sensor]:
@@ -164,14 +164,14 @@ class _Drive:
 
 
 def _pose(row: Row, path: Path) -> Pose:
-    what = row["token"]
-    wxyz = finite_numbers(row["rotation"], path, f"the rotation of {what}", 4)
-    position = finite_numbers(row["translation"], path, f"the translation of {what}", 3)
-    return from_quaternion(wxyz, position, path, what)
+    token = row["token"]
+    wxyz = finite_numbers(row["rotation"], path, f"the rotation of {token}", 4)
+    position = finite_numbers(row["translation"], path, f"the translation of {token}", 3)
+    return from_quaternion(wxyz, position, path, token)
 
 
 def _photographs(drive: _Drive) -> tuple[list[Photograph], list[RigCamera], int]:
-    """Return the photographs of the keyframes, their cameras, and how many have no pose."""
+    """Return the photographs of the keyframes, their cameras, and the number without a pose."""
     photographs: list[Photograph] = []
     cameras: dict[str, tuple[RigCamera, str]] = {}
     without = 0
@@ -200,8 +200,8 @@ def _camera(drive: _Drive, row: Row) -> RigCamera:
     K = finite_numbers(flat, path, what, 9).reshape(3, 3)
     if K[0, 0] <= 0 or K[1, 1] <= 0 or not np.allclose(K[2], [0, 0, 1]):
         raise broken(f"{path}:", f"{what} is not a camera matrix")
-    # The devkit draws K's products over pixels whose centres lie at integers (`imshow`), and asks
-    # for 0 to width - 1; ours are at +0.5.
+    # The devkit draws projections over pixels with centres at integers (`imshow`), and accepts 0 to
+    # width - 1; centres are at +0.5 here.
     K[:2, 2] += 0.5
     what, sides = f"the size of {row['filename']}", (row.get("width"), row.get("height"))
     width, height = finite_numbers(sides, drive.path("sample_data"), what)
@@ -209,7 +209,7 @@ def _camera(drive: _Drive, row: Row) -> RigCamera:
 
 
 def _sweeps(drive: _Drive) -> tuple[list[Sweep], int]:
-    """Return laser sweeps, and how many of the keyframes' are missing."""
+    """Return LiDAR sweeps, and the number of missing sweeps of keyframes."""
     sweeps, absent = [], 0
     for row in drive.of("lidar"):
         path, pose = drive.file(row), drive.pose(row)
@@ -226,23 +226,22 @@ def _read_sweep(path: Path, pose: Pose, end: float) -> SweepPoints:
     if values.size % POINT or path.stat().st_size % values.itemsize:
         raise broken(path, "is not a LiDAR sweep: float32 x y z intensity ring")
     local = values.reshape(-1, POINT)[:, :3].astype(np.float64)
-    # Points are already moved to where the car was at the end; the time that they were measured
-    # follows from their order.
+    # Points are already in the car's axes at the end of the turn; their order gives their times.
     times = end - TURN_S * (1 - np.arange(len(local)) / max(1, len(local)))
     return SweepPoints(local @ pose[:3, :3].T + pose[:3, 3], times)
 
 
 def _objects(drive: _Drive) -> tuple[tuple[TrackedObject, ...], list[str]]:
-    """Return what was followed, and notes."""
+    """Return the tracked objects, and notes."""
     path = drive.path("sample_annotation")
     needs: Kinds = {**PLACED, "size": list, "sample_token": str}
     there = path.is_file()
     rows = drive.rows("sample_annotation", needs, "sample_token", drive.moments) if there else []
     if not rows:
         why = "holds no box of this drive" if there else "is missing"
-        return (), [f"{path.name} {why}: what moves is not known."]
+        return (), [f"{path.name} {why}: moving objects are not known."]
     instances = {row.get("instance_token") for row in rows}
-    of = drive.by_token("instance", {"category_token": str}, instances)
+    known = drive.by_token("instance", {"category_token": str}, instances)
     categories, attributes = (drive.by_token(t, {"name": str}) for t in ("category", "attribute"))
     scanners = {}
     for row in drive.of("lidar"):
@@ -251,10 +250,10 @@ def _objects(drive: _Drive) -> tuple[tuple[TrackedObject, ...], list[str]]:
     boxes, untracked = [], 0
     for row in rows:
         name = row.get("instance_token")
-        if name not in of:
+        if name not in known:
             untracked += 1
             continue
-        label = categories.get(of[name]["category_token"], {"name": "unknown"})["name"]
+        label = categories.get(known[name]["category_token"], {"name": "unknown"})["name"]
         pose = _pose({"token": f"a box of {name}", **row}, path)
         size = finite_numbers(row["size"], path, f"the size of {name}", 3)
         width, length, height = size.tolist()
@@ -263,7 +262,7 @@ def _objects(drive: _Drive) -> tuple[tuple[TrackedObject, ...], list[str]]:
         sample = row["sample_token"]
         time = drive.stamps[sample]
         if sample in scanners:
-            # Annotators saw things where the scanner met them, not where they are at the stamp.
+            # Boxes are drawn at the place where the scanner met the object, not at the time stamp.
             to_scanner = scanners[sample]
             x, y, _ = to_scanner[:3, :3] @ pose[:3, 3] + to_scanner[:3, 3]
             time -= TURN_S * float(1 - turned(np.arctan2(y, x), TURN_START))
@@ -275,9 +274,9 @@ def _objects(drive: _Drive) -> tuple[tuple[TrackedObject, ...], list[str]]:
 
 
 def _moving(attributes: Sequence[str]) -> bool | None:
-    """Return what attributes say of a moment: `vehicle.moving`, `pedestrian.standing`, ...
+    """Return whether an object moves by its attributes, such as `vehicle.moving`, or None.
 
-    Those of cycles tell of a rider only.
+    Attributes of cycles only state whether there is a rider.
     """
     states = [name for name in attributes if name.startswith(("vehicle.", "pedestrian."))]
     return any(name.endswith(".moving") for name in states) if states else None

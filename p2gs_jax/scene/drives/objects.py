@@ -1,4 +1,4 @@
-"""Tracked things: their tracks, where they are in a view, and which pixels their boxes cover."""
+"""Tracked objects: their tracks, their poses in a view, and the pixels that their boxes cover."""
 
 from __future__ import annotations
 
@@ -17,12 +17,11 @@ from p2gs_jax.types import Placement, Scene, TrackedObject, View
 
 # A rigid pose as a matrix.
 Pose = Float64[np.ndarray, "4 4"]
-# Boxes of parked cars jump by a few decimetres from frame to frame; what gets further moves.
+# Boxes of parked cars jump by a few decimetres; an object that gets farther than this moves.
 STANDS_WITHIN_M = 1.0
 # Boxes are cut off this near to the camera, scene units.
 NEAR = 0.1
-# Boxes are widened by this much to every side: they are drawn tightly, and a photograph is not
-# taken in one moment. Scene units.
+# Boxes are widened by this much on every side, scene units: they are tight, and an exposure lasts.
 MARGIN = 0.15
 
 _SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
@@ -31,14 +30,14 @@ _EDGES = [(a, a | bit) for bit in (4, 2, 1) for a in range(8) if not a & bit]
 
 
 class Box(NamedTuple):
-    """One box around a thing, at one time.
+    """One bounding box of an object, at one time.
 
     Attributes:
-        track: name of the thing.
+        track: name of the object.
         size: length (x), width (y), height (z), metres.
         time: seconds.
         pose: box to world, the origin in the middle of the box.
-        moving: what the set says of this moment, or None.
+        moving: whether the object moves at this time, or None if the data set does not state it.
     """
 
     track: str
@@ -50,26 +49,26 @@ class Box(NamedTuple):
 
 
 def tracks(boxes: Iterable[Box]) -> tuple[TrackedObject, ...]:
-    """Return the things that boxes belong to, in the order of their first boxes.
+    """Return the objects that boxes belong to, in the order of their first boxes.
 
-    Boxes may come in any order of time; of those of one time the first counts. The size of a thing
-    is the median of its boxes. It moves if it does in one of them; where the set says nothing, if
-    it gets further than a metre from where it was first.
+    Boxes may come in any order of time; the first of several boxes at one time counts. The size of
+    an object is the median of its boxes. It moves if one of its boxes does. If the data set does
+    not state this, an object moves if it gets more than 1 m away from its first place.
     """
-    of: dict[str, list[Box]] = {}
+    boxes_of: dict[str, list[Box]] = {}
     for box in boxes:
-        of.setdefault(box.track, []).append(box)
-    things = []
-    for name, own in of.items():
-        times, rows = np.unique([box.time for box in own], return_index=True)
-        poses = np.stack([own[row].pose for row in rows])
-        told = [box.moving for box in own if box.moving is not None]
-        away = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1).max()
-        moving = any(told) if told else bool(away > STANDS_WITHIN_M)
-        length, width, height = np.median([box.size for box in own], axis=0).tolist()
+        boxes_of.setdefault(box.track, []).append(box)
+    objects = []
+    for name, its_boxes in boxes_of.items():
+        times, rows = np.unique([box.time for box in its_boxes], return_index=True)
+        poses = np.stack([its_boxes[row].pose for row in rows])
+        states = [box.moving for box in its_boxes if box.moving is not None]
+        farthest = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1).max()
+        moving = any(states) if states else bool(farthest > STANDS_WITHIN_M)
+        length, width, height = np.median([box.size for box in its_boxes], axis=0).tolist()
         size = (length, width, height)
-        things.append(TrackedObject(name, own[0].label, size, times, poses, moving))
-    return tuple(things)
+        objects.append(TrackedObject(name, its_boxes[0].label, size, times, poses, moving))
+    return tuple(objects)
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,7 @@ class MovingObjects:
     """The objects that Gaussians belong to, in the order of `Population.owner`.
 
     Attributes:
-        middle: of the drive, where Gaussians vibrate: the zero of `Placement.time`, seconds.
+        middle: middle of the drive, seconds, if Gaussians vibrate: the zero of `Placement.time`.
     """
 
     objects: tuple[TrackedObject, ...]
@@ -105,7 +104,7 @@ class MovingObjects:
 
 
 def middle_time(scene: Scene) -> float:
-    """Return the time of the middle one of the training views that have one, seconds."""
+    """Return the median time of the training views that have a time, seconds."""
     times = sorted(view.time for view in scene.training_views if view.time is not None)
     return times[len(times) // 2]
 
@@ -115,8 +114,8 @@ def object_mask(
 ) -> Bool[np.ndarray, "h w"]:
     """Return which pixels of a view the boxes of moving objects cover at its time.
 
-    Nothing is covered in a view without a time. The mask has the size that is asked for; boxes are
-    widened by the margin, scene units, to every side.
+    Nothing is covered in a view without a time. `width` and `height` are the mask's; boxes are
+    widened by the margin, scene units, on every side.
     """
     return painted(outlines(view, objects, margin), view, width, height)
 
@@ -124,7 +123,7 @@ def object_mask(
 def outlines(
     view: View, objects: Sequence[TrackedObject], margin: float = MARGIN
 ) -> list[Float[np.ndarray, "_ 2"]]:
-    """Return the convex outlines of the boxes in a view, pixels at its full size; see above."""
+    """Return the convex outlines of moving objects' boxes in a view, pixels at its full size."""
     if view.time is None:
         return []
     found = []
@@ -146,14 +145,14 @@ def outline_of(
 ) -> Float[np.ndarray, "c 2"] | None:
     """Return the convex outline of a box (`pose`: box to world), pixels of the view at full size.
 
-    None: the image shows nothing of it.
+    None: the box is outside the image.
     """
     corners = _SIGNS * (np.asarray(size) / 2 + margin)
     camera = view.viewmat.astype(np.float64) @ pose
     points = corners @ camera[:3, :3].T + camera[:3, 3]
     z = points[:, 2]
     ends = [(points[a], points[b]) for a, b in _EDGES if (z[a] < NEAR) != (z[b] < NEAR)]
-    # Where edges meet the near plane.
+    # Edges are cut at the near plane.
     cut = [a + (NEAR - a[2]) / (b[2] - a[2]) * (b - a) for a, b in ends]
     points = np.concatenate([points[z >= NEAR], *(c[None] for c in cut)])
     if len(points) < 3:

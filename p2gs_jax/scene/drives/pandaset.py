@@ -8,9 +8,9 @@
 
 Schema: https://github.com/scaleapi/pandaset-devkit (README.md, python/pandaset/annotations.py).
 
-Measured on sequence 002: `timestamps.json` is when the spinning scanner's turn ends; it looks
-backwards then, and turned clockwise for 0.1 s. Cameras are triggered as it passes them. The
-boxes of a frame are therefore not of one moment: each is of the time when the scanner passed it.
+Sequence 002 shows that `timestamps.json` holds the ends of the spinning scanner's turns. The
+scanner then looks backwards, after a clockwise turn of 0.1 s. Cameras trigger when it passes them.
+The boxes of a frame thus have different times: each has the time at which the scanner passed it.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ from p2gs_jax.scene.rigid import from_quaternion, inverse
 from p2gs_jax.types import TrackedObject
 
 MARKER = "camera/*/intrinsics.json"
-# Size of the photographs as published, which its files do not say.
+# The size of the published photographs, which no file states.
 CALIBRATED = (1920, 1080)
 PICKLES = (".pkl.gz", ".pkl")
-# Seconds a turn of the spinning scanner.
+# The time of a turn of the spinning scanner, seconds.
 TURN_S = 0.1
-# In `cuboids.sensor_id`: a second box of a moving thing, drawn on the forward scanner's points.
+# This `cuboids.sensor_id` marks a second box of a moving object, from the forward scanner's points.
 FORWARD = 1
-ALONE = "moving things have boxes of the forward scanner only: times are known to 0.1 s."
+ALONE = "moving objects have boxes of the forward scanner only: times are known to 0.1 s."
 POSITION = ("position.x", "position.y", "position.z")
-# Length, width, height: the set's boxes are long in y.
+# Length, width, height: boxes in the files are long in y.
 SIZE = ("dimensions.y", "dimensions.x", "dimensions.z")
 
 
@@ -58,9 +58,9 @@ def read_pandaset(root: Path, cfg: DataConfig) -> Recording:
             notes.append(f"{folder.name} has no photographs: it is left out.")
             continue
         cameras.append(_camera(folder, next(iter(files.values()))))
-        taken, without = _photographs(folder, files)
-        photographs += taken
-        notes += tables.counted(without, f"photographs of {folder.name} have no pose or time.")
+        found, unplaced = _photographs(folder, files)
+        photographs += found
+        notes += tables.counted(unplaced, f"photographs of {folder.name} have no pose or time.")
     sweeps, sweep_notes = _sweeps(root)
     objects, box_notes = _objects(root)
     notes += [*sweep_notes, *box_notes]
@@ -69,29 +69,29 @@ def read_pandaset(root: Path, cfg: DataConfig) -> Recording:
 
 def _camera(folder: Path, photograph: Path) -> RigCamera:
     path = folder / "intrinsics.json"
-    held = read_json(path, tables.UNPACK)
+    lens = read_json(path, tables.UNPACK)
     try:
-        values = (held[name] for name in ("fx", "fy", "cx", "cy"))
+        values = (lens[name] for name in ("fx", "fy", "cx", "cy"))
         fx, fy, cx, cy = tables.finite_numbers(values, path, "fx fy cx cy").tolist()
     except (KeyError, TypeError):
         raise broken(path, "lacks fx, fy, cx or cy") from None
     size = image_size(photograph)
     if np.abs([cx / CALIBRATED[0] - 0.5, cy / CALIBRATED[1] - 0.5]).max() < 0.1:
         size = CALIBRATED
-    # The devkit multiplies by K and says nothing of pixel centres. K comes from a calibration
-    # with OpenCV's conventions, where centres lie at integers; ours are at +0.5.
+    # The devkit multiplies by K and does not define pixel centres. K comes from a calibration with
+    # OpenCV's conventions, where centres lie at integers; here they are at +0.5.
     return RigCamera(folder.name, intrinsics(fx, fy, cx + 0.5, cy + 0.5), *size)
 
 
 def _photographs(folder: Path, files: dict[int, Path]) -> tuple[list[Photograph], int]:
-    """Return the photographs of a camera, and how many have no pose or time."""
+    """Return the photographs of a camera, and the number without a pose or time."""
     poses = _read_list(folder / "poses.json")
     times = _read_list(folder / "timestamps.json")
     count = min(len(poses), len(times))
-    photographs, without = [], 0
+    photographs, unplaced = [], 0
     for frame in sorted({*files, *range(count)}):
         if frame >= count or None in (poses[frame], times[frame]):
-            without += 1
+            unplaced += 1
             continue
         time = tables.finite_numbers([times[frame]], folder / "timestamps.json", f"entry {frame}")[
             0
@@ -99,24 +99,24 @@ def _photographs(folder: Path, files: dict[int, Path]) -> tuple[list[Photograph]
         pose = _pose(poses[frame], folder / "poses.json", frame)
         path = files.get(frame, folder / f"{frame:02d}.jpg")
         photographs.append(Photograph(folder.name, frame, float(time), path, pose))
-    return photographs, without
+    return photographs, unplaced
 
 
 def _read_list(path: Path) -> list[Any]:
-    held = read_json(path, tables.UNPACK)
-    if not isinstance(held, list):
-        raise broken(path, "should hold a list with an entry for each frame")
-    return held
+    entries = read_json(path, tables.UNPACK)
+    if not isinstance(entries, list):
+        raise broken(path, "is not a list with an entry for each frame")
+    return entries
 
 
-def _pose(held: Any, path: Path, frame: int) -> Pose:
-    what = f"frame {frame}"
+def _pose(entry: Any, path: Path, frame: int) -> Pose:
+    frame_name = f"frame {frame}"
     try:
-        wxyz = tables.finite_numbers((held["heading"][k] for k in "wxyz"), path, what)
-        position = tables.finite_numbers((held["position"][k] for k in "xyz"), path, what)
+        wxyz = tables.finite_numbers((entry["heading"][k] for k in "wxyz"), path, frame_name)
+        position = tables.finite_numbers((entry["position"][k] for k in "xyz"), path, frame_name)
     except (KeyError, TypeError):
-        raise broken(f"{path}:", f"the pose of {what} lacks position or heading") from None
-    return from_quaternion(wxyz, position, path, what)
+        raise broken(f"{path}:", f"the pose of {frame_name} lacks position or heading") from None
+    return from_quaternion(wxyz, position, path, frame_name)
 
 
 def _sweep_times(root: Path) -> Float64[np.ndarray, " k"]:
@@ -145,7 +145,7 @@ def _read_sweep(path: Path) -> SweepPoints:
 
 
 class _Cuboid(NamedTuple):
-    """A box, whether it is the forward scanner's, and the name of its thing's other track."""
+    """A box, whether it is the forward scanner's, and the name of its object's other track."""
 
     box: Box
     forward: bool
@@ -153,43 +153,43 @@ class _Cuboid(NamedTuple):
 
 
 def _objects(root: Path) -> tuple[tuple[TrackedObject, ...], list[str]]:
-    """Return what was followed through the sequence, once each, and notes."""
+    """Return the tracked objects of the sequence, each once, and notes."""
     files = tables.numbered(root / "annotations" / "cuboids", PICKLES)
     if not files:
-        return (), ["There are no boxes of moving things."]
+        return (), ["There are no boxes of moving objects."]
     times = _sweep_times(root)
     path = root / "lidar" / "poses.json"
     scanner = _read_list(path)
     known = min(len(times), len(scanner))
     used = [frame for frame in files if frame < known]
-    of: dict[str, list[_Cuboid]] = {}
+    by_track: dict[str, list[_Cuboid]] = {}
     for frame in used:
         for cuboid in _cuboids(files[frame], times[frame], _pose(scanner[frame], path, frame)):
-            of.setdefault(cuboid.box.track, []).append(cuboid)
-    nameless = len(of.pop("", []))
-    doubled = _doubled(of)
-    alone = [name for name, own in of.items() if own[0].forward and name not in doubled]
+            by_track.setdefault(cuboid.box.track, []).append(cuboid)
+    nameless = len(by_track.pop("", []))
+    doubled = _doubled(by_track)
+    forward_only = [name for name, c in by_track.items() if c[0].forward and name not in doubled]
     notes = [
         *tables.counted(known - len(used), f"of {known} frames have no boxes."),
-        *tables.counted(len(files) - len(used), "tables of boxes are of frames without a time."),
+        *tables.counted(len(files) - len(used), "tables of boxes have frames without a time."),
         *tables.counted(nameless, "boxes belong to no track: they are left out."),
-        *tables.counted(len(alone), ALONE),
+        *tables.counted(len(forward_only), ALONE),
     ]
-    return tracks(c.box for name in of if name not in doubled for c in of[name]), notes
+    return tracks(c.box for name in by_track if name not in doubled for c in by_track[name]), notes
 
 
 def _cuboids(path: Path, time: float, scanner: Pose) -> Iterator[_Cuboid]:
-    """Yield the boxes of a frame, whose turn of the scanner ended at a time, seconds."""
+    """Yield the boxes of a frame; `time` is the end of its turn of the scanner, seconds."""
     table = tables.read_pickled(path)
     position, size = table.stacked(POSITION), table.stacked(SIZE)
-    # 0 looks along y, counterclockwise; our boxes look along x.
+    # Angle 0 is along y and angles are counterclockwise; `Box` looks along x.
     yaw = table.numbers("yaw") + np.pi / 2
     stands = table.numbers("stationary") > 0
     none = np.full(len(yaw), -1)
     sensor = table.get("cuboids.sensor_id", none)
     sibling = table.get("cuboids.sibling_id", none)
     if not np.isfinite(np.column_stack([position, size, yaw])).all() or (size <= 0).any():
-        raise broken(f"{path}:", "boxes should have finite positions and positive sizes")
+        raise broken(f"{path}:", "boxes do not all have finite positions and positive sizes")
     # The scanner's axes are x to the right, y forward.
     local = (position - scanner[:3, 3]) @ inverse(scanner)[:3, :3].T
     azimuth = np.arctan2(local[:, 1], local[:, 0])
@@ -197,24 +197,24 @@ def _cuboids(path: Path, time: float, scanner: Pose) -> Iterator[_Cuboid]:
     for row, (name, label) in enumerate(zip(table["uuid"], table["label"], strict=True)):
         pose, (c, s) = np.eye(4), (np.cos(yaw[row]), np.sin(yaw[row]))
         pose[:2, :2], pose[:3, 3] = [[c, -s], [s, c]], position[row]
-        # `stationary` is of the whole sequence; what is not may still wait all the time.
+        # `stationary` holds for the whole sequence; other objects may also stand all the time.
         moving = False if stands[row] else None
         name = name if isinstance(name, str) else ""
         box = Box(name, str(label), tuple(size[row]), float(passed[row]), pose, moving)
         yield _Cuboid(box, sensor[row] == FORWARD, str(sibling[row]))
 
 
-def _doubled(of: dict[str, list[_Cuboid]]) -> set[str]:
-    """Return the forward scanner's tracks whose thing has another one.
+def _doubled(cuboids_of: dict[str, list[_Cuboid]]) -> set[str]:
+    """Return the forward scanner's tracks whose object has another track.
 
-    Either may name its sibling; of some names the last letters are missing.
+    Either track may name the other; some names lack their last letters.
     """
-    others = {name for name, own in of.items() if not own[0].forward}
-    told = {cuboid.sibling for name in others for cuboid in of[name]}
+    others = {name for name, cuboids in cuboids_of.items() if not cuboids[0].forward}
+    named_siblings = {cuboid.sibling for name in others for cuboid in cuboids_of[name]}
     doubled = set()
-    for name in of.keys() - others:
-        siblings = {cuboid.sibling for cuboid in of[name]}
+    for name in cuboids_of.keys() - others:
+        siblings = {cuboid.sibling for cuboid in cuboids_of[name]}
         named = any(o.startswith(s) for s in siblings if len(s) > 8 for o in others)
-        if named or name in told:
+        if named or name in named_siblings:
             doubled.add(name)
     return doubled

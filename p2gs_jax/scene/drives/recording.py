@@ -1,21 +1,21 @@
 """The contract between readers of driving data sets and the rest of the program.
 
-A reader is a module, listed in `FORMATS`: by `MARKER`, the name of a file, a folder with a drive is
-recognised; `read_NAME(root, cfg)` reads the tables and returns a `Recording`, but decodes neither
-photographs nor laser points. `root` is the folder of a drive, or of several of which `cfg.drive`
-names one. What a reader promises:
+A reader is a module, listed in `FORMATS`. A folder is recognised by a file of the name `MARKER`.
+`read_NAME(root, cfg)` reads the tables and returns a `Recording`, but decodes neither photographs
+nor LiDAR points. `root` is the folder of one drive, or of several, and `cfg.drive` names one of
+them. A reader promises:
 
 - The world is right-handed and metric; its origin may be anywhere. One clock, in seconds, serves
   photographs, laser points and tracks.
-- A photograph has the time and the pose of its own camera; those of one moment share a frame. K has
-  pixel centres at +0.5. Names of cameras are names of folders.
+- A photograph has the time and the pose of its camera. Photographs of one moment share a frame. K
+  has pixel centres at +0.5. Names of cameras are names of folders.
 - Boxes look along x, y is left, z up, and their origin is the middle. A box has the time at which
-  the scanner passed it, not that of its frame; times of a track rise.
-- Sweeps are in the order of time. Each point lies where it was at its own time.
-- What is incomplete is left out, and a note counts it. What is broken raises UserError with the
-  name of the file, for a sweep when it is read.
+  the scanner passed it, not the time of its frame. The times of a track rise.
+- LiDAR sweeps are in the order of time. Each point lies where it was when it was measured.
+- Incomplete entries are left out, and a note counts them. A broken file raises UserError with its
+  name; a sweep does so when it is read.
 
-tests/scene/drives/test_readers.py asks all of this of every reader.
+tests/scene/drives/test_readers.py tests all of this for every reader.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ _AROUND = re.compile(r"(?:^|_)(?:camera|cam|ring)(?=_|$)")
 
 @dataclass(frozen=True)
 class RigCamera:
-    """One camera of a car, as the data set names it; sizes are those of its calibration, pixels.
+    """One camera of a car, with the data set's name and the calibrated size, pixels.
 
     Attributes:
         K: intrinsics in pixels of the undistorted image, pixel centres at +0.5.
-        distortion: what to remove on load, or None.
+        distortion: lens distortion that is removed on load, or None.
     """
 
     name: str
@@ -53,27 +53,27 @@ class RigCamera:
 
 
 class Trajectory(NamedTuple):
-    """Where something was at some times: seconds, rising, and poses to the world."""
+    """Poses to the world at rising times, seconds."""
 
     times: Float64[np.ndarray, " t"]
     poses: Float64[np.ndarray, "t 4 4"]
 
     def at(self, times: Float64[np.ndarray, " n"]):
-        """Return poses [n 4 4] at times, and which of these [n] are covered; NaN never is."""
+        """Return poses [n 4 4] at times, and which times [n] are covered; NaN never is."""
         poses, covered = interpolated(self.times, self.poses, np.nan_to_num(times))
         return poses, covered & np.isfinite(times)
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """One photograph and where its camera was.
+    """One photograph and the pose of its camera.
 
     Attributes:
         frame: number of the moment in the drive, the same for all cameras.
         time: seconds.
-        path: its file; an embedded photograph has none, and gets this name.
+        path: the file, or the name under which an embedded photograph is written.
         pose: camera to world at `time`, OpenCV axes.
-        embedded: returns the bytes of a photograph that has no file; else None.
+        embedded: returns the bytes of an embedded photograph; None: there is a file.
     """
 
     camera: str
@@ -85,11 +85,11 @@ class Photograph:
 
 
 class SweepPoints(NamedTuple):
-    """One sweep of a laser scanner.
+    """The points of one LiDAR sweep.
 
     Attributes:
-        points: world coordinates, each at its own time; NaN and inf are as in the file.
-        times: seconds; the same for all points where the set gives no more.
+        points: world coordinates, each at its measurement time; NaN and inf are as in the file.
+        times: seconds, the same for all points if the data set states one time a sweep.
     """
 
     points: Float64[np.ndarray, "n 3"]
@@ -98,7 +98,7 @@ class SweepPoints(NamedTuple):
 
 @dataclass(frozen=True)
 class Sweep:
-    """A sweep, at a time, seconds; `read` raises UserError where its file is broken."""
+    """A LiDAR sweep at a time, seconds; `read` raises UserError if its file is broken."""
 
     frame: int
     time: float
@@ -110,12 +110,12 @@ class Recording:
     """One drive.
 
     Attributes:
-        root: folder that the user named, or that of the chosen drive in it.
+        root: folder that the user named, or the folder of the chosen drive in it.
         format: name of the reader (`DataConfig.format`).
         cameras: all cameras of the car that have photographs.
-        photographs: in any order; those without a pose are left out and counted in `notes`.
+        photographs: in any order; photographs without a pose are counted in `notes` only.
         sweeps: from all scanners, in the order of their times.
-        notes: sentences: what was left out, and what the user should know.
+        notes: sentences for the user, for example about entries that were left out.
     """
 
     root: Path

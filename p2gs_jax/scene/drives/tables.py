@@ -1,8 +1,8 @@
 """Files of driving data sets: folders of drives, numbers, tables in JSON, Arrow and pickles.
 
-A pickle names functions and calls them. Here every name that a table of numbers and texts may hold
-stands for an inert record of what it was called with; other names are refused. What the records
-mean is worked out afterwards, for the layouts that pandas has written since 0.14.
+A pickle names functions and calls them. Here each name in a table of numbers and texts becomes a
+passive record with the arguments of the call, and other names are refused. The records are then
+decoded, for all layouts since pandas 0.14.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ Kinds = Mapping[str, type | tuple[type, ...]]
 
 UNPACK = "unpack that part of the data set there as well"
 _DECODER = json.JSONDecoder()
-# Rows of large JSON tables take less, bytes.
+# The longest row of a large JSON table, bytes.
 _LONGEST_ROW = 2**14
-# Modules moved between versions of pandas and numpy.
+# The pattern covers the modules of old and new versions of pandas and numpy.
 _IN_TABLES = re.compile(
     r"pandas(\.\w+)*\.(DataFrame|BlockManager|_unpickle_block|_new_Index|(Range|Int64)?Index)"
     r"|numpy\.(ndarray|dtype|_?core\.multiarray\._reconstruct|_?core\.numeric\._frombuffer)"
@@ -39,30 +39,30 @@ _IN_TABLES = re.compile(
 )
 # A message lists at most this many drives.
 LISTED = 5
-# A sweep of PandaSet takes 10 MB.
+# The largest unpacked table, bytes: a sweep of PandaSet has 10 MB.
 _MOST_BYTES = 2**28
 
 
 def counted(count: int, words: str) -> list[str]:
-    """Return the note `COUNT WORDS`, or none where nothing was counted."""
+    """Return the note `COUNT WORDS`, or no note if the count is 0."""
     return [f"{count} {words}"] if count else []
 
 
 def drive_folder(root: Path, asked: str | None, marker: str) -> Path:
-    """Return the folder of a drive: `root`, or the one below it that is asked for.
+    """Return the folder of a drive: `root`, or the subfolder with the name `asked`.
 
-    The folder of a drive is where the glob `marker` finds something. UserError: see `chosen_drive`.
+    The glob `marker` finds a file in the folder of a drive. UserError: see `chosen_drive`.
     """
     if any(root.glob(marker)):
         return root
-    there = {path.relative_to(root).parts[0] for path in root.glob(f"*/{marker}")}
-    return root / chosen_drive(asked, sorted(there), root)
+    drives = {path.relative_to(root).parts[0] for path in root.glob(f"*/{marker}")}
+    return root / chosen_drive(asked, sorted(drives), root)
 
 
 def chosen_drive(asked: str | None, there: Sequence[str], root: Path) -> str:
-    """Return the drive among those in `root` whose name was asked for, or how that begins.
+    """Return the drive in `root` whose name is, or begins with, `asked`; None: the only drive.
 
-    Nothing asked: the only one. UserError: none has this name, or several could be meant.
+    UserError: no drive has this name, or several begin with it.
     """
     fits = [name for name in there if asked is None or name.startswith(asked)]
     fits = [name for name in fits if name == asked] or fits
@@ -80,7 +80,7 @@ def chosen_drive(asked: str | None, there: Sequence[str], root: Path) -> str:
 
 
 def missing_file(path: Path) -> UserError:
-    """Return the error for a file that a drive needs and that is not there."""
+    """Return the error for a missing file that a drive needs."""
     return UserError(f"{path} does not exist", fix=UNPACK)
 
 
@@ -89,7 +89,7 @@ def finite_numbers(
 ) -> Float64[np.ndarray, " n"]:
     """Return numbers, or their texts, as an array.
 
-    UserError: one (of `what`) is not finite, or there are not as many as `count` says.
+    `what` names them in the message. UserError: a number is not finite, or there are not `count`.
     """
     try:
         numbers = np.array([float(value) for value in values])
@@ -102,9 +102,9 @@ def finite_numbers(
 
 
 def numbered(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
-    """Return the files of a folder whose names are numbers before a suffix, by these, rising.
+    """Return the files of a folder whose names are a number and a suffix, by rising number.
 
-    The folder may be absent. Suffixes have the dot (".pkl.gz"); the first one that fits counts.
+    The folder may be absent. Suffixes include the dot (".pkl.gz"); the first one that fits counts.
     """
     found: dict[int, Path] = {}
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
@@ -116,15 +116,15 @@ def numbered(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
 
 
 def read_rows(path: Path, needs: Kinds, column: str = "", among: Container[Any] = ()) -> list[Row]:
-    """Return rows of a large JSON list of objects; only those wanted are decoded.
+    """Return rows of a large JSON list of objects; only the wanted rows are decoded.
 
-    Tables of all of nuScenes' drives are millions of rows; those of one drive are found in the
-    text, which is not held in memory. Rows should hold no objects.
+    The tables of all nuScenes drives have millions of rows. The rows of one drive are found in the
+    text, which is not held in memory. Rows must not contain objects.
 
     Args:
         path: the table.
-        needs: columns that every row returned must have, and their types.
-        column: only rows whose value in it, a text, is `among` these; "": all rows.
+        needs: columns that every returned row must have, and their types.
+        column: only rows whose text in this column is in `among` are returned; "": all rows.
         among: values.
 
     Raises:
@@ -152,7 +152,7 @@ def read_rows(path: Path, needs: Kinds, column: str = "", among: Container[Any] 
 
 
 def _found(text: mmap.mmap, column: str, among: Container[Any]) -> Iterator[Row]:
-    """Yield the rows that hold one of the values; rows are taken to hold no objects."""
+    """Yield the rows with one of the values; rows must not contain objects."""
     for match in re.finditer(rf'"{re.escape(column)}"\s*:\s*"([^"]*)"'.encode(), text):
         if match[1].decode() in among:
             start = text.rfind(b"{", 0, match.start())
@@ -161,9 +161,9 @@ def _found(text: mmap.mmap, column: str, among: Container[Any]) -> Iterator[Row]
 
 
 class Columns(dict[str, np.ndarray]):
-    """Columns of a table by name; UserError where one that is asked for is not there.
+    """Columns of a table by name; UserError: a column is missing.
 
-    What is not a number is an object, None where there is nothing.
+    Values that are not numbers are objects, and empty cells are None.
     """
 
     def __init__(self, columns: Mapping[str, np.ndarray], path: Path):
@@ -176,22 +176,22 @@ class Columns(dict[str, np.ndarray]):
     def numbers(self, name: str) -> Float64[np.ndarray, " n"]:
         """Return a column of numbers; UserError: it holds something else."""
         if self[name].dtype.kind not in "biuf":
-            raise broken(f"{self.path}:", f"its column {name!r} should hold numbers")
+            raise broken(f"{self.path}:", f"the column {name!r} does not hold numbers")
         return self[name].astype(np.float64)
 
     def stacked(self, names: Iterable[str]) -> Float64[np.ndarray, "n k"]:
-        """Return columns of numbers side by side; UserError: one holds something else."""
+        """Return columns of numbers side by side; UserError: a column holds something else."""
         return np.stack([self.numbers(name) for name in names], 1)
 
     def whole(self, name: str) -> Int64[np.ndarray, " n"]:
         """Return a column of whole numbers; UserError: it holds others, or has gaps."""
         if self[name].dtype.kind not in "iu":
-            raise broken(f"{self.path}:", f"{name} should be whole numbers, without gaps")
+            raise broken(f"{self.path}:", f"{name} does not hold whole numbers without gaps")
         return self[name].astype(np.int64)
 
 
 def read_feather(path: Path, names: Sequence[str]) -> Columns:
-    """Return columns of a Feather file; UserError: one is not there, or the file is broken."""
+    """Return columns of a Feather file; UserError: a column is missing, or the file is broken."""
     with _reading(path):
         from pyarrow import feather
 
@@ -199,7 +199,7 @@ def read_feather(path: Path, names: Sequence[str]) -> Columns:
 
 
 class ParquetTable:
-    """A Parquet file: short columns are read whole, long ones a group of rows at a time."""
+    """A Parquet file: short columns are read whole, long ones by groups of rows."""
 
     def __init__(self, path: Path):
         """Open it; UserError: pyarrow or the file is missing, or the file is broken."""
@@ -214,15 +214,15 @@ class ParquetTable:
         self._held: tuple[int, Sequence[str], Any] | None = None
 
     def columns(self, names: Sequence[str]) -> Columns:
-        """Return columns by name; UserError: one is not there, or the file is broken."""
+        """Return columns by name; UserError: a column is missing, or the file is broken."""
         with _reading(self.path):
             return _arrow_columns(self._file.read(columns=list(names)), names, self.path)
 
     def cells(self, row: int, names: Sequence[str]) -> list[Any]:
-        """Return cells of one row: lists of numbers as arrays, texts and bytes as they are.
+        """Return cells of one row: lists of numbers as arrays, texts and bytes unchanged.
 
-        The group of rows that was read last is kept in memory. UserError: a column is not there, or
-        the file is broken.
+        The last group of rows stays in memory. UserError: a column is missing, or the file is
+        broken.
         """
         group = int(np.searchsorted(self._ends, row, side="right"))
         if self._held is None or self._held[:2] != (group, names):
@@ -238,7 +238,7 @@ class ParquetTable:
 
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
-    """Turn what goes wrong with pyarrow into errors that name the file."""
+    """Turn the errors of pyarrow into errors that name the file."""
     try:
         import pyarrow
     except ImportError:
@@ -254,15 +254,15 @@ def _reading(path: Path) -> Iterator[None]:
 
 
 def _arrow_columns(table: Any, names: Sequence[str], path: Path) -> Columns:
-    there = {name: table[name] for name in names if name in table.column_names}
-    # What is nowhere given would come as NaN.
-    nothing = np.full(len(table), None)
-    values = {n: nothing if str(c.type) == "null" else c.to_numpy() for n, c in there.items()}
+    found = {name: table[name] for name in names if name in table.column_names}
+    # A column without any value would come as NaN.
+    empty = np.full(len(table), None)
+    values = {n: empty if str(c.type) == "null" else c.to_numpy() for n, c in found.items()}
     return Columns(values, path)
 
 
 class _Record:
-    """What one name was called with, and the state it was given."""
+    """The arguments with which a pickle calls one name, and the state that it sets."""
 
     name = ""
     args: tuple
@@ -301,7 +301,7 @@ def read_pickled(path: Path) -> Columns:
         return Columns(_columns(_Records(io.BytesIO(content)).load()), path)
     except FileNotFoundError:
         raise missing_file(path) from None
-    # A damaged pickle ends in whatever its bytes happen to ask for.
+    # A damaged pickle may raise any error.
     except Exception as error:
         fix = "get the file again; tables are pickled pandas DataFrames of numbers and texts"
         raise broken(path, f"is not a table that can be read: {error}", fix) from error
@@ -316,8 +316,8 @@ def _columns(table: Any) -> dict[str, np.ndarray]:
         blocks = [block.args[:2] for block in blocks]
     else:
         # Until pandas 1.2: the last entry of the state holds what versions from 0.14.1 on read.
-        held = manager.state[3]["0.14.1"]
-        blocks, axes = [(b["values"], b["mgr_locs"]) for b in held["blocks"]], held["axes"]
+        state = manager.state[3]["0.14.1"]
+        blocks, axes = [(b["values"], b["mgr_locs"]) for b in state["blocks"]], state["axes"]
     names, rows = map(_array, axes)
     labels = [str(name) for name in names]
     columns: dict[str, np.ndarray] = {}
@@ -329,23 +329,23 @@ def _columns(table: Any) -> dict[str, np.ndarray]:
         for row, place in zip(_array(values).reshape(len(where), len(rows)), where, strict=True):
             columns[labels[place]] = row
     if len(columns) != len(labels):
-        raise ValueError(f"of {len(labels)} columns {len(columns)} are there")
+        raise ValueError(f"{len(columns)} of {len(labels)} columns have values")
     return {label: columns[label] for label in labels}
 
 
-def _array(held: Any) -> np.ndarray:
+def _array(record: Any) -> np.ndarray:
     """Return the array that a record stands for."""
-    name = held.name if isinstance(held, _Record) else type(held).__name__
+    name = record.name if isinstance(record, _Record) else type(record).__name__
     if name == "_new_Index":
-        kind, state = held.args
+        kind, state = record.args
         if kind.name == "RangeIndex":
             return np.arange(state["start"], state["stop"], state["step"])
         return _array(state["data"])
     if name == "_reconstruct":
-        _, shape, dtype, fortran, data = held.state
+        _, shape, dtype, fortran, data = record.state
         order = "F" if fortran else "C"
     elif name == "_frombuffer":
-        data, dtype, shape, order = held.args[:4]
+        data, dtype, shape, order = record.args[:4]
     else:
         raise ValueError(f"a {name} where an array was expected")
     kind, byte_order = dtype.args[0], dtype.state[1]

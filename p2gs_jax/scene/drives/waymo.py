@@ -1,11 +1,11 @@
 """Waymo Open Dataset v2, perception: five cameras and five laser scanners at 10 Hz, in Parquet.
 
     camera_image/SEGMENT.parquet        JPEG, pose, velocity and shutter of each photograph
-    camera_calibration/SEGMENT.parquet  lenses, and where cameras are on the car
+    camera_calibration/SEGMENT.parquet  lenses, and poses of cameras on the car
     vehicle_pose/SEGMENT.parquet        pose of the car that boxes and short-range points refer to
     lidar/SEGMENT.parquet               range images
-    lidar_pose/SEGMENT.parquet          pose of the car for every pixel of the upper scanner's
-    lidar_calibration/SEGMENT.parquet   beams, and where scanners are on the car
+    lidar_pose/SEGMENT.parquet          pose of the car for every pixel of the upper scanner
+    lidar_calibration/SEGMENT.parquet   beams, and poses of scanners on the car
     lidar_box/SEGMENT.parquet           boxes
 
 Schema: https://github.com/waymo-research/waymo-open-dataset, src/waymo_open_dataset/v2/perception/
@@ -13,16 +13,15 @@ Schema: https://github.com/waymo-research/waymo-open-dataset, src/waymo_open_dat
 and shutter: wdl_limited/camera/camera_model.cc. Geometry of range images:
 utils/range_image_utils.py and v2/perception/utils/lidar_utils.py.
 
-Pixel 0 begins at the image's edge there (v2/perception/lidar.py), so centres are at +0.5 as ours.
-Columns of an image are exposed one after the other, and its pose is not of the middle one's time;
-the set's velocities carry it there.
+Pixel 0 begins at the image's edge (v2/perception/lidar.py), so centres are at +0.5 as here. The
+columns of an image are exposed one after the other, and its pose has another time than the middle
+column; the data set's velocities give the pose at the middle.
 
-`frame_timestamp_micros` is when the upper scanner begins its turn; `vehicle_pose` is of another
-time, about the middle of it (issue 464). Pixels of the upper scanner have poses of their own;
-points of the others were moved to where the car is at `vehicle_pose`. That the turn begins at the
-back and is clockwise is not written down: it follows from the order of the columns. When the other
-scanners measured is not known: their points are taken as of the time when the upper one passed, as
-boxes are.
+`frame_timestamp_micros` is the begin of the upper scanner's turn; `vehicle_pose` has another time,
+about the middle of the turn (issue 464). Each pixel of the upper scanner has a pose; points of the
+other scanners are in the car's axes at `vehicle_pose`. The order of the columns shows that the turn
+begins at the back and is clockwise. The times of the other scanners are not known: their points,
+like boxes, get the time at which the upper scanner passed.
 """
 
 from __future__ import annotations
@@ -72,16 +71,16 @@ SCANNER = "[LiDARCalibrationComponent]."
 LOW, HIGH, BEAMS = (f"{SCANNER}beam_inclination.{name}" for name in ("min", "max", "values"))
 RANGES = tuple(f"[LiDARComponent].range_image_return1.{name}" for name in ("values", "shape"))
 POSES = tuple(f"[LiDARPoseComponent].range_image_return1.{name}" for name in ("values", "shape"))
-# Channels of the two: distance, intensity, elongation, no-label zone; roll, pitch, yaw, x, y, z.
+# Channels: distance, intensity, elongation, no-label zone; and roll, pitch, yaw, x, y, z.
 RANGE_CHANNELS, POSE_CHANNELS = 4, 6
-# The upper scanner: its number, seconds a turn (10 Hz), where the turn begins in the car's axes.
+# The upper scanner: number, time of a turn in seconds (10 Hz), azimuth of its begin on the car.
 UPPER, TURN_S, TURN_START = 1, 0.1, np.pi
-# What a segment without these files lacks.
+# The consequences of missing files.
 MISSING = {
     "vehicle_pose": "there are neither boxes nor LiDAR sweeps",
-    "lidar_box": "what moves is not known",
+    "lidar_box": "moving objects are not known",
 }
-# Axes of cameras: x forward, y left, z up; OpenCV's in these.
+# OpenCV's axes in Waymo's camera axes (x forward, y left, z up).
 OPENCV = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
 
@@ -95,14 +94,14 @@ def read_waymo(root: Path, cfg: DataConfig) -> Recording:
     cars = _cars(segment.open("vehicle_pose")) if segment.has("vehicle_pose") else {}
     objects, box_notes = _objects(segment, cars) if segment.has("lidar_box") else ((), [])
     sweeps, sweep_notes = _sweeps(segment, cars) if cars and segment.has("lidar") else ([], [])
-    own = {photograph.camera for photograph in photographs}
-    cameras = [camera for camera in cameras if camera.name in own]
+    with_photographs = {photograph.camera for photograph in photographs}
+    cameras = [camera for camera in cameras if camera.name in with_photographs]
     notes += [*box_notes, *sweep_notes]
     return Recording(root, "waymo", cameras, photographs, sweeps, objects, notes)
 
 
 class _Segment:
-    """The files of a segment, its moments, and its clock."""
+    """The files of a segment, the time stamps of its frames, and its clock."""
 
     def __init__(self, root: Path, name: str):
         self.root, self.name = root, name
@@ -134,7 +133,7 @@ def _name(names: tuple[str, ...], number: int) -> str:
 
 
 def _transform(values: Any, path: Path, what: str) -> Pose:
-    """Return the matrix of a cell of 16 numbers, row by row; UserError: it is not a rigid pose."""
+    """Return the matrix in a cell of 16 numbers, row by row; UserError: it is not a rigid pose."""
     matrix = np.full((4, 4), np.nan)
     if values is not None and len(values) == matrix.size:
         matrix = np.array(values, np.float64).reshape(4, 4)
@@ -142,17 +141,17 @@ def _transform(values: Any, path: Path, what: str) -> Pose:
 
 
 def _cameras(table: ParquetTable) -> tuple[list[RigCamera], dict[str, Pose]]:
-    """Return cameras, and where they are on the car (OpenCV axes)."""
+    """Return cameras, and their poses on the car (OpenCV axes)."""
     columns = table.columns([CAMERA, *LENS_NUMBERS, MOUNT])
     cameras, mounts = [], {}
     numbers, lenses = columns.whole(CAMERA), columns.stacked(LENS_NUMBERS)
     for row, (number, lens) in enumerate(zip(numbers, lenses, strict=True)):
         name = _name(CAMERAS, number)
         if not np.isfinite(lens).all() or (lens[[0, 1, -2, -1]] <= 0).any():
-            why = f"the lens of {name} should be finite numbers, with positive focal lengths and "
+            why = f"the lens of {name} does not have finite numbers, positive focal lengths and "
             raise broken(f"{table.path}:", f"{why}sizes")
-        fu, fv, cu, cv, *bent, width, height = lens.tolist()
-        K, distortion = intrinsics(fu, fv, cu, cv), make_distortion((*bent,))
+        fu, fv, cu, cv, *coefficients, width, height = lens.tolist()
+        K, distortion = intrinsics(fu, fv, cu, cv), make_distortion((*coefficients,))
         cameras.append(RigCamera(name, K, int(width), int(height), distortion))
         mounts[name] = _transform(columns[MOUNT][row], table.path, name) @ OPENCV
     return cameras, mounts
@@ -164,16 +163,16 @@ def _photographs(segment: _Segment, mounts: dict[str, Pose]) -> tuple[list[Photo
     table = images.columns([STAMP, CAMERA, POSE_TIME, *MOTION, *SHUTTER, POSE])
     motion, stamps, times = table.stacked(MOTION), table.whole(STAMP), table.numbers(POSE_TIME)
     trigger, done = map(table.numbers, SHUTTER)
-    photographs, without = [], 0
+    photographs, unplaced = [], 0
     for row, number in enumerate(table.whole(CAMERA)):
         name, stamp, posed = _name(CAMERAS, number), int(stamps[row]), float(times[row])
         if name not in mounts:
             raise broken(segment.path("camera_calibration"), f"has no camera {name}")
         if table[POSE][row] is None or not np.isfinite(posed):
-            without += 1
+            unplaced += 1
             continue
         car = _transform(table[POSE][row], images.path, f"photograph {row + 1}")
-        # From the trigger to the end of the readout, the middle column is exposed in the middle.
+        # The middle column is exposed halfway between the trigger and the end of the readout.
         lag = (trigger[row] + done[row]) / 2 - posed
         if not (abs(lag) < LONGEST_BEYOND_S and np.isfinite(motion[row]).all()):
             lag = 0.0
@@ -183,28 +182,28 @@ def _photographs(segment: _Segment, mounts: dict[str, Pose]) -> tuple[list[Photo
                 frame=segment.frame(stamp),
                 time=segment.seconds(posed * 1e6) + lag,
                 path=Path(f"{stamp}.jpg"),
-                pose=_carried(car, motion[row], lag) @ mounts[name],
+                pose=_moved(car, motion[row], lag) @ mounts[name],
                 embedded=partial(_jpeg, images, row),
             )
         )
-    return photographs, counted(without, "photographs have no pose: they are left out.")
+    return photographs, counted(unplaced, "photographs have no pose: they are left out.")
 
 
-def _carried(pose: Pose, motion: Float[np.ndarray, " 6"], lag: float) -> Pose:
-    """Return where the car is some seconds later.
+def _moved(pose: Pose, motion: Float[np.ndarray, " 6"], lag: float) -> Pose:
+    """Return the pose of the car `lag` seconds later.
 
-    Velocities are in world axes, turns about the car's, as the set's camera model takes them
-    (dataset.proto has turns in world axes; cars turn about z, where both agree).
+    Velocities are in world axes and turn rates in the car's axes, as in Waymo's camera model
+    (dataset.proto has turns in world axes; cars turn about z, for which both agree).
     """
-    turn = Rotation.from_rotvec(lag * motion[3:]).as_matrix()
-    return pose_of(pose[:3, :3] @ turn, pose[:3, 3] + lag * motion[:3])
+    rotation = Rotation.from_rotvec(lag * motion[3:]).as_matrix()
+    return pose_of(pose[:3, :3] @ rotation, pose[:3, 3] + lag * motion[:3])
 
 
 def _jpeg(images: ParquetTable, row: int) -> bytes:
-    (held,) = images.cells(row, [JPEG])
-    if not held:
+    (data,) = images.cells(row, [JPEG])
+    if not data:
         raise broken(f"{images.path}:", f"row {row + 1} holds no image")
-    return held
+    return data
 
 
 def _cars(table: ParquetTable) -> dict[int, Pose]:
@@ -225,12 +224,12 @@ def _objects(
     centre, extent = columns.stacked(CENTRE), columns.stacked(EXTENT)
     heading, types = columns.numbers(HEADING), columns.whole(TYPE)
     if not (np.isfinite(np.column_stack([centre, extent, heading])).all() and (extent > 0).all()):
-        raise broken(f"{table.path}:", "boxes should have finite positions and positive sizes")
+        raise broken(f"{table.path}:", "boxes do not all have finite positions and positive sizes")
     local = np.tile(np.eye(4), (len(centre), 1, 1))
     local[:, 0, 0] = local[:, 1, 1] = np.cos(heading)
     local[:, 1, 0], local[:, 0, 1] = np.sin(heading), -np.sin(heading)
     local[:, :3, 3] = centre
-    # Boxes are drawn on laser points, which were measured as the scanner passed.
+    # Boxes are drawn on LiDAR points, which have the times at which the scanner passed.
     passed = TURN_S * turned(np.arctan2(centre[:, 1], centre[:, 0]), TURN_START)
     boxes, untracked, lost = [], 0, 0
     for row, stamp in enumerate(columns.whole(STAMP).tolist()):
@@ -246,14 +245,14 @@ def _objects(
             boxes.append(Box(track, label, (length, width, height), time, cars[stamp] @ local[row]))
     notes = counted(untracked, "boxes belong to no track: they are left out.")
     if cars:
-        notes += counted(lost, "boxes are of frames without a pose: they are left out.")
+        notes += counted(lost, "boxes have frames without a pose: they are left out.")
     return tracks(boxes), notes
 
 
 class _Scanner(NamedTuple):
-    """Where a scanner is on the car, scanner to car, and its beams.
+    """The pose of a scanner on the car, scanner to car, and its beams.
 
-    `beams` are inclinations, radians, from below; two are the ends of evenly spaced ones.
+    `beams` are rising inclinations, radians; two values are the ends of evenly spaced beams.
     """
 
     mount: Pose
@@ -261,7 +260,7 @@ class _Scanner(NamedTuple):
 
 
 def _sweeps(segment: _Segment, cars: dict[int, Pose]) -> tuple[list[Sweep], list[str]]:
-    """Return a sweep a frame, of all scanners together, and notes."""
+    """Return one sweep of all scanners together for each frame, and notes."""
     images, scanners = segment.open("lidar"), _scanners(segment.open("lidar_calibration"))
     poses = segment.open("lidar_pose") if segment.has("lidar_pose") else None
     rows, posed = _rows(images), {} if poses is None else _rows(poses)
@@ -277,12 +276,10 @@ def _sweeps(segment: _Segment, cars: dict[int, Pose]) -> tuple[list[Sweep], list
         if stamp in cars
     ]
     unposed = sum((turn, UPPER) in rows and (turn, UPPER) not in posed for turn in turns)
-    words = (
-        f"of {len(turns)} LiDAR turns lack lidar_pose: their points are as if the car had stood."
-    )
+    words = f"of {len(turns)} LiDAR turns lack lidar_pose: their points ignore the car's motion."
     notes = counted(unposed, words)
     lost = len(turns) - len(sweeps)
-    return sweeps, notes + counted(lost, "LiDAR sweeps are of frames without a pose: left out.")
+    return sweeps, notes + counted(lost, "LiDAR sweeps have frames without a pose: left out.")
 
 
 def _rows(table: ParquetTable) -> dict[tuple[int, int], int]:
@@ -307,7 +304,7 @@ def _scanners(table: ParquetTable) -> dict[int, _Scanner]:
 
 
 class _Source(NamedTuple):
-    """Tables that sweeps are read from, and their rows by time stamp and scanner."""
+    """Tables for reading sweeps, and their rows by time stamp and scanner."""
 
     segment: _Segment
     images: ParquetTable
@@ -319,7 +316,7 @@ class _Source(NamedTuple):
     def read(self, stamp: int, car: Pose) -> SweepPoints:
         """Return the points of the turn that begins at a time stamp.
 
-        `car` leads from car to world, for the pixels that have no pose of their own.
+        `car` is the pose, car to world, for pixels without a pose in the table.
         """
         parts = [
             self._scanned(key[1], row, self.posed.get(key), car)
@@ -332,7 +329,7 @@ class _Source(NamedTuple):
     def _scanned(
         self, laser: int, row: int, posed: int | None, car: Pose
     ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"]]:
-        """Return the points of one range image, and after which share of the turn each was."""
+        """Return the points of one range image, and the share of the turn before each point."""
         distances = _image(self.images, row, RANGES, RANGE_CHANNELS)
         if distances is None:
             return np.zeros((0, 3)), np.zeros(0)
@@ -346,17 +343,17 @@ class _Source(NamedTuple):
         pixels = _image(self.poses, posed, POSES, POSE_CHANNELS)
         if pixels is None or pixels.shape[:2] != distances.shape[:2]:
             raise broken(f"{self.poses.path}:", f"row {posed + 1} does not fit its range image")
-        six = pixels[at].astype(np.float64)
-        # Pixels that nothing was measured in have no pose.
-        known = six.any(1)
-        world[known] = _rotated(local[known], six[known, :3]) + six[known, 3:]
+        poses = pixels[at].astype(np.float64)
+        # Pixels without a measurement have no pose.
+        valid = poses.any(1)
+        world[valid] = _rotated(local[valid], poses[valid, :3]) + poses[valid, 3:]
         return world, (at[1] + 0.5) / distances.shape[1]
 
 
 def _rotated(
     points: Float[np.ndarray, "n 3"], angles: Float[np.ndarray, "n 3"]
 ) -> Float64[np.ndarray, "n 3"]:
-    """Turn each point about x, then y, then z by its own angles; scipy takes ten times longer."""
+    """Rotate each point by its angles about x, then y, then z; scipy takes 10 times as long."""
     (x, y, z), (roll, pitch, yaw) = points.T, angles.T
     y, z = np.cos(roll) * y - np.sin(roll) * z, np.sin(roll) * y + np.cos(roll) * z
     z, x = np.cos(pitch) * z - np.sin(pitch) * x, np.sin(pitch) * z + np.cos(pitch) * x
@@ -365,12 +362,12 @@ def _rotated(
 
 
 def _image(table: ParquetTable, row: int, names: tuple[str, ...], channels: int):
-    """Return a range image [h, w, channels], or None where the row holds none."""
+    """Return a range image [h, w, channels], or None if the row holds none."""
     values, shape = table.cells(row, names)
     if values is None or shape is None:
         return None
     if len(shape) != 3 or shape[2] != channels or values.size != np.prod(shape):
-        why = f"row {row + 1} holds no range image of {channels} channels"
+        why = f"row {row + 1} is not a range image with {channels} channels"
         raise broken(f"{table.path}:", why)
     return values.reshape(shape)
 
@@ -381,16 +378,16 @@ def _vehicle_points(
     at: tuple[Int[np.ndarray, " n"], ...],
     path: Path,
 ) -> Float64[np.ndarray, "n 3"]:
-    """Return points in the car's axes: the first row looks highest, the first column back."""
+    """Return points in the car's axes: the first row looks up most, the first column back."""
     height, width = distances.shape
     beams = scanner.beams
     if len(beams) == 2:
         beams = beams[0] + (np.arange(height) + 0.5) / height * (beams[1] - beams[0])
     if len(beams) != height:
-        why = f"a range image has {height} rows, its scanner {len(beams)} beams"
-        raise broken(f"{path}:", why, "get the file and that in lidar_calibration again")
+        why = f"a range image has {height} rows, but its scanner has {len(beams)} beams"
+        raise broken(f"{path}:", why, "get the file again, and its file in lidar_calibration")
     inclination = beams[::-1][at[0]]
-    # Columns are numbered in the car's axes; the scanner's may be turned in these.
+    # Columns are numbered in the car's axes, in which the scanner may be rotated.
     share = (at[1] + 0.5) / width
     azimuth = np.pi * (1 - 2 * share) - np.arctan2(scanner.mount[1, 0], scanner.mount[0, 0])
     flat = distances[at].astype(np.float64) * np.cos(inclination)

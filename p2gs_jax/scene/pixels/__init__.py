@@ -1,1 +1,1 @@
-"""Decoded photographs, whatever their number: in memory where all fit, else in mapped files."""
+"""Decoded photographs in any number: in memory if all fit, otherwise in mapped files."""

@@ -1,7 +1,7 @@
-"""Decoded photographs in files that are mapped into memory: the system drops and reads pages.
+"""Decoded photographs in memory-mapped files, whose pages the system reads and drops.
 
-A folder for every size holds a record of NumPy's for every photograph, named by all that its pixels
-depend on. Threads fill the files before they are asked for.
+A folder for each size holds one NumPy record for each photograph. Its name is a hash of everything
+that its pixels depend on. Threads write the files before they are needed.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from p2gs_jax.scene.files import file_fingerprints
 from p2gs_jax.scene.pixels.decode import Decoded, decode, resamples
 from p2gs_jax.types import View
 
-# Any change of what pixels come out of `decode` raises it.
+# Raise this version whenever the results of `decode` change.
 _VERSION = 3
 MOST_THREADS = 4
 
 
 class Key(NamedTuple):
-    """A photograph, by the row of its view, at a size in pixels."""
+    """A photograph at a size in pixels; `view` is the row of its view."""
 
     view: int
     width: int
@@ -39,27 +39,27 @@ class Key(NamedTuple):
 class PixelFiles:
     """Files of decoded photographs in `folder`. All methods may be called from any thread.
 
-    Who looks for a photograph in order to decode it holds its view's lock: nobody decodes it twice.
+    A thread that reads or decodes a photograph holds its view's lock: none is decoded twice.
     """
 
     def __init__(self, folder: Path, views: Sequence[View]):
-        """Open a folder, and remove what none of the photographs can use."""
+        """Open a folder, and remove files that no photograph can use."""
         self.folder = folder
         bonnets: dict[int, str] = {}
         self._names = tuple(_digest(view, bonnets) for view in views)
         self.locks = tuple(threading.Lock() for _ in views)
         known = {f"{name}.px" for name in self._names}
-        # Those that were being written when a run was killed have other names, too.
+        # Unfinished files of a killed run have other names and are removed as well.
         for path in folder.glob("*/*"):
             if path.name not in known:
                 path.unlink(missing_ok=True)
 
     def path(self, key: Key) -> Path:
-        """Return where a photograph is, or goes."""
+        """Return the path of a photograph's file."""
         return self.folder / f"{key.width}x{key.height}" / f"{self._names[key.view]}.px"
 
     def read(self, key: Key) -> Decoded | None:
-        """Return a photograph, mapped; None: it is not there, or damaged."""
+        """Return a mapped photograph; None: its file is missing or damaged."""
         try:
             records = np.load(self.path(key), mmap_mode="r", allow_pickle=False)
             fields = [np.asarray(records[name][0]) for name in records.dtype.names]
@@ -68,7 +68,7 @@ class PixelFiles:
         return Decoded(*fields) if fields[1].shape == (key.height, key.width) else None
 
     def write(self, key: Key, photograph: Decoded) -> Decoded:
-        """Keep a photograph, and return it mapped.
+        """Write a photograph, and return it mapped.
 
         Raises UserError: the disk is full, or cannot be written.
         """
@@ -86,39 +86,36 @@ class PixelFiles:
                 f.writelines(parts)
         except OSError as error:
             why = f"decoded photographs cannot be written to {self.folder}: "
-            fix = "make room on that disk or name another --out; or give --data.cache-mb the "
-            fix += "memory that all photographs take, a smaller --max-width, or both"
+            fix = "free space on that disk or name another --out; or set --data.cache-mb to the "
+            fix += "memory that all photographs need, or a smaller --max-width"
             raise UserError(f"{why}{error.strerror or error}", fix=fix) from None
         return self.read(key) or photograph
 
     def require_room(self, needed: int) -> None:
-        """Refuse a disk that cannot take `needed` bytes of photographs, before hours go into them.
-
-        Raises UserError: it has less room.
-        """
+        """Raise UserError if the disk has less space than `needed` bytes of photographs."""
         place = next(p for p in (self.folder, *self.folder.parents) if p.exists())
-        there = sum(path.stat().st_size for path in self.folder.glob("*/*.px"))
+        written = sum(path.stat().st_size for path in self.folder.glob("*/*.px"))
         free = shutil.disk_usage(place).free
-        if free < needed - there:
+        if free < needed - written:
             wanted, left = -(-needed // 2**20), -(-free // 2**20)
             raise UserError(
-                f"{len(self._names)} decoded photographs take {wanted} MB of disk, more than "
-                f"--data.cache-mb holds in memory, and {self.folder} has {left} MB left",
-                fix=f"make room on that disk or name another --out; or --data.cache-mb {wanted}, "
+                f"{len(self._names)} decoded photographs need {wanted} MB of disk, more than "
+                f"--data.cache-mb holds in memory, but {self.folder} has {left} MB left",
+                fix=f"free space on that disk or name another --out; or --data.cache-mb {wanted}, "
                 "if there is so much memory, or a smaller --max-width",
             )
 
 
 def file_bytes(view: View, size: tuple[int, int]) -> int:
-    """Return about how many bytes a decoded photograph takes at (width, height)."""
+    """Return the approximate bytes of a decoded photograph at (width, height)."""
     samples = 4 if view.alpha == "background" else 3
     return size[0] * size[1] * (samples * (2 if resamples(view, size) else 1) + 1)
 
 
 def _digest(view: View, bonnets: dict[int, str]) -> str:
-    """Return a name for all that the pixels of a view depend on but their size.
+    """Return a hash of everything, except the size, that the pixels of a view depend on.
 
-    `bonnets` holds the names of masks that many views share, by identity.
+    `bonnets` caches the hashes of ego masks, which many views share, by identity.
     """
     bonnet = ""
     if view.own_car is not None:
@@ -134,18 +131,18 @@ def _digest(view: View, bonnets: dict[int, str]) -> str:
 
 
 def _fingerprint(path: Path) -> tuple[str, int, int]:
-    """Return path, size and time of a file; of a missing one, what no file has."""
+    """Return path, size and time of a file; -1 stands for those of a missing file."""
     return file_fingerprints([path])[0] if path.exists() else (str(path), -1, -1)
 
 
 class DecodingAhead:
-    """Threads that decode what the files lack; they end with the main thread at the latest.
+    """Threads that decode photographs without a file; they end with the main thread at the latest.
 
-    What they cannot decode is left to the caller that asks for it, and that gets the error.
+    They skip photographs that cannot be decoded: the caller that needs one gets the error.
     """
 
     def __init__(self, views: Sequence[View], files: PixelFiles, keys: Sequence[Sequence[Key]]):
-        """Begin; `keys` are for every view the sizes that will be asked for."""
+        """Start the threads; `keys` are the sizes that will be needed, for every view."""
         self._jobs = list(zip(reversed(views), reversed(keys), strict=True))
         count = min(max(1, available_cores() // 2), MOST_THREADS)
         given = (self._jobs, files)
@@ -154,7 +151,7 @@ class DecodingAhead:
             thread.start()
 
     def stop(self) -> None:
-        """End the threads; what they had not begun is left."""
+        """End the threads; photographs that are not begun are skipped."""
         self._jobs.clear()
         for thread in self._threads:
             thread.join()
@@ -167,7 +164,7 @@ def _decode(jobs: list[tuple[View, Sequence[Key]]], files: PixelFiles) -> None:
         except IndexError:
             return
         with contextlib.suppress(UserError), files.locks[keys[0].view]:
-            lacking = [key for key in keys if not files.path(key).exists()]
-            found = decode(view, [key[1:] for key in lacking]) if lacking else []
-            for key, photograph in zip(lacking, found, strict=True):
+            missing = [key for key in keys if not files.path(key).exists()]
+            found = decode(view, [key[1:] for key in missing]) if missing else []
+            for key, photograph in zip(missing, found, strict=True):
                 files.write(key, photograph)

@@ -1,4 +1,4 @@
-"""From a photograph's file to its pixels: masked, undistorted, shrunk."""
+"""From a photograph's file to its pixels: decoding, masks, undistortion, downsampling."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from p2gs_jax.scene.files import image_size, undecodable
 from p2gs_jax.scene.lens import undistortion_maps
 from p2gs_jax.types import View
 
-_FULL = 0.999  # a pixel is valid only where all of its sources are
+_FULL = 0.999  # a pixel is valid only if all of its sources are valid
 _ALPHA_VALID = 0.5
-# About what decoding, undistorting and shrinking a photograph takes at once, for a pixel of it; and
-# the share of the memory that all threads together may take so.
+# Memory for decoding, undistorting and resizing, bytes for each pixel of a photograph; and the
+# share of the free memory that all threads together may use.
 BYTES_PER_PIXEL, SHARE = 40, 0.5
-# Masks are drawn at sizes of their own: their ratio of width to height may differ by this.
+# The largest relative difference between the aspect ratios of a mask and its photograph.
 _ASPECT_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True)
 class Decoded:
-    """A photograph as it is cached: as decoded, or as 16 bits where it was resampled.
+    """A cached photograph: with its original bits, or with 16 bits if it was resampled.
 
-    The largest integer of `pixels` is 1.0; `valid` is where they count. A photograph that is shown
-    over a background has `alpha`, and its pixels are premultiplied by it.
+    The largest integer of `pixels` stands for 1.0; `valid` marks pixels that count. A photograph
+    that is shown over a background has `alpha`, which premultiplies its pixels.
     """
 
     pixels: UInt[np.ndarray, "h w 3"]
@@ -44,22 +44,22 @@ class Decoded:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all."""
+        """Bytes of all arrays."""
         opacity = 0 if self.alpha is None else self.alpha.nbytes
         return self.pixels.nbytes + self.valid.nbytes + opacity
 
 
 class Room:
-    """Memory, in bytes, for work that threads do at the same time; one is always let in."""
+    """A limit on the memory, bytes, of concurrent work in threads; one task may always run."""
 
     def __init__(self, most: int | None = None):
-        """Have room for `most`, or for a share of what there is when it is first needed."""
+        """Set the limit to `most`, or to a share of the memory that is free at the first use."""
         self._most, self._taken = most, 0
         self._changed = threading.Condition()
 
     @contextlib.contextmanager
     def taking(self, count: int) -> Iterator[None]:
-        """Wait for room, and hold it."""
+        """Wait until `count` bytes are free, and reserve them."""
         with self._changed:
             if self._most is None:
                 self._most = int(SHARE * (left_to_process() or sys.maxsize))
@@ -89,23 +89,23 @@ def resamples(view: View, size: tuple[int, int]) -> bool:
 
 
 def decode(view: View, sizes: Sequence[tuple[int, int]]) -> list[Decoded]:
-    """Return a photograph at some (width, height) in pixels; its file is opened once.
+    """Return a photograph at several (width, height) in pixels; its file is opened once.
 
-    Raises UserError: the file or its mask is missing, broken or of another size than the model's;
-    or there is too little memory for it.
+    Raises UserError: the file or its mask is missing, broken or has another size than the model
+    states; or there is too little memory.
     """
     try:
         with _ROOM.taking(BYTES_PER_PIXEL * view.width * view.height):
             return _decoded(view, sizes)
     except (MemoryError, cv2.error) as error:
-        why = f"{view.width}x{view.height} pixels need more memory than there is ({error})"
+        why = f"{view.width}x{view.height} pixels need more memory than is free ({error})"
         raise broken(f"{view.image_path}:", why, "make the photographs smaller") from None
 
 
 def _decoded(view: View, sizes: Sequence[tuple[int, int]]) -> list[Decoded]:
     pixels, opacity = _decode(view.image_path)
     if pixels.shape[:2] != (view.height, view.width):
-        why = f"is {pixels.shape[1]}x{pixels.shape[0]} pixels, but was {view.width}x{view.height} "
+        why = f"has {pixels.shape[1]}x{pixels.shape[0]} pixels, but had {view.width}x{view.height} "
         fix = "do not change the photographs during a run; start the run again"
         raise broken(view.image_path, why + "when the scene was read", fix)
     valid = np.ones(pixels.shape[:2], bool)
@@ -115,16 +115,16 @@ def _decoded(view: View, sizes: Sequence[tuple[int, int]]) -> list[Decoded]:
     if view.mask_path is not None:
         valid &= _decode_mask(view)
     if view.own_car is not None:
-        # Any pixel that takes part in interpolation counts: the outline is known roughly.
+        # Every pixel with a masked source is masked: the outline is only approximate.
         covered = view.own_car.astype(np.float32)
         valid &= cv2.resize(covered, (view.width, view.height)) == 0
-    whole = (view.width, view.height)
+    full = (view.width, view.height)
     as_stored = view.distortion is None and matte is None
-    if as_stored and all(size == whole for size in sizes):
+    if as_stored and all(size == full for size in sizes):
         return [_read_only(pixels, valid) for _ in sizes]
     ldr, straight = floats(pixels), valid
     if matte is not None:
-        # What is transparent must not colour its neighbours: all four are resampled together.
+        # Transparent pixels must not colour their neighbours: all channels are resampled together.
         opaque = floats(matte)[..., None]
         ldr = np.concatenate([ldr * opaque, opaque], axis=2)
     if view.distortion is not None:
@@ -132,7 +132,7 @@ def _decoded(view: View, sizes: Sequence[tuple[int, int]]) -> list[Decoded]:
         ldr = cv2.remap(ldr, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         straight = cv2.remap(valid.astype(np.float32), *maps, cv2.INTER_LINEAR) >= _FULL
     return [
-        _read_only(pixels, valid) if as_stored and size == whole else _at_size(ldr, straight, size)
+        _read_only(pixels, valid) if as_stored and size == full else _at_size(ldr, straight, size)
         for size in sizes
     ]
 
@@ -156,13 +156,13 @@ def _read_only(*arrays: np.ndarray) -> Decoded:
 
 
 def _resized(
-    valid: Bool[np.ndarray, "h w"], size: tuple[int, int], how: int
+    valid: Bool[np.ndarray, "h w"], size: tuple[int, int], method: int
 ) -> Bool[np.ndarray, "h2 w2"]:
-    return cv2.resize(valid.astype(np.float32), size, interpolation=how) >= _FULL
+    return cv2.resize(valid.astype(np.float32), size, interpolation=method) >= _FULL
 
 
 def _decode(path: Path) -> tuple[np.ndarray, UInt[np.ndarray, "h w"] | None]:
-    """Return pixels as stored, [h w 3] uint8 or uint16 in RGB order, and alpha if there is any.
+    """Return stored pixels, [h w 3] uint8 or uint16 in RGB order, and alpha if there is any.
 
     EXIF rotation is ignored, as COLMAP does: poses belong to the stored raster.
     """
@@ -175,33 +175,33 @@ def _decode(path: Path) -> tuple[np.ndarray, UInt[np.ndarray, "h w"] | None]:
     if channels <= 2:
         raw = raw[..., None] if raw.ndim == 2 else raw[..., :1]
         return np.repeat(raw, 3, axis=2), opacity
-    # NumPy takes twenty times as long to turn the order of channels round.
+    # NumPy takes 20 times as long to reverse the order of channels.
     return cv2.cvtColor(raw, cv2.COLOR_BGR2RGB if channels == 3 else cv2.COLOR_BGRA2RGB), opacity
 
 
 def _decode_mask(view: View) -> Bool[np.ndarray, "h w"]:
-    """Return where the mask is not zero, at the view's size."""
+    """Return the non-zero pixels of the mask, at the view's size."""
     assert view.mask_path is not None
     w, h = image_size(view.mask_path)
     if abs(w / h / (view.width / view.height) - 1.0) > _ASPECT_TOLERANCE:
-        why = f"is {w}x{h}, its photograph {view.width}x{view.height}"
+        why = f"is {w}x{h}, but its photograph is {view.width}x{view.height}"
         fix = "make the mask at the size of the photograph"
         raise broken(f"wrong size: the mask {view.mask_path}", why, fix)
     raw = _read_raster(view.mask_path)
     colours = raw if raw.ndim == 2 else raw[..., : 3 if raw.shape[2] >= 3 else 1].max(axis=2)
     mask = colours > 0
     if raw.ndim == 3 and raw.shape[2] in (2, 4):
-        # What is transparent is left out. Of some masks alpha says all, and they are black.
+        # Transparent pixels are left out. Some masks are black, and alpha is the mask.
         opaque = raw[..., -1] > 0
         mask = mask & opaque if mask.any() or opaque.all() else opaque
     if (w, h) == (view.width, view.height):
         return mask
-    how = cv2.INTER_AREA if w > view.width else cv2.INTER_LINEAR
-    return _resized(mask, (view.width, view.height), how)
+    method = cv2.INTER_AREA if w > view.width else cv2.INTER_LINEAR
+    return _resized(mask, (view.width, view.height), method)
 
 
 def _read_raster(path: Path, *, colours: bool = False) -> np.ndarray:
-    """Return what a file holds; `colours`: with its colour profile applied."""
+    """Return the pixels of a file; `colours`: with its colour profile applied."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -216,7 +216,7 @@ def _read_raster(path: Path, *, colours: bool = False) -> np.ndarray:
 
 
 def _complete(path: Path, data: bytes) -> bool:
-    """Return whether the file was not cut: OpenCV fills the rest of a truncated image with grey."""
+    """Return whether a file is complete: OpenCV fills the rest of a truncated image with grey."""
     if data[:2] == b"\xff\xd8" and data.rstrip(b"\0")[-2:] == b"\xff\xd9":
         return True
     if data[:4] == b"\x89PNG" and b"IEND" in data[-64:]:
@@ -225,6 +225,6 @@ def _complete(path: Path, data: bytes) -> bool:
         with Image.open(path) as image:
             image.load()
     except (OSError, SyntaxError, ValueError):
-        # OpenCV decides on formats that Pillow does not know.
+        # Formats that Pillow does not support are judged by OpenCV alone.
         return data[:2] != b"\xff\xd8" and data[:4] != b"\x89PNG"
     return True

@@ -26,14 +26,14 @@ from p2gs_jax.scene.pixels.cache import DecodingAhead, Key, PixelFiles, file_byt
 from p2gs_jax.scene.pixels.decode import Decoded, decode, floats
 from p2gs_jax.types import Camera, Placement, TrackedObject, View
 
-# All levels of a schedule together have this many pixels per pixel of the finest.
+# Pixels of all levels of a schedule together, divided by the pixels of the finest level.
 _LEVELS = 4 / 3
-# A background shows through what is less opaque.
+# Pixels below this opacity show the background.
 OPAQUE = 0.999
-# Threads that decode ahead of a fit's steps, and so many steps ahead of the present one.
+# The number of threads that decode ahead of a fit, and the number of steps they are ahead at most.
 DECODERS = max(available_cores() - 1, 1)
 MOST_PENDING = 4 * DECODERS
-# Of stores that were not closed.
+# The photographs of stores that are not closed.
 _OPEN: weakref.WeakSet[_DecodedPhotographs] = weakref.WeakSet()
 
 
@@ -47,19 +47,19 @@ def size_at(view: View, max_width: int | None, shrink: float | int = 1.0) -> tup
 def camera_at(
     view: View, max_width: int | None, shrink: float | int = 1.0
 ) -> tuple[Float32[np.ndarray, "3 3"], int, int]:
-    """Return K, width and height at the size of `size_at`; K follows each rounding exactly."""
+    """Return K, width and height at the size of `size_at`; K includes the rounding of the size."""
     width, height = size_at(view, max_width, shrink)
     K = scale_intrinsics(view.K, width / view.width, height / view.height)
     return K.astype(np.float32), width, height
 
 
 class ImageStore:
-    """The photographs of a scene, and where its moving objects are in them.
+    """The photographs of a scene, and the places of its moving objects in them.
 
-    Decoded images are kept up to `cfg.cache_mb`, the rest in files where there is a folder for
-    them. All methods may be called from any thread; an `index` is the row of a view, a `shrink` the
-    factor of `size_at`. Photographs with alpha are shown over the display values of `backdrop`, if
-    any; with `random_backdrop` training draws another one for every step.
+    Decoded images stay in memory up to `cfg.cache_mb`, and others in files if there is a folder.
+    All methods may be called from any thread. `index` is the row of a view and `shrink` the factor
+    of `size_at`. Photographs with alpha are shown over `backdrop` (display values), if any; with
+    `random_backdrop` training draws another one for every step.
     """
 
     def __init__(
@@ -71,11 +71,11 @@ class ImageStore:
         *,
         folder: Path | None = None,
     ):
-        """Begin with nothing in memory.
+        """Create the store without decoding.
 
-        Pixels in the boxes of `objects` that move are left out; `moving` are those that Gaussians
-        belong to, for the cameras. Photographs that memory does not hold are kept in `folder`
-        (UserError: it has no room), or decoded again when they are needed.
+        Pixels in the boxes of moving `objects` are left out; `moving` are the objects with
+        Gaussians, for the cameras. Photographs that do not fit into memory are written to `folder`
+        (UserError: the disk is too small), or decoded again when they are needed.
         """
         self.views = tuple(views)
         self.moving = moving
@@ -91,7 +91,7 @@ class ImageStore:
             if _LEVELS * needed > limit:
                 files = PixelFiles(folder, views)
                 files.require_room(needed)
-            else:  # An earlier start had less memory.
+            else:  # An earlier run may have had less memory.
                 shutil.rmtree(folder, ignore_errors=True)
         self._photographs = _DecodedPhotographs(self.views, limit, files, folder)
         self._placements: dict[int, Placement] = {}
@@ -99,16 +99,16 @@ class ImageStore:
         self._outlines: dict[int, list[np.ndarray]] = {}
 
     def leaving_out(self, objects: Sequence[TrackedObject], margin: float = MARGIN) -> ImageStore:
-        """Return a store of the same photographs without the boxes of other objects that move."""
+        """Return a store of the same photographs without the boxes of these moving objects."""
         return self._with(_objects=_moving(objects), _margin=margin, _outlines={})
 
     @property
     def backdrop_values(self) -> tuple[float, float, float] | None:
-        """The backdrop as a display transform has it."""
+        """The backdrop as a tuple, for a display transform."""
         return None if self.backdrop is None else tuple(self.backdrop.tolist())
 
     def only_opaque(self) -> ImageStore:
-        """Return a store of the same photographs without pixels that a background shows through."""
+        """Return a store of the same photographs without pixels that show the background."""
         return self if self.backdrop is None else self._with(_only_opaque=True)
 
     def get(
@@ -116,14 +116,14 @@ class ImageStore:
     ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
         """Return a photograph, display-encoded in [0, 1] and over the backdrop, and its mask.
 
-        The mask is 1 where pixels count and 0 where they are masked, transparent, of an object that
-        is left out, or outside the photograph after undistortion. Raises UserError: the file or its
-        mask is missing, broken or of another size than the model's.
+        The mask is 1 for pixels that count. It is 0 for pixels that are masked, transparent, in the
+        box of a moving object, or outside the photograph after undistortion. Raises UserError: the
+        file or its mask is missing, broken or has another size than the model states.
         """
         return self._shown(index, self._decoded(index, shrink))
 
     def whole(self, index: int) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
-        """Return what `get` does, at the photograph's full size; nothing of it is kept."""
+        """Return the results of `get` at the photograph's full size, without caching them."""
         view = self.views[index]
         size = view.width, view.height
         if size_at(view, self._max_width) == size:
@@ -133,7 +133,7 @@ class ImageStore:
     def stored(
         self, index: int, shrink: float | int = 1.0
     ) -> tuple[UInt[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-        """Return what is cached, read-only: integers whose maximum is 1, premultiplied by alpha."""
+        """Return cached pixels, read-only integers premultiplied by alpha, and the mask."""
         entry = self._decoded(index, shrink)
         return entry.pixels, self._counted(index, entry)
 
@@ -159,7 +159,7 @@ class ImageStore:
         return valid & ~painted(self._outlines[index], view, *valid.shape[::-1])
 
     def alpha(self, index: int, shrink: float | int = 1.0) -> UInt[np.ndarray, "h w"] | None:
-        """Return the opacity that is cached, or None if the scene is shown over no background."""
+        """Return the cached opacity, or None if the scene has no background."""
         if self.backdrop is None:
             return None
         entry = self._decoded(index, shrink)
@@ -175,12 +175,12 @@ class ImageStore:
     def camera(
         self, index: int, shrink: float | int = 1.0
     ) -> tuple[Float32[np.ndarray, "4 4"], Float32[np.ndarray, "3 3"], int, int]:
-        """Return viewmat, K, width and height of a view at the size that `get` gives it."""
+        """Return viewmat, K, width and height of a view at the size of `get`."""
         view = self.views[index]
         return (view.viewmat, *camera_at(view, self._max_width, shrink))
 
     def placement(self, index: int) -> Placement | None:
-        """Return where moving objects are in a view, on the host; None: there are none."""
+        """Return the placement of moving objects in a view, on the host; None: there are none."""
         view = self.views[index]
         if self.moving is None or view.time is None:
             return None
@@ -193,12 +193,12 @@ class ImageStore:
         self._photographs.prefetch(self._key(index, shrink))
 
     def expect(self, shrinks: Sequence[float | int]) -> None:
-        """Begin to decode photographs that memory does not hold, each at all these sizes."""
+        """Start decoding photographs into files, each at all these sizes."""
         rows = range(len(self.views))
         self._photographs.expect([[self._key(row, s) for s in shrinks] for row in rows])
 
     def close(self) -> None:
-        """Stop the background thread and drop everything that is held; files stay."""
+        """Stop the background threads and drop all photographs in memory; files stay."""
         self._photographs.close()
 
     def _key(self, index: int, shrink: float | int) -> Key:
@@ -218,14 +218,14 @@ def _moving(objects: Sequence[TrackedObject]) -> tuple[TrackedObject, ...]:
 
 
 def camera_of(store: ImageStore, index: int, shrink: float | int = 1.0) -> Camera:
-    """Return the camera of view `index`, on the device, at the resolution that `get` gives it."""
+    """Return the camera of view `index`, on the device, at the size of `get`."""
     viewmat, K, width, height = store.camera(index, shrink)
     return Camera(on_device(viewmat), on_device(K), width, height, store.placement(index))
 
 
 @contextlib.contextmanager
 def decoded_into(folder: Path) -> Iterator[Path]:
-    """Let stores keep decoded photographs in a folder; it and they end with the block, always."""
+    """Provide a folder for decoded photographs; at the end its stores close and it is removed."""
     try:
         yield folder
     finally:
@@ -236,17 +236,17 @@ def decoded_into(folder: Path) -> Iterator[Path]:
 
 
 class _DecodedPhotographs:
-    """Photographs of some views, decoded on demand and kept up to a limit in bytes.
+    """Photographs of some views, decoded on demand and cached up to a limit in bytes.
 
-    The least recently used goes first; the most recent one is always kept. What is not kept is
-    mapped again from files, or without files decoded again, when it is needed.
+    The least recently used one is dropped first; the most recent one always stays. A dropped
+    photograph is mapped from its file again, or decoded again if there are no files.
     """
 
     def __init__(
         self, views: Sequence[View], limit: int, files: PixelFiles | None, folder: Path | None
     ):
         self.views, self.folder = views, folder
-        self.decodings = 0  # photographs decoded so far, each size of each counted
+        self.decodings = 0  # decoded photographs, each size counted
         self._limit, self._files = limit, files
         self._cache: OrderedDict[Key, Decoded] = OrderedDict()
         self._bytes = 0
@@ -282,7 +282,7 @@ class _DecodedPhotographs:
         pending.add_done_callback(lambda _: self._pending.pop(key, None))
 
     def expect(self, keys: Sequence[Sequence[Key]]) -> None:
-        """Begin to decode what will be asked for into the files; without files nothing happens."""
+        """Start decoding photographs into files; without files nothing happens."""
         if self._files is not None:
             self._ahead = DecodingAhead(self.views, self._files, keys)
             weakref.finalize(self, self._ahead.stop)

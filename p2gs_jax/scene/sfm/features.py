@@ -1,7 +1,7 @@
-"""SIFT features and matches in a COLMAP database, and which pairs of images to match.
+"""SIFT features and matches in a COLMAP database, and the choice of image pairs to match.
 
-The database of `kept_features` outlives what is made of it: an interruption or ten photographs
-more cost only what is new. It is thrown away where a photograph changed or is gone.
+The database of `kept_features` is cached: after an interruption, or with more photographs, only new
+features and matches are computed. It is deleted if a photograph changed or is missing.
 """
 
 from __future__ import annotations
@@ -33,32 +33,32 @@ from p2gs_jax.scene.rigid import camera_centers
 MAX_IMAGE_SIZE = 1600
 MAX_FEATURES = 4096
 EXHAUSTIVE_LIMIT = 60
-"""Up to this many images every pair is matched."""
+"""Up to this number of images every pair is matched."""
 DATABASE, RECORD = "database.db", "photographs.json"
-# Photographs and pairs between two messages.
+# Photographs and pairs between two progress messages.
 IMAGES_AT_ONCE, PAIRS_AT_ONCE = 8, 100
 _OVERLAP, _LOOPS_EVERY = 10, 5
-# With known poses (nerf_fox, 50 views of 540x960, processor time): the nearest 20 give 574 pairs in
-# 71 s and 11,961 points, the nearest 10 292 pairs in 53 s and 12,017 points.
+# Nearest neighbours with known poses. For nerf_fox (50 views of 540x960), 20 neighbours give 574
+# pairs and 11,961 points in 71 s of processor time; 10 give 292 pairs and 12,017 points in 53 s.
 _NEIGHBOURS = 10
 _EXHAUSTIVE_LIMIT_BY_POSE = _NEIGHBOURS + 5
 
-# In COLMAP's lists of pairs a name ends at a blank, and a line that begins with # is a comment:
-# names have characters for private use instead while images are matched.
-_ONE_WORD = {ord(c): 0xE000 + ord(c) for c in " \t\v\f\r\n#"}
-_AS_THEY_ARE = {there: here for here, there in _ONE_WORD.items()}
+# In COLMAP's lists of pairs a name ends at a blank, and # begins a comment. Private-use characters
+# replace these while images are matched.
+_ESCAPED = {ord(c): 0xE000 + ord(c) for c in " \t\v\f\r\n#"}
+_UNESCAPED = {escaped: plain for plain, escaped in _ESCAPED.items()}
 
 Pair = tuple[str, str]
 
 
 def quiet_colmap() -> None:
-    """Set COLMAP's log to errors only; otherwise it reports progress."""
+    """Set COLMAP's log to errors only, without progress."""
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
 
 
 @contextmanager
 def opened(database: Path) -> Iterator[pycolmap.Database]:
-    """Provide a database that is closed afterwards."""
+    """Provide an open database, and close it at the end."""
     db = pycolmap.Database.open(database)
     try:
         yield db
@@ -77,8 +77,8 @@ def extract(
 ) -> None:
     """Detect SIFT features of images on the CPU and store them in a new or an existing database.
 
-    `mode` says how they share cameras, `camera` the id of one in the database that took them all;
-    with `enlarge` features are found in images of twice the size as well. Raises UserError: COLMAP
+    `mode` states how images share cameras; `camera` is the id of one camera in the database for all
+    of them. With `enlarge`, features are also found at twice the size. Raises UserError: COLMAP
     failed.
     """
     options = pycolmap.FeatureExtractionOptions()
@@ -88,9 +88,9 @@ def extract(
         options.sift.first_octave = 0
     # COLMAP decodes a photograph in every thread.
     largest = max(w * h for w, h in (image_size(image_folder / name) for name in names))
-    room = int(SHARE * (left_to_process() or sys.maxsize)) // (BYTES_PER_PIXEL * largest)
-    if room < available_cores():
-        options.num_threads = max(1, room)
+    most_threads = int(SHARE * (left_to_process() or sys.maxsize)) // (BYTES_PER_PIXEL * largest)
+    if most_threads < available_cores():
+        options.num_threads = max(1, most_threads)
     reader = pycolmap.ImageReaderOptions()
     if camera is not None:
         reader.existing_camera_id = camera
@@ -106,7 +106,7 @@ def extract(
         )
     except (RuntimeError, ValueError, OSError) as error:
         why = f"COLMAP could not extract features in {image_folder}: {error}."
-        fix = "look for an image there that does not open, and remove or replace it"
+        fix = "find an image there that does not open, and remove or replace it"
         raise UserError(why, fix=fix) from error
 
 
@@ -117,15 +117,15 @@ def match(database: Path, pairs: Iterable[Pair] | None) -> None:
         pycolmap.match_exhaustive(database, device=cpu)
         return
     listing = database.with_name("pairs.txt")
-    lines = (f"{a.translate(_ONE_WORD)} {b.translate(_ONE_WORD)}\n" for a, b in pairs)
+    lines = (f"{a.translate(_ESCAPED)} {b.translate(_ESCAPED)}\n" for a, b in pairs)
     listing.write_text("".join(lines), encoding="utf-8")
     options = pycolmap.ImportedPairingOptions()
     options.match_list_path = listing
-    _rename(database, _ONE_WORD)
+    _rename(database, _ESCAPED)
     try:
         pycolmap.match_image_pairs(database, pairing_options=options, device=cpu)
     finally:
-        _rename(database, _AS_THEY_ARE)
+        _rename(database, _UNESCAPED)
 
 
 def _rename(database: Path, characters: Mapping[int, int]) -> None:
@@ -141,10 +141,9 @@ def _rename(database: Path, characters: Mapping[int, int]) -> None:
 def kept_features(
     folder: Path, image_folder: Path, groups: Mapping[tuple, Sequence[str]], report: Report
 ) -> Path:
-    """Return a database, kept in `folder`, with the features of photographs; some may be there.
+    """Return the database in `folder` with the features of photographs, computing new ones.
 
-    `groups` holds the names of those of one camera by what they have in common. Raises UserError:
-    COLMAP failed.
+    `groups` holds the names of the photographs of each camera. Raises UserError: COLMAP failed.
     """
     files = {}
     for key, group in groups.items():
@@ -161,11 +160,11 @@ def kept_features(
     names = [name for group in groups.values() for name in group]
     if database.is_file():
         # A run may have been killed while it matched.
-        _rename(database, _AS_THEY_ARE)
+        _rename(database, _UNESCAPED)
     known = _cameras(database)
     new = [name for name in names if name not in known]
     if len(new) < len(names):
-        report(f"features of {len(names) - len(new)} images are kept from an earlier run")
+        report(f"features of {len(names) - len(new)} images come from an earlier run")
     progress, done = stage_progress(report, "detecting features", len(new), "images"), 0
     for group in groups.values():
         wanted = [name for name in group if name not in known]
@@ -183,14 +182,14 @@ def kept_features(
 def match_kept(
     database: Path, names: Sequence[str], pairs: Sequence[Pair] | None, report: Report
 ) -> None:
-    """Match what is not matched yet, of these pairs or of all."""
+    """Match the pairs, or all pairs for None, that are not matched yet."""
     wanted = list(combinations(sorted(names), 2)) if pairs is None else list(pairs)
     with opened(database) as db:
         ids = {image.name: image.image_id for image in db.read_all_images()}
         known = ((a, b) for a, b in wanted if a in ids and b in ids)
         left = [(a, b) for a, b in known if not db.exists_two_view_geometry(ids[a], ids[b])]
     if len(left) < len(wanted):
-        report(f"matches of {len(wanted) - len(left)} image pairs are kept from an earlier run")
+        report(f"matches of {len(wanted) - len(left)} image pairs come from an earlier run")
     progress = stage_progress(report, "matching", len(left), "image pairs")
     for start in range(0, len(left), PAIRS_AT_ONCE):
         match(database, left[start : start + PAIRS_AT_ONCE])
@@ -198,7 +197,7 @@ def match_kept(
 
 
 def _continues(path: Path, record: dict) -> bool:
-    """Return whether the photographs of an earlier run are among those of this, unchanged."""
+    """Return whether all photographs of an earlier run are still there and unchanged."""
     try:
         old = json.loads(path.read_text())
         now = record["files"]
@@ -210,7 +209,7 @@ def _continues(path: Path, record: dict) -> bool:
 
 
 def _cameras(database: Path) -> dict[str, int]:
-    """Return the camera of every photograph that has features."""
+    """Return the camera id of every photograph with features."""
     if not database.is_file():
         return {}
     with opened(database) as db:
@@ -219,12 +218,12 @@ def _cameras(database: Path) -> dict[str, int]:
 
 
 def pairs_by_name(names: Sequence[str], matching: Matching = "auto") -> list[Pair] | None:
-    """Return the pairs to match by their names alone; None means all.
+    """Return the pairs of images to match by their names alone; None means all.
 
-    Sequences, one a folder: each image meets the next 10 and those 16, 32, ... 512 later; where
-    a sequence is asked for, every fifth also meets every other fifth, for who comes back to a
-    place; images of different folders meet at the same place in the sequence and next to it. `auto`
-    takes long lists for sequences.
+    Each folder is a sequence. An image is matched with the next 10 images and those 16, 32, ... 512
+    later. With `sequence`, every fifth image is matched with every other fifth, which finds loops.
+    Images of different folders are matched at the same or the next position. `auto` treats long
+    lists as sequences.
     """
     if matching == "all" or (matching == "auto" and len(names) <= EXHAUSTIVE_LIMIT):
         return None
@@ -246,9 +245,9 @@ def pairs_by_name(names: Sequence[str], matching: Matching = "auto") -> list[Pai
 
 
 def pairs_by_pose(names: Sequence[str], viewmats: Float[np.ndarray, "v 4 4"]) -> list[Pair] | None:
-    """Return the pairs to match where world-to-camera poses are known; None means all.
+    """Return the pairs of images to match by known world-to-camera poses; None means all.
 
-    Each image meets the 10 nearest cameras that look less than 75 degrees another way.
+    Each image is matched with the 10 nearest cameras within 75 degrees of its viewing direction.
     """
     if len(names) <= _EXHAUSTIVE_LIMIT_BY_POSE:
         return None

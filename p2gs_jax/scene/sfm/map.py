@@ -28,19 +28,19 @@ from p2gs_jax.scene.sfm.features import opened, quiet_colmap
 from p2gs_jax.types import Scene, View
 
 KEPT, ACCOUNT = "features", "left_out.json"
-# Fewer features than this seldom give a pose.
+# A photograph with fewer features seldom gets a pose.
 FEW_FEATURES = 100
-# Matches further than this from where poses have them contradict the poses, pixels.
+# Matches farther from the epipolar line contradict the poses, pixels.
 EPIPOLAR_PX = 4.0
-# COLMAP takes a pair with fewer inliers for unverified.
+# COLMAP does not verify a pair with fewer inliers.
 LEAST_INLIERS = 15
-# Photographs with at least this many pixels along their longer side are not enlarged for SIFT
-# (nerf_fox: 53 s and 12,017 points become 15 s and 5,449); exposures and dense seeds need no more.
+# Photographs with at least this longer side, pixels, are not enlarged for SIFT. For nerf_fox, 53 s
+# and 12,017 points become 15 s and 5,449, enough for exposures and dense seeds.
 LONG_ENOUGH = 800
 LINKS = "photographs"
 _ADVICE = (
-    "photographs register when they are sharp, textured and overlap by more than half with at "
-    "least two others, taken from different places"
+    "photographs register if they are sharp, show texture, and overlap by more than half with at "
+    "least two others from different positions"
 )
 
 
@@ -54,9 +54,9 @@ def load_images(
 ) -> Scene:
     """Run COLMAP's structure from motion on the photographs in a folder; read the largest model.
 
-    `work_dir` keeps it under `sfm/` while the photographs stay the same, and features and matches
-    under `features/`, which serve more photographs. Raises UserError: fewer than two photographs,
-    one of them is not an image, or none registered.
+    `work_dir` caches the model of the same photographs in `sfm/`, and features and matches in
+    `features/`, also for more photographs. Raises UserError: there are fewer than two photographs,
+    one is not an image, or none is registered.
     """
     names = [path.relative_to(image_folder).as_posix() for path in paths]
     if len(paths) < 2:
@@ -87,7 +87,7 @@ def load_images(
     left_out = [name for name in names if name not in registered]
     notes = scene.notes
     if left_out:
-        known = {name: why.get(name, "no reason is known") for name in left_out}
+        known = {name: why.get(name, "for an unknown reason") for name in left_out}
         note = f"{len(left_out)} of {len(names)} images could not be registered and are not used: "
         notes = (*notes, f"{note}{sentence(known)}; {_ADVICE}")
     report(f"registered {len(registered)} of {len(names)} images, {len(scene.points)} points")
@@ -102,9 +102,9 @@ def _build(
     cfg: DataConfig,
     report: files.Report,
 ) -> None:
-    """Fill the folder with the largest model, and why photographs are not in it.
+    """Write the largest model, and the reasons of photographs that are not in it, to a folder.
 
-    The features are kept beside it.
+    The features are cached in `kept`.
     """
     quiet_colmap()
     names = [name for group in groups.values() for name in group]
@@ -138,7 +138,7 @@ def _build(
 def reasons(
     database: Path, names: Sequence[str], models: Sequence[pycolmap.Reconstruction]
 ) -> dict[str, str]:
-    """Return why photographs are not in the first model, in words, from the database of matches."""
+    """Return the reasons why photographs are not in the first model, from the database."""
     parts = [{model.image(i).name for i in model.reg_image_ids()} for model in models]
     used = parts[0] if parts else set()
     left = [name for name in names if name not in used]
@@ -157,7 +157,7 @@ def reasons(
 
 
 def sentence(why: Mapping[str, str]) -> str:
-    """Return the photographs and the reasons, those of one reason together."""
+    """Return the photographs grouped by reason, as text."""
     by_reason: dict[str, list[str]] = defaultdict(list)
     for name, reason in why.items():
         by_reason[reason].append(name)
@@ -165,7 +165,7 @@ def sentence(why: Mapping[str, str]) -> str:
 
 
 def _why(name: str, count: int, met: Mapping[str, int], parts: Sequence[set[str]]) -> str:
-    """Return why a photograph with so many features and verified matches did not register."""
+    """Return why a photograph with `count` features and the matches `met` is not registered."""
     if count == 0:
         return "no features: it does not open, or shows nothing"
     few = f"only {count} features: blurred, dark or without texture"
@@ -174,29 +174,29 @@ def _why(name: str, count: int, met: Mapping[str, int], parts: Sequence[set[str]
     other = next((part for part in parts[1:] if name in part), None)
     if other is not None:
         return f"in a part of {len(other)} photographs that shares too little with the rest"
-    here = {other: inliers for other, inliers in met.items() if parts and other in parts[0]}
-    if not here:
+    registered = {other: inliers for other, inliers in met.items() if parts and other in parts[0]}
+    if not registered:
         return "matches only photographs that did not register either"
     if count < FEW_FEATURES:
         return few
-    best = max(here, key=lambda other: here[other])
-    few = f"{here[best]} matches with {best}, its best of {len(here)}"
-    return f"{few}: too few of them are points that others see too"
+    best = max(registered, key=lambda other: registered[other])
+    few = f"{registered[best]} matches with {best}, its best of {len(registered)}"
+    return f"{few}: too few of them are points that other photographs see"
 
 
 def triangulate(
     scene: Scene, work_dir: Path | None, report: files.Report, *, only_training: bool = False
 ) -> Scene:
-    """Return the scene of posed views with points and tracks, none where nothing matches.
+    """Return the scene of posed views with triangulated points and tracks, if photographs match.
 
-    `work_dir` keeps the result under `triangulated/`. Raises UserError: there is only one view, or
-    a photograph cannot be read.
+    `work_dir` caches the result in `triangulated/`. Raises UserError: there is only one view, or a
+    photograph cannot be read.
     """
     views = tuple(scene.training_views) if only_training else scene.views
     if len(views) < 2:
         why = f"no point could be triangulated from the poses in {scene.root}"
-        fix = "check that there are several photographs, that they are sharp, and that the poses "
-        raise UserError(why, fix=fix + "are theirs")
+        fix = "check that there are several sharp photographs, and that the poses belong to them"
+        raise UserError(why, fix=fix)
     key = {
         "pycolmap": pycolmap.__version__,
         "files": files.file_fingerprints([view.image_path for view in views]),
@@ -221,14 +221,14 @@ def _triangulate(folder: Path, views: Sequence[View], root: Path, report: files.
     image_folder = _image_folder(views, folder)
     database = folder / "database.db"
     report(f"no seed points: detecting features in {len(views)} images")
-    # Intrinsics are held fixed, so it does not matter that every image has its own camera.
+    # Intrinsics are fixed, so that every image may have a separate camera.
     enlarge = max(max(view.width, view.height) for view in views) < LONG_ENOUGH
     mode = pycolmap.CameraMode.PER_IMAGE
     features.extract(database, image_folder, names, mode=mode, enlarge=enlarge)
     prior = _set_cameras(database, views)
     if unread := sorted({*names} - {image.name for image in prior.images.values()}):
-        why = f"COLMAP reads {len(views) - len(unread)} of {len(views)} photographs; one that it "
-        why += f"cannot read is {image_folder / unread[0]}."
+        why = f"COLMAP reads only {len(views) - len(unread)} of {len(views)} photographs; "
+        why += f"it cannot read {image_folder / unread[0]}."
         fix = "export those photographs again as PNG or JPEG, or remove them from the scene"
         raise UserError(why, fix=fix)
     pairs = features.pairs_by_pose(names, np.stack([view.viewmat for view in views]))
@@ -239,12 +239,12 @@ def _triangulate(folder: Path, views: Sequence[View], root: Path, report: files.
     report("triangulating")
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = 0
-    given = (prior, database, image_folder, folder)
-    model = pycolmap.triangulate_points(*given, refine_intrinsics=False, options=options)
+    arguments = (prior, database, image_folder, folder)
+    model = pycolmap.triangulate_points(*arguments, refine_intrinsics=False, options=options)
     if not model.points3D:
-        # COLMAP takes no point that two photographs alone show; of two there are no others.
+        # COLMAP omits points that only two photographs show; two photographs have no others.
         options.triangulation.ignore_two_view_tracks = False
-        model = pycolmap.triangulate_points(*given, refine_intrinsics=False, options=options)
+        model = pycolmap.triangulate_points(*arguments, refine_intrinsics=False, options=options)
     model.write(folder)
     database.unlink()  # large, and not needed again
     shutil.rmtree(folder / LINKS, ignore_errors=True)
@@ -270,7 +270,7 @@ def _set_cameras(database: Path, views: Sequence[View]) -> pycolmap.Reconstructi
 def agreement(database: Path, views: Sequence[View]) -> float:
     """Return the share of verified matches that lie near the epipolar lines of the poses.
 
-    It is 1 where there are too few to tell.
+    It is 1 if there are fewer than `FEW_FEATURES` matches.
     """
     known = {view.name: view for view in views}
     near: list[np.ndarray] = []
@@ -287,7 +287,7 @@ def agreement(database: Path, views: Sequence[View]) -> float:
             E = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ relative[:3, :3]
             first, second = rays[a][matches[:, 0]], rays[b][matches[:, 1]]
             line, other = first @ E.T, second @ E
-            # Sampson's distance, focal lengths; behind a camera nothing is seen.
+            # Sampson's distance is in focal lengths; points must lie in front of both cameras.
             across = np.hypot(np.hypot(*line[:, :2].T), np.hypot(*other[:, :2].T))
             off = np.abs((second * line).sum(1)) / np.maximum(across, 1e-12)
             turned = first @ relative[:3, :3].T
@@ -320,22 +320,22 @@ def camera_of(view: View, camera_id: int) -> pycolmap.Camera:
 
 
 def _lens(view: View) -> tuple[str, tuple[float, ...]]:
-    """Return COLMAP's name of the lens model, and as many coefficients as it has."""
+    """Return COLMAP's name of the lens model, and its coefficients."""
     if view.distortion is None:
         return "OPENCV", (0.0,) * 4
-    held = view.distortion.coefficients
+    coefficients = view.distortion.coefficients
     if view.distortion.model == "fisheye":
-        return "OPENCV_FISHEYE", held
-    if len(held) == 4:
-        return "OPENCV", held
-    return "FULL_OPENCV", (*held, 0.0, 0.0, 0.0)[:8]
+        return "OPENCV_FISHEYE", coefficients
+    if len(coefficients) == 4:
+        return "OPENCV", coefficients
+    return "FULL_OPENCV", (*coefficients, 0.0, 0.0, 0.0)[:8]
 
 
 def _image_folder(views: Sequence[View], folder: Path) -> Path:
     """Return the folder that the names of photographs are relative to.
 
-    Where there is none (KITTI's `image_02/data` belongs to camera `image_02`), one of links is
-    made.
+    If there is none (KITTI's `image_02/data` belongs to camera `image_02`), one with symbolic links
+    is made.
     """
     before = {str(view.image_path).removesuffix(view.name) for view in views}
     if len(before) == 1:

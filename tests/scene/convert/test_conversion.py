@@ -120,7 +120,7 @@ def test_raw_beside_jpeg_is_one_photograph(folder: Path, monkeypatch) -> None:
     write_image(folder / "a.jpg", 90, (96, 64))
     result = converted(folder)
     assert list(result.originals.values()) == [folder / "a.dng"]
-    assert noted(result, "there twice")
+    assert noted(result, "exist twice")
     # Its EXIF reaches the converted file.
     for file in (folder / "a.dng", *result.paths):
         assert exif_evs([file])[0] == pytest.approx(np.log2(1 / 250 * 400 / 2.8**2), abs=1e-3)
@@ -258,7 +258,7 @@ def test_files_that_are_refused(folder: Path) -> None:
         (folder / name).unlink()
 
     (folder / "a.nef").write_bytes(b"II*\0" + bytes(range(256)) * 40)
-    refuse("a.nef", r"does not know .*a\.nef", "DNG Converter")
+    refuse("a.nef", r"does not support .*a\.nef", "DNG Converter")
     (folder / "a.exr").write_bytes(b"\x76\x2f\x31\x01 and nothing")
     refuse("a.exr", r"a\.exr is not a readable OpenEXR")
     write_exr(folder / "b.exr", np.ones((8, 8, 1), np.float32), "Z")

@@ -53,7 +53,7 @@ def test_a_drive_becomes_views_with_frames_and_times_near_the_origin(drive):
 @pytest.mark.parametrize("name", ["../../CAM", "/CAM", "CAM/a", "..", "", "CAM\\a"])
 def test_a_camera_whose_name_is_a_path_is_refused(drive, name):
     hostile = replace(drive.cameras[1], name=name)
-    with refused("camera by the name of"):
+    with refused("is not a valid folder name"):
         assemble(replace(drive, cameras=(drive.cameras[0], hostile)), PLAIN)
 
 
@@ -85,7 +85,7 @@ def test_every_camera_holds_out_the_same_frames(drive):
     few = [p for p in drive.photographs if (p.camera, p.frame) != ("CAM_BACK", 0)]
     scene = assemble(replace(drive, photographs=few, sweeps=()), PLAIN)
     assert any("CAM_BACK 5" in note for note in scene.notes)
-    assert any("No LiDAR sweep" in note for note in scene.notes)
+    assert any("no LiDAR sweep" in note for note in scene.notes)
     held_out = {(v.camera, v.frame) for v in assign_split(scene.views, 4) if v.split == "test"}
     assert held_out == {("CAM_BACK", 4), ("CAM_FRONT", 0), ("CAM_FRONT", 4)}
 
@@ -103,7 +103,7 @@ def test_calibration_is_compared_with_the_photographs(drive):
     )
     assert (front.width, front.height) == (48, 32)
     np.testing.assert_allclose(front.K[:2], back.K[:2] / 2)
-    assert any("6 images have another size than the calibration says" in n for n in scene.notes)
+    assert any("6 images have another size than the calibration states" in n for n in scene.notes)
     with refused(r"wrong size: .*is 64x96"):
         made((96, 64))
     made((64, 96))

@@ -21,7 +21,7 @@ def project(points, to_camera, K):
 
 def test_laser_points_land_in_the_images_when_those_were_taken(shared_data, read):
     drive = read(shared_data("nuscenes_one_frame"))
-    assert drive.notes[0] == "scene.json counts 39 samples, sample.json holds 1."
+    assert drive.notes[0] == "scene.json counts 39 samples, but sample.json holds 1."
     points, times = drive.sweeps[0].read()
     assert len(points) == 34688
     assert len(drive.photographs) == 6

@@ -52,7 +52,7 @@ def test_what_nuscenes_lacks_is_counted(copied, read):
     drive = read(root)
     assert (len(drive.photographs), len(drive.sweeps), len(drive.objects)) == (3, 4, 2)
     assert drive.notes == [
-        "scene.json counts 39 samples, sample.json holds 3.",
+        "scene.json counts 39 samples, but sample.json holds 3.",
         "3 boxes in sample_annotation.json belong to no instance: they are left out.",
         "3 photographs have no pose in ego_pose.json: they are left out.",
         "1 LiDAR sweeps of the keyframes are missing, or have no pose.",
@@ -65,7 +65,7 @@ def test_what_nuscenes_lacks_is_counted(copied, read):
 def test_files_outside_the_set_are_refused(copied, read, name):
     root = copied("nuscenes").root
     edit(root, "sample_data", lambda rows: [{**row, "filename": name} for row in rows])
-    with refused(r"sample_data\.json names .* outside of"):
+    with refused(r"sample_data\.json names .* outside"):
         read(root)
 
 
@@ -153,9 +153,9 @@ def test_what_waymo_lacks_is_counted(copied, read):
     assert drive.notes == [
         "1 photographs have no pose: they are left out.",
         "1 boxes belong to no track: they are left out.",
-        "1 boxes are of frames without a pose: they are left out.",
-        "1 of 3 LiDAR turns lack lidar_pose: their points are as if the car had stood.",
-        "1 LiDAR sweeps are of frames without a pose: left out.",
+        "1 boxes have frames without a pose: they are left out.",
+        "1 of 3 LiDAR turns lack lidar_pose: their points ignore the car's motion.",
+        "1 LiDAR sweeps have frames without a pose: left out.",
     ]
     # Within what the car drives in half a turn.
     assert 0.1 < waymo.off_walls(drive.sweeps[0].read().points).max() < 1.5
@@ -164,14 +164,14 @@ def test_what_waymo_lacks_is_counted(copied, read):
     assert read(root).notes == [
         "1 photographs have no pose: they are left out.",
         "vehicle_pose is missing: there are neither boxes nor LiDAR sweeps.",
-        "lidar_box is missing: what moves is not known.",
+        "lidar_box is missing: moving objects are not known.",
     ]
 
 
 @pytest.mark.parametrize(
     ("component", "changes", "words"),
     [
-        ("lidar", {f"{waymo.RANGES}shape": [5, 7, 4]}, "holds no range image"),
+        ("lidar", {f"{waymo.RANGES}shape": [5, 7, 4]}, "is not a range image"),
         ("lidar", {"key.laser_name": 4}, "has no scanner 4"),
         ("lidar", waymo.ranged(waymo.RANGES, 0, 1, np.ones((2, 12, 4))), "2 rows"),
         ("lidar_pose", waymo.ranged(waymo.PIXELS, 0, 1, np.ones((1, 1, 6))), "does not fit its"),
@@ -214,7 +214,7 @@ def test_what_pandaset_lacks_is_counted(copied, read):
         "1 of 3 LiDAR sweeps are missing.",
         "1 of 3 frames have no boxes.",
         "1 boxes belong to no track: they are left out.",
-        "1 moving things have boxes of the forward scanner only: times are known to 0.1 s.",
+        "1 moving objects have boxes of the forward scanner only: times are known to 0.1 s.",
     ]
     assert [p.frame for p in recording.photographs] == [0, 2]
     assert {thing.name for thing in recording.objects} == {"parked", "ahead", "right", "x"}
@@ -223,7 +223,7 @@ def test_what_pandaset_lacks_is_counted(copied, read):
     recording = read(root)
     assert not recording.sweeps
     assert not recording.objects
-    assert "There are no boxes of moving things." in recording.notes
+    assert "There are no boxes of moving objects." in recording.notes
 
 
 def test_calibration_may_lie_beside_the_images_and_grey_cameras_are_pointed_out(copied, read):
@@ -255,7 +255,7 @@ def test_what_kitti_lacks_is_counted(write, read, tmp_path):
         "image_03 has no photographs: it is left out.",
         "4 of 8 LiDAR sweeps are missing.",
         "1 tracklets have no boxes: they are left out.",
-        "2 boxes are of frames without a LiDAR time: they are left out.",
+        "2 boxes have frames without a LiDAR time: they are left out.",
     ]
     assert {p.frame for p in recording.photographs} == {0, 1, 2, 3, 4}
 

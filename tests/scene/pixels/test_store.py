@@ -143,7 +143,7 @@ def test_truncated_images_changed_sizes_and_floats_are_refused(tmp_path):
         store_of(view).get(0)
     view = make_view(tmp_path / "a.png", noise())
     cv2.imwrite(str(view.image_path), np.zeros((24, 32), np.uint8))
-    with refused("32x24 pixels, but was 64x48"):
+    with refused("32x24 pixels, but had 64x48"):
         store_of(view).get(0)
     view = make_view(tmp_path / "a.tiff", np.zeros((48, 64, 3), np.float32))
     with refused(r"a.tiff has float32 pixels"):
@@ -254,7 +254,7 @@ def test_a_disk_without_room_is_refused_at_once_or_names_the_option(tmp_path, ki
         with refused("No space left on device", "--data.cache-mb"):
             in_files(tmp_path, kinds).stored(0)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=1000))
-    with refused(r"8 decoded photographs take 1 MB of disk.*1 MB left", "--data.cache-mb 1"):
+    with refused(r"8 decoded photographs need 1 MB of disk.*1 MB left", "--data.cache-mb 1"):
         in_files(tmp_path, kinds)
     in_files(tmp_path, kinds, DataConfig())
 
