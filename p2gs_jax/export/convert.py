@@ -1,7 +1,6 @@
-"""A finished run in the files of other programs: one function that writes the formats asked for.
+"""A finished run in the files of other programs: one function writes the chosen formats.
 
-Display colours are baked once, and the error that baking leaves is measured and written beside
-them.
+Display colours are baked once, and their baking error is measured and written beside them.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ from p2gs_jax.scene.convert.readers import read_exif_settings
 from p2gs_jax.scene.pixels.store import camera_of
 from p2gs_jax.types import Gaussians
 
-# What each format writes into the folder.
+# The files or folders that each format writes.
 PLACES: dict[str, tuple[str, ...]] = {
     "linear-ply": ("linear.ply", "linear.json"),
     "display-ply": ("display.ply", "display.ply.json"),
@@ -53,8 +52,7 @@ STEPS = 240
 MEASURED = 60
 
 
-# Of formats with display colours: writer; and reader, where what programs read differs from what
-# was written.
+# Writers of formats with display colours, and readers of those that round the Gaussians.
 WRITERS: dict[str, tuple[Callable, Callable | None]] = {
     "spz": (gsply.write_spz, gsply.read_spz),
     "compressed-ply": (gsply.write_compressed_ply, gsply.read_compressed_ply),
@@ -65,7 +63,7 @@ WRITERS: dict[str, tuple[Callable, Callable | None]] = {
 
 
 def require_packages(formats: Sequence[str]) -> None:
-    """Raise a UserError where a format needs a package that is not installed."""
+    """Raise UserError if a format needs a package that is not installed."""
     if {"spz", "compressed-ply"} & set(formats):
         gsply.require_gsply()
     if "usd" in formats:
@@ -86,10 +84,9 @@ def convert(
 ) -> Iterator[tuple[Path, str, float]]:
     """Write a run in every format; yield each place, a sentence about it, and seconds.
 
-    `transform` leads from radiance to the display colours of formats that hold these, which
-    `bake_steps` steps refine (None: enough). The page has at most `page_mb` million bytes. A
-    UserError says that something is in the way, or that a photograph is missing that a format
-    needs.
+    `transform` converts radiance to display colours, which `bake_steps` steps refine (None: a
+    default from the number of views). The page has at most `page_mb` million bytes. Raises
+    UserError: a file already exists, or a photograph that a format needs is missing.
     """
     _check_places(folder, [folder / place for name in formats for place in PLACES[name]], overwrite)
     if {"colmap", "nerfstudio", "exr"} & set(formats):
@@ -121,14 +118,14 @@ def convert(
 def _check_places(folder: Path, places: Sequence[Path], overwrite: bool) -> None:
     if folder.exists() and not folder.is_dir():
         raise UserError(f"{folder} is a file.", fix="name a folder with --out")
-    there = [path for path in places if path.exists()]
-    if there and not overwrite:
+    existing = [path for path in places if path.exists()]
+    if existing and not overwrite:
         fix = "add --overwrite to replace it, or name another folder with --out"
-        raise UserError(f"{there[0]} exists already.", fix=fix)
+        raise UserError(f"{existing[0]} already exists.", fix=fix)
 
 
 def _check_names(fitted: Run) -> None:
-    """Refuse names that would lead files out of the folder they are written to."""
+    """Raise UserError if the name of a view leads out of the folder of exported files."""
     for view in fitted.scene.views:
         name = PurePosixPath(view.name)
         if name.is_absolute() or ".." in name.parts:
@@ -146,7 +143,7 @@ def _linear_ply(ply: Path, fitted: Run) -> str:
     if kind is not None:
         views = fitted.scene.training_views
         write_appearance(ply.parent / corrections_name(kind), fitted.params.appearance, views)
-    return f"{count} Gaussians of linear radiance; {sidecar.name} says how to read them"
+    return f"{count} Gaussians of linear radiance; {sidecar.name} describes their fields"
 
 
 def _other_trainer(name: Program, place: Path, fitted: Run, reporter: Reporter) -> str:
@@ -178,7 +175,7 @@ class DisplayFiles:
     def __init__(
         self, fitted: Run, transform: DisplayTransform, steps: int | None, reporter: Reporter
     ):
-        """Render the true pictures that `steps` (None: enough) of refinement aim at, and bake."""
+        """Render the true pictures, bake, and refine by `steps` (None: a default)."""
         self.fitted, self.transform, self.reporter = fitted, transform, reporter
         scene, cfg = fitted.scene, fitted.cfg
         g = at_time(fitted.as_of(), None)
@@ -199,7 +196,7 @@ class DisplayFiles:
         self.baked = baking.refine(start, aims, cfg.render, **order, on_step=on_step)
 
     def write(self, name: str, path: Path, sidecar: Path) -> str:
-        """Write a format, and the JSON that says how far it is from the truth; return sentences."""
+        """Write a format, and a JSON file with its baking error; return sentences."""
         begin, more = time.monotonic(), ()
         write, read = WRITERS[name]
         error = self.error if read is None else {}
@@ -232,16 +229,16 @@ class DisplayFiles:
 
     @functools.cached_property
     def error(self) -> dict:
-        """The error of what was baked, by split."""
+        """The baking error by split."""
         return self._error(self.baked)
 
-    def _error(self, shown: Gaussians) -> dict:
-        """Return the baking error by split."""
+    def _error(self, gaussians: Gaussians) -> dict:
+        """Return the baking error of Gaussians by split."""
         self.reporter.stage("Measuring")
         scene, render = self.fitted.scene, self.fitted.cfg.render
         splits = {"train": scene.train_indices, "test": scene.test_indices}
         aims = {split: [self.targets[i] for i in _spread(rows)] for split, rows in splits.items()}
-        return {split: baking.baking_error(shown, aim, render) for split, aim in aims.items()}
+        return {split: baking.baking_error(gaussians, aim, render) for split, aim in aims.items()}
 
 
 def _spread(rows: Sequence[int]) -> list[int]:

@@ -1,8 +1,8 @@
 """The scene as folders of other programs: a COLMAP model, and nerfstudio's `transforms.json`.
 
 Cameras are pinholes at the size of the fit, and the photographs are undistorted to match. Points
-and tracks are those the fit started from. Neither program has a place for exposures:
-`exposures.csv` lies beside them; it is what `--known-exposures` reads.
+and tracks are those at the start of the fit. Neither format stores exposures: these are in
+`exposures.csv`, which `--known-exposures` reads.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from p2gs_jax.scene.convert.convert import kept_settings
 from p2gs_jax.types import Scene, Tracks, View
 
 JPEG_QUALITY = 98
-# What both programs read, and Pillow's modes of it; photographs of other kinds become PNG.
+# Suffixes and Pillow modes that both programs read; other photographs become PNG.
 READABLE, MODES = (".jpg", ".jpeg", ".png"), ("L", "RGB", "RGBA")
 # nerfstudio's file of points, and the colour of points without one.
 CLOUD, GREY = "sparse_pc.ply", 128
@@ -46,13 +46,13 @@ def write_folder(
     *,
     on_view: Callable[[int, int], None] = lambda done, count: None,
 ) -> None:
-    """Write `images`, `exposures.csv`, `masks` where a view has any, and the scene for a program.
+    """Write `images`, `exposures.csv`, `masks` if there are any, and the scene for a program.
 
     COLMAP reads `sparse/0`; nerfstudio's `splatfacto` reads `transforms.json` and `sparse_pc.ply`.
-    Coordinates are those of the data set, from which `Scene.origin` was taken off. The folder is
-    replaced once the new one is whole. The store has cameras at the size of the fit;
-    `on_view` receives how many photographs are written, and of how many. A UserError says that a
-    photograph cannot be read.
+    Coordinates are those of the data set, without the shift by `Scene.origin`. The folder is
+    replaced once the new one is complete. The store has cameras at the size of the fit. `on_view`
+    receives the number of written photographs and of all. Raises UserError: a photograph cannot be
+    read.
     """
     names = {view.name: exported_name(view) for view in scene.views}
     with atomic_folder(folder) as temporary:
@@ -61,13 +61,13 @@ def write_folder(
         for index, view in enumerate(scene.views):
             ldr, mask = store.get(index)
             _write_photograph(temporary / "images" / names[view.name], view, ldr)
-            path = temporary / _place_of_mask(names[view.name])
+            path = temporary / _mask_name(names[view.name])
             path.parent.mkdir(parents=True, exist_ok=True)
-            # 255 where the photograph is to be used.
+            # 255 marks pixels that count.
             Image.fromarray(np.where(mask > 0, 255, 0).astype(np.uint8)).save(path)
             masked |= not (mask > 0).all()
             on_view(index + 1, len(scene.views))
-        # Masks of all photographs or of none: nerfstudio refuses a part.
+        # nerfstudio needs masks for all photographs or for none.
         if not masked:
             shutil.rmtree(temporary / "masks")
         if program == "nerfstudio":
@@ -78,11 +78,11 @@ def write_folder(
 
 
 def exported_name(view: View) -> str:
-    """Return the name of an exported photograph: its own, or with .png behind it."""
+    """Return the name of an exported photograph: the view's name, with .png added if needed."""
     return view.name if Path(view.name).suffix.lower() in READABLE else f"{view.name}.png"
 
 
-def _place_of_mask(name: str) -> str:
+def _mask_name(name: str) -> str:
     """Return COLMAP's name of a mask: the photograph's, suffix included, and .png."""
     return (Path("masks") / f"{name}.png").as_posix()
 
@@ -98,7 +98,7 @@ def _transforms(
         names[view.split].append(place)
         frames.append(_frame(store, index, scene.origin) | {"file_path": place})
         if masked:
-            frames[-1]["mask_path"] = _place_of_mask(exported[view.name])
+            frames[-1]["mask_path"] = _mask_name(exported[view.name])
     content: dict[str, Any] = {"camera_model": "PINHOLE", "ply_file_path": CLOUD}
     if names["test"]:
         content["train_filenames"] = names["train"]
@@ -107,9 +107,9 @@ def _transforms(
 
 
 def exposure_table(photometry: Sequence[ViewPhotometry], names: Mapping[str, str]) -> str:
-    """Return exposures as CSV, under the exported names; a held-out view's is the fitted one.
+    """Return exposures as CSV under the exported names; a held-out view has its fitted exposure.
 
-    Where white balance is modelled, its factors follow.
+    The factors of white balance follow if it is modelled.
     """
     out = io.StringIO()
     table = csv.writer(out, lineterminator="\n")
@@ -153,7 +153,7 @@ def _write_model(folder: Path, scene: Scene, store: ImageStore, names: Mapping[s
             image_id=index + 1,
         )
         pose = np.asarray(viewmat, np.float64)
-        # The rotation that the float32 matrix was rounded from, orthonormal in float64.
+        # The nearest rotation to the float32 matrix is orthonormal in float64.
         u, _, vt = np.linalg.svd(pose[:3, :3])
         rotation = pycolmap.Rotation3d(u @ vt)
         pose_of_image = pycolmap.Rigid3d(rotation, pose[:3, 3] - u @ vt @ scene.origin)
@@ -162,33 +162,33 @@ def _write_model(folder: Path, scene: Scene, store: ImageStore, names: Mapping[s
             tracks[point].add_element(index + 1, slot)
     for xyz, track, color in zip(scene.points, tracks, _colors(scene), strict=True):
         model.add_point3D(xyz.astype(np.float64) + scene.origin, track, color)
-    # Mean distance of a point's projections from its observations: what COLMAP itself writes.
+    # COLMAP's point error is the mean distance of projections from observations.
     model.update_point_3d_errors()
     folder.mkdir(parents=True)
     model.write_binary(str(folder))
 
 
 def _write_photograph(path: Path, view: View, ldr: Float[np.ndarray, "h w 3"]) -> None:
-    """Copy a photograph that is used as it is; encode a changed one again, in sRGB.
+    """Copy an unchanged photograph; encode a changed one again, in sRGB.
 
-    Settings of the camera are kept, marks of another colour space are not.
+    The camera settings in EXIF are kept, but not the mark of another colour space.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    as_it_is = view.distortion is None and ldr.shape[1::-1] == (view.width, view.height)
+    unchanged = view.distortion is None and ldr.shape[1::-1] == (view.width, view.height)
     settings, readable = b"", False
     with contextlib.suppress(OSError), Image.open(view.image_path) as original:
         settings, readable = kept_settings(original.getexif()), original.mode in MODES
-    if as_it_is and readable and view.image_path.suffix.lower() == path.suffix.lower():
+    if unchanged and readable and view.image_path.suffix.lower() == path.suffix.lower():
         shutil.copyfile(view.image_path, path)
         return
-    how: dict[str, Any] = {"exif": b"Exif\0\0" + settings} if settings else {}
+    options: dict[str, Any] = {"exif": b"Exif\0\0" + settings} if settings else {}
     if path.suffix.lower() in (".jpg", ".jpeg"):
-        how |= {"quality": JPEG_QUALITY, "subsampling": 0}
-    Image.fromarray(np.rint(255 * ldr).astype(np.uint8)).save(path, **how)
+        options |= {"quality": JPEG_QUALITY, "subsampling": 0}
+    Image.fromarray(np.rint(255 * ldr).astype(np.uint8)).save(path, **options)
 
 
 def _frame(store: ImageStore, index: int, origin: Sequence[float]) -> dict[str, Any]:
-    """Return a camera in nerfstudio's words: OpenGL's axes, pixels, corners at whole numbers."""
+    """Return a camera in nerfstudio's format: OpenGL's axes, pixels with corners at integers."""
     viewmat, K, width, height = store.camera(index)
     pose = np.linalg.inv(np.asarray(viewmat, np.float64)) @ np.diag([1.0, -1.0, -1.0, 1.0])
     pose[:3, 3] += origin

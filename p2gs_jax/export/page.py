@@ -1,8 +1,8 @@
-"""One HTML file that is the scene: linear light, developed in the browser (docs/rendering.md).
+"""One HTML file with the scene: linear light, developed in the browser (docs/rendering.md).
 
-The browser draws with `web/*.js`, by the formulas of our renderer. Nothing is loaded from
-elsewhere, and no other script than this one runs, whatever names the views have: the policy in the
-page names its hash.
+The browser renders with `web/*.js`, by the formulas of our renderer. Nothing is loaded from
+elsewhere. The page's security policy states the hash of its script, so that no other script runs,
+whatever the names of views.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.read import Run
 
 SCRIPTS = ("decode", "shaders", "renderer", "camera", "link", "marks", "hands", "main")
-# Views on which the error is measured, and views whose pictures say which Gaussians weigh most.
+# Views for measuring the error, and views for weighing the Gaussians.
 JUDGED, WEIGHED = 12, 60
 MEGABYTE = 1_000_000
-# Bytes kept for sentences and for what says how to read the Gaussians.
+# Bytes reserved for sentences and for the header of the Gaussians.
 RESERVE = 4000
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Page:
-    """What was written: bytes, Gaussians, photographs, and sentences for page and terminal."""
+    """A written page: bytes, Gaussians, photographs, and sentences for page and terminal."""
 
     size: int
     splats: PageSplats
@@ -59,8 +59,8 @@ def write_page(
 ) -> Page:
     """Write the page of at most `size_mb` million bytes, with photographs for the split view.
 
-    The page opens with `look`; `say` receives what is going on. A UserError says that too little of
-    the scene fits, or that photographs are asked for and gone.
+    The page opens with `look`; `say` receives progress. Raises UserError: too little of the scene
+    fits, or photographs for the page are missing.
     """
     gaussians, scene = fitted.as_of(), fitted.scene
     render = make_renderer(fitted.cfg.render)
@@ -75,9 +75,9 @@ def write_page(
     embedded = embedded_photographs(fitted, photographs)
     known = page_scene(fitted, uncorrected(look), embedded)
     title = f"{fitted.folder.resolve().name}: linear light"
-    room = _room(int(size_mb * MEGABYTE), page_text(title, known, b""), size_mb)
+    most_bytes = _bytes_for_splats(int(size_mb * MEGABYTE), page_text(title, known, b""), size_mb)
     judge = functools.partial(page_error, pictures=pictures, render=render)
-    splats = fit_into(room, gaussians, fitted.cfg.render, weighed, judge, say)
+    splats = fit_into(most_bytes, gaussians, fitted.cfg.render, weighed, judge, say)
     sentences = _sentences(splats, fitted, size_mb)
     known |= {"splats": splats.packed.header, "about": [*sentences, *_fine_print(fitted)]}
     content = page_text(title, known, splats.packed.data)
@@ -86,10 +86,7 @@ def write_page(
 
 
 def page_text(title: str, known: Mapping[str, Any], data: bytes) -> str:
-    """Return the page.
-
-    `known` is what it reads besides the packed Gaussians (formats/packed.py).
-    """
+    """Return the page from its scene data (`known`) and packed Gaussians (formats/packed.py)."""
     script = '(() => {\n"use strict";\n' + "\n".join(map(_source, SCRIPTS)) + "})();\n"
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     policy = (
@@ -105,7 +102,7 @@ def page_text(title: str, known: Mapping[str, Any], data: bytes) -> str:
         "sorter": _source("sorter"),
         "script": script,
     }
-    # All at once: what is put in is never searched for places to put something.
+    # One pass replaces all places: inserted text is not searched again.
     return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], _read("page.html"))
 
 
@@ -114,66 +111,66 @@ def _read(name: str) -> str:
 
 
 def _source(name: str) -> str:
-    """Return a script; the name of a file of its own helps whoever reads the page's source."""
+    """Return a script after a comment with its file name, for readers of the page's source."""
     return f"// {name}.js\n{_read(f'{name}.js')}"
 
 
 def _json(value: Any) -> str:
-    """Return JSON that cannot end the element it stands in, nor open a comment or a script."""
-    said = json.dumps(rounded(plain(value)), allow_nan=False, separators=(",", ":"))
-    return said.replace("<", "\\u003c")
+    """Return JSON that cannot end its HTML element or begin a comment or a script."""
+    text = json.dumps(rounded(plain(value)), allow_nan=False, separators=(",", ":"))
+    return text.replace("<", "\\u003c")
 
 
-def _room(budget: int, empty: str, size_mb: float) -> int:
-    """Return how many bytes of Gaussians fit; a UserError says that none do."""
+def _bytes_for_splats(budget: int, empty: str, size_mb: float) -> int:
+    """Return the bytes that remain for Gaussians; UserError: there are none."""
     rest = len(empty.encode()) + RESERVE
     if rest >= budget:
         raise UserError(
-            f"--size-mb {size_mb:g} is too small: the page takes {rest / MEGABYTE:.2f} MB without "
+            f"--size-mb {size_mb:g} is too small: the page needs {rest / MEGABYTE:.2f} MB without "
             "any Gaussian.",
             fix="allow a larger page, or embed fewer --photographs",
         )
-    # Base64 makes 4 characters of 3 bytes.
+    # Base64 encodes 3 bytes in 4 characters.
     return (budget - rest) // 4 * 3
 
 
 def _sentences(splats: PageSplats, fitted: Run, size_mb: float) -> list[str]:
-    error, said = splats.error, []
+    error, out = splats.error, []
     kept, seen = splats.packed.count, splats.of - splats.unseen
     if splats.whole:
-        said.append(f"All {seen} Gaussians that can be seen, packed in few bits.")
+        out.append(f"The page has all {seen} visible Gaussians, packed in few bits.")
     else:
-        what = [f"{splats.dropped} of {seen} Gaussians that weigh least"] * bool(splats.dropped)
+        parts = [f"the {splats.dropped} least visible of {seen} Gaussians"] * bool(splats.dropped)
         if splats.kept_degree < splats.degree:
-            what.append(f"harmonics above degree {splats.kept_degree} (of {splats.degree})")
-        left_out = " and ".join(what)
-        said.append(f"Left out to stay within {size_mb:g} MB: {left_out}; {kept} Gaussians remain.")
-    said.append(
-        f"Against our renderer with nothing left out or rounded, {error.views} views at their own "
-        f"exposures: median {error.psnr_median:.1f} dB, worst {error.psnr_worst:.1f} dB "
+            parts.append(f"harmonics above degree {splats.kept_degree} (of {splats.degree})")
+        left_out = " and ".join(parts)
+        out.append(f"Left out to stay within {size_mb:g} MB: {left_out}; {kept} Gaussians remain.")
+    out.append(
+        f"{error.views} views at their exposures, compared with the run's renderer: "
+        f"median {error.psnr_median:.1f} dB, worst {error.psnr_worst:.1f} dB "
         f"({error.worst_view})."
     )
-    said.append(
-        f"Luminance of pixels that are not black is off by {error.stops_median:.4f} stops "
+    out.append(
+        f"The luminance of pixels that are not black differs by {error.stops_median:.4f} stops "
         f"(median), {error.stops_p99:.3f} (99 %), at most {error.stops_max:.2f}."
     )
     kind = fitted.cfg.photometry.appearance
     if kind is not None:
-        said.append(
+        out.append(
             f"The learned correction of display values ({kind}) is left out: the page has "
-            "exposure, white balance, gamma, curve and vignetting."
+            "exposure, white balance, gamma, tone curve and vignetting."
         )
-    return said
+    return out
 
 
 def _fine_print(fitted: Run) -> list[str]:
     out = [
-        "Light is linear until the last step: exposure is a factor on it, +1 EV doubles it. "
-        "Exposures count from the mean (geometric) of the training photographs.",
-        "White point: how much light becomes display white, in stops from what the curve alone "
-        "makes white. Mid-grey and what is darker stay; highlights are compressed or stretched.",
+        "Light is linear until the last step: exposure is a factor on it, and +1 EV doubles it. "
+        "Exposures are relative to the geometric mean of the training photographs.",
+        "The white point is the light that becomes display white, in stops from the white of the "
+        "tone curve alone. Mid-grey and darker tones stay; highlights are compressed or stretched.",
         "This file loads nothing from elsewhere and sends nothing.",
     ]
     if fitted.owner is not None:
-        out.insert(0, "Things that move stand where they were in the middle of the drive.")
+        out.insert(0, "Moving objects are at their places in the middle of the drive.")
     return out

@@ -1,4 +1,4 @@
-"""What a page knows of a run besides its Gaussians: views, how each was taken, curves, a look."""
+"""The data of a page besides its Gaussians: views with their photometry, curves, and a look."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ def uncorrected(transform: DisplayTransform) -> DisplayTransform:
 def page_scene(
     fitted: Run, look: DisplayTransform, photographs: Mapping[int, str]
 ) -> dict[str, Any]:
-    """Return what the page reads besides the Gaussians, as plain values or arrays.
+    """Return the data of the page besides the Gaussians, as plain values or arrays.
 
-    It opens with `look`; `photographs` are data URLs by row of the view.
+    The page opens with `look`; `photographs` are data URLs by row of the view.
     """
     mean, cfg = fitted.mean.exposure_geometric, fitted.cfg.render
     return {
@@ -63,7 +63,7 @@ def page_scene(
 def embedded_photographs(fitted: Run, count: int) -> dict[int, str]:
     """Return at most `count` undistorted photographs as data URLs, by row, evenly spread.
 
-    A UserError says that they are gone or broken.
+    Raises UserError: a photograph is missing or broken.
     """
     rows = [int(i) for i in evenly_spaced(len(fitted.scene.views), count)] if count else []
     fitted.require_photographs(rows)
@@ -73,12 +73,12 @@ def embedded_photographs(fitted: Run, count: int) -> dict[int, str]:
 
 def _tone(fitted: Run) -> dict[str, Any]:
     cfg = fitted.cfg.photometry
-    own, cameras = None, [camera.vignetting for camera in cfg.cameras]
+    curves, cameras = None, [camera.vignetting for camera in cfg.cameras]
     if cfg.curve == "spline" and (cfg.spline is not None or by_camera(cfg)):
         found = tables(cfg)
-        own = {name: getattr(found, name) for name in ("first", "step", "values", "channels")}
-        own["values"] = found.values.astype(np.float32)
-    return {"pivot": cfg.pivot, "tables": own, "cameras": cameras}
+        curves = {name: getattr(found, name) for name in ("first", "step", "values", "channels")}
+        curves["values"] = found.values.astype(np.float32)
+    return {"pivot": cfg.pivot, "tables": curves, "cameras": cameras}
 
 
 def _view(fitted: Run, index: int, mean: float) -> dict[str, Any]:
@@ -100,26 +100,26 @@ def _view(fitted: Run, index: int, mean: float) -> dict[str, Any]:
 
 
 def _balance(transform: DisplayTransform) -> list[float]:
-    """Return the log factors of the channels."""
+    """Return the natural logarithms of the white balance factors."""
     return list(transform.white_balance or (0.0, 0.0, 0.0))
 
 
 def _start(fitted: Run) -> int:
-    """Return the row of the view that the page opens at: the middle one of the first camera."""
+    """Return the row of the view at which the page opens: the first camera's middle view."""
     views, train = fitted.scene.views, fitted.scene.train_indices
-    own = [row for row in train if views[row].camera == views[train[0]].camera]
-    return own[len(own) // 2]
+    rows = [row for row in train if views[row].camera == views[train[0]].camera]
+    return rows[len(rows) // 2]
 
 
 def _up(fitted: Run) -> list[float]:
-    """Return the mean of where the cameras have their top, a unit vector."""
+    """Return the mean up direction of the cameras, a unit vector."""
     up = -np.mean([view.viewmat[1, :3] for view in fitted.scene.views], 0, dtype=float)
     length = np.linalg.norm(up)
     return [float(v) for v in (up / length if length > 1e-6 else (0.0, -1.0, 0.0))]
 
 
 def rounded(value: Any) -> Any:
-    """Return plain values with as many digits as float32 has."""
+    """Return plain values rounded to the digits of float32."""
     if isinstance(value, dict):
         return {key: rounded(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""Which Gaussians a page holds: all that can be seen, or the weightiest that fit; their error."""
+"""The Gaussians of a page: all visible ones, or those of largest weight that fit; their error."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from p2gs_jax.render.harmonics import C0, coefficient_count, degree_of
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians
 
-# A page whose Gaussians would be fewer than this share is refused rather than shown.
+# A page with a smaller share of the Gaussians is refused.
 LEAST_SHARE = 0.02
-# Attempts to meet a size from below, and how far below the first aims.
+# Attempts to reach a size from below, and the share of it that each attempt aims at.
 ATTEMPTS, MARGIN = 6, 0.985
-# Stops are compared where the brightest channel is shown as this 8-bit level or more.
+# Stops are compared for pixels whose brightest channel has at least this 8-bit level.
 DARKEST_LEVEL = 1.0
-# PSNR of equal pictures: the mean square error counts as this at least.
+# The least mean square error, which limits the PSNR of equal pictures.
 LEAST_ERROR = 1e-10
 
 
 class TruePicture(NamedTuple):
-    """A view as the run renders it, with all of its Gaussians: radiance and display values."""
+    """A view rendered with all Gaussians of the run: radiance and display values."""
 
     name: str
     camera: Camera
@@ -47,9 +47,9 @@ class TruePicture(NamedTuple):
 
 @dataclass(frozen=True)
 class PageError:
-    """Differences from the run's pictures of some views, each at its own exposure.
+    """Differences from the run's pictures of some views, each at the view's exposure.
 
-    PSNR (dB) is of developed pictures; stops are |log2| of the ratio of luminances, over pixels
+    PSNR (dB) compares developed pictures. Stops are |log2| of the ratio of luminances of pixels
     that are not black: median, 99th percentile, largest.
     """
 
@@ -66,8 +66,8 @@ class PageError:
 class PageSplats:
     """The packed Gaussians of a page, with their error against the run.
 
-    The run has `of` Gaussians, with harmonics of a `degree`. No renderer with our rules ever draws
-    the `unseen` ones: nothing is lost with them.
+    The run has `of` Gaussians, with harmonics of a `degree`. No renderer with our rules draws the
+    `unseen` ones, so that leaving them out changes nothing.
     """
 
     packed: Packed
@@ -78,7 +78,7 @@ class PageSplats:
 
     @property
     def dropped(self) -> int:
-        """Gaussians left out for the sake of the size."""
+        """Number of visible Gaussians that do not fit."""
         return self.of - self.unseen - self.packed.count
 
     @property
@@ -88,7 +88,7 @@ class PageSplats:
 
     @property
     def whole(self) -> bool:
-        """Whether nothing was left out that could be seen."""
+        """Whether all visible Gaussians and their harmonics are in the page."""
         return self.dropped == 0 and self.kept_degree == self.degree
 
 
@@ -102,16 +102,15 @@ def fit_into(
 ) -> PageSplats:
     """Return the Gaussians of a page, packed to at most `room` bytes.
 
-    If all do not fit, as many as do are kept at every degree of the harmonics, those first that
-    weigh most in the pictures of `cameras`; of these the one with the highest median PSNR is taken.
-    `judge` returns the error of some Gaussians. A UserError says that hardly any would fit, or that
-    there are none.
+    If not all fit, each degree of harmonics is tried with as many Gaussians as fit, in the order of
+    their weights in the pictures of `cameras`. The result has the highest median PSNR. `judge`
+    returns the error of Gaussians. Raises UserError: hardly any Gaussian fits, or none is visible.
     """
     seen = ever_drawn(gaussians, cfg)
     unseen, degree = int((~seen).sum()), degree_of(gaussians.sh.shape[1])
     whole = chosen(gaussians, seen)
     if whole.capacity == 0:
-        raise UserError("the run has no Gaussian that can be seen.", fix="fit it for longer")
+        raise UserError("the run has no visible Gaussian.", fix="fit it for longer")
 
     def judged(packed: Packed) -> PageSplats:
         return PageSplats(packed, judge(unpack(packed)), gaussians.capacity, degree, unseen)
@@ -130,13 +129,13 @@ def fit_into(
         if smaller is not None:
             found.append(judged(smaller))
     if not found:
-        why = f"of {whole.capacity} Gaussians less than {LEAST_SHARE:.0%} would fit into the page."
+        why = f"less than {LEAST_SHARE:.0%} of {whole.capacity} Gaussians would fit into the page."
         raise UserError(why, fix="allow a larger page with --size-mb, or embed fewer --photographs")
     return max(found, key=lambda splats: splats.error.psnr_median)
 
 
 def ever_drawn(gaussians: Gaussians, cfg: RenderConfig) -> Bool[np.ndarray, " n"]:
-    """Return which Gaussians any camera can see: finite, and less transparent than the cutoff."""
+    """Return which Gaussians a camera can see: finite, and more opaque than the cutoff."""
     finite = np.ones(gaussians.capacity, bool)
     for value in (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.sh):
         finite &= np.isfinite(np.asarray(value).reshape(gaussians.capacity, -1)).all(1)
@@ -150,7 +149,7 @@ def weights(
 ) -> Float[np.ndarray, " n"]:
     """Return the sum of each Gaussian's blending weights over the pixels of some views.
 
-    Where all radiance is 1 that is the gradient of the pictures' sum by log radiance.
+    This is the derivative of the pictures' sum by log radiance if all radiance is 1.
     """
     plain = replace(cfg, radiance="exp")
     alive = on_device(np.ones(gaussians.capacity), bool)
@@ -178,7 +177,7 @@ def weights(
 
 
 def _largest_that_fits(room: int, gaussians: Gaussians, order: np.ndarray) -> Packed | None:
-    """Return as many of the first Gaussians as fit, but for a percent or two; None: hardly any."""
+    """Return nearly as many of the first Gaussians as fit, packed; None: hardly any fits."""
     full = pack(gaussians)
     if len(full.data) <= room:
         return full
@@ -199,34 +198,34 @@ def _largest_that_fits(room: int, gaussians: Gaussians, order: np.ndarray) -> Pa
 def page_error(
     gaussians: Gaussians, pictures: Sequence[TruePicture], render: RenderView
 ) -> PageError:
-    """Compare pictures of the page's Gaussians with the true ones, at least one."""
+    """Compare pictures of the page's Gaussians with the true pictures, at least one."""
     psnrs, stops = [], []
     for true in pictures:
         linear = linear_light(gaussians, true.camera, render)
-        shown = develop(linear, true.transform)
-        square = np.mean((shown - true.display) ** 2, dtype=np.float64)
+        display = develop(linear, true.transform)
+        square = np.mean((display - true.display) ** 2, dtype=np.float64)
         psnrs.append(float(-10 * np.log10(max(square, LEAST_ERROR))))
         stops.append(_stops(linear, true))
-    # A view may be black all over.
-    apart = np.concatenate([np.zeros(1), *stops])
+    # A view may be entirely black.
+    differences = np.concatenate([np.zeros(1), *stops])
     worst = int(np.argmin(psnrs))
     return PageError(
         views=len(pictures),
         psnr_median=float(np.median(psnrs)),
         psnr_worst=psnrs[worst],
         worst_view=pictures[worst].name,
-        stops_median=float(np.median(apart)),
-        stops_p99=float(np.percentile(apart, 99)),
-        stops_max=float(apart.max()),
+        stops_median=float(np.median(differences)),
+        stops_p99=float(np.percentile(differences, 99)),
+        stops_max=float(differences.max()),
     )
 
 
 def _stops(linear: Float32[np.ndarray, "h w 3"], true: TruePicture) -> Float[np.ndarray, " p"]:
     lit = true.display.max(-1) >= DARKEST_LEVEL / 255
-    here, there = (np.maximum(luminance(p[lit]), 1e-12) for p in (linear, true.linear))
-    return np.abs(np.log2(here / there))
+    page, run = (np.maximum(luminance(p[lit]), 1e-12) for p in (linear, true.linear))
+    return np.abs(np.log2(page / run))
 
 
 def linear_light(g: Gaussians, camera: Camera, render: RenderView) -> Float32[np.ndarray, "h w 3"]:
-    """Return the radiance that a camera sees of all Gaussians."""
+    """Return the radiance of all Gaussians in a camera."""
     return np.asarray(render(g, on_device(np.ones(g.capacity), bool), camera).linear)

@@ -1,6 +1,6 @@
-"""`linear.json`: all that a foreign program needs to render `linear.ply` as we do.
+"""`linear.json`: everything that another program needs to render `linear.ply` as we do.
 
-docs/exports.md describes the fields; a change of their meaning raises VERSION.
+docs/exports.md describes the fields; raise VERSION whenever their meaning changes.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ BASIS = (
     f"{C3[4]} * z * (x * x - y * y)",
     f"-{C3[0]} * x * (x * x - 3 * y * y)",
 )
-# What the columns of the PLY hold.
+# The columns of the PLY.
 FIELDS = {
     "mean": "x, y, z: centre, scene units",
     "opacity": "opacity: peak opacity is 1 / (1 + exp(-opacity))",
@@ -57,12 +57,12 @@ FIELDS = {
     "spherical_harmonics": "coefficient 0 of channel c is f_dc_c; coefficient k > 0 is "
     "f_rest_(c (K - 1) + k - 1); K is `coefficients`",
 }
-# Stops about 1 at which the tone curve is tabulated.
+# The range of the tabulated tone curve in stops around 1, and the number of samples.
 DARKEST_EV, BRIGHTEST_EV, SAMPLES = -14.0, 4.0, 433
 
 
 def corrections_name(kind: Appearance) -> str:
-    """Return the name of the file beside it that holds learned corrections."""
+    """Return the name of the file with learned corrections beside the sidecar."""
     return f"linear.{RunFolder(Path()).appearance(kind).name}"
 
 
@@ -73,9 +73,9 @@ def linear_sidecar(
     store: ImageStore,
     photometry: PhotometryFile,
 ) -> dict[str, Any]:
-    """Return the content of the file that stands beside the PLY of these Gaussians.
+    """Return the content of the JSON file beside the PLY of these Gaussians.
 
-    `cfg` has the chosen model and curve, `store` cameras at the size of the fit.
+    `cfg` has the chosen model and curve, `store` the cameras at the size of the fit.
     """
     count, coefficients = gaussians.sh.shape[:2]
     return {
@@ -97,7 +97,7 @@ def linear_sidecar(
             + " of the sum s of coefficients times basis, by channel",
             "color_space": "linear light, primaries and white of BT.709 (the photographs' sRGB)",
             "chromaticities": list(BT709),
-            "unit": "relative; multiplied by what a view did to it it is what its tone curve takes "
+            "unit": "relative; a view's factors convert it to the input of its tone curve "
             "(tone.formula)",
         },
         "rendering": {
@@ -109,7 +109,7 @@ def linear_sidecar(
             "near": cfg.render.near,
         },
         "world": {
-            "axes": f"right-handed, those of the scene as it was read ({scene.format})",
+            "axes": f"right-handed, the axes of the scene that was read ({scene.format})",
             "unit": "scene units: metres where the source is metric",
             "origin": list(scene.origin),
             "viewmat": "world to camera, for column vectors; camera axes x right, y down, "
@@ -129,10 +129,10 @@ def _tone(cfg: FitConfig, photometry: PhotometryFile) -> dict[str, Any]:
     return {
         "formula": f"display = base(pivot * (e * W * V * L / pivot) ** ({GAMMA_SRGB} / gamma)); "
         "e * W * V * L is first clipped to exposed_limits; W is the view's white_balance by "
-        "channel, 1 where it is null; V is its camera's vignetting, 1 where that is null; base is "
-        "the curve, tabulated, or its camera's own",
-        "vignetting": "log V = k1 r^2 + k2 r^4 + k3 r^6 with the row k1, k2, k3 of all channels or "
-        "of each; r is the distance from the image's centre over half its diagonal",
+        "channel, or 1 if it is null; V is its camera's vignetting, or 1 if that is null; base is "
+        "the tabulated curve, or the curve of its camera",
+        "vignetting": "log V = k1 r^2 + k2 r^4 + k3 r^6 with one row k1, k2, k3 for all channels "
+        "or for each; r is the distance from the image's centre divided by half its diagonal",
         "model": photometry["model"],
         "curve": photometry["curve"]["name"],
         "pivot": p.pivot,
@@ -153,7 +153,7 @@ def _tone(cfg: FitConfig, photometry: PhotometryFile) -> dict[str, Any]:
 def _base(
     exposed: Float[np.ndarray, " s"], p: PhotometryConfig, camera: int | None
 ) -> Float32[np.ndarray, "s 3"]:
-    """Return display values of each channel under a camera's curve, or that of an unknown one."""
+    """Return display values of each channel under a camera's curve; None: an unknown camera."""
     grey = np.repeat(exposed[:, None], 3, 1)
     transform = DisplayTransform(1.0, GAMMA_SRGB, p, camera=camera).without_place()
     return develop(grey, transform)

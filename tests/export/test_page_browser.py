@@ -173,7 +173,7 @@ def test_a_device_that_was_taken_away_comes_back_with_the_picture(open_page):
     before = page.canvas()
     assert before.max() > 100
     page("(p.loss = p.renderer.gl.getExtension('WEBGL_lose_context')).loseContext()")
-    page.tab.locator("#status", has_text="taken away").wait_for()
+    page.tab.locator("#status", has_text="device was lost").wait_for()
     page("p.loss.restoreContext()")
     page.tab.locator("#status", has_text="Gaussians").wait_for()
     np.testing.assert_array_equal(page.canvas(), before)

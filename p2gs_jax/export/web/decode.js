@@ -1,4 +1,4 @@
-// The bytes of p2gs_jax/formats/packed.py, back to numbers.
+// Decodes the bytes of p2gs_jax/formats/packed.py.
 
 function bytesOfBase64(text) {
   if (Uint8Array.fromBase64) return Uint8Array.fromBase64(text);

@@ -1,6 +1,6 @@
 // Mouse, touch and keys that move the camera.
 
-// Radians a pixel and a second; depths of the scene a second.
+// Radians per pixel and per second; scene depths per second.
 const TURN = 0.005, KEYS_TURN = 0.9, KEYS_STEP = 0.5, FAST = 4;
 const MOVES = ["KeyW", "KeyA", "KeyS", "KeyD", "KeyQ", "KeyE", "ShiftLeft", "ShiftRight",
   "ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown"];
@@ -9,7 +9,7 @@ const typing = (e) => e.ctrlKey || e.metaKey || e.altKey || e.target.matches("se
   (e.target.matches("[type=range]") && e.code.startsWith("Arrow"));
 
 class Hands {
-  // `page` has camera, pivot, up, depth and fly, and is told through moved() and clicked().
+  // `page` has camera, pivot, up, depth and fly; moved() and clicked() notify it.
   constructor(element, page) {
     Object.assign(this, { element, page, fingers: new Map(), held: new Set(), travelled: 0 });
     element.addEventListener("pointerdown", (e) => this.down(e));
@@ -70,7 +70,7 @@ class Hands {
     return b ? Math.hypot(a.x - b.x, a.y - b.y) : 0;
   }
 
-  // What is seen follows the pointer, whether the camera turns or goes round.
+  // The picture follows the pointer, whether the camera turns or orbits.
   turn(dx, dy) {
     const { page } = this, by = page.fly ? TURN : -TURN;
     page.moved(lookAround(page.camera, by * dx, by * dy, page.fly ? page.camera.c : page.pivot, page.up));
@@ -92,7 +92,7 @@ class Hands {
       page.pivot = plus(page.camera.c, row(page.camera.R, 2), 0.02 * page.depth);
   }
 
-  // Go on for as long as keys are held; returns whether any is.
+  // Move while keys are pressed; returns whether any is.
   steer(seconds) {
     const { page, held } = this, on = (...codes) => (codes.some((c) => held.has(c)) ? 1 : 0);
     if (![...held].some((code) => !code.startsWith("Shift"))) return false;

@@ -1,4 +1,4 @@
-// The page's state in the fragment of its address. What an address says is checked, never trusted.
+// The page's state in the fragment of its address. Every value in an address is checked.
 
 const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
 const short = (x) => String(Number(x.toPrecision(7)));
@@ -29,7 +29,7 @@ function numbers(text, count) {
   return values.length === count && values.every(Number.isFinite) ? values : null;
 }
 
-// Take what makes sense of a fragment; the rest stays as it is.
+// Apply the valid values of a fragment; other values do not change.
 function followLink(hash, state, scene, curves) {
   const said = new URLSearchParams(hash.slice(1));
   for (const [name, [low, high]] of Object.entries(LIMITS)) {

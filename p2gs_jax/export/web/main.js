@@ -1,13 +1,13 @@
-// The page: its state, what the controls do to it, and when to draw.
+// The page: its state, the effects of its controls, and the times to draw.
 
 const SHOWS = ["picture", "stops", "clipping", "split"];
 const SAID = { picture: "picture", stops: "stops", clipping: "clipping", split: "photo | render" };
 const CURVE_NAMES = { spline: "fitted", srgb: "sRGB", power: "power 2.2", linear: "none" };
-// Frames that take longer are drawn smaller while the camera moves, s.
+// Slower frames are drawn smaller while the camera moves, seconds.
 const SLOW = 0.06, QUICK = 0.03, SMALLEST = 0.2, REST = 0.25;
 
 const $ = (id) => document.getElementById(id);
-// Pixels of the picture for each of the window's; more than two nobody sees.
+// Pixels of the picture for each pixel of the window; more than two are not visible.
 const density = () => Math.min(devicePixelRatio, 2);
 
 class Page {
@@ -43,7 +43,7 @@ class Page {
       this.choosePhotograph();
       this.show();
     });
-    // The first picture waits for its order.
+    // The first picture waits until its Gaussians are sorted.
     this.ready = this.renderer.sort(this.windowCamera()).then((row) => {
       this.sortedFor = row;
       this.newOrder = true;
@@ -52,12 +52,12 @@ class Page {
     });
   }
 
-  // The device may be taken away, as from a phone's page in the background, and come back.
+  // The device may be lost, for example by a phone's page in the background, and return.
   awaitLoss(canvas) {
     canvas.addEventListener("webglcontextlost", (e) => {
       e.preventDefault();
       this.lost = true;
-      $("status").textContent = "The graphics device was taken away; the picture returns with it.";
+      $("status").textContent = "The graphics device was lost; the picture returns with it.";
     });
     canvas.addEventListener("webglcontextrestored", () => {
       try { this.renderer.build(this.splats); } catch (error) { complain(error); }
@@ -89,7 +89,7 @@ class Page {
     return Math.max(dot(row(R, 2), plus(this.pivot, c, -1)), 0.01 * this.depth);
   }
 
-  // What the hands ask for.
+  // Callbacks of the hands.
   grabbed(x, y) {
     $("hands").focus({ preventScroll: true });
     const camera = this.windowCamera(1 / density());
@@ -109,7 +109,7 @@ class Page {
     this.show();
   }
 
-  // Stand where a photograph was taken, and take its exposure unless asked not to.
+  // Go to a photograph's pose, and use its exposure unless the control says not to.
   go(index) {
     this.stop();
     this.state.at = index;
@@ -126,7 +126,7 @@ class Page {
     Object.assign(this.state.look, { ev, gamma, balance, camera, curve: this.scene.look.curve });
   }
 
-  // Hand the photograph to the renderer, where the page has it.
+  // Give the photograph to the renderer if the page has it.
   async choosePhotograph() {
     const data = this.scene.photographs[this.state.at];
     if (!data || this.photographOf === this.state.at) return;
@@ -229,7 +229,7 @@ class Page {
     $("play").textContent = "▶ play";
   }
 
-  // Stand at a place along the drive, in photographs.
+  // Go to a place along the drive, in photographs.
   drive(place) {
     const views = this.drives[$("along").value].map((i) => this.scene.views[i]);
     const first = Math.min(Math.floor(place), views.length - 2), share = place - first;
@@ -284,7 +284,7 @@ class Page {
     this.show();
   }
 
-  // Make the controls say what the state is, and draw.
+  // Show the state in the controls, and draw.
   show() {
     const { look, show, at } = this.state;
     const sign = (v) => (v > 0 ? "+" : v < 0 ? "−" : "") + Math.abs(v).toFixed(2);
@@ -316,7 +316,7 @@ class Page {
   frame(now) {
     this.asleep = true;
     if (this.lost) return;
-    // After a rest nothing is known of the speed.
+    // After a rest the speed is unknown.
     const passed = this.lastFrame ? Math.min(now - this.lastFrame, 0.5) : 0;
     const steered = this.hands.steer(passed || 0.016);
     if (this.playing) {
@@ -347,7 +347,7 @@ class Page {
     }
   }
 
-  // Smaller pictures where the device cannot keep up, larger ones where it can.
+  // Draw smaller pictures if the device is too slow, and larger ones if it is fast.
   adapt(passed) {
     if (passed > SLOW) this.scale = Math.max(SMALLEST, this.scale * 0.8);
     else if (passed > 0 && passed < QUICK) this.scale = Math.min(1, this.scale * 1.1);
@@ -362,7 +362,7 @@ class Page {
       sorting.then((row) => {
         const same = this.sortedFor && row.every((v, k) => v === this.sortedFor[k]);
         this.sortedFor = row;
-        // The camera may have gone on while the worker was busy.
+        // The camera may have moved while the worker was busy.
         if (same && asked === this.pose) return;
         this.newOrder = true;
         this.wake();
@@ -404,7 +404,7 @@ class Page {
     const link = linkOf(this.state);
     if (link === this.written) return;
     this.written = link;
-    // Some browsers forbid it to pages opened from a disk.
+    // Some browsers forbid this for pages opened from a disk.
     try { history.replaceState(null, "", link); } catch { location.hash = link; }
   }
 
@@ -431,7 +431,7 @@ class Page {
     this.show();
   }
 
-  // Seconds that a frame takes, sorting aside: of `count` drawn one after the other.
+  // Mean seconds of a frame without sorting, from `count` consecutive frames.
   speed(count = 10) {
     const camera = this.windowCamera(), { gl } = this.renderer, pixel = new Uint8Array(4);
     const begin = performance.now();

@@ -1,4 +1,4 @@
-// Where photographs were taken, drawn over the picture: pyramids, coloured by exposure.
+// The cameras of photographs, drawn over the picture as pyramids with the colour of the exposure.
 
 class Marks {
   constructor(canvas, scene) {
@@ -52,7 +52,7 @@ class Marks {
     this.at = [];
   }
 
-  // The nearest camera whose mark is within reach of a place in the window, or null.
+  // The nearest camera whose mark is close to a place in the window, or null.
   find(x, y, reach) {
     const near = this.at.filter((m) => Math.hypot(m.x - x, m.y - y) < reach);
     return near.length ? near.reduce((a, b) => (a.z < b.z ? a : b)).index : null;

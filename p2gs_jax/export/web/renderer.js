@@ -1,12 +1,12 @@
-// Light in float: project, sort in a worker, composite back to front, develop.
+// Renders floating-point light: project, sort in a worker, composite back to front, develop.
 
 const ACTIVATIONS = { exp: 0, linear: 1 };
 const CURVES = { linear: 0, power: 1, srgb: 2, spline: 3 };
-// Largest half-precision number that leaves room for sums.
+// The largest half-precision number whose sums do not overflow.
 const HALF_MOST = 6e4;
 
 class Renderer {
-  // `precision`: 32 or 16 bits a channel; 32 where the device blends them.
+  // `precision`: 32 bits a channel if the device blends them, otherwise 16.
   constructor(canvas, scene, splats, precision) {
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false,
       preserveDrawingBuffer: true, powerPreference: "high-performance" });
@@ -16,7 +16,7 @@ class Renderer {
     this.startSorter(splats.means);
   }
 
-  // Make all that lies on the graphics device: also again, where a lost device comes back.
+  // Create everything on the graphics device, also after a lost device returns.
   build(splats) {
     const { gl, scene } = this;
     const float = gl.getExtension("EXT_color_buffer_float");
@@ -38,7 +38,7 @@ class Renderer {
     if (this.order) this.setOrder(this.order);
   }
 
-  // More than white, where browser and display offer it.
+  // Values above white, if browser and display support them.
   extendRange() {
     const { gl, canvas } = this;
     const offered = gl.drawingBufferStorage && gl.drawingBufferToneMapping &&
@@ -102,7 +102,7 @@ class Renderer {
       gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32UI, width, height);
       return texture;
     });
-    // Some devices hold 256 bits a pixel: there each column is projected by itself.
+    // Some devices hold only 256 bits a pixel: each column is projected separately there.
     this.projected = this.projections([[0, 1, 2]]) || this.projections([[0], [1], [2]]);
     if (!this.projected) throw new Error("This device cannot render to integers.");
     this.quads = gl.createVertexArray();
@@ -115,7 +115,7 @@ class Renderer {
     gl.bindVertexArray(null);
   }
 
-  // A framebuffer for each group of columns; null where the device cannot have them.
+  // A framebuffer for each group of columns; null if the device does not support it.
   projections(groups) {
     const { gl } = this;
     const made = groups.map((group) => {
@@ -130,7 +130,7 @@ class Renderer {
     return made.every(Boolean) ? made : null;
   }
 
-  // Whether the framebuffer can be drawn into; a device that was lost knows nothing of it.
+  // Whether the framebuffer can be drawn into; a lost device cannot answer.
   complete() {
     const { gl } = this;
     return gl.isContextLost() || gl.checkFramebufferStatus(gl.FRAMEBUFFER) === gl.FRAMEBUFFER_COMPLETE;
@@ -193,7 +193,7 @@ class Renderer {
     this.order = order;
   }
 
-  // Sort for a camera; resolves when the order is in use. One at a time: null while busy.
+  // Sort for a camera; resolves once the order is in use; null while another sort runs.
   sort(camera) {
     if (this.waiting) return null;
     const R = camera.R, c = camera.c;

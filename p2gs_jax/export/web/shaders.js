@@ -1,5 +1,5 @@
-// The same formulas as p2gs_jax/render/project.py, spherical_harmonics.py and
-// rasterize_reference.py, and for the picture p2gs_jax/photometry/formation.py.
+// The same formulas as p2gs_jax/render/project.py, harmonics.py and
+// tiles.py, and for the picture p2gs_jax/photometry/formation.py.
 
 const VERSION = "#version 300 es\nprecision highp float;\nprecision highp int;\n" +
   "precision highp sampler2D;\nprecision highp usampler2D;\nprecision highp sampler2DArray;\n";
@@ -9,7 +9,7 @@ void main() {
   gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0);
 }`;
 
-// One texel a Gaussian: where it falls in the picture, and its radiance towards the camera.
+// One texel for each Gaussian: its place in the picture, and its radiance towards the camera.
 const PROJECT = VERSION + `
 uniform sampler2DArray splats;
 uniform int count, coefficients, activation;
@@ -122,7 +122,7 @@ void main() {
   color = vec4(min(radiance, brightest) * alpha, alpha);
 }`;
 
-// Exposure, gamma, curve and white point; what is done to light is done once, here.
+// Exposure, gamma, curve and white point: the only change of light is here.
 const DEVELOP = VERSION + `
 uniform sampler2D linear, tables, photograph;
 uniform vec2 pictureSize, canvasSize;
@@ -134,7 +134,7 @@ uniform vec3 curveWhite;        // exposed radiance that the curve shows as 1
 uniform vec3 tableFirst, tableStep;
 uniform ivec3 tableRow;
 uniform mat3 vignetting;        // a column of k1, k2, k3 for each channel
-uniform vec3 frame;             // of the photograph: pixels of it a pixel of the canvas, its size
+uniform vec3 frame;             // the photograph's pixels for each pixel of the canvas, and its size
 uniform vec2 frameCentre;
 uniform float split;            // share of the canvas that shows the photograph
 uniform float most;             // largest display value
@@ -166,7 +166,7 @@ float table(float logLinear, int channel) {
   return a + (place - left) * (b - a);
 }
 
-// Straight up to middle grey; from there a shoulder that reaches 1 where white is asked for.
+// Linear up to mid-grey; from there a shoulder that reaches 1 at the chosen white point.
 float shoulder(float x, float top) {
   if (white == 1.0 || x <= GREY || top <= GREY) return x;
   float t = (x - GREY) / (top - GREY), w = (white * top - GREY) / (top - GREY);

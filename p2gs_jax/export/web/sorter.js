@@ -1,4 +1,4 @@
-// A worker: the Gaussians before the near plane from back to front, by depth exactly.
+// A worker that sorts the Gaussians beyond the near plane exactly by depth, from back to front.
 
 let means = null, near = 0;
 
@@ -24,7 +24,7 @@ onmessage = ({ data }) => {
   postMessage({ order }, [order.buffer]);
 };
 
-// Bits of positive floats are in the order of the floats: two passes of 16 bits, each stable.
+// The bits of positive floats sort like the floats: two stable passes of 16 bits.
 function farthestFirst(keys, rows) {
   let from = rows.slice(), keysFrom = keys.slice();
   for (const shift of [0, 16]) {
