@@ -1,8 +1,8 @@
-"""Photometry: how photographs come from radiance, and what is solved from their colours.
+"""Photometry: image formation, and its parameters from colours of shared points.
 
 Image formation (`formation`, `response`, `appearance` with `ppisp` and `luminance`, `display`)
-takes radiance to pictures and back. `sources` yield `observations` of shared points; `calibrate`
-chooses what varies (`models`, `candidates`) and solves it (`adjustment`) into a
-`solution`, of which `unmodelled` says what it leaves. A fit starts from its `parameters`.
-`metering` gives exposures to pictures that nobody took.
+turns radiance into pictures and back. `sources` yield `observations` of shared points. `calibrate`
+chooses a model and a curve (`models`, `candidates`) and solves for a `solution` (`adjustment`);
+`unmodelled` examines its residuals. `parameters` are the initial ones of a fit. `metering` chooses
+exposures of new pictures.
 """

@@ -1,12 +1,11 @@
-"""From observations to exposures, whatever their source: model only what the scene needs.
+"""From observations of any source to exposures, under the simplest model that suffices.
 
-What varies, times curves, is judged on held-out colours. Criterion: expected log predictive density
-of held-out observations in display units, so that models under different curves can be compared.
-The simplest model within max(2 standard errors, 0.01 nat) of the best is taken; the best itself
-over-selects (docs/photometry.md, 5). So is one whose predictions nobody could tell from the best's:
-sharp, noise-free images otherwise earn a gamma per view for differences of a hundredth of a stop
-(BUILD_NOTES). Curve and model are chosen together: a wrong curve fixed first drives every criterion
-to a gamma per view; so would a white balance that is left out.
+Models under different curves are compared by the expected log predictive density of held-out
+observations in display units. The choice is the simplest candidate within max(2 standard errors,
+0.01 nat) of the best; the best itself over-selects (docs/photometry.md, 5). A candidate whose
+predictions differ invisibly from the best's counts as well: otherwise sharp, noise-free images get
+a gamma per view for differences of 0.01 stops (BUILD_NOTES). Curve and model are chosen together: a
+wrong curve that is fixed first, or a missing white balance, leads to a gamma per view.
 """
 
 from __future__ import annotations
@@ -33,55 +32,55 @@ from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.scene.exposures import read_known_exposures
 from p2gs_jax.types import Scene
 
-# Points of a view that a given kind of curve is fitted to.
+# Points of each view to which a curve is fitted if the options give its kind.
 RESPONSE_PER_VIEW = 200
 HELD_OUT = 0.4
-# Candidates are compared on at most this many observations; the chosen one is solved on all.
+# Candidates are compared on at most this many observations; the choice is solved on all.
 MOST_OBSERVATIONS = 40_000
-SPLINE_OBSERVATIONS = 12_000  # a curve has few parameters; its basis is the most expensive one
+SPLINE_OBSERVATIONS = 12_000  # a curve has few parameters, and its basis is the most expensive
 
 OnChosen = Callable[[Form, Response], None]
-# Where a run's notes give the numbers behind a choice, and the gain from which it is clear, nat.
+# Beginning of the note with the numbers of a choice, and the gain, nat, from which it is clear.
 NUMBERS = "Held-out log-likelihood per observation beside the model kept (0.01 is little, 1 a lot)"
 CLEARLY = 0.1
 
 
 @dataclass(frozen=True)
 class CalibrationOptions:
-    """How observations are solved."""
+    """Options of a calibration."""
 
-    black: float  # values up to here say nothing
-    saturation: float  # values from here on say nothing
-    pivot: float  # linear value that gamma leaves alone
+    black: float  # display values up to this are not used
+    saturation: float  # display values from this on are not used
+    pivot: float  # linear value that gamma does not change
     known: KnownExposures | None = None
-    seed: int = 0  # which observations are held out
-    # What varies, and the curve: those that predict held-out colours, an exposure per view under
-    # one fitted response (stacks), or given ones; of a kind of curve, the splines are fitted.
+    seed: int = 0  # seed of the choice of held-out observations
+    # Model and curve: chosen on held-out colours, an exposure per view under one fitted response
+    # (stacks), or given; splines of a given kind of curve are fitted.
     choice: Literal["held_out", "one_response"] | tuple[Form, Response | Curve] = "held_out"
-    # What the photographs are, where they are light encoded as sRGB (`Scene.known_response`): no
-    # other curve is compared with held-out colours. None: a camera's own curve is in them.
+    # Kind of photographs that are light encoded as sRGB (`Scene.known_response`): no other curve is
+    # compared. None: the camera's tone curve is unknown.
     known_response: str | None = None
 
     def problem(self, observations: Observations) -> Problem:
-        """Lay observations out for the adjustment."""
+        """Return the observations prepared for the adjustment."""
         limits = {"black": self.black, "saturation": self.saturation, "pivot": self.pivot}
         return make_problem(observations, **limits, known=self.known)
 
 
 @dataclass(frozen=True)
 class Selection:
-    """What was chosen, and why."""
+    """The chosen model and curve, and the reasons."""
 
-    solution: PhotometricSolution  # the chosen model on all observations
-    candidates: tuple[Candidate, ...]  # everything compared, the best density first
+    solution: PhotometricSolution  # solution of the chosen model on all observations
+    candidates: tuple[Candidate, ...]  # all compared candidates, the best density first
     reasons: tuple[str, ...]  # sentences for the user
 
 
 def options_of(cfg: FitConfig, scene: Scene) -> CalibrationOptions:
-    """Return the options of a fit to a scene, whose training views are the ones observed.
+    """Return the options of a calibration of a scene's training views.
 
-    With `photometry.select` off, the model and curve of `cfg` are solved as they are. Raises
-    UserError: the known exposures cannot be read.
+    With `photometry.select` off, the model and curve are those of `cfg`. Raises UserError: the
+    known exposures cannot be read.
     """
     p = cfg.photometry
     known = None
@@ -100,7 +99,7 @@ def options_of(cfg: FitConfig, scene: Scene) -> CalibrationOptions:
 
 
 def _asked(p: PhotometryConfig) -> tuple[Form, Response | Curve]:
-    """Return what varies and the curve as the options say."""
+    """Return the model and the curve of the options."""
     form = Form(p.model, p.white_balance, p.vignetting)
     if p.curve == "spline" and p.spline is None:
         return form, Curve("srgb", p.responses)
@@ -118,7 +117,7 @@ def calibrate_observations(
     options: CalibrationOptions,
     on_chosen: OnChosen = lambda form, response: None,
 ) -> Selection:
-    """Choose the model and solve it; `on_chosen` is told of a choice by held-out colours first."""
+    """Choose a model and solve it; `on_chosen` is called between, if held-out colours decide."""
     if options.choice == "held_out":
         selection = _chosen(observations, options, on_chosen)
     elif options.choice == "one_response":
@@ -128,11 +127,11 @@ def calibrate_observations(
     coarse = observations.too_coarse
     if not coarse:
         return selection
-    said = (
+    note = (
         f"{coarse} of {coarse + len(observations.points)} observations were left out: their pixels "
-        f"cover more than {COARSEST:g} times what the closest view of the point resolves."
+        f"are more than {COARSEST:g} times as wide on the surface as those of the closest view."
     )
-    return dataclasses.replace(selection, reasons=(said, *selection.reasons))
+    return dataclasses.replace(selection, reasons=(note, *selection.reasons))
 
 
 def _given(
@@ -140,40 +139,40 @@ def _given(
 ) -> Selection:
     """Solve a form under a response, or under a kind of curve whose splines are fitted."""
     problem = options.problem(observations)
-    notes = _told(problem, free=isinstance(curve, Curve) or MODELS[form.model].gamma is not None)
+    notes = _notes(problem, free=isinstance(curve, Curve) or MODELS[form.model].gamma is not None)
     if isinstance(curve, Curve):
         few = problem.part(observations.thinned(RESPONSE_PER_VIEW, options.seed))
         base, beside = Response(curve.base), form._replace(model="view_exposure")
         fitted = fit_response(few, base, form=beside, by=curve.splines or "all")
         if fitted is None:
-            notes += (f"A fitted response collapsed: {curve.base} was used as it is.",)
+            notes += (f"A fitted response collapsed: {curve.base} is used without a spline.",)
         curve = fitted or base
     return Selection(fit_model(problem, form, curve), (), notes)
 
 
 def _by_one_response(problem: Problem) -> Selection:
-    """Solve an exposure per view under the base curve whose fitted spline leaves least unexplained.
+    """Solve an exposure per view under the base curve and fitted spline with the least residual.
 
-    A stack holds every level of tone often, so nothing needs to be chosen by held-out colours.
+    A stack shows every brightness often, so that no held-out colours are needed.
     """
     fitted = [fit_response(problem, Response(base)) for base in BASES]
     options = [fit_model(problem, "view_exposure", r) for r in fitted if r is not None]
     if not options:
-        collapsed = "A fitted response collapsed: sRGB was used as it is."
+        collapsed = "A fitted response collapsed: sRGB is used without a spline."
         return Selection(fit_model(problem, "view_exposure"), (), (collapsed,))
-    return Selection(min(options, key=lambda s: s.residual_ev), (), _told(problem))
+    return Selection(min(options, key=lambda s: s.residual_ev), (), _notes(problem))
 
 
-def _told(problem: Problem, *, free: bool = True) -> tuple[str, ...]:
-    """Say what known exposures tell; the power of the curve may be `free`."""
+def _notes(problem: Problem, *, free: bool = True) -> tuple[str, ...]:
+    """Return the note on what known exposures determine; the power of the curve may be `free`."""
     if problem.known is None:
         return ()
     head = f"The exposures of {np.isfinite(problem.known.log_exposures).sum()} view(s) are known"
     if not problem.told.size:
-        return (f"{head}: they fix the scale. The tone curve's power takes two that differ.",)
+        return (f"{head}: they fix the scale. Two different ones would fix the curve's power.",)
     if free:
-        return (f"{head}, and tell the tone curve's power, which photographs alone leave open.",)
-    return (f"{head}, and would tell the tone curve's power; it stays as the options say.",)
+        return (f"{head}, and fix the tone curve's power, which photographs do not determine.",)
+    return (f"{head}, and would fix the tone curve's power, which the options set.",)
 
 
 def _subset(observations: Observations, seed: int, most: int) -> Observations:
@@ -193,8 +192,8 @@ def _subset(observations: Observations, seed: int, most: int) -> Observations:
 def held_out(o: Observations, seed: int) -> Bool[np.ndarray, " o"]:
     """Return which observations to hold out: whole regions of images, in which errors are shared.
 
-    Held out one by one, each would be predicted by neighbours that err alike, and parameters that
-    explain such errors would look right (BUILD_NOTES, "Whole regions").
+    Single observations would be predicted by neighbours with the same error. Parameters that
+    explain such errors would then win (BUILD_NOTES, "Whole regions").
     """
     rng = generator(seed, Stream.HELD_OUT)
     if o.positions is None:
@@ -202,39 +201,39 @@ def held_out(o: Observations, seed: int) -> Bool[np.ndarray, " o"]:
     region = regions(o.positions, o.views, SHARED_REGION)
     view_of = np.zeros(int(region.max(initial=-1)) + 1, int)
     view_of[region] = o.views
-    # Of every view a share of its regions: at least one, if it keeps two.
+    # Hold out a share of every view's regions: at least one, if two remain.
     order = np.lexsort((rng.random(len(view_of)), view_of))
     count, first = np.bincount(view_of), np.searchsorted(view_of[order], view_of)
     rank = np.argsort(order) - first
-    taken = np.maximum(np.rint(HELD_OUT * count), count >= 3)
-    return (rank < taken[view_of])[region]
+    most = np.maximum(np.rint(HELD_OUT * count), count >= 3)
+    return (rank < most[view_of])[region]
 
 
 def _chosen(
     observations: Observations, options: CalibrationOptions, on_chosen: OnChosen
 ) -> Selection:
-    """Choose what varies and the curve on held-out observations, and solve that on all of them."""
+    """Choose model and curve on held-out observations, and solve them on all observations."""
     seed, problem = options.seed, options.problem(observations)
-    # What fixes the scale alone says nothing of models and curves.
-    told = options if problem.told.size else dataclasses.replace(options, known=None)
-    small = told.problem(_subset(observations, seed, MOST_OBSERVATIONS))
+    # Known exposures that fix only the scale do not distinguish models and curves.
+    used = options if problem.told.size else dataclasses.replace(options, known=None)
+    small = used.problem(_subset(observations, seed, MOST_OBSERVATIONS))
     held = held_out(small.observations, seed)
-    training = told.problem(_subset(small.observations.picked(~held), seed, SPLINE_OBSERVATIONS))
+    training = used.problem(_subset(small.observations.picked(~held), seed, SPLINE_OBSERVATIONS))
     search = Search(small, held, training, known=options.known_response is not None)
     notes = search.first()
     if options.known_response is not None:
         notes = [
-            f"The tone curve is known ({options.known_response}): none was fitted, and of light "
-            "encoded as sRGB it is sRGB's."
+            f"The tone curve is known ({options.known_response}): the photographs are light "
+            "encoded as sRGB, and no curve was fitted."
         ]
-    notes += _told(problem, free=options.known_response is None)
+    notes += _notes(problem, free=options.known_response is None)
     chosen = search.rest()
     on_chosen(chosen.form, chosen.response)
     candidates = sorted(search.judged(), key=lambda c: -c.density)
     if loose := sum(not f.converged for f, _ in search.fits.values()):
         notes.append(
-            f"{loose} of the {len(candidates)} models compared had not settled after "
-            f"{MOST_ROUNDS} rounds; they are judged as they were then."
+            f"{loose} of the {len(candidates)} models compared had not converged after "
+            f"{MOST_ROUNDS} rounds; their state after these rounds was compared."
         )
     solution = fit_model(problem, chosen.form, chosen.response)
     return Selection(solution, tuple(candidates), (*notes, *_reasons(chosen, candidates)))
@@ -243,7 +242,7 @@ def _chosen(
 def _reasons(chosen: Candidate, candidates: list[Candidate]) -> list[str]:
     """Return why a model was kept, and the numbers; candidates are sorted, the best density first.
 
-    What begins with `NUMBERS` is for the report.
+    The sentence that begins with `NUMBERS` is for the report only.
     """
     why, numbers = "", []
     if c := next((c for c in candidates if c.parameters < chosen.parameters), None):

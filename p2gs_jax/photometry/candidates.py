@@ -1,6 +1,6 @@
-"""Photometric models under curves, judged on colours that they have not seen.
+"""Photometric models and curves, compared on held-out colours.
 
-Densities over display values can be compared between curves; over decoded ones they could not.
+Densities are over display values: densities over decoded values depend on the curve.
 """
 
 from __future__ import annotations
@@ -37,42 +37,42 @@ from p2gs_jax.photometry.models import (
 from p2gs_jax.photometry.observations import Labels
 from p2gs_jax.photometry.response import BASES, Response, base_log
 
-# A response needs this spread of exposures, or of what vignetting leaves of the light, stops.
-# Without vignetting 0.02 is found, and 0.1 where corners lose 30 %.
+# Least spread of exposures, or of vignetted light, from which a response is fitted, stops.
+# The spread of light is 0.02 without vignetting, and 0.1 where corners lose 30 %.
 SPLINE_SPREAD_EV, SHADED_SPREAD_EV = 0.2, 0.05
-HOPELESS = 1.0  # nat per observation by which no tone curve makes up for missing exposures
-MOST_COMPARED = 80  # choices that are compared at most
+HOPELESS = 1.0  # deficit, nat per observation, that no tone curve compensates
+MOST_COMPARED = 80  # largest number of choices that are compared
 STANDARD_ERRORS, SMALLEST_GAIN = 2.0, 0.01
-LARGEST_CHANCE = 0.25  # nat per observation that no standard error of few regions excuses
-# Predictions that differ by no more than this in any view are as good as equal, 8-bit levels.
+LARGEST_CHANCE = 0.25  # largest deficit that a standard error excuses, nat per observation
+# Predictions that differ by at most this in every view count as equal, 8-bit levels.
 INVISIBLE_DIFFERENCE = 1.0
-# The predictive density is a mixture: outliers exist, and must not decide.
+# The predictive density is a mixture, so that outliers do not decide: their share and deviation.
 OUTLIERS, OUTLIER_DEVIATION = 0.1, 1.2
-RANGES = 8  # of brightness, as many values in each, in which errors of predictions are measured
+RANGES = 8  # number of ranges of brightness, equal in count, in which prediction errors are scaled
 
 
 @dataclass(frozen=True)
 class Candidate:
     """One form under one curve."""
 
-    choice: Choice  # what varies, and the kind of curve
+    choice: Choice  # form and kind of curve
     response: Response  # the curve
-    parameters: int  # free parameters, gauges not counted
+    parameters: int  # number of free parameters, without gauges
     density: float  # mean held-out log density, nat per observation
-    deficit: float  # how much lower than the best candidate's density, nat per observation
-    deficit_error: float  # standard error of that, over views or regions of images
-    # By how much its predictions differ from the best's, 8-bit levels: RMS of the view where that
-    # is largest.
+    deficit: float  # density of the best candidate minus this one, nat per observation
+    deficit_error: float  # standard error of the deficit, over views or regions of images
+    # Difference of its predictions from the best's, 8-bit levels: RMS in the view where it is
+    # largest.
     difference: float
 
     @property
     def form(self) -> Form:
-        """What varies."""
+        """The form: parameters that vary."""
         return self.choice.form
 
     @property
     def name(self) -> str:
-        """What reports call it."""
+        """Name in reports."""
         return f"{self.form.description}, {self.response.name}"
 
     @property
@@ -83,29 +83,29 @@ class Candidate:
 
     @property
     def good(self) -> bool:
-        """Whether it is not clearly worse than the best, or nobody could tell."""
+        """Whether it is not clearly worse than the best, or the difference is invisible."""
         return self.likely or self.difference <= INVISIBLE_DIFFERENCE
 
 
 def choose(candidates: list[Candidate]) -> Candidate:
     """Return the simplest candidate that is not clearly worse than the best."""
     simplest = min((c for c in candidates if c.good), key=lambda c: c.parameters)
-    # Curves cost nothing within a form.
+    # Among equally simple candidates the density decides.
     as_simple = [c for c in candidates if c.parameters <= simplest.parameters]
     return max(as_simple, key=lambda c: c.density)
 
 
 class Predicted(NamedTuple):
-    """What a fit says about held-out observations, NaN where it can say nothing."""
+    """Predictions of held-out observations; NaN where a fit predicts nothing."""
 
     densities: Float[np.ndarray, " h"]  # log densities
     errors: Float[np.ndarray, "h 3"]  # photographed minus predicted display values
 
 
 class Search:
-    """Choices solved so far (`fits`), and how well they predict what was `held` out.
+    """Choices solved so far (`fits`), and how well they predict the observations `held` out.
 
-    Splines are fitted to `training`, a part of the rest. If the curve is `known`, it is sRGB's.
+    Splines are fitted to `training`, a part of the others. If the curve is `known`, it is sRGB.
     """
 
     def __init__(
@@ -119,21 +119,21 @@ class Search:
         self._predicted: dict[Choice, Predicted] = {}
         self._hopeless: set[Level | None] = set()
         self._fitted: dict[tuple[Form, Curve], Response | None] = {}
-        # How the light of one surface varies under sRGB, log units; None: each form solves it.
+        # Spread of the light of one surface under sRGB, log units; None: each form solves it.
         self._spread: float | None = light_spread(self._solve(Choice(EXPOSURES), Response()))
         self._exposed = self._spread / LN2
-        told, places = self._exposed >= SPLINE_SPREAD_EV, o.positions is not None
-        if not told and places:
-            # Equal exposures tell a curve as well where each surface is seen darker in corners.
+        curves, places = self._exposed >= SPLINE_SPREAD_EV, o.positions is not None
+        if not curves and places:
+            # Vignetting determines a curve at equal exposures: corners show surfaces darker.
             shaded = self._solve(Choice(EXPOSURES._replace(vignetting="camera")), Response())
-            told, self._spread = light_spread(shaded) / LN2 >= SHADED_SPREAD_EV, None
+            curves, self._spread = light_spread(shaded) / LN2 >= SHADED_SPREAD_EV, None
         cameras = int(o.cameras.max(initial=0)) + 1
-        self._scope = Scope(cameras, places, told, known, problem.told.size > 0)
+        self._scope = Scope(cameras, places, curves, known, problem.told.size > 0)
         if not self._scope.allows(Choice(EXPOSURES)):
             self.fits.clear()
 
     def first(self) -> list[str]:
-        """Solve models under curves, and what cameras may do; say which curves were left out."""
+        """Solve models under curves, with effects of cameras; return notes on omitted curves."""
         self._try(Choice(Form(model)) for model in MODELS)
         self._rule_out()
         curves = [*(Curve(base) for base in BASES), Curve("srgb", "all")]
@@ -142,20 +142,20 @@ class Search:
         shade = "camera" if self._scope.places else None
         richest = [Form(model, "view", shade) for model in models]
         self._try(Choice(form, curve) for curve in curves for form in richest)
-        # One response for different cameras may collapse where theirs would not.
+        # One response for different cameras may collapse where separate ones do not.
         for by in ("camera", "channel"):
             self._try(Choice(form, Curve("srgb", by)) for form in (EXPOSURES, richest[0]))
         if not self._scope.curves:
             return [
-                f"Exposures differ by {self._exposed:.2f} EV (standard deviation): too little "
-                "to tell the shape of the tone curve, so only standard curves were tried."
+                f"Exposures differ by {self._exposed:.2f} EV (standard deviation): too little to "
+                "determine the shape of the tone curve, so only standard curves were compared."
             ]
         if all(response is None for response in self._fitted.values()):
             return ["A fitted tone curve collapsed; only standard curves were compared."]
         return []
 
     def rest(self) -> Candidate:
-        """Compare what is one step from the choice, or simpler than the best; choose."""
+        """Compare the neighbours of the choice, and simpler ones of the best; return the choice."""
         while True:
             candidates = self.judged()
             chosen = choose(candidates)
@@ -167,7 +167,7 @@ class Search:
                 return chosen
 
     def _try(self, choices: Iterable[Choice]) -> bool:
-        """Solve choices that are possible and not solved yet; return whether there were any."""
+        """Solve choices that are possible and not solved yet; return whether any was solved."""
         found = False
         for choice in choices:
             exposure = MODELS[choice.form.model].exposure
@@ -179,7 +179,7 @@ class Search:
         return found
 
     def _rule_out(self) -> None:
-        """Find exposures of which no curve can make anything: their best predicts far worse."""
+        """Rule out levels of exposure whose best candidate predicts much worse than the best."""
         best: dict[Level | None, float] = {}
         for candidate in self.judged():
             level = MODELS[candidate.form.model].exposure
@@ -187,24 +187,24 @@ class Search:
         self._hopeless = {k for k, d in best.items() if d < max(best.values()) - HOPELESS}
 
     def _response(self, choice: Choice) -> Response | None:
-        """Return the curve of a choice, fitted beside what cameras do; None: it collapsed."""
+        """Return the curve of a choice, fitted with its effects of cameras; None: it collapsed."""
         curve = choice.curve
         if curve.splines is None:
             return Response(curve.base)
         form = choice.form._replace(model="view_exposure")
         if (form, curve) not in self._fitted:
-            how = {"form": form, "by": curve.splines, "spread": self._spread}
-            self._fitted[form, curve] = fit_response(self._training, Response(curve.base), **how)
+            setup = {"form": form, "by": curve.splines, "spread": self._spread}
+            self._fitted[form, curve] = fit_response(self._training, Response(curve.base), **setup)
         return self._fitted[form, curve]
 
     def _solve(self, choice: Choice, response: Response) -> Fit:
-        """Solve a choice under its curve on what is not held out."""
-        how = {"use": self._use, "tolerance": COMPARED, "near": self._nearest(choice)}
-        self.fits[choice] = solve_model(self._problem, choice.form, response, **how)[0], response
+        """Solve a choice under its curve on the observations that are not held out."""
+        setup = {"use": self._use, "tolerance": COMPARED, "near": self._nearest(choice)}
+        self.fits[choice] = solve_model(self._problem, choice.form, response, **setup)[0], response
         return self.fits[choice][0]
 
     def _nearest(self, choice: Choice) -> Fit | None:
-        """Return the solution of the choice that has most in common; exposures count most."""
+        """Return the solution of the most similar choice; exposures count most."""
         exposure = MODELS[choice.form.model].exposure
 
         def common(other: Choice) -> int:
@@ -215,11 +215,11 @@ class Search:
         return self.fits[max(self.fits, key=common)][0] if self.fits else None
 
     def judged(self) -> list[Candidate]:
-        """Return every solution with how well it predicts."""
+        """Return a candidate for every solution, with the quality of its predictions."""
         for choice, fit in self.fits.items():
             if choice not in self._predicted:
                 self._predicted[choice] = _predict(self._problem, *fit, self._where)
-        # Where nothing is known, no solution predicts anything.
+        # A solution may predict no observation at all.
         density = {
             k: -np.inf if np.isnan(p.densities).all() else float(np.nanmean(p.densities))
             for k, p in self._predicted.items()
@@ -234,7 +234,7 @@ class Search:
 
     def _candidate(self, choice: Choice, density: float, best: Predicted) -> Candidate:
         found = self._predicted[choice]
-        # Neighbours in an image err alike, as do its pixels.
+        # Errors are correlated within a view and within a region of an image.
         lower, labels = best.densities - found.densities, (self._views, self._regions)
         deficits, errors = zip(*(_mean_deficit(lower, of) for of in labels), strict=True)
         difference = _largest_difference(best.errors - found.errors, self._views)
@@ -243,10 +243,10 @@ class Search:
 
 
 def _predict(problem: Problem, fit: Fit, response: Response, held: np.ndarray) -> Predicted:
-    """Return what a fit says about rows that were held out.
+    """Return predictions of held-out rows.
 
-    Curves differ in what they call noise, and must not be chosen for that: noise is that of sRGB,
-    and how far predictions are off is measured in units of it, in ranges of brightness.
+    The noise model depends on the curve, but must not decide between curves. The noise is that of
+    sRGB, and prediction errors are scaled in its units, in ranges of brightness.
     """
     o, layout = problem.observations, problem.layout
     sigma, slope = (a[held] for a in o.decoded(response)[1:])
@@ -255,9 +255,9 @@ def _predict(problem: Problem, fit: Fit, response: Response, held: np.ndarray) -
     a = fit.theta.a[o.views[held]][:, None]
     error = fit.at.residual[held] / slope
     standard, noise = base_log(y, "srgb")[1], o.picked(held).decoded(Response())[1]
-    # Points are as uncertain as what they are seen by.
-    known_by = 1 + a**2 / np.maximum(precision * sigma**2, 1e-9)
-    variance = (noise / standard) ** 2 * known_by
+    # The radiance of a point is uncertain as well.
+    of_point = 1 + a**2 / np.maximum(precision * sigma**2, 1e-9)
+    variance = (noise / standard) ** 2 * of_point
     if known.any():
         ranges = np.quantile(y[known], np.arange(1, RANGES) / RANGES)
         at = np.where(known, np.searchsorted(ranges, y), -1)
@@ -271,7 +271,7 @@ def _predict(problem: Problem, fit: Fit, response: Response, held: np.ndarray) -
     inlier = np.log(1 - OUTLIERS) + normal(variance)
     wide = variance + (OUTLIER_DEVIATION / standard) ** 2
     density = np.logaddexp(inlier, np.log(OUTLIERS) + normal(wide))
-    # Channels are correlated: an observation counts once, as their mean.
+    # Channels are correlated: an observation counts once, as the mean of its channels.
     count = known.sum(1)
     return Predicted(
         np.where(count > 0, (density * known).sum(1) / np.maximum(count, 1), np.nan),
@@ -288,7 +288,7 @@ def _largest_difference(difference: Float[np.ndarray, "h 3"], views: Labels) -> 
 
 
 def _mean_deficit(difference: np.ndarray, labels: Labels) -> tuple[float, float]:
-    """Return the mean of what is known, and its standard error over views or regions."""
+    """Return the mean of finite values, and its standard error over views or regions."""
     known, count = np.isfinite(difference), int(labels.max(initial=-1)) + 1
     if not known.any():
         return 0.0, np.inf

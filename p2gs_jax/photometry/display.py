@@ -1,6 +1,6 @@
-"""From radiance to a picture: an exposure, a gamma, a tone curve, and what else a view does.
+"""From radiance to a picture: exposure, gamma, tone curve and other parameters of a view.
 
-A transform without a camera shows no vignetting, and the response of no camera in particular.
+A transform without a camera has no vignetting, and the common or mean response of all cameras.
 """
 
 from __future__ import annotations
@@ -41,22 +41,22 @@ Opacity = Float[Array, "h w"] | Float[np.ndarray, "h w"] | None
 
 @dataclass(frozen=True)
 class DisplayTransform:
-    """How radiance is shown."""
+    """Parameters of the map from radiance to display values."""
 
     exposure: float  # e > 0, in the run's gauge
     gamma: float  # > 0
     formation: PhotometryConfig  # base curve, pivot, clamping, cameras, kind of correction
     correction: Correction | None = None  # of display values (photometry/appearance.py)
-    # Log factors on red, green, blue beside the exposure; None: all 1.
+    # Log factors on red, green, blue beside the exposure; None: all factors are 1.
     white_balance: Balance | None = None
-    # Row in `formation.cameras`, whose vignetting and response it has; None: no camera's.
+    # Row in `formation.cameras` of the vignetting and the response; None: no camera.
     camera: int | None = None
-    # Display values that pictures are put over, after all else: of all pixels or of each.
+    # Display values of the background behind pictures: for all pixels or for each.
     backdrop: Balance | Float32[np.ndarray, "h w 3"] | None = None
 
     @property
     def capture(self) -> Capture:
-        """What it does to light, for `formation`."""
+        """Its parameters for `formation`."""
         w = self.white_balance
         return on_host(
             Capture,
@@ -68,7 +68,7 @@ class DisplayTransform:
 
     @property
     def vignetting(self) -> tuple[tuple[float, ...], ...]:
-        """Coefficients of its vignetting: for all channels, or for each; empty: none."""
+        """Coefficients of its vignetting: one row, or one per channel; empty: no vignetting."""
         known = self.camera is not None and self.camera >= 0
         return self.formation.cameras[self.camera].vignetting if known else ()  # pyright: ignore
 
@@ -79,7 +79,7 @@ class DisplayTransform:
         return (red - green) / LN2, (blue - green) / LN2
 
     def matte(self, alpha: Opacity) -> Matte | None:
-        """Return what a render of this opacity is put over; None: nothing, or it is not known."""
+        """Return the background of a render of this opacity; None: there is none."""
         if alpha is None or self.backdrop is None:
             return None
         return Matte(alpha, np.asarray(self.backdrop, np.float32))
@@ -91,26 +91,26 @@ class DisplayTransform:
         return replace(self, white_balance=balance)
 
     def without_place(self) -> DisplayTransform:
-        """Return the transform for what lies nowhere in an image: without vignetting.
+        """Return the transform for colours without a position in an image: without vignetting.
 
-        The response of the camera stays, and of a correction what is the same everywhere.
+        The response of the camera stays, and the part of a correction that is equal everywhere.
         """
-        kept = without_place(self.correction, self.formation.appearance)
-        plain = self if kept is self.correction else replace(self, correction=kept)
+        correction = without_place(self.correction, self.formation.appearance)
+        plain = self if correction is self.correction else replace(self, correction=correction)
         if self.camera is None:
             return plain
         cameras = tuple(replace(c, vignetting=()) for c in self.formation.cameras)
         return replace(plain, formation=replace(self.formation, cameras=cameras))
 
     def with_curve(self, curve: Curve) -> DisplayTransform:
-        """Return the transform under another base curve; a correction belongs to the old one.
+        """Return the transform under another base curve, without the correction of the old curve.
 
-        Raises UserError: `spline` where the run has none.
+        Raises UserError: the curve is `spline` and the run has none.
         """
         if curve == self.formation.curve:
             return self
         if curve == "spline" and self.formation.spline is None and not by_camera(self.formation):
-            fix = f"choose another, or leave it out for the run's own ({self.formation.curve})"
+            fix = f"choose another, or leave it out for that of the run ({self.formation.curve})"
             raise UserError("The curve cannot be spline: the run has no spline.", fix=fix)
         return replace(self, formation=replace(self.formation, curve=curve), correction=None)
 
@@ -120,19 +120,18 @@ def develop(
 ) -> Float32[np.ndarray, "... 3"]:
     """Return display values in [0, 1] of linear radiance.
 
-    All but the configuration is traced: changing it compiles nothing. Where there is a
-    correction or vignetting, the radiance is an image, or lies at `positions`
-    (photometry/formation.py:places). The transform's backdrop counts if the opacity `alpha` of
-    the render is given.
+    Only a change of `formation` compiles a new program. With a correction or vignetting, the
+    radiance is an image, or lies at `positions` (photometry/formation.py:places). The backdrop of
+    the transform is shown if the opacity `alpha` of the render is given.
     """
-    how = (transform.capture, transform.correction, positions, transform.matte(alpha))
-    return np.asarray(_develop(linear, *how, transform.formation))
+    traced = (transform.capture, transform.correction, positions, transform.matte(alpha))
+    return np.asarray(_develop(linear, *traced, transform.formation))
 
 
 @functools.partial(jax.jit, static_argnames="cfg")
 def _develop(linear, capture, correction, positions, matte, cfg: PhotometryConfig):
-    own = formation(uncovered(linear, matte), capture, cfg, correction, positions)
-    return composited(display(own), matte)
+    ldr = formation(uncovered(linear, matte), capture, cfg, correction, positions)
+    return composited(display(ldr), matte)
 
 
 def undevelop(
@@ -140,37 +139,37 @@ def undevelop(
 ) -> Float32[np.ndarray, "... 3"]:
     """Return the linear radiance that a photograph shows: the inverse of `develop`, on the host.
 
-    Saturated values count as the radiance at which they saturate, values below half a code as that;
-    corrections of display values are not undone. `positions` as for `develop`.
+    Saturated values give the radiance at which they saturate, values below half an 8-bit code that
+    of half a code. Corrections of display values are not undone. `positions` are as for `develop`.
     """
     shown = np.asarray(ldr, np.float32)
     return inverse_formation(shown, transform.capture, transform.formation, positions)
 
 
 def display_of_view(params: Params, row: int, cfg: PhotometryConfig) -> DisplayTransform:
-    """Return how the training view in a row was taken; compiles nothing of host arrays."""
-    taken = jax.tree.map(np.asarray, params.photometry).capture(row)
+    """Return the transform of the training view in a row; host arrays compile no program."""
+    capture = jax.tree.map(np.asarray, params.photometry).capture(row)
     plain = DisplayTransform(1.0, 1.0, cfg, correction_of(params.appearance, row))
-    return with_capture(plain, taken)
+    return with_capture(plain, capture)
 
 
-def with_capture(transform: DisplayTransform, taken: Capture) -> DisplayTransform:
-    """Return a transform that does to light what a photograph did."""
+def with_capture(transform: DisplayTransform, capture: Capture) -> DisplayTransform:
+    """Return a transform with the photometric parameters of a photograph."""
     return replace(
         transform,
-        exposure=float(taken.exposure),
-        gamma=float(taken.gamma),
-        white_balance=_balance(taken.white_balance),
-        camera=None if taken.camera is None else int(taken.camera),
+        exposure=float(capture.exposure),
+        gamma=float(capture.gamma),
+        white_balance=_balance(capture.white_balance),
+        camera=None if capture.camera is None else int(capture.camera),
     )
 
 
 @dataclass(frozen=True)
 class MeanParameters:
-    """Parameters of a view that has none of its own: means over the training views."""
+    """Parameters of views that were not fitted: means over the training views."""
 
     exposure: float  # arithmetic mean (paper, eq. 6)
-    exposure_geometric: float  # geometric mean, which the gauges leave in place
+    exposure_geometric: float  # geometric mean, which the gauges do not change
     gamma: float  # arithmetic mean
     # Mean of the log factors, or None where white balance is not modelled.
     white_balance: Balance | None = None
@@ -178,32 +177,32 @@ class MeanParameters:
 
 def mean_parameters(photometry: Photometry) -> MeanParameters:
     """Return the means over the training views."""
-    taken: Photometry = jax.tree.map(np.asarray, photometry)
-    e = taken.exposures.astype(np.float64)
+    host: Photometry = jax.tree.map(np.asarray, photometry)
+    e = host.exposures.astype(np.float64)
     return MeanParameters(
         float(e.mean()),
         float(np.exp(np.log(e).mean())),
-        float(taken.gammas.astype(np.float64).mean()),
-        _mean_balance(taken),
+        float(host.gammas.astype(np.float64).mean()),
+        _mean_balance(host),
     )
 
 
 def usual_display(
     params: Params, taken_by: Sequence[str], camera: str | None, cfg: PhotometryConfig
 ) -> DisplayTransform:
-    """Return how a view of a camera (None: of none) is shown that has no parameters of its own.
+    """Return the transform of a view that was not fitted, of a camera or (None) of no camera.
 
     Its exposure is the geometric mean over the training views, its gamma and its correction are
-    the mean ones. Its white balance is the mean over all training views, or over those of its
-    camera where it varies by camera only. Its vignetting and its response are its camera's,
-    those of a correction as well. `taken_by` is the camera of every training view.
+    arithmetic means. Its white balance is the mean over all training views, or over those of its
+    camera if it varies by camera only. Its vignetting and its response, also those of a correction,
+    are its camera's. `taken_by` is the camera of every training view.
     """
-    taken: Photometry = jax.tree.map(np.asarray, params.photometry)
-    mean = mean_parameters(taken)
+    photometry: Photometry = jax.tree.map(np.asarray, params.photometry)
+    mean = mean_parameters(photometry)
     balance = mean.white_balance
-    own = np.array([name == camera for name in taken_by], bool)
-    if cfg.white_balance == "camera" and own.any():
-        balance = _mean_balance(taken, own)
+    rows_of_camera = np.array([name == camera for name in taken_by], bool)
+    if cfg.white_balance == "camera" and rows_of_camera.any():
+        balance = _mean_balance(photometry, rows_of_camera)
     correction = mean_correction(params.appearance, camera)
     rows = None if camera is None else camera_rows((camera,), cfg)
     row = None if rows is None else rows[0]

@@ -1,16 +1,16 @@
 """The image formation model: radiance, times exposure, through a tone curve (paper, Sec. 3.3).
 
 Paper: y = clamp(clamp(eL, 1e-6, 10)^(1/gamma), 0, 1). Robust (docs/photometry.md, 4):
-y = OETF(x0 (eL/x0)^(2.2/gamma)) with a pivot x0 at mid-grey that a change of gamma leaves alone,
-continued above 1 so that over-bright predictions keep a gradient. Where a scene needs it, e L is
-e W V L with the white balance W of the view and the vignetting V of its camera, and each camera has
-an OETF of its own (photometry/response.py). What is not modelled leaves the trace.
+y = OETF(x0 (eL/x0)^(2.2/gamma)) with a pivot x0 at mid-grey that gamma does not change. The curve
+continues above 1, so that over-bright predictions have a gradient. If a scene needs it, e L becomes
+e W V L with the white balance W of the view and the vignetting V of its camera, and every camera
+has a different OETF (photometry/response.py). Effects that are not modelled are not compiled.
 
 V of camera c darkens towards the corners: log V_c(r) = k1 r^2 + k2 r^4 + k3 r^6 with r = 1 in the
 corners of the image (docs/photometry.md, 1). Positions are measured from the image's centre in
 units of half its diagonal, so that they do not depend on the size of the image.
 
-All functions compute with numpy on host arrays and with JAX on others (`numerics.namespace`).
+All functions use numpy for host arrays and JAX for others (`numerics.namespace`).
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from p2gs_jax.types import GAMMA_SRGB, Array, Capture
 
 EXPOSED_FLOOR, EXPOSED_CEILING = 1e-6, 10.0  # paper, Tone-mapping estimation
 SRGB_LINEAR_END, SRGB_ENCODED_END = 0.0031308, 0.04045
-LEAST_ALPHA = 1e-3  # opacities below this count as this where radiance is divided by them
-# A row of `PhotometryConfig.cameras`, one for every pixel, or None where it makes no difference.
+LEAST_ALPHA = 1e-3  # lower bound of opacities by which radiance is divided
+# A row of `PhotometryConfig.cameras`, one row for every pixel, or None where it has no effect.
 CameraRow = Int[Array, "..."] | int | None
-# Of loose pixels in their images, from the centre in units of half the diagonal.
+# Positions of single pixels in their images, from the centre in units of half the diagonal.
 Positions = Float[Array, "*n 2"] | Float[np.ndarray, "*n 2"] | None
 
 
@@ -49,7 +49,7 @@ def eotf(encoded: Values, curve: str) -> Values:
 
 
 def camera_rows(names: Sequence[str], cfg: PhotometryConfig) -> tuple[int, ...] | None:
-    """Return the row of each camera in `cfg.cameras`: -1 if it is not there; None if none is."""
+    """Return the row of each camera in `cfg.cameras`, or -1; None: `cfg` has no cameras."""
     known = [camera.name for camera in cfg.cameras]
     return tuple(known.index(n) if n in known else UNKNOWN for n in names) if known else None
 
@@ -60,24 +60,24 @@ def darkens(cfg: PhotometryConfig) -> bool:
 
 
 def vignetting_table(cfg: PhotometryConfig) -> Float[np.ndarray, "c k n"]:
-    """Return the coefficients of all cameras and of an unknown one, which has none.
+    """Return the coefficients of all cameras, and zeros for an unknown camera in the last row.
 
-    There is one row (K = 1) for all channels, or one for each where any camera has that.
+    There is one polynomial (K = 1) for all channels, or K = 3 if any camera has one per channel.
     """
     rows = max([1, *(len(camera.vignetting) for camera in cfg.cameras)])
     terms = max([1, *(len(row) for c in cfg.cameras for row in c.vignetting)])
     table = np.zeros((len(cfg.cameras) + 1, rows, terms), np.float32)
-    for place, camera in zip(table, cfg.cameras, strict=False):
-        for channel in range(len(place)) if camera.vignetting else ():
+    for entry, camera in zip(table, cfg.cameras, strict=False):
+        for channel in range(len(entry)) if camera.vignetting else ():
             row = camera.vignetting[channel if len(camera.vignetting) > 1 else 0]
-            place[channel, : len(row)] = row
+            entry[channel, : len(row)] = row
     return table
 
 
 def squared_radii(height: int, width: int, xp: Any = np) -> Float[Any, "h w"]:
     """Return r^2 of the pixels of an image: 0 in its centre, 1 in its corners.
 
-    With JAX as `xp`, a compiled program holds a row and a column of them, not the image.
+    With JAX as `xp`, a compiled program holds one row and one column, not the image.
     """
     diagonal = (height**2 + width**2) / 4
     y, x = np.arange(height) + 0.5 - height / 2, np.arange(width) + 0.5 - width / 2
@@ -94,7 +94,7 @@ def places(xy: Values, width: int, height: int) -> Values:
 def log_vignetting(
     squared: Values, camera: Int[Array, "..."] | int, cfg: PhotometryConfig
 ) -> Values:
-    """Return log V at r^2, with an axis of one or three channels appended, of a row or of each."""
+    """Return log V at r^2 with an appended axis of 1 or 3 channels, of one camera or one each."""
     xp = namespace(squared, camera)
     k = xp.asarray(vignetting_table(cfg))[camera]
     s = squared[..., None]
@@ -112,10 +112,10 @@ def corner(camera: CameraFormation) -> tuple[float, ...]:
 def gain(
     shape: tuple[int, ...], capture: Capture, cfg: PhotometryConfig, positions: Positions = None
 ) -> Any:
-    """Return e W V: exposed radiance over radiance (paper, eq. 4: e), to broadcast against it.
+    """Return e W V, the factor on radiance (paper, eq. 4: e), to broadcast against it.
 
-    `capture` is of the view, or of each of loose pixels; these have `positions`, or none. Raises
-    ValueError: vignetting is modelled, and nobody knows where in the image the pixels lie.
+    `capture` is of the view, or of every single pixel; `positions` are those of single pixels.
+    Raises ValueError: vignetting is modelled, and positions of single pixels are missing.
     """
     e = _by_pixel(capture.exposure)
     logs: Any = capture.white_balance
@@ -126,7 +126,7 @@ def gain(
         elif len(shape) == 3 and not np.ndim(capture.camera):
             squared = squared_radii(*shape[:2], namespace(e, logs, capture.camera))
         else:
-            raise ValueError("vignetting needs an image, or the positions of pixels in theirs")
+            raise ValueError("vignetting needs an image, or positions of single pixels")
         shade = log_vignetting(squared, capture.camera, cfg)
         logs = shade if logs is None else logs + shade
     return e if logs is None else e * namespace(e, logs).exp(logs)
@@ -138,7 +138,7 @@ def tone_map(
     """Return the display-encoded image of exposed radiance e L.
 
     Radiance below 1e-6 counts as 1e-6 with zero gradient. In the paper's form dT/dgamma is -(ln
-    x / gamma^2) x^(1/gamma). `camera` counts where cameras have curves of their own.
+    x / gamma^2) x^(1/gamma). `camera` is used if cameras have different curves.
     """
     xp = namespace(exposed, gamma)
     if cfg.clamp:
@@ -167,7 +167,7 @@ def tone_map(
 def inverse_tone_map(
     ldr: Values, gamma: Scalar, cfg: PhotometryConfig, camera: CameraRow = None
 ) -> Values:
-    """Return the exposed radiance e L of display values; those below half a code count as that."""
+    """Return the exposed radiance e L of display values, which are at least half an 8-bit code."""
     xp = namespace(ldr, gamma)
     y = xp.maximum(ldr, DARKEST)
     if cfg.curve == "power" and cfg.pivot == 1.0:
@@ -181,10 +181,10 @@ def inverse_tone_map(
 
 
 def exposed_at(level: float, gamma: float, cfg: PhotometryConfig) -> float:
-    """Return the exposed radiance that shows as a display value; the least of several curves."""
-    shown = np.full(3, level, np.float32)
+    """Return the exposed radiance that maps to a display value; the least of several curves."""
+    ldr = np.full(3, level, np.float32)
     rows = range(-1, len(cfg.cameras)) if cfg.cameras else (None,)
-    return min(float(inverse_tone_map(shown, np.float32(gamma), cfg, row).min()) for row in rows)
+    return min(float(inverse_tone_map(ldr, np.float32(gamma), cfg, row).min()) for row in rows)
 
 
 def formation(
@@ -194,20 +194,20 @@ def formation(
     correction: Correction | None = None,
     positions: Positions = None,
 ) -> Values:
-    """Return T(e W V L): what the camera records of radiance `linear`.
+    """Return T(e W V L), the display values of radiance `linear`.
 
     With a `correction` of the view's display values, the radiance is an image. `capture` is of
-    the view, or of each of loose pixels, which need `positions` if vignetting counts (see
-    `gain`).
+    the view, or of every single pixel; single pixels need `positions` if vignetting is modelled
+    (see `gain`).
     """
-    shown: Any = linear
+    ldr: Any = linear
     if isinstance(correction, Formation):
-        return correction.apply(shown, capture)  # pyright: ignore[reportReturnType]
+        return correction.apply(ldr, capture)  # pyright: ignore[reportReturnType]
     exposed = gain(linear.shape, capture, cfg, positions) * linear
-    shown = tone_map(exposed, _by_pixel(capture.gamma), cfg, capture.camera)
+    ldr = tone_map(exposed, _by_pixel(capture.gamma), cfg, capture.camera)
     if cfg.appearance is not None and correction is not None:
-        shown = corrected(shown, correction, cfg.appearance)
-    return shown
+        ldr = corrected(ldr, correction, cfg.appearance)
+    return ldr
 
 
 def inverse_formation(
@@ -219,39 +219,39 @@ def inverse_formation(
 
 
 def _by_pixel(gamma: Any) -> Any:
-    """Return the gamma of a view as it is, and those of pixels with an axis for the channels."""
+    """Return the gamma of a view unchanged, and gammas of pixels with an axis for the channels."""
     return gamma[..., None] if np.ndim(gamma) else gamma
 
 
 def display(ldr: Values) -> Values:
-    """Clamp to what a display or an 8-bit file can hold."""
+    """Return values clamped to the range of a display or an 8-bit file."""
     return namespace(ldr).clip(ldr, 0.0, 1.0)
 
 
 class Matte(NamedTuple):
-    """What a render is put over, and how much of it shows.
+    """The background of a render, and the opacity in front of it.
 
-    A file with alpha holds the display colour c of what is there and how much of the pixel that
-    covers; published comparisons show a c + (1 - a) B, in display values. So is a render: its
-    radiance is premultiplied by the opacity A, what is there has the radiance L / A and the display
-    colour T(e L / A), and the picture is A T(e L / A) + (1 - A) B. Whatever the curve, the exposure
-    and B, the two agree where A = a and T(e L / A) = c. With a linear curve and e = 1 it is 3DGS's
-    L + (1 - A) B. B passes no camera: it is the same under every exposure, as in the photographs.
+    A file with alpha holds the display colour c of the foreground and the share a of the pixel that
+    it covers. Published comparisons show a c + (1 - a) B, in display values. A render is composited
+    in the same way: its radiance L is premultiplied by the opacity A, its foreground has the colour
+    T(e L / A), and the picture is A T(e L / A) + (1 - A) B. Under every curve, exposure and B, the
+    two agree where A = a and T(e L / A) = c. With a linear curve and e = 1 the picture is 3DGS's
+    L + (1 - A) B. B does not depend on the exposure, as in the photographs.
     """
 
     alpha: Float[Array, "h w"] | Any  # opacity A of the render
-    # Display values B of red, green, blue, of all pixels or of each.
+    # Display values B of red, green, blue, for all pixels or for each pixel.
     backdrop: Float[Array, " 3"] | Float[Array, "h w 3"] | Any
 
     def every(self, stride: int) -> Matte:
-        """Return it of every so many pixels along each axis."""
-        one_in = (slice(None, None, stride),) * 2
-        behind = self.backdrop if self.backdrop.ndim == 1 else self.backdrop[one_in]
-        return Matte(self.alpha[one_in], behind)
+        """Return the matte of every n-th pixel along each axis, n = `stride`."""
+        nth = (slice(None, None, stride),) * 2
+        backdrop = self.backdrop if self.backdrop.ndim == 1 else self.backdrop[nth]
+        return Matte(self.alpha[nth], backdrop)
 
 
 def uncovered(linear: Values, matte: Matte | None) -> Values:
-    """Return the radiance of what is there: without the share of the pixel that it covers."""
+    """Return the radiance of the foreground: not premultiplied by the opacity."""
     if matte is None:
         return linear
     xp: Any = namespace(linear, matte.alpha)
@@ -259,7 +259,7 @@ def uncovered(linear: Values, matte: Matte | None) -> Values:
 
 
 def composited(ldr: Values, matte: Matte | None) -> Values:
-    """Return display values of what is there, over the background; None: there is none."""
+    """Return display values of the foreground over the background; None: there is no background."""
     if matte is None:
         return ldr
     alpha: Any = matte.alpha[..., None]

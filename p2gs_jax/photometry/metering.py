@@ -1,8 +1,8 @@
-"""Metering: an exposure for a picture nobody took, from the radiance that it shows.
+"""Metering: the exposure of a new picture, from the radiance that it shows.
 
-A meter reads one number from linear radiance; a rule turns readings into an exposure. Given rules
-are what cameras print in their manuals (mid-grey for the log average, white for the highlights);
-the fitted one is whichever of them predicts the exposures that the camera itself chose.
+A meter reads one number from linear radiance; a rule turns readings into an exposure. Fixed rules
+are those of camera manuals (mid-grey for the log average, white for the highlights). The fitted
+rule is the one that best predicts the exposures that the camera chose.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from p2gs_jax.core.numerics import LN2
 
-# The meters, and what people call them.
+# The meters, and their names in text.
 WORDS: dict[str, str] = {
     "log_average": "log average",
     "average": "average",
@@ -30,22 +30,22 @@ Readings = Mapping[str, float]
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear red, green and blue (BT.709)
 HIGHLIGHT = 99.0
 CENTRE = 0.4  # standard deviation of the weights about the centre, half diagonals
-# Luminance this far below the mean counts as that: nothing that a picture shows is darker.
+# Lower bound of luminance relative to its mean; pictures show nothing darker.
 DARKEST = 2.0**-12
-# Less opaque pixels than this share of the picture are no picture.
+# A picture in which the share of opaque pixels is smaller than this has no readings.
 LEAST_SEEN = 0.01
 MID_GREY, BELOW_WHITE = 0.18, 0.98  # exposed radiance, and display value
-PIXELS = 100_000  # more pixels than about this many tell no more
-# Views are left out in at most this many stretches: neighbours in a video know each other's answer.
+PIXELS = 100_000  # approximate number of pixels that a meter reads
+# Cross-validation holds out at most this many stretches of views: neighbours in a video are alike.
 FOLDS = 12
 FEWEST_VIEWS = 6
-# A rule explains the camera if it leaves at most this share of what a constant leaves, left out.
+# A rule explains the camera if its RMS of held-out views is at most this share of a constant's.
 EXPLAINS = 0.8
-NEGLIGIBLE_EV = 0.05  # exposures that vary less, stops, are constant whatever predicts them
+NEGLIGIBLE_EV = 0.05  # exposures that vary by less, stops, count as constant
 
 
 def meter(linear: Float[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"]) -> dict[str, float]:
-    """Return what meters read of premultiplied radiance, natural logarithm; NaN: nothing."""
+    """Return readings of premultiplied radiance, natural logarithm; NaN if too little is opaque."""
     step = max(1, int(np.sqrt(alpha.size / PIXELS)))
     weight = np.asarray(alpha[::step, ::step], np.float64)
     light = np.asarray(linear[::step, ::step], np.float64) @ LUMINANCE
@@ -73,37 +73,37 @@ def meter(linear: Float[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"]) -
 
 @dataclass(frozen=True)
 class Rule:
-    """A meter whose reading the camera keeps constant: log e = offset - reading."""
+    """A meter whose exposed reading the camera keeps constant: log e = offset - reading."""
 
-    meter: str | None  # what is read; None: the exposure itself is constant
+    meter: str | None  # name of the meter; None: the exposure itself is constant
     offset: float  # natural logarithm
-    # RMS of exposures about it, stops, where each was predicted from the others.
+    # RMS of its errors, stops, where each view was predicted from the others.
     left_out_ev: float = float("nan")
 
     def log_exposure(self, readings: Readings) -> float:
-        """Return the natural logarithm of the exposure; NaN where the meter read nothing."""
+        """Return the natural logarithm of the exposure; NaN where there is no reading."""
         return self.offset - (0.0 if self.meter is None else readings[self.meter])
 
     @property
     def words(self) -> str:
-        """What people call it."""
+        """Its name in text."""
         return "constant" if self.meter is None else WORDS.get(self.meter, self.meter)
 
 
 @dataclass(frozen=True)
 class Metering:
-    """How exposures of new pictures are chosen, and what explains those of the photographs."""
+    """Rules for the exposures of new pictures, compared on the exposures of photographs."""
 
-    rule: Rule  # what `auto` follows: the rule that explains the photographs, or a constant
+    rule: Rule  # rule of `auto`: the one that explains the photographs, or a constant
     candidates: tuple[Rule, ...]  # all rules that were compared, best first
-    white: float  # exposed radiance that is shown just below white
-    names: tuple[str, ...]  # of the training views
-    # Of their renders, a row a view, a column for each of `METERS`.
+    white: float  # exposed radiance that is displayed just below white
+    names: tuple[str, ...]  # names of the training views
+    # Readings of their renders: a row per view, a column for each of `METERS`.
     readings: Float[np.ndarray, "v k"]
 
     @property
     def constant(self) -> Rule:
-        """The rule that reads nothing: the geometric mean of the training exposures."""
+        """The rule without a meter: the geometric mean of the training exposures."""
         return next(rule for rule in self.candidates if rule.meter is None)
 
     def exposure_ev(self, readings: Readings, of: ExposureOf = "auto") -> float:
@@ -125,42 +125,41 @@ class Metering:
     def exposure(self, readings: Readings, of: ExposureOf = "auto") -> float:
         """Return the exposure of a picture, a factor on radiance.
 
-        Where the `readings` saw nothing, it is the mean. `auto` follows `rule`; `log_average` and
-        `centre` bring that to mid-grey; `highlights` brings the 99th percentile just below white;
-        `protected` is the log average, or `highlights` where that would clip them.
+        Without `readings` it is the mean. `auto` follows `rule`; `log_average` and `centre` expose
+        that average to mid-grey; `highlights` exposes the 99th percentile to just below white;
+        `protected` is the log average, or `highlights` where the former would clip them.
         """
         return float(np.exp(self._log_exposure(readings, of)))
 
     def typical_exposure(self, of: ExposureOf = "auto") -> float:
-        """Return the geometric mean over the training views: one exposure for all of a scene."""
+        """Return the geometric mean over the training views: one exposure for the whole scene."""
         rows = [dict(zip(METERS, row, strict=True)) for row in self.readings.tolist()]
         return float(np.exp(float(np.mean([self._log_exposure(row, of) for row in rows]))))
 
     @property
     def telling(self) -> bool:
-        """Whether exposures vary in enough views for a rule to explain them or not."""
+        """Whether there are enough views, and exposures vary enough, to compare rules."""
         return len(self.candidates) > 1 and self.constant.left_out_ev >= NEGLIGIBLE_EV
 
     @property
     def sentence(self) -> str:
-        """Which rule explains the camera's exposures, or that none does."""
+        """A sentence on the rule that explains the camera's exposures, or on why none does."""
         constant = self.constant.left_out_ev
         rules = [rule for rule in self.candidates if rule.meter is not None]
         if not rules:
-            return f"Metering: {len(self.names)} training view(s) are too few to tell a rule."
+            return f"Metering: {len(self.names)} training view(s) are too few to find a rule."
         if constant < NEGLIGIBLE_EV:
             return f"Metering: exposures hardly vary ({constant:.2f} EV): constant."
         if self.rule.meter is None:
             best = rules[0]
             return (
-                f"Metering: none of {len(rules)} rules explains the exposures (the best, "
-                f"{best.words}, leaves {best.left_out_ev:.2f} EV of views left out; a constant "
-                f"{constant:.2f}): constant is used."
+                f"Metering: none of {len(rules)} rules explains the exposures (RMS error of "
+                f"held-out views: {best.left_out_ev:.2f} EV for the best, {best.words}; "
+                f"{constant:.2f} EV for a constant): a constant exposure is used."
             )
         return (
-            f"Metering: {self.rule.words} explains the exposures; it leaves "
-            f"{self.rule.left_out_ev:.2f} EV of views left out, a constant would leave "
-            f"{constant:.2f}."
+            f"Metering: {self.rule.words} explains the exposures (RMS error of held-out views: "
+            f"{self.rule.left_out_ev:.2f} EV; with a constant exposure {constant:.2f} EV)."
         )
 
 
@@ -170,15 +169,15 @@ def fit_metering(
     log_exposures: Float[np.ndarray, " v"],
     white: float = 1.0,
 ) -> Metering:
-    """Find the metering rule that predicts the exposures of the training views best.
+    """Find the metering rule that best predicts the exposures of the training views.
 
-    Every meter competes: the camera may have kept its reading constant. Each stretch of views,
-    which are in order, is predicted from the others. A constant exposure stays unless a rule leaves
-    clearly less. `white` is the exposed radiance that is shown just below white.
+    Every meter is compared, as if the camera had kept its reading constant. Each stretch of views,
+    which are in order, is predicted from the others. The rule is a constant exposure unless another
+    is clearly better. `white` is the exposed radiance that is displayed just below white.
     """
     table = np.array([[r[name] for name in METERS] for r in readings]).reshape(-1, len(METERS))
-    taken = np.isfinite(table).all(1)
-    x, y = table[taken], np.asarray(log_exposures, np.float64)[taken]
+    known = np.isfinite(table).all(1)
+    x, y = table[known], np.asarray(log_exposures, np.float64)[known]
     if len(y) < FEWEST_VIEWS:
         mean = Rule(None, float(np.mean(log_exposures)))
         return Metering(mean, (mean,), white, tuple(names), table)
@@ -200,8 +199,8 @@ def fit_metering(
 
 
 def adapted(exposures_ev: Float[np.ndarray, " f"], frames: float) -> Float[np.ndarray, " f"]:
-    """Return exposures in stops that follow those metered slowly, to 1/e in so many frames."""
-    # To both sides, so that a path played backwards looks the same.
+    """Return exposures, stops, smoothed with exponential weights of scale `frames`."""
+    # The weights are symmetric, so that a path played backwards looks the same.
     count = len(exposures_ev)
     away = np.abs(np.arange(count)[:, None] - np.arange(count))
     weight = np.exp(-away / max(frames, 1e-6))

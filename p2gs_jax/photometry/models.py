@@ -1,4 +1,4 @@
-"""What may be chosen: the table of photometric models, what cameras do besides, kinds of curves."""
+"""The choices: photometric models, white balance, vignetting and kinds of curves."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from p2gs_jax.photometry.response import BASES, Base, spline_parameters
 
 
 class Model(NamedTuple):
-    """What varies: per what the exposure and the gamma do (None: not), and in words."""
+    """Levels at which exposure and gamma vary (None: they do not), and a description."""
 
     exposure: Level | None
     gamma: Level | None
     description: str
 
 
-# From the simplest on.
+# In order of complexity.
 MODELS: dict[ModelName, Model] = {
     "constant": Model(None, None, "one exposure for all views"),
     "camera_exposure": Model("camera", None, "an exposure per camera"),
@@ -36,29 +36,28 @@ VIGNETTING_POWERS = (2, 4, 6)  # powers of the radius in log V(r) = k1 r^2 + k2 
 
 
 def polynomials(vignetting: VignettingKind | None) -> int:
-    """Return the polynomials of a camera: none, one for all channels, or one for each."""
+    """Return the number of polynomials of a camera: 0, 1 for all channels, or 3."""
     return {None: 0, "camera": 1, "channel": 3}[vignetting]
 
 
 class Form(NamedTuple):
-    """Everything that may vary: a model of exposures and gammas, and what cameras do besides."""
+    """The parameters that vary: a model of exposures and gammas, white balance and vignetting."""
 
-    model: ModelName  # of exposures and gammas
-    white_balance: Level | None = None  # per what it varies; per view only where exposures do
-    # Whether cameras darken towards their corners, each channel in its own way or all in the same.
-    vignetting: VignettingKind | None = None
+    model: ModelName  # model of exposures and gammas
+    white_balance: Level | None = None  # level; per view only if exposures are per view
+    vignetting: VignettingKind | None = None  # per camera, or per camera and channel
 
     @property
     def description(self) -> str:
-        """What reports call it."""
-        said = MODELS[self.model].description
+        """Description in reports."""
+        text = MODELS[self.model].description
         if self.white_balance is not None:
-            said += f", a white balance per {self.white_balance}"
+            text += f", a white balance per {self.white_balance}"
         if self.vignetting is not None:
-            said += ", vignetting per camera"
+            text += ", vignetting per camera"
         if self.vignetting == "channel":
-            said += " and channel"
-        return said
+            text += " and channel"
+        return text
 
 
 EXPOSURES = Form("view_exposure")
@@ -69,9 +68,9 @@ def parameter_count(
 ) -> int:
     """Return the number of free parameters, with splines `by` camera or channel, if any.
 
-    Each level loses one to its gauge; that of gammas and curves is none where known exposures tell
-    the `power`. Where every channel has exposures of its own, no photograph tells its power: two
-    more are gauges beside that of responses by themselves.
+    Each level loses one parameter to its gauge; gammas and curves lose none if known exposures fix
+    the `power`. If every channel has its exposures and its response, photographs do not determine
+    its power: this adds two gauges to that of the responses.
     """
     size = {None: 0, "camera": cameras - 1, "view": views - 1}
     varies = MODELS[form.model]
@@ -87,7 +86,7 @@ def parameter_count(
 
 
 class Curve(NamedTuple):
-    """A kind of curve: its base, and what has a fitted spline over it (None: nothing)."""
+    """A kind of curve: its base, and the kind of fitted splines over it (None: no spline)."""
 
     base: Base = "srgb"
     splines: ResponseKind | None = None
@@ -95,7 +94,7 @@ class Curve(NamedTuple):
 
 _ONE_FOR_ALL = Curve("srgb", "all")
 _PLAIN = [Curve(base) for base in BASES]
-# One step from each kind: several splines are worth trying where one is.
+# Neighbours of each kind: several splines are compared only where one is chosen.
 _CURVES: dict[ResponseKind | None, list[Curve]] = {
     None: [*_PLAIN, _ONE_FOR_ALL],
     "all": [*_PLAIN, Curve("srgb", "camera"), Curve("srgb", "channel")],
@@ -105,26 +104,26 @@ _CURVES: dict[ResponseKind | None, list[Curve]] = {
 
 
 class Choice(NamedTuple):
-    """What varies, and under which kind of curve."""
+    """A form and a kind of curve."""
 
     form: Form
     curve: Curve = Curve()
 
 
 class Scope(NamedTuple):
-    """What there is to choose from."""
+    """Limits of the choices that observations can distinguish."""
 
     cameras: int  # number of physical cameras
-    places: bool  # positions in the images are known: vignetting can be told
-    curves: bool  # exposures differ enough to tell a curve by
-    known: bool = False  # the curve is known, and sRGB's: no other is compared
-    power: bool = False  # known exposures tell the power of the curve
+    places: bool  # positions in the images are known, and vignetting can be solved
+    curves: bool  # exposures differ enough to determine a curve
+    known: bool = False  # the curve is known to be sRGB, and no other is compared
+    power: bool = False  # known exposures fix the power of the curve
 
     def allows(self, choice: Choice) -> bool:
         """Return whether a choice differs from simpler ones and can be solved.
 
-        With one physical camera, "per camera" means "for all": of gammas that is a gauge, unless
-        known exposures tell the power.
+        With one physical camera, "per camera" means "for all": a common gamma is a gauge, unless
+        known exposures fix the power.
         """
         form, by = choice.form, choice.curve.splines
         exposure, gamma, _ = MODELS[form.model]
@@ -140,13 +139,13 @@ class Scope(NamedTuple):
         )
 
     def _free(self, choice: Choice) -> bool:
-        """Return whether exposures are as they are known, and a power is free beside them."""
+        """Return whether exposures are per view and a power is free, as known ones require."""
         varies, by = MODELS[choice.form.model], choice.curve.splines
         return varies.exposure == "view" and bool(varies.gamma or by or self.known)
 
 
 def neighbours(choice: Choice, scope: Scope) -> list[Choice]:
-    """Return the choices of a scope that differ in one thing, simpler and richer ones."""
+    """Return the choices of a scope that differ in one property, simpler and richer ones."""
     form, curve = choice
     exposure, gamma, _ = MODELS[form.model]
     forms = [
@@ -155,7 +154,7 @@ def neighbours(choice: Choice, scope: Scope) -> list[Choice]:
         for g in _LEVELS
         if (e == exposure) != (g == gamma) and (name := _BY_LEVELS.get((e, g)))
     ]
-    # Exposures alone may not become simpler while more depends on them.
+    # These replace two levels at once, where one of them depends on the other.
     if gamma is not None and exposure == gamma:
         forms += [form._replace(model=_BY_LEVELS[(None, None)])]
     if form.white_balance == "view" and exposure == "view":
@@ -165,6 +164,6 @@ def neighbours(choice: Choice, scope: Scope) -> list[Choice]:
     forms += [form._replace(vignetting=kind) for kind in _VIGNETTING]
     near = [Choice(f, curve) for f in forms] + [Choice(form, c) for c in _CURVES[curve.splines]]
     if curve.splines == "camera" and (name := _BY_LEVELS.get((exposure, "camera"))):
-        # Gammas per camera are the simplest curves of their own.
+        # Gammas per camera are the simplest different curves of cameras.
         near += [Choice(form._replace(model=name), plain) for plain in _PLAIN]
     return [c for c in dict.fromkeys(near) if c != choice and scope.allows(c)]

@@ -1,4 +1,4 @@
-"""Colours of the same surface points in several views: what all of photometry starts from."""
+"""Observations: colours of the same surface points in several views."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from scipy.sparse.csgraph import connected_components
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.photometry.response import Response, deviation, log_exposed
 
-# An integer for every observation; a value for each of its channels.
+# An integer per observation; a value per observation and channel.
 Labels = Int[np.ndarray, " o"]
 PerChannel = Float[np.ndarray, "o 3"]
 
-# Sources sample a point in its coarsest view, which is at most this many times coarser than its
-# finest: what is still farther away mixes in neighbours (BUILD_NOTES).
+# Largest ratio of pixel sizes on the surface between a point's coarsest and finest view; coarser
+# views, which mix neighbouring surfaces, are left out (BUILD_NOTES).
 COARSEST = 3.0
 
 
@@ -33,14 +33,12 @@ class Observations:
     point_count: int  # number of points
     cameras: Int[np.ndarray, " v"]  # physical camera of each view, 0, 1, ...
     too_coarse: int = 0  # observations that were left out for their scale (`COARSEST`)
-    names: tuple[str, ...] = ()  # of the views; empty: their rows
-    # In the image, from its centre in units of half its diagonal; None where nobody knows, and
-    # nothing depends on the place.
+    names: tuple[str, ...] = ()  # names of the views; empty: their rows
+    # Positions in the image, from its centre in units of half its diagonal; None: unknown.
     positions: Float[np.ndarray, "o 2"] | None = None
-    camera_names: tuple[str, ...] = ()  # empty: their rows
-    brightest: PerChannel | None = None  # largest of the pixels that `colors` are means of
-    # Part of the scene in which each point lies: what is not modelled of a surface is shared there.
-    # None where nobody knows.
+    camera_names: tuple[str, ...] = ()  # names of the cameras; empty: their rows
+    brightest: PerChannel | None = None  # largest value of the pixels that were averaged
+    # Cell of the scene in which each point lies; unmodelled errors are shared in it. None: unknown.
     cells: Labels | None = None
 
     def decoded(self, response: Response) -> tuple[PerChannel, PerChannel, PerChannel]:
@@ -52,7 +50,7 @@ class Observations:
     def usable(self, black: float, saturation: float) -> Bool[np.ndarray, "o 3"]:
         """Return whether a value is neither near black nor saturated and its point is shared.
 
-        A mean is saturated where one of its pixels is: it is too dark then, which made exposures
+        A mean counts as saturated if one of its pixels is: it is then too dark, and exposures
         drift along a drive (BUILD_NOTES, "Clipped patches").
         """
         brightest = self.colors if self.brightest is None else self.brightest
@@ -71,16 +69,16 @@ class Observations:
         return np.unique(labels, return_inverse=True)[1]
 
     def picked(self, pick: np.ndarray | slice) -> Observations:
-        """Return some of them, chosen by a mask or by their rows."""
+        """Return some of the observations, by a mask or by rows."""
         names = ("views", "points", "colors", "spread", "positions", "brightest", "cells")
         kept = {k: v[pick] for k in names if (v := getattr(self, k)) is not None}
         return replace(self, **kept)
 
     def thinned(self, per_view: int, seed: int) -> Bool[np.ndarray, " o"]:
-        """Return which to keep so that every view has enough and their number grows with the views.
+        """Return which observations to keep: about `per_view` points of every view.
 
-        Points are put in a random order; those are kept, in all their views, that are among the
-        first `per_view` of some view.
+        In a random order of points, the first `per_view` points of every view are kept, in all
+        views that show them.
         """
         place = generator(seed, Stream.SOLVED_POINTS).permutation(self.point_count)[self.points]
         order = np.lexsort((place, self.views))
@@ -92,7 +90,7 @@ class Observations:
 
 
 def grouped(labels: Labels, count: int) -> list[Int[np.ndarray, " _"]]:
-    """Return the places of each of the labels 0, 1, ... below `count`, in order."""
+    """Return the indices of each of the labels 0, 1, ... below `count`, in order."""
     order = np.argsort(labels, kind="stable")
     return np.split(order, np.searchsorted(labels[order], np.arange(1, count)))
 
@@ -100,7 +98,7 @@ def grouped(labels: Labels, count: int) -> list[Int[np.ndarray, " _"]]:
 def sample_pairs(
     observations: Observations, count: int, seed: int
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
-    """Draw pairs of rows of a point in two views, with replacement; none if none is shared."""
+    """Draw pairs of rows of a point in two views, with replacement; empty if no point is shared."""
     order = np.argsort(observations.points, kind="stable")
     bounds = np.flatnonzero(np.diff(observations.points[order], prepend=-1, append=-1))
     lengths = np.diff(bounds)

@@ -1,4 +1,4 @@
-"""Parameters of a fit: what they start from, and the gauge they end in."""
+"""Photometric parameters of a fit: their initial values, and the gauge of the result."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.render.harmonics import RadianceKind, scaled
 from p2gs_jax.types import GAMMA_SRGB, Params, Photometry, Scene, View
 
-LEAST_EXPOSURE = 0.1  # exposures drawn at random are at least this
+LEAST_EXPOSURE = 0.1  # lower bound of random exposures
 
 
 def initial_photometry(
     solution: PhotometricSolution | None, taken_by: Sequence[str], cfg: FitConfig
 ) -> Photometry:
-    """Return what a fit starts from: a solution, else random exposures (paper), or equal ones."""
+    """Return initial parameters: a solution, or random exposures (paper), or exposures of 1."""
     count = len(taken_by)
     p = cfg.photometry
     if solution is not None:
@@ -53,10 +53,10 @@ def initial_appearance(
     cfg: FitConfig,
     photograph: Callable[[int], tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> Corrections | None:
-    """Return corrections that change nothing; None: the fit has none.
+    """Return corrections that change nothing; None: the fit has no corrections.
 
-    `photograph` takes a place in `views` to display values and mask, for corrections that
-    depend on photographs; without it these do not know them yet.
+    `photograph` returns display values and mask of the view with an index in `views`. Corrections
+    that depend on photographs need it.
     """
     kind = cfg.photometry.appearance
     if kind is None:
@@ -71,7 +71,7 @@ def initial_appearance(
 def point_radiance(
     scene: Scene, solution: PhotometricSolution | None, cfg: FitConfig
 ) -> Float[np.ndarray, "p 3"]:
-    """Return linear radiance of a scene's points: the solution's where it knows, else colours'."""
+    """Return linear radiance of a scene's points: from the solution, or else from their colours."""
     assert scene.point_colors is not None
     colors = scene.point_colors.astype(np.float32) / np.float32(255)
     radiance = inverse_tone_map(colors, np.float32(GAMMA_SRGB), cfg.photometry)
@@ -82,13 +82,13 @@ def point_radiance(
 
 
 def recentre(params: Params, activation: RadianceKind) -> Params:
-    """Return the same photographs with mean log exposure and white balance 0, exactly.
+    """Return parameters of the same photographs with mean log exposure and white balance 0.
 
-    Radiance moves the other way: it fixes the gauges of scale (docs/photometry.md, 2, scale), of
-    which every channel has one of its own with white balance. `activation` is from spherical
-    harmonics to radiance.
+    Radiance is scaled inversely, so that photographs do not change. This fixes the gauge of scale
+    (docs/photometry.md, 2, scale), with white balance that of every channel. `activation` is from
+    spherical harmonics to radiance.
     """
-    # On the host: once a fit, and every operation would be a program of its own.
+    # Computed on the host, because every operation on the device would compile a program.
     photometry = jax.tree.map(np.asarray, params.photometry)
     log_scale = np.mean(photometry.log_exposures)
     balance = photometry.white_balance

@@ -1,9 +1,9 @@
-"""Responses of cameras: from display values to log exposed radiance, z = F(y), and back.
+"""Response curves of cameras: from display values to log exposed radiance, z = F(y), and back.
 
 F is the logarithm of a base curve's decoding, optionally changed by a spline: F(y) = log base^-1(y)
-+ B(y) c, with hat functions B over fixed knots; cameras or channels may have splines of their own.
-That way is exact, on the host, in float64. Image formation needs the way back as well, on either
-side: it is tabulated over equal steps of log x, a table for each camera or channel with its own.
++ B(y) c, with hat functions B over fixed knots. Cameras or channels may have different splines. F
+is exact and computed on the host in float64. Image formation needs its inverse on host and device:
+a table over equal steps of log x, one for each camera or channel with its spline.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from p2gs_jax.types import Array
 
 Base = Literal["srgb", "power"]
 BASES: tuple[Base, ...] = get_args(Base)
-# The spline's knots in display values; two of them are held, which fixes scale and power.
+# The spline's knots in display values; two of them are fixed, which fixes scale and power.
 _PERCENT = [2, 5, 8, 12, 16, 21, 26, 32, 38, 44, 50, 56, 62, 68, 74, 80, 86, 90, 94, 98]
 KNOTS = np.array(_PERCENT) / 100
 HELD = (6, 16)
-# The knots that are solved for; of several splines, the powers differ as well.
+# The knots that are solved for; the powers of several splines differ as well.
 FREE = tuple(k for k in range(len(KNOTS)) if k not in HELD)
 FREE_OF_EACH = tuple(k for k in range(len(KNOTS)) if k != HELD[0])
-DARKEST = 0.5 / 255  # darkest photographed value that is decoded: half a code of 8 bits
+DARKEST = 0.5 / 255  # darkest display value that is decoded: half an 8-bit code
 # Noise model: 8-bit quantisation, photon and read noise (linear units), and a floor in log units
-# for what no model explains: texture, specularity, interpolation.
+# for texture, gloss and interpolation, which no model explains.
 SHOT_NOISE, READ_NOISE, FLOOR = 2e-4, 1e-6, 0.03
-# A curve with a spline may be at most this much flatter than its base, so that noise stays finite.
+# Least slope of a curve with a spline, relative to its base, so that noise stays finite.
 SMALLEST_SLOPE = 0.2
-SMALLEST_LOG_SLOPE = 0.3  # d log exposure / d log value of mid tones; flatter curves are a collapse
+SMALLEST_LOG_SLOPE = 0.3  # d log exposure / d log value of mid tones; flatter curves have collapsed
 TABLE = 1024  # entries of a table
 # The row of a camera that is not in `PhotometryConfig.cameras`; tables end with a row for it.
 UNKNOWN = -1
@@ -50,13 +50,13 @@ class Response:
     base: Base = "srgb"  # curve that splines are added to
     # Values of log exposure added at `KNOTS`, or None; where several are, their mean.
     spline: Spline | None = None
-    by: ResponseKind = "all"  # what has a spline of its own
-    # Of each camera, or of red, green and blue; empty where one is for all.
+    by: ResponseKind = "all"  # one spline for all, or one for each camera or channel
+    # Splines of the cameras, or of red, green and blue; empty where there is one for all.
     splines: tuple[Spline, ...] = ()
 
     @property
     def name(self) -> str:
-        """What reports call it."""
+        """Name in reports."""
         if self.spline is None:
             return self.base
         each = "" if self.by == "all" else f" per {self.by}"
@@ -69,25 +69,25 @@ class Response:
 
     @property
     def parts(self) -> tuple[Response, ...]:
-        """Its curves, one for all channels each: of every camera or channel with its own."""
+        """Its curves: one for all, or one for each camera or channel."""
         return tuple(Response(self.base, spline) for spline in self.splines or (self.spline,))
 
 
 def spline_count(by: ResponseKind | None, cameras: int) -> int:
-    """Return how many splines there are; `by` is what has one of its own (None: nothing)."""
+    """Return the number of splines: one for `all`, one for each camera or channel; None: 0."""
     return {None: 0, "all": 1, "camera": cameras, "channel": 3}[by]
 
 
 def spline_parameters(by: ResponseKind | None, cameras: int) -> int:
     """Return the number of free parameters of all splines; arguments as for `spline_count`."""
-    # Each has a power and a shape; one power is a gauge.
+    # Each spline has a power and a shape; one power is a gauge.
     return spline_count(by, cameras) * len(FREE_OF_EACH) - (by is not None)
 
 
 def spline_groups(
     by: ResponseKind, cameras: Int[np.ndarray, " o"], shape: tuple[int, ...]
 ) -> Int[np.ndarray, "o 3"]:
-    """Return which spline decodes each value of a shape; `cameras` is of each observation."""
+    """Return the row of the spline that decodes each value; `cameras` is of each observation."""
     if by == "camera":
         return np.broadcast_to(cameras[:, None], shape)
     return np.broadcast_to(np.arange(3) if by == "channel" else 0, shape)
@@ -100,7 +100,7 @@ def hat(y: Numbers) -> tuple[Int[np.ndarray, "..."], Numbers]:
 
 
 def base_log(y: Numbers, base: Base) -> tuple[Numbers, Numbers]:
-    """Return log of the decoded value and its derivative by the display value."""
+    """Return the log of the decoded value, and its derivative with respect to the display value."""
     y = np.clip(y, DARKEST, 1.0)
     if base == "power":
         return 2.2 * np.log(y), 2.2 / y
@@ -113,7 +113,7 @@ def base_log(y: Numbers, base: Base) -> tuple[Numbers, Numbers]:
 def log_exposed(
     y: Numbers, response: Response, cameras: Int[np.ndarray, " o"] | None = None
 ) -> tuple[Numbers, Numbers]:
-    """Return z = F(y) and dz/dy; y is (o, 3) where splines are several."""
+    """Return z = F(y) and dz/dy; y is (o, 3) if there are several splines."""
     z, slope = base_log(y, response.base)
     if response.spline is None:
         return z, slope
@@ -133,8 +133,8 @@ def deviation(
 ) -> Numbers:
     """Return the standard deviation of z.
 
-    `slope` is dz/dy, `spread` the standard deviation in display values from misplacement and
-    blur; photon noise is judged by the base curve.
+    `slope` is dz/dy, `spread` the standard deviation of display values from misplacement and blur;
+    photon noise follows the base curve.
     """
     logs, base_slope = base_log(y, base)
     exposed = np.exp(logs)
@@ -143,7 +143,7 @@ def deviation(
 
 
 def rises(response: Response) -> bool:
-    """Return whether it rises between its outer knots, and is not flat over mid tones."""
+    """Return whether the response rises between its outer knots and is not flat over mid tones."""
     outer, middle = np.linspace(KNOTS[0], KNOTS[-1], 400), np.linspace(0.06, 0.94, 90)
     return all(
         np.all(np.diff(log_exposed(outer, one)[0]) > 0)
@@ -155,10 +155,10 @@ def rises(response: Response) -> bool:
 class Tables(NamedTuple):
     """Display values over equal steps of log x."""
 
-    first: Float[np.ndarray, " r"]  # log x of the first entry, of every row
-    step: Float[np.ndarray, " r"]  # between entries
+    first: Float[np.ndarray, " r"]  # log x of the first entry of every row
+    step: Float[np.ndarray, " r"]  # step of log x between entries
     values: Float[np.ndarray, "r n"]  # display values
-    channels: int  # rows of one camera: 1 for all channels, or 3
+    channels: int  # number of rows of a camera: 1 for all channels, or 3
 
 
 @functools.lru_cache(64)
@@ -171,7 +171,7 @@ def _table(spline: Spline) -> tuple[float, float, np.ndarray]:
 
 
 def by_camera(cfg: PhotometryConfig) -> bool:
-    """Return whether any camera has a response of its own."""
+    """Return whether there are responses of single cameras."""
     return any(camera.splines for camera in cfg.cameras)
 
 
@@ -179,8 +179,8 @@ def by_camera(cfg: PhotometryConfig) -> bool:
 def tables(cfg: PhotometryConfig) -> Tables:
     """Return the tables of all responses.
 
-    With responses per camera there are rows for each, in order, and at the end for an unknown one:
-    the spline of all cameras, or else the mean. Raises ValueError: there is no spline.
+    With responses per camera, the last rows are for an unknown camera: the spline of all cameras,
+    or otherwise the mean. Raises ValueError: there is no spline.
     """
     if cfg.spline is None and not by_camera(cfg):
         raise ValueError("the curve 'spline' needs the values of its spline")
@@ -197,10 +197,10 @@ def _rows(splines: tuple[Spline, ...], channels: int) -> tuple[Spline, ...]:
 
 
 def spline_of(cfg: PhotometryConfig, camera: int | None = None) -> tuple[Spline, ...]:
-    """Return the spline of a camera (None, -1: unknown): a row for all channels, or each."""
-    own = () if camera is None or camera < 0 else cfg.cameras[camera].splines
-    if own:
-        return own
+    """Return the spline of a camera (None, -1: unknown): a row for all channels, or one each."""
+    splines = () if camera is None or camera < 0 else cfg.cameras[camera].splines
+    if splines:
+        return splines
     if cfg.spline is not None:
         return (cfg.spline,)
     others = [c.splines for c in cfg.cameras if c.splines]
@@ -212,10 +212,10 @@ def spline_of(cfg: PhotometryConfig, camera: int | None = None) -> tuple[Spline,
 
 
 def encode(log_linear: Values, cfg: PhotometryConfig, camera=None) -> Values:
-    """Return display values through the table; linear in x below it, in log x above it.
+    """Return display values from the table; linear in x below it, linear in log x above it.
 
     With responses per channel the last axis of `log_linear` is the channel. `camera` is a row
-    in `cfg.cameras` (None: unknown): one for all, or one for every entry but for the last axis.
+    in `cfg.cameras` (None: unknown): one for all, or one for every entry without the last axis.
     """
     xp, table = namespace(log_linear, camera), tables(cfg)
     if by_camera(cfg):
@@ -226,19 +226,19 @@ def encode(log_linear: Values, cfg: PhotometryConfig, camera=None) -> Values:
     else:
         first, step, flat = float(table.first[0]), float(table.step[0]), table.values[0]
         start, dimmest = None, float(flat[0])
-    place = (log_linear - first) / step
-    left = xp.clip(xp.floor(place), 0, TABLE - 2).astype(np.int32)
+    position = (log_linear - first) / step
+    left = xp.clip(xp.floor(position), 0, TABLE - 2).astype(np.int32)
     values = xp.asarray(flat, log_linear.dtype)
     at = left if start is None else left + start
-    # Above the table the last segment goes on, so that over-bright predictions keep a gradient.
-    inside = values[at] + (place - left) * (values[at + 1] - values[at])
-    dark = place < 0
+    # The last segment continues above the table, so that over-bright predictions have a gradient.
+    inside = values[at] + (position - left) * (values[at + 1] - values[at])
+    dark = position < 0
     below = dimmest * xp.exp(xp.where(dark, log_linear - first, 0.0))
     return xp.where(dark, below, inside)
 
 
 def decode(y: Values, cfg: PhotometryConfig, camera=None) -> Values:
-    """Return log exposed radiance, by tables as for `encode`, whose ends hold beyond them."""
+    """Return log exposed radiance from the tables of `encode`, constant beyond their ends."""
     xp, table = namespace(y, camera), tables(cfg)
     if not by_camera(cfg):
         logs = table.first[0] + table.step[0] * np.arange(TABLE)
@@ -246,7 +246,7 @@ def decode(y: Values, cfg: PhotometryConfig, camera=None) -> Values:
         return xp.interp(y, table.values[0].astype(y.dtype), logs.astype(y.dtype)).astype(y.dtype)
     row = _row(table, camera, xp)
     values = xp.asarray(table.values.reshape(-1), y.dtype)
-    # `interp` takes one table; this halves intervals until one entry is left.
+    # `interp` takes one table; this bisection searches many.
     left, span = xp.zeros(y.shape, np.int32), TABLE
     while span > 1:
         span //= 2
@@ -259,8 +259,8 @@ def decode(y: Values, cfg: PhotometryConfig, camera=None) -> Values:
 
 
 def _row(table: Tables, camera: Any, xp: Any) -> Int[Array, "..."]:
-    """Return the row of every entry's table, shaped to broadcast against display values."""
+    """Return the row of every entry's table, with a shape that broadcasts with display values."""
     count = len(table.first) // table.channels
-    given = xp.asarray(-1 if camera is None else camera)
-    given = xp.where(given < 0, count - 1, given)[..., None]
-    return (given * table.channels + np.arange(table.channels)).astype(np.int32)
+    row = xp.asarray(-1 if camera is None else camera)
+    row = xp.where(row < 0, count - 1, row)[..., None]
+    return (row * table.channels + np.arange(table.channels)).astype(np.int32)

@@ -1,6 +1,4 @@
-"""The result: exposures, gammas and response of a scene, what is known of their errors, and
-whether they agree with what the cameras say they did.
-"""
+"""The photometric solution of a scene with its standard errors, and its agreement with EXIF."""
 
 from __future__ import annotations
 
@@ -17,7 +15,7 @@ from p2gs_jax.photometry.response import Response
 
 MIN_OBSERVATIONS = 15  # views with fewer usable observations have uncertain exposures
 WEAK_GAMMA = 0.1  # gammas with a larger standard error are only roughly known
-# A view disagrees when its gap exceeds this, and three standard errors.
+# A view disagrees if its gap exceeds this and 3 standard errors.
 NOTICEABLE_EV = 0.2
 STANDARD_ERRORS = 3.0
 
@@ -26,49 +24,47 @@ PerView = Float[np.ndarray, " v"]
 
 @dataclass(frozen=True)
 class PhotometricSolution:
-    """Exposures, gammas and response, with what is known about their errors."""
+    """Exposures, gammas and response, with their standard errors."""
 
-    model: ModelName  # what varies
+    model: ModelName  # exposures and gammas that vary
     response: Response  # base curve and spline
     # Natural logarithm; mean 0 over each component unless exposures were known.
     log_exposures: PerView
-    # Standard errors of `log_exposures` (robust, gauge fixed); inf where unobserved or not to be
-    # told.
+    # Standard errors of `log_exposures` (robust, gauge fixed); inf where unobserved or unknown.
     exposure_errors: PerView
-    gammas: PerView  # per view
+    gammas: PerView  # gamma of each view
     gamma_errors: PerView  # standard errors; 0 where gamma is not modelled, inf as above
-    observations_per_view: Int[np.ndarray, " v"]  # usable observations
-    # Views with equal numbers share a scale; others cannot be compared.
+    observations_per_view: Int[np.ndarray, " v"]  # number of usable observations
+    # Label of each view: views with equal labels share a scale, others cannot be compared.
     component: Int[np.ndarray, " v"]
     # Natural logarithm per channel; NaN where unobserved.
     point_log_radiance: Float[np.ndarray, "p 3"]
-    residual_ev: float  # robust standard deviation of one observation, in stops
+    residual_ev: float  # robust standard deviation of one observation, stops
     view_residual_ev: PerView  # the same per view
-    # Median residual of red, green, blue in each view less their mean, stops: what a scalar
-    # exposure leaves of a white balance; NaN where unobserved.
+    # Median residual of red, green, blue in each view minus their mean, stops: white balance that
+    # a scalar exposure does not explain; NaN where unobserved.
     view_balance_ev: Float[np.ndarray, "v 3"]
     outliers: float  # share of observations that the robust loss ignores
-    rounds: int  # iterations
-    moved: float  # largest change of a parameter in the last of them, log units
-    converged: bool  # that was no more than the tolerance
-    unknown_errors: int  # observed views whose standard errors cannot be told
-    warnings: tuple[str, ...]  # what the user should know
-    white_balance_level: Level | None  # per what the white balance varies; None: it does not
+    rounds: int  # number of iterations
+    moved: float  # largest change of a parameter in the last iteration, log units
+    converged: bool  # `moved` is at most the tolerance
+    unknown_errors: int  # number of observed views with unknown standard errors
+    warnings: tuple[str, ...]  # warnings for the user
+    white_balance_level: Level | None  # level of the white balance; None: it does not vary
     # Log factors on red, green, blue beside the exposure: mean 0 in every view, and over the views
     # of a component; zeros where it does not vary.
     white_balance: Float[np.ndarray, "v 3"]
     white_balance_errors: Float[np.ndarray, "v 3"]  # standard errors, as `exposure_errors`
-    # Whether cameras darken towards their corners, and each channel in its own way.
-    vignetting: VignettingKind | None
-    # What each physical camera does, by its row in `Observations.cameras`; empty where none does
-    # anything of its own.
+    vignetting: VignettingKind | None  # per camera, or per camera and channel
+    # Vignetting and response of each physical camera, by row in `Observations.cameras`; empty where
+    # none has any.
     cameras: tuple[CameraFormation, ...]
     # Standard errors of log V in the corner, per camera and row of `vignetting`.
     corner_errors: Float[np.ndarray, "c k"]
 
     @property
     def state(self) -> dict[str, Any]:
-        """How the solution ended, for `metrics.json` and `calibration.json`."""
+        """Convergence of the solution, for `metrics.json` and `calibration.json`."""
         names = ("rounds", "converged", "unknown_errors")
         return {"last_change": self.moved, **{k: getattr(self, k) for k in names}}
 
@@ -86,17 +82,18 @@ class PhotometricSolution:
 class Agreement(NamedTuple):
     """Recovered exposures against stated ones (EXIF), scale aligned."""
 
-    views: int  # how many have both
-    correlation: float  # of the two, in stops; NaN where one of them does not vary
-    # Recovered over stated, least squares; other than 1 is the power gauge or tone mapping.
+    views: int  # number of views with both
+    correlation: float  # correlation of both, in stops; NaN if one of them does not vary
+    # Slope of recovered over stated, least squares; it differs from 1 by the power gauge or by tone
+    # mapping.
     slope: float
-    rms_ev: float  # RMS gap in stops
-    offset_ev: float  # what to add to stated exposures to lay them over the recovered ones
+    rms_ev: float  # RMS gap, stops
+    offset_ev: float  # offset from stated to recovered exposures, stops
     gap_ev: PerView  # recovered minus stated, median removed; NaN where either is missing
     disagrees: Bool[np.ndarray, " v"]  # views whose gap is noticeable and significant
 
     def sentence(self, source: str = "EXIF") -> str:
-        """Say it in words."""
+        """Return a sentence for the user."""
         if self.views < 2:
             return f"{source} gives the exposure of {self.views} view(s): nothing to compare."
         head = (
@@ -114,7 +111,7 @@ class Agreement(NamedTuple):
 
 
 def compare(exposures_ev: PerView, errors_ev: PerView, stated_ev: PerView) -> Agreement:
-    """Compare recovered exposures, stops, with stated ones: NaN where unknown; errors then inf."""
+    """Compare recovered exposures, stops, with stated ones; unknown: NaN, or errors of inf."""
     both = np.isfinite(stated_ev) & np.isfinite(errors_ev)
     gap = np.full(len(exposures_ev), np.nan)
     count = int(both.sum())

@@ -1,1 +1,1 @@
-"""From a scene folder to a run folder, and the photometry alone."""
+"""From a scene folder to a run folder, and photometry without splatting."""

@@ -1,7 +1,7 @@
-"""Photometry alone: exposures, gammas and tone curve in seconds, without splatting.
+"""Photometry without splatting: exposures, gammas and tone curve in seconds.
 
 Observations come from the tracks of a scene, through the rendered depth of a finished run, or from
-a stack of exposures of one fixed viewpoint; from there on all go one way (`solved`).
+a stack of exposures of one fixed viewpoint; `solved` processes all of them.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from p2gs_jax.types import View
 STACK_PIVOT = 0.18
 MEAN_GAUGE = "mean log exposure is 0 over each connected group of views"
 STACK_GAUGE = "mean log exposure is 0; exposures and response can be stretched together"
-# Of a solution, what `calibration.json` holds of it under the same names.
+# Fields of a solution that `calibration.json` holds under the same names.
 OF_SOLUTION = (
     *("residual_ev", "view_residual_ev", "view_balance_ev", "outliers", "component"),
     "observations_per_view",
@@ -55,20 +55,20 @@ OF_SOLUTION = (
 
 @dataclass(frozen=True)
 class Calibration:
-    """What a calibration finds."""
+    """The result of a calibration."""
 
-    # the photographs, in the order of the solution; of a stack poses mean nothing
+    # photographs, in the order of the solution; poses in a stack are meaningless
     views: tuple[View, ...]
     selection: Selection  # model, exposures, gammas, errors, reasons
-    # exposures from EXIF or a file, stops, laid over the recovered ones; NaN where unknown
+    # exposures from EXIF or a file, stops, shifted onto the recovered ones; NaN where unknown
     stated_ev: Float[np.ndarray, " v"]
-    agreement: Agreement  # of stated and recovered exposures
-    gauge: str  # what fixes the scale, in words
-    pivot: float  # linear value that gammas leave alone
-    messages: tuple[str, ...]  # what the user should know, in plain words
-    details: dict[str, Any]  # what `calibration.json` holds besides
-    observations: int  # how many were used
-    seconds: dict[str, float]  # of `reading` and sampling, and of the `adjustment`
+    agreement: Agreement  # agreement of stated and recovered exposures
+    gauge: str  # convention that fixes the scale, in words
+    pivot: float  # linear value that gammas do not change
+    messages: tuple[str, ...]  # notes for the user
+    details: dict[str, Any]  # other content of `calibration.json`
+    observations: int  # number of observations used
+    seconds: dict[str, float]  # duration of `reading` with sampling, and of the `adjustment`, s
 
     @property
     def solution(self) -> PhotometricSolution:
@@ -86,7 +86,7 @@ class Calibration:
         return self.solution.exposure_errors_ev
 
     def write(self, out: Path) -> Calibration:
-        """Write `photometry.json`, `calibration.json` and `calibration.png`; return this."""
+        """Write `photometry.json`, `calibration.json` and `calibration.png`; return `self`."""
         views, pivot, solution = self.views, self.pivot, self.solution
         path = out / "photometry.json"
         write_solution(path, solution, views=views, pivot=pivot, gauge=self.gauge)
@@ -107,12 +107,12 @@ def calibrate(
 ) -> Calibration:
     """Solve the photometry of a scene and write the files of a calibration.
 
-    The scene is a COLMAP model, a transforms.json or a folder of photographs. Of `cfg` (default
-    `robust`) data, photometry and the thresholds of loss count. The result is compared with stated
-    exposures: `exif` or a CSV file; by default EXIF's where photographs carry them.
+    The scene is a COLMAP model, a transforms.json or a folder of photographs. The options of data,
+    photometry and the thresholds of the loss in `cfg` (default `robust`) apply. The result is
+    compared with stated exposures from `exif` or a CSV file, by default those in EXIF, if any.
 
     Raises:
-        UserError: something the user can mend.
+        UserError: a fault that the user can fix.
     """
     cfg = require_config(cfg)
     cfg = dataclasses.replace(cfg, data=dataclasses.replace(cfg.data, test_every=0))
@@ -125,9 +125,9 @@ def calibrate(
         store = ImageStore(scene.views, cfg.data, scene.objects).only_opaque()
         if not (has_tracks(scene) or len(scene.points)):
             raise UserError(
-                f"{scene_dir} has neither tracks nor points: which pixels show the same surface is "
-                "not known.",
-                fix="give a COLMAP model with its images.bin, or the photographs alone",
+                f"{scene_dir} has neither tracks nor points: it is unknown which pixels show the "
+                "same surface.",
+                fix="give a COLMAP model with its images.bin, or only the photographs",
             )
         observations = surface_colors(
             scene, store, cfg.train.seed, lambda i, n: reporter.stage("Sampling colours", i, n)
@@ -146,21 +146,20 @@ def calibrate_run(
     compare_with: str | None = None,
     reporter: Reporter | None = None,
 ) -> Calibration:
-    """Solve the photometry of a finished run's training views anew, through its rendered depth.
+    """Solve the photometry of a finished run's training views again, through its rendered depth.
 
-    The run is not changed. The photometry of `cfg` (default `robust`) says what to choose from and
-    what is known; the run's own choice is not used. `scene` is as for `load_run`, the others as for
-    `calibrate`.
+    The run is not changed. The photometric options of `cfg` (default `robust`) apply, not those of
+    the run. `scene` is as for `load_run`, the other arguments are as for `calibrate`.
 
     Raises:
-        UserError: see `load_run`; the photographs are gone, the fit is opaque nowhere, or its views
-            do not overlap.
+        UserError: see `load_run`; or the photographs are missing, no pixel of the fit is opaque, or
+            its views do not overlap.
     """
     begin, reporter = time.monotonic(), reporter or Silent()
     asked, run = require_config(cfg), load_run(run_dir, scene)
     cfg = dataclasses.replace(run.cfg, photometry=asked.photometry)
     run.require_photographs(run.scene.train_indices)
-    # Of what stands still: the same pixel of something that moves is elsewhere in another view.
+    # Only static Gaussians: a moving surface point is elsewhere in another view.
     observations = rendered_colors(
         standing(run.params.gaussians, run.owner),
         run.scene,
@@ -192,8 +191,8 @@ def solved(
 ) -> Calibration:
     """Solve the photometry of some views, and compare it with stated exposures.
 
-    Reading began at `begin` (`time.monotonic`); `gauge` says what fixes the scale where `cfg` names
-    no known exposures. Views without `signal` are not compared.
+    Reading began at `begin` (`time.monotonic`); `gauge` describes what fixes the scale if `cfg`
+    names no known exposures. Views without `signal` are not compared.
     """
     sampled = time.monotonic()
     reporter.stage("Photometric bundle adjustment")
@@ -229,7 +228,7 @@ def solved(
 
 
 def _row(candidate: Candidate) -> dict[str, Any]:
-    """Return what `calibration.json` says of a candidate."""
+    """Return the entry of a candidate in `calibration.json`."""
     form = candidate.form
     return {
         "model": form.model,
@@ -252,10 +251,10 @@ def calibrate_stack(
     compare_with: str | None = None,
     reporter: Reporter | None = None,
 ) -> Calibration:
-    """Solve exposures and the common response of a stack: one fixed viewpoint, no poses needed.
+    """Solve exposures and the common response of a stack of photographs from one fixed viewpoint.
 
-    Without known exposures, their logarithms are found up to a factor: exposures and response
-    can be stretched together (the power gauge), which the standard curves' mid tones settle. The
+    Without known exposures, log exposures are determined up to a factor: exposures and response
+    can be stretched together (the power gauge). The mid tones of the standard curves fix it. The
     photometry of `cfg` (default `robust`) names known exposures, and its seed draws the sampled
     positions. Without `out` nothing is written; see `calibrate`.
 
@@ -271,10 +270,10 @@ def calibrate_stack(
         known = KnownExposures(values, p.known_deviation_ev)
     found = stack_colors(stack, seed)
     options = CalibrationOptions(found.black, SATURATED, STACK_PIVOT, known, seed, "one_response")
-    given = (stack.views, found.observations, options, cfg, begin, compare_with, reporter)
-    result = solved(*given, gauge=STACK_GAUGE, signal=found.signal)
-    how = (result.solution, found.xy, stack.valid.shape, found.signal)
-    local_ev = regional_ev(options.problem(found.observations), *how)
+    arguments = (stack.views, found.observations, options, cfg, begin, compare_with, reporter)
+    result = solved(*arguments, gauge=STACK_GAUGE, signal=found.signal)
+    of_frames = (result.solution, found.xy, stack.valid.shape, found.signal)
+    local_ev = regional_ev(options.problem(found.observations), *of_frames)
     details = {
         "signal": found.signal,
         "shifts": found.shifts,
@@ -289,7 +288,7 @@ def calibrate_stack(
 
 
 def _stack_messages(views: tuple[View, ...], found: StackColors, local_ev: float) -> list[str]:
-    """Say which frames are dark, that frames were moved, and that one response is not enough."""
+    """Return notes on dark frames, on moved frames, and on local tone mapping."""
     out = []
     dark = [view.name for view, signal in zip(views, found.signal, strict=True) if not signal]
     if dark:
@@ -303,8 +302,8 @@ def _stack_messages(views: tuple[View, ...], found: StackColors, local_ev: float
     if local_ev > LOCAL_EV:
         out.append(
             f"One response does not explain this stack: between frames, regions of equal "
-            f"brightness change by {local_ev:.2f} EV (RMS; {LOCAL_EV:g} at most for one "
-            "camera pipeline). The frames were tone-mapped by region, or the light changed; do not "
-            "trust the exposures."
+            f"brightness change by {local_ev:.2f} EV (RMS; one camera pipeline reaches at most "
+            f"{LOCAL_EV:g} EV). The frames were tone-mapped by region, or the light changed: do "
+            "not trust the exposures."
         )
     return out

@@ -1,4 +1,4 @@
-"""The demo: a small street whose exposures are known, fitted as if they were not."""
+"""The demo: a fit of a small street whose true exposures are known."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from p2gs_jax.synth.write import write_street
 
 @dataclass(frozen=True)
 class DemoResult:
-    """What the demo found: rows of (true stops, recovered stops), each from their mean."""
+    """Result of the demo; `rows` are (true, recovered) exposures, stops relative to their mean."""
 
     rows: list[tuple[float, float]]
     error: ExposureError
@@ -43,11 +43,12 @@ def run_demo(
 ) -> DemoResult:
     """Make a street, fit it and compare the exposures.
 
-    `out/street` and `out/run` are written; an earlier demo there is replaced. The street has
-    `frames` per camera, pictures `width` pixels wide, and exposures of ISO `iso_std` about 8.
+    The demo writes `out/street` and `out/run` and replaces an earlier demo there. The street has
+    `frames` frames per camera, `width` pixels wide, whose ISO has mean 8 and standard deviation
+    `iso_std`.
 
     Raises:
-        UserError: `out` holds something that the demo did not make, or that is being written to.
+        UserError: `out` holds files that the demo did not make, or another program writes to it.
     """
     street, run_dir = out / "street", out / "run"
     marker = out / "demo.json"
@@ -65,13 +66,13 @@ def run_demo(
         write_street(street, height=height, **made)
         reporter.message(f"Made a street: 3 cameras, {frames} frames each, {width}x{height}.")
         truth, reference = read_true_exposures(street), street / "reference"
-        given = {"reference": reference, "reporter": reporter, "true_exposures": truth}
-        result = fit(street, run_dir, cfg, **given)
+        options = {"reference": reference, "reporter": reporter, "true_exposures": truth}
+        result = fit(street, run_dir, cfg, **options)
     true = np.array([truth[view.name] for view in result.scene.training_views])
     found = np.asarray(result.params.photometry.exposures, np.float64)
     error = exposure_error(found, true)
-    recovered, given = (np.log2(e) - np.log2(e).mean() for e in (found, true))
-    rows = list(zip(given.tolist(), recovered.tolist(), strict=True))
+    recovered_ev, true_ev = (np.log2(e) - np.log2(e).mean() for e in (found, true))
+    rows = list(zip(true_ev.tolist(), recovered_ev.tolist(), strict=True))
     result.metrics["exposures"] = dict(error)
     write_json(run_dir / "metrics.json", result.metrics)
     return DemoResult(rows, error, result.metrics, run_dir)

@@ -1,7 +1,7 @@
 """Exposures before the first step.
 
-Colours of shared points are sampled from the photographs, model and curve are chosen and solved
-from them; where nothing is shared, exposures start at 1 and are learned.
+Colours of shared points are sampled from the photographs. Model and curve are chosen and solved
+from these colours. Where no points are shared, exposures start at 1 and are learned.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from p2gs_jax.types import Photometry, Scene
 
 @dataclass(frozen=True)
 class Exposures:
-    """What is known of the light of a scene's photographs before the first step."""
+    """Photometry of a scene's photographs before the first step."""
 
-    photometry: Photometry  # parameters of the training views to start from
-    decisions: Decisions  # what the scene settled
+    photometry: Photometry  # initial parameters of the training views
+    decisions: Decisions  # values that the scene decided
     observations: Observations | None = None  # colours of shared points, or None
     # model, exposures and their errors, or None where nothing was solved here
     selection: calibrate.Selection | None = None
-    # linear, of the scene's points; None: it follows from the selection
+    # linear radiance of the scene's points; None: it follows from the selection
     radiance: Float32[np.ndarray, "p 3"] | None = None
-    notes: tuple[str, ...] = ()  # what the user should know
+    notes: tuple[str, ...] = ()  # notes for the user
 
     @property
     def solved(self) -> bool:
-        """Whether exposures are known, here or for a whole of which the scene is a part."""
+        """Whether exposures were solved, for this scene or for a larger one that contains it."""
         return self.selection is not None or self.radiance is not None
 
 
@@ -52,18 +52,18 @@ def solve_exposures(
     dense: bool = False,
     kept: Decisions | None = None,
 ) -> Exposures:
-    """Sample colours of shared points, and solve the photometry from them; both where possible.
+    """Sample colours of shared points, and solve the photometry from them, where possible.
 
-    Photographs are those of what stands `still` and is opaque. `on_chosen` receives model and curve
-    before they are solved; those that the checkpoints of a resumed run `kept` stay. With `dense`,
-    observations are wanted even where the fit starts from no exposures.
+    The photographs `still` are without moving objects and transparent pixels. `on_chosen` receives
+    model and curve before they are solved; a resumed run keeps those of its checkpoints (`kept`).
+    With `dense`, observations are sampled even if the fit does not start from solved exposures.
     """
     found, notes = _sampled(scene, still, cfg, reporter or Silent(), dense=dense)
-    selection, under = None, cfg if kept is None else kept.resolve(cfg)
+    selection, options = None, cfg if kept is None else kept.resolve(cfg)
     if found is not None and len(found.points) and cfg.photometry.start == "tracks":
         (reporter or Silent()).stage("Photometric bundle adjustment")
         selection = calibrate.calibrate_observations(
-            found, calibrate.options_of(under, scene), on_chosen
+            found, calibrate.options_of(options, scene), on_chosen
         )
         if kept is not None:
             selection = dataclasses.replace(selection, reasons=kept.reasons)
@@ -71,20 +71,20 @@ def solve_exposures(
     decisions = decide(cfg, selection, kept)
     resolved = decisions.resolve(cfg)
     solution = None if selection is None else selection.solution
-    taken_by = [view.camera for view in scene.training_views]
-    photometry = initial_photometry(solution, taken_by, resolved)
+    cameras = [view.camera for view in scene.training_views]
+    photometry = initial_photometry(solution, cameras, resolved)
     return Exposures(photometry, decisions, found, selection, notes=tuple(notes))
 
 
 def _sampled(
     scene: Scene, still: ImageStore, cfg: FitConfig, reporter: Reporter, *, dense: bool
 ) -> tuple[Observations | None, list[str]]:
-    """Return colours of shared points, where they are wanted, and what the user should know."""
+    """Return colours of shared points, or None if nothing needs them, and notes for the user."""
     from_tracks, notes = cfg.photometry.start == "tracks", []
     if not (has_tracks(scene) or from_tracks or dense):
         return None, []
     if scene.random_seeds:
-        note = "Seeds at random show nothing twice: exposures start at 1 and are learned."
+        note = "Random seeds do not lie on surfaces: exposures start at 1 and are learned."
         return None, [note] if from_tracks else []
     if not has_tracks(scene):
         notes.append("No tracks: seed points are projected into the views instead.")
@@ -93,6 +93,6 @@ def _sampled(
     )
     if from_tracks and not len(found.points):
         notes.append(
-            "No point is seen twice: exposures start at 1 and are learned from the first step."
+            "No point is visible in two views: exposures start at 1 and are learned from step 1."
         )
     return found, notes

@@ -1,4 +1,4 @@
-"""The end of a fit: judge it and write what the run folder promises (docs/files.md)."""
+"""The end of a fit: evaluation and the files of the run folder (docs/files.md)."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from p2gs_jax.types import Params, Scene
 
 @dataclass(frozen=True)
 class Account:
-    """What a fit has to say of itself for `metrics.json`, beside its scores."""
+    """Entries of `metrics.json` other than scores."""
 
-    counts: dict[str, int]  # numbers
-    seconds: dict[str, float]  # times, by name
-    selection: Selection | None = None  # what the bundle adjustment found, or None
-    # what the user was told; what the evaluation finds is added
+    counts: dict[str, int]  # numbers of Gaussians, views, steps and so on
+    seconds: dict[str, float]  # durations, s, by name
+    selection: Selection | None = None  # result of the bundle adjustment, or None
+    # notes for the user; the evaluation adds its notes
     notes: list[str] = field(default_factory=list)
 
 
@@ -51,14 +51,14 @@ def finish(
     true_exposures: Mapping[str, float] | None = None,
     still_ours: Callable[[], None] = lambda: None,
 ) -> dict:
-    """Evaluate, write all results, and return what `metrics.json` holds.
+    """Evaluate the fit, write all results, and return the content of `metrics.json`.
 
-    Gaussians are the live ones, `owner` has the moving object of each, `cfg` is what the fit was
-    computed under; `still_ours` raises where the folder is another run's.
+    `params` holds live Gaussians only, `owner` the moving object of each, and `cfg` the options of
+    the fit. `still_ours` raises an error if another run has taken over the folder.
     """
     return_freed_memory()
     watch, exposures = Stopwatch(), {}
-    shown: dict[int, ViewResult | None] = dict.fromkeys(summary_rows(scene))
+    in_summary: dict[int, ViewResult | None] = dict.fromkeys(summary_rows(scene))
     with watch("evaluation"):
         found = evaluate(
             params,
@@ -69,10 +69,10 @@ def finish(
             reference=truth,
             radiance=find_radiance(scene, store),
             lpips_weights=lpips_weights,
-            on_view=functools.partial(_take, exposures, shown, scene, store, folder, watch),
+            on_view=functools.partial(_keep, exposures, in_summary, scene, store, folder, watch),
             on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
         )
-    watch.add("evaluation", -watch.seconds.get("files", 0.0))  # views are written meanwhile
+    watch.add("evaluation", -watch.seconds.get("files", 0.0))  # the evaluation also writes views
     reporter.stage("Writing files")
     hidden = found.metrics.get("hidden", ())
     with watch("files"):
@@ -86,7 +86,7 @@ def finish(
             fitted={r: e for r, e in exposures.items() if scene.views[r].name not in hidden},
             unknown=found.metrics.get("exposures_unknown", ()),
             solution=None if account.selection is None else account.selection.solution,
-            shown=[result for result in shown.values() if result is not None],
+            shown=[result for result in in_summary.values() if result is not None],
             metering=found.metering,
             true_exposures=true_exposures,
         )
@@ -96,23 +96,23 @@ def finish(
     return metrics
 
 
-def _take(
+def _keep(
     exposures: dict[int, float],
-    shown: dict[int, ViewResult | None],
+    in_summary: dict[int, ViewResult | None],
     scene: Scene,
     store: ImageStore,
     folder: RunFolder,
     watch: Stopwatch,
     result: ViewResult,
 ) -> None:
-    """Write a held-out view and note its exposure; keep a view of the summary."""
+    """Write a held-out view and keep its exposure; keep the views of the summary."""
     view = scene.views[result.index]
     if view.split == "test":
         exposures[result.index] = result.transform.exposure
         with watch("files"):
             write_view(folder.renders, view.name, result, store)
-    if result.index in shown:
-        shown[result.index] = result
+    if result.index in in_summary:
+        in_summary[result.index] = result
 
 
 def _accounted(
@@ -123,7 +123,7 @@ def _accounted(
     reporter: Reporter,
     found: Evaluation,
 ) -> dict:
-    """Return what `metrics.json` says of the fit itself."""
+    """Return the entries of `metrics.json` about the fit itself."""
     seconds = {
         **account.seconds,
         **watch.seconds,
@@ -151,10 +151,10 @@ def _accounted(
 def seconds_to_finish(
     scene: Scene, cfg: FitConfig, lpips_weights: LpipsWeights | None, *, reference: bool
 ) -> float:
-    """Return a guess of the seconds that evaluation and files will take, for the time budget.
+    """Return the seconds that the time budget reserves for evaluation and files.
 
-    At most a quarter of the budget is kept. With `reference` each view is compared with a reference
-    photograph as well.
+    They are at most a quarter of the budget. With `reference` each view is also compared with a
+    reference photograph.
     """
     if cfg.train.budget_s is None:
         return 0.0
@@ -162,13 +162,14 @@ def seconds_to_finish(
     for view in scene.views:
         width, height = size_at(view, cfg.data.max_width)
         pixels += width * height
-    # Measured (BUILD_NOTES, "Reserve for evaluation"): programs, then every view, and every pixel.
+    # Measured seconds per view and per pixel, and to compile (BUILD_NOTES, "Reserve for
+    # evaluation").
     per_view, per_pixel = (0.13, 0.45e-6) if reference else (0.09, 0.25e-6)
     start, times = 6.0, 5 if reference else 2
     if is_drive(scene):
-        # Parts of every view, and depth against LiDAR; LPIPS of static and moving pixels.
+        # Drives add scores of static and moving pixels of every view, and depth against LiDAR.
         start, per_view, times = start + 6.0, per_view + 0.1, 3 * times
     if lpips_weights is not None:
-        # Under two protocols (three where views have gammas), and three more against a reference.
+        # LPIPS runs under two protocols (three with gammas), and under three more with a reference.
         per_pixel += times * lpips_weights.network.seconds_per_pixel
     return min(start + per_view * len(scene.views) + per_pixel * pixels, 0.25 * cfg.train.budget_s)

@@ -52,20 +52,20 @@ from p2gs_jax.train.strategies import Strategy
 from p2gs_jax.train.terms import LossTerm
 from p2gs_jax.types import Params, Scene
 
-# Gaussians this many times out of reach are seen by nobody.
+# Gaussians farther away than this many times the reach of the scene are not visible in any view.
 RUNAWAY = 10.0
 
 
 @dataclass(frozen=True)
 class FitResult:
-    """What `fit` returns to a program."""
+    """The result of `fit`."""
 
     params: Params  # the fit, live Gaussians only
-    scene: Scene  # what it was fitted to
-    metrics: dict  # what `metrics.json` holds
+    scene: Scene  # the fitted scene
+    metrics: dict  # content of `metrics.json`
     run_dir: Path  # the run folder
-    selection: Selection | None  # what the bundle adjustment found, or None
-    decisions: Decisions  # what the scene settled
+    selection: Selection | None  # result of the bundle adjustment, or None
+    decisions: Decisions  # values that the scene decided
 
 
 def fit(
@@ -87,16 +87,15 @@ def fit(
 
     The scene is a COLMAP model, a transforms.json or a folder of photographs; `reference` has
     photographs of the same views under one common exposure. Without `cfg` the preset is `robust`.
-    Of the budget, `spent_s` seconds were gone before the call. True exposures by image name are for
-    the plot. Several `devices` share the views of a step; `train.batch` is a multiple of them.
-    Loss terms (by name), formation and densification of yours are as for `make_step`. The run
-    folder does not remember them: `resume` needs them again, and `load_run` shows pictures through
-    the tone curve of `cfg`.
+    `spent_s` seconds of the budget have passed before the call. `true_exposures` by image name are
+    for the plot. Several `devices` share the views of a step; `train.batch` is a multiple of them.
+    `terms` of the loss by name, `formation` and `strategy` are as for `make_step`. The run folder
+    does not store them: `resume` needs them again, and `load_run` uses the tone curve of `cfg`.
 
     Raises:
-        UserError: something the user can mend.
-        Interrupted: Ctrl-C, SIGTERM or SIGHUP came; once there are steps, after a checkpoint.
-        OSError: something cannot be read or written; `filename` names it.
+        UserError: a fault that the user can fix.
+        Interrupted: Ctrl-C, SIGTERM or SIGHUP came; during steps, a checkpoint is written first.
+        OSError: a file cannot be read or written; `filename` names it.
     """
     cfg, reporter = require_config(cfg), reporter or Silent()
     paths = Paths.of(scene_dir, run_dir, reference)
@@ -107,11 +106,11 @@ def fit(
     optimiser = Optimiser(folder, reporter, mesh, custom)
     pixels = decoded_into(folder.pixels)
     with no_empty_folders(paths.run), locked(paths.run) as lock, pixels, memory_named(), optimiser:
-        check_run_dir(paths.run, resume, cfg)  # another may have ended since
+        check_run_dir(paths.run, resume, cfg)  # another run may have ended in the meantime
         scene = load(paths.scene, paths.run, cfg, reporter, clock)
         truth = check_scene(scene, cfg, paths, weights)
         kept = kept_choice(cfg, folder) if resume else None
-        # A run that goes on for longer starts from what it was begun with.
+        # A resumed run that is longer starts from the steps and budget of its first start.
         asked = with_values(cfg, first_plan(folder))
         start = _prepared(scene, asked, folder, optimiser, kept, clock, reporter)
         start.cfg = dataclasses.replace(start.cfg, train=cfg.train)
@@ -123,9 +122,9 @@ def fit(
         params, owner = fitted(result, start.scene, cfg)
         lock.require()
         account = account_of(start, params, result, clock, begin)
-        what = (params, start.scene, start.survey.store, start.cfg, folder, account, reporter)
+        results = (params, start.scene, start.survey.store, start.cfg, folder, account, reporter)
         known = {"truth": truth, "lpips_weights": weights, "true_exposures": true_exposures}
-        metrics = finish(*what, owner=owner, still_ours=lock.require, **known)
+        metrics = finish(*results, owner=owner, still_ours=lock.require, **known)
     return FitResult(params, scene, metrics, paths.run, start.selection, start.decisions)
 
 
@@ -138,13 +137,13 @@ def _prepared(
     clock: Stopwatch,
     reporter: Reporter,
 ) -> Prepared:
-    """Start exposures, radiances and Gaussians from what a scene offers."""
+    """Solve the exposures of a scene and initialise its Gaussians."""
     render, note = suited(cfg.render)
     cfg = dataclasses.replace(cfg, render=render)
     with clock("photometry"):
         found = survey(scene, cfg, pixels=folder.pixels)
-        how = {"on_chosen": optimiser.expect(found, kept), "dense": found.dense, "kept": kept}
-        exposures = solve_exposures(scene, found.still, cfg, reporter, **how)
+        options = {"on_chosen": optimiser.expect(found, kept), "dense": found.dense, "kept": kept}
+        exposures = solve_exposures(scene, found.still, cfg, reporter, **options)
     with clock("seeds"):
         start = initialise(found, exposures, reporter)
     if note is not None:
@@ -182,8 +181,9 @@ class Optimiser:
     ) -> OnChosen:
         """Begin to compile steps while the exposures are solved, mostly on one core.
 
-        Model and curve are those that checkpoints `kept`, or that are `given` for a whole of which
-        the scene is a part; else most scenes' choice, and what is returned takes the scene's own.
+        Model and curve are those of checkpoints (`kept`) or of a larger scene that contains this
+        one (`given`). Otherwise they are the most frequent choice, and the returned function
+        compiles again for the choice of the scene.
         """
         guess = given or likely(found.cfg, kept, found.near)
 
@@ -194,7 +194,7 @@ class Optimiser:
             )
 
         def chosen(form: Form, response: Response) -> None:
-            # What cameras do enters the programs, and is only solved now.
+            # Vignetting and responses of cameras are constants of the programs, and not yet solved.
             if guess is not None and form.vignetting is None and response.by == "all":
                 begin(with_choice(guess, form, response), True)
 
@@ -207,26 +207,26 @@ class Optimiser:
     ) -> TrainResult:
         """Run the optimisation, from the start or from the newest checkpoint.
 
-        What the steps have to say is noted in `start` as well. Of the budget, `spent_s` seconds are
-        gone and `finish_s` are kept for evaluation and files.
+        Messages of the steps are added to the notes of `start`. `spent_s` seconds of the budget
+        have passed, and `finish_s` seconds are reserved for evaluation and files.
         """
         alive = np.ones(start.params.gaussians.capacity, bool)
-        params, how = self._custom.among(start.params), {"spent_s": spent_s, "finish_s": finish_s}
+        params, times = self._custom.among(start.params), {"spent_s": spent_s, "finish_s": finish_s}
         trainer = self._trainer(start, self._reporter)
-        return trainer.run(params, alive, start.owner, resume=resume, **how)
+        return trainer.run(params, alive, start.owner, resume=resume, **times)
 
     def _trainer(self, start: Prepared, reporter: Reporter) -> Trainer:
-        def say(text: str) -> None:
+        def note(text: str) -> None:
             start.notes.append(text)
             reporter.message(text)
 
         rows, train, found = start.scene.train_indices, start.cfg.train, start.survey
-        # What corrects display values knows places in an image.
+        # Corrections of display values may depend on the position in the image.
         plain = start.cfg.photometry.appearance is None and self._custom.formation is None
-        how = {"resident": train.batch == 1, "padded": plain}
+        storage = {"resident": train.batch == 1, "padded": plain}
         return Trainer(
             start.cfg,
-            TrainingViews(found.fitted, rows, train.seed, found.measured, **how),
+            TrainingViews(found.fitted, rows, train.seed, found.measured, **storage),
             found.extent,
             start.pairs,
             found.coverage,
@@ -234,7 +234,7 @@ class Optimiser:
             self._programs,
             start.decisions,
             on_log=reporter.log,
-            on_message=say,
+            on_message=note,
             mesh=self._mesh,
             terms=self._custom.terms,
             strategy=self._custom.strategy,
@@ -242,9 +242,9 @@ class Optimiser:
 
 
 def compact(result: TrainResult, scene: Scene | None = None) -> tuple[Params, np.ndarray | None]:
-    """Return the parameters with only the live Gaussians, in slot order, and whose they are.
+    """Return the parameters with the live Gaussians only, in slot order, and their owners.
 
-    Those that exploration threw out of reach of a scene, where nothing sees them, are left out.
+    Gaussians that exploration moved far out of the reach of a scene are left out.
     """
     population, params = result.state.population, result.state.params
     alive = np.asarray(population.alive)
@@ -252,7 +252,7 @@ def compact(result: TrainResult, scene: Scene | None = None) -> tuple[Params, np
     if scene is not None:
         middle, most = reach(scene.training_views, scene.points)
         away = np.linalg.norm(np.asarray(params.gaussians.means) - middle, axis=1)
-        # Of objects means are relative to their boxes.
+        # The means of objects are relative to their boxes.
         alive = alive & ((away <= RUNAWAY * most) | (False if owner is None else owner >= 0))
     gaussians = jax.tree.map(lambda a: jax.device_put(np.asarray(a)[alive]), params.gaussians)
     owner = None if owner is None else owner[alive]
@@ -260,13 +260,13 @@ def compact(result: TrainResult, scene: Scene | None = None) -> tuple[Params, np
 
 
 def fitted(result: TrainResult, scene: Scene, cfg: FitConfig) -> tuple[Params, np.ndarray | None]:
-    """Return the results of a fit under the options as asked, and whose each Gaussian is."""
+    """Return the results of a fit in their gauge, and the owner of each Gaussian."""
     params, owner = compact(result, scene)
     return centred(exposures_apart(params), cfg), owner
 
 
 def centred(params: Params, cfg: FitConfig) -> Params:
-    """Return parameters in the gauge of results: exposures of mean 1, unless some are known."""
+    """Return parameters in the gauge of results: mean log exposure 0 unless exposures are known."""
     if cfg.photometry.parameterization == "log" and cfg.photometry.known is None:
         return recentre(params, cfg.render.radiance)
     return params
@@ -275,7 +275,7 @@ def centred(params: Params, cfg: FitConfig) -> Params:
 def account_of(
     start: Prepared, params: Params, result: TrainResult, clock: Stopwatch, begin: float
 ) -> Account:
-    """Return what a fit says of itself; it began at `begin` (`time.monotonic`)."""
+    """Return counts, durations and notes of a fit that began at `begin` (`time.monotonic`)."""
     return Account(
         counts={
             "gaussians": params.gaussians.capacity,
@@ -299,9 +299,9 @@ def account_of(
 
 @contextlib.contextmanager
 def begun(folder: RunFolder, paths: Paths, cfg: FitConfig, decisions: Decisions) -> Iterator[None]:
-    """Make the folder a run's while its steps are taken, and keep it where they left something.
+    """Write the start of a run; remove it if the steps fail before the first checkpoint.
 
-    A run that failed before its first checkpoint leaves nothing to continue or to overwrite.
+    Such a run leaves no files that could be continued or would have to be overwritten.
     """
     write_start(folder, paths.scene, paths.reference, cfg, decisions)
     try:

@@ -1,9 +1,9 @@
-"""What can be refused is refused before anything is written: a wrong option costs no run folder.
+"""Invalid requests are refused before anything is written.
 
-Memory is foretold as well: a fit that dies after an hour helps nobody. A model from above, measured
-on fits of 1,000 and 300,000 Gaussians: programs and libraries, so much for every parameter of a
-Gaussian, for every pixel of the largest view and for every pixel of the photographs that are kept
-decoded. On a GPU Gaussians and the pixels of a view are the device's, and are not foretold.
+A fit that would run out of memory is refused as well. The estimate is an upper bound, measured on
+fits of 1,000 and 300,000 Gaussians. It adds programs and libraries, the parameters of Gaussians,
+the pixels of the largest view and the pixels of decoded photographs. On a GPU, Gaussians and the
+pixels of a view are in the device's memory, which is not estimated.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ OPTIONS = "--gaussians, --max-width or --data.cache-mb"
 
 @dataclass(frozen=True)
 class Paths:
-    """What a fit reads and writes; `reference` is under one common exposure."""
+    """Folders that a fit reads and writes; `reference` is under one common exposure."""
 
     scene: Path
     run: Path
@@ -49,19 +49,19 @@ class Paths:
 
     @classmethod
     def of(cls, scene: str | Path, run: str | Path, reference: str | Path | None = None) -> Paths:
-        """Return paths that a caller may have given as text."""
+        """Return the paths from paths or text."""
         return cls(Path(scene), Path(run), None if reference is None else Path(reference))
 
 
 def preflight(cfg: FitConfig, paths: Paths, *, resume: bool = False) -> LpipsWeights | None:
-    """Refuse what can be refused without the scene; nothing is written.
+    """Check the options and the folders, without the scene; nothing is written.
 
     Returns:
-        The weights of LPIPS, where they are asked for.
+        The weights of LPIPS, if the options name them.
 
     Raises:
-        UserError: an option contradicts another, a file it names cannot be used, or the run folder
-            holds another run or is in use.
+        UserError: options contradict each other, a file that they name cannot be used, or the run
+            folder holds another run or is in use.
     """
     require_free(paths.run)
     check_options(cfg)
@@ -75,10 +75,10 @@ def preflight(cfg: FitConfig, paths: Paths, *, resume: bool = False) -> LpipsWei
 def check_scene(
     scene: Scene, cfg: FitConfig, paths: Paths, lpips_weights: LpipsWeights | None
 ) -> Reference | None:
-    """Refuse what can be refused before exposures are solved; nothing is written.
+    """Check that options suit the scene, before exposures are solved; nothing is written.
 
     Returns:
-        The photographs under one common exposure, where there are any.
+        The photographs under one common exposure, if there are any.
 
     Raises:
         UserError: the options do not suit the views.
@@ -92,41 +92,45 @@ def check_scene(
 
 
 def check_options(cfg: FitConfig) -> None:
-    """Refuse moves that no shrinking makes up for, and a start of the exposures that contradicts.
+    """Check the options that depend on each other.
 
     Raises:
-        UserError: the spread is not in [0, 1); known exposures or the curve do not suit the start.
+        UserError: the spread is not in [0, 1); or known exposures or the curve do not suit the
+            initial exposures.
     """
     p, share = cfg.photometry, cfg.densify.spread
     curved, random = p.curve != "linear", "--photometry.curve linear --photometry.start random"
     if not 0 <= share < 1:
         why = f"--densify.spread {share:g} is not between 0 and 1 (1 excluded)."
-        raise UserError(why, fix="give a share of a Gaussian's own extent, for example 0.5")
+        raise UserError(why, fix="give a share of the Gaussian's extent, for example 0.5")
     if p.known is not None and p.start != "tracks":
-        why = f"the preset {cfg.preset!r} starts exposures at random: known ones would be ignored."
+        why = f"the preset {cfg.preset!r} draws initial exposures and would ignore known ones."
         raise UserError(why, fix="leave out --known-exposures, or add --photometry.start tracks")
     if p.appearance == "ppisp" and curved:
-        why = f"ppisp learns a whole camera: the curve {p.curve!r} would come before it."
+        why = f"ppisp learns a whole camera; it does not combine with curve {p.curve!r}."
         raise UserError(why, fix=f"use --preset ppisp, or add {random}")
     if p.appearance == "luminance" and curved:
-        why = f"Luminance-GS maps display values to display values: it knows no curve {p.curve!r}."
+        why = f"Luminance-GS corrects display values; it does not combine with curve {p.curve!r}."
         raise UserError(why, fix=f"use --preset luminance_gs, or add {random}")
     if not curved and p.start == "tracks":
-        why = "the curve 'linear' splats display values; the tracks' bundle adjustment does not "
-        why += "know it."
+        why = "the curve 'linear' splats display values; the bundle adjustment over tracks does "
+        why += "not support it."
         fix = "add --photometry.start random, or use the preset ppisp or one of 3dgs*"
         raise UserError(why, fix=fix)
 
 
 def check_run_dir(run_dir: Path, resume: bool, cfg: FitConfig) -> bool:
-    """Refuse to overwrite a run, and to continue one under other options.
+    """Check that the folder holds no run, or with `resume` a run under the same options.
 
     Options of the evaluation and the memory for photographs may differ: they do not change the fit.
-    Steps and budget may be larger; the result says whether they are.
+    Steps and budget may be larger.
+
+    Returns:
+        Whether steps or budget are larger than those of the run.
 
     Raises:
-        UserError: the folder holds a run and `resume` is not set, is not a folder, or holds a run
-            that was begun with other options.
+        UserError: the path is not a folder, holds a run and `resume` is not set, or holds a run
+            with other options.
     """
     if run_dir.exists() and not run_dir.is_dir():
         raise UserError(f"{run_dir} is a file.", fix="name a folder with --out")
@@ -144,19 +148,19 @@ def check_run_dir(run_dir: Path, resume: bool, cfg: FitConfig) -> bool:
     differ = [name for name in compared if saved.get(name) != now.get(name)]
     if differ:
         other = [f"{name} was {saved.get(name)}, now {now.get(name)}" for name in differ]
-        fix = "repeat the options it was begun with (--steps and --budget may be larger), or "
-        fix += "name another folder with --out"
+        fix = "repeat the options of its start (--steps and --budget may be larger), or name "
+        fix += "another folder with --out"
         raise UserError(f"{run_dir} was begun with other options: {'; '.join(other[:6])}.", fix=fix)
     return bool(longer)
 
 
 class MemoryNeeded(NamedTuple):
-    """Bytes that a fit takes at its peak, and the largest `population` there may be."""
+    """Bytes of memory that a fit needs at its peak, and the largest `population` (Gaussians)."""
 
     programs: float  # Python, libraries, compiling
     gaussians: float  # parameters, moments, gradients
-    photographs: float  # decoded and kept
-    view: float  # pictures of the largest view and their gradients
+    photographs: float  # decoded photographs in memory
+    view: float  # images of the largest view and their gradients
     population: int
 
     @property
@@ -166,7 +170,7 @@ class MemoryNeeded(NamedTuple):
 
 
 def memory_needed(scene: Scene, cfg: FitConfig, coverage: Coverage) -> MemoryNeeded:
-    """Return the bytes that a fit will take at its peak."""
+    """Return the bytes of memory that a fit needs at its peak."""
     count = max(seed_bound(cfg, min(len(scene.points), cfg.init.max_seeds), coverage), 1)
     parameters = 11 + 3 * (cfg.render.sh_degree + 1) ** 2
     here = jax.default_backend() == "cpu"
@@ -182,38 +186,38 @@ def memory_needed(scene: Scene, cfg: FitConfig, coverage: Coverage) -> MemoryNee
 
 
 def require_memory(needed: MemoryNeeded) -> None:
-    """Refuse a fit that will not find its memory.
+    """Check that the memory of a fit is available.
 
     Raises:
-        UserError: more is needed than is left; names the option that helps.
+        UserError: the fit needs more memory than there is; the message names options that help.
     """
     left = left_to_process()
     if left is None or needed.total <= left + resident():
         return
-    room = left + resident()
+    available = left + resident()
     raise UserError(
         f"this fit would take about {_gb(needed.total)} of memory at its peak ({needed.population} "
         f"Gaussians {_gb(needed.gaussians)}, photographs {_gb(needed.photographs)}, pixels of a "
-        f"view {_gb(needed.view)}, programs {_gb(needed.programs)}), and there are {_gb(room)}.",
+        f"view {_gb(needed.view)}, programs {_gb(needed.programs)}), and {_gb(available)} is left.",
         fix=f"lower {OPTIONS}, or end other programs",
     )
 
 
 @contextlib.contextmanager
 def memory_named() -> Iterator[None]:
-    """Let memory that runs out in a `with` block say what helps.
+    """Turn errors about memory in a `with` block into one that names the remedy.
 
     Raises:
-        UserError: it ran out. Other errors stay as they are.
+        UserError: memory ran out. Other errors pass unchanged.
     """
     try:
         yield
     except (MemoryError, RuntimeError, OSError) as error:
         if not ran_out(error):
             raise
-        said = str(error).splitlines()[0][:160] if str(error) else "an allocation failed"
+        cause = str(error).splitlines()[0][:160] if str(error) else "an allocation failed"
         fix = f"lower {OPTIONS}, in a new folder, or end other programs and add --resume"
-        raise UserError(f"memory ran out ({said}).", fix=fix) from error
+        raise UserError(f"memory ran out ({cause}).", fix=fix) from error
 
 
 def _gb(size: float) -> str:

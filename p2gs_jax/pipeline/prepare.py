@@ -1,4 +1,4 @@
-"""What the first optimisation step starts from: Gaussians of a scene whose exposures are known."""
+"""Initialisation: Gaussians of a scene whose exposures are known."""
 
 from __future__ import annotations
 
@@ -31,25 +31,25 @@ from p2gs_jax.types import Camera, Gaussians, Params, Scene, View
 
 @dataclass
 class Prepared:
-    """Everything known before the first optimisation step."""
+    """The state before the first optimisation step."""
 
-    survey: Survey  # what was known before the exposures
-    scene: Scene  # the same, and its points have colours
+    survey: Survey  # the scene before its exposures were known
+    scene: Scene  # the same scene, whose points have colours
     params: Params  # initial parameters
-    decisions: Decisions  # what the scene settled
-    cfg: FitConfig  # what the fit computes under: as asked, with `decisions` filled in
+    decisions: Decisions  # values that the scene decided
+    cfg: FitConfig  # options of the fit: those of the user with `decisions` filled in
     owner: np.ndarray | None = None  # moving object of each Gaussian (`Population.owner`)
     selection: Selection | None = None  # model, exposures and their errors from the tracks
     pairs: ColorPairs | None = None  # corresponding observations
-    notes: list[str] = field(default_factory=list)  # what the user should know
+    notes: list[str] = field(default_factory=list)  # notes for the user
 
     def view(self, index: int) -> tuple[Camera, Float32[np.ndarray, "h w 3"], np.ndarray]:
-        """Return the camera, the photograph (display values) and the mask that a step takes."""
+        """Return the camera, the photograph (display values) and the mask of a view in a step."""
         return camera_of(self.survey.fitted, index), *self.survey.fitted.get(index)
 
 
 def expected(found: Survey, decisions: Decisions) -> Prepared:
-    """Return what a fit will start from in its shapes: black Gaussians, exposures of 1."""
+    """Return an initial state with the shapes of the real one: black Gaussians, exposures of 1."""
     scene, cfg, views = found.scene, found.cfg, found.scene.training_views
     points = scene.points[found.seeds]
     black = seeding.gaussians_from_points(points, np.zeros_like(points), views, cfg)
@@ -71,8 +71,8 @@ def expected(found: Survey, decisions: Decisions) -> Prepared:
 
 
 def initialise(found: Survey, exposures: Exposures, reporter: Reporter | None = None) -> Prepared:
-    """Make Gaussians of the seeds of a scene whose exposures are known."""
-    return_freed_memory()  # what solving the exposures took
+    """Return the initial state: Gaussians at the seeds of a scene whose exposures are known."""
+    return_freed_memory()  # the solution of the exposures has freed much
     reporter, scene, nodes = reporter or Silent(), found.scene, found.nodes
     decisions = exposures.decisions
     if exposures.radiance is None:
@@ -151,14 +151,14 @@ def _notes(
     notes += [] if shell is None else [shell.note()]
     notes += thinned
     if found.cfg.dynamics.method == "vibration" and not found.vibrating:
-        notes.append("Views have no times: everything is fitted as if it stood still.")
+        notes.append("Views have no times: the whole scene is fitted as static.")
     return notes
 
 
 def _with_nodes(
     gaussians: Gaussians, nodes: Nodes, radiance: np.ndarray, views: list[View], cfg: FitConfig
 ) -> tuple[Gaussians, np.ndarray | None]:
-    """Return Gaussians with those of moving objects behind them, and to what each belongs."""
+    """Return Gaussians followed by those of moving objects, and the owner of each."""
     if not len(nodes.moving):
         return gaussians, None
     world = np.full(gaussians.capacity, -1, np.int32)
@@ -169,7 +169,7 @@ def _with_nodes(
 def _bounded(
     gaussians: Gaussians, owner: np.ndarray | None, cfg: FitConfig
 ) -> tuple[Gaussians, np.ndarray | None, list[str]]:
-    """Return at most as many Gaussians as the options allow, whose they are, and what to say."""
+    """Return at most as many Gaussians as the options allow, their owners, and notes."""
     bound = cfg.densify.max_gaussians
     if bound is None or gaussians.capacity <= bound:
         return gaussians, owner, []

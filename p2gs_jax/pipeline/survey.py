@@ -1,4 +1,4 @@
-"""What a scene offers before its exposures are known: photographs, size, places of seeds."""
+"""Survey of a scene before its exposures are known: photographs, size, positions of seeds."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ from p2gs_jax.train.lidar_depths import measured_depths
 from p2gs_jax.train.schedule import shrinks
 from p2gs_jax.types import Measured, Scene, View
 
-# The near plane is not farther than this share of the depth of near points (their percentile).
+# The near plane is at most this share of the depth of near points (this percentile of depths).
 NEAR_SHARE, NEAR_PERCENTILE = 0.2, 1.0
-# What a view shows near: this percentile of its points, many of which others hide.
+# Percentile of depths that stands for near surfaces; other points may occlude many of the points.
 EXTENT_PERCENTILE = 10.0
-# Steps of float32 at the scene's place, as a share of that depth; beyond, surfaces jitter.
+# Spacing of float32 at the cameras, as a share of that depth, above which surfaces jitter.
 COARSE = 1e-4
 
 
@@ -44,24 +44,24 @@ class Survey:
     """A scene before its exposures are known; lengths are in scene units."""
 
     scene: Scene
-    cfg: FitConfig  # as asked
-    store: ImageStore  # photographs, whole; its cameras see what moves
-    fitted: ImageStore  # the same without the pixels that are left out of the fit
-    still: ImageStore  # of what stands still and is opaque: exposures and seeds come from them
+    cfg: FitConfig  # options of the user
+    store: ImageStore  # whole photographs; its cameras show moving objects
+    fitted: ImageStore  # photographs without the pixels that are left out of the fit
+    still: ImageStore  # static, opaque pixels only, for exposures and seeds
     nodes: Nodes | None  # moving objects and their points
-    vibrating: bool  # Gaussians move by themselves
-    radius: float  # of the cameras
-    extent: float  # what rates of the means are shares of
-    near: float | None  # near plane, where the one asked for would cut the scene
-    coverage: Coverage  # how much of the scene the views show
+    vibrating: bool  # Gaussians move without boxes
+    radius: float  # radius of the cameras
+    extent: float  # unit of the rates of means
+    near: float | None  # closer near plane, if that of the options would cut the scene
+    coverage: Coverage  # extent of the scene in the views
     measured: list[Measured] | None  # depths of every training view for the loss
-    dense: bool  # seeds come from matching photographs as well
+    dense: bool  # more seeds come from optical flow
     seeds: Int[np.ndarray, " s"]  # rows of the scene's points that become Gaussians
-    init: InitConfig  # without a shell where a background lies behind everything
-    sphere: Sphere | None  # where a shell lies, where that is given
-    shell: Shell | None  # what lies behind all points; None: nothing, or dense seeds decide it
-    scale_notes: list[str]  # what the user should know of units and place
-    seed_notes: list[str]
+    init: InitConfig  # options of seeds; without a shell if there is a background
+    sphere: Sphere | None  # prescribed sphere of a shell, or None
+    shell: Shell | None  # shell behind all points; None: no shell, or dense seeds decide it
+    scale_notes: list[str]  # notes for the user on units and position
+    seed_notes: list[str]  # notes for the user on seeds
 
 
 def load(
@@ -71,10 +71,10 @@ def load(
     reporter: Reporter | None = None,
     clock: Stopwatch | None = None,
 ) -> Scene:
-    """Read a scene of any known format and check that there is something to fit.
+    """Read a scene of any known format and check that it can be fitted.
 
     Raises:
-        UserError: it cannot be read, or has fewer than two training views or no seed points.
+        UserError: the scene cannot be read, or has fewer than two training views or no seed points.
     """
     reporter, begin = reporter or Silent(), time.monotonic()
     reporter.stage("Reading the scene")
@@ -98,13 +98,13 @@ def load(
 def survey(
     scene: Scene, cfg: FitConfig, *, pixels: Path | None = None, sphere: Sphere | None = None
 ) -> Survey:
-    """Find what a scene offers without its exposures.
+    """Survey a scene before its exposures are known.
 
-    The folder `pixels` is for decoded photographs that are more than memory holds. What lies behind
-    all goes on `sphere`, where the whole of which the scene is a part has one.
+    The folder `pixels` is for decoded photographs that do not fit into memory. If a larger scene
+    contains this one, the shell lies on the `sphere` of the larger scene.
 
     Raises:
-        UserError: there is not the memory for a fit, nothing to see, or two backgrounds.
+        UserError: memory does not suffice, masks hide all pixels, or there are two backgrounds.
     """
     scene, far_notes = seeding.within_reach(scene)
     nodes, vibrating = find_nodes(scene, cfg.dynamics), vibrates(scene, cfg)
@@ -143,7 +143,7 @@ def survey(
         seeds=seeds,
         init=init,
         sphere=sphere,
-        # Dense seeds cover some of what the points do not.
+        # Dense seeds may cover directions in which there are no points.
         shell=None if dense else find_shell(views, scene.points, radius, init, sphere),
         scale_notes=notes,
         seed_notes=[*far_notes, *thinned],
@@ -151,19 +151,19 @@ def survey(
 
 
 def _require_something_to_see(scene: Scene, store: ImageStore) -> None:
-    """Refuse masks that hide everything; of most scenes the first photograph is looked at."""
+    """Check that masks do not hide all pixels; in most scenes only one photograph is read."""
     if not any(store.stored(index)[1].any() for index in scene.train_indices):
         why = f"the masks hide every pixel of all {len(scene.train_indices)} training views."
-        fix = "masks are black where pixels are to be ignored: invert them, or take them away"
+        fix = "masks are black where pixels are to be ignored: invert them, or remove them"
         raise UserError(why, fix=fix)
 
 
 def _shell_options(store: ImageStore, cfg: FitConfig) -> InitConfig:
-    """Return the options of seeds: what lies behind everything is the background, or a shell."""
+    """Return the options of seeds, without a shell if there is a background."""
     behind = cfg.render.background is not None
     if store.backdrop is not None and behind:
-        why = "render.background is light behind the splats, and the photographs' alpha shows "
-        why += "data.background there."
+        why = "there are two backgrounds: render.background, and data.background behind "
+        why += "photographs with alpha."
         fix = "leave one of them out: --render.background None, or --data.alpha mask"
         raise UserError(why, fix=fix)
     if (store.backdrop is not None or behind) and cfg.init.shell == "auto":
@@ -172,7 +172,7 @@ def _shell_options(store: ImageStore, cfg: FitConfig) -> InitConfig:
 
 
 def _choose_points(scene: Scene, cfg: FitConfig) -> tuple[np.ndarray, list[str]]:
-    """Return at most as many rows of points as the options allow, and what to say of it."""
+    """Return at most as many rows of points as the options allow, and notes."""
     bound, most, option = cfg.densify.max_gaussians, cfg.init.max_seeds, "--init.max-seeds"
     if bound is not None and bound <= most:
         most, option = bound, "--gaussians"
@@ -193,31 +193,31 @@ def seen_depths(points: Float[np.ndarray, "p 3"], views: Sequence[View]) -> Floa
 
 
 def near_depth(depths: Float[np.ndarray, " n"]) -> float | None:
-    """Return how deep the nearest points lie, scene units; None where none is seen."""
+    """Return the depth of near points, scene units; None if no view shows a point."""
     return float(np.percentile(depths, NEAR_PERCENTILE)) if len(depths) else None
 
 
 def extent_of_rates(radius: float, depths: Float[np.ndarray, " n"], cfg: FitConfig) -> float:
-    """Return the length that rates of the means are shares of, from the cameras' radius."""
+    """Return the unit of the rates of means: the cameras' radius, or the depth of near points."""
     if cfg.optimizer.extent == "cameras" or not len(depths):
         return radius
     return min(radius, float(np.percentile(depths, EXTENT_PERCENTILE)))
 
 
 def near_plane(depth: float | None, cfg: FitConfig) -> float | None:
-    """Return a near plane for scenes that the one asked for would cut; None: it stays."""
+    """Return a near plane if that of the options would cut the scene; None: it would not."""
     if depth is None or cfg.render.near <= NEAR_SHARE * depth:
         return None
     return float(f"{NEAR_SHARE * depth:.2g}")
 
 
 def scale_notes(scene: Scene, near: float | None, cfg: FitConfig, depth: float | None) -> list[str]:
-    """Return what the user should know of the scene's units and place."""
+    """Return notes for the user on the scene's units and position."""
     out = []
     if near is not None:
         out.append(
             f"The near plane is {near:g} scene units instead of {cfg.render.near:g}, which would "
-            "cut off what the photographs show."
+            "cut off surfaces that the photographs show."
         )
     views, wrong = scene.training_views, seeding.misplaced(scene.training_views, scene.points)
     if wrong.any():
@@ -225,14 +225,14 @@ def scale_notes(scene: Scene, near: float | None, cfg: FitConfig, depth: float |
         out.append(
             f"{wrong.sum()} of {len(views)} cameras stand {seeding.FARTHER:g} times as far away as "
             f"all others, or farther ({names}): their poses are probably wrong, and do not count "
-            "for the size of the scene. Take these photographs out of it."
+            "for the size of the scene. Remove these photographs from the scene."
         )
     away = float(np.abs(seeding.camera_centers(views)[~wrong]).max())
     step = away * float(np.finfo(np.float32).eps)
     if depth is not None and step > COARSE * depth:
         out.append(
             f"The cameras are up to {away:.2g} scene units from the origin, where float32 has "
-            f"steps of {step:.1g}, {step / depth:.1%} of the way to the nearest surfaces: "
-            "these may jitter. Subtract a common offset from poses and points."
+            f"steps of {step:.1g} ({step / depth:.1%} of the depth of near surfaces): "
+            "surfaces may jitter. Subtract a common offset from poses and points."
         )
     return out

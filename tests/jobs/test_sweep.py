@@ -127,7 +127,7 @@ def test_a_sweep_keeps_what_is_done_and_names_what_failed(tmp_path):
     metrics = json.loads((tmp_path / "out" / "good" / "seed_0" / "metrics.json").read_text())
     assert good["seconds"] == whole_run(metrics["seconds"]) > metrics["seconds"]["optimisation"]
     assert said[0].endswith(f"{good['seconds']:.0f} s")
-    assert "starts exposures at random" in result.rows[2]["reason"]
+    assert "draws initial exposures" in result.rows[2]["reason"]
     assert json.loads((tmp_path / "out" / "sweep.json").read_text()) == result.rows
     table = (tmp_path / "out" / "sweep.md").read_text()
     assert "| good | 2 of 2 |" in table

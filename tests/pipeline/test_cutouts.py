@@ -119,7 +119,7 @@ def test_an_exposure_moves_what_is_there_and_not_what_is_behind_it(twin):
 def test_light_behind_the_splats_and_a_background_are_one_too_many(ball, tmp_path):
     _, run = ball
     cfg = with_fields(run.cfg, {"render.background": (1.0,) * 3})
-    with pytest.raises(UserError, match=r"render.background is light behind the splats"):
+    with pytest.raises(UserError, match=r"there are two backgrounds: render.background"):
         fit(run.scene.root, tmp_path / "run", cfg)
 
 

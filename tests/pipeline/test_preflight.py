@@ -44,7 +44,7 @@ def scene(tmp_path_factory):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--preset", "paper", "--known-exposures", "KNOWN"), "starts exposures at random"),
+        (("--preset", "paper", "--known-exposures", "KNOWN"), "draws initial exposures"),
         (("--preset", "ppisp", "--photometry.curve", "srgb"), "a whole camera"),
         (("--known-exposures", "KNOWN"), "names none of the"),
         (("--known-exposures", "exif"), "carries an exposure time"),
@@ -255,7 +255,7 @@ def test_what_does_not_fit_is_refused_with_what_helps(left):
         left(enough)
         require_memory(needed)
     left(3 * GB)
-    said = r"about 11.0 GB .*4000000 Gaussians 8.0 GB.*are 4.0"
+    said = r"about 11.0 GB .*4000000 Gaussians 8.0 GB.*and 4.0 GB is left"
     with pytest.raises(UserError, match=said) as error:
         require_memory(needed)
     assert all(o in error.value.fix for o in ("--gaussians", "--data.cache-mb", "--max-width"))

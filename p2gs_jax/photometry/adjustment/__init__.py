@@ -3,15 +3,15 @@
 Model, in logarithms relative to the pivot x0: F(I) - log x0 = a_v (h_v + l_p) + noise, with h the
 log exposure, l the log radiance of a point and channel, a = 2.2 / gamma, and F the log response
 (`response.py`). With b = a h this is b_v + a_v l_p: linear but for one product. Point radiances are
-eliminated exactly (variable projection). What remains is the Schur complement over the views: its
-entries are sums over pairs of observations of a point, so cost and memory grow with those pairs,
-never with points times views.
+eliminated exactly (variable projection). The Schur complement over the views remains. Its entries
+are sums over pairs of observations of a point, so that cost and memory grow with those pairs, never
+with points times views.
 
-`problem` lays observations out; `parameters` says what is solved for, what is free and what is
-known besides. `equations` weighs and assembles sums from `matrices`, and `solve` repeats both until
-nothing moves. `errors` says how sure the result is, and `fit` makes a solution of it.
+`problem` prepares observations; `parameters` defines the unknowns, free directions and priors.
+`equations` weighs observations and assembles sums from `matrices`, and `solve` repeats both until
+convergence. `errors` computes standard errors, and `fit` returns a solution.
 
-All runs on the host, in numpy: derivatives are written out anyway, a round takes milliseconds, and
+Everything runs on the host, in numpy: derivatives are explicit, a round takes milliseconds, and
 four programs for the models, curves and sizes of one scene took longer to compile than to solve
 (BUILD_NOTES, "Compile less, outside the step").
 """

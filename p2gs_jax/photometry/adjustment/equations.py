@@ -1,6 +1,6 @@
-"""Residuals at given parameters, robust weights, and the normal equations they sum to.
+"""Residuals at given parameters, robust weights, and the normal equations.
 
-The points are eliminated from the equations: the Schur complement.
+The points are eliminated from the equations (Schur complement).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from p2gs_jax.photometry.observations import Labels, PerChannel
 
 Loss = Literal["l1", "geman_mcclure", "whole_points"]
 GEMAN_MCCLURE = 3.0  # width of the Geman-McClure loss in robust standard deviations
-# What is known of a point's spread before it is looked at counts as this many observations.
+# Weight of the prior of a point's spread, number of observations.
 PRIOR_SPREAD = 3.0
 SMALLEST_SCALE = 0.3
 MEDIAN_ROWS = 4096
@@ -29,15 +29,15 @@ PerObservation = Float[np.ndarray, " o"]
 
 
 class Weighted(NamedTuple):
-    """Everything per observation at given parameters."""
+    """Residuals and weights of all observations at given parameters."""
 
     weight: PerChannel  # robust weight over variance
     sigma: PerChannel  # stated standard deviation of z
     slope: PerChannel  # dz/dy
-    residual: PerChannel  # of each observation, log units
+    residual: PerChannel  # residual of each observation, log units
     radiance: Float[np.ndarray, "r 3"]  # log radiance of each row's point relative to the pivot
-    level: PerChannel  # the same at every observation, with what its camera adds
-    precision: Float[np.ndarray, "r 3"]  # of `radiance`
+    level: PerChannel  # the same at every observation, plus features of its camera
+    precision: Float[np.ndarray, "r 3"]  # inverse variance of `radiance`
     scale: float  # robust standard deviation of one observation in units of its stated one
     curvature: float  # mean second derivative of the robust loss over its weight (1 for squares)
 
@@ -45,7 +45,7 @@ class Weighted(NamedTuple):
 def weigh(model: Forward, theta: Parameters, weight: PerChannel, loss: Loss) -> Weighted:
     """Return residuals at some parameters, and the weights that they imply under a loss.
 
-    The weight of the round before decides the point radiances that residuals are taken from.
+    The point radiances of the residuals come from the weights of the previous round.
     """
     layout, z, sigma, slope = model.layout, model.z, model.sigma, model.slope
     if theta.c.size:
@@ -56,11 +56,11 @@ def weigh(model: Forward, theta: Parameters, weight: PerChannel, loss: Loss) -> 
     radiance, _ = _radiance(layout, a, z_of_point, weight)
     u = (z_of_point - a * radiance[layout.row]) / sigma
     scale = max(1.4826 * _median(model, np.abs(u)), SMALLEST_SCALE)
-    # One weight for the whole observation: an outlier is wrong in all channels.
+    # One weight for all channels: an outlier is wrong in all of them.
     used = model.weight.sum(1)
     size, width = np.maximum(used, 1), GEMAN_MCCLURE * scale
     square = (u**2 * model.weight).sum(1) / size / width**2
-    # An exposure moves all channels together: only what they share bends its loss.
+    # An exposure moves all channels together: its curvature comes from their common residual.
     common = ((u * model.weight).sum(1) / size / width) ** 2
     if loss == "l1":
         factor, curvature = 1 / np.maximum(np.abs(u) / scale, 0.5), 1.0
@@ -81,16 +81,16 @@ def weigh(model: Forward, theta: Parameters, weight: PerChannel, loss: Loss) -> 
 def _whole_points(
     square: PerObservation, common: PerObservation, share: PerObservation, layout: Layout
 ) -> tuple[PerObservation, PerObservation]:
-    """Return weights and second derivatives where every point has a spread of its own.
+    """Return weights and second derivatives if every point has a separate spread.
 
-    Gloss and silhouettes make all that a point shows uncertain, and by different amounts. So the
-    Geman-McClure losses of a point's observations are summed as the squares of Student's t are,
-    whose scale is the point's own: it counts the less, the more its views differ.
+    Gloss and silhouettes make all observations of a point uncertain, by different amounts for
+    different points. The Geman-McClure losses of a point are therefore summed as the squares in
+    Student's t, whose scale belongs to the point: its weight falls as its views differ more.
     """
     alone, curved = _derivatives(square, common)
     bound = GEMAN_MCCLURE**2
     losses = layout.by_row @ (share * bound * square / (1 + square))
-    # A point's radiance takes one observation away.
+    # A point's radiance takes one degree of freedom.
     freedom = np.maximum(layout.by_row @ share - 1, 0)
     of_row = ((PRIOR_SPREAD + freedom) / (PRIOR_SPREAD + losses))[layout.row]
     along = 2 * share * bound * common * alone**2 / (PRIOR_SPREAD + losses[layout.row])
@@ -100,14 +100,14 @@ def _whole_points(
 def _curvature(
     robust: PerObservation, second: PerObservation, known: PerObservation, layout: Layout
 ) -> float:
-    """Return the second derivative of the loss over its weight, points eliminated, on average.
+    """Return the mean ratio of the loss's second derivative to its weight, points eliminated.
 
-    Observations are `known` with inverse variances.
+    `known` are the inverse variances of observations.
     """
     weight, curved = known * robust, known * second
     of_row, bent = layout.by_row @ weight, layout.by_row @ curved
     whole = float((of_row - layout.by_row @ weight**2 / np.maximum(of_row, EMPTY)).sum())
-    # Where outliers of few observations bend a point's loss downwards, it is held nevertheless.
+    # Outliers can make a point's curvature negative; a lower bound keeps the point determined.
     bent = np.maximum(bent, LEAST_BENT * of_row)
     left = curved.sum() - (layout.by_row @ curved**2 / np.maximum(bent, EMPTY)).sum()
     return float(left) / max(whole, EMPTY)
@@ -116,21 +116,21 @@ def _curvature(
 def _derivatives(
     square: PerObservation, common: PerObservation
 ) -> tuple[PerObservation, PerObservation]:
-    """Return slope over residual and curvature of the Geman-McClure loss, of one observation.
+    """Return slope over residual, and curvature, of the Geman-McClure loss of an observation.
 
-    `square` is the mean over its channels of squared residuals, `common` the square of their mean.
+    `square` is the mean of squared residuals over its channels, `common` the square of their mean.
     """
     return 1 / (1 + square) ** 2, (1 + square - 4 * common) / (1 + square) ** 3
 
 
 def _radiance(layout: Layout, a, z, weight):
-    """Return the log radiance of each row and its precision; a per observation."""
+    """Return the log radiance of each row and its precision; `a` is per observation."""
     precision = layout.by_row @ (weight * a**2)
     return layout.by_row @ (weight * a * z) / (precision + EMPTY), precision
 
 
 def _median(model: Forward, values: PerChannel) -> float:
-    """Return the median of used values; of more rows than MEDIAN_ROWS, of every n-th row."""
+    """Return the median of used values; with more than MEDIAN_ROWS rows, of every n-th row."""
     used = model.weight > 0
     step = max(1, model.layout.rows // MEDIAN_ROWS)
     if step > 1:
@@ -143,10 +143,10 @@ def _median(model: Forward, values: PerChannel) -> float:
 
 
 class OfView(NamedTuple):
-    """A parameter that every view has: the derivative of predictions, and where it acts."""
+    """A parameter that every view has."""
 
-    derivative: PerChannel
-    channels: list[int]
+    derivative: PerChannel  # derivative of predictions
+    channels: list[int]  # channels in which it acts
 
 
 def normal_equations(
@@ -155,7 +155,7 @@ def normal_equations(
     """Return the reduced normal matrix and right side, without gauges and priors.
 
     A prediction b + a (l + k features) - c basis has the derivatives 1, l + k features, a features
-    and -basis; a point's own is a. The products of pairs are of a `kind`; see `Pairs.sums`.
+    and -basis; the derivative by l is a. `kind` is the type of products of pairs; see `Pairs.sums`.
     """
     layout, u = model.layout, model.unknowns
     w, pull = at.weight, at.weight * at.residual
@@ -165,7 +165,7 @@ def normal_equations(
     views = np.arange(u.views)
 
     def of_each(values: PerChannel, channels: list[int]):
-        # Of nothing at all, numpy counts in integers.
+        # Without values, `bincount` returns integers.
         return np.bincount(layout.views, values[:, channels].sum(1), u.views).astype(np.float64)
 
     for x, one in enumerate(per_view):
@@ -177,7 +177,7 @@ def normal_equations(
     factors, channels = [coupled * p.derivative for p in per_view], [p.channels for p in per_view]
     of_pairs = layout.pairs.sums(factors, channels, kind)
     parts.append(of_pairs._replace(values=-of_pairs.values))
-    # Without gammas, a keeps its place in the vector.
+    # Without gammas, a stays in the vector.
     right += [] if u.gammas else [np.zeros(u.views)]
     if (terms := others(model, theta)) is not None:
         more, pulled = _with_others(model, at, terms, per_view, coupled)
@@ -187,7 +187,7 @@ def normal_equations(
 
 
 def coupling(layout: Layout, theta: Parameters, at: Weighted) -> PerChannel:
-    """Return what couples the observations of a point once it is eliminated: its derivatives."""
+    """Return factors whose products couple observations of a point after its elimination."""
     return at.weight * theta.a[layout.views][:, None] / np.sqrt(at.precision + EMPTY)[layout.row]
 
 
@@ -211,7 +211,7 @@ def others(model: Forward, theta: Parameters) -> Terms | None:
 def _with_others(
     model: Forward, at: Weighted, terms: Terms, per_view: list[OfView], coupled: PerChannel
 ) -> tuple[list[Entries], Float[np.ndarray, " k"]]:
-    """Return what k and c add to the equations: entries, and their right side."""
+    """Return the parts of k and c in the equations: entries, and their right side."""
     layout, u = model.layout, model.unknowns
     place = 3 * layout.row[:, None] + np.arange(3)
     through = terms.sums(coupled, place, 3 * layout.rows)
@@ -242,7 +242,7 @@ def at_places(
     count: int,
     channels: Sequence[int] = (0, 1, 2),
 ) -> sp.csr_array:
-    """Return the matrix that holds values of channels at places and points: (count, 3 rows)."""
+    """Return the matrix of values of channels at `places` (rows) and points: (count, 3 rows)."""
     at = 3 * layout.row[:, None] + np.array(channels)
     where = np.broadcast_to(places[:, None], at.shape)
     shape = (count, 3 * layout.rows)
@@ -252,7 +252,7 @@ def at_places(
 def summed(
     model: Forward, theta: Parameters, at: Weighted, values: PerChannel, places: Labels
 ) -> sp.csr_array:
-    """Return sums over places of values (for scores: weight times residual) times derivatives."""
+    """Return sums at `places` of values (for scores: weight times residual) times derivatives."""
     layout, u = model.layout, model.unknowns
     count = int(places.max(initial=-1)) + 1
     totals = [(values * p.derivative)[:, p.channels].sum(1) for p in of_views(model, at)]
@@ -270,7 +270,7 @@ def over_all(
 ) -> sp.csr_array:
     """Return columns for all parameters: those of views, then those of k and c, if any."""
     parts = [*per_view]
-    if not u.gammas:  # a keeps its place
+    if not u.gammas:  # a stays in the vector
         parts.append(sp.csr_array((parts[0].shape[0], u.views)))  # pyright: ignore
     if more is not None:
         parts.append(sp.csr_array(more))

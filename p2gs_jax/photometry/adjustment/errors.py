@@ -1,9 +1,10 @@
-"""Standard errors that hold for robust weights and correlated pixels, and what nothing holds.
+"""Standard errors for robust weights and correlated pixels, and undetermined directions.
 
-Points side by side share texture, gloss and what is not modelled. Gloss, haze and moving shade err
-alike over a whole region of an image: points average such errors out between views, never within
-one. Counted as independent they left standard errors of photographs of known exposure 2 times too
-small, and of drives with simulated ones 3 to 7 times (BUILD_NOTES, "The camera as it is").
+Neighbouring points share texture, gloss and effects that are not modelled. Gloss, haze and moving
+shade cause the same error over a whole region of an image: it averages out between views, never
+within a view. If points counted as independent, standard errors were 2 times too small for
+photographs of known exposure, and 3 to 7 times for drives with simulated exposures (BUILD_NOTES,
+"The camera as it is").
 """
 
 from __future__ import annotations
@@ -23,37 +24,37 @@ from p2gs_jax.photometry.adjustment.parameters import EMPTY, Forward, Parameters
 from p2gs_jax.photometry.adjustment.solve import Balanced, Fit, one_thread
 from p2gs_jax.photometry.observations import Labels, Observations
 
-CANCELLED = 1e-6  # relative size of what a difference of equal numbers leaves of them
-# Share of a parameter's information that must be left beside all others'. Rounding leaves less, and
-# so does what keeps points without observations finite (`parameters.EMPTY`).
+CANCELLED = 1e-6  # relative rounding error of a difference of equal numbers
+# Least share of its information with which a direction counts as determined; rounding and
+# `parameters.EMPTY` leave less.
 HELD = 1e-11
-# Draws from the errors where unknowns are too many for their covariance: a standard error is then
-# known to 12 %.
+# Number of random draws if unknowns are too many for their covariance: the relative error of a
+# standard error is then 12 %.
 DRAWS = 32
-# Side of the regions whose points form a cluster, in units of half an image's diagonal. Errors over
-# error bars on photographs of known exposure: 2.1 where every point counts by itself, 1.6 in
-# regions of this size, and no better in larger ones (BUILD_NOTES, "The camera as it is").
+# Side of the regions whose points form a cluster, units of half an image's diagonal. Errors over
+# standard errors of photographs of known exposure: 2.1 if points are independent, 1.6 with regions
+# of this size, and no better with larger ones (BUILD_NOTES, "The camera as it is").
 REGION = 1 / 3
 SHARED_REGION = 2 / 3  # side of the regions that share an error, in the same units
-# Regions that hold fewer observations, or the weight of fewer, say nothing of what they share.
+# Least number, and least effective number, of observations in a region for its shared error.
 FEWEST, FEWEST_EFFECTIVE = 4, 3.0
 
-# What is asked, of changes of all parameters (columns) about the solution.
+# A linear function of changes of all parameters (columns) about the solution.
 Asked = Callable[[Parameters], Float[np.ndarray, "n c"]]
 
 
 class Uncertainty(NamedTuple):
-    """How sure a solution is."""
+    """The covariance of a solution."""
 
     # Columns whose outer products sum to the covariance of all parameters.
     roots: Float[np.ndarray, "d r"]
-    # Directions that the observations do not hold: `roots` knows nothing of them.
+    # Directions that the observations do not determine and `roots` does not contain.
     unknown: Float[np.ndarray, "d k"]
-    few: Float[np.ndarray, " v"]  # factors on the errors of views that few clusters tell of
-    split: Callable[[Float[np.ndarray, "d c"]], Parameters]  # their parts
+    few: Float[np.ndarray, " v"]  # factors on the errors of views with few clusters
+    split: Callable[[Float[np.ndarray, "d c"]], Parameters]  # splits vectors into parameters
 
     def of(self, asked: Asked) -> Float[np.ndarray, " n"]:
-        """Return the standard deviations of what is asked; inf where nothing is known."""
+        """Return the standard deviations of a function of the parameters; inf: undetermined."""
         deviation = np.linalg.norm(asked(self.split(self.roots)), axis=1)
         if not self.unknown.size:
             return deviation
@@ -64,9 +65,8 @@ class Uncertainty(NamedTuple):
 def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncertainty:
     """Return the robust covariance of all parameters: bread, meat, bread (Huber; White).
 
-    Residuals of the three channels of an observation, of a point, and of its neighbours are not
-    independent: the meat is summed over clusters, and counts them once. What regions of an
-    image share besides is added to it.
+    Residuals of the channels of an observation, of a point, and of its neighbours are not
+    independent: the meat is summed over clusters. Errors that regions of an image share are added.
     """
     layout = fit.model.layout
     clusters = observations.cells
@@ -75,7 +75,7 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
     each = summed(fit.model, fit.theta, fit.at, fit.at.weight * fit.at.residual, clusters)
     if observations.positions is not None and len(layout.row):
         labels = regions(observations.positions, observations.views, SHARED_REGION)
-        # In all points, also those that count for little: what matte ones share is less.
+        # The shared error is that of all points, also of those with small weights.
         alike = weigh(fit.model, fit.theta, fit.at.weight, "geman_mcclure")
         parts = layout.row if observations.cells is None else clusters
         deviation = _shared_deviation(fit.model, alike, labels, parts)
@@ -83,7 +83,7 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
             shared = deviation * _shared_scores(fit.model, fit.theta, fit.at, labels)
             each = sp.csr_array(sp.vstack([each, shared]))
     seen = fit.model.weight.any(1)
-    # A view's exposure is the mean of its clusters, and takes one of them away.
+    # A view's exposure is a mean over its clusters and takes one degree of freedom.
     pairs = np.unique(np.stack([layout.views[seen], clusters[seen]]), axis=1)[0]
     count = np.maximum(np.bincount(pairs, minlength=layout.view_count), 2)
     few = np.sqrt(count / (count - 1))
@@ -93,17 +93,17 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
     if not is_small(system.basis.shape[1]):  # pyright: ignore
         drawn = _drawn(Balanced(bread, gauges, system.basis), each, system)
         return Uncertainty(*drawn, few, system.unknowns.split)
-    # A prior is itself an observation with variance 1 / precision: it is its own meat.
+    # A prior is an observation with variance 1 / precision: its meat equals its bread.
     meat = each.T @ each + held
     with one_thread():
-        everything = whole(bread + gauges.T @ gauges)
-        return Uncertainty(*_sandwich(everything, meat, system.basis), few, system.unknowns.split)
+        dense = whole(bread + gauges.T @ gauges)
+        return Uncertainty(*_sandwich(dense, meat, system.basis), few, system.unknowns.split)
 
 
 def _sandwich(bread, meat, basis) -> tuple[Float[np.ndarray, "d r"], Float[np.ndarray, "d k"]]:
     if not basis.nnz:
         return np.zeros((len(bread), 1)), np.zeros((len(bread), 0))
-    # Exposures that are known say so much more than pixels that only ratios can be compared.
+    # Known exposures have much more information than pixels: directions are scaled to compare them.
     diagonal = (basis.T @ bread @ basis).diagonal()
     g = basis @ sp.diags_array(1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)))
     value, direction = np.linalg.eigh(whole(g.T @ bread @ g))
@@ -138,10 +138,10 @@ def regions(
 
 
 def side_by_side(observations: Observations, row: Labels) -> Labels:
-    """Return the cluster of each observation: the region of an image its point is first seen in.
+    """Return the cluster of each observation: the image region of its point in its first view.
 
-    Each point by itself would count a common error as often as there are points; so they count
-    where positions are not known. `row` is the row of the adjustment each belongs to.
+    Without positions every point is a cluster. `row` is the row in the adjustment of each
+    observation.
     """
     if observations.positions is None or not len(row):
         return row
@@ -153,11 +153,11 @@ def side_by_side(observations: Observations, row: Labels) -> Labels:
 
 
 def _shared_deviation(model: Forward, at: Weighted, labels: Labels, parts: Labels) -> float:
-    """Return the standard deviation of what observations of a region share, log units.
+    """Return the standard deviation of the error that observations of a region share, log units.
 
-    Means of regions vary by more than what each of their `parts` does by itself explains. Exposures
-    and radiances take a part of that away, which is put back. Medians: a region may show something
-    that moved.
+    It is the excess of the variance of region means over that from independent `parts`. Exposures
+    and radiances absorb a share of it, which is restored. Medians are used, because a region may
+    show a moving object.
     """
     layout, weight = model.layout, at.weight.sum(1)
     count = int(labels.max(initial=-1)) + 1
@@ -177,13 +177,13 @@ def _shared_deviation(model: Forward, at: Weighted, labels: Labels, parts: Label
         return 0.0
     mean = total(share * of_part) / np.maximum(size, EMPTY)
     spread = total(share * (of_part - mean[region]) ** 2) / np.maximum(size, EMPTY)
-    own = (spread / np.maximum(effective - 1, 1))[good]
-    excess = (1.4826 * np.median(np.abs(mean[good]))) ** 2 - np.median(own)
+    expected = (spread / np.maximum(effective - 1, 1))[good]
+    excess = (1.4826 * np.median(np.abs(mean[good]))) ** 2 - np.median(expected)
     used = weight > 0
     seen_by = np.bincount(layout.row[used])
     view = np.zeros(count, int)
     view[labels] = layout.views
-    # Regions of unequal weight are worth fewer equal ones.
+    # The effective number of regions of a view: unequal weights reduce it.
     of_view, squares = (np.bincount(view, v, layout.view_count) for v in (size, size**2))
     per_view = of_view[of_view > 0] ** 2 / squares[of_view > 0]
     kept = (1 - 1 / np.mean(seen_by[seen_by > 0])) * (1 - 1 / max(np.mean(per_view), 2))
@@ -191,10 +191,10 @@ def _shared_deviation(model: Forward, at: Weighted, labels: Labels, parts: Label
 
 
 def _shared_scores(model: Forward, theta: Parameters, at: Weighted, labels: Labels) -> sp.csr_array:
-    """Return how the right side, points eliminated, moves with errors of regions: (regions, d)."""
+    """Return derivatives of the right side, points eliminated, by region errors: (regions, d)."""
     layout, u = model.layout, model.unknowns
     coupled = equations.coupling(layout, theta, at)
-    taken = [
+    per_view = [
         equations.at_places(layout, coupled * p.derivative, layout.views, u.views, p.channels).T
         for p in equations.of_views(model, at)
     ]
@@ -202,5 +202,5 @@ def _shared_scores(model: Forward, theta: Parameters, at: Weighted, labels: Labe
     more = None if terms is None else terms.sums(coupled, place, 3 * layout.rows)
     of_points = equations.at_places(layout, coupled, labels, int(labels.max(initial=-1)) + 1)
     return summed(model, theta, at, at.weight, labels) - of_points @ equations.over_all(
-        u, taken, more
+        u, per_view, more
     )

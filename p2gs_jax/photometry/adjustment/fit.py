@@ -1,4 +1,4 @@
-"""From a problem to its solution: solved, explained, in its gauge, with errors and warnings."""
+"""From a problem to its solution, in its gauge, with standard errors and warnings."""
 
 from __future__ import annotations
 
@@ -23,30 +23,30 @@ from p2gs_jax.photometry.solution import MIN_OBSERVATIONS, PhotometricSolution
 from p2gs_jax.photometry.unmodelled import place_warnings
 from p2gs_jax.types import GAMMA_SRGB
 
-# Points by which a view is solved; more only repeat them (BUILD_NOTES, "Exposures from a part").
+# Points per view for the solution; more are redundant (BUILD_NOTES, "Exposures from a part").
 PER_VIEW = 1000
-# Observations of all views together, and what each view has nevertheless.
+# Largest number of observations of all views together, and least number of points per view.
 MOST_SOLVED, LEAST_PER_VIEW = 1_500_000, 200
-UNMODELLED_PER_VIEW = 2000  # points of a view from which is told what is not modelled
-# Observations that count less than this share of what their noise alone would give are ignored.
+UNMODELLED_PER_VIEW = 2000  # points per view for the test of effects that are not modelled
+# Observations count as outliers if their weight is below this share of that from their noise alone.
 IGNORED = 0.25
-BLOCK = 1_000_000  # observations that are looked at together: 20 million at once are gigabytes
-NOTICEABLE_BALANCE_EV = 0.1  # a channel off by this much in a view is worth a word
-# What is left of the way is worth no word below this share of a typical standard error.
+BLOCK = 1_000_000  # observations per block: 20 million at once take gigabytes
+NOTICEABLE_BALANCE_EV = 0.1  # error of a channel in a view from which there is a warning
+# Remaining change, as a share of a typical standard error, from which there is a warning.
 NEGLIGIBLE = 0.1
 
 
 def fit_model(
     problem: Problem, form: Form | ModelName, response: Response | None = None
 ) -> PhotometricSolution:
-    """Solve everything that varies, and radiances of all points; by default under sRGB.
+    """Solve a form and the radiances of all points; by default under sRGB.
 
-    Where views see very much, exposures are solved from a part; errors are of that part.
+    If there are very many observations, exposures and their errors come from a part of them.
     """
     response = response or Response()
     form = Form(form) if isinstance(form, str) else form
     o = problem.observations
-    # Fewer, where views are thousands.
+    # Thousands of views have fewer points each.
     most = int(np.clip(MOST_SOLVED / max(o.view_count, 1), LEAST_PER_VIEW, PER_VIEW))
     pick = o.thinned(most, 0)
     few = problem if pick.all() else problem.part(pick)
@@ -58,11 +58,11 @@ def fit_model(
 def explain(
     fit: Fit, problem: Problem, response: Response
 ) -> tuple[Float[np.ndarray, "p 3"], Float32[np.ndarray, "o 3"], float]:
-    """Explain all observations, whatever part `fit` was solved from.
+    """Explain all observations by `fit`, which may be solved from a part of them.
 
-    Return the log radiance of points relative to the pivot, gauges not yet set and NaN where
-    unobserved; residuals in log exposure, 0 where not usable; and the share of the usable values
-    that the robust loss ignores.
+    Return the log radiance of points relative to the pivot, before gauges are fixed and NaN where
+    unobserved; residuals in log exposure, 0 where not usable; and the share of usable values that
+    the robust loss ignores.
     """
     o = problem.observations
     radiance = np.full((o.point_count, 3), np.nan)
@@ -70,7 +70,7 @@ def explain(
     ignored = 0
     for pick, points, part in _blocks(problem):
         mine, usable = part.observations, part.usable
-        # At the solution each observation is judged by itself.
+        # At the solution each observation has a robust weight of its residual alone.
         model = Forward.of(part, usable, response, fit.model.unknowns)
         weight = model.noise_weight
         for loss in ("l1", "l1", "geman_mcclure", "geman_mcclure"):
@@ -90,28 +90,28 @@ def explain(
 
 
 def _blocks(problem: Problem) -> Iterator[tuple[np.ndarray | slice, np.ndarray | slice, Problem]]:
-    """Yield whole points with all their observations: which these are, and they alone."""
+    """Yield blocks of whole points: rows of observations, rows of points, and their problem."""
     points = problem.observations.points
     if len(points) <= BLOCK:
         yield slice(None), slice(None), problem
         return
     order = np.argsort(points, kind="stable")
-    place = 0
-    while place < len(order):
-        last = points[order[min(place + BLOCK, len(order)) - 1]]
+    start = 0
+    while start < len(order):
+        last = points[order[min(start + BLOCK, len(order)) - 1]]
         end = int(np.searchsorted(points, last, side="right", sorter=order))
-        pick = order[place:end]
-        own, label = np.unique(points[pick], return_inverse=True)
+        pick = order[start:end]
+        used, label = np.unique(points[pick], return_inverse=True)
         part = problem.part(pick)
-        few = replace(part.observations, points=label, point_count=len(own))
-        yield pick, own, replace(part, observations=few)
-        place = end
+        few = replace(part.observations, points=label, point_count=len(used))
+        yield pick, used, replace(part, observations=few)
+        start = end
 
 
 def solution_of(
     problem: Problem, form: Form, response: Response, fit: Fit, known: Uncertainty
 ) -> PhotometricSolution:
-    """Return exposures in their gauge, with errors and warnings; the problem holds everything."""
+    """Return the solution of the whole problem in its gauge, with errors and warnings."""
     o, used = problem.observations, problem.usable
     log_radiance, residual, outliers = explain(fit, problem, response)
     seen = used.any(1)
@@ -123,7 +123,7 @@ def solution_of(
         active = active | given
     scale, color = (_Gauge(problem.component, active & one) for one in (free, True))
     exposures, shifts, lost = _exposures(fit, known, active, scale, color)
-    # Points go the other way, as much as one of their views.
+    # Radiances of points shift inversely, by the shift of one of their views.
     some_view = np.zeros(o.point_count, int)
     some_view[o.points[seen]] = o.views[seen]
     view_residual, tint = _per_view_ev(o.views, residual, used, o.view_count)
@@ -150,15 +150,15 @@ def solution_of(
         cameras=cameras,
         corner_errors=corner_errors,
     )
-    said = _warnings(fit, solution, lost, active, o.names)
-    said += place_warnings(o.picked(part), residual[part] / LN2, used[part])
-    return replace(solution, warnings=tuple(said))
+    warnings = _warnings(fit, solution, lost, active, o.names)
+    warnings += place_warnings(o.picked(part), residual[part] / LN2, used[part])
+    return replace(solution, warnings=tuple(warnings))
 
 
 def _exposures(
     fit: Fit, known: Uncertainty, active: Bool[np.ndarray, " v"], scale: _Gauge, color: _Gauge
 ) -> tuple[dict[str, np.ndarray], Float[np.ndarray, "v x"], Bool[np.ndarray, " v"]]:
-    """Return exposures, gammas and tints with errors; shifts; views that have no errors."""
+    """Return exposures, gammas and white balance with errors; shifts; views without errors."""
     a, light = fit.theta.a, fit.theta.b / fit.theta.a[:, None]
     h, balance = light.mean(1), light - light.mean(1, keepdims=True)
     shift = scale.shift(h)
@@ -198,7 +198,7 @@ def _exposures(
 
 
 class _Gauge:
-    """Means over those `counted` of the views of a component, whose absolute terms are unknown."""
+    """Means over the `counted` views of each component, whose absolute values are unknown."""
 
     def __init__(self, component: Int[np.ndarray, " v"], counted: Bool[np.ndarray, " v"]):
         members = np.flatnonzero(counted)
@@ -214,14 +214,14 @@ class _Gauge:
         return (self._mean @ flat)[self._component].reshape(values.shape)
 
     def centred(self, values: Float[np.ndarray, "v ..."]) -> Float[np.ndarray, "v ..."]:
-        """Return values less that."""
+        """Return the values minus the means of their components."""
         return values - self.shift(values)
 
 
 def _cameras(
     fit: Fit, response: Response, known: Uncertainty, o: Observations
 ) -> tuple[tuple[CameraFormation, ...], Float[np.ndarray, "c j"]]:
-    """Return what each physical camera does, and standard errors of log V in its corners."""
+    """Return vignetting and response of each camera, and standard errors of log V in corners."""
     features = fit.model.unknowns.features
     if features.vignetting is None and not response.splines:
         return (), np.zeros((0, 0))
@@ -249,7 +249,7 @@ def _spread_ev(residual: Float[np.ndarray, " n"]) -> float:
 def _per_view_ev(
     views: Labels, residual: PerChannel, used: Bool[np.ndarray, "o 3"], count: int
 ) -> tuple[Float[np.ndarray, " v"], Float[np.ndarray, "v 3"]]:
-    """Return the spread of every view and its colour balance; NaN where it has none."""
+    """Return the residual spread of every view and its colour balance, stops; NaN: unobserved."""
     spread, balance = np.full(count, np.nan), np.full((count, 3), np.nan)
     for view, mine in enumerate(grouped(views, count)):
         seen = used[mine]
@@ -264,24 +264,24 @@ def _per_view_ev(
 def _warnings(
     fit: Fit, s: PhotometricSolution, lost: np.ndarray, active: np.ndarray, names: Sequence[str]
 ) -> list[str]:
-    """Say where numbers are not to be trusted, and what observations tell besides or do not tell.
+    """Return warnings about uncertain results and about effects that are not modelled.
 
-    Views that are `lost` have no errors; those that are `active` have any observations, or a known
-    exposure.
+    Views that are `lost` have no standard errors; views that are `active` have observations or a
+    known exposure.
     """
     out, balance = [], s.view_balance_ev
     known = s.exposure_errors[np.isfinite(s.exposure_errors)]
     typical = float(np.median(known)) if known.size else 0.0
     if not fit.converged and fit.left > NEGLIGIBLE * typical:
         out.append(
-            f"The photometric solution had not settled after {fit.rounds} rounds (its last moved a "
-            f"parameter by {fit.moved:.1e}, log units): exposures may be off by more than their "
-            "standard errors say. Compare them with --photometry.no-select and a simpler "
+            f"The photometric solution had not converged after {fit.rounds} rounds (the last "
+            f"changed a parameter by {fit.moved:.1e}, log units): errors of exposures may exceed "
+            "their standard errors. Compare them with --photometry.no-select and a simpler "
             "--photometry.model."
         )
     if lost.any():
         out.append(
-            f"The standard errors of {lost.sum()} training view(s) cannot be told: what joins them "
+            f"The standard errors of {lost.sum()} training view(s) are unknown: their connection "
             f"to the others is lost in rounding ({_listed(np.flatnonzero(lost), names)})."
         )
     few = np.flatnonzero(s.observations_per_view < MIN_OBSERVATIONS)
@@ -305,7 +305,7 @@ def _warnings(
         out.append(
             f"White balance changes: {len(tinted)} training view(s) are tinted against the others "
             f"({_listed(tinted, names)}; most of all {_listed([worst], names)}, by {channels} EV). "
-            "An exposure here is one number for all channels."
+            "The model has one exposure for all channels of a view."
         )
     return out
 

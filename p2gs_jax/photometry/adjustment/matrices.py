@@ -9,19 +9,19 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Int
 
-DENSE = 1500  # up to this many unknowns, matrices are kept and factorised as a whole
-CHUNK = 1 << 15  # pairs whose products are formed at once: they stay in the cache
+DENSE = 1500  # largest number of unknowns for dense matrices
+CHUNK = 1 << 15  # number of pairs whose products are formed at once, within the cache
 
 Matrix = np.ndarray | sp.csr_array | sp.csc_array
 
 
 def is_small(size: int) -> bool:
-    """Return whether matrices of this many unknowns are kept as a whole."""
+    """Return whether matrices of this many unknowns are dense."""
     return size <= DENSE
 
 
 class Entries(NamedTuple):
-    """Values at places of a matrix; those at one place are summed."""
+    """Entries of a matrix; values at the same row and column are summed."""
 
     rows: Int[np.ndarray, " n"]
     columns: Int[np.ndarray, " n"]
@@ -29,7 +29,7 @@ class Entries(NamedTuple):
 
 
 def block(row: int, column: int, values: Float[np.ndarray, "n m"]) -> Entries:
-    """Return a dense block whose first entry is at a place."""
+    """Return a dense block whose first entry is at a row and a column."""
     at = np.indices(values.shape)
     return Entries((row + at[0]).ravel(), (column + at[1]).ravel(), values.ravel())
 
@@ -43,23 +43,23 @@ def assembled(parts: list[Entries], size: int) -> Matrix:
 
 
 def whole(matrix: Matrix) -> Float[np.ndarray, "n n"]:
-    """Return a matrix that is dense."""
+    """Return the matrix as a dense array."""
     return matrix if isinstance(matrix, np.ndarray) else matrix.toarray()
 
 
 class Alike(NamedTuple):
     """Values that depend on the same parameters: their products are small and dense."""
 
-    where: Int[np.ndarray, " n"]  # among all values, channels of an observation in turn
+    where: Int[np.ndarray, " n"]  # index among all values; channels of an observation in turn
     columns: Int[np.ndarray, " m"]  # parameter of each term; `Terms.count` where there is no term
-    factors: Float[np.ndarray, "m n"]  # of that parameter
+    factors: Float[np.ndarray, "m n"]  # factor of that parameter
 
 
 @dataclass(frozen=True)
 class Terms:
-    """What every value depends on linearly, in a fixed number of terms.
+    """Linear dependence of every value on parameters, in a fixed number of terms.
 
-    Few of all combinations of parameters occur; `groups` holds each with its values.
+    Few of all combinations of parameters occur; `groups` holds each of them with its values.
     """
 
     groups: tuple[Alike, ...]
@@ -70,7 +70,7 @@ class Terms:
     def of_index(
         cls, index: Int[np.ndarray, "o 3 m"], factor: Float[np.ndarray, "o 3 m"], count: int
     ) -> Terms:
-        """Lay out terms by their parameters, `count` where there is none, and by their factors."""
+        """Group terms by their parameters (`count`: none) and factors."""
         index, factor = (part.reshape(-1, part.shape[-1]) for part in (index, factor))
         short = index.astype(np.min_scalar_type(count))  # sorted faster
         order = np.lexsort(short.T)
@@ -87,7 +87,7 @@ class Terms:
         return out.reshape(-1, 3)
 
     def scaled(self, by: Float[np.ndarray, "o 1"], terms: int) -> Terms:
-        """Return these with the first of all terms multiplied by a number an observation."""
+        """Return terms whose first `terms` are multiplied by a number per observation."""
         by, groups = np.repeat(by, 3), []
         for where, columns, factors in self.groups:
             scaled = np.concatenate([by[where] * factors[:terms], factors[terms:]])
@@ -97,12 +97,12 @@ class Terms:
     def sums(
         self, values: Float[np.ndarray, "o 3"], place: Int[np.ndarray, "o 3"], places: int
     ) -> Float[np.ndarray, "places k"]:
-        """Return sums of values times factors at each of `places` places, for each parameter."""
+        """Return sums of values times factors by `place`, one of `places`, for each parameter."""
         total, values, place = np.zeros((self.count + 1, places)), values.ravel(), place.ravel()
         for where, columns, factors in self.groups:
             here, weights = place[where], values[where]
             for column, factor in zip(columns, factors, strict=True):
-                # `bincount` would go through all places for each of many groups.
+                # `bincount` would visit all places for each of many groups.
                 np.add.at(total[column], here, weights * factor)
         return total[:-1].T
 
@@ -117,21 +117,21 @@ class Terms:
         """Return the sum of values times the outer products of factors."""
         total, values = np.zeros((self.count + 1,) * 2), values.ravel()
         for where, columns, factors in self.groups:
-            # No term may stand more than once.
+            # A parameter may occur in several terms.
             np.add.at(total, np.ix_(columns, columns), (factors * values[where]) @ factors.T)
         return total[:-1, :-1]
 
 
 class Pairs:
-    """Every pair of observations of a row once, each with itself: few of all pairs of views."""
+    """Every pair of observations in a row once, including an observation with itself."""
 
     def __init__(self, row: Int[np.ndarray, " o"], views: Int[np.ndarray, " o"], view_count: int):
-        # Sorted by row, the two of a pair lie close together.
+        # Sorted by row, the observations of a pair are close in memory.
         self._order = np.argsort(row, kind="stable")
         self._views = view_count
         here, seen_by = row[self._order], views[self._order]
         at = np.arange(len(here))
-        # Every entry with itself and those after it that equal it.
+        # Each observation is paired with itself and with later ones of the same row.
         following = np.searchsorted(here, here, side="right") - at
         self._first = np.repeat(at, following).astype(np.int32)
         ends = np.cumsum(following) - following
@@ -151,33 +151,33 @@ class Pairs:
     ) -> Entries:
         """Return the sum over rows of outer products of per-view vectors: (x V, x V).
 
-        `factors` are what each of x parameters contributes in the `channels` that it acts in.
-        Products are of a `kind`. In the rounds float32: there the matrix decides how fast they
-        converge, never where they end. Standard errors need float64: what joins groups of views by
-        a few dark points is less than the rounding of what joins the views of a group.
+        `factors` are those of each of x parameters in the `channels` in which it acts. `kind` is
+        the type of products. Rounds use float32: their matrix affects how fast they converge, not
+        the result. Standard errors need float64: the coupling of groups of views by a few dark
+        points is less than the rounding of the coupling inside a group.
         """
-        count, views, own = len(factors), self._views, channels
-        parts = [f[:, c][self._order].astype(kind) for f, c in zip(factors, own, strict=True)]
-        shared = [[c for c in one if c in other] for one in own for other in own]
+        count, views = len(factors), self._views
+        parts = [f[:, c][self._order].astype(kind) for f, c in zip(factors, channels, strict=True)]
+        shared = [[c for c in one if c in other] for one in channels for other in channels]
         used = [k for k, common in enumerate(shared) if common]
         totals = np.zeros((len(used), len(self._rows)))
-        # Not fewer at once than half of the entries they are added to.
+        # A chunk has at least half as many pairs as there are entries to add to.
         chunk = max(CHUNK, len(self._rows) // 2)
         for start in range(0, len(self._first), chunk):
             part = slice(start, start + chunk)
             first, second, place = self._first[part], self._second[part], self._place[part]
-            # A product of an observation with itself is counted twice below.
+            # The product of an observation with itself is counted twice below.
             half = np.where(first == second, kind(0.5), kind(1.0))
             left = [np.take(p, first, 0) * half[:, None] for p in parts]
             right = [np.take(p, second, 0) for p in parts]
             for total, k in zip(totals, used, strict=True):
                 x, y = divmod(k, count)
-                a, b = ([own[z].index(c) for c in shared[k]] for z in (x, y))
+                a, b = ([channels[z].index(c) for c in shared[k]] for z in (x, y))
                 products = np.einsum("pf,pf->p", left[x][:, a], right[y][:, b])
                 total += np.bincount(place, products, len(total))
         rows = np.concatenate([self._rows + k // count * views for k in used])
         columns = np.concatenate([self._columns + k % count * views for k in used])
         totals = totals.ravel()
-        # The other order of each pair.
+        # Add each pair in the other order as well.
         both = ((rows, columns), (columns, rows), (totals, totals))
         return Entries(*map(np.concatenate, both))

@@ -1,4 +1,4 @@
-"""What is to be explained: observations laid out once, for any number of models and curves."""
+"""The problem: observations prepared once, for any number of models and curves."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from p2gs_jax.photometry.adjustment.matrices import Pairs
 from p2gs_jax.photometry.observations import Observations
 
 LONGEST_ROW = 16
-TELLING_EV = 0.1  # known exposures that differ by less, stops, tell the power of no curve
+TELLING_EV = 0.1  # least difference of known exposures that fixes the power of a curve, stops
 
 
 @dataclass(frozen=True)
 class KnownExposures:
-    """What is known of the exposures besides the photographs."""
+    """Exposures known from another source than the photographs."""
 
-    log_exposures: Float[np.ndarray, " v"]  # natural logarithm; NaN where nothing is known
-    deviation_ev: float = 0.0  # standard deviation in stops; 0 keeps the value
+    log_exposures: Float[np.ndarray, " v"]  # natural logarithm; NaN where unknown
+    deviation_ev: float = 0.0  # standard deviation, stops; 0 fixes the values
 
 
 class Layout:
-    """Which row, view and camera each observation belongs to.
+    """Row, view and camera of each observation.
 
-    Tracks longer than `slots` are split into interleaved rows with a radiance of their own each,
-    which loses a few degrees of freedom and bounds the number of pairs. `by_row` sums observations
-    over their rows; `radius2` are squared distances from the image centre, 1 in the corners.
+    Tracks longer than `slots` are split into interleaved rows, each with a separate radiance. This
+    loses a few degrees of freedom and bounds the number of pairs. `by_row` sums observations over
+    their rows; `radius2` are squared distances from the image centre, 1 in the corners.
     """
 
     def __init__(self, observations: Observations):
@@ -56,29 +56,29 @@ class Layout:
 
     @functools.cached_property
     def pairs(self) -> Pairs:
-        """Every pair of observations in a row once, themselves included."""
+        """Every pair of observations in a row once, including an observation with itself."""
         return Pairs(self.row, self.views, self.view_count)
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Observations laid out once, for any number of models."""
+    """Observations prepared once, for any number of models."""
 
     observations: Observations  # the colours
-    usable: Bool[np.ndarray, "o 3"]  # which values can be used
+    usable: Bool[np.ndarray, "o 3"]  # whether a value can be used
     # Label of each view; views with different labels cannot be compared.
     component: Int[np.ndarray, " v"]
-    log_pivot: float  # log of the linear value that gamma leaves alone
+    log_pivot: float  # log of the linear value that gamma does not change
     known: KnownExposures | None  # exposures known beforehand, or None
 
     @functools.cached_property
     def layout(self) -> Layout:
-        """Where each observation lies."""
+        """Row, view and camera of each observation."""
         return Layout(self.observations)
 
     @functools.cached_property
     def told(self) -> Int[np.ndarray, " k"]:
-        """Labels of components whose known exposures differ: their power is not a gauge."""
+        """Labels of components whose known exposures differ, so that their power is no gauge."""
         if self.known is None:
             return np.zeros(0, int)
         known = np.isfinite(self.known.log_exposures)
@@ -100,7 +100,7 @@ def make_problem(
     pivot: float,
     known: KnownExposures | None = None,
 ) -> Problem:
-    """Lay observations out; display values up to `black` or from `saturation` on say nothing."""
+    """Prepare observations; display values up to `black` or from `saturation` on are not usable."""
     usable = observations.usable(black, saturation)
     component = observations.components(usable)
     return Problem(observations, usable, component, float(np.log(pivot)), known)

@@ -1,8 +1,8 @@
-"""Rounds of weighing and stepping: four under an L1 loss, then Geman-McClure's to a fixed point,
-either of single observations or of whole points (`equations.py`).
+"""Iteratively reweighted least squares: four rounds under an L1 loss, then Geman-McClure's loss.
 
-Outliers are weighted away: 0 / 10 / 30 % of them give 0.005 / 0.006 / 0.007 EV (docs/photometry.md,
-4). The L1 rounds bring the start near enough for the loss that ignores what is far away.
+The latter is of single observations or of whole points (`equations.py`). With 0 / 10 / 30 % of
+outliers the error is 0.005 / 0.006 / 0.007 EV (docs/photometry.md, 4). The L1 rounds bring the
+start near enough for a loss that ignores large residuals.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from p2gs_jax.photometry.adjustment.problem import Problem
 from p2gs_jax.photometry.models import EXPOSURES, Form
 from p2gs_jax.photometry.response import Response, rises
 
-# Rounds of both losses together are no more than MOST_ROUNDS.
+# Number of rounds under the L1 loss, and largest number of rounds under both losses.
 L1_ROUNDS, MOST_ROUNDS = 4, 60
 A_RANGE = (0.3, 3.0)
-# Change of a parameter, log units, at which rounds end: for what is kept, and what is compared.
+# Change of a parameter, log units, at which rounds end: for the result, and for comparisons.
 TOLERANCE, COMPARED = 1e-5, 5e-3
 DAMPING = 1e-8  # damping of the balanced matrix, whose diagonal is 1
-GROUPS = 1000  # groups of neighbouring unknowns, whose common changes a coarse system solves
-# Relative residual at which the iteration ends; a round's step need not be exact.
+GROUPS = 1000  # number of groups of neighbouring unknowns in the coarse system
+# Relative residual and number of iterations at which conjugate gradients end.
 PRECISION, MOST_ITERATIONS = 1e-7, 2000
-MOST_UNHELD = 8  # directions that nothing holds are looked for, where unknowns are many
-# A spline may change the spread of exposures by this factor: the power gauge contradicts none.
+MOST_UNHELD = 8  # largest number of undetermined directions that are found in large systems
+# Largest factor by which a spline may change the spread of exposures (the power gauge allows any).
 LARGEST_STRETCH = 1.6
 
 
@@ -44,16 +44,16 @@ _libraries = functools.cache(threadpoolctl.ThreadpoolController)
 
 
 def one_thread():
-    """Return a context in which BLAS does not wake threads.
+    """Return a context in which BLAS uses one thread.
 
-    It does so for a system of a hundred unknowns, and waits for busy cores: 52 ms instead of 2
-    while something else computes (BUILD_NOTES).
+    Otherwise it starts threads even for 100 unknowns and waits for busy cores: 52 ms instead of
+    2 ms while other programs compute (BUILD_NOTES).
     """
     return _libraries().limit(limits=1, user_api="blas")
 
 
 class Balanced:
-    """A matrix plus products of few rows, over its free directions (`basis`), its diagonal 1."""
+    """A matrix plus a product of few rows, over free directions (`basis`), scaled to diagonal 1."""
 
     def __init__(self, normal: Matrix, gauges: sp.csr_array, basis: sp.csr_array):
         reduced, held = basis.T @ normal @ basis, sp.csr_array(gauges @ basis)
@@ -77,15 +77,15 @@ class Balanced:
         return self._directions @ (scale * self._solve(scale * (self._directions.T @ right)))
 
     def unheld(self, held: float) -> Float[np.ndarray, "d k"]:
-        """Return the directions, some at most, along which less than a share of 1 is held."""
+        """Return directions, MOST_UNHELD at most, with eigenvalues up to `held`."""
         count = len(self._scale)
         inverse = _operator(count, self._solve)
-        # Inverses are known to PRECISION; the start is any that is the same in every run.
-        how = {"tol": 100 * PRECISION, "v0": np.cos(np.arange(count))}
-        some = min(MOST_UNHELD, count - 1)
+        # Inverses have PRECISION; the start vector is arbitrary, but the same in every run.
+        options = {"tol": 100 * PRECISION, "v0": np.cos(np.arange(count))}
+        most = min(MOST_UNHELD, count - 1)
         try:
             value, vector = scipy.sparse.linalg.eigsh(
-                inverse, some, sigma=-DAMPING, OPinv=inverse, **how
+                inverse, most, sigma=-DAMPING, OPinv=inverse, **options
             )
         except scipy.sparse.linalg.ArpackNoConvergence as found:
             value, vector = found.eigenvalues, found.eigenvectors
@@ -97,11 +97,11 @@ def _operator(count: int, multiply: Callable) -> Any:
 
 
 def _iterative(sparse: sp.csr_array, low_rank: Float[np.ndarray, "g n"]):
-    """Conjugate gradients with a two-level preconditioner.
+    """Return a solver by conjugate gradients with a two-level preconditioner.
 
-    A long drive is a chain: what is wrong by a little everywhere adds up from its one end to its
-    other, and takes as many iterations as there are links. Sums over groups of neighbours are
-    therefore solved exactly; and so is everything where iterations are not enough.
+    A long drive is a chain: small errors add up along it, and iterations alone would be as many as
+    its links. Sums over groups of neighbours are therefore solved exactly. If iterations do not
+    converge, the whole system is factorised.
     """
     count = low_rank.shape[1]
     sparse = sp.csr_array(sparse + DAMPING * sp.eye_array(count))
@@ -117,7 +117,7 @@ def _iterative(sparse: sp.csr_array, low_rank: Float[np.ndarray, "g n"]):
         return residual + coarse @ scipy.linalg.cho_solve(factor, coarse.T @ residual)
 
     matrix = _operator(count, multiply)
-    how = {"rtol": PRECISION, "maxiter": MOST_ITERATIONS, "M": _operator(count, precondition)}
+    options = {"rtol": PRECISION, "maxiter": MOST_ITERATIONS, "M": _operator(count, precondition)}
 
     @functools.cache
     def exactly():
@@ -126,7 +126,7 @@ def _iterative(sparse: sp.csr_array, low_rank: Float[np.ndarray, "g n"]):
         return scipy.sparse.linalg.splu(bordered)
 
     def one(right):
-        found, unfinished = scipy.sparse.linalg.cg(matrix, right, **how)
+        found, unfinished = scipy.sparse.linalg.cg(matrix, right, **options)
         if unfinished:
             found = exactly().solve(np.append(right, np.zeros(len(low_rank))))[:count]
         return found
@@ -135,23 +135,23 @@ def _iterative(sparse: sp.csr_array, low_rank: Float[np.ndarray, "g n"]):
 
 
 class Fit(NamedTuple):
-    """A solution and what its errors are computed from."""
+    """A solution and the input of its standard errors."""
 
     theta: Parameters  # the parameters
-    at: Weighted  # residuals and weights there
-    model: Forward  # what was solved
+    at: Weighted  # residuals and weights at the parameters
+    model: Forward  # the model
     normal: Matrix  # reduced normal matrix, without gauges and priors
-    rounds: int  # iterations
+    rounds: int  # number of iterations
     moved: float  # largest change of a parameter in the last round, log units
-    # How far the end is, were the rounds to go on as the last two did; inf if they grew.
+    # Remaining change if it shrinks as in the last two rounds, log units; inf if it grew.
     left: float
-    converged: bool  # `moved` was less than the tolerance
+    converged: bool  # `moved` is less than the tolerance
 
 
 def _step(
     model: Forward, system: System, theta: Parameters, at: Weighted
 ) -> tuple[Parameters, float]:
-    """Return the parameters after one Gauss-Newton step, and its largest change of one of them."""
+    """Return the parameters after one Gauss-Newton step, and the largest change of a parameter."""
     u, vector = system.unknowns, theta.vector()
     normal, right = normal_equations(model, theta, at, np.float32)
     normal = normal + system.priors.normal
@@ -175,9 +175,9 @@ def solve(
 ) -> Fit:
     """Adjust exposures, gammas, cameras and response to observations (float64).
 
-    A largest change of a parameter below the tolerance, log units, counts as none. `loss` is of the
-    rounds after those under L1; these are needed `near` a solution as well, of a form that lacked
-    what now explains what it took for outliers.
+    Rounds end when the largest change of a parameter is below the tolerance, log units. `loss` is
+    that after the L1 rounds. A start `near` the solution of another form needs L1 rounds as well:
+    that form may lack a parameter and have taken inliers for outliers.
     """
     theta, weight = system.start if near is None else near, model.noise_weight
     moved, before, count = np.inf, np.inf, 0
@@ -185,7 +185,7 @@ def solve(
         at = weigh(model, theta, weight, "l1" if count <= L1_ROUNDS else loss)
         weight, before = at.weight, moved
         theta, moved = _step(model, system, theta, at)
-        # The first round of another loss says nothing of the next.
+        # The first round under another loss does not predict the next one.
         if count > L1_ROUNDS + 1 and moved < tolerance:
             break
     at = weigh(model, theta, weight, loss)
@@ -212,11 +212,10 @@ def solve_model(
     loss: Loss = "geman_mcclure",
     near: Fit | None = None,
 ) -> tuple[Fit, System]:
-    """Solve one form under a response; `use` is 0 for observations that are kept out.
+    """Solve one form under a response; `use` is 0 for observations that are held out.
 
-    `splines` says what gets a spline over the response's base that is solved for as well (None:
-    nothing). The tolerance and the loss are those of `solve`, which begins `near` the solution of
-    another form or response.
+    `splines` over the response's base are solved as well (None: none). The tolerance and the loss
+    are those of `solve`, which begins `near` the solution of another form or response.
     """
     weight = problem.usable if use is None else problem.usable * use[:, None]
     system = make_system(problem, form, splines)
@@ -229,9 +228,9 @@ def solve_model(
 def with_free_curve(
     problem: Problem, form: Form, response: Response, fit: Fit
 ) -> tuple[Fit, System]:
-    """Return a solution as one that might also move its curve, of which c is the change.
+    """Return a solution with its splines as further unknowns, for standard errors.
 
-    A response with splines was fitted as exposures were, and is as uncertain.
+    The splines of a response were fitted to the same observations and are uncertain as well.
     """
     system = make_system(problem, form, response.by)
     model = Forward.of(problem, problem.usable, response, system.unknowns)
@@ -241,9 +240,9 @@ def with_free_curve(
 
 
 def light_spread(fit: Fit) -> float:
-    """Return by how much the light of one surface varies between views and places in the image.
+    """Return the spread of the light of one surface over views and positions in images.
 
-    The standard deviation of exposures and of what cameras do besides, log units.
+    It is the standard deviation of exposures, white balance and vignetting, log units.
     """
     added = 0.0 if fit.model.features is None else fit.model.features.of(fit.theta.k)
     return float(np.hypot(np.std(fit.theta.b.mean(1)), np.std(added)))
@@ -259,10 +258,10 @@ def fit_response(
 ) -> Response | None:
     """Return the base with the spline, or splines `by` camera or channel, that fit best.
 
-    None where one collapsed: it falls somewhere, is flat over mid tones, or stretches the
-    exposures by more than LARGEST_STRETCH (which no photograph contradicts: the power gauge).
-    The form that varies beside it has no gammas, which bend curves as well. `spread` is
-    `light_spread` under the base; it is solved if not given.
+    None if one collapsed: it falls somewhere, is flat over mid tones, or stretches the exposures by
+    more than LARGEST_STRETCH (photographs do not determine that: the power gauge). The form that
+    varies with it has no gammas, which bend curves as well. `spread` is `light_spread` under the
+    base; it is solved if not given.
     """
     fit, system = solve_model(problem, form, base, splines=by, tolerance=COMPARED)
     if spread is None:
