@@ -77,7 +77,7 @@ def load_scene(
 def with_what_lies_beside(scene: Scene, cfg: DataConfig) -> Scene:
     """Return a scene with masks, EXIF exposures and split.
 
-    Raises UserError: so many views cannot be held out, or a list of held-out views is wrong.
+    Raises UserError: the number of held-out views is impossible, or a list of them is wrong.
     """
     views, mask_notes = attach_masks(scene)
     paths = [view.image_path for view in views]

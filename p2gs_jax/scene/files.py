@@ -263,7 +263,7 @@ def at_file_size(
     """
     w, h = image_size(path)
     if not same_shape((w, h), size):
-        why = f"is {w}x{h}, but {source} says {size[0]}x{size[1]}"
+        why = f"is {w}x{h}, but {source} states {size[0]}x{size[1]}"
         fix = "use the photographs from which the model was made, neither cropped nor rotated"
         raise broken(f"wrong size: {path}", why, fix)
     return scale_intrinsics(K, w / size[0], h / size[1]).astype(np.float32), w, h

@@ -36,7 +36,7 @@ def split_scene(scene: Scene, cfg: DataConfig) -> Scene:
 
     A file that the user names comes first, then the data set's split (`split_by` and the views),
     then every n-th view. If `test_every` is 0, no view is held out. Raises UserError: the file is
-    broken or names a photograph that is not there, or so many views cannot be held out.
+    broken or names a missing photograph, or the number of held-out views is impossible.
     """
     if cfg.split is not None and cfg.split != EVERY and cfg.test_every:
         lists = read_split(Path(cfg.split))

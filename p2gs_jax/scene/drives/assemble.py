@@ -175,7 +175,7 @@ def _file_of(photograph: Photograph, folder: Path, write_embedded: bool) -> Path
 
 
 def _seeds(lidar: Lidar | None, cameras: Float64[np.ndarray, "v 3"]):
-    """Return seeds [s 3] on what does not move, float32, and notes."""
+    """Return seeds [s 3] on static surfaces, float32, and notes."""
     if lidar is None:
         return np.zeros((0, 3), np.float32), []
     points, angle = seeds(lidar, cameras)

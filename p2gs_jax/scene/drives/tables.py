@@ -315,7 +315,7 @@ def _columns(table: Any) -> dict[str, np.ndarray]:
         blocks, axes = manager.args[:2]
         blocks = [block.args[:2] for block in blocks]
     else:
-        # Until pandas 1.2: the last entry of the state holds what versions from 0.14.1 on read.
+        # Up to pandas 1.2, the last entry of the state holds the layout of version 0.14.1.
         state = manager.state[3]["0.14.1"]
         blocks, axes = [(b["values"], b["mgr_locs"]) for b in state["blocks"]], state["axes"]
     names, rows = map(_array, axes)
