@@ -1,4 +1,4 @@
-"""The 3DGS schedule, as the paper: clone small, split large, prune, reset opacities."""
+"""Densification of 3DGS, as in the paper: clone small, split large, prune, reset opacities."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Proposal(NamedTuple):
     prune: Bool[Array, " n"]
     clone: Bool[Array, " n"]
     split: Bool[Array, " n"]
-    wanted: Int[Array, ""]  # slots that must exist for it: survivors plus children
+    wanted: Int[Array, ""]  # slots that it needs: survivors plus children
 
 
 def propose(
@@ -34,10 +34,10 @@ def propose(
     prune_large: Bool[Array, ""] | bool,
     cfg: DensifyConfig,
 ) -> Proposal:
-    """Decide which Gaussians are pruned, cloned and split, from statistics since the last time.
+    """Choose the Gaussians to prune, clone and split, from statistics since the last densification.
 
-    `extent` is the scene's, scene units; with `prune_large` oversized Gaussians go too (3DGS: after
-    the first opacity reset).
+    `extent` is the scene extent in scene units. With `prune_large` oversized Gaussians are pruned,
+    too (3DGS: after the first opacity reset).
     """
     largest = jnp.exp(jnp.max(gaussians.log_scales, -1))
     prune = opacities(gaussians) < cfg.prune_opacity
@@ -54,10 +54,10 @@ def propose(
 def apply(
     key: PRNGKeyArray, gaussians: Gaussians, population: Population, proposal: Proposal
 ) -> Outcome:
-    """Carry out a proposal inside the present capacity.
+    """Carry out a proposal within the existing slots.
 
-    A clone is an exact copy; a split replaces the parent by two samples of its own distribution
-    with scales divided by 1.6 (3DGS).
+    A clone is an exact copy. A split replaces the parent by two samples from its distribution, with
+    scales divided by 1.6 (3DGS).
     """
     alive = population.alive & ~proposal.prune
     requests = proposal.clone | proposal.split
@@ -86,7 +86,7 @@ def apply(
 
 
 def reset_opacities(gaussians: Gaussians) -> Gaussians:
-    """Lower every opacity to at most 0.01; needed Gaussians become opaque again (3DGS)."""
+    """Lower every opacity to at most 0.01; useful Gaussians become opaque again (3DGS)."""
     ceiling = jnp.log(RESET_OPACITY / (1 - RESET_OPACITY))
     return dataclasses.replace(
         gaussians, opacity_logits=jnp.minimum(gaussians.opacity_logits, ceiling)

@@ -1,8 +1,8 @@
 """Display colours for ordinary 3DGS viewers, and the error of their pictures.
 
 A viewer composites display values; the true picture composites radiance and then applies the tone
-curve. Display colours computed for each Gaussian by itself are therefore wrong by many codes where
-translucent ones overlap (BUILD_NOTES, "Display PLY"); `refine` optimises colours and opacities.
+curve. So display colours computed per Gaussian are wrong by many 8-bit levels where translucent
+Gaussians overlap (BUILD_NOTES, "Display PLY"). `refine` optimises colours and opacities.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians, Render
 
 DIRECTIONS = 64
-# Gaussians per block; the last block is padded, so that one program fits all.
+# Gaussians per block; the last block is padded, so that all blocks share one program.
 CHUNK = 8192
-# Variance that viewers add to the 2D covariance, pixels^2, as 3DGS does.
+# Variance that viewers add to the 2D covariance, as 3DGS does, pixels^2.
 VIEWER_BLUR = 0.3
-# Adam's rates per step for colours of degree 0, of the others, and for opacity logits; they decay
-# to a tenth. Measured on two runs (BUILD_NOTES, "Display PLY").
+# Adam's learning rates for colours of degree 0, of higher degrees, and for opacity logits. They
+# decay to 0.1 times these. They were chosen on two runs (BUILD_NOTES, "Display PLY").
 COLOR_RATE, BANDS_RATE, OPACITY_RATE, DECAY = 0.05, 0.0025, 0.3, 0.1
 
 
 @dataclass(frozen=True)
 class Target:
-    """A view and its true picture, 8 bits."""
+    """A view and its true picture, 8-bit."""
 
     name: str
     camera: Camera
@@ -56,7 +56,7 @@ class Target:
 def true_target(
     name: str, gaussians: Gaussians, camera: Camera, transform: DisplayTransform, render: RenderView
 ) -> Target:
-    """Return the true picture of a view: linear radiance is composited, then developed."""
+    """Return a view with its true picture: linear radiance is composited, then developed."""
     linear = render(gaussians, _all(gaussians), camera).linear
     picture = np.rint(255 * develop(linear, transform)).astype(np.uint8)
     return Target(name, camera, picture)
@@ -64,22 +64,22 @@ def true_target(
 
 def display_comments(transform: DisplayTransform) -> list[str]:
     """Return the header lines of a PLY with display colours."""
-    said = [
+    lines = [
         "p2gs-jax: display colours, tone-mapped",
         f"p2gs-jax: exposure {transform.exposure:.6g}, gamma {transform.gamma:.6g}, "
         f"curve {transform.formation.curve}",
     ]
     if transform.white_balance is not None:
         factors = ", ".join(f"{w:.6g}" for w in np.exp(transform.white_balance))
-        said.append(f"p2gs-jax: white balance {factors}")
-    return said
+        lines.append(f"p2gs-jax: white balance {factors}")
+    return lines
 
 
 def bake(gaussians: Gaussians, transform: DisplayTransform, activation: RadianceKind) -> Gaussians:
-    """Return linear Gaussians with display colours, computed for each by itself."""
+    """Return linear Gaussians with display colours, computed per Gaussian."""
     sh = np.asarray(gaussians.sh)
-    shown = display_sh(sh, lambda linear: develop(linear, transform), activation)
-    return replace(gaussians, sh=on_device(shown))
+    display = display_sh(sh, lambda linear: develop(linear, transform), activation)
+    return replace(gaussians, sh=on_device(display))
 
 
 def display_sh(
@@ -87,9 +87,10 @@ def display_sh(
     tone: Callable[[np.ndarray], np.ndarray],
     activation: RadianceKind,
 ) -> Float[np.ndarray, "n k 3"]:
-    """Return coefficients whose value + 1/2 is the display colour, least squares over directions.
+    """Return coefficients whose value + 1/2 is the display colour: least squares over directions.
 
-    Exact for degree 0. `tone` takes radiance to display values, clamped to [0, 1] here.
+    It is exact for degree 0. `tone` maps radiance to display values, which are then clamped to
+    [0, 1].
     """
     directions = fibonacci_sphere(DIRECTIONS)
     table = harmonics.table(directions, degree_of(sh.shape[1]))
@@ -100,15 +101,15 @@ def display_sh(
         values = np.zeros((CHUNK, DIRECTIONS, 3), np.float32)
         values[: len(part)] = np.einsum("dk,nkc->ndc", table, part, optimize=True)
         colors = tone(np.asarray(harmonics.radiance_activation(values, activation)))[: len(part)]
-        shown = np.clip(colors, 0, 1) - 0.5
-        out[start : start + CHUNK] = np.einsum("kd,ndc->nkc", inverse, shown, optimize=True)
+        values = np.clip(colors, 0, 1) - 0.5
+        out[start : start + CHUNK] = np.einsum("kd,ndc->nkc", inverse, values, optimize=True)
     return out
 
 
 def viewer_config(cfg: RenderConfig) -> RenderConfig:
     """Return the options of an ordinary 3DGS viewer: display colours max(0, sh + 1/2)."""
-    usual = {"radiance": "linear", "blur": VIEWER_BLUR}
-    return replace(cfg, **usual, background=None)
+    standard = {"radiance": "linear", "blur": VIEWER_BLUR}
+    return replace(cfg, **standard, background=None)
 
 
 def refine(
@@ -122,10 +123,10 @@ def refine(
 ) -> Gaussians:
     """Return Gaussians from `bake` whose pictures in a viewer are closer to the targets.
 
-    Adam on the mean squared difference, one view a step, in epochs of random order. Every
-    other step has a background of random colour instead of black, as viewers may have bright
+    Adam minimises the mean squared difference, one view per step, in epochs of random order. Every
+    second step has a background of random colour instead of black, because viewers may have bright
     backgrounds. Base colours stay in [0, 1], which viewers with 8-bit colours need. Gaussians that
-    no target shows stay as they are. `on_step` is called with steps done and steps in all.
+    no target shows do not change. `on_step` is called with the steps done and the total.
     """
     if steps == 0 or not targets or gaussians.capacity == 0:
         return gaussians
@@ -136,14 +137,14 @@ def refine(
     bands = jnp.full((gaussians.sh.shape[1], 1), BANDS_RATE).at[0].set(COLOR_RATE)
     rates = {"sh": bands, "opacity_logits": OPACITY_RATE}
 
-    # Made here: places and shapes are constants to XLA, which folds what depends on them alone.
+    # Defined here, so that means and scales are constants, which XLA folds.
     @functools.partial(jax.jit, static_argnames="capacity", compiler_options=compiler_options())
     def step(moving, state, camera, picture, background, decay, *, capacity):
         def loss(moving):
-            shown = replace(gaussians, **moving)
-            result = render_linear(shown, _all(shown), camera, cfg, capacity, with_depth=False)
-            picture_shown = _over(result, background)
-            return jnp.mean((picture_shown - picture / 255.0) ** 2), result
+            current = replace(gaussians, **moving)
+            result = render_linear(current, _all(current), camera, cfg, capacity, with_depth=False)
+            display = _over(result, background)
+            return jnp.mean((display - picture / 255.0) ** 2), result
 
         (_, result), gradient = jax.value_and_grad(loss, has_aux=True)(moving)
         updates, state = optimizer.update(gradient, state)
@@ -161,9 +162,9 @@ def refine(
         decay = jnp.float32(DECAY ** (done / steps))
         picture = jnp.asarray(target.picture)
         background = jnp.asarray(rng.uniform(size=3) * (done % 2), jnp.float32)
-        given = (moving, state, target.camera, picture, background, decay)
+        inputs = (moving, state, target.camera, picture, background, decay)
         (moving, state), capacity = until_it_fits(
-            lambda entries, given=given: step(*given, capacity=entries), capacity
+            lambda entries, inputs=inputs: step(*inputs, capacity=entries), capacity
         )
         on_step(done + 1, steps)
     return replace(gaussians, **moving)
@@ -172,10 +173,10 @@ def refine(
 def baking_error(
     gaussians: Gaussians, targets: Sequence[Target], cfg: RenderConfig
 ) -> dict[str, Any] | None:
-    """Compare a viewer's pictures of display colours, as a file holds them, with the true ones.
+    """Compare a viewer's pictures of display colours with the true pictures.
 
-    PSNR is in dB, also that in a viewer whose background is white instead of black; mean and
-    largest absolute difference of any channel are in 8-bit levels. None where there are no targets.
+    PSNR is in dB, for a black and for a white background of the viewer. Mean and largest absolute
+    differences of channels are in 8-bit levels. It returns None without targets.
     """
     if not targets:
         return None
@@ -203,8 +204,8 @@ def _difference(target: Target, render: Render) -> dict[str, float]:
     """Return the differences of one view."""
 
     def from_truth(level: float) -> np.ndarray:
-        shown = np.clip(np.asarray(_over(render, jnp.full(3, level))), 0, 1)
-        return np.abs(255.0 * shown - target.picture)
+        display = np.clip(np.asarray(_over(render, jnp.full(3, level))), 0, 1)
+        return np.abs(255.0 * display - target.picture)
 
     def psnr(difference: np.ndarray) -> float:
         mse = float(np.mean((difference / 255.0) ** 2, dtype=np.float64))

@@ -1,9 +1,9 @@
-"""Dense starts: seeds from depth maps of the photographs, where points are too few.
+"""Dense seeds from depth maps of the photographs, for scenes with few points.
 
-After EDGS (arXiv 2504.13204), which triangulates dense matches instead of growing splats; the
-depth maps are those of `flow.py`. Pixels with a depth are drawn evenly: an image is cut into cells,
-a cell gives one seed, where there is little texture four cells together give one, and a cell that
-shows a seed already gives none.
+The idea is that of EDGS (arXiv 2504.13204), which triangulates dense matches instead of growing
+splats; the depth maps are from `flow.py`. Seeds are drawn evenly from pixels with a depth. An image
+is divided into cells, and each cell gives one seed. With little texture, four cells together give
+one seed. A cell that already shows a seed gives none.
 """
 
 from __future__ import annotations
@@ -30,68 +30,60 @@ from p2gs_jax.scene.pixels.store import ImageStore, size_at
 from p2gs_jax.scene.visibility import shown_share
 from p2gs_jax.types import Gaussians, Scene, View
 
-# A depth that two neighbours must agree on needs at least three views.
+# Two neighbours must agree on a depth, so at least three views are needed.
 FEWEST_VIEWS = 3
-# More views than this are not needed for seeds; they are taken evenly.
+# Largest number of views that give seeds, evenly spaced.
 MOST_VIEWS = 40
 NEIGHBOURS = 5
-# Longest side of the photographs that are matched, pixels.
+# Longest side of the matched photographs, pixels.
 MATCH_SIDE = 640
-# Stride of the candidates over pixels, along each axis.
+# Side of the smallest cell, pixels; each cell gives one candidate.
 FINEST_CELL = 3
-# Standard deviation of a seed over the spacing of seeds, along the surface and across it.
+# Standard deviations of a seed along the surface and across it, relative to the spacing of seeds.
 SPREAD, THICKNESS = 0.6, 0.2
-# Seeds stretch along slanted surfaces at most this much.
+# Largest stretch of seeds along slanted surfaces.
 LARGEST_STRETCH = 3.0
-# A cell shows a seed already if that lies within this share of its depth.
+# A cell already shows a seed if the seed's depth differs by less than this share.
 SAME_DEPTH = 0.05
-# Cells with more texture than this share of all are cut in four.
+# Cells with more texture than this quantile are divided into four.
 PLAIN = 0.5
-# Bound met within this share, in at most so many attempts.
+# The number of seeds meets the limit within this share, or after so many attempts.
 SLACK, ATTEMPTS = 0.05, 5
-# Dense seeds take at most this share of a time budget, where two idle cores need so long a view.
+# Largest share of a time budget for dense seeds; seconds per view on two idle cores; fewest views.
 DENSE_TIME, DENSE_SECONDS, FEWEST_DENSE_VIEWS = 0.25, 0.6, 8
-# Seeds may take this share of the bound on the population; the rest grows where it is needed.
+# Largest share of the population bound for seeds; densification adds the rest.
 DENSE_SHARE = 0.6
-# Scenes with this share of the bound in seeds need no more.
+# Scenes whose seeds reach this share of the population bound need no dense seeds.
 ENOUGH_SEEDS = 0.5
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """Pixels of one view that may become seeds: positions at the matched size and 1 / z.
+    """Pixels of one view that may become seeds."""
 
-    Normals are in camera coordinates, towards the camera, and zero where the surface is not flat;
-    radiance is in the gauge of the exposures; texture is the mean gradient about the pixel, display
-    values a pixel; `known` is the share of all pixels that have a depth.
-    """
-
-    row: int
-    xy: Float32[np.ndarray, "c 2"]
-    inverse: Float32[np.ndarray, " c"]
+    row: int  # of the training view
+    xy: Float32[np.ndarray, "c 2"]  # positions, pixels at the matched size
+    inverse: Float32[np.ndarray, " c"]  # 1 / z
+    # in camera coordinates, towards the camera; zero where the surface is not flat
     normals: Float32[np.ndarray, "c 3"]
-    radiance: Float32[np.ndarray, "c 3"]
-    texture: Float32[np.ndarray, " c"]
-    known: float
+    radiance: Float32[np.ndarray, "c 3"]  # in the gauge of the exposures
+    texture: Float32[np.ndarray, " c"]  # mean gradient around the pixel, display values per pixel
+    known: float  # share of all pixels that have a depth
 
 
 @dataclass(frozen=True)
 class DenseSeeds:
-    """Seeds from depth maps, scene units; radiance in the gauge of the exposures.
+    """Seeds from depth maps."""
 
-    `scales` are standard deviations along the axes of `quats` (w x y z); `known` is the share of
-    pixels with a depth; so many `views` were matched.
-    """
-
-    points: Float32[np.ndarray, "n 3"]
-    radiance: Float32[np.ndarray, "n 3"]
-    scales: Float32[np.ndarray, "n 3"]
-    quats: Float32[np.ndarray, "n 4"]
-    known: float = 0.0
-    views: int = 0
+    points: Float32[np.ndarray, "n 3"]  # scene units
+    radiance: Float32[np.ndarray, "n 3"]  # in the gauge of the exposures
+    scales: Float32[np.ndarray, "n 3"]  # standard deviations along the axes of `quats`, scene units
+    quats: Float32[np.ndarray, "n 4"]  # w x y z
+    known: float = 0.0  # share of pixels with a depth
+    views: int = 0  # number of matched views
 
     def note(self) -> str:
-        """Say what they are and how to do without."""
+        """Return a note about the seeds and the option that turns them off."""
         return (
             f"{len(self.points)} dense seeds from flow between {self.views} photographs "
             f"(--init.dense off leaves them out): {self.known:.0%} of the pixels have a depth."
@@ -109,20 +101,20 @@ def dense_seeds(
     limit: int,
     on_view: Callable[[int, int], None] = lambda i, n: None,
 ) -> DenseSeeds:
-    """Return at most `limit` seeds from the depths of training views; the same for the same seed.
+    """Return at most `limit` seeds from depth maps of training views; deterministic by the seed.
 
-    Runs in threads of its own and calls no JAX, so it may run beside a compilation. The flow's
-    stripes follow OpenCV's number of threads, so another number of cores may differ slightly.
+    It uses threads without JAX, so that it may run beside a compilation. The flow depends slightly
+    on OpenCV's number of threads, and so on the number of cores.
 
-    Photographs are compared under the tones `match`; `color` makes radiance of what a seed shows.
-    Existing seeds keep their place. A budget bounds the views that give seeds: they are taken
-    evenly, and their neighbours may be any. `on_view` is called with views done and views in all.
+    Photographs are compared under the tones `match`; the tones `color` give the radiance of seeds.
+    Existing seeds stay. A time budget bounds the number of views that give seeds: they are evenly
+    spaced, with any neighbours. `on_view` is called with the number of views done and the total.
     """
     rows = scene.train_indices
     empty = np.zeros((0, 3), np.float32)
-    nothing = DenseSeeds(empty, empty, empty, np.zeros((0, 4), np.float32))
+    no_seeds = DenseSeeds(empty, empty, empty, np.zeros((0, 4), np.float32))
     if len(rows) < FEWEST_VIEWS or limit < 1 or not len(scene.points):
-        return nothing
+        return no_seeds
     images = MatchImages(scene, store, match, MATCH_SIDE, cfg.loss.black, cfg.loss.saturation)
     most_views = MOST_VIEWS
     if cfg.train.budget_s is not None:
@@ -141,42 +133,42 @@ def dense_seeds(
         found.append(candidates)
         on_view(done + 1, len(wanted))
     if not sum(len(c.xy) for c in found):
-        return nothing
+        return no_seeds
     return choose_seeds(found, images, np.asarray(existing, np.float64), limit, cfg.train.seed)
 
 
 def _candidates(row: int, near, flows: Flows, color: Tones, seed: int) -> Candidates:
     frame, depth = flows.images[row], depth_map(flows, row, near)
-    shown = frame.ldr.mean(2)
-    steep = np.hypot(*np.gradient(shown)).astype(np.float32)
+    grey = frame.ldr.mean(2)
+    steep = np.hypot(*np.gradient(grey)).astype(np.float32)
     texture = cv2.blur(steep, (9, 9))
-    # One pixel of every cell, steep ones first: their matches are the surest.
+    # One pixel per cell, preferably with a steep gradient, where matches are most reliable.
     rng = generator(seed, Stream.MATCHED_PIXELS, row)
     y, x = np.nonzero(depth.valid)
     key = rng.random(len(x)) ** (1 / (0.1 + steep[y, x] / max(float(steep.mean()), 1e-6)))
     key += depth.flat[y, x]
-    pick = _winners(x // FINEST_CELL + (y // FINEST_CELL) * (shown.shape[1] + 1), key)
+    pick = _winners(x // FINEST_CELL + (y // FINEST_CELL) * (grey.shape[1] + 1), key)
     y, x = y[pick], x[pick]
-    centers = pixel_centers(*shown.shape)[y, x]
+    centers = pixel_centers(*grey.shape)[y, x]
     return Candidates(
         row,
         centers,
         depth.inverse[y, x],
         _normals(depth, frame.K, y, x),
-        np.exp(color.log_radiance(row, frame.ldr[y, x], places(centers, *shown.shape[::-1]))),
+        np.exp(color.log_radiance(row, frame.ldr[y, x], places(centers, *grey.shape[::-1]))),
         texture[y, x],
         float(depth.valid.mean()),
     )
 
 
 def _winners(cell: Int[np.ndarray, " c"], key: Float[np.ndarray, " c"]) -> Int[np.ndarray, " w"]:
-    """Return which has the largest key in each cell."""
+    """Return the index of the largest key in each cell."""
     order = np.argsort(-key, kind="stable")
     return order[np.unique(cell[order], return_index=True)[1]]
 
 
 def _normals(depth: DepthMap, K, y, x) -> Float32[np.ndarray, "c 3"]:
-    """Return normals: 1/z = s x + t y + c is the plane n X = 1 with n below."""
+    """Return unit normals towards the camera: 1/z = s x + t y + c is the plane n X = 1."""
     slope, inverse = depth.slope[y, x].astype(np.float64), depth.inverse[y, x]
     place = np.stack([x + 0.5 - K[0, 2], y + 0.5 - K[1, 2]], 1)
     last = inverse - (slope * place).sum(1)
@@ -194,7 +186,8 @@ def choose_seeds(
 ) -> DenseSeeds:
     """Draw at most `limit` seeds evenly from the candidates of all views.
 
-    Existing seeds keep their place; `seed` is that of the order of views, and of what is left out.
+    Existing seeds stay. `seed` is the random seed for the order of views and for the seeds left
+    out.
     """
     rng = generator(seed, Stream.DENSE_SEEDS)
     order = rng.permutation(len(found))
@@ -205,7 +198,7 @@ def choose_seeds(
     for _ in range(ATTEMPTS):
         drawn = _draw(found, images, existing, tree, cell, plain)
         count = sum(len(pick) for pick, _ in drawn)
-        # A few too many are left out at random below.
+        # A small excess is left out at random below.
         few = count < (1 - SLACK) * limit and cell > FINEST_CELL
         if not few and count <= (1 + SLACK) * limit:
             break
@@ -226,7 +219,7 @@ def _world(candidates: Candidates, images: MatchImages, pick) -> Float[np.ndarra
 
 
 def _cells(xy: Float[np.ndarray, "c 2"], size: float, width: int) -> Int[np.ndarray, " c"]:
-    """Return the number of the square cell that each pixel position lies in."""
+    """Return the number of the square cell that contains each pixel position."""
     across = int(np.ceil(width / size)) + 1
     return (xy[:, 0] // size).astype(int) + (xy[:, 1] // size).astype(int) * across
 
@@ -244,18 +237,19 @@ def _draw(found, images: MatchImages, existing, tree, cell: float, plain: float)
         rich = (mean / np.maximum(np.bincount(coarse, minlength=most), 1))[coarse] > plain
         first = int(fine.max(initial=0)) + 1
         place = np.where(rich, fine, first + coarse)
-        # Candidates are in the order of their cells, so that a fixed stride is a fair draw.
+        # Candidates are in the order of their cells, so a low-discrepancy sequence draws evenly.
         key = np.modf(np.arange(len(xy)) * 0.6180339887)[0]
-        # Texture first, but where surfaces are not flat wrong depths are ten times as frequent.
+        # Texture is preferred, and so are flat surfaces: elsewhere wrong depths are 10 times as
+        # frequent.
         key += np.minimum(candidates.texture / max(plain, 1e-9), 2) / 2
         key += (candidates.normals**2).sum(1) > 0.5
         pick = _winners(place, key)
         spacing = np.where(rich[pick], cell, 2 * cell)
-        # What other views and existing seeds show here already.
+        # Cells that already show a seed are left out.
         at, depths = frame.project(np.concatenate(chosen))
         inside = (at >= 0).all(1) & (at < [width, height]).all(1)
         at, depths = at[inside], depths[inside]
-        taken = np.zeros(len(pick), bool)
+        occupied = np.zeros(len(pick), bool)
         slot = np.full(first + most, -1)
         slot[place[pick]] = np.arange(len(pick))
         for size, bound, offset in ((cell, first, 0), (2 * cell, most, first)):
@@ -263,8 +257,8 @@ def _draw(found, images: MatchImages, existing, tree, cell: float, plain: float)
             known = where < bound
             hit = slot[where[known] + offset]
             zs, hit = depths[known][hit >= 0], hit[hit >= 0]
-            taken[hit[np.abs(zs / z[pick[hit]] - 1) < SAME_DEPTH]] = True
-        pick, spacing = pick[~taken], spacing[~taken]
+            occupied[hit[np.abs(zs / z[pick[hit]] - 1) < SAME_DEPTH]] = True
+        pick, spacing = pick[~occupied], spacing[~occupied]
         points = _world(candidates, images, pick)
         if tree is not None and len(points):
             size = spacing * z[pick] / np.mean(np.diag(frame.K)[:2])
@@ -286,7 +280,7 @@ def _seeds(candidates: Candidates, images: MatchImages, pick, spacing):
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     normal[~flat] = -ray[~flat]
     facing = np.clip(-(normal * ray).sum(1), 1 / LARGEST_STRETCH, 1)
-    # First axis: down the slope, where a pixel covers more of the surface.
+    # The first axis points down the slope, along which a pixel covers more of the surface.
     helper = np.where(np.abs(normal[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]])
     down = ray - (ray * normal).sum(1, keepdims=True) * normal
     steep = np.linalg.norm(down, axis=1, keepdims=True) > 1e-3
@@ -311,56 +305,56 @@ def gaussians_of(
     views: Sequence[View],
     cfg: FitConfig,
 ) -> Gaussians:
-    """Return Gaussians of the scene's points and of dense seeds, the former first.
+    """Return Gaussians of the scene's points, then of dense seeds.
 
-    A point that has dense seeds around it is as small as they are near. `radiance` is that of the
-    points, in the gauge of the exposures.
+    The scale of a point depends on its distance from all neighbours, including dense seeds.
+    `radiance` is the radiance of the points, in the gauge of the exposures.
     """
     if dense is None:
         return gaussians_from_points(points, radiance, views, cfg)
-    everything, count = np.concatenate([points, dense.points]), len(points)
-    bare = neighbour_scales(everything, views)[:count]
+    merged, count = np.concatenate([points, dense.points]), len(points)
+    scales = neighbour_scales(merged, views)[:count]
     opacities = [cfg.init.opacity, cfg.init.dense_opacity]
-    own = {
-        "scales": np.concatenate([np.repeat(bare[:, None], 3, 1), dense.scales]),
+    start = {
+        "scales": np.concatenate([np.repeat(scales[:, None], 3, 1), dense.scales]),
         "opacity": np.repeat(opacities, [count, len(dense.points)]),
         "quats": np.concatenate([np.tile(np.eye(1, 4), (count, 1)), dense.quats]),
     }
     colors = np.concatenate([radiance, dense.radiance])
-    return gaussians_from_points(everything, colors, views, cfg, **own)
+    return gaussians_from_points(merged, colors, views, cfg, **start)
 
 
 def coverage_of(scene: Scene, max_width: int | None) -> Coverage:
-    """Return how much of a scene its training views show; the largest counts."""
+    """Return the pixels of the largest training view, and the share of the scene that views show."""
     sizes = [size_at(view, max_width) for view in scene.training_views]
     return Coverage(max(w * h for w, h in sizes), shown_share(scene.points, scene.training_views))
 
 
 def seed_bound(cfg: FitConfig, seeds: int, coverage: Coverage) -> int:
-    """Return the bound on the population that so many seeds are measured by."""
-    given = cfg.densify.max_gaussians
-    if isinstance(given, int):
-        return given
+    """Return the bound on the population of a fit with this number of seeds."""
+    limit = cfg.densify.max_gaussians
+    if isinstance(limit, int):
+        return limit
     return default_max_gaussians(seeds, coverage, cfg.train)
 
 
 def dense_limit(cfg: FitConfig, seeds: int, coverage: Coverage) -> int:
-    """Return how many dense seeds a fit may start from, beside so many that are there already."""
+    """Return the number of dense seeds that a fit may add to its `seeds`."""
     bound = seed_bound(cfg, seeds, coverage)
-    room = bound - seeds
+    free = bound - seeds
     wanted = cfg.init.dense_points
     if wanted is None:
         wanted = int(DENSE_SHARE * bound) - seeds
     elif not isinstance(cfg.densify.max_gaussians, int):
-        room = wanted
-    return max(0, min(wanted, room))
+        free = wanted
+    return max(0, min(wanted, free))
 
 
 def wants_dense(scene: Scene, coverage: Coverage, cfg: FitConfig) -> bool:
     """Return whether the scene gets dense seeds.
 
-    The baselines that splat display values get them as well: a comparison with them is about
-    photometry, so all start from the same surfaces.
+    Baselines that splat display values get them, too: comparisons with them are about photometry,
+    so all methods start from the same surfaces.
     """
     if cfg.init.dense == "off" or len(scene.train_indices) < FEWEST_VIEWS:
         return False

@@ -1,9 +1,9 @@
-"""Depth of one photograph from optical flow to its neighbours, each pixel checked four times.
+"""Depth of one photograph from optical flow to its neighbours, with four checks per pixel.
 
-EDGS (arXiv 2504.13204) triangulates matches of a learned matcher; here DIS flow (Kroeger et al.
-2016, OpenCV) between photographs brought to one exposure, under known poses. A pixel's inverse
-depth r is what puts it nearest to its match: with x(r) = (a + r b) / (a_z + r b_z) the match q
-gives the linear equations (a - q a_z) + r (b - q b_z) = 0.
+EDGS (arXiv 2504.13204) triangulates the matches of a learned matcher. This module uses DIS flow
+(Kroeger et al. 2016, OpenCV) between photographs at a common exposure, with known poses. A pixel's
+inverse depth r projects it nearest to its match q: with x(r) = (a + r b) / (a_z + r b_z), q gives
+the linear equations (a - q a_z) + r (b - q b_z) = 0.
 """
 
 from __future__ import annotations
@@ -20,45 +20,41 @@ from scipy.spatial import KDTree
 
 from p2gs_jax.gaussians.matching import MatchImage, MatchImages, at_common_exposure
 
-# Pixels, at the size that is matched.
+# Largest errors of forward-backward flow and from the epipolar line, pixels at the matched size.
 FORWARD_BACKWARD = 1.0
 EPIPOLAR = 0.7
-# Matches are uncertain by this much, pixels.
+# Standard deviation of matches, pixels.
 DEVIATION = 0.5
-# Largest relative error of a depth that this may cause in one pair, and in all together.
+# Largest resulting relative error of a depth, for one pair and for all pairs together.
 PAIR_ERROR, FUSED_ERROR = 0.10, 0.025
-# Two pairs agree within this many standard deviations, and never farther apart than this share.
+# Two pairs agree if depths differ by less than this many standard deviations and this share.
 SIGMAS, APART = 2.0, 0.05
 # Largest difference of the 8-bit values at both ends of a match, after a small blur.
 COLOUR = 24.0
-# Window of the plane fit, pixels, and what of it must have a depth.
+# Window of the plane fit, pixels, and the share of it that must have a depth.
 WINDOW, SUPPORT = 9, 0.4
-# Inverse depths of a flat patch leave its plane by less than this share.
+# Largest relative distance of a flat patch's inverse depths from its plane.
 FLAT = 0.01
-# The start of the flow is interpolated from this many points, on a grid this coarse.
+# Number of points from which the initial flow is interpolated, and side of its grid cells, pixels.
 GUIDES, GUIDE_CELL = 6, 16
-# DIS at full resolution: half the depth error of its preset `medium`, which ends at half of it.
+# DIS at full resolution; its preset `medium` ends at half resolution, with twice the depth error.
 PATCH, STRIDE, DESCENTS = 8, 4, 16
-# Flows kept: those in the other direction serve the neighbours' own depth.
+# Number of flows kept in memory; a flow also serves the depth of the other view.
 KEPT_FLOWS = 128
 
 
 class DepthMap(NamedTuple):
-    """Depth of one view: 1 / z, and which pixels passed every check.
+    """Depth of one view."""
 
-    `slope` is d(1/z)/dx, d(1/z)/dy per pixel, from the plane through the window; where it is
-    `flat`, the window lies in that plane.
-    """
-
-    inverse: Float32[np.ndarray, "h w"]
-    valid: Bool[np.ndarray, "h w"]
-    slope: Float32[np.ndarray, "h w 2"]
-    flat: Bool[np.ndarray, "h w"]
+    inverse: Float32[np.ndarray, "h w"]  # 1 / z
+    valid: Bool[np.ndarray, "h w"]  # whether the pixel passed every check
+    slope: Float32[np.ndarray, "h w 2"]  # of the plane through the window: d(1/z) per pixel
+    flat: Bool[np.ndarray, "h w"]  # whether the window lies in that plane
 
 
 @dataclass(frozen=True)
 class _Geometry:
-    """What projects a pixel of one view into another: x(r) = (a + r b) / (a_z + r b_z)."""
+    """The projection of pixels of one view into another: x(r) = (a + r b) / (a_z + r b_z)."""
 
     a: Float32[np.ndarray, "h w 3"]
     b: Float32[np.ndarray, " 3"]
@@ -70,7 +66,7 @@ class _Geometry:
 
 
 def pixel_centers(height: int, width: int) -> Float32[np.ndarray, "h w 2"]:
-    """Return positions of pixels, centres at +0.5."""
+    """Return the positions of pixel centres, at +0.5."""
     y, x = np.mgrid[:height, :width].astype(np.float32) + np.float32(0.5)
     return np.stack([x, y], -1)
 
@@ -86,7 +82,7 @@ def _geometry(a: MatchImage, b: MatchImage) -> _Geometry:
 
 
 def guide(frame: MatchImage, points: Float[np.ndarray, "p 3"]) -> Float32[np.ndarray, "h w"]:
-    """Return inverse depth interpolated between points that the view sees, to start the flow."""
+    """Return inverse depth, interpolated between points that the view sees, for the initial flow."""
     height, width = frame.luminance.shape
     xy, z = frame.project(points)
     if not len(z):
@@ -103,12 +99,12 @@ def guide(frame: MatchImage, points: Float[np.ndarray, "p 3"]) -> Float32[np.nda
 
 
 def _squared(v):
-    """Return squared lengths; a sum over an axis of two is slow."""
+    """Return squared lengths; this is faster than a sum over an axis of size 2."""
     return v[..., 0] ** 2 + v[..., 1] ** 2
 
 
 def _flow(first, second, start) -> Float32[np.ndarray, "h w 2"]:
-    """Return the flow from one image to the other, which may be of another size."""
+    """Return the flow from one image to another, which may have another size."""
     height, width = first.shape
     tall, wide = np.maximum(first.shape, second.shape).tolist()
 
@@ -125,18 +121,18 @@ def _flow(first, second, start) -> Float32[np.ndarray, "h w 2"]:
     return matcher.calc(padded(first), padded(second), start)[:height, :width]
 
 
-def _sampled(image, xy, how=cv2.INTER_LINEAR):
-    """Sample at pixel positions; outside is 0."""
+def _sampled(image, xy, interpolation=cv2.INTER_LINEAR):
+    """Return the image at pixel positions; 0 outside."""
     at = np.nan_to_num(xy - np.float32(0.5), nan=-1e4).astype(np.float32)
-    return cv2.remap(image, at[..., 0], at[..., 1], how, borderMode=cv2.BORDER_CONSTANT)
+    return cv2.remap(image, at[..., 0], at[..., 1], interpolation, borderMode=cv2.BORDER_CONSTANT)
 
 
 @dataclass
 class Flows:
-    """Flows between training views, computed when asked for; from any thread.
+    """Flows between training views, computed on demand, in any thread.
 
-    `points` (scene units) start the flow; `seen` says which training view sees which. The last
-    flows, and what starts them, are kept.
+    `points` (scene units) give the initial flow; `seen` flags the points that each training view
+    sees. The last flows and their initial depths are cached.
     """
 
     images: MatchImages
@@ -152,16 +148,16 @@ class Flows:
     def _flow(self, i: int, j: int) -> Float32[np.ndarray, "h w 2"]:
         """Return the flow from a training view to another."""
         a, b = self.images[i], self.images[j]
-        # Always in one order, so that both directions compare the same pictures.
+        # The order is fixed, so that both directions compare the same pictures.
         first, second = at_common_exposure(a, b) if i < j else at_common_exposure(b, a)[::-1]
-        # It starts where the depth of the guide leads, if it leads anywhere.
+        # The initial flow is the projection of the interpolated depth, or 0.
         start = _geometry(a, b).project(self._guide(i))[0] - pixel_centers(*a.luminance.shape)
         most = max(a.luminance.shape)
         return _flow(first, second, np.clip(np.nan_to_num(start, nan=0.0), -most, most))
 
 
 def _match(flows: Flows, i: int, j: int):
-    """Return inverse depth of a view from its flow to another, and its precision; 0: refused."""
+    """Return inverse depth of a view from its flow to another, and its precision; 0: rejected."""
     a, b = flows.images[i], flows.images[j]
     first, second = at_common_exposure(a, b)
     here, to_b = pixel_centers(*a.luminance.shape), _geometry(a, b)
@@ -191,7 +187,7 @@ def _match(flows: Flows, i: int, j: int):
 
 
 def depth_map(flows: Flows, row: int, near: Sequence[int] | Int[np.ndarray, " k"]) -> DepthMap:
-    """Return the depth of a view, where at least two of its neighbours `near` agree on it."""
+    """Return the depth of a view, valid where at least two of its neighbours `near` agree."""
     inverse, precision = map(
         np.stack, zip(*(_match(flows, row, int(j)) for j in near), strict=True)
     )
@@ -216,7 +212,7 @@ def _fuse(inverse, precision):
             near = apart < SIGMAS * np.sqrt(variance[i] + variance[j])
             near &= apart < APART * np.maximum(inverse[i], inverse[j])
             agree[i, j] = agree[j, i] = near & (precision[i] > 0) & (precision[j] > 0)
-    # The most agreeing first, then the most precise.
+    # The largest agreeing group is best, then the most precise depth.
     score = (agree * (1 + 0.1 * precision / np.maximum(precision.sum(0), 1e-20))).sum(1)
     best = np.argmax(score, axis=0)
     group = np.take_along_axis(agree, best[None, None], 0)[0]
@@ -226,11 +222,11 @@ def _fuse(inverse, precision):
 
 
 def plane_fit(inverse: Float[np.ndarray, "h w"], valid: Bool[np.ndarray, "h w"]):
-    """Fit a plane to the valid inverse depths about every pixel; planes are linear in them.
+    """Fit a plane to the valid inverse depths around every pixel; inverse depth is linear on planes.
 
     Returns:
         Inverse depth of the plane at the pixel, its slope per pixel [h w 2], whether the window
-        lies in it, and the share of the window that is valid.
+        lies in the plane, and the share of the window that is valid.
     """
     height, width = inverse.shape
     w = valid.astype(np.float64)

@@ -1,4 +1,4 @@
-"""Photographs prepared for matching, radiance and usable pixels, and which of them to match."""
+"""Photographs prepared for matching (radiance, usable pixels), and the choice of pairs."""
 
 from __future__ import annotations
 
@@ -24,29 +24,29 @@ from p2gs_jax.types import GAMMA_SRGB, Photometry, Scene
 
 TABLE = 1024
 LUMINANCE = np.array([0.25, 0.6, 0.15], np.float32)
-# Images kept at once: a view, its neighbours, and those of the next views.
+# Number of images in memory: a view, its neighbours, and those of the next views.
 CACHED = 48
-# Quantile of luminance that becomes white in the comparison: lamps may clip.
+# Quantile of luminance that becomes white in the comparison, so that lamps may clip.
 WHITE_QUANTILE = 0.995
 LARGEST_GAIN = 30.0
 ROUNDS = 30
-# Angles under which a pair sees its points, degrees: below the first the depth is uncertain, above
-# the second flow begins to fail; it is hopeless some `FADE` later.
+# Angles between the rays of a pair to its points, degrees: below NARROW the depth is uncertain,
+# above WIDE flow begins to fail, and at WIDE + 2 FADE it fails completely.
 NARROW, WIDE, FADE = 4.0, 12.0, 8.0
-# Exposures this far apart (natural logarithm) share few usable tones.
+# Difference of log exposures (natural logarithm) at which photographs share few usable tones.
 EXPOSURE_FADE = 1.5
 FEWEST_SHARED = 5
 MOST_POINTS = 20_000
-# Least points in a view for an occlusion test among them.
+# Least number of points in a view for an occlusion test among them.
 FEWEST_HIDING = 1000
 
 
 @dataclass(frozen=True)
 class Tones:
-    """How display values of each training view become radiance: L = T^-1(y) / (e W V), in numpy.
+    """The map from display values of training views to radiance, L = T^-1(y) / (e W V), in NumPy.
 
-    Exposures are natural logarithms, white balances log factors on the channels; `formation` has
-    the base curve with its splines, cameras and pivot; `cameras` is the row of each view in
+    Exposures are natural logarithms; white balances are log factors on the channels. `formation`
+    has the base curve with its splines, cameras and pivot; `cameras` is the row of each view in
     `formation.cameras`.
     """
 
@@ -59,8 +59,8 @@ class Tones:
     @classmethod
     def of(cls, photometry: Photometry, formation: PhotometryConfig) -> Tones:
         """Return the tones of a fit."""
-        taken: Any = jax.tree.map(np.asarray, photometry)
-        return cls(taken.log_exposures, taken.gammas, formation, taken.white_balance, taken.cameras)
+        host: Any = jax.tree.map(np.asarray, photometry)
+        return cls(host.log_exposures, host.gammas, formation, host.white_balance, host.cameras)
 
     def log_radiance(
         self,
@@ -68,9 +68,9 @@ class Tones:
         ldr: Float32[np.ndarray, "... 3"],
         positions: Float[np.ndarray, "... 2"] | None = None,
     ) -> Float32[np.ndarray, "... 3"]:
-        """Return log radiance of an image of a training view, or of loose pixels of one.
+        """Return log radiance of an image of a training view, or of single pixels of it.
 
-        Loose pixels have `positions` where vignetting counts (photometry/formation.py:places).
+        Single pixels need `positions` if vignetting is modelled (photometry/formation.py:places).
         """
         camera = None if self.cameras is None else self.cameras[row]
         y = np.linspace(0.0, 1.0, TABLE)
@@ -83,8 +83,8 @@ class Tones:
             if self.formation.curve == "spline":
                 splines = spline_of(self.formation, camera)
             exposed = [log_exposed(y, Response(base, spline))[0] for spline in splines]
-        bend = self.gammas[row] / GAMMA_SRGB
-        curves = [log_pivot + (z - log_pivot) * bend - self.log_exposures[row] for z in exposed]
+        power = self.gammas[row] / GAMMA_SRGB
+        curves = [log_pivot + (z - log_pivot) * power - self.log_exposures[row] for z in exposed]
         if len(curves) == 1:
             logs = np.interp(ldr, y, curves[0])
         else:
@@ -98,10 +98,11 @@ class Tones:
 
 
 def rough_tones(tracks: Observations | None, count: int) -> Tones:
-    """Return tones good enough to compare photographs where no exposures were solved.
+    """Return tones that suffice to compare photographs without solved exposures.
 
-    One factor per view under sRGB's curve: residuals of log radiance against each point's mean,
-    averaged by turns. Without tracks of points, all factors are 1.
+    Each view gets one factor under the sRGB curve. Views and points are solved alternately: the
+    factor is the mean residual of log radiance from the mean of each point. Without tracks, all
+    factors are 1.
     """
     log_exposures, gammas = np.zeros(count), np.full(count, GAMMA_SRGB)
     if tracks is None or not len(tracks.points):
@@ -123,8 +124,8 @@ def rough_tones(tracks: Observations | None, count: int) -> Tones:
 class MatchImage:
     """A training view prepared for matching, at a reduced size.
 
-    `luminance` is linear radiance; `usable` pixels are neither masked, nor clipped, nor black;
-    `log_exposure` is natural.
+    `luminance` is linear radiance; `usable` pixels are neither masked nor clipped nor black;
+    `log_exposure` is a natural logarithm.
     """
 
     ldr: Float32[np.ndarray, "h w 3"]
@@ -148,10 +149,10 @@ class MatchImage:
 
 @dataclass
 class MatchImages:
-    """The training views of a scene, loaded when asked for by their rows; from any thread.
+    """The training views of a scene by row, loaded on demand, in any thread.
 
-    Their longest side has `longest` pixels; display values up to `black` and from `saturation` on
-    are not used. The last images are kept.
+    Their longest side has `longest` pixels. Display values up to `black` and from `saturation` on
+    are not usable. The last images are cached.
     """
 
     scene: Scene
@@ -174,7 +175,7 @@ class MatchImages:
         viewmat, K, _, _ = self.store.camera(index, shrink)
         brightest = ldr.max(2)
         usable = (mask > 0) & (brightest < self.saturation) & (brightest > self.black)
-        # Pixels beside clipped ones contain some of their light.
+        # Pixels next to clipped pixels contain some of their light.
         usable = cv2.erode(usable.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
         luminance = np.exp(self.tones.log_radiance(row, ldr)) @ LUMINANCE
         pose = viewmat.astype(np.float64), K.astype(np.float64)
@@ -184,9 +185,9 @@ class MatchImages:
 def at_common_exposure(
     a: MatchImage, b: MatchImage
 ) -> tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h2 w2"]]:
-    """Return two photographs as the longer of their exposures shows them, 8 bits.
+    """Return two photographs at the longer of their exposures, 8-bit.
 
-    Pixels clipped under that exposure are white in both. Dark pairs are brightened.
+    Pixels that clip at this exposure are white in both. Dark pairs are brightened.
     """
     exposure = np.exp(max(a.log_exposure, b.log_exposure))
     bright = max(float(np.quantile(f.luminance[::4, ::4], WHITE_QUANTILE)) for f in (a, b))
@@ -199,7 +200,7 @@ def at_common_exposure(
 
 
 def visibility(scene: Scene, seed: int) -> Bool[np.ndarray, "v p"]:
-    """Return which training view sees which point: by tracks, else by projection."""
+    """Return whether each training view sees each point: from tracks, else from projection."""
     rows = scene.train_indices
     seen = np.zeros((len(rows), len(scene.points)), bool)
     if scene.tracks is not None and len(scene.tracks.xy):
@@ -223,9 +224,9 @@ def visibility(scene: Scene, seed: int) -> Bool[np.ndarray, "v p"]:
 def neighbours(
     scene: Scene, seen: Bool[np.ndarray, "v p"], log_exposures: Float[np.ndarray, " v"], count: int
 ) -> list[Int[np.ndarray, " _"]]:
-    """Return for every training view the rows of the `count` views to match it with, best first.
+    """Return for every training view the rows of the `count` best views to match, best first.
 
-    `seen` says which view sees which point.
+    `seen` flags the points that each view sees.
     """
     views = [scene.views[i] for i in scene.train_indices]
     centers = camera_centers(views)

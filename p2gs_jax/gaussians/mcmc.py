@@ -1,8 +1,8 @@
 """3DGS as Markov chain Monte Carlo: relocate transparent Gaussians, explore with noise.
 
-Source: Kheradmand et al. 2024. The scale correction for N Gaussians in one place is written there
-as an alternating double sum of binomials; substituting 1/sqrt(k+1) = 2/sqrt(pi) int exp(-(k+1)t^2)
-turns it into (2/sqrt(pi)) int_0^inf 1 - (1 - o exp(-t^2))^N dt, which has no cancellation (ours).
+Source: Kheradmand et al. 2024. The paper writes the scale correction for N Gaussians in one place
+as an alternating double sum of binomials. With 1/sqrt(k+1) = 2/sqrt(pi) int exp(-(k+1)t^2) it
+becomes (2/sqrt(pi)) int_0^inf 1 - (1 - o exp(-t^2))^N dt, which has no cancellation (ours).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _WEIGHTS[0] = _WEIGHTS[-1] = _NODES[1] / 2
 def share(
     opacity: Float[Array, " n"], copies: Float[Array, " n"]
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Return opacity and scale factor of each of `copies` Gaussians that together look like one."""
+    """Return opacity and scale factor for `copies` equal Gaussians that together look like one."""
     new = 1 - jnp.exp(jnp.log1p(-jnp.minimum(opacity, 1 - 1e-6)) / copies)
     behind = jnp.log1p(-new[:, None] * jnp.exp(-(_NODES**2)))
     integrand = -jnp.expm1(copies[:, None] * behind)
@@ -47,11 +47,11 @@ def relocate_and_grow(
 ) -> Outcome:
     """Move transparent Gaussians onto opaque ones and add `births` new ones there.
 
-    Targets are drawn in proportion to opacity times demand (`train/strategies.py`; None: alike
-    everywhere). All Gaussians in one place get the opacity and scale of `share`, and they are moved
-    apart by `cfg.spread` of their extent: in exactly one place they would have the same gradients,
-    and opaque ones, which no noise reaches, would never separate (BUILD_NOTES, "Twins"). Births
-    without a free slot are counted in `refused`.
+    Targets are drawn in proportion to opacity times `demand` (`train/strategies.py`; None: equal).
+    All Gaussians in one place get the opacity and scale of `share`, and are moved apart by
+    `cfg.spread` of their scales. Otherwise their gradients would be equal, and opaque Gaussians,
+    which no noise reaches, would never separate (BUILD_NOTES, "Twins"). `refused` counts births
+    without a free slot.
     """
     n = population.alive.shape[0]
     dead = population.alive & (opacities(gaussians) <= cfg.prune_opacity)
@@ -81,7 +81,7 @@ def relocate_and_grow(
     )
     source = jnp.where(movers, jnp.minimum(target, n - 1), jnp.arange(n))
     gaussians = jax.tree.map(lambda a: a[source], gaussians)
-    # The target itself moves to the opposite side, so that their mean stays.
+    # The target itself moves to the opposite side, so that the mean of the group stays.
     away = jax.random.normal(jax.random.fold_in(key, 1), (n, 3)) * movers[:, None]
     pushed = jnp.zeros((n, 3)).at[target].add(away, mode="drop")
     away = away - pushed / jnp.maximum(arrivals, 1)[:, None]
@@ -95,10 +95,10 @@ def relocate_and_grow(
 def _apart(
     gaussians: Gaussians, away: Float[Array, "n 3"], where: Bool[Array, " n"], spread: float
 ) -> Gaussians:
-    """Move Gaussians within their own extent, and shrink them so that their joint extent stays.
+    """Move Gaussians within their extent, and shrink them so that the extent of the group stays.
 
-    `away` are directions in units of the principal axes, of variance 1, zero for those that stay;
-    `spread` is the deviation of the moves over that of the Gaussian, below 1.
+    `away` holds random moves of variance 1 in units of the scales, along the principal axes; it is
+    zero for Gaussians that stay. `spread`, below 1, multiplies the moves.
     """
     scales = jnp.exp(gaussians.log_scales)
     moved = rotated(rotation_matrices(gaussians.quats), spread * away * scales)
@@ -114,10 +114,10 @@ def exploration_noise(
 ) -> Float[Array, "n 3"]:
     """Return the noise to add to the means after a step.
 
-    It has the shape of each Gaussian's covariance and reaches only nearly transparent ones. `rate`
-    is the noise scale times the learning rate of the means.
+    It has the shape of each Gaussian's covariance and moves only nearly transparent Gaussians.
+    `rate` is the noise scale times the learning rate of the means.
     """
-    # The same numbers in any precision.
+    # Always float32, so that the random numbers are equal in any precision.
     normal = jax.random.normal(key, gaussians.means.shape, jnp.float32)
     return shaped_noise(normal, gaussians, alive, rate)
 
@@ -125,7 +125,7 @@ def exploration_noise(
 def shaped_noise(
     normal: Float[Array, "n 3"], gaussians: Gaussians, alive: Bool[Array, " n"], rate
 ) -> Float[Array, "n 3"]:
-    """Return the noise that independent normal numbers give; see `exploration_noise`."""
+    """Return the noise made from independent normal numbers; see `exploration_noise`."""
     gate = jax.nn.sigmoid(NOISE_STEEPNESS * (NOISE_OPACITY - opacities(gaussians)))
     R = rotation_matrices(gaussians.quats)
     variance = jnp.exp(2 * gaussians.log_scales)

@@ -1,4 +1,4 @@
-"""Where Gaussians begin that move: in the frames of boxes, or vibrating at times of their own."""
+"""Initial moving Gaussians: in the frames of boxes, or vibrating, each with its peak time."""
 
 from __future__ import annotations
 
@@ -23,42 +23,39 @@ from p2gs_jax.scene.rigid import interpolated, inverse
 from p2gs_jax.scene.visibility import unoccluded
 from p2gs_jax.types import Gaussians, Lidar, Photometry, Scene, TrackedObject, Vibration, View
 
-# A view shows an object from this share of its pixels on.
+# Least share of a view's pixels that an object must cover, and image width of the test, pixels.
 LEAST_AREA, AREA_WIDTH = 2e-4, 200
-# Points this near to the bottom of a box lie on the ground, scene units.
+# Points nearer than this to the bottom of a box lie on the ground, scene units.
 GROUND = 0.1
-# Measured points may lie this far outside of their box.
+# Largest distance of measured points outside of their box, scene units.
 OUTSIDE = 0.1
+# Largest initial scale, scene units.
 WIDEST = 0.3
 VOXEL_GROWTH = 1.3
-# Initial opacity of what may vibrate: most of it is at places that something stands still at.
+# Initial opacity of vibrating Gaussians; it is low because most of them lie on static surfaces.
 OPACITY = 0.1
 
 
 class Nodes(NamedTuple):
-    """Seeds of moving objects: points in the frame of their box, scene units.
-
-    `owner` is the row of their object in `moving`; objects that are `left` get none, and their
-    pixels are left out of the fit; `notes` are for the user.
-    """
+    """Seeds of moving objects."""
 
     moving: MovingObjects
-    points: Float32[np.ndarray, "p 3"]
-    owner: Int[np.ndarray, " p"]
-    left: tuple[TrackedObject, ...]
-    notes: tuple[str, ...]
+    points: Float32[np.ndarray, "p 3"]  # in the frames of their boxes, scene units
+    owner: Int[np.ndarray, " p"]  # row of the object in `moving`
+    left: tuple[TrackedObject, ...]  # objects without seeds; their pixels are left out of the fit
+    notes: tuple[str, ...]  # for the user
 
 
 def find_nodes(scene: Scene, cfg: DynamicsConfig) -> Nodes | None:
-    """Return the seeds of the objects that move in a scene; None where it has none."""
+    """Return the seeds of the moving objects of a scene; None if it has none."""
     moving = [row for row, thing in enumerate(scene.objects) if thing.moving]
     views, empty = scene.training_views, np.zeros((0, 3), np.float32)
     if cfg.method != "rigid" or not moving:
         return None
     if any(view.time is None for view in views):
         left = tuple(scene.objects[row] for row in moving)
-        said = "Views have no times: where things that move were is not known; they are masked."
-        return Nodes(MovingObjects(()), empty, np.zeros(0, np.int32), left, (said,))
+        note = "Views have no times, so positions of moving objects are not known: they are masked."
+        return Nodes(MovingObjects(()), empty, np.zeros(0, np.int32), left, (note,))
     kept, left, points, filled = [], [], [], 0
     for row in moving:
         thing = scene.objects[row]
@@ -73,7 +70,7 @@ def find_nodes(scene: Scene, cfg: DynamicsConfig) -> Nodes | None:
         kept.append(thing)
         points.append(measured.astype(np.float32))
     owner = np.repeat(np.arange(len(kept), dtype=np.int32), [len(p) for p in points])
-    note = f"{len(kept)} things move as pieces of their own, with {len(owner)} seeds"
+    note = f"{len(kept)} moving objects have separate Gaussians, with {len(owner)} seeds"
     if filled:
         note += f"; {filled} of them have few laser points: their boxes are filled"
     if left:
@@ -87,12 +84,12 @@ def node_gaussians(
 ) -> Gaussians:
     """Return the Gaussians of moving objects, in the frames of their boxes.
 
-    `radiance` is that of their points, in the gauge of the exposures.
+    `radiance` is the radiance of their points, in the gauge of the exposures.
     """
     scales = np.empty(len(nodes.points))
     for row in np.unique(nodes.owner):
-        mine = nodes.owner == row
-        scales[mine] = spacings(nodes.points[mine])
+        of_object = nodes.owner == row
+        scales[of_object] = spacings(nodes.points[of_object])
     scales = np.clip(scales, 1e-3, WIDEST)
     return gaussians_from_points(nodes.points, radiance, views, cfg, scales=scales)
 
@@ -100,7 +97,7 @@ def node_gaussians(
 def nodes_radiance(
     nodes: Nodes, scene: Scene, store: ImageStore, photometry: Photometry, cfg: FitConfig
 ) -> Float[np.ndarray, "p 3"]:
-    """Return the mean radiance of points of moving objects, where they were in each view."""
+    """Return the mean radiance of points of moving objects, at their positions in each view."""
     still = len(scene.points)
 
     def seen_in(view: View, row: int):
@@ -118,12 +115,12 @@ def nodes_radiance(
 
 
 def on_surface(size: tuple[float, float, float], count: int) -> Float[np.ndarray, "p 3"]:
-    """Return about `count` points spread evenly over a box about 0, but for its bottom."""
+    """Return about `count` points, evenly spread over a box around 0 except its bottom."""
     half = np.asarray(size, float) / 2
     faces = [(axis, sign) for axis in range(3) for sign in (-1, 1) if (axis, sign) != (2, -1)]
     areas = [4 * np.prod(np.delete(half, axis)) for axis, _ in faces]
     spacing = np.sqrt(sum(areas) / count)
-    found = []
+    points = []
     for axis, sign in faces:
         across = np.delete(half, axis)
         steps = [max(round(2 * extent / spacing), 1) for extent in across]
@@ -132,19 +129,19 @@ def on_surface(size: tuple[float, float, float], count: int) -> Float[np.ndarray
             for n, extent in zip(steps, across, strict=True)
         ]
         flat = np.stack(np.meshgrid(*lines, indexing="ij"), -1).reshape(-1, 2)
-        found.append(np.insert(flat, axis, sign * half[axis], axis=1))
-    return np.concatenate(found)
+        points.append(np.insert(flat, axis, sign * half[axis], axis=1))
+    return np.concatenate(points)
 
 
 def _measured(
     thing: TrackedObject, row: int, lidar: Lidar | None, cfg: DynamicsConfig
 ) -> Float[np.ndarray, "p 3"]:
-    """Return the laser points on an object in its own frame, of all sweeps, thinned."""
+    """Return the laser points of all sweeps on an object, in the frame of its box, thinned."""
     if lidar is None:
         return np.zeros((0, 3))
-    mine = lidar.objects == row
-    poses, there = interpolated(thing.times, thing.poses, lidar.times[mine])
-    points = lidar.points[mine].astype(np.float64) - poses[:, :3, 3]
+    hits = lidar.objects == row
+    poses, there = interpolated(thing.times, thing.poses, lidar.times[hits])
+    points = lidar.points[hits].astype(np.float64) - poses[:, :3, 3]
     local = np.einsum("nij,nj->ni", inverse(poses)[:, :3, :3], points)
     half = np.asarray(thing.size) / 2
     inside = there & (np.abs(local) <= half + OUTSIDE).all(1) & (local[:, 2] > GROUND - half[2])
@@ -159,36 +156,37 @@ def _measured(
 
 
 def _views_that_show(thing: TrackedObject, views: Sequence[View], cfg: DynamicsConfig) -> int:
-    """Return how many views show an object large enough to learn from; not more than needed."""
+    """Return the number of views that show an object large enough; counting stops when enough."""
     times = np.array([view.time for view in views], float)
     poses, there = interpolated(thing.times, thing.poses, times)
-    shown = 0
+    count = 0
     for view, pose in ((views[int(i)], poses[i]) for i in np.flatnonzero(there)):
         outline = outline_of(pose, thing.size, view, margin=0.0)
         if outline is None:
             continue
         height = max(1, round(AREA_WIDTH * view.height / view.width))
-        shown += int(painted([outline], view, AREA_WIDTH, height).mean() >= LEAST_AREA)
-        if shown >= cfg.least_views:
+        count += int(painted([outline], view, AREA_WIDTH, height).mean() >= LEAST_AREA)
+        if count >= cfg.least_views:
             break
-    return shown
+    return count
 
 
 def vibrates(scene: Scene, cfg: FitConfig) -> bool:
-    """Return whether Gaussians vibrate: it was asked for, and all views have times."""
+    """Return whether Gaussians vibrate: the option is set, and all views have times."""
     return cfg.dynamics.method == "vibration" and all(v.time is not None for v in scene.views)
 
 
 def clock_of(scene: Scene) -> MovingObjects:
-    """Return the clock of a scene whose Gaussians vibrate: no objects, but times of views."""
+    """Return moving objects without objects, only with the times of a scene with vibration."""
     return MovingObjects((), middle=middle_time(scene))
 
 
 def with_vibration(gaussians: Gaussians, scene: Scene, cfg: FitConfig) -> Gaussians:
-    """Return Gaussians that stand still, and behind them some that may move.
+    """Return the Gaussians as static ones, followed by vibrating ones.
 
-    These are drawn from the laser points, each at its own time, or from the Gaussians themselves at
-    any time where there are none; they look like the nearest one.
+    Vibrating Gaussians are drawn from the laser points, with the time of each point as their peak.
+    Without laser points they are drawn from the Gaussians, with random times. All other parameters
+    are those of the nearest Gaussian.
     """
     times = np.array([view.time for view in scene.views if view.time is not None])
     middle, rng = middle_time(scene), generator(cfg.train.seed, Stream.VIBRATING)
@@ -202,12 +200,12 @@ def with_vibration(gaussians: Gaussians, scene: Scene, cfg: FitConfig) -> Gaussi
         near = rng.integers(0, len(means), count)
         points, at = means[near], rng.uniform(times.min(), times.max(), count)
     at = np.clip(at, times.min(), times.max()) - middle
-    faint = np.full(len(at), np.log(OPACITY / (1 - OPACITY)))
-    like = jax.tree.map(lambda a: np.asarray(a)[near], gaussians)
+    logits = np.full(len(at), np.log(OPACITY / (1 - OPACITY)))
+    nearest = jax.tree.map(lambda a: np.asarray(a)[near], gaussians)
     moving = dataclasses.replace(
-        like,
+        nearest,
         means=on_device(points),
-        opacity_logits=on_device(faint),
+        opacity_logits=on_device(logits),
         vibration=_vibration(at, cfg.dynamics.vibration_life),
     )
     still = _vibration(np.zeros(len(means)), STILL)

@@ -1,4 +1,4 @@
-"""Gaussians in other coordinates, for files and viewers: of the world at one moment, turned."""
+"""Gaussians in other coordinates, for files and viewers: world axes at one time, or rotated."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from p2gs_jax.render.harmonics import degree_of, table
 from p2gs_jax.render.project import STILL
 from p2gs_jax.types import Gaussians
 
-# Twice as many as coefficients of degree 3, and more: the least squares are exact.
+# Number of directions of the least squares, which are exact because degree 3 has 16 coefficients.
 DIRECTIONS = 64
-# What a turn of 180 degrees about x does to coordinates.
+# Factors on coordinates in a rotation by 180 degrees about x.
 FLIP = (1.0, -1.0, -1.0)
 
 
 def standing(gaussians: Gaussians, owner: Int[np.ndarray, " n"] | None) -> Gaussians:
-    """Return only what stands still; `owner` is the moving object of each Gaussian, -1: none."""
+    """Return the static Gaussians only; `owner` is the moving object of each, -1: none."""
     moves = gaussians.vibration
     if moves is not None:
         stands = np.asarray(moves.log_lives) > np.log(STILL) - 1
@@ -31,7 +31,7 @@ def standing(gaussians: Gaussians, owner: Int[np.ndarray, " n"] | None) -> Gauss
 
 
 def chosen(gaussians: Gaussians, which: Bool[np.ndarray, " n"]) -> Gaussians:
-    """Return some Gaussians, in their order."""
+    """Return the flagged Gaussians, in their order."""
     return jax.tree.map(lambda a: on_device(np.asarray(a)[which]), gaussians)
 
 
@@ -41,36 +41,36 @@ def posed(
     poses: Float[np.ndarray, "k 4 4"],
     there: Bool[np.ndarray, " k"],
 ) -> Gaussians:
-    """Return Gaussians in world coordinates; those of objects that are not `there` are left out.
+    """Return Gaussians in world coordinates, without those of objects that are not `there`.
 
-    Those of objects lie in the frames of their boxes; `owner` is their object, -1: none; `poses`
-    are box to world.
+    `owner` is the moving object of each Gaussian, -1: none. Gaussians of objects are given in the
+    frames of their boxes; `poses` map box to world.
     """
     if owner is None:
         return gaussians
     owner = np.asarray(owner)
-    shown = (owner < 0) | there[owner]
-    owner = owner[shown]
-    host = jax.tree.map(lambda a: np.array(np.asarray(a)[shown]), gaussians)
+    kept = (owner < 0) | there[owner]
+    owner = owner[kept]
+    host = jax.tree.map(lambda a: np.array(np.asarray(a)[kept]), gaussians)
     for row in np.unique(owner[owner >= 0]):
-        mine, R = owner == row, poses[row, :3, :3]
-        host.means[mine] = host.means[mine] @ R.T + poses[row, :3, 3]
-        turned = Rotation.from_matrix(R) * rotations(host.quats[mine])
-        host.quats[mine] = turned.as_quat(scalar_first=True)
-        host.sh[mine] = np.einsum("ij,njc->nic", turning(R, host.sh.shape[1]), host.sh[mine])
+        at, R = owner == row, poses[row, :3, :3]
+        host.means[at] = host.means[at] @ R.T + poses[row, :3, 3]
+        turned = Rotation.from_matrix(R) * rotations(host.quats[at])
+        host.quats[at] = turned.as_quat(scalar_first=True)
+        host.sh[at] = np.einsum("ij,njc->nic", turning(R, host.sh.shape[1]), host.sh[at])
     return jax.tree.map(on_device, host)
 
 
 def rotations(quats: Float[np.ndarray, "n 4"]) -> Rotation:
-    """Return rotations of w x y z quaternions of any length; one of zeros is the identity."""
+    """Return the rotations of w x y z quaternions of any length; zeros give the identity."""
     zero = ~np.any(quats, axis=1, keepdims=True)
     return Rotation.from_quat(np.where(zero, np.eye(1, 4), quats), scalar_first=True)
 
 
 def turning(R: Float[np.ndarray, "3 3"], count: int) -> Float[np.ndarray, "k k"]:
-    """Return the matrix that turns so many spherical-harmonics coefficients.
+    """Return the matrix that rotates `count` spherical-harmonics coefficients by R.
 
-    A function of directions d becomes one of R^T d.
+    A function f(d) of directions becomes f(R^T d).
     """
     directions = fibonacci_sphere(DIRECTIONS)
     here, there = (
@@ -80,11 +80,12 @@ def turning(R: Float[np.ndarray, "3 3"], count: int) -> Float[np.ndarray, "k k"]
 
 
 def half_turn(g: Gaussians) -> Gaussians:
-    """Return the Gaussians turned by 180 degrees about x; twice is nothing.
+    """Return the Gaussians rotated by 180 degrees about x; twice gives the original.
 
-    From COLMAP's axes (right, down, forward) to those of graphics (right, up, back), and back.
+    This converts between COLMAP's axes (right, down, forward) and those of graphics (right, up,
+    back).
     """
-    # A half turn about an axis only changes signs of the harmonics.
+    # A rotation by 180 degrees about an axis only changes signs of the harmonics.
     signs = np.rint(np.diag(turning(np.diag(FLIP), g.sh.shape[1])))
     return dataclasses.replace(
         g,

@@ -1,4 +1,4 @@
-"""Seed points become Gaussians, with the radiance that photographs show at them."""
+"""Gaussians from seed points, with the radiance that photographs show at the points."""
 
 from __future__ import annotations
 
@@ -22,20 +22,22 @@ from p2gs_jax.scene.visibility import unoccluded
 from p2gs_jax.types import Gaussians, Photometry, Scene, View
 
 NEIGHBOURS = 3
-# 3DGS: the radius of the camera centres, with ten percent to spare.
+# 3DGS: the scene extent is 1.1 times the radius of the camera centres.
 EXTENT_MARGIN = 1.1
 MIN_RADIANCE = 1e-3
-# At most this share of the cameras, each so many times farther off than all others, is misplaced.
+# At most this share of the cameras counts as misplaced; each is so many times farther away than the
+# next nearer camera.
 FEW, FARTHER = 0.05, 20.0
-# Seeds and Gaussians lie no farther from the cameras than this, in radii of these or median
-# distances of the points.
+# Largest distance of seeds and Gaussians from the cameras, as a multiple of the cameras' radius or
+# of the median distance of the points.
 REACH = 1000.0
-# No seed starts wider than this fraction of its distance from the nearest camera.
+# Largest initial scale of a seed, as a share of its distance from the nearest camera.
 MAX_ANGLE = 0.05
-# Values that say nothing of the radiance count only where there are no others.
+# Weight of black or saturated values in the mean radiance; other values have weight 1.
 LEAST_WEIGHT = 1e-3
 
-# From a training view and its row to the points that it shows, and where, pixels at its full size.
+# Maps a training view and its row to the points that it shows and their positions, in pixels at
+# full size.
 SeenIn = Callable[[View, int], tuple[Int[np.ndarray, " s"], Float[np.ndarray, "s 2"]]]
 
 
@@ -45,7 +47,7 @@ def camera_centers(views: Sequence[View]) -> Float[np.ndarray, "v 3"]:
 
 
 def misplaced(views: Sequence[View], points: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, " v"]:
-    """Return which cameras stand so far from all others, and the points, that they are wrong."""
+    """Return flags of the cameras that are misplaced: far from all other cameras and the points."""
     centers = camera_centers(views).astype(np.float64)
     middle = np.median(centers, axis=0)
     away = np.linalg.norm(centers - middle, axis=1)
@@ -59,9 +61,9 @@ def misplaced(views: Sequence[View], points: Float[np.ndarray, "p 3"]) -> Bool[n
 
 
 def cameras_radius(views: Sequence[View], points: Float[np.ndarray, "p 3"]) -> float:
-    """Return the radius of the cameras (3DGS) but misplaced ones, scene units.
+    """Return the radius of the cameras (3DGS) without misplaced ones, scene units.
 
-    Where all cameras stand in one place, the median distance of the points is used.
+    It is at least 0.05 times the median distance of the points, for cameras in one place.
     """
     centers = camera_centers(views)[~misplaced(views, points)]
     middle = centers.mean(0)
@@ -75,17 +77,17 @@ def cameras_radius(views: Sequence[View], points: Float[np.ndarray, "p 3"]) -> f
 def reach(
     views: Sequence[View], points: Float[np.ndarray, "p 3"]
 ) -> tuple[Float[np.ndarray, " 3"], float]:
-    """Return the middle of the cameras, and how far from it anything may lie, scene units."""
+    """Return the middle of the cameras, and the largest allowed distance from it, scene units."""
     middle = camera_centers(views)[~misplaced(views, points)].astype(np.float64).mean(0)
     far = float(np.median(np.linalg.norm(points - middle, axis=1))) if len(points) else 0.0
     return middle, REACH * max(cameras_radius(views, points), far)
 
 
 def within_reach(scene: Scene) -> tuple[Scene, list[str]]:
-    """Return a scene whose seed points lie in reach, and a note of those that did not.
+    """Return a scene without seed points beyond the reach, and a note about moved points.
 
-    They are moved towards the cameras, which hardly see a difference: wide Gaussians far away would
-    be thrown about by the exploration of MCMC.
+    Points beyond the reach are moved towards the cameras, whose images hardly change. The
+    exploration noise of MCMC would move wide, far Gaussians too much.
     """
     if not len(scene.points):
         return scene, []
@@ -97,19 +99,19 @@ def within_reach(scene: Scene) -> tuple[Scene, list[str]]:
     points = scene.points.copy()
     points[far] = middle + (points[far] - middle) * (most / away[far])[:, None]
     note = f"{far.sum()} of {len(points)} seed points lie more than {most:.2g} scene units away, "
-    note += f"{REACH:g} times as far as most: they are moved there."
+    note += f"{REACH:g} times as far as most: they are moved to this distance."
     return dataclasses.replace(scene, points=points), [note]
 
 
 def subsample(count: int, limit: int, seed: int, stream: Stream = Stream.SEED_POINTS) -> np.ndarray:
-    """Return which seeds to keep, sorted, at most `limit`, drawn evenly."""
+    """Return the sorted indices of at most `limit` seeds to keep, drawn uniformly."""
     if count <= limit:
         return np.arange(count)
     return np.sort(generator(seed, stream).choice(count, limit, replace=False))
 
 
 def spacings(points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, " p"]:
-    """Return the RMS distance to the three nearest neighbours (3DGS); inf without so many."""
+    """Return the RMS distance to the 3 nearest neighbours (3DGS); inf with fewer neighbours."""
     if len(points) <= NEIGHBOURS:
         return np.full(len(points), np.inf)
     distances, _ = KDTree(points).query(points, k=NEIGHBOURS + 1)
@@ -119,7 +121,7 @@ def spacings(points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, " p"]:
 def neighbour_scales(
     points: Float[np.ndarray, "p 3"], views: Sequence[View]
 ) -> Float[np.ndarray, " p"]:
-    """Return the spacings of points, bounded by the view."""
+    """Return the spacings of points, bounded by their distance from the nearest view."""
     to_camera, _ = KDTree(camera_centers(views)).query(points)
     return np.clip(spacings(points), 1e-7, np.maximum(MAX_ANGLE * np.asarray(to_camera), 1e-6))
 
@@ -169,8 +171,8 @@ def photographed_radiance(
 ) -> Float[np.ndarray, "p 3"]:
     """Return the mean radiance at the scene's points in the training photographs that see them.
 
-    It is in the gauge of the exposures that the fit starts from. Points that no photograph sees get
-    the median of all others.
+    It is in the gauge of the initial exposures. Points that no photograph sees get the median of
+    the other points.
     """
 
     def seen_in(view: View, row: int):
@@ -189,12 +191,12 @@ def mean_radiance(
     photometry: Photometry,
     cfg: FitConfig,
 ) -> Float[np.ndarray, "p 3"]:
-    """Return the mean radiance of so many points in the training photographs that see them."""
+    """Return the mean radiance of `count` points in the training photographs that see them."""
     total, weight = np.zeros((count, 3)), np.zeros((count, 3))
-    for at, colors, found in photographed(seen_in, scene, store, photometry, cfg):
-        says = (colors > cfg.loss.black) & (colors < cfg.loss.saturation)
-        share = np.where(says, 1.0, LEAST_WEIGHT)
-        total[at] += share * found
+    for at, colors, radiance in photographed(seen_in, scene, store, photometry, cfg):
+        usable = (colors > cfg.loss.black) & (colors < cfg.loss.saturation)
+        share = np.where(usable, 1.0, LEAST_WEIGHT)
+        total[at] += share * radiance
         weight[at] += share
     known = weight.min(1) > 0
     radiance = total / np.maximum(weight, LEAST_WEIGHT / 2)
@@ -211,8 +213,8 @@ def photographed(
     cfg: FitConfig,
     shrink: int = 1,
 ) -> Iterator[tuple[Int[np.ndarray, " s"], Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]]:
-    """Yield points, their display colours and radiance, in each training photograph."""
-    taken: Photometry = jax.tree.map(np.asarray, photometry)
+    """Yield point indices, their display colours and radiance, for each training photograph."""
+    host: Photometry = jax.tree.map(np.asarray, photometry)
     for row, index in enumerate(scene.train_indices):
         view = scene.views[index]
         seen, xy = seen_in(view, row)
@@ -224,11 +226,11 @@ def photographed(
         valid = samples.valid
         colors = np.asarray(samples.colors[valid], np.float32)
         place = places(xy[valid], *mask.shape[::-1])
-        found = inverse_formation(colors, taken.capture(row), cfg.photometry, place)
-        yield seen[valid], colors, np.asarray(found)
+        radiance = inverse_formation(colors, host.capture(row), cfg.photometry, place)
+        yield seen[valid], colors, np.asarray(radiance)
 
 
 def with_colors(scene: Scene, radiance: Float[np.ndarray, "p 3"]) -> Scene:
-    """Return the scene with its points coloured, as sRGB of radiance at exposure 1."""
-    shown = np.asarray(srgb_encode(np.clip(radiance, 0, 1)))
-    return dataclasses.replace(scene, point_colors=np.rint(255 * shown).astype(np.uint8))
+    """Return the scene with point colours: sRGB of the radiance at exposure 1."""
+    encoded = np.asarray(srgb_encode(np.clip(radiance, 0, 1)))
+    return dataclasses.replace(scene, point_colors=np.rint(255 * encoded).astype(np.uint8))

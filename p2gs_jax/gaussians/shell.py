@@ -1,7 +1,7 @@
-"""A far shell of Gaussians, where views look past every seed point: sky, hills, far facades.
+"""A far shell of Gaussians for image regions without seed points: sky, hills, far facades.
 
-Directions that views look into, but in which no seed lies, get a Gaussian each, far behind the
-seeds. Scenes whose views are covered by seeds get none.
+Each viewing direction without seeds gets a Gaussian far behind the seeds. Scenes whose views are
+covered by seeds get no shell.
 """
 
 from __future__ import annotations
@@ -21,54 +21,50 @@ from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.visibility import in_frame
 from p2gs_jax.types import Gaussians, Photometry, Scene, View
 
-# Each view is cut into cells; a cell with a seed in it or beside it counts as covered.
+# Each view is divided into cells; a cell counts as covered if it or a neighbour contains a seed.
 CELLS_ACROSS = 16
-# A direction belongs to the shell if fewer of the views that look into it see a seed there.
+# A direction belongs to the shell if less than this share of the views that see it has seeds there.
 COVERED_FRACTION = 0.3
-# Less empty image than this is a gap in the seeds, not a sky.
+# If a smaller share of the image cells is empty, this is a gap in the seeds and not a sky.
 EMPTY_IMAGE_FRACTION = 0.04
-# Distance of the shell over that of the far seeds.
+# Distance of the shell relative to the far seeds.
 BEHIND_SEEDS = 2.0
 OVERLAP = 0.7
-# Shell colours come from small images: a direction covers many pixels.
+# Shell colours come from shrunk images, because a direction covers many pixels.
 SHELL_SHRINK = 4
 SHELL_OPACITY = 0.5
 
 
 @dataclass(frozen=True)
 class Shell:
-    """Directions to add: positions and standard deviations, scene units.
+    """The points of a shell."""
 
-    Which training view (row) sees each of them, and at which pixel of the full resolution; and the
-    share of image cells with no seed near.
-    """
-
-    points: Float32[np.ndarray, "s 3"]
-    scales: Float[np.ndarray, " s"]
-    seen: Bool[np.ndarray, "s v"]
-    xy: Float32[np.ndarray, "s v 2"]
-    empty_fraction: float
+    points: Float32[np.ndarray, "s 3"]  # positions, scene units
+    scales: Float[np.ndarray, " s"]  # standard deviations, scene units
+    seen: Bool[np.ndarray, "s v"]  # whether a training view (by row) sees each point
+    xy: Float32[np.ndarray, "s v 2"]  # position in that view, pixels at full resolution
+    empty_fraction: float  # share of image cells without seeds nearby
 
     def note(self) -> str:
-        """Say what it is and how to do without."""
+        """Return a note about the shell and the option that turns it off."""
         return (
-            f"{self.empty_fraction:.0%} of the images look past every seed point: a far shell "
+            f"{self.empty_fraction:.0%} of the image area shows no seed point: a far shell "
             f"of {len(self.points)} Gaussians was added (--init.shell off leaves it out)."
         )
 
 
 @dataclass(frozen=True)
 class Sphere:
-    """Where a shell lies, scene units."""
+    """The sphere of a shell."""
 
-    middle: Float[np.ndarray, " 3"]
-    radius: float
+    middle: Float[np.ndarray, " 3"]  # scene units
+    radius: float  # scene units
 
 
 def sphere_behind(
     views: Sequence[View], points: Float[np.ndarray, "p 3"], radius: float, cfg: InitConfig
 ) -> Sphere:
-    """Return where the shell of a scene lies: behind its seeds, beyond the cameras' radius."""
+    """Return the sphere of a scene's shell: behind its seeds, beyond the cameras' radius."""
     middle = seeds.camera_centers(views)[~seeds.misplaced(views, points)].mean(0)
     radius *= cfg.shell_radius
     if len(points):
@@ -78,9 +74,9 @@ def sphere_behind(
 
 
 def _project(view: View, points: Float[np.ndarray, "p 3"], shape: tuple[int, int]):
-    """Return pixel positions [p 2], which points are seen, and rows and columns of their cells.
+    """Return pixel positions [p 2], flags of seen points, and (rows, columns) of their cells.
 
-    The image is cut into cells of the given shape, rows and columns.
+    `shape` is the number of rows and columns of cells in the image.
     """
     xy, z = project_points(points.astype(np.float64), view)
     inside = in_frame(xy, z, view.width, view.height)
@@ -95,9 +91,9 @@ def find_shell(
     cfg: InitConfig,
     sphere: Sphere | None = None,
 ) -> Shell | None:
-    """Return the shell that a scene needs, or None.
+    """Return the shell of a scene, or None if it needs none.
 
-    It lies on `sphere`, or behind the seed points, beyond the cameras' radius.
+    It lies on `sphere`; None means `sphere_behind`.
     """
     if cfg.shell == "off":
         return None
@@ -142,17 +138,17 @@ def shell_gaussians(
     views: Sequence[View],
     cfg: FitConfig,
 ) -> Gaussians:
-    """Return the Gaussians of a shell, coloured by what the photographs show in its directions."""
+    """Return the Gaussians of a shell, with the mean radiance of the photographs at its points."""
 
     def seen_in(view: View, row: int):
         seen = np.flatnonzero(shell.seen[:, row])
         return seen, shell.xy[seen, row]
 
     total, weight = np.zeros((len(shell.points), 3)), np.zeros(len(shell.points))
-    for at, _, found in seeds.photographed(seen_in, scene, store, photometry, cfg, SHELL_SHRINK):
-        total[at] += found
+    for at, _, colors in seeds.photographed(seen_in, scene, store, photometry, cfg, SHELL_SHRINK):
+        total[at] += colors
         weight[at] += 1
     seen = weight > 0
     radiance = (total[seen] / weight[seen, None]).astype(np.float32)
-    own = {"scales": shell.scales[seen], "opacity": SHELL_OPACITY}
-    return seeds.gaussians_from_points(shell.points[seen], radiance, views, cfg, **own)
+    start = {"scales": shell.scales[seen], "opacity": SHELL_OPACITY}
+    return seeds.gaussians_from_points(shell.points[seen], radiance, views, cfg, **start)
