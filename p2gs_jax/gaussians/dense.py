@@ -325,7 +325,7 @@ def gaussians_of(
 
 
 def coverage_of(scene: Scene, max_width: int | None) -> Coverage:
-    """Return the pixels of the largest training view, and the share of the scene that views show."""
+    """Return the pixels of the largest training view, and the share of the scene that one shows."""
     sizes = [size_at(view, max_width) for view in scene.training_views]
     return Coverage(max(w * h for w, h in sizes), shown_share(scene.points, scene.training_views))
 

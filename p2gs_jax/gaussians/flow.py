@@ -82,7 +82,7 @@ def _geometry(a: MatchImage, b: MatchImage) -> _Geometry:
 
 
 def guide(frame: MatchImage, points: Float[np.ndarray, "p 3"]) -> Float32[np.ndarray, "h w"]:
-    """Return inverse depth, interpolated between points that the view sees, for the initial flow."""
+    """Return inverse depth interpolated between the view's points, for the initial flow."""
     height, width = frame.luminance.shape
     xy, z = frame.project(points)
     if not len(z):
@@ -222,7 +222,7 @@ def _fuse(inverse, precision):
 
 
 def plane_fit(inverse: Float[np.ndarray, "h w"], valid: Bool[np.ndarray, "h w"]):
-    """Fit a plane to the valid inverse depths around every pixel; inverse depth is linear on planes.
+    """Fit a plane to the valid inverse depths around every pixel, which are linear on planes.
 
     Returns:
         Inverse depth of the plane at the pixel, its slope per pixel [h w 2], whether the window

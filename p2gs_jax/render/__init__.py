@@ -25,12 +25,13 @@ def render_linear(
 ) -> Render:
     """Render linear HDR radiance of one view (paper, eq. 3).
 
-    A render whose `overflow` is set must be discarded and the `capacity` of the tile lists grown,
-    see `required_capacity`. `owner` is the moving object of each Gaussian (`Population.owner`);
-    `active_degree` is the highest spherical-harmonics degree in use, None for all.
+    `capacity` is the length of the tile list (`required_capacity`). If `overflow` is set, discard
+    the render and grow the capacity. `owner` is the moving object of each Gaussian
+    (`Population.owner`); `active_degree` is the highest spherical-harmonics degree in use, None for
+    all.
     """
     if gaussians.capacity == 0:
-        return _nothing(camera, cfg, with_depth)
+        return _empty_render(camera, cfg, with_depth)
     gaussians = at_time(gaussians, camera.objects)
     of_each = camera_of_each(camera, owner)
     splats = project(gaussians, alive, of_each, cfg)
@@ -47,7 +48,7 @@ def render_splats(
     *,
     with_depth: bool = True,
 ) -> Render:
-    """Render Gaussians that are projected already; see `render_linear`."""
+    """Render Gaussians that are already projected; see `render_linear`."""
     size, tiles = (camera.width, camera.height), None
     count, overflow = jnp.int32(0), jnp.array(False)
     if cfg.implementation != "reference":
@@ -65,7 +66,7 @@ def required_capacity(
     cfg: RenderConfig,
     owner: Int[Array, " n"] | None = None,
 ) -> Int[Array, ""]:
-    """Return the exact tile-list capacity one view needs; arguments as of `render_linear`."""
+    """Return the exact tile-list capacity that a view needs; for arguments see `render_linear`."""
     if gaussians.capacity == 0:
         return jnp.int32(0)
     gaussians = at_time(gaussians, camera.objects)
@@ -77,13 +78,13 @@ def required_capacity(
 def _over_background(
     linear: Float[Array, "h w 3"], alpha: Float[Array, "h w"], cfg: RenderConfig
 ) -> Float[Array, "h w 3"]:
-    """Return radiance with that of the background, where it shows through."""
+    """Return radiance composited over the background of `cfg`, if there is one."""
     if cfg.background is None:
         return linear
     return linear + (1 - alpha)[..., None] * jnp.asarray(cfg.background, linear.dtype)
 
 
-def _nothing(camera: Camera, cfg: RenderConfig, with_depth: bool) -> Render:
+def _empty_render(camera: Camera, cfg: RenderConfig, with_depth: bool) -> Render:
     blank = jnp.zeros((camera.height, camera.width))
     linear = _over_background(jnp.zeros((*blank.shape, 3)), blank, cfg)
     rest = jnp.int32(0), jnp.array(False), jnp.zeros(0, bool)

@@ -1,9 +1,10 @@
-"""Binning: which Gaussians each tile composites, in depth order, without a per-tile cap.
+"""Binning: the Gaussians that each tile composites, in depth order, without a per-tile cap.
 
-No gradients flow here. Two ways: by counting (binning_cpu.py), sequential and linear, for CPUs; by
-sorting (here), data-parallel, for everything else. `RenderConfig.binning` None takes the device's.
+Binning has no gradients. There are two methods: counting (binning_cpu.py), sequential and linear,
+for CPUs; and sorting (here), data-parallel, for other devices. If `RenderConfig.binning` is None,
+the device decides.
 
-Sorts have one unsigned key and one value of 32 bits, which XLA gives to CUB's radix sort on GPUs.
+Sorts use one unsigned key and one 32-bit value, for which XLA calls CUB's radix sort on GPUs.
 """
 
 from __future__ import annotations
@@ -30,9 +31,9 @@ def bin_tiles(
 ) -> TileList:
     """List the Gaussians of every tile in depth order.
 
-    A tile gets a Gaussian only if its ellipse at the alpha cutoff reaches a pixel centre of it. The
-    list holds `capacity` entries, see `count_entries`; if `overflow` is set it is incomplete and
-    must not be composited.
+    A tile lists a Gaussian only if its ellipse at the alpha cutoff reaches a pixel centre of the
+    tile. The tile list holds `capacity` entries, see `count_entries`. If `overflow` is set, it is
+    incomplete and must not be composited.
     """
     return _choose(binning_cpu.bin_tiles, _bin_by_sorting, splats, cfg, width, height, capacity)
 
@@ -45,24 +46,24 @@ def _choose(counting, sorting, splats: Splats2D, cfg: RenderConfig, *static):
 
 
 def longest_first(lengths: Int[Array, " n"]) -> Int[Array, " n"]:
-    """Return the indices of lengths, largest first; of very long ones the index decides."""
+    """Return the indices of lengths, longest first; very long ones are ordered by index."""
     bits = bits_for(lengths.shape[0])
     limit = 2 ** (32 - bits) - 1
     key = jnp.uint32(limit) - jnp.minimum(lengths, limit).astype(jnp.uint32)
-    # The index travels in the low bits: one operand sorts five times faster on CPUs.
+    # The low bits hold the index, because a single operand sorts 5 times faster on CPUs.
     key = lax.sort(key << bits | jnp.arange(lengths.shape[0], dtype=jnp.uint32), is_stable=False)
     return (key & jnp.uint32(2**bits - 1)).astype(jnp.int32)
 
 
 def depth_order(depths: Float[Array, " n"], visible: Bool[Array, " n"]) -> Int[Array, " n"]:
-    """Return a stable argsort of positive depths, invisible ones last."""
+    """Return a stable argsort of positive depths, with invisible Gaussians last."""
     key, _ = depth_keys(depths, visible)
     index = jnp.arange(depths.shape[0], dtype=jnp.int32)
     return lax.sort((key, index), num_keys=1, is_stable=True)[1]
 
 
 def _extents(splats: Splats2D, width: int, height: int, cfg: RenderConfig):
-    """Return (boxes, x0, y0, tiles across, entries): the tiles of each bounding box."""
+    """Return (boxes, first tile column, first tile row, tiles across, entries) of each splat."""
     box = boxes(splats, width, height, cfg)
     tile_x, tile_y = cfg.tile
     x0, y0 = box.first[:, 0] // tile_x, box.first[:, 1] // tile_y
@@ -72,20 +73,20 @@ def _extents(splats: Splats2D, width: int, height: int, cfg: RenderConfig):
 
 
 def _too_many(entries: Int[Array, " n"]) -> Bool[Array, ""]:
-    """Return whether the sum of `entries` leaves int32."""
+    """Return whether the sum of `entries` may exceed 2^30."""
     return jnp.sum(entries.astype(jnp.float32)) > 2.0**30
 
 
 def _count_by_sorting(
     splats: Splats2D, width: int, height: int, cfg: RenderConfig
 ) -> Int[Array, ""]:
-    """Return the tiles of all bounding boxes."""
+    """Return the number of tiles of all bounding boxes."""
     entries = _extents(splats, width, height, cfg)[-1]
     return jnp.where(_too_many(entries), 2**30, jnp.sum(entries))
 
 
 def _smallest_exponent(factor, left, right, top, bottom):
-    """Return the smallest |factor (x, y)|^2 over rectangles."""
+    """Return the smallest |factor (x, y)|^2 over each rectangle."""
     a11, a12, a22 = factor
     A, B, C = a11 * a11, a11 * a12, a12 * a12 + a22 * a22
 
@@ -109,7 +110,7 @@ def _bin_by_sorting(
     box, x0, y0, across, entries = _extents(splats, width, height, cfg)
     order = depth_order(splats.depths, box.visible)
 
-    # Expand boxes into entries, in depth order: a scatter of starts and a running maximum.
+    # Boxes are expanded into entries in depth order: a scatter of starts and a running maximum.
     ends = jnp.cumsum(entries[order])
     starts = ends - entries[order]
     count = jnp.where(_too_many(entries), 2**30, ends[-1])
@@ -135,7 +136,7 @@ def _bin_by_sorting(
     down = jnp.floor((nth + 0.5) / across_)
     col, line = x0_ + nth - down * across_, y0_ + down
 
-    # The tile's rectangle of pixel centres, about the splat's centre.
+    # The tile's rectangle of pixel centres, relative to the splat's centre.
     half_x, half_y = (tile_x - 1) / 2, (tile_y - 1) / 2
     dx, dy = col * tile_x + tile_x / 2 - mean_x, line * tile_y + tile_y / 2 - mean_y
     edges = dx - half_x, dx + half_x, dy - half_y, dy + half_y
@@ -143,7 +144,7 @@ def _bin_by_sorting(
     keep = (position < count) & (0.5 * smallest <= reach + 1e-4)
     tile_id = jnp.where(keep, (line * across_tiles + col).astype(jnp.int32), tile_count)
 
-    # Entries are in depth order already. Keys of 16 bits take half the passes of a radix sort.
+    # Entries are already in depth order. 16-bit keys need half the passes of a radix sort.
     kind = jnp.uint16 if tile_count < 2**16 else jnp.uint32
     tiles, sorted_ids = lax.sort((tile_id.astype(kind), ids), num_keys=1, is_stable=True)
     edges = jnp.arange(tile_count + 1, dtype=kind)

@@ -1,9 +1,9 @@
-"""Binning by counting: linear time, exact, on loops that XLA's CPU backend compiles whole.
+"""Binning by counting: linear time, exact, with loops that XLA's CPU backend compiles whole.
 
-A radix sort of the depths; then, from front to back, splats are expanded into the rows of tiles
-they touch and rows into tiles; then a counting sort by tile. The columns that an ellipse covers in
-a row of tiles are solved in closed form, so that the list holds exactly what is composited. Time
-depends on what a view needs, not on the capacity of its list.
+The steps are a radix sort of the depths; an expansion, from front to back, of splats into the rows
+of tiles that they touch, and of rows into tiles; and a counting sort by tile. The columns that an
+ellipse covers in a row of tiles follow in closed form, so that the list holds no needless entries.
+Time depends on the entries of a view, not on the capacity of its list.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from p2gs_jax.types import Splats2D, TileList
 DIGIT_BITS = 13
 # Elements written at once: one vector register.
 WRITES = 8
-# Counts saturate here, within int32.
+# Counts saturate at this number, within int32.
 MOST_ENTRIES = 2**30
-# Keeps splats that rounding alone would put below the cutoff.
+# Margin that keeps splats which only rounding puts below the cutoff.
 REACH_MARGIN = 1e-4
-# Rows of tiles solved at once.
+# Number of rows of tiles that are solved together.
 ROWS = 8192
 
 
 class Boxes(NamedTuple):
-    """Boxes where splats stay above the cutoff: first and last columns and rows, pixels.
+    """Bounding boxes of splats above the cutoff: first and last pixel columns and rows.
 
-    A splat is visible if it reaches at least one pixel centre's row and column; `reach` is
-    log(opacity / cutoff), the exponent at which it falls below the cutoff.
+    A splat is visible if its box contains a pixel centre. `reach` is log(opacity / cutoff), the
+    exponent at which alpha falls below the cutoff.
     """
 
     visible: Bool[Array, " n"]
@@ -50,7 +50,7 @@ def grid_size(width: int, height: int, tile: tuple[int, int]) -> tuple[int, int]
 
 
 def bits_for(count: int) -> int:
-    """Return how many bits tell `count` things apart (at least one)."""
+    """Return the number of bits that distinguish `count` values, at least 1."""
     return max(1, int(count - 1).bit_length())
 
 
@@ -59,7 +59,7 @@ def boxes(splats: Splats2D, width: int, height: int, cfg: RenderConfig) -> Boxes
     reach = splats.log_opacities - float(np.log(cfg.alpha_cutoff))
     radius = jnp.sqrt(2 * jnp.maximum(reach, 0.0))[:, None] * jnp.sqrt(splats.cov_diagonal)
     size = jnp.array([width, height], jnp.float32)
-    # Pixel centres sit at +0.5: the first and last centres inside the box.
+    # First and last pixel centres inside the box; centres are at +0.5.
     first = jnp.clip(jnp.ceil(splats.means2d - radius - 0.5), 0, size).astype(jnp.int32)
     last = jnp.clip(jnp.floor(splats.means2d + radius - 0.5), -1, size - 1).astype(jnp.int32)
     visible = splats.visible & (reach > 0) & jnp.all(last >= first, -1)
@@ -69,8 +69,8 @@ def boxes(splats: Splats2D, width: int, height: int, cfg: RenderConfig) -> Boxes
 def depth_keys(depths: Float[Array, " n"], visible: Bool[Array, " n"]):
     """Return (keys, span): unsigned integers that order positive depths, invisible ones last.
 
-    Bits of positive floats order as the floats do; the smallest visible one is subtracted so that
-    few bits are left to sort. `span` is the largest key.
+    The bits of positive floats have the order of the floats. The smallest visible key is
+    subtracted, so that fewer bits need sorting. `span` is the largest key.
     """
     bits = jnp.asarray(depths.astype(jnp.float32)).view(jnp.uint32)
     low = jnp.min(jnp.where(visible, bits, jnp.uint32(0xFFFFFFFF)))
@@ -89,7 +89,7 @@ def _put(a, value, i):
 
 @compiled_loop
 def _histogram(keys, blank, used):
-    """Return how often every value occurs among keys[:used], added to `blank`."""
+    """Return `blank` plus the number of times that each value occurs in keys[:used]."""
 
     def body(i, counts):
         key = _at(keys, i)
@@ -100,12 +100,12 @@ def _histogram(keys, blank, used):
 
 @compiled_loop
 def _place(keys, rows, values, starts, used):
-    """Return values[rows[:used]] in stable order of their keys; `starts`: where each key begins."""
+    """Return values[rows[:used]] stably sorted by key; `starts` is the first place of each key."""
 
     def body(i, state):
         cursor, out = state
         key = _at(keys, i)
-        # Reading the cursor back after its update spares XLA a copy of the whole array.
+        # Reading the cursor after its update saves XLA a copy of the whole array.
         cursor = _put(cursor, _at(cursor, key) + 1, key)
         return cursor, _put(out, _at(values, _at(rows, i)), _at(cursor, key) - 1)
 
@@ -114,7 +114,7 @@ def _place(keys, rows, values, starts, used):
 
 @compiled_loop
 def _place_indirect(digits, order, starts):
-    """Return `order` stably sorted by the digits of the things it lists."""
+    """Return `order` stably sorted by the digits of the elements that it lists."""
 
     def body(i, state):
         cursor, out = state
@@ -127,7 +127,7 @@ def _place_indirect(digits, order, starts):
 
 
 def depth_order(depths: Float[Array, " n"], visible: Bool[Array, " n"]) -> Int[Array, " n"]:
-    """Return a stable argsort of positive float32 depths, invisible ones last. Always exact."""
+    """Return an exact, stable argsort of positive float32 depths, with invisible ones last."""
     keys, span = depth_keys(depths, visible)
     order = jnp.arange(depths.shape[0], dtype=jnp.int32)
     for shift in range(0, 32, DIGIT_BITS):
@@ -145,11 +145,11 @@ def depth_order(depths: Float[Array, " n"], visible: Bool[Array, " n"]) -> Int[A
 
 
 def _expand(firsts, lengths, used, capacity: int):
-    """Expand ranges: range i gives the values firsts[i], firsts[i] + 1, ... (lengths[i] of them).
+    """Expand ranges: range i gives `lengths[i]` values firsts[i], firsts[i] + 1, ...
 
     Returns:
-        The number of values, up to MOST_ENTRIES; the first `capacity` of them; and the range of
-        each. Both arrays have room for one more write.
+        The number of values, up to MOST_ENTRIES; the first `capacity` values; and the range of
+        each. Both arrays are longer than `capacity` by one write.
     """
 
     @compiled_loop
@@ -162,8 +162,8 @@ def _expand(firsts, lengths, used, capacity: int):
                 k, values, owners = state
                 here = first + k + lax.iota(jnp.int32, WRITES)
                 values = lax.dynamic_update_slice(values, here, (count + k,))
-                mine = jnp.broadcast_to(i, (WRITES,))
-                return k + WRITES, values, lax.dynamic_update_slice(owners, mine, (count + k,))
+                range_id = jnp.broadcast_to(i, (WRITES,))
+                return k + WRITES, values, lax.dynamic_update_slice(owners, range_id, (count + k,))
 
             _, values, owners = lax.while_loop(
                 lambda s: (s[0] < length) & (count + s[0] < capacity),
@@ -179,10 +179,10 @@ def _expand(firsts, lengths, used, capacity: int):
 
 
 class _Ellipses(NamedTuple):
-    """The outlines of splats at their cutoffs, pixels.
+    """The outlines of splats at the alpha cutoff, pixels.
 
-    At height dy above its centre an ellipse spans slope dy +- half_width sqrt(1 - (curvature
-    dy)^2); it is widest to the right at dy = peak and reaches +-extent.
+    At height dy from its centre an ellipse spans slope dy +- half_width sqrt(1 - (curvature dy)^2).
+    Its rightmost point is at dy = peak; dy is in [-extent, extent].
     """
 
     x: Float[Array, " n"]
@@ -213,8 +213,8 @@ def _ellipses(splats: Splats2D, box: Boxes) -> _Ellipses:
 def _span(e: _Ellipses, row: Int[Array, " m"], width: int, tile: tuple[int, int]):
     """Return (first tile column, number of tiles) that each ellipse covers in a row of tiles.
 
-    A tile is covered if the ellipse reaches one of its columns of pixel centres within the row's
-    first and last line of them.
+    A tile is covered if the ellipse reaches one of its columns of pixel centres between the first
+    and the last line of pixel centres of the row.
     """
     tile_x, tile_y = tile
     top = jnp.maximum(row * tile_y + 0.5 - e.y, -e.extent)
@@ -241,12 +241,12 @@ def _tile_rows(box: Boxes, tile_y: int):
 
 
 def _of_image(row: Int[Array, " m"]) -> Int[Array, " m"]:
-    """Return which rows of the image's tiles the rows of this core are."""
+    """Return the row of tiles in the image for each row of this core."""
     return row * cores() + this_core() if cores() > 1 else row
 
 
 def count_entries(splats: Splats2D, width: int, height: int, cfg: RenderConfig) -> Int[Array, ""]:
-    """Return the tile-list capacity this view needs: rows or entries, whichever are more."""
+    """Return the tile-list capacity that a view needs: the larger count of rows and entries."""
     box = boxes(splats, width, height, cfg)
     ellipses = _ellipses(splats, box)
     first, rows = _tile_rows(box, cfg.tile[1])
@@ -264,7 +264,7 @@ def count_entries(splats: Splats2D, width: int, height: int, cfg: RenderConfig) 
 def bin_tiles(
     splats: Splats2D, width: int, height: int, capacity: int, cfg: RenderConfig
 ) -> TileList:
-    """Return the lists, see `p2gs_jax.render.binning.bin_tiles`."""
+    """Return the tile list; see `p2gs_jax.render.binning.bin_tiles`."""
     across, down = grid_size(width, height, cfg.tile)
     tile_count = across * -(-down // cores())
     box = boxes(splats, width, height, cfg)
@@ -280,7 +280,7 @@ def bin_tiles(
     )
     entries, tiles, row_of = _expand(row * across + first, lengths, used_rows, capacity)
     used = jnp.minimum(entries, capacity)
-    # One value more than there are tiles: XLA dissolves the counting of a single one and aborts.
+    # One count more than tiles, because XLA inlines the counting of a single value and aborts.
     counts = _histogram(tiles, jnp.zeros(tile_count + 1, jnp.int32), used)
     ends = jnp.cumsum(counts)
     offsets = jnp.concatenate([jnp.zeros(1, jnp.int32), ends[:tile_count]])
@@ -290,10 +290,10 @@ def bin_tiles(
 
 
 def _solve_rows(row, owner, order, ellipses: _Ellipses, used, width: int, tile: tuple[int, int]):
-    """Return (Gaussian, first tile column, number of tiles) of every row of tiles, block by block.
+    """Return (Gaussian, first tile column, number of tiles) for every splat and row of tiles.
 
-    `row` are the `used` rows of tiles that splats touch; `owner` whose they are, as places in
-    `order`, which lists the splats from front to back.
+    `row` holds the `used` rows of tiles that splats touch. `owner` is the splat of each, as an
+    index into `order`, which lists the splats from front to back.
     """
     size = min(ROWS, row.shape[0])
     table = jnp.stack(ellipses, -1)
@@ -302,8 +302,8 @@ def _solve_rows(row, owner, order, ellipses: _Ellipses, used, width: int, tile: 
         here = (k * size,)
         ids = order[lax.dynamic_slice(owner, here, (size,))]
         block = table.at[ids].get(mode="promise_in_bounds")
-        mine = _Ellipses(*(block[:, i] for i in range(len(_Ellipses._fields))))
-        first, lengths = _span(mine, _of_image(lax.dynamic_slice(row, here, (size,))), width, tile)
+        part = _Ellipses(*(block[:, i] for i in range(len(_Ellipses._fields))))
+        first, lengths = _span(part, _of_image(lax.dynamic_slice(row, here, (size,))), width, tile)
         return tuple(
             lax.dynamic_update_slice(a, b, here)
             for a, b in zip(state, (ids, first, lengths), strict=True)

@@ -1,9 +1,9 @@
 """One view divided over the cores of a CPU, each a device of JAX (docs/scaling.md).
 
-A program that `jax.shard_map` divides along the axis `CORES` is traced once for all cores. Where
-it is, the rasterizer composites every N-th row of tiles on each core, SSIM takes a strip of the
-image, and both give every core the whole result. Everywhere else there is one core, and nothing
-here leaves anything in a program.
+A program that `jax.shard_map` divides along the axis `CORES` is traced once for all N cores. In
+such a program, each core composites every N-th row of tiles and computes SSIM on a strip of the
+image; then all cores get the whole result. In other programs there is one core, and these functions
+add nothing to the program.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ Tree = TypeVar("Tree")
 
 
 def cores() -> int:
-    """Return the number of cores that the program being traced is divided over."""
+    """Return the number of cores over which the traced program is divided."""
     return jax.sharding.get_abstract_mesh().shape.get(CORES, 1)
 
 
 def this_core() -> Int[Array, ""] | int:
-    """Return the number of the core, from 0."""
+    """Return the index of the core, from 0."""
     return lax.axis_index(CORES) if cores() > 1 else 0
 
 
 def gather(tree: Tree, axis: int = 0) -> Tree:
-    """Return arrays of all cores, one after the other along an axis."""
+    """Return the arrays of all cores, concatenated along an axis."""
     if cores() == 1:
         return tree
     return jax.tree.map(lambda a: lax.all_gather(a, CORES, axis=axis, tiled=True), tree)
@@ -43,7 +43,7 @@ def scatter_sum(tree: Tree) -> Tree:
 
 
 def part(a: Array) -> Array:
-    """Return the core's part of an array that all cores have, along the first axis."""
+    """Return the core's part, along the first axis, of an array that is equal on all cores."""
     size = a.shape[0] // cores()
     return lax.dynamic_slice_in_dim(a, this_core() * size, size)
 
@@ -54,21 +54,21 @@ def total(a: Array) -> Array:
 
 
 def most(count: Int[Array, ""]) -> Int[Array, ""]:
-    """Return as many times the largest count of a core as there are cores."""
+    """Return the largest count of a core times the number of cores."""
     return lax.pmax(count, CORES) * cores() if cores() > 1 else count
 
 
 def all_true(flags: Bool[Array, "..."]) -> Bool[Array, "..."]:
-    """Return which flags are set on every core."""
+    """Return the flags that are set on every core."""
     return lax.pmin(flags.astype(jnp.int32), CORES) > 0 if cores() > 1 else flags
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
 def gather_rows(tiles: Float[Array, "t p"], across: int) -> Float[Array, "a p"]:
-    """Return the tiles of all cores in the order of the image; core k has rows k, k + N, ... of it.
+    """Return the tiles of all cores in the order of the image; core k has its rows k, k + N, ...
 
-    `across` is the number of tiles of a row. What follows is done by every core alike, so that each
-    knows its whole gradient and takes its rows of it.
+    `across` is the number of tiles of a row. All cores do the same work after this, so each knows
+    the whole gradient, and the backward pass selects its rows.
     """
     if cores() == 1:
         return tiles
@@ -82,8 +82,8 @@ def _gather_rows_fwd(tiles, across: int):
 
 def _gather_rows_bwd(across: int, _, v_tiles):
     rows = v_tiles.reshape(-1, cores(), across, v_tiles.shape[-1])
-    mine = lax.dynamic_index_in_dim(rows, this_core(), 1, keepdims=False)
-    return (mine.reshape(-1, v_tiles.shape[-1]),)
+    of_core = lax.dynamic_index_in_dim(rows, this_core(), 1, keepdims=False)
+    return (of_core.reshape(-1, v_tiles.shape[-1]),)
 
 
 gather_rows.defvjp(_gather_rows_fwd, _gather_rows_bwd)

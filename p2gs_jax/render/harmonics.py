@@ -32,7 +32,7 @@ Directions = tuple[Axis, Axis, Axis]
 
 
 def coefficient_count(degree: int) -> int:
-    """Return (degree + 1)^2."""
+    """Return (degree + 1)^2, the number of coefficients up to a degree."""
     return (degree + 1) ** 2
 
 
@@ -44,7 +44,7 @@ def degree_of(count: int) -> int:
     """
     degree = {coefficient_count(d): d for d in range(MAX_DEGREE + 1)}.get(count)
     if degree is None:
-        raise ValueError(f"{count} spherical-harmonics coefficients belong to no degree up to 3")
+        raise ValueError(f"{count} is not a valid number of spherical-harmonics coefficients")
     return degree
 
 
@@ -111,10 +111,10 @@ def evaluate(
     directions: Directions,
     active_degree: Int[Array, ""] | int | None = None,
 ) -> Float[Array, "n 3"]:
-    """Return the values of K = (degree + 1)^2 coefficients in unit directions, before activation.
+    """Return the sums of K = (degree + 1)^2 harmonics in unit directions, before activation.
 
-    Directions are x, y and z from the camera to the Gaussians, world axes. Coefficients above
-    `active_degree` are ignored; it is traced, so that raising it does not recompile.
+    Directions are x, y and z from the camera to the Gaussians, along world axes. Coefficients above
+    `active_degree` are ignored; it is traced, so that a change needs no compilation.
     """
     degree = degree_of(sh.shape[1])
     columns = basis(directions, degree)
@@ -128,9 +128,9 @@ def evaluate(
 
 
 def radiance_activation(value: Values, kind: RadianceKind) -> Values:
-    """Return radiance >= 0 of sums of spherical harmonics.
+    """Return radiance >= 0 from sums of spherical harmonics.
 
-    `exp` takes them for log radiance, clipped to +-30; `linear` is max(0, value + 1/2), as 3DGS
+    `exp` treats a sum as log radiance, clipped to +-30; `linear` is max(0, value + 1/2), as in 3DGS
     and the paper.
     """
     xp = namespace(value)
@@ -149,16 +149,16 @@ def radiance_preactivation(radiance: Values, kind: RadianceKind) -> Values:
 def scaled(
     sh: Float[np.ndarray, "n k 3"], log_scales: Float[np.ndarray, "..."], kind: RadianceKind
 ) -> Float[np.ndarray, "n k 3"]:
-    """Return coefficients whose radiance is larger by factors, exactly.
+    """Return coefficients whose radiance is multiplied by factors, exactly.
 
-    `log_scales` are the natural logarithms of the factors: of the channels (3,), of Gaussians (n,
-    1), or of both (n, 3).
+    `log_scales` are the natural logarithms of the factors: per channel (3,), per Gaussian (n, 1),
+    or both (n, 3).
     """
     sh = np.array(sh)
     if kind == "exp":
         sh[:, 0] += log_scales / C0
     else:
-        # radiance = value + 1/2: the half must grow with the rest.
+        # radiance = value + 1/2, so the constant 1/2 must be scaled, too.
         factors = np.exp(log_scales)
         sh *= np.expand_dims(factors, -2)
         sh[:, 0] += (factors - 1) * 0.5 / C0

@@ -1,18 +1,19 @@
-"""From 3D Gaussians, moving ones among them, to 2D splats and their radiance in one view.
+"""Projection of 3D Gaussians, static or moving, to 2D splats and their radiance in one view.
 
-The local affine approximation of EWA splatting. What is around it concerns drives:
+Splats use the local affine approximation of EWA splatting. Drives add two kinds of motion:
 
 Moving objects. Gaussians stay in the frame of their box, and the camera moves: a Gaussian of an
-object is projected with the view matrix from that object's box to the camera, and nothing else in
-the renderer knows of objects.
+object is projected with the view matrix from that object's box to the camera. No other part of the
+renderer depends on objects.
 
-Vibration (PVG, arXiv 2311.18561, section 3.2). Gaussians may come, move and go:
+Vibration (PVG, arXiv 2311.18561, section 3.2). Gaussians may appear, move and disappear:
 
     mean(t)    = mean + velocity sin(2 pi (t - peak) / cycle) cycle / (2 pi) still(life)
     opacity(t) = opacity exp(-(t - peak)^2 / (2 life^2))
 
-`still` = exp(-life / (2 cycle)) is how PVG tells what moves from what stands; there it scales the
-velocity that is shown, here the motion itself, so that what lives long stands exactly (ours).
+PVG separates moving from static Gaussians by `still` = exp(-life / (2 cycle)). There it scales the
+displayed velocity; here it scales the motion itself, so that Gaussians of a long life do not move
+(ours).
 """
 
 from __future__ import annotations
@@ -38,23 +39,23 @@ AnyCamera = TypeVar("AnyCamera", bound=Camera | Frustum)
 INVISIBLE_LOG_OPACITY = -100.0
 # Outside this range float32 products of scales and focal lengths leave the normal numbers.
 LOG_SCALE_RANGE = (-16.0, 9.0)
-# Beyond this many half images from the axis the affine approximation is evaluated at the border.
+# The affine approximation is evaluated at most this many half image sizes from the axis.
 TANGENT_LIMIT = 1.3
-# The view matrix of objects that are not there: every point is behind the camera.
+# View matrix of objects that are absent from a view: every point is behind the camera.
 HIDDEN = np.array([[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, -1], [0, 0, 0, 1]], np.float32)
-# Seconds of a vibration (PVG: ten photographs, at ten a second).
+# Cycle of a vibration, seconds (PVG: 10 photographs at 10 Hz).
 CYCLE = 1.0
-# Life of what stands still, seconds: its opacity is that of all times, and no gradient reaches it.
+# Life of static Gaussians, seconds: their opacity is constant, and the life gets no gradient.
 STILL = math.exp(30.0)
-# Log opacities of what vibrates stay within these, so that their logits are finite.
+# Log opacities of vibrating Gaussians stay within these bounds, so that their logits are finite.
 FAINTEST, MOST_OPAQUE = -30.0, -1e-6
 
 
 def at_time(gaussians: Gaussians, objects: Placement | None) -> Gaussians:
-    """Return Gaussians as they are at the time of a view; as they were given if none vibrates.
+    """Return the Gaussians at the time of a view; unchanged if none vibrates.
 
-    `objects` are the view's, with its time; without one, it is the middle of the drive. NumPy
-    arrays give NumPy results.
+    `objects` holds the time of the view; None means the middle of the drive. NumPy arrays give
+    NumPy results.
     """
     moves = gaussians.vibration
     if moves is None:
@@ -63,10 +64,10 @@ def at_time(gaussians: Gaussians, objects: Placement | None) -> Gaussians:
     t: Float[Array, ""] | np.ndarray = np.zeros((), np.float32) if time is None else time
     xp = namespace(gaussians.means, t)
     life = xp.exp(moves.log_lives)
-    away = t - moves.peaks
-    swing = xp.sin(away * (2 * math.pi / CYCLE)) * (CYCLE / (2 * math.pi))
+    since_peak = t - moves.peaks
+    swing = xp.sin(since_peak * (2 * math.pi / CYCLE)) * (CYCLE / (2 * math.pi))
     swing = swing * xp.exp(-life / (2 * CYCLE))
-    log_opacity = -xp.logaddexp(0.0, -gaussians.opacity_logits) - 0.5 * (away / life) ** 2
+    log_opacity = -xp.logaddexp(0.0, -gaussians.opacity_logits) - 0.5 * (since_peak / life) ** 2
     log_opacity = xp.clip(log_opacity, FAINTEST, MOST_OPAQUE)
     return dataclasses.replace(
         gaussians,
@@ -79,17 +80,17 @@ def at_time(gaussians: Gaussians, objects: Placement | None) -> Gaussians:
 def camera_of_each(camera: AnyCamera, owner: Int[Array | np.ndarray, " n"] | None) -> AnyCamera:
     """Return a camera with the view matrix of each Gaussian, along the last axis.
 
-    `owner` is the moving object that each Gaussian belongs to, -1: none; without it, the camera is
-    returned as it is. In a view without `objects`, none of them is there.
+    `owner` is the moving object of each Gaussian, -1: none; with None the camera is unchanged. In a
+    view without `objects`, all moving objects are hidden.
     """
     if owner is None:
         return camera
     xp = namespace(owner, camera.viewmat)
     objects = xp.asarray(HIDDEN)[None] if camera.objects is None else camera.objects.viewmats
-    # The world comes last, where -1 finds it.
+    # The view matrix of the world is last, so that index -1 selects it.
     stack = xp.concatenate([objects, camera.viewmat[None]])
     row = xp.minimum(owner, len(objects) - 1)
-    # An axis behind, so that each entry of the matrices is one vector.
+    # The axis of Gaussians is last, so that each entry of the matrices is one vector.
     return dataclasses.replace(camera, viewmat=xp.moveaxis(stack, 0, -1)[:, :, row], objects=None)
 
 
@@ -99,7 +100,7 @@ def rotation_matrices(quats: Float[Array, "n 4"]) -> list[list[Float[Array, " n"
     Quaternions are normalised first; a zero quaternion gives the identity.
     """
     raw = columns(quats)
-    # Dividing by the largest component first keeps the square in range, whatever the length.
+    # Dividing by the largest component first keeps the squares in range for any length.
     largest = jax.lax.stop_gradient(functools.reduce(jnp.maximum, [jnp.abs(c) for c in raw]))
     zero = largest < 1e-30
     raw = [c / jnp.where(zero, 1, largest) for c in raw]
@@ -113,7 +114,10 @@ def rotation_matrices(quats: Float[Array, "n 4"]) -> list[list[Float[Array, " n"
 
 
 def rotated(R: list[list[Float[Array, " n"]]], local: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """Return vectors along principal axes in world coordinates; R is from `rotation_matrices`."""
+    """Return vectors, given along principal axes, in world coordinates.
+
+    `R` is from `rotation_matrices`.
+    """
     return jnp.stack([sum(R[i][j] * local[:, j] for j in range(3)) for i in range(3)], -1)
 
 
@@ -122,10 +126,9 @@ def project(
 ) -> Splats2D:
     """Project Gaussians into a view.
 
-    Splats that are not alive, not in front of the near plane or not finite are invisible and have
-    zero gradients. The determinant of the 2D covariance is summed from squared minors
-    (Cauchy-Binet) rather than taken as a difference, so that needles keep a positive determinant in
-    float32.
+    Splats that are not alive, not beyond the near plane, or not finite are invisible and have zero
+    gradients. The determinant of the 2D covariance is a sum of squared minors (Cauchy-Binet)
+    instead of a difference, so that needles keep a positive determinant in float32.
     """
     R, t = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
     fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
@@ -186,7 +189,7 @@ def view_radiance(
     if camera.viewmat.ndim == 2:
         center = -matmul(camera.viewmat[:3, :3].T, camera.viewmat[:3, 3])
     else:
-        # The camera in the axes of each Gaussian.
+        # Camera centre in the frame of each Gaussian.
         R, t = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
         center = [-sum(R[i, k] * t[i] for i in range(3)) for k in range(3)]
     offset = [m - c for m, c in zip(columns(gaussians.means), center, strict=True)]

@@ -1,7 +1,7 @@
-"""`rasterization` with the names, shapes and meaning of gsplat, on our own kernel.
+"""`rasterization` with the names, shapes and meaning of gsplat, on the kernels of this package.
 
-After gsplat (Ye et al., arXiv 2409.06765), `gsplat/rendering.py`. Colours are linear radiance and
-are not clamped from above.
+The interface is that of `gsplat/rendering.py` (Ye et al., arXiv 2409.06765). Colours are linear
+radiance and are not clamped from above.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from p2gs_jax.render.harmonics import coefficient_count
 from p2gs_jax.types import Camera, Gaussians
 
 MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
-# Opacities are kept this far off 0 and 1, where their logits are infinite.
+# Opacities are clipped this far from 0 and 1, where logits are infinite.
 LEAST_OPACITY = 1e-7
 
 
@@ -49,19 +49,19 @@ def rasterization(
 
     Means, scales (standard deviations) and `near_plane`, before which nothing is visible, are in
     scene units; quats are w x y z, of any length; opacities are in [0, 1]. Colours are linear
-    radiance (n 3), or (c n 3) for each camera; with `sh_degree`, spherical harmonics (n k 3) of
-    radiance max(0, value + 1/2), of which those above the degree are ignored. View matrices go from
-    world to camera, OpenCV axes; `Ks` and the size are in pixels; `eps2d` is the variance added to
-    the 2D covariance, pixels^2; backgrounds are radiance, None is black. The mode is "RGB", "D"
-    (the sum of weights times z), "ED" (that over alpha), or both. The static `capacity` is the
-    number of entries of the tile lists; None measures it, which only works outside of `jax.jit`:
-    pass `meta["capacity"]` of such a call. All other options are in `cfg`.
+    radiance (n 3), or (c n 3) for each camera. With `sh_degree` they are spherical harmonics (n k
+    3) of radiance max(0, value + 1/2), and coefficients above the degree are ignored. View matrices
+    map world to camera, OpenCV axes; `Ks` and the size are in pixels. `eps2d` is the variance added
+    to the 2D covariance, pixels^2; backgrounds are radiance, None is black. The mode is "RGB", "D"
+    (the sum of weights times z), "ED" ("D" over alpha), or both. The static `capacity` is the
+    number of entries of the tile list. None measures it, which works only outside of `jax.jit`;
+    inside, pass `meta["capacity"]` of an earlier call. All other options are in `cfg`.
 
     Returns:
-        Colours with depth as their last channel, alphas, and by name: `means2d` (c n 2), `depths`
-        (c n), `radii` (c n 2: half the width and height of what lies above the alpha cutoff,
-        pixels, 0 for what is invisible), `entries` (c), `overflow` (c: the image is incomplete, as
-        it needs a longer tile list), `capacity`, `width` and `height`.
+        Colours with depth as their last channel, alphas, and a dictionary: `means2d` (c n 2),
+        `depths` (c n), `radii` (c n 2: half the width and height of a splat above the alpha cutoff,
+        pixels, 0 if invisible), `entries` (c), `overflow` (c: the image is incomplete and needs a
+        larger capacity), `capacity`, `width` and `height`.
 
     Raises:
         ValueError: the mode or a shape is not valid, or the capacity is missing inside `jax.jit`.
@@ -85,7 +85,7 @@ def rasterization(
 
 
 def _channels(rgb, alpha, depth, backgrounds, render_mode: str):
-    """Return the channels that a mode asks for."""
+    """Return the channels of a mode."""
     if backgrounds is not None:
         rgb = rgb + (1 - alpha) * backgrounds[:, None, None]
     parts = [rgb] if render_mode.startswith("RGB") else []
@@ -122,7 +122,7 @@ def _seen(gaussians, each, size, cfg: RenderConfig, sh_degree: int | None):
 
 @functools.partial(jax.jit, static_argnums=(4, 5, 6, 7, 8))
 def _render(gaussians, colors, viewmats, Ks, size, cfg, capacity, sh_degree, with_depth):
-    """Return radiance, alpha, depth (c h w) or None, and what is known of each camera."""
+    """Return radiance, alpha, depth (c h w) or None, and the dictionary of `rasterization`."""
 
     def one(each):
         camera, splats, color = _seen(gaussians, each, size, cfg, sh_degree)
@@ -143,7 +143,7 @@ def _render(gaussians, colors, viewmats, Ks, size, cfg, capacity, sh_degree, wit
 
 @functools.partial(jax.jit, static_argnums=(4, 5, 6))
 def _entries(gaussians, colors, viewmats, Ks, size, cfg, sh_degree):
-    """Return the entries that each camera needs."""
+    """Return the number of entries that each camera needs."""
 
     def one(each):
         camera, splats, _ = _seen(gaussians, each, size, cfg, sh_degree)
@@ -153,17 +153,17 @@ def _entries(gaussians, colors, viewmats, Ks, size, cfg, sh_degree):
 
 
 def _measured(arrays: tuple, size: tuple[int, int], cfg: RenderConfig, degree: int | None) -> int:
-    """Return the length of the tile lists that some cameras need, with some to spare.
+    """Return a capacity that fits these cameras, with a margin.
 
     Raises:
-        ValueError: the values are not known yet, inside `jax.jit`.
+        ValueError: the values are traced, inside `jax.jit`.
     """
     fixed: tuple = jax.lax.stop_gradient(arrays)
     try:
         needed = int(jnp.max(_entries(*fixed, size, cfg, degree)))
     except jax.errors.ConcretizationTypeError as error:
         raise ValueError(
-            "the capacity of the tile lists cannot be measured inside jax.jit: pass capacity=, "
-            'such as meta["capacity"] of a call outside of it'
+            "the capacity of the tile list cannot be measured inside jax.jit: pass capacity=, "
+            'such as meta["capacity"] of a call outside of jax.jit'
         ) from error
     return bucket(needed, PICTURES.first)

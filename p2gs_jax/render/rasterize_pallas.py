@@ -1,12 +1,12 @@
 """Tile compositing for NVIDIA GPUs through Pallas and Triton, forward and backward.
 
-One block of threads owns one tile and walks its list front to back; a thread owns a few pixels.
-Rows are read by all threads of a block from one address, `UNROLL` of them ahead of their use.
-Blocks are started longest lists first, so that no long one is left alone at the end.
+One block of threads owns one tile and walks its list front to back; each thread owns a few pixels.
+All threads of a block read the same row at a time; `UNROLL` rows are loaded before they are used.
+Tiles with long lists start first, so that no long list runs alone at the end.
 
-Backward. The same walk and the same moments as on the CPU (rasterize_xla.py). They are added to the
-Gaussian's gradient atomically or, where runs must repeat bit for bit, written per entry and summed
-per Gaussian in the order of the list.
+Backward. The walk and the moments are those of the CPU (rasterize_xla.py). The kernel adds each
+result to the Gaussian's gradient atomically. If runs must repeat bit for bit, it writes a gradient
+per entry, and a second kernel sums them per Gaussian in the order of the list.
 
 On a CPU the kernels are interpreted. Measurements: BUILD_NOTES, "The GPU kernel".
 """
@@ -25,21 +25,21 @@ from jax.experimental.pallas import triton as plt
 from p2gs_jax.render.binning import longest_first
 from p2gs_jax.render.tiles import DARKEST, GEOMETRY, Plan, geometry_gradient
 
-# Entries whose rows are loaded together, forward and backward; the stop rule is looked at once for
-# each such group (H200, 2026-11-26: fastest of 2, 4, 8).
+# Number of entries whose rows are loaded together, forward and backward. The stop rule is evaluated
+# once per group (H200, 2026-11-26: fastest of 2, 4, 8).
 UNROLL, UNROLL_BACK = 4, 2
-# Pixels per thread: sums over a tile cost a shuffle per halving of the threads, and nothing
-# within a thread. One warp per 128 pixels also needs no shared memory to sum.
+# Pixels per thread. A sum over a tile costs one shuffle per halving of the threads, but nothing
+# within a thread. With one warp per 128 pixels it also needs no shared memory.
 PIXELS_PER_THREAD = 4
-# Gradient columns, padded to what one vectorised atomic addition takes: eight together and the rest
-# singly took 0.8 ms more of 3.6.
+# Gradient columns, padded to the width of one vectorised atomic addition. One addition of 8 columns
+# and single ones for the rest took 0.8 ms more of 3.6 ms.
 COLUMNS = 16
-# Gaussians that one block of the ordered sum owns.
+# Number of Gaussians per block of the ordered sum.
 SUMMED = 32
 
 
 def exponent_scale(alpha_cutoff: float) -> float:
-    """Return ln 2: alpha = 2^e, the exponential that the hardware has."""
+    """Return ln 2: alpha = 2^e, because the hardware computes powers of two."""
     del alpha_cutoff
     return float(np.log(2.0))
 
@@ -53,7 +53,7 @@ def _parameters(pixels: int) -> plt.CompilerParams:
 
 
 class _Tile:
-    """The pixels of one tile, and an entry's values at them."""
+    """The pixels of one tile, and the values of an entry at them."""
 
     def __init__(self, tile, plan: Plan):
         self.plan = plan
@@ -65,7 +65,7 @@ class _Tile:
         self.y = (pixel // tile_x).astype(jnp.float32) - (tile_y - 1) / 2
 
     def load(self, rows_ref, ids_ref, position, end, count: int) -> list[list]:
-        """Return id and row of the next `count` entries, the dummy's beyond the end."""
+        """Return id and row of the next `count` entries; those of the dummy beyond the end."""
         ids = [
             jnp.where(
                 position + c < end, ids_ref[jnp.minimum(position + c, end - 1)], self.plan.gaussians
@@ -81,7 +81,7 @@ class _Tile:
         return a11 * dx + a12 * dy, a22 * dy, dx, dy
 
     def alpha(self, row, center):
-        """Return the opacities of one entry over the pixels."""
+        """Return the alphas of one entry at the pixels."""
         plan = self.plan
         a11, a12, a22, log_opacity = row[2:GEOMETRY]
         u = center[0] + a11 * self.x + a12 * self.y
@@ -123,7 +123,13 @@ def _forward_kernel(rows, ids, offsets, order, brightest, *outputs, plan: Plan):
 
 
 def forward(rows, ids, offsets, plan: Plan):
-    """Return the channels of the image and the transmittance, [T P] each, and the stops [T]."""
+    """Return the channels of the image and the transmittance, [T P] each, and the residuals.
+
+    The residuals are the offsets and the position where each tile stopped [T].
+
+    Raises:
+        ValueError: the number of pixels of a tile is not a power of two.
+    """
     if plan.pixels & (plan.pixels - 1):
         raise ValueError(
             "the pallas rasterizer needs tiles with a power of two of pixels, not "
@@ -152,7 +158,7 @@ def forward(rows, ids, offsets, plan: Plan):
 
 
 def _row(values):
-    """Return scalars as one vector, zeros behind them."""
+    """Return scalars as one vector, padded with zeros."""
     column, row = lax.broadcasted_iota(jnp.int32, (COLUMNS,), 0), jnp.zeros(COLUMNS, jnp.float32)
     for k, value in enumerate(values):
         row = jnp.where(column == k, value, row)
@@ -160,7 +166,7 @@ def _row(values):
 
 
 def _backward_kernel(rows, ids, offsets, stops, order, *arrays, plan: Plan):
-    """Walk a tile; `arrays` are the image, its gradient, the blank output and the output."""
+    """Walk a tile; `arrays` are the image, its gradient, the zeroed output and the output."""
     channels = plan.channels
     image, v_image = arrays[: channels + 1], arrays[channels + 1 : 2 * channels + 2]
     target = arrays[-1]
@@ -189,7 +195,7 @@ def _backward_kernel(rows, ids, offsets, stops, order, *arrays, plan: Plan):
             )
             values = _row(gradient)
             if plan.cfg.deterministic:
-                # Entries beyond the end write to the place behind the list.
+                # Entries beyond the end write to the extra row behind the list.
                 place = jnp.where(position + c < end, position + c, target.shape[0] - 1)
                 target[place, :] = values
             else:
@@ -201,7 +207,7 @@ def _backward_kernel(rows, ids, offsets, stops, order, *arrays, plan: Plan):
 
 
 def _sum_kernel(entries, places, runs, target):
-    """Sum the gradients of `SUMMED` Gaussians, each over its run of places in list order."""
+    """Sum the gradients of `SUMMED` Gaussians, each over its entries in list order."""
     first = pl.program_id(0) * SUMMED
 
     def gaussian(g, _):
@@ -218,7 +224,7 @@ def _sum_kernel(entries, places, runs, target):
 
 
 def _in_order(entries, ids, count: int):
-    """Return the sums of `entries` by Gaussian, always added in the order of the list."""
+    """Return the sums of `entries` per Gaussian, added in the order of the list."""
     places = jnp.argsort(ids, stable=True).astype(jnp.int32)
     blocks = -(-count // SUMMED)
     edges = jnp.arange(blocks * SUMMED + 1, dtype=ids.dtype)
@@ -234,7 +240,7 @@ def _in_order(entries, ids, count: int):
 
 
 def backward(rows, ids, residuals, image, v_image, plan: Plan):
-    """Return the gradient of the rows from those of the channels and transmittance."""
+    """Return the gradient by the rows from those by the channels and transmittance."""
     offsets, stops = residuals
     capacity, count = ids.shape[0], rows.shape[0]
     shape = (capacity + 1 if plan.cfg.deterministic else count, COLUMNS)

@@ -1,20 +1,21 @@
 """The lane queue: tile compositing in plain XLA, forward and backward, with no per-tile cap.
 
-B lanes each own one segment of a tile's list. Every iteration a lane composites the next C entries
-of its segment; when that ends, or all its pixels are opaque, it writes the result and takes the
-next segment, longest first. Long lists are cut (`cut`), so that all lanes are busy to the end,
-however uneven the lists (BUILD_NOTES, "Full lanes"). Compositing is associative: the segments of a
-tile are composited independently and merged, one of colour c and transmittance t in front of one of
-colour d giving c + t d. Work wasted on padding is bounded by C per tile.
+Each of B lanes owns one segment of a tile's list. In every iteration a lane composites the next C
+entries of its segment. When the segment ends, or all its pixels are opaque, the lane writes the
+result and gets the next segment, longest first. Long lists are cut into segments (`cut`), so that
+all lanes stay busy even if lists are uneven (BUILD_NOTES, "Full lanes"). Compositing is
+associative: the segments of a tile are composited independently and then merged. A segment of
+colour c and transmittance t before one of colour d gives c + t d. Padding wastes at most C entries
+per segment.
 
-The exponential is a polynomial on [-0.7, 0], squared as often as it takes to reach the cutoff
-(`exponent_scale`); rows are what tiles.py says.
+The exponential is a polynomial on [-0.7, 0], which is squared until its range reaches the cutoff
+(`exponent_scale`). tiles.py describes the rows.
 
-Backward. The same segments, front to back, each from the transmittance and light before it. With
-R the gradient-weighted light still to come, q = w (radiance . g) and R -= q after each entry, the
-gradient to the exponent of one entry is q - R alpha / (1 - alpha): no division by transmittance.
-The geometry gradients follow in closed form from six moments of it over the tile. Source and
-measurements: docs/architecture.md.
+Backward. The segments are walked again, front to back, from the transmittance and light before
+them. R is the gradient-weighted light behind an entry: q = w (radiance . g), and R -= q after each
+entry. The gradient by the exponent of an entry is q - R alpha / (1 - alpha), without a division by
+transmittance. The geometry gradients follow in closed form from its six moments over the tile.
+Source and measurements: docs/architecture.md.
 """
 
 from __future__ import annotations
@@ -32,19 +33,19 @@ from p2gs_jax.render.cores import cores, this_core
 from p2gs_jax.render.tiles import DARKEST, GEOMETRY, Plan, geometry_gradient
 from p2gs_jax.render.xla_cpu import compiled_loop, materialize
 
-# The backward pass has more overhead per iteration: more pixels in flight are faster.
+# The backward pass has more overhead per iteration, so more pixels in flight are faster.
 BACKWARD_LANE_FACTOR = 2
 PREFIX_GROUP = 8
-# A segment is as many chunks long as a lane's fair share over this. So there are at most as many
-# segments as tiles and this many times lanes: a static bound.
+# A segment is at most as long as a lane's fair share of the entries, divided by this number. The
+# number of segments has a static bound: tiles + SEGMENTS_PER_LANE * lanes.
 SEGMENTS_PER_LANE = 4
 
 
 class Segments(NamedTuple):
-    """Where each segment lies in the list of entries: its tile, its start, and the end behind it.
+    """The tile, start and end of each segment in the list of entries; the end is exclusive.
 
-    Slot t < T is the first segment of tile t. The slots after those hold all others, tile by tile
-    from front to back, `extra` of them; slots that are not needed are empty and come last.
+    Slot t < T is the first segment of tile t. The next `extra` slots hold the other segments, tile
+    by tile from front to back. The last slots are empty.
     """
 
     tiles: Int[Array, " s"]
@@ -54,7 +55,7 @@ class Segments(NamedTuple):
 
 
 def cut(offsets: Int[Array, " t1"], plan: Plan) -> Segments:
-    """Cut lists into segments; `offsets` are the start of every tile's list, and the last end."""
+    """Cut lists into segments; `offsets` are the starts of the tiles' lists, and the last end."""
     starts, ends = offsets[:-1], offsets[1:]
     most = SEGMENTS_PER_LANE * plan.lanes
     chunks = -((starts - ends) // plan.cfg.chunk)
@@ -62,7 +63,7 @@ def cut(offsets: Int[Array, " t1"], plan: Plan) -> Segments:
     more = jnp.maximum(-((starts - ends) // length) - 1, 0)
     last = jnp.cumsum(more)
     first = last - more
-    # The owner of an extra slot: the last tile whose extra slots begin at or before it.
+    # The owner of an extra slot is the last tile whose extra slots begin at or before it.
     tile = jnp.arange(plan.tile_count, dtype=jnp.int32)
     owner = jnp.zeros(most, jnp.int32).at[jnp.where(more > 0, first, most)].max(tile, mode="drop")
     owner = lax.cummax(owner)
@@ -82,10 +83,10 @@ def cut(offsets: Int[Array, " t1"], plan: Plan) -> Segments:
 def merge(
     composited: tuple[Float[Array, "s p"], ...], tiles: Int[Array, " e"], extra: Int[Array, ""]
 ) -> tuple[tuple[Float[Array, "t p"], ...], tuple[Float[Array, "e p"], ...]]:
-    """Return the channels and transmittance of every tile, and in front of each extra slot.
+    """Return the channels and transmittance of every tile, and those before each extra slot.
 
-    `composited` are the channels and, last, the transmittance of every slot; `tiles` are those of
-    extra slots, of which there are `extra`.
+    `composited` holds the channels and, last, the transmittance of every slot; `tiles` are the
+    tiles of the extra slots, of which `extra` are used.
     """
 
     def at(a, i):
@@ -96,7 +97,7 @@ def merge(
 
     count = composited[0].shape[0] - tiles.shape[0]
 
-    # The front is part of the loop's state: an array both read and written would be copied.
+    # The front is part of the loop's state, because XLA copies arrays that a loop reads and writes.
     def body(k, state):
         image, before, last, front = state
         tile = lax.dynamic_slice(tiles, (k,), (1,))[0]
@@ -117,10 +118,10 @@ def merge(
 
 
 class Queue(NamedTuple):
-    """Segments in the order in which lanes take them, longest first, then an empty slot per lane.
+    """Segments in the order in which lanes get them, longest first; then an empty slot per lane.
 
-    S slots hold segments; those from S on are empty: lanes wait there at the end. `work` slots
-    hold entries; `centers` are the middles of tiles, pixels.
+    The first S slots hold segments, and `work` of them are not empty. Lanes wait in the slots from
+    S on. `centers` are the tile centres, pixels.
     """
 
     order: Int[Array, " sb"]
@@ -132,7 +133,7 @@ class Queue(NamedTuple):
 
     @classmethod
     def build(cls, segments: Segments, ends: Array, plan: Plan) -> Queue:
-        """Queue the segments; `ends` is where each is composited to, at most its own end."""
+        """Queue the segments; `ends` is where compositing stops, at most the segment's end."""
         count, lanes, (tile_x, tile_y) = segments.starts.shape[0], plan.lanes, plan.cfg.tile
         lane = jnp.arange(lanes, dtype=jnp.int32)
         lengths = ends - segments.starts
@@ -155,22 +156,22 @@ class Queue(NamedTuple):
         return self.starts.shape[0] - self.lane.shape[0]
 
     def first(self):
-        """Return the slots that lanes begin with."""
+        """Return the first slot of each lane."""
         lane = self.lane
         return jnp.where(lane < self.work, self.order[: lane.shape[0]], self.slots + lane)
 
     def advance(self, turn, slot, position, done):
-        """Hand finished lanes their next slots; return (turn, slot, position)."""
+        """Assign the next slots to finished lanes; return (turn, slot, position)."""
         finished = done.astype(jnp.int32)
         total = jnp.cumsum(finished)
-        mine = turn + total - 1
-        new = jnp.where(done, self.order[jnp.minimum(mine, self.slots - 1)], slot)
-        new = jnp.where(done & (mine >= self.work), self.slots + self.lane, new)
+        rank = turn + total - 1
+        new = jnp.where(done, self.order[jnp.minimum(rank, self.slots - 1)], slot)
+        new = jnp.where(done & (rank >= self.work), self.slots + self.lane, new)
         return turn + total[-1], new, jnp.where(done, self.starts[new], position)
 
 
 def exponent_scale(alpha_cutoff: float) -> float:
-    """Return 2^s with s such that [-0.7, 0] times it reaches the log of the cutoff."""
+    """Return the least power of two, at least 8, such that -0.7 times it reaches log(cutoff)."""
     return float(2 ** max(3, int(np.ceil(np.log2(-np.log(alpha_cutoff) / 0.7)))))
 
 
@@ -189,9 +190,9 @@ def _scaled_exp(x: Array, plan: Plan) -> Array:
 
 
 class _Entries(NamedTuple):
-    """What a lane needs of its next C entries: gathered rows and their alphas.
+    """The next C entries of each lane: gathered rows and their alphas.
 
-    `center` has u, v and the offsets x and y from the mean at the tile's centre.
+    `center` holds u, v and the offsets x and y from the mean, at the tile's centre.
     """
 
     ids: Int[Array, "b c"]
@@ -227,17 +228,17 @@ def _padded(ids_list, plan: Plan):
 
 
 def _opaque(channels, transmittance, brightest, plan: Plan):
-    """Return whether what lies behind can be left out (RenderConfig.stop_error)."""
+    """Return whether entries behind can be left out (RenderConfig.stop_error)."""
     so_far = functools.reduce(jnp.maximum, channels[:3]) / brightest
     hidden = transmittance - (plan.cfg.stop_error or 0.0) * jnp.maximum(so_far, DARKEST)
     return jnp.max(hidden, -1) <= 0
 
 
 def forward(rows, ids_list, offsets, plan: Plan):
-    """Return the channels of the image and the transmittance, [T P] each, and what backward needs.
+    """Return the channels of the image and the transmittance, [T P] each, and the residuals.
 
-    That is the segments, where each stopped in the list [S], and the channels and transmittance
-    before every segment but the first of its tile.
+    The residuals are the segments, the position where each stopped [S], and the channels and
+    transmittance before every segment except the first of a tile.
     """
     segments = cut(offsets, plan)
     queue = Queue.build(segments, segments.ends, plan)
@@ -304,16 +305,16 @@ def _prefixes(first, values, step, group: int):
 
 
 def _through(entries: _Entries, v_out, transmittance, remaining, within, plan: Plan, always):
-    """Follow light through the next entries of every lane; `within` numbers those of a group.
+    """Follow light through the next entries of every lane; `within` numbers entries of a group.
 
     Returns:
-        Weights and gradients to the exponents, [B C P]; transmittance and light still to come
-        behind the entries, [B P].
+        Weights and gradients by the exponents, [B C P]; transmittance and remaining light behind
+        the entries, [B P].
     """
     alpha, row = entries.alpha, entries.rows
     lanes, chunk, pixels = alpha.shape
     group = within.shape[0]
-    # Transmittance before each entry in two levels: across groups, then within.
+    # Transmittance before each entry is computed across groups, then within groups.
     grouped = alpha.reshape(lanes, -1, group, pixels)
     t_groups = materialize(
         always, lambda: _prefixes(transmittance, alpha, lambda t, a: t * (1 - a), group)
@@ -347,7 +348,7 @@ def _through(entries: _Entries, v_out, transmittance, remaining, within, plan: P
 
 
 def _row_gradient(entries: _Entries, w, v_exponent, v_out, features, plan: Plan):
-    """Return the gradient to the rows of entries, [B C row], from moments over the pixels."""
+    """Return the gradient by the rows of entries, [B C row], from moments over the pixels."""
     lanes, chunk, pixels = w.shape
     moments = (v_exponent.reshape(lanes * chunk, pixels) @ features).reshape(lanes, chunk, 8)
     sums, factor = [moments[..., i] for i in range(6)], [entries.rows[..., i] for i in (2, 3, 4)]
@@ -357,7 +358,7 @@ def _row_gradient(entries: _Entries, w, v_exponent, v_out, features, plan: Plan)
 
 
 def backward(rows, ids_list, residuals, image, v_image, plan: Plan):
-    """Return the gradient of the rows from those of the channels and transmittance."""
+    """Return the gradient by the rows from those by the channels and transmittance."""
     segments, stops, before = residuals
     plan = plan._replace(lanes=plan.lanes * BACKWARD_LANE_FACTOR)
     lanes, pixels, chunk = plan.lanes, plan.pixels, plan.cfg.chunk
@@ -371,16 +372,16 @@ def backward(rows, ids_list, residuals, image, v_image, plan: Plan):
         [one, local_x, local_y, local_x**2, local_x * local_y, local_y**2, zero, zero], 1
     )
 
-    # Empty slots need no values: none of their results is kept.
+    # Empty slots need no values, because their results are dropped.
     tiles = jnp.concatenate([segments.tiles, jnp.zeros(lanes, jnp.int32)])
     light = functools.reduce(jnp.add, (a * v for a, v in zip(image, v_image, strict=True)))
     v_channels = jnp.stack(v_image[:-1], 1)
-    # The light still to come and the transmittance where each segment begins.
+    # Remaining light and transmittance at the start of each segment.
     behind = segments.tiles[plan.tile_count :]
-    there = light[behind] - sum(
+    extra_light = light[behind] - sum(
         b * v[behind] for b, v in zip(before[:-1], v_image[:-1], strict=True)
     )
-    light, ahead = jnp.concatenate([light, there]), before[-1]
+    light, ahead = jnp.concatenate([light, extra_light]), before[-1]
     slot = queue.first()
     within = jnp.arange(PREFIX_GROUP if chunk % PREFIX_GROUP == 0 else 1)[:, None]
 

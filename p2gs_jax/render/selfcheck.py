@@ -1,7 +1,7 @@
-"""Whether the rasterizer that runs here is right: image and gradient against float64.
+"""A check of the rasterizer on this device: image and gradient against float64.
 
-Three scenes of one shape, so that one program checks them: a crowd, needles, and radiance over
-thirteen stops. A kernel for a GPU is compiled by that machine's libraries, which no test has seen.
+Three scenes of one shape share one program: a crowd, needles, and radiance over 13 stops. A GPU
+kernel is compiled by the libraries of its machine, which no test of this package covers.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians
 
 WIDTH, HEIGHT, COUNT = 32, 24, 64
-# Largest errors: of the image over its brightest value, of gradients in the relative L2 norm. The
-# stop rule explains 5e-4 and 5e-3, a wrong kernel is off by everything.
+# Largest errors of the image, relative to its brightest value, and of gradients, in the relative L2
+# norm. The stop rule causes 5e-4 and 5e-3; a wrong kernel has far larger errors.
 IMAGE, GRADIENT = 1e-3, 1e-2
 
 
 class SelfCheck(NamedTuple):
-    """The largest errors that were found; NaN where a value was not finite."""
+    """The largest errors over the scenes; NaN if a value is not finite."""
 
     image: float
     gradient: float
 
     @property
     def fault(self) -> str | None:
-        """What is wrong, in words; None where nothing is."""
+        """A phrase that names the error; None without an error."""
         if not self.image <= IMAGE:
             return f"the image is wrong by {self.image:.0e} of its brightest value"
         if not self.gradient <= GRADIENT:
@@ -60,7 +60,7 @@ def scenes() -> Iterator[Gaussians]:
 
 
 def _checked(gaussians: Gaussians, kind: np.dtype, cfg: RenderConfig):
-    """Return image and gradient of its weighted sum, in a precision."""
+    """Return the gradient of the weighted sum of the image, and the image, in a precision."""
     gaussians = jax.tree.map(lambda a: jnp.asarray(a, kind), gaussians)
     K = np.array([[WIDTH, 0, WIDTH / 2], [0, WIDTH, HEIGHT / 2], [0, 0, 1]])
     camera = Camera(jnp.eye(4, dtype=kind), jnp.asarray(K, kind), WIDTH, HEIGHT)
@@ -75,15 +75,15 @@ def _checked(gaussians: Gaussians, kind: np.dtype, cfg: RenderConfig):
 
 
 def self_check(cfg: RenderConfig | None = None) -> SelfCheck:
-    """Compare the rasterizer of `cfg` with the float64 reference, in seconds of compiling."""
+    """Compare the rasterizer of `cfg` with the float64 reference; compilation takes seconds."""
     cfg = RenderConfig() if cfg is None else cfg
     exact_cfg = dataclasses.replace(cfg, implementation="reference")
     options = compiler_options()
-    own = jax.jit(lambda g: _checked(g, np.dtype(np.float32), cfg), compiler_options=options)
+    tested = jax.jit(lambda g: _checked(g, np.dtype(np.float32), cfg), compiler_options=options)
     reference = jax.jit(lambda g: _checked(g, np.dtype(np.float64), exact_cfg))
     image_errors, gradient_errors = [], []
     for scene in scenes():
-        gradient, image = jax.tree.map(np.asarray, own(scene))
+        gradient, image = jax.tree.map(np.asarray, tested(scene))
         with jax.enable_x64(True):
             exact = reference(scene)
         true_gradient, true_image = jax.tree.map(np.asarray, exact)
@@ -94,9 +94,9 @@ def self_check(cfg: RenderConfig | None = None) -> SelfCheck:
 
 
 def suited(render: RenderConfig) -> tuple[RenderConfig, str | None]:
-    """Return options whose rasterizer is right on this device, and what the user must know of it.
+    """Return options whose rasterizer is correct on this device, and a note for the user or None.
 
-    On a GPU the rasterizer is checked first: nobody has seen that card, driver and compiler.
+    On a GPU the rasterizer is checked first, because its card, driver and compiler are untested.
     """
     if render.implementation is not None or jax.default_backend() == "cpu":
         return render, None
@@ -105,12 +105,12 @@ def suited(render: RenderConfig) -> tuple[RenderConfig, str | None]:
         return render, slow
     try:
         fault = self_check(render).fault
-    except Exception as error:  # whatever compilers raise
+    except Exception as error:  # compilers raise many types
         fault = f"{type(error).__name__}: {error}"
     if fault is None:
         return render, None
     note = (
         f"The rasterizer for GPUs failed its self-check on this device ({fault}): the portable one "
-        "is used, which is much slower. Please report this with what `p2gs-jax doctor` prints."
+        "is used, which is much slower. Please report this with the output of `p2gs-jax doctor`."
     )
     return dataclasses.replace(render, implementation="xla"), note

@@ -1,16 +1,15 @@
-"""Compositing: the dense reference, and what all rasterizers of tiles share.
+"""Compositing: the dense reference, and the code that all tile rasterizers share.
 
-A tile rasterizer is a module `rasterize_NAME` with its exponent's unit, `exponent_scale`, and a
-pair of functions:
-`forward(rows, ids, offsets, plan)` gives the channels of the image and the transmittance, [T P]
-each, and what its own backward needs;
-`backward(rows, ids, residuals, image, v_image, plan)` gives the gradient of the rows.
+A tile rasterizer is a module `rasterize_NAME` with the function `exponent_scale`, the unit of its
+exponents, and a pair of functions:
+`forward(rows, ids, offsets, plan)` returns the channels of the image and the transmittance, [T P]
+each, and the residuals for its backward function;
+`backward(rows, ids, residuals, image, v_image, plan)` returns the gradient of the rows.
 
 Rows. A Gaussian is a row of floats: mean x, y; conic factor a11, a12, a22; log opacity; three
-radiances; depth if asked for. Factor, opacity and the plan's cutoff are divided by its
-`exponent_scale` (the factor by its root), in the units that suit an implementation's exponential:
-e = log opacity - (u^2 + v^2) and alpha = exp(exponent_scale e). Row N is a dummy that absorbs
-padding.
+radiances; optionally depth. Factor, opacity and the plan's cutoff are divided by `exponent_scale`
+(the factor by its root), which suits the implementation's exponential: e = log opacity -
+(u^2 + v^2) and alpha = exp(exponent_scale e). Row N is a dummy for padding.
 """
 
 from __future__ import annotations
@@ -33,11 +32,11 @@ from p2gs_jax.types import Splats2D, TileList
 TileImplementation = Literal["xla", "pallas"]
 DUMMY_LOG_OPACITY = -100.0
 GEOMETRY = 6  # columns of a row before its channels
-# Lanes for every tile of an image too small to fill them.
+# Most lanes per tile, for images too small to fill all lanes.
 MOST_LANES = 8
-# The oldest NVIDIA GPUs that Pallas supports through Triton.
+# Compute capability of the oldest NVIDIA GPUs that Pallas supports through Triton.
 AMPERE = 8.0
-# Floor of a pixel's brightness in the stop rule, over the brightest splat
+# Floor of a pixel's brightness in the stop rule, relative to the brightest splat
 # (RenderConfig.stop_error).
 DARKEST = 1e-4
 
@@ -47,8 +46,8 @@ def rasterize_reference(
 ) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"], Float[Array, "h w"]]:
     """Return radiance, alpha and alpha-weighted depth by dense compositing (paper, eq. 3).
 
-    The oracle: every pixel composites every Gaussian front to back, without a stop rule, by plain
-    autodiff, in whatever precision it is given. Memory is O(N H W): tests only.
+    This is the oracle of tests: every pixel composites every Gaussian front to back, without a stop
+    rule, with plain autodiff, in the precision of the input. It needs O(N H W) memory.
     """
     order = jnp.argsort(jnp.where(splats.visible, splats.depths, jnp.inf))
     s = jax.tree.map(lambda a: a[order], splats)
@@ -73,25 +72,25 @@ def rasterize_reference(
 
 
 class Plan(NamedTuple):
-    """Static shape of one compositing run, by one core; the cutoff is one of exponents."""
+    """Static sizes of one compositing run by one core."""
 
-    across: int
-    down: int
+    across: int  # tiles across
+    down: int  # rows of tiles
     lanes: int
     gaussians: int
     channels: int
     exponent_scale: float
-    cutoff: float
+    cutoff: float  # least exponent, in units of `exponent_scale`
     cfg: RenderConfig
 
     @property
     def tile_count(self) -> int:
-        """Tiles of the image."""
+        """Number of tiles."""
         return self.across * self.down
 
     @property
     def pixels(self) -> int:
-        """Pixels of a tile."""
+        """Number of pixels of a tile."""
         return self.cfg.tile[0] * self.cfg.tile[1]
 
     def local_pixels(self) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
@@ -123,11 +122,11 @@ def pack_rows(
 def geometry_gradient(
     moments: Sequence[Array], factor: Sequence[Array], center: Sequence[Array], scale: float
 ) -> tuple[Array, ...]:
-    """Return the gradient to the first six columns of a row, from moments over a tile.
+    """Return the gradient by the first six columns of a row, from moments over a tile.
 
-    `moments` are the sums over the tile's pixels of the gradient to the exponent times 1, x, y,
-    x^2, x y, y^2, with x and y from the tile's centre; `factor` is a11, a12, a22; `center` has u,
-    v, and the offsets x and y from the mean at the tile's centre; `scale` is the plan's
+    `moments` are the sums, over the tile's pixels, of the gradient by the exponent times 1, x, y,
+    x^2, x y, y^2, with x and y from the tile's centre. `factor` is a11, a12, a22. `center` holds u,
+    v, and the offsets x and y from the mean, at the tile's centre. `scale` is the plan's
     `exponent_scale`.
     """
     m1, mx, my, mxx, mxy, myy = moments
@@ -149,7 +148,7 @@ def geometry_gradient(
 
 
 def _module(name: TileImplementation):
-    """Return the module; Pallas is imported only where it is used."""
+    """Return the module of a rasterizer; Pallas is imported only if it is used."""
     return import_module(f"p2gs_jax.render.rasterize_{name}")
 
 
@@ -159,13 +158,13 @@ def _composite(rows, ids, offsets, plan: Plan, name: TileImplementation):
 
 
 def _composite_fwd(rows, ids, offsets, plan: Plan, name: TileImplementation):
-    image, own = _module(name).forward(rows, ids, offsets, plan)
-    return image, (rows, ids, own, image)
+    image, residuals = _module(name).forward(rows, ids, offsets, plan)
+    return image, (rows, ids, residuals, image)
 
 
-def _composite_bwd(plan: Plan, name: TileImplementation, residuals, v_image):
-    rows, ids, own, image = residuals
-    return _module(name).backward(rows, ids, own, image, v_image, plan), None, None
+def _composite_bwd(plan: Plan, name: TileImplementation, saved, v_image):
+    rows, ids, residuals, image = saved
+    return _module(name).backward(rows, ids, residuals, image, v_image, plan), None, None
 
 
 _composite.defvjp(_composite_fwd, _composite_bwd)
@@ -179,21 +178,21 @@ def _untile(channel, plan: Plan):
 
 
 def fastest_here() -> TileImplementation:
-    """Return the rasterizer of the default backend: `pallas` on NVIDIA GPUs that Triton knows.
+    """Return the rasterizer of the default backend: `pallas` on NVIDIA GPUs that Triton supports.
 
-    Called while tracing, so that a program contains one of them only.
+    It is called while JAX traces, so that a program contains only one variant.
     """
     if jax.default_backend() != "gpu":
         return "xla"
     try:
         capability = float(getattr(jax.devices()[0], "compute_capability", 0))
-    except ValueError:  # AMD's have names
+    except ValueError:  # AMD GPUs have names instead of numbers
         capability = 0.0
     return "pallas" if capability >= AMPERE else "xla"
 
 
 def slow_here() -> str | None:
-    """Say that the GPU here is none that the kernels for GPUs were written for, if so."""
+    """Return a note if the GPU kernels do not support this GPU, else None."""
     if jax.default_backend() == "cpu" or fastest_here() == "pallas":
         return None
     return (
@@ -213,15 +212,15 @@ def rasterize(
 ) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"], Float[Array, "h w"] | None]:
     """Composite splats of linear HDR radiance into radiance, alpha and alpha-weighted depth.
 
-    Radiance is >= 0, the background is black. `cfg.implementation` is `reference` (dense, any
+    Radiance must be >= 0; the background is black. `cfg.implementation` is `reference` (dense, any
     precision, without a tile list), `xla` (lane queue), `pallas` (a GPU block per tile), or None
-    for the fastest that runs here. A tile list must not have overflowed. Without depth there is
-    None in its place, and about 5 % less work.
+    for the fastest on this device. The tile list must be complete. Without `with_depth` the depth
+    is None, which saves about 5 % of the work.
 
     Raises:
-        ValueError: no such implementation, or one of tiles without a tile list.
+        ValueError: the implementation does not exist, or it needs a tile list.
     """
-    # The kernels for GPUs know single precision only.
+    # The GPU kernels support single precision only.
     name = cfg.implementation or (fastest_here() if radiance.dtype == jnp.float32 else "xla")
     if name == "reference":
         linear, alpha, depth = rasterize_reference(splats, radiance, width, height, cfg)

@@ -1,8 +1,8 @@
-"""Which Gaussians a view can show, a compact list of them, and their splats, block by block.
+"""The Gaussians that a view may show: a compact list, and their splats, block by block.
 
-One view of a drive sees a fifth of the population. Everything that is done per Gaussian
-(projection, spherical harmonics, their gradients, the optimiser) is done for that list only. It has
-a static length and a dynamic count, which the time of a loop over blocks follows; a block fits a
+One view of a drive shows about 20 % of the population. Work per Gaussian (projection, spherical
+harmonics, their gradients, the optimiser) is done only for the list. The list has a static length
+and a dynamic count, and the time of a loop over its blocks depends on the count. A block fits a
 core's cache (BUILD_NOTES, "The step costs what a view shows").
 """
 
@@ -32,7 +32,7 @@ from p2gs_jax.render.project import (
 from p2gs_jax.render.xla_cpu import compiled_loop
 from p2gs_jax.types import Array, Camera, Frustum, Gaussians, Splats2D
 
-# Pixels of slack for rounding.
+# Margin for rounding, pixels.
 SLACK = 1.0
 BLOCK = 4096
 
@@ -45,10 +45,10 @@ def in_view(
     camera: Camera | Frustum,
     cfg: RenderConfig,
 ) -> Bool[Any, " n"]:
-    """Return which Gaussians may reach a pixel: a conservative bound.
+    """Return flags of the Gaussians that may reach a pixel: a conservative bound.
 
-    The projected covariance is bounded by that of a ball as wide as the widest axis: along x its
-    deviation is at most s f / z sqrt(1 + t^2), t being the tangent at which `project` evaluates.
+    The projected covariance is bounded by that of a ball with the largest scale s. Along x its
+    standard deviation is at most s f / z sqrt(1 + t^2), with t the tangent that `project` uses.
     NumPy arrays give a NumPy result.
     """
     gaussians = at_time(gaussians, camera.objects)
@@ -67,7 +67,8 @@ def in_view(
         slant = xp.clip(tangent, -limit, limit)
         deviation2 = (widest * f * inverse_z) ** 2 * (1 + slant * slant) + cfg.blur
         radius = xp.sqrt(2 * xp.maximum(reach, 0) * deviation2) + SLACK
-        # Comparisons with NaN are false: what is not finite counts as seen, and `project` hides it.
+        # Comparisons with NaN are false: Gaussians that are not finite pass, and `project` hides
+        # them.
         at = f * tangent + c
         seen = seen & ~((at + radius < 0) | (at - radius > size))
     return seen
@@ -91,27 +92,27 @@ def _list_in_parallel(seen, blank):
     return place[-1] + 1, blank.at[where].set(index, mode="drop")
 
 
-def compact(seen: Bool[Array, " n"], room: int) -> tuple[Int[Array, " v"], Int[Array, ""]]:
-    """Return the indices of set flags in order, padded with n to a length of `room`; their number.
+def compact(seen: Bool[Array, " n"], length: int) -> tuple[Int[Array, " v"], Int[Array, ""]]:
+    """Return the indices of set flags in order, padded with n to `length`; and their number.
 
-    The number may exceed `room`; then the list holds the first of them.
+    The number may exceed `length`; then the list holds the first indices.
     """
     n = seen.shape[0]
-    # One more place than `room` receives what does not fit.
-    blank = jnp.full(room + 1, n, jnp.int32)
-    listed = _list if jax.default_backend() == "cpu" else _list_in_parallel
-    count, ids = listed(seen, blank)
-    used = jnp.arange(room, dtype=jnp.int32) < count
-    return jnp.where(used, ids[:room], n), count
+    # The last of `length + 1` places receives the indices that do not fit.
+    blank = jnp.full(length + 1, n, jnp.int32)
+    list_flags = _list if jax.default_backend() == "cpu" else _list_in_parallel
+    count, ids = list_flags(seen, blank)
+    used = jnp.arange(length, dtype=jnp.int32) < count
+    return jnp.where(used, ids[:length], n), count
 
 
-def whole_blocks(room: int) -> int:
-    """Return `room` rounded up to whole blocks."""
-    return -(-max(room, 1) // BLOCK) * BLOCK
+def whole_blocks(length: int) -> int:
+    """Return `length`, at least 1, rounded up to whole blocks."""
+    return -(-max(length, 1) // BLOCK) * BLOCK
 
 
 def take_rows(gaussians: Gaussians, ids: Int[Array, " v"], bands: int) -> Gaussians:
-    """Return some Gaussians, or their moments, with the first `bands` coefficients only.
+    """Return the Gaussians (or moments) of these ids, with the first `bands` coefficients only.
 
     Ids out of bounds give the last Gaussian.
     """
@@ -124,9 +125,9 @@ def take_rows(gaussians: Gaussians, ids: Int[Array, " v"], bands: int) -> Gaussi
 
 
 def put_rows(gaussians: Gaussians, ids: Int[Array, " v"], new: Gaussians) -> Gaussians:
-    """Return Gaussians with some rows replaced by what `take_rows` returned, changed.
+    """Return Gaussians with the rows `ids` replaced by `new`, of the shape of `take_rows`.
 
-    Every id occurs once; those out of bounds go nowhere.
+    Every id occurs once; rows of ids out of bounds are dropped.
     """
 
     def rows(a, b):
@@ -140,7 +141,7 @@ def put_rows(gaussians: Gaussians, ids: Int[Array, " v"], new: Gaussians) -> Gau
 def block_size(length: int) -> int:
     """Return the number of rows of a block: all rows on devices other than CPUs.
 
-    Called while tracing, so that a program contains one of them only.
+    It is called while JAX traces, so that a program contains only one variant.
     """
     return min(BLOCK, length) if jax.default_backend() == "cpu" else length
 
@@ -151,10 +152,10 @@ def slice_of(tree, block: Int[Array, ""] | int, size: int):
 
 
 def over_blocks(body: Callable, count: Int[Array, ""], length: int, start):
-    """Return the state after `body(block, state)` for every block of a list that is used.
+    """Return the state after `body(block, state)` for every used block of a list.
 
-    The list has a `length`, of which `count` rows are listed, or more where there was no room. One
-    block that holds all rows needs no loop, whose dynamic count the host of a GPU would read.
+    The list has `length` rows, of which the first `count` are used; after an overflow `count` is
+    larger. A single block needs no loop, whose dynamic count the host of a GPU would have to read.
     """
     size = block_size(length)
     if size == length:
@@ -176,7 +177,7 @@ def splat(
 
 
 def owners_at(owner: Int[Array, " n"] | None, ids: Int[Array, " v"]) -> Int[Array, " v"] | None:
-    """Return the owners of some Gaussians; -1, which is nobody, for ids out of bounds."""
+    """Return the moving object of each id; -1 (none) for ids out of bounds."""
     return None if owner is None else owner.at[ids].get(mode="fill", fill_value=-1)
 
 
@@ -193,8 +194,8 @@ def splat_listed(
 ) -> Shown:
     """Return the splats and the radiance of the listed Gaussians in a view.
 
-    `ids` are from `compact`, whole blocks long, of which `count` are listed; `bands` is the number
-    of coefficients in use.
+    `ids` is from `compact`, in whole blocks; its first `count` ids are used. `bands` is the number
+    of spherical-harmonics coefficients in use.
     """
     length = ids.shape[0]
     size = block_size(length)

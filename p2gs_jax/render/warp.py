@@ -11,24 +11,24 @@ from jaxtyping import Array, Bool, Float
 from p2gs_jax.core.numerics import matmul, namespace
 from p2gs_jax.types import Camera, Render, View
 
-# A pixel has a surface where the render is this opaque, unless the caller asks for more.
+# Default of the least alpha at which a pixel shows a surface.
 OPAQUE = 0.95
-# It is seen in another view where that view's own depth agrees within this share.
+# A surface is seen in another view if the depths agree within this share.
 DEPTH_TOLERANCE = 0.03
 
 
 class Warp(NamedTuple):
-    """Positions of pixels in another view, centres at +0.5, and where it shows the same surface."""
+    """Positions of pixels in another view."""
 
-    xy: Float[Array, "h w 2"]
-    seen: Bool[Array, "h w"]
+    xy: Float[Array, "h w 2"]  # pixels, centres at +0.5
+    seen: Bool[Array, "h w"]  # whether the other view shows the same surface there
 
 
 def surface_depth(render: Render, opaque: float = OPAQUE) -> Float[Array, "h w"]:
-    """Return the expected depth where the alpha of a render is above `opaque`, and 0 elsewhere.
+    """Return the expected depth at pixels whose alpha is above `opaque`, and 0 elsewhere.
 
     Raises:
-        ValueError: it was rendered without depth.
+        ValueError: the render has no depth.
     """
     if render.depth is None:
         raise ValueError("the warp needs depth: render with with_depth=True")
@@ -53,7 +53,7 @@ def unproject(depth: Float[Array | np.ndarray, "h w"], camera: Camera) -> Float[
 def project_points(
     points: Float[Array | np.ndarray, "*n 3"], camera: Camera | View
 ) -> tuple[Float[Any, "*n 2"], Float[Any, "*n"]]:
-    """Return pixel positions at full resolution (centres at +0.5) and camera z; valid where z > 0.
+    """Return pixel positions at full resolution (centres at +0.5) and camera z; valid for z > 0.
 
     NumPy arrays give NumPy results.
     """
@@ -67,16 +67,17 @@ def project_points(
 def visible(
     xy: Float[Array, "*n 2"], z: Float[Array, "*n"], depth: Float[Array, "h w"]
 ) -> Bool[Array, "*n"]:
-    """Return which projected points lie on the surface that a view shows at their pixel.
+    """Return flags of the points that lie on the surface that a view shows at their pixel.
 
-    `xy` and `z` are their positions and depths in the view, `depth` is that of `surface_depth`.
+    `xy` and `z` are the pixel positions and depths of the points in the view; `depth` is the view's
+    `surface_depth`.
     """
     height, width = depth.shape
     at = jnp.floor(xy).astype(jnp.int32)
     x, y = at[..., 0], at[..., 1]
     inside = (z > 1e-6) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
-    shown = depth[jnp.where(inside, y, 0), jnp.where(inside, x, 0)]
-    return inside & (shown > 0) & (jnp.abs(shown - z) < DEPTH_TOLERANCE * z)
+    surface = depth[jnp.where(inside, y, 0), jnp.where(inside, x, 0)]
+    return inside & (surface > 0) & (jnp.abs(surface - z) < DEPTH_TOLERANCE * z)
 
 
 def warp(
@@ -85,16 +86,16 @@ def warp(
     other_depth: Float[Array, "h2 w2"],
     other_camera: Camera,
 ) -> Warp:
-    """Return where the pixels of one view lie in another (docs/photometry.md, 3, w(u)).
+    """Return the positions of one view's pixels in another view (docs/photometry.md, 3, w(u)).
 
-    Depths are those of `surface_depth`.
+    The depths are from `surface_depth`.
     """
     xy, z = project_points(unproject(depth, camera), other_camera)
     return Warp(xy, (depth > 0) & visible(xy, z, other_depth))
 
 
 def sample_bilinear(image: Float[Array, "h w c"], xy: Float[Array, "*n 2"]) -> Float[Array, "*n c"]:
-    """Return the image at positions (centres at +0.5); beyond the border, the border's values."""
+    """Return the image at pixel positions (centres at +0.5), clamped to the border."""
     height, width, _ = image.shape
     limit = jnp.array([width - 1.0, height - 1.0])
     position = jnp.clip(xy - 0.5, 0.0, limit)

@@ -1,7 +1,7 @@
 """Idioms that XLA's CPU backend compiles well, each measured (BUILD_NOTES, "The kernel").
 
-None of them changes a result. On other backends they leave nothing in a program: there, a
-conditional or a loop with a dynamic count stops the device until the host has read a flag.
+They do not change results. On other backends they add nothing to a program: a conditional, or a
+loop with a dynamic count, would stop the device until the host has read a flag.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, Bool, Float
 
-# 512-bit vectors where the CPU has them; XLA prefers 256 (5-20 % of a render, BUILD_NOTES). LLVM's
-# first level of optimisation compiles a step 15 % sooner, and the step is no slower.
+# 512-bit vectors if the CPU has them; XLA's default of 256 bits costs 5 to 20 % of a render
+# (BUILD_NOTES). LLVM's optimisation level 1 compiles a step 15 % sooner, and the step is as fast.
 _CPU_OPTIONS = {"xla_cpu_prefer_vector_width": 512, "xla_backend_optimization_level": 1}
 
 F = TypeVar("F", bound=Callable)
@@ -25,23 +25,23 @@ SMALL_CALL = "xla_cpu_small_call"
 
 
 def compiled_loop(f: F) -> F:
-    """Return `f` compiled as one sequential native function where XLA runs on a CPU.
+    """Return `f` compiled as one sequential native function if XLA runs on a CPU.
 
     A `lax.while_loop` on the CPU normally launches kernels in every iteration, about 300 ns each.
-    XLA compiles loops whole that it considers small; the attribute set here asks for that whatever
-    the size: a counting sort then takes 6 ns an entry where `lax.sort` takes 54.
+    XLA compiles small loops as a whole; the attribute set here requests this for any size. A
+    counting sort then takes 6 ns per entry, and `lax.sort` takes 54 ns.
 
-    `sequential_vmap` makes vmap a loop over calls, since batched scatters cannot be compiled so,
-    and keeps the call whole under differentiation: its constants in a call without arguments would
-    become invalid code (XLA 0.10).
+    `sequential_vmap` turns vmap into a loop over calls, because batched scatters cannot be compiled
+    like this. It also keeps the call whole under differentiation, where constants in a call without
+    arguments would become invalid code (XLA 0.10).
 
-    `f` is a pure function of arrays, without matrix products, sorts or convolutions; it cannot be
-    differentiated.
+    `f` is a pure function of arrays, without matrix products, sorts or convolutions. The result
+    cannot be differentiated.
     """
 
     @jax.custom_batching.sequential_vmap
     def call(*args):
-        # `inlineable` keeps XLA from dissolving the call before the backend sees its attribute.
+        # `inlineable` keeps XLA from inlining the call before the backend sees its attribute.
         with set_xla_metadata(**{SMALL_CALL: "true", "inlineable": "false"}):
             return jax.jit(f)(*lax.optimization_barrier(args))
 
@@ -49,21 +49,21 @@ def compiled_loop(f: F) -> F:
 
 
 def compiler_options() -> dict[str, int] | None:
-    """Return what an outermost `jax.jit` around a renderer should pass as `compiler_options`."""
+    """Return the `compiler_options` of an outermost `jax.jit` around a renderer."""
     return _CPU_OPTIONS if jax.default_backend() == "cpu" else None
 
 
 def opaque_true(sample: Float[Array, ""]) -> Bool[Array, ""]:
-    """Return true, computed from data so that XLA cannot fold it; also for NaN."""
+    """Return true, computed from data so that XLA cannot fold it; NaN gives true, too."""
     return (sample == sample) | (sample != 0)
 
 
 def materialize(always: Bool[Array, ""], compute):
-    """Force the arrays that `compute()`, without arguments, returns into memory.
+    """Return the arrays of `compute()`, stored in memory before they are used.
 
     XLA's CPU backend fuses through `optimization_barrier` and then recomputes the whole chain in
-    each consumer (1155 against 421 CPU ms); a conditional survives. `always` is
-    true, but computed from data, so that XLA cannot know: `opaque_true`.
+    each consumer (1155 instead of 421 ms of CPU time); a conditional prevents this. `always` is
+    true, but computed from data, so that XLA cannot fold it: `opaque_true`.
     """
     if jax.default_backend() != "cpu":
         return compute()
@@ -75,11 +75,11 @@ def materialize(always: Bool[Array, ""], compute):
 
 @jax.custom_vjp
 def columns(a: Float[Array, "n k"]) -> tuple[Float[Array, " n"], ...]:
-    """Return the columns of a matrix, with a gradient that computes each of them once.
+    """Return the columns of a matrix, with a gradient that computes each column once.
 
     The plain gradient of slicing is a sum of padded columns, which XLA evaluates element by
-    element: the whole chain behind every column, once per column (18 against 6 ms for the
-    projection of 100k Gaussians).
+    element. It repeats the whole computation of a column once per column (18 instead of 6 ms for
+    the projection of 100,000 Gaussians).
     """
     return tuple(a[:, i] for i in range(a.shape[1]))
 

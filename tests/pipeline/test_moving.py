@@ -80,7 +80,7 @@ def test_the_run_remembers_whose_gaussians_are_and_where_boxes_were(run):
     assert (np.abs(mine) < np.array(SIZE)).all(1).mean() > 0.95
     metrics = json.loads((run.folder / "metrics.json").read_text())
     assert {"whole", "static", "moving"} <= set(metrics["test"]["exposure_fitted"])
-    assert "1 things move as pieces of their own" in " ".join(metrics["notes"])
+    assert "1 moving objects have separate Gaussians" in " ".join(metrics["notes"])
 
 
 def test_views_are_rendered_at_their_own_time(run):
