@@ -13,7 +13,7 @@ from p2gs_jax.errors import UserError
 
 # Values by variant or scene, and metric.
 Rows = dict[str, dict[str, float]]
-# How often times that seem worse are measured again.
+# Largest number of repeated measurements of times that are worse than the baseline.
 AGAIN = 2
 
 
@@ -23,11 +23,11 @@ class Metric:
 
     Attributes:
         title: table heading, with the unit.
-        better: which way is good.
-        tolerance: how far a value may be worse than the baseline before the gate closes; a factor
-            where `absolute` is false, else in the metric's unit.
+        better: whether lower or higher values are better.
+        tolerance: the worst allowed difference from the baseline: a factor, or with `absolute` a
+            number in the metric's unit.
         absolute: see `tolerance`.
-        timed: a ratio of wall times, which other work on the machine moves.
+        timed: whether it is a ratio of wall times, which other work on the machine changes.
     """
 
     title: str
@@ -37,7 +37,7 @@ class Metric:
     timed: bool = False
 
     def worse(self, value: float, baseline: float) -> bool:
-        """Return whether `value` is worse than `baseline` allows; NaN always is."""
+        """Return whether `value` is worse than `baseline` allows; NaN always is worse."""
         sign = 1.0 if self.better == "lower" else -1.0
         limit = (
             baseline + sign * self.tolerance if self.absolute else baseline * self.tolerance**sign
@@ -45,8 +45,9 @@ class Metric:
         return not sign * value <= sign * limit
 
 
-# Accuracy is deterministic up to the order of float32 sums; times are ratios to a reference
-# workload of the same run and still move with the machine: 1.8 times between two, by our own CI.
+# Accuracy is deterministic up to the order of float32 sums. Times are ratios to a reference
+# workload of the same run, but still differ between machines: by 1.8 times in continuous
+# integration.
 METRICS = {
     "max_abs": Metric("max abs", "lower", 1.25),
     "relative": Metric("relative max", "lower", 1.25),
@@ -66,9 +67,9 @@ class Complaint(NamedTuple):
 
     Attributes:
         row: variant or scene.
-        metric: which of its values.
-        timed: whether it is a time.
-        text: one sentence for a person.
+        metric: name of the metric.
+        timed: whether the metric is a time.
+        text: a sentence that names the value, the baseline and the tolerance.
     """
 
     row: str
@@ -78,7 +79,7 @@ class Complaint(NamedTuple):
 
 
 def write_baseline(path: Path, rows: Rows) -> None:
-    """Write the baseline that `check` reads; rows of the file that were not measured stay."""
+    """Write the baseline that `check` reads; other rows of an existing file stay."""
     known = json.loads(path.read_text()) if path.is_file() else {}
     write_json(path, known | rows)
 
@@ -101,7 +102,7 @@ def check(path: Path, rows: Rows) -> list[Complaint]:
             known = baseline.get(name, {}).get(metric)
             if not isinstance(known, int | float):
                 raise UserError(
-                    f"{path} has no {metric!r} of {name!r}", fix="write it anew: --write-baseline"
+                    f"{path} has no {metric!r} of {name!r}", fix="write a new one: --write-baseline"
                 )
             declared = METRICS[metric.removeprefix("numerics ")]
             if declared.worse(value, known):
@@ -116,20 +117,20 @@ def check(path: Path, rows: Rows) -> list[Complaint]:
 def settle(
     path: Path, rows: Rows, measure: Callable[[list[str]], Rows], again: int = AGAIN
 ) -> list[str]:
-    """Return one sentence for each value that is worse, times only where they stay so.
+    """Return one sentence for each value that is worse than the baseline allows.
 
-    Whatever else runs on a machine makes times longer, never shorter: rows whose times are worse
-    are measured again, at most `again` times, and the least of all measurements counts. Accuracy
-    counts as it was measured first.
+    Other work on a machine makes times longer, never shorter. So rows whose times are worse are
+    measured again, at most `again` times, and the least time counts. Accuracy is not measured
+    again.
 
     Args:
         path: the baseline.
-        rows: as for `check`.
-        measure: returns the rows of these names, measured anew.
-        again: how often at most.
+        rows: measured values, as for `check`.
+        measure: returns new measurements of the rows of these names.
+        again: largest number of repetitions.
 
     Raises:
-        UserError: as `check`.
+        UserError: see `check`.
     """
     complaints = check(path, rows)
     for _ in range(again):

@@ -1,10 +1,10 @@
-"""Beside gsplat on a GPU: the same Gaussians, camera, blur and cutoff, forward and backward.
+"""Comparison with gsplat on a GPU: same Gaussians, camera, blur and cutoff, forward and backward.
 
 python benchmarks/gpu.py --out runs/gpu
 python benchmarks/gpu.py --thousands 50 --pixels 480 270 --error
 
-gsplat (Ye et al., arXiv 2409.06765) is measured where it and torch are installed. A table goes to
-OUT/gpu.md, figures to OUT/gpu.json.
+gsplat (Ye et al., arXiv 2409.06765) is measured if it and torch are installed. OUT/gpu.md gets a
+table, OUT/gpu.json the numbers.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any
 import jax
 import numpy as np
 
-# Benchmarks find each other however they are started.
+# The folder `benchmarks` is importable from any working folder.
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.levels import whole_step
@@ -35,12 +35,12 @@ from p2gs_jax.render.capacity import bucket
 from p2gs_jax.types import Gaussians
 
 DEGREE = 3
-# gsplat's blur, pixels^2, and its colours: linear in the harmonics, not negative.
+# gsplat's blur, pixels^2, and its colours: linear in the harmonics and not negative.
 CFG = dataclasses.replace(RenderConfig(), blur=0.3, radiance="linear")
 
 
 def milliseconds(job: Callable[[], Any], wait: Callable[[Any], Any], repeats: int = 7) -> float:
-    """Return the median time of a job that keeps the device busy, ten calls at a time."""
+    """Return the median time of a call, milliseconds; 10 calls in a row keep the device busy."""
     out = job()
     wait(out)
     times = []
@@ -53,10 +53,11 @@ def milliseconds(job: Callable[[], Any], wait: Callable[[Any], Any], repeats: in
     return float(np.median(times)) * 1e3
 
 
-def beside(scene: BenchScene, weights: np.ndarray) -> tuple[Callable, Callable, Callable]:
-    """Return gsplat's forward, its forward and backward, and how to wait for it.
+def gsplat_jobs(scene: BenchScene, weights: np.ndarray) -> tuple[Callable, Callable, Callable]:
+    """Return gsplat's forward pass, its forward and backward pass, and a function that waits.
 
-    Backward gives the image (H, W, 3) and the gradients by all fields of `Gaussians`, as tensors.
+    The second returns the image (H, W, 3) and the gradients by all fields of `Gaussians`, as
+    tensors.
     """
     import gsplat  # pyright: ignore[reportMissingImports]
     import torch  # pyright: ignore[reportMissingImports]
@@ -89,14 +90,14 @@ def beside(scene: BenchScene, weights: np.ndarray) -> tuple[Callable, Callable, 
 
     def both():
         image = forward()
-        found = torch.autograd.grad((image * v).sum(), list(leaves.values()))
-        return image, found
+        gradients = torch.autograd.grad((image * v).sum(), list(leaves.values()))
+        return image, gradients
 
     return forward, both, lambda _: torch.cuda.synchronize()
 
 
 def measured(count: int, pixels: tuple[int, int], error: bool) -> dict[str, Any]:
-    """Return times of so many Gaussians, and errors against float64 where they are asked for."""
+    """Return times of `count` Gaussians, milliseconds, and optionally errors against float64."""
     scene = street(count, *pixels, degree=DEGREE)
     weights = cotangent(scene)
     forward, both, entries, _ = programs(scene, DEFAULT, CFG, weights)
@@ -109,18 +110,18 @@ def measured(count: int, pixels: tuple[int, int], error: bool) -> dict[str, Any]
     row["step"] = milliseconds(step, jax.block_until_ready)
     row["fault"] = fault()
     exact = truth(scene.gaussians, scene.camera, CFG, weights) if error else None
-    found = {"ours": (linear.astype(np.float64), gradient)}
+    results = {"ours": (linear.astype(np.float64), gradient)}
     try:
-        forward, both, wait = beside(scene, weights)
+        forward, both, wait = gsplat_jobs(scene, weights)
         row["gsplat forward"] = milliseconds(forward, wait)
         row["gsplat both"] = milliseconds(both, wait)
         image, leaves = both()
         arrays = (a.cpu().numpy() for a in leaves)
-        found["gsplat"] = image.detach().cpu().numpy().astype(np.float64), Gaussians(*arrays)
+        results["gsplat"] = image.detach().cpu().numpy().astype(np.float64), Gaussians(*arrays)
     except ImportError as missing:
         row["gsplat"] = f"not measured: {missing}"
     if exact is not None:
-        for name, pair in found.items():
+        for name, pair in results.items():
             row[f"{name} errors"] = errors(*pair, exact) | trimmed_errors(*pair, exact)
     return row
 
@@ -131,7 +132,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/gpu"))
     parser.add_argument("--thousands", type=int, nargs="+", default=[100, 1000, 3000])
     parser.add_argument("--pixels", type=int, nargs=2, default=[1920, 1080])
-    parser.add_argument("--error", action="store_true", help="errors against float64, slow")
+    parser.add_argument("--error", action="store_true", help="also errors against float64 (slow)")
     options = parser.parse_args()
     rows = []
     for thousands in options.thousands:
@@ -144,7 +145,7 @@ def main() -> None:
         [f"{v:.2f}" if isinstance(v, float) else f"{v:,}" if v else "" for v in row]
         for row in values
     ]
-    text = section("Milliseconds beside gsplat", header, cells)
+    text = section("Milliseconds compared with gsplat", header, cells)
     write_text(options.out / "gpu.md", text + "\n")
     print(text)
 

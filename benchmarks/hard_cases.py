@@ -1,4 +1,4 @@
-"""Scenes that break rasterizers: what must happen, and float32's error against float64."""
+"""Scenes that break rasterizers: their expected behaviour, and float32's error against float64."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NEAR = 0.0625
 CONFIG = RenderConfig(near=NEAR, pixels_in_flight=1024)
 # Scenes are padded to a multiple of this, so that they share their compiled programs.
 PADDING = 512
-# A pair whose exponent is this close to the cutoff may fall on either side of it.
+# A pair whose exponent is this close to the cutoff may be on either side of it.
 UNDECIDED = 2e-4
 SMALL_GROUP = 1e-4
 
@@ -44,7 +44,7 @@ def splats(
     logit=1.0,
     radiance=(0.7, 0.4, 0.2),
 ) -> Gaussians:
-    """Return `n` Gaussians; each argument is one value for all or an array of `n` of them."""
+    """Return `n` Gaussians; each argument is one value for all, or an array of `n` values."""
 
     def rows(value, width):
         return np.broadcast_to(np.asarray(value, np.float64), (n, width) if width else (n,))
@@ -67,7 +67,7 @@ def crowd(n: int = 60, seed: int = 0, **overrides) -> Gaussians:
     return splats(n, **(values | overrides))
 
 
-# Its size is not divisible by the tile's.
+# The image size is not divisible by the tile size.
 VIEW = camera()
 
 
@@ -76,14 +76,14 @@ class HardCase:
     """One scene and its expected behaviour.
 
     Attributes:
-        name: what tables call it.
-        expect: what must happen, in words.
-        build: makes the scene.
+        name: name in tables.
+        expect: the expected behaviour, in words.
+        build: returns the scene.
         view: the camera.
-        value_tolerance: largest image error relative to the largest value, besides undecided
+        value_tolerance: largest image error relative to the largest value, without undecided
             pairs and the stop rule.
         gradient_tolerance: largest relative L2 error of any gradient group.
-        unseen: nothing may appear and every gradient must be exactly zero.
+        unseen: whether the image must be empty and every gradient exactly zero.
     """
 
     name: str
@@ -205,12 +205,13 @@ class Gap(NamedTuple):
 
     Attributes:
         value: largest image error beyond undecided pairs, relative to the largest value.
-        relative: largest relative error of a pixel (pixels below 1e-4 of the largest held to it).
-        gradient: largest relative L2 error of a gradient group; errors of groups smaller than
-            `SMALL_GROUP` of the largest (cancellation, as along a needle) are relative to that.
-        undecided: pairs within float32's reach of the cutoff, where either side is right.
-        finite: no NaN or infinity in any value or gradient.
-        silent: nothing appeared and every gradient is exactly zero.
+        relative: largest relative error of a pixel; pixels darker than 1e-4 of the largest value
+            are measured relative to that level.
+        gradient: largest relative L2 error of a gradient group; groups smaller than `SMALL_GROUP`
+            of the largest (cancellation, as along a needle) are measured relative to that level.
+        undecided: number of pairs so near the cutoff that float32 may be on either side.
+        finite: whether all values and gradients are finite.
+        silent: whether the image is empty and every gradient exactly zero.
     """
 
     value: float
@@ -238,10 +239,10 @@ def _value_and_gradient(gaussians, alive, view, weights, cfg, capacity):
 
 
 def _padded(gaussians: Gaussians):
-    """Return the scene with room for others of its size, and which Gaussians are alive."""
+    """Return the Gaussians padded to a multiple of PADDING, and flags of the live ones."""
     n = gaussians.capacity
     padding = -n % PADDING
-    # By numpy: every shape would be a program otherwise.
+    # NumPy pads, because JAX would compile a program for every shape.
     padded = jax.tree.map(
         lambda a: np.pad(np.asarray(a), [(0, padding)] + [(0, 0)] * (np.ndim(a) - 1)), gaussians
     )
@@ -266,14 +267,14 @@ def _splats(gaussians, alive, view, cfg):
 
 
 def _undecided(s: Splats2D, view: Camera, cfg: RenderConfig) -> np.ndarray:
-    """Return per pixel how many splats are too close to the cutoff for float32 to decide."""
+    """Return the number of undecided splats per pixel: too close to the cutoff for float32."""
     x = np.arange(view.width) + 0.5
     y = np.arange(view.height) + 0.5
     counts = np.zeros((view.height, view.width), int)
     cutoff = np.log(cfg.alpha_cutoff)
     arrays = (s.means2d, s.conic_factor, s.log_opacities, s.visible)
-    for m, f, o, shown in zip(*map(np.asarray, arrays), strict=True):
-        if shown:
+    for m, f, o, visible in zip(*map(np.asarray, arrays), strict=True):
+        if visible:
             dx, dy = x[None] - m[0], y[:, None] - m[1]
             e = o - 0.5 * ((f[0] * dx + f[1] * dy) ** 2 + (f[2] * dy) ** 2)
             counts += np.abs(e - cutoff) < UNDECIDED
@@ -293,7 +294,7 @@ def float64_oracle(gaussians: Gaussians, view: Camera, cfg: RenderConfig):
 def gap(case: HardCase, cfg: RenderConfig, oracle=None) -> Gap:
     """Compare one implementation with the float64 oracle on one case.
 
-    `oracle` is what `float64_oracle` returned, where several implementations share it.
+    `oracle` is a result of `float64_oracle` that several implementations share, or None.
     """
     g = case.build()
     truth, v_truth, undecided, brightest = oracle or float64_oracle(g, case.view, cfg)

@@ -1,7 +1,7 @@
 """The whole training step at every level of coarse-to-fine, and indoors.
 
-A fit mostly renders small images of many Gaussians, whose tiles have long lists; full-size views of
-streets do not show that. Each scene here has the population and camera of one level of a fit.
+A fit mostly renders small images of many Gaussians, with long tile lists; full-size views of
+streets do not measure this. Each scene here has the population and camera of one level of a fit.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ SCENES: dict[str, Callable[[], BenchScene]] = {
     "town 1/1": lambda: town_level(1),
     "room": room,
 }
-# A ninth of the pixels and of the Gaussians: lists stay as long.
+# 1/9 of the pixels and of the Gaussians, so that lists have the same length.
 QUICK: dict[str, Callable[[], BenchScene]] = {
     "small town 1/4": lambda: town_level(4, width=160, points=6700),
     "small room": lambda: room(width=160, points=2700),
 }
-# Levels of a quick run whose whole step is timed; a step takes longest to compile.
+# Levels of a quick run with a timed step; the step takes longest to compile.
 QUICK_STEPS = ("small town 1/4",)
-# Metrics that do not depend on the few contributions at the cutoff itself.
+# Metrics without the few contributions exactly at the cutoff.
 GATED = ("relative_99", "gradient_99")
 SHOWN = ("relative", "relative_99", "gradient", "gradient_99")
 
@@ -58,10 +58,10 @@ class Lists(NamedTuple):
     """Lengths of the tile lists of a view.
 
     Attributes:
-        tiles: number of lists.
-        entries: of all.
-        longest: entries of the longest.
-        quantiles: 5, 50 and 95 % of their lengths.
+        tiles: number of tiles.
+        entries: number of entries of all tiles.
+        longest: number of entries of the longest list.
+        quantiles: 5, 50 and 95 % quantiles of the lengths.
     """
 
     tiles: int
@@ -86,14 +86,14 @@ class Level(NamedTuple):
     """One measured scene.
 
     Attributes:
-        scene: its name.
-        gaussians: how many.
-        size: width and height, pixels.
+        scene: name of the scene.
+        gaussians: number of Gaussians.
+        size: width and height of the image, pixels.
         lists: lengths of the tile lists.
-        milliseconds: medians: `forward`, `both` (forward and backward), `step` (the whole training
-            step) where it was asked for.
-        ratios: the same over the reference workload of the same run.
-        numerics: accuracy against the float64 truth under the same cutoff.
+        milliseconds: median times of `forward`, `both` (forward and backward), and optionally
+            `step` (the whole training step).
+        ratios: the same times relative to the reference workload of the run.
+        numerics: accuracy against the float64 truth with the same cutoff.
     """
 
     scene: str
@@ -106,7 +106,7 @@ class Level(NamedTuple):
 
 
 def gate_rows(levels: list[Level]) -> Rows:
-    """Return per scene what the gate compares."""
+    """Return the values that the gate compares, by scene."""
     return {
         level.scene: level.ratios | {f"numerics {k}": level.numerics[k] for k in GATED}
         for level in levels
@@ -114,17 +114,17 @@ def gate_rows(levels: list[Level]) -> Rows:
 
 
 def whole_step(scene: BenchScene, cfg: FitConfig, linear: np.ndarray, entries: int):
-    """Return a function that takes a training step and returns its loss, and one for the fault.
+    """Return a function that runs a training step and returns its loss, and one for the fault.
 
-    The photograph is the scene's image `linear` (H, W, 3) at half the exposure, near what a fit
-    compares with; the tile lists hold `entries` entries. After a fault, steps do nothing.
+    The photograph is the scene's image `linear` (H, W, 3) at half the exposure, similar to one of a
+    fit. The tile list holds `entries` entries. After a fault, steps do nothing.
     """
     ldr = jnp.asarray(np.clip(0.5 * linear, 0, 1) ** (1 / 2.2), jnp.float32)
     batch = Batch(scene.camera, ldr, jnp.ones(linear.shape[:2]), jnp.int32(0))
     alive = jnp.ones(scene.gaussians.capacity, bool)
     params = Params(scene.gaussians, Photometry(jnp.zeros(4), jnp.zeros(4)))
     optimizer = make_optimizer(cfg)
-    # The step donates its state: the scene keeps its own copy.
+    # A step donates its state. The copy lets the scene keep its Gaussians.
     holder = [jax.tree.map(jnp.copy, initial_state(params, alive, optimizer))]
     degree = cfg.render.sh_degree
     controls = Controls(jnp.float32(0.5), jnp.int32(degree), jnp.float32(1), jnp.uint32(0))
@@ -148,13 +148,13 @@ def measure_levels(
 ) -> list[Level]:
     """Time rendering, its gradient and the whole step of every scene; compare with float64.
 
-    The whole step is timed in the scenes named in `steps`, None: in all. `on_progress` is called
+    The whole step is timed for the scenes named in `steps`; None: for all. `on_progress` is called
     with (stage, done, count).
 
     Raises:
         RuntimeError: a step reports a fault.
     """
-    found = []
+    measured = []
     for i, (name, make) in enumerate(scenes.items()):
         on_progress("levels", i, len(scenes))
         scene = make()
@@ -171,7 +171,7 @@ def measure_levels(
             raise RuntimeError(f"a step of {name} failed: fault {fault()}")
         reference = times.pop(REFERENCE)
         exact = truth(scene.gaussians, camera, cfg.render, weights)
-        found.append(
+        measured.append(
             Level(
                 name,
                 scene.gaussians.capacity,
@@ -183,11 +183,11 @@ def measure_levels(
             )
         )
     on_progress("levels", len(scenes), len(scenes))
-    return found
+    return measured
 
 
 def table(levels: list[Level]) -> tuple[list[str], list[list[str]]]:
-    """Return header and rows: what every level asks of the renderer, and what it takes."""
+    """Return header and rows of a table: sizes, times and errors of every level."""
     rows = [
         [
             level.scene,

@@ -1,7 +1,7 @@
 """The float64 image and gradient of a whole scene, and the errors of a float32 render against them.
 
-The dense reference composites every splat at every pixel. A block of pixels only needs the splats
-whose ellipse touches it, so the reference can judge scenes of a hundred thousand splats.
+The dense reference composites every splat at every pixel. A block of pixels needs only the splats
+whose ellipse touches it, so the reference can test scenes of 100,000 splats.
 """
 
 from __future__ import annotations
@@ -21,10 +21,11 @@ from p2gs_jax.render import project, rasterize, view_radiance
 from p2gs_jax.types import Camera, Gaussians, Splats2D
 
 BLOCK = (32, 24)
-# Below this opacity a contribution is far beneath float32's resolution of the image.
+# A smaller alpha contributes far less than float32's resolution of the image.
 NEGLIGIBLE = 1e-9
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
-# Radiances below this part of the image's largest are held to it in relative errors.
+# Relative errors of pixels darker than this share of the largest radiance are relative to that
+# level.
 DARKEST = 1e-4
 
 
@@ -33,7 +34,7 @@ class Truth(NamedTuple):
 
     Attributes:
         linear: radiance, (H, W, 3), float64.
-        gradient: of the sum of `linear` times the cotangent, float64 leaves.
+        gradient: gradient of the sum of `linear` times the cotangent, float64 leaves.
     """
 
     linear: Float[np.ndarray, "h w 3"]
@@ -41,14 +42,14 @@ class Truth(NamedTuple):
 
 
 def untruncated(cfg: RenderConfig) -> RenderConfig:
-    """Return the options under which nothing is left out."""
+    """Return the options without cutoff, stop rule and approximate exponential."""
     return dataclasses.replace(cfg, alpha_cutoff=NEGLIGIBLE, stop_error=None, exp_degree=None)
 
 
 def truth(
     gaussians: Gaussians, camera: Camera, cfg: RenderConfig, cotangent: Float[np.ndarray, "h w 3"]
 ) -> Truth:
-    """Return image and gradient in float64 under the cutoffs of `cfg`, without a stop rule.
+    """Return image and gradient in float64 with the cutoff of `cfg`, without a stop rule.
 
     The gradient is that of the sum of the image times `cotangent`. See `untruncated`.
     """
@@ -86,15 +87,15 @@ def _block(splats: Splats2D, leaves, radiance, origin, v, cfg: RenderConfig):
 
 def _blocks(splats, leaves, radiance, camera, cfg, cotangent):
     means, cov = np.asarray(splats.means2d), np.asarray(splats.cov_diagonal)
-    room = np.asarray(splats.log_opacities) - np.log(cfg.alpha_cutoff)
-    shown = np.asarray(splats.visible) & (room > 0)
-    reach = np.sqrt(2 * np.maximum(room, 0)[:, None] * cov)
-    low, high = means - reach, means + reach
+    reach = np.asarray(splats.log_opacities) - np.log(cfg.alpha_cutoff)
+    visible = np.asarray(splats.visible) & (reach > 0)
+    radius = np.sqrt(2 * np.maximum(reach, 0)[:, None] * cov)
+    low, high = means - radius, means + radius
     width, height = camera.width, camera.height
     linear = np.zeros((height, width, 3))
     totals = [np.zeros(a.shape) for a in (*leaves, radiance)]
     for y in range(0, height, BLOCK[1]):
-        in_row = shown & (high[:, 1] > y) & (low[:, 1] < y + BLOCK[1])
+        in_row = visible & (high[:, 1] > y) & (low[:, 1] < y + BLOCK[1])
         for x in range(0, width, BLOCK[0]):
             chosen = np.flatnonzero(in_row & (high[:, 0] > x) & (low[:, 0] < x + BLOCK[0]))
             if not len(chosen):
@@ -120,7 +121,7 @@ def _blocks(splats, leaves, radiance, camera, cfg, cotangent):
 
 
 def _relative(error: np.ndarray, exact: np.ndarray) -> np.ndarray:
-    """Return the error of each pixel over its brightest channel."""
+    """Return the error of each pixel relative to its brightest channel."""
     brightest = exact.max(-1)
     return error.max(-1) / np.maximum(brightest, DARKEST * brightest.max())
 
@@ -130,9 +131,10 @@ def errors(
 ) -> dict[str, float]:
     """Return the accuracy metrics of a render and its gradient.
 
-    `max_abs` is in linear radiance exposed so that the truth's mean is 0.18; `relative` is the
-    largest error of a pixel over its brightest channel; `psnr` is of the sRGB encoding of the
-    exposed image; `gradient` is the relative L2 error of the worst parameter group.
+    `max_abs` is in linear radiance, exposed so that the mean of the truth is 0.18. `relative` is
+    the largest error of a pixel relative to its brightest channel. `psnr` (dB) compares the sRGB
+    encodings of the exposed images. `gradient` is the relative L2 error of the worst parameter
+    group.
     """
     exact = truth.linear
     exposure = 0.18 / max(float(exact.mean()), 1e-30)
@@ -153,16 +155,16 @@ def errors(
 def trimmed_errors(
     linear: Float[np.ndarray, "h w 3"], gradient: Gaussians, truth: Truth
 ) -> dict[str, float]:
-    """Return accuracy without the worst percent of the pixels and of the Gaussians.
+    """Return accuracy without the worst 1 % of the pixels and of the Gaussians.
 
-    Where many splats meet at a pixel, some contributions lie on the cutoff itself, and float32 and
-    float64 may decide differently; a few of these would dominate the metrics.
+    Where a pixel has many splats, some contributions lie exactly at the cutoff, and float32 and
+    float64 may decide differently. A few of these would dominate the metrics.
     """
     relative = _relative(np.abs(linear - truth.linear), truth.linear)
     groups = []
     for name in FIELDS:
         a, b = np.asarray(getattr(gradient, name), np.float64), getattr(truth.gradient, name)
-        off = np.linalg.norm((a - b).reshape(len(a), -1), axis=1)
-        kept = off[off <= np.quantile(off, 0.99)]
+        error = np.linalg.norm((a - b).reshape(len(a), -1), axis=1)
+        kept = error[error <= np.quantile(error, 0.99)]
         groups.append(np.linalg.norm(kept) / max(np.linalg.norm(b), 1e-30))
     return {"relative_99": float(np.quantile(relative, 0.99)), "gradient_99": float(max(groups))}

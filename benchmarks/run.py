@@ -1,11 +1,11 @@
-"""Measure the renderer: milliseconds against error, and the levels of a fit.
+"""Benchmarks of the renderer: milliseconds against error, and the levels of a fit.
 
 python benchmarks/run.py --quick
 python benchmarks/run.py speed_error levels --quick --baseline experiments/bench/baseline.json
 python benchmarks/run.py levels --set chunk=32 --out runs/bench
 
-Tables go to OUT/bench.md, figures to OUT/bench.json. The exit code is 1 where something is worse
-than the baseline allows, 2 where the arguments are wrong. `hard_cases` is what the tests share.
+OUT/bench.md gets the tables, OUT/bench.json the numbers. The exit code is 1 if a value is worse
+than the baseline allows, and 2 if an argument is not valid. Tests use `hard_cases`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pathlib import Path
 
 import jax
 
-# Benchmarks find each other however they are started.
+# The folder `benchmarks` is importable from any working folder.
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks import gate, levels, speed_error
@@ -35,7 +35,7 @@ PARTS = ("speed_error", "levels")
 
 
 def stamp() -> dict:
-    """Return what a figure depends on besides the code."""
+    """Return the machine and versions on which the numbers depend."""
     return {
         "jax": jax.__version__,
         "backend": jax.default_backend(),
@@ -46,7 +46,7 @@ def stamp() -> dict:
 
 
 def section(title: str, header: list[str], rows: list[list[str]]) -> str:
-    """Return a Markdown table below its title, the first column left, the others right."""
+    """Return a Markdown table with its title; the first column is left-aligned, others right."""
     lines = ["| " + " | ".join(r) + " |" for r in (header, *rows)]
     return "\n".join([f"## {title}\n", lines[0], "|---|" + "---:|" * (len(header) - 1), *lines[1:]])
 
@@ -55,7 +55,7 @@ def run(options: argparse.Namespace, on_progress) -> tuple[str, list[str]]:
     """Run the chosen parts and write `bench.md` and `bench.json`.
 
     Returns:
-        The tables as Markdown, and what is worse than the baseline allows.
+        The tables as Markdown, and a sentence for each value worse than the baseline allows.
 
     Raises:
         UserError: the baseline cannot be used.
@@ -89,21 +89,21 @@ def run(options: argparse.Namespace, on_progress) -> tuple[str, list[str]]:
         data["speed_error"] = [p._asdict() | {"variant": p.variant.name} for p in points]
         gated |= speed_error.gate_rows(points)
     if "levels" in parts:
-        found = of_levels(list(fits))
+        measured = of_levels(list(fits))
         title = "Levels of a fit: rendering and the whole step"
-        sections.append(section(title, *levels.table(found)))
-        data["levels"] = [level._asdict() | {"lists": level.lists._asdict()} for level in found]
-        gated |= levels.gate_rows(found)
+        sections.append(section(title, *levels.table(measured)))
+        data["levels"] = [level._asdict() | {"lists": level.lists._asdict()} for level in measured]
+        gated |= levels.gate_rows(measured)
     if options.write_baseline:
         gate.write_baseline(options.write_baseline, gated)
     if options.baseline:
 
-        def anew(names: list[str]) -> gate.Rows:
+        def measure(names: list[str]) -> gate.Rows:
             slow = [v for v in variants if v.name in names]
             rows = speed_error.gate_rows(of_variants(slow)) if slow else {}
             return rows | levels.gate_rows(of_levels([k for k in names if k in fits]))
 
-        complaints = gate.settle(options.baseline, gated, anew)
+        complaints = gate.settle(options.baseline, gated, measure)
     text = "\n\n".join(sections) + "\n"
     write_text(options.out / "bench.md", text)
     write_json(options.out / "bench.json", data)
@@ -121,16 +121,16 @@ def _field(text: str) -> tuple[str, object]:
 
 
 def options_of(arguments: Sequence[str] | None = None) -> argparse.Namespace:
-    """Return the parsed arguments; exits with 2 where they are wrong."""
+    """Return the parsed arguments; arguments that are not valid exit with code 2."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add = parser.add_argument
-    add("parts", nargs="*", help=f"{', '.join(PARTS)}; none named runs all", metavar="PART")
-    add("--out", type=Path, default=Path("runs/bench"), help="folder for tables and figures")
-    add("--quick", action="store_true", help="fewer and smaller: two minutes, not half an hour")
+    add("parts", nargs="*", help=f"{', '.join(PARTS)}; default: all", metavar="PART")
+    add("--out", type=Path, default=Path("runs/bench"), help="folder for tables and numbers")
+    add("--quick", action="store_true", help="fewer and smaller scenes: 2 instead of 30 minutes")
     add("--baseline", type=Path, help="compare speed_error and levels with this file")
-    add("--write-baseline", type=Path, help="write what speed_error and levels measured")
+    add("--write-baseline", type=Path, help="write the values of speed_error and levels to a file")
     add(
         "--set",
         type=_field,
@@ -141,9 +141,9 @@ def options_of(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     )
     options = parser.parse_args(arguments)
     if unknown := set(options.parts) - set(PARTS):
-        parser.error(f"there is no part {unknown.pop()!r}; choose {', '.join(PARTS)}")
+        parser.error(f"{unknown.pop()!r} is not a valid part; choose {', '.join(PARTS)}")
     if options.baseline and not options.baseline.is_file():
-        parser.error(f"there is no file {options.baseline}: make one with --write-baseline")
+        parser.error(f"the file {options.baseline} does not exist: write one with --write-baseline")
     return options
 
 

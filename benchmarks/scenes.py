@@ -1,9 +1,9 @@
 """Scenes: streets of splats, and the populations and cameras of a fit's levels.
 
-No fit is run and no file read. A town's surfaces are sampled where the drive's cameras see them and
-become Gaussians as seeds do at the start of a fit; opacities, sizes, shapes and colours are then
-changed, in part or wholly, to the statistics measured on a finished fit. The room has layers of
-splats that hide little, as fits of indoor captures do.
+The scenes need neither a fit nor a file. A town's surfaces are sampled where the drive's cameras
+see them, and become Gaussians like the seeds of a fit. Opacities, sizes, shapes and colours are
+then moved, partly or wholly, to the statistics measured on a finished fit. The room has layers of
+splats of low opacity, like fits of indoor captures.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ def street(
 ) -> BenchScene:
     """Return a canyon of ground, walls and backdrop: most splats near its surface, some behind.
 
-    `radius` is the median radius at the 1/255 cutoff, pixels, and `spread` the standard deviation
-    of its logarithm.
+    `radius` is the median radius at the alpha cutoff of 1/255, pixels; `spread` is the standard
+    deviation of its logarithm.
     """
     rng = np.random.default_rng(0)
     focal = 0.75 * width
@@ -70,7 +70,7 @@ def street(
     means = np.stack([dx * z, dy * z, z], -1)
     quats = rng.normal(size=(count, 4))
     sh = rng.normal(0, 0.1, (count, (degree + 1) ** 2, 3))
-    # exp(C0 sh0) is the radiance seen from everywhere.
+    # exp(C0 sh0) is the radiance without the higher degrees.
     sh[:, 0] = log_radiance / C0
     leaves = (means, quats, log_scales, logits, sh)
     gaussians = Gaussians(*(jnp.asarray(a, jnp.float32) for a in leaves))
@@ -80,21 +80,22 @@ def street(
 
 
 FRAMES, SEEN_PER_CAMERA = 30, 6
-FARTHEST = 90.0  # m, as of the seed points of `synth`
+FARTHEST = 90.0  # largest distance of points, m, as for the seed points of `synth`
 GROUND_ALBEDO, AMBIENT = 0.12, 0.35
-# State of a fit at each level of coarse-to-fine: 0 are the seeds, 1 is the end.
-WAY = {4: 0.25, 2: 0.6, 1: 1.0}
+# Progress of a fit at each level of coarse-to-fine: 0 are the seeds, 1 is the end.
+PROGRESS = {4: 0.25, 2: 0.6, 1: 1.0}
 
-# After 700 steps on 90 photographs of a town of 480x325 from 59,908 seeds (`synth --seed 3`): of
-# the 75k Gaussians, quantiles 5, 25, 50, 75, 95 % of the opacity 0.007 0.02 0.12 0.31 0.78.
-# Gaussians over seeds:
+# The next statistics were measured after 700 steps on 90 photographs of 480x325 pixels of a town,
+# from 59,908 seeds (`synth --seed 3`). The quantiles 5, 25, 50, 75 and 95 % of the opacity of the
+# 75,000 Gaussians were 0.007, 0.02, 0.12, 0.31 and 0.78.
+# Number of Gaussians relative to seeds:
 GROWN = 1.25
-# Mean and standard deviation of the opacity's logit, and of the log of the largest standard
-# deviation over the distance to the neighbours:
+# Mean and standard deviation of the opacity logit, and of the log of the largest scale relative to
+# the distance of the neighbours:
 LOGIT, LARGE = (-2.1, 1.9), (0.05, 0.6)
-# Part of the Gaussians that relocation has made smaller, and by how much (log):
+# Share of the Gaussians that relocation has shrunk, and the change of their log scale:
 SHRUNK = (0.25, -0.8)
-# Mean ratios (log) of largest to middle and middle to smallest axis:
+# Mean log ratios of largest to middle and of middle to smallest scale:
 GAPS = (0.6, 0.55)
 # Median size of the coefficients above degree 0, and its spread (log):
 SH = (0.023, 0.9)
@@ -104,13 +105,13 @@ def town_level(shrink: int, *, width: int = 480, points: int = 60_000) -> BenchS
     """Return a town with the population and camera of one level of coarse-to-fine.
 
     Args:
-        shrink: factor by which the photographs are smaller there: 4, 2 or 1.
-        width: of the photographs, pixels.
-        points: seeds.
+        shrink: factor by which the level shrinks photographs: 4, 2 or 1.
+        width: width of the photographs, pixels.
+        points: number of seeds.
     """
     views = _drive_views(width)
     xyz, radiance = _surface_points(width, points)
-    gaussians = _along_a_fit(xyz, radiance, views, WAY[shrink])
+    gaussians = _along_a_fit(xyz, radiance, views, PROGRESS[shrink])
     view = next(v for v in views if v.name == "front/000001.png")
     size = max(round(view.width / shrink), 1), max(round(view.height / shrink), 1)
     K = np.diag([size[0] / view.width, size[1] / view.height, 1.0]) @ view.K
@@ -118,11 +119,13 @@ def town_level(shrink: int, *, width: int = 480, points: int = 60_000) -> BenchS
     return BenchScene(f"town 1/{shrink}", gaussians, camera)
 
 
-def _along_a_fit(xyz: np.ndarray, radiance: np.ndarray, views: list[View], way: float) -> Gaussians:
-    """Return seeds as a fit has changed them on its way from the start, 0, to the end, 1."""
+def _along_a_fit(
+    xyz: np.ndarray, radiance: np.ndarray, views: list[View], progress: float
+) -> Gaussians:
+    """Return Gaussians like those of a fit at this progress, from 0 (the seeds) to 1 (the end)."""
     rng = np.random.default_rng([3, 1])
     start = gaussians_from_points(xyz, radiance, views, FitConfig())
-    clones = rng.choice(len(xyz), round(way * (GROWN - 1) * len(xyz)))
+    clones = rng.choice(len(xyz), round(progress * (GROWN - 1) * len(xyz)))
     leaves = {
         f.name: np.asarray(getattr(start, f.name), np.float64)[np.r_[: len(xyz), clones]]
         for f in dataclasses.fields(start)
@@ -135,13 +138,13 @@ def _along_a_fit(xyz: np.ndarray, radiance: np.ndarray, views: list[View], way: 
     large[shrunk] += SHRUNK[1] + rng.normal(0, 1, int(shrunk.sum()))
     gaps = [rng.exponential(mean, count) for mean in GAPS]
     axes = large - np.stack([np.zeros(count), gaps[0], gaps[0] + gaps[1]])
-    leaves["log_scales"] = near[:, None] + way * rng.permuted(axes.T, axis=1)
-    leaves["opacity_logits"] += way * (logit - leaves["opacity_logits"])
-    leaves["quats"] = leaves["quats"] + way * rng.normal(size=(count, 4))
-    # Off the surface by part of the Gaussian's size, and more where relocation has put it.
-    leaves["means"] += way * 0.5 * np.exp(near)[:, None] * rng.normal(size=(count, 3))
+    leaves["log_scales"] = near[:, None] + progress * rng.permuted(axes.T, axis=1)
+    leaves["opacity_logits"] += progress * (logit - leaves["opacity_logits"])
+    leaves["quats"] = leaves["quats"] + progress * rng.normal(size=(count, 4))
+    # Means leave the surface by a share of the distance of the neighbours.
+    leaves["means"] += progress * 0.5 * np.exp(near)[:, None] * rng.normal(size=(count, 3))
     size = SH[0] * np.exp(rng.normal(0, SH[1], (count, 1, 1)))
-    leaves["sh"][:, 1:] = way * size * rng.normal(size=leaves["sh"][:, 1:].shape)
+    leaves["sh"][:, 1:] = progress * size * rng.normal(size=leaves["sh"][:, 1:].shape)
     arrays = {k: jnp.asarray(v, jnp.float32) for k, v in leaves.items()}
     return Gaussians(**arrays)  # pyright: ignore[reportArgumentType]
 
@@ -163,14 +166,14 @@ def _drive_views(width: int) -> list[View]:
 
 @functools.lru_cache(maxsize=2)
 def _surface_points(width: int, points: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return first hits at random pixels of the drive's views and their radiance."""
+    """Return the surface points at random pixels of the drive's views, and their radiance."""
     town, rng = build_town(3, "town"), np.random.default_rng([3, 0])
     views = _drive_views(width)[:: FRAMES // SEEN_PER_CAMERA]
     each = -(-points // len(views))
     xyz, radiance = [], []
     for view in views:
         R, t = view.viewmat[:3, :3].astype(np.float64), view.viewmat[:3, 3].astype(np.float64)
-        # Rays to the sky are dropped; enough others remain.
+        # Rays to the sky are dropped; twice as many rays as points leave enough.
         pixels = rng.uniform((0, 0), (view.width, view.height), (2 * each, 2))
         rays = np.c_[pixels, np.ones(len(pixels))] @ np.linalg.inv(view.K.astype(np.float64)).T
         origin, direction = -R.T @ t, rays @ R
@@ -187,7 +190,7 @@ def _surface_points(width: int, points: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _in_view(town: Town, view: View) -> np.ndarray:
-    """Return the primitives that are not wholly behind the camera or beside its view."""
+    """Return the rows of the primitives that are not wholly outside of a view."""
     corner = np.indices((2, 2, 2)).reshape(3, 8).T[:, None]
     corners = np.where(corner, town.hi, town.lo) @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
     x, _, z = np.moveaxis(corners, -1, 0)
@@ -197,9 +200,10 @@ def _in_view(town: Town, view: View) -> np.ndarray:
 
 
 def _first_hits(town: Town, origin: np.ndarray, direction: np.ndarray, among: np.ndarray):
-    """Return distances along rays (inf: sky), rows of the primitives `among`, and normals.
+    """Return distances along rays (inf: sky), rows of the primitives hit, and normals.
 
-    Every primitive is taken as its bounding box: only number and size in the view matter.
+    Only the primitives `among` count. Each is replaced by its bounding box, because only number and
+    size in the view matter.
     """
     safe = np.where(np.abs(direction) < 1e-9, 1e-9, direction)
     with np.errstate(divide="ignore"):
@@ -217,7 +221,7 @@ def _first_hits(town: Town, origin: np.ndarray, direction: np.ndarray, among: np
     return best, row, normal
 
 
-# Corners, m: of the room, and of its furniture.
+# Corners of the room and of its furniture, m.
 ROOM = ((-3.0, -2.0, 0.0), (3.0, 2.0, 2.6))
 FURNITURE = (
     ((-0.6, -0.5, 0.0), (0.9, 0.5, 0.75)),  # table
@@ -228,13 +232,13 @@ FURNITURE = (
     ((0.9, -0.2, 0.75), (1.1, 0.0, 1.2)),  # lamp
 )
 LAYERS, LAYER_M = 4, 0.06
-DETAIL = 2.5  # Gaussians on furniture, an area, over those on walls
+DETAIL = 2.5  # density of Gaussians on furniture relative to walls
 
 
 def room(*, width: int = 500, points: int = 24_000) -> BenchScene:
-    """Return a closed room from inside: long lists of splats that hide little.
+    """Return a closed room from inside, with long tile lists of splats of low opacity.
 
-    The image is `width` pixels wide and three quarters of it high; `points` Gaussians.
+    The image has `width` x 0.75 `width` pixels; the room has `points` Gaussians.
     """
     rng = np.random.default_rng([0, 2])
     boxes = np.array([ROOM, *FURNITURE])
@@ -247,7 +251,7 @@ def room(*, width: int = 500, points: int = 24_000) -> BenchScene:
     xyz = boxes[box, 0] + rng.random((points, 3)) * size[box]
     rows = np.arange(points)
     xyz[rows, axis] = boxes[box, side, axis]
-    # Behind the surface: outside of the room, inside of the furniture.
+    # Layers lie behind the surface: outside of the room, inside of the furniture.
     outwards = np.where(box == 0, 1, -1) * np.where(side == 1, 1, -1)
     xyz[rows, axis] += outwards * LAYER_M * rng.integers(0, LAYERS, points)
     shade = np.exp(rng.normal(-1.5, 0.5, len(weight)))[face, None]
@@ -270,7 +274,7 @@ def room(*, width: int = 500, points: int = 24_000) -> BenchScene:
 
 
 def _room_view(width: int) -> View:
-    """Return the view from a corner to the opposite one."""
+    """Return the view from a corner to the opposite corner."""
     height, focal = round(0.75 * width), 0.8 * width
     center, target = np.array([-2.7, 1.7, 1.5]), np.array([1.5, -0.5, 0.9])
     forward = (target - center) / np.linalg.norm(target - center)

@@ -1,4 +1,4 @@
-"""Milliseconds against error, over every knob of the kernel."""
+"""Milliseconds against error, for every option of the kernel."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from p2gs_jax.render.capacity import bucket, count_needed
 from p2gs_jax.render.xla_cpu import compiler_options
 
 REFERENCE = "reference workload"
-# Variants compiled and timed together: a few, so that programs fit in memory.
+# Number of variants compiled and timed together, small enough that programs fit in memory.
 BATCH = 8
 
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """One setting of one knob.
+    """One value of one option.
 
     Attributes:
-        knob: name of the varied option.
-        setting: its value, in words.
-        changes: fields of `RenderConfig`.
+        knob: name of the option.
+        setting: its value as text.
+        changes: changed fields of `RenderConfig`.
     """
 
     knob: str
@@ -49,7 +49,7 @@ def _knob(knob: str, field: str, *values, label: Callable[[Any], str] = str) -> 
 
 
 DEFAULT = Variant("default", "")
-# Sorting is what a GPU does, and its time on a CPU is nobody's: only the long table has it.
+# GPUs bin by sorting. Its time on a CPU matters to nobody, so only the long table has it.
 QUICK = (DEFAULT, Variant("stop", "none", (("stop_error", None),)))
 VARIANTS = (
     DEFAULT,
@@ -75,13 +75,13 @@ class MeasuredVariant(NamedTuple):
     """One measured variant.
 
     Attributes:
-        variant: what was measured.
-        milliseconds: medians, `forward` and `both` (forward and backward).
-        ratios: the same over the reference workload of the same run.
+        variant: the variant.
+        milliseconds: median times of `forward` and `both` (forward and backward).
+        ratios: the same times relative to the reference workload of the run.
         error: accuracy metrics against the untruncated float64 truth.
-        numerics: the same under the default cutoff, where the variant does not change it.
-        entries: tile-list entries.
-        temporaries: bytes that forward and backward need beside inputs and outputs.
+        numerics: the same metrics with the default cutoff; None if the variant changes it.
+        entries: number of tile-list entries.
+        temporaries: bytes that forward and backward need besides inputs and outputs.
     """
 
     variant: Variant
@@ -96,9 +96,9 @@ class MeasuredVariant(NamedTuple):
 def interleaved(jobs: Mapping[str, Callable[[], Any]], repeats: int = 7) -> dict[str, float]:
     """Return the median wall time of each job, milliseconds.
 
-    The jobs run in turns, so that a machine that slows down slows all, and each runs untimed
-    first in every turn, so that it does not pay for the memory and caches of the one before (a
-    small job after a large one read 2-3 times its time).
+    The jobs run in turns, so that a machine that slows down slows all jobs. In every turn a job
+    first runs untimed, because the previous job has changed memory and caches (without this, a
+    small job after a large one took 2 to 3 times as long).
     """
     times: dict[str, list[float]] = {name: [] for name in jobs}
     for _ in range(repeats):
@@ -111,9 +111,9 @@ def interleaved(jobs: Mapping[str, Callable[[], Any]], repeats: int = 7) -> dict
 
 
 def reference_workload() -> Callable[[], jax.Array]:
-    """Return work that uses a machine as rendering does: exponentials, products, gathers.
+    """Return work that uses a machine like rendering: exponentials, products, gathers.
 
-    Times are divided by this one's, so that a gate means the same on a slower machine.
+    Times are divided by the time of this work, so that the gate is valid on slower machines.
     """
     x = jax.random.normal(jax.random.key(0), (1 << 21,))
     index = jax.random.permutation(jax.random.key(1), 1 << 21)
@@ -127,7 +127,7 @@ def reference_workload() -> Callable[[], jax.Array]:
 
 
 def cotangent(scene: BenchScene) -> np.ndarray:
-    """Return the random weights (H, W, 3) whose weighted sum of the image is differentiated."""
+    """Return random weights (H, W, 3); the weighted sum of the image is differentiated."""
     shape = (scene.camera.height, scene.camera.width, 3)
     return np.random.default_rng(0).normal(size=shape).astype(np.float32) / np.prod(shape[:2])
 
@@ -136,13 +136,13 @@ def programs(scene: BenchScene, variant: Variant, base: RenderConfig, weights: n
     """Compile one variant.
 
     Returns:
-        Forward and forward-and-backward as functions of no arguments, the entries, and the bytes of
-        temporaries of forward-and-backward.
+        Functions without arguments for forward, and for forward and backward; the number of
+        entries; and the bytes of temporaries of forward and backward.
     """
     cfg = dataclasses.replace(base, **dict(variant.changes))
     gaussians, alive = scene.gaussians, jnp.ones(scene.gaussians.capacity, bool)
-    need = int(count_needed(gaussians, alive, scene.camera, cfg=cfg))
-    capacity = bucket(need)
+    entries = int(count_needed(gaussians, alive, scene.camera, cfg=cfg))
+    capacity = bucket(entries)
 
     def linear(g):
         return render_linear(g, alive, scene.camera, cfg, capacity, with_depth=False).linear
@@ -157,11 +157,11 @@ def programs(scene: BenchScene, variant: Variant, base: RenderConfig, weights: n
     both = both.lower(gaussians).compile()
     memory: Any = both.memory_analysis()
     temporaries = 0 if memory is None else int(memory.temp_size_in_bytes)
-    return (lambda: forward(gaussians)), (lambda: both(gaussians)), need, temporaries
+    return (lambda: forward(gaussians)), (lambda: both(gaussians)), entries, temporaries
 
 
 def sweep_scene(quick: bool) -> BenchScene:
-    """Return a street of degree 3, with about five stops of contrast."""
+    """Return a street of degree 3, with a contrast of about 5 stops."""
     if quick:
         return street(4000, 256, 144, radius=6.0, degree=3)
     return street(20_000, 640, 360, radius=4.0, spread=1.1, degree=3)
@@ -193,7 +193,7 @@ def measure_speed_error(
             jobs[f"{v.name} forward"], jobs[f"{v.name} both"] = forward, both
         times = interleaved(jobs, repeats)
         for v in batch:
-            need, temporaries = facts[v.name]
+            entries, temporaries = facts[v.name]
             gradient, linear = jax.tree.map(np.asarray, jobs[f"{v.name} both"]())
             linear = linear.astype(np.float64)
             rules = "alpha_cutoff" not in dict(v.changes)
@@ -201,15 +201,16 @@ def measure_speed_error(
             ratios = {k: t / times[REFERENCE] for k, t in ms.items()}
             error = errors(linear, gradient, whole)
             numerics = errors(linear, gradient, same_rules) if rules else None
-            points.append(MeasuredVariant(v, ms, ratios, error, numerics, need, temporaries))
+            points.append(MeasuredVariant(v, ms, ratios, error, numerics, entries, temporaries))
     on_progress("variants", len(variants), len(variants))
     return points
 
 
 def gate_rows(points: list[MeasuredVariant]) -> Rows:
-    """Return per variant what the gate compares.
+    """Return the values that the gate compares, by variant.
 
-    The total error includes the rules' cutoffs; `numerics ...` is the implementation's own error.
+    The total error includes the effect of the cutoff; `numerics ...` is the error of the
+    implementation alone.
     """
     return {
         p.variant.name: {**p.error, **p.ratios}
@@ -219,7 +220,7 @@ def gate_rows(points: list[MeasuredVariant]) -> Rows:
 
 
 def table(points: list[MeasuredVariant]) -> tuple[list[str], list[list[str]]]:
-    """Return header and rows; a star marks points that no other beats in both time and error."""
+    """Return header and rows; a star marks variants that no other beats in both time and error."""
     rows = []
     for p in points:
         beaten = any(
@@ -244,7 +245,7 @@ def table(points: list[MeasuredVariant]) -> tuple[list[str], list[list[str]]]:
 
 
 def number(metric: str, values: Mapping[str, float]) -> str:
-    """Return one value as a table shows it; empty where it was not measured."""
+    """Return one value as text for a table; empty if it was not measured."""
     if metric not in values:
         return ""
     return f"{values[metric]:.1f}" if metric == "psnr" else f"{values[metric]:.1e}"
