@@ -97,8 +97,8 @@ def interleaved(jobs: Mapping[str, Callable[[], Any]], repeats: int = 7) -> dict
     """Return the median wall time of each job, milliseconds.
 
     The jobs run in turns, so that a machine that slows down slows all jobs. In every turn a job
-    first runs untimed, because the previous job has changed memory and caches (without this, a
-    small job after a large one took 2 to 3 times as long).
+    first runs untimed, because the previous job has changed memory and caches. Without this, a
+    small job after a large one took 2 to 3 times as long.
     """
     times: dict[str, list[float]] = {name: [] for name in jobs}
     for _ in range(repeats):

@@ -47,7 +47,7 @@ LARGEST_STRETCH = 3.0
 SAME_DEPTH = 0.05
 # Cells with more texture than this quantile are divided into four.
 PLAIN = 0.5
-# The number of seeds meets the limit within this share, or after so many attempts.
+# The number of seeds must meet the limit within SLACK; at most ATTEMPTS cell sizes are tried.
 SLACK, ATTEMPTS = 0.05, 5
 # Largest share of a time budget for dense seeds; seconds per view on two idle cores; fewest views.
 DENSE_TIME, DENSE_SECONDS, FEWEST_DENSE_VIEWS = 0.25, 0.6, 8

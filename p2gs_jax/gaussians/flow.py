@@ -225,8 +225,8 @@ def plane_fit(inverse: Float[np.ndarray, "h w"], valid: Bool[np.ndarray, "h w"])
     """Fit a plane to the valid inverse depths around every pixel, which are linear on planes.
 
     Returns:
-        Inverse depth of the plane at the pixel, its slope per pixel [h w 2], whether the window
-        lies in the plane, and the share of the window that is valid.
+        Inverse depth of the plane at the pixel; its slope per pixel [h w 2]; whether the window
+        lies in the plane; the share of the window that is valid.
     """
     height, width = inverse.shape
     w = valid.astype(np.float64)

@@ -48,7 +48,7 @@ class Nodes(NamedTuple):
 
 def find_nodes(scene: Scene, cfg: DynamicsConfig) -> Nodes | None:
     """Return the seeds of the moving objects of a scene; None if it has none."""
-    moving = [row for row, thing in enumerate(scene.objects) if thing.moving]
+    moving = [row for row, tracked in enumerate(scene.objects) if tracked.moving]
     views, empty = scene.training_views, np.zeros((0, 3), np.float32)
     if cfg.method != "rigid" or not moving:
         return None
@@ -58,16 +58,16 @@ def find_nodes(scene: Scene, cfg: DynamicsConfig) -> Nodes | None:
         return Nodes(MovingObjects(()), empty, np.zeros(0, np.int32), left, (note,))
     kept, left, points, filled = [], [], [], 0
     for row in moving:
-        thing = scene.objects[row]
-        measured = _measured(thing, row, scene.lidar, cfg)
+        tracked = scene.objects[row]
+        measured = _measured(tracked, row, scene.lidar, cfg)
         enough = scene.lidar is None or len(measured) >= cfg.least_points
-        if not enough or _views_that_show(thing, views, cfg) < cfg.least_views:
-            left.append(thing)
+        if not enough or _views_that_show(tracked, views, cfg) < cfg.least_views:
+            left.append(tracked)
             continue
         if len(measured) < cfg.few_points:
-            measured = np.concatenate([measured, on_surface(thing.size, cfg.few_points)])
+            measured = np.concatenate([measured, on_surface(tracked.size, cfg.few_points)])
             filled += 1
-        kept.append(thing)
+        kept.append(tracked)
         points.append(measured.astype(np.float32))
     owner = np.repeat(np.arange(len(kept), dtype=np.int32), [len(p) for p in points])
     note = f"{len(kept)} moving objects have separate Gaussians, with {len(owner)} seeds"
@@ -134,16 +134,16 @@ def on_surface(size: tuple[float, float, float], count: int) -> Float[np.ndarray
 
 
 def _measured(
-    thing: TrackedObject, row: int, lidar: Lidar | None, cfg: DynamicsConfig
+    tracked: TrackedObject, row: int, lidar: Lidar | None, cfg: DynamicsConfig
 ) -> Float[np.ndarray, "p 3"]:
     """Return the laser points of all sweeps on an object, in the frame of its box, thinned."""
     if lidar is None:
         return np.zeros((0, 3))
     hits = lidar.objects == row
-    poses, there = interpolated(thing.times, thing.poses, lidar.times[hits])
+    poses, there = interpolated(tracked.times, tracked.poses, lidar.times[hits])
     points = lidar.points[hits].astype(np.float64) - poses[:, :3, 3]
     local = np.einsum("nij,nj->ni", inverse(poses)[:, :3, :3], points)
-    half = np.asarray(thing.size) / 2
+    half = np.asarray(tracked.size) / 2
     inside = there & (np.abs(local) <= half + OUTSIDE).all(1) & (local[:, 2] > GROUND - half[2])
     local, side = local[inside], cfg.voxel
     while len(local):
@@ -155,13 +155,13 @@ def _measured(
     return local
 
 
-def _views_that_show(thing: TrackedObject, views: Sequence[View], cfg: DynamicsConfig) -> int:
+def _views_that_show(tracked: TrackedObject, views: Sequence[View], cfg: DynamicsConfig) -> int:
     """Return the number of views that show an object large enough; counting stops when enough."""
     times = np.array([view.time for view in views], float)
-    poses, there = interpolated(thing.times, thing.poses, times)
+    poses, there = interpolated(tracked.times, tracked.poses, times)
     count = 0
     for view, pose in ((views[int(i)], poses[i]) for i in np.flatnonzero(there)):
-        outline = outline_of(pose, thing.size, view, margin=0.0)
+        outline = outline_of(pose, tracked.size, view, margin=0.0)
         if outline is None:
             continue
         height = max(1, round(AREA_WIDTH * view.height / view.width))

@@ -25,7 +25,7 @@ NEIGHBOURS = 3
 # 3DGS: the scene extent is 1.1 times the radius of the camera centres.
 EXTENT_MARGIN = 1.1
 MIN_RADIANCE = 1e-3
-# At most this share of the cameras counts as misplaced; each is so many times farther away than the
+# At most the share FEW of the cameras counts as misplaced; each is FARTHER times as far away as the
 # next nearer camera.
 FEW, FARTHER = 0.05, 20.0
 # Largest distance of seeds and Gaussians from the cameras, as a multiple of the cameras' radius or

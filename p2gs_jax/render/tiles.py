@@ -125,8 +125,8 @@ def geometry_gradient(
     """Return the gradient by the first six columns of a row, from moments over a tile.
 
     `moments` are the sums, over the tile's pixels, of the gradient by the exponent times 1, x, y,
-    x^2, x y, y^2, with x and y from the tile's centre. `factor` is a11, a12, a22. `center` holds u,
-    v, and the offsets x and y from the mean, at the tile's centre. `scale` is the plan's
+    x^2, x y and y^2; x and y start at the tile's centre. `factor` is a11, a12, a22. `center` holds
+    u, v, and the offsets x and y from the mean, at the tile's centre. `scale` is the plan's
     `exponent_scale`.
     """
     m1, mx, my, mxx, mxy, myy = moments
@@ -226,7 +226,7 @@ def rasterize(
         linear, alpha, depth = rasterize_reference(splats, radiance, width, height, cfg)
         return linear, alpha, depth if with_depth else None
     if name not in ("xla", "pallas"):
-        raise ValueError(f"there is no rasterizer {name!r}; choose 'reference', 'xla' or 'pallas'")
+        raise ValueError(f"{name!r} is not a valid rasterizer: choose reference, xla or pallas")
     if tiles is None:
         raise ValueError(f"the {name} rasterizer needs a tile list: pass bin_tiles(...)")
     across, down = grid_size(width, height, cfg.tile)

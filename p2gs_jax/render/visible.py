@@ -202,9 +202,9 @@ def splat_listed(
 
     def block(k):
         here = slice_of(ids, k, size)
-        shown = alive.at[here].get(mode="fill", fill_value=False)
+        live = alive.at[here].get(mode="fill", fill_value=False)
         block = take_rows(gaussians, here, bands)
-        return splat(block, shown, camera, cfg, active_degree, owners_at(owner, here))
+        return splat(block, live, camera, cfg, active_degree, owners_at(owner, here))
 
     def body(k, out):
         return jax.tree.map(

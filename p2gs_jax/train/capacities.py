@@ -118,9 +118,8 @@ def allocate(
 ) -> Capacities:
     """Return capacities for all image sizes of the levels `shrinks`.
 
-    The sizes in `capacities` keep theirs. A capacity in `begun`, for which programs are compiled
-    already, is used if it suffices. `limit` is the largest later population; for `owner` see
-    `count_view`.
+    Existing `capacities` stay. A capacity in `begun`, for which programs are compiled already, is
+    used if it suffices. `limit` is the largest later population; for `owner` see `count_view`.
     """
     found = dict(capacities)
     gaussians, host_alive = jax.tree.map(np.asarray, (gaussians, alive))

@@ -105,8 +105,8 @@ class TrainingStep:
         batch = Batch(camera, jnp.asarray(photograph), mask, jnp.int32(view))
         controls = controls_at(progress, self._host.pace, 1.0, cfg)
         if size not in self._capacities:
-            on_device = (state.params.gaussians, state.population.alive, camera)
-            gaussians, alive, at = jax.tree.map(np.asarray, on_device)
+            arrays = (state.params.gaussians, state.population.alive, camera)
+            gaussians, alive, at = jax.tree.map(np.asarray, arrays)
             scene = (gaussians, alive, [at], self._slots.most)
             self._capacities[size] = capacity_for(*scene, cfg.render)
         while True:

@@ -177,10 +177,10 @@ def update_listed(
 
     def body(k, state: Updated) -> Updated:
         here = slice_of(ids, k, size)
-        shown = alive.at[here].get(mode="fill", fill_value=False)
-        mine = owners_at(owner, here)
+        live = alive.at[here].get(mode="fill", fill_value=False)
+        owners = owners_at(owner, here)
         old = take_rows(state.gaussians, here, bands)
-        _, pull = jax.vjp(lambda block: seen(block, shown, mine), old)
+        _, pull = jax.vjp(lambda block: seen(block, live, owners), old)
         (grads,) = pull(slice_of(v_seen, k, size))
         finite = jnp.stack([jnp.all(jnp.isfinite(g)) for g in jax.tree.leaves(grads)])
         before = optimizers.AdamState(
@@ -190,7 +190,7 @@ def update_listed(
         )
         moved, new = adam.update(grads, before, old, rates)
         if noise is not None:
-            moved = dataclasses.replace(moved, means=moved.means + noise(k, here, moved, shown))
+            moved = dataclasses.replace(moved, means=moved.means + noise(k, here, moved, live))
         where = jnp.where(healthy & jnp.all(finite), here, n)
         return Updated(
             put_rows(state.gaussians, where, moved),
