@@ -1,8 +1,8 @@
-"""Renders of other programs, judged as a run is: the same views, masks and scores.
+"""Renders of other programs, evaluated like a run: the same views, masks and scores.
 
-A program that knows no exposures is compared by `as_rendered`, as the field does it, and by
-`exposure_fitted`, which gives it what held-out views of a run get: one scalar a view, applied to
-the radiance that its pictures show under the run's usual display.
+There are two protocols: `as_rendered` scores the pictures unchanged, as published comparisons do;
+`exposure_fitted` fits one exposure per view, as for held-out views of a run. It scales the radiance
+that the pictures show under the run's usual display.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from p2gs_jax.photometry.formation import LEAST_ALPHA
 from p2gs_jax.scene.pixels.decode import floats
 from p2gs_jax.scene.pixels.store import ImageStore
 
-# Protocols of a run that are set beside those of other programs.
+# Protocols of a run that correspond to those of other programs.
 OWN = ("averaged", "exposure_fitted")
 
 
 def check_renders(found: OtherRenders, store: ImageStore) -> OtherRenders:
-    """Read all renders once, so that what is wrong with them is said before anything long.
+    """Read all renders once, so that errors appear before long computations.
 
     Raises:
         UserError: see `OtherRenders.read`.
@@ -47,8 +47,8 @@ def judge_renders(
     """Return the scores of renders of held-out views, from `check_renders`.
 
     Returns:
-        `as_rendered` and `exposure_fitted`, as the protocols of `metrics.json`; where there are
-        reference photographs `reference` with `as_rendered` and `scale_aligned`.
+        `as_rendered` and `exposure_fitted`, as the protocols of `metrics.json`; with reference
+        photographs also `reference` with `as_rendered` and `scale_aligned`.
 
     Raises:
         UserError: see `OtherRenders.read`.
@@ -91,7 +91,7 @@ def judge_renders(
 def _against_reference(
     rows: list[int], judge: Judge, light: Callable[[int], Light]
 ) -> dict[str, Any]:
-    """Score renders against the photographs of one common exposure that these views have."""
+    """Score renders of views against their reference photographs of one common exposure."""
     assert judge.reference is not None
 
     def score(row: int, ldr) -> dict[str, Any]:
@@ -122,30 +122,30 @@ def own_scores(metrics: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
 
 
 class Light(NamedTuple):
-    """What a render shows, so that it can be shown under another exposure."""
+    """Radiance of a render, from which pictures under other exposures follow."""
 
     linear: Float32[np.ndarray, "h w 3"]  # radiance, premultiplied by `alpha`
-    shown: DisplayTransform  # how it becomes the picture
+    shown: DisplayTransform  # transform from the radiance to the picture
     picture: Float32[np.ndarray, "h w 3"]  # display values
-    # opacity, over the backdrop of `shown`; None: it is over nothing
+    # opacity, over the backdrop of `shown`; None: there is no backdrop
     alpha: Float32[np.ndarray, "h w"] | None
 
     def fitted(
         self, photograph: Float32[np.ndarray, "h w 3"], mask: Float32[np.ndarray, "h w"]
     ) -> DisplayTransform:
-        """Return how it is shown under the exposure that fits a photograph best."""
+        """Return its display transform with the exposure that fits a photograph best."""
         return with_fitted_exposure(self.shown, self.linear, photograph, mask, self.alpha)
 
     def under(self, shown: DisplayTransform) -> Float32[np.ndarray, "h w 3"]:
-        """Return it as a picture."""
+        """Return the picture under a display transform."""
         return develop(self.linear, shown, alpha=self.alpha)
 
 
 def light_of(rendered: Rendered, shown: DisplayTransform, store: ImageStore, row: int) -> Light:
-    """Return what the render of a view shows.
+    """Return the radiance that the render of a view shows.
 
-    A picture does not say where its background is. Its photograph does: what that covers moves with
-    the exposure, and the rest stays as the picture has it.
+    The photograph determines where a picture shows its background. Pixels of the foreground change
+    with the exposure, and the background stays.
     """
     pixels, linear, opacity = rendered
     if linear:
@@ -159,7 +159,7 @@ def light_of(rendered: Rendered, shown: DisplayTransform, store: ImageStore, row
         return Light(undevelop(pixels, shown), shown, pixels, None)
     alpha, backdrop = floats(found), np.asarray(store.backdrop, np.float32)
     covered, free = (np.maximum(a, LEAST_ALPHA)[..., None] for a in (alpha, 1 - alpha))
-    own = np.clip((pixels - (1 - alpha[..., None]) * backdrop) / covered, 0, 1)
-    behind = (pixels - alpha[..., None] * own) / free
+    front = np.clip((pixels - (1 - alpha[..., None]) * backdrop) / covered, 0, 1)
+    behind = (pixels - alpha[..., None] * front) / free
     shown = replace(shown, backdrop=behind)
-    return Light(covered * undevelop(own, shown), shown, pixels, alpha)
+    return Light(covered * undevelop(front, shown), shown, pixels, alpha)

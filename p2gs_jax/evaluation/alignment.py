@@ -19,7 +19,7 @@ from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.photometry.formation import Matte, composited, display, formation, uncovered
 from p2gs_jax.types import Capture
 
-# Photographs may be so much darker than what a scene is shown for (LOM `low`: 6.6 stops).
+# Photographs can be much darker or brighter than the mean exposure (LOM `low`: 6.6 stops).
 SEARCH_STOPS, SEARCH_STEPS, GOLDEN_STEPS = 12.0, 49, 30
 REFINE_STEPS = 30
 # Stride of the coarse search over pixels, along each axis.
@@ -31,8 +31,8 @@ TOLERANCE = 5e-4
 class ExposureError(TypedDict):
     """Errors of recovered exposures, in stops: RMS and largest after the scale is aligned.
 
-    `ev_scale_power` is the RMS after scale and power are aligned; `power` is the power that aligns
-    them best, 1 where truth has no spread.
+    `ev_scale_power` is the RMS after scale and power are aligned; `power` is the best power, or 1
+    if the true exposures have no spread.
     """
 
     ev: float
@@ -44,7 +44,7 @@ class ExposureError(TypedDict):
 def exposure_error(
     exposures: Float[np.ndarray, " v"], truth: Float[np.ndarray, " v"]
 ) -> ExposureError:
-    """Return the error of exposures against the truth, gauges removed.
+    """Return the errors of exposures against the true ones, after gauges are removed.
 
     Raises:
         ValueError: an exposure is not positive.
@@ -67,9 +67,9 @@ def exposure_error(
 def error_of_views(
     views: Iterable[Mapping[str, Any]], truth: Mapping[str, float]
 ) -> ExposureError | None:
-    """Return the error of exposures of `photometry.json` over the views whose true one is known.
+    """Return the errors of exposures of `photometry.json` over views with known true exposures.
 
-    None where these are fewer than two.
+    None if there are fewer than two of these views.
     """
     pairs = [(v["exposure"], truth.get(v["image"])) for v in views if v["exposure"] is not None]
     known = [(a, b) for a, b in pairs if b is not None and a > 0 and b > 0]
@@ -86,23 +86,23 @@ def fit_exposure(
     correction: Correction | None = None,
     matte: Matte | None = None,
 ) -> Float[Array, ""]:
-    """Return the one exposure with which a render fits a photograph best, in squared LDR error.
+    """Return the exposure with which a render fits a photograph best, in squared LDR error.
 
-    A coarse search over +-12 stops around 1 followed by golden sections: the error of a clipped
-    image has flat stretches where Newton's method stalls. `capture` has all but the exposure, which
-    is not looked at; `matte` is what the render is put over, as the photograph is.
+    A coarse search over +-12 stops around 1 is followed by golden sections: the error of a clipped
+    image has flat stretches where Newton's method stalls. The exposure of `capture` is ignored;
+    `matte` is the background of render and photograph.
     """
-    # Imported late: of what evaluates, little searches.
+    # Imported here, because it is slow to load and rarely needed.
     import optimistix
 
     linear = uncovered(linear, matte)
 
     def error(log2_exposure, stride=1):
-        # What depends on the place counts in parts of the image, so fewer pixels are one as well.
+        # Positions are relative to the image, so that a strided image has the same vignetting.
         every = (slice(None, None, stride),) * 2
         behind = None if matte is None else matte.every(stride)
-        taken = dataclasses.replace(capture, exposure=jnp.exp2(log2_exposure))
-        ldr = composited(display(formation(linear[every], taken, cfg, correction)), behind)
+        exposed = dataclasses.replace(capture, exposure=jnp.exp2(log2_exposure))
+        ldr = composited(display(formation(linear[every], exposed, cfg, correction)), behind)
         squared = mask[every][..., None] * (ldr - photograph[every]) ** 2
         return jnp.sum(squared) / jnp.maximum(jnp.sum(mask), 1)
 
@@ -127,10 +127,10 @@ def with_fitted_exposure(
 ) -> DisplayTransform:
     """Return a display transform with the exposure under which a render fits a photograph best.
 
-    The opacity of the render is for the backdrop of the transform; None: it is over nothing.
+    The opacity `alpha` of the render is for the backdrop of the transform; None: no backdrop.
     """
-    how = (shown.capture, shown.formation, shown.correction, shown.matte(alpha))
-    found = float(fit_exposure(linear, photograph, mask, *how))
+    model = (shown.capture, shown.formation, shown.correction, shown.matte(alpha))
+    found = float(fit_exposure(linear, photograph, mask, *model))
     return dataclasses.replace(shown, exposure=found)
 
 
@@ -149,10 +149,10 @@ def fit_capture(
 ) -> Capture:
     """Return exposure, and gamma or white balance, that fit a photograph best (squared LDR error).
 
-    Levenberg-Marquardt on their logarithms, from the exposure that `fit_exposure` found; arguments
-    are those of `fit_exposure`. What is not asked for stays as `start` has it.
+    Levenberg-Marquardt on logarithms starts from the exposure of `fit_exposure`, whose arguments
+    are the same. Parameters that are not fitted are those of `start`.
     """
-    # Imported late: of what evaluates, little searches.
+    # Imported here, because it is slow to load and rarely needed.
     import optimistix
 
     weight = jnp.sqrt(mask / jnp.maximum(jnp.sum(mask), 1))[..., None]
@@ -163,7 +163,7 @@ def fit_capture(
         balance = start.white_balance
         if white_balance:
             before = jnp.zeros(3) if balance is None else balance
-            # Two numbers: the mean over channels is the exposure's.
+            # Two parameters, because the exposure holds the mean over channels.
             red, blue = balance_by
             balance = before + jnp.stack([red, -red - blue, blue])
         return dataclasses.replace(

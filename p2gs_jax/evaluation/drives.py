@@ -1,4 +1,4 @@
-"""What is judged of drives only: depth against what laser scanners measured at each view's time."""
+"""Scores of drives only: rendered depth against LiDAR at the time of each view."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from p2gs_jax.scene.rigid import interpolated, inverse
 from p2gs_jax.scene.visibility import unoccluded
 from p2gs_jax.types import Lidar, Scene, TrackedObject, View
 
-# Points within half a turn of a scanner at 10 Hz are the sweep of a view, seconds.
+# Points within half a turn of a scanner at 10 Hz belong to the sweep of a view, seconds.
 HALF_SWEEP_S = 0.06
-# Depth counts where the render is at least this opaque; elsewhere it is missing.
+# Rendered depth exists where the render is at least this opaque.
 SOLID = 0.5
 NEAR_ENOUGH = 0.1
-# Points of one view at most, evenly drawn.
+# Largest number of points of a view, evenly spaced.
 MOST_POINTS = 20_000
 
 
 class DepthScores:
-    """Collects how the depth of rendered views compares with LiDAR."""
+    """Collects the depth errors of rendered views against LiDAR."""
 
     def __init__(self, scene: Scene, store: ImageStore):
         self._scene, self._store = scene, store
         self._found: dict[int, DepthErrors] = {}
 
     def add(self, result: ViewResult, mask: Float32[np.ndarray, "h w"]) -> None:
-        """Take a rendered view, and which of its pixels count."""
+        """Add a rendered view; pixels count where `mask` is 1."""
         scene, index = self._scene, result.index
         if scene.lidar is None or scene.views[index].time is None:
             return
@@ -41,13 +41,13 @@ class DepthScores:
         _, K, width, height = self._store.camera(index)
         size = {"K": K, "width": width, "height": height, "distortion": None}
         view = dataclasses.replace(scene.views[index], **size)
-        given = (view, result.depth, result.alpha, mask)
-        found = depth_errors(scene.lidar, scene.objects, *given)
+        rendered = (view, result.depth, result.alpha, mask)
+        found = depth_errors(scene.lidar, scene.objects, *rendered)
         if len(found.error):
             self._found[index] = found
 
     def summary(self) -> dict:
-        """Return the part of `metrics.json`; empty where nothing was compared."""
+        """Return the part of `metrics.json`; empty if nothing was compared."""
         views = self._scene.views
         held_out = [d for row, d in self._found.items() if views[row].split == "test"]
         depth = {"all": summary(list(self._found.values())), "held_out": summary(held_out)}
@@ -58,8 +58,8 @@ class DepthErrors(NamedTuple):
     """Rendered against measured depth, point by point."""
 
     measured: Float32[np.ndarray, " p"]  # camera z, metres
-    error: Float32[np.ndarray, " p"]  # absolute, metres; infinite where no surface is shown
-    moving: Bool[np.ndarray, " p"]  # the point lies on something that moves
+    error: Float32[np.ndarray, " p"]  # absolute error, metres; infinite where there is no surface
+    moving: Bool[np.ndarray, " p"]  # the point lies on a moving object
 
 
 def depth_errors(
@@ -70,11 +70,10 @@ def depth_errors(
     alpha: Float32[np.ndarray, "h w"],
     mask: Float32[np.ndarray, "h w"] | None = None,
 ) -> DepthErrors:
-    """Return how rendered depth compares with the sweep nearest in time.
+    """Return the errors of rendered depth against the sweep nearest in time.
 
-    Points on moving boxes are carried along with them to the time of the view; points that nearer
-    ones hide are left out. K and size of the view are those of the images, and the rendered depth
-    is alpha-weighted camera z.
+    Points on moving boxes move with them to the time of the view; occluded points are left out. K
+    and size of the view are those of the images, and the rendered depth is alpha-weighted camera z.
     """
     assert view.time is not None
     rows = np.flatnonzero(np.abs(lidar.times - view.time) <= HALF_SWEEP_S)
@@ -88,9 +87,9 @@ def depth_errors(
     if len(kept) > MOST_POINTS:
         spread = np.linspace(0, len(kept) - 1, MOST_POINTS).astype(int)
         kept, at = kept[spread], at[spread]
-    there = alpha[at[:, 1], at[:, 0]]
-    shown = depth[at[:, 1], at[:, 0]] / np.maximum(there, SOLID)
-    error = np.where(there >= SOLID, np.abs(shown - z[kept]), np.inf)
+    opacity = alpha[at[:, 1], at[:, 0]]
+    rendered = depth[at[:, 1], at[:, 0]] / np.maximum(opacity, SOLID)
+    error = np.where(opacity >= SOLID, np.abs(rendered - z[kept]), np.inf)
     return DepthErrors(
         z[kept].astype(np.float32), error.astype(np.float32), lidar.objects[rows[kept]] >= 0
     )
@@ -99,7 +98,7 @@ def depth_errors(
 def at_time(
     lidar: Lidar, objects: Sequence[TrackedObject], rows: np.ndarray, time: float
 ) -> Float[np.ndarray, "r 3"]:
-    """Return some LiDAR points as of a time, seconds: those on moving boxes go along with them."""
+    """Return some LiDAR points at a time, seconds; those on moving boxes move with them."""
     points = lidar.points[rows].astype(np.float64)
     for row in np.unique(lidar.objects[rows]):
         if row < 0:
@@ -113,7 +112,7 @@ def at_time(
 
 
 def summary(parts: Sequence[DepthErrors]) -> dict:
-    """Return medians over all points, of what stands and of what moves, where there are any."""
+    """Return medians over all static points and over all moving points, if there are any."""
     if not parts:
         return {}
     measured, error, moving = map(np.concatenate, zip(*parts, strict=True))

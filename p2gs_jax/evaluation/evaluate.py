@@ -1,14 +1,17 @@
 """Evaluation of a finished fit: every view under every protocol.
 
-Protocols (docs/photometry.md, 6): `per_view` renders a training view with its own exposure, gamma
-and white balance; `averaged` uses the mean parameters over the training views (paper, Rendering
-for evaluation); `exposure_fitted` solves one scalar exposure from the photograph, because a
-held-out view has none of its own; `photometry_fitted` solves all that the model gives every view,
-where that is more than an exposure; `metered` takes the exposure that the rule gives its render
-that explains the training exposures, where there is one (photometry/metering.py); against
-reference photographs of one common exposure, `scale_aligned` solves one scalar for all of them.
-Vignetting and responses are the camera's in all. Where photographs have alpha, they and the renders
-are put over the same background (photometry/formation.py).
+Protocols (docs/photometry.md, 6):
+
+- `per_view` renders a training view with its fitted exposure, gamma and white balance.
+- `averaged` uses the mean parameters over the training views (paper, Rendering for evaluation).
+- `exposure_fitted` solves one scalar exposure of a held-out view from its photograph.
+- `photometry_fitted` solves all parameters that vary per view, if there are others than exposure.
+- `metered` uses the metering rule that explains the training exposures, if there is one
+  (photometry/metering.py).
+- `scale_aligned` solves one scalar for all reference photographs of one common exposure.
+
+Vignetting and responses are always those of the camera. If photographs have alpha, they and the
+renders are over the same background (photometry/formation.py).
 """
 
 from __future__ import annotations
@@ -42,7 +45,7 @@ from p2gs_jax.types import Camera, Params, Render, Scene
 
 
 class Evaluation(NamedTuple):
-    """What an evaluation finds."""
+    """The result of an evaluation."""
 
     # the `train`, `test`, `consistency`, `reference` and `radiance` parts of `metrics.json`, those
     # of drives, and the views without scores or exposure
@@ -51,10 +54,10 @@ class Evaluation(NamedTuple):
 
 
 class Judge:
-    """By what renders are judged: photographs, how the run shows radiance, and which scores.
+    """The inputs of scores: photographs, display transforms of a run, and kinds of scores.
 
-    The small arrays of the run's parameters say how views are shown; without weights there is no
-    LPIPS; `reference` is as for `evaluate`.
+    Display transforms follow from the photometry and the appearance of `params`. Without weights
+    there is no LPIPS; `reference` is as for `evaluate`.
     """
 
     def __init__(
@@ -78,17 +81,17 @@ class Judge:
         self.row_of = {index: row for row, index in enumerate(scene.train_indices)}
 
     def usual(self, index: int | None) -> display.DisplayTransform:
-        """Return how a view is shown by the mean parameters; None: one of no camera."""
+        """Return the display transform of a view by mean parameters; None: without a camera."""
         camera = None if index is None else self.scene.views[index].camera
         shown = display.usual_display(self.small, self.taken_by, camera, self.cfg.photometry)
         return self.over(shown)
 
     def over(self, transform: display.DisplayTransform) -> display.DisplayTransform:
-        """Return a display transform that puts renders over what the photographs are over."""
+        """Return a display transform with the background of the photographs."""
         return replace(transform, backdrop=self.store.backdrop_values)
 
     def scorer(self, index: int, photograph, mask) -> Callable[[np.ndarray], dict[str, Any]]:
-        """Return a function from display images of a view to scores, of a drive also by part."""
+        """Return a function from display images of a view to scores, in drives also of parts."""
         parts = scoring.masks_of_parts(self.scene, index, mask)
         return lambda ldr: scoring.view_scores(self.lpips_weights, ldr, photograph, mask, parts)
 
@@ -106,14 +109,13 @@ def evaluate(
     on_view: Callable[[scoring.ViewResult], None] = lambda result: None,
     on_progress: Callable[[int, int], None] = lambda done, count: None,
 ) -> Evaluation:
-    """Render and judge all views.
+    """Render and score all views.
 
-    The parameters are those of live Gaussians; `render` is from `make_renderer`, where it knows
-    which of them belong to moving objects. By the row of a view, `reference` gives the photograph
-    under the common exposure, and `radiance` the true linear radiance at the size of the
-    photographs, each None where there is none. With weights there is `lpips` wherever a view is
-    compared with a photograph. `on_progress` receives how many views are done, and how many there
-    are.
+    The parameters are those of live Gaussians; `render` is from `make_renderer`, with the owners of
+    moving Gaussians. By the row of a view, `reference` returns the photograph under the common
+    exposure, and `radiance` the true linear radiance at the size of the photographs, or None. With
+    weights, every comparison with a photograph has `lpips`. `on_progress` receives the number of
+    views done, and the number of all views.
 
     Raises:
         UserError: an image is too small for LPIPS.
@@ -124,7 +126,7 @@ def evaluate(
     seen = functools.partial(render or make_renderer(cfg.render), gaussians, living)
     views = _Views(judge, seen, radiance)
     judged = functools.partial(_judged, judge, seen, radiance)
-    # In the order of names: the frames of a camera are then in sequence.
+    # In the order of names, in which the frames of a camera are in sequence.
     for found in map_in_order(judged, range(len(scene.views))):
         on_progress(found.result.index + 1, len(scene.views))
         views.add(found)
@@ -133,17 +135,17 @@ def evaluate(
 
 
 class _Judged(NamedTuple):
-    """A view with its scores, and what of it tells with all others how to compare them."""
+    """A view with its scores, and its data for scores that need all views."""
 
     result: scoring.ViewResult
     averaged: Float32[np.ndarray, "h w 3"]  # display values with the mean parameters
     mask: Float32[np.ndarray, "h w"]
-    scores: dict[str, Any]  # of `result.ldr`
-    scores_averaged: dict[str, Any]
-    scores_all: dict[str, Any] | None  # of a held-out view with all fitted that varies per view
-    sample: np.ndarray | None  # of its radiance and the true one, where there is one
-    scale: float | None  # exposure under which it fits its reference, where there is one
-    readings: Readings
+    scores: dict[str, Any]  # scores of `result.ldr`
+    scores_averaged: dict[str, Any]  # scores of `averaged`
+    scores_all: dict[str, Any] | None  # scores of `photometry_fitted`, or None
+    sample: np.ndarray | None  # sample of rendered and true radiance, or None
+    scale: float | None  # exposure with which it fits its reference, or None
+    readings: Readings  # readings of meters
 
 
 def _judged(
@@ -159,8 +161,8 @@ def _judged(
     averaged = display.develop(linear, replace(usual, exposure=judge.mean.exposure), alpha=alpha)
     extra, everything = {}, None
     if scene.views[index].split == "train":
-        own = display.display_of_view(judge.small, judge.row_of[index], judge.cfg.photometry)
-        transform = judge.over(own)
+        fitted = display.display_of_view(judge.small, judge.row_of[index], judge.cfg.photometry)
+        transform = judge.over(fitted)
     elif not mask.any():
         transform = usual
     else:
@@ -194,17 +196,17 @@ def _judged(
 def _all_fitted(
     linear, photograph, still, start: display.DisplayTransform, score, alpha
 ) -> dict[str, Any] | None:
-    """Score a held-out view with all solved that varies per view; None: that is one scalar.
+    """Score a held-out view with all parameters fitted that vary per view; None: only exposure.
 
-    It is solved from what stands still, and starts from the fitted exposure.
+    They are fitted to static pixels, starting from the fitted exposure.
     """
     tone = start.formation
     gamma, balance = MODELS[tone.model].gamma == "view", tone.white_balance == "view"
     if not (gamma or balance):
         return None
-    given = (linear, photograph, still)
-    how = (start.capture, tone, start.correction, start.matte(alpha))
-    found = fit_capture(*given, *how, gamma=gamma, white_balance=balance)
+    images = (linear, photograph, still)
+    model = (start.capture, tone, start.correction, start.matte(alpha))
+    found = fit_capture(*images, *model, gamma=gamma, white_balance=balance)
     transform = display.with_capture(start, found)
     row = {**score(display.develop(linear, transform, alpha=alpha)), "exposure": transform.exposure}
     if gamma:
@@ -215,7 +217,7 @@ def _all_fitted(
 
 
 class _Views:
-    """Collects judged views, and what needs all of them."""
+    """Collects scored views, and computes scores that need all of them."""
 
     def __init__(self, judge: Judge, seen: Callable[[Camera], Render], radiance: Truth | None):
         self._judge, self._seen, self._radiance = judge, seen, radiance
@@ -224,22 +226,22 @@ class _Views:
         self._videos = {
             name: scoring.VideoScores() for name in ("per_view", "averaged", "photographs")
         }
-        # Names of views without scores, and of photographs that tell no exposure.
-        self._untold: dict[str, list[str]] = {"hidden": [], "exposures_unknown": []}
-        # What meters read in training views, by name; their rows; and in held-out views, by row.
+        # Names of views without scores, and of photographs with unknown exposures.
+        self._unknown: dict[str, list[str]] = {"hidden": [], "exposures_unknown": []}
+        # Readings of training views, by name; their rows; and readings of held-out views, by row.
         self._readings: dict[str, Readings] = {}
-        self._told: list[int] = []
+        self._metered_rows: list[int] = []
         self._held_out: dict[int, Readings] = {}
         self._scales: dict[int, float] = {}
         self._samples: dict[int, np.ndarray] = {}
 
     def add(self, found: _Judged) -> None:
-        """Take a view."""
+        """Add a view."""
         result, judge = found.result, self._judge
         view, index = judge.scene.views[result.index], result.index
         tells = scoring.tells_exposure(result.photograph, found.mask, judge.cfg.loss)
         if not tells:
-            self._untold["hidden" if tells is None else "exposures_unknown"].append(view.name)
+            self._unknown["hidden" if tells is None else "exposures_unknown"].append(view.name)
         if tells is None:
             return
         self._rows[view.split][view.name] = found.scores
@@ -251,7 +253,7 @@ class _Views:
         if found.scale is not None:
             self._scales[index] = found.scale
         if view.split == "train":
-            self._told.append(judge.row_of[index])
+            self._metered_rows.append(judge.row_of[index])
             self._readings[view.name] = found.readings
         else:
             self._held_out[index] = found.readings
@@ -262,7 +264,7 @@ class _Views:
         self._videos["photographs"].add(view.camera, result.photograph, exposure)
 
     def evaluation(self) -> Evaluation:
-        """Return all scores; what all views decide is scored in a second pass over some."""
+        """Return all scores; protocols that need all views take a second pass over some views."""
         judge, rows = self._judge, self._rows
         exposures = np.asarray(judge.small.photometry.exposures)
         train, tone = scoring.summary_of(rows["train"]), judge.cfg.photometry
@@ -273,7 +275,7 @@ class _Views:
                 "averaged": scoring.summary_of(rows["test averaged"]),
                 "exposure_fitted": scoring.summary_of(rows["test"]),
             },
-            **{key: names for key, names in self._untold.items() if names},
+            **{key: names for key, names in self._unknown.items() if names},
         }
         metrics["train"]["per_view"] = per_view
         if rows["all"]:
@@ -281,7 +283,7 @@ class _Views:
         logs, gamma = np.log(np.asarray(exposures, float)), judge.mean.gamma
         names, readings = list(self._readings), list(self._readings.values())
         metering = fit_metering(
-            names, readings, logs[self._told], exposed_at(BELOW_WHITE, gamma, tone)
+            names, readings, logs[self._metered_rows], exposed_at(BELOW_WHITE, gamma, tone)
         )
         metrics["consistency"] = {name: video.summary() for name, video in self._videos.items()}
         exposed = exposed_at(judge.cfg.loss.saturation, gamma, tone)
@@ -291,10 +293,10 @@ class _Views:
         return Evaluation(metrics, metering)
 
     def _again(self, metrics: dict[str, Any], metering: Metering, brightest: float) -> None:
-        """Render views that are compared once all are known, and add their scores.
+        """Render views again for the protocols that need all views, and add their scores.
 
-        Held-out views are shown under the exposure of the metering rule; others are compared with
-        references of one common exposure and with their true radiance.
+        Held-out views get the exposure of the metering rule; other protocols compare with
+        references of one common exposure and with true radiance.
         """
         judge, radiance, common = self._judge, self._radiance, {}
         if self._scales:
@@ -345,11 +347,10 @@ def _against_reference(
 ) -> dict[str, dict[str, Any]]:
     """Score a view against its photograph of the common exposure, under exposures by protocol.
 
-    Those photographs are taken to be what no camera in particular sees: without vignetting, and of
-    mean white balance.
+    References are assumed to have no vignetting and the mean white balance.
     """
     assert judge.reference is not None
     truth, usual = judge.reference(index), judge.usual(None)
     shown = {name: replace(usual, exposure=exposure) for name, exposure in exposures.items()}
     score = functools.partial(scoring.view_scores, judge.lpips_weights, target=truth, mask=mask)
-    return {n: score(display.develop(linear, how, alpha=alpha)) for n, how in shown.items()}
+    return {n: score(display.develop(linear, t, alpha=alpha)) for n, t in shown.items()}

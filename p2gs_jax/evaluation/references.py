@@ -1,4 +1,4 @@
-"""What renders are compared with beside the photographs: one common exposure, true radiance."""
+"""References beside the photographs: one common exposure, and true radiance."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Reference = Callable[[int], np.ndarray | None]
 
 
 def check_reference(folder: str | Path | None) -> None:
-    """Complain about a folder that is missing, before there are any views; None is fine.
+    """Check that the folder exists, before views are read; None: there is no folder.
 
     Raises:
         UserError: there is no such folder.
@@ -49,16 +49,16 @@ def load_reference(folder: str | Path, scene: Scene, cfg: FitConfig) -> Referenc
         why += f"{scene.views[0].name})."
         raise UserError(why, fix="name the reference photographs as the scene's images")
     order = sorted(rows)
-    # Each is looked at once: none is kept beside the photographs.
+    # Every reference is used once, so that no memory keeps them.
     store = ImageStore(tuple(rows[r] for r in order), dataclasses.replace(cfg.data, cache_mb=0))
     where = {r: i for i, r in enumerate(order)}
     return lambda row: store.get(where[row], 1)[0] if row in where else None
 
 
 def find_radiance(scene: Scene, store: ImageStore) -> Truth | None:
-    """Return true linear radiance by view row where the scene carries it (`truth/linear`).
+    """Return true linear radiance by view row if the scene has it (`truth/linear`).
 
-    Synthetic scenes do; it is used for judging only.
+    Synthetic scenes have it; only evaluation uses it.
     """
     folder = scene.root / "truth" / "linear"
     if not folder.is_dir():

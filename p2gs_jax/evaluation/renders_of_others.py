@@ -1,4 +1,4 @@
-"""Renders of held-out views that any program wrote: which file shows which view, and its pixels.
+"""Renders of held-out views by any program: the file of each view, and its pixels.
 
 docs/report.md describes the layouts.
 """
@@ -18,45 +18,46 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.types import Scene
 
-# Display values come first: a program that writes both developed them itself.
+# Display values come first: a program that writes both has its tone curve in them.
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
 
 
 class Rendered(NamedTuple):
-    """What a file holds: display values in [0, 1], or linear radiance."""
+    """Content of a file: display values in [0, 1], or linear radiance."""
 
     pixels: Float32[np.ndarray, "h w 3"]
     linear: bool
-    alpha: Float32[np.ndarray, "h w"] | None  # by which radiance is premultiplied, if it has any
+    alpha: Float32[np.ndarray, "h w"] | None  # opacity by which radiance is premultiplied, or None
 
 
 @dataclass(frozen=True)
 class OtherRenders:
-    """The files of a folder that show held-out views, by the rows of these."""
+    """The files of a folder that show held-out views, by row of the view."""
 
     folder: Path
-    layout: str  # in words
+    layout: str  # description of the layout
     files: dict[int, Path]
-    missing: tuple[str, ...] = ()  # names of held-out views that no file shows
+    missing: tuple[str, ...] = ()  # names of held-out views without a file
 
     @property
     def remark(self) -> str | None:
-        """What is to be said of it, if anything."""
+        """A note for the user on missing views, or None."""
         if not self.missing:
             return None
         return (
             f"{self.folder} lacks {len(self.missing)} of {len(self.missing) + len(self.files)} "
-            f"held-out views ({first_few(self.missing)}): this run is judged over the other "
-            f"{len(self.files)} as well."
+            f"held-out views ({first_few(self.missing)}): the scores of this run are also over "
+            f"the other {len(self.files)}."
         )
 
     def read(self, row: int, size: tuple[int, int], over: bool = False) -> Rendered:
         """Return the render of a view, which must have a size of (width, height) pixels.
 
-        With `over` it is to be put over a background: radiance must then have an opacity.
+        With `over` there is a background: radiance must then have an opacity.
 
         Raises:
-            UserError: it cannot be read, has another size, or holds what is not a colour.
+            UserError: the file cannot be read, has another size, or holds values that are not
+                finite.
         """
         path = self.files[row]
         linear, alpha = path.suffix.lower() == ".exr", None
@@ -67,11 +68,11 @@ class OtherRenders:
         height, width = pixels.shape[:2]
         if (width, height) != size:
             why = f"{path} is {width}x{height}, the run's view {size[0]}x{size[1]}."
-            fix = "render it at the size that the run was fitted at, or fit the run at that of "
-            fix += "the renders (--max-width)"
+            fix = "render it at the size of the run, or fit the run at the size of the renders "
+            fix += "(--max-width)"
             raise UserError(why, fix=fix)
         if linear and over and alpha is None:
-            why = f"{path} has no channel A, and the scene's photographs are shown over a "
+            why = f"{path} has no channel A, but the photographs of the scene are over a "
             why += "background."
             fix = "write the opacity of the render as well, or pictures over that background"
             raise UserError(why, fix=fix)
@@ -83,7 +84,7 @@ class OtherRenders:
 
 
 def read_display(path: Path) -> Float32[np.ndarray, "h w 3"]:
-    """Return display values of an opaque PNG or JPEG; a UserError says that it cannot be read."""
+    """Return display values of an opaque PNG or JPEG; raises UserError if it cannot be read."""
     try:
         pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
     except (OSError, cv2.error):
@@ -95,25 +96,25 @@ def read_display(path: Path) -> Float32[np.ndarray, "h w 3"]:
     if pixels.ndim == 2:
         pixels = np.repeat(pixels[..., None], 3, -1)
     if pixels.shape[-1] == 4 and (pixels[..., 3] < most).any():
-        fix = "write it over the background that was meant"
+        fix = "write it over the background of the photographs"
         raise UserError(f"{path} is transparent in places.", fix=fix)
     return pixels[..., 2::-1].astype(np.float32) / most
 
 
 def find_renders(folder: str | Path, scene: Scene) -> OtherRenders:
-    """Return which files of a folder show which held-out views.
+    """Return the files of a folder that show held-out views.
 
-    Pictures have the names of views; or bare numbers: all held-out views in the order of names.
+    Pictures have the names of views, or are numbered in the order of names of held-out views.
 
     Raises:
-        UserError: the scene holds nothing out, the folder holds no render, or numbered ones whose
-            count is another than that of the held-out views.
+        UserError: there are no held-out views, the folder holds no render, or the number of
+            numbered renders differs from that of held-out views.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise UserError(f"{folder} is not a folder.", fix="give --against a folder of renders")
     if not scene.test_indices:
-        why = "the run holds no view out, and renders are compared on held-out views."
+        why = "the run has no held-out views, on which renders are compared."
         raise UserError(why, fix="fit with --test-every 8")
     names, named = {row: scene.views[row].name for row in scene.test_indices}, _by_name(folder)
     files: dict[int, Path] = {}
@@ -132,8 +133,8 @@ def find_renders(folder: str | Path, scene: Scene) -> OtherRenders:
         fix = "name pictures as the scene's views, or number them in the order of these names"
         raise UserError(why, fix=fix)
     if len(numbered) != len(names):
-        why = f"{folder} holds {len(numbered)} numbered renders, the run holds {len(names)} views "
-        why += "out."
+        why = f"{folder} holds {len(numbered)} numbered renders, but the run has {len(names)} "
+        why += "held-out views."
         fix = "hold out the same views in both programs (--test-every), or name the renders as "
         fix += "the views"
         raise UserError(why, fix=fix)
@@ -142,7 +143,7 @@ def find_renders(folder: str | Path, scene: Scene) -> OtherRenders:
 
 
 def _by_name(folder: Path) -> dict[str, Path]:
-    """Return the pictures below a folder, by their names from there, suffixes in lower case."""
+    """Return the pictures below a folder by relative path, with suffixes in lower case."""
     found = (p for p in sorted(folder.rglob("*")) if p.suffix.lower() in SUFFIXES and p.is_file())
     return {
         p.relative_to(folder).with_suffix(p.suffix.lower()).as_posix(): p

@@ -1,7 +1,7 @@
-"""Scores of single views and their means, the same for everything that is judged.
+"""Scores of single views and their means.
 
-PSNR and SSIM (docs/photometry.md, 6), LPIPS where there are weights; of drives also over static
-pixels and over what moves; HIS and Std-Luminance of videos (paper, appendix Metrics).
+PSNR and SSIM (docs/photometry.md, 6), LPIPS if there are weights; in drives also over static and
+over moving pixels; HIS and Std-Luminance of videos (paper, appendix Metrics).
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from p2gs_jax.types import LUMINANCE, Scene
 Image = Float[Array, "h w 3"]
 
 PARTS = ("whole", "static", "moving")
-# Parts of fewer pixels get no scores.
+# Parts with fewer pixels have no scores.
 FEWEST_PIXELS = 64
-# A photograph tells its exposure where at least this share lies between black and saturation.
+# Least share of pixels between black and saturation that determines a photograph's exposure.
 FEWEST_TELLING = 1e-3
 
 Masks = Mapping[str, Float32[np.ndarray, "h w"]]
@@ -39,11 +39,11 @@ ssim = jax.jit(_ssim)
 
 
 class Protocol(NamedTuple):
-    """A way to show views for a score of `metrics.json`."""
+    """A protocol of `metrics.json`: views and the parameters under which they are displayed."""
 
-    views: str  # which, in words
-    shown: str  # at which exposure, in words
-    path: tuple[str, ...]  # where `metrics.json` has the scores
+    views: str  # description of the views
+    shown: str  # description of the exposure
+    path: tuple[str, ...]  # keys of the scores in `metrics.json`
 
 
 MEAN, FITTED = "mean exposure and gamma", "exposure fitted to each photograph"
@@ -69,8 +69,8 @@ PROTOCOLS = {
 class ViewResult:
     """One rendered view, by its row in `Scene.views`.
 
-    It is shown under the view's own transform; of a held-out view under the usual one with the
-    exposure fitted to its photograph.
+    A training view is displayed with its fitted parameters, a held-out view with mean parameters
+    and the exposure fitted to its photograph.
     """
 
     index: int
@@ -93,7 +93,7 @@ def psnr(ldr: Image, target: Image, mask: Float[Array, "h w"]) -> Float[Array, "
 def view_scores(
     weights: LpipsWeights | None, ldr, target, mask, parts: Masks | None = None
 ) -> dict[str, Any]:
-    """Return PSNR and SSIM of an image; LPIPS if there are weights for it; the same of parts."""
+    """Return PSNR and SSIM of an image and of its parts, and LPIPS if there are weights."""
     row: dict[str, Any] = {
         "psnr": float(psnr(ldr, target, mask)),
         "ssim": float(ssim(ldr, target, mask)),
@@ -135,15 +135,15 @@ def region_scores(
 
 @jax.jit
 def _similarity(ldr: Image, target: Image, mask: Float[Array, "h w"]) -> Float[Array, "h w"]:
-    """Return the SSIM of each pixel; pixels that do not count are alike."""
+    """Return the SSIM of each pixel; masked pixels are equal in both images."""
     seen = jnp.where(mask[..., None] > 0, ldr, target)
     return ssim_map(seen.transpose(2, 0, 1), target.transpose(2, 0, 1)).mean(0)
 
 
 def summary_of(rows: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """Return the means of rows of views by name, and the rows as `per_view`; empty without any.
+    """Return the means of rows of views by name, and the rows as `per_view`; empty without rows.
 
-    Of a drive also the means of each part over the views that have it, and how many these are.
+    Drives also have the means of each part over the views with that part, and their number.
     """
     if not rows:
         return {}
@@ -154,7 +154,7 @@ def summary_of(rows: dict[str, dict[str, Any]]) -> dict[str, Any]:
 
 
 def mean_of_parts(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float]]:
-    """Return the means of the views that have each part, and how many these are."""
+    """Return the means of each part over the views that have it, and their number."""
     out = {}
     for name in PARTS:
         there = [row[name] for row in rows if name in row]
@@ -165,21 +165,21 @@ def mean_of_parts(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, floa
 
 
 def is_drive(scene: Scene) -> bool:
-    """Return whether views have times: those of drives do."""
+    """Return whether views have times, as in drives."""
     return any(view.time is not None for view in scene.views)
 
 
 def parts_of(mask: Float32[np.ndarray, "h w"], moving: Bool[np.ndarray, "h w"]) -> Masks:
     """Return masks by name, without those that have too few pixels.
 
-    `moving` is covered by the boxes of what moves.
+    `moving` marks the pixels in boxes of moving objects.
     """
     masks = {"whole": mask, "static": mask * ~moving, "moving": mask * moving}
     return {k: m.astype(np.float32) for k, m in masks.items() if m.sum() >= FEWEST_PIXELS}
 
 
 def masks_of_parts(scene: Scene, index: int, mask: Float32[np.ndarray, "h w"]) -> Masks | None:
-    """Return the masks of a view's whole, static and moving pixels; None where it is no drive's."""
+    """Return the masks of a view's whole, static and moving pixels; None outside of drives."""
     if not is_drive(scene):
         return None
     height, width = mask.shape
@@ -189,7 +189,7 @@ def masks_of_parts(scene: Scene, index: int, mask: Float32[np.ndarray, "h w"]) -
 def still_mask(
     scene: Scene, index: int, mask: Float32[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w"]:
-    """Return a mask without what moves, for exposures; as it is where all of it moves."""
+    """Return a mask without moving objects, for exposures; unchanged if everything moves."""
     if not any(thing.moving for thing in scene.objects):
         return mask
     height, width = mask.shape
@@ -201,10 +201,10 @@ def still_mask(
 def tells_exposure(
     photograph: Float32[np.ndarray, "h w 3"], mask: Float32[np.ndarray, "h w"], loss: LossConfig
 ) -> bool | None:
-    """Return whether a photograph of display values tells its exposure.
+    """Return whether a photograph of display values determines its exposure.
 
-    One that is black or saturated everywhere does not: any exposure that is dark or bright enough
-    explains it. None: masks leave nothing of it, and its view cannot be judged.
+    A photograph that is black or saturated everywhere does not: any exposure that is dark or bright
+    enough explains it. None: masks hide all its pixels, and its view has no scores.
     """
     counted = photograph[mask > 0]
     if not len(counted):
@@ -214,17 +214,17 @@ def tells_exposure(
 
 
 def untold_notes(metrics: dict[str, Any]) -> list[str]:
-    """Return what the user should know of these views, from the metrics of an evaluation."""
+    """Return notes on views without scores or exposures, from the metrics of an evaluation."""
     out = []
     if hidden := metrics.get("hidden"):
         out.append(
-            f"{len(hidden)} view(s) are hidden by their masks altogether and have no scores "
+            f"{len(hidden)} view(s) are completely hidden by their masks and have no scores "
             f"({first_few(hidden)})."
         )
     if unknown := metrics.get("exposures_unknown"):
         out.append(
-            f"{len(unknown)} photograph(s) are black or saturated everywhere: their exposures are "
-            f"unknown, whatever photometry.json holds ({first_few(unknown)})."
+            f"{len(unknown)} photograph(s) are black or saturated everywhere: their exposures in "
+            f"photometry.json are meaningless ({first_few(unknown)})."
         )
     return out
 
@@ -233,12 +233,12 @@ def untold_notes(metrics: dict[str, Any]) -> list[str]:
 class VideoScores:
     """Scores of the videos of several cameras, frame by frame.
 
-    Frames of a camera follow each other in time; pairs of frames never mix cameras. HIS is averaged
-    over all pairs of all cameras. All are small for a dark or blurred video, and HIS contains the
-    motion of the scene: never read them without PSNR, and compare with those of the photographs.
+    Frames of a camera are in temporal order; pairs of frames are of one camera. HIS is averaged
+    over all pairs of all cameras. All scores are small for a dark or blurred video, and HIS
+    contains the motion of the scene: read them with PSNR, and compare with the photographs' scores.
 
     - `his_paper`, as printed: RMS over pixels of the difference of two frames' OETF^-1(R_t) e_t. It
-      multiplies by e where undoing an exposure means dividing, and is 0 for a black video.
+      multiplies by e, although exposures are undone by division, and is 0 for a black video.
     - `his`, corrected: divided by e and by the mean radiance; invariant to e -> c e.
     - `std_luminance`, as printed: standard deviation over frames of their mean BT.601 luminance.
     - `std_luminance_relative`: divided by the mean, so that darkening a video does not improve it.
@@ -251,7 +251,7 @@ class VideoScores:
     _luminance: list[float] = field(default_factory=list)
 
     def add(self, camera: str, ldr: Float[np.ndarray, "h w 3"], exposure: float) -> None:
-        """Append a frame of display values, taken under an exposure, to the video of a camera."""
+        """Append a frame of display values, with its exposure, to the video of a camera."""
         linear = eotf(np.asarray(ldr), "srgb").astype(np.float64)
         if camera in self._last and self._last[camera][0].shape == linear.shape:
             before, e = self._last[camera]

@@ -1,18 +1,18 @@
-"""Seams: the difference of photographs of one surface, as taken and under one display transform.
+"""Seams: the difference of photographs of one surface, before and after a common display transform.
 
 Pixels of one view are found in a neighbouring one through rendered depth, with an occlusion test
-(render/warp.py). Over the pixels that both show, unsaturated and not near black, the seam is the
-median over pixels and channels of the absolute difference, in 8-bit codes and in stops:
+(render/warp.py). The seam is the median absolute difference over pixels and channels, in 8-bit
+codes and in stops. It is over pixels that both views show, neither saturated nor near black:
 
-- before: of the photographs as taken. In stops, as if all were taken alike: both are decoded with
-  the common gamma, and no exposure is undone.
-- after: of the photographs developed alike: each is decoded with its own gamma and response,
-  divided by its own exposure, white balance and vignetting, and shown in the common display
+- before: difference of the unchanged photographs. In stops, both are decoded with the common gamma,
+  and not divided by their exposures.
+- after: difference of the photographs under one display transform. Each is decoded with its gamma
+  and response, divided by its exposure, white balance and vignetting, and displayed in the common
   transform.
 
-The step is the constant part of what is left: the median of the signed difference after, in stops.
-The rest contains misplaced pixels on texture, view-dependent reflection, and what the formation
-model leaves out.
+The step is the constant part of the remaining difference: the median of the signed difference
+after, in stops. The rest contains misplaced pixels on texture, view-dependent reflection, and
+effects that the formation model lacks.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from p2gs_jax.scene.rigid import camera_centers, moment_of, pose_of
 from p2gs_jax.scene.visibility import unoccluded
 from p2gs_jax.types import Camera, Render, Scene
 
-# Least pixels in common.
+# Least number of shared pixels.
 FEWEST_PIXELS = 200
-# Least points in common of two views that are compared.
+# Least number of shared points of two views that are compared.
 FEWEST_SHARED = 30
-# Points that overlaps are counted on where there are no tracks.
+# Largest number of points that are projected to count shared ones, if there are no tracks.
 MOST_COUNTED = 5000
-# In a picture of a seam, rendered depth is used from this opacity of the halfway view on, and
-# elsewhere this multiple of the largest rendered depth.
+# A picture of a seam uses rendered depth from this opacity of the halfway view, and elsewhere this
+# multiple of the largest rendered depth.
 OPAQUE, FAR = 0.5, 100.0
 BLANK = 0.5
 
@@ -54,26 +54,26 @@ class Photographed(NamedTuple):
     mask: Float32[np.ndarray, "h w"]  # 1 = use
     camera: Camera  # at the size of `ldr`
     depth: Float[np.ndarray, "h w"]  # from `surface_depth`, 0 where there is no surface
-    transform: DisplayTransform  # how it was taken
+    transform: DisplayTransform  # its display transform
 
 
 class Seam(NamedTuple):
     """The difference of two photographs; see the module for the definitions."""
 
-    before_ev: float  # as taken, stops
-    after_ev: float  # developed alike, stops
-    before_codes: float  # as taken, 8-bit codes
-    after_codes: float  # developed alike, 8-bit codes
-    step_ev: float  # by which the first is brighter throughout, developed alike, stops
-    pixels: int  # that both show
+    before_ev: float  # before, stops
+    after_ev: float  # after, stops
+    before_codes: float  # before, 8-bit codes
+    after_codes: float  # after, 8-bit codes
+    step_ev: float  # median of first minus second, after, stops
+    pixels: int  # number of shared pixels
 
 
 def neighbouring_pairs(scene: Scene, most: int) -> list[tuple[int, int]]:
-    """Return pairs of training views that should show the same surfaces, rows of `scene.views`.
+    """Return pairs of training views that show the same surfaces, as rows of `scene.views`.
 
-    On a rig these are different cameras at the same time that share points: of a drive, in the
-    same frame; else, files of the same name in different folders. Elsewhere every view is paired
-    with the one it shares most with. There are at most `most` pairs, spread evenly over the views.
+    On a rig these are different cameras at the same time that share points: in the same frame of a
+    drive, or files of the same name in different folders. Otherwise every view is paired with the
+    one with which it shares most points. There are at most `most` pairs, evenly spread over views.
     """
     train = scene.train_indices
     shared = _shared_points(scene)
@@ -91,7 +91,7 @@ def neighbouring_pairs(scene: Scene, most: int) -> list[tuple[int, int]]:
 
 
 def _closest(shared: np.ndarray) -> list[tuple[int, int]]:
-    """Return every view with the one it shares most with; among equals, the nearest in order."""
+    """Return every view with the one that shares most points; among equals, the nearest row."""
     order = np.arange(len(shared))
     near = shared - np.abs(order[:, None] - order) / (len(shared) + 1)
     np.fill_diagonal(near, -np.inf)
@@ -101,7 +101,7 @@ def _closest(shared: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _shared_points(scene: Scene) -> np.ndarray:
-    """Return how many points two training views have in common, 0 on the diagonal."""
+    """Return the number of points that each two training views share, 0 on the diagonal."""
     train = list(scene.train_indices)
     if scene.tracks is not None and len(scene.tracks.xy):
         where = (scene.tracks.view_indices, scene.tracks.point_indices)
@@ -124,10 +124,10 @@ def _shared_points(scene: Scene) -> np.ndarray:
 def measure_seam(
     first: Photographed, second: Photographed, common: DisplayTransform, cfg: LossConfig
 ) -> Seam | None:
-    """Return the seam between two photographs, or None where they have too little in common.
+    """Return the seam between two photographs, or None if they share too few pixels.
 
-    They are compared in the pixels of the first; `common` is the display transform of "after", and
-    has the gamma of "before". `cfg` says between which display values a pixel is used.
+    They are compared in the pixels of the first. `common` is the display transform of "after", and
+    its gamma is that of "before". `cfg` has the display values between which pixels are used.
     """
     there = warp(jnp.asarray(first.depth), first.camera, jnp.asarray(second.depth), second.camera)
     ldr = sample_bilinear(jnp.asarray(second.ldr), there.xy)
@@ -138,7 +138,7 @@ def measure_seam(
         return None
     a, b = first.ldr[use], np.asarray(ldr)[use]
     where = [np.argwhere(use)[:, ::-1] + np.float32(0.5), np.asarray(there.xy)[use]]
-    # As if all were taken alike.
+    # Radiance as if both had the common parameters.
     gamma, tone = np.float32(common.gamma), common.formation
     plain = [inverse_tone_map(np.asarray(values, np.float32), gamma, tone) for values in (a, b)]
     radiance = [
@@ -165,10 +165,10 @@ def _apart(a: np.ndarray, b: np.ndarray) -> float:
 
 
 class SeamPicture(NamedTuple):
-    """One picture made of two photographs, with a hard edge in the middle."""
+    """A picture of two photographs, with a hard edge in the middle."""
 
-    before: Float32[np.ndarray, "h w 3"]  # of the photographs as taken
-    after: Float32[np.ndarray, "h w 3"]  # of the photographs developed alike
+    before: Float32[np.ndarray, "h w 3"]  # the unchanged photographs
+    after: Float32[np.ndarray, "h w 3"]  # the photographs under one display transform
     left_first: bool  # the left half is the first photograph
 
 
@@ -196,7 +196,7 @@ def seam_picture(
         size = jnp.array([photograph.camera.width, photograph.camera.height])
         inside = np.asarray((z > 1e-6) & jnp.all((xy >= 0) & (xy < size), axis=-1))
         ldr = np.asarray(sample_bilinear(jnp.asarray(photograph.ldr), xy))
-        # Saturated pixels stay at the value of its white.
+        # Saturated pixels keep the value of the photograph's white.
         alike = develop(undevelop(ldr, photograph.transform), common)
         reached.append(inside)
         before.append(np.where(inside[..., None], ldr, BLANK))

@@ -131,7 +131,7 @@ def renamed(path, image):
             "transparent in",
         ),
         (infinite, "infinite"),
-        (numbered, "3 numbered renders, the run holds 2"),
+        (numbered, "3 numbered renders, but the run has 2"),
         (renamed, "no render of a held-out view"),
         (lambda path, image: shutil.rmtree(path.parent), "not a folder"),
     ],

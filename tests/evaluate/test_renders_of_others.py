@@ -76,5 +76,5 @@ def test_16_bits_and_grey_are_display_values_too(tmp_path):
 
 def test_a_scene_without_held_out_views_cannot_be_compared(tmp_path):
     scene, _ = made_scene(tmp_path / "scene", ())
-    with pytest.raises(UserError, match="holds no view out"):
+    with pytest.raises(UserError, match="has no held-out views"):
         find_renders(tmp_path, scene)
