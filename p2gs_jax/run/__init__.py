@@ -1,1 +1,1 @@
-"""The run folder: what lies in it, written and read (docs/files.md)."""
+"""The run folder: writing and reading its files (docs/files.md)."""

@@ -1,7 +1,7 @@
-"""Checkpoints of any pytree: written whole or not at all, and a broken newest is survived.
+"""Checkpoints of any pytree: complete or absent; a broken newest one is skipped.
 
-A checkpoint is a folder named by its step, with one `.npz`: the bytes of every leaf, and a table of
-their names, types and shapes beside plain values. The checksums of the archive find flipped bits.
+A checkpoint is a folder named by its step, with one `.npz`: the bytes of every leaf, a table of
+names, types and shapes, and plain values. The checksums of the archive detect flipped bits.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ FILE, TABLE = "state.npz", "table"
 
 
 def saved_steps(folder: Path) -> list[int]:
-    """Return the steps of complete checkpoints, by the names in their folder; rising."""
+    """Return the steps of complete checkpoints, by the names in their folder, ascending."""
     if not folder.is_dir():
         return []
     return sorted(int(path.name) for path in folder.iterdir() if path.name.isdecimal())
@@ -40,14 +40,14 @@ class CheckpointStore:
         return max(saved_steps(self.folder), default=None)
 
     def save(self, step: int, tree: Any, meta: dict) -> None:
-        """Write a checkpoint; an interruption leaves the previous ones as they were.
+        """Write a checkpoint; an interruption does not change the previous ones.
 
-        One that exists already is left alone. The tree is any pytree of arrays: None and static
-        fields come from `like` on restoring. In `meta`, scalars and arrays become plain values.
+        An existing checkpoint is not written again. The tree is any pytree of arrays: None and
+        static fields come from `like` in `restore`. In `meta`, arrays become plain values.
 
         Raises:
             TypeError: `meta` holds something else.
-            OSError: it cannot be written, for example because the disk is full.
+            OSError: the checkpoint cannot be written, for example because the disk is full.
         """
         if step in saved_steps(self.folder):
             return
@@ -70,7 +70,7 @@ class CheckpointStore:
         """Return the plain values saved with a checkpoint.
 
         Raises:
-            UserError: they cannot be read.
+            UserError: the checkpoint cannot be read.
         """
         return self._read(step)[0]
 
@@ -80,7 +80,7 @@ class CheckpointStore:
             try:
                 return self.read_meta(step)
             except UserError:
-                continue  # `restore_latest` says so
+                continue  # `restore_latest` reports the error
         return None
 
     def restore(self, step: int, like: Tree) -> tuple[Tree, dict]:
@@ -89,7 +89,7 @@ class CheckpointStore:
         `like` has arrays or shapes, in the structure that was saved.
 
         Raises:
-            UserError: it cannot be read, or holds other leaves, shapes or types than `like`.
+            UserError: the checkpoint cannot be read, or its structure differs from `like`.
         """
         meta, leaves = self._read(step, like)
         return jax.tree.unflatten(jax.tree.structure(like), leaves), meta
@@ -97,10 +97,10 @@ class CheckpointStore:
     def restore_latest(
         self, like: Callable[[dict], Tree], on_message: Callable[[str], None] = lambda text: None
     ) -> tuple[Tree, dict] | None:
-        """Return the newest readable checkpoint and its values, or None where there is none.
+        """Return the newest readable checkpoint and its values, or None if there is none.
 
-        `like` is called with the saved values, and returns what `restore` wants; `on_message` is
-        told about checkpoints that could not be read.
+        `like` is called with the saved values, and returns the `like` of `restore`; `on_message`
+        receives messages on checkpoints that cannot be read.
 
         Raises:
             UserError: there are checkpoints and none can be read.
@@ -124,9 +124,9 @@ class CheckpointStore:
                 shutil.rmtree(self.folder / str(newer))
 
     def _read(self, step: int, like: Any = None) -> tuple[dict, list[np.ndarray]]:
-        """Return the plain values, and the leaves of a structure where one is given."""
+        """Return the plain values, and the leaves if `like` gives their structure."""
         try:
-            # NumPy leaves the file open where it is broken.
+            # NumPy does not close a broken file.
             path = self.folder / str(step) / FILE
             with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
                 values = json.loads(str(file[TABLE]))
@@ -160,13 +160,13 @@ class CheckpointStore:
 
 
 def _named_leaves(tree) -> dict[str, Any]:
-    """Return leaves under names, so that a checkpoint of another structure is recognised."""
+    """Return leaves by name; names differ between structures."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
     return {f"{i:03d}{jax.tree_util.keystr(path)}": leaf for i, (path, leaf) in enumerate(leaves)}
 
 
 def _plain_scalar(value):
-    """Turn a numpy or jax value into a plain one, for `json.dumps`."""
+    """Return a numpy or jax value as a plain one, for `json.dumps`."""
     if hasattr(value, "tolist"):
         return np.asarray(value).tolist()
     raise TypeError(f"{type(value).__name__} in a checkpoint's values is not JSON")

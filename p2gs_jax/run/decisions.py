@@ -1,9 +1,9 @@
-"""What a fit decides from its scene, as one record: `decisions.json`, and in every checkpoint.
+"""Values that a fit derives from its scene: `decisions.json`, and in every checkpoint.
 
-The options stay as they were asked for (`config.json`). Model and curve are chosen from the
-photographs, in numpy and threads: another machine may break a near tie the other way, and a state
-that was optimised under one curve means little under another. So a resumed run keeps what its
-checkpoints say.
+The options in `config.json` stay those of the user. Model and curve are chosen from the
+photographs, in numpy and threads: another computer may choose differently in a near tie, and a
+state that was optimised under one curve does not fit another. A resumed run therefore keeps the
+decisions of its checkpoints.
 """
 
 from __future__ import annotations
@@ -25,44 +25,44 @@ from p2gs_jax.presets import camera_formations, with_values
 from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.folder import RunFolder
 
-# Under this name in the metadata of checkpoints.
+# Key of the decisions in the metadata of checkpoints.
 KEY = "decided"
-# Exposures that are learned from nothing move this many times faster (docs/photometry.md, 4).
+# Factor on the rates of exposures and gammas without solved ones (docs/photometry.md, 4).
 FROM_NOTHING = 10.0
 
 
 @dataclass(frozen=True)
 class Decisions:
-    """Values that the scene settles where the options leave them open."""
+    """Values that the options leave to the scene."""
 
     model: config.PhotometricModel  # photometric model
     curve: Literal["power", "srgb", "spline", "linear"]  # base of the tone curve
     spline: tuple[float, ...] | None  # its correction, or None
-    freeze_until: float  # share of the run during which exposures and gammas keep still
-    log_exposure_mean: float | None  # weight of the pull on the mean log exposure; None: no pull
+    freeze_until: float  # share of the run in which exposures and gammas are fixed
+    log_exposure_mean: float | None  # weight of the regulariser of the mean log exposure, or None
     exposure_rate: float  # learning rate of the exposures
     gamma_rate: float  # learning rate of the gammas
-    reasons: tuple[str, ...] = ()  # for the model and the curve, in words
-    white_balance: config.Level | None = None  # per what it varies, or None
-    # whether cameras have it, and per what it varies, or None
+    reasons: tuple[str, ...] = ()  # reasons for the model and the curve, in words
+    white_balance: config.Level | None = None  # level of the white balance, or None
+    # per camera, or per camera and channel, or None
     vignetting: config.VignettingKind | None = None
-    responses: config.ResponseKind = "all"  # what has a spline of its own
-    # what each physical camera does; empty: nothing of its own
+    responses: config.ResponseKind = "all"  # one response for all, or per camera or channel
+    # vignetting and response of each physical camera, if any
     cameras: tuple[config.CameraFormation, ...] = ()
-    # near plane, scene units, where the one asked for would cut the scene; None elsewhere
+    # closer near plane, scene units, if that of the options would cut the scene; or None
     near: float | None = None
 
     @classmethod
     def as_asked(cls, cfg: config.FitConfig) -> Decisions:
-        """Return what the options say before a scene is known."""
+        """Return the values of the options, before a scene is known."""
         return cls(**{name: attrgetter(place)(cfg) for name, place in _PLACES.items()})
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Decisions:
-        """Return what `to_dict` and JSON made of it.
+        """Return decisions from the result of `to_dict`, also after JSON.
 
         Raises:
-            KeyError, TypeError: something is missing or of another kind.
+            KeyError, TypeError: a value is missing or of another type.
         """
         spline = values["spline"]
         kept = {f.name: values[f.name] for f in dataclasses.fields(cls)}
@@ -75,7 +75,7 @@ class Decisions:
         return plain(dataclasses.asdict(self))
 
     def resolve(self, cfg: config.FitConfig) -> config.FitConfig:
-        """Return the options that a fit computes under: as asked, with these values filled in."""
+        """Return the options of a fit: those of the user with these values filled in."""
         values = {place: getattr(self, name) for name, place in _PLACES.items()}
         values["photometry.select"] = False
         if self.near is not None:
@@ -83,7 +83,7 @@ class Decisions:
         return with_values(cfg, values)
 
     def require_same(self, saved: dict[str, Any], folder: Path) -> None:
-        """Refuse to continue a run whose checkpoints, in `folder`, have other decisions.
+        """Check that the checkpoints of a run, in `folder`, have the same decisions.
 
         Reasons may differ.
 
@@ -94,14 +94,14 @@ class Decisions:
         del now["reasons"]
         other = [f"{k} was {saved.get(k)}, now {v}" for k, v in now.items() if saved.get(k) != v]
         if other:
-            why = f"The checkpoints in {folder} were made under other decisions than this scene "
-            why += f"leads to now: {'; '.join(other)}."
+            why = f"The checkpoints in {folder} have other decisions than this scene now leads "
+            why += f"to: {'; '.join(other)}."
             fix = "restore the scene as it was when the run began, or start again in another "
             fix += "folder with --out"
             raise UserError(why, fix=fix)
 
 
-# Options that the scene settles, by the names of the decisions.
+# Options that the scene decides, by the names of the decisions.
 _PLACES = {
     "model": "photometry.model",
     "curve": "photometry.curve",
@@ -123,10 +123,10 @@ def write_decisions(path: Path, decisions: Decisions) -> None:
 
 
 def read_decisions(path: Path) -> Decisions | None:
-    """Read `decisions.json`; None where there is no such file.
+    """Read `decisions.json`; None if there is no such file.
 
     Raises:
-        UserError: it is broken.
+        UserError: the file is broken.
     """
     if not path.exists():
         return None
@@ -136,10 +136,9 @@ def read_decisions(path: Path) -> Decisions | None:
 
 
 def decide(cfg: config.FitConfig, selection: Selection | None, kept: Decisions | None) -> Decisions:
-    """Return what the photographs decided.
+    """Return the decisions from the photographs.
 
-    Where the checkpoints of a run that is resumed are `kept`, what its cameras do stays to the
-    digit.
+    A resumed run keeps vignetting and responses of its checkpoints (`kept`) bit for bit.
     """
     decided = Decisions.as_asked(cfg)
     if selection is None:
@@ -154,7 +153,7 @@ def decide(cfg: config.FitConfig, selection: Selection | None, kept: Decisions |
     )
     if cfg.photometry.known is None:
         return decided
-    # Known exposures that are to be kept are not learned, and nothing pulls at their mean.
+    # Known exposures that are fixed are not learned, and no regulariser changes their mean.
     keep = cfg.photometry.known_deviation_ev == 0
     return dataclasses.replace(
         decided, log_exposure_mean=None, freeze_until=1.0 if keep else decided.freeze_until
@@ -162,14 +161,14 @@ def decide(cfg: config.FitConfig, selection: Selection | None, kept: Decisions |
 
 
 def likely(cfg: config.FitConfig, kept: Decisions | None, near: float | None) -> Decisions | None:
-    """Return what most scenes decide, to compile for it beforehand; None: who knows.
+    """Return the most frequent decisions, to compile for them early; None: unpredictable.
 
-    `near` is the near plane, where that is decided.
+    `near` is the decided near plane, or None.
     """
     p, relative = cfg.photometry, cfg.loss.relative_exposure
     if p.known is not None or relative.weight is not None or cfg.densify.method != "mcmc":
         return None
-    # What cameras do enters the programs, and is not solved yet.
+    # Vignetting and responses of cameras are constants of the programs, and not yet solved.
     solved = p.start == "tracks" and (p.vignetting is not None or p.responses != "all")
     if kept is None and not p.select and solved:
         return None
@@ -187,7 +186,7 @@ def likely(cfg: config.FitConfig, kept: Decisions | None, near: float | None) ->
 
 
 def with_choice(decided: Decisions, form: Form, response: Response) -> Decisions:
-    """Return the decisions under a form and a curve; what cameras do follows from the solution."""
+    """Return the decisions under a form and a curve; `cameras` follow from the solution."""
     return dataclasses.replace(
         decided,
         model=form.model,
@@ -200,7 +199,7 @@ def with_choice(decided: Decisions, form: Form, response: Response) -> Decisions
 
 
 def unsolved(decided: Decisions) -> Decisions:
-    """Return the decisions without what only a solution can give; views may still learn theirs."""
+    """Return the decisions without a solution; a white balance per view can still be learned."""
     by_view = decided.white_balance == "view"
     return dataclasses.replace(
         decided, white_balance="view" if by_view else None, vignetting=None, responses="all"
@@ -208,7 +207,7 @@ def unsolved(decided: Decisions) -> Decisions:
 
 
 def without_tracks(decided: Decisions) -> Decisions:
-    """Return the decisions for exposures learned from nothing: from the first step, and fast."""
+    """Return the decisions without solved exposures: they are learned fast from the first step."""
     return dataclasses.replace(
         decided,
         freeze_until=0.0,
@@ -218,7 +217,7 @@ def without_tracks(decided: Decisions) -> Decisions:
 
 
 def kept_choice(cfg: config.FitConfig, folder: RunFolder) -> Decisions | None:
-    """Return what the checkpoints of a run remember; None: nothing was found, or there are none."""
+    """Return the decisions in the checkpoints of a run; None: nothing was solved, or none exist."""
     p = cfg.photometry
     solved = p.vignetting is not None or p.responses != "all"
     if not ((p.select or solved) and p.start == "tracks"):

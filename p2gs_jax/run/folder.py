@@ -1,7 +1,7 @@
-"""A run folder: where its files lie, the paths it remembers, and the lock of the one who writes.
+"""A run folder: paths of its files, stored paths of the scene, and the lock of the writing process.
 
-The lock is the system's (`flock`): it ends with the process, however that ends. The file that
-carries it may stay behind after a crash, and means nothing then.
+The lock is the system's (`flock`): it ends with the process in every case. Its file may remain
+after a crash, but does not lock anything.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _FROM_RUN = "_from_run"
 
 
 class RunFolder:
-    """The paths of a run folder; docs/files.md says what each file holds."""
+    """The paths of a run folder; docs/files.md describes the files."""
 
     def __init__(self, root: Path):
         self.root = root
@@ -46,13 +46,13 @@ class RunFolder:
         self.renders = root / "renders"
 
     def appearance(self, kind: Appearance) -> Path:
-        """Return where the corrections lie that a baseline of this kind learns."""
+        """Return the file with the corrections that a baseline of this kind learns."""
         names = {"ppisp": "ppisp.json", "luminance": "luminance.json"}
         return self.root / names.get(kind, "appearance.npy")
 
 
 def remembered(key: str, path: Path | None, folder: Path) -> dict[str, str | None]:
-    """Return what `config.json` says about a path: absolute, and relative to the run folder."""
+    """Return the entries of a path in `config.json`: absolute, and relative to the run folder."""
     if path is None:
         return {key: None}
     absolute = os.path.abspath(path)
@@ -64,7 +64,7 @@ def remembered(key: str, path: Path | None, folder: Path) -> dict[str, str | Non
 
 
 def candidates(saved: Mapping[str, Any], key: str, folder: Path) -> list[Path]:
-    """Return where a path that `config.json` remembers may lie now, the likeliest place first."""
+    """Return possible paths of an entry in `config.json`, the likeliest first."""
     absolute, relative = saved.get(key), saved.get(key + _FROM_RUN)
     if not isinstance(absolute, str) or not absolute:
         return []
@@ -75,34 +75,34 @@ def candidates(saved: Mapping[str, Any], key: str, folder: Path) -> list[Path]:
 
 
 def find(saved: Mapping[str, Any], key: str, folder: Path) -> Path | None:
-    """Return where a remembered path lies, or lay where it is gone; None if there is none."""
-    places = candidates(saved, key, folder)
-    return next((p for p in places if p.exists()), places[0] if places else None)
+    """Return the existing path of an entry, or else its former path; None: there is no entry."""
+    paths = candidates(saved, key, folder)
+    return next((p for p in paths if p.exists()), paths[0] if paths else None)
 
 
 class RunLock:
-    """The lock of a folder while it is held; no handle: the file system knows no locks."""
+    """The held lock of a folder; no handle: the file system does not support locks."""
 
     def __init__(self, folder: Path, handle: int | None):
         self.folder, self._handle = folder, handle
 
     def require(self) -> None:
-        """Refuse to go on in a folder that is gone or was made anew by another process.
+        """Check that the folder still exists and was not created again by another process.
 
         Raises:
-            UserError: the folder was removed while the run went on.
+            UserError: the folder was removed or replaced during the run.
         """
         if self._handle is not None and not _is_at(self._handle, self.folder / NAME):
             why = f"{self.folder} was removed or replaced while the run was writing to it."
-            raise UserError(why, fix="start again; what was in the folder is lost")
+            raise UserError(why, fix="start again; the content of the folder is lost")
 
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[RunLock]:
-    """Hold the lock of a folder that exists; what a crash left half written in it is removed.
+    """Hold the lock of an existing folder; incomplete files of a crash in it are removed.
 
     Raises:
-        UserError: another process holds it, or a write failed because the folder was removed.
+        UserError: another process holds the lock, or the folder was removed during a write.
     """
     handle = None if fcntl is None else _acquire(folder)
     lock = RunLock(folder, handle)
@@ -115,7 +115,7 @@ def locked(folder: Path) -> Iterator[RunLock]:
         raise
     finally:
         if handle is not None:
-            # Removed while it is held: whoever opened it meanwhile looks again (`_acquire`).
+            # The file is removed under the lock: a process that has opened it tries again.
             if _is_at(handle, folder / NAME):
                 with contextlib.suppress(OSError):
                     (folder / NAME).unlink()
@@ -123,10 +123,10 @@ def locked(folder: Path) -> Iterator[RunLock]:
 
 
 def require_free(folder: Path) -> None:
-    """Refuse a folder that another process is writing to; nothing is written.
+    """Check that no other process writes to a folder; nothing is written.
 
     Raises:
-        UserError: it is locked.
+        UserError: the folder is locked.
     """
     if fcntl is None or not (folder / NAME).is_file():
         return
@@ -158,7 +158,7 @@ def _acquire(folder: Path) -> int | None:
 
 
 def _lock(handle: int, folder: Path) -> bool:
-    """Lock a file without waiting; return False where its file system knows no locks."""
+    """Lock a file without waiting; return False if its file system does not support locks."""
     assert fcntl is not None
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -173,7 +173,7 @@ def _lock(handle: int, folder: Path) -> bool:
 
 
 def _is_at(handle: int, path: Path) -> bool:
-    """Return whether a path still names the open file."""
+    """Return whether a path is still that of the open file."""
     try:
         return os.path.samestat(os.fstat(handle), os.stat(path))
     except OSError:

@@ -1,7 +1,7 @@
-"""What each camera did to the light, for other tools to read (docs/files.md).
+"""Photometric parameters in files that other tools can read (docs/files.md).
 
-`photometry.json` has exposures, gammas and tone curve; `metering.json` the rule that explains the
-exposures; `appearance.npy`, `ppisp.json` or `luminance.json` what a baseline learns.
+`photometry.json` has exposures, gammas and tone curve; `metering.json` has the rule that explains
+the exposures; `appearance.npy`, `ppisp.json` or `luminance.json` have corrections of a baseline.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ VERSION = 2
 AGAIN = "restore it from a copy, or run `p2gs-jax fit ... --resume` or `calibrate` again"
 
 
-# The file, and its rows; docs/files.md says what each number is, and where it is null or absent.
+# The file, and its rows; docs/files.md describes each number, and where it is null or absent.
 PhotometryFile = ViewPhotometry = CameraPhotometry = dict[str, Any]
 FIELDS = ("version", "model", "curve", "gauge", "mean", "cameras", "views")
 OF_VIEWS = (
@@ -43,16 +43,16 @@ OF_VIEWS = (
 
 
 def write_photometry(path: Path, **values: Any) -> None:
-    """Write `photometry.json` atomically; values are its fields."""
-    given = {"version": VERSION, "cameras": [], **values}
-    write_json(path, {name: given[name] for name in FIELDS})
+    """Write `photometry.json` atomically; `values` are its fields."""
+    fields = {"version": VERSION, "cameras": [], **values}
+    write_json(path, {name: fields[name] for name in FIELDS})
 
 
 def read_photometry(path: Path) -> PhotometryFile:
     """Read `photometry.json`.
 
     Raises:
-        UserError: it cannot be read, lacks a field, or has another version.
+        UserError: the file cannot be read, lacks a field, or has another version.
     """
     with readable(path, AGAIN):
         data = parse_json(Path(path).read_text(encoding="utf-8"))
@@ -62,7 +62,7 @@ def read_photometry(path: Path) -> PhotometryFile:
 
 
 def _problem(data) -> str | None:
-    """Return what keeps `data` from being a `PhotometryFile`, or None."""
+    """Return the reason why `data` is not a `PhotometryFile`, or None."""
     if missing := _missing(data, FIELDS):
         return missing
     if data["version"] != VERSION:
@@ -81,10 +81,10 @@ def _missing(data, fields: Sequence[str]) -> str | None:
 
 
 def with_curve_of(cfg: PhotometryConfig, saved: PhotometryFile) -> PhotometryConfig:
-    """Return options with the model and the tone curve that a file names.
+    """Return options with the model and the tone curve of a file.
 
     Raises:
-        UserError: it names none.
+        UserError: the file has no valid tone curve.
     """
     curve = saved["curve"]
     try:
@@ -92,7 +92,7 @@ def with_curve_of(cfg: PhotometryConfig, saved: PhotometryFile) -> PhotometryCon
         found = {"model": saved["model"], "curve": curve["name"], "spline": spline}
         return dataclasses.replace(cfg, select=False, **found)
     except (KeyError, TypeError, ValueError) as error:
-        raise UserError(f"photometry.json names no tone curve ({error}).", fix=AGAIN) from error
+        raise UserError(f"photometry.json has no tone curve ({error}).", fix=AGAIN) from error
 
 
 def write_fitted(
@@ -107,8 +107,9 @@ def write_fitted(
 ) -> None:
     """Write `photometry.json` of a finished fit.
 
-    Exposures that were `fitted` to held-out views are by row; `unknown` names photographs that tell
-    no exposure; errors and counts of the `solution` that the fit started from are passed on.
+    `fitted` has the exposures fitted to held-out views, by row; `unknown` has the names of
+    photographs with unknown exposures. Standard errors and counts come from the `solution` from
+    which the fit started.
     """
     p, mean = cfg.photometry, dataclasses.asdict(mean_parameters(params.photometry))
     gauge = (
@@ -121,9 +122,9 @@ def write_fitted(
     balance = mean.pop("white_balance")
     if balance is not None:
         mean["white_balance"] = np.exp(balance).tolist()
-    own = {index: k for k, index in enumerate(scene.train_indices)}
+    row_of = {index: k for k, index in enumerate(scene.train_indices)}
     rows = [
-        _fitted_row(params, view, own.get(index), solution, view.name in unknown)
+        _fitted_row(params, view, row_of.get(index), solution, view.name in unknown)
         | {"exposure_fitted": fitted.get(index)}
         for index, view in enumerate(scene.views)
     ]
@@ -139,7 +140,7 @@ def write_fitted(
 
 
 def _row(view: View, split: str, exposure, ev, gamma, balance=None) -> ViewPhotometry:
-    """Return the row of a view: what it says itself, and what everything has."""
+    """Return the row of a view with the fields that all views have."""
     return {
         "image": view.name,
         "camera": view.camera,
@@ -157,13 +158,13 @@ def _row(view: View, split: str, exposure, ev, gamma, balance=None) -> ViewPhoto
 def _fitted_row(
     params: Params, view: View, k: int | None, solution: PhotometricSolution | None, unknown: bool
 ) -> ViewPhotometry:
-    """Return the row of a view of a fit; held-out ones have no exposure of their own, `k` None."""
+    """Return the row of a view of a fit; `k` is its row in `Photometry`, None if held out."""
     row = _row(view, view.split, None, None, None)
     if k is not None:
-        taken: Photometry = jax.tree.map(np.asarray, params.photometry)
-        e, balance = float(taken.exposures[k]), taken.white_balance
+        host: Photometry = jax.tree.map(np.asarray, params.photometry)
+        e, balance = float(host.exposures[k]), host.white_balance
         balance = None if balance is None else np.exp(balance[k]).tolist()
-        row = _row(view, view.split, e, float(np.log2(e)), float(taken.gammas[k]), balance)
+        row = _row(view, view.split, e, float(np.log2(e)), float(host.gammas[k]), balance)
     if unknown:
         row["exposure_unknown"] = True
     if k is not None and solution is not None and np.isfinite(solution.exposure_errors[k]):
@@ -178,9 +179,10 @@ def _fitted_row(
 def write_solution(
     path: Path, solution: PhotometricSolution, *, views: Sequence[View], pivot: float, gauge: str
 ) -> None:
-    """Write `photometry.json` of a bundle adjustment; views it knows nothing about get nulls.
+    """Write `photometry.json` of a bundle adjustment; unobserved views get nulls.
 
-    `pivot` is the linear value that gammas leave alone, and `gauge` says what fixes the scale.
+    `pivot` is the linear value that gammas do not change, and `gauge` describes what fixes the
+    scale.
     """
     s, rows = solution, []
     seen = np.isfinite(s.exposure_errors)
@@ -211,7 +213,7 @@ def write_solution(
 def _camera_rows(
     cameras: Sequence[CameraFormation], corner_errors: Float[np.ndarray, "c k"] | None
 ) -> list[CameraPhotometry]:
-    """Return the `cameras` of the file; errors are those of log V in the corners, if known."""
+    """Return the `cameras` of the file, with standard errors of log V in the corners if known."""
     known = corner_errors is not None and len(corner_errors) == len(cameras)
     return [
         {
@@ -230,7 +232,7 @@ def _camera_rows(
 def _balance(
     solution: PhotometricSolution, row: int
 ) -> tuple[list[float] | None, list[float] | None]:
-    """Return white balance and its errors of a view as the file has them: factors, and stops."""
+    """Return the white balance of a view (factors) and its standard errors (stops), or None."""
     if solution.white_balance_level is None or not np.isfinite(solution.exposure_errors[row]):
         return None, None
     errors = solution.white_balance_errors[row] / LN2
@@ -239,7 +241,7 @@ def _balance(
 
 
 def write_metering(path: Path, metering: Metering) -> None:
-    """Write `metering.json`: what the meters read, stops, and which rule explains the exposures."""
+    """Write `metering.json`: readings in stops, and the rule that explains the exposures."""
     rows = zip(metering.names, (metering.readings / LN2).tolist(), strict=True)
     write_json(
         path,
@@ -257,7 +259,7 @@ def read_metering(path: Path) -> Metering:
     """Read `metering.json`.
 
     Raises:
-        UserError: it is missing or broken.
+        UserError: the file is missing or broken.
     """
     with readable(path, "write it again with `p2gs-jax eval RUN`"):
         data = parse_json(path.read_text(encoding="utf-8"))
@@ -283,11 +285,11 @@ def _rule(data: dict) -> Rule:
 
 
 class _Layout(NamedTuple):
-    """The fields of a learned correction under their names in its JSON file."""
+    """The fields of a learned correction by their names in its JSON file."""
 
-    cameras: dict[str, str]  # with a row for each camera
-    views: dict[str, str]  # with a row for each view
-    shared: tuple[str, ...] = ()  # of all views, named as in the file
+    cameras: dict[str, str]  # fields with a row for each camera
+    views: dict[str, str]  # fields with a row for each view
+    shared: tuple[str, ...] = ()  # fields common to all views, named as in the file
 
 
 _LAYOUTS = {
@@ -301,7 +303,7 @@ _LAYOUTS = {
 
 
 def write_appearance(path: Path, learned: Corrections, views: Sequence[View]) -> None:
-    """Write what was learned of all training views; exposures lie in `photometry.json`."""
+    """Write the corrections of all training views; `photometry.json` has their exposures."""
     appearance: Any = learned
     layout = _LAYOUTS.get(type(appearance))
     if layout is None:
@@ -323,10 +325,10 @@ def write_appearance(path: Path, learned: Corrections, views: Sequence[View]) ->
 
 
 def read_appearance(path: Path, kind: Appearance, views: Sequence[View]) -> Corrections:
-    """Return what `write_appearance` wrote of the training views.
+    """Return the corrections of the training views from `write_appearance`.
 
     Raises:
-        UserError: it cannot be read, or belongs to other views.
+        UserError: the file cannot be read, or belongs to other views.
     """
     like: Any = identity(kind, [view.camera for view in views])
     layout = _LAYOUTS.get(type(like))

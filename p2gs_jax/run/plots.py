@@ -29,7 +29,7 @@ STATED = {"true": "--", "EXIF": ":", "EXIF or file": ":"}
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 
 ROWS = ("photograph", "render,\nits own\nexposure", "render,\none exposure\nfor all")
-# Of the plot below the pictures, inches.
+# Height of the plot below the pictures, inches.
 PLOT = 3.0
 TITLE_SIZE, TEXT_SIZE = 8, 8.5
 # Largest mean width of a character of DejaVu Sans, in font sizes.
@@ -37,7 +37,7 @@ CHARACTER = 0.62
 
 CHANNELS = ("red", "green", "blue")
 MOST_CURVES = 12
-# Letters as wide as the narrowest panel.
+# Number of letters that fit into the narrowest panel.
 TITLE_LETTERS = 36
 
 
@@ -52,10 +52,10 @@ def write_summary(
 ) -> None:
     """Draw some views, photographs beside renders, and the exposures of the training views.
 
-    Renders are under the views' own exposures, and under one for all. True exposures are by the
-    name of the view.
+    Renders are under the exposures of the views, and under one exposure for all. True exposures are
+    by the name of the view.
     """
-    # Imported here: it takes as long to load as a small scene to read.
+    # Imported here, because it is slow to load.
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
@@ -97,7 +97,7 @@ def write_summary(
     axis.margins(x=0.01, y=0.08)
     below.legend(fontsize=TEXT_SIZE, ncols=3, loc="outside upper left", frameon=False)
     with atomic_write(path) as temporary:
-        # Packing tighter takes longer than drawing, for a tenth of the bytes.
+        # A higher compression takes longer than the drawing and saves 10 % of the bytes.
         figure.savefig(temporary, format="png", pil_kwargs={"compress_level": 2})
 
 
@@ -106,15 +106,15 @@ def _log2(value: float | None) -> float | None:
 
 
 def _shorten(name: str, inches: float) -> str:
-    """Return the end of a name, as much as fits."""
-    room = int(inches * 72 / (CHARACTER * TITLE_SIZE))
-    return name if len(name) <= room else "…" + name[1 - room :]
+    """Return the end of a name that fits into a width."""
+    most = int(inches * 72 / (CHARACTER * TITLE_SIZE))
+    return name if len(name) <= most else "…" + name[1 - most :]
 
 
 def _lines(exposures_ev, cameras: Sequence[str], stated: Mapping[str, Any]) -> list[tuple]:
     """Return (views, stops from the mean, style, label) of every line; one label per kind.
 
-    Stated exposures, by who says so, are stops up to a constant; None or NaN where unknown.
+    Stated exposures, by their source, are stops up to a constant; None or NaN where unknown.
     """
     centered = np.asarray(exposures_ev, float) - np.nanmean(exposures_ev)
     order, owner, out = dict.fromkeys(cameras), np.array(list(cameras)), []
@@ -122,8 +122,8 @@ def _lines(exposures_ev, cameras: Sequence[str], stated: Mapping[str, Any]) -> l
         rows = np.flatnonzero(owner == camera)
         style = {"marker": marker, "color": color, "markersize": 4.5, "linewidth": 1}
         out.append((rows, centered[rows], style, f"recovered, camera {printable(camera)}"))
-    for label, given in stated.items():
-        values = np.array(given, float)
+    for label, exposures in stated.items():
+        values = np.array(exposures, float)
         known = np.isfinite(values) & np.isfinite(centered)
         if not known.any():
             continue
@@ -149,10 +149,10 @@ def write_calibration_plot(
 ) -> None:
     """Draw exposures with error bars, and tone curves of a calibration.
 
-    Stated exposures (EXIF or a file) are laid over the recovered ones, NaN where unknown; `pivot`
-    is the linear value that gammas leave alone.
+    Stated exposures (EXIF or a file) are shifted onto the recovered ones, NaN where unknown;
+    `pivot` is the linear value that gammas do not change.
     """
-    # Imported here: it takes as long to load as a small scene to read.
+    # Imported here, because it is slow to load.
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 

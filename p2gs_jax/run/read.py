@@ -1,4 +1,4 @@
-"""Reading a finished run back."""
+"""Reading a finished run."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from p2gs_jax.types import GAMMA_SRGB, Camera, Gaussians, Params, Photometry, Re
 
 CONFIG_AGAIN = (
     "restore it from a copy; or remove it and repeat the `p2gs-jax fit` that made it, with "
-    "--resume, which writes it again and goes on from the last checkpoint"
+    "--resume, which writes it again and continues from the last checkpoint"
 )
 
 
@@ -42,18 +42,18 @@ CONFIG_AGAIN = (
 class Run:
     """A finished run."""
 
-    folder: Path  # where it lies
+    folder: Path  # the run folder
     params: Params  # the fit
-    # what it was made under: the options as asked, with what the scene decided filled in
+    # options of the fit: those of the user with decisions filled in
     cfg: FitConfig
-    scene: Scene  # what it was fitted to; its photographs may be gone
+    scene: Scene  # the fitted scene; its photographs may be missing
     reference: Path | None  # photographs under one common exposure, or None
-    # `photometry.json`, with what `params` does not hold: standard errors, EXIF, exposures fitted
-    # to held-out photographs
+    # content of `photometry.json`, also standard errors, EXIF, and exposures fitted to held-out
+    # photographs
     photometry: photometry_files.PhotometryFile
-    # the moving object that each Gaussian belongs to, -1: none; None: nothing moves
+    # moving object of each Gaussian, -1: none; None: nothing moves
     owner: Int[np.ndarray, " n"] | None = None
-    moving: MovingObjects | None = None  # these objects
+    moving: MovingObjects | None = None  # the moving objects
 
     @cached_property
     def store(self) -> ImageStore:
@@ -67,15 +67,15 @@ class Run:
     def camera(self, index: int) -> Camera:
         """Return the camera of a row of `scene.views` at the size of the fit.
 
-        It sees what moves, where this run has it.
+        It has the poses of the moving objects, if there are any.
         """
         return camera_of(self.store, index)
 
     def render(self, camera: Camera, time: float | None = None) -> Render:
-        """Return linear radiance, opacity and depth that a camera sees.
+        """Return linear radiance, opacity and depth of a camera.
 
-        What moves is shown where it was at `time`, seconds; None: where the camera says. A camera
-        of one's own (`make_camera`) says nothing and shows nothing that moves.
+        Moving objects are rendered at their poses at `time`, seconds; None: at those of the camera.
+        A new camera (`make_camera`) has no poses and shows no moving objects.
         """
         if time is not None and self.moving is not None:
             placement = self.moving.placement(np.asarray(camera.viewmat), time)
@@ -83,7 +83,7 @@ class Run:
         return self._renderer(self.params.gaussians, self.alive, camera)
 
     def without_objects(self) -> Run:
-        """Return the run without anything that moves."""
+        """Return the run without moving objects."""
         return self._of(standing(self.params.gaussians, self.owner), None)
 
     def over_black(self) -> Run:
@@ -92,10 +92,10 @@ class Run:
         return replace(self, cfg=replace(self.cfg, render=render))
 
     def only_objects(self) -> Run:
-        """Return the run with nothing but what moves.
+        """Return the run with moving objects only.
 
         Raises:
-            UserError: nothing moves.
+            UserError: there are no moving objects.
         """
         self._require_objects()
         assert self.owner is not None
@@ -107,14 +107,14 @@ class Run:
 
     def _require_objects(self) -> None:
         if self.owner is None:
-            fix = "leave the option out; a drive with boxes has some, fitted with "
-            fix += "--dynamics.method rigid"
-            raise UserError(f"{self.folder} has no object with Gaussians of its own.", fix=fix)
+            fix = "leave the option out; drives with boxes have moving objects if they are fitted "
+            fix += "with --dynamics.method rigid"
+            raise UserError(f"{self.folder} has no moving object with Gaussians.", fix=fix)
 
     def as_of(self, time: float | None = None) -> Gaussians:
-        """Return all Gaussians in world coordinates, for programs that know no motion.
+        """Return all Gaussians in world coordinates, for programs without moving objects.
 
-        What moves is where it was at `time`, seconds; None: in the middle of the drive.
+        Moving objects have their poses at `time`, seconds; None: in the middle of the drive.
         """
         if self.owner is None or self.moving is None:
             return self.params.gaussians
@@ -125,56 +125,56 @@ class Run:
         """Return the photograph of a row of `scene.views` at the size of the fit, display values.
 
         Raises:
-            UserError: it is gone or broken.
+            UserError: the photograph is missing or broken.
         """
         return self.store.get(index)[0]
 
     def require_photographs(self, indices: Sequence[int] | None = None) -> None:
-        """Make sure that the photographs of some rows of `scene.views` are there; None: of all.
+        """Check that the photographs of some rows of `scene.views` exist; None: of all rows.
 
         Raises:
-            UserError: one is not.
+            UserError: a photograph is missing.
         """
         rows = range(len(self.scene.views)) if indices is None else indices
-        gone = [p for p in (self.scene.views[i].image_path for i in rows) if not p.is_file()]
-        if not gone:
+        lost = [p for p in (self.scene.views[i].image_path for i in rows) if not p.is_file()]
+        if not lost:
             return
-        what = (
-            f"{gone[0]} is missing" + (f", and {len(gone) - 1} more" if len(gone) > 1 else "")
+        fault = (
+            f"{lost[0]} is missing" + (f", and {len(lost) - 1} more" if len(lost) > 1 else "")
             if self.scene.root.exists()
-            else f"the scene of this run, {self.scene.root}, is not there"
+            else f"the scene of this run, {self.scene.root}, does not exist"
         )
-        fix = "put them back, or say where the scene is (--scene of view, render, export, eval "
-        fix += "and report; in Python load_run(folder, scene))"
-        raise UserError(f"this needs the photographs of the run: {what}.", fix=fix)
+        fix = "put them back, or name the folder of the scene (--scene of view, render, export, "
+        fix += "eval and report; in Python load_run(folder, scene))"
+        raise UserError(f"this needs the photographs of the run: {fault}.", fix=fix)
 
     @property
     def alive(self) -> Bool[Array, " n"]:
-        """All Gaussians: a finished run keeps no empty slots."""
+        """True for all Gaussians: a finished run has no empty slots."""
         return on_device(np.ones(self.params.gaussians.capacity), bool)
 
     @property
     def mean(self) -> display.MeanParameters:
-        """Exposure and gamma of a view that has none of its own."""
+        """Exposure and gamma of a view that was not fitted."""
         return display.mean_parameters(self.params.photometry)
 
     def own_display(self, index: int) -> display.DisplayTransform:
-        """Return how the view in a row of `scene.views` was taken.
+        """Return the display transform of the photograph in a row of `scene.views`.
 
-        The exposure of a held-out view is that fitted to its photograph, all else is as usual for
-        its camera.
+        The exposure of a held-out view is that fitted to its photograph; its other parameters are
+        the usual ones of its camera.
         """
         if index in self.scene.train_indices:
             row = self.scene.train_indices.index(index)
-            own = display.display_of_view(self.params, row, self.cfg.photometry)
-            return replace(own, backdrop=self.store.backdrop_values)
+            trained = display.display_of_view(self.params, row, self.cfg.photometry)
+            return replace(trained, backdrop=self.store.backdrop_values)
         view = self.scene.views[index]
         usual = self._usual(view.camera)
         fitted = {v["image"]: v["exposure_fitted"] for v in self.photometry["views"]}.get(view.name)
         return usual if fitted is None else replace(usual, exposure=fitted)
 
     def common_display(self, exposure_ev: float = 0.0) -> display.DisplayTransform:
-        """Return one look for all views: of no camera in particular, without vignetting.
+        """Return one display transform for all views, without a camera and without vignetting.
 
         Its exposure is in stops from the geometric mean of the training views' exposures.
         """
@@ -190,11 +190,11 @@ class Run:
         names = [view.name for view in self.scene.views]
         if name not in names:
             near = difflib.get_close_matches(name, names, 1) or names[:1]
-            fix = f"name one as photometry.json does: {near[0]}"
+            fix = f"give a name of photometry.json, for example {near[0]}"
             raise UserError(f"the run has no view {name!r}.", fix=fix)
         balance = self.own_display(names.index(name)).white_balance
         if balance is None:
-            why = "this run models no white balance: all its photographs have the same."
+            why = "this run models no white balance: it is the same in all photographs."
             raise UserError(why, fix="leave --white-balance-of out")
         return balance
 
@@ -213,8 +213,8 @@ class Run:
     ) -> display.DisplayTransform:
         """Return the display transform of a new picture (`render`), with its exposure metered.
 
-        `of` says how: `auto`: as the camera that took the photographs would have chosen, where a
-        rule explains it, else the mean; or a given rule. `exposure_ev` is added, stops.
+        `of` names the rule; `auto`: the rule that explains the photographs, or else the mean
+        exposure. `exposure_ev` is added, stops.
         """
         readings = meter(np.asarray(rendered.linear), np.asarray(rendered.alpha))
         exposure = self.metering.exposure(readings, of) * 2**exposure_ev
@@ -224,12 +224,12 @@ class Run:
 def load_run(folder: str | Path, scene: str | Path | None = None) -> Run:
     """Read parameters, configuration and cameras of a finished run.
 
-    Photographs are read when they are asked for; all else works without them. `scene` says where
-    the scene lies now; None looks where it was, also relative to the run.
+    Photographs are read when they are needed, and most methods work without them. `scene` is the
+    current folder of the scene; None: its former path, also relative to the run.
 
     Raises:
-        UserError: the folder is not a run, is unfinished or damaged, or was made by a version that
-            this one cannot read; or `scene` does not exist.
+        UserError: the folder is not a run, is unfinished or damaged, or is of a version that this
+            one cannot read; or `scene` does not exist.
     """
     files = RunFolder(Path(folder))
     _require_finished(files)
@@ -241,7 +241,7 @@ def load_run(folder: str | Path, scene: str | Path | None = None) -> Run:
     found = read_scene(files.root, root or files.root / "scene")
     decisions = read_decisions(files.decisions)
     if decisions is None:
-        why = f"{files.root} has no {files.decisions.name}: it was made by a version that this one "
+        why = f"{files.root} has no {files.decisions.name}: the run is of a version that this one "
         why += "cannot read, or the file was removed."
         raise UserError(why, fix="restore it from a copy, or fit again")
     cfg = decisions.resolve(asked)
@@ -306,7 +306,7 @@ def read_config(path: Path) -> tuple[dict[str, Any], FitConfig]:
     """Return `config.json` and the configuration in it.
 
     Raises:
-        UserError: it is broken, or of another version.
+        UserError: the file is broken, or of another version.
     """
     with readable(path, CONFIG_AGAIN):
         saved = parse_json(path.read_text(encoding="utf-8"))

@@ -1,9 +1,9 @@
-"""`scene.npz` and `objects.npz`: the scene of a run, so that it opens without its folder.
+"""`scene.npz` and `objects.npz`: the scene of a run, readable without the scene folder.
 
-`scene.npz` has cameras, points and tracks. Photographs are not in it; where they lie is kept
-relative to the scene's folder, or to the run's where its cache holds them (frames of a video,
-developed raw files). `objects.npz` says which Gaussians belong to which moving object of the scene;
-runs in which nothing moves have no such file.
+`scene.npz` has cameras, points and tracks. It does not hold photographs, but their paths relative
+to the scene folder, or relative to the run folder if its cache holds them (frames of a video,
+developed raw files). `objects.npz` has the moving object of each Gaussian; runs without moving
+objects have no such file.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from p2gs_jax.scene.drives.objects import MovingObjects
 from p2gs_jax.types import Distortion, Lidar, Scene, TrackedObject, Tracks, View
 
 SCENE_FILE = "scene.npz"
-# Folder of a run in which developed photographs lie.
+# Folder of a run with developed photographs.
 CACHE = "cache"
-# Fields that are kept in JSON as they are.
+# Fields that JSON holds unchanged.
 _OF_SCENES = ("format", "notes", "origin", "split_by", "random_seeds", "known_response")
 _OF_VIEWS = ("name", "camera", "split", "exif_ev", "frame", "time", "alpha")
 _OF_OBJECTS = ("name", "label", "size", "moving")
 
 
 def write_scene(folder: Path, scene: Scene) -> None:
-    """Write into a run folder what the run must know of its scene."""
+    """Write the scene of a run into its folder."""
     base = _base(scene.root)
     own_cars = {v.camera: v.own_car for v in scene.views if v.own_car is not None}
     table = {
@@ -80,14 +80,14 @@ def _view_row(view: View, folder: Path, base: Path) -> dict[str, Any]:
 
 
 def read_scene(folder: Path, root: Path) -> Scene:
-    """Return the scene of a run folder; its own folder, `root`, need not exist any more.
+    """Return the scene of a run folder; the scene folder `root` need not exist any more.
 
     Raises:
         UserError: the file is missing or broken.
     """
     path, fix = folder / SCENE_FILE, "restore it from a copy, or fit again"
     if not path.is_file():
-        why = f"{folder} has no {SCENE_FILE}: it was made by a version that this one cannot read, "
+        why = f"{folder} has no {SCENE_FILE}: the run is of a version that this one cannot read, "
         why += "or the file was removed."
         raise UserError(why, fix=fix)
     with readable(path, fix):
@@ -143,7 +143,7 @@ def _scene_from(a: Mapping[str, np.ndarray], table: dict, folder: Path, root: Pa
 
 
 def read_times(folder: Path) -> dict[str, float]:
-    """Return the times of a drive's views by name, seconds; empty where there are none to read."""
+    """Return the times of a drive's views by name, seconds; empty if none can be read."""
     try:
         with np.load(folder / SCENE_FILE, allow_pickle=False) as file:
             views = parse_json(str(file["json"]))["views"]
@@ -153,12 +153,12 @@ def read_times(folder: Path) -> dict[str, float]:
 
 
 def _base(root: Path) -> Path:
-    """Return the folder that photographs are named from; a scene may be a transforms.json."""
+    """Return the folder to which paths of photographs are relative; `root` may be a JSON file."""
     return root.parent if root.suffix.lower() == ".json" else root
 
 
 def _relative(path: Path, base: Path) -> str:
-    """Return a path from the scene's folder where it lies below it, else an absolute one."""
+    """Return the path relative to `base` if it lies below it, or else an absolute path."""
     for a, b in ((os.path.abspath(path), os.path.abspath(base)), (path.resolve(), base.resolve())):
         if Path(a).is_relative_to(b):
             return Path(a).relative_to(b).as_posix()
@@ -168,7 +168,7 @@ def _relative(path: Path, base: Path) -> str:
 def write_objects(
     path: Path, owner: Int[np.ndarray, " n"] | None, moving: MovingObjects, scene: Scene
 ) -> None:
-    """Write the owner of each Gaussian, a row of `moving`, -1: none; None: nothing has a box.
+    """Write the owner of each Gaussian, a row of `moving`, -1: none; None: there are no boxes.
 
     `moving` has some of the scene's objects.
     """
@@ -189,7 +189,7 @@ def write_objects(
 def read_objects(
     path: Path, scene: Scene, count: int
 ) -> tuple[Int[np.ndarray, " n"] | None, MovingObjects | None]:
-    """Return what `write_objects` wrote for `count` Gaussians; None where nothing moves.
+    """Return owners and objects from `write_objects` for `count` Gaussians; None: nothing moves.
 
     Raises:
         UserError: the file is broken, or belongs to another run.

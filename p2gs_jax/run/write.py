@@ -37,7 +37,7 @@ SUMMARY_VIEWS = 4
 def write_start(
     folder: RunFolder, scene: Path, reference: Path | None, cfg: FitConfig, decisions: Decisions
 ) -> None:
-    """Write what was asked and what was decided: from here on the folder is a run's, unfinished."""
+    """Write options and decisions; the folder then holds an unfinished run."""
     folder.metrics.unlink(missing_ok=True)
     begun = first_plan(folder) or {
         "train.steps": cfg.train.steps,
@@ -56,9 +56,9 @@ def write_start(
 
 
 def first_plan(folder: RunFolder) -> dict[str, Any]:
-    """Return the steps and the budget that a run was begun with, by option; it may be longer now.
+    """Return steps and budget of a run's first start, by option; a resumed run may be longer.
 
-    What it starts from depends on them; {}: nothing was begun.
+    The initial state depends on them; {}: the folder holds no run.
     """
     try:
         return dict(parse_json(folder.config.read_text(encoding="utf-8"))["begun"])
@@ -82,13 +82,12 @@ def write_run(
     shown: Sequence[ViewResult] = (),
     true_exposures: Mapping[str, float] | None = None,
 ) -> None:
-    """Write the scene, the Gaussians, the photometry and the summary, for `load_run` to open.
+    """Write the scene, the Gaussians, the photometry and the summary for `load_run`.
 
-    The Gaussians are the live ones; `owner` has the row in `moving` of the object that each belongs
-    to, and `cfg` is what the fit computed under. `decisions` are given by a fit that wrote no
-    `config.json`: it is written as well. Exposures `fitted` to held-out views go by row, `unknown`
-    has the names of photographs that tell none, and true exposures by image name are for the plot.
-    Without `shown` there is no summary.
+    The Gaussians are live ones; `owner` has the row in `moving` of the object of each, and `cfg`
+    the options of the fit. With `decisions`, `config.json` is written as well. `fitted` has the
+    exposures fitted to held-out views by row, `unknown` the names of photographs with unknown
+    exposures. True exposures by image name are for the plot. Without `shown` there is no summary.
     """
     if not isinstance(folder, RunFolder):
         folder = RunFolder(Path(folder))
@@ -123,14 +122,14 @@ def write_run(
 
 
 def write_view(folder: Path, name: str, result: ViewResult, store: ImageStore) -> None:
-    """Write one view as EXR, PNG and its photograph, under the photograph's own name."""
+    """Write one view as EXR, PNG and its photograph, under the name of the photograph."""
     stem, camera = Path(name).with_suffix("").as_posix(), camera_of(store, result.index)
     shown = (result.linear, result.alpha, result.ldr, result.transform, result.depth)
     write_frame(folder, OutputFrame(stem, *shown, camera, result.photograph))
 
 
 def summary_rows(scene: Scene) -> list[int]:
-    """Return which views the summary shows: held-out ones first, spread over cameras and time."""
+    """Return the views of the summary: held-out views first, spread over cameras and time."""
     pool = list(scene.test_indices) or list(scene.train_indices)
     if len(pool) < SUMMARY_VIEWS:
         pool += [i for i in scene.train_indices if i not in pool]

@@ -88,7 +88,7 @@ def test_a_run_without_its_scene_renders_and_exports(succeeded, refused, tmp_pat
         command, *options = words.split()
         # Names of folders are long, and wrapped.
         text = " ".join(refused(command, alone, *options).split())
-        assert f"{tmp_path / 'gone'}, is not there" in text or "nowhere does not exist" in text
+        assert f"{tmp_path / 'gone'}, does not exist" in text or "nowhere does not exist" in text
         assert "--scene" in text
 
 

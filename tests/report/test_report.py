@@ -126,7 +126,7 @@ def test_without_rendering_or_the_scene_the_rest_is_there(run, tmp_path):
     edit(moved / "config.json", lambda c: c.update(scene=str(tmp_path / "gone")))
     text = write_report(moved).read_text()
     assert headings(text) == HEADINGS
-    assert f"{tmp_path / 'gone'}, is not there" in words_of(text)
+    assert f"{tmp_path / 'gone'}, does not exist" in words_of(text)
 
 
 @pytest.mark.parametrize("lost", ["metrics.json", "photometry.json", "log.jsonl", "radiance.ply"])
