@@ -1,1 +1,1 @@
-"""What every part uses: device arrays, random streams, files, clocks."""
+"""Helpers for all packages: device arrays, random streams, files, clocks."""

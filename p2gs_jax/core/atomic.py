@@ -1,4 +1,4 @@
-"""Files and folders that are written whole or not at all, and reasons why they cannot be."""
+"""Files and folders that are complete or absent, and errors of writes."""
 
 from __future__ import annotations
 
@@ -32,28 +32,28 @@ _PART = 1 << 20
 
 @contextlib.contextmanager
 def readable(path: Path, fix: str) -> Iterator[None]:
-    """Turn what reading a broken file of ours raises in a `with` block into one error.
+    """Turn errors from a broken file in a `with` block into one error for the user.
 
     Raises:
-        UserError: the file is missing, or not what was written; `fix` says what to do.
+        UserError: the file is missing or broken; `fix` is the remedy.
     """
     try:
         yield
     except (*BROKEN_ARRAYS, AttributeError) as error:
-        why = f"it has no {error}" if isinstance(error, KeyError) else error
+        why = f"the file has no {error}" if isinstance(error, KeyError) else error
         raise UserError(f"{path} cannot be read ({why}).", fix=fix) from error
 
 
 @contextlib.contextmanager
 def naming(path: Path, *, begun: Path | None = None, size: int = _PART) -> Iterator[None]:
-    """Let a write that fails in a `with` block for want of room or rights say so, with its path.
+    """Turn a failed write in a `with` block into the system's error, with the path.
 
-    Writers of images, checkpoints and tables report a full disk as anything from `False` to a page
-    of C++; the system's own words name the fault. To find them, `size` bytes more are written to
-    `begun`, which holds what was written so far, or without it to a new file beside `path`.
+    Writers of images, checkpoints and tables report a full disk in many forms, from `False` to a
+    page of C++. To find the system's error, `size` more bytes are written to the incomplete file
+    `begun`, or without it to a new file beside `path`.
 
     Raises:
-        OSError: the system's reason, with `filename`. Other errors stay as they are.
+        OSError: the system's error, with `filename`. Other errors pass unchanged.
     """
     try:
         yield
@@ -67,7 +67,7 @@ def naming(path: Path, *, begun: Path | None = None, size: int = _PART) -> Itera
 
 
 def _reason(path: Path, begun: Path | None, size: int) -> int | None:
-    """Return the number of what the system says to so many bytes more; None if it takes them."""
+    """Return the number of the system's error when `size` more bytes are written, or None."""
     try:
         with (
             tempfile.NamedTemporaryFile(dir=path.parent, prefix=".trying-")
@@ -87,11 +87,11 @@ def atomic_write(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """Yield a temporary path beside `path`; it replaces `path`, or is deleted after an error.
 
     The folder of `path` is created. The temporary name keeps the suffix, for writers that choose a
-    format by it. With `durable` the file is on the disk before it replaces `path`, so that a power
-    failure leaves no half of it; without, its reader must check it.
+    format by it. With `durable` the file is on the disk before it replaces `path`, so that no power
+    failure leaves a part of it. Otherwise its reader must check it.
 
     Raises:
-        OSError: it cannot be written; `filename` names it, whatever the writer said.
+        OSError: the file cannot be written; `filename` names it for every writer.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -114,8 +114,8 @@ def atomic_write(path: Path, *, durable: bool = True) -> Iterator[Path]:
 def atomic_folder(path: Path) -> Iterator[Path]:
     """Yield an empty folder beside `path`; it replaces `path`, or is deleted after an error.
 
-    What lies at `path` is removed once the new folder is there: whenever the process is killed, one
-    of both is whole and at `path`, if the file system can exchange two names at once.
+    The former folder at `path` is removed after the new one is in place. If the process is killed,
+    one of both is complete at `path`, provided that the file system can exchange two names at once.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -135,9 +135,9 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 
 
 def remove_begun(folder: Path, spare: str) -> None:
-    """Remove what a process that was killed had begun to write in a folder and its subfolders.
+    """Remove incomplete files of a killed process from a folder and its subfolders.
 
-    Nobody else may write there; subfolders that hold a file named `spare` are somebody else's.
+    No other process may write there, except in subfolders that hold a file named `spare`.
     """
     for at, folders, files in os.walk(folder):
         if spare in files and Path(at) != folder:
@@ -153,7 +153,7 @@ def remove_begun(folder: Path, spare: str) -> None:
 
 
 def _exchanged(a: Path, b: Path) -> bool:
-    """Exchange two folders at once; return whether system and file system can (Linux)."""
+    """Exchange two folders at once; return False if the system does not support it."""
     rename = getattr(ctypes.CDLL(None), "renameat2", None)
     here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
     return rename is not None and not rename(here, os.fsencode(a), here, os.fsencode(b), exchange)
@@ -161,9 +161,9 @@ def _exchanged(a: Path, b: Path) -> bool:
 
 @contextlib.contextmanager
 def no_empty_folders(path: Path) -> Iterator[None]:
-    """Create a folder for a `with` block; after an error, delete the empty parts of it again.
+    """Create a folder for a `with` block; after an error, remove its empty parts again.
 
-    The folder, and those above it, are removed only if they were not there before.
+    The folder and its parents are removed only if they did not exist before.
     """
     new = [folder for folder in (path, *path.parents) if not folder.exists()]
     path.mkdir(parents=True, exist_ok=True)
@@ -178,7 +178,7 @@ def no_empty_folders(path: Path) -> Iterator[None]:
 
 
 def plain(value: Any) -> Any:
-    """Return `value` as JSON types, numpy's and jax's included; NaN and infinities become null."""
+    """Return `value` as JSON types, also from numpy and jax; NaN and infinities become null."""
     if isinstance(value, dict):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
@@ -213,12 +213,12 @@ def append_jsonl(path: Path, record: dict) -> None:
             if file.read(1) != b"\n":
                 line = _mend(file) + line
         with naming(Path(path)):
-            while line:  # a disk that fills up takes a part
+            while line:  # a nearly full disk accepts only a part
                 line = line[file.write(line) :]
 
 
 def _mend(file) -> bytes:
-    """Cut a torn last line off; return the newline that a whole one lacks."""
+    """Remove a torn last line; return the newline that a complete last line lacks."""
     file.seek(0)
     content = file.read()
     start = content.rfind(b"\n") + 1

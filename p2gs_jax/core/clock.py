@@ -1,4 +1,4 @@
-"""Seconds by name, and whether a budget was kept."""
+"""Durations by name, and a note on an exceeded budget."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Any
 
 
 class Stopwatch:
-    """Wall seconds by name, in the order in which the names were first used.
+    """Durations by name, wall seconds, in the order in which the names were first used.
 
-    The same name adds up. Threads may share a stopwatch; parts that overlap are both counted in
-    full.
+    Durations of the same name are added. Threads may share a stopwatch; overlapping parts are both
+    counted in full.
     """
 
     def __init__(self, seconds: Mapping[str, float] | None = None):
@@ -22,7 +22,7 @@ class Stopwatch:
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
-        """Add the seconds of a `with` block to a name, also where the block raises."""
+        """Add the seconds of a `with` block to a name, also if the block raises an error."""
         begin = time.perf_counter()
         try:
             yield
@@ -35,24 +35,24 @@ class Stopwatch:
             self.seconds[name] = self.seconds.get(name, 0.0) + seconds
 
 
-# Sums and views of the others in the `seconds` of metrics.json: no parts of a run.
+# Entries of `seconds` in metrics.json that are sums of others, not parts of a run.
 NO_PARTS = ("total_until_evaluation", "optimisation", "evaluation_and_files")
-# What a budget may be exceeded by before that is said: a share, and seconds.
+# Tolerance of a budget before there is a note: a factor, and seconds.
 LATE = (1.1, 2.0)
 MOST_NAMED = 4
 
 
 def whole_run(seconds: Mapping[str, Any]) -> float | None:
-    """Return how long a run took by the `seconds` of its metrics.json; None where they lack it."""
+    """Return the duration of a run, s, from `seconds` of its metrics.json; None: unknown."""
     parts = [seconds.get(k) for k in ("total_until_evaluation", "evaluation_and_files")]
     known = [p for p in parts if isinstance(p, int | float) and not isinstance(p, bool)]
     return float(sum(known)) if known else None
 
 
 def over_budget(budget_s: float | None, seconds: Mapping[str, float]) -> str | None:
-    """Return by how much a run exceeded its budget and where its `seconds` (metrics.json) went.
+    """Return a note on a run that exceeded its budget, with its longest parts, or None.
 
-    None where it did not.
+    `seconds` are those of metrics.json.
     """
     total = whole_run(seconds)
     if budget_s is None or total is None or total <= LATE[0] * budget_s + LATE[1]:
@@ -60,6 +60,6 @@ def over_budget(budget_s: float | None, seconds: Mapping[str, float]) -> str | N
     parts = sorted(((v, k) for k, v in seconds.items() if k not in NO_PARTS), reverse=True)
     named = ", ".join(f"{k.replace('_', ' ')} {v:.0f}" for v, k in parts[:MOST_NAMED] if v >= 0.5)
     return (
-        f"The budget of {budget_s:.0f} s was exceeded: the run took {total:.0f} s ({named}). Only "
-        "steps are cut short; what comes before and after them takes its time."
+        f"The budget of {budget_s:.0f} s was exceeded: the run took {total:.0f} s ({named}). A "
+        "budget limits the steps only, not the work before and after them."
     )

@@ -1,7 +1,7 @@
-"""Signals that ask a program to end: it ends as after Ctrl-C, and first where it can be continued.
+"""Signals that end a program: it ends as after Ctrl-C, at a point from which it can continue.
 
-Only handlers of the system and of Python are replaced: what `nohup` or another program has set
-stays. Outside the main thread Python delivers no signals, and nothing here does anything.
+Only handlers of the system and of Python are replaced; handlers of `nohup` or another program stay.
+Outside the main thread Python delivers no signals, and these functions have no effect.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ class Interrupted(KeyboardInterrupt):
 
 
 def name_of(number: int) -> str:
-    """Return how a user knows a signal: "Ctrl-C", "SIGTERM"."""
+    """Return the common name of a signal: "Ctrl-C", "SIGTERM"."""
     return "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
 
 
 def exit_code(error: KeyboardInterrupt) -> int:
-    """Return the exit code by which shells and batch systems know the signal: 128 + its number."""
+    """Return the exit code for shells and batch systems: 128 + the number of the signal."""
     return 128 + (error.number if isinstance(error, Interrupted) else int(signal.SIGINT))
 
 
 def raised() -> contextlib.AbstractContextManager[None]:
-    """Let signals that ask for the end raise `Interrupted` within a `with` block.
+    """Let signals that end a program raise `Interrupted` within a `with` block.
 
     Raises:
         Interrupted: such a signal came.
@@ -43,7 +43,7 @@ def raised() -> contextlib.AbstractContextManager[None]:
 
 
 class Held:
-    """Signals that wait until the program is where it can be continued.
+    """Signals that wait until the program has reached a point from which it can continue.
 
     `arrived` is the number of the signal that waits, or None.
     """
@@ -53,11 +53,11 @@ class Held:
         self._holding = False
 
     def begin(self) -> None:
-        """Hold signals from here on; before, there is nothing to lose and they raise at once."""
+        """Begin to hold signals; before, there is no state to lose and they raise at once."""
         self._holding = True
 
     def deliver(self) -> None:
-        """Raise what waits.
+        """Raise a waiting signal.
 
         Raises:
             Interrupted: a signal has arrived.
@@ -67,7 +67,7 @@ class Held:
             raise Interrupted(number)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        # Who asks twice will not wait.
+        # A second signal ends the program at once.
         if not self._holding or self.arrived is not None:
             raise Interrupted(number)
         self.arrived = number
@@ -75,9 +75,9 @@ class Held:
 
 @contextlib.contextmanager
 def held() -> Iterator[Held]:
-    """Hold signals that ask for the end within a `with` block; a second one raises at once.
+    """Hold signals that end a program within a `with` block; a second signal raises at once.
 
-    What still waits is raised at the end of the block.
+    A signal that still waits is raised at the end of the block.
 
     Raises:
         Interrupted: a signal was delivered.

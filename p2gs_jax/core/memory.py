@@ -1,4 +1,4 @@
-"""Memory of the machine and of this process, and errors that say it ran out."""
+"""Memory of the computer and of this process, and errors from a lack of memory."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from pathlib import Path
 CGROUP = Path("/sys/fs/cgroup")
 MEMINFO = Path("/proc/meminfo")
 STATM, STATUS = Path("/proc/self/statm"), Path("/proc/self/status")
-# How JAX names its errors, and what it says where memory ran out.
+# Names of JAX's errors, and words in them if memory ran out.
 _OF_JAX = ("XlaRuntimeError", "JaxRuntimeError")
-_SAID = ("RESOURCE_EXHAUSTED", "Out of memory", "out of memory")
+_OUT_OF_MEMORY = ("RESOURCE_EXHAUSTED", "Out of memory", "out of memory")
 
 
 def memory() -> tuple[int | None, int | None]:
@@ -22,7 +22,7 @@ def memory() -> tuple[int | None, int | None]:
     limit, used = text_of(CGROUP / "memory.max"), text_of(CGROUP / "memory.current")
     if limit.isdecimal() and (total is None or int(limit) < total):
         total = int(limit)
-        # What it holds of files goes when memory is wanted.
+        # Cached files leave memory when programs need it.
         files = re.search(r"^inactive_file (\d+)$", text_of(CGROUP / "memory.stat"), re.MULTILINE)
         cached = int(files[1]) if files else 0
         left = total - int(used) + cached if used.isdecimal() else total
@@ -31,10 +31,10 @@ def memory() -> tuple[int | None, int | None]:
 
 
 def left_to_process() -> int | None:
-    """Return how many bytes more this process may take, or None where that is unknown.
+    """Return the number of bytes that are left to this process, or None if it is unknown.
 
-    What the machine has (swap included), or its container, or the limit of the process
-    (`ulimit -v`); the least counts.
+    It is the least of the memory of the computer (with swap), of its container, and of the limit
+    of the process (`ulimit -v`).
     """
     _, available = memory()
     found = [] if available is None else [available + _numbers(MEMINFO).get("SwapFree", 0)]
@@ -46,30 +46,30 @@ def left_to_process() -> int | None:
 
 
 def resident() -> int:
-    """Return the bytes of memory that this process holds; 0 where that is unknown."""
+    """Return the bytes of memory that this process holds; 0 if that is unknown."""
     pages = text_of(STATM).split()
     return int(pages[1]) * resource.getpagesize() if len(pages) > 1 else 0
 
 
 def peak_bytes() -> int | None:
-    """Return the most memory that this process has held, or None where the system does not say.
+    """Return the peak memory of this process, bytes, or None if it is unknown.
 
-    From /proc: `getrusage` counts what the process was before it became this one.
+    It is from /proc, because `getrusage` includes the program that the process ran before.
     """
     return _numbers(STATUS).get("VmHWM")
 
 
 def ran_out(error: BaseException) -> bool:
-    """Return whether an error says that memory ran out: Python's, the system's, or JAX's."""
+    """Return whether an error of Python, the system or JAX is about a lack of memory."""
     if isinstance(error, MemoryError) or "can't start new thread" in str(error):
         return True
     if isinstance(error, OSError):
         return error.errno == errno.ENOMEM
-    return type(error).__name__ in _OF_JAX and any(said in str(error) for said in _SAID)
+    return type(error).__name__ in _OF_JAX and any(part in str(error) for part in _OUT_OF_MEMORY)
 
 
 def text_of(path: Path) -> str:
-    """Return the text of a file of the system, empty where it cannot be read."""
+    """Return the text of a file of the system, empty if it cannot be read."""
     try:
         return path.read_text().strip()
     except (OSError, UnicodeDecodeError):
@@ -77,6 +77,6 @@ def text_of(path: Path) -> str:
 
 
 def _numbers(path: Path) -> dict[str, int]:
-    """Return bytes by name of lines such as "MemTotal: 8000000 kB"; others are passed over."""
+    """Return bytes by name from lines such as "MemTotal: 8000000 kB"; other lines are ignored."""
     found = re.findall(r"^(\S+):\s+(\d+) kB$", text_of(path), re.MULTILINE)
     return {name: int(kilobytes) * 1024 for name, kilobytes in found}

@@ -15,16 +15,16 @@ from numpy.typing import ArrayLike, DTypeLike
 LN2 = math.log(2.0)
 
 Record = TypeVar("Record")
-# Arrays that come back as what they were given: on the host or on a device.
+# Results are on the host or on a device like the arguments.
 Values = TypeVar("Values", Array, np.ndarray)
 Scalar = Array | np.ndarray | np.floating | float
 
 
 def namespace(*values) -> Any:
-    """Return numpy where all values are on the host, jax.numpy where any is a device's or traced.
+    """Return numpy if all values are on the host, or jax.numpy if any is on a device or traced.
 
-    The same lines then serve inside compiled programs and beside them: on the host, each operation
-    of JAX would be a program of its own, compiled for every new shape.
+    The same code then works in compiled programs and on the host, where every operation of JAX
+    would compile a program for every new shape.
     """
     return jnp if any(isinstance(value, jax.Array) for value in values) else np
 
@@ -35,14 +35,14 @@ def on_device(values: ArrayLike, dtype: DTypeLike = np.float32) -> Array:
 
 
 def device_bytes() -> int:
-    """Return the memory of the default device; 0 where that is the host's, or nobody tells."""
+    """Return the memory of the default device, bytes; 0 on the host, or if it is unknown."""
     if jax.default_backend() == "cpu":
         return 0
     return (jax.devices()[0].memory_stats() or {}).get("bytes_limit", 0)
 
 
 def matmul(a: Array | np.ndarray, b: Array | np.ndarray) -> Any:
-    """Return a @ b in full precision: GPUs would round float32 to three digits (TF32)."""
+    """Return a @ b in full precision: GPUs round float32 to three digits (TF32) by default."""
     if namespace(a, b) is np:
         return a @ b
     return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)
@@ -61,7 +61,7 @@ def positive_pow(x: Values, p: Scalar, floor: float) -> Values:
 
 
 def unit_clip(x: Array) -> Array:
-    """Return x clipped to [0, 1]; at the bounds themselves the gradient passes whole."""
+    """Return x clipped to [0, 1]; at the bounds the gradient is 1."""
     return jnp.where(x > 1, 1.0, jnp.where(x < 0, 0.0, x))
 
 
@@ -80,9 +80,9 @@ def fibonacci_sphere(count: int) -> Float[np.ndarray, "n 3"]:
 
 
 def on_host(record: Callable[..., Record], *values: Any) -> Record:
-    """Return a device record made of host arrays, which a compiled program takes as they are.
+    """Return a device record of host arrays, which compiled programs accept.
 
-    Its annotations are `Array`, as records are mostly on a device.
+    This only satisfies type checkers, because fields of records are annotated with `Array`.
     """
     return record(*values)
 
@@ -90,7 +90,7 @@ def on_host(record: Callable[..., Record], *values: Any) -> Record:
 def srgb_encode(linear: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """Return the sRGB encoding (IEC 61966-2-1) of linear values, clipped to [0, 1].
 
-    In double precision; fits use the curve in `photometry.formation`.
+    It is in double precision; fits use the curve in `photometry.formation`.
     """
     x = np.clip(linear, 0.0, 1.0)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)

@@ -1,8 +1,8 @@
-"""PLY files: text or binary of either byte order is read, little-endian binary written.
+"""PLY files: reads text and binary of both byte orders, writes little-endian binary.
 
-A header names elements, each a table: its count of rows and its properties, single values or lists
-(a face lists the numbers of its corners). After Greg Turk, "The PLY Polygon File Format" (1994),
-with the types' later names that say their sizes (int8, float32).
+A header declares elements. Each element is a table with a number of rows and properties, single
+values or lists (a face lists the numbers of its corners). The format is that of Greg Turk, "The PLY
+Polygon File Format" (1994), with later names of types that contain sizes (int8, float32).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 
 from p2gs_jax.errors import UserError
 
-# A header that is longer has no end.
+# Largest size of a header, bytes.
 MOST_HEADER = 2**20
 _CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 _NAMES = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")
@@ -32,21 +32,21 @@ _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
 class PlyError(ValueError):
-    """What is wrong with the contents of a file."""
+    """A fault in the content of a file."""
 
 
 class Element(NamedTuple):
-    """A table as a header announces it: its rows, and its columns: NumPy's types, "" for lists."""
+    """A table as declared in a header; columns are NumPy's types, "" for lists."""
 
     rows: int
     columns: dict[str, str]
 
 
 class Header(NamedTuple):
-    """What stands before the rows: elements by name, in the order of the file.
+    """The header of a file: elements by name, in the order of the file.
 
-    `order` is that of bytes, as NumPy has it: "<", ">", or "=" for text; `size` is the header's,
-    bytes.
+    `order` is the byte order in NumPy's notation: "<", ">", or "=" for text; `size` is that of the
+    header, bytes.
     """
 
     order: str
@@ -57,10 +57,10 @@ class Header(NamedTuple):
 def parse_header(head: bytes, size: int) -> Header:
     """Return the header at the `head` of a file of `size` bytes; no element has more rows.
 
-    Comments and obj_info are passed over.
+    Comments and obj_info are ignored.
 
     Raises:
-        ValueError: it is not a header, or announces what cannot be (PlyError), or is not ASCII.
+        ValueError: `head` is not a valid header (PlyError), or is not ASCII.
     """
     magic = re.match(rb"ply(\r\n|\n|\r)", head)
     if magic is None:
@@ -87,26 +87,26 @@ def parse_header(head: bytes, size: int) -> Header:
             case ["property", "list", *_, name] if elements and name not in columns:
                 columns[name] = ""
             case _:
-                said = f"line {number} of its header, {line[:80]!r}"
-                raise PlyError(f"{said}, is unknown, misplaced or there twice")
+                place = f"line {number} of its header, {line[:80]!r}"
+                raise PlyError(f"{place}, is unknown, misplaced or there twice")
     if not order:
         raise PlyError("its header states no format")
     return Header(order, elements, end.end())
 
 
 def header_of(name: str, row: np.dtype, count: int, comments: Sequence[str] = ()) -> bytes:
-    """Return the header of a file of one element, whose rows follow as NumPy holds them.
+    """Return the header of a file of one element, followed by its rows in NumPy's layout.
 
-    `row` has little-endian fields without gaps. A header is ASCII: other characters of the comments
-    are escaped.
+    `row` has little-endian fields without gaps. A header is ASCII: other characters of comments are
+    escaped.
 
     Raises:
-        KeyError: PLY has no such type.
+        KeyError: PLY has no type of a field.
     """
     lines = [
         "ply",
         "format binary_little_endian 1.0",
-        *(f"comment {said.encode('unicode_escape').decode()}" for said in comments),
+        *(f"comment {text.encode('unicode_escape').decode()}" for text in comments),
         f"element {name} {count}",
         *(f"property {_WRITTEN[row[field]]} {field}" for field in row.names or ()),
         "end_header",
@@ -116,32 +116,33 @@ def header_of(name: str, row: np.dtype, count: int, comments: Sequence[str] = ()
 
 @contextmanager
 def refusing(path: Path, what: str, *, fix: str) -> Iterator[None]:
-    """Turn errors inside into one for the user: `path` is not a PLY of `what`.
+    """Turn errors in a `with` block into one for the user: `path` is not a PLY of `what`.
 
     Raises:
-        UserError: the file cannot be read, is not a PLY, or lacks a property that was asked for.
+        UserError: the file cannot be read, is not a PLY, or lacks a property.
     """
     try:
         yield
     except (OSError, ValueError, KeyError) as error:
-        said = str(error).rstrip(".")
-        raise UserError(f"{path} is not a valid PLY of {what}: {said}.", fix=fix) from error
+        why = str(error).rstrip(".")
+        raise UserError(f"{path} is not a valid PLY of {what}: {why}.", fix=fix) from error
 
 
 def read_table(path: Path, name: str) -> np.ndarray:
     """Return the rows of an element: a field for each property.
 
-    Binary rows are mapped: what has been read may leave memory again. What follows a later element
-    with lists is not looked at; a file that was cut before is refused.
+    Binary rows are memory-mapped. The check for a truncated file ends at a later element with
+    lists.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: it is not a PLY, was cut, has no such element, or has lists in it or before it.
+        ValueError: the file is not a PLY, is truncated, or lacks the element; or that element or
+            an earlier one has lists.
     """
     with path.open("rb") as file:
         if not path.stat().st_size:
             raise PlyError("it is empty")
-        # Lives as long as rows that lie in it.
+        # The map lives as long as rows that refer to it.
         data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         header = parse_header(data[:MOST_HEADER], len(data))
         if name not in header.elements:

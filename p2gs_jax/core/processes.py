@@ -1,7 +1,7 @@
-"""This process and those that it starts: where they import from.
+"""Search path of imports in this process and in the processes that it starts.
 
-A working folder holds somebody's scene: a `cv2.py` beside the photographs would run where Python
-looks for modules there. `python -m` does, and so does an empty part of PYTHONPATH.
+The working folder may hold a scene: a `cv2.py` beside the photographs would run if Python searched
+there. `python -m` and an empty part of PYTHONPATH search the working folder.
 """
 
 from __future__ import annotations
@@ -9,19 +9,19 @@ from __future__ import annotations
 import os
 import sys
 
-# The folder that holds the package: an uninstalled checkout may be the working folder.
-_OWN = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+# The folder of the package: an uninstalled checkout may be the working folder.
+_PACKAGE = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 
 
 def leave_out_working_folder() -> None:
-    """Import nothing from the working folder any more."""
+    """Remove the working folder from the search path of imports."""
     sys.path[:] = _search_path()
 
 
 def environment() -> dict[str, str]:
-    """Return the environment of a Python process of ours, and of those that it starts.
+    """Return the environment of a Python process that this one starts.
 
-    They import from where this process does, and not from the working folder.
+    It has the search path of this process, without the working folder.
     """
     path = os.pathsep.join(_search_path())
     return {**os.environ, "PYTHONPATH": path, "PYTHONSAFEPATH": "1"}
@@ -30,7 +30,7 @@ def environment() -> dict[str, str]:
 def _search_path() -> list[str]:
     try:
         here = os.path.realpath(os.getcwd())
-    except OSError:  # it was removed
-        return [place for place in sys.path if place]
-    kept = [place for place in sys.path if place and os.path.realpath(place) != here]
-    return [_OWN, *kept] if here == os.path.realpath(_OWN) else kept
+    except OSError:  # the working folder was removed
+        return [folder for folder in sys.path if folder]
+    kept = [folder for folder in sys.path if folder and os.path.realpath(folder) != here]
+    return [_PACKAGE, *kept] if here == os.path.realpath(_PACKAGE) else kept

@@ -15,12 +15,12 @@ from rich.text import Text
 
 from p2gs_jax.core.text import as_clock, printable
 
-# Seconds between lines of progress where there is no terminal.
+# Seconds between lines of progress outside of a terminal.
 EVERY_S = 5.0
 
 
 class PlainConsole(Console):
-    """rich's console for text of others: neither markup nor control characters have an effect."""
+    """rich's console for text from outside: markup and control characters have no effect."""
 
     def __init__(self, **options: Any):
         super().__init__(highlight=False, markup=False, emoji=False, **options)
@@ -28,7 +28,7 @@ class PlainConsole(Console):
     def render(
         self, renderable: RenderableType, options: ConsoleOptions | None = None
     ) -> Iterator[Segment]:
-        """Yield segments whose text is printable; colours are no part of it."""
+        """Yield segments whose text is printable; styles are kept."""
         for segment in super().render(renderable, options):
             if segment.control:
                 yield segment
@@ -38,7 +38,7 @@ class PlainConsole(Console):
 
 @dataclass(frozen=True)
 class LogRecord:
-    """One line of `log.jsonl`, and what the live display shows."""
+    """One line of `log.jsonl`, and the content of the live display."""
 
     step: int
     progress: float
@@ -53,7 +53,7 @@ class LogRecord:
     terms: dict[str, float]
 
     def summary(self) -> str:
-        """Return how far the run is, as text."""
+        """Return the progress of the run as text."""
         total = max(round(self.step / self.progress), self.step) if self.progress else "?"
         left = "" if self.left_s is None else f", {as_clock(self.left_s)} left"
         scores = f"loss {self.loss:.4f}, PSNR {self.psnr:.2f} dB"
@@ -77,7 +77,7 @@ Silent = Reporter
 
 
 class TerminalReporter(Reporter):
-    """Prints messages as lines; progress is a live bar in a terminal, elsewhere a line at times.
+    """Prints messages as lines; progress is a live bar in a terminal, elsewhere a line every 5 s.
 
     It is a context manager.
     """
@@ -85,7 +85,7 @@ class TerminalReporter(Reporter):
     def __init__(self, console: Console | None = None):
         self.console = console or PlainConsole(file=sys.stderr)
         self.live: Live | None = None
-        self._said_at = time.monotonic()
+        self._printed_at = time.monotonic()
 
     def __enter__(self) -> TerminalReporter:
         if self.console.is_terminal:
@@ -102,20 +102,20 @@ class TerminalReporter(Reporter):
         self.console.print(Text(text))
 
     def stage(self, name: str, done: int = 0, total: int = 0) -> None:
-        """Show a stage and how far it is."""
+        """Show a stage and its progress."""
         text = f"{name} {done}/{total}" if total else f"{name} ..."
         self.show(Text(text), text)
 
     def show(self, display: RenderableType, line: str) -> None:
-        """Show something in a terminal; elsewhere a line, unless the last one is recent."""
+        """Show a display in a terminal; elsewhere print a line, unless the last one is recent."""
         if self.live is not None:
             self.live.update(display)
-        elif time.monotonic() - self._said_at >= EVERY_S:
-            self._said_at = time.monotonic()
+        elif time.monotonic() - self._printed_at >= EVERY_S:
+            self._printed_at = time.monotonic()
             self.console.print(Text(line), soft_wrap=True)
 
     def log(self, record: LogRecord) -> None:
-        """Show how far the optimisation is."""
+        """Show the progress of the optimisation."""
         text = f"{record.progress:4.0%}  {record.summary()}"
         bar = f"{'█' * int(12 * record.progress):<12} {text}"
         self.show(Text(bar, no_wrap=True, overflow="ellipsis"), text.strip())

@@ -1,7 +1,8 @@
-"""How the process of a command runs JAX; programs that import the package decide alone.
+"""Settings of JAX and of memory for commands; programs that import the package choose theirs.
 
-By default the C library hands the large arrays of every step back to the system and takes them
-anew: a fifth of a step (BUILD_NOTES, "Memory is kept"). Compiled programs are kept on disk.
+By default the C library returns the large arrays of every step to the system and requests them
+again, which takes 20 % of a step (BUILD_NOTES, "Memory is kept"). Compiled programs are kept on
+disk.
 """
 
 from __future__ import annotations
@@ -22,33 +23,33 @@ from p2gs_jax.errors import UserError
 
 # Numbers of mallopt(3).
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD = -1, -2, -3
-# Of 16 cores a step took 741 ms as XLA divides it, 321 divided over 4, 337 over 8, 666 over 16; two
-# are as fast either way (experiments/results/2026-11-27-cores.md).
+# With 16 cores a step took 741 ms as XLA divides it, 321 ms divided over 4, 337 ms over 8, 666 ms
+# over 16; with 2 cores both take as long (experiments/results/2026-11-27-cores.md).
 WORTH_DIVIDING = 4
-# Shorter compilations are not worth a file.
+# Programs that compile faster are not kept.
 SHORTEST_S = 0.5
-# The least recently used programs go first.
+# Size of the cache, bytes, above which the least recently used programs are removed.
 MOST_BYTES = 512 * 2**20
 
 
 def keep_freed_memory() -> bool:
-    """Let the C library keep freed memory for the next step; return whether it could be told to.
+    """Let the C library keep freed memory for the next step; return whether that succeeded.
 
-    The process then shrinks only by `return_freed_memory`. glibc only.
+    Only `return_freed_memory` then returns memory to the system. It needs glibc.
     """
     mallopt = _of_glibc("mallopt")
     if mallopt is None:
         return False
-    # The largest value that some libraries take comes second; all settings are tried.
-    wanted = ((_M_TRIM_THRESHOLD, 2**31 - 1), (_M_TOP_PAD, 64 << 20))
-    taken = [mallopt(what, value) == 1 for what, value in wanted]
-    return any(mallopt(_M_MMAP_THRESHOLD, 1 << n) == 1 for n in (30, 25)) and all(taken)
+    # Some libraries accept only the second threshold; all settings are made in any case.
+    settings = ((_M_TRIM_THRESHOLD, 2**31 - 1), (_M_TOP_PAD, 64 << 20))
+    accepted = [mallopt(number, value) == 1 for number, value in settings]
+    return any(mallopt(_M_MMAP_THRESHOLD, 1 << n) == 1 for n in (30, 25)) and all(accepted)
 
 
 def return_freed_memory() -> None:
-    """Hand freed memory back to the system, where a part of a run ends; glibc only.
+    """Return freed memory to the system at the end of a part of a run; needs glibc.
 
-    It costs what the next part takes anew, some tenths of a second a gigabyte.
+    The next part takes a few tenths of a second per gigabyte to request memory again.
     """
     trim = _of_glibc("malloc_trim")
     if trim is not None:
@@ -56,35 +57,35 @@ def return_freed_memory() -> None:
 
 
 def _of_glibc(name: str) -> Any:
-    """Return a function of the C library, None where there is no such function."""
+    """Return a function of the C library, or None if there is none."""
     return getattr(ctypes.CDLL(None), name, None) if sys.platform.startswith("linux") else None
 
 
 def tune_process() -> None:
-    """Prepare a process for long fits on a CPU; to be called before JAX computes anything.
+    """Prepare a process for long fits on a CPU; call it before JAX computes anything.
 
-    Programs run on the thread that calls them, whose memory is kept: a step waits for the step
-    before it in any case.
+    Programs run on the thread that calls them, whose memory is kept; steps depend on each other and
+    could not overlap.
     """
     keep_freed_memory()
     jax.config.update("jax_cpu_enable_async_dispatch", False)
 
 
 def use_cores(count: int | None = None) -> None:
-    """Let fits divide a view over so many cores; None: over four, where there are as many.
+    """Let fits divide a view over `count` cores; None: over 4, if there are as many.
 
-    To be called before JAX computes anything: each core becomes a device. Programs that do not call
-    this have one. Without a count, what the environment says of it stays (JAX_NUM_CPU_DEVICES, or
-    XLA_FLAGS with xla_force_host_platform_device_count), and so does what JAX already has.
+    Call it before JAX computes anything: each core becomes a device. Without this call there is one
+    device. Without a count, settings of the environment stay (JAX_NUM_CPU_DEVICES, or XLA_FLAGS
+    with xla_force_host_platform_device_count), and so do devices that JAX already has.
 
     Raises:
-        UserError: XLA_FLAGS says how many.
-        RuntimeError: JAX has computed something already.
+        UserError: XLA_FLAGS sets the number of devices.
+        RuntimeError: JAX has already computed something.
     """
     stated = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
     if count is not None and stated:
-        why = "XLA_FLAGS has xla_force_host_platform_device_count, which states the cores."
-        raise UserError(why, fix="leave it out, or say nothing else of cores (--threads)")
+        why = "XLA_FLAGS has xla_force_host_platform_device_count, which sets the cores."
+        raise UserError(why, fix="leave out either this flag or the number of cores (--threads)")
     if count is None and (stated or jax.config.values["jax_num_cpu_devices"] != -1):
         return
     usual = WORTH_DIVIDING if available_cores() >= WORTH_DIVIDING else 1
@@ -98,8 +99,8 @@ def use_cores(count: int | None = None) -> None:
 def use_compile_cache() -> None:
     """Let JAX keep compiled programs in the user's cache folder.
 
-    A folder that the user chose (JAX_COMPILATION_CACHE_DIR) stays; JAX_ENABLE_COMPILATION_CACHE=0
-    turns it off. Where the folder cannot be written, nothing is kept.
+    JAX_COMPILATION_CACHE_DIR names another folder; JAX_ENABLE_COMPILATION_CACHE=0 turns the cache
+    off. If the folder cannot be written, programs are not kept.
     """
     if jax.config.values["jax_compilation_cache_dir"] is not None:
         return
@@ -114,11 +115,11 @@ def use_compile_cache() -> None:
 
 
 def _machine() -> str:
-    """Return a name for what compiled programs depend on: JAX's version and the CPU's abilities."""
-    abilities = platform.processor()
+    """Return a name of JAX's version and the CPU's features, on which programs depend."""
+    features = platform.processor()
     info = Path("/proc/cpuinfo")
     if info.is_file():
         lines = info.read_text(errors="replace").splitlines()
-        abilities = next((line for line in lines if line.startswith(("flags", "Features"))), "")
-    key = hashlib.sha256(abilities.encode()).hexdigest()[:12]
+        features = next((line for line in lines if line.startswith(("flags", "Features"))), "")
+    key = hashlib.sha256(features.encode()).hexdigest()[:12]
     return f"jax-{jax.__version__}-{platform.machine()}-{key}"

@@ -1,7 +1,7 @@
-"""The random streams of fits and synthetic scenes, by name: users of one would be correlated.
+"""Random streams of fits and synthetic scenes, by name; two uses of one stream would be correlated.
 
-The order of views is the exception: its stream is the number of the epoch, and epoch 7 therefore
-has the words of `HELD_OUT`; nothing that is computed depends on both.
+The order of views is the exception: its stream is the number of the epoch. Epoch 7 therefore has
+the random numbers of `HELD_OUT`; no computation depends on both.
 """
 
 from __future__ import annotations
@@ -15,36 +15,36 @@ from jaxtyping import Array, Int, PRNGKeyArray, UInt32
 
 @unique
 class Stream(IntEnum):
-    """What a fit draws on the host, beside the order of its views."""
+    """Random choices of a fit on the host, except the order of its views."""
 
     PARTNER = 1  # second view of a step
     STEP_PAIRS = 2  # track observations that a step compares
     START_EXPOSURES = 3
     COMPARED_POINTS = 5  # points whose observations choose the photometric model
-    HELD_OUT = 7  # observations that judge it
+    HELD_OUT = 7  # observations that are held out to compare models
     COLOR_PAIRS = 11  # track observations that steps draw from
     STACK_PIXELS = 13
-    SURFACE_COLORS = 17  # points without tracks, and the views they are sampled in
-    SOLVED_POINTS = 19  # points that exposures are solved from
+    SURFACE_COLORS = 17  # points without tracks, and the views in which they are sampled
+    SOLVED_POINTS = 19  # points from which exposures are solved
     MATCHED_PIXELS = 23  # pixels of a view that may become dense seeds
     DENSE_SEEDS = 29
     SEED_POINTS = 31  # points of the scene that start as Gaussians
-    SEED_GAUSSIANS = 37  # those of these and of the shell that are kept
-    SHARED_POINTS = 41  # points that tell which views to match
-    RENDERED_PIXELS = 43  # pixels of a fit that are looked for in other views
-    LIDAR = 53  # laser measurements that are kept
-    MEASURED_DEPTHS = 59  # laser measurements that a view is compared with
+    SEED_GAUSSIANS = 37  # Gaussians of seeds and shell that are kept
+    SHARED_POINTS = 41  # points that select the views to match
+    RENDERED_PIXELS = 43  # pixels of a fit that are warped into other views
+    LIDAR = 53  # LiDAR measurements that are kept
+    MEASURED_DEPTHS = 59  # LiDAR measurements in the loss of a view
     RANDOM_SEEDS = 67  # seeds of scenes without points and matches
-    BACKDROP = 71  # what a step composites a photograph with alpha over
-    VIBRATING = 73  # laser points that start as Gaussians that vibrate
-    NETWORK = 79  # first weights of the network that reads photographs (Luminance-GS)
-    SELF_CHECK = 83  # Gaussians that the rasterizer is checked with
-    SCORE_SIGNS = 47  # signs of residuals, from which standard errors of many views are drawn
+    BACKDROP = 71  # background of a photograph with alpha in a step
+    VIBRATING = 73  # LiDAR points that become vibrating Gaussians
+    NETWORK = 79  # initial weights of the network of Luminance-GS
+    SELF_CHECK = 83  # Gaussians of the rasterizer's self-check
+    SCORE_SIGNS = 47  # signs of residuals for standard errors of many views
 
 
 @unique
 class SceneStream(IntEnum):
-    """What a synthetic scene draws."""
+    """Random choices of a synthetic scene."""
 
     BUILDINGS = 1
     ISO = 2
@@ -56,17 +56,17 @@ class SceneStream(IntEnum):
 
 
 def generator(seed: int, stream: Stream | SceneStream, *more: int) -> np.random.Generator:
-    """Return the generator of a stream, and of a step, view or row in it, at its beginning."""
+    """Return a new generator of a stream, or of a step, view or row in it (`more`)."""
     return np.random.default_rng((seed, int(stream), *more))
 
 
 def view_order(seed: int, epoch: int, count: int) -> Int[np.ndarray, " v"]:
-    """Return the order of so many views in an epoch."""
+    """Return the order of `count` views in an epoch."""
     return np.random.default_rng((seed, epoch)).permutation(count)
 
 
 def device_seed(seed: int) -> np.uint32:
-    """Return a seed as programs take it: an argument, so that every seed has the same program.
+    """Return a seed as an argument of programs, so that all seeds share one program.
 
     JAX uses the lowest 32 bits of a seed.
     """

@@ -1,4 +1,4 @@
-"""Text of others, as file names and their JSON: harmless in terminals, Markdown and pictures."""
+"""Text from outside, such as file names and JSON: safe in terminals, Markdown and pictures."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
-# Control characters but tab and newline, surrogates, and what turns the direction of writing.
+# Control characters except tab and newline, surrogates, and marks of the direction of writing.
 _HIDDEN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
 def printable(text: str) -> str:
-    r"""Return a text whose control characters are written out, as `\x1b`."""
+    r"""Return a text whose control characters are escaped, as `\x1b`."""
     return _HIDDEN.sub(lambda found: ascii(found.group())[1:-1], text)
 
 
@@ -24,7 +24,7 @@ def first_few(names: Sequence[str]) -> str:
 
 
 def count_of(number: float, noun: str) -> str:
-    """Return a number of things in words: "1 view" or "1,200 views"."""
+    """Return a number with its noun: "1 view" or "1,200 views"."""
     return f"{number:,.0f} {noun}{'' if number == 1 else 's'}"
 
 
@@ -36,7 +36,7 @@ def as_clock(seconds: float) -> str:
 
 
 def natural(text: str) -> tuple[list[int | str], str]:
-    """Return what sorts texts by the numbers in them: `a2` before `a10`."""
+    """Return a key that sorts texts by the numbers in them: `a2` before `a10`."""
     parts = re.split(r"(\d+)", text)
     return [int(part) if k % 2 else part for k, part in enumerate(parts)], text
 
@@ -45,8 +45,8 @@ def parse_json(text: str) -> Any:
     """Return the value of a text of JSON.
 
     Raises:
-        json.JSONDecodeError: it is not valid JSON, is nested deeper than Python reads, or holds a
-            number of thousands of digits.
+        json.JSONDecodeError: the text is not valid JSON, is nested too deeply for Python, or holds
+            a number with thousands of digits.
     """
     try:
         return json.loads(text)
@@ -58,17 +58,17 @@ def parse_json(text: str) -> Any:
         raise json.JSONDecodeError(str(error), text, 0) from None
 
 
-# What Markdown, or HTML within it, would take for more than text.
+# Characters with a meaning in Markdown, or in HTML within it.
 _MARKUP = re.compile(r"[\\`*|<>\[\]]")
 
 
 def escaped(text: str) -> str:
-    """Return a text of one line as Markdown that shows it as it is."""
+    """Return one line of text as Markdown that shows it unchanged."""
     return _MARKUP.sub(r"\\\g<0>", " ".join(printable(text).split()))
 
 
 def markdown_table(names: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table of text as Markdown; all columns but the first are aligned to the right."""
+    """Return a table of text as Markdown; all columns except the first are right-aligned."""
     lines = [[escaped(cell) for cell in row] for row in (names, *rows)]
     lines.insert(1, ["---", *["---:"] * (len(names) - 1)])
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
@@ -76,16 +76,16 @@ def markdown_table(names: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 @contextlib.contextmanager
 def names_as_they_are() -> Iterator[None]:
-    """Let matplotlib draw names as they are: a `with` block, or a decorator.
+    """Let matplotlib draw names unchanged: a context manager, or a decorator.
 
-    Text between dollars is not a formula, and letters that the font lacks are boxes in the picture,
-    without a warning in the terminal. Control characters are left to the caller (`printable`).
+    Text between dollars is not a formula. Letters that the font lacks are boxes in the picture,
+    without a warning in the terminal. The caller escapes control characters (`printable`).
     """
-    # Imported here: it takes as long to load as a small scene to read.
+    # Imported here, because it is slow to load.
     import matplotlib
 
     with matplotlib.rc_context(), warnings.catch_warnings():
-        # As nobody has set it: matplotlib reads a `matplotlibrc` of the working folder.
+        # Defaults, because matplotlib reads a `matplotlibrc` of the working folder.
         matplotlib.rcdefaults()
         matplotlib.rcParams["text.parse_math"] = False
         warnings.filterwarnings("ignore", message="Glyph", category=UserWarning)

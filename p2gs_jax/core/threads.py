@@ -1,4 +1,4 @@
-"""Cores that this process may use, and a map in threads that holds few results at once."""
+"""Number of cores for this process, and a map in threads that holds few results at once."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from p2gs_jax.core.memory import CGROUP, text_of
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-# A bound on the images held at once.
+# Largest number of threads, which bounds the images in memory.
 MOST_WORKERS = 4
 
 
 def available_cores() -> int:
-    """Return how many cores this process may use: its affinity, or the limit of its container."""
-    there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    """Return the number of cores for this process, by its affinity and its container's limit."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     # "QUOTA PERIOD", microseconds, or "max PERIOD".
     quota, _, period = text_of(CGROUP / "cpu.max").strip().partition(" ")
     if quota.isdecimal() and period.isdecimal():
-        there = min(there or 1, int(quota) // max(int(period), 1))
-    return max(there or 1, 1)
+        cores = min(cores or 1, int(quota) // max(int(period), 1))
+    return max(cores or 1, 1)
 
 
 def map_in_order(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
     """Yield a function's results in the order of the items, computed in threads.
 
     NumPy, JAX and image readers release the interpreter's lock. The first item is computed alone,
-    so that programs compile once. `Executor.map` would submit all items at once; here at most one
-    result more than there are threads is held.
+    so that programs compile once. `Executor.map` would submit all items at once; here memory holds
+    at most one result more than there are threads.
     """
     workers = min(available_cores(), MOST_WORKERS)
     rest = iter(items)

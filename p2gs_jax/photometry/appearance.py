@@ -2,10 +2,10 @@
 
 `affine`: a 3x4 colour matrix per view (the 3DGS code's exposure compensation). `bilateral`: a grid
 of such matrices over the image and luminance (bilateral-guided radiance fields). `curve`: one
-rising curve per view for all channels (in the manner of Luminance-GS). Their parameters are
-deviations: zeros change nothing. `ppisp` (`ppisp.py`) takes the place of the tone curve and has
-parameters of cameras as well. `luminance` (`luminance.py`) maps photographs to an enhanced scene,
-as Luminance-GS does; renders are shown through its inverse.
+increasing curve per view for all channels (similar to Luminance-GS). Their parameters are
+deviations: zeros change nothing. `ppisp` (`ppisp.py`) replaces the tone curve and also has
+parameters of cameras. `luminance` (`luminance.py`) maps photographs to an enhanced scene, as
+Luminance-GS does; its inverse maps renders to photographs.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from p2gs_jax.types import LUMINANCE, Array, Capture, Params
 
 @runtime_checkable
 class Formation(Protocol):
-    """An image formation of yours, in the place of the tone curve and of corrections.
+    """A custom image formation that replaces the tone curve and corrections.
 
-    A pytree (an `equinox.Module`) whose arrays are its initial parameters: they are learned at the
-    rate `OptimizerConfig.appearance`, the same for all views.
+    It is a pytree (an `equinox.Module`) whose arrays are its initial parameters. They are common to
+    all views and learned at the rate `OptimizerConfig.appearance`.
     """
 
     def apply(self, radiance: Float[Array, "h w 3"], capture: Capture) -> Float[Array, "h w 3"]:
@@ -40,11 +40,11 @@ class Formation(Protocol):
         ...
 
 
-# Of all training views: a row for each, or what PPISP, Luminance-GS or a formation learns.
+# Corrections of all training views: a row for each, or parameters of a model.
 Corrections = Float[Array, "v ..."] | Ppisp | Luminance | Formation
 Correction = Float[Array, "..."] | OneView | Curves | Formation  # of one view
 
-# Luminance levels, rows and columns of a bilateral grid, as its authors use.
+# Luminance levels, rows and columns of a bilateral grid, as published.
 GRID = (8, 16, 16)
 CURVE_KNOTS = 16
 
@@ -69,7 +69,7 @@ def correction_of(appearance: Corrections | None, row: Int[Array, ""] | int) -> 
 
 
 def mean_correction(appearance: Corrections | None, camera: str | None = None) -> Correction | None:
-    """Return the mean over the training views, for a view of a camera that has none of its own."""
+    """Return the mean over the training views, for views of a camera that were not fitted."""
     if isinstance(appearance, Ppisp):
         return appearance.mean(camera)
     if isinstance(appearance, Luminance):
@@ -80,7 +80,7 @@ def mean_correction(appearance: Corrections | None, camera: str | None = None) -
 
 
 def exposures_apart(params: Params) -> Params:
-    """Return a finished fit with PPISP's exposures in `Photometry`, as all others have theirs."""
+    """Return a finished fit with PPISP's exposures moved to `Photometry`, as for other models."""
     if not isinstance(params.appearance, Ppisp):
         return params
     stops, photometry = params.appearance.exposures, params.photometry
@@ -95,7 +95,7 @@ def exposures_apart(params: Params) -> Params:
 
 
 def without_place(correction: Correction | None, kind: Appearance | None) -> Correction | None:
-    """Return what of a correction does not depend on the position in the image."""
+    """Return the part of a correction that does not depend on the position in the image."""
     if isinstance(correction, OneView):
         return dataclasses.replace(correction, vignetting=None)
     return None if kind == "bilateral" else correction
@@ -104,11 +104,11 @@ def without_place(correction: Correction | None, kind: Appearance | None) -> Cor
 def corrected(
     ldr: Float[Array, "h w 3"], parameters: Float[Array, "..."] | OneView | Curves, kind: Appearance
 ) -> Float[Array, "h w 3"]:
-    """Return display values as one view shows them; `ldr` is rendered, for `ppisp` radiance."""
+    """Return corrected display values of a view; for `ppisp`, `ldr` is radiance."""
     if isinstance(parameters, OneView):
         return ppisp.applied(ldr, parameters)
     if isinstance(parameters, Curves):
-        # The Gaussians learn through it; it is learned from photographs alone.
+        # Gradients reach the Gaussians only; the curves are learned from photographs.
         return luminance.as_photographed(ldr, lax.stop_gradient(parameters))
     if kind == "affine":
         return ldr + ldr @ parameters[:, :3].T + parameters[:, 3]
@@ -116,19 +116,19 @@ def corrected(
 
 
 def _curve(ldr: Float[Array, "h w 3"], raw: Float[Array, " k"]) -> Float[Array, "h w 3"]:
-    """Piecewise linear with slopes exp(raw): always rising; the last piece goes on above 1."""
+    """Return values of a piecewise linear curve with slopes exp(raw) > 0, extended above 1."""
     count = raw.shape[0]
     slopes = jnp.exp(raw)
     starts = jnp.concatenate([jnp.zeros(1), jnp.cumsum(slopes)[:-1]]) / count
-    place = jnp.clip(jnp.floor(ldr * count), 0, count - 1).astype(jnp.int32)
-    return starts[place] + (ldr - place / count) * slopes[place]
+    piece = jnp.clip(jnp.floor(ldr * count), 0, count - 1).astype(jnp.int32)
+    return starts[piece] + (ldr - piece / count) * slopes[piece]
 
 
 def _bilateral(ldr: Float[Array, "h w 3"], grid: Float[Array, "12 d y x"]) -> Float[Array, "h w 3"]:
-    """Slice by matrix products and hat functions: dense, so that its gradient is as well."""
+    """Return values corrected by a grid, sliced by dense products with hat functions."""
     height, width, _ = ldr.shape
     levels, rows, columns = grid.shape[1:]
-    # y, x, level, coefficient: a third of the time of the grid's own order.
+    # In the order y, x, level, coefficient, which takes a third of the time of the grid's order.
     cells = grid.transpose(2, 3, 1, 0).reshape(rows, -1)
     up = (jnp.asarray(_hats(height, rows), ldr.dtype) @ cells).reshape(height, columns, -1)
     up = jnp.einsum("wx,hxk->hwk", jnp.asarray(_hats(width, columns), ldr.dtype), up)
@@ -146,7 +146,7 @@ def _hats(pixels: int, cells: int) -> np.ndarray:
 
 
 def regularisation(parameters: Corrections, kind: Appearance) -> Float[Array, ""] | None:
-    """Return the mean squared difference of neighbouring cells of grids, PPISP's own, or None."""
+    """Return the mean squared difference of neighbouring grid cells, or PPISP's terms, or None."""
     if isinstance(parameters, Ppisp):
         return ppisp.regularisation_of(parameters)
     if isinstance(parameters, Luminance | Formation) or kind != "bilateral":

@@ -1,11 +1,11 @@
 """Luminance-GS (Cui, Chu and Harada, CVPR 2025): a colour matrix and a curve per photograph.
 
-They map photographs to the enhanced scene and back. As its authors describe it: one curve for all
-photographs, to which a small network adds a bias for each, clipped to [0, 1]; three orthonormal
-colour axes per photograph, along which the curve acts; three numbers per photograph that shape a
-pseudo curve (a power, then an S), towards which the curve is drawn. Ours: the network sees the
-histogram and the mean colour instead of attending to the image and the camera's pose; the curve is
-interpolated, where theirs takes the entry below.
+They map photographs to the enhanced scene and back. The published method has one curve for all
+photographs, to which a small network adds a bias for each photograph, clipped to [0, 1]. The curve
+acts along three orthonormal colour axes per photograph. Three numbers per photograph shape a pseudo
+curve (a power, then an S), to which the loss pulls the curve. Ours differs in two points: the
+input of the network is the histogram and the mean colour, not the image and the camera's pose; and
+the curve is interpolated, where theirs takes the entry below.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from p2gs_jax.types import Array
 
 ENTRIES = 255  # entries of a curve, as published
 HIDDEN = 32  # width of the network (ours)
-# Steps of the cumulative histogram that the network sees, and all that it sees.
+# Number of steps of the cumulative histogram, and of all inputs of the network.
 LEVELS = 32
 STATISTICS = LEVELS + 3
 AXES = 5  # parameters of the axes
-# What a raw unit stands for, so that one learning rate serves all (the authors have rates of 1e-3
-# for the curve, 2e-4 for the axes and 1e-5 for the network).
+# Size of a raw unit, so that one learning rate suits all (the published rates are 1e-3 for the
+# curve, 2e-4 for the axes and 1e-5 for the network).
 AXES_UNIT, BIAS_UNIT = 0.2, 0.1
 # Published: power 1 + 0.1 g, turning point 0.5 + 0.002 a, exponent 1 + 0.002 b.
 POWER_UNIT, TURN_UNIT, BEND_UNIT = 0.1, 0.002, 0.002
@@ -36,33 +36,33 @@ LEAST_RISE = 1e-5  # least rise of a curve from one entry to the next where it i
 
 
 class Curves(eqx.Module):
-    """How one photograph was taken, as Luminance-GS models it."""
+    """Parameters of one photograph in Luminance-GS."""
 
-    # From the photograph's coordinates to the enhanced ones, at even steps over [0, 1].
+    # Enhanced coordinates at even steps of the photograph's coordinates over [0, 1].
     curve: Float[Array, " k"]
-    axes: Float[Array, "3 3"]  # as rows
-    shape: Float[Array, " 3"]  # of the pseudo curve: raw power, turning point and exponent
+    axes: Float[Array, "3 3"]  # colour axes as rows
+    shape: Float[Array, " 3"]  # raw power, turning point and exponent of the pseudo curve
 
 
 class Luminance(eqx.Module):
     """The parameters of all training views."""
 
-    curve: Float[Array, " k"]  # of all photographs
+    curve: Float[Array, " k"]  # curve of all photographs
     hidden: Float[Array, "s n"]  # weights from statistics to the hidden layer
-    hidden_bias: Float[Array, " n"]  # of the hidden layer
-    # Weights from there to the curve's biases and the pseudo curve's shape.
+    hidden_bias: Float[Array, " n"]  # biases of the hidden layer
+    # Weights from the hidden layer to the curve's biases and the pseudo curve's shape.
     out: Float[Array, "n o"]
-    out_bias: Float[Array, " o"]  # of these
-    axes: Float[Array, "v 5"]  # raw, of each view
-    statistics: Float[Array, "v s"]  # of each photograph; not learned
+    out_bias: Float[Array, " o"]  # biases of the output
+    axes: Float[Array, "v 5"]  # raw axes of each view
+    statistics: Float[Array, "v s"]  # statistics of each photograph; not learned
 
     def view(self, row: Int[Array, ""] | int) -> Curves:
-        """Return what holds for a training view."""
+        """Return the parameters of a training view."""
         curve, shape = self._predicted(self.statistics[row])
         return Curves(curve, axes_of(AXES_UNIT * jnp.asarray(self.axes[row])), shape)
 
     def mean(self) -> Curves:
-        """Return the mean over the training views: of curves, and of raw axes."""
+        """Return means over the training views, of curves and of raw axes."""
         curves, shapes = self._predicted(self.statistics)
         axes = axes_of(AXES_UNIT * jnp.asarray(self.axes).mean(0))
         return Curves(curves.mean(0), axes, shapes.mean(0))
@@ -78,8 +78,8 @@ class Luminance(eqx.Module):
 
 
 def identity(views: int) -> Luminance:
-    """Return parameters that change nothing; the statistics are zero until they are filled in."""
-    # Drawn once for all fits: a network of zeros would never learn.
+    """Return parameters that change nothing; the statistics are zero until they are set."""
+    # Random weights, the same in all fits: a network of zeros would never learn.
     weights = generator(0, Stream.NETWORK).normal(0, STATISTICS**-0.5, (STATISTICS, HIDDEN))
     outputs = ENTRIES + 3
     shapes = (HIDDEN, (HIDDEN, outputs), outputs, (views, AXES), (views, STATISTICS))
@@ -88,7 +88,7 @@ def identity(views: int) -> Luminance:
 
 
 def axes_of(raw: Float[Array, " 5"]) -> Float[Array, "3 3"]:
-    """Return three orthonormal axes as rows: the identity at zero, as their authors build them.
+    """Return three orthonormal axes as rows, as published: the identity at zero.
 
     `raw` is added to (1, 0, 0), and to the green and blue parts (1, 0) of the second axis, whose
     red part makes it orthogonal to the first.
@@ -107,7 +107,7 @@ def spans(axes: Float[Array, "3 3"]) -> tuple[Float[Array, " 3"], Float[Array, "
 
 
 def enhanced(ldr: Float[Array, "*p 3"], view: Curves) -> Float[Array, "*p 3"]:
-    """Return the enhanced display values that a photograph stands for."""
+    """Return the enhanced display values of a photograph."""
 
     def looked_up(t: Float[Array, "*p"]) -> Float[Array, "*p"]:
         at = jnp.clip(t, 0.0, 1.0) * (view.curve.shape[0] - 1)
@@ -119,10 +119,10 @@ def enhanced(ldr: Float[Array, "*p 3"], view: Curves) -> Float[Array, "*p 3"]:
 
 
 def as_photographed(ldr: Float[Array, "*p 3"], view: Curves) -> Float[Array, "*p 3"]:
-    """Return how a photograph shows enhanced display values: about the inverse of `enhanced`.
+    """Return display values of a photograph from enhanced ones: an approximate inverse.
 
-    Where the curve falls it counts as level; level pieces return their lower end. The authors
-    splat a second colour per Gaussian instead.
+    Decreasing pieces of the curve count as constant; constant pieces return their lower end. The
+    published method splats a second colour per Gaussian instead.
     """
     count = view.curve.shape[0]
     even = jnp.linspace(0.0, 1.0, count, dtype=view.curve.dtype)
@@ -132,14 +132,14 @@ def as_photographed(ldr: Float[Array, "*p 3"], view: Curves) -> Float[Array, "*p
 
 
 def _along_axes(ldr, axes, change):
-    """Return colours whose coordinates along the axes, scaled to [0, 1], have changed."""
+    """Return colours after `change` of their coordinates along the axes, scaled to [0, 1]."""
     low, high = spans(axes)
     along = (ldr @ axes.T - low) / (high - low)
     return (change(along) * (high - low) + low) @ axes
 
 
 def pseudo_curve(shape: Float[Array, " 3"]) -> Float[Array, " k"]:
-    """Return the curve that a power and an S make, as published; about the identity at zero."""
+    """Return the published curve of a power and an S; approximately the identity at zero."""
     x = jnp.linspace(0.0, 1.0, ENTRIES, dtype=shape.dtype)
     x = jnp.clip(x, DARKEST, 1.0) ** (1.0 + POWER_UNIT * shape[0])
     turn, bend = 0.5 + TURN_UNIT * shape[1], 1.0 + BEND_UNIT * shape[2]
@@ -153,7 +153,7 @@ def pseudo_curve(shape: Float[Array, " 3"]) -> Float[Array, " k"]:
 def cumulative(
     grey: Float[Array, " p"], weight: Float[Array, " p"], steps: int
 ) -> Float[Array, " s"]:
-    """Return the shares of greys up to k / (steps - 1); without any weight, even ones."""
+    """Return the shares of greys up to k / (steps - 1); without any weight, a uniform one."""
     bins = jnp.clip(jnp.ceil(grey * (steps - 1)), 0, steps - 1).astype(jnp.int32)
     counts = jnp.zeros(steps, grey.dtype).at[bins].add(weight)
     total = counts.sum()

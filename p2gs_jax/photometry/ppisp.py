@@ -3,7 +3,7 @@
 Radiance passes an exposure per view, vignetting per camera and channel, a homography of
 chromaticities per view, and a response per camera and channel, in this order. Formulas, constants
 and weights are those of the paper and of its reference implementation (github.com/nv-tlabs/ppisp,
-1.2); where the two differ, of the latter.
+1.2); where the two differ, the latter is used.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from p2gs_jax.types import Array
 COEFFICIENTS = 5
 # Chromaticities of blue, red, green and neutral, homogeneous.
 SOURCES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [0.0, 1.0, 1.0], [1 / 3, 1 / 3, 1.0]])
-# What a unit of each parameter moves of (r, g) of its point: they whiten the parameters, so that
-# all change the image about equally (paper, B.1; values of the reference implementation).
+# Change of (r, g) of a point per unit of its parameters. They whiten the parameters, so that all
+# have similar effects on the image (paper, B.1; values of the reference implementation).
 PRECONDITIONERS = np.array(
     [
         [[0.0480542, -0.0043631], [-0.0043631, 0.0481283]],
@@ -33,13 +33,13 @@ PRECONDITIONERS = np.array(
         [[0.0128369, -0.0034654], [-0.0034654, 0.0128158]],
     ]
 )
-EPSILON = 1e-5  # added to the intensity that is divided by, so that black stays black
-# Response of a channel: toe, shoulder, gamma, centre, as the optimiser sees them.
+EPSILON = 1e-5  # added to an intensity before division by it, so that black stays black
+# Lower bounds of the response's toe, shoulder and gamma.
 LEAST_TOE, LEAST_SHOULDER, LEAST_GAMMA = 0.3, 0.3, 0.1
-# Nearer to black or white than this the powers' slopes may be infinite: there they have none.
+# Distance from black and white below which powers have no gradient, because it may be infinite.
 FLAT = 1e-6
-# Weights, and where the Huber losses become linear (paper, table 7; the centre's weight is that of
-# the reference implementation, which takes means where the paper takes sums).
+# Weights, and transitions of the Huber losses (paper, table 7; the centre's weight is that of the
+# reference implementation, which has means where the paper has sums).
 EXPOSURE, EXPOSURE_DELTA = 1.0, 0.1
 COLOR, COLOR_DELTA = 1.0, 0.005
 CHANNELS = 0.1
@@ -47,12 +47,12 @@ CENTRE, BRIGHTENING = 0.02, 0.01
 
 
 class OneView(eqx.Module):
-    """What light passes on its way into one photograph."""
+    """The parameters of one photograph."""
 
     exposure: Float[Array, ""]  # stops
     color: Float[Array, " 8"]  # parameters of `homography_of`
-    response: Float[Array, "3 4"]  # of the camera
-    # Of the camera; None: light without a place in an image.
+    response: Float[Array, "3 4"]  # response of the camera
+    # Vignetting of the camera; None: colours without a position in an image.
     vignetting: Float[Array, "3 5"] | None = None
 
 
@@ -61,23 +61,23 @@ class Ppisp(eqx.Module):
 
     exposures: Float[Array, " v"]  # stops
     colors: Float[Array, "v 8"]  # parameters of `homography_of`
-    responses: Float[Array, "c 3 4"]  # of each camera
-    vignettings: Float[Array, "c 3 5"]  # of each camera
-    names: tuple[str, ...] = eqx.field(static=True)  # of the cameras
+    responses: Float[Array, "c 3 4"]  # response of each camera
+    vignettings: Float[Array, "c 3 5"]  # vignetting of each camera
+    names: tuple[str, ...] = eqx.field(static=True)  # names of the cameras
     cameras: tuple[int, ...] = eqx.field(static=True)  # row in `names` of each training view
 
     def view(self, row: Int[Array, ""] | int) -> OneView:
-        """Return what holds for a training view."""
+        """Return the parameters of a training view."""
         camera = jnp.asarray(self.cameras)[row]
         return OneView(
             self.exposures[row], self.colors[row], self.responses[camera], self.vignettings[camera]
         )
 
     def mean(self, camera: str | None = None) -> OneView:
-        """Return the mean over the training views, for views that have nothing of their own.
+        """Return the mean over the training views, for views that were not fitted.
 
-        Response and vignetting are the camera's; of one that is not known, or None, they are the
-        mean response and no vignetting.
+        Response and vignetting are the camera's; an unknown camera (or None) has the mean response
+        and no vignetting.
         """
         exposure, color = self.exposures.mean(axis=0), self.colors.mean(axis=0)
         if camera not in self.names:
@@ -87,7 +87,7 @@ class Ppisp(eqx.Module):
 
 
 def identity(cameras: Sequence[str]) -> Ppisp:
-    """Return parameters that change nothing but to clip at 1; `cameras` is of every view."""
+    """Return parameters that only clip at 1; `cameras` is the camera of every view."""
     names, views = tuple(sorted(set(cameras))), len(cameras)
     responses = np.tile(identity_response(), (len(names), 3, 1))
     vignettings = np.zeros((len(names), 3, COEFFICIENTS))
@@ -97,7 +97,7 @@ def identity(cameras: Sequence[str]) -> Ppisp:
 
 
 def applied(linear: Float[Array, "*p 3"], view: OneView) -> Float[Array, "*p 3"]:
-    """Return display values in [0, 1] of radiance: of an image where the view has vignetting."""
+    """Return display values in [0, 1] of radiance, which is an image if there is vignetting."""
     light = jnp.exp2(view.exposure) * linear
     if view.vignetting is not None:
         height, width, _ = linear.shape
@@ -110,7 +110,7 @@ def falloff(
 ) -> Float[Array, "{height} {width} 3"]:
     """Return 1 + a1 r^2 + a2 r^4 + a3 r^6 of every pixel and channel, clipped to [0, 1].
 
-    Lengths are in units of the longer side, from the middle of the image. Parameters are the
+    Lengths are in units of the longer side, from the centre of the image. Parameters are the
     optical centre (x, y) of each channel, and its a1, a2, a3; zeros change nothing.
     """
     centre, (a1, a2, a3) = parameters[:, :2], parameters[:, 2:].T
@@ -122,17 +122,17 @@ def falloff(
 
 
 def offsets(parameters: Float[Array, "... 8"]) -> Float[Array, "... 4 2"]:
-    """Return how far the four chromaticities move."""
+    """Return the displacements of the four chromaticities."""
     pairs = parameters.reshape(*parameters.shape[:-1], 4, 2)
     blocks = jnp.asarray(PRECONDITIONERS, parameters.dtype)
     return jnp.einsum("...ki,kij->...kj", pairs, blocks)
 
 
 def homography_of(parameters: Float[Array, " 8"]) -> Float[Array, "3 3"]:
-    """Return the map of homogeneous chromaticities that takes `SOURCES` to where they move.
+    """Return the homography of chromaticities that maps `SOURCES` to their displaced points.
 
-    Colours are taken as homogeneous (R, G, R + G + B), so that (R, G) / (R + G + B) are
-    chromaticities in a plane. With the sources of blue, red, green as the columns of S and their
+    Colours are homogeneous (R, G, R + G + B), so that (R, G) / (R + G + B) are chromaticities in a
+    plane. With the sources of blue, red, green as the columns of S and their
     targets as those of T, H S = T diag(k). The neutral source is S (1, 1, 1) / 3, so T k must be
     the neutral target up to scale: k is its coordinates in the basis T. Each point has two
     parameters; zeros give the identity.
@@ -149,10 +149,10 @@ def homography_of(parameters: Float[Array, " 8"]) -> Float[Array, "3 3"]:
 
 
 def recolored(rgb: Float[Array, "... 3"], parameters: Float[Array, " 8"]) -> Float[Array, "... 3"]:
-    """Return linear colours under their homography; R + G + B stays, but for `EPSILON`."""
+    """Return linear colours under their homography, which keeps R + G + B up to `EPSILON`."""
     intensity = rgb.sum(-1, keepdims=True)
     moved = jnp.concatenate([rgb[..., :2], intensity], -1) @ homography_of(parameters).T
-    # Parameters that throw a colour beyond the horizon would turn it negative.
+    # The bound keeps colours beyond the horizon of the homography from being negative.
     moved = moved * intensity / (jnp.maximum(moved[..., 2:], 0.0) + EPSILON)
     red, green = moved[..., 0], moved[..., 1]
     return jnp.stack([red, green, moved[..., 2] - red - green], -1)
@@ -165,11 +165,11 @@ def identity_response() -> Float[np.ndarray, " 4"]:
 
 
 def respond(light: Float[Array, "... 3"], raw: Float[Array, "3 4"]) -> Float[Array, "... 3"]:
-    """Return display values of light; 0 stays 0, 1 stays 1, and what lies beyond is clipped.
+    """Return display values of light, clipped to [0, 1]; 0 maps to 0, and 1 to 1.
 
     y = a (x / c)^t up to the centre c and 1 - (1 - a) ((1 - x) / (1 - c))^s beyond it, to the power
-    of g; a gives both parts the same slope at c. `raw` has, for each channel, what softplus (toe
-    t >= 0.3, shoulder s >= 0.3, gamma g >= 0.1) and a sigmoid (centre c) take.
+    of g; a gives both parts the same slope at c. `raw` has, for each channel, the arguments of
+    softplus (toe t >= 0.3, shoulder s >= 0.3, gamma g >= 0.1) and of a sigmoid (centre c).
     """
     toe = LEAST_TOE + jax.nn.softplus(raw[:, 0])
     shoulder = LEAST_SHOULDER + jax.nn.softplus(raw[:, 1])
@@ -183,17 +183,17 @@ def respond(light: Float[Array, "... 3"], raw: Float[Array, "3 4"]) -> Float[Arr
 
 
 def _power(base: Float[Array, "..."], exponent: Float[Array, "..."], flat: float = FLAT):
-    """Return base^exponent; 0, without a slope, up to `flat`."""
+    """Return base^exponent; 0 with zero gradient up to `flat`."""
     on = base > flat
     return jnp.where(on, jnp.exp(exponent * jnp.log(jnp.where(on, base, 1.0))), 0.0)
 
 
 def regularisation_of(parameters: Ppisp) -> Float[Array, ""]:
-    """Return what keeps parameters where radiance can be told from them (paper, 4.6).
+    """Return the regularisers that separate parameters from radiance (paper, 4.6).
 
-    Means over the views of exposures and of chromaticities are pulled to 0; channels of a camera to
-    one another; optical centres to the middle; coefficients of vignetting that brighten to 0. The
-    weighted sum of these terms is 0 at the identity.
+    They pull means over views of exposures and chromaticities to 0, channels of a camera to each
+    other, optical centres to the image centre, and brightening coefficients of vignetting to 0. The
+    weighted sum is 0 at the identity.
     """
     vignettings, responses = parameters.vignettings, parameters.responses
     moved = offsets(parameters.colors).mean(axis=0)
@@ -207,6 +207,6 @@ def regularisation_of(parameters: Ppisp) -> Float[Array, ""]:
 
 
 def _huber(x: Float[Array, "..."], delta: float) -> Float[Array, "..."]:
-    """Return |x| - delta / 2, made smooth within delta of 0."""
+    """Return |x| - delta / 2, or x^2 / (2 delta) within delta of 0."""
     size = jnp.abs(x)
     return jnp.where(size < delta, 0.5 * x**2 / delta, size - 0.5 * delta)

@@ -1,9 +1,9 @@
-"""What a solution leaves that no model of it explains: by place in an image, by frame or region.
+"""Residuals that the model does not explain: by position in an image, or by region of a stack.
 
-Exposure, gamma and response act on every pixel by its value alone. Flare, a shade or a reflection
-covers a part of the image: sentences name such photographs. Evidence is counted by blocks of the
-image, as residuals of one surface are alike. A stack of photographs shows besides how its tone
-curve changed from frame to frame, and local tone mapping.
+Exposure, gamma and response depend on the value of a pixel only. Flare, shade or a reflection
+covers a part of the image: warnings name such photographs. The test counts blocks of the image,
+because residuals of one surface are correlated. A stack of photographs also shows local tone
+mapping.
 """
 
 from __future__ import annotations
@@ -18,15 +18,14 @@ from p2gs_jax.photometry.observations import Observations, PerChannel, grouped
 from p2gs_jax.photometry.response import DARKEST, log_exposed
 from p2gs_jax.photometry.solution import PhotometricSolution
 
-# Fewer observations, or fewer blocks of the image with any, tell nothing of a view.
+# Least numbers of observations and of image blocks for a test of a view.
 FEWEST, FEWEST_BLOCKS = 60, 12
-BLOCKS = 5  # blocks across half the diagonal
-CLASSES = 10  # classes of equal value, of as many observations
-CLIPPED = 3.0  # residuals beyond this many robust standard deviations count as that
-# A photograph is named where the chance that noise alone looks as clear is smaller, and the RMS of
-# the dependence over the view, stops, is larger.
+BLOCKS = 5  # number of blocks across half the diagonal
+CLASSES = 10  # number of classes of similar values, equal in count
+CLIPPED = 3.0  # bound of residuals, robust standard deviations
+# Largest p-value, and least RMS of the fitted surface over the view (stops), for a warning.
 CHANCE, LEAST_EV = 2e-4, 0.08
-# Smooth residuals of a stack above this many stops, at equal brightness, mean local tone mapping.
+# RMS residual of a stack's regions at equal brightness above which tone mapping is local, stops.
 LOCAL_EV = 0.075
 GRID = (6, 8)  # rows and columns of a stack's regions
 
@@ -36,10 +35,9 @@ Values = Float[np.ndarray, " n"]
 def place_warnings(
     observations: Observations, residual_ev: PerChannel, usable: Bool[np.ndarray, "o 3"]
 ) -> list[str]:
-    """Say which photographs have residuals, in stops, that vary smoothly over the image.
+    """Return warnings on photographs whose residuals, stops, vary smoothly over the image.
 
-    Residuals of an equal value are compared; they count where they are `usable`. Without positions
-    nothing can be told.
+    The `usable` residuals of similar values are compared. Without positions there is no warning.
     """
     o, weight = observations, np.asarray(usable, np.float64)
     if o.positions is None:
@@ -49,7 +47,7 @@ def place_warnings(
     residual = np.where(weight > 0, residual_ev, 0.0).sum(1) / total
     value = np.log2(np.maximum(np.asarray(o.colors, np.float64), DARKEST)) * 2.2
     value = (value * np.where(seen[:, None], weight, 1.0)).sum(1) / np.where(seen, total, 3)
-    # Of the value without its own residual: else noise of the value looks like tone mapping.
+    # The value without its residual: otherwise noise of the value looks like tone mapping.
     value = value - np.where(seen, residual, 0.0)
     found = {}
     for view, mine in enumerate(grouped(o.views, o.view_count)):
@@ -64,14 +62,14 @@ def place_warnings(
     named = sorted(clear, key=lambda k: -clear[k])
     head = ", ".join(f"{o.names[k] if o.names else f'row {k}'} {clear[k]:.2f}" for k in named[:6])
     return [
-        "Not modelled: residuals depend on the place in the image: flare, a shade, reflections, or "
-        f"vignetting that is not modelled. In {len(clear)} of {len(tested)} training view(s), by "
-        f"EV: {head}{', ...' if len(named) > 6 else ''}."
+        "Not modelled: residuals depend on the position in the image, because of flare, shade, "
+        f"reflections or vignetting. In {len(clear)} of {len(tested)} training view(s), by EV: "
+        f"{head}{', ...' if len(named) > 6 else ''}."
     ]
 
 
 def _without_value(residual: Values, value: Values) -> Values:
-    """Return residuals less the median of their class of value, clipped."""
+    """Return residuals minus the median of their class of value, clipped."""
     rank = np.argsort(np.argsort(value, kind="stable"), kind="stable")
     kind = rank * CLASSES // len(value)
     flat = residual.copy()
@@ -82,10 +80,9 @@ def _without_value(residual: Values, value: Values) -> Values:
 
 
 def _smooth(flat: Values, places: Float[np.ndarray, "n 2"]) -> tuple[float, float]:
-    """Fit a quadratic surface; its significance is judged by means of blocks (F test).
+    """Fit a quadratic surface to block means, with an F test of its significance.
 
-    Return its RMS in the units of `flat` and the chance that noise looks as clear; NaN and 1 where
-    nothing can be told.
+    Return its RMS in the units of `flat`, and the p-value; NaN and 1 if there are too few blocks.
     """
     block = np.unique(np.floor(places * BLOCKS).astype(int), axis=0, return_inverse=True)[1]
     block: Int[np.ndarray, " n"] = block.reshape(-1)
@@ -95,7 +92,7 @@ def _smooth(flat: Values, places: Float[np.ndarray, "n 2"]) -> tuple[float, floa
     if len(n) < FEWEST_BLOCKS or free < FEWEST_BLOCKS // 2:
         return float("nan"), 1.0
     means = np.stack([np.bincount(block, c) / n for c in (flat, *terms.T)], 1)
-    # Blocks weigh by their number up to a few: beyond that, what is shared inside one limits it.
+    # The weight of a block saturates with its count, because errors are shared inside a block.
     root = np.sqrt(n / (n + np.median(n)))[:, None]
     a, b = means[:, 1:] * root, means[:, 0] * root[:, 0]
     fit = np.linalg.lstsq(a, b, rcond=None)[0]
@@ -113,9 +110,9 @@ def regional_ev(
     size: tuple[int, ...],
     signal: Bool[np.ndarray, " v"],
 ) -> float:
-    """Return what a stack's residuals of equal brightness still vary by over the image, RMS stops.
+    """Return the RMS over regions of a stack's residuals at equal brightness, stops.
 
-    The solution has an exposure per view; frames without `signal` do not count. Positions of the
+    The solution has an exposure per view; frames without `signal` are left out. Positions of the
     points and the size of the photographs (height, width) are in pixels.
     """
     o, good = problem.observations, problem.usable.all(1)
@@ -123,13 +120,13 @@ def regional_ev(
     level = solution.log_exposures[o.views][:, None] + solution.point_log_radiance[o.points]
     value = np.where(problem.usable, z - level, 0.0).mean(1)
     cell = (xy[:, 1] * GRID[0] // size[0]) * GRID[1] + xy[:, 0] * GRID[1] // size[1]
-    shown = np.clip((o.colors.mean(1) * 10).astype(int), 0, 9)
+    brightness = np.clip((o.colors.mean(1) * 10).astype(int), 0, 9)
     means = []
     for frame in np.flatnonzero(signal):
         mine = np.flatnonzero((o.views == frame) & good)
         flat = value[mine].copy()
         for k in range(10):
-            here = shown[mine] == k
+            here = brightness[mine] == k
             if here.sum() > 5:
                 flat[here] -= np.median(flat[here])
         cells = cell[o.points[mine]]

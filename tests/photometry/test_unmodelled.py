@@ -42,7 +42,7 @@ def test_a_photograph_that_depends_on_the_place_is_named_alone(scene):
     observations, noise, _ = scene
     change = np.where(observations.views == ODD, 0.5 * observations.positions[:, 0], 0.0)
     (line,) = said(scene, change)
-    assert "place in the image" in line
+    assert "position in the image" in line
     assert f"In 1 of {VIEWS}" in line
     assert [name for name in NAMES if name in line] == [NAMES[ODD]]
     blind = replace(observations, positions=None)
