@@ -133,7 +133,7 @@ def test_stack_tone_mapped_by_region_is_recognised(tmp_path):
 def test_stacks_must_fit_together(tmp_path):
     stack(tmp_path / "s", [1.0, 2.0])
     cv2.imwrite(str(tmp_path / "s" / "zz.png"), np.zeros((10, 10, 3), np.uint8))
-    with pytest.raises(UserError, match="a stack has one size"):
+    with pytest.raises(UserError, match="give photographs of one size"):
         read_stack(tmp_path / "s")
     (tmp_path / "s" / "zz.png").write_bytes(b"no image")
     with pytest.raises(UserError, match="cannot decode"):

@@ -1,7 +1,7 @@
-"""What is solved for, how it may move, and what holds it besides photographs.
+"""The unknowns, their free directions, and the priors and gauges that determine them.
 
-Features are what cameras do besides exposing, linear in log radiance: a white balance per camera is
-a constant per channel, vignetting a polynomial of the radius. Both act on light, before the tone
+Features are effects of cameras that are linear in log radiance: a white balance per camera is a
+constant per channel, and vignetting a polynomial of the radius. Both act on light before the tone
 curve: like a point's log radiance they are multiplied by a = 2.2 / gamma.
 """
 
@@ -35,16 +35,16 @@ from p2gs_jax.photometry.response import (
     spline_groups,
 )
 
-# Two directions that change the ratios of red, green and blue, and not their mean.
+# Two directions that change the ratios of red, green and blue, but not their mean.
 CHROMA = np.array([[2.0, -1.0, -1.0], [0.0, 1.0, -1.0]]) / np.sqrt([[6.0], [2.0]])
-ANCHOR = 10.0  # how hard gauges are held, relative to the mean diagonal of the normal matrix
-EMPTY = 1e-9  # what keeps sums over no observations from being zero
-# Standard deviation of a = 2.2 / gamma about 1 (gammas of 1.9 to 2.6 are within one of these).
+ANCHOR = 10.0  # strength of gauges, relative to the mean diagonal of the normal matrix
+EMPTY = 1e-9  # keeps sums over no observations from being zero
+# Standard deviation of a = 2.2 / gamma about 1 (gammas from 1.9 to 2.6 are within one deviation).
 A_PRIOR = 0.15
-# Standard deviation of each coefficient of log V about 0: lenses lose up to two stops.
+# Standard deviation of each coefficient of log V about 0: lenses lose up to 2 stops.
 VIGNETTING_PRIOR = 0.7
-FIXED_EV = 1e-5  # deviation of a known exposure that is to be kept, stops
-# Smoothness of the spline relative to its mean information, and the spacing of knots it holds for.
+FIXED_EV = 1e-5  # standard deviation of a fixed known exposure, stops
+# Smoothness of the spline relative to its mean information, at this spacing of knots.
 SMOOTHNESS, KNOT_SPACING = 3e-3, 0.12
 
 Vector = Float[np.ndarray, " d"]
@@ -52,7 +52,7 @@ Vector = Float[np.ndarray, " d"]
 
 @dataclass(frozen=True)
 class Features:
-    """Which features there are; parameters are ordered as these fields are, camera by camera."""
+    """The features; their parameters are in the order of these fields, camera by camera."""
 
     cameras: int  # number of physical cameras
     balance: bool = False  # whether there is a white balance per camera
@@ -60,7 +60,7 @@ class Features:
 
     @property
     def balance_count(self) -> int:
-        """Parameters of white balance."""
+        """Number of parameters of white balance."""
         return len(CHROMA) * self.cameras * self.balance
 
     @property
@@ -71,7 +71,7 @@ class Features:
 
     @property
     def terms_each(self) -> int:
-        """Features that a value depends on."""
+        """Number of features on which a value depends."""
         return len(CHROMA) * self.balance + len(VIGNETTING_POWERS) * (self.vignetting is not None)
 
     def terms(self, layout: Layout) -> tuple[Int[np.ndarray, "o 3 m"], Float[np.ndarray, "o 3 m"]]:
@@ -108,11 +108,11 @@ class Features:
 
 @dataclass(frozen=True)
 class Splines:
-    """Which response splines are solved for: `groups` of them (0: none), one for each of `by`."""
+    """The unknown response splines: `groups` of them (0: none), one for each of `by`."""
 
     by: ResponseKind = "all"
     groups: int = 0
-    power: bool = False  # known exposures tell the power
+    power: bool = False  # known exposures fix the power
 
     @property
     def free(self) -> np.ndarray:
@@ -126,7 +126,7 @@ class Splines:
 
     @property
     def powers(self) -> np.ndarray:
-        """Parameters that say how steep each spline is, where that is solved for."""
+        """Parameters of the power of each spline, if powers are solved for."""
         return np.flatnonzero(np.tile(self.free == HELD[1], self.groups))
 
     def values(self, c: Float[np.ndarray, " k"]) -> Float[np.ndarray, "g n"]:
@@ -138,11 +138,11 @@ class Splines:
     def terms(
         self, knot: Int[np.ndarray, "o 3"], fraction: PerChannel, group: Int[np.ndarray, "o 3"]
     ) -> tuple[Int[np.ndarray, "o 3 m"], Float[np.ndarray, "o 3 m"]]:
-        """Return parameters and values of the basis; `count` stands for a knot that is held."""
-        place = np.full(len(KNOTS), -1)
-        place[self.free] = np.arange(len(self.free))
-        place = place[np.stack([knot, knot + 1], -1)]
-        index = np.where(place < 0, self.count, group[..., None] * len(self.free) + place)
+        """Return parameters and values of the basis; `count` stands for a fixed knot."""
+        position = np.full(len(KNOTS), -1)
+        position[self.free] = np.arange(len(self.free))
+        position = position[np.stack([knot, knot + 1], -1)]
+        index = np.where(position < 0, self.count, group[..., None] * len(self.free) + position)
         return index, np.stack([1 - fraction, fraction], -1)
 
     def decode(
@@ -162,9 +162,8 @@ class Splines:
     ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
         """Return gradient and curvature of the sum of log dz/dy, weighted by `share`.
 
-        A density over photographed values carries the slope of the transform. Without it, a curve
-        that is flat nearly everywhere and jumps once explains everything: the residuals vanish with
-        it.
+        A density over display values contains the slope of the transform. Without it, a curve that
+        is flat except for one jump would explain all observations, because its residuals vanish.
         """
         steps = np.diff(np.eye(len(KNOTS)), axis=0)[:, self.free] / np.diff(KNOTS)[:, None]
         gaps = len(KNOTS) - 1
@@ -178,33 +177,33 @@ class Splines:
 
 
 class Parameters(NamedTuple):
-    """What is solved for."""
+    """The unknowns."""
 
-    # A h per view; a column for each channel where the white balance varies per view.
+    # a h per view; a column for each channel if the white balance varies per view.
     b: Float[np.ndarray, "v x"]
     a: Float[np.ndarray, " v"]  # 2.2 / gamma per view
-    k: Float[np.ndarray, " k"]  # what cameras do besides (`Features`)
-    # Response splines at their free knots; empty where the response is given.
+    k: Float[np.ndarray, " k"]  # parameters of `Features`
+    # Response splines at their free knots; empty if the response is given.
     c: Float[np.ndarray, " c"]
 
     def vector(self) -> Vector:
-        """Return all of them in one vector: columns of b, a, k, c."""
+        """Return all unknowns in one vector: columns of b, a, k, c."""
         return np.concatenate([self.b.T.ravel(), self.a, self.k, self.c])
 
 
 @dataclass(frozen=True)
 class Unknowns:
-    """How many parameters of each kind there are, and where they stand in their vector."""
+    """Numbers of parameters of each kind, and their slices of the vector."""
 
     views: int
-    channels: int  # columns of b: 1, or 3 where the white balance varies per view
+    channels: int  # columns of b: 1, or 3 if the white balance varies per view
     gammas: bool  # whether a is free
     features: Features
-    splines: Splines  # that are solved for
+    splines: Splines  # splines that are solved for
 
     @functools.cached_property
     def at(self) -> Any:
-        """Where b, a, k and c stand: `Parameters` of slices."""
+        """The slices of b, a, k and c, as `Parameters`."""
         each = (self.channels * self.views, self.views, self.features.count, self.splines.count)
         ends = itertools.pairwise((0, *itertools.accumulate(each)))
         return Parameters(*(slice(*pair) for pair in ends))  # pyright: ignore[reportArgumentType]
@@ -222,23 +221,23 @@ class Unknowns:
 
 
 class Forward(NamedTuple):
-    """Observations by row (one point each, or a part of a long track), and what explains them."""
+    """Observations by row (one point each, or a part of a long track), and their model."""
 
-    unknowns: Unknowns  # what is solved for
+    unknowns: Unknowns
     layout: Layout
     z: PerChannel  # log exposed radiance under the base curve, relative to the pivot
     sigma: PerChannel  # its standard deviation
     weight: PerChannel  # 1 used, 0 masked or held out
     knot: Int[np.ndarray, "o 3"]  # left spline knot
-    fraction: PerChannel  # of the way to the next knot
+    fraction: PerChannel  # fraction of the distance to the next knot
     slope: PerChannel  # dz/dy under the base curve
-    group: Int[np.ndarray, "o 3"]  # which spline decodes a value, where they are solved for
-    features: Terms | None  # what cameras do, at every value
-    terms: Terms | None  # derivatives of predictions by k and c, while a is 1
+    group: Int[np.ndarray, "o 3"]  # row of the spline that decodes a value, if they are solved for
+    features: Terms | None  # features at every value
+    terms: Terms | None  # derivatives of predictions by k and c for a = 1
 
     @property
     def noise_weight(self) -> PerChannel:
-        """Weights by the stated noise alone: where robust ones start."""
+        """Weights from the stated noise alone, with which robust weights start."""
         return self.weight / self.sigma**2
 
     @classmethod
@@ -249,7 +248,7 @@ class Forward(NamedTuple):
         response: Response,
         unknowns: Unknowns,
     ) -> Forward:
-        """Return the observations under a response, with the terms of the model laid out."""
+        """Return the observations under a response, with the terms of the model."""
         layout, o = problem.layout, problem.observations
         features, splines = unknowns.features, unknowns.splines
         z, sigma, slope = o.decoded(response)
@@ -268,7 +267,7 @@ class Forward(NamedTuple):
 
 @dataclass(frozen=True)
 class Held:
-    """Linear combinations of the parameters (rows), held at targets with inverse variances."""
+    """Linear combinations of the parameters (rows), with targets and inverse variances."""
 
     rows: sp.csr_array
     targets: Float[np.ndarray, " n"]
@@ -285,23 +284,23 @@ class Held:
 
 
 class System(NamedTuple):
-    """Which directions are free, and what is known besides the photographs."""
+    """Free directions, gauges and priors."""
 
-    unknowns: Unknowns  # what the parameters are
+    unknowns: Unknowns
     basis: sp.csr_array  # columns are the free directions
     anchors: Held  # the gauges; their precisions are relative (`gauges`)
-    priors: Held  # what is known
-    start: Parameters  # where rounds begin: at the prior mean of h
+    priors: Held  # the priors
+    start: Parameters  # initial parameters: the prior mean of h
     smoothness: Float[np.ndarray, "k k"]  # its quadratic form keeps a spline smooth
 
     def near(self, theta: Parameters, of: Unknowns) -> Parameters:
-        """Return what comes closest to other parameters among those that are free here."""
+        """Return the parameters of this system that are closest to those of another."""
         mine = self.unknowns
         h = theta.b / theta.a[:, None]
         if of.channels != mine.channels:
             h = np.repeat(h.mean(1, keepdims=True), mine.channels, 1)
         start = self.start
-        # Of what moves together, the mean.
+        # The mean over parameters that move together.
         moved = Parameters(h - start.b, theta.a - start.a, 0 * start.k, 0 * start.c).vector()
         size = np.asarray(self.basis.sum(0)).ravel()
         b, a, *_ = mine.split(self.basis @ (self.basis.T @ moved / size))
@@ -310,16 +309,16 @@ class System(NamedTuple):
         return Parameters((start.b + b) * a[:, None], a, theta.k if same else start.k, start.c)
 
     def gauges(self, normal: Matrix) -> tuple[float, sp.csr_array]:
-        """Return how hard gauges hold, by the exposures' information, and rows times its root.
+        """Return the strength of gauges, by the exposures' information, and rows times its root.
 
-        A gauge is a mean over views: over thousands of them its normal matrix would not be sparse.
+        A gauge is a mean over views: with thousands of views its normal matrix is not sparse.
         """
         of_b = normal.diagonal()[: self.unknowns.channels * self.unknowns.views]
         strength = ANCHOR * float(np.mean(of_b) + EMPTY)
         return strength, np.sqrt(strength) * self.anchors.rows
 
     def smooth(self, normal: Matrix) -> sp.csr_array:
-        """Return what keeps a spline smooth, by its mean information, as a normal matrix of all."""
+        """Return the smoothness of splines as a normal matrix, scaled by their mean information."""
         start = self.unknowns.at.c.start
         stiffness = float(np.mean(normal.diagonal()[start:])) if len(self.smoothness) else 0.0
         parts = [sp.csr_array((start, start)), stiffness * self.smoothness]
@@ -327,7 +326,7 @@ class System(NamedTuple):
 
 
 def make_system(problem: Problem, form: Form, splines: ResponseKind | None = None) -> System:
-    """Return free directions, gauges and priors; `splines` is what has one that is solved for."""
+    """Return free directions, gauges and priors; `splines` of this kind are solved for."""
     cameras, views = problem.observations.cameras, problem.observations.view_count
     camera_count = int(cameras.max(initial=0)) + 1
     model = MODELS[form.model]
@@ -350,7 +349,7 @@ def make_system(problem: Problem, form: Form, splines: ResponseKind | None = Non
         precision = given / (max(known.deviation_ev, FIXED_EV) * LN2) ** 2
     of_gammas = np.full(views, 1 / A_PRIOR**2)
     if model.gamma == "camera" and problem.told.size:
-        # What is expected of a camera counts once, not in each view.
+        # The prior of a camera counts once, not in each view.
         of_gammas /= np.bincount(cameras)[cameras]
     start = np.repeat(log_exposure[:, None], unknowns.channels, 1)
     more = (np.zeros(terms.count) for terms in (unknowns.features, unknowns.splines))
@@ -365,7 +364,7 @@ def make_system(problem: Problem, form: Form, splines: ResponseKind | None = Non
 
 
 def _directions(level: Level | None, cameras: np.ndarray) -> sp.csr_array:
-    """Return what may move together: nothing, the views of a camera, or each by itself."""
+    """Return free directions: none, one per camera, or one per view."""
     views = np.arange(len(cameras))
     if level is None:
         return sp.csr_array((len(views), 0))
@@ -390,7 +389,7 @@ def _anchors(problem: Problem, u: Unknowns, log_exposure, precision) -> Held:
             for channel in range(u.channels):
                 hold(channel * u.views + members, share)
         elif u.channels == 3:
-            # Known exposures say nothing of colours.
+            # Known exposures do not determine colours.
             for channel in (0, 2):
                 both = np.concatenate([channel * u.views + members, u.views + members])
                 hold(both, np.repeat([share, -share], len(members)))
@@ -403,7 +402,7 @@ def _anchors(problem: Problem, u: Unknowns, log_exposure, precision) -> Held:
             hold(at, views_of / views_of.sum())
     powers = u.at.c.start + u.splines.powers
     if u.splines.by == "channel" and u.channels == 3:
-        # No photograph tells the power of a channel with exposures of its own.
+        # Photographs do not determine the power of a channel with separate exposures.
         alone = [([power], [1.0]) for power in powers]
         alike = [([one, other], [1.0, -1.0]) for one, other in itertools.pairwise(powers)]
         for index, weights in alike if u.splines.power else alone:
@@ -414,7 +413,7 @@ def _anchors(problem: Problem, u: Unknowns, log_exposure, precision) -> Held:
 
 
 def _priors(u: Unknowns, log_exposure, precision, of_gammas) -> Held:
-    """Return what is known: exposures (b - a mu = 0 for h = mu), gammas (a precision), lenses."""
+    """Return the priors: exposures (b - a mu = 0 for h = mu), gammas and vignetting."""
     given = np.flatnonzero(precision > 0)
     at = np.arange(len(given))
     b = [(np.full(len(given), 1 / u.channels), c * u.views + given) for c in range(u.channels)]

@@ -1,5 +1,5 @@
-"""Where observations of shared points come from.
+"""Sources of observations of shared points.
 
-`points` of a scene or of a finished fit, `stack` for photographs of one viewpoint; `sampling` reads
-the colours.
+`points` are those of a scene or of a finished fit, `stack` is for photographs of one viewpoint, and
+`sampling` reads the colours.
 """

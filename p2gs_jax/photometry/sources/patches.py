@@ -1,14 +1,14 @@
-"""The same patch of surface in every view that shows a point.
+"""Patches: the same piece of surface in every view of a point.
 
-A pixel averages the light of what it covers. The mean of a logarithm depends on how much is
-averaged, so two views that average different patches differ as if their exposures did. Along a
-drive over a matte road that made 0.002 EV and more, always with one sign (BUILD_NOTES, "The same
-patch"). So a point's patch is as large as its coarsest view demands. It lies on the plane of the
-point's neighbours; where these tell no plane, it faces each camera.
+A pixel averages the light of a piece of surface. The mean of a logarithm depends on its size, so
+that views of different pieces differ as if by their exposures. Along a drive over a matte road this
+error was 0.002 EV and more, always with one sign (BUILD_NOTES, "The same patch"). Therefore the
+size of a point's patch is that in its coarsest view. The patch lies on the plane of the point's
+neighbours, or faces each camera if there is no such plane.
 
 A patch is described by its second moments in squared scene units, along two directions of its
-plane. A pixel is described by a metric: squared pixels per squared scene unit. The blur of pixels
-and of interpolation counts as a part of what a view averages.
+plane. A pixel is described by a metric: squared pixels per squared scene unit. The area that a view
+averages includes the blur of pixels and of interpolation.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from scipy.spatial import KDTree
 from p2gs_jax.types import View
 
 # Width of the patch in the coarsest view, in pixels, and as a share of the image's width: averages
-# quiet noise, and hide that a point is misplaced by a fraction of a pixel.
+# reduce noise, and the effect of misplacement by a fraction of a pixel.
 PATCH, PATCH_SHARE = 3.0, 1 / 213
-# Second moments along each axis that sampling adds, pixels squared: of the pixel itself, and of
-# bilinear interpolation at places that are spread evenly.
+# Second moments along each axis that sampling adds, pixels squared: those of the pixel, and of
+# bilinear interpolation at evenly spread positions.
 BLUR = 1 / 12 + 1 / 6
-# A normal is fitted to so many neighbours, the point itself included. They have to lie flat: their
-# extent across the plane is at most this share of the smaller one along it.
+# Number of neighbours of a normal, with the point itself, and their largest extent across the plane
+# as a share of the smaller extent along it.
 NEIGHBOURS, FLAT = 9, 0.25
-# Samples along an axis of a patch are apart by no more pixels than this, if so many suffice.
+# Largest spacing of samples along an axis of a patch, pixels, and numbers of samples.
 SPACING, SAMPLES = 2.0, (3, 6, 12)
 
 # Symmetric 2x2 matrices as their entries (xx, xy, yy), in the last axis.
@@ -42,11 +42,11 @@ class Surfaces(NamedTuple):
     """Points of a scene, and the planes on which they lie."""
 
     points: Float[np.ndarray, "p 3"]
-    normals: Float[np.ndarray, "p 3"]  # unit; NaN where the plane is not known
+    normals: Float[np.ndarray, "p 3"]  # unit vectors; NaN where the plane is unknown
 
 
 def surfaces_of(points: Float[np.ndarray, "p 3"], rows: Int[np.ndarray, " n"]) -> Surfaces:
-    """Return points; those of `rows` with the normals of the planes through their neighbours."""
+    """Return points, and for `rows` the normals of planes through their neighbours."""
     where = np.asarray(points, np.float64)
     normals = np.full((len(where), 3), np.nan)
     if len(where) >= NEIGHBOURS and len(rows):
@@ -59,7 +59,7 @@ def surfaces_of(points: Float[np.ndarray, "p 3"], rows: Int[np.ndarray, " n"]) -
 
 
 class Plane(NamedTuple):
-    """Points in a camera's axes, and the directions along which their patches extend."""
+    """Points in a camera's axes, and the two directions of their patches."""
 
     at: Float[np.ndarray, "n 3"]
     across: Float[np.ndarray, "n 3"]
@@ -67,11 +67,11 @@ class Plane(NamedTuple):
 
 
 def plane_in(surfaces: Surfaces, pick: Int[np.ndarray, " n"], view: View) -> Plane:
-    """Return picked points in a view; their patches face the camera where no normal is known."""
+    """Return picked points in a view; patches without a normal face the camera."""
     rotation = np.asarray(view.viewmat[:3, :3], np.float64)
     at = surfaces.points[pick] @ rotation.T + view.viewmat[:3, 3]
     normal = surfaces.normals[pick]
-    # Both directions follow from the normal alone: a patch lies alike in all views.
+    # Both directions follow from the normal alone, so that they are equal in all views.
     helper = np.eye(3)[np.argmin(np.abs(np.nan_to_num(normal)), axis=1)]
     across = np.cross(normal, helper)
     across /= np.linalg.norm(across, axis=1, keepdims=True)
@@ -101,20 +101,20 @@ def determinant(m: Symmetric) -> Float[np.ndarray, " n"]:
 
 
 def inverse(m: Symmetric) -> Symmetric:
-    """Return inverses; infinite where there is none."""
+    """Return inverses; infinite for singular matrices."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.stack([m[:, 2], -m[:, 1], m[:, 0]], 1) / determinant(m)[:, None]
 
 
 def joined(a: Symmetric, b: Symmetric) -> Symmetric:
-    """Return moments that are no smaller than `a` and `b` in any direction.
+    """Return moments that are at least `a` and `b` in every direction.
 
-    Where both are diagonal, each axis has the larger of the two. All moments are positive definite.
+    If both are diagonal, each axis has the larger of the two. All moments are positive definite.
     """
     size = determinant(a)
     middle = (a[:, 0] * b[:, 2] + a[:, 2] * b[:, 0] - 2 * a[:, 1] * b[:, 1]) / size / 2
     apart = np.sqrt(np.maximum(middle**2 - determinant(b) / size, 0.0))
-    # In the axes in which `a` is 1, `b` has these.
+    # Eigenvalues of `b` in the axes in which `a` is the identity.
     high, low = middle + apart, middle - apart
     larger, smaller = np.maximum(high, 1), np.maximum(low, 1)
     same = apart <= 1e-9 * middle
@@ -136,9 +136,9 @@ def smallest_moments(width: int) -> float:
 
 
 class Grid(NamedTuple):
-    """Where patches of the same number of samples are read."""
+    """Positions of samples, for patches with the same number of samples."""
 
-    rows: Int[np.ndarray, " g"]  # which of the patches these are
+    rows: Int[np.ndarray, " g"]  # rows of the patches
     xy: Float[np.ndarray, "g a b 2"]  # pixels, centres at +0.5
 
 
@@ -149,16 +149,16 @@ def grids_in(
     moments: Symmetric,
     xy: Float[np.ndarray, "n 2"],
 ) -> Iterator[Grid]:
-    """Yield where to sample patches of points so that with all blur they have `moments`.
+    """Yield positions of samples of patches that, with all blur, have second `moments`.
 
-    `xy` are the pixels of their middles. A patch is a parallelogram of the plane, its samples
-    spaced evenly.
+    `xy` are the pixels of their centres. A patch is a parallelogram of the plane with evenly spaced
+    samples.
     """
     plane = plane_in(surfaces, points, view)
     within = metric(plane, view)
-    own = moments - BLUR * inverse(within)
-    sides = np.sqrt(12) * root(own)
-    # The patch's sides, in lengths of the plane and in pixels.
+    sampled = moments - BLUR * inverse(within)
+    sides = np.sqrt(12) * root(sampled)
+    # The sides of the parallelogram, scene units.
     first, second = sides[:, [0, 1]], sides[:, [1, 2]]
 
     def pixels(side):
@@ -178,18 +178,18 @@ def grids_in(
 
 
 def _offsets(count: int) -> Float[np.ndarray, " k"]:
-    """Return evenly spaced places whose second moment is that of an interval of length 1."""
+    """Return evenly spaced offsets with the second moment of an interval of length 1."""
     return ((np.arange(count) + 0.5) / count - 0.5) / np.sqrt(1 - 1 / count**2)
 
 
 def _placed(
     plane: Plane, view: View, xy: np.ndarray, rows: np.ndarray, lengths: np.ndarray
 ) -> Float[np.ndarray, "g a b 2"]:
-    """Return pixels at `lengths` along the planes from their middles."""
+    """Return pixels at `lengths` along the planes from their centres."""
     focal, middle = np.diag(view.K)[:2].astype(np.float64), view.K[:2, 2].astype(np.float64)
     at, across, along = (v[rows, None, None] for v in plane)
     there = at + lengths[..., :1] * across + lengths[..., 1:] * along
-    # A plane does not reach behind the camera within a patch that is seen from afar.
+    # The bound keeps patches in front of the camera.
     z = np.maximum(there[..., 2:], 0.25 * at[..., 2:])
     centre = focal * at[..., :2] / at[..., 2:] + middle
     return focal * there[..., :2] / z + middle + (xy[rows, None, None] - centre)
@@ -198,7 +198,7 @@ def _placed(
 def two_sided(
     surfaces: Surfaces, points: list[Int[np.ndarray, " _"]], views: list[View]
 ) -> Bool[np.ndarray, " p"]:
-    """Return which normals are wrong: views see their points from both sides of the plane."""
+    """Return which normals are wrong: views show their points from both sides of the plane."""
     front, back = (np.zeros(len(surfaces.points), bool) for _ in range(2))
     for mine, view in zip(points, views, strict=True):
         centre = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]

@@ -24,27 +24,27 @@ from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.scene.visibility import unoccluded
 from p2gs_jax.types import Gaussians, Scene
 
-# Points that are sampled at most, and views of each: of projected and of rendered ones.
+# Largest numbers of points, and of views of a point, for projected and for rendered points.
 MOST_POINTS, MOST_PER_POINT = 40_000, 16
 RENDERED_POINTS, RENDERED_PER_POINT = 40_000, 8
-# More than `warp.OPAQUE`: a loss averages over a wrong correspondence, a solution gives way to it.
+# More than `warp.OPAQUE`, because a solution suffers more from wrong correspondences than a loss.
 OPAQUE = 0.98
 
-# Called with the number of views done, and of views in all.
+# Called with the number of views done, and the number of all views.
 OnView = Callable[[int, int], object] | None
 
 
 def surface_colors(
     scene: Scene, store: ImageStore, seed: int, on_view: OnView = None
 ) -> Observations:
-    """Return colours at the tracks; where there are none, of points that `seed` draws."""
+    """Return colours at the tracks, or without tracks those of points that `seed` draws."""
     if has_tracks(scene):
         return track_colors(scene, store, on_view)
     return projected_colors(scene, store, seed, on_view)
 
 
 def has_tracks(scene: Scene) -> bool:
-    """Return whether the scene says which pixels show the same point."""
+    """Return whether the scene has tracks."""
     return scene.tracks is not None and len(scene.tracks.xy) > 0
 
 
@@ -62,9 +62,9 @@ def track_colors(scene: Scene, store: ImageStore, on_view: OnView = None) -> Obs
 def projected_colors(
     scene: Scene, store: ImageStore, seed: int = 0, on_view: OnView = None
 ) -> Observations:
-    """Sample a scene's points (LiDAR or others) in every training view that sees them.
+    """Sample a scene's points (LiDAR or others) in every training view that shows them.
 
-    `seed` chooses among points, and views of a point.
+    `seed` chooses points, and views of a point.
     """
     rng = generator(seed, Stream.SURFACE_COLORS)
     chosen = np.arange(len(scene.points))
@@ -73,14 +73,14 @@ def projected_colors(
     where, seen = [], []
     for index in scene.train_indices:
         view = scene.views[index]
-        # All points hide; only the chosen ones are sampled.
+        # All points occlude; only the chosen ones are sampled.
         xy, z = project_points(scene.points, view)
         where.append(xy[chosen])
         seen.append(unoccluded(xy, z, view.width, view.height)[chosen])
     picks = thinned(np.stack(seen), rng, MOST_PER_POINT)
     points, xy = [chosen[p] for p in picks], [at[p] for at, p in zip(where, picks, strict=True)]
-    how = {"uncertainty": PROJECTED_UNCERTAINTY, "on_view": on_view}
-    return point_colors(scene, store, surfaces_of(scene.points, chosen), points, xy, **how)
+    options = {"uncertainty": PROJECTED_UNCERTAINTY, "on_view": on_view}
+    return point_colors(scene, store, surfaces_of(scene.points, chosen), points, xy, **options)
 
 
 def rendered_colors(
@@ -93,7 +93,7 @@ def rendered_colors(
 ) -> Observations:
     """Warp pixels of each training view, chosen by `seed`, into the others through rendered depth.
 
-    Points that a view hides are left out.
+    Points that are occluded in a view are left out there.
     """
     rng = generator(seed, Stream.RENDERED_PIXELS)
     render = make_renderer(cfg)
@@ -126,7 +126,7 @@ def rendered_colors(
 def _slopes(
     places: Float[np.ndarray, "h w 3"], depth: Float[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "h w 3"]:
-    """Return unit normals of a surface that pixels show; NaN where its depth jumps or ends."""
+    """Return unit normals of the rendered surface; NaN where its depth is discontinuous."""
     across, down = (np.gradient(places.astype(np.float64), axis=axis) for axis in (1, 0))
     normals = np.cross(across, down)
     size = np.linalg.norm(normals, axis=2, keepdims=True)
@@ -138,7 +138,7 @@ def _slopes(
 def thinned(
     seen: Bool[np.ndarray, "v p"], rng: np.random.Generator, most: int
 ) -> list[Int[np.ndarray, " _"]]:
-    """Return points of each view, each in at most `most` of those that see it, evenly at random."""
+    """Return points of each view; each point is in at most `most` random views that show it."""
     order = rng.random(seen.shape)
     order[~seen] = 2.0
     rank = np.argsort(np.argsort(order, axis=0), axis=0)

@@ -1,4 +1,4 @@
-"""What photographs show at given positions, and at given points in all of their views."""
+"""Colours of photographs at given positions, and of given points in all of their views."""
 
 from __future__ import annotations
 
@@ -19,16 +19,15 @@ from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.rigid import camera_centers
 from p2gs_jax.types import Scene, View
 
-# A track's position is uncertain by this share of the smallest patch; where the image is steep, so
-# is its colour.
+# Standard deviation of a track's position, as a share of the smallest patch; with the gradient of
+# the image it gives that of the colour.
 POSITION_DEVIATION = 1 / 6
-# Positions that come from calibration or rendered depth, not from matching, are less certain than
-# tracks by this factor.
+# Factor on this deviation for positions from calibration or rendered depth.
 PROJECTED_UNCERTAINTY = 2.0
-# Side of the cells of a scene whose points err alike, over the median distance of what is seen.
-# Errors over stated errors of a town of 100 frames: 2.5 by regions of images, 1.9 in cells of a
-# tenth, 1.5 of a quarter, 1.7 of a half; 0.9 on a matte plane and a short town, as before. Too few
-# cells do not tell how much they differ; then their sides are halved.
+# Side of the cells of a scene with shared errors, over the median distance of observed points.
+# Errors over standard errors in a town of 100 frames: 2.5 by image regions; in cells 1.9 at side
+# 0.1, 1.5 at 0.25, 1.7 at 0.5. A matte plane and a short town have 0.9 by both. If cells are too
+# few to compare, their sides are halved.
 CELL, FEWEST_CELLS, MOST_HALVINGS = 0.25, 64, 4
 
 
@@ -36,9 +35,9 @@ class Samples(NamedTuple):
     """Colours of an image at some positions."""
 
     colors: Float32[np.ndarray, "o 3"]  # averages over patches, display-encoded
-    # Standard deviation of `colors` from uncertain positions: gradient times that.
+    # Standard deviation of `colors` from uncertain positions: their deviation times the gradient.
     spread: Float32[np.ndarray, "o 3"]
-    brightest: Float32[np.ndarray, "o 3"]  # largest display values of the pixels that were averaged
+    brightest: Float32[np.ndarray, "o 3"]  # largest display values of the averaged pixels
     valid: np.ndarray  # [o] whether the whole patch is inside the image and its mask
 
 
@@ -47,7 +46,7 @@ def sample(
     mask: Float32[np.ndarray, "h w"],
     xy: Float[np.ndarray, "o 2"],
 ) -> Samples:
-    """Sample an image, where its mask is 1, at positions: squares of `patches.PATCH` pixels."""
+    """Sample squares of `patches.PATCH` pixels at positions of an image where its mask is 1."""
     steps = np.arange(-1.0, 2.0)
     around = np.stack(np.meshgrid(steps, steps, indexing="ij"), -1)[..., ::-1]
     grid = Grid(np.arange(len(xy)), xy[:, None, None] + around)
@@ -61,12 +60,12 @@ def sample_patches(
     count: int,
     deviation: float,
 ) -> Samples:
-    """Average an image over patches, of which there are `count`, each in one of the grids.
+    """Average an image over `count` patches, each in one of the grids.
 
-    Light averages linearly, whatever the exposure. A patch is misplaced by `deviation` pixels.
+    The average is over linear values. The position of a patch is uncertain by `deviation` pixels.
     """
     linear = srgb_decode(ldr)
-    # Of the pixels that are interpolated, and their neighbours.
+    # Over the interpolated pixels and their neighbours.
     largest, inside = cv2.dilate(ldr, np.ones((3, 3))), cv2.erode(mask, np.ones((3, 3)))
     colors, spread, brightest = (np.zeros((count, 3), np.float32) for _ in range(3))
     valid = np.zeros(count, bool)
@@ -88,7 +87,7 @@ def sample_patches(
 def _between(linear: Float32[np.ndarray, "h w 3"], position: np.ndarray) -> np.ndarray:
     """Return values between pixels, at positions [g a b 2]."""
     out = np.empty((*position.shape[:3], 3), np.float32)
-    # OpenCV takes fewer than 2^15 rows.
+    # OpenCV accepts fewer than 2^15 rows.
     for begin in range(0, len(position), 2**14):
         part = position[begin : begin + 2**14]
         x, y = (np.ascontiguousarray(part[..., k].reshape(len(part), -1)) for k in range(2))
@@ -98,10 +97,10 @@ def _between(linear: Float32[np.ndarray, "h w 3"], position: np.ndarray) -> np.n
 
 
 def _steepness(light: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Return the RMS of how display values of patches move along x and y, per pixel."""
+    """Return the norm of the gradient of display values of patches, per pixel."""
     seen, at = (np.stack([_ends(v), _ends(v.swapaxes(1, 2))], 1) for v in (light, position))
-    rise, way = (np.diff(v, axis=2)[:, :, 0] for v in (srgb_encode(seen), at))
-    return np.sqrt(((np.linalg.pinv(way) @ rise) ** 2).sum(1))
+    rise, run = (np.diff(v, axis=2)[:, :, 0] for v in (srgb_encode(seen), at))
+    return np.sqrt(((np.linalg.pinv(run) @ rise) ** 2).sum(1))
 
 
 def _ends(values: np.ndarray) -> np.ndarray:
@@ -122,9 +121,9 @@ def point_colors(
     """Sample points in training views at full size: the same patch of surface in all of them.
 
     For each training view, `points` are rows in `surfaces` and `xy` their positions in pixels of
-    the whole photograph, whose uncertainty is in units of POSITION_DEVIATION. Photographs are
-    decoded for this and dropped, so that the solution does not depend on the size of a fit, and
-    that clipped pixels are seen before anything is averaged.
+    the whole photograph, with `uncertainty` in units of POSITION_DEVIATION. Photographs are decoded
+    at full size and dropped: the solution does not depend on the size of a fit, and clipped pixels
+    are found before averages hide them.
     """
     views = [scene.views[i] for i in scene.train_indices]
     wrong = patches.two_sided(surfaces, points, views)
@@ -191,12 +190,12 @@ def _cells(
 def _at_one_scale(
     surfaces: Surfaces, points: list[Int[np.ndarray, " _"]], views: list[View]
 ) -> tuple[Symmetric, list[np.ndarray]]:
-    """Return the moments of every point's patch, and which points each view samples at all."""
+    """Return the moments of every point's patch, and which points each view samples."""
     within = [
         patches.metric(patches.plane_in(surfaces, mine, view), view)
         for mine, view in zip(points, views, strict=True)
     ]
-    # Pixels per length, the mean of both directions. A track behind its camera is wrong, not close.
+    # Pixels per length, the mean of both directions; 0 for wrong tracks behind their camera.
     scales = [np.maximum(patches.determinant(m), 0.0) ** 0.25 for m in within]
     finest = np.zeros(len(surfaces.points))
     for mine, scale in zip(points, scales, strict=True):

@@ -20,11 +20,11 @@ from p2gs_jax.types import View
 POINTS, CANDIDATES = 4000, 40_000
 MARGIN = 8
 SATURATED = 250 / 255
-ABOVE_BLACK = 8 / 255  # above the black level by this much a value carries signal, display values
-# A spike below this 8-bit value that holds this share of a frame is its black level.
+ABOVE_BLACK = 8 / 255  # least distance of a signal from the black level, display values
+# A spike in the histogram is the black level if it is below this 8-bit value and holds this share.
 BLACKEST, SPIKE = 40, 0.3
-SIGNAL = 0.15  # frames in which fewer pixels than this share carry signal say little
-# Shifts beyond this many pixels are mistakes of the matcher, not of the tripod.
+SIGNAL = 0.15  # least share of pixels with signal in a useful frame
+# Shifts beyond this many pixels are errors of the alignment.
 LARGEST_SHIFT = 7
 SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"}
 
@@ -34,20 +34,20 @@ Image = UInt8[np.ndarray, "h w 3"]
 class Stack(NamedTuple):
     """Photographs of one viewpoint."""
 
-    views: tuple[View, ...]  # the photographs; poses mean nothing
+    views: tuple[View, ...]  # the photographs; poses are meaningless
     images: list[Image]  # 8-bit RGB
-    # Pixels that hold data in every frame (a pure blue border is none).
+    # Pixels with data in every frame (a pure blue border has none).
     valid: Bool[np.ndarray, "h w"]
 
 
 class StackColors(NamedTuple):
-    """What a stack shows at points."""
+    """Colours of a stack at points."""
 
     observations: Observations  # colours, every frame at every point
     # Positions of the points in the first frame, pixel centres at +0.5.
     xy: Float[np.ndarray, "p 2"]
     shifts: Float[np.ndarray, "v 2"]  # pixels by which each frame was moved to fit the first
-    black: float  # values up to here were taken as black
+    black: float  # display value up to which pixels count as black
     signal: Bool[np.ndarray, " v"]  # frames in which enough pixels are neither black nor saturated
 
 
@@ -70,8 +70,8 @@ def read_stack(folder: Path) -> Stack:
         images.append(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
         size, first = (f"{i.shape[1]}x{i.shape[0]}" for i in (image, images[0]))
         if size != first:
-            why = f"is {size}, {files[0].name} {first}."
-            raise broken(path, why, "a stack has one size")
+            why = f"has {size} pixels, but {files[0].name} has {first}."
+            raise broken(path, why, "give photographs of one size")
     blue = np.all([(i[..., 2] > 200) & (i[..., 0] < 60) & (i[..., 1] < 60) for i in images], 0)
     grown = cv2.dilate(blue.astype(np.uint8), np.ones((15, 15), np.uint8)) > 0
     pose, K = np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32)
@@ -81,10 +81,10 @@ def read_stack(folder: Path) -> Stack:
 
 
 def align(images: list[Image]) -> Float[np.ndarray, "v 2"]:
-    """Return shifts that bring each frame onto the first, through its neighbours.
+    """Return shifts that align each frame with the first, through its neighbours.
 
-    Median threshold bitmaps do not depend on exposure; frames that are mostly black or white give
-    wild values, which count as no shift.
+    Median threshold bitmaps do not depend on exposure. Frames that are mostly black or white give
+    random shifts, which are ignored.
     """
     matcher = cv2.createAlignMTB(3)
     gray = [cv2.cvtColor(i, cv2.COLOR_RGB2GRAY) for i in images]
@@ -99,11 +99,11 @@ def align(images: list[Image]) -> Float[np.ndarray, "v 2"]:
 
 
 def black_level(stack: Stack) -> float:
-    """Return the value up to which the darkest frame shows nothing but its black level.
+    """Return the display value up to which pixels of the darkest frame count as black.
 
-    A frame that is mostly black has a spike in its histogram there, whatever the offset (film
-    scans: 13-16 of 255); one that is not is trusted down to its darkest percent. A value less than
-    twice that level is more offset than signal.
+    The histogram of a mostly black frame has a spike at its black level (film scans: 13 to 16 of
+    255). Without a spike, the level is the darkest percentile. Values below twice that level are
+    more offset than signal.
     """
     darkest = min(stack.images, key=lambda i: float(np.mean(i)))
     values = darkest[stack.valid]
@@ -117,7 +117,7 @@ def black_level(stack: Stack) -> float:
 
 
 def choose_points(stack: Stack, black: float, seed: int) -> Float[np.ndarray, "p 2"]:
-    """Return positions, as many in the mid tones of each frame."""
+    """Return positions, equally many in the mid tones of each frame."""
     rng = generator(seed, Stream.STACK_PIXELS)
     height, width = stack.valid.shape
     x = rng.integers(MARGIN, width - MARGIN, CANDIDATES)
