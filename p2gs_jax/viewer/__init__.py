@@ -1,1 +1,1 @@
-"""`p2gs-jax view`: a finished run in the browser, rendered live at any exposure."""
+"""`p2gs-jax view`: a finished run, rendered live in the browser at any exposure."""

@@ -1,7 +1,7 @@
-"""Cameras of the browser and ours: conversion, the scene's scale, and what marks them.
+"""Conversion between cameras of the browser and ours, the scale of the scene, and camera frusta.
 
-Both kinds look along z with x right and y down (OpenCV). viser's poses are camera-to-world; it has
-a vertical field of view instead of K, and lengths in the viewer's own unit.
+Both kinds look along z with x right and y down (OpenCV). Poses of viser are camera-to-world, with a
+vertical field of view instead of K, and with lengths in viewer units.
 """
 
 from __future__ import annotations
@@ -20,27 +20,27 @@ from p2gs_jax.scene import rigid
 from p2gs_jax.types import Camera, Scene, View
 
 Size = tuple[int, int]
-# Typical distance from a camera to what it sees, viewer units: viser's keys move 2 units a second.
+# Typical distance from a camera to the scene, viewer units; the keys of viser move 2 units/second.
 TYPICAL_DISTANCE = 10.0
 SMALLEST_FOV, LARGEST_FOV = 0.05, 2.8
-# Size of the frusta that mark cameras, viewer units.
+# Size of the frusta, viewer units.
 FRUSTUM = 0.3
-# Frusta closer to the camera than this, in sizes of a frustum, are hidden.
+# Frusta closer to the camera than this multiple of their size are hidden.
 TOO_CLOSE = 2.5
 LINE = 2.0
 
 
 class ViewerSpace(NamedTuple):
-    """Viewer units in a scene unit, and the direction away from the ground, of length 1."""
+    """The number of viewer units per scene unit, and the unit vector away from the ground."""
 
     unit: float
     up: Float[np.ndarray, " 3"]
 
 
 class Pose(NamedTuple):
-    """A camera pose in viser's terms: rotation camera-to-world, places in viewer units.
+    """A camera pose of viser: rotation camera-to-world, positions in viewer units.
 
-    It orbits `look_at`; `fov` is vertical, radians.
+    The camera orbits `look_at`; `fov` is vertical, radians.
     """
 
     wxyz: Float[np.ndarray, " 4"]
@@ -51,7 +51,7 @@ class Pose(NamedTuple):
 
 @dataclass(frozen=True)
 class BrowserView:
-    """The browser's camera and the size of its canvas, pixels."""
+    """The camera of a browser, and the size of its canvas, pixels."""
 
     wxyz: Float[np.ndarray, " 4"]
     position: Float[np.ndarray, " 3"]
@@ -77,7 +77,7 @@ def viewmats_of(views: Sequence[View]) -> Float[np.ndarray, "v 4 4"]:
 
 
 def make_viewer_space(scene: Scene, points: Float[np.ndarray, "n 3"]) -> ViewerSpace:
-    """Return a scene's scale, by the points of the scene, and its up direction."""
+    """Return the scale of a scene, from its points, and its up direction."""
     viewmats = viewmats_of(scene.views)
     every = max(1, len(viewmats) // 16)
     distance = np.median([distance_seen(m, points) for m in viewmats[::every]])
@@ -101,7 +101,7 @@ def pose_of(
 ) -> Pose:
     """Return the browser's camera for a world-to-camera matrix.
 
-    `distance` is that from the camera to the centre of its orbit, scene units; `fov` is vertical,
+    `distance` from the camera to the centre of its orbit is in scene units; `fov` is vertical,
     radians.
     """
     rotation = viewmat[:3, :3].T.astype(float)
@@ -116,7 +116,7 @@ def camera_of_browser(
 ) -> Camera:
     """Return our camera for the browser's, for a canvas with `aspect` = width / height.
 
-    Pixels are not square where the aspect of `size`, the pixels to render, is another.
+    Pixels are not square if `size`, the pixels to render, has another aspect.
     """
     rotation = Rotation.from_quat(np.asarray(view.wxyz, float), scalar_first=True).as_matrix()
     position = np.asarray(view.position, float) / space.unit
@@ -141,7 +141,7 @@ def fov_that_holds(view: View, aspect: float) -> float:
 
 
 class Frusta:
-    """The photographs' cameras that one browser shows, coloured by exposure."""
+    """The frusta of all views in one browser, coloured by exposure."""
 
     def __init__(
         self,
@@ -181,12 +181,12 @@ class Frusta:
             self._handles.append(handle)
 
     def show(self, visible: bool) -> None:
-        """Show or hide all of them."""
+        """Show or hide all frusta."""
         self._visible = visible
         self._apply()
 
     def keep_clear(self, position: Float[np.ndarray, " 3"]) -> None:
-        """Hide the frusta that are too close to a camera at a place in viewer units."""
+        """Hide the frusta that are too close to a camera at `position`, viewer units."""
         near = np.linalg.norm(self._positions - position, axis=1) < TOO_CLOSE * FRUSTUM
         if (near != self._near).any():
             self._near = near

@@ -1,9 +1,9 @@
 """The thread that keeps one browser's picture up to date.
 
-Requests wait in a mailbox that holds one: the camera and the settings are read when a frame begins,
-so the newest win. While anything changes, frames are as large as the frame rate allows and are sent
-as JPEG; at rest the canvas is rendered pixel for pixel and sent as PNG. What fails is reported
-once, and nothing is tried again before a request or a newly compiled program.
+At most one request waits. The camera and the settings are read when a frame begins, so a frame uses
+the newest ones. While they change, frames are as large as the frame rate allows and are sent as
+JPEG; at rest the canvas is rendered at full resolution and sent as PNG. A failure is reported once,
+and the frame is tried again only after a request or a newly compiled program.
 """
 
 from __future__ import annotations
@@ -30,34 +30,34 @@ from p2gs_jax.viewer.renderer import compilation_order, full_size, next_size, re
 from p2gs_jax.viewer.settings import Settings, display_of
 from p2gs_jax.viewer.viewed_run import ViewedRun
 
-# Nothing has changed for this long: at rest, seconds.
+# A picture is at rest after this time without changes, seconds.
 REST_S = 0.3
 JPEG_QUALITY = 85
-NO_PHOTOGRAPH = "No photograph was taken from here: choose one under Camera, Go to."
+NO_PHOTOGRAPH = "No photograph has this camera position: choose one under Camera, Go to."
 
 Request = Literal["look", "camera", "rest"]
 
 
-def report(client: viser.ClientHandle, what: str, error: Exception) -> None:
-    """Tell the user of a browser what went wrong."""
+def report(client: viser.ClientHandle, title: str, error: Exception) -> None:
+    """Show an error to the user of a browser."""
     if isinstance(error, UserError):
         text = str(error)
     else:
         print(printable("".join(traceback.format_exception(error))), file=sys.stderr)
         text = f"{type(error).__name__}: {error}"
-    client.add_notification(what, text, color="red")
+    client.add_notification(title, text, color="red")
 
 
 class Darkroom:
-    """Develops frames, for one thread: new display settings need no rendering.
+    """Develops rendered frames for one thread; new display settings need no new frame.
 
     `depth_limits` are the nearest and farthest depth of the colour scale, scene units.
     """
 
     def __init__(self, viewed: ViewedRun, depth_limits: tuple[float, float] | None = None):
-        """Begin without a photograph."""
+        """Start without a photograph."""
         self.depth_limits = depth_limits
-        self.photograph_error: str | None = None  # why the last one could not be shown
+        self.photograph_error: str | None = None  # the error of the last one
         self._viewed = viewed
         self._photograph: tuple[int, Camera, pictures.WarpedPhotograph] | None = None
 
@@ -104,7 +104,7 @@ class Darkroom:
             return pictures.note(NO_PHOTOGRAPH)
         if settings.mode == "split" and self.photograph_error is not None:
             return pictures.note(
-                html.escape(f"The photograph cannot be shown: {self.photograph_error}")
+                html.escape(f"The photograph cannot be displayed: {self.photograph_error}")
             )
         return None
 
@@ -118,11 +118,11 @@ class LivePicture:
         self.darkroom = Darkroom(viewed)
         self._changed = threading.Condition()
         self._request: Request | None = "camera"
-        self._rest_at: float | None = None  # when a picture at rest is due
+        self._rest_at: float | None = None  # time of the next picture at rest
         self._stopping = False
         self._frame: pictures.RenderedFrame | None = None
-        self._stale = True  # whether the frame is of an older camera
-        self._sharp = False  # whether it was shown at rest, and nothing has changed since
+        self._stale = True  # whether the frame has an older camera
+        self._sharp = False  # whether the picture at rest was sent, without changes since
         self._moving: tuple[Size | None, float] = (None, 0.0)  # size and time of the last frame
         self._last_ms = 0.0
         self._thread = threading.Thread(target=self._work, name="draw", daemon=True)
@@ -134,7 +134,7 @@ class LivePicture:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop the thread once its present frame is done."""
+        """Stop the thread after its current frame."""
         with self._changed:
             self._stopping = True
             self._changed.notify_all()
@@ -143,13 +143,13 @@ class LivePicture:
         self._thread.join()
 
     def post(self, request: Request) -> None:
-        """Ask for a frame: of another camera, or with another look of the present one."""
+        """Request a frame: for another camera, or the current frame with other display settings."""
         with self._changed:
             self._request = "camera" if "camera" in (request, self._request) else request
             self._changed.notify_all()
 
     def _renderer_changed(self) -> None:
-        """Ask for a picture at rest: with a new program it may be a better one."""
+        """Request a picture at rest, because a new program may render a larger one."""
         with self._changed:
             if self._rest_at is None:
                 self._rest_at = time.monotonic()
@@ -157,7 +157,7 @@ class LivePicture:
         self._update_status()
 
     def _take(self) -> Request | None:
-        """Wait for a request, or for the time of a picture at rest; None at the end."""
+        """Wait for a request, or for the time of a picture at rest; None means stop."""
         with self._changed:
             while not self._stopping:
                 if self._request is not None:
@@ -166,7 +166,7 @@ class LivePicture:
                     return request
                 wait = None if self._rest_at is None else self._rest_at - time.monotonic()
                 if wait is not None and wait <= 0:
-                    self._rest_at = None  # once, whatever comes of it
+                    self._rest_at = None  # one attempt only
                     return "rest"
                 self._changed.wait(wait)
         return None
@@ -176,7 +176,7 @@ class LivePicture:
             try:
                 self._draw(request, self._panel.settings())
             except Exception as error:
-                report(self._client, "This went wrong", error)
+                report(self._client, "An error occurred", error)
 
     def _draw(self, request: Request, settings: Settings) -> None:
         begin, view, at_rest = time.perf_counter(), browser_view(self._client), request == "rest"
@@ -196,7 +196,7 @@ class LivePicture:
             self._render(view, size, ready)
         if self._frame is None:
             return
-        if at_rest:  # done for every frame, the scale would flicker
+        if at_rest:  # for every frame, the scale would flicker
             self.darkroom.depth_limits = pictures.limits_of_depth(self._frame)
         self._show(self._frame, settings, sharp=at_rest)
         self._sharp = at_rest
@@ -208,7 +208,7 @@ class LivePicture:
         self._update_status()
 
     def _render(self, view: BrowserView, size: Size, ready: frozenset[Size]) -> None:
-        """Render the largest size up to `size` whose tile lists hold the view."""
+        """Render the largest size up to `size` whose tile lists have room for the view."""
         smaller = (s for s in ready if s[0] * s[1] < size[0] * size[1])
         for candidate in (size, *sorted(smaller, reverse=True)):
             frame = self._viewed.renderer.render(self.camera(view, candidate))
@@ -217,7 +217,7 @@ class LivePicture:
                 return
 
     def camera(self, view: BrowserView, size: Size) -> Camera:
-        """Return the camera that renders a browser's view."""
+        """Return the camera that renders the view of a browser."""
         return camera_of_browser(view, view.aspect, size, self._viewed.space)
 
     def _show(self, frame: pictures.RenderedFrame, settings: Settings, *, sharp: bool) -> None:

@@ -28,26 +28,26 @@ MEAN = "mean of all"
 NOWHERE = "choose ..."
 KEYS = "Drag to orbit, right-drag to pan, scroll to approach; W A S D Q E fly, arrows turn."
 HINTS = {
-    "Show": "The split needs a camera that stands where a photograph was taken.",
+    "Show": "The split needs the camera position of a photograph.",
     "Exposure": "Stops (EV) from the mean exposure of the training photographs.",
-    "Vignetting": "Darkens towards the corners as the camera of the matched photo does.",
-    "Curve": "The tone curve from exposed light to display values.",
-    "Match photo": "Sets all of this as a photograph was taken.",
-    "Go to": "Stands where a photograph was taken, and matches its exposure and gamma.",
-    "Lock exposure": "Go to, previous, next and split leave exposure, gamma and curve as they are.",
-    "Cameras": "Where photographs were taken; click one to go there.",
-    "Width": "Pixels across, {} to {}; the height follows the window.".format(*SAVED_WIDTHS),
+    "Vignetting": "Darkens the corners as in the matched photograph.",
+    "Curve": "The tone curve maps radiance times exposure to display values.",
+    "Match photo": "Sets these controls to the values of a photograph.",
+    "Go to": "Moves to the camera of a photograph, and sets its exposure and gamma.",
+    "Lock exposure": "Go to, previous, next and split do not change exposure, gamma and curve.",
+    "Cameras": "Shows the cameras of the photographs; click one to go there.",
+    "Width": "Width from {} to {} pixels; the height follows the window.".format(*SAVED_WIDTHS),
 }
 
 
 class Panel:
     """The controls of one browser.
 
-    `locked` says whether moving to a view leaves the display transform as it is.
+    `locked` is the control that keeps the display transform when the camera moves to a view.
     """
 
     def __init__(self, gui: viser.GuiApi, viewed: ViewedRun, actions: BrowserSession):
-        """Add the controls to a client's page; they call the actions."""
+        """Add the controls to the page of a client; they call `actions`."""
         run = viewed.run
         self._gui, self._viewed, self._actions = gui, viewed, actions
         self._names = [view.name for view in run.scene.views]
@@ -147,7 +147,7 @@ class Panel:
 
     @staticmethod
     def _when_chosen(handle: Any, act: Callable[[Any], object]) -> None:
-        """Call `act` when a person changes a control, but not when `put` does."""
+        """Call `act` when the user changes a control, but not when `put` changes it."""
 
         def on_update(event: viser.GuiEvent) -> None:
             if event.client_id is not None:
@@ -159,7 +159,7 @@ class Panel:
         return self._names.index(name) if name in self._names else None
 
     def settings(self) -> Settings:
-        """Return the present settings."""
+        """Return the current settings."""
         balance = tuple(handle.value for handle in self._balance)
         return Settings(
             gamma=self._gamma.value,
@@ -173,7 +173,7 @@ class Panel:
         )
 
     def put(self, settings: Settings) -> None:
-        """Set the controls to a display transform; the mode stays."""
+        """Set the controls to a display transform; the mode does not change."""
         index = self._taken_as = settings.taken_as
         self._exposure.value = settings.exposure_ev
         self._gamma.value = settings.gamma
@@ -194,7 +194,7 @@ class Panel:
             self._status.content = html
 
     def set_legend(self, html: str | None) -> None:
-        """Show the legend of the picture's colours, or none."""
+        """Show the legend of the picture; None hides it."""
         self._split.visible = MODES[self._mode.value] == "split"
         if html is not None and self._legend.content != html:
             self._legend.content = html

@@ -1,9 +1,8 @@
 """The renderer, compiled for a few sizes in the background, so that frames never wait.
 
-Every size needs its own compiled program, so there are few: six widths in a few aspect ratios.
-Pixels need not be square: until the size of a canvas is compiled, another one is stretched over it.
-A frame whose tile lists overflow is rendered at a smaller size while a program with longer lists is
-compiled.
+Every size needs a compiled program, so there are few sizes: six widths in a few aspect ratios.
+Until the size of a canvas is compiled, a frame of another size is stretched over it. A frame whose
+tile lists overflow is rendered at a smaller size while a program with longer lists is compiled.
 """
 
 from __future__ import annotations
@@ -24,19 +23,19 @@ from p2gs_jax.types import Camera, Gaussians, Render
 from p2gs_jax.viewer.camera import Size
 from p2gs_jax.viewer.pictures import RenderedFrame
 
-# Most entries of a tile list; a camera inside a splat may need any number.
+# Largest number of entries of a tile list; a camera inside a splat may need any number.
 MOST_ENTRIES = 2**26
-# Widths at an aspect of 16:10; areas grow by 2.25.
+# Widths at an aspect of 16:10, pixels; each area is 2.25 times the previous one.
 WIDTHS = (320, 480, 720, 1080, 1620, 2430)
-# Aspect ratios per factor of two: pixels are at most 9 % out of square.
+# Aspect ratios per factor of two; pixels are then square within 9 %.
 SHAPES_PER_OCTAVE = 4
 ALIGN = 8
-# Sizes with more than this share of the full size's pixels would save too little.
+# Sizes with more than this share of the full size's pixels would save too little time.
 FULL_FROM = 0.6
 # Target time of a frame while the camera moves, milliseconds.
 TARGET_MS = 75.0
-# Move to the next larger size if it is expected within the first share of the target time, and to
-# a smaller one beyond the second.
+# The next larger size follows if its expected time is below the first share of the target time, and
+# a smaller one if the time is above the second.
 ENLARGE_WITHIN, SHRINK_BEYOND = 0.85, 1.25
 
 
@@ -55,10 +54,10 @@ class Renderer:
         on_change: Callable[[], None] = lambda: None,
         warm_up: Callable[[Render], object] = lambda result: None,
     ):
-        """Begin without a program; new ones have room for what the typical cameras `probes` see.
+        """Start without a program; new ones have room for the views of typical cameras (`probes`).
 
-        `on_change` is called when a program was compiled, or is about to be; `warm_up` with a
-        render of every new size, to compile what uses it.
+        `on_change` is called before and after a program is compiled. `warm_up` is called with a
+        render of every new size, and compiles the functions that use it.
         """
         self._scene, self._cfg, self._probes = (gaussians, alive), cfg, probes
         self._on_change, self._warm_up = on_change, warm_up
@@ -69,19 +68,19 @@ class Renderer:
 
     @property
     def ready(self) -> frozenset[Size]:
-        """Sizes that render at once."""
+        """The compiled sizes."""
         with self._lock:
             return frozenset(s for s, job in self._jobs.items() if _succeeded(job))
 
     @property
     def compiling(self) -> Size | None:
-        """What is being compiled, or None."""
+        """The size that is being compiled, or None."""
         with self._lock:
             return next((size for size, job in self._jobs.items() if job.running()), None)
 
     @property
     def failure(self) -> str | None:
-        """What could not be compiled, or None."""
+        """A message on a size that could not be compiled, or None."""
         with self._lock:
             for (width, height), job in self._jobs.items():
                 if job.done() and (error := job.exception()) is not None:
@@ -89,7 +88,7 @@ class Renderer:
         return None
 
     def request(self, sizes: Sequence[Size]) -> None:
-        """Compile these sizes, in this order; what others wait for is put off."""
+        """Compile these sizes in this order; other sizes that still wait are cancelled."""
         with self._lock:
             for size in [s for s in self._jobs if s not in sizes]:
                 if self._jobs[size].cancel():
@@ -107,7 +106,7 @@ class Renderer:
         job.add_done_callback(done)
 
     def render(self, camera: Camera) -> RenderedFrame | None:
-        """Return a frame, or None where its size is not compiled or its tile lists overflow.
+        """Return a frame, or None if its size is not compiled or its tile lists overflow.
 
         After an overflow the size is not ready until a program with longer lists is compiled.
         """
@@ -127,25 +126,25 @@ class Renderer:
         return None
 
     def render_now(self, camera: Camera) -> RenderedFrame:
-        """Return a frame of any size, however long its program takes to compile.
+        """Return a frame of any size; compiling its program may take long.
 
-        Raises a UserError where it would need more memory than is reasonable.
+        Raises a UserError if its tile lists would need too much memory.
         """
         if int(capacity.count_needed(*self._scene, camera, cfg=self._cfg)) > MOST_ENTRIES:
             why = f"{camera.width} x {camera.height} pixels from here need too much memory."
-            raise UserError(why, fix="move away from what is close, or choose a smaller width")
+            raise UserError(why, fix="move away from close objects, or choose a smaller width")
         with self._one_frame:
             return _frame(self._render_any(*self._scene, camera), camera)
 
     def stop(self) -> None:
-        """Stop compiling, and wait for the program that is being compiled.
+        """Wait for the program that is being compiled, and compile no more.
 
-        An interpreter that ends while JAX works in another thread aborts.
+        Without the wait, Python would abort at exit while JAX still works in another thread.
         """
         self._compiler.shutdown(cancel_futures=True)
 
     def _compile(self, size: Size, needed: int) -> Callable[..., Render]:
-        """Return the program of a size, with room for what probes and a given view need."""
+        """Return the program of a size, with room for the probes and for `needed` entries."""
         self._on_change()
         cameras = [probe(size) for probe in self._probes]
         counts = [int(capacity.count_needed(*self._scene, c, cfg=self._cfg)) for c in cameras]
@@ -169,14 +168,14 @@ def _frame(result: Render, camera: Camera) -> RenderedFrame:
 
 
 def full_size(canvas: Size, max_width: int) -> Size:
-    """Return what to render at rest: the canvas itself, pixel for pixel, up to a width."""
+    """Return the size to render at rest: that of the canvas, at most `max_width` pixels wide."""
     width, height = max(canvas[0], 1), max(canvas[1], 1)
     scale = min(1.0, max_width / width)
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
 def render_sizes(full: Size) -> tuple[Size, ...]:
-    """Return the sizes to render a canvas at, smallest first and `full` last."""
+    """Return the render sizes of a canvas from the smallest to `full`."""
     octaves = round(math.log2(full[0] / full[1]) * SHAPES_PER_OCTAVE) / SHAPES_PER_OCTAVE
     areas = [width * width / 1.6 for width in WIDTHS]
     sides = [
@@ -188,7 +187,7 @@ def render_sizes(full: Size) -> tuple[Size, ...]:
 
 
 def compilation_order(sizes: tuple[Size, ...]) -> tuple[Size, ...]:
-    """Return the sizes in the order to compile them: a small one, the full size, then the rest."""
+    """Return the sizes in the order of compilation: a small one, the full size, then the others."""
     first = sizes[min(1, len(sizes) - 1)]
     return tuple(dict.fromkeys((first, sizes[-1], *reversed(sizes[:-1]))))
 
@@ -196,10 +195,10 @@ def compilation_order(sizes: tuple[Size, ...]) -> tuple[Size, ...]:
 def next_size(
     sizes: tuple[Size, ...], ready: Collection[Size], current: Size | None, ms: float
 ) -> Size | None:
-    """Return the size for the next frame of a moving camera, or None where none is ready.
+    """Return the size for the next frame of a moving camera, or None if none is compiled.
 
-    `sizes` of the canvas rise; `ready` ones may be of another canvas. The last frame took `ms`
-    milliseconds at the size `current`, which is kept unless another is clearly better.
+    `sizes` of the canvas increase; `ready` ones may be of another canvas. The last frame took `ms`
+    milliseconds at the size `current`, which stays unless another size is clearly better.
     """
     usable = [size for size in sizes if size in ready]
     if not usable:

@@ -1,10 +1,9 @@
-"""The web server: who may talk to it, one viewed run, and a session for every browser.
+"""The web server: access control, one viewed run, and a session for every browser.
 
-Pages of the viewer's own address may talk to it, and from outside only with a token. A page of any
-other site that is open in the same browser could otherwise connect to a port of this machine
-(WebSockets know no same-origin policy, RFC 6455, 10.2), also by a name of its own that it lets
-point here. viser has no hook for this; what it gives to the `websockets` library is wrapped while
-it starts.
+Only the page of the viewer may connect, and from other machines only with a token. Otherwise a page
+of any other site in the same browser could connect to a port of this machine (WebSockets have no
+same-origin policy, RFC 6455, 10.2), even through a host name that resolves to this machine. viser
+has no hook for such checks, so its call of the `websockets` library is wrapped during the start.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ from p2gs_jax.viewer.renderer import compilation_order, full_size, render_sizes
 from p2gs_jax.viewer.session import BrowserSession
 from p2gs_jax.viewer.viewed_run import ViewedRun
 
-# Canvas of a common browser window: its programs are compiled before any browser connects.
+# Canvas of a common browser window, pixels; its programs are compiled before a browser connects.
 LIKELY_CANVAS = (1280, 800)
 COOKIE, QUERY = "p2gs_jax_token", "token"
 _STARTING = threading.Lock()
@@ -48,38 +47,38 @@ Hook = Callable[[ServerConnection, Request], Response | None]
 
 
 class Guard(NamedTuple):
-    """What a request needs: one of this machine's names (None: any), and a token (None: none).
+    """Conditions for a request: one of these host names (None: any), and a token (None: none).
 
-    The token has to be in the address, or in the cookie that is set then.
+    The token must be in the address, or in the cookie that the first answer sets.
     """
 
     hosts: frozenset[str] | None
     token: str | None = None
 
     def refusal(self, request: Request) -> str | None:
-        """Return why a request is refused, or None."""
+        """Return the reason to refuse a request, or None."""
         host = request.headers.get("Host", "")
         if self.hosts is not None and _name(host) not in self.hosts:
-            return "This viewer does not answer to that name."
+            return "This viewer does not serve that host name."
         origin = request.headers.get("Origin")
         if origin is not None and origin.lower().partition("://")[2] != host.lower():
-            return "This viewer answers only to its own page."
+            return "This viewer accepts requests of its page only."
         if self.token is not None and not any(
-            hmac.compare_digest(said.encode(), self.token.encode()) for said in _tokens(request)
+            hmac.compare_digest(token.encode(), self.token.encode()) for token in _tokens(request)
         ):
-            return "Open the whole address that `p2gs-jax view` printed, with its token."
+            return "Open the complete address that `p2gs-jax view` printed, with its token."
         return None
 
 
 def guard_of(host: str) -> Guard:
-    """Return the guard of an address to listen on: with a token where others can reach it."""
+    """Return the guard of a listening address, with a token if other machines can reach it."""
     if is_loopback(host):
         return Guard(frozenset({*_LOOPBACK_NAMES, host.lower()}))
     return Guard(None, secrets.token_urlsafe(16))
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether only this machine reaches an address."""
+    """Return whether only this machine can reach an address."""
     try:
         found = socket.getaddrinfo(host, None, flags=socket.AI_PASSIVE)
     except (OSError, UnicodeError):
@@ -90,7 +89,7 @@ def is_loopback(host: str) -> bool:
 
 @contextmanager
 def guarded(guard: Guard) -> Iterator[None]:
-    """Let a guard stand before every server of `websockets` that starts in a `with` block."""
+    """Apply a guard to every server of `websockets` that starts in the `with` block."""
     with _STARTING:
         serve = websocket_server.serve
 
@@ -128,13 +127,13 @@ def _name(host: str) -> str:
 
 
 def _cookie(request: Request) -> str:
-    """Return the name of the cookie: a browser sends all cookies of a host to each of its ports."""
+    """Return the cookie name, with the port: browsers send cookies to all ports of a host."""
     port = request.headers.get("Host", "").rpartition(":")[2]
     return f"{COOKIE}_{port}" if port.isdecimal() and port.isascii() else COOKIE
 
 
 def _tokens(request: Request) -> list[str]:
-    """Return the tokens that a request carries."""
+    """Return the tokens in the address and the cookies of a request."""
     found = parse_qs(request.path.partition("?")[2]).get(QUERY, [])
     try:
         for header in request.headers.get_all("Cookie"):
@@ -171,7 +170,7 @@ def check_address(host: str, port: int) -> None:
 def open_viewer(run: Run, *, host: str, port: int, max_width: int) -> Iterator[str]:
     """Serve a run until the block ends; yield the address to open, with its token if it needs one.
 
-    Raises a UserError where nothing can listen there.
+    Raises a UserError if no server can listen on `host` and `port`.
     """
     check_address(host, port)
     # viser warns when a browser disconnects while a picture is being sent.
@@ -185,12 +184,12 @@ def open_viewer(run: Run, *, host: str, port: int, max_width: int) -> Iterator[s
     sessions: dict[int, BrowserSession] = {}
     try:
         if port not in (0, server.get_port()):
-            raise UserError(f"port {port} was taken just now.", fix="choose another with --port")
+            raise UserError(f"port {port} has become busy.", fix="choose another with --port")
         _set_up_server(server, viewed, sessions)
         sizes = render_sizes(full_size(LIKELY_CANVAS, max_width))
         viewed.renderer.request(compilation_order(sizes))
-        shown = "localhost" if host in ("0.0.0.0", "::", "") else host
-        address = f"http://{f'[{shown}]' if ':' in shown else shown}:{server.get_port()}"
+        name = "localhost" if host in ("0.0.0.0", "::", "") else host
+        address = f"http://{f'[{name}]' if ':' in name else name}:{server.get_port()}"
         yield address if guard.token is None else f"{address}/?{QUERY}={guard.token}"
     finally:
         for session in tuple(sessions.values()):
@@ -204,19 +203,19 @@ def open_viewer(run: Run, *, host: str, port: int, max_width: int) -> Iterator[s
 def _set_up_server(
     server: viser.ViserServer, viewed: ViewedRun, sessions: dict[int, BrowserSession]
 ) -> None:
-    """Set the page's theme, the initial camera, and what happens when a browser connects.
+    """Set the theme of the page, the initial camera, and the handlers of connections.
 
-    `sessions` of the connected browsers, by their ids, is kept up to date.
+    The handlers keep `sessions` (by the ids of connected browsers) up to date.
     """
     server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-    # Any page could ask viser's relay to publish the run, also without a button for it.
+    # Even without its button, any page could ask viser to publish the run through its relay.
     server.request_share_url = lambda verbose=True: None
     server.scene.set_up_direction(viewed.space.up)
     start = viewed.pose(viewed.first_view, LIKELY_CANVAS[0] / LIKELY_CANVAS[1])
     camera = server.initial_camera
     camera.position, camera.look_at, camera.fov = start.position, start.look_at, start.fov
     lock = threading.Lock()
-    # Browsers that left while their session was being made: viser calls from several threads.
+    # Browsers that disconnected before their session existed: viser calls from several threads.
     gone: set[int] = set()
 
     @server.on_client_connect
@@ -243,15 +242,15 @@ def _set_up_server(
 def serve(run: Run, *, host: str, port: int, max_width: int, say: Callable[[str], None]) -> None:
     """Serve a run until Ctrl-C or SIGTERM.
 
-    `say` prints a line. Raises a UserError where nothing can listen there.
+    `say` prints a line. Raises a UserError if no server can listen on `host` and `port`.
     """
     with open_viewer(run, host=host, port=port, max_width=max_width) as address:
         who = "only this machine" if is_loopback(host) else "any machine with this address"
         count = run.params.gaussians.capacity
         with contextlib.suppress(KeyboardInterrupt), interrupts.held() as asked:
-            # Signals are noted, not raised: Python drops what is raised while it collects garbage.
+            # Signals are recorded, not raised: Python drops exceptions during garbage collection.
             asked.begin()
             say(f"{count} Gaussians at {address} (open to {who}; Ctrl-C ends)")
             while asked.arrived is None:
                 time.sleep(0.1)
-        say("Ending, once what is being compiled is done.")
+        say("The viewer stops after the compilation in progress.")

@@ -1,4 +1,4 @@
-"""One connected browser: what its controls do."""
+"""One connected browser, and the actions of its controls."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class BrowserSession:
         self._live.start()
 
     def stop(self) -> None:
-        """Stop the thread: the browser has disconnected."""
+        """Stop the thread after the browser has disconnected."""
         self._live.stop()
 
     def _camera_moved(self, camera: viser.CameraHandle) -> None:
@@ -50,11 +50,11 @@ class BrowserSession:
             camera.wxyz = pose.wxyz
 
     def display_changed(self) -> None:
-        """Show the frame under the new settings."""
+        """Show the frame with the new settings."""
         self._live.post("look")
 
     def mode_changed(self) -> None:
-        """Show another mode; `split` moves to the nearest photograph and takes its settings."""
+        """Show another mode; `split` moves to the nearest photograph and uses its settings."""
         if self._panel.settings().mode == "split":
             camera = self._live.camera(browser_view(self._client), (64, 64))
             here = self._viewed.view_at(camera)
@@ -62,14 +62,14 @@ class BrowserSession:
         self._live.post("camera")
 
     def take_display_of(self, index: int | None) -> None:
-        """Take all that a view was taken with, or the mean."""
+        """Set the display transform to that of a view, or to the mean (None)."""
         now, run = self._panel.settings(), self._run
-        same = common_settings(run, now) if index is None else settings_of_view(run, index, now)
-        self._panel.put(same)
+        new = common_settings(run, now) if index is None else settings_of_view(run, index, now)
+        self._panel.put(new)
         self.display_changed()
 
     def go_to(self, index: int) -> None:
-        """Move to the camera of a view, and take its display transform unless that is locked."""
+        """Move to the camera of a view, and use its display transform unless that is locked."""
         pose = self._viewed.pose(index, browser_view(self._client).aspect)
         self._panel.put_view(index, float(np.rad2deg(pose.fov)))
         if not self._panel.locked.value:
@@ -81,7 +81,7 @@ class BrowserSession:
         self._client.camera.fov = float(np.deg2rad(degrees))
 
     def show_cameras(self, visible: bool) -> None:
-        """Show or hide the photographs' cameras."""
+        """Show or hide the cameras of the photographs."""
         with self._one_at_a_time:
             frusta = self._frusta or self._add_frusta()
             frusta.show(visible)
@@ -96,7 +96,7 @@ class BrowserSession:
         return frusta
 
     def save(self, kind: str, width: int) -> None:
-        """Send the view as a file, rendered at a width of its own."""
+        """Send the view as a file, rendered at `width` pixels."""
         view, settings = browser_view(self._client), self._panel.settings()
         size = width, max(1, round(width / view.aspect))
         text = f"Rendering {size[0]} x {size[1]} pixels ..."

@@ -1,4 +1,4 @@
-"""The viewer's settings, and the display transform that they give."""
+"""The settings of the viewer, and the display transform made from them."""
 
 from __future__ import annotations
 
@@ -18,36 +18,36 @@ ChosenCurve = Literal["run", "srgb", "power", "linear"]
 class Settings:
     """The display transform and the mode.
 
-    `taken_as` is the row in `scene.views` of the view whose correction and whose camera's
-    vignetting and response apply; None is the mean, and no camera.
+    `taken_as` is the row in `scene.views` of the view whose correction, vignetting and response
+    apply; None means the mean, without a camera.
     """
 
     gamma: float
     exposure_ev: float = 0.0  # stops from the mean training exposure
-    curve: ChosenCurve = "run"  # what the fit chose
+    curve: ChosenCurve = "run"  # the curve of the fit
     taken_as: int | None = None
-    balance_ev: tuple[float, float] | None = None  # of red and blue over green, where modelled
-    vignetting: bool = True  # whether that camera's is shown
+    balance_ev: tuple[float, float] | None = None  # red and blue relative to green, if modelled
+    vignetting: bool = True  # whether that of the camera applies
     mode: Mode = "display"
-    split: float = 0.5  # share of the photograph in `split`
+    split: float = 0.5  # visible share of the photograph in `split`
 
 
 def common_settings(run: Run, before: Settings | None = None) -> Settings:
-    """Return settings with the mean exposure, gamma and white balance; the rest is as before."""
+    """Return settings with the mean exposure, gamma and white balance; others are as before."""
     common = run.common_display()
-    return _taken(before or Settings(common.gamma), common, 0.0, None)
+    return _apply(before or Settings(common.gamma), common, 0.0, None)
 
 
 def settings_of_view(run: Run, index: int, before: Settings) -> Settings:
-    """Return settings as a row of `scene.views` was taken; the rest is as before."""
+    """Return settings with the display of a row of `scene.views`; others are as before."""
     own = run.own_display(index)
     ev = float(np.log2(own.exposure / run.mean.exposure_geometric))
-    return _taken(before, own, ev, index)
+    return _apply(before, own, ev, index)
 
 
-def _taken(before: Settings, shown: DisplayTransform, ev: float, view: int | None) -> Settings:
-    balance = None if shown.white_balance is None else shown.white_balance_ev
-    new = {"gamma": shown.gamma, "exposure_ev": ev, "taken_as": view, "balance_ev": balance}
+def _apply(before: Settings, display: DisplayTransform, ev: float, view: int | None) -> Settings:
+    balance = None if display.white_balance is None else display.white_balance_ev
+    new = {"gamma": display.gamma, "exposure_ev": ev, "taken_as": view, "balance_ev": balance}
     return replace(before, curve="run", **new)
 
 
@@ -66,7 +66,8 @@ def display_of(run: Run, settings: Settings) -> DisplayTransform:
 
 
 def exposures_ev(run: Run) -> dict[int, float]:
-    """Return stops from the geometric mean of every training view, by row in `scene.views`."""
+    """Return the exposure of every training view, stops from the geometric mean, by row in
+    `scene.views`."""
     values = np.log2(np.asarray(run.params.photometry.exposures, float))
     values = values - np.log2(run.mean.exposure_geometric)
     return dict(zip(run.scene.train_indices, values.tolist(), strict=True))

@@ -1,4 +1,4 @@
-"""A run prepared for the viewer: what all browsers share."""
+"""A run prepared for the viewer, shared by all browsers."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ from p2gs_jax.types import Camera
 from p2gs_jax.viewer import camera as cameras
 from p2gs_jax.viewer.renderer import Renderer
 
-# Views on which new programs are run.
+# Number of views on which new programs are run.
 PROBES = 4
-# Cameras closer than this count as being in one place, in typical distances.
+# Cameras closer than this count as being at one position, in typical distances.
 SAME_PLACE = 1e-3
 
 
 class ViewedRun:
     """A run with its photographs, its scale in the viewer and its compiled renderer.
 
-    No picture is rendered wider than `max_width` pixels. `listeners` are called when a program was
-    compiled, or is about to be.
+    No picture is rendered wider than `max_width` pixels. `listeners` are called before and after a
+    program is compiled.
     """
 
     def __init__(self, run: Run, max_width: int):
-        """Find scale and orientation of the scene; compile nothing yet."""
+        """Find the scale and the orientation of the scene; nothing is compiled yet."""
         self.run, self.max_width, self.store = run, max_width, run.store
         self.listeners: list[Callable[[], None]] = []
-        # The programs of a viewer know no time.
+        # The programs of the viewer have no time argument.
         gaussians = at_time(run.as_of(), None)
         points = run.scene.points
         self._points = points if len(points) else np.asarray(gaussians.means)
         self._centers = camera_centers(cameras.viewmats_of(run.scene.views))
         self.space = cameras.make_viewer_space(run.scene, self._points)
-        # Typical distance to what a view sees, scene units.
+        # Typical distance to the points that a view sees, scene units.
         views = run.scene.views
         self.distance = cache(
             lambda index: cameras.distance_seen(views[index].viewmat, self._points)
@@ -63,18 +63,18 @@ class ViewedRun:
         return cameras.camera_of_browser(self.pose(index, aspect), aspect, size, self.space)
 
     def view_at(self, camera: Camera) -> int | None:
-        """Return the row of the view taken from the place of a camera, or None."""
+        """Return the row of the view at the position of a camera, or None."""
         near = np.flatnonzero(
             self._away(camera) <= SAME_PLACE * cameras.TYPICAL_DISTANCE / self.space.unit
         )
         if not len(near):
             return None
-        # Several views may share a place (rigs, panoramas): take the one with the same direction.
+        # Several views may share a position (rigs, panoramas): the direction decides.
         forward, views = np.asarray(camera.viewmat)[2, :3], self.run.scene.views
         return int(max(near, key=lambda i: float(views[i].viewmat[2, :3] @ forward)))
 
     def nearest_view(self, camera: Camera) -> int:
-        """Return the row of the view taken nearest to a camera."""
+        """Return the row of the view nearest to a camera."""
         return int(np.argmin(self._away(camera)))
 
     def _away(self, camera: Camera) -> np.ndarray:
@@ -83,13 +83,13 @@ class ViewedRun:
 
     @property
     def first_view(self) -> int:
-        """Row of the view that a browser starts from: the first training view."""
+        """The row of the first training view, from which a browser starts."""
         return self.run.scene.train_indices[0]
 
     def pose(self, index: int, aspect: float) -> cameras.Pose:
         """Return the browser's camera for a row of `scene.views`.
 
-        The whole photograph fits into a canvas with `aspect` = width / height.
+        It shows the whole photograph on a canvas with `aspect` = width / height.
         """
         view = self.run.scene.views[index]
         fov = cameras.fov_that_holds(view, aspect)
