@@ -1,1 +1,1 @@
-"""Work larger than one process: jobs on engines that exist, sweeps, scenes in blocks."""
+"""Work larger than one process: jobs on existing engines, sweeps, and scenes in blocks."""

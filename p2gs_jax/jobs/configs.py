@@ -1,4 +1,4 @@
-"""Configurations by dotted field names: single ones, grids, and those that a TOML file lists."""
+"""Configurations by dotted field names: single ones, grids, and those of a TOML file."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ KEYS = ("scene", "reference", "out", "preset", "seeds", "max_parallel", "set", "
 def with_fields(cfg: FitConfig, fields: Mapping[str, Any]) -> FitConfig:
     """Return the configuration with the values of some dotted fields replaced.
 
-    Raises a UserError where a field (`loss.relative_exposure.weight`) does not exist, or does not
-    take the value.
+    Raises a UserError if a field (such as `loss.relative_exposure.weight`) does not exist, or if
+    its value is not valid.
     """
     for name, value in fields.items():
         cfg = with_values(cfg, {name: _checked(cfg, name, value)})
@@ -31,30 +31,30 @@ def with_fields(cfg: FitConfig, fields: Mapping[str, Any]) -> FitConfig:
 
 
 def _checked(cfg: FitConfig, whole: str, value: Any) -> Any:
-    """Return a value as the field takes it: lists as tuples, whole numbers as floats if need be."""
+    """Return a value with the type of the field: lists become tuples, integers floats if needed."""
     record: Any = cfg
     *groups, last = whole.split(".")
     for name in groups:
         _require_field(record, name, whole)
         record = getattr(record, name)
         if not dataclasses.is_dataclass(record):
-            fix = f"{name!r} is a value itself: leave out what follows it"
-            raise UserError(f"the configuration field {whole!r} goes too deep.", fix=fix)
+            fix = f"{name!r} is a value: leave out the names behind it"
+            raise UserError(f"{whole!r} is not a configuration field.", fix=fix)
     _require_field(record, last, whole)
     hint = typing.get_type_hints(type(record))[last]
     value = tuple(value) if isinstance(value, list) else value
     if isinstance(value, int) and not isinstance(value, bool) and not _fits(value, hint):
         value = float(value)
     if not _fits(value, hint):
-        raise UserError(f"{whole} = {value!r} does not fit.", fix=f"it takes {_shown(hint)}")
+        raise UserError(f"{whole} = {value!r} is not valid.", fix=f"write {_allowed(hint)}")
     return value
 
 
 def _require_field(record: Any, name: str, whole: str) -> None:
     names = [f.name for f in dataclasses.fields(record)]
     if name not in names:
-        fix = f"beside {name!r} there are: {', '.join(names)}"
-        raise UserError(f"there is no configuration field {whole!r}.", fix=fix)
+        fix = f"instead of {name!r} use one of: {', '.join(names)}"
+        raise UserError(f"{whole!r} is not a configuration field.", fix=fix)
 
 
 def _fits(value: Any, hint: Any) -> bool:
@@ -75,23 +75,23 @@ def _fits(value: Any, hint: Any) -> bool:
     return isinstance(value, hint)
 
 
-def _shown(hint: Any) -> str:
-    """Return the values that a field takes, in words."""
+def _allowed(hint: Any) -> str:
+    """Return the values that a field allows, in words."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin is typing.Literal:
         return ", ".join(repr(a) for a in args)
     if origin in (typing.Union, types.UnionType):
-        return " or ".join(_shown(a) for a in args)
+        return " or ".join(_allowed(a) for a in args)
     if hint is type(None):
         return '"none"'
     return hint.__name__ if isinstance(hint, type) and not args else str(hint)
 
 
 def grid(base: FitConfig, **axes: Sequence[Any]) -> dict[str, FitConfig]:
-    """Return every combination of some fields' values, by a name that lists them.
+    """Return every combination of the values of some fields, by a name that lists them.
 
     All other fields are those of `base`. Double underscores stand for dots in the names of `axes`,
-    as in `loss__relative_exposure__weight=[0.01, 0.1]`. Raises what `with_fields` does.
+    as in `loss__relative_exposure__weight=[0.01, 0.1]`. Errors are those of `with_fields`.
     """
     return _product(base, {name.replace("__", "."): values for name, values in axes.items()})
 
@@ -107,7 +107,7 @@ def _product(base: FitConfig, axes: Mapping[str, Sequence[Any]]) -> dict[str, Fi
 
 @dataclass(frozen=True)
 class SweepFile:
-    """The arguments of `sweep`, as a file gives them."""
+    """The arguments of `sweep` from a file."""
 
     scene: Path
     out: Path
@@ -127,13 +127,13 @@ def read_sweep(path: Path) -> SweepFile:
         seeds = [0, 1, 2]
         max_parallel = 1
 
-        [set]                               # for all
+        [set]                               # for all configurations
         "train.steps" = 600
 
         [grid]                              # every combination
         "loss.relative_exposure.weight" = ["none", 0.01]
 
-        [[case]]                            # and single ones
+        [[case]]                            # a single configuration
         name = "paper"
         preset = "paper"
         "densify.max_gaussians" = 30000
@@ -141,8 +141,8 @@ def read_sweep(path: Path) -> SweepFile:
     TOML has no null: "none" stands for it.
 
     Raises:
-        UserError: the file is missing or not TOML, a key or a field is unknown, or a value is
-            wrong.
+        UserError: the file is missing or not TOML, a key or a field is unknown, or a value is not
+            valid.
     """
     data = _parsed(Path(path))
     seeds, parallel = data.get("seeds", [0]), data.get("max_parallel", 1)
@@ -168,7 +168,7 @@ def _parsed(path: Path) -> dict[str, Any]:
         fix = "name a TOML file; docs/api.md shows one"
         raise UserError(f"{path} cannot be read: {error.strerror}.", fix=fix) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        fix = "mend that line; docs/api.md shows an example"
+        fix = "correct that line; docs/api.md shows an example"
         raise UserError(f"{path} is not valid TOML: {error}.", fix=fix) from error
     unknown = [key for key in data if key not in KEYS]
     if unknown:
@@ -179,7 +179,7 @@ def _parsed(path: Path) -> dict[str, Any]:
 
 
 def _configs(data: Mapping[str, Any], path: Path) -> dict[str, FitConfig]:
-    """Return the configurations of a file: those of its grid, then its single cases."""
+    """Return the configurations of a file: first its grid, then its single cases."""
 
     def start(name: Any) -> FitConfig:
         try:
@@ -195,8 +195,8 @@ def _configs(data: Mapping[str, Any], path: Path) -> dict[str, FitConfig]:
         fields = _nulls(case)
         name = str(fields.pop("name", f"case {number}"))
         if name in configs:
-            fix = "give each case its name"
-            raise UserError(f"{path}: two configurations are called {name!r}.", fix=fix)
+            fix = "give each case a different name"
+            raise UserError(f"{path}: two configurations have the name {name!r}.", fix=fix)
         configs[name] = with_fields(start(fields.pop("preset", usual)), fields)
     return configs
 

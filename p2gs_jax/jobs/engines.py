@@ -1,7 +1,7 @@
 """Engines by name: `local`, `dask://HOST:PORT`, `slurm` and `submitit-local`.
 
-Each is a `concurrent.futures.Executor`. Its machines have the package installed and see the same
-folders under the same paths.
+Each engine is a `concurrent.futures.Executor`. The package must be installed on its machines, which
+must have the same folders under the same paths.
 """
 
 from __future__ import annotations
@@ -24,33 +24,33 @@ from p2gs_jax.errors import UserError
 
 LOCAL = "local"
 KNOWN = "local, dask://HOST:PORT, slurm or slurm:OPTION=VALUE,..."
-# Seconds until a scheduler must have answered.
+# Longest wait for the answer of a scheduler, seconds.
 ANSWER_S = 20
-# Seconds between questions how a job of submitit is; it asks Slurm less often by itself.
+# Time between two checks of a job of submitit, seconds; submitit asks Slurm less often.
 ASK_S = 1.0
-# Jobs of a cluster that are waited for at a time.
+# Largest number of jobs of a cluster that are watched at a time.
 MOST_JOBS = 1000
-# By their names, so that no engine is imported that is not used: a worker died, or its node. Not
-# among them is Dask's KilledWorker: several workers died of the job.
+# Errors of a lost worker or node, by name, so that unused engines are not imported. Dask's
+# KilledWorker is not among them, because it means that a job killed several workers.
 _LOST = ("UncompletedJobError", "FutureCancelledError", "CommClosedError")
 
 
 def is_lost(error: BaseException) -> bool:
-    """Return whether a job's worker was lost, rather than the job failed."""
-    if "OUT_OF_MEMORY" in str(error):  # as Slurm calls it
+    """Return whether the worker of a job was lost; otherwise the job failed."""
+    if "OUT_OF_MEMORY" in str(error):  # the word of Slurm
         return False
     cancelled = CancelledError | asyncio.CancelledError
     return isinstance(error, cancelled) or type(error).__name__ in _LOST
 
 
 def check_engine(name: str) -> None:
-    """Raise a UserError for an engine that does not exist, or whose library is not installed."""
+    """Raise a UserError if an engine does not exist, or if its library is not installed."""
     if name == LOCAL:
         return
     if name.startswith("dask://"):
         if not name.removeprefix("dask://").rpartition(":")[2].isdecimal():
-            fix = "write where the scheduler listens, as in dask://10.0.0.5:8786"
-            raise UserError(f"--engine {name} names no port.", fix=fix)
+            fix = "write the address of the scheduler, as in dask://10.0.0.5:8786"
+            raise UserError(f"--engine {name} has no port.", fix=fix)
         _require("distributed", "dask", name)
         return
     kind, _, options = name.partition(":")
@@ -58,22 +58,22 @@ def check_engine(name: str) -> None:
         _options(name, options)
         _require("submitit", "slurm", name)
         return
-    raise UserError(f"there is no engine {name!r}.", fix=f"use {KNOWN}")
+    raise UserError(f"{name!r} is not a known engine.", fix=f"use {KNOWN}")
 
 
 def open_engine(
     name: str, parallel: int, folder: Path
 ) -> contextlib.AbstractContextManager[Executor]:
-    """Return an engine for a `with` block; when that ends it waits for what still runs.
+    """Return an engine for a `with` block, whose end waits for running jobs.
 
     OPTIONs of Slurm are those of submitit's `update_parameters` (timeout_min, slurm_partition,
-    gpus_per_node, ...); its files go into `folder`, which all machines see. On this machine
-    `parallel` jobs run at a time; a Dask scheduler and Slurm decide for themselves. Raises a
-    UserError where there is no such engine, or it does not answer.
+    gpus_per_node, ...). Its files go into `folder`, which all machines must share. `parallel`
+    limits jobs on this machine only; Dask and Slurm have their limits. Raises a UserError if the
+    engine does not exist or does not answer.
     """
     check_engine(name)
     if parallel < 1:
-        raise UserError(f"{parallel} jobs at a time.", fix="let at least 1 run at a time")
+        raise UserError(f"{parallel} parallel jobs are too few.", fix="use at least 1")
     if name == LOCAL:
         return ThreadPoolExecutor(parallel)
     if name.startswith("dask://"):
@@ -104,11 +104,11 @@ def _dask(name: str) -> Iterator[Executor]:
 def _submitit(kind: str, options: dict[str, int | str], folder: Path) -> Iterator[Executor]:
     cluster, before = "local" if kind == "submitit-local" else "slurm", dict(os.environ)
     folder.mkdir(parents=True, exist_ok=True)
-    # A folder of its own: submitit unpickles what lies there under the numbers of its jobs.
-    own = tempfile.mkdtemp(prefix="submitit-", dir=folder)
+    # A new folder, because submitit unpickles the files that it finds for its job numbers.
+    new = tempfile.mkdtemp(prefix="submitit-", dir=folder)
     os.environ.update(environment())  # submitit starts `python -m`
     try:
-        executor = _executor(own, cluster, options)
+        executor = _executor(new, cluster, options)
         with _Submitit(executor) as jobs:
             yield jobs
     finally:
@@ -119,12 +119,12 @@ def _submitit(kind: str, options: dict[str, int | str], folder: Path) -> Iterato
 def _executor(folder: str, cluster: str, options: dict[str, int | str]) -> Any:
     import submitit
 
-    python = f"{shlex.quote(sys.executable)} -P"  # where sbatch exports no environment
+    python = f"{shlex.quote(sys.executable)} -P"  # in case sbatch exports no environment
     try:
         executor = submitit.AutoExecutor(folder, cluster=cluster, slurm_python=python)
         executor.update_parameters(name="p2gs-jax", **options)
     except (RuntimeError, NameError, TypeError, ValueError) as error:
-        fix = "run this where `srun` is found, and name options as submitit does, for example "
+        fix = "run this on a machine with `srun`, with option names of submitit, for example "
         fix += "slurm:timeout_min=240,slurm_partition=gpu"
         raise UserError(f"--engine {cluster} cannot be used here: {error}.", fix=fix) from error
     return executor
@@ -136,7 +136,7 @@ def _options(name: str, text: str) -> dict[str, int | str]:
         key, equals, value = part.partition("=")
         if not (key.isidentifier() and equals and value):
             fix = "write slurm:timeout_min=240,slurm_partition=gpu"
-            raise UserError(f"--engine {name}: {part!r} is not OPTION=VALUE.", fix=fix)
+            raise UserError(f"--engine {name}: {part!r} does not read OPTION=VALUE.", fix=fix)
         found[key] = int(value) if value.isdecimal() else value
     return found
 
@@ -147,20 +147,20 @@ def _require(module: str, extra: str, name: str) -> None:
 
 
 class _Submitit(ThreadPoolExecutor):
-    """submitit's jobs as futures; a thread for each asks how it is."""
+    """Jobs of submitit as futures; a thread per job checks its state."""
 
     def __init__(self, cluster: Any):
         super().__init__(MOST_JOBS, "submitit")
         self._cluster = cluster
 
     def submit(self, fn, /, *args, **kwargs) -> Future:
-        """Hand a job to the cluster; to cancel its future takes it out of the queue."""
+        """Submit a job to the cluster; cancelling the future removes it from the queue."""
         job, future = self._cluster.submit(fn, *args, **kwargs), Future()
-        super().submit(_settle, job, future)
+        super().submit(_await, job, future)
         return future
 
 
-def _settle(job: Any, future: Future) -> None:
+def _await(job: Any, future: Future) -> None:
     try:
         while not job.done():
             if future.cancelled():
@@ -168,7 +168,7 @@ def _settle(job: Any, future: Future) -> None:
                 return
             time.sleep(ASK_S)
         result = job.result()
-    except Exception as error:  # its own, or it left no result that can be read
+    except Exception as error:  # the error of the job, or that of reading its result
         future.set_exception(error)
     else:
         future.set_result(result)

@@ -1,4 +1,4 @@
-"""A job: a function of the package and its arguments, as a file that any machine can read."""
+"""A job: a function of the package and its arguments, in a file that any machine can read."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from p2gs_jax.core.atomic import atomic_write, write_json
 from p2gs_jax.core.progress import LogRecord, Reporter
 from p2gs_jax.core.text import printable
 
-# In the folder of a job that failed.
+# A file in the folder of a failed job.
 REASON = "failure.json"
-# Seconds between two writes of the progress.
+# Time between two writes of the progress, seconds.
 EVERY_S = 0.5
 
 Task = Callable[[Path, dict[str, Any], Reporter], None]
@@ -28,55 +28,55 @@ Status = Literal["waiting", "running", "done", "failed", "stopped", "lost"]
 
 @dataclass(frozen=True)
 class Job:
-    """Something to be done once, which can be begun again where it was left."""
+    """A task that can continue after an interruption."""
 
-    name: str  # as the user knows it; jobs of one call have different names
-    folder: Path  # for the results; all machines of the engine see it under this path
-    task: Task  # at the top of a module; called again, it goes on from its checkpoint
+    name: str  # for the user; jobs of one call have different names
+    folder: Path  # for the results; the same path on all machines of the engine
+    task: Task  # at the top of a module; called again, it continues from its checkpoint
     arguments: dict[str, Any]  # JSON values
 
 
 @dataclass
 class JobState:
-    """How far a job is.
+    """The state of a job.
 
-    `stopped` is one that a signal ended: the same call goes on with it. `lost` never stays: such a
-    job is begun again, or has failed.
+    `stopped` means that a signal ended the job; the same call continues it. `lost` is temporary:
+    such a job is started again, or has failed.
     """
 
     name: str
     status: Status = "waiting"
-    begun: int = 0  # times in this call; more than one where a worker was lost
-    reason: str | None = None  # why it failed
-    doing: str = ""  # its present stage, in words
+    begun: int = 0  # number of starts in this call; above 1 if a worker was lost
+    reason: str | None = None  # of a failure
+    doing: str = ""  # the current stage, in words
     progress: float | None = None  # of that stage, 0 to 1
-    seconds: float = 0.0  # since this call began it
+    seconds: float = 0.0  # since the first start in this call
 
 
 @dataclass(frozen=True)
 class JobFiles:
-    """The files of a job, which lie beside those of the other jobs, apart from results."""
+    """The files of a job beside those of the other jobs, in another folder than the results."""
 
-    path: Path  # of the job file itself
+    path: Path  # the job file
 
     @property
     def progress(self) -> Path:
-        """How far the job is."""
+        """The progress of the job."""
         return self.path.with_suffix(".progress")
 
     @property
     def output(self) -> Path:
-        """What its process printed."""
+        """The output of its process."""
         return self.path.with_suffix(".log")
 
     @property
     def stop(self) -> Path:
-        """Where this file exists, all jobs beside it have to end."""
+        """The file that asks all jobs beside it to stop."""
         return self.path.with_name("stop")
 
 
 def slug(name: str) -> str:
-    """Return a file name for any name."""
+    """Return a valid file name for any name."""
     return re.sub(r"[^A-Za-z0-9.+-]+", "_", name).strip("_.") or "_"
 
 
@@ -90,7 +90,7 @@ def write_job(folder: Path, job: Job) -> JobFiles:
 
 
 def read_job(path: Path) -> Job:
-    """Read a job file; ImportError, AttributeError: this version does not have its task."""
+    """Read a job file; ImportError or AttributeError: this version does not have its task."""
     saved = json.loads(path.read_text(encoding="utf-8"))
     module, name = saved["task"].split(":")
     task = getattr(import_module(module), name)
@@ -98,28 +98,28 @@ def read_job(path: Path) -> Job:
 
 
 def write_reason(folder: Path, reason: str | None, **more: str) -> None:
-    """Leave in the folder of a job why it failed."""
+    """Write the reason of a failure into the folder of a job."""
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / REASON, {"reason": reason, **more})
 
 
 def read_reason(folder: Path) -> str:
-    """Return why the job of a folder failed."""
+    """Return the reason for which the job of a folder failed."""
     try:
         return json.loads((folder / REASON).read_text(encoding="utf-8"))["reason"]
     except (OSError, ValueError, KeyError, TypeError):
-        return "it left no result and no reason"
+        return "the job wrote neither a result nor a reason"
 
 
 class ProgressFile(Reporter):
-    """A reporter that keeps the newest state of a fit in a file, which others watch."""
+    """A reporter that keeps the newest state of a fit in a file for other processes."""
 
     def __init__(self, path: Path):
         self.path = path
         self._written, self._stage = -EVERY_S, ""
 
     def message(self, text: str) -> None:
-        """Keep a message for the user in the output."""
+        """Print a message for the user to the output."""
         print(printable(text), flush=True)
 
     def stage(self, name: str, done: int = 0, total: int = 0) -> None:
@@ -128,7 +128,7 @@ class ProgressFile(Reporter):
         self._write({"doing": name, "progress": done / total if total else None}, now=new)
 
     def log(self, record: LogRecord) -> None:
-        """Show the state of the optimisation."""
+        """Write the state of the optimisation."""
         self._write({"doing": record.summary(), "progress": record.progress}, now=False)
 
     def _write(self, state: dict[str, Any], *, now: bool) -> None:
@@ -140,7 +140,7 @@ class ProgressFile(Reporter):
 
 
 def read_progress(path: Path) -> dict[str, Any] | None:
-    """Return the contents of a `ProgressFile`, or None where there are none yet."""
+    """Return the contents of a `ProgressFile`, or None before the first write."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):

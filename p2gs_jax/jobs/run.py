@@ -1,4 +1,4 @@
-"""Jobs on an engine: begun, watched, repeated where a worker is lost, ended together."""
+"""Jobs on an engine: started, watched, started again if a worker is lost, and stopped together."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from p2gs_jax.jobs import job as records
 from p2gs_jax.jobs.engines import is_lost
 from p2gs_jax.jobs.worker import run_in_process
 
-# A job whose worker was lost so many times is not begun again.
+# A job is started at most so many times.
 MOST_BEGUN = 3
-# Seconds between looks at the progress of all.
+# Time between two readings of the progress of all jobs, seconds.
 LOOK_S = 0.5
-# Runs the job of a file: how it ended, and why it failed.
+# A function that runs the job of a file, and returns its status and the reason of a failure.
 Runner = Callable[[str], tuple[records.Status, str | None]]
 
 
@@ -29,15 +29,15 @@ def run_jobs(
     on_look: Callable[[Sequence[records.JobState]], None] = lambda states: None,
     run: Runner = run_in_process,
 ) -> list[records.JobState]:
-    """Run jobs of different names; one that fails leaves its reason and ends nothing else.
+    """Run jobs of different names; a failed job leaves its reason, and the others continue.
 
-    The folder is for job files, progress and output; all machines see it. `run` is what the engine
-    calls for each job file. `on_look` is called with all states, twice a second; `on_end` with the
-    number of a job that has ended, in this thread, and once more where a signal came into the call.
+    `folder` is for job files, progress and output; all machines must share it. The engine calls
+    `run` for each job file. `on_look` is called with all states, twice a second. `on_end` is called
+    in this thread with the number of an ended job, and again if a signal interrupts that call.
 
     Raises:
-        KeyboardInterrupt: a signal asked for the end; the jobs under way were asked as well, and
-            have ended. The same call goes on with them.
+        KeyboardInterrupt: a signal arrived; all running jobs have stopped as well. The same call
+            continues them.
     """
     folder = folder.absolute()
     folder.mkdir(parents=True, exist_ok=True)
@@ -48,7 +48,7 @@ def run_jobs(
     def pending() -> dict[Future, int]:
         return {one.future: n for n, one in enumerate(watched) if one.future is not None}
 
-    def tell(number: int) -> None:
+    def report(number: int) -> None:
         on_end(number, watched[number].state)
         watched[number].future = None
 
@@ -59,13 +59,13 @@ def run_jobs(
             ended, _ = wait(waited, timeout=LOOK_S, return_when=FIRST_COMPLETED)
             for future in ended:
                 if watched[waited[future]].end(engine):
-                    tell(waited[future])
+                    report(waited[future])
             for number in pending().values():
                 watched[number].look()
             on_look([one.state for one in watched])
     except KeyboardInterrupt:
-        # Wherever the signal came: jobs that were handed over and not yet told are waited for, but
-        # those that a batch system has not begun.
+        # Wherever the signal arrived, all submitted jobs without an `on_end` are waited for, except
+        # those that a batch system has not started.
         stop.touch()
         waited = pending()
         for future, number in waited.items():
@@ -75,29 +75,29 @@ def run_jobs(
         wait([future for future in waited if not future.cancelled()])
         for number in waited.values():
             watched[number].end(None)
-            tell(number)
+            report(number)
         raise
     return [one.state for one in watched]
 
 
 class _Watched:
-    """A job that was handed to an engine."""
+    """A job on an engine."""
 
     def __init__(self, job: records.Job, files: records.JobFiles, run: Runner):
         self.job, self.files, self.run = job, files, run
         self.state = records.JobState(job.name)
-        self.future: Future | None = None  # None before, and once its end was told
+        self.future: Future | None = None  # None before the start and after `on_end`
         self._since: float | None = None
 
     def begin(self, engine: Executor) -> None:
-        """Hand the job over."""
+        """Submit the job to an engine."""
         self.state.begun += 1
         self.state.doing, self.state.progress = "", None
         self.files.progress.unlink(missing_ok=True)
         self.future = engine.submit(self.run, str(self.files.path))
 
     def end(self, engine: Executor | None) -> bool:
-        """Note how the job ended, or begin it again on an engine; return whether it ended."""
+        """Record the end of the job, or start it again on an engine; return whether it ended."""
         assert self.future is not None
         self.look()
         state = self.state
@@ -115,16 +115,16 @@ class _Watched:
                 return False
             except Exception as gone:  # the engine itself ended
                 state.status = "failed"
-                state.reason = f"{state.reason}; the engine takes no more jobs ({gone})"
+                state.reason = f"{state.reason}; the engine accepts no more jobs ({gone})"
         elif state.status == "lost":
             state.status = "failed"
-            state.reason = f"its worker was lost {state.begun} times, at last: {state.reason}"
+            state.reason = f"its worker was lost {state.begun} times; last error: {state.reason}"
         if state.status == "failed" and not (self.job.folder / records.REASON).exists():
             records.write_reason(self.job.folder, state.reason)
         return True
 
     def look(self) -> None:
-        """Read how far the job is."""
+        """Read the progress of the job."""
         state = self.state
         found = records.read_progress(self.files.progress)
         if state.status in ("waiting", "running") and found is not None:

@@ -1,4 +1,4 @@
-"""Sweeps: one scene fitted under many configurations, in processes, resumable, into one table."""
+"""Sweeps: resumable fits of one scene with many configurations, in processes, with one table."""
 
 from __future__ import annotations
 
@@ -35,17 +35,17 @@ TABLE, TABLE_TEXT, JOBS = "sweep.json", "sweep.md", "jobs"
 
 @dataclass(frozen=True)
 class SweepResult:
-    """Result of a sweep: one row per configuration and seed.
+    """The result of a sweep: one row per configuration and seed.
 
-    Rows have name, seed, status (`done` or `failed`; in the table of a sweep that was stopped also
-    `waiting` and `interrupted`), run, the reason of a failure, and the `COLUMNS` of the run.
+    Rows have name, seed, status, run, the reason of a failure, and the `COLUMNS` of the run. The
+    status is `done` or `failed`, and in the table of a stopped sweep `waiting` or `interrupted`.
     """
 
     rows: list[dict[str, Any]]
     out: Path  # the folder, with sweep.json and sweep.md
 
     def to_markdown(self) -> str:
-        """Return the table, means over seeds."""
+        """Return the table with means over seeds."""
         return to_markdown(self.rows)
 
 
@@ -62,19 +62,20 @@ def sweep(
     on_look: Callable[[Sequence[JobState]], None] = lambda states: None,
     run: Runner = run_in_process,
 ) -> SweepResult:
-    """Fit a scene under every configuration and seed.
+    """Fit a scene with every configuration and seed.
 
-    Finished runs in `out` are kept, interrupted ones continue, failed ones are tried again; a
-    failure ends its run, not the sweep. The table is written anew after every run.
+    Finished runs in `out` are kept, interrupted ones continue, and failed ones are tried again. A
+    failure ends its run, but not the sweep. The table is written after every run.
 
-    Every one of `seeds` replaces `train.seed`. `max_parallel` processes run at a time; steps of one
-    hardly use more than one core (BUILD_NOTES). The engine is one of `jobs.engines.open_engine`;
-    `report` receives a line per run; `on_look` and `run` are those of `run_jobs`.
+    Each of `seeds` replaces `train.seed`. `max_parallel` processes run at a time; the steps of a
+    process hardly use more than one core (BUILD_NOTES). The engine is one of
+    `jobs.engines.open_engine`. `report` receives a line per run. `on_look` and `run` are those of
+    `run_jobs`.
 
     Raises:
-        UserError: nothing to do, names that would share a folder, a folder of other options, one
-            that another sweep is writing to, or an engine that is not there.
-        Interrupted: a signal asked for the end; the runs under way write their checkpoints first.
+        UserError: there is nothing to do, names would share a folder, a folder has other options,
+            another sweep is writing to it, or the engine does not exist.
+        Interrupted: a signal arrived; running fits write their checkpoints first.
     """
     scene, out = Path(scene), Path(out)
     _check(configs, seeds, max_parallel)
@@ -83,11 +84,11 @@ def sweep(
     jobs, rows, longer = _planned(scene, out, configs, seeds, reference)
 
     def tell(number: int, state: JobState | None) -> None:
-        """Note what became of a run; None: it was there before."""
+        """Record the result of a run; None: the run was finished before."""
         row = rows[number]
         row.update(_outcome(jobs[number].folder, scene, state))
-        took = "kept" if state is None else f"{row.get('seconds', state.seconds):.0f} s"
-        text = took if row["status"] == "done" else f"{row['status']}: {row['reason']}"
+        time_s = "kept" if state is None else f"{row.get('seconds', state.seconds):.0f} s"
+        text = time_s if row["status"] == "done" else f"{row['status']}: {row['reason']}"
         report(f"[{number + 1}/{len(jobs)}] {jobs[number].name}: {text}")
         write_json(out / TABLE, rows)
         write_text(out / TABLE_TEXT, to_markdown(rows))
@@ -116,10 +117,8 @@ def _planned(
     seeds: Sequence[int],
     reference: str | Path | None,
 ) -> tuple[list[Job], list[dict[str, Any]], set[int]]:
-    """Return the jobs of all configurations and seeds, and the beginning of their rows.
-
-    The numbers are of the runs that are planned for longer than they were.
-    """
+    """Return the jobs of all configurations and seeds, the first cells of their rows, and the
+    numbers of finished runs that now have more steps or time."""
     jobs, rows, longer = [], [], set()
     truth = None if reference is None else Path(reference)
     for name, cfg in configs.items():
@@ -142,7 +141,7 @@ def _check(configs: Mapping[str, FitConfig], seeds: Sequence[int], max_parallel:
         fix = "see docs/api.md for an example"
         raise UserError("a sweep needs at least one configuration and one seed.", fix=fix)
     if max_parallel < 1:
-        raise UserError(f"max_parallel is {max_parallel}.", fix="let at least 1 run at a time")
+        raise UserError(f"max_parallel = {max_parallel} is too small.", fix="use at least 1")
     folders = [slug(name) for name in configs]
     if len(set(folders)) < len(folders):
         twice = sorted({f for f in folders if folders.count(f) > 1})
@@ -151,7 +150,7 @@ def _check(configs: Mapping[str, FitConfig], seeds: Sequence[int], max_parallel:
 
 
 def fit_job(name: str, scene: Path, run: Path, cfg: FitConfig, reference: Path | None) -> Job:
-    """Return the job of a fit, which continues what its run folder holds."""
+    """Return the job of a fit, which continues the run in its folder."""
     arguments = {
         "scene": str(scene.absolute()),
         "reference": None if reference is None else str(reference.absolute()),
@@ -161,7 +160,7 @@ def fit_job(name: str, scene: Path, run: Path, cfg: FitConfig, reference: Path |
 
 
 def fit_task(folder: Path, arguments: dict[str, Any], reporter: Reporter) -> None:
-    """Fit, or go on with a fit, under the arguments of a `fit_job`; raises what `fit` does."""
+    """Start or continue a fit with the arguments of a `fit_job`; errors are those of `fit`."""
     use_compile_cache()
     tune_process()
     fit(
@@ -171,13 +170,13 @@ def fit_task(folder: Path, arguments: dict[str, Any], reporter: Reporter) -> Non
         reference=arguments["reference"],
         resume=RunFolder(folder).config.exists(),
         reporter=reporter,
-        # As for `p2gs-jax fit`: starting the interpreter counts.
+        # As in `p2gs-jax fit`, the start of the interpreter counts.
         spent_s=time.process_time(),
     )
 
 
 def _outcome(run: Path, scene: Path, state: JobState | None) -> dict[str, Any]:
-    """Return the status of a run that has ended, with its columns or the reason."""
+    """Return the status of an ended run, with its columns or the reason of its failure."""
     if state is not None and state.status == "stopped":
         return {"status": "interrupted", "reason": "the same sweep continues it"}
     if not _metrics(run).exists():
@@ -199,7 +198,7 @@ class Column(NamedTuple):
 
     @property
     def meaning(self) -> str:
-        """What it says, in words."""
+        """The meaning of the column in words."""
         for protocol in PROTOCOLS.values():
             if protocol.path == self.path[:-1]:
                 return f"{protocol.views} views, {protocol.shown}"
@@ -226,17 +225,17 @@ COLUMNS = (
     Column("ev", (), 4, "exposure error EV"),
     Column("ev_power", (), 4),
 )
-# Explanations of columns that are of no protocol.
+# Explanations of columns without a protocol.
 MEANING = {
-    "seconds": "of the whole run, compilation and evaluation included",
-    "radiance_stops": "RMS error of the radiance against HDR truth, stops",
-    "ev": "RMS error of the exposures against the truth, stops, after one scale",
-    "ev_power": "likewise after the best power as well",
+    "seconds": "duration of the whole run with compilation and evaluation, seconds",
+    "radiance_stops": "RMS error of the radiance against the true HDR images, stops",
+    "ev": "RMS error of the exposures against the true ones, stops, after one scale",
+    "ev_power": "RMS error of the exposures, stops, after one scale and the best power",
 }
 
 
 def read_row(run: Path, scene: Path) -> dict[str, Any]:
-    """Return the columns that a finished run of a scene has, by name."""
+    """Return the available columns of a finished run by name."""
     metrics = parse_json(_metrics(run).read_text(encoding="utf-8"))
     row: dict[str, Any] = {}
     for column in COLUMNS:
@@ -251,11 +250,11 @@ def read_row(run: Path, scene: Path) -> dict[str, Any]:
 
 
 def _exposures(run: Path, scene: Path) -> dict[str, float]:
-    """Return errors of the exposures where the scene knows them."""
+    """Return the errors of the exposures if the scene has true ones."""
     try:
         truth = read_true_exposures(scene)
     except UserError:
-        truth = {}  # the run is as good without
+        truth = {}  # the run is valid without them
     if not truth:
         return {}
     views = parse_json((run / "photometry.json").read_text(encoding="utf-8"))["views"]
@@ -264,7 +263,7 @@ def _exposures(run: Path, scene: Path) -> dict[str, float]:
 
 
 def brief(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[str]]]:
-    """Return headings and cells of the columns that matter most; means over seeds."""
+    """Return headings and cells of the most important columns, as means over seeds."""
     by_name = {column.name: column for column in COLUMNS if column.heading}
     shown = [by_name.pop("seconds"), *by_name.values()]
     shown = [column for column in shown if any(column.name in row for row in rows)]
@@ -272,7 +271,7 @@ def brief(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[str]]
 
 
 def _means(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -> list[list[str]]:
-    """Return a line of cells for each configuration: name, finished seeds, means over these."""
+    """Return the cells of each configuration: name, number of finished seeds, means over these."""
     lines = []
     for name in dict.fromkeys(row["name"] for row in rows):
         mine = [row for row in rows if row["name"] == name]
@@ -286,7 +285,7 @@ def _means(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -> list
 
 
 def failures(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return a line for every run that is not done, with its reason."""
+    """Return a line with the reason for every run that is not done."""
     return [
         f"{row['name']}, seed {row['seed']}: {row['status']}: {row.get('reason', '')}"
         for row in rows
@@ -295,12 +294,12 @@ def failures(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def to_markdown(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return a table: a line per configuration, means over its seeds; failures with reasons."""
+    """Return a table with means over seeds per configuration, and the failures with reasons."""
     shown = [column for column in COLUMNS if any(column.name in row for row in rows)]
     names = ["configuration", "seeds", *(c.name for c in shown)]
     lines = [markdown_table(names, _means(rows, shown))]
-    meant = [f"- `{c.name}`: {c.meaning}" for c in shown if c.meaning]
-    bad = [f"- {escaped(line)}" for line in failures(rows)]
-    lines += ["", *meant] if meant else []
-    lines += ["", "Not finished:", "", *bad] if bad else []
+    meanings = [f"- `{c.name}`: {c.meaning}" for c in shown if c.meaning]
+    failed = [f"- {escaped(line)}" for line in failures(rows)]
+    lines += ["", *meanings] if meanings else []
+    lines += ["", "Not finished:", "", *failed] if failed else []
     return "\n".join(lines) + "\n"

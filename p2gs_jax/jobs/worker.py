@@ -1,7 +1,7 @@
-"""A job in a process of its own, on whichever machine: `python -m p2gs_jax.jobs.worker JOB.json`.
+"""A job in a separate process on any machine: `python -m p2gs_jax.jobs.worker JOB.json`.
 
-A process gives its memory back, and one that the system kills takes nothing else with it. It ends
-with its caller: its standard input closes then, and no two processes write to one folder.
+The end of a process frees its memory, and killing it harms no other job. The process ends with its
+caller, which closes its standard input, so that no two processes write to one folder.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from p2gs_jax.core.processes import environment
 from p2gs_jax.errors import UserError
 from p2gs_jax.jobs import job as records
 
-# Seconds between looks at the file that asks for the end.
+# Time between two checks of the file that asks jobs to stop, seconds.
 LOOK_S = 0.2
-LESS = "let fewer run at a time, or lower --gaussians or --max-width"
-# Exit codes of a job that was asked to end and left its checkpoint.
+LESS = "let fewer jobs run at a time, or lower --gaussians or --max-width"
+# Exit codes of a job that stopped after a signal and wrote its checkpoint.
 ASKED = tuple(interrupts.exit_code(interrupts.Interrupted(n)) for n in interrupts.SIGNALS)
 
 
 def run_in_process(job_path: str) -> tuple[records.Status, str | None]:
-    """Run the job of a file in a process and wait for it: what engines call.
+    """Run the job of a file in a process and wait for it; engines call this function.
 
-    Returns how it ended, and why it failed; `lost` where a signal from elsewhere ended its process.
+    Returns its status and the reason of a failure; `lost` means that a foreign signal ended it.
     """
     files = records.JobFiles(Path(job_path))
     folder = records.read_job(files.path).folder
     if files.stop.exists():
         return "stopped", None
-    (folder / records.REASON).unlink(missing_ok=True)  # of an earlier try
+    (folder / records.REASON).unlink(missing_ok=True)  # of an earlier start
     files.progress.unlink(missing_ok=True)
     with files.output.open("wb") as output:
         process = subprocess.Popen(
@@ -46,7 +46,7 @@ def run_in_process(job_path: str) -> tuple[records.Status, str | None]:
             stdout=output,
             stderr=subprocess.STDOUT,
             env=environment(),
-            # Ctrl-C reaches the caller of the jobs, who asks each of them once.
+            # Ctrl-C reaches only the caller of the jobs, which asks each job once to stop.
             process_group=0,
         )
         stopped = _wait(process, files.stop)
@@ -57,8 +57,8 @@ def run_in_process(job_path: str) -> tuple[records.Status, str | None]:
     if stopped:
         return "stopped", None
     reason, code = _why(process.returncode, files.output), process.returncode
-    # Nobody here asked it to end: a batch system takes the node back, or its time is over. Where
-    # its memory ran out, it would again.
+    # This caller did not stop it: a batch system needs the node, or the time limit was reached.
+    # SIGKILL is excluded, because a job that ran out of memory would do so again.
     if code in ASKED or (code < 0 and code != -signal.SIGKILL):
         return "lost", reason
     records.write_reason(folder, reason)
@@ -66,7 +66,7 @@ def run_in_process(job_path: str) -> tuple[records.Status, str | None]:
 
 
 def _wait(process: subprocess.Popen, stop: Path) -> bool:
-    """Wait until a process ends; return whether it was asked to."""
+    """Wait until a process ends; return whether it was asked to stop."""
     asked = False
     try:
         while True:
@@ -84,16 +84,16 @@ def _wait(process: subprocess.Popen, stop: Path) -> bool:
 
 def _why(code: int, output: Path) -> str:
     if code == -signal.SIGKILL:
-        return f"its process was killed (SIGKILL), as where memory runs out: {LESS}"
+        return f"its process was killed (SIGKILL), probably because memory ran out: {LESS}"
     by = f"by {signal.Signals(-code).name}" if code < 0 else f"with code {code}"
     lines = output.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     return f"its process ended {by}: {(lines or ['no message'])[-1]}"
 
 
 def main(job_path: Path) -> int:
-    """Do the job of a file in this process; return 0 where it succeeded.
+    """Run the job of a file in this process; return 0 after success.
 
-    A failure leaves its reason in the job's folder; a signal that asks for the end does not.
+    A failure leaves its reason in the folder of the job; a signal does not.
     """
     threading.Thread(target=_end_with_parent, daemon=True).start()
     job = records.read_job(job_path)
@@ -117,7 +117,7 @@ def main(job_path: Path) -> int:
 
 
 def _end_with_parent() -> None:
-    """End at once when the caller is gone: the job is begun again elsewhere, in this folder."""
+    """Exit at once after the end of the caller, as the job may start again in this folder."""
     with contextlib.suppress(OSError):
         while os.read(0, 1):
             pass

@@ -59,7 +59,7 @@ def test_two_blocks_become_one_run(tmp_path, in_this_process):
     fail.add("block 1")
     with pytest.raises(UserError, match=r"1 of 2 blocks failed\. block 1: the disk is full"):
         p2gs_jax.fit_blocks(scene, run, SMALL, blocks=2)
-    with pytest.raises(UserError, match="begun with --blocks 2"):
+    with pytest.raises(UserError, match="started with --blocks 2"):
         p2gs_jax.fit_blocks(scene, run, SMALL, blocks=3, resume=True)
     fail.clear()
     result = p2gs_jax.fit_blocks(scene, run, SMALL, blocks=2, resume=True)
@@ -139,7 +139,7 @@ def test_less_memory_than_a_block_needs_is_said_with_how_many_would_fit(monkeypa
     with pytest.raises(UserError, match="2 at a time"):
         room.require_room(scene, SMALL, cut_scene(scene, 4), 2)
     monkeypatch.setattr(room, "left_to_process", lambda: 1e6)
-    with pytest.raises(UserError, match="however the scene is cut"):
+    with pytest.raises(UserError, match="even the smallest blocks"):
         room.fewest_blocks(scene, SMALL, 1)
     monkeypatch.setattr(room, "left_to_process", lambda: None)
     assert room.fewest_blocks(scene, SMALL, 1) == 1
@@ -151,7 +151,7 @@ def test_less_memory_than_a_block_needs_is_said_with_how_many_would_fit(monkeypa
         (p2gs_jax.preset("3dgs"), "'3dgs' learns them"),
         (p2gs_jax.preset("paper"), "learns them"),
         (with_fields(SMALL, {"loss.relative_exposure.weight": 0.1}), "nothing to move"),
-        (with_fields(SMALL, {"dynamics.method": "vibration"}), "what stands still"),
+        (with_fields(SMALL, {"dynamics.method": "vibration"}), "static scenes only"),
     ],
 )
 def test_options_under_which_blocks_would_share_nothing_are_refused(cfg, said):

@@ -215,16 +215,16 @@ def test_the_table_names_every_job_that_runs():
     console.print(table_of(states))
     shown = console.file.getvalue().splitlines()
     assert shown[0].split() == ["block", "17", "running", "25%", "step", "12", "1:10"]
-    assert any("block 4" in row and "begun again" in row for row in shown)
+    assert any("block 4" in row and "started again" in row for row in shown)
     assert "and 10 more" in shown[-1]
 
 
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("ray://host:1", "there is no engine 'ray://host:1'"),
-        ("dask://host", "names no port"),
-        ("slurm:gpu", "'gpu' is not OPTION=VALUE"),
+        ("ray://host:1", "'ray://host:1' is not a known engine"),
+        ("dask://host", "has no port"),
+        ("slurm:gpu", "'gpu' does not read OPTION=VALUE"),
     ],
 )
 def test_engines_that_are_not_there_are_refused(name, said):

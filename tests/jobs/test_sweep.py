@@ -39,11 +39,11 @@ def test_fields_are_replaced_by_their_dotted_names():
 @pytest.mark.parametrize(
     ("field", "value", "text"),
     [
-        ("loss.wieght", 1.0, "no configuration field"),
-        ("train.steps.more", 1, "too deep"),
-        ("train.steps", 1.5, "does not fit"),
+        ("loss.wieght", 1.0, "is not a configuration field"),
+        ("train.steps.more", 1, "leave out the names"),
+        ("train.steps", 1.5, "is not valid"),
         ("photometry.curve", "cubic", "'srgb'"),
-        ("photometry.select", 1, "does not fit"),
+        ("photometry.select", 1, "is not valid"),
     ],
 )
 def test_wrong_fields_and_values_are_named(field, value, text):
@@ -184,7 +184,7 @@ preset = "paper"
         ("seeds = [1]", "does not name a scene"),
         ("scene = 'x'\nseeds = 3", "write whole numbers"),
         ("scene = 'x'\npreset = 'best'", "no preset 'best'"),
-        ("scene = 'x'\n[grid]\n'train.stepz' = [1]", "no configuration field"),
+        ("scene = 'x'\n[grid]\n'train.stepz' = [1]", "is not a configuration field"),
     ],
 )
 def test_a_wrong_file_says_what_is_wrong(tmp_path, refused, text, message):

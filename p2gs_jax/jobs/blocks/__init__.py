@@ -1,1 +1,1 @@
-"""A scene fitted in blocks, of which each is a job."""
+"""A scene fitted in blocks; each block is a job."""

@@ -1,4 +1,4 @@
-"""The fit of one block, as a job: exposures given, everything of the block and around it fitted."""
+"""The fit of one block as a job: fixed exposures, and Gaussians of the block and around it."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ from p2gs_jax.scene.pixels.store import decoded_into
 from p2gs_jax.train.data_parallel import mesh_of
 from p2gs_jax.types import Scene
 
-# Gaussians for a coarse point outside a block, which stands for many, to one for a point inside.
-# With 1, cores of a town had 5 % fewer Gaussians than one fit and .18 dB less; with 1.6, on another
-# town, 13 % more and .09 dB less (BUILD_NOTES, "Districts").
+# Gaussians per coarse point outside a block, which replaces many points, for one per point inside.
+# With 1, the cores of a town had 5 % fewer Gaussians and 0.18 dB less than one fit; with 1.6, on
+# another town, 13 % more Gaussians and 0.09 dB less (BUILD_NOTES, "Districts").
 OUTSIDE = 1.6
 
 
 def block_job(scene: Path, run: Path, folder: Path, cut: Cut, number: int, cfg: FitConfig) -> Job:
     """Return the job of a block, from the folders of the scene, of the whole run and of all blocks.
 
-    The cache of the whole run is read; the folder of the blocks has what they share.
+    The job uses the cache of the whole run; `folder` contains the shared files of the blocks.
     """
     arguments = {
         "scene": str(scene.absolute()),
@@ -56,7 +56,7 @@ def block_config(
 ) -> FitConfig:
     """Return the options of a block: its share of the steps and of the Gaussians of `cfg`.
 
-    `own` of the points of its scene lie in the block; the whole has so many `train_views`.
+    `own` points of its scene are inside the block; `train_views` counts those of the whole scene.
     """
     share = len(cut.blocks[number].views) / train_views
     train, densify = cfg.train, cfg.densify
@@ -68,8 +68,8 @@ def block_config(
     if isinstance(most, int):
         most = max(1, round(share * most))
     elif most is None and densify.method == "mcmc":
-        # As dense as the whole would be, whose steps see a Gaussian as often as the block's do.
-        # What lies outside grows as well, and is thrown away: its share is beside the block's.
+        # The density is that of one fit of the scene, where a Gaussian is seen in as many steps.
+        # Gaussians outside the block grow as well and are discarded later: their share is added.
         seeds = own + round(OUTSIDE * (len(block.points) - own))
         most = default_max_gaussians(seeds, coverage_of(block, cfg.data.max_width), train)
     return dataclasses.replace(
@@ -80,7 +80,7 @@ def block_config(
 
 
 def fit_block(folder: Path, arguments: dict[str, Any], reporter: Reporter) -> None:
-    """Fit the block of a `block_job`, or go on with it; leaves `radiance.ply` and `metrics.json`.
+    """Start or continue the fit of a `block_job`; it writes `radiance.ply` and `metrics.json`.
 
     UserError: the scene cannot be read, or memory is short.
     """
@@ -105,7 +105,7 @@ def fit_block(folder: Path, arguments: dict[str, Any], reporter: Reporter) -> No
 def _fit(
     folder: RunFolder, block: Shared, own: int, cfg: FitConfig, reporter: Reporter, scene: str
 ) -> tuple[dict[str, int], dict[str, float]]:
-    """Fit a block's scene and write its Gaussians; return counts and seconds."""
+    """Fit the scene of a block and write its Gaussians; return counts and seconds."""
     clock = Stopwatch()
     with Optimiser(folder, reporter, mesh_of(cfg)) as optimiser:
         with clock("photometry"):

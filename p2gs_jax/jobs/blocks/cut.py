@@ -1,7 +1,7 @@
-"""A scene's ground cut into cells with as many photographs each, and a cell as a scene.
+"""The ground of a scene cut into cells with equally many photographs, and a cell as a scene.
 
-The cells are rectangles along the two axes in which the cameras spread most; the outer ones have no
-outer edge, so that every point of space is in the core of exactly one block.
+The cells are rectangles along the two axes with the largest spread of cameras. Cells at the border
+are unbounded, so that every point of space is in the core of exactly one block.
 """
 
 from __future__ import annotations
@@ -23,28 +23,28 @@ from p2gs_jax.scene.split import only
 from p2gs_jax.scene.visibility import in_frame
 from p2gs_jax.types import Scene, View
 
-# A block reaches beyond its core by this share of the shortest core.
+# A block extends beyond its core by this share of the shortest core.
 OVERLAP = 0.15
-# A view belongs to a block if this share of the points it sees lies in it.
+# A view belongs to a block if at least this share of its visible points lies in the block.
 LEAST_SEEN = 0.1
 FEWEST_VIEWS = 2
-# Of points without tracks at most so many are projected.
+# Largest number of points without tracks that are projected.
 MOST_PROJECTED = 20_000
-# Points outside a block are thinned to one in a cube whose side is this share of their distance.
+# Points outside a block are thinned to one per cube whose side is this share of their distance.
 DETAIL = 0.02
-# Views that are asked what they see of points without tracks.
+# Largest number of views into which points without tracks are projected.
 MOST_LOOKED = 48
 
 
 @dataclass(frozen=True)
 class Ground:
-    """The plane in which cells lie."""
+    """The plane of the cells."""
 
-    origin: Float[np.ndarray, " 3"]  # middle of the cameras, scene units
-    axes: Float[np.ndarray, "2 3"]  # unit vectors; cameras spread most along the first
+    origin: Float[np.ndarray, " 3"]  # mean of the cameras, scene units
+    axes: Float[np.ndarray, "2 3"]  # unit vectors; the first has the largest spread of cameras
 
     def place(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 2"]:
-        """Return where in the plane points lie."""
+        """Return the coordinates of points in the plane, scene units."""
         return (np.asarray(points, np.float64) - self.origin) @ self.axes.T
 
 
@@ -52,38 +52,38 @@ class Ground:
 class Block:
     """A cell, and the photographs that show it."""
 
-    lower: tuple[float, float]  # least coordinates in the plane; -inf at an outer edge
-    upper: tuple[float, float]  # greatest ones, which belong to the neighbour
+    lower: tuple[float, float]  # smallest coordinates in the plane; -inf if unbounded
+    upper: tuple[float, float]  # largest ones, which belong to the neighbour
     views: tuple[int, ...] = ()  # rows among the training views
 
     def holds(
         self, places: Float[np.ndarray, "p 2"], margin: float = 0.0
     ) -> Bool[np.ndarray, " p"]:
-        """Return which places lie in the core, or within a margin of it."""
+        """Return the mask of places in the core, or within a margin around it (scene units)."""
         low, high = np.array(self.lower) - margin, np.array(self.upper) + margin
         inside = (places >= low) & (places < high)
         return inside[:, 0] & inside[:, 1]
 
     def distance(self, places: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, " p"]:
-        """Return how far from the core places lie, scene units; 0 inside."""
+        """Return the distances of places from the core, scene units; 0 inside."""
         beyond = np.maximum(np.array(self.lower) - places, places - np.array(self.upper))
         return np.linalg.norm(np.maximum(beyond, 0.0), axis=1)
 
 
 @dataclass(frozen=True)
 class Cut:
-    """A scene's blocks."""
+    """The blocks of a scene."""
 
     ground: Ground  # the plane of the cells
-    margin: float  # how far blocks reach beyond their cores, scene units
+    margin: float  # extent of blocks beyond their cores, scene units
     blocks: tuple[Block, ...]
 
     def core(self, number: int, points: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, " p"]:
-        """Return which points lie in the core of a block."""
+        """Return the mask of points in the core of a block."""
         return self.blocks[number].holds(self.ground.place(points))
 
     def neighbours(self) -> list[tuple[int, int]]:
-        """Return the pairs of blocks whose cores touch, be it at a corner."""
+        """Return the pairs of blocks whose cores touch, even if only at a corner."""
         low, high = (np.array([getattr(b, k) for b in self.blocks]) for k in ("lower", "upper"))
         pairs = itertools.combinations(range(len(self.blocks)), 2)
         return [
@@ -93,7 +93,7 @@ class Cut:
         ]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values; edges that are none become null."""
+        """Return plain values; infinite coordinates become null in JSON."""
         return {
             "origin": self.ground.origin.tolist(),
             "axes": self.ground.axes.tolist(),
@@ -103,7 +103,7 @@ class Cut:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Cut:
-        """Return what `to_dict` and JSON made of it."""
+        """Return the cut from the values of `to_dict` or from its JSON."""
         ground = Ground(np.array(values["origin"]), np.array(values["axes"]))
         blocks = tuple(
             Block(_edge(b["lower"], -np.inf), _edge(b["upper"], np.inf), tuple(b["views"]))
@@ -118,13 +118,13 @@ def _edge(values: Sequence[float | None], outer: float) -> tuple[float, float]:
 
 
 def cut_scene(scene: Scene, count: int) -> Cut:
-    """Cut a scene into blocks; UserError: photographs or their places are too few for so many."""
+    """Cut a scene into `count` blocks; UserError: photographs or their places are too few."""
     seen = seen_points(scene)
     centers = camera_centers(scene.training_views)
     ground = ground_of(centers)
     places = ground.place(looked_at(scene, seen, centers))
     if count < 1:
-        raise UserError(f"--blocks {count}.", fix="write a whole number from 1, or auto")
+        raise UserError(f"--blocks {count} is not valid.", fix="write a whole number, or auto")
     distinct = len(np.unique(np.round(places, 9), axis=0))
     if count * FEWEST_VIEWS > len(places) or count > distinct:
         why = f"{len(places)} training photographs from {distinct} places are too few for {count} "
@@ -141,22 +141,22 @@ def cut_scene(scene: Scene, count: int) -> Cut:
         blocks.append(Block(cell.lower, cell.upper, tuple(np.flatnonzero(belongs).tolist())))
     few = [len(b.views) for b in blocks if len(b.views) < FEWEST_VIEWS]
     if few:
-        why = f"cut into {count} blocks, one is shown by {few[0]} photograph(s); a fit needs two."
+        why = f"one of {count} blocks has only {few[0]} photograph(s), and a fit needs two."
         raise UserError(why, fix=f"use --blocks {count - 1} or fewer")
     return Cut(ground, float(margin), tuple(blocks))
 
 
 def ground_of(centers: Float[np.ndarray, "v 3"]) -> Ground:
-    """Return the plane in which cameras spread most."""
+    """Return the plane with the largest spread of cameras."""
     middle = np.asarray(centers, np.float64).mean(0)
     _, _, axes = np.linalg.svd(centers - middle, full_matrices=True)
-    # A sign that does not depend on the library.
+    # Signs are chosen so that they do not depend on the linear algebra library.
     signs = np.sign(axes[np.arange(3), np.abs(axes).argmax(1)])
     return Ground(middle, (axes * signs[:, None])[:2])
 
 
 def split(places: Float[np.ndarray, "v 2"], count: int) -> list[Block]:
-    """Return cells with about as many places each; at least `count` places differ."""
+    """Return cells with about equally many places; at least `count` places must differ."""
     return _split(places, count, Block((-np.inf, -np.inf), (np.inf, np.inf)))
 
 
@@ -168,8 +168,8 @@ def _split(places: Float[np.ndarray, "v 2"], count: int, cell: Block) -> list[Bl
     values = np.sort(places[:, axis])
     edges = np.flatnonzero(np.diff(values) > 0)
     if not len(edges):
-        why = f"the photographs of a part of the scene show one place, which {count} blocks would "
-        why += "share."
+        why = f"all photographs of a part of the scene show one place, so that {count} blocks "
+        why += "cannot divide it."
         raise UserError(why, fix="use fewer --blocks")
     wanted = less / count * len(values) - 1
     at = edges[np.abs(edges - wanted).argmin()]
@@ -188,7 +188,7 @@ def _length(places: Float[np.ndarray, "v 2"]) -> float:
 
 
 def seen_points(scene: Scene) -> list[Int[np.ndarray, " _"]]:
-    """Return which points each training view sees: by tracks, else by projection of some points."""
+    """Return the points that each training view sees: by tracks, or by projecting some points."""
     rows = scene.train_indices
     if scene.tracks is not None and len(scene.tracks.xy):
         of_view = grouped(scene.tracks.view_indices, len(scene.views))
@@ -200,9 +200,9 @@ def seen_points(scene: Scene) -> list[Int[np.ndarray, " _"]]:
 def looked_at(
     scene: Scene, seen: Sequence[Int[np.ndarray, " _"]], centers: Float[np.ndarray, "v 3"]
 ) -> Float[np.ndarray, "v 3"]:
-    """Return where each training view counts: half way from its camera to the points it sees.
+    """Return the place of each training view: half way from its camera to the points it sees.
 
-    Cameras that all look ahead fill what lies before them, not what they stand on.
+    Cameras that look ahead show the ground before them, not the ground under them.
     """
     half = np.array(centers, np.float64)
     for row, points in enumerate(seen):
@@ -212,14 +212,15 @@ def looked_at(
 
 
 def shows(view: View, points: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, " p"]:
-    """Return which points lie in the frustum of a view."""
+    """Return the mask of points in the frustum of a view."""
     return in_frame(*project_points(points, view), view.width, view.height)
 
 
 def whole_of(scene: Scene, cut: Cut, number: int) -> tuple[Scene, Int[np.ndarray, " k"], int]:
-    """Return a block as a scene: its views, its points, and coarse ones of what lies around it.
+    """Return a block as a scene: its views, its points, and coarse points around it.
 
-    Also which points of the whole it has, and how many of them (the first) lie in the block.
+    Further results are the rows of its points in the whole scene, and the number of points (the
+    first ones) inside the block.
     """
     block = cut.blocks[number]
     places = cut.ground.place(scene.points)
@@ -234,7 +235,7 @@ def whole_of(scene: Scene, cut: Cut, number: int) -> tuple[Scene, Int[np.ndarray
 
 
 def _seen(scene: Scene, rows: Int[np.ndarray, " k"]) -> Bool[np.ndarray, " p"]:
-    """Return which points some of the views see: by tracks, else by projection into a few."""
+    """Return the mask of points that any view sees: by tracks, or by projection into some views."""
     seen = np.zeros(len(scene.points), bool)
     if scene.tracks is not None and len(scene.tracks.xy):
         seen[scene.tracks.point_indices[np.isin(scene.tracks.view_indices, rows)]] = True
@@ -247,9 +248,9 @@ def _seen(scene: Scene, rows: Int[np.ndarray, " k"]) -> Bool[np.ndarray, " p"]:
 def thinned(
     points: Float[np.ndarray, "p 3"], distance: Float[np.ndarray, " p"]
 ) -> Int[np.ndarray, " k"]:
-    """Return points of which no two share a cube; cubes grow with the distance from the block.
+    """Return the rows of one point per cube; cubes grow with the distance from the block.
 
-    Sides are powers of two; all lengths are in scene units.
+    The sides of cubes are powers of two; all lengths are in scene units.
     """
     if not len(points):
         return np.zeros(0, int)

@@ -1,4 +1,4 @@
-"""A scene fitted in blocks: photometry once, blocks as jobs, one run folder."""
+"""A scene fitted in blocks: one photometric solution, blocks as jobs, one run folder."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ from p2gs_jax.scene.pixels.store import ImageStore, decoded_into
 from p2gs_jax.types import Params, Scene
 
 BLOCKS = "blocks"
-# Under this name in `metrics.json`.
+# The key of the blocks in `metrics.json`.
 KEY = "districts"
 
 
 @dataclasses.dataclass(frozen=True)
 class Asked:
-    """How a scene is to be fitted in blocks: as `fit_blocks` is asked."""
+    """The arguments of `fit_blocks` on blocks and engines."""
 
     blocks: int | str
     parallel: int
@@ -68,29 +68,29 @@ def fit_blocks(
     on_look: Callable[[Sequence[JobState]], None] = lambda states: None,
     true_exposures: Mapping[str, float] | None = None,
 ) -> FitResult:
-    """Fit a scene in blocks and write a run folder as `fit` does, whose arguments it shares.
+    """Fit a scene in blocks and write a run folder as `fit` does, with the same other arguments.
 
-    The blocks are in the run's folder `blocks`: so many, or `auto`, as few as memory allows; with
-    one, this is `fit`. So many are fitted in parallel on this machine, or on an engine: local,
-    dask://HOST:PORT or slurm (docs/api.md). Finished blocks stay where a run is resumed;
-    `on_look` receives how far all are, twice a second.
+    The blocks are in the folder `blocks` of the run. `auto` is the smallest number of blocks that
+    memory allows; with one block this is `fit`. `parallel` blocks are fitted at a time on the
+    engine: local, dask://HOST:PORT or slurm (docs/api.md). A resumed run keeps finished blocks.
+    `on_look` receives the states of all blocks, twice a second.
 
     Raises:
-        UserError: something the user can mend; a block that failed is named, with its reason.
-        Interrupted: a signal came; blocks under way write their checkpoints first.
+        UserError: an error that the user can correct; a failed block is named with its reason.
+        Interrupted: a signal arrived; running blocks write their checkpoints first.
     """
     cfg, reporter = require_config(cfg), reporter or Silent()
     asked = Asked(blocks, parallel, engine)
     paths = Paths.of(scene_dir, run_dir, reference)
     if isinstance(blocks, str) and blocks != "auto":
-        raise UserError(f"--blocks {blocks}.", fix="write a whole number from 1, or auto")
+        raise UserError(f"--blocks {blocks} is not valid.", fix="write a whole number, or auto")
     plan.check_options(cfg)
     check_engine(engine)
     weights = preflight.preflight(cfg, paths, resume=resume)
     begin = time.monotonic()
     with no_empty_folders(paths.run), locked(paths.run) as lock:
         if check_run_dir(paths.run, resume, cfg):
-            # Blocks go on as well; this holds if we end before they begin.
+            # Finished blocks continue as well, even if this process ends before they start.
             for finished in (paths.run / BLOCKS).glob("*/metrics.json"):
                 finished.unlink()
         scene = load(paths.scene, paths.run, cfg, reporter)
@@ -101,7 +101,7 @@ def fit_blocks(
             whole = _Blocks(paths, cfg, asked, cut, lock, reporter, on_look)
             with decoded_into(whole.folder.pixels):
                 return whole.fit(scene, truth, weights, begin, true_exposures)
-    # One block is no block.
+    # With one block the scene is fitted as usual.
     return fit(
         paths.scene,
         paths.run,
@@ -117,30 +117,30 @@ def fit_blocks(
 def _cut(
     scene: Scene, cfg: FitConfig, asked: Asked, folder: Path, reporter: Reporter
 ) -> Cut | None:
-    """Return how the scene is cut, as before where it was; None: one block holds all."""
+    """Return the cut of the scene, the earlier one if there is one; None: one block is enough."""
     cut = plan.read_plan(folder, str(asked.blocks))
     if cut is None:
         count = asked.blocks
         if isinstance(count, str):
             count = plan.fewest_blocks(scene, cfg, asked.parallel)
         if count == 1:
-            reporter.message("One block: memory holds the scene whole.")
+            reporter.message("One block: the whole scene fits into memory.")
             return None
         cut = cut_scene(scene, count)
-    # Elsewhere there is other memory.
+    # Other machines have other memory.
     if asked.engine == LOCAL:
         plan.require_room(scene, cfg, cut, asked.parallel)
     sizes = [len(block.views) for block in cut.blocks]
     reporter.message(
-        f"{len(sizes)} blocks of {min(sizes)} to {max(sizes)} of {len(scene.train_indices)} "
-        f"training photographs, which reach {cut.margin:.3g} beyond their cores."
+        f"{len(sizes)} blocks with {min(sizes)} to {max(sizes)} of {len(scene.train_indices)} "
+        f"training photographs; they extend {cut.margin:.3g} scene units beyond their cores."
     )
     return cut
 
 
 @dataclasses.dataclass
 class _Blocks:
-    """A scene that is fitted in blocks, its folder locked."""
+    """A fit of a scene in blocks, in a locked run folder."""
 
     paths: Paths
     cfg: FitConfig
@@ -157,7 +157,7 @@ class _Blocks:
     def fit(
         self, scene: Scene, truth: Reference | None, weights, begin: float, true_exposures
     ) -> FitResult:
-        """Solve, fit every block, merge and judge."""
+        """Solve the photometry, fit every block, merge the blocks and evaluate the result."""
         with self.clock("photometry"):
             solved = self._solve(scene)
         with self.clock("blocks"):
@@ -175,7 +175,7 @@ class _Blocks:
         fitted.clear()
         photometry = jax.tree.map(on_device, solved.exposures.photometry)
         params = centred(Params(gaussians, photometry), cfg)
-        self._tell(seams)
+        self._report(seams)
         self.lock.require()
         account = self._account(scene, solved, gaussians.capacity, time.monotonic() - begin)
         metrics = finish(
@@ -214,7 +214,7 @@ class _Blocks:
             seconds={
                 **self.clock.seconds,
                 "total_until_evaluation": seconds,
-                "optimisation": optimisation,  # of all blocks, side by side or not
+                "optimisation": optimisation,  # the sum over all blocks
             },
             selection=solved.exposures.selection,
             notes=[*solved.scene.notes, *solved.exposures.notes],
@@ -233,10 +233,10 @@ class _Blocks:
         found, paths = solved.exposures, self.paths
         write_start(self.folder, paths.scene, paths.reference, self.cfg, found.decisions)
         if (self.blocks / shared.ARRAYS).exists():
-            # What blocks were fitted under stays, to the digit.
+            # The exposures of finished blocks must stay exactly the same.
             before = shared.read_shared(self.blocks, scene, self.cfg)
-            told = {"selection": found.selection, "notes": found.notes}
-            exposures = dataclasses.replace(before.exposures, **told)
+            new = {"selection": found.selection, "notes": found.notes}
+            exposures = dataclasses.replace(before.exposures, **new)
             return dataclasses.replace(before, exposures=exposures)
         plan.write_plan(self.blocks, self.cut, str(self.asked.blocks))
         shared.write_shared(self.blocks, solved)
@@ -257,28 +257,28 @@ class _Blocks:
         if failed:
             raise UserError(
                 f"{len(failed)} of {len(self.cut.blocks)} blocks failed. " + "; ".join(failed),
-                fix="mend that and add --resume: blocks that are finished stay",
+                fix="correct the cause and add --resume: finished blocks are kept",
             )
 
     def _ended(self, number: int, state: JobState) -> None:
-        how = "fitted" if state.status == "done" else state.status
-        self.reporter.message(f"{state.name}: {how} after {state.seconds:.0f} s.")
+        result = "fitted" if state.status == "done" else state.status
+        self.reporter.message(f"{state.name}: {result} after {state.seconds:.0f} s.")
 
     def _of_block(self, number: int) -> dict:
         return json.loads(RunFolder(self.blocks / str(number)).metrics.read_text(encoding="utf-8"))
 
-    def _tell(self, seams: Sequence[Seam]) -> None:
+    def _report(self, seams: Sequence[Seam]) -> None:
         seen = [s for s in seams if s.step_stops is not None]
         if seen:
             worst = max(seen, key=lambda s: abs(s.step_stops or 0.0))
             self.reporter.message(
-                f"The largest step of radiance left between blocks: {worst.step_stops:+.4f} stops "
-                f"(blocks {worst.blocks[0]} and {worst.blocks[1]}); median difference "
-                f"{worst.spread_stops:.3f} stops, {worst.spread_depth:.1%} of depth."
+                f"The largest step of radiance between blocks is {worst.step_stops:+.4f} stops "
+                f"(blocks {worst.blocks[0]} and {worst.blocks[1]}). The median difference is "
+                f"{worst.spread_stops:.3f} stops, and {worst.spread_depth:.1%} of the depth."
             )
 
     def _summary(self, seams: Sequence[Seam], counts: Sequence[int]) -> dict:
-        """Return what `metrics.json` says of the blocks."""
+        """Return the part of `metrics.json` on the blocks."""
         rows = []
         for number, (block, kept) in enumerate(zip(self.cut.blocks, counts, strict=True)):
             found = self._of_block(number)

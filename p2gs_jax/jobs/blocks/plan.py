@@ -1,4 +1,4 @@
-"""How a scene is to be cut: options that are refused, memory of blocks, the plan for `--resume`."""
+"""The plan of blocks: options that are refused, memory of blocks, and the plan for `--resume`."""
 
 from __future__ import annotations
 
@@ -17,48 +17,48 @@ from p2gs_jax.pipeline.preflight import memory_needed
 from p2gs_jax.types import Scene
 
 PLAN = "plan.json"
-# More blocks than this are not tried.
+# Largest number of blocks that is tried.
 MOST_BLOCKS = 256
 
 
 def check_options(cfg: FitConfig) -> None:
-    """Raise a UserError for options under which blocks would share nothing."""
+    """Raise a UserError for options that do not allow shared exposures or static Gaussians."""
     p = cfg.photometry
     if p.start != "tracks" or p.appearance is not None:
         raise UserError(
-            f"--blocks keeps exposures as they are solved for all photographs at once; the preset "
-            f"{cfg.preset!r} learns them with the Gaussians, in each block on its own.",
+            f"--blocks needs exposures that are solved once for all photographs, but the preset "
+            f"{cfg.preset!r} learns them together with the Gaussians, separately in each block.",
             fix="use --preset robust, or fit without --blocks",
         )
     if cfg.loss.relative_exposure.weight is not None:
-        why = "--blocks keeps exposures as they are solved: the relative-exposure loss has nothing "
-        why += "to move."
+        why = "--blocks keeps the solved exposures fixed, so the relative-exposure loss cannot "
+        why += "change them."
         fix = "add --loss.relative-exposure.weight None, or fit without --blocks"
         raise UserError(why, fix=fix)
     if cfg.dynamics.method == "vibration":
         raise UserError(
-            "--blocks fits what stands still: Gaussians that move would cross from block to block.",
+            "--blocks fits static scenes only: moving Gaussians would cross from block to block.",
             fix="add --dynamics.method mask, or fit without --blocks",
         )
 
 
 def check_scene(scene: Scene, cfg: FitConfig) -> None:
-    """Raise a UserError where moving objects of a scene are to be fitted."""
+    """Raise a UserError if moving objects of the scene would be fitted."""
     if cfg.dynamics.method != "mask" and any(thing.moving for thing in scene.objects):
-        why = f"--blocks fits what stands still, and things move in {scene.root}."
+        why = f"--blocks fits static scenes only, and {scene.root} has moving objects."
         fix = "add --dynamics.method mask, which leaves them out, or fit without --blocks"
         raise UserError(why, fix=fix)
 
 
 def write_plan(folder: Path, cut: Cut, asked: str) -> None:
-    """Write how the scene is cut, and what `--blocks` was."""
+    """Write the cut of a scene, and the value of `--blocks`."""
     write_json(folder / PLAN, {"asked": asked, "cut": cut.to_dict()})
 
 
 def read_plan(folder: Path, asked: str) -> Cut | None:
-    """Return how a run that is resumed was cut, or None where it was not yet.
+    """Return the cut of a resumed run, or None if it has none.
 
-    UserError: it was cut otherwise than `asked` now, or the file is broken.
+    UserError: `asked` is another number of blocks, or the file is broken.
     """
     path = folder / PLAN
     if not path.exists():
@@ -67,18 +67,18 @@ def read_plan(folder: Path, asked: str) -> Cut | None:
         saved: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         before, cut = saved["asked"], Cut.from_dict(saved["cut"])
     if before != asked and asked != str(len(cut.blocks)):
-        why = f"{folder.parent} was begun with --blocks {before} ({len(cut.blocks)} blocks)."
+        why = f"{folder.parent} was started with --blocks {before} ({len(cut.blocks)} blocks)."
         raise UserError(why, fix=f"repeat --blocks {before}, or name another folder with --out")
     return cut
 
 
 def bytes_needed(scene: Scene, cfg: FitConfig) -> float:
-    """Return what a fit of a scene, or of a block as a scene, takes at its peak."""
+    """Return the peak memory of the fit of a scene, or of a block as a scene, bytes."""
     return memory_needed(scene, cfg, coverage_of(scene, cfg.data.max_width)).total
 
 
 def largest_block(scene: Scene, cfg: FitConfig, cut: Cut) -> float:
-    """Return the bytes that the most demanding block of a cut takes."""
+    """Return the peak memory of the most demanding block of a cut, bytes."""
     count, most = len(scene.train_indices), 0.0
     for number in range(len(cut.blocks)):
         block, _, own = whole_of(scene, cut, number)
@@ -88,9 +88,9 @@ def largest_block(scene: Scene, cfg: FitConfig, cut: Cut) -> float:
 
 
 def fewest_blocks(scene: Scene, cfg: FitConfig, parallel: int) -> int:
-    """Return into how few blocks a scene must be cut for the memory there is; 1: it fits whole.
+    """Return the smallest number of blocks for the free memory; 1: the whole scene fits.
 
-    Raises a UserError where no cut is small enough.
+    Raises a UserError if no cut has small enough blocks.
     """
     room = left_to_process()
     if room is None or bytes_needed(scene, cfg) <= room:
@@ -98,15 +98,15 @@ def fewest_blocks(scene: Scene, cfg: FitConfig, parallel: int) -> int:
     count = _fitting(scene, cfg, parallel, room)
     if count is None:
         raise UserError(
-            f"memory for a block is short however the scene is cut: there are {room / 1e9:.1f} GB.",
-            fix="lower --max-width, --gaussians or --data.cache-mb, or let fewer run at a time "
+            f"even the smallest blocks need more than the {room / 1e9:.1f} GB of free memory.",
+            fix="lower --max-width, --gaussians or --data.cache-mb, or fit fewer blocks at a time "
             "with --jobs",
         )
     return count
 
 
 def require_room(scene: Scene, cfg: FitConfig, cut: Cut, parallel: int) -> None:
-    """Raise a UserError where so many blocks at a time are too large for the memory there is."""
+    """Raise a UserError if `parallel` blocks at a time need more than the free memory."""
     room = left_to_process()
     if room is None:
         return
@@ -116,16 +116,16 @@ def require_room(scene: Scene, cfg: FitConfig, cut: Cut, parallel: int) -> None:
         return
     count = _fitting(scene, cfg, parallel, room)
     fits = "" if count is None else f"use --blocks {count}; or "
-    alone = "let fewer run at a time with --jobs; or " if together > 1 else ""
+    fewer = "fit fewer blocks at a time with --jobs; or " if together > 1 else ""
     raise UserError(
-        f"the largest of {len(cut.blocks)} blocks would take about {most / 1e9:.1f} GB of memory"
-        f"{f', {together} at a time' if together > 1 else ''}, and there are {room / 1e9:.1f} GB.",
-        fix=f"{fits}{alone}lower --max-width, --gaussians or --data.cache-mb",
+        f"the largest of {len(cut.blocks)} blocks needs about {most / 1e9:.1f} GB of memory"
+        f"{f', {together} at a time' if together > 1 else ''}, but {room / 1e9:.1f} GB are free.",
+        fix=f"{fits}{fewer}lower --max-width, --gaussians or --data.cache-mb",
     )
 
 
 def _fitting(scene: Scene, cfg: FitConfig, parallel: int, room: float) -> int | None:
-    """Return the fewest blocks, in steps of a half, that fit; None: none do."""
+    """Return the smallest number of blocks that fit, in steps of a factor 1.5, or None."""
     count = 2
     while count <= MOST_BLOCKS:
         try:

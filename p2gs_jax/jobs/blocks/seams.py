@@ -1,10 +1,10 @@
-"""Where blocks meet: how their radiance and depth differ, made equal, and merged.
+"""Seams between blocks: differences of radiance and depth, their correction, and the merged scene.
 
-The same views are rendered by each block along a boundary. A difference in one direction is a step;
-one both ways is what two fits of anything differ by. Exposures drift along a drive by thousandths
-of a stop a block, and each block's radiance follows its photographs. The step is spread over the
-blocks beside it, less and less inwards, as seams of textures are levelled (Lempitsky and Ivanov
-2007; Waechter et al. 2014); docs/scaling.md says what that does and does not do.
+The blocks at a boundary render the same views. The median difference is a step; the rest is the
+difference between any two fits. Exposures drift along a drive by thousandths of a stop per block,
+and the radiance of each block follows its photographs. The step is distributed over both blocks
+with weights that fall inwards, like the levelling of texture seams (Lempitsky and Ivanov 2007;
+Waechter et al. 2014). docs/scaling.md describes the limits of this method.
 """
 
 from __future__ import annotations
@@ -27,32 +27,32 @@ from p2gs_jax.render.warp import unproject
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.types import Camera, Gaussians, Render, Scene
 
-# Views of a boundary that are rendered at most. With 12 a step was .018 stop, with 48 .005.
+# Largest number of rendered views of a boundary. With 12 a step was 0.018 stops, with 48 0.005.
 MOST_VIEWS = 48
-# Where either block shows less, nothing is compared.
+# Pixels are compared where both blocks have at least this opacity.
 OPAQUE = 0.9
 DARKEST = 1e-3
-# How far into a core its radiance is moved, as a share of the shortest core.
+# Depth to which the radiance of a core is corrected, as a share of the shortest core.
 INWARDS = 0.5
-# A view with fewer pixels of the strip says little.
+# A view with fewer pixels of the strip is ignored.
 FEWEST_PIXELS = 50
 
 
 @dataclass(frozen=True)
 class Seam:
-    """How two blocks differ in the strip around their boundary; None where nothing was compared.
+    """Differences of two blocks in the strip around their boundary; None without comparisons.
 
-    The step of radiance is what one sees as a seam.
+    The step of radiance is visible as a seam.
     """
 
-    blocks: tuple[int, int]  # their numbers
-    views: int  # that show the strip
-    pixels: int  # that were compared
-    step_stops: float | None = None  # median of the second's radiance over the first's, stops
-    spread_stops: float | None = None  # median size of that ratio
-    step_depth: float | None = None  # median of the second's depth over the first's, less one
-    spread_depth: float | None = None  # median size of that
-    levelled_stops: float | None = None  # the step that was taken out before, as other views told
+    blocks: tuple[int, int]  # numbers of the blocks
+    views: int  # number of views that show the strip
+    pixels: int  # number of compared pixels
+    step_stops: float | None = None  # median ratio of radiance, second to first, stops
+    spread_stops: float | None = None  # median absolute value of that ratio, stops
+    step_depth: float | None = None  # median ratio of depth, second to first, minus 1
+    spread_depth: float | None = None  # median absolute value of that difference
+    levelled_stops: float | None = None  # the step removed before, measured in other views
 
 
 def measure_seams(
@@ -63,10 +63,10 @@ def measure_seams(
     cfg: RenderConfig,
     which: slice,
 ) -> list[Seam]:
-    """Compare neighbouring blocks, by all Gaussians of each, in training views of both.
+    """Compare neighbouring blocks, with all Gaussians of each, in their common training views.
 
-    Of the photographs only the cameras are used; `which` selects among the views that two blocks
-    share, in the order of the scene.
+    Only the cameras of the photographs are used. `which` selects from the common views of two
+    blocks in the order of the scene.
     """
     seams = []
     for pair in cut.neighbours():
@@ -92,16 +92,16 @@ def _rendering(gaussians: Gaussians, cfg: RenderConfig) -> Callable[[Camera], Re
 def _compared(
     camera: Camera, cut: Cut, pair: tuple[int, int], renderers: list[Callable[[Camera], Render]]
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """Return log2 ratios of radiance and relative ones of depth where a view shows the strip."""
-    shown = []
+    """Return log2 ratios of radiance and relative differences of depth for pixels of the strip."""
+    renders = []
     for render in renderers:
         drawn = render(camera)
         linear, alpha = np.asarray(drawn.linear), np.asarray(drawn.alpha)
         assert drawn.depth is not None
         opaque = np.maximum(alpha, 1e-6)
-        shown.append((linear.mean(-1) / opaque, np.asarray(drawn.depth) / opaque, alpha))
-    (one, near, solid), (other, far, covered) = shown
-    # Chosen by one of the depths, pixels would be those in which the other is farther off.
+        renders.append((linear.mean(-1) / opaque, np.asarray(drawn.depth) / opaque, alpha))
+    (one, near, solid), (other, far, covered) = renders
+    # A choice by one of the two depths would favour pixels in which that depth is wrong.
     middle = np.sqrt(np.maximum(near * far, 0.0))
     points = unproject(middle, jax.tree.map(np.asarray, camera))
     places = cut.ground.place(points.reshape(-1, 3))
@@ -117,31 +117,31 @@ def _compared(
 def level_seams(
     scene: Scene, store: ImageStore, cut: Cut, fitted: Sequence[Gaussians], cfg: RenderConfig
 ) -> tuple[list[Gaussians], list[Seam]]:
-    """Take steps between blocks out; return their Gaussians, and seams with what was taken out.
+    """Remove the steps between blocks; return their Gaussians, and the seams after the correction.
 
-    Every second view of a boundary tells the step, the others judge: what is left is measured where
-    nothing was fitted to. Arguments are those of `measure_seams`.
+    Every second view of a boundary measures the step, and the other views measure the remaining
+    seam. Arguments are those of `measure_seams`.
     """
-    told = measure_seams(scene, store, cut, fitted, cfg, slice(0, None, 2))
-    steps = {s.blocks: s.step_stops for s in told if s.step_stops is not None}
+    before = measure_seams(scene, store, cut, fitted, cfg, slice(0, None, 2))
+    steps = {s.blocks: s.step_stops for s in before if s.step_stops is not None}
     levelled = []
     for number, gaussians in enumerate(fitted):
         shift = shifts(cut, number, np.asarray(gaussians.means), steps) * np.log(2)
         sh = scaled(np.asarray(gaussians.sh), shift[:, None], cfg.radiance)
         levelled.append(replace(gaussians, sh=on_device(sh)))
-    left = measure_seams(scene, store, cut, levelled, cfg, slice(1, None, 2))
-    return levelled, [replace(s, levelled_stops=steps.get(s.blocks)) for s in left]
+    after = measure_seams(scene, store, cut, levelled, cfg, slice(1, None, 2))
+    return levelled, [replace(s, levelled_stops=steps.get(s.blocks)) for s in after]
 
 
 def shifts(
     cut: Cut, number: int, means: Float[np.ndarray, "n 3"], steps: Mapping[tuple[int, int], float]
 ) -> Float[np.ndarray, " n"]:
-    """Return by how many stops a block's radiance is to grow at some places (scene units).
+    """Return the correction of a block's radiance at `means` (scene units), stops.
 
-    Where several blocks are near, their radiance becomes the mean of what each has, with weights
-    that fall with the distance from its core: two blocks come out alike wherever no third is near,
-    and a block's own radiance stays where none is. `steps` are of the second block over the first,
-    stops; pairs without one have no part in each other's mean.
+    Near several blocks the radiance becomes the weighted mean of theirs, with weights that fall
+    with the distance from their cores. Two blocks then agree wherever no third one is near, and
+    far from other blocks the radiance stays. `steps` are ratios of the second block to the first,
+    stops; pairs without a step do not influence each other.
     """
     places = cut.ground.place(means)
     reach = INWARDS * cut.margin / OVERLAP
@@ -161,10 +161,10 @@ def _near(distance: Float[np.ndarray, " n"], reach: float) -> Float[np.ndarray, 
 
 
 def merge_cores(cut: Cut, fitted: Sequence[Gaussians]) -> tuple[Gaussians, list[int]]:
-    """Return the Gaussians whose centres lie in the core of the block that fitted them.
+    """Return the Gaussians with centres in the core of their block, and their number per block.
 
-    They stand block after block; also how many each gave. Cores cover space once: nothing is there
-    twice, and nothing is left out. UserError: no block has any in its core.
+    They are ordered by block. Cores cover space exactly once, so that no part of the scene is
+    missing or doubled. UserError: no block has a Gaussian in its core.
     """
     kept = [
         np.flatnonzero(cut.core(number, np.asarray(gaussians.means)))

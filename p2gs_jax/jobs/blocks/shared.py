@@ -1,4 +1,4 @@
-"""The photometry of a whole scene, solved once before any block is fitted, kept for all jobs."""
+"""The photometry of a whole scene, solved before the blocks are fitted, and stored for all jobs."""
 
 from __future__ import annotations
 
@@ -27,25 +27,25 @@ ARRAYS, DECISIONS = "shared.npz", "decisions.json"
 
 @dataclasses.dataclass(frozen=True)
 class Shared:
-    """A scene, or a block of it, with what all blocks share: one gauge of radiance."""
+    """A scene or a block with the shared photometry, which has one gauge of radiance."""
 
     scene: Scene  # with colours of the points
-    exposures: Exposures  # of its training views, on the host, as they stay; with radiances
-    shell: Sphere  # where what lies behind everything is
+    exposures: Exposures  # fixed ones of its training views, on the host; with radiances of points
+    shell: Sphere  # the sphere of the background
 
 
 def solve_shared(
     scene: Scene, store: ImageStore, cfg: FitConfig, reporter: Reporter, kept: Decisions | None
 ) -> Shared:
-    """Solve the photometry of a scene; `kept` is what a run that is resumed decided before.
+    """Solve the photometry of a scene; `kept` has the earlier decisions of a resumed run.
 
-    UserError: no point is seen twice.
+    UserError: no point is seen by two photographs.
     """
     still = store.leaving_out(scene.objects, cfg.dynamics.margin).only_opaque()
     solved = solve_exposures(scene, still, cfg, reporter, kept=kept)
     if solved.selection is None:
-        why = f"{scene.root}: no point is seen by two photographs, so that blocks would share no "
-        why += "exposures."
+        why = f"{scene.root}: no point is seen by two photographs, so the exposures of blocks "
+        why += "cannot be compared."
         raise UserError(why, fix="fit it without --blocks, or with a structure-from-motion model")
     views = scene.training_views
     depth = near_depth(seen_depths(scene.points, views))
@@ -69,7 +69,7 @@ def solve_shared(
 
 
 def write_shared(folder: Path, shared: Shared) -> None:
-    """Write what the blocks share."""
+    """Write the shared photometry of the blocks."""
     write_decisions(folder / DECISIONS, shared.exposures.decisions)
     p, colors = shared.exposures.photometry, shared.scene.point_colors
     arrays = {
@@ -89,7 +89,7 @@ def write_shared(folder: Path, shared: Shared) -> None:
 
 
 def read_shared(folder: Path, scene: Scene, cfg: FitConfig) -> Shared:
-    """Return what the blocks share; `scene` was read again, and its points gain colours.
+    """Return the shared photometry of the blocks for a `scene` without it; adds point colours.
 
     UserError: the files are broken, or of another scene.
     """
@@ -122,9 +122,9 @@ def read_shared(folder: Path, scene: Scene, cfg: FitConfig) -> Shared:
 
 
 def block_of(shared: Shared, cut: Cut, number: int) -> tuple[Shared, int]:
-    """Return a block as a scene of its own: its training views, its points first, coarse ones.
+    """Return a block as a separate scene: its training views, its points, then coarse points.
 
-    Also how many of the points lie in the block.
+    The second result is the number of points inside the block.
     """
     scene, keep, own = whole_of(shared.scene, cut, number)
     given, rows = shared.exposures, np.array(cut.blocks[number].views)
