@@ -1,1 +1,1 @@
-"""Camera paths: the scene's own views, drives, orbits, files of cameras, and panoramas of rigs."""
+"""Camera paths: the views of a scene, drives, orbits, camera files, and panoramas of rigs."""

@@ -1,4 +1,4 @@
-"""A smooth ride through given poses, also beside the way that was driven."""
+"""A smooth camera path through given poses, also shifted sideways."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from p2gs_jax.types import View
 
 # Default number of frames from one pose to the next.
 FRAMES_BETWEEN = 8
-# Least time between two poses, as a share of the mean: cameras may stand still.
+# Shortest time between two poses, as a share of the mean, for cameras that stand still.
 SHORTEST = 0.1
 
 
 class PosePath:
-    """Poses over time, through every given one; velocity and acceleration are continuous.
+    """Poses over time through every given pose, with continuous velocity and acceleration.
 
     Positions follow a natural cubic spline, rotations scipy's `RotationSpline`. The time between
-    two poses is the square root of how far apart they are (centripetal), so that splines neither
-    loop nor overshoot where distances differ; equal distances take equal times. `times` are those
-    of the given poses, from 0; 1 is the mean of their differences.
+    two poses is the square root of their distance (centripetal), so that splines neither loop nor
+    overshoot if distances differ. `times` of the given poses begin at 0; their mean difference is
+    1.
     """
 
     def __init__(self, poses: Poses):
@@ -51,19 +51,19 @@ class PosePath:
 
 
 def frame_count(knots: int, frames: int | None) -> int:
-    """Return how many frames a ride through `knots` poses has."""
+    """Return the number of frames of a path through `knots` poses."""
     return FRAMES_BETWEEN * (knots - 1) + 1 if frames is None else frames
 
 
 def drive(knots: Sequence[Shot], frames: int | None = None) -> list[Shot]:
-    """Return a smooth path through shots, with their commonest lens.
+    """Return a smooth path through shots, with their most common lens.
 
-    Exposures (in stops), gammas (their logarithms) and times are interpolated linearly where all
-    shots have them. None takes `FRAMES_BETWEEN` frames from one shot to the next. A UserError says
-    that there are fewer than two knots.
+    Exposures (in stops), gammas (their logarithms) and times are interpolated linearly if all shots
+    have them. `frames` of None gives `FRAMES_BETWEEN` frames from one shot to the next. Raises a
+    UserError for fewer than two knots.
     """
     if len(knots) < 2:
-        why = f"A drive needs at least two views of a camera; here there are {len(knots)}."
+        why = f"A drive needs at least two views of a camera, but this one has {len(knots)}."
         raise UserError(why, fix="choose another --camera or --split, or --trajectory orbit")
     path = PosePath(inverse(np.stack([s.viewmat for s in knots])))
     times = path.evenly(frame_count(len(knots), frames))
@@ -79,7 +79,7 @@ def drive(knots: Sequence[Shot], frames: int | None = None) -> list[Shot]:
 
 
 def interpolated(at, values: Sequence[float | None], times) -> list[float | None]:
-    """Return values at times, linear between those given `at` some; None unless all are known."""
+    """Return values at `times`, linear between those `at` given times; None if any is None."""
     known = [v for v in values if v is not None]
     if len(known) < len(values):
         return [None] * len(times)
@@ -87,10 +87,10 @@ def interpolated(at, values: Sequence[float | None], times) -> list[float | None
 
 
 def beside(poses: Poses, views: Sequence[View], distance: float) -> Poses:
-    """Return poses moved to the left of the driving direction, looking the same way.
+    """Return poses moved to the left of the driving direction, with the same rotations.
 
-    They are camera-to-world (or rig-to-world) in the order of the ride; a negative distance (scene
-    units) is to the right. The views of the scene say what is up, and where a standing car looks.
+    They are camera-to-world (or rig-to-world) in the order of the drive; a negative distance (scene
+    units) is to the right. `views` give the up direction, and the heading of a standing car.
     """
     up = up_of_drive(np.stack([v.viewmat for v in views]), [v.camera for v in views])
     ahead = headings(poses[:, :3, 3], up, level_ahead(views, up))

@@ -1,4 +1,4 @@
-"""Files of cameras (docs/rendering.md)."""
+"""Camera files (docs/rendering.md)."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from p2gs_jax.scene.rigid import camera_centers, pose_of
 
 FIELDS = ("name", "viewmat", "K", "width", "height", "exposure_ev", "gamma", "time")
 MOST_STOPS = 60.0
-# Least and largest values of what an entry may leave out.
+# Smallest and largest values of optional fields.
 LIMITS = {"exposure_ev": (-MOST_STOPS, MOST_STOPS), "gamma": (1e-3, 1e3)}
 LIMITS["time"] = (-math.inf, math.inf)
 _FIX = "correct the file; docs/rendering.md has the format"
 
 
 def write_cameras(path: Path, shots: Sequence[Shot]) -> None:
-    """Write a path as a list of cameras that `read_cameras` reads."""
+    """Write a path as a list of cameras for `read_cameras`."""
     rows = [{key: getattr(shot, key) for key in FIELDS} for shot in shots]
     write_json(path, [{k: v for k, v in row.items() if v is not None} for row in rows])
 
 
 def read_cameras(path: Path) -> list[Shot]:
-    """Read a path; a UserError names the entry and the field of a file that is not one."""
+    """Read a path; a UserError names the wrong entry and field of the file."""
     try:
         data = parse_json(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
-        fix = "name a file of cameras, or choose --trajectory views, drive or orbit"
+        fix = "name a camera file, or choose --trajectory views, drive or orbit"
         raise UserError(f"{path} cannot be read: {error.strerror or error}.", fix=fix) from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise UserError(f"{path} is not valid JSON: {error}.", fix=_FIX) from None
@@ -58,7 +58,7 @@ def read_cameras(path: Path) -> list[Shot]:
 
 
 def near_scene(shots: Sequence[Shot], origin: Sequence[float]) -> list[Shot]:
-    """Return shots where the scene is, which may have been moved from there to the origin."""
+    """Return shots in the coordinates of a scene that may have been moved by `origin`."""
     middle = np.median(camera_centers(np.stack([shot.viewmat for shot in shots])), axis=0)
     if np.linalg.norm(middle - origin) >= np.linalg.norm(middle):
         return list(shots)
@@ -86,9 +86,9 @@ def _given(values: dict, key: str):
 def _pixels(values: dict, key: str) -> int:
     value = values.get(key)
     if isinstance(value, bool) or not isinstance(value, int | float) or value != round(value):
-        raise ValueError(f"has no whole number {key}")
+        raise ValueError(f"has no {key} that is a whole number")
     if not 1 <= value <= LARGEST:
-        raise ValueError(f"has the {key} {value}, which is not between 1 and {LARGEST}")
+        raise ValueError(f"has the {key} {value}, which is not between 1 and {LARGEST} pixels")
     return int(value)
 
 
@@ -103,5 +103,5 @@ def _name(values: dict, index: int) -> str:
     name = values.get("name", f"{index:05d}")
     parts = PurePosixPath(name).parts if isinstance(name, str) else ()
     if not parts or ".." in parts or PurePosixPath(name).is_absolute() or "\\" in name:
-        raise ValueError(f"has the name {name!r}, which names no file within the output folder")
+        raise ValueError(f"has the name {name!r}, which is not a file within the output folder")
     return name

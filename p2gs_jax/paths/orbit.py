@@ -1,4 +1,4 @@
-"""A circle around what the cameras look at, or an arc where they did not surround it."""
+"""A circle around the point that the cameras look at, or an arc if they do not surround it."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from p2gs_jax.paths.shots import Pose, Shot, common_lens
 from p2gs_jax.scene.rigid import camera_centers, pose_of, up_direction
 
 FRAMES = 120
-# Optical axes meet where they spread at least this much (sine squared) ...
+# Optical axes meet in a point if their spread is at least this (sine squared), ...
 LEAST_SPREAD = 0.01
-# ... and the point is in front of most cameras, within this angle from their axes (median).
+# ... if it is in front of this share of cameras, and within this median angle from their axes.
 MOST_IN_FRONT, WIDEST = 0.9, np.deg2rad(25)
-# A full circle needs cameras all around, with no larger gap than this.
+# A full circle needs cameras on all sides, with gaps below this angle.
 LARGEST_GAP = np.deg2rad(100)
 LEAST_SWAY = np.deg2rad(10)
 HIGHEST = np.deg2rad(85)
@@ -24,12 +24,12 @@ HIGHEST = np.deg2rad(85)
 
 @dataclass(frozen=True)
 class Orbit:
-    """A circle, or an arc that is followed back and forth.
+    """A circle, or an arc that the camera follows back and forth.
 
-    The camera looks at the focus, where the optical axes meet; else it lies in front of one
-    camera. `up` and the horizontal `forward`, azimuth 0 as seen from the focus, are unit vectors.
-    The radius is in scene units, angles in radians: elevation of the camera above the focus,
-    azimuth of the middle of the arc, and `sway`, half the arc (pi for a circle).
+    The camera looks at `focus`, where the optical axes meet, or else at a point in front of one
+    camera. `up` and the horizontal `forward` (azimuth 0 as seen from the focus) are unit vectors.
+    The radius is in scene units. Angles are in radians: elevation of the camera above the focus,
+    azimuth of the middle of the arc, and `sway`, half of the arc (pi for a circle).
     """
 
     focus: Float[np.ndarray, " 3"]
@@ -49,12 +49,12 @@ class Orbit:
 
 
 def orbit(circle: Orbit, shots: Sequence[Shot], frames: int | None = None) -> list[Shot]:
-    """Return a path of `frames` shots that ends where it begins, with the commonest lens."""
+    """Return a closed path of `frames` shots with the most common lens."""
     count = FRAMES if frames is None else frames
     turn = 2 * np.pi * np.arange(count) / count
     swing = turn if circle.sway >= np.pi else circle.sway * np.sin(turn)
     K, width, height = common_lens(shots)
-    # One moment: that of the middle shot.
+    # All frames have the time of the middle shot.
     time = shots[len(shots) // 2].time
     poses = [look_at(circle.center(a), circle.focus, circle.up) for a in circle.middle + swing]
     return [Shot(f"{k:05d}", pose, K, width, height, time=time) for k, pose in enumerate(poses)]
@@ -63,9 +63,9 @@ def orbit(circle: Orbit, shots: Sequence[Shot], frames: int | None = None) -> li
 def look_at(
     center: Float[np.ndarray, " 3"], focus: Float[np.ndarray, " 3"], up: Float[np.ndarray, " 3"]
 ) -> Pose:
-    """Return world-to-camera of a camera at `center` that looks at `focus`; `up` is shown upwards.
+    """Return world-to-camera of an upright camera at `center` that looks at `focus`.
 
-    The line of sight must not run along `up`.
+    The line of sight must not be parallel to `up`.
     """
     z = (focus - center) / np.linalg.norm(focus - center)
     x = np.cross(z, up)
@@ -77,12 +77,12 @@ def look_at(
 def find_orbit(
     shots: Sequence[Shot], own: Sequence[Shot], points: Float[np.ndarray, "p 3"]
 ) -> Orbit:
-    """Return an orbit that suits how a scene was taken.
+    """Return an orbit that fits the cameras of a scene.
 
-    Where the optical axes meet before the cameras, it is around that point at the cameras' median
-    distance and elevation: all around if the cameras are, else over the azimuths that they cover.
-    Where the axes do not meet, as on a vehicle, it sways about the median depth of the scene's
-    points, if there are any, before the middle one of `own`: the shots of one camera, in order.
+    If the optical axes meet, the orbit is around that point at the median distance and elevation of
+    the cameras: a circle if they surround it, else an arc over their azimuths. If the axes do not
+    meet, as on a vehicle, the arc is around a point in front of the middle shot of `own`, the shots
+    of one camera in order, at the median depth of the scene's points (if there are any).
     """
     viewmats = np.stack([s.viewmat for s in shots])
     up = up_direction(viewmats)
@@ -114,7 +114,7 @@ def meeting_point(
 
 
 def _around(focus, centers, up) -> Orbit:
-    """Return the orbit that goes where cameras are."""
+    """Return the orbit around a focus through the region of the cameras."""
     away = centers - focus
     distances = np.linalg.norm(away, axis=1)
     heights = np.arcsin(np.clip(away @ up / np.maximum(distances, 1e-12), -1, 1))
@@ -136,7 +136,7 @@ def _around(focus, centers, up) -> Orbit:
 
 
 def _median_depth(shot: Shot, points, centers) -> float:
-    """Return the median depth of the points in a shot; without any, the cameras' spread."""
+    """Return the median depth of the points in a shot, or the spread of the cameras without any."""
     local = points @ shot.viewmat[:3, :3].T + shot.viewmat[:3, 3]
     depths = local[shot.project(local)[1], 2]
     if len(depths):

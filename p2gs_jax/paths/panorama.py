@@ -1,6 +1,6 @@
 """Panoramas: pinhole images around a common centre, reprojected to a cylinder.
 
-A wide view of the radiance field is stitched from narrow slices around one centre.
+A wide view of the radiance field is stitched from renders of narrow slices around one centre.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from jaxtyping import Bool, Float, Float32
 from p2gs_jax.paths.shots import Pose, Shot
 from p2gs_jax.scene.rigid import pose_of
 
-# Coverage is judged at this many directions per radian, up to this height (tangent of elevation).
+# Coverage is tested at this many directions per radian, up to this height (tangent of elevation).
 PROBES, HIGHEST = 2 * 180 / np.pi, 3.0
-# A column counts as covered from this share of the tallest column on.
+# A column counts as covered if its height is at least this share of the tallest column.
 FULL_COLUMN = 0.75
-# Angle of a slice: the affine approximation of splats is off far from the axis; in narrow slices it
-# is nearly the same on both sides of an edge.
+# Largest angle of a slice: the affine approximation of splats has an error far from the axis, which
+# in narrow slices is nearly the same on both sides of an edge.
 WIDEST_SLICE = np.deg2rad(20)
 
 # Linear radiance [h w 3], alpha [h w] and alpha-weighted depth [h w].
@@ -45,17 +45,17 @@ class Cylinder:
 
     @property
     def span(self) -> float:
-        """Radians from the left edge to the right."""
+        """The angle from the left edge to the right one, radians."""
         return self.width / self.focal
 
     def resized(self, width: int) -> Cylinder:
-        """Return the cylinder with `width` pixels across; the height follows, rounded."""
+        """Return the cylinder with a width of `width` pixels, and the height in proportion."""
         scale = width / self.width
         height = max(1, round(self.height * scale))
         return replace(self, focal=self.focal * scale, width=width, height=height)
 
     def rays(self) -> Float[np.ndarray, "h w 3"]:
-        """Return world directions of all pixels, of length 1 across the axis."""
+        """Return world directions of all pixels, with length 1 perpendicular to the axis."""
         azimuth = self.left + (np.arange(self.width) + 0.5) / self.focal
         height = self.top + (np.arange(self.height) + 0.5) / self.focal
         h, a = np.meshgrid(height, azimuth, indexing="ij")
@@ -65,9 +65,9 @@ class Cylinder:
 def covering(shots: Iterable[Shot], viewmat: Pose) -> Cylinder:
     """Return the cylinder that cameras cover, at the finest of their resolutions.
 
-    From side to side it spans all cameras, less what is seen in less than three quarters of their
-    height, or the full circle where they see something all around; up and down it is cut to what is
-    seen in all columns that are covered. Distances between the cameras are neglected.
+    Horizontally it has the columns with at least three quarters of the full height, or the full
+    circle if every direction is seen. Vertically it has the rows that all these columns see.
+    Distances between the cameras are neglected.
     """
     shots = list(shots)
     around, tall = round(2 * np.pi * PROBES), 2 * round(HIGHEST * PROBES)
@@ -83,7 +83,7 @@ def covering(shots: Iterable[Shot], viewmat: Pose) -> Cylinder:
         rows = covered.any(1)
     first, last = np.flatnonzero(rows)[[0, -1]]
     focal = max(float(max(s.K[0, 0], s.K[1, 1])) for s in shots)
-    # A probe stands for its surroundings: leave one out at every edge.
+    # A probe represents its surroundings, so the outermost one at every edge is left out.
     cut = 0 if count == around else 1
     top, bottom = (probe.top + row / probe.focal for row in (first + 1, last))
     left = probe.left + (start + cut) / probe.focal
@@ -92,29 +92,29 @@ def covering(shots: Iterable[Shot], viewmat: Pose) -> Cylinder:
 
 
 def _without_largest_gap(good: Bool[np.ndarray, " n"]) -> tuple[int, int]:
-    """Return begin and length of the circular range that leaves out the longest run of False."""
-    there = np.flatnonzero(good)
-    gaps = np.diff(np.append(there, there[0] + len(good))) - 1
+    """Return start and length of the circular range without the longest run of False."""
+    rows = np.flatnonzero(good)
+    gaps = np.diff(np.append(rows, rows[0] + len(good))) - 1
     widest = int(np.argmax(gaps))
     if gaps[widest] == 0:
         return 0, len(good)
-    return int(there[(widest + 1) % len(there)]), int(len(good) - gaps[widest])
+    return int(rows[(widest + 1) % len(rows)]), int(len(good) - gaps[widest])
 
 
 def stitch(
     images: Sequence[Float32[np.ndarray, "h w c"]], shots: Sequence[Shot], cylinder: Cylinder
 ) -> Float32[np.ndarray, "h w c"]:
-    """Reproject images to a cylinder: every pixel from the one camera that sees it most centrally.
+    """Reproject images to a cylinder: each pixel from the camera that sees it closest to its axis.
 
-    Images have at most 4 channels, and their cameras a common centre; what none sees is 0. A
-    ValueError says that an image has another size than its camera.
+    Images have at most 4 channels, and their cameras a common centre; unseen pixels are 0. Raises a
+    ValueError if an image has another size than its camera.
     """
     rays = cylinder.rays()
     out = np.zeros((*rays.shape[:2], images[0].shape[2]), np.float32)
     best = np.full(rays.shape[:2], -np.inf)
     for k, (image, shot) in enumerate(zip(images, shots, strict=True)):
         if image.shape[:2] != (shot.height, shot.width):
-            raise ValueError(f"image {k} is {image.shape[:2]}, its camera not")
+            raise ValueError(f"image {k} has the size {image.shape[:2]}, unlike its camera")
         local = rays @ shot.viewmat[:3, :3].T
         xy, inside = shot.project(local)
         cosine = local[..., 2] / np.maximum(np.linalg.norm(local, axis=-1), 1e-12)
@@ -125,7 +125,7 @@ def stitch(
 
 
 def _sample(image: np.ndarray, at: Float32[np.ndarray, "h w 2"]) -> np.ndarray:
-    """Interpolate at positions in OpenCV's convention: pixel centres at integers."""
+    """Interpolate at positions in the convention of OpenCV, with pixel centres at integers."""
     values = np.ascontiguousarray(image, np.float32)
     x, y = np.ascontiguousarray(at[..., 0]), np.ascontiguousarray(at[..., 1])
     out = cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -133,15 +133,15 @@ def _sample(image: np.ndarray, at: Float32[np.ndarray, "h w 2"]) -> np.ndarray:
 
 
 def slices(cylinder: Cylinder) -> list[Shot]:
-    """Return pinhole cameras of one size that together see a cylinder from its centre.
+    """Return pinhole cameras of one size that together cover a cylinder from its centre.
 
-    They have its resolution in their middle and a finer one towards their edges.
+    Their resolution is that of the cylinder in the middle, and finer towards the edges.
     """
     count = max(1, int(np.ceil(cylinder.span / WIDEST_SLICE)))
     half = cylinder.span / count / 2
     f = cylinder.focal
     tallest = max(abs(cylinder.top), abs(cylinder.top + cylinder.height / f))
-    # One more pixel on each side for interpolation; principal point in the middle.
+    # One more pixel on each side is for interpolation; the principal point is in the middle.
     width = 2 * (int(np.ceil(f * np.tan(half))) + 1)
     height = 2 * (int(np.ceil(f * tallest / np.cos(half))) + 1)
     K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1.0]])

@@ -1,4 +1,4 @@
-"""Pictures of a finished run: of shots, and panoramas."""
+"""Pictures of a finished run: renders of shots, and panoramas."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ def _layers(run: Run, shot: Shot, at: float | None) -> Layers:
 def metered_shots(
     run: Run, shots: Sequence[Shot], of: ExposureOf, exposure_ev: float = 0.0, frames: float = 0.0
 ) -> list[Shot]:
-    """Return shots with the exposures that a metering rule gives small pictures of them.
+    """Return shots with the exposures that a metering rule chooses from small pictures of them.
 
-    `exposure_ev` adds stops. Exposures follow what is seen within about `frames` shots, in their
-    order; 0 meters each by itself.
+    `exposure_ev` adds stops. Exposures adapt to the scene within about `frames` shots in their
+    order; 0 meters each shot separately.
     """
     stops = []
     for shot in shots:
@@ -53,7 +53,7 @@ def shot_frames(
     display_of: Callable[[Shot], DisplayTransform],
     photograph: Callable[[int], Float32[np.ndarray, "h w 3"] | None] | None = None,
 ) -> Iterator[OutputFrame]:
-    """Yield a frame for every shot; `photograph` returns what is written beside a view."""
+    """Yield a frame for every shot; `photograph` returns the photograph of a view."""
     for shot in shots:
         linear, alpha, depth = _layers(run, shot, shot.time)
         transform = display_of(shot)
@@ -70,7 +70,7 @@ def wide_frames(
 ) -> Iterator[OutputFrame]:
     """Yield wide views of the field by name, rig-to-world pose and time, seconds.
 
-    The viewmat of the cylinder is rig-to-camera. What moves is shown at the time, or not at all.
+    The viewmat of the cylinder is rig-to-camera. Moving objects appear only if a time is given.
     """
     for name, pose, at in steps:
         placed = replace(cylinder, viewmat=cylinder.viewmat @ inverse(pose))

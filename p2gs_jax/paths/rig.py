@@ -1,7 +1,7 @@
-"""Rigs: cameras that move together, and which of their photographs were taken at the same time.
+"""Rigs: cameras that move together, and groups of their photographs with the same time.
 
-Photographs of different cameras belong to the same time step in the same frame of a drive, and
-elsewhere where their file names agree (`front/000003.png`, `front_left/000003.png`).
+Photographs of different cameras belong to one time step if they are of one frame of a drive, or
+otherwise if their file names agree (`front/000003.png`, `front_left/000003.png`).
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from p2gs_jax.paths.shots import Pose, Poses, Shot
 from p2gs_jax.scene.rigid import camera_centers, inverse, moment_of, pose_of, up_direction
 from p2gs_jax.types import View
 
-# Largest median angle between the cameras' relative rotations over time.
+# Largest median deviation of the cameras' relative rotations over time.
 LEAST_RIGID = np.deg2rad(5)
-# The mean of the directions in which cameras look is shorter than this where they look all around.
+# Cameras look in all directions if the mean of their viewing directions is shorter than this.
 ALL_AROUND = 0.5
 
 
 @dataclass(frozen=True)
 class TimeStep:
-    """What a rig took at one time: its rig-to-world pose, and shots by camera; some may be missing.
+    """The rig-to-world pose of a rig at one time, and its shots by camera; some may be missing.
 
-    The name is what the file names have in common, or the number of the frame.
+    The name is the common part of the file names, or the number of the frame.
     """
 
     name: str
@@ -38,18 +38,17 @@ class TimeStep:
 
     @property
     def time(self) -> float | None:
-        """The middle of its photographs' times, seconds, or None where they have none."""
+        """The median time of its photographs, seconds, or None if they have no times."""
         times = [shot.time for shot in self.shots.values() if shot.time is not None]
         return float(np.median(times)) if times else None
 
 
 @dataclass(frozen=True)
 class Rig:
-    """Cameras with fixed places on a rig, and its steps in the order of their names.
+    """Cameras with fixed positions on a rig, and its time steps in the order of their names.
 
-    The rig's origin is the mean of the cameras' centres; its axes are x right, y down and z
-    forward, level as its cameras are. A mount is the shot of a camera as seen from the rig: its
-    `viewmat` is rig-to-camera.
+    The origin of the rig is the mean of the camera centres; its axes are x right, y down and z
+    forward, level with its cameras. The `viewmat` of a mount is rig-to-camera.
     """
 
     mounts: dict[str, Shot]
@@ -57,15 +56,15 @@ class Rig:
 
     @property
     def poses(self) -> Poses:
-        """Rig-to-world at every step."""
+        """Rig-to-world poses at all time steps."""
         return np.stack([step.pose for step in self.steps])
 
 
 def find_rig(shots: Sequence[Shot], views: Sequence[View]) -> Rig:
-    """Return the rig that took the views of a scene.
+    """Return the rig of the cameras of a scene.
 
-    A UserError says that there is one camera, that no file names agree between cameras, or that
-    they move against each other.
+    Raises a UserError if there is one camera, if no file names agree between cameras, or if the
+    cameras move relative to each other.
     """
     cameras = sorted({v.camera for v in views})
     steps: dict[str, dict[str, Shot]] = defaultdict(dict)
@@ -112,8 +111,8 @@ def _mounts(cameras: list[str], steps: list[dict[str, Shot]]) -> dict[str, Shot]
         from_anchor[camera], lenses[camera] = _mean_pose(relative), pairs[0][camera]
         turns = Rotation.from_matrix(relative[:, :3, :3] @ from_anchor[camera][:3, :3].T)
         if np.median(turns.magnitude()) > LEAST_RIGID:
-            why = f"The cameras {anchor!r} and {camera!r} turn against each other: they do not sit "
-            why += "on a common rig."
+            why = f"The cameras {anchor!r} and {camera!r} turn relative to each other, so they are "
+            why += "not on one rig."
             raise UserError(why, fix="leave out --panorama")
     from_rig = _level(np.stack(list(from_anchor.values())), list(from_anchor))
     mounts = ((c, lens, from_anchor[c] @ from_rig) for c, lens in lenses.items())
@@ -121,10 +120,10 @@ def _mounts(cameras: list[str], steps: list[dict[str, Shot]]) -> dict[str, Shot]
 
 
 def _level(viewmats: Poses, names: Sequence[str]) -> Pose:
-    """Return rig-to-anchor: the origin amid the cameras, z where they look on average, x level.
+    """Return rig-to-anchor: the origin is the mean camera centre, z the mean viewing direction.
 
-    Where they look all around, z is where the one called "front" looks, else the first one. The
-    viewmats are anchor-to-camera.
+    The x axis is level. If cameras look in all directions, z is the viewing direction of the one
+    with "front" in its name, else of the first one. The viewmats are anchor-to-camera.
     """
     up = up_direction(viewmats)
     level = viewmats[:, 2, :3] - np.outer(viewmats[:, 2, :3] @ up, up)

@@ -1,4 +1,4 @@
-"""Shots: pictures to render of a fitted scene, with pose, lens, exposure and gamma.
+"""Shots: the cameras of pictures to render, with pose, lens, exposure and gamma.
 
 Poses are 4x4 matrices in float64 with OpenCV's axes: x right, y down, z forward.
 """
@@ -25,7 +25,7 @@ from p2gs_jax.types import Camera, View
 Pose = Float[np.ndarray, "4 4"]
 Poses = Float[np.ndarray, "n 4 4"]
 LARGEST = 16384  # pixels
-# Tolerance of rotations that were written with few digits; they are made orthonormal again.
+# Tolerance for rotations that were written with few digits; they are made orthonormal.
 TOLERANCE = 0.01
 
 
@@ -33,11 +33,11 @@ TOLERANCE = 0.01
 class Shot:
     """A pinhole camera on a path.
 
-    The name is that of the picture's file, without suffix; it may name subfolders. The viewmat is
-    world-to-camera (OpenCV axes); K, width and height are in pixels, pixel centres at +0.5. The
-    exposure is in stops from the geometric mean of the training exposures; `view` is the row in
-    `Scene.views` of the photograph taken there. What moves is where it was at `time`, seconds, or
-    is not shown.
+    The name is the file name of the picture without suffix, and may contain subfolders. The viewmat
+    is world-to-camera (OpenCV axes); K, width and height are in pixels, with pixel centres at +0.5.
+    The exposure is in stops from the geometric mean of the training exposures. `view` is the row in
+    `Scene.views` of the photograph with this camera. Moving objects are drawn where they were at
+    `time`, seconds; without a time they are not drawn.
     """
 
     name: str
@@ -51,7 +51,7 @@ class Shot:
     time: float | None = None
 
     def resized(self, width: int) -> Shot:
-        """Return the shot with `width` pixels across; the height follows, rounded."""
+        """Return the shot with a width of `width` pixels, and the height in proportion."""
         height = max(1, round(self.height * width / self.width))
         K = scale_intrinsics(self.K, width / self.width, height / self.height)
         return replace(self, K=K, width=width, height=height)
@@ -59,20 +59,20 @@ class Shot:
     def project(
         self, local: Float[np.ndarray, "*n 3"]
     ) -> tuple[Float[np.ndarray, "*n 2"], Bool[np.ndarray, "*n"]]:
-        """Return pixels of points in camera space, centres at +0.5, and which of them it sees."""
+        """Return pixels of points in camera space, centres at +0.5, and which are visible."""
         front = local[..., 2] > 1e-9
         xy = local[..., :2] / np.where(front, local[..., 2], 1.0)[..., None]
         xy = xy * self.K[[0, 1], [0, 1]] + self.K[:2, 2]
         return xy, front & np.all((xy >= 0) & (xy <= (self.width, self.height)), axis=-1)
 
     def camera(self) -> Camera:
-        """Return the renderer's camera."""
+        """Return the camera for the renderer."""
         viewmat, K = jnp.asarray(self.viewmat, jnp.float32), jnp.asarray(self.K, jnp.float32)
         return Camera(viewmat, K, self.width, self.height)
 
 
 def view_shots(views: Sequence[View], max_width: int | None = None) -> list[Shot]:
-    """Return a shot for every view of a scene, in order, at most `max_width` pixels across."""
+    """Return a shot for every view of a scene, in order, at most `max_width` pixels wide."""
     out = []
     for row, view in enumerate(views):
         K, width, height = camera_at(view, max_width)
@@ -83,10 +83,10 @@ def view_shots(views: Sequence[View], max_width: int | None = None) -> list[Shot
 
 
 def of_camera(shots: Sequence[Shot], views: Sequence[View], camera: str | None) -> list[Shot]:
-    """Return the shots that one physical camera took, in order of names.
+    """Return the shots of one physical camera in the order of names.
 
-    None takes the camera with the most shots, the first of several. A UserError says that a camera
-    took none.
+    None selects the camera with the most shots, or the first of several. Raises a UserError if the
+    camera has no shots.
     """
     cameras = [views[s.view].camera for s in shots if s.view is not None]
     counts = Counter(cameras)
@@ -95,7 +95,7 @@ def of_camera(shots: Sequence[Shot], views: Sequence[View], camera: str | None) 
     chosen = [s for s, name in zip(shots, cameras, strict=True) if name == camera]
     if not chosen:
         known = ", ".join(sorted(counts)) or "none"
-        raise UserError(f"--camera {camera!r} took none of these views.", fix=f"choose of: {known}")
+        raise UserError(f"--camera {camera!r} has none of these views.", fix=f"use one of: {known}")
     return sorted(chosen, key=lambda s: natural(s.name))
 
 
@@ -109,11 +109,11 @@ def common_lens(shots: Sequence[Shot]) -> tuple[Float[np.ndarray, "3 3"], int, i
 def make_camera(K: ArrayLike, viewmat: ArrayLike, width: int, height: int) -> Camera:
     """Return a pinhole camera to render from.
 
-    K is 3x3 without skew, in pixels as width and height, pixel centres at +0.5; the viewmat is 4x4,
-    world-to-camera, OpenCV axes, in the coordinates of the scene. A UserError says that an argument
-    has another shape or meaning.
+    K is 3x3 without skew, in pixels like width and height, with pixel centres at +0.5. The viewmat
+    is 4x4, world-to-camera, OpenCV axes, in the coordinates of the scene. Raises a UserError if an
+    argument has another shape or meaning.
     """
-    fix = "docs/conventions.md says what K and viewmat are"
+    fix = "docs/conventions.md defines K and viewmat"
     for name, value in (("width", width), ("height", height)):
         if not isinstance(value, int | np.integer) or not 1 <= value <= LARGEST:
             why = f"the camera's {name} {value!r} is not a whole number from 1 to {LARGEST}"
@@ -126,7 +126,7 @@ def make_camera(K: ArrayLike, viewmat: ArrayLike, width: int, height: int) -> Ca
 
 
 def as_matrix(values: ArrayLike, name: str, size: int) -> Float[np.ndarray, "n n"]:
-    """Return a square matrix of finite numbers; a ValueError says that values are not one."""
+    """Return a square matrix of finite numbers; other values raise a ValueError."""
     try:
         out = np.array(values, np.float64)
     except (TypeError, ValueError):
@@ -139,17 +139,17 @@ def as_matrix(values: ArrayLike, name: str, size: int) -> Float[np.ndarray, "n n
 
 
 def checked_lens(values: ArrayLike) -> Float[np.ndarray, "3 3"]:
-    """Return the camera matrix of a pinhole without skew; a ValueError says what it is not."""
+    """Return the camera matrix of a pinhole without skew; other values raise a ValueError."""
     K = as_matrix(values, "K", 3)
     if K[0, 0] <= 0 or K[1, 1] <= 0 or not np.array_equal(K[2], [0, 0, 1]):
-        raise ValueError("has a K with no positive focal lengths, or a last row other than 0 0 1")
+        raise ValueError("has a K without positive focal lengths, or a last row other than 0 0 1")
     if K[0, 1] != 0 or K[1, 0] != 0:
-        raise ValueError("has a K with skew, which the renderer does not know")
+        raise ValueError("has a K with skew, which the renderer does not support")
     return K
 
 
 def checked_pose(values: ArrayLike, name: str) -> Pose:
-    """Return a pose with an orthonormal rotation; a ValueError says that it is not a pose."""
+    """Return a pose with an orthonormal rotation; other values raise a ValueError."""
     matrix = as_matrix(values, name, 4)
     rotation = nearest_rotation(matrix[:3, :3], TOLERANCE)
     if rotation is None or not np.allclose(matrix[3], [0, 0, 0, 1], atol=TOLERANCE):

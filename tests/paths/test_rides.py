@@ -170,7 +170,7 @@ UNLIKE = [view(f"{c}/{c}_{k}.png", turned(0, (0, 0, k))) for c in "ab" for k in 
 LOOSE = [
     view(f"{c}/{k}.png", turned(40 * k * (c == "b"), (0, 0, k))) for c in "ab" for k in range(4)
 ]
-NO_RIGS = {"one camera": ALONE, "never agree": UNLIKE, "turn against each other": LOOSE}
+NO_RIGS = {"one camera": ALONE, "never agree": UNLIKE, "turn relative to each other": LOOSE}
 NO_RIGS["'back'"] = [*photographs(), view("back/000099.png", turned(180))]
 
 
