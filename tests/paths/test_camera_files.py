@@ -42,7 +42,7 @@ def test_what_is_written_is_read_again(tmp_path):
 WRONG = {
     "no viewmat": ("viewmat", ...),
     "no K": ("K", ...),
-    "K with no positive": ("K", [[0, 0, 1], [0, 50, 1], [0, 0, 1]]),
+    "K without positive": ("K", [[0, 0, 1], [0, 50, 1], [0, 0, 1]]),
     "skew": ("K", [[50, 3, 32], [0, 50, 24], [0, 0, 1]]),
     "unknown field 'exposure'": ("exposure", 2),
     "viewmat": ("viewmat", None, [[1, 2], [3, 4]], (2 * np.eye(4)).tolist()),
