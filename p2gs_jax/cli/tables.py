@@ -65,7 +65,7 @@ def print_headline(metrics: dict[str, Any], run: Path) -> None:
             facts = [f"{PROTOCOLS[name].views.capitalize()} {part['psnr']:.1f} dB over {views}"]
     facts.append(count_of(metrics["counts"]["gaussians"], "Gaussian"))
     facts.append(duration(whole_run(metrics["seconds"]) or 0.0))
-    next_ones = ("view {}", "report {}", "export {} --format display-ply")
+    next_ones = ("view {}", "report {}", "export {} --format html")
     lines = [f"{', '.join(facts)}.", "Next:"]
     lines += [f"  p2gs-jax {command.format(where)}" for command in next_ones]
     lines.append(f"Run folder: {run} (open {run / 'summary.png'} first)")
