@@ -176,8 +176,8 @@ def _judged(
     aligned = None if judge.reference is None else judge.reference(index)
     scale = sample = None
     if aligned is not None:
-        shown = judge.usual(None)
-        scale = with_fitted_exposure(shown, linear, aligned, mask, alpha).exposure
+        usual_of_all = judge.usual(None)
+        scale = with_fitted_exposure(usual_of_all, linear, aligned, mask, alpha).exposure
     if truth is not None:
         sample = sampled(linear, truth, mask > 0.5, len(scene.views))
     return _Judged(

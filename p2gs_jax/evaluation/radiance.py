@@ -147,15 +147,15 @@ class Alignment(NamedTuple):
         a, b = np.log2(np.maximum(linear[keep], 1e-12)), np.log2(truth[keep])
         stops = np.minimum(np.abs(a + self.shift / LN2 - b), STOPS_CAP)
         bent = np.minimum(np.abs(self.power * a + self.offset / LN2 - b), STOPS_CAP)
-        shown = (linear * scale, truth, mask, brightest * scale)
+        images = (linear * scale, truth, mask, brightest * scale)
         return {
             "stops_median": float(np.median(stops)) if stops.size else float("nan"),
             "stops_rms": float(np.sqrt(np.mean(stops**2))) if stops.size else float("nan"),
             "stops_rms_power": float(np.sqrt(np.mean(bent**2))) if bent.size else float("nan"),
-            "pu21_psnr": pu21_psnr(*shown),
-            "pu21_ssim": pu21_ssim(*shown),
-            "delta_e_itp": delta_e_itp(*shown),
-            "mu_law_psnr": mu_law_psnr(*shown[:3]),
+            "pu21_psnr": pu21_psnr(*images),
+            "pu21_ssim": pu21_ssim(*images),
+            "delta_e_itp": delta_e_itp(*images),
+            "mu_law_psnr": mu_law_psnr(*images[:3]),
         }
 
     def summary(self, rows: dict[str, dict[str, float]], splits: dict[str, str]) -> dict:

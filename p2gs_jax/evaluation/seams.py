@@ -145,12 +145,12 @@ def measure_seam(
         undevelop(values, view.transform, places(xy, view.camera.width, view.camera.height))
         for values, view, xy in zip((a, b), (first, second), where, strict=True)
     ]
-    shown = [develop(linear, common) for linear in radiance]
+    developed = [develop(linear, common) for linear in radiance]
     return Seam(
         _apart(np.log2(plain[0]), np.log2(plain[1])),
         _apart(np.log2(radiance[0]), np.log2(radiance[1])),
         255 * _apart(a, b),
-        255 * _apart(shown[0], shown[1]),
+        255 * _apart(developed[0], developed[1]),
         float(np.median(np.log2(radiance[0]) - np.log2(radiance[1]))),
         int(use.sum()),
     )

@@ -93,12 +93,12 @@ def options_of(cfg: FitConfig, scene: Scene) -> CalibrationOptions:
         pivot=p.pivot,
         known=known,
         seed=cfg.train.seed,
-        choice="held_out" if p.select else _asked(p),
+        choice="held_out" if p.select else _from_options(p),
         known_response=scene.known_response,
     )
 
 
-def _asked(p: PhotometryConfig) -> tuple[Form, Response | Curve]:
+def _from_options(p: PhotometryConfig) -> tuple[Form, Response | Curve]:
     """Return the model and the curve of the options."""
     form = Form(p.model, p.white_balance, p.vignetting)
     if p.curve == "spline" and p.spline is None:

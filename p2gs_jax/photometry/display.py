@@ -142,8 +142,8 @@ def undevelop(
     Saturated values give the radiance at which they saturate, values below half an 8-bit code that
     of half a code. Corrections of display values are not undone. `positions` are as for `develop`.
     """
-    shown = np.asarray(ldr, np.float32)
-    return inverse_formation(shown, transform.capture, transform.formation, positions)
+    values = np.asarray(ldr, np.float32)
+    return inverse_formation(values, transform.capture, transform.formation, positions)
 
 
 def display_of_view(params: Params, row: int, cfg: PhotometryConfig) -> DisplayTransform:

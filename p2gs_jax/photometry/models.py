@@ -127,8 +127,8 @@ class Scope(NamedTuple):
         """
         form, by = choice.form, choice.curve.splines
         exposure, gamma, _ = MODELS[form.model]
-        told = self.power and by is None and not self.known
-        levels = (exposure, None if told else gamma, form.white_balance, by)
+        fixed = self.power and by is None and not self.known
+        levels = (exposure, None if fixed else gamma, form.white_balance, by)
         return (
             (self.cameras > 1 or "camera" not in levels)
             and (form.white_balance != "view" or exposure == "view")

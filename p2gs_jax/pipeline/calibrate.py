@@ -156,8 +156,8 @@ def calibrate_run(
             its views do not overlap.
     """
     begin, reporter = time.monotonic(), reporter or Silent()
-    asked, run = require_config(cfg), load_run(run_dir, scene)
-    cfg = dataclasses.replace(run.cfg, photometry=asked.photometry)
+    requested, run = require_config(cfg), load_run(run_dir, scene)
+    cfg = dataclasses.replace(run.cfg, photometry=requested.photometry)
     run.require_photographs(run.scene.train_indices)
     # Only static Gaussians: a moving surface point is elsewhere in another view.
     observations = rendered_colors(

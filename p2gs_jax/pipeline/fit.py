@@ -111,8 +111,8 @@ def fit(
         truth = check_scene(scene, cfg, paths, weights)
         kept = kept_choice(cfg, folder) if resume else None
         # A resumed run that is longer starts from the steps and budget of its first start.
-        asked = with_values(cfg, first_plan(folder))
-        start = _prepared(scene, asked, folder, optimiser, kept, clock, reporter)
+        options = with_values(cfg, first_plan(folder))
+        start = _prepared(scene, options, folder, optimiser, kept, clock, reporter)
         start.cfg = dataclasses.replace(start.cfg, train=cfg.train)
         lock.require()
         left_s = seconds_to_finish(scene, cfg, weights, reference=truth is not None)

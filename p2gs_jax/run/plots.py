@@ -192,9 +192,9 @@ def curves_to_draw(s: PhotometricSolution) -> list[tuple[str, Response, float]]:
     """Return the tone curves to draw: name, response and gamma of each."""
     distinct = np.unique(np.round(s.gammas, 3))
     if len(s.response.parts) == 1:
-        shown = distinct[:: max(1, len(distinct) // MOST_CURVES)]
-        return [(f"gamma {gamma:.2f}", s.response, float(gamma)) for gamma in shown]
+        drawn = distinct[:: max(1, len(distinct) // MOST_CURVES)]
+        return [(f"gamma {gamma:.2f}", s.response, float(gamma)) for gamma in drawn]
     names = CHANNELS if s.response.by == "channel" else [c.name for c in s.cameras]
     middle = float(np.median(s.gammas))
-    shown = zip(names, s.response.parts, strict=True)
-    return [(name, part, middle) for name, part in shown][:MOST_CURVES]
+    drawn = zip(names, s.response.parts, strict=True)
+    return [(name, part, middle) for name, part in drawn][:MOST_CURVES]

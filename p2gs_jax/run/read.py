@@ -233,7 +233,7 @@ def load_run(folder: str | Path, scene: str | Path | None = None) -> Run:
     """
     files = RunFolder(Path(folder))
     _require_finished(files)
-    saved, asked = read_config(files.config)
+    saved, options = read_config(files.config)
     if scene is not None and not Path(scene).exists():
         fix = "name the folder of the run's scene with --scene"
         raise UserError(f"{scene} does not exist.", fix=fix)
@@ -244,7 +244,7 @@ def load_run(folder: str | Path, scene: str | Path | None = None) -> Run:
         why = f"{files.root} has no {files.decisions.name}: the run is of a version that this one "
         why += "cannot read, or the file was removed."
         raise UserError(why, fix="restore it from a copy, or fit again")
-    cfg = decisions.resolve(asked)
+    cfg = decisions.resolve(options)
     gaussians = read_ply(files.radiance)
     owner, moving = read_objects(files.objects, found, gaussians.capacity)
     photometry_file = photometry_files.read_photometry(files.photometry)

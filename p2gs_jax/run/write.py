@@ -101,8 +101,8 @@ def write_run(
     placed = params.gaussians
     if owner is not None and moving is not None:
         placed = posed(placed, owner, *moving.poses(middle_time(scene)))
-    shown_at_rest = bake(at_time(placed, None), transform, cfg.render.radiance)
-    write_ply(folder.splats, shown_at_rest, display_comments(transform))
+    baked = bake(at_time(placed, None), transform, cfg.render.radiance)
+    write_ply(folder.splats, baked, display_comments(transform))
     write_radiance(folder.radiance, params.gaussians, activation=cfg.render.radiance)
     write_fitted(
         folder.photometry,
@@ -124,8 +124,8 @@ def write_run(
 def write_view(folder: Path, name: str, result: ViewResult, store: ImageStore) -> None:
     """Write one view as EXR, PNG and its photograph, under the name of the photograph."""
     stem, camera = Path(name).with_suffix("").as_posix(), camera_of(store, result.index)
-    shown = (result.linear, result.alpha, result.ldr, result.transform, result.depth)
-    write_frame(folder, OutputFrame(stem, *shown, camera, result.photograph))
+    images = (result.linear, result.alpha, result.ldr, result.transform, result.depth)
+    write_frame(folder, OutputFrame(stem, *images, camera, result.photograph))
 
 
 def summary_rows(scene: Scene) -> list[int]:
