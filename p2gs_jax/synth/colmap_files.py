@@ -40,7 +40,8 @@ def write_seeds(
     rgb: UInt8[np.ndarray, "p 3"],
     depths: Sequence[np.ndarray],
 ) -> dict[str, int]:
-    """Write the model of the points that two views see; return how many points and observations.
+    """Write the model of points with at least two views; return the numbers of points and
+    observations.
 
     cameras.bin, images.bin and points3D.bin are as in https://colmap.github.io/format.html.
     """
@@ -108,11 +109,11 @@ def sample_seeds(
 def _observe_seeds(
     xyz: Float64[np.ndarray, "p 3"], views: DriveViews, depths: Sequence[np.ndarray]
 ) -> tuple[Float64[np.ndarray, "v p 2"], Bool[np.ndarray, "v p"]]:
-    """Project the points into every view and tell where they are visible.
+    """Project the points into every view; return the positions and the mask of visible points.
 
-    A point is visible where its projection lies among four pixel centres whose depth, interpolated,
-    is the point's within 1 %. What is interpolated is 1 / z: exact on planes. Silhouettes, where
-    the four pixels see different things, are rejected.
+    A point is visible if the depth interpolated from the four nearest pixel centres agrees within
+    1 %. The interpolated quantity is 1 / z, which is exact on planes. Silhouettes, where the four
+    pixels see different objects, are rejected.
     """
     K, width, height = views.K, views.width, views.height
     xy = np.zeros((len(views.names), len(xyz), 2))

@@ -42,8 +42,8 @@ _PAINTS: list[Vec3] = [
 def build_town(seed: int = 0, layout: Layout = "street", reach: float = 0.0) -> Town:
     """Return one street with a crossing, houses, trees, parked cars, lamps and signs.
 
-    `town` adds an underpass, deep in shadow, and draws the place of the sun; `matte` is the town
-    without gloss; `long` puts streets one behind another as far as the cameras drive, `reach`, m.
+    `town` adds an underpass in deep shadow and draws the position of the sun. `matte` is the town
+    without gloss. `long` repeats streets over the length of the drive, `reach` m.
     """
     if layout == "long":
         count = 1 + max(0, math.ceil((reach - t.STREET_END) / STREET_M))
@@ -58,7 +58,7 @@ def build_town(seed: int = 0, layout: Layout = "street", reach: float = 0.0) -> 
 
 
 def _furnish(build: Builder, *, closed: bool = True) -> None:
-    """Place what stands along a street, and what closes the view; the order decides the draws."""
+    """Place all objects along a street and at its end; their order determines the draws."""
     _pavements(build)
     _houses(build)
     if closed:

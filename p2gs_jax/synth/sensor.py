@@ -1,12 +1,12 @@
 """The cameras' pipeline: ISO drawn per photograph, sRGB, eight bits (paper, appendix "Exposure
-Control"), and on request what real ones add: a filmic curve, gains, drift, vignetting, white
+Control"), and optional effects of real cameras: a filmic curve, gains, drift, vignetting, white
 balance, a lens and a curve per camera, noise.
 
-Exposure is ISO / 8 times the gains: ISO-Const photographs (ISO 8) show the truth with e = 1.
+The exposure is ISO / 8 times the gains, so ISO-Const photographs (ISO 8) have an exposure of 1.
 
-How every photograph was taken is kept in `truth/exposures.csv`: image, camera, iso, exposure,
-exposure_ev, red, green, blue (factors beside the exposure; their product is 1), corners (share of
-the light that reaches them), curve.
+`truth/exposures.csv` has a row per photograph: image, camera, iso, exposure, exposure_ev, red,
+green, blue (factors relative to the exposure; their product is 1), corners (share of the light that
+reaches the corners), curve.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ ISO_REFERENCE, ISO_MINIMUM = 8, 1
 # Variances of photon noise per unit of exposed radiance, and of read noise.
 SHOT_NOISE, READ_NOISE = 2e-4, 1e-6
 DRIFT_PERIODS = 1.3
-# Lenses lose no more than this in their corners, whatever was drawn.
+# Largest share of the light that a drawn lens loses in its corners.
 MOST_LOST = 0.8
 FILE = Path("truth", "exposures.csv")
 COLUMNS = (
@@ -40,8 +40,8 @@ COLUMNS = (
 
 
 class Shots(NamedTuple):
-    """How every photograph was taken: factors on radiance (ISO-Const without gains: 1), and on red,
-    green, blue; share of the light lost in the corners; response."""
+    """Camera settings of every photograph: factors on radiance (ISO-Const without gains: 1) and on
+    red, green, blue; share of the light lost in the corners; tone curve."""
 
     iso: Int[np.ndarray, " v"]
     exposures: Float[np.ndarray, " v"]
@@ -51,12 +51,12 @@ class Shots(NamedTuple):
 
     @property
     def mean_exposures(self) -> Float[np.ndarray, " v"]:
-        """Exposures of the channels together: what balances is not in them."""
+        """Exposures without white balance: the geometric means over the channels."""
         return self.exposures * np.exp(np.log(self.balance).mean(1))
 
     @property
     def tints(self) -> Float[np.ndarray, "v 3"]:
-        """Factors on red, green, blue beside `mean_exposures`; their product is 1."""
+        """Factors on red, green, blue relative to `mean_exposures`; their product is 1."""
         return self.balance / np.exp(np.log(self.balance).mean(1, keepdims=True))
 
     def sensor(self, sensor: Sensor, row: int) -> Sensor:
@@ -66,13 +66,13 @@ class Shots(NamedTuple):
 
 
 def draw_iso(shape: tuple[int, ...], std: float, seed: int) -> Int[np.ndarray, "..."]:
-    """Return ISO ~ N(8, std) (paper: 2 and 4), rounded, at least 1; each photograph has a draw."""
+    """Return a draw of ISO ~ N(8, std) per photograph (paper: 2 and 4), rounded, at least 1."""
     noise = generator(seed, SceneStream.ISO).standard_normal(shape)
     return np.maximum(np.rint(ISO_REFERENCE + std * noise), ISO_MINIMUM).astype(np.int64)
 
 
 def draw_shots(sensor: Sensor, frames: int, cameras: int, seed: int) -> Shots:
-    """Return how all photographs are taken, camera by camera, frame by frame."""
+    """Return the camera settings of all photographs, ordered by camera, then by frame."""
     if len(sensor.curves) not in (0, cameras):
         fix = f"name {cameras} curves, or none"
         raise UserError(f"there are {cameras} cameras, but {len(sensor.curves)} curves.", fix=fix)
@@ -103,7 +103,7 @@ def encode(exposed: Float[np.ndarray, "..."], curve: Curve) -> Float[np.ndarray,
     if curve == "power":
         return np.clip(exposed, 0.0, 1.0) ** (1 / 2.2)
     if curve == "filmic":
-        # An S-curve as film and game engines use (Narkowicz's fit), before the sRGB encoding.
+        # The S-curve of film and game engines (Narkowicz's fit), before the sRGB encoding.
         x = 0.8 * exposed
         exposed = x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14)
     return srgb_encode(exposed)
@@ -112,7 +112,7 @@ def encode(exposed: Float[np.ndarray, "..."], curve: Curve) -> Float[np.ndarray,
 def vignette(height: int, width: int, lost: float) -> Float[np.ndarray, "h w 1"]:
     """Return the light that reaches each pixel: 1 in the centre, 1 - lost in the corners.
 
-    Circles about the centre are equally bright, as behind a lens.
+    Circles around the centre are equally bright, as behind a lens.
     """
     y, x = np.mgrid[:height, :width] + 0.5
     squared = (x - width / 2) ** 2 + (y - height / 2) ** 2
@@ -129,7 +129,8 @@ def photograph(
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Return the eight-bit photograph of linear radiance times an exposure.
 
-    No sensor is plain sRGB; `balance` are factors on red, green, blue; noise needs an `rng`.
+    Without a sensor the tone curve is sRGB. `balance` has factors on red, green, blue. Noise needs
+    an `rng`.
     """
     sensor = sensor or Sensor()
     exposed = np.asarray(linear, np.float64) * exposure
@@ -145,7 +146,7 @@ def photograph(
 
 
 def write_true_exposures(root: Path, names: Sequence[str], shots: Shots) -> None:
-    """Write how the photographs, CAMERA/FILE, were taken, below a scene folder with `truth/`."""
+    """Write the settings of the photographs (CAMERA/FILE) into `truth/` of a scene folder."""
     with (root / FILE).open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)
@@ -159,16 +160,16 @@ def write_true_exposures(root: Path, names: Sequence[str], shots: Shots) -> None
 
 
 def read_true_exposures(root: Path) -> dict[str, float]:
-    """Return image name -> true exposure; empty where the scene folder has no such file.
+    """Return true exposures by image name; empty if the scene folder has no such file.
 
     Raises:
-        UserError: the file lacks a column, or holds what is not a number.
+        UserError: the file lacks a column, or a value is not a number.
     """
     path = root / FILE
     if not path.is_file():
         return {}
     with (
-        readable(path, "mend it, or take it away: it is for judging only"),
+        readable(path, "correct or remove the file: only the evaluation uses it"),
         path.open(newline="", encoding="utf-8-sig") as file,
     ):
         return {row["image"]: float(row["exposure"]) for row in csv.DictReader(file)}

@@ -1,4 +1,4 @@
-"""Options of a data set, and the size of its images, without numpy, so that `--help` is fast."""
+"""Options and image size of a data set, without numpy, so that `--help` is fast."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from typing import Literal
 
 Curve = Literal["srgb", "power", "filmic"]
 Layout = Literal["street", "town", "long", "matte"]
-# Pixels of the paper's images.
+# Size of the paper's images, pixels.
 IMAGE_WIDTH, IMAGE_HEIGHT = 1920, 1300
 
 
 def image_height(width: int, *, multiple: int = 1) -> int:
-    """Return the height, a multiple of a number, with the proportions of the paper's images."""
+    """Return the height for a width (pixels) with the proportions of the paper's images."""
     return max(round(width * IMAGE_HEIGHT / IMAGE_WIDTH / multiple), 1) * multiple
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """What the cameras do to the light. The defaults are the paper's ISO-Var(4)."""
+    """The image formation of the cameras. The defaults are the paper's ISO-Var(4)."""
 
     iso_std: float = 4.0
     """Spread of the ISO about 8 (paper: 2 and 4); 0 is ISO-Const."""

@@ -1,4 +1,4 @@
-"""A town: primitives with materials under a sun and a sky; and what places them one by one.
+"""A town: primitives with materials under a sun and a sky, and the builder that places them.
 
 World: right-handed, metres, x along the street (the driving direction), y to the left, z up, the
 road surface at z = 0. Primitives are axis-aligned boxes, tapered boxes (car cabins, roofs) and
@@ -18,12 +18,12 @@ Vec3 = tuple[float, float, float]
 ROAD_HALF_WIDTH = 5.6
 KERB_HEIGHT = 0.14
 FACADE_LINE = 9.0
-# Along x: the side street, between the buildings' corners; the house across the street; how far
-# one can drive, as behind it stands the tower that closes the view.
+# Extents along x, m: the side street between the corners of buildings, the house across the street,
+# and the drivable length, which ends before the tower that closes the view.
 CROSS_STREET, UNDERPASS, STREET_END = (27.0, 36.0), (54.0, 68.0), 100.0
 UNDERPASS_HEIGHT, FLOOR_HEIGHT, GROUND_FLOOR_HEIGHT = 5.2, 3.2, 4.0
 
-# What `tracer` paints a primitive with; ROAD is the ground plane.
+# Materials of primitives for `tracer`; ROAD is the ground plane.
 Material = IntEnum(
     "Material",
     "ROAD PAVEMENT FACADE PLAIN CAR_BODY CAR_GLASS WHEEL BARK FOLIAGE METAL EMISSIVE SIGN TILES "
@@ -90,9 +90,9 @@ class Solid:
 
 @dataclass
 class Builder:
-    """Places solids; their order decides which random numbers they get.
+    """Places solids; their order determines their random numbers.
 
-    Nothing but houses stands within `clear`, an extent along x.
+    Only houses stand within `clear`, an extent along x, m.
     """
 
     rng: np.random.Generator
@@ -120,7 +120,7 @@ class Builder:
         self.solids.append(Solid(kind, lo, hi, material, color, accent, params, top))
 
     def is_clear(self, x: float, reach: float) -> bool:
-        """Return whether nothing may stand within reach of x."""
+        """Return whether the surroundings of x, within `reach` m, must stay free."""
         return self.clear is not None and (self.clear[0] - reach < x < self.clear[1] + reach)
 
     def post(

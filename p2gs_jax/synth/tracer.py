@@ -1,10 +1,11 @@
 """Ray caster: linear HDR radiance and depth of a town, on the CPU through XLA.
 
-The image is cut into tiles. Each tile makes short lists of the primitives that its rays can meet,
-that can shade its points, and that are near them. A sample finds its nearest primitive, is painted
-by `paint`, and is lit by the sun (one shadow ray), the sky and the ground (ambient, occluded by
-what lies within 5 m: the distance field of the town at three points along the normal, smooth and
-the same from every view). Radiance is averaged over the pixel in linear space.
+The image is cut into tiles. Each tile has short lists of the primitives that its rays can hit, that
+can shade its points, and that are near them. A sample finds its nearest primitive and gets its
+material from `paint`. Its light comes from the sun (one shadow ray), the sky and the ground. This
+ambient light is occluded by primitives within 5 m, through the distance field of the town at three
+points along the normal, which is smooth and equal in all views. Radiance is averaged over the pixel
+in linear space.
 
 Arrays are channel-first: points and directions are [3 R]. Loops over short lists of primitives are
 vectorised over some thousand rays.
@@ -146,7 +147,7 @@ def _light(town: Town, p: Array, view: Array, surface: Surface, hit: Array) -> A
 
 
 def _daylight(p: Float[Array, "3 r"], underpass: tuple[float, float]) -> Float[Array, " r"]:
-    """Return the share of ambient light that reaches points under a house: less from both ends."""
+    """Return the share of ambient light at points under a house, which falls from both ends."""
     inside = (jnp.abs(p[1]) < FACADE_LINE + 0.5) & (p[2] < UNDERPASS_HEIGHT + 0.01)
     depth = jnp.minimum(p[0] - underpass[0], underpass[1] - p[0])
     left = _DARKEST + (1 - _DARKEST) * jnp.exp(-jnp.maximum(depth, 0.0) / _DAYLIGHT_REACH)
@@ -249,7 +250,7 @@ def _intersect(town: Town, o: Array, d: Array, among: Array, carry, update: Call
 def open_sky(
     town: Town, p: Float[Array, "3 r"], n: Float[Array, "3 r"], lower: Array, upper: Array
 ) -> Float[Array, " r"]:
-    """Return how much ambient light reaches points, 0.12 to 1, from the distance field along n.
+    """Return the share of ambient light at points, 0.12 to 1, from the distance field along n.
 
     `n` are unit normals, `lower` and `upper` the bounds of the points.
     """

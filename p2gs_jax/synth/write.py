@@ -1,14 +1,14 @@
-"""Writes a drive as a scene folder: photographs, their truth, a COLMAP model.
+"""A synthetic drive as a scene folder: photographs, ground truth, and a COLMAP model.
 
     images/<camera>/<frame>.png      eight-bit photographs at the drawn ISO
     reference/<camera>/<frame>.png   the same views at ISO 8, without gains, vignetting and noise
     truth/linear/<camera>/<frame>.exr   radiance R G B (half), camera z Z (float; inf: sky)
     truth/sky_masks/<camera>/<frame>.png   255 where the pixel's centre sees the sky
-    truth/exposures.csv              how every photograph was taken, see `sensor`
+    truth/exposures.csv              exposure and camera settings of every photograph, see `sensor`
     sparse/0/*.bin                   PINHOLE cameras, poses, seed points with tracks
     dataset.json                     every parameter
 
-Everything but `reference/` and `truth/` is for a fit to see. The folder appears whole or not at
+A fit may use everything except `reference/` and `truth/`. The folder is created complete or not at
 all.
 """
 
@@ -55,21 +55,21 @@ def write_street(
     layout: Layout = "street",
     report: Callable[[str], None] = lambda line: None,
 ) -> Path:
-    """Render a drive along the procedural street and write it as a scene folder, which is returned.
+    """Render a drive along the procedural street, write its scene folder and return the path.
 
     Args:
-        out: the folder to make; it must not exist, or be empty.
-        frames: photographs of each of the three cameras, `step` m apart.
-        width: pixels (paper: 1920), as is the height (1300).
+        out: the new folder, which must be missing or empty.
+        frames: number of photographs of each of the three cameras, `step` m apart.
+        width: image width, pixels (paper: 1920, with a height of 1300).
         iso_std: spread of the ISO (paper: 2 and 4); 0 writes ISO-Const. `sensor` replaces it.
-        seed: of the town, the ISO and the points.
-        supersample: samples a pixel along each axis; 8 in a `matte` town, else 2, if not given.
-        points: seed points to sample; those seen once are dropped.
-        hold_out: no points are sampled in every n-th frame, as they may be held out; 0: in all.
-        sensor: what the cameras do to the light.
+        seed: seed of the town, the ISO and the points.
+        supersample: samples per pixel along each axis; the default is 8 for `matte`, else 2.
+        points: number of sampled seed points; points with one observation are dropped.
+        hold_out: every n-th frame, which may be held out, gives no points; 0: all frames do.
+        sensor: the image formation of the cameras.
         layout: `town` adds an underpass and draws the sun; `matte` has no gloss; `long` no end.
 
-    UserError: a parameter is impossible, or `out` is in the way.
+    UserError: a parameter is not valid, or `out` is not free.
     """
     out, sensor = Path(out), sensor or Sensor(iso_std=iso_std)
     supersample = (8 if layout == "matte" else 2) if supersample is None else supersample
@@ -83,7 +83,7 @@ def write_street(
     views, frame = _views(frames, width, height, step)
     shots = draw_shots(sensor, frames, len(MOUNTS), seed)
     with atomic_folder(out) as temporary:
-        report(f"rendering {len(views.names)} views of a street with {town.size} solids")
+        report(f"rendering {len(views.names)} views of a street with {town.size} primitives")
         rendered = _render_all(town, views, supersample)
         photographs, depths = _photograph(temporary, views, rendered, shots, sensor, seed, report)
         held = (frame % hold_out == 0) if hold_out and frames > 1 else np.zeros(len(frame), bool)
@@ -150,16 +150,16 @@ def _check(out: Path, asked: dict[str, Any]) -> None:
         asked[name] for name in ("frames", "width", "height", "supersample", "iso_std", "step_m")
     )
     if frames < 1 or width < 16 or height < 16 or std < 0 or samples < 1:
-        why = f"cannot render {frames} frames of {width}x{height} with {samples} samples a side "
-        why += f"and ISO std {std}"
+        why = f"{frames} frames of {width}x{height} pixels with {samples} samples along each axis "
+        why += f"and an ISO spread of {std} cannot be rendered."
         fix = "use at least 1 frame, 16x16 pixels, 1 sample, and a spread of 0 or more"
         raise UserError(why, fix=fix)
     _require_free(out)
     way = (frames - 1) * step
     if asked["layout"] != "long" and way > STREET_END:
-        why = f"{frames} frames of {step:g} m go on for {way:.0f} m; the street ends after "
-        why += f"{STREET_END:.0f}."
-        fix = "use --layout long, which is as many streets as the drive is long, or fewer frames"
+        why = f"{frames} frames with a step of {step:g} m need {way:.0f} m, but the street has "
+        why += f"{STREET_END:.0f} m."
+        fix = "use fewer frames, or --layout long, which has as many streets as the drive needs"
         raise UserError(why, fix=fix)
 
 
@@ -178,6 +178,6 @@ def _render_all(
         linear, depth = tracer.render(viewmat, views.K, views.width, views.height, supersample)
         return linear.astype(np.float16), depth
 
-    yield one(views.viewmats[0])  # compiles once, not once a thread
+    yield one(views.viewmats[0])  # compile before the threads start
     with ThreadPoolExecutor(2) as pool:
         yield from pool.map(one, views.viewmats[1:])

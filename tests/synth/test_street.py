@@ -186,9 +186,9 @@ def test_a_long_town_goes_on_as_far_as_the_drive_and_ends_behind_it(way):
 @pytest.mark.parametrize(
     ("asked", "words"),
     [
-        ({"frames": 0}, "cannot render"),
-        ({"frames": 101, "step": 1.2}, r"101 frames of 1\.2 m go on for 120 m"),
-        ({"frames": 101, "step": 1.2, "layout": "town"}, "use --layout long"),
+        ({"frames": 0}, "cannot be rendered"),
+        ({"frames": 101, "step": 1.2}, r"101 frames with a step of 1\.2 m need 120 m"),
+        ({"frames": 101, "step": 1.2, "layout": "town"}, "--layout long"),
     ],
 )
 def test_what_cannot_be_made_is_refused(street, tmp_path, asked, words):

@@ -1,7 +1,7 @@
 // The page: its state, the effects of its controls, and the times to draw.
 
 const SHOWS = ["picture", "stops", "clipping", "split"];
-const SAID = { picture: "picture", stops: "stops", clipping: "clipping", split: "photo | render" };
+const SHOW_NAMES = { picture: "picture", stops: "stops", clipping: "clipping", split: "photo | render" };
 const CURVE_NAMES = { spline: "fitted", srgb: "sRGB", power: "power 2.2", linear: "none" };
 // Slower frames are drawn smaller while the camera moves, seconds.
 const SLOW = 0.06, QUICK = 0.03, SMALLEST = 0.2, REST = 0.25;
@@ -165,13 +165,13 @@ class Page {
     change("line", "input", (e) => { look.split = Number(e.value); });
     for (const show of SHOWS) {
       const button = document.createElement("button");
-      Object.assign(button, { type: "button", textContent: SAID[show], id: `show-${show}` });
+      Object.assign(button, { type: "button", textContent: SHOW_NAMES[show], id: `show-${show}` });
       button.addEventListener("click", () => this.choose(show));
       $("shows").append(button);
     }
     const none = !Object.keys(this.scene.photographs).length;
     $("show-split").disabled = none;
-    if (none) $("show-split").title = "The page holds no photographs (--photographs)";
+    if (none) $("show-split").title = "The page contains no photographs (--photographs)";
     fill($("at"), [["", "—"], ...this.scene.views.map((v, i) => [i, v.name])]);
     change("at", "change", (e) => e.value !== "" && this.go(Number(e.value)));
     change("previous", "click", () => this.step(-1));
@@ -455,14 +455,14 @@ function fill(select, options) {
 function complain(error) {
   $("status").className = "wrong";
   $("status").setAttribute("role", "alert");
-  $("status").textContent = `This page cannot show its scene: ${error.message || error}`;
+  $("status").textContent = `This page cannot display its scene: ${error.message || error}`;
   throw error;
 }
 
 async function open() {
   const scene = JSON.parse($("scene").textContent);
   if (typeof DecompressionStream === "undefined")
-    throw new Error("This browser is too old to unpack it (no DecompressionStream).");
+    throw new Error("This browser is too old to decompress the scene (no DecompressionStream).");
   const splats = await decodeSplats(scene.splats, $("splats").textContent);
   $("splats").remove();
   const page = new Page(scene, splats);

@@ -86,7 +86,7 @@ class Renderer {
     const width = Math.min(2048, Math.max(splats.count, 1));
     const height = Math.ceil(splats.count / width);
     if (height > gl.getParameter(gl.MAX_TEXTURE_SIZE))
-      throw new Error("This device has no room for so many Gaussians.");
+      throw new Error("This device has not enough memory for the Gaussians.");
     this.table = [width, height];
     this.splats = this.texture(gl.TEXTURE_2D_ARRAY, gl.NEAREST);
     gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, gl.RGB32F, width, height, splats.triples.length);
@@ -104,7 +104,7 @@ class Renderer {
     });
     // Some devices hold only 256 bits a pixel: each column is projected separately there.
     this.projected = this.projections([[0, 1, 2]]) || this.projections([[0], [1], [2]]);
-    if (!this.projected) throw new Error("This device cannot render to integers.");
+    if (!this.projected) throw new Error("This device cannot render to integer textures.");
     this.quads = gl.createVertexArray();
     gl.bindVertexArray(this.quads);
     this.indices = gl.createBuffer();
