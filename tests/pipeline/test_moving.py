@@ -112,7 +112,7 @@ def test_only_objects(run):
     inside = object_mask(run.scene.views[4], run.scene.objects, camera.width, camera.height, 0.4)
     assert alpha[inside].max() > 0.5
     assert alpha[~inside].mean() < 0.02
-    with pytest.raises(UserError, match="no object"):
+    with pytest.raises(UserError, match="no moving object"):
         dataclasses.replace(run, owner=None, moving=None).only_objects()
 
 
