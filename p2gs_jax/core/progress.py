@@ -56,7 +56,7 @@ class LogRecord:
         """Return the progress of the run as text."""
         total = max(round(self.step / self.progress), self.step) if self.progress else "?"
         left = "" if self.left_s is None else f", {as_clock(self.left_s)} left"
-        scores = f"loss {self.loss:.4f}, PSNR {self.psnr:.2f} dB"
+        scores = f"loss {self.loss:.4f}, training PSNR {self.psnr:.2f} dB"
         return f"step {self.step} of {total}, {scores}{left}, {self.gaussians} Gaussians"
 
 

@@ -153,9 +153,9 @@ class Metering:
         if self.rule.meter is None:
             best = rules[0]
             return (
-                f"Metering: none of {len(rules)} rules explains the exposures (RMS error of "
-                f"held-out views: {best.left_out_ev:.2f} EV for the best, {best.words}; "
-                f"{constant:.2f} EV for a constant): a constant exposure is used."
+                "New viewpoints are shown at a constant exposure: no metering rule predicts the "
+                f"exposures of held-out views better (RMS error {best.left_out_ev:.2f} EV for the "
+                f"best of {len(rules)}, {best.words}; {constant:.2f} EV for a constant)."
             )
         return (
             f"Metering: {self.rule.words} explains the exposures (RMS error of held-out views: "

@@ -15,7 +15,7 @@ from p2gs_jax.core.progress import Reporter
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.alignment import ExposureError, exposure_error
 from p2gs_jax.pipeline.fit import fit
-from p2gs_jax.run.folder import locked, require_free
+from p2gs_jax.run.folder import RunFolder, locked, require_free
 from p2gs_jax.synth.sensor import read_true_exposures
 from p2gs_jax.synth.settings import image_height
 from p2gs_jax.synth.write import write_street
@@ -43,17 +43,21 @@ def run_demo(
 ) -> DemoResult:
     """Make a street, fit it and compare the exposures.
 
-    The demo writes `out/street` and `out/run` and replaces an earlier demo there. The street has
+    The demo writes `out/street` and `out/run`, also over a demo that was interrupted. The street has
     `frames` frames per camera, `width` pixels wide, whose ISO has mean 8 and standard deviation
     `iso_std`.
 
     Raises:
-        UserError: `out` holds files that the demo did not make, or another program writes to it.
+        UserError: `out` holds a finished demo or files that the demo did not make, or another
+            program writes to it.
     """
     street, run_dir = out / "street", out / "run"
     marker = out / "demo.json"
     if out.exists() and any(out.iterdir()) and not marker.exists():
         raise UserError(f"{out} holds other files.", fix="name another folder with --out")
+    if RunFolder(run_dir).metrics.exists():
+        fix = f"open {run_dir}, delete {out}, or name another folder with --out"
+        raise UserError(f"{out} holds a finished demo.", fix=fix)
     out.mkdir(parents=True, exist_ok=True)
     made: dict[str, Any] = {"frames": frames, "width": width, "iso_std": iso_std, "seed": seed}
     with locked(out):

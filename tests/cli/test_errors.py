@@ -45,7 +45,7 @@ WRONG = [
     ("fit castle --out run --blocks 2 --devices 2", "on one device"),
     ("fit castle --out run --blocks 2 --threads 2", "leave out --devices and --threads"),
     ("fit castle --out run --threads 0", "--threads 0 is not a number of cores"),
-    ("fit castle --out run --blocks 2 --engine ray", "no engine 'ray'"),
+    ("fit castle --out run --blocks 2 --engine ray", "'ray' is not a known engine"),
     ("fit castle --out run --blocks 2 --preset 3dgs", "learns them"),
     ("fit castle --out run --jobs 2", "add --blocks auto, or a number"),
     ("fit castle --out run --preset 3dgs --photometry.start tracks", "splats display values"),
@@ -95,6 +95,13 @@ def test_a_demo_is_not_replaced_while_it_runs(tmp_path, run_command):
             code, said = run_command("demo", "--out", tmp_path)
         assert (code, "is being written to by process" in said) == (2, True)
         assert (tmp_path / "street").is_dir()
+
+
+def test_a_finished_demo_is_kept(tmp_path, refused):
+    (tmp_path / "run").mkdir()
+    for path in (tmp_path / "demo.json", tmp_path / "run" / "metrics.json"):
+        path.touch()
+    assert "holds a finished demo" in refused("demo", "--out", tmp_path)
 
 
 @pytest.fixture(scope="module")
