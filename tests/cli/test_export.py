@@ -137,7 +137,7 @@ def test_what_is_there_is_replaced_only_when_asked_and_exports_lie_in_the_run(
     (tmp_path / "linear.json").write_text("mine")
     argv = ("export", finished_run, "--format", "linear-ply", "linear-ply", "--out")
     text = refused(*argv, tmp_path)
-    assert "linear.json exists" in text
+    assert "linear.json already exists" in text
     assert "--overwrite" in text
     assert (tmp_path / "linear.json").read_text() == "mine"
     assert "is a file" in refused(*argv, tmp_path / "linear.json")
