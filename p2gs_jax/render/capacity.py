@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
 from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple, TypeVar
@@ -67,19 +66,22 @@ def canvases(sizes: Iterable[tuple[int, int]]) -> dict[tuple[int, int], tuple[in
     """
     counts = Counter(sizes)
     groups = [[size] for size in sorted(counts)]
-
-    def area(group: list[tuple[int, int]]) -> int:
-        width, height = np.max(group, 0)
-        return int(width * height) * sum(counts[size] for size in group)
-
+    widths, heights = (np.array([size[k] for size in sorted(counts)]) for k in (0, 1))
+    views = np.array([counts[size] for size in sorted(counts)])
     while len(groups) > 1:
-        pairs = itertools.combinations(groups, 2)
-        added, one, other = min((area(a + b) - area(a) - area(b), a, b) for a, b in pairs)
-        if len(groups) <= MOST_CANVASES and added > LEAST_PADDING * area(one + other):
+        wider, higher = np.maximum.outer(widths, widths), np.maximum.outer(heights, heights)
+        joined, area = wider * higher * np.add.outer(views, views), widths * heights * views
+        added = joined - np.add.outer(area, area).astype(float)
+        np.fill_diagonal(added, np.inf)
+        one, other = sorted(map(int, np.unravel_index(np.argmin(added), added.shape)))
+        if len(groups) <= MOST_CANVASES and added[one, other] > LEAST_PADDING * joined[one, other]:
             break
-        groups = [group for group in groups if group not in (one, other)] + [one + other]
-    joined = {size: tuple(map(int, np.max(group, 0))) for group in groups for size in group}
-    return joined  # pyright: ignore[reportReturnType]
+        widths[one], heights[one] = wider[one, other], higher[one, other]
+        views[one] += views[other]
+        groups[one] += groups.pop(other)
+        widths, heights, views = (np.delete(a, other) for a in (widths, heights, views))
+    canvas = zip(widths.tolist(), heights.tolist(), strict=True)
+    return {size: place for group, place in zip(groups, canvas, strict=True) for size in group}
 
 
 def bucket(needed: int, margin: float = 1.0) -> int:
