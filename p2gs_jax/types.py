@@ -25,6 +25,8 @@ if not TYPE_CHECKING:
 
 Split = Literal["train", "test"]
 AlphaUse = Literal["background", "mask", "ignore"]
+ColmapLens = Literal["FOV", "DIVISION", "EUCM", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"]
+LensModel = Literal["radial", "fisheye"] | ColmapLens
 
 
 def _namespace(values) -> Any:
@@ -294,11 +296,12 @@ class Distortion:
     """Lens distortion; a `radial` lens of all zeros is a pinhole.
 
     `coefficients` are OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]] (`radial`, rational from k4 on),
-    or its k1, k2, k3, k4 of the angle (`fisheye`).
+    or its k1, k2, k3, k4 of the angle (`fisheye`). Other models have COLMAP's names, and its
+    parameters behind the principal point.
     """
 
     coefficients: tuple[float, ...]
-    model: Literal["radial", "fisheye"] = "radial"
+    model: LensModel = "radial"
 
 
 @dataclass(frozen=True)

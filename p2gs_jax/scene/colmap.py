@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -24,13 +24,17 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError, broken
 from p2gs_jax.scene import files
 from p2gs_jax.scene.cameras import name_cameras
-from p2gs_jax.scene.lens import intrinsics, make_distortion, undistort_points
+from p2gs_jax.scene.lens import COLMAP_LENSES, intrinsics, make_distortion, undistort_points
 from p2gs_jax.scene.rigid import off_origin, pose_of
 from p2gs_jax.scene.seeds import read_points
-from p2gs_jax.types import Distortion, Scene, Tracks, View
+from p2gs_jax.types import ColmapLens, Distortion, Scene, Tracks, View
 
 _FIX = "export the model again from COLMAP"
 _FIX_FILES = "copy the model again from where it was made, or export it again from COLMAP"
+CUT = (
+    "cut the panoramas into pinhole photographs: ns-process-data images --camera-type "
+    "equirectangular, or COLMAP's python/examples/panorama_sfm.py"
+)
 _LENGTH = struct.Struct("<Q")
 _NUMBERS = re.compile(r"[-+.\deEnaif\s]*")
 _STEMS = ("cameras", "images", "points3D")
@@ -50,16 +54,16 @@ _MODELS = {
     "OPENCV": (8, 2),
     "OPENCV_FISHEYE": (8, 2),
     "FULL_OPENCV": (12, 2),
-    "FOV": (5, 0),
+    "FOV": (5, 2),
     "SIMPLE_RADIAL_FISHEYE": (4, 1),
     "RADIAL_FISHEYE": (5, 1),
-    "THIN_PRISM_FISHEYE": (12, 0),
-    "RAD_TAN_THIN_PRISM_FISHEYE": (16, 0),
-    "SIMPLE_DIVISION": (4, 0),
-    "DIVISION": (5, 0),
+    "THIN_PRISM_FISHEYE": (12, 2),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (16, 2),
+    "SIMPLE_DIVISION": (4, 1),
+    "DIVISION": (5, 2),
     "SIMPLE_FISHEYE": (3, 1),
     "FISHEYE": (4, 2),
-    "EUCM": (6, 0),
+    "EUCM": (6, 2),
     "EQUIRECTANGULAR": (2, 0),
 }
 
@@ -233,7 +237,7 @@ def _find_images(root: Path, model: Model) -> Path:
 
 
 def _lens(path: Path, camera: CameraRecord) -> tuple[Float[np.ndarray, "3 3"], Distortion | None]:
-    """Return K and distortion: COLMAP's terms are OpenCV's, and absent terms are 0."""
+    """Return K and distortion: absent terms of OpenCV's lenses are 0."""
     focals, p = _MODELS.get(camera.model, (0, 0))[1], camera.params
     if not focals:
         raise _unsupported(path, camera.model)
@@ -241,9 +245,12 @@ def _lens(path: Path, camera: CameraRecord) -> tuple[Float[np.ndarray, "3 3"], D
     if not ((np.abs(p) < files.HUGE).all() and min(fx, fy, camera.width, camera.height) > 0):
         why = f"a {camera.model} camera of {camera.width}x{camera.height} pixels has "
         raise broken(f"{path}:", f"{why}impossible parameters {p}", _FIX)
-    terms = p[focals + 2 :]
+    K, terms = intrinsics(fx, fy, cx, cy), p[focals + 2 :]
+    own = camera.model.removeprefix("SIMPLE_")
+    if own in COLMAP_LENSES:
+        return K, make_distortion(terms, cast(ColmapLens, own))
     model = "fisheye" if "FISHEYE" in camera.model else "radial"
-    return intrinsics(fx, fy, cx, cy), make_distortion((*terms, *[0.0] * (4 - len(terms))), model)
+    return K, make_distortion((*terms, *[0.0] * (4 - len(terms))), model)
 
 
 class CameraRecord(NamedTuple):
@@ -476,4 +483,5 @@ def _image(
 def _unsupported(path: Path, model: str) -> UserError:
     supported = ", ".join(sorted(name for name, (_, focals) in _MODELS.items() if focals))
     why = f"uses the camera model {model}; supported are {supported}"
-    return broken(path, why, "run `colmap image_undistorter` and use the folder it writes")
+    undistort = "run `colmap image_undistorter` and use the folder it writes"
+    return broken(path, why, CUT if model == "EQUIRECTANGULAR" else undistort)

@@ -2,24 +2,28 @@
 
 Pixel centres are at +0.5. Projection and OpenCV's distortion do not depend on the position of
 centres, so points need no shift. Only OpenCV's *rasters* (remap) do, and only `undistortion_maps`
-converts them.
+converts them. COLMAP computes the lenses that only COLMAP has.
 """
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, get_args
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 from numpy.polynomial import Polynomial
 
-from p2gs_jax.types import Distortion
+from p2gs_jax.types import ColmapLens, Distortion, LensModel
+
+COLMAP_LENSES: tuple[ColmapLens, ...] = get_args(ColmapLens)
 
 # Lenses are inverted by a table of `_TABLE` angles and `_POLISHING` Newton steps. OpenCV's
 # iteration does not converge for strong rational lenses.
 _TABLE, _POLISHING = 4096, 3
 _MOST_ROUNDS, _CONVERGED = 20, 1e-10
+# The largest distance, pixels, of a point from where COLMAP projects the ray that it finds.
+_MISSED = 0.01
 # The largest distance from the principal point, focal lengths; smaller terms there count as 0.
 _FARTHEST, _NEGLIGIBLE = 100.0, 1e-9
 
@@ -35,7 +39,7 @@ def scale_intrinsics(K: Float[np.ndarray, "3 3"], sx: float, sy: float) -> Float
 
 
 def make_distortion(
-    coefficients: tuple[float, ...], model: Literal["radial", "fisheye"] = "radial"
+    coefficients: tuple[float, ...], model: LensModel = "radial"
 ) -> Distortion | None:
     """Return the distortion with `Distortion`'s coefficients, or None for a pinhole."""
     # A fisheye without coefficients still maps angles, not tangents, to distances.
@@ -56,6 +60,14 @@ def undistort_points(
         return np.asarray(xy, np.float32).reshape(-1, 2)
     points = np.asarray(xy, np.float64).reshape(-1, 2)
     focal, center = np.asarray(K, np.float64)[[0, 1], [0, 1]], np.asarray(K, np.float64)[:2, 2]
+    if distortion.model in COLMAP_LENSES:
+        camera = colmap_camera(K, distortion)
+        rays = np.c_[camera.cam_from_img(points), np.ones(len(points))]
+        # Newton's method may end at another point.
+        missed = ~(np.abs(camera.img_from_cam(rays) - points).max(axis=1) < _MISSED)
+        missed |= np.linalg.norm(rays[:, :2], axis=1) >= _fold_radius(distortion)
+        rays[missed] = np.nan
+        return (rays[:, :2] * focal + center).astype(np.float32)
     distorted = (points - center) / focal
     untilted = distorted
     if distortion.model == "radial" and any(distortion.coefficients[2:4]):
@@ -85,7 +97,9 @@ def undistortion_maps(
     shifted[:2, 2] -= 0.5
     lens = np.array(distortion.coefficients)
     size = (width, height)
-    if distortion.model == "fisheye":
+    if distortion.model in COLMAP_LENSES:
+        map_x, map_y = _colmap_maps(shifted, distortion, width, height)
+    elif distortion.model == "fisheye":
         map_x, map_y = cv2.fisheye.initUndistortRectifyMap(
             shifted, lens, np.eye(3), shifted, size, cv2.CV_32FC1
         )
@@ -98,6 +112,28 @@ def undistortion_maps(
         folded = x[None, :] ** 2 + y[:, None] ** 2 >= limit**2
         map_x[folded] = map_y[folded] = -10.0
     return map_x, map_y
+
+
+def colmap_camera(K: Float[np.ndarray, "3 3"], distortion: Distortion) -> Any:
+    """Return pycolmap's camera with K and one of COLMAP's lenses; it has no size."""
+    import pycolmap  # scenes with other lenses do not need it
+
+    (fx, _, cx), (_, fy, cy), _ = np.asarray(K, np.float64)
+    params = [fx, fy, cx, cy, *distortion.coefficients]
+    return pycolmap.Camera(model=distortion.model, width=0, height=0, params=params)
+
+
+def _colmap_maps(
+    K: Float[np.ndarray, "3 3"], distortion: Distortion, width: int, height: int
+) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+    """Return `undistortion_maps` of COLMAP's lenses; K has pixel centres at integers."""
+    camera, maps = colmap_camera(K, distortion), np.empty((2, height, width), np.float32)
+    rays = np.ones((width, 3))
+    rays[:, 0] = (np.arange(width) - K[0, 2]) / K[0, 0]
+    for row in range(height):
+        rays[:, 1] = (row - K[1, 2]) / K[1, 1]
+        maps[:, row] = camera.img_from_cam(rays).T
+    return maps[0], maps[1]
 
 
 def _profile(distortion: Distortion) -> tuple[Polynomial, Polynomial, float]:
@@ -130,6 +166,12 @@ def _first_root(polynomial: Polynomial) -> float:
 
 def _fold_radius(distortion: Distortion) -> float:
     """Return the undistorted radius at which the distorted radius stops growing."""
+    if distortion.model in COLMAP_LENSES:
+        radii = np.tan(np.linspace(0.0, np.arctan(_FARTHEST), _TABLE))
+        rays = np.stack([radii, 0 * radii, np.ones(_TABLE)], axis=1)
+        distorted = colmap_camera(np.eye(3), distortion).img_from_cam(rays)[:, 0]
+        falls = np.flatnonzero(~(np.diff(distorted) > 0))
+        return float(radii[falls[0]]) if len(falls) else float("inf")
     _, _, limit = _profile(distortion)
     if distortion.model == "radial":
         return limit

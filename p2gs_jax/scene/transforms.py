@@ -31,7 +31,7 @@ from p2gs_jax.core.atomic import BROKEN_ARRAYS
 from p2gs_jax.errors import broken
 from p2gs_jax.scene import files
 from p2gs_jax.scene.cameras import name_cameras, numbered
-from p2gs_jax.scene.colmap import IMAGE_FOLDERS
+from p2gs_jax.scene.colmap import CUT, IMAGE_FOLDERS
 from p2gs_jax.scene.files import HUGE, at_file_size, require_inside
 from p2gs_jax.scene.lens import intrinsics, make_distortion
 from p2gs_jax.scene.masks import image_folder_of
@@ -52,8 +52,6 @@ _PINHOLES = frozenset({"PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "
 _FISHEYE = "OPENCV_FISHEYE"
 _FIX = "correct the file, or write it again with the tool that made it"
 _UNDISTORT = "undistort the images to pinhole ones (colmap image_undistorter) and use those"
-_CUT = "cut the panoramas into pinhole photographs: ns-process-data images --camera-type "
-_CUT += "equirectangular, or COLMAP's python/examples/panorama_sfm.py"
 _IMAGES = re.compile(r"images(_\d+)?|input|input_images|rgb")
 _LISTS = {"train": "train_filenames", "test": "test_filenames", "val": "val_filenames"}
 
@@ -358,7 +356,7 @@ def _lens(
     fisheye = model == _FISHEYE or bool(values.get("is_fisheye"))
     if model not in (*_PINHOLES, _FISHEYE):
         known = ", ".join(sorted((*_PINHOLES, _FISHEYE)))
-        fix = _CUT if model == "EQUIRECTANGULAR" else _UNDISTORT
+        fix = CUT if model == "EQUIRECTANGULAR" else _UNDISTORT
         raise broken(path, f"uses the camera model {model}; supported are {known}", fix)
 
     def number(key: str, default: float) -> float:

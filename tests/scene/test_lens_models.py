@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -10,7 +11,12 @@ from scene.test_transforms import LENS, frames, write
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene import find_scene, load_scene
-from p2gs_jax.scene.lens import _fold_radius, intrinsics, undistort_points
+from p2gs_jax.scene.lens import (
+    _fold_radius,
+    intrinsics,
+    undistort_points,
+    undistortion_maps,
+)
 from p2gs_jax.scene.sfm.map import camera_of
 from p2gs_jax.types import Distortion
 
@@ -87,6 +93,43 @@ def test_colmap_lenses(tmp_path, camera, model, coefficients):
     ray = np.array([0.2, -0.1, 1.0])
     xy = undistort_points(camera_of(view, 1).img_from_cam(ray[None]), view.K, view.distortion)
     np.testing.assert_allclose(xy[0], (view.K @ ray)[:2], atol=1e-3)
+
+
+LENSES = {
+    "FOV": [50, 51, 20, 15, 0.9],
+    "SIMPLE_DIVISION": [50, 20, 15, -0.2],
+    "DIVISION": [50, 51, 20, 15, 4.0],
+    "EUCM": [50, 51, 20, 15, 0.6, 1.1],
+    "THIN_PRISM_FISHEYE": [50, 51, 20, 15, 0.1, -0.9, 1e-3, -2e-3, 0.03, 0, 1e-3, -2e-3],
+    "RAD_TAN_THIN_PRISM_FISHEYE": [
+        *(50, 51, 20, 15, 0.1, -0.02, 0.003, 0, 0, 0),
+        *(0.01, -0.02, 0.01, 0.02, 0.03, 0.01),
+    ],
+}
+# Radii where 1 - 4 k r^2 is 0, and where k1 and k2 let the distorted angle grow no more.
+FOLDS = {"DIVISION": 0.25, "THIN_PRISM_FISHEYE": 0.8698}
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_lenses_that_only_colmap_has(tmp_path, model):
+    params = LENSES[model]
+    line = f"1 {model} 40 30 {' '.join(map(str, params))}\n"
+    view = load_scene(write_tiny_model(tmp_path, cameras=line).parents[1], DataConfig()).views[0]
+    lens, K = view.distortion, view.K.astype(float)
+    colmap = pycolmap.Camera(model=model, width=40, height=30, params=params)
+    limit = FOLDS.get(model, 3.0)
+    X = rays(0.98 * limit)
+    seen = colmap.img_from_cam(X)
+    np.testing.assert_allclose(undistort_points(seen, K, lens), (X @ K.T)[:, :2], atol=2e-3)
+    np.testing.assert_allclose(camera_of(view, 1).img_from_cam(X), seen, atol=1e-9)
+    assert _fold_radius(lens) == pytest.approx(FOLDS.get(model, np.inf), rel=4e-3)
+    maps = np.stack(undistortion_maps(K, lens, 40, 30), axis=2)
+    x, y = np.meshgrid((np.arange(40) + 0.5 - 20) / K[0, 0], (np.arange(30) + 0.5 - 15) / K[1, 1])
+    grid = np.stack([x, y, np.ones_like(x)], axis=2)
+    inside = np.hypot(x, y) < 0.99 * limit
+    expected = colmap.img_from_cam(grid[inside]) - 0.5
+    np.testing.assert_allclose(maps[inside], expected, atol=1e-4)
+    assert (maps[np.hypot(x, y) > 1.01 * limit] == -10).all()
 
 
 @pytest.mark.parametrize("extra", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])

@@ -37,7 +37,7 @@ UTM = np.array([451_234.5, 5_212_345.25, 300.0])
     "place",
     [
         *("colmap/sparse/0", "dense/0/sparse", "distorted/sparse/0", "sparse/model"),
-        *("sparse/1", "rec", "a/dense/sparse/0"),
+        *("sparse/1", "rec", "a/dense/sparse/0", "colmap/sparse", "dense/sparse"),
     ],
 )
 def test_models_elsewhere_are_read(tmp_path, place):
@@ -60,11 +60,15 @@ def test_photographs_beside_an_undistorted_model_are_those_of_its_size(tmp_path)
     assert view.image_path == tmp_path / "dense" / "0" / "images" / "im 0.png"
 
 
-def test_the_largest_of_several_models_is_used(tmp_path):
+@pytest.mark.parametrize("inside", ["", "colmap"])
+def test_the_largest_of_several_models_is_used(tmp_path, inside):
     write_tiny_model(tmp_path, n=1)
     write_tiny_model(tmp_path / "other", n=5)
     shutil.move(tmp_path / "other" / "sparse" / "0", tmp_path / "sparse" / "1")
     shutil.copytree(tmp_path / "other" / "images", tmp_path / "images", dirs_exist_ok=True)
+    if inside:
+        (tmp_path / inside).mkdir()
+        (tmp_path / "sparse").rename(tmp_path / inside / "sparse")
     scene = find_scene(tmp_path, CFG)
     assert len(scene.views) == 5
     said = "sparse/1 with 5 photographs, the largest; the models beside it (0) are not used"

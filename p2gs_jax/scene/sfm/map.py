@@ -323,9 +323,9 @@ def _lens(view: View) -> tuple[str, tuple[float, ...]]:
     """Return COLMAP's name of the lens model, and its coefficients."""
     if view.distortion is None:
         return "OPENCV", (0.0,) * 4
-    coefficients = view.distortion.coefficients
-    if view.distortion.model == "fisheye":
-        return "OPENCV_FISHEYE", coefficients
+    model, coefficients = view.distortion.model, view.distortion.coefficients
+    if model != "radial":
+        return "OPENCV_FISHEYE" if model == "fisheye" else model, coefficients
     if len(coefficients) == 4:
         return "OPENCV", coefficients
     return "FULL_OPENCV", (*coefficients, 0.0, 0.0, 0.0)[:8]
