@@ -299,10 +299,11 @@ def _relative(source: Path, name: str) -> Path:
     normal, folder = Path(os.path.normpath(name.replace("\\", "/"))), source.parent
     if not normal.is_absolute():
         return normal
-    for above in (folder.absolute(), folder.resolve()):
-        for path in (normal, normal.parent.resolve() / normal.name):
-            if path.is_relative_to(above):
-                return path.relative_to(above)
+    both = (normal.parent.resolve() / normal.name, normal)
+    below = {above.resolve(): path.relative_to(above) for path in both for above in path.parents}
+    for place in (Path(), *map(Path, IMAGE_FOLDERS)):
+        if (found := below.get((folder / place).resolve())) is not None:
+            return place / found
     return Path(os.path.relpath(normal, folder.resolve()))
 
 

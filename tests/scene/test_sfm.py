@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 import os
 import shutil
 
@@ -64,7 +65,7 @@ def folder(noisy_street, tmp_path):
     features.quiet_colmap()
     (tmp_path / "photos").mkdir()
     for k, path in enumerate(sorted((noisy_street / "images").rglob("*.png"))[:5]):
-        shutil.copyfile(path, tmp_path / "photos" / f"{k}.png")
+        shutil.copyfile(path, tmp_path / "photos" / f"IMG ({k}).png")
     Image.new("RGB", (192, 128), (90, 90, 90)).save(tmp_path / "photos" / "blank.png")
     return tmp_path / "photos"
 
@@ -74,7 +75,7 @@ def test_only_what_is_new_is_done_and_matches_judge_poses(noisy_street, folder, 
         with features.opened(database) as db:
             return {i.name: (i.camera_id, i.image_id) for i in db.read_all_images()}
 
-    said, names, keep = [], [f"{k}.png" for k in range(5)], tmp_path / "features"
+    said, names, keep = [], [f"IMG ({k}).png" for k in range(5)], tmp_path / "features"
     database = kept_features(keep, folder, {("one",): names[:3]}, said.append)
     match_kept(database, names[:3], None, said.append)
     before = names_in(database)
@@ -101,20 +102,21 @@ def test_only_what_is_new_is_done_and_matches_judge_poses(noisy_street, folder, 
         require_axes(turned, functools.partial(agreement, database), "street")
 
     said.clear()
-    os.utime(folder / "1.png", ns=(1, 1))
+    os.utime(folder / "IMG (1).png", ns=(1, 1))
     kept_features(keep, folder, {("one",): names}, said.append)
     assert said == ["detecting features: 5 images"], "one changed: all anew"
 
     said.clear()
-    names = ["0.png", "1.png", "blank.png"]
+    names = ["IMG (0).png", "IMG (1).png", "blank.png"]
     database = kept_features(keep, folder, {("one",): names[:1], ("two",): names[1:]}, said.append)
     assert said == ["detecting features: 3 images"], "other cameras: all anew"
     match_kept(database, names, None, said.append)
     why = reasons(database, names, [])
     assert set(why) == set(names)
     assert why["blank.png"].startswith("no features")
-    assert why["0.png"] == why["1.png"] == "matches only photographs that did not register either"
-    assert "0.png, 1.png (matches only" in sentence(why)
+    only = "matches only photographs that did not register either"
+    assert why["IMG (0).png"] == why["IMG (1).png"] == only
+    assert "IMG (0).png, IMG (1).png (matches only" in sentence(why)
 
 
 def test_cache_survives_interruption(tmp_path):
@@ -152,6 +154,8 @@ def test_pairs_are_of_neighbours_by_name_and_by_pose():
     assert ("left/000.png", "left/010.png") in pairs
     assert ("left/000.png", "left/035.png") in pairs, "who comes back after a round is found"
     assert ("left/001.png", "left/036.png") not in pairs
+    frames = [f"frame_{k}.png" for k in range(100)]
+    assert {*itertools.pairwise(frames)} <= set(pairs_by_name(frames))
     names = [f"{i:03d}" for i in range(100)]
     viewmats = np.tile(np.eye(4, dtype=np.float32), (100, 1, 1))
     viewmats[:, 0, 3] = -np.arange(100)  # a walk along x

@@ -149,6 +149,11 @@ def test_absolute_names_inside_and_a_folder_that_the_user_names_are_read(tmp_pat
         find_scene(path, ALL)
     found = find_scene(path, DataConfig(test_every=0, images="../photographs"))
     assert found.views[0].name == "a.png"
+    # The folder of the photographs is a link, and tools write where it leads.
+    (scene / "images").symlink_to(tmp_path / "photographs")
+    for above in (link / "images", tmp_path / "photographs"):
+        edit(path, lambda data, name=above / "a.png": data["frames"][0].update(file_path=str(name)))
+        assert find_scene(path, ALL).views[0].image_path == scene / "images" / "a.png"
 
 
 def test_a_name_that_is_not_utf_8_is_refused(tmp_path):
