@@ -30,6 +30,8 @@ from p2gs_jax.core.numerics import evenly_spaced, srgb_decode
 from p2gs_jax.errors import UserError, broken
 from p2gs_jax.scene.convert import icc
 from p2gs_jax.scene.convert.convert import Converted, cache_of, write_png
+from p2gs_jax.scene.convert.readers import made_exif
+from p2gs_jax.scene.drone_srt import read_shots, shot_at, srt_beside
 from p2gs_jax.scene.files import Report, cached_folder, file_fingerprints
 
 RECORD = "frames.json"
@@ -275,6 +277,8 @@ def read_video(path: Path, cfg: DataConfig, work_dir: Path | None, report: Repor
     """
     key = {"version": _VERSION, "file": file_fingerprints([path])}
     key |= {"every": cfg.every, "max_frames": cfg.max_frames}
+    if subtitles := srt_beside(path):
+        key["subtitles"] = file_fingerprints([subtitles])
 
     def build(folder: Path) -> None:
         record = _keep(path, cfg, folder, report)
@@ -317,6 +321,11 @@ def _keep(path: Path, cfg: DataConfig, folder: Path, report: Report) -> dict[str
         why = f"{len(kept)} of {seen} frames would be used; a scene needs several from "
         fix = f"{_SHORT}, or choose frames by number with --every"
         raise broken(f"{path}:", why + "different positions.", fix)
+    subtitles = srt_beside(path)
+    shots = [] if subtitles is None else read_shots(subtitles)
+    if subtitles is not None:
+        where = f"are read from {subtitles.name}" if shots else f"are not in {subtitles.name}"
+        notes.append(f"The exposures of the frames {where}.")
     records: list[dict[str, Any]] = []
     transfers: set[str | None] = set()
     for frame in frames_of(path):
@@ -325,7 +334,8 @@ def _keep(path: Path, cfg: DataConfig, folder: Path, report: Report) -> dict[str
         if len(records) % 10 == 0:
             report(f"writing frames: {len(records)} of {len(kept)}")
         name = f"{frame.number:06d}.png"
-        write_png(folder / name, frame.codes())
+        exif = made_exif(shot_at(shots, frame.time)) if shots else None
+        write_png(folder / name, frame.codes(), exif)
         transfers.add(frame.transfer)
         records.append({"file": name, "frame": frame.number, "time": round(frame.time, 6)})
         if len(records) == len(kept):

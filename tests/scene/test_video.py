@@ -17,6 +17,8 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.core.numerics import srgb_decode
 from p2gs_jax.scene import find_scene, video
 from p2gs_jax.scene.convert.icc import PQ_WHITE, to_light
+from p2gs_jax.scene.convert.readers import exif_evs
+from p2gs_jax.scene.drone_srt import read_shots, shot_at
 from p2gs_jax.scene.survey import survey
 
 COLOURS = np.array(
@@ -229,6 +231,41 @@ def test_frames_are_kept_and_may_be_chosen_by_number(tmp_path: Path) -> None:
     surveyed = survey(film, DataConfig())
     assert surveyed.format == "video"
     assert (surveyed.cameras[0].photographs, surveyed.cameras[0].size) == (50, (240, 136))
+
+
+SUBTITLES = {
+    "new": "<font>SrtCnt : 1, Diff : 9ms\n[iso : {iso}] [shutter : 1/{s}.0] [fnum : 280]</font>",
+    "newest": "FrameCnt: 1, DiffTime: 33ms\n[iso: {iso}] [shutter: 1/{s}.0] [fnum: 2.8] [ev: 0]",
+    "old": "HOME(131.1,-25.2) 2017.07.29 15:18:50\r\nISO:{iso} Shutter:{s} EV: Fnum:F2.8 \r",
+    "mini": "F/2.8, SS {s}.00, ISO {iso}, EV 0, D 5.2m, H 3.1m",
+}
+
+
+def test_subtitles_of_drones_state_the_exposures_of_frames(tmp_path: Path) -> None:
+    film, subtitles = tmp_path / "DJI_0001.MP4", tmp_path / "DJI_0001.SRT"
+    write_video(film, [room(place) for place in WALK])
+    assert exif_evs(read(film, tmp_path, every=10).paths) == [None] * 5
+    # A subtitle for each of 35 frames: ISO doubles at frame 20, and the shutter halves at frame 30.
+    frames = [(200 if k >= 20 else 100, 1000 if k >= 30 else 500) for k in range(35)]
+    for text in SUBTITLES.values():
+        lines = []
+        for k, (iso, shutter) in enumerate(frames):
+            seconds, ms = divmod(k * 1000 // 30, 1000)
+            lines += [f"{k + 1}", f"00:00:0{seconds},{ms:03d} --> 00:00:09,000"]
+            lines += [text.format(iso=iso, s=shutter), ""]
+        subtitles.write_text("\n".join(lines))
+        shots = [shot_at(read_shots(subtitles), k / 30) for k in range(50)]
+        assert {shot.aperture for shot in shots} == {2.8}
+        known = [(shot.iso, round(1 / shot.time)) for shot in shots]
+        assert known == frames + [frames[-1]] * 15
+    found = read(film, tmp_path, every=10)
+    assert found.notes[1] == "The exposures of the frames are read from DJI_0001.SRT."
+    expected = np.log2(100 / 500 / 2.8**2) + np.array([0, 0, 1, 0, 0])
+    np.testing.assert_allclose(exif_evs(found.paths), expected, atol=1e-3)
+    subtitles.write_text("1\n00:00:00,000 --> 00:00:02,000\nA town.\n")
+    found = read(film, tmp_path, every=10)
+    assert found.notes[1] == "The exposures of the frames are not in DJI_0001.SRT."
+    assert exif_evs(found.paths) == [None] * 5
 
 
 def test_one_frame_no_motion_or_half_a_file(tmp_path: Path) -> None:

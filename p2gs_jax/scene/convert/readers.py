@@ -331,6 +331,16 @@ def read_exr(path: Path) -> Picture:
 
 def _exr_exif(header: dict) -> Image.Exif | None:
     shot = {tag: float(header[key]) for key, tag in _EXR_SETTINGS.items() if header.get(key)}
+    return _exif_of(shot)
+
+
+def made_exif(settings: ExifSettings) -> Image.Exif | None:
+    """Return EXIF with time, f-number and ISO, or None without any."""
+    named = {_TIME: settings.time, _F_NUMBER: settings.aperture, _ISO: settings.iso}
+    return _exif_of({tag: value for tag, value in named.items() if value is not None})
+
+
+def _exif_of(shot: dict[int, float]) -> Image.Exif | None:
     if not shot:
         return None
     if _ISO in shot:
