@@ -13,6 +13,7 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.radiance import Truth
 from p2gs_jax.formats.exr import read_exr
+from p2gs_jax.scene.hdr_sets import true_radiance
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.types import Scene
 
@@ -56,17 +57,20 @@ def load_reference(folder: str | Path, scene: Scene, cfg: FitConfig) -> Referenc
 
 
 def find_radiance(scene: Scene, store: ImageStore) -> Truth | None:
-    """Return true linear radiance by view row if the scene has it (`truth/linear`).
+    """Return true linear radiance by view row if the scene has it (`truth/linear`, or an HDR set).
 
-    Synthetic scenes have it; only evaluation uses it.
+    Only evaluation uses it.
     """
-    folder = scene.root / "truth" / "linear"
-    if not folder.is_dir():
+    linear_files = (scene.root / "truth" / "linear" / view.name for view in scene.views)
+    made = [path.with_suffix(".exr") for path in linear_files]
+    both = zip(scene.views, made, strict=True)
+    paths = [path if path.is_file() else true_radiance(scene.root, view) for view, path in both]
+    if not any(paths):
         return None
 
     def radiance(row: int) -> np.ndarray | None:
-        path = (folder / scene.views[row].name).with_suffix(".exr")
-        if not path.is_file():
+        path = paths[row]
+        if path is None:
             return None
         linear, *_ = read_exr(path)
         camera = camera_of(store, row)

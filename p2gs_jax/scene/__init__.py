@@ -17,7 +17,8 @@ from p2gs_jax.scene.drives import read_drive
 from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.drives.recording import Recording
 from p2gs_jax.scene.files import Report, image_size, list_images
-from p2gs_jax.scene.masks import attach_masks, with_alpha
+from p2gs_jax.scene.hdr_sets import exposure_times, with_all_exposures, with_raw_settings
+from p2gs_jax.scene.masks import attach_masks, image_folder_of, with_alpha
 from p2gs_jax.scene.pixels.store import ImageStore, camera_at, size_at
 from p2gs_jax.scene.seeds import FEWEST, with_random_seeds
 from p2gs_jax.scene.split import lists_beside, split_as_listed, split_scene
@@ -145,8 +146,14 @@ def _read_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
         notes.append(f"The cameras come from the COLMAP model in {folder}.")
     if not len(scene.points):
         notes.append(f"The COLMAP model {folder} has no points: points are triangulated.")
-    views = transforms.stated_exposures(root, scene.views)
-    return dataclasses.replace(scene, views=views, notes=(*scene.notes, *notes))
+    times, said = transforms.table_times(root, image_folder_of(scene.views[0]))
+    scene = dataclasses.replace(scene, notes=(*scene.notes, *notes, *said))
+    source = root / (transforms.LLFF_FILES[0] if times else "exposure.json")
+    if not times and source.is_file():
+        times = exposure_times(source)
+    return (
+        with_all_exposures(scene, times, source, cfg) if times else with_raw_settings(root, scene)
+    )
 
 
 def _photographs_alone(root: Path, cfg: DataConfig) -> PhotographsAlone:

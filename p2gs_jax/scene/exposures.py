@@ -22,15 +22,17 @@ def read_known_exposures(
 ) -> Float[np.ndarray, " v"]:
     """Return natural logarithms of known exposures of views, and NaN for unknown ones.
 
-    The source is `exif`, or a CSV file with a column `image` or `file` (name of the view, or any
-    end of it) and one of `ev`, `rel_exposure_ev` (stops), `exposure` (linear, > 0) or
-    `exposure_time_s` (seconds). `among` are all views of the scene, if `views` are some of them.
+    The source is `exif` (EXIF, or what the data set states), or a CSV file with a column `image` or
+    `file` (name of the view, or any end of it) and one of `ev`, `rel_exposure_ev` (stops),
+    `exposure` (linear, > 0) or `exposure_time_s` (seconds). `among` are all views of the scene, if
+    `views` are some of them.
     Raises UserError: the source cannot be used, names none of the views, or a name is ambiguous.
     """
     if source == "exif":
         values = _exif_ev(views) * LN2
         if not np.isfinite(values).any():
-            why = "no photograph carries an exposure time or ISO in its EXIF."
+            why = "no photograph carries an exposure time or ISO in its EXIF, and the data set "
+            why += "states no exposures."
             raise UserError(why, fix="give a CSV file to --known-exposures, or leave it out")
         return values
     table = _by_view(_read(Path(source)), among or views, source)

@@ -1,5 +1,7 @@
 """Held-out views: those that the user or the data set lists, or else every n-th of each camera.
 
+All views of an exposure bracket are held out together.
+
     FILE.json            {"train": ["a.png", ...], "test": ["b.png", ...]}; a missing list is the
                          rest of the views; `val` is held out if there is no `test`
     test.txt, train.txt  one name a line (3DGS reads test.txt beside a COLMAP model); empty lines
@@ -22,6 +24,7 @@ from jaxtyping import Int
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.text import first_few, natural
 from p2gs_jax.errors import UserError, broken
+from p2gs_jax.scene.brackets import brackets
 from p2gs_jax.scene.exposures import plain_name, row_finder
 from p2gs_jax.scene.files import read_json
 from p2gs_jax.scene.masks import image_folder_of
@@ -45,7 +48,8 @@ def split_scene(scene: Scene, cfg: DataConfig) -> Scene:
         return scene
     n = cfg.test_every
     views = assign_split(scene.views, n)
-    unit = "frame" if any(view.frame is not None for view in views) else "view of each camera"
+    unit = "bracket" if len({*brackets(views)}) < len(views) else "view"
+    unit = "frame" if any(view.frame is not None for view in views) else f"{unit} of each camera"
     ending = "th" if 10 <= n % 100 <= 20 else {1: "st", 2: "nd", 3: "rd"}.get(n % 10, "th")
     by = f"every {n}{ending} {unit}" if n else "--test-every 0"
     return dataclasses.replace(scene, views=views, split_by=by)
@@ -54,9 +58,10 @@ def split_scene(scene: Scene, cfg: DataConfig) -> Scene:
 def assign_split(views: tuple[View, ...], test_every: int) -> tuple[View, ...]:
     """Return the views with `split` set, in the order given.
 
-    Views 0, n, 2n, ... of each camera, sorted by the numbers in names, are `test`, as in 3DGS. If
-    views have frames, the frames 0, n, 2n, ... of the scene are. No view is held out if n is 0, or
-    if its camera would have no training view. Raises UserError: n is negative, or 1.
+    Views 0, n, 2n, ... of each camera, sorted by the numbers in names, are `test`, as in 3DGS. The
+    views of an exposure bracket count as one. If views have frames, the frames 0, n, 2n, ... of the
+    scene are. No view is held out if n is 0, or if its camera would have no training view. Raises
+    UserError: n is negative, or 1.
     """
     if test_every < 0 or test_every == 1:
         why = f"cannot hold out every n-th view with n = {test_every}"
@@ -67,9 +72,12 @@ def assign_split(views: tuple[View, ...], test_every: int) -> tuple[View, ...]:
         for i in sorted(range(len(views)), key=lambda i: natural(views[i].name)):
             by_camera[views[i].camera].append(i)
         frames = sorted({v.frame for v in views if v.frame is not None})
-        picked = set(frames[::test_every])
+        picked, bracket = set(frames[::test_every]), brackets(views)
         for rows in by_camera.values():
-            chosen = {i for i in rows if views[i].frame in picked} if frames else rows[::test_every]
+            held_out = {*[*dict.fromkeys(bracket[i] for i in rows)][::test_every]}
+            chosen = {
+                i for i in rows if (views[i].frame in picked if frames else bracket[i] in held_out)
+            }
             if len(chosen) < len(rows):
                 test.update(chosen)
     return _with_test(views, test)

@@ -33,8 +33,8 @@ from p2gs_jax.scene import files
 from p2gs_jax.scene.cameras import name_cameras, numbered
 from p2gs_jax.scene.colmap import CUT, IMAGE_FOLDERS
 from p2gs_jax.scene.files import HUGE, at_file_size, require_inside
+from p2gs_jax.scene.hdr_sets import by_pose, exposure_times, with_times
 from p2gs_jax.scene.lens import intrinsics, make_distortion
-from p2gs_jax.scene.masks import image_folder_of
 from p2gs_jax.scene.rigid import nearest_rotation, off_origin, pose_of, require_axes
 from p2gs_jax.scene.seeds import read_points
 from p2gs_jax.scene.split import lists_in, split_as_listed
@@ -105,8 +105,9 @@ def load_blender(root: Path, cfg: DataConfig) -> Scene:
     """Read the views of NeRF's synthetic scenes, and of all scenes with the same layout.
 
     Views in `transforms_train.json` are trained on, views in `transforms_test.json` (or else
-    `transforms_val.json`) are held out. One camera took all views. Raises UserError: as
-    `load_transforms` does, or if both files list a photograph.
+    `transforms_val.json`) are held out. One camera took all views. Exposure times are read as in
+    HDR-NeRF's scenes (`hdr_sets`). Raises UserError: as `load_transforms` does, or if both files
+    list a photograph, or times are broken.
     """
     train = root / "transforms_train.json"
     others = [root / f"transforms_{name}.json" for name in ("test", "val")]
@@ -114,7 +115,22 @@ def load_blender(root: Path, cfg: DataConfig) -> Scene:
     frames, _ = _frames(train)
     if test is not None:
         frames += _frames(test, "test")[0]
+    sources = [
+        path.with_name(path.name.replace("transforms", "exposure"))
+        for path in (train, test)
+        if path
+    ]
+    times = {path: exposure_times(path) for path in sources if path.is_file()}
+    poses = by_pose([name for names in times.values() for name in names])
+    # In HDR-NeRF's scenes, a frame stands for the photographs of all exposures.
+    frames = [
+        frame._replace(path=Path(name))
+        for frame in frames
+        for name in poses.get(frame.path.as_posix(), [frame.path.as_posix()])
+    ]
     scene = off_origin(_assembled(root, "blender", frames, cfg))
+    for path, of_path in times.items():
+        scene = replace(scene, views=with_times(scene.views, of_path, path))
     return scene if test is None else replace(scene, split_by=test.name)
 
 
@@ -131,9 +147,8 @@ def load_llff(root: Path, cfg: DataConfig) -> Scene:
     folder = next((place for place in places if place.is_dir()), places[0])
     photographs = files.list_images(folder, recursive=False)
     if len(photographs) != len(rows):
-        why = f"has {len(rows)} rows, but {folder} holds {len(photographs)} photographs"
         fix = "put all photographs of the poses there and no others, or name their folder with "
-        raise broken(path, why, fix + "--images")
+        raise broken(path, _unequal(len(rows), len(photographs), folder), fix + "--images")
     views, resized = [], 0
     for k, (image, row) in enumerate(zip(photographs, rows, strict=True)):
         matrix, row_name = row[:15].reshape(3, 5), f"row {k}"
@@ -155,14 +170,25 @@ def llff_table(root: Path) -> Path | None:
     return next((root / name for name in LLFF_FILES if (root / name).is_file()), None)
 
 
-def stated_exposures(root: Path, views: Sequence[View]) -> tuple[View, ...]:
-    """Return views of another format with the exposures of HDR-NeRF's table, if one is there."""
-    path, photographs = root / LLFF_FILES[0], files.list_images(image_folder_of(views[0]))
-    rows = _read_llff(path) if path.is_file() else ()
+def table_times(root: Path, folder: Path) -> tuple[dict[str, float], list[str]]:
+    """Return exposure times of HDR-NeRF's table by the names of the photographs in a folder.
+
+    The table lies beside a model of another format. If it does not fit the photographs, no times
+    and a note are returned. Raises UserError: the table is broken.
+    """
+    path = root / LLFF_FILES[0]
+    if not path.is_file():
+        return {}, []
+    rows, photographs = _read_llff(path), files.list_images(folder)
     if len(rows) != len(photographs):
-        return tuple(views)
-    evs = {p: float(np.log2(row[17])) for p, row in zip(photographs, rows, strict=True)}
-    return tuple(replace(view, exif_ev=evs[view.image_path]) for view in views)
+        why = f"{path} {_unequal(len(rows), len(photographs), folder)}: its exposures are not used."
+        return {}, [why]
+    names = [photograph.relative_to(folder).as_posix() for photograph in photographs]
+    return {name: float(row[17]) for name, row in zip(names, rows, strict=True)}, []
+
+
+def _unequal(rows: int, photographs: int, folder: Path) -> str:
+    return f"has {rows} rows, but {folder} holds {photographs} photographs"
 
 
 def _scene(root: Path, name: str, views: Sequence[View], notes: Sequence[str]) -> Scene:
