@@ -18,7 +18,7 @@ PresetName = Literal[OwnPreset, Baseline, Correction, CameraModel]
 ExposureByCamera = Literal["constant", "camera_exposure", "camera_exposure_gamma"]
 ExposureByView = Literal["view_exposure", "view_exposure_camera_gamma", "view_exposure_gamma"]
 PhotometricModel = Literal[ExposureByCamera, ExposureByView]
-RecordingFormat = Literal["pandaset", "nuscenes", "waymo", "argoverse", "kitti_raw"]
+RecordingFormat = Literal["pandaset", "nuscenes", "waymo", "argoverse", "kitti_raw", "drivestudio"]
 SceneFormat = Literal["colmap", "transforms", "blender", "llff", RecordingFormat, "images"]
 # Pairs of photographs that structure from motion matches.
 Matching = Literal["auto", "all", "sequence"]

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from scene.drives import writers_argoverse as argoverse
+from scene.drives import writers_drivestudio as drivestudio
 from scene.drives import writers_kitti as kitti
 from scene.drives import writers_nuscenes as nuscenes
 from scene.drives import writers_pandaset as pandaset
@@ -15,7 +16,7 @@ from p2gs_jax.scene.drives import read_drive
 
 WRITERS = {
     **{"argoverse": argoverse, "kitti_raw": kitti, "nuscenes": nuscenes},
-    **{"pandaset": pandaset, "waymo": waymo},
+    **{"pandaset": pandaset, "waymo": waymo, "drivestudio": drivestudio},
 }
 
 

@@ -1,0 +1,148 @@
+"""Waymo's recordings as drivestudio processes them; PVG and Street Gaussians read them as well.
+
+    images/TTT_C.jpg               photographs; T is the frame (10 Hz), C the camera
+    intrinsics/C.txt               fx fy cx cy k1 k2 p1 p2 k3
+    extrinsics/C.txt               camera to car; x forward, y left, z up, for both
+    ego_pose/TTT.txt               car to world
+    lidar/TTT.bin                  rows of 14 float32; columns 3 to 5 are a point in the car's axes
+    instances/instances_info.json  boxes
+
+Layout: github.com/ziyc/drivestudio, docs/Waymo.md and datasets/waymo/waymo_preprocess.py.
+
+There are no time stamps. The pose of the car is that of the middle of the upper scanner's turn
+(`waymo`), and counts as the pose at all photographs of the frame: they were taken up to 0.05 s
+earlier or later. Points and boxes get the time at which the upper scanner passed.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from p2gs_jax.config import DataConfig
+from p2gs_jax.errors import broken
+from p2gs_jax.scene.drives import tables
+from p2gs_jax.scene.drives.lidar import turned
+from p2gs_jax.scene.drives.objects import Box, Pose, tracks
+from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
+from p2gs_jax.scene.drives.waymo import CAMERAS, OPENCV, TURN_S, TURN_START
+from p2gs_jax.scene.files import image_size, read_json
+from p2gs_jax.scene.lens import intrinsics, make_distortion
+from p2gs_jax.scene.rigid import inverse, rigid
+from p2gs_jax.types import TrackedObject
+
+MARKER = "ego_pose/*.txt"
+COLUMNS = 14
+BOXES = "instances/instances_info.json"
+_PHOTOGRAPH = re.compile(r"(\d+)_(\d)\.(?:jpg|png)")
+
+
+def read_drivestudio(root: Path, cfg: DataConfig) -> Recording:
+    """Read a processed segment from its folder or that of all segments; UserError: it is broken."""
+    root = tables.drive_folder(root, cfg.drive, MARKER)
+    poses = tables.numbered(root / "ego_pose", (".txt",))
+    cars = {frame: _pose(path) for frame, path in poses.items()}
+    files: dict[int, dict[int, Path]] = {}
+    for path in sorted((root / "images").glob("*")):
+        if found := _PHOTOGRAPH.fullmatch(path.name):
+            files.setdefault(int(found[2]), {})[int(found[1])] = path
+    cameras, photographs, notes = [], [], []
+    for number, paths in sorted(files.items()):
+        camera = _camera(root, number, next(iter(paths.values())))
+        mount = _mount(root / "extrinsics" / f"{number}.txt")
+        cameras.append(camera)
+        for frame, car in cars.items():
+            path = paths.get(frame, root / "images" / f"{frame:03d}_{number}.jpg")
+            shot = Photograph(camera.name, frame, _time(frame), path, car @ mount)
+            photographs.append(shot)
+        unplaced = len(paths.keys() - cars.keys())
+        notes += tables.counted(unplaced, f"photographs of {camera.name} have no pose.")
+    scans = tables.numbered(root / "lidar", (".bin",))
+    sweeps = [
+        Sweep(frame, _time(frame), partial(_read_sweep, path, cars[frame], _time(frame)))
+        for frame, path in scans.items()
+        if frame in cars
+    ]
+    objects, box_notes = _objects(root / BOXES, cars)
+    notes += box_notes
+    return Recording(root, "drivestudio", cameras, photographs, sweeps, objects, notes)
+
+
+def _time(frame: int) -> float:
+    return TURN_S * frame
+
+
+def _numbers(path: Path, count: int) -> np.ndarray:
+    if not path.is_file():
+        raise tables.missing_file(path)
+    words = path.read_text("utf-8-sig", "replace").split()
+    return tables.finite_numbers(words, path, "its content", count)
+
+
+def _pose(path: Path) -> Pose:
+    matrix = _numbers(path, 16).reshape(4, 4)
+    return rigid(matrix[:3, :3], matrix[:3, 3], path, "this file")
+
+
+def _mount(path: Path) -> Pose:
+    """Return camera to car with OpenCV's axes in the camera; UserError: the file has other axes."""
+    mount = _pose(path)
+    # drivestudio writes OpenCV's axes for other data sets: their z is not up.
+    if mount[2, 2] < 0.5:
+        fix = "only Waymo's recordings of drivestudio are read: name the original data set"
+        raise broken(path, "is not the pose of an upright camera of Waymo", fix)
+    return mount @ OPENCV
+
+
+def _camera(root: Path, number: int, photograph: Path) -> RigCamera:
+    path = root / "intrinsics" / f"{number}.txt"
+    fx, fy, cx, cy, *lens = _numbers(path, 9).tolist()
+    if min(fx, fy) <= 0:
+        raise broken(path, "does not begin with two focal lengths")
+    name = CAMERAS[number + 1] if number + 1 < len(CAMERAS) else str(number)
+    size = image_size(photograph)
+    return RigCamera(name, intrinsics(fx, fy, cx, cy), *size, make_distortion((*lens,)))
+
+
+def _passed(points: np.ndarray, time: float) -> np.ndarray:
+    """Return when the upper scanner saw points [n 3] in the car's axes, seconds."""
+    azimuth = np.nan_to_num(np.arctan2(points[:, 1], points[:, 0]))
+    return time + TURN_S * (turned(azimuth, TURN_START) - 0.5)
+
+
+def _read_sweep(path: Path, car: Pose, time: float) -> SweepPoints:
+    values = np.fromfile(path, "<f4")
+    if values.size % COLUMNS or path.stat().st_size % 4:
+        raise broken(path, f"is not a LiDAR scan of {COLUMNS} float32 a point: its size is wrong")
+    points = values.reshape(-1, COLUMNS)[:, 3:6].astype(np.float64)
+    return SweepPoints(points @ car[:3, :3].T + car[:3, 3], _passed(points, time))
+
+
+def _objects(path: Path, cars: dict[int, Pose]) -> tuple[tuple[TrackedObject, ...], list[str]]:
+    """Return the tracked objects in the world, and notes."""
+    if not path.is_file():
+        return (), [f"There are no boxes of moving objects ({BOXES})."]
+    boxes, lost = [], 0
+    try:
+        for thing in read_json(path, tables.UNPACK).values():
+            kept = thing["frame_annotations"]
+            rows = zip(kept["frame_idx"], kept["obj_to_world"], kept["box_size"], strict=True)
+            for frame, matrix, size in rows:
+                pose = np.array(matrix, np.float64).reshape(4, 4)
+                pose = rigid(pose[:3, :3], pose[:3, 3], path, f"the box of {thing['id']}")
+                length, width, height = tables.finite_numbers(size, path, "a size", 3).tolist()
+                if min(length, width, height) <= 0:
+                    raise broken(f"{path}:", "a box has a side of 0 m")
+                if frame not in cars:
+                    lost += 1
+                    continue
+                local = (inverse(cars[frame]) @ pose)[None, :3, 3]
+                time = float(_passed(local, _time(frame))[0])
+                size = (length, width, height)
+                boxes.append(Box(str(thing["id"]), thing["class_name"], size, time, pose))
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise broken(path, f"is not a table of boxes: {error!r}", tables.UNPACK) from None
+    return tracks(boxes), tables.counted(lost, "boxes have frames without a pose.")

@@ -1,0 +1,76 @@
+"""Waymo's recordings in drivestudio's layout, by what its preprocessing writes."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+from scene.drives import writers as w
+from scipy.spatial.transform import Rotation
+
+AZIMUTHS = {0: 0.0, 1: 0.8}
+NAMES = {0: "FRONT", 1: "FRONT_LEFT"}
+TURN = 0.1
+BOXES = Path("instances/instances_info.json")
+
+
+def mount(camera) -> np.ndarray:
+    """Return camera to car, both with x forward, y left, z up."""
+    return w.matrix(Rotation.from_euler("z", AZIMUTHS[camera]), [1.5, 0.1, 2.1])
+
+
+def text(values) -> str:
+    """Return what numpy.savetxt writes."""
+    return "".join(" ".join(f"{v:.18e}" for v in np.atleast_1d(row)) + "\n" for row in values)
+
+
+def box(place) -> np.ndarray:
+    return w.box(place, 0.2)
+
+
+def instance(track, poses) -> dict:
+    kept = {
+        "frame_idx": list(range(len(poses))),
+        "obj_to_world": [pose.tolist() for pose in poses],
+        "box_size": [list(w.SIZE)] * len(poses),
+    }
+    return {"id": track, "class_name": "Vehicle", "frame_annotations": kept}
+
+
+def write(root: Path, frames=3) -> w.Made:
+    ats = TURN * np.arange(frames)
+    for camera in AZIMUTHS:
+        lens = [50.0, 51.0, 32.0, 24.0, 0.05, -0.02, 1e-3, -1e-3, 0.0]
+        w.write_bytes(root / f"intrinsics/{camera}.txt", text(lens))
+        w.write_bytes(root / f"extrinsics/{camera}.txt", text(mount(camera)))
+    for k, at in enumerate(ats):
+        car = w.car_at(at)
+        w.write_bytes(root / f"ego_pose/{k:03d}.txt", text(car))
+        for camera in AZIMUTHS:
+            w.write_bytes(root / f"images/{k:03d}_{camera}.jpg", w.jpeg(10 * k + camera))
+        rows = np.zeros((len(w.landmarks()), 14), "<f4")
+        rows[:, :3] = [1.43, 0, 2.18]
+        rows[:, 3:6] = w.applied(w.inv(car), w.landmarks())
+        w.write_bytes(root / f"lidar/{k:03d}.bin", rows.tobytes())
+    cars = [w.car_at(at) for at in ats]
+    things = {"ahead": [car @ box(w.AHEAD) for car in cars]}
+    things |= {"right": [car @ box(w.RIGHT) for car in cars]}
+    things |= {"parked": [cars[0] @ box(w.AHEAD)] * frames}
+    table = {str(k): instance(*item) for k, item in enumerate(things.items())}
+    w.write_bytes(root / BOXES, json.dumps(table))
+    opencv = w.matrix(Rotation.from_matrix(w.FORWARD), [0, 0, 0])
+    return w.Made(
+        root=root,
+        photographs={
+            (NAMES[c], k): (at, w.car_at(at) @ mount(c) @ opencv)
+            for c in AZIMUTHS
+            for k, at in enumerate(ats)
+        },
+        sweeps=list(ats),
+        # The scanner looks forward in the middle of its turn.
+        boxes=w.tracks(
+            ats, {"ahead": 0.0, "right": 0.25 * TURN}, lambda t, p: w.car_at(t) @ box(p)
+        ),
+        tables=[Path(f"{name}/0.txt") for name in ("intrinsics", "extrinsics")],
+        optional=[BOXES, Path("ego_pose/001.txt")],
+        scans=[Path(f"lidar/{k:03d}.bin") for k in range(frames)],
+    )
