@@ -7,7 +7,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 from p2gs_jax.config import DataConfig, SceneFormat
-from p2gs_jax.scene.drives import argoverse, drivestudio, kitti, nuscenes, pandaset, waymo
+from p2gs_jax.scene.drives import (
+    argoverse,
+    drivestudio,
+    kitti,
+    kitti_tracking,
+    nuscenes,
+    pandaset,
+    waymo,
+)
 from p2gs_jax.scene.drives.recording import Recording
 from p2gs_jax.scene.files import Report
 
@@ -37,6 +45,10 @@ FORMATS: dict[SceneFormat, DriveFormat] = {
     "waymo": DriveFormat((waymo.MARKER,), waymo.read_waymo),
     "argoverse": DriveFormat(_in_folders(argoverse.MARKER), argoverse.read_argoverse),
     "kitti_raw": DriveFormat(_in_folders(kitti.MARKER), kitti.read_kitti_raw),
+    "kitti_tracking": DriveFormat(
+        (kitti_tracking.MARKER, f"{kitti_tracking.SET}/{kitti_tracking.MARKER}"),
+        kitti_tracking.read_kitti_tracking,
+    ),
     "drivestudio": DriveFormat(_in_folders(drivestudio.MARKER), drivestudio.read_drivestudio),
 }
 

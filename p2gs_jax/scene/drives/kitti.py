@@ -13,6 +13,7 @@ matlab/convertOxtsToPose.m for the poses).
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
@@ -63,7 +64,7 @@ def read_kitti_raw(root: Path, cfg: DataConfig) -> Recording:
     imu_to_velo = _rigid_file(calibration_folder / "calib_imu_to_velo.txt")
     car, notes = _car(root)
     scanner = Trajectory(car.times, car.poses @ inverse(imu_to_velo))
-    calibration_file = _Calibration(calibration_folder / CALIBRATION)
+    calibration_file = Calibration(calibration_folder / CALIBRATION)
     R = calibration_file.matrix("R_rect_00", 3, 3)
     rectified = rigid(R, np.zeros(3), calibration_file.path, "camera 00 (R_rect_00)")
     to_car = inverse(imu_to_velo) @ inverse(velo_to_cam) @ inverse(rectified)
@@ -73,7 +74,7 @@ def read_kitti_raw(root: Path, cfg: DataConfig) -> Recording:
         if not files:
             notes.append(f"{folder.name} has no photographs: it is left out.")
             continue
-        K, to_reference = _rectified_camera(calibration_file, folder.name)
+        K, to_reference = rectified_camera(calibration_file, f"P_rect_{folder.name[-2:]}")
         size = _rectified_size(calibration_file, next(iter(files.values())), folder.name)
         cameras.append(RigCamera(folder.name, K, *size))
         found, unplaced = _photographs(folder, files, car, to_car @ to_reference)
@@ -86,7 +87,7 @@ def read_kitti_raw(root: Path, cfg: DataConfig) -> Recording:
     scans = tables.numbered(root / "velodyne_points" / "data", (".bin",))
     known = scanner.at(forward)[1] if len(forward) else forward
     sweeps = [
-        Sweep(k, float(forward[k]), partial(_read_sweep, path, forward[k], lengths[k], scanner))
+        Sweep(k, float(forward[k]), partial(read_sweep, path, forward[k], lengths[k], scanner))
         for k, path in scans.items()
         if k < len(forward) and known[k]
     ]
@@ -97,19 +98,21 @@ def read_kitti_raw(root: Path, cfg: DataConfig) -> Recording:
     return Recording(root, "kitti_raw", cameras, photographs, sweeps, objects, notes)
 
 
-def _read_lines(path: Path) -> list[str]:
+def read_lines(path: Path) -> list[str]:
+    """Return the lines of a text; UserError: it is missing."""
     try:
         return path.read_text("utf-8-sig", "replace").rstrip().splitlines()
     except FileNotFoundError:
         raise tables.missing_file(path) from None
 
 
-class _Calibration:
-    """The matrices in lines `NAME: numbers` of a file; UserError: it is missing."""
+class Calibration:
+    """The matrices in lines `NAME: numbers` of a file, or `NAME numbers`; UserError: no file."""
 
     def __init__(self, path: Path):
-        lines = (line.partition(":") for line in _read_lines(path))
-        self.path, self._held = path, {name.strip(): rest.split() for name, _, rest in lines}
+        """Read them."""
+        lines = (line.replace(":", " ").split() for line in read_lines(path))
+        self.path, self._held = path, {words[0]: words[1:] for words in lines if words}
 
     def __contains__(self, name: str) -> bool:
         return name in self._held
@@ -121,26 +124,28 @@ class _Calibration:
 
 
 def _rigid_file(path: Path) -> Pose:
-    calibration = _Calibration(path)
+    calibration = Calibration(path)
     return rigid(calibration.matrix("R", 3, 3), calibration.matrix("T", 3), path, "a sensor")
 
 
-def _rectified_camera(calib: _Calibration, name: str) -> tuple[Float64[np.ndarray, "3 3"], Pose]:
+def rectified_camera(calib: Calibration, key: str) -> tuple[Float64[np.ndarray, "3 3"], Pose]:
     """Return K (pixel centres at +0.5), and the pose from this camera to the reference camera.
+
+    `key` names the camera's projection.
 
     UserError: the projection of the camera is missing or has no focal lengths.
     """
     # P projects from the rectified reference camera, with pixel centres at integers.
-    P = calib.matrix(f"P_rect_{name[-2:]}", 3, 4)
+    P = calib.matrix(key, 3, 4)
     if not (P[0, 0] > 0 and P[1, 1] > 0 and P[2, 2] > 0):
-        raise broken(f"{calib.path}:", f"the projection of {name} has no focal lengths")
+        raise broken(f"{calib.path}:", f"the projection {key} has no focal lengths")
     K = P[:, :3].copy()
     to_reference = pose_of(np.eye(3), -np.linalg.solve(K, P[:, 3]))
     K[:2, 2] += 0.5
     return K, to_reference
 
 
-def _rectified_size(calib: _Calibration, photograph: Path, name: str) -> tuple[int, int]:
+def _rectified_size(calib: Calibration, photograph: Path, name: str) -> tuple[int, int]:
     """Return the calibrated size of rectified photographs, or the photograph's if none is stated.
 
     UserError: the photograph has the size of photographs that are not rectified.
@@ -165,7 +170,7 @@ def _read_stamps(path: Path) -> Float64[np.ndarray, " n"]:
     a time.
     """
     times = []
-    for number, line in enumerate(_read_lines(path), 1):
+    for number, line in enumerate(read_lines(path), 1):
         text = line.strip()
         try:
             if not _STAMP.fullmatch(text):
@@ -178,34 +183,38 @@ def _read_stamps(path: Path) -> Float64[np.ndarray, " n"]:
 
 
 def _car(root: Path) -> tuple[Trajectory, list[str]]:
-    """Return the trajectory of the GPS unit (x forward, y left, z up), and notes.
-
-    The world is metric at the first latitude (Mercator): x east, y north, z up. Its origin is the
-    begin of the drive.
-    """
+    """Return the trajectory of the GPS unit, and notes."""
     files = tables.numbered(root / "oxts" / "data", (".txt",))
     stamps = _read_stamps(root / "oxts" / "timestamps.txt")
     used = [k for k in files if k < len(stamps) and np.isfinite(stamps[k])]
     used.sort(key=lambda k: stamps[k])
-    rows = [_oxts(files[k]) for k in used]
+    rows = [oxts_row(files[k].read_text("utf-8-sig", "replace"), files[k]) for k in used]
     if not rows:
         raise broken(root / "oxts", "holds no measurement with a time", "unpack that folder again")
     times, first = np.unique(stamps[used], return_index=True)
-    latitude, longitude, altitude, roll, pitch, yaw = np.stack(rows)[first].T
+    words = f"of {len(stamps)} frames have no GPS measurement."
+    notes = tables.counted(len(stamps) - len(used), words)
+    return trajectory(times, np.stack(rows)[first]), notes
+
+
+def trajectory(times: Float64[np.ndarray, " t"], rows: Float64[np.ndarray, "t 6"]) -> Trajectory:
+    """Return the trajectory of the GPS unit (x forward, y left, z up) from rows of `oxts_row`.
+
+    The world is metric at the first latitude (Mercator): x east, y north, z up. Its origin is the
+    begin of the drive.
+    """
+    latitude, longitude, altitude, roll, pitch, yaw = rows.T
     scale = np.cos(np.radians(latitude[0]))
     east = scale * EARTH_RADIUS_M * np.radians(longitude)
     north = scale * EARTH_RADIUS_M * np.log(np.tan(np.pi / 4 + np.radians(latitude) / 2))
     position = np.stack([east, north, altitude], axis=1)
     turns = Rotation.from_euler("ZYX", np.stack([yaw, pitch, roll], 1)).as_matrix()
-    poses = pose_of(turns, position - position[0])
-    words = f"of {len(stamps)} frames have no GPS measurement."
-    return Trajectory(times, poses), tables.counted(len(stamps) - len(used), words)
+    return Trajectory(times, pose_of(turns, position - position[0]))
 
 
-def _oxts(path: Path) -> Float64[np.ndarray, " 6"]:
+def oxts_row(text: str, path: Path) -> Float64[np.ndarray, " 6"]:
     """Return latitude and longitude (degrees), altitude (metres), roll, pitch, yaw (radians)."""
-    words = path.read_text("utf-8-sig", "replace").split()
-    values = tables.finite_numbers(words[:6], path, "position and angles", 6)
+    values = tables.finite_numbers(text.split()[:6], path, "position and angles", 6)
     if abs(values[0]) >= 89:
         raise broken(f"{path}:", f"a latitude of {values[0]} degrees has no Mercator projection")
     return values
@@ -241,7 +250,7 @@ def _turns(root: Path) -> tuple[Float64[np.ndarray, " f"], Float64[np.ndarray, "
     return forward, np.where(plausible, lengths, TURN_S)
 
 
-def _read_sweep(path: Path, forward_s: float, turn_s: float, scanner: Trajectory) -> SweepPoints:
+def read_sweep(path: Path, forward_s: float, turn_s: float, scanner: Trajectory) -> SweepPoints:
     """Return the points of a scan in the world, by the scanner's pose at the time of each point."""
     values = np.fromfile(path, "<f4")
     if values.size % 4 or path.stat().st_size % 16:
@@ -270,15 +279,29 @@ def _objects(
     lengths: Float64[np.ndarray, " f"],
     scanner: Trajectory,
 ) -> tuple[tuple[TrackedObject, ...], list[str]]:
-    """Return the tracklets in the world; a box has the time at which the scanner passed it."""
+    """Return the tracklets in the world, and notes."""
     path = root / "tracklet_labels.xml"
     if not path.is_file():
         return (), ["There are no boxes of moving objects (tracklet_labels.xml)."]
     boxes, empty = _tracklets(path)
-    timed = [b for b in boxes if 0 <= b.time < len(forward) and np.isfinite(forward[int(b.time)])]
     notes = tables.counted(empty, "tracklets have no boxes: they are left out.")
+    objects, more = in_world(boxes, forward, lengths, scanner)
+    return objects, notes + more
+
+
+def in_world(
+    boxes: Sequence[Box],
+    forward: Float64[np.ndarray, " f"],
+    lengths: Float64[np.ndarray, " f"],
+    scanner: Trajectory,
+) -> tuple[tuple[TrackedObject, ...], list[str]]:
+    """Return objects in the world, and notes; times of boxes are frames, poses are to the scanner.
+
+    A box gets the time at which the scanner passed it.
+    """
+    timed = [b for b in boxes if 0 <= b.time < len(forward) and np.isfinite(forward[int(b.time)])]
     lost = len(boxes) - len(timed)
-    notes += tables.counted(lost, "boxes have frames without a LiDAR time: they are left out.")
+    notes = tables.counted(lost, "boxes have frames without a LiDAR time: they are left out.")
     if not timed:
         return (), notes
     local = np.stack([box.pose for box in timed])

@@ -7,6 +7,7 @@ import pytest
 from scene.drives import writers_argoverse as argoverse
 from scene.drives import writers_drivestudio as drivestudio
 from scene.drives import writers_kitti as kitti
+from scene.drives import writers_kitti_tracking as kitti_tracking
 from scene.drives import writers_nuscenes as nuscenes
 from scene.drives import writers_pandaset as pandaset
 from scene.drives import writers_waymo as waymo
@@ -16,7 +17,12 @@ from p2gs_jax.scene.drives import read_drive
 
 WRITERS = {
     **{"argoverse": argoverse, "kitti_raw": kitti, "nuscenes": nuscenes},
-    **{"pandaset": pandaset, "waymo": waymo, "drivestudio": drivestudio},
+    **{
+        "kitti_tracking": kitti_tracking,
+        "pandaset": pandaset,
+        "waymo": waymo,
+        "drivestudio": drivestudio,
+    },
 }
 
 

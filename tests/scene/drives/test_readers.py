@@ -12,6 +12,7 @@ from pyarrow import feather, parquet
 from scene.drives import writers_argoverse as argoverse
 from scene.drives import writers_drivestudio as drivestudio
 from scene.drives import writers_kitti as kitti
+from scene.drives import writers_kitti_tracking as tracking
 from scene.drives import writers_nuscenes as nuscenes
 from scene.drives import writers_pandaset as pandaset
 from scene.drives import writers_waymo as waymo
@@ -53,7 +54,7 @@ def test_photographs_laser_points_and_boxes_have_their_own_times_and_places(kept
         assert np.abs(times - sweep.time).max() <= 0.1001
     # Boxes have the time at which the scanner passed them; KITTI's tracks are numbered.
     found = {re.sub("^(scene-0001 |[0-9])", "", t.name): t for t in recording.objects}
-    if name == "kitti_raw":
+    if name.startswith("kitti"):
         found = {t.label: t for t in recording.objects}
     assert found.keys() == {"ahead", "right", "parked"}
     assert {name for name, thing in found.items() if thing.moving} == {"ahead", "right"}
@@ -218,6 +219,13 @@ REFUSED = {
         (drivestudio.BOXES, lambda held: [], "is not a table of boxes"),
         (drivestudio.BOXES, lambda held: {"0": {"id": "a"}}, "is not a table of boxes"),
         (drivestudio.BOXES, lambda held: {"0": FLAT}, "side of 0"),
+    ],
+    "kitti_tracking": [
+        (tracking.CALIBRATION, given("R_rect 1 0 0 0 1 0 0 0 1\n"), "Tr_velo_cam should be 12"),
+        (tracking.OXTS, given("49 8.4 110\n"), "should be 6 finite"),
+        (tracking.OXTS, given(""), "holds no measurement"),
+        (tracking.LABELS, given("0 0 Car 0 0\n"), "rotation in line 1 should be 8"),
+        (tracking.LABELS, lambda held: held.replace("1.8", "0"), "side of 0"),
     ],
     "kitti_raw": [
         ("calib_imu_to_velo.txt", given("R: 1 0 0 0 1 0 0 0 2\nT: 0 0 0\n"), "not a rotation"),

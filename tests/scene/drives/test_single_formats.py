@@ -238,6 +238,17 @@ def test_calibration_may_lie_beside_the_images_and_grey_cameras_are_pointed_out(
     assert any("grey" in note for note in read(drive).notes)
 
 
+def test_the_sequence_of_a_tracking_benchmark_has_to_be_named(copied, read):
+    training = copied("kitti_tracking").root / "training"
+    for path in [path for path in training.glob("*/*") if path.stem == "0006"]:
+        other = path.with_name(path.name.replace("0006", "0007"))
+        (shutil.copytree if path.is_dir() else shutil.copy)(path, other)
+    for root in (training, training.parent):
+        with refused("holds 2 drives: 0006, 0007"):
+            read(root)
+    assert {p.path.parent.name for p in read(training, drive="0007").photographs} == {"0007"}
+
+
 def test_what_kitti_lacks_is_counted(write, read, tmp_path):
     date = write("kitti_raw", tmp_path, frames=8).root
     drive = date / kitti.DRIVE
