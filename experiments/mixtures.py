@@ -27,7 +27,9 @@ def mixture_groups(
     return {view: rng.choice(groups) for view in sorted(views)}
 
 
-def write_mixture(lom: Path, out: Path, groups: Sequence[str] = GROUPS) -> None:
+def write_mixture(
+    lom: Path, out: Path, groups: Sequence[str] = GROUPS, test: Sequence[str] = ()
+) -> None:
     """Write a scene of `lom` whose views have one of several exposures each.
 
     Args:
@@ -35,6 +37,7 @@ def write_mixture(lom: Path, out: Path, groups: Sequence[str] = GROUPS) -> None:
         out: gets `images/`, `sparse/0`, `reference/` (`high` under the same names) and
             `groups.json` (view -> exposure).
         groups: exposures to draw from.
+        test: held-out views by their stems; without any, every eighth is held out.
     """
 
     def photographs(group: str) -> dict[str, Path]:
@@ -49,7 +52,16 @@ def write_mixture(lom: Path, out: Path, groups: Sequence[str] = GROUPS) -> None:
         for view, group in drawn.items():
             shutil.copy(files[group][view], folder / "images" / f"{view}.JPG")
             shutil.copy(files[REFERENCE][view], folder / "reference" / f"{view}.JPG")
+        if test:
+            lines = [f"{view}.JPG" for view in test]
+            (folder / "sparse" / "0" / "test.txt").write_text("\n".join(lines) + "\n")
         (folder / "groups.json").write_text(json.dumps(drawn, indent=1))
+
+
+def their_test_views(lom: Path) -> list[str]:
+    """Return the stems of the views that the authors of a LOM scene hold out."""
+    frames = json.loads((lom / "transforms_test.json").read_text())["frames"]
+    return [Path(frame["file_path"]).stem for frame in frames]
 
 
 def read_groups(scene: Path) -> dict[str, str]:

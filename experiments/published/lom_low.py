@@ -1,31 +1,30 @@
-"""The low-light protocol of Aleth-NeRF on LOM scenes: fitted to `low` alone, judged against `high`.
+"""The low-light protocol of Aleth-NeRF on any LOM scene: fitted to `low`, judged against `high`.
 
 python experiments/published/lom_low.py LOM_SCENE... --out DIR [--methods robust 3dgs luminance_gs]
     [--steps 600]
 
-Its authors never align: their method brightens by itself (with a degree and a gain that they chose
-for each scene), and PSNR is of the picture as it comes out. Methods without a notion of "well lit"
-cannot be compared so; what each score gives the method is said by its name:
+The authors' `transforms_test.json` lists the held-out views. They never align: their method
+brightens by itself, with a degree and a gain that they chose for each scene, and PSNR is that of
+the picture as rendered. Methods without a notion of "well lit" cannot be compared so. The name of
+each score says what the method is given:
 
-- `unaligned`: the held-out view as the dark photographs show it; what plain NeRF is published for;
-- `enhanced`: of `luminance_gs`, the enhanced view as it comes out: the authors' protocol;
+- `unaligned`: the held-out view as the dark photographs show it, for which plain NeRF is published;
+- `enhanced`: the enhanced view of `luminance_gs` as rendered: the authors' protocol;
 - `mean_half`: one exposure for all views that brings the mean of the training renders to half of
-  the display range; no `high` photograph is looked at;
+  the display range, without a look at any `high` photograph;
+- `per_view`: one exposure for each held-out view, solved from its `high` photograph. The cameras of
+  LOM metered every view anew (0.1 EV), which limits every score with one exposure for all views;
 - `exposure`: one exposure for all views, solved from the `high` photographs of the training views;
-- `all`: likewise exposure, gamma and white balance.
+- `all`: the same for exposure, gamma and white balance.
 
-The authors hold out views 1, 9, 17 and 25 by name (`transforms_test.json`); here every eighth is,
-which is one more, and those of theirs are judged. No photograph of these scenes may be in this
-project: keep --out outside of it.
+No photograph of these scenes may be in this project: keep --out outside of it.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import json
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -39,28 +38,10 @@ from p2gs_jax.photometry.display import with_capture
 
 sys.path.insert(0, str(HERE.parent))
 
-from mixtures import write_mixture
+from mixtures import their_test_views, write_mixture
 
 METHODS = ("robust", "3dgs", "luminance_gs")
 MEAN, STOPS, HALVINGS = 0.5, 12.0, 30
-
-
-def their_test_views(lom: Path) -> list[str]:
-    """Return the stems of the views that the authors hold out."""
-    frames = json.loads((lom / "transforms_test.json").read_text())["frames"]
-    return [Path(frame["file_path"]).stem for frame in frames]
-
-
-def judged_rows(run: p2gs_jax.Run, stems: Sequence[str]) -> list[int]:
-    """Return the rows of the authors' held-out views.
-
-    Raises:
-        SystemExit: this run was fitted to one of them.
-    """
-    rows = {Path(run.scene.views[row].name).stem: row for row in run.scene.test_indices}
-    if missing := sorted(set(stems) - set(rows)):
-        raise SystemExit(f"views {', '.join(missing)} were not held out by {run.folder}")
-    return [rows[stem] for stem in stems]
 
 
 class Aligned:
@@ -82,6 +63,11 @@ class Aligned:
     def linear(self, row: int) -> np.ndarray:
         """Return the radiance that a view shows."""
         return np.asarray(self.run.render(self.run.camera(row)).linear)
+
+    def per_view(self, row: int, linear: np.ndarray) -> p2gs_jax.DisplayTransform:
+        """Return the transform with the exposure fitted to one bright photograph."""
+        images = linear, self.target(row), self.run.store.get(row)[1]
+        return with_fitted_exposure(self._plain, *images)
 
     def displays(self) -> dict[str, p2gs_jax.DisplayTransform]:
         """Return the transform of each score; `enhanced` where corrections enhance."""
@@ -124,17 +110,18 @@ def _middle(values: Sequence[float]) -> float:
     return float(np.exp(np.median(np.log(values))))
 
 
-def figures(run: p2gs_jax.Run, stems: Sequence[str]) -> dict[str, float]:
-    """Return PSNR and SSIM against `high` under each alignment, means over the authors' views."""
-    aligned, rows = Aligned(run), judged_rows(run, stems)
-    linear = {row: aligned.linear(row) for row in rows}
+def figures(run: p2gs_jax.Run) -> dict[str, float]:
+    """Return PSNR and SSIM against `high` under each alignment, means over held-out views."""
+    aligned, found = Aligned(run), dict[str, list[tuple[float, float]]]()
+    displays = aligned.displays()
+    for row in run.scene.test_indices:
+        linear, target, mask = aligned.linear(row), aligned.target(row), run.store.get(row)[1]
+        for name, display in {**displays, "per_view": aligned.per_view(row, linear)}.items():
+            ldr = p2gs_jax.develop(linear, display)
+            scores = (float(psnr(ldr, target, mask)), float(ssim(ldr, target, mask)))
+            found.setdefault(name, []).append(scores)
     out = {}
-    for name, display in aligned.displays().items():
-        scores = []
-        for row in rows:
-            ldr, mask = p2gs_jax.develop(linear[row], display), run.store.get(row)[1]
-            target = aligned.target(row)
-            scores.append((float(psnr(ldr, target, mask)), float(ssim(ldr, target, mask))))
+    for name, scores in found.items():
         out[name], out[f"{name}_ssim"] = (float(v) for v in np.mean(scores, axis=0))
     return out
 
@@ -149,16 +136,15 @@ def main() -> None:
         lom = folders[key.scene]
         scene = args.out / key.scene
         if not scene.exists():
-            write_mixture(lom, scene, ["low"])
+            write_mixture(lom, scene, ["low"], their_test_views(lom))
         run = args.out / "runs" / f"{key.scene}_{key.method}_{key.steps}"
-        said = ("--preset", key.method, "--steps", str(key.steps))
-        fit = fitted(scene, run, (*said, "--reference", str(scene / "reference")), args.again)
+        chosen = ("--preset", key.method, "--steps", str(key.steps))
+        fit = fitted(scene, run, (*chosen, "--reference", str(scene / "reference")), args.again)
         command = (
             f"python experiments/published/lom_low.py LOM_{key.scene.upper()} "
             f"--methods {key.method} --steps {key.steps}"
         )
-        found = figures(p2gs_jax.load_run(run), their_test_views(lom))
-        return {"figures": found, **of_fit(fit, command)}
+        return {"figures": figures(p2gs_jax.load_run(run)), **of_fit(fit, command)}
 
     wanted = [Key("lom_low", n, m, s) for s in args.steps for n in folders for m in args.methods]
     measure(wanted, row, args.again)

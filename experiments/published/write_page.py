@@ -66,7 +66,7 @@ def section(
     figures = benchmark["figures"]
     if own:
         lines += ["Ours:", ""]
-        header = ["scene", "method", "steps", *figures.values(), "beside published, dB"]
+        header = ["scene", "method", "steps", *figures.values(), "beside the best published, dB"]
         header += ["Gaussians", "seconds", "commit", "command"]
         lines += table(header, [_cells(key, row, benchmark) for key, row in own.items()])
     else:
@@ -84,10 +84,10 @@ def _cells(key: Key, row: Mapping[str, Any], benchmark: Mapping[str, Any]) -> li
         digits = 3 if figure == "ssim" else 2
         cells.append(f"{found[figure]:.{digits}f}" if figure in found else "")
     beside = ""
-    compared = benchmark["compared"]
+    compared = [name for name in benchmark["compared"] if name in found]
     known = [p["psnr"] for p in benchmark["published"] if p["scene"] == key.scene]
-    if known and compared in found:
-        beside = ", ".join(f"{found[compared] - value:+.2f}" for value in known)
+    if known and compared:
+        beside = f"{found[compared[0]] - max(known):+.2f}"
     return [
         *(key.scene, key.method, str(key.steps), *cells, beside),
         *(str(row["gaussians"]), shown_seconds(row), row["commit"], f"`{row['command']}`"),
