@@ -5,9 +5,9 @@ python experiments/published/lego.py SCENE --out DIR [--methods 3dgs robust] [--
     [--perturbed --width 400]
 
 With --perturbed, training photographs but the first have the colours of NeRF in the Wild's
-experiment: s rgb + b, clipped, before they are composited on white; s is drawn from 0.8 to 1.2 and b
-from -0.2 to 0.2 for each channel, with the photograph's number as numpy's seed. Held-out views are
-judged under the parameters of the first photograph, as published.
+experiment: s rgb + b, clipped, before they are composited on white. For each channel s is drawn
+from 0.8 to 1.2 and b from -0.2 to 0.2, with the number of the photograph as the seed. Held-out
+views are judged under the parameters of the first photograph, as published.
 
 One row at a time; called again, it goes on where it was interrupted. PSNR of the held-out views as
 they are, without any exposure fitted, as published. The pictures of this scene are not for this
