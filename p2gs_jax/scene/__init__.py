@@ -9,14 +9,14 @@ from typing import NamedTuple
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import UserError, broken
 from p2gs_jax.scene import transforms
-from p2gs_jax.scene.colmap import find_deeper_model, find_model, load_colmap
+from p2gs_jax.scene.colmap import CUT, find_deeper_model, find_model, load_colmap
 from p2gs_jax.scene.convert.convert import convert_photographs, converted_views, with_originals
 from p2gs_jax.scene.convert.icc import colour_notes
 from p2gs_jax.scene.convert.readers import exif_evs
 from p2gs_jax.scene.drives import read_drive
 from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.drives.recording import Recording
-from p2gs_jax.scene.files import Report, image_size, list_images
+from p2gs_jax.scene.files import Report, is_panorama, list_images
 from p2gs_jax.scene.hdr_sets import exposure_times, with_all_exposures, with_raw_settings
 from p2gs_jax.scene.masks import attach_masks, image_folder_of, with_alpha
 from p2gs_jax.scene.pixels.store import ImageStore, camera_at, size_at
@@ -163,11 +163,14 @@ def _photographs_alone(root: Path, cfg: DataConfig) -> PhotographsAlone:
         # the user names the root.
         paths = list_images(folder, recursive=folder != root or cfg.images is not None)
         for path in paths:
-            image_size(path)
+            if is_panorama(path):
+                raise broken(path, "shows a whole sphere, and is not a pinhole photograph", CUT)
         if paths:
             return PhotographsAlone(folder, paths)
     looked = ", ".join(str(folder) for folder in folders)
     fix = "name the folder that holds one of these"
+    film = next((p for p in sorted(root.iterdir()) if p.suffix.lower() in VIDEO_SUFFIXES), None)
+    fix = fix if film is None else f"name the video itself, {film}"
     if cfg.images is None:
         below = sorted(d.name for d in root.iterdir() if list_images(d, recursive=False))
         if below:

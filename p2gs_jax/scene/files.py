@@ -47,6 +47,8 @@ _MOVED = "move it there, or name the folder of all photographs with --images"
 # Pillow refuses larger pictures as an attack.
 MOST_PIXELS = 2 * (Image.MAX_IMAGE_PIXELS or 2**26)
 _MARKER = "finished"
+# Bytes at the begin of a photograph that hold its XMP.
+_XMP_WITHIN = 2**18
 # Time between two progress messages, seconds.
 EVERY_S = 10.0
 
@@ -220,6 +222,24 @@ def decode_grey(data: bytes, shrink: int) -> UInt8[np.ndarray, "h w"] | None:
     flags = {2: cv2.IMREAD_REDUCED_GRAYSCALE_2, 4: cv2.IMREAD_REDUCED_GRAYSCALE_4}
     flag = flags.get(2 ** min(int(np.log2(max(shrink, 1))), 2), cv2.IMREAD_GRAYSCALE)
     return cv2.imdecode(np.frombuffer(data, np.uint8), flag | cv2.IMREAD_IGNORE_ORIENTATION)
+
+
+def is_panorama(path: Path) -> bool:
+    """Return whether a photograph of the ratio 2:1 shows a whole sphere (equirectangular).
+
+    Its XMP states it, or its first and last column are neighbours and its poles are single points.
+    """
+    width, height = image_size(path)
+    if width != 2 * height:
+        return False
+    data = path.read_bytes()
+    grey = decode_grey(data, shrink=4)
+    if grey is None or b"equirectangular" in data[:_XMP_WITHIN].lower():
+        return grey is not None
+    values = grey.astype(np.float32)
+    steps = np.abs(np.roll(values, 1, axis=1) - values).mean(axis=0)
+    closed = steps[0] < 2 * max(float(steps.mean()), 1.0)
+    return bool(closed and values[[0, -1]].std(axis=1).max() < values.std() / 10)
 
 
 def undecodable(path: Path) -> UserError:

@@ -52,6 +52,8 @@ _PINHOLES = frozenset({"PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "
 _FISHEYE = "OPENCV_FISHEYE"
 _FIX = "correct the file, or write it again with the tool that made it"
 _UNDISTORT = "undistort the images to pinhole ones (colmap image_undistorter) and use those"
+# Values of frames in sets of moving scenes and of depth cameras.
+_UNUSED = ("time", "depth_file_path")
 _IMAGES = re.compile(r"images(_\d+)?|input|input_images|rgb")
 _LISTS = {"train": "train_filenames", "test": "test_filenames", "val": "val_filenames"}
 
@@ -263,7 +265,10 @@ def _assembled(root: Path, name: str, frames: Sequence[_Frame], cfg: DataConfig)
         resized += differs
     _require_one_shape(views, dict(found))
     views = name_cameras(numbered(views), "one" if name == "blender" else cfg.camera_by)
-    return _scene(root, name, views, [*notes, *files.rescaled(resized, sources)])
+    notes += files.rescaled(resized, sources)
+    unused = [key for key in _UNUSED if any(key in frame.values for frame in frames)]
+    notes += [f"Frames of {sources} have {key}, which is not used." for key in unused]
+    return _scene(root, name, views, notes)
 
 
 def _names(folder: Path, frames: Sequence[_Frame], asked: Path | None) -> tuple[Path, list[str]]:

@@ -25,7 +25,7 @@ from p2gs_jax.paths.files import near_scene
 from p2gs_jax.paths.shots import Shot
 from p2gs_jax.scene import ImageStore, find_scene
 from p2gs_jax.scene.cameras import name_cameras
-from p2gs_jax.scene.files import find_names, same_shape
+from p2gs_jax.scene.files import find_names, is_panorama, same_shape
 from p2gs_jax.scene.rigid import require_axes
 from p2gs_jax.scene.visibility import share_in_view
 
@@ -201,6 +201,35 @@ def test_poses_in_other_axes_are_told(tmp_path):
             require_axes(views(change), agreeing, "a.json")
     # What agrees with no axes is left alone.
     require_axes(views(lambda pose: pose), lambda views: 0.0, "a.json")
+
+
+def test_pictures_of_a_whole_sphere_are_refused_with_a_remedy(tmp_path):
+    up, east = np.meshgrid(np.linspace(-1.57, 1.57, 64), np.linspace(-3.14, 3.14, 128))
+    # The brightness of a direction, so that the sides meet and a pole is one point.
+    sphere = 128 + 60 * (np.cos(up) * np.cos(3 * east + 1) + np.sin(up)).T
+    flat = sphere[:, :64].repeat(2, axis=1)
+    for k, picture in enumerate([flat, flat.T, sphere]):
+        Image.fromarray(picture.astype(np.uint8)).save(tmp_path / f"{k}.jpg", quality=95)
+    assert [is_panorama(tmp_path / f"{k}.jpg") for k in range(3)] == [False, False, True]
+    with refused("2.jpg shows a whole sphere", "cut the panoramas into pinhole photographs"):
+        find_scene(tmp_path, CFG)
+    data = (tmp_path / "0.jpg").read_bytes()
+    mark = b"\xff\xe1\x00\x38<GPano:ProjectionType>equirectangular</GPano:Projection>"
+    (tmp_path / "2.jpg").write_bytes(data[:2] + mark.ljust(58) + data[2:])
+    with refused("2.jpg shows a whole sphere"):
+        find_scene(tmp_path, CFG)
+    films = tmp_path / "films"
+    films.mkdir()
+    (films / "a.insv").write_bytes(b"")
+    with refused("no scene in", "name the video itself"):
+        find_scene(films, CFG)
+
+
+def test_times_and_depths_of_frames_are_not_dropped_in_silence(tmp_path):
+    listed = [frame | {"time": 0.5, "depth_file_path": "d.png"} for frame in frames("images/a.png")]
+    notes = find_scene(write(tmp_path, {**LENS, "frames": listed}), CFG).notes
+    stated = [f"Frames of transforms.json have {k}" for k in ("time", "depth_file_path")]
+    assert [note.removesuffix(", which is not used.") for note in notes] == stated
 
 
 def taken(tmp_path, *names, exif=None, models="111111"):
