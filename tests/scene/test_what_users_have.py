@@ -218,11 +218,10 @@ def test_pictures_of_a_whole_sphere_are_refused_with_a_remedy(tmp_path):
     (tmp_path / "2.jpg").write_bytes(data[:2] + mark.ljust(58) + data[2:])
     with refused("2.jpg shows a whole sphere"):
         find_scene(tmp_path, CFG)
-    films = tmp_path / "films"
-    films.mkdir()
-    (films / "a.insv").write_bytes(b"")
+    for path in tmp_path.iterdir():
+        path.rename(tmp_path / "a.insv")
     with refused("no scene in", "name the video itself"):
-        find_scene(films, CFG)
+        find_scene(tmp_path, CFG)
 
 
 def test_times_and_depths_of_frames_are_not_dropped_in_silence(tmp_path):

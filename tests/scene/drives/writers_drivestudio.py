@@ -52,9 +52,9 @@ def write(root: Path, frames=3) -> w.Made:
         rows[:, 3:6] = w.applied(w.inv(car), w.landmarks())
         w.write_bytes(root / f"lidar/{k:03d}.bin", rows.tobytes())
     cars = [w.car_at(at) for at in ats]
-    things = {"ahead": [car @ box(w.AHEAD) for car in cars]}
-    things |= {"right": [car @ box(w.RIGHT) for car in cars]}
-    things |= {"parked": [cars[0] @ box(w.AHEAD)] * frames}
+    moving = {"ahead": w.AHEAD, "right": w.RIGHT}
+    things = {name: [car @ box(place) for car in cars] for name, place in moving.items()}
+    things["parked"] = [cars[0] @ box(w.AHEAD)] * frames
     table = {str(k): instance(*item) for k, item in enumerate(things.items())}
     w.write_bytes(root / BOXES, json.dumps(table))
     opencv = w.matrix(Rotation.from_matrix(w.FORWARD), [0, 0, 0])
