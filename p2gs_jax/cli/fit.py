@@ -17,9 +17,13 @@ from p2gs_jax.config import DataConfig, FitConfig, PresetName
 from p2gs_jax.core.text import count_of
 
 if TYPE_CHECKING:
+    from p2gs_jax.export.develop import Development
     from p2gs_jax.scene.survey import Survey
 
 Preset = Annotated[PresetName, tyro.conf.arg(metavar="NAME")]
+DevelopedExposure = Annotated[
+    float | Literal["highlights"], tyro.conf.arg(metavar="STOPS|highlights")
+]
 Config = Annotated[FitConfig, tyro.conf.arg(name="")]
 
 
@@ -149,6 +153,7 @@ class Calibrate:
         p2gs-jax calibrate castle --out photometry
         p2gs-jax calibrate castle --out photometry --known-exposures exif
         p2gs-jax calibrate stack --out photometry --static
+        p2gs-jax calibrate castle --out photometry --develop 8bit
     """
 
     SHORT_NAMES: ClassVar = (
@@ -171,6 +176,14 @@ class Calibrate:
     """Stated exposures for comparison (default: EXIF)."""
     static: bool = False
     """Read photographs from one fixed viewpoint at several exposures."""
+    develop: Literal["8bit", "16bit", "exr"] | None = None
+    """Also write DIR/developed: the scene for other trainers, its photographs at one exposure and
+    white balance, without vignetting (docs/exports.md)."""
+    exposure_ev: DevelopedExposure = 0.0
+    """Exposure of developed photographs: stops from their mean, or as bright as no highlight of any
+    photograph is lost."""
+    masks: bool = True
+    """Mask pixels of developed photographs that are clipped or black in the original."""
     config: Config
     preset: Preset = "robust"
     """Initial values (p2gs-jax fit --help)."""
@@ -180,16 +193,29 @@ class Calibrate:
         from p2gs_jax.cli.tables import print_calibration
         from p2gs_jax.core.progress import TerminalReporter
         from p2gs_jax.pipeline.calibrate import calibrate, calibrate_run, calibrate_stack
+        from p2gs_jax.report.development import write_development
 
         scene, out, cfg = self.scene, self.out, self.checked()
         with TerminalReporter() as reporter:
             how = {"compare_with": self.compare_with, "reporter": reporter}
             if self.static:
                 found = calibrate_stack(scene, out, cfg, **how)
+            elif self.is_run:
+                found = calibrate_run(scene, out, cfg, **how)
             else:
-                found = (calibrate_run if self.is_run else calibrate)(scene, out, cfg, **how)
+                found = calibrate(scene, out, cfg, develop=self.development(), **how)
+            if found.developed is not None:
+                write_development(out, found.developed)
         print_calibration(found, out)
         return 0
+
+    def development(self) -> Development | None:
+        """Return the options of `--develop`, or None without it."""
+        from p2gs_jax.export.develop import Development
+
+        if self.develop is None:
+            return None
+        return Development(self.develop, self.exposure_ev, self.masks)
 
     @property
     def is_run(self) -> bool:
@@ -208,6 +234,15 @@ class Calibrate:
         check(own_size or not self.static, why, fix=leave_out)
         why = f"{scene} is a finished run, whose image size and folder stay"
         check(own_size or not is_run, why, fix=leave_out)
+        asked, ev = self.develop is not None, self.exposure_ev
+        why = "--exposure-ev and --no-masks have no effect without --develop"
+        check(asked or (ev == 0 and self.masks), why, fix="add --develop 8bit, 16bit or exr")
+        check(
+            isinstance(ev, str) or math.isfinite(ev), f"--exposure-ev {ev} is not a finite number"
+        )
+        why = "--develop needs a scene with cameras, neither a run nor a series of --static"
+        fix = "name the photographs of the run, or leave it out"
+        check(not (asked and (is_run or self.static)), why, fix=fix)
         return cfg
 
 

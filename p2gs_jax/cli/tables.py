@@ -120,7 +120,13 @@ def print_calibration(result: Calibration, out: Path) -> None:
             f"residual {s.residual_ev:.2f} EV; {seconds['reading']:.1f} s reading, "
             f"{seconds['adjustment']:.1f} s adjusting"
         )
-    stdout().print(f"Solved: {found}.\nResults: {out} (open {out / 'calibration.png'} first)")
+    lines = [f"Solved: {found}.", f"Results: {out} (open {out / 'calibration.png'} first)"]
+    if (done := result.developed) is not None:
+        count, page = count_of(len(done.rows), "photograph"), out / "developed.html"
+        at = f"at {done.exposure_ev:+.2f} EV, {done.written} of them written now"
+        lines = [*done.messages, lines[0], f"Developed: {count} {at}.", lines[1]]
+        lines.append(f"Scene for other trainers: {done.folder} ({page} shows what was done)")
+    stdout().print("\n".join(lines), soft_wrap=done is not None)
 
 
 def _print_solution(result: Calibration, more: Mapping[str, list[str]]) -> None:

@@ -34,6 +34,7 @@ def write_exr(
     taken: DisplayTransform | None = None,
     camera: Camera | None = None,
     shot: ExifSettings | None = None,
+    comments: str = "linear relative radiance; no exposure applied",
 ) -> None:
     """Write linear radiance, without exposure applied; docs/exports.md lists the header.
 
@@ -49,7 +50,7 @@ def write_exr(
         "type": OpenEXR.scanlineimage,
         "chromaticities": BT709,
         "adoptedNeutral": BT709[6:],
-        "comments": "linear relative radiance; no exposure applied",
+        "comments": comments,
     }
     if taken is not None:
         header |= _display_attributes(taken)

@@ -20,6 +20,8 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import no_empty_folders, write_json
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
+from p2gs_jax.export.develop import Developed, Development, develop_scene, places_of
+from p2gs_jax.export.poses import poses_of
 from p2gs_jax.gaussians.posed import standing
 from p2gs_jax.photometry.adjustment.problem import KnownExposures
 from p2gs_jax.photometry.calibrate import (
@@ -69,6 +71,7 @@ class Calibration:
     details: dict[str, Any]  # other content of `calibration.json`
     observations: int  # number of observations used
     seconds: dict[str, float]  # duration of `reading` with sampling, and of the `adjustment`, s
+    developed: Developed | None = None  # photographs for other trainers, if they were asked for
 
     @property
     def solution(self) -> PhotometricSolution:
@@ -103,6 +106,7 @@ def calibrate(
     cfg: FitConfig | None = None,
     *,
     compare_with: str | None = None,
+    develop: Development | None = None,
     reporter: Reporter | None = None,
 ) -> Calibration:
     """Solve the photometry of a scene and write the files of a calibration.
@@ -110,6 +114,7 @@ def calibrate(
     The scene is a COLMAP model, a transforms.json or a folder of photographs. The options of data,
     photometry and the thresholds of the loss in `cfg` (default `robust`) apply. The result is
     compared with stated exposures from `exif` or a CSV file, by default those in EXIF, if any.
+    With `develop`, the folder `developed` gets the photographs at one exposure, for other trainers.
 
     Raises:
         UserError: a fault that the user can fix.
@@ -122,6 +127,10 @@ def calibrate(
     reporter.stage("Reading the scene")
     with no_empty_folders(out):
         scene = load_scene(Path(scene_dir), cfg.data, out / "cache", reporter.message)
+        poses = None
+        if develop is not None:
+            poses = poses_of(scene, out / "cache")
+            places_of(poses, scene, out, develop)
         store = ImageStore(scene.views, cfg.data, scene.objects).only_opaque()
         if not (has_tracks(scene) or len(scene.points)):
             raise UserError(
@@ -134,7 +143,11 @@ def calibrate(
         )
     options, views = options_of(cfg, scene), scene.training_views
     found = solved(views, observations, options, cfg, begin, compare_with, reporter, scene.notes)
-    return found.write(out)
+    found.write(out)
+    if develop is None or poses is None:
+        return found
+    done = develop_scene(scene, poses, out, cfg, found.selection, develop, reporter)
+    return dataclasses.replace(found, developed=done)
 
 
 def calibrate_run(

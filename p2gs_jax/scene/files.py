@@ -14,7 +14,7 @@ import time
 import unicodedata
 import warnings
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
@@ -123,9 +123,20 @@ def find_names(names: Iterable[str], folder: Path) -> dict[str, str]:
     found = {name: name for name in names if (folder / name).is_file()}
     left = [name for name in dict.fromkeys(names) if name not in found]
     files = {path.relative_to(folder).as_posix() for path in list_images(folder) if left}
-    for alike in (_folded, _stem, lambda name: _folded(PurePath(name).name)):
+    return found | alike_names(left, files - set(found.values()))
+
+
+def alike_names(names: Iterable[str], files: Collection[str]) -> dict[str, str]:
+    """Return the file that each name means; names that mean none or several are left out.
+
+    A file may differ from the name as in `find_names`.
+    """
+    found: dict[str, str] = {}
+    left = list(dict.fromkeys(names))
+    for alike in (str, _folded, _stem, lambda name: _folded(PurePath(name).name)):
         there: dict[str, list[str]] = defaultdict(list)
-        for file in sorted(files - set(found.values()), key=lambda f: (not f.endswith(".png"), f)):
+        rest = set(files) - set(found.values())
+        for file in sorted(rest, key=lambda f: (not f.endswith(".png"), f)):
             there[alike(file)].append(file)
         wanted = Counter(map(alike, left))
         for name in left:

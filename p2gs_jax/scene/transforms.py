@@ -321,11 +321,11 @@ def _frames(
         name = values.get("file_path") if isinstance(values, dict) else None
         if not isinstance(name, str) or not name:
             raise broken(f"{path}:", f'frame {i} has no "file_path"', _FIX)
-        frames.append(_Frame(_relative(path, name), {**data, **values}, path, split))
+        frames.append(_Frame(relative_name(path, name), {**data, **values}, path, split))
     return frames, data
 
 
-def _relative(source: Path, name: str) -> Path:
+def relative_name(source: Path, name: str) -> Path:
     """Return a path in a file relative to the file's folder; both may contain symbolic links."""
     normal, folder = Path(os.path.normpath(name.replace("\\", "/"))), source.parent
     if not normal.is_absolute():
@@ -340,7 +340,7 @@ def _relative(source: Path, name: str) -> Path:
 
 def _beside(source: Path, name: str) -> Path:
     """Return the path of another file that `source` names, which must lie in its folder."""
-    relative = _relative(source, name)
+    relative = relative_name(source, name)
     require_inside(relative, source.parent, source)
     return source.parent / relative
 

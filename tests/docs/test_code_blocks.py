@@ -160,6 +160,7 @@ def options():
 # Options of other programs that pages mention.
 OTHERS = {"--help", "--help-all", "--version", "--ckpt", "--only", "--nthreads"}
 OTHERS |= {"--data", "--orientation-method", "--center-method", "--auto-scale-poses"}
+OTHERS |= {"--data_dir", "--data_factor", "--colmap-path", "--mask-mode"}
 
 
 # The history names options that are gone.

@@ -102,14 +102,19 @@ def decode(view: View, sizes: Sequence[tuple[int, int]]) -> list[Decoded]:
         raise broken(f"{view.image_path}:", why, "make the photographs smaller") from None
 
 
-def _decoded(view: View, sizes: Sequence[tuple[int, int]]) -> list[Decoded]:
+def stored(
+    view: View,
+) -> tuple[UInt[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"], UInt[np.ndarray, "h w"] | None]:
+    """Return the pixels in a photograph's file, in sRGB, which of them count, and its alpha.
+
+    The lens distortion is not removed. Raises UserError: as `decode` does.
+    """
     pixels, opacity = _decode(view.image_path)
     if pixels.shape[:2] != (view.height, view.width):
         why = f"has {pixels.shape[1]}x{pixels.shape[0]} pixels, but had {view.width}x{view.height} "
         fix = "do not change the photographs during a run; start the run again"
         raise broken(view.image_path, why + "when the scene was read", fix)
     valid = np.ones(pixels.shape[:2], bool)
-    matte = opacity if view.alpha == "background" else None
     if opacity is not None and view.alpha == "mask":
         valid = opacity >= _ALPHA_VALID * np.iinfo(opacity.dtype).max
     if view.mask_path is not None:
@@ -118,6 +123,12 @@ def _decoded(view: View, sizes: Sequence[tuple[int, int]]) -> list[Decoded]:
         # Every pixel with a masked source is masked: the outline is only approximate.
         covered = view.own_car.astype(np.float32)
         valid &= cv2.resize(covered, (view.width, view.height)) == 0
+    return pixels, valid, opacity
+
+
+def _decoded(view: View, sizes: Sequence[tuple[int, int]]) -> list[Decoded]:
+    pixels, valid, opacity = stored(view)
+    matte = opacity if view.alpha == "background" else None
     full = (view.width, view.height)
     as_stored = view.distortion is None and matte is None
     if as_stored and all(size == full for size in sizes):

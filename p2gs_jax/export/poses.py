@@ -1,0 +1,200 @@
+"""The pose files of a scene in another folder, where its photographs were written again.
+
+COLMAP models go to `sparse/0`, their photographs to `images`; the files of all other formats keep
+their place. Files are copied byte for byte, unless the photographs they name have another suffix,
+or masks are added. Poses, lenses and points never change.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from p2gs_jax.core.atomic import atomic_write
+from p2gs_jax.core.text import first_few
+from p2gs_jax.errors import UserError
+from p2gs_jax.scene.colmap import find_deeper_model, find_model, read_model
+from p2gs_jax.scene.files import IMAGE_SUFFIXES, alike_names, read_json
+from p2gs_jax.scene.transforms import llff_table, relative_name
+from p2gs_jax.types import Scene
+
+_STEMS = ("cameras", "images", "points3D", "rigs", "frames")
+_MODEL = (*(f"{stem}.{kind}" for stem in _STEMS for kind in ("bin", "txt")), "points3D.ply")
+# Lists of held-out photographs beside a model, or in the scene's folder.
+_LISTS = ("train.txt", "test.txt")
+_NAMES_IN_JSON = ("train_filenames", "val_filenames", "test_filenames")
+# Bytes of an image in COLMAP's images.bin before its name, and of each of its keypoints.
+_BEFORE_NAME, _KEYPOINT = 64, 24
+_FIX = "correct the file, or write it again with the tool that made it"
+
+
+@dataclass(frozen=True)
+class Poses:
+    """The pose files of a scene, and its photographs as these name them.
+
+    Attributes:
+        files: the files, by their place in the new folder.
+        stated: the name of each view's photograph in the files, by the name of the view.
+        base: folder of the names in the new folder.
+    """
+
+    files: Mapping[str, Path]
+    stated: Mapping[str, str]
+    base: str = "images"
+
+    def places(self, suffixes: Sequence[str], other: str) -> dict[str, str]:
+        """Return the place of each view's photograph in the new folder.
+
+        A name keeps its suffix if it is one of `suffixes`, and has the suffix `other` otherwise.
+        """
+        out: dict[str, str] = {}
+        for view, stated in self.stated.items():
+            own = _suffix(stated) or PurePosixPath(view).suffix
+            stem = PurePosixPath(self.base, stated.removesuffix(_suffix(stated))).as_posix()
+            place = stem + (own if own.lower() in suffixes else other)
+            # Photographs that differ in their suffix alone stay apart.
+            out[view] = place if place not in out.values() else f"{stem}-{own[1:]}{other}"
+        return out
+
+    def notes(self, places: Mapping[str, str]) -> list[str]:
+        """Return a note on photographs with other names than in the files of the scene, if any."""
+        other = [at for v, at in places.items() if _suffix(self.stated[v]) not in ("", _suffix(at))]
+        note = f"{len(other)} photographs have another suffix than their originals, in the files "
+        return [f"{note}with the poses too: {first_few(other)}."] if other else []
+
+    def write(self, folder: Path, places: Mapping[str, str], masks: Mapping[str, str]) -> None:
+        """Write the files to a folder; photographs and masks are at these places, by view."""
+        names = {self.stated[view]: place for view, place in places.items()}
+        below = {old: place.removeprefix("images/") for old, place in names.items()}
+        for place, path in self.files.items():
+            data = path.read_bytes()
+            if path.suffix == ".json":
+                of_name = {self.stated[view]: mask for view, mask in masks.items()}
+                data = _json(path, data, names, of_name, folder)
+            elif any(old != new for old, new in below.items()):
+                if path.name == "images.bin":
+                    data = _binary(data, below)
+                elif path.suffix == ".txt" and path.stem in ("images", "train", "test"):
+                    data = _text(data.decode("utf-8-sig"), below).encode()
+            write_if_new(folder / place, data)
+
+
+def poses_of(scene: Scene, cache: Path) -> Poses:
+    """Return the pose files of a scene; `cache` has the model of photographs without poses.
+
+    Raises UserError: the scene is of a format that other programs do not read.
+    """
+    root, names = scene.root, [view.name for view in scene.views]
+    if scene.format in ("colmap", "images"):
+        model = cache / "sfm" / "model" if scene.format == "images" else None
+        model = model or find_model(root) or find_deeper_model(root)
+        assert model is not None
+        files = {name: root / name for name in _LISTS}
+        files |= {f"sparse/0/{name}": model / name for name in (*_MODEL, *_LISTS)}
+        stated = [image.name for image in read_model(model).images]
+        there = {place: path for place, path in files.items() if path.is_file()}
+        return Poses(there, _by_view(stated, names))
+    if scene.format in ("transforms", "blender"):
+        if scene.format == "blender":
+            parts = [root / f"transforms_{part}.json" for part in ("train", "test", "val")]
+            found = [path for path in parts if path.is_file()][:2]
+        else:
+            found = [root if root.is_file() else root / "transforms.json"]
+        stated = [_plain(p, f["file_path"]) for p in found for f in _frames(read_json(p, _FIX))]
+        return Poses({path.name: path for path in found}, _by_view(stated, names), base="")
+    table = llff_table(root)
+    if scene.format == "llff" and table is not None:
+        return Poses({table.name: table}, {name: name for name in names})
+    why = f"{root} is a scene of the format {scene.format!r}: no other trainer reads its cameras."
+    fix = "leave out --develop, or fit the scene and use `p2gs-jax export RUN --format colmap`"
+    raise UserError(why, fix=fix)
+
+
+def write_if_new(path: Path, data: bytes) -> None:
+    """Write a file atomically, unless it has this content already."""
+    if not (path.is_file() and path.read_bytes() == data):
+        with atomic_write(path) as temporary:
+            temporary.write_bytes(data)
+
+
+def _suffix(name: str) -> str:
+    """Return the suffix of an image file, or nothing: Blender's names have none."""
+    suffix = PurePosixPath(name).suffix
+    return suffix if suffix.lower() in IMAGE_SUFFIXES else ""
+
+
+def _frames(data: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    for key in ("frames", "test_frames"):
+        yield from data.get(key) or ()
+
+
+def _plain(source: Path, name: str) -> str:
+    """Return a name in a file relative to its folder; names that lead out of it lose their path."""
+    path = relative_name(source, name)
+    return f"images/{path.name}" if ".." in path.parts else path.as_posix()
+
+
+def _by_view(stated: Sequence[str], views: Sequence[str]) -> dict[str, str]:
+    """Return the name in the pose files of each view, which may have more folders in front."""
+    best: dict[str, str] = {}
+    parts = {name: PurePosixPath(name).parts for name in stated}
+    for depth in range(max(map(len, parts.values()))):
+        tails = {"/".join(of_name[depth:]): name for name, of_name in parts.items()}
+        found = {view: tails[tail] for tail, view in alike_names(tails, views).items()}
+        best = max(best, found, key=len)
+    return best
+
+
+def _json(
+    path: Path, data: bytes, names: Mapping[str, str], masks: Mapping[str, str], folder: Path
+) -> bytes:
+    """Return a transforms.json with other names and masks; files that it names are copied."""
+    before = read_json(path, _FIX)
+    content, new = copy.deepcopy(before), dict[str, str]()
+    for frame in [*_frames(content)]:
+        name = frame["file_path"]
+        stated = _plain(path, name)
+        if stated not in names:  # photographs are missing, and the user allows it
+            content["frames"].remove(frame)
+            continue
+        place = names[stated]
+        same = place == stated if _suffix(stated) else place.startswith(f"{stated}.")
+        if not same or os.path.isabs(name) or ".." in Path(name).parts:
+            new[name] = frame["file_path"] = place
+        frame.pop("mask_path", None)
+        frame |= {"mask_path": masks[stated]} if masks else {}
+    for key in content.keys() & set(_NAMES_IN_JSON):
+        content[key] = [new.get(name, name) for name in content[key]]
+    for key, value in [(k, v) for part in (content, *_frames(content)) for k, v in part.items()]:
+        named = key.endswith("_path") and key not in ("file_path", "mask_path")
+        if named and isinstance(value, str) and (path.parent / value).is_file():
+            write_if_new(folder / _plain(path, value), (path.parent / value).read_bytes())
+    return data if content == before else json.dumps(content, indent=2).encode() + b"\n"
+
+
+def _binary(data: bytes, new: Mapping[str, str]) -> bytes:
+    """Return COLMAP's images.bin with other names."""
+    out, at = [data[:8]], 8
+    for _ in range(int.from_bytes(data[:8], "little")):
+        end = data.index(b"\0", at + _BEFORE_NAME)
+        stop = end + 9 + _KEYPOINT * struct.unpack_from("<Q", data, end + 1)[0]
+        name = data[at + _BEFORE_NAME : end].decode().replace("\\", "/")
+        out += [data[at : at + _BEFORE_NAME], new.get(name, name).encode(), data[end:stop]]
+        at = stop
+    return b"".join(out)
+
+
+def _text(text: str, new: Mapping[str, str]) -> str:
+    """Return COLMAP's images.txt, or a list of photographs, with other names at ends of lines."""
+    out = []
+    for line in text.splitlines():
+        name = line.split(maxsplit=9)[-1] if len(line.split(maxsplit=9)) == 10 else line.strip()
+        known = new.get(name.strip().replace("\\", "/"))
+        out.append(line if known is None else line[: len(line) - len(name)] + known)
+    return "\n".join(out) + "\n"

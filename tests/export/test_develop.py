@@ -1,0 +1,339 @@
+"""Developed photographs are those that one exposure, white balance and lens would have given."""
+
+import csv
+import dataclasses
+import json
+import os
+import shutil
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+from tiny_scene import make_scene, noise_scene
+
+from p2gs_jax.config import CameraFormation, DataConfig
+from p2gs_jax.core.numerics import on_host
+from p2gs_jax.core.progress import Silent
+from p2gs_jax.errors import UserError
+from p2gs_jax.export.develop import Development, develop_scene
+from p2gs_jax.export.poses import poses_of
+from p2gs_jax.formats.exr import read_exr
+from p2gs_jax.photometry.calibrate import Selection
+from p2gs_jax.photometry.formation import formation
+from p2gs_jax.photometry.response import Response
+from p2gs_jax.photometry.solution import PhotometricSolution
+from p2gs_jax.presets import preset
+from p2gs_jax.run.decisions import decide
+from p2gs_jax.scene import load_scene
+from p2gs_jax.scene.exposures import read_known_exposures
+from p2gs_jax.types import Capture
+
+CFG = preset("robust")
+EV = np.array([-1.0, 0.6, -0.4, 0.0, 1.0, -0.2])
+PLAIN = {"ev": np.zeros(6), "gammas": np.full(6, 2.2), "balances": np.zeros((6, 3)), "shade": ()}
+VARIED = {
+    "ev": EV,
+    "gammas": 2.2 * np.exp([0.1, -0.1, 0.05, -0.05, 0.1, -0.1]),
+    "balances": np.outer([0.1, -0.1, 0.05, -0.05, 0.12, -0.12], [1.0, 0.0, -1.0]),
+    "shade": ((-0.3, -0.1, 0.0), (-0.3, 0.0, 0.0), (-0.2, 0.0, -0.1)),
+}
+
+
+def selection_of(ev, gammas, balances, shade, seen=None):
+    """Return what a calibration of six photographs of one camera would have found."""
+    none, views = np.zeros(6), np.ones(6, int)
+    seen = np.ones(6, bool) if seen is None else seen
+    varies = bool(balances.any())
+    s = PhotometricSolution(
+        model="view_exposure_gamma",
+        response=Response(),
+        log_exposures=np.where(seen, ev * np.log(2), 0.0),
+        exposure_errors=np.where(seen, 0.01, np.inf),
+        gammas=gammas,
+        gamma_errors=none,
+        observations_per_view=100 * views,
+        component=none.astype(int),
+        point_log_radiance=np.zeros((0, 3)),
+        residual_ev=0.0,
+        view_residual_ev=none,
+        view_balance_ev=np.zeros((6, 3)),
+        outliers=0.0,
+        rounds=1,
+        moved=0.0,
+        converged=True,
+        unknown_errors=0,
+        warnings=(),
+        white_balance_level="view" if varies else None,
+        white_balance=balances,
+        white_balance_errors=np.zeros((6, 3)),
+        vignetting="channel" if shade else None,
+        cameras=(CameraFormation("1", shade),) if shade else (),
+        corner_errors=np.zeros((1, 3)),
+    )
+    return Selection(s, (), ())
+
+
+def radiance(height=100, width=112):
+    """Return smooth radiance over five stops."""
+    x, y = np.meshgrid(np.linspace(0, 1, width), np.linspace(0, 1, height))
+    waves = [np.sin(5 * x + 3 * y + 0.4 * c) * np.cos(4 * y - 0.2 * c) for c in range(3)]
+    return np.exp2(-2.2 + 2.2 * np.stack(waves, -1)).astype(np.float32)
+
+
+def seen_as(selection, row=None):
+    """Return display values of the radiance as a photograph shows it, or (None) at the mean."""
+    cfg, s = decide(CFG, selection, None).resolve(CFG).photometry, selection.solution
+    if row is None:
+        capture = on_host(Capture, np.float32(1.0), np.float32(s.gammas.mean()))
+    else:
+        of_view = (np.exp(s.log_exposures[row]), s.gammas[row], s.white_balance[row])
+        values = [np.asarray(v, np.float32) for v in of_view]
+        capture = on_host(Capture, *values, np.int32(0) if cfg.cameras else None)
+    return np.clip(formation(radiance(), capture, cfg), 0, 1)
+
+
+def scene_of(root, selection, suffix=".png", folder=""):
+    """Write a COLMAP scene whose photographs show the radiance; names may have a folder."""
+    make_scene(root)
+    (root / "images" / folder).mkdir(exist_ok=True)
+    listed = root / "sparse" / "0" / "images.txt"
+    text = listed.read_text()
+    for row in range(6):
+        (root / "images" / f"{row}.png").unlink()
+        codes = np.rint(255 * seen_as(selection, row)).astype(np.uint8)
+        Image.fromarray(codes).save(root / "images" / f"{folder}{row}{suffix}", quality=100)
+        text = text.replace(f" {row}.png", f" {folder}{row}{suffix}")
+    listed.write_text(text)
+    return root
+
+
+def run(root, selection, **options):
+    """Develop a scene; return what was done, and the folder."""
+    scene = load_scene(root, DataConfig(test_every=0), root / "out" / "cache")
+    poses = poses_of(scene, root / "out" / "cache")
+    asked = Development(**options)
+    done = develop_scene(scene, poses, root / "out", CFG, selection, asked, Silent())
+    return done, root / "out" / "developed"
+
+
+def files_in(folder):
+    """Return time and content of every file below a folder."""
+    paths = [p for p in folder.rglob("*") if p.is_file()]
+    return {p.relative_to(folder).as_posix(): (p.stat().st_mtime_ns, p.read_bytes()) for p in paths}
+
+
+def codes_in(path):
+    return np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))[..., ::-1].astype(float)
+
+
+def mask_in(path):
+    return np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)) == 255
+
+
+@pytest.fixture(scope="module")
+def varied(tmp_path_factory):
+    selection = selection_of(**VARIED)
+    return scene_of(tmp_path_factory.mktemp("varied"), selection), selection
+
+
+@pytest.mark.parametrize("depth", ["8bit", "16bit", "exr"])
+def test_photographs_become_those_of_the_common_exposure(varied, depth):
+    root, selection = varied
+    done, out = run(root, selection, depth=depth)
+    assert done.exposure_ev == pytest.approx(EV.mean(), abs=1e-6)
+    truth, suffix = 255 * seen_as(selection), "exr" if depth == "exr" else "png"
+    for row in range(6):
+        mask = mask_in(out / "masks" / f"{row}.{suffix}.png")
+        if depth == "exr":
+            light, _, header = read_exr(out / "images" / f"{row}.exr")
+            assert "common exposure" in header["comments"]
+            stops = np.log2(light / radiance())[mask]
+            assert abs(np.median(stops)) < 0.01
+            assert np.abs(stops).max() < 0.5
+            continue
+        found = codes_in(out / "images" / f"{row}.png") / (1 if depth == "8bit" else 257)
+        error = (found - truth)[mask]
+        # Half a code of a photograph that is brightened by a stop becomes more than one.
+        assert np.abs(error).max() < (3 if depth == "8bit" else 2)
+        assert abs(error.mean()) < 0.05, "dither keeps the mean"
+        assert np.abs(255 * seen_as(selection, row) - truth).mean() > 3, "they did differ"
+        assert (np.unique(found).size > 256) == (depth == "16bit")
+
+
+def test_masks_hold_what_the_originals_lost(varied):
+    root, selection = varied
+    _, out = run(root, selection)
+    for row in range(6):
+        original = codes_in(root / "images" / f"{row}.png").max(-1)
+        mask = mask_in(out / "masks" / f"{row}.png.png")
+        np.testing.assert_array_equal(mask, (original > 4) & (original < 250))
+        whole = codes_in(root / "images" / f"{row}.png").min(-1) >= 250
+        developed = codes_in(out / "images" / f"{row}.png")[whole]
+        assert np.ptp(developed, axis=-1).max(initial=0) <= 1, "lost light has no colour"
+    assert any(seen_as(selection, row).min(-1).max() == 1 for row in range(6))
+    run(root, selection, masks=False)
+    assert not (out / "masks").exists() or not any((out / "masks").iterdir())
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_equal_photographs_are_copied(tmp_path, suffix):
+    root = scene_of(tmp_path, selection_of(**PLAIN), suffix, "left cam/")
+    before = files_in(root / "images")
+    _, out = run(root, selection_of(**PLAIN), masks=False)
+    assert {n: c for n, (_, c) in files_in(out / "images").items()} == {
+        n: c for n, (_, c) in before.items()
+    }
+
+
+def test_the_model_stays_and_our_reader_and_colmap_read_it(tmp_path):
+    selection = selection_of(**VARIED)
+    root = scene_of(tmp_path, selection, ".jpg", "left cam/")
+    done, out = run(root, selection)
+    model = root / "sparse" / "0"
+    for path in model.iterdir():
+        assert (out / "sparse" / "0" / path.name).read_bytes() == path.read_bytes()
+    before, after = (load_scene(r, DataConfig(test_every=0)) for r in (root, out))
+    assert [v.name for v in after.views] == [v.name for v in before.views]
+    assert all(v.mask_path is not None for v in after.views)
+    ev = read_known_exposures(str(out / "exposures.csv"), after.views) / np.log(2)
+    np.testing.assert_allclose(ev, EV.mean(), atol=1e-5)
+    rows = list(csv.DictReader((out / "exposures.csv").open()))
+    np.testing.assert_allclose([float(r["original_ev"]) for r in rows], EV, atol=1e-5)
+    assert not done.messages
+
+    # 16 bits need another suffix, which text and binary models then name; nothing else changes.
+    binary = pycolmap.Reconstruction(str(model))
+    for number, image in binary.images.items():
+        image.name = f"left cam/{number - 1}.jpg"
+    binary.write_binary(str(model))
+    done, _ = run(root, selection, depth="16bit")
+    assert "another suffix" in done.messages[0]
+    assert not list(out.rglob("*.jpg")), "files of the former call are gone"
+    there = (out / "sparse" / "0" / "images.bin").read_bytes()
+    assert there == (model / "images.bin").read_bytes().replace(b".jpg\0", b".png\0")
+    text = (out / "sparse" / "0" / "images.txt").read_text()
+    assert text == (model / "images.txt").read_text().replace(".jpg", ".png")
+    read = pycolmap.Reconstruction(str(out / "sparse" / "0"))
+    assert all((out / "images" / image.name).is_file() for image in read.images.values())
+
+
+def test_developing_again_does_only_what_is_missing(varied):
+    root, selection = varied
+    _, out = run(root, selection, exposure=0.5)
+    before = files_in(out)
+    done, _ = run(root, selection, exposure=0.5)
+    assert done.written == 0
+    assert files_in(out) == before, "neither times nor contents change"
+    (out / "images" / "3.png").unlink()
+    done, _ = run(root, selection, exposure=0.5)
+    after = files_in(out)
+    assert done.written == 1
+    changed = {n for n in after if after[n] != before[n]}
+    assert changed == {"images/3.png", "masks/3.png.png"}
+    assert all(after[n][1] == before[n][1] for n in changed), "dither follows from the name"
+    done, _ = run(root, selection, exposure=-0.5)
+    assert done.written == 6
+
+
+def test_highlights_stay_below_white(varied):
+    root, selection = varied
+    done, out = run(root, selection, exposure="highlights")
+    most = []
+    for row in range(6):
+        found, mask = codes_in(out / "images" / f"{row}.png"), out / "masks" / f"{row}.png.png"
+        most.append(found.max(-1)[mask_in(mask)].max())
+    assert 245 <= max(most) <= 252, "the brightest is just below the threshold of clipping"
+    assert done.exposure_ev < EV.mean()
+
+
+def test_photographs_without_an_exposure_are_developed_and_named(tmp_path):
+    seen = np.arange(6) != 2
+    selection = selection_of(**{**PLAIN, "ev": EV}, seen=seen)
+    done, out = run(scene_of(tmp_path, selection), selection)
+    assert "1 photograph(s) share too few points" in done.messages[0]
+    assert "2.png" in done.messages[0]
+    assert (out / "images" / "2.png").is_file()
+    row = list(csv.DictReader((out / "exposures.csv").open()))[2]
+    assert (row["original_ev"], float(row["gain_ev"])) == ("", pytest.approx(0.0, abs=1e-6))
+
+
+@pytest.mark.parametrize("kind", ["transforms", "blender", "llff"])
+def test_other_pose_files_name_what_is_there(tmp_path, kind):
+    selection = selection_of(**{**PLAIN, "ev": EV})
+    root = scene_of(tmp_path / "scene", selection)
+    scene = load_scene(root, DataConfig(test_every=0))
+    shutil.rmtree(root / "sparse")
+    frames = []
+    for view in scene.views:
+        pose = np.linalg.inv(view.viewmat.astype(float)) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        name = f"./images/{view.name}" if kind == "transforms" else f"images/{view.name[0]}"
+        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
+    content = {"fl_x": 90.0, "w": 112, "h": 100, "frames": frames}
+    place = root / {"blender": "transforms_train.json"}.get(kind, "transforms.json")
+    if kind == "llff":
+        place, table = root / "poses_bounds.npy", np.zeros((6, 17))
+        table[:, :15] = [*[1, 0, 0, 0, 100], *[0, 1, 0, 0, 112], *[0, 0, 1, 0, 90]]
+        table[:, [3, 15, 16]] = np.arange(6)[:, None] * [0.2, 0, 0] + [0, 1, 9]
+        np.save(place, table)
+    else:
+        (root / "points.ply").write_text("")
+        place.write_text(json.dumps(content))
+    _, out = run(root, selection, masks=False)
+    assert (out / place.name).read_bytes() == place.read_bytes(), "nothing to change"
+    if kind == "llff":
+        return
+    _, out = run(root, selection)
+    after = json.loads((out / place.name).read_text())
+    assert [f.pop("mask_path") for f in after["frames"]] == [f"masks/{k}.png.png" for k in range(6)]
+    assert after == content, "names, poses and lenses stay"
+    # Absolute names would lead others to the originals.
+    frames[0]["file_path"] = str(root / "images" / "0.png")
+    place.write_text(json.dumps(content))
+    run(root, selection, depth="exr")
+    after = json.loads((out / place.name).read_text())
+    assert after["frames"][0]["file_path"] == "images/0.exr"
+    assert all((out / f["mask_path"]).is_file() for f in after["frames"])
+
+
+def test_originals_are_never_replaced(tmp_path):
+    selection = selection_of(**VARIED)
+    root = scene_of(tmp_path / "out" / "developed", selection)
+    scene = load_scene(root, DataConfig(test_every=0))
+    poses, before = poses_of(scene, tmp_path), files_in(root)
+    with pytest.raises(UserError, match="over the originals"):
+        develop_scene(scene, poses, tmp_path / "out", CFG, selection, Development(), Silent())
+    other = tmp_path / "other" / "developed"
+    other.mkdir(parents=True)
+    os.symlink(root / "images", other / "images")
+    with pytest.raises(UserError, match="over the originals"):
+        develop_scene(scene, poses, other.parent, CFG, selection, Development(), Silent())
+    assert files_in(root) == before
+
+
+def test_the_command(noisy_street, tmp_path, succeeded, refused):
+    given = ("--photometry.no-select", "--photometry.model", "view_exposure")
+    text = succeeded("calibrate", noisy_street, "--out", tmp_path, "--develop", "8bit", *given)
+    assert str(tmp_path / "developed") in text
+    assert (tmp_path / "developed.jpg").stat().st_size > 10_000
+    page = (tmp_path / "developed.html").read_text()
+    assert "Before and after" in page
+    spread = {}
+    for folder in (tmp_path, tmp_path / "again"):
+        scene = noisy_street if folder == tmp_path else tmp_path / "developed"
+        if folder != tmp_path:
+            succeeded("calibrate", scene, "--out", folder, *given)
+        views = json.loads((folder / "photometry.json").read_text())["views"]
+        spread[folder] = np.std([v["exposure_ev"] for v in views])
+    assert spread[tmp_path / "again"] < 0.05 < spread[tmp_path]
+    asked = ("calibrate", noisy_street, "--out", tmp_path / "none")
+    assert "without --develop" in refused(*asked, "--exposure-ev", "1")
+    assert "without --develop" in refused(*asked, "--no-masks")
+    assert "--static" in refused(*asked, "--static", "--develop", "8bit")
+
+
+def test_drives_are_refused(tmp_path):
+    scene = noise_scene(tmp_path, ["0.png"], [])
+    with pytest.raises(UserError, match="--format colmap"):
+        poses_of(dataclasses.replace(scene, format="pandaset"), tmp_path)
