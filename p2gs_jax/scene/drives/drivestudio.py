@@ -1,13 +1,15 @@
-"""Waymo's recordings as drivestudio processes them; PVG and Street Gaussians read them as well.
+"""Waymo's recordings as drivestudio and EmerNeRF process them: photographs, text files and scans.
 
     images/TTT_C.jpg               photographs; T is the frame (10 Hz), C the camera
     intrinsics/C.txt               fx fy cx cy k1 k2 p1 p2 k3
     extrinsics/C.txt               camera to car; x forward, y left, z up, for both
     ego_pose/TTT.txt               car to world
     lidar/TTT.bin                  rows of 14 float32; columns 3 to 5 are a point in the car's axes
-    instances/instances_info.json  boxes
+    instances/instances_info.json  boxes (drivestudio)
 
-Layout: github.com/ziyc/drivestudio, docs/Waymo.md and datasets/waymo/waymo_preprocess.py.
+Layout: github.com/ziyc/drivestudio, docs/Waymo.md and datasets/waymo/waymo_preprocess.py;
+github.com/NVlabs/EmerNeRF, datasets/waymo_preprocess.py. Street Gaussians has the same names of
+files with other axes (script/waymo/waymo_converter.py), which are refused.
 
 There are no time stamps. The pose of the car is that of the middle of the upper scanner's turn
 (`waymo`), and counts as the pose at all photographs of the frame: they were taken up to 0.05 s
@@ -90,9 +92,9 @@ def _pose(path: Path) -> Pose:
 def _mount(path: Path) -> Pose:
     """Return camera to car with OpenCV's axes in the camera; UserError: the file has other axes."""
     mount = _pose(path)
-    # drivestudio writes OpenCV's axes for other data sets: their z is not up.
+    # Other data sets and programs have OpenCV's axes: their z is not up.
     if mount[2, 2] < 0.5:
-        fix = "only Waymo's recordings of drivestudio are read: name the original data set"
+        fix = "process the recording with drivestudio, or name the original data set"
         raise broken(path, "is not the pose of an upright camera of Waymo", fix)
     return mount @ OPENCV
 
