@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 
-from p2gs_jax.cli.shared import DURATIONS, SHORT, check
+from p2gs_jax.cli.shared import DURATIONS, SHORT, check, require_viewer
 from p2gs_jax.config import DataConfig, FitConfig, PresetName
 from p2gs_jax.core.text import count_of
 
@@ -72,6 +72,10 @@ class Fit:
     """CPU cores that share a view (default: at most 4); results repeat for the same number."""
     verbose: bool = False
     """Print all scores, and the seconds of each part of the fit."""
+    view: bool = False
+    """Show the scene in the browser while it is fitted (needs the viewer's libraries)."""
+    port: int = 8080
+    """Port of --view; 0: any free port."""
     cluster: Annotated[Cluster, tyro.conf.OmitArgPrefixes] = Cluster()
 
     def execute(self) -> int:
@@ -80,6 +84,7 @@ class Fit:
         from functools import partial
 
         from p2gs_jax.cli.tables import print_headline, print_metrics
+        from p2gs_jax.cli.watched import WatchedReporter
         from p2gs_jax.core.progress import TerminalReporter
         from p2gs_jax.core.runtime import use_cores
         from p2gs_jax.pipeline.fit import fit
@@ -89,7 +94,7 @@ class Fit:
         cfg, out, cluster = checked(self.config), self.run_folder(), self.cluster
         if cluster.blocks is None:
             use_cores(self.threads)
-        with TerminalReporter() as reporter:
+        with WatchedReporter(out, self.port) if self.view else TerminalReporter() as reporter:
             reporter.message(f"Run folder: {out}")
             common = {"reference": self.reference, "resume": self.resume, "reporter": reporter}
             if cluster.blocks is None:
@@ -126,6 +131,11 @@ class Fit:
         return next(runs / name for name in names if not (runs / name).exists())
 
     def _check(self) -> None:
+        if self.view:
+            require_viewer()
+            fix = "view a block by its folder: p2gs-jax view RUN/blocks/0"
+            check(self.cluster.blocks is None, "--view does not show a fit in blocks", fix=fix)
+        check(self.view or self.port == 8080, "--port has no effect without --view")
         cluster, whole = self.cluster, "write a whole number from 1 on, or"
         count, devices = cluster.blocks, cluster.devices
         why = "--jobs and --engine have no effect without --blocks"

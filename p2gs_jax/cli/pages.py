@@ -1,20 +1,20 @@
-"""`view`, `report` and `compare`: finished runs in the browser."""
+"""`view`, `report` and `compare`: runs in the browser."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib.util import find_spec
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from p2gs_jax.cli.shared import RunPath, SceneFolder, check
+from p2gs_jax.cli.shared import RunPath, SceneFolder, check, require_viewer
 
 
 @dataclass(frozen=True)
 class View:
-    """Walk through a finished run in the browser, at any exposure.
+    """Walk through a run in the browser, at any exposure, also while it is being fitted.
 
     p2gs-jax view runs/street
     """
@@ -27,21 +27,28 @@ class View:
     """Address to listen on (plain HTTP); 0.0.0.0 admits whoever has the printed address."""
     max_width: int = 1920
     """Largest width of rendered pictures, pixels; wider windows enlarge them."""
+    with_fit: bool = False
+    """End with the fit that writes the run."""
 
     def execute(self) -> int:
         """Show the run in the browser until Ctrl-C."""
         from p2gs_jax.cli.tables import stdout
-        from p2gs_jax.run.read import load_run
 
-        why = "the viewer needs viser, which is not installed"
-        check(find_spec("viser") is not None, why, fix="pip install 'p2gs-jax[viewer]'")
+        require_viewer()
+        import jax
+
+        from p2gs_jax.viewer.follow import Follower
         from p2gs_jax.viewer.server import check_address, serve
 
         check(self.max_width >= 64, "--max-width must be at least 64")
         check_address(self.host, self.port)
-        fitted, console = load_run(self.run, self.scene), stdout()
+        say = partial(stdout().print, soft_wrap=True)
+        follower = Follower(self.run, self.scene, with_fit=self.with_fit)
+        if goes_on := follower.goes_on:
+            jax.config.update("jax_platforms", "cpu")  # the fit has the memory of a GPU
+        run = follower.first(say)
         place = {"host": self.host, "port": self.port, "max_width": self.max_width}
-        serve(fitted, say=lambda text: console.print(text, soft_wrap=True), **place)
+        serve(run, say=say, follower=follower if goes_on else None, **place)
         return 0
 
 

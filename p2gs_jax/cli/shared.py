@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -91,6 +92,12 @@ def check(condition: bool, text: str, *, fix: str | None = None) -> None:
     """Raise a UserError unless the condition holds."""
     if not condition:
         raise UserError(text + ".", fix=fix)
+
+
+def require_viewer() -> None:
+    """Raise a UserError unless the libraries of the viewer are installed."""
+    why = "the viewer needs viser, which is not installed"
+    check(find_spec("viser") is not None, why, fix="pip install 'p2gs-jax[viewer]'")
 
 
 def check_option_names(command: str, argv: Sequence[str], options: Collection[str]) -> None:

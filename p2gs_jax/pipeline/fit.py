@@ -35,6 +35,7 @@ from p2gs_jax.pipeline.preflight import (
     preflight,
 )
 from p2gs_jax.pipeline.prepare import Prepared, expected, initialise
+from p2gs_jax.pipeline.snapshots import Snapshots
 from p2gs_jax.pipeline.survey import Survey, load, survey
 from p2gs_jax.presets import require_config, with_values
 from p2gs_jax.render.selfcheck import suited
@@ -125,6 +126,7 @@ def fit(
         results = (params, start.scene, start.survey.store, start.cfg, folder, account, reporter)
         known = {"truth": truth, "lpips_weights": weights, "true_exposures": true_exposures}
         metrics = finish(*results, owner=owner, still_ours=lock.require, **known)
+        folder.remove_snapshot()
     return FitResult(params, scene, metrics, paths.run, start.selection, start.decisions)
 
 
@@ -238,6 +240,7 @@ class Optimiser:
             mesh=self._mesh,
             terms=self._custom.terms,
             strategy=self._custom.strategy,
+            look=Snapshots(self._folder, start).look,
         )
 
 

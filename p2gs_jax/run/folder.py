@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -26,19 +27,25 @@ _FROM_RUN = "_from_run"
 
 
 class RunFolder:
-    """The paths of a run folder; docs/files.md describes the files."""
+    """The paths of a run folder; docs/files.md describes the files.
 
-    def __init__(self, root: Path):
-        self.root = root
+    The parameters lie in the folder `at`, if it is given: that of a snapshot.
+    """
+
+    def __init__(self, root: Path, at: Path | None = None):
+        self.root, self._at = root, at or root
         self.config = root / "config.json"
         self.decisions = root / "decisions.json"
         self.log = root / "log.jsonl"
         self.checkpoints = root / "checkpoints"
         self.pixels = root / "cache" / "pixels"
-        self.radiance = root / "radiance.ply"
+        # The newest snapshot of an unfinished run, and the file by which a viewer asks for one.
+        self.snapshot = root / "snapshot"
+        self.wanted = root / "snapshot.wanted"
+        self.radiance = self._at / "radiance.ply"
         self.splats = root / "splats.ply"
-        self.objects = root / "objects.npz"
-        self.photometry = root / "photometry.json"
+        self.objects = self._at / "objects.npz"
+        self.photometry = self._at / "photometry.json"
         self.metering = root / "metering.json"
         self.metrics = root / "metrics.json"
         self.against = root / "against.json"
@@ -48,7 +55,12 @@ class RunFolder:
     def appearance(self, kind: Appearance) -> Path:
         """Return the file with the corrections that a baseline of this kind learns."""
         names = {"ppisp": "ppisp.json", "luminance": "luminance.json"}
-        return self.root / names.get(kind, "appearance.npy")
+        return self._at / names.get(kind, "appearance.npy")
+
+    def remove_snapshot(self) -> None:
+        """Remove the snapshot of a run that is finished."""
+        shutil.rmtree(self.snapshot, ignore_errors=True)
+        self.wanted.unlink(missing_ok=True)
 
 
 def remembered(key: str, path: Path | None, folder: Path) -> dict[str, str | None]:
@@ -136,6 +148,15 @@ def require_free(folder: Path) -> None:
             _lock(handle, folder)
         finally:
             os.close(handle)
+
+
+def is_written(folder: Path) -> bool:
+    """Return whether another process holds the lock of a folder; nothing is written."""
+    try:
+        require_free(folder)
+    except UserError:
+        return True
+    return False
 
 
 def _acquire(folder: Path) -> int | None:

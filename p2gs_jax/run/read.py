@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Array, Bool, Float32, Int
+from jaxtyping import Array, Bool, Float32, Int, UInt8
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import readable
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
+from p2gs_jax.formats.frames import to_uint8
 from p2gs_jax.formats.ply import read_ply
 from p2gs_jax.gaussians.posed import chosen, posed, standing
 from p2gs_jax.photometry import display
@@ -81,6 +82,21 @@ class Run:
             placement = self.moving.placement(np.asarray(camera.viewmat), time)
             camera = replace(camera, objects=placement)
         return self._renderer(self.params.gaussians, self.alive, camera)
+
+    def picture(
+        self, view: int | Camera, exposure_ev: float | None = None
+    ) -> UInt8[np.ndarray, "h w 3"]:
+        """Return a rendered picture that `matplotlib.pyplot.imshow` shows as it is.
+
+        `view` is a row of `scene.views`, rendered as its photograph was taken, or any camera. With
+        `exposure_ev`, in stops from the mean exposure, the display is common to all views.
+        """
+        shown = self.common_display(exposure_ev or 0.0)
+        if not isinstance(view, Camera):
+            shown = self.own_display(view) if exposure_ev is None else shown
+            view = self.camera(view)
+        rendered = self.render(view)
+        return to_uint8(display.develop(rendered.linear, shown, alpha=rendered.alpha))
 
     def without_objects(self) -> Run:
         """Return the run without moving objects."""
@@ -221,17 +237,20 @@ class Run:
         return replace(self.common_display(), exposure=exposure)
 
 
-def load_run(folder: str | Path, scene: str | Path | None = None) -> Run:
+def load_run(folder: str | Path, scene: str | Path | None = None, *, snapshot: bool = False) -> Run:
     """Read parameters, configuration and cameras of a finished run.
 
     Photographs are read when they are needed, and most methods work without them. `scene` is the
-    current folder of the scene; None: its former path, also relative to the run.
+    current folder of the scene; None: its former path, also relative to the run. The newest
+    `snapshot` of an unfinished run has empty slots, which are transparent, and no metering.
 
     Raises:
         UserError: the folder is not a run, is unfinished or damaged, or is of a version that this
             one cannot read; or `scene` does not exist.
     """
     files = RunFolder(Path(folder))
+    if snapshot:
+        files = RunFolder(files.root, files.snapshot)
     _require_finished(files)
     saved, options = read_config(files.config)
     if scene is not None and not Path(scene).exists():

@@ -74,7 +74,7 @@ def write_run(
     *,
     owner: np.ndarray | None = None,
     moving: MovingObjects | None = None,
-    metering: Metering,
+    metering: Metering | None,
     decisions: Decisions | None = None,
     fitted: Mapping[int, float] | None = None,
     unknown: Sequence[str] = (),
@@ -88,21 +88,15 @@ def write_run(
     the options of the fit. With `decisions`, `config.json` is written as well. `fitted` has the
     exposures fitted to held-out views by row, `unknown` the names of photographs with unknown
     exposures. True exposures by image name are for the plot. Without `shown` there is no summary.
+    Without `metering` there are only the files of parameters, as in a snapshot.
     """
     if not isinstance(folder, RunFolder):
         folder = RunFolder(Path(folder))
     folder.root.mkdir(parents=True, exist_ok=True)
     if decisions is not None:
         write_start(folder, scene.root, None, cfg, decisions)
-    write_scene(folder.root, scene)
     if moving is not None and (owner is not None or moving.middle is not None):
         write_objects(folder.objects, owner, moving, scene)
-    transform = usual_display(params, (), None, cfg.photometry).without_place()
-    placed = params.gaussians
-    if owner is not None and moving is not None:
-        placed = posed(placed, owner, *moving.poses(middle_time(scene)))
-    baked = bake(at_time(placed, None), transform, cfg.render.radiance)
-    write_ply(folder.splats, baked, display_comments(transform))
     write_radiance(folder.radiance, params.gaussians, activation=cfg.render.radiance)
     write_fitted(
         folder.photometry,
@@ -113,10 +107,19 @@ def write_run(
         unknown=unknown,
         solution=solution,
     )
-    write_metering(folder.metering, metering)
     kind = cfg.photometry.appearance
     if kind is not None:
         write_appearance(folder.appearance(kind), params.appearance, scene.training_views)
+    if metering is None:
+        return
+    write_scene(folder.root, scene)
+    transform = usual_display(params, (), None, cfg.photometry).without_place()
+    placed = params.gaussians
+    if owner is not None and moving is not None:
+        placed = posed(placed, owner, *moving.poses(middle_time(scene)))
+    baked = bake(at_time(placed, None), transform, cfg.render.radiance)
+    write_ply(folder.splats, baked, display_comments(transform))
+    write_metering(folder.metering, metering)
     if shown:
         write_summary(folder.summary, shown, params, scene, cfg, true_exposures)
 

@@ -99,6 +99,8 @@ class Trainer:
     strategy: Strategy | None = None  # densification; None: the strategy that `cfg` names
     now: Callable[[], float] = time.monotonic  # monotonic clock, seconds
     store: CheckpointStore | None = None  # of checkpoints; None: in `run_dir/checkpoints`
+    # called between bursts with a function that returns the state, and whether the run stops here
+    look: Callable[[Callable[[], FitState], bool], None] = lambda state, stops: None
 
     def __post_init__(self):
         cfg, views = self.cfg, self.views
@@ -210,6 +212,7 @@ class Trainer:
                 clock.tick(host)
                 saved = host.elapsed_s
                 pause = pause_between(every_s, saved - begun)
+            self.look(functools.partial(self.step.whole, state), signal is not None)
             if signal is not None:
                 self.on_message(
                     f"{interrupts.name_of(signal)}: the run stops after step {host.step} "

@@ -1,1 +1,1 @@
-"""`p2gs-jax view`: a finished run, rendered live in the browser at any exposure."""
+"""`p2gs-jax view`: a run, rendered live in the browser at any exposure."""

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 import viser
 
-from p2gs_jax.core.numerics import LN2
+from p2gs_jax.core.numerics import LN2, evenly_spaced
+from p2gs_jax.core.progress import LogRecord
 from p2gs_jax.photometry.formation import darkens
 from p2gs_jax.viewer.pictures import SAVED_WIDTHS, Mode, exposure_legend, note
 from p2gs_jax.viewer.settings import ChosenCurve, Settings, common_settings, exposures_ev
@@ -39,6 +40,14 @@ HINTS = {
     "Width": "Width from {} to {} pixels; the height follows the window.".format(*SAVED_WIDTHS),
 }
 
+# Charts of a fit that goes on by title: styles of their curves.
+CHARTS: dict[str, dict[str, Any]] = {
+    "Loss": {"width": 1.5},
+    "Exposures of the training views, EV": {"width": 0, "points": {"show": True, "size": 5}},
+}
+MOST_RECORDS = 300
+LINE, INK, GRID = "#4dabf7", "#c1c2c5", "#373a40"
+
 
 class Panel:
     """The controls of one browser.
@@ -54,6 +63,9 @@ class Panel:
         start = common_settings(run)
         self._taken_as: int | None = start.taken_as
         self._status = gui.add_html(note("starting ..."))
+        # A sentence on the fit and charts, if it goes on.
+        self._training = gui.add_html("", visible=False)
+        self._charts: list[viser.GuiUplotHandle] = []
         with gui.add_folder("Picture"):
             self._add_picture()
         with gui.add_folder("Camera"):
@@ -187,6 +199,25 @@ class Panel:
         """Set the controls to the camera of a view."""
         self._go_to.value = self._names[index]
         self._fov.value = degrees
+
+    def show_training(self, log: list[dict[str, Any]]) -> None:
+        """Show the last of the records of a fit, their losses, and the exposures."""
+        self._training.content = note(LogRecord(**log[-1]).summary())
+        if not self._charts:
+            self._training.visible = True
+            with self._gui.add_folder("Training", order=self._training.order):
+                self._charts = [self._chart(*words) for words in CHARTS.items()]
+        rows = evenly_spaced(len(log), MOST_RECORDS)
+        losses = [(log[row]["step"], log[row]["loss"]) for row in rows]
+        evs = list(exposures_ev(self._viewed.run).items())
+        for chart, pairs in zip(self._charts, (losses, evs), strict=True):
+            chart.data = tuple(np.array(pairs, float).T)
+
+    def _chart(self, title: str, style: dict[str, Any]) -> viser.GuiUplotHandle:
+        axes, nothing = ({"stroke": INK, "grid": {"stroke": GRID}},) * 2, (np.zeros(1),) * 2
+        plain: Any = {"scales": {"x": {"time": False}}, "legend": {"show": False}, "axes": axes}
+        series: Any = ({}, {"stroke": LINE, **style})
+        return self._gui.add_uplot(nothing, series, title=title, aspect=2.2, **plain)
 
     def set_status(self, html: str) -> None:
         """Show a status line."""

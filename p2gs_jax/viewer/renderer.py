@@ -66,6 +66,15 @@ class Renderer:
         self._lock, self._one_frame = threading.RLock(), threading.Lock()
         self._compiler = ThreadPoolExecutor(1, "compile")
 
+    def show(self, gaussians: Gaussians, alive: Bool[Array, " n"]) -> None:
+        """Render other Gaussians from now on; a different number of them needs new programs."""
+        with self._lock:
+            stays = self._scene[0].capacity == gaussians.capacity
+            self._scene = gaussians, alive
+            if not stays:
+                sizes, self._jobs = tuple(self._jobs), {}
+                self.request(sizes)
+
     @property
     def ready(self) -> frozenset[Size]:
         """The compiled sizes."""
@@ -112,11 +121,11 @@ class Renderer:
         """
         size = (camera.width, camera.height)
         with self._lock:
-            job = self._jobs.get(size)
+            job, scene = self._jobs.get(size), self._scene
         if job is None or not _succeeded(job):
             return None
         with self._one_frame:
-            result = job.result()(*self._scene, camera)
+            result = job.result()(*scene, camera)
             needed = int(result.count)
         if not bool(result.overflow):
             return _frame(result, camera)
@@ -130,11 +139,12 @@ class Renderer:
 
         Raises a UserError if its tile lists would need too much memory.
         """
-        if int(capacity.count_needed(*self._scene, camera, cfg=self._cfg)) > MOST_ENTRIES:
+        scene = self._scene
+        if int(capacity.count_needed(*scene, camera, cfg=self._cfg)) > MOST_ENTRIES:
             why = f"{camera.width} x {camera.height} pixels from here need too much memory."
             raise UserError(why, fix="move away from close objects, or choose a smaller width")
         with self._one_frame:
-            return _frame(self._render_any(*self._scene, camera), camera)
+            return _frame(self._render_any(*scene, camera), camera)
 
     def stop(self) -> None:
         """Wait for the program that is being compiled, and compile no more.
@@ -146,13 +156,13 @@ class Renderer:
     def _compile(self, size: Size, needed: int) -> Callable[..., Render]:
         """Return the program of a size, with room for the probes and for `needed` entries."""
         self._on_change()
-        cameras = [probe(size) for probe in self._probes]
-        counts = [int(capacity.count_needed(*self._scene, c, cfg=self._cfg)) for c in cameras]
+        scene, cameras = self._scene, [probe(size) for probe in self._probes]
+        counts = [int(capacity.count_needed(*scene, c, cfg=self._cfg)) for c in cameras]
         entries = capacity.bucket(max(needed, *counts), capacity.ANYWHERE.first)
         static = {"cfg": self._cfg, "capacity": entries}
-        run = capacity.compiled_renderer().lower(*self._scene, cameras[0], **static).compile()
+        run = capacity.compiled_renderer().lower(*scene, cameras[0], **static).compile()
         with self._one_frame:
-            result = jax.block_until_ready(run(*self._scene, cameras[0]))
+            result = jax.block_until_ready(run(*scene, cameras[0]))
         self._warm_up(result)
         return run
 

@@ -31,8 +31,10 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from p2gs_jax.core import interrupts
+from p2gs_jax.core.atomic import read_jsonl
 from p2gs_jax.errors import UserError
 from p2gs_jax.run.read import Run
+from p2gs_jax.viewer.follow import POLL_S, Follower
 from p2gs_jax.viewer.renderer import compilation_order, full_size, render_sizes
 from p2gs_jax.viewer.session import BrowserSession
 from p2gs_jax.viewer.viewed_run import ViewedRun
@@ -167,8 +169,13 @@ def check_address(host: str, port: int) -> None:
 
 
 @contextmanager
-def open_viewer(run: Run, *, host: str, port: int, max_width: int) -> Iterator[str]:
+def open_viewer(
+    run: Run, *, host: str, port: int, max_width: int, follower: Follower | None = None
+) -> Iterator[str]:
     """Serve a run until the block ends; yield the address to open, with its token if it needs one.
+
+    If a fit still writes the run, `follower` follows it, and nothing is compiled before a browser
+    connects.
 
     Raises a UserError if no server can listen on `host` and `port`.
     """
@@ -182,22 +189,44 @@ def open_viewer(run: Run, *, host: str, port: int, max_width: int) -> Iterator[s
             host=host, port=port, label=f"p2gs-jax: {run.folder.name}", verbose=False
         )
     sessions: dict[int, BrowserSession] = {}
+    ended = threading.Event()
+    arguments = (follower, viewed, sessions, ended)
+    following = threading.Thread(target=_follow, args=arguments, name="follow", daemon=True)
     try:
         if port not in (0, server.get_port()):
             raise UserError(f"port {port} has become busy.", fix="choose another with --port")
         _set_up_server(server, viewed, sessions)
-        sizes = render_sizes(full_size(LIKELY_CANVAS, max_width))
-        viewed.renderer.request(compilation_order(sizes))
+        if follower is None:
+            sizes = render_sizes(full_size(LIKELY_CANVAS, max_width))
+            viewed.renderer.request(compilation_order(sizes))
+        else:
+            following.start()
         name = "localhost" if host in ("0.0.0.0", "::", "") else host
         address = f"http://{f'[{name}]' if ':' in name else name}:{server.get_port()}"
         yield address if guard.token is None else f"{address}/?{QUERY}={guard.token}"
     finally:
+        ended.set()
+        if following.is_alive():
+            following.join()
         for session in tuple(sessions.values()):
             session.stop()
         viewed.renderer.stop()
         with contextlib.redirect_stdout(io.StringIO()):
             server.stop()
         viewed.store.close()
+
+
+def _follow(
+    follower: Follower, viewed: ViewedRun, sessions: dict[int, Any], ended: threading.Event
+) -> None:
+    """Show all browsers what a fit has reached, until the viewer has ended."""
+    while not ended.wait(POLL_S):
+        run = follower.poll(wanted=bool(sessions))
+        if run is not None:
+            viewed.show(run)
+        log = read_jsonl(follower.files.log) if sessions else []
+        for session in tuple(sessions.values()) if log else ():
+            session.follow(log, newer=run is not None)
 
 
 def _set_up_server(
@@ -239,18 +268,22 @@ def _set_up_server(
             session.stop()
 
 
-def serve(run: Run, *, host: str, port: int, max_width: int, say: Callable[[str], None]) -> None:
-    """Serve a run until Ctrl-C or SIGTERM.
+def serve(
+    run: Run, *, say: Callable[[str], None], follower: Follower | None = None, **place: Any
+) -> None:
+    """Serve a run until Ctrl-C or SIGTERM, or until the fit ends that `follower` ends with.
 
-    `say` prints a line. Raises a UserError if no server can listen on `host` and `port`.
+    `say` prints a line; `follower` and `place` (host, port, max_width) are as for `open_viewer`.
+    Raises a UserError if no server can listen on `host` and `port`.
     """
-    with open_viewer(run, host=host, port=port, max_width=max_width) as address:
-        who = "only this machine" if is_loopback(host) else "any machine with this address"
-        count = run.params.gaussians.capacity
+    with open_viewer(run, follower=follower, **place) as address:
+        alone = is_loopback(place["host"])
+        who = "only this machine" if alone else "any machine with this address"
+        what = "Watch the fit" if follower else f"{run.params.gaussians.capacity} Gaussians"
         with contextlib.suppress(KeyboardInterrupt), interrupts.held() as asked:
             # Signals are recorded, not raised: Python drops exceptions during garbage collection.
             asked.begin()
-            say(f"{count} Gaussians at {address} (open to {who}; Ctrl-C ends)")
-            while asked.arrived is None:
+            say(f"{what} at {address} (open to {who}; Ctrl-C ends)")
+            while asked.arrived is None and not (follower and follower.over):
                 time.sleep(0.1)
         say("The viewer stops after the compilation in progress.")

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import threading
 import time
+from typing import Any
 
 import numpy as np
 import viser
 
+from p2gs_jax.run.read import Run
 from p2gs_jax.viewer.camera import Frusta, Pose, browser_view
 from p2gs_jax.viewer.live import Darkroom, LivePicture, report
 from p2gs_jax.viewer.panel import Panel
@@ -21,7 +23,7 @@ class BrowserSession:
 
     def __init__(self, client: viser.ClientHandle, viewed: ViewedRun):
         """Add the controls to the page and start rendering."""
-        self._client, self._viewed, self._run = client, viewed, viewed.run
+        self._client, self._viewed = client, viewed
         self._panel = Panel(client.gui, viewed, self)
         self._live = LivePicture(client, viewed, self._panel)
         self._frusta: Frusta | None = None
@@ -35,6 +37,16 @@ class BrowserSession:
     def stop(self) -> None:
         """Stop the thread after the browser has disconnected."""
         self._live.stop()
+
+    @property
+    def _run(self) -> Run:
+        return self._viewed.run
+
+    def follow(self, log: list[dict[str, Any]], *, newer: bool) -> None:
+        """Show the log of the fit, and a `newer` state of the run at the same place."""
+        self._panel.show_training(log)
+        if newer:
+            self._live.post("camera")
 
     def _camera_moved(self, camera: viser.CameraHandle) -> None:
         if self._frusta is not None:

@@ -51,8 +51,13 @@ class ViewedRun:
             run.cfg.render,
             [partial(self._probe, int(row)) for row in probes],
             self._notify,
-            lambda result: develop(result.linear, run.common_display(), alpha=result.alpha),
+            lambda result: develop(result.linear, self.run.common_display(), alpha=result.alpha),
         )
+
+    def show(self, run: Run) -> None:
+        """Show a later state of the run; scale, cameras and photographs stay."""
+        self.run, gaussians = run, at_time(run.as_of(), None)
+        self.renderer.show(gaussians, on_device(np.ones(gaussians.capacity), bool))
 
     def _notify(self) -> None:
         for listener in tuple(self.listeners):

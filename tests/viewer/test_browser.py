@@ -1,6 +1,14 @@
 """The viewer in a real browser: it shows pictures, and a slider does what it claims."""
 
+import contextlib
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -143,3 +151,38 @@ def test_going_to_a_photograph_takes_its_look_and_place_and_cameras_appear(page)
     page.mouse.move(300, 500)
     page.mouse.wheel(0, 400)
     until(page, lambda now: np.abs(now - before).mean() > 0.01)
+
+
+def test_a_fit_is_seen_while_it_goes_on_and_its_viewer_ends_with_it(
+    browser, finished_run, tmp_path
+):
+    options = ["--steps", "100000", "--gaussians", "400", "--render.sh-degree", "1"]
+    options += ["--test-every", "3", "--init.shell", "off", "--view", "--port", "0"]
+    scene, root = finished_run.parent / "scene", Path(__file__).resolve().parents[2]
+    fit = subprocess.Popen(
+        [sys.executable, "-m", "p2gs_jax.cli", "fit", scene, "--out", tmp_path / "run", *options],
+        env=os.environ | {"PYTHONPATH": str(root), "COLUMNS": "200"},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        address = next(filter(None, (re.search(r"http://\S+", line) for line in fit.stderr)))[0]
+        page = browser.new_page(viewport=SIZE)
+        page.set_default_timeout(1e3 * PATIENCE_S)
+        page.goto(address)
+        page.wait_for_function("/step \\d+ of 100000, loss/.test(document.body.innerText)")
+        page.get_by_text("Exposures of the training views").wait_for()
+        page.wait_for_function("/\\d+ ms/.test(document.body.innerText)")
+        until(page, lambda shown: shown.std() > 0.05)
+        page.close()
+    finally:
+        fit.send_signal(signal.SIGINT)
+        said = fit.communicate(timeout=PATIENCE_S)[1]
+    assert fit.returncode == 130, said
+    host, port = address.removeprefix("http://").split(":")
+    end = time.monotonic() + PATIENCE_S
+    with contextlib.suppress(ConnectionRefusedError):
+        while time.monotonic() < end:  # it may still compile
+            socket.create_connection((host, int(port)), timeout=5).close()
+            time.sleep(1)
+        pytest.fail("the viewer goes on")

@@ -84,6 +84,21 @@ def test_renders_what_the_renderer_renders(made):
     np.testing.assert_allclose(shown.depth, expected.depth, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("count", [200, 150])
+def test_other_gaussians_are_shown_by_the_same_program_where_their_number_stays(made, count):
+    renderer, changed = made(gaussians())
+    renderer.request([SIZE])
+    wait_for(renderer, changed, SIZE)
+    other = gaussians(count, scale=-2.0)
+    renderer.show(other, jnp.ones(count, bool))
+    if count == 200:
+        assert renderer.compiling is None
+    wait_for(renderer, changed, SIZE)
+    expected = make_renderer(CFG)(other, jnp.ones(count, bool), camera(SIZE))
+    shown = renderer.render(camera(SIZE))
+    np.testing.assert_allclose(shown.linear, expected.linear, rtol=1e-5, atol=1e-6)
+
+
 def test_a_view_that_overflows_comes_as_soon_as_there_is_room(made):
     renderer, changed = made(gaussians(scale=-0.5), z=-100.0)  # probes look away: short lists
     renderer.request([LARGE])

@@ -32,7 +32,8 @@ PROTOCOL = f"viser-v{viser.__version__}"
 
 def test_without_viser_it_says_how_to_get_it(refused, monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "viser", None)
-    assert "pip install 'p2gs-jax[viewer]'" in refused("view", tmp_path)
+    for words in (("view", tmp_path), ("fit", tmp_path, "--view")):
+        assert "pip install 'p2gs-jax[viewer]'" in refused(*words)
 
 
 @pytest.mark.parametrize(
@@ -46,6 +47,11 @@ def test_without_viser_it_says_how_to_get_it(refused, monkeypatch, tmp_path):
 )
 def test_wrong_input(refused, tmp_path, options, said):
     assert said in refused("view", tmp_path, "--port", "0", *options)
+
+
+def test_a_port_of_a_fit_is_that_of_its_viewer(refused, tmp_path):
+    assert "without --view" in refused("fit", tmp_path, "--port", "9000")
+    assert "RUN/blocks/0" in refused("fit", tmp_path, "--view", "--blocks", "2")
 
 
 def test_busy_port(refused, tmp_path):

@@ -100,6 +100,7 @@ def fit_block(folder: Path, arguments: dict[str, Any], reporter: Reporter) -> No
     seconds["total"] = time.monotonic() - begin
     metrics = {"counts": counts, "seconds": seconds, "peak_bytes": peak_bytes()}
     write_json(RunFolder(folder).metrics, metrics)
+    RunFolder(folder).remove_snapshot()
 
 
 def _fit(

@@ -1,0 +1,68 @@
+"""A run that a fit still writes: its snapshots, its log, and its results at the end."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from p2gs_jax.errors import UserError
+from p2gs_jax.run.folder import RunFolder, is_written
+from p2gs_jax.run.read import Run, load_run
+
+# Seconds between two looks at the run folder.
+POLL_S = 1.0
+
+
+class Follower:
+    """Asks a fit for snapshots, and reads them; `files` has the paths of its run."""
+
+    def __init__(self, folder: Path, scene: Path | None = None, *, with_fit: bool = False):
+        """Follow the run in a folder, `with_fit` until its end; `scene` is as for `load_run`."""
+        self.files, self._scene, self._with_fit = RunFolder(folder), scene, with_fit
+        self._seen = 0  # time of the snapshot that was read last
+        self._went_on = False
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether a fit is writing the run; a finished run has scores."""
+        return is_written(self.files.root) and not self.files.metrics.exists()
+
+    @property
+    def over(self) -> bool:
+        """Whether the viewer ends, because the fit has ended."""
+        return self._with_fit and not self.goes_on
+
+    def first(self, say: Callable[[str], None]) -> Run:
+        """Return the run as soon as it can be shown; `say` receives a message if it must wait.
+
+        Raises:
+            UserError: see `load_run`.
+        """
+        if self.goes_on:
+            say("Waiting for the first steps of the fit ...")
+        while self.goes_on:
+            if (run := self.poll(wanted=True)) is not None:
+                return run
+            time.sleep(POLL_S)
+        return self._latest()
+
+    def poll(self, *, wanted: bool) -> Run | None:
+        """Return a newer state of the run, or None; if one is `wanted`, the fit is asked for it."""
+        before, self._went_on = self._went_on, self.goes_on
+        try:
+            if not self._went_on:
+                return self._latest() if before else None
+            if wanted:
+                self.files.wanted.touch()
+            now = self.files.snapshot.stat().st_mtime_ns
+            run = None if now == self._seen else self._latest()
+        except (OSError, UserError):  # there is no snapshot, or another one replaces it
+            return None
+        self._seen = now
+        return run
+
+    def _latest(self) -> Run:
+        """Return the snapshot of an unfinished run, or the finished run."""
+        there = self.files.snapshot.is_dir()
+        return load_run(self.files.root, self._scene, snapshot=there)
