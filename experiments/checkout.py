@@ -8,15 +8,15 @@ from pathlib import Path
 HERE = Path(__file__).parent
 
 
-def commit() -> str:
-    """Return the short commit of this checkout and whether files differ, figures aside."""
+def commit(root: Path = HERE) -> str:
+    """Return the short commit of a checkout and whether files differ, figures aside."""
     kept = [f":(top,exclude)experiments/**.{suffix}" for suffix in ("json", "md")]
-    changed = _git("status", "--porcelain", "-uno", "--", ":/", *kept)
-    return (_git("rev-parse", "--short", "HEAD") or "unknown") + (" and changes" if changed else "")
+    changed = git(root, "status", "--porcelain", "-uno", "--", ":/", *kept)
+    named = git(root, "rev-parse", "--short", "HEAD") or "unknown"
+    return named + (" and changes" if changed else "")
 
 
-def _git(*words: str) -> str:
-    done = subprocess.run(
-        ["git", "-C", str(HERE), *words], capture_output=True, text=True, check=False
-    )
-    return done.stdout.strip()
+def git(root: Path, *words: str) -> str:
+    """Return what git prints in a checkout, or an empty text where it fails."""
+    command = ["git", "-C", str(root), *words]
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()

@@ -31,22 +31,13 @@ PEAK = re.compile(r"VmHWM:\s+(\d+)")
 
 @dataclasses.dataclass(frozen=True)
 class Size:
-    """How large everything is.
+    """How large everything is."""
 
-    Attributes:
-        frames: of each of three cameras.
-        step_m: between them.
-        width: of the photographs, pixels.
-        points: sampled for the model.
-        steps: of one fit; blocks take their shares.
-        blocks: how many.
-    """
-
-    frames: int
-    step_m: float
-    width: int
-    points: int
-    steps: int
+    frames: int  # of each of three cameras
+    step_m: float  # between them
+    width: int  # of the photographs, pixels
+    points: int  # sampled for the model
+    steps: int  # of one fit; blocks take their shares
     blocks: int
 
     @property

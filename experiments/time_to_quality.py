@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import datetime
 import hashlib
-import itertools
 import json
 import os
 import resource
@@ -25,11 +24,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
+from checkout import commit, git
 from mixtures import read_groups, within_groups_ev, write_mixture
 
 from p2gs_jax.core.atomic import write_json
-from p2gs_jax.evaluation.alignment import exposure_error
+from p2gs_jax.evaluation.alignment import error_of_views
 from p2gs_jax.synth.sensor import Sensor, read_true_exposures
 from p2gs_jax.synth.settings import image_height
 from p2gs_jax.synth.write import write_street
@@ -40,17 +39,12 @@ THIS, AGAINST = "this", "against"
 
 
 class Version(NamedTuple):
-    """A checkout.
+    """A checkout."""
 
-    Attributes:
-        label: `this` or `against`.
-        code: hash of its `p2gs_jax`; rows are kept by it.
-    """
-
-    label: str
+    label: str  # `this` or `against`
     root: Path
     commit: str
-    code: str
+    code: str  # hash of its `p2gs_jax`; rows are kept by it
 
 
 class SceneToFit(NamedTuple):
@@ -76,19 +70,12 @@ class Job(NamedTuple):
 
 def version(label: str, root: Path) -> Version:
     """Return the version that a folder has checked out."""
-
-    def git(*arguments: str) -> str:
-        command = ["git", "-C", str(root), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
-
     if not (root / "p2gs_jax" / "cli").is_dir():
         raise SystemExit(f"{root} is not a checkout of p2gs-jax.")
-    code = git("rev-parse", "--short=10", "HEAD:p2gs_jax")
-    commit = git("rev-parse", "--short", "HEAD")
-    if changed := git("diff", "HEAD", "--", "p2gs_jax"):
+    code = git(root, "rev-parse", "--short=10", "HEAD:p2gs_jax")
+    if changed := git(root, "diff", "HEAD", "--", "p2gs_jax"):
         code += "+" + hashlib.sha256(changed.encode()).hexdigest()[:6]
-        commit += " and changes"
-    return Version(label, root, commit, code)
+    return Version(label, root, commit(root), code)
 
 
 def scenes(names: Sequence[str], work: Path, data: Path) -> list[SceneToFit]:
@@ -151,6 +138,7 @@ def execute(job: Job, work: Path) -> dict[str, Any]:
         metrics = json.loads((out / "metrics.json").read_text())
         photometry = json.loads((out / "photometry.json").read_text())
     truth, groups = read_true_exposures(job.scene.folder), read_groups(job.scene.folder)
+    error = error_of_views(photometry.get("views", ()), truth)
     return {
         "scene": job.scene.name,
         "version": job.version.label,
@@ -164,18 +152,8 @@ def execute(job: Job, work: Path) -> dict[str, Any]:
         "gaussians": at(metrics, "counts", "gaussians"),
         "test_psnr": at(metrics, "test", "exposure_fitted", "psnr"),
         "reference_test_psnr": at(metrics, "reference", "scale_aligned", "test", "psnr"),
-        "ev": within_groups_ev(photometry, groups) if groups else true_ev(photometry, truth),
+        "ev": within_groups_ev(photometry, groups) if groups else at(error or {}, "ev"),
     }
-
-
-def true_ev(photometry: Mapping[str, Any], truth: Mapping[str, float]) -> float | None:
-    """Return the RMS error of a run's exposures, EV, after one common scale; None without truth."""
-    pairs = [
-        (2.0 ** view["exposure_ev"], truth[view["image"]])
-        for view in photometry.get("views", ())
-        if view["exposure_ev"] is not None and view["image"] in truth
-    ]
-    return exposure_error(*np.array(pairs).T)["ev"] if pairs else None
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -189,41 +167,6 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
         first = [r["scene"], str(r["budget"]), f"{r['version']} ({r['commit']})"]
         lines.append("| " + " | ".join([*first, *cells]) + " |")
     return "\n".join(lines) + "\n"
-
-
-Curve = list[tuple[float, float]]
-
-
-def curve(rows: Sequence[Mapping[str, Any]], scene: str, label: str) -> Curve:
-    """Return (wall seconds, held-out PSNR) of one version, by time."""
-    mine = [r for r in rows if (r["scene"], r["version"]) == (scene, label)]
-    return sorted((r["wall_s"], r["test_psnr"]) for r in mine if r["test_psnr"] is not None)
-
-
-def seconds_to(points: Curve, level: float) -> float | None:
-    """Return when a curve first reaches a level, linear in log time; None where it does not."""
-    if points and points[0][1] >= level:
-        return points[0][0]
-    for (t0, v0), (t1, v1) in itertools.pairwise(points):
-        if v1 >= level:
-            part = (level - v0) / (v1 - v0)
-            return float(np.exp(np.log(t0) + part * np.log(t1 / t0)))
-    return None
-
-
-def speedups(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return a sentence per scene: when this version reaches the best of the other."""
-    out = []
-    for scene in dict.fromkeys(r["scene"] for r in rows):
-        ours, theirs = (curve(rows, scene, v) for v in (THIS, AGAINST))
-        if ours and theirs:
-            end, level = max(theirs, key=lambda point: point[1])
-            begin = seconds_to(ours, level)
-            here = (
-                "never" if begin is None else f"in {begin:.0f} s, {end / begin:.2f} times as fast"
-            )
-            out.append(f"{scene}: {level:.2f} dB takes the other {end:.0f} s; here: {here}")
-    return out
 
 
 def main() -> None:
@@ -251,7 +194,6 @@ def main() -> None:
     # Rows of other code stay in the file; the table shows these two versions.
     shown = [row for job in jobs for row in rows if job.of(row)]
     print(table(shown))
-    print("\n".join(f"- {line}" for line in speedups(shown)))
 
 
 if __name__ == "__main__":

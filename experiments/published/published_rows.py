@@ -30,18 +30,11 @@ ROWS = HERE / "rows.json"
 
 
 class Key(NamedTuple):
-    """What a row is of.
+    """What a row is of."""
 
-    Attributes:
-        benchmark: as in `published.json`.
-        scene: of the benchmark.
-        method: preset, with what differs from it.
-        steps: of the fit.
-    """
-
-    benchmark: str
+    benchmark: str  # as in `published.json`
     scene: str
-    method: str
+    method: str  # preset, with what differs from it
     steps: int
 
 
@@ -58,15 +51,10 @@ def add_row(key: Key, row: dict[str, Any], path: Path = ROWS) -> None:
 
 
 class Fit(NamedTuple):
-    """A finished fit.
+    """A finished fit."""
 
-    Attributes:
-        metrics: as `metrics.json`.
-        commit: of the checkout that fitted it; of one that was resumed by others, all.
-    """
-
-    metrics: dict[str, Any]
-    commit: str
+    metrics: dict[str, Any]  # as `metrics.json`
+    commit: str  # of the checkout that fitted it; of one that was resumed by others, all
 
 
 def of_fit(fit: Fit, command: str) -> dict[str, Any]:
