@@ -6,8 +6,8 @@ python experiments/published/hdr_nerf.py made --out DIR --steps 900
 SCENE is a folder of HDR-NeRF, HDR-GS or GaussHDR (docs/scenes.md, "HDR sets") with five exposures
 t1 to t5 of each pose. Each pose of training shows one of t1, t3, t5, in turn as in GaussHDR's
 "exp-1" (`--exposures 3`: all three). Held-out poses are the data set's; of a set without a split,
-every second pose, as in HDR-NeRF's real scenes. `made` is a procedural town in the layout of the
-synthetic scenes. Columns, in dB, are means over photographs of held-out poses:
+every second pose, as in HDR-NeRF's real scenes. `made` is a procedural town in the layout of
+GaussHDR. Columns, in dB, are means over photographs of held-out poses:
 
 - OE, NE: at t1, t3, t5, and at t2, t4. The exposure is the photograph's time, times one factor that
   the training views give: the median of their exposures over their times;
@@ -37,48 +37,42 @@ from p2gs_jax.scene import find_scene
 from p2gs_jax.scene.hdr_sets import by_pose
 from p2gs_jax.synth.sensor import photograph
 from p2gs_jax.synth.settings import Sensor, image_height
-from p2gs_jax.types import Scene, View
+from p2gs_jax.types import Scene
 
 TRAINED, TIMES = (0, 2, 4), (1 / 16, 1 / 4, 1.0, 4.0, 16.0)
-FRAMES, WIDTH = 12, 160
-OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+FRAMES, STEP_M, WIDTH = 12, 0.6, 160
 COLUMNS = ("EV error", "OE", "NE", "OE own", "NE own", "HDR")
 METHODS = {"given": ("--known-exposures", "exif"), "withheld": ()}
 
 
 def write_made(root: Path) -> None:
     """Write 18 poses to train on and 18 held out, five filmic photographs of each."""
-    town = root.with_name("town")
     if root.exists():
         return
-    size = {"width": WIDTH, "height": image_height(WIDTH)}
-    p2gs_jax.write_street(town, frames=FRAMES, iso_std=0.0, layout="town", **size)
-    views = sorted(p2gs_jax.load_scene(town, DataConfig()).views, key=lambda v: natural(v.name))
+    town, size = root.with_name("town"), {"width": WIDTH, "height": image_height(WIDTH)}
+    if not town.exists():
+        p2gs_jax.write_street(town, frames=FRAMES, step=STEP_M, iso_std=0.0, layout="town", **size)
+    views, times = p2gs_jax.load_scene(town, DataConfig()).views, {}
     numbers = sorted({Path(view.name).stem for view in views})
     with atomic_folder(root) as folder:
-        for k, part in enumerate(("train", "test")):
-            write_part(folder, part, town, [v for v in views if Path(v.name).stem in numbers[k::2]])
-
-
-def write_part(root: Path, part: str, town: Path, views: Sequence[View]) -> None:
-    """Write photographs, poses, times and true radiance of a part of the split."""
-    (root / part).mkdir()
-    (root / f"{part}_hdr").mkdir()
-    frames, times = [], {}
-    for k, view in enumerate(views):
-        truth = (town / "truth" / "linear" / view.name).with_suffix(".exr")
-        shutil.copy(truth, root / f"{part}_hdr" / f"hdr_{k:03d}.exr")
-        linear, *_ = read_exr(truth)
-        for e, time in enumerate(TIMES):
-            name = f"./{part}/r_{k}_{e}.png"
-            times[name] = time
-            pixels = photograph(linear, time, Sensor(curve="filmic"))
-            cv2.imwrite(str(root / name), pixels[..., ::-1])
-        pose = np.linalg.inv(view.viewmat.astype(float)) @ OPENGL
-        frames.append({"file_path": f"./{part}/r_{k}", "transform_matrix": pose.tolist()})
-    angle = 2 * float(np.arctan(views[0].width / (2 * views[0].K[0, 0])))
-    write_json(root / f"transforms_{part}.json", {"camera_angle_x": angle, "frames": frames})
-    write_json(root / f"exposure_{part}.json", times)
+        shutil.copytree(town / "sparse", folder / "sparse")
+        model = folder / "sparse" / "0" / "images.bin"
+        data = model.read_bytes()
+        for name in ("images", "images_hdr"):
+            (folder / name).mkdir()
+        for k, view in enumerate(views):
+            part = ("train", "test")[numbers.index(Path(view.name).stem) % 2]
+            truth = (town / "truth" / "linear" / view.name).with_suffix(".exr")
+            shutil.copy(truth, folder / "images_hdr" / f"{part}_hdr_{k:03d}.exr")
+            linear, *_ = read_exr(truth)
+            for e, time in enumerate(TIMES):
+                times[name := f"{part}_{k:03d}_{e}.png"] = time
+                pixels = photograph(linear, time, Sensor(curve="filmic"))
+                cv2.imwrite(str(folder / "images" / name), pixels[..., ::-1])
+            # Names end with a zero byte, so that another length is no matter.
+            data = data.replace(view.name.encode(), f"{part}_{k:03d}_0.png".encode())
+        model.write_bytes(data)
+        write_json(folder / "exposure.json", times)
 
 
 def by_exposure(scene: Scene, rows: Sequence[int]) -> list[list[int]]:
