@@ -13,35 +13,21 @@ COMMAND = "python experiments/reliability/run.py --only"
 
 
 class Failure(NamedTuple):
-    """A trial that was not survived.
+    """A trial that was not survived."""
 
-    Attributes:
-        name: of the trial.
-        reason: what happened instead.
-    """
-
-    name: str
-    reason: str
+    name: str  # of the trial
+    reason: str  # what happened instead
 
 
 @dataclass(frozen=True)
 class Family:
-    """What trials of one kind found.
+    """What trials of one kind found."""
 
-    Attributes:
-        name: of the module.
-        tried: how many trials.
-        survived: how many ended as they should.
-        failures: the others.
-        command: that repeats it.
-        seconds: that it took.
-        figures: further numbers, rows of one table; all have the same keys.
-    """
-
-    name: str
-    tried: int
-    survived: int
-    failures: tuple[Failure, ...] = ()
-    command: str = ""
-    seconds: float = 0.0
+    name: str  # of the module
+    tried: int  # how many trials
+    survived: int  # how many ended as they should
+    failures: tuple[Failure, ...] = ()  # the others
+    command: str = ""  # that repeats it
+    seconds: float = 0.0  # that it took
+    # further numbers, rows of one table; all have the same keys
     figures: tuple[Mapping[str, str | int | float], ...] = ()

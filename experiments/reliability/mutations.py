@@ -19,29 +19,18 @@ BAD_VALUES: tuple[Any, ...] = (
 
 
 class Broken(NamedTuple):
-    """A file that was whole.
+    """A file that was whole."""
 
-    Attributes:
-        name: what was done to it.
-        data: what it holds now.
-    """
-
-    name: str
-    data: bytes
+    name: str  # what was done to it
+    data: bytes  # what it holds now
 
 
 class Field(NamedTuple):
-    """A number of a binary file.
+    """A number of a binary file."""
 
-    Attributes:
-        layout: as `struct` has it, one value.
-        value: of it; bytes stand for themselves.
-        name: what it is.
-    """
-
-    layout: str
-    value: Any
-    name: str
+    layout: str  # as `struct` has it, one value
+    value: Any  # of it; bytes stand for themselves
+    name: str  # what it is
 
 
 def packed(fields: list[Field]) -> bytes:

@@ -31,42 +31,28 @@ _GRANULE = 0.01
 
 @dataclass(frozen=True)
 class Trial:
-    """Something to be survived.
+    """Something to be survived."""
 
-    Attributes:
-        name: unique in its family.
-        make: writes what is needed into an empty folder, and returns the folder or file to name.
-        act: is given what `make` returned, in a child; its code is that of the command line.
-        named: one of these words has to be in a refusal; empty: a path below the folder.
-        refused: it has to be refused; None: may be read or refused.
-        seconds: that it may take.
-        data: bytes of memory that it may ask for; resident it may have `BYTES`.
-    """
-
-    name: str
+    name: str  # unique in its family
+    # writes what is needed into an empty folder, and returns the folder or file to name
     make: Callable[[Path], Path]
+    # is given what `make` returned, in a child; its code is that of the command line
     act: Callable[[Path], int]
+    # one of these words has to be in a refusal; empty: a path below the folder
     named: tuple[str, ...] = ()
-    refused: bool | None = None
-    seconds: float = SECONDS
-    data: int = BYTES
+    refused: bool | None = None  # it has to be refused; None: may be read or refused
+    seconds: float = SECONDS  # that it may take
+    data: int = BYTES  # bytes of memory that it may ask for; resident it may have `BYTES`
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a child ended.
+    """How a child ended."""
 
-    Attributes:
-        code: exit status; negative: by this signal; None: it took too long.
-        text: all that it printed.
-        seconds: that it took.
-        peak: resident memory, bytes.
-    """
-
-    code: int | None
-    text: str
-    seconds: float
-    peak: int
+    code: int | None  # exit status; negative: by this signal; None: it took too long
+    text: str  # all that it printed
+    seconds: float  # that it took
+    peak: int  # resident memory, bytes
 
 
 def run_trials(

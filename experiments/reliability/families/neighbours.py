@@ -40,19 +40,12 @@ Check = Callable[[Scene], bool]
 
 @dataclass(frozen=True)
 class Case:
-    """A scene, and what is right.
+    """A scene, and what is right."""
 
-    Attributes:
-        make: writes it into an empty folder.
-        right: what holds of the scene that is read; None: it is refused.
-        says: words of the refusal.
-        known: an exposure is known by the name of a file alone.
-    """
-
-    make: Callable[[Path], object]
-    right: Check | None = None
-    says: tuple[str, ...] = ()
-    known: bool = False
+    make: Callable[[Path], object]  # writes it into an empty folder
+    right: Check | None = None  # what holds of the scene that is read; None: it is refused
+    says: tuple[str, ...] = ()  # words of the refusal
+    known: bool = False  # an exposure is known by the name of a file alone
 
 
 def run(quick: bool, out: Path, report: Report) -> Family:
