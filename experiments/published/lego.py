@@ -54,6 +54,7 @@ def perturb(lego: Path, out: Path) -> None:
         photographs = sorted((folder / "train").glob("r_*.png"), key=lambda f: int(f.stem[2:]))
         for number, path in enumerate(photographs[1:], 1):
             image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+            assert image is not None
             rng = np.random.RandomState(number)
             scale, offset = rng.uniform(0.8, 1.2, 3), rng.uniform(-0.2, 0.2, 3)
             rgb = np.clip(scale * (image[..., 2::-1] / 255) + offset, 0, 1)
