@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from p2gs_jax.evaluation.lpips import LpipsWeights
 from p2gs_jax.evaluation.references import Reference, find_radiance
 from p2gs_jax.evaluation.scores import ViewResult, is_drive, untold_notes
 from p2gs_jax.photometry.calibrate import Selection
+from p2gs_jax.photometry.models import MODELS
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.run.write import summary_rows, write_run, write_view
@@ -89,11 +91,38 @@ def finish(
             shown=[result for result in in_summary.values() if result is not None],
             metering=found.metering,
             true_exposures=true_exposures,
+            heading=heading(found.metrics, params, cfg),
+            psnrs=_psnrs(found.metrics),
         )
     metrics = found.metrics | _accounted(account, watch, scene, cfg, reporter, found)
     still_ours()
     write_json(folder.metrics, metrics)
     return metrics
+
+
+def heading(metrics: Mapping[str, Any], params: Params, cfg: FitConfig) -> list[str]:
+    """Return the lines above the pictures of `summary.png`: scores, model, the worst view."""
+    p, test = cfg.photometry, metrics.get("test", {}).get("exposure_fitted", {})
+    scores = [f"training views {metrics['train']['psnr']:.1f} dB"]
+    worst = None
+    if "psnr" in test:
+        scores.insert(0, f"held-out views {test['psnr']:.1f} dB (exposures fitted)")
+        psnrs = {name: row["psnr"] for name, row in test["per_view"].items()}
+        worst = min(psnrs, key=psnrs.__getitem__)
+    ev = np.log2(np.asarray(params.photometry.exposures, np.float64))
+    span = f"; exposures span {np.ptp(ev):.1f} stops" if np.ptp(ev) > 0 else ""
+    lines = [f"PSNR: {', '.join(scores)}."]
+    lines.append(f"Model: {MODELS[p.model].description}, {p.curve} curve{span}.")
+    if worst is not None:
+        lines.append(f"Worst held-out view: {worst}, {psnrs[worst]:.1f} dB.")
+    return lines
+
+
+def _psnrs(metrics: Mapping[str, Any]) -> dict[str, float]:
+    """Return the PSNR of every view under the parameters with which the summary shows it."""
+    parts = (metrics["train"], metrics.get("test", {}).get("exposure_fitted", {}))
+    rows = {name: row for part in parts for name, row in part.get("per_view", {}).items()}
+    return {name: row["psnr"] for name, row in rows.items() if "psnr" in row}
 
 
 def _keep(

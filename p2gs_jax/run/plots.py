@@ -28,10 +28,12 @@ MARKERS = "osD^vPX*"
 STATED = {"true": "--", "EXIF": ":", "EXIF or file": ":"}
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 
-ROWS = ("photograph", "render,\nits own\nexposure", "render,\none exposure\nfor all")
+ROWS = ("photograph", "render,\nexposure of\nthe view", "render,\none exposure\nfor all")
 # Height of the plot below the pictures, inches.
 PLOT = 3.0
-TITLE_SIZE, TEXT_SIZE = 8, 8.5
+TITLE_SIZE, TEXT_SIZE, HEADING_SIZE = 8, 8.5, 9.5
+# Height of a line of the heading, inches.
+HEADING = 0.2
 # Largest mean width of a character of DejaVu Sans, in font sizes.
 CHARACTER = 0.62
 
@@ -49,11 +51,14 @@ def write_summary(
     scene: Scene,
     cfg: FitConfig,
     true_exposures: Mapping[str, float] | None = None,
+    *,
+    heading: Sequence[str] = (),
+    psnrs: Mapping[str, float] | None = None,
 ) -> None:
     """Draw some views, photographs beside renders, and the exposures of the training views.
 
-    Renders are under the exposures of the views, and under one exposure for all. True exposures are
-    by the name of the view.
+    Renders are under the exposures of the views, and under one exposure for all. True exposures and
+    PSNRs are by the name of the view; `heading` has the lines above the pictures.
     """
     # Imported here, because it is slow to load.
     from matplotlib.figure import Figure
@@ -69,18 +74,26 @@ def write_summary(
     columns = len(shown)
     aspect = float(np.mean([p.shape[0] / p.shape[1] for p in pictures[0]]))
     width = max(2.0 if aspect > 1.2 else 3.0, 6.0 / columns)
-    heights = (3 * width * aspect + 0.5, PLOT)
+    heights = (3 * width * aspect + 0.5 + HEADING * len(heading), PLOT)
     size = (columns * width + 1.3, sum(heights))
     figure = Figure(figsize=size, dpi=110, layout="constrained")
     above, below = cast(np.ndarray, figure.subfigures(2, 1, height_ratios=heights))
     axes = above.subplots(3, columns, squeeze=False)
+    if heading:
+        letters = int(size[0] * 72 / (CHARACTER * HEADING_SIZE))
+        lines = [textwrap.shorten(line, letters, placeholder=" …") for line in heading]
+        text = printable("\n".join(lines))
+        above.suptitle(text, fontsize=HEADING_SIZE, x=0.01, ha="left", linespacing=1.4)
     for r, images in enumerate(pictures):
         axes[r, 0].set_ylabel(ROWS[r], fontsize=TEXT_SIZE, rotation=0, ha="right", va="center")
         for axis, image in zip(axes[r], images, strict=True):
             axis.imshow(np.clip(image, 0, 1), interpolation="lanczos")
             axis.set(xticks=[], yticks=[], frame_on=False)
     for axis, view in zip(axes[0], (scene.views[v.index] for v in shown), strict=True):
-        name = _shorten(f"{view.name} ({view.split})", width)
+        psnr = (psnrs or {}).get(view.name)
+        score = "" if psnr is None else f", {psnr:.1f} dB"
+        split = "held out" if view.split == "test" else "training"
+        name = _shorten(f"{view.name} ({split}{score})", width)
         axis.set_title(printable(name), fontsize=TITLE_SIZE, pad=4)
     axis, train = below.subplots(), scene.training_views
     found = np.log2(jax.tree.map(np.asarray, params.photometry).exposures)

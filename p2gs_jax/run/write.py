@@ -81,14 +81,17 @@ def write_run(
     solution: PhotometricSolution | None = None,
     shown: Sequence[ViewResult] = (),
     true_exposures: Mapping[str, float] | None = None,
+    heading: Sequence[str] = (),
+    psnrs: Mapping[str, float] | None = None,
 ) -> None:
     """Write the scene, the Gaussians, the photometry and the summary for `load_run`.
 
     The Gaussians are live ones; `owner` has the row in `moving` of the object of each, and `cfg`
     the options of the fit. With `decisions`, `config.json` is written as well. `fitted` has the
     exposures fitted to held-out views by row, `unknown` the names of photographs with unknown
-    exposures. True exposures by image name are for the plot. Without `shown` there is no summary.
-    Without `metering` there are only the files of parameters, as in a snapshot.
+    exposures. True exposures and PSNRs by image name, and the lines of `heading`, are for the
+    summary; without `shown` there is none. Without `metering` there are only the files of
+    parameters, as in a snapshot.
     """
     if not isinstance(folder, RunFolder):
         folder = RunFolder(Path(folder))
@@ -121,7 +124,8 @@ def write_run(
     write_ply(folder.splats, baked, display_comments(transform))
     write_metering(folder.metering, metering)
     if shown:
-        write_summary(folder.summary, shown, params, scene, cfg, true_exposures)
+        words = {"heading": heading, "psnrs": psnrs}
+        write_summary(folder.summary, shown, params, scene, cfg, true_exposures, **words)
 
 
 def write_view(folder: Path, name: str, result: ViewResult, store: ImageStore) -> None:

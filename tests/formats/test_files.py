@@ -2,6 +2,7 @@
 
 import json
 import os
+from dataclasses import replace
 from types import SimpleNamespace
 
 import cv2
@@ -15,6 +16,7 @@ from p2gs_jax.core.atomic import append_jsonl, atomic_folder, atomic_write, read
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.scores import ViewResult
 from p2gs_jax.photometry.display import DisplayTransform
+from p2gs_jax.pipeline.finish import heading
 from p2gs_jax.run.photometry_files import read_photometry, write_photometry
 from p2gs_jax.run.plots import write_summary
 from p2gs_jax.types import Params, Photometry
@@ -128,5 +130,24 @@ def test_a_summary_is_written_in_silence_with_gaps_in_exif_and_odd_names(tmp_pat
     params = Params(None, Photometry(jnp.linspace(-1, 1, 9), jnp.zeros(9), "log"))
     scene = SimpleNamespace(views=views, training_views=train)
     write_summary(tmp_path / "s.png", shown, params, scene, FitConfig())
-    assert cv2.imread(str(tmp_path / "s.png")).shape[1] > 600
+    plain = cv2.imread(str(tmp_path / "s.png")).shape
+    assert plain[1] > 600
+    above = {"heading": names, "psnrs": dict.fromkeys(names, 30.0)}
+    write_summary(tmp_path / "s.png", shown, params, scene, FitConfig(), **above)
+    assert cv2.imread(str(tmp_path / "s.png")).shape[0] > plain[0]
     assert not [str(w.message) for w in recwarn]
+
+
+def test_the_heading_of_a_summary_states_scores_model_and_worst_view():
+    rows = {"a.png": {"psnr": 30.0}, "b.png": {"psnr": 20.0}}
+    fitted = {"psnr": 25.0, "per_view": rows}
+    params = Params(None, Photometry(jnp.log(jnp.array([1.0, 4.0])), jnp.zeros(2), "log"))
+    cfg = replace(FitConfig().photometry, model="view_exposure", curve="srgb")
+    metrics = {"train": {"psnr": 31.0}, "test": {"exposure_fitted": fitted}}
+    assert heading(metrics, params, replace(FitConfig(), photometry=cfg)) == [
+        "PSNR: held-out views 25.0 dB (exposures fitted), training views 31.0 dB.",
+        "Model: an exposure per view, srgb curve; exposures span 2.0 stops.",
+        "Worst held-out view: b.png, 20.0 dB.",
+    ]
+    without = heading({"train": {"psnr": 31.0}}, params, replace(FitConfig(), photometry=cfg))
+    assert without[0] == "PSNR: training views 31.0 dB." and len(without) == 2
