@@ -150,4 +150,5 @@ def test_the_heading_of_a_summary_states_scores_model_and_worst_view():
         "Worst held-out view: b.png, 20.0 dB.",
     ]
     without = heading({"train": {"psnr": 31.0}}, params, replace(FitConfig(), photometry=cfg))
-    assert without[0] == "PSNR: training views 31.0 dB." and len(without) == 2
+    assert without[0] == "PSNR: training views 31.0 dB."
+    assert len(without) == 2
