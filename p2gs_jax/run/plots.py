@@ -22,7 +22,7 @@ from p2gs_jax.evaluation.scores import ViewResult
 from p2gs_jax.photometry.display import develop, usual_display
 from p2gs_jax.photometry.response import Response, log_exposed
 from p2gs_jax.photometry.solution import PhotometricSolution
-from p2gs_jax.types import GAMMA_SRGB, Params, Scene
+from p2gs_jax.types import GAMMA_SRGB, Params, Scene, View
 
 MARKERS = "osD^vPX*"
 STATED = {"true": "--", "EXIF": ":", "EXIF or file": ":"}
@@ -78,23 +78,15 @@ def write_summary(
     size = (columns * width + 1.3, sum(heights))
     figure = Figure(figsize=size, dpi=110, layout="constrained")
     above, below = cast(np.ndarray, figure.subfigures(2, 1, height_ratios=heights))
+    _write_heading(above, heading, size[0])
     axes = above.subplots(3, columns, squeeze=False)
-    if heading:
-        letters = int(size[0] * 72 / (CHARACTER * HEADING_SIZE))
-        lines = [textwrap.shorten(line, letters, placeholder=" …") for line in heading]
-        text = printable("\n".join(lines))
-        above.suptitle(text, fontsize=HEADING_SIZE, x=0.01, ha="left", linespacing=1.4)
     for r, images in enumerate(pictures):
         axes[r, 0].set_ylabel(ROWS[r], fontsize=TEXT_SIZE, rotation=0, ha="right", va="center")
         for axis, image in zip(axes[r], images, strict=True):
             axis.imshow(np.clip(image, 0, 1), interpolation="lanczos")
             axis.set(xticks=[], yticks=[], frame_on=False)
     for axis, view in zip(axes[0], (scene.views[v.index] for v in shown), strict=True):
-        psnr = (psnrs or {}).get(view.name)
-        score = "" if psnr is None else f", {psnr:.1f} dB"
-        split = "held out" if view.split == "test" else "training"
-        name = _shorten(f"{view.name} ({split}{score})", width)
-        axis.set_title(printable(name), fontsize=TITLE_SIZE, pad=4)
+        axis.set_title(_title(view, psnrs or {}, width), fontsize=TITLE_SIZE, pad=4)
     axis, train = below.subplots(), scene.training_views
     found = np.log2(jax.tree.map(np.asarray, params.photometry).exposures)
     stated = {"EXIF": [v.exif_ev for v in train]}
@@ -112,6 +104,21 @@ def write_summary(
     with atomic_write(path) as temporary:
         # A higher compression takes longer than the drawing and saves 10 % of the bytes.
         figure.savefig(temporary, format="png", pil_kwargs={"compress_level": 2})
+
+
+def _write_heading(figure: Any, heading: Sequence[str], width: float) -> None:
+    """Write the lines above the pictures, cut to a width in inches."""
+    letters = int(width * 72 / (CHARACTER * HEADING_SIZE))
+    lines = [textwrap.shorten(line, letters, placeholder=" …") for line in heading]
+    how = {"fontsize": HEADING_SIZE, "x": 0.01, "ha": "left", "linespacing": 1.4}
+    figure.suptitle(printable("\n".join(lines)), **how)
+
+
+def _title(view: View, psnrs: Mapping[str, float], width: float) -> str:
+    """Return the title of a view, cut to a width in inches."""
+    score = f", {psnrs[view.name]:.1f} dB" if view.name in psnrs else ""
+    split = "held out" if view.split == "test" else "training"
+    return printable(_shorten(f"{view.name} ({split}{score})", width))
 
 
 def _log2(value: float | None) -> float | None:
