@@ -103,19 +103,15 @@ def finish(
 def heading(metrics: Mapping[str, Any], params: Params, cfg: FitConfig) -> list[str]:
     """Return the lines above the pictures of `summary.png`: scores, model, the worst view."""
     p, test = cfg.photometry, metrics.get("test", {}).get("exposure_fitted", {})
-    scores = [f"training views {metrics['train']['psnr']:.1f} dB"]
-    worst = None
+    scores, lines = [f"training views {metrics['train']['psnr']:.1f} dB"], []
     if "psnr" in test:
         scores.insert(0, f"held-out views {test['psnr']:.1f} dB (exposures fitted)")
-        psnrs = {name: row["psnr"] for name, row in test["per_view"].items()}
-        worst = min(psnrs, key=psnrs.__getitem__)
+        psnr, worst = min((row["psnr"], name) for name, row in test["per_view"].items())
+        lines = [f"Worst held-out view: {worst}, {psnr:.1f} dB."]
     ev = np.log2(np.asarray(params.photometry.exposures, np.float64))
     span = f"; exposures span {np.ptp(ev):.1f} stops" if np.ptp(ev) > 0 else ""
-    lines = [f"PSNR: {', '.join(scores)}."]
-    lines.append(f"Model: {MODELS[p.model].description}, {p.curve} curve{span}.")
-    if worst is not None:
-        lines.append(f"Worst held-out view: {worst}, {psnrs[worst]:.1f} dB.")
-    return lines
+    model = f"Model: {MODELS[p.model].description}, {p.curve} curve{span}."
+    return [f"PSNR: {', '.join(scores)}.", model, *lines]
 
 
 def _psnrs(metrics: Mapping[str, Any]) -> dict[str, float]:
