@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
-from p2gs_jax.cli.shared import MeteringRule, RunPath, SceneFolder, check
+from p2gs_jax.cli.shared import MeteringRule, PhotometryFolder, RunPath, SceneFolder, check
 from p2gs_jax.errors import UserError
 
 if TYPE_CHECKING:
@@ -27,6 +27,7 @@ class Export:
     p2gs-jax export runs/street --format display-ply
     p2gs-jax export runs/street --format linear-ply colmap exr --out for_others
     p2gs-jax export runs/street --format usd exr --out for_blender
+    p2gs-jax export splat.ply --photometry calibrated --scene castle --format linear-ply html
     """
 
     run: RunPath
@@ -47,7 +48,7 @@ class Export:
     """View whose white balance display colours and html have (default: neutral)."""
     bake_steps: int | None = None
     """Number of steps that bring display colours closer to the true pictures (default: 240, or the
-    number of training views if larger); 0: none."""
+    number of training views if larger); 0: none. With --photometry also radiance."""
     without_objects: bool = False
     """Leave out moving objects; else files of Gaussians hold the middle of the drive."""
     size_mb: float | None = None
@@ -55,6 +56,7 @@ class Export:
     photographs: int | None = None
     """Number of photographs that the html page embeds (default: 0); readers can copy them."""
     scene: SceneFolder = None
+    photometry: PhotometryFolder = None
     overwrite: bool = False
     """Replace the files of an earlier export."""
 
@@ -62,21 +64,28 @@ class Export:
         """Write every requested format."""
         from p2gs_jax.cli.tables import stdout
         from p2gs_jax.core.progress import TerminalReporter
-        from p2gs_jax.export.convert import convert, require_packages
-        from p2gs_jax.run.read import load_run
+        from p2gs_jax.export.convert import STEPS, convert, require_packages
+        from p2gs_jax.run.foreign import ForeignRun, load_run_or_splats
 
         check_export(self)
         require_packages(self.format)
-        fitted = load_run(self.run, self.scene)
+        fitted = load_run_or_splats(self.run, self.scene, self.photometry)
         if self.without_objects:
             fitted = fitted.without_objects()
         with TerminalReporter() as reporter:
+            if isinstance(fitted, ForeignRun) and {"linear-ply", "html", *DISPLAY} & set(
+                self.format
+            ):
+                steps = STEPS if self.bake_steps is None else self.bake_steps
+                fitted = fitted.refined(steps, lambda i, n: reporter.stage("Lifting", i, n))
+            for note in fitted.notes:
+                reporter.message(note)
             if fitted.cfg.render.background is not None and {"html", *DISPLAY} & set(self.format):
                 reporter.message("Formats of Gaussians have no background: it is black there.")
             written = convert(
                 fitted,
                 tuple(dict.fromkeys(self.format)),
-                self.out or self.run / "exports",
+                self.out or fitted.folder / "exports",
                 display_transform(fitted, self),
                 bake_steps=self.bake_steps,
                 page_mb=20.0 if self.size_mb is None else self.size_mb,
@@ -116,7 +125,7 @@ def check_export(args: Export) -> None:
     look = ("exposure_ev", "meter", "gamma", "curve", "white_balance_of")
     for names, formats, what in (
         (look, (*DISPLAY, "html"), "a format of display colours, or html"),
-        (("bake_steps",), DISPLAY, "a format of display colours"),
+        (("bake_steps",), FORMATS if args.photometry else DISPLAY, "a format of display colours"),
         (("size_mb", "photographs"), ("html",), "the format html"),
     ):
         given = [n for n in names if getattr(args, n) is not None]

@@ -194,14 +194,17 @@ class Calibrate:
     photograph is lost."""
     masks: bool = True
     """Mask pixels of developed photographs that are clipped or black in the original."""
+    write_for: Annotated[tuple[Literal["ppisp", "3dgs"], ...], tyro.conf.arg(metavar="NAME")] = ()
+    """Also write values for other trainers: ppisp (gsplat, LichtFeld), 3dgs (docs/exports.md)."""
     config: Config
     preset: Preset = "robust"
     """Initial values (p2gs-jax fit --help)."""
 
     def execute(self) -> int:
         """Solve the photometry alone; print it as a table."""
-        from p2gs_jax.cli.tables import print_calibration
+        from p2gs_jax.cli.tables import print_calibration, stdout
         from p2gs_jax.core.progress import TerminalReporter
+        from p2gs_jax.export.trainers import write_for
         from p2gs_jax.pipeline.calibrate import calibrate, calibrate_run, calibrate_stack
         from p2gs_jax.report.development import write_development
 
@@ -217,6 +220,8 @@ class Calibrate:
             if found.developed is not None:
                 write_development(out, found.developed)
         print_calibration(found, out)
+        for sentence in write_for(self.write_for, out, found.views):
+            stdout().print(sentence, soft_wrap=True)
         return 0
 
     def development(self) -> Development | None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from p2gs_jax.cli.shared import MeteringRule, RunPath, SceneFolder, check
+from p2gs_jax.cli.shared import MeteringRule, PhotometryFolder, RunPath, SceneFolder, check
 from p2gs_jax.core.text import count_of
 from p2gs_jax.errors import UserError
 
@@ -32,6 +32,7 @@ class Render:
     p2gs-jax render runs/street --trajectory drive --out drive.mp4
     p2gs-jax render runs/street --trajectory drive --shift 2 --out left_lane.mp4
     p2gs-jax render runs/street --panorama --split test --width 1400 --out wide
+    p2gs-jax render splat.ply --photometry calibrated --scene castle --out as_photographed
     """
 
     run: RunPath
@@ -74,6 +75,7 @@ class Render:
     fps: float | None = None
     """Frames per second of a video (default: 24)."""
     scene: SceneFolder = None
+    photometry: PhotometryFolder = None
     overwrite: bool = False
     """Replace the files of an earlier render."""
 
@@ -93,7 +95,7 @@ class Render:
         given = read_cameras(Path(self.trajectory)) if self.trajectory not in PATHS else None
         fitted = _load(self)
         given = None if given is None else near_scene(given, fitted.scene.origin)
-        out = self.out or self.run / "renders" / _default_name(self, fitted.scene)
+        out = self.out or fitted.folder / "renders" / _default_name(self, fitted.scene)
         _check_place(out, self.overwrite)
         with TerminalReporter() as reporter:
             job = (
@@ -101,7 +103,7 @@ class Render:
                 if self.panorama
                 else shots_of(self, fitted, given, reporter.message)
             )
-            for note in job.notes:
+            for note in (*fitted.notes, *job.notes):
                 reporter.message(note)
             reporter.stage("Rendering", 0, job.count)
             with open_frames(out, job.size, self.fps or FPS) as write:
@@ -117,9 +119,9 @@ class Render:
 
 def _load(options: Render) -> Run:
     """Return the run; UserError: it has no such object, curve or white balance."""
-    from p2gs_jax.run.read import load_run
+    from p2gs_jax.run.foreign import load_run_or_splats
 
-    fitted = load_run(options.run, options.scene)
+    fitted = load_run_or_splats(options.run, options.scene, options.photometry)
     if options.curve == "spline":
         fitted.common_display(0.0).with_curve("spline")
     if options.white_balance_of is not None:

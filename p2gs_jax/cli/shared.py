@@ -18,6 +18,10 @@ SceneFolder = Annotated[
     Path | None,
     tyro.conf.arg(metavar="DIR", help="Scene of the run, where it has moved since the fit."),
 ]
+PhotometryFolder = Annotated[
+    Path | None,
+    tyro.conf.arg(metavar="DIR", help="Output of `calibrate --develop`, for splats trained on it."),
+]
 # Short names of fields of the configuration: the field, and the placeholder of its value. A command
 # that has any lists them as `SHORT_NAMES`.
 SHORT = {

@@ -139,6 +139,8 @@ def _linear_ply(ply: Path, fitted: Run) -> str:
     activation = fitted.cfg.render.radiance
     count = write_radiance(ply, g, activation=activation)
     content = linear_sidecar(g, fitted.cfg, fitted.scene, fitted.store, fitted.photometry)
+    if fitted.lifting_error is not None:
+        content["lifting_error"] = fitted.lifting_error
     write_json(sidecar, content)
     if kind is not None:
         views = fitted.scene.training_views
@@ -191,9 +193,9 @@ class DisplayFiles:
         reporter.stage("Baking")
         start = baking.bake(g, transform, cfg.render.radiance)
         aims = [self.targets[i] for i in scene.train_indices if i in self.targets]
-        order = {"steps": self.steps, "seed": cfg.train.seed}
+        steps, seed = self.steps, cfg.train.seed
         on_step = functools.partial(reporter.stage, "Baking")
-        self.baked = baking.refine(start, aims, cfg.render, **order, on_step=on_step)
+        self.baked = baking.refine(start, aims, cfg.render, steps=steps, seed=seed, on_step=on_step)
 
     def write(self, name: str, path: Path, sidecar: Path) -> str:
         """Write a format, and a JSON file with its baking error; return sentences."""

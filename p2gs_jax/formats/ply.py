@@ -33,6 +33,8 @@ def field_names(coefficients: int) -> list[str]:
     ]
 
 
+# The comment of files with radiance instead of display colours.
+LINEAR = "p2gs-jax: linear HDR radiance"
 # Fields of vibrating Gaussians, after those of the reference implementation.
 VIBRATION = ("velocity_x", "velocity_y", "velocity_z", "peak_time", "log_life")
 # Rows that are written or read at a time, about 16 MB; a whole file may have gigabytes.
@@ -85,18 +87,18 @@ def _columns(g: Gaussians, rows: slice) -> Float[np.ndarray, "k c"]:
 def write_radiance(path: Path, gaussians: Gaussians, *, activation: RadianceKind) -> int:
     """Write Gaussians with their linear coefficients; return their number."""
     kind = f"p2gs-jax: radiance activation {activation}"
-    return write_ply(path, gaussians, ["p2gs-jax: linear HDR radiance", kind])
+    return write_ply(path, gaussians, [LINEAR, kind])
 
 
 RESTORE = "restore it from a copy, or write it again with `p2gs-jax fit ... --resume`"
 
 
-def read_ply(path: Path) -> Gaussians:
+def read_ply(path: Path, fix: str = RESTORE) -> Gaussians:
     """Read Gaussians, bit for bit. Normals, which are not used, may be missing.
 
-    Raises UserError: the file is not such a PLY.
+    Raises UserError: the file is not such a PLY; `fix` is the remedy.
     """
-    with refusing(path, "Gaussians", fix=RESTORE):
+    with refusing(path, "Gaussians", fix=fix):
         return _read(read_table(path, "vertex"))
 
 

@@ -1,8 +1,9 @@
-"""Display colours for ordinary 3DGS viewers, and the error of their pictures.
+"""Display colours for ordinary 3DGS viewers, the way back, and the errors of both in pictures.
 
 A viewer composites display values; the true picture composites radiance and then applies the tone
 curve. So display colours computed per Gaussian are wrong by many 8-bit levels where translucent
-Gaussians overlap (BUILD_NOTES, "Display PLY"). `refine` optimises colours and opacities.
+Gaussians overlap (BUILD_NOTES, "Display PLY"). `refine` optimises colours and opacities. The same
+holds for display colours of other programs that are lifted to radiance.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from jaxtyping import Array, Float, UInt8
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import fibonacci_sphere, on_device
-from p2gs_jax.photometry.display import DisplayTransform, develop
+from p2gs_jax.photometry.display import DisplayTransform, develop, undevelop
+from p2gs_jax.photometry.formation import formation
 from p2gs_jax.render import harmonics, render_linear
 from p2gs_jax.render.capacity import (
     PICTURES,
@@ -51,6 +53,12 @@ class Target:
     name: str
     camera: Camera
     picture: UInt8[np.ndarray, "h w 3"]
+
+
+def displayed_target(name: str, splats: Gaussians, camera: Camera, render: RenderView) -> Target:
+    """Return a view with the picture of a viewer (`viewer_config`), which shows display colours."""
+    display = np.asarray(render(splats, _all(splats), camera).linear)
+    return Target(name, camera, np.rint(255 * np.clip(display, 0, 1)).astype(np.uint8))
 
 
 def true_target(
@@ -92,6 +100,34 @@ def display_sh(
     It is exact for degree 0. `tone` maps radiance to display values, which are then clamped to
     [0, 1].
     """
+
+    def shown(sums: np.ndarray) -> np.ndarray:
+        colors = tone(np.asarray(harmonics.radiance_activation(sums, activation)))
+        return np.clip(colors, 0, 1) - 0.5
+
+    return refitted(sh, shown)
+
+
+def lift(gaussians: Gaussians, developed: DisplayTransform) -> Gaussians:
+    """Return Gaussians of display colours with log radiance (`exp`), computed per Gaussian.
+
+    `developed` is the transform that the display colours show. Colours outside of [0, 1] are
+    clamped, and black counts as half an 8-bit code.
+    """
+
+    def logs(sums: np.ndarray) -> np.ndarray:
+        return np.log(undevelop(np.clip(sums + 0.5, 0, 1), developed))
+
+    return replace(gaussians, sh=on_device(refitted(np.asarray(gaussians.sh), logs)))
+
+
+def refitted(
+    sh: Float[np.ndarray, "n k 3"], changed: Callable[[np.ndarray], np.ndarray]
+) -> Float[np.ndarray, "n k 3"]:
+    """Return coefficients whose sums are the changed sums: least squares over directions.
+
+    It is exact for degree 0.
+    """
     directions = fibonacci_sphere(DIRECTIONS)
     table = harmonics.table(directions, degree_of(sh.shape[1]))
     inverse = np.linalg.pinv(table)
@@ -100,8 +136,7 @@ def display_sh(
         part = sh[start : start + CHUNK]
         values = np.zeros((CHUNK, DIRECTIONS, 3), np.float32)
         values[: len(part)] = np.einsum("dk,nkc->ndc", table, part, optimize=True)
-        colors = tone(np.asarray(harmonics.radiance_activation(values, activation)))[: len(part)]
-        values = np.clip(colors, 0, 1) - 0.5
+        values = changed(values)[: len(part)]
         out[start : start + CHUNK] = np.einsum("kd,ndc->nkc", inverse, values, optimize=True)
     return out
 
@@ -119,18 +154,20 @@ def refine(
     *,
     steps: int,
     seed: int = 0,
+    shown: DisplayTransform | None = None,
     on_step: Callable[[int, int], None] = lambda done, steps: None,
 ) -> Gaussians:
     """Return Gaussians from `bake` whose pictures in a viewer are closer to the targets.
 
     Adam minimises the mean squared difference, one view per step, in epochs of random order. Every
     second step has a background of random colour instead of black, because viewers may have bright
-    backgrounds. Base colours stay in [0, 1], which viewers with 8-bit colours need. Gaussians that
-    no target shows do not change. `on_step` is called with the steps done and the total.
+    backgrounds. Base colours stay in [0, 1], which viewers with 8-bit colours need. With `shown`,
+    Gaussians are those of `lift`, and their radiance over black is developed. Gaussians that no
+    target shows do not change. `on_step` is called with the steps done and the total.
     """
     if steps == 0 or not targets or gaussians.capacity == 0:
         return gaussians
-    cfg, optimizer = viewer_config(cfg), optax.scale_by_adam(eps=1e-15)
+    cfg, optimizer = cfg if shown else viewer_config(cfg), optax.scale_by_adam(eps=1e-15)
     alive = _all(gaussians)
     needed = max(int(count_needed(gaussians, alive, t.camera, cfg=cfg)) for t in targets)
     capacity = bucket(needed, PICTURES.first)
@@ -143,14 +180,15 @@ def refine(
         def loss(moving):
             current = replace(gaussians, **moving)
             result = render_linear(current, _all(current), camera, cfg, capacity, with_depth=False)
-            display = _over(result, background)
+            display = _over(result, background, shown)
             return jnp.mean((display - picture / 255.0) ** 2), result
 
         (_, result), gradient = jax.value_and_grad(loss, has_aux=True)(moving)
         updates, state = optimizer.update(gradient, state)
         moved = jax.tree.map(lambda m, rate, u: m - decay * rate * u, moving, rates, updates)
-        base = jnp.clip(moved["sh"][:, 0], -0.5 / C0, 0.5 / C0)
-        moved["sh"] = moved["sh"].at[:, 0].set(base)
+        if shown is None:
+            base = jnp.clip(moved["sh"][:, 0], -0.5 / C0, 0.5 / C0)
+            moved["sh"] = moved["sh"].at[:, 0].set(base)
         return (moved, state), result.count, result.overflow
 
     rng, order = np.random.default_rng(seed), []
@@ -161,7 +199,8 @@ def refine(
         target = targets[order.pop()]
         decay = jnp.float32(DECAY ** (done / steps))
         picture = jnp.asarray(target.picture)
-        background = jnp.asarray(rng.uniform(size=3) * (done % 2), jnp.float32)
+        bright = done % 2 if shown is None else 0
+        background = jnp.asarray(rng.uniform(size=3) * bright, jnp.float32)
         inputs = (moving, state, target.camera, picture, background, decay)
         (moving, state), capacity = until_it_fits(
             lambda entries, inputs=inputs: step(*inputs, capacity=entries), capacity
@@ -171,17 +210,24 @@ def refine(
 
 
 def baking_error(
-    gaussians: Gaussians, targets: Sequence[Target], cfg: RenderConfig
+    gaussians: Gaussians,
+    targets: Sequence[Target],
+    cfg: RenderConfig,
+    shown: DisplayTransform | None = None,
 ) -> dict[str, Any] | None:
     """Compare a viewer's pictures of display colours with the true pictures.
 
+    With `shown`, these are developed pictures of lifted Gaussians, and the true ones composite
+    display colours.
     PSNR is in dB, for a black and for a white background of the viewer. Mean and largest absolute
     differences of channels are in 8-bit levels. It returns None without targets.
     """
     if not targets:
         return None
-    render = make_renderer(viewer_config(cfg))
-    views = {t.name: _difference(t, render(gaussians, _all(gaussians), t.camera)) for t in targets}
+    render = make_renderer(viewer_config(cfg) if shown is None else cfg)
+    views = {
+        t.name: _difference(t, render(gaussians, _all(gaussians), t.camera), shown) for t in targets
+    }
     worst = min(views, key=lambda name: views[name]["psnr"])
     psnr, mean, most, white = zip(*(view.values() for view in views.values()), strict=True)
     return {
@@ -196,15 +242,19 @@ def baking_error(
     }
 
 
-def _over(render: Render, background: Float[Array, " 3"]) -> Float[Array, "h w 3"]:
-    return render.linear + (1 - render.alpha)[..., None] * background
+def _over(
+    render: Render, background: Float[Array, " 3"], shown: DisplayTransform | None = None
+) -> Float[Array, "h w 3"]:
+    over = render.linear + (1 - render.alpha)[..., None] * background
+    return over if shown is None else formation(over, shown.capture, shown.formation)
 
 
-def _difference(target: Target, render: Render) -> dict[str, float]:
+def _difference(target: Target, render: Render, shown: DisplayTransform | None) -> dict[str, float]:
     """Return the differences of one view."""
 
     def from_truth(level: float) -> np.ndarray:
-        display = np.clip(np.asarray(_over(render, jnp.full(3, level))), 0, 1)
+        display = np.asarray(_over(render, jnp.full(3, level)))
+        display = np.clip(display, 0, 1) if shown is None else develop(display, shown)
         return np.abs(255.0 * display - target.picture)
 
     def psnr(difference: np.ndarray) -> float:

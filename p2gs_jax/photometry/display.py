@@ -27,7 +27,7 @@ from p2gs_jax.photometry.formation import (
     inverse_formation,
     uncovered,
 )
-from p2gs_jax.photometry.response import by_camera
+from p2gs_jax.photometry.response import DARKEST, by_camera
 from p2gs_jax.types import Array, Capture, Params, Photometry
 
 Curve = Literal["power", "srgb", "spline", "linear"]
@@ -144,6 +144,17 @@ def undevelop(
     """
     values = np.asarray(ldr, np.float32)
     return inverse_formation(values, transform.capture, transform.formation, positions)
+
+
+def light_of(ldr: Pixels, transform: DisplayTransform) -> Float32[np.ndarray, "... 3"]:
+    """Return the linear radiance of display values as `undevelop`, but 0 for 0.
+
+    Below half an 8-bit code it is proportional to the value, so that empty pixels stay black under
+    every exposure. Values above 1 count as 1, unless the curve is linear.
+    """
+    most = np.inf if transform.formation.curve == "linear" else 1
+    values = np.clip(np.asarray(ldr, np.float32), 0, most)
+    return undevelop(values, transform) * np.minimum(values / np.float32(DARKEST), 1)
 
 
 def display_of_view(params: Params, row: int, cfg: PhotometryConfig) -> DisplayTransform:

@@ -18,7 +18,7 @@ from p2gs_jax.report.charts import COLORS, DASHES, FIRST, INK, MUTED, SOURCES, S
 from p2gs_jax.report.findings import against_exif, column, notes_of
 from p2gs_jax.report.page import figure, folded, listed, paragraph, table
 from p2gs_jax.report.run_files import RunFiles
-from p2gs_jax.run.photometry_files import CameraPhotometry, ViewPhotometry, with_curve_of
+from p2gs_jax.run.photometry_files import CameraPhotometry, ViewPhotometry, with_formation_of
 from p2gs_jax.run.scene_file import read_times
 from p2gs_jax.scene.drives.recording import short_name
 from p2gs_jax.types import GAMMA_SRGB
@@ -239,7 +239,7 @@ def _curves(run: RunFiles) -> tuple[list[Series], str]:
     """Return the common curve of all cameras at the smallest, the median and the largest gamma."""
     assert run.photometry is not None
     cfg = PhotometryConfig() if run.cfg is None else run.cfg.photometry
-    cfg = with_curve_of(cfg, run.photometry)
+    cfg = with_formation_of(cfg, run.photometry)
     gammas = [v["gamma"] for v in run.train if v["gamma"] is not None] or [GAMMA_SRGB]
     ends = [(min(gammas), "-."), (max(gammas), ":")] if np.ptp(gammas) > 0.02 else []
     curves = [

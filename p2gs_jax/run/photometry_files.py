@@ -27,6 +27,7 @@ from p2gs_jax.photometry.luminance import Luminance
 from p2gs_jax.photometry.metering import METERS, Metering, Rule
 from p2gs_jax.photometry.ppisp import Ppisp
 from p2gs_jax.photometry.solution import PhotometricSolution
+from p2gs_jax.presets import camera_formations
 from p2gs_jax.types import Params, Photometry, Scene, View
 
 VERSION = 2
@@ -80,19 +81,23 @@ def _missing(data, fields: Sequence[str]) -> str | None:
     return f"{', '.join(names)} missing" if names else None
 
 
-def with_curve_of(cfg: PhotometryConfig, saved: PhotometryFile) -> PhotometryConfig:
-    """Return options with the model and the tone curve of a file.
+def with_formation_of(cfg: PhotometryConfig, saved: PhotometryFile) -> PhotometryConfig:
+    """Return options with the image formation of a file, which has no learned corrections.
 
     Raises:
-        UserError: the file has no valid tone curve.
+        UserError: the file has no valid tone curve, or a broken camera.
     """
-    curve = saved["curve"]
+    curve, kinds = saved["curve"], ("vignetting", "splines")
+    balanced = any(view.get("white_balance") is not None for view in saved["views"])
     try:
         spline = None if curve["spline"] is None else tuple(map(float, curve["spline"]))
         found = {"model": saved["model"], "curve": curve["name"], "spline": spline}
-        return dataclasses.replace(cfg, select=False, **found)
+        cameras = [{"name": c["name"], **{k: c[k] or () for k in kinds}} for c in saved["cameras"]]
+        found |= {"pivot": float(curve["pivot"]), "cameras": camera_formations(cameras)}
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"photometry.json has no tone curve ({error}).", fix=AGAIN) from error
+    found["white_balance"] = "view" if balanced else None
+    return dataclasses.replace(cfg, select=False, **found)
 
 
 def write_fitted(

@@ -55,6 +55,9 @@ class Run:
     # moving object of each Gaussian, -1: none; None: nothing moves
     owner: Int[np.ndarray, " n"] | None = None
     moving: MovingObjects | None = None  # the moving objects
+    notes: tuple[str, ...] = ()  # notes for the user on what was read
+    # error of Gaussians that were lifted from display colours (run/foreign.py), or None
+    lifting_error: dict[str, Any] | None = None
 
     @cached_property
     def store(self) -> ImageStore:
@@ -267,7 +270,7 @@ def load_run(folder: str | Path, scene: str | Path | None = None, *, snapshot: b
     gaussians = read_ply(files.radiance)
     owner, moving = read_objects(files.objects, found, gaussians.capacity)
     photometry_file = photometry_files.read_photometry(files.photometry)
-    photometry = _photometry(photometry_file, found, cfg, files)
+    photometry = photometry_of(photometry_file, found, cfg, files.photometry)
     kind, views = cfg.photometry.appearance, found.training_views
     appearance = (
         None
@@ -289,21 +292,26 @@ def load_run(folder: str | Path, scene: str | Path | None = None, *, snapshot: b
 def _require_finished(files: RunFolder) -> None:
     if not files.config.is_file():
         why = f"{files.root} is not a run folder: {files.config.name} is missing."
-        raise UserError(why, fix="name the folder that was given to `p2gs-jax fit --out`")
+        fix = "name the folder that was given to `p2gs-jax fit --out`; splats of another program "
+        raise UserError(why, fix=fix + "need --photometry (docs/exports.md)")
     for path in (files.radiance, files.photometry):
         if not path.is_file():
             fix = "finish it with `p2gs-jax fit ... --resume`"
             raise UserError(f"{files.root} is unfinished: {path.name} is missing.", fix=fix)
 
 
-def _photometry(
-    saved: photometry_files.PhotometryFile, scene: Scene, cfg: FitConfig, files: RunFolder
+def photometry_of(
+    saved: photometry_files.PhotometryFile, scene: Scene, cfg: FitConfig, path: Path
 ) -> Photometry:
-    """Return exposures, gammas and white balances of the training views."""
+    """Return exposures, gammas and white balances of the training views from a file's content.
+
+    Raises:
+        UserError: the file lacks those of a view.
+    """
     by_name = {v["image"]: v for v in saved["views"] if v["exposure"] is not None}
     train = [by_name[v.name] for v in scene.training_views if v.name in by_name]
     if len(train) < len(scene.train_indices):
-        why = f"{files.photometry} does not belong to the scene {scene.root}: its training views "
+        why = f"{path} does not belong to the scene {scene.root}: its training views "
         why += "differ."
         raise UserError(why, fix="restore the scene folder as it was during the fit")
     exposures, gammas = (np.array([v[name] for v in train]) for name in ("exposure", "gamma"))
@@ -314,7 +322,7 @@ def _photometry(
         factors = [v.get("white_balance") for v in train]
         if None in factors:
             raise UserError(
-                f"{files.photometry} lacks the white balance of a view.", fix=photometry_files.AGAIN
+                f"{path} lacks the white balance of a view.", fix=photometry_files.AGAIN
             )
         balances = on_device(np.log(np.array(factors, float)))
     rows = camera_rows([view.camera for view in scene.training_views], p)

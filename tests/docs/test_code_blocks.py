@@ -160,7 +160,9 @@ def options():
 # Options of other programs that pages mention.
 OTHERS = {"--help", "--help-all", "--version", "--ckpt", "--only", "--nthreads"}
 OTHERS |= {"--data", "--orientation-method", "--center-method", "--auto-scale-poses"}
-OTHERS |= {"--data_dir", "--data_factor", "--colmap-path", "--mask-mode"}
+OTHERS |= {"--data_dir", "--data_factor", "--colmap-path", "--mask-mode", "--save-ply", "--center"}
+OTHERS |= {"--no-normalize-world-space", "--post_processing", "--train_test_exp"}
+OTHERS |= {"--ppisp", "--ppisp-freeze", "--ppisp-sidecar"}
 
 
 # The history names options that are gone.

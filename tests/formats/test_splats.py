@@ -1,9 +1,12 @@
 """Splats for other programs: read by their readers, or decoded here from published layouts."""
 
 import gzip
+import io
 import itertools
+import json
 import struct
 import tracemalloc
+import zipfile
 from dataclasses import replace
 from typing import Any
 
@@ -13,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import pygltflib
 import pytest
+from PIL import Image
 from plyfile import PlyData, PlyElement
 from scipy.spatial.transform import Rotation
 from splats import random_splats
@@ -22,6 +26,7 @@ from p2gs_jax.formats import gsply_files, ply
 from p2gs_jax.formats.gltf import EXTENSION, write_gltf
 from p2gs_jax.formats.packed import morton_order, pack, unpack
 from p2gs_jax.formats.ply import field_names, read_ply, write_ply, write_radiance
+from p2gs_jax.formats.splats import read_splats
 from p2gs_jax.formats.usd import CAMERAS, SPLATS, write_usd
 from p2gs_jax.render.harmonics import evaluate
 from p2gs_jax.scene.rigid import pose_of
@@ -204,6 +209,75 @@ def test_what_gsply_wrote_is_read_back(tmp_path, with_gsply, degree):
         np.testing.assert_allclose(found.sh[order], g.sh, atol=0.04)
         turned = ours(found)[0][order] - ours(g)[0]
         assert np.abs(turned).max() < 0.05 * np.exp(2 * np.asarray(g.log_scales)).max()
+
+
+def sog(path, quats, *, version=2, bands=2):
+    """Write three Gaussians as developer.playcanvas.com describes SOG, texel by texel."""
+    omitted = np.abs(quats).argmax(1)
+    signs = np.sign(quats[range(3), omitted])
+    others = [np.delete(q * s, k) for q, s, k in zip(quats, signs, omitted, strict=True)]
+    turned = np.rint(255 * (np.array(others) / np.sqrt(2) + 0.5))
+    textures = {
+        # 16 bits of a position: 0, 65535 and 256.
+        "means_l": [[0, 0, 0], [255, 255, 255], [0, 0, 0]],
+        "means_u": [[0, 0, 0], [255, 255, 255], [1, 1, 1]],
+        "scales": [[0, 1, 2], [3, 4, 5], [6, 7, 255]],
+        "quats": np.column_stack([turned, 252 + omitted]),
+        "sh0": [[10, 20, 30, 0], [40, 50, 60, 128], [70, 80, 90, 255]],
+        "shN_labels": [[0, 0, 0], [65, 0, 0], [2, 1, 0]],
+        # 259 entries of a palette, 64 in a row, each with eight coefficients.
+        "shN_centroids": np.arange(5 * 512 * 3).reshape(5, 512, 3) % 256,
+    }
+    table, files = (np.arange(256) / 64 - 2).tolist(), {}
+    for name, values in textures.items():
+        texels = np.array(values, np.uint8)
+        image = Image.fromarray(texels if texels.ndim == 3 else texels[None])
+        image.save(buffer := io.BytesIO(), "webp", lossless=True, exact=True)
+        files[f"{name}.webp"] = buffer.getvalue()
+    means = {"mins": [-1, -2, 0], "maxs": [1, 2, 3], "files": ["means_l.webp", "means_u.webp"]}
+    meta = {"version": version, "count": 3, "means": means, "quats": {"files": ["quats.webp"]}}
+    meta |= {part: {"codebook": table, "files": [f"{part}.webp"]} for part in ("scales", "sh0")}
+    names = ["shN_centroids.webp", "shN_labels.webp"]
+    meta["shN"] = {"count": 259, "bands": bands, "codebook": table, "files": names}
+    with zipfile.ZipFile(path, "w") as file:
+        for name, data in {**files, "meta.json": json.dumps(meta).encode()}.items():
+            file.writestr(name, data)
+
+
+def test_sog_is_read_as_its_specification_says(tmp_path):
+    quats = np.array([[0.9, 0.1, -0.3, 0.3], [0.1, -0.2, 0.1, -0.97], [-0.3, 0.9, 0.2, 0.2]])
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    sog(tmp_path / "a.sog", quats)
+    g = read_splats(tmp_path / "a.sog")
+    logs = np.array(
+        [[-1, -2, 0], [1, 2, 3], np.array([-1, -2, 0]) + 256 / 65535 * np.array([2, 4, 3])]
+    )
+    np.testing.assert_allclose(g.means, np.sign(logs) * np.expm1(np.abs(logs)), rtol=1e-5)
+    np.testing.assert_allclose(g.log_scales[2], np.array([6, 7, 255]) / 64 - 2)
+    same = np.abs((np.asarray(g.quats) * quats).sum(1))
+    np.testing.assert_allclose(same, 1, atol=1e-4)
+    assert np.isfinite(g.opacity_logits).all()
+    np.testing.assert_allclose(ours(g)[1], [0, 128 / 255, 1], atol=0.003)
+    np.testing.assert_allclose(g.sh[1, 0], np.array([40, 50, 60]) / 64 - 2)
+    # The labels are 0, 65 and 2 + 256: the entries 0, 1 and 2 of the rows 0, 1 and 4.
+    first = 3 * np.array([0, 512 + 8, 4 * 512 + 2 * 8])[:, None]
+    entries = (np.arange(8 * 3) + first) % 256
+    np.testing.assert_allclose(g.sh[:, 1:], entries.reshape(3, 8, 3) / 64 - 2)
+    sog(tmp_path / "old.sog", quats, version=1)
+    (tmp_path / "torn.sog").write_bytes((tmp_path / "a.sog").read_bytes()[:900])
+    for name in ("old", "torn"):
+        with pytest.raises(UserError, match=r"(its version is 1|zip)"):
+            read_splats(tmp_path / f"{name}.sog")
+
+
+def test_splats_are_told_by_the_end_of_their_names(tmp_path, with_gsply):
+    g = mild(1)
+    write_ply(tmp_path / "a.PLY", g, [])
+    gsply_files.write_compressed_ply(tmp_path / "b.compressed.ply", g)
+    gsply_files.write_spz(tmp_path / "c.spz", g)
+    for name in ("a.PLY", "b.compressed.ply", "c.spz"):
+        found = np.sort(np.asarray(read_splats(tmp_path / name).means[:, 0]))
+        np.testing.assert_allclose(found, np.sort(np.asarray(g.means[:, 0])), atol=0.02)
 
 
 def test_ellipsoids_stay_as_they_were_where_rotations_change():

@@ -1,0 +1,79 @@
+"""Solved photometry in the words of other trainers: PPISP (gsplat, LichtFeld Studio) and 3DGS.
+
+docs/exports.md tells how each program is given its file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from p2gs_jax.core.atomic import write_json
+from p2gs_jax.photometry.ppisp_start import start_of
+from p2gs_jax.run.foreign import common_look
+from p2gs_jax.run.photometry_files import PhotometryFile, read_photometry
+from p2gs_jax.types import GAMMA_SRGB, View
+
+
+def write_for(trainers: Sequence[str], folder: Path, views: Sequence[View]) -> list[str]:
+    """Write the files of some trainers beside the `photometry.json` of a calibration.
+
+    `views` are the calibrated photographs. Returns a sentence on each file, also where the program
+    has no words for this photometry and nothing is written.
+    """
+    saved, writers = read_photometry(folder / "photometry.json"), {"ppisp": _ppisp, "3dgs": _3dgs}
+    return [writers[name](folder, saved, views) for name in dict.fromkeys(trainers)]
+
+
+def _ppisp(folder: Path, saved: PhotometryFile, views: Sequence[View]) -> str:
+    """Write PPISP's parameters under its names; views of unknown exposure have the mean."""
+    path, common = folder / "ppisp_start.json", common_look(folder, saved)
+    rows = {row["image"]: row for row in saved["views"]}
+    found = [rows[view.name] for view in views]
+    start = start_of(
+        common.formation,
+        [view.camera for view in views],
+        np.array([row["exposure"] or common.exposure for row in found]),
+        np.array([row["gamma"] or common.gamma for row in found]),
+        np.log([row["white_balance"] or [1.0] * 3 for row in found]),
+        {view.camera: (view.width, view.height) for view in views},
+    )
+    p = start.parameters
+    content = {
+        "exposure_params": p.exposures,
+        "vignetting_params": p.vignettings,
+        "color_params": p.colors,
+        "crf_params": p.responses,
+        "frames": [view.name for view in views],
+        "cameras": p.names,
+        "camera_of_frame": p.cameras,
+        "radiance_ev": start.radiance_ev,
+        "codes": start.codes,
+    }
+    write_json(path, content)
+    return (
+        f"{path}: initial values of PPISP. Its response differs from the solved one by "
+        f"{start.codes[:, 0].mean():.1f} 8-bit codes in the mean, at most {start.codes.max():.0f}."
+    )
+
+
+def _3dgs(folder: Path, saved: PhotometryFile, views: Sequence[View]) -> str:
+    """Write 3DGS's matrices where an exposure is a gain of display values, the same for all."""
+    path, common = folder / "exposure.json", common_look(folder, saved)
+    cameras, curve = common.formation.cameras, common.formation.curve
+    gammas = [row["gamma"] for row in saved["views"] if row["gamma"] is not None]
+    by_place = any(camera.vignetting or camera.splines for camera in cameras)
+    if curve not in ("power", "linear") or np.ptp(gammas) > 1e-6 or by_place:
+        return (
+            f"{path.name} is not written: with the curve {curve}, vignetting or gammas that vary, "
+            "photographs differ by more than a matrix of 3DGS. Train on developed ones (--develop)."
+        )
+    power, matrices = (1 if curve == "power" else GAMMA_SRGB) / common.gamma, {}
+    for row in saved["views"]:
+        e = (row["exposure"] or common.exposure) / common.exposure
+        gains = (e * np.array(row["white_balance"] or [1.0] * 3)) ** power
+        matrices[row["image"]] = np.concatenate([np.diag(gains), np.zeros((3, 1))], axis=1)
+    write_json(path, matrices)
+    return f"{path}: matrices of 3DGS, from the common exposure to that of each photograph."

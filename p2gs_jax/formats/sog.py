@@ -1,0 +1,88 @@
+"""SOG, the compressed splats of PlayCanvas and SuperSplat, version 2: a ZIP of textures.
+
+A texel of each texture belongs to one Gaussian, in rows from the top. Positions have 16 bits in a
+logarithmic scale; rotations omit the largest component; scales and colours are entries of 256-entry
+tables. Harmonics of higher degree are rows of a palette, whose texture has 64 of them per row.
+Source: developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+from scipy.special import logit
+
+from p2gs_jax.core.numerics import on_device
+from p2gs_jax.core.text import parse_json
+from p2gs_jax.types import Gaussians
+
+VERSION = 2
+PARTS = ("scales", "sh0", "shN")  # the parts of `meta.json` with tables
+# Palette entries in a row of its texture.
+PALETTE_ROW = 64
+# The alpha of a rotation is this plus the place of the omitted component among w, x, y, z.
+FIRST_OMITTED = 252
+# Opacities of 8 bits are at least half a step from 0 and 1, so that logits are finite.
+LEAST_OPACITY = 0.5 / 255
+
+
+def read_sog(path: Path) -> Gaussians:
+    """Read Gaussians with display colours, in the order of the file.
+
+    Raises:
+        OSError: the file or a texture cannot be read.
+        ValueError: it is not such a ZIP, is of another version, or its content disagrees.
+        KeyError: a texture or a field of `meta.json` is missing.
+    """
+    try:
+        with zipfile.ZipFile(path) as file:
+            return _read(file)
+    except (zipfile.BadZipFile, TypeError, IndexError, AttributeError) as error:
+        raise ValueError(str(error)) from error
+
+
+def _read(file: zipfile.ZipFile) -> Gaussians:
+    meta = parse_json(file.read("meta.json").decode())
+    if meta.get("version") != VERSION:
+        raise ValueError(f"its version is {meta.get('version')}, and this program reads {VERSION}")
+
+    def texture(part: str, number: int = 0) -> UInt8[np.ndarray, "h w 4"]:
+        with Image.open(io.BytesIO(file.read(meta[part]["files"][number]))) as picture:
+            return np.asarray(picture.convert("RGBA"))
+
+    def texels(part: str, number: int = 0) -> UInt8[np.ndarray, "n 4"]:
+        return texture(part, number).reshape(-1, 4)[: meta["count"]]
+
+    tables = {part: np.array(meta[part].get("codebook", ())) for part in PARTS if part in meta}
+    low, high = (np.array(meta["means"][end], float) for end in ("mins", "maxs"))
+    whole = texels("means", 0)[:, :3] + 256.0 * texels("means", 1)[:, :3]
+    logs = low + whole / 65535 * (high - low)
+    base = texels("sh0")
+    sh = tables["sh0"][base[:, None, :3]]
+    if "shN" in meta:
+        each = (meta["shN"]["bands"] + 1) ** 2 - 1
+        palette = texture("shN")[:, : PALETTE_ROW * each, :3].reshape(-1, each, 3)
+        labels = texels("shN", 1)[:, :2] @ np.array([1, 256])
+        sh = np.concatenate([sh, tables["shN"][palette[labels]]], axis=1)
+    opacities = np.clip(base[:, 3] / 255, LEAST_OPACITY, 1 - LEAST_OPACITY)
+    scales = tables["scales"][texels("scales")[:, :3]]
+    means = np.sign(logs) * np.expm1(np.abs(logs))
+    parts = (means, _rotations(texels("quats")), scales, logit(opacities), sh)
+    if {len(part) for part in parts} != {meta["count"]}:
+        raise ValueError("its textures have fewer texels than it has Gaussians")
+    return Gaussians(*map(on_device, parts))
+
+
+def _rotations(texels: UInt8[np.ndarray, "n 4"]) -> np.ndarray:
+    """Return unit quaternions, wxyz."""
+    omitted = texels[:, 3].astype(int) - FIRST_OMITTED
+    three = (texels[:, :3] / 255 - 0.5) * np.sqrt(2)
+    largest = np.sqrt(np.maximum(1 - (three**2).sum(1, keepdims=True), 0))
+    # The place of each component among the omitted one, which comes first, and the others.
+    places = np.argsort([[k, *(j for j in range(4) if j != k)] for k in range(4)], axis=1)
+    return np.take_along_axis(np.concatenate([largest, three], 1), places[omitted], 1)

@@ -1,0 +1,101 @@
+"""Solved photometry in the parameters of PPISP, from which its trainers may start.
+
+Exposures, vignetting and white balance of greys carry over; a response of four numbers is fitted to
+the tone curve, and the difference is measured. PPISP's light is 1 where a photograph saturates, and
+its mean exposure is 0 stops, where its regularisation pulls it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import least_squares
+
+from p2gs_jax.config import PhotometryConfig
+from p2gs_jax.core.numerics import on_device
+from p2gs_jax.photometry import ppisp
+from p2gs_jax.photometry.display import DisplayTransform
+from p2gs_jax.photometry.formation import camera_rows, inverse_tone_map
+
+# Display values at which curves are compared: all but black of 8 bits.
+VALUES = np.repeat(np.arange(1, 256, dtype=np.float64)[:, None] / 255, 3, 1)
+
+
+class Start(NamedTuple):
+    """Initial parameters, and what they leave out."""
+
+    parameters: ppisp.Ppisp
+    radiance_ev: float  # PPISP's radiance is ours times 2 to this power
+    # mean and largest difference of greys of every camera, 8-bit codes: its tone curve at the mean
+    # gamma of its views beside PPISP's response
+    codes: Float[np.ndarray, "c 2"]
+
+
+def start_of(
+    cfg: PhotometryConfig,
+    cameras: Sequence[str],
+    exposures: Float[np.ndarray, " v"],
+    gammas: Float[np.ndarray, " v"],
+    balances: Float[np.ndarray, "v 3"],
+    sizes: Mapping[str, tuple[int, int]],
+) -> Start:
+    """Return PPISP's parameters of some views.
+
+    `cameras` are the cameras of the views, `balances` log factors on the channels, and `sizes` have
+    width and height of the photographs of every camera, pixels.
+    """
+    plain = ppisp.identity(cameras)
+    rows = camera_rows(plain.names, cfg) or (None,) * len(plain.names)
+    of_view, responses, vignettings, whites, codes = np.array(plain.cameras), [], [], [], []
+    for k, (name, row) in enumerate(zip(plain.names, rows, strict=True)):
+        exposed = inverse_tone_map(VALUES, float(gammas[of_view == k].mean()), cfg, row)
+        # The light of white; channels with different responses share their mean.
+        whites.append(np.exp(np.log(exposed[-1]).mean()))
+        response, off = _response(exposed / whites[-1])
+        responses.append(response)
+        codes.append((off.mean(), off.max()))
+        darker = DisplayTransform(1.0, 1.0, cfg, camera=row).vignetting
+        vignettings.append(_vignetting(darker, *sizes[name]))
+    # PPISP keeps R + G + B: the factors of greys have the sum 3, and the exposure has the rest.
+    factors = np.exp(balances)
+    sums = factors.sum(1, keepdims=True) / 3
+    stops = np.log2(exposures * sums[:, 0] / np.array(whites)[of_view])
+    neutral = (factors / sums)[:, :2] / 3 - 1 / 3
+    colors = np.pad(neutral @ np.linalg.inv(ppisp.PRECONDITIONERS[3]), ((0, 0), (6, 0)))
+    learned = (stops - stops.mean(), colors, np.array(responses), np.array(vignettings))
+    found = ppisp.Ppisp(*map(on_device, learned), names=plain.names, cameras=plain.cameras)
+    return Start(found, float(stops.mean()), np.array(codes))
+
+
+def _response(light: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the response (3, 4) closest to `VALUES` of light, and the distances in 8-bit codes."""
+    respond = jax.jit(ppisp.respond)
+
+    def off(raw: np.ndarray) -> np.ndarray:
+        found = respond(on_device(light), on_device(raw.reshape(3, 4)))
+        return (np.asarray(found, np.float64) - VALUES).ravel()
+
+    start = np.tile(ppisp.identity_response(), (3, 1))
+    start[:, 2] = np.log(np.expm1(1 / 2.2 - ppisp.LEAST_GAMMA))
+    # Responses are computed in float32.
+    raw = least_squares(off, start.ravel(), diff_step=1e-3, max_nfev=60).x
+    return raw.reshape(3, 4), 255 * np.abs(off(raw))
+
+
+def _vignetting(rows: Sequence[Sequence[float]], width: int, height: int) -> np.ndarray:
+    """Return the centre and the coefficients of r^2, r^4, r^6 of each channel, (3, 5).
+
+    `rows` are our coefficients for all channels or for each. Our radius is 1 in the corners,
+    PPISP's is in units of the longer side.
+    """
+    out, share = np.zeros((3, ppisp.COEFFICIENTS)), np.linspace(0, 1)[:, None]
+    squared = share * (width**2 + height**2) / (2 * max(width, height)) ** 2
+    for channel in range(3 if rows else 0):
+        row = np.array(rows[channel if len(rows) > 1 else 0])
+        falloff = np.exp(share ** np.arange(1, len(row) + 1) @ row)
+        out[channel, 2:] = np.linalg.lstsq(squared ** np.arange(1, 4), falloff - 1)[0]
+    return out

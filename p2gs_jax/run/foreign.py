@@ -1,0 +1,175 @@
+"""Splats of another program as a run: trained on developed photographs, shown as photographs were.
+
+The program knows one exposure: its Gaussians have display colours, and `calibrate --develop` has
+written the photographs. `photometry.json` of the same folder tells the look of every photograph.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from p2gs_jax.config import DataConfig, FitConfig, PhotometryConfig, RenderConfig
+from p2gs_jax.core.atomic import readable
+from p2gs_jax.core.numerics import evenly_spaced, on_device
+from p2gs_jax.core.text import count_of, first_few
+from p2gs_jax.errors import UserError, broken
+from p2gs_jax.formats.splats import read_splats
+from p2gs_jax.gaussians import bake
+from p2gs_jax.photometry.display import DisplayTransform, light_of
+from p2gs_jax.photometry.formation import LEAST_ALPHA
+from p2gs_jax.render.capacity import RenderView, make_renderer
+from p2gs_jax.run import photometry_files
+from p2gs_jax.run.read import Run, load_run, photometry_of
+from p2gs_jax.scene import find_scene, with_what_lies_beside
+from p2gs_jax.scene.masks import with_alpha
+from p2gs_jax.scene.pixels.store import camera_of
+from p2gs_jax.types import GAMMA_SRGB, Gaussians, Params, Scene
+
+# The table of `calibrate --develop` beside the photographs that it wrote: `ev` is their exposure.
+DEVELOPED = Path("developed") / "exposures.csv"
+# Lifted Gaussians are compared in this many views, at most this wide, pixels.
+MEASURED, MEASURED_WIDTH = 60, 960
+# Near plane of other programs, scene units.
+NEAR = 0.01
+
+
+@dataclass(frozen=True)
+class ForeignRun(Run):
+    """Splats of another program. `params.gaussians` are lifted, and approximate them.
+
+    `render` composites display colours as their program did, and returns the radiance that the
+    picture shows.
+    """
+
+    _: KW_ONLY
+    splats: Gaussians  # with display colours, max(0, sh + 1/2)
+    developed: DisplayTransform  # the look of the photographs that they were trained on
+
+    @cached_property
+    def _renderer(self) -> RenderView:
+        render = make_renderer(bake.viewer_config(self.cfg.render))
+
+        def shown(_, alive, camera):
+            result, share = render(self.splats, alive, camera), 1.0
+            if self.store.backdrop is not None:
+                share = np.maximum(np.asarray(result.alpha), LEAST_ALPHA)[..., None]
+            light = light_of(np.asarray(result.linear) / share, self.developed)
+            return replace(result, linear=share * light)
+
+        return shown
+
+    def refined(
+        self, steps: int, on_step: Callable[[int, int], None] = lambda done, steps: None
+    ) -> ForeignRun:
+        """Return the run with lifted Gaussians whose pictures are closer, and their error.
+
+        The pictures are the program's own, of display colours. `on_step` is called as by `refine`.
+        """
+        cfg, shown, targets = self.cfg.render, self.developed, []
+        render = make_renderer(bake.viewer_config(cfg))
+        for row in evenly_spaced(len(self.scene.views), MEASURED):
+            view = self.scene.views[row]
+            camera = camera_of(self.store, row, max(view.width / MEASURED_WIDTH, 1.0))
+            targets.append(bake.displayed_target(view.name, self.splats, camera, render))
+        lifted = self.params.gaussians
+        lifted = bake.refine(lifted, targets, cfg, steps=steps, shown=shown, on_step=on_step)
+        e: Any = bake.baking_error(lifted, targets, cfg, shown)
+        note = (
+            f"Lifted to radiance, the Gaussians show {count_of(e['views'], 'picture')} of their "
+            f"program with a median of {e['psnr_median']:.2f} dB, worst {e['psnr_worst']:.2f} dB "
+            f"({e['worst_view']}), mean {e['mean_codes']:.2f} and largest {e['max_codes']:.0f} "
+            "8-bit levels: light is composited instead of display values."
+        )
+        params = replace(self.params, gaussians=lifted)
+        return replace(self, params=params, lifting_error=e, notes=(*self.notes, note))
+
+
+def load_run_or_splats(run: Path, scene: Path | None, photometry: Path | None) -> Run:
+    """Return a finished run, or with `photometry` the splats of another program (`foreign_run`).
+
+    Raises:
+        UserError: see `load_run` and `foreign_run`; or splats come without a scene.
+    """
+    if photometry is None:
+        return load_run(run, scene)
+    if scene is None:
+        fix = "add --scene SCENE, the scene that was calibrated"
+        raise UserError("--photometry needs the cameras of a scene.", fix=fix)
+    return foreign_run(run, photometry, scene)
+
+
+def foreign_run(splats: str | Path, photometry: str | Path, scene: str | Path) -> ForeignRun:
+    """Return splats of another program as a run, with the photometry of a calibration.
+
+    `photometry` is the folder that `calibrate --develop` wrote, and `scene` the scene that was
+    calibrated. Splats must be in the coordinates of the scene. Views without a known exposure have
+    the mean, as held-out views.
+
+    Raises:
+        UserError: a file is missing or broken, or the photographs of the scene are others.
+    """
+    splats, folder, data = Path(splats), Path(photometry), DataConfig(test_every=0)
+    path = folder / "photometry.json"
+    saved, found = photometry_files.read_photometry(path), find_scene(Path(scene), data)
+    if not isinstance(found, Scene):
+        fix = f"name the scene that the other program read, {DEVELOPED.parent} in {folder}"
+        raise broken(scene, "has no COLMAP model and no transforms.json", fix)
+    found, notes = _with_known(with_alpha(with_what_lies_beside(found, data), data), saved, path)
+    gaussians = read_splats(splats)
+    means = on_device(np.asarray(gaussians.means, np.float64) - np.array(found.origin))
+    gaussians, developed = replace(gaussians, means=means), common_look(folder, saved)
+    render = RenderConfig(blur=bake.VIEWER_BLUR, near=NEAR)
+    cfg = FitConfig(photometry=developed.formation, render=render)
+    return ForeignRun(
+        splats.with_suffix(""),
+        Params(bake.lift(gaussians, developed), photometry_of(saved, found, cfg, path)),
+        cfg,
+        found,
+        None,
+        saved,
+        notes=notes,
+        splats=gaussians,
+        developed=developed,
+    )
+
+
+def _with_known(
+    scene: Scene, saved: photometry_files.PhotometryFile, path: Path
+) -> tuple[Scene, tuple[str, ...]]:
+    """Return the scene with views of unknown exposure held out, and notes on them."""
+    known = {view["image"] for view in saved["views"] if view["exposure"] is not None}
+    views = [replace(v, split="train" if v.name in known else "test") for v in scene.views]
+    unknown = [view.name for view in views if view.split == "test"]
+    if len(unknown) == len(views):
+        why = f"{path} has none of the photographs of {scene.root} (for example {unknown[0]})."
+        fix = "name the folder that `p2gs-jax calibrate` wrote for this scene"
+        raise UserError(why, fix=fix)
+    note = f"{count_of(len(unknown), 'view')} of unknown exposure ({first_few(unknown)}) have the "
+    return replace(scene, views=tuple(views)), (note + "mean.",) if unknown else ()
+
+
+def common_look(folder: Path, saved: photometry_files.PhotometryFile) -> DisplayTransform:
+    """Return the look of the developed photographs of a calibration's folder.
+
+    If there are none, it is the mean exposure and gamma of its `photometry.json`.
+
+    Raises:
+        UserError: their table cannot be read.
+    """
+    mean, path = saved["mean"], folder / DEVELOPED
+    cfg = photometry_files.with_formation_of(PhotometryConfig(), saved)
+    common = DisplayTransform(mean["exposure_geometric"], mean["gamma"], cfg)
+    if path.is_file():
+        with readable(path, "repeat `p2gs-jax calibrate ... --develop`"):
+            row = next(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+            common = replace(common, exposure=2.0 ** float(row["ev"]))
+            if row["image"].lower().endswith(".exr"):
+                common = replace(common.with_curve("linear"), gamma=GAMMA_SRGB)
+    return common

@@ -1,0 +1,61 @@
+"""Values for other trainers, applied as these apply them."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from p2gs_jax.export.trainers import write_for
+from p2gs_jax.run.photometry_files import OF_VIEWS, write_photometry
+from p2gs_jax.types import View
+
+EXPOSURES = {"a.png": 0.5, "b.png": 3.0}
+BALANCE, GAMMA, PIVOT = (1.1, 1.0, 1 / 1.1), 2.4, 0.18
+VIEWS = [View(n, Path(n), "0", np.eye(4), np.eye(3, dtype="f4"), 30, 20) for n in EXPOSURES]
+
+
+def photometry(path, curve, gammas=(GAMMA, GAMMA)):
+    views = [
+        {**dict.fromkeys(OF_VIEWS), "image": n, "camera": "0"}
+        | {"exposure": e, "gamma": gamma, "white_balance": BALANCE}
+        for (n, e), gamma in zip(EXPOSURES.items(), gammas, strict=True)
+    ]
+    curve = {"name": curve, "pivot": PIVOT, "spline": None}
+    mean = {"exposure": 1.75, "exposure_geometric": 1.5**0.5, "gamma": GAMMA}
+    write_photometry(path, model="view_exposure", curve=curve, gauge="", mean=mean, views=views)
+
+
+@pytest.mark.parametrize(("curve", "power"), [("power", 1 / 2.2), ("linear", 1.0)])
+def test_matrices_of_3dgs_turn_the_common_picture_into_each_photograph(tmp_path, curve, power):
+    photometry(tmp_path / "photometry.json", curve)
+    assert "exposure.json" in write_for(["3dgs"], tmp_path, VIEWS)[0]
+    light = np.random.default_rng(0).uniform(0.01, 0.2, (50, 3))
+
+    def taken(gains):
+        return (PIVOT * (gains * light / PIVOT) ** (2.2 / GAMMA)) ** power
+
+    for name, matrix in json.loads((tmp_path / "exposure.json").read_text()).items():
+        m = np.array(matrix)
+        assert m.shape == (3, 4)
+        # gaussian_renderer/__init__.py of 3DGS: colours are rows.
+        shown = taken(1.5**0.5) @ m[:, :3] + m[:, 3]
+        np.testing.assert_allclose(shown, taken(EXPOSURES[name] * np.array(BALANCE)), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("curve", "gammas"), [("srgb", (2.2, 2.2)), ("power", (2.2, 2.3))])
+def test_what_no_matrix_says_is_not_written(tmp_path, curve, gammas):
+    photometry(tmp_path / "photometry.json", curve, gammas)
+    assert "is not written" in write_for(["3dgs"], tmp_path, VIEWS)[0]
+    assert not (tmp_path / "exposure.json").exists()
+
+
+def test_values_of_ppisp_have_its_names_and_shapes(tmp_path):
+    photometry(tmp_path / "photometry.json", "srgb")
+    assert "8-bit codes" in write_for(["ppisp", "ppisp"], tmp_path, VIEWS)[0]
+    saved = json.loads((tmp_path / "ppisp_start.json").read_text())
+    names = ("exposure_params", "vignetting_params", "color_params", "crf_params")
+    assert [np.shape(saved[n]) for n in names] == [(2,), (1, 3, 5), (2, 8), (1, 3, 4)]
+    assert (saved["frames"], saved["camera_of_frame"]) == (["a.png", "b.png"], [0, 0])
+    stops = np.diff(saved["exposure_params"])
+    np.testing.assert_allclose(stops, np.log2(3.0 / 0.5), atol=1e-5)

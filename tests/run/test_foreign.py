@@ -1,0 +1,122 @@
+"""Splats that another program trained on developed photographs, shown as photographs were."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from splats import gaussians_of
+from tiny_scene import make_scene
+
+from p2gs_jax.formats.exr import read_exr
+from p2gs_jax.formats.ply import read_ply, write_ply, write_radiance
+from p2gs_jax.render.harmonics import C0
+from p2gs_jax.run.foreign import foreign_run
+from p2gs_jax.run.photometry_files import OF_VIEWS, write_photometry
+
+RADIANCE = np.array([0.1, 0.2, 0.05])
+# Exposures of two photographs and, in stops, of the developed ones; the third view is unknown.
+EXPOSURES, DEVELOPED_EV = (0.5, 2.0), 1.0
+BALANCE, VIGNETTING = (1.25, 1.0, 0.8), -0.5
+WIDTH, HEIGHT = 48, 40
+
+
+def srgb(x):
+    x = np.clip(x, 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+
+
+def walls(colors):
+    """Return opaque walls before all cameras with display colours; one lets 0.1 % through."""
+    means, scales = [(0, 0, 4), (0, 0, 5), (0, 0, 6)], (6, 6, -3)
+    return gaussians_of(means, (1, 0, 0, 0), scales, 12, (np.reshape(colors, (1, 3)) - 0.5) / C0)
+
+
+def photometry(folder, names, camera):
+    def view(name, e, balance):
+        values = {"image": name, "camera": camera, "exposure": e, "white_balance": balance}
+        return {**dict.fromkeys(OF_VIEWS), **values, "gamma": None if e is None else 2.2}
+
+    rows = zip(names, (*EXPOSURES, None), ((1, 1, 1), BALANCE, None), strict=True)
+    folder.mkdir()
+    write_photometry(
+        folder / "photometry.json",
+        model="view_exposure",
+        curve={"name": "srgb", "pivot": 0.18, "spline": None},
+        gauge="",
+        mean={"exposure": 1.25, "exposure_geometric": 1.0, "gamma": 2.2},
+        views=[view(*row) for row in rows],
+        cameras=[{"name": camera, "vignetting": [[VIGNETTING, 0.0, 0.0]], "splines": None}],
+    )
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """Return a folder with a scene, a calibration that developed it, and splats."""
+    root = tmp_path_factory.mktemp("foreign")
+    make_scene(root / "scene", views=3, points=20, size=(WIDTH, HEIGHT))
+    photometry(root / "cal", ("0.png", "1.png", "2.png"), "1")
+    (root / "cal" / "developed").mkdir()
+    table = root / "cal" / "developed" / "exposures.csv"
+    table.write_text(f"image,camera,ev\n0.png,1,{DEVELOPED_EV}\n")
+    write_ply(root / "splat.ply", walls(srgb(2**DEVELOPED_EV * RADIANCE)), [])
+    return root
+
+
+def told(root):
+    return ("--photometry", root / "cal", "--scene", root / "scene")
+
+
+def test_a_photograph_is_shown_as_it_was_taken(succeeded, trained, tmp_path):
+    text = succeeded("render", trained / "splat.ply", *told(trained), "--out", tmp_path)
+    assert "1 view of unknown exposure (2.png)" in " ".join(text.split())
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    squared = ((x - WIDTH / 2) ** 2 + (y - HEIGHT / 2) ** 2) / ((WIDTH**2 + HEIGHT**2) / 4)
+    light = np.exp(VIGNETTING * squared)[..., None] * RADIANCE
+    # The third view has the mean exposure, and the mean white balance of its camera.
+    for name, gains in (("0", 0.5), ("1", 2 * np.array(BALANCE)), ("2", np.sqrt(BALANCE))):
+        shown = np.asarray(cv2.imread(str(tmp_path / f"{name}.render.png")))[..., ::-1]
+        expected = 255 * srgb(gains * light)
+        assert np.abs(shown - expected)[4:-4, 4:-4].max() < 1.5
+        linear, *_ = read_exr(tmp_path / f"{name}.exr")
+        np.testing.assert_allclose(linear[20, 24], RADIANCE, rtol=0.01)
+
+
+def test_gaussians_are_lifted_to_radiance_and_the_error_is_said(succeeded, trained, tmp_path):
+    argv = ("--format", "linear-ply", "--bake-steps", "0", "--out", tmp_path)
+    text = succeeded("export", trained / "splat.ply", *told(trained), *argv)
+    assert "Lifted to radiance" in text
+    linear = read_ply(tmp_path / "linear.ply")
+    logs = np.broadcast_to(np.log(RADIANCE), (3, 3))
+    np.testing.assert_allclose(C0 * np.asarray(linear.sh[:, 0]), logs, atol=1e-4)
+    assert json.loads((tmp_path / "linear.json").read_text())["lifting_error"]["max_codes"] < 1.5
+
+
+def test_without_developed_photographs_colours_show_the_mean_exposure(trained, tmp_path):
+    photometry(tmp_path / "cal", ("0.png", "1.png", "2.png"), "1")
+    run = foreign_run(trained / "splat.ply", tmp_path / "cal", trained / "scene")
+    sums = C0 * np.asarray(run.params.gaussians.sh[0, 0])
+    np.testing.assert_allclose(sums, np.log(2**DEVELOPED_EV * RADIANCE), atol=1e-4)
+    assert run.scene.test_indices == (2,)
+
+
+def test_what_cannot_be_shown_is_refused(refused, trained, tmp_path):
+    photometry(tmp_path / "other", ("a.png", "b.png", "c.png"), "1")
+    write_radiance(tmp_path / "radiance.ply", walls(RADIANCE), activation="exp")
+    vertices = b"element vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+    header = b"ply\nformat binary_little_endian 1.0\n" + vertices + b"end_header\n"
+    (tmp_path / "points.ply").write_bytes(header + bytes(12))
+    (tmp_path / "alone").mkdir()
+    cv2.imwrite(str(tmp_path / "alone" / "0.png"), np.zeros((20, 20, 3), np.uint8))
+    good, place, scene = trained / "splat.ply", trained / "cal", trained / "scene"
+    for splats, photos, where, words in (
+        (tmp_path / "points.ply", place, scene, ("not a valid PLY", "no field")),
+        (tmp_path / "radiance.ply", place, scene, ("holds the radiance of a run",)),
+        (scene / "images" / "0.png", place, scene, ("not a file of splats", ".compressed.ply")),
+        (good, tmp_path / "other", scene, ("none of the photographs", "0.png")),
+        (good, place, tmp_path / "alone", ("no COLMAP model", "developed")),
+    ):
+        text = refused("render", splats, "--photometry", photos, "--scene", where)
+        assert all(word in " ".join(text.split()) for word in words), text
+    assert "add --scene" in refused("export", good, "--photometry", place, "--format", "exr")
+    assert "need --photometry" in " ".join(refused("render", good).split())
