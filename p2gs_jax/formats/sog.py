@@ -60,7 +60,7 @@ def _read(file: zipfile.ZipFile) -> Gaussians:
 
     tables = {part: np.array(meta[part].get("codebook", ())) for part in PARTS if part in meta}
     low, high = (np.array(meta["means"][end], float) for end in ("mins", "maxs"))
-    whole = texels("means", 0)[:, :3] + 256.0 * texels("means", 1)[:, :3]
+    whole = (texels("means", 0) + 256.0 * texels("means", 1))[:, :3]
     logs = low + whole / 65535 * (high - low)
     base = texels("sh0")
     sh = tables["sh0"][base[:, None, :3]]
@@ -69,10 +69,9 @@ def _read(file: zipfile.ZipFile) -> Gaussians:
         palette = texture("shN")[:, : PALETTE_ROW * each, :3].reshape(-1, each, 3)
         labels = texels("shN", 1)[:, :2] @ np.array([1, 256])
         sh = np.concatenate([sh, tables["shN"][palette[labels]]], axis=1)
-    opacities = np.clip(base[:, 3] / 255, LEAST_OPACITY, 1 - LEAST_OPACITY)
-    scales = tables["scales"][texels("scales")[:, :3]]
-    means = np.sign(logs) * np.expm1(np.abs(logs))
-    parts = (means, _rotations(texels("quats")), scales, logit(opacities), sh)
+    logits = logit(np.clip(base[:, 3] / 255, LEAST_OPACITY, 1 - LEAST_OPACITY))
+    means, scales = np.sign(logs) * np.expm1(np.abs(logs)), texels("scales")[:, :3]
+    parts = (means, _rotations(texels("quats")), tables["scales"][scales], logits, sh)
     if {len(part) for part in parts} != {meta["count"]}:
         raise ValueError("its textures have fewer texels than it has Gaussians")
     return Gaussians(*map(on_device, parts))

@@ -8,7 +8,7 @@ its mean exposure is 0 stops, where its regularisation pulls it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -23,6 +23,8 @@ from p2gs_jax.photometry.formation import camera_rows, inverse_tone_map
 
 # Display values at which curves are compared: all but black of 8 bits.
 VALUES = np.repeat(np.arange(1, 256, dtype=np.float64)[:, None] / 255, 3, 1)
+# Responses from the best of which a fit starts: it has several minima.
+STARTS = np.stack(np.meshgrid(*[np.linspace(-3, 3, 7)] * 4), -1).reshape(-1, 4)
 
 
 class Start(NamedTuple):
@@ -71,19 +73,20 @@ def start_of(
     return Start(found, float(stops.mean()), np.array(codes))
 
 
-def _response(light: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray]:
+def _response(light: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, ...]:
     """Return the response (3, 4) closest to `VALUES` of light, and the distances in 8-bit codes."""
-    respond = jax.jit(ppisp.respond)
+    respond, found = jax.jit(ppisp.respond), []
 
-    def off(raw: np.ndarray) -> np.ndarray:
-        found = respond(on_device(light), on_device(raw.reshape(3, 4)))
-        return (np.asarray(found, np.float64) - VALUES).ravel()
+    def off(raw: np.ndarray, column: np.ndarray) -> np.ndarray:
+        return np.asarray(respond(column, raw.reshape(-1, 4)), np.float64) - VALUES[:, :1]
 
-    start = np.tile(ppisp.identity_response(), (3, 1))
-    start[:, 2] = np.log(np.expm1(1 / 2.2 - ppisp.LEAST_GAMMA))
-    # Responses are computed in float32.
-    raw = least_squares(off, start.ravel(), diff_step=1e-3, max_nfev=60).x
-    return raw.reshape(3, 4), 255 * np.abs(off(raw))
+    for channel in light.T:
+        start = STARTS[np.square(off(STARTS, channel[:, None])).sum(0).argmin()]
+        # Responses are computed in float32. Far parameters would have no gradient in training.
+        how: Any = {"diff_step": 1e-3, "bounds": (-6, 6), "args": (channel[:, None],)}
+        best = least_squares(lambda *a: off(*a)[:, 0], start, **how)
+        found.append((best.x, 255 * np.abs(best.fun)))
+    return tuple(map(np.array, zip(*found, strict=True)))
 
 
 def _vignetting(rows: Sequence[Sequence[float]], width: int, height: int) -> np.ndarray:

@@ -34,10 +34,9 @@ from p2gs_jax.types import GAMMA_SRGB, Gaussians, Params, Scene
 
 # The table of `calibrate --develop` beside the photographs that it wrote: `ev` is their exposure.
 DEVELOPED = Path("developed") / "exposures.csv"
-# Lifted Gaussians are compared in this many views, at most this wide, pixels.
-MEASURED, MEASURED_WIDTH = 60, 960
-# Near plane of other programs, scene units.
-NEAR = 0.01
+# Lifted Gaussians are compared in this many views, at most this wide, pixels. The near plane of
+# other programs is at this depth, scene units.
+MEASURED, MEASURED_WIDTH, NEAR = 60, 960, 0.01
 
 
 @dataclass(frozen=True)
