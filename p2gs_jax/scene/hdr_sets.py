@@ -163,7 +163,10 @@ def with_raw_settings(root: Path, scene: Scene) -> Scene:
         return scene
     views = tuple(replace(v, exif_ev=ev) for v, ev in zip(scene.views, evs, strict=True))
     note = f"The exposures of {len(views)} photographs are those of {places[0]}."
-    if any(path is not None and path.with_suffix(".dng").is_file() for path in paths):
+    raw = [path.with_suffix(".dng") for path in paths if path is not None]
+    if any(
+        path.is_file() and path != view.image_path for path, view in zip(raw, views, strict=True)
+    ):
         note += " Its raw photographs are read with --images raw."
     return replace(scene, views=views, notes=(*scene.notes, note))
 
