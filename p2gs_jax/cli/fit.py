@@ -17,7 +17,6 @@ from p2gs_jax.config import DataConfig, FitConfig, PresetName
 from p2gs_jax.core.text import count_of
 
 if TYPE_CHECKING:
-    from p2gs_jax.export.develop import Development
     from p2gs_jax.scene.survey import Survey
 
 Preset = Annotated[PresetName, tyro.conf.arg(metavar="NAME")]
@@ -163,7 +162,7 @@ class Calibrate:
         p2gs-jax calibrate castle --out photometry
         p2gs-jax calibrate castle --out photometry --known-exposures exif
         p2gs-jax calibrate stack --out photometry --static
-        p2gs-jax calibrate castle --out photometry --develop 8bit
+        p2gs-jax calibrate castle --out photometry --develop
     """
 
     SHORT_NAMES: ClassVar = (
@@ -204,6 +203,7 @@ class Calibrate:
         """Solve the photometry alone; print it as a table."""
         from p2gs_jax.cli.tables import print_calibration, stdout
         from p2gs_jax.core.progress import TerminalReporter
+        from p2gs_jax.export.develop import Development
         from p2gs_jax.export.trainers import write_for
         from p2gs_jax.pipeline.calibrate import calibrate, calibrate_run, calibrate_stack
         from p2gs_jax.report.development import write_development
@@ -216,21 +216,15 @@ class Calibrate:
             elif self.is_run:
                 found = calibrate_run(scene, out, cfg, **how)
             else:
-                found = calibrate(scene, out, cfg, develop=self.development(), **how)
+                depth, ev, masks = self.develop, self.exposure_ev, self.masks
+                asked = None if depth is None else Development(depth, ev, masks)
+                found = calibrate(scene, out, cfg, develop=asked, **how)
             if found.developed is not None:
                 write_development(out, found.developed)
         print_calibration(found, out)
         for sentence in write_for(self.write_for, out, found.views):
             stdout().print(sentence, soft_wrap=True)
         return 0
-
-    def development(self) -> Development | None:
-        """Return the options of `--develop`, or None without it."""
-        from p2gs_jax.export.develop import Development
-
-        if self.develop is None:
-            return None
-        return Development(self.develop, self.exposure_ev, self.masks)
 
     @property
     def is_run(self) -> bool:

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import difflib
 import io
+import itertools
 import sys
 from typing import Any
 
@@ -39,6 +40,8 @@ COMMANDS = {name: kind for group in GROUPS.values() for name, kind in group.item
 WITH_PRESET = ("fit", "calibrate")
 # Commands whose `--help` is short; their `--help-all` lists the whole configuration.
 WITH_CONFIGURATION = (*WITH_PRESET, "inspect")
+# Options whose value may be left out, and their values.
+BARE = {"--develop": ("8bit", "16bit", "exr")}
 HELP, HELP_ALL, VERSION = ("-h", "--help"), "--help-all", ("-V", "--version")
 
 
@@ -91,7 +94,7 @@ def _options(name: str, argv: list[str]) -> Any:
                 kind,
                 prog=f"p2gs-jax {name}",
                 description="",
-                args=["--help" if a == HELP_ALL else a for a in argv],
+                args=_with_values(["--help" if a == HELP_ALL else a for a in argv]),
                 default=_defaults(name, argv),
                 registry=help_text.registry(brief),
             )
@@ -102,6 +105,15 @@ def _options(name: str, argv: list[str]) -> Any:
             more = name if brief and name in WITH_CONFIGURATION else ""
             print("\n" + help_text.examples(kind, more))
         raise
+
+
+def _with_values(argv: list[str]) -> list[str]:
+    """Return the words with the first choice after an option that was written without a value."""
+    out = []
+    for word, following in itertools.zip_longest(argv, argv[1:]):
+        bare = word in BARE and following not in BARE[word]
+        out += [word, BARE[word][0]] if bare else [word]
+    return out
 
 
 def _defaults(name: str, argv: list[str]) -> Any:

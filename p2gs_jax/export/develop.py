@@ -21,14 +21,14 @@ from jaxtyping import Bool, Float
 from PIL import ExifTags, Image
 
 from p2gs_jax.config import FitConfig
-from p2gs_jax.core.atomic import append_jsonl, atomic_write, plain, read_jsonl, remove_begun
+from p2gs_jax.core.atomic import append_jsonl, plain, read_jsonl, remove_begun
 from p2gs_jax.core.numerics import LN2, evenly_spaced
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.core.text import first_few
 from p2gs_jax.core.threads import map_in_order
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.film import Film, Finish, across, common_curve, dithered
-from p2gs_jax.export.folders import JPEG_QUALITY, MODES, RGB
+from p2gs_jax.export.folders import MODES, RGB, write_photograph
 from p2gs_jax.export.poses import Poses, write_if_new
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.frames import shrunk
@@ -37,7 +37,6 @@ from p2gs_jax.photometry.display import mean_parameters
 from p2gs_jax.photometry.formation import exposed_at
 from p2gs_jax.photometry.parameters import initial_photometry
 from p2gs_jax.run.decisions import decide
-from p2gs_jax.scene.convert.convert import kept_settings, write_png
 from p2gs_jax.scene.convert.icc import profile_of
 from p2gs_jax.scene.files import file_fingerprints
 from p2gs_jax.scene.pixels.decode import floats, stored
@@ -145,18 +144,12 @@ class _Lab:
 
     def notes(self) -> list[str]:
         """Return what users must know about exposures that were assumed."""
-        out, groups = [], len(np.unique(self.solution.component[self.seen]))
-        if names := [self.views[row].name for row in np.flatnonzero(~self.seen).tolist()]:
-            out.append(
-                f"{len(names)} photograph(s) share too few points with others: they were developed "
-                f"with the mean exposure of their camera, which may be wrong: {first_few(names)}."
-            )
-        if groups > 1:
-            out.append(
-                f"{groups} groups of photographs share no points: each was brought to its own mean "
-                "exposure, and the groups may differ in brightness."
-            )
-        return out
+        names = [self.views[row].name for row in np.flatnonzero(~self.seen).tolist()]
+        note = (
+            f"{len(names)} photograph(s) share too few points with others: they were developed "
+            f"with the mean exposure of their camera, which may be wrong: {first_few(names)}."
+        )
+        return [note] if names else []
 
 
 def places_of(poses: Poses, scene: Scene, out: Path, options: Development) -> dict[str, str]:
@@ -255,7 +248,7 @@ def _develop(
         if opacity is not None:
             alpha = np.rint(floats(opacity) * np.iinfo(found.dtype).max).astype(found.dtype)
             found = np.concatenate([found, alpha[..., None]], 2)
-        _write(target, found, view)
+        write_photograph(target, found, _exif(view))
     if not valid.all():
         _write_mask(folder / _mask_of(place), valid)
     shares = {"masked": ~valid, "clipped": clipped, "black": black}
@@ -273,22 +266,15 @@ def _copied(view: View, target: Path) -> bool:
     return False
 
 
-def _write(target: Path, pixels: np.ndarray, view: View) -> None:
-    """Write display values in sRGB, with the EXIF that still holds."""
+def _exif(view: View) -> Image.Exif | None:
+    """Return the EXIF of a photograph without what describes the original's brightness."""
     exif = None
     with contextlib.suppress(Exception), Image.open(view.image_path) as image:  # as `kept_settings`
         exif = image.getexif()
         shot = exif.get_ifd(ExifTags.IFD.Exif)
         for tag in _EXPOSURE:
             shot.pop(tag, None)
-    if target.suffix.lower() == ".png":
-        write_png(target, pixels, exif)
-        return
-    settings = kept_settings(exif)
-    options: dict[str, Any] = {"exif": b"Exif\0\0" + settings} if settings else {}
-    with atomic_write(target) as temporary:
-        # Only JPEG has a quality.
-        Image.fromarray(pixels).save(temporary, quality=JPEG_QUALITY, subsampling=0, **options)
+    return exif
 
 
 def _mask_of(place: str) -> str:

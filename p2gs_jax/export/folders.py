@@ -18,14 +18,14 @@ from typing import Any, Literal
 import numpy as np
 import pycolmap
 from jaxtyping import Float
-from PIL import Image
+from PIL import ExifTags, Image
 
-from p2gs_jax.core.atomic import atomic_folder, write_json, write_text
+from p2gs_jax.core.atomic import atomic_folder, atomic_write, write_json, write_text
 from p2gs_jax.core.ply import header_of
 from p2gs_jax.photometry.observations import grouped
 from p2gs_jax.run.photometry_files import ViewPhotometry
 from p2gs_jax.scene import ImageStore
-from p2gs_jax.scene.convert.convert import kept_settings
+from p2gs_jax.scene.convert.convert import kept_settings, write_png
 from p2gs_jax.types import Scene, Tracks, View
 
 JPEG_QUALITY = 98
@@ -175,16 +175,26 @@ def _write_photograph(path: Path, view: View, ldr: Float[np.ndarray, "h w 3"]) -
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     unchanged = view.distortion is None and ldr.shape[1::-1] == (view.width, view.height)
-    settings, readable = b"", False
+    exif, readable = None, False
     with contextlib.suppress(OSError), Image.open(view.image_path) as original:
-        settings, readable = kept_settings(original.getexif()), original.mode in MODES
+        exif, readable = original.getexif(), original.mode in MODES
+        exif.get_ifd(ExifTags.IFD.Exif)  # read while the file is open
     if unchanged and readable and view.image_path.suffix.lower() == path.suffix.lower():
         shutil.copyfile(view.image_path, path)
         return
+    write_photograph(path, np.rint(255 * ldr).astype(np.uint8), exif)
+
+
+def write_photograph(path: Path, pixels: np.ndarray, exif: Image.Exif | None) -> None:
+    """Write display values of 8 or (PNG only) 16 bits in sRGB, with the camera settings in EXIF."""
+    if path.suffix.lower() == ".png":
+        write_png(path, pixels, exif)
+        return
+    settings = kept_settings(exif)
     options: dict[str, Any] = {"exif": b"Exif\0\0" + settings} if settings else {}
-    if path.suffix.lower() in (".jpg", ".jpeg"):
-        options |= {"quality": JPEG_QUALITY, "subsampling": 0}
-    Image.fromarray(np.rint(255 * ldr).astype(np.uint8)).save(path, **options)
+    with atomic_write(path) as temporary:
+        # Only JPEG has a quality.
+        Image.fromarray(pixels).save(temporary, quality=JPEG_QUALITY, subsampling=0, **options)
 
 
 def _frame(store: ImageStore, index: int, origin: Sequence[float]) -> dict[str, Any]:

@@ -28,6 +28,7 @@ _STEMS = ("cameras", "images", "points3D", "rigs", "frames")
 _MODEL = (*(f"{stem}.{kind}" for stem in _STEMS for kind in ("bin", "txt")), "points3D.ply")
 # Lists of held-out photographs beside a model, or in the scene's folder.
 _LISTS = ("train.txt", "test.txt")
+_FRAMES = ("frames", "test_frames")
 _NAMES_IN_JSON = ("train_filenames", "val_filenames", "test_filenames")
 # Bytes of an image in COLMAP's images.bin before its name, and of each of its keypoints.
 _BEFORE_NAME, _KEYPOINT = 64, 24
@@ -130,14 +131,13 @@ def _suffix(name: str) -> str:
 
 
 def _frames(data: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    for key in ("frames", "test_frames"):
+    for key in _FRAMES:
         yield from data.get(key) or ()
 
 
 def _plain(source: Path, name: str) -> str:
-    """Return a name in a file relative to its folder; names that lead out of it lose their path."""
-    path = relative_name(source, name)
-    return f"images/{path.name}" if ".." in path.parts else path.as_posix()
+    """Return a name in a file relative to its folder; no name leads out of it."""
+    return "/".join(part for part in relative_name(source, name).parts if part != "..")
 
 
 def _by_view(stated: Sequence[str], views: Sequence[str]) -> dict[str, str]:
@@ -157,12 +157,12 @@ def _json(
     """Return a transforms.json with other names and masks; files that it names are copied."""
     before = read_json(path, _FIX)
     content, new = copy.deepcopy(before), dict[str, str]()
-    for frame in [*_frames(content)]:
+    for key in _FRAMES:
+        if content.get(key):  # photographs may be missing if the user allows it
+            content[key] = [f for f in content[key] if _plain(path, f["file_path"]) in names]
+    for frame in _frames(content):
         name = frame["file_path"]
         stated = _plain(path, name)
-        if stated not in names:  # photographs are missing, and the user allows it
-            content["frames"].remove(frame)
-            continue
         place = names[stated]
         same = place == stated if _suffix(stated) else place.startswith(f"{stated}.")
         if not same or os.path.isabs(name) or ".." in Path(name).parts:
