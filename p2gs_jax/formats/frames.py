@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import base64
 import contextlib
-from collections.abc import Callable, Iterator
+import html
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -90,6 +91,16 @@ def shrunk(image: Float[np.ndarray, "h w c"], longest: int) -> Float[np.ndarray,
     if share >= 1:
         return image
     return cv2.resize(image, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
+
+
+def notebook_html(rows: Mapping[str, object], picture: Path) -> str:
+    """Return a table of named values and, if it exists, a picture file, for a notebook."""
+    row = "<tr><th>{}</th><td>{}</td></tr>".format
+    cells = [row(html.escape(name), html.escape(str(value))) for name, value in rows.items()]
+    table, image = f"<table>{''.join(cells)}</table>", cv2.imread(str(picture))
+    if image is None:
+        return table
+    return f'{table}<img src="{data_url("png", shrunk(image[..., ::-1] / 255, 900))}">'
 
 
 @contextlib.contextmanager

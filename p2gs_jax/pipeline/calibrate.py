@@ -7,6 +7,7 @@ a stack of exposures of one fixed viewpoint; `solved` processes all of them.
 from __future__ import annotations
 
 import dataclasses
+import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.develop import Developed, Development, develop_scene, places_of
 from p2gs_jax.export.poses import poses_of
+from p2gs_jax.formats.frames import notebook_html
 from p2gs_jax.gaussians.posed import standing
 from p2gs_jax.photometry.adjustment.problem import KnownExposures
 from p2gs_jax.photometry.calibrate import (
@@ -90,14 +92,30 @@ class Calibration:
 
     def write(self, out: Path) -> Calibration:
         """Write `photometry.json`, `calibration.json` and `calibration.png`; return `self`."""
-        views, pivot, solution = self.views, self.pivot, self.solution
-        path = out / "photometry.json"
-        write_solution(path, solution, views=views, pivot=pivot, gauge=self.gauge)
+        path, given = out / "photometry.json", {"pivot": self.pivot, "gauge": self.gauge}
+        write_solution(path, self.solution, views=self.views, **given)
         write_json(out / "calibration.json", {"messages": self.messages, **self.details})
-        cameras, stated = [v.camera for v in views], self.stated_ev
-        plot = out / "calibration.png"
-        write_calibration_plot(plot, solution, cameras=cameras, stated_ev=stated, pivot=pivot)
+        self._plot(out / "calibration.png")
         return self
+
+    def _plot(self, path: Path) -> None:
+        how = {"cameras": [v.camera for v in self.views], "stated_ev": self.stated_ev}
+        write_calibration_plot(path, self.solution, pivot=self.pivot, **how)
+
+    def _repr_html_(self) -> str:
+        """Return the main numbers and `calibration.png`, for notebooks."""
+        s, known = self.solution, np.isfinite(self.errors_ev)
+        stops, error = self.exposures_ev[known], self.errors_ev[known].max(initial=0)
+        reach = f"{stops.min(initial=0):+.2f} to {stops.max(initial=0):+.2f} EV"
+        rows = {
+            "photographs": f"{len(self.views)}, of which {known.sum()} have an exposure",
+            "model": f"{s.model}, curve {s.response.name}",
+            "exposures": f"{reach}, standard errors up to {error:.3f} EV",
+            "residual": f"{s.residual_ev:.2f} EV over {self.observations:,} observations",
+        }
+        with tempfile.TemporaryDirectory() as folder:
+            self._plot(Path(folder) / "calibration.png")
+            return notebook_html(rows, Path(folder) / "calibration.png")
 
 
 def calibrate(

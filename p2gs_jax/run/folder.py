@@ -150,15 +150,6 @@ def require_free(folder: Path) -> None:
             os.close(handle)
 
 
-def is_written(folder: Path) -> bool:
-    """Return whether another process holds the lock of a folder; nothing is written."""
-    try:
-        require_free(folder)
-    except UserError:
-        return True
-    return False
-
-
 def _acquire(folder: Path) -> int | None:
     path = folder / NAME
     while True:

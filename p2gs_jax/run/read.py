@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +18,7 @@ from p2gs_jax.core.atomic import readable
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
-from p2gs_jax.formats.frames import to_uint8
+from p2gs_jax.formats.frames import notebook_html, to_uint8
 from p2gs_jax.formats.ply import read_ply
 from p2gs_jax.gaussians.posed import chosen, posed, standing
 from p2gs_jax.photometry import display
@@ -100,6 +101,22 @@ class Run:
             view = self.camera(view)
         rendered = self.render(view)
         return to_uint8(display.develop(rendered.linear, shown, alpha=rendered.alpha))
+
+    def _repr_html_(self) -> str:
+        """Return the main numbers and `summary.png`, for notebooks."""
+        files, scene = RunFolder(self.folder), self.scene
+        stops = np.log2(np.asarray(self.params.photometry.exposures) / self.mean.exposure_geometric)
+        rows: dict[str, object] = {
+            "run": files.root,
+            "views": f"{len(scene.train_indices)} trained, {len(scene.test_indices)} held out",
+            "Gaussians": f"{self.params.gaussians.capacity:,}",
+            "exposures": f"{stops.min():+.2f} to {stops.max():+.2f} EV from the mean",
+        }
+        with contextlib.suppress(OSError, ValueError, KeyError):  # not evaluated, or nothing is
+            metrics = parse_json(files.metrics.read_text(encoding="utf-8"))
+            psnr = metrics["test"]["exposure_fitted"]["psnr"]
+            rows["held-out views"] = f"{psnr:.2f} dB (exposures fitted)"
+        return notebook_html(rows, files.summary)
 
     def without_objects(self) -> Run:
         """Return the run without moving objects."""

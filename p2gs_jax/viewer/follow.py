@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from p2gs_jax.errors import UserError
-from p2gs_jax.run.folder import RunFolder, is_written
+from p2gs_jax.run.folder import RunFolder, require_free
 from p2gs_jax.run.read import Run, load_run
 
 # Seconds between two looks at the run folder.
@@ -15,23 +15,25 @@ POLL_S = 1.0
 
 
 class Follower:
-    """Asks a fit for snapshots, and reads them; `files` has the paths of its run."""
+    """Asks a fit for snapshots, and reads them.
+
+    `files` has the paths of the run; `with_fit` is whether the viewer ends with the fit.
+    """
 
     def __init__(self, folder: Path, scene: Path | None = None, *, with_fit: bool = False):
-        """Follow the run in a folder, `with_fit` until its end; `scene` is as for `load_run`."""
-        self.files, self._scene, self._with_fit = RunFolder(folder), scene, with_fit
+        """Follow the run in a folder; `scene` is as for `load_run`."""
+        self.files, self._scene, self.with_fit = RunFolder(folder), scene, with_fit
         self._seen = 0  # time of the snapshot that was read last
         self._went_on = False
 
     @property
     def goes_on(self) -> bool:
         """Whether a fit is writing the run; a finished run has scores."""
-        return is_written(self.files.root) and not self.files.metrics.exists()
-
-    @property
-    def over(self) -> bool:
-        """Whether the viewer ends, because the fit has ended."""
-        return self._with_fit and not self.goes_on
+        try:
+            require_free(self.files.root)
+        except UserError:
+            return not self.files.metrics.exists()
+        return False
 
     def first(self, say: Callable[[str], None]) -> Run:
         """Return the run as soon as it can be shown; `say` receives a message if it must wait.

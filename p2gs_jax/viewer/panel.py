@@ -63,9 +63,10 @@ class Panel:
         start = common_settings(run)
         self._taken_as: int | None = start.taken_as
         self._status = gui.add_html(note("starting ..."))
-        # A sentence on the fit and charts, if it goes on.
-        self._training = gui.add_html("", visible=False)
-        self._charts: list[viser.GuiUplotHandle] = []
+        self._training = gui.add_folder("Training", visible=False)
+        with self._training:  # a sentence and charts
+            self._progress = gui.add_html("")
+            self._charts = [self._chart(*words) for words in CHARTS.items()]
         with gui.add_folder("Picture"):
             self._add_picture()
         with gui.add_folder("Camera"):
@@ -202,11 +203,8 @@ class Panel:
 
     def show_training(self, log: list[dict[str, Any]]) -> None:
         """Show the last of the records of a fit, their losses, and the exposures."""
-        self._training.content = note(LogRecord(**log[-1]).summary())
-        if not self._charts:
-            self._training.visible = True
-            with self._gui.add_folder("Training", order=self._training.order):
-                self._charts = [self._chart(*words) for words in CHARTS.items()]
+        self._training.visible = True
+        self._progress.content = note(LogRecord(**log[-1]).summary())
         rows = evenly_spaced(len(log), MOST_RECORDS)
         losses = [(log[row]["step"], log[row]["loss"]) for row in rows]
         evs = list(exposures_ev(self._viewed.run).items())

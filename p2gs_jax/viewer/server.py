@@ -190,8 +190,7 @@ def open_viewer(
         )
     sessions: dict[int, BrowserSession] = {}
     ended = threading.Event()
-    arguments = (follower, viewed, sessions, ended)
-    following = threading.Thread(target=_follow, args=arguments, name="follow", daemon=True)
+    following = threading.Thread(target=_follow, args=(follower, viewed, sessions, ended))
     try:
         if port not in (0, server.get_port()):
             raise UserError(f"port {port} has become busy.", fix="choose another with --port")
@@ -277,13 +276,14 @@ def serve(
     Raises a UserError if no server can listen on `host` and `port`.
     """
     with open_viewer(run, follower=follower, **place) as address:
-        alone = is_loopback(place["host"])
-        who = "only this machine" if alone else "any machine with this address"
+        who = "only this machine" if is_loopback(place["host"]) else "any machine with this address"
         what = "Watch the fit" if follower else f"{run.params.gaussians.capacity} Gaussians"
         with contextlib.suppress(KeyboardInterrupt), interrupts.held() as asked:
             # Signals are recorded, not raised: Python drops exceptions during garbage collection.
             asked.begin()
             say(f"{what} at {address} (open to {who}; Ctrl-C ends)")
-            while asked.arrived is None and not (follower and follower.over):
+            while asked.arrived is None:
+                if follower is not None and follower.with_fit and not follower.goes_on:
+                    break
                 time.sleep(0.1)
         say("The viewer stops after the compilation in progress.")

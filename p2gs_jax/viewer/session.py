@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import threading
 import time
-from typing import Any
 
 import numpy as np
 import viser
 
-from p2gs_jax.run.read import Run
 from p2gs_jax.viewer.camera import Frusta, Pose, browser_view
 from p2gs_jax.viewer.live import Darkroom, LivePicture, report
 from p2gs_jax.viewer.panel import Panel
@@ -38,11 +36,7 @@ class BrowserSession:
         """Stop the thread after the browser has disconnected."""
         self._live.stop()
 
-    @property
-    def _run(self) -> Run:
-        return self._viewed.run
-
-    def follow(self, log: list[dict[str, Any]], *, newer: bool) -> None:
+    def follow(self, log: list[dict], *, newer: bool) -> None:
         """Show the log of the fit, and a `newer` state of the run at the same place."""
         self._panel.show_training(log)
         if newer:
@@ -75,7 +69,7 @@ class BrowserSession:
 
     def take_display_of(self, index: int | None) -> None:
         """Set the display transform to that of a view, or to the mean (None)."""
-        now, run = self._panel.settings(), self._run
+        now, run = self._panel.settings(), self._viewed.run
         new = common_settings(run, now) if index is None else settings_of_view(run, index, now)
         self._panel.put(new)
         self.display_changed()
@@ -99,8 +93,8 @@ class BrowserSession:
             frusta.show(visible)
 
     def _add_frusta(self) -> Frusta:
-        viewed, views = self._viewed, self._run.scene.views
-        evs = exposures_ev(self._run)
+        viewed, views = self._viewed, self._viewed.run.scene.views
+        evs = exposures_ev(self._viewed.run)
         colors = exposure_colors([evs.get(row) for row in range(len(views))])
         frusta = Frusta(self._client, views, colors, viewed.space, self.go_to)
         frusta.keep_clear(self._client.camera.position)
@@ -116,11 +110,13 @@ class BrowserSession:
         try:
             frame = self._viewed.renderer.render_now(self._live.camera(view, size))
             if kind == "exr":
-                content = exr_bytes(frame, display_of(self._run, settings).without_place())
+                content = exr_bytes(frame, display_of(self._viewed.run, settings).without_place())
             else:
                 darkroom = Darkroom(self._viewed, self._live.darkroom.depth_limits)
                 content = png_bytes(darkroom.develop(frame, settings))
-            name = f"{self._run.folder.resolve().name}_{time.strftime('%Y%m%d_%H%M%S')}.{kind}"
+            name = (
+                f"{self._viewed.run.folder.resolve().name}_{time.strftime('%Y%m%d_%H%M%S')}.{kind}"
+            )
             self._client.send_file_download(name, content, save_immediately=True)
         except Exception as error:
             report(self._client, "Saving failed", error)

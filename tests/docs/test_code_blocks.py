@@ -5,6 +5,7 @@
 lie `scene` and `street`, a tiny scene, and `RUN` and `runs/street`, a finished run of it.
 """
 
+import base64
 import contextlib
 import dataclasses
 import io
@@ -13,6 +14,9 @@ import re
 import shutil
 import tomllib
 
+import cv2
+import matplotlib
+import numpy as np
 import pytest
 from pages import LANGUAGES, PAGES, ROOT, blocks, commands, prose
 from tiny_scene import make_scene
@@ -84,6 +88,35 @@ def test_python_runs(page, place, quick_presets):
         if block.page == page:
             padded = "\n" * (block.line - 1) + block.code  # so that tracebacks name the page's line
             exec(compile(padded, block.page, "exec"), namespace)
+
+
+@pytest.mark.slow  # a whole fit, and the programs of its export
+@pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.ipynb")), ids=lambda p: p.name)
+def test_notebooks_run_and_are_stored_without_outputs(path, place, quick_presets):
+    """Code cells follow each other in one namespace; lines after `!` are commands."""
+    matplotlib.use("Agg")
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    namespace = {"__name__": "__main__", "command": run_of_notebook}
+    for number, cell in enumerate(c for c in cells if c["cell_type"] == "code"):
+        assert not cell["outputs"]
+        assert cell["execution_count"] is None
+        code = "".join(cell["source"]).replace('"train.budget_s": 120.0', '"train.steps": 10')
+        code = re.sub(r"^!p2gs-jax (.*)$", r'command("\1")', code, flags=re.M)
+        exec(compile(code, f"{path.name}, code cell {number}", "exec"), namespace)
+    assert (place / "runs/scene/exports").is_dir()
+    solved, run = namespace["solved"], namespace["run"]
+    psnr = namespace["result"].metrics["test"]["exposure_fitted"]["psnr"]
+    for shown, number in ((solved, f"{solved.observations:,}"), (run, f"{psnr:.2f} dB")):
+        html = shown._repr_html_()
+        assert number in html
+        data = base64.b64decode(re.search(r'src="data:image/png;base64,([^"]+)"', html)[1])
+        assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).std() > 10
+
+
+def run_of_notebook(words):
+    with pytest.raises(SystemExit) as stop:
+        main(words.split())
+    assert stop.value.code == 0, words
 
 
 @named(of("sh"))

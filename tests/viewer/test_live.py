@@ -14,6 +14,7 @@ pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 import viser
 from viewer_stubs import CANVAS, SIZES, Client, FakeRenderer, Panel
 
+from p2gs_jax.core.atomic import read_jsonl
 from p2gs_jax.errors import UserError
 from p2gs_jax.run.read import load_run
 from p2gs_jax.scene.pixels.store import camera_of
@@ -317,6 +318,13 @@ def test_the_panel_holds_what_it_is_set_to(viewed, run):
         panel.set_legend("legend")
         assert panel.settings() == replace(wanted, exposure_ev=pytest.approx(wanted.exposure_ev))
         assert not panel.locked.value
+        last = read_jsonl(run.folder / "log.jsonl")[-1]
+        panel.show_training([last | {"step": k, "loss": 1 / k} for k in range(1, 2001)])
+        assert "step 2000 of 2000, loss 0.0005" in panel._progress.content
+        loss, exposures = (chart.data for chart in panel._charts)
+        assert (loss[0][0], loss[0][-1], loss[1][-1]) == (1, 2000, 1 / 2000)
+        assert len(loss[0]) <= panels.MOST_RECORDS
+        assert dict(zip(*exposures, strict=True)) == pytest.approx(exposures_ev(run))
     finally:
         server.stop()
     assert not actions.method_calls  # these are a person's alone
