@@ -263,7 +263,7 @@ def ablations() -> dict[str, FitConfig]:
     """Return robust and the printed method, each without one part at a time."""
     robust, paper = preset("robust"), preset("paper")
     given = with_fields(robust, LEARNED)
-    learned = without_tracks(Decisions.as_asked(given)).resolve(given)
+    learned = without_tracks(Decisions.as_given(given)).resolve(given)
     reg = "loss.regularizers."
     no_gauge = {f"{reg}log_exposure_mean": None, f"{reg}gamma_mean_variance": None}
     on_photographs = {

@@ -74,8 +74,8 @@ class DataConfig:
     pairs of up to 60 photographs, and a sequence for videos and larger sets."""
     lidar: bool = True
     """Use the LiDAR of a drive for seeds and depth errors; otherwise photographs give the seeds."""
-    own_car: bool = True
-    """Leave out the pixels that show the recording car itself."""
+    ego_mask: bool = True
+    """Leave out the pixels that show the car with the cameras."""
     allow_missing: bool = False
     """Skip frames whose image file is missing; otherwise the command stops."""
     cache_mb: int = 2048
@@ -274,7 +274,7 @@ class OptimizerConfig:
     """Fraction to which the rates of exposure and gamma decay exponentially (ours)."""
     final: float = 0.1
     """Fraction to which all other rates decay exponentially (3DGS: no decay; ours: BUILD_NOTES)."""
-    settled: float | None = 600.0
+    full_rate_updates: float | None = 600.0
     """Number of updates n0 of a Gaussian after which its rates, except those of colours, shrink by
     sqrt(n0 / updates); None: never (ours: BUILD_NOTES, "Length")."""
     extent: Literal["cameras", "near"] = "near"

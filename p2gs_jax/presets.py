@@ -48,7 +48,7 @@ PUBLISHED: Fields = {
     "optimizer.opacities": 5e-2,
     "optimizer.quats": 1e-3,
     "optimizer.final": 1.0,
-    "optimizer.settled": None,
+    "optimizer.full_rate_updates": None,
     "optimizer.exposures": 1e-2,
     "optimizer.gammas": 1e-2,
     "optimizer.photometry_final": 1.0,

@@ -324,7 +324,7 @@ class View:
     time: float | None = None  # seconds on the clock of `Scene.objects` and `Scene.lidar`, or None
     # pixels that show the car with the camera, at any resolution; the same for all photographs of
     # a camera; None: no such pixels are known
-    own_car: Bool[np.ndarray, "a b"] | None = None
+    ego_mask: Bool[np.ndarray, "a b"] | None = None
     alpha: AlphaUse = "mask"  # meaning of its alpha channel, if it has one (`DataConfig.alpha`)
 
 

@@ -77,7 +77,7 @@ def _swept(found: Recording) -> int:
     """
     for sweep in found.sweeps:
         sweep.read()
-    scene = assemble(found, DataConfig(own_car=False, allow_missing=True), write_embedded=False)
+    scene = assemble(found, DataConfig(ego_mask=False, allow_missing=True), write_embedded=False)
     measured = () if scene.lidar is None else (scene.lidar.points, scene.lidar.times)
     poses = [view.viewmat for view in scene.views] + [o.poses for o in scene.objects]
     return 0 if _finite(scene.points, *measured, *poses) else _nonsense("poses or points")

@@ -299,7 +299,7 @@ def _cameras(found: Survey):
         "focal length, px": ["" if c.focal is None else f"{c.focal:.0f}" for c in found.cameras],
         "lens": [c.lens for c in found.cameras],
         "EXIF, EV": [f"{c.ev[0]:.1f} to {c.ev[1]:.1f}" if c.ev else "" for c in found.cameras],
-        "own car": ["" if c.own_car is None else f"{c.own_car:.1%}" for c in found.cameras],
+        "ego mask": ["" if c.ego_mask is None else f"{c.ego_mask:.1%}" for c in found.cameras],
     }
     shown = {name: cells for name, cells in columns.items() if any(cells)}
     return make_table(tuple(shown), zip(*shown.values(), strict=True), plain=True)

@@ -53,6 +53,8 @@ RENAMED = {
     "--path": "--trajectory",
     "--known-deviation-ev": "--exposure-sigma",
     "--max-parallel": "--jobs",
+    "--data.own-car": "--data.ego-mask",
+    "--data.no-own-car": "--data.no-ego-mask",
 }
 SCENE = "the scene's folder itself, without an option"
 # Our names for commands and options of 3DGS, gsplat and nerfstudio.

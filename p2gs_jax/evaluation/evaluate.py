@@ -77,13 +77,13 @@ class Judge:
         )
         self.small: Params = jax.tree.map(np.asarray, without)
         self.mean = display.mean_parameters(self.small.photometry)
-        self.taken_by = [view.camera for view in scene.training_views]
+        self.cameras = [view.camera for view in scene.training_views]
         self.row_of = {index: row for row, index in enumerate(scene.train_indices)}
 
     def usual(self, index: int | None) -> display.DisplayTransform:
         """Return the display transform of a view by mean parameters; None: without a camera."""
         camera = None if index is None else self.scene.views[index].camera
-        shown = display.usual_display(self.small, self.taken_by, camera, self.cfg.photometry)
+        shown = display.usual_display(self.small, self.cameras, camera, self.cfg.photometry)
         return self.over(shown)
 
     def over(self, transform: display.DisplayTransform) -> display.DisplayTransform:

@@ -213,7 +213,7 @@ def tells_exposure(
     return bool(tells.mean() >= FEWEST_TELLING)
 
 
-def untold_notes(metrics: dict[str, Any]) -> list[str]:
+def notes_on_missing(metrics: dict[str, Any]) -> list[str]:
     """Return notes on views without scores or exposures, from the metrics of an evaluation."""
     out = []
     if hidden := metrics.get("hidden"):

@@ -168,7 +168,7 @@ def _notes(problem: Problem, *, free: bool = True) -> tuple[str, ...]:
     if problem.known is None:
         return ()
     head = f"The exposures of {np.isfinite(problem.known.log_exposures).sum()} view(s) are known"
-    if not problem.told.size:
+    if not problem.with_known_power.size:
         return (f"{head}: they fix the scale. Two different ones would fix the curve's power.",)
     if free:
         return (f"{head}, and fix the tone curve's power, which photographs do not determine.",)
@@ -215,7 +215,7 @@ def _chosen(
     """Choose model and curve on held-out observations, and solve them on all observations."""
     seed, problem = options.seed, options.problem(observations)
     # Known exposures that fix only the scale do not distinguish models and curves.
-    used = options if problem.told.size else dataclasses.replace(options, known=None)
+    used = options if problem.with_known_power.size else dataclasses.replace(options, known=None)
     small = used.problem(_subset(observations, seed, MOST_OBSERVATIONS))
     held = held_out(small.observations, seed)
     training = used.problem(_subset(small.observations.picked(~held), seed, SPLINE_OBSERVATIONS))

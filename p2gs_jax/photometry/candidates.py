@@ -128,7 +128,7 @@ class Search:
             shaded = self._solve(Choice(EXPOSURES._replace(vignetting="camera")), Response())
             curves, self._spread = light_spread(shaded) / LN2 >= SHADED_SPREAD_EV, None
         cameras = int(o.cameras.max(initial=0)) + 1
-        self._scope = Scope(cameras, places, curves, known, problem.told.size > 0)
+        self._scope = Scope(cameras, places, curves, known, problem.with_known_power.size > 0)
         if not self._scope.allows(Choice(EXPOSURES)):
             self.fits.clear()
 

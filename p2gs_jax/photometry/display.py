@@ -199,19 +199,19 @@ def mean_parameters(photometry: Photometry) -> MeanParameters:
 
 
 def usual_display(
-    params: Params, taken_by: Sequence[str], camera: str | None, cfg: PhotometryConfig
+    params: Params, cameras: Sequence[str], camera: str | None, cfg: PhotometryConfig
 ) -> DisplayTransform:
     """Return the transform of a view that was not fitted, of a camera or (None) of no camera.
 
     Its exposure is the geometric mean over the training views, its gamma and its correction are
     arithmetic means. Its white balance is the mean over all training views, or over those of its
     camera if it varies by camera only. Its vignetting and its response, also those of a correction,
-    are its camera's. `taken_by` is the camera of every training view.
+    are its camera's. `cameras` is the camera of every training view.
     """
     photometry: Photometry = jax.tree.map(np.asarray, params.photometry)
     mean = mean_parameters(photometry)
     balance = mean.white_balance
-    rows_of_camera = np.array([name == camera for name in taken_by], bool)
+    rows_of_camera = np.array([name == camera for name in cameras], bool)
     if cfg.white_balance == "camera" and rows_of_camera.any():
         balance = _mean_balance(photometry, rows_of_camera)
     correction = mean_correction(params.appearance, camera)

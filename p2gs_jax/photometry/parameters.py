@@ -24,10 +24,10 @@ LEAST_EXPOSURE = 0.1  # lower bound of random exposures
 
 
 def initial_photometry(
-    solution: PhotometricSolution | None, taken_by: Sequence[str], cfg: FitConfig
+    solution: PhotometricSolution | None, cameras: Sequence[str], cfg: FitConfig
 ) -> Photometry:
     """Return initial parameters: a solution, or random exposures (paper), or exposures of 1."""
-    count = len(taken_by)
+    count = len(cameras)
     p = cfg.photometry
     if solution is not None:
         log_exposures = np.asarray(solution.log_exposures)
@@ -44,7 +44,7 @@ def initial_photometry(
     balance = None
     if p.white_balance is not None:
         balance = on_device(np.zeros((count, 3)) if solution is None else solution.white_balance)
-    rows = camera_rows(taken_by, p)
+    rows = camera_rows(cameras, p)
     return Photometry(on_device(exposures), on_device(gammas), p.parameterization, balance, rows)
 
 

@@ -17,7 +17,7 @@ from p2gs_jax.core.runtime import return_freed_memory
 from p2gs_jax.evaluation.evaluate import Evaluation, evaluate
 from p2gs_jax.evaluation.lpips import LpipsWeights
 from p2gs_jax.evaluation.references import Reference, find_radiance
-from p2gs_jax.evaluation.scores import ViewResult, is_drive, untold_notes
+from p2gs_jax.evaluation.scores import ViewResult, is_drive, notes_on_missing
 from p2gs_jax.photometry.calibrate import Selection
 from p2gs_jax.photometry.models import MODELS
 from p2gs_jax.render.capacity import make_renderer
@@ -51,12 +51,12 @@ def finish(
     truth: Reference | None = None,
     lpips_weights: LpipsWeights | None = None,
     true_exposures: Mapping[str, float] | None = None,
-    still_ours: Callable[[], None] = lambda: None,
+    check_lock: Callable[[], None] = lambda: None,
 ) -> dict:
     """Evaluate the fit, write all results, and return the content of `metrics.json`.
 
     `params` holds live Gaussians only, `owner` the moving object of each, and `cfg` the options of
-    the fit. `still_ours` raises an error if another run has taken over the folder.
+    the fit. `check_lock` raises an error if another run has taken over the folder.
     """
     return_freed_memory()
     watch, exposures = Stopwatch(), {}
@@ -95,7 +95,7 @@ def finish(
             psnrs=_psnrs(found.metrics),
         )
     metrics = found.metrics | _accounted(account, watch, scene, cfg, reporter, found)
-    still_ours()
+    check_lock()
     write_json(folder.metrics, metrics)
     return metrics
 
@@ -156,7 +156,10 @@ def _accounted(
     }
     metered = found.metering.sentence if found.metering.telling else None
     late = over_budget(cfg.train.budget_s, seconds)
-    notes = [*untold_notes(found.metrics), *(note for note in (metered, late) if note is not None)]
+    notes = [
+        *notes_on_missing(found.metrics),
+        *(note for note in (metered, late) if note is not None),
+    ]
     account.notes.extend(notes)
     for note in notes:
         reporter.message(note)

@@ -125,7 +125,7 @@ def fit(
         account = account_of(start, params, result, clock, begin)
         results = (params, start.scene, start.survey.store, start.cfg, folder, account, reporter)
         known = {"truth": truth, "lpips_weights": weights, "true_exposures": true_exposures}
-        metrics = finish(*results, owner=owner, still_ours=lock.require, **known)
+        metrics = finish(*results, owner=owner, check_lock=lock.require, **known)
         folder.remove_snapshot()
     return FitResult(params, scene, metrics, paths.run, start.selection, start.decisions)
 

@@ -53,7 +53,7 @@ class Decisions:
     near: float | None = None
 
     @classmethod
-    def as_asked(cls, cfg: config.FitConfig) -> Decisions:
+    def as_given(cls, cfg: config.FitConfig) -> Decisions:
         """Return the values of the options, before a scene is known."""
         return cls(**{name: attrgetter(place)(cfg) for name, place in _PLACES.items()})
 
@@ -140,7 +140,7 @@ def decide(cfg: config.FitConfig, selection: Selection | None, kept: Decisions |
 
     A resumed run keeps vignetting and responses of its checkpoints (`kept`) bit for bit.
     """
-    decided = Decisions.as_asked(cfg)
+    decided = Decisions.as_given(cfg)
     if selection is None:
         decided = unsolved(decided)
         return without_tracks(decided) if cfg.photometry.start == "tracks" else decided
@@ -172,7 +172,7 @@ def likely(cfg: config.FitConfig, kept: Decisions | None, near: float | None) ->
     solved = p.start == "tracks" and (p.vignetting is not None or p.responses != "all")
     if kept is None and not p.select and solved:
         return None
-    decided = dataclasses.replace(Decisions.as_asked(cfg), near=near)
+    decided = dataclasses.replace(Decisions.as_given(cfg), near=near)
     if kept is not None:
         chosen = ("model", "curve", "spline", "white_balance", "vignetting", "responses", "cameras")
         return dataclasses.replace(decided, **{name: getattr(kept, name) for name in chosen})

@@ -251,7 +251,7 @@ def write_metering(path: Path, metering: Metering) -> None:
     write_json(
         path,
         {
-            "said": metering.sentence,
+            "sentence": metering.sentence,
             "rule": _rule_in_file(metering.rule),
             "candidates": [_rule_in_file(rule) for rule in metering.candidates],
             "white": metering.white,

@@ -235,8 +235,8 @@ class Run:
         return balance
 
     def _usual(self, camera: str | None) -> display.DisplayTransform:
-        taken_by = [view.camera for view in self.scene.training_views]
-        usual = display.usual_display(self.params, taken_by, camera, self.cfg.photometry)
+        cameras = [view.camera for view in self.scene.training_views]
+        usual = display.usual_display(self.params, cameras, camera, self.cfg.photometry)
         return replace(usual, backdrop=self.store.backdrop_values)
 
     @cached_property

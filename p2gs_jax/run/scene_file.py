@@ -35,12 +35,12 @@ _OF_OBJECTS = ("name", "label", "size", "moving")
 def write_scene(folder: Path, scene: Scene) -> None:
     """Write the scene of a run into its folder."""
     base = _base(scene.root)
-    own_cars = {v.camera: v.own_car for v in scene.views if v.own_car is not None}
+    ego_masks = {v.camera: v.ego_mask for v in scene.views if v.ego_mask is not None}
     table = {
         **{name: getattr(scene, name) for name in _OF_SCENES},
         "views": [_view_row(view, folder, base) for view in scene.views],
         "objects": [{name: getattr(o, name) for name in _OF_OBJECTS} for o in scene.objects],
-        "own_cars": list(own_cars),
+        "ego_masks": list(ego_masks),
     }
     arrays = {
         "viewmats": np.stack([v.viewmat for v in scene.views]),
@@ -50,8 +50,8 @@ def write_scene(folder: Path, scene: Scene) -> None:
     }
     if scene.point_colors is not None:
         arrays["point_colors"] = scene.point_colors
-    for row, mask in enumerate(own_cars.values()):
-        arrays[f"own_car_{row}"] = mask
+    for row, mask in enumerate(ego_masks.values()):
+        arrays[f"ego_mask_{row}"] = mask
     for row, thing in enumerate(scene.objects):
         arrays[f"object_{row}_times"], arrays[f"object_{row}_poses"] = thing.times, thing.poses
     if scene.lidar is not None:
@@ -98,7 +98,7 @@ def read_scene(folder: Path, root: Path) -> Scene:
 
 def _scene_from(a: Mapping[str, np.ndarray], table: dict, folder: Path, root: Path) -> Scene:
     base = _base(root)
-    own_cars = {camera: a[f"own_car_{k}"] for k, camera in enumerate(table["own_cars"])}
+    ego_masks = {camera: a[f"ego_mask_{k}"] for k, camera in enumerate(table["ego_masks"])}
     views = tuple(
         View(
             **{name: v[name] for name in _OF_VIEWS},
@@ -111,7 +111,7 @@ def _scene_from(a: Mapping[str, np.ndarray], table: dict, folder: Path, root: Pa
             if v["distortion"] is None
             else Distortion(tuple(v["distortion"]), v["lens"]),
             mask_path=None if v["mask"] is None else base / v["mask"],
-            own_car=own_cars.get(v["camera"]),
+            ego_mask=ego_masks.get(v["camera"]),
         )
         for i, v in enumerate(table["views"])
     )

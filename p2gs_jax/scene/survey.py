@@ -30,7 +30,7 @@ MOST_LABELS = 8
 class SurveyedCamera:
     """One physical camera, or photographs of one size if their cameras are unknown.
 
-    Sizes and focal lengths are in pixels. `own_car` is the share of the picture that shows the car,
+    Sizes and focal lengths are in pixels. `ego_mask` is the share of the picture that it covers,
     `ev` the range of log2(time ISO / N^2) in stops.
     """
 
@@ -39,7 +39,7 @@ class SurveyedCamera:
     size: tuple[int, int]
     focal: float | None = None
     lens: str = ""
-    own_car: float | None = None
+    ego_mask: float | None = None
     ev: tuple[float, float] | None = None
 
 
@@ -95,7 +95,7 @@ def _by_camera(scene: Scene) -> dict[str, list[View]]:
 def _camera(name: str, views: Sequence[View]) -> SurveyedCamera:
     view, ev = views[0], _range([v.exif_ev for v in views])
     lens = "" if view.distortion is None else view.distortion.model
-    car_share = None if view.own_car is None else float(view.own_car.mean())
+    car_share = None if view.ego_mask is None else float(view.ego_mask.mean())
     size = (view.width, view.height)
     return SurveyedCamera(name, len(views), size, float(view.K[0, 0]), lens, car_share, ev)
 

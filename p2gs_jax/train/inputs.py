@@ -212,7 +212,7 @@ def controls_at(progress: float, per_step: float, visible_share: float, cfg: Fit
     shows.
     """
     degree = schedule.sh_degree_at(progress, cfg.train, cfg.render.sh_degree)
-    rate = schedule.rate_factor(per_step, visible_share, cfg.optimizer.settled)
+    rate = schedule.rate_factor(per_step, visible_share, cfg.optimizer.full_rate_updates)
     values = (np.float32(progress), np.int32(degree), np.float32(rate))
     return on_host(Controls, *values, device_seed(cfg.train.seed))
 

@@ -75,7 +75,7 @@ class Darkroom:
             depth_limits=self.depth_limits,
             photograph=self._photograph_of(frame) if settings.mode == "split" else None,
             split=settings.split,
-            taken_by=None if taken_as is None else camera_of(self._viewed.store, taken_as),
+            vignetting_camera=None if taken_as is None else camera_of(self._viewed.store, taken_as),
         )
 
     def _photograph_of(self, frame: pictures.RenderedFrame) -> pictures.WarpedPhotograph | None:

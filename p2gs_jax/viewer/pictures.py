@@ -62,7 +62,7 @@ def picture_of(
     depth_limits: tuple[float, float] | None = None,
     photograph: WarpedPhotograph | None = None,
     split: float = 0.5,
-    taken_by: Camera | None = None,
+    vignetting_camera: Camera | None = None,
 ) -> Float32[np.ndarray, "h w 3"]:
     """Return display values of a frame in one of the modes.
 
@@ -71,29 +71,29 @@ def picture_of(
             a photograph equals `display`.
         depth_limits: ends of the colour scale, scene units; None uses those of the frame.
         split: visible share of the photograph's width, from the left.
-        taken_by: the camera of the transform's vignetting; None uses that of the frame.
+        vignetting_camera: the camera of the transform's vignetting; None uses that of the frame.
     """
     if mode == "stops":
         return false_color(np.asarray(frame.linear), MIDDLE_GREY / transform.exposure)
     if mode == "depth":
         return depth_color(frame.depth, frame.alpha, depth_limits or limits_of_depth(frame))
     positions = None
-    if taken_by is not None and transform.vignetting:
-        positions = places_in(taken_by, frame.camera)
+    if vignetting_camera is not None and transform.vignetting:
+        positions = places_in(vignetting_camera, frame.camera)
     ldr = develop(frame.linear, transform, positions, frame.alpha)
     return ldr if mode == "display" or photograph is None else split_picture(photograph, ldr, split)
 
 
-def places_in(taken_by: Camera, frame: Camera) -> Float32[np.ndarray, "h w 2"]:
+def places_in(vignetting_camera: Camera, frame: Camera) -> Float32[np.ndarray, "h w 2"]:
     """Return the positions of the frame's pixels in an image of a photograph's camera, [-1, 1].
 
     Positions outside of that image are moved to the radius of its corners, where vignetting ends.
     """
-    K, k = np.asarray(taken_by.K, float), np.asarray(frame.K, float)
+    K, k = np.asarray(vignetting_camera.K, float), np.asarray(frame.K, float)
     x, y = ((np.arange(n) + 0.5) for n in (frame.width, frame.height))
     u = (x - k[0, 2]) / k[0, 0] * K[0, 0] + K[0, 2]
     v = (y - k[1, 2]) / k[1, 1] * K[1, 1] + K[1, 2]
-    at = places(np.stack(np.meshgrid(u, v), -1), taken_by.width, taken_by.height)
+    at = places(np.stack(np.meshgrid(u, v), -1), vignetting_camera.width, vignetting_camera.height)
     return (at / np.maximum(np.linalg.norm(at, axis=-1, keepdims=True), 1)).astype(np.float32)
 
 
@@ -131,7 +131,7 @@ def limits_of_depth(frame: RenderedFrame) -> tuple[float, float]:
 def warp_photograph(
     ldr: Float32[np.ndarray, "h w 3"],
     mask: Float32[np.ndarray, "h w"],
-    taken_by: Camera,
+    vignetting_camera: Camera,
     frame: Camera,
 ) -> WarpedPhotograph:
     """Return a photograph resampled to the pixels of another camera at the same position.
@@ -139,8 +139,11 @@ def warp_photograph(
     Images of cameras with a common centre are related by a homography. The mask is 1 where the
     photograph counts.
     """
-    turn = np.asarray(taken_by.viewmat, float)[:3, :3] @ np.asarray(frame.viewmat, float)[:3, :3].T
-    K, k = np.asarray(taken_by.K, float), np.asarray(frame.K, float)
+    turn = (
+        np.asarray(vignetting_camera.viewmat, float)[:3, :3]
+        @ np.asarray(frame.viewmat, float)[:3, :3].T
+    )
+    K, k = np.asarray(vignetting_camera.K, float), np.asarray(frame.K, float)
     # OpenCV's first pixel centre is at 0, ours at 0.5.
     half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
     pull = np.linalg.inv(half) @ K @ turn @ np.linalg.inv(k) @ half
@@ -148,10 +151,15 @@ def warp_photograph(
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     shrink = _minification(pull, size)
     if shrink > 1.0:
-        small = (max(1, round(taken_by.width / shrink)), max(1, round(taken_by.height / shrink)))
+        small = (
+            max(1, round(vignetting_camera.width / shrink)),
+            max(1, round(vignetting_camera.height / shrink)),
+        )
         ldr = cv2.resize(ldr, small, interpolation=cv2.INTER_AREA)
         mask = cv2.resize(mask, small, interpolation=cv2.INTER_AREA)
-        scale = np.diag([small[0] / taken_by.width, small[1] / taken_by.height, 1.0])
+        scale = np.diag(
+            [small[0] / vignetting_camera.width, small[1] / vignetting_camera.height, 1.0]
+        )
         pull = np.linalg.inv(half) @ scale @ half @ pull
     pixels = cv2.warpPerspective(ldr, pull, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
     inside = cv2.warpPerspective(mask, pull, size, flags=flags) > 0.5

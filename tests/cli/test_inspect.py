@@ -16,7 +16,7 @@ def test_a_drive_is_counted(tmp_path, succeeded, monkeypatch):
     drive.photographs[3].path.unlink()
     monkeypatch.setattr(surveys, "find_scene", lambda *args: drive)
     monkeypatch.setenv("COLUMNS", "140")
-    said = succeeded("inspect", drive.root, "--data.no-own-car")
+    said = succeeded("inspect", drive.root, "--data.no-ego-mask")
     for text in (
         "31 photographs of 4 cameras.",
         "8 frames, 0.7 s, 7.0 m driven.",
@@ -31,7 +31,7 @@ def test_a_drive_is_counted(tmp_path, succeeded, monkeypatch):
     said = " ".join(said.split())
     assert "3 photographs of 1 camera. " in said
     assert " 4 frames, " in said
-    assert "own car: not seen by front" in said
+    assert "ego mask: not seen by front" in said
 
 
 def test_other_scenes_are_counted(tmp_path, succeeded):

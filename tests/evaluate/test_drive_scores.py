@@ -28,7 +28,7 @@ UP = np.array([0.0, 0.0, 1.0])
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     """A drive between two walls; frames 0 and 4 are held out."""
-    scene = assemble(make_recording(tmp_path_factory.mktemp("drive")), DataConfig(own_car=False))
+    scene = assemble(make_recording(tmp_path_factory.mktemp("drive")), DataConfig(ego_mask=False))
     return dataclasses.replace(scene, views=assign_split(scene.views, 4))
 
 

@@ -18,7 +18,7 @@ from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.core.threads import MOST_WORKERS, map_in_order
 from p2gs_jax.evaluation.evaluate import evaluate
 from p2gs_jax.evaluation.lpips import lpips
-from p2gs_jax.evaluation.scores import psnr, tells_exposure, untold_notes
+from p2gs_jax.evaluation.scores import notes_on_missing, psnr, tells_exposure
 from p2gs_jax.run.read import load_run
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Params, Photometry, Render
@@ -120,12 +120,12 @@ def test_black_and_saturated_photographs_tell_no_exposure_but_a_few_pixels_are_e
 
 def test_the_notes_name_the_first_views():
     names = [f"{k}.png" for k in range(10)]
-    hidden, unknown = untold_notes({"hidden": ["a.png"], "exposures_unknown": names})
+    hidden, unknown = notes_on_missing({"hidden": ["a.png"], "exposures_unknown": names})
     assert "1 view(s) are completely hidden" in hidden
     assert "(a.png)" in hidden
     assert "10 photograph(s)" in unknown
     assert "4.png, ...)" in unknown
-    assert untold_notes({"train": {}}) == []
+    assert notes_on_missing({"train": {}}) == []
 
 
 def test_hidden_views_are_left_out_of_the_scores(tmp_path, finished_run):

@@ -32,7 +32,7 @@ def scene(made_once):
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(drives.FORMATS, "pandaset", drive_format())
         folder = made_once("moving_box", write_photographs)
-        return load_scene(folder, DataConfig(own_car=False, format="pandaset"))
+        return load_scene(folder, DataConfig(ego_mask=False, format="pandaset"))
 
 
 def test_laser_points_of_all_sweeps_meet_in_the_box(scene):

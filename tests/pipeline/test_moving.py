@@ -19,7 +19,7 @@ from p2gs_jax.run.scene_file import read_objects
 from p2gs_jax.scene import drives
 from p2gs_jax.scene.drives.objects import object_mask
 
-FIELDS = {"data.format": "pandaset", "data.own_car": False, "data.frames": "::2"}
+FIELDS = {"data.format": "pandaset", "data.ego_mask": False, "data.frames": "::2"}
 FIELDS |= {"data.test_every": 4, "train.steps": 20, "train.log_every": 5}
 FIELDS |= {"train.coarse_to_fine": (), "train.checkpoint_every_s": 0.0}
 FIELDS |= {"render.sh_degree": 0, "render.pixels_in_flight": 2048}

@@ -75,7 +75,7 @@ def test_a_folder_is_a_runs_once_there_is_something_to_continue(
     tmp_path, scene, refused, monkeypatch, error, said, checkpoint
 ):
     run = tmp_path / "run"
-    start = SimpleNamespace(cfg=FitConfig(), decisions=Decisions.as_asked(FitConfig()))
+    start = SimpleNamespace(cfg=FitConfig(), decisions=Decisions.as_given(FitConfig()))
 
     def fail(*args, **kwargs):
         if checkpoint:
@@ -99,7 +99,7 @@ def test_a_resumed_run_keeps_the_model_and_curve_of_its_checkpoints(tmp_path, sc
     spline = (0.1, *np.random.default_rng(0).normal(size=19).tolist())
     chosen = {"photometry.model": "view_exposure", "photometry.curve": "spline"}
     chosen |= {"photometry.spline": list(spline)}
-    under = Decisions.as_asked(with_fields(FitConfig(), chosen))
+    under = Decisions.as_given(with_fields(FitConfig(), chosen))
     decided = dataclasses.replace(under, reasons=("Chosen: that.",))
     meta = {KEY: decided.to_dict()}
     CheckpointStore(run / "checkpoints").save(3, {"a": np.zeros(2)}, meta)
@@ -195,7 +195,7 @@ def test_a_full_disk_is_exit_2_before_anything_is_fitted(
 
 def test_a_run_may_only_become_longer(tmp_path):
     cfg = with_fields(FitConfig(), {"train.steps": 60, "train.budget_s": 60.0})
-    write_start(RunFolder(tmp_path), tmp_path, None, cfg, Decisions.as_asked(cfg))
+    write_start(RunFolder(tmp_path), tmp_path, None, cfg, Decisions.as_given(cfg))
     for name, value in {"steps": 61, "budget_s": 90.0}.items():
         assert check_run_dir(tmp_path, True, with_fields(cfg, {f"train.{name}": value}))
     # And with other memory.
@@ -205,7 +205,7 @@ def test_a_run_may_only_become_longer(tmp_path):
             check_run_dir(tmp_path, True, with_fields(cfg, {f"train.{name}": value}))
     for before, now in ((60.0, None), (None, 60.0)):
         cfg = with_fields(cfg, {"train.budget_s": before})
-        write_start(RunFolder(tmp_path), tmp_path, None, cfg, Decisions.as_asked(cfg))
+        write_start(RunFolder(tmp_path), tmp_path, None, cfg, Decisions.as_given(cfg))
         with pytest.raises(UserError, match=r"train\.budget_s was"):
             check_run_dir(tmp_path, True, with_fields(cfg, {"train.budget_s": now}))
 

@@ -57,7 +57,7 @@ def test_the_near_plane_follows_scenes_that_it_would_cut(scene, factor):
     assert near == pytest.approx(0.2 * depth, rel=0.1)
     assert len(notes) == 1
     assert f"{near:g} scene units instead of 0.05" in notes[0]
-    decided = dataclasses.replace(Decisions.as_asked(cfg), near=near)
+    decided = dataclasses.replace(Decisions.as_given(cfg), near=near)
     assert decided.resolve(cfg).render.near == near
     assert Decisions.from_dict(decided.to_dict()) == decided
 
@@ -66,7 +66,7 @@ def test_a_near_plane_that_cuts_nothing_stays(scene):
     cfg = with_fields(FitConfig(), {"render.near": 0.5})
     assert near_plane(nearest(scene), cfg) is None
     assert near_plane(None, cfg) is None
-    assert Decisions.as_asked(cfg).resolve(cfg).render.near == 0.5
+    assert Decisions.as_given(cfg).resolve(cfg).render.near == 0.5
 
 
 def test_points_that_no_view_shows_have_no_depth(scene):

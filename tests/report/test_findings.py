@@ -219,7 +219,7 @@ def wall_run(tmp_path_factory):
     points = np.stack([across, up, np.full_like(up, WALL)], -1).reshape(-1, 3).astype(np.float32)
     n = len(points)
     cfg = FitConfig(data=DataConfig(test_every=0), render=RenderConfig(sh_degree=0))
-    decisions = replace(Decisions.as_asked(cfg), model="view_exposure")
+    decisions = replace(Decisions.as_given(cfg), model="view_exposure")
     write_start(RunFolder(run), root, None, cfg, decisions)
     write_scene(run, Scene(root, "colmap", tuple(views), points, np.zeros((n, 3), np.uint8)))
     gaussians = Gaussians(

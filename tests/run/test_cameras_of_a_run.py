@@ -31,7 +31,7 @@ def test_options_and_decisions_survive_json(tmp_path):
     )
     cfg = dataclasses.replace(FitConfig(), photometry=photometry)
     assert from_dict(json.loads(json.dumps(to_dict(cfg)))) == cfg
-    decided = dataclasses.replace(Decisions.as_asked(cfg), responses="channel")
+    decided = dataclasses.replace(Decisions.as_given(cfg), responses="channel")
     saved = json.loads(json.dumps(decided.to_dict()))
     assert Decisions.from_dict(saved) == decided
     found = decided.resolve(FitConfig()).photometry

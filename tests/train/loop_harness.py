@@ -111,7 +111,7 @@ class Harness:
         programs = programs or Programs(self.clock)
         given = (cfg, Views(), 1.0, None, Coverage(400 * 300, 1.0), self.folder, programs)
         told = {"on_message": self.said.append, "now": lambda: self.clock.now}
-        trainer = loop.Trainer(*given, Decisions.as_asked(cfg), **told, store=self.checkpoints)
+        trainer = loop.Trainer(*given, Decisions.as_given(cfg), **told, store=self.checkpoints)
         return trainer.run(params(), np.ones(SEEDS, bool), resume=resume, **options), programs
 
     def log(self):

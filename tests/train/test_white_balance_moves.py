@@ -56,7 +56,7 @@ def test_without_a_solution_only_views_learn():
     assert (decided.white_balance, decided.vignetting) == ("view", None)
     assert likely(cfg, None, None) == decided
     by_camera = with_fields(cfg, {"photometry.white_balance": "camera"})
-    assert unsolved(Decisions.as_asked(by_camera)).white_balance is None
+    assert unsolved(Decisions.as_given(by_camera)).white_balance is None
 
 
 def photographed_by_a_camera(root, views=8):

@@ -189,7 +189,7 @@ class _Blocks:
             truth=truth,
             lpips_weights=weights,
             true_exposures=true_exposures,
-            still_ours=self.lock.require,
+            check_lock=self.lock.require,
         )
         metrics[KEY] = self._summary(seams, counts)
         write_json(self.folder.metrics, metrics)

@@ -335,7 +335,9 @@ def make_system(problem: Problem, form: Form, splines: ResponseKind | None = Non
         3 if form.white_balance == "view" else 1,
         model.gamma is not None,
         Features(camera_count, form.white_balance == "camera", form.vignetting),
-        Splines(splines or "all", spline_count(splines, camera_count), problem.told.size > 0),
+        Splines(
+            splines or "all", spline_count(splines, camera_count), problem.with_known_power.size > 0
+        ),
     )
     of_b, of_a = _directions(model.exposure, cameras), _directions(model.gamma, cameras)
     others = sp.eye_array(unknowns.count - unknowns.at.a.stop)
@@ -348,7 +350,7 @@ def make_system(problem: Problem, form: Form, splines: ResponseKind | None = Non
         log_exposure = np.where(given, known.log_exposures, 0.0)
         precision = given / (max(known.deviation_ev, FIXED_EV) * LN2) ** 2
     of_gammas = np.full(views, 1 / A_PRIOR**2)
-    if model.gamma == "camera" and problem.told.size:
+    if model.gamma == "camera" and problem.with_known_power.size:
         # The prior of a camera counts once, not in each view.
         of_gammas /= np.bincount(cameras)[cameras]
     start = np.repeat(log_exposure[:, None], unknowns.channels, 1)
@@ -393,7 +395,7 @@ def _anchors(problem: Problem, u: Unknowns, log_exposure, precision) -> Held:
             for channel in (0, 2):
                 both = np.concatenate([channel * u.views + members, u.views + members])
                 hold(both, np.repeat([share, -share], len(members)))
-        if label not in problem.told:
+        if label not in problem.with_known_power:
             hold(u.at.a.start + members, share, 1.0)
     if u.features.balance:
         views_of = np.bincount(problem.observations.cameras, minlength=u.features.cameras)

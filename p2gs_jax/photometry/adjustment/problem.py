@@ -77,7 +77,7 @@ class Problem:
         return Layout(self.observations)
 
     @functools.cached_property
-    def told(self) -> Int[np.ndarray, " k"]:
+    def with_known_power(self) -> Int[np.ndarray, " k"]:
         """Labels of components whose known exposures differ, so that their power is no gauge."""
         if self.known is None:
             return np.zeros(0, int)

@@ -270,6 +270,6 @@ def fit_response(
     mean, *each = (tuple(map(float, values)) for values in (splines.mean(0), *splines))
     response = Response(base.base, mean, by, () if by == "all" else tuple(each))
     stretch = (light_spread(fit) + 1e-3) / (spread + 1e-3)
-    if not problem.told.size and not 1 / LARGEST_STRETCH < stretch < LARGEST_STRETCH:
+    if not problem.with_known_power.size and not 1 / LARGEST_STRETCH < stretch < LARGEST_STRETCH:
         return None
     return response if rises(response) else None

@@ -57,7 +57,7 @@ def assemble(
     resized = {c.name for c in recording.cameras if cameras[c.name] is not c}
     notes += files.rescaled(sum(p.camera in resized for p in photographs), "the calibration")
     given = (recording, names, work_dir, report)
-    masks, mask_notes = find_ego_masks(*given) if cfg.own_car else ({}, [])
+    masks, mask_notes = find_ego_masks(*given) if cfg.ego_mask else ({}, [])
     centres = np.stack([p.pose[:3, 3] for p in photographs])
     middle = centres.mean(0)
     origin = np.rint(middle) if np.abs(middle).max() > FARTHEST_ORIGIN else np.zeros(3)
@@ -66,7 +66,7 @@ def assemble(
         dataclasses.replace(
             _view(p, cameras[p.camera], origin),
             image_path=_file_of(p, folder, write_embedded),
-            own_car=masks.get(p.camera),
+            ego_mask=masks.get(p.camera),
         )
         for p in photographs
     ]

@@ -35,7 +35,7 @@ MOST_LOOKED_AT, FEWEST_LOOKED_AT = 24, 6
 TURN_AS_WAY = 10.0
 # The version is part of the key of cached results: raise it whenever results change.
 _VERSION = 2
-_NOTE = "own car"
+_NOTE = "ego mask"
 # All lengths and thresholds in pictures are in pixels at this width (BUILD_NOTES).
 WIDTH = 480
 # Display values below `DARK` are noise; `BLUR` is the blur before gradients, pixels.
@@ -114,7 +114,7 @@ def _cached_mask(
     stamps = [(p.path.name, p.frame, 0 if p.embedded else p.path.stat().st_mtime_ns) for p in shots]
     places = [np.round(p.pose, 6).tolist() for p in shots]
     key = [_VERSION, camera.name, camera.K.tolist(), stamps, places]
-    with cached_folder(work_dir, f"own_car/{camera.name}", key, build) as folder:
+    with cached_folder(work_dir, f"ego_mask/{camera.name}", key, build) as folder:
         if not (folder / "car.png").is_file():
             return None
         picture = cv2.imread(str(folder / "car.png"), cv2.IMREAD_GRAYSCALE)

@@ -118,11 +118,11 @@ def _digest(view: View, bonnets: dict[int, str]) -> str:
     `bonnets` caches the hashes of ego masks, which many views share, by identity.
     """
     bonnet = ""
-    if view.own_car is not None:
-        mask = id(view.own_car)
+    if view.ego_mask is not None:
+        mask = id(view.ego_mask)
         if mask not in bonnets:
-            packed = np.packbits(view.own_car).tobytes()
-            bonnets[mask] = f"{view.own_car.shape} {hashlib.sha256(packed).hexdigest()}"
+            packed = np.packbits(view.ego_mask).tobytes()
+            bonnets[mask] = f"{view.ego_mask.shape} {hashlib.sha256(packed).hexdigest()}"
         bonnet = bonnets[mask]
     lens = None if view.distortion is None else (view.distortion, view.K.tolist())
     files = [path and _fingerprint(path) for path in (view.image_path, view.mask_path)]

@@ -119,9 +119,9 @@ def stored(
         valid = opacity >= _ALPHA_VALID * np.iinfo(opacity.dtype).max
     if view.mask_path is not None:
         valid &= _decode_mask(view)
-    if view.own_car is not None:
+    if view.ego_mask is not None:
         # Every pixel with a masked source is masked: the outline is only approximate.
-        covered = view.own_car.astype(np.float32)
+        covered = view.ego_mask.astype(np.float32)
         valid &= cv2.resize(covered, (view.width, view.height)) == 0
     return pixels, valid, opacity
 

@@ -18,7 +18,7 @@ from p2gs_jax.scene.drives.recording import SweepPoints
 from p2gs_jax.scene.split import assign_split
 from p2gs_jax.types import Lidar
 
-PLAIN = DataConfig(own_car=False)
+PLAIN = DataConfig(ego_mask=False)
 FRAMES = 6
 
 
@@ -70,12 +70,12 @@ def test_laser_points_are_told_apart_by_what_they_lie_on(drive):
 
 
 def test_cameras_and_frames_are_chosen_and_lidar_may_be_left_out(drive):
-    scene = assemble(drive, DataConfig(own_car=False, cameras=("front",), frames="1:5:2"))
+    scene = assemble(drive, DataConfig(ego_mask=False, cameras=("front",), frames="1:5:2"))
     assert [(v.camera, v.frame) for v in scene.views] == [("CAM_FRONT", 1), ("CAM_FRONT", 3)]
     assert set(np.round(scene.lidar.times, 3)) == {0.0, 0.1, 0.2, 0.3, 0.4}
     with refused("no camera 'left'"):
-        assemble(drive, DataConfig(own_car=False, cameras=("left",)))
-    scene = assemble(drive, DataConfig(own_car=False, lidar=False))
+        assemble(drive, DataConfig(ego_mask=False, cameras=("left",)))
+    scene = assemble(drive, DataConfig(ego_mask=False, lidar=False))
     assert scene.lidar is None
     assert not len(scene.points)
     assert any("--data.no-lidar" in note for note in scene.notes)
@@ -117,7 +117,7 @@ def test_missing_photographs_stop_or_are_counted(drive):
     drive.photographs[0].path.unlink()
     with refused(r"1 of the 12 images .*CAM_FRONT/000000.png"):
         assemble(drive, PLAIN)
-    scene = assemble(drive, DataConfig(own_car=False, allow_missing=True))
+    scene = assemble(drive, DataConfig(ego_mask=False, allow_missing=True))
     assert len(scene.views) == 11
     assert any("CAM_FRONT/000000.png" in note for note in scene.notes)
     with refused("no photograph with a pose"):

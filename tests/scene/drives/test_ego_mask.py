@@ -96,10 +96,10 @@ def test_drives_leave_it_out_and_runs_remember(tmp_path, monkeypatch):
     cameras = (CAMERA, dataclasses.replace(CAMERA, name="back"))
     recording = Recording(tmp_path, "pandaset", cameras, tuple(photographs))
     scene = assemble(recording, DataConfig(frames="0:4"), tmp_path / "work")
-    seen, unseen = [note for note in scene.notes if note.startswith("own car")]
+    seen, unseen = [note for note in scene.notes if note.startswith("ego mask")]
     assert "front 1" in seen
-    assert unseen == "own car: not seen by back"
-    assert (tmp_path / "work" / "own_car" / "front" / "car.png").is_file()
+    assert unseen == "ego mask: not seen by back"
+    assert (tmp_path / "work" / "ego_mask" / "front" / "car.png").is_file()
     by_camera = {view.camera: row for row, view in enumerate(scene.views)}
     with_masks = dataclasses.replace(
         scene, points=np.zeros((0, 3), np.float32), point_colors=np.zeros((0, 3), np.uint8)
@@ -117,5 +117,5 @@ def test_drives_leave_it_out_and_runs_remember(tmp_path, monkeypatch):
     # What was found is kept.
     monkeypatch.setattr("p2gs_jax.scene.drives.ego_mask.find_ego_mask", None)
     assert assemble(recording, DataConfig(frames="0:4"), tmp_path / "work").notes == scene.notes
-    without = assemble(recording, DataConfig(own_car=False))
-    assert all(view.own_car is None for view in without.views)
+    without = assemble(recording, DataConfig(ego_mask=False))
+    assert all(view.ego_mask is None for view in without.views)

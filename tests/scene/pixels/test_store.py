@@ -173,7 +173,7 @@ def kinds(tmp_path):
         "matted.png": {"channels": 4, "alpha": "background"},
         "matted_deep.png": {"channels": 4, "dtype": np.uint16, "alpha": "background"},
         "cut_out.png": {"channels": 4, "alpha": "mask"},
-        "driven.png": {"own_car": car},
+        "driven.png": {"ego_mask": car},
     }
     return [noisy_view(tmp_path / "images", name, **given) for name, given in fields.items()]
 
@@ -219,7 +219,7 @@ def test_every_kind_comes_back_bit_for_bit(tmp_path, kinds, shrink):
     assert not (tmp_path / "pixels").exists()
 
 
-@pytest.mark.parametrize("what", ["image_path", "mask_path", "distortion", "own_car", "K"])
+@pytest.mark.parametrize("what", ["image_path", "mask_path", "distortion", "ego_mask", "K"])
 def test_what_pixels_depend_on_makes_them_anew(tmp_path, what):
     view = noisy_view(tmp_path, "a.png", distortion=Distortion((0.1, 0, 0, 0)))
     in_files(tmp_path, [view]).stored(0)
@@ -228,7 +228,7 @@ def test_what_pixels_depend_on_makes_them_anew(tmp_path, what):
     cv2.imwrite(str(path), np.full((*SIZE, 3), 7, np.uint8))
     os.utime(path, ns=(1, 1))
     values = {"image_path": path, "mask_path": path, "distortion": Distortion((0.2, 0, 0, 0))}
-    values |= {"own_car": np.ones((3, 4), bool), "K": view.K * [[1.5], [1.5], [1]]}
+    values |= {"ego_mask": np.ones((3, 4), bool), "K": view.K * [[1.5], [1.5], [1]]}
     changed = [dataclasses.replace(view, **{what: values[what]})]
     store = in_files(tmp_path, changed)
     assert not first.exists()
