@@ -71,7 +71,7 @@ def _continues(views: Sequence[View], radius: float) -> bool:
     return differ and distance <= _NEAR * radius and cosine >= _TURNED
 
 
-def said_brackets(keys: Sequence[object]) -> list[str]:
+def bracket_notes(keys: Sequence[object]) -> list[str]:
     """Return a sentence on brackets, given the bracket of each photograph, or none."""
     sizes = [size for size in Counter(keys).values() if size > 1]
     if not sizes:

@@ -13,7 +13,7 @@ import numpy as np
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.text import count_of
 from p2gs_jax.scene import PhotographsAlone, find_scene, with_what_lies_beside
-from p2gs_jax.scene.brackets import brackets, names_of_brackets, said_brackets
+from p2gs_jax.scene.brackets import bracket_notes, brackets, names_of_brackets
 from p2gs_jax.scene.convert.readers import exif_evs
 from p2gs_jax.scene.drives.assemble import assemble, chosen_frames
 from p2gs_jax.scene.drives.recording import Recording
@@ -67,7 +67,7 @@ def survey(root: Path, cfg: DataConfig, report: Report = lambda message: None) -
     alone = ("There are no cameras: structure from motion finds them when a fit starts.",)
     if isinstance(found, PhotographsAlone):
         names = [path.relative_to(found.folder).as_posix() for path in found.paths]
-        return Survey("images", _sizes(found), (*said_brackets(names_of_brackets(names)), *alone))
+        return Survey("images", _sizes(found), (*bracket_notes(names_of_brackets(names)), *alone))
     if isinstance(found, Path):  # a video
         camera = SurveyedCamera("", expected_frames(found) or 0, video_size(found))
         return Survey("video", (camera,), alone)
@@ -81,7 +81,7 @@ def survey(root: Path, cfg: DataConfig, report: Report = lambda message: None) -
             facts.append(f"{len(scene.tracks.xy):,} observations of points.")
     if all(view.exif_ev is None for view in scene.views):
         facts.append("EXIF has no exposures.")
-    facts += said_brackets(brackets(scene.views))
+    facts += bracket_notes(brackets(scene.views))
     cameras = tuple(_camera(name, views) for name, views in _by_camera(scene).items())
     return Survey(scene.format, cameras, (*facts, *scene.notes))
 

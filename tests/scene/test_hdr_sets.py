@@ -20,7 +20,7 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.evaluation.references import find_radiance
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.scene import find_scene
-from p2gs_jax.scene.brackets import brackets, said_brackets
+from p2gs_jax.scene.brackets import bracket_notes, brackets
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.split import assign_split, split_scene
 from p2gs_jax.scene.survey import survey
@@ -181,7 +181,7 @@ OTHERS = {
 def test_brackets_are_told(tmp_path, shots):
     views = taken(tmp_path, *shots)
     assert brackets(views) == [0, 0, 2, 2, 4, 5]
-    assert said_brackets(brackets(views)) == ["2 brackets of 2 exposures."]
+    assert bracket_notes(brackets(views)) == ["2 brackets of 2 exposures."]
     assert [v.split for v in assign_split(views, 2)][:4] == ["test", "test", "train", "train"]
 
 
