@@ -315,7 +315,7 @@ def _rows(
     lab: _Lab, common: float, records: Sequence[Mapping[str, Any]]
 ) -> tuple[dict[str, Any], ...]:
     """Return the rows of `exposures.csv`; `ev` is that of the developed photographs."""
-    out, s, balance = [], lab.solution, lab.taken.white_balance
+    out, errors, balance = [], lab.solution.exposure_errors_ev, lab.taken.white_balance
     for row, (view, record) in enumerate(zip(lab.views, records, strict=True)):
         ev, known = float(lab.taken.log_exposures[row]) / LN2, bool(lab.seen[row])
         factors = () if balance is None else np.exp(balance[row]).tolist()
@@ -324,7 +324,7 @@ def _rows(
             "camera": view.camera,
             "ev": common,
             "original_ev": ev if known else None,
-            "original_ev_error": float(s.exposure_errors_ev[row]) if known else None,
+            "original_ev_error": float(errors[row]) if known else None,
             "gain_ev": common - ev,
             "gamma": float(lab.taken.gammas[row]),
             **dict(zip(RGB, factors, strict=False)),

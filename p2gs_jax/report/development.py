@@ -40,14 +40,13 @@ def _page(developed: Developed, sheet: np.ndarray) -> str:
         f"All photographs were brought to the exposure {developed.exposure_ev:+.2f} EV, neutral "
         f"white balance, one tone curve and no vignetting: {_DEPTHS[developed.options.depth]}."
     )
+    clipped, black = (np.mean([row[name] for row in table]) for name in ("clipped", "black"))
     numbers = [
         ("Photographs", f"{len(table):,}", f"in {developed.folder.name}/"),
         ("Exposures before", f"{np.ptp(gains):.2f} stops", "from the darkest to the brightest"),
-        ("Largest change", f"{max(gains, key=abs):+.2f} stops", "of one photograph"),
+        ("Clipped", f"{clipped:.2%}", "of the originals' pixels"),
+        ("Black", f"{black:.2%}", "of the originals' pixels"),
     ]
-    for name in ("clipped", "black"):
-        share = np.mean([row[name] for row in table])
-        numbers.append((name.capitalize(), f"{share:.2%}", "of the originals' pixels"))
     head = "<h1>Developed photographs</h1>" + html.paragraph(lead, "lead")
     caption = "Photographs as they were taken, and developed below; the darkest exposure first."
     picture = jpeg(sheet / 255, caption, max(sheet.shape))
