@@ -25,8 +25,7 @@ from p2gs_jax.gaussians import bake
 from p2gs_jax.photometry.display import DisplayTransform, light_of
 from p2gs_jax.photometry.formation import LEAST_ALPHA
 from p2gs_jax.render.capacity import RenderView, make_renderer
-from p2gs_jax.run import photometry_files
-from p2gs_jax.run.read import Run, load_run, photometry_of
+from p2gs_jax.run import photometry_files, read
 from p2gs_jax.scene import find_scene, with_what_lies_beside
 from p2gs_jax.scene.masks import with_alpha
 from p2gs_jax.scene.pixels.store import camera_of
@@ -40,7 +39,7 @@ MEASURED, MEASURED_WIDTH, NEAR = 60, 960, 0.01
 
 
 @dataclass(frozen=True)
-class ForeignRun(Run):
+class ForeignRun(read.Run):
     """Splats of another program. `params.gaussians` are lifted, and approximate them.
 
     `render` composites display colours as their program did, and returns the radiance that the
@@ -90,14 +89,14 @@ class ForeignRun(Run):
         return replace(self, params=params, lifting_error=e, notes=(*self.notes, note))
 
 
-def load_run_or_splats(run: Path, scene: Path | None, photometry: Path | None) -> Run:
+def load_run_or_splats(run: Path, scene: Path | None, photometry: Path | None) -> read.Run:
     """Return a finished run, or with `photometry` the splats of another program (`foreign_run`).
 
     Raises:
         UserError: see `load_run` and `foreign_run`; or splats come without a scene.
     """
     if photometry is None:
-        return load_run(run, scene)
+        return read.load_run(run, scene)
     if scene is None:
         fix = "add --scene SCENE, the scene that was calibrated"
         raise UserError("--photometry needs the cameras of a scene.", fix=fix)
@@ -128,7 +127,7 @@ def foreign_run(splats: str | Path, photometry: str | Path, scene: str | Path) -
     cfg = FitConfig(photometry=developed.formation, render=render)
     return ForeignRun(
         splats.with_suffix(""),
-        Params(bake.lift(gaussians, developed), photometry_of(saved, found, cfg, path)),
+        Params(bake.lift(gaussians, developed), read.photometry_of(saved, found, cfg, path)),
         cfg,
         found,
         None,
