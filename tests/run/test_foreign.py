@@ -84,8 +84,7 @@ def test_a_photograph_is_shown_as_it_was_taken(succeeded, trained, tmp_path):
 
 def test_gaussians_are_lifted_to_radiance_and_the_error_is_said(succeeded, trained, tmp_path):
     argv = ("--format", "linear-ply", "--bake-steps", "0", "--out", tmp_path)
-    text = succeeded("export", trained / "splat.ply", *told(trained), *argv)
-    assert "Lifted to radiance" in text
+    assert "Lifted" in succeeded("export", trained / "splat.ply", *told(trained), *argv)
     linear = read_ply(tmp_path / "linear.ply")
     logs = np.broadcast_to(np.log(RADIANCE), (3, 3))
     np.testing.assert_allclose(C0 * np.asarray(linear.sh[:, 0]), logs, atol=1e-4)
@@ -106,15 +105,13 @@ def test_what_cannot_be_shown_is_refused(refused, trained, tmp_path):
     vertices = b"element vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
     header = b"ply\nformat binary_little_endian 1.0\n" + vertices + b"end_header\n"
     (tmp_path / "points.ply").write_bytes(header + bytes(12))
-    (tmp_path / "alone").mkdir()
-    cv2.imwrite(str(tmp_path / "alone" / "0.png"), np.zeros((20, 20, 3), np.uint8))
     good, place, scene = trained / "splat.ply", trained / "cal", trained / "scene"
     for splats, photos, where, words in (
         (tmp_path / "points.ply", place, scene, ("not a valid PLY", "no field")),
         (tmp_path / "radiance.ply", place, scene, ("holds the radiance of a run",)),
         (scene / "images" / "0.png", place, scene, ("not a file of splats", ".compressed.ply")),
         (good, tmp_path / "other", scene, ("none of the photographs", "0.png")),
-        (good, place, tmp_path / "alone", ("no COLMAP model", "developed")),
+        (good, place, scene / "images", ("no COLMAP model", "developed")),
     ):
         text = refused("render", splats, "--photometry", photos, "--scene", where)
         assert all(word in " ".join(text.split()) for word in words), text
