@@ -147,7 +147,7 @@ def test_going_to_a_photograph_takes_its_look_and_place_and_cameras_appear(page)
     assert page.get_by_label("Match photo", exact=True).input_value() == "5.png"
     before = steady(page)
     page.get_by_label("Cameras", exact=True).check()
-    page.get_by_text("exposure, EV from the mean").wait_for()
+    page.get_by_text("exposure, stops (EV) from the mean").wait_for()
     page.mouse.move(300, 500)
     page.mouse.wheel(0, 400)
     until(page, lambda now: np.abs(now - before).mean() > 0.01)
