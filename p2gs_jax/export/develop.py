@@ -158,8 +158,10 @@ def places_of(poses: Poses, scene: Scene, out: Path, options: Development) -> di
     originals = {view.image_path.resolve() for view in scene.views}
     targets = {(folder / place).resolve() for place in places.values()}
     root = scene.root if scene.root.is_dir() else scene.root.parent
-    if originals & targets or folder == root.resolve():
-        why = f"--out {out} would write developed photographs over the originals in {root}."
+    holding = {root.resolve(), *(path.parent for path in originals)}
+    if originals & targets or holding & {out.resolve(), folder}:
+        why = f"--out {out} would write developed photographs over the originals in {root}, or "
+        why += "among them."
         raise UserError(why, fix="name another folder with --out")
     return places
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from p2gs_jax.errors import UserError
+from p2gs_jax.errors import UserError, broken
 from p2gs_jax.formats import gsply_files
 from p2gs_jax.formats.ply import LINEAR, read_ply
 from p2gs_jax.formats.sog import read_sog
@@ -32,6 +32,8 @@ def read_splats(path: Path) -> Gaussians:
     if read is None:
         fix = f"name a file of these formats: {', '.join(READERS)}"
         raise UserError(f"{path} is not a file of splats.", fix=fix)
+    if not path.is_file():
+        raise broken(path, "is not a file", "check the path of the splats")
     try:
         with path.open("rb") as file:
             if LINEAR.encode() in file.read(1024):

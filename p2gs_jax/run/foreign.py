@@ -24,6 +24,7 @@ from p2gs_jax.formats.splats import read_splats
 from p2gs_jax.gaussians import bake
 from p2gs_jax.photometry.display import DisplayTransform, light_of
 from p2gs_jax.photometry.formation import LEAST_ALPHA
+from p2gs_jax.photometry.metering import Metering
 from p2gs_jax.render.capacity import RenderView, make_renderer
 from p2gs_jax.run import photometry_files, read
 from p2gs_jax.scene import find_scene, with_what_lies_beside
@@ -49,6 +50,12 @@ class ForeignRun(read.Run):
     _: KW_ONLY
     splats: Gaussians  # with display colours, max(0, sh + 1/2)
     developed: DisplayTransform  # the look of the photographs that they were trained on
+
+    @property
+    def metering(self) -> Metering:
+        """Raise a UserError: no training exposures are known to splats."""
+        fix = "leave out --meter, or give an exposure with --exposure-ev"
+        raise UserError("--meter needs a run, and splats are not a run.", fix=fix)
 
     @cached_property
     def _renderer(self) -> RenderView:

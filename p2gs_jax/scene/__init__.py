@@ -40,8 +40,8 @@ def load_scene(
     photographs in `images/` or the folder itself, or a video. Structure from motion then finds the
     cameras of photographs and videos. If poses come without points, points are triangulated, or
     random where hardly anything matches. Views are sorted by name. `work_dir` keeps the results of
-    long computations for a resume. Raises UserError: there is no scene, or a file is broken; the
-    message names the file.
+    long computations for a resume, in the folder of results. Raises UserError: there is no scene,
+    a file is broken, or results would lie among photographs alone; the message names the file.
     """
     found = find_scene(root, cfg, report)
     if isinstance(found, Recording):
@@ -55,6 +55,10 @@ def load_scene(
             if cfg.matching == "auto":
                 cfg = dataclasses.replace(cfg, matching="sequence")
         else:
+            out = None if work_dir is None else work_dir.parent
+            if out is not None and out.resolve() in {path.parent.resolve() for path in found.paths}:
+                why = f"--out {out} holds the photographs, and pictures of results would join them."
+                raise UserError(why, fix="name another folder with --out")
             photographs = convert_photographs(*found, work_dir, report)
         folder, paths = photographs.folder, photographs.paths
         scene = load_images(Path(root), folder, paths, cfg, work_dir, report)

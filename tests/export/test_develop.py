@@ -299,7 +299,7 @@ def test_originals_are_never_replaced(tmp_path):
     other = tmp_path / "other" / "developed"
     other.mkdir(parents=True)
     os.symlink(root / "images", other / "images")
-    for out in (tmp_path / "out", other.parent):
+    for out in (tmp_path / "out", other.parent, root, root / "images"):
         with pytest.raises(UserError, match="over the originals"):
             develop_scene(scene, poses, out, CFG, selection, Development(), Silent())
     assert files_in(root) == before

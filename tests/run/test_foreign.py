@@ -110,10 +110,13 @@ def test_what_cannot_be_shown_is_refused(refused, trained, tmp_path):
         (tmp_path / "points.ply", place, scene, ("not a valid PLY", "no field")),
         (tmp_path / "radiance.ply", place, scene, ("holds the radiance of a run",)),
         (scene / "images" / "0.png", place, scene, ("not a file of splats", ".compressed.ply")),
+        (tmp_path / "none.ply", place, scene, ("none.ply is not a file", "check the path")),
         (good, tmp_path / "other", scene, ("none of the photographs", "0.png")),
         (good, place, scene / "images", ("no COLMAP model", "developed")),
     ):
         text = refused("render", splats, "--photometry", photos, "--scene", where)
         assert all(word in " ".join(text.split()) for word in words), text
+    metered = refused("export", good, *told(trained), "--format", "html", "--meter", "auto")
+    assert "--meter needs a run" in metered
     assert "add --scene" in refused("export", good, "--photometry", place, "--format", "exr")
     assert "need --photometry" in " ".join(refused("render", good).split())

@@ -45,6 +45,13 @@ def test_nothing_there(tmp_path):
         load_scene(tmp_path / "notes.txt", CFG)
 
 
+def test_results_stay_apart_from_photographs_alone(tmp_path):
+    write_image(tmp_path / "0.png")
+    with refused("holds the photographs"):
+        load_scene(tmp_path, CFG, tmp_path / "cache")
+    assert [path.name for path in tmp_path.iterdir()] == ["0.png"]
+
+
 def test_a_folder_of_cameras_is_one_if_asked_for(tmp_path):
     names = ["front/0.png", "left/0.png"]
     for name in names:
