@@ -8,7 +8,6 @@ import functools
 import hashlib
 import io
 import json
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -28,7 +27,7 @@ from p2gs_jax.core.text import first_few
 from p2gs_jax.core.threads import map_in_order
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.film import Film, Finish, across, common_curve, dithered
-from p2gs_jax.export.folders import MODES, RGB, write_photograph
+from p2gs_jax.export.folders import MODES, RGB, mask_name, write_photograph
 from p2gs_jax.export.poses import Poses, write_if_new
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.frames import shrunk
@@ -86,7 +85,6 @@ class Developed:
     rows: tuple[Mapping[str, Any], ...]  # the rows of `exposures.csv`
     messages: tuple[str, ...]  # sentences for the user
     written: int  # number of photographs that were not there before
-    seconds: float
     # Returns names and pictures of some photographs before and after, small display values, the
     # darkest exposure first.
     shown: Callable[[], list[tuple[str, Picture, Picture]]]
@@ -136,9 +134,8 @@ class _Lab:
             pixels, valid, _, film = self.read(row)
             used = valid & (across(np.maximum, pixels) < film.white)
             light = film.developed(pixels, np.exp).max(-1)[used]
-            found = (
-                max(found, float(np.log(np.quantile(light, _BELOW_WHITE)))) if used.any() else found
-            )
+            if used.any():
+                found = max(found, float(np.log(np.quantile(light, _BELOW_WHITE))))
         white = np.log(exposed_at(self.loss.saturation, self.mean.gamma, self.photometry))
         return float(white) - (found if np.isfinite(found) else 0.0)
 
@@ -180,7 +177,7 @@ def develop_scene(
     Photographs that are there already, from the same files, parameters and options, stay. Raises
     UserError: a photograph cannot be read, or a file would replace an original.
     """
-    begin, folder, log = time.monotonic(), out / FOLDER, out / "cache" / "developed.jsonl"
+    folder, log = out / FOLDER, out / "cache" / "developed.jsonl"
     views, places = scene.training_views, places_of(poses, scene, out, options)
     lab = _Lab(cfg, selection, views)
     log_exposure = lab.log_exposure(options.exposure, reporter)
@@ -213,9 +210,9 @@ def develop_scene(
     poses.write(folder, places, _complete_masks(folder, records))
     write_if_new(folder / "exposures.csv", _table(rows))
     messages = (*lab.notes(), *poses.notes(places))
-    seconds, shown = time.monotonic() - begin, functools.partial(_shown, lab, curve)
+    shown = functools.partial(_shown, lab, curve)
     ev = round(log_exposure / LN2, 6) + 0.0
-    return Developed(folder, options, ev, rows, messages, len(todo), seconds, shown)
+    return Developed(folder, options, ev, rows, messages, len(todo), shown)
 
 
 def _is_there(folder: Path, record: Mapping[str, Any]) -> bool:
@@ -280,8 +277,7 @@ def _exif(view: View) -> Image.Exif | None:
 
 
 def _mask_of(place: str) -> str:
-    """Return COLMAP's name of a mask: the photograph's, suffix included, and .png."""
-    return f"masks/{place.removeprefix('images/')}.png"
+    return mask_name(place.removeprefix("images/"))
 
 
 def _write_mask(path: Path, valid: Bool[np.ndarray, "h w"]) -> None:

@@ -61,7 +61,7 @@ def write_folder(
         for index, view in enumerate(scene.views):
             ldr, mask = store.get(index)
             _write_photograph(temporary / "images" / names[view.name], view, ldr)
-            path = temporary / _mask_name(names[view.name])
+            path = temporary / mask_name(names[view.name])
             path.parent.mkdir(parents=True, exist_ok=True)
             # 255 marks pixels that count.
             Image.fromarray(np.where(mask > 0, 255, 0).astype(np.uint8)).save(path)
@@ -82,9 +82,9 @@ def exported_name(view: View) -> str:
     return view.name if Path(view.name).suffix.lower() in READABLE else f"{view.name}.png"
 
 
-def _mask_name(name: str) -> str:
+def mask_name(name: str) -> str:
     """Return COLMAP's name of a mask: the photograph's, suffix included, and .png."""
-    return (Path("masks") / f"{name}.png").as_posix()
+    return f"masks/{name}.png"
 
 
 def _transforms(
@@ -98,7 +98,7 @@ def _transforms(
         names[view.split].append(place)
         frames.append(_frame(store, index, scene.origin) | {"file_path": place})
         if masked:
-            frames[-1]["mask_path"] = _mask_name(exported[view.name])
+            frames[-1]["mask_path"] = mask_name(exported[view.name])
     content: dict[str, Any] = {"camera_model": "PINHOLE", "ply_file_path": CLOUD}
     if names["test"]:
         content["train_filenames"] = names["train"]

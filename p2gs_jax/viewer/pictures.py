@@ -131,7 +131,7 @@ def limits_of_depth(frame: RenderedFrame) -> tuple[float, float]:
 def warp_photograph(
     ldr: Float32[np.ndarray, "h w 3"],
     mask: Float32[np.ndarray, "h w"],
-    vignetting_camera: Camera,
+    camera: Camera,
     frame: Camera,
 ) -> WarpedPhotograph:
     """Return a photograph resampled to the pixels of another camera at the same position.
@@ -139,11 +139,8 @@ def warp_photograph(
     Images of cameras with a common centre are related by a homography. The mask is 1 where the
     photograph counts.
     """
-    turn = (
-        np.asarray(vignetting_camera.viewmat, float)[:3, :3]
-        @ np.asarray(frame.viewmat, float)[:3, :3].T
-    )
-    K, k = np.asarray(vignetting_camera.K, float), np.asarray(frame.K, float)
+    turn = np.asarray(camera.viewmat, float)[:3, :3] @ np.asarray(frame.viewmat, float)[:3, :3].T
+    K, k = np.asarray(camera.K, float), np.asarray(frame.K, float)
     # OpenCV's first pixel centre is at 0, ours at 0.5.
     half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
     pull = np.linalg.inv(half) @ K @ turn @ np.linalg.inv(k) @ half
@@ -151,15 +148,10 @@ def warp_photograph(
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     shrink = _minification(pull, size)
     if shrink > 1.0:
-        small = (
-            max(1, round(vignetting_camera.width / shrink)),
-            max(1, round(vignetting_camera.height / shrink)),
-        )
+        small = (max(1, round(camera.width / shrink)), max(1, round(camera.height / shrink)))
         ldr = cv2.resize(ldr, small, interpolation=cv2.INTER_AREA)
         mask = cv2.resize(mask, small, interpolation=cv2.INTER_AREA)
-        scale = np.diag(
-            [small[0] / vignetting_camera.width, small[1] / vignetting_camera.height, 1.0]
-        )
+        scale = np.diag([small[0] / camera.width, small[1] / camera.height, 1.0])
         pull = np.linalg.inv(half) @ scale @ half @ pull
     pixels = cv2.warpPerspective(ldr, pull, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
     inside = cv2.warpPerspective(mask, pull, size, flags=flags) > 0.5

@@ -27,7 +27,7 @@ import numpy as np
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import broken
 from p2gs_jax.scene.drives import tables
-from p2gs_jax.scene.drives.lidar import turned
+from p2gs_jax.scene.drives.lidar import passed
 from p2gs_jax.scene.drives.objects import Box, Pose, tracks
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
 from p2gs_jax.scene.drives.waymo import CAMERAS, OPENCV, TURN_S, TURN_START
@@ -78,9 +78,7 @@ def _time(frame: int) -> float:
 
 
 def _numbers(path: Path, count: int) -> np.ndarray:
-    if not path.is_file():
-        raise tables.missing_file(path)
-    words = path.read_text("utf-8-sig", "replace").split()
+    words = " ".join(tables.read_lines(path)).split()
     return tables.finite_numbers(words, path, "its content", count)
 
 
@@ -109,18 +107,13 @@ def _camera(root: Path, number: int, photograph: Path) -> RigCamera:
     return RigCamera(name, intrinsics(fx, fy, cx, cy), *size, make_distortion((*lens,)))
 
 
-def _passed(points: np.ndarray, time: float) -> np.ndarray:
-    """Return when the upper scanner saw points [n 3] in the car's axes, seconds."""
-    azimuth = np.nan_to_num(np.arctan2(points[:, 1], points[:, 0]))
-    return time + TURN_S * (turned(azimuth, TURN_START) - 0.5)
-
-
 def _read_sweep(path: Path, car: Pose, time: float) -> SweepPoints:
     values = np.fromfile(path, "<f4")
     if values.size % COLUMNS or path.stat().st_size % 4:
         raise broken(path, f"is not a LiDAR scan of {COLUMNS} float32 a point: its size is wrong")
     points = values.reshape(-1, COLUMNS)[:, 3:6].astype(np.float64)
-    return SweepPoints(points @ car[:3, :3].T + car[:3, 3], _passed(points, time))
+    at = passed(points, time, TURN_S, TURN_START)
+    return SweepPoints(points @ car[:3, :3].T + car[:3, 3], at)
 
 
 def _objects(path: Path, cars: dict[int, Pose]) -> tuple[tuple[TrackedObject, ...], list[str]]:
@@ -135,15 +128,12 @@ def _objects(path: Path, cars: dict[int, Pose]) -> tuple[tuple[TrackedObject, ..
             for frame, matrix, size in rows:
                 pose = np.array(matrix, np.float64).reshape(4, 4)
                 pose = rigid(pose[:3, :3], pose[:3, 3], path, f"the box of {thing['id']}")
-                length, width, height = tables.finite_numbers(size, path, "a size", 3).tolist()
-                if min(length, width, height) <= 0:
-                    raise broken(f"{path}:", "a box has a side of 0 m")
+                size = tables.box_size(size, path)
                 if frame not in cars:
                     lost += 1
                     continue
                 local = (inverse(cars[frame]) @ pose)[None, :3, 3]
-                time = float(_passed(local, _time(frame))[0])
-                size = (length, width, height)
+                time = float(passed(local, _time(frame), TURN_S, TURN_START)[0])
                 boxes.append(Box(str(thing["id"]), thing["class_name"], size, time, pose))
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise broken(path, f"is not a table of boxes: {error!r}", tables.UNPACK) from None

@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import broken
 from p2gs_jax.scene.drives import tables
-from p2gs_jax.scene.drives.lidar import turned
+from p2gs_jax.scene.drives.lidar import passed
 from p2gs_jax.scene.drives.objects import Box, Pose, tracks
 from p2gs_jax.scene.drives.recording import (
     Photograph,
@@ -98,20 +98,12 @@ def read_kitti_raw(root: Path, cfg: DataConfig) -> Recording:
     return Recording(root, "kitti_raw", cameras, photographs, sweeps, objects, notes)
 
 
-def read_lines(path: Path) -> list[str]:
-    """Return the lines of a text; UserError: it is missing."""
-    try:
-        return path.read_text("utf-8-sig", "replace").rstrip().splitlines()
-    except FileNotFoundError:
-        raise tables.missing_file(path) from None
-
-
 class Calibration:
     """The matrices in lines `NAME: numbers` of a file, or `NAME numbers`; UserError: no file."""
 
     def __init__(self, path: Path):
         """Read them."""
-        lines = (line.replace(":", " ").split() for line in read_lines(path))
+        lines = (line.replace(":", " ").split() for line in tables.read_lines(path))
         self.path, self._held = path, {words[0]: words[1:] for words in lines if words}
 
     def __contains__(self, name: str) -> bool:
@@ -170,7 +162,7 @@ def _read_stamps(path: Path) -> Float64[np.ndarray, " n"]:
     a time.
     """
     times = []
-    for number, line in enumerate(read_lines(path), 1):
+    for number, line in enumerate(tables.read_lines(path), 1):
         text = line.strip()
         try:
             if not _STAMP.fullmatch(text):
@@ -257,20 +249,9 @@ def read_sweep(path: Path, forward_s: float, turn_s: float, scanner: Trajectory)
         raise broken(path, "is not a LiDAR scan of float32 x y z reflectance: its size is wrong")
     # Metres: x forward, y left, z up.
     points = values.reshape(-1, 4)[:, :3].astype(np.float64)
-    at = _passed(points, forward_s, turn_s)
+    at = passed(points, forward_s, turn_s, BACK)
     placed, _ = scanner.at(at)
     return SweepPoints(np.einsum("nij,nj->ni", placed[:, :3, :3], points) + placed[:, :3, 3], at)
-
-
-def _passed(
-    points: Float64[np.ndarray, "n 3"], forward_s: float, turn_s: float
-) -> Float64[np.ndarray, " n"]:
-    """Return the times at which the scanner measured points in its axes, seconds.
-
-    NaN counts as forward.
-    """
-    azimuth = np.nan_to_num(np.arctan2(points[:, 1], points[:, 0]))
-    return forward_s + turn_s * (turned(azimuth, start=BACK) - 0.5)
 
 
 def _objects(
@@ -306,7 +287,7 @@ def in_world(
         return (), notes
     local = np.stack([box.pose for box in timed])
     turn = float(np.median(lengths))
-    at = forward[[int(box.time) for box in timed]] + _passed(local[:, :3, 3], 0.0, turn)
+    at = forward[[int(box.time) for box in timed]] + passed(local[:, :3, 3], 0.0, turn, BACK)
     poses = scanner.at(at)[0] @ local
     moved = zip(timed, at.tolist(), poses, strict=True)
     return tracks(box._replace(time=time, pose=pose) for box, time, pose in moved), notes
@@ -328,9 +309,8 @@ def _tracklets(path: Path) -> tuple[list[Box], int]:
 
     found, empty = [], 0
     for number, item in enumerate(root.findall("./tracklets/item")):
-        length, width, height, first = numbers(item, "l w h first_frame")
-        if min(length, width, height) <= 0:
-            raise broken(f"{path}:", "a box has a side of 0 m")
+        *sides, first = numbers(item, "l w h first_frame")
+        size = tables.box_size(sides, path)
         boxes = item.findall("./poses/item")
         empty += not boxes
         label = (item.findtext("objectType") or "unknown").strip()
@@ -338,6 +318,6 @@ def _tracklets(path: Path) -> tuple[list[Box], int]:
             *position, roll, pitch, yaw = numbers(box, "tx ty tz rx ry rz")
             rotation = Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix()
             # The origin of KITTI's boxes is the middle of the bottom.
-            pose = pose_of(rotation, position + rotation[:, 2] * height / 2)
-            found.append(Box(str(number), label, (length, width, height), frame, pose))
+            pose = pose_of(rotation, position + rotation[:, 2] * size[2] / 2)
+            found.append(Box(str(number), label, size, frame, pose))
     return found, empty

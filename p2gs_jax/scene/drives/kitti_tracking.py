@@ -41,7 +41,7 @@ def read_kitti_tracking(root: Path, cfg: DataConfig) -> Recording:
     velo_to_cam = _rigid(calibration, "R_rect", 3) @ _rigid(calibration, "Tr_velo_cam")
     imu_to_velo = _rigid(calibration, "Tr_imu_velo")
     measured = root / "oxts" / f"{name}.txt"
-    rows = [kitti.oxts_row(line, measured) for line in kitti.read_lines(measured)]
+    rows = [kitti.oxts_row(line, measured) for line in tables.read_lines(measured)]
     if not rows:
         raise broken(measured, "holds no measurement", tables.UNPACK)
     times = kitti.TURN_S * np.arange(len(rows))
@@ -88,7 +88,7 @@ def _rigid(calibration: kitti.Calibration, key: str, columns: int = 4) -> Pose:
 def _boxes(path: Path, velo_to_cam: Pose) -> list[Box]:
     """Return boxes, whose times are frames and whose poses lead to the scanner."""
     boxes = []
-    for number, line in enumerate(kitti.read_lines(path), 1):
+    for number, line in enumerate(tables.read_lines(path), 1):
         words = line.split()
         if len(words) > 2 and words[2] == "DontCare":
             continue
@@ -96,10 +96,9 @@ def _boxes(path: Path, velo_to_cam: Pose) -> list[Box]:
         frame, height, width, length, x, y, z, turn = tables.finite_numbers(
             values, path, f"frame, size, position and rotation in line {number}", 8
         ).tolist()
-        if min(length, width, height) <= 0:
-            raise broken(f"{path}:", "a box has a side of 0 m")
+        size = tables.box_size((length, width, height), path)
         # The position is the middle of the bottom, and y points down.
         rotation = Rotation.from_euler("y", turn).as_matrix() @ UPRIGHT
         pose = inverse(velo_to_cam) @ pose_of(rotation, np.array([x, y - height / 2, z]))
-        boxes.append(Box(words[1], words[2], (length, width, height), frame, pose))
+        boxes.append(Box(words[1], words[2], size, frame, pose))
     return boxes

@@ -32,6 +32,17 @@ def turned(azimuth: Float[np.ndarray, "*n"] | float, start: float) -> Float[np.n
     return np.asarray(np.mod(start - azimuth, 2 * np.pi) / (2 * np.pi))
 
 
+def passed(
+    points: Float[np.ndarray, "n 3"], middle_s: float, turn_s: float, start: float
+) -> Float[np.ndarray, " n"]:
+    """Return the times at which a scanner passed points in its axes, seconds; NaN is at angle 0.
+
+    `middle_s` is the middle of its turn of `turn_s` seconds, which begins as in `turned`.
+    """
+    azimuth = np.nan_to_num(np.arctan2(points[:, 1], points[:, 0]))
+    return middle_s + turn_s * (turned(azimuth, start) - 0.5)
+
+
 def owners(
     points: Float[np.ndarray, "n 3"],
     times: Float[np.ndarray, " n"],

@@ -84,6 +84,22 @@ def missing_file(path: Path) -> UserError:
     return UserError(f"{path} does not exist", fix=UNPACK)
 
 
+def read_lines(path: Path) -> list[str]:
+    """Return the lines of a text; UserError: it is missing."""
+    try:
+        return path.read_text("utf-8-sig", "replace").rstrip().splitlines()
+    except FileNotFoundError:
+        raise missing_file(path) from None
+
+
+def box_size(sides: Iterable[Any], path: Path) -> tuple[float, float, float]:
+    """Return length, width and height of a box; UserError: they are not three positive numbers."""
+    length, width, height = finite_numbers(sides, path, "the size of a box", 3).tolist()
+    if min(length, width, height) <= 0:
+        raise broken(f"{path}:", "a box has a side of 0 m")
+    return length, width, height
+
+
 def finite_numbers(
     values: Iterable[Any], path: Path, what: str, count: int | None = None
 ) -> Float64[np.ndarray, " n"]:
