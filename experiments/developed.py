@@ -24,6 +24,7 @@ import pycolmap
 from exposure_spread import sensor
 from judging import contact_sheet
 from mixtures import their_test_views, write_mixture
+from sensor_town import town
 
 import p2gs_jax
 from p2gs_jax.config import FitConfig, PhotometryConfig
@@ -37,18 +38,9 @@ from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
-from p2gs_jax.synth.settings import image_height
 
-WIDTH, FRAMES, POINTS = 240, 20, 8000
+TOWN = argparse.Namespace(width=240, frames=20, points=8000, seed=0)
 GAMMA = 2.2
-
-
-def town(folder: Path, spread: float) -> Path:
-    """Return a town whose exposures spread over so many stops; it is made once."""
-    if not folder.exists():
-        size = {"width": WIDTH, "height": image_height(WIDTH), "frames": FRAMES, "points": POINTS}
-        p2gs_jax.write_street(folder, **size, step=1.2, sensor=sensor(spread), layout="town")
-    return folder
 
 
 def without(scene: Path, held_out: set[str], out: Path) -> Path:
@@ -111,7 +103,9 @@ def main() -> None:
     parser.add_argument("--lom", nargs="*", type=Path, default=[], help="LOM scene folders")
     parser.add_argument("--steps", type=int, default=2000)
     args = parser.parse_args()
-    scenes = {f"town, {s:g} stops": town(args.out / f"town_{s:g}", s) for s in args.spreads}
+    scenes = {
+        f"town, {s:g} stops": town(args.out / f"town_{s:g}", sensor(s), TOWN) for s in args.spreads
+    }
     for lom in args.lom:
         folder = args.out / lom.name
         if not folder.exists():

@@ -19,6 +19,7 @@ import matplotlib
 import numpy as np
 from jaxtyping import Float
 from PIL import Image, ImageDraw, ImageFont
+from towns import table, titles
 
 import p2gs_jax
 from p2gs_jax.config import FitConfig
@@ -81,15 +82,14 @@ def measured(
 
 def to_markdown(rows: Sequence[dict[str, Any]], columns: Sequence[tuple[str, str, int]]) -> str:
     """Return a table of the rows of `measured`; a cell without a value is empty."""
-    lines = ["| method | " + " | ".join(heading for heading, _, _ in columns) + " |"]
-    lines.append("|---|" + "---:|" * len(columns))
+    lines = []
     for row in rows:
         values = [(row.get(key), digits) for _, key, digits in columns]
         cells = ["" if value is None else f"{value:.{digits}f}" for value, digits in values]
         if "failed" in row:
             cells = [f"failed: {row['failed']}", *[""] * (len(columns) - 1)]
-        lines.append("| " + " | ".join([row["method"], *cells]) + " |")
-    return "\n".join(lines) + "\n"
+        lines.append([row["method"], *cells])
+    return table(("method", *titles(columns)), lines)
 
 
 def contact_sheet(path: Path, rows: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]]) -> None:

@@ -41,7 +41,6 @@ from towns import (
     methods,
     number,
     options,
-    save_plot,
     table,
     titles,
     write,
@@ -390,7 +389,7 @@ def make(o: Options, name: str) -> None:
             text, extra = reconstruction(runs, fps), {"fps": fps}
     write(o, name, text, runs, begin, extra)
     if plot is not None:
-        save_plot(o, name, plot(runs))
+        plot(runs).savefig(o.folder / f"{name}.png", dpi=120)
 
 
 def main() -> None:

@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 
 from checkout import commit, git
 from mixtures import read_groups, within_groups_ev
+from towns import ISO8, at
 
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.text import markdown_table
@@ -68,13 +69,6 @@ def version(label: str, root: Path) -> Version:
     return Version(label, root, commit(root), code)
 
 
-def at(values: Any, *path: str) -> float | None:
-    """Return a value of nested mappings, or None where there is none."""
-    for key in path:
-        values = values.get(key) if isinstance(values, Mapping) else None
-    return values if isinstance(values, int | float) else None
-
-
 def execute(job: Job, words: Sequence[str], work: Path) -> dict[str, Any]:
     """Run a fit and return its row.
 
@@ -109,11 +103,11 @@ def execute(job: Job, words: Sequence[str], work: Path) -> dict[str, Any]:
         "date": datetime.datetime.now().isoformat(timespec="seconds"),
         "wall_s": round(wall, 2),
         "cpu_s": round(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, 1),
-        "steps": at(metrics, "counts", "steps"),
-        "gaussians": at(metrics, "counts", "gaussians"),
-        "test_psnr": at(metrics, "test", "exposure_fitted", "psnr"),
-        "reference_test_psnr": at(metrics, "reference", "scale_aligned", "test", "psnr"),
-        "ev": within_groups_ev(photometry, groups) if groups else at(error or {}, "ev"),
+        "steps": at(metrics, ("counts", "steps")),
+        "gaussians": at(metrics, ("counts", "gaussians")),
+        "test_psnr": at(metrics, ("test", "exposure_fitted", "psnr")),
+        "reference_test_psnr": at(metrics, (*ISO8, "test", "psnr")),
+        "ev": within_groups_ev(photometry, groups) if groups else at(error, ("ev",)),
     }
 
 

@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 from checkout import commit
-from matplotlib.figure import Figure
 
 import p2gs_jax
 from p2gs_jax.config import FitConfig, PresetName
@@ -184,7 +183,7 @@ class Runs:
 
     def mean(self, method: str, std: float, *path: str) -> float:
         """Return the mean over towns of a value of metrics.json; NaN where none has it."""
-        found = [_at(m, path) for (a, s, _), m in self.metrics.items() if (a, s) == (method, std)]
+        found = [at(m, path) for (a, s, _), m in self.metrics.items() if (a, s) == (method, std)]
         values = [v for v in found if v is not None]
         return float(np.mean(values)) if values else float("nan")
 
@@ -230,7 +229,8 @@ def fit_all(o: Options, wanted: Mapping[float, Mapping[str, FitConfig]]) -> Runs
     return Runs(metrics, folders, tuple(failures), used)
 
 
-def _at(values: Any, path: Sequence[str]) -> float | None:
+def at(values: Any, path: Sequence[str]) -> float | None:
+    """Return a value of nested mappings, or None where there is none."""
     for key in path:
         values = values.get(key) if isinstance(values, Mapping) else None
     return values
@@ -241,7 +241,7 @@ def number(value: float, digits: int) -> str:
     return "n/a" if not np.isfinite(value) else f"{value:.{digits}f}"
 
 
-def titles(columns: Sequence[Column]) -> tuple[str, ...]:
+def titles(columns: Sequence[tuple[str, Any, int]]) -> tuple[str, ...]:
     """Return what the header says of these columns."""
     return tuple(title for title, _, _ in columns)
 
@@ -287,11 +287,6 @@ def write(
     )
     (o.folder / f"{name}.md").write_text(markdown + foot)
     print(markdown + foot)
-
-
-def save_plot(o: Options, name: str, figure: Figure) -> None:
-    """Write a table's plot beside it."""
-    figure.savefig(o.folder / f"{name}.png", dpi=120)
 
 
 def _scalars(values: Mapping[str, Any]) -> dict[str, Any]:

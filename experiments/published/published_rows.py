@@ -112,11 +112,9 @@ def fitted(scene: Path, run: Path, options: Sequence[str], again: bool = False) 
         write_json(record, made)
         resumed = ["--resume"] if begun else []
         words = ["fit", str(scene), "--out", str(run), *options, *resumed]
-        code = subprocess.run(
-            [sys.executable, "-m", "p2gs_jax.cli", *words], check=False
-        ).returncode
-        if code:
-            raise SystemExit(f"p2gs-jax {' '.join(words)} ended with {code}")
+        done = subprocess.run([sys.executable, "-m", "p2gs_jax.cli", *words], check=False)
+        if done.returncode:
+            raise SystemExit(f"p2gs-jax {' '.join(words)} ended with {done.returncode}")
     metrics = json.loads(found.read_text(encoding="utf-8"))
     return Fit(metrics, ", then ".join(made["commits"]))
 
@@ -144,9 +142,8 @@ def options(
     """Return the options that all benchmarks have."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("scenes", type=Path, nargs="+", help="scene folders")
-    parser.add_argument(
-        "--out", type=Path, default=Path(tempfile.gettempdir(), f"published_{name}")
-    )
+    out = Path(tempfile.gettempdir(), f"published_{name}")
+    parser.add_argument("--out", type=Path, default=out)
     parser.add_argument("--methods", nargs="+", default=list(methods))
     parser.add_argument("--steps", type=int, nargs="+", default=list(steps))
     parser.add_argument("--again", action="store_true", help="measure also what is there")

@@ -79,16 +79,10 @@ def only_headers(width: int, height: int) -> Iterator[tuple[str, Broken]]:
     yield "tif", Broken(said, tiff)
 
 
-def profile_bomb(size: int) -> bytes:
-    """Return a PNG whose colour profile unpacks to many bytes."""
+def bomb(kind: bytes, size: int) -> bytes:
+    """Return a PNG with a part, a colour profile or a comment, that unpacks to many bytes."""
     png = encoded(noise(48, 32), "png")
-    return with_chunk(png, b"iCCP", b"bomb\0\0" + zlib.compress(bytes(size), 9))
-
-
-def text_bomb(size: int) -> bytes:
-    """Return a PNG with a comment that unpacks to many bytes."""
-    png = encoded(noise(48, 32), "png")
-    return with_chunk(png, b"zTXt", b"Comment\0\0" + zlib.compress(bytes(size), 9))
+    return with_chunk(png, kind, b"Comment\0\0" + zlib.compress(bytes(size), 9))
 
 
 def with_exif(width: int, height: int) -> bytes:

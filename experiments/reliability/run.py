@@ -86,8 +86,8 @@ def one(module: ModuleType, quick: bool, out: Path) -> Family:
         found = Family(module.NAME, 0, 0, (Failure("the family itself", reason),))
     return replace(
         found,
-        command=found.command or f"{COMMAND} {module.NAME}",
-        seconds=found.seconds or time.perf_counter() - start,
+        command=f"{COMMAND} {module.NAME}",
+        seconds=time.perf_counter() - start,
     )
 
 

@@ -24,6 +24,7 @@ from reliability.family import Failure, Family, Report
 SECONDS = 30.0
 BYTES = 2 * 2**30
 REFUSED = 2
+ENDS: dict[int | None, str] = {0: "done", REFUSED: "refused"}
 # How a child says that what it read makes no sense.
 NONSENSE = 70
 _GRANULE = 0.01
@@ -34,9 +35,9 @@ class Trial:
     """Something to be survived."""
 
     name: str  # unique in its family
-    # writes what is needed into an empty folder, and returns the folder or file to name
-    make: Callable[[Path], Path]
-    # is given what `make` returned, in a child; its code is that of the command line
+    # writes what is needed into an empty folder; returns the folder or file to name, if another one
+    make: Callable[[Path], Path | None]
+    # is given what is named, in a child; its code is that of the command line
     act: Callable[[Path], int]
     # one of these words has to be in a refusal; empty: a path below the folder
     named: tuple[str, ...] = ()
@@ -55,12 +56,7 @@ class Outcome:
     peak: int  # resident memory, bytes
 
 
-def run_trials(
-    name: str,
-    trials: Sequence[Trial],
-    out: Path,
-    report: Report,
-) -> Family:
+def run_trials(name: str, trials: Sequence[Trial], out: Path, report: Report) -> Family:
     """Try all, one child each.
 
     Args:
@@ -69,15 +65,12 @@ def run_trials(
         out: an empty folder; every trial has a folder of its own there while it runs.
         report: receives progress.
     """
-    start = time.perf_counter()
     failures, outcomes = [], []
     kinds: Counter[str] = Counter()
     for number, trial in enumerate(trials, 1):
         outcome, reason = attempt(trial, out / "trial")
         outcomes.append(outcome)
-        kinds[
-            "done" if outcome.code == 0 else "refused" if outcome.code == REFUSED else "else"
-        ] += 1
+        kinds[ENDS.get(outcome.code, "neither")] += 1
         if reason is not None:
             failures.append(Failure(trial.name, reason))
             report(f"{trial.name}: {reason}")
@@ -86,18 +79,12 @@ def run_trials(
     figures = {
         "done": kinds["done"],
         "refused": kinds["refused"],
-        "neither": kinds["else"],
+        "neither": kinds["neither"],
         "longest, s": max((o.seconds for o in outcomes), default=0.0),
         "largest peak, MiB": round(max((o.peak for o in outcomes), default=0) / 2**20),
     }
-    return Family(
-        name,
-        len(trials),
-        len(trials) - len(failures),
-        tuple(failures),
-        seconds=time.perf_counter() - start,
-        figures=(figures,),
-    )
+    survived = len(trials) - len(failures)
+    return Family(name, len(trials), survived, tuple(failures), figures=(figures,))
 
 
 def attempt(trial: Trial, folder: Path) -> tuple[Outcome, str | None]:
@@ -106,7 +93,7 @@ def attempt(trial: Trial, folder: Path) -> tuple[Outcome, str | None]:
     scene, elsewhere = folder / "scene", folder / "elsewhere"
     scene.mkdir(parents=True)
     elsewhere.mkdir()
-    named = trial.make(scene)
+    named = trial.make(scene) or scene
     before = _listing(folder)
     outcome = in_child(lambda: trial.act(named), elsewhere, trial.seconds, trial.data)
     reason = _wrong(trial, outcome, folder)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 GAMMA = 2.2
 FOCAL = 60.0
@@ -97,7 +98,7 @@ def write_scene(root: Path, made: Made, seed: int = 0) -> Path:
             tracks[p].append((v + 1, len(shown)))
             shown.append(f"{x:.4f} {y:.4f} {p + 1}")
         t = -rotation @ (center * made.scale + np.array(made.origin))
-        q = _quaternion(rotation)
+        q = Rotation.from_matrix(rotation).as_quat(scalar_first=True)
         pose = " ".join(repr(float(x)) for x in (*q, *t))
         observed = " ".join(shown) if made.tracks else ""
         lines += [f"{v + 1} {pose} {v + 1} {name}", observed]
@@ -132,9 +133,3 @@ def _photograph(
             cv2.circle(image, middle, 2 * 16, dot, -1, cv2.LINE_AA, 4)
             found.append((int(p), x, y))
     return np.clip(image, 0, 1) ** (1 / GAMMA), found
-
-
-def _quaternion(rotation: np.ndarray) -> np.ndarray:
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(rotation).as_quat(scalar_first=True)

@@ -7,6 +7,7 @@ import json
 import shutil
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -69,15 +70,19 @@ def _drives(made: Path) -> Iterator[Trial]:
             for p in whole.rglob("*")
             if p.is_file() and p.suffix not in (".png", ".jpg")
         )
-        yield Trial(f"{name} whole", _copied(whole, drive, None, None), read, refused=False)
+        yield Trial(
+            f"{name} whole", partial(_copied, whole, drive, None, None), read, refused=False
+        )
         rng = np.random.default_rng(SEED + number)
         for _ in range(DAMAGES):
             place = files[int(rng.integers(len(files)))]
             broken = _damaged((whole / place).read_bytes(), rng)
-            damaged = _copied(whole, drive, place, broken)
+            damaged = partial(_copied, whole, drive, place, broken)
             yield Trial(f"{name}, {place}: {broken.name}", damaged, read)
         for place in files[:: max(1, len(files) // 6)]:
-            yield Trial(f"{name}, {place} is gone", _copied(whole, drive, place, None), read)
+            yield Trial(
+                f"{name}, {place} is gone", partial(_copied, whole, drive, place, None), read
+            )
 
 
 def _ways_out(made: Path) -> Iterator[Trial]:
@@ -92,7 +97,7 @@ def _ways_out(made: Path) -> Iterator[Trial]:
         data = (whole / place).read_bytes()
         for new in news:
             broken = Broken(f"{new.decode()} for {old.decode()}", data.replace(old, new))
-            made_so = _copied(whole, Path("set"), place, broken)
+            made_so = partial(_copied, whole, Path("set"), place, broken)
             yield Trial(f"nuscenes, {place}: {broken.name}", made_so, read, refused=True)
 
 
@@ -109,28 +114,19 @@ def _damaged(data: bytes, rng: np.random.Generator) -> Broken:
     return ways[int(rng.integers(len(ways)))]
 
 
-def _copied(
-    whole: Path, drive: Path, place: str | None, broken: Broken | None
-) -> Callable[[Path], Path]:
-    """Return what makes a copy in which one file is another, or gone, and names its drive."""
-
-    def make(root: Path) -> Path:
-        shutil.copytree(whole, root, dirs_exist_ok=True)
-        if place is not None and broken is None:
-            (root / place).unlink()
-        elif place is not None and broken is not None:
-            (root / place).write_bytes(broken.data)
-        return root / drive
-
-    return make
+def _copied(whole: Path, drive: Path, place: str | None, broken: Broken | None, root: Path) -> Path:
+    """Make a copy in which one file is another, or gone; return its drive."""
+    shutil.copytree(whole, root, dirs_exist_ok=True)
+    if place is not None and broken is None:
+        (root / place).unlink()
+    elif place is not None and broken is not None:
+        (root / place).write_bytes(broken.data)
+    return root / drive
 
 
-def _file(name: str, data: bytes) -> Callable[[Path], Path]:
-    def make(root: Path) -> Path:
-        (root / name).write_bytes(data)
-        return root / name
-
-    return make
+def _file(name: str, data: bytes, root: Path) -> Path:
+    (root / name).write_bytes(data)
+    return root / name
 
 
 def _refused(act: Callable[[Path], object]) -> Callable[[Path], int]:
@@ -163,7 +159,7 @@ def _exposures() -> Iterator[Trial]:
         Broken("more values than columns", b"image,ev\na,1,2,3\n"),
         Broken("UTF-16", table.encode("utf-16")),
     ):
-        yield Trial(f"exposures: {broken.name}", _file("exposures.csv", broken.data), act)
+        yield Trial(f"exposures: {broken.name}", partial(_file, "exposures.csv", broken.data), act)
 
 
 def _cameras() -> Iterator[Trial]:
@@ -186,7 +182,7 @@ def _cameras() -> Iterator[Trial]:
     act = _refused(read_cameras)
     for name, tree in (("cameras", [camera]), ("camera path", path)):
         for broken in wrong_json(tree, rng, 0.15):
-            yield Trial(f"{name}: {broken.name}", _file("cameras.json", broken.data), act)
+            yield Trial(f"{name}: {broken.name}", partial(_file, "cameras.json", broken.data), act)
 
 
 def _runs(made: Path) -> Iterator[Trial]:
@@ -205,15 +201,11 @@ def _runs(made: Path) -> Iterator[Trial]:
             every = list(wrong_json(json.loads(data), rng, 0.3))
             found += [every[int(k)] for k in rng.choice(len(every), 6, replace=False)]
         for broken in found:
-            make = _run_with(whole, place, broken)
+            make = partial(_run_with, whole, place, broken)
             yield Trial(f"run, {place}: {broken.name}", make, act, data=ADDRESSES)
 
 
-def _run_with(whole: Path, place: str, broken: Broken) -> Callable[[Path], Path]:
-    def make(root: Path) -> Path:
-        for name in RUN_FILES:
-            shutil.copyfile(whole / name, root / name)
-        (root / place).write_bytes(broken.data)
-        return root
-
-    return make
+def _run_with(whole: Path, place: str, broken: Broken, root: Path) -> None:
+    for name in RUN_FILES:
+        shutil.copyfile(whole / name, root / name)
+    (root / place).write_bytes(broken.data)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -30,7 +31,6 @@ NAME = "broken_models"
 ABOUT = """COLMAP models (binary and text), transforms.json, seed points, split lists and
 masks that are cut at fields, flipped, miscounted or out of range. Each is read whole, or refused
 with code 2 by a message that names file, fault and remedy, within 30 s and 2 GB."""
-_TRANSFORMS = "tests/scene/test_transforms.py"
 SEED = 20261123
 SPACING = 9
 
@@ -43,37 +43,29 @@ def run(quick: bool, out: Path, report: Report) -> Family:
 def trials() -> Iterator[Trial]:
     """Yield all, in their order."""
     for text in (False, True):
-        yield Trial(f"colmap whole ({text})", _whole(text), read, refused=False)
-    yield Trial("transforms whole", _made(scenes.write_transforms), read, refused=False)
+        yield Trial(
+            f"colmap whole ({text})",
+            partial(_made, partial(scenes.write_colmap, text=text)),
+            read,
+            refused=False,
+        )
+    yield Trial("transforms whole", partial(_made, scenes.write_transforms), read, refused=False)
     yield from _colmap()
     yield from _transforms()
     yield from _masks()
 
 
-def _whole(text: bool) -> Callable[[Path], Path]:
-    def make(root: Path) -> Path:
-        scenes.write_colmap(root, text)
-        return root
-
-    return make
-
-
-def _made(write: Callable[[Path], object]) -> Callable[[Path], Path]:
-    def make(root: Path) -> Path:
-        write(root)
-        return root
-
-    return make
+def _made(write: Callable[[Path], object], root: Path) -> None:
+    write(root)
 
 
 def _with(write: Callable[[Path], object], place: str, broken: Broken) -> Trial:
     """Return a trial of a scene in which one file is another."""
 
-    def make(root: Path) -> Path:
+    def make(root: Path) -> None:
         write(root)
         (root / place).parent.mkdir(parents=True, exist_ok=True)
         (root / place).write_bytes(broken.data)
-        return root
 
     return Trial(f"{place}: {broken.name}", make, read)
 

@@ -42,43 +42,30 @@ def trials() -> Iterator[Trial]:
     yield from _exif()
 
 
-def _among(data: Callable[[], bytes], suffix: str, size: tuple[int, int]) -> Callable[[Path], Path]:
-    """Return what makes a scene of which one photograph is another, whose size is known."""
-
-    def make(root: Path) -> Path:
-        scenes.write_photographs(root / "images")
-        (root / "images" / scenes.names()[1]).unlink()
-        name = f"000001.{suffix}"
-        (root / "images" / name).write_bytes(data())
-        said = scenes.transforms()
-        for key in ("train_filenames", "test_filenames", "ply_file_path"):
-            del said[key]
-        width, height = size
-        said["frames"][1] |= {"file_path": f"images/{name}", "w": width, "h": height}
-        said["frames"][1] |= {"cx": width / 2, "cy": height / 2}
-        (root / "transforms.json").write_text(json.dumps(said))
-        return root
-
-    return make
+def _among(data: Callable[[], bytes], suffix: str, size: tuple[int, int], root: Path) -> None:
+    """Make a scene of which one photograph is another, whose size is known."""
+    scenes.write_photographs(root / "images")
+    (root / "images" / scenes.names()[1]).unlink()
+    name = f"000001.{suffix}"
+    (root / "images" / name).write_bytes(data())
+    said = scenes.transforms()
+    for key in ("train_filenames", "test_filenames", "ply_file_path"):
+        del said[key]
+    width, height = size
+    said["frames"][1] |= {"file_path": f"images/{name}", "w": width, "h": height}
+    said["frames"][1] |= {"cx": width / 2, "cy": height / 2}
+    (root / "transforms.json").write_text(json.dumps(said))
 
 
-def _alone(data: Callable[[], bytes], suffix: str) -> Callable[[Path], Path]:
-    def make(root: Path) -> Path:
-        scenes.write_photographs(root / "images")
-        (root / "images" / f"more.{suffix}").write_bytes(data())
-        return root
-
-    return make
+def _alone(data: Callable[[], bytes], suffix: str, root: Path) -> None:
+    scenes.write_photographs(root / "images")
+    (root / "images" / f"more.{suffix}").write_bytes(data())
 
 
-def _mask(data: Callable[[], bytes]) -> Callable[[Path], Path]:
-    def make(root: Path) -> Path:
-        scenes.write_colmap(root)
-        (root / "masks").mkdir()
-        (root / "masks" / scenes.names()[1]).write_bytes(data())
-        return root
-
-    return make
+def _mask(data: Callable[[], bytes], root: Path) -> None:
+    scenes.write_colmap(root)
+    (root / "masks").mkdir()
+    (root / "masks" / scenes.names()[1]).write_bytes(data())
 
 
 def _sizes() -> Iterator[Trial]:
@@ -86,7 +73,7 @@ def _sizes() -> Iterator[Trial]:
         for kind in ("png", "jpg"):
             yield Trial(
                 f"size: {width}x{height}.{kind}",
-                _among(_noise(width, height, kind), kind, (width, height)),
+                partial(_among, _noise(width, height, kind), kind, (width, height)),
                 read,
                 refused=False,
             )
@@ -102,30 +89,30 @@ def _bombs() -> Iterator[Trial]:
         for depth, colour in ((1, 0), (8, 0), (1, 3), (8, 2)):
             if colour == 2 and size[0] > 13_000:
                 continue
-            data = _black(*size, depth, colour)
+            data = partial(pictures.black_png, *size, depth, colour)
             said = f"{name}, {depth} bits, kind {colour}"
-            yield Trial(f"bomb: {said}", _among(data, "png", size), read)
-            yield Trial(f"bomb as a mask: {said}", _mask(data), read)
-        yield Trial(f"bomb alone: {name}", _alone(_black(*size, 1, 0), "png"), read)
+            yield Trial(f"bomb: {said}", partial(_among, data, "png", size), read)
+            yield Trial(f"bomb as a mask: {said}", partial(_mask, data), read)
+        yield Trial(
+            f"bomb alone: {name}",
+            partial(_alone, partial(pictures.black_png, *size, 1, 0), "png"),
+            read,
+        )
     for size in ((20_000, 20_000), (60_000, 60_000), (2**31 - 1, 2**31 - 1), (0, 0)):
         for suffix, broken in pictures.only_headers(*size):
-            make = _among(_held(broken.data), suffix, size if size[0] else (1, 1))
+            make = partial(_among, _held(broken.data), suffix, size if size[0] else (1, 1))
             yield Trial(f"bomb: {broken.name}.{suffix}", make, read, refused=True)
     for size in (2**20, 2**30):
-        for name, bomb in (("profile", pictures.profile_bomb), ("comment", pictures.text_bomb)):
-            yield Trial(f"a {name} of {size} zeros", _png(partial(bomb, size)), read)
-
-
-def _black(width: int, height: int, depth: int, colour: int) -> Callable[[], bytes]:
-    return lambda: pictures.black_png(width, height, depth, colour)
+        for name, kind in (("profile", b"iCCP"), ("comment", b"zTXt")):
+            yield Trial(
+                f"a {name} of {size} zeros",
+                partial(_among, partial(pictures.bomb, kind, size), "png", SIZE),
+                read,
+            )
 
 
 def _held(data: bytes) -> Callable[[], bytes]:
     return lambda: data
-
-
-def _png(data: Callable[[], bytes]) -> Callable[[Path], Path]:
-    return _among(data, "png", SIZE)
 
 
 def _kinds() -> Iterator[Trial]:
@@ -170,7 +157,7 @@ def _kinds() -> Iterator[Trial]:
     }
     for name, data in made.items():
         suffix = name.rsplit(".", 1)[1]
-        yield Trial(f"kind: {name}", _among(_held(data), suffix, SIZE), read)
+        yield Trial(f"kind: {name}", partial(_among, _held(data), suffix, SIZE), read)
 
 
 def _broken() -> Iterator[Trial]:
@@ -179,17 +166,26 @@ def _broken() -> Iterator[Trial]:
         data = pictures.encoded(pictures.noise(*SIZE), kind)
         for broken in (*cuts(data, rng, 8), *flips(data[:200], rng, 12)):
             whole = broken.data if "cut" in broken.name else broken.data + data[200:]
-            yield Trial(f"{kind}: {broken.name}", _among(_held(whole), kind, SIZE), read)
+            yield Trial(f"{kind}: {broken.name}", partial(_among, _held(whole), kind, SIZE), read)
         yield Trial(
-            f"{kind}: twice over", _among(_held(data + data), kind, SIZE), read, refused=False
+            f"{kind}: twice over",
+            partial(_among, _held(data + data), kind, SIZE),
+            read,
+            refused=False,
         )
     for kind in (*pictures.KINDS, *DEVELOPED):
         for broken in random_bytes(rng):
             yield Trial(
-                f"{kind}: {broken.name}", _among(_held(broken.data), kind, SIZE), read, refused=True
+                f"{kind}: {broken.name}",
+                partial(_among, _held(broken.data), kind, SIZE),
+                read,
+                refused=True,
             )
         yield Trial(
-            f"{kind} alone: noise", _alone(_held(rng.bytes(4096)), kind), read, refused=True
+            f"{kind} alone: noise",
+            partial(_alone, _held(rng.bytes(4096)), kind),
+            read,
+            refused=True,
         )
 
 
@@ -201,14 +197,18 @@ def _exif() -> Iterator[Trial]:
     exif, rest = data[start : start + size], data[start + size :]
     for broken in (*flips(exif, rng, 60), *_numbers(exif)):
         whole = data[:start] + broken.data + rest
-        yield Trial(f"EXIF: {broken.name}", _among(_held(whole), "jpg", SIZE), read, refused=False)
+        yield Trial(
+            f"EXIF: {broken.name}", partial(_among, _held(whole), "jpg", SIZE), read, refused=False
+        )
     png = io.BytesIO()
     pictures.noise(*SIZE).save(png, "png")
     for broken in random_bytes(rng):
         whole = pictures.with_chunk(png.getvalue(), b"eXIf", broken.data)
-        yield Trial(f"EXIF of a PNG: {broken.name}", _among(_held(whole), "png", SIZE), read)
+        yield Trial(
+            f"EXIF of a PNG: {broken.name}", partial(_among, _held(whole), "png", SIZE), read
+        )
         profile = pictures.encoded(pictures.noise(*SIZE), "png", icc_profile=broken.data or b"x")
-        yield Trial(f"profile: {broken.name}", _among(_held(profile), "png", SIZE), read)
+        yield Trial(f"profile: {broken.name}", partial(_among, _held(profile), "png", SIZE), read)
 
 
 def _numbers(exif: bytes) -> Iterator[Broken]:

@@ -8,6 +8,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -57,25 +58,18 @@ def trials() -> Iterator[Trial]:
     """Yield all, in their order."""
     for name, case in CASES.items():
 
-        def make(root: Path, case: Case = case) -> Path:
+        def make(root: Path, case: Case = case) -> None:
             case.make(root)
             if case.known:
                 (root / "known.csv").write_text("image,exposure\na.png,1\n")
-            return root
 
-        def act(root: Path, case: Case = case) -> int:
-            return _tried(root, case)
-
-        yield Trial(name, make, act, case.says, case.right is None)
+        yield Trial(name, make, partial(_tried, case), case.says, case.right is None)
     for words, seconds in BUDGETS.items():
-
-        def said(root: Path, words: str = words, seconds: float | None = seconds) -> int:
-            return _budget(words, seconds)
-
-        yield Trial(f"--budget {words}", lambda root: root, said, (words,), seconds is None)
+        act = partial(_budget, words, seconds)
+        yield Trial(f"--budget {words}", lambda root: root, act, (words,), seconds is None)
 
 
-def _tried(root: Path, case: Case) -> int:
+def _tried(case: Case, root: Path) -> int:
     """Read a scene as a fit does, but for structure from motion."""
     cfg = DataConfig()
     try:
@@ -96,7 +90,7 @@ def _tried(root: Path, case: Case) -> int:
     return NONSENSE
 
 
-def _budget(words: str, seconds: float | None) -> int:
+def _budget(words: str, seconds: float | None, root: Path) -> int:
     from p2gs_jax.cli.shared import parse_duration
 
     try:
@@ -157,16 +151,12 @@ def model_at(*places: str) -> Callable[[Path], None]:
     return make
 
 
-def transforms(change: Callable[[dict], object]) -> Callable[[Path], None]:
-    """Return a writer of a changed transforms.json."""
-
-    def make(root: Path) -> None:
-        scenes.write_transforms(root)
-        data = scenes.transforms()
-        change(data)
-        (root / "transforms.json").write_text(json.dumps(data))
-
-    return make
+def transforms(change: Callable[[dict], object], root: Path) -> None:
+    """Write a changed transforms.json."""
+    scenes.write_transforms(root)
+    data = scenes.transforms()
+    change(data)
+    (root / "transforms.json").write_text(json.dumps(data))
 
 
 def per_frame(data: dict) -> None:
@@ -214,50 +204,38 @@ def masked(place: str, suffix: str = "", alpha: bool = False, images: bool = Fal
     return make
 
 
-def with_alpha_of(value: int) -> Callable[[Path], None]:
-    """Return a writer of photographs whose alpha is one value everywhere."""
-
-    def make(root: Path) -> None:
-        scenes.write_colmap(root)
-        for name in NAMES:
-            path = root / "images" / name
-            pixels = np.asarray(Image.open(path).convert("RGBA")).copy()
-            pixels[..., 3] = value
-            Image.fromarray(pixels).save(path, "PNG")
-
-    return make
+def with_alpha_of(value: int, root: Path) -> None:
+    """Write photographs whose alpha is one value everywhere."""
+    scenes.write_colmap(root)
+    for name in NAMES:
+        path = root / "images" / name
+        pixels = np.asarray(Image.open(path).convert("RGBA")).copy()
+        pixels[..., 3] = value
+        Image.fromarray(pixels).save(path, "PNG")
 
 
-def seeds(kind: str, most: float) -> Callable[[Path], None]:
-    """Return a writer of seed points whose colours reach to `most`."""
-
-    def make(root: Path) -> None:
-        scenes.write_transforms(root)
-        head, rows = scenes.ply().split("end_header\n")
-        for color in ("red", "green", "blue"):
-            head = head.replace(f"property uchar {color}", f"property {kind} {color}")
-        lines = [line.split() for line in rows.splitlines()]
-        scaled = [[*w[:3], *(f"{float(c) * most / 255:.0f}" for c in w[3:])] for w in lines]
-        if most == 1.0:
-            scaled = [[*w[:3], *(f"{float(c) / 255:.4f}" for c in w[3:])] for w in lines]
-        rows = "\n".join(map(" ".join, scaled)) + "\n"
-        (root / "points.ply").write_text(head + "end_header\n" + rows)
-
-    return make
+def seeds(kind: str, most: float, root: Path) -> None:
+    """Write seed points whose colours reach to `most`."""
+    scenes.write_transforms(root)
+    head, rows = scenes.ply().split("end_header\n")
+    for color in ("red", "green", "blue"):
+        head = head.replace(f"property uchar {color}", f"property {kind} {color}")
+    lines = [line.split() for line in rows.splitlines()]
+    scaled = [[*w[:3], *(f"{float(c) * most / 255:.0f}" for c in w[3:])] for w in lines]
+    if most == 1.0:
+        scaled = [[*w[:3], *(f"{float(c) / 255:.4f}" for c in w[3:])] for w in lines]
+    rows = "\n".join(map(" ".join, scaled)) + "\n"
+    (root / "points.ply").write_text(head + "end_header\n" + rows)
 
 
-def exif(tags: dict[int, Any]) -> Callable[[Path], None]:
-    """Return a writer of JPEGs that carry these tags, exposure times a stop apart."""
-
-    def make(root: Path) -> None:
-        colmap(root, lambda name, k: name.replace(".png", ".jpg"))
-        for k, path in enumerate(sorted((root / "images").iterdir())):
-            image = Image.open(path).convert("RGB")
-            found = image.getexif()
-            found.get_ifd(0x8769).update({t: v(k) if callable(v) else v for t, v in tags.items()})
-            image.save(path, "JPEG", exif=found)
-
-    return make
+def exif(tags: dict[int, Any], root: Path) -> None:
+    """Write JPEGs that carry these tags, exposure times a stop apart."""
+    colmap(root, lambda name, k: name.replace(".png", ".jpg"))
+    for k, path in enumerate(sorted((root / "images").iterdir())):
+        image = Image.open(path).convert("RGB")
+        found = image.getexif()
+        found.get_ifd(0x8769).update({t: v(k) if callable(v) else v for t, v in tags.items()})
+        image.save(path, "JPEG", exif=found)
 
 
 def with_mark(*places: str) -> Callable[[Path], None]:
@@ -367,7 +345,7 @@ CASES: dict[str, Case] = {
         lambda r: colmap(r, lambda n, k: f"rig1/camera{k % 2}/{n}"), cameras(2)
     ),
     "T1 two of COLMAP in a folder": Case(lambda r: colmap(r, cameras=True), cameras(2)),
-    "T1 two intrinsics in a folder": Case(transforms(per_frame), cameras(2)),
+    "T1 two intrinsics in a folder": Case(partial(transforms, per_frame), cameras(2)),
     "T2 UTM": Case(far(4.5e5, 5.2e6, 100.0), sharp),
     "T2 the other hemisphere": Case(far(-6.3e6, 1.2e6, -3e6), sharp),
     "T4 masks/NAME_mask.png": Case(masked("masks", "{}_mask.png"), half_hidden),
@@ -380,8 +358,8 @@ CASES: dict[str, Case] = {
     "T4 of no photograph": Case(masked("masks", "other{}.png"), noted("none is of a photograph")),
     "T5 images/masks/": Case(masked("images/masks", images=True), photographs(4)),
     "T5 images/NAME_mask.png": Case(masked("images", "{}_mask.png", images=True), photographs(4)),
-    "T6 opaque alpha": Case(with_alpha_of(255), no_alpha),
-    "T7 alpha of nothing": Case(with_alpha_of(0), says=("images",)),
+    "T6 opaque alpha": Case(partial(with_alpha_of, 255), no_alpha),
+    "T7 alpha of nothing": Case(partial(with_alpha_of, 0), says=("images",)),
     **{
         f"T8 {place}": Case(model_at(place), whole)
         for place in ("colmap/sparse/0", "dense/0/sparse", "distorted/sparse/0", "sparse/model")
@@ -392,11 +370,13 @@ CASES: dict[str, Case] = {
         lambda r: (colmap(r), [p.rename(p.with_suffix(".PNG")) for p in (r / "images").iterdir()]),
         whole,
     ),
-    "T12 ushort colours": Case(seeds("ushort", 65535.0), same_colors),
-    "T12 float colours": Case(seeds("float", 1.0), same_colors),
-    "T13 time alone": Case(exif(SECONDS), a_stop_apart),
-    "T13 no f-number": Case(exif(SECONDS | {0x8827: 200}), a_stop_apart),
-    "T13 APEX": Case(exif({0x9201: lambda k: math.log2(500) - k, 0x9202: 3.0}), a_stop_apart),
+    "T12 ushort colours": Case(partial(seeds, "ushort", 65535.0), same_colors),
+    "T12 float colours": Case(partial(seeds, "float", 1.0), same_colors),
+    "T13 time alone": Case(partial(exif, SECONDS), a_stop_apart),
+    "T13 no f-number": Case(partial(exif, SECONDS | {0x8827: 200}), a_stop_apart),
+    "T13 APEX": Case(
+        partial(exif, {0x9201: lambda k: math.log2(500) - k, 0x9202: 3.0}), a_stop_apart
+    ),
     "T14 COLMAP": Case(with_mark(*(f"sparse/0/{n}" for n in scenes.colmap_text())), whole),
     "T14 transforms": Case(with_mark("transforms.json"), whole),
     "T15 names of several": Case(
@@ -404,7 +384,9 @@ CASES: dict[str, Case] = {
     ),
     "T17 points as PLY": Case(without_points, whole),
     "T18 degrees": Case(
-        transforms(lambda d: (d.update(camera_angle_x=50.0), d.pop("fl_x"), d.pop("fl_y"))),
+        partial(
+            transforms, lambda d: (d.update(camera_angle_x=50.0), d.pop("fl_x"), d.pop("fl_y"))
+        ),
         says=("transforms.json",),
     ),
     "S10 through a link": Case(linked, whole),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 from reliability import scenes
@@ -69,100 +70,82 @@ def run(quick: bool, out: Path, report: Report) -> Family:
 def trials() -> Iterator[Trial]:
     """Yield all, in their order."""
     for name, odd in ODD.items():
-        yield Trial(f"photograph: {name}", with_photograph(odd), read)
-        yield Trial(f"camera: {name}", _camera(odd.removesuffix(".png")), read)
-        yield Trial(f"scene folder: {name}", _folder(odd), read)
-        yield Trial(f"of no photograph: {name}", _named_in_transforms(odd), read, refused=True)
+        yield Trial(f"photograph: {name}", partial(with_photograph, odd), read)
+        yield Trial(f"camera: {name}", partial(_camera, odd.removesuffix(".png")), read)
+        yield Trial(f"scene folder: {name}", partial(_folder, odd), read)
+        yield Trial(
+            f"of no photograph: {name}", partial(_named_in_transforms, odd), read, refused=True
+        )
     for name, outside in OUTSIDE.items():
-        yield Trial(f"model: {name}", _colmap_names(outside), read, refused=True)
-        yield Trial(f"transforms: {name}", _named_in_transforms(outside), read, refused=True)
+        yield Trial(f"model: {name}", partial(_colmap_names, outside), read, refused=True)
+        yield Trial(
+            f"transforms: {name}", partial(_named_in_transforms, outside), read, refused=True
+        )
         for key in ("mask_path", "ply_file_path"):
-            yield Trial(f"{key}: {name}", _key(key, outside), read, refused=True)
-    yield Trial("images lead to themselves", _loop("images"), read, refused=True)
-    yield Trial("a photograph leads to itself", _loop(f"images/{scenes.names()[1]}"), read)
-    yield Trial("masks lead to themselves", _loop("masks"), read)
-    yield Trial("a model leads to itself", _loop("sparse"), read)
+            yield Trial(f"{key}: {name}", partial(_key, key, outside), read, refused=True)
+    yield Trial("images lead to themselves", partial(_loop, "images"), read, refused=True)
+    yield Trial("a photograph leads to itself", partial(_loop, f"images/{scenes.names()[1]}"), read)
+    yield Trial("masks lead to themselves", partial(_loop, "masks"), read)
+    yield Trial("a model leads to itself", partial(_loop, "sparse"), read)
     yield Trial("a folder of images holds itself", _inside_itself, read)
     yield Trial("photographs alone in a folder that holds itself", _alone_inside_itself, read)
-    yield Trial("a photograph is a folder", _of_kind(lambda p: p.mkdir()), read, refused=True)
-    yield Trial("a photograph is a pipe", _of_kind(os.mkfifo), read, refused=True)
+    yield Trial(
+        "a photograph is a folder", partial(_of_kind, lambda p: p.mkdir()), read, refused=True
+    )
+    yield Trial("a photograph is a pipe", partial(_of_kind, os.mkfifo), read, refused=True)
     yield Trial("the model is a pipe", _model_is_a_pipe, read, refused=True)
 
 
-def with_photograph(odd: str) -> Callable[[Path], Path]:
-    """Return what makes a scene of which one photograph has a name."""
-
-    def make(root: Path) -> Path:
-        scenes.write_transforms(root)
-        odd_path = root / "images" / odd
-        odd_path.parent.mkdir(exist_ok=True)
-        (root / "images" / scenes.names()[1]).rename(odd_path)
-        said = scenes.transforms()
-        said["train_filenames"] = said["test_filenames"] = None
-        said["frames"][1]["file_path"] = f"images/{odd}"
-        (root / "transforms.json").write_text(json.dumps(said))
-        return root
-
-    return make
+def with_photograph(odd: str, root: Path) -> None:
+    """Make a scene of which one photograph has a name."""
+    scenes.write_transforms(root)
+    odd_path = root / "images" / odd
+    odd_path.parent.mkdir(exist_ok=True)
+    (root / "images" / scenes.names()[1]).rename(odd_path)
+    said = scenes.transforms()
+    said["train_filenames"] = said["test_filenames"] = None
+    said["frames"][1]["file_path"] = f"images/{odd}"
+    (root / "transforms.json").write_text(json.dumps(said))
 
 
-def _camera(odd: str) -> Callable[[Path], Path]:
-    def make(root: Path) -> Path:
-        scenes.write_transforms(root)
-        place = root / "images" / odd.replace("/", "|")
-        place.mkdir()
-        said = json.loads((root / "transforms.json").read_text())
-        frame = said["frames"][0]
-        photograph = root / frame["file_path"]
-        photograph.rename(place / photograph.name)
-        frame["file_path"] = f"images/{place.name}/{photograph.name}"
-        (root / "transforms.json").write_text(json.dumps(said))
-        return root
-
-    return make
+def _camera(odd: str, root: Path) -> None:
+    scenes.write_transforms(root)
+    place = root / "images" / odd.replace("/", "|")
+    place.mkdir()
+    said = json.loads((root / "transforms.json").read_text())
+    frame = said["frames"][0]
+    photograph = root / frame["file_path"]
+    photograph.rename(place / photograph.name)
+    frame["file_path"] = f"images/{place.name}/{photograph.name}"
+    (root / "transforms.json").write_text(json.dumps(said))
 
 
-def _folder(odd: str) -> Callable[[Path], Path]:
-    def make(root: Path) -> Path:
-        scenes.write_colmap(root / odd)
-        (root / odd / "sparse" / "0" / "cameras.bin").write_bytes(b"")
-        return root / odd
-
-    return make
+def _folder(odd: str, root: Path) -> Path:
+    scenes.write_colmap(root / odd)
+    (root / odd / "sparse" / "0" / "cameras.bin").write_bytes(b"")
+    return root / odd
 
 
-def _named_in_transforms(odd: str) -> Callable[[Path], Path]:
-    def make(root: Path) -> Path:
-        scenes.write_transforms(root)
-        said = scenes.transforms()
-        said["frames"][1]["file_path"] = _secret(root, odd)
-        del said["train_filenames"], said["test_filenames"]
-        (root / "transforms.json").write_text(json.dumps(said))
-        return root
-
-    return make
+def _named_in_transforms(odd: str, root: Path) -> None:
+    scenes.write_transforms(root)
+    said = scenes.transforms()
+    said["frames"][1]["file_path"] = _secret(root, odd)
+    del said["train_filenames"], said["test_filenames"]
+    (root / "transforms.json").write_text(json.dumps(said))
 
 
-def _key(key: str, outside: str) -> Callable[[Path], Path]:
-    def make(root: Path) -> Path:
-        scenes.write_transforms(root)
-        said = scenes.transforms()
-        said[key] = _secret(root, outside)
-        (root / "transforms.json").write_text(json.dumps(said))
-        return root
-
-    return make
+def _key(key: str, outside: str, root: Path) -> None:
+    scenes.write_transforms(root)
+    said = scenes.transforms()
+    said[key] = _secret(root, outside)
+    (root / "transforms.json").write_text(json.dumps(said))
 
 
-def _colmap_names(outside: str) -> Callable[[Path], Path]:
-    def make(root: Path) -> Path:
-        model = scenes.write_colmap(root, text=True)
-        name = _secret(root, outside)
-        text = (model / "images.txt").read_text().replace(scenes.names()[1], name)
-        (model / "images.txt").write_text(text)
-        return root
-
-    return make
+def _colmap_names(outside: str, root: Path) -> None:
+    model = scenes.write_colmap(root, text=True)
+    name = _secret(root, outside)
+    text = (model / "images.txt").read_text().replace(scenes.names()[1], name)
+    (model / "images.txt").write_text(text)
 
 
 def _secret(root: Path, name: str) -> str:
@@ -174,44 +157,33 @@ def _secret(root: Path, name: str) -> str:
     return str(secret) if name == "ABSOLUTE" else name
 
 
-def _loop(place: str) -> Callable[[Path], Path]:
-    def make(root: Path) -> Path:
-        scenes.write_colmap(root)
-        path = root / place
-        if path.is_dir():
-            path.rename(root / "elsewhere")
-        path.unlink(missing_ok=True)
-        path.symlink_to(path.name)
-        return root
-
-    return make
+def _loop(place: str, root: Path) -> None:
+    scenes.write_colmap(root)
+    path = root / place
+    if path.is_dir():
+        path.rename(root / "elsewhere")
+    path.unlink(missing_ok=True)
+    path.symlink_to(path.name)
 
 
-def _inside_itself(root: Path) -> Path:
+def _inside_itself(root: Path) -> None:
     scenes.write_colmap(root)
     (root / "images" / "again").symlink_to(".")
-    return root
 
 
-def _alone_inside_itself(root: Path) -> Path:
+def _alone_inside_itself(root: Path) -> None:
     scenes.write_photographs(root / "images")
     (root / "images" / "again").symlink_to("..")
-    return root
 
 
-def _of_kind(become: Callable[[Path], object]) -> Callable[[Path], Path]:
-    def make(root: Path) -> Path:
-        scenes.write_colmap(root)
-        path = root / "images" / scenes.names()[1]
-        path.unlink()
-        become(path)
-        return root
-
-    return make
+def _of_kind(become: Callable[[Path], object], root: Path) -> None:
+    scenes.write_colmap(root)
+    path = root / "images" / scenes.names()[1]
+    path.unlink()
+    become(path)
 
 
-def _model_is_a_pipe(root: Path) -> Path:
+def _model_is_a_pipe(root: Path) -> None:
     model = scenes.write_colmap(root)
     (model / "points3D.bin").unlink()
     os.mkfifo(model / "points3D.bin")
-    return root

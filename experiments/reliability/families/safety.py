@@ -11,6 +11,7 @@ import sys
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +47,9 @@ def trials() -> Iterator[Trial]:
     yield from _pickles()
     yield Trial("temporary files are private", _nothing, _temporary_files)
     yield Trial("nothing runs text or unpickles freely", _nothing, _forbidden_calls)
-    yield Trial("a report of hostile names", _hostile, _report, refused=False, **SLOW)
+    yield Trial(
+        "a report of hostile names", partial(with_photograph, HTML), _report, refused=False, **SLOW
+    )
 
 
 def _nothing(root: Path) -> Path:
@@ -83,32 +86,29 @@ def _viewer() -> Iterator[Trial]:
         ),
     }
     for name, (outside, path, headers, served) in asked.items():
-        act = _asks(outside, path, headers, served)
+        act = partial(_asks, outside, path, headers, served)
         yield Trial(f"viewer: {name}", _nothing, act, seconds=60)
     yield Trial("viewer: the address it listens on", _nothing, _listens)
 
 
-def _asks(outside: bool, path: str, headers: dict[str, str], served: bool) -> Callable[[Path], int]:
-    def act(root: Path) -> int:
-        import viser
+def _asks(outside: bool, path: str, headers: dict[str, str], served: bool, root: Path) -> int:
+    import viser
 
-        from p2gs_jax.viewer.server import Guard, guard_of, guarded
+    from p2gs_jax.viewer.server import Guard, guard_of, guarded
 
-        guard = Guard(None, SECRET) if outside else guard_of(LOOPBACK)
-        with guarded(guard):
-            server = viser.ViserServer(host=LOOPBACK, port=0, verbose=False)
-        port = server.get_port()
-        own = f"{LOOPBACK}:{port}"
-        sent = {key: value.format(own=own, port=port) for key, value in headers.items()}
-        request = urllib.request.Request(f"http://{own}{path}", headers=sent)
-        try:
-            with urllib.request.urlopen(request, timeout=20) as answer:
-                found = answer.status == 200
-        except urllib.error.HTTPError:
-            found = False
-        return forbidden(found != served, f"served: {found}")
-
-    return act
+    guard = Guard(None, SECRET) if outside else guard_of(LOOPBACK)
+    with guarded(guard):
+        server = viser.ViserServer(host=LOOPBACK, port=0, verbose=False)
+    port = server.get_port()
+    own = f"{LOOPBACK}:{port}"
+    sent = {key: value.format(own=own, port=port) for key, value in headers.items()}
+    request = urllib.request.Request(f"http://{own}{path}", headers=sent)
+    try:
+        with urllib.request.urlopen(request, timeout=20) as answer:
+            found = answer.status == 200
+    except urllib.error.HTTPError:
+        found = False
+    return forbidden(found != served, f"served: {found}")
 
 
 def _listens(root: Path) -> int:
@@ -132,42 +132,35 @@ class _Evil:
 def _pickles() -> Iterator[Trial]:
     places = ("poses_bounds.npy", "scene.npz", "table.pkl", "table.pkl.gz")
     for place in places:
-        yield Trial(f"pickle: {place}", _evil(place), _opened(place), seconds=60)
+        yield Trial(f"pickle: {place}", partial(_evil, place), partial(_opened, place), seconds=60)
 
 
-def _evil(place: str) -> Callable[[Path], Path]:
-    def make(root: Path) -> Path:
-        import gzip
+def _evil(place: str, root: Path) -> None:
+    import gzip
 
-        evil = _Evil(str(root.parent / "elsewhere" / "unpickled"))
-        array = np.array([evil], object)
-        scenes.write_photographs(root / "images")
-        path = root / place
-        if place.endswith(".npy"):
-            np.save(path, array, allow_pickle=True)
-        elif place.endswith(".npz"):
-            np.savez(path, json=array)
-        elif place.endswith(".gz"):
-            path.write_bytes(gzip.compress(pickle.dumps(evil)))
-        else:
-            path.write_bytes(pickle.dumps(evil))
-        return root
-
-    return make
+    evil = _Evil(str(root.parent / "elsewhere" / "unpickled"))
+    array = np.array([evil], object)
+    scenes.write_photographs(root / "images")
+    path = root / place
+    if place.endswith(".npy"):
+        np.save(path, array, allow_pickle=True)
+    elif place.endswith(".npz"):
+        np.savez(path, json=array)
+    elif place.endswith(".gz"):
+        path.write_bytes(gzip.compress(pickle.dumps(evil)))
+    else:
+        path.write_bytes(pickle.dumps(evil))
 
 
-def _opened(place: str) -> Callable[[Path], int]:
-    def act(root: Path) -> int:
-        path = root / place
-        if place.endswith(".npy"):
-            code = read(root)
-        elif place == "scene.npz":
-            code = _as_run(root)
-        else:
-            code = _table(path)
-        return forbidden(Path("unpickled").exists(), "unpickled") or code
-
-    return act
+def _opened(place: str, root: Path) -> int:
+    path = root / place
+    if place.endswith(".npy"):
+        code = read(root)
+    elif place == "scene.npz":
+        code = _as_run(root)
+    else:
+        code = _table(path)
+    return forbidden(Path("unpickled").exists(), "unpickled") or code
 
 
 def _as_run(root: Path) -> int:
@@ -226,10 +219,6 @@ def unsafe_calls(package: Path) -> list[str]:
 def _forbidden_calls(root: Path) -> int:
     found = unsafe_calls(PACKAGE)
     return forbidden(bool(found), ", ".join(found))
-
-
-def _hostile(root: Path) -> Path:
-    return with_photograph(HTML)(root)
 
 
 def _report(root: Path) -> int:
