@@ -51,7 +51,7 @@ class ForeignRun(read.Run):
     splats: Gaussians  # with display colours, max(0, sh + 1/2)
     developed: DisplayTransform  # the look of the photographs that they were trained on
 
-    @property
+    @cached_property
     def metering(self) -> Metering:
         """Raise a UserError: no training exposures are known to splats."""
         fix = "leave out --meter, or give an exposure with --exposure-ev"
@@ -166,15 +166,21 @@ def common_look(folder: Path, saved: photometry_files.PhotometryFile) -> Display
     If there are none, it is the mean exposure and gamma of its `photometry.json`.
 
     Raises:
-        UserError: their table cannot be read.
+        UserError: their table cannot be read, or another calibration developed them.
     """
     mean, path = saved["mean"], folder / DEVELOPED
     cfg = photometry_files.with_formation_of(PhotometryConfig(), saved)
     common = DisplayTransform(mean["exposure_geometric"], mean["gamma"], cfg)
     if path.is_file():
-        with readable(path, "repeat `p2gs-jax calibrate ... --develop`"):
-            row = next(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+        fix = "repeat `p2gs-jax calibrate ... --develop`"
+        with readable(path, fix):
+            rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+            row, exposures = rows[0], [view["exposure"] for view in saved["views"]]
+            known = [(r["original_ev"], e) for r, e in zip(rows, exposures, strict=True) if e]
             common = replace(common, exposure=2.0 ** float(row["ev"]))
+            same = np.allclose([2.0 ** float(ev) for ev, _ in known], [e for _, e in known], 1e-3)
             if row["image"].lower().endswith(".exr"):
                 common = replace(common.with_curve("linear"), gamma=GAMMA_SRGB)
+        if not same:
+            raise broken(path, "and photometry.json are of different calibrations", fix)
     return common

@@ -1,6 +1,7 @@
 """Splats that another program trained on developed photographs, shown as photographs were."""
 
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -57,8 +58,10 @@ def trained(tmp_path_factory):
     make_scene(root / "scene", views=3, points=20, size=(WIDTH, HEIGHT))
     photometry(root / "cal", ("0.png", "1.png", "2.png"), "1")
     (root / "cal" / "developed").mkdir()
+    evs = (*np.log2(EXPOSURES), "")
+    rows = [f"{k}.png,1,{DEVELOPED_EV},{ev}\n" for k, ev in enumerate(evs)]
     table = root / "cal" / "developed" / "exposures.csv"
-    table.write_text(f"image,camera,ev\n0.png,1,{DEVELOPED_EV}\n")
+    table.write_text("image,camera,ev,original_ev\n" + "".join(rows))
     write_ply(root / "splat.ply", walls(srgb(2**DEVELOPED_EV * RADIANCE)), [])
     return root
 
@@ -106,12 +109,16 @@ def test_what_cannot_be_shown_is_refused(refused, trained, tmp_path):
     header = b"ply\nformat binary_little_endian 1.0\n" + vertices + b"end_header\n"
     (tmp_path / "points.ply").write_bytes(header + bytes(12))
     good, place, scene = trained / "splat.ply", trained / "cal", trained / "scene"
+    shutil.copytree(place, tmp_path / "later")
+    table = tmp_path / "later" / "developed" / "exposures.csv"
+    table.write_text(table.read_text().replace("-1.0", "-0.9"))
     for splats, photos, where, words in (
         (tmp_path / "points.ply", place, scene, ("not a valid PLY", "no field")),
         (tmp_path / "radiance.ply", place, scene, ("holds the radiance of a run",)),
         (scene / "images" / "0.png", place, scene, ("not a file of splats", ".compressed.ply")),
         (tmp_path / "none.ply", place, scene, ("none.ply is not a file", "check the path")),
         (good, tmp_path / "other", scene, ("none of the photographs", "0.png")),
+        (good, tmp_path / "later", scene, ("exposures.csv and photometry.json", "--develop")),
         (good, place, scene / "images", ("no COLMAP model", "developed")),
     ):
         text = refused("render", splats, "--photometry", photos, "--scene", where)
