@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 from p2gs_jax.core.numerics import fibonacci_sphere, on_device
 from p2gs_jax.render.harmonics import degree_of, table
 from p2gs_jax.render.project import STILL
-from p2gs_jax.types import Gaussians
+from p2gs_jax.scene.drives.objects import MovingObjects, middle_time
+from p2gs_jax.types import Gaussians, Scene
 
 # Number of directions of the least squares, which are exact because degree 3 has 16 coefficients.
 DIRECTIONS = 64
@@ -35,9 +36,21 @@ def chosen(gaussians: Gaussians, which: Bool[np.ndarray, " n"]) -> Gaussians:
     return jax.tree.map(lambda a: on_device(np.asarray(a)[which]), gaussians)
 
 
-def posed(
+def in_world(
     gaussians: Gaussians,
     owner: Int[np.ndarray, " n"] | None,
+    moving: MovingObjects | None,
+    scene: Scene,
+) -> Gaussians:
+    """Return all Gaussians in world coordinates, moving objects in the middle of the drive."""
+    if owner is None or moving is None:
+        return gaussians
+    return posed(gaussians, owner, *moving.poses(middle_time(scene)))
+
+
+def posed(
+    gaussians: Gaussians,
+    owner: Int[np.ndarray, " n"],
     poses: Float[np.ndarray, "k 4 4"],
     there: Bool[np.ndarray, " k"],
 ) -> Gaussians:
@@ -46,8 +59,6 @@ def posed(
     `owner` is the moving object of each Gaussian, -1: none. Gaussians of objects are given in the
     frames of their boxes; `poses` map box to world.
     """
-    if owner is None:
-        return gaussians
     owner = np.asarray(owner)
     kept = (owner < 0) | there[owner]
     owner = owner[kept]

@@ -156,10 +156,7 @@ def _accounted(
     }
     metered = found.metering.sentence if found.metering.telling else None
     late = over_budget(cfg.train.budget_s, seconds)
-    notes = [
-        *notes_on_missing(found.metrics),
-        *(note for note in (metered, late) if note is not None),
-    ]
+    notes = [*notes_on_missing(found.metrics), *filter(None, (metered, late))]
     account.notes.extend(notes)
     for note in notes:
         reporter.message(note)

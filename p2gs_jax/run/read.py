@@ -20,7 +20,7 @@ from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.frames import notebook_html, to_uint8
 from p2gs_jax.formats.ply import read_ply
-from p2gs_jax.gaussians.posed import chosen, posed, standing
+from p2gs_jax.gaussians.posed import chosen, in_world, standing
 from p2gs_jax.photometry import display
 from p2gs_jax.photometry.formation import camera_rows
 from p2gs_jax.photometry.metering import ExposureOf, Metering, meter
@@ -30,7 +30,7 @@ from p2gs_jax.run import photometry_files
 from p2gs_jax.run.decisions import read_decisions
 from p2gs_jax.run.folder import RunFolder, find
 from p2gs_jax.run.scene_file import read_objects, read_scene
-from p2gs_jax.scene.drives.objects import MovingObjects, middle_time
+from p2gs_jax.scene.drives.objects import MovingObjects
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.types import GAMMA_SRGB, Camera, Gaussians, Params, Photometry, Render, Scene
 
@@ -147,15 +147,9 @@ class Run:
             fix += "with --dynamics.method rigid"
             raise UserError(f"{self.folder} has no moving object with Gaussians.", fix=fix)
 
-    def as_of(self, time: float | None = None) -> Gaussians:
-        """Return all Gaussians in world coordinates, for programs without moving objects.
-
-        Moving objects have their poses at `time`, seconds; None: in the middle of the drive.
-        """
-        if self.owner is None or self.moving is None:
-            return self.params.gaussians
-        at = middle_time(self.scene) if time is None else time
-        return posed(self.params.gaussians, self.owner, *self.moving.poses(at))
+    def as_of(self) -> Gaussians:
+        """Return all Gaussians in world coordinates, moving objects in the middle of the drive."""
+        return in_world(self.params.gaussians, self.owner, self.moving, self.scene)
 
     def photograph(self, index: int) -> Float32[np.ndarray, "h w 3"]:
         """Return the photograph of a row of `scene.views` at the size of the fit, display values.

@@ -16,7 +16,7 @@ from p2gs_jax.evaluation.scores import ViewResult
 from p2gs_jax.formats.frames import OutputFrame, write_frame
 from p2gs_jax.formats.ply import write_ply, write_radiance
 from p2gs_jax.gaussians.bake import bake, display_comments
-from p2gs_jax.gaussians.posed import posed
+from p2gs_jax.gaussians.posed import in_world
 from p2gs_jax.photometry.display import usual_display
 from p2gs_jax.photometry.metering import Metering
 from p2gs_jax.photometry.solution import PhotometricSolution
@@ -27,7 +27,7 @@ from p2gs_jax.run.folder import RunFolder, remembered
 from p2gs_jax.run.photometry_files import write_appearance, write_fitted, write_metering
 from p2gs_jax.run.plots import write_summary
 from p2gs_jax.run.scene_file import write_objects, write_scene
-from p2gs_jax.scene.drives.objects import MovingObjects, middle_time
+from p2gs_jax.scene.drives.objects import MovingObjects
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.types import Params, Scene
 
@@ -117,9 +117,7 @@ def write_run(
         return
     write_scene(folder.root, scene)
     transform = usual_display(params, (), None, cfg.photometry).without_place()
-    placed = params.gaussians
-    if owner is not None and moving is not None:
-        placed = posed(placed, owner, *moving.poses(middle_time(scene)))
+    placed = in_world(params.gaussians, owner, moving, scene)
     baked = bake(at_time(placed, None), transform, cfg.render.radiance)
     write_ply(folder.splats, baked, display_comments(transform))
     write_metering(folder.metering, metering)

@@ -104,19 +104,17 @@ class BrowserSession:
     def save(self, kind: str, width: int) -> None:
         """Send the view as a file, rendered at `width` pixels."""
         view, settings = browser_view(self._client), self._panel.settings()
-        size = width, max(1, round(width / view.aspect))
+        run, size = self._viewed.run, (width, max(1, round(width / view.aspect)))
         text = f"Rendering {size[0]} x {size[1]} pixels ..."
         notice = self._client.add_notification("Saving", text, loading=True)
         try:
             frame = self._viewed.renderer.render_now(self._live.camera(view, size))
             if kind == "exr":
-                content = exr_bytes(frame, display_of(self._viewed.run, settings).without_place())
+                content = exr_bytes(frame, display_of(run, settings).without_place())
             else:
                 darkroom = Darkroom(self._viewed, self._live.darkroom.depth_limits)
                 content = png_bytes(darkroom.develop(frame, settings))
-            name = (
-                f"{self._viewed.run.folder.resolve().name}_{time.strftime('%Y%m%d_%H%M%S')}.{kind}"
-            )
+            name = f"{run.folder.resolve().name}_{time.strftime('%Y%m%d_%H%M%S')}.{kind}"
             self._client.send_file_download(name, content, save_immediately=True)
         except Exception as error:
             report(self._client, "Saving failed", error)

@@ -79,26 +79,20 @@ def test_a_photograph_lines_up_with_a_turned_camera(size):
 def test_vignetting_is_where_the_photograph_has_it():
     """The window's shape is not the photograph's; beyond its corners nothing darkens further."""
     K = np.array([[50.0, 0, 40], [0, 50.0, 30], [0, 0, 1]], np.float32)
-    vignetting_camera = Camera(np.eye(4, dtype=np.float32), K, 80, 60)
-    radii = (pictures.places_in(vignetting_camera, vignetting_camera) ** 2).sum(-1)
+    own = Camera(np.eye(4, dtype=np.float32), K, 80, 60)
+    radii = (pictures.places_in(own, own) ** 2).sum(-1)
     np.testing.assert_allclose(radii, squared_radii(60, 80), atol=1e-6)
-    wide = Camera(
-        vignetting_camera.viewmat, K + np.array([[0, 0, 40], [0, 0, 0], [0, 0, 0]]), 160, 60
-    )
-    seen = pictures.places_in(vignetting_camera, wide)
-    np.testing.assert_allclose(
-        seen[:, 40:120], pictures.places_in(vignetting_camera, vignetting_camera), atol=1e-6
-    )
+    wide = Camera(own.viewmat, K + np.array([[0, 0, 40], [0, 0, 0], [0, 0, 0]]), 160, 60)
+    seen = pictures.places_in(own, wide)
+    np.testing.assert_allclose(seen[:, 40:120], pictures.places_in(own, own), atol=1e-6)
     assert np.linalg.norm(seen, axis=-1).max() <= 1 + 1e-6
     shaded = PhotometryConfig(cameras=(CameraFormation("a", ((-0.5, 0.0, 0.0),)),))
     transform = DisplayTransform(1.0, 2.2, shaded, camera=0)
     grey = np.full((60, 160, 3), 0.2, np.float32)
     window = pictures.RenderedFrame(grey, np.ones((60, 160)), np.ones((60, 160)), wide)
-    shown = pictures.picture_of(window, "display", transform, vignetting_camera=vignetting_camera)
+    shown = pictures.picture_of(window, "display", transform, vignetting_camera=own)
     np.testing.assert_allclose(shown[:, 40:120], develop(grey[:, :80], transform), atol=1e-5)
-    flat = pictures.picture_of(
-        window, "display", transform.without_place(), vignetting_camera=vignetting_camera
-    )
+    flat = pictures.picture_of(window, "display", transform.without_place(), vignetting_camera=own)
     assert np.ptp(flat) < 1e-6
     assert np.ptp(shown) > 0.1
 

@@ -108,10 +108,8 @@ def _camera(root: Path, number: int, photograph: Path) -> RigCamera:
 
 
 def _read_sweep(path: Path, car: Pose, time: float) -> SweepPoints:
-    values = np.fromfile(path, "<f4")
-    if values.size % COLUMNS or path.stat().st_size % 4:
-        raise broken(path, f"is not a LiDAR scan of {COLUMNS} float32 a point: its size is wrong")
-    points = values.reshape(-1, COLUMNS)[:, 3:6].astype(np.float64)
+    what = f"scan of {COLUMNS} float32 a point: its size is wrong"
+    points = tables.read_scan(path, COLUMNS, what)[:, 3:6].astype(np.float64)
     at = passed(points, time, TURN_S, TURN_START)
     return SweepPoints(points @ car[:3, :3].T + car[:3, 3], at)
 

@@ -244,11 +244,9 @@ def _turns(root: Path) -> tuple[Float64[np.ndarray, " f"], Float64[np.ndarray, "
 
 def read_sweep(path: Path, forward_s: float, turn_s: float, scanner: Trajectory) -> SweepPoints:
     """Return the points of a scan in the world, by the scanner's pose at the time of each point."""
-    values = np.fromfile(path, "<f4")
-    if values.size % 4 or path.stat().st_size % 16:
-        raise broken(path, "is not a LiDAR scan of float32 x y z reflectance: its size is wrong")
+    values = tables.read_scan(path, 4, "scan of float32 x y z reflectance: its size is wrong")
     # Metres: x forward, y left, z up.
-    points = values.reshape(-1, 4)[:, :3].astype(np.float64)
+    points = values[:, :3].astype(np.float64)
     at = passed(points, forward_s, turn_s, BACK)
     placed, _ = scanner.at(at)
     return SweepPoints(np.einsum("nij,nj->ni", placed[:, :3, :3], points) + placed[:, :3, 3], at)

@@ -33,6 +33,7 @@ from p2gs_jax.scene.drives.tables import (
     counted,
     finite_numbers,
     read_rows,
+    read_scan,
 )
 from p2gs_jax.scene.files import require_inside
 from p2gs_jax.scene.rigid import from_quaternion, inverse
@@ -222,10 +223,8 @@ def _sweeps(drive: _Drive) -> tuple[list[Sweep], int]:
 
 
 def _read_sweep(path: Path, pose: Pose, end: float) -> SweepPoints:
-    values = np.fromfile(path, "<f4")
-    if values.size % POINT or path.stat().st_size % values.itemsize:
-        raise broken(path, "is not a LiDAR sweep: float32 x y z intensity ring")
-    local = values.reshape(-1, POINT)[:, :3].astype(np.float64)
+    values = read_scan(path, POINT, "sweep: float32 x y z intensity ring")
+    local = values[:, :3].astype(np.float64)
     # Points are already in the car's axes at the end of the turn; their order gives their times.
     times = end - TURN_S * (1 - np.arange(len(local)) / max(1, len(local)))
     return SweepPoints(local @ pose[:3, :3].T + pose[:3, 3], times)

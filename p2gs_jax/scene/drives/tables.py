@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float32, Float64, Int64
 
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError, broken
@@ -90,6 +90,14 @@ def read_lines(path: Path) -> list[str]:
         return path.read_text("utf-8-sig", "replace").rstrip().splitlines()
     except FileNotFoundError:
         raise missing_file(path) from None
+
+
+def read_scan(path: Path, columns: int, what: str) -> Float32[np.ndarray, "n c"]:
+    """Return the rows of a LiDAR scan, float32; UserError: its size is wrong, it is not `what`."""
+    values = np.fromfile(path, "<f4")
+    if values.size % columns or path.stat().st_size % values.itemsize:
+        raise broken(path, f"is not a LiDAR {what}")
+    return values.reshape(-1, columns)
 
 
 def box_size(sides: Iterable[Any], path: Path) -> tuple[float, float, float]:
