@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
-from p2gs_jax.cli.shared import MeteringRule, PhotometryFolder, RunPath, SceneFolder, check
+from p2gs_jax.cli.shared import MeteringRule, PhotometryFolder, RunOrSplats, SceneFolder, check
 from p2gs_jax.errors import UserError
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ class Export:
     p2gs-jax export splat.ply --photometry calibrated --scene castle --format linear-ply html
     """
 
-    run: RunPath
+    run: RunOrSplats
     format: tuple[Format, ...]
     """Formats: linear-ply (radiance); display-ply, spz, compressed-ply, gltf, usd (display
     colours); colmap, nerfstudio (photographs, model); exr (renders); html (the scene)."""

@@ -135,6 +135,7 @@ class Fit:
             fix = "view a block by its folder: p2gs-jax view RUN/blocks/0"
             check(self.cluster.blocks is None, "--view does not show a fit in blocks", fix=fix)
         check(self.view or self.port == 8080, "--port has no effect without --view")
+        check(0 <= self.port < 2**16, "--port must be from 0 to 65535")
         cluster, whole = self.cluster, "write a whole number from 1 on, or"
         count, devices = cluster.blocks, cluster.devices
         why = "--jobs and --engine have no effect without --blocks"

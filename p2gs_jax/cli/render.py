@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from p2gs_jax.cli.shared import MeteringRule, PhotometryFolder, RunPath, SceneFolder, check
+from p2gs_jax.cli.shared import MeteringRule, PhotometryFolder, RunOrSplats, SceneFolder, check
 from p2gs_jax.core.text import count_of
 from p2gs_jax.errors import UserError
 
@@ -35,7 +35,7 @@ class Render:
     p2gs-jax render splat.ply --photometry calibrated --scene castle --out as_photographed
     """
 
-    run: RunPath
+    run: RunOrSplats
     trajectory: str = "views"
     """Camera path. views: the cameras of the scene; drive: a smooth path through the views of one
     camera; orbit: a circle around the scene; FILE.json: a list of cameras (docs/rendering.md)."""

@@ -14,6 +14,11 @@ from p2gs_jax.errors import UserError
 
 MeteringRule = Literal["auto", "log_average", "centre", "highlights", "protected"]
 RunPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(help="Run folder.")]
+RunOrSplats = Annotated[
+    Path,
+    tyro.conf.Positional,
+    tyro.conf.arg(help="Run folder; or a file of splats, with --photometry and --scene."),
+]
 SceneFolder = Annotated[
     Path | None,
     tyro.conf.arg(metavar="DIR", help="Scene of the run, where it has moved since the fit."),

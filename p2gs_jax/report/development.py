@@ -71,10 +71,11 @@ def _sheet(shown: Sequence[tuple[str, Picture, Picture]]) -> np.ndarray:
     both = [[to_uint8(shrunk(picture, _SIDE)) for picture in pair] for _, *pair in shown]
     height, width = (max(before.shape[axis] for before, _ in both) for axis in (0, 1))
     columns = min(_COLUMNS, len(shown))
-    size = (columns * (width + 4), -(-len(shown) // columns) * (2 * height + _LINE + 4))
-    sheet = Image.new("RGB", size, "white")
+    rows, above = -(-len(shown) // columns), _LINE + 4
+    sheet = Image.new("RGB", (columns * (width + 4), above + rows * (2 * height + above)), "white")
+    ImageDraw.Draw(sheet).text((0, 2), "above: as photographed; below: developed", "black")
     for place, ((name, *_), pair) in enumerate(zip(shown, both, strict=True)):
-        x, y = place % columns * (width + 4), place // columns * (2 * height + _LINE + 4)
+        x, y = place % columns * (width + 4), above + place // columns * (2 * height + above)
         for k, picture in enumerate(pair):
             sheet.paste(Image.fromarray(picture), (x, y + k * height))
         ImageDraw.Draw(sheet).text((x, y + 2 * height + 2), name[-width // 7 :], "black")

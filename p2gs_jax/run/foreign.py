@@ -122,6 +122,9 @@ def foreign_run(splats: str | Path, photometry: str | Path, scene: str | Path) -
     """
     splats, folder, data = Path(splats), Path(photometry), DataConfig(test_every=0)
     path = folder / "photometry.json"
+    if not path.is_file():
+        fix = "name the folder that `p2gs-jax calibrate --develop` wrote"
+        raise broken(folder, "has no photometry.json", fix)
     saved, found = photometry_files.read_photometry(path), find_scene(Path(scene), data)
     if not isinstance(found, Scene):
         fix = f"name the scene that the other program read, {DEVELOPED.parent} in {folder}"

@@ -304,7 +304,8 @@ def _require_finished(files: RunFolder) -> None:
     if not files.config.is_file():
         why = f"{files.root} is not a run folder: {files.config.name} is missing."
         fix = "name the folder that was given to `p2gs-jax fit --out`; splats of another program "
-        raise UserError(why, fix=fix + "need --photometry (docs/exports.md)")
+        fix += "need `render` or `export` with --photometry (docs/exports.md)"
+        raise UserError(why, fix=fix)
     for path in (files.radiance, files.photometry):
         if not path.is_file():
             fix = "finish it with `p2gs-jax fit ... --resume`"

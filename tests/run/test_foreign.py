@@ -126,4 +126,4 @@ def test_what_cannot_be_shown_is_refused(refused, trained, tmp_path):
     metered = refused("export", good, *told(trained), "--format", "html", "--meter", "auto")
     assert "--meter needs a run" in metered
     assert "add --scene" in refused("export", good, "--photometry", place, "--format", "exr")
-    assert "need --photometry" in " ".join(refused("render", good).split())
+    assert "`export` with --photometry" in " ".join(refused("render", good).split())
