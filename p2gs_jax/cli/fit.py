@@ -194,8 +194,11 @@ class Calibrate:
     photograph is lost."""
     masks: bool = True
     """Mask pixels of developed photographs that are clipped or black in the original."""
-    write_for: Annotated[tuple[Literal["ppisp", "3dgs"], ...], tyro.conf.arg(metavar="NAME")] = ()
-    """Also write values for other trainers: ppisp (gsplat, LichtFeld), 3dgs (docs/exports.md)."""
+    write_for: Annotated[
+        tuple[Literal["ppisp", "3dgs", "nerfstudio"], ...], tyro.conf.arg(metavar="NAME")
+    ] = ()
+    """Also write values for other trainers: ppisp (gsplat, LichtFeld), 3dgs, nerfstudio
+    (docs/exports.md)."""
     config: Config
     preset: Preset = "robust"
     """Initial values (p2gs-jax fit --help)."""

@@ -1,4 +1,4 @@
-"""Solved photometry in the words of other trainers: PPISP (gsplat, LichtFeld Studio) and 3DGS.
+"""Solved photometry in the words of other trainers: PPISP (gsplat, LichtFeld), 3DGS, nerfstudio.
 
 docs/exports.md tells how each program is given its file.
 """
@@ -23,7 +23,8 @@ def write_for(trainers: Sequence[str], folder: Path, views: Sequence[View]) -> l
     `views` are the calibrated photographs. Returns a sentence on each file, also where the program
     has no words for this photometry and nothing is written.
     """
-    saved, writers = read_photometry(folder / "photometry.json"), {"ppisp": _ppisp, "3dgs": _3dgs}
+    saved = read_photometry(folder / "photometry.json")
+    writers = {"ppisp": _ppisp, "3dgs": _3dgs, "nerfstudio": _nerfstudio}
     return [writers[name](folder, saved, views) for name in dict.fromkeys(trainers)]
 
 
@@ -77,3 +78,15 @@ def _3dgs(folder: Path, saved: PhotometryFile, views: Sequence[View]) -> str:
         matrices[row["image"]] = np.concatenate([np.diag(gains), np.zeros((3, 1))], axis=1)
     write_json(path, matrices)
     return f"{path}: matrices of 3DGS, from the common exposure to that of each photograph."
+
+
+def _nerfstudio(folder: Path, saved: PhotometryFile, views: Sequence[View]) -> str:
+    """Write the photometry of every photograph as fields of a frame of `transforms.json`."""
+    path, fields = folder / "frames.json", ("exposure_ev", "gamma", "white_balance")
+    rows = {row["image"]: row for row in saved["views"]}
+    frames = [
+        {"file_path": view.name, **{name: rows[view.name][name] for name in fields}}
+        for view in views
+    ]
+    write_json(path, {"frames": frames})
+    return f"{path}: fields of the frames of nerfstudio's transforms.json."

@@ -57,3 +57,11 @@ def test_values_of_ppisp_have_its_names_and_shapes(tmp_path):
     assert [np.shape(saved[n]) for n in names] == [(2,), (1, 3, 5), (2, 8), (1, 3, 4)]
     assert (saved["frames"], saved["camera_of_frame"]) == (["a.png", "b.png"], [0, 0])
     np.testing.assert_allclose(np.diff(saved["exposure_params"]), np.log2(3.0 / 0.5), atol=1e-5)
+
+
+def test_frames_of_nerfstudio_have_their_exposures(tmp_path):
+    photometry(tmp_path / "photometry.json", "srgb")
+    assert "frames.json" in write_for(["nerfstudio"], tmp_path, VIEWS)[0]
+    first, _ = json.loads((tmp_path / "frames.json").read_text())["frames"]
+    assert first["file_path"] == "a.png"
+    assert (first["gamma"], first["white_balance"]) == (GAMMA, list(BALANCE))
