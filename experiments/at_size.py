@@ -78,7 +78,7 @@ splat display values have none. P2GS as printed blurs its splats by .3 pixels^2,
 
 
 def options_of(key: Key) -> tuple[str, ...]:
-    """Return what a row's fit is asked for, beside its town; a row of other options is stale."""
+    """Return the options of a row's fit beside its town; rows with other options are stale."""
     said = ("--preset", key.method, "--steps", str(key.steps))
     if key.method in UNBOUNDED:
         said = (*said, "--gaussians", str(GAUSSIANS))

@@ -1,4 +1,4 @@
-"""What is checked out, so that a figure can be measured again."""
+"""The commit of this checkout, with which a figure can be measured again."""
 
 from __future__ import annotations
 

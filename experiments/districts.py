@@ -86,7 +86,7 @@ HEADER = (
 
 
 def fitted(town: Path, run: Path, size: Size, words: list[str]) -> dict[str, Any]:
-    """Return what `metrics.json` says of a run, with the peak memory of its process; it is kept."""
+    """Return the `metrics.json` of a run and the peak memory of its process; both are kept."""
     said = run / "metrics.json"
     kept = run / "peak.json"
     if not kept.exists():

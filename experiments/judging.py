@@ -1,4 +1,4 @@
-"""What the comparisons with learned cameras share: fits, a look for held-out views, what is found.
+"""Shared by comparisons with learned cameras: fits, a display for held-out views, their results.
 
 Methods keep what cameras do to the light in different places: `Photometry` and the configuration
 (ours), a matrix or grid per view (3dgs_affine, 3dgs_bilateral), or PPISP's own parameters.
@@ -28,7 +28,7 @@ from p2gs_jax.formats.frames import to_uint8, write_png
 from p2gs_jax.photometry.luminance import Luminance
 from p2gs_jax.photometry.ppisp import Ppisp, falloff, recolored
 
-# Grey that a colour correction is applied to, where it is no factor per channel.
+# Grey to which a colour correction is applied where it is not a factor per channel.
 GREY = 0.18
 
 
@@ -149,7 +149,7 @@ def common_display(
 
 
 class Found(NamedTuple):
-    """What a method found of the cameras; None where it has no such part.
+    """The cameras as a method found them; None for parts that it does not have.
 
     Attributes:
         exposures_ev: of every training view.
@@ -163,7 +163,7 @@ class Found(NamedTuple):
 
 
 def found_by(run: p2gs_jax.Run) -> Found:
-    """Return what a run found of exposures, white balances and vignetting."""
+    """Return the exposures, white balances and vignetting of a run."""
     appearance = run.params.appearance
     if isinstance(appearance, Ppisp):
         return _found_by_ppisp(run, appearance)

@@ -118,7 +118,7 @@ def _keyed(spread: dict[str, float]) -> dict[str, float]:
 
 
 def spreads(run: p2gs_jax.Run, groups: dict[str, str]) -> dict[str, float]:
-    """Return the spread within every group, EV; nothing where a run has no exposures."""
+    """Return the spread within every group, EV; empty if a run does not have exposures."""
     evs = found_by(run).exposures_ev
     if evs is None:
         return {}

@@ -65,7 +65,7 @@ def their_test_views(lom: Path) -> list[str]:
 
 
 def read_groups(scene: Path) -> dict[str, str]:
-    """Return the group of each view; empty where the scene is no mixture."""
+    """Return the group of each view; empty if the scene is not a mixture."""
     path = scene / "groups.json"
     return json.loads(path.read_text()) if path.is_file() else {}
 

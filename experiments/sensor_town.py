@@ -6,7 +6,7 @@ A procedural town is photographed by three cameras that differ in gain, white ba
 an ISO and a white balance drawn for every photograph. All methods get the same steps. Columns:
 
 - EV: RMS error of the exposures after one scale, and after scale and power;
-- white balance: RMS error of the factors beside the exposure, EV, after what all views share;
+- white balance: RMS error of the factors beside the exposure, EV, without the part that all views share;
 - corners: mean error over the cameras of the light that reaches the corners, per cent;
 - own: PSNR of held-out views with the exposure fitted to each;
 - ISO 8: PSNR of held-out views against photographs at ISO 8 without gains, tints and vignetting.
@@ -235,7 +235,7 @@ def options(description: str | None, name: str, methods: Sequence[str]) -> argpa
 
 
 def parsed(parser: argparse.ArgumentParser) -> argparse.Namespace:
-    """Return what the command line asks for."""
+    """Return the options of the command line."""
     args = parser.parse_args()
     if args.quick:
         args.steps, args.frames, args.width, args.points = 150, 8, 128, 3000

@@ -367,7 +367,7 @@ def ladders(runs: Runs) -> str:
 
 
 def make(o: Options, name: str) -> None:
-    """Fit what a table needs, and write it."""
+    """Run the fits of a table, and write it."""
     begin, plot, extra = time.monotonic(), None, None
     if name == "ladders":
         # The ladder sets the number of Gaussians itself.

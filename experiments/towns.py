@@ -1,4 +1,4 @@
-"""What the tables share: three towns, the methods under one budget, and their runs.
+"""Shared by the tables: three towns, the methods under one budget, and their runs.
 
 Every town is photographed at ISO 8 throughout (ISO-Const), and with ISO drawn about 8 with standard
 deviation 2 and 4 (paper, appendix "Exposure Control"); geometry and cameras are the same. All
@@ -86,7 +86,7 @@ EV_ERROR: Column = ("EV error", ("ev",), 4)
 
 @dataclass(frozen=True)
 class Options:
-    """What the command line chose."""
+    """The options of the command line."""
 
     out: Path
     protocol: Protocol
@@ -237,12 +237,12 @@ def at(values: Any, path: Sequence[str]) -> float | None:
 
 
 def number(value: float, digits: int) -> str:
-    """Return a cell; n/a where there is no value."""
+    """Return a cell; n/a stands for a missing value."""
     return "n/a" if not np.isfinite(value) else f"{value:.{digits}f}"
 
 
 def titles(columns: Sequence[tuple[str, Any, int]]) -> tuple[str, ...]:
-    """Return what the header says of these columns."""
+    """Return the part of the header on these columns."""
     return tuple(title for title, _, _ in columns)
 
 

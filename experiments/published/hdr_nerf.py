@@ -69,7 +69,7 @@ def write_made(root: Path) -> None:
                 times[name := f"{part}_{k:03d}_{e}.png"] = time
                 pixels = photograph(linear, time, Sensor(curve="filmic"))
                 cv2.imwrite(str(folder / "images" / name), pixels[..., ::-1])
-            # Names end with a zero byte, so that another length is no matter.
+            # Names end with a zero byte, so their length may change.
             data = data.replace(view.name.encode(), f"{part}_{k:03d}_0.png".encode())
         model.write_bytes(data)
         write_json(folder / "exposure.json", times)

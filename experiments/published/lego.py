@@ -9,9 +9,9 @@ experiment: s rgb + b, clipped, before they are composited on white. For each ch
 from 0.8 to 1.2 and b from -0.2 to 0.2, with the number of the photograph as the seed. Held-out
 views are judged under the parameters of the first photograph, as published.
 
-One row at a time; called again, it goes on where it was interrupted. PSNR of the held-out views as
-they are, without any exposure fitted, as published. The pictures of this scene are not for this
-project: keep --out outside of it.
+The script measures one row at a time, and continues after an interruption. PSNR of the held-out
+views is measured as they are, without any exposure fitted, as published. The pictures of this scene
+are not for this project: keep --out outside of it.
 """
 
 from __future__ import annotations

@@ -51,7 +51,7 @@ class Aligned:
         """Render the training views once."""
         self.run = run
         self._usual = dataclasses.replace(run.common_display(), exposure=run.mean.exposure)
-        # What is compared with `high` is the field, not how dark photographs show it.
+        # The field is compared with `high`, without the look of the dark photographs.
         self._plain = dataclasses.replace(self._usual, correction=None)
         reference = load_reference(run.scene.root / "reference", run.scene, run.cfg)
         self.target = lambda row: np.asarray(reference(row))

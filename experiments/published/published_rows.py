@@ -1,4 +1,4 @@
-"""Rows of published benchmarks: kept one by one, so that an interrupted call goes on where it was.
+"""Rows of published benchmarks, written one by one, so that an interrupted call can continue.
 
 `rows.json` beside this file holds what was measured. A row is told by its benchmark, scene, method
 and steps; measured again, it replaces the old one.
@@ -30,7 +30,7 @@ ROWS = HERE / "rows.json"
 
 
 class Key(NamedTuple):
-    """What a row is of."""
+    """The measurement of a row."""
 
     benchmark: str  # as in `published.json`
     scene: str
@@ -39,7 +39,7 @@ class Key(NamedTuple):
 
 
 def read_rows(path: Path = ROWS) -> dict[Key, dict[str, Any]]:
-    """Return the rows that were measured; none where there is no file."""
+    """Return the measured rows; none if there is no file."""
     rows = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
     return {Key(*(row[name] for name in Key._fields)): row for row in rows}
 
@@ -58,7 +58,7 @@ class Fit(NamedTuple):
 
 
 def of_fit(fit: Fit, command: str) -> dict[str, Any]:
-    """Return what every row says of its fit."""
+    """Return the entries about the fit that every row has."""
     metrics = fit.metrics
     seconds = metrics["seconds"]
     # Of a resumed fit, "optimisation" is that of all its processes, all else of the last.
@@ -76,13 +76,13 @@ def of_fit(fit: Fit, command: str) -> dict[str, Any]:
 
 
 def shown_seconds(row: Mapping[str, Any]) -> str:
-    """Return a row's seconds as a cell says them; a row without cores had two."""
+    """Return the cell with a row's seconds; rows without a number of cores had two."""
     alone = " on one core" if row.get("cores", 2) == 1 else ""
     return f"{row['seconds']}{alone}"
 
 
 def fitted(scene: Path, run: Path, options: Sequence[str], again: bool = False) -> Fit:
-    """Fit by the command line, or go on with what was interrupted.
+    """Fit by the command line, or continue an interrupted fit.
 
     Args:
         scene: what is fitted.
@@ -125,7 +125,7 @@ def measure(
     again: bool = False,
     path: Path = ROWS,
 ) -> None:
-    """Measure rows one after another and keep each; those that are there are left."""
+    """Measure the missing rows one after another, and write each at once."""
     for key in wanted:
         if key in read_rows(path) and not again:
             print(f"{' '.join(map(str, key))}: there already", file=sys.stderr, flush=True)

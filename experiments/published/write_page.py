@@ -1,4 +1,4 @@
-"""Write experiments/PUBLISHED.md from what was measured (`rows.json`) and published.
+"""Write experiments/PUBLISHED.md from the measured rows (`rows.json`) and published figures.
 
 python experiments/published/write_page.py
 """
@@ -23,7 +23,7 @@ and [published.json](published/published.json). [The README of the scripts](publ
 says how rows are made and which systems were not run. The machine is that of
 [the records](results/README.md).
 
-Splats are blurred by 0.05 pixels^2 unless the row says otherwise. Until commit 057bc06
+Splats are blurred by 0.05 pixels^2 unless the row names another blur. Until commit 057bc06
 (2026-11-25) the default was the blur of 3DGS, 0.3 pixels^2. Rows of LOM and nerf_fox from before
 that commit need `--render.blur 0.3` to be repeated; rows of lego name their blur. Rows of lego
 and nerf_fox are older than commit 05f3698 (2026-11-26); until then long fits slowed the learning

@@ -1,4 +1,4 @@
-"""What a family of trials is, and what it found."""
+"""A family of trials, and its results."""
 
 from __future__ import annotations
 

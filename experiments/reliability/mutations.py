@@ -21,7 +21,7 @@ BAD_VALUES: tuple[Any, ...] = (
 class Broken(NamedTuple):
     """A file that was whole."""
 
-    name: str  # what was done to it
+    name: str  # the damage
     data: bytes  # what it holds now
 
 

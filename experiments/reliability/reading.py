@@ -37,7 +37,7 @@ def command(*words: object) -> int:
 def read(root: Path) -> int:
     """Survey a scene on the command line, then read it as a fit does and decode every photograph.
 
-    Nothing is triangulated: what is read of scenes without points is poses and photographs.
+    Nothing is triangulated; only poses and photographs of scenes without points are read.
     """
     code = command("inspect", root)
     if code:

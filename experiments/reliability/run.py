@@ -1,11 +1,11 @@
-"""What the program survives: families of trials, and a dated record.
+"""Families of trials that the program has to survive, with a dated record.
 
 python experiments/reliability/run.py [--quick] [--only FAMILY...] [--out DIR]
 
 A family is a module `families/NAME.py` with
 
     NAME    its name, as the module's
-    ABOUT   what is tried, and what counts as survived, in one or two sentences
+    ABOUT   the trials, and when a trial counts as survived, in one or two sentences
     run     run(quick: bool, out: Path, report: Callable[[str], None]) -> Family
 
 `out` is an empty folder of its own; `Family` is in `family.py`. Trials follow from a fixed seed, so
@@ -92,7 +92,7 @@ def one(module: ModuleType, quick: bool, out: Path) -> Family:
 
 
 def record(found: Family, quick: bool) -> None:
-    """Put what a family found into the record of today (UTC); a part never replaces the whole."""
+    """Add the results of a family to the record of today (UTC); a part never replaces the whole."""
     date = datetime.datetime.now(datetime.UTC).date().isoformat()
     path = HERE / f"{date}.json"
     entries = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []

@@ -1,4 +1,4 @@
-"""Trials in children of one warm process: what they print, how they end, time and memory.
+"""Trials in children of one warm process: their output, exit codes, times and memory.
 
 A trial ends well if it is done, or refuses with code 2, the file, the fault and a remedy. It may
 neither take long nor much memory, nor touch anything but its own folder.
@@ -25,7 +25,7 @@ SECONDS = 30.0
 BYTES = 2 * 2**30
 REFUSED = 2
 ENDS: dict[int | None, str] = {0: "done", REFUSED: "refused"}
-# How a child says that what it read makes no sense.
+# Exit code of a child whose input was read but makes no sense.
 NONSENSE = 70
 _GRANULE = 0.01
 
@@ -35,9 +35,9 @@ class Trial:
     """Something to be survived."""
 
     name: str  # unique in its family
-    # writes what is needed into an empty folder; returns the folder or file to name, if another one
+    # writes the input into an empty folder; returns the folder or file to name, if another one
     make: Callable[[Path], Path | None]
-    # is given what is named, in a child; its code is that of the command line
+    # runs on the named input in a child; its exit code is that of the command line
     act: Callable[[Path], int]
     # one of these words has to be in a refusal; empty: a path below the folder
     named: tuple[str, ...] = ()
@@ -88,7 +88,7 @@ def run_trials(name: str, trials: Sequence[Trial], out: Path, report: Report) ->
 
 
 def attempt(trial: Trial, folder: Path) -> tuple[Outcome, str | None]:
-    """Make and try one; return how it ended and what was wrong with that."""
+    """Make and try one; return its end, and the fault of that end or None."""
     shutil.rmtree(folder, ignore_errors=True)
     scene, elsewhere = folder / "scene", folder / "elsewhere"
     scene.mkdir(parents=True)
@@ -157,7 +157,7 @@ def _reap(child: int, deadline: float) -> tuple[int | None, int]:
 
 
 def _wrong(trial: Trial, outcome: Outcome, folder: Path) -> str | None:
-    """Return what is wrong with how a trial ended, or None."""
+    """Return the fault in the end of a trial, or None."""
     last = next((line for line in reversed(outcome.text.splitlines()) if line.strip()), "")
     if outcome.code is None:
         return f"took more than {trial.seconds:.0f} s"

@@ -1,4 +1,4 @@
-"""Fits in processes of their own, ended in every way, and what they leave behind."""
+"""Fits in separate processes, ended in every way, and the files that they leave behind."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ OPTIONS = (
 )
 # No trial may hang.
 MOST_S = 300.0
-# No compiler effort: what is tried is not speed, and most time would go there.
+# No compiler effort: speed is not tested, and compiling would take most of the time.
 _FLAGS = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 
 
 class Trial(Exception):
-    """What a trial found instead of what it should have."""
+    """The result of a trial that should have been another."""
 
 
 def command(scene: Path, run: Path, *extra: str) -> list[str]:
@@ -37,7 +37,7 @@ def command(scene: Path, run: Path, *extra: str) -> list[str]:
 
 
 def environment(cache: Path) -> dict[str, str]:
-    """Return variables under which fits share what is compiled, in `cache` or where they say."""
+    """Return variables with which fits share compiled programs in `cache`."""
     return os.environ | {
         "JAX_PLATFORMS": "cpu",
         "XLA_FLAGS": _FLAGS,
@@ -127,7 +127,7 @@ def lines(run: Path) -> int:
 
 
 def content(run: Path) -> tuple:
-    """Return what a run promises to repeat: log without times, Gaussians, photometry, scores."""
+    """Return the repeatable results of a run: log without times, Gaussians, photometry, scores."""
     log = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
     times = ("seconds", "step_seconds", "left_s")
     timeless = [{k: v for k, v in r.items() if k not in times} for r in log]

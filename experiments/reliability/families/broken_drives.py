@@ -130,7 +130,7 @@ def _file(name: str, data: bytes, root: Path) -> Path:
 
 
 def _refused(act: Callable[[Path], object]) -> Callable[[Path], int]:
-    """Return an act whose errors are said as the command line says them."""
+    """Return an act that reports errors as the command line does."""
 
     def said(path: Path) -> int:
         try:

@@ -52,7 +52,7 @@ main(sys.argv[1:])
 
 
 def _as_in_a_terminal() -> None:
-    """Let signals arrive that nohup, or a shell in the background, tells its children to ignore."""
+    """Let signals arrive that children of nohup, or of a background shell, would ignore."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
 
@@ -207,7 +207,7 @@ class Faults:
             raise Trial("it locked the folder")
 
     def out_of_memory(self, run: Path) -> None:
-        """Take all memory away between steps: the fit says so or dies, and goes on later."""
+        """Take all memory away between steps: the fit reports it or dies, and can be resumed."""
         given = fits.command(self.scene, run)[3:]
         argv = [sys.executable, "-c", _MEMORY, str(run / "log.jsonl"), "3", *given]
         ended = fits.run(argv, self.env)

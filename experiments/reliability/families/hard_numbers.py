@@ -1,4 +1,4 @@
-"""Whole fits of scenes whose numbers are as bad as numbers get, and what each has to end in."""
+"""Whole fits of scenes with extreme numbers, and the result that each has to end in."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ QUICK = ("nothing hard", "all black", "one white", "10^6 m from the origin", "on
 
 
 class _Heard(Silent):
-    """Keeps what a fit says."""
+    """Keeps the messages of a fit."""
 
     def __init__(self):
         self.said: list[str] = []
@@ -151,7 +151,7 @@ def run(quick: bool, out: Path, report: Report) -> Family:
 
 
 def attempt(case: Case, out: Path) -> tuple[str | None, dict[str, str | float]]:
-    """Fit a case; return what is wrong, or None, and what became of it."""
+    """Fit a case; return its fault or None, and its result."""
     heard = _Heard()
     cfg = with_fields(preset("robust"), OPTIONS | dict(case.options))
     scene = write_scene(out / "scene", case.made)
@@ -202,7 +202,7 @@ def _held_out(run: Path) -> set[str]:
 
 
 def _not_finite(run: Path) -> str | None:
-    """Return what a run holds that is no number."""
+    """Return the values of a run that are not finite."""
     gaussians = read_ply(run / "radiance.ply")
     for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
         if not np.isfinite(np.asarray(getattr(gaussians, name))).all():

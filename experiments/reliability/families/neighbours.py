@@ -1,4 +1,4 @@
-"""Small inputs after what users of neighbouring programs report, each with what is right."""
+"""Small inputs after reports by users of neighbouring programs, each with the right result."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ Check = Callable[[Scene], bool]
 
 @dataclass(frozen=True)
 class Case:
-    """A scene, and what is right."""
+    """A scene, and the right result."""
 
     make: Callable[[Path], object]  # writes it into an empty folder
     right: Check | None = None  # what holds of the scene that is read; None: it is refused
@@ -271,7 +271,7 @@ def linked(root: Path) -> None:
     (root / "transforms.json").write_text(json.dumps(data))
 
 
-# ---------------------------------------------------------------------- what is right of a scene
+# ---------------------------------------------------------------------- right results
 
 
 def cameras(count: int) -> Check:
@@ -326,13 +326,13 @@ def same_colors(scene: Scene) -> bool:
 
 
 def a_stop_apart(scene: Scene) -> bool:
-    """EXIF says that each view is a stop brighter than the one before."""
+    """EXIF makes each view a stop brighter than the one before."""
     found = [view.exif_ev for view in scene.views]
     return None not in found and bool(np.allclose(np.diff(np.array(found, float)), 1, atol=0.02))
 
 
 def noted(words: str) -> Check:
-    """A note says so."""
+    """A note reports it."""
     return lambda scene: any(words in note for note in scene.notes)
 
 

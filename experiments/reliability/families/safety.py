@@ -57,7 +57,7 @@ def _nothing(root: Path) -> Path:
 
 
 def forbidden(condition: bool, what: str) -> int:
-    """Return a code: whether something happened that must not, which is said."""
+    """Return an exit code: whether something forbidden happened, which is printed."""
     if condition:
         print(f"it happened: {what}", file=sys.stderr)
     return HAPPENED if condition else 0
@@ -198,7 +198,7 @@ def _temporary_files(root: Path) -> int:
 
 
 def unsafe_calls(package: Path) -> list[str]:
-    """Return where a package runs text, unpickles what is in files, or names temporary files."""
+    """Return the places where a package runs text, unpickles files, or names temporary files."""
     bad = re.compile(
         r"^(eval|exec|os\.system|os\.popen|pickle\.loads?|marshal\.loads?|tempfile\.mktemp|"
         r"yaml\.load|shelve\.open|joblib\.load|torch\.load)$"
