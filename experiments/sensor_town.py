@@ -6,7 +6,7 @@ A procedural town is photographed by three cameras that differ in gain, white ba
 an ISO and a white balance drawn for every photograph. All methods get the same steps. Columns:
 
 - EV: RMS error of the exposures after one scale, and after scale and power;
-- white balance: RMS error of the factors beside the exposure, EV, without the part that all views share;
+- white balance: RMS error of the factors beside the exposure, EV, after removing their mean;
 - corners: mean error over the cameras of the light that reaches the corners, per cent;
 - own: PSNR of held-out views with the exposure fitted to each;
 - ISO 8: PSNR of held-out views against photographs at ISO 8 without gains, tints and vignetting.

@@ -37,7 +37,7 @@ def command(scene: Path, run: Path, *extra: str) -> list[str]:
 
 
 def environment(cache: Path) -> dict[str, str]:
-    """Return variables with which fits share compiled programs in `cache`."""
+    """Return variables with which fits share compiled programs, by default in `cache`."""
     return os.environ | {
         "JAX_PLATFORMS": "cpu",
         "XLA_FLAGS": _FLAGS,
