@@ -112,7 +112,7 @@ def _point(
 def _brushes(
     s: Point, seed: int, none: Array, dull: Array
 ) -> dict[Material, Callable[[], tuple[Array, Array, Array]]]:
-    """Return what gives albedo, emission and gloss, by material."""
+    """Return the functions of albedo, emission and gloss, by material."""
     mottled = s.color * (1.0 + 0.16 * s.fine[0] + 0.16 * s.coarse[0])
     return {
         Material.ROAD: lambda: (_road(s, seed), none, dull),
@@ -279,7 +279,7 @@ def _windows(s: Point, bay: _Bay, seed: int) -> tuple[Array, Array, Array]:
     edge, bar = half_h - 0.06, s.bar(du, 0.035)
 
     def above(low: Array | float, reveal: float) -> Array:
-        """Share of panes above a height, between bars, less what the reveal takes at the top."""
+        """Share of panes above a height, between bars, without the reveal's shade at the top."""
         cross = s.span(dz, jnp.maximum(low, 0.265), 0.335)
         dark = reveal * s.span(dz, jnp.maximum(low, half_h - 0.18), edge)
         return (s.span(dz, low, edge) - cross - dark) * upper
