@@ -149,7 +149,9 @@ def calibrate(
         if develop is not None:
             poses = poses_of(scene, out / "cache")
             places_of(poses, scene, out, develop)
-        store = ImageStore(scene.views, cfg.data, scene.objects).only_opaque()
+        # Every photograph is read once.
+        once = dataclasses.replace(cfg.data, cache_mb=0)
+        store = ImageStore(scene.views, once, scene.objects).only_opaque()
         if not (has_tracks(scene) or len(scene.points)):
             raise UserError(
                 f"{scene_dir} has neither tracks nor points: it is unknown which pixels show the "

@@ -64,7 +64,8 @@ def sample_patches(
 
     The average is over linear values. The position of a patch is uncertain by `deviation` pixels.
     """
-    linear = srgb_decode(ldr)
+    grids = list(grids)
+    linear = _light_around(ldr, grids)
     # Over the interpolated pixels and their neighbours.
     largest, inside = cv2.dilate(ldr, np.ones((3, 3))), cv2.erode(mask, np.ones((3, 3)))
     colors, spread, brightest = (np.zeros((count, 3), np.float32) for _ in range(3))
@@ -82,6 +83,24 @@ def sample_patches(
         brightest[rows] = largest[y, x].max((1, 2))
         valid[rows] = inside[y, x].min((1, 2)) > 0.99
     return Samples(colors, spread, brightest, valid)
+
+
+def _light_around(
+    ldr: Float32[np.ndarray, "h w 3"], grids: Iterable[Grid]
+) -> Float32[np.ndarray, "h w 3"]:
+    """Return linear values of the pixels around all positions, and 0 elsewhere.
+
+    Most pixels of a large photograph lie in no patch, and converting all of them is slow.
+    """
+    near = np.zeros(ldr.shape[:2], np.uint8)
+    for _, xy in grids:
+        x, y = np.rint(xy.reshape(-1, 2) - 0.5).astype(int).T
+        inside = (x >= 0) & (x < near.shape[1]) & (y >= 0) & (y < near.shape[0])
+        near[y[inside], x[inside]] = 1
+    near = cv2.dilate(near, np.ones((3, 3))) > 0
+    linear = np.zeros(ldr.shape, np.float32)
+    linear[near] = srgb_decode(ldr[near])
+    return linear
 
 
 def _between(linear: Float32[np.ndarray, "h w 3"], position: np.ndarray) -> np.ndarray:

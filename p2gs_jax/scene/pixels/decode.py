@@ -79,7 +79,9 @@ _ROOM = Room()
 
 def floats(pixels: UInt[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:
     """Return stored values in [0, 1]."""
-    return pixels.astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
+    out = pixels.astype(np.float32)
+    out /= np.float32(np.iinfo(pixels.dtype).max)  # in place: photographs are large
+    return out
 
 
 def resamples(view: View, size: tuple[int, int]) -> bool:
@@ -154,7 +156,8 @@ def _at_size(
     if size != ldr.shape[1::-1]:
         ldr = cv2.resize(ldr, size, interpolation=cv2.INTER_AREA)
         valid = _resized(valid, size, cv2.INTER_AREA)
-    pixels = np.rint(ldr * np.float32(np.iinfo(np.uint16).max)).astype(np.uint16)
+    scaled = ldr * np.float32(np.iinfo(np.uint16).max)
+    pixels = np.rint(scaled, out=scaled).astype(np.uint16)
     if pixels.shape[2] == 3:
         return _read_only(pixels, valid)
     return _read_only(np.ascontiguousarray(pixels[..., :3]), valid, pixels[..., 3].copy())
