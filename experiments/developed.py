@@ -38,9 +38,9 @@ from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
+from p2gs_jax.types import GAMMA_SRGB
 
 TOWN = argparse.Namespace(width=240, frames=20, points=8000, seed=0)
-GAMMA = 2.2
 
 
 def without(scene: Path, held_out: set[str], out: Path) -> Path:
@@ -78,7 +78,7 @@ class Judge:
         self.targets = [np.asarray(reference(row)) for row in self.rows]
         self.masks = [self.store.get(row)[1] for row in self.rows]
         self.render = make_renderer(viewer_config(cfg.render))
-        self.shown = DisplayTransform(1.0, GAMMA, PhotometryConfig(curve="srgb"))
+        self.shown = DisplayTransform(1.0, GAMMA_SRGB, PhotometryConfig(curve="srgb"))
 
     def __call__(self, ply: Path) -> tuple[float, list[np.ndarray]]:
         """Return the PSNR of splats under one fitted exposure, and the pictures."""

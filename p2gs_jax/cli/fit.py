@@ -226,8 +226,9 @@ class Calibrate:
             if found.developed is not None:
                 write_development(out, found.developed)
         print_calibration(found, out)
-        for sentence in write_for(self.write_for, out, found.views):
-            stdout().print(sentence, soft_wrap=True)
+        if self.write_for:
+            for sentence in write_for(self.write_for, out, found.views):
+                stdout().print(sentence, soft_wrap=True)
         return 0
 
     @property

@@ -21,7 +21,7 @@ from p2gs_jax.core.text import first_few
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.colmap import find_deeper_model, find_model, read_model
 from p2gs_jax.scene.files import IMAGE_SUFFIXES, alike_names, read_json
-from p2gs_jax.scene.transforms import llff_table, relative_name
+from p2gs_jax.scene.transforms import FIX, llff_table, relative_name
 from p2gs_jax.types import Scene
 
 _STEMS = ("cameras", "images", "points3D", "rigs", "frames")
@@ -32,7 +32,6 @@ _FRAMES = ("frames", "test_frames")
 _NAMES_IN_JSON = ("train_filenames", "val_filenames", "test_filenames")
 # Bytes of an image in COLMAP's images.bin before its name, and of each of its keypoints.
 _BEFORE_NAME, _KEYPOINT = 64, 24
-_FIX = "correct the file, or write it again with the tool that made it"
 
 
 @dataclass(frozen=True)
@@ -54,13 +53,14 @@ class Poses:
 
         A name keeps its suffix if it is one of `suffixes`, and has the suffix `other` otherwise.
         """
-        out: dict[str, str] = {}
+        out, taken = dict[str, str](), set[str]()
         for view, stated in self.stated.items():
             own = _suffix(stated) or PurePosixPath(view).suffix
             stem = PurePosixPath(self.base, stated.removesuffix(_suffix(stated))).as_posix()
             place = stem + (own if own.lower() in suffixes else other)
             # Photographs that differ in their suffix alone stay apart.
-            out[view] = place if place not in out.values() else f"{stem}-{own[1:]}{other}"
+            out[view] = place if place not in taken else f"{stem}-{own[1:]}{other}"
+            taken.add(out[view])
         return out
 
     def notes(self, places: Mapping[str, str]) -> list[str]:
@@ -107,7 +107,7 @@ def poses_of(scene: Scene, cache: Path) -> Poses:
             found = [path for path in parts if path.is_file()][:2]
         else:
             found = [root if root.is_file() else root / "transforms.json"]
-        stated = [_plain(p, f["file_path"]) for p in found for f in _frames(read_json(p, _FIX))]
+        stated = [_plain(p, f["file_path"]) for p in found for f in _frames(read_json(p, FIX))]
         return Poses({path.name: path for path in found}, _by_view(stated, names), base="")
     table = llff_table(root)
     if scene.format == "llff" and table is not None:
@@ -155,7 +155,7 @@ def _json(
     path: Path, data: bytes, names: Mapping[str, str], masks: Mapping[str, str], folder: Path
 ) -> bytes:
     """Return a transforms.json with other names and masks; files that it names are copied."""
-    before = read_json(path, _FIX)
+    before = read_json(path, FIX)
     content, new = copy.deepcopy(before), dict[str, str]()
     for key in _FRAMES:
         if content.get(key):  # photographs may be missing if the user allows it

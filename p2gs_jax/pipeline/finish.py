@@ -19,7 +19,7 @@ from p2gs_jax.evaluation.lpips import LpipsWeights
 from p2gs_jax.evaluation.references import Reference, find_radiance
 from p2gs_jax.evaluation.scores import ViewResult, is_drive, notes_on_missing
 from p2gs_jax.photometry.calibrate import Selection
-from p2gs_jax.photometry.models import MODELS
+from p2gs_jax.photometry.models import Form
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.run.write import summary_rows, write_run, write_view
@@ -110,7 +110,8 @@ def heading(metrics: Mapping[str, Any], params: Params, cfg: FitConfig) -> list[
         lines = [f"Worst held-out view: {worst}, {psnr:.1f} dB."]
     ev = np.log2(np.asarray(params.photometry.exposures, np.float64))
     span = f"; exposures span {np.ptp(ev):.1f} stops" if np.ptp(ev) > 0 else ""
-    model = f"Model: {MODELS[p.model].description}, {p.curve} curve{span}."
+    form = Form(p.model, p.white_balance, p.vignetting)
+    model = f"Model: {form.description}, {p.curve} curve{span}."
     return [f"PSNR: {', '.join(scores)}.", model, *lines]
 
 

@@ -48,8 +48,11 @@ def split_scene(scene: Scene, cfg: DataConfig) -> Scene:
         return scene
     n = cfg.test_every
     views = assign_split(scene.views, n)
-    unit = "bracket" if len({*brackets(views)}) < len(views) else "view"
-    unit = "frame" if any(view.frame is not None for view in views) else f"{unit} of each camera"
+    if any(view.frame is not None for view in views):
+        unit = "frame"
+    else:
+        unit = "bracket" if n and len({*brackets(views)}) < len(views) else "view"
+        unit += " of each camera"
     ending = "th" if 10 <= n % 100 <= 20 else {1: "st", 2: "nd", 3: "rd"}.get(n % 10, "th")
     by = f"every {n}{ending} {unit}" if n else "--test-every 0"
     return dataclasses.replace(scene, views=views, split_by=by)
@@ -72,12 +75,13 @@ def assign_split(views: tuple[View, ...], test_every: int) -> tuple[View, ...]:
         for i in sorted(range(len(views)), key=lambda i: natural(views[i].name)):
             by_camera[views[i].camera].append(i)
         frames = sorted({v.frame for v in views if v.frame is not None})
-        picked, bracket = set(frames[::test_every]), brackets(views)
+        picked, bracket = set(frames[::test_every]), [] if frames else brackets(views)
         for rows in by_camera.values():
-            held_out = {*[*dict.fromkeys(bracket[i] for i in rows)][::test_every]}
-            chosen = {
-                i for i in rows if (views[i].frame in picked if frames else bracket[i] in held_out)
-            }
+            if frames:
+                chosen = {i for i in rows if views[i].frame in picked}
+            else:
+                held_out = {*[*dict.fromkeys(bracket[i] for i in rows)][::test_every]}
+                chosen = {i for i in rows if bracket[i] in held_out}
             if len(chosen) < len(rows):
                 test.update(chosen)
     return _with_test(views, test)

@@ -50,7 +50,7 @@ _OPENGL_SIGNS = np.array([1.0, -1.0, -1.0, 1.0])
 _LLFF_FIX = "write it again with LLFF's imgs2poses.py, or remove it"
 _PINHOLES = frozenset({"PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"})
 _FISHEYE = "OPENCV_FISHEYE"
-_FIX = "correct the file, or write it again with the tool that made it"
+FIX = "correct the file, or write it again with the tool that made it"
 _UNDISTORT = "undistort the images to pinhole ones (colmap image_undistorter) and use those"
 # Values of frames in sets of moving scenes and of depth cameras.
 _UNUSED = ("time", "depth_file_path")
@@ -89,7 +89,7 @@ def load_transforms(root: Path, json_path: Path, cfg: DataConfig) -> Scene:
     name = data.get("ply_file_path")
     if name:
         if not isinstance(name, str):
-            raise broken(f"{json_path}:", '"ply_file_path" is not the name of a file', _FIX)
+            raise broken(f"{json_path}:", '"ply_file_path" is not the name of a file', FIX)
         points, colors = read_points(_beside(json_path, name))
         scene = replace(scene, points=points, point_colors=colors)
         if not len(points):
@@ -254,7 +254,7 @@ def _assembled(root: Path, name: str, frames: Sequence[_Frame], cfg: DataConfig)
     if repeated is not None:
         first, *_, last = (frame.source for name, frame in found if name == repeated)
         if first == last:
-            raise broken(first, f"lists {repeated} more than once", _FIX)
+            raise broken(first, f"lists {repeated} more than once", FIX)
         why = f"both list {repeated}: a view is either trained on or held out"
         fix = f"remove it from one of them, or name {first} itself to hold out every 8th view"
         raise broken(f"{first} and {last.name}", why, fix)
@@ -312,15 +312,15 @@ def _frames(
     path: Path, split: Split = "train", key: str = "frames"
 ) -> tuple[list[_Frame], dict[str, Any]]:
     """Return the frames in a file, and the whole content of the file."""
-    data, frames = files.read_json(path, _FIX), []
+    data, frames = files.read_json(path, FIX), []
     if not isinstance(data, dict) or not isinstance(data.get(key), list):
-        raise broken(path, f'has no list "{key}"', _FIX)
+        raise broken(path, f'has no list "{key}"', FIX)
     if not data[key]:
-        raise broken(path, "lists no frames", _FIX)
+        raise broken(path, "lists no frames", FIX)
     for i, values in enumerate(data[key]):
         name = values.get("file_path") if isinstance(values, dict) else None
         if not isinstance(name, str) or not name:
-            raise broken(f"{path}:", f'frame {i} has no "file_path"', _FIX)
+            raise broken(f"{path}:", f'frame {i} has no "file_path"', FIX)
         frames.append(_Frame(relative_name(path, name), {**data, **values}, path, split))
     return frames, data
 
@@ -356,7 +356,7 @@ def _view(frame: _Frame, folder: Path, name: str) -> tuple[View, bool]:
     except KeyError:
         size = files.image_size(image_path)
     except (TypeError, ValueError, OverflowError):
-        raise broken(f"{path}:", f"{name} has an impossible size w, h", _FIX) from None
+        raise broken(f"{path}:", f"{name} has an impossible size w, h", FIX) from None
     K, distortion = _lens(path, values, name, *size)
     if not {"w", "h"} <= set(values) and np.abs(K[:2, 2] / size - 0.5).max() > files.MOST_OFF:
         why = f"{name} has its principal point at {K[0, 2]:.0f}, {K[1, 2]:.0f}, far from the middle"
@@ -366,15 +366,15 @@ def _view(frame: _Frame, folder: Path, name: str) -> tuple[View, bool]:
     mask = values.get("mask_path")
     mask_path = _beside(path, mask) if isinstance(mask, str) and mask else None
     if mask_path is not None and not mask_path.is_file():
-        raise broken(f"{path}:", f"the mask {mask_path} of {name} does not exist", _FIX)
+        raise broken(f"{path}:", f"the mask {mask_path} of {name} does not exist", FIX)
     matrix_name = f"the transform_matrix of {name}"
     try:
         c2w = np.array(values.get("transform_matrix"), np.float64)[:3]
     except (TypeError, ValueError, IndexError):
         c2w = np.zeros(0)
     if c2w.shape != (3, 4) or not (np.abs(c2w) < HUGE).all():
-        raise broken(f"{path}:", f"{matrix_name} is not a finite 4x4 matrix", _FIX)
-    viewmat = _viewmat(c2w * _OPENGL_SIGNS, path, matrix_name, _FIX)
+        raise broken(f"{path}:", f"{matrix_name} is not a finite 4x4 matrix", FIX)
+    viewmat = _viewmat(c2w * _OPENGL_SIGNS, path, matrix_name, FIX)
     # Photographs with the same lens come from one camera.
     camera = f"{values.get('w')} {values.get('h')} {np.round(K, 3).tolist()} {distortion}"
     view = View(name, image_path, camera, viewmat, K, width, height, distortion, mask_path)
@@ -394,7 +394,7 @@ def _lens(
     def number(key: str, default: float) -> float:
         value = values.get(key, default)
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < HUGE:
-            raise broken(f"{path}:", f"{key} of {name} is {value!r}, not a number", _FIX)
+            raise broken(f"{path}:", f"{key} of {name} is {value!r}, not a number", FIX)
         return float(value)
 
     def focal(key: str, angle_key: str, size: int) -> float | None:
@@ -414,7 +414,7 @@ def _lens(
     fx, fy = fy if fx is None else fx, fx if fy is None else fy
     if fx is None or fy is None or not (fx > 0 and fy > 0):
         why = f"no focal length for {name}: it needs a positive fl_x"
-        raise broken(f"{path}:", why + ("" if fisheye else " or camera_angle_x"), _FIX)
+        raise broken(f"{path}:", why + ("" if fisheye else " or camera_angle_x"), FIX)
     K = intrinsics(fx, fy, number("cx", width / 2), number("cy", height / 2))
     if fisheye:
         return K, make_distortion(tuple(number(f"k{i}", 0.0) for i in (1, 2, 3, 4)), "fisheye")

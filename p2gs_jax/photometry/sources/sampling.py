@@ -92,10 +92,11 @@ def _light_around(
 
     Most pixels of a large photograph lie in no patch, and converting all of them is slow.
     """
-    near = np.zeros(ldr.shape[:2], np.uint8)
+    height, width, _ = ldr.shape
+    near = np.zeros((height, width), np.uint8)
     for _, xy in grids:
         x, y = np.rint(xy.reshape(-1, 2) - 0.5).astype(int).T
-        inside = (x >= 0) & (x < near.shape[1]) & (y >= 0) & (y < near.shape[0])
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
         near[y[inside], x[inside]] = 1
     near = cv2.dilate(near, np.ones((3, 3))) > 0
     linear = np.zeros(ldr.shape, np.float32)
