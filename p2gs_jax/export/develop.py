@@ -72,12 +72,12 @@ class Development:
     # Exposure of the result: stops from the geometric mean of the photographs, or the largest that
     # loses no highlight.
     exposure: float | Literal["highlights"] = 0.0
-    masks: bool = True  # mask what is clipped or black in a photograph
+    masks: bool = True  # mask pixels that are clipped or black in a photograph
 
 
 @dataclass(frozen=True)
 class Developed:
-    """What `develop_scene` wrote."""
+    """The results of `develop_scene`."""
 
     folder: Path
     options: Development
@@ -266,7 +266,7 @@ def _copied(view: View, target: Path) -> bool:
 
 
 def _exif(view: View) -> Image.Exif | None:
-    """Return the EXIF of a photograph without what describes the original's brightness."""
+    """Return the EXIF of a photograph without the tags of the original's brightness."""
     exif = None
     with contextlib.suppress(Exception), Image.open(view.image_path) as image:  # as `kept_settings`
         exif = image.getexif()

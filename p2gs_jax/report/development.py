@@ -1,4 +1,4 @@
-"""`developed.html` and `developed.jpg`: what `calibrate --develop` made of the photographs."""
+"""`developed.html` and `developed.jpg`: the photographs before and after `calibrate --develop`."""
 
 from __future__ import annotations
 
