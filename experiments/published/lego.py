@@ -69,7 +69,7 @@ def under_first(run: p2gs_jax.Run) -> float:
     for index in run.scene.test_indices:
         result = run.render(run.camera(index))
         shown = display(index)
-        ldr = p2gs_jax.develop(result.linear, shown, result.alpha)
+        ldr = p2gs_jax.develop(result.linear, shown, alpha=result.alpha)
         photograph, mask = run.store.get(index)
         scores.append(float(psnr(ldr, photograph, mask)))
     return float(np.mean(scores))
