@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
@@ -9,6 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
+from p2gs_jax.core.memory import give_back
 from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 from p2gs_jax.core.threads import map_in_order
 from p2gs_jax.photometry.formation import places
@@ -66,8 +68,6 @@ def sample_patches(
     """
     grids = list(grids)
     linear = _light_around(ldr, grids)
-    # Over the interpolated pixels and their neighbours.
-    largest, inside = cv2.dilate(ldr, np.ones((3, 3))), cv2.erode(mask, np.ones((3, 3)))
     colors, spread, brightest = (np.zeros((count, 3), np.float32) for _ in range(3))
     valid = np.zeros(count, bool)
     height, width = mask.shape
@@ -80,8 +80,9 @@ def sample_patches(
         light = _between(linear, position)
         colors[rows] = srgb_encode(light.mean((1, 2)))
         spread[rows] = deviation * _steepness(light, position)
-        brightest[rows] = largest[y, x].max((1, 2))
-        valid[rows] = inside[y, x].min((1, 2)) > 0.99
+        # Over the interpolated pixels and their neighbours.
+        brightest[rows] = _neighbours(ldr, x, y, np.maximum).max((1, 2))
+        valid[rows] = _neighbours(mask, x, y, np.minimum).min((1, 2)) > 0.99
     return Samples(colors, spread, brightest, valid)
 
 
@@ -102,6 +103,16 @@ def _light_around(
     linear = np.zeros(ldr.shape, np.float32)
     linear[near] = srgb_decode(ldr[near])
     return linear
+
+
+def _neighbours(image: np.ndarray, x: np.ndarray, y: np.ndarray, better: np.ufunc) -> np.ndarray:
+    """Return the best of the 3x3 values around pixels; a copy of a large photograph is larger."""
+    height, width = image.shape[:2]
+    found = image[y, x]
+    for down, right in itertools.product((-1, 0, 1), repeat=2):
+        rows, columns = np.clip(y + down, 0, height - 1), np.clip(x + right, 0, width - 1)
+        better(found, image[rows, columns], out=found)
+    return found
 
 
 def _between(linear: Float32[np.ndarray, "h w 3"], position: np.ndarray) -> np.ndarray:
@@ -165,6 +176,7 @@ def point_colors(
     parts: list[tuple[np.ndarray, ...]] = [(none, none, *[nothing] * 3, nothing[:, :2])]
     for done, found in enumerate(map_in_order(read, rows)):
         parts.append(found)
+        give_back()
         if on_view is not None:
             on_view(done + 1, len(rows))
     of_view, seen, colors, spread, brightest, positions = map(

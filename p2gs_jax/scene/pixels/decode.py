@@ -23,6 +23,7 @@ from p2gs_jax.types import View
 
 _FULL = 0.999  # a pixel is valid only if all of its sources are valid
 _ALPHA_VALID = 0.5
+_ROWS = 256  # of a photograph that are converted at once
 # Memory for decoding, undistorting and resizing, bytes for each pixel of a photograph; and the
 # share of the free memory that all threads together may use.
 BYTES_PER_PIXEL, SHARE = 40, 0.5
@@ -156,8 +157,10 @@ def _at_size(
     if size != ldr.shape[1::-1]:
         ldr = cv2.resize(ldr, size, interpolation=cv2.INTER_AREA)
         valid = _resized(valid, size, cv2.INTER_AREA)
-    scaled = ldr * np.float32(np.iinfo(np.uint16).max)
-    pixels = np.rint(scaled, out=scaled).astype(np.uint16)
+    pixels = np.empty_like(ldr, np.uint16)
+    for row in range(0, len(ldr), _ROWS):
+        scaled = ldr[row : row + _ROWS] * np.float32(np.iinfo(np.uint16).max)
+        pixels[row : row + _ROWS] = np.rint(scaled, out=scaled)
     if pixels.shape[2] == 3:
         return _read_only(pixels, valid)
     return _read_only(np.ascontiguousarray(pixels[..., :3]), valid, pixels[..., 3].copy())
