@@ -96,11 +96,14 @@ def main() -> None:
         name = f"{key.method.replace(', ', '_').replace(' ', '_')}_{key.steps}"
         out = args.out / "_".join([name, *size[1:], *(["perturbed"] if args.perturbed else [])])
         fit = fitted(scene, out, chosen, args.again)
+        command = f"p2gs-jax fit LEGO {' '.join(chosen)}"
         test = fit.metrics["test"]["averaged"]
         figures = {k: test[k] for k in ("psnr", "ssim", "lpips") if k in test}
         if args.perturbed:
             figures = {"psnr": under_first(p2gs_jax.load_run(out))}
-        return {"figures": figures, **of_fit(fit, f"p2gs-jax fit LEGO {' '.join(chosen)}")}
+            command = "python experiments/published/lego.py LEGO --perturbed"
+            command += f" --width {args.width} --methods {key.method} --steps {key.steps}"
+        return {"figures": figures, **of_fit(fit, command)}
 
     measure([Key(benchmark, of, m, s) for s in args.steps for m in args.methods], row, args.again)
 

@@ -76,9 +76,9 @@ def of_fit(fit: Fit, command: str) -> dict[str, Any]:
 
 
 def shown_seconds(row: Mapping[str, Any]) -> str:
-    """Return the cell with a row's seconds; rows without a number of cores had two."""
-    alone = " on one core" if row.get("cores", 2) == 1 else ""
-    return f"{row['seconds']}{alone}"
+    """Return the cell with a row's seconds; rows without a device had two cores or one."""
+    device = "one core" if row.get("cores", 2) == 1 else row.get("device")
+    return f"{row['seconds']} on {device}" if device else f"{row['seconds']}"
 
 
 def fitted(scene: Path, run: Path, options: Sequence[str], again: bool = False) -> Fit:
