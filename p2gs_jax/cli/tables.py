@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,11 @@ from p2gs_jax.report.findings import duration
 
 # Columns of words; all others hold numbers.
 WORDS = ("views", "view", "camera", "protocol", "program", "lens", "configuration", "")
+# Scores below this, dB, are of short fits, or of photographs with a fault (15.6 dB of nine views).
+LOW_DB = 20.0
+VERDICT_ON_LOW = (
+    "This is low: fit for longer (--budget), or read docs/quickstart.md, When something goes wrong."
+)
 
 
 def stdout() -> Console:
@@ -60,13 +66,17 @@ def print_headline(metrics: dict[str, Any], run: Path) -> None:
     facts, where = [], shlex.quote(str(run))
     for name in ("test_fitted", "train"):
         part, fitted = _part(metrics, name), " (exposures fitted)" if name != "train" else ""
-        if "psnr" in part and not facts:
+        if "psnr" in part:
             views = count_of(len(part["per_view"]), "view") + fitted
             facts = [f"{PROTOCOLS[name].views.capitalize()} {part['psnr']:.1f} dB over {views}"]
+            break
     facts.append(count_of(metrics["counts"]["gaussians"], "Gaussian"))
     facts.append(duration(whole_run(metrics["seconds"]) or 0.0))
-    next_ones = ("view {}", "report {}", "export {} --format html")
+    viewer = "" if find_spec("viser") else "   # first: pip install 'p2gs-jax[viewer]'"
+    next_ones = ("view {}" + viewer, "report {}", "export {} --format html")
     lines = [f"{', '.join(facts)}.", "Next:"]
+    if part.get("psnr", LOW_DB) < LOW_DB:
+        lines.insert(1, VERDICT_ON_LOW)
     lines += [f"  p2gs-jax {command.format(where)}" for command in next_ones]
     lines.append(f"Run folder: {run} (open {run / 'summary.png'} first)")
     stdout().print("\n".join(lines), soft_wrap=True)

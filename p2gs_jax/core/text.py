@@ -11,6 +11,8 @@ from typing import Any
 
 # Control characters except tab and newline, surrogates, and marks of the direction of writing.
 _HIDDEN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+# Names that a message lists.
+MOST_NAMED = 5
 
 
 def printable(text: str) -> str:
@@ -19,8 +21,9 @@ def printable(text: str) -> str:
 
 
 def first_few(names: Sequence[str]) -> str:
-    """Return the first of some names for a message."""
-    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+    """Return the first of some names for a message, and the number of all others."""
+    more = len(names) - MOST_NAMED
+    return ", ".join(names[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def count_of(number: float, noun: str) -> str:

@@ -92,7 +92,7 @@ def test_missing_images_are_listed_or_skipped(tmp_path):
     write_tiny_model(tmp_path, n=10)
     for i in range(7):
         (tmp_path / "images" / f"im {i}.png").unlink()
-    with refused("7 of the 10 images", "im 4.png, ...; ", "--allow-missing"):
+    with refused("7 of the 10 images", "im 4.png and 2 more; ", "--allow-missing"):
         load_scene(tmp_path, CFG)
     scene = load_scene(tmp_path, DataConfig(allow_missing=True))
     assert [v.name for v in scene.views] == ["im 7.png", "im 8.png", "im 9.png"]

@@ -1,0 +1,18 @@
+"""The headline that ends a fit."""
+
+import pytest
+
+from p2gs_jax.cli import tables
+
+
+@pytest.mark.parametrize(("psnr", "viewer"), [(25.0, True), (15.6, False)])
+def test_headline_names_what_comes_next(psnr, viewer, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(tables, "find_spec", lambda name: viewer or None)
+    test = {"exposure_fitted": {"psnr": psnr, "per_view": {"a": {}, "b": {}}}}
+    metrics = {"test": test, "counts": {"gaussians": 1000}, "seconds": {}}
+    tables.print_headline(metrics, tmp_path / "a run")
+    printed = capsys.readouterr().out
+    assert printed.startswith(f"Held out {psnr} dB over 2 views (exposures fitted), 1,000 Gaussian")
+    assert ("This is low" in printed) == (psnr < tables.LOW_DB)
+    assert f"p2gs-jax view '{tmp_path / 'a run'}'" in printed
+    assert ("pip install" in printed) == (not viewer)
