@@ -2,10 +2,10 @@
 
 python experiments/at_size.py [--out DIR] [--methods robust 3dgs ...] [--stds 4 2 0 | --dusk]
 
-One town, three cameras with 100 photographs of 480x325 each along 90 m, 7,000 steps, population by
-need: that of the presets that have a bound, also for the paper's, which has none. `--dusk`: no ISO
-is drawn; each camera's automatic exposure moves over six stops instead. Learned corrections take
-rates that suit 261 training views and ISO, as some presets' do not. Rows are kept in
+One town, three cameras with 100 photographs of 480x325 each along 90 m, 7,000 steps. The bound on
+Gaussians follows from the scene; `paper`, which has no bound, gets the same. `--dusk`: no ISO is
+drawn; each camera's automatic exposure moves over six stops instead. Learned corrections take rates
+that suit 261 training views and ISO, as those of some presets do not. Rows are kept in
 `experiments/at_size.json`, with the commit and seconds of each; called again, it goes on where it
 was interrupted. `experiments/at_size.md` is written from all that are there.
 """
@@ -39,17 +39,16 @@ from towns import (
 from p2gs_jax.core.atomic import write_text
 from p2gs_jax.jobs.sweep import read_row
 
-# The paper's drive at a quarter of its width; hours.
+# The paper's drive at a quarter of its width; all rows take hours on CPUs.
 AT_SIZE = Protocol(
     towns=(0,), frames=100, step_m=0.9, width=480, points=60_000, steps=7000, gaussians=None
 )
-# What the presets with a bound choose here. Without one `paper` had 275,000 after 850 steps: hours,
-# and no comparison at equal numbers.
+# The bound that presets choose here. Without one `paper` had 275,000 after 850 steps.
 GAUSSIANS = 189_096
 UNBOUNDED = frozenset({"paper"})
 # What their corrections start at and which fraction they end at: the best of what was tried at half
 # the width (BUILD_NOTES, "Learned corrections at size"); the presets' own lose up to 1 dB there. At
-# dusk AT's own are the best.
+# dusk those of the preset `3dgs_affine` are the best.
 RATES = {"3dgs_affine": (3e-3, 0.01), "ppisp": (2e-2, 0.01), "3dgs_bilateral": (2e-3, 0.1)}
 DUSK, STOPS = "dusk, 6 stops", 6.0
 ROWS = Path(__file__).with_name("at_size.json")
@@ -89,14 +88,14 @@ def options_of(key: Key) -> tuple[str, ...]:
 
 
 def street_of(options: Options, name: str) -> Path:
-    """Return the folder of the town that rows of a name were trained on, made where missing."""
+    """Return the folder of the town that a row names, which is made where it is missing."""
     if name == DUSK:
         return photographed(options, 0, f"dusk{STOPS:g}", sensor(STOPS))
     return scene(options, 0, std_of(name))
 
 
 def std_of(name: str) -> float:
-    """Return the ISO's spread that rows of a name were trained on."""
+    """Return the standard deviation of the ISO that a row names."""
     return next(std for std, known in STD_NAMES.items() if known == name)
 
 
@@ -105,7 +104,7 @@ def figures(metrics: Mapping[str, Any], ev: float | None, linear: bool) -> dict[
 
     Args:
         metrics: as `metrics.json`.
-        ev: RMS error of the exposures, stops; None where the method or the photographs have none.
+        ev: RMS error of the exposures, stops; None if the method has none, or all are equal.
         linear: the method has linear radiance.
     """
     iso_8 = metrics["reference"]["scale_aligned"]

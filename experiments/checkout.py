@@ -9,7 +9,7 @@ HERE = Path(__file__).parent
 
 
 def commit(root: Path = HERE) -> str:
-    """Return the short commit of a checkout and whether files differ, figures aside."""
+    """Return the short commit of a checkout and whether files but JSON and Markdown differ."""
     kept = [f":(top,exclude)experiments/**.{suffix}" for suffix in ("json", "md")]
     changed = git(root, "status", "--porcelain", "-uno", "--", ":/", *kept)
     named = git(root, "rev-parse", "--short", "HEAD") or "unknown"

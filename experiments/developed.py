@@ -3,11 +3,11 @@
 python experiments/developed.py --opensplat PROGRAM --out DIR [--spreads 0 4 8] [--lom LOM_SCENE...]
     [--steps 2000]
 
-OpenSplat (github.com/WebODM/OpenSplat, run as a program) is trained for equal steps. Its splats
-are judged in held-out views against photographs of one exposure: those at ISO 8 of a town, whose
-exposures spread over so many stops (`exposure_spread.py`), or those of the group `high` of a LOM
-mixture. One exposure for all views is fitted first. No photograph of LOM may be in this project:
-keep --out outside of it.
+OpenSplat (github.com/WebODM/OpenSplat, run as a program) is trained for equal steps. Held-out
+photographs of one exposure judge its splats: those of a town at ISO 8, or those of the group `high`
+of a LOM mixture. `--spreads` are the ranges of the town's exposures in stops
+(`exposure_spread.py`). One exposure for all views is fitted first. No photograph of LOM may be in
+this project: keep --out outside of it.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ TOWN = argparse.Namespace(width=240, frames=20, points=8000, seed=0)
 
 
 def without(scene: Path, held_out: set[str], out: Path) -> Path:
-    """Return a copy of a COLMAP scene without the held-out views."""
+    """Copy a COLMAP scene; the model of the copy lacks the held-out views."""
     if not out.exists():
         model = pycolmap.Reconstruction(scene / "sparse" / "0")
         for image in list(model.images.values()):
@@ -57,7 +57,7 @@ def without(scene: Path, held_out: set[str], out: Path) -> Path:
 
 
 def trained(program: Path, scene: Path, steps: int) -> Path:
-    """Return the splats that OpenSplat trained."""
+    """Return the PLY of OpenSplat, which is trained if there is none."""
     ply = scene / f"splats_{steps}.ply"
     if not ply.exists():
         words = [program, scene, "--cpu", "-n", str(steps), "-o", ply]

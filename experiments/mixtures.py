@@ -1,6 +1,6 @@
 """Mixtures of exposures: the LOM scenes were photographed in several, and each view draws one.
 
-Nothing differs between the photographs of a group, so all their exposures should come out equal.
+Photographs of a group have nearly one exposure, so their solved exposures should nearly agree.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
 python experiments/stereo_pair.py LEFT RIGHT --out SCENE
 
-The pair is one of the Middlebury 2014 stereo benchmark (Scharstein et al. 2014), a quarter of its
-size, as scikit-image distributes it under its BSD licence: `skimage/data/motorcycle_left.png` and
-`motorcycle_right.png` in its wheels up to 0.17. The calibration is that of its documentation.
+The pair is one of the Middlebury 2014 stereo benchmark (Scharstein et al. 2014), at a quarter of
+its width, as scikit-image distributes it under its BSD licence: `skimage/data/motorcycle_left.png`
+and `motorcycle_right.png` in its wheels up to 0.17. The calibration is that of its documentation.
 
     p2gs-jax fit SCENE --out RUN --steps 800 --data.test-every 0
     p2gs-jax export RUN --format html --photographs 2
@@ -20,7 +20,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-FOCAL, CENTRE, RIGHT_OF_CENTRE, BASELINE_M = 994.978, (311.193, 254.877), 31.086, 0.193001
+# In pixels, but for the baseline. The centre of the right photograph lies farther to the right.
+FOCAL, CENTRE, RIGHT_CX_SHIFT, BASELINE_M = 994.978, (311.193, 254.877), 31.086, 0.193001
 
 
 def main() -> None:
@@ -47,7 +48,7 @@ def main() -> None:
                 "h": height,
                 "fl_x": FOCAL,
                 "fl_y": FOCAL,
-                "cx": CENTRE[0] + k * RIGHT_OF_CENTRE,
+                "cx": CENTRE[0] + k * RIGHT_CX_SHIFT,
                 "cy": CENTRE[1],
             }
         )

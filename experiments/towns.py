@@ -2,7 +2,7 @@
 
 Every town is photographed at ISO 8 throughout (ISO-Const), and with ISO drawn about 8 with standard
 deviation 2 and 4 (paper, appendix "Exposure Control"); geometry and cameras are the same. All
-methods get the same renderer, seeds, steps and number of Gaussians. Runs are kept in the output
+methods get the same renderer, seeds, steps and bound on Gaussians. Runs are kept in the output
 folder and shared between tables; run a script again to continue.
 """
 
@@ -74,8 +74,8 @@ METHODS: dict[str, PresetName] = {
 }
 WITH_EXPOSURES = frozenset({"P2GS as printed", "P2GS, appendix weights", "robust (ours)"})
 NOT_BUILT = """Not built here: Difix3D needs its diffusion weights; PVG, StreetGS, OmniRe and
-DeSIRE-GS are dynamic systems (these towns stand still). Luminance-GS is the preset `luminance_gs`:
-its curve per view under our renderer; a monotone curve per view is the row above it."""
+DeSIRE-GS are dynamic systems (these towns stand still). Luminance-GS is the preset `luminance_gs`,
+its curve per view under our renderer; `3DGS + curve` has a monotone curve per view."""
 
 # A column of a table: its title, where metrics.json has its value, digits shown.
 Column = tuple[str, tuple[str, ...], int]

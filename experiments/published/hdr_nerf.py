@@ -7,7 +7,8 @@ SCENE is a folder of HDR-NeRF, HDR-GS or GaussHDR (docs/scenes.md, "HDR sets") w
 t1 to t5 of each pose. Each pose of training shows one of t1, t3, t5, in turn as in GaussHDR's
 "exp-1" (`--exposures 3`: all three). Held-out poses are the data set's; of a set without a split,
 every second pose, as in HDR-NeRF's real scenes. `made` is a procedural town in the layout of
-GaussHDR. Columns, in dB, are means over photographs of held-out poses:
+GaussHDR. `EV error` is the RMS error of the training exposures in stops, after one factor for all.
+The other columns, in dB, are means over photographs of held-out poses:
 
 - OE, NE: at t1, t3, t5, and at t2, t4. The exposure is the photograph's time, times one factor that
   the training views give: the median of their exposures over their times;
@@ -103,28 +104,28 @@ def write_split(root: Path, path: Path, exposures: int) -> None:
 
 
 def scores(run: p2gs_jax.Run) -> dict[str, float]:
-    """Return the error of the training exposures after one factor, EV, and PSNR, dB."""
+    """Return the RMS error of the training exposures after one factor, EV, and PSNRs, dB."""
     shown, values = run.own_display, {name: list[float]() for name in COLUMNS[1:5]}
     stops = [view.exif_ev or 0.0 for view in run.scene.views]
     found = np.array([np.log2(shown(k).exposure) - stops[k] for k in run.scene.train_indices])
-    factor = float(np.median(found))
+    offset_ev = float(np.median(found))
     for rows in by_exposure(run.scene, run.scene.test_indices):
         for e, row in enumerate(rows):
             linear, (target, mask) = run.render(run.camera(row)).linear, run.store.get(row)
             own = shown(row)
-            stated = dataclasses.replace(own, exposure=2.0 ** (stops[row] + factor))
+            stated = dataclasses.replace(own, exposure=2.0 ** (stops[row] + offset_ev))
             name = "OE" if e in TRAINED else "NE"
             for column, display in ((name, stated), (f"{name} own", own)):
                 ldr = p2gs_jax.develop(np.asarray(linear), display)
                 values[column].append(float(psnr(ldr, target, mask)))
-    error = float(np.sqrt(np.mean((found - factor) ** 2)))
+    error = float(np.sqrt(np.mean((found - offset_ev) ** 2)))
     return {"EV error": error, **{name: float(np.mean(v)) for name, v in values.items()}}
 
 
 def main() -> None:
     parser = options(__doc__, "hdr_nerf", METHODS, (7000,))
     parser.add_argument("--max-width", default="400")
-    parser.add_argument("--exposures", type=int, choices=(1, 3), default=1, help="of a pose")
+    parser.add_argument("--exposures", type=int, choices=(1, 3), default=1, help="of each pose")
     args = parser.parse_args()
     print(f"| scene | exposures | {' | '.join(COLUMNS)} |\n|---|---|{'---:|' * len(COLUMNS)}")
     for scene in args.scenes:

@@ -5,10 +5,10 @@ python experiments/published/lom_low.py LOM_SCENE... --out DIR [--methods robust
 
 The authors' `transforms_test.json` lists the held-out views. They never align: their method
 brightens by itself, with a degree and a gain that they chose for each scene, and PSNR is that of
-the picture as rendered. Methods without a notion of "well lit" cannot be compared so. The name of
-each score says what the method is given:
+the picture as rendered. Methods that do not know how bright a picture should be cannot be judged
+by this. The name of each score says what the method is given:
 
-- `unaligned`: the held-out view as the dark photographs show it, for which plain NeRF is published;
+- `unaligned`: the held-out view as the dark photographs show it; plain NeRF is published so;
 - `enhanced`: the enhanced view of `luminance_gs` as rendered: the authors' protocol;
 - `mean_half`: one exposure for all views that brings the mean of the training renders to half of
   the display range, without a look at any `high` photograph;
@@ -51,7 +51,7 @@ class Aligned:
         """Render the training views once."""
         self.run = run
         self._usual = dataclasses.replace(run.common_display(), exposure=run.mean.exposure)
-        # The field is compared with `high`, without the look of the dark photographs.
+        # Renders are compared with `high` without the corrections learned from `low`.
         self._plain = dataclasses.replace(self._usual, correction=None)
         reference = load_reference(run.scene.root / "reference", run.scene, run.cfg)
         self.target = lambda row: np.asarray(reference(row))
@@ -70,7 +70,7 @@ class Aligned:
         return with_fitted_exposure(self._plain, *images)
 
     def displays(self) -> dict[str, p2gs_jax.DisplayTransform]:
-        """Return the transform of each score; `enhanced` where corrections enhance."""
+        """Return the transforms of scores but `per_view`; only `luminance_gs` has `enhanced`."""
         exposed = [with_fitted_exposure(self._plain, *images) for images in self._training]
         found = [
             fit_capture(*images, start.capture, start.formation, gamma=True, white_balance=True)

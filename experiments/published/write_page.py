@@ -21,13 +21,13 @@ command, the seconds of the whole fit, and the commit.
 `python experiments/published/write_page.py` writes the page from [rows.json](published/rows.json)
 and [published.json](published/published.json). [The README of the scripts](published/README.md)
 says how rows are made and which systems were not run. The machine is that of
-[the records](results/README.md).
+[the records](results/README.md) unless a row names another.
 
 Splats are blurred by 0.05 pixels^2 unless the row names another blur. Until commit 057bc06
-(2026-11-25) the default was the blur of 3DGS, 0.3 pixels^2. Rows of LOM and nerf_fox from before
-that commit need `--render.blur 0.3` to be repeated; rows of lego name their blur. Rows of lego
-and nerf_fox are older than commit 05f3698 (2026-11-26); until then long fits slowed the learning
-of colours as well ([length](results/2026-11-25-length.md)).
+(2026-11-25) the default was the blur of 3DGS, 0.3 pixels^2. Rows of nerf_fox need
+`--render.blur 0.3` to be repeated. Rows of nerf_fox and of unperturbed lego are older than commit
+05f3698 (2026-11-26); until then long fits slowed the learning of colours as well
+([length](results/2026-11-25-length.md)).
 """
 NOT_RUN = "Not run yet."
 AT_SIZE, HDR = HERE.parent / "at_size.json", "mu_law_novel"
@@ -66,7 +66,7 @@ def section(
     figures = benchmark["figures"]
     if own:
         lines += ["Ours:", ""]
-        header = ["scene", "method", "steps", *figures.values(), "beside the best published, dB"]
+        header = ["scene", "method", "steps", *figures.values(), "minus the best published, dB"]
         header += ["Gaussians", "seconds", "commit", "command"]
         lines += table(header, [_cells(key, row, benchmark) for key, row in own.items()])
     else:
@@ -95,7 +95,7 @@ def _cells(key: Key, row: Mapping[str, Any], benchmark: Mapping[str, Any]) -> li
 
 
 def hdr_section(rows: Mapping[Key, Mapping[str, Any]]) -> list[str]:
-    """Return the lines of the HDR score, of the towns at size whose true radiance is known."""
+    """Return the lines of the HDR score, with the rows that have one."""
     found = {key: row for key, row in sorted(rows.items()) if HDR in row["figures"]}
     header = ["photographed at", "method", "steps", "mu law, novel views, dB", "commit", "command"]
     cells = [
@@ -119,7 +119,7 @@ def page(
         SystemExit: a row belongs to no benchmark.
     """
     if unknown := {key.benchmark for key in rows} - set(published):
-        raise SystemExit(f"rows.json has rows of {', '.join(sorted(unknown))}: not published.json")
+        raise SystemExit(f"published.json lacks {', '.join(sorted(unknown))}, as in rows.json")
     lines = [HEAD]
     for name, benchmark in published.items():
         lines += section(name, benchmark, rows)

@@ -37,7 +37,7 @@ def command(*words: object) -> int:
 def read(root: Path) -> int:
     """Survey a scene on the command line, then read it as a fit does and decode every photograph.
 
-    Nothing is triangulated; only poses and photographs of scenes without points are read.
+    Scenes without points are not triangulated: only their poses and photographs are read.
     """
     code = command("inspect", root)
     if code:
@@ -71,9 +71,9 @@ def _whole(root: Path) -> int:
 
 
 def _swept(found: Recording) -> int:
-    """Read all that a survey of a drive leaves closed, as a fit has it.
+    """Read the files of a drive that `inspect` does not open, as a fit does.
 
-    Every sweep first: a fit reads only those of the photographs' time.
+    All sweeps are read; a fit reads only those of the photographs' time.
     """
     for sweep in found.sweeps:
         sweep.read()

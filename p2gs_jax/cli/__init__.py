@@ -16,8 +16,8 @@ from p2gs_jax.errors import UserError
 # Silence the native libraries before they load.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 os.environ.setdefault("GLOG_minloglevel", "3")
-os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # warnings name files as they are
-# Where Pillow refuses, too (scene/files.py): what a header says is not decoded to find out.
+os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # its warnings do not escape names of files
+# The limit of Pillow (scene/files.py): OpenCV too refuses larger pictures before it decodes them.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2 * 89_478_485))
 
 
@@ -37,8 +37,8 @@ def _run(argv: list[str]) -> int:
 def main(argv: list[str] | None = None) -> None:
     """Run the command line and exit.
 
-    Codes: 0 done, 1 worse than a baseline or something needed is broken, 2 bad input, 128 + the
-    signal's number where one asked for the end (130 Ctrl-C, 143 SIGTERM).
+    Exit codes: 0 done; 1 a run of a sweep failed, or the installation or a report is incomplete; 2
+    an error with a message; 128 + the signal's number (130 Ctrl-C, 143 SIGTERM).
     """
     if argv is None:
         argv = sys.argv[1:]
@@ -79,7 +79,7 @@ def _complain(error: UserError) -> int:
 
 
 def _missing(error: ImportError, argv: list[str]) -> int:
-    """Report which library is broken; `doctor` runs even if it is the parser's."""
+    """Report which library is broken; `doctor` runs even if the parser needs that library."""
     if (error.name or "").split(".")[0] == "p2gs_jax":
         raise error
     if argv[:1] == ["doctor"]:

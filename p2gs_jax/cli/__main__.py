@@ -1,4 +1,4 @@
-"""`python -m p2gs_jax.cli`."""
+"""Entry point of `python -m p2gs_jax.cli`."""
 
 from p2gs_jax.cli import main
 

@@ -38,7 +38,7 @@ def _checked(cfg: FitConfig, whole: str, value: Any) -> Any:
         _require_field(record, name, whole)
         record = getattr(record, name)
         if not dataclasses.is_dataclass(record):
-            fix = f"{name!r} is a value: leave out the names behind it"
+            fix = f"{name!r} is a value: leave out the names after it"
             raise UserError(f"{whole!r} is not a configuration field.", fix=fix)
     _require_field(record, last, whole)
     hint = typing.get_type_hints(type(record))[last]

@@ -18,8 +18,8 @@ Vec3 = tuple[float, float, float]
 ROAD_HALF_WIDTH = 5.6
 KERB_HEIGHT = 0.14
 FACADE_LINE = 9.0
-# Extents along x, m: the side street between the corners of buildings, the house across the street,
-# and the drivable length, which ends before the tower that closes the view.
+# Extents along x, m: the side street between the corners of buildings, the underpass of a house
+# over the street, and the drivable length, which ends before the tower that closes the view.
 CROSS_STREET, UNDERPASS, STREET_END = (27.0, 36.0), (54.0, 68.0), 100.0
 UNDERPASS_HEIGHT, FLOOR_HEIGHT, GROUND_FLOOR_HEIGHT = 5.2, 3.2, 4.0
 
@@ -36,7 +36,7 @@ Material = IntEnum(
 class Light:
     """Radiance of sky and lit ground (`bounce`), and a sun in a unit direction.
 
-    `sun` is its irradiance over pi, so that a white wall facing it has this radiance.
+    `sun` is the irradiance of the sun over pi: the radiance of a white wall that faces it.
     """
 
     sun_direction: Vec3 = (-0.46, -0.50, 0.735)
@@ -48,7 +48,7 @@ class Light:
 
 @dataclass(frozen=True)
 class Town:
-    """P primitives, ordered boxes, tapered boxes, ellipsoids; columns as in `Solid`.
+    """P primitives: boxes, then tapered boxes, then ellipsoids; columns as in `Solid`.
 
     `planes` are (n, d) of the tapered boxes' six faces: inside is n . p <= d, n unit. `seed` is
     that of the textures' noise, `underpass` its extent along x, or None.
@@ -92,7 +92,7 @@ class Solid:
 class Builder:
     """Places solids; their order determines their random numbers.
 
-    Only houses stand within `clear`, an extent along x, m.
+    `clear` is the extent of the underpass along x, m, where no tree, car or lamp is placed.
     """
 
     rng: np.random.Generator
@@ -120,7 +120,7 @@ class Builder:
         self.solids.append(Solid(kind, lo, hi, material, color, accent, params, top))
 
     def is_clear(self, x: float, reach: float) -> bool:
-        """Return whether the surroundings of x, within `reach` m, must stay free."""
+        """Return whether nothing may be placed within `reach` m of x, because of the underpass."""
         return self.clear is not None and (self.clear[0] - reach < x < self.clear[1] + reach)
 
     def post(

@@ -27,7 +27,7 @@ def fitted(finished_run):
 
 @pytest.fixture(scope="module")
 def whole(fitted, tmp_path_factory):
-    """Return the page of a run that fits, and what was said about it."""
+    """Return the path of a page with all splats, and what `write_page` returned."""
     path = tmp_path_factory.mktemp("page") / "scene.html"
     return path, write_page(path, fitted, fitted.common_display(), size_mb=5)
 

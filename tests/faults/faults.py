@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class Fault(NamedTuple):
-    """A line that is wrong."""
+    """Correct code, and the wrong code that replaces it."""
 
     name: str  # what the fault does
     file: str  # inside p2gs_jax
@@ -55,7 +55,7 @@ FAULTS = (
         ORACLE,
     ),
     Fault(
-        "one band of the harmonics has the other sign",
+        "one function of the harmonics has the other sign",
         "render/harmonics.py",
         "values += [-C1 * y, C1 * z, -C1 * x]",
         "values += [-C1 * y, C1 * z, C1 * x]",
@@ -139,7 +139,7 @@ FAULTS = (
         "properties/test_pir.py::test_17_masked_pixels_get_zero_gradient",
     ),
     Fault(
-        "the printed loss forgets its scale prior",
+        "the scale prior of the printed loss has another mean",
         "train/terms.py",
         '"exposure_scale": lambda p: jnp.mean((p.exposures - 1) ** 2)',
         '"exposure_scale": lambda p: jnp.mean((p.exposures - 2) ** 2)',

@@ -140,7 +140,7 @@ def test_colours_step_at_whole_stops_and_near_is_bright():
     shown = depth_color(depth, alpha, limits)
     assert luminance(shown)[0, 0] > luminance(shown)[0, 1] > 0
     assert not shown[0, 2].any()
-    # The same surface, half covered: the expected depth counts.
+    # The same surface with an opacity of 0.6: depth is divided by it.
     np.testing.assert_allclose(depth_color(depth * 0.6, alpha * 0.6, limits), shown)
 
 

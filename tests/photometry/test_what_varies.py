@@ -61,7 +61,7 @@ def test_corners_are_solved_for_each_camera(kind):
     assert np.abs(corners - expected).max() < (0.05 if kind == "camera" else 0.08)
     assert np.abs((np.log(corners) - np.log(expected)) / s.corner_errors).max() < 4
     assert [c.name for c in s.cameras] == list(o.camera_names)
-    # Nobody else explains the corners: exposures are wrong without them.
+    # No other parameter explains the corners: exposures are wrong without them.
     assert np.std(s.log_exposures - np.log(ISO4)) / np.log(2) < 0.015
 
 
@@ -80,8 +80,8 @@ def test_cameras_may_have_responses_of_their_own():
 
 
 def test_channels_with_exposures_of_their_own_have_no_powers_of_their_own():
-    # Dark photographs are bluer; a power per channel would explain that as well, and any tint of
-    # a view with it: the mean of the white balances would be no white balance.
+    # Dark photographs are bluer; a power per channel would explain that as well, and leave white
+    # balances undetermined.
     o = observe(DRIVE, ISO4[:, None] * np.exp(DARK), seed=2)
     form = Form("view_exposure", "view")
     response = fit_response(problem_of(o), Response(), form=form, by="channel")
@@ -145,7 +145,7 @@ def test_what_varies_is_found(exposures, curve, gamma, model, response):
     ],
 )
 def test_known_exposures_that_differ_tell_the_power_of_the_curve(known, cameras):
-    """A camera of gamma 2.8: under sRGB, radiance comes out as its power of 0.8."""
+    """A camera of gamma 2.8: decoded as sRGB, radiance comes out to the power of 0.8."""
     truth = make_exposures(SHORT, "iso4")
     how = {"curve": "power", "gammas": np.full(len(truth), 2.8), "pivot": 0.18}
     o = observe(SHORT, truth, **how)

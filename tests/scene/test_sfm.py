@@ -152,7 +152,7 @@ def test_pairs_are_of_neighbours_by_name_and_by_pose():
     pairs = pairs_by_name(left, "sequence")
     assert len(pairs) == len(set(pairs)) < 40 * 39 / 2
     assert ("left/000.png", "left/010.png") in pairs
-    assert ("left/000.png", "left/035.png") in pairs, "who comes back after a round is found"
+    assert ("left/000.png", "left/035.png") in pairs, "a return after a loop is matched"
     assert ("left/001.png", "left/036.png") not in pairs
     frames = [f"frame_{k}.png" for k in range(100)]
     assert {*itertools.pairwise(frames)} <= set(pairs_by_name(frames))

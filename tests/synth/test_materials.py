@@ -20,7 +20,7 @@ TO_SUN = np.array([-0.5, -0.5, 0.7], np.float32)[:, None] / np.sqrt(0.99)
 
 
 class Face(NamedTuple):
-    """A solid, the axis along which its face looks (to the low side; up), the widest footprint."""
+    """A solid, the axis of its face (the low side, or the top), and the widest footprint, m."""
 
     lo: Vec3
     hi: Vec3
@@ -60,9 +60,9 @@ FACES = {
 
 @pytest.fixture(scope="module")
 def look():
-    """Return a function: means by channel of a face, of points, rows, a view and a footprint.
+    """Return a function of points, rows in the town, a ray direction and a footprint in m.
 
-    They are of albedo, gloss, and light from the sun and the sky.
+    It returns the face's mean albedo, gloss, and light from the sun and the sky, by channel.
     """
     build = Builder(np.random.default_rng(0))
     for face in sorted(FACES.values(), key=kind):

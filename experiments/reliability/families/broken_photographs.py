@@ -212,7 +212,7 @@ def _exif() -> Iterator[Trial]:
 
 
 def _numbers(exif: bytes) -> Iterator[Broken]:
-    """Put extreme words into every fourth byte."""
+    """Put extreme 4-byte numbers at every twelfth byte."""
     for at in range(8, len(exif) - 4, 12):
         for value in (0, 0xFFFFFFFF):
             other = exif[:at] + struct.pack(">I", value) + exif[at + 4 :]

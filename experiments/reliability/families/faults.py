@@ -20,9 +20,9 @@ from reliability.family import Failure, Family, Report
 NAME = "faults"
 ABOUT = """
 A fit is killed at random moments (also while it writes checkpoints and results), asked to end, and
-loses disk, folder, memory or clock. Survived: it ends with the exit code and the words that belong
-to the fault, without a traceback, and resumed it gives the run that was never interrupted, byte for
-byte (log, Gaussians, photometry, scores).
+loses disk, folder, memory or clock. A trial is survived if the fit ends with the exit code and the
+words that belong to the fault, without a traceback. The resumed run then equals the uninterrupted
+one byte for byte, times aside (log, Gaussians, photometry, scores).
 """
 KILLS, KILLS_QUICK = 50, 4
 # Bytes that a file may have: from no room for the first file to none for the checkpoint.
@@ -113,7 +113,7 @@ class Faults:
                 delay = self.rng.uniform(0, 0.1)
                 fits.wait_for(process, lambda: fits.lines(run) >= wanted)
                 fits.wait_for(process, _after(delay))
-                moment = "between steps"
+                moment = "after a line of its log"
             elif kind == "checkpoint":
                 folder = run / "checkpoints"
                 fits.wait_for(process, lambda: any(folder.glob(".writing-*")))
@@ -135,7 +135,7 @@ class Faults:
             fits.wait_for(process, lambda: fits.lines(run) >= 3)
             process.send_signal(number)
             fits.end(process).require(128 + number, word, "--resume continues")
-        # A frequent checkpoint is an option of the run: the same as it was begun with.
+        # The interval of checkpoints must be that of the start of the run.
         again = fits.run(fits.command(self.scene, run, "--resume", *rare), self.env)
         again.require(0, "Resuming after step")
         fits.require_same(self.whole, run)
@@ -204,7 +204,7 @@ class Faults:
         ended = fits.run(argv, self.env, preexec_fn=limit)
         ended.require(2, "would take about", "--gaussians")
         if (run / "config.json").exists():
-            raise Trial("it locked the folder")
+            raise Trial("it left a config.json")
 
     def out_of_memory(self, run: Path) -> None:
         """Take all memory away between steps: the fit reports it or dies, and can be resumed."""

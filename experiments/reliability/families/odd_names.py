@@ -74,7 +74,7 @@ def trials() -> Iterator[Trial]:
         yield Trial(f"camera: {name}", partial(_camera, odd.removesuffix(".png")), read)
         yield Trial(f"scene folder: {name}", partial(_folder, odd), read)
         yield Trial(
-            f"of no photograph: {name}", partial(_named_in_transforms, odd), read, refused=True
+            f"missing photograph: {name}", partial(_named_in_transforms, odd), read, refused=True
         )
     for name, outside in OUTSIDE.items():
         yield Trial(f"model: {name}", partial(_colmap_names, outside), read, refused=True)

@@ -1,4 +1,4 @@
-"""What others could do to who opens their files, or stands on the same network."""
+"""Attacks through files from others, or from the same network."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from p2gs_jax.scene.drives.tables import read_pickled
 
 NAME = "safety"
 ABOUT = """The viewer listens on loopback unless told otherwise, refuses pages of other sites and
-names that were made to point here, and wants a token where others reach it; reports hold no script
-and escape names; pickles that call something are refused; temporary files are private; the package
-calls nothing that runs text. A trial survives if what is forbidden does not happen."""
+host names that others let point here, and wants a token where others reach it; reports hold no
+script and escape names; pickles that call something are refused; temporary files are private; the
+package calls nothing that runs text. A trial is survived if nothing forbidden happens."""
 PACKAGE = Path(__file__).resolve().parents[3] / "p2gs_jax"
 HAPPENED = 71
 HTML = "<img src=x onerror=alert(1)>.png"
