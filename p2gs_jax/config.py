@@ -62,7 +62,7 @@ class DataConfig:
     drive: str | None = None
     """Name of a drive in a folder of several drives, or the beginning of its name."""
     cameras: tuple[str, ...] = ()
-    """Cameras of a drive; the prefixes `camera_`, `cam_` and `ring_` are optional; none: all."""
+    """Cameras of a drive, with or without `camera_`, `cam_` or `ring_` in front; empty: all."""
     frames: str | None = None
     """Frames of a drive that are used, as a Python slice: FIRST:END[:STEP]."""
     every: int | None = None
@@ -177,7 +177,7 @@ class PhotometryConfig:
     """Learned correction of display values per view: a colour matrix (3DGS), a bilateral grid, a
     `curve`, a whole camera (`ppisp`) or an enhancing curve (`luminance`)."""
     freeze_until: float = 0.6
-    """Fraction of the run that fixes the exposures from tracks (ours: docs/photometry.md, 4)."""
+    """Fraction of the run that keeps exposures from tracks fixed (ours: docs/photometry.md, 4)."""
 
 
 @dataclass(frozen=True)
@@ -187,7 +187,7 @@ class RelativeExposureConfig:
     weight: float | None = None
     """lambda_exp (paper: 0.01 in the main text, 0.1 in the appendix)."""
     form: Literal["literal_same_pose", "observed_ldr"] = "literal_same_pose"
-    """Interpretation of the printed formula."""
+    """Interpretation of the formula in the paper."""
     huber_delta: float = 0.05
     """Transition of the Huber loss of `observed_ldr`, which compares photographs; LDR units."""
 
@@ -275,8 +275,8 @@ class OptimizerConfig:
     final: float = 0.1
     """Fraction to which all other rates decay exponentially (3DGS: no decay; ours: BUILD_NOTES)."""
     full_rate_updates: float | None = 600.0
-    """Number of updates n0 of a Gaussian after which its rates, except those of colours, shrink by
-    sqrt(n0 / updates); None: never (ours: BUILD_NOTES, "Length")."""
+    """Number n0: if a Gaussian gets more updates in the whole run, all its rates except those of
+    colours are multiplied by sqrt(n0 / updates); None: never (ours: BUILD_NOTES, "Length")."""
     extent: Literal["cameras", "near"] = "near"
     """Scene extent in rates of the means and thresholds: the radius of the cameras (3DGS), or the
     depth of near points if it is smaller (ours: BUILD_NOTES, "Extent")."""
@@ -367,11 +367,11 @@ class InitConfig:
     shell_count: int = 4000
     """Number of directions on the whole sphere from which Gaussians of the shell are chosen."""
     shell_radius: float = 30.0
-    """Radius of the shell, radii of the cameras."""
+    """Radius of the shell, radii of the cameras; at 2 to 10 times the distance of far seeds."""
     dense: Literal["auto", "on", "off"] = "auto"
     """Seeds from optical flow (after EDGS, arXiv 2504.13204); `auto`: where seeds are few."""
     dense_points: int | None = None
-    """Largest number of seeds from optical flow; None: 60 % of the bound on the population."""
+    """Largest number of seeds from optical flow; None: with all other seeds 60 % of the bound."""
     dense_opacity: float = 0.5
     """Initial peak opacity of seeds from optical flow (ours: BUILD_NOTES)."""
 
@@ -408,10 +408,10 @@ class EvaluationConfig:
 
 @dataclass(frozen=True)
 class FitConfig:
-    """All values of a fit."""
+    """All options of a fit."""
 
     preset: PresetName = "robust"
-    """Preset of the initial values."""
+    """Preset on which the options are based."""
     data: DataConfig = field(default_factory=DataConfig)
     render: RenderConfig = field(default_factory=RenderConfig)
     photometry: PhotometryConfig = field(default_factory=PhotometryConfig)

@@ -1,4 +1,4 @@
-"""Scenes small enough to fit, or to judge, in seconds."""
+"""Scenes that are small enough to fit or to evaluate in seconds."""
 
 import cv2
 import numpy as np
@@ -8,7 +8,7 @@ from p2gs_jax.types import Scene, View
 
 
 def make_scene(root, views=6, points=150, size=(112, 100), seed=0):
-    """Write coloured dots seen by a row of cameras, under exposures that differ, as COLMAP text."""
+    """Write a COLMAP text model and images of discs: cameras in a row, random exposures."""
     rng = np.random.default_rng(seed)
     width, height = size
     focal = 90.0
@@ -51,14 +51,14 @@ def make_scene(root, views=6, points=150, size=(112, 100), seed=0):
 
 
 def prepared(scene, cfg, kept=None):
-    """Return what a fit of a scene starts from."""
+    """Return the initial state of a fit of a scene, with solved exposures."""
     found = survey(scene, cfg)
     exposures = solve_exposures(scene, found.still, cfg, dense=found.dense, kept=kept)
     return initialise(found, exposures)
 
 
 def noise_scene(folder, train, held_out, masked=False):
-    """Return views of noise, 40x34, by their names; their left halves count or are masked."""
+    """Write images of noise, 40x34 pixels; return their scene. `masked` leaves out left halves."""
     rng, views = np.random.default_rng(0), []
     K = np.array([[40, 0, 20], [0, 40, 17], [0, 0, 1]], np.float32)
     for name in (*train, *held_out):

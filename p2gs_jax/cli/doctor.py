@@ -1,6 +1,6 @@
 """`doctor`: what works on this machine, and what to install for missing features.
 
-Every library is imported inside a check, as it may be the broken one; no check raises.
+Each check imports its libraries itself, because any of them may be broken; no check raises.
 """
 
 from __future__ import annotations
@@ -47,11 +47,11 @@ FEATURES = (
 
 
 class Finding(NamedTuple):
-    """What a check found."""
+    """The result of a check."""
 
     name: str
     text: str
-    ok: bool = True  # False: something that everything needs is broken
+    ok: bool = True  # False: the part is broken, or the feature is not ready
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class Doctor:
 
 
 def check_libraries() -> list[Finding]:
-    """Return the version, or what is wrong, of each library that all need."""
+    """Return for every required library its version, or its fault."""
     out = []
     for name, wanted in sorted(requirements().items(), key=lambda item: item[0].lower()):
         version, module, trouble = installed(name), module_of(name), ""
@@ -105,7 +105,7 @@ def check_libraries() -> list[Finding]:
             version = version or getattr(loaded, "__version__", None)
             if wanted is not None and version is not None and not wanted.contains(version, True):
                 trouble = f"too old: {name}{wanted} is needed"
-        except Exception as error:  # whatever a broken library raises
+        except Exception as error:  # a broken library can raise anything
             reason = str(error).strip().splitlines()
             trouble = f"{type(error).__name__}: {reason[0] if reason else module}"
         text = f"BROKEN ({version}): {trouble}" if trouble else str(version)
@@ -114,7 +114,7 @@ def check_libraries() -> list[Finding]:
 
 
 def module_of(name: str) -> str:
-    """Return what a distribution is imported as."""
+    """Return the import name of a distribution."""
     return MODULES.get(name.lower(), name)
 
 
@@ -127,7 +127,7 @@ def installed(name: str) -> str | None:
 
 
 def requirements() -> dict[str, Any]:
-    """Return ranges of versions by distribution; None where unknown."""
+    """Return the accepted versions by distribution; None where unknown."""
     try:
         from packaging.requirements import Requirement
 
@@ -141,7 +141,7 @@ def requirements() -> dict[str, Any]:
 def check_features(broken: Sequence[str]) -> list[Finding]:
     """Return for each feature whether it is ready, and what it uses, or what to install.
 
-    The names are those of broken libraries.
+    `broken` has the names of broken libraries.
     """
     core = [name for name in broken if name != "pycolmap"]
     again = f"pip install --force-reinstall {' '.join(core)}"
@@ -154,32 +154,32 @@ def check_features(broken: Sequence[str]) -> list[Finding]:
 
 
 def check_devices() -> list[Finding]:
-    """Return JAX's devices, and the implementations that a fit would use."""
+    """Return JAX's devices, and the rasterizer of a fit, with a note on unsupported GPUs."""
     try:
         import jax
 
         from p2gs_jax.render.tiles import fastest_here, slow_here
 
         names = [device.device_kind for device in jax.devices()]
-        with suppress(Exception):  # CPUs and some plugins do not tell
+        with suppress(Exception):  # CPUs and some plugins do not report it
             limits = [d.memory_stats()["bytes_limit"] / 2**30 for d in jax.devices()]
             names = [f"{n} ({limit:.1f} GiB)" for n, limit in zip(names, limits, strict=True)]
         text, driver = ", ".join(names), Path("/proc/driver/nvidia/version")
         if jax.default_backend() == "cpu" and (shutil.which("nvidia-smi") or driver.is_file()):
             text += " alone; for the NVIDIA GPU: pip install 'p2gs-jax[cuda]'"
-        used = ". ".join(filter(None, [fastest_here(), slow_here()]))
-        return [Finding("JAX runs on", text), Finding("Rasterizer", used)]
-    except Exception as error:  # whatever a broken JAX raises
+        rasterizer = ". ".join(filter(None, [fastest_here(), slow_here()]))
+        return [Finding("JAX runs on", text), Finding("Rasterizer", rasterizer)]
+    except Exception as error:  # a broken JAX can raise anything
         return [Finding("JAX runs on", f"{type(error).__name__}: {error}", ok=False)]
 
 
 def check_render() -> Finding:
-    """Compare images of small scenes, and their gradients, with the float64 reference's."""
+    """Compare images of small scenes, and their gradients, with those of the float64 reference."""
     try:
         from p2gs_jax.render.selfcheck import self_check
 
         found = self_check()
-    except Exception as error:  # whatever is broken
+    except Exception as error:  # any library may be broken
         return Finding("Self-test", f"FAILED: {type(error).__name__}: {error}", ok=False)
     if found.fault is not None:
         return Finding("Self-test", f"FAILED: {found.fault}", ok=False)
@@ -191,7 +191,7 @@ def check_render() -> Finding:
 
 
 def _row(name: str, text: str, width: int = 13) -> str:
-    """Return a line of at most 80 columns, but for paths and errors."""
+    """Return a row, wrapped at 80 columns; longer words, such as paths, stay whole."""
     wrapper = textwrap.TextWrapper(80, break_long_words=False, break_on_hyphens=False)
     wrapper.initial_indent, wrapper.subsequent_indent = name.ljust(width), " " * width
     return wrapper.fill(printable(text))

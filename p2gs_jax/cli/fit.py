@@ -31,11 +31,11 @@ class Cluster:
     """A large scene is cut into blocks, which one machine or a cluster (Dask, Slurm) fits."""
 
     blocks: int | Literal["auto"] | None = None
-    """Number of blocks that are fitted apart and merged; auto: as few as memory allows."""
+    """Number of blocks that are fitted separately and merged; auto: as few as memory allows."""
     jobs: int = 1
-    """Number of blocks at a time on this machine."""
+    """Number of blocks that this machine fits at the same time."""
     engine: Annotated[str, tyro.conf.arg(metavar="NAME")] = "local"
-    """Place of the fits: local, dask://HOST:PORT, or slurm:OPTION=VALUE,... (docs/api.md)."""
+    """Where blocks are fitted: local, dask://HOST:PORT, or slurm:OPTION=VALUE,... (docs/api.md)."""
     devices: int | Literal["all"] = 1
     """Number of devices that share a step (--train.batch) of a fit without blocks."""
 
@@ -62,13 +62,13 @@ class Fit:
     """Continue an interrupted run; larger --steps or --budget also continue a finished one."""
     config: Config
     preset: Preset = "robust"
-    """Initial values: robust; paper or paper_appendix (as printed); or one of the baselines 3dgs,
-    3dgs_published, 3dgs_gain, 3dgs_affine, 3dgs_bilateral, 3dgs_curve, luminance_gs, ppisp,
+    """Preset of options: robust; paper or paper_appendix (as printed); or one of the baselines
+    3dgs, 3dgs_published, 3dgs_gain, 3dgs_affine, 3dgs_bilateral, 3dgs_curve, luminance_gs, ppisp,
     ppisp_solved."""
     reference: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Photographs of the same views under one common exposure, for evaluation."""
     threads: int | None = None
-    """CPU cores that share a view (default: at most 4); results repeat for the same number."""
+    """CPU cores per view (default: 4, or 1 on small CPUs); equal numbers give equal results."""
     verbose: bool = False
     """Print all scores, and the seconds of each part of the fit."""
     view: bool = False
@@ -97,7 +97,7 @@ class Fit:
             reporter.message(f"Run folder: {out}")
             common = {"reference": self.reference, "resume": self.resume, "reporter": reporter}
             if cluster.blocks is None:
-                # Starting the interpreter and loading libraries is processor time throughout.
+                # The budget includes the start of Python, whose duration is about its CPU time.
                 common |= {"spent_s": time.process_time(), "devices": cluster.devices}
                 cfg = with_a_view_each(cfg, cluster.devices)
                 result = fit(self.scene, out, cfg, **common)
@@ -114,7 +114,7 @@ class Fit:
         return 0
 
     def run_folder(self) -> Path:
-        """Return --out, or a new folder of today, or the newest that can be continued."""
+        """Return --out; else a new folder with today's date, or with --resume the newest run."""
         if self.out is not None:
             return self.out
         scene, runs = self.scene.resolve(), Path("runs")
@@ -141,24 +141,24 @@ class Fit:
         why = "--jobs and --engine have no effect without --blocks"
         fix = "add --blocks auto, or a number"
         check(count is not None or (cluster.jobs == 1 and cluster.engine == "local"), why, fix=fix)
-        right = not isinstance(count, int) or count >= 1
-        check(right, f"--blocks {count} is not a number of blocks", fix=f"{whole} auto")
+        valid = not isinstance(count, int) or count >= 1
+        check(valid, f"--blocks {count} is not a number of blocks", fix=f"{whole} auto")
         check(cluster.jobs >= 1, "--jobs must be at least 1")
-        right = self.threads is None or self.threads >= 1
-        check(right, f"--threads {self.threads} is not a number of cores", fix="give 1 or more")
+        valid = self.threads is None or self.threads >= 1
+        check(valid, f"--threads {self.threads} is not a number of cores", fix="give 1 or more")
         why = "--blocks fits every block on one device, and on a CPU on one core"
         fix = "leave out --devices and --threads; --jobs and --engine are for blocks"
         check(count is None or (devices == 1 and self.threads is None), why, fix=fix)
-        right = not isinstance(devices, int) or devices >= 1
-        check(right, f"--devices {devices} is not a number of devices", fix=f"{whole} all")
+        valid = not isinstance(devices, int) or devices >= 1
+        check(valid, f"--devices {devices} is not a number of devices", fix=f"{whole} all")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Calibrate:
     """Solve exposures and tone curves alone, in seconds.
 
-    The colours of shared points give them without splatting, and with standard errors. The command
-    prints a table and writes photometry.json; open calibration.png first.
+    They follow from the colours of shared points, without splatting, and have standard errors. The
+    command prints a table and writes photometry.json; open calibration.png first.
 
         p2gs-jax calibrate castle --out photometry
         p2gs-jax calibrate castle --out photometry --known-exposures exif
@@ -190,18 +190,18 @@ class Calibrate:
     """Also write DIR/developed: the scene for other trainers, its photographs at one exposure and
     white balance, without vignetting (docs/exports.md)."""
     exposure_ev: DevelopedExposure = 0.0
-    """Exposure of developed photographs: stops from their mean, or as bright as no highlight of any
-    photograph is lost."""
+    """Exposure of developed photographs: stops from their mean; highlights: the brightest exposure
+    that keeps the highlights of every photograph."""
     masks: bool = True
     """Mask pixels of developed photographs that are clipped or black in the original."""
     write_for: Annotated[
         tuple[Literal["ppisp", "3dgs", "nerfstudio"], ...], tyro.conf.arg(metavar="NAME")
     ] = ()
-    """Also write values for other trainers: ppisp (gsplat, LichtFeld), 3dgs, nerfstudio
+    """Also write the solution for other trainers: ppisp (gsplat, LichtFeld), 3dgs, nerfstudio
     (docs/exports.md)."""
     config: Config
     preset: Preset = "robust"
-    """Initial values (p2gs-jax fit --help)."""
+    """Preset of options (p2gs-jax fit --help)."""
 
     def execute(self) -> int:
         """Solve the photometry alone; print it as a table."""
@@ -239,23 +239,23 @@ class Calibrate:
     def checked(self) -> FitConfig:
         """Return the configuration; raise a UserError where a value makes no sense."""
         scene, is_run, data, usual = self.scene, self.is_run, self.config.data, FitConfig().data
-        own_size = data == usual
+        no_data_options = data == usual
         why = "--data.test-every and --data.split have no effect here"
         fix = "leave them out: every photograph is calibrated"
         check((data.test_every, data.split) == (usual.test_every, usual.split), why, fix=fix)
         cfg, leave_out = checked(self.config), "leave out --max-width, --images and --data options"
         why = "--static reads every photograph of the folder at its own size"
-        check(own_size or not self.static, why, fix=leave_out)
-        why = f"{scene} is a finished run, whose image size and folder stay"
-        check(own_size or not is_run, why, fix=leave_out)
+        check(no_data_options or not self.static, why, fix=leave_out)
+        why = f"{scene} is a finished run, whose image size and folder cannot change"
+        check(no_data_options or not is_run, why, fix=leave_out)
         asked, ev = self.develop is not None, self.exposure_ev
         why = "--exposure-ev and --no-masks have no effect without --develop"
         check(asked or (ev == 0 and self.masks), why, fix="add --develop 8bit, 16bit or exr")
         check(
             isinstance(ev, str) or math.isfinite(ev), f"--exposure-ev {ev} is not a finite number"
         )
-        why = "--develop needs a scene with cameras, neither a run nor a series of --static"
-        fix = "name the photographs of the run, or leave it out"
+        why = "--develop needs a scene with cameras, not a run or photographs of --static"
+        fix = "name the scene of the run, or leave out --develop"
         check(not (asked and (is_run or self.static)), why, fix=fix)
         return cfg
 
@@ -264,7 +264,7 @@ class Calibrate:
 class Inspect:
     """Inspect a scene without fitting it: cameras, frames, LiDAR, boxes, missing files.
 
-    The command reads every format that `fit` reads, and starts no structure from motion.
+    The command reads every format that `fit` reads. It does not start structure from motion.
 
         p2gs-jax inspect drive
         p2gs-jax inspect drive --cameras front front_left --frames 0:40
@@ -287,13 +287,13 @@ class Inspect:
         console, cameras = stdout(), count_of(len(found.cameras), "camera")
         photographs = count_of(found.photographs, "photograph")
         console.print(f"{self.scene} ({found.format}): {photographs} of {cameras}.", soft_wrap=True)
-        console.print(_cameras(found))
+        console.print(_camera_table(found))
         for line in found.sentences:
             console.print(line, soft_wrap=True)
         return 0
 
 
-def _cameras(found: Survey):
+def _camera_table(found: Survey):
     """Return a table of the cameras, without empty columns."""
     from p2gs_jax.cli.tables import make_table
 

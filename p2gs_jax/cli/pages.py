@@ -1,4 +1,4 @@
-"""`view`, `report` and `compare`: runs in the browser."""
+"""`view`, `report` and `compare`: runs in the browser, on a page and in tables."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from p2gs_jax.cli.shared import RunPath, SceneFolder, check, require_viewer
 
 @dataclass(frozen=True)
 class View:
-    """Walk through a run in the browser, at any exposure, also while it is being fitted.
+    """Show a run in the browser, at any exposure, also while it is being fitted.
 
     p2gs-jax view runs/street
     """
@@ -24,11 +24,11 @@ class View:
     port: int = 8080
     """Port to listen on; 0: any free port."""
     host: str = "127.0.0.1"
-    """Address to listen on (plain HTTP); 0.0.0.0 admits whoever has the printed address."""
+    """Address to listen on (plain HTTP); 0.0.0.0: all who have the printed address can connect."""
     max_width: int = 1920
     """Largest width of rendered pictures, pixels; wider windows enlarge them."""
     with_fit: bool = False
-    """End with the fit that writes the run."""
+    """Stop the viewer when the fit that writes the run ends."""
 
     def execute(self) -> int:
         """Show the run in the browser until Ctrl-C."""
@@ -45,7 +45,7 @@ class View:
         say = partial(stdout().print, soft_wrap=True)
         follower = Follower(self.run, self.scene, with_fit=self.with_fit)
         if goes_on := follower.goes_on:
-            jax.config.update("jax_platforms", "cpu")  # the fit has the memory of a GPU
+            jax.config.update("jax_platforms", "cpu")  # the fit uses the GPU's memory
         run = follower.first(say)
         place = {"host": self.host, "port": self.port, "max_width": self.max_width}
         serve(run, say=say, follower=follower if goes_on else None, **place)
@@ -64,10 +64,10 @@ class Report:
     """File of the page (default: RUN/report.html)."""
     scene: SceneFolder = None
     render: bool = True
-    """Load the scene and render it for the seams; without it, the run folder gives all."""
+    """Load the scene and render it to measure seams; otherwise use only the run folder."""
 
     def execute(self) -> int:
-        """Write the page; 1 where a file of the run is broken."""
+        """Write the page; return 1 if a file of the run is broken."""
         from p2gs_jax.cli.tables import stdout
         from p2gs_jax.core.progress import TerminalReporter
         from p2gs_jax.report.report import write_report
@@ -94,10 +94,10 @@ class Compare:
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN ...]")]
     """Run folders; the others are compared with the first."""
     out: Path | None = None
-    """Markdown file of the tables (default: none)."""
+    """Markdown file for the tables (default: none)."""
 
     def execute(self) -> int:
-        """Print the runs side by side."""
+        """Print the runs side by side, and write the file."""
         from p2gs_jax.cli.tables import make_table, stdout
         from p2gs_jax.core.atomic import write_text
         from p2gs_jax.report.compare import compare_runs, starred, to_markdown

@@ -44,18 +44,18 @@ class Render:
     split: Literal["all", "train", "test"] = "all"
     """Subset of the scene's views; test: the held-out views."""
     camera: str | None = None
-    """Camera whose views are rendered (default for drive and orbit: that with the most)."""
+    """Camera whose views are rendered (default for drive and orbit: that with the most views)."""
     panorama: bool = False
     """Render one wide image of a rig of cameras, at every time step or along a drive."""
     exposure_ev: float | Literal["own"] | None = None
     """Exposure in stops from the geometric mean of the training exposures; own: that of each
-    photograph, interpolated on a drive (default: own for views, 0 for other trajectories)."""
+    photograph, interpolated on a drive (default: own for views, else 0, also for panoramas)."""
     meter: MeteringRule | None = None
     """Exposure metered from each picture, smoothly along a trajectory. auto: the camera's rule,
     where one explains the photographs; log_average, centre: to mid-grey; highlights: to just below
     white; protected: to mid-grey, highlights kept. --exposure-ev then adds stops."""
     gamma: float | None = None
-    """Gamma (default: that of each view; the mean of the training views for other trajectories)."""
+    """Gamma (default: that of each view; for other pictures the mean of the training views)."""
     curve: Literal["run", "srgb", "power", "linear", "spline"] = "run"
     """Tone curve; run: the fitted one."""
     white_balance_of: str | None = None
@@ -65,7 +65,7 @@ class Render:
     without_objects: bool = False
     """Leave out moving objects."""
     only_objects: bool = False
-    """Show moving objects alone."""
+    """Render only moving objects."""
     shift: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None
     """Shift of a drive to the left, metres (scene units); a negative shift is to the right."""
     frames: int | None = None
@@ -133,20 +133,20 @@ def _load(options: Render) -> Run:
 
 def _check_place(out: Path, overwrite: bool) -> None:
     """Refuse to overwrite files without --overwrite."""
-    there = out.is_file() or (out.is_dir() and any(out.iterdir()))
-    if there and not overwrite:
+    occupied = out.is_file() or (out.is_dir() and any(out.iterdir()))
+    if occupied and not overwrite:
         what = f"{out} exists already" if out.is_file() else f"{out} holds files already"
         fix = "add --overwrite to replace them, or choose another place with --out"
         raise UserError(f"{what}.", fix=fix)
 
 
 def is_video(out: Path) -> bool:
-    """Return whether frames are written into one file."""
+    """Return whether frames are written into a video file."""
     return out.suffix.lower() == ".mp4"
 
 
 def _default_name(options: Render, scene: Scene) -> str:
-    """Return the name of a folder in which a fit writes no held-out view."""
+    """Return a folder name that the fit's renders of held-out views do not use."""
     path = options.trajectory
     name = path if path in PATHS else Path(path).stem
     if path == "views":
@@ -164,10 +164,10 @@ def _check_picture(o: Render) -> None:
     from p2gs_jax.paths.files import LARGEST, MOST_STOPS
 
     path, ev, one = o.trajectory, o.exposure_ev, "leave one of them out"
-    right = path in PATHS or path.lower().endswith(".json")
+    valid = path in PATHS or path.lower().endswith(".json")
     fix = "choose views, drive, orbit or a FILE.json"
-    check(right, f"--trajectory {path!r} is not a valid trajectory", fix=fix)
-    why = "--meter is for pictures of single cameras, instead of --exposure-ev own"
+    check(valid, f"--trajectory {path!r} is not a valid trajectory", fix=fix)
+    why = "--meter works neither with --panorama nor with --exposure-ev own"
     check(o.meter is None or not (o.panorama or ev == "own"), why, fix=one)
     why = f"--exposure-ev {ev} is not a number of stops"
     check(not isinstance(ev, float | int) or abs(ev) <= MOST_STOPS, why, fix="write 0, 1 or -2.5")
@@ -191,12 +191,12 @@ def _check_path(o: Render) -> None:
     check(near, f"--shift must be from {-MOST_SHIFT:g} to {MOST_SHIFT:g} metres")
     check(o.frames is None or o.frames >= 2, "--frames must be at least 2")
     fix = "choose one of them, or leave it out"
-    right = not o.panorama or path in ("views", "drive")
-    check(right, f"--panorama {only} views and drive", fix=fix)
+    valid = not o.panorama or path in ("views", "drive")
+    check(valid, f"--panorama {only} views and drive", fix=fix)
     single = path in PATHS and not o.panorama
     check(o.camera is None or single, "--camera is for single cameras of the scene", fix=leave)
-    right = o.split == "all" or path in PATHS
-    check(right, "--split is for the cameras of the scene", fix=leave)
+    valid = o.split == "all" or path in PATHS
+    check(valid, "--split is for the cameras of the scene", fix=leave)
 
 
 def _check_file(o: Render) -> None:
@@ -205,8 +205,8 @@ def _check_file(o: Render) -> None:
         why = f"--out {out}: {out.suffix} files are not written"
         check(out.suffix.lower() not in OTHER_FILES, why, fix="name a folder, or NAME.mp4")
         kind = "a folder" if out.is_dir() else "a file"
-        right = not out.exists() or out.is_dir() != is_video(out)
-        check(right, f"--out {out} is {kind}", fix="choose another name")
+        valid = not out.exists() or out.is_dir() != is_video(out)
+        check(valid, f"--out {out} is {kind}", fix="choose another name")
     video = out is not None and is_video(out)
     fix = "write --out NAME.mp4, or leave it out"
     check(o.fps is None or video, "--fps is for videos", fix=fix)

@@ -1,4 +1,4 @@
-"""What the options of several commands share: types, parsers, short names, names of others."""
+"""Types, parsers, short names and checks of options that several commands have."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ SYNONYMS = {theirs: ours for ours, names in OTHERS.items() for theirs in names.s
 def parse_duration(text: str) -> float:
     """Return the seconds of `90`, `90s`, `5m`, `1h30m` or `1h30`; UserError: anything else.
 
-    A last number without a unit, below 60, has the unit below that of the number before it.
+    A last number below 60 without a unit counts the next smaller unit: `1h30` is 1 h 30 min.
     """
     number = r"([0-9]{1,9}(?:\.[0-9]+)?)"
     match = re.fullmatch(rf"(?:{number}h)?(?:{number}m)?(?:{number}s)?|{number}", text.strip())
@@ -112,7 +112,7 @@ def require_viewer() -> None:
 
 
 def check_option_names(command: str, argv: Sequence[str], options: Collection[str]) -> None:
-    """Raise a UserError that gives our name of an option of other programs, unless in `options`."""
+    """Raise a UserError for another program's option that is not in `options`; it names ours."""
     for word in argv:
         name = word.split("=", 1)[0].replace("_", "-")
         ours = SYNONYMS.get(name)

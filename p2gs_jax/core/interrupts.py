@@ -1,6 +1,6 @@
-"""Signals that end a program: it ends as after Ctrl-C, at a point from which it can continue.
+"""Signals that end a program as Ctrl-C does, at a point from which it can continue.
 
-Only handlers of the system and of Python are replaced; handlers of `nohup` or another program stay.
+Only default handlers and that of `raised` are replaced; those of `nohup` or other programs stay.
 Outside the main thread Python delivers no signals, and these functions have no effect.
 """
 
@@ -16,7 +16,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal of this number asked the program to end."""
+    """The signal `number` asked the program to end."""
 
     def __init__(self, number: int):
         super().__init__(number)
@@ -53,11 +53,11 @@ class Held:
         self._holding = False
 
     def begin(self) -> None:
-        """Begin to hold signals; before, there is no state to lose and they raise at once."""
+        """Hold signals from now on; earlier ones raise at once, as there is no state to lose."""
         self._holding = True
 
     def deliver(self) -> None:
-        """Raise a waiting signal.
+        """Raise the waiting signal, if there is one.
 
         Raises:
             Interrupted: a signal has arrived.
@@ -75,9 +75,9 @@ class Held:
 
 @contextlib.contextmanager
 def held() -> Iterator[Held]:
-    """Hold signals that end a program within a `with` block; a second signal raises at once.
+    """Hold signals that end a program from `Held.begin` to the end of a `with` block.
 
-    A signal that still waits is raised at the end of the block.
+    A second signal raises at once. One that still waits is raised at the end of the block.
 
     Raises:
         Interrupted: a signal was delivered.
@@ -96,8 +96,8 @@ def _raise(number: int, frame: FrameType | None) -> None:
 def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
     before = {}
     if threading.current_thread() is threading.main_thread():
-        ours = (signal.SIG_DFL, signal.default_int_handler, _raise)
-        before = {n: signal.getsignal(n) for n in SIGNALS if signal.getsignal(n) in ours}
+        replaced = (signal.SIG_DFL, signal.default_int_handler, _raise)
+        before = {n: signal.getsignal(n) for n in SIGNALS if signal.getsignal(n) in replaced}
     for number in before:
         signal.signal(number, handler)
     try:

@@ -55,9 +55,9 @@ class Header(NamedTuple):
 
 
 def parse_header(head: bytes, size: int) -> Header:
-    """Return the header at the `head` of a file of `size` bytes; no element has more rows.
+    """Return the header of a file of `size` bytes, whose first bytes are `head`.
 
-    Comments and obj_info are ignored.
+    Comments and obj_info are ignored. An element with more than `size` rows is an error.
 
     Raises:
         ValueError: `head` is not a valid header (PlyError), or is not ASCII.
@@ -79,7 +79,7 @@ def parse_header(head: bytes, size: int) -> Header:
                 order = _ORDERS[kind]
             case ["element", name, count] if order and name not in elements and count.isdecimal():
                 if int(count) > size:
-                    raise PlyError(f"it announces {count[:18]} records and has {size} bytes")
+                    raise PlyError(f"it announces {count[:18]} rows but has only {size} bytes")
                 columns = {}
                 elements[name] = Element(int(count), columns)
             case ["property", kind, name] if elements and name not in columns and kind in _TYPES:
@@ -95,13 +95,13 @@ def parse_header(head: bytes, size: int) -> Header:
 
 
 def header_of(name: str, row: np.dtype, count: int, comments: Sequence[str] = ()) -> bytes:
-    """Return the header of a file of one element, followed by its rows in NumPy's layout.
+    """Return the header of a file with one element; its rows follow in NumPy's layout.
 
     `row` has little-endian fields without gaps. A header is ASCII: other characters of comments are
     escaped.
 
     Raises:
-        KeyError: PLY has no type of a field.
+        KeyError: PLY has no type for a field.
     """
     lines = [
         "ply",
@@ -116,7 +116,7 @@ def header_of(name: str, row: np.dtype, count: int, comments: Sequence[str] = ()
 
 @contextmanager
 def refusing(path: Path, what: str, *, fix: str) -> Iterator[None]:
-    """Turn errors in a `with` block into one for the user: `path` is not a PLY of `what`.
+    """Turn errors in a `with` block into a UserError: `path` is not a valid PLY of `what`.
 
     Raises:
         UserError: the file cannot be read, is not a PLY, or lacks a property.
@@ -131,8 +131,8 @@ def refusing(path: Path, what: str, *, fix: str) -> Iterator[None]:
 def read_table(path: Path, name: str) -> np.ndarray:
     """Return the rows of an element: a field for each property.
 
-    Binary rows are memory-mapped. The check for a truncated file ends at a later element with
-    lists.
+    Binary rows are memory-mapped. Later elements are also checked for missing rows, up to the first
+    one with lists.
 
     Raises:
         OSError: the file cannot be read.

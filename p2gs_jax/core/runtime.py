@@ -1,4 +1,4 @@
-"""Settings of JAX and of memory for commands; programs that import the package choose theirs.
+"""Settings of JAX and memory for our commands; other programs choose theirs themselves.
 
 By default the C library returns the large arrays of every step to the system and requests them
 again, which takes 20 % of a step (BUILD_NOTES, "Memory is kept"). Compiled programs are kept on
@@ -23,10 +23,10 @@ from p2gs_jax.errors import UserError
 
 # Numbers of mallopt(3).
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD = -1, -2, -3
-# With 16 cores a step took 741 ms as XLA divides it, 321 ms divided over 4, 337 ms over 8, 666 ms
-# over 16; with 2 cores both take as long (experiments/results/2026-11-27-cores.md).
+# On 16 cores a step took 741 ms if XLA divided it, and 321, 337 and 666 ms if we divided the view
+# over 4, 8 and 16; on 2 cores both take equally long (experiments/results/2026-11-27-cores.md).
 WORTH_DIVIDING = 4
-# Programs that compile faster are not kept.
+# Programs that compile faster, seconds, are not kept on disk.
 SHORTEST_S = 0.5
 # Size of the cache, bytes, above which the least recently used programs are removed.
 MOST_BYTES = 512 * 2**20
@@ -35,19 +35,19 @@ MOST_BYTES = 512 * 2**20
 def keep_freed_memory() -> bool:
     """Let the C library keep freed memory for the next step; return whether that succeeded.
 
-    Only `return_freed_memory` then returns memory to the system. It needs glibc.
+    Only `return_freed_memory` then returns memory to the system. Both functions need glibc.
     """
     mallopt = _of_glibc("mallopt")
     if mallopt is None:
         return False
-    # Some libraries accept only the second threshold; all settings are made in any case.
+    # Some versions of glibc reject the threshold 2**30 and accept 2**25. All settings are tried.
     settings = ((_M_TRIM_THRESHOLD, 2**31 - 1), (_M_TOP_PAD, 64 << 20))
     accepted = [mallopt(number, value) == 1 for number, value in settings]
     return any(mallopt(_M_MMAP_THRESHOLD, 1 << n) == 1 for n in (30, 25)) and all(accepted)
 
 
 def return_freed_memory() -> None:
-    """Return freed memory to the system at the end of a part of a run; needs glibc.
+    """Return freed memory to the system at the end of a part of a run; this needs glibc.
 
     The next part takes a few tenths of a second per gigabyte to request memory again.
     """
@@ -57,15 +57,15 @@ def return_freed_memory() -> None:
 
 
 def _of_glibc(name: str) -> Any:
-    """Return a function of the C library, or None if there is none."""
+    """Return a function of glibc, or None if there is no such function."""
     return getattr(ctypes.CDLL(None), name, None) if sys.platform.startswith("linux") else None
 
 
 def tune_process() -> None:
     """Prepare a process for long fits on a CPU; call it before JAX computes anything.
 
-    Programs run on the thread that calls them, whose memory is kept; steps depend on each other and
-    could not overlap.
+    Freed memory is kept. Compiled programs run on the thread that calls them, because steps depend
+    on each other and cannot overlap.
     """
     keep_freed_memory()
     jax.config.update("jax_cpu_enable_async_dispatch", False)
@@ -104,7 +104,7 @@ def use_compile_cache() -> None:
     """
     if jax.config.values["jax_compilation_cache_dir"] is not None:
         return
-    folder = platformdirs.user_cache_path("p2gs-jax", appauthor=False) / _machine()
+    folder = platformdirs.user_cache_path("p2gs-jax", appauthor=False) / _cache_name()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:
@@ -114,8 +114,8 @@ def use_compile_cache() -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST_S)
 
 
-def _machine() -> str:
-    """Return a name of JAX's version and the CPU's features, on which programs depend."""
+def _cache_name() -> str:
+    """Return a folder name for the JAX version and CPU features, on which programs depend."""
     features = platform.processor()
     info = Path("/proc/cpuinfo")
     if info.is_file():

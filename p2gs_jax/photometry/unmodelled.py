@@ -18,14 +18,14 @@ from p2gs_jax.photometry.observations import Observations, PerChannel, grouped
 from p2gs_jax.photometry.response import DARKEST, log_exposed
 from p2gs_jax.photometry.solution import PhotometricSolution
 
-# Least numbers of observations and of image blocks for a test of a view.
+# Smallest numbers of observations and of image blocks for which a view is tested.
 FEWEST, FEWEST_BLOCKS = 60, 12
 BLOCKS = 5  # number of blocks across half the diagonal
 CLASSES = 10  # number of classes of similar values, equal in count
 CLIPPED = 3.0  # bound of residuals, robust standard deviations
 # Largest p-value, and least RMS of the fitted surface over the view (stops), for a warning.
 CHANCE, LEAST_EV = 2e-4, 0.08
-# RMS residual of a stack's regions at equal brightness above which tone mapping is local, stops.
+# A stack has local tone mapping if `regional_ev` exceeds this, stops.
 LOCAL_EV = 0.075
 GRID = (6, 8)  # rows and columns of a stack's regions
 
@@ -35,9 +35,9 @@ Values = Float[np.ndarray, " n"]
 def place_warnings(
     observations: Observations, residual_ev: PerChannel, usable: Bool[np.ndarray, "o 3"]
 ) -> list[str]:
-    """Return warnings on photographs whose residuals, stops, vary smoothly over the image.
+    """Return a warning on photographs whose residuals, stops, vary smoothly over the image.
 
-    The `usable` residuals of similar values are compared. Without positions there is no warning.
+    Only `usable` residuals of similar values are compared. Without positions there is no warning.
     """
     o, weight = observations, np.asarray(usable, np.float64)
     if o.positions is None:
@@ -47,14 +47,14 @@ def place_warnings(
     residual = np.where(weight > 0, residual_ev, 0.0).sum(1) / total
     value = np.log2(np.maximum(np.asarray(o.colors, np.float64), DARKEST)) * 2.2
     value = (value * np.where(seen[:, None], weight, 1.0)).sum(1) / np.where(seen, total, 3)
-    # The value without its residual: otherwise noise of the value looks like tone mapping.
+    # The residual is subtracted; otherwise noise of the value would look like tone mapping.
     value = value - np.where(seen, residual, 0.0)
     found = {}
     for view, mine in enumerate(grouped(o.views, o.view_count)):
         good = mine[seen[mine]]
         if len(good) >= FEWEST:
-            flat = _without_value(residual[good], value[good])
-            found[view] = _smooth(flat, np.asarray(o.positions[good], np.float64))
+            flat = _minus_median(residual[good], value[good])
+            found[view] = _fit_surface(flat, np.asarray(o.positions[good], np.float64))
     tested = [ev for ev, _ in found.values() if np.isfinite(ev)]
     clear = {k: ev for k, (ev, chance) in found.items() if chance < CHANCE and ev > LEAST_EV}
     if not clear:
@@ -63,13 +63,13 @@ def place_warnings(
     head = ", ".join(f"{o.names[k] if o.names else f'row {k}'} {clear[k]:.2f}" for k in named[:6])
     return [
         "Not modelled: residuals depend on the position in the image, because of flare, shade, "
-        f"reflections or vignetting. In {len(clear)} of {len(tested)} training view(s), by EV: "
+        f"reflections or vignetting. In {len(clear)} of {len(tested)} training view(s), RMS in EV: "
         f"{head}{', ...' if len(named) > 6 else ''}."
     ]
 
 
-def _without_value(residual: Values, value: Values) -> Values:
-    """Return residuals minus the median of their class of value, clipped."""
+def _minus_median(residual: Values, value: Values) -> Values:
+    """Return residuals minus the median residual of similar values, clipped; stops."""
     rank = np.argsort(np.argsort(value, kind="stable"), kind="stable")
     kind = rank * CLASSES // len(value)
     flat = residual.copy()
@@ -79,7 +79,7 @@ def _without_value(residual: Values, value: Values) -> Values:
     return np.clip(flat, -limit, limit)
 
 
-def _smooth(flat: Values, places: Float[np.ndarray, "n 2"]) -> tuple[float, float]:
+def _fit_surface(flat: Values, places: Float[np.ndarray, "n 2"]) -> tuple[float, float]:
     """Fit a quadratic surface to block means, with an F test of its significance.
 
     Return its RMS in the units of `flat`, and the p-value; NaN and 1 if there are too few blocks.
@@ -110,10 +110,10 @@ def regional_ev(
     size: tuple[int, ...],
     signal: Bool[np.ndarray, " v"],
 ) -> float:
-    """Return the RMS over regions of a stack's residuals at equal brightness, stops.
+    """Return the RMS over image regions of residuals minus those of equal brightness, stops.
 
-    The solution has an exposure per view; frames without `signal` are left out. Positions of the
-    points and the size of the photographs (height, width) are in pixels.
+    The photographs are a stack with an exposure per view; those without `signal` are left out. `xy`
+    are the positions of the points, and `size` is (height, width), both in pixels.
     """
     o, good = problem.observations, problem.usable.all(1)
     z, _ = log_exposed(np.asarray(o.colors, np.float64), solution.response)

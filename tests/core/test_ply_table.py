@@ -148,7 +148,7 @@ REFUSED = {
     "a row long": ((VERTICES, b"0 0 1 5\n0 1 0\n"), r"requires 3 columns but 4 were found"),
     "a word": ((VERTICES, b"0 0 x\n0 1 0\n"), r"could not convert string 'x' to float32"),
     "a colour of 256": ((COLORED, b"0 0 1 256\n0 1 0 0\n"), r"'256' to uint8"),
-    "a huge count": ((["element vertex 99999999999", *AXES], TEXT), r"announces 99999999999 rec"),
+    "a huge count": ((["element vertex 99999999999", *AXES], TEXT), r"announces 99999999999 row"),
     "a count without end": ((["element vertex " + "9" * 5000], TEXT), r"limit \(4300 digits\)"),
     "empty": (b"", r"is not a valid PLY of points: it is empty"),
     "no end": (WHOLE.replace(b"end_header\n", b""), r"it has no line 'end_header'"),

@@ -1,4 +1,4 @@
-"""Segments of lists merge to what one pass would composite."""
+"""Segments of tile lists, composited separately and merged, equal one pass over the lists."""
 
 import jax
 import jax.numpy as jnp
@@ -7,22 +7,20 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from p2gs_jax.config import RenderConfig
-from p2gs_jax.render.rasterize_xla import SEGMENTS_PER_LANE, cut, merge
+from p2gs_jax.render.rasterize_xla import cut, merge
 from p2gs_jax.render.tiles import Plan
 
 TILES, LANES, CHUNK, PIXELS = 6, 4, 2, 3
-UNUSED = dict.fromkeys(Plan._fields) | {"cfg": RenderConfig(chunk=CHUNK)}
-PLAN = Plan(
-    **UNUSED | {"across": TILES, "down": 1, "lanes": LANES}  # type: ignore[arg-type]
-)
-MOST = SEGMENTS_PER_LANE * LANES
+# All other fields of the plan are unused here.
+FIELDS = {"across": TILES, "down": 1, "lanes": LANES, "cfg": RenderConfig(chunk=CHUNK)}
+PLAN = Plan(**dict.fromkeys(Plan._fields) | FIELDS)  # type: ignore[arg-type]
 LENGTHS = st.lists(
     st.one_of(st.just(0), st.integers(0, 9), st.integers(0, 400)), min_size=TILES, max_size=TILES
 )
 GIANT = [0, 0, 4000, 0, 1, 0]
 
-cut_here = jax.jit(lambda offsets: cut(offsets, PLAN))
-merge_here = jax.jit(lambda c, segments: merge(c, segments.tiles[TILES:], segments.extra))
+jitted_cut = jax.jit(lambda offsets: cut(offsets, PLAN))
+jitted_merge = jax.jit(lambda c, segments: merge(c, segments.tiles[TILES:], segments.extra))
 
 
 def composite(colors, alphas):
@@ -36,19 +34,19 @@ def composite(colors, alphas):
 @settings(max_examples=25, deadline=None)
 @given(LENGTHS, st.integers(0, 100))
 @example(GIANT, 0)
-def test_merging_is_compositing(lengths, seed):
+def test_merged_segments_equal_one_pass(lengths, seed):
     rng = np.random.default_rng(seed)
     offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
     total = int(offsets[-1])
     colors = rng.uniform(0, 4, (total, PIXELS))
     alphas = rng.uniform(0, 0.1, (total, PIXELS)) * (rng.random((total, 1)) < 0.5)
-    segments = cut_here(jnp.asarray(offsets))
+    segments = jitted_cut(jnp.asarray(offsets))
     parts = [
         composite(colors[a:b], alphas[a:b])
         for a, b in zip(np.asarray(segments.starts), np.asarray(segments.ends), strict=True)
     ]
     stacked = tuple(jnp.asarray(np.stack(p), jnp.float32) for p in zip(*parts, strict=True))
-    image, before = merge_here(stacked, segments)
+    image, before = jitted_merge(stacked, segments)
     for t in range(TILES):
         whole = composite(*(a[offsets[t] : offsets[t + 1]] for a in (colors, alphas)))
         for got, expected in zip(image, whole, strict=True):

@@ -1,4 +1,4 @@
-"""Noise photographed from four places, and Gaussians that each view shows or does not."""
+"""Photographs of noise from four camera positions, and Gaussians of which a view shows a part."""
 
 import numpy as np
 
@@ -14,15 +14,15 @@ EXTENT, DEGREE = 2.0, 1
 
 
 def config(method: str | None = "mcmc", batch: int = 1) -> FitConfig:
-    # DSSIM would only cost compiling; with an epsilon of about the gradient's size, updates are as
-    # smooth as the gradient.
+    # Without DSSIM the programs compile faster. Adam's epsilon is about as large as the gradient,
+    # so that updates are as smooth as the gradient.
     fields = {"loss.dssim_weight": None, "optimizer.eps": 1e-5, "densify.method": method}
     fields |= {"render.sh_degree": DEGREE, "render.pixels_in_flight": 2048, "train.batch": batch}
     return with_values(FitConfig(), fields)
 
 
 def start(count: int = COUNT, spread: float = 0.9, behind: int = 0) -> Params:
-    """Some Gaussians that each view shows and others that it does not, or that are behind it."""
+    """Return parameters of Gaussians; a view shows some, and the first `behind` lie behind it."""
     rng = np.random.default_rng(0)
     z = rng.uniform(3, 8, count)
     xy = rng.uniform(-spread, spread, (count, 2)) * z[:, None] * [WIDTH / FOCAL, HEIGHT / FOCAL]
@@ -40,7 +40,7 @@ def start(count: int = COUNT, spread: float = 0.9, behind: int = 0) -> Params:
 
 
 def view(row: int) -> tuple[Batch, Partner]:
-    """A photograph of noise, from its own place."""
+    """Return a photograph of noise from the camera position of a row, and its partner."""
     K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]], np.float32)
     pose = np.eye(4, dtype=np.float32)
     pose[0, 3] = 1.5 * row - 2

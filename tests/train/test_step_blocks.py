@@ -1,4 +1,4 @@
-"""One step in blocks is one Adam update of the loss; what cannot be taken changes nothing."""
+"""A step in blocks is one Adam update of the loss; a failed step changes only the fault."""
 
 import dataclasses
 import functools
@@ -41,8 +41,8 @@ def photograph() -> Batch:
 
 @pytest.fixture(scope="module")
 def made():
-    """Return steps from one start that fit and overflow, and the gradient they should follow."""
-    # More are in view than fit into a block, and some are behind the camera.
+    """Return a step that overflows and one that does not, and the expected gradient."""
+    # More Gaussians are in view than fit into a block, and some are behind the camera.
     params, batch = jax.tree.map(jnp.asarray, (start(COUNT, 0.45, HIDDEN), photograph()))
     optimizer = make_optimizer(CFG)
     # A tenth of the slots are empty.
@@ -62,14 +62,14 @@ def made():
     slope = jax.jit(jax.value_and_grad(objective, argnums=(0, 1)))
     loss, (gradient, probe) = jax.device_get(slope(params, jnp.zeros((COUNT, 2))))
     tight = Capacity(64, BLOCK)
-    refused = step(tight)
-    fault = refused[0].fault
+    overflowed = step(tight)
+    fault = overflowed[0].fault
     capacity = tight.grown(int(fault.needed), int(fault.visible))
     seen = np.asarray(in_view(params.gaussians, alive, batch.camera, CFG.render))
     expected = {"gradient": gradient, "probe": probe, "loss": float(loss), "seen": seen}
     after = step(capacity)
-    given = {"tight": tight, "refused": refused, "capacity": capacity, "step": step, "after": after}
-    return SimpleNamespace(params=params, alive=np.asarray(alive), **expected, **given)
+    calls = {"tight": tight, "overflowed": overflowed, "capacity": capacity, "step": step}
+    return SimpleNamespace(params=params, alive=np.asarray(alive), **expected, **calls, after=after)
 
 
 def rows_of(tree, name, rows):
@@ -112,7 +112,7 @@ def widened(tree):
     return jax.tree.map(lambda a: a.astype(np.float64) if a.dtype.kind == "f" else a, narrow)
 
 
-def test_a_step_agrees_with_one_in_float64_where_nothing_becomes_narrow(made):
+def test_a_step_agrees_with_one_that_is_float64_throughout(made):
     optimizer = make_optimizer(CFG)
     start = widened(initial_state(made.params, made.alive, optimizer))
     given = widened((photograph(), Partner(np.int32(0)), CONTROLS))
@@ -124,7 +124,7 @@ def test_a_step_agrees_with_one_in_float64_where_nothing_becomes_narrow(made):
     for path, leaf in jax.tree_util.tree_leaves_with_path(wide):
         assert leaf.dtype.kind != "f" or leaf.dtype == np.float64, jax.tree_util.keystr(path)
     assert float(report.loss) == pytest.approx(float(exact_report.loss), rel=1e-6)
-    assert float(report.loss) != float(exact_report.loss)  # it is computed otherwise
+    assert float(report.loss) != float(exact_report.loss)  # the precisions differ
     of_gaussians = [s.opt_state.gaussians.mu for s in (state, exact)]
     of_photometry = [s.opt_state.rest.mu[0] for s in (state, exact)]
     for name in (*FIELDS, *PHOTOMETRY):
@@ -147,7 +147,7 @@ def test_out_of_view_nothing_is_touched(made):
     np.testing.assert_array_equal(moments.counts, made.seen.astype(np.int32))
 
 
-def test_where_every_gaussian_moves_all_are_listed(made):
+def test_without_visible_only_all_gaussians_are_listed(made):
     cfg = with_values(CFG, {"optimizer.visible_only": False})
     step, capacity, state = Step(cfg, make_optimizer(cfg), EXTENT), made.capacity, made.after[0]
     listed = step.program("show", capacity, DEGREE)(
@@ -157,7 +157,7 @@ def test_where_every_gaussian_moves_all_are_listed(made):
     np.testing.assert_array_equal(listed.ids, np.minimum(np.arange(len(listed.ids)), COUNT))
 
 
-def test_the_statistic_is_the_screen_space_gradient(made):
+def test_the_densification_statistic_is_the_screen_space_gradient(made):
     state, _ = made.after
     norm = np.linalg.norm(made.probe * [WIDTH / 2, HEIGHT / 2], axis=1)
     assert norm.max() > 0
@@ -167,7 +167,7 @@ def test_the_statistic_is_the_screen_space_gradient(made):
 
 
 def test_a_view_that_overflows_changes_nothing_but_the_fault(made):
-    state, report = made.refused
+    state, report = made.overflowed
     fresh = initial_state(made.params, jnp.asarray(made.alive), make_optimizer(CFG))
     chex.assert_trees_all_equal(dataclasses.replace(state, fault=fresh.fault), fresh)
     assert int(state.fault.kind) == FAULT_OVERFLOW
@@ -184,11 +184,11 @@ def test_a_view_that_overflows_changes_nothing_but_the_fault(made):
     [
         ("sh", "loss term"),
         ("quats", "gradient of"),
-        # Of another view than the step's: only the mean over all views knows it.
+        # This exposure belongs to another view: only the mean over all views contains it.
         ("raw_exposures", "loss term log_exposure_mean"),
     ],
 )
-def test_the_first_that_is_not_finite_is_named(made, field, named):
+def test_the_first_part_that_is_not_finite_is_named(made, field, named):
     part = "photometry" if field in PHOTOMETRY else "gaussians"
     before, row = getattr(made.params, part), 0 if field in PHOTOMETRY else np.argmax(made.seen)
     broken = dataclasses.replace(before, **{field: getattr(before, field).at[row].set(jnp.nan)})
@@ -221,7 +221,7 @@ class ForCuda:
 )
 @pytest.mark.parametrize("name", list(steps.PROGRAMS))
 def test_a_step_on_a_gpu_never_waits_for_the_host(monkeypatch, name):
-    """XLA's GPU runtime stops at conditionals and loops until the host has read a flag."""
+    """On GPUs, conditionals and loops of unknown length wait until the host has read a flag."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(rasterize_pallas, "_interpreted", lambda: False)
     monkeypatch.setattr(tiles, "fastest_here", lambda: "pallas")

@@ -1,4 +1,4 @@
-"""`p2gs-jax view`: wrong input, who may talk to it, browsers that leave, and how it ends."""
+"""`p2gs-jax view`: wrong input, access, browsers that disconnect, and the end of the server."""
 
 import os
 import re
@@ -30,14 +30,14 @@ ROOT = Path(__file__).resolve().parents[2]
 PROTOCOL = f"viser-v{viser.__version__}"
 
 
-def test_without_viser_it_says_how_to_get_it(refused, monkeypatch, tmp_path):
+def test_without_viser_the_error_says_how_to_install_it(refused, monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "viser", None)
     for words in (("view", tmp_path), ("fit", tmp_path, "--view")):
         assert "pip install 'p2gs-jax[viewer]'" in refused(*words)
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "named"),
     [
         ((), "config.json"),
         (("--port", "70000"), "--port"),
@@ -45,11 +45,11 @@ def test_without_viser_it_says_how_to_get_it(refused, monkeypatch, tmp_path):
         (("--max-width", "3"), "--max-width"),
     ],
 )
-def test_wrong_input(refused, tmp_path, options, said):
-    assert said in refused("view", tmp_path, "--port", "0", *options)
+def test_wrong_input(refused, tmp_path, options, named):
+    assert named in refused("view", tmp_path, "--port", "0", *options)
 
 
-def test_a_port_of_a_fit_is_that_of_its_viewer(refused, tmp_path):
+def test_fit_refuses_a_port_without_view_and_a_view_of_blocks(refused, tmp_path):
     assert "without --view" in refused("fit", tmp_path, "--port", "9000")
     assert "RUN/blocks/0" in refused("fit", tmp_path, "--view", "--blocks", "2")
 
@@ -81,31 +81,31 @@ def test_ctrl_c_ends_it_cleanly(finished_run):
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_a_signal_that_comes_where_nothing_can_be_raised_ends_it(monkeypatch):
+def test_a_signal_during_garbage_collection_ends_it(monkeypatch):
     class Collected:
         def __del__(self):
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(module, "open_viewer", lambda run, **options: nullcontext("an address"))
-    said, garbage = [], [Collected()]
+    lines, garbage = [], [Collected()]
 
     def say(line):
         garbage.clear()
-        said.append(line)
+        lines.append(line)
 
     run = SimpleNamespace(params=SimpleNamespace(gaussians=SimpleNamespace(capacity=3)))
     with interrupts.raised():
         module.serve(run, host="127.0.0.1", port=0, max_width=64, say=say)
-    assert len(said) == 2
+    assert len(lines) == 2
 
 
 def test_only_loopback_needs_no_token():
-    alone = ("127.0.0.1", "::1", "localhost", "127.8.9.1")
-    for host in (*alone, "0.0.0.0", "::", "", "no.such.host.invalid"):
+    loopback = ("127.0.0.1", "::1", "localhost", "127.8.9.1")
+    for host in (*loopback, "0.0.0.0", "::", "", "no.such.host.invalid"):
         guard = guard_of(host)
-        assert is_loopback(host) == (host in alone)
-        assert (guard.token is None) == (guard.hosts is not None) == (host in alone)
-        assert host in alone or guard.token != guard_of(host).token
+        assert is_loopback(host) == (host in loopback)
+        assert (guard.token is None) == (guard.hosts is not None) == (host in loopback)
+        assert host in loopback or guard.token != guard_of(host).token
 
 
 def start(guard):
@@ -115,7 +115,7 @@ def start(guard):
 
 @pytest.fixture(scope="module")
 def servers():
-    """Return servers as for this machine and as for others; both listen on loopback only."""
+    """Return a server for this machine and one with a token; both listen on loopback only."""
     found = [start(guard_of("127.0.0.1")), start(Guard(None, "secret"))]
     yield found
     for server in found:
@@ -123,7 +123,7 @@ def servers():
 
 
 def get(server, path="/", **headers):
-    """Return the status of a page, and the cookie that is set."""
+    """Return the HTTP status of a page, and the cookie that it sets."""
     request = urllib.request.Request(f"http://127.0.0.1:{server.get_port()}{path}", headers=headers)
     try:
         with urllib.request.urlopen(request, timeout=20) as answer:
@@ -133,9 +133,9 @@ def get(server, path="/", **headers):
 
 
 def connects(server, origin=None, **headers):
-    """Return whether a WebSocket is let in.
+    """Return whether the server accepts a WebSocket.
 
-    Without an event loop: the session's browser keeps one running in this thread.
+    The client is synchronous: the test session's browser already runs an event loop here.
     """
     try:
         with websockets.sync.client.connect(
@@ -149,7 +149,7 @@ def connects(server, origin=None, **headers):
         return error.response.status_code != 403
 
 
-def test_the_viewer_s_own_page_is_served(servers):
+def test_the_viewer_s_page_is_served(servers):
     server = servers[0]
     assert get(server) == (200, "")
     for name in ("127.0.0.1", "localhost"):
@@ -159,7 +159,7 @@ def test_the_viewer_s_own_page_is_served(servers):
     assert connects(server, origin=f"http://127.0.0.1:{server.get_port()}")
 
 
-def test_pages_of_other_sites_and_names_that_were_made_to_point_here_are_refused(servers):
+def test_requests_from_other_sites_and_for_other_host_names_are_refused(servers):
     for origin in ("http://evil.example", "http://127.0.0.1:1", "null", "http://[", ""):
         assert get(servers[0], Origin=origin)[0] == 403
         assert not origin or not connects(servers[0], origin=origin)
@@ -182,13 +182,13 @@ def test_others_need_the_token(servers):
     assert get(server, "/", Cookie=kept)[0] == 200
     assert connects(server, Cookie=kept)
     assert not connects(server, origin="http://evil.example", Cookie=kept)
-    # A browser keeps cookies by host: those of two viewers lie beside each other.
+    # A browser keeps cookies by host, not by port: it also sends that of another viewer.
     assert kept == f"p2gs_jax_token_{port}=secret"
     assert connects(server, Cookie=f"p2gs_jax_token_{port + 1}=other; {kept}")
 
 
-def test_a_browser_that_leaves_is_stopped_once_also_while_its_session_is_made(monkeypatch):
-    # A server's hooks, its sessions, and the ids of those that were made and stopped.
+def test_the_session_of_a_browser_that_disconnects_stops_once(monkeypatch):
+    # Sessions by browser, and the ids of browsers whose sessions were made and stopped.
     served = SimpleNamespace(sessions={}, made=[], stopped=[], on_made=None)
 
     class Session:
@@ -216,6 +216,7 @@ def test_a_browser_that_leaves_is_stopped_once_also_while_its_session_is_made(mo
     served.disconnect(clients[1])
     assert sorted(served.sessions) == [0, 2]
     assert served.stopped == [1]
+    # Browsers that disconnect while their session is made.
     served.on_made = served.disconnect
     for number in (5, 6):
         served.connect(SimpleNamespace(client_id=number))

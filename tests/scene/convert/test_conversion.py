@@ -1,4 +1,4 @@
-"""HEIC, raw, linear light and colour profiles, from files to what the store gives."""
+"""HEIC, raw and linear photographs and colour profiles, from the file to the store's pixels."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def light_of(path: Path) -> np.ndarray:
     return srgb_decode(codes / 65535)
 
 
-def record_of(result: Converted) -> list[dict]:
+def records_of(result: Converted) -> list[dict]:
     return json.loads((result.folder / "photographs.json").read_text())["photographs"]
 
 
@@ -78,40 +78,40 @@ def test_raw_is_linear_above_its_black_level(folder: Path) -> None:
     result = converted(folder)
     assert result.known == "camera raw"
     bright, dark, white = (light_of(path) for path in result.paths)
-    assert bright.shape == (64, 96, 3)  # as the sensor lies, whatever the orientation
+    assert bright.shape == (64, 96, 3)  # the sensor's orientation, not that of EXIF
     inner = (slice(8, -8), slice(8, -8))
-    # The rest is LibRaw's guess between the pixels of the filter.
+    # The remaining error comes from LibRaw's interpolation between pixels of one colour.
     assert np.percentile(np.abs(bright - light)[inner], 99) < 0.02
-    # Two stops are two stops, down to the dark: black was subtracted and nothing was brightened.
+    # Two stops are a factor of 4 in the dark, too: black was subtracted, nothing brightened.
     ratio = bright[inner] / dark[inner]
     assert np.median(ratio) == pytest.approx(4, rel=2e-3)
     assert np.percentile(np.abs(ratio - 4), 95) < 0.1
     # The sensor's white is saturated in all channels.
     assert white.min() == pytest.approx(1, abs=1e-4)
-    assert record_of(result)[2]["saturated"] == 1
+    assert records_of(result)[2]["saturated"] == 1
 
 
 def test_one_white_balance_for_all_raws_of_a_camera(folder: Path) -> None:
-    # The same light and sensor; the camera changed its mind about white.
+    # Light and sensor stay the same; only the camera's white balance changes.
     light = np.full((64, 96, 3), (0.2, 0.3, 0.25))
     for name, chosen in {"a": (2.0, 1, 1.5), "b": (2.2, 1, 1.4), "c": (1.6, 1, 1.8)}.items():
         write_dng(folder / f"{name}.dng", light, chosen=chosen)
     result = converted(folder)
     colours = [light_of(path)[32, 48] for path in result.paths]
     np.testing.assert_allclose(colours, np.broadcast_to((0.2, 0.3, 0.25), (3, 3)), atol=2e-3)
-    assert record_of(result)[1]["balance"] == pytest.approx((2.2, 1, 1.4), rel=1e-3)
+    assert records_of(result)[1]["balance"] == pytest.approx((2.2, 1, 1.4), rel=1e-3)
     (note,) = (note for note in result.notes if note.startswith("White balance of 3"))
     assert "red 2.000, blue 1.500" in note
 
 
 @pytest.mark.parametrize(
-    ("module", "name", "command"),
+    ("module", "name", "package"),
     [("rawpy", "a.dng", "p2gs-jax[raw]"), ("pillow_heif", "a.heic", "p2gs-jax[heic]")],
 )
-def test_what_to_install(folder: Path, monkeypatch, module: str, name: str, command: str) -> None:
+def test_missing_packages(folder: Path, monkeypatch, module: str, name: str, package: str) -> None:
     (folder / name).write_bytes(b"whatever")
     monkeypatch.setitem(sys.modules, module, None)
-    with refused(name, f"pip install '{command}'"):
+    with refused(name, f"pip install '{package}'"):
         converted(folder)
 
 
@@ -121,12 +121,12 @@ def test_raw_beside_jpeg_is_one_photograph(folder: Path, monkeypatch) -> None:
     result = converted(folder)
     assert list(result.originals.values()) == [folder / "a.dng"]
     assert noted(result, "exist twice")
-    # Its EXIF reaches the converted file.
+    # The raw file's EXIF reaches the converted file.
     for file in (folder / "a.dng", *result.paths):
         assert exif_evs([file])[0] == pytest.approx(np.log2(1 / 250 * 400 / 2.8**2), abs=1e-3)
     assert read_exif_settings(result.paths[0]).time == pytest.approx(1 / 250)
     assert image_size(folder / "a.dng") == (96, 64)
-    # Without rawpy the JPEG is used, where it is.
+    # Without rawpy the JPEG is used, without conversion.
     monkeypatch.setattr("p2gs_jax.scene.convert.convert.find_spec", lambda name: None)
     result = converted(folder)
     assert list(result.originals.values()) == result.paths == [folder / "a.jpg"]
@@ -138,7 +138,7 @@ def save(path: Path, pixels: np.ndarray, **options) -> None:
         save_heic(path, pixels, **options)
         return
     if not features.check(path.suffix[1:]):
-        pytest.skip(f"this Pillow knows no {path.suffix}")
+        pytest.skip(f"this Pillow does not support {path.suffix}")
     how = {"quality": 100, "subsampling": "4:4:4"} if path.suffix == ".avif" else {"lossless": True}
     Image.fromarray(pixels).save(path, **how, **options)
 
@@ -149,7 +149,7 @@ def test_display_values_profile_and_settings_are_kept(folder: Path, kind: str) -
     save(file, pixels, exif=settings().tobytes(), icc_profile=DISPLAY_P3)
     assert image_size(file) == (96, 64)
     result = converted(folder)
-    assert result.known is None  # a phone's own curve is in it
+    assert result.known is None  # the tone curve of a phone is unknown
     (path,) = result.paths
     assert stored(path).dtype == np.uint8
     assert np.abs(stored(path).astype(int) - pixels).max() <= 4
@@ -175,7 +175,7 @@ def test_white_is_white_and_coded_primaries_are_brought_to_srgb(folder: Path, de
     top, kind = (65535, np.uint16) if deep else (255, np.uint8)
     for name, colour in {"green": (60, 200, 60), "white": (255, 255, 255)}.items():
         pixels = np.full((64, 96, 3), np.array(colour) * (top // 255), kind)
-        # Display P3 without a profile.
+        # Display P3 by code points, without an ICC profile.
         coded = {"color_primaries": 12, "transfer_characteristics": 13, "matrix_coefficients": 6}
         save_heic(folder / f"{name}.heic", pixels, full_range_flag=1, **coded)
     green, white = (stored(path)[32, 48] / 257 for path in converted(folder).paths)
@@ -190,7 +190,7 @@ def tiff(tags: dict) -> bytes:
 
 
 def embedded(kind: str) -> bytes:
-    """Return the beginning of a raw file that is no plain TIFF."""
+    """Return the beginning of a raw file that is not a plain TIFF."""
     camera, shot = tiff({0x010F: "Made", 0x0110: "One"}), tiff({0x829A: 0.5, 0x829D: 2.0})
     if kind == "cr3":
         boxes = ((b"CMT1", camera), (b"CMT2", shot))
@@ -222,7 +222,7 @@ def test_exr_keeps_light_between_photographs(folder: Path) -> None:
     assert image_size(folder / "a.exr") == (96, 64)
     result = converted(folder)
     assert result.known == "linear EXR"
-    assert [r["scale"] for r in record_of(result)] == [0.125, 0.125]
+    assert [r["scale"] for r in records_of(result)] == [0.125, 0.125]
     bright, dark = (light_of(path) for path in result.paths)
     np.testing.assert_allclose(bright, np.minimum(light * 0.125, 1), atol=1e-4)
     seen = dark > 1e-3
@@ -230,7 +230,7 @@ def test_exr_keeps_light_between_photographs(folder: Path) -> None:
     assert noted(result, "multiplied by 0.125")
 
 
-def test_exr_grey_alpha_chromaticities_and_no_numbers(folder: Path) -> None:
+def test_exr_with_nan_alpha_and_chromaticities(folder: Path) -> None:
     grey = np.full((8, 8, 1), 0.3, np.float32)
     grey[0, 0], grey[0, 1], grey[0, 2] = np.nan, np.inf, -1
     write_exr(folder / "a.exr", grey, "Y", expTime=0.01, aperture=4.0, isoSpeed=100.0)
@@ -269,7 +269,7 @@ def test_files_that_are_refused(folder: Path) -> None:
     refuse("a.dng", r"a\.dng")
 
 
-def test_kinds_beside_each_other_are_converted_once(folder: Path) -> None:
+def test_a_folder_of_several_formats_is_converted_once(folder: Path) -> None:
     (folder / "sub").mkdir()
     write_dng(folder / "sub" / "a.dng", GREY)
     write_image(folder / "b.jpg", 90, (96, 64))
@@ -305,7 +305,7 @@ def test_a_model_of_exr_photographs(tmp_path: Path) -> None:
     np.testing.assert_allclose(pixels, srgb_encode(LIGHT / 2), atol=2e-5)
     np.testing.assert_array_equal(mask, np.eye(30, 40))
     assert options_of(FitConfig(), scene).known_response == "linear EXR"
-    # A run remembers it.
+    # The run folder records the known response.
     (tmp_path / "run").mkdir()
     write_scene(tmp_path / "run", scene)
     again = read_scene(tmp_path / "run", root)
@@ -314,8 +314,8 @@ def test_a_model_of_exr_photographs(tmp_path: Path) -> None:
     assert again.views[0].image_path == scene.views[0].image_path
 
 
-def test_names_paths_and_masks_are_the_users_own(tmp_path: Path) -> None:
-    """Structure from motion of photographs alone sees the converted files."""
+def test_views_keep_the_names_and_masks_of_the_originals(tmp_path: Path) -> None:
+    """Structure from motion reads converted files, whose names the scene must not show."""
     root = tmp_path / "scene"
     folder, masks = root / "images", [root / "masks" / name for name in ("a.png", "b.png")]
     write_image(folder / "a.jpg", 90, (96, 64))
@@ -354,7 +354,7 @@ def test_colours_are_those_of_littlecms(data: bytes, name: str) -> None:
     inside = (theirs > 0) & (theirs < 255)
     assert inside.mean() > 0.9
     assert np.abs(to_srgb(PIXELS, profile) / 257 - theirs)[inside].max() < 1.5
-    # It is a change that matters, or nothing would be tested.
+    # The conversion changes colours; otherwise the comparison above would prove nothing.
     assert np.abs(theirs - PIXELS).max() > 10
     # Grey stays grey.
     grey = np.repeat(np.array([[30, 128, 255]], np.uint8)[..., None], 3, 2)
@@ -368,13 +368,13 @@ def test_srgb_and_broken_profiles_change_nothing() -> None:
         assert read_profile(data) is None
 
 
-def test_a_store_converts_and_the_user_is_told(tmp_path: Path) -> None:
+def test_a_store_converts_colours_and_notes_say_so(tmp_path: Path) -> None:
     profiles = {"a.png": None, "b.png": DISPLAY_P3, "c.png": TABLES}
     views = [make_view(tmp_path / name, size=(96, 64)) for name in profiles]
     for view, data in zip(views, profiles.values(), strict=True):
         Image.fromarray(PIXELS).save(view.image_path, **({"icc_profile": data} if data else {}))
     kept, changed, tabulated = (ImageStore(views, DataConfig()).stored(k)[0] for k in range(3))
-    assert kept.dtype == np.uint8  # what needs no precision takes no memory for it
+    assert kept.dtype == np.uint8  # photographs without conversion stay 8-bit
     assert changed.dtype == np.uint16
     profile = read_profile(DISPLAY_P3)
     assert profile is not None
@@ -385,7 +385,7 @@ def test_a_store_converts_and_the_user_is_told(tmp_path: Path) -> None:
     assert "not applied" in notes[1]
 
 
-def test_alpha_beside_a_profile_is_kept_and_grey_has_none(tmp_path: Path) -> None:
+def test_alpha_beside_a_profile_is_kept_and_grey_is_unchanged(tmp_path: Path) -> None:
     pixels = np.full((8, 8, 4), 100, np.uint8)
     pixels[:, :4, 3], pixels[:, 4:, 3] = 255, 0
     Image.fromarray(pixels).save(tmp_path / "a.png", icc_profile=DISPLAY_P3)
