@@ -1,4 +1,4 @@
-"""`export`: a finished run in the formats of other programs."""
+"""The command `export` and its options."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from p2gs_jax.photometry.display import DisplayTransform
     from p2gs_jax.run.read import Run
 
-# The formats that hold display colours and therefore one display transform.
+# The formats that hold display colours, converted from radiance by one display transform.
 Display = Literal["display-ply", "spz", "compressed-ply", "gltf", "usd"]
 Format = Literal["linear-ply", Display, "colmap", "nerfstudio", "exr", "html"]
 FORMATS, DISPLAY = get_args(Format), get_args(Display)
@@ -33,24 +33,24 @@ class Export:
     run: RunOrSplats
     format: tuple[Format, ...]
     """Formats: linear-ply (radiance); display-ply, spz, compressed-ply, gltf, usd (display
-    colours); colmap, nerfstudio (photographs, model); exr (renders); html (the scene)."""
+    colours); colmap, nerfstudio (photographs, model); exr (renders); html (a page to view)."""
     out: Path | None = None
     """Folder to write into (default: RUN/exports)."""
     exposure_ev: float | None = None
     """Exposure of display colours and html, stops from the mean (default: 0)."""
     meter: MeteringRule | None = None
-    """Exposure metered in the training views (rules of `render`); --exposure-ev adds stops."""
+    """Rule (as in `render`) that meters the training views; --exposure-ev adds stops."""
     gamma: float | None = None
     """Gamma of display colours and html (default: the run's mean)."""
     curve: Literal["power", "srgb", "spline", "linear"] | None = None
     """Tone curve of display colours and html (default: the run's)."""
     white_balance_of: str | None = None
-    """View whose white balance display colours and html have (default: neutral)."""
+    """View that gives display colours and html their white balance (default: neutral)."""
     bake_steps: int | None = None
     """Number of steps that bring display colours closer to the true pictures (default: 240, or the
-    number of training views if larger); 0: none. With --photometry also radiance."""
+    number of training views if larger); 0: none. With --photometry they also refine radiance."""
     without_objects: bool = False
-    """Leave out moving objects; else files of Gaussians hold the middle of the drive."""
+    """Leave out moving objects; else Gaussians and html show them at mid-drive."""
     size_mb: float | None = None
     """Largest size of the html page, MB (default: 20); the least visible Gaussians are left out."""
     photographs: int | None = None
@@ -81,7 +81,7 @@ class Export:
             for note in fitted.notes:
                 reporter.message(note)
             if fitted.cfg.render.background is not None and {"html", *DISPLAY} & set(self.format):
-                reporter.message("Formats of Gaussians have no background: it is black there.")
+                reporter.message("Exported Gaussians have no background, so it is black.")
             written = convert(
                 fitted,
                 tuple(dict.fromkeys(self.format)),
@@ -99,7 +99,7 @@ class Export:
 
 
 def display_transform(fitted: Run, options: Export) -> DisplayTransform:
-    """Return the display transform; UserError: the run has no such curve or white balance."""
+    """Return the chosen transform; UserError: the run lacks the curve, rule or white balance."""
     ev = options.exposure_ev or 0.0
     transform = fitted.common_display(ev)
     if options.meter is not None:
@@ -114,7 +114,7 @@ def display_transform(fitted: Run, options: Export) -> DisplayTransform:
 
 
 def check_export(args: Export) -> None:
-    """Raise a UserError for values that make no sense."""
+    """Raise a UserError for values out of range and options without effect."""
     ev, gamma, size = args.exposure_ev, args.gamma, args.size_mb
     check(bool(args.format), "--format needs a format", fix=f"choose from {', '.join(FORMATS)}")
     check(ev is None or abs(ev) <= 32, "--exposure-ev must be from -32 to 32 stops")

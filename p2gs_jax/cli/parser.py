@@ -26,7 +26,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.presets import preset
 
 # A class holds the options of a command, and its `execute` runs the command and returns the exit
-# code. The order is that of `p2gs-jax --help`: as a new user needs them.
+# code. `p2gs-jax --help` lists commands in this order, in which a new user needs them.
 GROUPS: dict[str, dict[str, type]] = {
     "First": {"doctor": Doctor, "demo": Demo},
     "From photographs": {"inspect": Inspect, "fit": Fit, "calibrate": Calibrate},
@@ -40,7 +40,7 @@ COMMANDS = {name: kind for group in GROUPS.values() for name, kind in group.item
 WITH_PRESET = ("fit", "calibrate")
 # Commands whose `--help` is short; their `--help-all` lists the whole configuration.
 WITH_CONFIGURATION = (*WITH_PRESET, "inspect")
-# Options whose value may be left out, and their values.
+# Options whose value may be left out, and their values; the first is then used.
 BARE = {"--develop": ("8bit", "16bit", "exr")}
 HELP, HELP_ALL, VERSION = ("-h", "--help"), "--help-all", ("-V", "--version")
 
@@ -50,7 +50,7 @@ def parse(argv: list[str]) -> tuple[str, Any]:
 
     Raises:
         UserError: there is no such command or preset.
-        SystemExit: 0 after help was asked for and printed, 2 after a complaint about options.
+        SystemExit: 0 after requested help or version, 2 without a command or with invalid options.
     """
     argv = _with_new_names(argv)
     first = argv[0] if argv else ""
@@ -66,7 +66,7 @@ def parse(argv: list[str]) -> tuple[str, Any]:
 
 
 def _with_new_names(argv: list[str]) -> list[str]:
-    """Return the words with today's names of commands and options; old ones get a hint."""
+    """Return words with current names of commands and options; print a hint for each old name."""
     out = []
     for k, word in enumerate(argv):
         old, equals, value = word.partition("=")
@@ -99,7 +99,7 @@ def _options(name: str, argv: list[str]) -> Any:
                 registry=help_text.registry(brief),
             )
     except SystemExit as end:
-        # tyro repeats words as they are: names of files that a pattern of the shell found.
+        # tyro repeats words unchanged; file names among them may have control characters.
         print(printable(complaint.getvalue()), end="", file=sys.stderr)
         if end.code == 0:
             more = name if brief and name in WITH_CONFIGURATION else ""
@@ -108,7 +108,7 @@ def _options(name: str, argv: list[str]) -> Any:
 
 
 def _with_values(argv: list[str]) -> list[str]:
-    """Return the words with the first choice after an option that was written without a value."""
+    """Return the words with the first value of `BARE` after an option that has no value."""
     out = []
     for word, following in itertools.zip_longest(argv, argv[1:]):
         bare = word in BARE and following not in BARE[word]
@@ -126,8 +126,8 @@ def _defaults(name: str, argv: list[str]) -> Any:
             name_of_preset = argv[i + 1]
         elif arg.startswith("--preset="):
             name_of_preset = arg.split("=", 1)[1]
-    given = {} if name == "fit" else {"out": tyro.MISSING}
-    return COMMANDS[name](scene=tyro.MISSING, config=preset(name_of_preset), **given)
+    required = {} if name == "fit" else {"out": tyro.MISSING}
+    return COMMANDS[name](scene=tyro.MISSING, config=preset(name_of_preset), **required)
 
 
 def _unknown(word: str) -> UserError:

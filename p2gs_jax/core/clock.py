@@ -30,14 +30,14 @@ class Stopwatch:
             self.add(name, time.perf_counter() - begin)
 
     def add(self, name: str, seconds: float) -> None:
-        """Add seconds that were measured elsewhere."""
+        """Add seconds to a name that were measured elsewhere."""
         with self._lock:
             self.seconds[name] = self.seconds.get(name, 0.0) + seconds
 
 
-# Entries of `seconds` in metrics.json that are sums of others, not parts of a run.
+# Entries of `seconds` in metrics.json that are sums of other entries, and so not parts of a run.
 NO_PARTS = ("total_until_evaluation", "optimisation", "evaluation_and_files")
-# Tolerance of a budget before there is a note: a factor, and seconds.
+# Excess over a budget without a note: a factor, and seconds. Most parts that a note names.
 LATE = (1.1, 2.0)
 MOST_NAMED = 4
 
@@ -50,9 +50,9 @@ def whole_run(seconds: Mapping[str, Any]) -> float | None:
 
 
 def over_budget(budget_s: float | None, seconds: Mapping[str, float]) -> str | None:
-    """Return a note on a run that exceeded its budget, with its longest parts, or None.
+    """Return a note with the longest parts of a run that exceeded its budget clearly, or None.
 
-    `seconds` are those of metrics.json.
+    `seconds` is the entry of this name in metrics.json.
     """
     total = whole_run(seconds)
     if budget_s is None or total is None or total <= LATE[0] * budget_s + LATE[1]:
@@ -61,5 +61,5 @@ def over_budget(budget_s: float | None, seconds: Mapping[str, float]) -> str | N
     named = ", ".join(f"{k.replace('_', ' ')} {v:.0f}" for v, k in parts[:MOST_NAMED] if v >= 0.5)
     return (
         f"The budget of {budget_s:.0f} s was exceeded: the run took {total:.0f} s ({named}). A "
-        "budget limits the steps only, not the work before and after them."
+        "budget shortens the optimisation only, not the work before and after it."
     )

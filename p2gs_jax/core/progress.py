@@ -1,4 +1,4 @@
-"""Progress of a fit: a live display in a terminal, plain lines elsewhere."""
+"""Progress of a command: a live display in a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from rich.text import Text
 
 from p2gs_jax.core.text import as_clock, printable
 
-# Seconds between lines of progress outside of a terminal.
+# Least time between two lines of progress outside a terminal, seconds.
 EVERY_S = 5.0
 
 
 class PlainConsole(Console):
-    """rich's console for text from outside: markup and control characters have no effect."""
+    """A console of rich that prints markup and control characters without their effect."""
 
     def __init__(self, **options: Any):
         super().__init__(highlight=False, markup=False, emoji=False, **options)
@@ -38,7 +38,7 @@ class PlainConsole(Console):
 
 @dataclass(frozen=True)
 class LogRecord:
-    """One line of `log.jsonl`, and the content of the live display."""
+    """A line of `log.jsonl` (docs/files.md has units), and the content of the live display."""
 
     step: int
     progress: float
@@ -61,7 +61,7 @@ class LogRecord:
 
 
 class Reporter:
-    """Receives the progress and the messages of a fit; this one ignores them."""
+    """Receives the progress and the messages of a command; this class ignores them."""
 
     def message(self, text: str) -> None:
         """Receive a sentence that the user must know."""

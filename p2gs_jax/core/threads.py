@@ -1,4 +1,4 @@
-"""Number of cores for this process, and a map in threads that holds few results at once."""
+"""The number of cores for this process, and a threaded map that holds few results at once."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MOST_WORKERS = 4
 def available_cores() -> int:
     """Return the number of cores for this process, by its affinity and its container's limit."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    # "QUOTA PERIOD", microseconds, or "max PERIOD".
+    # The file holds "QUOTA PERIOD" in microseconds, or "max PERIOD" without a limit.
     quota, _, period = text_of(CGROUP / "cpu.max").strip().partition(" ")
     if quota.isdecimal() and period.isdecimal():
         cores = min(cores or 1, int(quota) // max(int(period), 1))

@@ -1,4 +1,4 @@
-"""Recovered radiance against HDR truth: stops, PU21, colour, mu law (docs/photometry.md, 6)."""
+"""Scores of recovered radiance against HDR truth (docs/photometry.md, 6)."""
 
 from __future__ import annotations
 
@@ -23,10 +23,9 @@ WHITE_NITS = 100.0
 # GaussHDR (CVPR 2025) and HDR-NeRF (CVPR 2022): log(1 + mu x) / log(1 + mu), mu = 5000.
 MU = 5000.0
 # Numbers of evenly spaced pixels of a view for alignment and for colour difference, and of all
-# views together for alignment, each up to a factor of 2. Without the last, 900 views of 160 pixels
-# took 4 GB.
+# views for alignment; up to twice as many are used. Without the last bound, 900 views took 4 GB.
 ALIGNMENT_PIXELS, COLOR_PIXELS, MOST_ALIGNED = 10_000, 20_000, 1_000_000
-STOPS_CAP = 3.0
+STOPS_CAP = 3.0  # larger errors count as this, stops
 
 
 def pu21_encode(nits: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
@@ -37,7 +36,7 @@ def pu21_encode(nits: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
 
 
 def pu21_psnr(linear, truth, mask: Bool[np.ndarray, "h w"], white: float) -> float:
-    """Return PSNR of PU21-encoded aligned radiance, dB; `white` is shown as 100 cd/m^2."""
+    """Return PSNR of PU21-encoded, aligned radiance, dB; radiance `white` counts as 100 cd/m^2."""
     a, b = (pu21_encode(x / white * WHITE_NITS) for x in (linear, truth))
     mse = float(np.mean((a - b)[mask] ** 2)) if mask.any() else float("nan")
     return float(20 * np.log10(PU21_PEAK) - 10 * np.log10(max(mse, 1e-12)))
@@ -53,9 +52,9 @@ def pu21_ssim(linear, truth, mask: Bool[np.ndarray, "h w"], white: float) -> flo
 
 
 def delta_e_itp(linear, truth, mask: Bool[np.ndarray, "h w"], white: float) -> float:
-    """Return the mean colour difference of BT.2124 (1 = just noticeable), sRGB primaries.
+    """Return the mean colour difference of BT.2124 (1 = just noticeable); see `pu21_psnr`.
 
-    The mean is over evenly spaced pixels, at least 20,000 if there are so many.
+    Primaries are sRGB's. The mean is over 20,000 to 40,000 evenly spaced pixels, or all if fewer.
     """
     if not mask.any():
         return float("nan")
@@ -85,9 +84,9 @@ def mu_law_psnr(
 ) -> float:
     """Return PSNR of tone-mapped radiance, dB, as GaussHDR's code computes it for synthetic scenes.
 
-    Both images are divided by the brightest true channel of the view. Its authors round both to
-    8-bit files first, which this does not. `linear` is aligned to the truth by one scale for all
-    views. NaN if the mask is empty or the truth is black.
+    Both images are divided by the brightest true channel of the view. GaussHDR also rounds them to
+    8 bits, this function does not. `linear` is aligned to the truth by one scale for all views.
+    The result is NaN if the mask is empty or the truth is black.
     """
     brightest = float(truth[mask].max()) if mask.any() else 0.0
     if brightest <= 0:
@@ -97,7 +96,7 @@ def mu_law_psnr(
 
 
 def sampled(linear, truth, mask: Bool[np.ndarray, "h w"], views: int) -> Float[np.ndarray, "2 n 3"]:
-    """Return log recovered and true radiance of evenly spaced pixels of one of `views` views."""
+    """Return natural logs of recovered and true radiance at some pixels of one of `views` views."""
     pick = np.flatnonzero(mask & (truth.min(-1) > 0) & (linear.min(-1) > 0))
     each = max(1, min(ALIGNMENT_PIXELS, MOST_ALIGNED // views))
     pick = pick[:: max(1, len(pick) // each)]
@@ -107,9 +106,9 @@ def sampled(linear, truth, mask: Bool[np.ndarray, "h w"], views: int) -> Float[n
 class Alignment(NamedTuple):
     """The alignment of recovered and true radiance, the same for all views.
 
-    At radiance `brightest`, in units of recovered radiance, half of the training photographs are
-    saturated: errors in stops leave out pixels with a larger true radiance. The truth is
-    `exp(shift)` times the recovered radiance, or `exp(offset)` times its `power`.
+    The truth is `exp(shift)` times recovered radiance, or `exp(offset) * recovered**power`. A
+    recovered radiance of `brightest` saturates the photograph of median exposure; errors in stops
+    leave out pixels whose true radiance is larger.
     """
 
     brightest: float
@@ -138,9 +137,9 @@ class Alignment(NamedTuple):
         return float(np.exp(self.shift))
 
     def scores(self, linear, truth, mask: Bool[np.ndarray, "h w"]) -> dict[str, float]:
-        """Return the scores of a view.
+        """Return the scores of a view after alignment by the scale.
 
-        `stops_median` and `stops_rms` are after the scale, `stops_rms_power` after scale and power.
+        `stops_rms_power` is after alignment by power and offset instead.
         """
         scale, brightest = self.scale, self.brightest
         keep = mask & (truth.min(-1) > 0) & (truth.max(-1) < brightest * scale)
@@ -159,7 +158,7 @@ class Alignment(NamedTuple):
         }
 
     def summary(self, rows: dict[str, dict[str, float]], splits: dict[str, str]) -> dict:
-        """Return means of the scores of views by name: over all, training and held-out views."""
+        """Return mean scores over all, training and held-out views, from scores by view name."""
         parts = {
             part: {
                 k: _mean([rows[n][k] for n in rows if part in ("all", splits[n])])
@@ -178,7 +177,7 @@ def _mean(values: list[float]) -> float:
 
 
 def _power(logs: np.ndarray) -> tuple[float, float]:
-    """Return (power, offset) with log truth ~ power log linear + offset, without outliers."""
+    """Return (power, offset) with log truth ~ power * log recovered + offset, without outliers."""
     if logs.shape[1] < 2 or np.ptp(logs[0]) < 1e-6:
         return 1.0, 0.0
     keep = np.ones(logs.shape[1], bool)

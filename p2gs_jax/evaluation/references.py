@@ -1,4 +1,4 @@
-"""References beside the photographs: one common exposure, and true radiance."""
+"""References of evaluation: photographs under one common exposure, and true radiance."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ Reference = Callable[[int], np.ndarray | None]
 
 
 def check_reference(folder: str | Path | None) -> None:
-    """Check that the folder exists, before views are read; None: there is no folder.
+    """Check a folder of references before views are read; None: none was given.
 
     Raises:
-        UserError: there is no such folder.
+        UserError: the folder does not exist.
     """
     if folder is not None and not Path(folder).is_dir():
         fix = "give --reference a folder of photographs"
@@ -50,16 +50,16 @@ def load_reference(folder: str | Path, scene: Scene, cfg: FitConfig) -> Referenc
         why += f"{scene.views[0].name})."
         raise UserError(why, fix="name the reference photographs as the scene's images")
     order = sorted(rows)
-    # Every reference is used once, so that no memory keeps them.
+    # References are not cached, because each is used once.
     store = ImageStore(tuple(rows[r] for r in order), dataclasses.replace(cfg.data, cache_mb=0))
     where = {r: i for i, r in enumerate(order)}
     return lambda row: store.get(where[row], 1)[0] if row in where else None
 
 
 def find_radiance(scene: Scene, store: ImageStore) -> Truth | None:
-    """Return true linear radiance by view row if the scene has it (`truth/linear`, or an HDR set).
+    """Return a function from a view's row to its true linear radiance, or None without any truth.
 
-    Only evaluation uses it.
+    The truth is in `truth/linear`, or the scene is an HDR set. Only evaluation uses it.
     """
     linear_files = (scene.root / "truth" / "linear" / view.name for view in scene.views)
     made = [path.with_suffix(".exr") for path in linear_files]

@@ -1,17 +1,17 @@
-"""Seams: the difference of photographs of one surface, before and after a common display transform.
+"""Seams: differences of photographs of one surface, before and after a common display transform.
 
 Pixels of one view are found in a neighbouring one through rendered depth, with an occlusion test
-(render/warp.py). The seam is the median absolute difference over pixels and channels, in 8-bit
-codes and in stops. It is over pixels that both views show, neither saturated nor near black:
+(render/warp.py). The seam is the median absolute difference over channels and pixels, in 8-bit
+codes and in stops. Pixels count if both views show them, neither saturated nor nearly black:
 
-- before: difference of the unchanged photographs. In stops, both are decoded with the common gamma,
+- before: difference of the unchanged photographs. For stops, both are decoded with the common gamma
   and not divided by their exposures.
 - after: difference of the photographs under one display transform. Each is decoded with its gamma
-  and response, divided by its exposure, white balance and vignetting, and displayed in the common
-  transform.
+  and response, divided by its exposure, white balance and vignetting, and displayed under the
+  common transform.
 
-The step is the constant part of the remaining difference: the median of the signed difference
-after, in stops. The rest contains misplaced pixels on texture, view-dependent reflection, and
+The step is the constant part of the difference "after": the median of the signed difference, in
+stops. The rest contains misplaced pixels on texture, view-dependent reflection, and
 effects that the formation model lacks.
 """
 
@@ -37,12 +37,12 @@ from p2gs_jax.types import Camera, Render, Scene
 
 # Least number of shared pixels.
 FEWEST_PIXELS = 200
-# Least number of shared points of two views that are compared.
+# Least number of shared points of a pair of views.
 FEWEST_SHARED = 30
 # Largest number of points that are projected to count shared ones, if there are no tracks.
 MOST_COUNTED = 5000
-# A picture of a seam uses rendered depth from this opacity of the halfway view, and elsewhere this
-# multiple of the largest rendered depth.
+# A picture of a seam uses rendered depth where the opacity is at least this, and elsewhere this
+# multiple of the largest rendered depth. Pixels without a photograph have the display value BLANK.
 OPAQUE, FAR = 0.5, 100.0
 BLANK = 0.5
 
@@ -54,7 +54,7 @@ class Photographed(NamedTuple):
     mask: Float32[np.ndarray, "h w"]  # 1 = use
     camera: Camera  # at the size of `ldr`
     depth: Float[np.ndarray, "h w"]  # from `surface_depth`, 0 where there is no surface
-    transform: DisplayTransform  # its display transform
+    transform: DisplayTransform
 
 
 class Seam(NamedTuple):
@@ -64,7 +64,7 @@ class Seam(NamedTuple):
     after_ev: float  # after, stops
     before_codes: float  # before, 8-bit codes
     after_codes: float  # after, 8-bit codes
-    step_ev: float  # median of first minus second, after, stops
+    step_ev: float  # signed median after, first minus second, stops
     pixels: int  # number of shared pixels
 
 
@@ -73,7 +73,7 @@ def neighbouring_pairs(scene: Scene, most: int) -> list[tuple[int, int]]:
 
     On a rig these are different cameras at the same time that share points: in the same frame of a
     drive, or files of the same name in different folders. Otherwise every view is paired with the
-    one with which it shares most points. There are at most `most` pairs, evenly spread over views.
+    view with which it shares most points. There are at most `most` pairs, evenly spread over views.
     """
     train = scene.train_indices
     shared = _shared_points(scene)
@@ -91,7 +91,7 @@ def neighbouring_pairs(scene: Scene, most: int) -> list[tuple[int, int]]:
 
 
 def _closest(shared: np.ndarray) -> list[tuple[int, int]]:
-    """Return every view with the one that shares most points; among equals, the nearest row."""
+    """Return pairs of each view and the view that shares most points, the nearest among equals."""
     order = np.arange(len(shared))
     near = shared - np.abs(order[:, None] - order) / (len(shared) + 1)
     np.fill_diagonal(near, -np.inf)
@@ -101,7 +101,7 @@ def _closest(shared: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _shared_points(scene: Scene) -> np.ndarray:
-    """Return the number of points that each two training views share, 0 on the diagonal."""
+    """Return the number of shared points of every two training views, 0 on the diagonal."""
     train = list(scene.train_indices)
     if scene.tracks is not None and len(scene.tracks.xy):
         where = (scene.tracks.view_indices, scene.tracks.point_indices)
@@ -165,7 +165,7 @@ def _apart(a: np.ndarray, b: np.ndarray) -> float:
 
 
 class SeamPicture(NamedTuple):
-    """A picture of two photographs, with a hard edge in the middle."""
+    """Pictures whose halves show two photographs, with a hard edge in the middle."""
 
     before: Float32[np.ndarray, "h w 3"]  # the unchanged photographs
     after: Float32[np.ndarray, "h w 3"]  # the photographs under one display transform
@@ -180,7 +180,7 @@ def seam_picture(
 ) -> SeamPicture:
     """Warp half of each photograph into a camera halfway between the two.
 
-    There is no occlusion test: beside foreground edges the picture repeats the foreground. Pixels
+    There is no occlusion test: beside foreground edges the foreground appears twice. Pixels
     that a photograph does not cover are grey. `common` is the display transform of "after", and
     `render` renders a camera with depth.
     """
@@ -196,11 +196,11 @@ def seam_picture(
         size = jnp.array([photograph.camera.width, photograph.camera.height])
         inside = np.asarray((z > 1e-6) & jnp.all((xy >= 0) & (xy < size), axis=-1))
         ldr = np.asarray(sample_bilinear(jnp.asarray(photograph.ldr), xy))
-        # Saturated pixels keep the value of the photograph's white.
-        alike = develop(undevelop(ldr, photograph.transform), common)
+        # A saturated pixel has the radiance at which its photograph saturates.
+        common_look = develop(undevelop(ldr, photograph.transform), common)
         reached.append(inside)
         before.append(np.where(inside[..., None], ldr, BLANK))
-        after.append(np.where(inside[..., None], alike, BLANK))
+        after.append(np.where(inside[..., None], common_look, BLANK))
     edge = camera.width // 2
     left_first = bool(
         reached[0][:, :edge].sum() + reached[1][:, edge:].sum()

@@ -22,23 +22,23 @@ from p2gs_jax.photometry import formation
 from p2gs_jax.photometry.response import DARKEST, by_camera
 from p2gs_jax.types import GAMMA_SRGB, Capture
 
-# Steps of the common curve in log radiance: one is less than a fifth of a 16-bit code.
+# Steps of the common curve in log radiance: one is at most 0.4 of a 16-bit code at gamma 2.2.
 _STEPS = 2**20
-# Entries of vignetting over r^2, and rows of pixels that are converted at a time.
+# Entries of a table of vignetting over r^2, and rows of pixels that are converted at a time.
 _RADII, _ROWS = 2**16, 64
 
 Pixels = UInt[np.ndarray, "h w 3"]
 Logs = Float32[np.ndarray, "*n 3"]
 Finish = Callable[[Logs], Any]
-"""From log radiance (natural logarithm, -inf for none) to values of a result."""
+"""A function from log radiance (natural, -inf for black) to output values."""
 
 
 def common_curve(log_exposure: float, gamma: float, cfg: PhotometryConfig, most: int) -> Finish:
-    """Return the function from log radiance to stored values at an exposure; `most` is white."""
+    """Return the function from log radiance to stored values; `most` is the value of white."""
     white = formation.inverse_tone_map(np.ones(3), gamma, cfg, None).max()
     first, last = np.log(formation.EXPOSED_FLOOR), np.log(white)
     exposed = np.exp(np.linspace(first, last, _STEPS))[:, None]
-    # Only channels with own responses need a column each.
+    # Each channel needs a column only if responses differ.
     exposed = np.repeat(exposed, 3 if by_camera(cfg) else 1, 1)
     display = formation.display(formation.tone_map(exposed, gamma, cfg, None))
     values = np.rint(most * display).astype(np.uint16)
@@ -58,7 +58,7 @@ def common_curve(log_exposure: float, gamma: float, cfg: PhotometryConfig, most:
 
 @dataclass(frozen=True)
 class Film:
-    """The inverse curve of one photograph."""
+    """The inverse curve of one photograph, from stored values to log radiance."""
 
     logs: Float32[np.ndarray, "levels 3"]  # log radiance of every stored value, without vignetting
     shade: Float32[np.ndarray, "r k"] | None  # log V over r^2 of all channels or each, or None
@@ -69,16 +69,16 @@ class Film:
         """Return the film of stored values 0 to `top`; `saturation` is a display value."""
         values = np.repeat((np.arange(1, top + 1) / top)[:, None], 3, 1)
         logs = np.log(formation.inverse_formation(values, capture, cfg, np.zeros((top, 2))))
-        # Below half an 8-bit code the curves continue as they begin.
+        # Below half an 8-bit code the curves are continued as a power of the value.
         steepness = float(capture.gamma) / (1 if cfg.curve == "power" else GAMMA_SRGB)
         logs += steepness * np.log(np.minimum(values / DARKEST, 1.0))
         logs, shade = np.concatenate([np.full((1, 3), -np.inf), logs]), None
         if capture.camera is not None:
             squared = np.linspace(0, 1, _RADII, dtype=np.float32)
             shade = formation.log_vignetting(squared, capture.camera, cfg)
-        dark = shade is not None and shade.any()
+        shaded = shade is not None and shade.any()
         white = int(np.ceil(saturation * top - 1e-6))
-        return cls(logs.astype(np.float32), shade if dark else None, white)
+        return cls(logs.astype(np.float32), shade if shaded else None, white)
 
     def most(self) -> float:
         """Return the largest log radiance of a value below white, anywhere in a photograph."""
@@ -86,7 +86,7 @@ class Film:
         return float(self.logs[self.white - 1].max()) - darkest
 
     def changes_nothing(self, finish: Finish) -> bool:
-        """Return whether all 8-bit values stay; white is 255 * 256 in the results of `finish`."""
+        """Return whether `finish`, whose white is 255 * 256, maps every 8-bit value to itself."""
         table = finish(self.logs)
         same = np.arange(len(table))[:, None] * 256
         return self.shade is None and len(table) == 256 and bool((table == same).all())
@@ -94,8 +94,8 @@ class Film:
     def developed(self, pixels: Pixels, finish: Finish) -> np.ndarray:
         """Return the result of every pixel.
 
-        Pixels that are clipped in all channels become neutral: all channels have the largest value,
-        because every one is a lower bound of the light there.
+        If channels differ in their curves, pixels that are clipped in all channels become neutral:
+        all get the largest value, because each value is a lower bound of the light.
         """
         table = finish(self.logs)
         out = np.empty(pixels.shape, table.dtype)
@@ -117,9 +117,9 @@ class Film:
 
 
 def dithered(codes: UInt16[np.ndarray, "h w 3"], name: str) -> UInt8[np.ndarray, "h w 3"]:
-    """Return 8 bits of 16: noise below one code is added before rounding down.
+    """Return 8-bit of 16-bit codes: noise below one 8-bit code is added before rounding down.
 
-    The noise follows from the photograph's name. Whole codes do not change.
+    The photograph's name is the seed of the noise. Multiples of 256 become their 8-bit code.
     """
     rng = np.random.Generator(np.random.SFC64(zlib.crc32(name.encode())))
     out = np.empty(codes.shape, np.uint8)
@@ -128,21 +128,21 @@ def dithered(codes: UInt16[np.ndarray, "h w 3"], name: str) -> UInt8[np.ndarray,
     return out
 
 
-def across(largest: Callable[..., Any], pixels: Pixels) -> UInt[np.ndarray, "h w"]:
+def across(extreme: Callable[..., Any], pixels: Pixels) -> UInt[np.ndarray, "h w"]:
     """Return np.maximum or np.minimum of three channels; NumPy's reductions take far longer."""
-    return largest(largest(pixels[..., 0], pixels[..., 1]), pixels[..., 2])
+    return extreme(extreme(pixels[..., 0], pixels[..., 1]), pixels[..., 2])
 
 
 def _blocks(pixels: Pixels) -> Iterator[tuple[slice, Pixels]]:
-    """Yield blocks of rows that fit into a processor's cache, and where they are."""
+    """Yield the place and pixels of blocks of rows that fit into a processor's cache."""
     for begin in range(0, len(pixels), _ROWS):
         rows = slice(begin, begin + _ROWS)
         yield rows, pixels[rows]
 
 
 def _looked_up(pixels: Pixels, table: Any) -> Any:
-    """Return the entry of every stored value in the column of its channel."""
+    """Return for every stored value its entry in the table's column of the channel."""
     if pixels.dtype == np.uint8:
-        # NumPy takes three times as long.
+        # Indexing with NumPy takes three times as long.
         return cv2.LUT(np.ascontiguousarray(pixels), table[None])
     return np.stack([table[pixels[..., c], c] for c in range(3)], -1)

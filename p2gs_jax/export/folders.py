@@ -1,7 +1,7 @@
 """The scene as folders of other programs: a COLMAP model, and nerfstudio's `transforms.json`.
 
 Cameras are pinholes at the size of the fit, and the photographs are undistorted to match. Points
-and tracks are those at the start of the fit. Neither format stores exposures: these are in
+and tracks are those at the start of the fit. Neither format stores exposures: they are in
 `exposures.csv`, which `--known-exposures` reads.
 """
 
@@ -29,7 +29,7 @@ from p2gs_jax.scene.convert.convert import kept_settings, write_png
 from p2gs_jax.types import Scene, Tracks, View
 
 JPEG_QUALITY = 98
-# Suffixes and Pillow modes that both programs read; other photographs become PNG.
+# Suffixes that both programs read (others become PNG), and Pillow modes that need no new encoding.
 READABLE, MODES = (".jpg", ".jpeg", ".png"), ("L", "RGB", "RGBA")
 # nerfstudio's file of points, and the colour of points without one.
 CLOUD, GREY = "sparse_pc.ply", 128
@@ -51,8 +51,8 @@ def write_folder(
     COLMAP reads `sparse/0`; nerfstudio's `splatfacto` reads `transforms.json` and `sparse_pc.ply`.
     Coordinates are those of the data set, without the shift by `Scene.origin`. The folder is
     replaced once the new one is complete. The store has cameras at the size of the fit. `on_view`
-    receives the number of written photographs and of all. Raises UserError: a photograph cannot be
-    read.
+    receives the numbers of written and of all photographs. Raises UserError: a photograph cannot
+    be read.
     """
     names = {view.name: exported_name(view) for view in scene.views}
     with atomic_folder(folder) as temporary:
@@ -83,7 +83,7 @@ def exported_name(view: View) -> str:
 
 
 def mask_name(name: str) -> str:
-    """Return COLMAP's name of a mask: the photograph's, suffix included, and .png."""
+    """Return the path of a mask as COLMAP expects it: .png follows the photograph's suffix."""
     return f"masks/{name}.png"
 
 
@@ -107,9 +107,9 @@ def _transforms(
 
 
 def exposure_table(photometry: Sequence[ViewPhotometry], names: Mapping[str, str]) -> str:
-    """Return exposures as CSV under the exported names; a held-out view has its fitted exposure.
+    """Return exposures by exported name as CSV; a held-out view has its fitted exposure.
 
-    The factors of white balance follow if it is modelled.
+    If white balance is modelled, its factors are the last columns.
     """
     out = io.StringIO()
     table = csv.writer(out, lineterminator="\n")
@@ -169,9 +169,9 @@ def _write_model(folder: Path, scene: Scene, store: ImageStore, names: Mapping[s
 
 
 def _write_photograph(path: Path, view: View, ldr: Float[np.ndarray, "h w 3"]) -> None:
-    """Copy an unchanged photograph; encode a changed one again, in sRGB.
+    """Copy a photograph that was not undistorted or resized; encode any other again, in sRGB.
 
-    The camera settings in EXIF are kept, but not the mark of another colour space.
+    A new file keeps the camera settings in EXIF, but not the mark of another colour space.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     unchanged = view.distortion is None and ldr.shape[1::-1] == (view.width, view.height)
@@ -193,12 +193,12 @@ def write_photograph(path: Path, pixels: np.ndarray, exif: Image.Exif | None) ->
     settings = kept_settings(exif)
     options: dict[str, Any] = {"exif": b"Exif\0\0" + settings} if settings else {}
     with atomic_write(path) as temporary:
-        # Only JPEG has a quality.
+        # All other suffixes are of JPEG.
         Image.fromarray(pixels).save(temporary, quality=JPEG_QUALITY, subsampling=0, **options)
 
 
 def _frame(store: ImageStore, index: int, origin: Sequence[float]) -> dict[str, Any]:
-    """Return a camera in nerfstudio's format: OpenGL's axes, pixels with corners at integers."""
+    """Return a camera in nerfstudio's format: OpenGL's axes, pixel corners at integers."""
     viewmat, K, width, height = store.camera(index)
     pose = np.linalg.inv(np.asarray(viewmat, np.float64)) @ np.diag([1.0, -1.0, -1.0, 1.0])
     pose[:3, 3] += origin

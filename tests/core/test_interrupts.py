@@ -1,4 +1,4 @@
-"""Signals that ask for the end raise, or wait where they are held."""
+"""Signals that end a program raise `Interrupted`, at once or when the program can continue."""
 
 import os
 import signal
@@ -26,25 +26,25 @@ def test_a_signal_raises_within_the_block_and_the_former_handler_is_back_after_i
     assert signal.getsignal(number) == before
 
 
-def test_python_s_own_ctrl_c_has_the_code_of_the_shell():
+def test_ctrl_c_has_the_exit_code_of_shells():
     assert interrupts.exit_code(KeyboardInterrupt()) == 130
     assert interrupts.name_of(INT) == "Ctrl-C"
     assert interrupts.name_of(TERM) == "SIGTERM"
 
 
 @pytest.mark.parametrize(
-    ("begun", "sent", "delivered", "passed", "raised"),
+    ("begun", "sent", "delivered", "reached", "raised"),
     [
         (True, [TERM], True, 1, TERM),  # waits until it is delivered
         (True, [TERM], False, 2, TERM),  # raised at the end of the block
-        (False, [TERM], False, 0, TERM),  # before there is something to lose nothing waits
-        (True, [TERM, INT], False, 1, INT),  # nor does the second
+        (False, [TERM], False, 0, TERM),  # raises at once before `begin`
+        (True, [TERM, INT], False, 1, INT),  # a second signal raises at once
     ],
 )
 def test_a_held_signal_waits_until_the_program_can_be_continued(
-    begun, sent, delivered, passed, raised
+    begun, sent, delivered, reached, raised
 ):
-    went = []
+    trace = []
 
     def work():
         with interrupts.held() as waiting:
@@ -52,18 +52,18 @@ def test_a_held_signal_waits_until_the_program_can_be_continued(
                 waiting.begin()
             for number in sent:
                 send(number)
-                went.append(waiting.arrived)
+                trace.append(waiting.arrived)
             if delivered:
                 waiting.deliver()
-            went.append("to the end")
+            trace.append("end of the block")
 
     with pytest.raises(interrupts.Interrupted) as stop:
         work()
-    assert went == [TERM, "to the end"][:passed]
+    assert trace == [TERM, "end of the block"][:reached]
     assert stop.value.number == raised
 
 
-def test_handlers_of_others_stay():
+def test_handlers_of_other_programs_stay():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
     try:
         with interrupts.raised(), interrupts.held() as waiting:

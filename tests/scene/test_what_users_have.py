@@ -1,4 +1,4 @@
-"""Scenes as neighbouring programs and people leave them: other places, names, axes and origins."""
+"""Scenes as users and other programs store them: unusual places, names, axes and origins."""
 
 import codecs
 import shutil
@@ -51,7 +51,7 @@ def test_models_elsewhere_are_read(tmp_path, place):
     assert place in scene.notes[-1]
 
 
-def test_photographs_beside_an_undistorted_model_are_those_of_its_size(tmp_path):
+def test_an_undistorted_model_uses_the_photographs_of_its_size(tmp_path):
     write_tiny_model(tmp_path / "dense" / "0")
     (tmp_path / "dense" / "0" / "sparse" / "0").rename(tmp_path / "dense" / "0" / "model")
     for k in range(2):
@@ -71,8 +71,8 @@ def test_the_largest_of_several_models_is_used(tmp_path, inside):
         (tmp_path / "sparse").rename(tmp_path / inside / "sparse")
     scene = find_scene(tmp_path, CFG)
     assert len(scene.views) == 5
-    said = "sparse/1 with 5 photographs, the largest; the models beside it (0) are not used"
-    assert said in " ".join(scene.notes)
+    note = "sparse/1 with 5 photographs, the largest; the models beside it (0) are not used"
+    assert note in " ".join(scene.notes)
 
 
 @pytest.mark.parametrize(
@@ -93,7 +93,7 @@ def test_names_that_are_nearly_right(tmp_path, names, files):
     assert find_names(names, tmp_path) == expected
 
 
-def test_other_names_are_said_and_the_nearest_file_is_named(tmp_path):
+def test_a_note_or_an_error_names_the_nearest_file(tmp_path):
     images = write_tiny_model(tmp_path) / "images.txt"
     images.write_text(images.read_text().replace("im 0.png", "IM 0.JPG"))
     scene = find_scene(tmp_path, CFG)
@@ -113,10 +113,10 @@ def test_a_folder_of_smaller_images_keeps_the_folders_of_cameras(tmp_path):
         assert (view.name, view.camera) == ("cam0/a.png", "cam0")
 
 
-def test_byte_order_marks_and_lines_that_are_not_there(tmp_path):
+def test_byte_order_marks_and_missing_lines_are_accepted(tmp_path):
     model = write_tiny_model(tmp_path)
     images = model / "images.txt"
-    # Without the second lines, as of tools that export poses alone.
+    # Tools that export only poses leave out the second line of every image.
     images.write_text("".join(images.read_text().splitlines(keepends=True)[::2]))
     (tmp_path / "test.txt").write_text("im 1.png\n")
     for path in (*model.iterdir(), tmp_path / "test.txt"):
@@ -128,7 +128,7 @@ def test_byte_order_marks_and_lines_that_are_not_there(tmp_path):
     assert len(find_scene(path, CFG).views) == 1
 
 
-def test_points_that_are_not_there_or_in_a_ply(tmp_path):
+def test_points_may_be_missing_or_in_a_ply(tmp_path):
     model = write_tiny_model(tmp_path)
     (model / "points3D.txt").unlink()
     scene = find_scene(tmp_path, CFG)
@@ -147,7 +147,7 @@ def test_a_crop_is_not_another_size():
         assert not same_shape(size, (5187, 3361))
 
 
-def test_what_is_far_from_the_origin_keeps_its_places(tmp_path):
+def test_scenes_far_from_the_origin_keep_their_coordinates(tmp_path):
     poses, names = around(6), [f"images/{k}.png" for k in range(6)]
     poses[:, :3, 3] += UTM
     listed = [
@@ -164,7 +164,7 @@ def test_what_is_far_from_the_origin_keeps_its_places(tmp_path):
         assert view.viewmat.dtype == np.float32
         centre = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
         np.testing.assert_allclose(centre + origin, pose[:3, 3], atol=2e-6)
-    # Exports are where the data set is.
+    # Exports have the coordinates of the data set.
     store = ImageStore(scene.views, CFG)
     for program in ("colmap", "nerfstudio"):
         write_folder(program, tmp_path / program, scene, store, [])
@@ -185,7 +185,7 @@ def test_paths_of_cameras_follow_the_scene():
             np.testing.assert_allclose(shot.viewmat, expected.viewmat, atol=1e-6)
 
 
-def test_poses_in_other_axes_are_told(tmp_path):
+def test_poses_in_other_axes_are_refused(tmp_path):
     def views(change):
         view, poses = make_view(tmp_path / "0.png"), map(change, around(6))
         return [replace(view, viewmat=np.linalg.inv(pose @ OPENGL)) for pose in poses]
@@ -199,7 +199,7 @@ def test_poses_in_other_axes_are_told(tmp_path):
     ):
         with refused("a.json has poses that contradict the photographs", words):
             require_axes(views(change), agreeing, "a.json")
-    # What agrees with no axes is left alone.
+    # Poses that agree in no axes are not refused.
     require_axes(views(lambda pose: pose), lambda views: 0.0, "a.json")
 
 
@@ -224,15 +224,15 @@ def test_pictures_of_a_whole_sphere_are_refused_with_a_remedy(tmp_path):
         find_scene(tmp_path, CFG)
 
 
-def test_times_and_depths_of_frames_are_not_dropped_in_silence(tmp_path):
+def test_notes_name_times_and_depths_that_are_not_used(tmp_path):
     listed = [frame | {"time": 0.5, "depth_file_path": "d.png"} for frame in frames("images/a.png")]
     notes = find_scene(write(tmp_path, {**LENS, "frames": listed}), CFG).notes
     stated = [f"Frames of transforms.json have {k}" for k in ("time", "depth_file_path")]
     assert [note.removesuffix(", which is not used.") for note in notes] == stated
 
 
-def taken(tmp_path, *names, exif=None, models="111111"):
-    """Return views by the names of their files, with models' cameras and makers."""
+def views_of(tmp_path, *names, exif=None, models="111111"):
+    """Return views by file name, with the cameras of a model and the camera models of EXIF."""
     out = []
     for k, (name, camera) in enumerate(zip(names, models, strict=False)):
         path = tmp_path / name
@@ -248,27 +248,27 @@ def taken(tmp_path, *names, exif=None, models="111111"):
 FOLDER = [f"{k}.jpg" for k in range(6)]
 RIG = [f"rig1/camera{c}/{k}.jpg" for c in (1, 2) for k in range(3)]
 PAIR = ["l/a.jpg", "l/b.jpg", "r/a.jpg", "r/b.jpg"]
-TOLD = {"models": list("1122"), "exif": list("ABAB")}
+CAMERAS = {"models": list("1122"), "exif": list("ABAB")}
 LAYOUTS = {
     "rig": ("auto", RIG, {}, ["rig1/camera1"] * 3 + ["rig1/camera2"] * 3),
     "two models": ("auto", FOLDER, {"models": list("112211")}, list("112211")),
     "two devices": ("auto", FOLDER[:4], {"exif": list("ABAB")}, ["1 1", "1 2", "1 1", "1 2"]),
     "a camera for each": ("auto", FOLDER[:4], {"models": list("1234")}, ["0"] * 4),
     "a zoom in one folder": ("auto", PAIR, {"models": list("1234")}, ["l", "l", "r", "r"]),
-    "by folder": ("folder", PAIR, TOLD, ["l", "l", "r", "r"]),
-    "by model": ("model", PAIR, TOLD, list("1122")),
-    "by exif": ("exif", PAIR, TOLD, list("ABAB")),
-    "one": ("one", PAIR, TOLD, ["0"] * 4),
+    "by folder": ("folder", PAIR, CAMERAS, ["l", "l", "r", "r"]),
+    "by model": ("model", PAIR, CAMERAS, list("1122")),
+    "by exif": ("exif", PAIR, CAMERAS, list("ABAB")),
+    "one": ("one", PAIR, CAMERAS, ["0"] * 4),
 }
 
 
-@pytest.mark.parametrize(("by", "names", "told", "expected"), LAYOUTS.values(), ids=LAYOUTS)
-def test_what_is_one_camera(tmp_path, by, names, told, expected):
-    views = taken(tmp_path, *names, **told)
+@pytest.mark.parametrize(("by", "names", "cameras", "expected"), LAYOUTS.values(), ids=LAYOUTS)
+def test_views_are_grouped_by_camera(tmp_path, by, names, cameras, expected):
+    views = views_of(tmp_path, *names, **cameras)
     assert [view.camera for view in name_cameras(views, by)] == expected
 
 
-def test_lenses_of_frames_and_models_tell_cameras_apart(tmp_path):
+def test_cameras_differ_by_the_lenses_of_frames(tmp_path):
     names = [f"images/{k}.png" for k in range(4)]
     listed = frames(*names)
     for k, frame in enumerate(listed):
@@ -279,13 +279,13 @@ def test_lenses_of_frames_and_models_tell_cameras_apart(tmp_path):
     assert {v.camera for v in find_scene(path, cfg).views} == {"0"}
 
 
-def test_exposures_of_hdr_nerf_and_frames_held_out(tmp_path):
+def test_exposures_of_hdr_nerf_and_held_out_frames_are_read(tmp_path):
     root, table = tmp_path / "hdr", np.c_[rows(), [0.25, 1.0, 4.0, 1.0]]
     write_llff(root, table, folder="input_images")
     (root / "poses_bounds.npy").rename(root / "poses_bounds_exps.npy")
     scene = find_scene(root, CFG)
     assert [view.exif_ev for view in scene.views] == [-2.0, 0.0, 2.0, 0.0]
-    # HDR-GS puts a COLMAP model beside it.
+    # HDR-GS puts a COLMAP model beside the file of exposures.
     write_tiny_model(tmp_path / "gs", n=4)
     shutil.copy(root / "poses_bounds_exps.npy", tmp_path / "gs")
     scene = find_scene(tmp_path / "gs", CFG)

@@ -1,7 +1,7 @@
-"""Steps on virtual devices, of several views and of one, in a process of its own: prints JSON.
+"""Train steps on virtual devices, with one or several views, and print the results as JSON.
 
-JAX counts its devices once, so a test run cannot have both one and four: four are wanted here
-(JAX_NUM_CPU_DEVICES=4).
+This runs in a separate process, because JAX counts devices once and tests run with one device. It
+needs four (JAX_NUM_CPU_DEVICES=4).
 """
 
 import json
@@ -37,8 +37,8 @@ def first_moments(state):
     return state.opt_state.gaussians.mu, state.opt_state.rest.mu[0].raw_exposures
 
 
-def of_one_view() -> dict:
-    """Loss and first moments after a step of each view, all from the start; their means."""
+def mean_of_single_views() -> dict:
+    """Return mean loss and first moments of steps of one view each, all from the start."""
     cfg = config(method=None)
     optimizer = make_optimizer(cfg)
     step = Step(cfg, optimizer, EXTENT)
@@ -54,7 +54,7 @@ def of_one_view() -> dict:
 
 
 def on_devices(count: int) -> dict:
-    """A step that overflows, then two that fit: losses, fault, moments and parameters."""
+    """Return results of two steps on devices, after one that overflows if each has one view."""
     cfg = config(batch=VIEWS)
     optimizer, mesh = make_optimizer(cfg), default_mesh(count)
     step = ParallelStep(cfg, optimizer, EXTENT, cfg.densify.noise, mesh=mesh)
@@ -77,7 +77,7 @@ def on_devices(count: int) -> dict:
 
 
 def overflowing(step: Step, state, inputs, show, advance):
-    """The state after a step that overflows, with the fault cleared; and what the step changed."""
+    """Return the state after a step that overflows, without its fault; and fault and changes."""
     before = jax.tree.map(np.asarray, state.params)
     narrow = step.program("differentiate", Capacity(64, CAPACITY.visible), DEGREE)
     state, _ = step.chained(show, narrow, advance)(state, *inputs)
@@ -87,9 +87,9 @@ def overflowing(step: Step, state, inputs, show, advance):
 
 
 def over_cores(count: int) -> dict:
-    """Two steps of one view divided over cores, and how far what comes of them is from one core's.
+    """Return how far two steps with views divided over cores are from steps on one core.
 
-    Before them comes a step that overflows, which must change nothing.
+    A step that overflows comes first and must change nothing.
     """
     cfg = with_values(config(method=None), {"loss.dssim_weight": 0.2})
     optimizer, mesh = make_optimizer(cfg), Mesh(np.array(jax.devices()[:count]), (CORES,))
@@ -104,32 +104,32 @@ def over_cores(count: int) -> dict:
         end = jax.tree.map(lambda a: a[:COUNT] * 1.0 if a.ndim else a, step.whole(state))
         ends.append((end.params, end.opt_state, end.population))
         reports.append(float(report.loss))
-    return found | {"of one core": distance(*ends), "losses": reports}
+    return found | {"from one core": distance(*ends), "losses": reports}
 
 
 def distance(tree, other) -> float:
     """Return the largest relative L2 distance of two trees' arrays."""
 
-    def of(a, b):
+    def relative(a, b):
         return float(np.linalg.norm(a - b) / max(np.linalg.norm(a), 1e-30))
 
-    return max(map(of, jax.tree.leaves(tree), jax.tree.leaves(other)))
+    return max(map(relative, jax.tree.leaves(tree), jax.tree.leaves(other)))
 
 
 def main() -> None:
-    xla_cpu._CPU_OPTIONS = {}
-    single = of_one_view()
+    xla_cpu._CPU_OPTIONS = {}  # XLA's defaults
+    single = mean_of_single_views()
     found = {"one view": {"loss": single["loss"]}}
     whole = None
     for count in (1, 4):
         made = on_devices(count)
         whole = whole or made
         found[str(count)] = {
-            "of one view": distance(single["moments"], made.pop("moments")),
-            "of one device": distance(whole["params"], made["params"]),
+            "from one view": distance(single["moments"], made.pop("moments")),
+            "from one device": distance(whole["params"], made["params"]),
             **{k: v for k, v in made.items() if k not in ("moments", "params")},
         }
-    # Neither Gaussians nor rows of tiles are a multiple of three.
+    # The numbers of Gaussians and of tile rows are not multiples of three.
     found["cores"] = over_cores(3)
     json.dump(found, sys.stdout)
 

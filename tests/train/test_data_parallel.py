@@ -38,8 +38,8 @@ def test_a_step_takes_the_mean_over_views_wherever_they_are(found, devices):
     """Loss and gradient are means; devices change neither losses nor noise; views are counted."""
     made = found[devices]
     assert made["losses"][0] == pytest.approx(found["one view"]["loss"], rel=1e-6)
-    assert made["of one view"] < 1e-6
-    assert made["of one device"] < 2e-7
+    assert made["from one view"] < 1e-6
+    assert made["from one device"] < 2e-7
     assert made["losses"] == pytest.approx(found["1"]["losses"], rel=1e-6)
     assert made["step"] == 8
 
@@ -59,7 +59,7 @@ def test_a_view_divided_over_cores_moves_everything_as_one_core_does(found):
     """Gaussians, moments, photometry and statistics."""
     made = found["cores"]
     assert made["losses"][1] == pytest.approx(made["losses"][0], rel=1e-6)
-    assert made["of one core"] < 2e-6
+    assert made["from one core"] < 2e-6
 
 
 def test_one_view_on_one_device_needs_no_mesh():

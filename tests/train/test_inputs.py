@@ -1,4 +1,4 @@
-"""Inputs of a step: photographs as they are stored, and batches of views of one size."""
+"""Inputs of a step: stored photographs, batches of one size, and canvases of compiled sizes."""
 
 import chex
 import jax
@@ -19,7 +19,7 @@ from p2gs_jax.train.terms import loss_terms
 from p2gs_jax.types import Batch, Camera, Photometry, Render
 
 
-def test_photographs_travel_as_integers(tmp_path):
+def test_batches_hold_photographs_as_integers(tmp_path):
     scene = load_scene(make_scene(tmp_path / "scene", views=3, points=30), DataConfig())
     store = ImageStore(scene.views, DataConfig())
     views = TrainingViews(store, scene.train_indices, 0)
@@ -52,7 +52,7 @@ def test_pixels_of_8_and_16_bits_become_one_type_of_the_same_values():
     assert fine.tolist() == [[0, 65535], [7, 65535]]
 
 
-def test_on_a_gpu_photographs_of_one_level_stay_there(tmp_path, monkeypatch):
+def test_photographs_of_one_level_stay_on_a_gpu(tmp_path, monkeypatch):
     monkeypatch.setattr(inputs, "device_bytes", lambda: 1 << 30)
     scene = load_scene(make_scene(tmp_path / "scene", views=3, points=30), DataConfig())
     views = TrainingViews(ImageStore(scene.views, DataConfig()), scene.train_indices, 0)
@@ -71,10 +71,10 @@ SIDE = st.integers(40, 2000)
 
 @given(st.lists(st.tuples(SIDE, SIDE), min_size=1, max_size=12))
 def test_few_canvases_hold_all_sizes(sizes):
-    on = canvases(sizes)
-    assert on.keys() == set(sizes)
-    assert all(w <= on[w, h][0] and h <= on[w, h][1] for w, h in sizes)
-    assert len(set(on.values())) <= MOST_CANVASES
+    canvas = canvases(sizes)
+    assert canvas.keys() == set(sizes)
+    assert all(w <= canvas[w, h][0] and h <= canvas[w, h][1] for w, h in sizes)
+    assert len(set(canvas.values())) <= MOST_CANVASES
     assert canvases(sizes[:1] * 3) == {sizes[0]: sizes[0]}
 
 
@@ -82,9 +82,9 @@ def test_canvases_of_a_collection_add_less_than_a_tenth():
     draw = np.random.default_rng(0)
     ratios = draw.choice([4 / 3, 3 / 2, 16 / 9, 3 / 4, 2 / 3], 135, p=[0.4, 0.3, 0.05, 0.15, 0.1])
     sizes = [(960, round(960 / r)) for r in ratios * draw.normal(1, 0.004, 135)]
-    on = canvases(sizes)
-    assert len(on) > 30
-    assert sum(np.prod(on[s]) for s in sizes) < 1.1 * sum(map(np.prod, sizes))
+    canvas = canvases(sizes)
+    assert len(canvas) > 30
+    assert sum(np.prod(canvas[s]) for s in sizes) < 1.1 * sum(map(np.prod, sizes))
 
 
 def test_a_photograph_on_a_larger_canvas_has_the_same_loss():
@@ -93,16 +93,16 @@ def test_a_photograph_on_a_larger_canvas_has_the_same_loss():
     rng, terms, found = np.random.default_rng(0), loss_terms(cfg), []
     ldr, linear = rng.random((2, 14, 17, 3), np.float32)
     mask = rng.random((14, 17)) > 0.1
-    taken = Photometry(jnp.zeros(1), jnp.zeros(1), cameras=(0,))
+    photometry = Photometry(jnp.zeros(1), jnp.zeros(1), cameras=(0,))
     for below, right, size in ((0, 0, None), (5, 3, jnp.array([17.0, 14.0]))):
-        there = (14 + below, 17 + right)
-        around = rng.random((*there, 3), np.float32)
-        around[:14, :17] = linear
-        alpha = jnp.ones(there)
-        render = Render(around, alpha, None, jnp.int32(0), jnp.bool_(False), jnp.zeros(0, bool))
-        laid = (np.pad(a, [(0, below), (0, right), (0, 0)][: a.ndim]) for a in (ldr, mask))
-        view = Camera(jnp.eye(4), jnp.eye(3), *there[::-1])
-        batch = Batch(view, *laid, jnp.int32(0), size=size)
-        rendered, target = compared(render, batch, taken, None, cfg)
+        shape = (14 + below, 17 + right)
+        padded = rng.random((*shape, 3), np.float32)
+        padded[:14, :17] = linear
+        alpha = jnp.ones(shape)
+        render = Render(padded, alpha, None, jnp.int32(0), jnp.bool_(False), jnp.zeros(0, bool))
+        photograph = (np.pad(a, [(0, below), (0, right), (0, 0)][: a.ndim]) for a in (ldr, mask))
+        view = Camera(jnp.eye(4), jnp.eye(3), *shape[::-1])
+        batch = Batch(view, *photograph, jnp.int32(0), size=size)
+        rendered, target = compared(render, batch, photometry, None, cfg)
         found.append({name: terms[name](rendered, target, None) for name in ("l1", "dssim")})
     chex.assert_trees_all_close(*found, rtol=1e-5)

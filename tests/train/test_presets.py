@@ -1,4 +1,4 @@
-"""Every preset and every reading of the relative-exposure loss runs, learns and stays finite."""
+"""The paper's presets and the baselines: their fits run, learn, stay finite and load again."""
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +38,7 @@ def test_the_paper_runs_as_printed(tmp_path):
     result = p2gs_jax.fit(make_scene(tmp_path / "scene"), tmp_path / "run", cfg)
     log = check(result, tmp_path / "run")
     assert {"l1", "dssim", "relative_exposure", "exposure_variance"} <= set(log[0]["terms"])
-    # Every Gaussian is shown in every view, so the programs grow with them.
+    # Every view shows all Gaussians, so their growth beyond one block needs larger programs.
     assert log[0]["gaussians"] < BLOCK < log[-1]["gaussians"]
 
 
@@ -50,14 +50,14 @@ def test_the_appendix_differs_from_the_main_text_in_one_weight():
 
 
 @pytest.mark.slow
-def test_opacity_resets_empty_the_scene_and_it_grows_back(tmp_path):
+def test_the_loss_rises_after_an_opacity_reset_and_falls_again(tmp_path):
     cfg = small("paper", reset_every=0.4, min_reset_steps=10, prune_scale=10.0)
     cfg = with_fields(cfg, {"train.steps": 160})
     result = p2gs_jax.fit(make_scene(tmp_path / "scene"), tmp_path / "run", cfg)
     assert max(np.diff([r["loss"] for r in check(result, tmp_path / "run")])) > 0.01  # the reset
 
 
-# Of 30,000 steps: factor on the rate (arXiv 2601.18336, C.1).
+# Factor on the learning rate by step of 30,000 (arXiv 2601.18336, C.1).
 RATES = {0: 0.01, 250: 0.505, 500: 1.0, 15_500: 0.1, 30_000: 0.01 ** (1 - 1 / 60)}
 BASELINES = (
     *("3dgs_published", "3dgs_gain", "3dgs_affine", "3dgs_bilateral", "3dgs_curve"),
@@ -67,7 +67,7 @@ BASELINES = (
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", BASELINES)
-def test_baselines_run_and_come_back_as_they_were_saved(tmp_path, name):
+def test_baselines_run_and_load_as_they_were_saved(tmp_path, name):
     result = p2gs_jax.fit(make_scene(tmp_path / "scene"), tmp_path / "run", small(name))
     check(result, tmp_path / "run")
     again = p2gs_jax.load_run(tmp_path / "run").params
@@ -85,7 +85,7 @@ def test_baselines_run_and_come_back_as_they_were_saved(tmp_path, name):
         jax.tree.map(np.testing.assert_array_equal, again.appearance, saved)
         moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), saved, start)
         if name == "ppisp":
-            # Its exposures are handed on to where all others have theirs.
+            # A run stores PPISP's exposures in `photometry`, like those of all methods.
             assert moved.exposures == 0
             assert np.ptp(exposures) > 1e-3
             moved = (moved.colors, moved.responses, moved.vignettings)

@@ -1,4 +1,4 @@
-"""From a recording to a scene: what is chosen, what is counted, what the user reads."""
+"""A recording becomes a scene: chosen frames, views, LiDAR points, objects and notes."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -59,7 +59,7 @@ def test_a_camera_whose_name_is_a_path_is_refused(drive, name):
 
 def test_laser_points_are_told_apart_by_what_they_lie_on(drive):
     scene = assemble(drive, PLAIN)
-    # The standing car owns nothing: it is part of the static scene.
+    # Points on the standing car have no object: it is a part of the static scene.
     assert (scene.lidar.objects == 0).sum() == 60 * FRAMES
     assert (scene.lidar.objects == -1).sum() == 800 * FRAMES
     assert np.isfinite(scene.lidar.points).all()
@@ -91,13 +91,13 @@ def test_every_camera_holds_out_the_same_frames(drive):
 
 
 def test_calibration_is_compared_with_the_photographs(drive):
-    def made(size, camera="CAM_FRONT"):
+    def assembled(size, camera="CAM_FRONT"):
         for photograph in drive.photographs:
             if photograph.camera == camera:
                 cv2.imwrite(str(photograph.path), np.zeros((*size, 3), np.uint8))
         return assemble(drive, PLAIN)
 
-    scene = made((32, 48))
+    scene = assembled((32, 48))
     front, back = (
         next(v for v in scene.views if v.camera == f"CAM_{n}") for n in ("FRONT", "BACK")
     )
@@ -105,8 +105,8 @@ def test_calibration_is_compared_with_the_photographs(drive):
     np.testing.assert_allclose(front.K[:2], back.K[:2] / 2)
     assert any("6 images have another size than the calibration states" in n for n in scene.notes)
     with refused(r"wrong size: .*is 64x96"):
-        made((96, 64))
-    made((64, 96))
+        assembled((96, 64))
+    assembled((64, 96))
     aside = np.array([[0, 0, 40], [0, 0, 0], [0, 0, 0]])
     shifted = [replace(c, K=c.K + aside) for c in drive.cameras]
     with refused("principal point at 88, 32, far from the middle"):
@@ -135,13 +135,13 @@ def test_embedded_photographs_are_written_once(drive, tmp_path):
     assert scene.views[0].image_path.is_relative_to(tmp_path / "work")
 
 
-def test_frames_are_sliced_by_their_place_and_what_makes_no_sense_is_refused():
-    there = [3, 4, 5, 7]
-    for asked, found in ((None, there), ("1:3", [4, 5]), ("::2", [3, 5]), ("-1:", [7])):
-        assert chosen_frames(asked, there) == found
+def test_frames_are_sliced_by_their_place_and_invalid_slices_are_refused():
+    existing = [3, 4, 5, 7]
+    for asked, found in ((None, existing), ("1:3", [4, 5]), ("::2", [3, 5]), ("-1:", [7])):
+        assert chosen_frames(asked, existing) == found
     for asked in ("3", "a:b", "1:2:3:4", "9:12", "::0"):
         with refused("--frames"):
-            chosen_frames(asked, there)
+            chosen_frames(asked, existing)
 
 
 def test_seeds_are_dense_near_the_path_and_sparse_far_from_it():
@@ -156,23 +156,23 @@ def test_seeds_are_dense_near_the_path_and_sparse_far_from_it():
 
 
 @pytest.mark.parametrize(
-    ("xs", "says", "moves"),
+    ("xs", "stated", "moves"),
     [
         ((0, 0.4, -0.3, 0.2), None, False),
         ((0, 0.7, 1.4), None, True),
         ((0, 3, 0), None, True),
-        # What the set says counts more.
+        # A statement of the data set overrules the positions.
         ((0,), True, True),
         ((0, 9), False, False),
     ],
 )
-def test_what_gets_away_from_where_it_was_moves(xs, says, moves):
+def test_an_object_moves_if_it_leaves_its_first_place(xs, stated, moves):
     poses = np.tile(np.eye(4), (len(xs), 1, 1))
     poses[:, 0, 3] = xs
-    boxes = [Box("a", "Car", (4, 2, 1.5), k, pose, says) for k, pose in enumerate(poses)]
+    boxes = [Box("a", "Car", (4, 2, 1.5), k, pose, stated) for k, pose in enumerate(poses)]
     (thing,) = tracks(boxes)
     assert thing.moving is moves
-    # Sorted, and of one time the first box counts.
+    # Boxes are sorted by time; the first of two boxes at one time counts.
     (again,) = tracks([*boxes[::-1], boxes[0]._replace(pose=9 * poses[0])])
     np.testing.assert_array_equal(again.poses, poses)
     assert again.size == (4.0, 2.0, 1.5)

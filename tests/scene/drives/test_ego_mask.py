@@ -1,4 +1,4 @@
-"""The car itself is found in pictures of a road that passes, and nothing else is."""
+"""The ego mask covers the car in pictures of a passing road, and nothing else."""
 
 import dataclasses
 
@@ -23,26 +23,26 @@ SOIL = 0.25 + 0.2 * (SOIL - SOIL.mean()) / SOIL.std() / 3
 CLOUDS = cv2.GaussianBlur(RNG.random((512, 1024)).astype(np.float32), (0, 0), 6)
 
 
-def pose_at(way, turned=0.0):
-    return pose_of(cv2.Rodrigues(np.array([0.0, turned, 0.0]))[0], [0, 0, way])
+def pose_at(metres, yaw=0.0):
+    return pose_of(cv2.Rodrigues(np.array([0.0, yaw, 0.0]))[0], [0, 0, metres])
 
 
-# Where the bonnet is: an arch at the bottom.
+# The bonnet is an arch at the bottom of the picture.
 BONNET = np.arange(H)[:, None] >= (H - 60 + 30 * np.linspace(-1, 1, W) ** 2)[None]
 
 
 def road(pose):
-    """Linear picture of a plane with texture and, above the horizon, infinitely far clouds."""
+    """Return linear values of a textured plane below clouds that are infinitely far away."""
     xs, ys = np.meshgrid(np.arange(W) + 0.5, np.arange(H) + 0.5)
     rays = np.stack([(xs - K[0, 2]) / F, (ys - K[1, 2]) / F, np.ones_like(xs)], -1)
     rays = rays @ pose[:3, :3].T
     ahead = np.maximum(rays[..., 1], 1e-3)
     at = pose[:3, 3] + rays * (HEIGHT / ahead)[..., None]
-    # Finer than a pixel far away: there it is one grey.
+    # Far away the texture is finer than a pixel and fades to a uniform grey.
     tiles = (30 * at[..., [0, 2]]).astype(np.float32) % 512
     soil = cv2.remap(SOIL, tiles[..., 0], tiles[..., 1], cv2.INTER_LINEAR)
     ground = 0.25 + np.clip(12 * ahead, 0, 1) * (soil - 0.25)
-    # A marking that runs with the car: structure that stays, and is no part of it.
+    # A lane marking along the road stays in the picture, but is not a part of the car.
     ground[np.abs(at[..., 0] + 1.2) < 0.08] = 0.6
     azimuth = np.arctan2(rays[..., 0], rays[..., 2])
     height = rays[..., 1] / np.hypot(rays[..., 0], rays[..., 2])
@@ -50,12 +50,12 @@ def road(pose):
     return np.where(rays[..., 1] > 0, ground, 0.2 + cv2.remap(CLOUDS, *where, cv2.INTER_LINEAR))
 
 
-def pictures(poses, *, own=True, exposures=None):
-    """Display pictures, 8 bits, with a smooth bonnet that mirrors a little of what passes."""
+def pictures(poses, *, bonnet=True, exposures=None):
+    """Return 8-bit display values, with a smooth bonnet whose reflections change slightly."""
     out = []
     for k, (pose, exposure) in enumerate(zip(poses, exposures or [1.0] * len(poses), strict=True)):
         glint = 0.02 * np.sin(np.arange(W) / 40 + k)[None]
-        linear = np.where(own & BONNET, 0.5 + glint, road(pose))
+        linear = np.where(bonnet & BONNET, 0.5 + glint, road(pose))
         shown = np.clip(linear * exposure, 0, 1) ** (1 / 2.2)
         out.append(np.rint(255 * np.clip(shown + RNG.normal(0, 0.004, shown.shape), 0, 1)))
     return np.array(out, np.uint8)
@@ -64,15 +64,15 @@ def pictures(poses, *, own=True, exposures=None):
 DRIVEN = np.array([pose_at(0.7 * k) for k in range(12)])
 
 
-def test_the_bonnet_is_found_whatever_the_exposures():
+def test_the_bonnet_is_found_under_changing_exposures():
     exposures = [2.0**-0.8, 2.0**0.3, 1.0] * 4
     mask = find_ego_mask(CAMERA, pictures(DRIVEN, exposures=exposures), DRIVEN, UP)
     assert mask is not None
     assert (mask & BONNET).sum() / (mask | BONNET).sum() > 0.93
 
 
-def test_a_road_and_the_sky_in_turns_are_no_car_and_one_that_stands_says_nothing():
-    found = find_ego_mask(CAMERA, pictures(DRIVEN, own=False), DRIVEN, UP)
+def test_road_and_sky_are_not_masked_and_too_little_motion_gives_no_mask():
+    found = find_ego_mask(CAMERA, pictures(DRIVEN, bonnet=False), DRIVEN, UP)
     assert found is not None
     assert not found.any()
     turning = np.array([pose_at(0.7 * k, 0.01 * k) for k in range(12)])
@@ -84,12 +84,12 @@ def test_a_road_and_the_sky_in_turns_are_no_car_and_one_that_stands_says_nothing
     assert find_ego_mask(CAMERA, pictures(DRIVEN[:3]), DRIVEN[:3], UP) is None
 
 
-def test_drives_leave_it_out_and_runs_remember(tmp_path, monkeypatch):
-    # Of two cameras one sees a bonnet.
+def test_drives_mask_the_car_and_runs_keep_the_mask(tmp_path, monkeypatch):
+    # Only the front camera sees a bonnet.
     photographs = []
     for name in ("front", "back"):
         (tmp_path / name).mkdir()
-        for k, picture in enumerate(pictures(DRIVEN, own=name == "front")):
+        for k, picture in enumerate(pictures(DRIVEN, bonnet=name == "front")):
             path = tmp_path / name / f"{k:02d}.png"
             cv2.imwrite(str(path), picture)
             photographs.append(Photograph(name, k, 0.1 * k, path, DRIVEN[k]))
@@ -114,7 +114,7 @@ def test_drives_leave_it_out_and_runs_remember(tmp_path, monkeypatch):
         assert mask[: H // 2].all()
         assert store.get(by_camera["back"])[1].all()
         store.close()
-    # What was found is kept.
+    # The cached mask is read again.
     monkeypatch.setattr("p2gs_jax.scene.drives.ego_mask.find_ego_mask", None)
     assert assemble(recording, DataConfig(frames="0:4"), tmp_path / "work").notes == scene.notes
     without = assemble(recording, DataConfig(ego_mask=False))
