@@ -68,6 +68,7 @@ def main(argv: list[str] | None = None) -> None:
 _CONTINUED = {
     "fit": "; --resume continues from the last checkpoint",
     "sweep": "; the same command continues it",
+    "demo": "; the same command begins it again",
 }
 
 
