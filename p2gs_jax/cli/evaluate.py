@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from p2gs_jax.evaluation.evaluate import Judge
     from p2gs_jax.evaluation.renders_of_others import OtherRenders
 
-# Names of folders that do not tell the program.
+# Names of folders that do not name a program.
 COMMON = re.compile(r"renders|rgb|test|ours_\d+|\.")
-# Views that could not be judged: others may be now.
+# Keys that `evaluate` leaves out if no view has the problem, so old values are dropped.
 UNJUDGED = ("hidden", "exposures_unknown")
 
 
@@ -96,7 +96,7 @@ class Eval:
 
 
 def _labelled(folders: tuple[Path, ...]) -> dict[str, Path]:
-    """Return the folders by the names of their programs, or by their paths."""
+    """Return the folders by program; by their paths if two programs have the same name."""
     labels = []
     for folder in folders:
         names = [n for n in folder.resolve().parts if not COMMON.fullmatch(n)]
@@ -129,7 +129,7 @@ def _judged(
 
 
 def _kept(path: Path) -> dict[str, Any]:
-    """Return what the file has: of the fit, and of references that are not given again."""
+    """Return the metrics in the file, among them those of the fit and of earlier references."""
     from p2gs_jax.core.text import parse_json
 
     try:

@@ -34,8 +34,8 @@ def memory() -> tuple[int | None, int | None]:
 def left_to_process() -> int | None:
     """Return the number of bytes that are left to this process, or None if it is unknown.
 
-    It is the least of the memory of the computer (with swap), of its container, and of the limit
-    of the process (`ulimit -v`).
+    One bound is the available memory of the computer or its container, plus the computer's free
+    swap. The other is what the limit of the process (`ulimit -v`) leaves; the smaller counts.
     """
     _, available = memory()
     found = [] if available is None else [available + _numbers(MEMINFO).get("SwapFree", 0)]

@@ -22,7 +22,7 @@ from p2gs_jax.types import Camera
 
 # Constant rate factor of videos; at 16 compression is hardly visible.
 QUALITY = "16"
-# Least width and height of a video, pixels.
+# Least width and height of a video after rounding, pixels.
 SMALLEST = 16
 
 
@@ -31,8 +31,8 @@ class OutputFrame:
     """A rendered picture: radiance without exposure, opacity, and display values in [0, 1].
 
     `name` is the name of its files without suffix, possibly with subfolders. `transform` converts
-    `linear` to `ldr`; `depth` is alpha-weighted; `photograph` has the display values of the
-    photograph at this pose.
+    `linear` to `ldr`; `depth` is camera z times alpha, scene units; `photograph` has the display
+    values of the photograph at this pose.
     """
 
     name: str
@@ -59,7 +59,7 @@ def write_png(path: Path, ldr: Float32[np.ndarray, "h w 3"]) -> None:
 
 
 def write_frame(folder: Path, frame: OutputFrame) -> None:
-    """Write `NAME.exr` and `NAME.png`, or `NAME.render.png` and `NAME.photograph.png`."""
+    """Write NAME.exr, and NAME.png or, with a photograph, `.render.png` and `.photograph.png`."""
     stem = folder / frame.name
     write_exr(
         stem.with_name(f"{stem.name}.exr"),
@@ -124,11 +124,11 @@ def open_video(
 ) -> Iterator[Callable[[Float32[np.ndarray, "h w 3"]], None]]:
     """Yield a function that appends display values in [0, 1]; the file appears at the end.
 
-    Smaller frames than `width` by `height` pixels are centred on black. The size is rounded down to
-    even numbers, as the codec requires. Display values are tagged as BT.709 primaries with the sRGB
-    curve. Raises UserError: the size is too small, or PyAV has no encoder.
+    `width` and `height`, pixels, are rounded down to even numbers, as the codec requires. Smaller
+    frames are centred on black, larger ones are cut. Display values are tagged as BT.709 primaries
+    with the sRGB curve. Raises UserError: the size is too small, or PyAV has no encoder.
     """
-    # The import is here: a fit writes pictures, but no video.
+    # The import is here, because a fit writes pictures but no video.
     import av
     from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 

@@ -50,7 +50,7 @@ CURVE_KNOTS = 16
 
 
 def identity(kind: Appearance, cameras: Sequence[str]) -> Corrections:
-    """Return parameters that change nothing; `cameras` is the camera of every training view."""
+    """Return parameters that change nothing (`ppisp` clips at 1); a camera per training view."""
     if kind == "ppisp":
         return ppisp.identity(cameras)
     if kind == "luminance":
@@ -69,7 +69,7 @@ def correction_of(appearance: Corrections | None, row: Int[Array, ""] | int) -> 
 
 
 def mean_correction(appearance: Corrections | None, camera: str | None = None) -> Correction | None:
-    """Return the mean over the training views, for views of a camera that were not fitted."""
+    """Return the mean over the training views, for others; PPISP's depends on their camera."""
     if isinstance(appearance, Ppisp):
         return appearance.mean(camera)
     if isinstance(appearance, Luminance):
@@ -146,7 +146,7 @@ def _hats(pixels: int, cells: int) -> np.ndarray:
 
 
 def regularisation(parameters: Corrections, kind: Appearance) -> Float[Array, ""] | None:
-    """Return the mean squared difference of neighbouring grid cells, or PPISP's terms, or None."""
+    """Return mean squared differences of grid cells, summed over 3 axes; PPISP's terms; or None."""
     if isinstance(parameters, Ppisp):
         return ppisp.regularisation_of(parameters)
     if isinstance(parameters, Luminance | Formation) or kind != "bilateral":

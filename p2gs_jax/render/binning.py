@@ -2,9 +2,9 @@
 
 Binning has no gradients. There are two methods: counting (binning_cpu.py), sequential and linear,
 for CPUs; and sorting (here), data-parallel, for other devices. If `RenderConfig.binning` is None,
-the device decides.
+the device decides; programs divided over CPU cores always count.
 
-Sorts use one unsigned key and one 32-bit value, for which XLA calls CUB's radix sort on GPUs.
+Sorts use an unsigned key and at most one 32-bit value: XLA then calls CUB's radix sort on GPUs.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ def bin_tiles(
 ) -> TileList:
     """List the Gaussians of every tile in depth order.
 
-    A tile lists a Gaussian only if its ellipse at the alpha cutoff reaches a pixel centre of the
-    tile. The tile list holds `capacity` entries, see `count_entries`. If `overflow` is set, it is
-    incomplete and must not be composited.
+    A tile lists a Gaussian only if its ellipse at the alpha cutoff reaches the rectangle between
+    the tile's outermost pixel centres. The list holds `capacity` entries, see `count_entries`. If
+    `overflow` is set, it is incomplete and must not be composited.
     """
     return _choose(binning_cpu.bin_tiles, _bin_by_sorting, splats, cfg, width, height, capacity)
 
@@ -46,7 +46,7 @@ def _choose(counting, sorting, splats: Splats2D, cfg: RenderConfig, *static):
 
 
 def longest_first(lengths: Int[Array, " n"]) -> Int[Array, " n"]:
-    """Return the indices of lengths, longest first; very long ones are ordered by index."""
+    """Return the indices of lengths, longest first; equal and very long ones are by index."""
     bits = bits_for(lengths.shape[0])
     limit = 2 ** (32 - bits) - 1
     key = jnp.uint32(limit) - jnp.minimum(lengths, limit).astype(jnp.uint32)
@@ -80,7 +80,7 @@ def _too_many(entries: Int[Array, " n"]) -> Bool[Array, ""]:
 def _count_by_sorting(
     splats: Splats2D, width: int, height: int, cfg: RenderConfig
 ) -> Int[Array, ""]:
-    """Return the number of tiles of all bounding boxes."""
+    """Return the number of tiles of all bounding boxes, at most 2^30."""
     entries = _extents(splats, width, height, cfg)[-1]
     return jnp.where(_too_many(entries), 2**30, jnp.sum(entries))
 

@@ -49,13 +49,13 @@ def rasterization(
 
     Means, scales (standard deviations) and `near_plane`, before which nothing is visible, are in
     scene units; quats are w x y z, of any length; opacities are in [0, 1]. Colours are linear
-    radiance (n 3), or (c n 3) for each camera. With `sh_degree` they are spherical harmonics (n k
-    3) of radiance max(0, value + 1/2), and coefficients above the degree are ignored. View matrices
-    map world to camera, OpenCV axes; `Ks` and the size are in pixels. `eps2d` is the variance added
-    to the 2D covariance, pixels^2; backgrounds are radiance, None is black. The mode is "RGB", "D"
-    (the sum of weights times z), "ED" ("D" over alpha), or both. The static `capacity` is the
-    number of entries of the tile list. None measures it, which works only outside of `jax.jit`;
-    inside, pass `meta["capacity"]` of an earlier call. All other options are in `cfg`.
+    radiance (n 3). With `sh_degree` they are spherical harmonics (n k 3) of radiance max(0, value +
+    1/2); coefficients above the degree are ignored. Both may begin with an axis of cameras. View
+    matrices map world to camera, OpenCV axes; `Ks` and the size are in pixels. `eps2d` is the
+    variance added to the 2D covariance, pixels^2; backgrounds are radiance, None is black. The mode
+    is "RGB", "D" (the sum of weights times z), "ED" ("D" over alpha), or RGB and one depth. The
+    static `capacity` counts entries of the tile list; None measures it outside of `jax.jit`, and
+    inside it is needed: `meta["capacity"]` of an earlier call. `cfg` has all other options.
 
     Returns:
         Colours with depth as their last channel, alphas, and a dictionary: `means2d` (c n 2),

@@ -24,7 +24,7 @@ _DEPTHS = {
 
 
 def write_development(out: Path, developed: Developed) -> None:
-    """Write the page and the sheet into a folder, unless they are there and nothing changed."""
+    """Write the page and the sheet, unless both are in the folder and no photograph is new."""
     page, sheet = out / "developed.html", out / "developed.jpg"
     if developed.written or not (page.is_file() and sheet.is_file()):
         picture = _sheet(developed.shown())
@@ -67,7 +67,7 @@ def _cell(value: object) -> str:
 
 
 def _sheet(shown: Sequence[tuple[str, Picture, Picture]]) -> np.ndarray:
-    """Return rows of photographs as they were taken, each above the developed one and its name."""
+    """Return the sheet [h w 3]: each photograph, its developed version below, then its name."""
     both = [[to_uint8(shrunk(picture, _SIDE)) for picture in pair] for _, *pair in shown]
     height, width = (max(before.shape[axis] for before, _ in both) for axis in (0, 1))
     columns = min(_COLUMNS, len(shown))

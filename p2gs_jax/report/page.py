@@ -43,7 +43,7 @@ def _read(name: str) -> str:
 
 
 def check_place(path: Path) -> None:
-    """Raise a UserError if the path is a folder or does not end in .html."""
+    """Raise a UserError if the path is a folder or does not end in .html or .htm."""
     if path.suffix.lower() not in (".html", ".htm") or path.is_dir():
         fix = "name a file that ends in .html"
         raise UserError(f"{path} is not a valid name for a page.", fix=fix)
@@ -91,7 +91,7 @@ def figure(content: str, caption: str) -> str:
 def row(cells: Sequence[tuple[str, str]], columns: str) -> str:
     """Return a row of pictures (HTML) with captions, which becomes a column on narrow screens.
 
-    `columns` is `two`, `three`, or `many`.
+    `columns`, the number of pictures side by side, is `two` or `three`.
     """
     inner = "".join(f"<div>{picture}<span>{text(under)}</span></div>" for picture, under in cells)
     return f'<div class="row {columns}">{inner}</div>'
@@ -104,7 +104,7 @@ def table(
     numbers: Iterable[int] = (),
     tall: bool = False,
 ) -> str:
-    """Return a table of text, with a scroll bar if it is too wide or `tall`.
+    """Return a table of text, with scroll bars if it is too wide or, with `tall`, too high.
 
     `numbers` holds the indices of columns with numbers.
     """

@@ -30,8 +30,8 @@ MOST_LABELS = 8
 class SurveyedCamera:
     """One physical camera, or photographs of one size if their cameras are unknown.
 
-    Sizes and focal lengths are in pixels. `ego_mask` is the share of the picture that it covers,
-    `ev` the range of log2(time ISO / N^2) in stops.
+    Sizes and focal lengths are in pixels. `ego_mask` is the share of the picture that the car
+    covers, `ev` the range of log2(time ISO / N^2) in stops, up to a constant.
     """
 
     name: str

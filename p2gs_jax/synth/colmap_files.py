@@ -22,8 +22,8 @@ _SEED_RANGE = 90.0  # m: farther points are not triangulated
 class DriveViews(NamedTuple):
     """The photographs of a drive: sorted names, which begin with the folder of the camera.
 
-    `viewmats` are world-to-camera, OpenCV axes, m; K is that of all cameras, pixels, centres at
-    +0.5.
+    `viewmats` are world-to-camera, OpenCV axes, m. All cameras have the same K and size, in pixels,
+    with pixel centres at +0.5.
     """
 
     names: Sequence[str]
@@ -40,10 +40,10 @@ def write_seeds(
     rgb: UInt8[np.ndarray, "p 3"],
     depths: Sequence[np.ndarray],
 ) -> dict[str, int]:
-    """Write the model of points with at least two views; return the numbers of points and
-    observations.
+    """Write the points that at least two views see; return counts of points and observations.
 
-    cameras.bin, images.bin and points3D.bin are as in https://colmap.github.io/format.html.
+    `xyz` are world coordinates, m; `depths` hold camera z [h w] of every view, m. The format of the
+    files is https://colmap.github.io/format.html.
     """
     xy, seen = _observe_seeds(xyz, views, depths)
     kept = seen.sum(0) >= 2
@@ -90,7 +90,7 @@ def sample_seeds(
     points: int,
     seed: int,
 ) -> tuple[Float64[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:
-    """Sample first hits at random pixels of the sampled views, with the photographs' colours."""
+    """Return about `points` points (world, m) at random pixels of sampled views, and colours."""
     rng = generator(seed, SceneStream.SEED_POINTS)
     rows = np.flatnonzero(sampled)
     xyz, rgb = [], []

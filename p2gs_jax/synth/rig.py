@@ -18,7 +18,7 @@ from jaxtyping import Float
 from p2gs_jax.scene.rigid import pose_of
 
 FOV_DEGREES = 60.0
-# y of the middle of the lane.
+# y of the middle of the lane in our world, m.
 LANE = -1.75
 _FLIP = np.diag([1.0, -1.0, 1.0])  # CARLA's left-handed axes to ours, and back
 
@@ -57,7 +57,7 @@ def carla_rotation(roll: float, pitch: float, yaw: float) -> Float[np.ndarray, "
 def camera_viewmat(
     mount: Mount, vehicle: Float[np.ndarray, " 3"] | tuple[float, float, float]
 ) -> Float[np.ndarray, "4 4"]:
-    """Return world-to-camera (OpenCV) of a camera on a vehicle at a place that heads along +x."""
+    """Return a mount's world-to-camera (OpenCV, m); the vehicle (world, m) heads along +x."""
     forward, right, up = (_FLIP @ carla_rotation(*mount.rotation)).T
     R = np.stack([right, -up, forward])
     center = np.asarray(vehicle) + _FLIP @ np.asarray(mount.location)

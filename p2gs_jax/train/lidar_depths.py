@@ -21,7 +21,7 @@ CLIP = 0.2
 LEAST_ALPHA = 0.05
 # Largest number of measurements used per view.
 MOST_PER_VIEW = 8192
-# Measurements within this many seconds of a view decide which points are hidden in it.
+# Measurements within this many seconds of a view are used for it.
 NEAR_S = 1.0
 
 
@@ -47,8 +47,8 @@ def lidar_loss(
 def measured_depths(scene: Scene, cfg: FitConfig) -> list[Measured] | None:
     """Return the measured depths of every training view; None if the loss needs none.
 
-    Only static points are used, so that every sweep serves all views. Points behind a nearer
-    measurement or a moving object are left out.
+    A view uses static points measured within `NEAR_S` of it, or those nearest in time. Points
+    behind a nearer measurement or a moving object are left out.
 
     Raises:
         UserError: the loss needs measurements, and the scene has none.

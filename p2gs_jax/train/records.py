@@ -87,8 +87,8 @@ class Records:
     ) -> tuple[FitState, HostState] | None:
         """Return the restored state and counters of a resumed run, else None.
 
-        It drops log records after the checkpoint. If the run is `planned` for longer than before
-        (`HostState.planned`), it continues as if this had always been its plan.
+        It drops log records after the checkpoint, or all without one. If the run is `planned` for
+        longer than before (`HostState.planned`), it continues as if this had always been its plan.
         """
         restored = self.restore(template) if resume else None
         if restored is None:
@@ -123,12 +123,12 @@ class Records:
         self._store.save(host.step, state, meta)
 
     def restore(self, template: FitState) -> tuple[FitState, HostState] | None:
-        """Return the newest readable checkpoint, or None; newer ones are deleted.
+        """Return the newest readable checkpoint, and delete newer ones; None: there is none.
 
         `template` is a state of the same structure with any number of slots.
 
         Raises:
-            UserError: no checkpoint can be read, or the scene now leads to other options.
+            UserError: no existing checkpoint is readable, or the scene leads to other options.
         """
         found = self._store.restore_latest(
             lambda meta: shapes_of(template, meta["gaussian_capacity"]), self.on_message

@@ -33,7 +33,7 @@ def shrinks(cfg: TrainConfig) -> tuple[int, ...]:
 def levels(cfg: TrainConfig, width: int, height: int) -> Levels:
     """Return the levels of the schedule, for images of this width and height in pixels.
 
-    It leaves out levels whose images would be smaller than 96 pixels across.
+    It leaves out levels whose images would have a shorter side of less than 96 pixels.
     """
     kept = [
         (end, shrink)
@@ -88,8 +88,8 @@ def rate_factor(per_step: float, visible_share: float, most_updates: float | Non
 
     Near an optimum the noise of Adam's steps grows with their number times the squared learning
     rate. So long fits divide rates by the root of their length (ours: BUILD_NOTES, "Length").
-    `visible_share` is the share of the Gaussians that one step updates. Up to `most_updates`
-    updates of a Gaussian the configured rates hold; None: always.
+    `visible_share` is the share of the Gaussians that a view shows. The configured rates hold up to
+    `most_updates` updates of a Gaussian; None: always.
     """
     if most_updates is None:
         return 1.0
@@ -115,7 +115,7 @@ class RunClock:
     A budget loses `spent_s` seconds used before the run. It reserves `finish_s` seconds for
     evaluation and export on an unloaded machine, where a step at full size takes `full_step_s`
     seconds. `now` is a monotonic clock in seconds. `deadline_s` is the time since the start of the
-    run at which optimisation must end, seconds; None without a budget.
+    run at which optimisation must end, at least 5 seconds; None without a budget.
     """
 
     def __init__(
@@ -146,7 +146,7 @@ class RunClock:
         host.pace = replanned(host.pace, host.progress, left, host.step_s)
 
     def left(self, host: HostState, plan: Levels) -> float | None:
-        """Return an estimate of the seconds of optimisation left; None before a step is timed."""
+        """Return an estimate of the seconds left; None without a budget before a step is timed."""
         if self.deadline_s is not None:
             return max(self.deadline_s - self._passed(host), 0.0)
         if host.step_s <= 0:

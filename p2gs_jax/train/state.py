@@ -58,7 +58,7 @@ class HostState:
     elapsed_s: float = 0.0  # seconds of this session and of earlier ones
     densified_at: float = 0.0  # progress of the last densification
     reset_at: float = 0.0  # progress of the last opacity reset
-    refused: int = 0  # sum of densification requests that found no free slot
+    refused: int = 0  # requests for new Gaussians without a free slot, summed over the run
     overflows: int = 0  # how many times a capacity grew
     # capacity of a view for every image size "WxH"; checkpoints hold it by this name
     rooms: dict[str, Capacity] = field(default_factory=dict)
@@ -72,7 +72,7 @@ class HostState:
         return cls(**{**values, "rooms": {k: Capacity(*c) for k, c in values["rooms"].items()}})
 
     def extended(self, planned: float) -> HostState:
-        """Return the counters for a longer plan, in units of `planned`; progress shrinks."""
+        """Return the counters for a longer plan (`planned`: steps or seconds); progress shrinks."""
         share = self.planned / planned
         times = {
             k: share * getattr(self, k) for k in ("progress", "pace", "densified_at", "reset_at")
@@ -91,7 +91,7 @@ def initial_state(
 
     `alive` flags the rows of `params` that exist; `owner` is the moving object of each row.
     """
-    # A step donates its state. The copy lets the caller keep `params`.
+    # A step donates its state. The result is a copy, so the caller keeps `params`.
     return jax.tree.map(jnp.asarray, _initial_state(params, alive, optimizer, slots, owner))
 
 

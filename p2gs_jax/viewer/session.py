@@ -37,7 +37,7 @@ class BrowserSession:
         self._live.stop()
 
     def follow(self, log: list[dict], *, newer: bool) -> None:
-        """Show the log of the fit, and a `newer` state of the run at the same place."""
+        """Show the log of the fit; `newer`: render its new state from the present camera."""
         self._panel.show_training(log)
         if newer:
             self._live.post("camera")
@@ -60,7 +60,7 @@ class BrowserSession:
         self._live.post("look")
 
     def mode_changed(self) -> None:
-        """Show another mode; `split` moves to the nearest photograph and uses its settings."""
+        """Show another mode; `split` moves to the nearest photograph, as `go_to` does."""
         if self._panel.settings().mode == "split":
             camera = self._live.camera(browser_view(self._client), (64, 64))
             here = self._viewed.view_at(camera)

@@ -29,9 +29,9 @@ from p2gs_jax.scene.pixels.store import decoded_into
 from p2gs_jax.train.data_parallel import mesh_of
 from p2gs_jax.types import Scene
 
-# Gaussians per coarse point outside a block, which replaces many points, for one per point inside.
-# With 1, the cores of a town had 5 % fewer Gaussians and 0.18 dB less than one fit; with 1.6, on
-# another town, 13 % more Gaussians and 0.09 dB less (BUILD_NOTES, "Districts").
+# Seeds that a coarse point outside a block counts as, because it replaces many points. With 1, the
+# cores of a town had 5 % fewer Gaussians and 0.18 dB less than one fit. With 1.6, another town had
+# 13 % more Gaussians and 0.09 dB less (BUILD_NOTES, "Districts").
 OUTSIDE = 1.6
 
 
@@ -68,8 +68,8 @@ def block_config(
     if isinstance(most, int):
         most = max(1, round(share * most))
     elif most is None and densify.method == "mcmc":
-        # The density is that of one fit of the scene, where a Gaussian is seen in as many steps.
-        # Gaussians outside the block grow as well and are discarded later: their share is added.
+        # The density is that of one fit of the scene: there, as many steps show a Gaussian.
+        # Gaussians outside the block grow as well and are discarded later, so their share is added.
         seeds = own + round(OUTSIDE * (len(block.points) - own))
         most = default_max_gaussians(seeds, coverage_of(block, cfg.data.max_width), train)
     return dataclasses.replace(
@@ -82,7 +82,7 @@ def block_config(
 def fit_block(folder: Path, arguments: dict[str, Any], reporter: Reporter) -> None:
     """Start or continue the fit of a `block_job`; it writes `radiance.ply` and `metrics.json`.
 
-    UserError: the scene cannot be read, or memory is short.
+    UserError: the scene or a shared file cannot be read, or memory is short.
     """
     use_compile_cache()
     tune_process()

@@ -100,7 +100,7 @@ def make_problem(
     pivot: float,
     known: KnownExposures | None = None,
 ) -> Problem:
-    """Prepare observations; display values up to `black` or from `saturation` on are not usable."""
+    """Prepare observations; `black` and `saturation` are the limits of `Observations.usable`."""
     usable = observations.usable(black, saturation)
     component = observations.components(usable)
     return Problem(observations, usable, component, float(np.log(pivot)), known)

@@ -1,9 +1,9 @@
 """The contract between readers of driving data sets and the rest of the program.
 
-A reader is a module, listed in `FORMATS`. A folder is recognised by a file of the name `MARKER`.
+A reader is a module, listed in `FORMATS`. A path that fits the glob `MARKER` identifies a folder.
 `read_NAME(root, cfg)` reads the tables and returns a `Recording`, but decodes neither photographs
-nor LiDAR points. `root` is the folder of one drive, or of several, and `cfg.drive` names one of
-them. A reader promises:
+nor LiDAR points. `root` is the folder of one drive, or of several drives: `cfg.drive` names one.
+A reader promises:
 
 - The world is right-handed and metric; its origin may be anywhere. One clock, in seconds, serves
   photographs, laser points and tracks.
