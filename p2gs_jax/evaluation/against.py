@@ -1,8 +1,8 @@
 """Renders of other programs, evaluated like a run: the same views, masks and scores.
 
-There are two protocols: `as_rendered` scores the pictures unchanged, as published comparisons do;
-`exposure_fitted` fits one exposure per view, as for held-out views of a run. It scales the radiance
-that the pictures show under the run's usual display.
+There are two protocols. `as_rendered` scores pictures unchanged, as published comparisons do, and
+radiance at the run's mean exposure. `exposure_fitted` fits one exposure per view, as for held-out
+views of a run; it scales the radiance that a picture shows under the run's usual display.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from p2gs_jax.photometry.formation import LEAST_ALPHA
 from p2gs_jax.scene.pixels.decode import floats
 from p2gs_jax.scene.pixels.store import ImageStore
 
-# Protocols of a run that correspond to those of other programs.
+# Protocols of a run that correspond to `as_rendered` and `exposure_fitted`.
 OWN = ("averaged", "exposure_fitted")
 
 
@@ -44,7 +44,7 @@ def judge_renders(
     judge: Judge,
     on_progress: Callable[[int, int], None] = lambda done, count: None,
 ) -> dict[str, Any]:
-    """Return the scores of renders of held-out views, from `check_renders`.
+    """Return the scores of renders of held-out views; `found` comes from `check_renders`.
 
     Returns:
         `as_rendered` and `exposure_fitted`, as the protocols of `metrics.json`; with reference
@@ -91,7 +91,7 @@ def judge_renders(
 def _against_reference(
     rows: list[int], judge: Judge, light: Callable[[int], Light]
 ) -> dict[str, Any]:
-    """Score renders of views against their reference photographs of one common exposure."""
+    """Score renders against the reference photographs, which have one common exposure."""
     assert judge.reference is not None
 
     def score(row: int, ldr) -> dict[str, Any]:
@@ -127,8 +127,7 @@ class Light(NamedTuple):
     linear: Float32[np.ndarray, "h w 3"]  # radiance, premultiplied by `alpha`
     shown: DisplayTransform  # transform from the radiance to the picture
     picture: Float32[np.ndarray, "h w 3"]  # display values
-    # opacity, over the backdrop of `shown`; None: there is no backdrop
-    alpha: Float32[np.ndarray, "h w"] | None
+    alpha: Float32[np.ndarray, "h w"] | None  # opacity over the backdrop; None: no backdrop
 
     def fitted(
         self, photograph: Float32[np.ndarray, "h w 3"], mask: Float32[np.ndarray, "h w"]
@@ -144,8 +143,8 @@ class Light(NamedTuple):
 def light_of(rendered: Rendered, shown: DisplayTransform, store: ImageStore, row: int) -> Light:
     """Return the radiance that the render of a view shows.
 
-    The photograph determines where a picture shows its background. Pixels of the foreground change
-    with the exposure, and the background stays.
+    For a picture, the alpha of the photograph separates foreground and background; a render of
+    radiance has its own opacity. An exposure changes the foreground only.
     """
     pixels, linear, opacity = rendered
     if linear:

@@ -16,11 +16,11 @@ from p2gs_jax.scene.rigid import interpolated, inverse
 from p2gs_jax.scene.visibility import unoccluded
 from p2gs_jax.types import Lidar, Scene, TrackedObject, View
 
-# Points within half a turn of a scanner at 10 Hz belong to the sweep of a view, seconds.
+# Points this near in time belong to the sweep of a view: half a turn at 10 Hz and more, seconds.
 HALF_SWEEP_S = 0.06
 # Rendered depth exists where the render is at least this opaque.
 SOLID = 0.5
-NEAR_ENOUGH = 0.1
+NEAR_ENOUGH = 0.1  # relative error
 # Largest number of points of a view, evenly spaced.
 MOST_POINTS = 20_000
 
@@ -33,7 +33,7 @@ class DepthScores:
         self._found: dict[int, DepthErrors] = {}
 
     def add(self, result: ViewResult, mask: Float32[np.ndarray, "h w"]) -> None:
-        """Add a rendered view; pixels count where `mask` is 1."""
+        """Add a rendered view; pixels count where `mask` is above 0."""
         scene, index = self._scene, result.index
         if scene.lidar is None or scene.views[index].time is None:
             return
@@ -70,7 +70,7 @@ def depth_errors(
     alpha: Float32[np.ndarray, "h w"],
     mask: Float32[np.ndarray, "h w"] | None = None,
 ) -> DepthErrors:
-    """Return the errors of rendered depth against the sweep nearest in time.
+    """Return the errors of rendered depth against the LiDAR points near the view's time.
 
     Points on moving boxes move with them to the time of the view; occluded points are left out. K
     and size of the view are those of the images, and the rendered depth is alpha-weighted camera z.
@@ -112,7 +112,7 @@ def at_time(
 
 
 def summary(parts: Sequence[DepthErrors]) -> dict:
-    """Return medians over all static points and over all moving points, if there are any."""
+    """Return statistics over all static points and over all moving points, if there are any."""
     if not parts:
         return {}
     measured, error, moving = map(np.concatenate, zip(*parts, strict=True))

@@ -15,16 +15,16 @@ from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.photometry.response import by_camera, tables
 from p2gs_jax.run.read import Run
 
-# Steps of false colour: whole stops from -6 to 6 about middle grey (formats/false_color.py).
+# Middles of the steps of false colour, stops from middle grey (formats/false_color.py).
 STEPS = np.arange(-6, 6) + 0.5
-# Longer side of embedded photographs, pixels, and their quality.
+# Longer side of embedded photographs, pixels, and their WebP quality, percent.
 LONGEST, QUALITY = 960, 80
-# Digits of numbers in the page: those of float32.
+# Significant digits of numbers in the page: those of float32.
 DIGITS = 7
 
 
 def uncorrected(transform: DisplayTransform) -> DisplayTransform:
-    """Return the transform without a learned correction: the page has none."""
+    """Return the transform without a learned correction, which the page cannot apply."""
     return replace(transform, correction=None)
 
 
@@ -105,21 +105,21 @@ def _balance(transform: DisplayTransform) -> list[float]:
 
 
 def _start(fitted: Run) -> int:
-    """Return the row of the view at which the page opens: the first camera's middle view."""
+    """Return the row of the view shown first: the middle training view of the first camera."""
     views, train = fitted.scene.views, fitted.scene.train_indices
     rows = [row for row in train if views[row].camera == views[train[0]].camera]
     return rows[len(rows) // 2]
 
 
 def _up(fitted: Run) -> list[float]:
-    """Return the mean up direction of the cameras, a unit vector."""
+    """Return the mean up direction of the cameras, a unit vector in the world."""
     up = -np.mean([view.viewmat[1, :3] for view in fitted.scene.views], 0, dtype=float)
     length = np.linalg.norm(up)
     return [float(v) for v in (up / length if length > 1e-6 else (0.0, -1.0, 0.0))]
 
 
 def rounded(value: Any) -> Any:
-    """Return plain values rounded to the digits of float32."""
+    """Return plain values with floats rounded to `DIGITS`; whole ones below 1e6 become integers."""
     if isinstance(value, dict):
         return {key: rounded(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

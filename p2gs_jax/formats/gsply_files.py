@@ -1,8 +1,8 @@
 """SPZ and compressed PLY, both through the package gsply.
 
-SPZ (https://github.com/nianticlabs/spz) is about 10 times smaller than PLY. Its axes are right, up,
-back; COLMAP's world has right, down, forward. The caller of gsply converts the axes, and chooses
-the number of fractional bits so that no position is clipped. Compressed PLY is the format of
+SPZ (https://github.com/nianticlabs/spz) is about 8 times smaller than PLY. Its axes are right, up,
+back; COLMAP's world has right, down, forward. This module converts the axes, and chooses the
+number of fractional bits so that no position is clipped. Compressed PLY is the format of
 PlayCanvas and SuperSplat: a Gaussian has 16 bytes and its harmonics; blocks of 256 Gaussians share
 the ranges in which positions, scales and colours are quantised.
 """
@@ -22,12 +22,12 @@ from p2gs_jax.formats.ply import unit_quats
 from p2gs_jax.gaussians.posed import half_turn
 from p2gs_jax.types import Gaussians
 
-# Positions are signed integers with 24 bits; more than 24 fractional bits are not allowed.
+# Positions are signed integers of 24 bits, with 1 to 24 fractional bits.
 LARGEST_INTEGER, MOST_FRACTIONAL_BITS = 2**23 - 1, 24
 
 
 def require_gsply() -> ModuleType:
-    """Return the package that writes both formats; UserError: it is not installed."""
+    """Return the package for both formats; UserError: it cannot be imported."""
     try:
         import gsply
     except ImportError as error:
@@ -92,9 +92,9 @@ def write_spz(path: Path, gaussians: Gaussians) -> int:
 
 
 def fractional_bits(means: np.ndarray) -> int:
-    """Return the largest number of fractional bits with which every coordinate fits.
+    """Return the largest number of fractional bits, at most 24, with which every coordinate fits.
 
-    Raises UserError: a coordinate does not fit with any.
+    Raises UserError: a coordinate does not fit with 1 bit.
     """
     farthest = max(float(np.abs(means).max(initial=0.0)), 1e-12)
     bits = int(np.floor(np.log2(LARGEST_INTEGER / farthest)))
@@ -105,7 +105,7 @@ def fractional_bits(means: np.ndarray) -> int:
 
 
 def read_spz(path: Path) -> Gaussians:
-    """Read Gaussians as the file holds them; UserError: they cannot be read."""
+    """Read Gaussians, with axes right, down, forward; UserError: they cannot be read."""
     require_gsply()
     from gsply.spz import read_spz as read
 

@@ -1,8 +1,8 @@
 """3DGS as Markov chain Monte Carlo: relocate transparent Gaussians, explore with noise.
 
-Source: Kheradmand et al. 2024. The paper writes the scale correction for N Gaussians in one place
-as an alternating double sum of binomials. With 1/sqrt(k+1) = 2/sqrt(pi) int exp(-(k+1)t^2) it
-becomes (2/sqrt(pi)) int_0^inf 1 - (1 - o exp(-t^2))^N dt, which has no cancellation (ours).
+Source: Kheradmand et al. 2024. The paper divides by an alternating double sum of binomials to
+correct the scale of N Gaussians in one place. As 1/sqrt(k+1) = 2/sqrt(pi) int_0^inf exp(-(k+1)t^2)
+dt, it is 2/sqrt(pi) int_0^inf (1 - (1 - o exp(-t^2))^N) dt, without cancellation (ours).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from p2gs_jax.gaussians.population import Outcome, fresh_population, logit, opac
 from p2gs_jax.render.project import rotated, rotation_matrices
 from p2gs_jax.types import Gaussians, Population
 
-# Noise falls off above this opacity, with this steepness (Kheradmand et al. 2024).
+# Noise is halved at this opacity and falls with this steepness (Kheradmand et al. 2024).
 NOISE_OPACITY, NOISE_STEEPNESS = 0.005, 100.0
 _NODES = np.linspace(0.0, 4.5, 49, dtype=np.float32)
 _WEIGHTS = np.full(49, _NODES[1], np.float32)
@@ -48,10 +48,10 @@ def relocate_and_grow(
     """Move transparent Gaussians onto opaque ones and add `births` new ones there.
 
     Targets are drawn in proportion to opacity times `demand` (`train/strategies.py`; None: equal).
-    All Gaussians in one place get the opacity and scale of `share`, and are moved apart by
-    `cfg.spread` of their scales. Otherwise their gradients would be equal, and opaque Gaussians,
-    which no noise reaches, would never separate (BUILD_NOTES, "Twins"). `refused` counts births
-    without a free slot.
+    Gaussians in one place get the scale of `share` and its opacity, at least `cfg.prune_opacity`.
+    Random moves, `cfg.spread` times their scales, separate them. Otherwise their gradients would be
+    equal, and opaque ones, which get no noise, would stay together (BUILD_NOTES, "Twins").
+    `refused` counts births without a free slot.
     """
     n = population.alive.shape[0]
     dead = population.alive & (opacities(gaussians) <= cfg.prune_opacity)
@@ -81,7 +81,7 @@ def relocate_and_grow(
     )
     source = jnp.where(movers, jnp.minimum(target, n - 1), jnp.arange(n))
     gaussians = jax.tree.map(lambda a: a[source], gaussians)
-    # The target itself moves to the opposite side, so that the mean of the group stays.
+    # The target moves opposite to the mean of its arrivals, so that the middle of a pair stays.
     away = jax.random.normal(jax.random.fold_in(key, 1), (n, 3)) * movers[:, None]
     pushed = jnp.zeros((n, 3)).at[target].add(away, mode="drop")
     away = away - pushed / jnp.maximum(arrivals, 1)[:, None]
@@ -95,10 +95,10 @@ def relocate_and_grow(
 def _apart(
     gaussians: Gaussians, away: Float[Array, "n 3"], where: Bool[Array, " n"], spread: float
 ) -> Gaussians:
-    """Move Gaussians within their extent, and shrink them so that the extent of the group stays.
+    """Move Gaussians within their extent, and shrink them: a pair keeps its mean extent.
 
-    `away` holds random moves of variance 1 in units of the scales, along the principal axes; it is
-    zero for Gaussians that stay. `spread`, below 1, multiplies the moves.
+    `away` holds random moves along the principal axes, in units of the scales; it is zero for
+    Gaussians that stay. `spread`, below 1, multiplies the moves.
     """
     scales = jnp.exp(gaussians.log_scales)
     moved = rotated(rotation_matrices(gaussians.quats), spread * away * scales)
@@ -112,10 +112,10 @@ def _apart(
 def exploration_noise(
     key: PRNGKeyArray, gaussians: Gaussians, alive: Bool[Array, " n"], rate: Float[Array, ""]
 ) -> Float[Array, "n 3"]:
-    """Return the noise to add to the means after a step.
+    """Return the noise to add to the means after a step, scene units.
 
-    It has the shape of each Gaussian's covariance and moves only nearly transparent Gaussians.
-    `rate` is the noise scale times the learning rate of the means.
+    It is a normal vector times each Gaussian's covariance and moves only nearly transparent
+    Gaussians. `rate` is the noise scale times the learning rate of the means.
     """
     # Always float32, so that the random numbers are equal in any precision.
     normal = jax.random.normal(key, gaussians.means.shape, jnp.float32)

@@ -30,7 +30,7 @@ class Outcome(NamedTuple):
 
 
 def fresh_population(alive: Bool[Array, " n"], owner: Int[Array, " n"] | None = None) -> Population:
-    """Return a population with empty statistics; `owner` is the moving object of each Gaussian."""
+    """Return a population with zero statistics; `owner` is the object of a Gaussian, -1: none."""
     # Two separate arrays: a step donates its input, and a buffer can be donated only once.
     zeros = [jnp.zeros(alive.shape, jnp.float32) for _ in range(2)]
     return Population(alive, *zeros, owner=owner)
@@ -82,7 +82,7 @@ def default_max_gaussians(seeds: int, coverage: Coverage, train: TrainConfig) ->
     """Return the limit of the population if the configuration sets none.
 
     A longer run can fit more Gaussians. A scene needs more Gaussians if a view shows a smaller
-    share of it. The limit is at least 1.25 times the number of seeds, and 1,000.
+    share of it. The limit is at least 1.25 times the number of seeds and at least 1,000.
     """
     steps = train.steps
     if train.budget_s is not None:
@@ -92,7 +92,7 @@ def default_max_gaussians(seeds: int, coverage: Coverage, train: TrainConfig) ->
 
 
 def bucket_for(needed: int, current: int, limit: int | None) -> int:
-    """Return the capacity to grow to: at least `needed`, in steps of 1.5, at most `limit`."""
+    """Return the capacity to grow to: by factors of 1.5, at most `limit`, but at least `needed`."""
     capacity = current
     while capacity < needed:
         capacity = int(capacity * GROWTH_BUCKET) + 256
@@ -125,6 +125,6 @@ def opacities(gaussians: Gaussians) -> Float[Array, " n"]:
 
 
 def logit(p: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Return log(p / (1 - p)), with p clipped away from 0 and 1."""
+    """Return log(p / (1 - p)), with p clipped to [1e-6, 1 - 1e-6]."""
     p = jnp.clip(p, 1e-6, 1 - 1e-6)
     return jnp.log(p) - jnp.log1p(-p)

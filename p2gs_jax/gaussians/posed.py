@@ -16,7 +16,7 @@ from p2gs_jax.render.project import STILL
 from p2gs_jax.scene.drives.objects import MovingObjects, middle_time
 from p2gs_jax.types import Gaussians, Scene
 
-# Number of directions of the least squares, which are exact because degree 3 has 16 coefficients.
+# Directions of the least squares, whose solution is exact: degree 3 has only 16 coefficients.
 DIRECTIONS = 64
 # Factors on coordinates in a rotation by 180 degrees about x.
 FLIP = (1.0, -1.0, -1.0)
@@ -42,7 +42,7 @@ def in_world(
     moving: MovingObjects | None,
     scene: Scene,
 ) -> Gaussians:
-    """Return all Gaussians in world coordinates, moving objects in the middle of the drive."""
+    """Return Gaussians in world coordinates at the middle of the drive, without absent objects."""
     if owner is None or moving is None:
         return gaussians
     return posed(gaussians, owner, *moving.poses(middle_time(scene)))

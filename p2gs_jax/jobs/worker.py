@@ -1,7 +1,7 @@
 """A job in a separate process on any machine: `python -m p2gs_jax.jobs.worker JOB.json`.
 
-The end of a process frees its memory, and killing it harms no other job. The process ends with its
-caller, which closes its standard input, so that no two processes write to one folder.
+The end of a process frees its memory, and killing it harms no other job. When the
+caller ends, standard input closes and the process exits: no two processes write to one folder.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from p2gs_jax.core.processes import environment
 from p2gs_jax.errors import UserError
 from p2gs_jax.jobs import job as records
 
-# Time between two checks of the file that asks jobs to stop, seconds.
+# Seconds between two checks for the file that asks jobs to stop.
 LOOK_S = 0.2
 LESS = "let fewer jobs run at a time, or lower --gaussians or --max-width"
 # Exit codes of a job that stopped after a signal and wrote its checkpoint.
@@ -31,7 +31,8 @@ ASKED = tuple(interrupts.exit_code(interrupts.Interrupted(n)) for n in interrupt
 def run_in_process(job_path: str) -> tuple[records.Status, str | None]:
     """Run the job of a file in a process and wait for it; engines call this function.
 
-    Returns its status and the reason of a failure; `lost` means that a foreign signal ended it.
+    Returns its status, and the reason if it is `failed` or `lost`. A job is lost if a signal other
+    than SIGKILL ended it and this caller did not send that signal.
     """
     files = records.JobFiles(Path(job_path))
     folder = records.read_job(files.path).folder
@@ -91,9 +92,9 @@ def _why(code: int, output: Path) -> str:
 
 
 def main(job_path: Path) -> int:
-    """Run the job of a file in this process; return 0 after success.
+    """Run the job of a file in this process; return the exit code, 0 after success.
 
-    A failure leaves its reason in the folder of the job; a signal does not.
+    A failure of the task leaves its reason in the folder of the job; a signal does not.
     """
     threading.Thread(target=_end_with_parent, daemon=True).start()
     job = records.read_job(job_path)
@@ -117,7 +118,7 @@ def main(job_path: Path) -> int:
 
 
 def _end_with_parent() -> None:
-    """Exit at once after the end of the caller, as the job may start again in this folder."""
+    """Wait for the end of the caller and exit at once: the job may start again in its folder."""
     with contextlib.suppress(OSError):
         while os.read(0, 1):
             pass

@@ -17,10 +17,10 @@ from p2gs_jax.scene.rigid import pose_of
 
 # Coverage is tested at this many directions per radian, up to this height (tangent of elevation).
 PROBES, HIGHEST = 2 * 180 / np.pi, 3.0
-# A column counts as covered if its height is at least this share of the tallest column.
+# A column is good if its height is at least this share of the tallest column's.
 FULL_COLUMN = 0.75
-# Largest angle of a slice: the affine approximation of splats has an error far from the axis, which
-# in narrow slices is nearly the same on both sides of an edge.
+# Largest angle of a slice, radians. The affine approximation of splats errs far from the axis, but
+# on both sides of the edge between narrow slices the error is nearly the same.
 WIDEST_SLICE = np.deg2rad(20)
 
 # Linear radiance [h w 3], alpha [h w] and alpha-weighted depth [h w].
@@ -31,9 +31,9 @@ Layers = tuple[np.ndarray, np.ndarray, np.ndarray]
 class Cylinder:
     """A camera with a cylindrical image: azimuth across, height on the unit cylinder down.
 
-    Column u, row v of the image look along (sin a, h, cos a) in the camera, with a = left + u /
-    focal (radians) and h = top + v / focal; pixel centres are at +0.5. `viewmat` is
-    world-to-camera; x right, y down along the axis, z towards azimuth 0.
+    The image at (u, v), pixels, looks along (sin a, h, cos a) in the camera, with a = left +
+    u / focal (radians) and h = top + v / focal; pixel centres are at +0.5. `focal` is in pixels per
+    radian. `viewmat` is world-to-camera: x right, y down along the axis, z towards azimuth 0.
     """
 
     viewmat: Pose
@@ -65,9 +65,9 @@ class Cylinder:
 def covering(shots: Iterable[Shot], viewmat: Pose) -> Cylinder:
     """Return the cylinder that cameras cover, at the finest of their resolutions.
 
-    Horizontally it has the columns with at least three quarters of the full height, or the full
-    circle if every direction is seen. Vertically it has the rows that all these columns see.
-    Distances between the cameras are neglected.
+    A column is good if it has three quarters of the largest height. Horizontally the cylinder
+    leaves out the widest gap between good columns, or nothing if every azimuth is seen. Vertically
+    it has the rows that all good columns see. Distances between the cameras are neglected.
     """
     shots = list(shots)
     around, tall = round(2 * np.pi * PROBES), 2 * round(HIGHEST * PROBES)
@@ -158,7 +158,7 @@ def slices(cylinder: Cylinder) -> list[Shot]:
 def render_wide(
     render: Callable[[Shot], Layers], cylinder: Cylinder
 ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
-    """Return a wide view of the field: radiance, premultiplied by alpha, and opacity.
+    """Return a wide view of the field: radiance, premultiplied by alpha, and alpha.
 
     `render` returns the layers of a pinhole camera.
     """

@@ -24,8 +24,8 @@ from p2gs_jax.types import Camera, View
 
 Pose = Float[np.ndarray, "4 4"]
 Poses = Float[np.ndarray, "n 4 4"]
-LARGEST = 16384  # pixels
-# Tolerance for rotations that were written with few digits; they are made orthonormal.
+LARGEST = 16384  # largest width and height, pixels
+# Tolerance for poses that were written with few digits; their rotations are made orthonormal.
 TOLERANCE = 0.01
 
 
@@ -36,8 +36,8 @@ class Shot:
     The name is the file name of the picture without suffix, and may contain subfolders. The viewmat
     is world-to-camera (OpenCV axes); K, width and height are in pixels, with pixel centres at +0.5.
     The exposure is in stops from the geometric mean of the training exposures. `view` is the row in
-    `Scene.views` of the photograph with this camera. Moving objects are drawn where they were at
-    `time`, seconds; without a time they are not drawn.
+    `Scene.views` of the photograph with this camera. The picture shows moving objects at `time`,
+    seconds; without a time it shows none.
     """
 
     name: str
@@ -59,7 +59,7 @@ class Shot:
     def project(
         self, local: Float[np.ndarray, "*n 3"]
     ) -> tuple[Float[np.ndarray, "*n 2"], Bool[np.ndarray, "*n"]]:
-        """Return pixels of points in camera space, centres at +0.5, and which are visible."""
+        """Return pixels of points in camera space, centres at +0.5, and which are in the image."""
         front = local[..., 2] > 1e-9
         xy = local[..., :2] / np.where(front, local[..., 2], 1.0)[..., None]
         xy = xy * self.K[[0, 1], [0, 1]] + self.K[:2, 2]
@@ -85,8 +85,8 @@ def view_shots(views: Sequence[View], max_width: int | None = None) -> list[Shot
 def of_camera(shots: Sequence[Shot], views: Sequence[View], camera: str | None) -> list[Shot]:
     """Return the shots of one physical camera in the order of names.
 
-    None selects the camera with the most shots, or the first of several. Raises a UserError if the
-    camera has no shots.
+    None selects the camera with the most shots; among equals it is the first by name. Raises a
+    UserError if the camera has no shots.
     """
     cameras = [views[s.view].camera for s in shots if s.view is not None]
     counts = Counter(cameras)
@@ -126,7 +126,7 @@ def make_camera(K: ArrayLike, viewmat: ArrayLike, width: int, height: int) -> Ca
 
 
 def as_matrix(values: ArrayLike, name: str, size: int) -> Float[np.ndarray, "n n"]:
-    """Return a square matrix of finite numbers; other values raise a ValueError."""
+    """Return a finite square matrix, given as rows or flat; other values raise a ValueError."""
     try:
         out = np.array(values, np.float64)
     except (TypeError, ValueError):

@@ -3,9 +3,9 @@
 They map photographs to the enhanced scene and back. The published method has one curve for all
 photographs, to which a small network adds a bias for each photograph, clipped to [0, 1]. The curve
 acts along three orthonormal colour axes per photograph. Three numbers per photograph shape a pseudo
-curve (a power, then an S), to which the loss pulls the curve. Ours differs in two points: the
-input of the network is the histogram and the mean colour, not the image and the camera's pose; and
-the curve is interpolated, where theirs takes the entry below.
+curve (a power, then an S), to which the loss pulls the curve. The network's input here is the
+histogram and the mean colour; theirs is the image and the camera's pose. The curve is interpolated;
+theirs takes the entry below. docs/baselines.md lists the differences.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ HIDDEN = 32  # width of the network (ours)
 LEVELS = 32
 STATISTICS = LEVELS + 3
 AXES = 5  # parameters of the axes
-# Size of a raw unit, so that one learning rate suits all (the published rates are 1e-3 for the
-# curve, 2e-4 for the axes and 1e-5 for the network).
+# Factors on raw parameters, so that one learning rate suits all (the published rates are 1e-3 for
+# the curve, 2e-4 for the axes and 1e-5 for the network).
 AXES_UNIT, BIAS_UNIT = 0.2, 0.1
 # Published: power 1 + 0.1 g, turning point 0.5 + 0.002 a, exponent 1 + 0.002 b.
 POWER_UNIT, TURN_UNIT, BEND_UNIT = 0.1, 0.002, 0.002
@@ -50,8 +50,7 @@ class Luminance(eqx.Module):
     curve: Float[Array, " k"]  # curve of all photographs
     hidden: Float[Array, "s n"]  # weights from statistics to the hidden layer
     hidden_bias: Float[Array, " n"]  # biases of the hidden layer
-    # Weights from the hidden layer to the curve's biases and the pseudo curve's shape.
-    out: Float[Array, "n o"]
+    out: Float[Array, "n o"]  # weights to the curve's biases and the pseudo curve's shape
     out_bias: Float[Array, " o"]  # biases of the output
     axes: Float[Array, "v 5"]  # raw axes of each view
     statistics: Float[Array, "v s"]  # statistics of each photograph; not learned
@@ -62,7 +61,7 @@ class Luminance(eqx.Module):
         return Curves(curve, axes_of(AXES_UNIT * jnp.asarray(self.axes[row])), shape)
 
     def mean(self) -> Curves:
-        """Return means over the training views, of curves and of raw axes."""
+        """Return means over the training views: of curves, raw axes and raw shapes."""
         curves, shapes = self._predicted(self.statistics)
         axes = axes_of(AXES_UNIT * jnp.asarray(self.axes).mean(0))
         return Curves(curves.mean(0), axes, shapes.mean(0))
@@ -90,8 +89,8 @@ def identity(views: int) -> Luminance:
 def axes_of(raw: Float[Array, " 5"]) -> Float[Array, "3 3"]:
     """Return three orthonormal axes as rows, as published: the identity at zero.
 
-    `raw` is added to (1, 0, 0), and to the green and blue parts (1, 0) of the second axis, whose
-    red part makes it orthogonal to the first.
+    The first three numbers are added to (1, 0, 0), the others to the green and blue parts (1, 0) of
+    the second axis. Its red part makes it orthogonal to the first.
     """
     first = raw[:3] + jnp.array([1.0, 0.0, 0.0], raw.dtype)
     green, blue = raw[3] + 1.0, raw[4]
@@ -121,8 +120,8 @@ def enhanced(ldr: Float[Array, "*p 3"], view: Curves) -> Float[Array, "*p 3"]:
 def as_photographed(ldr: Float[Array, "*p 3"], view: Curves) -> Float[Array, "*p 3"]:
     """Return display values of a photograph from enhanced ones: an approximate inverse.
 
-    Decreasing pieces of the curve count as constant; constant pieces return their lower end. The
-    published method splats a second colour per Gaussian instead.
+    Decreasing pieces of the curve count as constant. A constant piece returns the position in it
+    that is nearest to its value. The published method splats a second colour per Gaussian instead.
     """
     count = view.curve.shape[0]
     even = jnp.linspace(0.0, 1.0, count, dtype=view.curve.dtype)
@@ -153,7 +152,7 @@ def pseudo_curve(shape: Float[Array, " 3"]) -> Float[Array, " k"]:
 def cumulative(
     grey: Float[Array, " p"], weight: Float[Array, " p"], steps: int
 ) -> Float[Array, " s"]:
-    """Return the shares of greys up to k / (steps - 1); without any weight, a uniform one."""
+    """Return the shares of greys up to k / (steps - 1); without weight, k / (steps - 1)."""
     bins = jnp.clip(jnp.ceil(grey * (steps - 1)), 0, steps - 1).astype(jnp.int32)
     counts = jnp.zeros(steps, grey.dtype).at[bins].add(weight)
     total = counts.sum()
@@ -164,7 +163,7 @@ def cumulative(
 def statistics_of(
     photograph: Float[Array, "h w 3"], mask: Float[Array, "h w"]
 ) -> Float[Array, " s"]:
-    """Return the histogram and the mean colour of every fourth pixel along both axes."""
+    """Return cumulative histogram and mean colour of every fourth pixel along both axes."""
     seen, weight = photograph[::4, ::4].reshape(-1, 3), mask[::4, ::4].reshape(-1)
     mean = (weight[:, None] * seen).sum(0) / jnp.maximum(weight.sum(), 1.0)
     return jnp.concatenate([cumulative(seen.mean(-1), weight, LEVELS), mean])

@@ -16,8 +16,8 @@ from p2gs_jax.photometry.response import Response, deviation, log_exposed
 Labels = Int[np.ndarray, " o"]
 PerChannel = Float[np.ndarray, "o 3"]
 
-# Largest ratio of pixel sizes on the surface between a point's coarsest and finest view; coarser
-# views, which mix neighbouring surfaces, are left out (BUILD_NOTES).
+# Largest width of a pixel on the surface, relative to the finest view of the point. Coarser views
+# mix neighbouring surfaces and are left out (BUILD_NOTES).
 COARSEST = 3.0
 
 
@@ -42,16 +42,16 @@ class Observations:
     cells: Labels | None = None
 
     def decoded(self, response: Response) -> tuple[PerChannel, PerChannel, PerChannel]:
-        """Return log exposed radiance, its stated standard deviation and dz/dy."""
+        """Return log exposed radiance z, its standard deviation by the noise model, and dz/dy."""
         y = np.asarray(self.colors, np.float64)
         z, slope = log_exposed(y, response, self.cameras[self.views])
         return z, deviation(y, slope, self.spread, response.base), slope
 
     def usable(self, black: float, saturation: float) -> Bool[np.ndarray, "o 3"]:
-        """Return whether a value is neither near black nor saturated and its point is shared.
+        """Return which values are neither near black nor saturated, if the point has two of them.
 
-        A mean counts as saturated if one of its pixels is: it is then too dark, and exposures
-        drift along a drive (BUILD_NOTES, "Clipped patches").
+        Both bounds are display values. A mean with a saturated pixel is too dark, and exposures
+        then drift along a drive, so it counts as saturated (BUILD_NOTES, "Clipped patches").
         """
         brightest = self.colors if self.brightest is None else self.brightest
         keep = (self.colors > black) & (brightest < saturation)
@@ -75,9 +75,9 @@ class Observations:
         return replace(self, **kept)
 
     def thinned(self, per_view: int, seed: int) -> Bool[np.ndarray, " o"]:
-        """Return which observations to keep: about `per_view` points of every view.
+        """Return which observations to keep: at least `per_view` points of every view, or all.
 
-        In a random order of points, the first `per_view` points of every view are kept, in all
+        The points have a random order. The first `per_view` points of every view are kept in all
         views that show them.
         """
         place = generator(seed, Stream.SOLVED_POINTS).permutation(self.point_count)[self.points]
@@ -98,7 +98,7 @@ def grouped(labels: Labels, count: int) -> list[Int[np.ndarray, " _"]]:
 def sample_pairs(
     observations: Observations, count: int, seed: int
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
-    """Draw pairs of rows of a point in two views, with replacement; empty if no point is shared."""
+    """Draw pairs of observations of one point, with replacement; none if no point is shared."""
     order = np.argsort(observations.points, kind="stable")
     bounds = np.flatnonzero(np.diff(observations.points[order], prepend=-1, append=-1))
     lengths = np.diff(bounds)

@@ -26,7 +26,10 @@ LEAST_EXPOSURE = 0.1  # lower bound of random exposures
 def initial_photometry(
     solution: PhotometricSolution | None, cameras: Sequence[str], cfg: FitConfig
 ) -> Photometry:
-    """Return initial parameters: a solution, or random exposures (paper), or exposures of 1."""
+    """Return the start: a solution, or gamma 2.2 with exposures that are random (paper) or 1.
+
+    `cameras` has the camera of every training view.
+    """
     count = len(cameras)
     p = cfg.photometry
     if solution is not None:
@@ -55,8 +58,7 @@ def initial_appearance(
 ) -> Corrections | None:
     """Return corrections that change nothing; None: the fit has no corrections.
 
-    `photograph` returns display values and mask of the view with an index in `views`. Corrections
-    that depend on photographs need it.
+    `photograph(k)` returns the display values and the mask of `views[k]`. Luminance-GS needs it.
     """
     kind = cfg.photometry.appearance
     if kind is None:
@@ -71,7 +73,7 @@ def initial_appearance(
 def point_radiance(
     scene: Scene, solution: PhotometricSolution | None, cfg: FitConfig
 ) -> Float[np.ndarray, "p 3"]:
-    """Return linear radiance of a scene's points: from the solution, or else from their colours."""
+    """Return linear radiance of a scene's points, from the solution or else from their colours."""
     assert scene.point_colors is not None
     colors = scene.point_colors.astype(np.float32) / np.float32(255)
     radiance = inverse_tone_map(colors, np.float32(GAMMA_SRGB), cfg.photometry)
@@ -82,11 +84,11 @@ def point_radiance(
 
 
 def recentre(params: Params, activation: RadianceKind) -> Params:
-    """Return parameters of the same photographs with mean log exposure and white balance 0.
+    """Return parameters whose log exposures and log white balances have the mean 0 over the views.
 
     Radiance is scaled inversely, so that photographs do not change. This fixes the gauge of scale
-    (docs/photometry.md, 2, scale), with white balance that of every channel. `activation` is from
-    spherical harmonics to radiance.
+    (docs/photometry.md, 2), with white balance that of each channel. `activation` maps spherical
+    harmonics to radiance.
     """
     # Computed on the host, because every operation on the device would compile a program.
     photometry = jax.tree.map(np.asarray, params.photometry)

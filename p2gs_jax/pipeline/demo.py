@@ -43,9 +43,9 @@ def run_demo(
 ) -> DemoResult:
     """Make a street, fit it and compare the exposures.
 
-    The demo writes `out/street` and `out/run`, also over a demo that was interrupted. The street
-    has `frames` frames per camera, `width` pixels wide, whose ISO has mean 8 and standard
-    deviation `iso_std`.
+    The demo writes `out/street` and `out/run`, also over a demo that was interrupted. Each of 3
+    cameras takes `frames` photographs, `width` pixels wide. Their ISO has the mean 8 and the
+    standard deviation `iso_std`.
 
     Raises:
         UserError: `out` holds a finished demo or files that the demo did not make, or another

@@ -25,13 +25,13 @@ from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians
 
 WIDTH, HEIGHT, COUNT = 32, 24, 64
-# Largest errors of the image, relative to its brightest value, and of gradients, in the relative L2
-# norm. The stop rule causes 5e-4 and 5e-3; a wrong kernel has far larger errors.
+# Largest allowed errors: of the image relative to its brightest value, of gradients in the relative
+# L2 norm. The stop rule causes 5e-4 and 5e-3; a wrong kernel has far larger errors.
 IMAGE, GRADIENT = 1e-3, 1e-2
 
 
 class SelfCheck(NamedTuple):
-    """The largest errors over the scenes; NaN if a value is not finite."""
+    """The largest errors over the scenes; not finite if a value is not."""
 
     image: float
     gradient: float
@@ -47,7 +47,7 @@ class SelfCheck(NamedTuple):
 
 
 def scenes() -> Iterator[Gaussians]:
-    """Yield Gaussians that are hard for a rasterizer, in front of `camera`; float64."""
+    """Yield Gaussians that are hard for a rasterizer, in camera coordinates; float64."""
     rng = generator(0, Stream.SELF_CHECK)
     for needle, stops in ((1.0, 2.0), (5.0, 2.0), (1.0, 13.0)):
         z = rng.uniform(2, 9, COUNT)
@@ -60,7 +60,7 @@ def scenes() -> Iterator[Gaussians]:
 
 
 def _checked(gaussians: Gaussians, kind: np.dtype, cfg: RenderConfig):
-    """Return the gradient of the weighted sum of the image, and the image, in a precision."""
+    """Return the gradient of a weighted sum of the image, and the image, in the type `kind`."""
     gaussians = jax.tree.map(lambda a: jnp.asarray(a, kind), gaussians)
     K = np.array([[WIDTH, 0, WIDTH / 2], [0, WIDTH, HEIGHT / 2], [0, 0, 1]])
     camera = Camera(jnp.eye(4, dtype=kind), jnp.asarray(K, kind), WIDTH, HEIGHT)
@@ -94,9 +94,10 @@ def self_check(cfg: RenderConfig | None = None) -> SelfCheck:
 
 
 def suited(render: RenderConfig) -> tuple[RenderConfig, str | None]:
-    """Return options whose rasterizer is correct on this device, and a note for the user or None.
+    """Return options with a rasterizer for this device, and a note for the user or None.
 
-    On a GPU the rasterizer is checked first, because its card, driver and compiler are untested.
+    A chosen rasterizer stays. The default of a GPU with kernels is checked first, because its card,
+    driver and compiler are untested; after a fault, `xla` replaces it.
     """
     if render.implementation is not None or jax.default_backend() == "cpu":
         return render, None

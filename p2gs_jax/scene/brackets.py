@@ -16,15 +16,15 @@ from p2gs_jax.types import View
 # The ends of names that state an exposure: `_-2EV`, `_ev+1.3`, `_exp2`.
 _NUMBER = r"[+-]?\d+(?:\.\d+)?"
 _EXPOSURE = re.compile(rf"[_-](?:ev_?{_NUMBER}|{_NUMBER}_?ev|exp(?:osure)?_?\d+)$", re.IGNORECASE)
-# Poses that structure from motion finds for one pose differ by less: share of the distance of the
-# camera's centres from their middle, and cosine of half a degree.
+# Poses are nearly the same if they differ by less. The distance is relative to the camera's median
+# distance from the middle of its centres; the rotation is the cosine of half a degree.
 _NEAR, _TURNED = 0.01, float(np.cos(np.radians(0.5)))
 # The smallest difference of two exposures of a bracket, stops.
 _STEP = 0.2
 
 
 def names_of_brackets(names: Sequence[str]) -> list[str]:
-    """Return for each photograph the name of its bracket: its own name without its exposure."""
+    """Return for each photograph the name of its bracket: without suffix and stated exposure."""
     paths = [PurePosixPath(name) for name in names]
     return [path.with_name(_EXPOSURE.sub("", path.stem)).as_posix() for path in paths]
 
@@ -33,8 +33,8 @@ def brackets(views: Sequence[View]) -> list[int]:
     """Return for each view a number that all views of its bracket share.
 
     Views of one camera form a bracket if their names differ only by a stated exposure, or if they
-    follow each other by name and have the same pose. Poses that are only nearly the same count if
-    the exposures are known and differ. Views of a camera that never moves form none of the latter.
+    follow each other by name and have the same pose. If poses are only nearly the same, or if the
+    camera never moves, all exposures must be known and differ.
     """
     names = names_of_brackets([view.name for view in views])
     centers = camera_centers(np.stack([view.viewmat for view in views]))

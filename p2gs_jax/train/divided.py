@@ -3,8 +3,8 @@
 Each of N cores holds every N-th Gaussian; it lists, projects and moves those that the view may
 show. The cores exchange splats, so that each knows all of them, and each composites every N-th row
 of tiles; then they exchange the rows of the image (`render/cores.py`). A step still has one view.
-Its result differs from that of one core only by the order of sums and by the exploration noise,
-which every core draws for its Gaussians.
+Its result differs from that of one core only by the order of sums and by the exploration noise:
+every core draws noise of its own.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from p2gs_jax.types import Params
 
 ALIKE: Any = P()
 DIVIDED: Any = P(CORES)
-# Capacity of a core as a multiple of its fair share of a view's Gaussians, and of its entries.
+# Capacity of a core as multiples of its equal share: of Gaussians in view, of tile-list entries.
 SPARE, SPARE_ENTRIES = 1.05, 1.25
 
 
@@ -70,7 +70,7 @@ STATE = FitState(
 
 
 def mesh_of_cores() -> Mesh | None:
-    """Return the mesh of cores of a CPU; None for a single core (`core.runtime.use_cores`)."""
+    """Return the mesh of CPU cores (`core.runtime.use_cores`); None on a GPU or a single core."""
     if jax.default_backend() != "cpu" or jax.device_count() == 1:
         return None
     return Mesh(np.array(jax.devices()), (CORES,))

@@ -1,6 +1,6 @@
 """The training step for custom loops, with a custom loss, image formation and densification.
 
-No such change needs a change of this package. `fit`, a complete fit, takes the same arguments.
+None of them needs a change of this package. `fit` also takes `terms`, `formation` and `strategy`.
 docs/api.md, "Ablations", has examples.
 """
 
@@ -57,7 +57,7 @@ AS_CONFIGURED = Custom()
 class TrainingStep:
     """A training step of one view, and a densification; `make_step` makes it.
 
-    A new image size gets its capacity at its first view, and more after an overflow.
+    Each image size gets a tile-list capacity at its first view, and more after an overflow.
     """
 
     def __init__(self, cfg: FitConfig, custom: Custom, extent: float):
@@ -94,8 +94,8 @@ class TrainingStep:
             camera: camera of the view.
             photograph: display values in [0, 1], or unsigned integers whose largest value means 1.
             view: row in `Photometry`.
-            mask: 1 = use; None: all pixels.
-            progress: fraction of the run completed, for the schedules of learning rates and degree.
+            mask: True = use; None: all pixels.
+            progress: completed fraction of the run, which sets learning rates and harmonics degree.
 
         Raises:
             DivergenceError: a loss term or gradient is not finite.
@@ -132,7 +132,7 @@ class TrainingStep:
             state = states.healed(state)
 
     def densify(self, state: states.FitState, progress: float) -> states.FitState:
-        """Return the state with the population that the strategy returns; the state is donated."""
+        """Return the state after a densification (donated); UserError: no Gaussian is left."""
         if self.strategy is None:
             return state
         self._host.step, self._host.progress = int(state.step), progress
@@ -164,7 +164,7 @@ def make_step(
         formation: an image formation that replaces the tone curve: a pytree with
             `apply(radiance, capture)`, whose arrays are learned.
         strategy: densification: an object with `start(seeds)` and `densify(gaussians, population,
-            now)`; see `train/strategies.py`.
+            now)`; see `train/strategies.py`. None: that of `cfg`.
         extent: scene extent, scene units; the learning rate of the means is a multiple of it.
     """
     return TrainingStep(cfg, Custom(terms, formation, strategy), extent)

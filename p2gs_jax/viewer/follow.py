@@ -17,18 +17,18 @@ POLL_S = 1.0
 class Follower:
     """Asks a fit for snapshots, and reads them.
 
-    `files` has the paths of the run; `with_fit` is whether the viewer ends with the fit.
+    `files` has the paths of the run; with `with_fit` the viewer ends with the fit.
     """
 
     def __init__(self, folder: Path, scene: Path | None = None, *, with_fit: bool = False):
         """Follow the run in a folder; `scene` is as for `load_run`."""
         self.files, self._scene, self.with_fit = RunFolder(folder), scene, with_fit
-        self._seen = 0  # time of the snapshot that was read last
+        self._seen = 0  # time of the snapshot that was read last, nanoseconds
         self._went_on = False
 
     @property
     def goes_on(self) -> bool:
-        """Whether a fit is writing the run; a finished run has scores."""
+        """Whether a fit is writing the run: the folder is locked and has no scores yet."""
         try:
             require_free(self.files.root)
         except UserError:
@@ -50,7 +50,7 @@ class Follower:
         return self._latest()
 
     def poll(self, *, wanted: bool) -> Run | None:
-        """Return a newer state of the run, or None; if one is `wanted`, the fit is asked for it."""
+        """Return a newer state of the run, or None; with `wanted` it asks the fit for one."""
         before, self._went_on = self._went_on, self.goes_on
         try:
             if not self._went_on:

@@ -19,27 +19,27 @@ class Settings:
     """The display transform and the mode.
 
     `taken_as` is the row in `scene.views` of the view whose correction, vignetting and response
-    apply; None means the mean, without a camera.
+    apply. None: the mean correction and response apply, without vignetting.
     """
 
     gamma: float
-    exposure_ev: float = 0.0  # stops from the mean training exposure
-    curve: ChosenCurve = "run"  # the curve of the fit
+    exposure_ev: float = 0.0  # stops from the geometric mean of the training exposures
+    curve: ChosenCurve = "run"  # `run`: the curve of the fit
     taken_as: int | None = None
-    balance_ev: tuple[float, float] | None = None  # red and blue relative to green, if modelled
+    balance_ev: tuple[float, float] | None = None  # gains of red and blue over green, stops
     vignetting: bool = True  # whether that of the camera applies
     mode: Mode = "display"
-    split: float = 0.5  # visible share of the photograph in `split`
+    split: float = 0.5  # visible share of the photograph's width in the mode `split`
 
 
 def common_settings(run: Run, before: Settings | None = None) -> Settings:
-    """Return settings with the mean exposure, gamma and white balance; others are as before."""
+    """Return settings with the run's mean display and curve; mode, vignetting and split stay."""
     common = run.common_display()
     return _apply(before or Settings(common.gamma), common, 0.0, None)
 
 
 def settings_of_view(run: Run, index: int, before: Settings) -> Settings:
-    """Return settings with the display of a row of `scene.views`; others are as before."""
+    """Return settings with the display of a row of `scene.views`; see `common_settings`."""
     own = run.own_display(index)
     ev = float(np.log2(own.exposure / run.mean.exposure_geometric))
     return _apply(before, own, ev, index)
@@ -66,8 +66,7 @@ def display_of(run: Run, settings: Settings) -> DisplayTransform:
 
 
 def exposures_ev(run: Run) -> dict[int, float]:
-    """Return the exposure of every training view, stops from the geometric mean, by row in
-    `scene.views`."""
+    """Return the training exposures by row in `scene.views`, stops from their geometric mean."""
     values = np.log2(np.asarray(run.params.photometry.exposures, float))
     values = values - np.log2(run.mean.exposure_geometric)
     return dict(zip(run.scene.train_indices, values.tolist(), strict=True))

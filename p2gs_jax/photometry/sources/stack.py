@@ -34,9 +34,9 @@ Image = UInt8[np.ndarray, "h w 3"]
 class Stack(NamedTuple):
     """Photographs of one viewpoint."""
 
-    views: tuple[View, ...]  # the photographs; poses are meaningless
+    views: tuple[View, ...]  # the photographs; their cameras are meaningless
     images: list[Image]  # 8-bit RGB
-    # Pixels with data in every frame (a pure blue border has none).
+    # All pixels except those in or near an area that is pure blue in every frame, as borders are.
     valid: Bool[np.ndarray, "h w"]
 
 
@@ -44,9 +44,8 @@ class StackColors(NamedTuple):
     """Colours of a stack at points."""
 
     observations: Observations  # colours, every frame at every point
-    # Positions of the points in the first frame, pixel centres at +0.5.
-    xy: Float[np.ndarray, "p 2"]
-    shifts: Float[np.ndarray, "v 2"]  # pixels by which each frame was moved to fit the first
+    xy: Float[np.ndarray, "p 2"]  # points in the first frame, pixels, centres at +0.5
+    shifts: Float[np.ndarray, "v 2"]  # moves (x, y) of each frame to fit the first, pixels
     black: float  # display value up to which pixels count as black
     signal: Bool[np.ndarray, " v"]  # frames in which enough pixels are neither black nor saturated
 
@@ -54,7 +53,7 @@ class StackColors(NamedTuple):
 def read_stack(folder: Path) -> Stack:
     """Read the photographs of a folder (or of its `images/`).
 
-    Raises UserError: fewer than two photographs, unreadable ones, or different sizes.
+    Raises UserError: no folder, fewer than two photographs, unreadable ones, or different sizes.
     """
     if not folder.is_dir():
         raise broken(folder, "is not a folder.", "name the folder of the photographs")
@@ -81,10 +80,10 @@ def read_stack(folder: Path) -> Stack:
 
 
 def align(images: list[Image]) -> Float[np.ndarray, "v 2"]:
-    """Return shifts that align each frame with the first, through its neighbours.
+    """Return the shifts (x, y) that align each frame with the first, pixels.
 
-    Median threshold bitmaps do not depend on exposure. Frames that are mostly black or white give
-    random shifts, which are ignored.
+    They are sums of shifts between successive frames. Median threshold bitmaps do not depend on
+    exposure. Mostly black or white frames give random shifts, which are ignored.
     """
     matcher = cv2.createAlignMTB(3)
     gray = [cv2.cvtColor(i, cv2.COLOR_RGB2GRAY) for i in images]
@@ -99,11 +98,11 @@ def align(images: list[Image]) -> Float[np.ndarray, "v 2"]:
 
 
 def black_level(stack: Stack) -> float:
-    """Return the display value up to which pixels of the darkest frame count as black.
+    """Return the display value, in [0, 1], up to which pixels count as black.
 
     The histogram of a mostly black frame has a spike at its black level (film scans: 13 to 16 of
-    255). Without a spike, the level is the darkest percentile. Values below twice that level are
-    more offset than signal.
+    255). Without a spike in the darkest frame, the level is its darkest percentile. Values below
+    twice that level are more offset than signal.
     """
     darkest = min(stack.images, key=lambda i: float(np.mean(i)))
     values = darkest[stack.valid]
@@ -117,7 +116,7 @@ def black_level(stack: Stack) -> float:
 
 
 def choose_points(stack: Stack, black: float, seed: int) -> Float[np.ndarray, "p 2"]:
-    """Return positions, equally many in the mid tones of each frame."""
+    """Return positions, pixels: up to equally many mid tones of each frame, others at random."""
     rng = generator(seed, Stream.STACK_PIXELS)
     height, width = stack.valid.shape
     x = rng.integers(MARGIN, width - MARGIN, CANDIDATES)
@@ -136,7 +135,7 @@ def choose_points(stack: Stack, black: float, seed: int) -> Float[np.ndarray, "p
 
 
 def stack_colors(stack: Stack, seed: int = 0) -> StackColors:
-    """Align a stack, choose points with signal (drawn by `seed`) and sample every frame there."""
+    """Align a stack, choose points (drawn by `seed`) and sample every frame there."""
     shifts = align(stack.images)
     black = black_level(stack)
     xy = choose_points(stack, black, seed)
