@@ -68,7 +68,7 @@ class Demo:
 class Synth:
     """Make a data set by the paper's protocol, with linear HDR truth.
 
-    Three cameras and a LiDAR drive through a procedural town (docs/scenes.md).
+    Three cameras drive through a procedural town (docs/scenes.md).
 
         p2gs-jax synth town --seed 1
         p2gs-jax synth constant --sensor.iso-std 0 --frames 20 --width 240
@@ -132,7 +132,7 @@ class Sweep:
     """Where fits run: local, dask://HOST:PORT, or slurm:OPTION=VALUE,... (docs/api.md)."""
 
     def execute(self) -> int:
-        """Run the sweep and print its table; 1 where a run failed."""
+        """Run the sweep and print its table; return 1 if a run is not finished."""
         from functools import partial
 
         from p2gs_jax.cli.tables import make_table, stdout

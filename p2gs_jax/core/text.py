@@ -11,12 +11,12 @@ from typing import Any
 
 # Control characters except tab and newline, surrogates, and marks of the direction of writing.
 _HIDDEN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
-# Names that a message lists.
+# Largest number of names that a message lists.
 MOST_NAMED = 5
 
 
 def printable(text: str) -> str:
-    r"""Return a text whose control characters are escaped, as `\x1b`."""
+    r"""Return a text whose hidden characters (`_HIDDEN`) are escaped, as `\x1b`."""
     return _HIDDEN.sub(lambda found: ascii(found.group())[1:-1], text)
 
 
@@ -32,7 +32,7 @@ def count_of(number: float, noun: str) -> str:
 
 
 def as_clock(seconds: float) -> str:
-    """Return seconds as m:ss or h:mm:ss."""
+    """Return whole seconds as m:ss or h:mm:ss; negative times are 0:00."""
     minutes, rest = divmod(max(int(seconds), 0), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
@@ -61,12 +61,12 @@ def parse_json(text: str) -> Any:
         raise json.JSONDecodeError(str(error), text, 0) from None
 
 
-# Characters with a meaning in Markdown, or in HTML within it.
+# The most frequent characters with a meaning in Markdown, or in HTML within it.
 _MARKUP = re.compile(r"[\\`*|<>\[\]]")
 
 
 def escaped(text: str) -> str:
-    """Return one line of text as Markdown that shows it unchanged."""
+    """Return text as one line of Markdown, with the characters of `_MARKUP` escaped."""
     return _MARKUP.sub(r"\\\g<0>", " ".join(printable(text).split()))
 
 

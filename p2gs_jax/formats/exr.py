@@ -1,8 +1,8 @@
 """OpenEXR: linear radiance with its photometry and its camera.
 
 Standard attributes follow https://openexr.com/en/latest/StandardAttributes.html: matrices act on
-row vectors, as in Imath; camera space is left-handed with x right, y up and z forward; NDC range
-from (0, 0) at the upper left of the display window to (1, 1) at its lower right.
+row vectors, as in Imath. Camera space is left-handed with x right, y up and z forward. NDC are
+(0, 0) at the upper left of the display window and (1, 1) at its lower right.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ def write_exr(
 ) -> None:
     """Write linear radiance, without exposure applied; docs/exports.md lists the header.
 
-    16-bit floats are used (`half`) unless a value would overflow. Depth is alpha-weighted, and
-    written as expected depth in channel Z; `alpha` is channel A. `taken`, `camera` and `shot` are
-    the display transform, the camera and the EXIF settings of the header.
+    Colours and `alpha` (channel A) are 16-bit floats with `half`, unless a value would overflow.
+    Depth is alpha-weighted, and is written as expected depth in channel Z, 32 bits. `taken`,
+    `camera` and `shot` are the display transform, camera and EXIF settings of the header.
     """
     linear = np.asarray(linear, np.float32)
     small = half and bool(np.all(np.abs(linear) <= HALF_MAX))
@@ -74,7 +74,7 @@ def camera_attributes(camera: Camera) -> dict:
     """Return the header attributes that describe a camera."""
     viewmat, K = np.asarray(camera.viewmat, np.float64), np.asarray(camera.K, np.float64)
     to_y_up = np.diag([1.0, -1.0, 1.0, 1.0])
-    # This matrix acts on column vectors in OpenCV's camera space; its third row gives 1 / z.
+    # This matrix acts on column vectors in OpenCV's camera space; the third coordinate is 1 / z.
     to_ndc = np.zeros((4, 4))
     to_ndc[:2, :3] = K[:2] / np.array([[camera.width], [camera.height]])
     to_ndc[2, 3] = to_ndc[3, 2] = 1.0
@@ -114,7 +114,7 @@ def _display_attributes(taken: DisplayTransform) -> dict:
 def read_exr(
     path: Path,
 ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"] | None, dict]:
-    """Return linear radiance, premultiplied by opacity, the opacity or None, and the header.
+    """Return linear radiance (premultiplied by opacity), the opacity or None, and the header.
 
     Raises UserError: the file cannot be read or has no R, G, B.
     """

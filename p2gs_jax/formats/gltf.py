@@ -1,7 +1,7 @@
 """Binary glTF with KHR_gaussian_splatting (Khronos): a point primitive whose attributes are splats.
 
 Attributes follow the extension: scales are lengths, opacities are in [0, 1], rotations are x y z w,
-harmonics are those of 3DGS. glTF's world is right-handed with y up; COLMAP's is rotated to it.
+harmonics are those of 3DGS. glTF's world has y up: COLMAP's is turned by 180 degrees about x.
 https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting
 """
 

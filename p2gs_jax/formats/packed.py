@@ -2,7 +2,7 @@
 
 Neighbours in space follow each other (Morton order) and form chunks. Every column of a chunk is
 stored as integers between its least and its largest value, with separate low and high bytes, and
-deflated. Lengths, opacities and, under the activation `exp`, radiance are logarithms, so that
+deflated. Lengths and (under the activation `exp`) radiance are logarithms, opacities are logits:
 errors are factors at any dynamic range. `p2gs_jax/export/web/decode.js` reads this format.
 """
 
@@ -21,11 +21,11 @@ from p2gs_jax.types import Gaussians
 
 CHUNK = 256
 # Bits of centres, lengths, rotations (each coordinate), opacity, harmonics of degree 0, and other
-# harmonics (our choice; a page states the resulting error).
+# harmonics (our choice; an exported web page states the resulting error).
 MEANS, SCALES, ROTATIONS, OPACITY, BASE, BANDS = 16, 10, 11, 10, 12, 8
 # Columns before the harmonics: 3 each for centres, lengths and rotations, and 1 for opacity.
 GEOMETRY = 10
-# Logits beyond this limit are opaque or transparent to 7 digits.
+# Splats with logits beyond this limit are opaque or transparent within 2e-7.
 LOGIT_LIMIT = 16.0
 
 
@@ -43,13 +43,13 @@ class Packed:
 
     @property
     def header(self) -> dict[str, Any]:
-        """Return the header for reading the bytes, as plain values."""
+        """The values that a reader of the bytes needs, as plain values."""
         sizes = {"count": self.count, "chunk": CHUNK, "coefficients": self.coefficients}
         return {**sizes, "bits": column_bits(self.coefficients)}
 
 
 def column_bits(coefficients: int) -> list[int]:
-    """Return the bits of every column."""
+    """Return the number of bits of every column."""
     geometry = [MEANS] * 3 + [SCALES] * 3 + [ROTATIONS] * 3 + [OPACITY]
     return geometry + [BASE] * 3 + [BANDS] * 3 * (coefficients - 1)
 
@@ -57,8 +57,8 @@ def column_bits(coefficients: int) -> list[int]:
 def morton_order(means: Float32[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
     """Return an order in which neighbours in space follow each other.
 
-    Cells halve the number of Gaussians along each axis, not the length, so that a far sky does not
-    coarsen the street.
+    Along each axis all cells hold equally many Gaussians, so that a far sky does not make the cells
+    of the street coarse.
     """
     count = max(len(means), 1)
     code = np.zeros(len(means), np.int64)

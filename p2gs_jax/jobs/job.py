@@ -41,7 +41,7 @@ class JobState:
     """The state of a job.
 
     `stopped` means that a signal ended the job; the same call continues it. `lost` is temporary:
-    such a job is started again, or has failed.
+    such a job is started again, or becomes `failed` or `stopped`.
     """
 
     name: str
@@ -49,13 +49,13 @@ class JobState:
     begun: int = 0  # number of starts in this call; above 1 if a worker was lost
     reason: str | None = None  # of a failure
     doing: str = ""  # the current stage, in words
-    progress: float | None = None  # of that stage, 0 to 1
-    seconds: float = 0.0  # since the first start in this call
+    progress: float | None = None  # of that stage, 0 to 1; None: unknown
+    seconds: float = 0.0  # since its first progress in this call
 
 
 @dataclass(frozen=True)
 class JobFiles:
-    """The files of a job beside those of the other jobs, in another folder than the results."""
+    """The files of a job. They lie beside those of other jobs, not in the folder of results."""
 
     path: Path  # the job file
 
@@ -81,7 +81,7 @@ def slug(name: str) -> str:
 
 
 def write_job(folder: Path, job: Job) -> JobFiles:
-    """Write a job file into an absolute folder."""
+    """Write a job file into an absolute folder, and remove old progress."""
     files = JobFiles(folder / f"{slug(job.name)}.json")
     task, place = f"{job.task.__module__}:{job.task.__qualname__}", str(job.folder.absolute())
     write_json(files.path, {"task": task, "folder": place, "arguments": job.arguments})
@@ -90,7 +90,7 @@ def write_job(folder: Path, job: Job) -> JobFiles:
 
 
 def read_job(path: Path) -> Job:
-    """Read a job file; ImportError or AttributeError: this version does not have its task."""
+    """Read a job file; ImportError or AttributeError: this version lacks its task."""
     saved = json.loads(path.read_text(encoding="utf-8"))
     module, name = saved["task"].split(":")
     task = getattr(import_module(module), name)
@@ -140,7 +140,7 @@ class ProgressFile(Reporter):
 
 
 def read_progress(path: Path) -> dict[str, Any] | None:
-    """Return the contents of a `ProgressFile`, or None before the first write."""
+    """Return the contents of a `ProgressFile`, or None if it is missing or not readable."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -12,7 +12,7 @@ from p2gs_jax.jobs import job as records
 from p2gs_jax.jobs.engines import is_lost
 from p2gs_jax.jobs.worker import run_in_process
 
-# A job is started at most so many times.
+# Largest number of starts of a job.
 MOST_BEGUN = 3
 # Time between two readings of the progress of all jobs, seconds.
 LOOK_S = 0.5
@@ -32,8 +32,8 @@ def run_jobs(
     """Run jobs of different names; a failed job leaves its reason, and the others continue.
 
     `folder` is for job files, progress and output; all machines must share it. The engine calls
-    `run` for each job file. `on_look` is called with all states, twice a second. `on_end` is called
-    in this thread with the number of an ended job, and again if a signal interrupts that call.
+    `run` for each job file. `on_look` is called with all states every LOOK_S, or sooner. `on_end`
+    is called in this thread with the number of an ended job, and again if a signal interrupts it.
 
     Raises:
         KeyboardInterrupt: a signal arrived; all running jobs have stopped as well. The same call
@@ -64,8 +64,8 @@ def run_jobs(
                 watched[number].look()
             on_look([one.state for one in watched])
     except KeyboardInterrupt:
-        # Wherever the signal arrived, all submitted jobs without an `on_end` are waited for, except
-        # those that a batch system has not started.
+        # Jobs that have not started are cancelled. All others whose `on_end` was not called are
+        # waited for, wherever the signal arrived.
         stop.touch()
         waited = pending()
         for future, number in waited.items():
@@ -97,7 +97,7 @@ class _Watched:
         self.future = engine.submit(self.run, str(self.files.path))
 
     def end(self, engine: Executor | None) -> bool:
-        """Record the end of the job, or start it again on an engine; return whether it ended."""
+        """Record the end of the job, or start a lost one again; return whether it ended."""
         assert self.future is not None
         self.look()
         state = self.state

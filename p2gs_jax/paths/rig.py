@@ -19,9 +19,9 @@ from p2gs_jax.paths.shots import Pose, Poses, Shot
 from p2gs_jax.scene.rigid import camera_centers, inverse, moment_of, pose_of, up_direction
 from p2gs_jax.types import View
 
-# Largest median deviation of the cameras' relative rotations over time.
+# Largest median deviation of a camera's rotation from its mean on the rig, radians.
 LEAST_RIGID = np.deg2rad(5)
-# Cameras look in all directions if the mean of their viewing directions is shorter than this.
+# Cameras look in all directions if the mean of their unit viewing directions is shorter.
 ALL_AROUND = 0.5
 
 
@@ -63,8 +63,8 @@ class Rig:
 def find_rig(shots: Sequence[Shot], views: Sequence[View]) -> Rig:
     """Return the rig of the cameras of a scene.
 
-    Raises a UserError if there is one camera, if no file names agree between cameras, or if the
-    cameras move relative to each other.
+    Raises a UserError if there is one camera, if file names of a camera agree with no others, or if
+    cameras turn relative to each other.
     """
     cameras = sorted({v.camera for v in views})
     steps: dict[str, dict[str, Shot]] = defaultdict(dict)
@@ -122,8 +122,9 @@ def _mounts(cameras: list[str], steps: list[dict[str, Shot]]) -> dict[str, Shot]
 def _level(viewmats: Poses, names: Sequence[str]) -> Pose:
     """Return rig-to-anchor: the origin is the mean camera centre, z the mean viewing direction.
 
-    The x axis is level. If cameras look in all directions, z is the viewing direction of the one
-    with "front" in its name, else of the first one. The viewmats are anchor-to-camera.
+    Both axes are level. If cameras look in all directions, z is the direction of the camera with
+    "front" in its name (the shortest such name). If there is none and the mean is below 0.1, it is
+    that of the first camera. The viewmats are anchor-to-camera.
     """
     up = up_direction(viewmats)
     level = viewmats[:, 2, :3] - np.outer(viewmats[:, 2, :3] @ up, up)

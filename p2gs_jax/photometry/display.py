@@ -51,7 +51,7 @@ class DisplayTransform:
     white_balance: Balance | None = None
     # Row in `formation.cameras` of the vignetting and the response; None: no camera.
     camera: int | None = None
-    # Display values of the background behind pictures: for all pixels or for each.
+    # Display values of the background of pictures: one for all pixels, or one for each pixel.
     backdrop: Balance | Float32[np.ndarray, "h w 3"] | None = None
 
     @property
@@ -120,9 +120,9 @@ def develop(
 ) -> Float32[np.ndarray, "... 3"]:
     """Return display values in [0, 1] of linear radiance.
 
-    Only a change of `formation` compiles a new program. With a correction or vignetting, the
-    radiance is an image, or lies at `positions` (photometry/formation.py:places). The backdrop of
-    the transform is shown if the opacity `alpha` of the render is given.
+    A new `formation` or shape compiles a new program, but new values do not. With a correction or
+    vignetting, radiance is an image, or lies at `positions` (photometry/formation.py:places). The
+    backdrop of the transform is shown if the opacity `alpha` of the render is given.
     """
     traced = (transform.capture, transform.correction, positions, transform.matte(alpha))
     return np.asarray(_develop(linear, *traced, transform.formation))
@@ -139,8 +139,8 @@ def undevelop(
 ) -> Float32[np.ndarray, "... 3"]:
     """Return the linear radiance that a photograph shows: the inverse of `develop`, on the host.
 
-    Saturated values give the radiance at which they saturate, values below half an 8-bit code that
-    of half a code. Corrections of display values are not undone. `positions` are as for `develop`.
+    Saturated values give the radiance at which they saturate. Values below half an 8-bit code count
+    as half a code. Corrections of display values are not undone. `positions` are as for `develop`.
     """
     values = np.asarray(ldr, np.float32)
     return inverse_formation(values, transform.capture, transform.formation, positions)
@@ -182,7 +182,7 @@ class MeanParameters:
     exposure: float  # arithmetic mean (paper, eq. 6)
     exposure_geometric: float  # geometric mean, which the gauges do not change
     gamma: float  # arithmetic mean
-    # Mean of the log factors, or None where white balance is not modelled.
+    # Mean of the log factors; None if white balance is not modelled.
     white_balance: Balance | None = None
 
 
@@ -201,12 +201,12 @@ def mean_parameters(photometry: Photometry) -> MeanParameters:
 def usual_display(
     params: Params, cameras: Sequence[str], camera: str | None, cfg: PhotometryConfig
 ) -> DisplayTransform:
-    """Return the transform of a view that was not fitted, of a camera or (None) of no camera.
+    """Return the transform of a view that was not fitted; `camera` is None if it has no camera.
 
     Its exposure is the geometric mean over the training views, its gamma and its correction are
     arithmetic means. Its white balance is the mean over all training views, or over those of its
     camera if it varies by camera only. Its vignetting and its response, also those of a correction,
-    are its camera's. `cameras` is the camera of every training view.
+    are those of its camera. `cameras` is the camera of every training view.
     """
     photometry: Photometry = jax.tree.map(np.asarray, params.photometry)
     mean = mean_parameters(photometry)

@@ -69,8 +69,8 @@ def parameter_count(
     """Return the number of free parameters, with splines `by` camera or channel, if any.
 
     Each level loses one parameter to its gauge; gammas and curves lose none if known exposures fix
-    the `power`. If every channel has its exposures and its response, photographs do not determine
-    its power: this adds two gauges to that of the responses.
+    the `power`. If every channel has separate exposures and a separate response, photographs do not
+    determine its power: this adds two gauges to that of the responses.
     """
     size = {None: 0, "camera": cameras - 1, "view": views - 1}
     varies = MODELS[form.model]
@@ -94,7 +94,7 @@ class Curve(NamedTuple):
 
 _ONE_FOR_ALL = Curve("srgb", "all")
 _PLAIN = [Curve(base) for base in BASES]
-# Neighbours of each kind: several splines are compared only where one is chosen.
+# Neighbours of each kind; several splines are compared only after a spline was chosen.
 _CURVES: dict[ResponseKind | None, list[Curve]] = {
     None: [*_PLAIN, _ONE_FOR_ALL],
     "all": [*_PLAIN, Curve("srgb", "camera"), Curve("srgb", "channel")],
@@ -122,8 +122,8 @@ class Scope(NamedTuple):
     def allows(self, choice: Choice) -> bool:
         """Return whether a choice differs from simpler ones and can be solved.
 
-        With one physical camera, "per camera" means "for all": a common gamma is a gauge, unless
-        known exposures fix the power.
+        With one physical camera, "per camera" means "for all". A common gamma is then a gauge,
+        unless known exposures fix the power of an unknown curve without a spline.
         """
         form, by = choice.form, choice.curve.splines
         exposure, gamma, _ = MODELS[form.model]
@@ -139,13 +139,13 @@ class Scope(NamedTuple):
         )
 
     def _free(self, choice: Choice) -> bool:
-        """Return whether exposures are per view and a power is free, as known ones require."""
+        """Return whether exposures are per view, and a power is free or the curve is known."""
         varies, by = MODELS[choice.form.model], choice.curve.splines
         return varies.exposure == "view" and bool(varies.gamma or by or self.known)
 
 
 def neighbours(choice: Choice, scope: Scope) -> list[Choice]:
-    """Return the choices of a scope that differ in one property, simpler and richer ones."""
+    """Return simpler and richer choices of a scope: one property differs, or two dependent ones."""
     form, curve = choice
     exposure, gamma, _ = MODELS[form.model]
     forms = [
@@ -154,7 +154,7 @@ def neighbours(choice: Choice, scope: Scope) -> list[Choice]:
         for g in _LEVELS
         if (e == exposure) != (g == gamma) and (name := _BY_LEVELS.get((e, g)))
     ]
-    # These replace two levels at once, where one of them depends on the other.
+    # These replace two levels at once, because one of them requires the other.
     if gamma is not None and exposure == gamma:
         forms += [form._replace(model=_BY_LEVELS[(None, None)])]
     if form.white_balance == "view" and exposure == "view":
@@ -164,6 +164,6 @@ def neighbours(choice: Choice, scope: Scope) -> list[Choice]:
     forms += [form._replace(vignetting=kind) for kind in _VIGNETTING]
     near = [Choice(f, curve) for f in forms] + [Choice(form, c) for c in _CURVES[curve.splines]]
     if curve.splines == "camera" and (name := _BY_LEVELS.get((exposure, "camera"))):
-        # Gammas per camera are the simplest different curves of cameras.
+        # A gamma per camera is the simplest way in which curves of cameras differ.
         near += [Choice(form._replace(model=name), plain) for plain in _PLAIN]
     return [c for c in dict.fromkeys(near) if c != choice and scope.allows(c)]

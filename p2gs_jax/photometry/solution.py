@@ -13,7 +13,7 @@ from p2gs_jax.core.numerics import LN2
 from p2gs_jax.photometry.models import ModelName
 from p2gs_jax.photometry.response import Response
 
-MIN_OBSERVATIONS = 15  # views with fewer usable observations have uncertain exposures
+MIN_OBSERVATIONS = 15  # exposures of views with fewer usable observations are uncertain
 WEAK_GAMMA = 0.1  # gammas with a larger standard error are only roughly known
 # A view disagrees if its gap exceeds this and 3 standard errors.
 NOTICEABLE_EV = 0.2
@@ -28,7 +28,7 @@ class PhotometricSolution:
 
     model: ModelName  # exposures and gammas that vary
     response: Response  # base curve and spline
-    # Natural logarithm; mean 0 over each component unless exposures were known.
+    # Natural logarithm; mean 0 over each component without known exposures.
     log_exposures: PerView
     # Standard errors of `log_exposures` (robust, gauge fixed); inf where unobserved or unknown.
     exposure_errors: PerView
@@ -42,21 +42,21 @@ class PhotometricSolution:
     residual_ev: float  # robust standard deviation of one observation, stops
     view_residual_ev: PerView  # the same per view
     # Median residual of red, green, blue in each view minus their mean, stops: white balance that
-    # a scalar exposure does not explain; NaN where unobserved.
+    # the model does not explain. NaN: a channel has fewer than MIN_OBSERVATIONS usable values.
     view_balance_ev: Float[np.ndarray, "v 3"]
-    outliers: float  # share of observations that the robust loss ignores
+    outliers: float  # share of usable values that the robust loss largely ignores
     rounds: int  # number of iterations
     moved: float  # largest change of a parameter in the last iteration, log units
-    converged: bool  # `moved` is at most the tolerance
-    unknown_errors: int  # number of observed views with unknown standard errors
+    converged: bool  # `moved` is below the tolerance
+    unknown_errors: int  # number of views with data or a known exposure, but no standard errors
     warnings: tuple[str, ...]  # warnings for the user
     white_balance_level: Level | None  # level of the white balance; None: it does not vary
-    # Log factors on red, green, blue beside the exposure: mean 0 in every view, and over the views
-    # of a component; zeros where it does not vary.
+    # Log factors on red, green, blue beside the exposure: their mean is 0 in every view and over
+    # the views of a component. They are 0 if white balance does not vary.
     white_balance: Float[np.ndarray, "v 3"]
     white_balance_errors: Float[np.ndarray, "v 3"]  # standard errors, as `exposure_errors`
     vignetting: VignettingKind | None  # per camera, or per camera and channel
-    # Vignetting and response of each physical camera, by row in `Observations.cameras`; empty where
+    # Vignetting and response of each physical camera, by row in `Observations.cameras`; empty if
     # none has any.
     cameras: tuple[CameraFormation, ...]
     # Standard errors of log V in the corner, per camera and row of `vignetting`.
@@ -80,16 +80,16 @@ class PhotometricSolution:
 
 
 class Agreement(NamedTuple):
-    """Recovered exposures against stated ones (EXIF), scale aligned."""
+    """Agreement of recovered with stated exposures (EXIF), after their scales are aligned."""
 
-    views: int  # number of views with both
-    correlation: float  # correlation of both, in stops; NaN if one of them does not vary
-    # Slope of recovered over stated, least squares; it differs from 1 by the power gauge or by tone
-    # mapping.
+    views: int  # number of views with both; below 2, only `offset_ev` is a number
+    correlation: float  # correlation of both, in stops; NaN if either does not vary
+    # Least-squares slope of recovered over stated stops; the power gauge or tone mapping makes it
+    # differ from 1. NaN if either does not vary.
     slope: float
-    rms_ev: float  # RMS gap, stops
-    offset_ev: float  # offset from stated to recovered exposures, stops
-    gap_ev: PerView  # recovered minus stated, median removed; NaN where either is missing
+    rms_ev: float  # RMS difference about its mean, stops
+    offset_ev: float  # median of recovered minus stated, stops
+    gap_ev: PerView  # recovered minus stated minus offset, stops; NaN where either is missing
     disagrees: Bool[np.ndarray, " v"]  # views whose gap is noticeable and significant
 
     def sentence(self, source: str = "EXIF") -> str:
@@ -111,7 +111,7 @@ class Agreement(NamedTuple):
 
 
 def compare(exposures_ev: PerView, errors_ev: PerView, stated_ev: PerView) -> Agreement:
-    """Compare recovered exposures, stops, with stated ones; unknown: NaN, or errors of inf."""
+    """Compare exposures in stops; unknown ones are NaN (stated) or have errors of inf."""
     both = np.isfinite(stated_ev) & np.isfinite(errors_ev)
     gap = np.full(len(exposures_ev), np.nan)
     count = int(both.sum())

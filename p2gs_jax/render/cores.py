@@ -2,8 +2,8 @@
 
 A program that `jax.shard_map` divides along the axis `CORES` is traced once for all N cores. In
 such a program, each core composites every N-th row of tiles and computes SSIM on a strip of the
-image; then all cores get the whole result. In other programs there is one core, and these functions
-add nothing to the program.
+image; then all cores get the whole result. In other programs there is one core, and functions
+except `part` and `scatter_sum` add nothing.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def gather(tree: Tree, axis: int = 0) -> Tree:
 
 
 def scatter_sum(tree: Tree) -> Tree:
-    """Return the core's part of the sum over all cores, along the first axis."""
+    """Return the core's part of the sum over all cores (2 or more), along the first axis."""
     return jax.tree.map(lambda a: lax.psum_scatter(a, CORES, tiled=True), tree)
 
 
@@ -54,12 +54,12 @@ def total(a: Array) -> Array:
 
 
 def most(count: Int[Array, ""]) -> Int[Array, ""]:
-    """Return the largest count of a core times the number of cores."""
+    """Return the largest count of any core, times the number of cores."""
     return lax.pmax(count, CORES) * cores() if cores() > 1 else count
 
 
 def all_true(flags: Bool[Array, "..."]) -> Bool[Array, "..."]:
-    """Return the flags that are set on every core."""
+    """Return flags that are true where those of every core are true."""
     return lax.pmin(flags.astype(jnp.int32), CORES) > 0 if cores() > 1 else flags
 
 
@@ -67,8 +67,8 @@ def all_true(flags: Bool[Array, "..."]) -> Bool[Array, "..."]:
 def gather_rows(tiles: Float[Array, "t p"], across: int) -> Float[Array, "a p"]:
     """Return the tiles of all cores in the order of the image; core k has its rows k, k + N, ...
 
-    `across` is the number of tiles of a row. All cores do the same work after this, so each knows
-    the whole gradient, and the backward pass selects its rows.
+    `across` is the number of tiles of a row. All cores do the same work after this. Each therefore
+    knows the whole gradient, and its backward pass selects its rows.
     """
     if cores() == 1:
         return tiles

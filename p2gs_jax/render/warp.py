@@ -11,9 +11,9 @@ from jaxtyping import Array, Bool, Float
 from p2gs_jax.core.numerics import matmul, namespace
 from p2gs_jax.types import Camera, Render, View
 
-# Default of the least alpha at which a pixel shows a surface.
+# Pixels with a larger alpha show a surface, by default.
 OPAQUE = 0.95
-# A surface is seen in another view if the depths agree within this share.
+# A surface is seen in another view if the depths differ by less than this share.
 DEPTH_TOLERANCE = 0.03
 
 
@@ -37,7 +37,7 @@ def surface_depth(render: Render, opaque: float = OPAQUE) -> Float[Array, "h w"]
 
 
 def unproject(depth: Float[Array | np.ndarray, "h w"], camera: Camera) -> Float[Any, "h w 3"]:
-    """Return world positions of pixel centres at the given camera depths.
+    """Return world positions of pixel centres at the given depths, camera z in scene units.
 
     NumPy arrays give NumPy results, in double precision.
     """
@@ -53,9 +53,9 @@ def unproject(depth: Float[Array | np.ndarray, "h w"], camera: Camera) -> Float[
 def project_points(
     points: Float[Array | np.ndarray, "*n 3"], camera: Camera | View
 ) -> tuple[Float[Any, "*n 2"], Float[Any, "*n"]]:
-    """Return pixel positions at full resolution (centres at +0.5) and camera z; valid for z > 0.
+    """Return pixel positions (centres at +0.5) and camera z in scene units; valid for z > 1e-6.
 
-    NumPy arrays give NumPy results.
+    Pixels are those of the size of `camera`. NumPy arrays give NumPy results.
     """
     xp = namespace(points, camera.K)
     local = matmul(points, camera.viewmat[:3, :3].T) + camera.viewmat[:3, 3]
@@ -67,10 +67,9 @@ def project_points(
 def visible(
     xy: Float[Array, "*n 2"], z: Float[Array, "*n"], depth: Float[Array, "h w"]
 ) -> Bool[Array, "*n"]:
-    """Return flags of the points that lie on the surface that a view shows at their pixel.
+    """Return flags of the points that lie on the surface that a view shows at their pixels.
 
-    `xy` and `z` are the pixel positions and depths of the points in the view; `depth` is the view's
-    `surface_depth`.
+    `xy` and `z` are the points' pixels and depths in the view; `depth` is its `surface_depth`.
     """
     height, width = depth.shape
     at = jnp.floor(xy).astype(jnp.int32)

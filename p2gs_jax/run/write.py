@@ -37,7 +37,7 @@ SUMMARY_VIEWS = 4
 def write_start(
     folder: RunFolder, scene: Path, reference: Path | None, cfg: FitConfig, decisions: Decisions
 ) -> None:
-    """Write options and decisions; the folder then holds an unfinished run."""
+    """Write options and decisions, and remove `metrics.json`: the run is then unfinished."""
     folder.metrics.unlink(missing_ok=True)
     begun = first_plan(folder) or {
         "train.steps": cfg.train.steps,
@@ -58,7 +58,7 @@ def write_start(
 def first_plan(folder: RunFolder) -> dict[str, Any]:
     """Return steps and budget of a run's first start, by option; a resumed run may be longer.
 
-    The initial state depends on them; {}: the folder holds no run.
+    The initial state depends on them. The result is {} if the folder holds no readable run.
     """
     try:
         return dict(parse_json(folder.config.read_text(encoding="utf-8"))["begun"])
@@ -86,12 +86,12 @@ def write_run(
 ) -> None:
     """Write the scene, the Gaussians, the photometry and the summary for `load_run`.
 
-    The Gaussians are live ones; `owner` has the row in `moving` of the object of each, and `cfg`
-    the options of the fit. With `decisions`, `config.json` is written as well. `fitted` has the
-    exposures fitted to held-out views by row, `unknown` the names of photographs with unknown
-    exposures. True exposures and PSNRs by image name, and the lines of `heading`, are for the
-    summary; without `shown` there is none. Without `metering` there are only the files of
-    parameters, as in a snapshot.
+    All Gaussians are alive. `owner` has the row in `moving` of the object of each, and `cfg` the
+    options of the fit. With `decisions`, this starts the run folder anew (`write_start`). `fitted`
+    has the exposures fitted to held-out views by row, `unknown` the names of photographs with
+    unknown exposures. True exposures and PSNRs by image name, and the lines of `heading`, are for
+    the summary; without `shown` there is none. Without `metering` only the files of parameters are
+    written, as in a snapshot.
     """
     if not isinstance(folder, RunFolder):
         folder = RunFolder(Path(folder))
@@ -127,14 +127,14 @@ def write_run(
 
 
 def write_view(folder: Path, name: str, result: ViewResult, store: ImageStore) -> None:
-    """Write one view as EXR, PNG and its photograph, under the name of the photograph."""
+    """Write one view as EXR and PNG, and its photograph as PNG, under the photograph's name."""
     stem, camera = Path(name).with_suffix("").as_posix(), camera_of(store, result.index)
     images = (result.linear, result.alpha, result.ldr, result.transform, result.depth)
     write_frame(folder, OutputFrame(stem, *images, camera, result.photograph))
 
 
 def summary_rows(scene: Scene) -> list[int]:
-    """Return the views of the summary: held-out views first, spread over cameras and time."""
+    """Return rows of views for the summary, evenly spaced; training views only fill it up."""
     pool = list(scene.test_indices) or list(scene.train_indices)
     if len(pool) < SUMMARY_VIEWS:
         pool += [i for i in scene.train_indices if i not in pool]

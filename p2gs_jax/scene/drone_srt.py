@@ -6,8 +6,8 @@ A subtitle holds the settings of one frame, or of one second in older models:
     ISO:100 Shutter:60 EV:0 Fnum:2.2                also Fnum:F2.2
     F/2.8, SS 206.14, ISO 150, EV 0
 
-The f-number may be times 100, and the shutter may lack its `1/`. Frames are found by time, because
-not every model writes a subtitle for each frame.
+The f-number may be multiplied by 100, and the shutter may lack its `1/`. Frames are found by time,
+because not every model writes a subtitle for each frame.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ _START = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{3})\s*-->")
 _ISO = re.compile(r"\bISO\s*:?\s*(\d+)", re.IGNORECASE)
 _SHUTTER = re.compile(r"\b(?:Shutter\s*:|SS)\s*(?:1/)?(\d+(?:\.\d+)?)", re.IGNORECASE)
 _F_NUMBER = re.compile(r"\b(?:Fnum\s*:\s*F?|F/)(\d+(?:\.\d+)?)", re.IGNORECASE)
-# A larger f-number is times 100.
+# A larger f-number was multiplied by 100.
 _LARGEST_F_NUMBER = 64
 # Times of subtitles are rounded to milliseconds, times of frames are not; seconds.
 _ROUNDED = 0.004
 
 
 class Shot(NamedTuple):
-    """The settings from a time on, seconds from the begin of the video."""
+    """The settings from a time on, in seconds after the start of the video."""
 
     time: float
     settings: ExifSettings
@@ -45,7 +45,7 @@ def srt_beside(video: Path) -> Path | None:
 
 
 def read_shots(path: Path) -> list[Shot]:
-    """Return the settings in a file of subtitles in the order of time; others have none."""
+    """Return the settings in subtitles by time; subtitles without shutter or ISO are skipped."""
     shots = []
     for part in _SUBTITLE.split(path.read_text("utf-8-sig", "replace"))[1:]:
         start, settings = _START.search(part), _settings(part)
@@ -56,7 +56,7 @@ def read_shots(path: Path) -> list[Shot]:
 
 
 def shot_at(shots: Sequence[Shot], time: float) -> ExifSettings:
-    """Return the settings of the frame at a time, seconds."""
+    """Return the settings of the frame at a time, seconds; `shots` must not be empty."""
     after = bisect_right(shots, time + _ROUNDED, key=lambda shot: shot.time)
     return shots[max(after - 1, 0)].settings
 

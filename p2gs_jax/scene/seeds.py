@@ -1,8 +1,8 @@
 """Seed points: from a PLY that a scene names, or random if photographs do not match.
 
-3DGS starts NeRF's synthetic scenes with 100,000 points in a known cube. Here the volume follows
-from the cameras: it contains the points between the nearest and the farthest depth of training
-views that at least half as many views see as see the most visible point.
+3DGS starts NeRF's synthetic scenes with 100,000 points in a known cube. Here the cameras give the
+volume: points lie between the nearest and the farthest depth of a training view. A point is kept if
+the number of views that see it is at least half the largest such number.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from p2gs_jax.scene.visibility import in_frame
 from p2gs_jax.types import Scene, View
 
 COUNT = 100_000
-# Fewer matched points than this count as none.
+# Random points replace fewer matched points than this.
 FEWEST = 50
-# A point is kept if this share of the number of views that see the most visible point see it.
+# Least number of views that see a kept point, relative to that of the most visible point.
 COMMON = 0.5
-# Nearest and farthest depth of cameras without a common focus, in multiples of their extent.
+# Nearest and farthest depth if cameras have no common focus, in multiples of their extent.
 APART = (0.5, 10.0)
-# The largest number of views that count visibility.
+# The largest number of views in which visibility is counted.
 MOST_VIEWS = 64
 _ROUNDS = 20
 _COLORS = (
@@ -39,7 +39,7 @@ _COLORS = (
     ("r", "g", "b"),
     ("f_dc_0", "f_dc_1", "f_dc_2"),
 )
-# Float colours up to this value have 1 for white.
+# White is 1 if no float colour exceeds this value.
 _MOST_OF_ONE = 2.0
 _FIX = "write it again with the tool that made it"
 
@@ -47,9 +47,9 @@ _FIX = "write it again with the tool that made it"
 def read_points(path: Path) -> tuple[Float64[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"] | None]:
     """Return the positions and the display colours, if there are any, of the points in a PLY.
 
-    Colours are red, green, blue with 8 or 16 bits, floats up to 1 or 255, or those of Gaussians
-    (f_dc). Raises UserError: the file is absent, is not such a PLY, or holds points that are not
-    finite.
+    Colours are red, green, blue with 8 or 16 bits, floats up to 1, 255 or 65535, or those of
+    Gaussians (f_dc). Raises UserError: the file is absent, is not such a PLY, or holds points that
+    are not finite.
     """
     if not path.is_file():
         fix = "put the file there, or remove its name from the .json: points are then triangulated"
@@ -66,7 +66,7 @@ def read_points(path: Path) -> tuple[Float64[np.ndarray, "p 3"], UInt8[np.ndarra
 
 
 def _display_colors(vertex: np.ndarray, names: Sequence[str]) -> UInt8[np.ndarray, "p 3"]:
-    """Return the colours in three columns of a table; the largest value decides which is white."""
+    """Return the colours in three columns of a table; the largest value decides what white is."""
     values = np.stack([vertex[name] for name in names], 1)
     floats = values.dtype.kind == "f"
     values = np.nan_to_num(values.astype(np.float64))
@@ -96,7 +96,7 @@ def with_random_seeds(scene: Scene) -> Scene:
 
 
 def depth_range(views: Sequence[View]) -> tuple[float, float]:
-    """Return the nearest and farthest depth of the volume that views share, scene units."""
+    """Return the nearest and farthest depth, scene units, of the volume at which views look."""
     viewmats = np.stack([view.viewmat for view in views]).astype(np.float64)
     forward = viewmats[:, 2, :3]
     centers = camera_centers(viewmats)
@@ -117,7 +117,7 @@ def depth_range(views: Sequence[View]) -> tuple[float, float]:
 def common_points(
     views: Sequence[View], near: float, far: float, count: int = COUNT
 ) -> Float32[np.ndarray, "p 3"]:
-    """Return at most `count` points that many views see, uniform in pixels and in 1 / depth.
+    """Return at most `count` points that many views see, drawn uniformly in pixels and 1 / depth.
 
     Depths are between `near` and `far`, scene units.
     """

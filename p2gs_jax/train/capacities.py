@@ -1,6 +1,6 @@
 """Upper estimates, made on the host, of the capacities that the views of a run need.
 
-NumPy makes them, because an exact count would be one more program to compile per image size.
+NumPy computes them, because an exact count would need one more compiled program per image size.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from p2gs_jax.render.visible import in_view
 from p2gs_jax.train.inputs import TrainingViews
 from p2gs_jax.types import Array, Camera, Gaussians
 
-# Number of views counted per image size, evenly spaced.
+# Largest number of views that are counted per image size, evenly spaced.
 SAMPLED_VIEWS = 32
 
 
@@ -35,12 +35,12 @@ def count_view(
     """Return upper bounds, up to rounding, of a view's (tile-list entries, visible Gaussians).
 
     Entries are the tiles of all bounding boxes; visible Gaussians are those that `in_view` accepts.
-    All arrays are on the host; `owner` is the moving object of each Gaussian.
+    All arrays are on the host; `owner` is the row of the moving object of each Gaussian, or -1.
     """
     gaussians = at_time(gaussians, camera.objects)
     camera = camera_of_each(camera, owner)  # pyright: ignore[reportArgumentType]
     seen = in_view(gaussians, alive, camera, cfg)  # pyright: ignore[reportArgumentType]
-    # Harmonics are most of a Gaussian and count for nothing here.
+    # Harmonics take most of a Gaussian's memory and are not needed here.
     bare = dataclasses.replace(gaussians, sh=gaussians.sh[:, :0])
     shown = jax.tree.map(lambda a: a[seen], bare)
     viewmat = np.asarray(camera.viewmat)
@@ -76,9 +76,9 @@ def capacity_for(
     cfg: RenderConfig,
     owner: Int[np.ndarray, " n"] | None = None,
 ) -> Capacity:
-    """Return the capacity that suffices all views of one image size until the run ends.
+    """Return a capacity that should suffice for all views of one image size until the run ends.
 
-    It counts SAMPLED_VIEWS of the cameras. `limit` is the largest later population; the estimate
+    It counts at most SAMPLED_VIEWS cameras. `limit` is the largest later population; the estimate
     assumes that a view's share of the Gaussians stays constant.
     """
     picks = evenly_spaced(len(cameras), SAMPLED_VIEWS)
@@ -137,12 +137,12 @@ def allocate(
 def grown(
     capacities: Mapping[str, Capacity], size: tuple[int, int], entries: int, visible: int
 ) -> Capacities:
-    """Return capacities after an overflow in a view of this size, which needed these counts."""
+    """Return capacities after an overflow in a view of this size that needed these counts."""
     name = size_name(size)
     return _sharing_visible({**capacities, name: capacities[name].grown(entries, visible)})
 
 
 def _sharing_visible(capacities: Capacities) -> Capacities:
-    """Return capacities with one common `visible`: all sizes share the programs per Gaussian."""
+    """Return capacities with one `visible`, so that all sizes share the programs per Gaussian."""
     most = max((capacity.visible for capacity in capacities.values()), default=0)
     return {name: capacity._replace(visible=most) for name, capacity in capacities.items()}

@@ -51,14 +51,14 @@ def check_scene(scene: Scene, cfg: FitConfig) -> None:
 
 
 def write_plan(folder: Path, cut: Cut, asked: str) -> None:
-    """Write the cut of a scene, and the value of `--blocks`."""
+    """Write the cut of a scene, and `asked`, the value of `--blocks`."""
     write_json(folder / PLAN, {"asked": asked, "cut": cut.to_dict()})
 
 
 def read_plan(folder: Path, asked: str) -> Cut | None:
     """Return the cut of a resumed run, or None if it has none.
 
-    UserError: `asked` is another number of blocks, or the file is broken.
+    Raises a UserError if `asked` is another number of blocks, or if the file is broken.
     """
     path = folder / PLAN
     if not path.exists():
@@ -73,12 +73,12 @@ def read_plan(folder: Path, asked: str) -> Cut | None:
 
 
 def bytes_needed(scene: Scene, cfg: FitConfig) -> float:
-    """Return the peak memory of the fit of a scene, or of a block as a scene, bytes."""
+    """Return the peak memory, bytes, of the fit of a scene or of a block."""
     return memory_needed(scene, cfg, coverage_of(scene, cfg.data.max_width)).total
 
 
 def largest_block(scene: Scene, cfg: FitConfig, cut: Cut) -> float:
-    """Return the peak memory of the most demanding block of a cut, bytes."""
+    """Return the peak memory, bytes, of the block of a cut that needs the most."""
     count, most = len(scene.train_indices), 0.0
     for number in range(len(cut.blocks)):
         block, _, own = whole_of(scene, cut, number)
@@ -88,9 +88,9 @@ def largest_block(scene: Scene, cfg: FitConfig, cut: Cut) -> float:
 
 
 def fewest_blocks(scene: Scene, cfg: FitConfig, parallel: int) -> int:
-    """Return the smallest number of blocks for the free memory; 1: the whole scene fits.
+    """Return the number of blocks for the free memory, by `_fitting`; 1: the scene fits whole.
 
-    Raises a UserError if no cut has small enough blocks.
+    It is also 1 if free memory is unknown. Raises a UserError if no cut has small enough blocks.
     """
     room = left_to_process()
     if room is None or bytes_needed(scene, cfg) <= room:
@@ -125,7 +125,7 @@ def require_room(scene: Scene, cfg: FitConfig, cut: Cut, parallel: int) -> None:
 
 
 def _fitting(scene: Scene, cfg: FitConfig, parallel: int, room: float) -> int | None:
-    """Return the smallest number of blocks that fit, in steps of a factor 1.5, or None."""
+    """Return the first number of blocks that fits, tried in steps of a factor 1.5, or None."""
     count = 2
     while count <= MOST_BLOCKS:
         try:

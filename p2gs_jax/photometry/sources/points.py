@@ -24,10 +24,10 @@ from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.scene.visibility import unoccluded
 from p2gs_jax.types import Gaussians, Scene
 
-# Largest numbers of points, and of views of a point, for projected and for rendered points.
+# Largest number of points, and of views of a point: first for projected, then for rendered points.
 MOST_POINTS, MOST_PER_POINT = 40_000, 16
 RENDERED_POINTS, RENDERED_PER_POINT = 40_000, 8
-# More than `warp.OPAQUE`, because a solution suffers more from wrong correspondences than a loss.
+# Above `warp.OPAQUE`: wrong correspondences harm a solution of exposures more than a loss.
 OPAQUE = 0.98
 
 # Called with the number of views done, and the number of all views.
@@ -37,7 +37,7 @@ OnView = Callable[[int, int], object] | None
 def surface_colors(
     scene: Scene, store: ImageStore, seed: int, on_view: OnView = None
 ) -> Observations:
-    """Return colours at the tracks, or without tracks those of points that `seed` draws."""
+    """Return colours at the tracks; without tracks, those of points that `seed` draws."""
     if has_tracks(scene):
         return track_colors(scene, store, on_view)
     return projected_colors(scene, store, seed, on_view)
@@ -49,7 +49,7 @@ def has_tracks(scene: Scene) -> bool:
 
 
 def track_colors(scene: Scene, store: ImageStore, on_view: OnView = None) -> Observations:
-    """Sample every track in every training view."""
+    """Sample every observation of a track in a training view."""
     assert scene.tracks is not None
     of_view = grouped(scene.tracks.view_indices, len(scene.views))
     picks = [of_view[i] for i in scene.train_indices]
@@ -62,9 +62,9 @@ def track_colors(scene: Scene, store: ImageStore, on_view: OnView = None) -> Obs
 def projected_colors(
     scene: Scene, store: ImageStore, seed: int = 0, on_view: OnView = None
 ) -> Observations:
-    """Sample a scene's points (LiDAR or others) in every training view that shows them.
+    """Sample a scene's points (LiDAR or others) in training views that show them.
 
-    `seed` chooses points, and views of a point.
+    `seed` chooses MOST_POINTS points, and MOST_PER_POINT views of a point, if there are more.
     """
     rng = generator(seed, Stream.SURFACE_COLORS)
     chosen = np.arange(len(scene.points))
@@ -91,9 +91,9 @@ def rendered_colors(
     seed: int = 0,
     on_view: OnView = None,
 ) -> Observations:
-    """Warp pixels of each training view, chosen by `seed`, into the others through rendered depth.
+    """Sample pixels of each training view, chosen by `seed`, in training views that show them.
 
-    Points that are occluded in a view are left out there.
+    Rendered depth warps and occludes them. Each is sampled in at most RENDERED_PER_POINT views.
     """
     rng = generator(seed, Stream.RENDERED_PIXELS)
     render = make_renderer(cfg)
@@ -126,7 +126,7 @@ def rendered_colors(
 def _slopes(
     places: Float[np.ndarray, "h w 3"], depth: Float[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "h w 3"]:
-    """Return unit normals of the rendered surface; NaN where its depth is discontinuous."""
+    """Return unit normals of the rendered surface; NaN where depth jumps or is missing."""
     across, down = (np.gradient(places.astype(np.float64), axis=axis) for axis in (1, 0))
     normals = np.cross(across, down)
     size = np.linalg.norm(normals, axis=2, keepdims=True)
@@ -138,7 +138,7 @@ def _slopes(
 def thinned(
     seen: Bool[np.ndarray, "v p"], rng: np.random.Generator, most: int
 ) -> list[Int[np.ndarray, " _"]]:
-    """Return points of each view; each point is in at most `most` random views that show it."""
+    """Return the points of each view; a point keeps at most `most` random views that show it."""
     order = rng.random(seen.shape)
     order[~seen] = 2.0
     rank = np.argsort(np.argsort(order, axis=0), axis=0)

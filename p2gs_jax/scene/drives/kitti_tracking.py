@@ -7,7 +7,7 @@
     training/label_02/NNNN.txt              a line for each box in each frame
 
 Schema: https://www.cvlibs.net/datasets/kitti/eval_tracking.php (readme.txt of its devkit). There
-are no time stamps: frames follow each other after 0.1 s, and everything in a frame has its time.
+are no time stamps: frames follow each other after 0.1 s, and the scanner's turn is centred on each.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from p2gs_jax.scene.rigid import inverse, pose_of, rigid
 
 MARKER = "oxts/[0-9]*.txt"
 SET = "training"
-# Axes of a box (x forward, y left, z up) in those of a camera in whose x the box looks.
+# Axes of a box (x forward, y left, z up) in camera axes, if its forward is the camera's x.
 UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
@@ -86,7 +86,7 @@ def _rigid(calibration: kitti.Calibration, key: str, columns: int = 4) -> Pose:
 
 
 def _boxes(path: Path, velo_to_cam: Pose) -> list[Box]:
-    """Return boxes, whose times are frames and whose poses lead to the scanner."""
+    """Return boxes; their times are frame numbers, and their poses are box-to-scanner."""
     boxes = []
     for number, line in enumerate(tables.read_lines(path), 1):
         words = line.split()
@@ -97,7 +97,7 @@ def _boxes(path: Path, velo_to_cam: Pose) -> list[Box]:
             values, path, f"frame, size, position and rotation in line {number}", 8
         ).tolist()
         size = tables.box_size((length, width, height), path)
-        # The position is the middle of the bottom, and y points down.
+        # The position is the centre of the bottom face, and y points down.
         rotation = Rotation.from_euler("y", turn).as_matrix() @ UPRIGHT
         pose = inverse(velo_to_cam) @ pose_of(rotation, np.array([x, y - height / 2, z]))
         boxes.append(Box(words[1], words[2], size, frame, pose))

@@ -11,11 +11,11 @@ from scipy.spatial import KDTree
 from p2gs_jax.scene.rigid import interpolated, inverse
 from p2gs_jax.types import Lidar, TrackedObject
 
-# Boxes are tight and measurements noisy: points this near to a box count as inside, metres.
+# Boxes are tight and measurements are noisy: points within this distance count as inside, metres.
 BOX_MARGIN = 0.15
-# The largest number of points from all sweeps, the same from each sweep.
+# The largest number of points from all sweeps; every sweep gives at most an equal share.
 MOST_MEASURED = 2_000_000
-# Seeds: one for each voxel, whose side grows with the distance from the nearest camera.
+# Seeds, one per voxel: their number, the least side (metres), side / camera distance, its growth.
 MOST_SEEDS, FINEST_VOXEL, VOXEL_ANGLE, VOXEL_GROWTH = 200_000, 0.05, 0.01, 1.3
 
 
@@ -27,7 +27,7 @@ def turned(azimuth: Float[np.ndarray, "*n"] | float, start: float) -> Float[np.n
     Args:
         azimuth: directions, radians counterclockwise as seen from above; scanners on cars turn
             clockwise.
-        start: direction in which the turn begins and ends.
+        start: direction in which the turn begins and ends, radians.
     """
     return np.asarray(np.mod(start - azimuth, 2 * np.pi) / (2 * np.pi))
 
@@ -35,9 +35,9 @@ def turned(azimuth: Float[np.ndarray, "*n"] | float, start: float) -> Float[np.n
 def passed(
     points: Float[np.ndarray, "n 3"], middle_s: float, turn_s: float, start: float
 ) -> Float[np.ndarray, " n"]:
-    """Return the times at which a scanner passed points in its axes, seconds; NaN is at angle 0.
+    """Return the times at which a scanner passed points in its axes, seconds; NaN has angle 0.
 
-    `middle_s` is the middle of its turn of `turn_s` seconds, which begins as in `turned`.
+    `middle_s` is the middle of its turn of `turn_s` seconds, and `start` is as in `turned`.
     """
     azimuth = np.nan_to_num(np.arctan2(points[:, 1], points[:, 0]))
     return middle_s + turn_s * (turned(azimuth, start) - 0.5)
@@ -50,7 +50,7 @@ def owners(
 ) -> Int[np.ndarray, " n"]:
     """Return the row of the moving object whose box holds each point, -1 for none.
 
-    Points are world coordinates, each at its measurement time (seconds).
+    `times` are the measurement times of the points in seconds, and points are in world coordinates.
     """
     found = np.full(len(points), -1, np.int32)
     if not len(points):
@@ -90,7 +90,7 @@ def seeds(
     """Return static points, one for each voxel; voxels are smaller near the cameras.
 
     Voxels grow until at most `most` points are left. The second result is the side of a voxel
-    divided by its distance from the nearest camera.
+    divided by its distance from the nearest camera, before limits and rounding.
     """
     points = lidar.points[lidar.objects < 0]
     angle = VOXEL_ANGLE
@@ -105,7 +105,7 @@ def seeds(
 
 
 def _one_per_voxel(points: Float32[np.ndarray, "n 3"], side: Float[np.ndarray, " n"]):
-    """Return the row of the first point in each voxel; sides are rounded to powers of 2."""
+    """Return the row of the first point in each voxel; sides become FINEST_VOXEL 2^level."""
     level = np.clip(np.rint(np.log2(side / FINEST_VOXEL)), 0, 15).astype(np.uint64)
     cell = np.floor((points - points.min(0)) / np.ldexp(FINEST_VOXEL, level.astype(int))[:, None])
     # 4 bits hold the level and 20 bits each axis: 52 km at the finest level.

@@ -1,7 +1,7 @@
 """Decoded photographs in memory-mapped files, whose pages the system reads and drops.
 
-A folder for each size holds one NumPy record for each photograph. Its name is a hash of everything
-that its pixels depend on. Threads write the files before they are needed.
+A folder for each size holds one file (a NumPy record) for each photograph. The name of the file is
+a hash of everything that its pixels depend on. Threads write files before they are needed.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Key(NamedTuple):
 class PixelFiles:
     """Files of decoded photographs in `folder`. All methods may be called from any thread.
 
-    A thread that reads or decodes a photograph holds its view's lock: none is decoded twice.
+    Callers hold the lock of a view while they read or decode it, so that none is decoded twice.
     """
 
     def __init__(self, folder: Path, views: Sequence[View]):
@@ -92,7 +92,7 @@ class PixelFiles:
         return self.read(key) or photograph
 
     def require_room(self, needed: int) -> None:
-        """Raise UserError if the disk has less space than `needed` bytes of photographs."""
+        """Raise UserError if the disk lacks space for all files; `needed` is their bytes."""
         place = next(p for p in (self.folder, *self.folder.parents) if p.exists())
         written = sum(path.stat().st_size for path in self.folder.glob("*/*.px"))
         free = shutil.disk_usage(place).free
@@ -131,12 +131,12 @@ def _digest(view: View, bonnets: dict[int, str]) -> str:
 
 
 def _fingerprint(path: Path) -> tuple[str, int, int]:
-    """Return path, size and time of a file; -1 stands for those of a missing file."""
+    """Return the path, size and time of a file; a missing file has size and time -1."""
     return file_fingerprints([path])[0] if path.exists() else (str(path), -1, -1)
 
 
 class DecodingAhead:
-    """Threads that decode photographs without a file; they end with the main thread at the latest.
+    """Threads that decode photographs without a file; they end soon after the main thread.
 
     They skip photographs that cannot be decoded: the caller that needs one gets the error.
     """
