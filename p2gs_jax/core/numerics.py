@@ -56,7 +56,7 @@ def safe_log(x: Values, floor: float) -> Values:
 
 
 def positive_pow(x: Values, p: Scalar, floor: float) -> Values:
-    """Return max(x, floor)^p through exp(p log x); the gradient to x is zero below the floor."""
+    """Return max(x, floor)^p through exp(p log x); the gradient to x is zero up to the floor."""
     return namespace(x, p).exp(p * safe_log(x, floor))
 
 
@@ -66,12 +66,12 @@ def unit_clip(x: Array) -> Array:
 
 
 def evenly_spaced(count: int, most: int) -> Int[np.ndarray, " k"]:
-    """Return at most `most` of the indices below `count`, evenly spaced, both ends included."""
+    """Return at most `most` indices below `count`, evenly spaced, with both ends if most > 1."""
     return np.linspace(0, count - 1, min(count, most)).round().astype(int)
 
 
 def fibonacci_sphere(count: int) -> Float[np.ndarray, "n 3"]:
-    """Return evenly spread unit vectors."""
+    """Return `count` evenly spread unit vectors."""
     i = np.arange(count) + 0.5
     z = 1 - 2 * i / count
     azimuth = np.pi * (1 + 5**0.5) * i
@@ -90,7 +90,7 @@ def on_host(record: Callable[..., Record], *values: Any) -> Record:
 def srgb_encode(linear: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """Return the sRGB encoding (IEC 61966-2-1) of linear values, clipped to [0, 1].
 
-    It is in double precision; fits use the curve in `photometry.formation`.
+    The precision is that of the argument. Fits use the curve in `photometry.formation`.
     """
     x = np.clip(linear, 0.0, 1.0)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)

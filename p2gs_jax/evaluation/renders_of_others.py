@@ -18,7 +18,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.types import Scene
 
-# Display values come first: a program that writes both has its tone curve in them.
+# Display values come first: if a program also writes radiance, only they have its tone curve.
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
 
 
@@ -107,8 +107,8 @@ def find_renders(folder: str | Path, scene: Scene) -> OtherRenders:
     Pictures have the names of views, or are numbered in the order of names of held-out views.
 
     Raises:
-        UserError: there are no held-out views, the folder holds no render, or the number of
-            numbered renders differs from that of held-out views.
+        UserError: there are no held-out views, the folder is absent or holds no render, or the
+            number of numbered renders differs from that of held-out views.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -143,7 +143,7 @@ def find_renders(folder: str | Path, scene: Scene) -> OtherRenders:
 
 
 def _by_name(folder: Path) -> dict[str, Path]:
-    """Return the pictures below a folder by relative path, with suffixes in lower case."""
+    """Return the pictures, except hidden ones, by relative path with a lower-case suffix."""
     found = (p for p in sorted(folder.rglob("*")) if p.suffix.lower() in SUFFIXES and p.is_file())
     return {
         p.relative_to(folder).with_suffix(p.suffix.lower()).as_posix(): p

@@ -1,6 +1,6 @@
 """Solved photometry in the words of other trainers: PPISP (gsplat, LichtFeld), 3DGS, nerfstudio.
 
-docs/exports.md tells how each program is given its file.
+docs/exports.md says how to pass each program its file.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from p2gs_jax.types import GAMMA_SRGB, View
 def write_for(trainers: Sequence[str], folder: Path, views: Sequence[View]) -> list[str]:
     """Write the files of some trainers beside the `photometry.json` of a calibration.
 
-    `views` are the calibrated photographs. Returns a sentence on each file, also where the program
-    has no words for this photometry and nothing is written.
+    `views` are the calibrated photographs. Returns a sentence on each file. It says so if the
+    program cannot express this photometry and the file is not written.
     """
     saved = read_photometry(folder / "photometry.json")
     writers = {"ppisp": _ppisp, "3dgs": _3dgs, "nerfstudio": _nerfstudio}
@@ -29,7 +29,7 @@ def write_for(trainers: Sequence[str], folder: Path, views: Sequence[View]) -> l
 
 
 def _ppisp(folder: Path, saved: PhotometryFile, views: Sequence[View]) -> str:
-    """Write PPISP's parameters under its names; views of unknown exposure have the mean."""
+    """Write PPISP's parameters under its names; a view without an exposure gets the common one."""
     path, common = folder / "ppisp_start.json", common_look(folder, saved)
     rows = {row["image"]: row for row in saved["views"]}
     found = [rows[view.name] for view in views]
@@ -61,7 +61,7 @@ def _ppisp(folder: Path, saved: PhotometryFile, views: Sequence[View]) -> str:
 
 
 def _3dgs(folder: Path, saved: PhotometryFile, views: Sequence[View]) -> str:
-    """Write 3DGS's matrices where an exposure is a gain of display values, the same for all."""
+    """Write 3DGS's matrices if photographs differ only by gains of their display values."""
     path, common = folder / "exposure.json", common_look(folder, saved)
     cameras, curve = common.formation.cameras, common.formation.curve
     gammas = [row["gamma"] for row in saved["views"] if row["gamma"] is not None]

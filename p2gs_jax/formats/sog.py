@@ -1,8 +1,8 @@
 """SOG, the compressed splats of PlayCanvas and SuperSplat, version 2: a ZIP of textures.
 
-A texel of each texture belongs to one Gaussian, in rows from the top. Positions have 16 bits in a
-logarithmic scale; rotations omit the largest component; scales and colours are entries of 256-entry
-tables. Harmonics of higher degree are rows of a palette, whose texture has 64 of them per row.
+A texel belongs to one Gaussian, in rows from the top, except in the palette. Positions have 16 bits
+on a logarithmic scale; rotations omit the largest component; log scales and colours are indices
+into tables of 256. Higher harmonics are entries of the palette, which has 64 of them in a row.
 Source: developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog.
 """
 
@@ -78,7 +78,7 @@ def _read(file: zipfile.ZipFile) -> Gaussians:
 
 
 def _rotations(texels: UInt8[np.ndarray, "n 4"]) -> np.ndarray:
-    """Return unit quaternions, wxyz."""
+    """Return unit quaternions, wxyz, [n 4]."""
     omitted = texels[:, 3].astype(int) - FIRST_OMITTED
     three = (texels[:, :3] / 255 - 0.5) * np.sqrt(2)
     largest = np.sqrt(np.maximum(1 - (three**2).sum(1, keepdims=True), 0))

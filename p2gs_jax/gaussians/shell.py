@@ -27,9 +27,9 @@ CELLS_ACROSS = 16
 COVERED_FRACTION = 0.3
 # If a smaller share of the image cells is empty, this is a gap in the seeds and not a sky.
 EMPTY_IMAGE_FRACTION = 0.04
-# Distance of the shell relative to the far seeds.
+# Smallest distance of the shell relative to the far seeds.
 BEHIND_SEEDS = 2.0
-OVERLAP = 0.7
+OVERLAP = 0.7  # standard deviation of a Gaussian relative to the spacing
 # Shell colours come from shrunk images, because a direction covers many pixels.
 SHELL_SHRINK = 4
 SHELL_OPACITY = 0.5
@@ -41,7 +41,7 @@ class Shell:
 
     points: Float32[np.ndarray, "s 3"]  # positions, scene units
     scales: Float[np.ndarray, " s"]  # standard deviations, scene units
-    seen: Bool[np.ndarray, "s v"]  # whether a training view (by row) sees each point
+    seen: Bool[np.ndarray, "s v"]  # whether a view (by row) sees a point away from seeds
     xy: Float32[np.ndarray, "s v 2"]  # position in that view, pixels at full resolution
     empty_fraction: float  # share of image cells without seeds nearby
 
@@ -64,7 +64,7 @@ class Sphere:
 def sphere_behind(
     views: Sequence[View], points: Float[np.ndarray, "p 3"], radius: float, cfg: InitConfig
 ) -> Sphere:
-    """Return the sphere of a scene's shell: behind its seeds, beyond the cameras' radius."""
+    """Return the sphere of a shell, from the cameras' `radius` and the distance of far seeds."""
     middle = seeds.camera_centers(views)[~seeds.misplaced(views, points)].mean(0)
     radius *= cfg.shell_radius
     if len(points):
@@ -93,7 +93,7 @@ def find_shell(
 ) -> Shell | None:
     """Return the shell of a scene, or None if it needs none.
 
-    It lies on `sphere`; None means `sphere_behind`.
+    It lies on `sphere`; None means `sphere_behind`. `radius` is the cameras' radius, scene units.
     """
     if cfg.shell == "off":
         return None
@@ -138,7 +138,7 @@ def shell_gaussians(
     views: Sequence[View],
     cfg: FitConfig,
 ) -> Gaussians:
-    """Return the Gaussians of a shell, with the mean radiance of the photographs at its points."""
+    """Return Gaussians at the points of a shell that photographs show, with their mean radiance."""
 
     def seen_in(view: View, row: int):
         seen = np.flatnonzero(shell.seen[:, row])

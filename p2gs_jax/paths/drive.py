@@ -25,9 +25,8 @@ class PosePath:
     """Poses over time through every given pose, with continuous velocity and acceleration.
 
     Positions follow a natural cubic spline, rotations scipy's `RotationSpline`. The time between
-    two poses is the square root of their distance (centripetal), so that splines neither loop nor
-    overshoot if distances differ. `times` of the given poses begin at 0; their mean difference is
-    1.
+    two poses goes with sqrt(distance / mean distance + angle in radians), which is centripetal:
+    splines neither loop nor overshoot. `times` begin at 0; their mean difference is 1.
     """
 
     def __init__(self, poses: Poses):
@@ -79,7 +78,7 @@ def drive(knots: Sequence[Shot], frames: int | None = None) -> list[Shot]:
 
 
 def interpolated(at, values: Sequence[float | None], times) -> list[float | None]:
-    """Return values at `times`, linear between those `at` given times; None if any is None."""
+    """Return values at `times`, linear between those at times `at`; all None if any is None."""
     known = [v for v in values if v is not None]
     if len(known) < len(values):
         return [None] * len(times)

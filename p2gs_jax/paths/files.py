@@ -18,7 +18,7 @@ from p2gs_jax.scene.rigid import camera_centers, pose_of
 
 FIELDS = ("name", "viewmat", "K", "width", "height", "exposure_ev", "gamma", "time")
 MOST_STOPS = 60.0
-# Smallest and largest values of optional fields.
+# Smallest and largest values of optional fields; exposures in stops, times in seconds.
 LIMITS = {"exposure_ev": (-MOST_STOPS, MOST_STOPS), "gamma": (1e-3, 1e3)}
 LIMITS["time"] = (-math.inf, math.inf)
 _FIX = "correct the file; docs/rendering.md has the format"
@@ -58,7 +58,7 @@ def read_cameras(path: Path) -> list[Shot]:
 
 
 def near_scene(shots: Sequence[Shot], origin: Sequence[float]) -> list[Shot]:
-    """Return shots in the coordinates of a scene that may have been moved by `origin`."""
+    """Return shots relative to the scene's `origin`, unless they are nearer to 0 than to it."""
     middle = np.median(camera_centers(np.stack([shot.viewmat for shot in shots])), axis=0)
     if np.linalg.norm(middle - origin) >= np.linalg.norm(middle):
         return list(shots)

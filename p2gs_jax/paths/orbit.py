@@ -12,9 +12,9 @@ from p2gs_jax.paths.shots import Pose, Shot, common_lens
 from p2gs_jax.scene.rigid import camera_centers, pose_of, up_direction
 
 FRAMES = 120
-# Optical axes meet in a point if their spread is at least this (sine squared), ...
+# Optical axes meet in a point only if they spread at least this much (mean squared sine).
 LEAST_SPREAD = 0.01
-# ... if it is in front of this share of cameras, and within this median angle from their axes.
+# The point must be in front of this share of cameras, at most this median angle off their axes.
 MOST_IN_FRONT, WIDEST = 0.9, np.deg2rad(25)
 # A full circle needs cameras on all sides, with gaps below this angle.
 LARGEST_GAP = np.deg2rad(100)
@@ -49,7 +49,7 @@ class Orbit:
 
 
 def orbit(circle: Orbit, shots: Sequence[Shot], frames: int | None = None) -> list[Shot]:
-    """Return a closed path of `frames` shots with the most common lens."""
+    """Return a closed path of `frames` shots (None: `FRAMES`) with the most common lens."""
     count = FRAMES if frames is None else frames
     turn = 2 * np.pi * np.arange(count) / count
     swing = turn if circle.sway >= np.pi else circle.sway * np.sin(turn)
@@ -82,7 +82,7 @@ def find_orbit(
     If the optical axes meet, the orbit is around that point at the median distance and elevation of
     the cameras: a circle if they surround it, else an arc over their azimuths. If the axes do not
     meet, as on a vehicle, the arc is around a point in front of the middle shot of `own`, the shots
-    of one camera in order, at the median depth of the scene's points (if there are any).
+    of one camera in order, at the median depth of the points in that shot (if there are any).
     """
     viewmats = np.stack([s.viewmat for s in shots])
     up = up_direction(viewmats)
@@ -136,7 +136,7 @@ def _around(focus, centers, up) -> Orbit:
 
 
 def _median_depth(shot: Shot, points, centers) -> float:
-    """Return the median depth of the points in a shot, or the spread of the cameras without any."""
+    """Return the median depth of the points in a shot; without any, the spread of the cameras."""
     local = points @ shot.viewmat[:3, :3].T + shot.viewmat[:3, 3]
     depths = local[shot.project(local)[1], 2]
     if len(depths):

@@ -17,12 +17,12 @@ from p2gs_jax.photometry.metering import ExposureOf, adapted, meter
 from p2gs_jax.run.read import Run
 from p2gs_jax.scene.rigid import inverse
 
-# Pictures are metered at this width, pixels.
+# Wider pictures are metered at this width, pixels.
 METERED_WIDTH = 240
 
 
 def _layers(run: Run, shot: Shot, at: float | None) -> Layers:
-    """Return linear radiance, alpha and alpha-weighted depth of a pinhole camera at a time."""
+    """Return linear radiance, alpha and alpha-weighted depth of a shot at a time, seconds."""
     result = run.render(shot.camera(), at)
     return np.asarray(result.linear), np.asarray(result.alpha), np.asarray(result.depth)
 
@@ -32,8 +32,8 @@ def metered_shots(
 ) -> list[Shot]:
     """Return shots with the exposures that a metering rule chooses from small pictures of them.
 
-    `exposure_ev` adds stops. Exposures adapt to the scene within about `frames` shots in their
-    order; 0 meters each shot separately.
+    `exposure_ev`, stops, is added to each. Exposures are smoothed over about `frames` shots in the
+    given order; with 0 every shot is metered separately.
     """
     stops = []
     for shot in shots:
@@ -68,7 +68,7 @@ def wide_frames(
     steps: Iterable[tuple[str, Pose, float | None]],
     transform: DisplayTransform,
 ) -> Iterator[OutputFrame]:
-    """Yield wide views of the field by name, rig-to-world pose and time, seconds.
+    """Yield a wide view of the field for each step: name, rig-to-world pose and time, seconds.
 
     The viewmat of the cylinder is rig-to-camera. Moving objects appear only if a time is given.
     """

@@ -2,7 +2,7 @@
 
 Exposures, vignetting and white balance of greys carry over; a response of four numbers is fitted to
 the tone curve, and the difference is measured. PPISP's light is 1 where a photograph saturates, and
-its mean exposure is 0 stops, where its regularisation pulls it.
+its mean exposure is 0 stops, to which its regularisation pulls it.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from p2gs_jax.photometry import ppisp
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.photometry.formation import camera_rows, inverse_tone_map
 
-# Display values at which curves are compared: all but black of 8 bits.
+# Display values at which curves are compared: 8-bit codes 1 to 255, for three channels.
 VALUES = np.repeat(np.arange(1, 256, dtype=np.float64)[:, None] / 255, 3, 1)
-# Responses from the best of which a fit starts: it has several minima.
+# A fit has several minima, and starts from the best of these responses.
 STARTS = np.stack(np.meshgrid(*[np.linspace(-3, 3, 7)] * 4), -1).reshape(-1, 4)
 
 
 class Start(NamedTuple):
-    """Initial parameters, and what they leave out."""
+    """Initial parameters, and their difference from the solved photometry."""
 
     parameters: ppisp.Ppisp
     radiance_ev: float  # PPISP's radiance is ours times 2 to this power
-    # mean and largest difference of greys of every camera, 8-bit codes: its tone curve at the mean
-    # gamma of its views beside PPISP's response
+    # mean and largest difference, 8-bit codes, between PPISP's response to greys and every camera's
+    # tone curve at the mean gamma of its views
     codes: Float[np.ndarray, "c 2"]
 
 
@@ -47,8 +47,8 @@ def start_of(
 ) -> Start:
     """Return PPISP's parameters of some views.
 
-    `cameras` are the cameras of the views, `balances` log factors on the channels, and `sizes` have
-    width and height of the photographs of every camera, pixels.
+    `cameras` and `exposures` (factors on radiance) are by view, `balances` are log factors on the
+    channels, and `sizes` are width and height of every camera's photographs, pixels.
     """
     plain = ppisp.identity(cameras)
     rows = camera_rows(plain.names, cfg) or (None,) * len(plain.names)
@@ -74,7 +74,7 @@ def start_of(
 
 
 def _response(light: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, ...]:
-    """Return the response (3, 4) closest to `VALUES` of light, and the distances in 8-bit codes."""
+    """Return responses (3, 4) that map light to `VALUES`, and absolute errors (3, n) in codes."""
     respond, found = jax.jit(ppisp.respond), []
 
     def off(raw: np.ndarray, column: np.ndarray) -> np.ndarray:
@@ -82,7 +82,7 @@ def _response(light: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, ...]:
 
     for channel in light.T:
         start = STARTS[np.square(off(STARTS, channel[:, None])).sum(0).argmin()]
-        # Responses are computed in float32. Far parameters would have no gradient in training.
+        # The step suits float32. Far parameters are excluded: they have no gradient in training.
         how: Any = {"diff_step": 1e-3, "bounds": (-6, 6), "args": (channel[:, None],)}
         best = least_squares(lambda *a: off(*a)[:, 0], start, **how)
         found.append((best.x, 255 * np.abs(best.fun)))

@@ -79,7 +79,7 @@ def solve_exposures(
 def _sampled(
     scene: Scene, still: ImageStore, cfg: FitConfig, reporter: Reporter, *, dense: bool
 ) -> tuple[Observations | None, list[str]]:
-    """Return colours of shared points, or None if nothing needs them, and notes for the user."""
+    """Return colours of shared points (None: unneeded, or seeds are random), and notes."""
     from_tracks, notes = cfg.photometry.start == "tracks", []
     if not (has_tracks(scene) or from_tracks or dense):
         return None, []

@@ -41,8 +41,8 @@ def picture(url: str, alt: str) -> str:
 def signed_difference(
     render: Float[np.ndarray, "h w 3"], photograph: Float[np.ndarray, "h w 3"]
 ) -> Float32[np.ndarray, "h w 3"]:
-    """Return render minus photograph in luminance: grey is no difference, lighter pixels have a
-    render that is too bright."""
+    """Return render minus photograph in luminance, as a picture: grey where both are equal, lighter
+    where the render is too bright."""
     bright, there = (luminance(np.nan_to_num(p).clip(0, 1)) for p in (render, photograph))
     shown = np.clip(0.5 + 0.5 * GAIN * (bright - there), 0, 1)
     return np.repeat(shown[..., None], 3, -1).astype(np.float32)
@@ -54,9 +54,9 @@ def without_suffix(name: str) -> str:
 
 
 def held_out_section(run: RunFiles, most: int, problems: list[str]) -> str:
-    """Return at most `most` held-out views from files, evenly spaced from the worst to the best.
+    """Return HTML of at most `most` held-out views, evenly spaced from the worst to the best.
 
-    Each view has its photograph, its render at the fitted exposure, and their difference;
+    Each view has its photograph, its render at the fitted exposure, and their difference.
     `problems` receives a sentence for each view that cannot be read.
     """
     scores = run.part("test", "exposure_fitted", "per_view")

@@ -30,9 +30,9 @@ def write_report(
 ) -> Path:
     """Write one page about a run, which needs no other file and no network; return its path.
 
-    The page is `report.html` in the folder unless `out` names another file. `scene` is the current
-    folder of the scene (None: as in the run). Without `render` the page uses only the run folder,
-    and has no seams. A UserError reports a folder without a run, or a page that cannot be written.
+    The page is `report.html` in the folder, or else `out`. `scene` is the scene's current folder
+    (None: as in the run). Without `render` the page has no seams, and only true exposures come from
+    the scene. A UserError reports a folder without a run, or a page that cannot be written.
     """
     reporter = reporter or Silent()
     folder = Path(folder)

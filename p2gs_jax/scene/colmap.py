@@ -122,8 +122,8 @@ def _count(folder: Path) -> int:
 def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
     """Read the COLMAP model in a folder; views have no split, masks or EXIF yet.
 
-    Raises UserError: a file is broken, images are missing or have another size, the camera model is
-    not supported, or the model is empty.
+    Raises UserError: a file is broken, images are missing or have another aspect ratio, the camera
+    model is not supported, or the model is empty.
     """
     model = read_model(folder)
     _check_model(model)
@@ -166,10 +166,10 @@ def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
 
 
 def tracks_of(model: Model, views: Sequence[View]) -> Tracks | None:
-    """Return every observation of the model's points, in undistorted pixels of the views.
+    """Return observations of the model's points, in undistorted pixels of the views, or None.
 
-    Views are matched by name, and keypoints rescaled to the size of the view. Observations in other
-    images are left out, and those of points that the model lacks (some tools thin points3D alone).
+    Views are matched by name; keypoints are scaled to the view's size. Keypoints of other images,
+    of points that the model lacks (some tools thin points3D) and outside a pinhole are left out.
     """
     if not (model.point_ids >= 0).any():
         return None
@@ -280,7 +280,7 @@ class ImageRecord(NamedTuple):
 class Model(NamedTuple):
     """A COLMAP model: cameras by id, images in the file's order, ascending `point_ids`.
 
-    `xyz` is in scene units, `rgb` is display-encoded, and `kind` is the suffix of the files.
+    `xyz` is in scene units, `rgb` display-encoded, `kind` bin or txt. The ids of a PLY are -1.
     """
 
     folder: Path

@@ -24,8 +24,8 @@ def read_known_exposures(
 
     The source is `exif` (EXIF, or what the data set states), or a CSV file with a column `image` or
     `file` (name of the view, or any end of it) and one of `ev`, `rel_exposure_ev` (stops),
-    `exposure` (linear, > 0) or `exposure_time_s` (seconds). `among` are all views of the scene, if
-    `views` are some of them.
+    `exposure` (linear, > 0) or `exposure_time_s` (seconds). Names in the file may mean any
+    view in `among` (all views of the scene; by default `views`).
     Raises UserError: the source cannot be used, names none of the views, or a name is ambiguous.
     """
     if source == "exif":
@@ -45,7 +45,7 @@ def read_known_exposures(
 
 
 def _by_view(table: dict[str, float], views: Sequence[View], source: str) -> dict[str, float]:
-    """Return the exposures of views by their whole names."""
+    """Return the log exposures of views by their whole names."""
     row_of, out = row_finder(views, source), dict[str, float]()
     for name, value in table.items():
         row = row_of(name)
@@ -67,7 +67,7 @@ def row_finder(views: Sequence[View], source: object) -> Callable[[str], int | N
     UserError if a name is ambiguous.
     """
     rows_of: dict[str, set[int]] = defaultdict(set)
-    # A converted photograph lies elsewhere.
+    # The path of a converted photograph differs from its name.
     both = [(row, p) for row, v in enumerate(views) for p in (v.image_path, PurePosixPath(v.name))]
     for row, path in both:
         parts = path.as_posix().lstrip("/").split("/")
@@ -96,7 +96,7 @@ def check_source(source: str | None) -> None:
 
 
 def stated_ev(source: str | None, views: Sequence[View]) -> Float[np.ndarray, " v"]:
-    """Return exposures in stops, up to a constant, from a source or, if None, from EXIF."""
+    """Return exposures in stops up to a constant, or NaN, from a source or, if None, from EXIF."""
     if source is None:
         return _exif_ev(views)
     return read_known_exposures(source, views) / LN2

@@ -1,9 +1,9 @@
 """Building blocks of procedural textures: points on surfaces, noise, hashes, soft edges.
 
-Texture finer than a pixel becomes its mean: shapes are averaged over half a pixel (`slab`), noise
-and hashes about zero fade (`detail`). Materials are linear in both, sums of disjoint shapes, so
-that their means are the same from every distance. Arrays are channel-first over R rays: points and
-colours are [3 R].
+Texture finer than a pixel becomes its mean: shapes are averaged over half a pixel (`slab`), and
+noise of zero mean fades (`detail`). All materials but leaves are linear in both, sums of disjoint
+shapes, so that their means are the same from every distance. Arrays are channel-first over R
+rays: points and colours are [3 R].
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from jaxtyping import Array, Float
 
 
 class Surface(NamedTuple):
-    """Optical properties at R points: emitted radiance, scale of the mirror reflection (0 to 1),
-    and unit normals of the geometry and with the texture's relief."""
+    """Optical properties at R points: albedo, emitted radiance, scale of the mirror reflection (0
+    to 1), unit normals of the geometry, and unit normals bent by the texture's relief."""
 
     albedo: Float[Array, "3 r"]
     emission: Float[Array, "3 r"]
@@ -26,12 +26,12 @@ class Surface(NamedTuple):
 
 
 class Point(NamedTuple):
-    """One row of the primitives' table per ray, and where on the primitive it is."""
+    """A primitive's row of the table for each ray, and the point that it hits; [R] by default."""
 
-    p: Array  # [3 R]
+    p: Array  # [3 R], m
     normal: Array  # [3 R]
-    lo: Array  # [3 R]
-    hi: Array  # [3 R]
+    lo: Array  # [3 R], m
+    hi: Array  # [3 R], m
     color: Array  # [3 R]
     accent: Array  # [3 R]
     style: Array
@@ -40,8 +40,8 @@ class Point(NamedTuple):
     random: Array
     row: Array
     footprint: Array  # a pixel's width on the surface, m
-    fine: Array  # [3 R] noise in [-1, 1], wavelength by material
-    coarse: Array  # [3 R], which does not fade
+    fine: Array  # [3 R] noise in [-1.25, 1.25], wavelength by material
+    coarse: Array  # [3 R] noise in [-1, 1], which does not fade
     rough: Array  # [3 R] `fine` before it fades
 
     def bar(self, x: Array, half: Array | float) -> Array:
@@ -53,12 +53,12 @@ class Point(NamedTuple):
         return slab(x - (low + high) / 2, (high - low) / 2, self.footprint)
 
     def grid(self, x: Array, period: float, half: Array | float) -> Array:
-        """Return the share of bars in the cells of a periodic pattern, about their middles."""
+        """Return the share of bars, of half-width `half`, in the middle of cells of a `period`."""
         width = 0.5 * self.footprint + 1e-6
         offset = x - (jnp.floor(x / period) + 0.5) * period
 
         def covered(y: Array) -> Array:
-            """Length of the bars between the middle of the cell and y."""
+            """Return the length of the bars between the middle of the cell and y."""
             cell = jnp.round(y / period)
             return 2 * half * cell + jnp.clip(y - cell * period, -half, half)
 
@@ -66,12 +66,12 @@ class Point(NamedTuple):
 
 
 def detail(footprint: Array, wavelength: Array) -> Array:
-    """Return 1 where a wavelength spans many pixels, 0 below about one and a half."""
+    """Return 1 where a wavelength spans 4 pixels or more, and less down to 0 at 1.5 pixels."""
     return jnp.clip((wavelength / footprint - 1.5) / 2.5, 0.0, 1.0)
 
 
 def slab(x: Array, half: Array | float, footprint: Array) -> Array:
-    """Return the share of |x| < half in a box about x, half a pixel wide (a pixel has samples)."""
+    """Return the share of |x| < half in a box about x that is half a pixel wide."""
     width = 0.5 * footprint + 1e-6
     return (jnp.clip(x + width / 2, -half, half) - jnp.clip(x - width / 2, -half, half)) / width
 
@@ -83,7 +83,7 @@ def smooth(low: float, high: float, x: Array) -> Array:
 
 
 def _bits(x: Array, y: Array, z: Array, salt: Array) -> Array:
-    """Return 32 well-mixed bits of integer lattice coordinates (Wang-style finaliser)."""
+    """Return 32 well-mixed bits of integer lattice coordinates (mixed as by lowbias32)."""
     h = x * jnp.uint32(0x8DA6B343) + y * jnp.uint32(0xD8163841) + z * jnp.uint32(0xCB1AB31F)
     h = h + salt
     h = (h ^ (h >> 16)) * jnp.uint32(0x7FEB352D)
@@ -117,7 +117,7 @@ def hash3(x: Array, y: Array, z: Array, seed: int) -> Array:
 
 
 def value_noise(x: Array, y: Array, z: Array, seeds: tuple[int, ...]) -> Array:
-    """Return smooth value noise, about [-1, 1], wavelength about 2 cells.
+    """Return smooth value noise in [-1, 1] with a wavelength of about 2 cells.
 
     Coordinates are in cells, [S R], with a row for each seed; the three channels of the result are
     independent, [3 S R].

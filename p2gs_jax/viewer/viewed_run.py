@@ -16,9 +16,9 @@ from p2gs_jax.types import Camera
 from p2gs_jax.viewer import camera as cameras
 from p2gs_jax.viewer.renderer import Renderer
 
-# Number of views on which new programs are run.
+# Number of views for which the tile lists of new programs have room.
 PROBES = 4
-# Cameras closer than this count as being at one position, in typical distances.
+# Cameras closer than this share of the typical distance count as being at one position.
 SAME_PLACE = 1e-3
 
 

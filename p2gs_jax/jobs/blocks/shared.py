@@ -39,7 +39,7 @@ def solve_shared(
 ) -> Shared:
     """Solve the photometry of a scene; `kept` has the earlier decisions of a resumed run.
 
-    UserError: no point is seen by two photographs.
+    UserError: no point of a surface is seen by two photographs.
     """
     still = store.leaving_out(scene.objects, cfg.dynamics.margin).only_opaque()
     solved = solve_exposures(scene, still, cfg, reporter, kept=kept)
@@ -89,7 +89,7 @@ def write_shared(folder: Path, shared: Shared) -> None:
 
 
 def read_shared(folder: Path, scene: Scene, cfg: FitConfig) -> Shared:
-    """Return the shared photometry of the blocks for a `scene` without it; adds point colours.
+    """Return the stored photometry of the blocks, and `scene` with the stored point colours.
 
     UserError: the files are broken, or of another scene.
     """

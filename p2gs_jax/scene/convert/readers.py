@@ -54,7 +54,7 @@ _RAW_SETTINGS |= {"focal_length": _FOCAL_LENGTH}
 # OpenEXR's standard attributes.
 _EXR_SETTINGS = {"expTime": _TIME, "aperture": _F_NUMBER, "isoSpeed": _ISO}
 _EXR_ERRORS = (RuntimeError, KeyError, OSError, ValueError)
-# The first bytes of a file, in which Canon writes the settings.
+# Canon writes the settings within this many bytes from the begin of a file.
 _RAW_HEADER = 2**18
 _AGAIN = "copy that photograph again, or remove it from the scene"
 
@@ -64,7 +64,7 @@ class Picture:
     """A decoded photograph: display values (`codes`, `profile`) or light.
 
     The largest unsigned integer in `codes` stands for 1; channels are R G B, R G B A or one. Light
-    is linear in sRGB's primaries. `invalid` counts pixels that are not numbers, which are black.
+    is linear in sRGB's primaries, `alpha` in [0, 1]. `invalid` counts pixels with NaN, stored as 0.
     """
 
     codes: UInt[np.ndarray, "h w c"] | None = None
@@ -96,7 +96,7 @@ def pillow_heif(path: Path) -> Any:
 
 
 def read_heif(path: Path) -> Picture:
-    """Return display values, or the light of a HEIC whose transfer function is HLG or PQ.
+    """Return display values of a HEIC, AVIF or WebP, or its light if it is coded in HLG or PQ.
 
     Raises UserError: the library is missing, or the file is broken.
     """
@@ -168,7 +168,7 @@ class RawFacts:
 def read_facts(path: Path) -> RawFacts:
     """Return the metadata of a raw file without reading pixels.
 
-    Raises UserError: rawpy is not installed, or LibRaw does not support this file.
+    Raises UserError: rawpy is not installed, or LibRaw cannot read this file.
     """
     with _raw(path) as raw:
         chosen = [float(x) for x in raw.camera_whitebalance[:3]]
@@ -351,7 +351,7 @@ def _exif_of(shot: dict[int, float]) -> Image.Exif | None:
 
 
 def size_of(path: Path) -> tuple[int, int] | None:
-    """Return (width, height) of raw and OpenEXR; None: Pillow opens the file.
+    """Return (width, height) of raw and OpenEXR, pixels; None: Pillow opens the file.
 
     Raises UserError: the file is broken, or a package for it is missing.
     """
@@ -365,7 +365,7 @@ def size_of(path: Path) -> tuple[int, int] | None:
 
 @dataclass(frozen=True)
 class ExifSettings:
-    """Exposure time (seconds), f-number, sensitivity (ISO) and local date; None: not in EXIF."""
+    """Exposure time (seconds), f-number, ISO, local `YYYY:MM:DD HH:MM:SS`; None: not in EXIF."""
 
     time: float | None = None
     aperture: float | None = None
@@ -399,7 +399,7 @@ def exif_evs(paths: Sequence[Path], cameras: Sequence[str] = ()) -> list[float |
     """Return log2(time * ISO / N^2) of photographs, stops; None where EXIF does not give it.
 
     Only differences matter. A setting that no photograph states is a constant (ISO 100). A missing
-    setting gets the value of the same camera if all other photographs of it have the same value.
+    setting gets the value of the same camera if all its photographs that state one agree.
     Exposure bias is ignored: the shutter contains it. For `images_2` the EXIF of `images` counts.
     """
     shots = [read_exif_settings(path) for path in map(_original, paths)]
@@ -432,7 +432,7 @@ def _original(path: Path) -> Path:
 def read_exif_camera(path: Path, *, zoom: bool = False) -> str:
     """Return make, model, serial number and lens as one string; empty without EXIF.
 
-    With `zoom`, the focal length is added.
+    With `zoom`, the focal length is added. EXIF behind the pixels of a PNG is not read.
     """
     tags = _exif_tags(path, behind=False)
     wanted = (_MAKE, _MODEL, _SERIAL, _LENS, *([_FOCAL_LENGTH] if zoom else []))

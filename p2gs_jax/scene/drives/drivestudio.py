@@ -4,16 +4,16 @@
     intrinsics/C.txt               fx fy cx cy k1 k2 p1 p2 k3
     extrinsics/C.txt               camera to car; x forward, y left, z up, for both
     ego_pose/TTT.txt               car to world
-    lidar/TTT.bin                  rows of 14 float32; columns 3 to 5 are a point in the car's axes
+    lidar/TTT.bin                  rows of 14 float32; [3:6] is a point in the car's axes, m
     instances/instances_info.json  boxes (drivestudio)
 
 Layout: github.com/ziyc/drivestudio, docs/Waymo.md and datasets/waymo/waymo_preprocess.py;
-github.com/NVlabs/EmerNeRF, datasets/waymo_preprocess.py. Street Gaussians has the same names of
-files with other axes (script/waymo/waymo_converter.py), which are refused.
+github.com/NVlabs/EmerNeRF, datasets/waymo_preprocess.py. The files of Street Gaussians have the
+same names but other axes (script/waymo/waymo_converter.py), and this reader rejects them.
 
-There are no time stamps. The pose of the car is that of the middle of the upper scanner's turn
-(`waymo`), and counts as the pose at all photographs of the frame: they were taken up to 0.05 s
-earlier or later. Points and boxes get the time at which the upper scanner passed.
+There are no time stamps: frame T is at 0.1 T seconds. The car's pose is that in the middle of the
+upper scanner's turn (`waymo`), and all photographs of the frame get it, although they were taken up
+to 0.05 s earlier or later. Points and boxes get the time at which the upper scanner passed.
 """
 
 from __future__ import annotations
