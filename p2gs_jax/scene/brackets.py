@@ -40,7 +40,7 @@ def brackets(views: Sequence[View]) -> list[int]:
     centers = camera_centers(np.stack([view.viewmat for view in views]))
     cameras = np.array([view.camera for view in views])
     radius = {
-        camera: float(np.median(np.linalg.norm(own - own.mean(0), axis=1)))
+        camera: float(np.median(np.linalg.norm(own - np.median(own, 0), axis=1)))
         for camera in np.unique(cameras)
         for own in [centers[cameras == camera]]
     }

@@ -114,12 +114,13 @@ def _read(path: Path) -> dict[str, float]:
         why = f"cannot be read: {getattr(error, 'strerror', None) or error}."
         fix = "name a CSV file with the columns image and ev, or exif"
         raise broken(path, why, fix) from error
-    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
-    reader = csv.DictReader(lines)
+    lines = ["" if line.startswith("#") else line.strip() for line in text.splitlines()]
+    first = next((k for k, line in enumerate(lines) if line), 0)
+    reader = csv.DictReader(lines[first:])
     try:
         names = [n.strip() for n in reader.fieldnames or []]
         reader.fieldnames = names
-        rows = list(reader)
+        rows = [(first + reader.line_num, row) for row in reader]
     except csv.Error as error:
         raise broken(path, f"is not a CSV file: {error}.", "write it again") from None
     kind = next((n for n in KINDS if n in names), None)
@@ -128,7 +129,7 @@ def _read(path: Path) -> dict[str, float]:
         why = f"has the columns {', '.join(names) or 'none'}."
         raise broken(path, why, f"it needs `image` and one of {', '.join(KINDS)}")
     out = {}
-    for number, row in enumerate(rows, 2):
+    for number, row in rows:
         if not (text := row[kind] or "").strip():
             continue
         try:

@@ -67,6 +67,7 @@ def test_exif():
     [
         ("image,value\na.png,1\n", "columns image, value"),
         ("image,exposure\na.png,-1\n", "line 2"),
+        ("# by hand\n\nimage,exposure\n\na.png,-1\n", "line 5"),
         ("image,exposure\nother.png,1\n", "names none of the 1"),
         pytest.param(f"image,ev\n{'x' * 200_000},1\n", "e.csv is not a CSV file", id="long"),
     ],

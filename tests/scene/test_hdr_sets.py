@@ -15,6 +15,7 @@ from scene.helpers import (
     write_tiny_model,
 )
 from scene.test_transforms import held_out, rows, write_llff
+from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.evaluation.references import find_radiance
@@ -191,6 +192,11 @@ def test_other_photographs_are_no_brackets(tmp_path, shots):
     assert brackets(views) == [*range(len(views))]
     still = taken(tmp_path, ("a", 0.0, None), ("b", 0.0, None), end=0.0)
     assert brackets(still) == [0, 1, 2, 3]
+    # The mean of equal centres may differ from them by rounding.
+    turn = Rotation.from_euler("xyz", (15, 20, 30), degrees=True).as_matrix()
+    viewmat = np.float32([*np.c_[turn, (0.1, -3.7, 11.3)], (0, 0, 0, 1)])
+    turned = replace(still[0], viewmat=viewmat)
+    assert brackets([replace(turned, name=f"{k}.png") for k in range(10)]) == [*range(10)]
 
 
 def test_brackets_of_photographs_alone_are_told_by_their_names(tmp_path):

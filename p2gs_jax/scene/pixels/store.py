@@ -272,11 +272,7 @@ class _DecodedPhotographs:
 
     def prefetch(self, key: Key) -> None:
         with self._lock:
-            if (
-                key in self._cache
-                or key in self._pending
-                or len(self._pending) >= MOST_PENDING * DECODERS
-            ):
+            if key in self._cache or key in self._pending or len(self._pending) >= MOST_PENDING:
                 return
             pending = self._pending[key] = self._worker.submit(self._load, key)
         pending.add_done_callback(lambda _: self._pending.pop(key, None))

@@ -19,6 +19,7 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.scene import ImageStore, size_at
 from p2gs_jax.scene.lens import undistort_points
 from p2gs_jax.scene.pixels import cache, decode
+from p2gs_jax.scene.pixels import store as store_module
 from p2gs_jax.scene.pixels.store import decoded_into
 from p2gs_jax.types import Distortion
 
@@ -115,6 +116,19 @@ def test_cache_is_bounded_and_reused(tmp_path):
     views[0].image_path.unlink()
     with refused(r"cannot read .*0.png"):
         store.get(0)
+
+
+def test_decoding_ahead_is_bounded_on_many_cores(tmp_path, monkeypatch):
+    monkeypatch.setattr(store_module, "DECODERS", 3)
+    monkeypatch.setattr(store_module, "MOST_PENDING", 4)
+    store = store_of(*(make_view(tmp_path / f"{k}.png", noise(3)) for k in range(9)))
+    photographs, gate = store._photographs, threading.Event()
+    monkeypatch.setattr(photographs, "_load", lambda key: gate.wait(60))
+    for k in range(9):
+        store.prefetch(k)
+    waiting = len(photographs._pending)
+    gate.set()
+    assert waiting == 4
 
 
 def test_prefetch_from_many_threads(tmp_path):
