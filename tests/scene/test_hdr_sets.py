@@ -194,7 +194,8 @@ def test_other_photographs_are_no_brackets(tmp_path, shots):
     assert brackets(still) == [0, 1, 2, 3]
     # The mean of equal centres may differ from them by rounding.
     turn = Rotation.from_euler("xyz", (15, 20, 30), degrees=True).as_matrix()
-    viewmat = np.float32([*np.c_[turn, (0.1, -3.7, 11.3)], (0, 0, 0, 1)])
+    viewmat = np.eye(4, dtype=np.float32)
+    viewmat[:3] = np.c_[turn, (0.1, -3.7, 11.3)]
     turned = replace(still[0], viewmat=viewmat)
     assert brackets([replace(turned, name=f"{k}.png") for k in range(10)]) == [*range(10)]
 
