@@ -124,7 +124,7 @@ def test_the_notes_name_the_first_views():
     assert "1 view(s) are completely hidden" in hidden
     assert "(a.png)" in hidden
     assert "10 photograph(s)" in unknown
-    assert "4.png, ...)" in unknown
+    assert "4.png and 5 more)" in unknown
     assert notes_on_missing({"train": {}}) == []
 
 

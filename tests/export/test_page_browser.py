@@ -126,6 +126,7 @@ def test_the_exposure_slider_multiplies_light_by_exactly_two_to_the_ev(open_page
 def test_the_picture_is_developed_as_ours(open_page, fitted):
     camera, transform = fitted.camera(1), fitted.own_display(1)
     page = open_page(size=(camera.width, camera.height))
+    page.tab.locator("#keep").evaluate("box => { box.checked = false; }")
     for curve in ("srgb", "power", "linear"):
         page(f'(p.go(1), p.set({{curve: "{curve}", gamma: 1.9}}))')
         linear = np.ascontiguousarray(page.light(1, linear=True)[..., :3])
@@ -196,7 +197,7 @@ def test_what_cannot_be_drawn_is_said(open_page):
     page.expect("cannot render light")
 
 
-def test_clicking_a_camera_goes_there_and_takes_its_exposure(open_page):
+def test_clicking_a_camera_goes_there_and_uses_its_exposure_if_asked(open_page):
     page = open_page()
     page("(p.hands.approach(0.4), p.marksShown = true, p.show())")
     page.canvas()
@@ -204,7 +205,10 @@ def test_clicking_a_camera_goes_there_and_takes_its_exposure(open_page):
     page.tab.mouse.click(mark["x"], mark["y"])
     at = page("p.state.at")
     assert at is not None
-    assert page("p.state.look.ev") == page(f"p.scene.views[{at}].ev")
+    assert page("p.state.look.ev") == 0  # all photographs are shown under one exposure
+    page.tab.locator("#keep").evaluate("box => { box.checked = false; }")
+    page(f"p.go({at})")
+    assert page("p.state.look.ev") == page(f"p.scene.views[{at}].ev") != 0
 
 
 def test_dragging_wheel_and_keys_move_and_say_how_fast(open_page):
