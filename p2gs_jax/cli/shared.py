@@ -79,6 +79,7 @@ OTHERS = {
     SCENE: "--source-path --data --data-dir -s",
 }
 SYNONYMS = {theirs: ours for ours, names in OTHERS.items() for theirs in names.split()}
+INSTALL_VIEWER = "pip install 'p2gs-jax[viewer]'"
 
 
 def parse_duration(text: str) -> float:
@@ -105,10 +106,14 @@ def check(condition: bool, text: str, *, fix: str | None = None) -> None:
         raise UserError(text + ".", fix=fix)
 
 
+def has_viewer() -> bool:
+    """Return whether the libraries of the viewer are installed."""
+    return find_spec("viser") is not None
+
+
 def require_viewer() -> None:
     """Raise a UserError unless the libraries of the viewer are installed."""
-    why = "the viewer needs viser, which is not installed"
-    check(find_spec("viser") is not None, why, fix="pip install 'p2gs-jax[viewer]'")
+    check(has_viewer(), "the viewer needs viser, which is not installed", fix=INSTALL_VIEWER)
 
 
 def check_option_names(command: str, argv: Sequence[str], options: Collection[str]) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from p2gs_jax.cli.shared import INSTALL_VIEWER, has_viewer
 from p2gs_jax.core.clock import NO_PARTS, whole_run
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.core.progress import PlainConsole
@@ -72,7 +72,7 @@ def print_headline(metrics: dict[str, Any], run: Path) -> None:
             break
     facts.append(count_of(metrics["counts"]["gaussians"], "Gaussian"))
     facts.append(duration(whole_run(metrics["seconds"]) or 0.0))
-    viewer = "" if find_spec("viser") else "   # first: pip install 'p2gs-jax[viewer]'"
+    viewer = "" if has_viewer() else f"   # first: {INSTALL_VIEWER}"
     next_ones = ("view {}" + viewer, "report {}", "export {} --format html")
     lines = [f"{', '.join(facts)}.", "Next:"]
     if part.get("psnr", LOW_DB) < LOW_DB:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import errno
 import re
 import resource
@@ -50,16 +49,6 @@ def resident() -> int:
     """Return the bytes of memory that this process holds; 0 if that is unknown."""
     pages = text_of(STATM).split()
     return int(pages[1]) * resource.getpagesize() if len(pages) > 1 else 0
-
-
-def give_back() -> None:
-    """Return freed memory to the system; glibc keeps arrays below 32 MB for later ones.
-
-    With photographs of 12 MP in several threads it kept 1 GB. Other C libraries have no such call.
-    """
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:
-        trim(0)
 
 
 def peak_bytes() -> int | None:

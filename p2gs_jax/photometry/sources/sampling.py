@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from p2gs_jax.core.memory import give_back
 from p2gs_jax.core.numerics import srgb_decode, srgb_encode
+from p2gs_jax.core.runtime import return_freed_memory
 from p2gs_jax.core.threads import map_in_order
 from p2gs_jax.photometry.formation import places
 from p2gs_jax.photometry.observations import COARSEST, Labels, Observations
@@ -66,16 +66,11 @@ def sample_patches(
 
     The average is over linear values. The position of a patch is uncertain by `deviation` pixels.
     """
-    grids = list(grids)
-    linear = _light_around(ldr, grids)
+    within = [_within(grid, *mask.shape[::-1]) for grid in grids]
+    linear = _light_around(ldr, [nearest for *_, nearest in within])
     colors, spread, brightest = (np.zeros((count, 3), np.float32) for _ in range(3))
     valid = np.zeros(count, bool)
-    height, width = mask.shape
-    for rows, xy in grids:
-        position = (xy - 0.5).astype(np.float32)
-        nearest = np.rint(position).astype(int)
-        here = ((nearest >= 0) & (nearest < [width, height])).all((1, 2, 3))
-        rows, position, nearest = rows[here], position[here], nearest[here]
+    for rows, position, nearest in within:
         x, y = nearest[..., 0], nearest[..., 1]
         light = _between(linear, position)
         colors[rows] = srgb_encode(light.mean((1, 2)))
@@ -86,19 +81,26 @@ def sample_patches(
     return Samples(colors, spread, brightest, valid)
 
 
+def _within(
+    grid: Grid, width: int, height: int
+) -> tuple[Int[np.ndarray, " g"], Float32[np.ndarray, "g a b 2"], Int[np.ndarray, "g a b 2"]]:
+    """Return the patches within an image: rows, positions with pixels at integers, pixels."""
+    position = (grid.xy - 0.5).astype(np.float32)
+    nearest = np.rint(position).astype(int)
+    here = ((nearest >= 0) & (nearest < [width, height])).all((1, 2, 3))
+    return grid.rows[here], position[here], nearest[here]
+
+
 def _light_around(
-    ldr: Float32[np.ndarray, "h w 3"], grids: Iterable[Grid]
+    ldr: Float32[np.ndarray, "h w 3"], pixels: Iterable[Int[np.ndarray, "g a b 2"]]
 ) -> Float32[np.ndarray, "h w 3"]:
-    """Return linear values of the pixels around all positions, and 0 elsewhere.
+    """Return linear values of some pixels (x, y) and those around them, and 0 elsewhere.
 
     Most pixels of a large photograph lie in no patch, and converting all of them is slow.
     """
-    height, width, _ = ldr.shape
-    near = np.zeros((height, width), np.uint8)
-    for _, xy in grids:
-        x, y = np.rint(xy.reshape(-1, 2) - 0.5).astype(int).T
-        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-        near[y[inside], x[inside]] = 1
+    near = np.zeros(ldr.shape[:2], np.uint8)
+    for nearest in pixels:
+        near[nearest[..., 1], nearest[..., 0]] = 1
     near = cv2.dilate(near, np.ones((3, 3))) > 0
     linear = np.zeros(ldr.shape, np.float32)
     linear[near] = srgb_decode(ldr[near])
@@ -176,7 +178,7 @@ def point_colors(
     parts: list[tuple[np.ndarray, ...]] = [(none, none, *[nothing] * 3, nothing[:, :2])]
     for done, found in enumerate(map_in_order(read, rows)):
         parts.append(found)
-        give_back()
+        return_freed_memory()  # of photographs of 12 MP, 1 GB
         if on_view is not None:
             on_view(done + 1, len(rows))
     of_view, seen, colors, spread, brightest, positions = map(
