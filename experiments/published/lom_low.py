@@ -1,7 +1,7 @@
 """The low-light protocol of Aleth-NeRF on any LOM scene: fitted to `low`, judged against `high`.
 
 python experiments/published/lom_low.py LOM_SCENE... --out DIR [--methods robust 3dgs luminance_gs]
-    [--steps 600]
+    [--steps 600] [--mixed]
 
 The authors' `transforms_test.json` lists the held-out views. They never align: their method
 brightens by itself, with a degree and a gain that they chose for each scene, and PSNR is that of
@@ -16,6 +16,9 @@ by this. The name of each score says what the method is given:
   LOM metered every view anew (0.1 EV), which limits every score with one exposure for all views;
 - `exposure`: one exposure for all views, solved from the `high` photographs of the training views;
 - `all`: the same for exposure, gamma and white balance.
+
+With --mixed every view draws its dark or its bright photograph, as in `lom_mixtures.py`; `common`
+is the score under the mean parameters of the bright training views, beside `per_view`.
 
 No photograph of these scenes may be in this project: keep --out outside of it.
 """
@@ -38,7 +41,8 @@ from p2gs_jax.photometry.display import with_capture
 
 sys.path.insert(0, str(HERE.parent))
 
-from mixtures import their_test_views, write_mixture
+from lom_mixtures import under_common_exposure
+from mixtures import read_groups, their_test_views, write_mixture
 
 METHODS = ("robust", "3dgs", "luminance_gs")
 MEAN, STOPS, HALVINGS = 0.5, 12.0, 30
@@ -126,27 +130,38 @@ def figures(run: p2gs_jax.Run) -> dict[str, float]:
     return out
 
 
+def figures_of_mixture(run: p2gs_jax.Run) -> dict[str, float]:
+    """Return PSNR against `high`; nothing is fitted to held-out views for `common`."""
+    found = under_common_exposure(run, read_groups(run.scene.root))
+    return {"common": found.psnr, "per_view": found.per_view}
+
+
 def main() -> None:
-    args = options(__doc__, "lom", METHODS, (600,)).parse_args()
+    parser = options(__doc__, "lom", METHODS, (600,))
+    parser.add_argument("--mixed", action="store_true", help="fitted to `low` and `high` together")
+    args = parser.parse_args()
     if args.out.resolve().is_relative_to(HERE.parents[1].resolve()):
         raise SystemExit("--out is inside this project, where no picture of these scenes may be.")
     folders = {lom.resolve().name.removeprefix("lom_"): lom for lom in args.scenes}
+    benchmark, groups, judge = "lom_low", ["low"], figures
+    if args.mixed:
+        benchmark, groups, judge = "lom_mixed", ["low", "high"], figures_of_mixture
 
     def row(key: Key) -> dict[str, Any]:
         lom = folders[key.scene]
-        scene = args.out / key.scene
+        scene = args.out / (f"{key.scene}_mixed" if args.mixed else key.scene)
         if not scene.exists():
-            write_mixture(lom, scene, ["low"], their_test_views(lom))
-        run = args.out / "runs" / f"{key.scene}_{key.method}_{key.steps}"
+            write_mixture(lom, scene, groups, their_test_views(lom))
+        run = args.out / "runs" / f"{scene.name}_{key.method}_{key.steps}"
         chosen = ("--preset", key.method, "--steps", str(key.steps))
         fit = fitted(scene, run, (*chosen, "--reference", str(scene / "reference")), args.again)
         command = (
             f"python experiments/published/lom_low.py LOM_{key.scene.upper()} "
-            f"--methods {key.method} --steps {key.steps}"
+            f"{'--mixed ' if args.mixed else ''}--methods {key.method} --steps {key.steps}"
         )
-        return {"figures": figures(p2gs_jax.load_run(run)), **of_fit(fit, command)}
+        return {"figures": judge(p2gs_jax.load_run(run)), **of_fit(fit, command)}
 
-    wanted = [Key("lom_low", n, m, s) for s in args.steps for n in folders for m in args.methods]
+    wanted = [Key(benchmark, n, m, s) for s in args.steps for n in folders for m in args.methods]
     measure(wanted, row, args.again)
 
 

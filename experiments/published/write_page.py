@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from statistics import fmean
 from typing import Any
 
 from published_rows import HERE, Key, read_rows, shown_seconds
@@ -16,8 +17,8 @@ from p2gs_jax.core.atomic import write_text
 OUT = HERE.parent / "PUBLISHED.md"
 HEAD = """# Beside published figures
 
-This page has our figures beside published ones. Each row is one run with one seed, and has its
-command, the seconds of the whole fit, and the commit.
+This page has our figures beside published ones. A row of the first table is a claim, with what
+differs from the published protocol. The sections below have all rows, each one run with one seed.
 `python experiments/published/write_page.py` writes the page from [rows.json](published/rows.json)
 and [published.json](published/published.json). [The README of the scripts](published/README.md)
 says how rows are made and which systems were not run. The machine is that of
@@ -29,16 +30,7 @@ Splats are blurred by 0.05 pixels^2 unless the row names another blur. Until com
 05f3698 (2026-11-26); until then long fits slowed the learning of colours as well
 ([length](results/2026-11-25-length.md)).
 """
-NOT_RUN = "Not run yet."
-AT_SIZE, HDR = HERE.parent / "at_size.json", "mu_law_novel"
-HDR_HEAD = """## HDR radiance, as GaussHDR and HDR-NeRF judge it
-
-The score is the PSNR of radiance after log(1 + 5000 x) / log(5001). The brightest true value of a
-view is 1, and one scale is fitted to all views (`p2gs_jax/evaluation/radiance.py`). We do not have
-their scenes, so no published figure stands beside ours. The rows are of a town of 300 photographs
-whose true radiance is known ([at size](RESULTS.md#at-size-300-photographs-of-480x325-7000-steps)).
-Photographs of one exposure (ISO-Const) do not determine the tone curve.
-"""
+AT_SIZE = HERE.parent / "at_size.json"
 
 
 def table(header: list[str], rows: list[list[str]]) -> list[str]:
@@ -52,26 +44,16 @@ def section(
 ) -> list[str]:
     """Return the lines of a benchmark: published figures, ours, and how they came about."""
     lines = [f"## {benchmark['title']}", ""]
-    if benchmark["published"]:
-        lines += ["Published:", ""]
-        lines += table(
-            ["scene", "method", "PSNR, dB", "source"],
-            [
-                [p["scene"], p["method"], f"{p['psnr']:.2f}", p["source"]]
-                for p in benchmark["published"]
-            ],
-        )
-        lines += [""]
-    own = {key: row for key, row in sorted(rows.items()) if key.benchmark == name}
+    if published := benchmark["published"]:
+        cells = [[p["scene"], p["method"], f"{p['psnr']:.2f}", p["source"]] for p in published]
+        header = ["scene", "method", "PSNR, dB", "source"]
+        lines += ["Published:", "", *table(header, cells), ""]
     figures = benchmark["figures"]
-    if own:
-        lines += ["Ours:", ""]
-        header = ["scene", "method", "steps", *figures.values(), "minus the best published, dB"]
-        header += ["Gaussians", "seconds", "commit", "command"]
-        lines += table(header, [_cells(key, row, benchmark) for key, row in own.items()])
-    else:
-        lines += [NOT_RUN]
-    lines += [""]
+    own = {key: row for key, row in sorted(rows.items()) if key.benchmark == name}
+    cells = [_cells(k, r, benchmark) for k, r in own.items() if r["figures"].keys() & figures]
+    header = ["scene", "method", "steps", *figures.values(), "minus the best published, dB"]
+    header += ["Gaussians", "seconds", "commit", "command"]
+    lines += ["Ours:", "", *table(header, cells), ""]
     for note in benchmark["notes"]:
         lines += [f"- {note}"]
     return [*lines, ""] if benchmark["notes"] else lines
@@ -94,25 +76,27 @@ def _cells(key: Key, row: Mapping[str, Any], benchmark: Mapping[str, Any]) -> li
     ]
 
 
-def hdr_section(rows: Mapping[Key, Mapping[str, Any]]) -> list[str]:
-    """Return the lines of the HDR score, with the rows that have one."""
-    found = {key: row for key, row in sorted(rows.items()) if HDR in row["figures"]}
-    header = ["photographed at", "method", "steps", "mu law, novel views, dB", "commit", "command"]
-    cells = [
-        [
-            *(key.scene, key.method, str(key.steps), f"{row['figures'][HDR]:.2f}"),
-            *(row["commit"], f"`{row['command']}`"),
-        ]
-        for key, row in found.items()
-    ]
-    return [HDR_HEAD, *table(header, cells), ""]
+def claims(published: Mapping[str, Any], rows: Mapping[Key, Mapping[str, Any]]) -> list[str]:
+    """Return the lines of the table of claims, with means over the scenes of each."""
+    cells = []
+    for name, benchmark in published.items():
+        for claim in benchmark.get("claims", ()):
+            scenes, method, steps = claim["scenes"], claim["method"], claim["steps"]
+            found = [rows[Key(name, scene, method, steps)] for scene in scenes]
+            known = {
+                p["scene"]: p for p in benchmark["published"] if p["method"] == claim["theirs"]
+            }
+            ours = fmean(row["figures"][claim["figure"]] for row in found)
+            theirs = fmean(known[scene]["psnr"] for scene in scenes)
+            result = f"{abs(ours - theirs):.2f} dB {'ahead' if ours > theirs else 'behind'}"
+            cells += [[f"{claim['claim']}: {result}", f"{ours:.2f} (`{method}`, {steps:,} steps)"]]
+            cells[-1] += [f"{theirs:.2f} ({claim['theirs']})", claim["protocol"], claim["differs"]]
+            cells[-1] += ["<br>".join(f"`{row['command']}`" for row in found)]
+    header = ["claim", "ours, dB", "theirs, dB", "protocol", "what differs", "command"]
+    return [*table(header, cells), ""]
 
 
-def page(
-    published: Mapping[str, Any],
-    rows: Mapping[Key, Mapping[str, Any]],
-    at_size: Mapping[Key, Mapping[str, Any]],
-) -> str:
+def page(published: Mapping[str, Any], rows: Mapping[Key, Mapping[str, Any]]) -> str:
     """Return the whole page.
 
     Raises:
@@ -120,16 +104,15 @@ def page(
     """
     if unknown := {key.benchmark for key in rows} - set(published):
         raise SystemExit(f"published.json lacks {', '.join(sorted(unknown))}, as in rows.json")
-    lines = [HEAD]
+    lines = [HEAD, *claims(published, rows)]
     for name, benchmark in published.items():
         lines += section(name, benchmark, rows)
-    lines += hdr_section(at_size)
     return "\n".join(lines).rstrip() + "\n"
 
 
 def main() -> None:
     published = json.loads((HERE / "published.json").read_text(encoding="utf-8"))
-    write_text(OUT, page(published, read_rows(), read_rows(AT_SIZE)))
+    write_text(OUT, page(published, read_rows() | read_rows(AT_SIZE)))
 
 
 if __name__ == "__main__":

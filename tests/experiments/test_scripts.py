@@ -35,6 +35,6 @@ def test_the_package_calls_nothing_unsafe(tmp_path):
 
 
 def test_the_page_in_the_repository_is_that_of_its_rows():
-    rows, at_size = published_rows.read_rows(), published_rows.read_rows(write_page.AT_SIZE)
+    rows = published_rows.read_rows() | published_rows.read_rows(write_page.AT_SIZE)
     published = json.loads((published_rows.HERE / "published.json").read_text(encoding="utf-8"))
-    assert write_page.OUT.read_text(encoding="utf-8") == write_page.page(published, rows, at_size)
+    assert write_page.OUT.read_text(encoding="utf-8") == write_page.page(published, rows)
