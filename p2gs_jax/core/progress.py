@@ -51,13 +51,14 @@ class LogRecord:
     step_seconds: float
     left_s: float | None
     terms: dict[str, float]
+    steps: int | None = None  # of the whole run; None: unknown, under a time budget
 
     def summary(self) -> str:
         """Return the progress of the run as text."""
-        total = max(round(self.step / self.progress), self.step) if self.progress else "?"
+        of = "" if self.steps is None else f" of {self.steps}"
         left = "" if self.left_s is None else f", {as_clock(self.left_s)} left"
         scores = f"loss {self.loss:.4f}, training PSNR {self.psnr:.2f} dB"
-        return f"step {self.step} of {total}, {scores}{left}, {self.gaussians} Gaussians"
+        return f"step {self.step}{of}, {scores}{left}, {self.gaussians} Gaussians"
 
 
 class Reporter:

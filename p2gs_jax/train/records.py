@@ -25,13 +25,17 @@ SHARE, LATEST = 0.01, 20.0
 
 
 def record_of(
-    reports: Sequence[StepReport], host: HostState, gaussians: int, left_s: float | None
+    reports: Sequence[StepReport],
+    host: HostState,
+    gaussians: int,
+    left_s: float | None,
+    steps: int | None,
 ) -> LogRecord:
     """Return the log record of a burst.
 
     `reports` are the reports of its steps; `host` and `gaussians` are the counters and the
     population after it. `left_s` is the estimated time of optimisation left, seconds; None: not
-    known yet.
+    known yet. `steps` is the length of the run; None under a time budget.
     """
     reports = jax.device_get(list(reports))  # in one transfer, because each costs a round trip
     last = reports[-1]
@@ -47,6 +51,7 @@ def record_of(
         step_seconds=round(host.step_s, 5),
         left_s=None if left_s is None else round(left_s, 1),
         terms={k: _mean(r.terms[k] for r in reports) for k in last.terms},
+        steps=steps,
     )
 
 

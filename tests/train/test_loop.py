@@ -8,6 +8,7 @@ import pytest
 from loop_harness import SHORT, Harness, Programs, signalled
 
 from p2gs_jax.core.interrupts import Interrupted
+from p2gs_jax.core.progress import LogRecord
 from p2gs_jax.errors import DivergenceError, UserError
 from p2gs_jax.jobs.configs import with_fields
 
@@ -80,10 +81,12 @@ def test_a_longer_run_that_is_killed_before_it_saves_goes_on_as_if_nothing_had_b
     harness.run(longer, resume=True)
     logged = [line["progress"] for line in harness.log()]
     assert logged == pytest.approx([k / 40 for k in range(1, 41)], abs=1e-6)
+    assert "step 200 of 200, loss" in LogRecord(**harness.log()[-1]).summary()
 
 
 def test_a_run_that_its_budget_ended_goes_on_under_a_larger_one(harness):
     first, _ = harness.run(BUDGET)
+    assert "step 5, loss" in LogRecord(**harness.log()[0]).summary()
     result, programs = harness.run(with_fields(BUDGET, {"train.budget_s": 120.0}), resume=True)
     assert programs.taken[0][2] == pytest.approx(first.host.progress / 2)
     assert result.host.progress == pytest.approx(1.0, abs=0.01)

@@ -320,7 +320,7 @@ def test_the_panel_holds_what_it_is_set_to(viewed, run):
         assert not panel.locked.value
         last = read_jsonl(run.folder / "log.jsonl")[-1]
         panel.show_training([last | {"step": k, "loss": 1 / k} for k in range(1, 2001)])
-        assert "step 2000 of 2000, loss 0.0005" in panel._progress.content
+        assert f"step 2000 of {last['steps']}, loss 0.0005" in panel._progress.content
         loss, exposures = (chart.data for chart in panel._charts)
         assert (loss[0][0], loss[0][-1], loss[1][-1]) == (1, 2000, 1 / 2000)
         assert len(loss[0]) <= panels.MOST_RECORDS
