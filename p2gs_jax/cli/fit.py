@@ -94,7 +94,6 @@ class Fit:
         if cluster.blocks is None:
             use_cores(self.threads)
         with WatchedReporter(out, self.port) if self.view else TerminalReporter() as reporter:
-            reporter.message(f"Run folder: {out}")
             common = {"reference": self.reference, "resume": self.resume, "reporter": reporter}
             if cluster.blocks is None:
                 # The budget includes the start of Python, whose duration is about its CPU time.

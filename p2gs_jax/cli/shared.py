@@ -64,6 +64,7 @@ RENAMED = {
 SCENE = "the scene's folder itself, without an option"
 # Our names for commands and options of 3DGS, gsplat and nerfstudio.
 COMMANDS_OF_OTHERS = {"train": "fit SCENE", "viewer": "view RUN", "metrics": "eval RUN"}
+COMMANDS_OF_OTHERS |= {"simple_trainer": "fit SCENE"}
 OTHERS = {
     "--steps": "--iterations --iters --max-steps --max-num-iterations --num-iterations",
     "--gaussians": "--cap-max --max-gaussians --num-gaussians",

@@ -86,6 +86,7 @@ def load(
     if len(scene.points) == 0:
         fix = "check the poses and that the photographs overlap"
         raise UserError(f"{scene_dir} has no seed points.", fix=fix)
+    reporter.message(f"Run folder: {run_dir}")
     reporter.message(f"Held out: {held} of {len(scene.views)} views ({scene.split_by}).")
     if clock is not None:
         # Without a model, nearly all of it is finding and matching features.

@@ -24,6 +24,7 @@ WRONG = [
     ("fit", "SCENE"),
     ("fit castle --resume", "name the run with --out"),
     ("train.py -s castle -m run", "p2gs-jax fit SCENE"),
+    ("simple_trainer.py mcmc --data-dir castle", "p2gs-jax fit SCENE"),
     ("fit -s castle", "p2gs-jax fit SCENE"),
     ("fit castle -m run", "--out"),
     ("fit castle --out run --bugdet 5m", "--budget"),
@@ -138,7 +139,9 @@ def test_wrong_words_are_answered_with_a_way_on(refused, place, monkeypatch, wor
     monkeypatch.chdir(place)
     monkeypatch.setenv("COLUMNS", "100")
     before = contents(place)
-    assert way_on in refused(*words.split())
+    said = refused(*words.split())
+    assert way_on in said
+    assert "Run folder" not in said
     assert contents(place).items() >= before.items(), "a failure leaves everything as it was"
     assert not any((place / name).exists() for name in ("new", "run", "x"))
 
