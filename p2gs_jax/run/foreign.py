@@ -88,9 +88,8 @@ class ForeignRun(read.Run):
         e: Any = bake.baking_error(lifted, targets, cfg, shown)
         note = (
             f"Lifted to radiance, the Gaussians show {count_of(e['views'], 'picture')} of their "
-            f"program with a median of {e['psnr_median']:.2f} dB, worst {e['psnr_worst']:.2f} dB "
-            f"({e['worst_view']}), mean {e['mean_codes']:.2f} and largest {e['max_codes']:.0f} "
-            "8-bit levels: light is composited instead of display values."
+            f"program with a median of {e['psnr_median']:.2f} dB: light is composited "
+            "instead of display values."
         )
         params = replace(self.params, gaussians=lifted)
         return replace(self, params=params, lifting_error=e, notes=(*self.notes, note))

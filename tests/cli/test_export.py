@@ -57,6 +57,7 @@ def test_the_baking_error_is_written_and_true(exported):
         error = said["baking_error"][split]
         assert error["views"] == len(rows)
         assert any(f"median {error['psnr_median']:.2f} dB" in c for c in comments)
+        assert "different from the true ones (below 30 dB)" in comments[-1]
     # One view judged here, with nothing from gaussians/bake.py.
     index = fitted.scene.train_indices[1]
     camera = camera_of(fitted.store, index)
@@ -94,15 +95,16 @@ def colors_of(folder):
 def test_a_look_changes_the_display_colours(exported, finished_run, succeeded, tmp_path):
     def base(name, *options):
         argv = ("export", finished_run, "--format", "display-ply", "--out", tmp_path / name)
-        succeeded(*argv, "--bake-steps", "0", *options)
-        return colors_of(tmp_path / name)
+        text = succeeded(*argv, "--bake-steps", "0", *options)
+        return *colors_of(tmp_path / name), text
 
     plain, said = colors_of(exported[1])
     assert said["exposure_ev_from_mean"] == pytest.approx(0, abs=1e-6)
-    dark, said = base("dark", "--exposure-ev", "-2")
-    assert said["exposure_ev_from_mean"] == pytest.approx(-2, abs=1e-5)
+    dark, said, text = base("dark", "--exposure-ev", "-4")
+    assert "close to the true ones (at least 30 dB)" in " ".join(text.split())
+    assert said["exposure_ev_from_mean"] == pytest.approx(-4, abs=1e-5)
     assert dark.mean() < plain.mean() - 0.05
-    linear, said = base("linear", "--curve", "linear", "--gamma", "2.2")
+    linear, said, _ = base("linear", "--curve", "linear", "--gamma", "2.2")
     assert (said["curve"], said["gamma"]) == ("linear", 2.2)
     assert linear.mean() < plain.mean() - 0.05
 
