@@ -1,6 +1,7 @@
 """A scene in two blocks is a run as any other, with the exposures that were solved for all."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,10 +18,11 @@ from p2gs_jax.jobs.blocks import plan as room
 from p2gs_jax.jobs.blocks.block import block_config
 from p2gs_jax.jobs.blocks.cut import cut_scene
 from p2gs_jax.jobs.blocks.plan import check_options, read_plan, write_plan
-from p2gs_jax.jobs.blocks.shared import read_shared
+from p2gs_jax.jobs.blocks.shared import read_shared, solve_shared
 from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.jobs.job import JobState
 from p2gs_jax.pipeline.survey import load
+from p2gs_jax.scene.pixels.store import ImageStore
 
 FIELDS = {"train.steps": 20, "train.coarse_to_fine": [], "data.test_every": 4}
 FIELDS |= {"densify.max_gaussians": 400, "init.dense": "off", "init.shell": "off"}
@@ -101,6 +103,10 @@ def test_one_block_is_an_ordinary_fit(tmp_path, monkeypatch):
     assert p2gs_jax.fit_blocks(scene, tmp_path / "run", SMALL, blocks="auto") == "fitted"
     assert asked["cfg"] == SMALL
     assert not (tmp_path / "run" / "blocks").exists()
+    loaded = replace(load(scene, tmp_path / "run", SMALL), random_seeds=True)
+    store = ImageStore(loaded.views, SMALL.data)
+    with pytest.raises(UserError, match="seed points are random, so the exposures"):
+        solve_shared(loaded, store, SMALL, Silent(), None)
 
 
 def test_a_block_has_the_population_of_the_whole_and_more_for_what_is_outside():

@@ -39,13 +39,14 @@ def solve_shared(
 ) -> Shared:
     """Solve the photometry of a scene; `kept` has the earlier decisions of a resumed run.
 
-    UserError: no point of a surface is seen by two photographs.
+    UserError: seed points are random, or no point of a surface is seen by two photographs.
     """
     still = store.leaving_out(scene.objects, cfg.dynamics.margin).only_opaque()
     solved = solve_exposures(scene, still, cfg, reporter, kept=kept)
     if solved.selection is None:
-        why = f"{scene.root}: no point is seen by two photographs, so the exposures of blocks "
-        why += "cannot be compared."
+        unseen = "no point is seen by two photographs"
+        why = f"{scene.root}: {'seed points are random' if scene.random_seeds else unseen}, so the "
+        why += "exposures of blocks cannot be compared."
         raise UserError(why, fix="fit it without --blocks, or with a structure-from-motion model")
     views = scene.training_views
     depth = near_depth(seen_depths(scene.points, views))
