@@ -37,8 +37,8 @@ def rasterization(
     width: int,
     height: int,
     *,
-    near_plane: float = 0.01,
-    eps2d: float = 0.3,
+    near_plane: float | None = None,
+    eps2d: float | None = None,
     sh_degree: int | None = None,
     backgrounds: Float[Array, "c 3"] | None = None,
     render_mode: str = "RGB",
@@ -52,10 +52,12 @@ def rasterization(
     radiance (n 3). With `sh_degree` they are spherical harmonics (n k 3) of radiance max(0, value +
     1/2); coefficients above the degree are ignored. Both may begin with an axis of cameras. View
     matrices map world to camera, OpenCV axes; `Ks` and the size are in pixels. `eps2d` is the
-    variance added to the 2D covariance, pixels^2; backgrounds are radiance, None is black. The mode
-    is "RGB", "D" (the sum of weights times z), "ED" ("D" over alpha), or RGB and one depth. The
-    static `capacity` counts entries of the tile list; None measures it outside of `jax.jit`, and
-    inside it is needed: `meta["capacity"]` of an earlier call. `cfg` has all other options.
+    variance added to the 2D covariance, pixels^2; backgrounds are radiance. None is the value of
+    `cfg` (`near`, `blur`, `background`), and without `cfg` gsplat's: 0.01, 0.3 and black. `cfg` has
+    all other options; its `radiance` and `sh_degree` have no effect. The mode is "RGB", "D" (the
+    sum of weights times z), "ED" ("D" over alpha), or RGB and one depth. The static `capacity`
+    counts entries of the tile list; None measures it outside of `jax.jit`, and inside it is needed:
+    `meta["capacity"]` of an earlier call.
 
     Returns:
         Colours with depth as their last channel, alphas, and a dictionary: `means2d` (c n 2),
@@ -69,8 +71,13 @@ def rasterization(
     if render_mode not in MODES:
         raise ValueError(f"render_mode {render_mode!r} is not valid: choose {', '.join(MODES)}")
     each = _for_each_camera(colors, means.shape[0], viewmats.shape[0], sh_degree)
+    cfg = cfg or RenderConfig(near=0.01, blur=0.3)
     cfg = dataclasses.replace(
-        cfg or RenderConfig(), near=near_plane, blur=eps2d, radiance="linear", background=None
+        cfg,
+        near=cfg.near if near_plane is None else near_plane,
+        blur=cfg.blur if eps2d is None else eps2d,
+        background=cfg.background if backgrounds is None else None,
+        radiance="linear",
     )
     p, no_color = jnp.clip(opacities, LEAST_OPACITY, 1 - LEAST_OPACITY), jnp.zeros_like(means)
     logits = jnp.log(p) - jnp.log1p(-p)

@@ -13,7 +13,7 @@ from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import render_linear, view_radiance
 from p2gs_jax.render.harmonics import C0
 
-CFG = RenderConfig(pixels_in_flight=2048)
+CFG = RenderConfig(pixels_in_flight=2048, near=0.01)
 WIDTH, HEIGHT = 48, 36
 BACK = np.array([[1.0, 0.5, 0.0], [2.0, 2.0, 2.0]], np.float32)
 
@@ -31,7 +31,7 @@ def arguments(n=300, dtype=np.float32, seed=4):
 
 
 def draw(given, **options):
-    options = {"width": WIDTH, "height": HEIGHT, "eps2d": CFG.blur, "cfg": CFG} | options
+    options = {"width": WIDTH, "height": HEIGHT, "cfg": CFG} | options
     return p2gs_jax.rasterization(**given, **options)
 
 
@@ -40,7 +40,7 @@ def ours(given, k, sh):
     g, _ = street(n=len(given["means"]), width=WIDTH, height=HEIGHT, degree=0)
     g = dataclasses.replace(g, sh=sh)
     view = camera(WIDTH, HEIGHT, float(given["Ks"][k, 0, 0]), given["viewmats"][k])
-    cfg = dataclasses.replace(CFG, radiance="linear", near=0.01)
+    cfg = dataclasses.replace(CFG, radiance="linear")
     render = jax.jit(render_linear, static_argnames=("cfg", "capacity"))
     return render(g, jnp.ones(g.capacity, bool), view, cfg=cfg, capacity=2**14)
 
@@ -75,6 +75,13 @@ def test_modes_backgrounds_and_colours_of_each_camera(drawn):
     expected, _, _ = draw(given, render_mode="RGB+ED", **fixed)
     np.testing.assert_allclose(expected[..., 3:] * jnp.maximum(alphas, 1e-10), depth, rtol=1e-5)
     np.testing.assert_array_equal(draw(given, render_mode="D", **fixed)[0], depth)
+    over = dataclasses.replace(CFG, background=(1.0, 0.5, 0.0), near=9.0, blur=9.0)
+    asked = {"near_plane": CFG.near, "eps2d": CFG.blur} | fixed
+    np.testing.assert_allclose(
+        draw(given, cfg=over, **asked)[0], rgb + (1 - alphas) * BACK[0], 1e-5
+    )
+    asked |= {"cfg": over, "backgrounds": jnp.zeros((2, 3))}
+    np.testing.assert_allclose(draw(given, **asked)[0], rgb, 1e-5)
     each = {"colors": jnp.stack([given["colors"], 2 * given["colors"]])}
     twice, _, _ = draw(given | each, backgrounds=jnp.asarray(BACK), render_mode="RGB+D", **fixed)
     behind = (1 - alphas) * BACK[:, None, None]
