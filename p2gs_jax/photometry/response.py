@@ -57,10 +57,8 @@ class Response:
     @property
     def name(self) -> str:
         """Name in reports."""
-        if self.spline is None:
-            return self.base
-        each = "" if self.by == "all" else f" per {self.by}"
-        return f"spline{each} over {self.base}"
+        base, each = self.base.replace("srgb", "sRGB"), f" per {self.by}".replace(" per all", "")
+        return base if self.spline is None else f"spline{each} over {base}"
 
     @property
     def curve(self) -> Literal["srgb", "power", "spline"]:

@@ -111,7 +111,7 @@ def heading(metrics: Mapping[str, Any], params: Params, cfg: FitConfig) -> list[
     ev = np.log2(np.asarray(params.photometry.exposures, np.float64))
     span = f"; exposures span {np.ptp(ev):.1f} stops" if np.ptp(ev) > 0 else ""
     form = Form(p.model, p.white_balance, p.vignetting)
-    model = f"Model: {form.description}, {p.curve} curve{span}."
+    model = f"Model: {form.description}, {p.curve.replace('srgb', 'sRGB')} curve{span}."
     return [f"PSNR: {', '.join(scores)}.", model, *lines]
 
 

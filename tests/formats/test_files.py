@@ -146,7 +146,7 @@ def test_the_heading_of_a_summary_states_scores_model_and_worst_view():
     metrics = {"train": {"psnr": 31.0}, "test": {"exposure_fitted": fitted}}
     assert heading(metrics, params, replace(FitConfig(), photometry=cfg)) == [
         "PSNR: held-out views 25.0 dB (exposures fitted), training views 31.0 dB.",
-        "Model: an exposure per view, srgb curve; exposures span 2.0 stops.",
+        "Model: an exposure per view, sRGB curve; exposures span 2.0 stops.",
         "Worst held-out view: b.png, 20.0 dB.",
     ]
     without = heading({"train": {"psnr": 31.0}}, params, replace(FitConfig(), photometry=cfg))

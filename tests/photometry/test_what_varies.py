@@ -71,7 +71,7 @@ def test_cameras_may_have_responses_of_their_own():
     o = observe(drive, make_exposures(drive, "iso4"), curve=curves, outliers=0.02)
     found = fit_response(problem_of(o), Response(), by="camera")
     assert found is not None
-    assert found.name == "spline per camera over srgb"
+    assert found.name == "spline per camera over sRGB"
     y = np.repeat(np.linspace(0.2, 0.85, 20)[:, None], 3, 1)
     first, bent, third = (log_exposed(y, found, np.full(20, c))[0][:, 0] for c in range(3))
     assert np.ptp((first - third) - (first - third).mean()) < 0.5 * np.ptp(first - bent)
@@ -116,7 +116,7 @@ def test_choices_one_step_apart():
     [
         ("constant", "srgb", None, "constant", None),
         ("cameras", "power", None, "camera_exposure", "power"),
-        ("iso4", "srgb", None, "view_exposure", "srgb"),
+        ("iso4", "srgb", None, "view_exposure", "sRGB"),
         ("iso2", "power", "camera", "view_exposure_camera_gamma", "power"),
     ],
 )
@@ -174,10 +174,10 @@ def test_known_exposures_that_are_alike_fix_the_scale_only():
 def test_a_filmic_camera_gets_a_spline_unless_its_curve_is_known():
     seen = observe(SHORT, make_exposures(SHORT, "iso2"), curve="filmic")
     free = select(seen).solution
-    assert (free.model, free.response.name) == ("view_exposure", "spline over srgb")
+    assert (free.model, free.response.name) == ("view_exposure", "spline over sRGB")
     s = select(seen, known_response="camera raw")
     assert s.solution.response == Response("srgb")
-    assert {c.response.name for c in s.candidates} == {"srgb"}
+    assert {c.response.name for c in s.candidates} == {"sRGB"}
     assert "The tone curve is known (camera raw)" in s.reasons[0]
 
 
