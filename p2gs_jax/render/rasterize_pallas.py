@@ -2,7 +2,9 @@
 
 One block of threads owns one tile and walks its list front to back; each thread owns a few pixels.
 All threads of a block read the same row at a time; `UNROLL` rows are loaded before they are used.
-Tiles with long lists start first, so that no long list runs alone at the end.
+Tiles with long lists start first, so that no long list runs alone at the end. A small image has too
+few tiles for a GPU: its lists are cut into segments with a block each, and a third kernel merges
+them (segments.py).
 
 Backward. The walk and the moments are those of the CPU (rasterize_xla.py). The kernel adds each
 result to the Gaussian's gradient atomically. If runs must repeat bit for bit, it writes a gradient
@@ -23,7 +25,8 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plt
 
 from p2gs_jax.render.binning import longest_first
-from p2gs_jax.render.tiles import DARKEST, GEOMETRY, Plan, geometry_gradient
+from p2gs_jax.render.segments import cut, opaque
+from p2gs_jax.render.tiles import GEOMETRY, Plan, geometry_gradient
 
 # Number of entries whose rows are loaded together, forward and backward. The stop rule is evaluated
 # once per group (H200, 2026-11-26: fastest of 2, 4, 8).
@@ -36,6 +39,9 @@ PIXELS_PER_THREAD = 4
 COLUMNS = 16
 # Number of Gaussians per block of the ordered sum.
 SUMMED = 32
+# Images of fewer tiles have their lists cut into segments, at most this many per lane more. With
+# 256 lanes these are 4,096 blocks; an H200 has 132 multiprocessors for 16 to 32 blocks each.
+FEW_TILES, SEGMENTS_PER_LANE = 512, 16
 
 
 def exponent_scale(alpha_cutoff: float) -> float:
@@ -91,11 +97,11 @@ class _Tile:
         return jnp.where(exponent > plan.cutoff, alpha, 0.0)
 
 
-def _forward_kernel(rows, ids, offsets, order, brightest, *outputs, plan: Plan):
+def _forward_kernel(rows, ids, tiles, starts, ends, order, brightest, *outputs, plan: Plan):
     *image, stops = outputs
-    tile = order[pl.program_id(0)]
-    pixels = _Tile(tile, plan)
-    end = offsets[tile + 1]
+    slot = order[pl.program_id(0)]
+    pixels = _Tile(tiles[slot], plan)
+    start, end = starts[slot], ends[slot]
     brightest = brightest[0]
 
     def body(state):
@@ -107,25 +113,46 @@ def _forward_kernel(rows, ids, offsets, order, brightest, *outputs, plan: Plan):
         position = jnp.minimum(position + UNROLL, end)
         done = position >= end
         if plan.cfg.stop_error is not None:
-            so_far = functools.reduce(jnp.maximum, channels[:3]) / brightest
-            hidden = transmittance - plan.cfg.stop_error * jnp.maximum(so_far, DARKEST)
-            done = done | (jnp.max(hidden) <= 0)
+            done = done | opaque(channels, transmittance, brightest, plan)
         return position, done, transmittance, *channels
 
-    start = offsets[tile]
     blank = jnp.zeros(plan.pixels, jnp.float32)
     state = (start, start >= end, blank + 1.0, *(blank,) * plan.channels)
     position, _, *sums = lax.while_loop(lambda s: jnp.logical_not(s[1]), body, state)
     transmittance, *channels = sums
     for target, value in zip(image, (*channels, transmittance), strict=True):
+        target[slot, :] = value
+    stops[slot] = position
+
+
+def _merge_kernel(firsts, *arrays, plan: Plan):
+    """Merge the segments of a tile; `arrays` are all slots, the image, and what is before slots."""
+    count = plan.channels + 1
+    composited, image, before = arrays[:count], arrays[count : 2 * count], arrays[2 * count :]
+    tile = pl.program_id(0)
+
+    def body(k, front):
+        for target, value in zip(before, front, strict=True):
+            target[k, :] = value
+        *channels, behind = (a[plan.tile_count + k, :] for a in composited)
+        light = (f + front[-1] * c for f, c in zip(front[:-1], channels, strict=True))
+        return (*light, front[-1] * behind)
+
+    front = tuple(a[tile, :] for a in composited)
+    front = lax.fori_loop(firsts[tile], firsts[tile + 1], body, front)
+    for target, value in zip(image, front, strict=True):
         target[tile, :] = value
-    stops[tile] = position
+
+
+def _images(count: int, plan: Plan) -> tuple[jax.ShapeDtypeStruct, ...]:
+    return (jax.ShapeDtypeStruct((count, plan.pixels), jnp.float32),) * (plan.channels + 1)
 
 
 def forward(rows, ids, offsets, plan: Plan):
     """Return the channels of the image and the transmittance, [T P] each, and the residuals.
 
-    The residuals are the offsets and the position where each tile stopped [T].
+    The residuals are the segments, the position where each stopped [S], and the channels and
+    transmittance before every segment except the first of a tile; none if no list is cut.
 
     Raises:
         ValueError: the number of pixels of a tile is not a power of two.
@@ -135,26 +162,41 @@ def forward(rows, ids, offsets, plan: Plan):
             "the pallas rasterizer needs tiles with a power of two of pixels, not "
             f"{plan.cfg.tile}: set RenderConfig.tile to (16, 8) or (16, 16)"
         )
-    shape = jax.ShapeDtypeStruct((plan.tile_count, plan.pixels), jnp.float32)
-    radiance = rows[:, GEOMETRY : GEOMETRY + 3]
+    tiles, most = plan.tile_count, SEGMENTS_PER_LANE * plan.lanes
+    most = most if tiles < FEW_TILES else 0
+    segments = cut(offsets, most, plan.cfg.chunk)
+    brightest = jnp.maximum(jnp.max(rows[:, GEOMETRY : GEOMETRY + 3]), 1e-30)
+    options = {"compiler_params": _parameters(plan.pixels), "interpret": _interpreted()}
     *image, stops = pl.pallas_call(
         functools.partial(_forward_kernel, plan=plan),
         out_shape=(
-            *(shape,) * (plan.channels + 1),
-            jax.ShapeDtypeStruct((plan.tile_count,), jnp.int32),
+            *_images(tiles + most, plan),
+            jax.ShapeDtypeStruct((tiles + most,), jnp.int32),
         ),
-        grid=(plan.tile_count,),
-        compiler_params=_parameters(plan.pixels),
-        interpret=_interpreted(),
+        grid=(tiles + most,),
         name="composite_tiles",
+        **options,
     )(
         rows,
         ids,
-        offsets,
-        longest_first(offsets[1:] - offsets[:-1]),
-        jnp.maximum(jnp.max(radiance), 1e-30)[None],
+        *segments[:3],
+        longest_first(segments.ends - segments.starts),
+        brightest[None],
     )
-    return tuple(image), (offsets, stops)
+    if not most:
+        return tuple(image), (segments, stops, ())
+    merged = pl.pallas_call(
+        functools.partial(_merge_kernel, plan=plan),
+        out_shape=(*_images(tiles, plan), *_images(most, plan)),
+        grid=(tiles,),
+        name="merge_segments",
+        **options,
+    )(segments.firsts, *image)
+    image, before = merged[: len(image)], merged[len(image) :]
+    if plan.cfg.stop_error is not None:
+        hidden = opaque(before[:-1], before[-1], brightest, plan)
+        stops = jnp.where(jnp.concatenate([jnp.zeros(tiles, bool), hidden]), segments.starts, stops)
+    return image, (segments, stops, before)
 
 
 def _row(values):
@@ -165,16 +207,29 @@ def _row(values):
     return row
 
 
-def _backward_kernel(rows, ids, offsets, stops, order, *arrays, plan: Plan):
-    """Walk a tile; `arrays` are the image, its gradient, the zeroed output and the output."""
+def _backward_kernel(rows, ids, tiles, starts, stops, order, *arrays, plan: Plan):
+    """Walk a segment.
+
+    `arrays` are the image, its gradient, what is before extra slots, the zeroed output and the
+    output.
+    """
     channels = plan.channels
     image, v_image = arrays[: channels + 1], arrays[channels + 1 : 2 * channels + 2]
-    target = arrays[-1]
-    tile = order[pl.program_id(0)]
+    *before, _, target = arrays[2 * channels + 2 :]
+    slot = order[pl.program_id(0)]
+    tile = tiles[slot]
     pixels = _Tile(tile, plan)
-    start, end = offsets[tile], stops[tile]
+    start, end = starts[slot], stops[slot]
     v_out = [v[tile, :] for v in v_image]
     light = sum(a[tile, :] * v for a, v in zip(image, v_out, strict=True))
+    transmittance = jnp.ones(plan.pixels, jnp.float32)
+    if before:
+        extra, first = jnp.maximum(slot - plan.tile_count, 0), slot < plan.tile_count
+        *ahead, through = (b[extra, :] for b in before)
+        light = light - sum(
+            jnp.where(first, 0.0, a) * v for a, v in zip(ahead, v_out[:-1], strict=True)
+        )
+        transmittance = jnp.where(first, 1.0, through)
     x, y = pixels.x, pixels.y
 
     def body(state):
@@ -202,7 +257,7 @@ def _backward_kernel(rows, ids, offsets, stops, order, *arrays, plan: Plan):
                 plt.atomic_add(target, (gaussian, slice(None)), values)
         return jnp.minimum(position + UNROLL_BACK, end), transmittance, remaining
 
-    state = (start, jnp.ones(plan.pixels, jnp.float32), light)
+    state = (start, transmittance, light)
     lax.while_loop(lambda s: s[0] < end, body, state)
 
 
@@ -241,16 +296,17 @@ def _in_order(entries, ids, count: int):
 
 def backward(rows, ids, residuals, image, v_image, plan: Plan):
     """Return the gradient by the rows from those by the channels and transmittance."""
-    offsets, stops = residuals
+    segments, stops, before = residuals
     capacity, count = ids.shape[0], rows.shape[0]
     shape = (capacity + 1 if plan.cfg.deterministic else count, COLUMNS)
     blank = jnp.zeros(shape, jnp.float32)
-    order = longest_first(stops - offsets[:-1])
-    operands = (rows, ids, offsets, stops, order, *image, *v_image, blank)
+    order = longest_first(stops - segments.starts)
+    operands = (rows, ids, segments.tiles, segments.starts, stops, order)
+    operands = (*operands, *image, *v_image, *before, blank)
     v_rows = pl.pallas_call(
         functools.partial(_backward_kernel, plan=plan),
         out_shape=jax.ShapeDtypeStruct(shape, jnp.float32),
-        grid=(plan.tile_count,),
+        grid=(stops.shape[0],),
         input_output_aliases={len(operands) - 1: 0},
         compiler_params=_parameters(plan.pixels),
         interpret=_interpreted(),

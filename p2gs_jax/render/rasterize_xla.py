@@ -30,7 +30,8 @@ from jaxtyping import Array, Float, Int
 
 from p2gs_jax.render.binning import longest_first
 from p2gs_jax.render.cores import cores, this_core
-from p2gs_jax.render.tiles import DARKEST, GEOMETRY, Plan, geometry_gradient
+from p2gs_jax.render.segments import Segments, cut, opaque
+from p2gs_jax.render.tiles import GEOMETRY, Plan, geometry_gradient
 from p2gs_jax.render.xla_cpu import compiled_loop, materialize
 
 # The backward pass has more overhead per iteration, so more pixels in flight are faster.
@@ -39,44 +40,6 @@ PREFIX_GROUP = 8
 # A segment is at most as long as a lane's fair share of the entries, divided by this number. The
 # number of segments has a static bound: tiles + SEGMENTS_PER_LANE * lanes.
 SEGMENTS_PER_LANE = 4
-
-
-class Segments(NamedTuple):
-    """The tile, start and end of each segment in the list of entries; the end is exclusive.
-
-    Slot t < T is the first segment of tile t. The next `extra` slots hold the other segments, tile
-    by tile from front to back. The last slots are empty.
-    """
-
-    tiles: Int[Array, " s"]
-    starts: Int[Array, " s"]
-    ends: Int[Array, " s"]
-    extra: Int[Array, ""]
-
-
-def cut(offsets: Int[Array, " t1"], plan: Plan) -> Segments:
-    """Cut lists into segments; `offsets` are the starts of the tiles' lists, and the last end."""
-    starts, ends = offsets[:-1], offsets[1:]
-    most = SEGMENTS_PER_LANE * plan.lanes
-    chunks = -((starts - ends) // plan.cfg.chunk)
-    length = jnp.maximum(1, -(-jnp.sum(chunks) // most)) * plan.cfg.chunk
-    more = jnp.maximum(-((starts - ends) // length) - 1, 0)
-    last = jnp.cumsum(more)
-    first = last - more
-    # The owner of an extra slot is the last tile whose extra slots begin at or before it.
-    tile = jnp.arange(plan.tile_count, dtype=jnp.int32)
-    owner = jnp.zeros(most, jnp.int32).at[jnp.where(more > 0, first, most)].max(tile, mode="drop")
-    owner = lax.cummax(owner)
-    slot = jnp.arange(most, dtype=jnp.int32)
-    used = slot < last[-1]
-    start = starts[owner] + (slot - first[owner] + 1) * length
-    end = jnp.minimum(start + length, ends[owner])
-    return Segments(
-        jnp.concatenate([tile, jnp.where(used, owner, 0)]),
-        jnp.concatenate([starts, jnp.where(used, start, 0)]),
-        jnp.concatenate([jnp.minimum(starts + length, ends), jnp.where(used, end, 0)]),
-        last[-1],
-    )
 
 
 @compiled_loop
@@ -227,20 +190,13 @@ def _padded(ids_list, plan: Plan):
     return jnp.concatenate([ids_list, jnp.full((plan.cfg.chunk,), plan.gaussians, jnp.int32)])
 
 
-def _opaque(channels, transmittance, brightest, plan: Plan):
-    """Return whether entries behind can be left out (RenderConfig.stop_error)."""
-    so_far = functools.reduce(jnp.maximum, channels[:3]) / brightest
-    hidden = transmittance - (plan.cfg.stop_error or 0.0) * jnp.maximum(so_far, DARKEST)
-    return jnp.max(hidden, -1) <= 0
-
-
 def forward(rows, ids_list, offsets, plan: Plan):
     """Return the channels of the image and the transmittance, [T P] each, and the residuals.
 
     The residuals are the segments, the position where each stopped [S], and the channels and
     transmittance before every segment except the first of a tile.
     """
-    segments = cut(offsets, plan)
+    segments = cut(offsets, SEGMENTS_PER_LANE * plan.lanes, plan.cfg.chunk)
     queue = Queue.build(segments, segments.ends, plan)
     slots, lanes, pixels = queue.slots, plan.lanes, plan.pixels
     local = plan.local_pixels()
@@ -265,7 +221,7 @@ def forward(rows, ids_list, offsets, plan: Plan):
         position = jnp.minimum(position + plan.cfg.chunk, end)
         done = position >= end
         if plan.cfg.stop_error is not None:
-            done = done | _opaque(channels, transmittance, brightest, plan)
+            done = done | opaque(channels, transmittance, brightest, plan)
         target = jnp.where(done, slot, slots + lanes)
         image = tuple(
             a.at[target].set(b, mode="drop", unique_indices=True)
@@ -285,9 +241,9 @@ def forward(rows, ids_list, offsets, plan: Plan):
     state = (*begin, sums, image, stops)
     state = lax.while_loop(lambda s: jnp.any(s[1] < slots), body, state)
     composited, stops = tuple(a[:slots] for a in state[5]), state[6][:slots]
-    image, before = merge(composited, segments.tiles[plan.tile_count :], segments.extra)
+    image, before = merge(composited, segments.tiles[plan.tile_count :], segments.firsts[-1])
     if plan.cfg.stop_error is not None:
-        hidden = _opaque(before[:-1], before[-1], brightest, plan)
+        hidden = opaque(before[:-1], before[-1], brightest, plan)
         starts = segments.starts[plan.tile_count :]
         stops = stops.at[plan.tile_count :].set(jnp.where(hidden, starts, stops[plan.tile_count :]))
     return image, (segments, stops, before)

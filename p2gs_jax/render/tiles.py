@@ -36,9 +36,6 @@ GEOMETRY = 6  # columns of a row before its channels
 MOST_LANES = 8
 # Compute capability of the oldest NVIDIA GPUs that Pallas supports through Triton.
 AMPERE = 8.0
-# Floor of a pixel's brightness in the stop rule, relative to the brightest splat
-# (RenderConfig.stop_error).
-DARKEST = 1e-4
 
 
 def rasterize_reference(

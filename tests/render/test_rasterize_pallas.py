@@ -45,15 +45,25 @@ def test_views_batch_and_the_ordered_sum_is_the_atomic_one():
     jax.__version_info__ >= (0, 11) and jax.default_backend() != "gpu",
     reason="from JAX 0.11 on Pallas lowers only for a GPU that is there",
 )
-@pytest.mark.parametrize("deterministic", [False, True])
-def test_the_kernels_lower_to_triton(monkeypatch, deterministic):
-    """Without a GPU the program for one can still be lowered: forward, backward, ordered sum."""
+@pytest.mark.parametrize(
+    ("size", "deterministic", "kernels"),
+    [
+        # An image of many tiles: forward, backward, and the ordered sum.
+        ((256, 256), False, ["composite_tiles", "composite_tiles_gradient"]),
+        ((256, 256), True, ["composite_tiles", "composite_tiles_gradient", "sum_gradients"]),
+        # The lists of few tiles are cut into segments.
+        ((40, 32), False, ["composite_tiles", "merge_segments", "composite_tiles_gradient"]),
+    ],
+)
+def test_the_kernels_lower_to_triton(monkeypatch, size, deterministic, kernels):
+    """Without a GPU the program for one can still be lowered."""
     monkeypatch.setattr(rasterize_pallas, "_interpreted", lambda: False)
-    g, cam = street(n=200, width=40, height=32)
+    g, cam = street(n=200, width=size[0], height=size[1])
     cfg = dataclasses.replace(CFG, deterministic=deterministic)
     traced = jax.jit(jax.grad(lambda g: loss(g, cam, cfg))).trace(g)
     text = traced.lower(lowering_platforms=("cuda",)).as_text()
-    assert text.count("__gpu$xla.gpu.triton") == 2 + deterministic
+    assert text.count("__gpu$xla.gpu.triton") == len(kernels)
+    assert all(name in text for name in kernels)
 
 
 def test_what_runs_here_is_chosen(monkeypatch):

@@ -6,21 +6,17 @@ import numpy as np
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from p2gs_jax.config import RenderConfig
-from p2gs_jax.render.rasterize_xla import cut, merge
-from p2gs_jax.render.tiles import Plan
+from p2gs_jax.render.rasterize_xla import merge
+from p2gs_jax.render.segments import cut
 
-TILES, LANES, CHUNK, PIXELS = 6, 4, 2, 3
-# All other fields of the plan are unused here.
-FIELDS = {"across": TILES, "down": 1, "lanes": LANES, "cfg": RenderConfig(chunk=CHUNK)}
-PLAN = Plan(**dict.fromkeys(Plan._fields) | FIELDS)  # type: ignore[arg-type]
+TILES, MOST, UNIT, PIXELS = 6, 16, 2, 3
 LENGTHS = st.lists(
     st.one_of(st.just(0), st.integers(0, 9), st.integers(0, 400)), min_size=TILES, max_size=TILES
 )
 GIANT = [0, 0, 4000, 0, 1, 0]
 
-jitted_cut = jax.jit(lambda offsets: cut(offsets, PLAN))
-jitted_merge = jax.jit(lambda c, segments: merge(c, segments.tiles[TILES:], segments.extra))
+jitted_cut = jax.jit(lambda offsets: cut(offsets, MOST, UNIT))
+jitted_merge = jax.jit(lambda c, segments: merge(c, segments.tiles[TILES:], segments.firsts[-1]))
 
 
 def composite(colors, alphas):
@@ -52,7 +48,7 @@ def test_merged_segments_equal_one_pass(lengths, seed):
         for got, expected in zip(image, whole, strict=True):
             np.testing.assert_allclose(np.asarray(got)[t], expected, rtol=1e-5, atol=1e-6)
     tiles, starts = np.asarray(segments.tiles), np.asarray(segments.starts)
-    for k in range(int(segments.extra)):
+    for k in range(int(segments.firsts[-1])):
         t, start = tiles[TILES + k], starts[TILES + k]
         front = composite(*(a[offsets[t] : start] for a in (colors, alphas)))
         for got, expected in zip(before, front, strict=True):
