@@ -27,7 +27,7 @@ from p2gs_jax.report.findings import duration
 
 # Columns of words; all others hold numbers.
 WORDS = ("views", "view", "camera", "protocol", "program", "lens", "configuration", "")
-# Scores below this, dB, are of short fits, or of photographs with a fault (15.6 dB of nine views).
+# Scores below this, dB, are of short fits, or of too few photographs (15.8 dB of nine).
 LOW_DB = 20.0
 VERDICT_ON_LOW = (
     "This is low: fit for longer (--budget), or read docs/quickstart.md, When something goes wrong."
