@@ -1,4 +1,5 @@
-// Cameras as in the run: x right, y down, z forward; R is world to camera, by rows, c the centre.
+// Cameras have the run's axes (x right, y down, z forward), a rotation R from world to camera
+// (row-major) and a centre c in the world.
 // A lens belongs to a picture {width, height, fx, fy, cx, cy}, which is fitted into the window.
 
 const row = (m, i) => [m[3 * i], m[3 * i + 1], m[3 * i + 2]];
@@ -16,7 +17,7 @@ function cameraOf(view) {
   return { R, c, lens: { width: view.width, height: view.height, fx, fy, cx, cy } };
 }
 
-// Window pixels for each pixel of the lens's picture, which is shown completely.
+// Return the window pixels per pixel of the lens's picture, which is shown completely.
 const fit = (lens, width, height) => Math.min(width / lens.width, height / lens.height);
 
 function intoWindow({ R, c, lens }, width, height) {
@@ -37,19 +38,19 @@ function turn(axis, angle) {
     y * z * k - x * s, x * z * k - y * s, y * z * k + x * s, z * z * k + c];
 }
 
-// The point at a depth on the ray of a pixel.
+// Return the point at a depth on the ray of a pixel.
 function pointAt({ R, c, lens: [fx, fy, cx, cy] }, x, y, depth) {
   const ray = [((x - cx) / fx) * depth, ((y - cy) / fy) * depth, depth];
   return plus(c, [0, 1, 2].map((k) => R[k] * ray[0] + R[3 + k] * ray[1] + R[6 + k] * ray[2]));
 }
 
-// Rotate a camera about a point, by a rotation of the world.
+// Return a camera turned about a point, by a rotation of the world.
 function turned(camera, M, about) {
   const R = [0, 1, 2].flatMap((i) => times(M, row(camera.R, i)));
   return { ...camera, R, c: plus(about, times(M, plus(camera.c, about, -1))) };
 }
 
-// Yaw about `up` and pitch about the camera's x axis, at most to straight up or down.
+// Return a camera after a yaw about `up` and a pitch about its x axis, never quite to the vertical.
 function lookAround(camera, yaw, pitch, about, up) {
   let out = turned(camera, turn(up, yaw), about);
   const tilted = turned(out, turn(row(out.R, 0), pitch), about);
@@ -72,7 +73,8 @@ function rotation([w, x, y, z]) {
     2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)];
 }
 
-// A camera between two others: centre on the line, rotation on the arc, lens of the nearer one.
+// Return a camera between two others. Its centre is on the line between theirs, its rotation on
+// the arc, and its lens is that of the nearer one.
 function between(a, b, share) {
   const p = quaternion(a.R), q = quaternion(b.R);
   let cos = p.reduce((s, v, k) => s + v * q[k], 0);
@@ -86,7 +88,7 @@ function between(a, b, share) {
     lens: share < 0.5 ? a.lens : b.lens };
 }
 
-// The depth of the first surface at a pixel, from the Gaussians with centres near it.
+// Return the depth of the first surface at a pixel, from the Gaussians with centres near it.
 function depthAt(splats, camera, x, y) {
   const found = [], opacities = splats.triples[3], reach = 24;
   const { means } = splats, { R, c } = camera, [fx, fy, cx, cy] = camera.lens;

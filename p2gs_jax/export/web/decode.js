@@ -13,8 +13,8 @@ async function inflate(bytes) {
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-// Triples of columns, interleaved: centres, lengths (logarithms), rotations (x y z of a unit
-// quaternion), opacity (logit; two zeros), then the harmonics, a triple of channels each.
+// Return interleaved triples of columns: centres, logarithms of lengths, rotations (x y z of a
+// unit quaternion), opacity (a logit and two zeros), then the channels of every harmonic.
 async function decodeSplats(header, text) {
   const raw = await inflate(bytesOfBase64(text));
   const { count, chunk, bits } = header;

@@ -1,6 +1,6 @@
 // Mouse, touch and keys that move the camera.
 
-// Radians per pixel and per second; scene depths per second.
+// Speeds are in radians per pixel, radians per second, and scene depths per second.
 const TURN = 0.005, KEYS_TURN = 0.9, KEYS_STEP = 0.5, FAST = 4;
 const MOVES = ["KeyW", "KeyA", "KeyS", "KeyD", "KeyQ", "KeyE", "ShiftLeft", "ShiftRight",
   "ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown"];
@@ -92,7 +92,7 @@ class Hands {
       page.pivot = plus(page.camera.c, row(page.camera.R, 2), 0.02 * page.depth);
   }
 
-  // Move while keys are pressed; returns whether any is.
+  // Move while keys are pressed; return whether a key is pressed.
   steer(seconds) {
     const { page, held } = this, on = (...codes) => (codes.some((c) => held.has(c)) ? 1 : 0);
     if (![...held].some((code) => !code.startsWith("Shift"))) return false;

@@ -3,11 +3,11 @@
 const SHOWS = ["picture", "stops", "clipping", "split"];
 const SHOW_NAMES = { picture: "picture", stops: "stops", clipping: "clipping", split: "photo | render" };
 const CURVE_NAMES = { spline: "fitted", srgb: "sRGB", power: "power 2.2", linear: "none" };
-// Slower frames are drawn smaller while the camera moves, seconds.
+// Frames that take longer than SLOW, seconds, are drawn smaller while the camera moves.
 const SLOW = 0.06, QUICK = 0.03, SMALLEST = 0.2, REST = 0.25;
 
 const $ = (id) => document.getElementById(id);
-// Pixels of the picture for each pixel of the window; more than two are not visible.
+// Return the picture's pixels per pixel of the window; more than two are not visible.
 const density = () => Math.min(devicePixelRatio, 2);
 
 class Page {
@@ -52,7 +52,7 @@ class Page {
     });
   }
 
-  // The device may be lost, for example by a phone's page in the background, and return.
+  // A device may be lost, for example while a phone has the page in the background, and return.
   awaitLoss(canvas) {
     canvas.addEventListener("webglcontextlost", (e) => {
       e.preventDefault();
@@ -89,7 +89,7 @@ class Page {
     return Math.max(dot(row(R, 2), plus(this.pivot, c, -1)), 0.01 * this.depth);
   }
 
-  // Callbacks of the hands.
+  // The hands call these.
   grabbed(x, y) {
     $("hands").focus({ preventScroll: true });
     const camera = this.windowCamera(1 / density());
@@ -408,8 +408,8 @@ class Page {
     try { history.replaceState(null, "", link); } catch { location.hash = link; }
   }
 
-  // For scripts: exposed radiance (RGBA, rows from the top) of a view at its size, under the look;
-  // radiance itself with `linear`.
+  // Return the exposed radiance of a view at its size, under the look (RGBA, rows from the top), or
+  // its radiance if `linear`. Scripts call this.
   async measure(index, linear = false) {
     const view = this.scene.views[index], { R, c, lens } = cameraOf(view);
     const camera = { R, c, lens: [lens.fx, lens.fy, lens.cx, lens.cy] };
@@ -431,7 +431,7 @@ class Page {
     this.show();
   }
 
-  // Mean seconds of a frame without sorting, from `count` consecutive frames.
+  // Return the mean seconds of `count` consecutive frames, without sorting.
   speed(count = 10) {
     const camera = this.windowCamera(), { gl } = this.renderer, pixel = new Uint8Array(4);
     const begin = performance.now();
@@ -470,5 +470,5 @@ async function open() {
   return page;
 }
 
-// For scripts in the console: a promise of the page.
+// Scripts in the console find a promise of the page here.
 window.p2gs = open().catch(complain);

@@ -52,7 +52,7 @@ class Marks {
     this.at = [];
   }
 
-  // The nearest camera whose mark is close to a place in the window, or null.
+  // Return the nearest camera whose mark is close to a place in the window, or null.
   find(x, y, reach) {
     const near = this.at.filter((m) => Math.hypot(m.x - x, m.y - y) < reach);
     return near.length ? near.reduce((a, b) => (a.z < b.z ? a : b)).index : null;

@@ -38,7 +38,7 @@ class Renderer {
     if (this.order) this.setOrder(this.order);
   }
 
-  // Values above white, if browser and display support them.
+  // Show values above white, if browser and display support them.
   extendRange() {
     const { gl, canvas } = this;
     const offered = gl.drawingBufferStorage && gl.drawingBufferToneMapping &&
@@ -96,13 +96,13 @@ class Renderer {
       padded.set(values);
       gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, layer, width, height, 1, gl.RGB, gl.FLOAT, padded);
     });
-    // Integers hold the bits of floats: such targets exist on every device.
+    // Integers hold the bits of floats, because integer targets exist on every device.
     this.columns = [0, 1, 2].map(() => {
       const texture = this.texture(gl.TEXTURE_2D, gl.NEAREST);
       gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32UI, width, height);
       return texture;
     });
-    // Some devices hold only 256 bits a pixel: each column is projected separately there.
+    // Some devices hold only 256 bits per pixel, so each column is projected separately there.
     this.projected = this.projections([[0, 1, 2]]) || this.projections([[0], [1], [2]]);
     if (!this.projected) throw new Error("This device cannot render to integer textures.");
     this.quads = gl.createVertexArray();
@@ -115,7 +115,7 @@ class Renderer {
     gl.bindVertexArray(null);
   }
 
-  // A framebuffer for each group of columns; null if the device does not support it.
+  // Return a framebuffer for each group of columns; null if the device does not support it.
   projections(groups) {
     const { gl } = this;
     const made = groups.map((group) => {
@@ -130,7 +130,7 @@ class Renderer {
     return made.every(Boolean) ? made : null;
   }
 
-  // Whether the framebuffer can be drawn into; a lost device cannot answer.
+  // Return whether the framebuffer can be drawn into; a lost device cannot answer.
   complete() {
     const { gl } = this;
     return gl.isContextLost() || gl.checkFramebufferStatus(gl.FRAMEBUFFER) === gl.FRAMEBUFFER_COMPLETE;
@@ -193,7 +193,7 @@ class Renderer {
     this.order = order;
   }
 
-  // Sort for a camera; resolves once the order is in use; null while another sort runs.
+  // Return a promise of the order for a camera, or null while another sort runs.
   sort(camera) {
     if (this.waiting) return null;
     const R = camera.R, c = camera.c;
@@ -204,7 +204,7 @@ class Renderer {
     });
   }
 
-  // Linear radiance of a camera {R, c, lens: [fx, fy, cx, cy]} into a target; row 0 is the top.
+  // Render the linear radiance of a camera {R, c, lens: [fx, fy, cx, cy]} into a target; row 0 is the top.
   render(camera, width, height, target = this.picture) {
     const { gl, scene } = this, r = scene.render;
     const [p, d] = [this.project, this.draw];
@@ -254,7 +254,7 @@ class Renderer {
     gl.uniform1i(program.at[name], unit);
   }
 
-  // Develop a rendered target: onto the canvas, or (`mode` 3) as exposed radiance into `into`.
+  // Develop a rendered target onto the canvas, or write its exposed radiance into `into`.
   develop(look, frame, target = this.picture, into = null) {
     const { gl, canvas, scene } = this, p = this.developing;
     const [width, height] = into ? [target.width, target.height] : [canvas.width, canvas.height];
@@ -290,7 +290,7 @@ class Renderer {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  // RGBA of a target, rows from the top.
+  // Return the RGBA of a target, rows from the top.
   read(target) {
     const { gl } = this, out = new Float32Array(4 * target.width * target.height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.buffer);
@@ -299,7 +299,7 @@ class Renderer {
   }
 }
 
-// Exposure times white balance of each channel.
+// Return exposure times white balance of each channel.
 function factorsOf(look, scene) {
   return look.balance.map((b) => scene.look.exposure * 2 ** look.ev * Math.exp(b));
 }
@@ -313,7 +313,7 @@ function tableRows(look, scene) {
   return { rows, first: rows.map((r) => tables.first[r]), step: rows.map((r) => tables.step[r]) };
 }
 
-// Exposed radiance that each channel's curve shows as 1.
+// Return the exposed radiance that each channel's curve shows as 1.
 function whiteOf(look, scene, tables) {
   const { pivot } = scene.tone;
   const last = scene.tone.tables ? scene.tone.tables.values[0].length - 1 : 0;

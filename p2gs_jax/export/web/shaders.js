@@ -1,5 +1,5 @@
-// The same formulas as p2gs_jax/render/project.py, harmonics.py and
-// tiles.py, and for the picture p2gs_jax/photometry/formation.py.
+// The formulas are those of p2gs_jax/render (project.py, harmonics.py, tiles.py), and for the
+// picture those of p2gs_jax/photometry/formation.py.
 
 const VERSION = "#version 300 es\nprecision highp float;\nprecision highp int;\n" +
   "precision highp sampler2D;\nprecision highp usampler2D;\nprecision highp sampler2DArray;\n";
@@ -9,7 +9,7 @@ void main() {
   gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0);
 }`;
 
-// One texel for each Gaussian: its place in the picture, and its radiance towards the camera.
+// Each Gaussian has a texel with its place in the picture and its radiance towards the camera.
 const PROJECT = VERSION + `
 uniform sampler2DArray splats;
 uniform int count, coefficients, activation;
@@ -100,7 +100,7 @@ void main() {
   float reach = where.z - where.w;
   gl_Position = vec4(2.0, 2.0, 0.0, 1.0);
   if (!(reach > 0.0)) return;
-  // A little wider than the ellipse: rounding must not cut pixels off.
+  // The quad is a little wider than the ellipse, so that rounding does not cut pixels off.
   vec2 u = 1.001 * sqrt(2.0 * reach) * vec2(gl_VertexID % 2 * 2 - 1, gl_VertexID / 2 * 2 - 1);
   float y = u.y / factor.z;
   vec2 corner = where.xy + vec2((u.x - factor.y * y) / factor.x, y);
@@ -122,13 +122,13 @@ void main() {
   color = vec4(min(radiance, brightest) * alpha, alpha);
 }`;
 
-// Exposure, gamma, curve and white point: the only change of light is here.
+// Exposure, gamma, curve and white point are applied here, and light is not changed elsewhere.
 const DEVELOP = VERSION + `
 uniform sampler2D linear, tables, photograph;
 uniform vec2 pictureSize, canvasSize;
 uniform vec3 factors;           // exposure times white balance
 uniform int mode;               // 0 picture, 1 stops, 2 clipping, 3 exposed radiance as it is
-uniform int curve;              // 0 linear, 1 power, 2 srgb, 3 table
+uniform int curve;              // 0 linear, 1 power, 2 sRGB, 3 table
 uniform float gamma, pivot, white;
 uniform vec3 curveWhite;        // exposed radiance that the curve shows as 1
 uniform vec3 tableFirst, tableStep;
@@ -166,7 +166,7 @@ float table(float logLinear, int channel) {
   return a + (place - left) * (b - a);
 }
 
-// Linear up to mid-grey; from there a shoulder that reaches 1 at the chosen white point.
+// The curve is linear up to mid-grey, then a shoulder that reaches 1 at the chosen white point.
 float shoulder(float x, float top) {
   if (white == 1.0 || x <= GREY || top <= GREY) return x;
   float t = (x - GREY) / (top - GREY), w = (white * top - GREY) / (top - GREY);

@@ -24,7 +24,7 @@ onmessage = ({ data }) => {
   postMessage({ order }, [order.buffer]);
 };
 
-// The bits of positive floats sort like the floats: two stable passes of 16 bits.
+// Bits of positive floats sort like the floats, here in two stable passes of 16 bits.
 function farthestFirst(keys, rows) {
   let from = rows.slice(), keysFrom = keys.slice();
   for (const shift of [0, 16]) {
