@@ -186,15 +186,14 @@ class Trainer:
 
     def _loop(self, state: FitState, host: HostState, clock: RunClock) -> FitState:
         """Run bursts until the run is complete or its time is over."""
-        train = self.cfg.train
-        every_s, steps = train.checkpoint_every_s, None if train.budget_s else train.steps
+        every_s = self.cfg.train.checkpoint_every_s
         saved, pause = host.elapsed_s, every_s
         while not schedule.is_over(host.progress, host.pace):
             state, reports = self._take_burst(state, host)
             clock.tick(host)
             if reports:
                 alive, left_s = alive_in(state.population), clock.left(host, self.levels)
-                self.records.log(record_of(reports, host, alive, left_s, steps))
+                self.records.log(record_of(reports, host, alive, left_s))
                 # From here on a signal waits until a checkpoint can be written.
                 self.signals.begin()
                 state = self._densified(state, host)

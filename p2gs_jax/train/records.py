@@ -25,17 +25,13 @@ SHARE, LATEST = 0.01, 20.0
 
 
 def record_of(
-    reports: Sequence[StepReport],
-    host: HostState,
-    gaussians: int,
-    left_s: float | None,
-    steps: int | None,
+    reports: Sequence[StepReport], host: HostState, gaussians: int, left_s: float | None
 ) -> LogRecord:
     """Return the log record of a burst.
 
     `reports` are the reports of its steps; `host` and `gaussians` are the counters and the
     population after it. `left_s` is the estimated time of optimisation left, seconds; None: not
-    known yet. `steps` is the length of the run; None under a time budget.
+    known yet.
     """
     reports = jax.device_get(list(reports))  # in one transfer, because each costs a round trip
     last = reports[-1]
@@ -51,7 +47,6 @@ def record_of(
         step_seconds=round(host.step_s, 5),
         left_s=None if left_s is None else round(left_s, 1),
         terms={k: _mean(r.terms[k] for r in reports) for k in last.terms},
-        steps=steps,
     )
 
 
@@ -114,7 +109,9 @@ class Records:
         return state, host
 
     def log(self, record: LogRecord) -> None:
-        """Append a record to the log and pass it on."""
+        """Append a record to the log, with the steps of the whole run, and pass it on."""
+        train = self.cfg.train
+        record = dataclasses.replace(record, steps=None if train.budget_s else train.steps)
         append_jsonl(self._log, dataclasses.asdict(record))
         self.on_log(record)
 

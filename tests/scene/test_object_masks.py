@@ -85,7 +85,7 @@ def test_stores_share_photographs_and_leave_out_boxes(tmp_path):
     without = whole.leaving_out([box, thing((3, 0, 8.0), moving=False)])
     np.testing.assert_array_equal(whole.get(0)[1], 1)
     assert without.stored(0)[0] is whole.stored(0)[0]
-    assert whole._photographs.cached_bytes == without._photographs.cached_bytes > 0
+    assert whole._photographs._bytes == without._photographs._bytes > 0
     for store in (without, ImageStore([view], DataConfig(), [box])):
         np.testing.assert_array_equal(store.get(0)[1], ~mask)
         np.testing.assert_array_equal(store.stored(0)[1], ~mask)

@@ -25,13 +25,6 @@ SMALL_FIT = {
     "init.shell": "off",
     "init.dense": "off",
 }
-# A fit that takes a second once its programs are compiled. The model is given: a curve that is
-# fitted is a constant of the programs, which are then compiled for every fit.
-SMALLEST_FIT = SMALL_FIT | {
-    "train.steps": 20,
-    "photometry.select": False,
-    "photometry.curve": "srgb",
-}
 
 
 def in_a_row(count: int) -> list[tuple[np.ndarray, np.ndarray]]:

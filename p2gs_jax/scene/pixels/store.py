@@ -256,11 +256,6 @@ class _DecodedPhotographs:
         self._worker = ThreadPoolExecutor(DECODERS, thread_name_prefix="decode")
         _OPEN.add(self)
 
-    @property
-    def cached_bytes(self) -> int:
-        with self._lock:
-            return self._bytes
-
     def get(self, key: Key) -> Decoded:
         with self._lock:
             entry = self._cache.get(key)

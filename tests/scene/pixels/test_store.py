@@ -71,7 +71,7 @@ def test_shrinking_averages_and_masks_conservatively(tmp_path):
     # A whole photograph does not depend on the width of a fit, and is not kept.
     small = store_of(view, max_width=16)
     np.testing.assert_array_equal(small.whole(0)[0], bgr[..., ::-1] / np.float32(255))
-    assert small._photographs.cached_bytes == 0
+    assert small._photographs._bytes == 0
 
 
 def _pattern(x, y):
@@ -108,7 +108,7 @@ def test_cache_is_bounded_and_reused(tmp_path):
     store = store_of(*views, cache_mb=3)
     for i in range(6):
         assert store.get(i)[0].max() == np.float32(i / 255)
-        assert store._photographs.cached_bytes <= 3 * 2**20
+        assert store._photographs._bytes <= 3 * 2**20
     for view in views[3:]:
         view.image_path.unlink()
     for i in (3, 4, 5):
@@ -143,7 +143,7 @@ def test_prefetch_from_many_threads(tmp_path):
     with ThreadPoolExecutor(4) as threads:
         np.testing.assert_array_equal([*threads.map(work, asked)], np.float32(asked / 255))
     store.close()
-    assert store._photographs.cached_bytes == 0
+    assert store._photographs._bytes == 0
     gone = store_of(make_view(tmp_path / "gone.png"))
     gone.prefetch(0)
     with refused(r"gone.png"):
@@ -321,4 +321,4 @@ def test_decoded_photographs_go_however_their_run_ends(tmp_path, views, ended):
         if not ended:
             raise KeyboardInterrupt
     assert not folder.exists()
-    assert store._photographs.cached_bytes == 0
+    assert store._photographs._bytes == 0
