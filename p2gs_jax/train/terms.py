@@ -252,13 +252,9 @@ def contrast_loss(rendered: Image, photograph: Image, mask: Layer) -> Float[Arra
     error = jnp.where(whole, _pooled((raised * photograph - rendered).mean(-1)), 0.0)
     total = jnp.zeros(())
     for axis in (0, 1):
-        both = _both(whole, axis)
+        both = whole[1:] & whole[:-1] if axis == 0 else whole[:, 1:] & whole[:, :-1]
         total += 2 * jnp.sum(jnp.where(both, jnp.diff(error, axis=axis) ** 2, 0.0))
     return total / jnp.maximum(whole.sum(), 1)
-
-
-def _both(whole, axis: int):
-    return whole[1:] & whole[:-1] if axis == 0 else whole[:, 1:] & whole[:, :-1]
 
 
 def _pooled(image: Layer) -> Float[Array, "y x"]:

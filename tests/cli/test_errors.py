@@ -139,8 +139,7 @@ def test_wrong_words_are_answered_with_a_way_on(refused, place, monkeypatch, wor
     monkeypatch.chdir(place)
     monkeypatch.setenv("COLUMNS", "100")
     before = contents(place)
-    said = refused(*words.split())
-    assert way_on in said
+    assert way_on in (said := refused(*words.split()))
     assert "Run folder" not in said
     assert contents(place).items() >= before.items(), "a failure leaves everything as it was"
     assert not any((place / name).exists() for name in ("new", "run", "x"))

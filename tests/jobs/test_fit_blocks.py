@@ -103,10 +103,9 @@ def test_one_block_is_an_ordinary_fit(tmp_path, monkeypatch):
     assert p2gs_jax.fit_blocks(scene, tmp_path / "run", SMALL, blocks="auto") == "fitted"
     assert asked["cfg"] == SMALL
     assert not (tmp_path / "run" / "blocks").exists()
-    loaded = replace(load(scene, tmp_path / "run", SMALL), random_seeds=True)
-    store = ImageStore(loaded.views, SMALL.data)
+    scene = replace(load(scene, tmp_path / "run", SMALL), random_seeds=True)
     with pytest.raises(UserError, match="seed points are random, so the exposures"):
-        solve_shared(loaded, store, SMALL, Silent(), None)
+        solve_shared(scene, ImageStore(scene.views, SMALL.data), SMALL, Silent(), None)
 
 
 def test_a_block_has_the_population_of_the_whole_and_more_for_what_is_outside():

@@ -29,8 +29,7 @@ FIELDS |= {"photometry.select": False, "photometry.model": "view_exposure"}
 SHORT = with_fields(FitConfig(), FIELDS)
 METHODS = {
     "rigid": SHORT,
-    "mask": with_fields(SHORT, {"dynamics.method": "mask"}),
-    "off": with_fields(SHORT, {"dynamics.method": "off"}),
+    **{name: with_fields(SHORT, {"dynamics.method": name}) for name in ("mask", "off")},
     "vibration": with_fields(SHORT, {"dynamics.method": "vibration", "dynamics.vibrating": 600}),
     "adaptive": with_fields(SHORT, {"densify.method": "adaptive", "densify.grad_threshold": 0.0}),
 }

@@ -76,12 +76,10 @@ def test_modes_backgrounds_and_colours_of_each_camera(drawn):
     np.testing.assert_allclose(expected[..., 3:] * jnp.maximum(alphas, 1e-10), depth, rtol=1e-5)
     np.testing.assert_array_equal(draw(given, render_mode="D", **fixed)[0], depth)
     over = dataclasses.replace(CFG, background=(1.0, 0.5, 0.0), near=9.0, blur=9.0)
-    asked = {"near_plane": CFG.near, "eps2d": CFG.blur} | fixed
-    np.testing.assert_allclose(
-        draw(given, cfg=over, **asked)[0], rgb + (1 - alphas) * BACK[0], 1e-5
-    )
-    asked |= {"cfg": over, "backgrounds": jnp.zeros((2, 3))}
-    np.testing.assert_allclose(draw(given, **asked)[0], rgb, 1e-5)
+    asked = {"cfg": over, "near_plane": CFG.near, "eps2d": CFG.blur} | fixed
+    np.testing.assert_allclose(draw(given, **asked)[0], rgb + (1 - alphas) * BACK[0], 1e-5)
+    black = draw(given, backgrounds=jnp.zeros((2, 3)), **asked)[0]
+    np.testing.assert_allclose(black, rgb, 1e-5)
     each = {"colors": jnp.stack([given["colors"], 2 * given["colors"]])}
     twice, _, _ = draw(given | each, backgrounds=jnp.asarray(BACK), render_mode="RGB+D", **fixed)
     behind = (1 - alphas) * BACK[:, None, None]

@@ -9,6 +9,7 @@ import pytest
 from splats import gaussians_of
 from tiny_scene import make_scene
 
+from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.formats.ply import read_ply, write_ply, write_radiance
 from p2gs_jax.render.harmonics import C0
@@ -20,11 +21,6 @@ RADIANCE = np.array([0.1, 0.2, 0.05])
 EXPOSURES, DEVELOPED_EV = (0.5, 2.0), 1.0
 BALANCE, VIGNETTING = (1.25, 1.0, 0.8), -0.5
 WIDTH, HEIGHT = 48, 40
-
-
-def srgb(x):
-    x = np.clip(x, 0, 1)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
 
 
 def walls(colors):
@@ -62,7 +58,7 @@ def trained(tmp_path_factory):
     rows = [f"{k}.png,1,{DEVELOPED_EV},{ev}\n" for k, ev in enumerate(evs)]
     table = root / "cal" / "developed" / "exposures.csv"
     table.write_text("image,camera,ev,original_ev\n" + "".join(rows))
-    write_ply(root / "splat.ply", walls(srgb(2**DEVELOPED_EV * RADIANCE)), [])
+    write_ply(root / "splat.ply", walls(srgb_encode(2**DEVELOPED_EV * RADIANCE)), [])
     return root
 
 
@@ -79,7 +75,7 @@ def test_a_photograph_is_shown_as_it_was_taken(succeeded, trained, tmp_path):
     # The third view has the mean exposure, and the mean white balance of its camera.
     for name, gains in (("0", 0.5), ("1", 2 * np.array(BALANCE)), ("2", np.sqrt(BALANCE))):
         shown = np.asarray(cv2.imread(str(tmp_path / f"{name}.render.png")))[..., ::-1]
-        expected = 255 * srgb(gains * light)
+        expected = 255 * srgb_encode(gains * light)
         assert np.abs(shown - expected)[4:-4, 4:-4].max() < 1.5
         linear, *_ = read_exr(tmp_path / f"{name}.exr")
         np.testing.assert_allclose(linear[20, 24], RADIANCE, rtol=0.01)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from made_drive import FORWARD
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax.scene.rigid import pose_of
@@ -15,8 +16,6 @@ from p2gs_jax.scene.rigid import pose_of
 WIDTH, HEIGHT = 64, 48
 # Of every camera: fx, fy, cx, cy with pixel centres at +0.5.
 K = (50, 51, 32, 24)
-# OpenCV's axes (x right, y down, z forward) in those of cars (x forward, y left, z up).
-FORWARD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 # Boxes about the scanner, in axes x forward, y left: one ahead, one to the right.
 AHEAD, RIGHT = (12.0, 0.0), (0.0, -8.0)
 LENGTH, BREADTH, TALL = SIZE = (4.2, 1.8, 1.5)
