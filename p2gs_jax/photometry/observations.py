@@ -40,6 +40,8 @@ class Observations:
     brightest: PerChannel | None = None  # largest value of the pixels that were averaged
     # Cell of the scene in which each point lies; unmodelled errors are shared in it. None: unknown.
     cells: Labels | None = None
+    # Doublings of a pixel's width on the surface, up to a constant; None: unknown.
+    footprints: Float[np.ndarray, " o"] | None = None
 
     def decoded(self, response: Response) -> tuple[PerChannel, PerChannel, PerChannel]:
         """Return log exposed radiance z, its standard deviation by the noise model, and dz/dy."""
@@ -71,6 +73,7 @@ class Observations:
     def picked(self, pick: np.ndarray | slice) -> Observations:
         """Return some of the observations, by a mask or by rows."""
         names = ("views", "points", "colors", "spread", "positions", "brightest", "cells")
+        names = (*names, "footprints")
         kept = {k: v[pick] for k in names if (v := getattr(self, k)) is not None}
         return replace(self, **kept)
 

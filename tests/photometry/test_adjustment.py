@@ -12,7 +12,7 @@ from synthetic_drive import make_drive, make_exposures, observe
 
 from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 from p2gs_jax.evaluation.alignment import exposure_error
-from p2gs_jax.photometry.adjustment import equations, matrices, solve
+from p2gs_jax.photometry.adjustment import equations, errors, matrices, solve
 from p2gs_jax.photometry.adjustment import fit as fitting
 from p2gs_jax.photometry.adjustment.errors import uncertainty
 from p2gs_jax.photometry.adjustment.problem import KnownExposures
@@ -106,11 +106,21 @@ def with_surfaces(o, frames, seed):
     return dataclasses.replace(o, colors=colors, cells=cell)
 
 
+def with_footprints(o, frames, change):
+    """Return observations whose light changes by `change` per doubling of a pixel's width."""
+    wide = -0.3 * (o.views % frames)
+    wide = (wide - np.random.default_rng(0).uniform(0, 9, o.point_count)[o.points]).astype("f4")
+    colors = np.clip(o.colors * np.exp(change * wide / 2.2)[:, None], 0, 1)
+    return dataclasses.replace(o, colors=colors, footprints=wide)
+
+
 @pytest.mark.parametrize(
-    "case", ["exposures", "gammas", "neighbours err alike", "surfaces err alike"]
+    "case",
+    ["exposures", "gammas", "neighbours err alike", "surfaces err alike", "footprints matter"],
 )
-def test_standard_errors_have_the_size_of_the_errors(case):
+def test_standard_errors_have_the_size_of_the_errors(case, monkeypatch):
     ratios = []
+    monkeypatch.setattr(errors, "FOOTPRINT", 0.02)
     for seed in range(5):
         drive = make_drive(8, 800, seed)
         truth = make_exposures(drive, "iso4", seed)
@@ -121,6 +131,8 @@ def test_standard_errors_have_the_size_of_the_errors(case):
         o = observe(drive, truth, curve="power", shared_texture=shared, **how)
         if case == "surfaces err alike":
             o = with_surfaces(o, 8, seed)
+        if case == "footprints matter":
+            o = with_footprints(o, 8, 0.02 * (-1) ** seed)
         model = "view_exposure_gamma" if case == "gammas" else "view_exposure"
         s = adjust(o, model, Response("power"))
         gap = s.log_exposures - np.log(truth)

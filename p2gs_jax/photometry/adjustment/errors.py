@@ -39,6 +39,10 @@ SHARED_REGION = 2 / 3  # side of the regions that share an error, in the same un
 # Least number, and least effective number, of observations in a region for its shared error.
 FEWEST, FEWEST_EFFECTIVE = 4, 3.0
 
+# Standard deviation of the change of light per doubling of a pixel's width on the surface, log
+# units; uniform points of a town of 600 m have this slope (BUILD_NOTES, "Error bars").
+FOOTPRINT = 6e-4
+
 # A linear function of changes of all parameters (columns) about the solution.
 Asked = Callable[[Parameters], Float[np.ndarray, "n c"]]
 
@@ -66,7 +70,8 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
     """Return the robust covariance of all parameters: bread, meat, bread (Huber; White).
 
     Residuals of the channels of an observation, of a point, and of its neighbours are not
-    independent: the meat is summed over clusters. Errors that regions of an image share are added.
+    independent: the meat is summed over clusters. Errors that regions of an image share are added,
+    and the effect of a change of light with the footprint, which drifts along a drive.
     """
     layout = fit.model.layout
     clusters = observations.cells
@@ -82,6 +87,11 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
         if deviation > 0:
             shared = deviation * _shared_scores(fit.model, fit.theta, fit.at, labels)
             each = sp.csr_array(sp.vstack([each, shared]))
+    if observations.footprints is not None and len(layout.row):
+        # A change of the data acts through the second derivative of the loss.
+        wide = fit.at.curvature * FOOTPRINT * observations.footprints
+        one = _shared_scores(fit.model, fit.theta, fit.at, np.zeros_like(layout.row), wide)
+        each = sp.csr_array(sp.vstack([each, one]))
     seen = fit.model.weight.any(1)
     # A view's exposure is a mean over its clusters and takes one degree of freedom.
     pairs = np.unique(np.stack([layout.views[seen], clusters[seen]]), axis=1)[0]
@@ -190,8 +200,14 @@ def _shared_deviation(model: Forward, at: Weighted, labels: Labels, parts: Label
     return float(np.sqrt(max(excess, 0.0) / kept))
 
 
-def _shared_scores(model: Forward, theta: Parameters, at: Weighted, labels: Labels) -> sp.csr_array:
-    """Return derivatives of the right side, points eliminated, by region errors: (regions, d)."""
+def _shared_scores(
+    model: Forward, theta: Parameters, at: Weighted, labels: Labels, size: np.ndarray | float = 1.0
+) -> sp.csr_array:
+    """Return derivatives of the right side, points eliminated, by errors that labels share.
+
+    `size` are the errors of observations relative to those of their labels. The result is (labels,
+    d).
+    """
     layout, u = model.layout, model.unknowns
     coupled = equations.coupling(layout, theta, at)
     per_view = [
@@ -200,7 +216,8 @@ def _shared_scores(model: Forward, theta: Parameters, at: Weighted, labels: Labe
     ]
     terms, place = equations.others(model, theta), 3 * layout.row[:, None] + np.arange(3)
     more = None if terms is None else terms.sums(coupled, place, 3 * layout.rows)
-    of_points = equations.at_places(layout, coupled, labels, int(labels.max(initial=-1)) + 1)
-    return summed(model, theta, at, at.weight, labels) - of_points @ equations.over_all(
+    size = np.broadcast_to(size, labels.shape)[:, None]
+    of_points = equations.at_places(layout, coupled * size, labels, int(labels.max(initial=-1)) + 1)
+    return summed(model, theta, at, at.weight * size, labels) - of_points @ equations.over_all(
         u, per_view, more
     )

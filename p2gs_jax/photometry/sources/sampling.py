@@ -161,7 +161,7 @@ def point_colors(
     views = [scene.views[i] for i in scene.train_indices]
     wrong = patches.two_sided(surfaces, points, views)
     surfaces = surfaces._replace(normals=np.where(wrong[:, None], np.nan, surfaces.normals))
-    moments, keep = _at_one_scale(surfaces, points, views)
+    moments, keep, scales = _at_one_scale(surfaces, points, views)
 
     def read(row: int):
         mine, there = points[row][keep[row]], xy[row][keep[row]]
@@ -171,17 +171,20 @@ def point_colors(
         found = sample_patches(ldr, mask, grids, len(mine), deviation)
         good = found.valid
         at = places(there[good], *mask.shape[::-1]).astype(np.float32)
-        return (np.full(len(at), row), mine[good], *(values[good] for values in found[:3]), at)
+        wide = -np.log2(scales[row][keep[row]][good]).astype(np.float32)
+        return (np.full(len(at), row), mine[good], *(v[good] for v in found[:3]), at, wide)
 
     rows = [row for row, kept in enumerate(keep) if kept.any()]
     nothing, none = np.zeros((0, 3), np.float32), np.zeros(0, int)
-    parts: list[tuple[np.ndarray, ...]] = [(none, none, *[nothing] * 3, nothing[:, :2])]
+    parts: list[tuple[np.ndarray, ...]] = [
+        (none, none, *[nothing] * 3, nothing[:, :2], nothing[:, 0])
+    ]
     for done, found in enumerate(map_in_order(read, rows)):
         parts.append(found)
         return_freed_memory()  # of photographs of 12 MP, 1 GB
         if on_view is not None:
             on_view(done + 1, len(rows))
-    of_view, seen, colors, spread, brightest, positions = map(
+    of_view, seen, colors, spread, brightest, positions, footprints = map(
         np.concatenate, zip(*parts, strict=True)
     )
     cameras = [view.camera for view in views]
@@ -199,6 +202,7 @@ def point_colors(
         brightest=brightest,
         camera_names=tuple(sorted(set(cameras))),
         cells=_cells(surfaces.points, seen, of_view, views),
+        footprints=footprints,
     )
 
 
@@ -223,13 +227,16 @@ def _cells(
 
 def _at_one_scale(
     surfaces: Surfaces, points: list[Int[np.ndarray, " _"]], views: list[View]
-) -> tuple[Symmetric, list[np.ndarray]]:
-    """Return the moments of every point's patch, and which points each view samples."""
+) -> tuple[Symmetric, list[np.ndarray], list[np.ndarray]]:
+    """Return the moments of every point's patch, which points each view samples, and its scales.
+
+    A scale is the number of pixels per scene unit on the surface.
+    """
     within = [
         patches.metric(patches.plane_in(surfaces, mine, view), view)
         for mine, view in zip(points, views, strict=True)
     ]
-    # Pixels per length, the mean of both directions; 0 for wrong tracks behind their camera.
+    # The mean of both directions; 0 for wrong tracks behind their camera.
     scales = [np.maximum(patches.determinant(m), 0.0) ** 0.25 for m in within]
     finest = np.zeros(len(surfaces.points))
     for mine, scale in zip(points, scales, strict=True):
@@ -245,4 +252,4 @@ def _at_one_scale(
         here = pixel * patches.inverse(metric[kept])
         new = moments[few, 0] == 0
         moments[few] = patches.joined(np.where(new[:, None], here, moments[few]), here)
-    return moments, keep
+    return moments, keep, scales
