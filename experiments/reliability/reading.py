@@ -13,7 +13,7 @@ from p2gs_jax.cli import main
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.text import printable
 from p2gs_jax.errors import UserError
-from p2gs_jax.scene import find_scene, with_what_lies_beside
+from p2gs_jax.scene import find_scene, with_masks_and_split
 from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.drives.recording import Recording
 from p2gs_jax.scene.pixels.store import ImageStore
@@ -56,7 +56,7 @@ def _whole(root: Path) -> int:
         return _swept(found)
     if not isinstance(found, Scene):
         return 0
-    scene = with_what_lies_beside(found, cfg)
+    scene = with_masks_and_split(found, cfg)
     store = ImageStore(scene.views, cfg)
     for row in range(len(scene.views)):
         pixels, mask = store.get(row)

@@ -58,7 +58,7 @@ def write_exr(
         header |= camera_attributes(camera)
     if shot is not None:
         numbers = {"expTime": shot.time, "aperture": shot.aperture, "isoSpeed": shot.iso}
-        exif = numbers | {"capDate": shot.taken}
+        exif = numbers | {"capDate": shot.date}
         header |= {name: value for name, value in exif.items() if value is not None}
     channels = {c: np.ascontiguousarray(linear[..., i].astype(pixel)) for i, c in enumerate("RGB")}
     if alpha is not None:

@@ -27,7 +27,7 @@ from p2gs_jax.photometry.formation import LEAST_ALPHA
 from p2gs_jax.photometry.metering import Metering
 from p2gs_jax.render.capacity import RenderView, make_renderer
 from p2gs_jax.run import photometry_files, read
-from p2gs_jax.scene import find_scene, with_what_lies_beside
+from p2gs_jax.scene import find_scene, with_masks_and_split
 from p2gs_jax.scene.masks import with_alpha
 from p2gs_jax.scene.pixels.store import camera_of
 from p2gs_jax.types import GAMMA_SRGB, Gaussians, Params, Scene
@@ -128,7 +128,7 @@ def foreign_run(splats: str | Path, photometry: str | Path, scene: str | Path) -
     if not isinstance(found, Scene):
         fix = f"name the scene that the other program read, {DEVELOPED.parent} in {folder}"
         raise broken(scene, "has no COLMAP model and no transforms.json", fix)
-    found, notes = _with_known(with_alpha(with_what_lies_beside(found, data), data), saved, path)
+    found, notes = _with_known(with_alpha(with_masks_and_split(found, data), data), saved, path)
     gaussians = read_splats(splats)
     means = on_device(np.asarray(gaussians.means, np.float64) - np.array(found.origin))
     gaussians, developed = replace(gaussians, means=means), common_look(folder, saved)

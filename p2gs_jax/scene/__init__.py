@@ -1,4 +1,4 @@
-"""From a folder on disk to a `Scene`: the format is recognised, and masks, EXIF and split added."""
+"""From a folder on disk to a `Scene`: its format is recognised; masks, EXIF and split are added."""
 
 from __future__ import annotations
 
@@ -38,16 +38,16 @@ def load_scene(
     `transforms_train.json` with one file for each other part of the split; LLFF's
     `poses_bounds.npy`; a COLMAP model in a deeper folder; a drive of a known data set (`drives`);
     photographs in `images/` or the folder itself, or a video. Structure from motion then finds the
-    cameras of photographs and videos. If poses come without points, points are triangulated, or
-    random where hardly anything matches. Views are sorted by name. `work_dir` keeps the results of
-    long computations for a resume, in the folder of results. Raises UserError: there is no scene,
-    a file is broken, or results would lie among photographs alone; the message names the file.
+    cameras of photographs and videos. Poses without points get triangulated points, or random ones
+    if fewer than `FEWEST` are found. Views are sorted by name. `work_dir`, in the folder of
+    results, keeps long computations for a resume. Raises UserError: there is no scene, a file is
+    broken, or results would be written among photographs; the message names the file.
     """
     found = find_scene(root, cfg, report)
     if isinstance(found, Recording):
         scene = assemble(found, cfg, work_dir, report)
     elif isinstance(found, PhotographsAlone | Path):
-        # The import is here, as below: scenes with cameras and points do not need COLMAP.
+        # This import is local, as the one below: scenes with cameras and points need no COLMAP.
         from p2gs_jax.scene.sfm.map import load_images
 
         if isinstance(found, Path):
@@ -67,7 +67,7 @@ def load_scene(
         scene = found
     listed = scene.split_by is not None or cfg.split is not None
     # Masks and EXIF belong to the original photographs, alpha to the converted ones.
-    scene = converted_views(with_what_lies_beside(scene, cfg), work_dir, report)
+    scene = converted_views(with_masks_and_split(scene, cfg), work_dir, report)
     scene = with_alpha(scene, cfg)
     if len(scene.points) == 0:
         from p2gs_jax.scene.sfm.map import triangulate
@@ -79,8 +79,8 @@ def load_scene(
     return scene
 
 
-def with_what_lies_beside(scene: Scene, cfg: DataConfig) -> Scene:
-    """Return a scene with masks, EXIF exposures and split.
+def with_masks_and_split(scene: Scene, cfg: DataConfig) -> Scene:
+    """Return a scene with the masks of its views, EXIF exposures and the split.
 
     Raises UserError: the number of held-out views is impossible, or a list of them is wrong.
     """
@@ -95,7 +95,7 @@ def with_what_lies_beside(scene: Scene, cfg: DataConfig) -> Scene:
 
 
 class PhotographsAlone(NamedTuple):
-    """Photographs without cameras: the folder that names are relative to, and sorted paths."""
+    """Photographs without cameras: sorted paths, and the folder to which names are relative."""
 
     folder: Path
     paths: list[Path]
@@ -106,8 +106,8 @@ def find_scene(
 ) -> Scene | Recording | PhotographsAlone | Path:
     """Return the scene of a folder in the order of `load_scene`, without long computations.
 
-    A Path stands for a video without cameras. Raises UserError: there is no scene, or a file is
-    broken; the message names the file.
+    A Path names a video. Raises UserError: there is no scene, or a file is broken; the message
+    names the file.
     """
     root = Path(root)
     if not root.exists():
@@ -150,8 +150,8 @@ def _read_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
         notes.append(f"The cameras come from the COLMAP model in {folder}.")
     if not len(scene.points):
         notes.append(f"The COLMAP model {folder} has no points: points are triangulated.")
-    times, said = transforms.table_times(root, image_folder_of(scene.views[0]))
-    scene = dataclasses.replace(scene, notes=(*scene.notes, *notes, *said))
+    times, time_notes = transforms.table_times(root, image_folder_of(scene.views[0]))
+    scene = dataclasses.replace(scene, notes=(*scene.notes, *notes, *time_notes))
     source = root / (transforms.LLFF_FILES[0] if times else "exposure.json")
     if not times and source.is_file():
         times = exposure_times(source)

@@ -13,18 +13,18 @@ from p2gs_jax.core.text import count_of, natural
 from p2gs_jax.scene.rigid import camera_centers
 from p2gs_jax.types import View
 
-# The ends of names that state an exposure: `_-2EV`, `_ev+1.3`, `_exp2`.
+# Ends of names that state an exposure: `_-2EV`, `_ev+1.3`, `_exp2`.
 _NUMBER = r"[+-]?\d+(?:\.\d+)?"
 _EXPOSURE = re.compile(rf"[_-](?:ev_?{_NUMBER}|{_NUMBER}_?ev|exp(?:osure)?_?\d+)$", re.IGNORECASE)
-# Poses are nearly the same if they differ by less. The distance is relative to the camera's median
-# distance from the middle of its centres; the rotation is the cosine of half a degree.
+# Poses are nearly the same within these limits: a distance, divided by the median distance of the
+# camera's centres from their middle, and the cosine of a rotation by 0.5 degrees.
 _NEAR, _TURNED = 0.01, float(np.cos(np.radians(0.5)))
 # The smallest difference of two exposures of a bracket, stops.
 _STEP = 0.2
 
 
 def names_of_brackets(names: Sequence[str]) -> list[str]:
-    """Return for each photograph the name of its bracket: without suffix and stated exposure."""
+    """Return for each photograph its name without suffix and stated exposure."""
     paths = [PurePosixPath(name) for name in names]
     return [path.with_name(_EXPOSURE.sub("", path.stem)).as_posix() for path in paths]
 
@@ -40,9 +40,9 @@ def brackets(views: Sequence[View]) -> list[int]:
     centers = camera_centers(np.stack([view.viewmat for view in views]))
     cameras = np.array([view.camera for view in views])
     radius = {
-        camera: float(np.median(np.linalg.norm(own - np.median(own, 0), axis=1)))
+        camera: float(np.median(np.linalg.norm(group - np.median(group, 0), axis=1)))
         for camera in np.unique(cameras)
-        for own in [centers[cameras == camera]]
+        for group in [centers[cameras == camera]]
     }
     named, last = dict[tuple[str, str], int](), dict[str, list[int]]()
     out = [0] * len(views)
@@ -72,7 +72,7 @@ def _continues(views: Sequence[View], radius: float) -> bool:
 
 
 def bracket_notes(keys: Sequence[object]) -> list[str]:
-    """Return a sentence on brackets, given the bracket of each photograph, or none."""
+    """Return a note on brackets, or no note; `keys` name the bracket of each photograph."""
     sizes = [size for size in Counter(keys).values() if size > 1]
     if not sizes:
         return []

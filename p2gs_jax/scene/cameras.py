@@ -1,4 +1,4 @@
-"""Which photographs count as one camera: they share a lens, and an effect on light."""
+"""Names of cameras: photographs of one camera share a lens and its photometric model."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from p2gs_jax.types import View
 
 
 def parent_of(name: str) -> str:
-    """Return the folders in the relative name of an image, or an empty text."""
+    """Return the folders in the relative name of an image, or an empty string."""
     return PurePosixPath(name).parent.as_posix().removeprefix(".")
 
 
 def numbered(views: Sequence[View]) -> list[View]:
-    """Return views with a number instead of the text in `View.camera` that describes the lens."""
+    """Return views whose `camera`, here a description of the lens, is replaced by a number."""
     numbers = {lens: k for k, lens in enumerate(dict.fromkeys(view.camera for view in views))}
     return [replace(view, camera=str(numbers[view.camera])) for view in views]
 
 
 def name_cameras(views: Sequence[View], by: CameraBy) -> tuple[View, ...]:
-    """Return views with the names of their cameras; `View.camera` is still the model's camera.
+    """Return views with the names of their cameras; `views` have the model's camera ids instead.
 
     `auto` separates photographs by folder, by the model's camera, and by make, model and lens in
-    EXIF. The last two do not count if hardly any value is shared by two photographs, as in models
-    with one camera for each photograph.
+    EXIF. The model's cameras and EXIF count only if at least half of the photographs share their
+    value with another one; COLMAP may write a camera for each photograph.
     """
     folders = models = devices = [""] * len(views)
     if by in ("auto", "folder"):
@@ -52,7 +52,7 @@ def name_cameras(views: Sequence[View], by: CameraBy) -> tuple[View, ...]:
 
 
 def _shared(keys: list[str], folders: Sequence[str]) -> list[str]:
-    """Return keys, or empty ones if most belong to one photograph: these are not cameras."""
+    """Return keys, or empty ones if most photographs share their key with no other."""
     counts = Counter(zip(folders, keys, strict=True))
     shared = sum(n for n in counts.values() if n > 1)
     return keys if 2 * shared >= len(keys) else [""] * len(keys)

@@ -36,16 +36,16 @@ CUT = (
     "equirectangular, or COLMAP's python/examples/panorama_sfm.py"
 )
 _LENGTH = struct.Struct("<Q")
-_NUMBERS = re.compile(r"[-+.\deEnaif\s]*")
+_NUMBERS = re.compile(r"[-+.\deEnaif\s]*")  # `nan` and `inf` included
 _STEMS = ("cameras", "images", "points3D")
 _POINT = np.dtype([("id", "<i8"), ("xyz", "<f8", 3), ("rgb", "u1", 3)])
-# A point is followed by its error and by the number of observations, which have 8 bytes each.
+# Bytes of a point up to its observations, and the position of their number, behind the error.
 _POINT_BYTES, _LENGTH_AT = 51, 43
 _KEYPOINT = np.dtype([("xy", "<f8", 2), ("id", "<i8")])
 IMAGE_FOLDERS = ("images", "input", "input_images")
 """Folders of photographs beside a model, as nerfstudio, 3DGS and HDR-NeRF name them."""
-# The number of parameters and the number of focal lengths among them, in the order of COLMAP's
-# model ids. The model is not supported if the latter is 0.
+# Numbers of parameters, and of focal lengths among these, in the order of COLMAP's model ids. A
+# model with 0 focal lengths is not supported.
 _MODELS = {
     "SIMPLE_PINHOLE": (3, 1),
     "PINHOLE": (4, 2),
@@ -72,7 +72,7 @@ def find_model(root: Path) -> Path | None:
     """Return the folder of a scene's COLMAP model, or None.
 
     It is `sparse/0`, `sparse`, the root, or a folder below `sparse`. Numbered models are parts that
-    COLMAP could not join: the one with most photographs is used.
+    COLMAP could not join; the part with most photographs is used.
     """
     usual = (root / "sparse" / "0", root / "sparse", root)
     return _largest(next((f for f in usual if is_model(f)), None) or _first_below(root / "sparse"))
@@ -122,8 +122,8 @@ def _count(folder: Path) -> int:
 def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
     """Read the COLMAP model in a folder; views have no split, masks or EXIF yet.
 
-    Raises UserError: a file is broken, images are missing or have another aspect ratio, the camera
-    model is not supported, or the model is empty.
+    Raises UserError: a file is broken, images are missing or have another aspect ratio, the lens
+    is not supported, or the model is empty.
     """
     model = read_model(folder)
     _check_model(model)
@@ -237,7 +237,7 @@ def _find_images(root: Path, model: Model) -> Path:
 
 
 def _lens(path: Path, camera: CameraRecord) -> tuple[Float[np.ndarray, "3 3"], Distortion | None]:
-    """Return K and distortion: absent terms of OpenCV's lenses are 0."""
+    """Return K and distortion; terms of OpenCV's lenses that the model lacks are 0."""
     focals, p = _MODELS.get(camera.model, (0, 0))[1], camera.params
     if not focals:
         raise _unsupported(path, camera.model)
@@ -246,9 +246,9 @@ def _lens(path: Path, camera: CameraRecord) -> tuple[Float[np.ndarray, "3 3"], D
         why = f"a {camera.model} camera of {camera.width}x{camera.height} pixels has "
         raise broken(f"{path}:", f"{why}impossible parameters {p}", _FIX)
     K, terms = intrinsics(fx, fy, cx, cy), p[focals + 2 :]
-    own = camera.model.removeprefix("SIMPLE_")
-    if own in COLMAP_LENSES:
-        return K, make_distortion(terms, cast(ColmapLens, own))
+    lens = camera.model.removeprefix("SIMPLE_")
+    if lens in COLMAP_LENSES:
+        return K, make_distortion(terms, cast(ColmapLens, lens))
     model = "fisheye" if "FISHEYE" in camera.model else "radial"
     return K, make_distortion((*terms, *[0.0] * (4 - len(terms))), model)
 
@@ -280,7 +280,7 @@ class ImageRecord(NamedTuple):
 class Model(NamedTuple):
     """A COLMAP model: cameras by id, images in the file's order, ascending `point_ids`.
 
-    `xyz` is in scene units, `rgb` display-encoded, `kind` bin or txt. The ids of a PLY are -1.
+    `xyz` is in scene units, `rgb` display-encoded, `kind` bin or txt. Points of a PLY have id -1.
     """
 
     folder: Path
@@ -305,8 +305,8 @@ def is_model(folder: Path) -> bool:
 def read_model(folder: Path) -> Model:
     """Read the model in a folder; binary files are preferred if both kinds are complete.
 
-    Points may be absent, or in a PLY, as 3DGS writes them. Raises UserError: another file is
-    missing, or a file is truncated or malformed; the message names it.
+    Points may be absent, or in 3DGS's points3D.ply. Raises UserError: another file is missing, or
+    a file is truncated or malformed; the message names it.
     """
     parts = {ext: [folder / f"{stem}.{ext}" for stem in _STEMS] for ext in ("bin", "txt")}
     absent = {ext: [p for p in paths if not p.is_file()] for ext, paths in parts.items()}

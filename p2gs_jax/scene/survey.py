@@ -12,7 +12,7 @@ import numpy as np
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.text import count_of
-from p2gs_jax.scene import PhotographsAlone, find_scene, with_what_lies_beside
+from p2gs_jax.scene import PhotographsAlone, find_scene, with_masks_and_split
 from p2gs_jax.scene.brackets import bracket_notes, brackets, names_of_brackets
 from p2gs_jax.scene.convert.readers import exif_evs
 from p2gs_jax.scene.drives.assemble import assemble, chosen_frames
@@ -72,10 +72,10 @@ def survey(root: Path, cfg: DataConfig, report: Report = lambda message: None) -
         camera = SurveyedCamera("", expected_frames(found) or 0, video_size(found))
         return Survey("video", (camera,), alone)
     if isinstance(found, Recording):
-        scene = with_what_lies_beside(assemble(found, cfg, None, report, write_embedded=False), cfg)
+        scene = with_masks_and_split(assemble(found, cfg, None, report, write_embedded=False), cfg)
         facts = _drive_facts(scene, found, cfg)
     else:
-        scene = with_what_lies_beside(found, cfg)
+        scene = with_masks_and_split(found, cfg)
         facts = [f"{len(scene.points):,} points."] if len(scene.points) else []
         if scene.tracks is not None:
             facts.append(f"{len(scene.tracks.xy):,} observations of points.")

@@ -27,7 +27,7 @@ from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.presets import preset
 from p2gs_jax.run.decisions import decide
-from p2gs_jax.scene import find_scene, with_what_lies_beside
+from p2gs_jax.scene import find_scene, with_masks_and_split
 from p2gs_jax.scene.exposures import read_known_exposures
 from p2gs_jax.types import Capture, Scene
 
@@ -100,7 +100,7 @@ def read(root):
     cfg = DataConfig(test_every=0)
     found = find_scene(root, cfg)
     assert isinstance(found, Scene)
-    return with_what_lies_beside(found, cfg)
+    return with_masks_and_split(found, cfg)
 
 
 def run(root, selection, **options):

@@ -80,7 +80,7 @@ def test_points_lie_in_the_header_s_cameras_where_the_camera_sees_them(tmp_path)
 
 def test_exif_has_attributes_of_its_own(tmp_path):
     path = tmp_path / "a.exr"
-    exif = ExifSettings(time=1 / 60, aperture=2.8, iso=None, taken="2010:10:12 14:43:07")
+    exif = ExifSettings(time=1 / 60, aperture=2.8, iso=None, date="2010:10:12 14:43:07")
     header = written(path, shot=exif)
     assert header["expTime"] == pytest.approx(1 / 60)
     assert header["aperture"] == pytest.approx(2.8)

@@ -11,7 +11,7 @@ from report.page_tools import edit
 from scene.helpers import around, blender, refused, write_image, write_rgba, write_tiny_model
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.scene import find_scene, load_scene, with_what_lies_beside
+from p2gs_jax.scene import find_scene, load_scene, with_masks_and_split
 from p2gs_jax.scene.seeds import FEWEST, common_points, depth_range
 from p2gs_jax.scene.sfm import map as sfm
 from p2gs_jax.scene.transforms import load_blender
@@ -219,7 +219,7 @@ def test_the_split_of_the_data_set_wins_and_random_seeds_follow(tmp_path, monkey
 def test_every_and_none_are_held_out_and_cameras_that_look_apart(tmp_path):
     write_blender(tmp_path)
     cfg = DataConfig(split="every", test_every=3)
-    none, every = (with_what_lies_beside(find_scene(tmp_path, c), c) for c in (ALL, cfg))
+    none, every = (with_masks_and_split(find_scene(tmp_path, c), c) for c in (ALL, cfg))
     assert held_out(none) == []
     assert every.split_by == "every 3rd view of each camera"
     assert len(held_out(every)) == 3

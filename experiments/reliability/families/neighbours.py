@@ -23,7 +23,7 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.core.text import printable
 from p2gs_jax.errors import UserError
 from p2gs_jax.render.warp import project_points
-from p2gs_jax.scene import find_scene, with_what_lies_beside
+from p2gs_jax.scene import find_scene, with_masks_and_split
 from p2gs_jax.scene.exposures import read_known_exposures
 from p2gs_jax.scene.masks import with_alpha
 from p2gs_jax.scene.pixels.store import ImageStore
@@ -75,7 +75,7 @@ def _tried(case: Case, root: Path) -> int:
     try:
         scene = find_scene(root, cfg)
         if isinstance(scene, Scene):
-            scene = with_alpha(with_what_lies_beside(scene, cfg), cfg)
+            scene = with_alpha(with_masks_and_split(scene, cfg), cfg)
             store = ImageStore(scene.views, cfg)
             store.get(0)
             store.close()

@@ -43,17 +43,17 @@ _NAMES: dict[Kind, str] = {
     "webp": "WebP",
     "exr": "linear EXR",
 }
-# If one photograph has two files, the first of these kinds is used: it holds most of the light.
+# If one photograph has two files, the first of these kinds is used: earlier kinds keep more light.
 _RANK: tuple[Kind, ...] = ("exr", "raw", "heif", "avif", "webp", "plain")
-# Linear files without a white point saturate above this percentile of their pixels, percent.
-_BRIGHT = 99.9
-_DARK = 0.25
-# Fast: a better compression saves 10 % of the space and takes 5 times as long.
+# EXR files have no white point: they are scaled until this percentage of each one's pixels is below
+# 1, unless the largest of these percentiles lies between _DARK and 1 already.
+_BRIGHT, _DARK = 99.9, 0.25
+# PNG's level of compression: a better one saves 10 % of the space and takes 5 times as long.
 _COMPRESSION = 1
-_SIGNATURE_AND_HEADER = 8 + 25
-# Make and model; structure from motion starts from the focal length.
+_SIGNATURE_AND_HEADER = 8 + 25  # bytes of a PNG
+# EXIF tags that are copied: make and model.
 _KEPT = (0x010F, 0x0110)
-# Exposure time, f-number, sensitivities, date, focal length, its 35 mm equivalent, camera, lens.
+# Exposure time, f-number, sensitivities, date, focal length, its 35 mm equivalent, serial, lens.
 _KEPT_EXIF = (
     *(0x829A, 0x829D, 0x8827, 0x8830, 0x8831, 0x8832, 0x8833),
     *(0x9003, 0x9011, 0x9291, 0x920A, 0xA405, 0xA431, 0xA434),
@@ -63,10 +63,10 @@ _NO_ROOM = "free space on that disk, or name another --out"
 
 @dataclass(frozen=True)
 class Converted:
-    """Photographs in a folder that structure from motion can read, sorted.
+    """Photographs that structure from motion can read, sorted, in `folder`.
 
     `originals` are the user's files, by path relative to `folder`; `known` is the reason why the
-    response of all photographs is known, or None.
+    tone curve of all photographs is known, or None.
     """
 
     folder: Path
@@ -81,8 +81,8 @@ def convert_photographs(
 ) -> Converted:
     """Return the photographs of a folder as files that every module can read.
 
-    If a file needs conversion, all are written to `work_dir`, or the user's cache. Raises
-    UserError: a photograph cannot be decoded, or a package for it is missing.
+    If a file needs conversion, all are written to `work_dir`, or the user's cache if it is None.
+    Raises UserError: a photograph cannot be decoded, or a package for it is missing.
     """
     kinds, notes = _without_twins({path: kind_of(path) for path in paths})
     names = {path: path.relative_to(folder).as_posix() for path in kinds}
@@ -102,7 +102,7 @@ def convert_photographs(
 def with_originals(scene: Scene, converted: Converted) -> Scene:
     """Return a scene of converted photographs with the names and notes of the user's files.
 
-    Linked files are read at their original place, so that a run folder can move.
+    Plain photographs are read at their original place, so that a run folder can move.
     """
     views, originals = [], []
     for view in scene.views:
@@ -123,11 +123,11 @@ def with_originals(scene: Scene, converted: Converted) -> Scene:
 def converted_views(scene: Scene, work_dir: Path | None, report: Report) -> Scene:
     """Return a scene whose views show converted photographs if its files need conversion.
 
-    These are cached in `work_dir`, or the user's cache. Raises UserError: a photograph cannot be
-    decoded, or a package for it is missing.
+    Converted files are cached in `work_dir`, or the user's cache. Raises UserError: a photograph
+    cannot be decoded, or a package for it is missing.
     """
     kinds: dict[Path, Kind] = {v.image_path: kind_of(v.image_path) for v in scene.views}
-    # The second suffix distinguishes photographs whose names differ only in the first.
+    # `.png` is added: names may differ in their suffix alone.
     places = {v.image_path: v.name + ".png" for v in scene.views if kinds[v.image_path] != "plain"}
     if not places:
         return scene
@@ -154,7 +154,7 @@ def _listed(names: Iterable[str]) -> str:
 
 
 def _without_twins(kinds: dict[Path, Kind]) -> tuple[dict[Path, Kind], list[str]]:
-    """Return one file for each photograph, even if it was written twice, as raw and JPEG."""
+    """Return one file for each photograph (cameras may write raw and JPEG), and notes."""
     shots: dict[Path, list[Path]] = defaultdict(list)
     for path in kinds:
         shots[path.with_suffix("")].append(path)
@@ -181,7 +181,7 @@ def _converted(
 ) -> tuple[Path, list[str], str | None]:
     """Write photographs to their places in a cached folder.
 
-    Returns the folder, notes, and the reason why the response of all photographs is known, or None.
+    Returns the folder, notes, and the reason why the tone curve of all is known, or None.
     """
     names = list(places.values())
     key = {"version": _VERSION, "files": file_fingerprints(list(places)), "places": names}
@@ -200,7 +200,7 @@ def _converted(
 
 
 class _Converter:
-    """Converts photographs of one scene with a common white balance and white point."""
+    """Converts photographs with one white balance a camera and one white point a scene."""
 
     def __init__(self, kinds: Mapping[Path, Kind]):
         self._kinds = kinds
@@ -217,7 +217,7 @@ class _Converter:
         self._scale = self._common_scale()
 
     def fill(self, folder: Path, places: Mapping[Path, str], report: Report) -> dict[str, Any]:
-        """Write all photographs; return the record of the conversion."""
+        """Write or link all photographs; return the record of the conversion."""
         records: list[dict[str, Any]] = []
         total = sum(self._kinds[path] != "plain" for path in places)
         for path, place in places.items():
@@ -234,7 +234,7 @@ class _Converter:
         return {"known": known, "notes": self._notes(records), "photographs": records}
 
     def _common_scale(self) -> float:
-        """Return the factor, a power of 2, on linear files without a white point."""
+        """Return the factor, a power of 2, by which EXR files are scaled."""
         brightest = 0.0
         for path, kind in self._kinds.items():
             if kind == "exr":
@@ -321,7 +321,7 @@ def write_png(
     """Write a converted photograph, uint8 or uint16 in the order R G B (A), or one channel.
 
     The settings in `exif` are copied without the orientation: poses belong to the stored raster.
-    `profile` is the ICC profile, None for sRGB. Raises UserError: the disk cannot be written.
+    `profile` is an ICC profile, or None for sRGB. Raises UserError: the file cannot be written.
     """
     order = {3: [2, 1, 0], 4: [2, 1, 0, 3]}.get(pixels.shape[2], [0])
     raster = np.ascontiguousarray(pixels[..., order])
@@ -332,10 +332,10 @@ def write_png(
         extra += _chunk(b"iCCP", b"ICC profile\0\0" + zlib.compress(profile))
     if settings := kept_settings(exif):
         extra += _chunk(b"eXIf", settings)
-    whole, at = data.tobytes(), _SIGNATURE_AND_HEADER
+    png, at = data.tobytes(), _SIGNATURE_AND_HEADER
     try:
         with atomic_write(path) as temporary:
-            temporary.write_bytes(whole[:at] + extra + whole[at:])
+            temporary.write_bytes(png[:at] + extra + png[at:])
     except OSError as error:
         why = f"cannot be written: {error.strerror or error}."
         raise broken(path, why, _NO_ROOM) from None

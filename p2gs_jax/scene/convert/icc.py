@@ -1,8 +1,8 @@
 """Colours: transfer functions, primaries and ICC profiles, converted to light or to sRGB.
 
-Sources: ITU-R BT.2100-2 (HLG and PQ, tables 4 and 5), BT.2020, IEC 61966-2-1, ICC.1:2022. Only
+Sources: ITU-R BT.2100-2 (PQ and HLG, tables 4 and 5), BT.2020, IEC 61966-2-1, ICC.1:2022. Only
 profiles with a matrix and a curve per channel are applied (ICC.1:2022, 8.3.3), as all cameras and
-phones write them. A photograph with another profile is used without it, and a note says so.
+phones write them. Other profiles are ignored, and a note says so.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 Transfer = Literal["linear", "hlg", "pq"]
 
 PQ_WHITE = 1000.0
-"""Luminance that becomes 1, cd/m^2, the peak of phones and most masters; more is saturated."""
+"""Luminance that becomes 1, cd/m^2: the peak of phones and most masters. Above it, PQ saturates."""
 _HLG_A = 0.17883277
 _HLG_B, _HLG_C = 1 - 4 * _HLG_A, 0.5 - _HLG_A * np.log(4 * _HLG_A)
 _M1, _M2 = 2610 / 16384, 2523 / 4096 * 128
@@ -38,7 +38,7 @@ BT709: Primaries = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, *_D65)
 BT2020: Primaries = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, *_D65)
 DISPLAY_P3: Primaries = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, *_D65)
 ADOBE_RGB: Primaries = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, *_D65)
-# Codes of ITU-T H.273. Other codes stand for the camera's tone curve and for sRGB's primaries.
+# Codes of ITU-T H.273. With another code, the tone curve is unknown or the primaries are sRGB's.
 TRANSFERS: dict[int, Transfer] = {16: "pq", 18: "hlg"}
 PRIMARIES: dict[int, Primaries] = {9: BT2020, 12: DISPLAY_P3}
 
@@ -50,8 +50,8 @@ _BRADFORD = np.array(
 _PCS_WHITE = np.array([0.9642, 1.0, 0.8249])
 # A profile that changes colours by less than this, display values, counts as sRGB.
 _INVISIBLE = 0.004
+# EXIF tags, and their mark of Adobe RGB in files without a profile (DCF).
 _INTEROPERABILITY, _INTEROP_INDEX = 0xA005, 1
-# DCF's mark of Adobe RGB in files without a profile.
 _DCF_OPTION = "R03"
 _ENTRIES = 1024
 
@@ -148,7 +148,7 @@ def read_profile(data: bytes) -> Profile | None:
 
 
 def to_srgb(pixels: UInt[np.ndarray, "h w 3"], profile: Profile) -> UInt[np.ndarray, "h w 3"]:
-    """Return RGB colours in sRGB as 16 bits, or unchanged for a profile made of tables.
+    """Return RGB colours as sRGB with 16 bits, or unchanged for a profile made of tables.
 
     Colours outside sRGB are clipped, as if the camera had written sRGB.
     """
@@ -163,9 +163,9 @@ def to_srgb(pixels: UInt[np.ndarray, "h w 3"], profile: Profile) -> UInt[np.ndar
 
 
 def coded_profile(code: int) -> Profile | None:
-    """Return the colour space of display values by its code in HEIC, AVIF and video.
+    """Return the colour space with these primaries (ITU-T H.273, table 2) and sRGB's curve.
 
-    None: sRGB's primaries, or an unknown code. The curve is sRGB's (ITU-T H.273, table 2).
+    HEIC, AVIF and video store the code. None: sRGB's primaries, or an unknown code.
     """
     if code not in PRIMARIES:
         return None
@@ -174,14 +174,14 @@ def coded_profile(code: int) -> Profile | None:
 
 
 def encode_16(light: Float[np.ndarray, "..."]) -> UInt[np.ndarray, "..."]:
-    """Return light in [0, 1] as sRGB in 16 bits; values outside are clipped."""
+    """Return light in [0, 1] as sRGB with 16 bits; light outside is clipped."""
     return np.rint(srgb_encode(light) * 65535).astype(np.uint16)
 
 
 def with_profile_applied(
     data: bytes, pixels: UInt[np.ndarray, "h w c"]
 ) -> UInt[np.ndarray, "h w c"]:
-    """Return a photograph in sRGB, by the profile in the bytes of its file.
+    """Return a photograph in sRGB; `data` is its file, which holds the profile.
 
     Pixels are in OpenCV's order B G R, or B G R A.
     """
@@ -201,7 +201,7 @@ def with_profile_applied(
 def brought_to_srgb(
     pixels: UInt[np.ndarray, "h w c"], profile: Profile
 ) -> UInt[np.ndarray, "h w c"]:
-    """Return R G B or R G B A in sRGB as 16 bits; see `to_srgb`."""
+    """Return pixels R G B (A) as sRGB with 16 bits (see `to_srgb`); alpha stays linear."""
     colours = to_srgb(pixels[..., :3], profile)
     alpha = pixels[..., 3:].astype(np.uint16)
     return np.concatenate([colours, alpha * 257 if pixels.dtype == np.uint8 else alpha], axis=2)

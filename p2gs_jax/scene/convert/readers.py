@@ -2,7 +2,7 @@
 
 LibRaw subtracts the black level of raw, scales white to 1, interpolates the colour filter, and
 converts to sRGB's primaries with the camera's matrix. Automatic white balance differs between
-photographs, but the sensor does not: all photographs of one camera model get the same factors. AVIF
+photographs, but the sensor does not: photographs of one camera model share their balance. AVIF
 and WebP are read through Pillow, always with 8 bits.
 """
 
@@ -43,18 +43,18 @@ _KINDS: dict[str, Kind] = {
 }
 CONVERTED_SUFFIXES = frozenset(_KINDS)
 """Suffixes of files that must be converted."""
-_TIME, _F_NUMBER, _ISO, _FOCAL_LENGTH, _TAKEN = 0x829A, 0x829D, 0x8827, 0x920A, 0x9003
-# PhotographicSensitivity has 16 bits: 65535 means that another tag holds the value.
+_TIME, _F_NUMBER, _ISO, _FOCAL_LENGTH, _DATE = 0x829A, 0x829D, 0x8827, 0x920A, 0x9003
+# _ISO has 16 bits: 65535 means that another of these tags holds the value.
 _SENSITIVITIES = (_ISO, 0x8833, 0x8832, 0x8831)
+# APEX values (log2, stops) from this size on are broken.
 _SHUTTER_SPEED, _APERTURE, _LARGEST_APEX = 0x9201, 0x9202, 32.0
 _MAKE, _MODEL, _SERIAL, _LENS = 0x010F, 0x0110, 0xA431, 0xA434
-# LibRaw's attributes.
+# Attributes of LibRaw, and OpenEXR's standard attributes.
 _RAW_SETTINGS = {"shutter_speed": _TIME, "aperture": _F_NUMBER, "iso_speed": _ISO}
 _RAW_SETTINGS |= {"focal_length": _FOCAL_LENGTH}
-# OpenEXR's standard attributes.
 _EXR_SETTINGS = {"expTime": _TIME, "aperture": _F_NUMBER, "isoSpeed": _ISO}
 _EXR_ERRORS = (RuntimeError, KeyError, OSError, ValueError)
-# Canon writes the settings within this many bytes from the begin of a file.
+# Canon's CR3 holds the settings in its first bytes, this many at most.
 _RAW_HEADER = 2**18
 _AGAIN = "copy that photograph again, or remove it from the scene"
 
@@ -63,8 +63,8 @@ _AGAIN = "copy that photograph again, or remove it from the scene"
 class Picture:
     """A decoded photograph: display values (`codes`, `profile`) or light.
 
-    The largest unsigned integer in `codes` stands for 1; channels are R G B, R G B A or one. Light
-    is linear in sRGB's primaries, `alpha` in [0, 1]. `invalid` counts pixels with NaN, stored as 0.
+    The largest unsigned integer in `codes` stands for 1; channels are R G B (A) or one. Light is
+    linear in sRGB's primaries, `alpha` in [0, 1]. `invalid` counts pixels with NaN, stored as 0.
     """
 
     codes: UInt[np.ndarray, "h w c"] | None = None
@@ -76,14 +76,14 @@ class Picture:
 
 
 def kind_of(path: Path) -> Kind:
-    """Return the kind of a photograph, by its suffix."""
+    """Return the kind of a photograph from its suffix."""
     return _KINDS.get(path.suffix.lower(), "plain")
 
 
 def pillow_heif(path: Path) -> Any:
     """Return the library that reads HEIC, and register it with Pillow.
 
-    Raises UserError: it is not installed.
+    Raises UserError: pillow-heif is not installed.
     """
     try:
         import pillow_heif
@@ -156,7 +156,7 @@ class RawFacts:
     """The metadata of a raw file; the size is in pixels, in the orientation of the sensor.
 
     `balance` are the camera's factors on red, green (1) and blue, None if they are not recorded.
-    `matrix` is False if the camera's colours are unknown; its primaries are kept then.
+    `matrix` is False if LibRaw does not know the camera's colours: pixels keep its primaries.
     """
 
     size: tuple[int, int]
@@ -195,7 +195,7 @@ def read_raw(path: Path, balance: Balance | None) -> Picture:
             user_wb=None if balance is None else [*balance, balance[1]],
             gamma=(1, 1),
             no_auto_bright=True,
-            # Otherwise white would follow the brightest pixel of each photograph.
+            # Other values make white depend on the brightest pixel of a photograph.
             adjust_maximum_thr=0.0,
             output_bps=16,
             user_flip=0,
@@ -299,8 +299,8 @@ def read_exr_exif(path: Path) -> Image.Exif | None:
 def read_exr(path: Path) -> Picture:
     """Return the light of an OpenEXR: channels R, G, B (even in a layer) or Y.
 
-    Colours are converted from the header's chromaticities, and divided by A, which premultiplies
-    them. Raises UserError: the file is not a readable OpenEXR, or has no such channels.
+    Colours are converted from the header's chromaticities, and divided by their alpha (A). Raises
+    UserError: the file is not a readable OpenEXR, or has no such channels.
     """
     with _exr(path, separate_channels=True) as file:
         channels: dict[str, Any] = {k: c.pixels for k, c in file.channels().items()}
@@ -335,7 +335,7 @@ def _exr_exif(header: dict) -> Image.Exif | None:
 
 
 def made_exif(settings: ExifSettings) -> Image.Exif | None:
-    """Return EXIF with time, f-number and ISO, or None without any."""
+    """Return EXIF with time, f-number and ISO, or None if all are unknown."""
     named = {_TIME: settings.time, _F_NUMBER: settings.aperture, _ISO: settings.iso}
     return _exif_of({tag: value for tag, value in named.items() if value is not None})
 
@@ -365,18 +365,18 @@ def size_of(path: Path) -> tuple[int, int] | None:
 
 @dataclass(frozen=True)
 class ExifSettings:
-    """Exposure time (seconds), f-number, ISO, local `YYYY:MM:DD HH:MM:SS`; None: not in EXIF."""
+    """Exposure time (seconds), f-number, ISO, local date `YYYY:MM:DD HH:MM:SS`; None: unknown."""
 
     time: float | None = None
     aperture: float | None = None
     iso: float | None = None
-    taken: str | None = None
+    date: str | None = None
 
 
 def read_exif_settings(path: Path) -> ExifSettings:
     """Return the settings in the EXIF of an image; without readable EXIF all are None.
 
-    A missing time or f-number comes from APEX values: log2 of 1 / time and of f-number^2.
+    A missing time or f-number comes from APEX values, log2(1 / time) and log2(f-number^2).
     """
     tags = _exif_tags(path)
     time, aperture = _positive(tags.get(_TIME)), _positive(tags.get(_F_NUMBER))
@@ -386,21 +386,22 @@ def read_exif_settings(path: Path) -> ExifSettings:
     if aperture is None and opening is not None and opening < _LARGEST_APEX:
         aperture = 2.0 ** (opening / 2)
     isos = (_positive(tags.get(tag)) for tag in _SENSITIVITIES)
-    taken = str(tags.get(_TAKEN, "")).strip("\0 ")
+    date = str(tags.get(_DATE, "")).strip("\0 ")
     return ExifSettings(
         time=time,
         aperture=aperture,
         iso=next((value for value in isos if value not in (None, 65535.0)), None),
-        taken=taken if re.fullmatch(r"\d{4}:\d\d:\d\d \d\d:\d\d:\d\d", taken) else None,
+        date=date if re.fullmatch(r"\d{4}:\d\d:\d\d \d\d:\d\d:\d\d", date) else None,
     )
 
 
 def exif_evs(paths: Sequence[Path], cameras: Sequence[str] = ()) -> list[float | None]:
-    """Return log2(time * ISO / N^2) of photographs, stops; None where EXIF does not give it.
+    """Return log2(time * ISO / N^2) of photographs, stops; None: unknown.
 
-    Only differences matter. A setting that no photograph states is a constant (ISO 100). A missing
-    setting gets the value of the same camera if all its photographs that state one agree.
-    Exposure bias is ignored: the shutter contains it. For `images_2` the EXIF of `images` counts.
+    N is the f-number; only differences matter. A setting that no photograph states is a constant
+    (ISO 100). A missing setting gets the value on which the camera's other photographs agree, if
+    they do. Exposure bias is ignored: the time contains it. Files in `images_2` get the EXIF of
+    `images`.
     """
     shots = [read_exif_settings(path) for path in map(_original, paths)]
     camera = np.array(list(cameras) or [""] * len(shots))
@@ -432,15 +433,15 @@ def _original(path: Path) -> Path:
 def read_exif_camera(path: Path, *, zoom: bool = False) -> str:
     """Return make, model, serial number and lens as one string; empty without EXIF.
 
-    With `zoom`, the focal length is added. EXIF behind the pixels of a PNG is not read.
+    With `zoom`, the focal length is added. EXIF after the pixels of a PNG is not read.
     """
-    tags = _exif_tags(path, behind=False)
+    tags = _exif_tags(path, after_pixels=False)
     wanted = (_MAKE, _MODEL, _SERIAL, _LENS, *([_FOCAL_LENGTH] if zoom else []))
     parts = (tags.get(tag) for tag in wanted)
     return " ".join(str(part).strip("\0 ") for part in parts if part is not None)
 
 
-def _exif_tags(path: Path, *, behind: bool = True) -> dict:
+def _exif_tags(path: Path, *, after_pixels: bool = True) -> dict:
     kind = kind_of(path)
     # Pillow raises many kinds of errors on malformed EXIF (struct, Syntax, Value, OS, ...).
     try:
@@ -452,7 +453,7 @@ def _exif_tags(path: Path, *, behind: bool = True) -> dict:
             pillow_heif(path)
         with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
             # Pillow would decode a PNG to find EXIF after its pixels.
-            if not behind and image.format == "PNG" and "exif" not in image.info:
+            if not after_pixels and image.format == "PNG" and "exif" not in image.info:
                 return {}
             exif = image.getexif()
             return {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
