@@ -45,8 +45,8 @@ Depth = Literal["8bit", "16bit", "exr"]
 FOLDER = "developed"
 # Part of the key of developed photographs: raise it whenever results change.
 _VERSION = 1
-# Suffixes that photographs keep, that of all others, and the stored value of white: 8 bits have 8
-# more behind the point.
+# Suffixes that photographs keep, the suffix of all others, and the stored value of white: values of
+# 8 bits have 8 fractional bits.
 _FORMATS: dict[Depth, tuple[tuple[str, ...], str, int]] = {
     "8bit": ((".jpg", ".jpeg", ".jfif", ".png", ".tif", ".tiff", ".bmp"), ".png", 255 * 256),
     "16bit": ((".png",), ".png", 65535),
@@ -56,8 +56,8 @@ _FORMATS: dict[Depth, tuple[tuple[str, ...], str, int]] = {
 _BELOW_WHITE = 0.999
 # Number of photographs on the sheet, and their longer side, pixels.
 _SHOWN, _SMALL = 12, 480
-_ORIENTATION = 0x0112
-# Exposure time, f-number, sensitivities, and APEX values: they describe the original's brightness.
+_ORIENTATION = 0x0112  # EXIF tag
+# EXIF tags of exposure time, f-number, sensitivities and APEX values, which describe the original.
 _EXPOSURE = (0x829A, 0x829D, 0x8827, 0x8830, 0x8831, 0x8832, 0x8833, 0x9201, 0x9202, 0x9204)
 _COMMENT = "linear relative radiance times the common exposure of all photographs"
 
@@ -69,8 +69,8 @@ class Development:
     """Options of `develop_scene`."""
 
     depth: Depth = "8bit"  # 8 or 16 bits of display values, or linear radiance
-    # Exposure of the result: stops from the geometric mean of the photographs, or the largest that
-    # loses no highlight.
+    # Exposure of the result: stops from the geometric mean exposure of the photographs, or the
+    # largest that loses no highlight.
     exposure: float | Literal["highlights"] = 0.0
     masks: bool = True  # mask pixels that are clipped or black in a photograph
 
@@ -95,22 +95,22 @@ class _Lab:
 
     def __init__(self, cfg: FitConfig, selection: Selection, views: Sequence[View]):
         s, self.views, self.loss = selection.solution, views, cfg.loss
-        self.seen, self.solution = np.isfinite(s.exposure_errors), s
+        self.solved, self.solution = np.isfinite(s.exposure_errors), s
         cameras = np.array([view.camera for view in views])
         names = ("log_exposures", "gammas", "white_balance")
         values = {name: np.array(getattr(s, name), float) for name in names}
-        for row in np.flatnonzero(~self.seen) if self.seen.any() else ():
-            alike = self.seen & (cameras == cameras[row])
+        for row in np.flatnonzero(~self.solved) if self.solved.any() else ():
+            alike = self.solved & (cameras == cameras[row])
             for value in values.values():
-                value[row] = value[alike if alike.any() else self.seen].mean(0)
+                value[row] = value[alike if alike.any() else self.solved].mean(0)
         resolved = decide(cfg, selection, None).resolve(cfg)
-        self.photometry = resolved.photometry
+        self.cfg = resolved.photometry
         found = initial_photometry(replace(s, **values), cameras.tolist(), resolved)
-        self.taken: Photometry = jax.tree.map(np.asarray, found)
-        self.mean = mean_parameters(self.taken)
+        self.photometry: Photometry = jax.tree.map(np.asarray, found)
+        self.mean = mean_parameters(self.photometry)
 
     def film(self, row: int, top: int) -> Film:
-        return Film.of(self.taken.capture(row), top, self.photometry, self.loss.saturation)
+        return Film.of(self.photometry.capture(row), top, self.cfg, self.loss.saturation)
 
     def read(self, row: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, Film]:
         """Return stored values, the pixels that count, alpha, and the film of a photograph."""
@@ -136,12 +136,12 @@ class _Lab:
             light = film.developed(pixels, np.exp).max(-1)[used]
             if used.any():
                 found = max(found, float(np.log(np.quantile(light, _BELOW_WHITE))))
-        white = np.log(exposed_at(self.loss.saturation, self.mean.gamma, self.photometry))
+        white = np.log(exposed_at(self.loss.saturation, self.mean.gamma, self.cfg))
         return float(white) - (found if np.isfinite(found) else 0.0)
 
     def notes(self) -> list[str]:
         """Return what users must know about exposures that were assumed."""
-        names = [self.views[row].name for row in np.flatnonzero(~self.seen).tolist()]
+        names = [self.views[row].name for row in np.flatnonzero(~self.solved).tolist()]
         note = (
             f"{len(names)} photograph(s) share too few points with others: they were developed "
             f"with the mean exposure of their camera, which may be wrong: {first_few(names)}."
@@ -181,7 +181,7 @@ def develop_scene(
     views, places = scene.training_views, places_of(poses, scene, out, options)
     lab = _Lab(cfg, selection, views)
     log_exposure = lab.log_exposure(options.exposure, reporter)
-    curve = (log_exposure, lab.mean.gamma, lab.photometry)
+    curve = (log_exposure, lab.mean.gamma, lab.cfg)
     codes = common_curve(*curve, _FORMATS[options.depth][2])
     key = _key(lab, log_exposure, options, places)
     log.parent.mkdir(parents=True, exist_ok=True)
@@ -255,7 +255,7 @@ def _develop(
 
 
 def _copied(view: View, target: Path) -> bool:
-    """Copy a photograph whose values stay; False: its file holds other values, or is turned."""
+    """Copy a photograph; False: its suffix, orientation, mode or profile rules this out."""
     same = view.image_path.suffix.lower() == target.suffix.lower()
     with contextlib.suppress(OSError), Image.open(view.image_path) as image:
         upright = image.getexif().get(_ORIENTATION, 1) in (0, 1)
@@ -268,7 +268,7 @@ def _copied(view: View, target: Path) -> bool:
 def _exif(view: View) -> Image.Exif | None:
     """Return the EXIF of a photograph without the tags of the original's brightness."""
     exif = None
-    with contextlib.suppress(Exception), Image.open(view.image_path) as image:  # as `kept_settings`
+    with contextlib.suppress(Exception), Image.open(view.image_path) as image:  # malformed EXIF
         exif = image.getexif()
         shot = exif.get_ifd(ExifTags.IFD.Exif)
         for tag in _EXPOSURE:
@@ -300,9 +300,10 @@ def _complete_masks(folder: Path, records: Sequence[Mapping[str, Any]]) -> dict[
 def _key(lab: _Lab, log_exposure: float, options: Development, places: Mapping[str, str]) -> str:
     """Return a hash of everything that the developed photographs depend on."""
     paths = [p for view in lab.views for p in (view.image_path, view.mask_path) if p is not None]
-    taken = [lab.taken.raw_exposures, lab.taken.raw_gammas, lab.taken.raw_white_balance]
-    given = [asdict(lab.photometry), asdict(lab.loss), asdict(options), dict(places)]
-    whole = [_VERSION, file_fingerprints(paths), log_exposure, taken, given]
+    p = lab.photometry
+    parameters = [p.raw_exposures, p.raw_gammas, p.raw_white_balance]
+    settings = [asdict(lab.cfg), asdict(lab.loss), asdict(options), dict(places)]
+    whole = [_VERSION, file_fingerprints(paths), log_exposure, parameters, settings]
     # The last digits of a solution may differ between processors.
     text = json.dumps(plain(whole))
     rounded = json.loads(text, parse_float=lambda number: round(float(number), 5) + 0.0)
@@ -312,10 +313,10 @@ def _key(lab: _Lab, log_exposure: float, options: Development, places: Mapping[s
 def _rows(
     lab: _Lab, common: float, records: Sequence[Mapping[str, Any]]
 ) -> tuple[dict[str, Any], ...]:
-    """Return the rows of `exposures.csv`; `ev` is that of the developed photographs."""
-    out, errors, balance = [], lab.solution.exposure_errors_ev, lab.taken.white_balance
+    """Return the rows of `exposures.csv`; `ev` is the exposure of the developed photographs."""
+    out, errors, balance = [], lab.solution.exposure_errors_ev, lab.photometry.white_balance
     for row, (view, record) in enumerate(zip(lab.views, records, strict=True)):
-        ev, known = float(lab.taken.log_exposures[row]) / LN2, bool(lab.seen[row])
+        ev, known = float(lab.photometry.log_exposures[row]) / LN2, bool(lab.solved[row])
         factors = () if balance is None else np.exp(balance[row]).tolist()
         values = {
             "image": record["place"].removeprefix("images/"),
@@ -324,7 +325,7 @@ def _rows(
             "original_ev": ev if known else None,
             "original_ev_error": float(errors[row]) if known else None,
             "gain_ev": common - ev,
-            "gamma": float(lab.taken.gammas[row]),
+            "gamma": float(lab.photometry.gammas[row]),
             **dict(zip(RGB, factors, strict=False)),
         }
         out.append(values | {name: record[name] for name in ("clipped", "black")})
@@ -342,7 +343,7 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> bytes:
 
 def _shown(lab: _Lab, curve: tuple[float, float, Any]) -> list[tuple[str, Picture, Picture]]:
     out, codes = [], common_curve(*curve, most=65535)
-    order = np.argsort(lab.taken.log_exposures, kind="stable")
+    order = np.argsort(lab.photometry.log_exposures, kind="stable")
     for row in order[evenly_spaced(len(order), _SHOWN)]:
         pixels, _, _, film = lab.read(row)
         small = np.ascontiguousarray(shrunk(pixels, _SMALL))

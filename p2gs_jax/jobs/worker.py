@@ -25,7 +25,7 @@ from p2gs_jax.jobs import job as records
 LOOK_S = 0.2
 LESS = "let fewer jobs run at a time, or lower --gaussians or --max-width"
 # Exit codes of a job that stopped after a signal and wrote its checkpoint.
-ASKED = tuple(interrupts.exit_code(interrupts.Interrupted(n)) for n in interrupts.SIGNALS)
+SIGNALLED = tuple(interrupts.exit_code(interrupts.Interrupted(n)) for n in interrupts.SIGNALS)
 
 
 def run_in_process(job_path: str) -> tuple[records.Status, str | None]:
@@ -60,7 +60,7 @@ def run_in_process(job_path: str) -> tuple[records.Status, str | None]:
     reason, code = _why(process.returncode, files.output), process.returncode
     # This caller did not stop it: a batch system needs the node, or the time limit was reached.
     # SIGKILL is excluded, because a job that ran out of memory would do so again.
-    if code in ASKED or (code < 0 and code != -signal.SIGKILL):
+    if code in SIGNALLED or (code < 0 and code != -signal.SIGKILL):
         return "lost", reason
     records.write_reason(folder, reason)
     return "failed", reason

@@ -62,7 +62,7 @@ def start_of(
         codes.append((off.mean(), off.max()))
         darker = DisplayTransform(1.0, 1.0, cfg, camera=row).vignetting
         vignettings.append(_vignetting(darker, *sizes[name]))
-    # PPISP keeps R + G + B: the factors of greys have the sum 3, and the exposure has the rest.
+    # PPISP keeps R + G + B: the factors of a grey have the sum 3, and the exposure takes the rest.
     factors = np.exp(balances)
     sums = factors.sum(1, keepdims=True) / 3
     stops = np.log2(exposures * sums[:, 0] / np.array(whites)[of_view])

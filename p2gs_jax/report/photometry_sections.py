@@ -27,8 +27,8 @@ from p2gs_jax.types import GAMMA_SRGB
 MOST_PANELS, FEWEST_VIEWS = 6, 3
 MID_GREY = 0.18
 CHANNELS = ("red", "green", "blue")
-MARKED = [{"color": c, "marker": m} for c, m in zip(COLORS[1::-1], "^s", strict=True)]
-MARKED.insert(1, {"color": COLORS[2], "marker": "o"})
+CHANNEL_COLORS = (1, 2, 0)  # of `COLORS`
+MARKED = [{"color": COLORS[k], "marker": m} for k, m in zip(CHANNEL_COLORS, "^os", strict=True)]
 SRGB: dict[str, Any] = {"color": INK, "linestyle": (0, (4, 4))}
 # Lines of the cameras of a drive, in turn.
 CAMERA_COLORS, CAMERA_MARKERS = (*COLORS, INK, MUTED), "osD^vPX*"
@@ -114,7 +114,7 @@ def exposure_section(run: RunFiles, truth: dict[str, float]) -> str:
 
 
 def _stops_by_source(run: RunFiles, truth: dict[str, float]) -> Stops:
-    """Return a function for exposures; EXIF and true ones are shifted to the mean of the fit's."""
+    """Return the function of exposures; EXIF and true ones are shifted to the solved mean."""
     found = column(v["exposure_ev"] for v in run.train)
     center = float(np.mean(found[np.isfinite(found)])) if np.isfinite(found).any() else 0.0
     agreement, gap = against_exif(run), found - _true_stops(run.train, truth)
@@ -202,9 +202,8 @@ def white_balance_section(run: RunFiles) -> str:
         curves,
         "gain of the channel, stops",
         "White balance of the photographs of each camera, in stops",
-        "Gains of channels relative to the exposure: their means are 0, over each photograph and "
-        "each channel, because only differences can be measured. Error bars are two standard "
-        "errors.",
+        "Gains are relative to the exposure. Only their differences can be measured, so their mean "
+        "is 0 over each photograph and over each channel. Error bars are two standard errors.",
     )
 
 
@@ -231,7 +230,7 @@ def response_section(run: RunFiles) -> str:
         label="Tone curves of this run against sRGB",
         height=260,
     )
-    far = f"For values above 0.05 it differs from sRGB (dashed) by at most {apart:.2f} stops."
+    far = f"For values above 0.05 curves differ from sRGB (dashed) by at most {apart:.2f} stops."
     return figure(chart, f"The tone curve maps radiance times exposure to a value. {caption} {far}")
 
 
@@ -270,7 +269,7 @@ def _camera_curves(run: RunFiles, curved: list[CameraPhotometry]) -> tuple[list[
         for c in range(len(camera.splines)):
             named = [camera.name] * (len(formations) > 1) + [CHANNELS[c]] * several
             name = " ".join(named) if len(formations) <= MOST_PANELS else ""
-            color, line = ((1, 2, 0)[c], k) if several else (k, 0)
+            color, line = (CHANNEL_COLORS[c], k) if several else (k, 0)
             style = {"color": COLORS[color % len(COLORS)], "linestyle": DASHES[line % len(DASHES)]}
             curves.append(Series(name, stops[:, c], VALUES, style))
     owner = "camera" if len(formations) > 1 else "channel"

@@ -112,7 +112,7 @@ class Run:
             "Gaussians": f"{self.params.gaussians.capacity:,}",
             "exposures": f"{stops.min():+.2f} to {stops.max():+.2f} EV from the mean",
         }
-        with contextlib.suppress(OSError, ValueError, KeyError):  # not evaluated, or nothing is
+        with contextlib.suppress(OSError, ValueError, KeyError):  # a run without held-out scores
             metrics = parse_json(files.metrics.read_text(encoding="utf-8"))
             psnr = metrics["test"]["exposure_fitted"]["psnr"]
             rows["held-out views"] = f"{psnr:.2f} dB (exposures fitted)"
@@ -255,8 +255,8 @@ def load_run(folder: str | Path, scene: str | Path | None = None, *, snapshot: b
     """Read parameters, configuration and cameras of a finished run.
 
     Photographs are read when they are needed, and most methods work without them. `scene` is the
-    current folder of the scene; None: its former path, also relative to the run. The newest
-    `snapshot` of an unfinished run has empty slots, which are transparent, and no metering.
+    folder of the scene; None: its path during the fit, absolute or relative to the run. `snapshot`
+    reads the newest one of an unfinished run: empty slots are transparent, and it has no metering.
 
     Raises:
         UserError: the folder is not a run, is unfinished or damaged, or is of a version that this

@@ -3,7 +3,7 @@
 const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
 const short = (x) => String(Number(x.toPrecision(7)));
 
-const LIMITS = { ev: [-16, 16], gamma: [0.5, 6], white: [-2, 8] };
+const LIMITS = { ev: [-16, 16], gamma: [0.5, 6], white: [-2, 8] };  // stops, exponent, stops
 
 function linkOf(state) {
   const out = new URLSearchParams();
@@ -31,26 +31,26 @@ function numbers(text, count) {
 
 // Apply the valid values of a fragment; other values do not change.
 function followLink(hash, state, scene, curves) {
-  const said = new URLSearchParams(hash.slice(1));
+  const given = new URLSearchParams(hash.slice(1));
   for (const [name, [low, high]] of Object.entries(LIMITS)) {
-    const value = numbers(said.get(name), 1);
+    const value = numbers(given.get(name), 1);
     if (value) state.look[name] = clamp(value[0], low, high);
   }
-  if (curves.includes(said.get("curve"))) state.look.curve = said.get("curve");
-  if (SHOWS.includes(said.get("show"))) state.show = said.get("show");
-  const balance = numbers(said.get("wb"), 3);
+  if (curves.includes(given.get("curve"))) state.look.curve = given.get("curve");
+  if (SHOWS.includes(given.get("show"))) state.show = given.get("show");
+  const balance = numbers(given.get("wb"), 3);
   if (balance) state.look.balance = balance.map((b) => clamp(b, -3, 3));
-  const row = numbers(said.get("camera"), 1);
+  const row = numbers(given.get("camera"), 1);
   if (row && scene.tone.cameras[row[0]] !== undefined) state.look.camera = row[0];
-  const line = numbers(said.get("line"), 1);
+  const line = numbers(given.get("line"), 1);
   if (line) state.look.split = clamp(line[0], 0, 1);
-  const at = numbers(said.get("at"), 1);
+  const at = numbers(given.get("at"), 1);
   if (at && scene.views[at[0]]) {
     state.at = at[0];
     state.camera = cameraOf(scene.views[at[0]]);
     return;
   }
-  const [c, q, lens] = [numbers(said.get("c"), 3), numbers(said.get("q"), 4), numbers(said.get("lens"), 6)];
+  const [c, q, lens] = [numbers(given.get("c"), 3), numbers(given.get("q"), 4), numbers(given.get("lens"), 6)];
   if (!c || !q || !lens || Math.hypot(...q) < 0.1 || lens.slice(0, 4).some((v) => !(v > 0))) return;
   const [width, height, fx, fy, cx, cy] = lens, n = Math.hypot(...q);
   state.at = null;

@@ -30,7 +30,7 @@ class Shared:
     """A scene or a block with the shared photometry, which has one gauge of radiance."""
 
     scene: Scene  # with colours of the points
-    exposures: Exposures  # fixed ones of its training views, on the host; with radiances of points
+    exposures: Exposures  # fixed, of the training views, on the host; has point radiances
     shell: Sphere  # the sphere of the background
 
 
@@ -127,7 +127,7 @@ def block_of(shared: Shared, cut: Cut, number: int) -> tuple[Shared, int]:
 
     The second result is the number of points inside the block.
     """
-    scene, keep, own = whole_of(shared.scene, cut, number)
+    scene, keep, inside = whole_of(shared.scene, cut, number)
     given, rows = shared.exposures, np.array(cut.blocks[number].views)
     cameras = given.photometry.cameras
     assert given.radiance is not None
@@ -139,4 +139,4 @@ def block_of(shared: Shared, cut: Cut, number: int) -> tuple[Shared, int]:
         ),
         radiance=given.radiance[keep],
     )
-    return Shared(scene, exposures, shared.shell), own
+    return Shared(scene, exposures, shared.shell), inside

@@ -1,7 +1,7 @@
 """Iteratively reweighted least squares: four rounds under an L1 loss, then Geman-McClure's loss.
 
-The latter is of single observations or of whole points (`equations.py`). With 0 / 10 / 30 % of
-outliers the error is 0.005 / 0.006 / 0.007 EV (docs/photometry.md, 4). The L1 rounds bring the
+The second loss acts on single observations or whole points (`equations.py`). With 0 / 10 / 30 %
+of outliers the error is 0.005 / 0.006 / 0.007 EV (docs/photometry.md, 4). The L1 rounds bring the
 start near enough for a loss that ignores large residuals.
 """
 
@@ -28,7 +28,7 @@ from p2gs_jax.photometry.response import Response, rises
 
 # Number of rounds under the L1 loss, and largest number of rounds under both losses.
 L1_ROUNDS, MOST_ROUNDS = 4, 60
-A_RANGE = (0.3, 3.0)
+A_RANGE = (0.3, 3.0)  # limits of a = 2.2 / gamma
 # Change of a parameter, log units, at which rounds end: for the result, and for comparisons.
 TOLERANCE, COMPARED = 1e-5, 5e-3
 DAMPING = 1e-8  # damping of the balanced matrix, whose diagonal is 1
@@ -47,13 +47,13 @@ def one_thread():
     """Return a context in which BLAS uses one thread.
 
     Otherwise it starts threads even for 100 unknowns and waits for busy cores: 52 ms instead of
-    2 ms while other programs compute (BUILD_NOTES).
+    2 ms while other programs compute (experiments/results/2026-11-26-lab-book.md).
     """
     return _libraries().limit(limits=1, user_api="blas")
 
 
 class Balanced:
-    """A matrix plus a product of few rows, over free directions (`basis`), scaled to diagonal 1."""
+    """A normal matrix plus that of `gauges`, along the columns of `basis`, scaled to diagonal 1."""
 
     def __init__(self, normal: Matrix, gauges: sp.csr_array, basis: sp.csr_array):
         reduced, held = basis.T @ normal @ basis, sp.csr_array(gauges @ basis)
@@ -175,8 +175,8 @@ def solve(
 ) -> Fit:
     """Adjust exposures, gammas, cameras and response to observations (float64).
 
-    Rounds end when the largest change of a parameter is below the tolerance, log units. `loss` is
-    that after the L1 rounds. A start `near` the solution of another form needs L1 rounds as well:
+    Rounds end when the largest change of a parameter is below the tolerance, log units. `loss`
+    applies after the L1 rounds. A start `near` the solution of another form also needs L1 rounds:
     that form may lack a parameter and have taken inliers for outliers.
     """
     theta, weight = system.start if near is None else near, model.noise_weight
@@ -191,7 +191,7 @@ def solve(
     at = weigh(model, theta, weight, loss)
     return Fit(
         theta=theta,
-        at=at._replace(curvature=max(at.curvature, 0.1)),
+        at=at._replace(curvature=max(at.curvature, 0.1)),  # keeps standard errors finite
         model=model,
         normal=normal_equations(model, theta, at)[0],
         rounds=count,
@@ -258,10 +258,10 @@ def fit_response(
 ) -> Response | None:
     """Return the base with the spline, or splines `by` camera or channel, that fit best.
 
-    None if one collapsed: it falls somewhere, is flat over mid tones, or stretches the exposures by
-    more than LARGEST_STRETCH (photographs do not determine that: the power gauge). The form that
-    varies with it has no gammas, which bend curves as well. `spread` is `light_spread` under the
-    base; it is solved if not given.
+    None if a spline collapsed: it falls somewhere, is flat over mid tones, or changes the spread of
+    exposures by more than LARGEST_STRETCH, which photographs do not determine (the power gauge).
+    `form` has no gammas, because they bend curves as well. `spread` is `light_spread` under the
+    base; None: it is computed.
     """
     fit, system = solve_model(problem, form, base, splines=by, tolerance=COMPARED)
     if spread is None:
