@@ -24,19 +24,19 @@ from reliability.trials import REFUSED, Trial, run_trials
 from p2gs_jax.scene.drives.tables import read_pickled
 
 NAME = "safety"
-ABOUT = """The viewer listens on loopback unless told otherwise, refuses pages of other sites and
-host names that others let point here, and wants a token where others reach it; reports hold no
-script and escape names; pickles that call something are refused; temporary files are private; the
-package calls nothing that runs text. A trial is survived if nothing forbidden happens."""
+ABOUT = """By default the viewer listens on loopback. It refuses pages of other sites and foreign
+host names that resolve to this machine, and needs a token if others can reach it. Reports hold no
+script and escape names. Pickles that call a function are refused, temporary files are private, and
+the package never runs strings as code. A trial is survived if nothing forbidden happens."""
 PACKAGE = Path(__file__).resolve().parents[3] / "p2gs_jax"
-HAPPENED = 71
+HAPPENED = 71  # exit code of a child that did something forbidden
 HTML = "<img src=x onerror=alert(1)>.png"
-SLOW = {"seconds": 120.0, "data": 8 * 2**30}
+SLOW = {"seconds": 120.0, "data": 8 * 2**30}  # limits in seconds and bytes
 LOOPBACK, SECRET = "127.0.0.1", "secret"
 
 
 def run(quick: bool, out: Path, report: Report) -> Family:
-    """Try all; `quick`: no fit."""
+    """Run the trials; `quick`: without the fit."""
     found = [t for t in trials() if not (quick and t.seconds > 100)]
     return run_trials(NAME, found, out, report)
 
@@ -46,7 +46,7 @@ def trials() -> Iterator[Trial]:
     yield from _viewer()
     yield from _pickles()
     yield Trial("temporary files are private", _nothing, _temporary_files)
-    yield Trial("nothing runs text or unpickles freely", _nothing, _forbidden_calls)
+    yield Trial("no string runs as code, no free unpickling", _nothing, _forbidden_calls)
     yield Trial(
         "a report of hostile names", partial(with_photograph, HTML), _report, refused=False, **SLOW
     )
@@ -57,33 +57,31 @@ def _nothing(root: Path) -> Path:
 
 
 def forbidden(condition: bool, what: str) -> int:
-    """Return an exit code: whether something forbidden happened, which is printed."""
+    """Return the exit code: HAPPENED, after printing `what`, if the condition holds, or else 0."""
     if condition:
         print(f"it happened: {what}", file=sys.stderr)
     return HAPPENED if condition else 0
 
 
 def _viewer() -> Iterator[Trial]:
-    own = "{own}"
+    evil = {"Origin": "http://evil.example"}
     asked: dict[str, tuple[bool, str, dict[str, str], bool]] = {
         "its own page": (False, "/", {}, True),
-        "its own origin": (False, "/", {"Origin": f"http://{own}"}, True),
-        "another site": (False, "/", {"Origin": "http://evil.example"}, False),
+        "its own origin": (False, "/", {"Origin": "http://{address}"}, True),
+        "another site": (False, "/", evil, False),
         "another port": (False, "/", {"Origin": "http://127.0.0.1:1"}, False),
-        "no origin at all": (False, "/", {"Origin": "null"}, False),
+        "an opaque origin": (False, "/", {"Origin": "null"}, False),
         "another scheme": (False, "/", {"Origin": "file://"}, False),
         "a name that points here": (False, "/", {"Host": "evil.example"}, False),
         "a name that begins alike": (False, "/", {"Host": "127.0.0.1.evil.example"}, False),
         "a file above": (False, "/../../../../etc/passwd", {}, False),
-        "a file above, in percents": (False, "/%2e%2e/%2e%2e/%2e%2e/etc/passwd", {}, False),
+        "a file above, percent-encoded": (False, "/%2e%2e/%2e%2e/%2e%2e/etc/passwd", {}, False),
         "outside, without token": (True, "/", {}, False),
         "outside, empty token": (True, "/?token=", {}, False),
         "outside, wrong token": (True, "/?token=secreT", {}, False),
         "outside, token": (True, f"/?token={SECRET}", {}, True),
         "outside, cookie": (True, "/", {"Cookie": f"p2gs_jax_token_{{port}}={SECRET}"}, True),
-        "outside, token and another site": (
-            *(True, f"/?token={SECRET}", {"Origin": "http://evil.example"}, False),
-        ),
+        "outside, token and another site": (True, f"/?token={SECRET}", evil, False),
     }
     for name, (outside, path, headers, served) in asked.items():
         act = partial(_asks, outside, path, headers, served)
@@ -100,9 +98,9 @@ def _asks(outside: bool, path: str, headers: dict[str, str], served: bool, root:
     with guarded(guard):
         server = viser.ViserServer(host=LOOPBACK, port=0, verbose=False)
     port = server.get_port()
-    own = f"{LOOPBACK}:{port}"
-    sent = {key: value.format(own=own, port=port) for key, value in headers.items()}
-    request = urllib.request.Request(f"http://{own}{path}", headers=sent)
+    address = f"{LOOPBACK}:{port}"
+    sent = {key: value.format(address=address, port=port) for key, value in headers.items()}
+    request = urllib.request.Request(f"http://{address}{path}", headers=sent)
     try:
         with urllib.request.urlopen(request, timeout=20) as answer:
             found = answer.status == 200
@@ -198,7 +196,7 @@ def _temporary_files(root: Path) -> int:
 
 
 def unsafe_calls(package: Path) -> list[str]:
-    """Return the places where a package runs text, unpickles files, or names temporary files."""
+    """Return the calls in a package that run strings as code, unpickle, or name temporary files."""
     bad = re.compile(
         r"^(eval|exec|os\.system|os\.popen|pickle\.loads?|marshal\.loads?|tempfile\.mktemp|"
         r"yaml\.load|shelve\.open|joblib\.load|torch\.load)$"
@@ -222,7 +220,7 @@ def _forbidden_calls(root: Path) -> int:
 
 
 def _report(root: Path) -> int:
-    """Fit photographs with hostile names, and look at the report and the page."""
+    """Fit photographs with hostile names, and look at the report."""
     run = root.parent / "run"
     try:
         code = command("fit", root, "--out", run, *FIT) or command("report", run)
