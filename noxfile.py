@@ -1,7 +1,7 @@
 """Everyday commands: `nox -s lint`, `nox -s tests`, ... `nox -l` lists them.
 
 They run in the environment that nox was started from (`pip install -e '.[dev,docs]'`): its
-libraries are large, and `.ci/run` checks a fresh one. Only `wheel` makes an environment.
+libraries are large, and `.ci/run` checks a fresh one. Only `audit` and `wheel` make one.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def docs(session: nox.Session) -> None:
 
 @nox.session(venv_backend="venv")
 def audit(session: nox.Session) -> None:
-    """Look for known faults in what is installed here; needs the index's own JSON interface."""
+    """Look for known vulnerabilities of installed packages; needs the JSON interface of PyPI."""
     session.install("pip-audit")
     session.run("pip-audit", "--path", sysconfig.get_paths()["purelib"])
 
@@ -81,7 +81,7 @@ def wheel(session: nox.Session) -> None:
 
 @nox.session
 def bench(session: nox.Session) -> None:
-    """Hold the renderer against the baseline, as CI does."""
+    """Compare the renderer with the baseline, as CI does."""
     parts = session.posargs or ("speed_error", "levels", "--quick")
     out = Path(session.create_tmp()).resolve()
     session.run("python", "benchmarks/run.py", *parts, "--out", str(out), "--baseline", BASELINE)

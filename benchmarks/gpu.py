@@ -56,8 +56,8 @@ def milliseconds(job: Callable[[], Any], wait: Callable[[Any], Any], repeats: in
 def gsplat_jobs(scene: BenchScene, weights: np.ndarray) -> tuple[Callable, Callable, Callable]:
     """Return gsplat's forward pass, its forward and backward pass, and a function that waits.
 
-    The second returns the image (H, W, 3) and the gradients by all fields of `Gaussians`, as
-    tensors.
+    The second returns the image (H, W, 3) and the gradients by all fields of `Gaussians` but
+    `vibration`, as tensors.
     """
     import gsplat  # pyright: ignore[reportMissingImports]
     import torch  # pyright: ignore[reportMissingImports]

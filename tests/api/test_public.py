@@ -47,15 +47,15 @@ def test_examples_import_public_names_only(name):
 K, POSE = [[90.0, 0, 20], [0, 90, 15], [0, 0, 1]], np.eye(4)
 
 
-def test_a_camera_of_one_s_own_sees_what_the_view_sees(finished_run):
+def test_a_new_camera_with_the_parameters_of_a_view_sees_the_same(finished_run):
     run = p2gs_jax.load_run(finished_run)
     view = run.scene.views[2]
-    own = p2gs_jax.make_camera(view.K.tolist(), view.viewmat, view.width, view.height)
+    made = p2gs_jax.make_camera(view.K.tolist(), view.viewmat, view.width, view.height)
     of_view = run.camera(2)
-    np.testing.assert_allclose(own.viewmat, of_view.viewmat, atol=1e-6)
-    np.testing.assert_allclose(own.K, of_view.K)
-    assert (own.width, own.height) == (of_view.width, of_view.height)
-    linear = run.render(own).linear
+    np.testing.assert_allclose(made.viewmat, of_view.viewmat, atol=1e-6)
+    np.testing.assert_allclose(made.K, of_view.K)
+    assert (made.width, made.height) == (of_view.width, of_view.height)
+    linear = run.render(made).linear
     bright = p2gs_jax.develop(linear, run.common_display(exposure_ev=1.0))
     assert bright.shape == run.photograph(2).shape
     assert bright.mean() > p2gs_jax.develop(linear, run.common_display()).mean()
@@ -92,7 +92,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_bad_input_is_the_user_s(name, tmp_path, monkeypatch):
+def test_bad_input_is_a_user_error_with_a_remedy(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UserError) as error:
         BAD[name]()

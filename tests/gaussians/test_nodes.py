@@ -1,4 +1,4 @@
-"""Where things begin that move: in their boxes, of which colour; or vibrating, at which times."""
+"""Initial Gaussians of moving objects, in their boxes, and vibrating ones, with their times."""
 
 import dataclasses
 
@@ -45,7 +45,7 @@ def test_laser_points_of_all_sweeps_meet_in_the_box(scene):
     # They were measured on the surface, with a deviation of 1 cm.
     depth = (half - np.abs(nodes.points)).min(1)
     assert np.percentile(np.abs(depth), 95) < 0.04
-    # Of one sweep there are 60; and no two lie in one cube.
+    # A sweep has 60 points on the box. Fewer than 1 % of all share a cube.
     assert len(nodes.points) > 200
     cells = np.floor(nodes.points.astype(np.float64) / 0.02).astype(int)
     assert len(np.unique(cells, axis=0)) > 0.99 * len(cells)
@@ -54,11 +54,11 @@ def test_laser_points_of_all_sweeps_meet_in_the_box(scene):
     assert np.percentile(away, 99) < 0.1
 
 
-def test_boxes_with_few_points_are_filled_and_said(scene):
+def test_boxes_with_few_points_are_filled_and_noted(scene):
     few = dataclasses.replace(scene.lidar, objects=np.full(len(scene.lidar.objects), -1))
     nodes = find_nodes(dataclasses.replace(scene, lidar=None), CFG)
     assert len(nodes.points) == pytest.approx(CFG.few_points, rel=0.2)
-    # On all sides but the bottom.
+    # The points lie on all sides but the bottom.
     half = np.array(SIZE) / 2
     assert np.isclose(np.abs(nodes.points), half).any(1).all()
     assert not np.isclose(nodes.points[:, 2], -half[2]).any()
@@ -69,7 +69,7 @@ def test_boxes_with_few_points_are_filled_and_said(scene):
     assert not len(left.points)
 
 
-def test_what_few_views_show_is_left_to_the_mask(scene):
+def test_objects_that_few_views_show_are_left_to_the_mask(scene):
     views = tuple(
         dataclasses.replace(v, split="train" if v.frame < 2 else "test") for v in scene.views
     )
@@ -90,14 +90,14 @@ def timeless(scene):
     return dataclasses.replace(scene, views=views)
 
 
-def test_without_times_what_moves_is_masked(scene):
+def test_moving_objects_are_masked_if_views_have_no_times(scene):
     nodes = find_nodes(timeless(scene), CFG)
     assert len(nodes.left) == 1
     assert "no times" in nodes.notes[0]
 
 
 def test_points_get_the_colours_that_photographs_show(scene):
-    """Of radiance, whatever the exposures: those of the frames differ by a stop."""
+    """The colours are radiance: exposures of frames, over 1.6 stops, do not change them."""
     cfg = with_fields(FitConfig(), {"photometry.model": "view_exposure"})
     nodes = find_nodes(scene, CFG)
     start = initial_photometry(None, [v.camera for v in scene.training_views], cfg)
@@ -123,7 +123,7 @@ def rows(values):
     return {tuple(row) for row in np.asarray(values)}
 
 
-def test_laser_points_begin_at_their_own_times(scene):
+def test_vibrating_gaussians_begin_at_laser_points_and_their_times(scene):
     still = make_world().wall
     g = with_vibration(still, scene, VIBRATING)
     n, moves = still.capacity, g.vibration
@@ -143,11 +143,11 @@ def test_laser_points_begin_at_their_own_times(scene):
     assert len(np.unique(times.round(2))) == FRAMES
     assert standing(g, None).capacity == n
     assert standing(g, None).vibration is None
-    # Colours of the wall behind, for want of better ones.
+    # Their colours are those of the wall.
     assert rows(g.sh[n:, 0]) <= rows(g.sh[:n, 0])
 
 
-def test_without_laser_points_they_begin_anywhere_at_any_time(scene):
+def test_without_laser_points_they_begin_at_static_gaussians_at_random_times(scene):
     still = make_world().wall
     g = with_vibration(still, dataclasses.replace(scene, lidar=None), VIBRATING)
     n = still.capacity
@@ -158,7 +158,7 @@ def test_without_laser_points_they_begin_anywhere_at_any_time(scene):
     assert np.ptp(g.vibration.peaks[n:]) > 1.5 * half
 
 
-def test_it_is_only_where_it_is_asked_for_and_views_have_times(scene):
+def test_gaussians_vibrate_only_by_request_and_if_views_have_times(scene):
     assert vibrates(scene, VIBRATING)
     assert not vibrates(scene, FitConfig())
     assert not vibrates(timeless(scene), VIBRATING)

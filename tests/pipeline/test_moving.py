@@ -1,4 +1,4 @@
-"""A drive before which a box crosses, with its box and without, from its folder to files."""
+"""A drive with a box that crosses before the cameras: fits, rendering, exports and scores."""
 
 import dataclasses
 import json
@@ -33,7 +33,7 @@ METHODS = {
     "vibration": with_fields(SHORT, {"dynamics.method": "vibration", "dynamics.vibrating": 600}),
     "adaptive": with_fields(SHORT, {"densify.method": "adaptive", "densify.grad_threshold": 0.0}),
 }
-SLOWLY = [pytest.param(name, marks=pytest.mark.slow) for name in ("vibration", "adaptive")]
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("vibration", "adaptive")]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -63,7 +63,7 @@ def run(fitted):
     return load_run(fitted("rigid"))
 
 
-def test_the_run_remembers_whose_gaussians_are_and_where_boxes_were(run):
+def test_the_run_stores_the_owner_of_each_gaussian_and_the_boxes(run):
     assert run.owner is not None
     assert run.moving is not None
     assert set(run.owner) == {-1, 0}
@@ -83,7 +83,7 @@ def test_the_run_remembers_whose_gaussians_are_and_where_boxes_were(run):
 
 
 def test_views_are_rendered_at_their_own_time(run):
-    """Where the box is, there the picture differs from that without it."""
+    """The pictures with the box and without it differ where the box is."""
     for index in (0, 12):
         view = run.scene.views[index]
         camera = run.camera(index)
@@ -92,11 +92,11 @@ def test_views_are_rendered_at_their_own_time(run):
         plain = dataclasses.replace(camera, objects=None)
         np.testing.assert_array_equal(without, run.render(plain).linear)
         np.testing.assert_allclose(run.render(plain, view.time).linear, with_box, atol=1e-5)
-        # And by a camera of one's own.
+        # A new camera shows the box only if a time is given.
         viewmat, K, width, height = run.store.camera(index)
-        own = make_camera(K, viewmat, width, height)
-        np.testing.assert_array_equal(run.render(own).linear, without)
-        np.testing.assert_allclose(run.render(own, view.time).linear, with_box, atol=1e-4)
+        new = make_camera(K, viewmat, width, height)
+        np.testing.assert_array_equal(run.render(new).linear, without)
+        np.testing.assert_allclose(run.render(new, view.time).linear, with_box, atol=1e-4)
         changed = np.abs(with_box - without).max(-1) > 0.1
         inside = object_mask(view, run.scene.objects, camera.width, camera.height, 0.3)
         assert changed.sum() > 100
@@ -166,7 +166,7 @@ def test_scores_can_be_computed_again(run, tmp_path, succeeded):
         assert found == pytest.approx(expected, abs=1e-3)
 
 
-@pytest.mark.parametrize("method", ["rigid", *SLOWLY])
+@pytest.mark.parametrize("method", ["rigid", *SLOW])
 def test_a_resumed_run_is_the_one_that_was_never_stopped(fitted, folder, tmp_path, method):
     whole, out = fitted(method), tmp_path / "run"
     shutil.copytree(whole, out)
@@ -206,7 +206,7 @@ def test_gaussians_that_vibrate_are_shown_at_the_time_of_each_view(fitted):
     assert at_time(run.as_of(), None).vibration is None
 
 
-def test_broken_or_foreign_owners_are_said(run, tmp_path):
+def test_broken_or_foreign_owners_are_refused(run, tmp_path):
     path = tmp_path / "objects.npz"
     path.write_bytes((run.folder / "objects.npz").read_bytes()[:100])
     with pytest.raises(UserError, match="cannot be read"):

@@ -13,7 +13,7 @@ SEGMENT = "10023947602400723454_1120_000_1140_000"
 IMAGE = "[CameraImageComponent]."
 LENS = "[CameraCalibrationComponent]."
 RANGES = "[LiDARComponent].range_image_return1."
-PIXELS = "[LiDARPoseComponent].range_image_return1."
+POSES = "[LiDARPoseComponent].range_image_return1."
 SCANNERS = "[LiDARCalibrationComponent]."
 BOX = "[LiDARBoxComponent]."
 CAR = "[VehiclePoseComponent].world_from_vehicle.transform"
@@ -23,12 +23,12 @@ UPPER = w.matrix(Rotation.from_euler("ZYX", [2.6, 0.01, 0.02]), [1.43, 0, 2.18])
 SIDE = w.matrix(Rotation.from_euler("z", 1.5), [3.2, 1.0, 0.9])
 BEAMS = np.radians([-17, -9, -4, -1, 2])
 WIDE, NARROW = 48, 12
-TURN = 0.1
-# Where `vehicle_pose` is on the clock of a frame.
+TURN = 0.1  # s
+# Time of `vehicle_pose` after the start of a frame, s.
 MIDDLE = 0.052
 ROOM = np.array([1150.0, -760.0, 11.0]), np.array([1260.0, -640.0, 30.0])
-LISTS = {f"{p}shape": pa.list_(pa.int32(), 3) for p in (RANGES, PIXELS)}
-LISTS |= {f"{p}values": pa.list_(pa.float32()) for p in (RANGES, PIXELS)}
+LISTS = {f"{p}shape": pa.list_(pa.int32(), 3) for p in (RANGES, POSES)}
+LISTS |= {f"{p}values": pa.list_(pa.float32()) for p in (RANGES, POSES)}
 LISTS |= {f"{SCANNERS}beam_inclination.values": pa.list_(pa.float64())}
 
 
@@ -59,7 +59,7 @@ def mount(camera) -> np.ndarray:
 
 
 def image_row(k, camera, **changes) -> dict:
-    # The pose is of 20 ms before the middle column.
+    # The car has this pose 20 ms before the middle column is exposed.
     at = 0.1 * k + 0.03 - 0.002 * camera
     step = 1e-4
     later, pose = w.car_at(at + step), w.car_at(at)
@@ -125,20 +125,20 @@ def ranged(prefix, k, laser, image) -> dict:
 
 def write_lidar(root, count, segment) -> None:
     images, poses = [], []
-    side = np.linspace(-0.5, 0.3, 7)[:-1] + 0.4 / 6
+    side = np.linspace(-0.5, 0.3, 13)[1::2]  # the centres of 6 equal parts
     for k in range(count):
         turning = [w.car_at(TURN * (k + (c + 0.5) / WIDE)) for c in range(WIDE)]
         upper = scan(UPPER, BEAMS, turning)
         # Roll, pitch, yaw and the position of a pose.
         turns = [Rotation.from_matrix(p[:3, :3]).as_euler("ZYX")[::-1] for p in turning]
         six = np.hstack([turns, [p[:3, 3] for p in turning]]).astype(np.float32)
-        own = np.tile(six, (len(BEAMS), 1, 1))
+        of_pixels = np.tile(six, (len(BEAMS), 1, 1))
         # Nothing was measured here, and there is no pose.
-        upper[0, :5, 0], own[0, :5] = -1, 0
+        upper[0, :5, 0], of_pixels[0, :5] = -1, 0
         still = [w.car_at(TURN * k + MIDDLE)] * NARROW
         images.append(ranged(RANGES, k, 3, scan(SIDE, side, still)))
         images.append(ranged(RANGES, k, 1, upper))
-        poses.append(ranged(PIXELS, k, 1, own))
+        poses.append(ranged(POSES, k, 1, of_pixels))
     write_rows(root, "lidar", images, segment)
     write_rows(root, "lidar_pose", poses, segment)
     beams = f"{SCANNERS}beam_inclination."
