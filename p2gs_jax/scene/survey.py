@@ -45,7 +45,7 @@ class SurveyedCamera:
 
 @dataclass(frozen=True)
 class Survey:
-    """Facts about a scene: its format as in `DataConfig`, its cameras, and sentences."""
+    """Facts about a scene: its format as in `DataConfig`, its cameras, and other facts in words."""
 
     format: str
     cameras: tuple[SurveyedCamera, ...]
@@ -58,7 +58,7 @@ class Survey:
 
 
 def survey(root: Path, cfg: DataConfig, report: Report = lambda message: None) -> Survey:
-    """Return facts about a folder, with the options of a fit; missing photographs are counted.
+    """Return facts about a folder, read with the options of a fit; missing photographs are counted.
 
     Raises UserError as `find_scene` does, and if an image is broken or a table malformed.
     """
@@ -104,13 +104,13 @@ def _drive_facts(scene: Scene, found: Recording, cfg: DataConfig) -> list[str]:
     """Return sentences on the frames, the distance and the boxes of a drive."""
     frames = len(chosen_frames(cfg.frames, sorted({p.frame for p in found.photographs})))
     by_camera = _by_camera(scene)
-    longest = camera_centers(np.stack([v.viewmat for v in max(by_camera.values(), key=len)]))
-    total = float(np.linalg.norm(np.diff(longest, axis=0), axis=1).sum())
+    centers = camera_centers(np.stack([v.viewmat for v in max(by_camera.values(), key=len)]))
+    total = float(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum())
     times = [view.time for view in scene.views if view.time is not None]
     missing = frames * len(by_camera) - len(scene.views)
     facts = [f"{count_of(frames, 'frame')}, {max(times) - min(times):.1f} s, {total:.1f} m driven."]
     if missing:
-        facts.append(f"{count_of(missing, 'photograph')} missing in these frames.")
+        facts.append(f"These frames lack {count_of(missing, 'photograph')}.")
     labels = Counter(thing.label for thing in scene.objects)
     if not labels:
         return [*facts, "There are no boxes."]

@@ -20,7 +20,7 @@ def test_a_drive_is_counted(tmp_path, succeeded, monkeypatch):
     for text in (
         "31 photographs of 4 cameras.",
         "8 frames, 0.7 s, 7.0 m driven.",
-        "1 photograph missing in these frames.",
+        "These frames lack 1 photograph.",
         "LiDAR: ",
         "Boxes: 2 tracked, 1 moving: 2 Car (1 moving).",
         "EXIF has no exposures.",

@@ -2,8 +2,8 @@
 
 Pixels of the car never change while it drives. An edge that stays is evidence for the car only if
 the world would have moved at its pixel. The least motion is that of the farthest visible surface,
-the road (above the horizon there is none). Motion counts across an edge, not along it: a lane
-marking parallel to the car stays too. An edge that changes is evidence for the world. Smooth
+the road; above the horizon no motion is expected. Motion counts across an edge, not along it: a
+lane marking parallel to the car stays too. An edge that changes is evidence for the world. Smooth
 bonnets, sky and asphalt have no edges and count like the pixels around them: the mask is a minimal
 cut through the pixels, cheap along edges that stay. Gradients are of logarithms, so exposure does
 not matter.
@@ -32,11 +32,11 @@ from p2gs_jax.types import Distortion
 # The most photographs of a camera that are used, and the fewest that suffice.
 MOST_LOOKED_AT, FEWEST_LOOKED_AT = 24, 6
 # A turn by 1 radian counts like this distance, metres.
-TURN_AS_WAY = 10.0
+TURN_AS_DISTANCE = 10.0
 # The version is part of the key of cached results: raise it whenever results change.
 _VERSION = 2
 _NOTE = "ego mask"
-# All lengths and thresholds in pictures are in pixels at this width (BUILD_NOTES).
+# Lengths and thresholds in pictures are in pixels at this width (BUILD_NOTES, "The car itself").
 WIDTH = 480
 # Display values below `DARK` are noise; `BLUR` is the blur before gradients, pixels.
 DARK, BLUR = 0.02, 1.0
@@ -44,20 +44,20 @@ DARK, BLUR = 0.02, 1.0
 # the frames, and there at least 0.5 times the gradient of the strongest 20 %.
 LEAST_GRADIENT, STEADY = 0.012, (20, 80, 0.5)
 # The largest height of the camera above the road, and the largest distance of the road, metres.
-LOWEST_ROAD, FARTHEST = 2.5, 1e4
+HIGHEST_CAMERA, FARTHEST = 2.5, 1e4
 # The world counts as moved after `APART` pixels. An edge that stays is evidence once this happened
 # more than `FEWEST` times, full evidence after `ENOUGH` times. Motion along an edge, within an
 # angle of sine `ALONG`, does not count.
 APART, FEWEST, ENOUGH, ALONG = 3.0, 1.5, 5.5, 0.1
 # Weights of the cut: evidence for the car, length of the outline, its least share on edges, area.
-OWN, OUTLINE, THROUGH_EDGES, AREA = 3.0, 2.0, 0.02, 0.004
-# The change of a gradient from which on it is evidence for the world, and full evidence.
+CAR, OUTLINE, THROUGH_EDGES, AREA = 3.0, 2.0, 0.02, 0.004
+# Changes of a gradient at which evidence for the world begins, and at which it is full.
 CHANGE = (0.006, 0.018)
 # A part of the mask needs this width (pixels), this share of its outline on edges that stay, this
-# much evidence for each pixel of it, and this share of the picture. Gaps up to `GAP` are closed.
+# much evidence per pixel of outline, and this share of the picture. Gaps up to `GAP` are closed.
 NARROWEST, EDGE_SHARE, EDGE_EVIDENCE, LEAST_SHARE, GAP = 7, 0.5, 0.3, 0.002, 13
-_MOTION_STEP = 8
-_CAPACITY = 1000
+_MOTION_STEP = 8  # spacing of computed motions, pixels
+_CAPACITY = 1000  # integer units of flow for a price of 1
 
 
 def find_ego_masks(
@@ -78,7 +78,7 @@ def find_ego_masks(
     for name in names:
         photographs = [p for p in recording.photographs if p.camera == name]
         existing = [p for p in photographs if p.embedded is not None or p.path.is_file()]
-        spread = spread_over_the_way(sorted(existing, key=lambda p: p.frame), MOST_LOOKED_AT)
+        spread = spread_over_distance(sorted(existing, key=lambda p: p.frame), MOST_LOOKED_AT)
         mask = _cached_mask(cameras[name], spread, up, work_dir)
         if mask is None:
             undecided.append(name)
@@ -92,7 +92,7 @@ def find_ego_masks(
         notes.append(f"{_NOTE}: not seen by {', '.join(unseen)}")
     if undecided:
         notes.append(
-            f"{_NOTE}: cannot be found by {', '.join(undecided)}, with too few photographs or "
+            f"{_NOTE}: not found for {', '.join(undecided)}, because of too few photographs or "
             "hardly any motion; add masks if the car is visible"
         )
     return masks, notes
@@ -131,7 +131,7 @@ def _picture(photograph: Photograph, camera: RigCamera) -> UInt8[np.ndarray, "h 
     return cv2.resize(picture, (WIDTH, height), interpolation=cv2.INTER_AREA)
 
 
-def spread_over_the_way(photographs: Sequence[Photograph], most: int) -> list[Photograph]:
+def spread_over_distance(photographs: Sequence[Photograph], most: int) -> list[Photograph]:
     """Return at most `most` photographs of one camera, given in the order of time.
 
     They are spread evenly over the distance, not over time: cars wait.
@@ -141,7 +141,7 @@ def spread_over_the_way(photographs: Sequence[Photograph], most: int) -> list[Ph
     poses = np.stack([p.pose for p in photographs])
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     turned = np.einsum("nij,nij->n", poses[1:, :3, :3], poses[:-1, :3, :3])
-    steps += TURN_AS_WAY * np.arccos(np.clip((turned - 1) / 2, -1, 1))
+    steps += TURN_AS_DISTANCE * np.arccos(np.clip((turned - 1) / 2, -1, 1))
     distance = np.concatenate([[0.0], np.cumsum(steps)])
     stops = np.linspace(0, distance[-1], most)
     rows = sorted({int(np.abs(distance - stop).argmin()) for stop in stops})
@@ -176,13 +176,13 @@ class Evidence(NamedTuple):
     Attributes:
         stays: whether an edge is there in nearly all frames.
         strength: gradient of this edge, natural logarithms per pixel.
-        own: evidence for the car, 0 to 1.
+        car: evidence for the car, 0 to 1.
         change: median change of the gradient.
     """
 
     stays: Bool[np.ndarray, "h w"]
     strength: Float32[np.ndarray, "h w"]
-    own: Float32[np.ndarray, "h w"]
+    car: Float32[np.ndarray, "h w"]
     change: Float32[np.ndarray, "h w"]
 
 
@@ -214,8 +214,8 @@ def expected_motion(
     out = []
     for pose, next_pose in pairwise(poses):
         towards = rays @ pose[:3, :3].T
-        drop = np.maximum(-(towards @ up), LOWEST_ROAD / FARTHEST)
-        distance = LOWEST_ROAD / drop
+        drop = np.maximum(-(towards @ up), HIGHEST_CAMERA / FARTHEST)
+        distance = HIGHEST_CAMERA / drop
         points = pose[:3, 3] + towards * distance[..., None]
         local = (points - next_pose[:3, 3]) @ next_pose[:3, :3]
         # Points behind the other camera are far outside its image.
@@ -253,7 +253,7 @@ def cut(evidence: Evidence) -> Bool[np.ndarray, "h w"]:
     """Return the parts of a picture that never move and touch its border, without small gaps."""
     least, most = CHANGE
     moves = np.clip((evidence.change - least) / (most - least), 0, 1)
-    gain = OWN * evidence.own - np.where(evidence.stays, 0, moves) - AREA
+    gain = CAR * evidence.car - np.where(evidence.stays, 0, moves) - AREA
     passage = np.exp(-((evidence.strength / (2 * LEAST_GRADIENT)) ** 2))
     return _solid_parts(_minimal_cut(gain, passage), evidence)
 
@@ -294,7 +294,7 @@ def _minimal_cut(gain: np.ndarray, passage: np.ndarray) -> Bool[np.ndarray, "h w
 
 
 def _solid_parts(found: Bool[np.ndarray, "h w"], evidence: Evidence) -> Bool[np.ndarray, "h w"]:
-    """Return the parts that are wide, touch the border, and end at edges that stay."""
+    """Return parts that are wide, touch the border, and end within 2 pixels of edges that stay."""
     opened = _morphology(found, cv2.MORPH_OPEN, NARROWEST)
     parts, count = _labelled(opened)
     near = cv2.dilate(evidence.stays.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
@@ -310,7 +310,7 @@ def _solid_parts(found: Bool[np.ndarray, "h w"], evidence: Evidence) -> Bool[np.
         length = max(int(rim.sum()), 1)
         if near[rim].sum() < EDGE_SHARE * length:
             continue
-        if evidence.own[part].sum() >= EDGE_EVIDENCE * length:
+        if evidence.car[part].sum() >= EDGE_EVIDENCE * length:
             kept |= part
     closed = _morphology(kept, cv2.MORPH_CLOSE, GAP)
     # Holes are filled, even those that only the lower border closes.
@@ -326,7 +326,7 @@ def _labelled(mask: Bool[np.ndarray, "h w"]) -> tuple[Int[np.ndarray, "h w"], in
 
 
 def _morphology(mask: Bool[np.ndarray, "h w"], kind: int, side: int) -> Bool[np.ndarray, "h w"]:
-    """Open or close by a disc; the picture goes on beyond its border as it ends there."""
+    """Open or close by a disc; pixels beyond the border repeat those at the border."""
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
     padded = np.pad(mask.astype(np.uint8), 2 * side, mode="edge")
     done = cv2.morphologyEx(padded, kind, disc)[2 * side : -2 * side, 2 * side : -2 * side]

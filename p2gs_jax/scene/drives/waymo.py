@@ -2,7 +2,7 @@
 
     camera_image/SEGMENT.parquet        JPEG, pose, velocity and shutter of each photograph
     camera_calibration/SEGMENT.parquet  lenses, and poses of cameras on the car
-    vehicle_pose/SEGMENT.parquet        pose of the car that boxes and short-range points refer to
+    vehicle_pose/SEGMENT.parquet        pose of the car for boxes and for the other scanners
     lidar/SEGMENT.parquet               range images
     lidar_pose/SEGMENT.parquet          pose of the car for every pixel of the upper scanner
     lidar_calibration/SEGMENT.parquet   beams, and poses of scanners on the car
@@ -14,14 +14,14 @@ and shutter: wdl_limited/camera/camera_model.cc. Geometry of range images:
 utils/range_image_utils.py and v2/perception/utils/lidar_utils.py.
 
 Pixel 0 begins at the image's edge (v2/perception/lidar.py), so centres are at +0.5 as here. The
-columns of an image are exposed one after the other, and its pose has another time than the middle
-column; the data set's velocities give the pose at the middle.
+columns of an image are exposed one after the other. Its pose is from another time than its middle
+column; the data set's velocities give the pose at the middle column.
 
-`frame_timestamp_micros` is the begin of the upper scanner's turn; `vehicle_pose` has another time,
-about the middle of the turn (issue 464). Each pixel of the upper scanner has a pose; points of the
-other scanners are in the car's axes at `vehicle_pose`. The order of the columns shows that the turn
-begins at the back and is clockwise. The times of the other scanners are not known: their points,
-like boxes, get the time at which the upper scanner passed.
+`frame_timestamp_micros` is the start of the upper scanner's turn; `vehicle_pose` is from about the
+middle of the turn (waymo-open-dataset issue 464). Each pixel of the upper scanner has a pose;
+points of the other scanners are in the car's axes at `vehicle_pose`. The order of the columns shows
+that the turn begins at the back and is clockwise. The times of the other scanners are not known:
+their points, like boxes, get the time at which the upper scanner passed.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ RANGES = tuple(f"[LiDARComponent].range_image_return1.{name}" for name in ("valu
 POSES = tuple(f"[LiDARPoseComponent].range_image_return1.{name}" for name in ("values", "shape"))
 # Channels: distance, intensity, elongation, no-label zone; and roll, pitch, yaw, x, y, z.
 RANGE_CHANNELS, POSE_CHANNELS = 4, 6
-# The upper scanner: number, time of a turn in seconds (10 Hz), azimuth of its begin on the car.
+# The upper scanner: number, time of a turn in seconds (10 Hz), azimuth of its start on the car.
 UPPER, TURN_S, TURN_START = 1, 0.1, np.pi
 # The consequences of missing files.
 MISSING = {
@@ -148,8 +148,8 @@ def _cameras(table: ParquetTable) -> tuple[list[RigCamera], dict[str, Pose]]:
     for row, (number, lens) in enumerate(zip(numbers, lenses, strict=True)):
         name = _name(CAMERAS, number)
         if not np.isfinite(lens).all() or (lens[[0, 1, -2, -1]] <= 0).any():
-            why = f"the lens of {name} does not have finite numbers, positive focal lengths and "
-            raise broken(f"{table.path}:", f"{why}sizes")
+            why = f"the lens of {name} needs finite numbers, and positive focal lengths and sizes"
+            raise broken(f"{table.path}:", why)
         fu, fv, cu, cv, *coefficients, width, height = lens.tolist()
         K, distortion = intrinsics(fu, fv, cu, cv), make_distortion((*coefficients,))
         cameras.append(RigCamera(name, K, int(width), int(height), distortion))
@@ -172,7 +172,7 @@ def _photographs(segment: _Segment, mounts: dict[str, Pose]) -> tuple[list[Photo
             unplaced += 1
             continue
         car = _transform(table[POSE][row], images.path, f"photograph {row + 1}")
-        # The middle column is exposed halfway between the trigger and the end of the readout.
+        # The middle column is exposed halfway between trigger and readout; absurd lags count as 0.
         lag = (trigger[row] + done[row]) / 2 - posed
         if not (abs(lag) < LONGEST_BEYOND_S and np.isfinite(motion[row]).all()):
             lag = 0.0
@@ -193,7 +193,7 @@ def _moved(pose: Pose, motion: Float[np.ndarray, " 6"], lag: float) -> Pose:
     """Return the pose of the car `lag` seconds later.
 
     Velocities are in world axes and turn rates in the car's axes, as in Waymo's camera model
-    (dataset.proto has turns in world axes; cars turn about z, for which both agree).
+    (dataset.proto has turn rates in world axes; cars turn about z, for which both agree).
     """
     rotation = Rotation.from_rotvec(lag * motion[3:]).as_matrix()
     return pose_of(pose[:3, :3] @ rotation, pose[:3, 3] + lag * motion[:3])
@@ -278,8 +278,8 @@ def _sweeps(segment: _Segment, cars: dict[int, Pose]) -> tuple[list[Sweep], list
     unposed = sum((turn, UPPER) in rows and (turn, UPPER) not in posed for turn in turns)
     words = f"of {len(turns)} LiDAR turns lack lidar_pose: their points ignore the car's motion."
     notes = counted(unposed, words)
-    lost = len(turns) - len(sweeps)
-    return sweeps, notes + counted(lost, "LiDAR sweeps have frames without a pose: left out.")
+    words = "LiDAR sweeps have frames without a pose: they are left out."
+    return sweeps, notes + counted(len(turns) - len(sweeps), words)
 
 
 def _rows(table: ParquetTable) -> dict[tuple[int, int], int]:
@@ -344,7 +344,7 @@ class _Source(NamedTuple):
         if pixels is None or pixels.shape[:2] != distances.shape[:2]:
             raise broken(f"{self.poses.path}:", f"row {posed + 1} does not fit its range image")
         poses = pixels[at].astype(np.float64)
-        # Pixels without a measurement have no pose.
+        # Six zeros mean that a pixel has no pose in the table.
         valid = poses.any(1)
         world[valid] = _rotated(local[valid], poses[valid, :3]) + poses[valid, 3:]
         return world, (at[1] + 0.5) / distances.shape[1]

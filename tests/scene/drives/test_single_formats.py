@@ -155,7 +155,7 @@ def test_what_waymo_lacks_is_counted(copied, read):
         "1 boxes belong to no track: they are left out.",
         "1 boxes have frames without a pose: they are left out.",
         "1 of 3 LiDAR turns lack lidar_pose: their points ignore the car's motion.",
-        "1 LiDAR sweeps have frames without a pose: left out.",
+        "1 LiDAR sweeps have frames without a pose: they are left out.",
     ]
     # In half a turn the car drives 0.45 m, and its rotation of 0.015 rad moves far points.
     assert 0.1 < waymo.off_walls(drive.sweeps[0].read().points).max() < 1.5
