@@ -80,9 +80,9 @@ def fibonacci_sphere(count: int) -> Float[np.ndarray, "n 3"]:
 
 
 def on_host(record: Callable[..., Record], *values: Any) -> Record:
-    """Return a device record of host arrays, which compiled programs accept.
+    """Return a record of host arrays, which compiled programs accept.
 
-    This only satisfies type checkers, because fields of records are annotated with `Array`.
+    The call only satisfies type checkers, because fields of records are annotated with `Array`.
     """
     return record(*values)
 

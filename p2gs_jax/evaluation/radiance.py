@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.evaluation.scores import ssim
 
-Truth = Callable[[int], Float[np.ndarray, "h w 3"] | None]
+Truth = Callable[[int], Float[np.ndarray, "h w 3"] | None]  # true radiance by row of the view
 
 # PU21, "banding + glare" (Mantiuk and Azimi, Picture Coding Symposium 2021), domain in cd/m^2.
 PU21 = (0.353487901, 0.3734658629, 8.277049286e-05, 0.9062562627, 0.09150303166, 0.9099517204)
@@ -22,8 +22,8 @@ PU21_PEAK = 256.0
 WHITE_NITS = 100.0
 # GaussHDR (CVPR 2025) and HDR-NeRF (CVPR 2022): log(1 + mu x) / log(1 + mu), mu = 5000.
 MU = 5000.0
-# Numbers of evenly spaced pixels of a view for alignment and for colour difference, and of all
-# views for alignment; up to twice as many are used. Without the last bound, 900 views took 4 GB.
+# Evenly spaced pixels: of a view for alignment and for colour difference, and of all views for
+# alignment. Up to twice as many are used. The last number bounds memory.
 ALIGNMENT_PIXELS, COLOR_PIXELS, MOST_ALIGNED = 10_000, 20_000, 1_000_000
 STOPS_CAP = 3.0  # larger errors count as this, stops
 
@@ -96,7 +96,7 @@ def mu_law_psnr(
 
 
 def sampled(linear, truth, mask: Bool[np.ndarray, "h w"], views: int) -> Float[np.ndarray, "2 n 3"]:
-    """Return natural logs of recovered and true radiance at some pixels of one of `views` views."""
+    """Return natural logs of recovered and true radiance at pixels of a view, one of `views`."""
     pick = np.flatnonzero(mask & (truth.min(-1) > 0) & (linear.min(-1) > 0))
     each = max(1, min(ALIGNMENT_PIXELS, MOST_ALIGNED // views))
     pick = pick[:: max(1, len(pick) // each)]
@@ -108,7 +108,7 @@ class Alignment(NamedTuple):
 
     The truth is `exp(shift)` times recovered radiance, or `exp(offset) * recovered**power`. A
     recovered radiance of `brightest` saturates the photograph of median exposure; errors in stops
-    leave out pixels whose true radiance is larger.
+    leave out pixels whose true radiance exceeds `brightest * scale`.
     """
 
     brightest: float
@@ -119,7 +119,7 @@ class Alignment(NamedTuple):
     @classmethod
     def of(cls, samples: Sequence[Float[np.ndarray, "2 _ 3"]], brightest: float) -> Alignment:
         """Return the alignment of samples from all views."""
-        # Single precision is too coarse for a line through 500,000 points.
+        # Single precision is too coarse for a line through millions of points.
         recovered, true = np.concatenate(samples, 1).astype(np.float64)
         level, shift = float(np.log(brightest)), 0.0
         kept = recovered.max(-1, initial=-np.inf) < level

@@ -31,7 +31,7 @@ class Job:
     """A task that can continue after an interruption."""
 
     name: str  # for the user; jobs of one call have different names
-    folder: Path  # for the results; the same path on all machines of the engine
+    folder: Path  # for the results; the same path on all machines that run jobs
     task: Task  # at the top of a module; called again, it continues from its checkpoint
     arguments: dict[str, Any]  # JSON values
 
@@ -98,7 +98,7 @@ def read_job(path: Path) -> Job:
 
 
 def write_reason(folder: Path, reason: str | None, **more: str) -> None:
-    """Write the reason of a failure into the folder of a job."""
+    """Write the reason of a failure, and `more` entries, into the folder of a job."""
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / REASON, {"reason": reason, **more})
 
@@ -112,7 +112,7 @@ def read_reason(folder: Path) -> str:
 
 
 class ProgressFile(Reporter):
-    """A reporter that keeps the newest state of a fit in a file for other processes."""
+    """A reporter that keeps the newest state of a job in a file for other processes."""
 
     def __init__(self, path: Path):
         self.path = path

@@ -1,9 +1,9 @@
-"""Residuals that the model does not explain: by position in an image, or by region of a stack.
+"""Residuals that the model does not explain, because they depend on the position in the image.
 
 Exposure, gamma and response depend on the value of a pixel only. Flare, shade or a reflection
-covers a part of the image: warnings name such photographs. The test counts blocks of the image,
-because residuals of one surface are correlated. A stack of photographs also shows local tone
-mapping.
+covers a part of the image: an F test finds such photographs, and warnings name them. It counts
+blocks of the image, because residuals of one surface are correlated. A stack of photographs also
+shows local tone mapping.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def place_warnings(
     seen = weight.sum(1) > 0
     total = np.maximum(weight.sum(1), 1)
     residual = np.where(weight > 0, residual_ev, 0.0).sum(1) / total
-    value = np.log2(np.maximum(np.asarray(o.colors, np.float64), DARKEST)) * 2.2
+    value = np.log2(np.maximum(np.asarray(o.colors, np.float64), DARKEST)) * 2.2  # gamma 2.2
     value = (value * np.where(seen[:, None], weight, 1.0)).sum(1) / np.where(seen, total, 3)
     # The residual is subtracted; otherwise noise of the value would look like tone mapping.
     value = value - np.where(seen, residual, 0.0)
@@ -110,7 +110,7 @@ def regional_ev(
     size: tuple[int, ...],
     signal: Bool[np.ndarray, " v"],
 ) -> float:
-    """Return the RMS over image regions of residuals minus those of equal brightness, stops.
+    """Return the RMS of median residuals of image regions, corrected for brightness, stops.
 
     The photographs are a stack with an exposure per view; those without `signal` are left out. `xy`
     are the positions of the points, and `size` is (height, width), both in pixels.
@@ -120,7 +120,7 @@ def regional_ev(
     level = solution.log_exposures[o.views][:, None] + solution.point_log_radiance[o.points]
     value = np.where(problem.usable, z - level, 0.0).mean(1)
     cell = (xy[:, 1] * GRID[0] // size[0]) * GRID[1] + xy[:, 0] * GRID[1] // size[1]
-    brightness = np.clip((o.colors.mean(1) * 10).astype(int), 0, 9)
+    brightness = np.clip((o.colors.mean(1) * 10).astype(int), 0, 9)  # ten classes
     means = []
     for frame in np.flatnonzero(signal):
         mine = np.flatnonzero((o.views == frame) & good)

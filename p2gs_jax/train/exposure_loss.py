@@ -48,9 +48,9 @@ class Partner(eqx.Module):
 
 
 def literal_same_pose(linear: Float[Array, "h w 3"], e_i, e_j) -> Float[Array, ""]:
-    """Return the loss for both radiances at one pose: |e_j/e_i - 1| L.
+    """Return the loss if L_i and L_j are the same render L: |e_j/e_i - 1| L.
 
-    It is the mean over pixels of the sum over channels, and zero iff the exposures are equal.
+    It averages pixels, sums channels, and is zero iff the exposures are equal or L is black.
     """
     return jnp.mean(jnp.sum(jnp.abs((e_j / e_i - 1) * linear), -1))
 
@@ -71,8 +71,8 @@ def observed_ldr(
 ) -> Float[Array, ""]:
     """Return the mean of Huber(T_j(alpha T_i^-1(I_i(u))) - I_j(w(u))) over valid pairs.
 
-    This is PIR in display units, and scale-invariant. The error of values that are near black or
-    saturated counts as zero.
+    One point is at u and at w(u). This is the principle of invariant radiance in display units, and
+    scale-invariant. The error of values that are near black or saturated counts as zero.
     """
     capture_i, capture_j = photometry.capture(pairs.views_i), photometry.capture(pairs.views_j)
     radiance = inverse_formation(pairs.colors_i, capture_i, cfg, pairs.positions_i)

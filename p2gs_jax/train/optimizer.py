@@ -1,8 +1,8 @@
 """Adam with a learning rate per group over the single parameter pytree.
 
-A step updates only the Gaussians that it sees; moments and parameters of the others do not change.
-Updates are counted per Gaussian, and bias correction uses this count. All other parameters share
-one count.
+With `visible_only`, a step updates only Gaussians that its view may show; moments and parameters of
+the others do not change. Updates are counted per Gaussian, and bias correction uses this count. All
+other parameters share one count.
 """
 
 from __future__ import annotations
@@ -65,9 +65,9 @@ class Adam(NamedTuple):
         counts = state.counts + 1
         mu = jax.tree.map(lambda m, g: b1 * m + (1 - b1) * g, state.mu, grads)
         nu = jax.tree.map(lambda v, g: b2 * v + (1 - b2) * g * g, state.nu, grads)
-        kind = jax.tree.leaves(mu)[0].dtype
-        first = 1 / (1 - b1 ** counts.astype(kind))
-        second = 1 / (1 - b2 ** counts.astype(kind))
+        dtype = jax.tree.leaves(mu)[0].dtype
+        first = 1 / (1 - b1 ** counts.astype(dtype))
+        second = 1 / (1 - b2 ** counts.astype(dtype))
 
         def moved(p, m, v, rate):
             shape = counts.shape + (1,) * (m.ndim - counts.ndim) if self.by_row else ()
@@ -95,12 +95,12 @@ def make_optimizer(cfg: FitConfig) -> Optimizer:
     return Optimizer(Adam(o.b1, o.b2, o.eps, by_row=True), Adam(eps=o.eps))
 
 
-def means_rate(progress: Array, rate: Array, extent: float, cfg: FitConfig) -> Float[Array, ""]:
+def means_rate(progress: Array, factor: Array, extent: float, cfg: FitConfig) -> Float[Array, ""]:
     """Return the learning rate of the means, scene units per step (3DGS: exponential decay)."""
     o = cfg.optimizer
     if o.means == 0:  # the means are fixed
-        return 0.0 * rate
-    return rate * extent * o.means * (o.means_final / o.means) ** progress
+        return 0.0 * factor
+    return factor * extent * o.means * (o.means_final / o.means) ** progress
 
 
 def photometry_gate(progress: Array, cfg: FitConfig) -> Float[Array, ""]:
@@ -113,8 +113,8 @@ def photometry_gate(progress: Array, cfg: FitConfig) -> Float[Array, ""]:
     if frozen >= 1.0:
         return jnp.zeros(())
     along = (progress - frozen) / (1.0 - frozen)
-    rate = cfg.optimizer.photometry_final ** jnp.clip(along, 0.0, 1.0)
-    return jnp.where(along >= 0, rate, 0.0)
+    factor = cfg.optimizer.photometry_final ** jnp.clip(along, 0.0, 1.0)
+    return jnp.where(along >= 0, factor, 0.0)
 
 
 def appearance_rate(progress: Array, cfg: FitConfig) -> Float[Array, ""]:
@@ -129,23 +129,22 @@ def appearance_rate(progress: Array, cfg: FitConfig) -> Float[Array, ""]:
 
 
 def learning_rates(
-    progress: Array, rate: Array, extent: float, like: Params, cfg: FitConfig, bands: int
+    progress: Array, factor: Array, extent: float, like: Params, cfg: FitConfig, bands: int
 ) -> Params:
     """Return the learning rate of every parameter, with shapes that broadcast against `like`.
 
-    `rate` is the factor on the rates of Gaussians except colours (`schedule.rate_factor`). `extent`
-    is the scene extent in scene units; `bands` is the number of spherical-harmonics coefficients in
-    use.
+    `factor` is on the rates of Gaussians except colours (`schedule.rate_factor`). `extent` is the
+    scene extent in scene units; `bands` is the number of spherical-harmonics coefficients in use.
     """
     o = cfg.optimizer
     final = o.final**progress
-    decay = rate * final
+    decay = factor * final
     # Colours keep their full learning rates in long fits (BUILD_NOTES, "Length").
     sh = jnp.full((bands, 1), o.sh_rest).at[0].set(o.sh_dc) * final
     gate = photometry_gate(progress, cfg)
     varies = MODELS[cfg.photometry.model]
     # The order is that of the fields.
-    of_gaussians = [means_rate(progress, rate, extent, cfg), o.quats * decay, o.scales * decay]
+    of_gaussians = [means_rate(progress, factor, extent, cfg), o.quats * decay, o.scales * decay]
     of_gaussians += [o.opacities * decay, sh]
     if like.gaussians.vibration is not None:
         of_gaussians += [o.velocities * decay, o.peaks * decay, o.lives * decay]
