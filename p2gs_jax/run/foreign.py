@@ -1,7 +1,7 @@
-"""Splats of another program as a run: trained on developed photographs, shown as photographs were.
+"""Splats of another program as a run, shown with the exposures of the original photographs.
 
-The program knows one exposure: its Gaussians have display colours, and `calibrate --develop` has
-written the photographs. `photometry.json` of the same folder tells the look of every photograph.
+Its Gaussians have display colours, trained on photographs that `calibrate --develop` wrote at one
+exposure. `photometry.json` of the same folder has the exposure of every original photograph.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from p2gs_jax.types import GAMMA_SRGB, Gaussians, Params, Scene
 
 # The table of `calibrate --develop` beside the photographs that it wrote: `ev` is their exposure.
 DEVELOPED = Path("developed") / "exposures.csv"
-# Lifted Gaussians are compared in this many views, at most this wide, pixels. The near plane of
-# other programs is at this depth, scene units.
+# Lifted Gaussians are compared in at most `MEASURED` views, at most `MEASURED_WIDTH` pixels wide.
+# `NEAR` is the depth of other programs' near plane, scene units.
 MEASURED, MEASURED_WIDTH, NEAR = 60, 960, 0.01
 
 
 @dataclass(frozen=True)
 class ForeignRun(read.Run):
-    """Splats of another program. `params.gaussians` are lifted, and approximate them.
+    """Splats of another program. `params.gaussians` are lifted to radiance, and approximate them.
 
     `render` composites display colours as their program did, and returns the radiance that the
     picture shows.
@@ -73,22 +73,22 @@ class ForeignRun(read.Run):
     def refined(
         self, steps: int, on_step: Callable[[int, int], None] = lambda done, steps: None
     ) -> ForeignRun:
-        """Return the run with lifted Gaussians whose pictures are closer, and their error.
+        """Return the run with lifted Gaussians that are closer to the other program's pictures.
 
-        The pictures are the program's own, of display colours. `on_step` is called as by `refine`.
+        These pictures show display colours. The run has the error; `on_step` is that of `refine`.
         """
-        cfg, shown, targets = self.cfg.render, self.developed, []
+        cfg, developed, targets = self.cfg.render, self.developed, []
         render = make_renderer(bake.viewer_config(cfg))
         for row in evenly_spaced(len(self.scene.views), MEASURED):
             view = self.scene.views[row]
             camera = camera_of(self.store, row, max(view.width / MEASURED_WIDTH, 1.0))
             targets.append(bake.displayed_target(view.name, self.splats, camera, render))
         lifted = self.params.gaussians
-        lifted = bake.refine(lifted, targets, cfg, steps=steps, shown=shown, on_step=on_step)
-        e: Any = bake.baking_error(lifted, targets, cfg, shown)
+        lifted = bake.refine(lifted, targets, cfg, steps=steps, shown=developed, on_step=on_step)
+        e: Any = bake.baking_error(lifted, targets, cfg, developed)
         note = (
-            f"Lifted to radiance, the Gaussians show {count_of(e['views'], 'picture')} of their "
-            f"program with a median of {e['psnr_median']:.2f} dB: light is composited "
+            f"Lifted to radiance, the Gaussians match {count_of(e['views'], 'picture')} of their "
+            f"program with a median PSNR of {e['psnr_median']:.2f} dB: radiance is composited "
             "instead of display values."
         )
         params = replace(self.params, gaussians=lifted)
@@ -117,7 +117,7 @@ def foreign_run(splats: str | Path, photometry: str | Path, scene: str | Path) -
     the mean, as held-out views.
 
     Raises:
-        UserError: a file is missing or broken, or the photographs of the scene are others.
+        UserError: a file is missing or broken, or the calibration is of another scene.
     """
     splats, folder, data = Path(splats), Path(photometry), DataConfig(test_every=0)
     path = folder / "photometry.json"
@@ -158,8 +158,9 @@ def _with_known(
         why = f"{path} has none of the photographs of {scene.root} (for example {unknown[0]})."
         fix = "name the folder that `p2gs-jax calibrate` wrote for this scene"
         raise UserError(why, fix=fix)
-    note = f"{count_of(len(unknown), 'view')} of unknown exposure ({first_few(unknown)}) have the "
-    return replace(scene, views=tuple(views)), (note + "mean.",) if unknown else ()
+    few = f"{count_of(len(unknown), 'view')} of unknown exposure ({first_few(unknown)})"
+    notes = (f"The mean exposure is used for {few}.",) if unknown else ()
+    return replace(scene, views=tuple(views)), notes
 
 
 def common_look(folder: Path, saved: photometry_files.PhotometryFile) -> DisplayTransform:
