@@ -11,10 +11,10 @@ void main() {
 
 // Each Gaussian has a texel with its place in the picture and its radiance towards the camera.
 const PROJECT = VERSION + `
-uniform sampler2DArray splats;
+uniform sampler2DArray splats;  // mean, log scales, quaternion, logit, then the harmonics
 uniform int count, coefficients, activation;
 uniform mat3 rotation;  // world to camera
-uniform vec3 centre;
+uniform vec3 centre;    // of the camera
 uniform vec4 lens;      // fx, fy, cx, cy
 uniform vec2 size;
 uniform float near, blur, logCutoff;
@@ -54,7 +54,7 @@ vec3 radiance(vec3 v) {
 void main() {
   place = shape = light = uvec4(0u);
   ivec2 at = ivec2(gl_FragCoord.xy);
-  place.z = floatBitsToUint(-100.0);
+  place.z = floatBitsToUint(-100.0);  // log opacity of an invisible Gaussian
   if (at.y * textureSize(splats, 0).x + at.x >= count) return;
   vec3 mean = read(0, at), p = rotation * (mean - centre);
   if (!(p.z > near)) return;
@@ -88,7 +88,7 @@ const SPLAT_VERTEX = VERSION + `
 uniform usampler2D place, shape, light;
 uniform vec2 size;
 layout(location = 0) in uint index;
-flat out vec4 where;
+flat out vec4 where;  // as in place: x, y, log opacity, log cutoff
 flat out vec3 factor, radiance;
 
 void main() {
@@ -129,13 +129,13 @@ uniform vec2 pictureSize, canvasSize;
 uniform vec3 factors;           // exposure times white balance
 uniform int mode;               // 0 picture, 1 stops, 2 clipping, 3 exposed radiance as it is
 uniform int curve;              // 0 linear, 1 power, 2 sRGB, 3 table
-uniform float gamma, pivot, white;
+uniform float gamma, pivot, white;  // white: factor on the white point of the curve
 uniform vec3 curveWhite;        // exposed radiance that the curve shows as 1
-uniform vec3 tableFirst, tableStep;
+uniform vec3 tableFirst, tableStep;  // natural logarithms
 uniform ivec3 tableRow;
 uniform mat3 vignetting;        // a column of k1, k2, k3 for each channel
-uniform vec3 frame;             // the photograph's pixels for each pixel of the canvas, and its size
-uniform vec2 frameCentre;
+uniform vec3 frame;             // photograph pixels per canvas pixel; the photograph's width and height
+uniform vec2 frameCentre;       // the middle of the canvas in the photograph, pixels
 uniform float split;            // share of the canvas that shows the photograph
 uniform float most;             // largest display value
 uniform vec3 stopColors[12];
@@ -189,7 +189,7 @@ vec3 develop(vec3 exposed) {
 
 void main() {
   vec2 at = gl_FragCoord.xy;
-  if (mode != 3) at.y = canvasSize.y - at.y;
+  if (mode != 3) at.y = canvasSize.y - at.y;  // row 0 of the canvas is at the bottom
   vec2 inPhoto = (at - canvasSize / 2.0) * frame.x + frameCentre;
   vec2 off = inPhoto - frame.yz / 2.0;
   float r2 = min(4.0 * dot(off, off) / dot(frame.yz, frame.yz), 1.0);
@@ -205,7 +205,7 @@ void main() {
     shown = stopColors[int(clamp(floor(stops), -6.0, 5.0)) + 6];
   } else if (mode == 2) {
     vec3 levels = 255.0 * shown;
-    ivec2 pixel = ivec2(at);
+    ivec2 pixel = ivec2(at);  // below, 60000 keeps a difference positive
     bool over = any(greaterThan(levels, vec3(254.5))), under = all(lessThanEqual(levels, vec3(0.5)));
     shown = clamp(shown, 0.0, 1.0);
     if (over && (pixel.x + pixel.y) / 6 % 2 == 0) shown = vec3(1.0, 0.15, 0.15);
