@@ -1,4 +1,4 @@
-"""LPIPS gives the figures of its authors' package, and a damaged package is named."""
+"""LPIPS agrees with its authors' package, and damaged files of weights are named."""
 
 import pickle
 from pathlib import Path
@@ -90,18 +90,18 @@ class Trap:
         return Path.touch, (self.path,)
 
 
-def test_the_package_has_the_arrays_by_their_names(weights, monkeypatch, tmp_path):
+def test_weights_come_from_the_package_and_wrong_names_are_refused(weights, monkeypatch, tmp_path):
     install(monkeypatch, tmp_path, package("alex"))
     a, b, mask = images()
     expected = float(lpips(weights, a, b, mask))
     assert float(lpips(read_lpips_weights("alex"), a, b, mask)) == expected
-    for name, said in (("vgg", "vgg16.ckpt does not hold"), ("weights.npz", "choose alex or vgg")):
-        with pytest.raises(UserError, match=said):
+    for name, words in (("vgg", "vgg16.ckpt does not hold"), ("weights.npz", "choose alex or vgg")):
+        with pytest.raises(UserError, match=words):
             read_lpips_weights(name)
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "words"),
     [
         (lambda trap: None, "not installed"),
         (lambda trap: b"nothing", "does not hold the weights"),
@@ -109,16 +109,16 @@ def test_the_package_has_the_arrays_by_their_names(weights, monkeypatch, tmp_pat
         (lambda trap: pickle.dumps({"AlexNet_0": trap}), "which is not an array"),
     ],
 )
-def test_a_package_that_is_missing_or_damaged(monkeypatch, tmp_path, content, said):
+def test_a_package_that_is_missing_or_damaged(monkeypatch, tmp_path, content, words):
     trap = Trap(tmp_path / "sprung")
     install(monkeypatch, tmp_path, content(trap))
-    with pytest.raises(UserError, match=said) as error:
+    with pytest.raises(UserError, match=words) as error:
         read_lpips_weights("alex")
     assert "p2gs-jax[lpips]" in (error.value.fix or "")
     assert not trap.path.exists()
 
 
-def test_what_cannot_be_judged_is_not_fitted(monkeypatch, tmp_path, refused):
+def test_images_too_small_for_lpips_are_refused_before_a_fit(monkeypatch, tmp_path, refused):
     install(monkeypatch, tmp_path, package("alex"))
     out, scene = tmp_path / "run", make_scene(tmp_path / "scene", size=(40, 30))
     assert "at least 31x31" in refused("fit", scene, "--out", out, "--lpips-weights", "alex")

@@ -30,11 +30,11 @@ def oracle(name: str):
 def test_hard_case(case: HardCase, implementation: str):
     cfg = IMPLEMENTATIONS[implementation]
     if case.name.startswith("10^5") and implementation != "xla, counting":
-        pytest.skip("a minute where kernels are interpreted")
+        pytest.skip("interpreted kernels take a minute")
     g = gap(case, cfg, oracle(case.name))
     assert g.finite, case.expect
     assert g.silent == case.unseen, case.expect
-    # The stop rule may add its own error, and a flipped pair moves gradients by its cutoff.
+    # The stop rule may add its error, and an undecided pair moves gradients by the cutoff.
     stop = cfg.stop_error
     assert g.value <= case.value_tolerance + stop, g
     assert g.relative <= 1e-3, g
@@ -42,7 +42,7 @@ def test_hard_case(case: HardCase, implementation: str):
 
 
 def test_relative_error_over_a_high_dynamic_range():
-    """10^4:1 radiance, bright lights behind nearly opaque dark surfaces: the default stop rule."""
+    """The default stop rule keeps bright lights behind many faint dark Gaussians (10^4:1)."""
     cfg, rng, n = IMPLEMENTATIONS["xla, counting"], np.random.default_rng(0), 400
     depth = np.sort(rng.uniform(2, 8, n))
     # The nearer half is dark, the farther half bright; transmittance falls gradually.

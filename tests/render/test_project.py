@@ -1,4 +1,4 @@
-"""Projection and harmonics against definitions: the oracle of the rasterizer shares them."""
+"""Projection and harmonics against definitions: the rasterizer's oracle shares their code."""
 
 import dataclasses
 
@@ -33,7 +33,7 @@ def by_definition(g, cam, i):
     return np.array([fx * x / z + cx, fy * y / z + cy]), covariance, z
 
 
-def test_splats_are_the_definition():
+def test_splats_follow_the_definition():
     with jax.enable_x64(True):
         g, cam = street(dtype=np.float64)
         viewmat = pose_of(rotation(np.array([1, 0.05, -0.1, 0.2])), (0.3, -0.2, 0.5))

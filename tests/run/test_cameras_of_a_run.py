@@ -64,25 +64,25 @@ def _without_balance(saved):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "words"),
     [
         (lambda saved: saved.update(version=3), "version is 3"),
         (lambda saved: saved.pop("cameras"), "cameras missing"),
         (_without_balance, "lacks the white balance"),
     ],
 )
-def test_a_file_that_does_not_fit_is_refused(camera_run, tmp_path, change, said):
+def test_a_file_that_does_not_fit_is_refused(camera_run, tmp_path, change, words):
     folder = shutil.copytree(camera_run, tmp_path / "run")
     path = folder / "photometry.json"
     saved = json.loads(path.read_text())
     assert read_photometry(path) == saved
     change(saved)
     path.write_text(json.dumps(saved))
-    with pytest.raises(UserError, match=said):
+    with pytest.raises(UserError, match=words):
         load_run(folder)
 
 
-def test_render_shows_them_and_leaves_them_out_where_asked(
+def test_render_has_white_balance_and_vignetting_or_leaves_them_out(
     camera_run, finished_run, tmp_path, succeeded, refused
 ):
     run = load_run(camera_run)
@@ -109,23 +109,23 @@ def test_render_shows_them_and_leaves_them_out_where_asked(
     balance = np.exp(run.white_balance_of(last))
     np.testing.assert_allclose(header["p2gsWhiteBalance"], balance, rtol=1e-5)
     assert (warm / np.maximum(shown, 0.05))[..., 0].mean() > 1.05
-    balance, out = "--white-balance-of", tmp_path / "no"
-    said = refused("render", camera_run, balance, "nobody.png", "--out", out)
-    assert "no view 'nobody.png'" in said
-    said = refused("render", finished_run, balance, first, "--out", out)
-    assert "models no white balance" in said
+    option, out = "--white-balance-of", tmp_path / "no"
+    text = refused("render", camera_run, option, "nobody.png", "--out", out)
+    assert "no view 'nobody.png'" in text
+    text = refused("render", finished_run, option, first, "--out", out)
+    assert "models no white balance" in text
 
 
-def test_exports_carry_them(camera_run, tmp_path, succeeded):
+def test_exports_have_white_balance_and_vignetting(camera_run, tmp_path, succeeded):
     run = load_run(camera_run)
     rows = run.scene.train_indices
     last = run.scene.views[rows[-1]].name
     formats = ("linear-ply", "display-ply", "colmap", "exr")
     argv = ["export", camera_run, "--format", *formats, "--out", tmp_path]
     succeeded(*argv, "--bake-steps", 0, "--white-balance-of", last)
-    said = json.loads((tmp_path / "linear.json").read_text())
-    assert len(said["tone"]["cameras"][0]["vignetting"]) == 3
-    view = said["views"][rows[1]]
+    saved = json.loads((tmp_path / "linear.json").read_text())
+    assert len(saved["tone"]["cameras"][0]["vignetting"]) == 3
+    view = saved["views"][rows[1]]
     factors = np.array(view["white_balance"])
     np.testing.assert_allclose(factors, np.exp(run.own_display(rows[1]).white_balance), rtol=1e-6)
     # The formula of linear.json, followed to the letter, gives the picture.
@@ -133,12 +133,12 @@ def test_exports_carry_them(camera_run, tmp_path, succeeded):
     height, width = linear.shape[:2]
     y, x = np.mgrid[:height, :width] + 0.5
     r2 = ((x - width / 2) ** 2 + (y - height / 2) ** 2) / ((width**2 + height**2) / 4)
-    k = np.array(said["tone"]["cameras"][0]["vignetting"])
+    k = np.array(saved["tone"]["cameras"][0]["vignetting"])
     vignetting = np.exp(sum(k[:, n] * r2[..., None] ** (n + 1) for n in range(3)))
-    pivot = said["tone"]["pivot"]
+    pivot = saved["tone"]["pivot"]
     light = view["exposure"] * factors * vignetting * linear
     bent = pivot * (np.maximum(light, 1e-6) / pivot) ** (2.2 / view["gamma"])
-    base = said["tone"]["base"]
+    base = saved["tone"]["base"]
     by_hand = np.interp(bent, base["linear"], base["display"])
     own = run.own_display(rows[1])
     np.testing.assert_allclose(by_hand.clip(0, 1), develop(linear, own), atol=2e-3)
@@ -152,7 +152,7 @@ def test_exports_carry_them(camera_run, tmp_path, succeeded):
     assert table[held_out]["red"] == ""
 
 
-def test_the_viewer_s_settings_hold_them(camera_run):
+def test_the_viewer_has_white_balance_and_vignetting(camera_run):
     run = load_run(camera_run)
     index = run.scene.train_indices[2]
     plain = common_settings(run)
@@ -167,18 +167,18 @@ def test_the_viewer_s_settings_hold_them(camera_run):
     np.testing.assert_allclose(bluer.white_balance_ev, (0.0, 1.0), atol=1e-6)
 
 
-def test_the_report_shows_them_and_nothing_of_the_kind_elsewhere(
+def test_the_report_has_white_balance_and_vignetting_only_if_modelled(
     camera_run, finished_run, tmp_path, succeeded
 ):
-    def headings(folder, name):
+    def report(folder, name):
         out = tmp_path / name
         succeeded("report", folder, "--no-render", "--out", out)
         return out.read_text()
 
-    page = headings(camera_run, "a.html")
+    page = report(camera_run, "a.html")
     assert "<h2>White balance" in page
     assert "<h2>Vignetting" in page
     assert "33 %" in page, "of red, in the corners: 1 - exp(-0.4)"
-    other = headings(finished_run, "b.html")
+    other = report(finished_run, "b.html")
     assert "<h2>White balance" not in other
     assert "<h2>Vignetting" not in other

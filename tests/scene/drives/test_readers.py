@@ -1,4 +1,4 @@
-"""What every reader promises (`scene/drives/recording.py`), asked of made drives of all formats."""
+"""Promises of every reader (`scene/drives/recording.py`), tested on made drives of all formats."""
 
 import json
 import re
@@ -104,7 +104,7 @@ def test_a_table_that_is_cut_off_or_gone_is_named(copied, read, name):
     for table in made.tables + made.optional:
         whole = (made.root / table).read_bytes()
         cut(made.root / table)
-        # A text that is cut may still be a table, of fewer frames.
+        # A text file that is cut may still be a valid table of fewer frames.
         if table.suffix != ".txt":
             with refused(re.escape(table.name)):
                 read(made.root)
@@ -123,7 +123,7 @@ def test_reading_decodes_nothing_and_a_broken_sweep_is_named_when_it_is_read(cop
     for scan in made.scans:
         held = (made.root / scan).read_bytes()
         (made.root / scan).write_bytes(held[: len(held) // 2 + 1])
-    # The size of one photograph a camera is looked at, in sets that do not tell it.
+    # Readers open one photograph per camera if the tables of a set lack its size.
     for path in made.root.rglob("*.jpg"):
         if path != min(path.parent.iterdir()) and path.name != "000_1.jpg":
             path.write_bytes(b"never read")
@@ -148,13 +148,12 @@ def given(content):
     return lambda held: content
 
 
-LENS, SEGMENT = waymo.LENS, waymo.file
-MOUNT, FOCAL = f"{LENS}extrinsic.transform", f"{LENS}intrinsic.f_u"
-LENSES, BOXES = SEGMENT("camera_calibration"), SEGMENT("lidar_box")
+MOUNT, FOCAL = f"{waymo.LENS}extrinsic.transform", f"{waymo.LENS}intrinsic.f_u"
+LENSES, BOXES = waymo.file("camera_calibration"), waymo.file("lidar_box")
 SIDE, TURN = (f"{waymo.BOX}box.{name}" for name in ("size.x", "heading"))
 FRONT, CUBOIDS = pandaset.FRONT, pandaset.CUBOIDS / "01.pkl.gz"
-HALF = {"position": dict.fromkeys("xyz", 0)}
-BENT = {**HALF, "heading": dict.fromkeys("wxyz", 1)}
+NO_HEADING = {"position": dict.fromkeys("xyz", 0)}
+BENT = {**NO_HEADING, "heading": dict.fromkeys("wxyz", 1)}
 OXTS, SHOTS = (f"{kitti.DRIVE}/{part}" for part in ("oxts/data/0000000000.txt", "image_03"))
 TRACKLETS = kitti.BOXES
 
@@ -200,11 +199,11 @@ REFUSED = {
         (LENSES, every(**{"key.camera_name": 8}), "has no camera SIDE_RIGHT"),
         (BOXES, first(**{SIDE: 0.0}), "positive sizes"),
         (BOXES, first(**{TURN: float("nan")}), "finite positions"),
-        (SEGMENT("lidar_pose"), lambda rows: [{"other": 1}], "has no column"),
+        (waymo.file("lidar_pose"), lambda rows: [{"other": 1}], "has no column"),
     ],
     "pandaset": [
         (FRONT / "poses.json", lambda held: {}, "is not a list"),
-        (FRONT / "poses.json", lambda held: [HALF], "the pose of frame 0 lacks"),
+        (FRONT / "poses.json", lambda held: [NO_HEADING], "the pose of frame 0 lacks"),
         (FRONT / "poses.json", lambda held: [BENT], "the rotation of frame 0 is not a unit"),
         (FRONT / "intrinsics.json", lambda held: {"fx": 60}, "lacks"),
         (FRONT / "timestamps.json", lambda held: ["now", "a", "b"], "entry 0 should be finite"),

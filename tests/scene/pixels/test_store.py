@@ -1,4 +1,4 @@
-"""What a store gives of photographs, and how those that memory does not hold are kept."""
+"""Photographs from a store, and the files of those that memory does not hold."""
 
 import contextlib
 import dataclasses
@@ -99,7 +99,7 @@ def test_undistortion_puts_pixels_where_the_pinhole_expects_them(tmp_path, lens)
     truth = _pattern(centres[..., 0], centres[..., 1])
     inside = mask > 0
     assert inside.mean() > 0.5
-    assert np.abs(ldr[..., 0] - truth)[inside].max() < 3e-3  # half a pixel would be 3e-2
+    assert np.abs(ldr[..., 0] - truth)[inside].max() < 3e-3  # an error of half a pixel gives 3e-2
 
 
 def test_cache_is_bounded_and_reused(tmp_path):
@@ -207,7 +207,7 @@ def stored(store, count, shrink):
 
 
 def same(store, views, shrinks=SHRINKS):
-    """Assert that a store holds what another decodes."""
+    """Assert that a store holds the same pixels as one that decodes them."""
     plain = ImageStore(views, DataConfig())
     for shrink in shrinks:
         expected, found = (stored(s, len(views), shrink) for s in (plain, store))
@@ -224,7 +224,7 @@ def test_every_kind_comes_back_bit_for_bit(tmp_path, kinds, shrink):
     for _ in range(2):
         same(store, kinds, [shrink])
     assert store._photographs.decodings == len(kinds)
-    # Another start decodes nothing; one with more memory clears what was written.
+    # A second store decodes nothing; a store with enough memory removes the files.
     again = in_files(tmp_path, kinds)
     stored(again, len(kinds), shrink)
     assert again._photographs.decodings == 0
@@ -234,7 +234,7 @@ def test_every_kind_comes_back_bit_for_bit(tmp_path, kinds, shrink):
 
 
 @pytest.mark.parametrize("what", ["image_path", "mask_path", "distortion", "ego_mask", "K"])
-def test_what_pixels_depend_on_makes_them_anew(tmp_path, what):
+def test_pixels_are_decoded_anew_if_their_view_changes(tmp_path, what):
     view = noisy_view(tmp_path, "a.png", distortion=Distortion((0.1, 0, 0, 0)))
     in_files(tmp_path, [view]).stored(0)
     (first,) = (tmp_path / "pixels").rglob("*.px")
@@ -279,7 +279,7 @@ def test_threads_decode_all_sizes_and_the_caller_none(tmp_path, views):
     store.expect(SHRINKS)
     for thread in store._photographs._ahead._threads:
         thread.join()
-    # What a thread cannot decode is reported to the caller that asks.
+    # An error of a thread is reported to the caller that asks for the photograph.
     with refused(r"5\.png"):
         store.stored(5)
     for row in {*range(12)} - {5}:
@@ -308,7 +308,7 @@ def test_threads_end_with_the_store(tmp_path, views, monkeypatch, end):
         store.close()
     del store
     assert not thread.is_alive()
-    assert len(list((tmp_path / "pixels").rglob("*.px"))) == 2
+    assert len(list((tmp_path / "pixels").rglob("*.px"))) == 2  # sizes of one photograph
 
 
 @pytest.mark.parametrize("ended", [False, True])
