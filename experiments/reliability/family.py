@@ -13,7 +13,7 @@ COMMAND = "python experiments/reliability/run.py --only"
 
 
 class Failure(NamedTuple):
-    """A trial that was not survived."""
+    """A trial that did not end as it should."""
 
     name: str  # of the trial
     reason: str  # what happened instead
@@ -21,13 +21,13 @@ class Failure(NamedTuple):
 
 @dataclass(frozen=True)
 class Family:
-    """What trials of one kind found."""
+    """The results of trials of one kind."""
 
     name: str  # of the module
     tried: int  # how many trials
     survived: int  # how many ended as they should
     failures: tuple[Failure, ...] = ()  # the others
-    command: str = ""  # that repeats it
-    seconds: float = 0.0  # that it took
+    command: str = ""  # repeats the family
+    seconds: float = 0.0  # of the whole family
     # further numbers, rows of one table; all have the same keys
     figures: tuple[Mapping[str, str | int | float], ...] = ()
