@@ -35,7 +35,7 @@ class DriveFormat(NamedTuple):
 
 
 def _in_folders(marker: str) -> tuple[str, ...]:
-    """Return the markers of a format whose drives may lie in subfolders."""
+    """Return the markers of a format: a drive lies in the folder, or in a subfolder."""
     return marker, f"*/{marker}"
 
 
@@ -57,7 +57,7 @@ def read_drive(root: Path, cfg: DataConfig, report: Report) -> Recording | None:
     """Return the recording in a folder, or None if it holds no drive of a known format.
 
     `cfg.format` may name the reader, `cfg.drive` one of several drives in the folder. UserError:
-    there are several drives, or a file is missing or broken; the message names it.
+    no drive or several fit `cfg.drive`, or a file is missing or broken; the message names it.
     """
     for name, reader in FORMATS.items():
         if cfg.format in (None, name) and reader.recognise(root):

@@ -1,9 +1,9 @@
 """Argoverse 2, the sensor data set: seven ring cameras, LiDAR sweeps and boxes at 10 Hz.
 
     city_SE3_egovehicle.feather                poses of the car
-    calibration/intrinsics.feather             fx fy cx cy, sizes
+    calibration/intrinsics.feather             fx fy cx cy and sizes, pixels
     calibration/egovehicle_SE3_sensor.feather  poses of the sensors on the car
-    sensors/cameras/NAME/TIME.jpg              photographs, nanoseconds
+    sensors/cameras/NAME/TIME.jpg              photographs; TIME in nanoseconds
     sensors/lidar/TIME.feather                 x y z of both scanners in the car's axes
     annotations.feather                        boxes in the car's axes
 
@@ -11,8 +11,8 @@ Schema: https://github.com/argoverse/av2-api/blob/main/src/av2/datasets/sensor/R
 src/av2/structures/{sweep,cuboid}.py there.
 
 Photographs are undistorted already: k1, k2, k3 in intrinsics.feather describe the original lens
-(https://github.com/argoverse/av2-api/issues/219 and 226; the API projects with K alone). The time
-of a sweep is that of its first point; all its points, and the boxes, are in the car's axes then.
+(https://github.com/argoverse/av2-api/issues/219 and 226; the API projects with K alone). A
+sweep has the time of its first point; its points and boxes are in the car's axes at this time.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ GREY = "stereo"
 
 
 def read_argoverse(root: Path, cfg: DataConfig) -> recording.Recording:
-    """Read a log; `cfg.cameras` may name the stereo pair; UserError: a table is broken."""
+    """Read a log, the stereo pair only if `cfg.cameras` names it; UserError: a table is broken."""
     log = drive_folder(root, cfg.drive, MARKER)
     cameras, files, notes = _cameras(log, cfg)
-    # The camera with most photographs defines the frames: cameras trigger twice in a turn of the
-    # scanners, so that a sweep's number would stand for two photographs.
+    # The camera with most photographs defines the frames. Sweeps cannot: cameras trigger twice in a
+    # turn of the scanners.
     most = max((files[camera.name] for camera in cameras), key=len, default={})
     car = _Car(log, np.array(sorted(most), np.int64))
     photographs, photograph_notes = _photographs(car, cameras, files)
@@ -70,14 +70,14 @@ class _Car:
             raise broken(path, "holds no pose")
         stamps, rows = np.unique(stamps, return_index=True)
         self.log, self.moments, self.start = log, moments, stamps[0]
-        self.way = recording.Trajectory(self.seconds(stamps), _poses(table, "pose")[rows])
+        self.trajectory = recording.Trajectory(self.seconds(stamps), _poses(table, "pose")[rows])
 
     def seconds(self, stamps: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
         """Return time stamps in seconds since the first pose."""
         return (stamps - self.start) * 1e-9
 
     def frames(self, stamps: Int64[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-        """Return the nearest frames."""
+        """Return the frames that are nearest to time stamps."""
         if not len(self.moments):
             return np.zeros(len(stamps), int)
         return np.abs(stamps[:, None] - self.moments).argmin(1)
@@ -103,7 +103,7 @@ def _cameras(
         found = {name: files for name, files in found.items() if name not in grey}
     unknown = [name for name in found if name not in lenses]
     if unknown:
-        notes.append(f"{INTRINSICS} has no row for {', '.join(unknown)}: left out.")
+        notes.append(f"{INTRINSICS} has no row for {', '.join(unknown)}: they are left out.")
     absent = [n for n in lenses if n not in found and not n.startswith(GREY)]
     if absent:
         notes.append(f"There are no photographs of {', '.join(absent)}.")
@@ -134,7 +134,7 @@ def _photographs(
             raise broken(path, f"has no pose of {name}")
         stamps = np.array(list(files[name]), np.int64)
         times, frames = car.seconds(stamps), car.frames(stamps)
-        poses, covered = car.way.at(times)
+        poses, covered = car.trajectory.at(times)
         unplaced += int((~covered).sum())
         for k in np.flatnonzero(covered):
             pose, file = poses[k] @ mounts[name], files[name][int(stamps[k])]
@@ -148,7 +148,7 @@ def _sweeps(car: _Car) -> tuple[list[recording.Sweep], list[str]]:
     files = numbered(car.log / "sensors" / "lidar", (".feather",))
     stamps = np.array(list(files), np.int64)
     times, frames = car.seconds(stamps), car.frames(stamps)
-    poses, known = car.way.at(times)
+    poses, known = car.trajectory.at(times)
     sweeps = [
         recording.Sweep(
             int(frames[k]), float(times[k]), partial(_read_sweep, path, poses[k], times[k])
@@ -174,7 +174,7 @@ def _objects(car: _Car) -> tuple[tuple[TrackedObject, ...], list[str]]:
     times, size = car.seconds(table.whole(STAMP)), table.stacked(SIZE)
     if not (size > 0).all():
         raise broken(f"{path}:", "a box has no size")
-    cars, known = car.way.at(times)
+    cars, known = car.trajectory.at(times)
     poses = cars @ _poses(table, "box")
     names, labels = table["track_uuid"], table["category"]
     named = np.array([bool(name) for name in names], bool)

@@ -22,7 +22,7 @@ from p2gs_jax.scene.drives.tables import counted
 from p2gs_jax.scene.rigid import inverse
 from p2gs_jax.types import Lidar, Scene, TrackedObject, View
 
-# Farther scenes are moved to the origin, metres: float32 has 7 digits.
+# Scenes farther from the origin than this, metres, are moved to it: float32 has 7 digits.
 FARTHEST_ORIGIN = 1000.0
 # LiDAR sweeps within this time of the chosen frames are used, seconds.
 SWEEP_SLACK_S = 0.1
@@ -41,9 +41,9 @@ def assemble(
     Seed points have no colours yet; there are no feature tracks.
 
     Args:
-        cfg: cameras and frames, and whether photographs may be missing.
+        cfg: chosen cameras and frames; whether photographs may be missing; use of LiDAR.
         work_dir: embedded photographs are written below it; None: below the user's cache folder.
-        write_embedded: False: embedded photographs get file names, but are not written.
+        write_embedded: if False, embedded photographs get file names but are not written.
 
     Raises:
         UserError: a camera, frame or photograph is missing, or a camera name or sweep is invalid.
@@ -56,8 +56,8 @@ def assemble(
     cameras = {c.name: _at_size(c, photographs, recording.root) for c in recording.cameras}
     resized = {c.name for c in recording.cameras if cameras[c.name] is not c}
     notes += files.rescaled(sum(p.camera in resized for p in photographs), "the calibration")
-    given = (recording, names, work_dir, report)
-    masks, mask_notes = find_ego_masks(*given) if cfg.ego_mask else ({}, [])
+    inputs = (recording, names, work_dir, report)
+    masks, mask_notes = find_ego_masks(*inputs) if cfg.ego_mask else ({}, [])
     centres = np.stack([p.pose[:3, 3] for p in photographs])
     middle = centres.mean(0)
     origin = np.rint(middle) if np.abs(middle).max() > FARTHEST_ORIGIN else np.zeros(3)
@@ -193,7 +193,7 @@ def _read_sweeps(
     origin: Float[np.ndarray, " 3"],
     report: files.Report,
 ) -> tuple[Lidar | None, list[str]]:
-    """Return the measurements between the first photograph and the last, and notes."""
+    """Return the LiDAR points between the first photograph and the last, and notes."""
     times = [p.time for p in photographs]
     first, last = min(times) - SWEEP_SLACK_S, max(times) + SWEEP_SLACK_S
     sweeps = [s for s in recording.sweeps if first <= s.time <= last]
@@ -202,53 +202,54 @@ def _read_sweeps(
     report(f"Reading {len(sweeps)} LiDAR sweeps")
     most_each = max(1, MOST_MEASURED // len(sweeps))
     rng = generator(0, Stream.LIDAR)
-    parts, broken = [], 0
+    parts, invalid = [], 0
     for sweep in sweeps:
         points, at = sweep.read()
         with np.errstate(over="ignore", invalid="ignore"):
             local = (points - origin).astype(np.float32)
         finite = np.isfinite(local).all(1)
-        broken += int((~finite).sum())
+        invalid += int((~finite).sum())
         local, at = local[finite], np.asarray(at, np.float64)[finite]
         part = thinned(Lidar(local, at, np.full(len(local), -1, np.int32)), most_each, rng)
         parts.append((part.points, part.times, owners(part.points, part.times, objects)))
-    notes = counted(broken, "LiDAR points are not finite numbers and are left out.")
+    notes = counted(invalid, "LiDAR points are not finite numbers and are left out.")
     return Lidar(*map(np.concatenate, zip(*parts, strict=True))), notes
 
 
-def chosen_cameras(asked: Sequence[str], there: Sequence[str]) -> list[str]:
-    """Return cameras by their (short) names, all if none is asked; UserError: one is unknown."""
-    if not asked:
-        return list(there)
+def chosen_cameras(names: Sequence[str], existing: Sequence[str]) -> list[str]:
+    """Return the cameras with these (short) names; no names: all; UserError: one is unknown."""
+    if not names:
+        return list(existing)
     found = []
-    for name in asked:
+    for name in names:
         short = short_name(name)
-        fits = [c for c in there if c == name] or [c for c in there if short_name(c) == short]
+        fits = [c for c in existing if c == name]
+        fits = fits or [c for c in existing if short_name(c) == short]
         if not fits:
-            listed = ", ".join(map(short_name, there))
+            listed = ", ".join(map(short_name, existing))
             raise UserError(f"there is no camera {name!r}", fix=f"choose one of {listed}")
         found += [c for c in fits if c not in found]
     return found
 
 
-def chosen_frames(asked: str | None, there: Sequence[int]) -> list[int]:
+def chosen_frames(text: str | None, existing: Sequence[int]) -> list[int]:
     """Return the frames in a slice FIRST:END[:STEP] of the existing frames, or all for None.
 
-    As in Python a part may be empty, and negative numbers count from the end. UserError: the text
+    As in Python, parts may be empty, and negative numbers count from the end. UserError: the text
     is not a slice, or the slice holds no frame.
     """
-    if asked is None:
-        return list(there)
-    parts = asked.split(":")
+    if text is None:
+        return list(existing)
+    parts = text.split(":")
     try:
         numbers = [int(part) if part.strip() else None for part in parts]
         if len(numbers) not in (2, 3):
-            raise ValueError(asked)
-        found = list(there)[slice(*numbers)]
+            raise ValueError(text)
+        found = list(existing)[slice(*numbers)]
     except ValueError:
         fix = "write FIRST:END or FIRST:END:STEP, as 0:30:2"
-        raise UserError(f"--frames {asked!r} is not a valid slice", fix=fix) from None
+        raise UserError(f"--frames {text!r} is not a valid slice", fix=fix) from None
     if not found:
-        fix = f"the drive has {len(there)} frames, from 0 on"
-        raise UserError(f"--frames {asked} holds no frame of this drive", fix=fix)
+        fix = f"the drive has {len(existing)} frames, from 0 on"
+        raise UserError(f"--frames {text} holds no frame of this drive", fix=fix)
     return found

@@ -1,6 +1,6 @@
 """Waymo's recordings as drivestudio and EmerNeRF process them: photographs, text files and scans.
 
-    images/TTT_C.jpg               photographs; T is the frame (10 Hz), C the camera
+    images/TTT_C.jpg               photographs; T is the frame (10 Hz), C the camera's number
     intrinsics/C.txt               fx fy cx cy k1 k2 p1 p2 k3
     extrinsics/C.txt               camera to car; x forward, y left, z up, for both
     ego_pose/TTT.txt               car to world
@@ -11,8 +11,8 @@ Layout: github.com/ziyc/drivestudio, docs/Waymo.md and datasets/waymo/waymo_prep
 github.com/NVlabs/EmerNeRF, datasets/waymo_preprocess.py. The files of Street Gaussians have the
 same names but other axes (script/waymo/waymo_converter.py), and this reader rejects them.
 
-There are no time stamps: frame T is at 0.1 T seconds. The car's pose is that in the middle of the
-upper scanner's turn (`waymo`), and all photographs of the frame get it, although they were taken up
+There are no time stamps: frame T is at 0.1 T seconds. The pose of a frame holds for the middle of
+the upper scanner's turn (`waymo`). All its photographs get this pose, although they were exposed up
 to 0.05 s earlier or later. Points and boxes get the time at which the upper scanner passed.
 """
 
@@ -43,7 +43,7 @@ _PHOTOGRAPH = re.compile(r"(\d+)_(\d)\.(?:jpg|png)")
 
 
 def read_drivestudio(root: Path, cfg: DataConfig) -> Recording:
-    """Read a processed segment from its folder or that of all segments; UserError: it is broken."""
+    """Read a processed segment; `root` may hold several segments; UserError: a file is broken."""
     root = tables.drive_folder(root, cfg.drive, MARKER)
     poses = tables.numbered(root / "ego_pose", (".txt",))
     cars = {frame: _pose(path) for frame, path in poses.items()}
@@ -88,9 +88,9 @@ def _pose(path: Path) -> Pose:
 
 
 def _mount(path: Path) -> Pose:
-    """Return camera to car with OpenCV's axes in the camera; UserError: the file has other axes."""
+    """Return the pose camera-to-car, with OpenCV's axes; UserError: the file has other axes."""
     mount = _pose(path)
-    # Other data sets and programs have OpenCV's axes: their z is not up.
+    # Other data sets and programs write cameras with OpenCV's axes, whose z is not up.
     if mount[2, 2] < 0.5:
         fix = "process the recording with drivestudio, or name the original data set"
         raise broken(path, "is not the pose of an upright camera of Waymo", fix)

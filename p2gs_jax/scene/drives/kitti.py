@@ -44,7 +44,7 @@ EARTH_RADIUS_M = 6378137.0
 CALIBRATION = "calib_cam_to_cam.txt"
 GREY = ("image_00", "image_01")
 PHOTOGRAPHS = (".png", ".jpg", ".jpeg")
-# The time of a turn of the scanner, seconds, if no file states its begin and end.
+# The time of a turn of the scanner, seconds, if no file states its start and end.
 TURN_S = 0.1
 # The scanner turns clockwise from its back (x forward, y left), and triggers the cameras when it
 # looks forward. KITTI's readme states counterclockwise, but the authors' code for moving scans
@@ -99,19 +99,19 @@ def read_kitti_raw(root: Path, cfg: DataConfig) -> Recording:
 
 
 class Calibration:
-    """The matrices in lines `NAME: numbers` of a file, or `NAME numbers`; UserError: no file."""
+    """The matrices in lines `NAME: numbers` of a file, or `NAME numbers`."""
 
     def __init__(self, path: Path):
-        """Read them."""
+        """Read the matrices; UserError: the file is missing."""
         lines = (line.replace(":", " ").split() for line in tables.read_lines(path))
-        self.path, self._held = path, {words[0]: words[1:] for words in lines if words}
+        self.path, self._words = path, {words[0]: words[1:] for words in lines if words}
 
     def __contains__(self, name: str) -> bool:
-        return name in self._held
+        return name in self._words
 
     def matrix(self, name: str, *shape: int) -> Float64[np.ndarray, "..."]:
         """Return a matrix; UserError: it is missing, or has another number of finite numbers."""
-        words = self._held.get(name, ())
+        words = self._words.get(name, ())
         return tables.finite_numbers(words, self.path, name, int(np.prod(shape))).reshape(shape)
 
 
@@ -123,9 +123,7 @@ def _rigid_file(path: Path) -> Pose:
 def rectified_camera(calib: Calibration, key: str) -> tuple[Float64[np.ndarray, "3 3"], Pose]:
     """Return K (pixel centres at +0.5), and the pose from this camera to the reference camera.
 
-    `key` names the camera's projection.
-
-    UserError: the projection of the camera is missing or has no focal lengths.
+    `key` names the camera's projection. UserError: it is missing or has no focal lengths.
     """
     # P projects from the rectified reference camera, with pixel centres at integers.
     P = calib.matrix(key, 3, 4)
@@ -138,9 +136,9 @@ def rectified_camera(calib: Calibration, key: str) -> tuple[Float64[np.ndarray, 
 
 
 def _rectified_size(calib: Calibration, photograph: Path, name: str) -> tuple[int, int]:
-    """Return the calibrated size of rectified photographs, or the photograph's if none is stated.
+    """Return the calibrated size of rectified photographs, or the photograph's size without one.
 
-    UserError: the photograph has the size of photographs that are not rectified.
+    UserError: the photograph has the calibrated size before rectification.
     """
     size, number = image_size(photograph), name[-2:]
     if f"S_rect_{number}" not in calib:
@@ -193,7 +191,7 @@ def trajectory(times: Float64[np.ndarray, " t"], rows: Float64[np.ndarray, "t 6"
     """Return the trajectory of the GPS unit (x forward, y left, z up) from rows of `oxts_row`.
 
     The world is metric at the first latitude (Mercator): x east, y north, z up. Its origin is the
-    begin of the drive.
+    start of the drive.
     """
     latitude, longitude, altitude, roll, pitch, yaw = rows.T
     scale = np.cos(np.radians(latitude[0]))
@@ -227,7 +225,7 @@ def _photographs(
 
 
 def _turns(root: Path) -> tuple[Float64[np.ndarray, " f"], Float64[np.ndarray, " f"]]:
-    """Return when the scanner looked forward, and the time of a turn, by frame, seconds."""
+    """Return, by frame, when the scanner looked forward and how long its turn was, seconds."""
     folder = root / "velodyne_points"
     if not (folder / "timestamps.txt").is_file() and not (folder / "data").is_dir():
         return np.zeros(0), np.zeros(0)
@@ -235,9 +233,9 @@ def _turns(root: Path) -> tuple[Float64[np.ndarray, " f"], Float64[np.ndarray, "
     start, end = folder / "timestamps_start.txt", folder / "timestamps_end.txt"
     lengths = np.full(len(forward), TURN_S)
     if start.is_file() and end.is_file():
-        begun, ended = _read_stamps(start), _read_stamps(end)
-        known = min(len(forward), len(begun), len(ended))
-        lengths[:known] = ended[:known] - begun[:known]
+        starts, ends = _read_stamps(start), _read_stamps(end)
+        known = min(len(forward), len(starts), len(ends))
+        lengths[:known] = ends[:known] - starts[:known]
     plausible = (lengths > TURN_S / 2) & (lengths < TURN_S * 2)
     return forward, np.where(plausible, lengths, TURN_S)
 
@@ -274,9 +272,9 @@ def in_world(
     lengths: Float64[np.ndarray, " f"],
     scanner: Trajectory,
 ) -> tuple[tuple[TrackedObject, ...], list[str]]:
-    """Return objects in the world, and notes; times of boxes are frames, poses are to the scanner.
+    """Return objects in the world, each box at the time when the scanner passed it, and notes.
 
-    A box gets the time at which the scanner passed it.
+    `boxes` have frame numbers as times and box-to-scanner poses; `forward`, `lengths`: `_turns`.
     """
     timed = [b for b in boxes if 0 <= b.time < len(forward) and np.isfinite(forward[int(b.time)])]
     lost = len(boxes) - len(timed)
@@ -292,7 +290,7 @@ def in_world(
 
 
 def _tracklets(path: Path) -> tuple[list[Box], int]:
-    """Return boxes (times are frames, poses lead to the scanner), and the count of empty tracklets.
+    """Return boxes (as in `in_world`), and the number of tracklets without boxes.
 
     UserError: the file is broken.
     """

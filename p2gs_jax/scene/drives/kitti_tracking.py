@@ -1,4 +1,4 @@
-"""KITTI's tracking benchmark: sequences of its raw recordings, in other files (`kitti`).
+"""KITTI's tracking benchmark: sequences of its raw recordings (`kitti`), in another layout.
 
     training/image_0[23]/NNNN/TTTTTT.png    rectified photographs of sequence NNNN, frame T
     training/velodyne/NNNN/TTTTTT.bin       scans
@@ -7,7 +7,7 @@
     training/label_02/NNNN.txt              a line for each box in each frame
 
 Schema: https://www.cvlibs.net/datasets/kitti/eval_tracking.php (readme.txt of its devkit). There
-are no time stamps: frames follow each other after 0.1 s, and the scanner's turn is centred on each.
+are no time stamps: frames are 0.1 s apart, and each is the middle of a turn of the scanner.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from p2gs_jax.scene.rigid import inverse, pose_of, rigid
 
 MARKER = "oxts/[0-9]*.txt"
 SET = "training"
-# Axes of a box (x forward, y left, z up) in camera axes, if its forward is the camera's x.
+# The axes of a box (x forward, y left, z up) in camera axes, if it looks along the camera's x.
 UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 

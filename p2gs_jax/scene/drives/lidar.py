@@ -13,16 +13,15 @@ from p2gs_jax.types import Lidar, TrackedObject
 
 # Boxes are tight and measurements are noisy: points within this distance count as inside, metres.
 BOX_MARGIN = 0.15
-# The largest number of points from all sweeps; every sweep gives at most an equal share.
+# The largest number of points of all sweeps together; each gives at most an equal share.
 MOST_MEASURED = 2_000_000
-# Seeds, one per voxel: their number, the least side (metres), side / camera distance, its growth.
+# Seeds, one per voxel: their largest number; the least side of a voxel, metres; the side divided by
+# the distance from the cameras at first, and its growth until the number is small enough.
 MOST_SEEDS, FINEST_VOXEL, VOXEL_ANGLE, VOXEL_GROWTH = 200_000, 0.05, 0.01, 1.3
 
 
 def turned(azimuth: Float[np.ndarray, "*n"] | float, start: float) -> Float[np.ndarray, "*n"]:
     """Return the share of a turn, in [0, 1), after which a spinning scanner looks in a direction.
-
-    Points and boxes of moving objects lie where the object was at that time.
 
     Args:
         azimuth: directions, radians counterclockwise as seen from above; scanners on cars turn
@@ -35,9 +34,10 @@ def turned(azimuth: Float[np.ndarray, "*n"] | float, start: float) -> Float[np.n
 def passed(
     points: Float[np.ndarray, "n 3"], middle_s: float, turn_s: float, start: float
 ) -> Float[np.ndarray, " n"]:
-    """Return the times at which a scanner passed points in its axes, seconds; NaN has angle 0.
+    """Return the times at which a scanner passed points, seconds.
 
-    `middle_s` is the middle of its turn of `turn_s` seconds, and `start` is as in `turned`.
+    Points are in its axes (NaN counts as azimuth 0). `middle_s` is the middle of its turn, which
+    lasts `turn_s`; `start` is as in `turned`.
     """
     azimuth = np.nan_to_num(np.arctan2(points[:, 1], points[:, 0]))
     return middle_s + turn_s * (turned(azimuth, start) - 0.5)
@@ -50,7 +50,7 @@ def owners(
 ) -> Int[np.ndarray, " n"]:
     """Return the row of the moving object whose box holds each point, -1 for none.
 
-    `times` are the measurement times of the points in seconds, and points are in world coordinates.
+    Points are in world coordinates and have measurement times, seconds.
     """
     found = np.full(len(points), -1, np.int32)
     if not len(points):
@@ -89,8 +89,8 @@ def seeds(
 ) -> tuple[Float32[np.ndarray, "s 3"], float]:
     """Return static points, one for each voxel; voxels are smaller near the cameras.
 
-    Voxels grow until at most `most` points are left. The second result is the side of a voxel
-    divided by its distance from the nearest camera, before limits and rounding.
+    Voxels grow until at most `most` points are left. The second result is a voxel's side divided by
+    its distance from the nearest of the `cameras` (positions), before limits and rounding.
     """
     points = lidar.points[lidar.objects < 0]
     angle = VOXEL_ANGLE

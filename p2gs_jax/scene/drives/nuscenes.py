@@ -2,7 +2,7 @@
 
     v1.0-VERSION/*.json      tables of all drives, linked by tokens
     samples/CHANNEL/*        photographs and sweeps of the annotated moments ("keyframes")
-    sweeps/CHANNEL/*         recordings between keyframes, of which LiDAR sweeps are used
+    sweeps/CHANNEL/*         recordings between keyframes; only LiDAR sweeps are used
 
 Schema: https://github.com/nutonomy/nuscenes-devkit/blob/master/docs/schema_nuscenes.md
 
@@ -43,7 +43,7 @@ MARKER = "v1.0-*/sample_data.json"
 NUMBER = (int, float)
 # The scanner: time of a turn, seconds (20 Hz), and the azimuth where a turn begins.
 TURN_S, TURN_START = 0.05, np.pi
-# The numbers of a LiDAR point: x y z intensity ring.
+# Numbers of a LiDAR point (x y z intensity ring); columns of poses and of sample_data.
 POINT = 5
 PLACED: Kinds = {"translation": list, "rotation": list}
 RECORDED: Kinds = {
@@ -58,7 +58,7 @@ _FIX = "get the tables again, all of one version"
 def read_nuscenes(root: Path, cfg: DataConfig) -> Recording:
     """Read one drive ("scene") of a folder with `v1.0-...` and `samples`.
 
-    `cfg.drive` must name the drive if there are photographs of several. UserError: a table is
+    `cfg.drive` must name the drive if the tables have several. UserError: a table is
     missing, or a table or a pose is broken.
     """
     tables, scene = _chosen_scene(root, cfg.drive)
@@ -74,14 +74,14 @@ def read_nuscenes(root: Path, cfg: DataConfig) -> Recording:
     return Recording(root, "nuscenes", cameras, photographs, sweeps, objects, notes)
 
 
-def _chosen_scene(root: Path, asked: str | None) -> tuple[Path, Row]:
-    """Return the folder of tables and the drive's row, from the first version that has it."""
+def _chosen_scene(root: Path, name: str | None) -> tuple[Path, Row]:
+    """Return the folder of tables and the row of the drive, of its first version by name."""
     versions = sorted(path.parent for path in root.glob(MARKER))
     there: dict[str, tuple[Path, Row]] = {}
     for tables in reversed(versions):
         rows = read_rows(tables / "scene.json", {"name": str, "token": str})
         there |= {row["name"]: (tables, row) for row in rows}
-    return there[chosen_drive(asked, list(there), root)]
+    return there[chosen_drive(name, list(there), root)]
 
 
 class _Sensor(NamedTuple):
@@ -92,7 +92,7 @@ class _Sensor(NamedTuple):
 
 
 class _Drive:
-    """Rows of one drive, linked."""
+    """The rows of one drive, linked by tokens; keyframes (`moments`) are numbered by time."""
 
     def __init__(self, root: Path, tables: Path, scene: Row):
         self.root, self.tables = root, tables
@@ -147,7 +147,7 @@ class _Drive:
         return self.root / name
 
     def of(self, modality: str) -> list[Row]:
-        """Return the rows of all sensors of a modality, in the order of time."""
+        """Return the rows of sample_data of all sensors of a modality, in the order of time."""
         return [row for row in self.data if self.sensor(row).modality == modality]
 
     def _read_sensors(self) -> dict[str, _Sensor]:
@@ -175,7 +175,7 @@ def _photographs(drive: _Drive) -> tuple[list[Photograph], list[RigCamera], int]
     """Return the photographs of the keyframes, their cameras, and the number without a pose."""
     photographs: list[Photograph] = []
     cameras: dict[str, tuple[RigCamera, str]] = {}
-    without = 0
+    unplaced = 0
     for row in drive.of("camera"):
         if not row["is_key_frame"]:
             continue
@@ -187,11 +187,11 @@ def _photographs(drive: _Drive) -> tuple[list[Photograph], list[RigCamera], int]
             raise broken(f"{drive.path('sample_data')}:", why)
         pose = drive.pose(row)
         if pose is None:
-            without += 1
+            unplaced += 1
             continue
         frame, time = drive.moments[row["sample_token"]], drive.seconds(row["timestamp"])
         photographs.append(Photograph(channel, frame, time, drive.file(row), pose))
-    return photographs, [camera for _, (camera, _) in sorted(cameras.items())], without
+    return photographs, [camera for _, (camera, _) in sorted(cameras.items())], unplaced
 
 
 def _camera(drive: _Drive, row: Row) -> RigCamera:
@@ -261,7 +261,7 @@ def _objects(drive: _Drive) -> tuple[tuple[TrackedObject, ...], list[str]]:
         sample = row["sample_token"]
         time = drive.stamps[sample]
         if sample in scanners:
-            # Boxes are drawn at the place where the scanner met the object, not at the time stamp.
+            # Boxes lie where the scanner met the object; the time stamp is the end of its turn.
             to_scanner = scanners[sample]
             x, y, _ = to_scanner[:3, :3] @ pose[:3, 3] + to_scanner[:3, 3]
             time -= TURN_S * float(1 - turned(np.arctan2(y, x), TURN_START))
@@ -273,9 +273,9 @@ def _objects(drive: _Drive) -> tuple[tuple[TrackedObject, ...], list[str]]:
 
 
 def _moving(attributes: Sequence[str]) -> bool | None:
-    """Return whether an object moves by its attributes, such as `vehicle.moving`, or None.
+    """Return whether attributes such as `vehicle.moving` state that an object moves; None: unknown.
 
-    Attributes of cycles only state whether there is a rider.
+    Attributes of cycles state only whether there is a rider.
     """
     states = [name for name in attributes if name.startswith(("vehicle.", "pedestrian."))]
     return any(name.endswith(".moving") for name in states) if states else None

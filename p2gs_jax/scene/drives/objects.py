@@ -15,17 +15,17 @@ from p2gs_jax.render.project import HIDDEN
 from p2gs_jax.scene.rigid import interpolated
 from p2gs_jax.types import Placement, Scene, TrackedObject, View
 
-# A rigid pose as a matrix.
+# The matrix of a rigid pose.
 Pose = Float64[np.ndarray, "4 4"]
 # Boxes of parked cars jump by a few decimetres; an object that gets farther than this moves.
 STANDS_WITHIN_M = 1.0
-# Boxes are cut off this near to the camera, scene units.
+# The least depth at which boxes are drawn, scene units.
 NEAR = 0.1
-# Boxes are widened by this much on every side, scene units: they are tight, and an exposure lasts.
+# Boxes are widened on every side, scene units: they are tight, and objects move while exposed.
 MARGIN = 0.15
 
 _SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
-# Corners that differ in one coordinate.
+# Pairs of corners that differ in one coordinate.
 _EDGES = [(a, a | bit) for bit in (4, 2, 1) for a in range(8) if not a & bit]
 
 
@@ -33,7 +33,7 @@ class Box(NamedTuple):
     """One bounding box of an object, at one time.
 
     Attributes:
-        track: name of the object.
+        track: name of the object; `label` is its class.
         size: length (x), width (y), height (z), metres.
         time: seconds.
         pose: box to world, the origin in the middle of the box.
@@ -53,7 +53,7 @@ def tracks(boxes: Iterable[Box]) -> tuple[TrackedObject, ...]:
 
     Boxes may come in any order of time; the first of several boxes at one time counts. The size of
     an object is the median of its boxes. It moves if one of its boxes does. If the data set does
-    not state this, an object moves if it gets more than 1 m away from its first place.
+    not state this, an object moves if it gets `STANDS_WITHIN_M` away from its first position.
     """
     boxes_of: dict[str, list[Box]] = {}
     for box in boxes:
@@ -76,7 +76,7 @@ class MovingObjects:
     """The objects that Gaussians belong to, in the order of `Population.owner`.
 
     Attributes:
-        middle: middle of the drive, seconds, if Gaussians vibrate: the zero of `Placement.time`.
+        middle: middle of the drive, seconds (the zero of `Placement.time`); None: none vibrate.
     """
 
     objects: tuple[TrackedObject, ...]
@@ -95,7 +95,7 @@ class MovingObjects:
         return out, there
 
     def placement(self, viewmat: Float[np.ndarray, "4 4"], time: float) -> Placement:
-        """Return where the objects are in a view (world-to-camera) at a time, on the host."""
+        """Return the placement of objects in a view (world-to-camera) at a time, on the host."""
         poses, there = self.poses(time)
         viewmats = (np.asarray(viewmat, np.float64) @ poses).astype(np.float32)
         viewmats[~there] = HIDDEN
@@ -114,8 +114,8 @@ def object_mask(
 ) -> Bool[np.ndarray, "h w"]:
     """Return which pixels of a view the boxes of moving objects cover at its time.
 
-    Nothing is covered in a view without a time. `width` and `height` are the mask's; boxes are
-    widened by the margin, scene units, on every side.
+    Nothing is covered in a view without a time. `width` and `height` are the mask's, in pixels; the
+    margin, scene units, widens boxes on every side.
     """
     return painted(outlines(view, objects, margin), view, width, height)
 
@@ -167,9 +167,9 @@ def outline_of(
 def painted(
     polygons: Sequence[Float[np.ndarray, "_ 2"]], view: View, width: int, height: int
 ) -> Bool[np.ndarray, "h w"]:
-    """Return which pixel centres lie within convex polygons, in an image of the given size.
+    """Return which pixel centres lie within convex polygons, in an image of this size.
 
-    The corners of a polygon are in order, in pixels of the view at its full size.
+    The corners of a polygon are in their order around it, in pixels of the view at its full size.
     """
     out = np.zeros((height, width), bool)
     for polygon in polygons:

@@ -9,8 +9,8 @@
 Schema: https://github.com/scaleapi/pandaset-devkit (README.md, python/pandaset/annotations.py).
 
 Sequence 002 shows that `timestamps.json` holds the ends of the spinning scanner's turns. The
-scanner then looks backwards, after a clockwise turn of 0.1 s. Cameras trigger when it passes them.
-The boxes of a frame thus have different times: each has the time at which the scanner passed it.
+scanner then looks backwards, after a clockwise turn of 0.1 s. Cameras trigger when it passes their
+direction. Each box has the time at which the scanner passed it, so times differ within a frame.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ CALIBRATED = (1920, 1080)
 PICKLES = (".pkl.gz", ".pkl")
 # The time of a turn of the spinning scanner, seconds.
 TURN_S = 0.1
-# This `cuboids.sensor_id` marks a second box of a moving object, from the forward scanner's points.
+# The `cuboids.sensor_id` of boxes from the forward scanner's points: a moving object may have two.
 FORWARD = 1
 ALONE = "moving objects have boxes of the forward scanner only: times are known to 0.1 s."
 POSITION = ("position.x", "position.y", "position.z")
@@ -49,7 +49,7 @@ SIZE = ("dimensions.y", "dimensions.x", "dimensions.z")
 
 
 def read_pandaset(root: Path, cfg: DataConfig) -> Recording:
-    """Read a sequence, with `camera` and `lidar` in its folder; UserError: a table is broken."""
+    """Read a sequence; its folder holds `camera` and `lidar`; UserError: a table is broken."""
     root = tables.drive_folder(root, cfg.drive, MARKER)
     cameras, photographs, notes = [], [], []
     for folder in sorted(p.parent for p in root.glob(MARKER)):
@@ -85,17 +85,15 @@ def _camera(folder: Path, photograph: Path) -> RigCamera:
 
 def _photographs(folder: Path, files: dict[int, Path]) -> tuple[list[Photograph], int]:
     """Return the photographs of a camera, and the number without a pose or time."""
-    poses = _read_list(folder / "poses.json")
-    times = _read_list(folder / "timestamps.json")
+    poses, times_path = _read_list(folder / "poses.json"), folder / "timestamps.json"
+    times = _read_list(times_path)
     count = min(len(poses), len(times))
     photographs, unplaced = [], 0
     for frame in sorted({*files, *range(count)}):
         if frame >= count or None in (poses[frame], times[frame]):
             unplaced += 1
             continue
-        time = tables.finite_numbers([times[frame]], folder / "timestamps.json", f"entry {frame}")[
-            0
-        ]
+        (time,) = tables.finite_numbers([times[frame]], times_path, f"entry {frame}")
         pose = _pose(poses[frame], folder / "poses.json", frame)
         path = files.get(frame, folder / f"{frame:02d}.jpg")
         photographs.append(Photograph(folder.name, frame, float(time), path, pose))
@@ -145,7 +143,7 @@ def _read_sweep(path: Path) -> SweepPoints:
 
 
 class _Cuboid(NamedTuple):
-    """A box, whether it is the forward scanner's, and the name of its object's other track."""
+    """A box, whether the forward scanner gave it, and the name of its object's other track."""
 
     box: Box
     forward: bool
@@ -182,7 +180,7 @@ def _cuboids(path: Path, time: float, scanner: Pose) -> Iterator[_Cuboid]:
     """Yield the boxes of a frame; `time` is the end of its turn of the scanner, seconds."""
     table = tables.read_pickled(path)
     position, size = table.stacked(POSITION), table.stacked(SIZE)
-    # Angle 0 is along y and angles are counterclockwise; `Box` looks along x.
+    # Yaw is counterclockwise and 0 for a box along y; a `Box` looks along x.
     yaw = table.numbers("yaw") + np.pi / 2
     stands = table.numbers("stationary") > 0
     none = np.full(len(yaw), -1)
@@ -197,7 +195,7 @@ def _cuboids(path: Path, time: float, scanner: Pose) -> Iterator[_Cuboid]:
     for row, (name, label) in enumerate(zip(table["uuid"], table["label"], strict=True)):
         pose, (c, s) = np.eye(4), (np.cos(yaw[row]), np.sin(yaw[row]))
         pose[:2, :2], pose[:3, 3] = [[c, -s], [s, c]], position[row]
-        # `stationary` holds for the whole sequence; other objects may also stand all the time.
+        # `stationary` holds for the whole sequence, but objects without it may never move either.
         moving = False if stands[row] else None
         name = name if isinstance(name, str) else ""
         box = Box(name, str(label), tuple(size[row]), float(passed[row]), pose, moving)
@@ -207,7 +205,7 @@ def _cuboids(path: Path, time: float, scanner: Pose) -> Iterator[_Cuboid]:
 def _doubled(cuboids_of: dict[str, list[_Cuboid]]) -> set[str]:
     """Return the forward scanner's tracks whose object has another track.
 
-    Either track may name the other; some names lack their last letters.
+    Either track may name the other; names may lack their last letters, but 9 must be left.
     """
     others = {name for name, cuboids in cuboids_of.items() if not cuboids[0].forward}
     named_siblings = {cuboid.sibling for name in others for cuboid in cuboids_of[name]}

@@ -1,9 +1,9 @@
 """The contract between readers of driving data sets and the rest of the program.
 
-A reader is a module, listed in `FORMATS`. A path that fits the glob `MARKER` identifies a folder.
-`read_NAME(root, cfg)` reads the tables and returns a `Recording`, but decodes neither photographs
-nor LiDAR points. `root` is the folder of one drive, or of several drives: `cfg.drive` names one.
-A reader promises:
+A reader is a module, listed in `FORMATS`. A file that fits the glob `MARKER` identifies the folder
+of a drive. `read_NAME(root, cfg)` reads the tables and returns a `Recording`, but decodes neither
+photographs nor LiDAR points. `root` is the folder of one drive, or of several drives: `cfg.drive`
+names one. A reader promises:
 
 - The world is right-handed and metric; its origin may be anywhere. One clock, in seconds, serves
   photographs, laser points and tracks.
@@ -32,13 +32,13 @@ from jaxtyping import Float64
 from p2gs_jax.scene.rigid import interpolated
 from p2gs_jax.types import Distortion, TrackedObject
 
-# Words that data sets put around the names of their cameras.
+# Words that data sets add to the names of their cameras.
 _AROUND = re.compile(r"(?:^|_)(?:camera|cam|ring)(?=_|$)")
 
 
 @dataclass(frozen=True)
 class RigCamera:
-    """One camera of a car, with the data set's name and the calibrated size, pixels.
+    """One camera of a car: its name in the data set, and its calibrated size, pixels.
 
     Attributes:
         K: intrinsics in pixels of the undistorted image, pixel centres at +0.5.
@@ -59,7 +59,7 @@ class Trajectory(NamedTuple):
     poses: Float64[np.ndarray, "t 4 4"]
 
     def at(self, times: Float64[np.ndarray, " n"]):
-        """Return poses [n 4 4] at times, and which times [n] are covered; NaN never is."""
+        """Return poses [n 4 4] at times, and which of these [n] are covered; NaN is not."""
         poses, covered = interpolated(self.times, self.poses, np.nan_to_num(times))
         return poses, covered & np.isfinite(times)
 
@@ -89,7 +89,7 @@ class SweepPoints(NamedTuple):
 
     Attributes:
         points: world coordinates, each at its measurement time; NaN and inf are as in the file.
-        times: seconds, the same for all points if the data set states one time a sweep.
+        times: seconds; they are equal if the data set states one time for a sweep.
     """
 
     points: Float64[np.ndarray, "n 3"]
@@ -98,7 +98,7 @@ class SweepPoints(NamedTuple):
 
 @dataclass(frozen=True)
 class Sweep:
-    """A LiDAR sweep at a time, seconds; `read` raises UserError if its file is broken."""
+    """A LiDAR sweep; `time` is in seconds; `read` raises UserError if the file is broken."""
 
     frame: int
     time: float
@@ -128,5 +128,5 @@ class Recording:
 
 
 def short_name(camera: str) -> str:
-    """Return a camera's name without the words around it: `front_left` for `CAM_FRONT_LEFT`."""
+    """Return a camera's name without the words added to it: `front_left` for `CAM_FRONT_LEFT`."""
     return _AROUND.sub("", camera.lower()).strip("_") or camera.lower()

@@ -1,8 +1,8 @@
 """Files of driving data sets: folders of drives, numbers, tables in JSON, Arrow and pickles.
 
-A pickle names functions and calls them. Here each name in a table of numbers and texts becomes a
-passive record with the arguments of the call, and other names are refused. The records are then
-decoded, for all layouts since pandas 0.14.
+A pickle names functions and calls them. Here each name that a table of numbers and texts needs
+becomes a passive record with the arguments of the call, and other names are refused. The records
+are then decoded, for all layouts since pandas 0.14.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ UNPACK = "unpack that part of the data set there as well"
 _DECODER = json.JSONDecoder()
 # The longest row of a large JSON table, bytes.
 _LONGEST_ROW = 2**14
-# The pattern covers the modules of old and new versions of pandas and numpy.
+# Names in pickled tables, with the modules of old and new versions of pandas and numpy.
 _IN_TABLES = re.compile(
     r"pandas(\.\w+)*\.(DataFrame|BlockManager|_unpickle_block|_new_Index|(Range|Int64)?Index)"
     r"|numpy\.(ndarray|dtype|_?core\.multiarray\._reconstruct|_?core\.numeric\._frombuffer)"
@@ -39,7 +39,7 @@ _IN_TABLES = re.compile(
 )
 # A message lists at most this many drives.
 LISTED = 5
-# The largest unpacked table, bytes: a sweep of PandaSet has 10 MB.
+# The largest unpacked table, 256 MiB; a sweep of PandaSet has 10 MB.
 _MOST_BYTES = 2**28
 
 
@@ -48,34 +48,34 @@ def counted(count: int, words: str) -> list[str]:
     return [f"{count} {words}"] if count else []
 
 
-def drive_folder(root: Path, asked: str | None, marker: str) -> Path:
-    """Return the folder of a drive: `root`, or the subfolder with the name `asked`.
+def drive_folder(root: Path, wanted: str | None, marker: str) -> Path:
+    """Return the folder of a drive: `root`, or the subfolder with the name `wanted`.
 
     The glob `marker` finds a file in the folder of a drive. UserError: see `chosen_drive`.
     """
     if any(root.glob(marker)):
         return root
     drives = {path.relative_to(root).parts[0] for path in root.glob(f"*/{marker}")}
-    return root / chosen_drive(asked, sorted(drives), root)
+    return root / chosen_drive(wanted, sorted(drives), root)
 
 
-def chosen_drive(asked: str | None, there: Sequence[str], root: Path) -> str:
-    """Return the drive in `root` whose name is, or begins with, `asked`; None: the only drive.
+def chosen_drive(wanted: str | None, there: Sequence[str], root: Path) -> str:
+    """Return the drive in `root` whose name is or begins with `wanted`; None: the only drive.
 
     UserError: no drive has this name, or several begin with it.
     """
-    fits = [name for name in there if asked is None or name.startswith(asked)]
-    fits = [name for name in fits if name == asked] or fits
+    fits = [name for name in there if wanted is None or name.startswith(wanted)]
+    fits = [name for name in fits if name == wanted] or fits
     if len(fits) == 1:
         return fits[0]
     listed = sorted(fits or there)
     names = ", ".join(listed[:LISTED]) + (", ..." if len(listed) > LISTED else "")
-    if asked is None:
+    if wanted is None:
         message = f"{root} holds {len(there)} drives: {names}"
     elif fits:
-        message = f"{len(fits)} drives of {root} begin with {asked!r}: {names}"
+        message = f"{len(fits)} drives of {root} begin with {wanted!r}: {names}"
     else:
-        message = f"{root} holds no drive {asked!r}; there are {names or 'none'}"
+        message = f"{root} holds no drive {wanted!r}; there are {names or 'none'}"
     raise UserError(message, fix="name one of them: --drive NAME")
 
 
@@ -93,7 +93,7 @@ def read_lines(path: Path) -> list[str]:
 
 
 def read_scan(path: Path, columns: int, what: str) -> Float32[np.ndarray, "n c"]:
-    """Return the rows of a LiDAR scan, float32; UserError: its size is wrong, it is not `what`."""
+    """Return the rows of a LiDAR scan; UserError: its size is wrong; `what` names the layout."""
     values = np.fromfile(path, "<f4")
     if values.size % columns or path.stat().st_size % values.itemsize:
         raise broken(path, f"is not a LiDAR {what}")
@@ -111,9 +111,9 @@ def box_size(sides: Iterable[Any], path: Path) -> tuple[float, float, float]:
 def finite_numbers(
     values: Iterable[Any], path: Path, what: str, count: int | None = None
 ) -> Float64[np.ndarray, " n"]:
-    """Return numbers, or their texts, as an array.
+    """Return numbers, which may be texts, as an array.
 
-    `what` names them in the message. UserError: a number is not finite, or there are not `count`.
+    `what` names them in a message. UserError: a number is not finite, or there are not `count`.
     """
     try:
         numbers = np.array([float(value) for value in values])
@@ -128,7 +128,7 @@ def finite_numbers(
 def numbered(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
     """Return the files of a folder whose names are a number and a suffix, by rising number.
 
-    The folder may be absent. Suffixes include the dot (".pkl.gz"); the first one that fits counts.
+    The folder may be absent. Suffixes include dots (".pkl.gz"); the first suffix that fits counts.
     """
     found: dict[int, Path] = {}
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
@@ -142,14 +142,14 @@ def numbered(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
 def read_rows(path: Path, needs: Kinds, column: str = "", among: Container[Any] = ()) -> list[Row]:
     """Return rows of a large JSON list of objects; only the wanted rows are decoded.
 
-    The tables of all nuScenes drives have millions of rows. The rows of one drive are found in the
-    text, which is not held in memory. Rows must not contain objects.
+    The tables of nuScenes have millions of rows. The rows of one drive are searched in the file,
+    which is not held in memory. Rows must not contain objects.
 
     Args:
         path: the table.
         needs: columns that every returned row must have, and their types.
         column: only rows whose text in this column is in `among` are returned; "": all rows.
-        among: values.
+        among: wanted texts.
 
     Raises:
         UserError: the file is missing, not a list of objects, or cut off, or a row lacks a column.
@@ -161,8 +161,8 @@ def read_rows(path: Path, needs: Kinds, column: str = "", among: Container[Any] 
                 and re.search(rb"[}\[]\s*]\s*$", text[-999:])
             ):
                 raise ValueError("it should be a list of objects")
-            whole = "" if column else text[:].decode("utf-8-sig")
-            rows = list(_found(text, column, among)) if column else parse_json(whole)
+            every = "" if column else text[:].decode("utf-8-sig")
+            rows = list(_found(text, column, among)) if column else parse_json(every)
     except FileNotFoundError:
         raise missing_file(path) from None
     except (ValueError, RecursionError) as error:
@@ -185,9 +185,9 @@ def _found(text: mmap.mmap, column: str, among: Container[Any]) -> Iterator[Row]
 
 
 class Columns(dict[str, np.ndarray]):
-    """Columns of a table by name; UserError: a column is missing.
+    """Columns of a table by name; a missing column raises UserError.
 
-    Values that are not numbers are objects, and empty cells are None.
+    Columns of other values than numbers hold objects; their empty cells are None.
     """
 
     def __init__(self, columns: Mapping[str, np.ndarray], path: Path):
@@ -223,10 +223,10 @@ def read_feather(path: Path, names: Sequence[str]) -> Columns:
 
 
 class ParquetTable:
-    """A Parquet file: short columns are read whole, long ones by groups of rows."""
+    """A Parquet file: `columns` reads whole columns, `cells` one group of rows at a time."""
 
     def __init__(self, path: Path):
-        """Open it; UserError: pyarrow or the file is missing, or the file is broken."""
+        """Open the file; UserError: pyarrow or the file is missing, or the file is broken."""
         self.path = path
         with _reading(path):
             from pyarrow import parquet
@@ -235,7 +235,7 @@ class ParquetTable:
         meta = self._file.metadata
         counts = [meta.row_group(group).num_rows for group in range(meta.num_row_groups)]
         self._ends = np.cumsum(counts, dtype=int)
-        self._held: tuple[int, Sequence[str], Any] | None = None
+        self._group: tuple[int, Sequence[str], Any] | None = None
 
     def columns(self, names: Sequence[str]) -> Columns:
         """Return columns by name; UserError: a column is missing, or the file is broken."""
@@ -245,16 +245,16 @@ class ParquetTable:
     def cells(self, row: int, names: Sequence[str]) -> list[Any]:
         """Return cells of one row: lists of numbers as arrays, texts and bytes unchanged.
 
-        The last group of rows stays in memory. UserError: a column is missing, or the file is
-        broken.
+        The group of rows stays in memory until another one is read. UserError: a column is missing,
+        or the file is broken.
         """
         group = int(np.searchsorted(self._ends, row, side="right"))
-        if self._held is None or self._held[:2] != (group, names):
-            self._held = None
+        if self._group is None or self._group[:2] != (group, names):
+            self._group = None
             with _reading(self.path):
                 table = self._file.read_row_group(group, columns=list(names))
-            self._held = group, names, table
-        table = self._held[2]
+            self._group = group, names, table
+        table = self._group[2]
         inside = row - int(self._ends[group]) + table.num_rows
         cells = _arrow_columns(table.slice(inside, 1), names, self.path)
         return [cells[name][0] for name in names]
@@ -279,14 +279,14 @@ def _reading(path: Path) -> Iterator[None]:
 
 def _arrow_columns(table: Any, names: Sequence[str], path: Path) -> Columns:
     found = {name: table[name] for name in names if name in table.column_names}
-    # A column without any value would come as NaN.
+    # pyarrow would return NaN for a column without values.
     empty = np.full(len(table), None)
     values = {n: empty if str(c.type) == "null" else c.to_numpy() for n, c in found.items()}
     return Columns(values, path)
 
 
 class _Record:
-    """The arguments with which a pickle calls one name, and the state that it sets."""
+    """The arguments with which a pickle calls a name, and the state that it sets."""
 
     name = ""
     args: tuple
@@ -313,7 +313,7 @@ class _Records(pickle.Unpickler):
 def read_pickled(path: Path) -> Columns:
     """Return the columns of a pickled table (.pkl or .pkl.gz); texts are objects.
 
-    UserError: it is missing or damaged, or holds anything but a table of numbers and texts.
+    UserError: the file is missing, damaged, or not a table of numbers and texts.
     """
     try:
         content = path.read_bytes()

@@ -94,7 +94,7 @@ def test_what_argoverse_lacks_is_counted(copied, read):
     assert (len(drive.photographs), len(drive.sweeps)) == (12, 2)
     assert [t.name for t in drive.objects] == ["a"]
     assert drive.notes[1:] == [
-        "calibration/intrinsics.feather has no row for ring_rear_left: left out.",
+        "calibration/intrinsics.feather has no row for ring_rear_left: they are left out.",
         "There are no photographs of ring_side_right.",
         "1 photographs are outside city_SE3_egovehicle.feather: they are left out.",
         "1 LiDAR sweeps are outside city_SE3_egovehicle.feather.",
