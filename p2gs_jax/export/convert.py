@@ -1,6 +1,6 @@
 """A finished run in the files of other programs: one function writes the chosen formats.
 
-Display colours are baked once, and their baking error is measured and written beside them.
+Display colours are baked once. Their baking error is measured and written beside each file.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ PLACES: dict[str, tuple[str, ...]] = {
     "exr": ("exr",),
     "html": ("scene.html",),
 }
-STEPS = 240
+STEPS = 240  # least number of baking steps by default
 # The baking error is measured on at most this many views of each split, evenly spread.
 MEASURED = 60
-# Least median PSNR, dB, that is called close: two scenes had 31 to 38, without refining 19 to 22.
+# Least median PSNR called close, dB: two scenes had 31 to 38 dB, without refinement 19 to 22 dB.
 CLOSE_DB = 30.0
 
 
-# Writers of formats with display colours, and readers of those that round the Gaussians.
+# The writer of each format with display colours, and its reader if the format rounds values.
 WRITERS: dict[str, tuple[Callable, Callable | None]] = {
     "spz": (gsply.write_spz, gsply.read_spz),
     "compressed-ply": (gsply.write_compressed_ply, gsply.read_compressed_ply),
@@ -84,11 +84,11 @@ def convert(
     overwrite: bool,
     reporter: Reporter,
 ) -> Iterator[tuple[Path, str, float]]:
-    """Write a run in every format; yield each place, a sentence about it, and seconds.
+    """Write a run in every format; yield each path, a sentence about it, and the seconds it took.
 
-    `transform` converts radiance to display colours, which `bake_steps` steps refine (None: a
-    default from the number of views). The page has at most `page_mb` million bytes. Raises
-    UserError: a file already exists, or a photograph that a format needs is missing.
+    `transform` makes display colours, which `bake_steps` steps refine (None: a default). The page
+    has at most `page_mb` million bytes and `page_photographs` photographs. Raises UserError: a file
+    exists without `overwrite`, or a photograph that a format needs is missing.
     """
     _check_places(folder, [folder / place for name in formats for place in PLACES[name]], overwrite)
     if {"colmap", "nerfstudio", "exr"} & set(formats):
@@ -167,8 +167,9 @@ def _exr(place: Path, fitted: Run, reporter: Reporter) -> str:
             camera = camera_of(fitted.store, index)
             result, path = fitted.render(camera), (temporary / view.name).with_suffix(".exr")
             linear, depth, alpha = map(np.asarray, (result.linear, result.depth, result.alpha))
-            taken, shot = fitted.own_display(index), read_exif_settings(view.image_path)
-            write_exr(path, linear, depth=depth, alpha=alpha, taken=taken, camera=camera, shot=shot)
+            transform, shot = fitted.own_display(index), read_exif_settings(view.image_path)
+            channels = {"depth": depth, "alpha": alpha}
+            write_exr(path, linear, **channels, transform=transform, camera=camera, shot=shot)
             reporter.stage("Rendering", index + 1, len(views))
     return f"{len(views)} linear renders"
 
@@ -179,7 +180,7 @@ class DisplayFiles:
     def __init__(
         self, fitted: Run, transform: DisplayTransform, steps: int | None, reporter: Reporter
     ):
-        """Render the true pictures, bake, and refine by `steps` (None: a default)."""
+        """Render the true pictures, bake, and refine in `steps` steps (None: a default)."""
         self.fitted, self.transform, self.reporter = fitted, transform, reporter
         scene, cfg = fitted.scene, fitted.cfg
         g = at_time(fitted.as_of(), None)
@@ -200,7 +201,7 @@ class DisplayFiles:
         self.baked = baking.refine(start, aims, cfg.render, steps=steps, seed=seed, on_step=on_step)
 
     def write(self, name: str, path: Path, sidecar: Path) -> str:
-        """Write a format, and a JSON file with its baking error; return a sentence."""
+        """Write the format `name`, and its baking error as JSON; return a sentence on it."""
         begin, more = time.monotonic(), ()
         write, read = WRITERS[name]
         error = self.error if read is None else {}
@@ -251,7 +252,7 @@ def _spread(rows: Sequence[int]) -> list[int]:
 
 
 def _sentence(error: dict) -> str:
-    """Return a sentence on the baking error, which says whether it is small."""
+    """Return a sentence on the baking error by split, and whether it is small."""
     splits = (("training", error["train"]), ("held-out", error["test"]))
     found = [(e["psnr_median"], e["views"], name) for name, e in splits if e is not None]
     far = "visibly different from the true ones (below"

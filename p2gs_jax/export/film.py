@@ -22,9 +22,9 @@ from p2gs_jax.photometry import formation
 from p2gs_jax.photometry.response import DARKEST, by_camera
 from p2gs_jax.types import GAMMA_SRGB, Capture
 
-# Steps of the common curve in log radiance: one is at most 0.4 of a 16-bit code at gamma 2.2.
+# Steps of the common curve in log radiance: each is at most 0.4 of a 16-bit code at gamma 2.2.
 _STEPS = 2**20
-# Entries of a table of vignetting over r^2, and rows of pixels that are converted at a time.
+# Entries of the table of vignetting over r^2, and rows of pixels that are converted at a time.
 _RADII, _ROWS = 2**16, 64
 
 Pixels = UInt[np.ndarray, "h w 3"]
@@ -34,12 +34,11 @@ Finish = Callable[[Logs], Any]
 
 
 def common_curve(log_exposure: float, gamma: float, cfg: PhotometryConfig, most: int) -> Finish:
-    """Return the function from log radiance to stored values; `most` is the value of white."""
+    """Return the function from natural log radiance to stored values; `most` is that of white."""
     white = formation.inverse_tone_map(np.ones(3), gamma, cfg, None).max()
     first, last = np.log(formation.EXPOSED_FLOOR), np.log(white)
     exposed = np.exp(np.linspace(first, last, _STEPS))[:, None]
-    # Each channel needs a column only if responses differ.
-    exposed = np.repeat(exposed, 3 if by_camera(cfg) else 1, 1)
+    exposed = np.repeat(exposed, 3 if by_camera(cfg) else 1, 1)  # columns of separate responses
     display = formation.display(formation.tone_map(exposed, gamma, cfg, None))
     values = np.rint(most * display).astype(np.uint16)
     values[0] = 0
@@ -61,12 +60,12 @@ class Film:
     """The inverse curve of one photograph, from stored values to log radiance."""
 
     logs: Float32[np.ndarray, "levels 3"]  # log radiance of every stored value, without vignetting
-    shade: Float32[np.ndarray, "r k"] | None  # log V over r^2 of all channels or each, or None
-    white: int  # least stored value that counts as clipped
+    shade: Float32[np.ndarray, "r k"] | None  # log V over r^2, k = 1 or 3 channels
+    white: int  # smallest stored value that counts as clipped
 
     @classmethod
     def of(cls, capture: Capture, top: int, cfg: PhotometryConfig, saturation: float) -> Film:
-        """Return the film of stored values 0 to `top`; `saturation` is a display value."""
+        """Return the curve of values 0 to `top`; display values >= `saturation` are clipped."""
         values = np.repeat((np.arange(1, top + 1) / top)[:, None], 3, 1)
         logs = np.log(formation.inverse_formation(values, capture, cfg, np.zeros((top, 2))))
         # Below half an 8-bit code the curves are continued as a power of the value.
@@ -81,7 +80,7 @@ class Film:
         return cls(logs.astype(np.float32), shade if shaded else None, white)
 
     def most(self) -> float:
-        """Return the largest log radiance of a value below white, anywhere in a photograph."""
+        """Return the largest log radiance of an unclipped value at any place of the photograph."""
         darkest = 0.0 if self.shade is None else min(0.0, float(self.shade.min()))
         return float(self.logs[self.white - 1].max()) - darkest
 
@@ -92,10 +91,10 @@ class Film:
         return self.shade is None and len(table) == 256 and bool((table == same).all())
 
     def developed(self, pixels: Pixels, finish: Finish) -> np.ndarray:
-        """Return the result of every pixel.
+        """Return `finish` of the log radiance of every pixel.
 
-        If channels differ in their curves, pixels that are clipped in all channels become neutral:
-        all get the largest value, because each value is a lower bound of the light.
+        If the curves of channels differ, pixels that are clipped in all channels become neutral:
+        their channels get the largest of their values, since each is a lower bound of the light.
         """
         table = finish(self.logs)
         out = np.empty(pixels.shape, table.dtype)
@@ -117,7 +116,7 @@ class Film:
 
 
 def dithered(codes: UInt16[np.ndarray, "h w 3"], name: str) -> UInt8[np.ndarray, "h w 3"]:
-    """Return 8-bit of 16-bit codes: noise below one 8-bit code is added before rounding down.
+    """Return 16-bit codes as 8-bit codes: noise below one 8-bit code is added before rounding down.
 
     The photograph's name is the seed of the noise. Multiples of 256 become their 8-bit code.
     """
@@ -134,14 +133,14 @@ def across(extreme: Callable[..., Any], pixels: Pixels) -> UInt[np.ndarray, "h w
 
 
 def _blocks(pixels: Pixels) -> Iterator[tuple[slice, Pixels]]:
-    """Yield the place and pixels of blocks of rows that fit into a processor's cache."""
+    """Yield the rows and pixels of blocks that fit into a processor's cache."""
     for begin in range(0, len(pixels), _ROWS):
         rows = slice(begin, begin + _ROWS)
         yield rows, pixels[rows]
 
 
 def _looked_up(pixels: Pixels, table: Any) -> Any:
-    """Return for every stored value its entry in the table's column of the channel."""
+    """Return the entry of every stored value in its channel's column of a table."""
     if pixels.dtype == np.uint8:
         # Indexing with NumPy takes three times as long.
         return cv2.LUT(np.ascontiguousarray(pixels), table[None])

@@ -1,7 +1,7 @@
 """The scene as folders of other programs: a COLMAP model, and nerfstudio's `transforms.json`.
 
-Cameras are pinholes at the size of the fit, and the photographs are undistorted to match. Points
-and tracks are those at the start of the fit. Neither format stores exposures: they are in
+Cameras are pinholes at the image size of the fit, and the photographs are undistorted to match.
+Points and tracks are those at the start of the fit. Neither format stores exposures: they are in
 `exposures.csv`, which `--known-exposures` reads.
 """
 
@@ -31,7 +31,7 @@ from p2gs_jax.types import Scene, Tracks, View
 JPEG_QUALITY = 98
 # Suffixes that both programs read (others become PNG), and Pillow modes that need no new encoding.
 READABLE, MODES = (".jpg", ".jpeg", ".png"), ("L", "RGB", "RGBA")
-# nerfstudio's file of points, and the colour of points without one.
+# nerfstudio's file of points, and the 8-bit grey of points without a colour.
 CLOUD, GREY = "sparse_pc.ply", 128
 RGB = ("red", "green", "blue")
 Program = Literal["colmap", "nerfstudio"]
@@ -50,9 +50,8 @@ def write_folder(
 
     COLMAP reads `sparse/0`; nerfstudio's `splatfacto` reads `transforms.json` and `sparse_pc.ply`.
     Coordinates are those of the data set, without the shift by `Scene.origin`. The folder is
-    replaced once the new one is complete. The store has cameras at the size of the fit. `on_view`
-    receives the numbers of written and of all photographs. Raises UserError: a photograph cannot
-    be read.
+    replaced once the new one is complete. `on_view` receives the number of written photographs
+    and the number of all. Raises UserError: a photograph cannot be read.
     """
     names = {view.name: exported_name(view) for view in scene.views}
     with atomic_folder(folder) as temporary:
@@ -169,9 +168,9 @@ def _write_model(folder: Path, scene: Scene, store: ImageStore, names: Mapping[s
 
 
 def _write_photograph(path: Path, view: View, ldr: Float[np.ndarray, "h w 3"]) -> None:
-    """Copy a photograph that was not undistorted or resized; encode any other again, in sRGB.
+    """Copy the file if the fit neither undistorts nor resizes it; otherwise encode `ldr` in sRGB.
 
-    A new file keeps the camera settings in EXIF, but not the mark of another colour space.
+    A new file keeps the camera settings in EXIF, but not the tag of another colour space.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     unchanged = view.distortion is None and ldr.shape[1::-1] == (view.width, view.height)
@@ -186,14 +185,13 @@ def _write_photograph(path: Path, view: View, ldr: Float[np.ndarray, "h w 3"]) -
 
 
 def write_photograph(path: Path, pixels: np.ndarray, exif: Image.Exif | None) -> None:
-    """Write display values of 8 or (PNG only) 16 bits in sRGB, with the camera settings in EXIF."""
+    """Write sRGB values as PNG (8 or 16 bits) or else JPEG, with the camera settings in EXIF."""
     if path.suffix.lower() == ".png":
         write_png(path, pixels, exif)
         return
     settings = kept_settings(exif)
     options: dict[str, Any] = {"exif": b"Exif\0\0" + settings} if settings else {}
     with atomic_write(path) as temporary:
-        # All other suffixes are of JPEG.
         Image.fromarray(pixels).save(temporary, quality=JPEG_QUALITY, subsampling=0, **options)
 
 

@@ -40,7 +40,7 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Page:
-    """A written page: bytes, Gaussians, photographs, and sentences for page and terminal."""
+    """A written page: its bytes, Gaussians, number of photographs, and sentences on its error."""
 
     size: int
     splats: PageSplats
@@ -57,36 +57,36 @@ def write_page(
     photographs: int = 0,
     say: Say = lambda text: None,
 ) -> Page:
-    """Write the page of at most `size_mb` million bytes, with photographs for the split view.
+    """Write the page of at most `size_mb` million bytes.
 
-    The page opens with `look`; `say` receives progress. Raises UserError: too little of the scene
-    fits, or photographs for the page are missing.
+    It opens with `look`, and has at most `photographs` photographs for the split view. `say`
+    receives progress. Raises UserError: too few Gaussians fit, or a photograph is missing.
     """
     gaussians, scene = fitted.as_of(), fitted.scene
     render = make_renderer(fitted.cfg.render)
     say("Rendering true pictures")
     pictures = []
     for i in map(int, evenly_spaced(len(scene.views), JUDGED)):
-        camera, taken = fitted.camera(i), uncorrected(fitted.own_display(i))
+        camera, display = fitted.camera(i), uncorrected(fitted.own_display(i))
         linear, name = linear_light(gaussians, camera, render), scene.views[i].name
-        pictures.append(TruePicture(name, camera, taken, linear, develop(linear, taken)))
+        pictures.append(TruePicture(name, camera, display, linear, develop(linear, display)))
     train = scene.train_indices
     weighed = [fitted.camera(train[k]) for k in evenly_spaced(len(train), WEIGHED)]
     embedded = embedded_photographs(fitted, photographs)
-    known = page_scene(fitted, uncorrected(look), embedded)
+    data = page_scene(fitted, uncorrected(look), embedded)
     title = f"{fitted.folder.resolve().name}: linear light"
-    most_bytes = _bytes_for_splats(int(size_mb * MEGABYTE), page_text(title, known, b""), size_mb)
+    most_bytes = _bytes_for_splats(int(size_mb * MEGABYTE), page_text(title, data, b""), size_mb)
     judge = functools.partial(page_error, pictures=pictures, render=render)
     splats = fit_into(most_bytes, gaussians, fitted.cfg.render, weighed, judge, say)
     sentences = _sentences(splats, fitted, size_mb)
-    known |= {"splats": splats.packed.header, "about": [*sentences, *_fine_print(fitted)]}
-    content = page_text(title, known, splats.packed.data)
+    data |= {"splats": splats.packed.header, "about": [*sentences, *_fine_print(fitted)]}
+    content = page_text(title, data, splats.packed.data)
     write_text(path, content)
     return Page(len(content.encode()), splats, len(embedded), tuple(sentences))
 
 
-def page_text(title: str, known: Mapping[str, Any], data: bytes) -> str:
-    """Return the page from its scene data (`known`) and packed Gaussians (formats/packed.py)."""
+def page_text(title: str, scene: Mapping[str, Any], splats: bytes) -> str:
+    """Return the page from its `page_scene` and its packed Gaussians (formats/packed.py)."""
     script = '(() => {\n"use strict";\n' + "\n".join(map(_source, SCRIPTS)) + "})();\n"
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     policy = (
@@ -97,12 +97,12 @@ def page_text(title: str, known: Mapping[str, Any], data: bytes) -> str:
         "policy": policy,
         "title": html.escape(printable(title)),
         "css": _read("page.css"),
-        "scene": _json(known),
-        "splats": base64.b64encode(data).decode(),
+        "scene": _json(scene),
+        "splats": base64.b64encode(splats).decode(),
         "sorter": _source("sorter"),
         "script": script,
     }
-    # One pass replaces all places: inserted text is not searched again.
+    # One pass replaces all placeholders, so that inserted text is never searched for them.
     return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], _read("page.html"))
 
 
@@ -122,7 +122,7 @@ def _json(value: Any) -> str:
 
 
 def _bytes_for_splats(budget: int, empty: str, size_mb: float) -> int:
-    """Return the bytes that remain for Gaussians; UserError: there are none."""
+    """Return the bytes for Gaussians besides the `empty` page; UserError: none remain."""
     rest = len(empty.encode()) + RESERVE
     if rest >= budget:
         raise UserError(
@@ -136,11 +136,11 @@ def _bytes_for_splats(budget: int, empty: str, size_mb: float) -> int:
 
 def _sentences(splats: PageSplats, fitted: Run, size_mb: float) -> list[str]:
     error, out = splats.error, []
-    kept, seen = splats.packed.count, splats.of - splats.unseen
+    kept, drawn = splats.packed.count, splats.total - splats.unseen
     if splats.whole:
-        out.append(f"The page has all {seen} visible Gaussians, packed in few bits.")
+        out.append(f"The page has all {drawn} visible Gaussians, packed in few bits.")
     else:
-        parts = [f"the {splats.dropped} least visible of {seen} Gaussians"] * bool(splats.dropped)
+        parts = [f"the {splats.dropped} least visible of {drawn} Gaussians"] * bool(splats.dropped)
         if splats.kept_degree < splats.degree:
             parts.append(f"harmonics above degree {splats.kept_degree} (of {splats.degree})")
         left_out = " and ".join(parts)

@@ -15,7 +15,7 @@ from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.photometry.response import by_camera, tables
 from p2gs_jax.run.read import Run
 
-# Middles of the steps of false colour, stops from middle grey (formats/false_color.py).
+# Middles of the steps of false colour, stops from mid-grey (formats/false_color.py).
 STEPS = np.arange(-6, 6) + 0.5
 # Longer side of embedded photographs, pixels, and their WebP quality, percent.
 LONGEST, QUALITY = 960, 80
@@ -33,7 +33,7 @@ def page_scene(
 ) -> dict[str, Any]:
     """Return the data of the page besides the Gaussians, as plain values or arrays.
 
-    The page opens with `look`; `photographs` are data URLs by row of the view.
+    The page opens with `look`; `photographs` has data URLs by row in `scene.views`.
     """
     mean, cfg = fitted.mean.exposure_geometric, fitted.cfg.render
     return {
@@ -61,7 +61,7 @@ def page_scene(
 
 
 def embedded_photographs(fitted: Run, count: int) -> dict[int, str]:
-    """Return at most `count` undistorted photographs as data URLs, by row, evenly spread.
+    """Return at most `count` evenly spaced, undistorted photographs as data URLs by row.
 
     Raises UserError: a photograph is missing or broken.
     """
@@ -73,25 +73,25 @@ def embedded_photographs(fitted: Run, count: int) -> dict[int, str]:
 
 def _tone(fitted: Run) -> dict[str, Any]:
     cfg = fitted.cfg.photometry
-    curves, cameras = None, [camera.vignetting for camera in cfg.cameras]
+    curves, vignettings = None, [camera.vignetting for camera in cfg.cameras]
     if cfg.curve == "spline" and (cfg.spline is not None or by_camera(cfg)):
         found = tables(cfg)
         curves = {name: getattr(found, name) for name in ("first", "step", "values", "channels")}
         curves["values"] = found.values.astype(np.float32)
-    return {"pivot": cfg.pivot, "tables": curves, "cameras": cameras}
+    return {"pivot": cfg.pivot, "tables": curves, "cameras": vignettings}
 
 
 def _view(fitted: Run, index: int, mean: float) -> dict[str, Any]:
-    view, taken, camera = fitted.scene.views[index], fitted.own_display(index), fitted.camera(index)
-    K = np.asarray(camera.K)
+    camera, display = fitted.camera(index), fitted.own_display(index)
+    view, K = fitted.scene.views[index], np.asarray(camera.K)
     return {
         "name": view.name,
         "camera": view.camera,
         "split": view.split,
-        "ev": float(np.log2(taken.exposure / mean)),
-        "gamma": taken.gamma,
-        "balance": _balance(taken),
-        "row": -1 if taken.camera is None else taken.camera,
+        "ev": float(np.log2(display.exposure / mean)),
+        "gamma": display.gamma,
+        "balance": _balance(display),
+        "row": -1 if display.camera is None else display.camera,
         "width": camera.width,
         "height": camera.height,
         "K": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]],

@@ -1,4 +1,4 @@
-"""The Gaussians of a page: all visible ones, or those of largest weight that fit; their error."""
+"""The Gaussians of a page, and their error: all visible ones, or those of largest weight."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from p2gs_jax.types import Camera, Gaussians
 
 # A page with a smaller share of the Gaussians is refused.
 LEAST_SHARE = 0.02
-# Attempts to reach a size from below, and the share of it that each attempt aims at.
+# Attempts to fit into a page, and the share of its room at which each attempt aims.
 ATTEMPTS, MARGIN = 6, 0.985
 # Stops are compared for pixels whose brightest channel has at least this 8-bit level.
 DARKEST_LEVEL = 1.0
-# The least mean square error, which limits the PSNR of equal pictures.
+# The least mean squared error: the PSNR of equal pictures is 100 dB.
 LEAST_ERROR = 1e-10
 
 
@@ -66,20 +66,20 @@ class PageError:
 class PageSplats:
     """The packed Gaussians of a page, with their error against the run.
 
-    The run has `of` Gaussians, with harmonics of a `degree`. No renderer with our rules draws the
-    `unseen` ones, so that leaving them out changes nothing.
+    The run has `total` Gaussians with harmonics of degree `degree`. No camera shows the `unseen`
+    ones, so the page leaves them out.
     """
 
     packed: Packed
     error: PageError
-    of: int
+    total: int
     degree: int
     unseen: int
 
     @property
     def dropped(self) -> int:
-        """Number of visible Gaussians that do not fit."""
-        return self.of - self.unseen - self.packed.count
+        """Number of visible Gaussians that are left out."""
+        return self.total - self.unseen - self.packed.count
 
     @property
     def kept_degree(self) -> int:
@@ -106,9 +106,9 @@ def fit_into(
     their weights in the pictures of `cameras`. The result has the highest median PSNR. `judge`
     returns the error of Gaussians. Raises UserError: hardly any Gaussian fits, or none is visible.
     """
-    seen = ever_drawn(gaussians, cfg)
-    unseen, degree = int((~seen).sum()), degree_of(gaussians.sh.shape[1])
-    whole = chosen(gaussians, seen)
+    drawn = ever_drawn(gaussians, cfg)
+    unseen, degree = int((~drawn).sum()), degree_of(gaussians.sh.shape[1])
+    whole = chosen(gaussians, drawn)
     if whole.capacity == 0:
         raise UserError("the run has no visible Gaussian.", fix="fit it for longer")
 
@@ -135,7 +135,7 @@ def fit_into(
 
 
 def ever_drawn(gaussians: Gaussians, cfg: RenderConfig) -> Bool[np.ndarray, " n"]:
-    """Return which Gaussians a camera can see: finite, and more opaque than the cutoff."""
+    """Return a mask of Gaussians that are finite and more opaque than the cutoff."""
     finite = np.ones(gaussians.capacity, bool)
     for value in (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.sh):
         finite &= np.isfinite(np.asarray(value).reshape(gaussians.capacity, -1)).all(1)
@@ -147,9 +147,9 @@ def ever_drawn(gaussians: Gaussians, cfg: RenderConfig) -> Bool[np.ndarray, " n"
 def weights(
     gaussians: Gaussians, cameras: Sequence[Camera], cfg: RenderConfig
 ) -> Float[np.ndarray, " n"]:
-    """Return the sum of each Gaussian's blending weights over the pixels of some views.
+    """Return the sum of each Gaussian's blending weights over the pixels of all `cameras`.
 
-    This is the derivative of the pictures' sum by log radiance if all radiance is 1.
+    If all radiance is 1, this is the derivative of the sum of all pixels by log radiance.
     """
     plain = replace(cfg, radiance="exp")
     alive = on_device(np.ones(gaussians.capacity), bool)
@@ -177,7 +177,7 @@ def weights(
 
 
 def _largest_that_fits(room: int, gaussians: Gaussians, order: np.ndarray) -> Packed | None:
-    """Return nearly as many of the first Gaussians as fit, packed; None: hardly any fits."""
+    """Return the first Gaussians in `order`, nearly as many as fit; None: hardly any fits."""
     full = pack(gaussians)
     if len(full.data) <= room:
         return full
@@ -198,7 +198,7 @@ def _largest_that_fits(room: int, gaussians: Gaussians, order: np.ndarray) -> Pa
 def page_error(
     gaussians: Gaussians, pictures: Sequence[TruePicture], render: RenderView
 ) -> PageError:
-    """Compare pictures of the page's Gaussians with the true pictures, at least one."""
+    """Compare pictures of the page's Gaussians with one or more true pictures."""
     psnrs, stops = [], []
     for true in pictures:
         linear = linear_light(gaussians, true.camera, render)
@@ -227,5 +227,5 @@ def _stops(linear: Float32[np.ndarray, "h w 3"], true: TruePicture) -> Float[np.
 
 
 def linear_light(g: Gaussians, camera: Camera, render: RenderView) -> Float32[np.ndarray, "h w 3"]:
-    """Return the radiance of all Gaussians in a camera."""
+    """Return the picture of all Gaussians in a camera, linear radiance."""
     return np.asarray(render(g, on_device(np.ones(g.capacity), bool), camera).linear)

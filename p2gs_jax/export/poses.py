@@ -1,4 +1,4 @@
-"""The pose files of a scene in another folder, where its photographs were written again.
+"""The pose files of a scene, written to another folder that holds new photographs.
 
 COLMAP models go to `sparse/0`, their photographs to `images`; the files of all other formats keep
 their place. Files are copied byte for byte, unless the photographs they name have another suffix,
@@ -30,7 +30,7 @@ _MODEL = (*(f"{stem}.{kind}" for stem in _STEMS for kind in ("bin", "txt")), "po
 _LISTS = ("train.txt", "test.txt")
 _FRAMES = ("frames", "test_frames")
 _NAMES_IN_JSON = ("train_filenames", "val_filenames", "test_filenames")
-# Bytes of an image in COLMAP's images.bin before its name, and of each of its keypoints.
+# Sizes in COLMAP's images.bin, bytes: an image up to its name, and a keypoint.
 _BEFORE_NAME, _KEYPOINT = 64, 24
 
 
@@ -41,7 +41,7 @@ class Poses:
     Attributes:
         files: the files, by their place in the new folder.
         stated: the name of each view's photograph in the files, by the name of the view.
-        base: folder of the names in the new folder.
+        base: subfolder of the new folder to which the names are relative.
     """
 
     files: Mapping[str, Path]
@@ -53,41 +53,41 @@ class Poses:
 
         A name keeps its suffix if it is one of `suffixes`, and has the suffix `other` otherwise.
         """
-        out, taken = dict[str, str](), set[str]()
+        out, used = dict[str, str](), set[str]()
         for view, stated in self.stated.items():
-            own = _suffix(stated) or PurePosixPath(view).suffix
+            suffix = _suffix(stated) or PurePosixPath(view).suffix
             stem = PurePosixPath(self.base, stated.removesuffix(_suffix(stated))).as_posix()
-            place = stem + (own if own.lower() in suffixes else other)
-            # Photographs that differ in their suffix alone stay apart.
-            out[view] = place if place not in taken else f"{stem}-{own[1:]}{other}"
-            taken.add(out[view])
+            place = stem + (suffix if suffix.lower() in suffixes else other)
+            # Photographs whose names differ only by suffix get different places.
+            out[view] = place if place not in used else f"{stem}-{suffix[1:]}{other}"
+            used.add(out[view])
         return out
 
     def notes(self, places: Mapping[str, str]) -> list[str]:
-        """Return a note on photographs with other names than in the files of the scene, if any."""
-        other = [at for v, at in places.items() if _suffix(self.stated[v]) not in ("", _suffix(at))]
+        """Return a note on photographs with another suffix than in the scene's files, if any."""
+        other = [p for v, p in places.items() if _suffix(self.stated[v]) not in ("", _suffix(p))]
         note = f"{len(other)} photographs have another suffix than their originals, in the files "
         return [f"{note}with the poses too: {first_few(other)}."] if other else []
 
     def write(self, folder: Path, places: Mapping[str, str], masks: Mapping[str, str]) -> None:
         """Write the files to a folder; photographs and masks are at these places, by view."""
         names = {self.stated[view]: place for view, place in places.items()}
-        below = {old: place.removeprefix("images/") for old, place in names.items()}
+        relative = {old: place.removeprefix("images/") for old, place in names.items()}
         for place, path in self.files.items():
             data = path.read_bytes()
             if path.suffix == ".json":
-                of_name = {self.stated[view]: mask for view, mask in masks.items()}
-                data = _json(path, data, names, of_name, folder)
-            elif any(old != new for old, new in below.items()):
+                by_name = {self.stated[view]: mask for view, mask in masks.items()}
+                data = _json(path, data, names, by_name, folder)
+            elif any(old != new for old, new in relative.items()):
                 if path.name == "images.bin":
-                    data = _binary(data, below)
+                    data = _binary(data, relative)
                 elif path.suffix == ".txt" and path.stem in ("images", "train", "test"):
-                    data = _text(data.decode("utf-8-sig"), below).encode()
+                    data = _text(data.decode("utf-8-sig"), relative).encode()
             write_if_new(folder / place, data)
 
 
 def poses_of(scene: Scene, cache: Path) -> Poses:
-    """Return the pose files of a scene; `cache` has the model of photographs without poses.
+    """Return the pose files of a scene; `cache` has the model made for photographs without poses.
 
     Raises UserError: the scene is of a format that other programs do not read.
     """
@@ -99,8 +99,8 @@ def poses_of(scene: Scene, cache: Path) -> Poses:
         files = {name: root / name for name in _LISTS}
         files |= {f"sparse/0/{name}": model / name for name in (*_MODEL, *_LISTS)}
         stated = [image.name for image in read_model(model).images]
-        there = {place: path for place, path in files.items() if path.is_file()}
-        return Poses(there, _by_view(stated, names))
+        existing = {place: path for place, path in files.items() if path.is_file()}
+        return Poses(existing, _by_view(stated, names))
     if scene.format in ("transforms", "blender"):
         if scene.format == "blender":
             parts = [root / f"transforms_{part}.json" for part in ("train", "test", "val")]
@@ -125,7 +125,7 @@ def write_if_new(path: Path, data: bytes) -> None:
 
 
 def _suffix(name: str) -> str:
-    """Return the suffix of an image file, or nothing: Blender's names have none."""
+    """Return the suffix of an image file, or "": Blender's names have no suffix."""
     suffix = PurePosixPath(name).suffix
     return suffix if suffix.lower() in IMAGE_SUFFIXES else ""
 
@@ -136,16 +136,16 @@ def _frames(data: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def _plain(source: Path, name: str) -> str:
-    """Return a name in a file relative to its folder; no name leads out of it."""
+    """Return a name in the file `source` relative to its folder, which it never leaves."""
     return "/".join(part for part in relative_name(source, name).parts if part != "..")
 
 
 def _by_view(stated: Sequence[str], views: Sequence[str]) -> dict[str, str]:
-    """Return the name in the pose files of each view, which may have more folders in front."""
+    """Return the name of each view in the pose files, which may begin with more folders."""
     best: dict[str, str] = {}
     parts = {name: PurePosixPath(name).parts for name in stated}
     for depth in range(max(map(len, parts.values()))):
-        tails = {"/".join(of_name[depth:]): name for name, of_name in parts.items()}
+        tails = {"/".join(folders[depth:]): name for name, folders in parts.items()}
         found = {view: tails[tail] for tail, view in alike_names(tails, views).items()}
         best = max(best, found, key=len)
     return best
@@ -154,7 +154,7 @@ def _by_view(stated: Sequence[str], views: Sequence[str]) -> dict[str, str]:
 def _json(
     path: Path, data: bytes, names: Mapping[str, str], masks: Mapping[str, str], folder: Path
 ) -> bytes:
-    """Return a transforms.json with other names and masks; files that it names are copied."""
+    """Return a transforms.json with other names and masks; copy other files that it names."""
     before = read_json(path, FIX)
     content, new = copy.deepcopy(before), dict[str, str]()
     for key in _FRAMES:

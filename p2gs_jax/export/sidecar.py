@@ -1,4 +1,4 @@
-"""`linear.json`: everything that another program needs to render `linear.ply` as we do.
+"""`linear.json`: the data that another program needs to render `linear.ply` as we do.
 
 docs/exports.md describes the fields; raise VERSION whenever their meaning changes.
 """
@@ -57,7 +57,7 @@ FIELDS = {
     "spherical_harmonics": "coefficient 0 of channel c is f_dc_c; coefficient k > 0 is "
     "f_rest_(c (K - 1) + k - 1); K is `coefficients`",
 }
-# The range of the tabulated tone curve in stops around 1, and the number of samples.
+# Range of the tabulated tone curve, stops from exposed radiance 1, and the number of samples.
 DARKEST_EV, BRIGHTEST_EV, SAMPLES = -14.0, 4.0, 433
 
 
@@ -75,7 +75,7 @@ def linear_sidecar(
 ) -> dict[str, Any]:
     """Return the content of the JSON file beside the PLY of these Gaussians.
 
-    `cfg` has the chosen model and curve, `store` the cameras at the size of the fit.
+    `cfg` has the model and curve of the fit, `store` the cameras at its image size.
     """
     count, coefficients = gaussians.sh.shape[:2]
     return {
@@ -153,7 +153,7 @@ def _tone(cfg: FitConfig, photometry: PhotometryFile) -> dict[str, Any]:
 def _base(
     exposed: Float[np.ndarray, " s"], p: PhotometryConfig, camera: int | None
 ) -> Float32[np.ndarray, "s 3"]:
-    """Return display values of each channel under a camera's curve; None: an unknown camera."""
+    """Return display values of greys under the curves of a camera (None: the mean curves)."""
     grey = np.repeat(exposed[:, None], 3, 1)
     transform = DisplayTransform(1.0, GAMMA_SRGB, p, camera=camera).without_place()
     return develop(grey, transform)
@@ -167,8 +167,8 @@ def _views(
     out = []
     for index, view in enumerate(scene.views):
         viewmat, K, width, height = store.camera(index)
-        taken = {key: photometry.get(view.name, {}).get(key) for key in keys}
+        values = {key: photometry.get(view.name, {}).get(key) for key in keys}
         camera = {"width": width, "height": height, "K": K, "viewmat": viewmat}
         name = {"image": view.name, "camera": view.camera, "split": view.split}
-        out.append({**name, **taken, **camera})
+        out.append({**name, **values, **camera})
     return out

@@ -1,6 +1,6 @@
-"""Solved photometry in the words of other trainers: PPISP (gsplat, LichtFeld), 3DGS, nerfstudio.
+"""Solved photometry in the files of other trainers: PPISP (gsplat, LichtFeld), 3DGS, nerfstudio.
 
-docs/exports.md says how to pass each program its file.
+docs/exports.md explains how to pass each file to its program.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from p2gs_jax.types import GAMMA_SRGB, View
 def write_for(trainers: Sequence[str], folder: Path, views: Sequence[View]) -> list[str]:
     """Write the files of some trainers beside the `photometry.json` of a calibration.
 
-    `views` are the calibrated photographs. Returns a sentence on each file. It says so if the
-    program cannot express this photometry and the file is not written.
+    `views` are the calibrated photographs. Returns a sentence on each file, or the reason why it
+    is not written: the program cannot express this photometry.
     """
     saved = read_photometry(folder / "photometry.json")
     writers = {"ppisp": _ppisp, "3dgs": _3dgs, "nerfstudio": _nerfstudio}
@@ -65,8 +65,8 @@ def _3dgs(folder: Path, saved: PhotometryFile, views: Sequence[View]) -> str:
     path, common = folder / "exposure.json", common_look(folder, saved)
     cameras, curve = common.formation.cameras, common.formation.curve
     gammas = [row["gamma"] for row in saved["views"] if row["gamma"] is not None]
-    by_place = any(camera.vignetting or camera.splines for camera in cameras)
-    if curve not in ("power", "linear") or np.ptp(gammas) > 1e-6 or by_place:
+    varied = any(camera.vignetting or camera.splines for camera in cameras)
+    if curve not in ("power", "linear") or np.ptp(gammas) > 1e-6 or varied:
         return (
             f"{path.name} is not written: with the curve {curve}, vignetting or gammas that vary, "
             "photographs differ by more than a matrix of 3DGS. Train on developed ones (--develop)."

@@ -21,7 +21,7 @@ from p2gs_jax.scene.convert.readers import ExifSettings
 from p2gs_jax.types import Camera
 
 BT709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
-HALF_MAX = 65504.0
+HALF_MAX = 65504.0  # largest finite 16-bit float
 
 
 def write_exr(
@@ -31,20 +31,20 @@ def write_exr(
     half: bool = True,
     depth: Float32[np.ndarray, "h w"] | None = None,
     alpha: Float32[np.ndarray, "h w"] | None = None,
-    taken: DisplayTransform | None = None,
+    transform: DisplayTransform | None = None,
     camera: Camera | None = None,
     shot: ExifSettings | None = None,
     comments: str = "linear relative radiance; no exposure applied",
 ) -> None:
     """Write linear radiance, without exposure applied; docs/exports.md lists the header.
 
-    Colours and `alpha` (channel A) are 16-bit floats with `half`, unless a value would overflow.
-    Depth is alpha-weighted, and is written as expected depth in channel Z, 32 bits. `taken`,
-    `camera` and `shot` are the display transform, camera and EXIF settings of the header.
+    With `half` colours and `alpha` (channel A) are 16-bit floats, unless a colour would overflow.
+    `depth` is camera z times alpha; channel Z holds expected depth as 32-bit floats. The header
+    describes `transform`, `camera` and the EXIF settings `shot`.
     """
     linear = np.asarray(linear, np.float32)
-    small = half and bool(np.all(np.abs(linear) <= HALF_MAX))
-    pixel = np.float16 if small else np.float32
+    as_half = half and bool(np.all(np.abs(linear) <= HALF_MAX))
+    pixel = np.float16 if as_half else np.float32
     header: dict = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
@@ -52,8 +52,8 @@ def write_exr(
         "adoptedNeutral": BT709[6:],
         "comments": comments,
     }
-    if taken is not None:
-        header |= _display_attributes(taken)
+    if transform is not None:
+        header |= _display_attributes(transform)
     if camera is not None:
         header |= camera_attributes(camera)
     if shot is not None:
@@ -92,20 +92,20 @@ def camera_attributes(camera: Camera) -> dict:
 
 
 def _for_rows(matrix: Float[np.ndarray, "4 4"]) -> Float32[np.ndarray, "4 4"]:
-    """Return the matrix for row vectors, contiguous because OpenEXR ignores strides."""
+    """Return a matrix for row vectors, contiguous because OpenEXR ignores strides."""
     return np.ascontiguousarray(matrix.T, np.float32)
 
 
-def _display_attributes(taken: DisplayTransform) -> dict:
+def _display_attributes(transform: DisplayTransform) -> dict:
     """Return exposure and gamma, and white balance and vignetting if they are modelled."""
     out: dict[str, Any] = {
-        "p2gsExposure": float(taken.exposure),
-        "p2gsExposureEV": float(np.log2(taken.exposure)),
-        "p2gsGamma": float(taken.gamma),
+        "p2gsExposure": float(transform.exposure),
+        "p2gsExposureEV": float(np.log2(transform.exposure)),
+        "p2gsGamma": float(transform.gamma),
     }
-    if taken.white_balance is not None:
-        out["p2gsWhiteBalance"] = tuple(float(w) for w in np.exp(taken.white_balance))
-    rows = taken.vignetting * 3 if len(taken.vignetting) == 1 else taken.vignetting
+    if transform.white_balance is not None:
+        out["p2gsWhiteBalance"] = tuple(float(w) for w in np.exp(transform.white_balance))
+    rows = transform.vignetting * (3 if len(transform.vignetting) == 1 else 1)
     for name, row in zip(("Red", "Green", "Blue"), rows, strict=False):
         out[f"p2gsVignetting{name}"] = tuple(row)
     return out

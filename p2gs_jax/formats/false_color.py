@@ -9,15 +9,15 @@ import matplotlib
 import numpy as np
 from jaxtyping import Float, Float32
 
-# Weights of BT.709 primaries in luminance (the linear radiance's primaries).
-BT709 = (0.2126, 0.7152, 0.0722)
-STOPS = (-6.0, 6.0)
+# Weights of the BT.709 primaries in luminance; linear radiance has these primaries.
+WEIGHTS = (0.2126, 0.7152, 0.0722)
+STOPS = (-6.0, 6.0)  # ends of the map of false colours, stops from its middle
 STOPS_MAP, DEPTH_MAP = "viridis", "cividis"
 
 
 def luminance(linear: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "..."]:
     """Return the luminance of linear BT.709 radiance."""
-    return np.asarray(linear) @ np.asarray(BT709, np.float32)
+    return np.asarray(linear) @ np.asarray(WEIGHTS, np.float32)
 
 
 def stops(linear: Float[np.ndarray, "... 3"], middle: float) -> Float[np.ndarray, "..."]:
@@ -26,9 +26,9 @@ def stops(linear: Float[np.ndarray, "... 3"], middle: float) -> Float[np.ndarray
 
 
 def false_color(linear: Float[np.ndarray, "h w 3"], middle: float) -> Float32[np.ndarray, "h w 3"]:
-    """Return luminance as colour, one step of the map for each whole stop from `middle`.
+    """Return luminance as colour, one step of the map for each stop from the luminance `middle`.
 
-    `STOPS` are the ends of the map; values beyond are clamped.
+    Luminances beyond the ends of the map, `STOPS`, have the colours of its ends.
     """
     low, high = STOPS
     whole = np.clip(np.floor(stops(linear, middle)), low, high - 1)
@@ -38,9 +38,9 @@ def false_color(linear: Float[np.ndarray, "h w 3"], middle: float) -> Float32[np
 def depth_color(
     depth: Float[np.ndarray, "h w"], alpha: Float[np.ndarray, "h w"], limits: tuple[float, float]
 ) -> Float32[np.ndarray, "h w 3"]:
-    """Return expected depth as colour, near bright, linear in 1 / depth; black for transparency.
+    """Return expected depth as colour, linear in 1 / depth: near is bright, transparent black.
 
-    `depth` is alpha-weighted; `limits` are the nearest and the farthest depth, scene units.
+    `depth` is camera z times alpha; `limits` are the nearest and the farthest depth, scene units.
     """
     opaque = alpha > 0.5
     inverse = np.where(opaque, alpha / np.maximum(depth, 1e-9), 0)

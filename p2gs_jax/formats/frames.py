@@ -30,7 +30,7 @@ SMALLEST = 16
 class OutputFrame:
     """A rendered picture: radiance without exposure, opacity, and display values in [0, 1].
 
-    `name` is the name of its files without suffix, possibly with subfolders. `transform` converts
+    `name` is the path of its files in the output folder, without suffix. `transform` converts
     `linear` to `ldr`; `depth` is camera z times alpha, scene units; `photograph` has the display
     values of the photograph at this pose.
     """
@@ -66,7 +66,7 @@ def write_frame(folder: Path, frame: OutputFrame) -> None:
         frame.linear,
         depth=frame.depth,
         alpha=frame.alpha,
-        taken=frame.transform,
+        transform=frame.transform,
         camera=frame.camera,
     )
     if frame.photograph is None:
@@ -94,7 +94,7 @@ def shrunk(image: Float[np.ndarray, "h w c"], longest: int) -> Float[np.ndarray,
 
 
 def notebook_html(rows: Mapping[str, object], picture: Path) -> str:
-    """Return a table of named values and, if it exists, a picture file, for a notebook."""
+    """Return HTML for a notebook: a table of named values, and the picture file if it exists."""
     row = "<tr><th>{}</th><td>{}</td></tr>".format
     cells = [row(html.escape(name), html.escape(str(value))) for name, value in rows.items()]
     table, image = f"<table>{''.join(cells)}</table>", cv2.imread(str(picture))
@@ -128,7 +128,7 @@ def open_video(
     frames are centred on black, larger ones are cut. Display values are tagged as BT.709 primaries
     with the sRGB curve. Raises UserError: the size is too small, or PyAV has no encoder.
     """
-    # The import is here, because a fit writes pictures but no video.
+    # This import is late, because a fit writes pictures but no video.
     import av
     from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 

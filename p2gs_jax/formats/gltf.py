@@ -1,7 +1,7 @@
 """Binary glTF with KHR_gaussian_splatting (Khronos): a point primitive whose attributes are splats.
 
 Attributes follow the extension: scales are lengths, opacities are in [0, 1], rotations are x y z w,
-harmonics are those of 3DGS. glTF's world has y up: COLMAP's is turned by 180 degrees about x.
+harmonics are as in 3DGS. glTF's world has y up, so COLMAP's axes are turned by 180 degrees about x.
 https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting
 """
 
@@ -23,9 +23,9 @@ from p2gs_jax.render.harmonics import degree_of
 from p2gs_jax.types import Gaussians
 
 EXTENSION = "KHR_gaussian_splatting"
-FLOAT, POINTS, ARRAY_BUFFER = 5126, 0, 34962
-KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
-MAGIC, VERSION, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
+FLOAT, POINTS, ARRAY_BUFFER = 5126, 0, 34962  # glTF's codes
+KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}  # by number of components
+MAGIC, VERSION, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 2, 0x4E4F534A, 0x004E4942  # of GLB
 
 
 def write_gltf(path: Path, gaussians: Gaussians) -> int:

@@ -3,8 +3,8 @@
 SPZ (https://github.com/nianticlabs/spz) is about 8 times smaller than PLY. Its axes are right, up,
 back; COLMAP's world has right, down, forward. This module converts the axes, and chooses the
 number of fractional bits so that no position is clipped. Compressed PLY is the format of
-PlayCanvas and SuperSplat: a Gaussian has 16 bytes and its harmonics; blocks of 256 Gaussians share
-the ranges in which positions, scales and colours are quantised.
+PlayCanvas and SuperSplat: a Gaussian has 16 bytes besides its harmonics; blocks of 256 Gaussians
+share the ranges in which positions, scales and colours are quantised.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ LARGEST_INTEGER, MOST_FRACTIONAL_BITS = 2**23 - 1, 24
 
 
 def require_gsply() -> ModuleType:
-    """Return the package for both formats; UserError: it cannot be imported."""
+    """Return the package gsply; UserError: it cannot be imported."""
     try:
         import gsply
     except ImportError as error:
@@ -67,7 +67,7 @@ def write_compressed_ply(path: Path, gaussians: Gaussians) -> int:
 
 
 def read_compressed_ply(path: Path) -> Gaussians:
-    """Read Gaussians in the order of the file; UserError: they cannot be read."""
+    """Read Gaussians in the order of the file; UserError: the file cannot be read."""
     gsply = require_gsply()
     try:
         data = gsply.decompress_from_bytes(path.read_bytes())
@@ -105,7 +105,7 @@ def fractional_bits(means: np.ndarray) -> int:
 
 
 def read_spz(path: Path) -> Gaussians:
-    """Read Gaussians, with axes right, down, forward; UserError: they cannot be read."""
+    """Read Gaussians, with axes right, down, forward; UserError: the file cannot be read."""
     require_gsply()
     from gsply.spz import read_spz as read
 

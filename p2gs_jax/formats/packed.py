@@ -1,9 +1,9 @@
-"""Gaussians in few bytes: columns of small integers between the bounds of their neighbourhood.
+"""Gaussians in few bytes: columns of small integers between the bounds of a chunk.
 
 Neighbours in space follow each other (Morton order) and form chunks. Every column of a chunk is
 stored as integers between its least and its largest value, with separate low and high bytes, and
-deflated. Lengths and (under the activation `exp`) radiance are logarithms, opacities are logits:
-errors are factors at any dynamic range. `p2gs_jax/export/web/decode.js` reads this format.
+deflated. Lengths and (under the activation `exp`) radiance are logarithms, and opacities logits, so
+that errors are relative at any dynamic range. `p2gs_jax/export/web/decode.js` reads this format.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ CHUNK = 256
 MEANS, SCALES, ROTATIONS, OPACITY, BASE, BANDS = 16, 10, 11, 10, 12, 8
 # Columns before the harmonics: 3 each for centres, lengths and rotations, and 1 for opacity.
 GEOMETRY = 10
-# Splats with logits beyond this limit are opaque or transparent within 2e-7.
+# Beyond this limit of the logit, opacity is within 2e-7 of 0 or 1.
 LOGIT_LIMIT = 16.0
 
 
@@ -94,19 +94,19 @@ def pack(gaussians: Gaussians) -> Packed:
 
 
 def unpack(packed: Packed) -> Gaussians:
-    """Return the Gaussians that a reader of the bytes gets."""
+    """Return the Gaussians as a reader of the bytes decodes them."""
     raw, count, bits = zlib.decompress(packed.data), packed.count, column_bits(packed.coefficients)
     chunks = -(-count // CHUNK)
     bounds = np.frombuffer(raw, "<f4", 2 * len(bits) * chunks).reshape(len(bits), 2, chunks)
     at, columns = bounds.nbytes, np.empty((len(bits), count), np.float32)
-    for row, column_of_bits in enumerate(bits):
+    for row, width in enumerate(bits):
         whole = np.frombuffer(raw, np.uint8, count, at).astype(np.float64)
         at += count
-        if column_of_bits > 8:
+        if width > 8:
             whole += 256.0 * np.frombuffer(raw, np.uint8, count, at)
             at += count
         low, high = (np.repeat(bounds[row, k].astype(np.float64), CHUNK)[:count] for k in (0, 1))
-        columns[row] = low + whole * (high - low) / (2**column_of_bits - 1)
+        columns[row] = low + whole * (high - low) / (2**width - 1)
     xyz = columns[6:9].T
     w = np.sqrt(np.maximum(1 - (xyz.astype(np.float64) ** 2).sum(1), 0))
     sh = columns[GEOMETRY:].reshape(packed.coefficients, 3, count).transpose(2, 0, 1)
@@ -132,10 +132,10 @@ def _columns(g: Gaussians) -> Float32[np.ndarray, "c n"]:
 
 
 def _small_rotations(quats: np.ndarray) -> Float32[np.ndarray, "n 3"]:
-    """Return x, y, z of a unit quaternion with the largest w that gives the same ellipsoids.
+    """Return x, y, z of the unit quaternion with the largest w for the same ellipsoid.
 
-    A half turn about one of its axes does not change an ellipsoid. It is the product with i, j or
-    k, which moves any component to the place of w.
+    A half turn about one of its axes does not change an ellipsoid. In quaternions this turn is the
+    product with i, j or k, which moves any component to the place of w.
     """
     q = quats.astype(np.float64)
     length = np.linalg.norm(q, axis=1, keepdims=True)

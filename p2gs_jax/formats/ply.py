@@ -1,7 +1,7 @@
 """Gaussians as PLY in the field order of the reference implementation (Inria).
 
-Common viewers show files with display colours (gaussians/bake.py) correctly; `radiance.ply` holds
-the linear coefficients before the activation.
+Files hold display colours (gaussians/bake.py), which common viewers show correctly, or the linear
+coefficients before the activation of radiance (`radiance.ply`, `linear.ply`).
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ def field_names(coefficients: int) -> list[str]:
 LINEAR = "p2gs-jax: linear HDR radiance"
 # Fields of vibrating Gaussians, after those of the reference implementation.
 VIBRATION = ("velocity_x", "velocity_y", "velocity_z", "peak_time", "log_life")
-# Rows that are written or read at a time, about 16 MB; a whole file may have gigabytes.
+# Rows that are written or read at a time, about 16 MB; a whole file may have some gigabytes.
 CHUNK = 65536
 
 
 def unit_quats(gaussians: Gaussians) -> Float[np.ndarray, "n 4"]:
-    """Return rotations as wxyz of length 1, in float64; zeros stay zeros."""
+    """Return unit quaternions wxyz in float64; zero quaternions stay zero."""
     quats = np.asarray(gaussians.quats, np.float64)
     return quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)
 
@@ -50,7 +50,7 @@ def unit_quats(gaussians: Gaussians) -> Float[np.ndarray, "n 4"]:
 def write_ply(path: Path, gaussians: Gaussians, comments: Sequence[str]) -> int:
     """Write Gaussians without conversion; return their number.
 
-    Comments are header lines, with all characters except ASCII escaped.
+    `comments` become lines of the header, with all characters except ASCII escaped.
     """
     g = jax.tree.map(np.asarray, gaussians)
     names = [*field_names(g.sh.shape[1]), *(() if g.vibration is None else VIBRATION)]
@@ -66,10 +66,10 @@ def _columns(g: Gaussians, rows: slice) -> Float[np.ndarray, "k c"]:
     """Return some Gaussians as rows of the table."""
     sh = g.sh[rows]
     count = len(sh)
-    moves = []
+    vibration = []
     if g.vibration is not None:
         v = g.vibration
-        moves = [v.velocities[rows], v.peaks[rows][:, None], v.log_lives[rows][:, None]]
+        vibration = [v.velocities[rows], v.peaks[rows][:, None], v.log_lives[rows][:, None]]
     columns = [
         g.means[rows],
         np.zeros((count, 3), np.float32),
@@ -79,7 +79,7 @@ def _columns(g: Gaussians, rows: slice) -> Float[np.ndarray, "k c"]:
         g.opacity_logits[rows][:, None],
         g.log_scales[rows],
         g.quats[rows],
-        *moves,
+        *vibration,
     ]
     return np.concatenate(columns, axis=1).astype("<f4")
 
@@ -103,7 +103,7 @@ def read_ply(path: Path, fix: str = RESTORE) -> Gaussians:
 
 
 def _read(vertex: np.ndarray) -> Gaussians:
-    """Return the Gaussians of a table, which is read once, `CHUNK` rows at a time."""
+    """Return the Gaussians of a table; each row is read once, `CHUNK` rows at a time."""
     names = vertex.dtype.names or ()
     bands = sum(n.startswith("f_rest_") for n in names) // 3
     harmonics = [[f"f_dc_{c}" for c in range(3)]]

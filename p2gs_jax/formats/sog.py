@@ -25,7 +25,7 @@ VERSION = 2
 PARTS = ("scales", "sh0", "shN")  # the parts of `meta.json` with tables
 # Palette entries in a row of its texture.
 PALETTE_ROW = 64
-# The alpha of a rotation is this plus the place of the omitted component among w, x, y, z.
+# The alpha of a rotation is this plus the index of the omitted component in w, x, y, z.
 FIRST_OMITTED = 252
 # Opacities of 8 bits are at least half a step from 0 and 1, so that logits are finite.
 LEAST_OPACITY = 0.5 / 255
@@ -36,7 +36,7 @@ def read_sog(path: Path) -> Gaussians:
 
     Raises:
         OSError: the file or a texture cannot be read.
-        ValueError: it is not such a ZIP, is of another version, or its content disagrees.
+        ValueError: the file is not a ZIP, has another version, or its parts disagree.
         KeyError: a texture or a field of `meta.json` is missing.
     """
     try:
@@ -65,8 +65,8 @@ def _read(file: zipfile.ZipFile) -> Gaussians:
     base = texels("sh0")
     sh = tables["sh0"][base[:, None, :3]]
     if "shN" in meta:
-        each = (meta["shN"]["bands"] + 1) ** 2 - 1
-        palette = texture("shN")[:, : PALETTE_ROW * each, :3].reshape(-1, each, 3)
+        size = (meta["shN"]["bands"] + 1) ** 2 - 1
+        palette = texture("shN")[:, : PALETTE_ROW * size, :3].reshape(-1, size, 3)
         labels = texels("shN", 1)[:, :2] @ np.array([1, 256])
         sh = np.concatenate([sh, tables["shN"][palette[labels]]], axis=1)
     logits = logit(np.clip(base[:, 3] / 255, LEAST_OPACITY, 1 - LEAST_OPACITY))
@@ -82,6 +82,6 @@ def _rotations(texels: UInt8[np.ndarray, "n 4"]) -> np.ndarray:
     omitted = texels[:, 3].astype(int) - FIRST_OMITTED
     three = (texels[:, :3] / 255 - 0.5) * np.sqrt(2)
     largest = np.sqrt(np.maximum(1 - (three**2).sum(1, keepdims=True), 0))
-    # The place of each component among the omitted one, which comes first, and the others.
+    # For each omitted component: the indices of w, x, y, z in `largest` followed by `three`.
     places = np.argsort([[k, *(j for j in range(4) if j != k)] for k in range(4)], axis=1)
     return np.take_along_axis(np.concatenate([largest, three], 1), places[omitted], 1)

@@ -1,7 +1,7 @@
 """OpenUSD: a ParticleField3DGaussianSplat and a camera for every photograph, through Pixar's pxr.
 
 The stage is right-handed with y up, and one scene unit is stated as one metre. Cameras look along
--z with y up, as USD requires; their lengths are in tenths of a scene unit.
+-z with y up, as USD requires. Their apertures and focal lengths are in tenths of a scene unit.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from p2gs_jax.gaussians.posed import FLIP, half_turn
 from p2gs_jax.render.harmonics import degree_of
 from p2gs_jax.types import Camera, Gaussians
 
-# Width of 35 mm film, the usual reference of focal lengths.
+# Width of 35 mm film, to which focal lengths usually refer.
 APERTURE_MM = 36.0
-TENTHS_PER_MM = 0.01
+TENTHS_PER_MM = 0.01  # tenths of a scene unit, which is 1 m
 MODULES = ("Gf", "Usd", "UsdGeom", "UsdVol", "Vt")
 SPLATS, CAMERAS = "/scene/splats", "/scene/cameras"
 
@@ -31,7 +31,7 @@ SPLATS, CAMERAS = "/scene/splats", "/scene/cameras"
 def require_pxr() -> tuple[Any, ...]:
     """Return pxr's Gf, Usd, UsdGeom, UsdVol and Vt, which have no types.
 
-    Raises UserError: OpenUSD is not installed, or too old for splats.
+    Raises UserError: OpenUSD is not installed, or is too old for splats.
     """
     try:
         found = [importlib.import_module(f"pxr.{name}") for name in MODULES]
@@ -85,7 +85,7 @@ def write_usd(path: Path, gaussians: Gaussians, cameras: Mapping[str, Camera]) -
 
 
 def _extent(means: np.ndarray, scales: np.ndarray) -> np.ndarray:
-    """Return the box about all Gaussians up to three standard deviations."""
+    """Return the box around all Gaussians up to three of their largest standard deviations."""
     if not len(means):
         return np.zeros((2, 3), np.float32)
     reach = 3 * scales.max(1, keepdims=True)
@@ -99,14 +99,14 @@ def _define_camera(stage: Any, path: str, name: str, camera: Camera) -> None:
     pose = turn @ np.linalg.inv(np.asarray(camera.viewmat, np.float64)) @ turn
     K, width, height = np.asarray(camera.K), camera.width, camera.height
     aperture = APERTURE_MM * TENTHS_PER_MM
-    across = aperture / width
-    along = across * K[0, 0] / K[1, 1]
+    pixel_width = aperture / width
+    pixel_height = pixel_width * K[0, 0] / K[1, 1]
     prim = UsdGeom.Camera.Define(stage, path)
     # USD multiplies row vectors.
     prim.AddTransformOp().Set(Gf.Matrix4d(pose.T.tolist()))
-    prim.CreateFocalLengthAttr(float(K[0, 0] * across))
+    prim.CreateFocalLengthAttr(float(K[0, 0] * pixel_width))
     prim.CreateHorizontalApertureAttr(aperture)
-    prim.CreateVerticalApertureAttr(float(height * along))
-    prim.CreateHorizontalApertureOffsetAttr(float((width / 2 - K[0, 2]) * across))
-    prim.CreateVerticalApertureOffsetAttr(float((K[1, 2] - height / 2) * along))
+    prim.CreateVerticalApertureAttr(float(height * pixel_height))
+    prim.CreateHorizontalApertureOffsetAttr(float((width / 2 - K[0, 2]) * pixel_width))
+    prim.CreateVerticalApertureOffsetAttr(float((K[1, 2] - height / 2) * pixel_height))
     prim.GetPrim().SetMetadata("comment", name)

@@ -187,7 +187,7 @@ def exr_bytes(frame: RenderedFrame, transform: DisplayTransform) -> bytes:
             np.asarray(frame.linear),
             depth=frame.depth,
             alpha=frame.alpha,
-            taken=transform,
+            transform=transform,
             camera=frame.camera,
         )
         return path.read_bytes()

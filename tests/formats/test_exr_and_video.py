@@ -38,7 +38,7 @@ def test_exr_holds_radiance_exposure_and_depth(tmp_path):
     depth, alpha = np.full((7, 9), 4.0, np.float32), np.full((7, 9), 0.5, np.float32)
     path = tmp_path / "a.exr"
     taken = DisplayTransform(2.0, 2.1, PhotometryConfig())
-    write_exr(path, linear, depth=depth, alpha=alpha, taken=taken)
+    write_exr(path, linear, depth=depth, alpha=alpha, transform=taken)
     back, _, header = read_exr(path)
     np.testing.assert_allclose(back, linear, rtol=1e-3)
     assert header["p2gsExposure"] == 2.0
@@ -95,13 +95,13 @@ def test_the_header_holds_white_balance_and_vignetting(tmp_path):
         cfg = PhotometryConfig(cameras=(CameraFormation("a"), CameraFormation("b", rows)))
         balance = (0.2, -0.05, -0.15)
         taken = DisplayTransform(1.0, 2.2, cfg, white_balance=balance, camera=1)
-        write_exr(path, linear, taken=taken)
+        write_exr(path, linear, transform=taken)
         header = read_exr(path)[-1]
         np.testing.assert_allclose(header["p2gsWhiteBalance"], np.exp(balance), rtol=1e-6)
         each = rows if len(rows) == 3 else rows * 3
         for name, row in zip(("Red", "Green", "Blue"), each, strict=True):
             np.testing.assert_allclose(header[f"p2gsVignetting{name}"], row, rtol=1e-6)
-    write_exr(path, linear, taken=taken.without_place())
+    write_exr(path, linear, transform=taken.without_place())
     assert "p2gsVignettingRed" not in read_exr(path)[-1]
 
 

@@ -1,6 +1,6 @@
 // Cameras have the run's axes (x right, y down, z forward), a rotation R from world to camera
 // (row-major) and a centre c in the world.
-// A lens belongs to a picture {width, height, fx, fy, cx, cy}, which is fitted into the window.
+// A view's lens is {width, height, fx, fy, cx, cy}, pixels; in a window it is [fx, fy, cx, cy].
 
 const row = (m, i) => [m[3 * i], m[3 * i + 1], m[3 * i + 2]];
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -17,7 +17,7 @@ function cameraOf(view) {
   return { R, c, lens: { width: view.width, height: view.height, fx, fy, cx, cy } };
 }
 
-// Return the window pixels per pixel of the lens's picture, which is shown completely.
+// Return the window pixels per pixel of a lens's picture that is shown completely.
 const fit = (lens, width, height) => Math.min(width / lens.width, height / lens.height);
 
 function intoWindow({ R, c, lens }, width, height) {
@@ -50,7 +50,7 @@ function turned(camera, M, about) {
   return { ...camera, R, c: plus(about, times(M, plus(camera.c, about, -1))) };
 }
 
-// Return a camera after a yaw about `up` and a pitch about its x axis, never quite to the vertical.
+// Return a camera after a yaw about `up` and a pitch about its x axis that ends before the vertical.
 function lookAround(camera, yaw, pitch, about, up) {
   let out = turned(camera, turn(up, yaw), about);
   const tilted = turned(out, turn(row(out.R, 0), pitch), about);
@@ -73,8 +73,8 @@ function rotation([w, x, y, z]) {
     2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)];
 }
 
-// Return a camera between two others. Its centre is on the line between theirs, its rotation on
-// the arc, and its lens is that of the nearer one.
+// Return a camera between two others: it is on the line between their centres, its rotation is on
+// the arc between their rotations, and it has the lens of the nearer camera.
 function between(a, b, share) {
   const p = quaternion(a.R), q = quaternion(b.R);
   let cos = p.reduce((s, v, k) => s + v * q[k], 0);
@@ -88,7 +88,7 @@ function between(a, b, share) {
     lens: share < 0.5 ? a.lens : b.lens };
 }
 
-// Return the depth of the first surface at a pixel, from the Gaussians with centres near it.
+// Return the first quartile of depths of Gaussians more opaque than 0.5 near a pixel, or null.
 function depthAt(splats, camera, x, y) {
   const found = [], opacities = splats.triples[3], reach = 24;
   const { means } = splats, { R, c } = camera, [fx, fy, cx, cy] = camera.lens;

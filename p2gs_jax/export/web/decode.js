@@ -13,7 +13,7 @@ async function inflate(bytes) {
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-// Return interleaved triples of columns: centres, logarithms of lengths, rotations (x y z of a
+// Return triples of columns, interleaved: centres, logarithms of lengths, rotations (x y z of a
 // unit quaternion), opacity (a logit and two zeros), then the channels of every harmonic.
 async function decodeSplats(header, text) {
   const raw = await inflate(bytesOfBase64(text));

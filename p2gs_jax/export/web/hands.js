@@ -1,6 +1,6 @@
 // Mouse, touch and keys that move the camera.
 
-// Speeds are in radians per pixel, radians per second, and scene depths per second.
+// Speeds in radians per pixel, radians per second, and scene depths per second; factor of Shift.
 const TURN = 0.005, KEYS_TURN = 0.9, KEYS_STEP = 0.5, FAST = 4;
 const MOVES = ["KeyW", "KeyA", "KeyS", "KeyD", "KeyQ", "KeyE", "ShiftLeft", "ShiftRight",
   "ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown"];
@@ -9,7 +9,7 @@ const typing = (e) => e.ctrlKey || e.metaKey || e.altKey || e.target.matches("se
   (e.target.matches("[type=range]") && e.code.startsWith("Arrow"));
 
 class Hands {
-  // `page` has camera, pivot, up, depth and fly; moved() and clicked() notify it.
+  // `page` is the Page of main.js; its moved(), clicked() and grabbed() are called.
   constructor(element, page) {
     Object.assign(this, { element, page, fingers: new Map(), held: new Set(), travelled: 0 });
     element.addEventListener("pointerdown", (e) => this.down(e));

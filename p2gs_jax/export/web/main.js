@@ -1,13 +1,14 @@
-// The page: its state, the effects of its controls, and the times to draw.
+// The page: its state, the effects of its controls, and when it draws.
 
 const SHOWS = ["picture", "stops", "clipping", "split"];
 const SHOW_NAMES = { picture: "picture", stops: "stops", clipping: "clipping", split: "photo | render" };
 const CURVE_NAMES = { spline: "fitted", srgb: "sRGB", power: "power 2.2", linear: "none" };
-// Frames that take longer than SLOW, seconds, are drawn smaller while the camera moves.
+// While the camera moves, frames that take more than SLOW seconds become smaller, down to the scale
+// SMALLEST, and those below QUICK larger. REST seconds after a move they have the full size.
 const SLOW = 0.06, QUICK = 0.03, SMALLEST = 0.2, REST = 0.25;
 
 const $ = (id) => document.getElementById(id);
-// Return the picture's pixels per pixel of the window; more than two are not visible.
+// Return the picture's pixels per CSS pixel; more than two are not visible.
 const density = () => Math.min(devicePixelRatio, 2);
 
 class Page {
@@ -52,7 +53,7 @@ class Page {
     });
   }
 
-  // A device may be lost, for example while a phone has the page in the background, and return.
+  // The device may be lost and return, for example while a phone has the page in the background.
   awaitLoss(canvas) {
     canvas.addEventListener("webglcontextlost", (e) => {
       e.preventDefault();
@@ -89,7 +90,7 @@ class Page {
     return Math.max(dot(row(R, 2), plus(this.pivot, c, -1)), 0.01 * this.depth);
   }
 
-  // The hands call these.
+  // hands.js calls the next three methods.
   grabbed(x, y) {
     $("hands").focus({ preventScroll: true });
     const camera = this.windowCamera(1 / density());
@@ -149,7 +150,6 @@ class Page {
     return far.indexOf(Math.min(...far));
   }
 
-  // Controls.
   controls() {
     const { look } = this.state, wake = () => this.show();
     const change = (id, event, act) => $(id).addEventListener(event, () => { act($(id)); wake(); });
@@ -229,7 +229,7 @@ class Page {
     $("play").textContent = "▶ play";
   }
 
-  // Go to a place along the drive, in photographs.
+  // Go to a position along the drive, counted in photographs.
   drive(place) {
     const views = this.drives[$("along").value].map((i) => this.scene.views[i]);
     const first = Math.min(Math.floor(place), views.length - 2), share = place - first;
@@ -237,7 +237,7 @@ class Page {
     this.state.at = null;
     this.state.camera = between(cameraOf(a), cameraOf(b), share);
     this.pivot = plus(this.camera.c, row(this.camera.R, 2), this.depth);
-    if ($("own").checked) {
+    if ($("matched").checked) {
       const mix = (x, y) => (1 - share) * x + share * y;
       const balance = a.balance.map((v, k) => mix(v, b.balance[k]));
       this.match({ ev: mix(a.ev, b.ev), gamma: mix(a.gamma, b.gamma), balance, row: a.row });
@@ -289,9 +289,9 @@ class Page {
     const { look, show, at } = this.state;
     const sign = (v) => (v > 0 ? "+" : v < 0 ? "−" : "") + Math.abs(v).toFixed(2);
     for (const id of ["ev", "white", "gamma"]) $(id).value = look[id];
-    $("ev-said").textContent = `${sign(look.ev)} EV`;
-    $("white-said").textContent = `${sign(look.white)} EV`;
-    $("gamma-said").textContent = look.gamma.toFixed(2);
+    $("ev-value").textContent = `${sign(look.ev)} EV`;
+    $("white-value").textContent = `${sign(look.white)} EV`;
+    $("gamma-value").textContent = look.gamma.toFixed(2);
     $("curve").value = look.curve;
     $("vignetting").checked = look.vignetting;
     $("hdr").checked = look.hdr;
@@ -357,13 +357,13 @@ class Page {
     const camera = this.windowCamera(share);
     this.renderer.render(camera, ...camera.size);
     this.drawn = share;
-    const sorting = this.renderer.sort(camera), asked = this.pose;
+    const sorting = this.renderer.sort(camera), sortedPose = this.pose;
     if (sorting)
       sorting.then((row) => {
         const same = this.sortedFor && row.every((v, k) => v === this.sortedFor[k]);
         this.sortedFor = row;
         // The camera may have moved while the worker was busy.
-        if (same && asked === this.pose) return;
+        if (same && sortedPose === this.pose) return;
         this.newOrder = true;
         this.wake();
       });
@@ -408,8 +408,8 @@ class Page {
     try { history.replaceState(null, "", link); } catch { location.hash = link; }
   }
 
-  // Return the exposed radiance of a view at its size, under the look (RGBA, rows from the top), or
-  // its radiance if `linear`. Scripts call this.
+  // Return a view's exposed radiance under the look, or its radiance if `linear`, as RGBA at the size
+  // of the view, rows from the top. Scripts call this.
   async measure(index, linear = false) {
     const view = this.scene.views[index], { R, c, lens } = cameraOf(view);
     const camera = { R, c, lens: [lens.fx, lens.fy, lens.cx, lens.cy] };
@@ -425,7 +425,7 @@ class Page {
     return out;
   }
 
-  // Set parts of the look.
+  // Set parts of the look. Scripts call this.
   set(look) {
     Object.assign(this.state.look, look);
     this.show();
@@ -445,9 +445,9 @@ class Page {
 }
 
 function fill(select, options) {
-  for (const [value, said] of options) {
+  for (const [value, label] of options) {
     const option = document.createElement("option");
-    Object.assign(option, { value, textContent: said });
+    Object.assign(option, { value, textContent: label });
     select.append(option);
   }
 }

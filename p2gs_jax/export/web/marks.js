@@ -1,12 +1,12 @@
-// The cameras of photographs, drawn over the picture as pyramids with the colour of the exposure.
+// The cameras of photographs, drawn over the picture as pyramids coloured by exposure.
 
 class Marks {
   constructor(canvas, scene) {
     Object.assign(this, { canvas, scene, at: [] });
     this.cameras = scene.views.map(cameraOf);
     const steps = this.cameras.slice(1).map((b, i) => length(plus(b.c, this.cameras[i].c, -1)));
-    const far = steps.filter((s) => s > 0).sort((a, b) => a - b);
-    this.size = 0.35 * (far[Math.floor(far.length / 2)] || 0.1 * scene.depth);
+    const sorted = steps.filter((s) => s > 0).sort((a, b) => a - b);
+    this.size = 0.35 * (sorted[Math.floor(sorted.length / 2)] || 0.1 * scene.depth);
     const evs = scene.views.map((v) => v.ev);
     [this.low, this.high] = [Math.min(...evs), Math.max(...evs)];
   }
@@ -22,12 +22,12 @@ class Marks {
     const pen = this.canvas.getContext("2d");
     pen.clearRect(0, 0, this.canvas.width, this.canvas.height);
     this.at = [];
-    this.cameras.forEach((taken, index) => {
+    this.cameras.forEach((drawn, index) => {
       if (index === here) return;
-      const { R, c, lens } = taken, d = this.size;
+      const { R, c, lens } = drawn, d = this.size;
       const corners = [[0, 0], [1, 0], [1, 1], [0, 1]].map(([u, v]) => {
-        const own = { R, c, lens: [lens.fx, lens.fy, lens.cx, lens.cy] };
-        return projectPoint(camera, pointAt(own, u * lens.width, v * lens.height, d));
+        const pinhole = { R, c, lens: [lens.fx, lens.fy, lens.cx, lens.cy] };
+        return projectPoint(camera, pointAt(pinhole, u * lens.width, v * lens.height, d));
       });
       const tip = projectPoint(camera, c);
       if ([tip, ...corners].some((p) => !(p[2] > 0.05))) return;
@@ -52,7 +52,7 @@ class Marks {
     this.at = [];
   }
 
-  // Return the nearest camera whose mark is close to a place in the window, or null.
+  // Return the row of the nearest camera whose mark is within `reach` pixels of (x, y), or null.
   find(x, y, reach) {
     const near = this.at.filter((m) => Math.hypot(m.x - x, m.y - y) < reach);
     return near.length ? near.reduce((a, b) => (a.z < b.z ? a : b)).index : null;

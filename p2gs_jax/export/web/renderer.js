@@ -1,12 +1,12 @@
-// Renders floating-point light: project, sort in a worker, composite back to front, develop.
+// Renders floating-point radiance: project, sort in a worker, composite back to front, develop.
 
 const ACTIVATIONS = { exp: 0, linear: 1 };
 const CURVES = { linear: 0, power: 1, srgb: 2, spline: 3 };
-// The largest half-precision number whose sums do not overflow.
+// The radiance of a splat is clamped to this in half precision, whose largest number is 65504.
 const HALF_MOST = 6e4;
 
 class Renderer {
-  // `precision`: 32 bits a channel if the device blends them, otherwise 16.
+  // `precision` is 16 or 32 bits per channel; 32 become 16 if the device cannot blend them.
   constructor(canvas, scene, splats, precision) {
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false,
       preserveDrawingBuffer: true, powerPreference: "high-performance" });
@@ -102,7 +102,7 @@ class Renderer {
       gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32UI, width, height);
       return texture;
     });
-    // Some devices hold only 256 bits per pixel, so each column is projected separately there.
+    // On devices with at most 256 bits per pixel, each column is projected separately.
     this.projected = this.projections([[0, 1, 2]]) || this.projections([[0], [1], [2]]);
     if (!this.projected) throw new Error("This device cannot render to integer textures.");
     this.quads = gl.createVertexArray();
@@ -115,7 +115,7 @@ class Renderer {
     gl.bindVertexArray(null);
   }
 
-  // Return a framebuffer for each group of columns; null if the device does not support it.
+  // Return a framebuffer for each group of columns; null if the device does not support one.
   projections(groups) {
     const { gl } = this;
     const made = groups.map((group) => {
@@ -204,7 +204,7 @@ class Renderer {
     });
   }
 
-  // Render the linear radiance of a camera {R, c, lens: [fx, fy, cx, cy]} into a target; row 0 is the top.
+  // Render the radiance of a camera {R, c, lens: [fx, fy, cx, cy]} into a target; row 0 is the top.
   render(camera, width, height, target = this.picture) {
     const { gl, scene } = this, r = scene.render;
     const [p, d] = [this.project, this.draw];
@@ -254,7 +254,7 @@ class Renderer {
     gl.uniform1i(program.at[name], unit);
   }
 
-  // Develop a rendered target onto the canvas, or write its exposed radiance into `into`.
+  // Develop a rendered target onto the canvas, or write its exposed radiance into the target `into`.
   develop(look, frame, target = this.picture, into = null) {
     const { gl, canvas, scene } = this, p = this.developing;
     const [width, height] = into ? [target.width, target.height] : [canvas.width, canvas.height];

@@ -1,4 +1,4 @@
-// A worker that sorts the Gaussians beyond the near plane exactly by depth, from back to front.
+// A worker that sorts the Gaussians beyond the near plane by their exact depth, farthest first.
 
 let means = null, near = 0;
 
