@@ -24,7 +24,7 @@ class Proposal(NamedTuple):
     prune: Bool[Array, " n"]
     clone: Bool[Array, " n"]
     split: Bool[Array, " n"]
-    wanted: Int[Array, ""]  # slots that it needs: survivors plus children
+    wanted: Int[Array, ""]  # number of slots needed: survivors plus children
 
 
 def propose(
@@ -36,8 +36,8 @@ def propose(
 ) -> Proposal:
     """Choose the Gaussians to prune, clone and split, from statistics since the last densification.
 
-    `extent` is the scene extent in scene units. With `prune_large` oversized Gaussians are pruned,
-    too (3DGS: after the first opacity reset).
+    `extent` is the scene extent in scene units. `prune_large` also prunes oversized Gaussians
+    (3DGS: after the first opacity reset).
     """
     largest = jnp.exp(jnp.max(gaussians.log_scales, -1))
     prune = opacities(gaussians) < cfg.prune_opacity
@@ -57,7 +57,7 @@ def apply(
     """Carry out a proposal within the existing slots.
 
     A clone is an exact copy. A split replaces the parent by two samples from its distribution, with
-    scales divided by 1.6 (3DGS).
+    scales divided by 1.6 (3DGS). `key` draws the samples.
     """
     alive = population.alive & ~proposal.prune
     requests = proposal.clone | proposal.split

@@ -1,4 +1,4 @@
-"""Display colours for ordinary 3DGS viewers, the way back, and the errors of both in pictures.
+"""Display colours for ordinary 3DGS viewers, their conversion to radiance, and both errors.
 
 A viewer composites display values; the true picture composites radiance and then applies the tone
 curve. So display colours computed per Gaussian are wrong by many 8-bit levels where translucent
@@ -37,12 +37,12 @@ from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians, Render
 
 DIRECTIONS = 64
-# Gaussians per block; the last block is padded, so that all blocks share one program.
+# Gaussians per chunk; the last chunk is padded, so that all chunks share one program.
 CHUNK = 8192
 # Variance that viewers add to the 2D covariance, as 3DGS does, pixels^2.
 VIEWER_BLUR = 0.3
 # Adam's learning rates for colours of degree 0, of higher degrees, and for opacity logits. They
-# decay to 0.1 times these. They were chosen on two runs (BUILD_NOTES, "Display PLY").
+# decay to 0.1 times these values. They were chosen on two runs (BUILD_NOTES, "Display PLY").
 COLOR_RATE, BANDS_RATE, OPACITY_RATE, DECAY = 0.05, 0.0025, 0.3, 0.1
 
 
@@ -101,17 +101,17 @@ def display_sh(
     [0, 1].
     """
 
-    def shown(sums: np.ndarray) -> np.ndarray:
+    def display(sums: np.ndarray) -> np.ndarray:
         colors = tone(np.asarray(harmonics.radiance_activation(sums, activation)))
         return np.clip(colors, 0, 1) - 0.5
 
-    return refitted(sh, shown)
+    return refitted(sh, display)
 
 
 def lift(gaussians: Gaussians, developed: DisplayTransform) -> Gaussians:
     """Return Gaussians of display colours with log radiance (`exp`), computed per Gaussian.
 
-    `developed` is the transform that the display colours show. Colours outside of [0, 1] are
+    `developed` is the transform that made the display colours. Colours outside of [0, 1] are
     clamped, and black counts as half an 8-bit code.
     """
 
@@ -122,9 +122,9 @@ def lift(gaussians: Gaussians, developed: DisplayTransform) -> Gaussians:
 
 
 def refitted(
-    sh: Float[np.ndarray, "n k 3"], changed: Callable[[np.ndarray], np.ndarray]
+    sh: Float[np.ndarray, "n k 3"], change: Callable[[np.ndarray], np.ndarray]
 ) -> Float[np.ndarray, "n k 3"]:
-    """Return coefficients whose sums are the changed sums: least squares over directions.
+    """Return coefficients whose sums are `change` of the old sums: least squares over directions.
 
     It is exact for degree 0.
     """
@@ -136,7 +136,7 @@ def refitted(
         part = sh[start : start + CHUNK]
         values = np.zeros((CHUNK, DIRECTIONS, 3), np.float32)
         values[: len(part)] = np.einsum("dk,nkc->ndc", table, part, optimize=True)
-        values = changed(values)[: len(part)]
+        values = change(values)[: len(part)]
         out[start : start + CHUNK] = np.einsum("kd,ndc->nkc", inverse, values, optimize=True)
     return out
 
@@ -162,7 +162,7 @@ def refine(
     Adam minimises the mean squared difference, one view per step, in epochs of random order. Every
     second step has a background of random colour instead of black, because viewers may have bright
     backgrounds. Base colours stay in [0, 1], which viewers with 8-bit colours need. With `shown`,
-    Gaussians are those of `lift`, and their radiance over black is developed. Gaussians that no
+    the Gaussians come from `lift`, and their radiance over black is developed. Gaussians that no
     target shows do not change. `on_step` is called with the steps done and the total.
     """
     if steps == 0 or not targets or gaussians.capacity == 0:
@@ -217,10 +217,10 @@ def baking_error(
 ) -> dict[str, Any] | None:
     """Compare a viewer's pictures of display colours with the true pictures.
 
-    With `shown`, these are developed pictures of lifted Gaussians, and the true ones composite
-    display colours.
+    With `shown`, the viewer develops the radiance of lifted Gaussians, and the true pictures
+    composite display colours.
     PSNR is in dB, for a black and for a white background of the viewer. Mean and largest absolute
-    differences of channels are in 8-bit levels. It returns None without targets.
+    differences of channels are in 8-bit levels. The result is None without targets.
     """
     if not targets:
         return None
@@ -250,7 +250,7 @@ def _over(
 
 
 def _difference(target: Target, render: Render, shown: DisplayTransform | None) -> dict[str, float]:
-    """Return the differences of one view."""
+    """Return PSNR (dB) and differences (8-bit levels) of one view."""
 
     def from_truth(level: float) -> np.ndarray:
         display = np.asarray(_over(render, jnp.full(3, level)))

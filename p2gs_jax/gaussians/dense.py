@@ -1,6 +1,6 @@
 """Dense seeds from depth maps of the photographs, for scenes with few points.
 
-The idea is that of EDGS (arXiv 2504.13204), which triangulates dense matches instead of growing
+The idea comes from EDGS (arXiv 2504.13204), which triangulates dense matches instead of growing
 splats; the depth maps are from `flow.py`. Seeds are drawn evenly from pixels with a depth. An image
 is divided into cells, and each cell gives one seed. With little texture, four cells together give
 one seed. A cell that already shows a seed gives none.
@@ -32,22 +32,18 @@ from p2gs_jax.types import Gaussians, Scene, View
 
 # Two neighbours must agree on a depth, so at least three views are needed.
 FEWEST_VIEWS = 3
-# Largest number of views that give seeds, evenly spaced.
-MOST_VIEWS = 40
-NEIGHBOURS = 5
-# Longest side of the matched photographs, pixels.
-MATCH_SIDE = 640
-# Side of the smallest cell, pixels; each cell gives one candidate.
-FINEST_CELL = 3
+MOST_VIEWS = 40  # largest number of views that give seeds, evenly spaced
+NEIGHBOURS = 5  # views that each view is matched with
+MATCH_SIDE = 640  # longest side of the matched photographs, pixels
+FINEST_CELL = 3  # side of the smallest cell, pixels; each cell gives one candidate
 # Standard deviations of a seed along the surface and across it, relative to the spacing of seeds.
 SPREAD, THICKNESS = 0.6, 0.2
-# Largest stretch of seeds along slanted surfaces.
-LARGEST_STRETCH = 3.0
-# A cell already shows a seed if the seed's depth differs by less than this share.
+LARGEST_STRETCH = 3.0  # of seeds along slanted surfaces
+# A cell already shows a seed if the depths of seed and candidate differ by less than this share.
 SAME_DEPTH = 0.05
-# Cells with more texture than this quantile are divided into four.
+# Cells whose texture is above this quantile of all candidates' texture are divided into four.
 PLAIN = 0.5
-# The number of seeds must meet the limit within SLACK; at most ATTEMPTS cell sizes are tried.
+# The number of seeds must meet the limit within this share; number of cell sizes that are tried.
 SLACK, ATTEMPTS = 0.05, 5
 # Largest share of a time budget for dense seeds; seconds per view on two idle cores; fewest views.
 DENSE_TIME, DENSE_SECONDS, FEWEST_DENSE_VIEWS = 0.25, 0.6, 8
@@ -101,14 +97,14 @@ def dense_seeds(
     limit: int,
     on_view: Callable[[int, int], None] = lambda i, n: None,
 ) -> DenseSeeds:
-    """Return at most `limit` seeds from depth maps of training views; deterministic by the seed.
+    """Return at most `limit` seeds from depth maps of training views; equal for equal random seeds.
 
-    It uses threads without JAX, so that it may run beside a compilation. The flow depends slightly
-    on OpenCV's number of threads, and so on the number of cores.
+    The function uses threads without JAX, so that it may run beside a compilation. The flow
+    depends slightly on OpenCV's number of threads, and so on the number of cores.
 
     Photographs are compared under the tones `match`; the tones `color` give the radiance of seeds.
-    Existing seeds stay. A time budget bounds the number of views that give seeds: they are evenly
-    spaced, with any neighbours. `on_view` is called with the number of views done and the total.
+    No seed is placed where an `existing` one is. A time budget bounds the number of evenly spaced
+    views that give seeds. `on_view` is called with the number of views done and the total.
     """
     rows = scene.train_indices
     empty = np.zeros((0, 3), np.float32)
@@ -126,10 +122,10 @@ def dense_seeds(
     flows = Flows(images, scene.points, seen)
     found: list[Candidates] = []
 
-    def made(row: int) -> Candidates:
+    def candidates_of(row: int) -> Candidates:
         return _candidates(row, near[row], flows, color, cfg.train.seed)
 
-    for done, candidates in enumerate(map_in_order(made, wanted)):
+    for done, candidates in enumerate(map_in_order(candidates_of, wanted)):
         found.append(candidates)
         on_view(done + 1, len(wanted))
     if not sum(len(c.xy) for c in found):
@@ -186,8 +182,8 @@ def choose_seeds(
 ) -> DenseSeeds:
     """Draw at most `limit` seeds evenly from the candidates of all views.
 
-    Existing seeds stay. `seed` is the random seed for the order of views and for the seeds left
-    out.
+    No seed is placed where an `existing` one is. `seed` is a random seed, for the order of views
+    and for the choice among too many seeds.
     """
     rng = generator(seed, Stream.DENSE_SEEDS)
     order = rng.permutation(len(found))
@@ -225,19 +221,23 @@ def _cells(xy: Float[np.ndarray, "c 2"], size: float, width: int) -> Int[np.ndar
 
 
 def _draw(found, images: MatchImages, existing, tree, cell: float, plain: float):
-    """Return for each view the chosen candidates and their spacing in pixels."""
+    """Return for each view the chosen candidates and their spacing in pixels.
+
+    `cell` is the side of small cells, pixels; with less texture than `plain` cells are twice as
+    wide. `tree` holds the existing seeds.
+    """
     chosen, drawn = [existing], []
     for candidates in found:
         frame = images[candidates.row]
         height, width = frame.luminance.shape
         xy, z = candidates.xy, 1 / candidates.inverse
         fine, coarse = (_cells(xy, size, width) for size in (cell, 2 * cell))
-        most = int(coarse.max(initial=0)) + 1
-        mean = np.bincount(coarse, candidates.texture, most)
-        rich = (mean / np.maximum(np.bincount(coarse, minlength=most), 1))[coarse] > plain
-        first = int(fine.max(initial=0)) + 1
-        place = np.where(rich, fine, first + coarse)
-        # Candidates are in the order of their cells, so a low-discrepancy sequence draws evenly.
+        coarse_count = int(coarse.max(initial=0)) + 1
+        summed = np.bincount(coarse, candidates.texture, coarse_count)
+        rich = (summed / np.maximum(np.bincount(coarse, minlength=coarse_count), 1))[coarse] > plain
+        fine_count = int(fine.max(initial=0)) + 1
+        place = np.where(rich, fine, fine_count + coarse)
+        # Candidates are in the order of their cells, so a golden-ratio sequence draws evenly.
         key = np.modf(np.arange(len(xy)) * 0.6180339887)[0]
         # Texture is preferred, and so are flat surfaces: elsewhere wrong depths are 10 times as
         # frequent.
@@ -250,9 +250,9 @@ def _draw(found, images: MatchImages, existing, tree, cell: float, plain: float)
         inside = (at >= 0).all(1) & (at < [width, height]).all(1)
         at, depths = at[inside], depths[inside]
         occupied = np.zeros(len(pick), bool)
-        slot = np.full(first + most, -1)
+        slot = np.full(fine_count + coarse_count, -1)
         slot[place[pick]] = np.arange(len(pick))
-        for size, bound, offset in ((cell, first, 0), (2 * cell, most, first)):
+        for size, bound, offset in ((cell, fine_count, 0), (2 * cell, coarse_count, fine_count)):
             where = _cells(at, size, width)
             known = where < bound
             hit = slot[where[known] + offset]
@@ -307,7 +307,7 @@ def gaussians_of(
 ) -> Gaussians:
     """Return Gaussians of the scene's points, then of dense seeds.
 
-    The scale of a point depends on its distance from all neighbours, including dense seeds.
+    The scale of a point depends on its nearest neighbours, which may be dense seeds.
     `radiance` is the radiance of the points, in the gauge of the exposures.
     """
     if dense is None:
@@ -325,7 +325,7 @@ def gaussians_of(
 
 
 def coverage_of(scene: Scene, max_width: int | None) -> Coverage:
-    """Return the pixels of the largest training view, and the share of the scene that one shows."""
+    """Return the largest training view's pixels, and the mean share of the scene in a view."""
     sizes = [size_at(view, max_width) for view in scene.training_views]
     return Coverage(max(w * h for w, h in sizes), shown_share(scene.points, scene.training_views))
 

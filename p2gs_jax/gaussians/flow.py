@@ -1,9 +1,9 @@
-"""Depth of one photograph from optical flow to its neighbours, with four checks per pixel.
+"""Depth of one photograph from optical flow to its neighbours, checked at every pixel.
 
 EDGS (arXiv 2504.13204) triangulates the matches of a learned matcher. This module uses DIS flow
 (Kroeger et al. 2016, OpenCV) between photographs at a common exposure, with known poses. A pixel's
-inverse depth r projects it nearest to its match q: with x(r) = (a + r b) / (a_z + r b_z), q gives
-the linear equations (a - q a_z) + r (b - q b_z) = 0.
+inverse depth r projects it to x(r) = (a + r b) / (a_z + r b_z). With its match q as x(r) the
+equations (a - q a_z) + r (b - q b_z) = 0 are linear in r; least squares solve them.
 """
 
 from __future__ import annotations
@@ -20,12 +20,11 @@ from scipy.spatial import KDTree
 
 from p2gs_jax.gaussians.matching import MatchImage, MatchImages, at_common_exposure
 
-# Largest errors of forward-backward flow and from the epipolar line, pixels at the matched size.
+# Largest forward-backward error, and distance from the epipolar line, pixels at the matched size.
 FORWARD_BACKWARD = 1.0
 EPIPOLAR = 0.7
-# Standard deviation of matches, pixels.
-DEVIATION = 0.5
-# Largest resulting relative error of a depth, for one pair and for all pairs together.
+DEVIATION = 0.5  # standard deviation of matches, pixels
+# Largest relative standard deviation of a depth, from one pair and from all pairs together.
 PAIR_ERROR, FUSED_ERROR = 0.10, 0.025
 # Two pairs agree if depths differ by less than this many standard deviations and this share.
 SIGMAS, APART = 2.0, 0.05
@@ -33,8 +32,7 @@ SIGMAS, APART = 2.0, 0.05
 COLOUR = 24.0
 # Window of the plane fit, pixels, and the share of it that must have a depth.
 WINDOW, SUPPORT = 9, 0.4
-# Largest relative distance of a flat patch's inverse depths from its plane.
-FLAT = 0.01
+FLAT = 0.01  # largest relative distance of a flat patch's inverse depths from its plane
 # Number of points from which the initial flow is interpolated, and side of its grid cells, pixels.
 GUIDES, GUIDE_CELL = 6, 16
 # DIS at full resolution; its preset `medium` ends at half resolution, with twice the depth error.
@@ -48,7 +46,7 @@ class DepthMap(NamedTuple):
 
     inverse: Float32[np.ndarray, "h w"]  # 1 / z
     valid: Bool[np.ndarray, "h w"]  # whether the pixel passed every check
-    slope: Float32[np.ndarray, "h w 2"]  # of the plane through the window: d(1/z) per pixel
+    slope: Float32[np.ndarray, "h w 2"]  # of the plane fitted to the window: d(1/z) per pixel
     flat: Bool[np.ndarray, "h w"]  # whether the window lies in that plane
 
 
@@ -157,7 +155,7 @@ class Flows:
 
 
 def _match(flows: Flows, i: int, j: int):
-    """Return inverse depth of a view from its flow to another, and its precision; 0: rejected."""
+    """Return a view's inverse depth from flow to another, and its precision, 0 where rejected."""
     a, b = flows.images[i], flows.images[j]
     first, second = at_common_exposure(a, b)
     here, to_b = pixel_centers(*a.luminance.shape), _geometry(a, b)
@@ -179,10 +177,10 @@ def _match(flows: Flows, i: int, j: int):
     with np.errstate(invalid="ignore"):
         on_line = ahead & (_squared(predicted - match) < EPIPOLAR**2)
     sensitivity = np.sqrt(square) / np.maximum(z, 1e-6)
-    apart = ahead & (sensitivity * inverse > DEVIATION / PAIR_ERROR)
-    blurred = [cv2.blur(i, (3, 3)).astype(np.float32) for i in (first, second)]
+    precise = ahead & (sensitivity * inverse > DEVIATION / PAIR_ERROR)
+    blurred = [cv2.blur(image, (3, 3)).astype(np.float32) for image in (first, second)]
     same = np.abs(blurred[0] - _sampled(blurred[1], match)) < COLOUR
-    passed = usable & returns & on_line & apart & same
+    passed = usable & returns & on_line & precise & same
     return inverse, np.where(passed, (sensitivity / DEVIATION) ** 2, 0).astype(np.float32)
 
 
@@ -194,14 +192,14 @@ def depth_map(flows: Flows, row: int, near: Sequence[int] | Int[np.ndarray, " k"
     fused, agreeing, total = _fuse(inverse, precision)
     with np.errstate(divide="ignore", invalid="ignore"):
         sharp = 1 / np.sqrt(total) < FUSED_ERROR * fused
-    third = (agreeing.sum(0) >= 2) & sharp
-    smooth, slope, flat, support = plane_fit(fused, third)
-    valid = third & (support > SUPPORT)
+    confirmed = (agreeing.sum(0) >= 2) & sharp
+    smooth, slope, flat, support = plane_fit(fused, confirmed)
+    valid = confirmed & (support > SUPPORT)
     return DepthMap(np.where(flat, smooth, fused), valid, slope, flat & valid)
 
 
 def _fuse(inverse, precision):
-    """Return the mean of the largest group of agreeing depths, the group, and its precision."""
+    """Return the mean inverse depth of the largest agreeing group, the group, and its precision."""
     count = len(inverse)
     variance = 1 / np.maximum(precision, 1e-20)
     agree = np.zeros((count, *inverse.shape), bool)
@@ -222,7 +220,9 @@ def _fuse(inverse, precision):
 
 
 def plane_fit(inverse: Float[np.ndarray, "h w"], valid: Bool[np.ndarray, "h w"]):
-    """Fit a plane to the valid inverse depths around every pixel, which are linear on planes.
+    """Fit a plane to the valid inverse depths around every pixel.
+
+    On a plane, inverse depth is linear in the pixel position.
 
     Returns:
         Inverse depth of the plane at the pixel; its slope per pixel [h w 2]; whether the window
@@ -248,9 +248,9 @@ def plane_fit(inverse: Float[np.ndarray, "h w"], valid: Bool[np.ndarray, "h w"])
     xx, yy = xx + 0.1, yy + 0.1  # pixels^2; keeps thin windows finite
     det = np.maximum(xx * yy - xy**2, 1e-9)
     sx, sy = (yy * xv - xy * yv) / det, (xx * yv - xy * xv) / det
-    left = np.maximum(vv - sx * xv - sy * yv, 0)
+    residual = np.maximum(vv - sx * xv - sy * yv, 0)
     smooth = mv + sx * (x - mx) + sy * (y - my)
-    flat = (np.sqrt(left) < FLAT * smooth) & (share > SUPPORT) & (smooth > 0)
+    flat = (np.sqrt(residual) < FLAT * smooth) & (share > SUPPORT) & (smooth > 0)
     flat &= np.abs(smooth - inverse) < 2 * FLAT * smooth
     slope = np.stack([sx, sy], -1).astype(np.float32)
     return smooth.astype(np.float32), slope, flat, share

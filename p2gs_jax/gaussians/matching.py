@@ -22,21 +22,21 @@ from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.visibility import in_frame, unoccluded
 from p2gs_jax.types import GAMMA_SRGB, Photometry, Scene
 
-TABLE = 1024
-LUMINANCE = np.array([0.25, 0.6, 0.15], np.float32)
-# Number of images in memory: a view, its neighbours, and those of the next views.
+TABLE = 1024  # entries of a tabulated tone curve
+LUMINANCE = np.array([0.25, 0.6, 0.15], np.float32)  # weights of red, green and blue radiance
+# Number of images in memory: some views and their neighbours.
 CACHED = 48
 # Quantile of luminance that becomes white in the comparison, so that lamps may clip.
 WHITE_QUANTILE = 0.995
-LARGEST_GAIN = 30.0
-ROUNDS = 30
-# Angles between the rays of a pair to its points, degrees: below NARROW the depth is uncertain,
+LARGEST_GAIN = 30.0  # largest factor on dark pairs
+ROUNDS = 30  # of `rough_tones`
+# Angles between the rays of two views to a point, degrees: below NARROW the depth is uncertain,
 # above WIDE flow begins to fail, and at WIDE + 2 FADE it fails completely.
 NARROW, WIDE, FADE = 4.0, 12.0, 8.0
 # Difference of log exposures (natural logarithm) at which photographs share few usable tones.
 EXPOSURE_FADE = 1.5
-FEWEST_SHARED = 5
-MOST_POINTS = 20_000
+FEWEST_SHARED = 5  # points that both views of a pair see
+MOST_POINTS = 20_000  # that are compared without tracks
 # Least number of points in a view for an occlusion test among them.
 FEWEST_HIDING = 1000
 
@@ -100,9 +100,9 @@ class Tones:
 def rough_tones(tracks: Observations | None, count: int) -> Tones:
     """Return tones that suffice to compare photographs without solved exposures.
 
-    Each view gets one factor under the sRGB curve. Views and points are solved alternately: the
-    factor is the mean residual of log radiance from the mean of each point. Without tracks, all
-    factors are 1.
+    Each of `count` views gets one factor under the sRGB curve. Views and points are solved in turn:
+    the log factor is the mean residual of log radiance from the mean of each point. Without tracks,
+    all factors are 1.
     """
     log_exposures, gammas = np.zeros(count), np.full(count, GAMMA_SRGB)
     if tracks is None or not len(tracks.points):
@@ -136,7 +136,7 @@ class MatchImage:
     log_exposure: float
 
     def project(self, points: Float[np.ndarray, "p 3"]):
-        """Return positions [q 2], pixels, and depths [q] of the points before the camera."""
+        """Return positions [q 2], pixels, and depths [q] of the points in front of the camera."""
         local = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
         local = local[local[:, 2] > 1e-6]
         xy = local @ self.K.T
@@ -151,8 +151,8 @@ class MatchImage:
 class MatchImages:
     """The training views of a scene by row, loaded on demand, in any thread.
 
-    Their longest side has `longest` pixels. Display values up to `black` and from `saturation` on
-    are not usable. The last images are cached.
+    Their longest side has at most `longest` pixels. Display values up to `black` and from
+    `saturation` on are not usable. The last images are cached.
     """
 
     scene: Scene
@@ -185,7 +185,7 @@ class MatchImages:
 def at_common_exposure(
     a: MatchImage, b: MatchImage
 ) -> tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h2 w2"]]:
-    """Return two photographs at the longer of their exposures, 8-bit.
+    """Return two photographs at the larger of their exposures, 8-bit.
 
     Pixels that clip at this exposure are white in both. Dark pairs are brightened.
     """

@@ -2,7 +2,7 @@
 
 Source: Kheradmand et al. 2024. The paper divides by an alternating double sum of binomials to
 correct the scale of N Gaussians in one place. As 1/sqrt(k+1) = 2/sqrt(pi) int_0^inf exp(-(k+1)t^2)
-dt, it is 2/sqrt(pi) int_0^inf (1 - (1 - o exp(-t^2))^N) dt, without cancellation (ours).
+dt, the sum is 2/sqrt(pi) int_0^inf (1 - (1 - o exp(-t^2))^N) dt, without cancellation (ours).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from p2gs_jax.types import Gaussians, Population
 
 # Noise is halved at this opacity and falls with this steepness (Kheradmand et al. 2024).
 NOISE_OPACITY, NOISE_STEEPNESS = 0.005, 100.0
-_NODES = np.linspace(0.0, 4.5, 49, dtype=np.float32)
+_NODES = np.linspace(0.0, 4.5, 49, dtype=np.float32)  # trapezoidal rule for this integral
 _WEIGHTS = np.full(49, _NODES[1], np.float32)
 _WEIGHTS[0] = _WEIGHTS[-1] = _NODES[1] / 2
 
@@ -47,8 +47,8 @@ def relocate_and_grow(
 ) -> Outcome:
     """Move transparent Gaussians onto opaque ones and add `births` new ones there.
 
-    Targets are drawn in proportion to opacity times `demand` (`train/strategies.py`; None: equal).
-    Gaussians in one place get the scale of `share` and its opacity, at least `cfg.prune_opacity`.
+    Targets are drawn in proportion to opacity times `demand` (`train/strategies.py`; None: 1).
+    Gaussians in one place get the opacity (at least `cfg.prune_opacity`) and scale of `share`.
     Random moves, `cfg.spread` times their scales, separate them. Otherwise their gradients would be
     equal, and opaque ones, which get no noise, would stay together (BUILD_NOTES, "Twins").
     `refused` counts births without a free slot.
@@ -98,7 +98,7 @@ def _apart(
     """Move Gaussians within their extent, and shrink them: a pair keeps its mean extent.
 
     `away` holds random moves along the principal axes, in units of the scales; it is zero for
-    Gaussians that stay. `spread`, below 1, multiplies the moves.
+    Gaussians that stay. `where` flags those that shrink; `spread`, below 1, multiplies the moves.
     """
     scales = jnp.exp(gaussians.log_scales)
     moved = rotated(rotation_matrices(gaussians.quats), spread * away * scales)

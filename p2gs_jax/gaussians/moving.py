@@ -31,7 +31,7 @@ GROUND = 0.1
 OUTSIDE = 0.1
 # Largest initial scale, scene units.
 WIDEST = 0.3
-VOXEL_GROWTH = 1.3
+VOXEL_GROWTH = 1.3  # factor on the voxel's side while an object has too many points
 # Initial opacity of vibrating Gaussians; it is low because most of them lie on static surfaces.
 OPACITY = 0.1
 
@@ -98,7 +98,7 @@ def nodes_radiance(
     nodes: Nodes, scene: Scene, store: ImageStore, photometry: Photometry, cfg: FitConfig
 ) -> Float[np.ndarray, "p 3"]:
     """Return the mean radiance of points of moving objects, at their positions in each view."""
-    still = len(scene.points)
+    static_count = len(scene.points)
 
     def seen_in(view: View, row: int):
         assert view.time is not None
@@ -108,14 +108,14 @@ def nodes_radiance(
         world = np.einsum("nij,nj->ni", pose[:, :3, :3], nodes.points[rows]) + pose[:, :3, 3]
         xy, z = project_points(np.concatenate([scene.points, world]), view)
         seen = np.flatnonzero(unoccluded(xy, z, view.width, view.height))
-        seen = seen[seen >= still]
-        return rows[seen - still], xy[seen]
+        seen = seen[seen >= static_count]
+        return rows[seen - static_count], xy[seen]
 
     return mean_radiance(len(nodes.points), seen_in, scene, store, photometry, cfg)
 
 
 def on_surface(size: tuple[float, float, float], count: int) -> Float[np.ndarray, "p 3"]:
-    """Return about `count` points, evenly spread over a box around 0 except its bottom."""
+    """Return about `count` points, evenly spread over a box's sides and top; its centre is 0."""
     half = np.asarray(size, float) / 2
     faces = [(axis, sign) for axis in range(3) for sign in (-1, 1) if (axis, sign) != (2, -1)]
     areas = [4 * np.prod(np.delete(half, axis)) for axis, _ in faces]
@@ -177,7 +177,7 @@ def vibrates(scene: Scene, cfg: FitConfig) -> bool:
 
 
 def clock_of(scene: Scene) -> MovingObjects:
-    """Return moving objects without objects, only with the times of a scene with vibration."""
+    """Return `MovingObjects` without objects, which only hold the middle time of the drive."""
     return MovingObjects((), middle=middle_time(scene))
 
 
@@ -185,8 +185,8 @@ def with_vibration(gaussians: Gaussians, scene: Scene, cfg: FitConfig) -> Gaussi
     """Return the Gaussians as static ones, followed by vibrating ones.
 
     Vibrating Gaussians are drawn from the laser points, with the time of each point as their peak.
-    Without laser points they are drawn from the Gaussians, with random times. All other parameters
-    are those of the nearest Gaussian.
+    Without laser points they are drawn from the Gaussians, with random times. Shape and colour are
+    copied from the nearest Gaussian.
     """
     times = np.array([view.time for view in scene.views if view.time is not None])
     middle, rng = middle_time(scene), generator(cfg.train.seed, Stream.VIBRATING)

@@ -52,12 +52,12 @@ def empty_gaussians(count: int, like: Gaussians) -> Gaussians:
     )
 
 
-# Seconds of a step per pixel, and its least seconds: on two cores of 2025; on an H200 (2026-11-26).
+# Seconds of a step per pixel, and least seconds of a step: two CPU cores (2025), an H200 (2026).
 STEP_SECONDS = {"cpu": (5e-7, 0.0), "gpu": (4e-9, 4e-3)}
-# Visible Gaussians per pixel of a view; the share grows with the steps of a run, within these
-# bounds (ours: BUILD_NOTES, "Population").
+# Visible Gaussians per pixel of a view: the steps of a run / STEPS_PER_SHARE, within these bounds
+# (ours: BUILD_NOTES, "Population").
 SMALLEST_SHARE, LARGEST_SHARE, STEPS_PER_SHARE = 0.1, 0.3, 15_000
-MOST_BY_DEFAULT = 400_000
+MOST_BY_DEFAULT = 400_000  # Gaussians
 
 
 class Coverage(NamedTuple):
@@ -92,7 +92,7 @@ def default_max_gaussians(seeds: int, coverage: Coverage, train: TrainConfig) ->
 
 
 def bucket_for(needed: int, current: int, limit: int | None) -> int:
-    """Return the capacity to grow to: by factors of 1.5, at most `limit`, but at least `needed`."""
+    """Return a capacity, grown by factors of about 1.5: at most `limit`, at least `needed`."""
     capacity = current
     while capacity < needed:
         capacity = int(capacity * GROWTH_BUCKET) + 256

@@ -16,7 +16,7 @@ from p2gs_jax.render.project import STILL
 from p2gs_jax.scene.drives.objects import MovingObjects, middle_time
 from p2gs_jax.types import Gaussians, Scene
 
-# Directions of the least squares, whose solution is exact: degree 3 has only 16 coefficients.
+# Number of directions of the least squares, which are exact: degree 3 has only 16 coefficients.
 DIRECTIONS = 64
 # Factors on coordinates in a rotation by 180 degrees about x.
 FLIP = (1.0, -1.0, -1.0)
@@ -54,10 +54,10 @@ def posed(
     poses: Float[np.ndarray, "k 4 4"],
     there: Bool[np.ndarray, " k"],
 ) -> Gaussians:
-    """Return Gaussians in world coordinates, without those of objects that are not `there`.
+    """Return Gaussians in world coordinates, without the Gaussians of objects that are not `there`.
 
-    `owner` is the moving object of each Gaussian, -1: none. Gaussians of objects are given in the
-    frames of their boxes; `poses` map box to world.
+    `owner` is the moving object of each Gaussian, -1: none. Gaussians of objects are in the frames
+    of their boxes; `poses` map box to world.
     """
     owner = np.asarray(owner)
     kept = (owner < 0) | there[owner]

@@ -24,9 +24,9 @@ from p2gs_jax.types import Gaussians, Photometry, Scene, View
 NEIGHBOURS = 3
 # 3DGS: the scene extent is 1.1 times the radius of the camera centres.
 EXTENT_MARGIN = 1.1
-MIN_RADIANCE = 1e-3
-# At most the share FEW of the cameras counts as misplaced; each is FARTHER times as far away as the
-# next nearer camera.
+MIN_RADIANCE = 1e-3  # in the gauge of the exposures
+# At most the share FEW of the cameras (at least one) counts as misplaced; the nearest of these is
+# FARTHER times as far away as every other camera and as the median point.
 FEW, FARTHER = 0.05, 20.0
 # Largest distance of seeds and Gaussians from the cameras, as a multiple of the cameras' radius or
 # of the median distance of the points.
@@ -86,7 +86,7 @@ def reach(
 def within_reach(scene: Scene) -> tuple[Scene, list[str]]:
     """Return a scene without seed points beyond the reach, and a note about moved points.
 
-    Points beyond the reach are moved towards the cameras, whose images hardly change. The
+    Points beyond the reach are moved towards the cameras; the images hardly change. The
     exploration noise of MCMC would move wide, far Gaussians too much.
     """
     if not len(scene.points):
@@ -138,8 +138,8 @@ def gaussians_from_points(
 ) -> Gaussians:
     """Return one Gaussian per point; radiance is linear, in the gauge of the exposures.
 
-    Standard deviations, of each axis or of all, are by default the mean distance to three
-    neighbours (3DGS), bounded by the distance from the views; orientations are w x y z.
+    `scales` are standard deviations, per axis or one for all axes, scene units; None stands for
+    `neighbour_scales`. `quats` are w x y z.
     """
     count = len(points)
     scales = neighbour_scales(points, views) if scales is None else np.asarray(scales)
@@ -213,7 +213,7 @@ def photographed(
     cfg: FitConfig,
     shrink: int = 1,
 ) -> Iterator[tuple[Int[np.ndarray, " s"], Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]]:
-    """Yield point indices, their display colours and radiance, for each training photograph."""
+    """Yield point indices, display colours and radiance per training photograph at 1 / `shrink`."""
     host: Photometry = jax.tree.map(np.asarray, photometry)
     for row, index in enumerate(scene.train_indices):
         view = scene.views[index]

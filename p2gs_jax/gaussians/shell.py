@@ -27,7 +27,7 @@ CELLS_ACROSS = 16
 COVERED_FRACTION = 0.3
 # If a smaller share of the image cells is empty, this is a gap in the seeds and not a sky.
 EMPTY_IMAGE_FRACTION = 0.04
-# Smallest distance of the shell relative to the far seeds.
+# Smallest radius of the shell relative to the distance of far seeds.
 BEHIND_SEEDS = 2.0
 OVERLAP = 0.7  # standard deviation of a Gaussian relative to the spacing
 # Shell colours come from shrunk images, because a direction covers many pixels.
@@ -116,8 +116,8 @@ def find_shell(
     for k, (view, cells) in enumerate(zip(views, covered, strict=True)):
         xy[:, k], seen[:, k], here = _project(view, candidates, cells.shape)
         explained[seen[:, k], k] = cells[here]
-    looked = seen.sum(1)
-    keep = (looked > 0) & (explained.sum(1) < COVERED_FRACTION * looked)
+    views_seeing = seen.sum(1)
+    keep = (views_seeing > 0) & (explained.sum(1) < COVERED_FRACTION * views_seeing)
     if not keep.any():
         return None
     spacing = radius * np.sqrt(4 * np.pi / cfg.shell_count)
@@ -145,8 +145,8 @@ def shell_gaussians(
         return seen, shell.xy[seen, row]
 
     total, weight = np.zeros((len(shell.points), 3)), np.zeros(len(shell.points))
-    for at, _, colors in seeds.photographed(seen_in, scene, store, photometry, cfg, SHELL_SHRINK):
-        total[at] += colors
+    for at, _, light in seeds.photographed(seen_in, scene, store, photometry, cfg, SHELL_SHRINK):
+        total[at] += light
         weight[at] += 1
     seen = weight > 0
     radiance = (total[seen] / weight[seen, None]).astype(np.float32)

@@ -16,13 +16,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.render import binning_cpu
-from p2gs_jax.render.binning_cpu import bits_for, boxes, depth_keys, grid_size
+from p2gs_jax.render.binning_cpu import REACH_MARGIN, bits_for, boxes, depth_keys, grid_size
 from p2gs_jax.render.cores import cores
 from p2gs_jax.types import Splats2D, TileList
 
 
 def count_entries(splats: Splats2D, width: int, height: int, cfg: RenderConfig) -> Int[Array, ""]:
-    """Return the tile-list capacity this view needs, at most 2^30."""
+    """Return the tile-list capacity that a view needs, at most 2^30."""
     return _choose(binning_cpu.count_entries, _count_by_sorting, splats, cfg, width, height)
 
 
@@ -46,7 +46,7 @@ def _choose(counting, sorting, splats: Splats2D, cfg: RenderConfig, *static):
 
 
 def longest_first(lengths: Int[Array, " n"]) -> Int[Array, " n"]:
-    """Return the indices of lengths, longest first; equal and very long ones are by index."""
+    """Return the indices of lengths, longest first; equal or very long lengths are by index."""
     bits = bits_for(lengths.shape[0])
     limit = 2 ** (32 - bits) - 1
     key = jnp.uint32(limit) - jnp.minimum(lengths, limit).astype(jnp.uint32)
@@ -141,12 +141,12 @@ def _bin_by_sorting(
     dx, dy = col * tile_x + tile_x / 2 - mean_x, line * tile_y + tile_y / 2 - mean_y
     edges = dx - half_x, dx + half_x, dy - half_y, dy + half_y
     smallest = _smallest_exponent((a11, a12, a22), *edges)
-    keep = (position < count) & (0.5 * smallest <= reach + 1e-4)
+    keep = (position < count) & (0.5 * smallest <= reach + REACH_MARGIN)
     tile_id = jnp.where(keep, (line * across_tiles + col).astype(jnp.int32), tile_count)
 
     # Entries are already in depth order. 16-bit keys need half the passes of a radix sort.
     kind = jnp.uint16 if tile_count < 2**16 else jnp.uint32
     tiles, sorted_ids = lax.sort((tile_id.astype(kind), ids), num_keys=1, is_stable=True)
-    edges = jnp.arange(tile_count + 1, dtype=kind)
-    offsets = jnp.searchsorted(tiles, edges, method="scan_unrolled").astype(jnp.int32)
+    every_tile = jnp.arange(tile_count + 1, dtype=kind)
+    offsets = jnp.searchsorted(tiles, every_tile, method="scan_unrolled").astype(jnp.int32)
     return TileList(sorted_ids, offsets, count, count > capacity)

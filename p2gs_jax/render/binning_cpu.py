@@ -20,12 +20,12 @@ from p2gs_jax.render.cores import cores, this_core
 from p2gs_jax.render.xla_cpu import compiled_loop
 from p2gs_jax.types import Splats2D, TileList
 
-DIGIT_BITS = 13
+DIGIT_BITS = 13  # of the radix sort
 # Elements written at once: one vector register.
 WRITES = 8
 # Counts saturate at this number, within int32.
 MOST_ENTRIES = 2**30
-# Margin that keeps splats which only rounding puts below the cutoff.
+# Margin of `Boxes.reach` that keeps splats which only rounding puts below the cutoff.
 REACH_MARGIN = 1e-4
 # Number of rows of tiles that are solved together.
 ROWS = 8192
@@ -145,7 +145,7 @@ def depth_order(depths: Float[Array, " n"], visible: Bool[Array, " n"]) -> Int[A
 
 
 def _expand(firsts, lengths, used, capacity: int):
-    """Expand ranges: range i gives `lengths[i]` values firsts[i], firsts[i] + 1, ...
+    """Expand the first `used` ranges; range i gives `lengths[i]` values from firsts[i] upwards.
 
     Returns:
         The number of values, up to MOST_ENTRIES; the first `capacity` values; and the range of
@@ -240,19 +240,19 @@ def _tile_rows(box: Boxes, tile_y: int):
     return first, jnp.where(box.visible, last - first + 1, 0)
 
 
-def _of_image(row: Int[Array, " m"]) -> Int[Array, " m"]:
+def _image_row(row: Int[Array, " m"]) -> Int[Array, " m"]:
     """Return the row of tiles in the image for each row of this core."""
     return row * cores() + this_core() if cores() > 1 else row
 
 
 def count_entries(splats: Splats2D, width: int, height: int, cfg: RenderConfig) -> Int[Array, ""]:
-    """Return the tile-list capacity that a view needs: the larger count of rows and entries."""
+    """Return the tile-list capacity that a view needs: the larger number of rows and of entries."""
     box = boxes(splats, width, height, cfg)
     ellipses = _ellipses(splats, box)
     first, rows = _tile_rows(box, cfg.tile[1])
 
     def body(k, total):
-        lengths = _span(ellipses, _of_image(first + k), width, cfg.tile)[1]
+        lengths = _span(ellipses, _image_row(first + k), width, cfg.tile)[1]
         here = jnp.sum(jnp.where(k < rows, lengths, 0).astype(jnp.float32))
         # Each step is exact below 2^24 and the sum saturates.
         return jnp.minimum(total + here.astype(jnp.int32), MOST_ENTRIES)
@@ -303,7 +303,7 @@ def _solve_rows(row, owner, order, ellipses: _Ellipses, used, width: int, tile: 
         ids = order[lax.dynamic_slice(owner, here, (size,))]
         block = table.at[ids].get(mode="promise_in_bounds")
         part = _Ellipses(*(block[:, i] for i in range(len(_Ellipses._fields))))
-        first, lengths = _span(part, _of_image(lax.dynamic_slice(row, here, (size,))), width, tile)
+        first, lengths = _span(part, _image_row(lax.dynamic_slice(row, here, (size,))), width, tile)
         return tuple(
             lax.dynamic_update_slice(a, b, here)
             for a, b in zip(state, (ids, first, lengths), strict=True)

@@ -24,8 +24,8 @@ from p2gs_jax.render.visible import whole_blocks
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians, Render
 
-STEP = 1.25
-SMALLEST = 4096
+STEP = 1.25  # ratio of consecutive list lengths
+SMALLEST = 4096  # entries
 
 Result = TypeVar("Result")
 # Renders one view: (gaussians, alive, camera, owner=None), the arguments of `render_linear`.
@@ -50,8 +50,8 @@ ANYWHERE = Margins(1.5, 1.5)
 TRAINING = Margins(1.5, 1.5)
 # Gaussians that a training view shows: only views between the sampled ones may show more.
 TRAINING_VISIBLE = Margins(1.1, 1.2)
-# The most canvas sizes for images of many sizes; further sizes join a canvas if that pads less than
-# this share of its pixels.
+# Largest number of canvas sizes of a scene; smaller numbers are used if that pads less than this
+# share of the pixels.
 MOST_CANVASES, LEAST_PADDING = 3, 0.01
 # Tile lists of training are at least this long, whatever the count.
 ENTRIES_PER_GAUSSIAN, FEWEST_ENTRIES = 4, 16_384
@@ -95,7 +95,7 @@ def bucket(needed: int, margin: float = 1.0) -> int:
 def until_it_fits(
     draw: Callable[[int], tuple[Result, Any, Any]], entries: int
 ) -> tuple[Result, int]:
-    """Return a picture and the capacity that sufficed; the tile list grows while it overflows.
+    """Return a result and the capacity that sufficed; the tile list grows while it overflows.
 
     `draw` maps a static number of entries to (result, entries needed, whether they overflowed).
     """
@@ -119,11 +119,11 @@ class Capacity(NamedTuple):
 
     @classmethod
     def allocate(cls, entries: int, visible: int, growth: float, limit: int) -> Capacity:
-        """Return the capacity that suffices all views of one image size until the run ends.
+        """Return the capacity that suffices for all views of one image size until the run ends.
 
         `entries` and `visible` are the largest counts of a view now. The population may still grow
-        by the factor `growth`, at most to `limit`. A view then shows the same share of it, and
-        denser Gaussians are smaller.
+        by the factor `growth`, at most to `limit`. A view then shows the same share of the
+        population, and denser Gaussians are smaller.
         """
         wanted = int(visible * TRAINING_VISIBLE.first * growth)
         lists = int(TRAINING.first * entries * growth**0.5)

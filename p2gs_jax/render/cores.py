@@ -2,8 +2,8 @@
 
 A program that `jax.shard_map` divides along the axis `CORES` is traced once for all N cores. In
 such a program, each core composites every N-th row of tiles and computes SSIM on a strip of the
-image; then all cores get the whole result. In other programs there is one core, and functions
-except `part` and `scatter_sum` add nothing.
+image; then all cores get the whole result. In other programs there is one core, and all
+functions except `part` and `scatter_sum` add no operation.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def most(count: Int[Array, ""]) -> Int[Array, ""]:
 
 
 def all_true(flags: Bool[Array, "..."]) -> Bool[Array, "..."]:
-    """Return flags that are true where those of every core are true."""
+    """Return flags that are true where the flags of every core are true."""
     return lax.pmin(flags.astype(jnp.int32), CORES) > 0 if cores() > 1 else flags
 
 

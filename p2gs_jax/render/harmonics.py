@@ -13,7 +13,7 @@ from p2gs_jax.core.numerics import Values, namespace
 from p2gs_jax.render.xla_cpu import stack_columns
 
 RadianceKind = Literal["exp", "linear"]
-LOG_RADIANCE_LIMIT = 30.0
+LOG_RADIANCE_LIMIT = 30.0  # natural logarithm
 
 C0 = 0.28209479177387814
 C1 = 0.4886025119029199
@@ -114,7 +114,7 @@ def evaluate(
     """Return the sums of K = (degree + 1)^2 harmonics in unit directions, before activation.
 
     Directions are x, y and z from the camera to the Gaussians, along world axes. Coefficients above
-    `active_degree` are ignored; it is traced, so that a change needs no compilation.
+    `active_degree` are ignored; a traced `active_degree` may change without a compilation.
     """
     degree = degree_of(sh.shape[1])
     columns = basis(directions, degree)
@@ -147,19 +147,19 @@ def radiance_preactivation(radiance: Values, kind: RadianceKind) -> Values:
 
 
 def scaled(
-    sh: Float[np.ndarray, "n k 3"], log_scales: Float[np.ndarray, "..."], kind: RadianceKind
+    sh: Float[np.ndarray, "n k 3"], log_factors: Float[np.ndarray, "..."], kind: RadianceKind
 ) -> Float[np.ndarray, "n k 3"]:
     """Return coefficients whose radiance is multiplied by factors, exactly.
 
-    `log_scales` are the natural logarithms of the factors: per channel (3,), per Gaussian (n, 1),
+    `log_factors` are the natural logarithms of the factors: per channel (3,), per Gaussian (n, 1),
     or both (n, 3).
     """
     sh = np.array(sh)
     if kind == "exp":
-        sh[:, 0] += log_scales / C0
+        sh[:, 0] += log_factors / C0
     else:
         # radiance = value + 1/2, so the constant 1/2 must be scaled, too.
-        factors = np.exp(log_scales)
+        factors = np.exp(log_factors)
         sh *= np.expand_dims(factors, -2)
         sh[:, 0] += (factors - 1) * 0.5 / C0
     return sh

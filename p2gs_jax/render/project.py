@@ -2,8 +2,8 @@
 
 Splats use the local affine approximation of EWA splatting. Drives add two kinds of motion:
 
-Moving objects. Gaussians stay in the frame of their box, and the camera moves: a Gaussian of an
-object is projected with the view matrix from that object's box to the camera. No other part of the
+Moving objects. Gaussians stay in the frame of their box, and the camera moves: the view matrix of
+an object's Gaussians maps its box to the camera. No other part of the
 renderer depends on objects.
 
 Vibration (PVG, arXiv 2311.18561, section 3.2). Gaussians may appear, move and disappear:
@@ -37,7 +37,7 @@ from p2gs_jax.types import Camera, Frustum, Gaussians, Placement, Splats2D
 AnyCamera = TypeVar("AnyCamera", bound=Camera | Frustum)
 
 INVISIBLE_LOG_OPACITY = -100.0
-# Outside this range float32 products of scales and focal lengths leave the normal numbers.
+# Log scene units; outside this range float32 products with focal lengths are not normal numbers.
 LOG_SCALE_RANGE = (-16.0, 9.0)
 # The affine approximation is evaluated at most this many half image sizes from the axis.
 TANGENT_LIMIT = 1.3

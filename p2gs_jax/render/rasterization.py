@@ -52,12 +52,12 @@ def rasterization(
     radiance (n 3). With `sh_degree` they are spherical harmonics (n k 3) of radiance max(0, value +
     1/2); coefficients above the degree are ignored. Both may begin with an axis of cameras. View
     matrices map world to camera, OpenCV axes; `Ks` and the size are in pixels. `eps2d` is the
-    variance added to the 2D covariance, pixels^2; backgrounds are radiance. None is the value of
-    `cfg` (`near`, `blur`, `background`), and without `cfg` gsplat's: 0.01, 0.3 and black. `cfg` has
-    all other options; its `radiance` and `sh_degree` have no effect. The mode is "RGB", "D" (the
-    sum of weights times z), "ED" ("D" over alpha), or RGB and one depth. The static `capacity`
-    counts entries of the tile list; None measures it outside of `jax.jit`, and inside it is needed:
-    `meta["capacity"]` of an earlier call.
+    variance added to the 2D covariance, pixels^2; backgrounds are radiance. None stands for the
+    value in `cfg` (`near`, `blur`, `background`), or without `cfg` for gsplat's 0.01, 0.3, black.
+    `cfg` has all other options; its `radiance` and `sh_degree` have no effect. The mode is "RGB",
+    "D" (the sum of weights times z), "ED" ("D" over alpha), or RGB and one depth. The static
+    `capacity` counts entries of the tile list; None measures it, outside of `jax.jit` only. Inside,
+    pass `meta["capacity"]` of an earlier call.
 
     Returns:
         Colours with depth as their last channel, alphas, and a dictionary: `means2d` (c n 2),
@@ -117,7 +117,7 @@ def _for_each_camera(colors, count: int, cameras: int, sh_degree: int | None):
     return jnp.broadcast_to(kept, (cameras, *shape))
 
 
-def _seen(gaussians, each, size, cfg: RenderConfig, sh_degree: int | None):
+def _splatted(gaussians, each, size, cfg: RenderConfig, sh_degree: int | None):
     """Return the camera of a view, the splats in it, and their radiance."""
     color, viewmat, K = each
     camera = Camera(viewmat, K, *size)
@@ -132,7 +132,7 @@ def _render(gaussians, colors, viewmats, Ks, size, cfg, capacity, sh_degree, wit
     """Return radiance, alpha, depth (c h w) or None, and the dictionary of `rasterization`."""
 
     def one(each):
-        camera, splats, color = _seen(gaussians, each, size, cfg, sh_degree)
+        camera, splats, color = _splatted(gaussians, each, size, cfg, sh_degree)
         result = render_splats(splats, color, camera, cfg, capacity, with_depth=with_depth)
         reach = jnp.maximum(splats.log_opacities - float(np.log(cfg.alpha_cutoff)), 0)
         radii = jnp.ceil(jnp.sqrt(2 * reach[:, None] * splats.cov_diagonal))
@@ -153,7 +153,7 @@ def _entries(gaussians, colors, viewmats, Ks, size, cfg, sh_degree):
     """Return the number of entries that each camera needs."""
 
     def one(each):
-        camera, splats, _ = _seen(gaussians, each, size, cfg, sh_degree)
+        camera, splats, _ = _splatted(gaussians, each, size, cfg, sh_degree)
         return count_entries(splats, camera.width, camera.height, cfg)
 
     return jax.lax.map(one, (colors, viewmats, Ks))

@@ -37,7 +37,7 @@ PIXELS_PER_THREAD = 4
 # Gradient columns, padded to the width of one vectorised atomic addition. One addition of 8 columns
 # and single ones for the rest took 0.8 ms more of 3.6 ms.
 COLUMNS = 16
-# Number of Gaussians per block of the ordered sum.
+# Number of Gaussians per block of threads in the ordered sum.
 SUMMED = 32
 # Images of fewer tiles have their lists cut into segments, at most this many per lane more. With
 # 256 lanes these are 4,096 blocks; an H200 has 132 multiprocessors for 16 to 32 blocks each.
@@ -71,7 +71,7 @@ class _Tile:
         self.y = (pixel // tile_x).astype(jnp.float32) - (tile_y - 1) / 2
 
     def load(self, rows_ref, ids_ref, position, end, count: int) -> list[list]:
-        """Return id and row of the next `count` entries; those of the dummy beyond the end."""
+        """Return id and row of the next `count` entries; beyond the end these are the dummy's."""
         ids = [
             jnp.where(
                 position + c < end, ids_ref[jnp.minimum(position + c, end - 1)], self.plan.gaussians
@@ -126,7 +126,7 @@ def _forward_kernel(rows, ids, tiles, starts, ends, order, brightest, *outputs, 
 
 
 def _merge_kernel(firsts, *arrays, plan: Plan):
-    """Merge the segments of a tile; `arrays` are all slots, the image, and what is before slots."""
+    """Merge a tile's segments; `arrays`: all slots, the image, the state before each extra slot."""
     count = plan.channels + 1
     composited, image, before = arrays[:count], arrays[count : 2 * count], arrays[2 * count :]
     tile = pl.program_id(0)
@@ -210,8 +210,8 @@ def _row(values):
 def _backward_kernel(rows, ids, tiles, starts, stops, order, *arrays, plan: Plan):
     """Walk a segment.
 
-    `arrays` are the image, its gradient, what is before extra slots, the zeroed output and the
-    output.
+    `arrays` are the image, its gradient, the channels and transmittance before extra slots, the
+    zeroed output and the output.
     """
     channels = plan.channels
     image, v_image = arrays[: channels + 1], arrays[channels + 1 : 2 * channels + 2]
@@ -295,7 +295,7 @@ def _in_order(entries, ids, count: int):
 
 
 def backward(rows, ids, residuals, image, v_image, plan: Plan):
-    """Return the gradient by the rows from those by the channels and transmittance."""
+    """Return the gradient by the rows from the gradient by the channels and transmittance."""
     segments, stops, before = residuals
     capacity, count = ids.shape[0], rows.shape[0]
     shape = (capacity + 1 if plan.cfg.deterministic else count, COLUMNS)

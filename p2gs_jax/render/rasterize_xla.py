@@ -14,7 +14,7 @@ The exponential is a polynomial on [-0.7, 0], which is squared until its range r
 Backward. The segments are walked again, front to back, from the transmittance and light before
 them. R is the gradient-weighted light behind an entry: q = w (radiance . g), and R -= q after each
 entry. The gradient by the exponent of an entry is q - R alpha / (1 - alpha), without a division by
-transmittance. The geometry gradients follow in closed form from its six moments over the tile.
+transmittance. Six moments of this gradient over the tile give the geometry gradients.
 Source and measurements: docs/architecture.md.
 """
 
@@ -36,7 +36,7 @@ from p2gs_jax.render.xla_cpu import compiled_loop, materialize
 
 # The backward pass has more overhead per iteration, so more pixels in flight are faster.
 BACKWARD_LANE_FACTOR = 2
-PREFIX_GROUP = 8
+PREFIX_GROUP = 8  # entries whose running products are computed together
 # A segment is at most as long as a lane's fair share of the entries, divided by this number. The
 # number of segments has a static bound: tiles + SEGMENTS_PER_LANE * lanes.
 SEGMENTS_PER_LANE = 4
@@ -46,7 +46,7 @@ SEGMENTS_PER_LANE = 4
 def merge(
     composited: tuple[Float[Array, "s p"], ...], tiles: Int[Array, " e"], extra: Int[Array, ""]
 ) -> tuple[tuple[Float[Array, "t p"], ...], tuple[Float[Array, "e p"], ...]]:
-    """Return the channels and transmittance of every tile, and those before each extra slot.
+    """Return the channels and transmittance of every tile, and before each extra slot.
 
     `composited` holds the channels and, last, the transmittance of every slot; `tiles` are the
     tiles of the extra slots, of which `extra` are used.
@@ -124,7 +124,7 @@ class Queue(NamedTuple):
         return jnp.where(lane < self.work, self.order[: lane.shape[0]], self.slots + lane)
 
     def advance(self, turn, slot, position, done):
-        """Assign the next slots to finished lanes; return (turn, slot, position)."""
+        """Assign the next slots to finished lanes; `turn` counts all assigned slots."""
         finished = done.astype(jnp.int32)
         total = jnp.cumsum(finished)
         rank = turn + total - 1
@@ -314,7 +314,7 @@ def _row_gradient(entries: _Entries, w, v_exponent, v_out, features, plan: Plan)
 
 
 def backward(rows, ids_list, residuals, image, v_image, plan: Plan):
-    """Return the gradient by the rows from those by the channels and transmittance."""
+    """Return the gradient by the rows from the gradient by the channels and transmittance."""
     segments, stops, before = residuals
     plan = plan._replace(lanes=plan.lanes * BACKWARD_LANE_FACTOR)
     lanes, pixels, chunk = plan.lanes, plan.pixels, plan.cfg.chunk
@@ -333,9 +333,9 @@ def backward(rows, ids_list, residuals, image, v_image, plan: Plan):
     light = functools.reduce(jnp.add, (a * v for a, v in zip(image, v_image, strict=True)))
     v_channels = jnp.stack(v_image[:-1], 1)
     # Remaining light and transmittance at the start of each segment.
-    behind = segments.tiles[plan.tile_count :]
-    extra_light = light[behind] - sum(
-        b * v[behind] for b, v in zip(before[:-1], v_image[:-1], strict=True)
+    extra_tiles = segments.tiles[plan.tile_count :]
+    extra_light = light[extra_tiles] - sum(
+        b * v[extra_tiles] for b, v in zip(before[:-1], v_image[:-1], strict=True)
     )
     light, ahead = jnp.concatenate([light, extra_light]), before[-1]
     slot = queue.first()

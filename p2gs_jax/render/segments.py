@@ -25,8 +25,8 @@ class Segments(NamedTuple):
     """The tile, start and end of each segment in the list of entries; the end is exclusive.
 
     Slot t < T is the first segment of tile t. The extra slots behind hold the other segments, tile
-    by tile from front to back: those of tile t are `firsts[t]` to `firsts[t + 1]`. The last slots
-    are empty.
+    by tile from front to back: tile t has the extra slots from `firsts[t]` up to `firsts[t + 1]`.
+    The last slots are empty.
     """
 
     tiles: Int[Array, " s"]
@@ -38,7 +38,7 @@ class Segments(NamedTuple):
 def cut(offsets: Int[Array, " t1"], most: int, unit: int) -> Segments:
     """Cut lists into segments of equal length, a multiple of `unit`, with `most` extra slots.
 
-    `offsets` are the starts of the tiles' lists, and the last end.
+    `offsets` are the starts of the tiles' lists, and the end of the last list.
     """
     starts, ends = offsets[:-1], offsets[1:]
     tile = jnp.arange(starts.shape[0], dtype=jnp.int32)

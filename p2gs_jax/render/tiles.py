@@ -7,9 +7,9 @@ each, and the residuals for its backward function;
 `backward(rows, ids, residuals, image, v_image, plan)` returns the gradient of the rows.
 
 Rows. A Gaussian is a row of floats: mean x, y; conic factor a11, a12, a22; log opacity; three
-radiances; optionally depth. Factor, opacity and the plan's cutoff are divided by `exponent_scale`
-(the factor by its root), which suits the implementation's exponential: e = log opacity -
-(u^2 + v^2) and alpha = exp(exponent_scale e). Row N is a dummy for padding.
+radiances; optionally depth. Log opacity and the plan's cutoff are divided by `exponent_scale`, the
+factor by the root of twice this number. This suits the implementation's exponential: e = log
+opacity - (u^2 + v^2), and alpha = exp(exponent_scale e). Row N is a dummy for padding.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from p2gs_jax.render.cores import cores, gather_rows
 from p2gs_jax.types import Splats2D, TileList
 
 TileImplementation = Literal["xla", "pallas"]
-DUMMY_LOG_OPACITY = -100.0
+DUMMY_LOG_OPACITY = -100.0  # invisible
 GEOMETRY = 6  # columns of a row before its channels
 # Most lanes per tile, for images too small to fill all lanes.
 MOST_LANES = 8
@@ -73,10 +73,10 @@ class Plan(NamedTuple):
 
     across: int  # tiles across
     down: int  # rows of tiles
-    lanes: int
-    gaussians: int
-    channels: int
-    exponent_scale: float
+    lanes: int  # tiles that are composited at once (rasterize_xla.py)
+    gaussians: int  # their number, which is also the row of the dummy
+    channels: int  # 3, or 4 with depth
+    exponent_scale: float  # of the rasterizer
     cutoff: float  # least exponent, in units of `exponent_scale`
     cfg: RenderConfig
 

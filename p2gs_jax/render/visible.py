@@ -32,9 +32,8 @@ from p2gs_jax.render.project import (
 from p2gs_jax.render.xla_cpu import compiled_loop
 from p2gs_jax.types import Array, Camera, Frustum, Gaussians, Splats2D
 
-# Margin for rounding, pixels.
-SLACK = 1.0
-BLOCK = 4096
+SLACK = 1.0  # margin for rounding, pixels
+BLOCK = 4096  # Gaussians
 
 Shown = tuple[Splats2D, Float[Array, "v 3"]]
 
@@ -47,7 +46,7 @@ def in_view(
 ) -> Bool[Any, " n"]:
     """Return flags of the Gaussians that may reach a pixel: a conservative bound.
 
-    The projected covariance is bounded by that of a ball with the largest scale s. Along x its
+    The projection of a ball with the largest scale s bounds the projected covariance. Along x its
     standard deviation is at most s f / z sqrt(1 + t^2), with t the tangent that `project` uses.
     NumPy arrays give a NumPy result.
     """

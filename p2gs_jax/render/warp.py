@@ -55,7 +55,7 @@ def project_points(
 ) -> tuple[Float[Any, "*n 2"], Float[Any, "*n"]]:
     """Return pixel positions (centres at +0.5) and camera z in scene units; valid for z > 1e-6.
 
-    Pixels are those of the size of `camera`. NumPy arrays give NumPy results.
+    Pixels refer to the image size of `camera`. NumPy arrays give NumPy results.
     """
     xp = namespace(points, camera.K)
     local = matmul(points, camera.viewmat[:3, :3].T) + camera.viewmat[:3, 3]

@@ -16,7 +16,7 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, Bool, Float
 
 # 512-bit vectors, if the CPU has them, are 1.1 to 1.25 times as fast as XLA's default of 256 bits
-# (BUILD_NOTES). LLVM's optimisation level 1 compiles a step 15 % sooner, and the step is as fast.
+# (BUILD_NOTES). LLVM's optimisation level 1 compiles a step 15 % faster, and the step is as fast.
 _CPU_OPTIONS = {"xla_cpu_prefer_vector_width": 512, "xla_backend_optimization_level": 1}
 
 F = TypeVar("F", bound=Callable)
