@@ -112,7 +112,7 @@ def _judged(
     on_progress: Callable[[int, int], None],
 ) -> dict[str, Any]:
     """Return what `against.json` holds (docs/files.md)."""
-    from p2gs_jax.evaluation.against import judge_renders, own_scores
+    from p2gs_jax.evaluation.against import judge_renders, scores_of_run
 
     programs = {}
     for label, renders in found.items():
@@ -123,7 +123,7 @@ def _judged(
             "views": len(names),
             "missing": list(renders.missing),
             **judge_renders(renders, judge, on_progress),
-            "run": own_scores(metrics, names),
+            "run": scores_of_run(metrics, names),
         }
     return {"version": 1, "programs": programs}
 

@@ -2,7 +2,7 @@
 
 There are two protocols. `as_rendered` scores pictures unchanged, as published comparisons do, and
 radiance at the run's mean exposure. `exposure_fitted` fits one exposure per view, as for held-out
-views of a run; it scales the radiance that a picture shows under the run's usual display.
+views of a run. It scales radiance, into which the run's usual display transform decodes pictures.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from p2gs_jax.scene.pixels.decode import floats
 from p2gs_jax.scene.pixels.store import ImageStore
 
 # Protocols of a run that correspond to `as_rendered` and `exposure_fitted`.
-OWN = ("averaged", "exposure_fitted")
+RUN_PROTOCOLS = ("averaged", "exposure_fitted")
 
 
 def check_renders(found: OtherRenders, store: ImageStore) -> OtherRenders:
@@ -83,8 +83,8 @@ def judge_renders(
     }
     compared = [r for r in rows if judge.reference is not None and judge.reference(r) is not None]
     if compared:
-        everywhere = judge.usual(None)
-        scores["reference"] = _against_reference(compared, judge, lambda r: light(r, everywhere))
+        usual = judge.usual(None)
+        scores["reference"] = _against_reference(compared, judge, lambda r: light(r, usual))
     return scores
 
 
@@ -115,10 +115,11 @@ def _against_reference(
     }
 
 
-def own_scores(metrics: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
+def scores_of_run(metrics: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
     """Return the scores of a run, from its `metrics.json`, over some of its held-out views."""
     wanted, test = list(names), metrics["test"]
-    return {name: summary_of({n: test[name]["per_view"][n] for n in wanted}) for name in OWN}
+    of_wanted = {p: {n: test[p]["per_view"][n] for n in wanted} for p in RUN_PROTOCOLS}
+    return {protocol: summary_of(rows) for protocol, rows in of_wanted.items()}
 
 
 class Light(NamedTuple):
@@ -132,7 +133,7 @@ class Light(NamedTuple):
     def fitted(
         self, photograph: Float32[np.ndarray, "h w 3"], mask: Float32[np.ndarray, "h w"]
     ) -> DisplayTransform:
-        """Return its display transform with the exposure that fits a photograph best."""
+        """Return the display transform with the exposure that fits a photograph best."""
         return with_fitted_exposure(self.shown, self.linear, photograph, mask, self.alpha)
 
     def under(self, shown: DisplayTransform) -> Float32[np.ndarray, "h w 3"]:

@@ -19,12 +19,12 @@ from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.photometry.formation import Matte, composited, display, formation, uncovered
 from p2gs_jax.types import Capture
 
-# Photographs can be much darker or brighter than the mean exposure (LOM `low`: 6.6 stops).
+# Stops on each side and steps of the coarse search; golden steps. LOM `low` is 6.6 stops dark.
 SEARCH_STOPS, SEARCH_STEPS, GOLDEN_STEPS = 12.0, 49, 30
 REFINE_STEPS = 30
 # Stride of the coarse search over pixels, along each axis.
 SEARCH_STRIDE = 3
-# Tolerance, stops: changes a display value by 1e-4, and a PSNR of 40 dB by 1e-3 dB.
+# Tolerance, stops or log units: changes a display value by 1e-4, and a PSNR of 40 dB by 1e-3 dB.
 TOLERANCE = 5e-4
 
 
@@ -88,8 +88,8 @@ def fit_exposure(
 ) -> Float[Array, ""]:
     """Return the exposure with which a render fits a photograph best, in squared LDR error.
 
-    A coarse search over +-12 stops around 1 is followed by golden sections: the error of a clipped
-    image has flat stretches where Newton's method stalls. The exposure of `capture` is ignored;
+    A coarse search over +-12 stops around 1 precedes a golden-section search: clipped images give
+    the error flat stretches, where Newton's method stalls. The exposure of `capture` is ignored;
     `matte` is the background of render and photograph.
     """
     # Imported here, because it is slow to load and rarely needed.
@@ -147,7 +147,7 @@ def fit_capture(
     gamma: bool,
     white_balance: bool,
 ) -> Capture:
-    """Return exposure, and gamma or white balance, that fit a photograph best (squared LDR error).
+    """Return exposure and the flagged parameters that fit a photograph best, in squared LDR error.
 
     Levenberg-Marquardt on logarithms starts from the exposure of `fit_exposure`, whose arguments
     are the same. Parameters that are not fitted are those of `start`.

@@ -16,7 +16,7 @@ from p2gs_jax.scene.rigid import interpolated, inverse
 from p2gs_jax.scene.visibility import unoccluded
 from p2gs_jax.types import Lidar, Scene, TrackedObject, View
 
-# Points this near in time belong to the sweep of a view: half a turn at 10 Hz and more, seconds.
+# Seconds from a view to points of its sweep: half a turn at 10 Hz (0.05 s), and a margin.
 HALF_SWEEP_S = 0.06
 # Rendered depth exists where the render is at least this opaque.
 SOLID = 0.5
@@ -58,7 +58,7 @@ class DepthErrors(NamedTuple):
     """Rendered against measured depth, point by point."""
 
     measured: Float32[np.ndarray, " p"]  # camera z, metres
-    error: Float32[np.ndarray, " p"]  # absolute error, metres; infinite where there is no surface
+    error: Float32[np.ndarray, " p"]  # absolute error, metres; infinite below the opacity SOLID
     moving: Bool[np.ndarray, " p"]  # the point lies on a moving object
 
 
@@ -82,8 +82,8 @@ def depth_errors(
     kept = np.flatnonzero(unoccluded(xy, z, view.width, view.height))
     at = np.floor(xy[kept]).astype(int)
     if mask is not None:
-        counts = mask[at[:, 1], at[:, 0]] > 0
-        kept, at = kept[counts], at[counts]
+        counted = mask[at[:, 1], at[:, 0]] > 0
+        kept, at = kept[counted], at[counted]
     if len(kept) > MOST_POINTS:
         spread = np.linspace(0, len(kept) - 1, MOST_POINTS).astype(int)
         kept, at = kept[spread], at[spread]

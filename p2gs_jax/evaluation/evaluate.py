@@ -5,12 +5,12 @@ Protocols (docs/photometry.md, 6):
 - `per_view` renders a training view with its fitted exposure, gamma and white balance.
 - `averaged` uses the mean parameters over the training views (paper, Rendering for evaluation).
 - `exposure_fitted` solves one scalar exposure of a held-out view from its photograph.
-- `photometry_fitted` solves all parameters that vary per view, if there are others than exposure.
+- `photometry_fitted` solves all parameters that vary per view, if any besides exposure does.
 - `metered` uses the metering rule that explains the training exposures, if there is one
   (photometry/metering.py).
 - `scale_aligned` solves one scalar for all reference photographs of one common exposure.
 
-Vignetting and responses are always those of the camera. If photographs have alpha, they and the
+Vignetting and response always come from the view's camera. If photographs have alpha, they and the
 renders are over the same background (photometry/formation.py).
 """
 
@@ -47,8 +47,8 @@ from p2gs_jax.types import Camera, Params, Render, Scene
 class Evaluation(NamedTuple):
     """The result of an evaluation."""
 
-    # the `train`, `test`, `consistency`, `reference` and `radiance` parts of `metrics.json`, those
-    # of drives, and the views without scores or exposure
+    # the `train`, `test`, `consistency`, `reference` and `radiance` parts of `metrics.json`, the
+    # parts of drives, and the views without scores or exposure
     metrics: dict[str, Any]
     metering: Metering  # the rule that explains the exposures of the training views
 
@@ -91,7 +91,7 @@ class Judge:
         return replace(transform, backdrop=self.store.backdrop_values)
 
     def scorer(self, index: int, photograph, mask) -> Callable[[np.ndarray], dict[str, Any]]:
-        """Return a function from display images of a view to scores, in drives also of parts."""
+        """Return a function from display images of a view to scores, in drives also by part."""
         parts = scoring.masks_of_parts(self.scene, index, mask)
         return lambda ldr: scoring.view_scores(self.lpips_weights, ldr, photograph, mask, parts)
 
@@ -111,8 +111,8 @@ def evaluate(
 ) -> Evaluation:
     """Render and score all views.
 
-    The parameters are those of live Gaussians; `render` is from `make_renderer`, with the owners of
-    moving Gaussians. By the row of a view, `reference` returns the photograph under the common
+    `params` holds live Gaussians only; `render` is from `make_renderer`, with the owners of
+    moving Gaussians. For the row of a view, `reference` returns the photograph under the common
     exposure, and `radiance` the true linear radiance at the size of the photographs, or None. With
     weights, every comparison with a photograph has `lpips`. `on_progress` receives the number of
     views done, and the number of all views.
@@ -123,10 +123,10 @@ def evaluate(
     judge = Judge(scene, store, params, cfg, lpips_weights, reference)
     gaussians = jax.device_put(params.gaussians)
     living = jax.device_put(np.ones(params.gaussians.capacity, bool))
-    seen = functools.partial(render or make_renderer(cfg.render), gaussians, living)
-    views = _Views(judge, seen, radiance)
-    judged = functools.partial(_judged, judge, seen, radiance)
-    # In the order of names, in which the frames of a camera are in sequence.
+    render_camera = functools.partial(render or make_renderer(cfg.render), gaussians, living)
+    views = _Views(judge, render_camera, radiance)
+    judged = functools.partial(_judged, judge, render_camera, radiance)
+    # Views are in the order of names, in which the frames of a camera are in sequence.
     for found in map_in_order(judged, range(len(scene.views))):
         on_progress(found.result.index + 1, len(scene.views))
         views.add(found)
@@ -144,22 +144,22 @@ class _Judged(NamedTuple):
     scores_averaged: dict[str, Any]  # scores of `averaged`
     scores_all: dict[str, Any] | None  # scores of `photometry_fitted`, or None
     sample: np.ndarray | None  # sample of rendered and true radiance, or None
-    scale: float | None  # exposure with which it fits its reference, or None
-    readings: Readings  # readings of meters
+    scale: float | None  # exposure with which the render fits its reference, or None
+    readings: Readings  # readings of meters, for exposures
 
 
 def _judged(
-    judge: Judge, seen: Callable[[Camera], Render], radiance: Truth | None, index: int
+    judge: Judge, render: Callable[[Camera], Render], radiance: Truth | None, index: int
 ) -> _Judged:
     """Render a view and score it under the protocols that need no other view."""
     scene, store = judge.scene, judge.store
     photograph, mask = store.get(index, 1)
     score = judge.scorer(index, photograph, mask)
-    rendered = seen(camera_of(store, index))
+    rendered = render(camera_of(store, index))
     linear, alpha = np.asarray(rendered.linear), np.asarray(rendered.alpha)
     usual = judge.usual(index)
     averaged = display.develop(linear, replace(usual, exposure=judge.mean.exposure), alpha=alpha)
-    extra, everything = {}, None
+    extra, scores_all = {}, None
     if scene.views[index].split == "train":
         fitted = display.display_of_view(judge.small, judge.row_of[index], judge.cfg.photometry)
         transform = judge.over(fitted)
@@ -169,15 +169,15 @@ def _judged(
         still = scoring.still_mask(scene, index, mask)
         transform = with_fitted_exposure(usual, linear, photograph, still, alpha)
         extra = {"exposure": transform.exposure}
-        everything = _all_fitted(linear, photograph, still, transform, score, alpha)
+        scores_all = _all_fitted(linear, photograph, still, transform, score, alpha)
     ldr = display.develop(linear, transform, alpha=alpha)
     depth = np.asarray(rendered.depth)
     truth = None if radiance is None else radiance(index)
-    aligned = None if judge.reference is None else judge.reference(index)
+    target = None if judge.reference is None else judge.reference(index)
     scale = sample = None
-    if aligned is not None:
+    if target is not None:
         usual_of_all = judge.usual(None)
-        scale = with_fitted_exposure(usual_of_all, linear, aligned, mask, alpha).exposure
+        scale = with_fitted_exposure(usual_of_all, linear, target, mask, alpha).exposure
     if truth is not None:
         sample = sampled(linear, truth, mask > 0.5, len(scene.views))
     return _Judged(
@@ -186,7 +186,7 @@ def _judged(
         mask,
         {**score(ldr), **extra},
         score(averaged),
-        everything,
+        scores_all,
         sample,
         scale,
         meter(linear, alpha),
@@ -219,8 +219,8 @@ def _all_fitted(
 class _Views:
     """Collects scored views, and computes scores that need all of them."""
 
-    def __init__(self, judge: Judge, seen: Callable[[Camera], Render], radiance: Truth | None):
-        self._judge, self._seen, self._radiance = judge, seen, radiance
+    def __init__(self, judge: Judge, render: Callable[[Camera], Render], radiance: Truth | None):
+        self._judge, self._render, self._radiance = judge, render, radiance
         self._depths = DepthScores(judge.scene, judge.store)
         self._rows: dict[str, dict[str, dict]] = defaultdict(dict)
         self._videos = {
@@ -228,7 +228,7 @@ class _Views:
         }
         # Names of views without scores, and of photographs with unknown exposures.
         self._unknown: dict[str, list[str]] = {"hidden": [], "exposures_unknown": []}
-        # Readings of training views, by name; their rows; and readings of held-out views, by row.
+        # Readings of training views by name, rows of these views, and readings of held-out views.
         self._readings: dict[str, Readings] = {}
         self._metered_rows: list[int] = []
         self._held_out: dict[int, Readings] = {}
@@ -309,7 +309,7 @@ class _Views:
 
         def judged(index: int) -> dict[str, dict[str, Any]]:
             photograph, mask = judge.store.get(index)
-            rendered, found = self._seen(camera_of(judge.store, index)), {}
+            rendered, found = self._render(camera_of(judge.store, index)), {}
             linear, alpha = np.asarray(rendered.linear), np.asarray(rendered.alpha)
             if index in metered:
                 exposure = metering.exposure(metered[index])

@@ -65,7 +65,7 @@ POOL_2, POOL_3 = (Layer(n, stride=2, padding=0, pool=True) for n in (2, 3))
 FIRST = (Layer(11, stride=4, padding=2),)
 ALEX = (FIRST, (POOL_3, Layer(5, padding=2)), (POOL_3, PLAIN), (PLAIN,), (PLAIN,))
 VGG = ((PLAIN,) * 2, (POOL_2, *(PLAIN,) * 2), *((POOL_2, *(PLAIN,) * 3),) * 3)
-# By the names in options.
+# Networks by their names in options.
 NETWORKS = {
     "alex": Network("AlexNet", "alexnet.ckpt", "AlexNet_0", ALEX, seconds_per_pixel=1.1e-6),
     "vgg": Network("VGG-16", "vgg16.ckpt", "VGG16_0", VGG, seconds_per_pixel=2.4e-5),

@@ -21,7 +21,7 @@ Reference = Callable[[int], np.ndarray | None]
 
 
 def check_reference(folder: str | Path | None) -> None:
-    """Check a folder of references before views are read; None: none was given.
+    """Check a folder of references before views are read; None: there is no folder.
 
     Raises:
         UserError: the folder does not exist.
@@ -50,7 +50,7 @@ def load_reference(folder: str | Path, scene: Scene, cfg: FitConfig) -> Referenc
         why += f"{scene.views[0].name})."
         raise UserError(why, fix="name the reference photographs as the scene's images")
     order = sorted(rows)
-    # References are not cached, because each is used once.
+    # References are not cached: evaluation reads each only a few times.
     store = ImageStore(tuple(rows[r] for r in order), dataclasses.replace(cfg.data, cache_mb=0))
     where = {r: i for i, r in enumerate(order)}
     return lambda row: store.get(where[row], 1)[0] if row in where else None
@@ -61,9 +61,9 @@ def find_radiance(scene: Scene, store: ImageStore) -> Truth | None:
 
     The truth is in `truth/linear`, or the scene is an HDR set. Only evaluation uses it.
     """
-    linear_files = (scene.root / "truth" / "linear" / view.name for view in scene.views)
-    made = [path.with_suffix(".exr") for path in linear_files]
-    both = zip(scene.views, made, strict=True)
+    names = (scene.root / "truth" / "linear" / view.name for view in scene.views)
+    exrs = [path.with_suffix(".exr") for path in names]
+    both = zip(scene.views, exrs, strict=True)
     paths = [path if path.is_file() else true_radiance(scene.root, view) for view, path in both]
     if not any(paths):
         return None

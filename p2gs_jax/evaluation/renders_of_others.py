@@ -18,7 +18,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.types import Scene
 
-# Display values come first: if a program also writes radiance, only they have its tone curve.
+# Display values come first: if a program also writes radiance, they alone have its tone curve.
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
 
 
@@ -53,11 +53,11 @@ class OtherRenders:
     def read(self, row: int, size: tuple[int, int], over: bool = False) -> Rendered:
         """Return the render of a view, which must have a size of (width, height) pixels.
 
-        With `over` there is a background: radiance must then have an opacity.
+        With `over` the photographs are over a background: radiance must then have an opacity.
 
         Raises:
-            UserError: the file cannot be read, has another size, or holds values that are not
-                finite.
+            UserError: the file cannot be read, has another size, lacks an opacity, or holds values
+                that are not finite.
         """
         path = self.files[row]
         linear, alpha = path.suffix.lower() == ".exr", None
@@ -108,7 +108,7 @@ def find_renders(folder: str | Path, scene: Scene) -> OtherRenders:
 
     Raises:
         UserError: there are no held-out views, the folder is absent or holds no render, or the
-            number of numbered renders differs from that of held-out views.
+            number of numbered renders is not the number of held-out views.
     """
     folder = Path(folder)
     if not folder.is_dir():

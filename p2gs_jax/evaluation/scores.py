@@ -111,8 +111,8 @@ def region_scores(
 ) -> dict[str, dict[str, float]]:
     """Return PSNR, SSIM and, with weights, LPIPS of each part (`parts_of`).
 
-    SSIM is the mean of the whole image's map over the part. LPIPS is the distance with the
-    photograph outside of the part, over the part's share of the image.
+    SSIM is the mean over the part of the whole image's SSIM map. LPIPS is the distance with the
+    photograph outside of the part, divided by the part's share of the image.
     """
     if not masks:
         return {}
@@ -136,14 +136,14 @@ def region_scores(
 @jax.jit
 def _similarity(ldr: Image, target: Image, mask: Float[Array, "h w"]) -> Float[Array, "h w"]:
     """Return the SSIM of each pixel; masked pixels are equal in both images."""
-    seen = jnp.where(mask[..., None] > 0, ldr, target)
-    return ssim_map(seen.transpose(2, 0, 1), target.transpose(2, 0, 1)).mean(0)
+    filled = jnp.where(mask[..., None] > 0, ldr, target)
+    return ssim_map(filled.transpose(2, 0, 1), target.transpose(2, 0, 1)).mean(0)
 
 
 def summary_of(rows: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """Return the means of rows of views by name, and the rows as `per_view`; empty without rows.
+    """Return the mean scores of views by name, and their rows as `per_view`; empty without rows.
 
-    Drives also have the means of each part over the views with that part, and their number.
+    Drives also have the means of each part, and the number of views with that part.
     """
     if not rows:
         return {}
@@ -154,7 +154,7 @@ def summary_of(rows: dict[str, dict[str, Any]]) -> dict[str, Any]:
 
 
 def mean_of_parts(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float]]:
-    """Return the means of each part over the views that have it, and their number."""
+    """Return the means of each part over the views with it, and the number of these views."""
     out = {}
     for name in PARTS:
         there = [row[name] for row in rows if name in row]
@@ -233,14 +233,14 @@ def notes_on_missing(metrics: dict[str, Any]) -> list[str]:
 class VideoScores:
     """Scores of the videos of several cameras, frame by frame.
 
-    Frames of a camera are in temporal order; pairs of frames are of one camera. HIS is averaged
-    over all pairs of all cameras. All scores are small for a dark or blurred video, and HIS
+    Frames of a camera arrive in temporal order; every two consecutive ones are a pair. HIS is the
+    mean over the pairs of all cameras. All scores are small for a dark or blurred video, and HIS
     contains the motion of the scene: read them with PSNR, and compare with the photographs' scores.
 
-    - `his_paper`, as printed: RMS over pixels of the difference of two frames' OETF^-1(R_t) e_t. It
-      multiplies by e, although exposures are undone by division, and is 0 for a black video.
+    - `his_paper`, as in the paper: RMS over pixels of the difference of a pair's OETF^-1(R_t) e_t.
+      It multiplies by e, although exposures are undone by division; a black video has 0.
     - `his`, corrected: divided by e and by the mean radiance; invariant to e -> c e.
-    - `std_luminance`, as printed: standard deviation over frames of their mean BT.601 luminance.
+    - `std_luminance`, as in the paper: standard deviation over frames of mean BT.601 luminance.
     - `std_luminance_relative`: divided by the mean, so that darkening a video does not improve it.
     """
 

@@ -2,7 +2,7 @@
 
 Pixels of one view are found in a neighbouring one through rendered depth, with an occlusion test
 (render/warp.py). The seam is the median absolute difference over channels and pixels, in 8-bit
-codes and in stops. Pixels count if both views show them, neither saturated nor nearly black:
+codes and in stops, over pixels that both photographs show neither saturated nor nearly black:
 
 - before: difference of the unchanged photographs. For stops, both are decoded with the common gamma
   and not divided by their exposures.
@@ -39,10 +39,10 @@ from p2gs_jax.types import Camera, Render, Scene
 FEWEST_PIXELS = 200
 # Least number of shared points of a pair of views.
 FEWEST_SHARED = 30
-# Largest number of points that are projected to count shared ones, if there are no tracks.
+# Largest number of points among which shared ones are counted, if there are no tracks.
 MOST_COUNTED = 5000
-# A picture of a seam uses rendered depth where the opacity is at least this, and elsewhere this
-# multiple of the largest rendered depth. Pixels without a photograph have the display value BLANK.
+# A picture of a seam uses rendered depth where the opacity is at least OPAQUE, and elsewhere FAR
+# times the largest rendered depth. Pixels without a photograph have the display value BLANK.
 OPAQUE, FAR = 0.5, 100.0
 BLANK = 0.5
 
@@ -91,7 +91,7 @@ def neighbouring_pairs(scene: Scene, most: int) -> list[tuple[int, int]]:
 
 
 def _closest(shared: np.ndarray) -> list[tuple[int, int]]:
-    """Return pairs of each view and the view that shares most points, the nearest among equals."""
+    """Return pairs of each view and the view that shares most points (if equal, the nearest)."""
     order = np.arange(len(shared))
     near = shared - np.abs(order[:, None] - order) / (len(shared) + 1)
     np.fill_diagonal(near, -np.inf)
@@ -127,7 +127,7 @@ def measure_seam(
     """Return the seam between two photographs, or None if they share too few pixels.
 
     They are compared in the pixels of the first. `common` is the display transform of "after", and
-    its gamma is that of "before". `cfg` has the display values between which pixels are used.
+    its gamma is that of "before". `cfg` limits the display values of used pixels.
     """
     there = warp(jnp.asarray(first.depth), first.camera, jnp.asarray(second.depth), second.camera)
     ldr = sample_bilinear(jnp.asarray(second.ldr), there.xy)

@@ -2,7 +2,7 @@
 
 It is memory-bound. Its blurs are 11 shifted adds per axis, one colour channel at a time, so that
 its maps stay in cache (all channels at once add 1 ms to a step of 7 ms on an H200). Its gradient is
-explicit: it needs three blurs beside the four of the moments, and autodiff would need four
+explicit: it needs three blurs after the four blurs of the loss, and autodiff would need four
 (BUILD_NOTES, "SSIM").
 """
 
@@ -22,7 +22,7 @@ from p2gs_jax.render.xla_cpu import materialize, opaque_true
 
 Image = Float[Array, "h w 3"]
 
-WINDOW, SIGMA = 11, 1.5
+WINDOW, SIGMA = 11, 1.5  # pixels
 C1, C2 = 0.01**2, 0.03**2
 
 
@@ -49,9 +49,9 @@ class _Parts(NamedTuple):
     """The terms of 1 - SSIM = A + B - A B; A and B vanish where both images agree.
 
     With the sum s and difference d of both images, blurred means m and variances v, SSIM is
-    (1 - A)(1 - B), A = m(d)^2 / b1 and B = v(d) / b2. In this form no large numbers cancel, neither
-    in the loss nor in its gradient, and small errors keep their digits (ours: BUILD_NOTES, "SSIM of
-    differences").
+    (1 - A)(1 - B), A = m(d)^2 / b1 and B = v(d) / b2 with SSIM's denominators b1 and b2. No large
+    numbers cancel in this form, neither in the loss nor in its gradient, and small errors keep
+    their digits (ours: BUILD_NOTES, "SSIM of differences").
     """
 
     s: Float[Array, "h w"]

@@ -69,7 +69,7 @@ def correction_of(appearance: Corrections | None, row: Int[Array, ""] | int) -> 
 
 
 def mean_correction(appearance: Corrections | None, camera: str | None = None) -> Correction | None:
-    """Return the mean over the training views, for others; PPISP's depends on their camera."""
+    """Return the mean over the training views, for other views; PPISP's depends on their camera."""
     if isinstance(appearance, Ppisp):
         return appearance.mean(camera)
     if isinstance(appearance, Luminance):

@@ -34,7 +34,7 @@ from p2gs_jax.types import Scene
 
 # Points of each view to which a curve is fitted if the options give its kind.
 RESPONSE_PER_VIEW = 200
-HELD_OUT = 0.4
+HELD_OUT = 0.4  # share of each view's regions that is held out
 # Candidates are compared on at most this many observations; the choice is solved on all.
 MOST_OBSERVATIONS = 40_000
 SPLINE_OBSERVATIONS = 12_000  # a curve has few parameters, and its basis is the most expensive
@@ -55,7 +55,7 @@ class CalibrationOptions:
     known: KnownExposures | None = None
     seed: int = 0  # seed of the choice of held-out observations
     # Model and curve: chosen on held-out colours, an exposure per view under one fitted response
-    # (stacks), or given; splines of a given kind of curve are fitted.
+    # (stacks), or fixed. A fixed `Curve` is a kind of curve, whose splines are fitted.
     choice: Literal["held_out", "one_response"] | tuple[Form, Response | Curve] = "held_out"
     # Kind of photographs that are light encoded as sRGB (`Scene.known_response`): no other curve is
     # compared. None: the camera's tone curve is unknown.
@@ -123,7 +123,7 @@ def calibrate_observations(
     elif options.choice == "one_response":
         selection = _by_one_response(options.problem(observations))
     else:
-        selection = _given(observations, options, *options.choice)
+        selection = _fixed(observations, options, *options.choice)
     coarse = observations.too_coarse
     if not coarse:
         return selection
@@ -134,7 +134,7 @@ def calibrate_observations(
     return dataclasses.replace(selection, reasons=(note, *selection.reasons))
 
 
-def _given(
+def _fixed(
     observations: Observations, options: CalibrationOptions, form: Form, curve: Response | Curve
 ) -> Selection:
     """Solve a form under a response, or under a kind of curve whose splines are fitted."""
@@ -156,15 +156,15 @@ def _by_one_response(problem: Problem) -> Selection:
     A stack shows every brightness often, so that no held-out colours are needed.
     """
     fitted = [fit_response(problem, Response(base)) for base in BASES]
-    options = [fit_model(problem, "view_exposure", r) for r in fitted if r is not None]
-    if not options:
+    solutions = [fit_model(problem, "view_exposure", r) for r in fitted if r is not None]
+    if not solutions:
         collapsed = "A fitted response collapsed: sRGB is used without a spline."
         return Selection(fit_model(problem, "view_exposure"), (), (collapsed,))
-    return Selection(min(options, key=lambda s: s.residual_ev), (), _notes(problem))
+    return Selection(min(solutions, key=lambda s: s.residual_ev), (), _notes(problem))
 
 
 def _notes(problem: Problem, *, free: bool = True) -> tuple[str, ...]:
-    """Return the note on what known exposures determine; the power of the curve may be `free`."""
+    """Return the note on gauges that known exposures fix; `free`: options do not set the power."""
     if problem.known is None:
         return ()
     head = f"The exposures of {np.isfinite(problem.known.log_exposures).sum()} view(s) are known"
@@ -190,7 +190,7 @@ def _subset(observations: Observations, seed: int, most: int) -> Observations:
 
 
 def held_out(o: Observations, seed: int) -> Bool[np.ndarray, " o"]:
-    """Return which observations to hold out: whole regions of images, in which errors are shared.
+    """Return the mask of observations to hold out: whole regions of images, which share errors.
 
     Single observations would be predicted by neighbours with the same error. Parameters that
     explain such errors would then win (BUILD_NOTES, "Whole regions").

@@ -42,11 +42,11 @@ from p2gs_jax.photometry.response import BASES, Response, base_log
 SPLINE_SPREAD_EV, SHADED_SPREAD_EV = 0.2, 0.05
 HOPELESS = 1.0  # deficit, nat per observation, that no tone curve compensates
 MOST_COMPARED = 80  # largest number of choices that are compared
-STANDARD_ERRORS, SMALLEST_GAIN = 2.0, 0.01
+STANDARD_ERRORS, SMALLEST_GAIN = 2.0, 0.01  # deficits up to these (the latter in nat) are excused
 LARGEST_CHANCE = 0.25  # largest deficit that a standard error excuses, nat per observation
 # Predictions that differ by at most this in every view count as equal, 8-bit levels.
 INVISIBLE_DIFFERENCE = 1.0
-# The predictive density is a mixture, so that outliers do not decide: their share and deviation.
+# The predictive density is a mixture, so that outliers do not decide: share, deviation (log).
 OUTLIERS, OUTLIER_DEVIATION = 0.1, 1.2
 RANGES = 8  # number of ranges of brightness, equal in count, in which prediction errors are scaled
 
@@ -61,8 +61,7 @@ class Candidate:
     density: float  # mean held-out log density, nat per observation
     deficit: float  # density of the best candidate minus this one, nat per observation
     deficit_error: float  # standard error of the deficit, over views or regions of images
-    # Difference of its predictions from the best's, 8-bit levels: RMS in the view where it is
-    # largest.
+    # RMS difference from the best's predictions in the view with the largest RMS, 8-bit levels.
     difference: float
 
     @property
@@ -77,7 +76,7 @@ class Candidate:
 
     @property
     def likely(self) -> bool:
-        """Whether it predicts about as well as the best."""
+        """Whether this candidate predicts about as well as the best."""
         chance = min(STANDARD_ERRORS * self.deficit_error, LARGEST_CHANCE)
         return self.deficit <= max(chance, SMALLEST_GAIN)
 
@@ -121,8 +120,8 @@ class Search:
         self._fitted: dict[tuple[Form, Curve], Response | None] = {}
         # Spread of the light of one surface under sRGB, log units; None: each form solves it.
         self._spread: float | None = light_spread(self._solve(Choice(EXPOSURES), Response()))
-        self._exposed = self._spread / LN2
-        curves, places = self._exposed >= SPLINE_SPREAD_EV, o.positions is not None
+        self._spread_ev = self._spread / LN2
+        curves, places = self._spread_ev >= SPLINE_SPREAD_EV, o.positions is not None
         if not curves and places:
             # Vignetting determines a curve at equal exposures: corners show surfaces darker.
             shaded = self._solve(Choice(EXPOSURES._replace(vignetting="camera")), Response())
@@ -147,7 +146,7 @@ class Search:
             self._try(Choice(form, Curve("srgb", by)) for form in (EXPOSURES, richest[0]))
         if not self._scope.curves:
             return [
-                f"Exposures differ by {self._exposed:.2f} EV (standard deviation): too little to "
+                f"Exposures differ by {self._spread_ev:.2f} EV (standard deviation): too little to "
                 "determine the shape of the tone curve, so only standard curves were compared."
             ]
         if all(response is None for response in self._fitted.values()):
@@ -245,8 +244,8 @@ class Search:
 def _predict(problem: Problem, fit: Fit, response: Response, held: np.ndarray) -> Predicted:
     """Return predictions of held-out rows.
 
-    The noise model depends on the curve, but must not decide between curves. The noise is that of
-    sRGB, and prediction errors are scaled in its units, in ranges of brightness.
+    The noise model depends on the curve, but must not decide between curves. The noise under sRGB
+    is therefore used for all, rescaled to the prediction errors in each range of brightness.
     """
     o, layout = problem.observations, problem.layout
     sigma, slope = (a[held] for a in o.decoded(response)[1:])
@@ -254,10 +253,10 @@ def _predict(problem: Problem, fit: Fit, response: Response, held: np.ndarray) -
     known = problem.usable[held] & (precision > 1e-3)
     a = fit.theta.a[o.views[held]][:, None]
     error = fit.at.residual[held] / slope
-    standard, noise = base_log(y, "srgb")[1], o.picked(held).decoded(Response())[1]
+    srgb_slope, noise = base_log(y, "srgb")[1], o.picked(held).decoded(Response())[1]
     # The radiance of a point is uncertain as well.
     of_point = 1 + a**2 / np.maximum(precision * sigma**2, 1e-9)
-    variance = (noise / standard) ** 2 * of_point
+    variance = (noise / srgb_slope) ** 2 * of_point
     if known.any():
         ranges = np.quantile(y[known], np.arange(1, RANGES) / RANGES)
         at = np.where(known, np.searchsorted(ranges, y), -1)
@@ -269,7 +268,7 @@ def _predict(problem: Problem, fit: Fit, response: Response, held: np.ndarray) -
         return -0.5 * error**2 / v - 0.5 * np.log(2 * np.pi * v)
 
     inlier = np.log(1 - OUTLIERS) + normal(variance)
-    wide = variance + (OUTLIER_DEVIATION / standard) ** 2
+    wide = variance + (OUTLIER_DEVIATION / srgb_slope) ** 2
     density = np.logaddexp(inlier, np.log(OUTLIERS) + normal(wide))
     # Channels are correlated: an observation counts once, as the mean of its channels.
     count = known.sum(1)

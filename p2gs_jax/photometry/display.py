@@ -56,7 +56,7 @@ class DisplayTransform:
 
     @property
     def capture(self) -> Capture:
-        """Its parameters for `formation`."""
+        """The parameters of the view for `formation`."""
         w = self.white_balance
         return on_host(
             Capture,
@@ -68,7 +68,7 @@ class DisplayTransform:
 
     @property
     def vignetting(self) -> tuple[tuple[float, ...], ...]:
-        """Coefficients of its vignetting: one row, or one per channel; empty: no vignetting."""
+        """Coefficients of the vignetting: one row, or one per channel; empty: no vignetting."""
         known = self.camera is not None and self.camera >= 0
         return self.formation.cameras[self.camera].vignetting if known else ()  # pyright: ignore
 
@@ -147,7 +147,7 @@ def undevelop(
 
 
 def light_of(ldr: Pixels, transform: DisplayTransform) -> Float32[np.ndarray, "... 3"]:
-    """Return the linear radiance of display values as `undevelop`, but 0 for 0.
+    """Return the linear radiance of display values like `undevelop`, but 0 for 0.
 
     Below half an 8-bit code it is proportional to the value, so that empty pixels stay black under
     every exposure. Values above 1 count as 1, unless the curve is linear.
@@ -203,10 +203,10 @@ def usual_display(
 ) -> DisplayTransform:
     """Return the transform of a view that was not fitted; `camera` is None if it has no camera.
 
-    Its exposure is the geometric mean over the training views, its gamma and its correction are
-    arithmetic means. Its white balance is the mean over all training views, or over those of its
-    camera if it varies by camera only. Its vignetting and its response, also those of a correction,
-    are those of its camera. `cameras` is the camera of every training view.
+    The exposure is the geometric mean over the training views; gamma and correction are arithmetic
+    means. The white balance is the mean over all training views, or over the views of the camera if
+    it varies by camera only. Vignetting and response, also in a correction, come from the camera.
+    `cameras` lists the camera of every training view.
     """
     photometry: Photometry = jax.tree.map(np.asarray, params.photometry)
     mean = mean_parameters(photometry)

@@ -94,7 +94,7 @@ def places(xy: Values, width: int, height: int) -> Values:
 def log_vignetting(
     squared: Values, camera: Int[Array, "..."] | int, cfg: PhotometryConfig
 ) -> Values:
-    """Return log V at r^2 with an appended axis of 1 or 3 channels, of one camera or one each."""
+    """Return log V at r^2, of one camera or one per position, with an axis of 1 or 3 channels."""
     xp = namespace(squared, camera)
     k = xp.asarray(vignetting_table(cfg))[camera]
     s = squared[..., None]
@@ -112,7 +112,7 @@ def corner(camera: CameraFormation) -> tuple[float, ...]:
 def gain(
     shape: tuple[int, ...], capture: Capture, cfg: PhotometryConfig, positions: Positions = None
 ) -> Any:
-    """Return e W V, the factor on radiance (paper, eq. 4: e), to broadcast against it.
+    """Return e W V, the factor that broadcasts against radiance (paper, eq. 4: only e).
 
     `capture` is of the view, or of every single pixel; `positions` are those of single pixels.
     Raises ValueError: vignetting is modelled, and positions of single pixels are missing.
@@ -181,7 +181,7 @@ def inverse_tone_map(
 
 
 def exposed_at(level: float, gamma: float, cfg: PhotometryConfig) -> float:
-    """Return the exposed radiance that maps to a display value; the least of several curves."""
+    """Return the exposed radiance that maps to a display value: the least over all curves."""
     ldr = np.full(3, level, np.float32)
     rows = range(-1, len(cfg.cameras)) if cfg.cameras else (None,)
     return min(float(inverse_tone_map(ldr, np.float32(gamma), cfg, row).min()) for row in rows)
@@ -218,9 +218,9 @@ def inverse_formation(
     return exposed / gain(ldr.shape, capture, cfg, positions)
 
 
-def _by_pixel(gamma: Any) -> Any:
-    """Return the gamma of a view unchanged, and gammas of pixels with an axis for the channels."""
-    return gamma[..., None] if np.ndim(gamma) else gamma
+def _by_pixel(value: Any) -> Any:
+    """Return the value of a view unchanged, and values of pixels with an axis for the channels."""
+    return value[..., None] if np.ndim(value) else value
 
 
 def display(ldr: Values) -> Values:

@@ -31,7 +31,7 @@ AXES = 5  # parameters of the axes
 AXES_UNIT, BIAS_UNIT = 0.2, 0.1
 # Published: power 1 + 0.1 g, turning point 0.5 + 0.002 a, exponent 1 + 0.002 b.
 POWER_UNIT, TURN_UNIT, BEND_UNIT = 0.1, 0.002, 0.002
-DARKEST = 1e-3
+DARKEST = 1e-3  # lower bound of bases of powers, whose gradient at 0 may be infinite
 LEAST_RISE = 1e-5  # least rise of a curve from one entry to the next where it is inverted
 
 
@@ -70,8 +70,8 @@ class Luminance(eqx.Module):
         self, statistics: Float[Array, "*v s"]
     ) -> tuple[Float[Array, "*v k"], Float[Array, "*v 3"]]:
         """Return the curves of photographs and the shapes of their pseudo curves."""
-        seen = lax.stop_gradient(jnp.asarray(statistics))
-        inner = jnp.tanh(seen @ self.hidden + self.hidden_bias)
+        inputs = lax.stop_gradient(jnp.asarray(statistics))
+        inner = jnp.tanh(inputs @ self.hidden + self.hidden_bias)
         found = inner @ self.out + self.out_bias
         return jnp.clip(self.curve + BIAS_UNIT * found[..., :ENTRIES], 0, 1), found[..., ENTRIES:]
 
@@ -131,7 +131,7 @@ def as_photographed(ldr: Float[Array, "*p 3"], view: Curves) -> Float[Array, "*p
 
 
 def _along_axes(ldr, axes, change):
-    """Return colours after `change` of their coordinates along the axes, scaled to [0, 1]."""
+    """Return colours after `change` of their axis coordinates, which are scaled to [0, 1]."""
     low, high = spans(axes)
     along = (ldr @ axes.T - low) / (high - low)
     return (change(along) * (high - low) + low) @ axes
@@ -164,6 +164,6 @@ def statistics_of(
     photograph: Float[Array, "h w 3"], mask: Float[Array, "h w"]
 ) -> Float[Array, " s"]:
     """Return cumulative histogram and mean colour of every fourth pixel along both axes."""
-    seen, weight = photograph[::4, ::4].reshape(-1, 3), mask[::4, ::4].reshape(-1)
-    mean = (weight[:, None] * seen).sum(0) / jnp.maximum(weight.sum(), 1.0)
-    return jnp.concatenate([cumulative(seen.mean(-1), weight, LEVELS), mean])
+    colors, weight = photograph[::4, ::4].reshape(-1, 3), mask[::4, ::4].reshape(-1)
+    mean = (weight[:, None] * colors).sum(0) / jnp.maximum(weight.sum(), 1.0)
+    return jnp.concatenate([cumulative(colors.mean(-1), weight, LEVELS), mean])

@@ -1,7 +1,7 @@
 """Metering: the exposure of a new picture, from the radiance that it shows.
 
 A meter reads one number from linear radiance; a rule turns readings into an exposure. Fixed rules
-are those of camera manuals (mid-grey for the log average, white for the highlights). The fitted
+follow camera manuals (mid-grey for the log average, white for the highlights). The fitted
 rule is the one that best predicts the exposures that the camera chose.
 """
 
@@ -27,8 +27,8 @@ METERS = tuple(WORDS)
 ExposureOf = Literal["auto", "log_average", "centre", "highlights", "protected"]
 Readings = Mapping[str, float]
 
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear red, green and blue (BT.709)
-HIGHLIGHT = 99.0
+BT709 = np.array([0.2126, 0.7152, 0.0722])  # luminance of linear red, green and blue
+HIGHLIGHT = 99.0  # percentile of the luminance
 CENTRE = 0.4  # standard deviation of the weights about the centre, half diagonals
 # Lower bound of luminance relative to its mean; pictures show nothing darker.
 DARKEST = 2.0**-12
@@ -38,17 +38,17 @@ MID_GREY, BELOW_WHITE = 0.18, 0.98  # exposed radiance, and display value
 PIXELS = 100_000  # approximate number of pixels that a meter reads
 # Cross-validation holds out at most this many stretches of views: neighbours in a video are alike.
 FOLDS = 12
-FEWEST_VIEWS = 6
+FEWEST_VIEWS = 6  # with fewer views the rule is a constant
 # A rule explains the camera if its RMS of held-out views is at most this share of a constant's.
 EXPLAINS = 0.8
 NEGLIGIBLE_EV = 0.05  # exposures that vary by less, stops, count as constant
 
 
 def meter(linear: Float[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"]) -> dict[str, float]:
-    """Return readings of premultiplied radiance, natural logarithm; NaN if too little is opaque."""
+    """Return readings of premultiplied radiance, natural logs; NaN if too little is opaque."""
     step = max(1, int(np.sqrt(alpha.size / PIXELS)))
     weight = np.asarray(alpha[::step, ::step], np.float64)
-    light = np.asarray(linear[::step, ::step], np.float64) @ LUMINANCE
+    light = np.asarray(linear[::step, ::step], np.float64) @ BT709
     seen = (weight > 0) & np.isfinite(light)
     if weight[seen].sum() < LEAST_SEEN * weight.size:
         return dict.fromkeys(METERS, float("nan"))
@@ -86,7 +86,7 @@ class Rule:
 
     @property
     def words(self) -> str:
-        """Its name in text."""
+        """The name of the rule in text."""
         return "constant" if self.meter is None else WORDS.get(self.meter, self.meter)
 
 
@@ -125,9 +125,9 @@ class Metering:
     def exposure(self, readings: Readings, of: ExposureOf = "auto") -> float:
         """Return the exposure of a picture, a factor on radiance.
 
-        Without `readings` it is the mean. `auto` follows `rule`; `log_average` and `centre` expose
-        that average to mid-grey; `highlights` exposes the 99th percentile to just below white;
-        `protected` is the log average, or `highlights` where the former would clip them.
+        NaN readings give the geometric mean. `auto` follows `rule`; `log_average` and `centre`
+        expose that average to mid-grey; `highlights` exposes the 99th percentile to just below
+        white; `protected` is `log_average`, or `highlights` where the former would clip highlights.
         """
         return float(np.exp(self._log_exposure(readings, of)))
 

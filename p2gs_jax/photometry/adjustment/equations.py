@@ -19,11 +19,11 @@ from p2gs_jax.photometry.observations import Labels, PerChannel
 
 Loss = Literal["l1", "geman_mcclure", "whole_points"]
 GEMAN_MCCLURE = 3.0  # width of the Geman-McClure loss in robust standard deviations
-# Weight of the prior of a point's spread, number of observations.
+# Weight of the prior of a point's spread, as a number of observations.
 PRIOR_SPREAD = 3.0
-SMALLEST_SCALE = 0.3
-MEDIAN_ROWS = 4096
-LEAST_BENT = 0.2
+SMALLEST_SCALE = 0.3  # lower bound of `Weighted.scale`
+MEDIAN_ROWS = 4096  # a median uses fewer than twice this many rows
+LEAST_BENT = 0.2  # least curvature of a point over its weight
 
 PerObservation = Float[np.ndarray, " o"]
 
@@ -36,7 +36,7 @@ class Weighted(NamedTuple):
     slope: PerChannel  # dz/dy
     residual: PerChannel  # residual of each observation, log units
     radiance: Float[np.ndarray, "r 3"]  # log radiance of each row's point relative to the pivot
-    level: PerChannel  # the same at every observation, plus features of its camera
+    level: PerChannel  # `radiance` at every observation, plus features of its camera
     precision: Float[np.ndarray, "r 3"]  # inverse variance of `radiance`
     scale: float  # robust standard deviation of one observation in units of its stated one
     curvature: float  # mean second derivative of the robust loss over its weight (1 for squares)
@@ -84,8 +84,8 @@ def _whole_points(
     """Return weights and second derivatives if every point has a separate spread.
 
     Gloss and silhouettes make all observations of a point uncertain, by different amounts for
-    different points. The Geman-McClure losses of a point are therefore summed as the squares in
-    Student's t, whose scale belongs to the point: its weight falls as its views differ more.
+    different points. Their Geman-McClure losses therefore act as the squares in Student's t with a
+    scale per point. `share` is the used share of channels; the rest as for `_derivatives`.
     """
     alone, curved = _derivatives(square, common)
     bound = GEMAN_MCCLURE**2
@@ -102,7 +102,7 @@ def _curvature(
 ) -> float:
     """Return the mean ratio of the loss's second derivative to its weight, points eliminated.
 
-    `known` are the inverse variances of observations.
+    `robust` and `second` are factors on `known`, the inverse variances of observations.
     """
     weight, curved = known * robust, known * second
     of_row, bent = layout.by_row @ weight, layout.by_row @ curved
@@ -116,7 +116,7 @@ def _curvature(
 def _derivatives(
     square: PerObservation, common: PerObservation
 ) -> tuple[PerObservation, PerObservation]:
-    """Return slope over residual, and curvature, of the Geman-McClure loss of an observation.
+    """Return slope over residual, and curvature, of the Geman-McClure loss of observations.
 
     `square` is the mean of squared residuals over its channels, `common` the square of their mean.
     """
@@ -130,7 +130,7 @@ def _radiance(layout: Layout, a, z, weight):
 
 
 def _median(model: Forward, values: PerChannel) -> float:
-    """Return the median of used values; with more than MEDIAN_ROWS rows, of every n-th row."""
+    """Return the median of used values; from 2 MEDIAN_ROWS rows on, of every n-th row."""
     used = model.weight > 0
     step = max(1, model.layout.rows // MEDIAN_ROWS)
     if step > 1:
@@ -177,7 +177,7 @@ def normal_equations(
     factors, channels = [coupled * p.derivative for p in per_view], [p.channels for p in per_view]
     of_pairs = layout.pairs.sums(factors, channels, kind)
     parts.append(of_pairs._replace(values=-of_pairs.values))
-    # Without gammas, a stays in the vector.
+    # Without gammas, a is fixed, but keeps its place.
     right += [] if u.gammas else [np.zeros(u.views)]
     if (terms := others(model, theta)) is not None:
         more, pulled = _with_others(model, at, terms, per_view, coupled)
@@ -201,7 +201,7 @@ def of_views(model: Forward, at: Weighted) -> list[OfView]:
 
 
 def others(model: Forward, theta: Parameters) -> Terms | None:
-    """Return the derivatives of predictions by k and c."""
+    """Return the derivatives of predictions by k (features) and c (splines)."""
     if model.terms is None or not model.unknowns.gammas:
         return model.terms
     a = theta.a[model.layout.views][:, None]
@@ -268,9 +268,9 @@ def over_all(
     per_view: Sequence[sp.csr_array | sp.csc_array],
     more: Float[np.ndarray, "n k"] | None,
 ) -> sp.csr_array:
-    """Return columns for all parameters: those of views, then those of k and c, if any."""
+    """Return columns for all parameters: of views, then of k and c, if any."""
     parts = [*per_view]
-    if not u.gammas:  # a stays in the vector
+    if not u.gammas:  # a is fixed, but keeps its place
         parts.append(sp.csr_array((parts[0].shape[0], u.views)))  # pyright: ignore
     if more is not None:
         parts.append(sp.csr_array(more))

@@ -25,8 +25,8 @@ from p2gs_jax.photometry.adjustment.solve import Balanced, Fit, one_thread
 from p2gs_jax.photometry.observations import Labels, Observations
 
 CANCELLED = 1e-6  # relative rounding error of a difference of equal numbers
-# Least share of its information with which a direction counts as determined; rounding and
-# `parameters.EMPTY` leave less.
+# Least information of a determined direction, where each parameter's information is scaled to 1.
+# Rounding and `parameters.EMPTY` leave less.
 HELD = 1e-11
 # Number of random draws if unknowns are too many for their covariance: the relative error of a
 # standard error is then 12 %.
@@ -44,7 +44,7 @@ FEWEST, FEWEST_EFFECTIVE = 4, 3.0
 FOOTPRINT = 6e-4
 
 # A linear function of changes of all parameters (columns) about the solution.
-Asked = Callable[[Parameters], Float[np.ndarray, "n c"]]
+LinearMap = Callable[[Parameters], Float[np.ndarray, "n c"]]
 
 
 class Uncertainty(NamedTuple):
@@ -57,12 +57,12 @@ class Uncertainty(NamedTuple):
     few: Float[np.ndarray, " v"]  # factors on the errors of views with few clusters
     split: Callable[[Float[np.ndarray, "d c"]], Parameters]  # splits vectors into parameters
 
-    def of(self, asked: Asked) -> Float[np.ndarray, " n"]:
+    def of(self, function: LinearMap) -> Float[np.ndarray, " n"]:
         """Return the standard deviations of a function of the parameters; inf: undetermined."""
-        deviation = np.linalg.norm(asked(self.split(self.roots)), axis=1)
+        deviation = np.linalg.norm(function(self.split(self.roots)), axis=1)
         if not self.unknown.size:
             return deviation
-        lost = (np.abs(asked(self.split(self.unknown))) > CANCELLED).any(1)
+        lost = (np.abs(function(self.split(self.unknown))) > CANCELLED).any(1)
         return np.where(lost, np.inf, deviation)
 
 
@@ -80,7 +80,7 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
     each = summed(fit.model, fit.theta, fit.at, fit.at.weight * fit.at.residual, clusters)
     if observations.positions is not None and len(layout.row):
         labels = regions(observations.positions, observations.views, SHARED_REGION)
-        # The shared error is that of all points, also of those with small weights.
+        # All points have the shared error, also those with small weights.
         alike = weigh(fit.model, fit.theta, fit.at.weight, "geman_mcclure")
         parts = layout.row if observations.cells is None else clusters
         deviation = _shared_deviation(fit.model, alike, labels, parts)
@@ -97,14 +97,14 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
     pairs = np.unique(np.stack([layout.views[seen], clusters[seen]]), axis=1)[0]
     count = np.maximum(np.bincount(pairs, minlength=layout.view_count), 2)
     few = np.sqrt(count / (count - 1))
-    held = system.priors.normal + system.smooth(fit.normal)
-    bread = fit.normal * fit.at.curvature + held
+    prior = system.priors.normal + system.smooth(fit.normal)
+    bread = fit.normal * fit.at.curvature + prior
     gauges = system.gauges(bread)[1]
     if not is_small(system.basis.shape[1]):  # pyright: ignore
         drawn = _drawn(Balanced(bread, gauges, system.basis), each, system)
         return Uncertainty(*drawn, few, system.unknowns.split)
     # A prior is an observation with variance 1 / precision: its meat equals its bread.
-    meat = each.T @ each + held
+    meat = each.T @ each + prior
     with one_thread():
         dense = whole(bread + gauges.T @ gauges)
         return Uncertainty(*_sandwich(dense, meat, system.basis), few, system.unknowns.split)
@@ -117,11 +117,11 @@ def _sandwich(bread, meat, basis) -> tuple[Float[np.ndarray, "d r"], Float[np.nd
     diagonal = (basis.T @ bread @ basis).diagonal()
     g = basis @ sp.diags_array(1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)))
     value, direction = np.linalg.eigh(whole(g.T @ bread @ g))
-    held = value > HELD
-    inverse = (direction[:, held] / value[held]) @ direction[:, held].T
+    determined = value > HELD
+    inverse = (direction[:, determined] / value[determined]) @ direction[:, determined].T
     size, across = np.linalg.eigh(whole(g.T @ meat @ g))
     roots = inverse @ (across * np.sqrt(np.maximum(size, 0)))
-    unknown = g @ direction[:, ~held]
+    unknown = g @ direction[:, ~determined]
     return g @ roots, unknown / np.linalg.norm(unknown, axis=0)
 
 
@@ -131,9 +131,10 @@ def _drawn(
     """Return solutions for clusters and priors with random signs (wild bootstrap)."""
     rng = generator(0, Stream.SCORE_SIGNS)
     priors = system.priors
-    own, known = (rng.choice([-1.0, 1.0], (n, DRAWS)) for n in (each.shape[0], len(priors.targets)))
-    right = each.T @ own
-    right += priors.rows.T @ (np.sqrt(priors.precisions)[:, None] * known)
+    counts = (each.shape[0], len(priors.targets))
+    of_clusters, of_priors = (rng.choice([-1.0, 1.0], (n, DRAWS)) for n in counts)
+    right = each.T @ of_clusters
+    right += priors.rows.T @ (np.sqrt(priors.precisions)[:, None] * of_priors)
     unknown = bread.unheld(HELD)
     return bread.solve(right) / np.sqrt(DRAWS), unknown / np.linalg.norm(unknown, axis=0)
 
@@ -150,8 +151,7 @@ def regions(
 def side_by_side(observations: Observations, row: Labels) -> Labels:
     """Return the cluster of each observation: the image region of its point in its first view.
 
-    Without positions every point is a cluster. `row` is the row in the adjustment of each
-    observation.
+    Without positions every point is a cluster. `row` is each observation's row in the adjustment.
     """
     if observations.positions is None or not len(row):
         return row
@@ -165,9 +165,9 @@ def side_by_side(observations: Observations, row: Labels) -> Labels:
 def _shared_deviation(model: Forward, at: Weighted, labels: Labels, parts: Labels) -> float:
     """Return the standard deviation of the error that observations of a region share, log units.
 
-    It is the excess of the variance of region means over that from independent `parts`. Exposures
-    and radiances absorb a share of it, which is restored. Medians are used, because a region may
-    show a moving object.
+    Its square is the excess variance of region means over the variance that independent `parts`
+    cause. Exposures and radiances absorb a share of it, which is restored. Medians are used,
+    because a region may show a moving object.
     """
     layout, weight = model.layout, at.weight.sum(1)
     count = int(labels.max(initial=-1)) + 1
@@ -205,8 +205,7 @@ def _shared_scores(
 ) -> sp.csr_array:
     """Return derivatives of the right side, points eliminated, by errors that labels share.
 
-    `size` are the errors of observations relative to those of their labels. The result is (labels,
-    d).
+    `size` is the error of each observation relative to its label's. The result is (labels, d).
     """
     layout, u = model.layout, model.unknowns
     coupled = equations.coupling(layout, theta, at)

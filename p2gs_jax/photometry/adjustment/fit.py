@@ -28,11 +28,11 @@ PER_VIEW = 1000
 # Largest number of observations of all views together, and least number of points per view.
 MOST_SOLVED, LEAST_PER_VIEW = 1_500_000, 200
 UNMODELLED_PER_VIEW = 2000  # points per view for the test of effects that are not modelled
-# Observations count as outliers if their weight is below this share of that from their noise alone.
+# An observation is an outlier if its weight is below this share of its weight from noise alone.
 IGNORED = 0.25
 BLOCK = 1_000_000  # observations per block: 20 million at once take gigabytes
-NOTICEABLE_BALANCE_EV = 0.1  # error of a channel in a view from which there is a warning
-# Remaining change, as a share of a typical standard error, from which there is a warning.
+NOTICEABLE_BALANCE_EV = 0.1  # error of a channel in a view that causes a warning, stops
+# Remaining change, as a share of a typical standard error, above which there is a warning.
 NEGLIGIBLE = 0.1
 
 
@@ -70,7 +70,7 @@ def explain(
     ignored = 0
     for pick, points, part in _blocks(problem):
         mine, usable = part.observations, part.usable
-        # At the solution each observation has a robust weight of its residual alone.
+        # At the solution the robust weight of an observation depends on its residual alone.
         model = Forward.of(part, usable, response, fit.model.unknowns)
         weight = model.noise_weight
         for loss in ("l1", "l1", "geman_mcclure", "geman_mcclure"):
@@ -109,7 +109,7 @@ def _blocks(problem: Problem) -> Iterator[tuple[np.ndarray | slice, np.ndarray |
 
 
 def solution_of(
-    problem: Problem, form: Form, response: Response, fit: Fit, known: Uncertainty
+    problem: Problem, form: Form, response: Response, fit: Fit, covariance: Uncertainty
 ) -> PhotometricSolution:
     """Return the solution of the whole problem in its gauge, with errors and warnings."""
     o, used = problem.observations, problem.usable
@@ -118,16 +118,16 @@ def solution_of(
     per_view = np.bincount(o.views[seen], minlength=o.view_count)
     active, free = per_view > 0, np.ones(o.view_count, bool)
     if problem.known is not None:
-        given = np.isfinite(problem.known.log_exposures)
-        free = ~np.isin(problem.component, np.unique(problem.component[given]))
-        active = active | given
+        fixed = np.isfinite(problem.known.log_exposures)
+        free = ~np.isin(problem.component, np.unique(problem.component[fixed]))
+        active = active | fixed
     scale, color = (_Gauge(problem.component, active & one) for one in (free, True))
-    exposures, shifts, lost = _exposures(fit, known, active, scale, color)
+    exposures, shifts, lost = _exposures(fit, covariance, active, scale, color)
     # Radiances of points shift inversely, by the shift of one of their views.
     some_view = np.zeros(o.point_count, int)
     some_view[o.points[seen]] = o.views[seen]
     view_residual, tint = _per_view_ev(o.views, residual, used, o.view_count)
-    cameras, corner_errors = _cameras(fit, response, known, o)
+    cameras, corner_errors = _cameras(fit, response, covariance, o)
     part = o.thinned(UNMODELLED_PER_VIEW, 0)
     solution = PhotometricSolution(
         model=form.model,
@@ -156,9 +156,9 @@ def solution_of(
 
 
 def _exposures(
-    fit: Fit, known: Uncertainty, active: Bool[np.ndarray, " v"], scale: _Gauge, color: _Gauge
+    fit: Fit, covariance: Uncertainty, active: Bool[np.ndarray, " v"], scale: _Gauge, color: _Gauge
 ) -> tuple[dict[str, np.ndarray], Float[np.ndarray, "v x"], Bool[np.ndarray, " v"]]:
-    """Return exposures, gammas and white balance with errors; shifts; views without errors."""
+    """Return exposures, gammas, white balance and errors; gauge shifts; views without errors."""
     a, light = fit.theta.a, fit.theta.b / fit.theta.a[:, None]
     h, balance = light.mean(1), light - light.mean(1, keepdims=True)
     shift = scale.shift(h)
@@ -178,21 +178,22 @@ def _exposures(
         moved = np.broadcast_to(moved, (len(h), 3, moved.shape[2]))
         return color.centred(moved - moved.mean(1, keepdims=True)).reshape(-1, moved.shape[2])
 
-    h_errors = known.few * known.of(lambda change: scale.centred(of_light(change).mean(1)))
-    a_errors = known.few * known.of(lambda change: change.a)
-    balance_errors = known.few[:, None] * known.of(of_balance).reshape(-1, 3)
+    few = covariance.few
+    h_errors = few * covariance.of(lambda change: scale.centred(of_light(change).mean(1)))
+    a_errors = few * covariance.of(lambda change: change.a)
+    balance_errors = few[:, None] * covariance.of(of_balance).reshape(-1, 3)
     lost = active & ~(np.isfinite(h_errors) & np.isfinite(a_errors))
-    seen = active & ~lost
+    determined = active & ~lost
     if features.balance:
         balance = balance + of_cameras(fit.theta.k[:, None])[..., 0]
     balance = color.centred(np.broadcast_to(balance, (len(h), 3)))
     found = {
         "log_exposures": np.where(active, h - shift, 0.0),
-        "exposure_errors": np.where(seen, h_errors, np.inf),
+        "exposure_errors": np.where(determined, h_errors, np.inf),
         "gammas": np.where(active, GAMMA_SRGB / a, GAMMA_SRGB),
-        "gamma_errors": np.where(seen, GAMMA_SRGB / a / a * a_errors, np.inf),
+        "gamma_errors": np.where(determined, GAMMA_SRGB / a / a * a_errors, np.inf),
         "white_balance": np.where(active[:, None], balance, 0.0),
-        "white_balance_errors": np.where(seen[:, None], balance_errors, np.inf),
+        "white_balance_errors": np.where(determined[:, None], balance_errors, np.inf),
     }
     return found, shifts, lost
 
@@ -219,7 +220,7 @@ class _Gauge:
 
 
 def _cameras(
-    fit: Fit, response: Response, known: Uncertainty, o: Observations
+    fit: Fit, response: Response, covariance: Uncertainty, o: Observations
 ) -> tuple[tuple[CameraFormation, ...], Float[np.ndarray, "c j"]]:
     """Return vignetting and response of each camera, and standard errors of log V in corners."""
     features = fit.model.unknowns.features
@@ -238,7 +239,7 @@ def _cameras(
         each = [features.vignetting_of(column).sum(2).ravel() for column in change.k.T]
         return np.stack(each, 1)
 
-    errors = known.of(corner).reshape(shape) if np.prod(shape) else np.zeros(shape)
+    errors = covariance.of(corner).reshape(shape) if np.prod(shape) else np.zeros(shape)
     return tuple(formations), errors
 
 

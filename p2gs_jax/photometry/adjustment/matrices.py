@@ -70,7 +70,7 @@ class Terms:
     def of_index(
         cls, index: Int[np.ndarray, "o 3 m"], factor: Float[np.ndarray, "o 3 m"], count: int
     ) -> Terms:
-        """Group terms by their parameters (`count`: none) and factors."""
+        """Group values by the parameters of their terms; the index `count` stands for no term."""
         index, factor = (part.reshape(-1, part.shape[-1]) for part in (index, factor))
         short = index.astype(np.min_scalar_type(count))  # sorted faster
         order = np.lexsort(short.T)
@@ -128,14 +128,14 @@ class Pairs:
     def __init__(self, row: Int[np.ndarray, " o"], views: Int[np.ndarray, " o"], view_count: int):
         # Sorted by row, the observations of a pair are close in memory.
         self._order = np.argsort(row, kind="stable")
-        self._views = view_count
+        self._view_count = view_count
         here, seen_by = row[self._order], views[self._order]
         at = np.arange(len(here))
         # Each observation is paired with itself and with later ones of the same row.
         following = np.searchsorted(here, here, side="right") - at
         self._first = np.repeat(at, following).astype(np.int32)
-        ends = np.cumsum(following) - following
-        offset = np.arange(len(self._first)) - np.repeat(ends, following)
+        starts = np.cumsum(following) - following
+        offset = np.arange(len(self._first)) - np.repeat(starts, following)
         self._second = (self._first + offset).astype(np.int32)
         del offset
         keys = seen_by[self._first] * np.int64(view_count) + seen_by[self._second]
@@ -151,12 +151,12 @@ class Pairs:
     ) -> Entries:
         """Return the sum over rows of outer products of per-view vectors: (x V, x V).
 
-        `factors` are those of each of x parameters in the `channels` in which it acts. `kind` is
+        x parameters of each of V views have `factors`, and `channels` in which they act. `kind` is
         the type of products. Rounds use float32: their matrix affects how fast they converge, not
         the result. Standard errors need float64: the coupling of groups of views by a few dark
         points is less than the rounding of the coupling inside a group.
         """
-        count, views = len(factors), self._views
+        count, views = len(factors), self._view_count
         parts = [f[:, c][self._order].astype(kind) for f, c in zip(factors, channels, strict=True)]
         shared = [[c for c in one if c in other] for one in channels for other in channels]
         used = [k for k, common in enumerate(shared) if common]

@@ -1,7 +1,7 @@
 """The unknowns, their free directions, and the priors and gauges that determine them.
 
-Features are effects of cameras that are linear in log radiance: a white balance per camera is a
-constant per channel, and vignetting a polynomial of the radius. Both act on light before the tone
+Features are effects of cameras that add to log radiance: a white balance per camera is a constant
+per channel, and vignetting a polynomial of the radius. Both act on light before the tone
 curve: like a point's log radiance they are multiplied by a = 2.2 / gamma.
 """
 
@@ -75,7 +75,7 @@ class Features:
         return len(CHROMA) * self.balance + len(VIGNETTING_POWERS) * (self.vignetting is not None)
 
     def terms(self, layout: Layout) -> tuple[Int[np.ndarray, "o 3 m"], Float[np.ndarray, "o 3 m"]]:
-        """Return parameters and values of the features at every value."""
+        """Return the parameters and factors of the features of every observed value."""
         camera = layout.cameras[layout.views][:, None]
         index, factor = [], []
         if self.balance:
@@ -138,7 +138,7 @@ class Splines:
     def terms(
         self, knot: Int[np.ndarray, "o 3"], fraction: PerChannel, group: Int[np.ndarray, "o 3"]
     ) -> tuple[Int[np.ndarray, "o 3 m"], Float[np.ndarray, "o 3 m"]]:
-        """Return parameters and values of the basis; `count` stands for a fixed knot."""
+        """Return parameters and factors of the basis; `count` stands for a fixed knot."""
         position = np.full(len(KNOTS), -1)
         position[self.free] = np.arange(len(self.free))
         position = position[np.stack([knot, knot + 1], -1)]
@@ -183,7 +183,7 @@ class Parameters(NamedTuple):
     b: Float[np.ndarray, "v x"]
     a: Float[np.ndarray, " v"]  # 2.2 / gamma per view
     k: Float[np.ndarray, " k"]  # parameters of `Features`
-    # Response splines at their free knots; empty if the response is given.
+    # Response splines at their free knots; empty if the response is fixed.
     c: Float[np.ndarray, " c"]
 
     def vector(self) -> Vector:
@@ -275,11 +275,11 @@ class Held:
 
     @functools.cached_property
     def normal(self) -> sp.csr_array:
-        """Its normal matrix."""
+        """The normal matrix."""
         return sp.csr_array(self.rows.T @ self.rows.multiply(self.precisions[:, None]))
 
     def pull(self, vector: Vector) -> Vector:
-        """Return its right side at some parameters."""
+        """Return the right side at some parameters."""
         return self.rows.T @ (self.precisions * (self.targets - self.rows @ vector))
 
 
@@ -290,11 +290,11 @@ class System(NamedTuple):
     basis: sp.csr_array  # columns are the free directions
     anchors: Held  # the gauges; their precisions are relative (`gauges`)
     priors: Held  # the priors
-    start: Parameters  # initial parameters: the prior mean of h
-    smoothness: Float[np.ndarray, "k k"]  # its quadratic form keeps a spline smooth
+    start: Parameters  # initial parameters; h is its prior mean
+    smoothness: Float[np.ndarray, "k k"]  # matrix of the quadratic form that keeps splines smooth
 
     def near(self, theta: Parameters, of: Unknowns) -> Parameters:
-        """Return the parameters of this system that are closest to those of another."""
+        """Return the parameters of this system closest to `theta`, which has the unknowns `of`."""
         mine = self.unknowns
         h = theta.b / theta.a[:, None]
         if of.channels != mine.channels:
@@ -346,9 +346,9 @@ def make_system(problem: Problem, form: Form, splines: ResponseKind | None = Non
     known = problem.known
     log_exposure, precision = np.zeros(views), np.zeros(views)
     if known is not None:
-        given = np.isfinite(known.log_exposures)
-        log_exposure = np.where(given, known.log_exposures, 0.0)
-        precision = given / (max(known.deviation_ev, FIXED_EV) * LN2) ** 2
+        fixed = np.isfinite(known.log_exposures)
+        log_exposure = np.where(fixed, known.log_exposures, 0.0)
+        precision = fixed / (max(known.deviation_ev, FIXED_EV) * LN2) ** 2
     of_gammas = np.full(views, 1 / A_PRIOR**2)
     if model.gamma == "camera" and problem.with_known_power.size:
         # The prior of a camera counts once, not in each view.
@@ -416,13 +416,13 @@ def _anchors(problem: Problem, u: Unknowns, log_exposure, precision) -> Held:
 
 def _priors(u: Unknowns, log_exposure, precision, of_gammas) -> Held:
     """Return the priors: exposures (b - a mu = 0 for h = mu), gammas and vignetting."""
-    given = np.flatnonzero(precision > 0)
-    at = np.arange(len(given))
-    b = [(np.full(len(given), 1 / u.channels), c * u.views + given) for c in range(u.channels)]
-    b.append((-log_exposure[given], u.at.a.start + given))
+    fixed = np.flatnonzero(precision > 0)
+    at = np.arange(len(fixed))
+    b = [(np.full(len(fixed), 1 / u.channels), c * u.views + fixed) for c in range(u.channels)]
+    b.append((-log_exposure[fixed], u.at.a.start + fixed))
     values, columns = (np.concatenate(part) for part in zip(*b, strict=True))
     exposures = sp.csr_array(
-        (values, (np.tile(at, u.channels + 1), columns)), shape=(len(given), u.count)
+        (values, (np.tile(at, u.channels + 1), columns)), shape=(len(fixed), u.count)
     )
     every = sp.csr_array(sp.eye_array(u.count))
     of_gammas = of_gammas if u.gammas else of_gammas[:0]
@@ -431,8 +431,8 @@ def _priors(u: Unknowns, log_exposure, precision, of_gammas) -> Held:
     of_lenses = np.full(len(lenses), 1 / VIGNETTING_PRIOR**2)
     return Held(
         sp.csr_array(sp.vstack([exposures, every[gammas], every[lenses]])),
-        np.repeat([0.0, 1.0, 0.0], [len(given), len(gammas), len(lenses)]),
-        np.concatenate([precision[given], of_gammas, of_lenses]),
+        np.repeat([0.0, 1.0, 0.0], [len(fixed), len(gammas), len(lenses)]),
+        np.concatenate([precision[fixed], of_gammas, of_lenses]),
     )
 
 

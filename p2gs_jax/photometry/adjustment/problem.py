@@ -13,7 +13,7 @@ from p2gs_jax.core.numerics import LN2
 from p2gs_jax.photometry.adjustment.matrices import Pairs
 from p2gs_jax.photometry.observations import Observations
 
-LONGEST_ROW = 16
+LONGEST_ROW = 16  # largest number of observations of a row
 TELLING_EV = 0.1  # least difference of known exposures that fixes the power of a curve, stops
 
 
@@ -64,7 +64,7 @@ class Layout:
 class Problem:
     """Observations prepared once, for any number of models."""
 
-    observations: Observations  # the colours
+    observations: Observations
     usable: Bool[np.ndarray, "o 3"]  # whether a value can be used
     # Label of each view; views with different labels cannot be compared.
     component: Int[np.ndarray, " v"]
@@ -78,13 +78,13 @@ class Problem:
 
     @functools.cached_property
     def with_known_power(self) -> Int[np.ndarray, " k"]:
-        """Labels of components whose known exposures differ, so that their power is no gauge."""
+        """Labels of components whose known exposures differ, which determines their power."""
         if self.known is None:
             return np.zeros(0, int)
         known = np.isfinite(self.known.log_exposures)
-        given, label = self.known.log_exposures[known] / LN2, self.component[known]
+        stops, label = self.known.log_exposures[known] / LN2, self.component[known]
         least = max(TELLING_EV, self.known.deviation_ev)
-        return np.array([k for k in np.unique(label) if np.ptp(given[label == k]) >= least], int)
+        return np.array([k for k in np.unique(label) if np.ptp(stops[label == k]) >= least], int)
 
     def part(self, pick: np.ndarray | slice) -> Problem:
         """Return some of the observations, chosen by a mask or their rows."""
