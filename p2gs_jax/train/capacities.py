@@ -78,7 +78,7 @@ def capacity_for(
 ) -> Capacity:
     """Return a capacity that should suffice for all views of one image size until the run ends.
 
-    It counts at most SAMPLED_VIEWS cameras. `limit` is the largest later population; the estimate
+    At most SAMPLED_VIEWS cameras are counted. `limit` is the largest later population; the estimate
     assumes that a view's share of the Gaussians stays constant.
     """
     picks = evenly_spaced(len(cameras), SAMPLED_VIEWS)
@@ -118,8 +118,8 @@ def allocate(
 ) -> Capacities:
     """Return capacities for all image sizes of the levels `shrinks`.
 
-    Existing `capacities` stay. A capacity in `begun`, for which programs are compiled already, is
-    used if it suffices. `limit` is the largest later population; for `owner` see `count_view`.
+    Existing `capacities` stay. A capacity in `begun`, for which compilation has begun, is used
+    if it suffices. `limit` is the largest later population; for `owner` see `count_view`.
     """
     found = dict(capacities)
     gaussians, host_alive = jax.tree.map(np.asarray, (gaussians, alive))
@@ -129,8 +129,8 @@ def allocate(
             name = size_name(size)
             if name not in found:
                 capacity = capacity_for(gaussians, host_alive, cameras, limit, cfg, host_owner)
-                compiled = begun.get(name, capacity)
-                found[name] = compiled if compiled.holds(capacity) else capacity
+                earlier = begun.get(name, capacity)
+                found[name] = earlier if earlier.holds(capacity) else capacity
     return _sharing_visible(found)
 
 

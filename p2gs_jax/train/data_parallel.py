@@ -1,8 +1,8 @@
 """Steps of several views, divided over devices that each hold the whole scene.
 
 Each device computes its views one by one, as in a step of one view; devices exchange only sums of
-gradients. The loss is the mean over the views. Learning rates are those of one view times the root
-of the number of views, so that the same views move a Gaussian about as far (Krizhevsky 2014;
+gradients. The loss is the mean over the views. The learning rates of one view are multiplied by the
+root of the number of views, so that the same views move a Gaussian about as far (Krizhevsky 2014;
 Grendel-GS, arXiv 2406.18533; docs/scaling.md).
 """
 
@@ -42,7 +42,7 @@ Count = int | Literal["all"]
 
 
 def default_mesh(count: int) -> Mesh:
-    """Return a mesh of the first devices."""
+    """Return a mesh of the first `count` devices."""
     return Mesh(np.array(jax.devices()[:count]), (VIEWS,))
 
 
@@ -109,7 +109,7 @@ def _differentiate(
 ) -> ImageGradient:
     """Return the mean loss of all `views` of the step, and its gradient.
 
-    Gradients by splats are those of each view's loss, for the views of this device.
+    The gradients by splats belong to the loss of each view of this device.
     """
 
     def one(view):
@@ -162,7 +162,7 @@ def _advance(
     fits = ~gradient.overflow & (most <= ids.shape[1])
     healthy = is_healthy(state, gradient, fits)
     sums = _sums(state, ids, visible, gradient, frusta, controls, cfg, bands)
-    seen, count = visibility.compact((sums.shown > 0) & alive, visibility.whole_blocks(n))
+    listed, count = visibility.compact((sums.shown > 0) & alive, visibility.whole_blocks(n))
     progress, rate = controls.progress, controls.rate
     rates = learning_rates(progress, rate, extent, state.params, cfg, bands)
     rates = jax.tree.map(lambda r: r * views**0.5, rates)
@@ -170,7 +170,7 @@ def _advance(
     key = noise_key(controls.seed, state.step)
 
     def exploring(block, rows, moved, on):
-        # The key depends on the Gaussian, so its noise does not depend on the rest of the list.
+        # The key depends on the Gaussian, so the noise does not depend on the rest of the list.
         keys = jax.vmap(functools.partial(jax.random.fold_in, key))(rows)
         normal = jax.vmap(lambda k: jax.random.normal(k, (3,)))(keys)
         return shaped_noise(normal, moved, on, noise_rate)
@@ -179,13 +179,15 @@ def _advance(
         gaussians,
         state.opt_state.gaussians,
         alive,
-        seen,
+        listed,
         count,
         healthy,
         bands=bands,
         # `sums` already holds the gradient by the Gaussians, so the function is the identity.
-        seen=lambda block, on, owner: block,
-        v_seen=jax.tree.map(lambda g: g / views, visibility.take_rows(sums.gradient, seen, bands)),
+        inputs_of=lambda block, on, owner: block,
+        v_inputs=jax.tree.map(
+            lambda g: g / views, visibility.take_rows(sums.gradient, listed, bands)
+        ),
         adam=optimizer.gaussians,
         rates=rates.gaussians,
         noise=None if noise is None else exploring,
@@ -247,8 +249,6 @@ def _sums(state, ids, visible, gradient, frusta, controls, cfg, bands: int) -> S
     sums, _ = lax.scan(add, Sums(blank, *zeros), views)
     return lax.psum(sums, VIEWS)
 
-
-# ---------------------------------------------------------------------------- the step
 
 GRADIENT = ImageGradient(*(ALIKE for _ in ImageGradient._fields))
 GRADIENT = GRADIENT._replace(v_shown=OF_VIEWS, visible=OF_VIEWS)

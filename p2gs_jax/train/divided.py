@@ -1,10 +1,10 @@
 """The step of one view, divided over the cores of a CPU (docs/scaling.md, "Cores").
 
 Each of N cores holds every N-th Gaussian; it lists, projects and moves those that the view may
-show. The cores exchange splats, so that each knows all of them, and each composites every N-th row
+show. The cores exchange splats, so that each knows all splats, and each composites every N-th row
 of tiles; then they exchange the rows of the image (`render/cores.py`). A step still has one view.
 Its result differs from that of one core only by the order of sums and by the exploration noise:
-every core draws noise of its own.
+every core draws other noise.
 """
 
 from __future__ import annotations

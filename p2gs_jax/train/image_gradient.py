@@ -22,7 +22,7 @@ from p2gs_jax.train.exposure_loss import Partner
 from p2gs_jax.train.terms import Aux, LossTerm, Rendered, Target, censor
 from p2gs_jax.types import Array, Batch, Frustum, Gaussians, Photometry, Render
 
-# Photographed colours of pixels with a lower alpha are black.
+# Photographed colours of pixels with a lower alpha count as black.
 LEAST_SEEN = 0.5 / 255
 
 
@@ -31,7 +31,7 @@ class Listed(NamedTuple):
 
     ids: Int[Array, " v"]  # from `compact`
     visible: Int[Array, ""]  # their number; larger than the length of `ids` after an overflow
-    shown: Shown  # splats and radiance of the listed ones
+    shown: Shown  # splats and radiance of the listed Gaussians
 
 
 class LossAux(NamedTuple):
@@ -68,7 +68,7 @@ def show(
 ) -> Listed:
     """List the Gaussians that the view of a step may show, and project them.
 
-    If `cfg.optimizer.visible_only` is off, it lists all Gaussians. Gaussians beyond the list's
+    If `cfg.optimizer.visible_only` is off, all Gaussians are listed. Gaussians beyond the list's
     length `capacity` are counted, not listed. `degree` is the highest spherical-harmonics degree
     that is evaluated; `owner` is the moving object of each Gaussian.
     """
@@ -107,8 +107,8 @@ def unit(stored: Array) -> Float[Array, "..."]:
 def pixel_places(shape: tuple[int, ...], size: Float[Array, " 2"]) -> Float[Array, "h w 2"]:
     """Return the positions of the pixels of a canvas in the image in its upper left corner.
 
-    `size` is the width and height of the image, pixels. Positions are those of `formation`: from
-    the image centre, in units of half the diagonal.
+    `size` is the width and height of the image, pixels. Positions are as in `formation`: from the
+    image centre, in units of half the diagonal.
     """
     y, x = (jnp.arange(n, dtype=size.dtype) + 0.5 for n in shape)
     return (2 * jnp.stack(jnp.meshgrid(x, y), -1) - size) / jnp.linalg.norm(size)
@@ -170,8 +170,8 @@ def image_loss(
     `shown` holds splats and radiance in the view; `photometry` and `appearance` belong to all
     views; `capacity` is the length of the tile list.
     """
-    deep = any(getattr(term, "needs_depth", False) for term in terms.values())
-    render = render_splats(*shown, batch.camera, cfg.render, capacity, with_depth=deep)
+    with_depth = any(getattr(term, "needs_depth", False) for term in terms.values())
+    render = render_splats(*shown, batch.camera, cfg.render, capacity, with_depth=with_depth)
     correction = correction_of(appearance, batch.view_index)
     rendered, target = compared(render, batch, photometry, correction, cfg)
     aux = Aux(
@@ -201,7 +201,7 @@ def differentiate(
 ) -> ImageGradient:
     """Composite a view, compare it with its photograph and return the gradient of the loss.
 
-    The arguments are those of `image_loss`.
+    For the arguments see `image_loss`.
     """
     (loss, aux), (v_shown, *v_rest) = jax.value_and_grad(
         image_loss, argnums=(0, 1, 2), has_aux=True, allow_int=True

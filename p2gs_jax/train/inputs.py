@@ -1,6 +1,6 @@
 """Inputs of a step besides its state: photographs, a second view, settings from the schedule.
 
-All of them depend only on the seed and the step number.
+All of them depend only on the seed, the step number and the progress.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ class TrainingViews:
     """Photographs of the training views at any level of the coarse-to-fine schedule.
 
     `rows` are rows in the scene, in the order of `Photometry`; `seed` sets the order of every
-    epoch; `measured` holds the measured depths of each view, or None. A step of several views
-    stacks photographs on the host, so `resident` must be off. Photographs of different sizes are
-    padded to `canvases`, unless `padded` is off: learned corrections depend on pixel positions.
+    epoch; `measured` holds the measured depths of each view, or None. `resident` keeps photographs
+    on a GPU; it must be off for steps of several views, which stack photographs on the host.
+    `padded` pads photographs to `canvases`; learned corrections, by pixel position, need it off.
     """
 
     def __init__(

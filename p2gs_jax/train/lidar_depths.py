@@ -21,7 +21,7 @@ CLIP = 0.2
 LEAST_ALPHA = 0.05
 # Largest number of measurements used per view.
 MOST_PER_VIEW = 8192
-# Measurements within this many seconds of a view are used for it.
+# Measurements within this many seconds of a view are used for the view.
 NEAR_S = 1.0
 
 
@@ -47,8 +47,8 @@ def lidar_loss(
 def measured_depths(scene: Scene, cfg: FitConfig) -> list[Measured] | None:
     """Return the measured depths of every training view; None if the loss needs none.
 
-    A view uses static points measured within `NEAR_S` of it, or those nearest in time. Points
-    behind a nearer measurement or a moving object are left out.
+    A view uses static points measured within `NEAR_S` of it, or else up to `NEAR_S` / 4 after the
+    nearest in time. Points behind a nearer point or a moving object are left out.
 
     Raises:
         UserError: the loss needs measurements, and the scene has none.
@@ -66,8 +66,8 @@ def measured_depths(scene: Scene, cfg: FitConfig) -> list[Measured] | None:
 
 def _of_view(points, times, view, objects, rng) -> Measured:
     if view.time is not None:
-        nearest = np.abs(times - view.time)
-        points = points[nearest <= max(NEAR_S, nearest.min() + NEAR_S / 4)]
+        apart = np.abs(times - view.time)
+        points = points[apart <= max(NEAR_S, apart.min() + NEAR_S / 4)]
     xy, z = project_points(points, view)
     seen = np.flatnonzero(unoccluded(xy, z, view.width, view.height))
     hidden = object_mask(view, objects, view.width, view.height)

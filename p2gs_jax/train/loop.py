@@ -57,9 +57,9 @@ from p2gs_jax.train.terms import LossTerm
 from p2gs_jax.train.update import StepReport, finite_names
 from p2gs_jax.types import Gaussians, Params
 
-NEARLY_DONE = 0.99
-MAX_BURST = 50
-# Weight of a new measurement in the running mean of the seconds per step.
+NEARLY_DONE = 0.99  # progress from which on a note about an early end is left out
+MAX_BURST = 50  # views
+# Weight of a new measurement in the running mean of the seconds per view.
 PACE_SHARE = 0.3
 
 
@@ -104,8 +104,8 @@ class Trainer:
 
     def __post_init__(self):
         cfg, views = self.cfg, self.views
-        sizes = [views.camera(i, 1) for i in range(len(views))]
-        width, height = min(c.width for c in sizes), min(c.height for c in sizes)
+        cameras = [views.camera(i, 1) for i in range(len(views))]
+        width, height = min(c.width for c in cameras), min(c.height for c in cameras)
         self.levels = schedule.levels(cfg.train, width, height)
         self.stopwatch = Stopwatch()
         store = self.store or CheckpointStore(self.run_dir / "checkpoints")
@@ -331,7 +331,7 @@ class Trainer:
     def _expect(self, state: FitState, host: HostState, images: bool = True) -> None:
         """Begin to compile the steps that are left; `state` may consist of shapes.
 
-        It does nothing for more image sizes than MOST_CANVASES, not all of which may be needed.
+        With more image sizes than MOST_CANVASES nothing is compiled, as not all may be needed.
         """
         steps = self.views.first_of_sizes(host.step, self.cfg.train.batch)
         if not getattr(self.densification, "slots_stay", True) or len(steps) > MOST_CANVASES:

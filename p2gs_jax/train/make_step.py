@@ -1,6 +1,6 @@
 """The training step for custom loops, with a custom loss, image formation and densification.
 
-None of them needs a change of this package. `fit` also takes `terms`, `formation` and `strategy`.
+These need no change of this package. `fit` also takes `terms`, `formation` and `strategy`.
 docs/api.md, "Ablations", has examples.
 """
 
@@ -38,14 +38,14 @@ PIXELS = 640 * 480
 
 
 class Custom(NamedTuple):
-    """Parts of a fit that replace those of its configuration (`make_step`)."""
+    """Parts of a fit that replace parts of its configuration (`make_step`)."""
 
     terms: Mapping[str, LossTerm | None] | None = None  # loss terms by name
     formation: Formation | None = None  # an image formation, or None
     strategy: Strategy | None = None  # a densification, or None
 
     def among(self, params: Params) -> Params:
-        """Return the parameters, including those of the custom formation if there is one."""
+        """Return the parameters, including the parameters of a custom formation."""
         if self.formation is None:
             return params
         return dataclasses.replace(params, appearance=jax.tree.map(on_device, self.formation))
@@ -159,12 +159,12 @@ def make_step(
 
     Args:
         cfg: configuration of all parts that are not replaced below.
-        terms: loss terms by name, which are added to those of `cfg` or replace them; None removes
-            a term. A term is a function of (Rendered, Target, Aux); see `train/terms.py`.
+        terms: loss terms by name, added to the terms of `cfg` or replacing them; None removes a
+            term. A term is a function of (Rendered, Target, Aux); see `train/terms.py`.
         formation: an image formation that replaces the tone curve: a pytree with
             `apply(radiance, capture)`, whose arrays are learned.
         strategy: densification: an object with `start(seeds)` and `densify(gaussians, population,
-            now)`; see `train/strategies.py`. None: that of `cfg`.
+            now)`; see `train/strategies.py`. None: the densification of `cfg`.
         extent: scene extent, scene units; the learning rate of the means is a multiple of it.
     """
     return TrainingStep(cfg, Custom(terms, formation, strategy), extent)

@@ -19,9 +19,9 @@ from p2gs_jax.run.decisions import KEY, Decisions
 from p2gs_jax.train.state import FitState, HostState, shapes_of
 from p2gs_jax.train.update import StepReport
 
-# Share of a run's time that writing checkpoints may take, and the largest factor by which this may
-# lengthen the pause between them.
-SHARE, LATEST = 0.01, 20.0
+# Share of a run's time that writing checkpoints may take, and the longest pause between them as a
+# multiple of `train.checkpoint_every_s`.
+SHARE, LONGEST_PAUSE = 0.01, 20.0
 
 
 def record_of(
@@ -55,12 +55,12 @@ def _mean(values) -> float:
 
 
 def pause_between(every_s: float, took_s: float) -> float:
-    """Return the seconds between a checkpoint and the next one.
+    """Return the seconds between a checkpoint and the next checkpoint.
 
     `every_s` is the option `train.checkpoint_every_s`; `took_s` is the time that writing the last
     checkpoint took, seconds.
     """
-    return max(every_s, min(took_s / SHARE, LATEST * every_s))
+    return max(every_s, min(took_s / SHARE, LONGEST_PAUSE * every_s))
 
 
 class Records:
@@ -87,8 +87,8 @@ class Records:
     ) -> tuple[FitState, HostState] | None:
         """Return the restored state and counters of a resumed run, else None.
 
-        It drops log records after the checkpoint, or all without one. If the run is `planned` for
-        longer than before (`HostState.planned`), it continues as if this had always been its plan.
+        Log records after the checkpoint are dropped; without one, all are. If the run is `planned`
+        for longer than before (`HostState.planned`), it continues as if this had always been so.
         """
         restored = self.restore(template) if resume else None
         if restored is None:
@@ -101,7 +101,7 @@ class Records:
             host = host.extended(planned)
             self.on_message(f"The run is planned for longer: {host.progress:.0%} of it is done.")
             last = kept[-1]["progress"] if kept else 0.0
-            # A session that ended before its first checkpoint may have rewritten them already.
+            # A session that ended before its first checkpoint may have rewritten the log already.
             if abs(last - host.progress) > 1e-5:
                 share = host.progress / last
                 kept = [line | {"progress": round(share * line["progress"], 6)} for line in kept]

@@ -13,10 +13,10 @@ from collections.abc import Callable
 from p2gs_jax.config import TrainConfig
 from p2gs_jax.train.state import HostState
 
-MIN_LEVEL_PIXELS = 96
-MIN_STEPS_LEFT = 8
-MAX_SPEED_UP = 1.5
-# Time of a step relative to one at half the image width (ours: 1.6 to 2.8 on photographs).
+MIN_LEVEL_PIXELS = 96  # least shorter side of the images of a level
+# The progress per step grows at most by this factor at once, and leaves at least so many steps.
+MIN_STEPS_LEFT, MAX_SPEED_UP = 8, 1.5
+# Time of a step relative to a step at half the image width (measured: 1.6 to 2.8).
 COST_OF_A_LEVEL = 2.0
 # Upper bound of the estimated slowdown relative to an unloaded machine.
 MOST_SLOWNESS = 3.0
@@ -33,7 +33,7 @@ def shrinks(cfg: TrainConfig) -> tuple[int, ...]:
 def levels(cfg: TrainConfig, width: int, height: int) -> Levels:
     """Return the levels of the schedule, for images of this width and height in pixels.
 
-    It leaves out levels whose images would have a shorter side of less than 96 pixels.
+    Levels are left out if the shorter side of their images would have less than 96 pixels.
     """
     kept = [
         (end, shrink)
@@ -100,8 +100,8 @@ def replanned(per_step: float, progress: float, left_s: float, step_s: float) ->
     """Return the progress per step with which the run ends on time.
 
     Under a budget, progress is the share of time. Every level gets its share of the seconds,
-    whatever its steps cost, and compilation counts as time. Steps have made `per_step` progress so
-    far and take `step_s` seconds; the deadline is in `left_s` seconds.
+    whatever its steps cost, and compilation counts as time. Steps so far made `per_step` progress
+    each and took `step_s` seconds; the deadline is in `left_s` seconds.
     """
     wanted = (1.0 - progress) * step_s / max(left_s, 1e-3)
     # One slow burst, for example with a page fault, must not use up the schedule.

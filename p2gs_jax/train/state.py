@@ -54,7 +54,7 @@ class HostState:
     step: int = 0  # views completed
     planned: float = 0.0  # length of the run: steps, or seconds of its time budget
     progress: float = 0.0  # fraction of the run completed
-    pace: float = 0.0  # progress per step
+    pace: float = 0.0  # progress per view
     elapsed_s: float = 0.0  # seconds of this session and of earlier ones
     densified_at: float = 0.0  # progress of the last densification
     reset_at: float = 0.0  # progress of the last opacity reset
@@ -63,7 +63,7 @@ class HostState:
     # capacity of a view for every image size "WxH"; checkpoints hold it by this name
     rooms: dict[str, Capacity] = field(default_factory=dict)
     shrink: int = 0  # factor by which the present level shrinks images
-    # running mean of the seconds per step at this level, without compilation; 0: not timed yet
+    # running mean of the seconds per view at this level, without compilation; 0: not timed yet
     step_s: float = 0.0
 
     @classmethod
@@ -103,7 +103,7 @@ def _initial_state(params: Params, alive, optimizer: Optimizer, slots: int, owne
 
 
 def alive_in(population: Population) -> int:
-    """Return how many Gaussians are alive, read from the device."""
+    """Return the number of living Gaussians, read from the device."""
     return int(_sum(population.alive))
 
 

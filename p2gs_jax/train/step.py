@@ -32,8 +32,8 @@ from p2gs_jax.train.terms import LossTerm, loss_terms
 from p2gs_jax.train.update import Controls, StepReport, advance
 from p2gs_jax.types import Batch, Frustum
 
-# The options that each program reads; None: all of a group. Fits that differ in other options share
-# the program, and a program that reads another option raises AttributeError.
+# The options that each program reads; None: the whole group. Fits that differ in other options
+# share the program, and a program that reads another option raises AttributeError.
 FORMATION_OPTIONS = ("curve", "spline", "pivot", "clamp", "cameras", "appearance")
 OPTIONS_READ: dict[str, dict[str, Any]] = {
     "show": {"render": None, "optimizer": ("visible_only",)},
@@ -98,8 +98,8 @@ class Step:
     """The step `(state, batch, partner, controls, capacity=..., degree=...)` of a fit.
 
     It returns the next state and a report; the previous state is donated. Random numbers depend on
-    the seed and the step number alone. The loss is that of `image_loss`. Work per Gaussian runs in
-    blocks, and only for Gaussians that the view may show; the others do not change
+    the seed and the step number alone. `image_loss` is the loss. Work per Gaussian runs in
+    blocks, and only for Gaussians that the view may show; all others do not change
     (`OptimizerConfig.visible_only`). `train/update.py` describes how a step treats overflows and
     values that are not finite.
     """
@@ -260,7 +260,7 @@ class StepPrograms:
     def expect(self, step: Any, key: Key, *arguments: Any, images: bool = True) -> list[Future]:
         """Begin to compile a step in the background; return its programs in their order.
 
-        `arguments` are those of the `step`, or their shapes. Without `images`, the middle program,
+        `step` takes the `arguments`, of which shapes suffice. Without `images`, the middle program,
         which depends on the tone curve, is left out.
         """
         visible_only = step.settings("show")["cfg"].optimizer.visible_only

@@ -36,8 +36,8 @@ from p2gs_jax.train.schedule import Levels, shrinks_left
 from p2gs_jax.train.state import FitState, HostState, alive_in, grow_state
 from p2gs_jax.types import Array, Gaussians, Population
 
-SLOTS = 1024
-# A step at full size takes about twice as long as one at the coarse level before it.
+SLOTS = 1024  # numbers of slots are multiples of this
+# A step at full size takes about twice as long as a step at the coarse level before.
 FULL_SIZE_COST = 2.0
 
 
@@ -159,7 +159,7 @@ class Mcmc:
         """Return the population after the next relocation."""
         limit = self._affordable(alive, now)
         growth_left = max((limit or alive) / max(alive, 1), 1.0)
-        # The last event reaches the limit: a Gaussian born earlier would cost time in more steps.
+        # The last event reaches the limit: Gaussians born earlier would cost time in more steps.
         events = (self.cfg.densify.stop - now.host.progress) / now.interval
         factor = max(self.cfg.densify.growth, growth_left ** (1 / max(events, 1.0)))
         return min(math.ceil(alive * factor), limit or alive)
@@ -167,7 +167,7 @@ class Mcmc:
     def _affordable(self, alive: int, now: Moment) -> int | None:
         """Return the bound on the population that the speed of this machine allows.
 
-        A bound chosen for a time budget assumes an unloaded machine, so it is checked again here.
+        A bound chosen for a time budget assumes an unloaded machine; this checks it again.
         """
         cfg, limit, host = self.cfg, now.limit, now.host
         chosen = cfg.densify.max_gaussians is None and cfg.train.budget_s is not None

@@ -36,7 +36,7 @@ Layer = Float[Array, "h w"]
 ENHANCED, CURVE = 0.5, 10.0
 # Published: 1 in the first 3 of 10,000 steps, then 0.1. Ours: 0.1 in all steps.
 EQUALIZED = 0.1
-PSEUDO, PSEUDO_EQUALIZED, SMOOTH = 0.5, 0.01, 0.1
+PSEUDO, PSEUDO_EQUALIZED, SMOOTH = 0.5, 0.01, 0.1  # weights in `curve_prior`
 # Mean brightness to which the contrast term scales photographs; side of its squares, pixels.
 CONTRAST_LEVEL, POOL = 0.5, 4
 
@@ -191,7 +191,7 @@ def variance(x: Float[Array, " v"]) -> Float[Array, ""]:
 
 
 # The paper's three priors (eq. 10) fix the global scale, the spread of exposures (and shrink it:
-# docs/photometry.md, 3) and the tone. Ours fix the scale gauge alone and the power gauge.
+# docs/photometry.md, 3) and the tone. Our two priors fix the scale gauge only, and the power gauge.
 PRIORS: dict[str, Callable[[Photometry], Float[Array, ""]]] = {
     "exposure_scale": lambda p: jnp.mean((p.exposures - 1) ** 2),
     "exposure_variance": lambda p: variance(p.exposures),
@@ -222,9 +222,9 @@ def enhanced_loss(
 
 
 def curve_prior(view: Curves, photograph: Image, mask: Layer) -> Float[Array, ""]:
-    """Return the curve's weighted distances from histogram equalisation and from its pseudo curve.
+    """Return weighted squared distances of curve, pseudo curve and histogram equalisation.
 
-    A third summand is its roughness. The histogram is the photograph's, over pixels of mask 1.
+    A further summand is the curve's roughness. The histogram is of the photograph's valid pixels.
     """
     grey = photograph[::4, ::4].mean(-1).reshape(-1)
     equalized = lax.stop_gradient(cumulative(grey, mask[::4, ::4].reshape(-1), ENTRIES))

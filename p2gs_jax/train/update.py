@@ -130,10 +130,10 @@ def advance(
         count,
         healthy,
         bands=bands,
-        seen=lambda block, on, owner: differentiable(
+        inputs_of=lambda block, on, owner: differentiable(
             splat(block, on, frustum, cfg.render, controls.active_degree, owner)
         ),
-        v_seen=gradient.v_shown,
+        v_inputs=gradient.v_shown,
         adam=optimizer.gaussians,
         rates=rates.gaussians,
         noise=None if noise is None else exploring,
@@ -156,8 +156,8 @@ def update_listed(
     healthy: Bool[Array, ""],
     *,
     bands: int,
-    seen: Callable[[Gaussians, Bool[Array, " b"], Any], Any],
-    v_seen: Any,
+    inputs_of: Callable[[Gaussians, Bool[Array, " b"], Any], Any],
+    v_inputs: Any,
     adam: optimizers.Adam,
     rates: Gaussians,
     noise: Callable[..., Float[Array, "b 3"]] | None,
@@ -168,8 +168,8 @@ def update_listed(
     Args:
         ids: from `compact`, in whole blocks; the first `count` are listed.
         bands: number of spherical-harmonics coefficients that are read and moved.
-        seen: (Gaussians, alive, owner) of a block -> the differentiable inputs of the image.
-        v_seen: gradient of the loss by these inputs, for the whole list.
+        inputs_of: (Gaussians, alive, owner) of a block -> the differentiable inputs of the image.
+        v_inputs: gradient of the loss by these inputs, for the whole list.
         noise: (number of the block, ids, Gaussians, alive) -> noise on their means; or None.
         owner: moving object of each Gaussian, or None.
     """
@@ -180,8 +180,8 @@ def update_listed(
         live = alive.at[here].get(mode="fill", fill_value=False)
         owners = owners_at(owner, here)
         old = take_rows(state.gaussians, here, bands)
-        _, pull = jax.vjp(lambda block: seen(block, live, owners), old)
-        (grads,) = pull(slice_of(v_seen, k, size))
+        _, pull = jax.vjp(lambda block: inputs_of(block, live, owners), old)
+        (grads,) = pull(slice_of(v_inputs, k, size))
         finite = jnp.stack([jnp.all(jnp.isfinite(g)) for g in jax.tree.leaves(grads)])
         before = optimizers.AdamState(
             state.moments.counts.at[here].get(mode="clip"),
@@ -230,7 +230,7 @@ def finished(
     view may show. `views` is the number of views of the step.
     """
     (updated, population), (fits, healthy, count) = moved, checks
-    first = state.fault.kind == FAULT_NONE
+    free = state.fault.kind == FAULT_NONE
     old_rest = (state.params.photometry, state.params.appearance)
     (photometry, appearance), rest_moments = optimizer.rest.update(
         gradient.v_rest, state.opt_state.rest, old_rest, (rates.photometry, rates.appearance)
@@ -247,7 +247,7 @@ def finished(
     kind = jnp.where(fits, broken, FAULT_OVERFLOW).astype(jnp.int32)
     term = jnp.argmin(checked).astype(jnp.int32)
     fault = jax.tree.map(
-        lambda a, b: jnp.where(first, a, b), Fault(kind, gradient.entries, count, term), state.fault
+        lambda a, b: jnp.where(free, a, b), Fault(kind, gradient.entries, count, term), state.fault
     )
     (photometry, appearance), rest_moments = jax.tree.map(
         lambda new, old: jnp.where(healthy, new, old),
