@@ -1,1 +1,1 @@
-"""Pages about finished runs: one run explained, or several compared. No page needs the network."""
+"""Pages about finished runs: one run, or several compared. No page needs the network."""

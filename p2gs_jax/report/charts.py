@@ -25,7 +25,7 @@ from p2gs_jax.core.text import names_as_they_are, printable
 
 # Width of the charts, CSS pixels; one point of matplotlib is one pixel.
 WIDTH = 860
-# Half the window of a running median, as a share of the run.
+# Half the window of a running median, as a share of the entries of a log.
 SMOOTHING = 0.01
 # Placeholder colours of matplotlib, and the variables of the style sheet that replace them.
 INK, MUTED, GRID, PAPER = "#100001", "#100002", "#100003", "#100008"
@@ -88,9 +88,9 @@ def _chart(
     shared: bool = True,
     title: str = "",
 ) -> str:
-    """Return a chart as HTML: `draw` fills its axes, each `height` CSS pixels high.
+    """Return a chart of `rows` panels as HTML: `draw` fills their axes.
 
-    All panels have one x axis, and one y axis if `shared`. `label` is the text alternative.
+    Each is `height` CSS pixels high. All share x, and y if `shared`. `label` is alternative text.
     """
     with names_as_they_are(), matplotlib.rc_context(RC):
         size = (WIDTH / 72, (rows * height + 40) / 72)
@@ -103,7 +103,7 @@ def _chart(
 
 
 def _markup(figure: Figure, label: str) -> str:
-    """Return the SVG element with unique ids and with the colours and the font of the page."""
+    """Return a figure as SVG with unique ids, and the colours and the font of the page."""
     buffer = io.StringIO()
     metadata = {"Date": None, "Creator": None, "Format": None, "Type": None}
     figure.savefig(buffer, format="svg", metadata=metadata)
@@ -130,7 +130,7 @@ def _font(match: re.Match[str]) -> str:
 
 
 def _legend(axes: Axes, labels: Sequence[str]) -> None:
-    """Draw a legend of the labelled lines, in their order, to the right of the axes."""
+    """Draw a legend of the lines whose label is not empty, to the right of the axes."""
     named = [
         (line, printable(name)) for line, name in zip(axes.containers, labels, strict=True) if name
     ]
@@ -152,13 +152,13 @@ def panels_chart(
     y_label: str,
     x_label: str,
     label: str,
-    band: float | None = None,
+    level: float | None = None,
     height: float = 150,
 ) -> str:
     """Return a column of panels, each with a title and curves, on common axes.
 
-    Axis labels contain their units. `label` is the text alternative. `band` is the height of a
-    horizontal line. Each panel is `height` CSS pixels high.
+    Axis labels contain their units. `label` is the alternative text. Each panel has a horizontal
+    line at the value `level`, and is `height` CSS pixels high.
     """
     longest = max((len(s.x) for _, series in panels for s in series), default=1)
 
@@ -167,8 +167,8 @@ def panels_chart(
             _draw(axes, series, float(np.clip(500 / longest, 1.5, 5.5)))
             axes.set_title(printable(title))
             axes.margins(0.02, 0.08)
-            if band is not None:
-                axes.axhline(band, color=MUTED, linewidth=0.8)
+            if level is not None:
+                axes.axhline(level, color=MUTED, linewidth=0.8)
         rows[-1].set_xlabel(x_label)
         rows[-1].xaxis.set_major_locator(MaxNLocator(8, integer=True))
 
@@ -186,7 +186,7 @@ def training_chart(
 ) -> str:
     """Return curves of PSNR (dB), losses (by name), and the number of Gaussians over the steps.
 
-    `marks` are the steps with a dotted vertical line.
+    Dotted vertical lines are at the steps `marks`; `label` is the alternative text.
     """
     window = max(3, 2 * round(SMOOTHING * len(steps)) + 1)
 

@@ -29,12 +29,12 @@ class TableRow(NamedTuple):
 
 @dataclass(frozen=True)
 class Comparison:
-    """Several runs side by side, in the given order, each with a short unique label.
+    """Several runs side by side, in the order of the command, each with a short unique label.
 
     `remarks` are sentences on results that cannot be compared. Scores compare only if the scene is
-    the same. `options` holds the options that differ. `apart` has an entry for each later run: its
-    label, the RMS difference of its exposures from the first run's after removing the means
-    (stops), and the number of common views.
+    the same. `options` holds the options that differ. `apart` has an entry for each later run
+    with at least 2 views of the first: its label, the RMS difference of their exposures after
+    removing the means (stops), and the number of common views.
     """
 
     runs: tuple[RunFiles, ...]
@@ -61,7 +61,7 @@ class Comparison:
         ]
 
 
-# Paths in `metrics.json` of the numbers of the table; the last part determines their digits.
+# Paths of the scores in `metrics.json`; the last part of a path determines the digits.
 NUMBERS: dict[str, tuple[str, ...]] = {
     "Gaussians": ("counts", "gaussians"),
     "steps": ("counts", "steps"),
@@ -107,7 +107,7 @@ def compare_runs(folders: Sequence[str | Path]) -> Comparison:
 
 
 def _labels(folders: list[Path]) -> list[str]:
-    """Return the last parts of the paths, as many as make them distinct."""
+    """Return the shortest ends of the paths that differ, all of the same depth."""
     parts = [folder.resolve().parts for folder in folders]
     for depth in range(1, max(map(len, parts)) + 1):
         names = ["/".join(p[-depth:]).replace("//", "/") for p in parts]
@@ -166,9 +166,9 @@ def _true_error(run: RunFiles) -> float | None:
 
 
 def _options(runs: Sequence[RunFiles]) -> list[TableRow]:
-    every = [{n: option_text(value) for n, value in flat(run.options).items()} for run in runs]
-    names = dict.fromkeys(name for options in every for name in options)
-    rows = [TableRow(n, tuple(options.get(n, "") for options in every)) for n in names]
+    texts = [{n: option_text(value) for n, value in flat(run.options).items()} for run in runs]
+    names = dict.fromkeys(name for options in texts for name in options)
+    rows = [TableRow(n, tuple(options.get(n, "") for options in texts)) for n in names]
     return [r for r in rows if len(set(r.cells)) > 1]
 
 
@@ -184,7 +184,7 @@ def _apart(runs: Sequence[RunFiles], labels: Sequence[str]) -> Iterator[tuple[st
 
 
 def to_markdown(found: Comparison) -> str:
-    """Return the tables as Markdown, with a star behind the best scores."""
+    """Return a comparison as Markdown, with a star behind the best scores."""
     parts = [escaped(remark) for remark in found.remarks]
     for title, rows in found.tables.items():
         cells = [[r.name, *starred(r)] for r in rows]
@@ -193,5 +193,5 @@ def to_markdown(found: Comparison) -> str:
 
 
 def starred(row: TableRow) -> list[str]:
-    """Return the cells of a row, with a star behind those of the best runs."""
+    """Return the cells of a row: best ones with a star behind, empty ones as -."""
     return [f"{c} *" if i in row.best else c or "-" for i, c in enumerate(row.cells)]

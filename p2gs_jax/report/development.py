@@ -1,4 +1,4 @@
-"""`developed.html` and `developed.jpg`: the photographs before and after `calibrate --develop`."""
+"""`developed.html` and `developed.jpg`: photographs before and after `calibrate --develop`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from p2gs_jax.formats.frames import shrunk, to_uint8
 from p2gs_jax.report import page as html
 from p2gs_jax.report.pictures import JPEG_QUALITY, jpeg
 
-# Columns of the sheet, longer side of its pictures, and height of a line of text, pixels.
+# Number of columns of the sheet; longer side of its pictures and height of a text line, pixels.
 _COLUMNS, _SIDE, _LINE = 6, 320, 18
 _DEPTHS = {
     "8bit": "8-bit photographs, dithered",
@@ -24,7 +24,7 @@ _DEPTHS = {
 
 
 def write_development(out: Path, developed: Developed) -> None:
-    """Write the page and the sheet, unless both are in the folder and no photograph is new."""
+    """Write the page and the sheet, unless both exist and no photograph is new."""
     page, sheet = out / "developed.html", out / "developed.jpg"
     if developed.written or not (page.is_file() and sheet.is_file()):
         picture = _sheet(developed.shown())
@@ -67,7 +67,7 @@ def _cell(value: object) -> str:
 
 
 def _sheet(shown: Sequence[tuple[str, Picture, Picture]]) -> np.ndarray:
-    """Return the sheet [h w 3]: each photograph, its developed version below, then its name."""
+    """Return the sheet [h w 3] from names and pairs: photograph, developed one below it, name."""
     both = [[to_uint8(shrunk(picture, _SIDE)) for picture in pair] for _, *pair in shown]
     height, width = (max(before.shape[axis] for before, _ in both) for axis in (0, 1))
     columns = min(_COLUMNS, len(shown))

@@ -27,14 +27,14 @@ CORRECTIONS = {
     "curve": "a curve",
     "luminance": "colour axes and an enhancing curve",
 }
-# Smallest reported gap between the PSNR of training and held-out views, dB.
+# Smallest gap between the PSNR of training and held-out views that gives a warning, dB.
 WIDE_GAP = 4.0
-# Smallest reported standard error of an exposure, stops.
+# Standard errors of exposures above this give a warning, stops.
 WEAK_EV = 0.1
-# Smallest reported rise of the PSNR between the last two tenths of a run, dB.
+# Smallest rise of the PSNR between the last two tenths of a run that gives a warning, dB.
 STILL_RISING = 0.3
-FINISHED = 0.99
-MOST_NAMES = 5
+FINISHED = 0.99  # runs that ended before this share of the schedule give a warning
+MOST_NAMES = 5  # names of views in a warning
 
 
 def duration(seconds: float) -> str:
@@ -89,7 +89,7 @@ def exposure_span(run: RunFiles) -> float | None:
 
 
 def true_error(run: RunFiles, true_exposures: dict[str, float]) -> ExposureError | None:
-    """Return the error of the exposures; None without true exposures (by the name of the view)."""
+    """Return the error of the exposures against true ones by name; None if there are none."""
     return error_of_views(run.train, true_exposures)
 
 
@@ -100,7 +100,7 @@ def notes_of(run: RunFiles) -> list[str]:
 
 
 def against_exif(run: RunFiles) -> Agreement | None:
-    """Return the agreement of the exposures with EXIF; None if fewer than two views have EXIF."""
+    """Return the agreement of the exposures with EXIF; None if fewer than two views have both."""
     views = [v for v in run.train if v["exposure_ev"] is not None]
     if sum(v["exif_ev"] is not None for v in views) < 2:
         return None
@@ -125,8 +125,8 @@ def run_warnings(run: RunFiles) -> list[RunWarning]:
     return [*_on_the_run(run), *named, *_on_more_to_gain(run)]
 
 
-# A warning about views: its title, the views from the worst on, and its text with placeholders for
-# their `{count}` and their `{names}`.
+# A warning about views: its title, their names from the worst on, and its text with placeholders
+# for `{count}` and `{names}`.
 ViewWarning = tuple[str, list[str], str]
 
 

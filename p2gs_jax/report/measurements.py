@@ -60,9 +60,9 @@ class SeamPair:
 class SceneMeasurements:
     """Measurements on the scene; `missing` holds sentences on those that failed.
 
-    True exposures are by view, if the scene has them. Seams are in the order of the views;
-    `tried_pairs` counts the pairs compared (None: nothing was measured). `shown` is the pair in
-    `picture`, which has the widest seam.
+    True exposures are by name of the view, if the scene has them. Seams are in the order of the
+    views; `tried_pairs` counts the compared pairs (None: nothing was measured). `picture` shows the
+    pair `shown`, which has the widest seam.
     """
 
     true_exposures: dict[str, float] = field(default_factory=dict)
@@ -88,7 +88,7 @@ def measure_scene(files: RunFiles, reporter: Reporter, *, render: bool = True) -
         return out
     reporter.stage("Reading the scene")
     try:
-        run = load_run(files.folder, files.given)
+        run = load_run(files.folder, files.scene_argument)
         run.require_photographs()
         _measure_seams(run, out, reporter)
     except UserError as error:
@@ -136,7 +136,7 @@ def _measure_seams(run: Run, out: SceneMeasurements, reporter: Reporter) -> None
 
 
 def seam_medians(seams: Sequence[SeamPair]) -> tuple[float, float]:
-    """Return the medians over pairs of the seams before and after, stops."""
+    """Return the medians over pairs of `before_ev` and `after_ev`, stops."""
     before = float(np.median([p.seam.before_ev for p in seams]))
     return before, float(np.median([p.seam.after_ev for p in seams]))
 
@@ -153,13 +153,13 @@ def seam_section(scene: SceneMeasurements) -> str:
         )
     before, after = seam_medians(seams)
     step = float(np.median([abs(p.seam.step_ev) for p in seams]))
-    whole = f"{step:.2f}" if step >= 0.005 else "less than 0.01"
+    shown = f"{step:.2f}" if step >= 0.005 else "less than 0.01"
     pairs = "1 pair" if len(seams) == 1 else f"{len(seams)} pairs"
     body = paragraph(
         "The brightness of the same surfaces in neighbouring photographs differs by "
         f"{before:.2f} stops as recorded, and by {after:.2f} stops after conversion to one "
         f"exposure (medians over {pairs}). The visible step between two photographs is then "
-        f"{whole} stops. The rest is misaligned texture, gloss, and effects outside the model."
+        f"{shown} stops. The rest is misaligned texture, gloss, and effects outside the model."
     )
     if scene.picture is not None and scene.shown is not None:
         body += _seam_picture(scene.shown, scene.picture)

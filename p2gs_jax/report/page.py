@@ -19,7 +19,7 @@ POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 def page(title: str, head: str, sections: Sequence[tuple[str, str, str]], foot: str) -> str:
     """Return the whole page; `head` and `foot` are HTML above and below the sections.
 
-    A section is its anchor, its heading, and its HTML; sections without HTML are left out.
+    A section has an anchor, a heading and HTML; sections without HTML are left out.
     """
     shown = [(key, text(heading), body) for key, heading, body in sections if body]
     parts = {
@@ -34,7 +34,7 @@ def page(title: str, head: str, sections: Sequence[tuple[str, str, str]], foot: 
         ),
         "foot": foot,
     }
-    # One pass replaces all placeholders, so that inserted text is never searched for placeholders.
+    # One pass replaces all placeholders, so that inserted text is never searched for them.
     return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], _read("page.html"))
 
 
@@ -50,7 +50,7 @@ def check_place(path: Path) -> None:
 
 
 def write_page(path: Path, html_text: str) -> None:
-    """Write a page; a UserError gives the reason if it cannot be written."""
+    """Write a page; UserError: it cannot be written."""
     check_place(path)
     try:
         write_text(path, html_text)
@@ -67,7 +67,7 @@ def made_by(command: str) -> str:
 
 
 def text(value: object) -> str:
-    """Return text as HTML."""
+    """Return a value as text escaped for HTML."""
     return html.escape(printable(str(value)), quote=True)
 
 
@@ -78,13 +78,13 @@ def paragraph(sentence: str, kind: str = "") -> str:
 
 
 def listed(sentences: Iterable[str]) -> str:
-    """Return a list of sentences; empty if there are none."""
+    """Return a list of sentences as HTML, or "" if there are none."""
     items = "".join(f"<li>{text(s)}</li>" for s in sentences)
     return f'<ul class="plain">{items}</ul>' if items else ""
 
 
 def figure(content: str, caption: str) -> str:
-    """Return HTML with a caption (text)."""
+    """Return a figure of HTML `content` with a caption (text)."""
     return f"<figure>\n{content}\n<figcaption>{text(caption)}</figcaption></figure>"
 
 
@@ -133,5 +133,5 @@ def key_numbers(items: Sequence[tuple[str, str, str]]) -> str:
 
 
 def folded(title: str, content: str) -> str:
-    """Return collapsed content with a title."""
+    """Return HTML `content` under a title that unfolds it."""
     return f"<details><summary>{text(title)}</summary>{content}</details>"

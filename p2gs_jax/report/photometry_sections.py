@@ -23,11 +23,11 @@ from p2gs_jax.run.scene_file import read_times
 from p2gs_jax.scene.drives.recording import short_name
 from p2gs_jax.types import GAMMA_SRGB
 
-# More cameras than this, or cameras with fewer views than this, share one panel.
+# More cameras than the first, or cameras with fewer views than the second, share one panel.
 MOST_PANELS, FEWEST_VIEWS = 6, 3
 MID_GREY = 0.18
 CHANNELS = ("red", "green", "blue")
-CHANNEL_COLORS = (1, 2, 0)  # of `COLORS`
+CHANNEL_COLORS = (1, 2, 0)  # indices in `COLORS`
 MARKED = [{"color": COLORS[k], "marker": m} for k, m in zip(CHANNEL_COLORS, "^os", strict=True)]
 SRGB: dict[str, Any] = {"color": INK, "linestyle": (0, (4, 4))}
 # Lines of the cameras of a drive, in turn.
@@ -42,9 +42,9 @@ def model_section(run: RunFiles) -> str:
     if run.photometry is None:
         return listed(notes_of(run))
     model, curve = run.photometry["model"], str(run.photometry["curve"].get("name"))
-    what, tone_curve = findings.DESCRIPTIONS.get(model, model), findings.CURVES.get(curve, curve)
+    kind, tone_curve = findings.DESCRIPTIONS.get(model, model), findings.CURVES.get(curve, curve)
     return (
-        paragraph(f"Model: {what}. Tone curve: {tone_curve}. Scale: {run.photometry['gauge']}.")
+        paragraph(f"Model: {kind}. Tone curve: {tone_curve}. Scale: {run.photometry['gauge']}.")
         + paragraph(
             "Models and curves are scored by their errors on held-out colours of surface points. "
             "The fit keeps the simplest one that is about as good as the best. Its notes:",
@@ -74,7 +74,7 @@ def _chart(
         by_camera = {"": views}
     panels = [(title, curves(v, np.arange(1.0, len(v) + 1))) for title, v in by_camera.items()]
     order = "photographs in the order of their names"
-    chart = panels_chart(panels, y_label=y_label, x_label=order, label=label, band=0.0)
+    chart = panels_chart(panels, y_label=y_label, x_label=order, label=label, level=0.0)
     return figure(chart, caption)
 
 
@@ -83,7 +83,7 @@ Stops = Callable[[list[ViewPhotometry]], dict[str, np.ndarray]]
 
 
 def exposure_section(run: RunFiles, truth: dict[str, float]) -> str:
-    """Return exposures over time for each camera, with those of EXIF and the true ones."""
+    """Return charts and a table of recovered, held-out, EXIF and true exposures."""
     if all(v["exposure"] is None and v["exposure_fitted"] is None for v in run.views):
         return ""
     stops = _stops_by_source(run, truth)
@@ -143,7 +143,7 @@ def _errors(rows: list[ViewPhotometry]) -> np.ndarray:
 
 
 def _true_stops(rows: list[ViewPhotometry], truth: dict[str, float]) -> np.ndarray:
-    """Return true exposures in stops, NaN if unknown."""
+    """Return the logarithms of true exposures, stops; NaN if unknown."""
     known = (truth.get(v["image"], 0.0) for v in rows)
     return np.array([np.log2(e) if e > 0 else np.nan for e in known])
 
@@ -164,7 +164,7 @@ def _over_time(run: RunFiles, times: dict[str, float], stops: Stops) -> str:
     label = "Exposures of every camera over the seconds of the drive, in stops"
     caption = "Error bars are two standard errors. Empty markers are held-out views."
     chart = panels_chart(
-        [("", series)], y_label=STOPS, x_label="time, seconds", label=label, band=0.0, height=260
+        [("", series)], y_label=STOPS, x_label="time, seconds", label=label, level=0.0, height=260
     )
     return figure(chart, caption)
 
@@ -212,7 +212,7 @@ def _triples(values: Iterable) -> np.ndarray:
 
 
 def response_section(run: RunFiles) -> str:
-    """Return the tone curve, or the curves of cameras and channels, against sRGB."""
+    """Return a chart of the tone curve, or of the curves of cameras and channels, and of sRGB."""
     if run.photometry is None:
         return ""
     try:
@@ -235,7 +235,7 @@ def response_section(run: RunFiles) -> str:
 
 
 def _curves(run: RunFiles) -> tuple[list[Series], str]:
-    """Return the common curve of all cameras at the smallest, the median and the largest gamma."""
+    """Return the common curve at the smallest, median and largest gamma, and a caption."""
     assert run.photometry is not None
     cfg = PhotometryConfig() if run.cfg is None else run.cfg.photometry
     cfg = with_formation_of(cfg, run.photometry)
@@ -252,12 +252,12 @@ def _curves(run: RunFiles) -> tuple[list[Series], str]:
 
 
 def _camera_curves(run: RunFiles, curved: list[CameraPhotometry]) -> tuple[list[Series], str]:
-    """Return the separate curves of cameras and channels."""
+    """Return the curves of single cameras or channels, and a caption."""
     assert run.photometry is not None
     formations = camera_formations(
         [{"name": c["name"], "vignetting": (), "splines": c["splines"]} for c in curved]
     )
-    # With one response per channel for all cameras, the first stands for all.
+    # If all cameras share their responses, one camera stands for all.
     if all(c.splines == formations[0].splines for c in formations):
         formations = formations[:1]
     pivot = float(run.photometry["curve"].get("pivot") or MID_GREY)
@@ -285,19 +285,19 @@ def _exposed(
 
 
 def vignetting_section(run: RunFiles) -> str:
-    """Return the loss of light in the corners per camera; empty if it is not modelled."""
+    """Return the loss of light in the corners by camera, or "" if it is not modelled."""
     cells = []
     for camera in [] if run.photometry is None else run.photometry["cameras"]:
         corners, errors = camera["corner"] or [], camera["corner_ev_error"] or []
-        for k, left in enumerate(corners):
+        for k, share in enumerate(corners):
             known = f" ± {errors[k]:.2f}" if k < len(errors) else ""
             which = CHANNELS[k] if len(corners) > 1 else "all"
-            stops = f"{np.log2(left):+.2f}{known}"
-            cells.append([camera["name"], which, f"{100 * (1 - left):.0f} %", stops])
+            stops = f"{np.log2(share):+.2f}{known}"
+            cells.append([camera["name"], which, f"{100 * (1 - share):.0f} %", stops])
     if not cells:
         return ""
     names = ["camera", "channels", "loss in the corners", "brightness in the corners, stops"]
     return paragraph(
         "Lenses lose light towards the corners of a photograph. The fit models this loss, so the "
-        "radiance of the splats is free of it."
+        "radiance of the splats does not contain it."
     ) + table(names, cells, numbers=range(2, 4))

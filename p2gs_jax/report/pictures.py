@@ -23,7 +23,7 @@ GAIN = 4.0
 
 
 def spread(items: Sequence, most: int) -> list:
-    """Return at most `most` items, evenly spaced, the first and the last included."""
+    """Return at most `most` evenly spaced items, with the first and the last."""
     return [items[i] for i in evenly_spaced(len(items), most)]
 
 
@@ -41,10 +41,10 @@ def picture(url: str, alt: str) -> str:
 def signed_difference(
     render: Float[np.ndarray, "h w 3"], photograph: Float[np.ndarray, "h w 3"]
 ) -> Float32[np.ndarray, "h w 3"]:
-    """Return render minus photograph in luminance, as a picture: grey where both are equal, lighter
-    where the render is too bright."""
-    bright, there = (luminance(np.nan_to_num(p).clip(0, 1)) for p in (render, photograph))
-    shown = np.clip(0.5 + 0.5 * GAIN * (bright - there), 0, 1)
+    """Return the difference in luminance as a picture: grey where both are equal, lighter where the
+    render is too bright."""
+    found, true = (luminance(np.nan_to_num(p).clip(0, 1)) for p in (render, photograph))
+    shown = np.clip(0.5 + 0.5 * GAIN * (found - true), 0, 1)
     return np.repeat(shown[..., None], 3, -1).astype(np.float32)
 
 
@@ -86,8 +86,8 @@ def held_out_section(run: RunFiles, most: int, problems: list[str]) -> str:
         return ""
     some = "" if shown == total else f" ({shown} of {total}, evenly from the worst to the best)"
     note = (
-        f"The fit did not use these photographs{some}. Each render has the exposure fitted to its "
-        "photograph. The difference is in luminance: grey means equal, lighter that the render is "
-        f"too bright, darker too dark, white and black at least {256 / GAIN:.0f} of 255 levels."
+        f"The fit did not use these photographs{some}. Renders have the exposure fitted to their "
+        "photograph. The difference in luminance is grey where both are equal, lighter where the "
+        f"render is too bright, else darker; beyond {256 / GAIN:.0f} of 255 levels it is saturated."
     )
     return paragraph(note) + body

@@ -17,7 +17,7 @@ from p2gs_jax.report.measurements import SceneMeasurements
 from p2gs_jax.report.page import check_place, listed, page, paragraph, text
 from p2gs_jax.report.run_files import RunFiles, read_run
 
-MOST_COMPARED = 6
+MOST_COMPARED = 6  # held-out views on the page
 
 
 def write_report(
@@ -30,9 +30,9 @@ def write_report(
 ) -> Path:
     """Write one page about a run, which needs no other file and no network; return its path.
 
-    The page is `report.html` in the folder, or else `out`. `scene` is the scene's current folder
+    The page is `out`, by default `report.html` in the folder. `scene` is the scene's current folder
     (None: as in the run). Without `render` the page has no seams, and only true exposures come from
-    the scene. A UserError reports a folder without a run, or a page that cannot be written.
+    the scene. Raises UserError: the folder has no run, or the page cannot be written.
     """
     reporter = reporter or Silent()
     folder = Path(folder)

@@ -31,15 +31,15 @@ class HeldOutFiles(NamedTuple):
 class RunFiles:
     """A run folder and the contents of its files; missing contents are empty or None.
 
-    `scene` is the folder of the scene, which may no longer exist; `given` is the folder from the
-    caller. `options` are nested values of `config.json`; `cfg` is made from them, or None if this
-    version cannot read them. The log has the lines that hold a step. `missing` holds sentences on
-    unreadable files, `broken` the names of those that exist.
+    `scene` is the folder of the scene, which may no longer exist; `scene_argument` is the argument
+    of `read_run`. `options` are nested values of `config.json`; `cfg` is made from them, or None if
+    this version cannot read them. The log has the lines that hold a step. `missing` has a sentence
+    on each file that is missing or cannot be read; `broken` has the names of the latter.
     """
 
     folder: Path
     scene: Path
-    given: Path | None
+    scene_argument: Path | None
     options: dict[str, Any]
     cfg: FitConfig | None
     metrics: dict[str, Any]
@@ -102,9 +102,9 @@ def number_at(values: Any, *path: str) -> float | None:
 
 
 def read_run(folder: Path, scene: Path | None = None) -> RunFiles:
-    """Read all files of a run folder; a UserError reports a folder without a run.
+    """Read all files of a run folder; UserError: the folder has no run.
 
-    The scene is searched in the folder of the fit, unless the caller names its current folder.
+    `scene` is the current folder of the scene (None: the folder that the fit read).
     """
     path = folder / "config.json"
     if not path.is_file():
@@ -144,7 +144,7 @@ def read_run(folder: Path, scene: Path | None = None) -> RunFiles:
 
 
 def _read_log(path: Path, missing: list[str]) -> list[dict[str, Any]]:
-    """Return the lines of the log that hold a step; `missing` receives the reason for none."""
+    """Return the lines of the log that hold a step; if there are none, `missing` gets a reason."""
     try:
         records = read_jsonl(path)
     except (UserError, OSError) as error:
@@ -157,7 +157,7 @@ def _read_log(path: Path, missing: list[str]) -> list[dict[str, Any]]:
 
 
 def _find_held_out(folder: Path, names: list[str]) -> tuple[HeldOutFiles, ...]:
-    """Return the held-out views that `fit` wrote into `renders/`; `names`: of all views."""
+    """Return the held-out views that `fit` wrote into `renders/`; `names` has all views."""
     whole = {str(Path(name).with_suffix("")): name for name in names}
     out = []
     for render in sorted(folder.rglob("*.render.png")):
@@ -171,7 +171,7 @@ def _find_held_out(folder: Path, names: list[str]) -> tuple[HeldOutFiles, ...]:
 
 
 def _read_object(path: Path, content: str, missing: list[str]) -> dict[str, Any]:
-    """Return a JSON object; `missing` receives a sentence if there is none."""
+    """Return the JSON object `content` of a file; if there is none, `missing` gets a sentence."""
     effect = f"{content} cannot be displayed"
     try:
         value = parse_json(path.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""Sections on scores (by protocol, and of drives), on training, and on options."""
+"""Sections on scores, depth, training and options."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from p2gs_jax.report.findings import column, duration
 from p2gs_jax.report.page import figure, folded, paragraph, table, text
 from p2gs_jax.report.run_files import RunFiles, number_at
 
-MOST_TERMS = 3
-SCORES = {"psnr": 2, "ssim": 4, "lpips": 4}
+MOST_TERMS = 3  # terms of the loss in the chart
+SCORES = {"psnr": 2, "ssim": 4, "lpips": 4}  # digits behind the point
 RADIANCE = {
     "pu21_psnr": "PU21 PSNR {:.2f} dB",
     "pu21_ssim": "PU21 SSIM {:.4f}",
     "delta_e_itp": "colour difference {:.1f} ΔE ITP",
     "mu_law_psnr": "mu-law PSNR {:.2f} dB",
 }
-# Protocols of scores by part, parts of a view, and splits of depth, as `metrics.json` has them.
+# Names in `metrics.json`: protocols with scores by part, parts of a view, splits, and depth errors.
 BY_PART = ("train", "test_averaged", "test_fitted", "test_metered")
 PARTS = {"whole": "all", "static": "static", "moving": "moving"}
 SPLITS = {"all": "all", "held_out": "held out"}
@@ -37,7 +37,7 @@ def _cell(value: float | None, digits: int) -> str:
 
 
 def _scores(run: RunFiles, *path: str) -> list[str]:
-    """Return PSNR, SSIM and LPIPS at a path of `metrics.json`; empty if they are missing."""
+    """Return PSNR, SSIM and LPIPS at a path of `metrics.json`, each "" if it is missing."""
     return [_cell(run.number(*path, name), digits) for name, digits in SCORES.items()]
 
 
@@ -52,7 +52,7 @@ def _numbers(names: list[str], rows: list[list[str]], first: int, note: str = ""
 
 
 def score_section(run: RunFiles) -> str:
-    """Return all scores by protocol."""
+    """Return a table of scores by protocol."""
     rows = [[p.views, p.shown, *_scores(run, *p.path)] for p in PROTOCOLS.values()]
     names = ["views", "rendered with", "PSNR, dB", "SSIM", "LPIPS"]
     body = _numbers(names, [r for r in rows if r[2] or r[3]], 2)
@@ -72,7 +72,7 @@ def _radiance(run: RunFiles) -> str:
 
 
 def parts_section(run: RunFiles) -> str:
-    """Return scores over static pixels and over those of moving objects."""
+    """Return a table of scores over all, static and moving pixels of drives."""
     rows = []
     for name, (part, what) in itertools.product(BY_PART, PARTS.items()):
         views, shown, path = PROTOCOLS[name]
@@ -82,13 +82,13 @@ def parts_section(run: RunFiles) -> str:
     names = ["views", "rendered with", "pixels", "PSNR, dB", "SSIM", "LPIPS", "number of views"]
     note = (
         "Moving pixels are in the boxes of objects that move at some time. SSIM is computed on the "
-        "whole image and averaged over the pixels. The last column counts views that have any."
+        "whole image and averaged over the pixels. The last column counts views with such pixels."
     )
     return _numbers(names, rows, 3, note)
 
 
 def depth_section(run: RunFiles) -> str:
-    """Return rendered depth against LiDAR."""
+    """Return a table of errors of rendered depth at LiDAR points."""
     rows = []
     for (split, views), part in itertools.product(SPLITS.items(), ("static", "moving")):
         found = run.part("depth", split, part)
@@ -113,7 +113,7 @@ def _depth(found: dict[str, Any], name: str) -> str:
 
 
 def training_section(run: RunFiles) -> str:
-    """Return loss, PSNR and Gaussians over the steps."""
+    """Return a chart of loss, PSNR and number of Gaussians over the steps."""
     log = [r for r in run.log if number_at(r, "gaussians") is not None]
     if len(log) < 2:
         return paragraph("There are no curves; the list of missing parts gives the reason.")
