@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 Appearance = Literal["affine", "bilateral", "curve", "ppisp", "luminance"]
-OwnPreset = Literal["paper", "paper_appendix", "robust"]
+OurPreset = Literal["paper", "paper_appendix", "robust"]
 Baseline = Literal["3dgs", "3dgs_published", "3dgs_gain"]
 Correction = Literal["3dgs_affine", "3dgs_bilateral", "3dgs_curve"]
 CameraModel = Literal["ppisp", "ppisp_solved", "luminance_gs"]
-PresetName = Literal[OwnPreset, Baseline, Correction, CameraModel]
+PresetName = Literal[OurPreset, Baseline, Correction, CameraModel]
 ExposureByCamera = Literal["constant", "camera_exposure", "camera_exposure_gamma"]
 ExposureByView = Literal["view_exposure", "view_exposure_camera_gamma", "view_exposure_gamma"]
 PhotometricModel = Literal[ExposureByCamera, ExposureByView]
@@ -371,7 +371,7 @@ class InitConfig:
     dense: Literal["auto", "on", "off"] = "auto"
     """Seeds from optical flow (after EDGS, arXiv 2504.13204); `auto`: where seeds are few."""
     dense_points: int | None = None
-    """Largest number of seeds from optical flow; None: with all other seeds 60 % of the bound."""
+    """Largest number of seeds from optical flow; None: all seeds are 60 % of `max_gaussians`."""
     dense_opacity: float = 0.5
     """Initial peak opacity of seeds from optical flow (ours: BUILD_NOTES)."""
 

@@ -16,8 +16,8 @@ from p2gs_jax.errors import UserError
 # Silence the native libraries before they load.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 os.environ.setdefault("GLOG_minloglevel", "3")
-os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # its warnings do not escape names of files
-# The limit of Pillow (scene/files.py): OpenCV too refuses larger pictures before it decodes them.
+os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # warnings print unescaped file names
+# Pillow's limit, pixels: OpenCV too refuses larger pictures before it decodes them.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2 * 89_478_485))
 
 

@@ -96,7 +96,7 @@ class Doctor:
 
 
 def check_libraries() -> list[Finding]:
-    """Return for every required library its version, or its fault."""
+    """Return the version or the fault of every required library."""
     out = []
     for name, wanted in sorted(requirements().items(), key=lambda item: item[0].lower()):
         version, module, trouble = installed(name), module_of(name), ""
@@ -139,7 +139,7 @@ def requirements() -> dict[str, Any]:
 
 
 def check_features(broken: Sequence[str]) -> list[Finding]:
-    """Return for each feature whether it is ready, and what it uses, or what to install.
+    """Return for each feature whether it is ready, and the library that it uses or needs.
 
     `broken` has the names of broken libraries.
     """
@@ -154,7 +154,7 @@ def check_features(broken: Sequence[str]) -> list[Finding]:
 
 
 def check_devices() -> list[Finding]:
-    """Return JAX's devices, and the rasterizer of a fit, with a note on unsupported GPUs."""
+    """Return JAX's devices and the rasterizer of a fit, with a note if it is slow here."""
     try:
         import jax
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 # Names of folders that do not name a program.
 COMMON = re.compile(r"renders|rgb|test|ours_\d+|\.")
-# Keys that `evaluate` leaves out if no view has the problem, so old values are dropped.
+# Keys that `evaluate` writes only if a view has the problem; old values are dropped.
 UNJUDGED = ("hidden", "exposures_unknown")
 
 
@@ -106,16 +106,16 @@ def _labelled(folders: tuple[Path, ...]) -> dict[str, Path]:
 
 
 def _judged(
-    found: dict[str, OtherRenders],
+    others: dict[str, OtherRenders],
     judge: Judge,
     metrics: dict[str, Any],
     on_progress: Callable[[int, int], None],
 ) -> dict[str, Any]:
-    """Return what `against.json` holds (docs/files.md)."""
+    """Return the content of `against.json` (docs/files.md)."""
     from p2gs_jax.evaluation.against import judge_renders, scores_of_run
 
     programs = {}
-    for label, renders in found.items():
+    for label, renders in others.items():
         names = [judge.scene.views[row].name for row in sorted(renders.files)]
         programs[label] = {
             "folder": str(renders.folder),
@@ -129,7 +129,7 @@ def _judged(
 
 
 def _kept(path: Path) -> dict[str, Any]:
-    """Return the metrics in the file, among them those of the fit and of earlier references."""
+    """Return the metrics in the file, which include scores of earlier references."""
     from p2gs_jax.core.text import parse_json
 
     try:

@@ -88,7 +88,7 @@ class Synth:
     supersample: int | None = None
     """Samples per pixel along each axis (default: 2; 8 for a matte town)."""
     points: int = 60_000
-    """Number of seed points of the COLMAP model; points that one view sees are dropped."""
+    """Number of seed points of the COLMAP model; points in only one view are dropped."""
     seed: int = 0
     """Random seed of the town, the ISO and the points."""
 
@@ -142,8 +142,8 @@ class Sweep:
         from p2gs_jax.jobs.table import show
 
         console, wanted = stdout(), dict(vars(read_sweep(self.file)))
-        own = {"out": self.out, "max_parallel": self.jobs}
-        wanted |= {name: value for name, value in own.items() if value is not None}
+        options = {"out": self.out, "max_parallel": self.jobs}
+        wanted |= {name: value for name, value in options.items() if value is not None}
         with TerminalReporter() as reporter:
             shown = {"report": reporter.message, "on_look": partial(show, reporter)}
             result = sweep(**wanted, engine=self.engine, **shown)
@@ -151,7 +151,7 @@ class Sweep:
         for line in failures(result.rows):
             console.print(f"Not finished: {line}")
         console.print(
-            "Scores are means over seeds, and seconds those of whole runs; held-out views have a "
-            f"fitted exposure each. All columns are in {result.out / 'sweep.md'} (and sweep.json)."
+            "Scores and the seconds of whole runs are means over seeds; each held-out view has a "
+            f"fitted exposure. All columns are in {result.out / 'sweep.md'} (and sweep.json)."
         )
         return 0 if all(row["status"] == "done" for row in result.rows) else 1

@@ -123,13 +123,13 @@ def check_export(args: Export) -> None:
     check(size is None or (math.isfinite(size) and size > 0), "--size-mb must be positive")
     check(args.photographs is None or args.photographs >= 0, "--photographs must be at least 0")
     look = ("exposure_ev", "meter", "gamma", "curve", "white_balance_of")
-    for names, formats, what in (
+    for names, formats, needed in (
         (look, (*DISPLAY, "html"), "a format of display colours, or html"),
         (("bake_steps",), FORMATS if args.photometry else DISPLAY, "a format of display colours"),
         (("size_mb", "photographs"), ("html",), "the format html"),
     ):
-        given = [n for n in names if getattr(args, n) is not None]
-        if given and not set(args.format) & set(formats):
+        used = [n for n in names if getattr(args, n) is not None]
+        if used and not set(args.format) & set(formats):
             fix = f"leave it out, or add one of these to --format: {', '.join(formats)}"
-            name = given[0].replace("_", "-")
-            raise UserError(f"--{name} has no effect without {what}.", fix=fix)
+            name = used[0].replace("_", "-")
+            raise UserError(f"--{name} has no effect without {needed}.", fix=fix)

@@ -135,13 +135,13 @@ class Fit:
             check(self.cluster.blocks is None, "--view does not show a fit in blocks", fix=fix)
         check(self.view or self.port == 8080, "--port has no effect without --view")
         check(0 <= self.port < 2**16, "--port must be from 0 to 65535")
-        cluster, whole = self.cluster, "write a whole number from 1 on, or"
+        cluster, number = self.cluster, "write a whole number from 1 on, or"
         count, devices = cluster.blocks, cluster.devices
         why = "--jobs and --engine have no effect without --blocks"
         fix = "add --blocks auto, or a number"
         check(count is not None or (cluster.jobs == 1 and cluster.engine == "local"), why, fix=fix)
         valid = not isinstance(count, int) or count >= 1
-        check(valid, f"--blocks {count} is not a number of blocks", fix=f"{whole} auto")
+        check(valid, f"--blocks {count} is not a number of blocks", fix=f"{number} auto")
         check(cluster.jobs >= 1, "--jobs must be at least 1")
         valid = self.threads is None or self.threads >= 1
         check(valid, f"--threads {self.threads} is not a number of cores", fix="give 1 or more")
@@ -149,7 +149,7 @@ class Fit:
         fix = "leave out --devices and --threads; --jobs and --engine are for blocks"
         check(count is None or (devices == 1 and self.threads is None), why, fix=fix)
         valid = not isinstance(devices, int) or devices >= 1
-        check(valid, f"--devices {devices} is not a number of devices", fix=f"{whole} all")
+        check(valid, f"--devices {devices} is not a number of devices", fix=f"{number} all")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -220,8 +220,8 @@ class Calibrate:
                 found = calibrate_run(scene, out, cfg, **how)
             else:
                 depth, ev, masks = self.develop, self.exposure_ev, self.masks
-                asked = None if depth is None else Development(depth, ev, masks)
-                found = calibrate(scene, out, cfg, develop=asked, **how)
+                development = None if depth is None else Development(depth, ev, masks)
+                found = calibrate(scene, out, cfg, develop=development, **how)
             if found.developed is not None:
                 write_development(out, found.developed)
         print_calibration(found, out)
@@ -236,7 +236,7 @@ class Calibrate:
         return all((self.scene / name).is_file() for name in ("config.json", "radiance.ply"))
 
     def checked(self) -> FitConfig:
-        """Return the configuration; raise a UserError where a value makes no sense."""
+        """Return the configuration; raise a UserError if a value is not valid."""
         scene, is_run, data, usual = self.scene, self.is_run, self.config.data, FitConfig().data
         no_data_options = data == usual
         why = "--data.test-every and --data.split have no effect here"
@@ -247,15 +247,15 @@ class Calibrate:
         check(no_data_options or not self.static, why, fix=leave_out)
         why = f"{scene} is a finished run, whose image size and folder cannot change"
         check(no_data_options or not is_run, why, fix=leave_out)
-        asked, ev = self.develop is not None, self.exposure_ev
+        develops, ev = self.develop is not None, self.exposure_ev
         why = "--exposure-ev and --no-masks have no effect without --develop"
-        check(asked or (ev == 0 and self.masks), why, fix="add --develop 8bit, 16bit or exr")
+        check(develops or (ev == 0 and self.masks), why, fix="add --develop 8bit, 16bit or exr")
         check(
             isinstance(ev, str) or math.isfinite(ev), f"--exposure-ev {ev} is not a finite number"
         )
         why = "--develop needs a scene with cameras, not a run or photographs of --static"
         fix = "name the scene of the run, or leave out --develop"
-        check(not (asked and (is_run or self.static)), why, fix=fix)
+        check(not (develops and (is_run or self.static)), why, fix=fix)
         return cfg
 
 
@@ -310,9 +310,9 @@ def _camera_table(found: Survey):
 
 
 def checked(cfg: FitConfig) -> FitConfig:
-    """Return the configuration; raise a UserError where a value makes no sense."""
-    data, train, known, behind = cfg.data, cfg.train, cfg.photometry, cfg.render.background
-    most = cfg.densify.max_gaussians
+    """Return the configuration; raise a UserError if a value is not valid."""
+    data, train, photometry = cfg.data, cfg.train, cfg.photometry
+    most, background = cfg.densify.max_gaussians, cfg.render.background
     check(data.max_width is None or data.max_width >= 16, "--max-width must be at least 16 pixels")
     check(data.every is None or data.every >= 1, "--every must be at least 1")
     check(data.max_frames >= 2, "--max-frames must be at least 2")
@@ -326,9 +326,9 @@ def checked(cfg: FitConfig) -> FitConfig:
     check(train.batch >= 1, "--train.batch must be at least 1")
     check(not isinstance(most, int) or most >= 1, "--gaussians must be at least 1")
     why = "--render.background must be linear radiance, three numbers that are not negative"
-    check(all(math.isfinite(x) and x >= 0 for x in behind or ()), why)
-    check(known.known_deviation_ev >= 0, "--exposure-sigma must be at least 0 stops")
+    check(all(math.isfinite(x) and x >= 0 for x in background or ()), why)
+    check(photometry.known_deviation_ev >= 0, "--exposure-sigma must be at least 0 stops")
     why = "--exposure-sigma has no effect without --known-exposures"
     fix = "add --known-exposures FILE, or exif"
-    check(known.known_deviation_ev == 0 or known.known is not None, why, fix=fix)
+    check(photometry.known_deviation_ev == 0 or photometry.known is not None, why, fix=fix)
     return cfg

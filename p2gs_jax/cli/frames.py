@@ -21,7 +21,7 @@ from p2gs_jax.paths.shots import Shot, of_camera, view_shots
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.run.read import Run
 
-Photograph = Callable[[int], Float32[np.ndarray, "h w 3"] | None]
+Photograph = Callable[[int], Float32[np.ndarray, "h w 3"] | None]  # by the row of its view
 # A metered exposure follows what is seen within about this time, seconds.
 ADAPT_S = 0.5
 
@@ -38,14 +38,14 @@ class Job:
 
 
 def _display_transform(fitted: Run, options: Render, shot: Shot | None = None) -> DisplayTransform:
-    """Return a shot's display transform: from the options, else its own, else its photograph's."""
+    """Return the display transform of a shot's photograph or exposure; the options change it."""
     if shot is not None and shot.view is not None:
         transform = fitted.own_display(shot.view)
     else:
         ev = None if shot is None else shot.exposure_ev
         transform = fitted.common_display(0.0 if ev is None else ev)
     if options.meter is not None and shot is not None and shot.exposure_ev is not None:
-        metered = fitted.common_display(shot.exposure_ev)  # with --exposure-ev already
+        metered = fitted.common_display(shot.exposure_ev)  # includes --exposure-ev
         transform = replace(transform, exposure=metered.exposure)
     elif isinstance(options.exposure_ev, float | int):
         common = fitted.common_display(float(options.exposure_ev))
@@ -74,37 +74,37 @@ def _chosen(options: Render, fitted: Run) -> list[Shot]:
 
 
 def shots_of(
-    options: Render, fitted: Run, given: list[Shot] | None, say: Callable[[str], None]
+    options: Render, fitted: Run, listed: list[Shot] | None, say: Callable[[str], None]
 ) -> Job:
-    """Return the job of rendering pinhole cameras; those of a file replace the scene's.
+    """Return the job of rendering pinhole cameras; those `listed` in a file replace the scene's.
 
-    `say` tells the user something while frames are rendered. Raises a UserError where the scene has
-    no such views.
+    `say` shows the user a note while frames are rendered. Raises a UserError if the scene has no
+    such views.
     """
     notes, photograph = [], None
     views = fitted.scene.views
-    if given is not None:
-        shots = given
+    if listed is not None:
+        shots = listed
     elif options.trajectory == "views":
         chosen = _chosen(options, fitted)
         shots = chosen if options.camera is None else of_camera(chosen, views, options.camera)
         photograph = _photographs(fitted, say)
     else:
         chosen = _chosen(options, fitted)
-        own = of_camera(chosen, views, options.camera)
+        filmed = of_camera(chosen, views, options.camera)
         if options.trajectory == "drive":
-            shots = drive(_recorded(own, options, fitted), options.frames)
+            shots = drive(_recorded(filmed, options, fitted), options.frames)
             if options.shift is not None:
                 shots = beside_shots(shots, views, options.shift)
         else:
-            circle = find_orbit(chosen, own, np.asarray(fitted.scene.points, np.float64))
-            shots = orbit(circle, own, options.frames)
+            circle = find_orbit(chosen, filmed, np.asarray(fitted.scene.points, np.float64))
+            shots = orbit(circle, filmed, options.frames)
     if options.width is not None:
         shots = [shot.resized(options.width) for shot in shots]
     if options.meter is not None:
         added = options.exposure_ev if isinstance(options.exposure_ev, float | int) else 0.0
-        frames_s = ADAPT_S * (options.fps or FPS) if options.trajectory != "views" else 0.0
-        shots = pictures.metered_shots(fitted, shots, options.meter, added, frames_s)
+        adapted = ADAPT_S * (options.fps or FPS) if options.trajectory != "views" else 0.0
+        shots = pictures.metered_shots(fitted, shots, options.meter, added, adapted)
         if options.meter == "auto":
             notes = [*notes, fitted.metering.sentence]
     size = (max(s.width for s in shots), max(s.height for s in shots))
@@ -115,7 +115,7 @@ def shots_of(
 
 
 def _photographs(fitted: Run, say: Callable[[str], None]) -> Photograph:
-    """Return a function to the photographs that are written beside renders, where they exist."""
+    """Return a function that loads a view's photograph; `say` reports the first missing one."""
     missing = []
 
     def of(index: int) -> Float32[np.ndarray, "h w 3"] | None:
@@ -131,7 +131,7 @@ def _photographs(fitted: Run, say: Callable[[str], None]) -> Photograph:
 
 
 def _recorded(shots: list[Shot], options: Render, fitted: Run) -> list[Shot]:
-    """Return shots with the exposures and gammas of their photographs where `own` asks for them."""
+    """Return shots with the exposures and gammas of their photographs for `--exposure-ev own`."""
     if options.exposure_ev != "own":
         return shots
     transforms = [fitted.own_display(shot.view) for shot in shots if shot.view is not None]
@@ -143,7 +143,7 @@ def _recorded(shots: list[Shot], options: Render, fitted: Run) -> list[Shot]:
 
 
 def panoramas_of(options: Render, fitted: Run) -> Job:
-    """Return the job of rendering panoramas; UserError: there is no such rig, or time step."""
+    """Return the job of rendering panoramas; UserError: no such rig or time step."""
     views = fitted.scene.views
     rig = find_rig(view_shots(views, fitted.cfg.data.max_width), views)
     cylinder = covering(rig.mounts.values(), np.eye(4))
@@ -169,6 +169,6 @@ def panoramas_of(options: Render, fitted: Run) -> Job:
         steps = [(step.name, step.pose, step.time) for step in shown]
         alone = len(views) - sum(len(step.shots) for step in rig.steps)
         if alone:
-            notes.append(f"{alone} views without another camera's at their time are left out.")
+            notes.append(f"{alone} views are left out: no other camera has a view at their time.")
     frames = pictures.wide_frames(fitted, cylinder, steps, _display_transform(fitted, options))
     return Job(frames, len(steps), (cylinder.width, cylinder.height), (), notes)

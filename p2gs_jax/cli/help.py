@@ -40,10 +40,10 @@ DURATION = constructors.PrimitiveConstructorSpec(
 def registry(brief: bool) -> constructors.ConstructorRegistry:
     """Return the rules by which tyro reads our option classes.
 
-    In `brief` help, nothing of the configuration is shown but the fields that have short names.
+    `brief` help shows only those fields of the configuration that have short names.
     """
     rules = constructors.ConstructorRegistry()
-    # Of the command that is being read: short names by field, and the fields that are options.
+    # Short names by field, and the fields that are options, of the command that is being read.
     short: dict[str, str] = {}
     only: list[str] = []
 
@@ -91,15 +91,15 @@ def _number_rule(
     known: dict[str, Any] = {word: word for word in sorted(words)}
     values = known | ({"None": None} if NoneType in kinds else {})
 
-    def read(given: list[str]) -> Any:
-        if given[0] in values:
-            return values[given[0]]
+    def read(argument: list[str]) -> Any:
+        if argument[0] in values:
+            return values[argument[0]]
         try:
-            return kind(given[0])
+            return kind(argument[0])
         except ValueError:
-            what = "whole number" if kind is int else "number"
+            noun = "whole number" if kind is int else "number"
             other = f", and not {' or '.join(known)}" if known else ""
-            raise ValueError(f"{given[0]!r} is not a {what}{other}") from None
+            raise ValueError(f"{argument[0]!r} is not a {noun}{other}") from None
 
     def fits(value: Any) -> bool:
         return value in values.values() or type(value) is kind
@@ -142,9 +142,9 @@ def _fields(
 def _field(
     kind: type, name: str, parent: Any, short: str | None, *, brief: bool = True
 ) -> constructors.StructFieldSpec:
-    """Return the rule of the option of a field, whose class has the default `parent`.
+    """Return tyro's rule for the option of a field; `parent` is the default of its class.
 
-    In `brief` help a short name is the only one.
+    In `brief` help a short name replaces the long one.
     """
     hint, default = _hints(kind)[name], _default(kind, name, parent)
     extras = (*_settings(kind, name, hint, default, brief and short is not None), *_extras(hint))
@@ -177,10 +177,10 @@ def _default(kind: type, name: str, parent: Any) -> Any:
 
 
 def _settings(kind: type, name: str, hint: Any, default: Any, brief: bool) -> tuple[Any, ...]:
-    """Return tyro's settings of an option, which those of its field may override.
+    """Return tyro's settings of an option, which annotations of its field may override.
 
-    In the configuration None is a value like others; in a command's own options it means "not
-    given", and there a switch that is off can only be turned on.
+    In the configuration None is a value like others. In all other options of a command it means
+    that the option is absent; there a switch that is off can only be turned on.
     """
     plain, none_counts = _plain(hint), kind.__module__ == FitConfig.__module__ and not brief
     if plain is bool and not none_counts and not default:
@@ -192,7 +192,7 @@ def _settings(kind: type, name: str, hint: Any, default: Any, brief: bool) -> tu
 
 
 def _placeholder(plain: Any, none_counts: bool) -> str | None:
-    """Return the placeholder of a value of a type, or None for tyro's own."""
+    """Return the placeholder of a value of a type, or None for tyro's placeholder."""
     origin, args = get_origin(plain), get_args(plain)
     if _is_union(plain):
         parts = [_placeholder(a, none_counts) or "" for a in args if a is not NoneType]
@@ -252,7 +252,7 @@ def _field_docs(kind: type) -> dict[str, str]:
 
 
 def overview(groups: Mapping[str, Mapping[str, type]]) -> str:
-    """Return what `p2gs-jax --help` prints of commands, whose names stand under headings."""
+    """Return the text of `p2gs-jax --help`; `groups` are option classes by command and heading."""
     indent = 2 + 2 + max(len(name) for commands in groups.values() for name in commands)
     about = (
         "p2gs-jax fits one linear HDR radiance field, and an exposure and a tone curve for each "
@@ -275,14 +275,14 @@ def overview(groups: Mapping[str, Mapping[str, type]]) -> str:
 
 
 def prose(kind: type) -> str:
-    """Return what stands above the options in the help of a command: the docstring's prose."""
+    """Return the text above the options in a command's help: the docstring's prose."""
     return "\n\n".join("\n".join(_wrapped(p)) for p in _paragraphs(kind)[0])
 
 
 def examples(kind: type, name: str) -> str:
-    """Return what stands below the options: the docstring's examples.
+    """Return the text below the options: the docstring's examples.
 
-    The name is that of a command whose options were left out: how to list them is added.
+    A `name` is that of a command whose help is brief; the text then names the full help.
     """
     below = [f"{INDENT}{line}" for line in _paragraphs(kind)[1]]
     if below:

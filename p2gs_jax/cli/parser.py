@@ -49,7 +49,7 @@ def parse(argv: list[str]) -> tuple[str, Any]:
     """Return the command's name and its options.
 
     Raises:
-        UserError: there is no such command or preset.
+        UserError: there is no such command or preset, or the option is another program's.
         SystemExit: 0 after requested help or version, 2 without a command or with invalid options.
     """
     argv = _with_new_names(argv)
@@ -117,7 +117,7 @@ def _with_values(argv: list[str]) -> list[str]:
 
 
 def _defaults(name: str, argv: list[str]) -> Any:
-    """Return the defaults of a command's options; those of the configuration are the preset's."""
+    """Return the defaults of a command's options; those of the configuration are a preset's."""
     if name not in WITH_PRESET:
         return tyro.MISSING_NONPROP
     name_of_preset: Any = "robust"

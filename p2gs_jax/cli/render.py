@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 PATHS = ("views", "drive", "orbit")
 FPS = 24.0
-# Largest shift, scene units.
-MOST_SHIFT = 100.0
+MOST_SHIFT = 100.0  # scene units
+# Files that --out cannot name.
 OTHER_FILES = (".mov", ".avi", ".mkv", ".webm", ".gif", ".png", ".jpg", ".exr", ".json")
 
 
@@ -92,16 +92,16 @@ class Render:
         begin = time.monotonic()
         for refuse in (_check_picture, _check_path, _check_file):  # before anything is read
             refuse(self)
-        given = read_cameras(Path(self.trajectory)) if self.trajectory not in PATHS else None
+        cameras = read_cameras(Path(self.trajectory)) if self.trajectory not in PATHS else None
         fitted = _load(self)
-        given = None if given is None else near_scene(given, fitted.scene.origin)
+        cameras = None if cameras is None else near_scene(cameras, fitted.scene.origin)
         out = self.out or fitted.folder / "renders" / _default_name(self, fitted.scene)
         _check_place(out, self.overwrite)
         with TerminalReporter() as reporter:
             job = (
                 panoramas_of(self, fitted)
                 if self.panorama
-                else shots_of(self, fitted, given, reporter.message)
+                else shots_of(self, fitted, cameras, reporter.message)
             )
             for note in (*fitted.notes, *job.notes):
                 reporter.message(note)
@@ -135,9 +135,9 @@ def _check_place(out: Path, overwrite: bool) -> None:
     """Refuse to overwrite files without --overwrite."""
     occupied = out.is_file() or (out.is_dir() and any(out.iterdir()))
     if occupied and not overwrite:
-        what = f"{out} exists already" if out.is_file() else f"{out} holds files already"
+        why = f"{out} exists already" if out.is_file() else f"{out} holds files already"
         fix = "add --overwrite to replace them, or choose another place with --out"
-        raise UserError(f"{what}.", fix=fix)
+        raise UserError(f"{why}.", fix=fix)
 
 
 def is_video(out: Path) -> bool:
@@ -184,15 +184,15 @@ def _check_picture(o: Render) -> None:
 
 def _check_path(o: Render) -> None:
     path, leave = o.trajectory, "leave it out"
-    moves, only = path in ("drive", "orbit"), "is for --trajectory"
-    check(o.frames is None or moves, f"--frames {only} drive and orbit", fix=leave)
-    check(o.shift is None or path == "drive", f"--shift {only} drive", fix=leave)
+    moves, needs = path in ("drive", "orbit"), "is for --trajectory"
+    check(o.frames is None or moves, f"--frames {needs} drive and orbit", fix=leave)
+    check(o.shift is None or path == "drive", f"--shift {needs} drive", fix=leave)
     near = o.shift is None or abs(o.shift) <= MOST_SHIFT
     check(near, f"--shift must be from {-MOST_SHIFT:g} to {MOST_SHIFT:g} metres")
     check(o.frames is None or o.frames >= 2, "--frames must be at least 2")
     fix = "choose one of them, or leave it out"
     valid = not o.panorama or path in ("views", "drive")
-    check(valid, f"--panorama {only} views and drive", fix=fix)
+    check(valid, f"--panorama {needs} views and drive", fix=fix)
     single = path in PATHS and not o.panorama
     check(o.camera is None or single, "--camera is for single cameras of the scene", fix=leave)
     valid = o.split == "all" or path in PATHS

@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from p2gs_jax.cli.shared import INSTALL_VIEWER, has_viewer
-from p2gs_jax.core.clock import NO_PARTS, whole_run
+from p2gs_jax.core.clock import SUMS, whole_run
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.core.progress import PlainConsole
 from p2gs_jax.core.text import count_of
@@ -27,7 +27,7 @@ from p2gs_jax.report.findings import duration
 
 # Columns of words; all others hold numbers.
 WORDS = ("views", "view", "camera", "protocol", "program", "lens", "configuration", "")
-# Scores below this, dB, are of short fits, or of too few photographs (15.8 dB of nine).
+# Short fits, or too few photographs, have lower scores, dB (nine photographs: 15.8 dB).
 LOW_DB = 20.0
 VERDICT_ON_LOW = (
     "This is low: fit for longer (--budget), or read docs/quickstart.md, When something goes wrong."
@@ -35,7 +35,7 @@ VERDICT_ON_LOW = (
 
 
 def stdout() -> Console:
-    """Return where results go; progress and messages go to stderr."""
+    """Return the console for results; progress and messages go to stderr."""
     return PlainConsole()
 
 
@@ -56,7 +56,7 @@ def make_table(
 
 
 def scores(part: Mapping[str, Any]) -> tuple[str, str, str]:
-    """Return PSNR, SSIM and LPIPS of a part of metrics.json in print."""
+    """Return PSNR, SSIM and LPIPS of a part of metrics.json as text."""
     lpips = f"{part['lpips']:.4f}" if "lpips" in part else "n/a"
     return f"{part['psnr']:.2f}", f"{part['ssim']:.4f}", lpips
 
@@ -110,13 +110,13 @@ def print_metrics(metrics: dict[str, Any]) -> None:
             f"{1e3 * metrics['seconds_per_step']:.0f} ms a step."
         )
     seconds = metrics.get("seconds", {}).items()
-    spent = [f"{k.replace('_', ' ')} {v:.0f}" for k, v in seconds if k not in NO_PARTS and v >= 0.5]
+    spent = [f"{k.replace('_', ' ')} {v:.0f}" for k, v in seconds if k not in SUMS and v >= 0.5]
     if spent:
         console.print(f"Seconds: {', '.join(spent)}.")
 
 
 def print_calibration(result: Calibration, out: Path) -> None:
-    """Print solved exposures with their errors; gammas and cameras, or the response of a stack."""
+    """Print solved exposures with errors, and gammas and cameras, or the response of a stack."""
     s, seconds = result.solution, result.seconds
     if "signal" in result.details:
         points = [str(count) for count in s.observations_per_view]
@@ -162,7 +162,7 @@ def _exposure_columns(result: Calibration) -> dict[str, list[str]]:
     """Return columns by title, without those that are empty or constant."""
     s, views = result.solution, result.views
     errors, stated, gaps = s.exposure_errors_ev, result.stated_ev, result.agreement.gap_ev
-    known, given, wrong = np.isfinite(errors), np.isfinite(stated), result.agreement.disagrees
+    known, has_stated, wrong = np.isfinite(errors), np.isfinite(stated), result.agreement.disagrees
     rows = range(len(views))
     columns = {"view": [v.name for v in views]}
     if len({v.camera for v in views}) > 1:
@@ -170,8 +170,8 @@ def _exposure_columns(result: Calibration) -> dict[str, list[str]]:
     columns["exposure"] = [
         f"{s.exposures_ev[i]:+.2f} +- {errors[i]:.2f}" if known[i] else "unknown" for i in rows
     ]
-    if given.any():
-        columns["stated"] = [f"{stated[i]:+.2f}" if given[i] else "" for i in rows]
+    if has_stated.any():
+        columns["stated"] = [f"{stated[i]:+.2f}" if has_stated[i] else "" for i in rows]
         columns["gap"] = [
             f"{gaps[i]:+.2f}{' !' if wrong[i] else ''}" if np.isfinite(gaps[i]) else ""
             for i in rows
@@ -202,8 +202,8 @@ def _balance_column(s: PhotometricSolution) -> dict[str, list[str]]:
     gains = [" ".join(f"{ev:+.2f}" for ev in row) for row in stops]
     return {
         "white balance (R G B)": [
-            f"{text} +- {error:.2f}" if seen else "unknown"
-            for text, error, seen in zip(gains, errors, known, strict=True)
+            f"{text} +- {error:.2f}" if solved else "unknown"
+            for text, error, solved in zip(gains, errors, known, strict=True)
         ]
     }
 
@@ -211,21 +211,21 @@ def _balance_column(s: PhotometricSolution) -> dict[str, list[str]]:
 def print_against(
     against: dict[str, Any], run: Path, metrics: dict[str, Any], remarks: Iterable[str], path: Path
 ) -> None:
-    """Print the scores of other programs, as against.json (`path`) has them, beside a run's."""
+    """Print the scores of other programs in against.json (`path`) beside a run's."""
     fitted = PROTOCOLS["test_fitted"].shown
     protocols = {"averaged": PROTOCOLS["test_averaged"].shown, "as_rendered": "as rendered"}
     protocols |= {"exposure_fitted": fitted, "scale_aligned": "one scale for all"}
-    own = Path(run).resolve().name + " (this run)"
+    this = Path(run).resolve().name + " (this run)"
     rows, shown = [], []
     for label, program in against["programs"].items():
         views = program["views"]
-        # Once, unless programs lack different views.
+        # The run's rows appear once, unless programs lack different views.
         if program["missing"] or views not in shown:
             shown.append(views)
-            rows += [(own, protocols[n], views, part) for n, part in program["run"].items()]
+            rows += [(this, protocols[n], views, part) for n, part in program["run"].items()]
             if "reference" in program and "reference" in metrics:
                 part = metrics["reference"]["scale_aligned"]["test"]
-                rows.append((own, "reference, one scale for all", len(part["per_view"]), part))
+                rows.append((this, "reference, one scale for all", len(part["per_view"]), part))
         for name in ("as_rendered", "exposure_fitted"):
             rows.append((label, protocols[name], views, program[name]))
         for name, part in program.get("reference", {}).items():

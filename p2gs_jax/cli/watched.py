@@ -27,7 +27,7 @@ class WatchedReporter(TerminalReporter):
         super().log(record)
 
     def _view(self, command: list[str]) -> None:
-        """Run the viewer, and repeat what it prints; Ctrl-C does not reach it."""
+        """Run the viewer, and repeat its output; Ctrl-C does not reach it."""
         output = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
         group = {"process_group": 0, "env": environment()}
         with subprocess.Popen(command, stdin=subprocess.DEVNULL, **output, **group) as viewer:

@@ -26,8 +26,8 @@ BROKEN_ARRAYS = (
     *(OSError, ValueError, KeyError, TypeError, IndexError, EOFError, MemoryError, RuntimeError),
     *(zipfile.BadZipFile, zlib.error, struct.error),
 )
-_BEGUN = ".writing-"
-_PART = 1 << 20
+_BEGUN = ".writing-"  # prefix of incomplete files and folders
+_PART = 1 << 20  # bytes
 
 
 @contextlib.contextmanager
@@ -67,7 +67,7 @@ def naming(path: Path, *, begun: Path | None = None, size: int = _PART) -> Itera
 
 
 def _reason(path: Path, begun: Path | None, size: int) -> int | None:
-    """Return the number of the system's error when `size` more bytes are written, or None."""
+    """Write `size` more bytes; return the errno of the system's error, or None."""
     try:
         with (
             tempfile.NamedTemporaryFile(dir=path.parent, prefix=".trying-")
@@ -115,7 +115,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     """Yield an empty folder beside `path`; it replaces `path`, or is deleted after an error.
 
     The former folder at `path` is removed after the new one is in place. If the process is killed,
-    one of both is complete at `path`, provided that the file system can exchange two names at once.
+    one of the two is complete at `path` if the file system can exchange two names at once.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -199,7 +199,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON atomically, keys in the given order."""
+    """Write JSON atomically; keys keep their order."""
     write_text(path, json.dumps(plain(value), indent=2, allow_nan=False) + "\n")
 
 

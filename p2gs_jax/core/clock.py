@@ -30,16 +30,16 @@ class Stopwatch:
             self.add(name, time.perf_counter() - begin)
 
     def add(self, name: str, seconds: float) -> None:
-        """Add seconds to a name that were measured elsewhere."""
+        """Add seconds that were measured elsewhere to a name."""
         with self._lock:
             self.seconds[name] = self.seconds.get(name, 0.0) + seconds
 
 
-# Entries of `seconds` in metrics.json that are sums of other entries, and so not parts of a run.
-NO_PARTS = ("total_until_evaluation", "optimisation", "evaluation_and_files")
-# Excess over a budget without a note: a factor, and seconds. Most parts that a note names.
+# Entries of `seconds` in metrics.json that are sums of other entries.
+SUMS = ("total_until_evaluation", "optimisation", "evaluation_and_files")
+# A run may take its budget times this factor, plus these seconds, without a note.
 LATE = (1.1, 2.0)
-MOST_NAMED = 4
+MOST_NAMED = 4  # parts of a run in a note
 
 
 def whole_run(seconds: Mapping[str, Any]) -> float | None:
@@ -57,7 +57,7 @@ def over_budget(budget_s: float | None, seconds: Mapping[str, float]) -> str | N
     total = whole_run(seconds)
     if budget_s is None or total is None or total <= LATE[0] * budget_s + LATE[1]:
         return None
-    parts = sorted(((v, k) for k, v in seconds.items() if k not in NO_PARTS), reverse=True)
+    parts = sorted(((v, k) for k, v in seconds.items() if k not in SUMS), reverse=True)
     named = ", ".join(f"{k.replace('_', ' ')} {v:.0f}" for v, k in parts[:MOST_NAMED] if v >= 0.5)
     return (
         f"The budget of {budget_s:.0f} s was exceeded: the run took {total:.0f} s ({named}). A "

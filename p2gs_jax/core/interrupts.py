@@ -1,6 +1,6 @@
 """Signals that end a program as Ctrl-C does, at a point from which it can continue.
 
-Only default handlers and that of `raised` are replaced; those of `nohup` or other programs stay.
+Only default handlers and the handler of `raised` are replaced; those of `nohup` and others stay.
 Outside the main thread Python delivers no signals, and these functions have no effect.
 """
 
@@ -77,7 +77,7 @@ class Held:
 def held() -> Iterator[Held]:
     """Hold signals that end a program from `Held.begin` to the end of a `with` block.
 
-    A second signal raises at once. One that still waits is raised at the end of the block.
+    A second signal raises at once. A signal that still waits is raised at the end of the block.
 
     Raises:
         Interrupted: a signal was delivered.

@@ -34,7 +34,7 @@ def left_to_process() -> int | None:
     """Return the number of bytes that are left to this process, or None if it is unknown.
 
     One bound is the available memory of the computer or its container, plus the computer's free
-    swap. The other is what the limit of the process (`ulimit -v`) leaves; the smaller counts.
+    swap. The other is the rest of the limit of the process (`ulimit -v`); the smaller counts.
     """
     _, available = memory()
     found = [] if available is None else [available + _numbers(MEMINFO).get("SwapFree", 0)]
@@ -54,7 +54,7 @@ def resident() -> int:
 def peak_bytes() -> int | None:
     """Return the peak memory of this process, bytes, or None if it is unknown.
 
-    It is from /proc, because `getrusage` includes the program that the process ran before.
+    The number is from /proc, because `getrusage` includes the program that the process ran before.
     """
     return _numbers(STATUS).get("VmHWM")
 

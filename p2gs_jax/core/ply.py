@@ -45,8 +45,8 @@ class Element(NamedTuple):
 class Header(NamedTuple):
     """The header of a file: elements by name, in the order of the file.
 
-    `order` is the byte order in NumPy's notation: "<", ">", or "=" for text; `size` is that of the
-    header, bytes.
+    `order` is the byte order in NumPy's notation: "<", ">", or "=" for text; `size` is the
+    length of the header, bytes.
     """
 
     order: str
@@ -115,8 +115,8 @@ def header_of(name: str, row: np.dtype, count: int, comments: Sequence[str] = ()
 
 
 @contextmanager
-def refusing(path: Path, what: str, *, fix: str) -> Iterator[None]:
-    """Turn errors in a `with` block into a UserError: `path` is not a valid PLY of `what`.
+def refusing(path: Path, content: str, *, fix: str) -> Iterator[None]:
+    """Turn errors in a `with` block into a UserError: `path` is not a valid PLY of `content`.
 
     Raises:
         UserError: the file cannot be read, is not a PLY, or lacks a property.
@@ -125,7 +125,7 @@ def refusing(path: Path, what: str, *, fix: str) -> Iterator[None]:
         yield
     except (OSError, ValueError, KeyError) as error:
         why = str(error).rstrip(".")
-        raise UserError(f"{path} is not a valid PLY of {what}: {why}.", fix=fix) from error
+        raise UserError(f"{path} is not a valid PLY of {content}: {why}.", fix=fix) from error
 
 
 def read_table(path: Path, name: str) -> np.ndarray:

@@ -108,7 +108,7 @@ class TerminalReporter(Reporter):
         self.show(Text(text), text)
 
     def show(self, display: RenderableType, line: str) -> None:
-        """Show a display in a terminal; elsewhere print a line, unless the last one is recent."""
+        """Show a display in a terminal; elsewhere print a line, at most every EVERY_S."""
         if self.live is not None:
             self.live.update(display)
         elif time.monotonic() - self._printed_at >= EVERY_S:

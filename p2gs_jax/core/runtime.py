@@ -26,7 +26,7 @@ _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD = -1, -2, -3
 # On 16 cores a step took 741 ms if XLA divided it, and 321, 337 and 666 ms if we divided the view
 # over 4, 8 and 16; on 2 cores both take equally long (experiments/results/2026-11-27-cores.md).
 WORTH_DIVIDING = 4
-# Programs that compile faster, seconds, are not kept on disk.
+# Compile time, seconds, below which programs are not kept on disk.
 SHORTEST_S = 0.5
 # Size of the cache, bytes, above which the least recently used programs are removed.
 MOST_BYTES = 512 * 2**20
@@ -72,7 +72,7 @@ def tune_process() -> None:
 
 
 def use_cores(count: int | None = None) -> None:
-    """Let fits divide a view over `count` cores; None: over 4, if there are as many.
+    """Let fits divide a view over `count` cores; None: over 4, or 1 if there are fewer.
 
     Call it before JAX computes anything: each core becomes a device. Without this call there is one
     device. Without a count, settings of the environment stay (JAX_NUM_CPU_DEVICES, or XLA_FLAGS

@@ -1,7 +1,7 @@
 """Random streams of fits and synthetic scenes, by name; two uses of one stream would be correlated.
 
-The order of views is the exception: its stream is the number of the epoch. Epoch 7 therefore has
-the random numbers of `HELD_OUT`; no computation depends on both.
+The order of views is the exception: its stream is the number of the epoch. Epoch 7, for example,
+has the random numbers of `HELD_OUT`; no computation depends on both.
 """
 
 from __future__ import annotations

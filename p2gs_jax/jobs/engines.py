@@ -168,7 +168,7 @@ def _await(job: Any, future: Future) -> None:
                 return
             time.sleep(ASK_S)
         result = job.result()
-    except Exception as error:  # the error of the job, or that of reading its result
+    except Exception as error:  # from the job, or from reading its result
         future.set_exception(error)
     else:
         future.set_result(result)

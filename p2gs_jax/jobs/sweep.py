@@ -83,12 +83,12 @@ def sweep(
     out.mkdir(parents=True, exist_ok=True)
     jobs, rows, longer = _planned(scene, out, configs, seeds, reference)
 
-    def tell(number: int, state: JobState | None) -> None:
+    def record(number: int, state: JobState | None) -> None:
         """Record the result of a run; None: the run was finished before."""
         row = rows[number]
         row.update(_outcome(jobs[number].folder, scene, state))
-        time_s = "kept" if state is None else f"{row.get('seconds', state.seconds):.0f} s"
-        text = time_s if row["status"] == "done" else f"{row['status']}: {row['reason']}"
+        duration = "kept" if state is None else f"{row.get('seconds', state.seconds):.0f} s"
+        text = duration if row["status"] == "done" else f"{row['status']}: {row['reason']}"
         report(f"[{number + 1}/{len(jobs)}] {jobs[number].name}: {text}")
         write_json(out / TABLE, rows)
         write_text(out / TABLE_TEXT, to_markdown(rows))
@@ -96,14 +96,14 @@ def sweep(
     with locked(out):
         left = [k for k, job in enumerate(jobs) if k in longer or not _metrics(job.folder).exists()]
         for number in sorted({*range(len(jobs))} - {*left}):
-            tell(number, None)
+            record(number, None)
         if left:
             with open_engine(engine, max_parallel, out / JOBS) as workers:
                 run_jobs(
                     [jobs[number] for number in left],
                     workers,
                     out / JOBS,
-                    on_end=lambda k, state: tell(left[k], state),
+                    on_end=lambda k, state: record(left[k], state),
                     on_look=on_look,
                     run=run,
                 )
@@ -170,7 +170,7 @@ def fit_task(folder: Path, arguments: dict[str, Any], reporter: Reporter) -> Non
         reference=arguments["reference"],
         resume=RunFolder(folder).config.exists(),
         reporter=reporter,
-        # As in `p2gs-jax fit`, the start of the interpreter counts.
+        # As in `p2gs-jax fit`, the budget includes the start of Python.
         spent_s=time.process_time(),
     )
 
@@ -194,7 +194,7 @@ class Column(NamedTuple):
     name: str
     path: tuple[str, ...]  # keys in metrics.json; () for values that are computed
     digits: int  # after the decimal point
-    heading: str = ""  # in the short table, which fits a terminal; "" where it is not there
+    heading: str = ""  # in the short table, which fits a terminal; "": not in it
 
     @property
     def meaning(self) -> str:
@@ -274,13 +274,13 @@ def _means(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -> list
     """Return the cells of each configuration: name, number of finished seeds, means over these."""
     lines = []
     for name in dict.fromkeys(row["name"] for row in rows):
-        mine = [row for row in rows if row["name"] == name]
-        done = [row for row in mine if row["status"] == "done"]
+        runs = [row for row in rows if row["name"] == name]
+        done = [row for row in runs if row["status"] == "done"]
         cells = []
         for column in columns:
             values = [row[column.name] for row in done if column.name in row]
             cells.append(f"{np.mean(values):.{column.digits}f}" if values else "-")
-        lines.append([str(name), f"{len(done)} of {len(mine)}", *cells])
+        lines.append([str(name), f"{len(done)} of {len(runs)}", *cells])
     return lines
 
 

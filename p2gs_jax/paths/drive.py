@@ -1,4 +1,4 @@
-"""A smooth camera path through given poses, also shifted sideways."""
+"""A smooth camera path through poses, also shifted sideways."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SHORTEST = 0.1
 
 
 class PosePath:
-    """Poses over time through every given pose, with continuous velocity and acceleration.
+    """A path through all poses over time, with continuous velocity and acceleration.
 
     Positions follow a natural cubic spline, rotations scipy's `RotationSpline`. The time between
     two poses goes with sqrt(distance / mean distance + angle in radians), which is centripetal:
@@ -67,12 +67,12 @@ def drive(knots: Sequence[Shot], frames: int | None = None) -> list[Shot]:
     path = PosePath(inverse(np.stack([s.viewmat for s in knots])))
     times = path.evenly(frame_count(len(knots), frames))
     logs = [None if s.gamma is None else float(np.log(s.gamma)) for s in knots]
-    given = [s.exposure_ev for s in knots], logs, [s.time for s in knots]
-    evs, found, clock = (interpolated(path.times, values, times) for values in given)
-    gammas = [None if g is None else float(np.exp(g)) for g in found]
+    columns = [s.exposure_ev for s in knots], logs, [s.time for s in knots]
+    evs, logs, moments = (interpolated(path.times, values, times) for values in columns)
+    gammas = [None if g is None else float(np.exp(g)) for g in logs]
     K, width, height = common_lens(knots)
     return [
-        Shot(f"{k:05d}", viewmat, K, width, height, evs[k], gammas[k], time=clock[k])
+        Shot(f"{k:05d}", viewmat, K, width, height, evs[k], gammas[k], time=moments[k])
         for k, viewmat in enumerate(inverse(path(times)))
     ]
 

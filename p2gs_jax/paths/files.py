@@ -70,14 +70,14 @@ def _entry(values: dict, index: int) -> Shot:
     unknown = sorted(set(values) - set(FIELDS))
     if unknown:
         raise ValueError(f"has an unknown field {unknown[0]!r} (known are {', '.join(FIELDS)})")
-    viewmat = checked_pose(_given(values, "viewmat"), "viewmat")
-    K, name = checked_lens(_given(values, "K")), _name(values, index)
+    viewmat = checked_pose(_required(values, "viewmat"), "viewmat")
+    K, name = checked_lens(_required(values, "K")), _name(values, index)
     shot = Shot(name, viewmat, K, _pixels(values, "width"), _pixels(values, "height"))
     more = {key: _number(values, key, *limits) for key, limits in LIMITS.items() if key in values}
     return replace(shot, **more)
 
 
-def _given(values: dict, key: str):
+def _required(values: dict, key: str):
     if key not in values:
         raise ValueError(f"has no {key}")
     return values[key]

@@ -11,13 +11,14 @@ from jaxtyping import Float
 from p2gs_jax.paths.shots import Pose, Shot, common_lens
 from p2gs_jax.scene.rigid import camera_centers, pose_of, up_direction
 
-FRAMES = 120
+FRAMES = 120  # of an orbit, unless a number is chosen
 # Optical axes meet in a point only if they spread at least this much (mean squared sine).
 LEAST_SPREAD = 0.01
 # The point must be in front of this share of cameras, at most this median angle off their axes.
 MOST_IN_FRONT, WIDEST = 0.9, np.deg2rad(25)
 # A full circle needs cameras on all sides, with gaps below this angle.
 LARGEST_GAP = np.deg2rad(100)
+# Smallest half of an arc, and largest elevation of the camera.
 LEAST_SWAY = np.deg2rad(10)
 HIGHEST = np.deg2rad(85)
 
@@ -75,21 +76,21 @@ def look_at(
 
 
 def find_orbit(
-    shots: Sequence[Shot], own: Sequence[Shot], points: Float[np.ndarray, "p 3"]
+    shots: Sequence[Shot], filmed: Sequence[Shot], points: Float[np.ndarray, "p 3"]
 ) -> Orbit:
     """Return an orbit that fits the cameras of a scene.
 
     If the optical axes meet, the orbit is around that point at the median distance and elevation of
     the cameras: a circle if they surround it, else an arc over their azimuths. If the axes do not
-    meet, as on a vehicle, the arc is around a point in front of the middle shot of `own`, the shots
-    of one camera in order, at the median depth of the points in that shot (if there are any).
+    meet, as on a vehicle, the arc is around a point in front of the middle shot of `filmed`, the
+    shots of one camera in order, at the median depth of the points in that shot (if any).
     """
     viewmats = np.stack([s.viewmat for s in shots])
     up = up_direction(viewmats)
     centers, axes = camera_centers(viewmats), viewmats[:, 2, :3]
     focus = meeting_point(centers, axes)
     if focus is None:
-        middle = own[len(own) // 2]
+        middle = filmed[len(filmed) // 2]
         distance = _median_depth(middle, points, centers)
         center = camera_centers(middle.viewmat[None])[0]
         return _around(center + distance * middle.viewmat[2, :3], center[None], up)

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Float32
 from p2gs_jax.paths.shots import Pose, Shot
 from p2gs_jax.scene.rigid import pose_of
 
-# Coverage is tested at this many directions per radian, up to this height (tangent of elevation).
+# Coverage is tested at two directions per degree, up to this height (tangent of elevation).
 PROBES, HIGHEST = 2 * 180 / np.pi, 3.0
 # A column is good if its height is at least this share of the tallest column's.
 FULL_COLUMN = 0.75
@@ -83,7 +83,7 @@ def covering(shots: Iterable[Shot], viewmat: Pose) -> Cylinder:
         rows = covered.any(1)
     first, last = np.flatnonzero(rows)[[0, -1]]
     focal = max(float(max(s.K[0, 0], s.K[1, 1])) for s in shots)
-    # A probe represents its surroundings, so the outermost one at every edge is left out.
+    # A probe represents its surroundings, so the outermost probe at every edge is left out.
     cut = 0 if count == around else 1
     top, bottom = (probe.top + row / probe.focal for row in (first + 1, last))
     left = probe.left + (start + cut) / probe.focal

@@ -28,19 +28,19 @@ def _layers(run: Run, shot: Shot, at: float | None) -> Layers:
 
 
 def metered_shots(
-    run: Run, shots: Sequence[Shot], of: ExposureOf, exposure_ev: float = 0.0, frames: float = 0.0
+    run: Run, shots: Sequence[Shot], rule: ExposureOf, exposure_ev: float = 0.0, frames: float = 0.0
 ) -> list[Shot]:
     """Return shots with the exposures that a metering rule chooses from small pictures of them.
 
-    `exposure_ev`, stops, is added to each. Exposures are smoothed over about `frames` shots in the
-    given order; with 0 every shot is metered separately.
+    `exposure_ev`, stops, is added to each. Exposures are smoothed over about `frames` shots in
+    their order; with 0 every shot is metered separately.
     """
     stops = []
     for shot in shots:
         small = shot.resized(METERED_WIDTH) if shot.width > METERED_WIDTH else shot
         rendered = run.render(small.camera(), small.time)
         readings = meter(np.asarray(rendered.linear), np.asarray(rendered.alpha))
-        stops.append(run.metering.exposure_ev(readings, of))
+        stops.append(run.metering.exposure_ev(readings, rule))
     if frames > 0:
         stops = adapted(np.array(stops), frames).tolist()
     added = exposure_ev - float(np.log2(run.mean.exposure_geometric))
@@ -70,7 +70,7 @@ def wide_frames(
 ) -> Iterator[OutputFrame]:
     """Yield a wide view of the field for each step: name, rig-to-world pose and time, seconds.
 
-    The viewmat of the cylinder is rig-to-camera. Moving objects appear only if a time is given.
+    The viewmat of the cylinder is rig-to-camera. Moving objects appear only at a known time.
     """
     for name, pose, at in steps:
         placed = replace(cylinder, viewmat=cylinder.viewmat @ inverse(pose))

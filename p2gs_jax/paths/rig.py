@@ -20,8 +20,8 @@ from p2gs_jax.scene.rigid import camera_centers, inverse, moment_of, pose_of, up
 from p2gs_jax.types import View
 
 # Largest median deviation of a camera's rotation from its mean on the rig, radians.
-LEAST_RIGID = np.deg2rad(5)
-# Cameras look in all directions if the mean of their unit viewing directions is shorter.
+LARGEST_DEVIATION = np.deg2rad(5)
+# Cameras look in all directions if the mean of their viewing directions, made level, is shorter.
 ALL_AROUND = 0.5
 
 
@@ -110,7 +110,7 @@ def _mounts(cameras: list[str], steps: list[dict[str, Shot]]) -> dict[str, Shot]
         relative = np.stack([f[camera].viewmat @ inverse(f[anchor].viewmat) for f in pairs])
         from_anchor[camera], lenses[camera] = _mean_pose(relative), pairs[0][camera]
         turns = Rotation.from_matrix(relative[:, :3, :3] @ from_anchor[camera][:3, :3].T)
-        if np.median(turns.magnitude()) > LEAST_RIGID:
+        if np.median(turns.magnitude()) > LARGEST_DEVIATION:
             why = f"The cameras {anchor!r} and {camera!r} turn relative to each other, so they are "
             why += "not on one rig."
             raise UserError(why, fix="leave out --panorama")
@@ -122,9 +122,9 @@ def _mounts(cameras: list[str], steps: list[dict[str, Shot]]) -> dict[str, Shot]
 def _level(viewmats: Poses, names: Sequence[str]) -> Pose:
     """Return rig-to-anchor: the origin is the mean camera centre, z the mean viewing direction.
 
-    Both axes are level. If cameras look in all directions, z is the direction of the camera with
-    "front" in its name (the shortest such name). If there is none and the mean is below 0.1, it is
-    that of the first camera. The viewmats are anchor-to-camera.
+    The mean is made level. If cameras look in all directions, z is the direction of the camera
+    with "front" in its name (the shortest such name). If there is none and the mean is shorter
+    than 0.1, z is the direction of the first camera. The viewmats are anchor-to-camera.
     """
     up = up_direction(viewmats)
     level = viewmats[:, 2, :3] - np.outer(viewmats[:, 2, :3] @ up, up)

@@ -111,7 +111,7 @@ def make_camera(K: ArrayLike, viewmat: ArrayLike, width: int, height: int) -> Ca
 
     K is 3x3 without skew, in pixels like width and height, with pixel centres at +0.5. The viewmat
     is 4x4, world-to-camera, OpenCV axes, in the coordinates of the scene. Raises a UserError if an
-    argument has another shape or meaning.
+    argument is not valid.
     """
     fix = "docs/conventions.md defines K and viewmat"
     for name, value in (("width", width), ("height", height)):
@@ -126,7 +126,7 @@ def make_camera(K: ArrayLike, viewmat: ArrayLike, width: int, height: int) -> Ca
 
 
 def as_matrix(values: ArrayLike, name: str, size: int) -> Float[np.ndarray, "n n"]:
-    """Return a finite square matrix, given as rows or flat; other values raise a ValueError."""
+    """Return a finite square matrix from rows or a flat list; other values raise a ValueError."""
     try:
         out = np.array(values, np.float64)
     except (TypeError, ValueError):

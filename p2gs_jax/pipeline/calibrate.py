@@ -73,7 +73,7 @@ class Calibration:
     details: dict[str, Any]  # other content of `calibration.json`
     observations: int  # number of observations used
     seconds: dict[str, float]  # duration of `reading` with sampling, and of the `adjustment`, s
-    developed: Developed | None = None  # photographs for other trainers, if they were asked for
+    developed: Developed | None = None  # photographs for other trainers (`develop`)
 
     @property
     def solution(self) -> PhotometricSolution:
@@ -92,8 +92,8 @@ class Calibration:
 
     def write(self, out: Path) -> Calibration:
         """Write `photometry.json`, `calibration.json` and `calibration.png`; return `self`."""
-        path, given = out / "photometry.json", {"pivot": self.pivot, "gauge": self.gauge}
-        write_solution(path, self.solution, views=self.views, **given)
+        path, convention = out / "photometry.json", {"pivot": self.pivot, "gauge": self.gauge}
+        write_solution(path, self.solution, views=self.views, **convention)
         write_json(out / "calibration.json", {"messages": self.messages, **self.details})
         self._plot(out / "calibration.png")
         return self
@@ -106,11 +106,11 @@ class Calibration:
         """Return the main numbers and `calibration.png`, for notebooks."""
         s, known = self.solution, np.isfinite(self.errors_ev)
         stops, error = self.exposures_ev[known], self.errors_ev[known].max(initial=0)
-        reach = f"{stops.min(initial=0):+.2f} to {stops.max(initial=0):+.2f} EV"
+        span = f"{stops.min(initial=0):+.2f} to {stops.max(initial=0):+.2f} EV"
         rows = {
-            "photographs": f"{len(self.views)}, of which {known.sum()} have an exposure",
+            "photographs": f"{len(self.views)}, {known.sum()} with an exposure",
             "model": f"{s.model}, curve {s.response.name}",
-            "exposures": f"{reach}, standard errors up to {error:.3f} EV",
+            "exposures": f"{span}, standard errors up to {error:.3f} EV",
             "residual": f"{s.residual_ev:.2f} EV over {self.observations:,} observations",
         }
         with tempfile.TemporaryDirectory() as folder:
@@ -287,7 +287,7 @@ def calibrate_stack(
     """Solve exposures and the common response of a stack of photographs from one fixed viewpoint.
 
     Without known exposures, log exposures are determined up to a factor: exposures and response
-    can be stretched together (the power gauge). The mid tones of the standard curves fix it. The
+    can be stretched together. The mid tones of the standard curves fix this power gauge. The
     photometry of `cfg` (default `robust`) names known exposures, and its seed draws the sampled
     positions. Without `out` nothing is written; see `calibrate`.
 

@@ -30,7 +30,7 @@ class Exposures:
     photometry: Photometry  # initial parameters of the training views
     decisions: Decisions  # values that the scene decided
     observations: Observations | None = None  # colours of shared points, or None
-    # model, exposures and their errors, or None where nothing was solved here
+    # model, exposures and their errors, or None if nothing was solved here
     selection: calibrate.Selection | None = None
     # linear radiance of the scene's points; None: it follows from the selection
     radiance: Float32[np.ndarray, "p 3"] | None = None
@@ -54,7 +54,7 @@ def solve_exposures(
 ) -> Exposures:
     """Sample colours of shared points, and solve the photometry from them, where possible.
 
-    The photographs `still` are without moving objects and transparent pixels. `on_chosen` receives
+    `still` has the photographs without moving objects and transparent pixels. `on_chosen` receives
     model and curve before they are solved; a resumed run keeps those of its checkpoints (`kept`).
     With `dense`, observations are sampled even if the fit does not start from solved exposures.
     """

@@ -116,7 +116,7 @@ def heading(metrics: Mapping[str, Any], params: Params, cfg: FitConfig) -> list[
 
 
 def _psnrs(metrics: Mapping[str, Any]) -> dict[str, float]:
-    """Return the PSNR of every view under the parameters with which the summary shows it."""
+    """Return the PSNR of every view with the exposure that `summary.png` shows."""
     parts = (metrics["train"], metrics.get("test", {}).get("exposure_fitted", {}))
     rows = {name: row for part in parts for name, row in part.get("per_view", {}).items()}
     return {name: row["psnr"] for name, row in rows.items() if "psnr" in row}

@@ -29,7 +29,7 @@ from p2gs_jax.scene.pixels.store import decoded_into
 from p2gs_jax.train.data_parallel import mesh_of
 from p2gs_jax.types import Scene
 
-# Seeds that a coarse point outside a block counts as, because it replaces many points. With 1, the
+# A coarse point outside a block counts as this many seeds, as it replaces many points. With 1, the
 # cores of a town had 5 % fewer Gaussians and 0.18 dB less than one fit. With 1.6, another town had
 # 13 % more Gaussians and 0.09 dB less (BUILD_NOTES, "Districts").
 OUTSIDE = 1.6
@@ -52,11 +52,11 @@ def block_job(scene: Path, run: Path, folder: Path, cut: Cut, number: int, cfg: 
 
 
 def block_config(
-    cfg: FitConfig, cut: Cut, number: int, block: Scene, own: int, *, train_views: int
+    cfg: FitConfig, cut: Cut, number: int, block: Scene, inside: int, *, train_views: int
 ) -> FitConfig:
     """Return the options of a block: its share of the steps and of the Gaussians of `cfg`.
 
-    `own` points of its scene are inside the block; `train_views` counts those of the whole scene.
+    `inside`: points of the scene `block` in it; `train_views`: training views of the whole scene.
     """
     share = len(cut.blocks[number].views) / train_views
     train, densify = cfg.train, cfg.densify
@@ -68,9 +68,9 @@ def block_config(
     if isinstance(most, int):
         most = max(1, round(share * most))
     elif most is None and densify.method == "mcmc":
-        # The density is that of one fit of the scene: there, as many steps show a Gaussian.
+        # The density is that of one fit of the whole scene, where as many steps show a Gaussian.
         # Gaussians outside the block grow as well and are discarded later, so their share is added.
-        seeds = own + round(OUTSIDE * (len(block.points) - own))
+        seeds = inside + round(OUTSIDE * (len(block.points) - inside))
         most = default_max_gaussians(seeds, coverage_of(block, cfg.data.max_width), train)
     return dataclasses.replace(
         cfg,
@@ -91,12 +91,12 @@ def fit_block(folder: Path, arguments: dict[str, Any], reporter: Reporter) -> No
     reporter.stage("Reading the scene")
     scene = load(Path(arguments["scene"]), Path(arguments["run"]), whole)
     number, train_views = arguments["number"], len(scene.train_indices)
-    block, own = block_of(read_shared(Path(arguments["shared"]), scene, whole), cut, number)
-    cfg = block_config(whole, cut, number, block.scene, own, train_views=train_views)
+    block, inside = block_of(read_shared(Path(arguments["shared"]), scene, whole), cut, number)
+    cfg = block_config(whole, cut, number, block.scene, inside, train_views=train_views)
     del scene
     folder.mkdir(parents=True, exist_ok=True)
     with locked(folder), decoded_into(RunFolder(folder).pixels):
-        counts, seconds = _fit(RunFolder(folder), block, own, cfg, reporter, arguments["scene"])
+        counts, seconds = _fit(RunFolder(folder), block, inside, cfg, reporter, arguments["scene"])
     seconds["total"] = time.monotonic() - begin
     metrics = {"counts": counts, "seconds": seconds, "peak_bytes": peak_bytes()}
     write_json(RunFolder(folder).metrics, metrics)
@@ -104,7 +104,7 @@ def fit_block(folder: Path, arguments: dict[str, Any], reporter: Reporter) -> No
 
 
 def _fit(
-    folder: RunFolder, block: Shared, own: int, cfg: FitConfig, reporter: Reporter, scene: str
+    folder: RunFolder, block: Shared, inside: int, cfg: FitConfig, reporter: Reporter, root: str
 ) -> tuple[dict[str, int], dict[str, float]]:
     """Fit the scene of a block and write its Gaussians; return counts and seconds."""
     clock = Stopwatch()
@@ -114,7 +114,7 @@ def _fit(
             optimiser.expect(found, given=block.exposures.decisions)
         with clock("seeds"):
             prepared = initialise(found, block.exposures, reporter)
-        with begun(folder, Paths(Path(scene), folder.root), cfg, prepared.decisions):
+        with begun(folder, Paths(Path(root), folder.root), cfg, prepared.decisions):
             result = optimiser.run(prepared, resume=True)
     params, _ = compact(result)
     count = params.gaussians.capacity
@@ -123,7 +123,7 @@ def _fit(
     counts = {
         "gaussians": count,
         "seed_points": len(block.scene.points),
-        "seed_points_outside": len(block.scene.points) - own,
+        "seed_points_outside": len(block.scene.points) - inside,
         "train_views": len(block.scene.views),
         "steps": result.host.step,
     }

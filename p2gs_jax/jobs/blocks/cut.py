@@ -23,11 +23,11 @@ from p2gs_jax.scene.split import only
 from p2gs_jax.scene.visibility import in_frame
 from p2gs_jax.types import Scene, View
 
-# A block extends beyond its core by this share of the shortest core.
+# A block extends beyond its core by this share of the length of the shortest core.
 OVERLAP = 0.15
 # A view belongs to a block if at least this share of its visible points lies in the block.
 LEAST_SEEN = 0.1
-FEWEST_VIEWS = 2
+FEWEST_VIEWS = 2  # of a block
 # Largest number of points without tracks that are projected.
 MOST_PROJECTED = 20_000
 # Points outside a block are thinned to one per cube whose side is this share of their distance.
@@ -53,7 +53,7 @@ class Block:
     """A cell, and the photographs that show it."""
 
     lower: tuple[float, float]  # smallest coordinates in the plane; -inf if unbounded
-    upper: tuple[float, float]  # largest ones, which belong to the neighbour
+    upper: tuple[float, float]  # largest coordinates, which belong to the neighbour
     views: tuple[int, ...] = ()  # rows among the training views
 
     def holds(
@@ -122,7 +122,7 @@ def cut_scene(scene: Scene, count: int) -> Cut:
     seen = seen_points(scene)
     centers = camera_centers(scene.training_views)
     ground = ground_of(centers)
-    places = ground.place(looked_at(scene, seen, centers))
+    places = ground.place(view_places(scene, seen, centers))
     if count < 1:
         raise UserError(f"--blocks {count} is not valid.", fix="write a whole number, or auto")
     distinct = len(np.unique(np.round(places, 9), axis=0))
@@ -188,7 +188,7 @@ def _length(places: Float[np.ndarray, "v 2"]) -> float:
 
 
 def seen_points(scene: Scene) -> list[Int[np.ndarray, " _"]]:
-    """Return the points that each training view sees: by tracks, or by projecting some points."""
+    """Return the points that each training view sees: by tracks, else by projecting a sample."""
     rows = scene.train_indices
     if scene.tracks is not None and len(scene.tracks.xy):
         of_view = grouped(scene.tracks.view_indices, len(scene.views))
@@ -197,7 +197,7 @@ def seen_points(scene: Scene) -> list[Int[np.ndarray, " _"]]:
     return [picked[shows(scene.views[i], scene.points[picked])] for i in rows]
 
 
-def looked_at(
+def view_places(
     scene: Scene, seen: Sequence[Int[np.ndarray, " _"]], centers: Float[np.ndarray, "v 3"]
 ) -> Float[np.ndarray, "v 3"]:
     """Return the place of each training view: half way from its camera to the points it sees.
@@ -219,8 +219,8 @@ def shows(view: View, points: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, " p"
 def whole_of(scene: Scene, cut: Cut, number: int) -> tuple[Scene, Int[np.ndarray, " k"], int]:
     """Return a block as a scene: its views, its points, and coarse points around it.
 
-    Further results are the rows of its points in the whole scene, and the number of points (the
-    first ones) inside the block.
+    The other results are the rows of these points in the whole scene, and the number of points
+    inside the block, which come first.
     """
     block = cut.blocks[number]
     places = cut.ground.place(scene.points)
@@ -235,7 +235,7 @@ def whole_of(scene: Scene, cut: Cut, number: int) -> tuple[Scene, Int[np.ndarray
 
 
 def _seen(scene: Scene, rows: Int[np.ndarray, " k"]) -> Bool[np.ndarray, " p"]:
-    """Return the mask of points that any view sees: by tracks, or by projection into some views."""
+    """Return the mask of points that any view sees: by tracks, else by projection into a few."""
     seen = np.zeros(len(scene.points), bool)
     if scene.tracks is not None and len(scene.tracks.xy):
         seen[scene.tracks.point_indices[np.isin(scene.tracks.view_indices, rows)]] = True

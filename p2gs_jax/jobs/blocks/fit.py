@@ -46,8 +46,8 @@ KEY = "districts"
 
 
 @dataclasses.dataclass(frozen=True)
-class Asked:
-    """The arguments of `fit_blocks` on blocks and engines."""
+class Request:
+    """The arguments of `fit_blocks` about blocks and engines."""
 
     blocks: int | str
     parallel: int
@@ -80,7 +80,7 @@ def fit_blocks(
         Interrupted: a signal arrived; running blocks write their checkpoints first.
     """
     cfg, reporter = require_config(cfg), reporter or Silent()
-    asked = Asked(blocks, parallel, engine)
+    request = Request(blocks, parallel, engine)
     paths = Paths.of(scene_dir, run_dir, reference)
     if isinstance(blocks, str) and blocks != "auto":
         raise UserError(f"--blocks {blocks} is not valid.", fix="write a whole number, or auto")
@@ -96,9 +96,9 @@ def fit_blocks(
         scene = load(paths.scene, paths.run, cfg, reporter)
         plan.check_scene(scene, cfg)
         truth = preflight.check_scene(scene, cfg, paths, weights)
-        cut = _cut(scene, cfg, asked, paths.run / BLOCKS, reporter)
+        cut = _cut(scene, cfg, request, paths.run / BLOCKS, reporter)
         if cut is not None:
-            whole = _Blocks(paths, cfg, asked, cut, lock, reporter, on_look)
+            whole = _Blocks(paths, cfg, request, cut, lock, reporter, on_look)
             with decoded_into(whole.folder.pixels):
                 return whole.fit(scene, truth, weights, begin, true_exposures)
     # With one block the scene is fitted as usual.
@@ -115,21 +115,21 @@ def fit_blocks(
 
 
 def _cut(
-    scene: Scene, cfg: FitConfig, asked: Asked, folder: Path, reporter: Reporter
+    scene: Scene, cfg: FitConfig, request: Request, folder: Path, reporter: Reporter
 ) -> Cut | None:
     """Return the cut of the scene, the earlier one if there is one; None: one block is enough."""
-    cut = plan.read_plan(folder, str(asked.blocks))
+    cut = plan.read_plan(folder, str(request.blocks))
     if cut is None:
-        count = asked.blocks
+        count = request.blocks
         if isinstance(count, str):
-            count = plan.fewest_blocks(scene, cfg, asked.parallel)
+            count = plan.fewest_blocks(scene, cfg, request.parallel)
         if count == 1:
             reporter.message("One block: the whole scene fits into memory.")
             return None
         cut = cut_scene(scene, count)
     # Other machines have other memory.
-    if asked.engine == LOCAL:
-        plan.require_room(scene, cfg, cut, asked.parallel)
+    if request.engine == LOCAL:
+        plan.require_room(scene, cfg, cut, request.parallel)
     sizes = [len(block.views) for block in cut.blocks]
     reporter.message(
         f"{len(sizes)} blocks with {min(sizes)} to {max(sizes)} of {len(scene.train_indices)} "
@@ -144,7 +144,7 @@ class _Blocks:
 
     paths: Paths
     cfg: FitConfig
-    asked: Asked
+    request: Request
     cut: Cut
     lock: RunLock
     reporter: Reporter
@@ -157,7 +157,7 @@ class _Blocks:
     def fit(
         self, scene: Scene, truth: Reference | None, weights, begin: float, true_exposures
     ) -> FitResult:
-        """Solve the photometry, fit every block, merge the blocks and evaluate the result."""
+        """Solve the photometry, fit and merge all blocks, evaluate; the run began at `begin`."""
         with self.clock("photometry"):
             solved = self._solve(scene)
         with self.clock("blocks"):
@@ -238,7 +238,7 @@ class _Blocks:
             new = {"selection": found.selection, "notes": found.notes}
             exposures = dataclasses.replace(before.exposures, **new)
             return dataclasses.replace(before, exposures=exposures)
-        plan.write_plan(self.blocks, self.cut, str(self.asked.blocks))
+        plan.write_plan(self.blocks, self.cut, str(self.request.blocks))
         shared.write_shared(self.blocks, solved)
         return solved
 
@@ -251,7 +251,7 @@ class _Blocks:
         if not left:
             return
         jobs = self.blocks / "jobs"
-        with open_engine(self.asked.engine, self.asked.parallel, jobs) as workers:
+        with open_engine(self.request.engine, self.request.parallel, jobs) as workers:
             states = run_jobs(left, workers, jobs, on_end=self._ended, on_look=self.on_look)
         failed = [f"{s.name}: {s.reason}" for s in states if s.status != "done"]
         if failed:
@@ -268,9 +268,9 @@ class _Blocks:
         return json.loads(RunFolder(self.blocks / str(number)).metrics.read_text(encoding="utf-8"))
 
     def _report(self, seams: Sequence[Seam]) -> None:
-        seen = [s for s in seams if s.step_stops is not None]
-        if seen:
-            worst = max(seen, key=lambda s: abs(s.step_stops or 0.0))
+        compared = [s for s in seams if s.step_stops is not None]
+        if compared:
+            worst = max(compared, key=lambda s: abs(s.step_stops or 0.0))
             self.reporter.message(
                 f"The largest step of radiance between blocks is {worst.step_stops:+.4f} stops "
                 f"(blocks {worst.blocks[0]} and {worst.blocks[1]}). The median difference is "

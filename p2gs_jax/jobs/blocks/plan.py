@@ -50,15 +50,15 @@ def check_scene(scene: Scene, cfg: FitConfig) -> None:
         raise UserError(why, fix=fix)
 
 
-def write_plan(folder: Path, cut: Cut, asked: str) -> None:
-    """Write the cut of a scene, and `asked`, the value of `--blocks`."""
-    write_json(folder / PLAN, {"asked": asked, "cut": cut.to_dict()})
+def write_plan(folder: Path, cut: Cut, blocks: str) -> None:
+    """Write the cut of a scene, and `blocks`, the value of `--blocks`."""
+    write_json(folder / PLAN, {"asked": blocks, "cut": cut.to_dict()})
 
 
-def read_plan(folder: Path, asked: str) -> Cut | None:
+def read_plan(folder: Path, blocks: str) -> Cut | None:
     """Return the cut of a resumed run, or None if it has none.
 
-    Raises a UserError if `asked` is another number of blocks, or if the file is broken.
+    Raises a UserError if `blocks` is another number of blocks, or if the file is broken.
     """
     path = folder / PLAN
     if not path.exists():
@@ -66,7 +66,7 @@ def read_plan(folder: Path, asked: str) -> Cut | None:
     with readable(path, "start again in another folder with --out"):
         saved: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         before, cut = saved["asked"], Cut.from_dict(saved["cut"])
-    if before != asked and asked != str(len(cut.blocks)):
+    if before != blocks and blocks != str(len(cut.blocks)):
         why = f"{folder.parent} was started with --blocks {before} ({len(cut.blocks)} blocks)."
         raise UserError(why, fix=f"repeat --blocks {before}, or name another folder with --out")
     return cut
@@ -81,16 +81,16 @@ def largest_block(scene: Scene, cfg: FitConfig, cut: Cut) -> float:
     """Return the peak memory, bytes, of the block of a cut that needs the most."""
     count, most = len(scene.train_indices), 0.0
     for number in range(len(cut.blocks)):
-        block, _, own = whole_of(scene, cut, number)
-        options = block_config(cfg, cut, number, block, own, train_views=count)
+        block, _, inside = whole_of(scene, cut, number)
+        options = block_config(cfg, cut, number, block, inside, train_views=count)
         most = max(most, bytes_needed(block, options))
     return most
 
 
 def fewest_blocks(scene: Scene, cfg: FitConfig, parallel: int) -> int:
-    """Return the number of blocks for the free memory, by `_fitting`; 1: the scene fits whole.
+    """Return the number of blocks for the free memory, by `_fitting`; 1: the whole scene fits.
 
-    It is also 1 if free memory is unknown. Raises a UserError if no cut has small enough blocks.
+    The result is also 1 if free memory is unknown. UserError: no cut has small enough blocks.
     """
     room = left_to_process()
     if room is None or bytes_needed(scene, cfg) <= room:

@@ -31,7 +31,7 @@ from p2gs_jax.types import Camera, Gaussians, Render, Scene
 MOST_VIEWS = 48
 # Pixels are compared where both blocks have at least this opacity.
 OPAQUE = 0.9
-DARKEST = 1e-3
+DARKEST = 1e-3  # linear radiance; darker pixels count as this
 # Depth to which the radiance of a core is corrected, as a share of the shortest core.
 INWARDS = 0.5
 # A view with fewer pixels of the strip is ignored.
@@ -52,7 +52,7 @@ class Seam:
     spread_stops: float | None = None  # median absolute value of that ratio, stops
     step_depth: float | None = None  # median ratio of depth, second to first, minus 1
     spread_depth: float | None = None  # median absolute value of that difference
-    levelled_stops: float | None = None  # the step removed before, measured in other views
+    levelled_stops: float | None = None  # the step that was removed, measured in other views
 
 
 def measure_seams(
@@ -100,18 +100,18 @@ def _compared(
         assert drawn.depth is not None
         opaque = np.maximum(alpha, 1e-6)
         renders.append((linear.mean(-1) / opaque, np.asarray(drawn.depth) / opaque, alpha))
-    (one, near, solid), (other, far, covered) = renders
+    (radiance, depth, alpha), (other, other_depth, other_alpha) = renders
     # A choice by one of the two depths would favour pixels in which that depth is wrong.
-    middle = np.sqrt(np.maximum(near * far, 0.0))
+    middle = np.sqrt(np.maximum(depth * other_depth, 0.0))
     points = unproject(middle, jax.tree.map(np.asarray, camera))
     places = cut.ground.place(points.reshape(-1, 3))
     strip = np.ones(len(places), bool)
     for number in pair:
         strip &= cut.blocks[number].holds(places, cut.margin)
-    good = strip.reshape(near.shape) & (solid > OPAQUE) & (covered > OPAQUE)
-    good &= (near > 0) & (far > 0)
-    ratio = np.log2(np.maximum(other[good], DARKEST) / np.maximum(one[good], DARKEST))
-    return ratio, far[good] / near[good] - 1
+    good = strip.reshape(depth.shape) & (alpha > OPAQUE) & (other_alpha > OPAQUE)
+    good &= (depth > 0) & (other_depth > 0)
+    ratio = np.log2(np.maximum(other[good], DARKEST) / np.maximum(radiance[good], DARKEST))
+    return ratio, other_depth[good] / depth[good] - 1
 
 
 def level_seams(
@@ -145,18 +145,18 @@ def shifts(
     """
     places = cut.ground.place(means)
     reach = INWARDS * cut.margin / OVERLAP
-    weight = _near(cut.blocks[number].distance(places), reach)
+    weight = _weight(cut.blocks[number].distance(places), reach)
     total, moved = weight.copy(), np.zeros(len(places))
     for (first, second), step in steps.items():
         if number in (first, second):
             other, more = (second, step) if number == first else (first, -step)
-            weight = _near(cut.blocks[other].distance(places), reach)
+            weight = _weight(cut.blocks[other].distance(places), reach)
             total += weight
             moved += weight * more
     return moved / np.maximum(total, np.finfo(float).tiny)
 
 
-def _near(distance: Float[np.ndarray, " n"], reach: float) -> Float[np.ndarray, " n"]:
+def _weight(distance: Float[np.ndarray, " n"], reach: float) -> Float[np.ndarray, " n"]:
     return np.maximum(1 - distance / reach, 0.0)
 
 
