@@ -27,12 +27,12 @@ _SHUTTER = re.compile(r"\b(?:Shutter\s*:|SS)\s*(?:1/)?(\d+(?:\.\d+)?)", re.IGNOR
 _F_NUMBER = re.compile(r"\b(?:Fnum\s*:\s*F?|F/)(\d+(?:\.\d+)?)", re.IGNORECASE)
 # A larger f-number was multiplied by 100.
 _LARGEST_F_NUMBER = 64
-# Times of subtitles are rounded to milliseconds, times of frames are not; seconds.
+# Times of subtitles are rounded: those up to this much after a frame's count for it, seconds.
 _ROUNDED = 0.004
 
 
 class Shot(NamedTuple):
-    """The settings from a time on, in seconds after the start of the video."""
+    """Settings that hold from `time` on, seconds after the start of the video."""
 
     time: float
     settings: ExifSettings

@@ -1,4 +1,4 @@
-"""Known exposures from a CSV file or EXIF, and the view that a name in a file means."""
+"""Known exposures from a CSV file or EXIF, and the views that names in a file mean."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def read_known_exposures(
     """Return natural logarithms of known exposures of views, and NaN for unknown ones.
 
     The source is `exif` (EXIF, or what the data set states), or a CSV file with a column `image` or
-    `file` (name of the view, or any end of it) and one of `ev`, `rel_exposure_ev` (stops),
+    `file` (the view's name, or any end of its path) and one of `ev`, `rel_exposure_ev` (stops),
     `exposure` (linear, > 0) or `exposure_time_s` (seconds). Names in the file may mean any
     view in `among` (all views of the scene; by default `views`).
     Raises UserError: the source cannot be used, names none of the views, or a name is ambiguous.
@@ -45,7 +45,7 @@ def read_known_exposures(
 
 
 def _by_view(table: dict[str, float], views: Sequence[View], source: str) -> dict[str, float]:
-    """Return the log exposures of views by their whole names."""
+    """Return the values in a table of any names by the full names of their views."""
     row_of, out = row_finder(views, source), dict[str, float]()
     for name, value in table.items():
         row = row_of(name)
@@ -56,7 +56,7 @@ def _by_view(table: dict[str, float], views: Sequence[View], source: str) -> dic
 
 
 def plain_name(name: str) -> str:
-    """Return a name with forward slashes and without `.` parts, the same on every system."""
+    """Return a name with forward slashes and without parts `.`, equal on every system."""
     return PurePosixPath(name.replace("\\", "/")).as_posix()
 
 
@@ -68,8 +68,8 @@ def row_finder(views: Sequence[View], source: object) -> Callable[[str], int | N
     """
     rows_of: dict[str, set[int]] = defaultdict(set)
     # The path of a converted photograph differs from its name.
-    both = [(row, p) for row, v in enumerate(views) for p in (v.image_path, PurePosixPath(v.name))]
-    for row, path in both:
+    paths = [(row, p) for row, v in enumerate(views) for p in (v.image_path, PurePosixPath(v.name))]
+    for row, path in paths:
         parts = path.as_posix().lstrip("/").split("/")
         for tail in ("/".join(parts[start:]) for start in range(len(parts))):
             rows_of[tail].add(row)
@@ -78,12 +78,12 @@ def row_finder(views: Sequence[View], source: object) -> Callable[[str], int | N
     def find(name: str) -> int | None:
         normal = plain_name(name)
         rows = rows_of.get(normal.lstrip("/"), set())
-        whole = {row: views[row].name for row in rows}
-        exact = {row for row, n in whole.items() if normal in (n, n.removesuffix(Path(n).suffix))}
+        names = {row: views[row].name for row in rows}
+        exact = {row for row, n in names.items() if normal in (n, n.removesuffix(Path(n).suffix))}
         rows = exact if len(exact) == 1 else rows
         if len(rows) > 1:
-            names = " and ".join(views[row].name for row in sorted(rows)[:2])
-            raise broken(f"{source}:", f"{name} may be {names}", "write more of its path")
+            both = " and ".join(views[row].name for row in sorted(rows)[:2])
+            raise broken(f"{source}:", f"{name} may be {both}", "write more of its path")
         return next(iter(rows), None)
 
     return find
@@ -96,7 +96,7 @@ def check_source(source: str | None) -> None:
 
 
 def stated_ev(source: str | None, views: Sequence[View]) -> Float[np.ndarray, " v"]:
-    """Return exposures in stops up to a constant, or NaN, from a source or, if None, from EXIF."""
+    """Return exposures in stops up to a constant, or NaN; the source None stands for EXIF."""
     if source is None:
         return _exif_ev(views)
     return read_known_exposures(source, views) / LN2

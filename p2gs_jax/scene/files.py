@@ -38,16 +38,16 @@ MASK_FOLDERS = ("masks", "mask", "dynamic_masks", "dynamic_mask")
 # Folders of pictures that are not photographs.
 OTHER_FOLDERS = {*MASK_FOLDERS, "depth", "depths", "normal", "normals"}
 _MASK_NAME = re.compile(r"^(dynamic_)?masks?[._-](?=.)|(?<=.)[._-](dynamic_)?masks?$")
-_TWICE = re.compile(r"\.(jpe?g|png)\.png$", re.IGNORECASE)
+_TWO_SUFFIXES = re.compile(r"\.(jpe?g|png)\.png$", re.IGNORECASE)
 # The farthest principal point from the middle of a photograph, as a fraction of its sides.
 MOST_OFF = 0.25
-# Finite numbers from this size on overflow in float32 arithmetic.
+# Numbers from this size on count as infinite: float32 arithmetic may overflow.
 HUGE = 1e30
 _MOVED = "move it there, or name the folder of all photographs with --images"
 # Pillow refuses larger pictures as an attack.
 MOST_PIXELS = 2 * (Image.MAX_IMAGE_PIXELS or 2**26)
 _MARKER = "finished"
-# Bytes at the begin of a photograph that hold its XMP.
+# The first bytes of a photograph, among which its XMP is searched.
 _XMP_WITHIN = 2**18
 # Time between two progress messages, seconds.
 EVERY_S = 10.0
@@ -76,8 +76,8 @@ def list_images(folder: Path, *, recursive: bool = True) -> list[Path]:
 
 
 def named_as_mask(name: str) -> bool:
-    """Return whether a file may be a mask by its name, `a.jpg.png` included."""
-    return _MASK_NAME.search(_bare(name)) is not None or _TWICE.search(name) is not None
+    """Return whether the name of a file may be that of a mask; `a.jpg.png` may."""
+    return _MASK_NAME.search(_bare(name)) is not None or _TWO_SUFFIXES.search(name) is not None
 
 
 def _always_mask(name: str) -> bool:
@@ -117,8 +117,8 @@ def read_json(path: Path, fix: str) -> Any:
 def find_names(names: Iterable[str], folder: Path) -> dict[str, str]:
     """Return the file below a folder for each name; names without such a file are left out.
 
-    A file may differ from the name in case, Unicode form or suffix, or lie in the folder itself, if
-    it is the only such file and no other name fits it.
+    The file may differ in case, Unicode form or suffix, or lie in another subfolder, if it is the
+    only such file and no other name fits it.
     """
     found = {name: name for name in names if (folder / name).is_file()}
     left = [name for name in dict.fromkeys(names) if name not in found]
@@ -141,7 +141,7 @@ def alike_names(names: Iterable[str], files: Collection[str]) -> dict[str, str]:
         wanted = Counter(map(alike, left))
         for name in left:
             like = there.get(alike(name), [])
-            # Blender's scenes leave the suffix out.
+            # A name without suffix (Blender's scenes) may fit several files: PNG first.
             alone = len(like) == 1 or (like and _stem(name) == _folded(name))
             if alone and wanted[alike(name)] == 1:
                 found[name] = like[0]
@@ -150,7 +150,7 @@ def alike_names(names: Iterable[str], files: Collection[str]) -> dict[str, str]:
 
 
 def nearly_named(files: Mapping[str, str], source: str) -> list[str]:
-    """Return a note about names whose file has a slightly different name, or no note."""
+    """Return a note about names whose files have slightly different names, or no note."""
     other = [f"{file} for {n}" for n, file in files.items() if PurePath(n).suffix and file != n]
     note = f"{len(other)} images named by {source} have nearly these names: {first_few(other)}"
     return [note] if other else []
@@ -177,7 +177,7 @@ def require_inside(name: PurePath, folder: Path, source: Path, fix: str = _MOVED
 
 
 def require_plain(name: str, source: Path) -> None:
-    """Raise UserError if the name of a camera in the file `source` is a path."""
+    """Raise UserError if a camera's name in the file `source` is not a valid folder name."""
     if name in ("", ".", "..") or any(c in name for c in "/\\\0"):
         why = f"names a camera {name!r}, which is not a valid folder name"
         raise broken(source, why, "get its tables again, or rename the camera in all of them")
@@ -226,9 +226,9 @@ def _size_in_header(path: Path) -> tuple[int, int]:
 
 
 def decode_grey(data: bytes, shrink: int) -> UInt8[np.ndarray, "h w"] | None:
-    """Return the photograph in the bytes of a file in grey as stored, or None if it is broken.
+    """Return the photograph in the bytes of a file, grey and not rotated; None: it is broken.
 
-    It is shrunk by up to the factor `shrink` if that saves time, as it does for JPEG.
+    It is shrunk by 2 or 4, but at most by `shrink`: JPEG decodes faster then.
     """
     flags = {2: cv2.IMREAD_REDUCED_GRAYSCALE_2, 4: cv2.IMREAD_REDUCED_GRAYSCALE_4}
     flag = flags.get(2 ** min(int(np.log2(max(shrink, 1))), 2), cv2.IMREAD_GRAYSCALE)
@@ -238,7 +238,7 @@ def decode_grey(data: bytes, shrink: int) -> UInt8[np.ndarray, "h w"] | None:
 def is_panorama(path: Path) -> bool:
     """Return whether a photograph of the ratio 2:1 shows a whole sphere (equirectangular).
 
-    Its XMP states it, or its first and last column are neighbours and its poles are single points.
+    Its XMP states this, or its first and last columns are alike and its outer rows are uniform.
     """
     width, height = image_size(path)
     if width != 2 * height:
@@ -265,8 +265,8 @@ def check_missing(
 ) -> list[str]:
     """Return notes about missing images of a model that names `total` images.
 
-    `folder` is where they were searched. Raises UserError: images are missing and `allow_missing`
-    is not set, or no image is left.
+    They were searched in `folder`. Raises UserError: images are missing and `allow_missing` is not
+    set, or no image is left.
     """
     if not missing:
         return []
@@ -290,7 +290,7 @@ def at_file_size(
 ) -> tuple[Float32[np.ndarray, "3 3"], int, int]:
     """Return K, width and height of an image file, given the model's K and size (pixels).
 
-    Raises UserError: the file is not an image, or has another shape than `source` states.
+    Raises UserError: the file is not an image, or has another aspect ratio than `source` states.
     """
     w, h = image_size(path)
     if not same_shape((w, h), size):
@@ -301,7 +301,7 @@ def at_file_size(
 
 
 def same_shape(a: tuple[int, int], b: tuple[int, int]) -> bool:
-    """Return whether two sizes have one aspect ratio; each side may be rounded by a pixel."""
+    """Return whether two sizes have one aspect ratio; sides of `a` may be rounded by a pixel."""
     sides = np.array(a) / b, 1 / np.array(b)
     return bool((sides[0] - sides[1]).max() <= (sides[0] + sides[1]).min())
 
@@ -347,7 +347,7 @@ def file_fingerprints(paths: Sequence[Path]) -> list[tuple[str, int, int]]:
 def stage_progress(report: Report, stage: str, total: int, unit: str) -> Callable[[int], None]:
     """Begin a stage, such as "matching" 100 "image pairs"; return a function that reports progress.
 
-    It takes the number done. The first message comes at once, then one every `EVERY_S` seconds.
+    Its argument is the number done. The first message comes at once, then one every `EVERY_S` s.
     """
     begin = last = time.monotonic()
     if total:

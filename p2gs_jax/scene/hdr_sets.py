@@ -103,7 +103,7 @@ def with_all_exposures(
 
     A photograph that the model lacks gets the pose and the observations of the first one of its
     pose. Names that begin with `train` or `test` decide the split. Raises UserError: as
-    `with_times` does, or photographs are missing, or have another size than those of their pose.
+    `with_times` does, or photographs are missing or have another aspect ratio than their pose's.
     """
     folder = image_folder_of(scene.views[0])
     present = {view.name for view in scene.views}
@@ -139,7 +139,7 @@ def with_all_exposures(
 
 
 def _copied(tracks: Tracks | None, sources: Sequence[int]) -> Tracks | None:
-    """Return tracks of new views, each with the observations of its row in `sources`."""
+    """Return the tracks of new views; `sources` are the old views whose observations they get."""
     if tracks is None:
         return None
     picked = [np.flatnonzero(tracks.view_indices == row) for row in sources]
@@ -149,7 +149,7 @@ def _copied(tracks: Tracks | None, sources: Sequence[int]) -> Tracks | None:
 
 
 def with_raw_settings(root: Path, scene: Scene) -> Scene:
-    """Return a scene with the exposures that exiftool's files in `raw/` state for all its views.
+    """Return a scene with the exposures in exiftool's files in `raw/`, if all views have them.
 
     Raises UserError: such a file is broken.
     """
@@ -172,7 +172,7 @@ def with_raw_settings(root: Path, scene: Scene) -> Scene:
 
 
 def _raw_ev(path: Path) -> float | None:
-    """Return log2(time ISO / N^2) of a file of exiftool, or None if it states no time."""
+    """Return log2(time * ISO / f-number^2) of a file of exiftool; None: it states no time."""
     data: Any = files.read_json(path, _FIX)
     data = data[0] if isinstance(data, list) and data else data
     if not isinstance(data, dict):

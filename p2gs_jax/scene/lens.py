@@ -1,8 +1,8 @@
 """Lenses and intrinsics, shared by the readers and the image store.
 
-Pixel centres are at +0.5. Projection and OpenCV's distortion do not depend on the position of
-centres, so points need no shift. Only OpenCV's *rasters* (remap) do, and only `undistortion_maps`
-converts them. COLMAP computes the lenses that only COLMAP has.
+Pixel centres are at +0.5. Projection and OpenCV's distortion do not depend on their position, so
+points need no shift. Only OpenCV's rasters (remap) depend on it, and `undistortion_maps` converts
+them. Lenses that only COLMAP has are computed by COLMAP.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ COLMAP_LENSES: tuple[ColmapLens, ...] = get_args(ColmapLens)
 # Lenses are inverted by a table of `_TABLE` angles and `_POLISHING` Newton steps. OpenCV's
 # iteration does not converge for strong rational lenses.
 _TABLE, _POLISHING = 4096, 3
-_MOST_ROUNDS, _CONVERGED = 20, 1e-10
-# The largest distance, pixels, of a point from where COLMAP projects the ray that it finds.
+_MOST_ROUNDS, _CONVERGED = 20, 1e-10  # of tangential terms; the last change, focal lengths
+# A ray that COLMAP projects farther than this from the point is wrong, pixels.
 _MISSED = 0.01
-# The largest distance from the principal point, focal lengths; smaller terms there count as 0.
+# The largest distance from the principal point, focal lengths; terms below this there count as 0.
 _FARTHEST, _NEGLIGIBLE = 100.0, 1e-9
 
 
@@ -41,7 +41,7 @@ def scale_intrinsics(K: Float[np.ndarray, "3 3"], sx: float, sy: float) -> Float
 def make_distortion(
     coefficients: tuple[float, ...], model: LensModel = "radial"
 ) -> Distortion | None:
-    """Return the distortion with `Distortion`'s coefficients, or None for a pinhole."""
+    """Return the distortion with coefficients as in `Distortion`, or None for a pinhole."""
     # A fisheye without coefficients still maps angles, not tangents, to distances.
     if model == "radial" and not any(coefficients):
         return None
@@ -51,9 +51,9 @@ def make_distortion(
 def undistort_points(
     xy: Float[np.ndarray, "n 2"], K: Float[np.ndarray, "3 3"], distortion: Distortion | None
 ) -> Float32[np.ndarray, "n 2"]:
-    """Return pixel positions of the photograph in its undistorted version with the same K.
+    """Return the undistorted positions of a photograph's pixels, with the same K.
 
-    They are NaN if no pinhole ray belongs to them: outside the range in which the lens model is
+    They are NaN for pixels without a pinhole ray: outside the range in which the lens model is
     monotonic, and at the sides of a fisheye.
     """
     if distortion is None or len(xy) == 0:
@@ -150,7 +150,7 @@ def _profile(distortion: Distortion) -> tuple[Polynomial, Polynomial, float]:
         c[: len(distortion.coefficients)] = distortion.coefficients
         n = x * Polynomial([1.0, 0.0, c[0], 0.0, c[1], 0.0, c[4]])
         d = Polynomial([1.0, 0.0, c[5], 0.0, c[6], 0.0, c[7]])
-    # The numerator has the sign of the slope; the radius is infinite at a root of d.
+    # The derivative has the sign of its numerator; the radius is infinite at a root of d.
     return n, d, min(_first_root(n.deriv() * d - n * d.deriv()), _first_root(d))
 
 
@@ -183,8 +183,8 @@ def _without_radial(
 ) -> Float[np.ndarray, "n 2"]:
     """Return normalised positions without the radial distortion of a lens.
 
-    They are exact, and NaN without a ray. If `rough`, they are interpolated from the table, and
-    positions without a ray get the last ray.
+    They are exact, and NaN if there is no ray. If `rough`, they are interpolated from a table, and
+    the last ray stands for a missing one.
     """
     n, d, limit = _profile(distortion)
     fisheye = distortion.model == "fisheye"

@@ -1,4 +1,4 @@
-"""Masks of photographs, which pixels count: files beside the photographs, and alpha channels."""
+"""Masks, which state the pixels that count: files beside photographs, and alpha channels."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from p2gs_jax.scene.files import IMAGE_SUFFIXES, MASK_FOLDERS, name_without_mask
 from p2gs_jax.types import Scene, View
 
 RANDOM = "random"
-NAMED = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
+NAMED_COLORS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 # If training draws a random background, scores use this one, as 3DGS does.
-JUDGED = "white"
-# These never have an alpha channel.
+SCORE_BACKGROUND = "white"
+# Suffixes of files that never have an alpha channel.
 _OPAQUE = frozenset({".jpg", ".jpeg", ".jfif", ".pgm", ".ppm"})
 
 
@@ -63,17 +63,17 @@ def find_masks(views: Sequence[View], root: Path) -> tuple[list[Path | None], di
                 found[-1] = _exact(folder, name) or masks.get(name_without_mask(name))
                 if found[-1] is not None:
                     break
-    return found, {f: len(masks) for f, masks in folders.items() if masks and _for_masks(f)}
+    return found, {f: len(masks) for f, masks in folders.items() if masks and _holds_masks(f)}
 
 
-def _for_masks(folder: Path) -> bool:
+def _holds_masks(folder: Path) -> bool:
     """Return whether a folder has the name of a folder of masks, in any case."""
     return folder.name.lower() in MASK_FOLDERS
 
 
 def _mask_folders(place: Path) -> list[Path]:
-    """Return the folders of masks in a folder, the commonest name first."""
-    found = [p for p in place.iterdir() if _for_masks(p) and p.is_dir()] if place.is_dir() else []
+    """Return the folders of masks in a folder, in the order of `MASK_FOLDERS`."""
+    found = [p for p in place.iterdir() if _holds_masks(p) and p.is_dir()] if place.is_dir() else []
     return sorted(found, key=lambda p: (MASK_FOLDERS.index(p.name.lower()), p.name))
 
 
@@ -94,7 +94,7 @@ def _places(
 
 def _masks_in(folder: Path) -> dict[str, Path]:
     """Return the masks in a folder by `name_without_mask`; other files are left out."""
-    all_masks = _for_masks(folder)
+    all_masks = _holds_masks(folder)
     files = folder.glob("**/*" if all_masks else "*")
     files = (p for p in files if p.suffix.lower() in IMAGE_SUFFIXES and p.name[0] != ".")
     files = (p for p in files if all_masks or named_as_mask(p.name))
@@ -102,25 +102,25 @@ def _masks_in(folder: Path) -> dict[str, Path]:
 
 
 def _exact(folder: Path, name: str) -> Path | None:
-    """Return the mask in a folder of masks that has the name of its photograph, or None."""
+    """Return the mask in a folder of masks with exactly its photograph's name, or None."""
     path = folder / name
     names = (path, path.with_suffix(".png"), path.with_name(path.name + ".png"))
-    return next((p for p in names if _for_masks(folder) and p.is_file()), None)
+    return next((p for p in names if _holds_masks(folder) and p.is_file()), None)
 
 
 def image_folder_of(view: View) -> Path:
-    """Return the folder that the name of a view is relative to."""
+    """Return the folder to which the name of a view is relative."""
     return view.image_path.parents[len(Path(view.name).parts) - 1]
 
 
 def background_color(cfg: DataConfig) -> Float32[np.ndarray, " 3"]:
-    """Return the background, display values, of photographs with alpha in pictures and scores.
+    """Return the background of photographs with alpha in pictures and scores, display values.
 
     Raises UserError: the option is not a colour.
     """
-    text = JUDGED if cfg.background == RANDOM else cfg.background
-    if text in NAMED:
-        return np.array(NAMED[text], np.float32)
+    text = SCORE_BACKGROUND if cfg.background == RANDOM else cfg.background
+    if text in NAMED_COLORS:
+        return np.array(NAMED_COLORS[text], np.float32)
     try:
         color = np.array([float(word) for word in text.split(",")], np.float32)
     except ValueError:
@@ -132,7 +132,7 @@ def background_color(cfg: DataConfig) -> Float32[np.ndarray, " 3"]:
 
 
 def has_alpha(path: Path) -> bool:
-    """Return whether an image file has an alpha channel; a broken file has none."""
+    """Return whether an image file has an alpha channel; False for a broken file."""
     if path.suffix.lower() in _OPAQUE:
         return False
     try:
@@ -145,7 +145,7 @@ def has_alpha(path: Path) -> bool:
 def _opacity(paths: Sequence[Path]) -> tuple[int, int]:
     """Return the least and the most alpha of photographs, 0 to 255.
 
-    Reading stops once transparent and other pixels are found; unreadable photographs count as 255.
+    Reading stops once transparent and other pixels are found. Unreadable photographs are skipped.
     """
     least, most = 255, 0
     for path in paths:
@@ -158,7 +158,7 @@ def _opacity(paths: Sequence[Path]) -> tuple[int, int]:
 
 
 def with_alpha(scene: Scene, cfg: DataConfig) -> Scene:
-    """Return a scene whose views state the use of their alpha channel; opaque channels have none.
+    """Return a scene whose views state the use of their alpha channels, unless all are opaque.
 
     Raises UserError: the option is not a colour, or all photographs are transparent everywhere.
     """
@@ -170,7 +170,7 @@ def with_alpha(scene: Scene, cfg: DataConfig) -> Scene:
         why = "is transparent everywhere, as are all photographs of the scene"
         fix = "export them again without an alpha channel, or add --data.alpha ignore"
         raise broken(channels[0], why, fix)
-    # Some programs write an alpha channel that is opaque everywhere.
+    # Some programs write alpha channels that are opaque everywhere.
     if least == 255:
         if cfg.background == DataConfig.background:
             return scene

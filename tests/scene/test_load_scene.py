@@ -358,8 +358,8 @@ def test_alpha_says_something_where_it_varies(tmp_path):
 
 def test_photographs_are_decoded_together_as_far_as_memory_goes():
     room = Room(100)
-    with room.taking(60), room.taking(40):
-        assert room._taken == 100
-    with room.taking(1000):  # one is always let in
-        assert room._taken == 1000
-    assert room._taken == 0
+    with room.reserving(60), room.reserving(40):
+        assert room._reserved == 100
+    with room.reserving(1000):  # one is always let in
+        assert room._reserved == 1000
+    assert room._reserved == 0

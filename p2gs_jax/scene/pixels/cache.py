@@ -1,4 +1,4 @@
-"""Decoded photographs in memory-mapped files, whose pages the system reads and drops.
+"""Decoded photographs in memory-mapped files: the system reads and drops their pages.
 
 A folder for each size holds one file (a NumPy record) for each photograph. The name of the file is
 a hash of everything that its pixels depend on. Threads write files before they are needed.
@@ -39,14 +39,14 @@ class Key(NamedTuple):
 class PixelFiles:
     """Files of decoded photographs in `folder`. All methods may be called from any thread.
 
-    Callers hold the lock of a view while they read or decode it, so that none is decoded twice.
+    Callers hold a view's lock while they read or decode it, so that nothing is decoded twice.
     """
 
     def __init__(self, folder: Path, views: Sequence[View]):
         """Open a folder, and remove files that no photograph can use."""
         self.folder = folder
-        bonnets: dict[int, str] = {}
-        self._names = tuple(_digest(view, bonnets) for view in views)
+        ego_hashes: dict[int, str] = {}
+        self._names = tuple(_digest(view, ego_hashes) for view in views)
         self.locks = tuple(threading.Lock() for _ in views)
         known = {f"{name}.px" for name in self._names}
         # Unfinished files of a killed run have other names and are removed as well.
@@ -112,21 +112,21 @@ def file_bytes(view: View, size: tuple[int, int]) -> int:
     return size[0] * size[1] * (samples * (2 if resamples(view, size) else 1) + 1)
 
 
-def _digest(view: View, bonnets: dict[int, str]) -> str:
+def _digest(view: View, ego_hashes: dict[int, str]) -> str:
     """Return a hash of everything, except the size, that the pixels of a view depend on.
 
-    `bonnets` caches the hashes of ego masks, which many views share, by identity.
+    `ego_hashes` caches the hashes of ego masks, which many views share, by identity.
     """
-    bonnet = ""
+    ego_hash = ""
     if view.ego_mask is not None:
-        mask = id(view.ego_mask)
-        if mask not in bonnets:
+        identity = id(view.ego_mask)
+        if identity not in ego_hashes:
             packed = np.packbits(view.ego_mask).tobytes()
-            bonnets[mask] = f"{view.ego_mask.shape} {hashlib.sha256(packed).hexdigest()}"
-        bonnet = bonnets[mask]
+            ego_hashes[identity] = f"{view.ego_mask.shape} {hashlib.sha256(packed).hexdigest()}"
+        ego_hash = ego_hashes[identity]
     lens = None if view.distortion is None else (view.distortion, view.K.tolist())
     files = [path and _fingerprint(path) for path in (view.image_path, view.mask_path)]
-    parts = (_VERSION, *files, (view.width, view.height, view.alpha), lens, bonnet)
+    parts = (_VERSION, *files, (view.width, view.height, view.alpha), lens, ego_hash)
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
 
 
@@ -136,22 +136,22 @@ def _fingerprint(path: Path) -> tuple[str, int, int]:
 
 
 class DecodingAhead:
-    """Threads that decode photographs without a file; they end soon after the main thread.
+    """Threads that decode photographs into missing files; they end soon after the main thread.
 
     They skip photographs that cannot be decoded: the caller that needs one gets the error.
     """
 
     def __init__(self, views: Sequence[View], files: PixelFiles, keys: Sequence[Sequence[Key]]):
-        """Start the threads; `keys` are the sizes that will be needed, for every view."""
+        """Start the threads; `keys` holds the sizes that each view will need."""
         self._jobs = list(zip(reversed(views), reversed(keys), strict=True))
         count = min(max(1, available_cores() // 2), MOST_THREADS)
-        given = (self._jobs, files)
-        self._threads = [threading.Thread(target=_decode, args=given) for _ in range(count)]
+        arguments = (self._jobs, files)
+        self._threads = [threading.Thread(target=_decode, args=arguments) for _ in range(count)]
         for thread in self._threads:
             thread.start()
 
     def stop(self) -> None:
-        """End the threads; photographs that are not begun are skipped."""
+        """End the threads; photographs that no thread has begun are skipped."""
         self._jobs.clear()
         for thread in self._threads:
             thread.join()

@@ -21,11 +21,11 @@ from p2gs_jax.scene.files import image_size, undecodable
 from p2gs_jax.scene.lens import undistortion_maps
 from p2gs_jax.types import View
 
-_FULL = 0.999  # a pixel is valid only if all of its sources are valid
-_ALPHA_VALID = 0.5
-_ROWS = 256  # of a photograph that are converted at once
+_FULL = 0.999  # a resampled pixel is valid only if all pixels that it mixes are valid
+_ALPHA_VALID = 0.5  # the least alpha of valid pixels
+_ROWS = 256  # rows of a photograph that are converted at once
 # Memory for decoding, undistorting and resizing, bytes for each pixel of a photograph; and the
-# share of the free memory that all threads together may use.
+# share of the free memory that all threads together may use for it.
 BYTES_PER_PIXEL, SHARE = 40, 0.5
 # The largest relative difference between the aspect ratios of a mask and its photograph.
 _ASPECT_TOLERANCE = 0.01
@@ -35,8 +35,8 @@ _ASPECT_TOLERANCE = 0.01
 class Decoded:
     """A cached photograph: with its original bits, or with 16 bits if it was resampled.
 
-    The largest integer of `pixels` stands for 1.0; `valid` marks pixels that count. A photograph
-    that is shown over a background has `alpha`, which premultiplies its pixels.
+    The largest integer of `pixels` stands for 1.0; `valid` marks pixels that count. Only
+    photographs that are shown over a background have `alpha`; their pixels are premultiplied.
     """
 
     pixels: UInt[np.ndarray, "h w 3"]
@@ -55,23 +55,23 @@ class Room:
 
     def __init__(self, most: int | None = None):
         """Set the limit to `most`, or to a share of the memory that is free at the first use."""
-        self._most, self._taken = most, 0
+        self._most, self._reserved = most, 0
         self._changed = threading.Condition()
 
     @contextlib.contextmanager
-    def taking(self, count: int) -> Iterator[None]:
+    def reserving(self, count: int) -> Iterator[None]:
         """Wait until `count` bytes are free, and reserve them."""
         with self._changed:
             if self._most is None:
                 self._most = int(SHARE * (left_to_process() or sys.maxsize))
             most = self._most
-            self._changed.wait_for(lambda: not self._taken or self._taken + count <= most)
-            self._taken += count
+            self._changed.wait_for(lambda: not self._reserved or self._reserved + count <= most)
+            self._reserved += count
         try:
             yield
         finally:
             with self._changed:
-                self._taken -= count
+                self._reserved -= count
                 self._changed.notify_all()
 
 
@@ -79,7 +79,7 @@ _ROOM = Room()
 
 
 def floats(pixels: UInt[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:
-    """Return stored values in [0, 1]."""
+    """Return stored integers as values in [0, 1]."""
     out = pixels.astype(np.float32)
     out /= np.float32(np.iinfo(pixels.dtype).max)  # in place: photographs are large
     return out
@@ -98,7 +98,7 @@ def decode(view: View, sizes: Sequence[tuple[int, int]]) -> list[Decoded]:
     states; or there is too little memory.
     """
     try:
-        with _ROOM.taking(BYTES_PER_PIXEL * view.width * view.height):
+        with _ROOM.reserving(BYTES_PER_PIXEL * view.width * view.height):
             return _decoded(view, sizes)
     except (MemoryError, cv2.error) as error:
         why = f"{view.width}x{view.height} pixels need more memory than is free ({error})"
@@ -123,7 +123,7 @@ def stored(
     if view.mask_path is not None:
         valid &= _decode_mask(view)
     if view.ego_mask is not None:
-        # Every pixel with a masked source is masked: the outline is only approximate.
+        # A pixel that mixes any masked one is masked: the outline is only approximate.
         covered = view.ego_mask.astype(np.float32)
         valid &= cv2.resize(covered, (view.width, view.height)) == 0
     return pixels, valid, opacity
@@ -136,7 +136,7 @@ def _decoded(view: View, sizes: Sequence[tuple[int, int]]) -> list[Decoded]:
     as_stored = view.distortion is None and matte is None
     if as_stored and all(size == full for size in sizes):
         return [_read_only(pixels, valid) for _ in sizes]
-    ldr, straight = floats(pixels), valid
+    ldr, usable = floats(pixels), valid
     if matte is not None:
         # Transparent pixels must not colour their neighbours: all channels are resampled together.
         opaque = floats(matte)[..., None]
@@ -144,9 +144,9 @@ def _decoded(view: View, sizes: Sequence[tuple[int, int]]) -> list[Decoded]:
     if view.distortion is not None:
         maps = undistortion_maps(view.K, view.distortion, view.width, view.height)
         ldr = cv2.remap(ldr, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        straight = cv2.remap(valid.astype(np.float32), *maps, cv2.INTER_LINEAR) >= _FULL
+        usable = cv2.remap(valid.astype(np.float32), *maps, cv2.INTER_LINEAR) >= _FULL
     return [
-        _read_only(pixels, valid) if as_stored and size == full else _at_size(ldr, straight, size)
+        _read_only(pixels, valid) if as_stored and size == full else _at_size(ldr, usable, size)
         for size in sizes
     ]
 
@@ -197,7 +197,7 @@ def _decode(path: Path) -> tuple[np.ndarray, UInt[np.ndarray, "h w"] | None]:
 
 
 def _decode_mask(view: View) -> Bool[np.ndarray, "h w"]:
-    """Return the non-zero pixels of the mask, at the view's size."""
+    """Return which pixels of a view's mask are not 0, at the view's size."""
     assert view.mask_path is not None
     w, h = image_size(view.mask_path)
     if abs(w / h / (view.width / view.height) - 1.0) > _ASPECT_TOLERANCE:
@@ -208,7 +208,7 @@ def _decode_mask(view: View) -> Bool[np.ndarray, "h w"]:
     colours = raw if raw.ndim == 2 else raw[..., : 3 if raw.shape[2] >= 3 else 1].max(axis=2)
     mask = colours > 0
     if raw.ndim == 3 and raw.shape[2] in (2, 4):
-        # Transparent pixels are left out. Some masks are black, and alpha is the mask.
+        # Transparent pixels do not count. If a mask is black everywhere, its alpha is the mask.
         opaque = raw[..., -1] > 0
         mask = mask & opaque if mask.any() or opaque.all() else opaque
     if (w, h) == (view.width, view.height):

@@ -1,4 +1,4 @@
-"""Photographs as arrays, and the cameras that took them, at any size."""
+"""Photographs as arrays, and their cameras, at any size."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from p2gs_jax.scene.pixels.cache import DecodingAhead, Key, PixelFiles, file_byt
 from p2gs_jax.scene.pixels.decode import Decoded, decode, floats
 from p2gs_jax.types import Camera, Placement, TrackedObject, View
 
-# Pixels of all levels of a schedule together, divided by the pixels of the finest level.
+# Pixels of all levels of a coarse-to-fine schedule, divided by the pixels of the finest one.
 _LEVELS = 4 / 3
 # Pixels below this opacity show the background.
 OPAQUE = 0.999
-# The number of threads that decode ahead of a fit, and the number of steps they are ahead at most.
+# The number of threads that decode ahead of a fit, and the largest number of waiting photographs.
 DECODERS = max(available_cores() - 1, 1)
 MOST_PENDING = 4 * DECODERS
 # The photographs of stores that are not closed.
@@ -116,9 +116,9 @@ class ImageStore:
     ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
         """Return a photograph, display-encoded in [0, 1] and over the backdrop, and its mask.
 
-        The mask is 1 for pixels that count. It is 0 for pixels that are masked, transparent, in the
-        box of a moving object, or outside the photograph after undistortion. Raises UserError: the
-        file or its mask is missing, broken or has another size than the model states.
+        The mask is 1 for pixels that count. It is 0 for pixels that are masked (also by alpha), in
+        the box of a moving object, or outside the photograph after undistortion. Raises UserError:
+        the file or its mask is missing, broken or has another size than the model states.
         """
         return self._shown(index, self._decoded(index, shrink))
 
@@ -159,7 +159,7 @@ class ImageStore:
         return valid & ~painted(self._outlines[index], view, *valid.shape[::-1])
 
     def alpha(self, index: int, shrink: float | int = 1.0) -> UInt[np.ndarray, "h w"] | None:
-        """Return the cached opacity, or None if the scene has no background."""
+        """Return the cached opacity of a photograph; None: the store has no backdrop."""
         if self.backdrop is None:
             return None
         entry = self._decoded(index, shrink)
@@ -193,7 +193,7 @@ class ImageStore:
         self._photographs.prefetch(self._key(index, shrink))
 
     def expect(self, shrinks: Sequence[float | int]) -> None:
-        """Start decoding photographs into files, each at all these sizes."""
+        """Start decoding photographs into files, each at all of these factors."""
         rows = range(len(self.views))
         self._photographs.expect([[self._key(row, s) for s in shrinks] for row in rows])
 
@@ -225,7 +225,7 @@ def camera_of(store: ImageStore, index: int, shrink: float | int = 1.0) -> Camer
 
 @contextlib.contextmanager
 def decoded_into(folder: Path) -> Iterator[Path]:
-    """Provide a folder for decoded photographs; at the end its stores close and it is removed."""
+    """Provide a folder for decoded photographs; at its end, stores close and it is removed."""
     try:
         yield folder
     finally:
