@@ -18,23 +18,24 @@ Rotation3 = Float64[np.ndarray, "3 3"]
 Vector3 = Float[np.ndarray, " 3"]
 Pose = Float64[np.ndarray, "4 4"]
 Poses = Float64[np.ndarray, "n 4 4"]
-# Singular values of the rotations in driving data sets differ from 1 by rounding only.
+# Singular values of rotations in driving data sets may differ from 1 by this much (rounding).
 ORTHOGONAL = 1e-3
 # Scenes farther from the origin than this, in multiples of their extent, are moved to it.
 FAR = 100.0
 # Poses are extrapolated beyond the ends of their track by at most this time, seconds.
 LONGEST_BEYOND_S = 0.15
-# The normal of the cameras' right-hand axes counts as up from this ratio of singular values on.
-PLANE_RATIO = 0.1
+# The cameras' right-hand axes span a plane if their RMS in its second direction is this large.
+SPANNING_RMS = 0.1
 # A direction over a shorter distance is noise, metres.
 SHORTEST_WAY = 0.3
 # The distance over which driving directions are measured, if the drive is that long, metres.
 HEADING_WAY = 2.0
-# The usual errors of tools in formats with OpenGL's camera-to-world matrices are in `_OTHERS`.
+# From OpenGL's camera axes to OpenCV's, and back.
 _TURN = np.diag([1.0, -1.0, -1.0, 1.0])
-# Poses are wrong if at most this share agrees with them, and at least the other with other axes.
+# Axes are wrong if at most the first share of the data agrees with them, and at least the second
+# share with axes of `_WRONG`: usual errors in formats with OpenGL's camera-to-world matrices.
 _CONTRADICTS, _AGREES = 0.2, 0.6
-_OTHERS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+_WRONG: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "the second and third column of every matrix negated (OpenCV's axes instead of OpenGL's)": (
         lambda viewmat: _TURN @ viewmat
     ),
@@ -53,7 +54,7 @@ _OTHERS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 def nearest_rotation(matrix: Rotation3, tolerance: float = 0.01) -> Rotation3 | None:
     """Return the rotation nearest to a finite matrix in least squares.
 
-    None: the matrix mirrors, or one of its singular values differs from 1 by more than `tolerance`.
+    None: it is a reflection, or one of its singular values differs from 1 by more than `tolerance`.
     """
     u, sizes, vt = np.linalg.svd(matrix)
     if np.abs(sizes - 1.0).max() > tolerance or np.linalg.det(matrix) < 0:
@@ -83,7 +84,7 @@ def from_quaternions(
 ) -> Poses:
     """Return the matrices of quaternions (w x y z) and positions.
 
-    Raises UserError: the length of a quaternion differs from 1 by 0.01, or a number is not finite.
+    Raises UserError: the length of a quaternion is not 1 to within 0.01, or a number is not finite.
     """
     wxyz = np.asarray(wxyz, np.float64)
     bad = ~(np.abs(np.linalg.norm(wxyz, axis=1) - 1) < 1e-2) | ~np.isfinite(positions).all(1)
@@ -162,7 +163,7 @@ def interpolated(
 
     Positions are linear in time, and rotations have a constant rate. Beyond an end the motion of
     the nearest two poses continues for `LONGEST_BEYOND_S`, and then stops. Times are in seconds,
-    and those of the track rise.
+    and the track's `times` rise.
     """
     times, at = np.asarray(times, np.float64), np.asarray(at, np.float64)
     begin, end = times[0] - LONGEST_BEYOND_S, times[-1] + LONGEST_BEYOND_S
@@ -181,7 +182,7 @@ def interpolated(
 
 
 def moment_of(view: View) -> int | str:
-    """Return the key that views of one moment share: the frame of a drive, or the file's stem."""
+    """Return the key that views of one moment share: the frame of a drive, or the name's stem."""
     return PurePosixPath(view.name).stem if view.frame is None else view.frame
 
 
@@ -195,7 +196,7 @@ def up_direction(viewmats: Float[np.ndarray, "n 4 4"]) -> Vector3:
     _, sizes, axes = np.linalg.svd(viewmats[:, 0, :3], full_matrices=True)
     sizes = np.append(sizes, np.zeros(3))[:3] / np.sqrt(len(viewmats))
     normal = axes[2] * np.sign(axes[2] @ mean)
-    if sizes[1] < PLANE_RATIO or sizes[2] > 0.5 * sizes[1] or not normal.any():
+    if sizes[1] < SPANNING_RMS or sizes[2] > 0.5 * sizes[1] or not normal.any():
         normal = mean
     return normal / max(np.linalg.norm(normal), 1e-12)
 
@@ -211,7 +212,7 @@ def up_of_drive(viewmats: Float[np.ndarray, "n 4 4"], cameras: Sequence[str]) ->
     for name in set(cameras):
         centers[names == name] -= centers[names == name].mean(0)
     _, sizes, axes = np.linalg.svd(centers, full_matrices=False)
-    # If the trajectory is not a line, only the cameras' axes are used.
+    # If the trajectory is not a line, the cameras' axes alone decide.
     if sizes[0] / np.sqrt(len(centers)) > SHORTEST_WAY / 4 and sizes[1] < sizes[0] / 3:
         up = up - axes[0] * (axes[0] @ up)
     return up / np.linalg.norm(up)
@@ -262,14 +263,14 @@ def require_axes(
 ) -> None:
     """Raise UserError if photographs contradict the poses and agree with them in other axes.
 
-    `agreeing` returns the share of matches between photographs, or of seed points, that agrees with
-    the poses of views; `source` is the file of the poses.
+    `agreeing` returns the share of the data (matches or seed points) that agrees with the poses of
+    views; `source` is the file of the poses.
     """
     stated = agreeing(views)
     if stated > _CONTRADICTS:
         return
     found = {}
-    for axes, change in _OTHERS.items():
+    for axes, change in _WRONG.items():
         changed = (replace(v, viewmat=change(v.viewmat.astype(np.float64))) for v in views)
         found[axes] = agreeing(list(changed))
     best = max(found, key=lambda axes: found[axes])

@@ -1,4 +1,4 @@
-"""Seed points: from a PLY that a scene names, or random if photographs do not match.
+"""Seed points from a PLY that a scene names, or at random if photographs do not match.
 
 3DGS starts NeRF's synthetic scenes with 100,000 points in a known cube. Here the cameras give the
 volume: points lie between the nearest and the farthest depth of a training view. A point is kept if
@@ -23,16 +23,16 @@ from p2gs_jax.scene.rigid import camera_centers
 from p2gs_jax.scene.visibility import in_frame
 from p2gs_jax.types import Scene, View
 
-COUNT = 100_000
+COUNT = 100_000  # random points
 # Random points replace fewer matched points than this.
 FEWEST = 50
-# Least number of views that see a kept point, relative to that of the most visible point.
+# Least number of views that see a kept point, relative to the number for the most visible point.
 COMMON = 0.5
 # Nearest and farthest depth if cameras have no common focus, in multiples of their extent.
 APART = (0.5, 10.0)
 # The largest number of views in which visibility is counted.
 MOST_VIEWS = 64
-_ROUNDS = 20
+_ROUNDS = 20  # of drawing points
 _COLORS = (
     ("red", "green", "blue"),
     ("diffuse_red", "diffuse_green", "diffuse_blue"),
@@ -47,7 +47,7 @@ _FIX = "write it again with the tool that made it"
 def read_points(path: Path) -> tuple[Float64[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"] | None]:
     """Return the positions and the display colours, if there are any, of the points in a PLY.
 
-    Colours are red, green, blue with 8 or 16 bits, floats up to 1, 255 or 65535, or those of
+    Colours are red, green, blue with 8 or 16 bits, floats up to 1, 255 or 65535, or coefficients of
     Gaussians (f_dc). Raises UserError: the file is absent, is not such a PLY, or holds points that
     are not finite.
     """
@@ -66,7 +66,7 @@ def read_points(path: Path) -> tuple[Float64[np.ndarray, "p 3"], UInt8[np.ndarra
 
 
 def _display_colors(vertex: np.ndarray, names: Sequence[str]) -> UInt8[np.ndarray, "p 3"]:
-    """Return the colours in three columns of a table; the largest value decides what white is."""
+    """Return the colours in three columns of a table; their largest value decides what is white."""
     values = np.stack([vertex[name] for name in names], 1)
     floats = values.dtype.kind == "f"
     values = np.nan_to_num(values.astype(np.float64))
@@ -96,7 +96,7 @@ def with_random_seeds(scene: Scene) -> Scene:
 
 
 def depth_range(views: Sequence[View]) -> tuple[float, float]:
-    """Return the nearest and farthest depth, scene units, of the volume at which views look."""
+    """Return the nearest and farthest depth of the volume at which views look, scene units."""
     viewmats = np.stack([view.viewmat for view in views]).astype(np.float64)
     forward = viewmats[:, 2, :3]
     centers = camera_centers(viewmats)
@@ -106,7 +106,7 @@ def depth_range(views: Sequence[View]) -> tuple[float, float]:
     ahead = np.einsum("vi,vi->v", focus - centers, forward)
     distance = float(np.median(ahead))
     tangent = max(np.hypot(v.width, v.height) / (2 * min(v.K[0, 0], v.K[1, 1])) for v in views)
-    radius = distance * min(float(tangent), 0.9)
+    radius = distance * min(float(tangent), 0.9)  # the nearest depth stays positive
     missed = np.linalg.norm(np.einsum("vij,vj->vi", across, focus - centers), axis=1)
     if (ahead > 0).all() and np.median(missed) < radius:
         return distance - radius, distance + radius
@@ -123,7 +123,7 @@ def common_points(
     """
     rng = generator(0, Stream.RANDOM_SEEDS)
     step = max(1, -(-len(views) // MOST_VIEWS))
-    judges = views[::step]
+    counting_views = views[::step]
     sizes = np.array([(v.width, v.height) for v in views], float)
     Ks = np.stack([v.K for v in views]).astype(np.float64)
     viewmats = np.stack([v.viewmat for v in views]).astype(np.float64)
@@ -140,7 +140,7 @@ def common_points(
         poses = viewmats[rows]
         points = np.einsum("nji,nj->ni", poses[:, :3, :3], local - poses[:, :3, 3])
         seen = np.zeros(len(points), int)
-        for view in judges:
+        for view in counting_views:
             seen += in_frame(*project_points(points, view), view.width, view.height)
         best = max(best, int(seen.max()))
         chosen = points[seen >= COMMON * best]

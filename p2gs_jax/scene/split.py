@@ -1,4 +1,4 @@
-"""Held-out views: those that the user or the data set lists, or else every n-th of each camera.
+"""Held-out views: listed by the user or the data set, or else every n-th view of each camera.
 
 All views of an exposure bracket are held out together.
 
@@ -59,12 +59,12 @@ def split_scene(scene: Scene, cfg: DataConfig) -> Scene:
 
 
 def assign_split(views: tuple[View, ...], test_every: int) -> tuple[View, ...]:
-    """Return the views with `split` set, in the order given.
+    """Return the views with `split` set, in their order.
 
     Views 0, n, 2n, ... of each camera, sorted by the numbers in names, are `test`, as in 3DGS. The
     views of an exposure bracket count as one. If views have frames, the frames 0, n, 2n, ... of the
-    scene are. No view is held out if n is 0, or if its camera would have no training view. Raises
-    UserError: n is negative, or 1.
+    scene are `test`. No view is held out if n is 0, or if its camera would have no training view.
+    Raises UserError: n is negative, or 1.
     """
     if test_every < 0 or test_every == 1:
         why = f"cannot hold out every n-th view with n = {test_every}"
@@ -94,7 +94,7 @@ def _with_test(views: Sequence[View], test: set[int]) -> tuple[View, ...]:
 
 
 class SplitLists(NamedTuple):
-    """Names of photographs that are trained on or held out; None stands for the rest.
+    """Names of photographs that are trained on or held out; None stands for the rest of the views.
 
     `where` is the file with the lists, or the folder and the names of several files.
     """
@@ -159,7 +159,7 @@ def split_as_listed(scene: Scene, lists: SplitLists, *, allow_missing: bool = Fa
     views, where, name, notes = scene.views, lists.where, lists.where.name, []
     row_of = row_finder(views, where)
     found = [
-        None if names is None else {name: row_of(name) for name in names}
+        None if names is None else {n: row_of(n) for n in names}
         for names in (lists.train, lists.test)
     ]
     unused = [n for rows in found for n, row in (rows or {}).items() if row is None]
@@ -196,7 +196,7 @@ def split_as_listed(scene: Scene, lists: SplitLists, *, allow_missing: bool = Fa
 def only(
     scene: Scene, rows: Sequence[int] | np.ndarray, points: Int[np.ndarray, " k"] | None = None
 ) -> Scene:
-    """Return a scene with some views and points (None: all points), and their observations."""
+    """Return a scene with the views in `rows`, points (None: all), and their observations."""
     points = np.arange(len(scene.points)) if points is None else points
     view, point = (np.full(len(a), -1, np.int32) for a in (scene.views, scene.points))
     view[rows], point[points] = np.arange(len(rows)), np.arange(len(points))

@@ -41,25 +41,25 @@ from p2gs_jax.scene.split import lists_in, split_as_listed
 from p2gs_jax.scene.visibility import share_in_view
 from p2gs_jax.types import Distortion, Scene, Split, View
 
-# HDR-NeRF's table has one more column: exposure times in seconds.
+# HDR-NeRF's table has one more column than LLFF's: exposure times in seconds.
 LLFF_FILES = ("poses_bounds_exps.npy", "poses_bounds.npy")
 _LLFF_COLUMNS = 17
 # The columns of LLFF's pose in the order of OpenCV's x, y, z and position, and their signs.
 _LLFF_AXES, _LLFF_SIGNS = [1, 0, 2, 3], np.array([1.0, 1.0, -1.0, 1.0])
-_OPENGL_SIGNS = np.array([1.0, -1.0, -1.0, 1.0])
+_OPENGL_SIGNS = np.array([1.0, -1.0, -1.0, 1.0])  # of the same columns in OpenGL's pose
 _LLFF_FIX = "write it again with LLFF's imgs2poses.py, or remove it"
-_PINHOLES = frozenset({"PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"})
+_PERSPECTIVE = frozenset({"PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"})
 _FISHEYE = "OPENCV_FISHEYE"
 FIX = "correct the file, or write it again with the tool that made it"
 _UNDISTORT = "undistort the images to pinhole ones (colmap image_undistorter) and use those"
-# Values of frames in sets of moving scenes and of depth cameras.
+# Keys of frames that are not read; sets of moving scenes and of depth cameras have them.
 _UNUSED = ("time", "depth_file_path")
 _IMAGES = re.compile(r"images(_\d+)?|input|input_images|rgb")
 _LISTS = {"train": "train_filenames", "test": "test_filenames", "val": "val_filenames"}
 
 
 class _Frame(NamedTuple):
-    """A frame of the file `source`: `path` is relative to its folder."""
+    """A frame of the file `source`; `path` is relative to the folder of this file."""
 
     path: Path
     values: Mapping[str, Any]
@@ -73,7 +73,7 @@ def is_blender(root: Path) -> bool:
 
 
 def load_transforms(root: Path, json_path: Path, cfg: DataConfig) -> Scene:
-    """Read poses and intrinsics; the scene has no tracks yet, and points if the file names any.
+    """Read poses, intrinsics, and the seed points that the file may name; there are no tracks yet.
 
     Raises UserError: the file is malformed (the message names the line or the frame), the lens
     model is not supported, images are missing or have another size, or the split lists a name that
@@ -107,9 +107,9 @@ def load_blender(root: Path, cfg: DataConfig) -> Scene:
     """Read the views of NeRF's synthetic scenes, and of all scenes with the same layout.
 
     Views in `transforms_train.json` are trained on, views in `transforms_test.json` (or else
-    `transforms_val.json`) are held out. One camera took all views. Exposure times are read as in
-    HDR-NeRF's scenes (`hdr_sets`). Raises UserError: as `load_transforms` does, or if both files
-    list a photograph, or times are broken.
+    `transforms_val.json`) are held out. All views have one camera. Exposure times are read as in
+    HDR-NeRF's scenes (`hdr_sets`). Raises UserError: as `load_transforms` does, or both files list
+    a photograph, or exposure times are broken.
     """
     train = root / "transforms_train.json"
     others = [root / f"transforms_{name}.json" for name in ("test", "val")]
@@ -131,8 +131,8 @@ def load_blender(root: Path, cfg: DataConfig) -> Scene:
         for name in poses.get(frame.path.as_posix(), [frame.path.as_posix()])
     ]
     scene = off_origin(_assembled(root, "blender", frames, cfg))
-    for path, of_path in times.items():
-        scene = replace(scene, views=with_times(scene.views, of_path, path))
+    for path, path_times in times.items():
+        scene = replace(scene, views=with_times(scene.views, path_times, path))
     return scene if test is None else replace(scene, split_by=test.name)
 
 
@@ -140,7 +140,7 @@ def load_llff(root: Path, cfg: DataConfig) -> Scene:
     """Read LLFF's poses, intrinsics and bounds; the scene has no points and no tracks yet.
 
     Raises UserError: the file is broken, does not have one row for each photograph, or states
-    another shape than the photographs have.
+    another aspect ratio than the photographs have.
     """
     path = llff_table(root)
     assert path is not None
@@ -209,8 +209,8 @@ def _viewmat(
     return pose_of(rotation, -rotation @ pose[:, 3])
 
 
-def _read_llff(path: Path) -> Float64[np.ndarray, "v 17"]:
-    """Return the table, without running any code in the file."""
+def _read_llff(path: Path) -> Float64[np.ndarray, "v c"]:
+    """Return LLFF's or HDR-NeRF's table; code in the file does not run."""
     try:
         table = np.load(path, allow_pickle=False)
     except BROKEN_ARRAYS as error:
@@ -238,7 +238,7 @@ def _read_llff(path: Path) -> Float64[np.ndarray, "v 17"]:
 
 
 def _assembled(root: Path, name: str, frames: Sequence[_Frame], cfg: DataConfig) -> Scene:
-    """Return the scene of frames, float64; a Blender scene has one camera."""
+    """Return the scene of frames, its poses in float64; a Blender scene has one camera."""
     folder = frames[0].source.parent
     place, names = _names(folder, frames, files.image_folder(folder, cfg))
     located = files.find_names(names, place)
@@ -271,11 +271,11 @@ def _assembled(root: Path, name: str, frames: Sequence[_Frame], cfg: DataConfig)
     return _scene(root, name, views, notes)
 
 
-def _names(folder: Path, frames: Sequence[_Frame], asked: Path | None) -> tuple[Path, list[str]]:
+def _names(folder: Path, frames: Sequence[_Frame], chosen: Path | None) -> tuple[Path, list[str]]:
     """Return the image folder, such as `images/`, and the names of the images relative to it.
 
     If no folder has such a name, the deepest common folder is returned. If the user names a folder
-    (`asked`), the names that most files there have are used.
+    (`chosen`), names begin at the part of the path with which most files exist there.
     """
     common = Path(os.path.commonpath([frame.path.parent for frame in frames]))
     depth = next((k + 1 for k, n in enumerate(common.parts) if _IMAGES.fullmatch(n)), None)
@@ -284,13 +284,13 @@ def _names(folder: Path, frames: Sequence[_Frame], asked: Path | None) -> tuple[
         [Path(*frame.path.parts[k:]) for frame in frames] for k in range(len(common.parts) + 1)
     ]
     for frame, name in zip(frames, below[depth], strict=True):
-        require_inside(frame.path if asked is None else name, asked or folder, frame.source)
-    if asked is not None:
+        require_inside(frame.path if chosen is None else name, chosen or folder, frame.source)
+    if chosen is not None:
         order = sorted(range(len(below)), key=lambda k: (k != depth, k))
         order = [k for k in order if ".." not in common.parts[k:]]
-        counts = [sum((asked / name).is_file() for name in below[k]) for k in order]
+        counts = [sum((chosen / name).is_file() for name in below[k]) for k in order]
         depth = order[int(np.argmax(counts))]
-    place = folder.joinpath(*common.parts[:depth]) if asked is None else asked
+    place = folder.joinpath(*common.parts[:depth]) if chosen is None else chosen
     return place, [name.as_posix() for name in below[depth]]
 
 
@@ -375,7 +375,7 @@ def _view(frame: _Frame, folder: Path, name: str) -> tuple[View, bool]:
     if c2w.shape != (3, 4) or not (np.abs(c2w) < HUGE).all():
         raise broken(f"{path}:", f"{matrix_name} is not a finite 4x4 matrix", FIX)
     viewmat = _viewmat(c2w * _OPENGL_SIGNS, path, matrix_name, FIX)
-    # Photographs with the same lens come from one camera.
+    # Photographs with the same size and lens come from one camera.
     camera = f"{values.get('w')} {values.get('h')} {np.round(K, 3).tolist()} {distortion}"
     view = View(name, image_path, camera, viewmat, K, width, height, distortion, mask_path)
     return replace(view, split=frame.split), (width, height) != size
@@ -386,8 +386,8 @@ def _lens(
 ) -> tuple[Float[np.ndarray, "3 3"], Distortion | None]:
     model = str(values.get("camera_model", "OPENCV")).upper()
     fisheye = model == _FISHEYE or bool(values.get("is_fisheye"))
-    if model not in (*_PINHOLES, _FISHEYE):
-        known = ", ".join(sorted((*_PINHOLES, _FISHEYE)))
+    if model not in (*_PERSPECTIVE, _FISHEYE):
+        known = ", ".join(sorted((*_PERSPECTIVE, _FISHEYE)))
         fix = CUT if model == "EQUIRECTANGULAR" else _UNDISTORT
         raise broken(path, f"uses the camera model {model}; supported are {known}", fix)
 

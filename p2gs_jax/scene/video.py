@@ -3,7 +3,7 @@
 Corners are tracked from frame to frame. Parallax is the part of their motion that no rotation
 explains: a rotating camera shows no depth. A frame is due if the camera has moved far enough since
 the last chosen frame; the sharpest frame around that time is chosen. So frame rate and speed do not
-matter, and a camera that rests gives one photograph.
+matter, and a resting camera gives one photograph.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from p2gs_jax.scene.drone_srt import read_shots, shot_at, srt_beside
 from p2gs_jax.scene.files import Report, cached_folder, file_fingerprints
 
 RECORD = "frames.json"
-_VERSION = 2
+_VERSION = 2  # part of the key of the cached folder, as in `convert`
 _TRANSFER_NAMES = {"hlg": "HLG video", "pq": "PQ video"}
 _AGAIN = "copy or export the video again"
 _SHORT = "film while walking around the object"
@@ -45,23 +45,23 @@ VIDEO_SUFFIXES = frozenset(
 )
 # Files of 360-degree cameras, with two fisheye images or six sides of a cube in a frame.
 _ALL_ROUND = frozenset({".insv", ".360"})
+# Weights of red and blue in luma, by the code of the matrix (ITU-T H.273, table 4).
 _BT601 = (0.299, 0.114)
-# Weights of red and blue in luma, by matrix.
 _LUMA = {1: (0.2126, 0.0722), 5: _BT601, 6: _BT601, 7: (0.212, 0.087), 9: (0.2627, 0.0593)}
-_FULL_RANGE = 2
-_SMALLEST_HD = 720
+_FULL_RANGE = 2  # FFmpeg's code
+_SMALLEST_HD = 720  # shorter side, pixels: smaller videos use BT.601 if they state no matrix
 # Longer side of the frames for tracking, pixels.
-WIDTH = 640
-_CORNERS, _FEWEST = 400, 30
-# The usual focal length of video, in longer sides. An error of a third turns a tenth of a rotation
-# of 10 degrees into parallax.
+LONGER_SIDE = 640
+_CORNERS, _FEWEST = 400, 30  # tracked corners: the largest number, and the fewest for a motion
+# The usual focal length of video, in longer sides. If it is wrong by a third, a rotation of 10
+# degrees looks like parallax of a tenth of its motion.
 _FOCAL = 0.85
-_BACK = 1.0  # the largest distance from its start of a corner that is tracked back, pixels
-_MID, _CONTRAST = 128.0, 48.0
-_ROUNDS = 4
-# A frame is due at one of these thresholds (BUILD_NOTES, "Videos").
+_BACK = 1.0  # a corner that is tracked back must end this near to its start, pixels
+_MID, _CONTRAST = 128.0, 48.0  # mean and deviation of normalised frames, 8-bit levels
+_ROUNDS = 4  # of the robust fit of a rotation
+# A frame is due at one of these: motion in longer sides, and share of lost corners (BUILD_NOTES).
 PARALLAX, DISPLACEMENT, LOST = 0.012, 0.10, 0.5
-# Frames are candidates from this fraction of a threshold on.
+# A frame is a candidate from this fraction of a threshold on.
 _CANDIDATE = 0.6
 # The largest number of candidates: the frames of a hovering camera must not fill the memory.
 _MOST_CANDIDATES = 48
@@ -77,38 +77,38 @@ _FIRST = 6
 class Frame:
     """A decoded frame, which `turn` counterclockwise quarter turns make upright.
 
-    Numbers count from 0 in display order, `time` is in seconds from the beginning, and `square` is
-    the ratio of width to height of a pixel.
+    Numbers count from 0 in display order, `time` is in seconds from the first frame, and
+    `pixel_aspect` is the ratio of width to height of a pixel.
     """
 
     number: int
     time: float
     turn: int
-    square: float
+    pixel_aspect: float
     _decoded: av.VideoFrame
 
     @property
     def size(self) -> tuple[int, int]:
         """Width and height in square pixels, upright."""
-        width, height = round(self._decoded.width * self.square), self._decoded.height
+        width, height = round(self._decoded.width * self.pixel_aspect), self._decoded.height
         return (height, width) if self.turn % 2 else (width, height)
 
     @property
     def transfer(self) -> icc.Transfer | None:
-        """Transfer function if it gives light; None: the camera's tone curve."""
+        """The transfer function that gives light; None: the camera's tone curve."""
         return icc.TRANSFERS.get(int(self._decoded.color_trc))
 
-    def grey(self, width: int) -> UInt8[np.ndarray, "h w"]:
-        """Return a small grey picture, not rotated; its longer side has at most `width` pixels."""
+    def grey(self, longer_side: int) -> UInt8[np.ndarray, "h w"]:
+        """Return a small grey picture, not rotated; its longer side is at most this, pixels."""
         frame = self._decoded
-        scale = min(1.0, width / max(frame.width, frame.height))
+        scale = min(1.0, longer_side / max(frame.width, frame.height))
         # swscale needs even widths.
         size = [max(2, round(n * scale / 2) * 2) for n in (frame.width, frame.height)]
         small = frame.reformat(width=size[0], height=size[1], format="gray")
         return small.to_ndarray()
 
     def codes(self) -> UInt[np.ndarray, "h w 3"]:
-        """Return upright display values in sRGB, with 16 bits for deep colour and for light."""
+        """Return upright sRGB values, with 16 bits for light, other primaries and deep colour."""
         signal = _signal(self._decoded)
         primaries = icc.PRIMARIES.get(int(self._decoded.color_primaries), icc.BT709)
         if self.transfer is not None:
@@ -121,9 +121,9 @@ class Frame:
             deep = max(c.bits for c in self._decoded.format.components) > 8
             kind = np.uint16 if deep else np.uint8
             codes = np.rint(np.clip(signal, 0, 1) * np.iinfo(kind).max).astype(kind)
-        if self.square != 1:
-            width = round(codes.shape[1] * self.square)
-            method = cv2.INTER_AREA if self.square < 1 else cv2.INTER_LINEAR
+        if self.pixel_aspect != 1:
+            width = round(codes.shape[1] * self.pixel_aspect)
+            method = cv2.INTER_AREA if self.pixel_aspect < 1 else cv2.INTER_LINEAR
             codes = cv2.resize(codes, (width, codes.shape[0]), interpolation=method)
         return np.ascontiguousarray(np.rot90(codes, self.turn))
 
@@ -138,7 +138,7 @@ def frames_of(path: Path) -> Iterator[Frame]:
         stream.thread_type = "AUTO"
         rate = float(stream.average_rate or 30)
         ratio = stream.sample_aspect_ratio
-        square = float(ratio) if ratio else 1.0
+        pixel_aspect = float(ratio) if ratio else 1.0
         first, begin, number = None, 0.0, 0
         try:
             for decoded in _whole_frames(container.decode(stream), stream):
@@ -150,7 +150,7 @@ def frames_of(path: Path) -> Iterator[Frame]:
                     why = f"changes its size: frame {number} is {size}, earlier ones are {first}."
                     raise broken(path, why, "cut it into parts of one size and fit one of them")
                 turn = round(decoded.rotation / 90) % 4
-                yield Frame(number, time - begin, turn, square, decoded)
+                yield Frame(number, time - begin, turn, pixel_aspect, decoded)
                 number += 1
         except av.FFmpegError as error:
             # The frames before the fault of a broken file are used, and the caller counts them.
@@ -204,7 +204,7 @@ def video_size(path: Path) -> tuple[int, int]:
 
 
 def no_frames(path: Path, count: int) -> UserError:
-    """Return the error for a video that is too short."""
+    """Return the error for a video with `count` frames, which are too few."""
     frames = "no frame" if count == 0 else "one frame" if count == 1 else f"{count} frames"
     why = f"holds {frames}; a scene needs several from different positions."
     return broken(path, why, _SHORT)
@@ -271,7 +271,7 @@ def _signal(frame: av.VideoFrame) -> Float[np.ndarray, "h w 3"]:
 
 
 def read_video(path: Path, cfg: DataConfig, work_dir: Path | None, report: Report) -> Converted:
-    """Return the chosen frames of a video as photographs in `work_dir` or the user's cache.
+    """Return the chosen frames of a video as photographs in `work_dir`, or in the user's cache.
 
     Raises UserError: as `frames_of` does, or fewer than two frames would be used.
     """
@@ -292,7 +292,7 @@ def read_video(path: Path, cfg: DataConfig, work_dir: Path | None, report: Repor
 
 
 def _keep(path: Path, cfg: DataConfig, folder: Path, report: Report) -> dict[str, Any]:
-    """Choose frames and write them; return the record."""
+    """Choose frames and write them to `folder`; return their record."""
     expected, seen = expected_frames(path), 0
 
     def small_frames() -> Iterator[tuple[int, np.ndarray]]:
@@ -302,14 +302,14 @@ def _keep(path: Path, cfg: DataConfig, folder: Path, report: Report) -> dict[str
                 total = "" if expected is None else f" of {expected}"
                 report(f"reading the video: frame {frame.number}{total}")
             seen += 1
-            yield frame.number, frame.grey(WIDTH)
+            yield frame.number, frame.grey(LONGER_SIDE)
 
     if cfg.every is None:
         found = choose_frames(small_frames())
         rule = "sharp ones, each from a new position"
     else:
         found = [n for n, _ in small_frames() if n % cfg.every == 0]
-        rule = "all of them" if cfg.every == 1 else f"every {cfg.every}th"
+        rule = "all of them" if cfg.every == 1 else f"one in {cfg.every}"
     if seen < 2:
         raise no_frames(path, seen)
     kept = [found[row] for row in evenly_spaced(len(found), cfg.max_frames)]
@@ -350,13 +350,13 @@ def _keep(path: Path, cfg: DataConfig, folder: Path, report: Report) -> dict[str
 class Motion:
     """The motion of a frame relative to the reference, in longer sides of the picture.
 
-    `displacement` is the median over corners, `parallax` the upper quartile of the displacement
-    after the best rotation, and `kept` the share of the reference's corners that are still tracked.
+    `displacement` is the median over corners, `parallax` the upper quartile of displacements after
+    the best rotation, and `tracked` the share of the reference's corners that are still tracked.
     """
 
     displacement: float
     parallax: float
-    kept: float
+    tracked: float
 
 
 def normalised(grey: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
@@ -376,7 +376,7 @@ class Tracker:
         self._count = max(len(self._start), 1)
 
     def follow(self, grey: UInt8[np.ndarray, "h w"]) -> Motion:
-        """Return the motion of the next frame, which is normalised like the reference."""
+        """Return the motion of the next frame, normalised like the reference."""
         if len(self._now) >= _FEWEST:
             ahead, found, _ = cv2.calcOpticalFlowPyrLK(
                 self._last, grey, self._now, np.empty_like(self._now)
@@ -401,7 +401,7 @@ class Tracker:
 def _parallax(
     start: Float32[np.ndarray, "n 2"], now: Float32[np.ndarray, "n 2"], shape: tuple[int, ...]
 ) -> float:
-    """Return the upper quartile of motion after the best rotation, in longer sides."""
+    """Return the upper quartile of displacements after the best rotation, in longer sides."""
     side = max(shape)
     focal = _FOCAL * side
     middle = np.array([shape[1] / 2, shape[0] / 2])
@@ -427,10 +427,10 @@ def choose_frames(frames: Iterable[tuple[int, UInt8[np.ndarray, "h w"]]]) -> lis
     """Return the numbers of the chosen frames, in order, from numbers and small grey pictures."""
     chosen: list[tuple[float, int]] = []
     tracker: Tracker | None = None
-    # Each candidate is its sharpness, number and picture.
+    # A candidate has a sharpness, a number and a picture.
     waiting: list[tuple[float, int, UInt8[np.ndarray, "h w"]]] = []
 
-    def take() -> Tracker:
+    def choose() -> Tracker:
         """Choose the sharpest candidate; track from it to the newest frame."""
         best = max(range(len(waiting)), key=lambda k: waiting[k][0])
         (sharp, number, grey), later = waiting[best], waiting[best + 1 :]
@@ -442,9 +442,9 @@ def choose_frames(frames: Iterable[tuple[int, UInt8[np.ndarray, "h w"]]]) -> lis
         return started
 
     def consider(tracker: Tracker, sharp: float, number: int, grey: np.ndarray) -> float:
-        """Add a frame to the candidates; return its fraction of a threshold; 1: a frame is due."""
+        """Return motion / threshold of a frame (1: one is due); it may become a candidate."""
         motion = tracker.follow(grey)
-        lost = (1 - motion.kept) / LOST
+        lost = (1 - motion.tracked) / LOST
         share = max(motion.parallax / PARALLAX, motion.displacement / DISPLACEMENT, lost)
         if share >= _CANDIDATE:
             waiting.append((sharp, number, grey))
@@ -457,12 +457,12 @@ def choose_frames(frames: Iterable[tuple[int, UInt8[np.ndarray, "h w"]]]) -> lis
         if tracker is None:
             waiting.append((sharp, number, grey))
             if len(waiting) == _FIRST:
-                tracker = take()
+                tracker = choose()
             continue
         share = consider(tracker, sharp, number, grey)
         due = share >= 1 and max(sharp for sharp, *_ in waiting) >= _BLURRED * chosen[-1][0]
         if due or share >= _LATEST or len(waiting) >= _MOST_CANDIDATES:
-            tracker = take()
+            tracker = choose()
     if waiting:
-        take()
+        choose()
     return [number for _, number in chosen]

@@ -12,11 +12,11 @@ from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.render.warp import project_points
 from p2gs_jax.types import View
 
-# A point is hidden by a point within about this many point spacings in the image ...
+# A nearer point hides a point within about this many spacings of points in the image, ...
 SPACINGS = 1.5
-# ... that is nearer by more than this share of its depth.
+# ... if their depths differ by more than this share of the nearer depth.
 DEPTH_MARGIN = 0.05
-# The largest numbers of views and points for a share, sampled evenly.
+# The largest numbers of views and points, sampled evenly, for `share_in_view`.
 SHARE_VIEWS, SHARE_POINTS = 32, 20_000
 
 
@@ -34,13 +34,13 @@ def share_in_view(points: Float[np.ndarray, "p 3"], views: Sequence[View]) -> fl
     sample = points[:: max(1, len(points) // SHARE_POINTS)]
     views_used = [views[row] for row in evenly_spaced(len(views), SHARE_VIEWS)]
     seen = (in_frame(*project_points(sample, view), view.width, view.height) for view in views_used)
-    return float(np.mean([one.mean() for one in seen]))
+    return float(np.mean([inside.mean() for inside in seen]))
 
 
 def shown_share(points: Float[np.ndarray, "p 3"], views: Sequence[View]) -> float:
     """Return the mean share of points in a view's frustum; 1 without points.
 
-    It is at least 1 / views, because all views together show the whole scene.
+    It is at least 1 / (number of views), because all views together show the whole scene.
     """
     return max(share_in_view(points, views), 1 / len(views))
 
@@ -48,7 +48,7 @@ def shown_share(points: Float[np.ndarray, "p 3"], views: Sequence[View]) -> floa
 def unoccluded(
     xy: Float[np.ndarray, "p 2"], z: Float[np.ndarray, " p"], width: int, height: int
 ) -> Bool[np.ndarray, " p"]:
-    """Return which projected points no nearer point hides.
+    """Return which projected points are in the image and not hidden by nearer points.
 
     A coarse depth buffer of the points decides, with cells about as wide as their spacing.
     """

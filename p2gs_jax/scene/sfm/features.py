@@ -1,7 +1,8 @@
 """SIFT features and matches in a COLMAP database, and the choice of image pairs to match.
 
 The database of `kept_features` is cached: after an interruption, or with more photographs, only new
-features and matches are computed. It is deleted if a photograph changed or is missing.
+features and matches are computed. It is deleted if photographs are missing, or files or options
+changed.
 """
 
 from __future__ import annotations
@@ -30,14 +31,14 @@ from p2gs_jax.scene.files import Report, file_fingerprints, image_size, stage_pr
 from p2gs_jax.scene.pixels.decode import BYTES_PER_PIXEL, SHARE
 from p2gs_jax.scene.rigid import camera_centers
 
-MAX_IMAGE_SIZE = 1600
-MAX_FEATURES = 4096
+MAX_IMAGE_SIZE = 1600  # longer side for SIFT, pixels
+MAX_FEATURES = 4096  # of one image
 EXHAUSTIVE_LIMIT = 60
-"""Up to this number of images every pair is matched."""
+"""Every pair of up to this number of images is matched."""
 DATABASE, RECORD = "database.db", "photographs.json"
-# Photographs and pairs between two progress messages.
+# The numbers of photographs and pairs between two reports of progress.
 IMAGES_AT_ONCE, PAIRS_AT_ONCE = 8, 100
-_OVERLAP, _LOOPS_EVERY = 10, 5
+_OVERLAP, _LOOPS_EVERY = 10, 5  # images (`pairs_by_name`)
 # Nearest neighbours with known poses. For nerf_fox (50 views of 540x960), 20 neighbours give 574
 # pairs and 11,961 points in 71 s of processor time; 10 give 292 pairs and 12,017 points in 53 s.
 _NEIGHBOURS = 10
@@ -77,8 +78,8 @@ def extract(
 ) -> None:
     """Detect SIFT features of images on the CPU and store them in a new or an existing database.
 
-    `mode` states how images share cameras; `camera` is the id of one camera in the database for all
-    of them. With `enlarge`, features are also found at twice the size. Raises UserError: COLMAP
+    `mode` states how images share cameras; `camera` is the id, in the database, of one camera for
+    all images. With `enlarge`, features are also found at twice the size. Raises UserError: COLMAP
     failed.
     """
     options = pycolmap.FeatureExtractionOptions()
@@ -141,14 +142,14 @@ def _rename(database: Path, characters: Mapping[int, int]) -> None:
 def kept_features(
     folder: Path, image_folder: Path, groups: Mapping[tuple, Sequence[str]], report: Report
 ) -> Path:
-    """Return the database in `folder` with the features of photographs, computing new ones.
+    """Return the database in `folder` with the features of photographs; missing ones are computed.
 
-    `groups` holds the names of the photographs of each camera. Raises UserError: COLMAP failed.
+    `groups` holds the names of photographs by camera. Raises UserError: COLMAP failed.
     """
     files = {}
     for key, group in groups.items():
-        prints = file_fingerprints([image_folder / name for name in group])
-        for name, (_, size, changed) in zip(group, prints, strict=True):
+        fingerprints = file_fingerprints([image_folder / name for name in group])
+        for name, (_, size, changed) in zip(group, fingerprints, strict=True):
             files[name] = [size, changed, str(key)]
     options = [pycolmap.__version__, MAX_IMAGE_SIZE, MAX_FEATURES]
     record = {"options": options, "files": files}
@@ -159,7 +160,7 @@ def kept_features(
     write_json(folder / RECORD, record)
     names = [name for group in groups.values() for name in group]
     if database.is_file():
-        # A run may have been killed while it matched.
+        # A run that was killed while it matched leaves escaped names.
         _rename(database, _UNESCAPED)
     known = _cameras(database)
     new = [name for name in names if name not in known]
@@ -182,7 +183,7 @@ def kept_features(
 def match_kept(
     database: Path, names: Sequence[str], pairs: Sequence[Pair] | None, report: Report
 ) -> None:
-    """Match the pairs, or all pairs for None, that are not matched yet."""
+    """Match those pairs (None: all pairs) that the database does not have yet."""
     wanted = list(combinations(sorted(names), 2)) if pairs is None else list(pairs)
     with opened(database) as db:
         ids = {image.name: image.image_id for image in db.read_all_images()}

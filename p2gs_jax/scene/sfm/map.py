@@ -27,17 +27,17 @@ from p2gs_jax.scene.sfm import features
 from p2gs_jax.scene.sfm.features import opened, quiet_colmap
 from p2gs_jax.types import Scene, View
 
-KEPT, ACCOUNT = "features", "left_out.json"
+FEATURES, REASONS = "features", "left_out.json"
 # A photograph with fewer features seldom gets a pose.
 FEW_FEATURES = 100
-# Matches farther from the epipolar line contradict the poses, pixels.
+# Matches farther than this from the epipolar line contradict the poses, pixels.
 EPIPOLAR_PX = 4.0
 # COLMAP does not verify a pair with fewer inliers.
 LEAST_INLIERS = 15
 # Photographs with at least this longer side, pixels, are not enlarged for SIFT. For nerf_fox, 53 s
 # and 12,017 points become 15 s and 5,449, enough for exposures and dense seeds.
 LONG_ENOUGH = 800
-LINKS = "photographs"
+LINKS = "photographs"  # a folder
 _ADVICE = (
     "photographs register if they are sharp, show texture, and overlap by more than half with at "
     "least two others from different positions"
@@ -54,9 +54,9 @@ def load_images(
 ) -> Scene:
     """Run COLMAP's structure from motion on the photographs in a folder; read the largest model.
 
-    `work_dir` caches the model of the same photographs in `sfm/`, and features and matches in
-    `features/`, also for more photographs. Raises UserError: there are fewer than two photographs,
-    one is not an image, or none is registered.
+    `work_dir` caches the model in `sfm/`, for the same photographs, and features and matches in
+    `features/`, also if photographs are added. Raises UserError: there are fewer than two
+    photographs, one is not an image, or none is registered.
     """
     names = [path.relative_to(image_folder).as_posix() for path in paths]
     if len(paths) < 2:
@@ -76,13 +76,13 @@ def load_images(
         key["camera_by"] = cfg.camera_by
 
     def build(folder: Path) -> None:
-        kept = (folder if work_dir is None else work_dir) / KEPT
+        kept = (folder if work_dir is None else work_dir) / FEATURES
         _build(folder, kept, image_folder, groups, cfg, report)
 
     with files.cached_folder(work_dir, "sfm", key, build) as folder:
         images = str(image_folder.resolve())
         scene = load_colmap(root, folder / "model", dataclasses.replace(cfg, images=images))
-        why = json.loads((folder / ACCOUNT).read_text())
+        why = json.loads((folder / REASONS).read_text())
     registered = {view.name for view in scene.views}
     left_out = [name for name in names if name not in registered]
     notes = scene.notes
@@ -102,7 +102,7 @@ def _build(
     cfg: DataConfig,
     report: files.Report,
 ) -> None:
-    """Write the largest model, and the reasons of photographs that are not in it, to a folder.
+    """Write the largest model to a folder, and the reasons why photographs are not in it.
 
     The features are cached in `kept`.
     """
@@ -131,7 +131,7 @@ def _build(
         raise UserError(f"{none}: {sentence(why)}", fix=_ADVICE)
     (folder / "model").mkdir()
     models[0].write(folder / "model")
-    write_json(folder / ACCOUNT, why)
+    write_json(folder / REASONS, why)
     shutil.rmtree(models_folder)
 
 
@@ -157,31 +157,31 @@ def reasons(
 
 
 def sentence(why: Mapping[str, str]) -> str:
-    """Return the photographs grouped by reason, as text."""
+    """Return photographs and their reasons as text, grouped by reason."""
     by_reason: dict[str, list[str]] = defaultdict(list)
     for name, reason in why.items():
         by_reason[reason].append(name)
     return "; ".join(f"{', '.join(names)} ({reason})" for reason, names in by_reason.items())
 
 
-def _why(name: str, count: int, met: Mapping[str, int], parts: Sequence[set[str]]) -> str:
-    """Return why a photograph with `count` features and the matches `met` is not registered."""
+def _why(name: str, count: int, matches: Mapping[str, int], parts: Sequence[set[str]]) -> str:
+    """Return why a photograph with `count` features and these matches is not in the first part."""
     if count == 0:
         return "no features: it does not open, or shows nothing"
     few = f"only {count} features: blurred, dark or without texture"
-    if not met:
+    if not matches:
         return few if count < FEW_FEATURES else "matches no other photograph"
     other = next((part for part in parts[1:] if name in part), None)
     if other is not None:
         return f"in a part of {len(other)} photographs that shares too little with the rest"
-    registered = {other: inliers for other, inliers in met.items() if parts and other in parts[0]}
+    registered = {other: n for other, n in matches.items() if parts and other in parts[0]}
     if not registered:
         return "matches only photographs that did not register either"
     if count < FEW_FEATURES:
         return few
     best = max(registered, key=lambda other: registered[other])
-    few = f"{registered[best]} matches with {best}, its best of {len(registered)}"
-    return f"{few}: too few of them are points that other photographs see"
+    most = f"{registered[best]} matches with {best}, its best of {len(registered)}"
+    return f"{most}: too few of them are points that other photographs see"
 
 
 def triangulate(
@@ -189,8 +189,8 @@ def triangulate(
 ) -> Scene:
     """Return the scene of posed views with triangulated points and tracks, if photographs match.
 
-    `work_dir` caches the result in `triangulated/`. Raises UserError: there is only one view, or a
-    photograph cannot be read.
+    `only_training` leaves out the held-out views. `work_dir` caches the result in `triangulated/`.
+    Raises UserError: there is only one view, or a photograph cannot be read.
     """
     views = tuple(scene.training_views) if only_training else scene.views
     if len(views) < 2:
@@ -242,7 +242,7 @@ def _triangulate(folder: Path, views: Sequence[View], root: Path, report: files.
     arguments = (prior, database, image_folder, folder)
     model = pycolmap.triangulate_points(*arguments, refine_intrinsics=False, options=options)
     if not model.points3D:
-        # COLMAP omits points that only two photographs show; two photographs have no others.
+        # COLMAP omits points in only two photographs, that is, all points of a pair.
         options.triangulation.ignore_two_view_tracks = False
         model = pycolmap.triangulate_points(*arguments, refine_intrinsics=False, options=options)
     model.write(folder)
@@ -251,7 +251,7 @@ def _triangulate(folder: Path, views: Sequence[View], root: Path, report: files.
 
 
 def _set_cameras(database: Path, views: Sequence[View]) -> pycolmap.Reconstruction:
-    """Overwrite the guessed cameras in the database; return a model of the known poses."""
+    """Overwrite COLMAP's guessed cameras in the database; return a model of the known poses."""
     known = {view.name: view for view in views}
     reconstruction = pycolmap.Reconstruction()
     with opened(database) as db:
@@ -332,10 +332,10 @@ def _lens(view: View) -> tuple[str, tuple[float, ...]]:
 
 
 def _image_folder(views: Sequence[View], folder: Path) -> Path:
-    """Return the folder that the names of photographs are relative to.
+    """Return the folder to which the names of photographs are relative.
 
-    If there is none (KITTI's `image_02/data` belongs to camera `image_02`), one with symbolic links
-    is made.
+    If there is none (KITTI's `image_02/data` belongs to camera `image_02`), symbolic links in
+    `folder` stand for the photographs.
     """
     before = {str(view.image_path).removesuffix(view.name) for view in views}
     if len(before) == 1:
