@@ -1,4 +1,4 @@
-"""Conversion between cameras of the browser and ours, the scale of the scene, and camera frusta.
+"""Conversion between viser's cameras and ours, the scale of the scene, and camera frusta.
 
 Both kinds look along z with x right and y down (OpenCV). Poses of viser are camera-to-world, with a
 vertical field of view instead of K, and with lengths in viewer units.
@@ -19,15 +19,15 @@ from scipy.spatial.transform import Rotation
 from p2gs_jax.scene import rigid
 from p2gs_jax.types import Camera, Scene, View
 
-Size = tuple[int, int]
-# Typical distance from a camera to the scene, viewer units; the keys of viser move 2 units/second.
+Size = tuple[int, int]  # width and height, pixels
+# Typical distance from a camera to the scene, viewer units: viser's keys move 2 of them per second.
 TYPICAL_DISTANCE = 10.0
-SMALLEST_FOV, LARGEST_FOV = 0.05, 2.8
+SMALLEST_FOV, LARGEST_FOV = 0.05, 2.8  # vertical, radians
 # Size of the frusta, viewer units.
 FRUSTUM = 0.3
 # Frusta closer to the camera than this multiple of their size are hidden.
 TOO_CLOSE = 2.5
-LINE = 2.0
+LINE = 2.0  # width of a frustum's lines, pixels
 
 
 class ViewerSpace(NamedTuple):
@@ -77,7 +77,7 @@ def viewmats_of(views: Sequence[View]) -> Float[np.ndarray, "v 4 4"]:
 
 
 def make_viewer_space(scene: Scene, points: Float[np.ndarray, "n 3"]) -> ViewerSpace:
-    """Return the scale of a scene, from its points, and its up direction."""
+    """Return the scale of a scene, which its points determine, and its up direction."""
     viewmats = viewmats_of(scene.views)
     every = max(1, len(viewmats) // 16)
     distance = np.median([distance_seen(m, points) for m in viewmats[::every]])
@@ -101,7 +101,7 @@ def pose_of(
 ) -> Pose:
     """Return the browser's camera for a world-to-camera matrix.
 
-    `distance` from the camera to the centre of its orbit is in scene units; `fov` is vertical,
+    `distance`, scene units, is from the camera to the centre of its orbit; `fov` is vertical,
     radians.
     """
     rotation = viewmat[:3, :3].T.astype(float)
@@ -114,9 +114,9 @@ def pose_of(
 def camera_of_browser(
     view: BrowserView | Pose, aspect: float, size: Size, space: ViewerSpace
 ) -> Camera:
-    """Return our camera for the browser's, for a canvas with `aspect` = width / height.
+    """Return our camera for a browser's, for a canvas with `aspect` = width / height.
 
-    Pixels are not square if `size`, the pixels to render, has another aspect.
+    `size` is that of the render; pixels are not square if its aspect differs.
     """
     rotation = Rotation.from_quat(np.asarray(view.wxyz, float), scalar_first=True).as_matrix()
     position = np.asarray(view.position, float) / space.unit

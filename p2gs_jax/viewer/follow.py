@@ -15,16 +15,16 @@ POLL_S = 1.0
 
 
 class Follower:
-    """Asks a fit for snapshots, and reads them.
+    """Requests snapshots of a fit, and reads them.
 
-    `files` has the paths of the run; with `with_fit` the viewer ends with the fit.
+    `files` has the paths of the run. If `with_fit`, the viewer ends with the fit.
     """
 
     def __init__(self, folder: Path, scene: Path | None = None, *, with_fit: bool = False):
         """Follow the run in a folder; `scene` is as for `load_run`."""
         self.files, self._scene, self.with_fit = RunFolder(folder), scene, with_fit
         self._seen = 0  # time of the snapshot that was read last, nanoseconds
-        self._went_on = False
+        self._went_on = False  # whether the fit went on at the last poll
 
     @property
     def goes_on(self) -> bool:
@@ -36,7 +36,7 @@ class Follower:
         return False
 
     def first(self, say: Callable[[str], None]) -> Run:
-        """Return the run as soon as it can be shown; `say` receives a message if it must wait.
+        """Return the run as soon as it can be shown; `say` receives a message about a wait.
 
         Raises:
             UserError: see `load_run`.
@@ -50,7 +50,7 @@ class Follower:
         return self._latest()
 
     def poll(self, *, wanted: bool) -> Run | None:
-        """Return a newer state of the run, or None; with `wanted` it asks the fit for one."""
+        """Return a newer state of the run, or None; if `wanted`, request a snapshot."""
         before, self._went_on = self._went_on, self.goes_on
         try:
             if not self._went_on:
@@ -66,5 +66,5 @@ class Follower:
 
     def _latest(self) -> Run:
         """Return the snapshot of an unfinished run, or the finished run."""
-        there = self.files.snapshot.is_dir()
-        return load_run(self.files.root, self._scene, snapshot=there)
+        unfinished = self.files.snapshot.is_dir()
+        return load_run(self.files.root, self._scene, snapshot=unfinished)

@@ -1,9 +1,9 @@
 """The thread that keeps one browser's picture up to date.
 
-At most one request waits. The camera and the settings are read when a frame begins, so a frame uses
-the newest ones. While they change, frames are as large as the frame rate allows and are sent as
-JPEG; at rest the canvas is rendered at full resolution and sent as PNG. A failure is reported once,
-and the frame is tried again only after a request or a newly compiled program.
+At most one request waits. A frame uses the newest camera and settings. While these change, frames
+are as large as the frame rate allows and are sent as JPEG; at rest the canvas is rendered at full
+resolution and sent as PNG. A failure is reported once, and the frame is tried again only after a
+request or a newly compiled program.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def report(client: viser.ClientHandle, title: str, error: Exception) -> None:
 
 
 class Darkroom:
-    """Develops rendered frames for one thread; new display settings need no new frame.
+    """Develops rendered frames, for one thread: other display settings need no other frame.
 
     `depth_limits` are the nearest and farthest depth of the colour scale, scene units.
     """
@@ -57,7 +57,7 @@ class Darkroom:
     def __init__(self, viewed: ViewedRun, depth_limits: tuple[float, float] | None = None):
         """Start without a photograph."""
         self.depth_limits = depth_limits
-        self.photograph_error: str | None = None  # the error of the last one
+        self.photograph_error: str | None = None  # the error of the last photograph
         self._viewed = viewed
         self._photograph: tuple[int, Camera, pictures.WarpedPhotograph] | None = None
 
@@ -67,7 +67,7 @@ class Darkroom:
         """Return display values of a frame."""
         if settings.mode == "depth" and self.depth_limits is None:
             self.depth_limits = pictures.limits_of_depth(frame)
-        taken_as = settings.taken_as
+        view = settings.view
         return pictures.picture_of(
             frame,
             settings.mode,
@@ -75,7 +75,7 @@ class Darkroom:
             depth_limits=self.depth_limits,
             photograph=self._photograph_of(frame) if settings.mode == "split" else None,
             split=settings.split,
-            vignetting_camera=None if taken_as is None else camera_of(self._viewed.store, taken_as),
+            vignetting_camera=None if view is None else camera_of(self._viewed.store, view),
         )
 
     def _photograph_of(self, frame: pictures.RenderedFrame) -> pictures.WarpedPhotograph | None:
@@ -95,7 +95,7 @@ class Darkroom:
         return kept[2]
 
     def legend(self, frame: pictures.RenderedFrame, settings: Settings) -> str | None:
-        """Return the legend of the last picture as HTML."""
+        """Return the legend of the last picture of a frame as HTML, or None."""
         if settings.mode == "stops":
             return pictures.stops_legend()
         if settings.mode == "depth" and self.depth_limits is not None:
@@ -122,7 +122,7 @@ class LivePicture:
         self._stopping = False
         self._frame: pictures.RenderedFrame | None = None
         self._stale = True  # whether the frame has an older camera
-        self._sharp = False  # whether the picture at rest was sent, without changes since
+        self._sharp = False  # whether the last picture sent was one at rest
         self._moving: tuple[Size | None, float] = (None, 0.0)  # size and time of the last frame
         self._last_ms = 0.0
         self._thread = threading.Thread(target=self._work, name="draw", daemon=True)
@@ -143,7 +143,7 @@ class LivePicture:
         self._thread.join()
 
     def post(self, request: Request) -> None:
-        """Request a frame: for another camera, or the current frame with other display settings."""
+        """Request a frame ("camera"), or the current one with other display settings ("look")."""
         with self._changed:
             self._request = "camera" if "camera" in (request, self._request) else request
             self._changed.notify_all()
@@ -166,7 +166,7 @@ class LivePicture:
                     return request
                 wait = None if self._rest_at is None else self._rest_at - time.monotonic()
                 if wait is not None and wait <= 0:
-                    self._rest_at = None  # one attempt only
+                    self._rest_at = None  # one attempt
                     return "rest"
                 self._changed.wait(wait)
         return None
@@ -196,7 +196,7 @@ class LivePicture:
             self._render(view, size, ready)
         if self._frame is None:
             return
-        if at_rest:  # for every frame, the scale would flicker
+        if at_rest:  # new limits in every frame would flicker
             self.darkroom.depth_limits = pictures.limits_of_depth(self._frame)
         self._show(self._frame, settings, sharp=at_rest)
         self._sharp = at_rest

@@ -40,19 +40,19 @@ HINTS = {
     "Width": "Width from {} to {} pixels; the height follows the window.".format(*SAVED_WIDTHS),
 }
 
-# Charts of a fit that goes on by title: styles of their curves.
+# Charts of an unfinished fit by title, with the styles of their curves.
 CHARTS: dict[str, dict[str, Any]] = {
     "Loss": {"width": 1.5},
     "Exposures of the training views, EV": {"width": 0, "points": {"show": True, "size": 5}},
 }
-MOST_RECORDS = 300
+MOST_RECORDS = 300  # records of the log in a chart
 LINE, INK, GRID = "#4dabf7", "#c1c2c5", "#373a40"
 
 
 class Panel:
     """The controls of one browser.
 
-    `locked` is the control that keeps the display transform when the camera moves to a view.
+    `locked` is the control that keeps the display settings when the camera moves to a view.
     """
 
     def __init__(self, gui: viser.GuiApi, viewed: ViewedRun, actions: BrowserSession):
@@ -61,7 +61,7 @@ class Panel:
         self._gui, self._viewed, self._actions = gui, viewed, actions
         self._names = [view.name for view in run.scene.views]
         start = common_settings(run)
-        self._taken_as: int | None = start.taken_as
+        self._view: int | None = start.view
         self._status = gui.add_html(note("starting ..."))
         self._training = gui.add_folder("Training", visible=False)
         with self._training:  # a sentence and charts
@@ -178,7 +178,7 @@ class Panel:
             gamma=self._gamma.value,
             exposure_ev=self._exposure.value,
             curve=self._curves[self._curve.value],
-            taken_as=self._taken_as,
+            view=self._view,
             balance_ev=(balance[0], balance[1]) if balance else None,
             vignetting=self._vignetting.value,
             mode=MODES[self._mode.value],
@@ -187,7 +187,7 @@ class Panel:
 
     def put(self, settings: Settings) -> None:
         """Set the controls to a display transform; the mode does not change."""
-        index = self._taken_as = settings.taken_as
+        index = self._view = settings.view
         self._exposure.value = settings.exposure_ev
         self._gamma.value = settings.gamma
         for handle, ev in zip(self._balance, settings.balance_ev or (), strict=False):
@@ -197,12 +197,12 @@ class Panel:
         self._match.value = MEAN if index is None else self._names[index]
 
     def put_view(self, index: int, degrees: float) -> None:
-        """Set the controls to the camera of a view."""
+        """Set the controls to a view and its vertical field of view."""
         self._go_to.value = self._names[index]
         self._fov.value = degrees
 
     def show_training(self, log: list[dict[str, Any]]) -> None:
-        """Show the last of the records of a fit, their losses, and the exposures."""
+        """Show the last record of the log of a fit, its losses, and the exposures."""
         self._training.visible = True
         self._progress.content = note(LogRecord(**log[-1]).summary())
         rows = evenly_spaced(len(log), MOST_RECORDS)

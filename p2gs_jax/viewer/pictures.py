@@ -25,16 +25,16 @@ Mode = Literal["display", "stops", "depth", "split"]
 MIDDLE_GREY = 0.18
 # Percentiles of depth at the ends of the colour scale.
 DEPTH_TAILS = (1.0, 99.0)
-LINE = 1.0
+LINE = 1.0  # display value of the split's line
 # Smallest and largest width of a saved picture, pixels.
 SAVED_WIDTHS = (16, 16384)
 BOX = "margin:0 0.75em 0.75em;font-size:0.75em;line-height:1.4;opacity:0.9"
-COLORS = 12
+COLORS = 12  # colours of the gradient of a legend
 
 
 @dataclass(frozen=True)
 class RenderedFrame:
-    """A rendered view, the source of every mode; depth is weighted by alpha, scene units."""
+    """A rendered view, the source of every mode; depth is camera z times alpha, scene units."""
 
     linear: Float[Array, "h w 3"]
     alpha: Float[np.ndarray, "h w"]
@@ -69,9 +69,9 @@ def picture_of(
     Args:
         mode: `stops` counts from mid-grey at the exposure of the transform; `split` without
             a photograph equals `display`.
-        depth_limits: ends of the colour scale, scene units; None uses those of the frame.
+        depth_limits: ends of the colour scale, scene units; None: `limits_of_depth`.
         split: visible share of the photograph's width, from the left.
-        vignetting_camera: the camera of the transform's vignetting; None uses that of the frame.
+        vignetting_camera: the camera of the transform's vignetting; None: the frame's camera.
     """
     if mode == "stops":
         return false_color(np.asarray(frame.linear), MIDDLE_GREY / transform.exposure)
@@ -85,9 +85,9 @@ def picture_of(
 
 
 def places_in(vignetting_camera: Camera, frame: Camera) -> Float32[np.ndarray, "h w 2"]:
-    """Return the positions of the frame's pixels in an image of a photograph's camera, [-1, 1].
+    """Return the positions of the frame's pixels in a photograph, half diagonals from its centre.
 
-    Positions outside of that image are moved to the radius of its corners, where vignetting ends.
+    Positions beyond 1 are moved to 1, the radius of the corners, where vignetting ends.
     """
     K, k = np.asarray(vignetting_camera.K, float), np.asarray(frame.K, float)
     x, y = ((np.arange(n) + 0.5) for n in (frame.width, frame.height))
@@ -136,7 +136,7 @@ def warp_photograph(
 ) -> WarpedPhotograph:
     """Return a photograph resampled to the pixels of another camera at the same position.
 
-    Images of cameras with a common centre are related by a homography. The mask is 1 where the
+    Images of cameras with a common centre are related by a homography. `mask` is 1 where the
     photograph counts.
     """
     turn = np.asarray(camera.viewmat, float)[:3, :3] @ np.asarray(frame.viewmat, float)[:3, :3].T
@@ -169,7 +169,7 @@ def _minification(pull: Float[np.ndarray, "3 3"], size: tuple[int, int]) -> floa
 
 
 def to_uint8_fast(ldr: Float[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Return display values in [0, 1] rounded to 8 bits (1920 x 1080: cv2 1 ms, numpy 32 ms)."""
+    """Return display values in [0, 1] as 8 bits (1920 x 1080 pixels: cv2 1 ms, NumPy 32 ms)."""
     return cv2.convertScaleAbs(ldr, alpha=255.0)
 
 
@@ -194,7 +194,7 @@ def exr_bytes(frame: RenderedFrame, transform: DisplayTransform) -> bytes:
 
 
 def stops_legend() -> str:
-    """Return the legend of false colours as HTML with one box per stop."""
+    """Return the legend of the mode `stops` as HTML, with one box per stop."""
     low, high = (int(limit) for limit in STOPS)
     values = 2.0 ** (np.arange(low, high) + 0.5)
     colors = false_color(np.repeat(values[None, :, None], 3, -1).astype(np.float32), 1.0)[0]
@@ -209,18 +209,18 @@ def stops_legend() -> str:
 
 
 def depth_legend(near: float, far: float) -> str:
-    """Return the colour scale of depth in scene units as HTML; near points are bright."""
+    """Return the legend of the mode `depth` as HTML; its ends are in scene units."""
     return _scale(DEPTH_MAP, (1, 0), f"{near:.3g}", f"{far:.3g}", "depth, scene units")
 
 
 def exposure_legend(low: float, high: float) -> str:
-    """Return the colour scale of the cameras by exposure in stops as HTML."""
+    """Return the legend of `exposure_colors` as HTML; its ends are in stops."""
     text = "exposure, stops (EV) from the mean; grey: held-out view"
     return _scale(STOPS_MAP, (0, 1), f"{low:+.1f}", f"{high:+.1f}", text)
 
 
 def exposure_colors(evs: Sequence[float | None]) -> UInt8[np.ndarray, "n 3"]:
-    """Return a colour for each exposure, lighter for larger ones; grey if it is None."""
+    """Return a colour for each exposure, lighter for larger ones, and grey for None."""
     known = [ev for ev in evs if ev is not None]
     low, high = (min(known), max(known)) if known else (0.0, 1.0)
     out = np.full((len(evs), 3), 128, np.uint8)

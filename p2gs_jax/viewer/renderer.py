@@ -23,19 +23,19 @@ from p2gs_jax.types import Camera, Gaussians, Render
 from p2gs_jax.viewer.camera import Size
 from p2gs_jax.viewer.pictures import RenderedFrame
 
-# Largest number of entries of a tile list; a camera inside a splat may need any number.
+# Largest number of entries of a view's tile lists; a camera inside a splat may need any number.
 MOST_ENTRIES = 2**26
-# Widths at an aspect of 16:10, pixels; each area is 2.25 times the previous one.
+# Widths of the sizes at an aspect of 16:10, pixels; each area is 2.25 times the previous one.
 WIDTHS = (320, 480, 720, 1080, 1620, 2430)
 # Aspect ratios per factor of two; pixels are then square within 9 %.
 SHAPES_PER_OCTAVE = 4
-ALIGN = 8
+ALIGN = 8  # widths and heights are multiples of this, pixels
 # Sizes with more than this share of the full size's pixels would save too little time.
 FULL_FROM = 0.6
 # Target time of a frame while the camera moves, milliseconds.
 TARGET_MS = 75.0
 # The next larger size follows if its expected time is below the first share of the target time, and
-# a smaller one if the time is above the second.
+# a smaller one if the last frame took more than the second.
 ENLARGE_WITHIN, SHRINK_BEYOND = 0.85, 1.25
 
 
@@ -54,10 +54,10 @@ class Renderer:
         on_change: Callable[[], None] = lambda: None,
         warm_up: Callable[[Render], object] = lambda result: None,
     ):
-        """Start without a program; new ones have room for the views of typical cameras (`probes`).
+        """Start without a program; `alive` is the mask of the Gaussians to draw.
 
-        `on_change` is called before and after a program is compiled. `warm_up` is called with a
-        render of every new size, and compiles the functions that use it.
+        New programs have room for the views of typical cameras (`probes`). `on_change` is called
+        before and after a compilation. `warm_up` compiles the functions that use a new render.
         """
         self._scene, self._cfg, self._probes = (gaussians, alive), cfg, probes
         self._on_change, self._warm_up = on_change, warm_up
@@ -97,7 +97,7 @@ class Renderer:
         return None
 
     def request(self, sizes: Sequence[Size]) -> None:
-        """Compile these sizes in this order; other sizes that still wait are cancelled."""
+        """Compile these sizes in this order; cancel other sizes that still wait."""
         with self._lock:
             for size in [s for s in self._jobs if s not in sizes]:
                 if self._jobs[size].cancel():
@@ -154,7 +154,7 @@ class Renderer:
         self._compiler.shutdown(cancel_futures=True)
 
     def _compile(self, size: Size, needed: int) -> Callable[..., Render]:
-        """Return the program of a size, with room for the probes and for `needed` entries."""
+        """Return the program of a size, with room for the probes and `needed` tile-list entries."""
         self._on_change()
         scene, cameras = self._scene, [probe(size) for probe in self._probes]
         counts = [int(capacity.count_needed(*scene, c, cfg=self._cfg)) for c in cameras]
@@ -185,7 +185,7 @@ def full_size(canvas: Size, max_width: int) -> Size:
 
 
 def render_sizes(full: Size) -> tuple[Size, ...]:
-    """Return the render sizes of a canvas from the smallest to `full`."""
+    """Return the sizes of renders for a canvas, from the smallest to `full`."""
     octaves = round(math.log2(full[0] / full[1]) * SHAPES_PER_OCTAVE) / SHAPES_PER_OCTAVE
     areas = [width * width / 1.6 for width in WIDTHS]
     sides = [
@@ -197,7 +197,7 @@ def render_sizes(full: Size) -> tuple[Size, ...]:
 
 
 def compilation_order(sizes: tuple[Size, ...]) -> tuple[Size, ...]:
-    """Return the sizes in the order of compilation: a small one, the full size, then the others."""
+    """Return the sizes in the order of compilation: a small one, the full one, then the others."""
     first = sizes[min(1, len(sizes) - 1)]
     return tuple(dict.fromkeys((first, sizes[-1], *reversed(sizes[:-1]))))
 
@@ -207,8 +207,8 @@ def next_size(
 ) -> Size | None:
     """Return the size for the next frame of a moving camera, or None if none is compiled.
 
-    `sizes` of the canvas increase; `ready` ones may be of another canvas. The last frame took `ms`
-    milliseconds at the size `current`, which stays unless another size is clearly better.
+    `sizes` are those of the canvas and increase; `ready` sizes may belong to other canvases. The
+    last frame took `ms` milliseconds at the size `current`, which stays unless another is better.
     """
     usable = [size for size in sizes if size in ready]
     if not usable:

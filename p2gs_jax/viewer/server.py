@@ -1,6 +1,6 @@
 """The web server: access control, one viewed run, and a session for every browser.
 
-Only the page of the viewer may connect, and from other machines only with a token. Otherwise a page
+Only the page of the viewer may connect, and other machines need a token. Otherwise a page
 of any other site in the same browser could connect to a port of this machine (WebSockets have no
 same-origin policy, RFC 6455, 10.2), even through a host name that resolves to this machine. viser
 has no hook for such checks, so its call of the `websockets` library is wrapped during the start.
@@ -49,7 +49,7 @@ Hook = Callable[[ServerConnection, Request], Response | None]
 
 
 class Guard(NamedTuple):
-    """Conditions for a request: one of these host names (None: any), and a token (None: none).
+    """Conditions for a request: its host name (`hosts` None: any), and its token (None: no token).
 
     The token must be in the address, or in the cookie that the first answer sets.
     """
@@ -147,7 +147,7 @@ def _tokens(request: Request) -> list[str]:
 
 
 def check_address(host: str, port: int) -> None:
-    """Raise a UserError unless a server can listen on an address."""
+    """Raise UserError if no server can listen on an address."""
     if not 0 <= port <= 65535:
         raise UserError(f"--port {port} is not a valid port.", fix="choose one from 1024 to 65535")
     try:
@@ -175,9 +175,8 @@ def open_viewer(
     """Serve a run until the block ends; yield the address to open, with its token if it needs one.
 
     If a fit still writes the run, `follower` follows it, and nothing is compiled before a browser
-    connects.
-
-    Raises a UserError if no server can listen on `host` and `port`.
+    connects. Live pictures are at most `max_width` pixels wide. Raises UserError: no server can
+    listen on `host` and `port`.
     """
     check_address(host, port)
     # viser warns when a browser disconnects while a picture is being sent.
@@ -218,7 +217,7 @@ def open_viewer(
 def _follow(
     follower: Follower, viewed: ViewedRun, sessions: dict[int, Any], ended: threading.Event
 ) -> None:
-    """Show all browsers what a fit has reached, until the viewer has ended."""
+    """Show the newest state of a fit in all browsers, until `ended` is set."""
     while not ended.wait(POLL_S):
         run = follower.poll(wanted=bool(sessions))
         if run is not None:
@@ -243,18 +242,18 @@ def _set_up_server(
     camera = server.initial_camera
     camera.position, camera.look_at, camera.fov = start.position, start.look_at, start.fov
     lock = threading.Lock()
-    # Browsers that disconnected before their session existed: viser calls from several threads.
+    # Browsers that disconnected before they had a session: viser calls from several threads.
     gone: set[int] = set()
 
     @server.on_client_connect
     def _(client: viser.ClientHandle) -> None:
         session = BrowserSession(client, viewed)
         with lock:
-            left = client.client_id in gone
+            has_left = client.client_id in gone
             gone.discard(client.client_id)
-            if not left:
+            if not has_left:
                 sessions[client.client_id] = session
-        if left:
+        if has_left:
             session.stop()
 
     @server.on_client_disconnect
@@ -268,21 +267,21 @@ def _set_up_server(
 
 
 def serve(
-    run: Run, *, say: Callable[[str], None], follower: Follower | None = None, **place: Any
+    run: Run, *, say: Callable[[str], None], follower: Follower | None = None, **options: Any
 ) -> None:
-    """Serve a run until Ctrl-C or SIGTERM, or until the fit ends that `follower` ends with.
+    """Serve a run until Ctrl-C or SIGTERM, or until its fit ends if `follower.with_fit`.
 
-    `say` prints a line; `follower` and `place` (host, port, max_width) are as for `open_viewer`.
-    Raises a UserError if no server can listen on `host` and `port`.
+    `say` prints a line; `open_viewer` explains its other arguments (`options`) and errors.
     """
-    with open_viewer(run, follower=follower, **place) as address:
-        who = "only this machine" if is_loopback(place["host"]) else "any machine with this address"
+    with open_viewer(run, follower=follower, **options) as address:
+        local = is_loopback(options["host"])
+        who = "only this machine" if local else "any machine with this address"
         what = "Watch the fit" if follower else f"{run.params.gaussians.capacity} Gaussians"
-        with contextlib.suppress(KeyboardInterrupt), interrupts.held() as asked:
+        with contextlib.suppress(KeyboardInterrupt), interrupts.held() as signals:
             # Signals are recorded, not raised: Python drops exceptions during garbage collection.
-            asked.begin()
+            signals.begin()
             say(f"{what} at {address} (open to {who}; Ctrl-C ends)")
-            while asked.arrived is None:
+            while signals.arrived is None:
                 if follower is not None and follower.with_fit and not follower.goes_on:
                     break
                 time.sleep(0.1)

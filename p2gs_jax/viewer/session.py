@@ -37,7 +37,7 @@ class BrowserSession:
         self._live.stop()
 
     def follow(self, log: list[dict], *, newer: bool) -> None:
-        """Show the log of the fit; `newer`: render its new state from the present camera."""
+        """Show the log of the fit; if `newer`, render its new state from the current camera."""
         self._panel.show_training(log)
         if newer:
             self._live.post("camera")
@@ -60,7 +60,7 @@ class BrowserSession:
         self._live.post("look")
 
     def mode_changed(self) -> None:
-        """Show another mode; `split` moves to the nearest photograph, as `go_to` does."""
+        """Show another mode; for `split`, go to the nearest photograph first."""
         if self._panel.settings().mode == "split":
             camera = self._live.camera(browser_view(self._client), (64, 64))
             here = self._viewed.view_at(camera)
@@ -68,14 +68,14 @@ class BrowserSession:
         self._live.post("camera")
 
     def take_display_of(self, index: int | None) -> None:
-        """Set the display transform to that of a view, or to the mean (None)."""
+        """Set the display settings to the values of a view, or to the mean values (None)."""
         now, run = self._panel.settings(), self._viewed.run
         new = common_settings(run, now) if index is None else settings_of_view(run, index, now)
         self._panel.put(new)
         self.display_changed()
 
     def go_to(self, index: int) -> None:
-        """Move to the camera of a view, and use its display transform unless that is locked."""
+        """Move to the camera of a view, and use its display settings unless they are locked."""
         pose = self._viewed.pose(index, browser_view(self._client).aspect)
         self._panel.put_view(index, float(np.rad2deg(pose.fov)))
         if not self._panel.locked.value:
@@ -83,7 +83,7 @@ class BrowserSession:
         self._move(pose)
 
     def set_fov(self, degrees: float) -> None:
-        """Set the vertical field of view."""
+        """Set the vertical field of view, degrees."""
         self._client.camera.fov = float(np.deg2rad(degrees))
 
     def show_cameras(self, visible: bool) -> None:
@@ -102,7 +102,7 @@ class BrowserSession:
         return frusta
 
     def save(self, kind: str, width: int) -> None:
-        """Send the view as a file, rendered at `width` pixels."""
+        """Send the view to the browser as a file (`png` or `exr`), rendered at `width` pixels."""
         view, settings = browser_view(self._client), self._panel.settings()
         run, size = self._viewed.run, (width, max(1, round(width / view.aspect)))
         text = f"Rendering {size[0]} x {size[1]} pixels ..."

@@ -16,10 +16,10 @@ from p2gs_jax.types import Camera
 from p2gs_jax.viewer import camera as cameras
 from p2gs_jax.viewer.renderer import Renderer
 
-# Number of views for which the tile lists of new programs have room.
+# Number of views that determine the length of a new program's tile lists.
 PROBES = 4
-# Cameras closer than this share of the typical distance count as being at one position.
-SAME_PLACE = 1e-3
+# Cameras closer than this share of the typical distance have the same position.
+SAME_POSITION = 1e-3
 
 
 class ViewedRun:
@@ -39,7 +39,7 @@ class ViewedRun:
         self._points = points if len(points) else np.asarray(gaussians.means)
         self._centers = camera_centers(cameras.viewmats_of(run.scene.views))
         self.space = cameras.make_viewer_space(run.scene, self._points)
-        # Typical distance to the points that a view sees, scene units.
+        # The distance of the points that a view sees by its row, scene units.
         views = run.scene.views
         self.distance = cache(
             lambda index: cameras.distance_seen(views[index].viewmat, self._points)
@@ -55,7 +55,7 @@ class ViewedRun:
         )
 
     def show(self, run: Run) -> None:
-        """Show a later state of the run; scale, cameras and photographs stay."""
+        """Show a newer state of the run; scale, cameras and photographs stay."""
         self.run, gaussians = run, at_time(run.as_of(), None)
         self.renderer.show(gaussians, on_device(np.ones(gaussians.capacity), bool))
 
@@ -70,7 +70,7 @@ class ViewedRun:
     def view_at(self, camera: Camera) -> int | None:
         """Return the row of the view at the position of a camera, or None."""
         near = np.flatnonzero(
-            self._away(camera) <= SAME_PLACE * cameras.TYPICAL_DISTANCE / self.space.unit
+            self._distances(camera) <= SAME_POSITION * cameras.TYPICAL_DISTANCE / self.space.unit
         )
         if not len(near):
             return None
@@ -80,9 +80,9 @@ class ViewedRun:
 
     def nearest_view(self, camera: Camera) -> int:
         """Return the row of the view nearest to a camera."""
-        return int(np.argmin(self._away(camera)))
+        return int(np.argmin(self._distances(camera)))
 
-    def _away(self, camera: Camera) -> np.ndarray:
+    def _distances(self, camera: Camera) -> np.ndarray:
         center = camera_centers(np.asarray(camera.viewmat)[None])
         return np.linalg.norm(self._centers - center, axis=1)
 

@@ -218,7 +218,7 @@ def test_corrections_hold_under_the_curve_they_were_learned_with(run):
     corrected = replace(run, params=params, cfg=replace(run.cfg, photometry=photometry))
     own = settings_of_view(corrected, run.scene.train_indices[2], Settings(gamma=2.2))
     np.testing.assert_array_equal(display_of(corrected, own).correction, corrections[2])
-    mean = display_of(corrected, replace(own, taken_as=None))
+    mean = display_of(corrected, replace(own, view=None))
     np.testing.assert_allclose(mean.correction, corrections.mean(0), atol=1e-6)
     assert display_of(corrected, replace(own, curve="linear")).correction is None
 
@@ -287,7 +287,7 @@ def test_the_exposure_can_be_locked(session):
     assert session._panel.now == before
     session._panel.locked.value = False
     session.go_to(2)
-    assert session._panel.now.taken_as == 2
+    assert session._panel.now.view == 2
 
 
 def test_a_view_is_saved_also_after_a_failure(session, viewed, client):
