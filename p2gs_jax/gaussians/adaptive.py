@@ -14,8 +14,8 @@ from p2gs_jax.gaussians.population import Outcome, fresh_population, opacities, 
 from p2gs_jax.render.project import rotated, rotation_matrices
 from p2gs_jax.types import Gaussians, Population
 
-SPLIT_SHRINK = 1.6
-RESET_OPACITY = 0.01
+SPLIT_SHRINK = 1.6  # divisor of the scales in a split (3DGS)
+RESET_OPACITY = 0.01  # largest opacity after a reset (3DGS)
 
 
 class Proposal(NamedTuple):

@@ -36,7 +36,7 @@ from p2gs_jax.render.harmonics import C0, RadianceKind, degree_of
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians, Render
 
-DIRECTIONS = 64
+DIRECTIONS = 64  # number of directions of the least squares
 # Gaussians per chunk; the last chunk is padded, so that all chunks share one program.
 CHUNK = 8192
 # Variance that viewers add to the 2D covariance, as 3DGS does, pixels^2.
@@ -176,24 +176,24 @@ def refine(
 
     # Defined here, so that means and scales are constants, which XLA folds.
     @functools.partial(jax.jit, static_argnames="capacity", compiler_options=compiler_options())
-    def step(moving, state, camera, picture, background, decay, *, capacity):
-        def loss(moving):
-            current = replace(gaussians, **moving)
+    def step(trained, state, camera, picture, background, decay, *, capacity):
+        def loss(trained):
+            current = replace(gaussians, **trained)
             result = render_linear(current, _all(current), camera, cfg, capacity, with_depth=False)
             display = _over(result, background, shown)
             return jnp.mean((display - picture / 255.0) ** 2), result
 
-        (_, result), gradient = jax.value_and_grad(loss, has_aux=True)(moving)
+        (_, result), gradient = jax.value_and_grad(loss, has_aux=True)(trained)
         updates, state = optimizer.update(gradient, state)
-        moved = jax.tree.map(lambda m, rate, u: m - decay * rate * u, moving, rates, updates)
+        updated = jax.tree.map(lambda v, rate, u: v - decay * rate * u, trained, rates, updates)
         if shown is None:
-            base = jnp.clip(moved["sh"][:, 0], -0.5 / C0, 0.5 / C0)
-            moved["sh"] = moved["sh"].at[:, 0].set(base)
-        return (moved, state), result.count, result.overflow
+            base = jnp.clip(updated["sh"][:, 0], -0.5 / C0, 0.5 / C0)
+            updated["sh"] = updated["sh"].at[:, 0].set(base)
+        return (updated, state), result.count, result.overflow
 
     rng, order = np.random.default_rng(seed), []
-    moving = {"sh": gaussians.sh, "opacity_logits": gaussians.opacity_logits}
-    state = optimizer.init(moving)
+    trained = {"sh": gaussians.sh, "opacity_logits": gaussians.opacity_logits}
+    state = optimizer.init(trained)
     for done in range(steps):
         order = order or list(rng.permutation(len(targets)))
         target = targets[order.pop()]
@@ -201,12 +201,12 @@ def refine(
         picture = jnp.asarray(target.picture)
         bright = done % 2 if shown is None else 0
         background = jnp.asarray(rng.uniform(size=3) * bright, jnp.float32)
-        inputs = (moving, state, target.camera, picture, background, decay)
-        (moving, state), capacity = until_it_fits(
+        inputs = (trained, state, target.camera, picture, background, decay)
+        (trained, state), capacity = until_it_fits(
             lambda entries, inputs=inputs: step(*inputs, capacity=entries), capacity
         )
         on_step(done + 1, steps)
-    return replace(gaussians, **moving)
+    return replace(gaussians, **trained)
 
 
 def baking_error(

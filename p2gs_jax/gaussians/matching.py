@@ -68,7 +68,7 @@ class Tones:
         ldr: Float32[np.ndarray, "... 3"],
         positions: Float[np.ndarray, "... 2"] | None = None,
     ) -> Float32[np.ndarray, "... 3"]:
-        """Return log radiance of an image of a training view, or of single pixels of it.
+        """Return log radiance of a training view's image, or of single pixels.
 
         Single pixels need `positions` if vignetting is modelled (photometry/formation.py:places).
         """
@@ -107,14 +107,14 @@ def rough_tones(tracks: Observations | None, count: int) -> Tones:
     log_exposures, gammas = np.zeros(count), np.full(count, GAMMA_SRGB)
     if tracks is None or not len(tracks.points):
         return Tones(log_exposures, gammas)
-    good = ((tracks.colors > 0.03) & (tracks.colors < 0.95)).all(1)
+    good = ((tracks.colors > 0.03) & (tracks.colors < 0.95)).all(1)  # neither black nor clipped
     z = base_log(tracks.colors[good], "srgb")[0].mean(1)
     views, points = tracks.views[good], tracks.points[good]
     per_view = np.maximum(np.bincount(views, minlength=count), 1)
     per_point = np.maximum(np.bincount(points, minlength=tracks.point_count), 1)
     for _ in range(ROUNDS):
         mean = np.bincount(points, z - log_exposures[views], tracks.point_count) / per_point
-        off = np.clip(z - log_exposures[views] - mean[points], -1.0, 1.0)
+        off = np.clip(z - log_exposures[views] - mean[points], -1.0, 1.0)  # outliers
         log_exposures = log_exposures + np.bincount(views, off, count) / per_view
         log_exposures -= log_exposures.mean()
     return Tones(log_exposures, gammas)

@@ -114,7 +114,7 @@ def exploration_noise(
 ) -> Float[Array, "n 3"]:
     """Return the noise to add to the means after a step, scene units.
 
-    It is a normal vector times each Gaussian's covariance and moves only nearly transparent
+    The noise, a normal vector times each Gaussian's covariance, moves only nearly transparent
     Gaussians. `rate` is the noise scale times the learning rate of the means.
     """
     # Always float32, so that the random numbers are equal in any precision.

@@ -17,7 +17,7 @@ from p2gs_jax.types import Gaussians, Population
 
 # Opacity logit of empty slots: below every cutoff.
 EMPTY_LOGIT = -20.0
-GROWTH_BUCKET = 1.5
+GROWTH_BUCKET = 1.5  # ratio of consecutive capacities
 
 
 class Outcome(NamedTuple):

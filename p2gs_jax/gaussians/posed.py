@@ -93,7 +93,7 @@ def turning(R: Float[np.ndarray, "3 3"], count: int) -> Float[np.ndarray, "k k"]
 def half_turn(g: Gaussians) -> Gaussians:
     """Return the Gaussians rotated by 180 degrees about x; twice gives the original.
 
-    This converts between COLMAP's axes (right, down, forward) and those of graphics (right, up,
+    This converts between COLMAP's axes (right, down, forward) and graphics' axes (right, up,
     back).
     """
     # A rotation by 180 degrees about an axis only changes signs of the harmonics.

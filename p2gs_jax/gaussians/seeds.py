@@ -21,7 +21,7 @@ from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.visibility import unoccluded
 from p2gs_jax.types import Gaussians, Photometry, Scene, View
 
-NEIGHBOURS = 3
+NEIGHBOURS = 3  # number of neighbours that give a scale (3DGS)
 # 3DGS: the scene extent is 1.1 times the radius of the camera centres.
 EXTENT_MARGIN = 1.1
 MIN_RADIANCE = 1e-3  # in the gauge of the exposures
@@ -63,7 +63,7 @@ def misplaced(views: Sequence[View], points: Float[np.ndarray, "p 3"]) -> Bool[n
 def cameras_radius(views: Sequence[View], points: Float[np.ndarray, "p 3"]) -> float:
     """Return the radius of the cameras (3DGS) without misplaced ones, scene units.
 
-    It is at least 0.05 times the median distance of the points, for cameras in one place.
+    The radius is at least 0.05 times the median distance of the points, for cameras in one place.
     """
     centers = camera_centers(views)[~misplaced(views, points)]
     middle = centers.mean(0)
@@ -171,7 +171,7 @@ def photographed_radiance(
 ) -> Float[np.ndarray, "p 3"]:
     """Return the mean radiance at the scene's points in the training photographs that see them.
 
-    It is in the gauge of the initial exposures. Points that no photograph sees get the median of
+    Its gauge is set by the initial exposures. Points that no photograph sees get the median of
     the other points.
     """
 

@@ -68,7 +68,7 @@ def sphere_behind(
     middle = seeds.camera_centers(views)[~seeds.misplaced(views, points)].mean(0)
     radius *= cfg.shell_radius
     if len(points):
-        far = float(np.quantile(np.linalg.norm(points - middle, axis=1), 0.98))
+        far = float(np.quantile(np.linalg.norm(points - middle, axis=1), 0.98))  # without outliers
         radius = max(min(radius, 10 * far), BEHIND_SEEDS * far)
     return Sphere(middle, radius)
 
@@ -93,7 +93,7 @@ def find_shell(
 ) -> Shell | None:
     """Return the shell of a scene, or None if it needs none.
 
-    It lies on `sphere`; None means `sphere_behind`. `radius` is the cameras' radius, scene units.
+    The shell lies on `sphere`; None stands for `sphere_behind` the cameras, of radius `radius`.
     """
     if cfg.shell == "off":
         return None

@@ -1,6 +1,6 @@
 """`rasterization` with the names, shapes and meaning of gsplat, on the kernels of this package.
 
-The interface is that of `gsplat/rendering.py` (Ye et al., arXiv 2409.06765). Colours are linear
+The interface follows `gsplat/rendering.py` (Ye et al., arXiv 2409.06765). Colours are linear
 radiance and are not clamped from above.
 """
 

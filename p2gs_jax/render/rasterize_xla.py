@@ -49,7 +49,7 @@ def merge(
     """Return the channels and transmittance of every tile, and before each extra slot.
 
     `composited` holds the channels and, last, the transmittance of every slot; `tiles` are the
-    tiles of the extra slots, of which `extra` are used.
+    tiles of the extra slots; the first `extra` of these are used.
     """
 
     def at(a, i):

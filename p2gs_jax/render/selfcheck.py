@@ -24,7 +24,7 @@ from p2gs_jax.render.tiles import slow_here
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians
 
-WIDTH, HEIGHT, COUNT = 32, 24, 64
+WIDTH, HEIGHT, COUNT = 32, 24, 64  # pixels, pixels, Gaussians
 # Largest allowed errors: of the image relative to its brightest value, of gradients in the relative
 # L2 norm. The stop rule causes 5e-4 and 5e-3; a wrong kernel has far larger errors.
 IMAGE, GRADIENT = 1e-3, 1e-2

@@ -3,7 +3,7 @@
 Each of N cores holds every N-th Gaussian; it lists, projects and moves those that the view may
 show. The cores exchange splats, so that each knows all splats, and each composites every N-th row
 of tiles; then they exchange the rows of the image (`render/cores.py`). A step still has one view.
-Its result differs from that of one core only by the order of sums and by the exploration noise:
+Its result differs from a step on one core only by the order of sums and by the exploration noise:
 every core draws other noise.
 """
 

@@ -84,7 +84,7 @@ class TrainingViews:
         return batches_of(view_order(self.seed, epoch, len(self.rows)), self._kinds, count)
 
     def first_of_sizes(self, step: int, count: int) -> list[int]:
-        """Return the next step, from this one on, for every canvas size."""
+        """Return the next step, from `step` on, for every canvas size."""
         steps = range(step, step + count * len(self._batches(0, count)), count)
         kinds = [self._kinds[self.indices_at(k, count)[0]] for k in steps]
         return [steps[kinds.index(kind)] for kind in dict.fromkeys(kinds)]

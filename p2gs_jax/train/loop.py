@@ -77,7 +77,7 @@ class TrainResult:
 
 @dataclass(eq=False)
 class Trainer:
-    """Runs one fit from its initial parameters to its final ones.
+    """Runs one fit from its initial to its final parameters.
 
     A custom image formation is passed as `params.appearance` of `run`.
     """
@@ -94,7 +94,7 @@ class Trainer:
     on_log: Callable[[LogRecord], None] = lambda record: None
     on_message: Callable[[str], None] = lambda text: None  # receives messages to the user
     mesh: Mesh | None = None  # the devices of a step, from `mesh_of`
-    # loss terms to add to those of `cfg`, to replace, or (None) to remove
+    # loss terms by name, added to the terms of `cfg` or replacing them; None removes a term
     terms: Mapping[str, LossTerm | None] | None = None
     strategy: Strategy | None = None  # densification; None: the strategy that `cfg` names
     now: Callable[[], float] = time.monotonic  # monotonic clock, seconds
@@ -207,11 +207,11 @@ class Trainer:
                 break
             signal = self.signals.arrived
             if signal is not None or host.elapsed_s - saved > pause:
-                begun = host.elapsed_s
+                save_began = host.elapsed_s
                 self._save(self.step.whole(state), host)
                 clock.tick(host)
                 saved = host.elapsed_s
-                pause = pause_between(every_s, saved - begun)
+                pause = pause_between(every_s, saved - save_began)
             self.look(functools.partial(self.step.whole, state), signal is not None)
             if signal is not None:
                 self.on_message(

@@ -27,7 +27,7 @@ SHARE, LONGEST_PAUSE = 0.01, 20.0
 def record_of(
     reports: Sequence[StepReport], host: HostState, gaussians: int, left_s: float | None
 ) -> LogRecord:
-    """Return the log record of a burst.
+    """Return the log record of a burst of steps.
 
     `reports` are the reports of its steps; `host` and `gaussians` are the counters and the
     population after it. `left_s` is the estimated time of optimisation left, seconds; None: not

@@ -24,7 +24,7 @@ FAULT_NONE, FAULT_OVERFLOW, FAULT_NONFINITE = 0, 1, 2
 
 
 class Fault(eqx.Module):
-    """Why the state stopped advancing; it stays set, so the host need not look after every step."""
+    """The reason why no step writes; it stays set, so the host need not look after every step."""
 
     kind: Int[Array, ""]  # 0 none, 1 a list was too short, 2 a value is not finite
     needed: Int[Array, ""]  # entries that the tile list needed

@@ -97,8 +97,8 @@ def compiled_over(kind: type[MeshStep], name: str, *, mesh: Mesh, **static: Any)
 class Step:
     """The step `(state, batch, partner, controls, capacity=..., degree=...)` of a fit.
 
-    It returns the next state and a report; the previous state is donated. Random numbers depend on
-    the seed and the step number alone. `image_loss` is the loss. Work per Gaussian runs in
+    A call returns the next state and a report; the previous state is donated. Random numbers depend
+    on the seed and the step number alone. `image_loss` is the loss. Work per Gaussian runs in
     blocks, and only for Gaussians that the view may show; all others do not change
     (`OptimizerConfig.visible_only`). `train/update.py` describes how a step treats overflows and
     values that are not finite.
@@ -108,7 +108,7 @@ class Step:
     optimizer: Optimizer  # from `make_optimizer`
     extent: float  # scene extent, scene units
     noise: float | None = None  # scale of the exploration noise, or None (`strategies.Strategy`)
-    # loss terms to add to those of `cfg`, to replace, or (None) to remove; see `loss_terms`
+    # loss terms by name, added to the terms of `cfg` or replacing them (`loss_terms`)
     terms: Mapping[str, LossTerm | None] = dataclasses.field(default_factory=dict)
     _ready: dict[Any, Callable] = dataclasses.field(default_factory=dict, init=False)
 
@@ -260,7 +260,7 @@ class StepPrograms:
     def expect(self, step: Any, key: Key, *arguments: Any, images: bool = True) -> list[Future]:
         """Begin to compile a step in the background; return its programs in their order.
 
-        `step` takes the `arguments`, of which shapes suffice. Without `images`, the middle program,
+        `step` takes the `arguments`; their shapes suffice. Without `images`, the middle program,
         which depends on the tone curve, is left out.
         """
         visible_only = step.settings("show")["cfg"].optimizer.visible_only

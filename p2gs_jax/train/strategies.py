@@ -91,7 +91,7 @@ class Strategy(Protocol):
 def demand(gaussians: Gaussians, moments: AdamState, b2: float) -> Float[Array, " n"]:
     """Return the demand for more Gaussians at each Gaussian; 0 for those that no step has seen.
 
-    It is the root mean square, over the views that showed a Gaussian, of the gradient of the loss
+    Demand is the root mean square, over the views that showed a Gaussian, of the loss's gradient
     by its mean, in units of its largest scale. If views pull a Gaussian in different directions,
     one Gaussian is too few. 3DGS splits by the mean length of the same gradient on the screen
     (ours: BUILD_NOTES, "Births where they are needed"). `b2` is Adam's decay of the second moment.

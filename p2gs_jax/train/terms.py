@@ -213,31 +213,31 @@ def enhanced_loss(
     rendered: Image,
     photograph: Image,
     mask: Layer,
-    view: Curves,
+    curves: Curves,
     cfg: LossConfig,
 ) -> Float[Array, ""]:
     """Return the weighted photometric loss of a render against the enhanced photograph."""
-    compared = photometric_loss(rendered, enhanced(photograph, view), mask, cfg)
+    compared = photometric_loss(rendered, enhanced(photograph, curves), mask, cfg)
     return ENHANCED * sum(compared.values(), jnp.zeros(()))
 
 
-def curve_prior(view: Curves, photograph: Image, mask: Layer) -> Float[Array, ""]:
+def curve_prior(curves: Curves, photograph: Image, mask: Layer) -> Float[Array, ""]:
     """Return weighted squared distances of curve, pseudo curve and histogram equalisation.
 
     A further summand is the curve's roughness. The histogram is of the photograph's valid pixels.
     """
     grey = photograph[::4, ::4].mean(-1).reshape(-1)
     equalized = lax.stop_gradient(cumulative(grey, mask[::4, ::4].reshape(-1), ENTRIES))
-    pseudo = pseudo_curve(view.shape)
+    pseudo = pseudo_curve(curves.shape)
 
     def mean_square(a, b):
         return jnp.mean((a - b) ** 2)
 
     return (
-        EQUALIZED * mean_square(view.curve, equalized)
-        + SMOOTH * jnp.mean(jnp.diff(view.curve) ** 2)
+        EQUALIZED * mean_square(curves.curve, equalized)
+        + SMOOTH * jnp.mean(jnp.diff(curves.curve) ** 2)
         + PSEUDO
-        * (mean_square(pseudo, view.curve) + PSEUDO_EQUALIZED * mean_square(pseudo, equalized))
+        * (mean_square(pseudo, curves.curve) + PSEUDO_EQUALIZED * mean_square(pseudo, equalized))
     )
 
 
