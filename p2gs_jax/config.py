@@ -166,7 +166,7 @@ class PhotometryConfig:
     ours: mid-grey, whose errors in EV are 2.5 to 5 times smaller: docs/photometry.md, 3)."""
     clamp: bool = False
     """Clamp exposed radiance to [1e-6, 10] and display values to [0, 1] (paper, Tone-mapping
-    estimation); ours does not clamp and censors the loss."""
+    estimation; ours: no clamp, but a censored loss)."""
     parameterization: Literal["log", "linear"] = "log"
     """Parameters of the optimiser: logarithms (ours), or e and gamma themselves (paper)."""
     start: Literal["tracks", "random"] = "tracks"
@@ -263,7 +263,7 @@ class OptimizerConfig:
     appearance_final: float = 0.1
     """Fraction to which the rate of the corrections decays exponentially (3DGS: 0.1)."""
     appearance_warmup: float = 0.0
-    """Fraction of the run in which that rate rises from 1 % of it (PPISP: 500 steps of 30k)."""
+    """Fraction of the run in which the corrections' rate rises from 1 % (PPISP: 500 of 30k)."""
     velocities: float = 0.3
     """Rate of the velocities of vibrating Gaussians, scene units per second (ours: BUILD_NOTES)."""
     peaks: float = 0.03

@@ -74,7 +74,7 @@ DISPLAY: Fields = {
     "photometry.freeze_until": 0.0,
     "loss.censored": False,
 }
-# The same with the schedule, renderer and budget of `robust`. Rates of colours are 4 times the best
+# DISPLAY with the schedule, renderer and budget of `robust`. Rates of colours are 4 times the best
 # of three (BUILD_NOTES, "LDR splatting"); the factor 4 was not measured (BUILD_NOTES, "Rates").
 LDR: Fields = DISPLAY | {
     "optimizer.sh_dc": 2e-2,

@@ -280,11 +280,11 @@ class Batch(eqx.Module):
     mask: Float[Array, "h w"] | Bool[Array, "h w"]  # 1 = use, 0 = ignore
     view_index: Int[Array, ""]  # its row in `Photometry`
     measured: Measured | None = None  # depths for the loss, or None where the loss has no such term
-    # opacity of the photograph, stored as `ldr`, which is then premultiplied by it; None: there is
-    # no background
+    # opacity of the photograph, in the type of `ldr`, which is then premultiplied by it; None: no
+    # background
     alpha: Float[Array, "h w"] | UInt[Array, "h w"] | None = None
     backdrop: Float[Array, " 3"] | None = None  # display values of the background, or None
-    # width and height of the photograph in the upper left of a larger canvas; None: it fills it
+    # width and height of the photograph in the upper left of a larger canvas; None: no canvas
     size: Float[Array, " 2"] | None = None
 
 
@@ -296,8 +296,8 @@ class Distortion:
     """Lens distortion; a `radial` lens of all zeros is a pinhole.
 
     `coefficients` are OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]] (`radial`, rational from k4 on),
-    or its k1, k2, k3, k4 of the angle (`fisheye`). Other models have COLMAP's names, and its
-    parameters behind the principal point.
+    or its k1, k2, k3, k4 of the angle (`fisheye`). Other models have COLMAP's names, and
+    COLMAP's parameters after the principal point.
     """
 
     coefficients: tuple[float, ...]
@@ -346,7 +346,7 @@ class TrackedObject:
 class Lidar:
     """All measurements of the laser scanners of a drive.
 
-    Points are in world coordinates at the time of their measurement, seconds; `objects` is the row
+    Points are in world coordinates at their `times`, seconds; `objects` is the row
     in `Scene.objects` of the moving object that a point lies on, -1: on none.
     """
 
@@ -372,7 +372,7 @@ class Scene:
     """The input of a fit, as read from any format.
 
     Attributes:
-        root: folder that the user named.
+        root: folder or JSON file that the user named.
         format: name of the format.
         views: sorted by name.
         points: seed points, scene units.

@@ -111,15 +111,15 @@ def fit(
         scene = load(paths.scene, paths.run, cfg, reporter, clock)
         truth = check_scene(scene, cfg, paths, weights)
         kept = kept_choice(cfg, folder) if resume else None
-        # A resumed run that is longer starts from the steps and budget of its first start.
+        # A resumed run is prepared with the steps and the budget of its first start.
         options = with_values(cfg, first_plan(folder))
         start = _prepared(scene, options, folder, optimiser, kept, clock, reporter)
         start.cfg = dataclasses.replace(start.cfg, train=cfg.train)
         lock.require()
-        left_s = seconds_to_finish(scene, cfg, weights, reference=truth is not None)
+        finish_s = seconds_to_finish(scene, cfg, weights, reference=truth is not None)
         with begun(folder, paths, cfg, start.decisions):
             spent_s = time.monotonic() - begin
-            result = optimiser.run(start, resume=resume, spent_s=spent_s, finish_s=left_s)
+            result = optimiser.run(start, resume=resume, spent_s=spent_s, finish_s=finish_s)
         params, owner = fitted(result, start.scene, cfg)
         lock.require()
         account = account_of(start, params, result, clock, begin)
@@ -157,8 +157,8 @@ def _prepared(
 class Optimiser:
     """Compiles and runs the steps of a fit; as a context manager it ends the compilers.
 
-    The log and checkpoints go into `folder`. `mesh` has the devices of a step of several views, and
-    `custom` the parts that the caller of `fit` passed.
+    The log and checkpoints go into `folder`. `mesh` has the devices that share a step; `custom` has
+    the loss terms, the formation and the strategy of the caller of `fit`.
     """
 
     def __init__(
@@ -179,15 +179,15 @@ class Optimiser:
         self._programs.close()
 
     def expect(
-        self, found: Survey, kept: Decisions | None = None, given: Decisions | None = None
+        self, found: Survey, kept: Decisions | None = None, larger: Decisions | None = None
     ) -> OnChosen:
         """Begin to compile steps while the exposures are solved, mostly on one core.
 
         Model and curve are those of checkpoints (`kept`) or of a larger scene that contains this
-        one (`given`). Otherwise they are the most frequent choice, and the returned function
+        one (`larger`). Otherwise they are the most frequent choice, and the returned function
         compiles again for the choice of the scene.
         """
-        guess = given or likely(found.cfg, kept, found.near)
+        guess = larger or likely(found.cfg, kept, found.near)
 
         def begin(decisions: Decisions, curve_known: bool) -> None:
             start = expected(found, decisions)
@@ -196,12 +196,12 @@ class Optimiser:
             )
 
         def chosen(form: Form, response: Response) -> None:
-            # Vignetting and responses of cameras are constants of the programs, and not yet solved.
+            # Vignetting and responses of cameras are constants of the programs, but not yet solved.
             if guess is not None and form.vignetting is None and response.by == "all":
                 begin(with_choice(guess, form, response), True)
 
         if guess is not None:
-            begin(guess, bool(kept or given) or not found.cfg.photometry.select)
+            begin(guess, bool(kept or larger) or not found.cfg.photometry.select)
         return chosen
 
     def run(

@@ -31,9 +31,9 @@ from p2gs_jax.scene.exposures import check_source, read_known_exposures
 from p2gs_jax.scene.pixels.store import size_at
 from p2gs_jax.types import Scene
 
-# Bytes.
+# Bytes of programs and libraries, and for each parameter, pixel of a view and decoded pixel.
 OF_PROGRAMS = 0.8e9
-A_PARAMETER = 37  # with its moments, gradient and the copies of a densification
+A_PARAMETER = 37  # with moments, gradient and the copies of a densification
 A_PIXEL = 650
 A_PHOTOGRAPH_PIXEL = 7
 OPTIONS = "--gaussians, --max-width or --data.cache-mb"
@@ -173,14 +173,14 @@ def memory_needed(scene: Scene, cfg: FitConfig, coverage: Coverage) -> MemoryNee
     """Return the bytes of memory that a fit needs at its peak."""
     count = max(seed_bound(cfg, min(len(scene.points), cfg.init.max_seeds), coverage), 1)
     parameters = 11 + 3 * (cfg.render.sh_degree + 1) ** 2
-    here = jax.default_backend() == "cpu"
+    on_host = jax.default_backend() == "cpu"
     sizes = [size_at(view, cfg.data.max_width) for view in scene.views]
     decoded = sum(w * h for w, h in sizes) * A_PHOTOGRAPH_PIXEL
     return MemoryNeeded(
         programs=OF_PROGRAMS,
-        gaussians=float(here * count * parameters * A_PARAMETER),
+        gaussians=float(on_host * count * parameters * A_PARAMETER),
         photographs=float(min(decoded, cfg.data.cache_mb * 2**20)),
-        view=float(here * coverage.pixels * A_PIXEL),
+        view=float(on_host * coverage.pixels * A_PIXEL),
         population=count,
     )
 
@@ -205,7 +205,7 @@ def require_memory(needed: MemoryNeeded) -> None:
 
 @contextlib.contextmanager
 def memory_named() -> Iterator[None]:
-    """Turn errors about memory in a `with` block into one that names the remedy.
+    """Turn an error about memory in a `with` block into one that names the remedy.
 
     Raises:
         UserError: memory ran out. Other errors pass unchanged.

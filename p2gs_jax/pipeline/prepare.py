@@ -44,7 +44,7 @@ class Prepared:
     notes: list[str] = field(default_factory=list)  # notes for the user
 
     def view(self, index: int) -> tuple[Camera, Float32[np.ndarray, "h w 3"], np.ndarray]:
-        """Return the camera, the photograph (display values) and the mask of a view in a step."""
+        """Return the camera, the photograph (display values) and the mask of a view in the fit."""
         return camera_of(self.survey.fitted, index), *self.survey.fitted.get(index)
 
 
@@ -72,7 +72,7 @@ def expected(found: Survey, decisions: Decisions) -> Prepared:
 
 def initialise(found: Survey, exposures: Exposures, reporter: Reporter | None = None) -> Prepared:
     """Return the initial state: Gaussians at the seeds of a scene whose exposures are known."""
-    return_freed_memory()  # the solution of the exposures has freed much
+    return_freed_memory()  # the solver of the exposures has freed much
     reporter, scene, nodes = reporter or Silent(), found.scene, found.nodes
     decisions = exposures.decisions
     if exposures.radiance is None:

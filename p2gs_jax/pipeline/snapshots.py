@@ -46,7 +46,7 @@ class Snapshots:
     def _write(self, state: FitState) -> None:
         start, population = self._start, state.population
         params = exposures_apart(jax.tree.map(np.asarray, state.params))
-        # All slots, so that the number of rows stays and a viewer needs no other program.
+        # All slots are written: the number of rows stays, and a viewer needs no other program.
         logits = np.where(population.alive, params.gaussians.opacity_logits, EMPTY_LOGIT)
         gaussians = dataclasses.replace(params.gaussians, opacity_logits=logits)
         params = dataclasses.replace(params, gaussians=gaussians)

@@ -33,9 +33,9 @@ from p2gs_jax.types import Measured, Scene, View
 
 # The near plane is at most this share of the depth of near points (this percentile of depths).
 NEAR_SHARE, NEAR_PERCENTILE = 0.2, 1.0
-# Percentile of depths that stands for near surfaces; other points may occlude many of the points.
+# Percentile of depths that stands for near surfaces; many of the farther points are occluded.
 EXTENT_PERCENTILE = 10.0
-# Spacing of float32 at the cameras, as a share of that depth, above which surfaces jitter.
+# Spacing of float32 at the cameras, as a share of the near depth, above which surfaces jitter.
 COARSE = 1e-4
 
 
@@ -89,9 +89,9 @@ def load(
     reporter.message(f"Run folder: {run_dir}")
     reporter.message(f"Held out: {held} of {len(scene.views)} views ({scene.split_by}).")
     if clock is not None:
-        # Without a model, nearly all of it is finding and matching features.
-        found = scene.format in ("images", "transforms")
-        name = "structure_from_motion" if found else "reading"
+        # Without a model, features are found and matched for nearly all of this time.
+        matched = scene.format in ("images", "transforms")
+        name = "structure_from_motion" if matched else "reading"
         clock.add(name, time.monotonic() - begin)
     return scene
 

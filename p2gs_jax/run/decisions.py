@@ -27,7 +27,7 @@ from p2gs_jax.run.folder import RunFolder
 
 # Key of the decisions in the metadata of checkpoints.
 KEY = "decided"
-# Factor on the rates of exposures and gammas without solved ones (docs/photometry.md, 4).
+# Factor on the rates of exposures and gammas if none were solved (docs/photometry.md, 4).
 FROM_NOTHING = 10.0
 
 
@@ -154,9 +154,9 @@ def decide(cfg: config.FitConfig, selection: Selection | None, kept: Decisions |
     if cfg.photometry.known is None:
         return decided
     # Known exposures that are fixed are not learned, and no regulariser changes their mean.
-    keep = cfg.photometry.known_deviation_ev == 0
+    fixed = cfg.photometry.known_deviation_ev == 0
     return dataclasses.replace(
-        decided, log_exposure_mean=None, freeze_until=1.0 if keep else decided.freeze_until
+        decided, log_exposure_mean=None, freeze_until=1.0 if fixed else decided.freeze_until
     )
 
 
@@ -168,7 +168,7 @@ def likely(cfg: config.FitConfig, kept: Decisions | None, near: float | None) ->
     p, relative = cfg.photometry, cfg.loss.relative_exposure
     if p.known is not None or relative.weight is not None or cfg.densify.method != "mcmc":
         return None
-    # Vignetting and responses of cameras are constants of the programs, and not yet solved.
+    # Vignetting and responses of cameras are constants of the programs, but not yet solved.
     solved = p.start == "tracks" and (p.vignetting is not None or p.responses != "all")
     if kept is None and not p.select and solved:
         return None
@@ -217,7 +217,7 @@ def without_tracks(decided: Decisions) -> Decisions:
 
 
 def kept_choice(cfg: config.FitConfig, folder: RunFolder) -> Decisions | None:
-    """Return the decisions in the checkpoints of a run; None: nothing was solved, or none exist."""
+    """Return the decisions in the checkpoints of a run; None: nothing was solved or saved."""
     p = cfg.photometry
     solved = p.vignetting is not None or p.responses != "all"
     if not ((p.select or solved) and p.start == "tracks"):

@@ -22,14 +22,14 @@ try:
 except ImportError:  # systems without flock have no lock
     fcntl = None
 
-NAME = ".lock"
+NAME = ".lock"  # file of the lock
 _FROM_RUN = "_from_run"
 
 
 class RunFolder:
     """The paths of a run folder; docs/files.md describes the files.
 
-    The parameters lie in the folder `at`, if it is given: that of a snapshot.
+    The files of parameters lie in `at`, the folder of a snapshot, or in `root` without it.
     """
 
     def __init__(self, root: Path, at: Path | None = None):
@@ -93,7 +93,7 @@ def find(saved: Mapping[str, Any], key: str, folder: Path) -> Path | None:
 
 
 class RunLock:
-    """The held lock of a folder; no handle: the file system does not support locks."""
+    """The held lock of a folder; without a handle, the file system does not support locks."""
 
     def __init__(self, folder: Path, handle: int | None):
         self.folder, self._handle = folder, handle

@@ -82,7 +82,7 @@ def _missing(data, fields: Sequence[str]) -> str | None:
 
 
 def with_formation_of(cfg: PhotometryConfig, saved: PhotometryFile) -> PhotometryConfig:
-    """Return options with the image formation of a file, which has no learned corrections.
+    """Return options with the image formation of a file; it has no learned corrections.
 
     Raises:
         UserError: the file has no valid tone curve, or a broken camera.
@@ -190,12 +190,12 @@ def write_solution(
     scale.
     """
     s, rows = solution, []
-    seen = np.isfinite(s.exposure_errors)
-    e = np.exp(s.log_exposures[seen])
+    solved = np.isfinite(s.exposure_errors)
+    e = np.exp(s.log_exposures[solved])
     for i, view in enumerate(views):
         found = (np.exp(s.log_exposures[i]), s.exposures_ev[i], s.gammas[i])
         errors = (s.exposure_errors_ev[i], s.gamma_errors[i])
-        values = [float(v) if seen[i] else None for v in (*found, *errors)]
+        values = [float(v) if solved[i] else None for v in (*found, *errors)]
         row = _row(view, "train", *values[:3])
         row["exposure_ev_error"], row["gamma_error"] = values[3:]
         row["white_balance"], row["white_balance_ev_error"] = _balance(s, i)

@@ -25,7 +25,7 @@ from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.types import GAMMA_SRGB, Params, Scene, View
 
 MARKERS = "osD^vPX*"
-STATED = {"true": "--", "EXIF": ":", "EXIF or file": ":"}
+STATED = {"true": "--", "EXIF": ":", "EXIF or file": ":"}  # line styles by source
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 
 ROWS = ("photograph", "render,\nexposure of\nthe view", "render,\none exposure\nfor all")
@@ -154,7 +154,7 @@ def _lines(exposures_ev, cameras: Sequence[str], stated: Mapping[str, Any]) -> l
             if len(rows):
                 lone = {"marker": "_", "markersize": 7} if len(rows) == 1 else {}
                 out.append((rows, values[rows], style | lone, label))
-                label = ""  # once
+                label = ""  # in the legend once
     return out
 
 
@@ -178,9 +178,9 @@ def write_calibration_plot(
 
     figure = Figure(figsize=(11, 4), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(2, 1))
-    seen = np.isfinite(solution.exposure_errors)
-    found = np.where(seen, solution.exposures_ev, np.nan)
-    bars = np.where(seen, 2 * solution.exposure_errors_ev, np.nan)
+    solved = np.isfinite(solution.exposure_errors)
+    found = np.where(solved, solution.exposures_ev, np.nan)
+    bars = np.where(solved, 2 * solution.exposure_errors_ev, np.nan)
     for rows, values, style, label in _lines(found, cameras, {"EXIF or file": stated_ev}):
         error = None if label in STATED or not label else bars[rows]
         left.errorbar(rows, values, error, label=label or None, **style)

@@ -168,9 +168,9 @@ def _relative(path: Path, base: Path) -> str:
 def write_objects(
     path: Path, owner: Int[np.ndarray, " n"] | None, moving: MovingObjects, scene: Scene
 ) -> None:
-    """Write the owner of each Gaussian, a row of `moving`, -1: none; None: there are no boxes.
+    """Write the owner of each Gaussian: a row of `moving.objects`, or -1; None: there are no boxes.
 
-    `moving` has some of the scene's objects.
+    The objects of `moving` are objects of the scene.
     """
     rows = [
         next(row for row, other in enumerate(scene.objects) if other is thing)
@@ -189,7 +189,7 @@ def write_objects(
 def read_objects(
     path: Path, scene: Scene, count: int
 ) -> tuple[Int[np.ndarray, " n"] | None, MovingObjects | None]:
-    """Return owners and objects from `write_objects` for `count` Gaussians; None: nothing moves.
+    """Return owners and objects from `write_objects` for `count` Gaussians; None: there are none.
 
     Raises:
         UserError: the file is broken, or belongs to another run.

@@ -86,8 +86,8 @@ def write_run(
 ) -> None:
     """Write the scene, the Gaussians, the photometry and the summary for `load_run`.
 
-    All Gaussians are alive. `owner` has the row in `moving` of the object of each, and `cfg` the
-    options of the fit. With `decisions`, this starts the run folder anew (`write_start`). `fitted`
+    All slots of `params` are written. `owner` has the row of the object of each in `moving`; `cfg`
+    has the options of the fit. With `decisions`, `write_start` begins the folder anew. `fitted`
     has the exposures fitted to held-out views by row, `unknown` the names of photographs with
     unknown exposures. True exposures and PSNRs by image name, and the lines of `heading`, are for
     the summary; without `shown` there is none. Without `metering` only the files of parameters are

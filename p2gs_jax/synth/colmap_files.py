@@ -1,4 +1,4 @@
-"""A drive as a COLMAP model: cameras.bin, images.bin, points3D.bin; its points are true depth."""
+"""A drive as a COLMAP model: cameras.bin, images.bin, points3D.bin; its points have true depth."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from p2gs_jax.core.streams import SceneStream, generator
 from p2gs_jax.synth.rig import MOUNTS
 
 _PINHOLE = 1  # COLMAP's model id
-_DEPTH_TOLERANCE = 0.01
+_DEPTH_TOLERANCE = 0.01  # share of the depth
 _SEED_RANGE = 90.0  # m: farther points are not triangulated
 
 
@@ -62,11 +62,11 @@ def write_seeds(
     for row, name in enumerate(views.names):
         x, y, z, w = Rotation.from_matrix(views.viewmats[row][:3, :3]).as_quat(canonical=True)
         pose = (w, x, y, z, *views.viewmats[row][:3, 3])
-        which = np.flatnonzero(seen[row])
-        keypoints = np.empty(len(which), keypoint)
-        keypoints["xy"], keypoints["id"] = xy[row, which], which + 1
+        visible = np.flatnonzero(seen[row])
+        keypoints = np.empty(len(visible), keypoint)
+        keypoints["xy"], keypoints["id"] = xy[row, visible], visible + 1
         data.append(struct.pack("<I7dI", row + 1, *pose, ids[name.split("/")[0]]))
-        data.append(name.encode() + b"\0" + struct.pack("<Q", len(which)) + keypoints.tobytes())
+        data.append(name.encode() + b"\0" + struct.pack("<Q", len(visible)) + keypoints.tobytes())
     (folder / "images.bin").write_bytes(b"".join(data))
 
     slot = np.cumsum(seen, axis=1) - 1  # the observation's place among its image's keypoints
@@ -131,6 +131,6 @@ def _observe_seeds(
         inverse = 1.0 / depths[row].astype(np.float64)
         top = (1 - a) * inverse[j, i] + a * inverse[j, i + 1]
         bottom = (1 - a) * inverse[j + 1, i] + a * inverse[j + 1, i + 1]
-        found = (1 - b) * top + b * bottom
-        seen[row] = inside & (np.abs(found * z - 1.0) < _DEPTH_TOLERANCE)
+        interpolated = (1 - b) * top + b * bottom
+        seen[row] = inside & (np.abs(interpolated * z - 1.0) < _DEPTH_TOLERANCE)
     return xy, seen

@@ -59,7 +59,8 @@ def paint(
 ) -> Surface:
     """Return the surface at the points that rays, of unit directions, hit.
 
-    `index` is the row of the primitive, P for the ground; `footprint` a pixel's width there, m.
+    `index` is the row of the primitive, `town.size` for the ground; `footprint` is the width of a
+    pixel there, m.
     """
     material = jnp.asarray(np.append(town.material, Material.ROAD).astype(np.int32))[index]
     s = _point(town, p, view, index, material, footprint)
@@ -112,7 +113,7 @@ def _point(
 def _brushes(
     s: Point, seed: int, none: Array, dull: Array
 ) -> dict[Material, Callable[[], tuple[Array, Array, Array]]]:
-    """Return the functions of albedo, emission and gloss, by material."""
+    """Return functions for albedo, emission and gloss, by material; `none` and `dull` are zeros."""
     mottled = s.color * (1.0 + 0.16 * s.fine[0] + 0.16 * s.coarse[0])
     return {
         Material.ROAD: lambda: (_road(s, seed), none, dull),
@@ -192,7 +193,7 @@ def _sign(s: Point) -> Array:
 
 
 def _normal(town: Town, p: Array, index: Array, lo: Array, hi: Array) -> Array:
-    """Return the unit normal of the primitive, the ground's where index is P."""
+    """Return the unit normal of the primitive, or of the ground where `index` is `town.size`."""
     middle, half = (lo + hi) / 2, jnp.maximum((hi - lo) / 2, 1e-6)
     local = (p - middle) / half
     # The face of a box is the one whose plane the point lies on.
@@ -213,21 +214,21 @@ def _normal(town: Town, p: Array, index: Array, lo: Array, hi: Array) -> Array:
 
 
 class _Bay(NamedTuple):
-    """Where on a wall points are, in bays and floors; lengths are in m."""
+    """Positions of points on a wall, in bays and floors; lengths are in m."""
 
     u: Array  # along the wall
     du: Array  # from the middle of a bay
     dz: Array  # from the middle of a floor
     cell: Array  # width of a bay
-    length: Array
-    seen: Array  # number of the wall, which no other has
-    draw: Array  # three random numbers a bay and floor
+    length: Array  # of the wall
+    wall_id: Array  # a number that no other wall has
+    draw: Array  # three random numbers for each bay and floor
     half: Array  # half the width of a window
-    frame: Array  # tone of its frames
+    frame: Array  # albedo of window frames
 
 
 def _facade(s: Point, seed: int) -> tuple[Array, Array, Array]:
-    """Windows on a grid of bays and floors, shop fronts below; brick, plaster or stone."""
+    """Return albedo, emission and gloss of walls: windows on a grid, shop fronts below."""
     z = s.p[2]
     along_y = jnp.abs(s.normal[0]) > 0.5
     u = jnp.where(along_y, s.p[1] - s.lo[1], s.p[0] - s.lo[0])
@@ -238,10 +239,10 @@ def _facade(s: Point, seed: int) -> tuple[Array, Array, Array]:
     du = u - (column + 0.5) * cell
     floor = jnp.floor((z - t.GROUND_FLOOR_HEIGHT) / t.FLOOR_HEIGHT)
     dz = z - t.GROUND_FLOOR_HEIGHT - (floor + 0.5) * t.FLOOR_HEIGHT - 0.05
-    seen = s.row.astype(jnp.float32) + 0.25 * along_y
-    draw = hash3(column, floor, seen, seed + 20)
+    wall_id = s.row.astype(jnp.float32) + 0.25 * along_y
+    draw = hash3(column, floor, wall_id, seed + 20)
     half, frame = jnp.minimum(0.58, 0.3 * cell), jnp.where(s.random < 0.6, 0.62, 0.07)
-    bay = _Bay(u, du, dz, cell, length, seen, draw, half, frame)
+    bay = _Bay(u, du, dz, cell, length, wall_id, draw, half, frame)
     albedo, emission, gloss = _windows(s, bay, seed)
 
     # Ground floor: shop windows, doors, dark gateways, or plain windows in a rusticated base.
@@ -265,7 +266,7 @@ def _facade(s: Point, seed: int) -> tuple[Array, Array, Array]:
 
 
 def _windows(s: Point, bay: _Bay, seed: int) -> tuple[Array, Array, Array]:
-    """Walls and windows of the upper floors, some of them lit."""
+    """Return albedo, emission and gloss of the upper floors; some windows are lit."""
     z, du, dz, draw, half_w, half_h = s.p[2], bay.du, bay.dz, bay.draw, bay.half, 0.92
     wall = s.color * _masonry(s, bay.u, z, seed)
     drip = jnp.exp(-jnp.abs(dz + 1.15) * 2.5) * jnp.clip(s.coarse[2] + 0.3, 0.0, 1.0)
@@ -299,8 +300,8 @@ def _windows(s: Point, bay: _Bay, seed: int) -> tuple[Array, Array, Array]:
 
 
 def _shop(s: Point, bay: _Bay, shop: Array, seed: int) -> tuple[Array, Array, Array]:
-    """Shop fronts with goods on shelves, doors and gateways."""
-    u, du, z, seen, draw = bay.u, bay.du, s.p[2], bay.seen, bay.draw
+    """Return albedo, emission and gloss of shop fronts, with goods, doors and gateways."""
+    u, du, z, wall_id, draw = bay.u, bay.du, s.p[2], bay.wall_id, bay.draw
     gate = shop & (draw[0] > 0.86)
     door = shop & (draw[0] < 0.22) & ~gate
     wide = jnp.where(door, 0.55, 0.5 * bay.cell - 0.2)
@@ -309,8 +310,8 @@ def _shop(s: Point, bay: _Bay, shop: Array, seed: int) -> tuple[Array, Array, Ar
     hole = s.bar(du, wide) * s.span(z, low, high) * shop
     across = s.bar(du, wide - rim) * shop
     glass = across * (s.span(z, low + rim, high - rim) - s.span(z, 2.41, 2.49) * (~gate))
-    goods = hash1(jnp.floor(u / 0.42), jnp.floor(z / 0.36), seen, seed + 30)
-    tint = hash3(jnp.floor(u / 0.42), jnp.floor(z / 0.36), seen, seed + 31)
+    goods = hash1(jnp.floor(u / 0.42), jnp.floor(z / 0.36), wall_id, seed + 30)
+    tint = hash3(jnp.floor(u / 0.42), jnp.floor(z / 0.36), wall_id, seed + 31)
     shelf = s.grid(u, 0.42, 0.16) * s.grid(z, 0.36, 0.13) * (goods > 0.35)
     shelf = shelf * across * s.span(z, low + rim, 2.4) * (~(door | gate))
     show = glass * jnp.where(gate, 0.004, 0.03)
@@ -321,7 +322,7 @@ def _shop(s: Point, bay: _Bay, shop: Array, seed: int) -> tuple[Array, Array, Ar
     colors = jnp.asarray(colors, jnp.float32)
     front = colors[jnp.clip((s.random * 4).astype(jnp.int32), 0, 3)].T
     letters = s.grid(u, 0.34, 0.11) * s.bar(z - 3.42, 0.15) * shop
-    letters = letters * (hash1(jnp.floor(u / 0.34), 0.0 * u, seen, seed + 40) > 0.25)
+    letters = letters * (hash1(jnp.floor(u / 0.34), 0.0 * u, wall_id, seed + 40) > 0.25)
     letters = letters * (jnp.abs(u - 0.5 * bay.length) < 0.28 * bay.length)
     front = front * (1.0 + 0.1 * s.fine[0])
     base = front + letters * (as_column((0.72, 0.66, 0.48)) - front)
@@ -333,12 +334,12 @@ def _shop(s: Point, bay: _Bay, shop: Array, seed: int) -> tuple[Array, Array, Ar
 
 def _masonry(s: Point, u: Array, z: Array, seed: int) -> Array:
     """Relative tone of the wall: bricks, plaster with stains, or stone blocks."""
-    f, seen = s.footprint, s.row.astype(jnp.float32)
+    f, wall_id = s.footprint, s.row.astype(jnp.float32)
 
     def courses(w: float, h: float, joint: float, k: int) -> tuple[Array, Array]:
         course = jnp.floor(z / h)
         shifted = u + 0.5 * w * (course % 2)
-        shade = hash1(jnp.floor(shifted / w), course, seen, seed + k) - 0.5
+        shade = hash1(jnp.floor(shifted / w), course, wall_id, seed + k) - 0.5
         solid = s.grid(shifted, w, (w - joint) / 2) * s.grid(z, h, (h - joint) / 2)
         return shade * detail(f, jnp.float32(h)), 1.0 - solid
 

@@ -29,7 +29,7 @@ from p2gs_jax.synth.settings import Curve, Sensor
 ISO_REFERENCE, ISO_MINIMUM = 8, 1
 # Variances of photon noise per unit of exposed radiance, and of read noise.
 SHOT_NOISE, READ_NOISE = 2e-4, 1e-6
-DRIFT_PERIODS = 1.3
+DRIFT_PERIODS = 1.3  # of the automatic exposure in a drive
 # Largest share of the light that a drawn lens loses in its corners.
 MOST_LOST = 0.8
 FILE = Path("truth", "exposures.csv")
@@ -87,12 +87,12 @@ def draw_shots(sensor: Sensor, frames: int, cameras: int, seed: int) -> Shots:
     balance = np.exp2(np.stack([tint[:, 0], np.zeros(cameras), tint[:, 1]], 1))
     optics = generator(seed, SceneStream.OPTICS)
     lost = sensor.vignetting + sensor.vignetting_spread * optics.standard_normal(cameras)
-    turned = sensor.white_balance_drift_ev * optics.standard_normal((cameras * frames, 3))
+    drift = sensor.white_balance_drift_ev * optics.standard_normal((cameras * frames, 3))
     balance = np.repeat(balance, frames, axis=0)
     return Shots(
         iso,
         iso / ISO_REFERENCE * np.exp2(stops.ravel()),
-        balance * np.exp2(turned - turned.mean(1, keepdims=True)),
+        balance * np.exp2(drift - drift.mean(1, keepdims=True)),
         np.repeat(np.clip(lost, 0, MOST_LOST), frames),
         tuple(c for c in sensor.curves or (sensor.curve,) * cameras for _ in range(frames)),
     )

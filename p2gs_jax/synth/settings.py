@@ -21,7 +21,7 @@ class Sensor:
     """The image formation of the cameras. The defaults are the paper's ISO-Var(4)."""
 
     iso_std: float = 4.0
-    """Spread of the ISO about 8 (paper: 2 and 4); 0 is ISO-Const."""
+    """Standard deviation of the ISO about 8 (paper: 2 and 4); 0 is ISO-Const."""
     curve: Curve = "srgb"
     """Response; `filmic` bends it into an S before sRGB."""
     curves: tuple[Curve, ...] = ()
@@ -41,4 +41,4 @@ class Sensor:
     white_balance_drift_ev: float = 0.0
     """Standard deviation of each channel's gain per photograph, stops."""
     noise: float = 0.0
-    """Standard deviation of photon and read noise, 1 = a small sensor in daylight."""
+    """Factor on photon and read noise; 1: a small sensor in daylight."""

@@ -26,7 +26,7 @@ class Surface(NamedTuple):
 
 
 class Point(NamedTuple):
-    """A primitive's row of the table for each ray, and the point that it hits; [R] by default."""
+    """The point that each ray hits, and the columns of its primitive (`Solid`); [R] by default."""
 
     p: Array  # [3 R], m
     normal: Array  # [3 R]
@@ -38,7 +38,7 @@ class Point(NamedTuple):
     bay: Array
     use: Array
     random: Array
-    row: Array
+    row: Array  # of the primitive
     footprint: Array  # a pixel's width on the surface, m
     fine: Array  # [3 R] noise in [-1.25, 1.25], wavelength by material
     coarse: Array  # [3 R] noise in [-1, 1], which does not fade
@@ -100,7 +100,7 @@ def _cell_bits(x: Array, y: Array, z: Array, seed: int) -> Array:
     return _bits(_lattice(x), _lattice(y), _lattice(4.0 * z), salt)
 
 
-def _tenth_bits(bits: Array, channel: int) -> Array:
+def _ten_bits(bits: Array, channel: int) -> Array:
     """Return ten of 32 bits as a number, 0 to 1023."""
     return ((bits >> (2 + 10 * channel)) & 1023).astype(jnp.float32)
 
@@ -113,7 +113,7 @@ def hash1(x: Array, y: Array, z: Array, seed: int) -> Array:
 def hash3(x: Array, y: Array, z: Array, seed: int) -> Array:
     """Return three numbers in [0, 1) for every lattice cell (z in quarters), [3 R]."""
     bits = _cell_bits(x, y, z, seed)
-    return jnp.stack([_tenth_bits(bits, c) / 1024.0 for c in range(3)])
+    return jnp.stack([_ten_bits(bits, c) / 1024.0 for c in range(3)])
 
 
 def value_noise(x: Array, y: Array, z: Array, seeds: tuple[int, ...]) -> Array:
@@ -136,7 +136,7 @@ def value_noise(x: Array, y: Array, z: Array, seeds: tuple[int, ...]) -> Array:
         for axis in range(3):
             weight = weight * (w[axis] if offset[axis] else 1.0 - w[axis])
         for c in range(3):
-            total[c] = total[c] + weight * (_tenth_bits(bits, c) / 511.5 - 1.0)
+            total[c] = total[c] + weight * (_ten_bits(bits, c) / 511.5 - 1.0)
     return jnp.stack(total)
 
 

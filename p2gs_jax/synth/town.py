@@ -15,13 +15,11 @@ from jaxtyping import Float32, Int32
 
 Vec3 = tuple[float, float, float]
 
-ROAD_HALF_WIDTH = 5.6
-KERB_HEIGHT = 0.14
-FACADE_LINE = 9.0
+ROAD_HALF_WIDTH, KERB_HEIGHT, FACADE_LINE = 5.6, 0.14, 9.0  # m
 # Extents along x, m: the side street between the corners of buildings, the underpass of a house
 # over the street, and the drivable length, which ends before the tower that closes the view.
 CROSS_STREET, UNDERPASS, STREET_END = (27.0, 36.0), (54.0, 68.0), 100.0
-UNDERPASS_HEIGHT, FLOOR_HEIGHT, GROUND_FLOOR_HEIGHT = 5.2, 3.2, 4.0
+UNDERPASS_HEIGHT, FLOOR_HEIGHT, GROUND_FLOOR_HEIGHT = 5.2, 3.2, 4.0  # m
 
 # Materials of primitives for `tracer`; ROAD is the ground plane.
 Material = IntEnum(
@@ -51,7 +49,7 @@ class Town:
     """P primitives: boxes, then tapered boxes, then ellipsoids; columns as in `Solid`.
 
     `planes` are (n, d) of the tapered boxes' six faces: inside is n . p <= d, n unit. `seed` is
-    that of the textures' noise, `underpass` its extent along x, or None.
+    for the noise of textures, `underpass` its extent along x, m, or None.
     """
 
     n_boxes: int
@@ -119,7 +117,7 @@ class Builder:
         kind, lo, hi = 1 if top else kind, (x0, y0, z0), (x1, y1, z1)
         self.solids.append(Solid(kind, lo, hi, material, color, accent, params, top))
 
-    def is_clear(self, x: float, reach: float) -> bool:
+    def stays_clear(self, x: float, reach: float) -> bool:
         """Return whether nothing may be placed within `reach` m of x, because of the underpass."""
         return self.clear is not None and (self.clear[0] - reach < x < self.clear[1] + reach)
 
@@ -136,7 +134,7 @@ class Builder:
         self.add(tuple(c - r), tuple(c + r), material, color, kind=2)
 
     def uniform(self, low: float, high: float) -> float:
-        """Return a random number."""
+        """Return a random number from `low` to `high`."""
         return float(self.rng.uniform(low, high))
 
     def pick(self, items: list[Vec3]) -> Vec3:

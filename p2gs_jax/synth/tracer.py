@@ -28,11 +28,11 @@ from p2gs_jax.synth.town import FACADE_LINE, UNDERPASS_HEIGHT, Material, Town
 
 _TILE = 32  # pixels: a tile's rays stay in the second-level cache and share a list of primitives
 _OFFSET = 4e-3  # shadow rays start this far off the surface, m
-_DARKEST, _DAYLIGHT_REACH = 0.05, 2.5  # share of ambient light deep in an underpass; m
-_AMBIENT_UP = (0.27, 0.325, 0.43)
-_UNROLL = 4
+_DARKEST, _DAYLIGHT_REACH = 0.05, 2.5  # share of light deep in an underpass; decay, m
+_AMBIENT_UP = (0.27, 0.325, 0.43)  # radiance of the sky as ambient light
+_UNROLL = 4  # primitives per iteration of a loop
 _REACH = (0.35, 1.4)  # distances along the normal where the distance field is read, m
-_WEIGHT = (0.30, 0.30)  # how much of the ambient light each can take
+_WEIGHT = (0.30, 0.30)  # largest share of the ambient light that each removes
 _CANYON_REACH, _CANYON_WEIGHT = 5.0, 0.28  # the same for the houses alone
 
 
@@ -42,7 +42,7 @@ class Tracer:
     def __init__(self, town: Town):
         """Keep the town; nothing is compiled yet."""
         self.town = town
-        # Most of a small job is compilation; without LLVM's slowest passes it takes two thirds.
+        # Small jobs mostly compile: without LLVM's slowest passes for two thirds of the time.
         self._render = jax.jit(
             self._render_tiles,
             static_argnums=(2, 3, 4),
@@ -140,10 +140,10 @@ def _light(town: Town, p: Array, view: Array, surface: Surface, hit: Array) -> A
     fresnel = surface.gloss * (0.06 + 0.94 * (1.0 - cosine) ** 5)
     street = as_column((0.13, 0.115, 0.10))
     blend = jnp.clip((mirrored[2] - 0.12) / 0.35, 0.0, 1.0)
-    seen = street + blend * (sky(town, mirrored, clouds=False) - street)
+    reflected = street + blend * (sky(town, mirrored, clouds=False) - street)
     lobe = jnp.maximum(jnp.sum(mirrored * to_sun, 0), 0.0) ** 80
     highlight = as_column(light.sun) * (6.0 * lobe * (sun > 0))
-    return diffuse + fresnel * (seen + highlight) + surface.emission
+    return diffuse + fresnel * (reflected + highlight) + surface.emission
 
 
 def _daylight(p: Float[Array, "3 r"], underpass: tuple[float, float]) -> Float[Array, " r"]:
@@ -155,7 +155,7 @@ def _daylight(p: Float[Array, "3 r"], underpass: tuple[float, float]) -> Float[A
 
 
 def _screen_boxes(town: Town, viewmat: Array, K: Array) -> tuple[Array, Array]:
-    """Return bounds in pixels of every primitive, [P 2] each; everything if it may be beside us."""
+    """Return bounds of every primitive, pixels, [P 2]; infinite if it may be beside the camera."""
     picks = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), -1).reshape(-1, 3)
     corners = np.where(picks[:, None, :] == 0, town.lo, town.hi)  # [8 P 3]
     local = corners @ viewmat[:3, :3].T + viewmat[:3, 3]
@@ -172,7 +172,7 @@ def _screen_boxes(town: Town, viewmat: Array, K: Array) -> tuple[Array, Array]:
 def nearest_hit(
     town: Town, o: Float[Array, "3 1"], d: Float[Array, "3 r"], among: Bool[Array, " p"]
 ) -> tuple[Float[Array, " r"], Int[Array, " r"]]:
-    """Return t of the nearest hit (inf: sky) and the primitive's row; P is the ground."""
+    """Return t of the nearest hit along o + t d (inf: sky), and its row (`town.size`: ground)."""
     ground = jnp.where(d[2] < -1e-7, -o[2] / jnp.where(d[2] < -1e-7, d[2], -1.0), jnp.inf)
     start = (ground, jnp.full(d.shape[1], town.size, jnp.int32))
 

@@ -60,12 +60,12 @@ def write_street(
     Args:
         out: the new folder, which must be missing or empty.
         frames: number of photographs of each of the three cameras, `step` m apart.
-        width: image width, pixels (paper: 1920, with a height of 1300).
-        iso_std: spread of the ISO (paper: 2 and 4); 0 writes ISO-Const. `sensor` replaces it.
+        width, height: image size, pixels (paper: 1920 x 1300).
+        iso_std: standard deviation of the ISO (paper: 2 and 4); 0: ISO-Const; unless `sensor`.
         seed: seed of the town, the ISO and the points.
         supersample: samples per pixel along each axis; the default is 8 for `matte`, else 2.
         points: number of sampled seed points; points with one observation are dropped.
-        hold_out: every n-th frame, which may be held out, gives no points; 0: all frames do.
+        hold_out: every n-th frame may be held out and gives no points; 0: all frames do.
         sensor: the image formation of the cameras.
         layout: `town` adds an underpass and draws the sun; `matte` has no gloss; `long` no end.
 
@@ -73,12 +73,12 @@ def write_street(
     """
     out, sensor = Path(out), sensor or Sensor(iso_std=iso_std)
     supersample = (8 if layout == "matte" else 2) if supersample is None else supersample
-    asked = {
+    options = {
         **{"seed": seed, "frames": frames, "width": width, "height": height},
         **{"supersample": supersample, "step_m": step, "layout": layout},
         **{"hold_out": hold_out, "points_sampled": points, "iso_std": sensor.iso_std},
     }
-    _check(out, asked)
+    _check(out, options)
     town = build_town(seed, layout, frames * step)
     views, frame = _views(frames, width, height, step)
     shots = draw_shots(sensor, frames, len(MOUNTS), seed)
@@ -91,7 +91,7 @@ def write_street(
         observed = write_seeds(temporary / "sparse" / "0", views, xyz, rgb, depths)
         write_true_exposures(temporary, views.names, shots)
         card = {
-            **{"format": FORMAT, **asked, **observed, "iso_reference": ISO_REFERENCE},
+            **{"format": FORMAT, **options, **observed, "iso_reference": ISO_REFERENCE},
             **{"K": views.K.tolist(), "solids": town.size, "sensor": asdict(sensor)},
             **{"cameras": {k: asdict(m) for k, m in MOUNTS.items()}, "light": asdict(town.light)},
         }
@@ -104,11 +104,11 @@ def write_street(
 def _views(frames: int, width: int, height: int, step: float):
     """Return the cameras of a drive, and the frame of each view."""
     places = drive(frames, step=step)
-    taken = [(camera, f) for camera in sorted(MOUNTS) for f in range(frames)]
-    names = [f"{camera}/{f:06d}.png" for camera, f in taken]
-    viewmats = np.stack([camera_viewmat(MOUNTS[camera], places[f]) for camera, f in taken])
+    shots = [(camera, f) for camera in sorted(MOUNTS) for f in range(frames)]
+    names = [f"{camera}/{f:06d}.png" for camera, f in shots]
+    viewmats = np.stack([camera_viewmat(MOUNTS[camera], places[f]) for camera, f in shots])
     views = DriveViews(names, viewmats, intrinsics(width, height), width, height)
-    return views, np.array([f for _, f in taken])
+    return views, np.array([f for _, f in shots])
 
 
 def _photograph(
@@ -123,8 +123,9 @@ def _photograph(
     """Write all views; return photographs and depths."""
     photographs, depths = [], []
     for row, (linear, depth) in enumerate(rendered):
-        rng, own = generator(seed, SceneStream.PHOTOGRAPH, row), shots.sensor(sensor, row)
-        shot = photograph(linear, shots.exposures[row], own, balance=shots.balance[row], rng=rng)
+        rng, pipeline = generator(seed, SceneStream.PHOTOGRAPH, row), shots.sensor(sensor, row)
+        e, balance = shots.exposures[row], shots.balance[row]
+        shot = photograph(linear, e, pipeline, balance=balance, rng=rng)
         reference = photograph(linear, 1.0, Sensor(curve=sensor.curve))
         sky = np.where(np.isinf(depth), np.uint8(255), np.uint8(0))
         pictures = {"images": shot, "reference": reference, "truth/sky_masks": sky}
@@ -145,9 +146,9 @@ def _photograph(
     return photographs, depths
 
 
-def _check(out: Path, asked: dict[str, Any]) -> None:
+def _check(out: Path, options: dict[str, Any]) -> None:
     frames, width, height, samples, std, step = (
-        asked[name] for name in ("frames", "width", "height", "supersample", "iso_std", "step_m")
+        options[name] for name in ("frames", "width", "height", "supersample", "iso_std", "step_m")
     )
     if frames < 1 or width < 16 or height < 16 or std < 0 or samples < 1:
         why = f"{frames} frames of {width}x{height} pixels with {samples} samples along each axis "
@@ -155,9 +156,9 @@ def _check(out: Path, asked: dict[str, Any]) -> None:
         fix = "use at least 1 frame, 16x16 pixels, 1 sample, and a spread of 0 or more"
         raise UserError(why, fix=fix)
     _require_free(out)
-    way = (frames - 1) * step
-    if asked["layout"] != "long" and way > STREET_END:
-        why = f"{frames} frames with a step of {step:g} m need {way:.0f} m, but the street has "
+    length = (frames - 1) * step
+    if options["layout"] != "long" and length > STREET_END:
+        why = f"{frames} frames with a step of {step:g} m need {length:.0f} m, but the street has "
         why += f"{STREET_END:.0f} m."
         fix = "use fewer frames, or --layout long, which has as many streets as the drive needs"
         raise UserError(why, fix=fix)

@@ -111,7 +111,7 @@ def _fit(
     with Optimiser(folder, reporter, mesh_of(cfg)) as optimiser:
         with clock("photometry"):
             found = survey(block.scene, cfg, pixels=folder.pixels, sphere=block.shell)
-            optimiser.expect(found, given=block.exposures.decisions)
+            optimiser.expect(found, larger=block.exposures.decisions)
         with clock("seeds"):
             prepared = initialise(found, block.exposures, reporter)
         with begun(folder, Paths(Path(root), folder.root), cfg, prepared.decisions):
