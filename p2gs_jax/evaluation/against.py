@@ -64,10 +64,10 @@ def judge_renders(
     def judged(row: int) -> tuple[dict[str, Any], dict[str, Any]]:
         photograph, mask = judge.store.get(row)
         score = judge.scorer(row, photograph, mask)
-        rendered = light(row, judge.usual(row))
-        fitted = rendered.fitted(photograph, still_mask(judge.scene, row, mask))
-        plain = score(rendered.picture)
-        return plain, {**score(rendered.under(fitted)), "exposure": fitted.exposure}
+        radiance = light(row, judge.usual(row))
+        fitted = radiance.fitted(photograph, still_mask(judge.scene, row, mask))
+        plain = score(radiance.picture)
+        return plain, {**score(radiance.under(fitted)), "exposure": fitted.exposure}
 
     rows = sorted(found.files)
     as_rendered, exposure_fitted = {}, {}
@@ -100,15 +100,15 @@ def _against_reference(
 
     as_rendered, aligned, exposures = {}, {}, []
     for row in rows:
-        rendered, name = light(row), judge.scene.views[row].name
+        radiance, name = light(row), judge.scene.views[row].name
         target, mask = judge.reference(row), judge.store.get(row)[1]
         assert target is not None
-        exposures.append(rendered.fitted(target, mask).exposure)
-        as_rendered[name] = score(row, rendered.picture)
+        exposures.append(radiance.fitted(target, mask).exposure)
+        as_rendered[name] = score(row, radiance.picture)
     common = float(np.exp(np.median(np.log(exposures))))
     for row in rows:
-        rendered, name = light(row), judge.scene.views[row].name
-        aligned[name] = score(row, rendered.under(replace(rendered.shown, exposure=common)))
+        radiance, name = light(row), judge.scene.views[row].name
+        aligned[name] = score(row, radiance.under(replace(radiance.shown, exposure=common)))
     return {
         "as_rendered": summary_of(as_rendered),
         "scale_aligned": {**summary_of(aligned), "exposure": common},

@@ -67,7 +67,7 @@ class OtherRenders:
             pixels = read_display(path)
         height, width = pixels.shape[:2]
         if (width, height) != size:
-            why = f"{path} is {width}x{height}, the run's view {size[0]}x{size[1]}."
+            why = f"{path} is {width}x{height} pixels, but the run's view {size[0]}x{size[1]}."
             fix = "render it at the size of the run, or fit the run at the size of the renders "
             fix += "(--max-width)"
             raise UserError(why, fix=fix)

@@ -71,7 +71,7 @@ class _Parts(NamedTuple):
 
 def _parts(x: Float[Array, "h w"], y: Float[Array, "h w"], always: Bool[Array, ""]) -> _Parts:
     s, d = x + y, x - y
-    # Without `materialize` XLA blurs again for every later map (10.1 instead of 6.8 ms).
+    # Without `materialize` XLA blurs again for every later map (500x375 pixels: 10.1, not 6.8 ms).
     ms, md, mss, mdd = materialize(always, lambda: _blur(jnp.stack([s, d, s * s, d * d]), always))
     # The squared means (and variances) of both images sum to half of those of s and d.
     means = (ms * ms + md * md) / 2

@@ -50,7 +50,7 @@ CURVE_KNOTS = 16
 
 
 def identity(kind: Appearance, cameras: Sequence[str]) -> Corrections:
-    """Return parameters that change nothing (`ppisp` clips at 1); a camera per training view."""
+    """Return parameters that change nothing (`ppisp` clips at 1); `cameras` has one per view."""
     if kind == "ppisp":
         return ppisp.identity(cameras)
     if kind == "luminance":

@@ -237,8 +237,8 @@ class Search:
         lower, labels = best.densities - found.densities, (self._views, self._regions)
         deficits, errors = zip(*(_mean_deficit(lower, of) for of in labels), strict=True)
         difference = _largest_difference(best.errors - found.errors, self._views)
-        known = (self.fits[choice][1], self._parameters(choice), density)
-        return Candidate(choice, *known, deficits[0], max(errors), difference)
+        fields = (self.fits[choice][1], self._parameters(choice), density)
+        return Candidate(choice, *fields, deficits[0], max(errors), difference)
 
 
 def _predict(problem: Problem, fit: Fit, response: Response, held: np.ndarray) -> Predicted:

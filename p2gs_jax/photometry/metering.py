@@ -16,8 +16,7 @@ from jaxtyping import Float
 
 from p2gs_jax.core.numerics import LN2
 
-# The meters, and their names in text.
-WORDS: dict[str, str] = {
+WORDS: dict[str, str] = {  # the meters, and their names in text
     "log_average": "log average",
     "average": "average",
     "centre_log_average": "centre-weighted log average",
@@ -147,7 +146,7 @@ class Metering:
         constant = self.constant.left_out_ev
         rules = [rule for rule in self.candidates if rule.meter is not None]
         if not rules:
-            return f"Metering: {len(self.names)} training view(s) are too few to find a rule."
+            return f"Metering: a rule needs {FEWEST_VIEWS} training views that can be metered."
         if constant < NEGLIGIBLE_EV:
             return f"Metering: exposures hardly vary ({constant:.2f} EV): constant."
         if self.rule.meter is None:

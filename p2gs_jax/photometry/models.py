@@ -1,4 +1,4 @@
-"""The choices: photometric models, white balance, vignetting and kinds of curves."""
+"""The choices of a calibration: model, white balance, vignetting and kind of curve."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def parameter_count(
 
     Each level loses one parameter to its gauge; gammas and curves lose none if known exposures fix
     the `power`. If every channel has separate exposures and a separate response, photographs do not
-    determine its power: this adds two gauges to that of the responses.
+    determine the channels' powers, which loses two more parameters.
     """
     size = {None: 0, "camera": cameras - 1, "view": views - 1}
     varies = MODELS[form.model]

@@ -17,7 +17,7 @@ Labels = Int[np.ndarray, " o"]
 PerChannel = Float[np.ndarray, "o 3"]
 
 # Largest width of a pixel on the surface, relative to the finest view of the point. Coarser views
-# mix neighbouring surfaces and are left out (BUILD_NOTES).
+# mix neighbouring surfaces and are left out (BUILD_NOTES, "The same patch").
 COARSEST = 3.0
 
 
@@ -32,7 +32,7 @@ class Observations:
     view_count: int  # number of views
     point_count: int  # number of points
     cameras: Int[np.ndarray, " v"]  # physical camera of each view, 0, 1, ...
-    too_coarse: int = 0  # observations that were left out for their scale (`COARSEST`)
+    too_coarse: int = 0  # number of observations left out for their scale (`COARSEST`)
     names: tuple[str, ...] = ()  # names of the views; empty: their rows
     # Positions in the image, from its centre in units of half its diagonal; None: unknown.
     positions: Float[np.ndarray, "o 2"] | None = None
@@ -40,7 +40,7 @@ class Observations:
     brightest: PerChannel | None = None  # largest value of the pixels that were averaged
     # Cell of the scene in which each point lies; unmodelled errors are shared in it. None: unknown.
     cells: Labels | None = None
-    # Doublings of a pixel's width on the surface, up to a constant; None: unknown.
+    # Log2 of a pixel's width on the surface, up to a constant; None: unknown.
     footprints: Float[np.ndarray, " o"] | None = None
 
     def decoded(self, response: Response) -> tuple[PerChannel, PerChannel, PerChannel]:
@@ -50,7 +50,7 @@ class Observations:
         return z, deviation(y, slope, self.spread, response.base), slope
 
     def usable(self, black: float, saturation: float) -> Bool[np.ndarray, "o 3"]:
-        """Return which values are neither near black nor saturated, if the point has two of them.
+        """Return the mask of values neither black nor saturated, of points with two such views.
 
         Both bounds are display values. A mean with a saturated pixel is too dark, and exposures
         then drift along a drive, so it counts as saturated (BUILD_NOTES, "Clipped patches").
@@ -78,7 +78,7 @@ class Observations:
         return replace(self, **kept)
 
     def thinned(self, per_view: int, seed: int) -> Bool[np.ndarray, " o"]:
-        """Return which observations to keep: at least `per_view` points of every view, or all.
+        """Return the mask of observations to keep: at least `per_view` of every view, or all.
 
         The points have a random order. The first `per_view` points of every view are kept in all
         views that show them.

@@ -65,8 +65,8 @@ def initial_appearance(
         return None
     start = identity(kind, [view.camera for view in views])
     if isinstance(start, Luminance) and photograph is not None:
-        seen = [statistics_of(*map(jnp.asarray, photograph(k))) for k in range(len(views))]
-        return dataclasses.replace(start, statistics=on_device(np.stack(seen)))
+        rows = [statistics_of(*map(jnp.asarray, photograph(k))) for k in range(len(views))]
+        return dataclasses.replace(start, statistics=on_device(np.stack(rows)))
     return start
 
 
@@ -87,7 +87,7 @@ def recentre(params: Params, activation: RadianceKind) -> Params:
     """Return parameters whose log exposures and log white balances have the mean 0 over the views.
 
     Radiance is scaled inversely, so that photographs do not change. This fixes the gauge of scale
-    (docs/photometry.md, 2), with white balance that of each channel. `activation` maps spherical
+    (docs/photometry.md, 2), with white balance one per channel. `activation` maps spherical
     harmonics to radiance.
     """
     # Computed on the host, because every operation on the device would compile a program.

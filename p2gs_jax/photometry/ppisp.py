@@ -2,8 +2,8 @@
 
 Radiance passes an exposure per view, vignetting per camera and channel, a homography of
 chromaticities per view, and a response per camera and channel, in this order. Formulas, constants
-and weights are those of the paper and of its reference implementation (github.com/nv-tlabs/ppisp,
-1.2); where the two differ, the latter is used.
+and weights come from the paper and its reference implementation (github.com/nv-tlabs/ppisp, 1.2);
+where the two differ, the implementation is followed.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ EPSILON = 1e-5  # added to an intensity before division by it, so that black sta
 LEAST_TOE, LEAST_SHOULDER, LEAST_GAMMA = 0.3, 0.3, 0.1
 # Distance from black and white below which powers have no gradient, because it may be infinite.
 FLAT = 1e-6
-# Weights, and transitions of the Huber losses (paper, table 7; the centre's weight is that of the
+# Weights, and transitions of the Huber losses (paper, table 7; the centre's weight comes from the
 # reference implementation, which has means where the paper has sums).
 EXPOSURE, EXPOSURE_DELTA = 1.0, 0.1
 COLOR, COLOR_DELTA = 1.0, 0.005
@@ -51,7 +51,7 @@ class OneView(eqx.Module):
 
     exposure: Float[Array, ""]  # stops
     color: Float[Array, " 8"]  # parameters of `homography_of`
-    response: Float[Array, "3 4"]  # response of the camera
+    response: Float[Array, "3 4"]  # response of the camera, as `raw` of `respond`
     # Vignetting of the camera; None: colours without a position in an image.
     vignetting: Float[Array, "3 5"] | None = None
 
@@ -132,8 +132,8 @@ def homography_of(parameters: Float[Array, " 8"]) -> Float[Array, "3 3"]:
     """Return the homography of chromaticities that maps `SOURCES` to their displaced points.
 
     Colours are homogeneous (R, G, R + G + B), so that (R, G) / (R + G + B) are chromaticities in a
-    plane. With the sources of blue, red, green as the columns of S and their
-    targets as those of T, H S = T diag(k). The neutral source is S (1, 1, 1) / 3, so T k must be
+    plane. With the sources of blue, red, green as columns of S and their
+    targets as columns of T, H S = T diag(k). The neutral source is S (1, 1, 1) / 3, so T k must be
     the neutral target up to scale: k is its coordinates in the basis T. Each point has two
     parameters; zeros give the identity.
     """

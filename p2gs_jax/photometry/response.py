@@ -21,16 +21,16 @@ from p2gs_jax.types import Array
 
 Base = Literal["srgb", "power"]
 BASES: tuple[Base, ...] = get_args(Base)
-# The spline's knots in display values; two of them are fixed, which fixes scale and power.
+# Knots, display values. Splines are 0 at the knots HELD, which fixes scale and power.
 _PERCENT = [2, 5, 8, 12, 16, 21, 26, 32, 38, 44, 50, 56, 62, 68, 74, 80, 86, 90, 94, 98]
 KNOTS = np.array(_PERCENT) / 100
 HELD = (6, 16)
-# The knots that are solved for; the powers of several splines differ as well.
+# Knots that are solved for: of one spline, and of each of several, whose powers differ.
 FREE = tuple(k for k in range(len(KNOTS)) if k not in HELD)
 FREE_OF_EACH = tuple(k for k in range(len(KNOTS)) if k != HELD[0])
 DARKEST = 0.5 / 255  # darkest display value that is decoded: half an 8-bit code
-# Noise model: 8-bit quantisation, photon and read noise (linear units), and a floor in log units
-# for texture, gloss and interpolation, which no model explains.
+# Noise model: 8-bit quantisation; photon (per light) and read noise, variances of linear values;
+# and a floor, deviation in log units, for texture, gloss and interpolation.
 SHOT_NOISE, READ_NOISE, FLOOR = 2e-4, 1e-6, 0.03
 # Least slope of a curve with a spline, relative to its base, so that noise stays finite.
 SMALLEST_SLOPE = 0.2
@@ -67,7 +67,7 @@ class Response:
 
     @property
     def parts(self) -> tuple[Response, ...]:
-        """Its curves: one for all, or one for each camera or channel."""
+        """The single curves: one for all, or one for each camera or channel."""
         return tuple(Response(self.base, spline) for spline in self.splines or (self.spline,))
 
 
@@ -213,7 +213,7 @@ def encode(log_linear: Values, cfg: PhotometryConfig, camera=None) -> Values:
     """Return display values from the table; linear in x below it, linear in log x above it.
 
     With responses per channel the last axis of `log_linear` is the channel. `camera` is a row
-    in `cfg.cameras` (None: unknown): one for all, or one for every entry without the last axis.
+    in `cfg.cameras` (None: unknown): one for all, or one for each entry of all axes but the last.
     """
     xp, table = namespace(log_linear, camera), tables(cfg)
     if by_camera(cfg):

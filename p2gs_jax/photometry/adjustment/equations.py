@@ -74,8 +74,8 @@ def weigh(model: Forward, theta: Parameters, weight: PerChannel, loss: Loss) -> 
     weight = model.weight / sigma**2 * factor
     radiance, precision = _radiance(layout, a, z_of_point, weight)
     of_point = radiance[layout.row]
-    known = z_of_point - a * of_point, radiance, of_point + added, precision
-    return Weighted(weight, sigma, slope, *known, scale, curvature)
+    fields = z_of_point - a * of_point, radiance, of_point + added, precision
+    return Weighted(weight, sigma, slope, *fields, scale, curvature)
 
 
 def _whole_points(

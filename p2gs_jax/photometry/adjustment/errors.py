@@ -77,7 +77,7 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
     clusters = observations.cells
     if clusters is None:
         clusters = side_by_side(observations, layout.row)
-    each = summed(fit.model, fit.theta, fit.at, fit.at.weight * fit.at.residual, clusters)
+    scores = summed(fit.model, fit.theta, fit.at, fit.at.weight * fit.at.residual, clusters)
     if observations.positions is not None and len(layout.row):
         labels = regions(observations.positions, observations.views, SHARED_REGION)
         # All points have the shared error, also those with small weights.
@@ -86,12 +86,12 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
         deviation = _shared_deviation(fit.model, alike, labels, parts)
         if deviation > 0:
             shared = deviation * _shared_scores(fit.model, fit.theta, fit.at, labels)
-            each = sp.csr_array(sp.vstack([each, shared]))
+            scores = sp.csr_array(sp.vstack([scores, shared]))
     if observations.footprints is not None and len(layout.row):
         # A change of the data acts through the second derivative of the loss.
         wide = fit.at.curvature * FOOTPRINT * observations.footprints
         one = _shared_scores(fit.model, fit.theta, fit.at, np.zeros_like(layout.row), wide)
-        each = sp.csr_array(sp.vstack([each, one]))
+        scores = sp.csr_array(sp.vstack([scores, one]))
     seen = fit.model.weight.any(1)
     # A view's exposure is a mean over its clusters and takes one degree of freedom.
     pairs = np.unique(np.stack([layout.views[seen], clusters[seen]]), axis=1)[0]
@@ -101,10 +101,10 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
     bread = fit.normal * fit.at.curvature + prior
     gauges = system.gauges(bread)[1]
     if not is_small(system.basis.shape[1]):  # pyright: ignore
-        drawn = _drawn(Balanced(bread, gauges, system.basis), each, system)
+        drawn = _drawn(Balanced(bread, gauges, system.basis), scores, system)
         return Uncertainty(*drawn, few, system.unknowns.split)
     # A prior is an observation with variance 1 / precision: its meat equals its bread.
-    meat = each.T @ each + prior
+    meat = scores.T @ scores + prior
     with one_thread():
         dense = whole(bread + gauges.T @ gauges)
         return Uncertainty(*_sandwich(dense, meat, system.basis), few, system.unknowns.split)
@@ -126,14 +126,14 @@ def _sandwich(bread, meat, basis) -> tuple[Float[np.ndarray, "d r"], Float[np.nd
 
 
 def _drawn(
-    bread: Balanced, each, system: System
+    bread: Balanced, scores, system: System
 ) -> tuple[Float[np.ndarray, "d r"], Float[np.ndarray, "d k"]]:
     """Return solutions for clusters and priors with random signs (wild bootstrap)."""
     rng = generator(0, Stream.SCORE_SIGNS)
     priors = system.priors
-    counts = (each.shape[0], len(priors.targets))
+    counts = (scores.shape[0], len(priors.targets))
     of_clusters, of_priors = (rng.choice([-1.0, 1.0], (n, DRAWS)) for n in counts)
-    right = each.T @ of_clusters
+    right = scores.T @ of_clusters
     right += priors.rows.T @ (np.sqrt(priors.precisions)[:, None] * of_priors)
     unknown = bread.unheld(HELD)
     return bread.solve(right) / np.sqrt(DRAWS), unknown / np.linalg.norm(unknown, axis=0)

@@ -271,8 +271,8 @@ def _warnings(
     known exposure.
     """
     out, balance = [], s.view_balance_ev
-    known = s.exposure_errors[np.isfinite(s.exposure_errors)]
-    typical = float(np.median(known)) if known.size else 0.0
+    finite = s.exposure_errors[np.isfinite(s.exposure_errors)]
+    typical = float(np.median(finite)) if finite.size else 0.0
     if not fit.converged and fit.left > NEGLIGIBLE * typical:
         out.append(
             f"The photometric solution had not converged after {fit.rounds} rounds (the last "

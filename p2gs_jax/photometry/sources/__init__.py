@@ -1,5 +1,5 @@
 """Sources of observations of shared points.
 
-`points` are those of a scene or of a finished fit, `stack` is for photographs of one viewpoint, and
-`sampling` reads the colours.
+`points` are points of a scene or of a finished fit, `stack` pixels of one viewpoint's photographs.
+`sampling` reads their colours, for `points` over `patches` of surface.
 """

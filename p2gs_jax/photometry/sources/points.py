@@ -27,7 +27,7 @@ from p2gs_jax.types import Gaussians, Scene
 # Largest number of points, and of views of a point: first for projected, then for rendered points.
 MOST_POINTS, MOST_PER_POINT = 40_000, 16
 RENDERED_POINTS, RENDERED_PER_POINT = 40_000, 8
-# Above `warp.OPAQUE`: wrong correspondences harm a solution of exposures more than a loss.
+# Least opacity, above `warp.OPAQUE`: wrong correspondences harm exposures more than a loss.
 OPAQUE = 0.98
 
 # Called with the number of views done, and the number of all views.
@@ -37,7 +37,7 @@ OnView = Callable[[int, int], object] | None
 def surface_colors(
     scene: Scene, store: ImageStore, seed: int, on_view: OnView = None
 ) -> Observations:
-    """Return colours at the tracks; without tracks, those of points that `seed` draws."""
+    """Return colours at the tracks; without tracks, at points that `seed` draws."""
     if has_tracks(scene):
         return track_colors(scene, store, on_view)
     return projected_colors(scene, store, seed, on_view)
@@ -49,7 +49,7 @@ def has_tracks(scene: Scene) -> bool:
 
 
 def track_colors(scene: Scene, store: ImageStore, on_view: OnView = None) -> Observations:
-    """Sample every observation of a track in a training view."""
+    """Sample all tracks in the training views that observe them."""
     assert scene.tracks is not None
     of_view = grouped(scene.tracks.view_indices, len(scene.views))
     picks = [of_view[i] for i in scene.train_indices]
@@ -107,7 +107,7 @@ def rendered_colors(
         pick = rng.permutation(np.flatnonzero(np.asarray(depth) > 0))[:each]
         places = np.asarray(unproject(depth, camera))
         points.append(places.reshape(-1, 3)[pick])
-        normals.append(_slopes(places, np.asarray(depth)).reshape(-1, 3)[pick])
+        normals.append(_normals(places, np.asarray(depth)).reshape(-1, 3)[pick])
         if on_view is not None:
             on_view(done + 1, len(cameras))
     world = np.concatenate(points)
@@ -123,7 +123,7 @@ def rendered_colors(
     return point_colors(scene, store, surfaces, picks, xy, uncertainty=PROJECTED_UNCERTAINTY)
 
 
-def _slopes(
+def _normals(
     places: Float[np.ndarray, "h w 3"], depth: Float[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "h w 3"]:
     """Return unit normals of the rendered surface; NaN where depth jumps or is missing."""

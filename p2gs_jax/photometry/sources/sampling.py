@@ -1,4 +1,4 @@
-"""Colours of photographs at given positions, and of given points in all of their views."""
+"""Colours of photographs at positions, and of points in all of their views."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from p2gs_jax.scene.rigid import camera_centers
 from p2gs_jax.types import Scene, View
 
 # Standard deviation of a track's position, as a share of the smallest patch; with the gradient of
-# the image it gives that of the colour.
+# the image it gives the deviation of the colour.
 POSITION_DEVIATION = 1 / 6
 # Factor on this deviation for positions from calibration or rendered depth.
 PROJECTED_UNCERTAINTY = 2.0
@@ -75,7 +75,7 @@ def sample_patches(
         light = _between(linear, position)
         colors[rows] = srgb_encode(light.mean((1, 2)))
         spread[rows] = deviation * _steepness(light, position)
-        # Over the interpolated pixels and their neighbours.
+        # Interpolation reads neighbouring pixels as well.
         brightest[rows] = _neighbours(ldr, x, y, np.maximum).max((1, 2))
         valid[rows] = _neighbours(mask, x, y, np.minimum).min((1, 2)) > 0.99
     return Samples(colors, spread, brightest, valid)
@@ -107,13 +107,13 @@ def _light_around(
     return linear
 
 
-def _neighbours(image: np.ndarray, x: np.ndarray, y: np.ndarray, better: np.ufunc) -> np.ndarray:
-    """Return the best of the 3x3 values around pixels; a copy of a large photograph is larger."""
+def _neighbours(image: np.ndarray, x: np.ndarray, y: np.ndarray, extreme: np.ufunc) -> np.ndarray:
+    """Return the `extreme` of the 3x3 values around pixels, without a copy of the photograph."""
     height, width = image.shape[:2]
     found = image[y, x]
     for down, right in itertools.product((-1, 0, 1), repeat=2):
         rows, columns = np.clip(y + down, 0, height - 1), np.clip(x + right, 0, width - 1)
-        better(found, image[rows, columns], out=found)
+        extreme(found, image[rows, columns], out=found)
     return found
 
 
@@ -181,16 +181,16 @@ def point_colors(
     ]
     for done, found in enumerate(map_in_order(read, rows)):
         parts.append(found)
-        return_freed_memory()  # of photographs of 12 MP, 1 GB
+        return_freed_memory()  # 1 GB with photographs of 12 megapixels
         if on_view is not None:
             on_view(done + 1, len(rows))
-    of_view, seen, colors, spread, brightest, positions, footprints = map(
+    of_view, of_point, colors, spread, brightest, positions, footprints = map(
         np.concatenate, zip(*parts, strict=True)
     )
     cameras = [view.camera for view in views]
     return Observations(
         views=of_view,
-        points=seen,
+        points=of_point,
         colors=colors,
         spread=np.float32(uncertainty) * spread,
         view_count=len(views),
@@ -201,24 +201,24 @@ def point_colors(
         positions=positions,
         brightest=brightest,
         camera_names=tuple(sorted(set(cameras))),
-        cells=_cells(surfaces.points, seen, of_view, views),
+        cells=_cells(surfaces.points, of_point, of_view, views),
         footprints=footprints,
     )
 
 
 def _cells(
-    points: Float[np.ndarray, "p 3"], seen: Labels, of_view: Labels, views: list[View]
+    points: Float[np.ndarray, "p 3"], of_point: Labels, of_view: Labels, views: list[View]
 ) -> Labels:
     """Return the cell of the scene in which each observed point lies."""
-    if not len(seen):
-        return seen
+    if not len(of_point):
+        return of_point
     centers = camera_centers(np.stack([view.viewmat for view in views]))
-    side = CELL * np.median(np.linalg.norm(points[seen] - centers[of_view], axis=1))
-    used, row = np.unique(seen, return_inverse=True)
+    side = CELL * np.median(np.linalg.norm(points[of_point] - centers[of_view], axis=1))
+    used, row = np.unique(of_point, return_inverse=True)
 
     def cells(side):
-        corners = np.floor(points[used] / side).astype(np.int64)
-        return np.unique(corners, axis=0, return_inverse=True)[1].reshape(-1)
+        indices = np.floor(points[used] / side).astype(np.int64)
+        return np.unique(indices, axis=0, return_inverse=True)[1].reshape(-1)
 
     sides = side * 0.5 ** np.arange(MOST_HALVINGS + 1)
     enough = (label for each in sides if (label := cells(each)).max() + 1 >= FEWEST_CELLS)
@@ -228,7 +228,7 @@ def _cells(
 def _at_one_scale(
     surfaces: Surfaces, points: list[Int[np.ndarray, " _"]], views: list[View]
 ) -> tuple[Symmetric, list[np.ndarray], list[np.ndarray]]:
-    """Return the moments of every point's patch, which points each view samples, and its scales.
+    """Return moments of all points' patches; per view the mask of sampled points, and scales.
 
     A scale is the number of pixels per scene unit on the surface.
     """
@@ -247,9 +247,10 @@ def _at_one_scale(
     ]
     moments = np.zeros((len(surfaces.points), 3))
     for mine, metric, kept, view in zip(points, within, keep, views, strict=True):
-        few = mine[kept]
+        sampled = mine[kept]
         pixel = patches.smallest_moments(view.width) + patches.BLUR
         here = pixel * patches.inverse(metric[kept])
-        new = moments[few, 0] == 0
-        moments[few] = patches.joined(np.where(new[:, None], here, moments[few]), here)
+        new = moments[sampled, 0] == 0
+        former = np.where(new[:, None], here, moments[sampled])
+        moments[sampled] = patches.joined(former, here)
     return moments, keep, scales

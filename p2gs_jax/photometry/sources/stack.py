@@ -17,9 +17,9 @@ from p2gs_jax.scene.convert.readers import exif_evs
 from p2gs_jax.scene.files import undecodable
 from p2gs_jax.types import View
 
-POINTS, CANDIDATES = 4000, 40_000
-MARGIN = 8
-SATURATED = 250 / 255
+POINTS, CANDIDATES = 4000, 40_000  # sampled pixels, and random ones that they are chosen from
+MARGIN = 8  # least distance of a point from the border, pixels
+SATURATED = 250 / 255  # display value
 ABOVE_BLACK = 8 / 255  # least distance of a signal from the black level, display values
 # A spike in the histogram is the black level if it is below this 8-bit value and holds this share.
 BLACKEST, SPIKE = 40, 0.3
