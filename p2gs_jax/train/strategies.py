@@ -53,8 +53,8 @@ class Slots(NamedTuple):
         return max(self.limit or 0, self.slots)
 
 
-class Moment(NamedTuple):
-    """Inputs of a densification besides Gaussians and population."""
+class Event(NamedTuple):
+    """One densification: its inputs besides Gaussians and population."""
 
     key: PRNGKeyArray  # random key of this densification
     moments: AdamState  # Adam's moments of the Gaussians
@@ -79,7 +79,7 @@ class Strategy(Protocol):
         """Return the number of slots at the start, at least the number of seeds."""
         ...
 
-    def densify(self, gaussians: Gaussians, population: Population, now: Moment) -> Outcome:
+    def densify(self, gaussians: Gaussians, population: Population, now: Event) -> Outcome:
         """Return the new population, with at least as many slots.
 
         Moments of the slots in `Outcome.reset_moments` become zero. A strategy that returns
@@ -149,13 +149,13 @@ class Mcmc:
             **self._static,
         )
 
-    def densify(self, gaussians: Gaussians, population: Population, now: Moment) -> Outcome:
+    def densify(self, gaussians: Gaussians, population: Population, now: Event) -> Outcome:
         """Relocate, and grow towards the bound."""
         alive = alive_in(population)
         births = np.int32(max(self._target(alive, now) - alive, 0))
         return self._relocate(now.key, gaussians, population, now.moments, births)
 
-    def _target(self, alive: int, now: Moment) -> int:
+    def _target(self, alive: int, now: Event) -> int:
         """Return the population after the next relocation."""
         limit = self._affordable(alive, now)
         growth_left = max((limit or alive) / max(alive, 1), 1.0)
@@ -164,7 +164,7 @@ class Mcmc:
         factor = max(self.cfg.densify.growth, growth_left ** (1 / max(events, 1.0)))
         return min(math.ceil(alive * factor), limit or alive)
 
-    def _affordable(self, alive: int, now: Moment) -> int | None:
+    def _affordable(self, alive: int, now: Event) -> int | None:
         """Return the bound on the population that the speed of this machine allows.
 
         A bound chosen for a time budget assumes an unloaded machine; this checks it again.
@@ -199,7 +199,7 @@ class Adaptive:
         """Return the configured bound, and a slot per seed."""
         return Slots(self.cfg.max_gaussians, seeds)
 
-    def densify(self, gaussians: Gaussians, population: Population, now: Moment) -> Outcome:
+    def densify(self, gaussians: Gaussians, population: Population, now: Event) -> Outcome:
         """Prune, clone and split; reset opacities if a reset is due."""
         d, host = self.cfg, now.host
         proposal = _propose(gaussians, population, now.extent, host.reset_at > 0, cfg=d)
@@ -267,7 +267,7 @@ def densified(
     """
     key = compiled_key(device_seed(cfg.train.seed), np.int32(host.step))
     pause, reset_at = interval(cfg.densify, host), host.reset_at
-    now = Moment(key, state.opt_state.gaussians, extent, pause, limit, host)
+    now = Event(key, state.opt_state.gaussians, extent, pause, limit, host)
     outcome = strategy.densify(state.params.gaussians, state.population, now)
     refused = int(outcome.refused)
     if refused > 0:
