@@ -22,11 +22,11 @@ def read_known_exposures(
 ) -> Float[np.ndarray, " v"]:
     """Return natural logarithms of known exposures of views, and NaN for unknown ones.
 
-    The source is `exif` (EXIF, or what the data set states), or a CSV file with a column `image` or
-    `file` (the view's name, or any end of its path) and one of `ev`, `rel_exposure_ev` (stops),
-    `exposure` (linear, > 0) or `exposure_time_s` (seconds). Names in the file may mean any
-    view in `among` (all views of the scene; by default `views`).
-    Raises UserError: the source cannot be used, names none of the views, or a name is ambiguous.
+    The source is `exif` (EXIF, or exposures that the data set states), or a CSV file with a column
+    `image` or `file` (the view's name, or any end of its path) and one of `ev`, `rel_exposure_ev`
+    (stops), `exposure` (linear, > 0) or `exposure_time_s` (seconds). Names in the file may mean any
+    view in `among` (all views of the scene; by default `views`). Raises UserError: the source
+    cannot be used, names none of the views, or a name is ambiguous.
     """
     if source == "exif":
         values = _exif_ev(views) * LN2

@@ -76,7 +76,7 @@ def list_images(folder: Path, *, recursive: bool = True) -> list[Path]:
 
 
 def named_as_mask(name: str) -> bool:
-    """Return whether the name of a file may be that of a mask; `a.jpg.png` may."""
+    """Return whether a file, judged by its name, may be a mask; `a.jpg.png` may be one."""
     return _MASK_NAME.search(_bare(name)) is not None or _TWO_SUFFIXES.search(name) is not None
 
 

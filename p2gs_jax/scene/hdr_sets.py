@@ -10,7 +10,7 @@
                          `train` or `test`; true radiance in `images_hdr/PART_hdr_000.exr`
     RawNeRF              `raw/NAME.json`, exiftool's settings, beside a COLMAP model
 
-The layouts are those of the readers in github.com/xhuangcv/hdr-nerf, caiyuanhao1998/HDR-GS,
+The layouts follow the readers in github.com/xhuangcv/hdr-nerf, caiyuanhao1998/HDR-GS,
 LiuJF1226/GaussHDR and google-research/multinerf. Times are kept in `View.exif_ev`.
 """
 

@@ -66,7 +66,7 @@ def read_points(path: Path) -> tuple[Float64[np.ndarray, "p 3"], UInt8[np.ndarra
 
 
 def _display_colors(vertex: np.ndarray, names: Sequence[str]) -> UInt8[np.ndarray, "p 3"]:
-    """Return the colours in three columns of a table; their largest value decides what is white."""
+    """Return 8-bit colours of three columns of a table; the largest value tells the scale."""
     values = np.stack([vertex[name] for name in names], 1)
     floats = values.dtype.kind == "f"
     values = np.nan_to_num(values.astype(np.float64))
