@@ -21,7 +21,7 @@ from p2gs_jax.types import Capture
 
 # Stops on each side and steps of the coarse search; golden steps. LOM `low` is 6.6 stops dark.
 SEARCH_STOPS, SEARCH_STEPS, GOLDEN_STEPS = 12.0, 49, 30
-REFINE_STEPS = 30
+REFINE_STEPS = 30  # largest number of Levenberg-Marquardt steps
 # Stride of the coarse search over pixels, along each axis.
 SEARCH_STRIDE = 3
 # Tolerance, stops or log units: changes a display value by 1e-4, and a PSNR of 40 dB by 1e-3 dB.

@@ -16,7 +16,7 @@ from p2gs_jax.scene.rigid import interpolated, inverse
 from p2gs_jax.scene.visibility import unoccluded
 from p2gs_jax.types import Lidar, Scene, TrackedObject, View
 
-# Seconds from a view to points of its sweep: half a turn at 10 Hz (0.05 s), and a margin.
+# Largest time from a view to points of its sweep, seconds: half a turn at 10 Hz, and a margin.
 HALF_SWEEP_S = 0.06
 # Rendered depth exists where the render is at least this opaque.
 SOLID = 0.5
@@ -72,8 +72,8 @@ def depth_errors(
 ) -> DepthErrors:
     """Return the errors of rendered depth against the LiDAR points near the view's time.
 
-    Points on moving boxes move with them to the time of the view; occluded points are left out. K
-    and size of the view are those of the images, and the rendered depth is alpha-weighted camera z.
+    Points on moving boxes move with them to the time of the view; occluded points are left out. The
+    view has K and size of its images, and the rendered depth is alpha-weighted camera z.
     """
     assert view.time is not None
     rows = np.flatnonzero(np.abs(lidar.times - view.time) <= HALF_SWEEP_S)

@@ -154,7 +154,7 @@ def summary_of(rows: dict[str, dict[str, Any]]) -> dict[str, Any]:
 
 
 def mean_of_parts(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float]]:
-    """Return the means of each part over the views with it, and the number of these views."""
+    """Return each part's means over the views with that part, and the number of these views."""
     out = {}
     for name in PARTS:
         there = [row[name] for row in rows if name in row]

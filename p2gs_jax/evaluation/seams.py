@@ -126,8 +126,8 @@ def measure_seam(
 ) -> Seam | None:
     """Return the seam between two photographs, or None if they share too few pixels.
 
-    They are compared in the pixels of the first. `common` is the display transform of "after", and
-    its gamma is that of "before". `cfg` limits the display values of used pixels.
+    They are compared in the pixels of the first. `common` is the display transform of "after";
+    "before" uses its gamma. `cfg` limits the display values of used pixels.
     """
     there = warp(jnp.asarray(first.depth), first.camera, jnp.asarray(second.depth), second.camera)
     ldr = sample_bilinear(jnp.asarray(second.ldr), there.xy)

@@ -46,7 +46,7 @@ Correction = Float[Array, "..."] | OneView | Curves | Formation  # of one view
 
 # Luminance levels, rows and columns of a bilateral grid, as published.
 GRID = (8, 16, 16)
-CURVE_KNOTS = 16
+CURVE_PIECES = 16
 
 
 def identity(kind: Appearance, cameras: Sequence[str]) -> Corrections:
@@ -55,7 +55,7 @@ def identity(kind: Appearance, cameras: Sequence[str]) -> Corrections:
         return ppisp.identity(cameras)
     if kind == "luminance":
         return luminance.identity(len(cameras))
-    shapes = {"affine": (3, 4), "bilateral": (12, *GRID), "curve": (CURVE_KNOTS,)}
+    shapes = {"affine": (3, 4), "bilateral": (12, *GRID), "curve": (CURVE_PIECES,)}
     return on_device(np.zeros((len(cameras), *shapes[kind])))
 
 

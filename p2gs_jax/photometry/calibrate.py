@@ -79,8 +79,8 @@ class Selection:
 def options_of(cfg: FitConfig, scene: Scene) -> CalibrationOptions:
     """Return the options of a calibration of a scene's training views.
 
-    With `photometry.select` off, the model and curve are those of `cfg`. Raises UserError: the
-    known exposures cannot be read.
+    With `photometry.select` off, `cfg` sets the model and the curve. Raises UserError: the known
+    exposures cannot be read.
     """
     p = cfg.photometry
     known = None
@@ -117,7 +117,7 @@ def calibrate_observations(
     options: CalibrationOptions,
     on_chosen: OnChosen = lambda form, response: None,
 ) -> Selection:
-    """Choose a model and solve it; `on_chosen` is called between, if held-out colours decide."""
+    """Choose a model and solve it; `on_chosen` is called in between, if held-out colours decide."""
     if options.choice == "held_out":
         selection = _chosen(observations, options, on_chosen)
     elif options.choice == "one_response":

@@ -186,7 +186,7 @@ class Search:
         self._hopeless = {k for k, d in best.items() if d < max(best.values()) - HOPELESS}
 
     def _response(self, choice: Choice) -> Response | None:
-        """Return the curve of a choice, fitted with its effects of cameras; None: it collapsed."""
+        """Return the curve of a choice, fitted with effects of cameras; None: it has collapsed."""
         curve = choice.curve
         if curve.splines is None:
             return Response(curve.base)

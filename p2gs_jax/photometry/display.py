@@ -110,7 +110,7 @@ class DisplayTransform:
         if curve == self.formation.curve:
             return self
         if curve == "spline" and self.formation.spline is None and not by_camera(self.formation):
-            fix = f"choose another, or leave it out for that of the run ({self.formation.curve})"
+            fix = f"choose another, or leave it out to use the run's ({self.formation.curve})"
             raise UserError("The curve cannot be spline: the run has no spline.", fix=fix)
         return replace(self, formation=replace(self.formation, curve=curve), correction=None)
 
@@ -201,7 +201,7 @@ def mean_parameters(photometry: Photometry) -> MeanParameters:
 def usual_display(
     params: Params, cameras: Sequence[str], camera: str | None, cfg: PhotometryConfig
 ) -> DisplayTransform:
-    """Return the transform of a view that was not fitted; `camera` is None if it has no camera.
+    """Return the transform of a view that was not fitted; `camera` is None if the view has none.
 
     The exposure is the geometric mean over the training views; gamma and correction are arithmetic
     means. The white balance is the mean over all training views, or over the views of the camera if

@@ -28,7 +28,7 @@ from p2gs_jax.photometry.response import DARKEST, UNKNOWN, decode, encode
 from p2gs_jax.types import GAMMA_SRGB, Array, Capture
 
 EXPOSED_FLOOR, EXPOSED_CEILING = 1e-6, 10.0  # paper, Tone-mapping estimation
-SRGB_LINEAR_END, SRGB_ENCODED_END = 0.0031308, 0.04045
+SRGB_LINEAR_END, SRGB_ENCODED_END = 0.0031308, 0.04045  # end of sRGB's linear toe
 LEAST_ALPHA = 1e-3  # lower bound of opacities by which radiance is divided
 # A row of `PhotometryConfig.cameras`, one row for every pixel, or None where it has no effect.
 CameraRow = Int[Array, "..."] | int | None
@@ -114,7 +114,7 @@ def gain(
 ) -> Any:
     """Return e W V, the factor that broadcasts against radiance (paper, eq. 4: only e).
 
-    `capture` is of the view, or of every single pixel; `positions` are those of single pixels.
+    `capture` is of the view, or of every single pixel; `positions` belong to single pixels.
     Raises ValueError: vignetting is modelled, and positions of single pixels are missing.
     """
     e = _by_pixel(capture.exposure)

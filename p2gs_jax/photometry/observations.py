@@ -38,7 +38,7 @@ class Observations:
     positions: Float[np.ndarray, "o 2"] | None = None
     camera_names: tuple[str, ...] = ()  # names of the cameras; empty: their rows
     brightest: PerChannel | None = None  # largest value of the pixels that were averaged
-    # Cell of the scene in which each point lies; unmodelled errors are shared in it. None: unknown.
+    # Cell of the scene in which each point lies; it shares unmodelled errors. None: unknown.
     cells: Labels | None = None
     # Log2 of a pixel's width on the surface, up to a constant; None: unknown.
     footprints: Float[np.ndarray, " o"] | None = None

@@ -254,7 +254,7 @@ class Forward(NamedTuple):
         z, sigma, slope = o.decoded(response)
         knot, fraction = hat(np.asarray(o.colors, np.float64))
         group = spline_groups(splines.by, layout.cameras[layout.views], z.shape)
-        seen = (z - problem.log_pivot, sigma, np.asarray(weight, np.float64))
+        values = (z - problem.log_pivot, sigma, np.asarray(weight, np.float64))
         index, factor = features.terms(layout)
         more = terms = Terms.of_index(index, factor, features.count) if features.count else None
         if splines.count:
@@ -262,7 +262,7 @@ class Forward(NamedTuple):
             index = np.concatenate([index, features.count + there], -1)
             factor = np.concatenate([factor, -steep], -1)
             terms = Terms.of_index(index, factor, features.count + splines.count)
-        return cls(unknowns, layout, *seen, knot, fraction, slope, group, more, terms)
+        return cls(unknowns, layout, *values, knot, fraction, slope, group, more, terms)
 
 
 @dataclass(frozen=True)

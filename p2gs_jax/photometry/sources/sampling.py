@@ -131,8 +131,8 @@ def _between(linear: Float32[np.ndarray, "h w 3"], position: np.ndarray) -> np.n
 
 def _steepness(light: np.ndarray, position: np.ndarray) -> np.ndarray:
     """Return the norm of the gradient of display values of patches, per pixel."""
-    seen, at = (np.stack([_ends(v), _ends(v.swapaxes(1, 2))], 1) for v in (light, position))
-    rise, run = (np.diff(v, axis=2)[:, :, 0] for v in (srgb_encode(seen), at))
+    ends, at = (np.stack([_ends(v), _ends(v.swapaxes(1, 2))], 1) for v in (light, position))
+    rise, run = (np.diff(v, axis=2)[:, :, 0] for v in (srgb_encode(ends), at))
     return np.sqrt(((np.linalg.pinv(run) @ rise) ** 2).sum(1))
 
 
@@ -164,13 +164,13 @@ def point_colors(
     moments, keep, scales = _at_one_scale(surfaces, points, views)
 
     def read(row: int):
-        mine, there = points[row][keep[row]], xy[row][keep[row]]
-        grids = patches.grids_in(views[row], surfaces, mine, moments[mine], there)
+        mine, centres = points[row][keep[row]], xy[row][keep[row]]
+        grids = patches.grids_in(views[row], surfaces, mine, moments[mine], centres)
         deviation = POSITION_DEVIATION * np.sqrt(12 * patches.smallest_moments(views[row].width))
         ldr, mask = store.whole(scene.train_indices[row])
         found = sample_patches(ldr, mask, grids, len(mine), deviation)
         good = found.valid
-        at = places(there[good], *mask.shape[::-1]).astype(np.float32)
+        at = places(centres[good], *mask.shape[::-1]).astype(np.float32)
         wide = -np.log2(scales[row][keep[row]][good]).astype(np.float32)
         return (np.full(len(at), row), mine[good], *(v[good] for v in found[:3]), at, wide)
 
