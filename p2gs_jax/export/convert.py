@@ -167,9 +167,9 @@ def _exr(place: Path, fitted: Run, reporter: Reporter) -> str:
             camera = camera_of(fitted.store, index)
             result, path = fitted.render(camera), (temporary / view.name).with_suffix(".exr")
             linear, depth, alpha = map(np.asarray, (result.linear, result.depth, result.alpha))
-            transform, shot = fitted.own_display(index), read_exif_settings(view.image_path)
-            channels = {"depth": depth, "alpha": alpha}
-            write_exr(path, linear, **channels, transform=transform, camera=camera, shot=shot)
+            write = functools.partial(write_exr, depth=depth, alpha=alpha, camera=camera)
+            shot = read_exif_settings(view.image_path)
+            write(path, linear, transform=fitted.own_display(index), shot=shot)
             reporter.stage("Rendering", index + 1, len(views))
     return f"{len(views)} linear renders"
 
