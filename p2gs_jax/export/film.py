@@ -42,11 +42,11 @@ def common_curve(log_exposure: float, gamma: float, cfg: PhotometryConfig, most:
     display = formation.display(formation.tone_map(exposed, gamma, cfg, None))
     values = np.rint(most * display).astype(np.uint16)
     values[0] = 0
-    per_step = (_STEPS - 1) / (last - first)
+    steps_per_log = (_STEPS - 1) / (last - first)
 
     def codes(logs: Logs) -> UInt16[np.ndarray, "*n 3"]:
-        position = logs * np.float32(per_step)
-        position += np.float32((log_exposure - first) * per_step)
+        position = logs * np.float32(steps_per_log)
+        position += np.float32((log_exposure - first) * steps_per_log)
         index = np.clip(position, 0, _STEPS - 1, out=position).astype(np.int32)
         if values.shape[1] == 1:
             return values[:, 0][index]

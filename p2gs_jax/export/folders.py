@@ -131,8 +131,8 @@ def _colors(scene: Scene) -> np.ndarray:
 def _write_model(folder: Path, scene: Scene, store: ImageStore, names: Mapping[str, str]) -> None:
     model = pycolmap.Reconstruction()
     none = np.zeros(0, np.int32)
-    seen = scene.tracks or Tracks(none, none, np.zeros((0, 2), np.float32))
-    of_view = grouped(seen.view_indices, len(scene.views))
+    observed = scene.tracks or Tracks(none, none, np.zeros((0, 2), np.float32))
+    of_view = grouped(observed.view_indices, len(scene.views))
     camera_ids: dict[tuple, int] = {}
     tracks = [pycolmap.Track() for _ in scene.points]
     for index, view in enumerate(scene.views):
@@ -144,7 +144,8 @@ def _write_model(folder: Path, scene: Scene, store: ImageStore, names: Mapping[s
         if camera_id not in model.cameras:
             camera = pycolmap.Camera(model="PINHOLE", params=params, camera_id=camera_id, **size)
             model.add_camera_with_trivial_rig(camera)
-        xy, points = seen.xy[of_view[index]], seen.point_indices[of_view[index]]
+        rows = of_view[index]
+        xy, points = observed.xy[rows], observed.point_indices[rows]
         image = pycolmap.Image(
             name=names[view.name],
             keypoints=np.asarray(xy * (width / view.width, height / view.height), np.float64),

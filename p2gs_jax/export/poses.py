@@ -191,7 +191,7 @@ def _binary(data: bytes, new: Mapping[str, str]) -> bytes:
 
 
 def _text(text: str, new: Mapping[str, str]) -> str:
-    """Return COLMAP's images.txt, or a list of photographs, with other names at ends of lines."""
+    """Return COLMAP's images.txt (10 fields per image) or a list of names, with other names."""
     out = []
     for line in text.splitlines():
         name = line.split(maxsplit=9)[-1] if len(line.split(maxsplit=9)) == 10 else line.strip()

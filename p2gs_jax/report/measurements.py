@@ -141,15 +141,15 @@ def seam_medians(seams: Sequence[SeamPair]) -> tuple[float, float]:
     return before, float(np.median([p.seam.after_ev for p in seams]))
 
 
-def seam_section(scene: SceneMeasurements) -> str:
+def seam_section(measured: SceneMeasurements) -> str:
     """Return the seams between neighbouring photographs, as recorded and at one exposure."""
-    seams = scene.seams
+    seams = measured.seams
     if not seams:
-        if scene.tried_pairs is None:
+        if measured.tried_pairs is None:
             return paragraph("No seam was measured; the list of missing parts gives the reason.")
         return paragraph(
-            f"{scene.tried_pairs} pairs of training views share enough points, but no pair shows "
-            "enough of the same unsaturated surface for a comparison."
+            f"{measured.tried_pairs} pairs of training views share enough points, but no pair shows"
+            " enough of the same unsaturated surface for a comparison."
         )
     before, after = seam_medians(seams)
     step = float(np.median([abs(p.seam.step_ev) for p in seams]))
@@ -161,8 +161,8 @@ def seam_section(scene: SceneMeasurements) -> str:
         f"exposure (medians over {pairs}). The visible step between two photographs is then "
         f"{shown} stops. The rest is misaligned texture, gloss, and effects outside the model."
     )
-    if scene.picture is not None and scene.shown is not None:
-        body += _seam_picture(scene.shown, scene.picture)
+    if measured.picture is not None and measured.shown is not None:
+        body += _seam_picture(measured.shown, measured.picture)
     heads = ["pair", *(head for _, head, _ in COLUMNS)]
     rows = [
         [p.name, *(format(getattr(p.seam, name), form) for name, _, form in COLUMNS)] for p in seams

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.core.text import count_of
-from p2gs_jax.report import findings, pictures
-from p2gs_jax.report import measurements as scenes
+from p2gs_jax.report import findings, measurements, pictures
 from p2gs_jax.report import page as html
 from p2gs_jax.report import photometry_sections as photometry
 from p2gs_jax.report import run_sections as sections
@@ -39,26 +38,26 @@ def write_report(
     run = read_run(folder, None if scene is None else Path(scene))
     path = folder / "report.html" if out is None else Path(out)
     check_place(path)
-    measured = scenes.measure_scene(run, reporter, render=render)
+    measured = measurements.measure_scene(run, reporter, render=render)
     reporter.stage("Drawing")
     html.write_page(path, report_page(run, measured))
     return path
 
 
-def report_page(run: RunFiles, scene: SceneMeasurements) -> str:
+def report_page(run: RunFiles, measured: SceneMeasurements) -> str:
     """Return the page of a run from the files of its folder and measurements on its scene."""
     problems: list[str] = []
-    truth = scene.true_exposures
+    truth = measured.true_exposures
     views = pictures.held_out_section(run, MOST_COMPARED, problems)
     found = run_warnings(run)
     shown = [
-        ("warnings", "Warnings", _warnings(found, run, [*scene.missing, *problems])),
+        ("warnings", "Warnings", _warnings(found, run, [*measured.missing, *problems])),
         ("model", "Photometric model", photometry.model_section(run)),
         ("exposures", "Exposures", photometry.exposure_section(run, truth)),
         ("white-balance", "White balance", photometry.white_balance_section(run)),
         ("response", "Tone curve", photometry.response_section(run)),
         ("vignetting", "Vignetting", photometry.vignetting_section(run)),
-        ("seams", "Seams between photographs", scenes.seam_section(scene)),
+        ("seams", "Seams between photographs", measurements.seam_section(measured)),
         ("views", "Held-out views", views),
         ("scores", "Scores", sections.score_section(run)),
         ("parts", "Static and moving pixels", sections.parts_section(run)),
@@ -70,15 +69,15 @@ def report_page(run: RunFiles, scene: SceneMeasurements) -> str:
     name, under = run.scene.name or folder, f"A fit with the preset {run.preset}, in {folder}/"
     head = f"<h1>{text(name)}</h1>\n{paragraph(under, 'quiet')}"
     head += paragraph(findings.modelled(run), "lead")
-    head += html.key_numbers(list(_key_numbers(run, scene, found)))
+    head += html.key_numbers(list(_key_numbers(run, measured, found)))
     return page(f"{name} · p2gs-jax", head, shown, html.made_by("report"))
 
 
 def _key_numbers(
-    run: RunFiles, scene: SceneMeasurements, found: list[RunWarning]
+    run: RunFiles, measured: SceneMeasurements, found: list[RunWarning]
 ) -> Iterator[tuple[str, str, str]]:
     held_out, train = run.number("test", "exposure_fitted", "psnr"), run.number("train", "psnr")
-    error = findings.true_error(run, scene.true_exposures)
+    error = findings.true_error(run, measured.true_exposures)
     for name, value, form, remark in (
         ("Held-out PSNR", held_out, "{:.1f} dB", "with the exposure fitted to each view"),
         ("Training PSNR", train, "{:.1f} dB", "with the exposure of each view"),
@@ -87,9 +86,9 @@ def _key_numbers(
     ):
         if value is not None:
             yield name, form.format(value), remark
-    if scene.seams:
-        before, after = scenes.seam_medians(scene.seams)
-        pairs = count_of(len(scene.seams), "pair")
+    if measured.seams:
+        before, after = measurements.seam_medians(measured.seams)
+        pairs = count_of(len(measured.seams), "pair")
         yield "Seams", f"{before:.2f} → {after:.2f} stops", f"before and after, median of {pairs}"
     gaussians, steps = run.number("counts", "gaussians"), run.number("counts", "steps")
     if gaussians is not None:

@@ -123,10 +123,10 @@ def training_section(run: RunFiles) -> str:
 
     terms = sorted({name for r in log for name in r.get("terms") or {}})
     values = {n: v for n in terms if np.isfinite(v := over_steps("terms", n)).any()}
-    size = {n: float(np.nanmedian(v)) for n, v in values.items()}
+    medians = {n: float(np.nanmedian(v)) for n, v in values.items()}
     # Very small terms would only stretch the axis.
-    large = [n for n in size if size[n] > 1e-3 * max(size.values())]
-    ranked = sorted(large, key=lambda n: -size[n])[:MOST_TERMS]
+    large = [n for n in medians if medians[n] > 1e-3 * max(medians.values())]
+    ranked = sorted(large, key=lambda n: -medians[n])[:MOST_TERMS]
     losses = {"loss": over_steps("loss")} | {n.replace("_", " "): values[n] for n in ranked}
     losses = {n: np.where(v > 0, v, np.nan) for n, v in losses.items()}
     steps, psnr, gaussians = (over_steps(name) for name in ("step", "psnr", "gaussians"))

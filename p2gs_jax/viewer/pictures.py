@@ -143,7 +143,7 @@ def warp_photograph(
     K, k = np.asarray(camera.K, float), np.asarray(frame.K, float)
     # OpenCV's first pixel centre is at 0, ours at 0.5.
     half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
-    pull = np.linalg.inv(half) @ K @ turn @ np.linalg.inv(k) @ half
+    pull = np.linalg.inv(half) @ K @ turn @ np.linalg.inv(k) @ half  # frame to photograph
     size = (frame.width, frame.height)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     shrink = _minification(pull, size)

@@ -69,7 +69,7 @@ class Page {
     });
   }
 
-  measureDepth() {
+  measureDepth() {  // at the middle of a window of 800 x 600 pixels
     const camera = intoWindow(this.state.camera, 800, 600);
     this.depth = this.scene.depth = depthAt(this.splats, camera, 400, 300) || 10;
     this.pivot = plus(this.state.camera.c, row(this.state.camera.R, 2), this.depth);
