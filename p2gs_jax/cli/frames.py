@@ -103,8 +103,8 @@ def shots_of(
         shots = [shot.resized(options.width) for shot in shots]
     if options.meter is not None:
         added = options.exposure_ev if isinstance(options.exposure_ev, float | int) else 0.0
-        adapted = ADAPT_S * (options.fps or FPS) if options.trajectory != "views" else 0.0
-        shots = pictures.metered_shots(fitted, shots, options.meter, added, adapted)
+        adapt_frames = ADAPT_S * (options.fps or FPS) if options.trajectory != "views" else 0.0
+        shots = pictures.metered_shots(fitted, shots, options.meter, added, adapt_frames)
         if options.meter == "auto":
             notes = [*notes, fitted.metering.sentence]
     size = (max(s.width for s in shots), max(s.height for s in shots))

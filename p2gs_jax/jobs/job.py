@@ -46,7 +46,7 @@ class JobState:
 
     name: str
     status: Status = "waiting"
-    begun: int = 0  # number of starts in this call; above 1 if a worker was lost
+    starts: int = 0  # their number in this call; above 1 if a worker was lost
     reason: str | None = None  # of a failure
     doing: str = ""  # the current stage, in words
     progress: float | None = None  # of that stage, 0 to 1; None: unknown

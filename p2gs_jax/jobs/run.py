@@ -13,7 +13,7 @@ from p2gs_jax.jobs.engines import is_lost
 from p2gs_jax.jobs.worker import run_in_process
 
 # Largest number of starts of a job.
-MOST_BEGUN = 3
+MOST_STARTS = 3
 # Time between two readings of the progress of all jobs, seconds.
 LOOK_S = 0.5
 # A function that runs the job of a file, and returns its status and the reason of a failure.
@@ -91,7 +91,7 @@ class _Watched:
 
     def begin(self, engine: Executor) -> None:
         """Submit the job to an engine."""
-        self.state.begun += 1
+        self.state.starts += 1
         self.state.doing, self.state.progress = "", None
         self.files.progress.unlink(missing_ok=True)
         self.future = engine.submit(self.run, str(self.files.path))
@@ -108,7 +108,7 @@ class _Watched:
             state.reason = f"{type(error).__name__}: {error}"
         if engine is None:
             state.status = "stopped" if state.status == "lost" else state.status
-        elif state.status == "lost" and state.begun < MOST_BEGUN:
+        elif state.status == "lost" and state.starts < MOST_STARTS:
             state.status = "waiting"
             try:
                 self.begin(engine)
@@ -118,7 +118,7 @@ class _Watched:
                 state.reason = f"{state.reason}; the engine accepts no more jobs ({gone})"
         elif state.status == "lost":
             state.status = "failed"
-            state.reason = f"its worker was lost {state.begun} times; last error: {state.reason}"
+            state.reason = f"its worker was lost {state.starts} times; last error: {state.reason}"
         if state.status == "failed" and not (self.job.folder / records.REASON).exists():
             records.write_reason(self.job.folder, state.reason)
         return True

@@ -129,10 +129,10 @@ def calibrate(
 ) -> Calibration:
     """Solve the photometry of a scene and write the files of a calibration.
 
-    The scene is a COLMAP model, a transforms.json or a folder of photographs. The options of data,
-    photometry and the thresholds of the loss in `cfg` (default `robust`) apply. The result is
-    compared with stated exposures from `exif` or a CSV file, by default those in EXIF, if any.
-    With `develop`, the folder `developed` gets the photographs at one exposure, for other trainers.
+    The scene has any format that `load_scene` reads. The options of data, photometry and the
+    thresholds of the loss in `cfg` (default `robust`) apply. The result is compared with stated
+    exposures from `exif` or a CSV file, by default those in EXIF, if any. With `develop`, the
+    folder `developed` gets the photographs at one exposure, for other trainers.
 
     Raises:
         UserError: a fault that the user can fix.

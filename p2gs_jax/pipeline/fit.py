@@ -86,8 +86,8 @@ def fit(
 ) -> FitResult:
     """Fit a scene and write a run folder.
 
-    The scene is a COLMAP model, a transforms.json or a folder of photographs; `reference` has
-    photographs of the same views under one common exposure. Without `cfg` the preset is `robust`.
+    The scene has any format that `load_scene` reads; `reference` has photographs of the same views
+    under one common exposure. Without `cfg` the preset is `robust`.
     `spent_s` seconds of the budget have passed before the call. `true_exposures` by image name are
     for the plot. Several `devices` share the views of a step; `train.batch` is a multiple of them.
     `terms` of the loss by name, `formation` and `strategy` are as for `make_step`. The run folder

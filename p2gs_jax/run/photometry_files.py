@@ -95,7 +95,9 @@ def with_formation_of(cfg: PhotometryConfig, saved: PhotometryFile) -> Photometr
         cameras = [{"name": c["name"], **{k: c[k] or () for k in kinds}} for c in saved["cameras"]]
         found |= {"pivot": float(curve["pivot"]), "cameras": camera_formations(cameras)}
     except (KeyError, TypeError, ValueError) as error:
-        raise UserError(f"photometry.json has no tone curve ({error}).", fix=AGAIN) from error
+        raise UserError(
+            f"photometry.json has no valid tone curve or camera ({error}).", fix=AGAIN
+        ) from error
     found["white_balance"] = "view" if balanced else None
     return dataclasses.replace(cfg, select=False, **found)
 

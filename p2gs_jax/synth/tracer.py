@@ -104,7 +104,7 @@ def _radiance(
 ) -> Float[Array, "3 r"]:
     """Return the linear radiance that arrives at the origin [3] along rays [3 R].
 
-    Directions are not normalised; `t` [R] is where a ray hits (inf: sky) and `index` [R] what; a
+    Directions are not normalised; `t` [R] is the hit on a ray (inf: sky), `index` [R] its row. A
     pixel is `pixel_angle` wide at unit camera z, and finer texture fades out.
     """
     hit = jnp.isfinite(t)

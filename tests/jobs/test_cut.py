@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.seeds import camera_centers
-from p2gs_jax.jobs.blocks.cut import cut_scene, seen_points, split, thinned, whole_of
+from p2gs_jax.jobs.blocks.cut import block_scene, cut_scene, seen_points, split, thinned
 from p2gs_jax.types import Scene, Tracks, View
 
 LENGTH = 100.0
@@ -102,11 +102,11 @@ def test_too_many_blocks_are_refused_with_how_many_there_may_be():
 def test_a_block_has_its_points_whole_and_those_around_it_coarse(tracks):
     scene = make_road(tracks=tracks, points=20_000)
     cut = cut_scene(scene, 4)
-    found, keep, own = whole_of(scene, cut, 1)
+    found, keep, inside = block_scene(scene, cut, 1)
     near = cut.blocks[1].holds(cut.ground.place(found.points), cut.margin)
-    assert near[:own].all()
-    assert not near[own:].any()
-    assert own == cut.blocks[1].holds(cut.ground.place(scene.points), cut.margin).sum()
+    assert near[:inside].all()
+    assert not near[inside:].any()
+    assert inside == cut.blocks[1].holds(cut.ground.place(scene.points), cut.margin).sum()
     np.testing.assert_array_equal(found.points, scene.points[keep])
     assert len(found.train_indices) == len(found.views) == len(cut.blocks[1].views)
     if tracks:

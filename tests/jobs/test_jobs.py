@@ -57,9 +57,9 @@ def test_one_that_fails_leaves_its_reason_and_ends_nothing_else(tmp_path):
     found = {s.name: s for s in states}
     once = dict.fromkeys(("refused", "stumbled", "left", "killed", "full"), ("failed", 1))
     expected = {"good": ("done", 1), "asked": ("done", 2), "doomed": ("failed", 3), **once}
-    assert {name: (s.status, s.begun) for name, s in found.items()} == expected
+    assert {name: (s.status, s.starts) for name, s in found.items()} == expected
     for name, state in found.items():
-        assert len((tmp_path / name / "tries").read_text()) == state.begun
+        assert len((tmp_path / name / "tries").read_text()) == state.starts
     assert "add photographs" in found["refused"].reason
     assert found["stumbled"].reason == "ZeroDivisionError: by zero"
     assert "with code 3: last words" in found["left"].reason
@@ -247,7 +247,7 @@ def test_the_local_executor_of_submitit_runs_jobs(tmp_path):
     with open_engine("submitit-local:timeout_min=5", 1, tmp_path) as engine:
         states = run_jobs(jobs, engine, tmp_path / "jobs")
         assert [s.status for s in states] == ["done", "done", "failed"]
-        assert [s.begun for s in states] == [1, 2, 1]
+        assert [s.starts for s in states] == [1, 2, 1]
 
 
 def test_slurm_where_there_is_none_is_refused(tmp_path, monkeypatch):

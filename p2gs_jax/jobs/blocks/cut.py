@@ -216,7 +216,7 @@ def shows(view: View, points: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, " p"
     return in_frame(*project_points(points, view), view.width, view.height)
 
 
-def whole_of(scene: Scene, cut: Cut, number: int) -> tuple[Scene, Int[np.ndarray, " k"], int]:
+def block_scene(scene: Scene, cut: Cut, number: int) -> tuple[Scene, Int[np.ndarray, " k"], int]:
     """Return a block as a scene: its views, its points, and coarse points around it.
 
     The other results are the rows of these points in the whole scene, and the number of points

@@ -12,7 +12,7 @@ from p2gs_jax.core.memory import left_to_process
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.dense import coverage_of
 from p2gs_jax.jobs.blocks.block import block_config
-from p2gs_jax.jobs.blocks.cut import Cut, cut_scene, whole_of
+from p2gs_jax.jobs.blocks.cut import Cut, block_scene, cut_scene
 from p2gs_jax.pipeline.preflight import memory_needed
 from p2gs_jax.types import Scene
 
@@ -81,7 +81,7 @@ def largest_block(scene: Scene, cfg: FitConfig, cut: Cut) -> float:
     """Return the peak memory, bytes, of the block of a cut that needs the most."""
     count, most = len(scene.train_indices), 0.0
     for number in range(len(cut.blocks)):
-        block, _, inside = whole_of(scene, cut, number)
+        block, _, inside = block_scene(scene, cut, number)
         options = block_config(cfg, cut, number, block, inside, train_views=count)
         most = max(most, bytes_needed(block, options))
     return most

@@ -27,7 +27,7 @@ from p2gs_jax.render.warp import unproject
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.types import Camera, Gaussians, Render, Scene
 
-# Largest number of rendered views of a boundary. With 12 a step was 0.018 stops, with 48 0.005.
+# Largest number of rendered views of a boundary. A step of 0.005 stops read 0.018 with 12 views.
 MOST_VIEWS = 48
 # Pixels are compared where both blocks have at least this opacity.
 OPAQUE = 0.9

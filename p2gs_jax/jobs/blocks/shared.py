@@ -14,7 +14,7 @@ from p2gs_jax.core.progress import Reporter
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.seeds import cameras_radius, photographed_radiance, with_colors
 from p2gs_jax.gaussians.shell import Sphere, sphere_behind
-from p2gs_jax.jobs.blocks.cut import Cut, whole_of
+from p2gs_jax.jobs.blocks.cut import Cut, block_scene
 from p2gs_jax.photometry.parameters import point_radiance
 from p2gs_jax.pipeline.exposures import Exposures, solve_exposures
 from p2gs_jax.pipeline.survey import near_depth, near_plane, scale_notes, seen_depths
@@ -127,7 +127,7 @@ def block_of(shared: Shared, cut: Cut, number: int) -> tuple[Shared, int]:
 
     The second result is the number of points inside the block.
     """
-    scene, keep, inside = whole_of(shared.scene, cut, number)
+    scene, keep, inside = block_scene(shared.scene, cut, number)
     given, rows = shared.exposures, np.array(cut.blocks[number].views)
     cameras = given.photometry.cameras
     assert given.radiance is not None
