@@ -55,12 +55,14 @@ def measured_depths(scene: Scene, cfg: FitConfig) -> list[Measured] | None:
     """
     if cfg.loss.lidar is None:
         return None
-    if scene.lidar is None:
+    lidar = scene.lidar
+    if lidar is None or not (lidar.objects < 0).any():
         fix = "leave the option out, or name a drive with LiDAR sweeps"
-        raise UserError(f"{scene.root} has no laser measurements for --loss.lidar.", fix=fix)
+        kind = "laser measurements" if lidar is None else "laser measurements of things at rest"
+        raise UserError(f"{scene.root} has no {kind} for --loss.lidar.", fix=fix)
     rng = generator(cfg.train.seed, Stream.MEASURED_DEPTHS)
-    static = scene.lidar.objects < 0
-    points, times = scene.lidar.points[static], scene.lidar.times[static]
+    static = lidar.objects < 0
+    points, times = lidar.points[static], lidar.times[static]
     return [_of_view(points, times, v, scene.objects, rng) for v in scene.training_views]
 
 

@@ -102,7 +102,7 @@ class Records:
             self.on_message(f"The run is planned for longer: {host.progress:.0%} of it is done.")
             last = kept[-1]["progress"] if kept else 0.0
             # A session that ended before its first checkpoint may have rewritten the log already.
-            if abs(last - host.progress) > 1e-5:
+            if last and abs(last - host.progress) > 1e-5:
                 share = host.progress / last
                 kept = [line | {"progress": round(share * line["progress"], 6)} for line in kept]
         write_text(self._log, "".join(json.dumps(line) + "\n" for line in kept))

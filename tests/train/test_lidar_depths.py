@@ -72,6 +72,10 @@ def test_views_get_what_stands_still_near_in_time_and_is_not_hidden():
 
 
 def test_a_loss_without_measurements_is_refused():
-    with pytest.raises(UserError, match=r"no laser measurements"):
-        measured_depths(wall_scene(), FitConfig(loss=LossConfig(lidar=0.1)))
+    cfg = FitConfig(loss=LossConfig(lidar=0.1))
+    with pytest.raises(UserError, match=r"no laser measurements for"):
+        measured_depths(wall_scene(), cfg)
+    moving = wall_scene(points=np.ones((2, 3)), times=np.zeros(2), objects=np.zeros(2, int))
+    with pytest.raises(UserError, match=r"no laser measurements of things at rest"):
+        measured_depths(moving, cfg)
     assert measured_depths(wall_scene(), FitConfig()) is None

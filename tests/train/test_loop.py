@@ -84,6 +84,13 @@ def test_a_longer_run_that_is_killed_before_it_saves_goes_on_as_if_nothing_had_b
     assert "step 200 of 200, loss" in LogRecord(**harness.log()[-1]).summary()
 
 
+def test_a_longer_run_goes_on_without_its_log(harness):
+    harness.run(SHORT)
+    (harness.folder / "log.jsonl").unlink()
+    result, _ = harness.run(with_fields(SHORT, {"train.steps": 200}), resume=True)
+    assert (result.host.step, harness.log()[0]["progress"]) == (200, pytest.approx(105 / 200))
+
+
 def test_a_run_that_its_budget_ended_goes_on_under_a_larger_one(harness):
     first, _ = harness.run(BUDGET)
     assert "step 5, loss" in LogRecord(**harness.log()[0]).summary()

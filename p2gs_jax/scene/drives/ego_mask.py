@@ -113,7 +113,8 @@ def _cached_mask(
 
     stamps = [(p.path.name, p.frame, 0 if p.embedded else p.path.stat().st_mtime_ns) for p in shots]
     places = [np.round(p.pose, 6).tolist() for p in shots]
-    key = [_VERSION, camera.name, camera.K.tolist(), stamps, places]
+    lens = [camera.K.tolist(), repr(camera.distortion), np.round(up, 6).tolist()]
+    key = [_VERSION, camera.name, lens, stamps, places]
     with cached_folder(work_dir, f"ego_mask/{camera.name}", key, build) as folder:
         if not (folder / "car.png").is_file():
             return None

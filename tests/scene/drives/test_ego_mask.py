@@ -7,11 +7,13 @@ import numpy as np
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.run.scene_file import read_scene, write_scene
+from p2gs_jax.scene.drives import ego_mask
 from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.drives.ego_mask import find_ego_mask
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.rigid import pose_of
+from p2gs_jax.types import Distortion
 
 W, H, F, HEIGHT = 480, 270, 400.0, 1.6
 K = np.array([[F, 0, W / 2], [0, F, 0.45 * H], [0, 0, 1.0]])
@@ -119,3 +121,25 @@ def test_drives_mask_the_car_and_runs_keep_the_mask(tmp_path, monkeypatch):
     assert assemble(recording, DataConfig(frames="0:4"), tmp_path / "work").notes == scene.notes
     without = assemble(recording, DataConfig(ego_mask=False))
     assert all(view.ego_mask is None for view in without.views)
+
+
+def test_another_lens_is_not_answered_with_the_mask_of_the_last(tmp_path, monkeypatch):
+    lenses = []
+
+    def found(camera, *_):
+        lenses.append(camera.distortion)
+        return np.zeros((2, 2), bool)
+
+    monkeypatch.setattr(ego_mask, "find_ego_mask", found)
+    cv2.imwrite(str(tmp_path / "0.png"), np.zeros((H, W), np.uint8))
+    recording = Recording(
+        tmp_path,
+        "pandaset",
+        (CAMERA,),
+        (Photograph("front", 0, 0.0, tmp_path / "0.png", np.eye(4)),),
+    )
+    bent = dataclasses.replace(CAMERA, distortion=Distortion((0.1,)))
+    for camera in (CAMERA, CAMERA, bent):
+        drive = dataclasses.replace(recording, cameras=(camera,))
+        ego_mask.find_ego_masks(drive, ["front"], tmp_path / "work", lambda text: None)
+    assert lenses == [None, bent.distortion]
