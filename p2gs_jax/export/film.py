@@ -34,7 +34,7 @@ Finish = Callable[[Logs], Any]
 
 
 def common_curve(log_exposure: float, gamma: float, cfg: PhotometryConfig, most: int) -> Finish:
-    """Return the function from natural log radiance to stored values; `most` is that of white."""
+    """Return the function from natural log radiance to values; `most` is the value of white."""
     white = formation.inverse_tone_map(np.ones(3), gamma, cfg, None).max()
     first, last = np.log(formation.EXPOSED_FLOOR), np.log(white)
     exposed = np.exp(np.linspace(first, last, _STEPS))[:, None]

@@ -49,7 +49,7 @@ def write_folder(
     """Write `images`, `exposures.csv`, `masks` if there are any, and the scene for a program.
 
     COLMAP reads `sparse/0`; nerfstudio's `splatfacto` reads `transforms.json` and `sparse_pc.ply`.
-    Coordinates are those of the data set, without the shift by `Scene.origin`. The folder is
+    Coordinates are as in the data set, without the shift by `Scene.origin`. The folder is
     replaced once the new one is complete. `on_view` receives the number of written photographs
     and the number of all. Raises UserError: a photograph cannot be read.
     """

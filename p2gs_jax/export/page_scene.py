@@ -19,7 +19,7 @@ from p2gs_jax.run.read import Run
 STEPS = np.arange(-6, 6) + 0.5
 # Longer side of embedded photographs, pixels, and their WebP quality, percent.
 LONGEST, QUALITY = 960, 80
-# Significant digits of numbers in the page: those of float32.
+# Significant digits of numbers in the page, enough for float32.
 DIGITS = 7
 
 

@@ -1,4 +1,4 @@
-"""The Gaussians of a page, and their error: all visible ones, or those of largest weight."""
+"""The Gaussians of a page: all visible ones, or the ones of largest weight; and their error."""
 
 from __future__ import annotations
 

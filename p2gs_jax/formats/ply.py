@@ -35,7 +35,7 @@ def field_names(coefficients: int) -> list[str]:
 
 # The comment of files with radiance instead of display colours.
 LINEAR = "p2gs-jax: linear HDR radiance"
-# Fields of vibrating Gaussians, after those of the reference implementation.
+# Fields of vibrating Gaussians, after the fields of the reference implementation.
 VIBRATION = ("velocity_x", "velocity_y", "velocity_z", "peak_time", "log_life")
 # Rows that are written or read at a time, about 16 MB; a whole file may have some gigabytes.
 CHUNK = 65536

@@ -79,7 +79,7 @@ def held_out_section(run: RunFiles, most: int, problems: list[str]) -> str:
         if render.shape == photograph.shape:
             difference = signed_difference(render, photograph)
         three = {"Photograph": photograph, "Render of": render, "Difference at": difference}
-        cells = [(jpeg(p, f"{what} {files.name}"), what.split()[0]) for what, p in three.items()]
+        cells = [(jpeg(p, f"{name} {files.name}"), name.split()[0]) for name, p in three.items()]
         body += f"<h3>{text(without_suffix(files.name))}{text(dB)}</h3>{row(cells, 'three')}"
         shown += 1
     if not shown:

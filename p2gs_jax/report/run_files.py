@@ -34,7 +34,7 @@ class RunFiles:
     `scene` is the folder of the scene, which may no longer exist; `scene_argument` is the argument
     of `read_run`. `options` are nested values of `config.json`; `cfg` is made from them, or None if
     this version cannot read them. The log has the lines that hold a step. `missing` has a sentence
-    on each file that is missing or cannot be read; `broken` has the names of the latter.
+    on each file that is missing or cannot be read; `broken` names the unreadable ones.
     """
 
     folder: Path

@@ -74,11 +74,11 @@ def _radiance(run: RunFiles) -> str:
 def parts_section(run: RunFiles) -> str:
     """Return a table of scores over all, static and moving pixels of drives."""
     rows = []
-    for name, (part, what) in itertools.product(BY_PART, PARTS.items()):
+    for name, (part, pixels) in itertools.product(BY_PART, PARTS.items()):
         views, shown, path = PROTOCOLS[name]
         scores, seen = _scores(run, *path, part), run.number(*path, part, "views")
         if scores[0] and seen is not None:
-            rows.append([views, shown, what, *scores, f"{seen:.0f}"])
+            rows.append([views, shown, pixels, *scores, f"{seen:.0f}"])
     names = ["views", "rendered with", "pixels", "PSNR, dB", "SSIM", "LPIPS", "number of views"]
     note = (
         "Moving pixels are in the boxes of objects that move at some time. SSIM is computed on the "

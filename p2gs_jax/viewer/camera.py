@@ -116,7 +116,7 @@ def camera_of_browser(
 ) -> Camera:
     """Return our camera for a browser's, for a canvas with `aspect` = width / height.
 
-    `size` is that of the render; pixels are not square if its aspect differs.
+    `size` is the size of the render; pixels are not square if its aspect differs.
     """
     rotation = Rotation.from_quat(np.asarray(view.wxyz, float), scalar_first=True).as_matrix()
     position = np.asarray(view.position, float) / space.unit

@@ -46,7 +46,7 @@ CHARTS: dict[str, dict[str, Any]] = {
     "Exposures of the training views, EV": {"width": 0, "points": {"show": True, "size": 5}},
 }
 MOST_RECORDS = 300  # records of the log in a chart
-LINE, INK, GRID = "#4dabf7", "#c1c2c5", "#373a40"
+LINE, INK, GRID = "#4dabf7", "#c1c2c5", "#373a40"  # colours of charts
 
 
 class Panel:

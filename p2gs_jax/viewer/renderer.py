@@ -178,7 +178,7 @@ def _frame(result: Render, camera: Camera) -> RenderedFrame:
 
 
 def full_size(canvas: Size, max_width: int) -> Size:
-    """Return the size to render at rest: that of the canvas, at most `max_width` pixels wide."""
+    """Return the size at rest: the size of the canvas, at most `max_width` pixels wide."""
     width, height = max(canvas[0], 1), max(canvas[1], 1)
     scale = min(1.0, max_width / width)
     return max(1, round(width * scale)), max(1, round(height * scale))
@@ -207,7 +207,7 @@ def next_size(
 ) -> Size | None:
     """Return the size for the next frame of a moving camera, or None if none is compiled.
 
-    `sizes` are those of the canvas and increase; `ready` sizes may belong to other canvases. The
+    `sizes` belong to the canvas and increase; `ready` sizes may belong to other canvases. The
     last frame took `ms` milliseconds at the size `current`, which stays unless another is better.
     """
     usable = [size for size in sizes if size in ready]

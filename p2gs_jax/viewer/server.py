@@ -276,11 +276,11 @@ def serve(
     with open_viewer(run, follower=follower, **options) as address:
         local = is_loopback(options["host"])
         who = "only this machine" if local else "any machine with this address"
-        what = "Watch the fit" if follower else f"{run.params.gaussians.capacity} Gaussians"
+        shown = "Watch the fit" if follower else f"{run.params.gaussians.capacity} Gaussians"
         with contextlib.suppress(KeyboardInterrupt), interrupts.held() as signals:
             # Signals are recorded, not raised: Python drops exceptions during garbage collection.
             signals.begin()
-            say(f"{what} at {address} (open to {who}; Ctrl-C ends)")
+            say(f"{shown} at {address} (open to {who}; Ctrl-C ends)")
             while signals.arrived is None:
                 if follower is not None and follower.with_fit and not follower.goes_on:
                     break

@@ -47,7 +47,7 @@ class Hands {
     const dx = e.clientX - finger.x, dy = e.clientY - finger.y;
     Object.assign(finger, { x: e.clientX, y: e.clientY });
     this.travelled += Math.hypot(dx, dy);
-    if (this.travelled < 4) return;
+    if (this.travelled < 4) return;  // pixels; so far this may be a click
     if (this.fingers.size === 1 && !this.pans) return this.turn(dx, dy);
     const after = this.middle();
     this.pan(after.x - before.x, after.y - before.y);

@@ -241,7 +241,7 @@ class Renderer {
       this.bind(d, name, k, this.columns[k], gl.TEXTURE_2D));
     gl.uniform2f(d.at.size, width, height);
     gl.uniform1f(d.at.alphaMax, r.alphaMax);
-    gl.uniform1f(d.at.brightest, this.half ? HALF_MOST : 3e38);
+    gl.uniform1f(d.at.brightest, this.half ? HALF_MOST : 3e38);  // the latter: float32
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.order.length);
     gl.bindVertexArray(null);
     gl.disable(gl.BLEND);
