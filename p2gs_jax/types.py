@@ -191,7 +191,7 @@ class Camera(eqx.Module):
 class Frustum(eqx.Module):
     """A camera whose image size is traced: per-Gaussian programs compile once for all sizes.
 
-    Attributes are those of `Camera`.
+    `Camera` describes the attributes.
     """
 
     viewmat: Float[Array, "4 4"] | Float[Array, "4 4 n"]

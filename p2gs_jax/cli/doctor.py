@@ -174,7 +174,7 @@ def check_devices() -> list[Finding]:
 
 
 def check_render() -> Finding:
-    """Compare images of small scenes, and their gradients, with those of the float64 reference."""
+    """Compare images and gradients of small scenes with the float64 reference."""
     try:
         from p2gs_jax.render.selfcheck import self_check
 

@@ -35,10 +35,10 @@ class Eval:
     against: tuple[Path, ...] = ()
     """Folders of renders of the held-out views by other programs (docs/report.md)."""
     lpips_weights: str | None = None
-    """Weights of LPIPS: alex, vgg, or none (default: those of the run)."""
+    """Weights of LPIPS: alex, vgg, or none (default: the run's weights)."""
 
     def execute(self) -> int:
-        """Evaluate the run and rewrite its metrics; options replace those of the run."""
+        """Evaluate the run and rewrite its metrics; options replace the run's options."""
         from p2gs_jax.cli.tables import print_against, print_metrics, stdout
         from p2gs_jax.core.atomic import write_json
         from p2gs_jax.core.progress import TerminalReporter

@@ -84,7 +84,7 @@ class Synth:
     """Image width, pixels (paper: 1920); the height follows as 1300 / 1920 of it."""
     layout: Layout = "town"
     """Layout of the town. town: an underpass, and another sun for every seed; matte: the same
-    without gloss; street: that of the demo; long: streets one behind another."""
+    without gloss; street: the demo's layout; long: streets one behind another."""
     supersample: int | None = None
     """Samples per pixel along each axis (default: 2; 8 for a matte town)."""
     points: int = 60_000

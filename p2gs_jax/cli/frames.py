@@ -22,7 +22,7 @@ from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.run.read import Run
 
 Photograph = Callable[[int], Float32[np.ndarray, "h w 3"] | None]  # by the row of its view
-# A metered exposure follows what is seen within about this time, seconds.
+# A metered exposure follows changes of the picture within about this time, seconds.
 ADAPT_S = 0.5
 
 
@@ -34,7 +34,7 @@ class Job:
     count: int
     size: tuple[int, int]  # width and height of the largest, pixels
     shots: Sequence[Shot] = ()  # cameras that can be kept as a file; panoramas have none
-    notes: Sequence[str] = ()  # what the user should know
+    notes: Sequence[str] = ()  # notes for the user
 
 
 def _display_transform(fitted: Run, options: Render, shot: Shot | None = None) -> DisplayTransform:

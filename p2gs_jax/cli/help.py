@@ -282,7 +282,7 @@ def prose(kind: type) -> str:
 def examples(kind: type, name: str) -> str:
     """Return the text below the options: the docstring's examples.
 
-    A `name` is that of a command whose help is brief; the text then names the full help.
+    With the `name` of a command whose help is brief, the text also names the full help.
     """
     below = [f"{INDENT}{line}" for line in _paragraphs(kind)[1]]
     if below:

@@ -117,7 +117,7 @@ def _with_values(argv: list[str]) -> list[str]:
 
 
 def _defaults(name: str, argv: list[str]) -> Any:
-    """Return the defaults of a command's options; those of the configuration are a preset's."""
+    """Return the defaults of a command's options; the configuration is a preset."""
     if name not in WITH_PRESET:
         return tyro.MISSING_NONPROP
     name_of_preset: Any = "robust"

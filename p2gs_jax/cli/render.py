@@ -55,11 +55,11 @@ class Render:
     where one explains the photographs; log_average, centre: to mid-grey; highlights: to just below
     white; protected: to mid-grey, highlights kept. --exposure-ev then adds stops."""
     gamma: float | None = None
-    """Gamma (default: that of each view; for other pictures the mean of the training views)."""
+    """Gamma (default: the view's; for other pictures the mean of the training views)."""
     curve: Literal["run", "srgb", "power", "linear", "spline"] = "run"
     """Tone curve; run: the fitted one."""
     white_balance_of: str | None = None
-    """View whose white balance is used (default: that of each view, or neutral)."""
+    """View whose white balance is used (default: the picture's view, or neutral)."""
     no_vignetting: bool = False
     """Leave out the vignetting of the run's cameras."""
     without_objects: bool = False
@@ -71,7 +71,7 @@ class Render:
     frames: int | None = None
     """Number of frames of a drive (default: 8 per view) or an orbit (default: 120)."""
     width: int | None = None
-    """Image width, pixels; the height follows (default: that of the photographs)."""
+    """Image width, pixels; the height follows (default: the photographs' width)."""
     fps: float | None = None
     """Frames per second of a video (default: 24)."""
     scene: SceneFolder = None

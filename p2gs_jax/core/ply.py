@@ -1,8 +1,8 @@
 """PLY files: reads text and binary of both byte orders, writes little-endian binary.
 
 A header declares elements. Each element is a table with a number of rows and properties, single
-values or lists (a face lists the numbers of its corners). The format is that of Greg Turk, "The PLY
-Polygon File Format" (1994), with later names of types that contain sizes (int8, float32).
+values or lists (a face lists the numbers of its corners). Greg Turk defined the format in "The PLY
+Polygon File Format" (1994). Names of types with their sizes (int8, float32) came later.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Configurations by dotted field names: single ones, grids, and those of a TOML file."""
+"""Configurations by dotted field names: single ones, grids, and sweeps in TOML files."""
 
 from __future__ import annotations
 
@@ -90,8 +90,8 @@ def _allowed(hint: Any) -> str:
 def grid(base: FitConfig, **axes: Sequence[Any]) -> dict[str, FitConfig]:
     """Return every combination of the values of some fields, by a name that lists them.
 
-    All other fields are those of `base`. Double underscores stand for dots in the names of `axes`,
-    as in `loss__relative_exposure__weight=[0.01, 0.1]`. Errors are those of `with_fields`.
+    All other fields are as in `base`. Double underscores stand for dots in the names of `axes`,
+    as in `loss__relative_exposure__weight=[0.01, 0.1]`. Errors are as in `with_fields`.
     """
     return _product(base, {name.replace("__", "."): values for name, values in axes.items()})
 

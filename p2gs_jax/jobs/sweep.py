@@ -69,7 +69,7 @@ def sweep(
 
     Each of `seeds` replaces `train.seed`. `max_parallel` processes run at a time; the steps of a
     process hardly use more than one core (BUILD_NOTES). The engine is one of
-    `jobs.engines.open_engine`. `report` receives a line per run. `on_look` and `run` are those of
+    `jobs.engines.open_engine`. `report` receives a line per run. `on_look` and `run` are as for
     `run_jobs`.
 
     Raises:
@@ -160,7 +160,7 @@ def fit_job(name: str, scene: Path, run: Path, cfg: FitConfig, reference: Path |
 
 
 def fit_task(folder: Path, arguments: dict[str, Any], reporter: Reporter) -> None:
-    """Start or continue a fit with the arguments of a `fit_job`; errors are those of `fit`."""
+    """Start or continue a fit with the arguments of a `fit_job`; it raises the errors of `fit`."""
     use_compile_cache()
     tune_process()
     fit(

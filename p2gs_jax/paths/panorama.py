@@ -135,7 +135,7 @@ def _sample(image: np.ndarray, at: Float32[np.ndarray, "h w 2"]) -> np.ndarray:
 def slices(cylinder: Cylinder) -> list[Shot]:
     """Return pinhole cameras of one size that together cover a cylinder from its centre.
 
-    Their resolution is that of the cylinder in the middle, and finer towards the edges.
+    Their resolution equals that of the cylinder in the middle, and is finer towards the edges.
     """
     count = max(1, int(np.ceil(cylinder.span / WIDEST_SLICE)))
     half = cylinder.span / count / 2

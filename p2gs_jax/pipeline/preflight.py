@@ -126,7 +126,7 @@ def check_run_dir(run_dir: Path, resume: bool, cfg: FitConfig) -> bool:
     Steps and budget may be larger.
 
     Returns:
-        Whether steps or budget are larger than those of the run.
+        Whether steps or budget are larger than when the run began.
 
     Raises:
         UserError: the path is not a folder, holds a run and `resume` is not set, or holds a run

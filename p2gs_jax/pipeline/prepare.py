@@ -37,7 +37,7 @@ class Prepared:
     scene: Scene  # the same scene, whose points have colours
     params: Params  # initial parameters
     decisions: Decisions  # values that the scene decided
-    cfg: FitConfig  # options of the fit: those of the user with `decisions` filled in
+    cfg: FitConfig  # the user's options with `decisions` filled in
     owner: np.ndarray | None = None  # moving object of each Gaussian (`Population.owner`)
     selection: Selection | None = None  # model, exposures and their errors from the tracks
     pairs: ColorPairs | None = None  # corresponding observations
@@ -158,7 +158,7 @@ def _notes(
 def _with_nodes(
     gaussians: Gaussians, nodes: Nodes, radiance: np.ndarray, views: list[View], cfg: FitConfig
 ) -> tuple[Gaussians, np.ndarray | None]:
-    """Return Gaussians followed by those of moving objects, and the owner of each."""
+    """Return Gaussians followed by Gaussians of moving objects, and the owner of each."""
     if not len(nodes.moving):
         return gaussians, None
     world = np.full(gaussians.capacity, -1, np.int32)

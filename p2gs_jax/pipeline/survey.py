@@ -52,7 +52,7 @@ class Survey:
     vibrating: bool  # Gaussians move without boxes
     radius: float  # radius of the cameras
     extent: float  # unit of the rates of means
-    near: float | None  # closer near plane, if that of the options would cut the scene
+    near: float | None  # closer near plane, if the one in `cfg` would cut the scene
     coverage: Coverage  # extent of the scene in the views
     measured: list[Measured] | None  # depths of every training view for the loss
     dense: bool  # more seeds come from optical flow
@@ -206,7 +206,7 @@ def extent_of_rates(radius: float, depths: Float[np.ndarray, " n"], cfg: FitConf
 
 
 def near_plane(depth: float | None, cfg: FitConfig) -> float | None:
-    """Return a near plane if that of the options would cut the scene; None: it would not."""
+    """Return a closer near plane if the one in `cfg` would cut the scene, or None."""
     if depth is None or cfg.render.near <= NEAR_SHARE * depth:
         return None
     return float(f"{NEAR_SHARE * depth:.2g}")

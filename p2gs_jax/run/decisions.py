@@ -1,6 +1,6 @@
 """Values that a fit derives from its scene: `decisions.json`, and in every checkpoint.
 
-The options in `config.json` stay those of the user. Model and curve are chosen from the
+The options in `config.json` stay as the user chose them. Model and curve are chosen from the
 photographs, in numpy and threads: another computer may choose differently in a near tie, and a
 state that was optimised under one curve does not fit another. A resumed run therefore keeps the
 decisions of its checkpoints.
@@ -49,7 +49,7 @@ class Decisions:
     responses: config.ResponseKind = "all"  # one response for all, or per camera or channel
     # vignetting and response of each physical camera, if any
     cameras: tuple[config.CameraFormation, ...] = ()
-    # closer near plane, scene units, if that of the options would cut the scene; or None
+    # closer near plane, scene units, if the one in the options would cut the scene; or None
     near: float | None = None
 
     @classmethod
@@ -75,7 +75,7 @@ class Decisions:
         return plain(dataclasses.asdict(self))
 
     def resolve(self, cfg: config.FitConfig) -> config.FitConfig:
-        """Return the options of a fit: those of the user with these values filled in."""
+        """Return the options of a fit: the user's options with these values filled in."""
         values = {place: getattr(self, name) for name, place in _PLACES.items()}
         values["photometry.select"] = False
         if self.near is not None:

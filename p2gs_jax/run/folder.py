@@ -185,7 +185,7 @@ def _lock(handle: int, folder: Path) -> bool:
 
 
 def _is_at(handle: int, path: Path) -> bool:
-    """Return whether a path is still that of the open file."""
+    """Return whether a path still leads to the open file."""
     try:
         return os.path.samestat(os.fstat(handle), os.stat(path))
     except OSError:

@@ -29,13 +29,13 @@ class Sensor:
     camera_gain_ev: float = 0.0
     """Standard deviation of a fixed gain per camera, stops."""
     drift_ev: float = 0.0
-    """Amplitude of a slow automatic exposure, each camera at its own phase, stops."""
+    """Amplitude of a slow automatic exposure, stops; each camera has another phase."""
     compensation_ev: float = 0.0
-    """Added to the exposure of all photographs, not to that of references, stops."""
+    """Stops that are added to all photographs, but not to references."""
     vignetting: float = 0.0
     """Share of the light lost in the corners."""
     vignetting_spread: float = 0.0
-    """Standard deviation of that share between cameras."""
+    """Standard deviation between cameras of the share of light lost in the corners."""
     white_balance_ev: float = 0.0
     """Standard deviation of red and blue gains per camera, stops."""
     white_balance_drift_ev: float = 0.0

@@ -120,7 +120,7 @@ def level_seams(
     """Remove the steps between blocks; return their Gaussians, and the seams after the correction.
 
     Every second view of a boundary measures the step, and the other views measure the remaining
-    seam. Arguments are those of `measure_seams`.
+    seam. `measure_seams` describes the arguments.
     """
     before = measure_seams(scene, store, cut, fitted, cfg, slice(0, None, 2))
     steps = {s.blocks: s.step_stops for s in before if s.step_stops is not None}
