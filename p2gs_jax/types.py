@@ -41,7 +41,7 @@ def _at_least(values, floor: float) -> Any:
     return jnp.where(values > floor, values, floor + (values - lax.stop_gradient(values)))
 
 
-GAMMA_SRGB = 2.2
+GAMMA_SRGB = 2.2  # gamma under which a tone curve equals its base, such as sRGB
 # Weights of red, green and blue in the luminance of display values (BT.601).
 LUMINANCE = (0.299, 0.587, 0.114)
 

@@ -135,13 +135,13 @@ class Fit:
             check(self.cluster.blocks is None, "--view does not show a fit in blocks", fix=fix)
         check(self.view or self.port == 8080, "--port has no effect without --view")
         check(0 <= self.port < 2**16, "--port must be from 0 to 65535")
-        cluster, number = self.cluster, "write a whole number from 1 on, or"
+        cluster, write = self.cluster, "write a whole number from 1 on, or"
         count, devices = cluster.blocks, cluster.devices
         why = "--jobs and --engine have no effect without --blocks"
         fix = "add --blocks auto, or a number"
         check(count is not None or (cluster.jobs == 1 and cluster.engine == "local"), why, fix=fix)
         valid = not isinstance(count, int) or count >= 1
-        check(valid, f"--blocks {count} is not a number of blocks", fix=f"{number} auto")
+        check(valid, f"--blocks {count} is not a number of blocks", fix=f"{write} auto")
         check(cluster.jobs >= 1, "--jobs must be at least 1")
         valid = self.threads is None or self.threads >= 1
         check(valid, f"--threads {self.threads} is not a number of cores", fix="give 1 or more")
@@ -149,7 +149,7 @@ class Fit:
         fix = "leave out --devices and --threads; --jobs and --engine are for blocks"
         check(count is None or (devices == 1 and self.threads is None), why, fix=fix)
         valid = not isinstance(devices, int) or devices >= 1
-        check(valid, f"--devices {devices} is not a number of devices", fix=f"{number} all")
+        check(valid, f"--devices {devices} is not a number of devices", fix=f"{write} all")
 
 
 @dataclass(frozen=True, kw_only=True)

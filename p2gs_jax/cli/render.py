@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from p2gs_jax.types import Scene
 
 PATHS = ("views", "drive", "orbit")
-FPS = 24.0
+FPS = 24.0  # of a video, by default
 MOST_SHIFT = 100.0  # scene units
 # Files that --out cannot name.
 OTHER_FILES = (".mov", ".avi", ".mkv", ".webm", ".gif", ".png", ".jpg", ".exr", ".json")

@@ -17,7 +17,7 @@ from p2gs_jax.paths.shots import LARGEST, Shot, checked_lens, checked_pose
 from p2gs_jax.scene.rigid import camera_centers, pose_of
 
 FIELDS = ("name", "viewmat", "K", "width", "height", "exposure_ev", "gamma", "time")
-MOST_STOPS = 60.0
+MOST_STOPS = 60.0  # from the mean exposure, up or down
 # Smallest and largest values of optional fields; exposures in stops, times in seconds.
 LIMITS = {"exposure_ev": (-MOST_STOPS, MOST_STOPS), "gamma": (1e-3, 1e3)}
 LIMITS["time"] = (-math.inf, math.inf)

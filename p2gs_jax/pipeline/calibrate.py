@@ -47,7 +47,7 @@ from p2gs_jax.scene.exposures import check_source, read_known_exposures, stated_
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import View
 
-STACK_PIVOT = 0.18
+STACK_PIVOT = 0.18  # linear value that gammas do not change
 MEAN_GAUGE = "mean log exposure is 0 over each connected group of views"
 STACK_GAUGE = "mean log exposure is 0; exposures and response can be stretched together"
 # Fields of a solution that `calibration.json` holds under the same names.

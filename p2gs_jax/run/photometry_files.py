@@ -30,7 +30,7 @@ from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.presets import camera_formations
 from p2gs_jax.types import Params, Photometry, Scene, View
 
-VERSION = 2
+VERSION = 2  # of photometry.json
 AGAIN = "restore it from a copy, or run `p2gs-jax fit ... --resume` or `calibrate` again"
 
 

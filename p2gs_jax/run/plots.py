@@ -38,7 +38,7 @@ HEADING = 0.2
 CHARACTER = 0.62
 
 CHANNELS = ("red", "green", "blue")
-MOST_CURVES = 12
+MOST_CURVES = 12  # in the plot of a calibration
 # Number of letters that fit into the narrowest panel.
 TITLE_LETTERS = 36
 

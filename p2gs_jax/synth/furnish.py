@@ -93,7 +93,7 @@ def _light(seed: int) -> Light:
 
 
 def _pavements(build: Builder) -> None:
-    """Both pavements, cut by the side street."""
+    """Place both pavements, cut by the side street."""
     first, last = t.CROSS_STREET
     grey = (0.34, 0.33, 0.31)
     for side in (-1.0, 1.0):
@@ -103,7 +103,7 @@ def _pavements(build: Builder) -> None:
 
 
 def _houses(build: Builder) -> None:
-    """A row of houses on each side, in walls that do not repeat next door."""
+    """Place a row of houses on each side; neighbours have different walls."""
     for side in (-1.0, 1.0):
         order = build.rng.permutation(len(_WALLS))
         k = 0
@@ -158,7 +158,7 @@ def _house(
 
 
 def _vista(build: Builder) -> None:
-    """The town hall that closes the street, and its tower."""
+    """Place the town hall that closes the street, and its tower."""
     wall, trim = (0.60, 0.48, 0.33), (0.70, 0.66, 0.57)
     stone = {"accent": trim, "style": 2.0}
     red, green = (0.30, 0.12, 0.08), (0.16, 0.32, 0.27)
@@ -172,7 +172,7 @@ def _vista(build: Builder) -> None:
 
 
 def _underpass(build: Builder) -> None:
-    """A house built across the street on two thick walls: 14 m of shadow to drive through."""
+    """Place a house across the street on two thick walls: the drive has 14 m of shadow."""
     (x0, x1), side, low = t.UNDERPASS, t.FACADE_LINE + 0.5, t.UNDERPASS_HEIGHT
     wall, trim = (0.55, 0.47, 0.38), (0.70, 0.66, 0.57)
     stone = {"accent": trim, "style": 2.0}
@@ -187,7 +187,7 @@ def _underpass(build: Builder) -> None:
 
 
 def _trees(build: Builder) -> None:
-    """Trees along both kerbs: a trunk and a few ellipsoids of leaves."""
+    """Place trees along both kerbs: a trunk and a few ellipsoids of leaves."""
     for side, first, step in ((1.0, 5.0, 10.5), (-1.0, 14.5, 11.5)):
         for i in range(7):
             x = first + step * i + build.uniform(-0.8, 0.8)
@@ -212,7 +212,7 @@ def _trees(build: Builder) -> None:
 
 
 def _cars(build: Builder) -> None:
-    """Parked cars on both sides."""
+    """Place parked cars on both sides."""
     spots = {-1.0: (13.0, 45.5, 51.5, 64.0, 70.5), 1.0: (7.5, 14.5, 21.0, 43.5, 50.0, 62.5, 76.0)}
     paints = list(build.rng.permutation(len(_PAINTS)))
     k = 0
@@ -225,7 +225,7 @@ def _cars(build: Builder) -> None:
 
 
 def _car(build: Builder, x: float, y: float, side: float, paint: Vec3) -> None:
-    """A parked car; the right side's cars look along +x, the left side's along -x."""
+    """Place a parked car; the right side's cars look along +x, the left side's along -x."""
     ahead = -side
     van = build.rng.random() < 0.2
     half, width = build.uniform(2.05, 2.3), 0.88
@@ -251,7 +251,7 @@ def _car(build: Builder, x: float, y: float, side: float, paint: Vec3) -> None:
 
 
 def _lamps(build: Builder) -> None:
-    """Street lamps, and traffic lights at the crossing: red glows towards the cameras."""
+    """Place street lamps, and traffic lights at the crossing that show red to the cameras."""
     for side, xs in ((1.0, (11.5, 39.0, 66.0)), (-1.0, (20.5, 52.0, 80.0))):
         for x in xs:
             if build.stays_clear(x, 0.5):

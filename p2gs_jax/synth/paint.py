@@ -280,7 +280,7 @@ def _windows(s: Point, bay: _Bay, seed: int) -> tuple[Array, Array, Array]:
     edge, bar = half_h - 0.06, s.bar(du, 0.035)
 
     def above(low: Array | float, reveal: float) -> Array:
-        """Share of panes above a height, between bars, without the reveal's shade at the top."""
+        """Return the share of panes above `low`, between bars, without the reveal's shade."""
         cross = s.span(dz, jnp.maximum(low, 0.265), 0.335)
         dark = reveal * s.span(dz, jnp.maximum(low, half_h - 0.18), edge)
         return (s.span(dz, low, edge) - cross - dark) * upper
@@ -333,7 +333,7 @@ def _shop(s: Point, bay: _Bay, shop: Array, seed: int) -> tuple[Array, Array, Ar
 
 
 def _masonry(s: Point, u: Array, z: Array, seed: int) -> Array:
-    """Relative tone of the wall: bricks, plaster with stains, or stone blocks."""
+    """Return the relative tone of a wall: bricks, plaster with stains, or stone blocks."""
     f, wall_id = s.footprint, s.row.astype(jnp.float32)
 
     def courses(w: float, h: float, joint: float, k: int) -> tuple[Array, Array]:
@@ -353,7 +353,7 @@ def _masonry(s: Point, u: Array, z: Array, seed: int) -> Array:
 
 
 def _tiles(s: Point, seed: int) -> Array:
-    """Roof tiles in rows."""
+    """Return the albedo of roof tiles in rows."""
     along_y = jnp.abs(s.normal[0]) > jnp.abs(s.normal[1])
     u = jnp.where(along_y, s.p[1], s.p[0])
     row = jnp.floor(s.p[2] / 0.28)
@@ -364,13 +364,13 @@ def _tiles(s: Point, seed: int) -> Array:
 
 
 def _awning(s: Point) -> Array:
-    """Stripes in two colours."""
+    """Return the albedo of stripes in two colours."""
     stripe = s.grid(s.p[0], 0.6, 0.15)
     return (s.color + stripe * (s.accent - s.color)) * (1.0 + 0.08 * s.fine[0])
 
 
 def _car_body(s: Point) -> Array:
-    """Paint with seams, arches, handles, plates, lights and bumpers."""
+    """Return the albedo of paint with seams, arches, handles, plates, lights and bumpers."""
     middle = (s.lo + s.hi) / 2
     ahead = jnp.where(s.style == 0.0, 1.0, s.style)
     u = (s.p[0] - middle[0]) * ahead
@@ -395,7 +395,7 @@ def _car_body(s: Point) -> Array:
 
 
 def _car_glass(s: Point) -> tuple[Array, Array, Array]:
-    """Windows between pillars; return albedo, emission and gloss."""
+    """Return albedo, emission and gloss of windows between pillars."""
     middle = (s.lo + s.hi) / 2
     u = (s.p[0] - middle[0]) * s.style
     height = (s.p[2] - s.lo[2]) / (s.hi[2] - s.lo[2])
@@ -413,7 +413,7 @@ def _car_glass(s: Point) -> tuple[Array, Array, Array]:
 
 
 def _wheel(s: Point) -> Array:
-    """A tyre about a rim of five spokes."""
+    """Return the albedo of a tyre about a rim of five spokes."""
     middle = (s.lo + s.hi) / 2
     x, z = s.p[0] - middle[0], s.p[2] - middle[2]
     radius = jnp.sqrt(x**2 + z**2)

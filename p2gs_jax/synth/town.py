@@ -15,7 +15,7 @@ from jaxtyping import Float32, Int32
 
 Vec3 = tuple[float, float, float]
 
-ROAD_HALF_WIDTH, KERB_HEIGHT, FACADE_LINE = 5.6, 0.14, 9.0  # m
+ROAD_HALF_WIDTH, KERB_HEIGHT, FACADE_LINE = 5.6, 0.14, 9.0  # m; facades are at y = +-9
 # Extents along x, m: the side street between the corners of buildings, the underpass of a house
 # over the street, and the drivable length, which ends before the tower that closes the view.
 CROSS_STREET, UNDERPASS, STREET_END = (27.0, 36.0), (54.0, 68.0), 100.0
@@ -143,7 +143,7 @@ class Builder:
 
 
 def _taper_planes(solid: Solid) -> np.ndarray:
-    """Six (n, d) of a tapered box, outward unit normals: -x, +x, -y, +y, bottom, top."""
+    """Return six (n, d) of a tapered box, outward unit normals: -x, +x, -y, +y, bottom, top."""
     (x0, y0, z0), (x1, y1, z1) = solid.lo, solid.hi
     assert solid.top is not None
     tx0, tx1, ty0, ty1 = solid.top

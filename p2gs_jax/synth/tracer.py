@@ -196,7 +196,7 @@ def in_shadow(
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
 
     def extent(lo, hi):
-        """Interval that a box covers along each of the two axes."""
+        """Return the interval that a box covers along each of the two axes."""
         center, half = (lo + hi) / 2 @ axes.T, (hi - lo) / 2 @ np.abs(axes).T
         return center - half, center + half
 

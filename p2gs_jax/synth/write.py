@@ -68,6 +68,7 @@ def write_street(
         hold_out: every n-th frame may be held out and gives no points; 0: all frames do.
         sensor: the image formation of the cameras.
         layout: `town` adds an underpass and draws the sun; `matte` has no gloss; `long` no end.
+        report: receives lines on the progress.
 
     UserError: a parameter is not valid, or `out` is not free.
     """
