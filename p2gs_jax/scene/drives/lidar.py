@@ -64,8 +64,10 @@ def owners(
         inside = (tracked.times >= first - 1) & (tracked.times <= last + 1)
         if not inside.any():
             continue
-        reach = float(np.linalg.norm(half)) + 2.0
         centres = tracked.poses[inside, :3, 3]
+        # Halfway between two boxes an object is this far from both.
+        between = np.linalg.norm(np.diff(centres, axis=0), axis=1).max(initial=0.0) / 2
+        reach = float(np.linalg.norm(half) + between) + 2.0
         balls = tree.query_ball_point(centres, reach)
         near = np.unique(np.concatenate([np.asarray(ball, int) for ball in balls]))
         if not len(near):

@@ -12,11 +12,11 @@ from scene.helpers import refused
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene.drives.assemble import assemble, chosen_frames
-from p2gs_jax.scene.drives.lidar import seeds
+from p2gs_jax.scene.drives.lidar import owners, seeds
 from p2gs_jax.scene.drives.objects import Box, tracks
 from p2gs_jax.scene.drives.recording import SweepPoints
 from p2gs_jax.scene.split import assign_split
-from p2gs_jax.types import Lidar
+from p2gs_jax.types import Lidar, TrackedObject
 
 PLAIN = DataConfig(ego_mask=False)
 FRAMES = 6
@@ -176,3 +176,14 @@ def test_an_object_moves_if_it_leaves_its_first_place(xs, stated, moves):
     (again,) = tracks([*boxes[::-1], boxes[0]._replace(pose=9 * poses[0])])
     np.testing.assert_array_equal(again.poses, poses)
     assert again.size == (4.0, 2.0, 1.5)
+
+
+def test_points_of_a_fast_object_between_two_of_its_boxes_belong_to_it():
+    """At 2 Hz and 30 m/s boxes are 15 m apart."""
+    times = np.arange(4) / 2
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, 0, 3] = 30 * times
+    car = TrackedObject("1", "Car", (4.6, 1.9, 1.6), times, poses, moving=True)
+    at = np.linspace(0, 1.5, 61)
+    points = np.stack([30 * at + 2.0, 0 * at, 0 * at], 1)
+    np.testing.assert_array_equal(owners(points, at, [car]), 0)
