@@ -15,7 +15,7 @@ from p2gs_jax.config import FitConfig, InitConfig
 from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.core.progress import Reporter, Silent
-from p2gs_jax.core.text import first_few
+from p2gs_jax.core.text import count_of, first_few
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians import seeds as seeding
 from p2gs_jax.gaussians.dense import coverage_of, wants_dense
@@ -82,7 +82,8 @@ def load(
     held, count = len(scene.test_indices), len(scene.train_indices)
     if count < 2:
         fix = "add photographs, or hold out fewer with --test-every 0"
-        raise UserError(f"{scene_dir} has {count} training view(s); a fit needs two.", fix=fix)
+        why = f"{scene_dir} has {count_of(count, 'training view')}; a fit needs two."
+        raise UserError(why, fix=fix)
     if len(scene.points) == 0:
         fix = "check the poses and that the photographs overlap"
         raise UserError(f"{scene_dir} has no seed points.", fix=fix)

@@ -139,9 +139,8 @@ def cut_scene(scene: Scene, count: int) -> Cut:
         share = np.array([near[points].mean() if len(points) else 0.0 for points in seen])
         belongs = cell.holds(places, margin) | (share >= LEAST_SEEN)
         blocks.append(Block(cell.lower, cell.upper, tuple(np.flatnonzero(belongs).tolist())))
-    few = [len(b.views) for b in blocks if len(b.views) < FEWEST_VIEWS]
-    if few:
-        why = f"one of {count} blocks has only {few[0]} photograph(s), and a fit needs two."
+    if min(len(b.views) for b in blocks) < FEWEST_VIEWS:
+        why = f"one of {count} blocks has fewer than two photographs, which a fit needs."
         raise UserError(why, fix=f"use --blocks {count - 1} or fewer")
     return Cut(ground, float(margin), tuple(blocks))
 
