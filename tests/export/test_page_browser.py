@@ -110,6 +110,18 @@ def test_five_views_are_those_of_our_renderer(open_page, fitted, link):
         assert np.abs(shown[..., 3] - np.asarray(true.alpha)).mean() < 0.01
 
 
+def test_a_camera_that_looks_straight_down_can_be_tilted_up_but_not_back(open_page):
+    page = open_page()
+    up = np.array(page("p.up"))
+    aside = np.cross(up, np.roll(up, 1) + np.array([0.1, 0.2, 0.3]))
+    aside /= np.linalg.norm(aside)
+    rows = np.stack([aside, np.cross(-up, aside), -up]).ravel().tolist()
+    page(f"(p.state.camera = {{...p.state.camera, R: {rows}}}, 1)")
+    for key in ("ArrowUp", "ArrowDown"):
+        page(f"(p.hands.held.add('{key}'), p.hands.steer(0.05), p.hands.held.clear(), 1)")
+        assert -np.array(page("p.camera.R"))[6:] @ up == pytest.approx(np.cos(0.9 * 0.05))
+
+
 def test_the_exposure_slider_multiplies_light_by_exactly_two_to_the_ev(open_page):
     page = open_page()
     page("p.set({ev: 0})")

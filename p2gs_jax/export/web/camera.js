@@ -50,12 +50,13 @@ function turned(camera, M, about) {
   return { ...camera, R, c: plus(about, times(M, plus(camera.c, about, -1))) };
 }
 
-// Return a camera after a yaw about `up` and a pitch about its x axis that ends before the vertical.
+// Return a camera after a yaw about `up` and a pitch about its x axis. A pitch counts if it ends
+// before the vertical or leads away from it.
 function lookAround(camera, yaw, pitch, about, up) {
-  let out = turned(camera, turn(up, yaw), about);
+  const out = turned(camera, turn(up, yaw), about);
   const tilted = turned(out, turn(row(out.R, 0), pitch), about);
-  if (Math.abs(dot(row(tilted.R, 2), up)) < 0.99) out = tilted;
-  return out;
+  const steep = (view) => Math.abs(dot(row(view.R, 2), up));
+  return steep(tilted) < Math.max(0.99, steep(out)) ? tilted : out;
 }
 
 function quaternion(R) {

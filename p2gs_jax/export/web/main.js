@@ -134,6 +134,7 @@ class Page {
     const image = new Image(), index = this.state.at;
     image.src = data;
     await image.decode();
+    if (this.state.at !== index) return;  // another view was chosen meanwhile
     this.renderer.setPhotograph(image);
     this.photographOf = index;
     this.wake();
