@@ -217,10 +217,19 @@ def without_tracks(decided: Decisions) -> Decisions:
 
 
 def kept_choice(cfg: config.FitConfig, folder: RunFolder) -> Decisions | None:
-    """Return the decisions in the checkpoints of a run; None: nothing was solved or saved."""
+    """Return the decisions in the checkpoints of a run; None: nothing was solved or saved.
+
+    Raises:
+        UserError: another version of the program wrote the checkpoints.
+    """
     p = cfg.photometry
     solved = p.vignetting is not None or p.responses != "all"
     if not ((p.select or solved) and p.start == "tracks"):
         return None
     saved = (CheckpointStore(folder.checkpoints).latest_meta() or {}).get(KEY)
-    return None if saved is None else Decisions.from_dict(saved)
+    try:
+        return None if saved is None else Decisions.from_dict(saved)
+    except (KeyError, TypeError) as error:
+        why = f"The checkpoints in {folder.checkpoints} belong to another version: {error!r}."
+        fix = "resume with the version of the run, or start again in another folder with --out"
+        raise UserError(why, fix=fix) from error

@@ -87,6 +87,15 @@ def test_a_wrong_image_or_an_error_fails_the_self_test(monkeypatch, wrong, said)
     assert said in found.text
 
 
+def test_an_installation_without_pycolmap_can_fit(monkeypatch, capsys):
+    broken = [doctor.Finding("pycolmap", "BROKEN", False)]
+    monkeypatch.setattr(doctor, "check_libraries", lambda: broken)
+    assert doctor.Doctor(skip_self_test=True).execute() == 0
+    out = capsys.readouterr().out
+    assert "This installation can fit." in out
+    assert "no    pip install pycolmap" in out
+
+
 def test_features_say_what_to_install(monkeypatch):
     monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda name: None)
     monkeypatch.setattr(doctor.shutil, "which", lambda name: None)

@@ -136,6 +136,10 @@ def test_the_saved_choice_is_solved_and_its_reasons_repeated(tmp_path, scene):
     )
     kept = kept_choice(cfg, RunFolder(tmp_path))
     assert kept == first.decisions
+    older = {k: v for k, v in first.decisions.to_dict().items() if k != "near"}
+    CheckpointStore(tmp_path / "older" / "checkpoints").save(3, {"a": np.zeros(2)}, {KEY: older})
+    with pytest.raises(UserError, match="another version: KeyError\\('near'\\)"):
+        kept_choice(cfg, RunFolder(tmp_path / "older"))
     again = prepared(loaded, cfg, kept)
     assert again.selection is not None
     assert again.selection.reasons == reasons
