@@ -38,7 +38,7 @@ def first_moments(state):
 
 
 def mean_of_single_views() -> dict:
-    """Return mean loss and first moments of steps of one view each, all from the start."""
+    """Return the mean loss and mean first moments of first steps with one view each."""
     cfg = config(method=None)
     optimizer = make_optimizer(cfg)
     step = Step(cfg, optimizer, EXTENT)
@@ -54,7 +54,7 @@ def mean_of_single_views() -> dict:
 
 
 def on_devices(count: int) -> dict:
-    """Return results of two steps on devices, after one that overflows if each has one view."""
+    """Return results of two steps on `count` devices; if each has one view, one overflows first."""
     cfg = config(batch=VIEWS)
     optimizer, mesh = make_optimizer(cfg), default_mesh(count)
     step = ParallelStep(cfg, optimizer, EXTENT, cfg.densify.noise, mesh=mesh)
@@ -77,7 +77,7 @@ def on_devices(count: int) -> dict:
 
 
 def overflowing(step: Step, state, inputs, show, advance):
-    """Return the state after a step that overflows, without its fault; and fault and changes."""
+    """Run a step that overflows; return its state without the fault, then fault and changes."""
     before = jax.tree.map(np.asarray, state.params)
     narrow = step.program("differentiate", Capacity(64, CAPACITY.visible), DEGREE)
     state, _ = step.chained(show, narrow, advance)(state, *inputs)
@@ -119,15 +119,14 @@ def distance(tree, other) -> float:
 def main() -> None:
     xla_cpu._CPU_OPTIONS = {}  # XLA's defaults
     single = mean_of_single_views()
-    found = {"one view": {"loss": single["loss"]}}
-    whole = None
+    found, reference = {"one view": {"loss": single["loss"]}}, None
     for count in (1, 4):
-        made = on_devices(count)
-        whole = whole or made
+        result = on_devices(count)
+        reference = reference or result
         found[str(count)] = {
-            "from one view": distance(single["moments"], made.pop("moments")),
-            "from one device": distance(whole["params"], made["params"]),
-            **{k: v for k, v in made.items() if k not in ("moments", "params")},
+            "from one view": distance(single["moments"], result.pop("moments")),
+            "from one device": distance(reference["params"], result["params"]),
+            **{k: v for k, v in result.items() if k != "params"},
         }
     # The numbers of Gaussians and of tile rows are not multiples of three.
     found["cores"] = over_cores(3)

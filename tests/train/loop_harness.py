@@ -1,4 +1,4 @@
-"""A training loop whose steps cost nothing: a clock that stands still, programs that only count."""
+"""A training loop that computes nothing: a simulated clock, and programs that only count."""
 
 import dataclasses
 import os
@@ -49,14 +49,14 @@ class Views:
 
 
 class Programs:
-    """Programs that take `compile_s` to wait for and `step_s(width)` to run, on the given clock."""
+    """Programs that compile in `compile_s` and run in `step_s(width)` seconds of a clock."""
 
     def __init__(
         self, clock, compile_s=5.0, step_s=lambda width: 0.1, *, overflows_at=None, breaks_at=None
     ):
         self.clock, self.compile_s, self.step_s = clock, compile_s, step_s
         self.capacities, self.waited_s = {}, 0.0
-        self.made, self.taken = [], []
+        self.made, self.ran = [], []  # keys; (step, width, progress)
         self.overflows_at, self.breaks_at = overflows_at, breaks_at
 
     def expect(self, *arguments, **options):
@@ -83,7 +83,7 @@ class Programs:
             if kind:
                 fault = Fault(*map(np.int32, (kind, 10**6, 1, 0)))
                 return dataclasses.replace(state, fault=fault), REPORT
-            self.taken.append((at, key.size[0], float(controls.progress)))
+            self.ran.append((at, key.size[0], float(controls.progress)))
             return dataclasses.replace(state, step=np.int32(at + 1)), REPORT
 
         return run
@@ -105,13 +105,13 @@ class Harness:
     def __init__(self, folder):
         self.clock = SimpleNamespace(now=0.0)
         self.checkpoints = CheckpointStore(folder / "checkpoints")
-        self.folder, self.said = folder, []
+        self.folder, self.messages = folder, []
 
     def run(self, cfg=SHORT, *, resume=False, programs=None, **options):
         programs = programs or Programs(self.clock)
-        given = (cfg, Views(), 1.0, None, Coverage(400 * 300, 1.0), self.folder, programs)
-        told = {"on_message": self.said.append, "now": lambda: self.clock.now}
-        trainer = loop.Trainer(*given, Decisions.as_given(cfg), **told, store=self.checkpoints)
+        inputs = (cfg, Views(), 1.0, None, Coverage(400 * 300, 1.0), self.folder, programs)
+        hooks = {"on_message": self.messages.append, "now": lambda: self.clock.now}
+        trainer = loop.Trainer(*inputs, Decisions.as_given(cfg), **hooks, store=self.checkpoints)
         return trainer.run(params(), np.ones(SEEDS, bool), resume=resume, **options), programs
 
     def log(self):
@@ -119,10 +119,10 @@ class Harness:
 
 
 def signalled(harness, *numbers, at):
-    """Return programs during whose step of that number signals come."""
+    """Return programs whose step `at` sends signals of these numbers to the process."""
 
     def step_s(width):
-        if len(programs.taken) == at:
+        if len(programs.ran) == at:
             for number in numbers:
                 os.kill(os.getpid(), number)
         return 0.1

@@ -1,4 +1,4 @@
-"""Photographs of noise from four camera positions, and Gaussians of which a view shows a part."""
+"""Photographs of noise from four camera positions, and Gaussians that a view shows in part."""
 
 import numpy as np
 
@@ -22,7 +22,7 @@ def config(method: str | None = "mcmc", batch: int = 1) -> FitConfig:
 
 
 def start(count: int = COUNT, spread: float = 0.9, behind: int = 0) -> Params:
-    """Return parameters of Gaussians; a view shows some, and the first `behind` lie behind it."""
+    """Return parameters of Gaussians; the first `behind` of them lie behind all cameras."""
     rng = np.random.default_rng(0)
     z = rng.uniform(3, 8, count)
     xy = rng.uniform(-spread, spread, (count, 2)) * z[:, None] * [WIDTH / FOCAL, HEIGHT / FOCAL]

@@ -1,4 +1,4 @@
-"""A step is one step, however many devices share its views, or cores its one view."""
+"""A step is the same however many devices share its views, or cores its only view."""
 
 import json
 import os
@@ -34,8 +34,8 @@ def found():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("devices", ["1", "4"])
-def test_a_step_takes_the_mean_over_views_wherever_they_are(found, devices):
-    """Loss and gradient are means; devices change neither losses nor noise; views are counted."""
+def test_a_step_is_the_mean_over_views_on_any_number_of_devices(found, devices):
+    """Loss and gradient are means; devices change neither; every view counts as a step."""
     made = found[devices]
     assert made["losses"][0] == pytest.approx(found["one view"]["loss"], rel=1e-6)
     assert made["from one view"] < 1e-6
@@ -46,7 +46,7 @@ def test_a_step_takes_the_mean_over_views_wherever_they_are(found, devices):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("devices", ["4", "cores"])
-def test_a_view_that_finds_no_room_stops_all_devices_until_there_is_some(found, devices):
+def test_an_overflow_on_one_device_changes_nothing_on_any(found, devices):
     made = found[devices]
     assert made["fault"]["kind"] == FAULT_OVERFLOW
     assert made["fault"]["needed"] > 64
@@ -55,7 +55,7 @@ def test_a_view_that_finds_no_room_stops_all_devices_until_there_is_some(found, 
 
 
 @pytest.mark.slow
-def test_a_view_divided_over_cores_moves_everything_as_one_core_does(found):
+def test_a_view_divided_over_cores_gives_the_update_of_one_core(found):
     """Gaussians, moments, photometry and statistics."""
     made = found["cores"]
     assert made["losses"][1] == pytest.approx(made["losses"][0], rel=1e-6)
@@ -72,7 +72,7 @@ def test_one_view_on_one_device_needs_no_mesh():
     ("devices", "batch", "words"),
     [(1000, 1, "not between 1 and"), (1, 0, "--train.batch is 0")],
 )
-def test_what_cannot_be_is_refused_by_name(devices, batch, words):
+def test_wrong_numbers_of_devices_or_views_are_refused(devices, batch, words):
     with pytest.raises(UserError, match=words) as refused:
         mesh_of(with_fields(FitConfig(), {"train.batch": batch}), devices)
     assert refused.value.fix

@@ -1,4 +1,4 @@
-"""The relative-exposure readings under white balance, vignetting and responses of cameras."""
+"""Both readings of the relative-exposure loss under white balance, vignetting and responses."""
 
 import dataclasses
 
@@ -22,7 +22,7 @@ from p2gs_jax.train.exposure_loss import color_pairs
 from p2gs_jax.types import Photometry
 
 WIDTH, HEIGHT = 48, 32
-# One program a shape, where eager calls make one an operation.
+# Jitted: eager calls would compile every operation.
 formation = jax.jit(forming.formation, static_argnames="cfg")
 observed_ldr = jax.jit(rel.observed_ldr, static_argnums=(2, 3))
 OBSERVED = LossConfig(relative_exposure=RelativeExposureConfig(1.0, "observed_ldr"))
@@ -32,7 +32,7 @@ CAMERAS = (
 )
 SHADED = PhotometryConfig(cameras=CAMERAS)
 CURVED = dataclasses.replace(SHADED, curve="spline")
-CONFIGS = pytest.mark.parametrize("cfg", [SHADED, CURVED], ids=["srgb", "own responses"])
+CONFIGS = pytest.mark.parametrize("cfg", [SHADED, CURVED], ids=["srgb", "spline"])
 
 
 def truth(views=4, seed=0) -> Photometry:
@@ -56,7 +56,7 @@ def observed(photometry, cfg, count=400) -> rel.ColorPairs:
 
 
 @CONFIGS
-def test_zero_at_the_truth_and_only_there(cfg):
+def test_the_loss_is_zero_only_at_the_true_photometry(cfg):
     right = truth()
     pairs = observed(right, cfg)
     at_truth = float(observed_ldr(pairs, right, OBSERVED, cfg))
@@ -74,7 +74,7 @@ def test_zero_at_the_truth_and_only_there(cfg):
         assert loss > max(2e-3, 20 * at_truth), name
 
 
-def test_the_literal_reading_takes_the_whole_gain():
+def test_the_literal_reading_includes_white_balance_and_vignetting():
     right = dataclasses.replace(truth(), raw_gammas=jnp.zeros(4))
     linear, views = jnp.full((HEIGHT, WIDTH, 3), 0.2), (jnp.int32(0), jnp.int32(1))
     cfg = LossConfig(relative_exposure=RelativeExposureConfig(1.0))
@@ -86,7 +86,7 @@ def test_the_literal_reading_takes_the_whole_gain():
     assert found == pytest.approx(expected, rel=1e-4)
 
 
-def test_pairs_of_tracks_are_two_views_of_a_point_and_have_places_where_they_count():
+def test_color_pairs_are_two_views_of_a_point_and_have_positions_under_vignetting():
     count = 60
     rng = np.random.default_rng(0)
     views, points = np.repeat(np.arange(3), 20), np.tile(np.arange(20), 3)

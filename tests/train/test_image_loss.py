@@ -16,7 +16,7 @@ def pair(shape=(20, 31), dtype=np.float64, seed=0):
     return tuple(jnp.asarray(rng.uniform(size=(3, *shape)), dtype) for _ in range(2))
 
 
-def test_map_matches_the_definition():
+def test_the_ssim_map_matches_the_definition():
     x, y = pair((40, 50), np.float32)
 
     def blur(a):
@@ -59,7 +59,7 @@ value_and_slope = jax.jit(jax.value_and_grad(ssim.one_less_ssim))
 
 
 @pytest.mark.parametrize("apart", [1e-2, 1e-4])
-def test_what_is_fitted_well_keeps_its_digits(apart):
+def test_nearly_equal_images_keep_the_digits_of_their_loss(apart):
     rng = np.random.default_rng(0)
     bright = 0.8 + 0.02 * rng.uniform(size=(48, 64, 3))
     inputs = [np.float32(a) for a in (bright + apart * rng.normal(size=bright.shape), bright)]
@@ -83,7 +83,7 @@ def test_identical_images_and_empty_mask():
     assert set(photometric_loss(x, x, ones, LossConfig(dssim_weight=None))) == {"l1"}
 
 
-def test_a_saturated_photograph_says_at_least_this_bright():
+def test_a_saturated_photograph_is_a_lower_bound():
     target = jnp.full((12, 12, 3), 0.99)
     mask = jnp.ones((12, 12))
     cfg = LossConfig()

@@ -32,7 +32,7 @@ def test_batches_hold_photographs_as_integers(tmp_path):
         chex.assert_trees_all_close(decoded(batch), expected, atol=1e-7)
 
 
-def test_every_view_of_an_epoch_is_in_a_batch_of_its_own_size():
+def test_every_view_of_an_epoch_is_in_a_batch_of_one_size():
     order = np.random.default_rng(0).permutation(11)
     kinds = ["wide" if view < 7 else "tall" for view in range(11)]
     batches = batches_of(order, kinds, 3)
@@ -52,7 +52,7 @@ def test_pixels_of_8_and_16_bits_become_one_type_of_the_same_values():
     assert fine.tolist() == [[0, 65535], [7, 65535]]
 
 
-def test_photographs_of_one_level_stay_on_a_gpu(tmp_path, monkeypatch):
+def test_photographs_of_the_current_level_stay_on_a_gpu_if_they_fit(tmp_path, monkeypatch):
     monkeypatch.setattr(inputs, "device_bytes", lambda: 1 << 30)
     scene = load_scene(make_scene(tmp_path / "scene", views=3, points=30), DataConfig())
     views = TrainingViews(ImageStore(scene.views, DataConfig()), scene.train_indices, 0)

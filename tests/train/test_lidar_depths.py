@@ -27,7 +27,7 @@ def loss(depth, alpha, m):
     return lidar_loss(alpha, jnp.asarray(depth * alpha, jnp.float32), m)
 
 
-def test_it_is_the_mean_huber_error_of_log_depth():
+def test_the_loss_is_the_mean_huber_error_of_log_depth():
     depth, alpha = np.full((HEIGHT, WIDTH), 10.0), np.full((HEIGHT, WIDTH), 0.7)
     m = measured([(1, 2), (5, 3), (0, 0)], [10 * np.exp(0.1), 10 * np.exp(-1.0), 0.0])
     small, large = 0.5 * 0.1**2 / CLIP, 1.0 - 0.5 * CLIP
@@ -35,7 +35,7 @@ def test_it_is_the_mean_huber_error_of_log_depth():
 
 
 @pytest.mark.parametrize(("alpha", "measurement"), [(0.0, 5.0), (0.9, 0.0)])
-def test_where_nothing_is_opaque_or_measured_it_is_zero_and_finite(alpha, measurement):
+def test_the_loss_is_zero_without_opaque_pixels_or_measurements(alpha, measurement):
     depth, alphas = np.full((HEIGHT, WIDTH), 10.0), np.full((HEIGHT, WIDTH), alpha)
     m = measured([(1, 1)], [measurement])
     value, slope = jax.value_and_grad(loss)(jnp.asarray(depth), alphas, m)
@@ -51,11 +51,11 @@ def wall_scene(**lidar) -> Scene:
     )
 
 
-def test_views_get_what_stands_still_near_in_time_and_is_not_hidden():
+def test_views_get_the_visible_laser_points_at_rest():
     rng = np.random.default_rng(0)
     wall = np.column_stack([rng.uniform(-4, 4, (500, 2)), np.full(500, 10.0)])
     points = np.concatenate([wall, wall * [1, 1, 3], wall - np.array([0, 0, 5])]).astype(np.float32)
-    # In front of the wall something moves.
+    # The points in front of the wall belong to a moving object.
     owner = np.repeat([-1, -1, 0], 500).astype(np.int32)
     scene = wall_scene(points=points, times=np.zeros(1500), objects=owner)
     found = measured_depths(scene, FitConfig(loss=LossConfig(lidar=0.1)))

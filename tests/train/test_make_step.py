@@ -1,4 +1,4 @@
-"""A loss term, an image formation and a strategy of one's own, without touching the package."""
+"""A user's loss term, image formation and strategy work without a change of the package."""
 
 import dataclasses
 
@@ -20,7 +20,7 @@ CFG = config()
 
 
 def bright(rendered, target, aux):
-    """Infinite where the photograph is black."""
+    """Return a loss that is infinite if the photograph is black."""
     return 0.5 * jnp.mean(rendered.linear) / jnp.mean(target.ldr)
 
 
@@ -40,7 +40,7 @@ class Gain(eqx.Module):
 
 
 class Halve:
-    """Keeps every second Gaussian, and doubles the room."""
+    """A strategy that keeps every second Gaussian, and doubles the slots."""
 
     def start(self, seeds):
         return seeds
@@ -55,21 +55,21 @@ class Halve:
 
 @pytest.fixture(scope="module")
 def made():
-    """Return a step with all three, and a function that takes it from the start."""
-    given = {"terms": TERMS, "formation": Gain(np.float32(0.2)), "strategy": Halve()}
-    step = p2gs_jax.make_step(CFG, **given, extent=EXTENT)
+    """Return a step with all three, and a function that runs it from the start state."""
+    parts = {"terms": TERMS, "formation": Gain(np.float32(0.2)), "strategy": Halve()}
+    step = p2gs_jax.make_step(CFG, **parts, extent=EXTENT)
     params, (batch, _) = start(), view(0)
 
     def take(gain=0.2, light=1):
         state = step.start(params.gaussians, params.photometry)
-        own = dataclasses.replace(state.params, appearance=Gain(jnp.float32(gain)))
-        state = dataclasses.replace(state, params=own)
+        changed = dataclasses.replace(state.params, appearance=Gain(jnp.float32(gain)))
+        state = dataclasses.replace(state, params=changed)
         return step(state, batch.camera, batch.ldr * np.uint8(light), view=0, progress=0.3)
 
     return step, take
 
 
-def test_terms_are_added_taken_away_and_summed_under_their_names(made):
+def test_terms_are_added_removed_and_summed_under_their_names(made):
     state, report = made[1]()
     assert set(report.terms) == {"l1", "bright", "deep"}
     params, (batch, partner) = start(), view(0)
@@ -90,13 +90,13 @@ def test_terms_are_added_taken_away_and_summed_under_their_names(made):
     assert int(state.step) == 1
 
 
-def test_without_anything_of_ones_own_the_terms_are_those_of_the_configuration():
+def test_without_user_terms_the_terms_are_those_of_the_configuration():
     names = {"l1", "dssim", "log_exposure_mean", "gamma_mean_variance"}
     assert set(loss_terms(FitConfig())) == names
     assert loss_terms(FitConfig()) == loss_terms(FitConfig())  # so that fits share programs
 
 
-def test_a_formation_takes_the_place_of_the_tone_curve_and_is_learned(made):
+def test_a_user_formation_replaces_the_tone_curve_and_is_learned(made):
     state, first = made[1]()
     moved = float(state.params.appearance.log_gain) - 0.2
     assert abs(moved) == pytest.approx(CFG.optimizer.appearance, rel=0.6)
@@ -114,7 +114,7 @@ def test_a_strategy_changes_the_population_and_moments_follow(made):
     after = np.asarray(state.opt_state.gaussians.counts)
     slots = np.arange(2 * n)
     np.testing.assert_array_equal(after, np.tile(counts, 2) * (slots % 2 == 0) * (slots < n))
-    # Without exploration noise, steps sum what densification by gradients needs.
+    # Without exploration noise, steps sum the statistics for densification by gradients.
     assert float(state.population.seen_count.sum()) > 0
 
 

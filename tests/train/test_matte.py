@@ -1,4 +1,4 @@
-"""Photographs with alpha and renders over one background: they agree wherever they should."""
+"""Photographs with alpha and renders are compared over the same background."""
 
 import dataclasses
 import functools
@@ -48,7 +48,7 @@ def capture_of(exposure=0.7, gamma=2.2):
 
 @pytest.fixture
 def surfaces():
-    """Return radiance and cover: nothing, everything, and all between."""
+    """Return radiance and alpha: a row of 0, a row of 1, and values between."""
     alpha = RNG.uniform(0.02, 1, SIZE)
     alpha[0], alpha[1] = 0, 1
     return RNG.uniform(0.05, 0.9, (*SIZE, 3)), alpha
@@ -57,8 +57,8 @@ def surfaces():
 @functools.partial(jax.jit, static_argnames="cfg")
 def matted_loss(render, batch, capture, correction, cfg):
     """Return the picture over the background and the terms that compare it."""
-    taken = Photometry(capture.exposure[None], capture.gamma[None], "linear")
-    rendered, target = compared(render, batch, taken, correction, cfg)
+    photometry = Photometry(capture.exposure[None], capture.gamma[None], "linear")
+    rendered, target = compared(render, batch, photometry, correction, cfg)
     terms = loss_terms(cfg)
     names = [name for name in ("l1", "dssim", "alpha") if name in terms]
     return rendered.ldr, {name: terms[name](rendered, target, None) for name in names}
@@ -70,7 +70,7 @@ def config(curve, **loss):
 
 @pytest.mark.parametrize("curve", CURVES)
 @pytest.mark.parametrize("backdrop", BACKDROPS)
-def test_they_agree_at_every_opacity(surfaces, curve, backdrop):
+def test_render_and_photograph_agree_at_every_opacity(surfaces, curve, backdrop):
     radiance, alpha = surfaces
     cfg, capture = config(curve, alpha=1.0), capture_of()
     color = np.asarray(formation(jnp.float32(radiance), capture, cfg.photometry)).clip(0, 1)
@@ -90,7 +90,7 @@ def test_they_agree_at_every_opacity(surfaces, curve, backdrop):
     np.testing.assert_allclose(shown, expected, atol=2e-5)
 
 
-def test_without_a_backdrop_nothing_changes(surfaces):
+def test_alpha_or_a_backdrop_alone_changes_nothing(surfaces):
     radiance, alpha = surfaces
     linear = np.float32(radiance)
     plain = DisplayTransform(0.7, 2.0, PhotometryConfig())
@@ -99,25 +99,25 @@ def test_without_a_backdrop_nothing_changes(surfaces):
     np.testing.assert_array_equal(develop(linear, over), develop(linear, plain))
 
 
-def test_a_white_background_hides_nothing_brighter_than_it():
-    """Where nothing is, a white backdrop is not a saturated photograph of something bright."""
+def test_a_white_background_does_not_count_as_saturated():
+    """White behind transparent pixels is not a saturated photograph of a bright surface."""
     cfg = config("srgb")
     bright = render_of(np.full((*SIZE, 3), 40.0), np.full(SIZE, 0.5))
     nothing = batch_of(np.zeros((*SIZE, 3)), np.zeros(SIZE), (1, 1, 1))
     _, terms = matted_loss(bright, nothing, capture_of(1.0), None, cfg)
     assert float(terms["l1"]) > 0.1
-    # What is there and saturated still only says "at least as bright".
+    # A saturated photograph of a surface is still a lower bound.
     clipped = batch_of(np.ones((*SIZE, 3)), np.full(SIZE, 0.5), (1, 1, 1))
     _, terms = matted_loss(bright, clipped, capture_of(1.0), None, cfg)
     assert float(terms["l1"]) < 1e-5
 
 
-def test_the_weight_of_alpha_counts_the_difference(surfaces):
+def test_the_alpha_term_is_the_weighted_mean_difference(surfaces):
     radiance, _ = surfaces
     batch = batch_of(radiance, np.full(SIZE, 0.25), (1, 1, 1))
-    given = (render_of(radiance, np.full(SIZE, 0.75)), batch, capture_of(), None)
-    assert float(matted_loss(*given, config("srgb", alpha=0.1))[1]["alpha"]) == pytest.approx(0.05)
-    assert "alpha" not in matted_loss(*given, config("srgb"))[1]
+    inputs = (render_of(radiance, np.full(SIZE, 0.75)), batch, capture_of(), None)
+    assert float(matted_loss(*inputs, config("srgb", alpha=0.1))[1]["alpha"]) == pytest.approx(0.05)
+    assert "alpha" not in matted_loss(*inputs, config("srgb"))[1]
 
 
 def test_exposures_are_fitted_over_the_background(surfaces):
@@ -126,5 +126,5 @@ def test_exposures_are_fitted_over_the_background(surfaces):
     over = DisplayTransform(1.7, 2.2, tone, backdrop=(1.0, 1.0, 1.0))
     linear = np.float32(radiance * alpha[..., None])
     photograph = develop(linear, over, alpha=alpha)
-    given = (linear, photograph, np.ones(SIZE, np.float32), over.capture, tone, None)
-    assert float(fit_exposure(*given, over.matte(alpha))) == pytest.approx(1.7, rel=2e-3)
+    inputs = (linear, photograph, np.ones(SIZE, np.float32), over.capture, tone, None)
+    assert float(fit_exposure(*inputs, over.matte(alpha))) == pytest.approx(1.7, rel=2e-3)

@@ -92,7 +92,7 @@ def test_baselines_run_and_load_as_they_were_saved(tmp_path, name):
         assert min(jax.tree.leaves(moved)) > 1e-3
 
 
-def test_a_learned_camera_warms_up_and_decays_as_published():
+def test_the_rate_of_a_learned_camera_warms_up_and_decays_as_published():
     cfg = p2gs_jax.preset("ppisp")
     o = cfg.optimizer
     at = {step: float(appearance_rate(jnp.float32(step / 30_000), cfg)) for step in RATES}

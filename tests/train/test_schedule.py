@@ -14,7 +14,7 @@ from p2gs_jax.train.state import HostState
 from p2gs_jax.types import Gaussians, Params, Photometry
 
 
-def test_levels_and_degrees():
+def test_levels_and_degrees_follow_progress():
     cfg = TrainConfig(coarse_to_fine=(0.25, 0.5))
     plan = schedule.levels(cfg, 1000, 600)
     assert plan == ((0.25, 4), (0.5, 2), (1.0, 1))
@@ -26,7 +26,7 @@ def test_levels_and_degrees():
 @pytest.mark.parametrize("step_s", [0.02, 0.1, 0.5])
 @pytest.mark.parametrize("compile_s", [0.0, 4.0])
 def test_a_replanned_run_ends_on_time(step_s, compile_s):
-    """Simulated: levels cost what they cost, compilation interrupts, and replanning copes."""
+    """The simulated levels differ in time per step, and each is compiled first."""
     plan = ((0.25, 4), (0.5, 2), (1.0, 1))
     pace, elapsed, progress, shrinks = 1 / 2000, 0.0, 0.0, []
     while progress < 1 - 0.5 * pace and elapsed < 60:
@@ -45,7 +45,7 @@ def test_one_slow_burst_does_not_use_up_the_schedule():
     assert schedule.replanned(1 / 1000, 0.1, 50.0, 30.0) <= 1.5 / 1000
 
 
-def test_long_fits_take_lower_rates():
+def test_long_fits_have_lower_rates():
     settled = 600.0
     assert schedule.rate_factor(1 / 600, 1.0, settled) == 1.0
     assert schedule.rate_factor(1 / 100, 1.0, settled) == 1.0
@@ -77,7 +77,7 @@ def test_finer_levels_count_for_more_in_the_time_left():
     assert left(1.0) == 0
 
 
-def test_a_clock_says_what_is_left_of_its_steps_or_of_its_budget():
+def test_a_clock_estimates_the_time_left_from_steps_or_budget():
     host = HostState(progress=0.5, pace=0.01, step_s=0.2, shrink=1, elapsed_s=10.0)
     free = RunClock(TrainConfig(), host, full_step_s=0.2)
     free.replan(host)

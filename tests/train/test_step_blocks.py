@@ -56,8 +56,8 @@ def made():
     def objective(params, probe):
         splats, radiance = splat(params.gaussians, alive, batch.camera, CFG.render, DEGREE)
         splats = dataclasses.replace(splats, means2d=splats.means2d + probe)
-        given = (batch, partner, CFG, loss_terms(CFG), 2**16)
-        return image_loss((splats, radiance), params.photometry, None, *given)[0]
+        inputs = (batch, partner, CFG, loss_terms(CFG), 2**16)
+        return image_loss((splats, radiance), params.photometry, None, *inputs)[0]
 
     slope = jax.jit(jax.value_and_grad(objective, argnums=(0, 1)))
     loss, (gradient, probe) = jax.device_get(slope(params, jnp.zeros((COUNT, 2))))
@@ -115,10 +115,10 @@ def widened(tree):
 def test_a_step_agrees_with_one_that_is_float64_throughout(made):
     optimizer = make_optimizer(CFG)
     start = widened(initial_state(made.params, made.alive, optimizer))
-    given = widened((photograph(), Partner(np.int32(0)), CONTROLS))
+    args = widened((photograph(), Partner(np.int32(0)), CONTROLS))
     with jax.enable_x64(True):
         step = Step(CFG, optimizer, EXTENT)
-        wide = step(jax.tree.map(jnp.asarray, start), *given, capacity=made.capacity, degree=DEGREE)
+        wide = step(jax.tree.map(jnp.asarray, start), *args, capacity=made.capacity, degree=DEGREE)
     (state, report), (exact, exact_report) = made.after, jax.device_get(wide)
     assert int(exact.fault.kind) == FAULT_NONE
     for path, leaf in jax.tree_util.tree_leaves_with_path(wide):
@@ -134,7 +134,7 @@ def test_a_step_agrees_with_one_that_is_float64_throughout(made):
         assert np.linalg.norm(got - expected) < 1e-4 * np.linalg.norm(expected), name
 
 
-def test_out_of_view_nothing_is_touched(made):
+def test_gaussians_out_of_view_do_not_change(made):
     state, _ = made.after
     hidden = ~made.seen
     assert hidden.sum() > HIDDEN / 2
@@ -217,7 +217,7 @@ class ForCuda:
 
 @pytest.mark.skipif(
     jax.__version_info__ >= (0, 11) and jax.default_backend() != "gpu",
-    reason="from JAX 0.11 on Pallas lowers only for a GPU that is there",
+    reason="from JAX 0.11 on Pallas lowers only for a GPU of this machine",
 )
 @pytest.mark.parametrize("name", list(steps.PROGRAMS))
 def test_a_step_on_a_gpu_never_waits_for_the_host(monkeypatch, name):

@@ -1,4 +1,4 @@
-"""Which steps share a program, and what waiting for one is counted as."""
+"""Steps that share programs, and the time that counts as waiting for one."""
 
 import threading
 import time
@@ -19,7 +19,7 @@ FULL = COARSE._replace(size=(240, 160), capacity=Capacity(8192, 4096), pixels="u
 SHAPES = tuple(np.zeros(k) for k in range(1, 5))
 
 
-def test_a_program_that_reads_what_it_was_not_given_raises():
+def test_a_program_that_reads_a_setting_outside_its_key_raises():
     """Fits share programs: a default must never stand in for the value of a fit."""
     step = Step(preset("robust"), make_optimizer(FitConfig()), 1.0)
     for name in PROGRAMS:
@@ -35,7 +35,7 @@ def test_a_program_that_reads_what_it_was_not_given_raises():
 
 
 class Traced:
-    """Stands for a step: counts what is compiled, and computes nothing."""
+    """A stand-in for a step that counts compilations and computes nothing."""
 
     def __init__(self, cfg: FitConfig):
         real = Step(cfg, make_optimizer(cfg), 1.0)
@@ -66,7 +66,7 @@ def under(curve="srgb", model="view_exposure", seed=0, **optimizer):
     return with_fields(FitConfig(), fields | {f"optimizer.{k}": v for k, v in optimizer.items()})
 
 
-def test_levels_share_what_is_done_per_gaussian(programs):
+def test_levels_share_the_programs_per_gaussian(programs):
     step = Traced(under())
     for key in (COARSE, FULL, COARSE):
         assert programs.get(step, key, *SHAPES) == ("show", "differentiate", "advance")
@@ -93,7 +93,7 @@ def test_a_larger_population_keeps_the_program_of_the_image_unless_views_show_al
         ({}, []),
     ],
 )
-def test_what_was_begun_before_exposures_were_known_is_used_where_it_fits(programs, change, again):
+def test_programs_begun_before_exposures_are_known_are_used_if_they_fit(programs, change, again):
     early, step = Traced(under()), Traced(under(**change))
     programs.expect(early, COARSE, *SHAPES)
     programs.get(step, COARSE, *SHAPES)

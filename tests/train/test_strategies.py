@@ -1,4 +1,4 @@
-"""Which strategy a configuration means, its bounds, and what its programs are shared by."""
+"""Strategies of configurations, their bounds and times, and the programs that fits share."""
 
 import chex
 import jax
@@ -20,7 +20,7 @@ SEEDS, COVERAGE = 50, Coverage(400 * 300, 1.0)
 DEFAULT = default_max_gaussians(SEEDS, COVERAGE, FitConfig().train)
 
 
-def of(**densify):
+def strategy_of(**densify):
     cfg = with_fields(FitConfig(), {f"densify.{k}": v for k, v in densify.items()})
     return strategies.make_strategy(cfg, COVERAGE, ((1.0, 1),)), cfg
 
@@ -31,7 +31,7 @@ def state():
 
 
 @pytest.mark.parametrize(
-    ("densify", "kind", "limit", "slots", "ahead"),
+    ("densify", "kind", "limit", "slots", "slots_stay"),
     [
         ({"max_gaussians": 300}, Mcmc, 300, SLOTS, True),
         ({"max_gaussians": 20}, Mcmc, SEEDS, SLOTS, True),
@@ -41,17 +41,17 @@ def state():
         ({"method": None, "max_gaussians": 300}, type(None), None, SEEDS, None),
     ],
 )
-def test_a_configuration_means_a_strategy_with_its_bounds(densify, kind, limit, slots, ahead):
-    strategy, _ = of(**densify)
+def test_a_configuration_means_a_strategy_with_its_bounds(densify, kind, limit, slots, slots_stay):
+    strategy, _ = strategy_of(**densify)
     found = strategies.started(strategy, SEEDS)
     assert type(strategy) is kind
-    assert (found, getattr(strategy, "slots_stay", None)) == (Slots(limit, slots), ahead)
+    assert (found, getattr(strategy, "slots_stay", None)) == (Slots(limit, slots), slots_stay)
     assert found.most == max(limit or 0, slots)
     assert (getattr(strategy, "noise", None) is not None) == (kind is Mcmc)
 
 
-def test_it_is_due_within_its_time_and_not_too_often():
-    _, cfg = of(start=0.1, stop=0.5, every=0.05, min_every_steps=10)
+def test_densification_is_due_within_its_time_and_not_too_often():
+    _, cfg = strategy_of(start=0.1, stop=0.5, every=0.05, min_every_steps=10)
 
     def due(progress, densified_at, pace=0.001):
         host = HostState(progress=progress, densified_at=densified_at, pace=pace)
@@ -69,17 +69,17 @@ def test_fits_share_the_relocation_and_count_what_found_no_slot(monkeypatch):
     jax.clear_caches()
     monkeypatch.setattr(strategies, "demand", chex.assert_max_traces(strategies.demand, n=1))
     for _ in range(2):
-        strategy, cfg = of(max_gaussians=3 * SEEDS)
-        host, said = HostState(step=7, progress=0.4999, pace=0.01), []
-        grown = strategies.densified(strategy, state(), host, cfg, 1.0, 3 * SEEDS, said.append)
-        # Nothing was seen yet, so nothing pulls, and nobody is born.
+        strategy, cfg = strategy_of(max_gaussians=3 * SEEDS)
+        host, messages = HostState(step=7, progress=0.4999, pace=0.01), []
+        grown = strategies.densified(strategy, state(), host, cfg, 1.0, 3 * SEEDS, messages.append)
+        # No view was seen yet, so the demand is 0 everywhere and no Gaussian is born.
         assert alive_in(grown.population) == SEEDS
         assert host.refused == SEEDS
-        assert len(said) == 1
-        assert "Step 7: 50 Gaussians could not grow" in said[0]
+        assert len(messages) == 1
+        assert "Step 7: 50 Gaussians could not grow" in messages[0]
 
 
-def test_a_population_that_dies_is_said():
-    strategy, cfg = of(method="adaptive", prune_opacity=1.0)
+def test_a_population_that_dies_is_an_error():
+    strategy, cfg = strategy_of(method="adaptive", prune_opacity=1.0)
     with pytest.raises(UserError, match="every Gaussian"):
         strategies.densified(strategy, state(), HostState(pace=0.01), cfg, 1.0, None, print)

@@ -26,7 +26,7 @@ def params(balance):
 
 @pytest.mark.parametrize("level", ["view", "camera"])
 @pytest.mark.parametrize("progress", [0.3, 0.9])
-def test_rates(level, progress):
+def test_only_white_balance_per_view_has_the_rate_of_exposures(level, progress):
     cfg = with_fields(FitConfig(), {"photometry.white_balance": level})
     like = params(jnp.zeros((2, 3)))
     found = learning_rates(jnp.float32(progress), jnp.float32(1), 1.0, like, cfg, 1).photometry
@@ -38,7 +38,7 @@ def test_rates(level, progress):
     assert plain.photometry.raw_white_balance is None
 
 
-def test_the_gauge_of_every_channel_is_kept():
+def test_the_mean_white_balance_of_every_channel_stays_0():
     raw = np.random.default_rng(0).normal(0.3, 0.2, (5, 3)).astype(np.float32)
     photometry = Photometry(jnp.ones(5), jnp.zeros(5), "log", jnp.asarray(raw))
     for weight in (0.01, None):
@@ -48,10 +48,10 @@ def test_the_gauge_of_every_channel_is_kept():
         assert (float(jnp.mean(found.raw_exposures)) == 0) == (weight is not None)
 
 
-def test_without_a_solution_only_views_learn():
-    asked = {"photometry.select": False, "photometry.start": "random"}
-    asked |= {"photometry.white_balance": "view", "photometry.vignetting": "camera"}
-    cfg = with_fields(FitConfig(), asked)
+def test_without_solved_exposures_only_white_balance_per_view_remains():
+    fields = {"photometry.select": False, "photometry.start": "random"}
+    fields |= {"photometry.white_balance": "view", "photometry.vignetting": "camera"}
+    cfg = with_fields(FitConfig(), fields)
     decided = decide(cfg, None, None)
     assert (decided.white_balance, decided.vignetting) == ("view", None)
     assert likely(cfg, None, None) == decided
@@ -60,7 +60,7 @@ def test_without_a_solution_only_views_learn():
 
 
 def photographed_by_a_camera(root, views=8):
-    """Write the small scene with a white balance per view and vignetting; return log W."""
+    """Write a scene with vignetting and a white balance per view; return the latter's logarithm."""
     scene = make_scene(root, views=views)
     balance = np.random.default_rng(0).normal(0, 0.2, (views, 3))
     balance -= balance.mean(1, keepdims=True)
