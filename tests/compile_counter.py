@@ -1,22 +1,20 @@
-"""Counts what XLA compiles: JAX offers listeners but no counter."""
+"""Counts the programs that XLA compiles: JAX offers listeners but no counter."""
 
 from jax import monitoring
 
 _COMPILED = "/jax/core/compile/backend_compile_duration"
-
-
 _compiled = [0]
 
 
 class CompileCounter:
-    """What XLA compiled since this counter was made, in all threads of the process."""
+    """Counts programs since it was made, in all threads of the process."""
 
     def __init__(self):
         self._begin = _compiled[0]
 
     @property
     def programs(self) -> int:
-        """Programs compiled, or read back from the cache on disk."""
+        """The number of programs compiled, or read back from the cache on disk."""
         return _compiled[0] - self._begin
 
 

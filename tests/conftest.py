@@ -13,17 +13,16 @@ from pathlib import Path
 import pytest
 from filelock import FileLock
 
-# Programs compiled by one test or its child processes serve all others, in later sessions too: JAX
-# finds them by what they compute.
+# All tests, their child processes and later sessions share compiled programs.
 COMPILED = Path(__file__).parents[1] / ".pytest_cache" / "xla"
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(COMPILED))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 # Tests run side by side already; `fit` would divide a view over all cores.
 os.environ.setdefault("JAX_NUM_CPU_DEVICES", "1")
-# Nor is Python compiled anew by every process of a test run.
+# Processes of a test run share Python's bytecode as well.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
-# The cache is cut to this between sessions: JAX's own bound looks at every file at every write.
+# Each session first cuts the cache to this: JAX's bound looks at every file at every write.
 MOST_CACHED_GB = 2.0
 
 
@@ -37,8 +36,8 @@ def pytest_sessionstart(session):
                 path.unlink(missing_ok=True)
 
 
-# What takes the longest begins first: at the end no process waits for another. Nor at the start:
-# the second file does not need the run that the first fits for all.
+# The slowest files begin first, so that no process is idle at the end. The second file does not
+# wait for the run that the first one fits for all.
 LONGEST = (
     *("train/test_presets", "faults/test_faults", "jobs/test_sweep", "pipeline/test_moving"),
     *("docs/test_code_blocks", "cli/test_against", "render/test_rasterize", "jobs/test_fit_blocks"),
@@ -50,10 +49,10 @@ LONGEST = (
 
 
 def pytest_collection_modifyitems(items):
-    """Let the files that take the longest come first, each in one piece."""
+    """Sort the slowest files first, each in one piece."""
     places = {f"tests/{name}.py": place for place, name in enumerate(LONGEST)}
     items.sort(key=lambda item: places.get(item.nodeid.partition("::")[0], len(places)))
-    # What was imported and collected stays: the collector need not look at it again and again.
+    # Imported modules and tests stay: the garbage collector need not visit them.
     gc.freeze()
 
 
@@ -68,7 +67,7 @@ def _signals_as_in_a_terminal():
 
 @pytest.fixture(scope="module", autouse=True)
 def _forget_programs():
-    """Let compiled programs go between files once processes of the run fill half of the memory."""
+    """Drop compiled programs after a file if the processes of the run fill half of the memory."""
     yield
     from p2gs_jax.core.memory import resident
 
@@ -82,7 +81,7 @@ def _forget_programs():
 
 
 def pytest_terminal_summary(terminalreporter):
-    """Say where the time went: seconds of set-up, test and tear-down by folder."""
+    """Print the seconds of set-up, tests and tear-down by folder."""
     seconds: dict[str, float] = collections.Counter()
     for reports in terminalreporter.stats.values():
         for report in reports:
@@ -94,8 +93,8 @@ def pytest_terminal_summary(terminalreporter):
             terminalreporter.write_line(f"{spent:7.1f}  {folder}")
 
 
-# Programs of tests run once or twice: XLA compiles them with the least effort. With the options of
-# users the renderer is measured by the bench in `.ci/run`.
+# Programs of tests run once or twice: XLA compiles them with the least effort. The bench
+# in `.ci/run` measures the renderer with the users' options.
 EFFORT = {
     "xla_backend_optimization_level": 0,
     "xla_llvm_disable_expensive_passes": True,
@@ -138,7 +137,7 @@ def shared_data():
 
 @pytest.fixture
 def hostile(tmp_path, monkeypatch):
-    """Go to a folder on the path with modules of its own; return what they would write."""
+    """Go to a folder on the path whose modules write a file on import; return that file's path."""
     folder, ran = tmp_path / "hostile", tmp_path / "ran"
     folder.mkdir()
     for name in ("cv2", "jax", "numpy", "email", "sitecustomize"):
@@ -150,7 +149,7 @@ def hostile(tmp_path, monkeypatch):
 
 @pytest.fixture
 def run_command(capsys):
-    """Return a function from the words of a command line to its exit status and what it printed.
+    """Return a function from a command line to its exit status and printed text.
 
     Whatever happens, users see no traceback.
     """
@@ -167,7 +166,7 @@ def run_command(capsys):
 
 
 def _ending_with(status):
-    """Return a fixture: a function from a command line to what it printed before that status."""
+    """Return a fixture: a function from a command line, which must end so, to its printed text."""
 
     @pytest.fixture
     def ended(run_command):
@@ -188,7 +187,7 @@ succeeded, refused = _ending_with(0), _ending_with(2)
 def made_once(tmp_path_factory, request):
     """Return a function that makes a folder once for all processes of a test run.
 
-    What several files read costs seconds to make, and xdist's processes share no fixtures.
+    Such a folder takes seconds to make, and xdist's processes share no fixtures.
     """
     base = tmp_path_factory.getbasetemp()
     shared = base.parent if hasattr(request.config, "workerinput") else base
@@ -222,9 +221,9 @@ def finished_run(made_once) -> Path:
 
 @pytest.fixture(scope="session")
 def camera_run(made_once, finished_run) -> Path:
-    """Return that run as if its camera had vignetting and every view a white balance; only read it.
+    """Return `finished_run` with vignetting of its camera and white balance of views; only read it.
 
-    By its row k a training view has gains of 2^(k/10), 1 and 2^(-k/10) over green.
+    Training view k has the gains 2^(k/10), 1 and 2^(-k/10) relative to green.
     """
     return made_once("camera", lambda root: _with_cameras(finished_run, root / "run")) / "run"
 

@@ -41,21 +41,21 @@ def test_worse_values_are_named_with_their_row(baseline):
     ("first", "later", "complaint"),
     [(2.0, (), None), (9.0, (2.1,), None), (9.0, (9.0, 4.0), None), (9.0, (6.0, 7.0), "is 6,")],
 )
-def test_a_time_is_worse_only_if_it_stays_so(baseline, first, later, complaint):
-    times, asked = iter(later), []
+def test_a_slow_time_fails_only_if_repetitions_are_slow_too(baseline, first, later, complaint):
+    times, measured = iter(later), []
 
     def measure(names):
-        asked.append(names)
+        measured.append(names)
         return {"town 1/4": {"step": next(times), "numerics gradient": 0.0}}
 
     slow = {"town 1/4": {"step": first, "numerics gradient": 1e-5}}
     texts = gate.settle(baseline, ROWS | slow, measure)
-    assert asked == [["town 1/4"]] * len(later)
+    assert measured == [["town 1/4"]] * len(later)
     assert [complaint in t for t in texts] == ([] if complaint is None else [True])
 
 
 @pytest.mark.parametrize("step", [9.0, 2.0])
-def test_accuracy_counts_as_measured_first(baseline, step):
+def test_accuracy_is_judged_by_its_first_measurement(baseline, step):
     def measure(names):
         assert step == 9.0, "accuracy was measured again"
         return {"town 1/4": {"step": 2.0, "numerics gradient": 1e-5}}
@@ -64,7 +64,7 @@ def test_accuracy_counts_as_measured_first(baseline, step):
     assert "gradient" in text
 
 
-def test_a_contribution_on_the_cutoff_does_not_hide_the_others():
+def test_trimmed_errors_ignore_single_pixels_and_gaussians():
     gradient = jax.tree.map(lambda a: np.ones(a.shape), splats(300))
     exact = Truth(np.full((20, 20, 3), 0.5), gradient)
     linear = exact.linear * (1 + 1e-6)

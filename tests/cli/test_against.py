@@ -1,4 +1,4 @@
-"""`eval --against`: renders of other programs in every layout, and what is wrong with them."""
+"""`eval --against`: renders of other programs in every layout, and errors for broken ones."""
 
 import json
 import shutil
@@ -12,14 +12,14 @@ from p2gs_jax.run.read import load_run
 
 
 @pytest.fixture(scope="module")
-def own_run(finished_run, tmp_path_factory):
+def run_copy(finished_run, tmp_path_factory):
     return shutil.copytree(finished_run, tmp_path_factory.mktemp("against") / "castle")
 
 
 @pytest.fixture(scope="module")
-def held_out(own_run):
-    """Return the held-out photographs by name, 8 bits, as OpenCV has them."""
-    scene = load_run(own_run).scene
+def held_out(run_copy):
+    """Return the held-out photographs by name, in OpenCV's 8-bit BGR."""
+    scene = load_run(run_copy).scene
     views = [scene.views[row] for row in scene.test_indices]
     return {view.name: cv2.imread(str(view.image_path)) for view in views}
 
@@ -30,47 +30,47 @@ def write(path, image):
 
 
 @pytest.fixture
-def judged(succeeded, own_run):
-    """Return a function from folders of renders to what is found of each, and what was printed."""
+def judged(succeeded, run_copy):
+    """Return a function from folders of renders to the scores of each and the printed text."""
 
     def judge(*folders, options=()):
-        text = succeeded("eval", own_run, "--against", *folders, *options)
-        found = json.loads((own_run / "against.json").read_text())["programs"]
+        text = succeeded("eval", run_copy, "--against", *folders, *options)
+        found = json.loads((run_copy / "against.json").read_text())["programs"]
         return [*found.values()], text
 
     return judge
 
 
-def test_what_the_run_rendered_itself_scores_as_the_run(own_run, judged, tmp_path):
-    twin = shutil.copytree(own_run / "renders", tmp_path / "twin")
-    before = json.loads((own_run / "metrics.json").read_text()) | {"districts": {"blocks": [1]}}
-    (own_run / "metrics.json").write_text(json.dumps(before))
+def test_renders_of_the_run_itself_have_its_scores(run_copy, judged, tmp_path):
+    twin = shutil.copytree(run_copy / "renders", tmp_path / "twin")
+    before = json.loads((run_copy / "metrics.json").read_text()) | {"districts": {"blocks": [1]}}
+    (run_copy / "metrics.json").write_text(json.dumps(before))
     (found,), text = judged(twin)
-    # What a fit says of itself stays, whatever it is.
-    after = json.loads((own_run / "metrics.json").read_text())
+    # `--against` keeps the scores of the fit and unknown keys.
+    after = json.loads((run_copy / "metrics.json").read_text())
     assert before.keys() == after.keys()
     assert {k: after[k] for k in ("split", "counts", "districts")} == {
         k: before[k] for k in ("split", "counts", "districts")
     }
-    own = found["run"]["exposure_fitted"]
+    of_run = found["run"]["exposure_fitted"]
     assert found["layout"] == "pictures by name"
     # Held-out views are written under the exposure fitted to them, in 8 bits.
     for protocol in ("as_rendered", "exposure_fitted"):
-        assert found[protocol]["psnr"] == pytest.approx(own["psnr"], abs=0.05)
-        assert found[protocol]["ssim"] == pytest.approx(own["ssim"], abs=2e-3)
-    saved = json.loads((own_run / "metrics.json").read_text())["test"]["exposure_fitted"]
-    assert own["psnr"] == saved["psnr"]
+        assert found[protocol]["psnr"] == pytest.approx(of_run["psnr"], abs=0.05)
+        assert found[protocol]["ssim"] == pytest.approx(of_run["ssim"], abs=2e-3)
+    saved = json.loads((run_copy / "metrics.json").read_text())["test"]["exposure_fitted"]
+    assert of_run["psnr"] == saved["psnr"]
     assert "castle (this run)" in text
-    # Radiance is developed as the run develops its own.
+    # EXR renders are developed like the radiance of the run.
     for picture in twin.glob("*.png"):
         picture.unlink()
     (found,), _ = judged(twin)
-    assert found["exposure_fitted"]["psnr"] == pytest.approx(own["psnr"], abs=0.01)
+    assert found["exposure_fitted"]["psnr"] == pytest.approx(of_run["psnr"], abs=0.01)
     averaged = found["run"]["averaged"]["psnr"]
     assert found["as_rendered"]["psnr"] == pytest.approx(averaged, abs=0.01)
 
 
-def test_an_exposure_a_view_undoes_what_is_a_matter_of_exposure(held_out, judged, tmp_path):
+def test_an_exposure_per_view_corrects_darker_renders(held_out, judged, tmp_path):
     for k, name in enumerate(sorted(held_out)):
         write(tmp_path / f"a/{k:05d}.png", held_out[name])
         write(tmp_path / f"b/{k:05d}.png", held_out[name] // 2)
@@ -80,20 +80,19 @@ def test_an_exposure_a_view_undoes_what_is_a_matter_of_exposure(held_out, judged
     assert b["exposure_fitted"]["psnr"] > b["as_rendered"]["psnr"] + 10
 
 
-def test_views_that_are_missing_are_said_and_left_out_of_both(own_run, held_out, judged, tmp_path):
+def test_missing_views_are_named_and_left_out_of_both_scores(run_copy, held_out, judged, tmp_path):
     kept, lost = sorted(held_out)
-    training = load_run(own_run).scene.training_views[0].name
+    training = load_run(run_copy).scene.training_views[0].name
     for name in (kept, training, "logo.png"):
         write(tmp_path / "part" / name, held_out[kept])
     (found,), text = judged(tmp_path / "part")
     assert found["missing"] == [lost]
     assert found["views"] == 1
     assert list(found["run"]["averaged"]["per_view"]) == [kept]
-    said = " ".join(text.split())
-    assert f"lacks 1 of 2 held-out views ({lost})" in said
+    assert f"lacks 1 of 2 held-out views ({lost})" in " ".join(text.split())
 
 
-def test_a_common_exposure_is_judged_too(held_out, judged, tmp_path):
+def test_scores_against_a_reference_are_also_scale_aligned(held_out, judged, tmp_path):
     for name, image in held_out.items():
         write(tmp_path / "reference" / name, image)
         write(tmp_path / "other" / name, image // 2)
@@ -101,7 +100,7 @@ def test_a_common_exposure_is_judged_too(held_out, judged, tmp_path):
     (found,), text = judged(tmp_path / "other", options=options)
     reference = found["reference"]
     assert reference["scale_aligned"]["psnr"] > reference["as_rendered"]["psnr"] + 5
-    # Of the run scale aligned, of the program also as rendered.
+    # The run has one row (scale aligned), the program two (also as rendered).
     assert text.split("beside other programs")[1].count("reference") == 3
 
 
@@ -122,7 +121,7 @@ def renamed(path, image):
 
 
 @pytest.mark.parametrize(
-    ("spoil", "said"),
+    ("spoil", "words"),
     [
         (lambda path, image: write(path, image[:-2]), "112x98"),
         (lambda path, image: path.write_bytes(path.read_bytes()[:40]), "cannot be read"),
@@ -136,15 +135,15 @@ def renamed(path, image):
         (lambda path, image: shutil.rmtree(path.parent), "not a folder"),
     ],
 )
-def test_what_is_wrong_is_said_before_anything_is_judged(
-    own_run, held_out, refused, tmp_path, spoil, said
+def test_broken_renders_are_refused_before_any_evaluation(
+    run_copy, held_out, refused, tmp_path, spoil, words
 ):
     folder, image = tmp_path / "other", next(iter(held_out.values()))
     for name in held_out:
         write(folder / name, image)
     spoil(folder / max(held_out), image)
-    before = (own_run / "metrics.json").stat().st_mtime_ns
-    text = refused("eval", own_run, "--against", folder)
-    assert said in " ".join(text.split())
+    before = (run_copy / "metrics.json").stat().st_mtime_ns
+    text = refused("eval", run_copy, "--against", folder)
+    assert words in " ".join(text.split())
     assert "To fix it" in text
-    assert (own_run / "metrics.json").stat().st_mtime_ns == before
+    assert (run_copy / "metrics.json").stat().st_mtime_ns == before

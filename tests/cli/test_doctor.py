@@ -1,4 +1,4 @@
-"""The doctor tells what is there, and survives what is not."""
+"""`doctor` reports libraries, features and devices, also missing and broken ones."""
 
 import importlib.metadata
 import re
@@ -21,7 +21,7 @@ from p2gs_jax.render.selfcheck import self_check
 PROJECT = Path(__file__).resolve().parents[2] / "pyproject.toml"
 
 
-def test_everything_here_is_well(capsys):
+def test_this_installation_passes(capsys):
     assert Doctor().execute() == 0
     text = capsys.readouterr().out
     assert "This installation can fit." in text
@@ -31,8 +31,8 @@ def test_everything_here_is_well(capsys):
     assert self_check(preset("paper").render).fault is None
 
 
-def test_every_dependency_can_be_tried(monkeypatch):
-    """A dependency whose module is called otherwise must be in MODULES."""
+def test_every_dependency_has_an_importable_module(monkeypatch):
+    """A dependency whose module has another name must be in MODULES."""
     project = tomllib.loads(PROJECT.read_text())["project"]
     for name in [Requirement(line).name for line in project["dependencies"]]:
         assert find_spec(doctor.module_of(name)) is not None, name
@@ -44,22 +44,22 @@ def test_every_dependency_can_be_tried(monkeypatch):
     assert {"jax", "jaxlib", "numpy"} <= set(doctor.requirements())
 
 
-def test_a_broken_library_is_said_and_costs_the_exit_code(capsys, monkeypatch, tmp_path):
+def test_broken_libraries_are_reported_and_exit_with_1(capsys, monkeypatch, tmp_path):
     (tmp_path / "broken_splats.py").write_text("raise OSError('libsplat.so: no such file')")
     monkeypatch.syspath_prepend(tmp_path)
     wanted = dict.fromkeys(["numpy", "broken_splats", "absent_splats"])
     monkeypatch.setattr(doctor, "requirements", lambda: wanted)
-    broken = doctor.Finding("Self-test", "XLA said no", ok=False)
+    broken = doctor.Finding("Self-test", "XLA failed", ok=False)
     monkeypatch.setattr(doctor, "check_render", lambda: broken)
     assert Doctor().execute() == 1
     text = " ".join(capsys.readouterr().out.split())
-    for said in ("libsplat.so: no such file", "No module named 'absent_splats'", "XLA said no"):
-        assert said in text
+    for words in ("libsplat.so: no such file", "No module named 'absent_splats'", "XLA failed"):
+        assert words in text
     assert "'absent_splats' 'broken_splats'" in text
     assert "no pip install --force-reinstall" in text
 
 
-def test_an_old_library_is_said(monkeypatch):
+def test_an_old_library_is_reported(monkeypatch):
     wanted = {"numpy": Requirement("numpy>=999").specifier}
     monkeypatch.setattr(doctor, "requirements", lambda: wanted)
     (found,) = doctor.check_libraries()
@@ -67,13 +67,13 @@ def test_an_old_library_is_said(monkeypatch):
     assert not found.ok
 
 
-@pytest.mark.parametrize(("wrong", "said"), [(True, "the image is wrong"), (False, "XLA said no")])
-def test_a_wrong_image_or_an_error_fails_the_self_test(monkeypatch, wrong, said):
+@pytest.mark.parametrize(("wrong", "words"), [(True, "the image is wrong"), (False, "XLA failed")])
+def test_a_wrong_image_or_an_error_fails_the_self_test(monkeypatch, wrong, words):
     true = rendering.render_linear
 
     def broken(gaussians, alive, camera, cfg, capacity):
         if not wrong:
-            raise RuntimeError("XLA said no")
+            raise RuntimeError("XLA failed")
         scale = 1.0 if cfg.implementation == "reference" else 1.01
         cfg = replace(cfg, implementation="reference")
         result = true(gaussians, alive, camera, cfg, capacity)
@@ -84,7 +84,7 @@ def test_a_wrong_image_or_an_error_fails_the_self_test(monkeypatch, wrong, said)
     monkeypatch.setattr(rendering, "render_linear", broken)
     found = doctor.check_render()
     assert not found.ok
-    assert said in found.text
+    assert words in found.text
 
 
 def test_an_installation_without_pycolmap_can_fit(monkeypatch, capsys):

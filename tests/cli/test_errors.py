@@ -15,7 +15,7 @@ from p2gs_jax.pipeline.preflight import check_run_dir
 from p2gs_jax.presets import preset, to_dict
 from p2gs_jax.run.folder import locked
 
-# What was written, and a word of the way on.
+# Command lines, and a part of the remedy that the error names.
 WRONG = [
     ("", "p2gs-jax COMMAND --help"),
     ("fitt castle", "did you mean fit?"),
@@ -93,8 +93,8 @@ def test_a_demo_is_not_replaced_while_it_runs(tmp_path, run_command):
     for running in (tmp_path, tmp_path / "run"):
         running.mkdir(exist_ok=True)
         with locked(running):
-            code, said = run_command("demo", "--out", tmp_path)
-        assert (code, "is being written to by process" in said) == (2, True)
+            code, text = run_command("demo", "--out", tmp_path)
+        assert (code, "is being written to by process" in text) == (2, True)
         assert (tmp_path / "street").is_dir()
 
 
@@ -106,17 +106,15 @@ def test_a_finished_demo_is_kept(tmp_path, refused):
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory):
-    """Return a folder with what the words of WRONG name, each broken in its own way."""
+def folder(tmp_path_factory):
+    """Return a folder with the scenes, runs and files that WRONG names, each with its fault."""
     root = tmp_path_factory.mktemp("wrong")
     for name in ("castle", "junk", "empty", "begun", "other", "torn", "gaps/images"):
         (root / name).mkdir(parents=True)
     for name in ("castle", "gaps/images"):
         cv2.imwrite(str(root / name / "000.png"), np.full((30, 40, 3), 60, np.uint8))
-    poses = [np.eye(4).tolist(), np.eye(4).tolist()]
-    frames = [
-        {"file_path": f"images/{k:03d}.png", "transform_matrix": m} for k, m in enumerate(poses)
-    ]
+    pose = {"transform_matrix": np.eye(4).tolist()}
+    frames = [{"file_path": f"images/{k:03d}.png", **pose} for k in range(2)]
     shape = {"fl_x": 40, "fl_y": 40, "cx": 20, "cy": 15, "w": 40, "h": 30}
     (root / "gaps" / "transforms.json").write_text(json.dumps(shape | {"frames": frames}))
     for name in ("a.jpg", "b.jpg"):
@@ -134,19 +132,19 @@ def contents(root):
     return {path: path.is_file() and path.read_bytes() for path in root.rglob("*")}
 
 
-@pytest.mark.parametrize(("words", "way_on"), WRONG)
-def test_wrong_words_are_answered_with_a_way_on(refused, place, monkeypatch, words, way_on):
-    monkeypatch.chdir(place)
+@pytest.mark.parametrize(("words", "remedy"), WRONG)
+def test_wrong_command_lines_end_with_a_remedy(refused, folder, monkeypatch, words, remedy):
+    monkeypatch.chdir(folder)
     monkeypatch.setenv("COLUMNS", "100")
-    before = contents(place)
-    assert way_on in (said := refused(*words.split()))
-    assert "Run folder" not in said
-    assert contents(place).items() >= before.items(), "a failure leaves everything as it was"
-    assert not any((place / name).exists() for name in ("new", "run", "x"))
+    before = contents(folder)
+    assert remedy in (text := refused(*words.split()))
+    assert "Run folder" not in text
+    assert contents(folder).items() >= before.items(), "a failure leaves everything as it was"
+    assert not any((folder / name).exists() for name in ("new", "run", "x"))
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "said"),
+    ("name", "content", "remedy"),
     [
         ("radiance.ply", 500, "restore it from a copy"),
         ("photometry.json", 500, "restore it from a copy"),
@@ -156,7 +154,7 @@ def test_wrong_words_are_answered_with_a_way_on(refused, place, monkeypatch, wor
         ("config.json", "newer", "with the version that made it"),
     ],
 )
-def test_a_damaged_run_says_what_mends_it(refused, tmp_path, finished_run, name, content, said):
+def test_damaged_runs_end_with_a_remedy(refused, tmp_path, finished_run, name, content, remedy):
     path = shutil.copytree(finished_run, tmp_path / "run") / name
     if content == "newer":
         saved = json.loads(path.read_text())
@@ -166,10 +164,10 @@ def test_a_damaged_run_says_what_mends_it(refused, tmp_path, finished_run, name,
     path.write_bytes(whole[:content] if isinstance(content, int) else content.encode())
     text = refused("eval", tmp_path / "run")
     assert name in text
-    assert said in text
+    assert remedy in text
 
 
-def test_a_resumed_run_may_be_evaluated_otherwise_and_no_more(tmp_path):
+def test_a_resumed_run_may_change_only_its_evaluation(tmp_path):
     def resume(cfg, name="robust"):
         (tmp_path / "config.json").write_text(json.dumps({"scene": "s", "fit": cfg}))
         check_run_dir(tmp_path, True, preset(name))
@@ -190,7 +188,7 @@ def test_a_resumed_run_may_be_evaluated_otherwise_and_no_more(tmp_path):
         resume(cfg, "paper")
 
 
-def test_a_file_without_room_is_named(refused, tmp_path, monkeypatch):
+def test_a_file_that_cannot_grow_is_named(refused, tmp_path, monkeypatch):
     def run(options):
         raise OSError(errno.EFBIG, "File too large", "out.json")
 
@@ -198,7 +196,7 @@ def test_a_file_without_room_is_named(refused, tmp_path, monkeypatch):
     assert "out.json: File too large" in refused("synth", tmp_path / "new")
 
 
-def test_durations():
+def test_durations_are_parsed_or_refused():
     right = {"90": 90, "90s": 90, "5m": 300, "1h30m": 5400, "1m30s": 90, "1.5h": 5400, "0.5": 0.5}
     right |= {"1h30": 5400, "2h15": 8100, "1h05": 3900, "5m30": 330, "1h2m3": 3723, "1h30s": 3630}
     assert {text: parse_duration(text) for text in right} == right

@@ -1,4 +1,4 @@
-"""`p2gs-jax export` on a finished run, and what it says to wrong input."""
+"""`p2gs-jax export` on a finished run, and its errors."""
 
 import json
 import shutil
@@ -25,7 +25,7 @@ STEPS = ("--bake-steps", "12")
 
 @pytest.fixture(scope="module")
 def exported(finished_run, tmp_path_factory):
-    """Return a run and a folder with every format whose package is here."""
+    """Return a run and a folder with every format whose package is installed."""
     out = tmp_path_factory.mktemp("exports")
     formats = ("linear-ply", "display-ply", *SPZ, "colmap", "exr", "gltf", "nerfstudio")
     argv = ["export", str(finished_run), "--format", *formats, "--out", str(out), *STEPS]
@@ -35,44 +35,44 @@ def exported(finished_run, tmp_path_factory):
     return load_run(finished_run), out
 
 
-def test_the_linear_ply_is_the_run_bit_for_bit(exported):
+def test_the_linear_ply_equals_the_run_bit_for_bit(exported):
     fitted, out = exported
     back = read_ply(out / "linear.ply")
     for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
         np.testing.assert_array_equal(getattr(back, name), getattr(fitted.params.gaussians, name))
-    said = json.loads((out / "linear.json").read_text())
-    assert said["gaussians"] == fitted.params.gaussians.capacity
-    assert said["radiance"]["activation"] == fitted.cfg.render.radiance
-    e = {v["image"]: v["exposure"] for v in said["views"]}
+    saved = json.loads((out / "linear.json").read_text())
+    assert saved["gaussians"] == fitted.params.gaussians.capacity
+    assert saved["radiance"]["activation"] == fitted.cfg.render.radiance
+    e = {v["image"]: v["exposure"] for v in saved["views"]}
     train = [fitted.scene.views[i].name for i in fitted.scene.train_indices]
     np.testing.assert_allclose([e[n] for n in train], fitted.params.photometry.exposures, rtol=1e-6)
-    assert said["mean"]["gamma"] == pytest.approx(fitted.mean.gamma)
+    assert saved["mean"]["gamma"] == pytest.approx(fitted.mean.gamma)
 
 
-def test_the_baking_error_is_written_and_true(exported):
+def test_the_baking_error_is_written_and_right(exported):
     fitted, out = exported
-    said = json.loads((out / "display.ply.json").read_text())
+    saved = json.loads((out / "display.ply.json").read_text())
     comments = PlyData.read(str(out / "display.ply")).comments
     for split, rows in (("train", fitted.scene.train_indices), ("test", fitted.scene.test_indices)):
-        error = said["baking_error"][split]
+        error = saved["baking_error"][split]
         assert error["views"] == len(rows)
         assert any(f"median {error['psnr_median']:.2f} dB" in c for c in comments)
         assert "different from the true ones (below 30 dB)" in comments[-1]
-    # One view judged here, with nothing from gaussians/bake.py.
+    # One view is measured again, without code of gaussians/bake.py.
     index = fitted.scene.train_indices[1]
     camera = camera_of(fitted.store, index)
     linear = make_renderer(fitted.cfg.render)(fitted.params.gaussians, fitted.alive, camera).linear
     viewer = make_renderer(replace(fitted.cfg.render, radiance="linear", blur=0.3))
     shown = np.clip(viewer(read_ply(out / "display.ply"), fitted.alive, camera).linear, 0, 1)
     difference = 255 * (shown - develop(linear, fitted.common_display()))
-    found = said["baking_error"]["train"]["per_view"][fitted.scene.views[index].name]
+    found = saved["baking_error"]["train"]["per_view"][fitted.scene.views[index].name]
     assert found["mean_codes"] == pytest.approx(np.abs(difference).mean(), abs=0.5)
     psnr = -20 * np.log10(np.sqrt((difference**2).mean()) / 255)
     assert found["psnr"] == pytest.approx(psnr, abs=0.1)
-    for kind in SPZ:  # measured as they are read back
-        said = json.loads((out / f"display.{kind}.json").read_text())
-        assert said["file"] == f"display.{kind}"
-        assert 10 < said["baking_error"]["train"]["psnr_median"] < 60
+    for kind in SPZ:  # measured on the file read back
+        saved = json.loads((out / f"display.{kind}.json").read_text())
+        assert saved["file"] == f"display.{kind}"
+        assert 10 < saved["baking_error"]["train"]["psnr_median"] < 60
 
 
 def test_the_colmap_folder_can_be_calibrated(exported, succeeded, tmp_path):
@@ -87,30 +87,30 @@ def test_the_colmap_folder_can_be_calibrated(exported, succeeded, tmp_path):
 
 
 def colors_of(folder):
-    """Return the colours of a display PLY without direction, and what its JSON file says."""
-    said = json.loads((folder / "display.ply.json").read_text())
-    return 0.5 + C0 * np.asarray(read_ply(folder / "display.ply").sh[:, 0]), said
+    """Return the colours of degree 0 in a display PLY, and its JSON file."""
+    saved = json.loads((folder / "display.ply.json").read_text())
+    return 0.5 + C0 * np.asarray(read_ply(folder / "display.ply").sh[:, 0]), saved
 
 
-def test_a_look_changes_the_display_colours(exported, finished_run, succeeded, tmp_path):
+def test_exposure_and_curve_change_the_display_colours(exported, finished_run, succeeded, tmp_path):
     def base(name, *options):
         argv = ("export", finished_run, "--format", "display-ply", "--out", tmp_path / name)
         text = succeeded(*argv, "--bake-steps", "0", *options)
         return *colors_of(tmp_path / name), text
 
-    plain, said = colors_of(exported[1])
-    assert said["exposure_ev_from_mean"] == pytest.approx(0, abs=1e-6)
-    dark, said, text = base("dark", "--exposure-ev", "-4")
+    plain, saved = colors_of(exported[1])
+    assert saved["exposure_ev_from_mean"] == pytest.approx(0, abs=1e-6)
+    dark, saved, text = base("dark", "--exposure-ev", "-4")
     assert "close to the true ones (at least 30 dB)" in " ".join(text.split())
-    assert said["exposure_ev_from_mean"] == pytest.approx(-4, abs=1e-5)
+    assert saved["exposure_ev_from_mean"] == pytest.approx(-4, abs=1e-5)
     assert dark.mean() < plain.mean() - 0.05
-    linear, said, _ = base("linear", "--curve", "linear", "--gamma", "2.2")
-    assert (said["curve"], said["gamma"]) == ("linear", 2.2)
+    linear, saved, _ = base("linear", "--curve", "linear", "--gamma", "2.2")
+    assert (saved["curve"], saved["gamma"]) == ("linear", 2.2)
     assert linear.mean() < plain.mean() - 0.05
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "words"),
     [
         ("--format obj", "obj"),
         ("", "format"),
@@ -128,12 +128,12 @@ def test_a_look_changes_the_display_colours(exported, finished_run, succeeded, t
         ("--format exr --photographs 3", "--photographs"),
     ],
 )
-def test_senseless_options(finished_run, refused, tmp_path, options, said):
-    assert said in refused("export", finished_run, *options.split(), "--out", tmp_path / "out")
+def test_wrong_options_are_refused(finished_run, refused, tmp_path, options, words):
+    assert words in refused("export", finished_run, *options.split(), "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_what_is_there_is_replaced_only_when_asked_and_exports_lie_in_the_run(
+def test_files_are_replaced_only_with_overwrite_and_exports_lie_in_the_run(
     finished_run, succeeded, refused, tmp_path
 ):
     (tmp_path / "linear.json").write_text("mine")
@@ -163,7 +163,7 @@ def test_names_that_lead_outside_are_refused(finished_run, refused, tmp_path, mo
     assert list(tmp_path.iterdir()) == []
 
 
-def test_corrections_travel_with_the_linear_ply(finished_run, succeeded, tmp_path, monkeypatch):
+def test_corrections_come_with_the_linear_ply(finished_run, succeeded, tmp_path, monkeypatch):
     def corrected(fitted):
         appearance = jnp.full((len(fitted.scene.train_indices), 3, 4), 0.1)
         photometry = replace(fitted.cfg.photometry, appearance="affine")
@@ -172,5 +172,5 @@ def test_corrections_travel_with_the_linear_ply(finished_run, succeeded, tmp_pat
 
     monkeypatch.setattr(read, "load_run", lambda folder, scene=None: corrected(load_run(folder)))
     succeeded("export", finished_run, "--format", "linear-ply", "--out", tmp_path)
-    said = json.loads((tmp_path / "linear.json").read_text())
-    np.testing.assert_allclose(np.load(tmp_path / said["tone"]["correction"]["file"]), 0.1)
+    saved = json.loads((tmp_path / "linear.json").read_text())
+    np.testing.assert_allclose(np.load(tmp_path / saved["tone"]["correction"]["file"]), 0.1)

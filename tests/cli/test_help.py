@@ -1,4 +1,4 @@
-"""Help that a person can work from: at once, at 80 columns, with examples that are right."""
+"""Help appears at once, fits into 80 columns, and its examples can be parsed."""
 
 import os
 import re
@@ -24,17 +24,17 @@ def shown(run_command, monkeypatch):
 
 
 def wide(text):
-    """Return lines beyond 80 columns, but for the one-line summary of usage."""
+    """Return lines beyond 80 columns, except the one-line summary of usage."""
     return [line for line in text.splitlines() if len(line) > 80 and not line.startswith("usage:")]
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_help_of_every_command(shown, name):
+def test_help_fits_and_its_examples_can_be_parsed(shown, name):
     code, text = shown(name, "--help")
     assert code == 0
     options, _, examples = text.partition("Examples:")
     assert not wide(options)
-    # In a command's own options None says nothing.
+    # A default of None is not shown.
     assert "{None}" not in text
     assert "default: None" not in text
     found = [line for line in examples.splitlines() if line.strip().startswith("p2gs-jax ")]
@@ -58,7 +58,7 @@ def test_overview_names_every_command_once_and_in_order(shown):
     assert text.split()[1][0].isdigit()
 
 
-def test_common_options_come_first_and_the_rest_on_request(shown):
+def test_help_has_common_options_and_help_all_the_rest(shown):
     _, brief = shown("fit", "--help")
     _, whole = shown("fit", "--help-all")
     for option in ("--out DIR", "--budget TIME", "--preset NAME", "--gaussians N"):
@@ -84,7 +84,7 @@ def test_calibrate_has_the_options_that_it_reads(shown):
     assert options.config.train.steps == 30_000
 
 
-def test_a_preset_decides_defaults_and_options_are_read_as_what_they_are():
+def test_a_preset_sets_defaults_and_options_are_read_as_their_types():
     argv = "fit a --out b --preset=paper --render.near 0.1 --render.stop-error None"
     _, options = parse([*argv.split(), *["--train.coarse-to-fine", ".1", ".2", "--resume"]])
     assert options.config.preset == "paper"
@@ -102,7 +102,7 @@ VALUES |= {"allow_missing": ("", True), "camera_by": ("folder", "folder")}
 
 
 @pytest.mark.parametrize("which", ["short", "long"])
-def test_short_names_and_long_ones_are_one_option(which):
+def test_short_and_long_names_set_the_same_field(which):
     words = "fit a --out b"
     for name, (path, _) in SHORT.items():
         option = (name if which == "short" else path).replace("_", "-")
@@ -146,7 +146,7 @@ def test_help_imports_nothing_heavy():
 
 @pytest.fixture
 def broken(tmp_path):
-    """Return a function that runs the command line where a library raises when imported."""
+    """Return a function that runs p2gs-jax with a library that raises when imported."""
 
     def run(module, *argv):
         (tmp_path / f"{module}.py").write_text("raise ImportError('libfoo.so.1 is missing')")
@@ -159,11 +159,11 @@ def broken(tmp_path):
 
 
 def test_nothing_is_imported_from_the_working_folder(hostile):
-    """`python -m` would: the scene is often the working folder."""
+    """`python -m` alone searches the working folder, which often is the scene."""
     argv, root = [sys.executable, "-m", "p2gs_jax.cli"], str(Path(__file__).parents[2])
     env = os.environ | {"PYTHONPATH": root}
-    words = ("calibrate", ".", "--out", "new")
-    done = subprocess.run([*argv, *words], env=env, capture_output=True, text=True)
+    argv += ["calibrate", ".", "--out", "new"]
+    done = subprocess.run(argv, env=env, capture_output=True, text=True)
     assert done.returncode == 2, done.stderr
     assert "no scene in ." in done.stderr
     assert not hostile.exists()
@@ -179,7 +179,7 @@ def test_a_broken_library_is_named_with_what_to_do(broken, tmp_path, module):
 
 
 @pytest.mark.parametrize("module", ["jax", pytest.param("tyro", marks=pytest.mark.slow)])
-def test_doctor_survives_what_it_looks_for(broken, module):
+def test_doctor_survives_a_broken_library(broken, module):
     done = broken(module, "doctor", "--skip-self-test")
     assert done.returncode == 1, done.stderr
     assert "libfoo.so.1 is missing" in done.stdout

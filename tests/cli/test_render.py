@@ -1,4 +1,4 @@
-"""`render` from end to end, on a small run and on a rig that photographed its field."""
+"""`render` on a small run: pictures, cameras, videos and wrong options."""
 
 import json
 import shutil
@@ -17,7 +17,7 @@ from p2gs_jax.run.read import load_run
 
 @pytest.fixture
 def rendered(succeeded):
-    """Return a function from the words behind `render` to what was printed, on one line."""
+    """Return a function from the arguments of `render` to the printed text, on one line."""
     return lambda *argv: " ".join(succeeded("render", *argv).split())
 
 
@@ -33,17 +33,17 @@ def video(path):
 
 
 @pytest.fixture(scope="module")
-def own_run(finished_run, tmp_path_factory) -> Path:
+def run_copy(finished_run, tmp_path_factory) -> Path:
     return shutil.copytree(finished_run, tmp_path_factory.mktemp("render") / "run")
 
 
-def test_a_file_of_cameras_renders_what_the_views_rendered(rendered, own_run, tmp_path):
-    rendered(own_run, "--out", tmp_path / "a", "--exposure-ev", "0", "--gamma", "2.2")
+def test_cameras_from_a_file_render_as_their_views_did(rendered, run_copy, tmp_path):
+    rendered(run_copy, "--out", tmp_path / "a", "--exposure-ev", "0", "--gamma", "2.2")
     cameras = tmp_path / "a" / "cameras.json"
     data = json.loads(cameras.read_text())[:2]
     data[1].update(exposure_ev=1.0, name="far/brighter")
     cameras.write_text(json.dumps(data))
-    rendered(own_run, "--trajectory", cameras, "--out", tmp_path / "b", "--gamma", "2.2")
+    rendered(run_copy, "--trajectory", cameras, "--out", tmp_path / "b", "--gamma", "2.2")
     first = picture(tmp_path / "a" / "0.render.png")
     np.testing.assert_allclose(picture(tmp_path / "b" / "0.png"), first, atol=1 / 255)
     second = picture(tmp_path / "a" / "1.render.png")
@@ -54,10 +54,10 @@ def test_a_file_of_cameras_renders_what_the_views_rendered(rendered, own_run, tm
     assert ratio == pytest.approx(2, rel=1e-5)
 
 
-def test_one_stop_doubles_the_linear_picture_and_leaves_the_radiance(rendered, own_run, tmp_path):
+def test_one_stop_doubles_the_linear_picture_and_leaves_the_radiance(rendered, run_copy, tmp_path):
     for ev in ("-3", "-2"):
         argv = ("--trajectory", "orbit", "--frames", "2", "--curve", "linear", "--gamma", "2.2")
-        rendered(own_run, *argv, "--exposure-ev", ev, "--out", tmp_path / ev)
+        rendered(run_copy, *argv, "--exposure-ev", ev, "--out", tmp_path / ev)
     dark, bright = (picture(tmp_path / ev / "00001.png") for ev in ("-3", "-2"))
     assert dark.mean() > 0.01
     assert bright.max() < 1
@@ -66,9 +66,9 @@ def test_one_stop_doubles_the_linear_picture_and_leaves_the_radiance(rendered, o
     np.testing.assert_array_equal(*linear)
 
 
-def test_a_drive_becomes_a_video_that_is_not_replaced(refused, rendered, own_run, tmp_path):
+def test_a_drive_becomes_a_video_that_is_not_replaced(refused, rendered, run_copy, tmp_path):
     out = tmp_path / "new" / "drive.mp4"
-    argv = (own_run, "--trajectory=drive", "--frames", 7, "--fps", 12, "--width", 64, "--out", out)
+    argv = (run_copy, "--trajectory=drive", "--frames", 7, "--fps", 12, "--width", 64, "--out", out)
     rendered(*argv)
     assert [p.name for p in out.parent.iterdir()] == ["drive.mp4"]
     frames = video(out)
@@ -78,10 +78,10 @@ def test_a_drive_becomes_a_video_that_is_not_replaced(refused, rendered, own_run
     assert "--overwrite" in refused("render", *argv)
 
 
-def test_a_drive_can_be_exposed_as_photographed(rendered, own_run, tmp_path):
-    fitted = load_run(own_run)
+def test_a_drive_can_be_exposed_as_photographed(rendered, run_copy, tmp_path):
+    fitted = load_run(run_copy)
     argv = ("--trajectory", "drive", "--frames", "6", "--split", "all")
-    rendered(own_run, *argv, "--exposure-ev", "own", "--out", tmp_path)
+    rendered(run_copy, *argv, "--exposure-ev", "own", "--out", tmp_path)
     first, last = (json.loads((tmp_path / "cameras.json").read_text())[k] for k in (0, -1))
     for entry, index in ((first, 0), (last, 5)):
         transform = fitted.own_display(index)
@@ -90,26 +90,25 @@ def test_a_drive_can_be_exposed_as_photographed(rendered, own_run, tmp_path):
         assert entry["gamma"] == pytest.approx(transform.gamma, rel=1e-6)
 
 
-def test_a_drive_can_be_metered(rendered, own_run, tmp_path):
+def test_a_drive_can_be_metered(rendered, run_copy, tmp_path):
     bare = ["--trajectory", "drive", "--frames", 5, "--width", 64]
-    for name, more in (("of", []), ("more", ["--exposure-ev", 1])):
-        argv = [own_run, *bare, "--meter", "log_average", *more, "--out", tmp_path / name]
-        rendered(*argv)
+    for name, more in (("plain", []), ("more", ["--exposure-ev", 1])):
+        out = ("--out", tmp_path / name)
+        rendered(run_copy, *bare, "--meter", "log_average", *more, *out)
     metered, brighter = (
         [shot["exposure_ev"] for shot in json.loads((tmp_path / n / "cameras.json").read_text())]
-        for n in ("of", "more")
+        for n in ("plain", "more")
     )
     np.testing.assert_allclose(np.subtract(brighter, metered), 1.0, atol=1e-5)
-    linear, *_ = read_exr(tmp_path / "of" / "00002.exr")
+    linear, *_ = read_exr(tmp_path / "plain" / "00002.exr")
     light = linear @ [0.2126, 0.7152, 0.0722]
-    exposed = load_run(own_run).common_display(metered[2]).exposure * light
+    exposed = load_run(run_copy).common_display(metered[2]).exposure * light
     assert np.exp(np.log(exposed[exposed > 0]).mean()) == pytest.approx(0.18, rel=0.3)
-    said = rendered(own_run, *bare, "--meter", "auto", "--out", tmp_path / "auto")
-    assert "Metering:" in said
+    assert "Metering:" in rendered(run_copy, *bare, "--meter", "auto", "--out", tmp_path / "auto")
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "words"),
     [
         ("--trajectory spiral", "--trajectory"),
         ("--trajectory nowhere.json", "nowhere.json"),
@@ -133,15 +132,15 @@ def test_a_drive_can_be_metered(rendered, own_run, tmp_path):
         ("--split best", "--split"),
     ],
 )
-def test_senseless_requests_end_with_one_message(refused, own_run, options, said):
-    before = sorted(own_run.rglob("*"))
-    text = refused("render", own_run, *options.split())
-    assert said in " ".join(text.split())
-    assert sorted(own_run.rglob("*")) == before
+def test_wrong_options_are_refused_and_nothing_is_written(refused, run_copy, options, words):
+    before = sorted(run_copy.rglob("*"))
+    text = refused("render", run_copy, *options.split())
+    assert words in " ".join(text.split())
+    assert sorted(run_copy.rglob("*")) == before
 
 
-def test_what_is_there_is_replaced_only_when_asked_for(refused, rendered, own_run, tmp_path):
-    argv = (own_run, "--trajectory", "drive", "--frames", 2, "--width", 64, "--out", tmp_path)
+def test_frames_are_replaced_only_with_overwrite(refused, rendered, run_copy, tmp_path):
+    argv = (run_copy, "--trajectory", "drive", "--frames", 2, "--width", 64, "--out", tmp_path)
     rendered(*argv)
     before = [p.stat().st_mtime_ns for p in tmp_path.iterdir()]
     assert "--overwrite" in refused("render", *argv)
@@ -150,11 +149,11 @@ def test_what_is_there_is_replaced_only_when_asked_for(refused, rendered, own_ru
     assert [p.stat().st_mtime_ns for p in tmp_path.iterdir()] != before
 
 
-def test_a_folder_in_place_of_a_video_is_kept(refused, own_run, tmp_path):
+def test_a_folder_in_place_of_a_video_is_kept(refused, run_copy, tmp_path):
     (tmp_path / "v.mp4").mkdir()
-    assert "is a folder" in refused("render", own_run, "--out", tmp_path / "v.mp4")
+    assert "is a folder" in refused("render", run_copy, "--out", tmp_path / "v.mp4")
     (tmp_path / "notes").write_text("mine")
-    refused("render", own_run, "--out", tmp_path / "notes")
+    refused("render", run_copy, "--out", tmp_path / "notes")
     assert (tmp_path / "notes").read_text() == "mine"
 
 
@@ -168,11 +167,11 @@ def test_a_folder_in_place_of_a_video_is_kept(refused, own_run, tmp_path):
         ({"split": "test", "panorama": True}, ("cam/0.png",), "test_panorama"),
         ({"panorama": True}, ("cam/0.png",), "panorama"),
         ({"trajectory": "drive", "shift": -2.0}, ("cam/0.png",), "drive_2_right"),
-        # Where the fit keeps its held-out views.
+        # The folder of that name holds photographs.
         ({"split": "test"}, ("test/r_0.png",), "test_views"),
         ({"trajectory": "drive"}, ("drive/0.png",), "drive_views"),
     ],
 )
-def test_a_folder_is_named_by_what_is_rendered(tmp_path, options, names, folder):
+def test_the_default_folder_is_named_after_its_renders(tmp_path, options, names, folder):
     scene = SimpleNamespace(views=[SimpleNamespace(name=name) for name in names])
     assert _default_name(Render(tmp_path, **options), scene) == folder

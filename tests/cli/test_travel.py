@@ -1,4 +1,4 @@
-"""Runs travel: they open from anywhere, without their scene where cameras suffice, or with it."""
+"""Runs that were moved open with their scene, or without it where cameras suffice."""
 
 import json
 import shutil
@@ -18,7 +18,7 @@ from p2gs_jax.scene import load_scene
 
 @pytest.fixture
 def alone(tmp_path, finished_run):
-    """Return a copy of a run whose scene has gone."""
+    """Return a copy of a run whose scene does not exist."""
     folder = shutil.copytree(finished_run, tmp_path / "elsewhere" / "run")
     path = folder / "config.json"
     saved = json.loads(path.read_text())
@@ -26,7 +26,7 @@ def alone(tmp_path, finished_run):
     return folder
 
 
-def test_a_scene_comes_back_from_the_run(tmp_path):
+def test_a_scene_is_read_back_from_the_run(tmp_path):
     (tmp_path / "masks").mkdir()
     root = make_scene(tmp_path / "scene")
     shutil.copytree(root / "images", root / "masks")
@@ -61,7 +61,7 @@ def test_photographs_outside_the_scene_keep_their_place(tmp_path):
         assert read_scene(tmp_path, place).views[0].image_path.samefile(tmp_path / "photos/0.png")
 
 
-def test_places_are_remembered_in_two_ways(tmp_path, monkeypatch, finished_run):
+def test_paths_are_stored_absolute_and_relative_to_the_run(tmp_path, monkeypatch, finished_run):
     monkeypatch.chdir(tmp_path)
     for name in ("street", "runs/first"):
         (tmp_path / name).mkdir(parents=True)
@@ -86,7 +86,7 @@ def test_a_run_without_its_scene_renders_and_exports(succeeded, refused, tmp_pat
     assert len(list((tmp_path / "e" / "exr").iterdir())) == 6
     for words in ("eval", "export --format colmap", "calibrate --out new", "view --scene nowhere"):
         command, *options = words.split()
-        # Names of folders are long, and wrapped.
+        # The terminal wraps long paths.
         text = " ".join(refused(command, alone, *options).split())
         assert f"{tmp_path / 'gone'}, does not exist" in text or "nowhere does not exist" in text
         assert "--scene" in text
@@ -106,7 +106,7 @@ def test_the_scene_can_be_named_and_one_photograph_may_be_broken(
 
 
 @pytest.mark.parametrize("name", [SCENE_FILE, "decisions.json", "metering.json"])
-def test_a_run_of_another_version_is_refused(alone, name):
+def test_a_run_without_a_file_of_this_version_is_refused(alone, name):
     (alone / name).unlink()
     with pytest.raises(UserError, match=rf"(?s){name}.*(fit again|eval RUN)"):
         _ = load_run(alone).metering

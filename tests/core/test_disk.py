@@ -1,4 +1,4 @@
-"""A write for which there is no room says so, names its file and leaves the old one as it was."""
+"""A write without room raises an error that names the file, and leaves the old file as it was."""
 
 import contextlib
 import errno
@@ -14,7 +14,7 @@ from p2gs_jax.formats.frames import write_png
 
 @contextlib.contextmanager
 def room_for(size):
-    """Let no file of this process grow beyond so many bytes, as on a disk that is full."""
+    """Limit the files of this process to so many bytes, like a full disk."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
@@ -32,7 +32,7 @@ WRITERS = {
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_a_full_disk_is_named_with_the_file(tmp_path, name):
+def test_a_write_to_a_full_disk_names_its_file(tmp_path, name):
     path = tmp_path / name
     path.write_text("before")
     with room_for(4096), pytest.raises(OSError, match=r".") as error:
@@ -43,18 +43,18 @@ def test_a_full_disk_is_named_with_the_file(tmp_path, name):
     assert path.read_text() == "before"
 
 
-def test_a_log_without_room_is_named_and_mended(tmp_path):
+def test_a_log_on_a_full_disk_is_named_and_mended(tmp_path):
     path = tmp_path / "log.jsonl"
     append_jsonl(path, {"step": 1})
     with room_for(20), pytest.raises(OSError, match=r".") as error:
-        append_jsonl(path, {"step": 2, "said": "x" * 50})
+        append_jsonl(path, {"step": 2, "text": "x" * 50})
     assert (error.value.errno, error.value.filename) == (errno.EFBIG, str(path))
-    assert path.stat().st_size == 20, "what fits was written: the last line is torn"
+    assert path.stat().st_size == 20, "the last line was cut"
     append_jsonl(path, {"step": 3})
     assert read_jsonl(path) == [{"step": 1}, {"step": 3}]
 
 
-def test_errors_that_have_nothing_to_do_with_room_stay_as_they_are(tmp_path):
+def test_other_errors_stay_as_they_are(tmp_path):
     def write():
         with atomic_write(tmp_path / "a") as temporary:
             temporary.write_text("half")

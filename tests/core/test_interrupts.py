@@ -33,7 +33,7 @@ def test_ctrl_c_has_the_exit_code_of_shells():
 
 
 @pytest.mark.parametrize(
-    ("begun", "sent", "delivered", "reached", "raised"),
+    ("begins", "sent", "delivered", "reached", "raised"),
     [
         (True, [TERM], True, 1, TERM),  # waits until it is delivered
         (True, [TERM], False, 2, TERM),  # raised at the end of the block
@@ -42,13 +42,13 @@ def test_ctrl_c_has_the_exit_code_of_shells():
     ],
 )
 def test_a_held_signal_waits_until_the_program_can_be_continued(
-    begun, sent, delivered, reached, raised
+    begins, sent, delivered, reached, raised
 ):
     trace = []
 
     def work():
         with interrupts.held() as waiting:
-            if begun:
+            if begins:
                 waiting.begin()
             for number in sent:
                 send(number)

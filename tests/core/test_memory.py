@@ -1,4 +1,4 @@
-"""How much memory there is, and which errors say that it ran out."""
+"""The memory of a machine, container and process; the errors that mean that it ran out."""
 
 import errno
 import resource
@@ -17,13 +17,13 @@ def container(monkeypatch, tmp_path):
     return tmp_path
 
 
-def test_memory_of_the_system_and_of_a_container(container):
+def test_memory_is_that_of_the_system_or_its_container(container):
     system = (8_000_000 * 1024, 6_000_000 * 1024)
     assert memory.memory() == system
     (container / "memory.max").write_text("1000000000\n")
     (container / "memory.current").write_text("400000000\n")
     assert memory.memory() == (1_000_000_000, 600_000_000)
-    # Files that it caches can go.
+    # Memory of cached files counts as available.
     (container / "memory.current").write_text("900000000\n")
     (container / "memory.stat").write_text("anon 300000000\ninactive_file 500000000\n")
     assert memory.memory() == (1_000_000_000, 600_000_000)
@@ -31,7 +31,7 @@ def test_memory_of_the_system_and_of_a_container(container):
     assert memory.memory() == system
 
 
-def test_what_is_left_is_the_least_of_machine_and_limit(container, monkeypatch):
+def test_a_process_is_bounded_by_the_machine_and_its_limit(container, monkeypatch):
     monkeypatch.setattr(memory, "STATM", container / "statm")
     (container / "meminfo").write_text((container / "meminfo").read_text() + "SwapFree: 1000 kB\n")
     free = 6_001_000 * 1024
@@ -50,7 +50,7 @@ def test_what_is_left_is_the_least_of_machine_and_limit(container, monkeypatch):
 
 
 class JaxRuntimeError(RuntimeError):
-    """As JAX names its own."""
+    """An exception with the name of JAX's."""
 
 
 @pytest.mark.parametrize(
@@ -65,5 +65,5 @@ class JaxRuntimeError(RuntimeError):
         (ValueError("RESOURCE_EXHAUSTED"), False),
     ],
 )
-def test_errors_that_say_memory_ran_out(error, ran_out):
+def test_errors_that_mean_memory_ran_out_are_recognised(error, ran_out):
     assert memory.ran_out(error) == ran_out

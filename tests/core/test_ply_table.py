@@ -1,4 +1,4 @@
-"""PLY tables against plyfile, and whatever is no such file."""
+"""PLY tables against plyfile, and errors for other files."""
 
 import tracemalloc
 
@@ -27,13 +27,13 @@ def ply(kind, lines, data=b"", newline="\n"):
     return newline.join(["ply", f"format {kind} 1.0", *lines, "end_header", ""]).encode() + data
 
 
-def written(path, data):
+def write(path, data):
     path.write_bytes(data)
     return path
 
 
 def numbers(rng, code, shape):
-    """Draw any value of a type, those at its ends among them."""
+    """Draw values over the whole range of a type."""
     kind = np.dtype(code)
     if kind.kind == "f":
         odd = np.array([np.nan, np.inf, -np.inf, -0.0, np.finfo(kind).max, np.finfo(kind).tiny])
@@ -51,8 +51,8 @@ tables = st.lists(
 seeds = st.integers(0, 2**32 - 1)
 
 
-def described(rng, name, count, codes):
-    """Return an element as plyfile has it."""
+def element(rng, name, count, codes):
+    """Return an element of plyfile with random values."""
     table = np.empty(count, [(f"{name}_{k}", code) for k, code in enumerate(codes)])
     for column in table.dtype.names:
         table[column] = numbers(rng, table.dtype[column], count)
@@ -60,11 +60,11 @@ def described(rng, name, count, codes):
 
 
 @given(tables, st.sampled_from(list(FORMATS)), seeds)
-def test_every_table_is_what_plyfile_reads(tmp_path_factory, elements, kind, seed):
+def test_every_table_is_read_as_by_plyfile(tmp_path_factory, elements, kind, seed):
     rng = np.random.default_rng(seed)
     path = tmp_path_factory.getbasetemp() / "drawn.ply"
-    made = [described(rng, "abc"[k], *said) for k, said in enumerate(elements)]
-    # Lists behind the tables are passed over.
+    made = [element(rng, "abc"[k], *shape) for k, shape in enumerate(elements)]
+    # The reader skips lists behind the tables.
     faces = np.empty(1, [("corners", object)])
     faces[0] = (np.arange(3, dtype="i4"),)
     made.append(PlyElement.describe(faces, "face"))
@@ -87,10 +87,10 @@ def test_comments_are_one_line_of_ascii():
 
 @pytest.mark.parametrize("kind", FORMATS)
 @pytest.mark.parametrize("name", TYPES)
-def test_all_names_of_types(tmp_path, name, kind):
+def test_all_names_of_types_are_read(tmp_path, name, kind):
     values = np.array([7, 100], FORMATS[kind] + TYPES[name])
     data = b"7\n100\n" if kind == "ascii" else values.tobytes()
-    path = written(tmp_path / "a.ply", ply(kind, ["element e 2", f"property {name} x"], data))
+    path = write(tmp_path / "a.ply", ply(kind, ["element e 2", f"property {name} x"], data))
     rows = read_table(path, "e")
     assert rows.dtype["x"] == values.dtype
     np.testing.assert_array_equal(rows["x"], values)
@@ -107,12 +107,12 @@ def positions(rows):
 
 @pytest.mark.parametrize("newline", ["\n", "\r\n", "\r"])
 @pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
-def test_lines_end_as_the_first_does(tmp_path, newline, kind):
-    # A first byte that looks like a line's end belongs to the data.
+def test_every_kind_of_line_end_is_read(tmp_path, newline, kind):
+    # The first byte of the data, 10, is no line's end.
     points = POINTS.copy()
     points.view("<i4")[0, 0] = 10
     data = TEXT.replace(b"\n", newline.encode()) if kind == "ascii" else points.tobytes()
-    path = written(tmp_path / "a.ply", ply(kind, VERTICES, data, newline))
+    path = write(tmp_path / "a.ply", ply(kind, VERTICES, data, newline))
     expected = POINTS if kind == "ascii" else points
     np.testing.assert_array_equal(positions(read_table(path, "vertex")), expected)
 
@@ -122,8 +122,8 @@ def test_a_file_that_was_cut_anywhere_is_refused(tmp_path, kind):
     data = TEXT if kind == "ascii" else POINTS.astype(FORMATS[kind] + "f4").tobytes()
     path, data = tmp_path / "a.ply", ply(kind, VERTICES, data)
     for end in range(len(data) + 1):
-        written(path, data[:end])
-        # Text may lack its last line's end.
+        write(path, data[:end])
+        # The last line of a text may lack its end.
         if end < len(data) - (kind == "ascii"):
             with pytest.raises(ValueError):  # noqa: PT011
                 read_table(path, "vertex")
@@ -133,7 +133,7 @@ def test_a_file_that_was_cut_anywhere_is_refused(tmp_path, kind):
 
 COLORED = [*VERTICES, "property uchar red"]
 WHOLE = ply("ascii", VERTICES, TEXT)
-# A whole file, or what stands behind "ply" and the format; and what is said of it.
+# A file, or the lines and data behind "ply" and the format; the words of its error.
 REFUSED = {
     "no count": ((["element vertex", *AXES], TEXT), r"line 3 of its header, 'element vertex', is"),
     "a type unknown": ((["element vertex 2", "property int64 x"], TEXT), r"line 4 .*int64 x', is"),
@@ -158,27 +158,27 @@ REFUSED = {
 
 
 def refused(path, message):
-    with pytest.raises(UserError, match=message) as said, refusing(path, "points", fix="write it"):
+    with pytest.raises(UserError, match=message) as error, refusing(path, "points", fix="write it"):
         positions(read_table(path, "vertex"))
-    assert str(said.value).startswith(str(path))
-    assert said.value.fix == "write it"
+    assert str(error.value).startswith(str(path))
+    assert error.value.fix == "write it"
 
 
 @pytest.mark.parametrize(("content", "message"), REFUSED.values(), ids=REFUSED)
-def test_what_is_wrong_is_said(tmp_path, content, message):
+def test_broken_files_are_refused_with_their_fault(tmp_path, content, message):
     data = content if isinstance(content, bytes) else ply("ascii", *content)
-    refused(written(tmp_path / "a.ply", data), message)
+    refused(write(tmp_path / "a.ply", data), message)
 
 
-def test_no_file_and_a_folder(tmp_path):
+def test_missing_files_and_folders_are_refused(tmp_path):
     refused(tmp_path / "nowhere.ply", r"is not a valid PLY of points: .*No such file")
     refused(tmp_path, r"is not a valid PLY of points: .*directory")
 
 
-def test_rows_are_mapped(tmp_path):
+def test_rows_are_mapped_instead_of_read(tmp_path):
     rows = np.zeros(10**6, [("x", "<f8")])
     data = header_of("vertex", rows.dtype, len(rows)) + rows.tobytes()
-    path = written(tmp_path / "a.ply", data)
+    path = write(tmp_path / "a.ply", data)
     del data
     tracemalloc.start()
     assert len(read_table(path, "vertex")) == len(rows)

@@ -1,4 +1,4 @@
-"""What a terminal is given holds nothing that commands it."""
+"""No text that is printed can command the terminal."""
 
 import io
 import re
@@ -57,7 +57,7 @@ def test_a_terminal_gets_colours_and_no_control_characters():
         assert printed(name).strip() == name
 
 
-def test_pictures_are_drawn_as_nobody_has_set_them():
+def test_settings_of_matplotlib_do_not_change_pictures():
     """matplotlib reads a `matplotlibrc` of the working folder, which may be a scene's."""
     with matplotlib.rc_context({"text.usetex": True, "axes.facecolor": "red"}):
         with names_as_they_are():
@@ -66,7 +66,7 @@ def test_pictures_are_drawn_as_nobody_has_set_them():
     assert drawn == [False, False]
 
 
-def test_every_console_is_plain_and_so_is_what_workers_say(tmp_path, capsys):
+def test_every_console_and_message_of_a_worker_is_plain(tmp_path, capsys):
     for path in Path(p2gs_jax.__file__).parent.rglob("*.py"):
         made = re.findall(r"(?<!class )\b\w*Console\(", path.read_text(encoding="utf-8"))
         assert set(made) <= {"PlainConsole("}, path
@@ -76,7 +76,7 @@ def test_every_console_is_plain_and_so_is_what_workers_say(tmp_path, capsys):
 
 def test_errors_are_printable(refused, tmp_path):
     red = tmp_path / "\x1b[31mred"
-    # The second is a word too many, as a pattern of the shell may find.
+    # The second is a superfluous argument, as a shell's pattern may add.
     for words, shown in (([red], "red does not exist"), ([tmp_path, "\x1b[31mred"], "red")):
         text = refused("inspect", *words)
         assert f"\\x1b[31m{shown}" in text

@@ -1,4 +1,4 @@
-"""Few programs: what is small is computed by numpy, what is large by one program per image size."""
+"""Few programs are compiled: NumPy computes small arrays, one program per image size the rest."""
 
 import numpy as np
 import pytest
@@ -36,10 +36,10 @@ def test_a_fit_without_its_steps_compiles_few_programs(scene, tmp_path):
     params = recentre(start.params, cfg.render.radiance)
     assert counter.programs == 0
     account = Account({}, {"total_until_evaluation": 60.0}, start.selection, start.notes)
-    given = (params, start.scene, start.survey.store, start.cfg, RunFolder(tmp_path), account)
-    metrics = finish(*given, Silent())
-    # Counting tiles, rendering, developing (images; colours of splats), fitting an exposure, PSNR,
-    # SSIM, and the basis of spherical harmonics.
+    inputs = (params, start.scene, start.survey.store, start.cfg, RunFolder(tmp_path), account)
+    metrics = finish(*inputs, Silent())
+    # They count tiles, render, develop (images; colours of splats), fit an exposure, and compute
+    # PSNR, SSIM and the basis of spherical harmonics.
     assert counter.programs <= 8
     assert metrics["photometry"]["converged"]
     assert metrics["photometry"]["unknown_errors"] == 0

@@ -1,4 +1,4 @@
-"""Memory that a process keeps and hands back, programs that it keeps on disk, and its cores."""
+"""Memory that a process keeps or returns, compiled programs on disk, and its number of cores."""
 
 import os
 import subprocess
@@ -41,18 +41,18 @@ def test_freed_memory_is_kept_until_it_is_handed_back():
     assert left < 40
 
 
-@pytest.mark.parametrize(("largest", "told"), [(2**30, True), (2**25, True), (0, False)])
-def test_a_library_that_refuses_one_setting_gets_the_others(monkeypatch, largest, told):
-    """Older ones take no threshold above 32 MB."""
-    asked = []
+@pytest.mark.parametrize(("largest", "succeeds"), [(2**30, True), (2**25, True), (0, False)])
+def test_a_library_that_refuses_one_setting_gets_the_others(monkeypatch, largest, succeeds):
+    """Older versions of glibc refuse thresholds above 32 MB."""
+    settings = []
 
     def mallopt(what, value):
-        asked.append(what)
+        settings.append(what)
         return int(what != -3 or value <= largest)
 
     monkeypatch.setattr(runtime, "_of_glibc", lambda name: mallopt)
-    assert runtime.keep_freed_memory() == told
-    assert set(asked) == {-1, -2, -3}
+    assert runtime.keep_freed_memory() == succeeds
+    assert set(settings) == {-1, -2, -3}
 
 
 CHILD = """
@@ -87,7 +87,7 @@ def run(**variables) -> str:
     return folder
 
 
-def test_programs_are_kept_for_this_machine_where_they_can_be(tmp_path):
+def test_compiled_programs_are_cached_in_a_writable_folder(tmp_path):
     assert run(XDG_CACHE_HOME=str(tmp_path)).startswith(str(tmp_path / "p2gs-jax"))
     assert list((tmp_path / "p2gs-jax").rglob("*-cache"))
     chosen = str(tmp_path / "chosen")
@@ -95,7 +95,7 @@ def test_programs_are_kept_for_this_machine_where_they_can_be(tmp_path):
     assert run(XDG_CACHE_HOME=str(tmp_path / "xdg"), **set_otherwise) == chosen
     assert not (tmp_path / "xdg").exists()
     (tmp_path / "file").write_text("in the way")
-    # What the environment says of cores stays as well.
+    # A number of cores in the environment stays as well.
     assert run(XDG_CACHE_HOME=str(tmp_path / "file"), JAX_NUM_CPU_DEVICES="1") == "None"
 
 

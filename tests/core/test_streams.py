@@ -1,4 +1,4 @@
-"""Nobody draws from another's stream, and seeds mean what they meant."""
+"""Every random stream has one user, and a seed draws the same numbers as in former versions."""
 
 import re
 from pathlib import Path
@@ -19,7 +19,7 @@ from p2gs_jax.core.streams import (
 )
 
 PACKAGE = Path(p2gs_jax.__file__).parent
-# Each draws everything from one stream of its own: toy data, an export's order.
+# Modules with one generator for everything: toy data, an export's order.
 ALONE = ("core/streams.py", "synth/drive", "gaussians/bake.py")
 
 
@@ -39,7 +39,7 @@ def test_every_stream_has_one_user():
     assert not {s: names for s, names in uses.items() if len(names) > 1}
 
 
-def test_seeds_mean_what_they_meant():
+def test_seeds_draw_the_numbers_of_former_versions():
     old = {Stream.PARTNER: 1, Stream.STEP_PAIRS: 2, Stream.START_EXPOSURES: 3, Stream.HELD_OUT: 7}
     old |= {Stream.COMPARED_POINTS: 5, Stream.COLOR_PAIRS: 11, Stream.SURFACE_COLORS: 17}
     old |= {Stream.SOLVED_POINTS: 19, SceneStream.ISO: 2, SceneStream.LIGHT: 5}
@@ -51,7 +51,7 @@ def test_seeds_mean_what_they_meant():
 
 
 @pytest.mark.parametrize("seed", [0, 7, 2**31, 2**32 - 1, 2**32 + 5])
-def test_a_seed_that_is_an_argument_draws_what_a_constant_draws(seed):
+def test_a_traced_seed_draws_the_numbers_of_a_constant_seed(seed):
     made = set()
     for key, constant in ((noise_key, seed), (densification_key, seed + 1)):
         for step in (4, 5):

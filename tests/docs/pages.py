@@ -1,10 +1,10 @@
-"""Reading the documentation: its code blocks, what is said about testing them, and its links.
+"""Reading the documentation: its code blocks, the directives for their tests, and its links.
 
-A block is tested by its language. What a reader need not see stands in comments right above it:
+The language of a block decides its test. Directives are comments right above the block:
 
     <!-- test: skip (why) -->               it cannot run here
     <!-- test: run -->                      run these commands (sh), not only parse them
-    <!-- test: write "300.0" as "2.0" -->   so that it ends soon; any number of these
+    <!-- test: write "300.0" as "2.0" -->   so that it ends soon; can be repeated
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 
 
 class Block(NamedTuple):
-    """A code block from a line of a page on, with replacements made; why it is skipped, or None."""
+    """A code block after replacements, its first line, and the reason to skip it."""
 
     page: Path
     line: int
@@ -41,29 +41,29 @@ class Block(NamedTuple):
 
 
 def blocks(page: Path) -> list[Block]:
-    """Return the code blocks of a page; a ValueError says what cannot be understood."""
-    found, said, inside = [], [], None
+    """Return the code blocks of a page; a wrong directive raises a ValueError."""
+    found, directives, inside = [], [], None
     for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), 1):
         if inside is not None:
             if line.strip() == "```":
-                found.append(_block(page, *inside, said))
-                inside, said = None, []
+                found.append(_block(page, *inside, directives))
+                inside, directives = None, []
             else:
                 inside[2].append(line)
         elif line.startswith("```"):
             inside = (number + 1, line[3:].strip(), [])
-        elif said_here := DIRECTIVE.findall(line):
-            said += said_here
-        elif line.strip() and said:
+        elif here := DIRECTIVE.findall(line):
+            directives += here
+        elif line.strip() and directives:
             raise ValueError(f"{page}:{number}: a test directive must stand above a code block")
     if inside is not None:
         raise ValueError(f"{page}: the code block of line {inside[0]} stays open")
     return found
 
 
-def _block(page: Path, line: int, language: str, lines: list[str], said: list[str]) -> Block:
+def _block(page: Path, line: int, language: str, lines: list[str], directives: list[str]) -> Block:
     code, skip = "\n".join(lines) + "\n", None
-    for text in said:
+    for text in directives:
         if match := SKIP.fullmatch(text):
             skip = match[1]
         elif (match := WRITE.fullmatch(text)) and match[1] in code:
@@ -72,11 +72,11 @@ def _block(page: Path, line: int, language: str, lines: list[str], said: list[st
             raise ValueError(
                 f"{page}:{line}: {text!r} cannot be understood, or is not in the block"
             )
-    return Block(page, line, language, code, skip, "run" in said)
+    return Block(page, line, language, code, skip, "run" in directives)
 
 
 def commands(code: str) -> list[list[str]]:
-    """Return the commands of a shell block, as words; comments and redirections go."""
+    """Return the commands of a shell block, as words, without comments and redirections."""
     found = []
     for line in code.replace("\\\n", " ").splitlines():
         lexer = shlex.shlex(line, posix=True, punctuation_chars="&|;<>")
@@ -97,11 +97,11 @@ def prose(page: Path) -> str:
 
 
 def links(page: Path) -> list[str]:
-    """Return what the page links to or shows, but for addresses on the web."""
+    """Return the targets of links and images, except addresses on the web."""
     return [t for t in LINK.findall(prose(page)) if not re.match(r"(https?|mailto):", t)]
 
 
 def anchors(page: Path) -> set[str]:
-    """Return the anchors of a page's headings, as web sites for Markdown make them."""
+    """Return the anchors of a page's headings, made like GitHub's."""
     headings = re.findall(r"^#+ (.*)$", prose(page), flags=re.M)
     return {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings}

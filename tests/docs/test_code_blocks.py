@@ -1,8 +1,8 @@
-"""What the documentation shows works: Python runs, commands are parsed, files are read.
+"""Examples of the documentation work: Python runs, commands are parsed, files are read.
 
-`pages.py` says what a page can say about the test of a block. While pages are tested, the preset
-`robust` is quick (`quick_presets`), so that Python runs as it stands; in the folder where it runs
-lie `scene` and `street`, a tiny scene, and `RUN` and `runs/street`, a finished run of it.
+`pages.py` describes the directives of blocks. Tests make the preset `robust` quick
+(`quick_presets`), so that Python runs unchanged. The working folder has a tiny scene, `scene` and
+`street`, and a finished run of it, `RUN` and `runs/street`.
 """
 
 import base64
@@ -30,19 +30,19 @@ from p2gs_jax.jobs.configs import read_sweep
 BLOCKS = [block for page in PAGES for block in blocks(page)]
 
 
-def of(*languages):
+def testable(*languages):
     """Return blocks of some languages that can be tested."""
     return [b for b in BLOCKS if b.language in languages and b.skip is None]
 
 
-def named(found):
+def each(found):
     return pytest.mark.parametrize("block", found, ids=[b.name for b in found])
 
 
 @pytest.fixture
 def quick_presets(monkeypatch):
     """Let `robust` take a few steps at one resolution, with few Gaussians."""
-    slow, made = config.FitConfig(), config.FitConfig.__init__
+    slow, init = config.FitConfig(), config.FitConfig.__init__
     quick = {
         "data": dataclasses.replace(slow.data, test_every=3),
         "render": dataclasses.replace(slow.render, sh_degree=1),
@@ -51,12 +51,12 @@ def quick_presets(monkeypatch):
         "train": dataclasses.replace(slow.train, steps=10, coarse_to_fine=()),
     }
     monkeypatch.setattr(
-        config.FitConfig, "__init__", lambda self, **given: made(self, **(quick | given))
+        config.FitConfig, "__init__", lambda self, **fields: init(self, **(quick | fields))
     )
 
 
 @pytest.fixture
-def place(tmp_path, monkeypatch, finished_run):
+def folder(tmp_path, monkeypatch, finished_run):
     make_scene(tmp_path / "scene")
     make_scene(tmp_path / "street")
     for name in ("RUN", "runs/street"):
@@ -69,8 +69,8 @@ def test_every_block_has_a_language_that_is_tested():
     assert {block.language for block in BLOCKS} <= set(LANGUAGES)
 
 
-PYTHON_PAGES = sorted({b.page for b in of("python")})
-# Whole fits, one after the other.
+PYTHON_PAGES = sorted({b.page for b in testable("python")})
+# Pages with several whole fits.
 LONG_PAGES = ("api.md",)
 
 
@@ -81,10 +81,10 @@ LONG_PAGES = ("api.md",)
         for p in PYTHON_PAGES
     ],
 )
-def test_python_runs(page, place, quick_presets):
+def test_python_runs(page, folder, quick_presets):
     """Blocks of a page follow each other in one namespace."""
     namespace = {"__name__": "__main__"}
-    for block in of("python"):
+    for block in testable("python"):
         if block.page == page:
             padded = "\n" * (block.line - 1) + block.code  # so that tracebacks name the page's line
             exec(compile(padded, block.page, "exec"), namespace)
@@ -92,7 +92,7 @@ def test_python_runs(page, place, quick_presets):
 
 @pytest.mark.slow  # a whole fit, and the programs of its export
 @pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.ipynb")), ids=lambda p: p.name)
-def test_notebooks_run_and_are_stored_without_outputs(path, place, quick_presets):
+def test_notebooks_run_and_are_stored_without_outputs(path, folder, quick_presets):
     """Code cells follow each other in one namespace; lines after `!` are commands."""
     matplotlib.use("Agg")
     cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
@@ -103,7 +103,7 @@ def test_notebooks_run_and_are_stored_without_outputs(path, place, quick_presets
         code = "".join(cell["source"]).replace('"train.budget_s": 120.0', '"train.steps": 10')
         code = re.sub(r"^!p2gs-jax (.*)$", r'command("\1")', code, flags=re.M)
         exec(compile(code, f"{path.name}, code cell {number}", "exec"), namespace)
-    assert (place / "runs/scene/exports").is_dir()
+    assert (folder / "runs/scene/exports").is_dir()
     solved, run = namespace["solved"], namespace["run"]
     psnr = namespace["result"].metrics["test"]["exposure_fitted"]["psnr"]
     for shown, number in ((solved, f"{solved.observations:,}"), (run, f"{psnr:.2f} dB")):
@@ -119,9 +119,9 @@ def run_of_notebook(words):
     assert stop.value.code == 0, words
 
 
-@named(of("sh"))
-def test_commands_are_right(block, tmp_path, monkeypatch):
-    """Every word is understood; nothing is run."""
+@each(testable("sh"))
+def test_commands_can_be_parsed(block, tmp_path, monkeypatch):
+    """Every argument can be parsed; nothing is run."""
     monkeypatch.chdir(tmp_path)
     for words in commands(block.code):
         check_command(words, block.name)
@@ -144,13 +144,13 @@ def check_command(words, where):
 
 
 def check_ours(argv, where):
-    if len(argv) == 1 and argv[0] in (*COMMANDS, *RENAMED):  # the command as such is spoken of
+    if len(argv) == 1 and argv[0] in (*COMMANDS, *RENAMED):  # the text names a command alone
         return
     try:
         name, options = parse(argv)
     except SystemExit as stop:
         if stop.code:
-            pytest.fail(f"{where}: this is not understood")
+            pytest.fail(f"{where}: this cannot be parsed")
         return
     assert name in COMMANDS
     if isinstance(options, Fit):
@@ -159,23 +159,23 @@ def check_ours(argv, where):
         options.checked()
 
 
-@named([b for b in of("sh") if b.run])
-def test_cheap_commands_run(block, place, quick_presets):
+@each([b for b in testable("sh") if b.run])
+def test_cheap_commands_run(block, folder, quick_presets):
     for words in commands(block.code):
         with pytest.raises(SystemExit) as stop:
             main(words[1:])
         assert stop.value.code == 0, words
 
 
-@named(of("toml"))
+@each(testable("toml"))
 def test_sweep_files_are_read(block, tmp_path):
     path = tmp_path / "sweep.toml"
     path.write_text(block.code)
     assert read_sweep(path).configs
 
 
-@named(of("json"))
-def test_json_is_json(block):
+@each(testable("json"))
+def test_json_can_be_parsed(block):
     json.loads(block.code)
 
 
@@ -198,7 +198,7 @@ OTHERS |= {"--no-normalize-world-space", "--post_processing", "--train_test_exp"
 OTHERS |= {"--ppisp", "--ppisp-freeze", "--ppisp-sidecar"}
 
 
-# The history names options that are gone.
+# The history names removed options.
 TODAY = [page for page in PAGES if page.name != "CHANGELOG.md"]
 
 

@@ -1,4 +1,4 @@
-"""Pages that list things list all of them, links lead somewhere, licences are those installed."""
+"""Lists in pages are complete, links resolve, and licences are the installed packages' ones."""
 
 import importlib
 import json
@@ -12,7 +12,7 @@ from p2gs_jax.evaluation.scores import PROTOCOLS
 DOCS = ROOT / "docs"
 
 
-def test_files_page_knows_what_a_run_folder_holds(finished_run):
+def test_the_files_page_names_every_file_and_key_of_a_run(finished_run):
     page = (DOCS / "files.md").read_text(encoding="utf-8")
     metrics = json.loads((finished_run / "metrics.json").read_text())
     photometry = json.loads((finished_run / "photometry.json").read_text())
@@ -21,19 +21,19 @@ def test_files_page_knows_what_a_run_folder_holds(finished_run):
     keys |= set(metrics["consistency"]) | set(metrics["consistency"]["averaged"])
     missing = keys - set(re.findall(r"\w+", page))
     missing |= {path.name for path in finished_run.iterdir() if f"`{path.name}" not in page}
-    assert not missing, "docs/files.md does not speak of them"
+    assert not missing, "docs/files.md does not name them"
 
 
 NAMING = [ROOT / "CONTRIBUTING.md", ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
 
 
 @pytest.mark.parametrize("page", NAMING, ids=lambda page: str(page.relative_to(ROOT)))
-def test_pages_name_modules_and_what_they_hold(page):
-    """`folder/file.py:name`, relative to the package but for tests and experiments."""
+def test_modules_and_names_in_pages_exist(page):
+    """`folder/file.py:name`, relative to the package except in tests/ and experiments/."""
     found = re.findall(r"`((?:\w+/)*\w+\.py)(?::([\w.]+))?`", page.read_text(encoding="utf-8"))
     for path, name in found:
         if ("/" not in path and not name) or "NAME" in path:
-            continue  # beside the page, or a file that a user makes
+            continue  # a file beside the page, or the user's
         outside = path.startswith(("tests/", "experiments/", "p2gs_jax/", "docs/"))
         file = ROOT / ("" if outside else "p2gs_jax/") / path
         assert file.is_file(), f"there is no {path}"
@@ -76,7 +76,7 @@ def test_the_paper_map_has_every_equation_and_names_fields_that_exist():
             value = getattr(value, part)
 
 
-def test_drawings_are_what_their_script_draws(tmp_path, monkeypatch):
+def test_drawings_are_those_of_their_script(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(DOCS / "images"))
     draw = importlib.import_module("draw")
     for name, drawing in draw.DRAWINGS.items():
@@ -112,22 +112,22 @@ def licences(monkeypatch):
     return importlib.import_module("licences")
 
 
-def test_the_page_is_what_its_script_writes(licences):
+def test_the_licence_page_is_that_of_its_script(licences):
     text = licences.PAGE.read_text(encoding="utf-8")
     assert text == licences.page(), "run python docs/licences.py"
     assert all(f"| {name} |" in text for name in licences.declared())
 
 
-def test_nothing_that_users_install_is_under_the_gpl_and_what_carries_it_is_named(licences):
+def test_no_dependency_is_under_the_gpl_and_packages_that_carry_it_are_named(licences):
     rows = licences.rows()
-    assert [name for name, (_, said, _) in rows.items() if licences.is_gpl(said)] == []
+    assert [name for name, (_, licence, _) in rows.items() if licences.is_gpl(licence)] == []
     marked = {name for name, (_, _, carried) in rows.items() if licences.is_gpl(carried)}
     assert marked == set(licences.WHY)
     assert licences.is_gpl("GNU General Public License v3 (GPLv3+)")
     assert not licences.is_gpl("GNU Lesser General Public License")
 
 
-def test_the_program_imports_nothing_of_the_tests():
+def test_the_package_does_not_import_plyfile():
     imported = re.compile(r"^\s*(?:from|import) plyfile\b", re.MULTILINE)
     for path in (ROOT / "p2gs_jax").rglob("*.py"):
         assert not imported.search(path.read_text(encoding="utf-8")), path
