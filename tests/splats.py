@@ -1,4 +1,4 @@
-"""Small sets of Gaussians for the tests of exports."""
+"""Small sets of Gaussians and a camera for tests."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +11,7 @@ SRGB = DisplayTransform(1.0, 2.2, PhotometryConfig())
 
 
 def gaussians_of(means, quats, log_scales, opacity_logits, sh):
-    """Return Gaussians of arrays of the host; one row may stand for all."""
+    """Return Gaussians of these arrays; a single row is repeated for all."""
     n, values = len(means), (means, quats, log_scales, opacity_logits, sh)
     shapes = (n, 3), (n, 4), (n, 3), (n,), (n, *np.shape(sh)[-2:])
     pairs = zip(values, shapes, strict=True)

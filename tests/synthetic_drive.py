@@ -20,17 +20,17 @@ from p2gs_jax.synth.settings import Curve
 
 Curves = Curve | np.ndarray
 Exposures = Literal["constant", "iso2", "iso4", "cameras"]
-YAWS = (0.0, -44.2, 44.8)
+YAWS = (0.0, -44.2, 44.8)  # degrees to the left
 CAMERA_NAMES = ("front", "right", "left")
-HALF_WIDTH, HALF_HEIGHT = 30.0, 21.0
-NEAREST, FARTHEST = 3.0, 45.0
-LONGEST_TRACK, SHORTEST_TRACK = 30, 3
-# Extent of errors that neighbouring points share, in units of half the image's diagonal.
+HALF_WIDTH, HALF_HEIGHT = 30.0, 21.0  # degrees of the field of view
+NEAREST, FARTHEST = 3.0, 45.0  # distances of visible points
+LONGEST_TRACK, SHORTEST_TRACK = 30, 3  # observations
+# Extent, in half diagonals, of errors that neighbouring points share; waves that form them.
 NEIGHBOURHOOD, WAVES = 0.2, 16
 
 
 class Drive(NamedTuple):
-    """Who sees what; a view is camera * frames + frame."""
+    """Observations of points by views; a view is camera * frames + frame."""
 
     views: Int[np.ndarray, " o"]
     points: Int[np.ndarray, " o"]
@@ -46,7 +46,7 @@ def _on_image(
     """Return where a pinhole sees directions, degrees to the left and up, inside its image."""
     a, h = np.radians(azimuth), np.radians(height)
     half_width = np.tan(np.radians(HALF_WIDTH))
-    # What is HALF_HEIGHT up at the edge of the image is still inside.
+    # Directions HALF_HEIGHT up are inside even at the left and right edges.
     half_height = np.tan(np.radians(HALF_HEIGHT)) / np.cos(np.radians(HALF_WIDTH))
     places = np.stack([-np.tan(a), -np.tan(h) / np.cos(a)], axis=1)
     return places / np.hypot(half_width, half_height)
@@ -99,7 +99,7 @@ def make_drive(frames: int = 20, points: int = 1200, seed: int = 0, seen: float 
 def make_exposures(drive: Drive, kind: Exposures, seed: int = 2) -> Float[np.ndarray, " v"]:
     """Return exposures > 0 of every view.
 
-    `iso2` and `iso4` draw ISO ~ N(8, std), rounded, at least 1, over 8; `cameras` is a gain each.
+    `iso2` and `iso4` draw ISO ~ N(8, std), rounded, at least 1, over 8; `cameras` have one each.
     """
     if kind == "constant":
         return np.ones(len(drive.cameras))
@@ -124,13 +124,13 @@ def observe(
     shared_texture: float = 0.0,
     seed: int = 3,
 ) -> Observations:
-    """Photograph the points under exposures of every view, or of every channel of it.
+    """Photograph the points under exposures of every view, or of every view and channel.
 
     `curve` is the response, or an array of names that fits cameras x channels; `gammas` of every
     view replace it by x^(1 / gamma) about the pivot, the linear value that they leave alone.
     `outliers` is the share of observations that show another point, `texture` the standard
     deviation of log radiance between views, `shared_texture` that of errors that neighbours in an
-    image share, `noise` a factor of photon noise and texture; `bits` of None do not round;
+    image share, `noise` a factor of photon noise and texture; `bits=None` does not round;
     `corner_loss` is the share of the light that each camera loses in its corners.
     """
     rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""What the cameras add to the light is what was asked for, and nothing by default."""
+"""Cameras change the light as their options state; by default only the ISO value varies."""
 
 import dataclasses
 
@@ -26,7 +26,7 @@ def test_iso_is_rounded_normal_with_a_floor_and_by_default_the_only_difference(s
     np.testing.assert_array_equal(draw_shots(Sensor(iso_std=0.0), 10, 3, seed=0).exposures, 1)
 
 
-def test_gain_drift_and_tint_are_each_cameras_own():
+def test_gain_drift_and_tint_differ_by_camera():
     still = draw_shots(Sensor(iso_std=0, camera_gain_ev=0.5, white_balance_ev=0.2), 20, 3, seed=1)
     gains = np.log2(still.exposures).reshape(3, 20)
     assert np.ptp(gains, axis=1).max() < 1e-12
@@ -55,15 +55,15 @@ def test_vignetting_spares_the_centre():
     np.testing.assert_allclose(srgb_decode(shot / 255.0)[..., 0], 0.2 * light, atol=0.003)
 
 
-def test_every_camera_can_have_a_lens_and_a_curve_of_its_own():
+def test_every_camera_can_have_another_lens_and_curve():
     sensor = Sensor(vignetting=0.3, vignetting_spread=0.1, curves=("srgb", "filmic", "power"))
     shots = draw_shots(sensor, 4, 3, seed=2)
     lost = shots.corner_loss.reshape(3, 4)
     assert np.ptp(lost, axis=1).max() == 0
     assert 0.01 < np.std(lost[:, 0]) < 0.3
     assert shots.curves == ("srgb",) * 4 + ("filmic",) * 4 + ("power",) * 4
-    mine = shots.sensor(sensor, 5)
-    assert (mine.curve, mine.vignetting) == ("filmic", lost[1, 0])
+    second = shots.sensor(sensor, 5)
+    assert (second.curve, second.vignetting) == ("filmic", lost[1, 0])
     strong = draw_shots(Sensor(vignetting_spread=9.0), 1, 40, seed=0).corner_loss
     assert (strong.min(), strong.max()) == (0, 0.8)
     with pytest.raises(UserError, match="3 cameras, but 1 curves"):
@@ -78,7 +78,7 @@ def test_white_balance_of_every_photograph_leaves_its_exposure():
     assert np.log2(shots.tints).std() == pytest.approx(0.1 * np.sqrt(2 / 3), rel=0.1)
 
 
-def test_what_is_off_changes_no_draw():
+def test_further_options_change_no_other_draw():
     sensor = Sensor(camera_gain_ev=0.3, drift_ev=0.4, white_balance_ev=0.1)
     shots = draw_shots(sensor, 5, 3, seed=7)
     drawn = [1.87855992736123, 1.15341964545267, 1.05287613137381]
@@ -98,7 +98,7 @@ def test_noise_has_the_stated_size_and_needs_a_generator():
         photograph(flat, 1.0, Sensor(noise=1.0))
 
 
-def test_towns_have_an_underpass_and_their_own_sun():
+def test_towns_have_an_underpass_and_different_suns():
     towns = [build_town(seed, "town") for seed in range(3)]
     assert len({t.light.sun_direction for t in towns}) == 3
     for town in towns:

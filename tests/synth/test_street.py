@@ -22,7 +22,7 @@ from p2gs_jax.synth.settings import Sensor, image_height
 from p2gs_jax.synth.town import Material
 from p2gs_jax.synth.write import write_street
 
-# Those of `noisy_street`, which several tests share.
+# The options of the fixture `noisy_street`.
 SIZE = {"frames": 5, "width": 192, "height": 128, "points": 6000}
 SIZE |= {"supersample": 1, "seed": 3}
 
@@ -35,7 +35,7 @@ NAMES = [f"{camera}/{f:06d}.png" for camera in sorted(MOUNTS) for f in range(SIZ
 
 
 def truth(street, name):
-    """Return linear radiance, and camera z (m, inf: sky)."""
+    """Return linear radiance, and camera z in metres, which is infinite in the sky."""
     path = (street / "truth" / "linear" / name).with_suffix(".exr")
     with OpenEXR.File(str(path), separate_channels=True) as file:
         pixels = {k: np.array(c.pixels, np.float32) for k, c in file.channels().items()}
@@ -52,8 +52,8 @@ def scene(street):
     return load_colmap(street, street / "sparse" / "0", DataConfig())
 
 
-def test_what_is_rendered_is_deterministic_in_the_seed(street, tmp_path):
-    # A shorter drive sees the same town; ISO, and with it photographs, are drawn for all at once.
+def test_renders_are_deterministic_in_the_seed(street, tmp_path):
+    # Photographs are not compared: their ISO values are drawn for the whole drive at once.
     again = write_street(tmp_path / "again", **SIZE | {"frames": 1})
     folders = ("reference", "truth/linear", "truth/sky_masks")
     files = [p for folder in folders for p in (again / folder).rglob("*.*")]
@@ -83,7 +83,7 @@ def test_rig_follows_the_papers_mounts():
     assert [image_height(w, multiple=4) for w in (320, 160)] == [216, 108]
 
 
-def test_photographs_are_the_exposed_truth_of_three_orders_and_masks_agree_with_depth(street):
+def test_photographs_are_the_exposed_radiance_and_masks_agree_with_depth(street):
     lines = (street / "truth" / "exposures.csv").read_text().splitlines()
     rows = {row["image"]: row for row in csv.DictReader(lines)}
     assert list(rows) == NAMES
@@ -116,7 +116,7 @@ def test_photographs_are_the_exposed_truth_of_three_orders_and_masks_agree_with_
     assert ((linear > 0.02) & (linear < 1.0)).mean() > 0.6
 
 
-def test_colmap_model_is_what_pycolmap_reads(street, scene):
+def test_pycolmap_reads_the_model_that_was_written(street, scene):
     card = json.loads((street / "dataset.json").read_text())
     model = pycolmap.Reconstruction(str(street / "sparse" / "0"))
     assert model.is_valid()
@@ -133,7 +133,7 @@ def test_colmap_model_is_what_pycolmap_reads(street, scene):
         np.testing.assert_allclose(view.K, K, rtol=1e-6)
 
 
-def test_tracks_land_on_their_points_and_see_one_radiance(street, scene):
+def test_tracks_are_projections_of_their_points_and_see_one_radiance(street, scene):
     tracks = scene.tracks
     local_log = np.full(len(tracks.xy), np.nan)
     for i, view in enumerate(scene.views):
@@ -153,7 +153,7 @@ def test_tracks_land_on_their_points_and_see_one_radiance(street, scene):
     assert len(tracks.xy) / len(scene.points) > 3
 
 
-def test_seed_colours_are_from_photographs_of_views_that_are_not_held_out(street, scene):
+def test_seed_colours_come_from_training_views(street, scene):
     found = np.zeros(len(scene.points), bool)
     for i, view in enumerate(scene.views):
         if view.name.endswith("000000.png"):
@@ -167,39 +167,39 @@ def test_seed_colours_are_from_photographs_of_views_that_are_not_held_out(street
     assert found.all()
 
 
-@pytest.mark.parametrize("way", [90.0, 120.0, 226.0, 300.0])
-def test_a_long_town_goes_on_as_far_as_the_drive_and_ends_behind_it(way):
-    town = build_town(3, "long", way)
+@pytest.mark.parametrize("length_m", [90.0, 120.0, 226.0, 300.0])
+def test_a_long_town_goes_on_as_far_as_the_drive_and_ends_behind_it(length_m):
+    town = build_town(3, "long", length_m)
     houses = np.asarray(town.material) == Material.FACADE
     reached = np.sort(town.lo[houses, 0])
-    assert reached[-1] > way
-    assert np.diff(reached).max() < 25, "no hole but the side streets"
-    x = np.linspace(0, way + 3, 200)
+    assert reached[-1] > length_m
+    assert np.diff(reached).max() < 25, "only side streets part the houses"
+    x = np.linspace(0, length_m + 3, 200)
     eyes = np.stack([x, np.full_like(x, -1.75), np.full_like(x, 3.845)], 1)[:, None]
     assert not ((eyes > town.lo[houses]) & (eyes < town.hi[houses])).all(-1).any()
-    if way > 2 * STREET_M:
+    if length_m > 2 * STREET_M:
         # No two streets are alike.
         first = town.color[houses & (town.lo[:, 0] < STREET_M - 22)]
         assert not np.array_equal(first, town.color[houses][len(first) : 2 * len(first)])
 
 
 @pytest.mark.parametrize(
-    ("asked", "words"),
+    ("options", "words"),
     [
         ({"frames": 0}, "cannot be rendered"),
         ({"frames": 101, "step": 1.2}, r"101 frames with a step of 1\.2 m need 120 m"),
         ({"frames": 101, "step": 1.2, "layout": "town"}, "--layout long"),
     ],
 )
-def test_what_cannot_be_made_is_refused(street, tmp_path, asked, words):
+def test_impossible_drives_are_refused(street, tmp_path, options, words):
     with pytest.raises(UserError, match=words):
-        write_street(tmp_path / "x", **asked)
+        write_street(tmp_path / "x", **options)
     assert not (tmp_path / "x").exists()
     with pytest.raises(UserError, match="not an empty folder"):
         write_street(street)
 
 
-def test_the_card_and_the_table_say_what_was_done(street, tmp_path):
+def test_the_card_and_the_table_hold_seed_and_sensor(street, tmp_path):
     card = json.loads((street / "dataset.json").read_text())
     assert (card["seed"], card["sensor"]["iso_std"]) == (SIZE["seed"], 4.0)
     sensor = Sensor(iso_std=2.0, camera_gain_ev=0.3, white_balance_ev=0.1, vignetting=0.2)

@@ -17,7 +17,7 @@ import pytest
 from p2gs_jax.run.read import load_run
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
-# Browsers wait more than they compute: a minute and a half.
+# These tests take 90 s, in which they mostly wait for the browser.
 pytestmark = pytest.mark.slow
 
 SIZE = {"width": 900, "height": 640}
@@ -34,7 +34,7 @@ def address(finished_run):
 
 @pytest.fixture
 def page(browser, address):
-    """Return the viewer's page with its first picture at rest; nothing may go wrong in it."""
+    """Return the viewer's page with its first picture at rest; the page may log no error."""
     page = browser.new_page(viewport=SIZE, accept_downloads=True)
     page.set_default_timeout(1e3 * PATIENCE_S)
     wrong = []
@@ -48,7 +48,7 @@ def page(browser, address):
 
 
 def at_rest(page):
-    """Wait until the canvas was rendered at full size, nothing compiles and nothing changes."""
+    """Return the picture once it is at full size, nothing compiles and nothing changes."""
     page.wait_for_function(
         "/640 x \\d+/.test(document.body.innerText) && !/compiling/.test(document.body.innerText)"
     )
@@ -67,18 +67,14 @@ def steady(page):
         before = now
 
 
-def control(page, label):
-    """Return what stands beside a label."""
-    return page.locator(f"xpath=//label[text()='{label}']/ancestor::div[1]/following-sibling::div")
-
-
 def choose(page, label, option):
     page.get_by_label(label, exact=True).click()
     page.get_by_role("option", name=option, exact=True).click()
 
 
 def enter(page, label, number):
-    field = control(page, label).locator("input[inputmode=decimal]")
+    beside = f"xpath=//label[text()='{label}']/ancestor::div[1]/following-sibling::div"
+    field = page.locator(beside).locator("input[inputmode=decimal]")
     field.fill(str(number))
     field.press("Enter")
 
@@ -120,7 +116,7 @@ def test_one_stop_on_the_slider_doubles_the_brightness(page):
     assert after.mean() > before.mean()
 
 
-def test_every_mode_shows_something_else_and_saved_files_arrive(page):
+def test_every_mode_shows_another_picture_and_files_can_be_saved(page):
     shown = [picture(page)]
     for mode in ("stops (false colour)", "depth", "split: photo | render"):
         choose(page, "Show", mode)
@@ -140,7 +136,7 @@ def test_every_mode_shows_something_else_and_saved_files_arrive(page):
             assert shown.shape[1] == 333
 
 
-def test_going_to_a_photograph_takes_its_look_and_place_and_cameras_appear(page):
+def test_going_to_a_photograph_sets_camera_and_look_and_cameras_are_drawn(page):
     before = picture(page)
     choose(page, "Go to", "5.png")
     until(page, lambda now: np.abs(now - before).mean() > 0.01)
@@ -153,9 +149,7 @@ def test_going_to_a_photograph_takes_its_look_and_place_and_cameras_appear(page)
     until(page, lambda now: np.abs(now - before).mean() > 0.01)
 
 
-def test_a_fit_is_seen_while_it_goes_on_and_its_viewer_ends_with_it(
-    browser, finished_run, tmp_path
-):
+def test_the_viewer_shows_a_running_fit_and_ends_with_it(browser, finished_run, tmp_path):
     options = "--steps 100000 --gaussians 400 --test-every 3 --init.shell off --view --port 0"
     words = ["fit", finished_run.parent / "scene", "--out", tmp_path / "run", *options.split()]
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2]), "COLUMNS": "200"}
@@ -172,8 +166,8 @@ def test_a_fit_is_seen_while_it_goes_on_and_its_viewer_ends_with_it(
         page.close()
     finally:
         fit.send_signal(signal.SIGINT)
-        said = fit.communicate(timeout=PATIENCE_S)[1]
-    assert fit.returncode == 130, said
+        text = fit.communicate(timeout=PATIENCE_S)[1]
+    assert fit.returncode == 130, text
     end = time.monotonic() + PATIENCE_S
     with contextlib.suppress(ConnectionRefusedError):
         while time.monotonic() < end:  # it may still compile

@@ -41,7 +41,7 @@ def test_a_point_is_where_the_browser_draws_it_at_any_size(size):
 
 
 @pytest.mark.parametrize("aspect", [0.5, 1.0, 1.3, 3.0])
-def test_a_whole_photograph_is_seen(aspect):
+def test_the_field_of_view_holds_a_whole_photograph(aspect):
     K = np.array([[90.0, 0, 70], [0, 110, 30], [0, 0, 1]])
     view = View("a", None, "0", np.eye(4), K, 120, 80)
     pose = cameras.Pose((1, 0, 0, 0), (0, 0, 0), (0, 0, 1), cameras.fov_that_holds(view, aspect))
@@ -51,11 +51,11 @@ def test_a_whole_photograph_is_seen(aspect):
     at = np.array([pixel(camera, corner) for corner in corners])
     assert at.min() > -1
     assert np.all(at.max(0) < np.array(size) + 1)
-    # ... and as large as that allows: it touches an edge.
+    # It is as large as possible: it touches an edge.
     assert np.abs(np.concatenate([at, at - size])).min() < 1.5
 
 
-def test_up_is_what_cameras_hold_up_and_distances_are_typical():
+def test_up_is_the_mean_up_of_cameras_and_the_unit_follows_from_distances():
     rolls = [viewmat([0, 0, roll], [0, 0, 0]) for roll in (-0.3, 0.1, 0.2)]
     points = np.random.default_rng(0).uniform([-0.1, -0.1, 4.9], [0.1, 0.1, 5.1], (50, 3))
     views = tuple(View("a", None, "0", pose, np.eye(3), 120, 80) for pose in rolls)
@@ -63,6 +63,6 @@ def test_up_is_what_cameras_hold_up_and_distances_are_typical():
     space = cameras.make_viewer_space(scene, points)
     np.testing.assert_allclose(space.up, [0, -1, 0], atol=0.02)
     np.testing.assert_allclose(space.unit, cameras.TYPICAL_DISTANCE / 5, rtol=0.03)
-    # What is behind or beside has no distance.
+    # Points behind or beside the camera do not count.
     seen = np.array([[0, 0, -3.0], [5, 0, 1.0], [0, 0, 7.0]])
     assert cameras.distance_seen(np.eye(4), seen) == 7.0

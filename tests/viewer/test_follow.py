@@ -1,4 +1,4 @@
-"""A fit that goes on, as the viewer sees it: its snapshots, its log, its end, in every browser."""
+"""Snapshots, log and end of a running fit reach the viewer and every browser."""
 
 import shutil
 import threading
@@ -25,13 +25,13 @@ def run(finished_run, tmp_path):
 
 
 def copy(finished, out, names):
-    """Copy files of a run, the last one last."""
+    """Copy files of a run in the order of their names."""
     out.mkdir(exist_ok=True)
     for name in names:
         shutil.copy(finished / name, out / name)
 
 
-def test_it_asks_only_when_somebody_looks_and_reads_every_snapshot_once(run, finished_run):
+def test_snapshots_are_requested_only_if_wanted_and_each_is_read_once(run, finished_run):
     follower = Follower(run.root)
     with locked(run.root):
         assert follower.poll(wanted=False) is None
@@ -54,7 +54,7 @@ def test_it_asks_only_when_somebody_looks_and_reads_every_snapshot_once(run, fin
     assert not run.wanted.exists()
 
 
-def test_every_browser_gets_what_the_fit_has_reached(run, finished_run, monkeypatch):
+def test_every_browser_gets_the_log_of_a_new_snapshot(run, finished_run, monkeypatch):
     monkeypatch.setattr(server, "POLL_S", 0.01)
     copy(finished_run, run.snapshot, FILES)
     ended, viewed, browser = threading.Event(), MagicMock(), MagicMock()

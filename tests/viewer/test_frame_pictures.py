@@ -27,7 +27,7 @@ def camera(width=40, height=24, focal=50.0, rotation=(0, 0, 0), K=None):
     return Camera(jnp.asarray(viewmat), jnp.asarray(K), width, height)
 
 
-def test_every_mode_shows_what_it_says():
+def test_every_mode_shows_its_picture():
     rng = np.random.default_rng(0)
     linear = np.exp2(rng.uniform(-8, 3, (*SIZE, 3))).astype(np.float32)
     alpha = rng.uniform(0, 1, SIZE).astype(np.float32)
@@ -52,8 +52,8 @@ def test_every_mode_shows_what_it_says():
 
 @pytest.mark.parametrize("size", [(120, 90), (33, 21)])
 def test_a_photograph_lines_up_with_a_turned_camera(size):
-    # The photograph shows where each of its pixels looks; so must every pixel of the frame.
-    taken = camera(400, 300, K=np.array([[300.0, 0, 190], [0, 320, 160], [0, 0, 1]]))
+    # The colours of the photograph are ray directions, and so must those of the frame be.
+    photo = camera(400, 300, K=np.array([[300.0, 0, 190], [0, 320, 160], [0, 0, 1]]))
     other = camera(*size, focal=1.2 * size[0], rotation=(0.1, -0.15, 0.05))
 
     def directions(c):
@@ -62,12 +62,12 @@ def test_a_photograph_lines_up_with_a_turned_camera(size):
         rays = rays @ np.asarray(c.viewmat, float)[:3, :3]
         return rays / rays[..., 2:]
 
-    ldr = (0.5 + 0.4 * directions(taken)).astype(np.float32)
-    seen = pictures.warp_photograph(ldr, np.ones((300, 400), np.float32), taken, other)
+    ldr = (0.5 + 0.4 * directions(photo)).astype(np.float32)
+    seen = pictures.warp_photograph(ldr, np.ones((300, 400), np.float32), photo, other)
     expected = 0.5 + 0.4 * directions(other)
     np.testing.assert_allclose(seen.ldr[seen.inside], expected[seen.inside], atol=2e-3)
-    local = directions(other) @ np.asarray(taken.viewmat, float)[:3, :3].T
-    at = local @ np.asarray(taken.K, float).T
+    local = directions(other) @ np.asarray(photo.viewmat, float)[:3, :3].T
+    at = local @ np.asarray(photo.K, float).T
     at = at[..., :2] / at[..., 2:]
     within = np.all((at > 4) & (at < np.array([396, 296])), axis=-1)
     outside = np.any((at < -4) | (at > np.array([404, 304])), axis=-1)
@@ -76,23 +76,24 @@ def test_a_photograph_lines_up_with_a_turned_camera(size):
     assert within.any()
 
 
-def test_vignetting_is_where_the_photograph_has_it():
-    """The window's shape is not the photograph's; beyond its corners nothing darkens further."""
+def test_vignetting_in_a_window_follows_the_photograph():
+    """In a wider window nothing darkens further beyond the photograph's corners."""
     K = np.array([[50.0, 0, 40], [0, 50.0, 30], [0, 0, 1]], np.float32)
-    own = Camera(np.eye(4, dtype=np.float32), K, 80, 60)
-    radii = (pictures.places_in(own, own) ** 2).sum(-1)
+    photo = Camera(np.eye(4, dtype=np.float32), K, 80, 60)
+    radii = (pictures.places_in(photo, photo) ** 2).sum(-1)
     np.testing.assert_allclose(radii, squared_radii(60, 80), atol=1e-6)
-    wide = Camera(own.viewmat, K + np.array([[0, 0, 40], [0, 0, 0], [0, 0, 0]]), 160, 60)
-    seen = pictures.places_in(own, wide)
-    np.testing.assert_allclose(seen[:, 40:120], pictures.places_in(own, own), atol=1e-6)
+    wide = Camera(photo.viewmat, K + np.array([[0, 0, 40], [0, 0, 0], [0, 0, 0]]), 160, 60)
+    seen = pictures.places_in(photo, wide)
+    np.testing.assert_allclose(seen[:, 40:120], pictures.places_in(photo, photo), atol=1e-6)
     assert np.linalg.norm(seen, axis=-1).max() <= 1 + 1e-6
     shaded = PhotometryConfig(cameras=(CameraFormation("a", ((-0.5, 0.0, 0.0),)),))
     transform = DisplayTransform(1.0, 2.2, shaded, camera=0)
+    plain = transform.without_place()
     grey = np.full((60, 160, 3), 0.2, np.float32)
     window = pictures.RenderedFrame(grey, np.ones((60, 160)), np.ones((60, 160)), wide)
-    shown = pictures.picture_of(window, "display", transform, vignetting_camera=own)
+    shown = pictures.picture_of(window, "display", transform, vignetting_camera=photo)
     np.testing.assert_allclose(shown[:, 40:120], develop(grey[:, :80], transform), atol=1e-5)
-    flat = pictures.picture_of(window, "display", transform.without_place(), vignetting_camera=own)
+    flat = pictures.picture_of(window, "display", plain, vignetting_camera=photo)
     assert np.ptp(flat) < 1e-6
     assert np.ptp(shown) > 0.1
 

@@ -1,4 +1,4 @@
-"""The thread behind one browser's picture and what its controls do, without a browser."""
+"""The thread that makes a browser's pictures, and the effects of controls, without a browser."""
 
 import time
 from dataclasses import replace
@@ -73,7 +73,7 @@ def setup(viewed, client):
 
 @pytest.fixture
 def seen(setup, client):
-    """Start the thread; return how many pictures there were up to the first one at rest."""
+    """Start the thread; return the number of pictures up to the first one at rest."""
     setup.live.start()
     return client.wait_sharp()
 
@@ -96,16 +96,16 @@ def shown_at(setup, viewed):
     return -float(setup.live._frame.camera.viewmat[0, 3]) * viewed.space.unit
 
 
-def test_it_sharpens_at_rest(setup, seen, viewed):
+def test_the_picture_sharpens_at_rest(setup, seen, viewed):
     assert [kind for kind, *_ in setup.pictures] == ["jpeg", "png"]
     assert shape(setup.pictures[-1]) == CANVAS
     assert set(setup.renderer.wanted[0]) == set(SIZES)
-    compiled(viewed)  # another size is ready, and none is better
+    compiled(viewed)  # no size is better than the one shown
     time.sleep(2 * REST_S)
     assert len(setup.pictures) == 2  # nothing changes, nothing is sent
 
 
-def test_a_new_look_renders_nothing(setup, client, seen):
+def test_a_new_look_needs_no_new_render(setup, client, seen):
     before = len(setup.renderer.rendered)
     for ev in (0.5, 1.0, 2.0):
         setup.panel.now = Settings(gamma=2.2, exposure_ev=ev)
@@ -134,7 +134,7 @@ def test_the_newest_camera_wins(setup, client, viewed, seen):
     assert len(setup.renderer.rendered) < 32
 
 
-def test_the_best_there_is_comes_until_more_is_compiled_or_has_room(setup, client, viewed):
+def test_the_largest_ready_size_that_has_room_is_shown(setup, client, viewed):
     setup.renderer.ready, setup.renderer.refused = frozenset(SIZES[:1]), {SIZES[-1]}
     setup.live.start()
     seen = client.wait_sharp()
@@ -173,7 +173,7 @@ def test_a_first_view_that_cannot_be_rendered_waits(setup, client, viewed, state
 
 @pytest.mark.parametrize("error", [UserError("no photo"), RuntimeError("no photo")])
 @pytest.mark.parametrize("part", ["render", "develop"])
-def test_what_fails_is_said_once_and_the_next_is_served(setup, client, monkeypatch, error, part):
+def test_a_failure_is_shown_once_and_pictures_go_on(setup, client, monkeypatch, error, part):
     with monkeypatch.context() as patch:
         if part == "render":
             patch.setattr(setup.renderer, "broken", error)
@@ -181,12 +181,12 @@ def test_what_fails_is_said_once_and_the_next_is_served(setup, client, monkeypat
             patch.setattr(setup.live.darkroom, "develop", MagicMock(side_effect=error))
         setup.live.start()
         time.sleep(4 * REST_S)
-        said = len(client.said)
-        assert 1 <= said <= 2  # for the request, and at rest
-        assert all("no photo" in text for text in client.said)
+        count = len(client.notices)
+        assert 1 <= count <= 2  # for the request, and at rest
+        assert all("no photo" in text for text in client.notices)
     setup.live.post("camera")
     client.wait_sharp()
-    assert len(client.said) == said
+    assert len(client.notices) == count
 
 
 @pytest.fixture
@@ -205,8 +205,8 @@ def test_exposures_count_from_the_mean_whatever_the_gauge(run):
     other = replace(run, params=replace(run.params, photometry=shifted))
     index = run.scene.train_indices[1]
     settings = settings_of_view(other, index, common_settings(other))
-    own = other.own_display(index).exposure
-    assert display_of(other, settings).exposure == pytest.approx(own, rel=1e-5)
+    expected = other.own_display(index).exposure
+    assert display_of(other, settings).exposure == pytest.approx(expected, rel=1e-5)
     assert settings.exposure_ev == pytest.approx(exposures_ev(run)[index], abs=1e-5)
 
 
@@ -216,14 +216,14 @@ def test_corrections_hold_under_the_curve_they_were_learned_with(run):
     photometry = replace(run.cfg.photometry, appearance="affine")
     params = replace(run.params, appearance=corrections)
     corrected = replace(run, params=params, cfg=replace(run.cfg, photometry=photometry))
-    own = settings_of_view(corrected, run.scene.train_indices[2], Settings(gamma=2.2))
-    np.testing.assert_array_equal(display_of(corrected, own).correction, corrections[2])
-    mean = display_of(corrected, replace(own, view=None))
+    settings = settings_of_view(corrected, run.scene.train_indices[2], Settings(gamma=2.2))
+    np.testing.assert_array_equal(display_of(corrected, settings).correction, corrections[2])
+    mean = display_of(corrected, replace(settings, view=None))
     np.testing.assert_allclose(mean.correction, corrections.mean(0), atol=1e-6)
-    assert display_of(corrected, replace(own, curve="linear")).correction is None
+    assert display_of(corrected, replace(settings, curve="linear")).correction is None
 
 
-def test_the_split_shows_the_photograph_in_its_place(viewed, frame, run):
+def test_the_split_shows_the_photograph_beside_the_render(viewed, frame, run):
     darkroom = Darkroom(viewed)
     settings = settings_of_view(run, 1, Settings(gamma=2.2, mode="split", split=0.5))
     shown, photo = darkroom.develop(frame, settings), viewed.store.get(1)[0]
@@ -232,11 +232,11 @@ def test_the_split_shows_the_photograph_in_its_place(viewed, frame, run):
     np.testing.assert_allclose(shown[left], photo[left], atol=2e-3)
     rendered = darkroom.develop(frame, replace(settings, mode="display"))
     np.testing.assert_array_equal(shown[right], rendered[right])
-    # ... and it is about the same thing, so the halves belong together.
+    # The render resembles the photograph, so the halves match.
     assert np.mean(np.abs(rendered[left] - photo[left])) < 0.15
 
 
-def test_without_a_photograph_the_split_is_the_picture(viewed, frame, run, monkeypatch):
+def test_without_a_photograph_the_split_is_the_render(viewed, frame, run, monkeypatch):
     darkroom = Darkroom(viewed)
     assert viewed.view_at(frame.camera) == 1
     split = replace(common_settings(run), mode="split")
@@ -256,7 +256,7 @@ def test_without_a_photograph_the_split_is_the_picture(viewed, frame, run, monke
 
 @pytest.fixture
 def session(viewed, client, monkeypatch):
-    """Return a session at the photograph in row 1, with +1 EV of the person's own."""
+    """Return a session at the photograph in row 1 whose user has set +1 EV."""
     panel = Panel(replace(common_settings(viewed.run), exposure_ev=1.0))
     monkeypatch.setattr(sessions, "Panel", lambda gui, viewed, actions: panel)
     out = BrowserSession(client, viewed)
@@ -270,10 +270,10 @@ def show(session, mode):
     session.mode_changed()
 
 
-def test_a_split_takes_the_look_of_the_photograph(session, run):
-    own = settings_of_view(run, 1, session._panel.now)
+def test_a_split_sets_the_exposure_of_the_photograph(session, run):
+    photo = settings_of_view(run, 1, session._panel.now)
     show(session, "split")
-    assert session._panel.now.exposure_ev == pytest.approx(own.exposure_ev)
+    assert session._panel.now.exposure_ev == pytest.approx(photo.exposure_ev)
     assert session._panel.now.exposure_ev != 1.0
 
 
@@ -294,7 +294,7 @@ def test_a_view_is_saved_also_after_a_failure(session, viewed, client):
     for error in (UserError("too much memory"), RuntimeError("too much memory")):
         viewed.renderer.broken = error
         session.save("png", 100)
-        assert "too much memory" in client.said[-1]
+        assert "too much memory" in client.notices[-1]
         assert client.files == []
     viewed.renderer.broken = None
     session.save("png", 100)
@@ -307,7 +307,7 @@ def test_a_view_is_saved_also_after_a_failure(session, viewed, client):
     assert picture.shape == (round(100 * CANVAS[1] / CANVAS[0]), 100, 3)
 
 
-def test_the_panel_holds_what_it_is_set_to(viewed, run):
+def test_the_panel_returns_the_settings_that_were_put(viewed, run):
     server, actions = viser.ViserServer(port=0, verbose=False), MagicMock()
     try:
         panel = panels.Panel(server.gui, viewed, actions)
@@ -327,4 +327,4 @@ def test_the_panel_holds_what_it_is_set_to(viewed, run):
         assert dict(zip(*exposures, strict=True)) == pytest.approx(exposures_ev(run))
     finally:
         server.stop()
-    assert not actions.method_calls  # these are a person's alone
+    assert not actions.method_calls  # only a user's clicks call them

@@ -1,4 +1,4 @@
-"""Programs compiled ahead: the renderer's picture, no wait for longer tile lists, and sizes."""
+"""The renderer with programs compiled ahead: its pictures, overflows, failures and sizes."""
 
 import threading
 from dataclasses import replace
@@ -47,7 +47,7 @@ def camera(size, z=0.0):
 
 @pytest.fixture
 def made(monkeypatch):
-    """Return a function that makes a renderer and the event that it compiled something."""
+    """Return a function that makes a renderer and the event that is set after compilations."""
     monkeypatch.setattr("p2gs_jax.render.capacity.SMALLEST", 4096)
     every = []
 
@@ -72,7 +72,7 @@ def wait_for(renderer, changed, size):
     raise AssertionError(f"{size} was never compiled")
 
 
-def test_renders_what_the_renderer_renders(made):
+def test_the_viewer_renders_the_same_as_make_renderer(made):
     scene = gaussians()
     renderer, changed = made(scene)
     assert renderer.render(camera(SIZE)) is None
@@ -85,7 +85,7 @@ def test_renders_what_the_renderer_renders(made):
 
 
 @pytest.mark.parametrize("count", [200, 150])
-def test_other_gaussians_are_shown_by_the_same_program_where_their_number_stays(made, count):
+def test_other_gaussians_are_shown_by_the_same_program_if_their_number_stays(made, count):
     renderer, changed = made(gaussians())
     renderer.request([SIZE])
     wait_for(renderer, changed, SIZE)
@@ -116,7 +116,7 @@ def test_a_view_to_save_waits_for_its_program(made, monkeypatch):
         renderer.render_now(camera(LARGE))
 
 
-def test_what_cannot_be_compiled_is_said_and_the_next_size_is(made, monkeypatch):
+def test_a_size_that_cannot_be_compiled_is_reported_and_the_next_one_is_compiled(made, monkeypatch):
     renderer, changed = made(gaussians())
     monkeypatch.setattr(renderer, "_probes", [lambda size: 1 / (size != LARGE) and camera(size)])
     renderer.request([LARGE, SIZE])
@@ -138,7 +138,7 @@ def test_sizes_rise_to_the_canvas_itself_up_to_a_width():
 
 
 def ms(size, of, share):
-    """Return the time of a frame of one size with which another one takes a share of the target."""
+    """Return the time, ms, of a frame at which one of size `of` takes a share of the target."""
     return share * TARGET_MS * size[0] * size[1] / (of[0] * of[1])
 
 
@@ -154,7 +154,7 @@ def ms(size, of, share):
         # A size is kept until it is clearly too slow, and left for the largest that keeps up.
         (SIZES, SIZES[2], (SHRINK_BEYOND - 0.01) * TARGET_MS, SIZES[2]),
         (SIZES, SIZES[2], 2 * TARGET_MS, SIZES[1]),
-        # What is not compiled is not chosen; programs of another window serve until then.
+        # Only compiled sizes are chosen; those of another window serve until then.
         (SIZES[1:2], SIZES[1], 0.1, SIZES[1]),
         ((), None, 0.0, None),
         (((336, 192), (2000, 1000)), None, 0.0, (336, 192)),

@@ -45,7 +45,7 @@ def test_without_viser_the_error_says_how_to_install_it(refused, monkeypatch, tm
         (("--max-width", "3"), "--max-width"),
     ],
 )
-def test_wrong_input(refused, tmp_path, options, named):
+def test_wrong_options_are_refused_by_name(refused, tmp_path, options, named):
     assert named in refused("view", tmp_path, "--port", "0", *options)
 
 
@@ -54,17 +54,17 @@ def test_fit_refuses_a_port_without_view_and_a_view_of_blocks(refused, tmp_path)
     assert "RUN/blocks/0" in refused("fit", tmp_path, "--view", "--blocks", "2")
 
 
-def test_busy_port(refused, tmp_path):
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
+def test_a_busy_port_is_refused(refused, tmp_path):
+    with socket.socket() as busy:
+        busy.bind(("127.0.0.1", 0))
+        busy.listen()
+        port = busy.getsockname()[1]
         text = refused("view", tmp_path, "--port", port)
     assert str(port) in text
     assert "--port" in text
 
 
-def test_ctrl_c_ends_it_cleanly(finished_run):
+def test_ctrl_c_ends_the_server_cleanly(finished_run):
     process = subprocess.Popen(
         [sys.executable, "-m", "p2gs_jax.cli", "view", str(finished_run), "--port", "0"],
         cwd=ROOT,
@@ -81,7 +81,7 @@ def test_ctrl_c_ends_it_cleanly(finished_run):
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_a_signal_during_garbage_collection_ends_it(monkeypatch):
+def test_a_signal_during_garbage_collection_ends_the_server(monkeypatch):
     class Collected:
         def __del__(self):
             signal.raise_signal(signal.SIGINT)
@@ -167,7 +167,7 @@ def test_requests_from_other_sites_and_for_other_host_names_are_refused(servers)
         assert get(servers[0], Host=host, Origin=f"http://{host}")[0] == 403
 
 
-def test_others_need_the_token(servers):
+def test_other_machines_need_the_token(servers):
     server = servers[1]
     for path in ("/", "/?token=", "/?token=wrong", "/?token=secre", "/index.html", "/?t=secret"):
         assert get(server, path) == (403, "")
@@ -182,7 +182,7 @@ def test_others_need_the_token(servers):
     assert get(server, "/", Cookie=kept)[0] == 200
     assert connects(server, Cookie=kept)
     assert not connects(server, origin="http://evil.example", Cookie=kept)
-    # A browser keeps cookies by host, not by port: it also sends that of another viewer.
+    # A browser keeps cookies by host, not by port: it also sends the cookie of another viewer.
     assert kept == f"p2gs_jax_token_{port}=secret"
     assert connects(server, Cookie=f"p2gs_jax_token_{port + 1}=other; {kept}")
 
@@ -216,7 +216,7 @@ def test_the_session_of_a_browser_that_disconnects_stops_once(monkeypatch):
     served.disconnect(clients[1])
     assert sorted(served.sessions) == [0, 2]
     assert served.stopped == [1]
-    # Browsers that disconnect while their session is made.
+    # These browsers disconnect while their session is made.
     served.on_made = served.disconnect
     for number in (5, 6):
         served.connect(SimpleNamespace(client_id=number))

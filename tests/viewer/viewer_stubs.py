@@ -1,4 +1,4 @@
-"""A browser that only records, controls that hold what they are set to, a renderer as wanted."""
+"""A browser that only records, a panel that keeps its settings, and a renderer with faults."""
 
 import contextlib
 import threading
@@ -17,7 +17,7 @@ PATIENCE_S = 60
 
 
 class FakeRenderer:
-    """What is compiled, what overflows and what is broken, as a test wants it."""
+    """A renderer whose compiled sizes, overflows (`refused`) and error (`broken`) a test sets."""
 
     def __init__(self, run):
         self.run, self.renderer = run, make_renderer(run.cfg.render)
@@ -40,7 +40,7 @@ class FakeRenderer:
 
 class Client:
     def __init__(self):
-        self.pictures, self.said, self.files = [], [], []
+        self.pictures, self.notices, self.files = [], [], []
         self.came = threading.Condition()
         self.scene = SimpleNamespace(set_background_image=self.show)
         place = {"wxyz": np.array([1.0, 0, 0, 0]), "position": np.zeros(3), "fov": 0.9}
@@ -57,7 +57,7 @@ class Client:
         self.keep(self.pictures, (kind, image, more))
 
     def add_notification(self, title, body, **more):
-        self.keep(self.said, body)
+        self.keep(self.notices, body)
         return SimpleNamespace(remove=lambda: None)
 
     def send_file_download(self, name, content, **more):
@@ -65,7 +65,7 @@ class Client:
 
     def wait(self, holds):
         with self.came:
-            assert self.came.wait_for(holds, PATIENCE_S), (len(self.pictures), self.said)
+            assert self.came.wait_for(holds, PATIENCE_S), (len(self.pictures), self.notices)
 
     def wait_sharp(self, after=0):
         self.wait(lambda: len(self.pictures) > after and self.pictures[-1][0] == "png")
