@@ -60,7 +60,8 @@ def write_street(
     Args:
         out: the new folder, which must be missing or empty.
         frames: number of photographs of each of the three cameras, `step` m apart.
-        width, height: image size, pixels (paper: 1920 x 1300).
+        width: image width, pixels (paper: 1920).
+        height: image height, pixels (paper: 1300).
         iso_std: standard deviation of the ISO (paper: 2 and 4); 0: ISO-Const; unless `sensor`.
         seed: seed of the town, the ISO and the points.
         supersample: samples per pixel along each axis; the default is 8 for `matte`, else 2.
