@@ -68,7 +68,7 @@ class Fit:
     reference: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Photographs of the same views under one common exposure, for evaluation."""
     threads: int | None = None
-    """CPU cores per view (default: 4, or 1 on small CPUs); equal numbers give equal results."""
+    """CPU cores per view (default: 4; 1 if there are fewer); equal numbers give equal results."""
     verbose: bool = False
     """Print all scores, and the seconds of each part of the fit."""
     view: bool = False
@@ -189,8 +189,8 @@ class Calibrate:
     """Also write DIR/developed: the scene for other trainers, its photographs at one exposure and
     white balance, without vignetting (docs/exports.md)."""
     exposure_ev: DevelopedExposure = 0.0
-    """Exposure of developed photographs: stops from their mean; highlights: the brightest exposure
-    that keeps the highlights of every photograph."""
+    """Exposure of developed photographs: stops from the mean exposure; highlights: the largest
+    exposure that keeps the highlights of every photograph."""
     masks: bool = True
     """Mask pixels of developed photographs that are clipped or black in the original."""
     write_for: Annotated[
@@ -219,8 +219,8 @@ class Calibrate:
             elif self.is_run:
                 found = calibrate_run(scene, out, cfg, **how)
             else:
-                depth, ev, masks = self.develop, self.exposure_ev, self.masks
-                development = None if depth is None else Development(depth, ev, masks)
+                bits, ev, masks = self.develop, self.exposure_ev, self.masks
+                development = None if bits is None else Development(bits, ev, masks)
                 found = calibrate(scene, out, cfg, develop=development, **how)
             if found.developed is not None:
                 write_development(out, found.developed)

@@ -75,7 +75,7 @@ class Held:
 
 @contextlib.contextmanager
 def held() -> Iterator[Held]:
-    """Hold signals that end a program from `Held.begin` to the end of a `with` block.
+    """Hold the signals, after `Held.begin`, until the end of a `with` block.
 
     A second signal raises at once. A signal that still waits is raised at the end of the block.
 

@@ -2,8 +2,8 @@
 
 EDGS (arXiv 2504.13204) triangulates the matches of a learned matcher. This module uses DIS flow
 (Kroeger et al. 2016, OpenCV) between photographs at a common exposure, with known poses. A pixel's
-inverse depth r projects it to x(r) = (a + r b) / (a_z + r b_z). With its match q as x(r) the
-equations (a - q a_z) + r (b - q b_z) = 0 are linear in r; least squares solve them.
+inverse depth r projects it to x(r) = (a + r b) / (a_z + r b_z). If x(r) is its
+match q, (a - q a_z) + r (b - q b_z) = 0: two linear equations, solved by least squares.
 """
 
 from __future__ import annotations
@@ -69,13 +69,13 @@ def pixel_centers(height: int, width: int) -> Float32[np.ndarray, "h w 2"]:
     return np.stack([x, y], -1)
 
 
-def _geometry(a: MatchImage, b: MatchImage) -> _Geometry:
-    height, width = a.luminance.shape
-    relative = b.viewmat @ np.linalg.inv(a.viewmat)
-    turn = (b.K @ relative[:3, :3] @ np.linalg.inv(a.K)).astype(np.float32)
+def _geometry(view: MatchImage, other: MatchImage) -> _Geometry:
+    height, width = view.luminance.shape
+    relative = other.viewmat @ np.linalg.inv(view.viewmat)
+    turn = (other.K @ relative[:3, :3] @ np.linalg.inv(view.K)).astype(np.float32)
     x = np.arange(width, dtype=np.float32)[None, :, None] + np.float32(0.5)
     y = np.arange(height, dtype=np.float32)[:, None, None] + np.float32(0.5)
-    shift = (b.K @ relative[:3, 3]).astype(np.float32)
+    shift = (other.K @ relative[:3, 3]).astype(np.float32)
     return _Geometry(x * turn[:, 0] + y * turn[:, 1] + turn[:, 2], shift)
 
 
@@ -145,34 +145,34 @@ class Flows:
 
     def _flow(self, i: int, j: int) -> Float32[np.ndarray, "h w 2"]:
         """Return the flow from a training view to another."""
-        a, b = self.images[i], self.images[j]
-        # The order is fixed, so that both directions compare the same pictures.
-        first, second = at_common_exposure(a, b) if i < j else at_common_exposure(b, a)[::-1]
+        view, other = self.images[i], self.images[j]
+        first, second = at_common_exposure(view, other)
         # The initial flow is the projection of the interpolated depth, or 0.
-        start = _geometry(a, b).project(self._guide(i))[0] - pixel_centers(*a.luminance.shape)
-        most = max(a.luminance.shape)
+        predicted = _geometry(view, other).project(self._guide(i))[0]
+        start = predicted - pixel_centers(*first.shape)
+        most = max(first.shape)
         return _flow(first, second, np.clip(np.nan_to_num(start, nan=0.0), -most, most))
 
 
 def _match(flows: Flows, i: int, j: int):
     """Return a view's inverse depth from flow to another, and its precision, 0 where rejected."""
-    a, b = flows.images[i], flows.images[j]
-    first, second = at_common_exposure(a, b)
-    here, to_b = pixel_centers(*a.luminance.shape), _geometry(a, b)
+    view, other = flows.images[i], flows.images[j]
+    first, second = at_common_exposure(view, other)
+    here, to_other = pixel_centers(*first.shape), _geometry(view, other)
     forward, backward = flows.between(i, j), flows.between(j, i)
     match = here + forward
     height, width = second.shape
     x, y = match[..., 0], match[..., 1]
     inside = (x > 0.5) & (y > 0.5) & (x < width - 0.5) & (y < height - 0.5)
-    usable = a.usable & inside & (_sampled(b.usable.astype(np.float32), match) > 0.99)
+    usable = view.usable & inside & (_sampled(other.usable.astype(np.float32), match) > 0.99)
     back = _sampled(backward, match)
     returns = _squared(forward + back) < FORWARD_BACKWARD**2
-    u = to_b.b[:2] - match * to_b.b[2]
-    v = to_b.a[..., :2] - match * to_b.a[..., 2:]
+    u = to_other.b[:2] - match * to_other.b[2]
+    v = to_other.a[..., :2] - match * to_other.a[..., 2:]
     square = _squared(u)
     dot = u[..., 0] * v[..., 0] + u[..., 1] * v[..., 1]
     inverse = -dot / np.maximum(square, 1e-20)
-    predicted, z = to_b.project(inverse)
+    predicted, z = to_other.project(inverse)
     ahead = (inverse > 0) & (z > 1e-6)
     with np.errstate(invalid="ignore"):
         on_line = ahead & (_squared(predicted - match) < EPIPOLAR**2)

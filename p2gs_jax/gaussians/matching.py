@@ -23,20 +23,20 @@ from p2gs_jax.scene.visibility import in_frame, unoccluded
 from p2gs_jax.types import GAMMA_SRGB, Photometry, Scene
 
 TABLE = 1024  # entries of a tabulated tone curve
-LUMINANCE = np.array([0.25, 0.6, 0.15], np.float32)  # weights of red, green and blue radiance
+LUMINANCE = np.array([0.25, 0.6, 0.15], np.float32)  # approximate weights of R, G, B
 # Number of images in memory: some views and their neighbours.
 CACHED = 48
 # Quantile of luminance that becomes white in the comparison, so that lamps may clip.
 WHITE_QUANTILE = 0.995
 LARGEST_GAIN = 30.0  # largest factor on dark pairs
-ROUNDS = 30  # of `rough_tones`
+ROUNDS = 30  # number of rounds of `rough_tones`
 # Angles between the rays of two views to a point, degrees: below NARROW the depth is uncertain,
 # above WIDE flow begins to fail, and at WIDE + 2 FADE it fails completely.
 NARROW, WIDE, FADE = 4.0, 12.0, 8.0
 # Difference of log exposures (natural logarithm) at which photographs share few usable tones.
 EXPOSURE_FADE = 1.5
 FEWEST_SHARED = 5  # points that both views of a pair see
-MOST_POINTS = 20_000  # that are compared without tracks
+MOST_POINTS = 20_000  # largest number of points compared without tracks
 # Least number of points in a view for an occlusion test among them.
 FEWEST_HIDING = 1000
 
@@ -114,7 +114,7 @@ def rough_tones(tracks: Observations | None, count: int) -> Tones:
     per_point = np.maximum(np.bincount(points, minlength=tracks.point_count), 1)
     for _ in range(ROUNDS):
         mean = np.bincount(points, z - log_exposures[views], tracks.point_count) / per_point
-        off = np.clip(z - log_exposures[views] - mean[points], -1.0, 1.0)  # outliers
+        off = np.clip(z - log_exposures[views] - mean[points], -1.0, 1.0)  # bounds outliers
         log_exposures = log_exposures + np.bincount(views, off, count) / per_view
         log_exposures -= log_exposures.mean()
     return Tones(log_exposures, gammas)
@@ -151,8 +151,8 @@ class MatchImage:
 class MatchImages:
     """The training views of a scene by row, loaded on demand, in any thread.
 
-    Their longest side has at most `longest` pixels. Display values up to `black` and from
-    `saturation` on are not usable. The last images are cached.
+    Their longest side has at most `longest` pixels. Pixels whose brightest channel is not between
+    `black` and `saturation`, and their neighbours, are not usable. The last images are cached.
     """
 
     scene: Scene

@@ -16,7 +16,7 @@ from p2gs_jax.render.project import STILL
 from p2gs_jax.scene.drives.objects import MovingObjects, middle_time
 from p2gs_jax.types import Gaussians, Scene
 
-# Number of directions of the least squares, which are exact: degree 3 has only 16 coefficients.
+# Number of directions to which `turning` fits; the fit is exact, as degree 3 has 16 coefficients.
 DIRECTIONS = 64
 # Factors on coordinates in a rotation by 180 degrees about x.
 FLIP = (1.0, -1.0, -1.0)
@@ -26,7 +26,7 @@ def standing(gaussians: Gaussians, owner: Int[np.ndarray, " n"] | None) -> Gauss
     """Return the static Gaussians only; `owner` is the moving object of each, -1: none."""
     moves = gaussians.vibration
     if moves is not None:
-        stands = np.asarray(moves.log_lives) > np.log(STILL) - 1
+        stands = np.asarray(moves.log_lives) > np.log(STILL) - 1  # a margin for rounding
         return chosen(dataclasses.replace(gaussians, vibration=None), stands)
     return gaussians if owner is None else chosen(gaussians, np.asarray(owner) < 0)
 

@@ -28,8 +28,8 @@ MIN_RADIANCE = 1e-3  # in the gauge of the exposures
 # At most the share FEW of the cameras (at least one) counts as misplaced; the nearest of these is
 # FARTHER times as far away as every other camera and as the median point.
 FEW, FARTHER = 0.05, 20.0
-# Largest distance of seeds and Gaussians from the cameras, as a multiple of the cameras' radius or
-# of the median distance of the points.
+# Largest distance of seeds and Gaussians from the cameras, as a multiple of the larger one of the
+# cameras' radius and the median distance of the points.
 REACH = 1000.0
 # Largest initial scale of a seed, as a share of its distance from the nearest camera.
 MAX_ANGLE = 0.05
@@ -84,7 +84,7 @@ def reach(
 
 
 def within_reach(scene: Scene) -> tuple[Scene, list[str]]:
-    """Return a scene without seed points beyond the reach, and a note about moved points.
+    """Return a scene whose seed points are all within the reach, and a note about moved points.
 
     Points beyond the reach are moved towards the cameras; the images hardly change. The
     exploration noise of MCMC would move wide, far Gaussians too much.
@@ -121,7 +121,7 @@ def spacings(points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, " p"]:
 def neighbour_scales(
     points: Float[np.ndarray, "p 3"], views: Sequence[View]
 ) -> Float[np.ndarray, " p"]:
-    """Return the spacings of points, bounded by their distance from the nearest view."""
+    """Return the spacings of points, at most a share of their distance from the nearest view."""
     to_camera, _ = KDTree(camera_centers(views)).query(points)
     return np.clip(spacings(points), 1e-7, np.maximum(MAX_ANGLE * np.asarray(to_camera), 1e-6))
 
@@ -213,7 +213,7 @@ def photographed(
     cfg: FitConfig,
     shrink: int = 1,
 ) -> Iterator[tuple[Int[np.ndarray, " s"], Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]]:
-    """Yield point indices, display colours and radiance per training photograph at 1 / `shrink`."""
+    """Yield point indices, display colours and radiance per photograph, reduced by `shrink`."""
     host: Photometry = jax.tree.map(np.asarray, photometry)
     for row, index in enumerate(scene.train_indices):
         view = scene.views[index]

@@ -1,7 +1,7 @@
 """Luminance-GS (Cui, Chu and Harada, CVPR 2025): a colour matrix and a curve per photograph.
 
 They map photographs to the enhanced scene and back. The published method has one curve for all
-photographs, to which a small network adds a bias for each photograph, clipped to [0, 1]. The curve
+photographs; a small network adds a bias per photograph, and the sum is clipped to [0, 1]. The curve
 acts along three orthonormal colour axes per photograph. Three numbers per photograph shape a pseudo
 curve (a power, then an S), to which the loss pulls the curve. The network's input here is the
 histogram and the mean colour; theirs is the image and the camera's pose. The curve is interpolated;
@@ -22,7 +22,7 @@ from p2gs_jax.types import Array
 
 ENTRIES = 255  # entries of a curve, as published
 HIDDEN = 32  # width of the network (ours)
-# Number of steps of the cumulative histogram, and of all inputs of the network.
+# Number of steps of the cumulative histogram; number of the network's inputs.
 LEVELS = 32
 STATISTICS = LEVELS + 3
 AXES = 5  # parameters of the axes

@@ -32,16 +32,16 @@ from p2gs_jax.scene.pixels.store import size_at
 from p2gs_jax.types import Scene
 
 # Bytes of programs and libraries, and for each parameter, pixel of a view and decoded pixel.
-OF_PROGRAMS = 0.8e9
-A_PARAMETER = 37  # with moments, gradient and the copies of a densification
-A_PIXEL = 650
-A_PHOTOGRAPH_PIXEL = 7
+PROGRAM_BYTES = 0.8e9
+PARAMETER_BYTES = 37  # with moments, gradient and the copies of a densification
+PIXEL_BYTES = 650
+DECODED_BYTES = 7
 OPTIONS = "--gaussians, --max-width or --data.cache-mb"
 
 
 @dataclass(frozen=True)
 class Paths:
-    """Folders that a fit reads and writes; `reference` is under one common exposure."""
+    """Folders that a fit reads and writes; the photographs in `reference` have one exposure."""
 
     scene: Path
     run: Path
@@ -95,8 +95,8 @@ def check_options(cfg: FitConfig) -> None:
     """Check the options that depend on each other.
 
     Raises:
-        UserError: the spread is not in [0, 1); or known exposures or the curve do not suit the
-            initial exposures.
+        UserError: the spread is not in [0, 1), the initial exposures contradict known exposures or
+            the curve, or the appearance contradicts the curve.
     """
     p, share = cfg.photometry, cfg.densify.spread
     curved, random = p.curve != "linear", "--photometry.curve linear --photometry.start random"
@@ -104,7 +104,8 @@ def check_options(cfg: FitConfig) -> None:
         why = f"--densify.spread {share:g} is not between 0 and 1 (1 excluded)."
         raise UserError(why, fix="give a share of the Gaussian's extent, for example 0.5")
     if p.known is not None and p.start != "tracks":
-        why = f"the preset {cfg.preset!r} draws initial exposures and would ignore known ones."
+        why = "--photometry.start random, which some presets set, draws initial exposures "
+        why += "and would ignore known ones."
         raise UserError(why, fix="leave out --known-exposures, or add --photometry.start tracks")
     if p.appearance == "ppisp" and curved:
         why = f"ppisp learns a whole camera; it does not combine with curve {p.curve!r}."
@@ -113,8 +114,7 @@ def check_options(cfg: FitConfig) -> None:
         why = f"Luminance-GS corrects display values; it does not combine with curve {p.curve!r}."
         raise UserError(why, fix=f"use --preset luminance_gs, or add {random}")
     if not curved and p.start == "tracks":
-        why = "the curve 'linear' splats display values; the bundle adjustment over tracks does "
-        why += "not support it."
+        why = "the curve 'linear' splats display values; it does not combine with solved exposures."
         fix = "add --photometry.start random, or use the preset ppisp or one of 3dgs*"
         raise UserError(why, fix=fix)
 
@@ -175,12 +175,12 @@ def memory_needed(scene: Scene, cfg: FitConfig, coverage: Coverage) -> MemoryNee
     parameters = 11 + 3 * (cfg.render.sh_degree + 1) ** 2
     on_host = jax.default_backend() == "cpu"
     sizes = [size_at(view, cfg.data.max_width) for view in scene.views]
-    decoded = sum(w * h for w, h in sizes) * A_PHOTOGRAPH_PIXEL
+    decoded = sum(w * h for w, h in sizes) * DECODED_BYTES
     return MemoryNeeded(
-        programs=OF_PROGRAMS,
-        gaussians=float(on_host * count * parameters * A_PARAMETER),
+        programs=PROGRAM_BYTES,
+        gaussians=float(on_host * count * parameters * PARAMETER_BYTES),
         photographs=float(min(decoded, cfg.data.cache_mb * 2**20)),
-        view=float(on_host * coverage.pixels * A_PIXEL),
+        view=float(on_host * coverage.pixels * PIXEL_BYTES),
         population=count,
     )
 

@@ -3,8 +3,7 @@
 Splats use the local affine approximation of EWA splatting. Drives add two kinds of motion:
 
 Moving objects. Gaussians stay in the frame of their box, and the camera moves: the view matrix of
-an object's Gaussians maps its box to the camera. No other part of the
-renderer depends on objects.
+an object's Gaussians maps its box to the camera (`camera_of_each`).
 
 Vibration (PVG, arXiv 2311.18561, section 3.2). Gaussians may appear, move and disappear:
 

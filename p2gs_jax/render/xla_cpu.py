@@ -32,8 +32,8 @@ def compiled_loop(f: F) -> F:
     counting sort then takes 6 ns per entry, and `lax.sort` takes 54 ns.
 
     `sequential_vmap` turns vmap into a loop over calls, because batched scatters cannot be compiled
-    like this. It also keeps the call whole under differentiation, where constants in a call without
-    arguments would become invalid code (jaxlib 0.10).
+    like this. It also keeps the call whole where the code around it is differentiated: constants in
+    a call without arguments would become invalid code there (jaxlib 0.10).
 
     `f` is a pure function of arrays, without matrix products, sorts or convolutions. The result
     cannot be differentiated.
@@ -62,8 +62,8 @@ def materialize(always: Bool[Array, ""], compute):
     """Return the arrays of `compute()`, stored in memory before they are used.
 
     XLA's CPU backend fuses through `optimization_barrier` and then recomputes the whole chain in
-    each consumer (1155 instead of 421 ms of CPU time); a conditional prevents this. `always` is
-    true, but computed from data, so that XLA cannot fold it: `opaque_true`.
+    each consumer; a conditional prevents this. `always` is true, but computed from data, so that
+    XLA cannot fold it: `opaque_true`.
     """
     if jax.default_backend() != "cpu":
         return compute()

@@ -11,7 +11,7 @@ from p2gs_jax.core.clock import whole_run
 from p2gs_jax.core.text import count_of
 from p2gs_jax.evaluation.alignment import ExposureError, error_of_views
 from p2gs_jax.photometry.models import MODELS
-from p2gs_jax.photometry.solution import Agreement, compare
+from p2gs_jax.photometry.solution import NOTICEABLE_EV, Agreement, compare
 from p2gs_jax.report.run_files import RunFiles, number_at
 
 CURVES = {
@@ -190,8 +190,8 @@ def _on_views(run: RunFiles) -> Iterator[ViewWarning]:
             "EXIF disagrees with the pixels",
             _worst(off, "+.2f"),
             f"In {{count}} of {agreement.views} the exposure recovered from the pixels differs "
-            "from that of EXIF by more than 0.2 stops ({names}). EXIF does not include flare, "
-            "vignetting, or processing in the camera, so the fit used the pixels.",
+            f"from that of EXIF by more than {NOTICEABLE_EV:g} stops ({{names}}). EXIF does not "
+            "include flare, vignetting, or processing in the camera, so the fit used the pixels.",
         )
     errors = [(v["image"], v.get("exposure_ev_error") or 0.0) for v in run.train]
     yield (

@@ -1,4 +1,4 @@
-"""Values that a fit derives from its scene: `decisions.json`, and in every checkpoint.
+"""Values that a fit derives from its scene, in `decisions.json` and in every checkpoint.
 
 The options in `config.json` stay as the user chose them. Model and curve are chosen from the
 photographs, in numpy and threads: another computer may choose differently in a near tie, and a
@@ -44,8 +44,7 @@ class Decisions:
     gamma_rate: float  # learning rate of the gammas
     reasons: tuple[str, ...] = ()  # reasons for the model and the curve, in words
     white_balance: config.Level | None = None  # level of the white balance, or None
-    # per camera, or per camera and channel, or None
-    vignetting: config.VignettingKind | None = None
+    vignetting: config.VignettingKind | None = None  # one per camera, or per channel of a camera
     responses: config.ResponseKind = "all"  # one response for all, or per camera or channel
     # vignetting and response of each physical camera, if any
     cameras: tuple[config.CameraFormation, ...] = ()
@@ -94,8 +93,8 @@ class Decisions:
         del now["reasons"]
         other = [f"{k} was {saved.get(k)}, now {v}" for k, v in now.items() if saved.get(k) != v]
         if other:
-            why = f"The checkpoints in {folder} have other decisions than this scene now leads "
-            why += f"to: {'; '.join(other)}."
+            why = f"The decisions in the checkpoints of {folder} differ from those that the scene "
+            why += f"gives now: {'; '.join(other)}."
             fix = "restore the scene as it was when the run began, or start again in another "
             fix += "folder with --out"
             raise UserError(why, fix=fix)
@@ -169,8 +168,8 @@ def likely(cfg: config.FitConfig, kept: Decisions | None, near: float | None) ->
     if p.known is not None or relative.weight is not None or cfg.densify.method != "mcmc":
         return None
     # Vignetting and responses of cameras are constants of the programs, but not yet solved.
-    solved = p.start == "tracks" and (p.vignetting is not None or p.responses != "all")
-    if kept is None and not p.select and solved:
+    camera_effects = p.start == "tracks" and (p.vignetting is not None or p.responses != "all")
+    if kept is None and not p.select and camera_effects:
         return None
     decided = dataclasses.replace(Decisions.as_given(cfg), near=near)
     if kept is not None:
@@ -223,8 +222,8 @@ def kept_choice(cfg: config.FitConfig, folder: RunFolder) -> Decisions | None:
         UserError: another version of the program wrote the checkpoints.
     """
     p = cfg.photometry
-    solved = p.vignetting is not None or p.responses != "all"
-    if not ((p.select or solved) and p.start == "tracks"):
+    camera_effects = p.vignetting is not None or p.responses != "all"
+    if not ((p.select or camera_effects) and p.start == "tracks"):
         return None
     saved = (CheckpointStore(folder.checkpoints).latest_meta() or {}).get(KEY)
     try:

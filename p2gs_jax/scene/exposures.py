@@ -1,4 +1,4 @@
-"""Known exposures from a CSV file or EXIF, and the views that names in a file mean."""
+"""Known exposures from a CSV file or EXIF, and the views to which names in a file refer."""
 
 from __future__ import annotations
 

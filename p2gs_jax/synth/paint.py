@@ -57,7 +57,7 @@ def paint(
     index: Int[Array, " r"],
     footprint: Float[Array, " r"],
 ) -> Surface:
-    """Return the surface at the points that rays, of unit directions, hit.
+    """Return the surface at the points that rays hit; `view` has their unit directions.
 
     `index` is the row of the primitive, `town.size` for the ground; `footprint` is the width of a
     pixel there, m.
@@ -86,22 +86,22 @@ def paint(
 def _point(
     town: Town, p: Array, view: Array, index: Array, material: Array, footprint: Array
 ) -> Point:
-    """Return the rows of the primitives that rays hit, with noise of a wavelength by material."""
+    """Return the points that rays hit, with the rows of their primitives and their noise."""
     table = np.zeros((town.size + 1, 16), np.float32)
     table[:-1] = np.concatenate([town.lo, town.hi, town.color, town.accent, town.params], axis=1)
-    table[-1, 12:] = 0.5
+    table[-1, 12:] = 0.5  # of the ground, whose material has no parameters
     rows = jnp.asarray(table)[index].T
     normal = _normal(town, p, index, rows[0:3], rows[3:6])
     slant = jnp.maximum(jnp.abs(jnp.sum(normal * view, 0)), 0.12)
     footprint = footprint / jnp.sqrt(slant)
-    fine, coarse = (
+    fine_m, coarse_m = (
         jnp.asarray([waves.get(m, default) for m in Material], jnp.float32)[material]
         for default, waves in ((0.10, _FINE), (1.6, _COARSE))
     )
-    waves = jnp.stack([fine, 4.0 * fine, coarse])
+    waves = jnp.stack([fine_m, 4.0 * fine_m, coarse_m])
     x, y, z = p[:, None] / waves
     noise = value_noise(x, y, z, (town.seed + 1, town.seed + 2, town.seed + 3))
-    # Light and colour of leaves are not linear in their noise, so that it must not fade.
+    # Light and colour of leaves are not linear in their noise: it must not fade.
     fade = jnp.where(material == Material.FOLIAGE, 1.0, detail(footprint, waves[:2]))
     rough, coarse = 0.7 * noise[:, 0] + 0.55 * noise[:, 1], noise[:, 2]
     fine = 0.7 * fade[0] * noise[:, 0] + 0.55 * fade[1] * noise[:, 1]
@@ -305,7 +305,7 @@ def _shop(s: Point, bay: _Bay, shop: Array, seed: int) -> tuple[Array, Array, Ar
     gate = shop & (draw[0] > 0.86)
     door = shop & (draw[0] < 0.22) & ~gate
     wide = jnp.where(door, 0.55, 0.5 * bay.cell - 0.2)
-    # Doors go on below the ground: no light comes from there.
+    # Doors reach below the ground: they have no frame at the bottom.
     low, high, rim = jnp.where(door | gate, -1.0, 0.62), 3.05, jnp.where(gate, 0.0, 0.08)
     hole = s.bar(du, wide) * s.span(z, low, high) * shop
     across = s.bar(du, wide - rim) * shop
@@ -372,7 +372,7 @@ def _awning(s: Point) -> Array:
 def _car_body(s: Point) -> Array:
     """Return the albedo of paint with seams, arches, handles, plates, lights and bumpers."""
     middle = (s.lo + s.hi) / 2
-    ahead = jnp.where(s.style == 0.0, 1.0, s.style)
+    ahead = jnp.where(s.style == 0.0, 1.0, s.style)  # the style is the direction along x, 1 or -1
     u = (s.p[0] - middle[0]) * ahead
     v, z = jnp.abs(s.p[1] - middle[1]), s.p[2]
     half = (s.hi[0] - s.lo[0]) / 2
@@ -408,8 +408,8 @@ def _car_glass(s: Point) -> tuple[Array, Array, Array]:
     relative = s.footprint / jnp.maximum(s.hi[2] - s.lo[2], 0.1)
     glass = across * slab(height - 0.53, 0.41, relative)
     seats = across * slab(height - 0.31, 0.19, relative) * (jnp.abs(s.coarse[0]) > 0.2)
-    paint = s.color + glass * (0.018 - s.color) + 0.03 * seats
-    return paint, jnp.zeros_like(paint), 0.7 + 0.3 * glass
+    albedo = s.color + glass * (0.018 - s.color) + 0.03 * seats
+    return albedo, jnp.zeros_like(albedo), 0.7 + 0.3 * glass
 
 
 def _wheel(s: Point) -> Array:

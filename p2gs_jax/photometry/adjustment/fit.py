@@ -25,7 +25,7 @@ from p2gs_jax.types import GAMMA_SRGB
 
 # Points per view for the solution; more are redundant (BUILD_NOTES, "Exposures from a part").
 PER_VIEW = 1000
-# Largest number of observations of all views together, and least number of points per view.
+# With thousands of views: largest number of their observations, least number of points per view.
 MOST_SOLVED, LEAST_PER_VIEW = 1_500_000, 200
 UNMODELLED_PER_VIEW = 2000  # points per view for the test of effects that are not modelled
 # An observation is an outlier if its weight is below this share of its weight from noise alone.
@@ -46,13 +46,12 @@ def fit_model(
     response = response or Response()
     form = Form(form) if isinstance(form, str) else form
     o = problem.observations
-    # Thousands of views have fewer points each.
     most = int(np.clip(MOST_SOLVED / max(o.view_count, 1), LEAST_PER_VIEW, PER_VIEW))
     pick = o.thinned(most, 0)
     few = problem if pick.all() else problem.part(pick)
     fit, system = solve_model(few, form, response, loss="whole_points")
-    free = (fit, system) if response.spline is None else with_free_curve(few, form, response, fit)
-    return solution_of(problem, form, response, fit, uncertainty(*free, few.observations))
+    judged = (fit, system) if response.spline is None else with_free_curve(few, form, response, fit)
+    return solution_of(problem, form, response, fit, uncertainty(*judged, few.observations))
 
 
 def explain(
@@ -70,18 +69,18 @@ def explain(
     ignored = 0
     for pick, points, part in _blocks(problem):
         mine, usable = part.observations, part.usable
-        # At the solution the robust weight of an observation depends on its residual alone.
+        # Exposures are fixed: a few rounds find each point's radiance and robust weights.
         model = Forward.of(part, usable, response, fit.model.unknowns)
         weight = model.noise_weight
         for loss in ("l1", "l1", "geman_mcclure", "geman_mcclure"):
             at = weigh(model, fit.theta, weight, loss)
             weight = at.weight
-        # The rows of each point are combined.
-        total, weight = (np.zeros((mine.point_count, 3)) for _ in range(2))
+        # The rows of each point are combined by their precision.
+        total, precision = (np.zeros((mine.point_count, 3)) for _ in range(2))
         np.add.at(total, part.layout.point_of_row, at.precision * at.radiance)
-        np.add.at(weight, part.layout.point_of_row, at.precision)
+        np.add.at(precision, part.layout.point_of_row, at.precision)
         with np.errstate(invalid="ignore", divide="ignore"):
-            radiance[points] = np.where(weight > 0, total / weight, np.nan)
+            radiance[points] = np.where(precision > 0, total / precision, np.nan)
         of_exposure = at.residual / fit.theta.a[mine.views][:, None]
         residual[pick] = np.where(usable, of_exposure, 0.0)
         ideal = 1 / mine.decoded(response)[1] ** 2
@@ -121,7 +120,8 @@ def solution_of(
         fixed = np.isfinite(problem.known.log_exposures)
         free = ~np.isin(problem.component, np.unique(problem.component[fixed]))
         active = active | fixed
-    scale, color = (_Gauge(problem.component, active & one) for one in (free, True))
+    # Known exposures fix the mean exposure of a component, but not its mean colour.
+    scale, color = _Gauge(problem.component, active & free), _Gauge(problem.component, active)
     exposures, shifts, lost = _exposures(fit, covariance, active, scale, color)
     # Radiances of points shift inversely, by the shift of one of their views.
     some_view = np.zeros(o.point_count, int)
@@ -178,10 +178,10 @@ def _exposures(
         moved = np.broadcast_to(moved, (len(h), 3, moved.shape[2]))
         return color.centred(moved - moved.mean(1, keepdims=True)).reshape(-1, moved.shape[2])
 
-    few = covariance.few
-    h_errors = few * covariance.of(lambda change: scale.centred(of_light(change).mean(1)))
-    a_errors = few * covariance.of(lambda change: change.a)
-    balance_errors = few[:, None] * covariance.of(of_balance).reshape(-1, 3)
+    factor = covariance.few
+    h_errors = factor * covariance.of(lambda change: scale.centred(of_light(change).mean(1)))
+    a_errors = factor * covariance.of(lambda change: change.a)
+    balance_errors = factor[:, None] * covariance.of(of_balance).reshape(-1, 3)
     lost = active & ~(np.isfinite(h_errors) & np.isfinite(a_errors))
     determined = active & ~lost
     if features.balance:
@@ -199,7 +199,7 @@ def _exposures(
 
 
 class _Gauge:
-    """Means over the `counted` views of each component, whose absolute values are unknown."""
+    """Means over the `counted` views of each component, which the photographs do not determine."""
 
     def __init__(self, component: Int[np.ndarray, " v"], counted: Bool[np.ndarray, " v"]):
         members = np.flatnonzero(counted)
@@ -244,6 +244,7 @@ def _cameras(
 
 
 def _spread_ev(residual: Float[np.ndarray, " n"]) -> float:
+    # 1.4826 times the median absolute deviation: the standard deviation of a normal distribution.
     return 1.4826 * float(np.median(np.abs(residual))) / LN2
 
 
@@ -306,7 +307,7 @@ def _warnings(
         out.append(
             f"White balance changes: {len(tinted)} training view(s) are tinted against the others "
             f"({_listed(tinted, names)}; most of all {_listed([worst], names)}, by {channels} EV). "
-            "The model has one exposure for all channels of a view."
+            "The model does not include these changes."
         )
     return out
 

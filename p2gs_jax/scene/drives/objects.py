@@ -76,7 +76,7 @@ class MovingObjects:
     """The objects that Gaussians belong to, in the order of `Population.owner`.
 
     Attributes:
-        middle: middle of the drive, seconds (the zero of `Placement.time`); None: none vibrate.
+        middle: middle of the drive, seconds (the zero of `Placement.time`); None: no vibration.
     """
 
     objects: tuple[TrackedObject, ...]
