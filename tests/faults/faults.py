@@ -94,7 +94,7 @@ FAULTS = (
         "photometry/parameters.py",
         "log_scale + tint, activation)",
         "0.0 * (log_scale + tint), activation)",
-        "photometry/test_formation.py::test_photographs_stay_and_the_mean_goes",
+        "photometry/test_formation.py::test_recentring_keeps_photographs_and_removes_the_mean",
     ),
     Fault(
         "saturated pixels count as observations of radiance",

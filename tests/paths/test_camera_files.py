@@ -20,7 +20,7 @@ def save(path, value):
     return path
 
 
-def test_what_is_written_is_read_again(tmp_path):
+def test_cameras_are_read_back_as_they_were_written(tmp_path):
     shots = [
         shot(turned(20, (1, 2, 3), pitch=5), "a/first"),
         shot(turned(), "second", exposure_ev=-1.5, gamma=1.8, view=3),
@@ -33,12 +33,12 @@ def test_what_is_written_is_read_again(tmp_path):
         for field in ("name", "width", "height", "exposure_ev", "gamma"):
             assert getattr(after, field) == getattr(before, field)
     assert back[1].view is None
-    # Names are numbers where there are none.
+    # Entries without a name are named by their numbers.
     unnamed = read_cameras(save(tmp_path / "c.json", [GOOD, GOOD]))
     assert [s.name for s in unnamed] == ["00000", "00001"]
 
 
-# Values that a field cannot have, `...` where it is missing, by words of the message.
+# Refused values of a field (`...`: the field is missing) by words of the error.
 WRONG = {
     "no viewmat": ("viewmat", ...),
     "no K": ("K", ...),
@@ -67,7 +67,7 @@ def test_errors_name_the_entry_and_the_field(tmp_path, field, value, words):
     assert str(path) in str(error.value)
 
 
-def test_other_files_missing_ones_and_equal_names_are_refused(tmp_path):
+def test_invalid_and_missing_files_and_equal_names_are_refused(tmp_path):
     for content in (3, [], [3], {"camera_path": 3}):
         with pytest.raises(UserError, match=r"c\.json"):
             read_cameras(save(tmp_path / "c.json", content))

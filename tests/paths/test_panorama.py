@@ -33,14 +33,14 @@ def test_every_pixel_comes_from_the_camera_that_looks_there():
     assert (stitch(flat[:1], shots[:1], cylinder)[:, -1] == 0).all()
 
 
-def test_the_cylinder_is_cut_to_what_the_cameras_see():
+def test_the_cylinder_covers_only_directions_that_cameras_see():
     cylinder = covering(cameras(), turned())
     half = cylinder.span / 2
     assert np.rad2deg(half) == pytest.approx(75, abs=1.2)
     assert cylinder.left == pytest.approx(-half, abs=0.02)
     focal = cameras()[0].K[0, 0]
     assert cylinder.focal == focal
-    # The lowest edge of an image is nearest to the horizon in its corners, 30 degrees off the axis.
+    # The edge of an image is nearest to the horizon at its corners, 30 degrees off the axis.
     assert -cylinder.top == pytest.approx(24 / focal * np.cos(np.pi / 6), abs=0.02)
     small = cylinder.resized(cylinder.width // 2)
     assert small.span == pytest.approx(cylinder.span)
@@ -50,25 +50,25 @@ def test_the_cylinder_is_cut_to_what_the_cameras_see():
 
 
 @pytest.mark.parametrize(
-    ("yaws", "span", "seen"), [((150, 210), 120, True), ((-60, 60), 180, False)]
+    ("yaws", "span", "gapless"), [((150, 210), 120, True), ((-60, 60), 180, False)]
 )
-def test_cameras_stay_together_and_a_gap_stays_between_them(yaws, span, seen):
+def test_neighbours_share_a_cylinder_and_gaps_between_cameras_stay_empty(yaws, span, gapless):
     shots = [shot(turned(y)) for y in yaws]
     cylinder = covering(shots, turned())
     assert np.rad2deg(cylinder.span) == pytest.approx(span, abs=3)
     flat = [np.full((s.height, s.width, 1), k + 1, np.float32) for k, s in enumerate(shots)]
     source = stitch(flat, shots, cylinder)[..., 0]
-    assert (source > 0).all() == seen
-    assert (source[:, cylinder.width // 2] > 0).all() == seen
+    assert (source > 0).all() == gapless
+    assert (source[:, cylinder.width // 2] > 0).all() == gapless
     assert set(source[cylinder.height // 2].tolist()) - {0} == {1, 2}
 
 
-def test_a_wide_view_of_slices_is_the_cylinder_itself():
+def test_a_wide_view_rendered_in_slices_shows_the_cylinder():
     cylinder = Cylinder(turned(20, (1, 2, 3), pitch=5), 120.0, np.deg2rad(-70), -0.5, 290, 100)
     covered = replace(cylinder, viewmat=turned())
 
     def render(s):
-        # Half transparent: linear and depth are weighted, as the renderer's.
+        # The opacity is 0.8; it weights radiance and depth, as in the renderer.
         d = directions(s)
         local = d @ s.viewmat[:3, :3].T
         level = d @ cylinder.viewmat[:3, :3].T

@@ -1,4 +1,4 @@
-"""Drives are smooth; orbits go around what is seen; rigs are found, level and centred."""
+"""Camera paths: smooth drives, orbits around a focus, level and centred rigs."""
 
 import dataclasses
 
@@ -28,15 +28,15 @@ def test_a_path_passes_through_every_pose_without_a_kink():
     assert np.mean(np.diff(path.times)) == pytest.approx(1)
 
     def change(h):
-        """Largest change of velocity over h, anywhere."""
+        """Return the largest change of velocity over a time h."""
         at = np.linspace(h, path.times[-1] - h, 3000)
         return np.abs(path(at + h) - 2 * path(at) + path(at - h)).max() / h
 
-    # Of a kink the change of velocity stays as h goes to 0; of a smooth path it goes with h.
+    # At a kink the change of velocity stays as h goes to 0; on a smooth path it vanishes.
     assert change(1e-3) < 0.2 * change(1e-2)
 
 
-def test_a_drive_has_the_frames_asked_for_and_exposures_between_those_of_its_knots():
+def test_a_drive_has_the_requested_frames_and_interpolates_exposures_and_gammas():
     knots = [shot(turned(0, (0, 0, z)), width=64) for z in range(3)]
     knots[1] = shot(knots[1].viewmat, width=32)
     frames = drive(knots, 9)
@@ -81,7 +81,7 @@ def seen_from(focus, shots):
     return np.linalg.norm(away, axis=1), np.rad2deg(np.arctan2(away[:, 0], away[:, 2]))
 
 
-def test_a_circle_around_what_all_cameras_look_at_upright():
+def test_cameras_all_around_give_a_level_circle_around_their_focus():
     cameras = around(np.arange(0, 360, 30))
     circle = find_orbit(cameras, cameras, NO_POINTS)
     np.testing.assert_allclose(circle.focus, FOCUS, atol=1e-9)
@@ -98,7 +98,7 @@ def test_a_circle_around_what_all_cameras_look_at_upright():
         assert inverse(s.viewmat)[1, 3] == pytest.approx(FOCUS[1] - 5 * np.sin(np.deg2rad(30)))
 
 
-def test_cameras_on_one_side_give_an_arc_over_what_they_cover():
+def test_cameras_on_one_side_give_an_arc_over_their_azimuths():
     cameras = around(np.arange(150, 251, 10))
     circle = find_orbit(cameras, cameras, NO_POINTS)
     _, azimuth = seen_from(FOCUS, orbit(circle, cameras, 40))
@@ -144,7 +144,7 @@ def rig_of(views):
     return find_rig(view_shots(views), views)
 
 
-def test_cameras_sit_on_a_level_rig_about_its_middle_also_where_photographs_are_missing():
+def test_rigs_are_level_and_centred_also_where_photographs_are_missing():
     rig = rig_of(photographs())
     assert [s.name for s in rig.steps] == [f"{k:06d}" for k in range(4)]
     for step in rig.steps:
@@ -157,12 +157,11 @@ def test_cameras_sit_on_a_level_rig_about_its_middle_also_where_photographs_are_
     pose = rig.steps[0].pose
     np.testing.assert_allclose(pose[:3, 1], [0, 1, 0], atol=0.02)  # down stays down
     assert np.rad2deg(np.arccos(pose[2, 2])) < 2  # forward stays forward
-    full = rig_of(photographs())
     some = rig_of(photographs(leave_out={("left", 0), ("right", 2), ("left", 3), ("front", 3)}))
     assert [s.name for s in some.steps] == ["000000", "000001", "000002"]
     assert sorted(some.steps[0].shots) == ["front", "right"]
     for k in range(3):
-        np.testing.assert_allclose(some.steps[k].pose, full.steps[k].pose, atol=1e-5)
+        np.testing.assert_allclose(some.steps[k].pose, rig.steps[k].pose, atol=1e-5)
 
 
 ALONE = photographs(mounts={"front": MOUNTS["front"]})
@@ -175,33 +174,33 @@ NO_RIGS["'back'"] = [*photographs(), view("back/000099.png", turned(180))]
 
 
 @pytest.mark.parametrize(("words", "views"), NO_RIGS.items(), ids=NO_RIGS)
-def test_what_is_not_a_rig_is_refused(words, views):
+def test_views_that_form_no_rig_are_refused(words, views):
     with pytest.raises(UserError, match=words):
         rig_of(views)
 
 
-# Around the car, degrees to the right; alphabetically "back" comes first.
+# Azimuths around the car, degrees to the right; alphabetically "back" comes first.
 AROUND = {"back": 180, "front": 0, "front_left": -60, "front_right": 60, "left": -120, "right": 120}
 
 
-def straight(camera, yaw, steps=5, speed=1.0):
-    """Views of a camera of a car that drives along z, in a world with y down."""
-    return [view(f"{camera}/{k:02d}.png", turned(yaw, (0.0, 0.0, speed * k))) for k in range(steps)]
+def straight(camera, yaw):
+    """Return five views of a camera of a car that drives along z, in a world with y down."""
+    return [view(f"{camera}/{k:02d}.png", turned(yaw, (0.0, 0.0, float(k)))) for k in range(5)]
 
 
 @pytest.mark.parametrize("camera", ["front", "left", "back"])
-def test_left_is_left_of_the_way_wherever_a_camera_looks(camera):
+def test_a_shift_to_the_left_follows_the_car_wherever_a_camera_looks(camera):
     views = [v for name, yaw in AROUND.items() for v in straight(name, yaw)]
     shots = [s for s in view_shots(views) if s.name.startswith(f"{camera}/")]
     for before, after in zip(shots, beside_shots(shots, views, 2.0), strict=True):
         shift = inverse(after.viewmat)[:3, 3] - inverse(before.viewmat)[:3, 3]
-        # x is right of z.
+        # The car drives along z, and x is to the right.
         np.testing.assert_allclose(shift, [-2, 0, 0], atol=1e-5)
         np.testing.assert_allclose(after.viewmat[:3, :3], before.viewmat[:3, :3])
         assert after.name == before.name
 
 
-def test_a_rig_that_looks_all_around_has_its_front_in_the_middle():
+def test_a_rig_of_cameras_all_around_looks_along_the_front_camera():
     views = sorted(
         (v for name, yaw in AROUND.items() for v in straight(name, yaw)), key=lambda v: v.name
     )
@@ -210,11 +209,11 @@ def test_a_rig_that_looks_all_around_has_its_front_in_the_middle():
     np.testing.assert_allclose(axes["front"], [0, 0, 1], atol=1e-6)
 
 
-def test_cameras_belong_together_by_frame():
+def test_photographs_are_grouped_by_frame_whatever_their_names():
     views = [
-        dataclasses.replace(v, name=f"{camera}/{17 * v_k + k:05d}.png", frame=v_k)
+        dataclasses.replace(v, name=f"{camera}/{17 * frame + k:05d}.png", frame=frame)
         for k, (camera, yaw) in enumerate(AROUND.items())
-        for v_k, v in enumerate(straight(camera, yaw))
+        for frame, v in enumerate(straight(camera, yaw))
     ]
     rig = find_rig(view_shots(views), views)
     assert [step.name for step in rig.steps] == [f"{k:06d}" for k in range(5)]

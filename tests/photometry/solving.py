@@ -1,4 +1,4 @@
-"""What tests of the adjustment share: a drive, its exposures, and how it is solved."""
+"""Shared by tests of the adjustment: a drive, its exposures, and functions that solve for them."""
 
 import numpy as np
 from synthetic_drive import make_drive, make_exposures, observe

@@ -1,4 +1,4 @@
-"""Exposures from shared points: right where the pixels say so, honest where they do not."""
+"""Exposures solved from shared points: their accuracy, their standard errors and warnings."""
 
 import dataclasses
 import functools
@@ -38,7 +38,7 @@ def test_exposures_are_recovered(outliers, limit):
     assert np.median(np.abs(stops - np.median(stops))) < 0.05
 
 
-def test_a_part_of_the_observations_tells_exposures_and_all_points_get_a_radiance(monkeypatch):
+def test_a_part_of_the_observations_suffices_and_all_points_get_a_radiance(monkeypatch):
     o, few = observe(DRIVE, ISO4, outliers=0.1), 100
     whole = adjust(o)
     monkeypatch.setattr(fitting, "BLOCK", 700)
@@ -64,15 +64,15 @@ def test_a_part_of_the_observations_tells_exposures_and_all_points_get_a_radianc
 
 def test_saturation_must_be_masked():
     """Without the mask the error grows from 0.006 to 0.042 EV."""
-    alone, masked = (
+    unmasked, masked = (
         solve.solve_model(p, VIEW_EXPOSURE, Response())[0].theta.b[:, 0] - np.log(ISO4)
         for p in (problem_of(saturation=1.1), problem_of())
     )
-    assert np.std(alone) > 2 * np.std(masked)
+    assert np.std(unmasked) > 2 * np.std(masked)
 
 
 def test_terms_of_many_cameras_are_products_with_their_matrix():
-    """Of 1,023 parameters, seven a value: powers of their number exceed 64-bit integers."""
+    """Every value depends on 7 of 1,023 parameters; 1,023^7 exceeds 64-bit integers."""
     rng, count, scaled, places = np.random.default_rng(0), 1023, 5, 40
     index = np.broadcast_to(np.arange(7), (300, 3, 7)).copy()
     index[..., 6] = rng.integers(6, count + 1, (300, 3))
@@ -98,7 +98,7 @@ def test_terms_of_many_cameras_are_products_with_their_matrix():
 
 
 def with_surfaces(o, frames, seed):
-    """Return observations whose points change alike along a drive where they share a surface."""
+    """Return observations in which points of one surface change alike along the drive."""
     rng = np.random.default_rng(seed)
     cell = rng.integers(0, 40, o.point_count)[o.points]
     change = 0.05 * rng.standard_normal((40, frames)).cumsum(1)[cell, o.views % frames]
@@ -107,7 +107,7 @@ def with_surfaces(o, frames, seed):
 
 
 def with_footprints(o, frames, change):
-    """Return observations whose light changes by `change` per doubling of a pixel's width."""
+    """Return observations whose log radiance changes by `change` per doubled width of a pixel."""
     wide = -0.3 * (o.views % frames)
     wide = (wide - np.random.default_rng(0).uniform(0, 9, o.point_count)[o.points]).astype("f4")
     colors = np.clip(o.colors * np.exp(change * wide / 2.2)[:, None], 0, 1)
@@ -142,13 +142,13 @@ def test_standard_errors_have_the_size_of_the_errors(case, monkeypatch):
     assert 0.93 < rms(ratios) < 1.33
 
 
-def test_exposures_are_as_uncertain_as_the_curve_that_was_fitted_beside_them():
+def test_errors_of_exposures_include_the_uncertainty_of_a_fitted_curve():
     o = observe(SMALL, ISO2, curve="filmic")
     curve = solve.fit_response(problem_of(o), Response())
     fit, system = solve.solve_model(problem_of(o), VIEW_EXPOSURE, curve, loss="whole_points")
     known = uncertainty(fit, system, o)
-    given = known.few * known.of(lambda change: change.b[:, 0] - change.b.mean((0, 1)))
-    assert 1.05 < rms(adjust(o, response=curve).exposure_errors) / rms(given) < 2
+    without_curve = known.few * known.of(lambda change: change.b[:, 0] - change.b.mean((0, 1)))
+    assert 1.05 < rms(adjust(o, response=curve).exposure_errors) / rms(without_curve) < 2
 
 
 @pytest.mark.parametrize("loss", ["geman_mcclure", "whole_points"])
@@ -174,7 +174,7 @@ def test_the_fixed_point_minimises_the_robust_loss(loss):
 
         gradient = np.asarray(jax.jit(jax.grad(total))(fit.theta.b[:, 0]))
         curvature = fit.normal.diagonal()[: len(gradient)]
-    # What a Newton step would still move, stops.
+    # A further Newton step would move log exposures by less.
     assert np.abs(gradient / curvature).max() < 1e-4
 
 
@@ -208,7 +208,7 @@ def test_common_factor_order_and_names_do_not_matter():
         np.testing.assert_allclose(adjust(other).log_exposures[rows], exposures, atol=1e-4)
 
 
-def test_disconnected_views_are_said_and_centred_apart():
+def test_disconnected_views_are_reported_and_centred_apart():
     o, half = PLAIN, PLAIN.view_count // 2
     views = np.where(o.points % 2, o.views % half, half + o.views % half)
     s = adjust(dataclasses.replace(o, views=views))
@@ -219,7 +219,7 @@ def test_disconnected_views_are_said_and_centred_apart():
 
 
 @pytest.mark.parametrize("level", [0.0, 1.0])
-def test_a_view_without_information_keeps_one_and_is_said(level):
+def test_a_view_without_information_keeps_exposure_1_and_is_reported(level):
     colors = PLAIN.colors.copy()
     colors[PLAIN.views == 4] = level
     names = tuple(f"view_{i}.jpg" for i in range(PLAIN.view_count))
@@ -232,7 +232,7 @@ def test_a_view_without_information_keeps_one_and_is_said(level):
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_nothing_to_go_by(model):
+def test_without_shared_points_exposures_are_1_and_unknown(model):
     empty, none = np.zeros((0, 3)), np.zeros(0, int)
     seen_once = PLAIN.picked(np.unique(PLAIN.points, return_index=True)[1])
     for o in (Observations(none, none, empty, empty, 4, 7, np.zeros(4, int)), seen_once):
@@ -253,7 +253,7 @@ def test_known_exposures_are_kept_and_set_the_gauge():
     assert rms(s.log_exposures - np.log(truth)) / np.log(2) < 0.02
 
 
-def test_a_wrong_prior_is_outvoted_by_its_uncertainty():
+def test_pixels_outvote_a_wrong_but_uncertain_prior():
     wrong = np.log(ISO4) + np.random.default_rng(0).normal(0, 0.3, len(ISO4))
     assert ev(adjust(known=KnownExposures(wrong, 0.0))) > 0.3
     prior = adjust(known=KnownExposures(wrong, 0.5))
@@ -271,7 +271,7 @@ def test_long_tracks_are_split_and_lose_little():
     assert np.isfinite(s.point_log_radiance).mean() > 0.9
 
 
-def test_a_white_balance_that_changes_is_measured_and_said():
+def test_a_white_balance_that_changes_is_measured_and_reported():
     truth = make_exposures(DRIVE, "iso2")
     gains = np.repeat(truth[:, None], 3, 1)
     gains[7] *= np.exp2([0.3, 0.0, -0.3])
@@ -284,7 +284,7 @@ def test_a_white_balance_that_changes_is_measured_and_said():
 
 @pytest.mark.parametrize("iterations", [2000, 1])
 def test_thousands_of_views_are_solved_like_few(monkeypatch, iterations):
-    """Conjugate gradients, or what follows them where they do not end, against the whole matrix."""
+    """Conjugate gradients, and the fallback without convergence, agree with the whole matrix."""
     dark = np.where(np.median(ISO4) > ISO4, 1.0, -1.0)[:, None] * [-0.06, -0.06, 0.12]
     lost = np.array([[0.45], [0.15], [0.3]]) * np.ones(3)
     o = observe(DRIVE, ISO4[:, None] * np.exp(dark), corner_loss=lost)
@@ -301,11 +301,11 @@ def test_thousands_of_views_are_solved_like_few(monkeypatch, iterations):
     assert 0.5 < ratio.min() < ratio.max() < 1.7
 
 
-# ------------------------------------------ what the solver cannot know it says
+# ------------------------------------------ unknown exposures and missing convergence
 
 
 def two_groups() -> tuple[Observations, np.ndarray]:
-    """Two groups of views with much in common inside and one dark point between them."""
+    """Return observations of two groups of views that share one dark point; log exposures."""
     group, each, seen_by = 20, 800, 6
     rng = np.random.default_rng(0)
     draws = [rng.choice(group, seen_by, replace=False) for _ in range(2 * each)]
@@ -334,11 +334,11 @@ def test_a_thin_link_does_not_make_exposures_certain():
 
 
 @pytest.mark.parametrize("dense", [1500, 0], ids=["whole", "iterated"])
-def test_what_no_observation_holds_is_unknown_and_said(monkeypatch, dense):
+def test_exposures_without_observations_are_unknown_and_reported(monkeypatch, dense):
     monkeypatch.setattr(matrices, "DENSE", dense)
     monkeypatch.setattr(solve, "GROUPS", 8)
     o = observe(SMALL, ISO2)
-    # A view whose pixels are misplaced by so much that they say nothing.
+    # The pixels of this view are so uncertain that they determine nothing.
     o.spread[o.views == 3] = 1e8
     problem, response = problem_of(o), Response()
     fit, system = solve.solve_model(problem, VIEW_EXPOSURE, response)
@@ -352,7 +352,7 @@ def test_what_no_observation_holds_is_unknown_and_said(monkeypatch, dense):
 
 
 @pytest.mark.parametrize("rounds", [5, 60])
-def test_an_end_that_is_none_is_said(monkeypatch, rounds):
+def test_missing_convergence_is_reported(monkeypatch, rounds):
     monkeypatch.setattr(solve, "MOST_ROUNDS", rounds)
     found = select(observe(SMALL, ISO2))
     s = found.solution
@@ -365,7 +365,7 @@ def test_an_end_that_is_none_is_said(monkeypatch, rounds):
         assert "may exceed their standard errors" in s.warnings[0]
 
 
-def test_an_end_that_is_near_enough_does_not_alarm(monkeypatch):
+def test_an_almost_converged_solution_gives_no_warning(monkeypatch):
     o = observe(SMALL, ISO2)
     settled = adjust(o)
     monkeypatch.setattr(solve, "MOST_ROUNDS", settled.rounds - 1)
@@ -378,7 +378,7 @@ def test_an_end_that_is_near_enough_does_not_alarm(monkeypatch):
 # ------------------------------------------------ stated against recovered exposures
 
 
-def test_stated_exposures_agree_but_for_a_common_offset_are_named_or_too_few():
+def test_stated_exposures_are_compared_up_to_a_common_offset():
     stated = np.array([0.0, 1.0, -0.5, 0.7, 0.2, np.nan])
     a = compare(stated + 3, np.full(6, 0.01), stated)
     assert a.rms_ev == pytest.approx(0, abs=1e-12)

@@ -1,4 +1,4 @@
-"""Corrections of display values: nothing at the start, what they claim elsewhere, gradients."""
+"""Corrections of display values: identity at the start, published formulas, gradients."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ RNG = np.random.default_rng(0)
 IMAGE = RNG.uniform(0.02, 0.9, (12, 20, 3))
 PICTURE = jnp.asarray(IMAGE, jnp.float32)
 MASK = jnp.ones(IMAGE.shape[:2], jnp.float32)
-# As fits call them: one program a shape, where eager calls make one an operation.
+# Compiled once per shape; eager calls would compile each operation.
 corrected = jax.jit(appearance.corrected, static_argnums=2)
 correction_of, contrast_loss = jax.jit(appearance.correction_of), jax.jit(terms.contrast_loss)
 mean_correction = jax.jit(appearance.mean_correction, static_argnums=1)
@@ -59,7 +59,7 @@ def test_a_bilateral_grid_is_sliced_trilinearly():
     np.testing.assert_allclose(corrected(PICTURE, grid, "bilateral"), expected, atol=1e-5)
 
 
-def test_a_curve_rises_and_goes_on():
+def test_a_curve_rises_and_continues_smoothly_above_1():
     x = jnp.linspace(0, 1.5, 400)[:, None, None] * jnp.ones(3)
     y = np.asarray(corrected(x, noisy("curve", 1.0), "curve"))[:, 0, 0]
     assert np.all(np.diff(y) > 0)
@@ -67,7 +67,7 @@ def test_a_curve_rises_and_goes_on():
     assert np.abs(np.diff(y, 2)).max() < 0.05
 
 
-def test_only_grids_are_kept_smooth():
+def test_only_bilateral_grids_are_regularised():
     smooth = jnp.ones_like(identity("bilateral", ["a", "b"]))
     grids = jax.jit(regularisation, static_argnums=1)
     assert float(grids(smooth, "bilateral")) == 0
@@ -135,12 +135,12 @@ def oracle(linear, view: ppisp.OneView):
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_ppisp_computes_what_the_paper_says(seed):
+def test_ppisp_agrees_with_the_published_formulas(seed):
     view = some_view(seed)
     np.testing.assert_allclose(applied(PICTURE, view), oracle(IMAGE, view), atol=3e-5)
 
 
-def test_a_view_has_its_own_exposure_and_its_cameras_response():
+def test_exposures_belong_to_views_and_responses_to_cameras():
     start = ppisp.identity(["b", "a", "b"])
     assert start.names == ("a", "b")
     parameters = jax.tree.map(lambda x: jnp.arange(x.size, dtype=x.dtype).reshape(x.shape), start)
@@ -158,7 +158,7 @@ def test_gradients_of_ppisp_are_finite_at_black_and_white():
     slope = jax.jit(jax.grad(lambda v, x: jnp.sum(ppisp.applied(x, v)), (0, 1)))
     gradient = slope(some_view(2, 1.5), image)
     assert all(bool(jnp.all(jnp.isfinite(g))) for g in jax.tree.leaves(gradient))
-    # At the identity the clips stand on their bounds; their parameters must be able to leave.
+    # At the identity values are at the bounds of clips, where gradients must not vanish.
     at_start = slope(ppisp.identity(["a"]).view(0), PICTURE)[0]
     y, x = np.mgrid[:12, :20] + 0.5
     r2 = ((y - 6) ** 2 + (x - 10) ** 2) / 20**2
@@ -166,7 +166,7 @@ def test_gradients_of_ppisp_are_finite_at_black_and_white():
     np.testing.assert_allclose(at_start.vignetting[:, 2], expected, rtol=1e-3)
 
 
-def test_the_regularisation_is_what_is_published():
+def test_the_regularisation_follows_the_published_formula():
     published, start = jax.jit(ppisp.regularisation_of), ppisp.identity(["a", "a", "b"])
     assert float(published(start)) == pytest.approx(0, abs=1e-7)
     moved = jax.tree.map(lambda x: x + jnp.asarray(RNG.normal(0, 0.4, x.shape), x.dtype), start)
@@ -190,7 +190,7 @@ def test_the_regularisation_is_what_is_published():
 
 
 @pytest.mark.parametrize("parameterization", ["log", "linear"])
-def test_exposures_are_handed_on_and_photographs_stay(parameterization):
+def test_exposures_move_from_ppisp_to_the_photometry_and_photographs_stay(parameterization):
     learned = replace(ppisp.identity(["a", "b"]), exposures=jnp.asarray([0.7, -1.2], jnp.float32))
     raw = (jnp.zeros(2),) * 2 if parameterization == "log" else (jnp.ones(2), jnp.full(2, 2.2))
     photometry = Photometry(*raw, parameterization)
@@ -209,7 +209,7 @@ def test_exposures_are_handed_on_and_photographs_stay(parameterization):
 
 # ---------------------------------------------------------------------- Luminance-GS
 
-# Of what is learned; statistics are not.
+# Fields that are learned; statistics are not.
 LEARNED = ("curve", "hidden", "hidden_bias", "out", "out_bias", "axes")
 
 
@@ -226,12 +226,12 @@ def learned(size, dtype=jnp.float32) -> gs.Luminance:
 def test_curves_stay_in_bounds_whatever_is_learned(size):
     view = learned(size).view(0)
     assert 0 <= float(view.curve.min()) < float(view.curve.max()) <= 1
-    # The clip is at work.
+    # At large sizes the clip is active.
     assert float(view.curve.min()) == 0 or size < 1
     assert bool(np.isfinite(enhanced(PICTURE, view)).all())
 
 
-def test_a_rising_curve_is_undone_and_any_gives_a_rising_display():
+def test_a_rising_curve_is_inverted_and_any_curve_gives_a_rising_display():
     start = gs.identity(1)
     view = replace(start, curve=start.curve**0.4, axes=start.axes + 0.7).view(0)
     photographed = jax.jit(gs.as_photographed)
@@ -241,7 +241,7 @@ def test_a_rising_curve_is_undone_and_any_gives_a_rising_display():
     assert (np.diff(shown, axis=0) >= -1e-6).all()
 
 
-def test_histogram_equalisation_is_what_it_is_called():
+def test_histogram_equalisation_follows_the_cumulative_histogram():
     grey = jnp.asarray([0.1, 0.1, 0.5, 0.9])
     found = cumulative(grey, jnp.asarray([1.0, 1.0, 1.0, 0.0]), 11)
     np.testing.assert_allclose(found, [0, *[2 / 3] * 4, *[1] * 6], atol=1e-6)
@@ -250,7 +250,7 @@ def test_histogram_equalisation_is_what_it_is_called():
     np.testing.assert_allclose(seen[-3:], IMAGE[::4, ::4].mean((0, 1)), rtol=1e-5)
 
 
-def test_a_dark_photograph_asks_for_a_curve_that_brightens():
+def test_the_prior_of_a_dark_photograph_brightens_its_curve():
     start = gs.identity(1)
 
     @jax.jit
@@ -260,7 +260,7 @@ def test_a_dark_photograph_asks_for_a_curve_that_brightens():
         return terms.curve_prior(moved.view(0), 0.1 * PICTURE, MASK)
 
     assert float(jax.grad(prior)(start.curve)[10:80].max()) < 0
-    # The pseudo curve, which follows, holds it back.
+    # A bent curve costs less only if the pseudo curve bends with it.
     bent = start.curve**0.4
     assert float(prior(bent, 0.4)) < float(prior(start.curve)) < float(prior(bent))
 
@@ -268,7 +268,7 @@ def test_a_dark_photograph_asks_for_a_curve_that_brightens():
 def test_contrast_compares_with_the_brightened_photograph():
     dark = 0.1 * PICTURE
     bright = dark * (0.5 / dark.mean())
-    # Brightness itself is not its business.
+    # The loss ignores brightness.
     for same in (bright, bright + 0.2):
         assert float(contrast_loss(same, dark, MASK)) == pytest.approx(0, abs=1e-9)
     assert float(contrast_loss(dark, dark, MASK)) > 1e-3
@@ -278,7 +278,7 @@ def test_contrast_compares_with_the_brightened_photograph():
     assert float(contrast_loss(aligned, dark, half)) == pytest.approx(0, abs=1e-9)
 
 
-def test_renders_teach_gaussians_alone_and_nothing_the_statistics():
+def test_shown_renders_train_no_curve_and_nothing_trains_the_statistics():
     at = learned(0.05)
 
     def shown(parameters):

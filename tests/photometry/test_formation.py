@@ -62,9 +62,9 @@ def capture(camera, exposure=1.7, gamma=2.0):
 
 
 def by_hand(linear, cfg, camera, exposure=1.7, gamma=2.0):
-    """The formation model, pixel by pixel in double precision."""
-    own = cfg.cameras[camera] if cfg.cameras and camera >= 0 else CameraFormation("")
-    splines = own.splines or ((cfg.spline,) if cfg.spline else ())
+    """Return the image by the formation model, pixel by pixel in double precision."""
+    row = cfg.cameras[camera] if cfg.cameras and camera >= 0 else CameraFormation("")
+    splines = row.splines or ((cfg.spline,) if cfg.spline else ())
     if cfg.curve == "spline" and not splines:
         splines = tuple(map(tuple, np.mean([c.splines for c in cfg.cameras], 0)))
     y = np.linspace(0.5 / 255, 1, 20000)
@@ -72,7 +72,7 @@ def by_hand(linear, cfg, camera, exposure=1.7, gamma=2.0):
     for c in range(3):
         spline = splines[c if len(splines) > 1 else 0] if splines else None
         z = log_exposed(y, Response("srgb", spline))[0]
-        k = own.vignetting[c if len(own.vignetting) > 1 else 0] if own.vignetting else (0, 0, 0)
+        k = row.vignetting[c if len(row.vignetting) > 1 else 0] if row.vignetting else (0, 0, 0)
         for v, u in np.ndindex(HEIGHT, WIDTH):
             from_centre = np.hypot(u + 0.5 - WIDTH / 2, v + 0.5 - HEIGHT / 2)
             r = from_centre / (np.hypot(WIDTH, HEIGHT) / 2)
@@ -97,38 +97,38 @@ def test_the_whole_model_against_pixels_by_hand(cfg, camera):
 
 @CONFIGS
 @pytest.mark.parametrize("camera", [-1, 0, 1])
-def test_the_inverse_takes_formation_back_below_saturation(cfg, camera):
+def test_the_inverse_recovers_radiance_below_saturation(cfg, camera):
     for seed, (exposure, gamma) in enumerate([(0.3, 1.6), (1.0, 2.2), (3.0, 2.8), (3.0, 1.6)]):
-        linear, taken = picture(seed), capture(np.int32(camera), exposure, gamma)
-        ldr = formation(linear, taken, cfg)
+        linear, settings = picture(seed), capture(np.int32(camera), exposure, gamma)
+        ldr = formation(linear, settings, cfg)
         seen = (ldr < 0.99) & (ldr > 2 / 255)
         assert seen.mean() > 0.3
-        back = inverse_formation(ldr, taken, cfg)
+        back = inverse_formation(ldr, settings, cfg)
         np.testing.assert_allclose(back[seen], linear[seen], rtol=5e-3)
 
 
 @CONFIGS
-def test_loose_pixels_are_those_of_the_image(cfg):
+def test_single_pixels_are_formed_as_in_the_whole_image(cfg):
     linear = picture()
-    taken = [capture(np.int32(camera), e) for camera, e in ((0, 1.0), (1, 2.0), (-1, 0.5))]
-    whole = np.array([formation(linear, one, cfg) for one in taken])
+    captures = [capture(np.int32(camera), e) for camera, e in ((0, 1.0), (1, 2.0), (-1, 0.5))]
+    whole = np.array([formation(linear, one, cfg) for one in captures])
     rng = np.random.default_rng(0)
     which, v, u = (rng.integers(0, n, 50) for n in (3, HEIGHT, WIDTH))
     names = ("exposure", "gamma", "white_balance", "camera")
-    rows = Capture(*(np.array([getattr(one, n) for one in taken])[which] for n in names))
+    rows = Capture(*(np.array([getattr(one, n) for one in captures])[which] for n in names))
     place = places(np.stack([u, v], 1) + np.float32(0.5), WIDTH, HEIGHT)
-    loose = formation(linear[v, u], rows, cfg, positions=place)
-    np.testing.assert_allclose(loose, whole[which, v, u], atol=1e-5)
+    single = formation(linear[v, u], rows, cfg, positions=place)
+    np.testing.assert_allclose(single, whole[which, v, u], atol=1e-5)
 
 
-def test_vignetting_without_a_place_is_refused():
+def test_vignetting_without_pixel_positions_is_refused():
     with pytest.raises(ValueError, match="positions"):
         formation(picture()[0], capture(0), SHADED)
     alone = DisplayTransform(1.0, 2.2, SHADED, camera=0)
     assert develop(picture()[0], alone.without_place()).shape == (WIDTH, 3)
 
 
-def test_what_is_not_modelled_leaves_the_trace():
+def test_parts_that_are_not_modelled_are_absent_from_the_trace():
     linear, row = jnp.asarray(picture()), jnp.int32(1)
     photometry = Photometry(jnp.zeros(3), jnp.zeros(3))
 
@@ -137,7 +137,7 @@ def test_what_is_not_modelled_leaves_the_trace():
         return sorted(str(e.primitive) for e in traced.jaxpr.eqns)
 
     def before(linear, photometry, row):
-        """What formation was when it knew exposures and gammas only."""
+        """Return the image formed with exposures and gammas alone."""
         return tone_map(photometry.exposures[row] * linear, photometry.gammas[row], PLAIN)
 
     def now(cfg):
@@ -169,7 +169,7 @@ def test_cameras_are_found_by_name_and_radii_are_1_in_corners():
 SRGB = preset("robust").photometry
 
 
-def test_a_display_transform_holds_all_of_it():
+def test_a_display_transform_holds_the_whole_formation_model():
     linear = picture()
     transform = DisplayTransform(1.7, 2.0, BY_CHANNEL, None, tuple(map(float, BALANCE)), 1)
     ldr = develop(linear, transform)
@@ -183,7 +183,7 @@ def test_a_display_transform_holds_all_of_it():
     assert transform.without_place().formation.cameras[1].splines == (OTHER, THIRD, BENT)
 
 
-def test_saturated_values_count_as_where_they_saturate():
+def test_saturated_values_are_undeveloped_to_the_saturation_level():
     back = undevelop(np.ones((1, 1, 3), np.float32), DisplayTransform(4.0, 2.2, SRGB))
     np.testing.assert_allclose(back, 0.25, rtol=1e-4)
 
@@ -210,7 +210,7 @@ VALUE_AND_SLOPE = jax.jit(jax.value_and_grad(tone_map), static_argnums=2)
 
 
 @pytest.mark.parametrize("x", [-1.0, 0.0, 1e-45, 1 + 1e-6, 5.0, 50.0, np.inf])
-def test_dark_and_bright_ends(x):
+def test_dark_and_bright_ends_have_finite_gradients(x):
     y, slope = VALUE_AND_SLOPE(np.float32(x), np.float32(2.2), PAPER)
     assert np.isfinite(slope)
     if x < 1:
@@ -260,7 +260,7 @@ def test_parameterisations_never_reach_zero():
         p = Photometry(raw, raw, "linear")
         return jnp.sum(p.exposures + 2 * p.gammas)
 
-    # What has left the range can come back.
+    # Parameters outside the range keep their gradient.
     np.testing.assert_array_equal(jax.grad(total)(jnp.array([-5.0, 1e-3, 2.0])), 3.0)
 
 
@@ -278,7 +278,7 @@ def test_radiance_activations_invert(kind):
 @pytest.mark.parametrize("tinted", [False, True])
 @pytest.mark.parametrize("parameterization", ["log", "linear"])
 @pytest.mark.parametrize("activation", ["exp", "linear"])
-def test_photographs_stay_and_the_mean_goes(activation, parameterization, tinted):
+def test_recentring_keeps_photographs_and_removes_the_mean(activation, parameterization, tinted):
     rng = np.random.default_rng(0)
     zeros = jnp.zeros((20, 3))
     sh = jnp.asarray(rng.normal(0, 0.5, (20, 4, 3)), jnp.float32).at[:, 0].add(2.0)
@@ -290,7 +290,7 @@ def test_photographs_stay_and_the_mean_goes(activation, parameterization, tinted
     after = recentre(before, activation)
 
     def exposed(p):
-        # Any direction: values of degree 1 are arbitrary here, that of degree 0 is constant.
+        # Harmonics of one direction: degree 0 is constant, values of degree 1 are arbitrary.
         value = jnp.einsum("k,nkc->nc", jnp.array([0.28209479, 0.3, -0.2, 0.4]), p.gaussians.sh)
         light = p.photometry.exposures[:, None, None] * radiance_activation(value, activation)
         tint = p.photometry.white_balance

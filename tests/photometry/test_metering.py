@@ -1,4 +1,4 @@
-"""Meters read what they say, and the rule that a camera followed is found, or none is."""
+"""Readings of meters, and the metering rule of a camera, which is found only if there is one."""
 
 import numpy as np
 import pytest
@@ -34,14 +34,14 @@ def test_meters_follow_the_light_and_nothing_else():
     for name, value in meter(3 * PICTURE, OPAQUE).items():
         assert value == pytest.approx(found[name] + np.log(3)), name
     for name, value in meter(0.5 * PICTURE, 0.5 * OPAQUE).items():
-        assert value == pytest.approx(found[name]), f"{name} sees opacity"
+        assert value == pytest.approx(found[name]), f"{name} depends on opacity"
     bright_centre = np.ones((40, 60, 3))
     bright_centre[15:25, 22:38] = 8.0
     found = meter(bright_centre, OPAQUE)
     assert found["centre_log_average"] > found["log_average"] + 0.1
 
 
-def test_a_hole_says_nothing_and_takes_the_mean():
+def test_a_transparent_render_has_no_reading_and_gets_the_mean_exposure():
     found = meter(np.zeros((40, 60, 3)), np.zeros((40, 60)))
     assert np.isnan(list(found.values())).all()
     logs = 0.7 - READ["average"]
@@ -57,17 +57,17 @@ def test_the_rule_of_a_camera_is_found(name):
     assert LN2 * metering.exposure_ev(ROWS[3]) == pytest.approx(0.4 - ROWS[3][name], abs=0.05)
 
 
-def test_drawn_and_constant_exposures_have_no_rule():
-    drawn = 0.4 * np.random.default_rng(7).standard_normal(40)
-    metering = fit(drawn)
+def test_random_and_constant_exposures_have_no_rule():
+    random = 0.4 * np.random.default_rng(7).standard_normal(40)
+    metering = fit(random)
     assert metering.rule.meter is None
     assert "best of 4" in metering.sentence
-    assert metering.exposure_ev(ROWS[0]) == pytest.approx(drawn.mean() / LN2)
-    assert "hardly vary" in fit(0.01 * drawn).sentence
-    assert "too few" in fit(drawn[:3]).sentence
+    assert metering.exposure_ev(ROWS[0]) == pytest.approx(random.mean() / LN2)
+    assert "hardly vary" in fit(0.01 * random).sentence
+    assert "too few" in fit(random[:3]).sentence
 
 
-def test_given_rules_bring_the_picture_where_they_say():
+def test_named_rules_bring_the_render_to_their_display_level():
     cfg, read = PhotometryConfig(), meter(PICTURE, OPAQUE)
     metering = fit(np.zeros(8), exposed_at(0.98, 2.2, cfg))
 
@@ -75,10 +75,10 @@ def test_given_rules_bring_the_picture_where_they_say():
         pixel = np.full((1, 1, 3), radiance, np.float32)
         return develop(pixel, DisplayTransform(exposure, 2.2, cfg)).max()
 
-    for of, level in (("log_average", shown(1.0, 0.18)), ("highlights", 0.98)):
-        found = shown(metering.exposure(read, of), np.exp(read[of]))
+    for rule, level in (("log_average", shown(1.0, 0.18)), ("highlights", 0.98)):
+        found = shown(metering.exposure(read, rule), np.exp(read[rule]))
         assert found == pytest.approx(level, abs=1e-3)
-    least = min(metering.exposure(read, of) for of in ("log_average", "highlights"))
+    least = min(metering.exposure(read, rule) for rule in ("log_average", "highlights"))
     assert metering.exposure(read, "protected") == pytest.approx(least)
 
 
@@ -90,7 +90,7 @@ def test_exposures_along_a_path_adapt_alike_in_both_directions():
     np.testing.assert_allclose(adapted(np.full(9, 0.3), 5.0), 0.3)
 
 
-def test_the_file_gives_the_metering_back(tmp_path):
+def test_metering_is_read_back_from_its_file(tmp_path):
     metering, path = fit(-READ["average"][:12], 0.9), tmp_path / "metering.json"
     write_metering(path, metering)
     back = read_metering(path)
@@ -98,8 +98,8 @@ def test_the_file_gives_the_metering_back(tmp_path):
     assert (back.names, back.white) == (metering.names, metering.white)
     assert [r.words for r in back.candidates] == [r.words for r in metering.candidates]
     assert back.rule.left_out_ev == metering.rule.left_out_ev
-    for of in ("auto", "log_average"):
-        assert back.typical_exposure(of) == pytest.approx(metering.typical_exposure(of), rel=1e-12)
+    for rule in ("auto", "log_average"):
+        assert back.typical_exposure(rule) == pytest.approx(metering.typical_exposure(rule), 1e-12)
     path.write_text("{}")
     with pytest.raises(UserError, match=r"metering\.json cannot be read"):
         read_metering(path)

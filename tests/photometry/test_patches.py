@@ -1,4 +1,4 @@
-"""The same patch of surface in every view: what a matte road must not do to exposures."""
+"""Patches of a surface, alike in all views: a matte road must not bias exposures."""
 
 from pathlib import Path
 
@@ -24,7 +24,7 @@ class Road(ImageStore):
     """Photographs of a matte road, its pixels integrated exactly; cameras are 1.5 m above it."""
 
     K = np.array([[200.0, 0, 80], [0, 200, 20], [0, 0, 1]], np.float32)
-    width, height, above, cell = 160, 110, 1.5, 0.02
+    width, height, above, cell = 160, 110, 1.5, 0.02  # pixels, pixels, m, m
 
     def __init__(self, contrast=0.35):
         rng, shape = np.random.default_rng(0), (2000, 500)
@@ -58,7 +58,7 @@ class Road(ImageStore):
 
 @pytest.fixture(scope="module")
 def road():
-    """Return what twelve views of the road, 0.8 m apart, show at 4,000 of its points."""
+    """Return observations of 4,000 points of the road in twelve views that are 0.8 m apart."""
     rng = np.random.default_rng(1)
     points = np.stack([rng.uniform(-4, 4, 4000), np.full(4000, 1.5), rng.uniform(3, 38, 4000)], 1)
     views, which, seen, places = [], [], [], []
@@ -80,16 +80,16 @@ OPTIONS = CalibrationOptions(black=4 / 255, saturation=250 / 255, pivot=0.18)
 
 
 def test_exposures_do_not_drift_along_a_matte_road(road):
-    """A view averages more of the road the farther it looks: patches have to be alike."""
+    """A pixel averages more of the road farther away, so patches must be alike in all views."""
     solved = fit_model(OPTIONS.problem(road), "view_exposure")
     ev = solved.exposures_ev - solved.exposures_ev.mean()
-    # Squares in the image left 0.005 EV, all of it a drift.
+    # With square patches in the image the drift was 0.005 EV.
     assert np.std(ev) < 0.0015
     assert abs(np.polyfit(0.8 * np.arange(12), ev, 1)[0]) < 2e-4
 
 
 def test_equal_exposures_of_a_matte_road_are_found_equal(road):
-    """What predicts neighbours is not chosen, nor what a curve takes for noise."""
+    """Neither correlated neighbours nor a curve's noise model favour a richer model."""
     chosen = calibrate_observations(road, OPTIONS)
     assert chosen.solution.model == "constant"
     density = {
@@ -97,7 +97,7 @@ def test_equal_exposures_of_a_matte_road_are_found_equal(road):
         for c in chosen.candidates
         if c.form == Form("constant") and c.choice.curve.splines is None
     }
-    # Equal exposures tell no curve. Each under its own noise, they differed by 0.035.
+    # Equal exposures tell no curve. With a noise model per curve, densities differed by 0.035.
     assert abs(density["srgb"] - density["power"]) < 0.003
 
 
@@ -111,7 +111,7 @@ def test_whole_regions_are_held_out(road):
     assert np.any(held != held_out(road, 1))
 
 
-def test_normals_are_those_of_neighbours_or_unknown():
+def test_normals_follow_flat_neighbourhoods_and_are_unknown_elsewhere():
     rng = np.random.default_rng(0)
     flat = np.concatenate([rng.uniform(-1, 1, (400, 2)), 0.001 * rng.standard_normal((400, 1))], 1)
     turn, _ = np.linalg.qr(rng.standard_normal((3, 3)))

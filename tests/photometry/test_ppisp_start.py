@@ -11,14 +11,14 @@ from p2gs_jax.photometry.ppisp_start import start_of
 
 EXPOSURES, GAMMAS = np.array([0.5, 1.0, 3.0]), np.full(3, 2.2)
 BALANCES = np.log([[1.2, 1.0, 1 / 1.2], [1, 1, 1], [0.8, 1.1, 1 / 0.88]])
-# The second camera darkens by channel; its photographs are upright.
+# The second camera has vignetting per channel; its photographs are in portrait format.
 DARKENS = (((-0.3, 0.05, 0.0),), ((-0.4, 0, 0), (-0.5, 0, 0), (-0.6, 0, 0)))
 CAMERAS = tuple(CameraFormation(n, v) for n, v in zip("ab", DARKENS, strict=True))
 SIZES = {"a": (48, 32), "b": (32, 48)}
 
 
 @pytest.mark.parametrize(("curve", "codes"), [("power", 0.5), ("srgb", 1.5)])
-def test_greys_and_vignetting_are_those_of_the_photographs(curve, codes):
+def test_greys_and_vignetting_agree_with_the_photographs(curve, codes):
     cfg, cameras = PhotometryConfig(curve=curve, cameras=CAMERAS), ("a", "a", "b")
     start = start_of(cfg, cameras, EXPOSURES, GAMMAS, BALANCES, SIZES)
     assert start.codes.max() < codes
@@ -29,8 +29,8 @@ def test_greys_and_vignetting_are_those_of_the_photographs(curve, codes):
         ramp = np.geomspace(1e-3, 2, width * height, dtype=np.float32)
         grey = np.repeat(np.random.default_rng(row).permutation(ramp)[:, None], 3, 1)
         grey = grey.reshape(height, width, 3)
-        taken = {"white_balance": tuple(BALANCES[row]), "camera": "ab".index(name)}
-        expected = develop(grey, DisplayTransform(EXPOSURES[row], 2.2, cfg, **taken))
+        settings = {"white_balance": tuple(BALANCES[row]), "camera": "ab".index(name)}
+        expected = develop(grey, DisplayTransform(EXPOSURES[row], 2.2, cfg, **settings))
         light = grey * np.float32(2**start.radiance_ev)
         found = jax.jit(ppisp.applied)(light, start.parameters.view(row))
         off = 255 * np.abs(np.asarray(found) - expected)

@@ -1,4 +1,4 @@
-"""Responses: derivatives, inverse, monotony, and the bent curve in image formation."""
+"""Responses: derivatives, inverse, monotonicity, and the bent curve in image formation."""
 
 import jax
 import jax.numpy as jnp
@@ -39,7 +39,7 @@ def test_slope_is_the_derivative(response):
     np.testing.assert_allclose(log_exposed(y, response)[1], numeric, rtol=1e-5)
 
 
-def test_knots_and_held_ones():
+def test_knots_rise_and_falling_or_flat_curves_are_recognised():
     assert np.all(np.diff(KNOTS) > 0)
     assert set(FREE) | set(HELD) == set(range(len(KNOTS)))
     assert rises(BENT)
@@ -48,13 +48,13 @@ def test_knots_and_held_ones():
 
 
 @pytest.mark.parametrize("by", ["all", "camera", "channel"])
-def test_parameters_of_splines_are_those_that_are_solved_for(by):
+def test_the_count_of_spline_parameters_is_that_of_the_solver(by):
     solved = Splines(by, spline_count(by, 4))
     assert spline_parameters(by, 4) == solved.count - bool(solved.powers.size)
     assert spline_parameters(None, 4) == 0
 
 
-def test_dark_and_uncertain_values_say_less():
+def test_dark_and_uncertain_values_have_larger_deviations():
     y = np.array([0.02, 0.1, 0.5])
     slope = log_exposed(y, Response())[1]
     plain = deviation(y, slope)
@@ -74,7 +74,7 @@ def test_the_host_decodes_as_the_device_does(base):
     np.testing.assert_allclose(np.exp(base_log(y, base)[0]), on_device, rtol=5e-6)
 
 
-def test_formation_follows_the_spline_and_is_never_dead():
+def test_formation_follows_the_spline_and_its_slope_is_never_0():
     y = jnp.linspace(0.01, 0.995, 200)
     exposed = jnp.exp(jnp.asarray(log_exposed(np.asarray(y), BENT)[0]))
     np.testing.assert_allclose(tone_map(exposed, jnp.float32(2.2), CFG), y, atol=2e-3)
@@ -96,7 +96,7 @@ def test_a_filmic_curve_is_found():
     x = np.geomspace(0.02, 0.5, 50)
 
     def off(response):
-        """Up to scale and power, which no photograph can tell."""
+        """Return the largest error up to scale and power, which no photograph determines."""
         z = log_exposed(encode(x, "filmic"), response)[0]
         return np.abs(np.polyval(np.polyfit(np.log(x), z, 1), np.log(x)) - z).max()
 

@@ -1,4 +1,4 @@
-"""Residuals that depend on the place are said with their photographs; noise is not."""
+"""Residuals that depend on the position in the image are reported; noise is not."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ NAMES = tuple(f"{k}.jpg" for k in range(VIEWS))
 
 @pytest.fixture(scope="module")
 def scene():
-    """Return observations of points that move through the image, and noise as residuals, stops."""
+    """Return observations of moving points, noise of residuals (stops) and radiances (stops)."""
     rng = np.random.default_rng(0)
     start = rng.uniform(-0.75, 0.75, (POINTS, 2)) * [0.8, 0.6]
     places = (start * np.linspace(0.8, 1.2, VIEWS)[:, None, None]).reshape(-1, 2)
@@ -27,21 +27,21 @@ def scene():
     return observations, noise, stops
 
 
-def said(scene, change):
+def warnings_of(scene, change):
     observations, noise, _ = scene
     return place_warnings(observations, noise + change[:, None], np.ones(noise.shape, bool))
 
 
-def test_noise_and_values_say_nothing(scene):
+def test_noise_and_residuals_of_brightness_give_no_warning(scene):
     stops = scene[2]
-    assert said(scene, np.zeros(len(stops))) == []
-    assert said(scene, 0.1 * stops) == [], "a tone curve does not depend on the place"
+    assert warnings_of(scene, np.zeros(len(stops))) == []
+    assert warnings_of(scene, 0.1 * stops) == [], "a tone curve does not depend on positions"
 
 
 def test_a_photograph_that_depends_on_the_place_is_named_alone(scene):
     observations, noise, _ = scene
     change = np.where(observations.views == ODD, 0.5 * observations.positions[:, 0], 0.0)
-    (line,) = said(scene, change)
+    (line,) = warnings_of(scene, change)
     assert "position in the image" in line
     assert f"In 1 of {VIEWS}" in line
     assert [name for name in NAMES if name in line] == [NAMES[ODD]]

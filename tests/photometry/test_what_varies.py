@@ -1,4 +1,4 @@
-"""The model is as rich as the scene needs: solved right, told apart, and chosen with reasons."""
+"""Models as rich as the scene needs: their parameters, their selection and its reasons."""
 
 import dataclasses
 
@@ -14,10 +14,10 @@ from p2gs_jax.photometry.candidates import Candidate, choose
 from p2gs_jax.photometry.models import Choice, Curve, Form, Scope, neighbours, parameter_count
 from p2gs_jax.photometry.response import FREE, HELD, Response, log_exposed
 
-# Log factors on red, green, blue: dark photographs are bluer; each camera has its own.
+# Log factors on red, green, blue: dark photographs are bluer; cameras differ.
 DARK = np.where(np.median(ISO4) > ISO4, 1.0, -1.0)[:, None] * [-0.06, -0.06, 0.12]
 OF_CAMERA = np.array([[0.1, 0.0, -0.1], [-0.05, 0.0, 0.05], [-0.05, 0.0, 0.05]])
-LOST = np.array([[0.45], [0.15], [0.3]]) * [1.0, 1.0, 1.0]
+LOST = np.array([[0.45], [0.15], [0.3]]) * [1.0, 1.0, 1.0]  # share of light, per camera
 SHORT = make_drive(10, 700)
 
 
@@ -65,7 +65,7 @@ def test_corners_are_solved_for_each_camera(kind):
     assert np.std(s.log_exposures - np.log(ISO4)) / np.log(2) < 0.015
 
 
-def test_cameras_may_have_responses_of_their_own():
+def test_each_camera_may_have_a_separate_response():
     drive = make_drive(16, 1500)
     curves = np.array([["srgb"] * 3, ["filmic"] * 3, ["srgb"] * 3])
     o = observe(drive, make_exposures(drive, "iso4"), curve=curves, outliers=0.02)
@@ -79,7 +79,7 @@ def test_cameras_may_have_responses_of_their_own():
     assert [c.splines for c in s.cameras] == [(spline,) for spline in found.splines]
 
 
-def test_channels_with_exposures_of_their_own_have_no_powers_of_their_own():
+def test_with_a_white_balance_per_view_channels_have_no_separate_powers():
     # Dark photographs are bluer; a power per channel would explain that as well, and leave white
     # balances undetermined.
     o = observe(DRIVE, ISO4[:, None] * np.exp(DARK), seed=2)
@@ -92,7 +92,7 @@ def test_channels_with_exposures_of_their_own_have_no_powers_of_their_own():
     assert apart == 3 * len(FREE)
 
 
-def test_choices_one_step_apart():
+def test_neighbours_are_choices_one_step_apart():
     scope = Scope(cameras=3, places=True, curves=True)
     plain = Choice(Form("view_exposure"))
     near = neighbours(plain, scope)
@@ -120,7 +120,7 @@ def test_choices_one_step_apart():
         ("iso2", "power", "camera", "view_exposure_camera_gamma", "power"),
     ],
 )
-def test_what_varies_is_found(exposures, curve, gamma, model, response):
+def test_the_simulated_variation_is_found(exposures, curve, gamma, model, response):
     gammas = None if gamma is None else np.array([2.0, 2.2, 2.45])[SHORT.cameras]
     truth = make_exposures(SHORT, exposures)
     s = select(observe(SHORT, truth, curve=curve, gammas=gammas, pivot=0.18))
@@ -151,9 +151,9 @@ def test_known_exposures_that_differ_tell_the_power_of_the_curve(known, cameras)
     o = observe(SHORT, truth, **how)
     if cameras == 1:
         o = dataclasses.replace(o, cameras=0 * o.cameras, camera_names=("front",))
-    given = np.full(len(truth), np.nan)
-    given[:known] = np.log(truth[:known])
-    s = select(o, known=KnownExposures(given))
+    log_known = np.full(len(truth), np.nan)
+    log_known[:known] = np.log(truth[:known])
+    s = select(o, known=KnownExposures(log_known))
     light = s.solution.point_log_radiance
     seen = np.isfinite(light).all(1)
     slope = np.polyfit(np.log(SHORT.radiance[seen]).ravel(), light[seen].ravel(), 1)[0]
@@ -191,14 +191,14 @@ def test_equal_exposures_stay_equal_where_corners_tell_the_curve():
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("value", [0.0, 1.0])
-def test_photographs_that_tell_nothing_choose_something_and_know_no_exposure(value):
+def test_black_and_saturated_photographs_give_a_model_without_known_exposures(value):
     s = select(dataclasses.replace(PLAIN, colors=np.full_like(PLAIN.colors, value))).solution
     assert np.isinf(s.exposure_errors).all()
     assert np.isfinite(s.log_exposures).all()
     assert (s.observations_per_view == 0).all()
 
 
-def test_the_simplest_that_is_not_clearly_worse_wins():
+def test_the_simplest_model_that_is_not_clearly_worse_wins():
     def candidate(model, parameters, density, deficit, error, difference=9.0):
         choice = Choice(Form(model))
         return Candidate(choice, Response(), parameters, density, deficit, error, difference)
@@ -207,7 +207,7 @@ def test_the_simplest_that_is_not_clearly_worse_wins():
     middle = candidate("camera_exposure", 2, -0.51, 0.008, 0.001)
     rich = candidate("view_exposure", 40, -0.5, 0.0, 0.0)
     assert choose([rich, simple, middle]) is middle
-    # Two standard errors count, where they are more than the smallest gain.
+    # Two standard errors are allowed, if these exceed the smallest gain.
     noisy = candidate("constant", 0, -0.6, 0.1, 0.06)
     assert choose([rich, noisy, middle]) is noisy
     # A difference that nobody can see does not count, however sure it is.
