@@ -16,7 +16,7 @@ from p2gs_jax.run.photometry_files import read_photometry
 from p2gs_jax.synth.sensor import read_true_exposures
 
 
-def test_street(noisy_street, tmp_path):
+def test_exposures_of_a_street_are_recovered(noisy_street, tmp_path):
     result = calibrate(noisy_street, tmp_path / "out")
     saved = read_photometry(tmp_path / "out" / "photometry.json")
     truth = read_true_exposures(noisy_street)
@@ -36,24 +36,24 @@ def test_command_keeps_known_exposures(noisy_street, tmp_path, succeeded):
     path = tmp_path / "known.csv"
     path.write_text("image,exposure\n" + "\n".join(f"{k},{5 * v}" for k, v in truth.items()))
     argv = ("calibrate", noisy_street, "--out", tmp_path / "out", "--known-exposures", path)
-    # What is chosen without known exposures, `test_street` says.
+    # `test_exposures_of_a_street_are_recovered` selects a model; here it is fixed.
     text = succeeded(*argv, "--photometry.no-select", "--photometry.model", "view_exposure")
     assert "Results: " in text
     for view in read_photometry(tmp_path / "out" / "photometry.json")["views"]:
         assert view["exposure"] == pytest.approx(5 * truth[view["image"]], rel=1e-3)
 
 
-def test_castle_says_that_exif_and_pixels_disagree(shared_data, tmp_path):
+def test_a_photograph_whose_exif_and_pixels_disagree_is_reported(shared_data, tmp_path):
     root = shared_data("sceaux_castle")
-    given = {"photometry.select": False, "photometry.model": "view_exposure"}
-    cfg = p2gs_jax.with_fields(p2gs_jax.preset("robust"), given)
+    fixed = {"photometry.select": False, "photometry.model": "view_exposure"}
+    cfg = p2gs_jax.with_fields(p2gs_jax.preset("robust"), fixed)
     result = calibrate(root, tmp_path / "out", cfg, compare_with=str(root / "exposures.csv"))
     assert result.agreement.correlation > 0.7
     assert result.agreement.disagrees[[v.name for v in result.views].index("100_7109.jpg")]
     assert any("disagrees with the pixels" in m for m in result.messages)
 
 
-def test_what_a_small_run_can_say_is_written(finished_run, tmp_path):
+def test_a_short_run_is_calibrated_from_its_depth(finished_run, tmp_path):
     run = p2gs_jax.load_run(finished_run)
     found = calibrate_run(finished_run, tmp_path / "out", run.cfg)
     saved = read_photometry(tmp_path / "out" / "photometry.json")["views"]
@@ -67,7 +67,7 @@ def test_what_a_small_run_can_say_is_written(finished_run, tmp_path):
 
 
 def stack(folder, times, response=lambda x: x ** (1 / 2.2), seed=0, drift=None):
-    """Write a smooth HDR picture at several exposures."""
+    """Write an HDR picture at exposures `times`; `drift(frame, linear)` is a factor on light."""
     rng = np.random.default_rng(seed)
     base = cv2.resize(rng.normal(0, 1, (12, 16, 1)), (320, 240), interpolation=cv2.INTER_CUBIC)
     log = 1.8 * base[..., None] + 0.2 * np.array([0.3, 0.0, -0.3]) - 1.5
@@ -85,7 +85,7 @@ def s_curve(x):
 
 
 @pytest.mark.parametrize("response", [lambda x: x ** (1 / 2.2), s_curve])
-def test_stack_exposures(tmp_path, response):
+def test_exposures_of_a_stack_are_recovered(tmp_path, response):
     times = 2.0 ** np.arange(3, -4, -1)
     stack(tmp_path / "s", times, response)
     result = calibrate_stack(tmp_path / "s")
@@ -96,7 +96,7 @@ def test_stack_exposures(tmp_path, response):
     assert result.details["one_response"]
 
 
-def test_the_command_writes_what_a_stack_says(tmp_path, succeeded):
+def test_the_command_writes_the_calibration_of_a_stack(tmp_path, succeeded):
     times = 2.0 ** np.arange(2, -3, -1)
     stack(tmp_path / "s", times)
     listed = tmp_path / "times.csv"
@@ -116,7 +116,7 @@ def test_the_command_writes_what_a_stack_says(tmp_path, succeeded):
     assert (out / "calibration.png").stat().st_size > 10_000
 
 
-def test_stack_tone_mapped_by_region_is_recognised(tmp_path):
+def test_a_stack_with_local_tone_mapping_is_recognised(tmp_path):
     def local(i, linear):
         # Shadows are lifted, more in some regions, and differently from frame to frame.
         regions = cv2.resize(
@@ -130,7 +130,7 @@ def test_stack_tone_mapped_by_region_is_recognised(tmp_path):
     assert any("One response does not explain" in m for m in result.messages)
 
 
-def test_stacks_must_fit_together(tmp_path):
+def test_stacks_of_several_sizes_or_with_broken_files_are_refused(tmp_path):
     stack(tmp_path / "s", [1.0, 2.0])
     cv2.imwrite(str(tmp_path / "s" / "zz.png"), np.zeros((10, 10, 3), np.uint8))
     with pytest.raises(UserError, match="give photographs of one size"):
@@ -147,8 +147,8 @@ def test_stacks_must_fit_together(tmp_path):
         *(pytest.param(n, marks=pytest.mark.slow) for n in ("hdr_memorial", "hdr_taipei_night")),
     ],
 )
-def test_real_stacks(shared_data, name):
-    """Recovered exposure ratios against the listed times on the frames that carry signal."""
+def test_exposures_of_real_stacks_are_recovered(shared_data, name):
+    """Recovered exposures agree with the listed times in frames that carry signal."""
     folder = shared_data(name)
     result = calibrate_stack(folder)
     with (folder / "exposures.csv").open(newline="") as file:
@@ -160,5 +160,5 @@ def test_real_stacks(shared_data, name):
     assert result.details["one_response"]
 
 
-def test_the_phone_is_recognised(shared_data):
+def test_a_phone_without_a_single_response_is_recognised(shared_data):
     assert not calibrate_stack(shared_data("hdr_iphone_night")).details["one_response"]

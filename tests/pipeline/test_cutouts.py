@@ -21,7 +21,7 @@ SIZE, COLOR = 48, np.array([0.8, 0.3, 0.2])
 
 
 def write_ball(root, count, part):
-    """Write views of a ball of one colour and radius 1 around the origin, seen from 4 away."""
+    """Write views of a ball of one colour and radius 1 at the origin, from a distance of 4."""
     data = blender(around(count), part, angle=0.7)
     (root / part).mkdir(parents=True)
     (root / f"transforms_{part}.json").write_text(json.dumps(data))
@@ -44,7 +44,7 @@ SHORT |= {"render.sh_degree": 0, "render.pixels_in_flight": 2048}
 
 @pytest.fixture(scope="module")
 def ball(tmp_path_factory):
-    """Return the run of a ball over green, a few steps from seeds at random."""
+    """Return result and run of a short fit of a ball over green, from random seeds."""
     root = tmp_path_factory.mktemp("ball")
     write_ball(root, 12, "train")
     write_ball(root, 4, "test")
@@ -52,7 +52,7 @@ def ball(tmp_path_factory):
     return result, load_run(root / "run")
 
 
-def test_held_out_views_are_the_data_set_s_and_scores_over_the_background(ball):
+def test_held_out_views_of_the_data_set_are_scored_over_the_background(ball):
     result, run = ball
     assert result.metrics["split"] == "transforms_test.json"
     assert sorted(result.metrics["test"]["averaged"]["per_view"]) == [
@@ -71,9 +71,9 @@ def test_pictures_show_the_background_and_exr_files_do_not(ball):
     _, run = ball
     stem = run.folder / "renders" / "test" / "r_0"
     shown = cv2.imread(f"{stem}.render.png")[..., ::-1] / 255
-    taken = cv2.imread(f"{stem}.photograph.png")[..., ::-1] / 255
+    photograph = cv2.imread(f"{stem}.photograph.png")[..., ::-1] / 255
     assert np.abs(shown[:3, :3] - [0.1, 0.9, 0.1]).max() < 0.1
-    assert np.abs(taken[0, 0] - [0.1, 0.9, 0.1]).max() < 0.01
+    assert np.abs(photograph[0, 0] - [0.1, 0.9, 0.1]).max() < 0.01
     linear, *_ = read_exr(stem.with_suffix(".exr"))
     assert np.abs(linear[:3, :3]).max() < 0.1
     assert run.own_display(0).backdrop == pytest.approx((0.1, 0.9, 0.1))
@@ -81,7 +81,7 @@ def test_pictures_show_the_background_and_exr_files_do_not(ball):
 
 @pytest.fixture
 def twin(ball, tmp_path):
-    """Return a copy of the run's renders, and how it is judged as another program's."""
+    """Return a copy of the run's renders, a function that judges it, and the run's scores."""
     result, run = ball
     shutil.copytree(run.folder / "renders", tmp_path / "twin")
 
@@ -93,30 +93,30 @@ def twin(ball, tmp_path):
 
 
 def test_renders_of_others_are_judged_over_the_same_background(twin):
-    folder, judged, own = twin
-    for kind, suffix, tolerance in (("pictures", ".png", 0.1), ("radiance", ".exr", 0.01)):
+    folder, judged, scores = twin
+    for kind, suffix, limit in (("pictures", ".png", 0.1), ("radiance", ".exr", 0.01)):
         found = judged()
         fitted = found["exposure_fitted"]
-        assert fitted["psnr"] == pytest.approx(own["exposure_fitted"]["psnr"], abs=tolerance), kind
+        assert fitted["psnr"] == pytest.approx(scores["exposure_fitted"]["psnr"], abs=limit), kind
         for path in folder.rglob(f"*{suffix}"):
             path.unlink()
         if kind == "radiance":
             mean = found["as_rendered"]["psnr"]
-            assert mean == pytest.approx(own["averaged"]["psnr"], abs=tolerance)
+            assert mean == pytest.approx(scores["averaged"]["psnr"], abs=limit)
 
 
-def test_an_exposure_moves_what_is_there_and_not_what_is_behind_it(twin):
-    folder, judged, own = twin
-    # Darker by a power of light, the background with it: no exposure brings that back.
+def test_a_fitted_exposure_changes_the_object_and_not_the_background(twin):
+    folder, judged, scores = twin
+    # The background is darkened as well, which no exposure restores.
     for path in folder.rglob("*.render.png"):
         cv2.imwrite(str(path), np.rint(0.7 * cv2.imread(str(path)).astype(float)))
     found = judged()
-    behind = -10 * np.log10(0.75 * np.mean((0.3 * np.array([0.1, 0.9, 0.1])) ** 2))
-    assert found["as_rendered"]["psnr"] < found["exposure_fitted"]["psnr"] < behind + 1
-    assert found["exposure_fitted"]["psnr"] < own["exposure_fitted"]["psnr"] - 3
+    background_db = -10 * np.log10(0.75 * np.mean((0.3 * np.array([0.1, 0.9, 0.1])) ** 2))
+    assert found["as_rendered"]["psnr"] < found["exposure_fitted"]["psnr"] < background_db + 1
+    assert found["exposure_fitted"]["psnr"] < scores["exposure_fitted"]["psnr"] - 3
 
 
-def test_light_behind_the_splats_and_a_background_are_one_too_many(ball, tmp_path):
+def test_two_backgrounds_are_refused(ball, tmp_path):
     _, run = ball
     cfg = with_fields(run.cfg, {"render.background": (1.0,) * 3})
     with pytest.raises(UserError, match=r"there are two backgrounds: render.background"):

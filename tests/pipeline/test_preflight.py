@@ -1,4 +1,4 @@
-"""A fit that is refused leaves its folder to the next command; memory is foretold and named."""
+"""A refused fit leaves its folder to the next command; memory is estimated before a fit."""
 
 import dataclasses
 import shutil
@@ -18,7 +18,7 @@ from p2gs_jax.errors import DivergenceError, UserError
 from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.pipeline import fit as pipeline
-from p2gs_jax.pipeline import preflight as module
+from p2gs_jax.pipeline import preflight
 from p2gs_jax.pipeline.preflight import (
     MemoryNeeded,
     check_run_dir,
@@ -32,8 +32,7 @@ from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import KEY, Decisions, kept_choice
 from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.run.write import write_start
-from p2gs_jax.scene.pixels import cache
-from p2gs_jax.scene.pixels import store as held
+from p2gs_jax.scene.pixels import cache, store
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +41,7 @@ def scene(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "words"),
     [
         (("--preset", "paper", "--known-exposures", "KNOWN"), "draws initial exposures"),
         (("--preset", "ppisp", "--photometry.curve", "srgb"), "a whole camera"),
@@ -50,13 +49,13 @@ def scene(tmp_path_factory):
         (("--known-exposures", "exif"), "carries an exposure time"),
     ],
 )
-def test_a_refused_option_does_not_lock_the_folder(tmp_path, scene, refused, options, said):
+def test_a_refused_option_does_not_lock_the_folder(tmp_path, scene, refused, options, words):
     known = tmp_path / "known.csv"
     known.write_text("image,exposure\nelsewhere.png,1\n")
     run = tmp_path / "run"
-    given = [str(known) if o == "KNOWN" else o for o in options]
-    text = refused("fit", scene, "--out", run, *given)
-    assert said in text
+    argv = [str(known) if o == "KNOWN" else o for o in options]
+    text = refused("fit", scene, "--out", run, *argv)
+    assert words in text
     assert "To fix it" in text
     assert not (run / "config.json").exists()
     check_run_dir(run, False, FitConfig())
@@ -64,15 +63,15 @@ def test_a_refused_option_does_not_lock_the_folder(tmp_path, scene, refused, opt
 
 @pytest.mark.parametrize("checkpoint", [False, True])
 @pytest.mark.parametrize(
-    ("error", "said"),
+    ("error", "words"),
     [
         (DivergenceError("Step 1: no.", fix="lower the learning rates"), "Step 1: no."),
         (MemoryError(), "memory ran out"),
         (JaxRuntimeError("RESOURCE_EXHAUSTED: 9 bytes\nat f"), "--gaussians"),
     ],
 )
-def test_a_folder_is_a_runs_once_there_is_something_to_continue(
-    tmp_path, scene, refused, monkeypatch, error, said, checkpoint
+def test_a_failed_fit_keeps_its_folder_only_if_it_has_a_checkpoint(
+    tmp_path, scene, refused, monkeypatch, error, words, checkpoint
 ):
     run = tmp_path / "run"
     start = SimpleNamespace(cfg=FitConfig(), decisions=Decisions.as_given(FitConfig()))
@@ -87,7 +86,7 @@ def test_a_folder_is_a_runs_once_there_is_something_to_continue(
     monkeypatch.setattr(pipeline, "initialise", lambda *a, **k: start)
     monkeypatch.setattr(pipeline.Optimiser, "expect", lambda *a, **k: None)
     monkeypatch.setattr(pipeline.Optimiser, "run", fail)
-    assert said in refused("fit", scene, "--out", run)
+    assert words in refused("fit", scene, "--out", run)
     assert (run / "config.json").exists() == checkpoint
     if checkpoint:
         with pytest.raises(UserError, match="already holds a run"):
@@ -99,14 +98,14 @@ def test_a_resumed_run_keeps_the_model_and_curve_of_its_checkpoints(tmp_path, sc
     spline = (0.1, *np.random.default_rng(0).normal(size=19).tolist())
     chosen = {"photometry.model": "view_exposure", "photometry.curve": "spline"}
     chosen |= {"photometry.spline": list(spline)}
-    under = Decisions.as_given(with_fields(FitConfig(), chosen))
-    decided = dataclasses.replace(under, reasons=("Chosen: that.",))
+    fixed = Decisions.as_given(with_fields(FitConfig(), chosen))
+    decided = dataclasses.replace(fixed, reasons=("Chosen: that.",))
     meta = {KEY: decided.to_dict()}
     CheckpointStore(run / "checkpoints").save(3, {"a": np.zeros(2)}, meta)
-    given = []
+    solved = []
 
     def solve(scene, still, cfg, reporter, *, kept, **how):
-        given.append((cfg, kept))
+        solved.append((cfg, kept))
         raise KeyboardInterrupt
 
     monkeypatch.setattr(pipeline, "solve_exposures", solve)
@@ -114,18 +113,18 @@ def test_a_resumed_run_keeps_the_model_and_curve_of_its_checkpoints(tmp_path, sc
     for resume in (True, False):
         with pytest.raises(KeyboardInterrupt):
             p2gs_jax.fit(scene, run, FitConfig(), resume=resume)
-    # What was asked stays; what was decided comes beside it.
-    assert given == [(FitConfig(), decided), (FitConfig(), None)]
+    # The configuration stays as it is; decisions are passed beside it.
+    assert solved == [(FitConfig(), decided), (FitConfig(), None)]
     photometry = decided.resolve(FitConfig()).photometry
     assert (photometry.curve, photometry.spline, photometry.select) == ("spline", spline, False)
     decided.require_same(meta[KEY], run)
-    # What the user fixes, or starts at random, was never chosen.
-    for fixed in ({"photometry.select": False}, {"photometry.start": "random"}):
-        cfg = with_fields(FitConfig(), fixed)
+    # A model that the user fixes, or that starts at random, was never chosen.
+    for options in ({"photometry.select": False}, {"photometry.start": "random"}):
+        cfg = with_fields(FitConfig(), options)
         assert kept_choice(cfg, RunFolder(run)) is None
 
 
-def test_the_saved_choice_is_solved_and_its_reasons_repeated(tmp_path, scene):
+def test_a_saved_choice_is_solved_again_and_its_reasons_are_repeated(tmp_path, scene):
     cfg = with_fields(FitConfig(), {"init.shell": "off", "init.dense": "off"})
     loaded = load(scene, tmp_path, cfg)
     first = prepared(loaded, cfg)
@@ -157,9 +156,9 @@ def test_masks_that_hide_everything_are_refused(tmp_path, refused):
     for image in (made / "images").iterdir():
         height, width = cv2.imread(str(image)).shape[:2]
         cv2.imwrite(str(made / "masks" / image.name), np.zeros((height, width), np.uint8))
-    said = refused("fit", made, "--out", tmp_path / "run")
-    assert "the masks hide every pixel of all" in said
-    assert "invert them" in said
+    text = refused("fit", made, "--out", tmp_path / "run")
+    assert "the masks hide every pixel of all" in text
+    assert "invert them" in text
     assert not (tmp_path / "run" / "config.json").exists()
 
 
@@ -170,16 +169,16 @@ FIT = (
 )
 
 
-def test_a_fit_from_files_is_the_same(finished_run, tmp_path, succeeded, monkeypatch):
-    """As that of `finished_run`, but for its memory; every photograph is decoded once a level."""
+def test_a_fit_from_files_is_that_from_memory(finished_run, tmp_path, succeeded, monkeypatch):
+    """Like `finished_run` without a cache in memory; photographs are decoded once per size."""
     decoded = Counter()
-    plain = held.decode
+    plain = store.decode
 
     def counted(view, sizes):
         decoded.update((view.name, size) for size in sizes)
         return plain(view, sizes)
 
-    for place in (held, cache):  # who asks, and who decodes ahead
+    for place in (store, cache):  # the store, and the cache that decodes ahead
         monkeypatch.setattr(place, "decode", counted)
     run, scene = tmp_path / "run", finished_run.parent / "scene"
     succeeded("fit", scene, "--out", run, *FIT, "--data.cache-mb", "0")
@@ -202,7 +201,7 @@ def test_a_run_may_only_become_longer(tmp_path):
     write_start(RunFolder(tmp_path), tmp_path, None, cfg, Decisions.as_given(cfg))
     for name, value in {"steps": 61, "budget_s": 90.0}.items():
         assert check_run_dir(tmp_path, True, with_fields(cfg, {f"train.{name}": value}))
-    # And with other memory.
+    # Options of memory may change.
     assert not check_run_dir(tmp_path, True, with_fields(cfg, {"data.cache_mb": 17}))
     for name, value in {"steps": 59, "budget_s": 30.0, "seed": 7}.items():
         with pytest.raises(UserError, match=f"train.{name} was"):
@@ -220,17 +219,17 @@ ROBUST = p2gs_jax.preset("robust")
 
 @pytest.fixture
 def left(monkeypatch):
-    """Return a function that says how much there is; of it 1 GB is held already."""
-    monkeypatch.setattr(module, "resident", lambda: GB)
+    """Return a function that sets the free memory; the process holds 1 GB already."""
+    monkeypatch.setattr(preflight, "resident", lambda: GB)
 
-    def there_are(size):
-        monkeypatch.setattr(module, "left_to_process", lambda: size)
+    def set_free(size):
+        monkeypatch.setattr(preflight, "left_to_process", lambda: size)
 
-    return there_are
+    return set_free
 
 
-def test_every_part_counts(monkeypatch):
-    monkeypatch.setattr(module, "size_at", lambda view, width: view.size)
+def test_the_estimate_of_memory_counts_every_part(monkeypatch):
+    monkeypatch.setattr(preflight, "size_at", lambda view, width: view.size)
     coverage = Coverage(500_000, 1.0)
     view = SimpleNamespace(width=1000, height=500, size=(1000, 500), name="a", image=None)
 
@@ -247,20 +246,20 @@ def test_every_part_counts(monkeypatch):
     assert parts({"data.cache_mb": 1}).photographs == 2**20
     harmonics = parts({"render.sh_degree": 3}).gaussians / parts({"render.sh_degree": 0}).gaussians
     assert harmonics == (11 + 48) / (11 + 3)
-    monkeypatch.setattr(module.jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(preflight.jax, "default_backend", lambda: "gpu")
     on_gpu = parts()
     assert (on_gpu.gaussians, on_gpu.view) == (0, 0)
     assert on_gpu.photographs == found.photographs
 
 
-def test_what_does_not_fit_is_refused_with_what_helps(left):
+def test_fits_beyond_the_memory_are_refused_with_options_that_save_memory(left):
     needed = MemoryNeeded(GB, 8 * GB, GB, GB, 4_000_000)
     for enough in (None, needed.total - GB):
         left(enough)
         require_memory(needed)
     left(3 * GB)
-    said = r"about 11.0 GB .*4000000 Gaussians 8.0 GB.*and 4.0 GB is left"
-    with pytest.raises(UserError, match=said) as error:
+    words = r"about 11.0 GB .*4000000 Gaussians 8.0 GB.*and 4.0 GB is left"
+    with pytest.raises(UserError, match=words) as error:
         require_memory(needed)
     assert all(o in error.value.fix for o in ("--gaussians", "--data.cache-mb", "--max-width"))
 
@@ -273,7 +272,7 @@ def test_a_fit_is_refused_before_its_exposures_are_solved(tmp_path, scene, left,
 
 
 @pytest.mark.parametrize("found", [SelfCheck(0.5, 0.0), SelfCheck(0.0, float("nan")), OSError("x")])
-def test_a_rasterizer_that_is_wrong_on_a_gpu_gives_way(monkeypatch, found):
+def test_a_kernel_that_fails_its_self_check_on_a_gpu_is_replaced(monkeypatch, found):
     assert suited(RenderConfig()) == (RenderConfig(), None)
     monkeypatch.setattr(selfcheck.jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(selfcheck, "slow_here", lambda: None)

@@ -1,4 +1,4 @@
-"""Snapshots of a fit that goes on: only when wanted, without effect on the fit, complete."""
+"""Snapshots of a running fit: only on request, complete, and without effect on the fit."""
 
 import json
 import signal
@@ -17,16 +17,16 @@ from p2gs_jax.viewer.follow import Follower
 
 
 class Watched(Reporter):
-    """Fits the scene of a run again, and acts at a step; notes when there was a snapshot."""
+    """Fits the scene of a run again, acts at a step and records when a snapshot existed."""
 
     def __init__(self, finished_run, folder, step, act):
         self.run, self.step, self.act = RunFolder(folder), step, act
-        self.there, self.last = [], None
+        self.existed, self.last = [], None
         cfg = from_dict(json.loads((finished_run / "config.json").read_text())["fit"])
         fit(finished_run.parent / "scene", folder, cfg, reporter=self)
 
     def log(self, record):
-        self.there.append(self.run.snapshot.exists())
+        self.existed.append(self.run.snapshot.exists())
         if record.step == self.step:
             self.act(self.run)
 
@@ -35,17 +35,17 @@ class Watched(Reporter):
             self.last = load_run(self.run.root, snapshot=True)
 
 
-def test_a_snapshot_comes_when_it_is_wanted_and_the_fit_stays_the_same(
+def test_a_snapshot_is_written_on_request_and_the_fit_stays_the_same(
     finished_run, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(snapshots, "LOOK_S", 0.0)
     watched = Watched(finished_run, tmp_path, 60, lambda run: run.wanted.touch())
-    assert watched.there == [False] * 6
+    assert watched.existed == [False] * 6
     assert not watched.run.snapshot.exists()
     assert not watched.run.wanted.exists()
     for name in ("radiance.ply", "photometry.json"):
         assert (tmp_path / name).read_bytes() == (finished_run / name).read_bytes()
-    # Wanted at the last step, it shows the end of the fit.
+    # A snapshot that is requested at the last step shows the end of the fit.
     shown, end = watched.last, load_run(finished_run)
     there = np.asarray(shown.params.gaussians.opacity_logits) > snapshots.EMPTY_LOGIT
     means = np.asarray(shown.params.gaussians.means)[there]

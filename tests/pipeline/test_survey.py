@@ -76,16 +76,16 @@ def test_points_that_no_view_shows_have_no_depth(scene):
         assert extent_of_rates(300.0, depths, FitConfig()) == 300.0
 
 
-def test_a_scene_far_from_the_origin_is_said_to_be_coarse(scene):
+def test_a_scene_far_from_the_origin_is_reported_as_coarse(scene):
     depth = nearest(scene)
-    for offset, said in ((0.0, False), (1e3, False), (1e5, True)):
+    for offset, coarse in ((0.0, False), (1e3, False), (1e5, True)):
         notes = scale_notes(scaled(scene, 1.0, offset), None, FitConfig(), depth)
-        assert bool(notes) == said
+        assert bool(notes) == coarse
     assert "1e+05 scene units from the origin" in notes[0]
     assert "Subtract a common offset" in notes[0]
 
 
-def test_rates_of_a_long_drive_are_those_of_its_streets(scene):
+def test_learning_rates_do_not_grow_with_the_length_of_a_drive(scene):
     cfg, views, points = FitConfig(), scene.training_views, scene.points
     far = [np.array([60.0 * k, 0, 0]) for k in range(10)]
     drive = [
@@ -93,9 +93,9 @@ def test_rates_of_a_long_drive_are_those_of_its_streets(scene):
     ]
     street = np.concatenate([points + by for by in far]).astype(np.float32)
     narrow, wide = seen_depths(points, views), seen_depths(street, drive)
-    own = extent_of_rates(300.0, narrow, cfg)
-    assert 3 < own < 6
-    assert extent_of_rates(300.0, wide, cfg) == pytest.approx(own, rel=0.2)
+    short = extent_of_rates(300.0, narrow, cfg)
+    assert 3 < short < 6
+    assert extent_of_rates(300.0, wide, cfg) == pytest.approx(short, rel=0.2)
     assert extent_of_rates(0.5, narrow, cfg) == 0.5
     cameras = with_fields(cfg, {"optimizer.extent": "cameras"})
     assert extent_of_rates(300.0, wide, cameras) == 300.0

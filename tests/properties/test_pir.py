@@ -1,4 +1,4 @@
-"""The properties of PHOTOMETRY section 7 that a formation model and its losses must have."""
+"""Properties of formation models and their losses (docs/photometry.md, 7)."""
 
 import dataclasses
 import functools
@@ -29,7 +29,7 @@ FEW = settings(max_examples=25, deadline=None)
 SEEDS = st.integers(0, 2**31 - 1)
 SCALES = st.floats(0.2, 5.0)
 GAMMAS = st.floats(1.4, 3.2)
-# One program a shape, where eager calls make one an operation.
+# Compiled once per shape; eager calls would compile each operation.
 formation = jax.jit(forming.formation, static_argnums=2)
 tone_map = jax.jit(forming.tone_map, static_argnums=2)
 inverse_tone_map = jax.jit(forming.inverse_tone_map, static_argnums=2)
@@ -115,21 +115,21 @@ def test_6_monotone(cfg, gamma, e):
 
 
 def observed(seed, cfg, noise_free=True, views=5, n=400):
-    """Observations of the same radiances by views of known exposure and gamma."""
+    """Return pairs of colours of one radiance in two views, and the photometry of views."""
     rng = np.random.default_rng(seed)
     e = np.exp2(rng.normal(0, 0.7, views)).astype(np.float32)
     gammas = np.full(views, 2.2, np.float32)
     L = np.exp2(rng.uniform(-5, 0, (n, 3)))
     i = rng.integers(0, views, n)
     j = (i + rng.integers(1, views, n)) % views
-    taken = Photometry(e, gammas, "linear")
-    I = [np.asarray(formation(jnp.asarray(L, jnp.float32), taken.capture(k), cfg)) for k in (i, j)]
+    truth = Photometry(e, gammas, "linear")
+    I = [np.asarray(formation(jnp.asarray(L, jnp.float32), truth.capture(k), cfg)) for k in (i, j)]
     I = [np.clip(a, 0, 1) for a in I]
     if not noise_free:
         I = [np.rint(a * 255) / 255 for a in I]
     rows = (i.astype(np.int32), j.astype(np.int32), np.ones(n, np.float32))
     pairs = rel.ColorPairs(*(jnp.asarray(a) for a in (*I, *rows)))
-    return pairs, jax.tree.map(jnp.asarray, taken)
+    return pairs, jax.tree.map(jnp.asarray, truth)
 
 
 LOSS = LossConfig(relative_exposure=RelativeExposureConfig(1.0, "observed_ldr"))
@@ -148,7 +148,7 @@ def test_11_observed_reading(cfg, seed, c):
     e = truth.exposures
     reading = jax.jit(rel.observed_ldr, static_argnums=(2, 3))
     assert float(reading(pairs, truth, LOSS, cfg)) < 1e-5
-    # Where the true ones are all about one (seed 775), ones are no error.
+    # Exposures of 1 are an error, unless the true ones are about 1 (seed 775).
     if float(jnp.std(jnp.log(e))) > 0.12:
         assert float(reading(pairs, exposed(jnp.ones_like(e)), LOSS, cfg)) > 0.01
     a, b = (float(reading(pairs, exposed(s * jnp.sqrt(e)), LOSS, cfg)) for s in (1.0, c))
@@ -177,7 +177,7 @@ def test_12_closed_form_scale(seed):
 
 
 def mean_rms(frames):
-    """The definition of HIS: RMS of each difference of two frames, averaged."""
+    """Return HIS by its definition: the mean RMS difference of consecutive frames."""
     return np.sqrt(((frames[:-1] - frames[1:]) ** 2).mean((1, 2, 3))).mean()
 
 

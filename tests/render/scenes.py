@@ -7,7 +7,7 @@ from p2gs_jax.types import Camera, Gaussians
 
 
 def street(n=1500, width=72, height=53, seed=3, radius=6.0, degree=1, dtype=np.float32):
-    """Splats on a street-like mix of depths, sizes, opacities; HDR radiance over five stops."""
+    """Return Gaussians with street-like depths, sizes, opacities and radiances, and a camera."""
     rng = np.random.default_rng(seed)
     focal = 0.75 * width
     u, v = rng.uniform(-0.05, 1.05, (2, n)) * np.array([[width], [height]])

@@ -1,4 +1,4 @@
-"""Gaussians that move with the camera of their box, against Gaussians that are moved themselves."""
+"""Gaussians of moving boxes are rendered like Gaussians that were moved to the world."""
 
 import dataclasses
 
@@ -22,7 +22,7 @@ from p2gs_jax.types import Camera, Placement
 WIDTH, HEIGHT = 48, 40
 CFG = RenderConfig(sh_degree=3, stop_error=None)
 COUNT = 60
-# One program a shape, where eager calls make one an operation.
+# Compiled once per shape; eager calls would compile each operation.
 splat_listed = jax.jit(visibility.splat_listed, static_argnums=(5, 6, 7))
 in_view = jax.jit(visibility.in_view, static_argnums=3)
 
@@ -32,11 +32,11 @@ def pose(seed: int, at=(0.0, 0.0, 4.0)) -> np.ndarray:
 
 
 POSES = np.stack([pose(1, (0.4, 0.2, 4.0)), pose(2, (-0.6, -0.3, 5.0)), pose(3)])
-THERE = np.array([True, True, False])
+THERE = np.array([True, True, False])  # boxes that exist at the time of the view
 
 
 def scene():
-    """Return Gaussians near the origins of world and boxes, and whose each is."""
+    """Return Gaussians near the origins of world (owner -1) and boxes, and their owners."""
     g = random_splats(COUNT, degree=3)
     owner = np.arange(COUNT) % 4 - 1
     means = np.array(g.means) * 0.5
@@ -64,7 +64,7 @@ def seen_by(g, alive, camera, owner=None):
     return splat(g, alive, camera, CFG, 3, owner)
 
 
-def test_a_camera_in_the_frame_of_the_box_sees_what_moved_gaussians_show():
+def test_a_camera_in_the_frame_of_the_box_agrees_with_moved_gaussians():
     g, owner = scene()
     ours, shown = seen_by(g, jnp.ones(COUNT, bool), view(), jnp.asarray(owner))
     explicit = posed(g, owner, POSES, THERE)
@@ -79,8 +79,8 @@ def test_a_camera_in_the_frame_of_the_box_sees_what_moved_gaussians_show():
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_what_is_not_there_leaves_the_picture_as_if_it_were_removed(known):
-    """Tracked, but not now; and a camera that knows no time."""
+def test_absent_objects_are_rendered_as_if_they_were_removed(known):
+    """One object is not tracked at the time; without a time all are absent."""
     g, owner = scene()
     gone = owner == 2 if known else owner >= 0
     camera = view(known)
@@ -100,7 +100,7 @@ def test_what_is_not_there_leaves_the_picture_as_if_it_were_removed(known):
         assert not np.asarray(leaf)[gone].any()
 
 
-def test_bounds_and_capacities_know_where_objects_are():
+def test_bounds_and_capacities_account_for_poses_of_objects():
     (g, owner), alive, camera = scene(), jnp.ones(COUNT, bool), view()
     each = jax.jit(camera_of_each)(camera, jnp.asarray(owner))
     seen = np.asarray(in_view(g, alive, each, CFG))
@@ -116,7 +116,7 @@ def test_bounds_and_capacities_know_where_objects_are():
     assert shown.sum() >= seen.sum() > 0
 
 
-def test_blocks_take_each_gaussian_to_its_own_box():
+def test_blocks_pose_each_gaussian_by_its_box():
     (g, owner), alive, camera = scene(), jnp.ones(COUNT, bool), view()
     ids, count = jax.jit(compact, static_argnums=1)(alive, BLOCK)
     listed = splat_listed(g, alive, ids, count, camera, CFG, 3, 16, jnp.asarray(owner))

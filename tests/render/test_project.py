@@ -56,7 +56,7 @@ def test_splats_follow_the_definition():
         assert np.exp(splats.log_opacities[i]) == pytest.approx(opacity)
 
 
-def test_the_basis_is_scipys_in_the_signs_of_3dgs():
+def test_harmonics_agree_with_scipy_in_the_signs_of_3dgs():
     d = np.random.default_rng(0).normal(size=(50, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     polar, azimuth = np.arccos(d[:, 2]), np.arctan2(d[:, 1], d[:, 0])

@@ -1,4 +1,4 @@
-"""gsplat's `rasterization` on our kernel: against our own renders and float64."""
+"""`rasterization` with gsplat's arguments agrees with `render_linear`."""
 
 import dataclasses
 
@@ -24,22 +24,22 @@ def arguments(n=300, dtype=np.float32, seed=4):
     g, cam = street(n=n, width=WIDTH, height=HEIGHT, degree=0, dtype=dtype)
     viewmats = np.tile(np.eye(4), (2, 1, 1))
     viewmats[1, 0, 3] = 0.3
-    given = {"means": g.means, "quats": g.quats, "scales": jnp.exp(g.log_scales)}
-    given |= {"opacities": jax.nn.sigmoid(g.opacity_logits), "Ks": jnp.tile(cam.K, (2, 1, 1))}
+    args = {"means": g.means, "quats": g.quats, "scales": jnp.exp(g.log_scales)}
+    args |= {"opacities": jax.nn.sigmoid(g.opacity_logits), "Ks": jnp.tile(cam.K, (2, 1, 1))}
     colors = jnp.asarray(np.exp(rng.normal(-1, 1, (n, 3))), dtype)
-    return given | {"colors": colors, "viewmats": jnp.asarray(viewmats, dtype)}
+    return args | {"colors": colors, "viewmats": jnp.asarray(viewmats, dtype)}
 
 
-def draw(given, **options):
+def draw(args, **options):
     options = {"width": WIDTH, "height": HEIGHT, "cfg": CFG} | options
-    return p2gs_jax.rasterization(**given, **options)
+    return p2gs_jax.rasterization(**args, **options)
 
 
-def ours(given, k, sh):
-    """Return our own render of one camera, with the same radiance."""
-    g, _ = street(n=len(given["means"]), width=WIDTH, height=HEIGHT, degree=0)
+def ours(args, k, sh):
+    """Return `render_linear` of one camera, with the same radiance."""
+    g, _ = street(n=len(args["means"]), width=WIDTH, height=HEIGHT, degree=0)
     g = dataclasses.replace(g, sh=sh)
-    view = camera(WIDTH, HEIGHT, float(given["Ks"][k, 0, 0]), given["viewmats"][k])
+    view = camera(WIDTH, HEIGHT, float(args["Ks"][k, 0, 0]), args["viewmats"][k])
     cfg = dataclasses.replace(CFG, radiance="linear")
     render = jax.jit(render_linear, static_argnames=("cfg", "capacity"))
     return render(g, jnp.ones(g.capacity, bool), view, cfg=cfg, capacity=2**14)
@@ -47,21 +47,21 @@ def ours(given, k, sh):
 
 @pytest.fixture(scope="module")
 def drawn():
-    """Return the arguments of two cameras and what they see, with depth."""
-    given = arguments()
-    return given, *draw(given, render_mode="RGB+D")
+    """Return arguments of two cameras, and their colours with depth, alphas and meta."""
+    args = arguments()
+    return args, *draw(args, render_mode="RGB+D")
 
 
-def test_two_cameras_show_what_our_own_render_shows(drawn):
-    given, colors, alphas, meta = drawn
+def test_two_cameras_agree_with_render_linear(drawn):
+    args, colors, alphas, meta = drawn
     assert colors.shape == (2, HEIGHT, WIDTH, 4)
     assert alphas.shape == (2, HEIGHT, WIDTH, 1)
     assert meta["radii"].shape == meta["means2d"].shape == (2, 300, 2)
     assert not meta["overflow"].any()
     assert (meta["entries"] <= meta["capacity"]).all()
-    sh = ((given["colors"] - 0.5) / C0)[:, None]
+    sh = ((args["colors"] - 0.5) / C0)[:, None]
     for k in range(2):
-        r = ours(given, k, sh)
+        r = ours(args, k, sh)
         np.testing.assert_allclose(colors[k, ..., :3], r.linear, atol=1e-5)
         np.testing.assert_allclose(alphas[k, ..., 0], r.alpha, atol=1e-5)
         np.testing.assert_allclose(colors[k, ..., 3], r.depth, atol=1e-3)
@@ -69,54 +69,54 @@ def test_two_cameras_show_what_our_own_render_shows(drawn):
 
 
 def test_modes_backgrounds_and_colours_of_each_camera(drawn):
-    given, both, alphas, meta = drawn
+    args, both, alphas, meta = drawn
     fixed = {"capacity": meta["capacity"]}
     rgb, depth = both[..., :3], both[..., 3:]
-    expected, _, _ = draw(given, render_mode="RGB+ED", **fixed)
+    expected, _, _ = draw(args, render_mode="RGB+ED", **fixed)
     np.testing.assert_allclose(expected[..., 3:] * jnp.maximum(alphas, 1e-10), depth, rtol=1e-5)
-    np.testing.assert_array_equal(draw(given, render_mode="D", **fixed)[0], depth)
+    np.testing.assert_array_equal(draw(args, render_mode="D", **fixed)[0], depth)
     over = dataclasses.replace(CFG, background=(1.0, 0.5, 0.0), near=9.0, blur=9.0)
-    asked = {"cfg": over, "near_plane": CFG.near, "eps2d": CFG.blur} | fixed
-    np.testing.assert_allclose(draw(given, **asked)[0], rgb + (1 - alphas) * BACK[0], 1e-5)
-    black = draw(given, backgrounds=jnp.zeros((2, 3)), **asked)[0]
+    explicit = {"cfg": over, "near_plane": CFG.near, "eps2d": CFG.blur} | fixed
+    np.testing.assert_allclose(draw(args, **explicit)[0], rgb + (1 - alphas) * BACK[0], 1e-5)
+    black = draw(args, backgrounds=jnp.zeros((2, 3)), **explicit)[0]
     np.testing.assert_allclose(black, rgb, 1e-5)
-    each = {"colors": jnp.stack([given["colors"], 2 * given["colors"]])}
-    twice, _, _ = draw(given | each, backgrounds=jnp.asarray(BACK), render_mode="RGB+D", **fixed)
+    each = {"colors": jnp.stack([args["colors"], 2 * args["colors"]])}
+    twice, _, _ = draw(args | each, backgrounds=jnp.asarray(BACK), render_mode="RGB+D", **fixed)
     behind = (1 - alphas) * BACK[:, None, None]
-    # The stop rule depends on what is brightest.
+    # The stop rule depends on the brightest Gaussian.
     np.testing.assert_allclose(
         twice[..., :3], rgb * np.array([1, 2])[:, None, None, None] + behind, atol=2e-3
     )
 
 
-def test_coefficients_above_the_degree_are_ignored_and_negative_radiance_is_none(drawn):
-    given, _, _, meta = drawn
+def test_coefficients_above_the_degree_are_ignored_and_radiance_is_clipped_at_0(drawn):
+    args, _, _, meta = drawn
     sh = np.random.default_rng(1).normal(0, 1.0, (300, 9, 3)).astype(np.float32)
     fixed = {"capacity": meta["capacity"], "render_mode": "RGB+D"}
-    colors, _, _ = draw(given | {"colors": jnp.asarray(sh)}, sh_degree=1, **fixed)
+    colors, _, _ = draw(args | {"colors": jnp.asarray(sh)}, sh_degree=1, **fixed)
     assert colors[..., :3].min() >= 0
     g, _ = street(n=300, width=WIDTH, height=HEIGHT, degree=0)
     g = dataclasses.replace(g, sh=jnp.asarray(sh[:, :4]))
     cfg = dataclasses.replace(CFG, radiance="linear")
     radiance = jax.jit(view_radiance, static_argnums=2)
-    seen = [radiance(g, camera(viewmat=m), cfg) for m in given["viewmats"]]
-    expected, _, _ = draw(given | {"colors": jnp.stack(seen)}, **fixed)
+    seen = [radiance(g, camera(viewmat=m), cfg) for m in args["viewmats"]]
+    expected, _, _ = draw(args | {"colors": jnp.stack(seen)}, **fixed)
     np.testing.assert_allclose(colors, expected, atol=1e-5)
 
 
 @pytest.mark.parametrize(
-    ("changes", "options", "says"),
+    ("changes", "options", "words"),
     [
         ({}, {"render_mode": "RGBD"}, "choose RGB, D, ED"),
         ({"colors": jnp.zeros((300, 4))}, {}, "(300, 3) is needed"),
         ({"colors": jnp.zeros((300, 4, 3))}, {"sh_degree": 2}, "(300, 9, 3) is needed"),
     ],
 )
-def test_what_is_not_valid_is_refused(changes, options, says):
-    with pytest.raises(ValueError, match=says.replace("(", r"\(").replace(")", r"\)")):
+def test_invalid_modes_and_shapes_are_refused(changes, options, words):
+    with pytest.raises(ValueError, match=words.replace("(", r"\(").replace(")", r"\)")):
         draw(arguments() | changes, **options)
 
 
-def test_a_capacity_is_wanted_inside_jit():
+def test_a_capacity_is_required_inside_jit():
     with pytest.raises(ValueError, match="pass capacity="):
-        jax.jit(lambda given: draw(given)[0])(arguments())
+        jax.jit(lambda args: draw(args)[0])(arguments())

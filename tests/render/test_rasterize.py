@@ -45,7 +45,7 @@ def slope(g, cam, cfg=CFG, alive=None):
 
 @pytest.fixture(scope="module")
 def oracle():
-    """Float64 gradient and image of the shared street."""
+    """Return the float64 gradient and render of the shared street."""
     with jax.enable_x64(True):
         return slope(*street(dtype=np.float64), ORACLE)
 
@@ -64,7 +64,7 @@ def oracle():
 def test_values_and_gradients_match_oracle(oracle, implementation, tile, stop):
     v_expected, expected = oracle
     cfg = dataclasses.replace(CFG, tile=tile, stop_error=stop, implementation=implementation)
-    # Hard cases sum gradients atomically.
+    # test_hard_cases.py covers atomic sums of gradients.
     cfg = dataclasses.replace(cfg, deterministic=implementation == "pallas")
     g, cam = street()
     v, r = slope(g, cam, cfg)
@@ -80,7 +80,7 @@ def test_values_and_gradients_match_oracle(oracle, implementation, tile, stop):
         assert error < (2e-4 if stop is None else 1e-3), (name, error)
 
 
-def test_the_lane_queue_computes_in_the_precision_that_it_is_given(oracle):
+def test_the_lane_queue_computes_in_the_precision_of_its_input(oracle):
     v_expected, expected = oracle
     # Nothing is left out and nothing approximated: what remains is rounding.
     cfg = dataclasses.replace(CFG, implementation="xla", stop_error=None, exp_degree=None)
@@ -96,7 +96,7 @@ def test_the_lane_queue_computes_in_the_precision_that_it_is_given(oracle):
 def test_oracle_gradient_matches_finite_differences():
     with jax.enable_x64(True):
         g, cam = street(n=40, width=20, height=15, seed=5, dtype=np.float64)
-        # Above a vanishing cutoff the image is smooth, so central differences are meaningful.
+        # With a vanishing cutoff the image is smooth, so central differences are meaningful.
         cfg = dataclasses.replace(ORACLE, alpha_cutoff=1e-12, blur=0.3)
         f = jax.jit(lambda g: scalar(g, alive_of(g), cam, cfg)[0])
         v, h = slope(g, cam, cfg)[0], 1e-6
@@ -146,7 +146,7 @@ def test_an_image_of_one_tile_has_one_list():
     assert 0 < tiles.count <= 300
 
 
-def test_tile_lists_match_brute_force_and_overflow_is_said(shown):
+def test_tile_lists_match_brute_force_and_overflow_is_reported(shown):
     """Every splat that reaches a pixel centre of a tile is listed there, in depth order."""
     g, cam, _ = shown
     need = int(jax.jit(lambda g: required_capacity(g, alive_of(g), cam, CFG))(g))
@@ -173,15 +173,15 @@ def test_tile_lists_match_brute_force_and_overflow_is_said(shown):
         assert len(set(listed.tolist())) == len(listed)
 
 
-def test_light_behind_shows_through(shown):
+def test_the_background_shows_through(shown):
     g, cam, image = shown
     few = np.arange(g.capacity) < 60
     with jax.enable_x64(True):
-        given = street(dtype=np.float64)
-        lit = slope(*given, ORACLE, few)[1]
+        exact = street(dtype=np.float64)
+        lit = slope(*exact, ORACLE, few)[1]
         unlit = dataclasses.replace(ORACLE, background=None)
         dark = jax.jit(render_linear, static_argnums=(3, 4))(
-            given[0], few, given[1], unlit, CAPACITY
+            exact[0], few, exact[1], unlit, CAPACITY
         )
         through = (1 - lit.alpha)[..., None] * np.array(BEHIND)
         np.testing.assert_allclose(lit.linear, dark.linear + through, rtol=1e-12)

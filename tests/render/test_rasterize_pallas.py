@@ -1,4 +1,4 @@
-"""What only the GPU kernels promise. Values and gradients: the shared tests beside this file."""
+"""Properties of the GPU kernels alone; their values and gradients: test_rasterize.py."""
 
 import dataclasses
 import functools
@@ -22,7 +22,7 @@ def loss(g, cam, cfg):
 
 
 @pytest.mark.slow
-def test_views_batch_and_the_ordered_sum_is_the_atomic_one():
+def test_views_can_be_batched_and_ordered_sums_agree_with_atomic_ones():
     g, cam = street(n=60, width=24, height=16)
     ordered = dataclasses.replace(CFG, deterministic=True)
     viewmats = jnp.stack([jnp.eye(4).at[0, 3].set(0.3 * i) for i in range(3)])
@@ -48,7 +48,7 @@ def test_views_batch_and_the_ordered_sum_is_the_atomic_one():
 @pytest.mark.parametrize(
     ("size", "deterministic", "kernels"),
     [
-        # An image of many tiles: forward, backward, and the ordered sum.
+        # Images of many tiles.
         ((256, 256), False, ["composite_tiles", "composite_tiles_gradient"]),
         ((256, 256), True, ["composite_tiles", "composite_tiles_gradient", "sum_gradients"]),
         # The lists of few tiles are cut into segments.
@@ -66,7 +66,7 @@ def test_the_kernels_lower_to_triton(monkeypatch, size, deterministic, kernels):
     assert all(name in text for name in kernels)
 
 
-def test_what_runs_here_is_chosen(monkeypatch):
+def test_the_fastest_supported_implementation_is_chosen(monkeypatch):
     assert fastest_here() == ("pallas" if jax.default_backend() == "gpu" else "xla")
     assert slow_here() is None or jax.default_backend() != "cpu"
 
@@ -86,7 +86,7 @@ def test_what_runs_here_is_chosen(monkeypatch):
         assert slow_here().startswith("Card is not an NVIDIA GPU of compute capability 8.0")
 
 
-def test_tiles_of_other_sizes_are_refused():
+def test_sizes_of_tiles_must_be_powers_of_two():
     cfg = dataclasses.replace(CFG, tile=(12, 8))
     with pytest.raises(ValueError, match="power of two"):
         jax.eval_shape(lambda g: loss(g, camera(), cfg), street(n=3)[0])

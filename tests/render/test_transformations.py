@@ -47,11 +47,11 @@ def one_by_one():
     ],
     ids=["vmap", "several views", "constants only"],
 )
-def test_views_in_one_program(one_by_one, together):
+def test_views_in_one_program_have_the_tile_lists_of_single_views(one_by_one, together):
     np.testing.assert_array_equal(jax.jit(together)(SCENE.gaussians, VIEWS), one_by_one)
 
 
-def test_gradient_of_a_loop_over_views():
+def test_the_gradient_of_a_loop_is_the_sum_of_the_gradients_of_views():
     def energy(g, viewmat):
         splats, ids = binned(g, viewmat)
         return jnp.mean(jnp.where(ids[:, None] < 0, 0, splats.means2d[ids] ** 2))

@@ -1,4 +1,4 @@
-"""Gaussians that come, move and go: their places and opacities at a time."""
+"""Vibrating Gaussians: their positions and opacities over time."""
 
 import dataclasses
 
@@ -38,7 +38,7 @@ def opacity(g):
     return float(jax.nn.sigmoid(g.opacity_logits)[0])
 
 
-def test_it_is_where_and_as_opaque_as_the_formula_says():
+def test_position_and_opacity_follow_the_formula():
     g, still = gaussian(), np.exp(-LIFE / (2 * CYCLE))
     for time in (-0.5, 0.0, 0.2, 0.3, 0.9):
         now = at(g, placement(time))
@@ -54,7 +54,7 @@ def test_it_is_where_and_as_opaque_as_the_formula_says():
     assert at_time(standing, placement(0.3)) is standing
 
 
-def test_it_is_the_same_on_the_host_and_without_a_time_in_the_middle_of_the_drive():
+def test_the_host_agrees_and_without_a_time_the_middle_of_the_drive_is_shown():
     g = gaussian()
     for objects in (None, dataclasses.replace(placement(0.7), time=None)):
         chex.assert_trees_all_close(at(g, objects), at(g, placement(0.0)), rtol=0)
@@ -64,7 +64,7 @@ def test_it_is_the_same_on_the_host_and_without_a_time_in_the_middle_of_the_driv
     chex.assert_trees_all_close(host, at(g, placement(0.35)), rtol=1e-5, atol=1e-6)
 
 
-def test_what_lives_for_ever_stands_and_no_gradient_moves_it():
+def test_gaussians_of_endless_life_stand_still_and_get_no_gradient():
     g = gaussian(velocity=(9.0, 9.0, 9.0), life=STILL)
 
     def shown(moves):
@@ -79,7 +79,7 @@ def test_what_lives_for_ever_stands_and_no_gradient_moves_it():
         assert np.abs(leaf).max() < 1e-18  # far below the epsilon of the optimiser, 1e-15
 
 
-def test_far_from_its_peak_it_is_out_of_view_and_all_stays_finite():
+def test_far_from_its_peak_a_gaussian_is_out_of_view_with_finite_gradients():
     g = gaussian(life=1e-3)
     assert [bool(in_view(g, ALIVE, seen(t), CFG)[0]) for t in (0.2, 0.9)] == [True, False]
 

@@ -1,4 +1,4 @@
-"""What a view may show is listed whole, the host counts no less, and lists grow until it fits."""
+"""Gaussians in view are all listed, the host counts no fewer, and lists grow on demand."""
 
 import functools
 
@@ -18,12 +18,12 @@ from p2gs_jax.train.capacities import count_view
 from p2gs_jax.types import Camera, Gaussians
 
 COUNT, WIDTH, HEIGHT = 300, 80, 56
-# Every tile of every Gaussian.
+# Every Gaussian in each of 5 x 7 tiles.
 CAPACITY = COUNT * 5 * 7
 
 
 def scene(seed: int, spread: float, size: float, shape: float, near: float) -> Gaussians:
-    """Gaussians all around the camera: far and near, round and elongated, opaque and not."""
+    """Return Gaussians around the camera: far and near, round and elongated, opaque and not."""
     rng = np.random.default_rng(seed)
     means = spread * rng.normal(size=(COUNT, 3))
     means[: COUNT // 4, 2] = near * rng.uniform(0.5, 2, COUNT // 4)
@@ -60,7 +60,7 @@ def seen_and_listed(gaussians, alive, camera, cfg):
     near=st.sampled_from([0.05, 0.2, 2.0]),
     focal=st.sampled_from([10.0, 60.0, 400.0]),
 )
-def test_all_that_is_listed_is_in_view_and_counted(seed, spread, size, shape, near, focal):
+def test_every_listed_gaussian_is_in_view_and_counted(seed, spread, size, shape, near, focal):
     cfg = RenderConfig(sh_degree=0)
     gaussians, camera = scene(seed, spread, size, shape, near), view(seed, focal)
     alive = jnp.arange(COUNT) % 7 != 3
@@ -87,7 +87,7 @@ def test_compact_lists_the_flags(room, share):
     np.testing.assert_array_equal(ids, padded[:room])
 
 
-def test_buckets_are_few_and_hold_what_they_must():
+def test_buckets_are_few_and_large_enough():
     lengths = {bucket(n) for n in range(1, 200_000, 37)}
     assert len(lengths) < 20
     assert min(lengths) == SMALLEST
@@ -95,7 +95,7 @@ def test_buckets_are_few_and_hold_what_they_must():
         assert needed * 1.5 <= bucket(needed, 1.5) <= max(SMALLEST, 1.26 * 1.5 * needed)
 
 
-def test_a_view_is_drawn_again_until_it_fits():
+def test_a_view_is_drawn_again_until_its_lists_fit():
     needs, drawn = iter([40_000, 90_000, 60_000]), []
 
     def draw(entries):

@@ -1,4 +1,4 @@
-"""The warp through depth against geometry that can be written down."""
+"""The warp through depth agrees with closed-form geometry."""
 
 import dataclasses
 import functools
@@ -16,7 +16,7 @@ from p2gs_jax.types import Render
 
 WIDTH, HEIGHT = 24, 16
 Y, X = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-# One program a shape, where eager calls make one an operation.
+# Compiled once per shape; eager calls would compile each operation.
 project_points, sample_bilinear = jax.jit(warping.project_points), jax.jit(warping.sample_bilinear)
 surface_depth, unproject = jax.jit(warping.surface_depth), jax.jit(warping.unproject)
 visible, warp = jax.jit(warping.visible), jax.jit(warping.warp)
@@ -28,7 +28,7 @@ def plane(z):
 
 
 @pytest.mark.parametrize(("x", "yaw", "z"), [(0, 0, 1), (-2, 0.5, 0.5), (1.5, -0.4, 7), (2, 0, 50)])
-def test_projecting_what_was_unprojected_gives_the_pixel_back(x, yaw, z):
+def test_projection_inverts_unprojection(x, yaw, z):
     seen_by = camera(x, yaw=yaw)
     points = unproject(plane(float(z)), seen_by)
     host = warping.unproject(np.full(X.shape, float(z)), jax.tree.map(np.asarray, seen_by))
@@ -41,23 +41,23 @@ def test_projecting_what_was_unprojected_gives_the_pixel_back(x, yaw, z):
 def test_world_coordinates_are_multiplied_in_full_precision():
     """GPUs would round to three digits: centimetres at a hundred metres."""
     g = splats.random_splats(4)
-    for program, given in (
+    for program, argument in (
         (lambda z: warp(z, camera(), z, camera()), plane(1.0)),
         (lambda g: view_radiance(g, camera(), RenderConfig()), g),
     ):
-        text = str(jax.make_jaxpr(program)(given))
+        text = str(jax.make_jaxpr(program)(argument))
         assert (
             text.count("dot_general[") == text.count("(Precision.HIGHEST, Precision.HIGHEST)") > 0
         )
 
 
-def test_a_sideways_step_is_the_disparity():
+def test_a_sideways_step_shifts_pixels_by_the_disparity():
     there = warp(plane(10.0), camera(), plane(10.0), camera(x=1.0))
     np.testing.assert_allclose(there.xy[..., 0], X - 20.0 / 10.0, atol=1e-4)
     np.testing.assert_array_equal(there.seen, X - 2.0 >= 0)
 
 
-def test_what_is_hidden_or_empty_or_behind_is_not_seen():
+def test_hidden_and_empty_surfaces_and_those_behind_are_not_seen():
     near = plane(10.0).at[:, WIDTH // 2 :].set(4.0)
     there = warp(plane(10.0), camera(), near, camera())
     np.testing.assert_array_equal(there.seen, X < WIDTH // 2)
@@ -83,7 +83,7 @@ def test_bilinear_samples_are_exact_on_a_ramp_and_hold_the_border():
     ramp = jnp.asarray(np.stack([X, Y, 2 * X - Y], -1), jnp.float32)
     limits = [0.5, 0.5], [WIDTH - 0.5, HEIGHT - 0.5]
     xy = np.random.default_rng(0).uniform(*limits, (50, 2)).astype(np.float32)
-    want = np.stack([xy[:, 0], xy[:, 1], 2 * xy[:, 0] - xy[:, 1]], -1)
-    np.testing.assert_allclose(sample_bilinear(ramp, jnp.asarray(xy)), want, atol=1e-4)
+    expected = np.stack([xy[:, 0], xy[:, 1], 2 * xy[:, 0] - xy[:, 1]], -1)
+    np.testing.assert_allclose(sample_bilinear(ramp, jnp.asarray(xy)), expected, atol=1e-4)
     outside = sample_bilinear(ramp, jnp.array([[-5.0, -5.0], [1e3, 1e3]]))
     np.testing.assert_allclose(outside, [ramp[0, 0], ramp[-1, -1]], atol=1e-4)
