@@ -1,4 +1,4 @@
-"""Small scenes made on disk, and the one measure every reader is held to."""
+"""Small scenes made on disk, and the reprojection errors by which readers are judged."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from p2gs_jax.types import Scene, View
 
 @contextlib.contextmanager
 def refused(*words: str) -> Iterator[None]:
-    """Expect a UserError whose message matches the first pattern, and that holds other words."""
+    """Expect a UserError whose message matches the first pattern and whose text has the others."""
     with pytest.raises(UserError, match=words[0]) as info:
         yield
     for word in words[1:]:
@@ -39,7 +39,7 @@ def reprojection_errors(scene: Scene) -> np.ndarray:
 
 
 def copy_model(source: Path, target: Path) -> Path:
-    """Copy `sparse/0` and link the images, writable; return the model's folder."""
+    """Copy `sparse/0`, writable, and link the images; return the model's folder."""
     model = target / "sparse" / "0"
     model.mkdir(parents=True)
     for file in (source / "sparse" / "0").iterdir():
@@ -88,7 +88,7 @@ def write_rgba(path: Path, value: int = 90, size: tuple[int, int] = (40, 30)) ->
 def make_view(
     path: Path, image: np.ndarray | None = None, f: float = 60.0, *, at=(0.0, 0.0, 0.0), **fields
 ) -> View:
-    """Return a pinhole's view of a file that looks along z; an image given is written first."""
+    """Return a pinhole view of a file, `f` in pixels, along z; `image` is written to the file."""
     size, viewmat = fields.pop("size", (64, 48)), np.eye(4, dtype=np.float32)
     viewmat[:3, 3] -= at
     if image is not None:
@@ -111,7 +111,7 @@ def around(count: int, distance: float = 4.0) -> np.ndarray:
 
 
 def blender(poses: np.ndarray, part: str, angle: float = 0.7) -> dict:
-    """Return what NeRF's synthetic scenes have in the .json of a part of the split."""
+    """Return the .json of a part of the split, as NeRF's synthetic scenes have it."""
     frames = [
         {"file_path": f"./{part}/r_{k}", "rotation": 0.01, "transform_matrix": pose.tolist()}
         for k, pose in enumerate(poses)

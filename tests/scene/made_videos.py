@@ -1,4 +1,4 @@
-"""Videos made with PyAV; what it cannot write is patched into the file."""
+"""Videos made with PyAV; rotations, which it cannot write, are patched into the file."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ def write_video(
     quality: int = 10,
     options: dict[str, str] | None = None,
 ) -> None:
-    """Write pictures, uint8 or uint16 R G B, as a video of 30 frames a second or at given times.
+    """Write pictures, uint8 or uint16 R G B, as a video of 30 frames a second or at `times`, s.
 
-    Not with libx265: PyAV 18.1's returns packets that its own muxer refuses, in 638 of 1,800 calls
-    that we counted, whatever its threads.
+    libx265 cannot be used: in 638 of 1,800 calls PyAV 18.1's returned packets that PyAV's muxer
+    refuses, whatever the number of threads.
     """
     with av.open(str(path), "w") as container:
         stream = container.add_stream(
@@ -59,7 +59,7 @@ def write_video(
 
 
 def turn(path: Path, degrees: int) -> None:
-    """Say in an .mp4 that it is to be shown turned clockwise, as phones do."""
+    """Mark an .mp4 as rotated clockwise for display, as phones do."""
     data = bytearray(path.read_bytes())
     at = data.index(b"tkhd") + 44
     a, b, c, d = _TURNS[degrees]
@@ -75,7 +75,7 @@ _TEXTURES = [
 
 @functools.cache
 def room(position: float) -> np.ndarray:
-    """Return what a camera sees that moves sideways, metres, in a made room.
+    """Return the picture of a camera at a sideways position, metres, in a made room.
 
     A textured wall stands at 4 m, and textured posts before it at 2 m.
     """

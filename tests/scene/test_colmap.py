@@ -1,4 +1,4 @@
-"""COLMAP models, binary and text: against pycolmap, and broken copies."""
+"""COLMAP models, binary and text, agree with pycolmap, and broken ones are refused."""
 
 import os
 
@@ -39,7 +39,7 @@ def test_reader_agrees_with_pycolmap(shared_data, name):
 
 
 @pytest.mark.parametrize("stem", ["cameras", "images", "points3D"])
-def test_damaged_binary_names_the_file(shared_data, tmp_path, stem):
+def test_damaged_binary_files_are_named(shared_data, tmp_path, stem):
     file = copy_model(shared_data("bundler_et"), tmp_path) / f"{stem}.bin"
     data = file.read_bytes()
     file.write_bytes(data[: len(data) // 2])
@@ -54,7 +54,7 @@ def test_damaged_binary_names_the_file(shared_data, tmp_path, stem):
         load_scene(tmp_path, CFG)
 
 
-def test_tiny_model_and_names_with_blanks(tmp_path):
+def test_text_models_and_names_with_blanks_are_read(tmp_path):
     thinned = "9 0.1 0.2 4 10 20 30 0.5\n8 0 0 4 10 20 30 0.5\n"
     write_tiny_model(tmp_path / "other_tool", points=thinned)
     scene = load_scene(tmp_path / "other_tool", CFG)
@@ -82,7 +82,7 @@ def test_tiny_model_and_names_with_blanks(tmp_path):
         ({"cameras": "1 PINHOLE 30 40 50 50 15 20\n"}, "wrong size: .*im 0.png is 40x30"),
     ],
 )
-def test_broken_models(tmp_path, change, message):
+def test_broken_models_are_refused(tmp_path, change, message):
     write_tiny_model(tmp_path, **change)
     with refused(message, *(["image_undistorter"] if "OTHER" in message else [])):
         load_scene(tmp_path, CFG)
@@ -114,7 +114,7 @@ def test_smaller_images_rescale_the_cameras(tmp_path):
     assert "rescaled" in scene.notes[0]
 
 
-def test_image_folder_option(tmp_path):
+def test_an_option_names_the_folder_of_images(tmp_path):
     write_tiny_model(tmp_path)
     (tmp_path / "images").rename(tmp_path / "photos")
     with refused("no image folder", "--images"):

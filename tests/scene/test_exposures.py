@@ -1,4 +1,4 @@
-"""Known exposures: CSV in several spellings, EXIF, and what is wrong with a file."""
+"""Known exposures are read from CSV or EXIF, and faults of a file are named."""
 
 import dataclasses
 from pathlib import Path
@@ -25,14 +25,14 @@ def views(*names, exif=None):
         ("# comment\nimage,exposure\nb.png,0.5\nz.png,3\n", [np.nan, -1]),
     ],
 )
-def test_csv(tmp_path, text, expected):
+def test_columns_and_names_of_a_csv_file_are_read(tmp_path, text, expected):
     path = tmp_path / "e.csv"
     path.write_text(text, encoding="utf-8")
     found = read_known_exposures(str(path), views("front/a.png", "b.png")) / np.log(2)
     np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
-def test_names_are_whole_or_ends_and_never_several(tmp_path):
+def test_names_match_whole_or_by_their_end_and_never_several_views(tmp_path):
     path = tmp_path / "e.csv"
     rig = views(*(f"rig/cam{k}/{n}.png" for k in range(3) for n in "ab"))
     path.write_text("image,ev\nrig\\cam0\\a.png,1\ncam1/a,2\nrig/cam2/b.png,3\n")
@@ -46,7 +46,7 @@ def test_names_are_whole_or_ends_and_never_several(tmp_path):
         path.write_text("image,ev\n" + rows)
         with refused(words):
             read_known_exposures(str(path), rig)
-    # Also where all but one of them are held out.
+    # A name stays ambiguous if all but one of its views are held out.
     path.write_text("image,ev\na.png,1\n")
     with refused("a.png may be"):
         read_known_exposures(str(path), rig[:1], among=rig)
@@ -55,7 +55,7 @@ def test_names_are_whole_or_ends_and_never_several(tmp_path):
     np.testing.assert_allclose(read_known_exposures(str(path), both) / np.log(2), [1, np.nan])
 
 
-def test_exif():
+def test_exposures_of_exif_are_read():
     found = read_known_exposures("exif", [*views("a", exif=1.5), *views("b")])
     np.testing.assert_allclose(found / np.log(2), [1.5, np.nan])
     with refused("EXIF"):
@@ -72,7 +72,7 @@ def test_exif():
         pytest.param(f"image,ev\n{'x' * 200_000},1\n", "e.csv is not a CSV file", id="long"),
     ],
 )
-def test_bad_files_are_explained(tmp_path, text, words):
+def test_broken_csv_files_are_refused(tmp_path, text, words):
     (tmp_path / "e.csv").write_text(text)
     with refused(words):
         read_known_exposures(str(tmp_path / "e.csv"), views("a.png"))

@@ -36,7 +36,7 @@ def write_truth(path, value):
 
 
 def radiance_of(scene):
-    """Return the first true value of every view, or None."""
+    """Return the true radiance of every view's first pixel, or None."""
     found = find_radiance(scene, ImageStore(scene.views, CFG))
     truth = [found(row) for row in range(len(scene.views))]
     return [None if of_view is None else float(of_view[0, 0, 0]) for of_view in truth]
@@ -60,7 +60,7 @@ def write_synthetic(root):
 
 
 def write_poses(root, numbers=("train_000", "train_001", "test_000")):
-    """Write a COLMAP model with the photograph of one exposure for each pose, and the others."""
+    """Write a COLMAP model of one exposure for each pose, and photographs of all; return names."""
     images = write_tiny_model(root, n=len(numbers)) / "images.txt"
     text = images.read_text()
     for k, number in enumerate(numbers):
@@ -72,7 +72,7 @@ def write_poses(root, numbers=("train_000", "train_001", "test_000")):
     return [f"{number}_{e}.png" for number in numbers for e in range(3)]
 
 
-def test_synthetic_scenes_of_hdr_nerf(tmp_path):
+def test_synthetic_scenes_of_hdr_nerf_are_read(tmp_path):
     poses = write_synthetic(tmp_path / "sofa")
     scene = find_scene(tmp_path / "sofa", CFG)
     of_pose = ("test/r_0", "train/r_0", "train/r_1")
@@ -86,7 +86,7 @@ def test_synthetic_scenes_of_hdr_nerf(tmp_path):
     assert "3 brackets of 3 exposures." in survey(tmp_path / "sofa", CFG).sentences
 
 
-def test_models_with_one_photograph_of_each_pose(tmp_path):
+def test_models_of_one_exposure_get_the_others_of_each_pose(tmp_path):
     root = tmp_path / "gauss"
     names = write_poses(root)
     # 3DGS writes matrices to a file of this name.
@@ -113,7 +113,7 @@ def test_models_with_one_photograph_of_each_pose(tmp_path):
     assert "has 5 rows, but" in find_scene(root, CFG).notes[-1]
 
 
-def test_settings_of_raw_photographs(tmp_path):
+def test_settings_of_raw_photographs_are_read(tmp_path):
     write_tiny_model(tmp_path)
     for k, shutter in enumerate(("1/8", "1/2")):
         write_image(tmp_path / "raw" / f"im {k}.png")
@@ -137,7 +137,7 @@ def test_settings_of_raw_photographs(tmp_path):
         ("{", "exposure.json is not valid JSON"),
     ],
 )
-def test_broken_exposures(tmp_path, content, message):
+def test_broken_files_of_exposures_are_refused(tmp_path, content, message):
     write_poses(tmp_path / "a")
     (tmp_path / "a" / "exposure.json").write_text(content)
     with refused(message):
@@ -158,8 +158,8 @@ def test_brackets_of_tables_are_held_out_whole(tmp_path):
             find_scene(tmp_path, CFG)
 
 
-def taken(path, *shots, end=20.0):
-    """Return views of shots (name, place, exposure), and of two more places."""
+def views_of(path, *shots, end=20.0):
+    """Return views of shots (name, x, exposure in EV), and of two more places."""
     shots = (*shots, ("y", end / 2, None), ("z", end, None))
     views = [(replace(make_view(path, at=(x, 0, 0)), exif_ev=ev), name) for name, x, ev in shots]
     return tuple(replace(view, name=f"{name}.png") for view, name in views)
@@ -179,18 +179,18 @@ OTHERS = {
 
 
 @pytest.mark.parametrize("shots", SHOTS.values(), ids=SHOTS)
-def test_brackets_are_told(tmp_path, shots):
-    views = taken(tmp_path, *shots)
+def test_brackets_are_found_by_names_poses_or_exposures(tmp_path, shots):
+    views = views_of(tmp_path, *shots)
     assert brackets(views) == [0, 0, 2, 2, 4, 5]
     assert bracket_notes(brackets(views)) == ["2 brackets of 2 exposures."]
     assert [v.split for v in assign_split(views, 2)][:4] == ["test", "test", "train", "train"]
 
 
 @pytest.mark.parametrize("shots", OTHERS.values(), ids=OTHERS)
-def test_other_photographs_are_no_brackets(tmp_path, shots):
-    views = taken(tmp_path, *shots)
+def test_other_photographs_are_not_brackets(tmp_path, shots):
+    views = views_of(tmp_path, *shots)
     assert brackets(views) == [*range(len(views))]
-    still = taken(tmp_path, ("a", 0.0, None), ("b", 0.0, None), end=0.0)
+    still = views_of(tmp_path, ("a", 0.0, None), ("b", 0.0, None), end=0.0)
     assert brackets(still) == [0, 1, 2, 3]
     # The mean of equal centres may differ from them by rounding.
     turn = Rotation.from_euler("xyz", (15, 20, 30), degrees=True).as_matrix()
@@ -200,7 +200,7 @@ def test_other_photographs_are_no_brackets(tmp_path, shots):
     assert brackets([replace(turned, name=f"{k}.png") for k in range(10)]) == [*range(10)]
 
 
-def test_brackets_of_photographs_alone_are_told_by_their_names(tmp_path):
+def test_brackets_of_photographs_alone_are_found_by_names(tmp_path):
     for name in ("a_-2EV", "a_0EV", "a_+2EV", "b_-2EV", "b_0EV", "c"):
         write_image(tmp_path / f"{name}.png")
     assert survey(tmp_path, CFG).sentences[0] == "2 brackets of 2 to 3 exposures."

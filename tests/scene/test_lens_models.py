@@ -1,4 +1,4 @@
-"""Lenses: OpenCV's formulas forwards, ours backwards, in rasters and through the readers."""
+"""Lenses: undistortion inverts OpenCV's and COLMAP's projections, for points and rasters."""
 
 import cv2
 import numpy as np
@@ -11,12 +11,7 @@ from scene.test_transforms import LENS, frames, write
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene import find_scene, load_scene
-from p2gs_jax.scene.lens import (
-    _fold_radius,
-    intrinsics,
-    undistort_points,
-    undistortion_maps,
-)
+from p2gs_jax.scene.lens import _fold_radius, intrinsics, undistort_points, undistortion_maps
 from p2gs_jax.scene.sfm.map import camera_of
 from p2gs_jax.types import Distortion
 
@@ -50,14 +45,14 @@ lenses = st.one_of(radial.map(Distortion), fisheye.map(lambda c: Distortion(c, "
 
 @settings(max_examples=100, deadline=None)
 @given(lenses)
-def test_lenses_are_undone(lens):
+def test_undistortion_inverts_the_lens(lens):
     wide = lens.model == "fisheye"
     X = rays(0.98 * min(_fold_radius(lens), 15.0) if wide else 0.9 * min(_fold_radius(lens), 1.3))
     found = undistort_points(photographed(X, lens), K, lens)
     np.testing.assert_allclose(found, (X @ K.T)[:, :2], rtol=2e-5, atol=0.02)
 
 
-def test_beyond_the_fold_and_at_the_side_of_a_fisheye_there_is_no_ray():
+def test_beyond_the_fold_and_90_degrees_of_a_fisheye_there_is_no_ray():
     lens, fisheye = Distortion((-0.3, 0.0, 0.0, 0.0)), Distortion((0.0,) * 4, "fisheye")
     r = _fold_radius(lens)
     for one, outermost in ((lens, r * (1 - 0.3 * r**2)), (fisheye, np.pi / 2)):
@@ -85,11 +80,11 @@ def test_beyond_the_fold_and_at_the_side_of_a_fisheye_there_is_no_ray():
         ),
     ],
 )
-def test_colmap_lenses(tmp_path, camera, model, coefficients):
+def test_lenses_of_colmap_are_read(tmp_path, camera, model, coefficients):
     write_tiny_model(tmp_path, cameras=f"1 {camera}\n")
     view = load_scene(tmp_path, DataConfig()).views[0]
     assert view.distortion == Distortion(coefficients, model)
-    # COLMAP projects with its own model to where ours comes from.
+    # COLMAP's projection of a ray is undistorted to the pinhole's pixel.
     ray = np.array([0.2, -0.1, 1.0])
     xy = undistort_points(camera_of(view, 1).img_from_cam(ray[None]), view.K, view.distortion)
     np.testing.assert_allclose(xy[0], (view.K @ ray)[:2], atol=1e-3)
@@ -106,12 +101,12 @@ LENSES = {
         *(0.01, -0.02, 0.01, 0.02, 0.03, 0.01),
     ],
 }
-# Radii where 1 - 4 k r^2 is 0, and where k1 and k2 let the distorted angle grow no more.
+# Radii at which 1 - 4 k r^2 is 0, and at which k1 and k2 stop the growth of distorted angles.
 FOLDS = {"DIVISION": 0.25, "THIN_PRISM_FISHEYE": 0.8698}
 
 
 @pytest.mark.parametrize("model", LENSES)
-def test_lenses_that_only_colmap_has(tmp_path, model):
+def test_lenses_that_only_colmap_has_are_undistorted(tmp_path, model):
     params = LENSES[model]
     line = f"1 {model} 40 30 {' '.join(map(str, params))}\n"
     view = load_scene(write_tiny_model(tmp_path, cameras=line).parents[1], DataConfig()).views[0]
@@ -133,7 +128,7 @@ def test_lenses_that_only_colmap_has(tmp_path, model):
 
 
 @pytest.mark.parametrize("extra", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
-def test_transforms_with_fisheyes(tmp_path, extra):
+def test_fisheyes_of_transforms_are_read(tmp_path, extra):
     lens = {"k1": 0.1, "k2": 0.02, "k3": -0.01, "k4": 0.003, **extra}
     path = write(tmp_path, {**LENS, **lens, "frames": frames("images/a.png")})
     view = find_scene(path, DataConfig()).views[0]

@@ -1,4 +1,4 @@
-"""Detection of formats, EXIF, masks, alpha, and what names of files say; sizes of pictures."""
+"""Detection of formats, EXIF, masks, alpha, names of files, and sizes of pictures."""
 
 import dataclasses
 import struct
@@ -35,7 +35,7 @@ def store_of(root, **options):
     return ImageStore(load_scene(root, cfg).views, cfg)
 
 
-def test_nothing_there(tmp_path):
+def test_a_folder_without_a_scene_is_refused(tmp_path):
     with refused("no scene in", str(tmp_path), "COLMAP", "transforms.json", "photographs"):
         load_scene(tmp_path, CFG)
     with refused("does not exist"):
@@ -45,14 +45,14 @@ def test_nothing_there(tmp_path):
         load_scene(tmp_path / "notes.txt", CFG)
 
 
-def test_results_stay_apart_from_photographs_alone(tmp_path):
+def test_results_among_photographs_alone_are_refused(tmp_path):
     write_image(tmp_path / "0.png")
     with refused("holds the photographs"):
         load_scene(tmp_path, CFG, tmp_path / "cache")
     assert [path.name for path in tmp_path.iterdir()] == ["0.png"]
 
 
-def test_a_folder_of_cameras_is_one_if_asked_for(tmp_path):
+def test_folders_of_cameras_are_a_scene_with_an_option(tmp_path):
     names = ["front/0.png", "left/0.png"]
     for name in names:
         write_image(tmp_path / name, size=(8, 8))
@@ -84,7 +84,7 @@ def test_masks_are_found_and_used(tmp_path):
         store_of(tmp_path).get(3)
 
 
-TIME, F_NUMBER, ISO, TAKEN = 33434, 33437, 34855, 36867
+TIME, F_NUMBER, ISO, DATE = 33434, 33437, 34855, 36867
 SHUTTER, APERTURE = 37377, 37378
 FULL = {TIME: 0.01, F_NUMBER: 2.0, ISO: 400}
 
@@ -100,11 +100,11 @@ def jpeg_with_exif(path, tags):
     ("shots", "cameras", "expected"),
     [
         ([FULL, {**FULL, ISO: 800}], "aa", [0, 1]),
-        # What no photograph states drops out; an ISO is then taken as 100.
+        # Settings that no photograph states drop out; the ISO value then counts as 100.
         ([{TIME: 0.01, F_NUMBER: 2.0}, {TIME: 0.02, F_NUMBER: 2.0}], "aa", [-2, -1]),
         ([{TIME: 0.01, ISO: 400}, {TIME: 0.02, ISO: 400}], "aa", [2, 3]),
         ([{F_NUMBER: 2.0, ISO: 400}, {F_NUMBER: 4.0, ISO: 400}], "aa", [6.644, 4.644]),
-        # So does what the same camera keeps constant, and nothing else.
+        # Settings that the same camera keeps constant drop out too, and no others.
         ([FULL, {TIME: 0.01, ISO: 400}, {TIME: 0.02, F_NUMBER: 2.0}], "aaa", [0, 0, 1]),
         ([FULL, {**FULL, ISO: 800}, {TIME: 0.01, F_NUMBER: 2.0}], "aaa", [0, 1, None]),
         ([FULL, {**FULL, ISO: 800}, {TIME: 0.01, ISO: 400}], "aab", [0, 1, None]),
@@ -118,7 +118,7 @@ def jpeg_with_exif(path, tags):
         ([{**FULL, F_NUMBER: 0.0, APERTURE: 0.0}, {TIME: 0.02, ISO: 400}], "aa", [2, 3]),
     ],
 )
-def test_exif_rules(tmp_path, shots, cameras, expected):
+def test_exposures_follow_from_incomplete_exif(tmp_path, shots, cameras, expected):
     paths = [jpeg_with_exif(tmp_path / f"{k}.jpg", tags) for k, tags in enumerate(shots)]
     found = exif_evs(paths, cameras)
     assert [ev if ev is None else pytest.approx(ev, abs=1e-3) for ev in expected] == found
@@ -135,11 +135,11 @@ def test_smaller_copies_have_the_exif_of_the_photographs(tmp_path):
     assert exif_evs(copies) == [pytest.approx(0), pytest.approx(1), None]
 
 
-def test_how_a_photograph_was_taken(tmp_path):
-    path, taken = tmp_path / "a.jpg", "2010:10:12 14:43:07"
-    shot = read_exif_settings(jpeg_with_exif(path, {**FULL, TAKEN: taken}))
-    assert shot == ExifSettings(pytest.approx(0.01), 2.0, 400.0, taken)
-    for tags in ({TAKEN: "    :  :     :  :  "}, {ISO: 65535, TAKEN: "yesterday"}):
+def test_settings_and_dates_of_exif_are_read(tmp_path):
+    path, date = tmp_path / "a.jpg", "2010:10:12 14:43:07"
+    shot = read_exif_settings(jpeg_with_exif(path, {**FULL, DATE: date}))
+    assert shot == ExifSettings(pytest.approx(0.01), 2.0, 400.0, date)
+    for tags in ({DATE: "    :  :     :  :  "}, {ISO: 65535, DATE: "yesterday"}):
         assert read_exif_settings(jpeg_with_exif(path, tags)) == ExifSettings()
     path.write_bytes(b"nothing")
     assert exif_evs([path, tmp_path / "absent.jpg"]) == [None, None]
@@ -163,7 +163,7 @@ def cutouts(tmp_path):
     [("white", (1, 1, 1)), ("black", (0, 0, 0)), ("0.2,0.4,0.6", (0.2, 0.4, 0.6)),
      ("random", (1, 1, 1))],
 )  # fmt: skip
-def test_photographs_are_composited(cutouts, background, color):
+def test_photographs_are_composited_over_the_background(cutouts, background, color):
     root, held = cutouts
     store = store_of(root, background=background)
     for k, rgba in enumerate(held):
@@ -225,12 +225,12 @@ def test_random_backgrounds_follow_from_seed_and_step(cutouts):
 
 
 @pytest.mark.parametrize("text", ["blue", "1,1", "0.5,0.5,1.5", "0,0,nan", "", "1,1,1,1"])
-def test_colours_that_are_none(text):
+def test_invalid_colours_are_refused(text):
     with refused("is not a valid colour"):
         background_color(DataConfig(background=text))
 
 
-def test_what_is_too_large_is_refused_by_its_header(tmp_path):
+def test_images_that_are_too_large_are_refused_by_their_header(tmp_path):
     write_tiny_model(tmp_path)
     bomb = bytearray((tmp_path / "images" / "im 1.png").read_bytes())
     bomb[16:24] = struct.pack(">II", 20_000, 20_000)
@@ -241,7 +241,7 @@ def test_what_is_too_large_is_refused_by_its_header(tmp_path):
     with refused(huge):
         store_of(tmp_path).get(1)
     (tmp_path / "images" / "im 1.png").write_bytes(bomb)
-    # Photographs alone are looked at before their features are.
+    # Sizes of photographs alone are checked before features are detected.
     for root in (tmp_path, tmp_path / "images"):
         with refused(huge):
             load_scene(root, CFG)
@@ -255,7 +255,7 @@ ALL = DataConfig(test_every=0)
 @pytest.mark.parametrize(
     ("suffix", "kind"), [(".jfif", ".jpg"), (".jp2", ".jp2"), (".pgm", ".pgm")]
 )
-def test_seldom_formats_are_read_as_any_other(tmp_path, suffix, kind):
+def test_rare_formats_are_read(tmp_path, suffix, kind):
     gray = np.tile(np.linspace(20, 230, 64, dtype=np.uint8), (48, 1))
     path = tmp_path / f"a{suffix}"
     path.write_bytes(cv2.imencode(kind, gray)[1].tobytes())
@@ -265,7 +265,7 @@ def test_seldom_formats_are_read_as_any_other(tmp_path, suffix, kind):
     assert mask.all()
 
 
-def test_numbers_in_names_count(tmp_path):
+def test_names_are_ordered_by_their_numbers(tmp_path):
     names = [f"frame_{k}.jpg" for k in range(1, 101)]
     assert sorted(sorted(names), key=natural) == names
     assert {(names[k], names[k + 1]) for k in range(99)} <= {*pairs_by_name(sorted(names))}
@@ -273,7 +273,7 @@ def test_numbers_in_names_count(tmp_path):
     held = [v.name for v in assign_split(views, 8) if v.split == "test"]
     assert sorted(held, key=natural) == names[::8]
     assert [v.name for v in sorted(views, key=time_order)] == names
-    # A digit that is not a decimal is no number.
+    # A superscript digit is not a number.
     for name in ("3.bin", "\u00b2.bin", "10.bin"):
         (tmp_path / name).touch()
     assert [*numbered(tmp_path, (".bin",))] == [3, 10]
@@ -301,12 +301,12 @@ MASKS = [
 
 
 @pytest.mark.parametrize("place", MASKS)
-def test_masks_are_found_as_others_call_them(tmp_path, place):
+def test_masks_are_found_under_names_of_other_programs(tmp_path, place):
     write_tiny_model(tmp_path)
     write_image(tmp_path / place, 0)
     scene = load_scene(tmp_path, ALL)
     assert [view.mask_path for view in scene.views] == [tmp_path / place, None]
-    # What is a mask is no photograph.
+    # A mask is not listed as a photograph.
     assert [p.name for p in list_images(tmp_path / "images")] == ["im 0.png", "im 1.png"]
 
 
@@ -321,7 +321,7 @@ def test_masks_of_several_cameras_are_not_mixed_up(tmp_path):
     assert [v.mask_path.parent.name for v in found] == ["a", "b"]
 
 
-def test_masks_that_are_of_nothing_are_named_and_a_mask_may_be_a_photograph(tmp_path):
+def test_masks_of_no_photograph_are_noted_and_mask_may_be_part_of_a_name(tmp_path):
     write_tiny_model(tmp_path)
     write_image(tmp_path / "masks" / "other.png")
     (note,) = load_scene(tmp_path, ALL).notes
@@ -329,12 +329,12 @@ def test_masks_that_are_of_nothing_are_named_and_a_mask_may_be_a_photograph(tmp_
         "masks holds 1 files, but none has the name of a photograph: "
         "name each mask like its photograph"
     )
-    # Nothing there is called as this would be without the word.
+    # No photograph has this name without the word "mask".
     write_image(tmp_path / "images" / "venetian_mask.png")
     assert len(list_images(tmp_path / "images")) == 3
 
 
-def test_alpha_says_something_where_it_varies(tmp_path):
+def test_alpha_matters_only_if_it_varies(tmp_path):
     write_tiny_model(tmp_path)
 
     def write(alpha):

@@ -1,4 +1,4 @@
-"""Pixels and cameras of what moves: masks of boxes, and stores that leave them out."""
+"""Masks of boxes that move, and image stores that leave their pixels out."""
 
 import dataclasses
 
@@ -41,12 +41,12 @@ def by_points(view, box, time=0.0, margin=0.15):
     return mask
 
 
-# Beside the last the camera is within its length: it reaches behind.
+# The last box reaches behind the camera.
 @pytest.mark.parametrize(
     ("at", "turn"),
     [((0.5, 0.3, 8), 0.4), ((-4, 0, 6), -0.8), ((3, 0.5, 2), 0.2), ((2, 0.2, 0.5), 1.5)],
 )
-def test_a_mask_is_what_points_in_the_box_cover(tmp_path, at, turn):
+def test_a_mask_covers_the_pixels_of_points_in_the_box(tmp_path, at, turn):
     view, box = view_at(tmp_path), thing(at, turn)
     mask, sampled = object_mask(view, [box], *WHOLE), by_points(view, box)
     assert mask.any()
@@ -59,7 +59,7 @@ def test_a_mask_is_what_points_in_the_box_cover(tmp_path, at, turn):
     assert (shrunk & (closed == 0)).mean() < 2e-3
 
 
-def test_only_what_moves_at_the_view_s_own_time_and_any_size(tmp_path):
+def test_masks_cover_moving_boxes_at_the_time_of_the_view_at_any_size(tmp_path):
     box, view = thing((-2, 0, 8.0), step=(4.0, 0, 0)), view_at(tmp_path, time=0.75)
     mask = object_mask(view, [box], *WHOLE)
     assert (mask & by_points(view, box, 0.75)).sum() > 0.9 * mask.sum()

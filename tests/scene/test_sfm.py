@@ -1,4 +1,4 @@
-"""Structure from motion: pairs, features that stay, reasons, and scenes of photographs alone."""
+"""Structure from motion: pairs, reuse of features, reasons, and photographs alone."""
 
 import dataclasses
 import functools
@@ -22,13 +22,13 @@ from p2gs_jax.scene.sfm.map import agreement, reasons, sentence
 CFG = DataConfig()
 
 
-def test_bare_folder_with_a_stranger_and_its_cache(shared_data, tmp_path):
+def test_photographs_alone_with_a_stranger_are_mapped_and_cached(shared_data, tmp_path):
     source, folder = shared_data("bundler_et") / "images", tmp_path / "scene"
     shutil.copytree(source, folder, copy_function=shutil.copyfile)
     stranger = sorted((shared_data("sceaux_castle") / "images").iterdir())[0]
     shutil.copyfile(stranger, folder / "stranger.jpg")
-    said = []
-    scene = load_scene(folder, CFG, tmp_path / "work", said.append)
+    log = []
+    scene = load_scene(folder, CFG, tmp_path / "work", log.append)
     assert scene.format == "images"
     assert len(scene.views) >= 7
     assert {v.camera for v in scene.views} == {scene.views[0].camera}
@@ -37,16 +37,16 @@ def test_bare_folder_with_a_stranger_and_its_cache(shared_data, tmp_path):
     note = next(note for note in scene.notes if "could not be registered" in note)
     assert "stranger.jpg (matches no other photograph)" in note
     assert "overlap" in note
-    assert any("detecting" in line for line in said)
+    assert any("detecting" in line for line in log)
 
-    said.clear()
-    again = load_scene(folder, CFG, tmp_path / "work", said.append)
-    assert not any("detecting" in line for line in said)
+    log.clear()
+    again = load_scene(folder, CFG, tmp_path / "work", log.append)
+    assert not any("detecting" in line for line in log)
     assert np.array_equal(again.points, scene.points)
     assert again.notes == scene.notes
 
 
-def test_nothing_registers_or_opens(tmp_path):
+def test_photographs_that_do_not_register_or_open_are_refused(tmp_path):
     write_image(tmp_path / "0.png")
     with refused("holds 1 image"):
         load_scene(tmp_path, CFG)
@@ -61,7 +61,7 @@ def test_nothing_registers_or_opens(tmp_path):
 
 @pytest.fixture
 def folder(noisy_street, tmp_path):
-    """Return a folder with five photographs of a street, those of one camera, and a blank one."""
+    """Return a folder of five photographs of a street, by one camera, and a blank one."""
     features.quiet_colmap()
     (tmp_path / "photos").mkdir()
     for k, path in enumerate(sorted((noisy_street / "images").rglob("*.png"))[:5]):
@@ -70,27 +70,27 @@ def folder(noisy_street, tmp_path):
     return tmp_path / "photos"
 
 
-def test_only_what_is_new_is_done_and_matches_judge_poses(noisy_street, folder, tmp_path):
+def test_only_new_photographs_are_processed_and_matches_judge_poses(noisy_street, folder, tmp_path):
     def names_in(database):
         with features.opened(database) as db:
             return {i.name: (i.camera_id, i.image_id) for i in db.read_all_images()}
 
-    said, names, keep = [], [f"IMG ({k}).png" for k in range(5)], tmp_path / "features"
-    database = kept_features(keep, folder, {("one",): names[:3]}, said.append)
-    match_kept(database, names[:3], None, said.append)
+    log, names, keep = [], [f"IMG ({k}).png" for k in range(5)], tmp_path / "features"
+    database = kept_features(keep, folder, {("one",): names[:3]}, log.append)
+    match_kept(database, names[:3], None, log.append)
     before = names_in(database)
-    assert said == ["detecting features: 3 images", "matching: 3 image pairs"]
+    assert log == ["detecting features: 3 images", "matching: 3 image pairs"]
 
-    said.clear()
-    database = kept_features(keep, folder, {("one",): names}, said.append)
-    match_kept(database, names, None, said.append)
+    log.clear()
+    database = kept_features(keep, folder, {("one",): names}, log.append)
+    match_kept(database, names, None, log.append)
     after = names_in(database)
     assert {n: after[n] for n in before} == before
     assert len({camera for camera, _ in after.values()}) == 1, "still one camera"
-    assert "features of 3 images come from an earlier run" in said
-    assert "detecting features: 2 images" in said
-    assert "matches of 3 image pairs come from an earlier run" in said
-    assert "matching: 7 image pairs" in said
+    assert "features of 3 images come from an earlier run" in log
+    assert "detecting features: 2 images" in log
+    assert "matches of 3 image pairs come from an earlier run" in log
+    assert "matching: 7 image pairs" in log
 
     by_path = sorted(find_scene(noisy_street, CFG).views, key=lambda view: view.image_path)[:5]
     views = [dataclasses.replace(v, name=name) for v, name in zip(by_path, names, strict=True)]
@@ -101,16 +101,16 @@ def test_only_what_is_new_is_done_and_matches_judge_poses(noisy_street, folder, 
         ]
         require_axes(turned, functools.partial(agreement, database), "street")
 
-    said.clear()
+    log.clear()
     os.utime(folder / "IMG (1).png", ns=(1, 1))
-    kept_features(keep, folder, {("one",): names}, said.append)
-    assert said == ["detecting features: 5 images"], "one changed: all anew"
+    kept_features(keep, folder, {("one",): names}, log.append)
+    assert log == ["detecting features: 5 images"], "one changed: all anew"
 
-    said.clear()
+    log.clear()
     names = ["IMG (0).png", "IMG (1).png", "blank.png"]
-    database = kept_features(keep, folder, {("one",): names[:1], ("two",): names[1:]}, said.append)
-    assert said == ["detecting features: 3 images"], "other cameras: all anew"
-    match_kept(database, names, None, said.append)
+    database = kept_features(keep, folder, {("one",): names[:1], ("two",): names[1:]}, log.append)
+    assert log == ["detecting features: 3 images"], "other cameras: all anew"
+    match_kept(database, names, None, log.append)
     why = reasons(database, names, [])
     assert set(why) == set(names)
     assert why["blank.png"].startswith("no features")
@@ -119,7 +119,7 @@ def test_only_what_is_new_is_done_and_matches_judge_poses(noisy_street, folder, 
     assert "IMG (0).png, IMG (1).png (matches only" in sentence(why)
 
 
-def test_cache_survives_interruption(tmp_path):
+def test_an_interrupted_build_is_not_cached(tmp_path):
     calls = []
 
     def use(value, key, fail=False, work=tmp_path):

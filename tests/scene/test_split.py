@@ -1,4 +1,4 @@
-"""Who decides what is held out: a file of the user, the data set, or every n-th view."""
+"""A file of the user, the data set, or every n-th view decides which views are held out."""
 
 import dataclasses
 import json
@@ -29,7 +29,7 @@ def split_by(model, text, name="mine.json"):
     return load_scene(model, DataConfig(split=str(path)))
 
 
-def test_split_per_camera(tmp_path):
+def test_every_nth_view_of_each_camera_is_held_out(tmp_path):
     names = [("l", f"{i:02d}") for i in range(9)] + [("r", "0"), ("r", "1"), ("single", "s")]
     views = [dataclasses.replace(make_view(tmp_path), name=f"{c}/{n}", camera=c) for c, n in names]
     out = assign_split(tuple(reversed(views)), 4)
@@ -42,7 +42,7 @@ def test_split_per_camera(tmp_path):
 
 
 @pytest.mark.parametrize("folder", [".", "sparse/0"])
-def test_lists_beside_a_colmap_model(model, folder):
+def test_lists_beside_a_colmap_model_are_used(model, folder):
     scene = load_scene(model, CFG)
     assert (held_out(scene), scene.split_by) == (["im 0.png"], "every 8th view of each camera")
     (model / folder / "test.txt").write_text("# held out\nim 1.png\n\nim 3\n")
@@ -88,7 +88,7 @@ def test_a_list_of_the_user_wins(model):
         ('{"test": ["im 1.png"], "train": []}', r"leaves no view to train on"),
     ],
 )
-def test_broken_lists(model, text, message):
+def test_broken_lists_are_refused(model, text, message):
     with refused(message):
         split_by(model, text, "a.json" if text[0] == "{" else "a.txt")
     with refused(r"nowhere.txt does not exist"):
@@ -125,7 +125,7 @@ def write_ply(path, points, colors=None, names=RGB, kind="f4"):
     PlyData([PlyElement.describe(table, "vertex")]).write(str(path))
 
 
-def test_nerfstudio_lists(tmp_path):
+def test_lists_of_nerfstudio_are_used(tmp_path):
     lists = {
         "train_filenames": ["images/f_0.png", "images/f_1.png", "./images/f_2.png"],
         "val_filenames": ["images/f_3.png"],
@@ -150,7 +150,7 @@ def test_nerfstudio_seeds_are_read_or_named(tmp_path):
     for colors, expected, names in (
         (np.array([10, 200], np.uint8), [10, 200], RGB),
         (np.array([0.0, 1.0], np.float32), [0, 255], RGB),
-        # As other programs write them: wider, in other names, as coefficients.
+        # Other programs write wider integers, other names, or coefficients.
         (np.array([10, 200], np.uint16), [10, 200], RGB),
         (np.array([10.0, 200.0], np.float32), [10, 200], RGB),
         (np.array([10, 200], np.uint8), [10, 200], [f"diffuse_{name}" for name in RGB]),

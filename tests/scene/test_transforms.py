@@ -31,11 +31,10 @@ def write(folder, data, *, names=("images/a.png", "images/b.png")):
 
 
 def frames(*paths, **extra):
-    pose = np.eye(4).tolist()
-    return [{"file_path": path, "transform_matrix": pose, **extra} for path in paths]
+    return [{"file_path": p, "transform_matrix": np.eye(4).tolist(), **extra} for p in paths]
 
 
-def test_camera_angle_and_absent_extension(tmp_path):
+def test_angles_give_the_focal_length_and_names_may_lack_an_extension(tmp_path):
     data = {"camera_angle_x": 2 * np.arctan(0.5), "frames": frames("./images/a", "images/b")}
     scene = find_scene(write(tmp_path, data), CFG)
     assert [v.name for v in scene.views] == ["a.png", "b.png"]
@@ -94,7 +93,7 @@ POSE = "transform_matrix of a.png"
     ],
     ids=lambda value: str(value)[:40],
 )
-def test_broken_files(tmp_path, change, message):
+def test_broken_transforms_are_refused(tmp_path, change, message):
     if isinstance(change, dict):
         change = {**LENS, "frames": frames("images/a.png"), **change}
     path = write(tmp_path, change)
@@ -121,10 +120,10 @@ def test_two_photographs_are_triangulated(tmp_path):
 
 
 @pytest.mark.parametrize("key", ["images.txt", "file_path", "mask_path", "ply_file_path"])
-def test_names_stay_in_the_scene(tmp_path, key):
+def test_names_that_leave_the_scene_are_refused(tmp_path, key):
     scene, name = tmp_path / "scene", "a/../../../secret.png"
     images = write_tiny_model(scene) / "images.txt"
-    # It is there, but not in the scene, and nothing opens it.
+    # This file exists, but outside the scene, and no reader opens it.
     (tmp_path / "secret.png").write_text("secret")
     if key == "images.txt":
         path, root = images, scene
@@ -149,7 +148,7 @@ def test_absolute_names_inside_and_a_folder_that_the_user_names_are_read(tmp_pat
         find_scene(path, ALL)
     found = find_scene(path, DataConfig(test_every=0, images="../photographs"))
     assert found.views[0].name == "a.png"
-    # The folder of the photographs is a link, and tools write where it leads.
+    # The folder of the photographs is a link, and tools may write its target.
     (scene / "images").symlink_to(tmp_path / "photographs")
     for above in (link / "images", tmp_path / "photographs"):
         edit(path, lambda data, name=above / "a.png": data["frames"][0].update(file_path=str(name)))
@@ -178,7 +177,7 @@ def held_out(scene):
     return [view.name for view in scene.views if view.split == "test"]
 
 
-def test_val_takes_the_place_of_test_only_where_there_is_none(tmp_path):
+def test_val_replaces_test_only_if_there_is_none(tmp_path):
     both = load_blender(write_blender(tmp_path / "both", val=2), CFG)
     assert not any(view.name.startswith("val") for view in both.views)
     scene = load_blender(write_blender(tmp_path / "val", test=0, val=2), CFG)
@@ -192,7 +191,7 @@ def test_val_takes_the_place_of_test_only_where_there_is_none(tmp_path):
 
 @pytest.mark.parametrize("count", [0, FEWEST - 1, FEWEST])
 def test_the_split_of_the_data_set_wins_and_random_seeds_follow(tmp_path, monkeypatch, count):
-    """A handful of matched points is as good as none."""
+    """Fewer matched points than FEWEST count as none."""
     matched = np.random.default_rng(0).uniform(-1, 1, (count, 3)).astype(np.float32)
     found = lambda scene, *_, **__: dataclasses.replace(scene, points=matched)  # noqa: E731
     if count:  # Nothing matches in grey squares.
@@ -203,9 +202,9 @@ def test_the_split_of_the_data_set_wins_and_random_seeds_follow(tmp_path, monkey
     if count == FEWEST:
         np.testing.assert_array_equal(scene.points, matched)
         return
-    said = f"Only {count} points were matched" if count else "There are neither points nor matches"
-    assert f"{said}: {len(scene.points)} seeds were drawn at random" in scene.notes[-1]
-    # They are where all cameras look, and the same every time.
+    cause = f"Only {count} points were matched" if count else "There are neither points nor matches"
+    assert f"{cause}: {len(scene.points)} seeds were drawn at random" in scene.notes[-1]
+    # The seeds lie where all cameras look, and are the same every time.
     assert scene.tracks is scene.point_colors is None
     assert len(scene.points) > 10_000
     assert np.linalg.norm(scene.points, axis=1).max() < 3.5
@@ -216,7 +215,7 @@ def test_the_split_of_the_data_set_wins_and_random_seeds_follow(tmp_path, monkey
     assert (local[:, 2] > 0).all()
 
 
-def test_every_and_none_are_held_out_and_cameras_that_look_apart(tmp_path):
+def test_options_replace_the_split_and_depths_follow_from_cameras(tmp_path):
     write_blender(tmp_path)
     cfg = DataConfig(split="every", test_every=3)
     none, every = (with_masks_and_split(find_scene(tmp_path, c), c) for c in (ALL, cfg))
@@ -235,7 +234,7 @@ TRAIN, TEST = "transforms_train.json", "transforms_test.json"
 BOTH = r"transforms_(test|train).json and transforms_(test|train).json both list train/r_0.png"
 
 
-def test_broken_parts(tmp_path):
+def test_broken_parts_of_a_split_are_refused(tmp_path):
     edit(write_blender(tmp_path) / TEST, lambda d: d["frames"][0].update(file_path="train/r_0"))
     with refused(BOTH):
         load_scene(tmp_path, CFG)
@@ -248,7 +247,7 @@ def test_broken_parts(tmp_path):
 
 
 def rows(count=4, focal=50.0):
-    """Return what LLFF writes for cameras on a ring."""
+    """Return the rows of LLFF's table for cameras on a ring."""
     out = []
     for pose in around(count):
         # OpenGL's right, up, backwards; LLFF's down, right, backwards.
@@ -265,7 +264,7 @@ def write_llff(root, table, count=4, size=(40, 30), folder="images"):
     return root
 
 
-def test_llff_axes_and_lens(tmp_path):
+def test_llff_axes_and_lens_are_converted(tmp_path):
     scene = find_scene(write_llff(tmp_path, rows()), CFG)
     assert (scene.format, scene.depths) == ("llff", (2.0, 6.0))
     for view, pose in zip(scene.views, around(4), strict=True):
@@ -289,14 +288,14 @@ def test_llff_axes_and_lens(tmp_path):
         (3, [0, 5, 10], -rows()[3, [0, 5, 10]], "row 3 is not a rotation"),
     ],
 )
-def test_broken_llff_tables(tmp_path, row, columns, values, message):
+def test_broken_llff_tables_are_refused(tmp_path, row, columns, values, message):
     table = rows()
     table[row, columns] = values
     with refused(message, "poses_bounds.npy"):
         find_scene(write_llff(tmp_path, table), CFG)
 
 
-def test_broken_llff_files(tmp_path):
+def test_broken_llff_files_are_refused(tmp_path):
     path = write_llff(tmp_path, rows()) / "poses_bounds.npy"
     whole = path.read_bytes()
     for size in (0, 5, 40, len(whole) - 8):

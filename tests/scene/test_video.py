@@ -1,4 +1,4 @@
-"""Videos: colours, rotation, which frames are chosen, and what reaches the scene."""
+"""Videos: colours, rotation, the choice of frames, their files, and subtitles of drones."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_colours_survive_every_way_of_coding_them(tmp_path, codec, layout, full,
         ),
     ],
 )
-def test_hdr_video_becomes_light(tmp_path: Path, coding, name, signal, light) -> None:
+def test_hdr_video_is_converted_to_light(tmp_path: Path, coding, name, signal, light) -> None:
     assert to_light(np.array(signal), name) == pytest.approx(light, abs=2e-4)
     grey = np.repeat(np.repeat(np.linspace(6000, 46000, 8)[None, :, None], 64, 0), 40, 1)
     card, path = np.repeat(grey, 3, 2).astype(np.uint16), tmp_path / "a.mkv"
@@ -83,13 +83,13 @@ def test_hdr_video_becomes_light(tmp_path: Path, coding, name, signal, light) ->
 
 def test_wide_colours_of_a_phones_hdr_video_are_brought_to_srgb() -> None:
     # BT.2020's coordinates of sRGB red at half of HLG's range, as HEVC of 10 bits in an .mp4.
-    # The file is kept since libx265 in PyAV 18.1 fails on every other call (write_video's note).
+    # The file is kept since libx265 in PyAV 18.1 fails in every third call (write_video's note).
     light = srgb_decode(next(iter(video.frames_of(PHONE))).codes()[32, 32] / 65535)
     assert light == pytest.approx((1 / 12, 0, 0), abs=3e-3)
 
 
 @pytest.mark.parametrize(("degrees", "top"), [(90, "left"), (180, "bottom"), (270, "right")])
-def test_a_phone_held_upright_and_the_file_s_times(tmp_path: Path, degrees: int, top: str) -> None:
+def test_rotation_and_times_of_a_file_are_used(tmp_path: Path, degrees: int, top: str) -> None:
     card = np.zeros((64, 96, 3), np.uint8)
     edges = {"bottom": np.s_[-12:], "left": np.s_[:, :12], "right": np.s_[:, -12:]}
     card[edges[top]] = 255
@@ -102,12 +102,12 @@ def test_a_phone_held_upright_and_the_file_s_times(tmp_path: Path, degrees: int,
     codes = frame.codes()
     assert frame.size == video.video_size(path) == (codes.shape[1], codes.shape[0])
     assert codes.shape[:2] == ((64, 96) if degrees == 180 else (96, 64))
-    # Turned clockwise, what was on the left is above.
+    # Turned clockwise, the left edge is at the top.
     assert codes[4:8, 20:-20].min() > 240
     assert codes[-12:, 20:-20].max() < 15
 
 
-def test_two_moments_in_a_frame_are_taken_apart(tmp_path: Path) -> None:
+def test_interlaced_frames_show_one_moment(tmp_path: Path) -> None:
     path, moments = tmp_path / "a.mts", np.full((25, 96, 128, 3), 20, np.uint8)
     for k, moment in enumerate(moments):
         moment[:, 3 * k : 3 * k + 40] = 200
@@ -122,11 +122,11 @@ def test_two_moments_in_a_frame_are_taken_apart(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["a.insv", "a.360", "a.mp4"])
-def test_recordings_of_360_degree_cameras_are_no_picture_of_one_lens(tmp_path: Path, name) -> None:
+def test_recordings_of_360_degree_cameras_are_refused(tmp_path: Path, name) -> None:
     write_video(tmp_path / "plain.mp4", [CARD] * 2)
     data = (tmp_path / "plain.mp4").read_bytes()
     if name == "a.mp4":
-        # As stitching programs mark what they export.
+        # Stitching programs mark their exports so.
         at = data.index(b"moov") - 4
         size = int.from_bytes(data[at : at + 4], "big")
         mark = b"\0\0\0\x1euuid<GSpherical:Spherical>"
@@ -136,7 +136,7 @@ def test_recordings_of_360_degree_cameras_are_no_picture_of_one_lens(tmp_path: P
         survey(tmp_path / name, DataConfig())
 
 
-def test_what_is_no_video_is_refused(tmp_path: Path) -> None:
+def test_files_that_are_not_videos_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     path.write_bytes(b"this is a text file, not a film")
     with refused("cannot be opened as a video"):
@@ -177,23 +177,22 @@ def test_walking_gives_frames_at_even_distances_at_any_speed() -> None:
     assert 5 <= len(numbers) <= 30
     steps = np.diff(numbers[:-1])
     assert steps.max() <= 2.5 * steps.min()
-    slow = chosen(tuple(0.015 * k for k in range(100)))
-    assert abs(len(slow) - len(numbers)) <= 2
+    assert abs(len(chosen(tuple(0.015 * k for k in range(100)))) - len(numbers)) <= 2
     resting = (*WALK[:25], *([WALK[24]] * 15), *WALK[25:])
     assert abs(len(chosen(resting)) - len(numbers)) <= 1
     assert len(chosen((0.0,) * 12)) == 1
-    # Automatic exposure is no motion.
+    # Automatic exposure does not count as motion.
     frames = [grey(0.0, gain) for gain in np.linspace(0.3, 1.0, 15)]
     assert len(video.choose_frames(enumerate(frames))) == 1
 
 
-def test_of_neighbours_the_sharp_one_is_taken() -> None:
+def test_the_sharp_one_of_neighbouring_frames_is_chosen() -> None:
     numbers = chosen(WALK)
     middle = numbers[len(numbers) // 2]
     other = chosen(WALK, blurred=middle)
     assert middle not in other
     assert min(abs(n - middle) for n in other) <= 6
-    # A blurred frame is waited out: every frame is due once the camera walks.
+    # Every frame is due once the camera walks: the next one replaces a blurred frame.
     steps = (*([0.0] * 6), *(0.13 * k for k in range(1, 6)))
     assert 8 in chosen(steps)
     other = chosen(steps, blurred=8)
@@ -256,8 +255,7 @@ def test_subtitles_of_drones_state_the_exposures_of_frames(tmp_path: Path) -> No
         subtitles.write_text("\n".join(lines))
         shots = [shot_at(read_shots(subtitles), k / 30) for k in range(50)]
         assert {shot.aperture for shot in shots} == {2.8}
-        known = [(shot.iso, round(1 / shot.time)) for shot in shots]
-        assert known == frames + [frames[-1]] * 15
+        assert [(shot.iso, round(1 / shot.time)) for shot in shots] == frames + [frames[-1]] * 15
     found = read(film, tmp_path, every=10)
     assert found.notes[1] == "The exposures of the frames are read from DJI_0001.SRT."
     expected = np.log2(100 / 500 / 2.8**2) + np.array([0, 0, 1, 0, 0])
@@ -268,7 +266,7 @@ def test_subtitles_of_drones_state_the_exposures_of_frames(tmp_path: Path) -> No
     assert exif_evs(found.paths) == [None] * 5
 
 
-def test_one_frame_no_motion_or_half_a_file(tmp_path: Path) -> None:
+def test_one_frame_or_no_motion_is_refused_and_half_a_file_is_read(tmp_path: Path) -> None:
     write_video(tmp_path / "one.mp4", [room(0)])
     with refused("holds one frame"):
         read(tmp_path / "one.mp4", tmp_path)

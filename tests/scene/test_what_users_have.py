@@ -40,7 +40,7 @@ UTM = np.array([451_234.5, 5_212_345.25, 300.0])
         *("sparse/1", "rec", "a/dense/sparse/0", "colmap/sparse", "dense/sparse"),
     ],
 )
-def test_models_elsewhere_are_read(tmp_path, place):
+def test_models_in_other_folders_are_read(tmp_path, place):
     write_tiny_model(tmp_path)
     (tmp_path / "sparse" / "0").rename(tmp_path / "model")
     (tmp_path / "sparse").rmdir()
@@ -86,7 +86,7 @@ def test_the_largest_of_several_models_is_used(tmp_path, inside):
         (["left/a.png", "right/a.png"], [None, None, "a.png"]),
     ],
 )
-def test_names_that_are_nearly_right(tmp_path, names, files):
+def test_names_that_are_nearly_right_match(tmp_path, names, files):
     for file in filter(None, files):
         write_image(tmp_path / file)
     expected = {n: f for n, f in zip(names, files, strict=False) if f is not None}
@@ -121,8 +121,7 @@ def test_byte_order_marks_and_missing_lines_are_accepted(tmp_path):
     (tmp_path / "test.txt").write_text("im 1.png\n")
     for path in (*model.iterdir(), tmp_path / "test.txt"):
         path.write_bytes(codecs.BOM_UTF8 + path.read_bytes())
-    scene = find_scene(tmp_path, CFG)
-    assert [view.split for view in scene.views] == ["train", "test"]
+    assert [view.split for view in find_scene(tmp_path, CFG).views] == ["train", "test"]
     path = write(tmp_path / "other", {**LENS, "frames": frames("images/a.png")})
     path.write_bytes(codecs.BOM_UTF8 + path.read_bytes())
     assert len(find_scene(path, CFG).views) == 1
@@ -180,8 +179,8 @@ def test_paths_of_cameras_follow_the_scene():
     poses = around(3)
     poses[:, :3, 3] += UTM
     far = [Shot("a", np.linalg.inv(pose), np.eye(3), 8, 6) for pose in poses]
-    for given in (near, far):
-        for shot, expected in zip(near_scene(given, UTM), near, strict=True):
+    for shots in (near, far):
+        for shot, expected in zip(near_scene(shots, UTM), near, strict=True):
             np.testing.assert_allclose(shot.viewmat, expected.viewmat, atol=1e-6)
 
 
@@ -205,7 +204,7 @@ def test_poses_in_other_axes_are_refused(tmp_path):
 
 def test_pictures_of_a_whole_sphere_are_refused_with_a_remedy(tmp_path):
     up, east = np.meshgrid(np.linspace(-1.57, 1.57, 64), np.linspace(-3.14, 3.14, 128))
-    # The brightness of a direction, so that the sides meet and a pole is one point.
+    # Brightness depends on the direction, so that the sides meet and a pole is one point.
     sphere = 128 + 60 * (np.cos(up) * np.cos(3 * east + 1) + np.sin(up)).T
     flat = sphere[:, :64].repeat(2, axis=1)
     for k, picture in enumerate([flat, flat.T, sphere]):
@@ -275,8 +274,7 @@ def test_cameras_differ_by_the_lenses_of_frames(tmp_path):
         frame["fl_x"] = 50 + 10 * (k % 2)
     path = write(tmp_path, {**LENS, "frames": listed}, names=names)
     assert [v.camera for v in find_scene(path, CFG).views] == list("0101")
-    cfg = DataConfig(camera_by="one")
-    assert {v.camera for v in find_scene(path, cfg).views} == {"0"}
+    assert {v.camera for v in find_scene(path, DataConfig(camera_by="one")).views} == {"0"}
 
 
 def test_exposures_of_hdr_nerf_and_held_out_frames_are_read(tmp_path):

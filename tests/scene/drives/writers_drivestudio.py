@@ -1,4 +1,4 @@
-"""Waymo's recordings in drivestudio's layout, by what its preprocessing writes."""
+"""Waymo's recordings in the layout that drivestudio's preprocessing writes."""
 
 import json
 from pathlib import Path
@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 AZIMUTHS = {0: 0.0, 1: 0.8}
 NAMES = {0: "FRONT", 1: "FRONT_LEFT"}
-TURN = 0.1
+TURN = 0.1  # seconds of a scanner's turn
 BOXES = Path("instances/instances_info.json")
 
 
@@ -28,12 +28,12 @@ def box(place) -> np.ndarray:
 
 
 def instance(track, poses) -> dict:
-    kept = {
+    annotations = {
         "frame_idx": list(range(len(poses))),
         "obj_to_world": [pose.tolist() for pose in poses],
         "box_size": [list(w.SIZE)] * len(poses),
     }
-    return {"id": track, "class_name": "Vehicle", "frame_annotations": kept}
+    return {"id": track, "class_name": "Vehicle", "frame_annotations": annotations}
 
 
 def write(root: Path, frames=3) -> w.Made:

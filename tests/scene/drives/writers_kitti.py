@@ -8,13 +8,13 @@ from scene.drives import writers as w
 from scipy.spatial.transform import Rotation
 
 EARTH, LATITUDE, LONGITUDE = 6378137.0, 49.0, 8.4
-TURN = 0.1
+TURN = 0.1  # seconds of a scanner's turn
 # The reader's clock when the drive begins, s.
 START = np.datetime64("2011-09-26T13:02:25", "ns")
 BEGIN = START.astype(int) * 1e-9
 DATE, DRIVE = "2011_09_26", "2011_09_26_drive_0001_sync"
 BOXES = Path(DRIVE) / "tracklet_labels.xml"
-# When the scanner looks forward, and when cameras take photographs, after a frame begins.
+# Seconds from a frame's time until the scanner looks forward, and until photographs.
 SCANNED, LAG = 0.0035, {"image_02": 0.003, "image_03": 0.004}
 
 
@@ -35,7 +35,7 @@ P_RECT = {
 
 
 def imu(seconds: float) -> np.ndarray:
-    """Return the GPS unit in the reader's world, whose origin is where the drive begins."""
+    """Return the pose of the GPS unit; the reader's origin is where the drive begins."""
     out = w.car_at(seconds)
     out[:3, 3] -= w.car_at(0)[:3, 3]
     return out
@@ -53,9 +53,9 @@ def camera(name: str, seconds: float) -> np.ndarray:
 
 
 def local_when_passed(place: np.ndarray, forward: float) -> np.ndarray:
-    """Return a place in the scanner's axes when it is seen.
+    """Return a place in the scanner's axes at the moment when its beam passes the place.
 
-    The scanner turns clockwise from its back and looks forward in the middle of its turn.
+    The scanner turns clockwise from its back and looks forward at the time `forward`, s.
     """
     at = forward
     for _ in range(20):
@@ -144,10 +144,10 @@ def write(root: Path, frames=3) -> w.Made:
     things["parked"] = [[*s, yaw - 0.3 * at] for s, at in zip(stands, ats, strict=True)]
     boxes = tracklets(*(tracklet(name, 0, rows) for name, rows in things.items()))
     w.write_bytes(date / BOXES, boxes)
-    late = {"ahead": 0, "right": 0.25 * TURN}
+    delays = {"ahead": 0, "right": 0.25 * TURN}
 
     def box_at(time, place):
-        return scanner(time + late["right"] * (place == w.RIGHT)) @ box(place)
+        return scanner(time + delays["right"] * (place == w.RIGHT)) @ box(place)
 
     return w.Made(
         root=date,
@@ -158,7 +158,7 @@ def write(root: Path, frames=3) -> w.Made:
         },
         sweeps=list(BEGIN + forward),
         error=lambda points: w.off_landmarks(points, w.car_at(0)[:3, 3]),
-        boxes=w.tracks(forward, late, box_at, BEGIN),
+        boxes=w.tracks(forward, delays, box_at, BEGIN),
         tables=[Path(f"calib_{name}.txt") for name in ("cam_to_cam", "velo_to_cam", "imu_to_velo")]
         + [Path(DRIVE) / folder / "timestamps.txt" for folder in ("oxts", "image_03")],
         optional=[BOXES],

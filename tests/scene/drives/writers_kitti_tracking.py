@@ -1,4 +1,4 @@
-"""KITTI's tracking benchmark: the made sensors of its raw recordings, by its readme."""
+"""KITTI's tracking benchmark by its readme, with the sensors of `writers_kitti`."""
 
 from pathlib import Path
 
@@ -13,11 +13,11 @@ CALIBRATION, OXTS, LABELS = (
     SET / f"{part}/{SEQUENCE}.txt" for part in ("calib", "oxts", "label_02")
 )
 TO_CAMERA = raw.R_RECT @ raw.VELO_TO_CAM
-TURN_Y = 0.4
+TURN_Y = 0.4  # radians
 
 
 def label(frame, track, kind, middle, turn=TURN_Y) -> str:
-    """Return a line of a box whose middle is given in the scanner's axes."""
+    """Return a line of a box whose middle is in the scanner's axes."""
     x, y, z = w.applied(TO_CAMERA, np.asarray(middle)[None])[0]
     seen = f"{frame} {track} {kind} 0 0 -10 0 0 9 9"
     return f"{seen} 1.5 1.8 4.2 {x:.9f} {y + 0.75:.9f} {z:.9f} {turn:.9f}\n"
@@ -26,8 +26,7 @@ def label(frame, track, kind, middle, turn=TURN_Y) -> str:
 def box(place) -> np.ndarray:
     """Return the box in the scanner's axes: x forward, y left, z up, turned about a camera's y."""
     c, s = np.cos(TURN_Y), np.sin(TURN_Y)
-    turned = np.array([[c, s, 0], [0, 0, -1], [-s, c, 0]])
-    rotation = TO_CAMERA[:3, :3].T @ turned
+    rotation = TO_CAMERA[:3, :3].T @ np.array([[c, s, 0], [0, 0, -1], [-s, c, 0]])
     return w.matrix(Rotation.from_matrix(rotation), [*place, -0.5])
 
 
@@ -51,10 +50,10 @@ def write(root: Path, frames=3) -> w.Made:
         labels += label(k, 2, "parked", raw.local_when_passed(parked[:3, 3], at))
         labels += f"{k} -1 DontCare -1 -1 -10 1 2 3 4 -1 -1 -1 -1000 -1000 -1000 -10\n"
     w.write_bytes(root / LABELS, labels)
-    late = {"ahead": 0, "right": 0.25 * raw.TURN}
+    delays = {"ahead": 0, "right": 0.25 * raw.TURN}
 
     def box_at(time, place):
-        return raw.scanner(time + late["right"] * (place == w.RIGHT)) @ box(place)
+        return raw.scanner(time + delays["right"] * (place == w.RIGHT)) @ box(place)
 
     return w.Made(
         root=root,
@@ -63,7 +62,7 @@ def write(root: Path, frames=3) -> w.Made:
         },
         sweeps=list(ats),
         error=lambda points: w.off_landmarks(points, w.car_at(0)[:3, 3]),
-        boxes=w.tracks(ats, late, box_at),
+        boxes=w.tracks(ats, delays, box_at),
         tables=[CALIBRATION, OXTS],
         optional=[LABELS],
         scans=[SET / f"velodyne/{SEQUENCE}/{k:06d}.bin" for k in range(frames)],

@@ -1,4 +1,4 @@
-"""nuScenes: tables by the published schema; beside keyframes a sweep and a photograph between."""
+"""nuScenes: tables by the published schema, with a sweep and a photograph between keyframes."""
 
 import json
 from pathlib import Path
@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 from scene.drives import writers as w
 
-START = 1532402927647951
+START = 1532402927647951  # microseconds
 TABLES = Path("v1.0-mini")
 CAMERAS = {"CAM_FRONT": 0.0, "CAM_BACK_LEFT": 1.9}
 LAG = {"CAM_FRONT": -0.035, "CAM_BACK_LEFT": -0.001}
 K = [[50.0, 0, 31.5], [0, 51, 23.5], [0, 0, 1]]
-TURN = 0.05
+TURN = 0.05  # seconds of a scanner's turn
 
 
 def placed(pose) -> dict:

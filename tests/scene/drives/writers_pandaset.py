@@ -12,13 +12,13 @@ from scene.drives import writers as w
 BEGIN = 1557539956.5
 CAMERAS = {"front_camera": 0.0, "left_camera": np.pi / 2}
 LAG = {"front_camera": -0.05, "left_camera": -0.075}
-TURN = 0.1
+TURN = 0.1  # seconds of a scanner's turn
 FRONT = Path("camera/front_camera")
 CUBOIDS = Path("annotations/cuboids")
 
 
-def put(path: Path, held) -> None:
-    w.write_bytes(path, json.dumps(held))
+def put(path: Path, content) -> None:
+    w.write_bytes(path, json.dumps(content))
 
 
 def placed(pose: np.ndarray) -> dict:
@@ -47,7 +47,7 @@ def cuboid(uuid, pose, *, stationary=False, sensor=-1, sibling="-") -> dict:
 
 
 def cuboids(frame: int) -> list[dict]:
-    """Return two boxes that move with the car, a second one of the first, and one that stands."""
+    """Return a box at rest, two that move with the car, and a twin of the first of these."""
     at = TURN * frame
     return [
         cuboid("parked", beside(0, w.AHEAD), stationary=True),
