@@ -11,20 +11,20 @@ from p2gs_jax.types import TrackedObject
 WIDTH, HEIGHT, FOCAL = 96, 64, 48.0
 K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1.0]])
 AZIMUTHS = {"front": 0.0, "front_left": 45.0, "left": 90.0, "back": 180.0, "right": -90.0}
-SPEED, PERIOD, FAR = 10.0, 0.1, np.array([3000.0, 500.0, 20.0])
-# OpenCV's axes (x right, y down, z forward) in those of cars (x forward, y left, z up).
+SPEED, PERIOD, FAR = 10.0, 0.1, np.array([3000.0, 500.0, 20.0])  # m/s, s; the car's start, m
+# OpenCV's axes (x right, y down, z forward) in the car's axes (x forward, y left, z up).
 FORWARD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
-WALL = 6.0
+WALL = 6.0  # m beside the car
 
 
 def camera_pose(camera, frame):
-    """Camera to world: the car drives along x."""
+    """Return the camera-to-world matrix; the car drives along x."""
     turn = Rotation.from_euler("z", AZIMUTHS[camera], degrees=True).as_matrix()
     return pose_of(turn @ FORWARD, FAR + np.array([SPEED * PERIOD * frame, 0, 1.6]))
 
 
 def tracked_car(frames, moving=True):
-    """A car that overtakes on the left, or one that stands on the right."""
+    """Return a car that overtakes on the left, or one that stands on the right."""
     times = PERIOD * np.arange(frames)
     poses = np.tile(np.eye(4), (frames, 1, 1))
     poses[:, :3, 3] = FAR + ([4.0, 3.5, 0.8] if moving else [10.0, -4.0, 0.8])
@@ -34,7 +34,7 @@ def tracked_car(frames, moving=True):
 
 
 def sweep_points(frame, frames):
-    """Points of the walls, and of the car that moves, where it is then."""
+    """Return points of the walls and of the moving car in a frame."""
     rng = np.random.default_rng(frame)
     wall = rng.uniform([-20, 0, 0], [30, 0, 5], (800, 3))
     wall[:, 1] = np.where(np.arange(800) % 2, WALL, -WALL)

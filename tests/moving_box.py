@@ -1,4 +1,4 @@
-"""A drive past a wall before which a box crosses: photographs, laser points and a track."""
+"""A drive past a wall, in front of which a box crosses: photographs, laser points and a track."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FRAMES, INTERVAL, STEREO = 16, 0.1, 0.6
 SIZE = (2.0, 1.2, 1.0)
 # World: x right, y down, z forward, as of the first camera. Boxes: x forward, y left, z up.
 BOX_TO_WORLD = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-# Blurred as by 3DGS: the photographs that the shares found in the tests were measured on.
+# The blur of 3DGS; the bounds in tests were measured on these photographs.
 RENDER = RenderConfig(sh_degree=0, blur=0.3)
 
 
@@ -47,7 +47,7 @@ def splats(means, log_scales, radiance) -> Gaussians:
 
 def pose_at(time: float) -> np.ndarray:
     """Return where the box is: it crosses to the right, and turns a little."""
-    # Never along an axis: depths that are equal have no order.
+    # The box is never parallel to an axis: equal depths have no order.
     turn = 0.1 + 0.15 * time
     c, s = np.cos(turn), np.sin(turn)
     rotation = BOX_TO_WORLD @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
@@ -55,7 +55,7 @@ def pose_at(time: float) -> np.ndarray:
 
 
 def make_world() -> World:
-    """Return a wall with ground before it, and a box with a pattern of its own."""
+    """Return a wall with ground before it, and a box with a checked pattern."""
     rng = np.random.default_rng(0)
     u, v = np.meshgrid(np.arange(-8, 8, 0.4), np.arange(-4, 1.2, 0.4))
     wall = np.stack([u.ravel(), v.ravel(), np.full(u.size, 10.0)], 1)
@@ -88,12 +88,12 @@ def moved(gaussians: Gaussians, pose: np.ndarray) -> Gaussians:
 
 
 def camera_pose(frame: int, camera: int) -> np.ndarray:
-    """Return camera-to-world of one of two cameras that drive forward."""
+    """Return the camera-to-world matrix of one of two cameras that drive forward."""
     return pose_of(np.eye(3), [STEREO * (camera - 0.5), 0, 0.04 * frame])
 
 
-def taken(root: Path) -> list[Photograph]:
-    """Return where, when and from which pose the photographs are taken."""
+def photographs(root: Path) -> list[Photograph]:
+    """Return the photographs: their paths, times and poses."""
     return [
         Photograph(f"cam{k}", f, f * INTERVAL, root / f"cam{k}" / f"{f:03d}.png", camera_pose(f, k))
         for k, f in itertools.product(range(2), range(FRAMES))
@@ -103,7 +103,7 @@ def taken(root: Path) -> list[Photograph]:
 def write_photographs(root: Path) -> None:
     """Write the photographs of the drive: sRGB of exposed radiance, 8 bits."""
     world, render = make_world(), make_renderer(RENDER)
-    for photograph in taken(root):
+    for photograph in photographs(root):
         box = moved(world.box, pose_at(photograph.time))
         both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), world.wall, box)
         viewmat = np.linalg.inv(photograph.pose).astype(np.float32)
@@ -128,9 +128,9 @@ def recording(root: Path) -> Recording:
         return SweepPoints(found.astype(np.float64), np.full(len(found), time))
 
     sweeps = tuple(Sweep(f, f * INTERVAL, lambda f=f: sweep(f)) for f in range(FRAMES))
-    return Recording(root, "pandaset", cameras, taken(root), sweeps, (world.track,))
+    return Recording(root, "pandaset", cameras, photographs(root), sweeps, (world.track,))
 
 
 def drive_format() -> DriveFormat:
-    """Return a reader of such drives, to put in the place of a data set's."""
+    """Return a reader of this drive, which tests put in the place of a data set's reader."""
     return DriveFormat(("cam0",), lambda root, cfg: recording(root))

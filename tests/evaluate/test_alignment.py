@@ -45,7 +45,7 @@ def light(seed=0):
 @pytest.mark.parametrize("true", [2.0**-9, 0.4, 20.0, 2.0**9])
 @pytest.mark.parametrize("curve", ["srgb", "power"])
 def test_fit_exposure_finds_the_exposure(true, curve):
-    """Also where the photograph is far darker or brighter, and masked pixels say otherwise."""
+    """Also with exposures far from 1, and with masked pixels that are saturated."""
     cfg, linear = PhotometryConfig(curve=curve), light()
     photo = display(formation(linear, USUAL, cfg)).at[:4].set(1.0)
     mask = jnp.ones((20, 30)).at[:4].set(0.0)
@@ -65,15 +65,15 @@ def test_fit_exposure_finds_the_exposure(true, curve):
 )
 def test_exposure_gamma_and_white_balance_are_found_together(true, gamma, balance, before):
     cfg, linear = PhotometryConfig(), light()
-    asked = {"gamma": gamma is not None, "white_balance": balance is not None}
+    fitted = {"gamma": gamma is not None, "white_balance": balance is not None}
     before = before if balance else None
-    taken, given = (None if b is None else jnp.asarray(b, jnp.float32) for b in (balance, before))
-    true = Capture(jnp.float32(true), jnp.float32(gamma or 2.2), taken)
+    drawn, first = (None if b is None else jnp.asarray(b, jnp.float32) for b in (balance, before))
+    true = Capture(jnp.float32(true), jnp.float32(gamma or 2.2), drawn)
     mask = jnp.ones((20, 30)).at[:4].set(0.0)
     photo = display(formation(linear, true, cfg)).at[:4].set(1.0)
-    start = replace(USUAL, white_balance=given)
+    start = replace(USUAL, white_balance=first)
     start = replace(start, exposure=alignment.fit_exposure(linear, photo, mask, start, cfg))
-    found = alignment.fit_capture(linear, photo, mask, start, cfg, **asked)
+    found = alignment.fit_capture(linear, photo, mask, start, cfg, **fitted)
     assert float(found.exposure) == pytest.approx(float(true.exposure), rel=5e-3)
     assert float(found.gamma) == pytest.approx(float(true.gamma), rel=5e-3)
     if balance is None:
@@ -95,7 +95,7 @@ def scores(linear, truth, brightest=1e9):
     return aligned.summary(rows, {"a": "train", "b": "test"})
 
 
-def test_pu21_reference_values():
+def test_pu21_has_its_published_values():
     # The published encoding maps 100 cd/m^2 to 256 and its darkest value to 0.
     assert pu21_encode(np.array(100.0)) == pytest.approx(256, abs=0.5)
     assert pu21_encode(np.array(0.005)) == pytest.approx(0, abs=1e-3)
@@ -103,7 +103,7 @@ def test_pu21_reference_values():
 
 
 @pytest.mark.parametrize(("c", "power"), [(0.05, 1.0), (20.0, 1.0), (1.0, 0.8)])
-def test_a_common_factor_costs_nothing_and_a_power_until_it_is_aligned(c, power):
+def test_a_common_factor_costs_nothing_and_a_power_only_before_alignment(c, power):
     truth = image()
     result = scores(truth**power / c, truth)
     assert result["stops_rms_power"] < 1e-4
@@ -116,14 +116,14 @@ def test_a_common_factor_costs_nothing_and_a_power_until_it_is_aligned(c, power)
         assert result["stops_rms"] > 0.1
 
 
-def test_errors_are_in_stops_and_pixels_count_by_what_is_true_of_them():
+def test_errors_are_in_stops_and_pixels_count_by_their_true_radiance():
     truth = image()
     wrong = truth * np.exp2(np.random.default_rng(1).normal(0, 0.5, truth.shape))
     assert scores(wrong, truth)["stops_rms"] == pytest.approx(0.5, abs=0.03)
     black = truth.copy()
     black[:2] = 1e-9
     assert scores(black, truth)["stops_rms"] < 3
-    # What is recovered too bright is an error; what is saturated and too dark is none.
+    # Radiance that is too bright is an error; saturated radiance that is too dark is not.
     truth = image()
     wrong = truth / 4
     wrong[truth.max(-1) < 0.3] *= 30
@@ -134,7 +134,7 @@ def test_errors_are_in_stops_and_pixels_count_by_what_is_true_of_them():
     assert scores(dim, truth, brightest=0.5)["stops_rms"] < 1e-6
 
 
-def test_what_is_aligned_does_not_grow_with_the_views(monkeypatch):
+def test_the_number_of_aligned_samples_is_bounded(monkeypatch):
     monkeypatch.setattr(radiance, "MOST_ALIGNED", 1000)
     truth = image()
     samples = [sampled(truth / 2, truth, EVERYWHERE, 10) for _ in range(10)]
@@ -142,7 +142,7 @@ def test_what_is_aligned_does_not_grow_with_the_views(monkeypatch):
     assert Alignment.of(samples, 1e9).scale == pytest.approx(2, rel=1e-6)
 
 
-def test_perceptual_scores_see_hue():
+def test_perceptual_scores_notice_a_change_of_hue():
     truth = image()
     assert delta_e_itp(truth, truth, EVERYWHERE, 1.0) == pytest.approx(0, abs=1e-9)
     red = truth * [1.2, 1.0, 0.9]
@@ -154,7 +154,7 @@ TRUTH = np.random.default_rng(0).uniform(0.1, 4.0, (8, 10, 3))
 SOME = np.ones((8, 10), bool)
 
 
-def test_nothing_to_judge_has_no_score():
+def test_scores_without_valid_pixels_are_nan():
     assert np.isnan(mu_law_psnr(TRUTH, TRUTH, ~SOME))
     assert np.isnan(mu_law_psnr(TRUTH, 0 * TRUTH, SOME))
     none = np.zeros((24, 32), bool)
@@ -162,7 +162,7 @@ def test_nothing_to_judge_has_no_score():
     assert np.isnan(aligned.scores(image(), image(), none)["stops_rms"])
 
 
-def test_a_constant_step_after_the_curve_is_its_psnr_without_masked_pixels():
+def test_mu_law_psnr_has_its_known_value_without_masked_pixels():
     assert mu_law(np.array([0.0, 1.0, 7.0, -1.0])) == pytest.approx([0, 1, 1, 0])
     assert (np.diff(mu_law(np.linspace(0, 1, 100))) > 0).all()
     assert mu_law(np.array(0.01)) == pytest.approx(np.log(51) / np.log(5001))

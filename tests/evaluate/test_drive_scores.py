@@ -1,4 +1,4 @@
-"""What is judged of drives: parts, depth against LiDAR; seams of photographs."""
+"""Scores of drives: their static and moving parts, depth against LiDAR, seams of photographs."""
 
 import dataclasses
 import functools
@@ -71,7 +71,7 @@ def metrics(scene):
     return plain(out.metrics)
 
 
-def test_old_keys_stay_and_parts_stand_beside_them(scene, metrics):
+def test_scores_of_parts_stand_beside_those_of_whole_views(scene, metrics):
     for part in (metrics["train"], metrics["test"]["exposure_fitted"], metrics["test"]["averaged"]):
         assert part["whole"]["psnr"] == pytest.approx(part["psnr"])
         assert set(part["static"]) == {"psnr", "ssim", "views"}
@@ -86,7 +86,7 @@ def test_old_keys_stay_and_parts_stand_beside_them(scene, metrics):
     assert "right" not in seen
 
 
-def test_depth_agrees_with_the_walls_also_beside_the_way_and_not_with_what_moves(metrics):
+def test_depth_agrees_with_the_walls_and_not_with_moving_objects(metrics):
     for split in ("all", "held_out"):
         depth = metrics["depth"][split]
         assert depth["static"]["median_m"] < 0.1
@@ -97,7 +97,7 @@ def test_depth_agrees_with_the_walls_also_beside_the_way_and_not_with_what_moves
     assert metrics["depth"]["held_out"]["views"] < metrics["depth"]["all"]["views"]
 
 
-def test_points_on_moving_boxes_go_along(scene):
+def test_points_on_moving_boxes_move_with_them(scene):
     lidar = scene.lidar
     rows = np.flatnonzero((lidar.objects >= 0) & (np.abs(lidar.times - 0.2) < 1e-6))
     assert len(rows) > 20
@@ -108,7 +108,7 @@ def test_points_on_moving_boxes_go_along(scene):
     np.testing.assert_array_equal(drives.at_time(lidar, (), still, 9.0), lidar.points[still])
 
 
-def test_what_shows_no_surface_is_infinitely_wrong():
+def test_depth_without_a_surface_has_an_infinite_error():
     points = np.array([[0, 0, 5.0], [0, 0.1, 5.0]], np.float32)
     lidar = Lidar(points, np.zeros(2), np.full(2, -1))
     K = np.array([[10.0, 0, 8], [0, 10, 6], [0, 0, 1]], np.float32)
@@ -188,9 +188,9 @@ def photographed(x: float, exposure: float, gamma: float = 2.2, claimed: float |
         ({"exposure": 1.6, "claimed": 1.6 * 2**0.25}, 1.0, 0.25),
         ({"exposure": 0.8, "gamma": 2.8}, None, 0.0),
     ],
-    ids=["a stop", "a wrong exposure", "a gamma of its own"],
+    ids=["a stop", "a wrong exposure", "another gamma"],
 )
-def test_what_was_done_to_light_goes_when_photographs_are_developed_alike(second, before, left):
+def test_seams_vanish_when_both_photographs_are_developed_alike(second, before, left):
     found = seams.measure_seam(
         photographed(0.0, 0.8), photographed(0.5, **second), COMMON, LossConfig()
     )
@@ -223,7 +223,7 @@ def test_saturated_masked_and_hidden_pixels_do_not_count():
     assert some.pixels == (SIZE - 24) * SIZE
 
 
-def test_halves_lie_on_the_side_of_their_camera_and_match_when_developed_alike():
+def test_halves_lie_on_the_side_of_their_camera_and_match_after_development():
     first, second = photographed(0.5, 0.8), photographed(-0.5, 1.6)
     ones = jnp.ones((SIZE, SIZE))
 
@@ -264,7 +264,7 @@ OVERLAP = ((0, 100), (10, 110), (60, 160), (900, 910))
         (ALONE, OVERLAP, 1, 9, [(0, 2)]),
     ],
 )
-def test_neighbours_are_those_of_a_moment_or_share_most_points(names, seen, held_out, most, pairs):
+def test_neighbours_have_the_same_time_or_share_most_points(names, seen, held_out, most, pairs):
     pose, K = np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32)
     splits = ["test" if row == held_out else "train" for row in range(len(names))]
     views = tuple(

@@ -1,4 +1,4 @@
-"""Every protocol of an evaluation; LPIPS where there are weights, views that tell nothing."""
+"""Every protocol of an evaluation, LPIPS with weights, and views without information."""
 
 import dataclasses
 import json
@@ -33,7 +33,7 @@ def scene(tmp_path_factory):
 
 
 def judged(scene, *, slope=0.0, **options):
-    """Return the metrics of a grey fit that is darker on one side, against references."""
+    """Return the metrics of a grey fit, darker on one side; photographs are its references."""
     store = ImageStore(scene.views, FitConfig().data)
 
     def shaded(gaussians, alive, camera):
@@ -71,7 +71,7 @@ def test_every_comparison_has_lpips_where_there_are_weights(scene, tmp_path, cap
         assert len(rows) == views
         assert min(rows) > 0
         assert part["lpips"] == pytest.approx(np.mean(rows))
-    # Every exposure is 1 and every gamma sRGB's, but for the held-out view's own fitted exposure.
+    # Every exposure is 1 and every gamma sRGB's, except the held-out view's fitted exposure.
     store = ImageStore(scene.views, FitConfig().data)
     for row, part in ((0, metrics["train"]), (2, metrics["test"]["averaged"])):
         photograph, mask = store.get(row, 1)
@@ -154,15 +154,15 @@ def test_hidden_views_are_left_out_of_the_scores(tmp_path, finished_run):
         assert now["train"]["per_view"][name] == pytest.approx(before["train"]["per_view"][name])
     for protocol in ("averaged", "exposure_fitted"):
         assert list(now["test"][protocol].get("per_view", {})) == held_out[1:]
-    assert len(shown) == len(scene.views), "what is not scored is written all the same"
+    assert len(shown) == len(scene.views), "views without scores are written too"
 
 
 KEY = 0.2
 
 
 @pytest.mark.parametrize("metered", [True, False])
-def test_held_out_views_are_scored_under_the_exposure_of_the_training_views_rule(tmp_path, metered):
-    """The camera held the log average at KEY, or chose exposures by lot."""
+def test_held_out_views_are_scored_under_the_metering_of_training_views(tmp_path, metered):
+    """The camera held the log average at KEY, or exposures are random."""
     levels = np.exp2(np.random.default_rng(0).normal(-2, 1, 24))
     drawn = np.exp2(np.random.default_rng(3).normal(0, 1, 24))
     scene = noise_scene(tmp_path, [f"{k:02d}.png" for k in range(24)], ("99.png",))
@@ -215,12 +215,12 @@ def test_results_keep_their_order_and_an_error_ends_the_rest():
 
 
 def test_the_first_item_is_computed_alone_and_few_results_wait():
-    begun = []
-    results = map_in_order(begun.append, range(100))
-    assert begun == []
+    started = []
+    results = map_in_order(started.append, range(100))
+    assert started == []
     next(results)
-    assert begun == [0]
+    assert started == [0]
     next(results)
     time.sleep(0.05)
-    assert len(begun) <= 2 * MOST_WORKERS + 2
+    assert len(started) <= 2 * MOST_WORKERS + 2
     results.close()

@@ -1,4 +1,4 @@
-"""Which file shows which view, and which pixels count."""
+"""Renders of other programs: the view that a file shows, and the pixels that count."""
 
 from typing import Any, cast
 

@@ -1,4 +1,4 @@
-"""The scripts of experiments/, without a fit: they import and write what the repository holds."""
+"""The scripts of experiments/, without a fit: imports, their contract and the page."""
 
 import importlib
 import json
@@ -18,7 +18,7 @@ def test_every_script_finds_what_it_imports(path):
     assert importlib.import_module(path.stem).__doc__
 
 
-def test_families_keep_the_contract():
+def test_every_family_has_a_name_a_text_and_a_function():
     for name, module in reliability.families().items():
         assert name == module.NAME
         assert module.ABOUT
@@ -34,7 +34,7 @@ def test_the_package_calls_nothing_unsafe(tmp_path):
     assert len(unsafe_calls(tmp_path)) == 4
 
 
-def test_the_page_in_the_repository_is_that_of_its_rows():
+def test_the_page_in_the_repository_follows_from_its_rows():
     rows = published_rows.read_rows() | published_rows.read_rows(write_page.AT_SIZE)
     published = json.loads((published_rows.HERE / "published.json").read_text(encoding="utf-8"))
     assert write_page.OUT.read_text(encoding="utf-8") == write_page.page(published, rows)

@@ -34,7 +34,7 @@ from p2gs_jax.types import Capture, Scene
 CFG = preset("robust")
 EV = np.array([-1.0, 0.6, -0.4, 0.0, 1.0, -0.2])
 PLAIN = {"ev": np.zeros(6), "gammas": np.full(6, 2.2), "balances": np.zeros((6, 3)), "shade": ()}
-OWN = np.broadcast_to(np.arange(112) > 30, (100, 112))
+MASK = np.broadcast_to(np.arange(112) > 30, (100, 112))
 VARIED = {
     "ev": EV,
     "gammas": 2.2 * np.exp([0.1, -0.1, 0.05, -0.05, 0.1, -0.1]),
@@ -44,7 +44,7 @@ VARIED = {
 
 
 def selection_of(ev, gammas, balances, shade, seen=None):
-    """Return what a calibration of six photographs of one camera would have found."""
+    """Return the result of a calibration of six photographs of one camera."""
     seen = np.ones(6, bool) if seen is None else seen
     values: dict[str, Any] = {f.name: np.zeros(6) for f in dataclasses.fields(PhotometricSolution)}
     values |= {
@@ -69,7 +69,7 @@ def radiance(height=100, width=112):
 
 
 def seen_as(selection, row=None):
-    """Return display values of the radiance as a photograph shows it, or (None) at the mean."""
+    """Return display values of the radiance in a photograph, or (None) at the mean exposure."""
     cfg, s = decide(CFG, selection, None).resolve(CFG).photometry, selection.solution
     if row is None:
         capture = on_host(Capture, np.float32(1.0), np.float32(s.gammas.mean()))
@@ -104,11 +104,11 @@ def read(root):
 
 
 def run(root, selection, **options):
-    """Develop a scene; return what was done, and the folder."""
+    """Develop a scene; return the result of `develop_scene`, and the folder."""
     scene = read(root)
     poses = poses_of(scene, root / "out" / "cache")
-    asked = Development(**options)
-    done = develop_scene(scene, poses, root / "out", CFG, selection, asked, Silent())
+    how = Development(**options)
+    done = develop_scene(scene, poses, root / "out", CFG, selection, how, Silent())
     return done, root / "out" / "developed"
 
 
@@ -128,11 +128,11 @@ def mask_in(path):
 
 @pytest.fixture(scope="module")
 def varied(tmp_path_factory):
-    """Return a scene and its calibration; the last photograph has a mask of its own."""
+    """Return a scene and its calibration; only the last photograph has a mask."""
     selection = selection_of(**VARIED)
     root = scene_of(tmp_path_factory.mktemp("varied"), selection)
     (root / "masks").mkdir()
-    cv2.imwrite(str(root / "masks" / "5.png"), np.where(OWN, 255, 0).astype(np.uint8))
+    cv2.imwrite(str(root / "masks" / "5.png"), np.where(MASK, 255, 0).astype(np.uint8))
     return root, selection
 
 
@@ -160,20 +160,20 @@ def test_photographs_become_those_of_the_common_exposure(varied, depth):
         assert (np.unique(found).size > 256) == (depth == "16bit")
 
 
-def test_masks_hold_what_the_originals_lost(varied):
+def test_masks_hide_pixels_that_the_originals_lost(varied):
     root, selection = varied
     _, out = run(root, selection)
     for row in range(6):
         original = codes_in(root / "images" / f"{row}.png").max(-1)
         mask = mask_in(out / "masks" / f"{row}.png.png")
-        expected = (original > 4) & (original < 250) & (OWN if row == 5 else True)
+        expected = (original > 4) & (original < 250) & (MASK if row == 5 else True)
         np.testing.assert_array_equal(mask, expected)
         whole = codes_in(root / "images" / f"{row}.png").min(-1) >= 250
         developed = codes_in(out / "images" / f"{row}.png")[whole]
         assert np.ptp(developed, axis=-1).max(initial=0) <= 1, "lost light has no colour"
     assert any(seen_as(selection, row).min(-1).max() == 1 for row in range(6))
     run(root, selection, masks=False)
-    np.testing.assert_array_equal(mask_in(out / "masks" / "5.png.png"), OWN)
+    np.testing.assert_array_equal(mask_in(out / "masks" / "5.png.png"), MASK)
     assert mask_in(out / "masks" / "0.png.png").all()
 
 
@@ -258,7 +258,7 @@ def test_photographs_without_an_exposure_are_developed_and_named(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["transforms", "blender", "llff"])
-def test_other_pose_files_name_what_is_there(tmp_path, kind):
+def test_other_pose_files_name_the_developed_photographs(tmp_path, kind):
     selection = selection_of(**{**PLAIN, "ev": EV})
     root = scene_of(tmp_path / "scene", selection)
     shutil.rmtree(root / "sparse")
@@ -305,22 +305,22 @@ def test_originals_are_never_replaced(tmp_path):
     assert files_in(root) == before
 
 
-def test_the_command(noisy_street, tmp_path, succeeded, refused):
-    given = ("--photometry.no-select", "--photometry.model", "view_exposure")
-    text = succeeded("calibrate", noisy_street, "--out", tmp_path, "--develop", *given)
+def test_calibrate_develops_with_its_options(noisy_street, tmp_path, succeeded, refused):
+    model = ("--photometry.no-select", "--photometry.model", "view_exposure")
+    text = succeeded("calibrate", noisy_street, "--out", tmp_path, "--develop", *model)
     assert str(tmp_path / "developed") in text
     assert (tmp_path / "developed.jpg").stat().st_size > 10_000
     assert "Before and after" in (tmp_path / "developed.html").read_text()
-    succeeded("calibrate", tmp_path / "developed", "--out", tmp_path / "again", *given)
+    succeeded("calibrate", tmp_path / "developed", "--out", tmp_path / "again", *model)
     spread = []
     for folder in (tmp_path, tmp_path / "again"):
         views = json.loads((folder / "photometry.json").read_text())["views"]
         spread.append(np.std([v["exposure_ev"] for v in views]))
     assert spread[1] < 0.05 < spread[0]
-    asked = ("calibrate", noisy_street, "--out", tmp_path / "none")
-    assert "without --develop" in refused(*asked, "--exposure-ev", "1")
-    assert "without --develop" in refused(*asked, "--no-masks")
-    assert "--static" in refused(*asked, "--static", "--develop", "8bit")
+    argv = ("calibrate", noisy_street, "--out", tmp_path / "none")
+    assert "without --develop" in refused(*argv, "--exposure-ev", "1")
+    assert "without --develop" in refused(*argv, "--no-masks")
+    assert "--static" in refused(*argv, "--static", "--develop", "8bit")
 
 
 def test_drives_are_refused(tmp_path):

@@ -1,4 +1,4 @@
-"""What is exported for other programs is the same scene: its exposures, its light, its places."""
+"""Exports for other programs hold the same scene: poses, photographs, points and exposures."""
 
 import json
 
@@ -28,7 +28,7 @@ EXPOSURES = {"0.png": 0.5, "1.png": 2.0, "2.png": 1.25}
 
 
 def rows(scene):
-    """Return photometry of the views: one held out with a fitted exposure, one without."""
+    """Return views of `photometry.json`: one is held out, some have no exposure."""
     out = []
     for v in scene.views:
         name = f"{v.name.partition('.')[0]}.png"
@@ -46,7 +46,7 @@ def export(root, cfg, program="colmap"):
     return scene, store, load_scene(root / "out", DataConfig())
 
 
-def named(root, suffix, write, folder=""):
+def rewrite(root, suffix, write, folder=""):
     """Give the photographs of a scene another format; `write` gets a path and an image."""
     listed = root / "sparse" / "0" / "images.txt"
     text = listed.read_text()
@@ -69,7 +69,7 @@ def exported(tmp_path_factory):
     return root / "out", before, after
 
 
-def test_an_undistorted_scene_comes_back_as_it_was(exported):
+def test_an_undistorted_scene_is_read_back_unchanged(exported):
     out, before, after = exported
     for a, b in zip(after.views, before.views, strict=True):
         assert (a.name, a.camera, a.split) == (b.name, b.camera, b.split)
@@ -93,15 +93,15 @@ def test_pycolmap_reads_the_model(exported):
     assert model.compute_num_observations() == len(before.tracks.xy)
     written = {k: p.error for k, p in model.points3D.items()}
     model.update_point_3d_errors()
-    # Observations travel as float32, and are moved a little to be told from zero.
+    # Observations travel as float32, and are moved a little to differ from zero.
     assert all(0 < e < 1e-3 for e in written.values())
     assert written == pytest.approx({k: p.error for k, p in model.points3D.items()}, abs=1e-9)
     assert model.compute_mean_reprojection_error() < 1e-3, "the dots lie where points project"
 
 
 @pytest.mark.parametrize("program", ["colmap", "nerfstudio"])
-def test_distorted_and_shrunk_photographs_become_pinhole_ones(tmp_path, program):
-    root = named(make_scene(tmp_path), ".jpg", in_adobe_rgb, "left/")
+def test_distorted_and_shrunk_photographs_become_pinhole_photographs(tmp_path, program):
+    root = rewrite(make_scene(tmp_path), ".jpg", in_adobe_rgb, "left/")
     path = root / "sparse" / "0" / "cameras.txt"
     lens = path.read_text().strip().replace("PINHOLE", "OPENCV")
     path.write_text(f"{lens} 0.08 0.01 0.001 -0.002\n")
@@ -154,7 +154,7 @@ FORMATS = [
 @pytest.mark.parametrize(("program", "width"), [("colmap", 80), ("nerfstudio", None)])
 @pytest.mark.parametrize(("suffix", "write"), FORMATS, ids=[name for name, _ in FORMATS])
 def test_every_format_is_read_back_with_its_colours(tmp_path, suffix, write, program, width):
-    root = named(make_scene(tmp_path), suffix, write)
+    root = rewrite(make_scene(tmp_path), suffix, write)
     _, ours, after = export(root, DataConfig(max_width=width), program)
     theirs = ImageStore(after.views, DataConfig())
     ending = suffix if suffix in (".png", ".PNG", ".jpg") else f"{suffix}.png"
@@ -162,11 +162,11 @@ def test_every_format_is_read_back_with_its_colours(tmp_path, suffix, write, pro
         assert view.name.endswith(ending)
         with Image.open(view.image_path) as image:
             assert image.mode == "RGB"
-        # JPEG twice; elsewhere what 8 bits round.
+        # JPEG is compressed twice; other formats are rounded to 8 bits.
         limit = 2 / 255 if suffix == ".jpg" else 1 / 255
         assert np.abs(theirs.get(index)[0] - ours.get(index)[0]).mean() < limit
     if program == "colmap":
-        # Exposures of names that photographs have.
+        # The table has the names of the photographs.
         read_known_exposures(root / "out" / "exposures.csv", after.views[1:3])
 
 
@@ -226,21 +226,21 @@ def sidecar(folder, *, activation="exp", degree=3, **photometry):
 @pytest.mark.parametrize("activation", ["exp", "linear"])
 @pytest.mark.parametrize("degree", [0, 2, 3])
 def test_radiance_follows_from_the_two_files(tmp_path, activation, degree):
-    said, g, _ = sidecar(tmp_path, activation=activation, degree=degree)
-    vertex = PlyData.read(str(tmp_path / said["ply"]))["vertex"]
+    saved, g, _ = sidecar(tmp_path, activation=activation, degree=degree)
+    vertex = PlyData.read(str(tmp_path / saved["ply"]))["vertex"]
     x, y, z = direction = (0.36, 0.48, -0.8)
-    K = said["spherical_harmonics"]["coefficients"]
-    assert K == (said["spherical_harmonics"]["degree"] + 1) ** 2 == (degree + 1) ** 2
-    basis = [eval(text, {"x": x, "y": y, "z": z}) for text in said["spherical_harmonics"]["basis"]]
-    radiance = np.empty((said["gaussians"], 3))
+    K = saved["spherical_harmonics"]["coefficients"]
+    assert K == (saved["spherical_harmonics"]["degree"] + 1) ** 2 == (degree + 1) ** 2
+    basis = [eval(text, {"x": x, "y": y, "z": z}) for text in saved["spherical_harmonics"]["basis"]]
+    radiance = np.empty((saved["gaussians"], 3))
     for c in range(3):
         names = [f"f_dc_{c}", *(f"f_rest_{c * (K - 1) + k - 1}" for k in range(1, K))]
         s = sum(b * vertex[name] for b, name in zip(basis, names, strict=True))
-        formula = said["radiance"]["formula"].split(" of the sum")[0]
+        formula = saved["radiance"]["formula"].split(" of the sum")[0]
         names = {"exp": np.exp, "log": np.log, "clip": np.clip, "max": np.maximum, "s": s}
         radiance[:, c] = eval(formula.removeprefix("L = "), names)
     ours = radiance_activation(
-        evaluate(g.sh, tuple(jnp.full(50, v) for v in direction)), said["radiance"]["activation"]
+        evaluate(g.sh, tuple(jnp.full(50, v) for v in direction)), saved["radiance"]["activation"]
     )
     np.testing.assert_allclose(radiance, ours, rtol=2e-5, atol=1e-6)
 
@@ -251,8 +251,8 @@ def test_radiance_follows_from_the_two_files(tmp_path, activation, degree):
 )
 @pytest.mark.parametrize(("exposure", "gamma"), [(1.0, 2.2), (2.5, 1.9), (0.2, 2.6)])
 def test_the_tone_curve_follows_from_the_table(tmp_path, options, exposure, gamma):
-    said, _, cfg = sidecar(tmp_path, **options)
-    tone = said["tone"]
+    saved, _, cfg = sidecar(tmp_path, **options)
+    tone = saved["tone"]
     radiance = np.exp2(np.linspace(-10, 3, 200)).astype(np.float32)
     exposed = np.maximum(exposure * radiance, tone["exposed_limits"][0])
     if tone["exposed_limits"][1] is not None:
@@ -264,13 +264,13 @@ def test_the_tone_curve_follows_from_the_table(tmp_path, options, exposure, gamm
 
 
 def test_views_have_cameras_at_the_size_of_the_fit_and_their_exposures(tmp_path):
-    said, _, _ = sidecar(tmp_path)
-    a, b = said["views"]
+    saved, _, _ = sidecar(tmp_path)
+    a, b = saved["views"]
     assert (a["image"], a["exposure"], a["gamma"]) == ("a.png", 2.0, 2.4)
     assert (b["exposure"], b["exposure_fitted"]) == (None, 1.5)
     assert (a["width"], a["height"]) == (20, 17)
     assert a["K"] == [[20, 0, 10], [0, 20, 8.5], [0, 0, 1]]
-    assert said["mean"]["exposure_geometric"] == 2.0
-    assert said["tone"]["correction"] is None
-    said, *_ = sidecar(tmp_path, appearance="affine")
-    assert said["tone"]["correction"] == {"kind": "affine", "file": "linear.appearance.npy"}
+    assert saved["mean"]["exposure_geometric"] == 2.0
+    assert saved["tone"]["correction"] is None
+    saved, *_ = sidecar(tmp_path, appearance="affine")
+    assert saved["tone"]["correction"] == {"kind": "affine", "file": "linear.appearance.npy"}

@@ -1,4 +1,4 @@
-"""The page: what it holds, what it leaves out where room is short, and that names stay text."""
+"""The page: its contents, Gaussians left out of a small page, and names that stay text."""
 
 import json
 import re
@@ -58,20 +58,20 @@ def test_the_file_holds_every_visible_gaussian_states_its_error_and_loads_nothin
     assert "default-src 'none'" in text
 
 
-def test_too_small_a_page_drops_what_weighs_least_or_is_refused(whole, fitted, tmp_path):
-    _, all_of_it = whole
-    size = all_of_it.size + RESERVE - 2 * len(all_of_it.splats.packed.data) // 3
+def test_a_small_page_drops_the_least_weights_or_is_refused(whole, fitted, tmp_path):
+    _, complete = whole
+    size = complete.size + RESERVE - 2 * len(complete.splats.packed.data) // 3
     page = write_page(tmp_path / "s.html", fitted, fitted.common_display(), size_mb=size / MEGABYTE)
     assert page.size <= size
     assert not page.splats.whole
-    assert page.splats.error.psnr_median < all_of_it.splats.error.psnr_median
-    said = page.sentences[0]
-    assert said.startswith("Left out to stay within")
-    assert f"{page.splats.packed.count} Gaussians remain" in said
+    assert page.splats.error.psnr_median < complete.splats.error.psnr_median
+    sentence = page.sentences[0]
+    assert sentence.startswith("Left out to stay within")
+    assert f"{page.splats.packed.count} Gaussians remain" in sentence
     if page.splats.dropped:
-        assert str(page.splats.dropped) in said
+        assert str(page.splats.dropped) in sentence
     (tmp_path / "s.html").unlink()
-    for size in (0.01, (all_of_it.size - 4 / 3 * len(all_of_it.splats.packed.data)) / MEGABYTE):
+    for size in (0.01, (complete.size - 4 / 3 * len(complete.splats.packed.data)) / MEGABYTE):
         with pytest.raises(UserError, match=r"--size-mb|would fit"):
             write_page(tmp_path / "s.html", fitted, fitted.common_display(), size_mb=size)
     assert list(tmp_path.iterdir()) == []
@@ -109,7 +109,7 @@ def test_hostile_names_stay_text(fitted):
     assert json.loads(element(text, "scene"))["views"][0]["name"] == views[0].name
 
 
-def test_photographs_are_embedded_only_when_asked_for(fitted, whole):
+def test_photographs_are_embedded_only_on_request(fitted, whole):
     assert embedded_photographs(fitted, 0) == {}
     found = embedded_photographs(fitted, 2)
     assert len(found) == 2
@@ -123,7 +123,7 @@ def test_photographs_are_embedded_only_when_asked_for(fitted, whole):
         embedded_photographs(gone, 1)
 
 
-def test_the_command_writes_it_once(finished_run, run_command, tmp_path):
+def test_export_writes_the_page_and_does_not_replace_it(finished_run, run_command, tmp_path):
     argv = ("export", finished_run, "--format", "html", "--out", tmp_path)
     for expected, word in ((0, "dB"), (2, "--overwrite")):
         status, printed = run_command(*argv)

@@ -1,4 +1,4 @@
-"""The page in a real browser, opened from disk: its light is ours, its controls do as they say."""
+"""The page in a browser, opened from disk: it renders like the package, its controls work."""
 
 import base64
 import shutil
@@ -37,17 +37,17 @@ def file(fitted):
 
 
 class Opened:
-    """A page of the browser, and its `Page` within."""
+    """A browser tab with the page."""
 
     def __init__(self, tab):
         self.tab = tab
 
     def __call__(self, words):
-        """Return what an expression of `p`, the page, is."""
+        """Return the value of a JavaScript expression of `p`, the page's `Page`."""
         return self.tab.evaluate(f"window.p2gs.then(async (p) => {words})")
 
     def light(self, index, *, linear=False):
-        """Return RGBA of a view at its size, rows from the top."""
+        """Return RGBA of a view at its size, rows from the top; `linear`: before the exposure."""
         view = self(f"({{w: p.scene.views[{index}].width, h: p.scene.views[{index}].height}})")
         words = f"""(() => p.measure({index}, {str(linear).lower()}).then((a) => {{
             const bytes = new Uint8Array(a.buffer);
@@ -59,7 +59,7 @@ class Opened:
         return data.reshape(view["h"], view["w"], 4)
 
     def canvas(self):
-        """Return the picture as drawn, once it rests; RGB codes."""
+        """Return the RGB codes of the canvas after the page has come to rest."""
         self.tab.wait_for_timeout(700)
         self("(p.draw(), 1)")
         url = self('p.renderer.canvas.toDataURL("image/png")')
@@ -69,8 +69,8 @@ class Opened:
 
 @pytest.fixture
 def open_page(browser, file):
-    """Return a function that opens the page from disk, offline; nothing may go wrong in it."""
-    wrong, asked, contexts, expected = [], [], [], []
+    """Return a function that opens the page from disk, offline; errors and requests fail."""
+    wrong, requests, contexts, expected = [], [], [], []
 
     def opened(link="", size=(800, 600), ratio=1):
         options = {"viewport": {"width": size[0], "height": size[1]}, "device_scale_factor": ratio}
@@ -80,7 +80,7 @@ def open_page(browser, file):
         tab.set_default_timeout(1e3 * PATIENCE_S)
         tab.on("console", lambda m: wrong.append(m.text) if m.type == "error" else None)
         tab.on("pageerror", lambda error: wrong.append(str(error)))
-        tab.on("request", lambda request: asked.append(request.url))
+        tab.on("request", lambda request: requests.append(request.url))
         tab.goto(file.as_uri() + link)
         page = Opened(tab)
         page.expect = expected.append
@@ -90,8 +90,8 @@ def open_page(browser, file):
     yield opened
     for context in contexts:
         context.close()
-    assert [said for said in wrong if not any(words in said for words in expected)] == []
-    assert [url for url in asked if url.split(":")[0] not in ("file", "blob", "data")] == []
+    assert [text for text in wrong if not any(words in text for words in expected)] == []
+    assert [url for url in requests if url.split(":")[0] not in ("file", "blob", "data")] == []
 
 
 def decibels(a, b):
@@ -99,7 +99,7 @@ def decibels(a, b):
 
 
 @pytest.mark.parametrize("link", ["", "?half"])
-def test_five_views_are_those_of_our_renderer(open_page, fitted, link):
+def test_five_views_agree_with_our_renderer(open_page, fitted, link):
     page = open_page(link)
     assert page("p.renderer.half") == bool(link)
     for index in range(5):
@@ -135,7 +135,7 @@ def test_the_exposure_slider_multiplies_light_by_exactly_two_to_the_ev(open_page
     np.testing.assert_allclose(page.light(1)[..., :3], dark * 2**0.35, rtol=3e-7)
 
 
-def test_the_picture_is_developed_as_ours(open_page, fitted):
+def test_the_picture_is_developed_as_by_the_package(open_page, fitted):
     camera, transform = fitted.camera(1), fitted.own_display(1)
     page = open_page(size=(camera.width, camera.height))
     page.tab.locator("#keep").evaluate("box => { box.checked = false; }")
@@ -144,7 +144,7 @@ def test_the_picture_is_developed_as_ours(open_page, fitted):
         linear = np.ascontiguousarray(page.light(1, linear=True)[..., :3])
         expected = 255 * develop(linear, replace(transform.with_curve(curve), gamma=1.9))
         assert np.abs(page.canvas() - expected).max() < 1.01
-    # The white point leaves grey alone and reaches white where it says.
+    # The white point keeps values to 0.18, and maps 4 (2 stops) to white.
     page('(p.go(1), p.set({curve: "linear", gamma: 2.2, white: 2, ev: 1}))')
     x = page.light(1)[..., :3].astype(float)
     shown = page.canvas() / 255
@@ -155,7 +155,7 @@ def test_the_picture_is_developed_as_ours(open_page, fitted):
     assert (x > 0.3).any()
 
 
-def test_stops_and_clipping_show_something_else(open_page):
+def test_stops_and_clipping_change_the_picture(open_page):
     page = open_page()
     page("p.set({ev: 2})")
     seen = [page.canvas()]
@@ -181,7 +181,7 @@ def test_split_shows_the_photograph_on_the_left(open_page, fitted):
     assert decibels(embedded, fitted.photograph(index)) > 22
 
 
-def test_a_device_that_was_taken_away_comes_back_with_the_picture(open_page):
+def test_a_lost_device_is_restored_with_the_same_picture(open_page):
     page = open_page()
     before = page.canvas()
     assert before.max() > 100
@@ -200,7 +200,7 @@ def test_a_device_of_256_bits_a_pixel_draws_the_same(open_page):
     np.testing.assert_array_equal(page.canvas(), before)
 
 
-def test_what_cannot_be_drawn_is_said(open_page):
+def test_a_failure_to_render_is_shown(open_page):
     page = open_page()
     page(
         "(p.renderer.complete = () => false, p.renderer.picture.width = 0, p.pose = null, p.wake())"
@@ -209,7 +209,7 @@ def test_what_cannot_be_drawn_is_said(open_page):
     page.expect("cannot render light")
 
 
-def test_clicking_a_camera_goes_there_and_uses_its_exposure_if_asked(open_page):
+def test_a_click_on_a_camera_goes_there_and_can_use_its_exposure(open_page):
     page = open_page()
     page("(p.hands.approach(0.4), p.marksShown = true, p.show())")
     page.canvas()
@@ -223,7 +223,7 @@ def test_clicking_a_camera_goes_there_and_uses_its_exposure_if_asked(open_page):
     assert page("p.state.look.ev") == page(f"p.scene.views[{at}].ev") != 0
 
 
-def test_dragging_wheel_and_keys_move_and_say_how_fast(open_page):
+def test_dragging_and_the_wheel_move_and_playing_shows_its_speed(open_page):
     page = open_page()
     here = page("p.state.camera.c")
     page.tab.mouse.move(200, 300)
@@ -240,7 +240,7 @@ def test_dragging_wheel_and_keys_move_and_say_how_fast(open_page):
     assert page("p.playing")
 
 
-def test_a_link_brings_back_what_was_seen(open_page):
+def test_a_link_restores_the_view(open_page):
     page = open_page()
     page('(p.hands.approach(1.2), p.set({ev: 1.25, gamma: 1.8, white: 1}), p.choose("stops"))')
     page.canvas()

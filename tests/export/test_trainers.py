@@ -1,4 +1,4 @@
-"""Values for other trainers, applied as these apply them."""
+"""Values for other trainers, applied as by the code of these trainers."""
 
 import json
 from pathlib import Path
@@ -32,18 +32,18 @@ def test_matrices_of_3dgs_turn_the_common_picture_into_each_photograph(tmp_path,
     assert "exposure.json" in write_for(["3dgs"], tmp_path, VIEWS)[0]
     light = np.random.default_rng(0).uniform(0.01, 0.2, (50, 3))
 
-    def taken(gains):
+    def developed(gains):
         return (PIVOT * (gains * light / PIVOT) ** (2.2 / GAMMA)) ** power
 
     for name, matrix in json.loads((tmp_path / "exposure.json").read_text()).items():
         m = np.array(matrix).reshape(3, 4)
         # gaussian_renderer/__init__.py of 3DGS: colours are rows.
-        shown = taken(1.5**0.5) @ m[:, :3] + m[:, 3]
-        np.testing.assert_allclose(shown, taken(EXPOSURES[name] * np.array(BALANCE)), rtol=1e-6)
+        shown = developed(1.5**0.5) @ m[:, :3] + m[:, 3]
+        np.testing.assert_allclose(shown, developed(EXPOSURES[name] * np.array(BALANCE)), rtol=1e-6)
 
 
 @pytest.mark.parametrize(("curve", "gammas"), [("srgb", (2.2, 2.2)), ("power", (2.2, 2.3))])
-def test_what_no_matrix_says_is_not_written(tmp_path, curve, gammas):
+def test_no_matrix_is_written_for_other_curves_and_gammas(tmp_path, curve, gammas):
     photometry(tmp_path / "photometry.json", curve, gammas)
     assert "is not written" in write_for(["3dgs"], tmp_path, VIEWS)[0]
     assert not (tmp_path / "exposure.json").exists()

@@ -34,5 +34,5 @@ def test_the_fault_is_noticed(fault, tmp_path):
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-n", "0", f"tests/{fault.caught_by}"]
     environment = os.environ | {"PYTHONPATH": str(tmp_path)}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
-    # Any other status is the fault's own making: pytest could not run.
+    # With any other status pytest itself could not run.
     assert done.returncode == FAILED, done.stdout + done.stderr

@@ -1,4 +1,4 @@
-"""EXR, PNG, video and false colour: what others read in them, and what a broken file gives."""
+"""EXR, PNG, video and false colour, read by other libraries; broken files are refused."""
 
 import av
 import cv2
@@ -27,7 +27,7 @@ def camera():
     return Camera(jnp.asarray(pose_of(turn, [0.5, -1.0, 2.5])), jnp.asarray(K), WIDTH, HEIGHT)
 
 
-def written(path, **kwargs):
+def header_of(path, **kwargs):
     write_exr(path, np.full((HEIGHT, WIDTH, 3), 0.25, np.float32), camera=camera(), **kwargs)
     with OpenEXR.File(str(path)) as file:
         return dict(file.header())
@@ -37,8 +37,8 @@ def test_exr_holds_radiance_exposure_and_depth(tmp_path):
     linear = np.exp2(np.random.default_rng(0).uniform(-10, 6, (7, 9, 3))).astype(np.float32)
     depth, alpha = np.full((7, 9), 4.0, np.float32), np.full((7, 9), 0.5, np.float32)
     path = tmp_path / "a.exr"
-    taken = DisplayTransform(2.0, 2.1, PhotometryConfig())
-    write_exr(path, linear, depth=depth, alpha=alpha, transform=taken)
+    transform = DisplayTransform(2.0, 2.1, PhotometryConfig())
+    write_exr(path, linear, depth=depth, alpha=alpha, transform=transform)
     back, _, header = read_exr(path)
     np.testing.assert_allclose(back, linear, rtol=1e-3)
     assert header["p2gsExposure"] == 2.0
@@ -55,8 +55,8 @@ def test_exr_holds_radiance_exposure_and_depth(tmp_path):
         np.testing.assert_allclose(file.channels()["Z"].pixels, 8.0)
 
 
-def test_points_lie_in_the_header_s_cameras_where_the_camera_sees_them(tmp_path):
-    header, cam = written(tmp_path / "a.exr"), camera()
+def test_matrices_of_the_header_project_points_like_the_camera(tmp_path):
+    header, cam = header_of(tmp_path / "a.exr"), camera()
     viewmat, K = np.asarray(cam.viewmat, float), np.asarray(cam.K, float)
     matrices = [header[name] for name in ("worldToCamera", "worldToNDC", "p2gsIntrinsics")]
     assert {matrix.dtype for matrix in matrices} == {np.dtype(np.float32)}, "as is standard"
@@ -72,21 +72,21 @@ def test_points_lie_in_the_header_s_cameras_where_the_camera_sees_them(tmp_path)
         np.testing.assert_allclose(left_handed, [local[0], -local[1], local[2], 1.0], atol=1e-5)
     np.testing.assert_allclose(header["p2gsViewmat"], viewmat, atol=1e-6)
     np.testing.assert_allclose(header["p2gsIntrinsics"], camera().K)
-    # The screen window bounds the image at distance 1; there is more of it above the axis.
+    # The screen window bounds the image at distance 1; more of it lies above the axis.
     width, (x, y) = header["screenWindowWidth"], header["screenWindowCenter"]
     np.testing.assert_allclose([x - width / 2, x + width / 2], [-41 / 80, (90 - 41) / 80])
     assert y == pytest.approx((37 - (70 - 37)) / 2 / 84)
 
 
-def test_exif_has_attributes_of_its_own(tmp_path):
+def test_exif_values_have_standard_attributes(tmp_path):
     path = tmp_path / "a.exr"
     exif = ExifSettings(time=1 / 60, aperture=2.8, iso=None, date="2010:10:12 14:43:07")
-    header = written(path, shot=exif)
+    header = header_of(path, shot=exif)
     assert header["expTime"] == pytest.approx(1 / 60)
     assert header["aperture"] == pytest.approx(2.8)
     assert header["capDate"] == "2010:10:12 14:43:07"
     assert "isoSpeed" not in header
-    assert not {"expTime", "aperture", "capDate"} & set(written(path))
+    assert not {"expTime", "aperture", "capDate"} & set(header_of(path))
 
 
 def test_the_header_holds_white_balance_and_vignetting(tmp_path):
@@ -94,14 +94,14 @@ def test_the_header_holds_white_balance_and_vignetting(tmp_path):
     for rows in (((-0.3, 0.1, 0.0),), ((-0.3, 0.1, 0.0), (-0.2, 0.0, 0.0), (-0.1, 0.0, 0.05))):
         cfg = PhotometryConfig(cameras=(CameraFormation("a"), CameraFormation("b", rows)))
         balance = (0.2, -0.05, -0.15)
-        taken = DisplayTransform(1.0, 2.2, cfg, white_balance=balance, camera=1)
-        write_exr(path, linear, transform=taken)
+        transform = DisplayTransform(1.0, 2.2, cfg, white_balance=balance, camera=1)
+        write_exr(path, linear, transform=transform)
         header = read_exr(path)[-1]
         np.testing.assert_allclose(header["p2gsWhiteBalance"], np.exp(balance), rtol=1e-6)
         each = rows if len(rows) == 3 else rows * 3
         for name, row in zip(("Red", "Green", "Blue"), each, strict=True):
             np.testing.assert_allclose(header[f"p2gsVignetting{name}"], row, rtol=1e-6)
-    write_exr(path, linear, transform=taken.without_place())
+    write_exr(path, linear, transform=transform.without_place())
     assert "p2gsVignettingRed" not in read_exr(path)[-1]
 
 
@@ -172,7 +172,7 @@ def test_frames_keep_their_order_and_colours_and_odd_sizes_are_cut(tmp_path):
     assert small[:, :14].max() < 20
 
 
-def test_a_failure_leaves_what_was_there(tmp_path):
+def test_a_failure_keeps_the_old_video(tmp_path):
     (tmp_path / "v.mp4").write_bytes(b"old")
 
     def fail():

@@ -1,4 +1,4 @@
-"""What is written can be read back, by us and by others, or is not there at all."""
+"""Files are written whole or not at all, and can be read back."""
 
 import json
 import os
@@ -48,7 +48,7 @@ def test_a_failure_leaves_the_old_file_or_folder_and_success_replaces_it(tmp_pat
 
 
 @pytest.mark.parametrize("at_once", [True, False])
-def test_a_folder_is_removed_when_the_new_one_is_there(tmp_path, monkeypatch, at_once):
+def test_the_old_folder_is_removed_after_the_new_one_is_there(tmp_path, monkeypatch, at_once):
     """Whenever the process is killed, one of both is whole."""
     removed, out = [], tmp_path / "out"
 
@@ -98,7 +98,7 @@ VIEW = {"image": "a.png", "camera": "0", "split": "test", "exif_ev": 1.5, "expos
 VIEW |= dict.fromkeys(("exposure", "exposure_ev", "gamma"))
 
 
-def test_photometry_comes_back_and_incomplete_views_are_refused(tmp_path):
+def test_photometry_is_read_back_and_incomplete_views_are_refused(tmp_path):
     path, common = tmp_path / "photometry.json", {"model": "m", "gauge": "g"}
     write_photometry(path, **common, curve={}, mean={}, views=[VIEW])
     assert read_photometry(path)["views"][0] == VIEW
@@ -119,14 +119,14 @@ HOSTILE = ["\x1b[31mred.png", r"$\nothing$.png", "写真.png"]
 
 
 @pytest.mark.parametrize("names", [LONG[:1], LONG, HOSTILE], ids=["one", "long", "hostile"])
-def test_a_summary_is_written_in_silence_with_gaps_in_exif_and_odd_names(tmp_path, recwarn, names):
+def test_gaps_in_exif_and_odd_names_cause_no_warning_in_a_summary(tmp_path, recwarn, names):
     image, flat = np.full((24, 32, 3), 0.5, np.float32), np.ones((24, 32), np.float32)
     exif = [None if k in (1, 4, 7, 8) else float(k) for k in range(9)]
     cameras = [r"$\nothing$", "\x1b[31m", "写"] * 3
     train = [SimpleNamespace(exif_ev=e, camera=c) for e, c in zip(exif, cameras, strict=True)]
     views = [SimpleNamespace(name=name, split="test") for name in names]
-    taken = DisplayTransform(1.0, 2.2, FitConfig().photometry)
-    shown = [ViewResult(k, image, flat, flat, image, image, taken) for k in range(len(names))]
+    transform = DisplayTransform(1.0, 2.2, FitConfig().photometry)
+    shown = [ViewResult(k, image, flat, flat, image, image, transform) for k in range(len(names))]
     params = Params(None, Photometry(jnp.linspace(-1, 1, 9), jnp.zeros(9), "log"))
     scene = SimpleNamespace(views=views, training_views=train)
     write_summary(tmp_path / "s.png", shown, params, scene, FitConfig())

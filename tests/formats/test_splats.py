@@ -48,7 +48,7 @@ def ours(g):
 
 
 def assert_same_colors(sh, g, atol=2e-5):
-    """Check coefficients of a world that is turned by FLIP, in a direction."""
+    """Compare colours in one direction; `sh` is in axes turned by FLIP."""
     direction = np.array([0.48, -0.6, 0.64])
     seen = evaluate(jnp.asarray(sh), tuple(np.tile(direction * FLIP, (len(sh), 1)).T))
     expected = evaluate(g.sh, tuple(np.tile(direction, (len(sh), 1)).T))
@@ -56,7 +56,7 @@ def assert_same_colors(sh, g, atol=2e-5):
 
 
 def gltf_columns(path):
-    """Read the attributes of the one primitive by pygltflib."""
+    """Return what pygltflib reads: the document, its only primitive, and its attributes."""
     document: Any = pygltflib.GLTF2().load(str(path))
     blob, columns = document.binary_blob(), {}
     primitive = document.meshes[0].primitives[0]
@@ -81,9 +81,9 @@ def test_gltf_is_read_by_pygltflib(tmp_path, degree):
     assert primitive.mode == pygltflib.POINTS
     assert primitive.extensions[EXTENSION]["kernel"] == "ellipse"
     np.testing.assert_allclose(found["POSITION"], np.asarray(g.means) * FLIP)
-    said = document.accessors[primitive.attributes.POSITION]
-    np.testing.assert_array_equal(said.min, found["POSITION"].min(0))
-    np.testing.assert_array_equal(said.max, found["POSITION"].max(0))
+    accessor = document.accessors[primitive.attributes.POSITION]
+    np.testing.assert_array_equal(accessor.min, found["POSITION"].min(0))
+    np.testing.assert_array_equal(accessor.max, found["POSITION"].max(0))
     cov, opacities = ours(g)
     turned = covariances(found[f"{EXTENSION}:ROTATION"], found[f"{EXTENSION}:SCALE"])
     np.testing.assert_allclose(turned, cov * np.outer(FLIP, FLIP), rtol=1e-4, atol=1e-3)
@@ -192,7 +192,7 @@ def test_wrong_files_and_missing_ones_are_refused(tmp_path, with_gsply, read, co
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_what_gsply_wrote_is_read_back(tmp_path, with_gsply, degree):
+def test_files_of_gsply_are_read_back(tmp_path, with_gsply, degree):
     g = mild(degree)
     ways = (
         (gsply_files.write_compressed_ply, gsply_files.read_compressed_ply),
@@ -270,7 +270,7 @@ def test_sog_is_read_as_its_specification_says(tmp_path):
             read_splats(tmp_path / f"{name}.sog")
 
 
-def test_splats_are_told_by_the_end_of_their_names(tmp_path, with_gsply):
+def test_the_end_of_a_name_decides_how_splats_are_read(tmp_path, with_gsply):
     g = mild(1)
     write_ply(tmp_path / "a.PLY", g, [])
     gsply_files.write_compressed_ply(tmp_path / "b.compressed.ply", g)
@@ -280,13 +280,13 @@ def test_splats_are_told_by_the_end_of_their_names(tmp_path, with_gsply):
         np.testing.assert_allclose(found, np.sort(np.asarray(g.means[:, 0])), atol=0.02)
 
 
-def test_ellipsoids_stay_as_they_were_where_rotations_change():
+def test_packing_keeps_the_ellipsoids():
     g = random_splats(1000, degree=1)
     g = replace(g, means=g.means * np.array([10, 1, 300]), log_scales=2 * g.log_scales - 3)
     order = morton_order(np.asarray(g.means))
-    given, read = ours(g)[0][order], ours(unpack(pack(g)))[0]
-    size = np.trace(given, axis1=1, axis2=2)
-    assert (np.abs(read - given).max((1, 2)) / size).max() < 0.02
+    before, after = ours(g)[0][order], ours(unpack(pack(g)))[0]
+    size = np.trace(before, axis1=1, axis2=2)
+    assert (np.abs(after - before).max((1, 2)) / size).max() < 0.02
     g = replace(random_splats(3), quats=jnp.zeros((3, 4)))
     np.testing.assert_allclose(np.asarray(unpack(pack(g)).quats), [[1, 0, 0, 0]] * 3, atol=1e-3)
     assert unpack(pack(random_splats(0))).capacity == 0
@@ -305,7 +305,7 @@ def population(n, degree=1, *, moves=False):
 
 @pytest.mark.parametrize("moves", [False, True])
 @pytest.mark.parametrize("count", [0, 1, 9, 10, 11, 25])
-def test_every_row_comes_back_whatever_the_chunk(tmp_path, monkeypatch, count, moves):
+def test_every_row_is_read_back_with_any_size_of_chunks(tmp_path, monkeypatch, count, moves):
     monkeypatch.setattr(ply, "CHUNK", 10)
     g = population(count, degree=2, moves=moves)
     assert write_ply(tmp_path / "a.ply", g, ["line"]) == count
@@ -313,7 +313,7 @@ def test_every_row_comes_back_whatever_the_chunk(tmp_path, monkeypatch, count, m
         assert np.asarray(a).tobytes() == b.tobytes()
 
 
-def test_fields_and_bytes_are_the_reference_ones(tmp_path, monkeypatch):
+def test_fields_and_bytes_are_those_of_plyfile(tmp_path, monkeypatch):
     monkeypatch.setattr(ply, "CHUNK", 4)
     g = population(23, degree=3)
     names = field_names(16)
@@ -357,7 +357,7 @@ def test_memory_does_not_grow_with_the_file(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("kept", [0.3, 0.99, None])
-def test_a_file_that_was_cut_and_another_one_are_refused(tmp_path, kept):
+def test_cut_files_and_other_files_are_refused(tmp_path, kept):
     path = tmp_path / "a.ply"
     write_ply(path, population(100), [])
     content = path.read_bytes()

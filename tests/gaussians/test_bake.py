@@ -45,7 +45,7 @@ def test_colours_are_exact_for_degree_0_and_close_for_3():
     assert np.abs(np.einsum("k,nkc->nc", table, shown) + 0.5 - expected).max() < 0.03
 
 
-def test_a_correction_by_place_in_the_image_is_left_out():
+def test_corrections_by_position_in_the_image_are_left_out():
     grid = DisplayTransform(
         1.0, 2.2, PhotometryConfig(appearance="bilateral"), jnp.ones((12, 8, 16, 16))
     )
@@ -71,7 +71,7 @@ def targets():
     return [true_target(name, haze(), c, SRGB, render) for name, c in views.items()]
 
 
-def test_the_true_picture_is_light_composited_then_developed(targets):
+def test_the_true_picture_is_composited_in_light_and_then_developed(targets):
     linear = make_renderer(CFG)(haze(), jnp.ones(120, bool), camera(0.0)).linear
     expected = np.rint(255 * develop(linear, SRGB))
     np.testing.assert_array_equal(targets[2].picture, expected)
@@ -80,7 +80,7 @@ def test_the_true_picture_is_light_composited_then_developed(targets):
 
 @pytest.mark.slow
 def test_refining_brings_viewers_closer_to_unseen_views_as_well(targets):
-    """Also over white; what no view shows stays as it is."""
+    """Also over white; a Gaussian that no view shows stays as it is."""
     seen, unseen = [targets[i] for i in (0, 2, 4)], [targets[i] for i in (1, 3)]
     plain = bake(haze(), SRGB, "exp")
     plain = replace(plain, means=plain.means.at[0, 2].set(-3.0))
@@ -105,8 +105,8 @@ def test_refining_brings_viewers_closer_to_unseen_views_as_well(targets):
 
 
 @pytest.mark.slow
-def test_what_is_dark_by_transparency_becomes_opaque():
-    """Over black nothing tells a translucent black wall from an opaque one; over white it shows."""
+def test_a_wall_that_is_dark_by_transparency_becomes_opaque():
+    """A translucent black wall looks opaque over black, and not over white."""
     wall, logits = haze(), jnp.full(120, -100.0, jnp.float32).at[-1].set(0.0)
     wall = replace(wall, opacity_logits=logits, sh=wall.sh - 60.0)
     target = true_target("wall", wall, camera(), SRGB, make_renderer(CFG))
@@ -122,7 +122,7 @@ def test_what_is_dark_by_transparency_becomes_opaque():
     assert after["psnr_on_white_median"] > before["psnr_on_white_median"] + 8
 
 
-def test_the_error_of_a_known_difference():
+def test_a_known_difference_has_its_known_error():
     nothing = replace(bake(haze(), SRGB, "exp"), opacity_logits=jnp.full(120, -100.0))
     picture = np.full((32, 40, 3), 51, np.uint8)
     error = baking_error(nothing, [Target("grey", camera(), picture)], CFG)["per_view"]["grey"]
@@ -133,7 +133,7 @@ def test_the_error_of_a_known_difference():
 
 @pytest.mark.slow
 def test_lifted_colours_show_in_linear_light_what_a_viewer_shows():
-    """Translucent ones differ; refining brings them closer, in unseen views as well."""
+    """Translucent Gaussians differ; refining brings them closer, in unseen views as well."""
     shown, render = bake(haze(), SRGB, "exp"), make_renderer(viewer_config(CFG))
     places = {f"{x:+.1f}": camera(x) for x in (-0.4, -0.2, 0.0, 0.2, 0.4)}
     views = [displayed_target(name, shown, c, render) for name, c in places.items()]

@@ -1,4 +1,4 @@
-"""Dense starts: depths of textured planes, the checks, and what is drawn from them."""
+"""Dense starts: depths of textured planes, refused matches, and seeds drawn from the depths."""
 
 import dataclasses
 
@@ -93,8 +93,8 @@ class World:
         return found, np.abs(1 / np.maximum(found.inverse, 1e-9) / self.depths[row] - 1)
 
     def seeds(self, limit=100_000, existing=NONE):
-        given = self.scene, self.store, self.tones, self.tones, FitConfig()
-        return dense_seeds(*given, existing=existing, limit=limit)
+        inputs = self.scene, self.store, self.tones, self.tones, FitConfig()
+        return dense_seeds(*inputs, existing=existing, limit=limit)
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +109,7 @@ def test_depths_of_a_slanted_plane_are_right(plane):
     assert found.flat[found.valid].mean() > 0.95
 
 
-def test_what_one_photograph_hides_from_another_is_refused(tmp_path):
+def test_depths_of_hidden_surfaces_are_right_or_refused(tmp_path):
     world = World(tmp_path, square=True)
     found, error = world.depth()
     assert found.valid.mean() > 0.5
@@ -125,7 +125,7 @@ def test_wrong_matches_are_refused(tmp_path):
     found, error = one.depth()
     assert found.valid.mean() > 0.5
     assert np.quantile(error[found.valid], 0.95) < 0.01
-    # A picture of something else is no view of this.
+    # The photograph of another scene has no depths.
     assert one.depth(1)[0].valid.mean() < 0.01
 
 
@@ -140,10 +140,10 @@ def test_exposures_do_not_matter_once_they_are_solved(tmp_path):
     assert b.valid.mean() > 0.9 * a.valid.mean()
     both = a.valid & b.valid
     assert np.quantile(np.abs(a.inverse[both] / b.inverse[both] - 1), 0.95) < 0.01
-    # The gauge of the exposures is that of the radiances.
+    # Seeds have the world's radiance, 0.2, in the gauge of the exposures.
     for seeds in (same.seeds(), other.seeds()):
         assert abs(np.median(seeds.radiance) / 0.2 - 1) < 0.1
-    # Unsolved, the photographs are refused by their colours.
+    # Without solved exposures their colours seem to differ, and matches are refused.
     blind = World(tmp_path / "mixed", exposures=[1.0, 0.25, 4.0, 0.25, 4.0])
     blind.tones = same.tones
     assert blind.depth()[0].valid.mean() < 0.9 * b.valid.mean()
@@ -161,7 +161,7 @@ def test_clipped_pixels_carry_no_seed(tmp_path):
     assert not in_lamp.any()
 
 
-def test_the_bound_binds_and_seeds_are_spread_and_the_same_again(plane):
+def test_seeds_are_bounded_spread_and_repeatable(plane):
     many, few = plane.seeds(), plane.seeds(limit=150)
     for field in ("points", "radiance", "scales", "quats"):
         np.testing.assert_array_equal(getattr(few, field), getattr(plane.seeds(limit=150), field))
@@ -190,12 +190,12 @@ def test_existing_seeds_have_precedence(plane):
     left = plane.seeds(limit=400, existing=existing).points[:, 0] < -0.1
     assert (~left).sum() > 150
     assert left.sum() < 0.05 * len(left)
-    # Seeds far behind are seeds of something else.
+    # Existing seeds far behind do not count.
     behind = plane.seeds(limit=400, existing=existing * [1, 1, 3])
     assert (behind.points[:, 0] < -0.1).sum() > 100
 
 
-def test_pairs_see_the_same_from_different_places(plane):
+def test_neighbours_prefer_similar_exposures(plane):
     scene, even = plane.scene, np.zeros(len(CENTERS))
     near = neighbours(scene, visibility(scene, 0), even, 2)
     assert all(len(n) == 2 and k not in n for k, n in enumerate(near))
@@ -233,15 +233,15 @@ def test_dense_seeds_leave_room_to_grow():
     assert dense_limit(cfg, 0, quarter) == 4 * dense_limit(cfg, 0, whole) > 0
 
 
-def test_dense_starts_where_seeds_are_few(plane):
+def test_dense_starts_are_chosen_where_seeds_are_few(plane):
     scene, coverage = plane.scene, coverage_of(plane.scene, None)
     many = {name: np.repeat(getattr(scene, name), 200, 0) for name in ("points", "point_colors")}
     lidar = dataclasses.replace(scene, **many)
-    for given, cfg, wanted in (
+    for candidate, cfg, wanted in (
         (scene, FitConfig(), True),
         (scene, preset("3dgs"), True),
         (scene, preset("paper"), False),
         (scene, with_seeds(FitConfig(), dense="off"), False),
         (lidar, FitConfig(), False),
     ):
-        assert wants_dense(given, coverage, cfg) == wanted
+        assert wants_dense(candidate, coverage, cfg) == wanted

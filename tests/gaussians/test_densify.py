@@ -1,4 +1,4 @@
-"""Populations grow, shrink and move without changing what nobody asked to change."""
+"""Densification adds, removes and moves Gaussians, and leaves all others unchanged."""
 
 import dataclasses
 import functools
@@ -17,7 +17,7 @@ from p2gs_jax.train.optimizer import AdamState
 from p2gs_jax.train.strategies import demand
 
 CFG = DensifyConfig()
-# As strategies call them: one program a shape, where eager calls make one an operation.
+# Compiled once per shape, as in strategies; eager calls compile every operation.
 propose = jax.jit(adaptive.propose, static_argnums=(3, 4))
 apply = jax.jit(adaptive.apply)
 relocate_and_grow = jax.jit(mcmc.relocate_and_grow, static_argnums=4)
@@ -68,18 +68,18 @@ def test_clone_copies_and_split_replaces():
     assert out.reset_moments.tolist() == [True, *[False] * 7, True, True, False, False]
 
 
-def test_transparent_are_pruned_and_full_house_is_counted():
+def test_transparent_gaussians_are_pruned_and_refusals_are_counted():
     g = made()
     g = dataclasses.replace(g, opacity_logits=g.opacity_logits.at[3].set(-9.0))
     p = hot_population(8, np.arange(8) < 3)
     proposal = propose(g, p, 1.0, False, CFG)
     assert proposal.prune.tolist().index(True) == 3
     out = apply(jax.random.key(0), g, p, proposal)
-    assert int(out.refused) == 2  # one slot came free, three asked
+    assert int(out.refused) == 2  # three were wanted, one slot came free
     assert int(out.population.alive.sum()) == 8
 
 
-def test_reset_lowers_only():
+def test_a_reset_only_lowers_opacities():
     g = dataclasses.replace(made(), opacity_logits=jnp.linspace(-9.0, 5.0, 8))
     after = opacities(adaptive.reset_opacities(g))
     assert float(after.max()) == pytest.approx(0.01, rel=1e-4)
@@ -117,13 +117,13 @@ def test_relocation_moves_the_transparent_and_adds_births():
     widest = float(np.exp(g.log_scales).max())
     for i in np.flatnonzero(live):
         assert np.any(np.all(np.isclose(healthy, np.asarray(same.gaussians.means[i])), axis=1))
-        # Moved apart, each still lies within a few deviations of one that was healthy.
+        # Gaussians that were moved apart lie within three deviations of a healthy one.
         distance = np.linalg.norm(healthy - np.asarray(out.gaussians.means[i]), axis=1)
         assert distance.min() < 3 * widest
     assert int(relocate_and_grow(jax.random.key(1), grown, p, jnp.int32(9), CFG).refused) == 3
 
 
-def test_two_that_share_a_place_part_about_its_centre_and_keep_its_extent():
+def test_two_gaussians_at_one_place_move_apart_and_keep_its_extent():
     g = dataclasses.replace(
         made(1),
         quats=jnp.full((1, 4), 0.5),  # x -> y -> z -> x
@@ -159,7 +159,7 @@ def test_births_go_where_they_are_needed():
     out = relocate_and_grow(jax.random.key(0), grown, p, jnp.int32(4), together, needed)
     assert int(out.population.alive.sum()) == 14
     np.testing.assert_array_equal(out.gaussians.means[10:14], np.tile(g.means[7], (4, 1)))
-    # Where nothing is needed yet, nobody is born; those without a place are not put anywhere.
+    # Nothing is born without a need; nothing moves without an opaque Gaussian to move to.
     none = relocate_and_grow(jax.random.key(0), grown, p, jnp.int32(4), together, 0 * needed)
     faint = dataclasses.replace(grown, opacity_logits=jnp.full(16, -9.0))
     nobody = relocate_and_grow(jax.random.key(0), faint, p, jnp.int32(4), together, needed)
@@ -168,7 +168,7 @@ def test_births_go_where_they_are_needed():
         np.testing.assert_array_equal(out.gaussians.means, grown.means)
 
 
-def test_demand_is_the_mean_pull_on_what_was_seen():
+def test_demand_is_the_mean_pull_on_seen_gaussians():
     scales = jnp.array([[1.0, 2.0, 1.0], [4.0, 1.0, 1.0], [1.0, 1.0, 1.0]])
     g = dataclasses.replace(made(3), log_scales=jnp.log(scales))
     moments = AdamState(jnp.array([1, 3, 0]), g, jax.tree.map(jnp.zeros_like, g))
@@ -179,7 +179,7 @@ def test_demand_is_the_mean_pull_on_what_was_seen():
     np.testing.assert_allclose(demand(g, moments, b2), [3 * 2, 5 * 4, 0], rtol=1e-5)
 
 
-def test_noise_reaches_only_the_transparent_and_has_their_shape():
+def test_noise_moves_only_transparent_gaussians_and_has_their_shape():
     g = made(2000, opacity=0.001)
     g = dataclasses.replace(
         g,
@@ -197,7 +197,7 @@ def test_noise_reaches_only_the_transparent_and_has_their_shape():
 
 
 def families(n, alive):
-    """Return Gaussians of objects in turn, whose colours tell the object, and their population."""
+    """Return Gaussians of alternating objects, whose number is their colour, and the population."""
     owner = np.where(alive, np.arange(n) % 4 - 1, -1)
     g = dataclasses.replace(
         made(n), sh=on_device(np.tile(np.where(alive, owner, -9)[:, None, None], 3))
@@ -214,7 +214,7 @@ def check_families(outcome, count):
 
 
 def test_gaussians_belong_to_the_object_of_their_parents():
-    """Relocated, newborn, cloned and split ones."""
+    """Also if they were relocated, born, cloned or split."""
     index = np.arange(120)
     g, population = families(120, index < 90)
     g = dataclasses.replace(g, opacity_logits=jnp.where(index % 5 == 0, -9.0, 2.0))

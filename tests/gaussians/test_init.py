@@ -38,7 +38,7 @@ def street_points(ground_only):
     return np.concatenate([ground, wall]).astype(np.float32)
 
 
-def test_shell_only_where_views_look_past_the_seeds():
+def test_a_shell_lies_only_where_views_look_past_the_seeds():
     views = [view(x) for x in (0.0, 1.0, 2.0)]
     points = street_points(ground_only=True)
     shell = find_shell(views, points, 2.0, InitConfig())
@@ -51,7 +51,7 @@ def test_shell_only_where_views_look_past_the_seeds():
     assert shell.seen.any(1).all()
 
 
-def test_no_shell_where_seeds_cover_the_views_or_it_is_switched_off():
+def test_there_is_no_shell_where_seeds_cover_the_views_or_if_it_is_off():
     views = [view(x) for x in (0.0, 1.0, 2.0)]
     assert find_shell(views, street_points(ground_only=False), 2.0, InitConfig()) is None
     points = street_points(ground_only=True)
@@ -81,7 +81,7 @@ def test_a_camera_far_from_all_others_counts_for_nothing_and_is_named(tmp_path):
     (note,) = scale_notes(scene, None, FitConfig(), 5.0)
     assert "1 of 10 cameras" in note
     assert "60000.0.png" in note
-    # Nor where a car waits, or one photograph is from farther away.
+    # No camera is misplaced where a car waits, or one photograph is from farther away.
     for xs in ([0.0] * 50 + [1.0, 40.0, 90.0], [*range(9), 100.0]):
         assert not misplaced([view(x) for x in xs], points).any()
 
@@ -99,7 +99,7 @@ def test_seeds_out_of_reach_are_brought_nearer(tmp_path):
     np.testing.assert_array_equal(nearer.points[:-2], points)
 
 
-def test_more_seeds_than_the_bound_are_thinned_and_it_is_said(tmp_path):
+def test_seeds_beyond_the_bound_are_thinned_and_a_note_names_it(tmp_path):
     fields = {"render.sh_degree": 0, "photometry.select": False, "photometry.start": "random"}
     fields |= {"densify.max_gaussians": 40, "init.shell": "on"}
     cfg = with_fields(preset("robust"), fields)

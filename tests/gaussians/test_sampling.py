@@ -34,7 +34,7 @@ def test_a_wall_hides_what_is_behind_it():
     outer = np.any((far[:, :2] < 10) | (far[:, :2] > 70), 1)
     assert visible[600:][inner].mean() < 0.02
     assert visible[600:][outer].mean() > 0.98
-    # Nor is anything behind or outside.
+    # Points behind the camera or outside the image are not visible.
     xy = np.array([[5.0, 5.0], [5.0, 5.0], [-1.0, 5.0], [5.0, 11.0]])
     z = np.array([2.0, -2.0, 2.0, 2.0])
     assert unoccluded(xy, z, 10, 10).tolist() == [True, False, False, False]
@@ -44,7 +44,7 @@ def test_a_wall_hides_what_is_behind_it():
 CFG, CHOICE = preset("robust"), (Form("view_exposure"), Response())
 
 
-def test_exposures_without_tracks_and_what_was_left_out_is_said(noisy_street, tmp_path):
+def test_exposures_need_no_tracks_and_left_out_points_are_counted(noisy_street, tmp_path):
     scene = load_scene(noisy_street, CFG.data, tmp_path, lambda text: None)
     scene = dataclasses.replace(scene, tracks=None)
     observations = projected_colors(scene, ImageStore(scene.views, CFG.data))
@@ -70,7 +70,7 @@ class Grey(ImageStore):
 
 
 def seen_from(distances):
-    """Return a scene of one point and a view at every distance from it; behind where negative."""
+    """Return a scene of one point and a view at every distance; a negative one is behind it."""
     views = [
         make_view(Path(f"{k}.png"), f=50.0, at=(0, 0, -distance), size=(60, 40))
         for k, distance in enumerate(distances)
@@ -128,7 +128,7 @@ def test_samples_sit_at_pixel_centres():
     image = np.tile(ramp, (40, 1, 3)).astype(np.float32)
     xy = rng.uniform(9, 31, (100, 2))
     light = 0.2 + 0.8 * (xy[:, 0] - 0.5) / 49
-    # Half a pixel of misplacement on a ramp of 0.8/49 a pixel.
+    # `spread` is the change over half a pixel, on a ramp of 0.8/49 per pixel.
     slope = (srgb_encode(light + 1e-4) - srgb_encode(light - 1e-4)) / 2e-4
     colors, spread, _, valid = sample(image, np.ones((40, 50), np.float32), xy)
     assert valid.all()

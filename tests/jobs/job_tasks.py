@@ -1,4 +1,4 @@
-"""Tasks; processes of a test find them through PYTHONPATH."""
+"""A task of jobs; processes of a test find it through PYTHONPATH."""
 
 import os
 import signal
@@ -8,21 +8,21 @@ from p2gs_jax.errors import UserError
 
 
 def count(folder, arguments, reporter):
-    """Write how often it was begun; do as told the first time, and succeed after that."""
+    """Count starts in the file `tries`; do `first` in `until` starts (default 1), then succeed."""
     folder.mkdir(parents=True, exist_ok=True)
     tries = folder / "tries"
     with tries.open("a") as file:
         file.write("x")
-    times = tries.stat().st_size
-    reporter.stage("Counting", times, arguments.get("of", 4))
+    starts = tries.stat().st_size
+    reporter.stage("Counting", starts, 4)
     todo = arguments.get("first")
-    if todo is None or times > arguments.get("until", 1):
+    if todo is None or starts > arguments.get("until", 1):
         (folder / "done").touch()
     elif todo == "kill":
         os.kill(os.getpid(), signal.SIGKILL)
     elif todo == "fill":
         raise MemoryError("of the job")
-    elif todo == "ask":
+    elif todo == "terminate":
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(120)
     elif todo == "refuse":

@@ -20,7 +20,7 @@ from p2gs_jax.types import Scene
 GROUND = Ground(np.zeros(3), np.eye(3)[:2])
 INF = np.inf
 CFG = RenderConfig(sh_degree=0)
-REACH = INWARDS / OVERLAP  # of a margin of one
+REACH = INWARDS / OVERLAP  # for a margin of 1
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def test_every_gaussian_is_kept_by_the_block_whose_core_holds_it():
     assert {tuple(m) for m in means} == {tuple(m) for m in np.asarray(first.means)}
 
 
-def test_nothing_in_any_core_is_said():
+def test_blocks_with_empty_cores_are_refused():
     cut = halves()
     away = dataclasses.replace(wall(), means=wall().means + jnp.array([10.0, 0, 0]))
     with pytest.raises(UserError, match="no block has a Gaussian"):
@@ -64,7 +64,7 @@ def test_nothing_in_any_core_is_said():
 
 
 @pytest.mark.parametrize(("stops", "farther"), [(0.0, 0.0), (0.1, 0.0), (-0.25, 0.02)])
-def test_a_seam_is_measured_as_it_was_made(two_views, stops, farther):
+def test_a_seam_is_measured_with_its_true_steps(two_views, stops, farther):
     store = ImageStore(two_views.views, DataConfig())
     first = wall(0.3)
     second = wall(0.3 + stops * np.log(2), depth=4.0 * (1 + farther))
@@ -98,7 +98,7 @@ def test_blocks_around_a_corner_agree_there():
     blocks = [Block((u[0], v[0]), (u[1], v[1]), (0, 1)) for u in ranges for v in ranges]
     cut, offsets = Cut(GROUND, 1.0, tuple(blocks)), np.array([0.0, 0.3, -0.2, 0.7])
     pairs = cut.neighbours()
-    # Those that only touch in the corner as well.
+    # Blocks that touch only in the corner are neighbours as well.
     assert pairs == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
     steps = {(a, b): offsets[b] - offsets[a] for a, b in pairs}
     places = at(*np.random.default_rng(0).uniform(-1, 1, (2, 50)))
@@ -109,7 +109,7 @@ def test_blocks_around_a_corner_agree_there():
 
 
 @pytest.mark.parametrize("radiance", ["exp", "linear"])
-def test_what_is_left_is_measured_in_other_views(two_views, monkeypatch, radiance):
+def test_the_remaining_step_is_measured_in_other_views(two_views, monkeypatch, radiance):
     seen = []
     monkeypatch.setattr(
         measuring, "camera_of", lambda store, index: seen.append(index) or camera_of(store, index)
@@ -134,7 +134,7 @@ def test_what_is_left_is_measured_in_other_views(two_views, monkeypatch, radianc
     assert np.ptp(tone) > 0.15
 
 
-def test_a_boundary_that_no_view_shows_is_said_and_left_as_it_is(two_views):
+def test_a_boundary_that_no_view_shows_has_no_step_and_stays(two_views):
     walls, store = [wall(0.1), wall(0.5)], ImageStore(two_views.views, DataConfig())
     levelled, (seam,) = level_seams(two_views, store, halves(views=()), walls, CFG)
     assert (seam.views, seam.pixels, seam.step_stops, seam.levelled_stops) == (0, 0, None, None)

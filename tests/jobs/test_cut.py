@@ -1,4 +1,4 @@
-"""A cut covers space once, shares photographs out evenly, and gives each block what sees it."""
+"""A cut covers space once and shares photographs evenly; a block has the views that see it."""
 
 import dataclasses
 
@@ -47,7 +47,7 @@ def make_road(views=40, points=4000, seed=0, tracks=False, turned=0.0):
 
 @settings(max_examples=40, deadline=None)
 @given(count=st.integers(1, 9), seed=st.integers(0, 99), height=st.sampled_from([0.0, 1.0, 100.0]))
-def test_cells_cover_the_plane_once_and_are_as_full(count, seed, height):
+def test_cells_cover_the_plane_once_and_are_equally_full(count, seed, height):
     rng = np.random.default_rng(seed)
     places = rng.uniform(0, 1, (90, 2)) * [100.0, height]
     cells = split(places, count)
@@ -81,16 +81,16 @@ def test_blocks_of_a_road_follow_it(tracks, turned):
     centers = cut.ground.place(camera_centers(scene.training_views))
     for block in cut.blocks:
         # A view reaches 5 m to either side, at 45 degrees.
-        stands = block.distance(centers)
-        assert (stands[list(block.views)] <= cut.margin + 5.5).all()
-        assert set(np.flatnonzero(stands == 0)) <= set(block.views)
+        distance = block.distance(centers)
+        assert (distance[list(block.views)] <= cut.margin + 5.5).all()
+        assert set(np.flatnonzero(distance == 0)) <= set(block.views)
     sizes = [len(block.views) for block in cut.blocks]
     assert max(sizes) <= 1.5 * min(sizes)
     names = {scene.training_views[k].name for block in cut.blocks for k in block.views}
     assert names == {view.name for view in scene.training_views}
 
 
-def test_too_many_blocks_are_refused_with_how_many_there_may_be():
+def test_too_many_blocks_are_refused_with_the_largest_number():
     scene = make_road(views=8)
     with pytest.raises(UserError, match=r"too few for 5[\s\S]*--blocks 3 or fewer"):
         cut_scene(scene, 5)
@@ -99,7 +99,7 @@ def test_too_many_blocks_are_refused_with_how_many_there_may_be():
 
 
 @pytest.mark.parametrize("tracks", [False, True])
-def test_a_block_has_its_points_whole_and_those_around_it_coarse(tracks):
+def test_a_block_has_all_its_points_and_few_around_it(tracks):
     scene = make_road(tracks=tracks, points=20_000)
     cut = cut_scene(scene, 4)
     found, keep, inside = block_scene(scene, cut, 1)
@@ -111,14 +111,9 @@ def test_a_block_has_its_points_whole_and_those_around_it_coarse(tracks):
     assert len(found.train_indices) == len(found.views) == len(cut.blocks[1].views)
     if tracks:
         # Every observation is still of the same point in the same view.
-        view = found.tracks.view_indices[::50]
-        point = found.tracks.point_indices[::50]
-        names = [v.name for v in scene.views]
-        pairs = set(
-            zip(
-                scene.tracks.view_indices.tolist(), scene.tracks.point_indices.tolist(), strict=True
-            )
-        )
+        names, known = [v.name for v in scene.views], scene.tracks
+        pairs = set(zip(known.view_indices.tolist(), known.point_indices.tolist(), strict=True))
+        view, point = found.tracks.view_indices[::50], found.tracks.point_indices[::50]
         for v, p in zip(view, point, strict=True):
             assert (names.index(found.views[v].name), keep[p]) in pairs
 

@@ -25,31 +25,31 @@ pytestmark = pytest.mark.skipif(
 
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory):
-    """Return the engine of a scheduler that has two workers, and these."""
+    """Return the engine of a scheduler with two workers, and the workers' processes."""
     tmp_path = tmp_path_factory.mktemp("cluster")
     path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
-    said, env = tmp_path / "scheduler.json", os.environ | {"PYTHONPATH": path}
-    here = ["--scheduler-file", str(said), "--no-dashboard"]
+    file, env = tmp_path / "scheduler.json", os.environ | {"PYTHONPATH": path}
+    here = ["--scheduler-file", str(file), "--no-dashboard"]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": env}
     listen = ["--host", "127.0.0.1", "--port", "0"]
-    begun = [subprocess.Popen([*_tool("dask_scheduler"), *listen, *here], **quiet)]
+    processes = [subprocess.Popen([*_tool("dask_scheduler"), *listen, *here], **quiet)]
     one = ["--no-nanny", "--nthreads", "1", "--host", "127.0.0.1"]
     try:
-        begun += [
+        processes += [
             subprocess.Popen([*_tool("dask_worker"), *one, *here], cwd=tmp_path, **quiet)
             for _ in range(2)
         ]
-        while not said.exists() or not said.read_text().strip():
-            assert begun[0].poll() is None
+        while not file.exists() or not file.read_text().strip():
+            assert processes[0].poll() is None
             time.sleep(0.05)
-        address = json.loads(said.read_text())["address"].removeprefix("tcp://")
+        address = json.loads(file.read_text())["address"].removeprefix("tcp://")
         from dask.distributed import Client
 
         with Client(address, set_as_default=False) as client:
             client.wait_for_workers(2, timeout=60)
-        yield f"dask://{address}", begun[1:]
+        yield f"dask://{address}", processes[1:]
     finally:
-        for process in begun:
+        for process in processes:
             process.kill()
             process.wait()
 
@@ -58,7 +58,7 @@ def _tool(name: str) -> list[str]:
     return [sys.executable, "-m", f"distributed.cli.{name}"]
 
 
-def test_jobs_in_the_queue_of_a_scheduler_end_with_those_that_run(cluster, tmp_path):
+def test_an_interrupt_stops_running_and_queued_jobs(cluster, tmp_path):
     jobs = [Job(name, tmp_path / name, count, {"first": "wait"}) for name in "abc"]
     ended, folder = [], tmp_path / "jobs"
 
@@ -66,14 +66,14 @@ def test_jobs_in_the_queue_of_a_scheduler_end_with_those_that_run(cluster, tmp_p
         if sum(state.doing == "Counting" for state in states) == 2:
             raise KeyboardInterrupt
 
-    told = {"on_end": lambda number, state: ended.append(state.status), "on_look": interrupt}
+    callbacks = {"on_end": lambda number, state: ended.append(state.status), "on_look": interrupt}
     with pytest.raises(KeyboardInterrupt), open_engine(cluster[0], 1, tmp_path) as engine:
-        run_jobs(jobs, engine, folder, **told)
+        run_jobs(jobs, engine, folder, **callbacks)
     assert ended == ["stopped"] * 3
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="parents are read from /proc")
-def test_a_killed_worker_costs_nothing_but_time(cluster, tmp_path):
+def test_the_job_of_a_killed_worker_is_repeated(cluster, tmp_path):
     engine_name, workers = cluster
     job, killed = Job("one", tmp_path / "one", count, {"first": "wait"}), []
     files = JobFiles(tmp_path / "jobs" / "one.json")
@@ -88,11 +88,11 @@ def test_a_killed_worker_costs_nothing_but_time(cluster, tmp_path):
     with open_engine(engine_name, 1, tmp_path) as engine:
         (state,) = run_jobs([job], engine, tmp_path / "jobs", on_look=kill_its_worker)
     assert (state.status, state.reason) == ("done", None)
-    # The other worker began it again.
+    # The other worker started it again.
     assert (tmp_path / "one" / "tries").read_text() == "xx"
 
 
-def test_a_scheduler_that_is_not_there_is_said(tmp_path, monkeypatch):
+def test_a_missing_scheduler_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr("p2gs_jax.jobs.engines.ANSWER_S", 1)
     with (
         pytest.raises(UserError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9 "),

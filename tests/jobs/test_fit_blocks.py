@@ -1,4 +1,4 @@
-"""A scene in two blocks is a run as any other, with the exposures that were solved for all."""
+"""A scene in two blocks is a run like any other, with exposures solved for all blocks."""
 
 import json
 from dataclasses import replace
@@ -32,13 +32,13 @@ SMALL = with_fields(p2gs_jax.preset("robust"), FIELDS)
 
 @pytest.fixture
 def in_this_process(monkeypatch):
-    """Run blocks here, one after another; return which, and a set of those that are to fail."""
-    begun, fail = [], set()
+    """Run blocks in turn; return a list of the started ones, and a set for those that fail."""
+    started, fail = [], set()
 
     def run_jobs(jobs, engine, folder, *, on_end, on_look):
         states = []
         for number, job in enumerate(jobs):
-            begun.append(job.name)
+            started.append(job.name)
             state = JobState(job.name, "done")
             if job.name in fail:
                 state = JobState(job.name, "failed", reason="the disk is full")
@@ -51,12 +51,12 @@ def in_this_process(monkeypatch):
         return states
 
     monkeypatch.setattr(module, "run_jobs", run_jobs)
-    return begun, fail
+    return started, fail
 
 
 @pytest.mark.slow
 def test_two_blocks_become_one_run(tmp_path, in_this_process):
-    begun, fail = in_this_process
+    started, fail = in_this_process
     scene, run = make_scene(tmp_path / "scene", views=8), tmp_path / "run"
     fail.add("block 1")
     with pytest.raises(UserError, match=r"1 of 2 blocks failed\. block 1: the disk is full"):
@@ -65,57 +65,57 @@ def test_two_blocks_become_one_run(tmp_path, in_this_process):
         p2gs_jax.fit_blocks(scene, run, SMALL, blocks=3, resume=True)
     fail.clear()
     result = p2gs_jax.fit_blocks(scene, run, SMALL, blocks=2, resume=True)
-    # What was finished stays.
-    assert begun == ["block 0", "block 1", "block 1"]
-    said = json.loads((run / "metrics.json").read_text())
-    blocks = said["districts"]["blocks"]
+    # A finished block is kept.
+    assert started == ["block 0", "block 1", "block 1"]
+    saved = json.loads((run / "metrics.json").read_text())
+    blocks = saved["districts"]["blocks"]
     assert [b["views"] <= 6 for b in blocks] == [True, True]
-    assert sum(b["gaussians_in_core"] for b in blocks) == said["counts"]["gaussians"]
-    (seam,) = said["districts"]["seams"]
+    assert sum(b["gaussians_in_core"] for b in blocks) == saved["counts"]["gaussians"]
+    (seam,) = saved["districts"]["seams"]
     assert seam["blocks"] == [0, 1]
-    assert p2gs_jax.load_run(run).params.gaussians.capacity == said["counts"]["gaussians"]
-    # The exposures are those of the bundle adjustment, bit for bit, whatever the blocks did.
+    assert p2gs_jax.load_run(run).params.gaussians.capacity == saved["counts"]["gaussians"]
+    # The exposures are those of the bundle adjustment; blocks do not change them.
     shared = read_shared(run / "blocks", load(scene, run, SMALL), SMALL)
     solved = shared.exposures.photometry.exposures
     np.testing.assert_allclose(
         np.asarray(result.params.photometry.exposures), solved / np.exp(np.log(solved).mean()), 1e-5
     )
-    assert said["test"]["exposure_fitted"]["psnr"] > 15
+    assert saved["test"]["exposure_fitted"]["psnr"] > 15
     took = [json.loads((run / f"blocks/{k}/metrics.json").read_text())["seconds"] for k in (0, 1)]
-    assert said["seconds"]["optimisation"] == pytest.approx(sum(s["optimisation"] for s in took))
-    assert said["seconds_per_step"] == said["seconds"]["optimisation"] / said["counts"]["steps"]
-    # More steps are more steps of every block.
+    assert saved["seconds"]["optimisation"] == pytest.approx(sum(s["optimisation"] for s in took))
+    assert saved["seconds_per_step"] == saved["seconds"]["optimisation"] / saved["counts"]["steps"]
+    # More steps continue every block.
     longer = with_fields(SMALL, {"train.steps": 30})
     again = p2gs_jax.fit_blocks(scene, run, longer, blocks=2, resume=True).metrics
-    assert begun[3:] == ["block 0", "block 1"]
-    assert again["counts"]["steps"] == pytest.approx(1.5 * said["counts"]["steps"], abs=1)
+    assert started[3:] == ["block 0", "block 1"]
+    assert again["counts"]["steps"] == pytest.approx(1.5 * saved["counts"]["steps"], abs=1)
 
 
 def test_one_block_is_an_ordinary_fit(tmp_path, monkeypatch):
-    asked = {}
+    call = {}
 
     def fit(scene, run, cfg, **options):
-        asked.update(options, cfg=cfg)
+        call.update(options, cfg=cfg)
         return "fitted"
 
     monkeypatch.setattr(module, "fit", fit)
     scene = make_scene(tmp_path / "scene")
     assert p2gs_jax.fit_blocks(scene, tmp_path / "run", SMALL, blocks="auto") == "fitted"
-    assert asked["cfg"] == SMALL
+    assert call["cfg"] == SMALL
     assert not (tmp_path / "run" / "blocks").exists()
     scene = replace(load(scene, tmp_path / "run", SMALL), random_seeds=True)
     with pytest.raises(UserError, match="seed points are random, so the exposures"):
         solve_shared(scene, ImageStore(scene.views, SMALL.data), SMALL, Silent(), None)
 
 
-def test_a_block_has_the_population_of_the_whole_and_more_for_what_is_outside():
+def test_a_block_may_have_more_gaussians_if_points_lie_outside():
     scene = make_road(points=20_000)
     whole = with_fields(SMALL, {"densify.max_gaussians": None, "train.steps": 600})
     cut, count, views = cut_scene(scene, 4), len(scene.points), len(scene.train_indices)
 
-    def most(own, **densify):
+    def most(inside, **densify):
         cfg = with_fields(whole, {f"densify.{name}": value for name, value in densify.items()})
-        return block_config(cfg, cut, 0, scene, own, train_views=views).densify.max_gaussians
+        return block_config(cfg, cut, 0, scene, inside, train_views=views).densify.max_gaussians
 
     coverage = coverage_of(scene, whole.data.max_width)
     assert most(count) == default_max_gaussians(count, coverage, whole.train)
@@ -129,11 +129,11 @@ def test_a_block_has_the_population_of_the_whole_and_more_for_what_is_outside():
     assert most(count, method="adaptive") is None
 
 
-def test_less_memory_than_a_block_needs_is_said_with_how_many_would_fit(monkeypatch):
+def test_blocks_that_exceed_the_memory_are_refused_with_a_number_that_fits(monkeypatch):
     scene = make_road()
     four = room.largest_block(scene, SMALL, cut_scene(scene, 4))
     assert four < room.bytes_needed(scene, SMALL)
-    # Room for the blocks of four, and not for those of two.
+    # There is room for a quarter of the scene, and not for a half.
     monkeypatch.setattr(room, "left_to_process", lambda: four * 1.00001)
     count = room.fewest_blocks(scene, SMALL, 1)
     assert count in (3, 4)
@@ -151,7 +151,7 @@ def test_less_memory_than_a_block_needs_is_said_with_how_many_would_fit(monkeypa
 
 
 @pytest.mark.parametrize(
-    ("cfg", "said"),
+    ("cfg", "words"),
     [
         (p2gs_jax.preset("3dgs"), "'3dgs' learns them"),
         (p2gs_jax.preset("paper"), "learns them"),
@@ -159,8 +159,8 @@ def test_less_memory_than_a_block_needs_is_said_with_how_many_would_fit(monkeypa
         (with_fields(SMALL, {"dynamics.method": "vibration"}), "static scenes only"),
     ],
 )
-def test_options_under_which_blocks_would_share_nothing_are_refused(cfg, said):
-    with pytest.raises(UserError, match=said):
+def test_options_that_blocks_cannot_share_are_refused(cfg, words):
+    with pytest.raises(UserError, match=words):
         check_options(cfg)
 
 
@@ -171,8 +171,8 @@ def test_a_broken_plan_is_named(tmp_path):
         read_plan(tmp_path, "2")
 
 
-def test_a_plan_is_kept_also_where_its_number_was_chosen(tmp_path):
+def test_a_plan_is_kept_for_auto_and_for_its_number(tmp_path):
     cut = cut_scene(load(make_scene(tmp_path / "scene", views=12), tmp_path, SMALL), 3)
     write_plan(tmp_path, cut, "auto")
-    for asked in ("auto", "3"):
-        assert read_plan(tmp_path, asked).blocks == cut.blocks
+    for blocks in ("auto", "3"):
+        assert read_plan(tmp_path, blocks).blocks == cut.blocks

@@ -1,4 +1,4 @@
-"""Jobs end apart: what fails says why, what is killed is repeated, what is stopped goes on."""
+"""Jobs end independently: failures have a reason, lost jobs are repeated, stopped ones resume."""
 
 import io
 import json
@@ -42,21 +42,21 @@ def note_end(ended):
     return lambda number, state: ended.update({state.name: state.status})
 
 
-def test_one_that_fails_leaves_its_reason_and_ends_nothing_else(tmp_path):
-    ends = {"refused": "refuse", "stumbled": "stumble", "left": "leave", "doomed": "ask"}
+def test_a_failed_job_leaves_its_reason_and_stops_no_other(tmp_path):
+    ends = {"refused": "refuse", "stumbled": "stumble", "left": "leave", "doomed": "terminate"}
     todo = {name: {"first": first, "until": 9} for name, first in ends.items()}
     todo |= {"good": {}, "killed": {"first": "kill"}, "full": {"first": "fill"}}
-    jobs = jobs_of(tmp_path, **todo, asked={"first": "ask"})
+    jobs = jobs_of(tmp_path, **todo, lost={"first": "terminate"})
     ended, looks = [], []
     with open_engine("local", 2, tmp_path) as engine:
-        told = {"on_end": lambda number, state: ended.append(state.name)}
-        told |= {"on_look": lambda states: looks.append([s.status for s in states])}
-        states = run_jobs(jobs, engine, tmp_path / "jobs", **told)
+        callbacks = {"on_end": lambda number, state: ended.append(state.name)}
+        callbacks |= {"on_look": lambda states: looks.append([s.status for s in states])}
+        states = run_jobs(jobs, engine, tmp_path / "jobs", **callbacks)
     assert sorted(ended) == sorted(job.name for job in jobs)
     assert looks
     found = {s.name: s for s in states}
     once = dict.fromkeys(("refused", "stumbled", "left", "killed", "full"), ("failed", 1))
-    expected = {"good": ("done", 1), "asked": ("done", 2), "doomed": ("failed", 3), **once}
+    expected = {"good": ("done", 1), "lost": ("done", 2), "doomed": ("failed", 3), **once}
     assert {name: (s.status, s.starts) for name, s in found.items()} == expected
     for name, state in found.items():
         assert len((tmp_path / name / "tries").read_text()) == state.starts
@@ -88,7 +88,7 @@ def test_a_job_imports_nothing_from_the_working_folder(tmp_path, hostile, monkey
     assert not hostile.exists()
 
 
-def test_what_is_stopped_ends_and_the_same_call_goes_on(tmp_path):
+def test_stopped_jobs_are_finished_by_the_same_call(tmp_path):
     jobs = jobs_of(tmp_path, running={"first": "wait"}, waiting={})
 
     def interrupt(states):
@@ -107,13 +107,13 @@ def test_what_is_stopped_ends_and_the_same_call_goes_on(tmp_path):
 
 
 class Cluster:
-    """A batch system that never begins anything; or says that memory ran out."""
+    """A batch system that never starts a job, or ends every job with an error."""
 
     def __init__(self, error=None):
-        self.error, self.cancelled, self.begun = error, 0, 0
+        self.error, self.cancelled, self.starts = error, 0, 0
 
     def submit(self, *args):
-        self.begun += 1
+        self.starts += 1
         return self
 
     def done(self):
@@ -126,7 +126,7 @@ class Cluster:
         raise self.error
 
 
-def test_what_a_batch_system_has_not_begun_is_taken_out_of_its_queue(tmp_path):
+def test_jobs_that_wait_in_a_batch_system_are_cancelled(tmp_path):
     def interrupt(states):
         raise KeyboardInterrupt
 
@@ -137,31 +137,31 @@ def test_what_a_batch_system_has_not_begun_is_taken_out_of_its_queue(tmp_path):
     assert cluster.cancelled == 2
 
 
-@pytest.mark.parametrize(("said", "begun"), [("OUT_OF_MEMORY", 1), ("NODE_FAIL", 3)])
-def test_a_job_whose_memory_ran_out_is_not_begun_again(tmp_path, said, begun):
+@pytest.mark.parametrize(("reason", "starts"), [("OUT_OF_MEMORY", 1), ("NODE_FAIL", 3)])
+def test_a_job_whose_memory_ran_out_is_not_repeated(tmp_path, reason, starts):
     error = type("UncompletedJobError", (Exception,), {})
-    cluster = Cluster(error(f"has not produced any output (state: {said})"))
+    cluster = Cluster(error(f"has not produced any output (state: {reason})"))
     with engines._Submitit(cluster) as engine:
         (state,) = run_jobs(jobs_of(tmp_path, one={}), engine, tmp_path / "jobs")
-    assert (state.status, cluster.begun) == ("failed", begun)
+    assert (state.status, cluster.starts) == ("failed", starts)
     assert not engines.is_lost(type("KilledWorker", (Exception,), {})())
 
 
-def test_a_job_whose_end_was_being_told_as_the_signal_came_is_told(tmp_path):
+def test_an_end_is_reported_again_after_a_signal_in_its_report(tmp_path):
     (job,) = jobs_of(tmp_path, one={})
-    told = []
+    reported = []
 
     def interrupted_once(number, state):
-        told.append(state.status)
-        if len(told) == 1:
+        reported.append(state.status)
+        if len(reported) == 1:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt), open_engine("local", 1, tmp_path) as engine:
         run_jobs([job], engine, tmp_path / "jobs", on_end=interrupted_once)
-    assert told == ["done", "done"]
+    assert reported == ["done", "done"]
 
 
-def test_a_job_ends_with_whoever_waits_for_it(tmp_path):
+def test_a_job_ends_with_the_process_that_waits_for_it(tmp_path):
     (job,) = jobs_of(tmp_path, orphan={"first": "wait"})
     files = write_job(tmp_path / "jobs", job)
     code = f"from p2gs_jax.jobs.worker import run_in_process; run_in_process({str(files.path)!r})"
@@ -184,7 +184,7 @@ def _lives(pid: int) -> bool:
         return False
 
 
-def test_the_reason_is_of_the_last_try(tmp_path):
+def test_a_success_removes_the_reason_of_a_former_failure(tmp_path):
     (job,) = jobs_of(tmp_path, one={"first": "stumble"})
     files = write_job(tmp_path / "jobs", job)
     assert run_in_process(str(files.path))[0] == "failed"
@@ -192,7 +192,7 @@ def test_the_reason_is_of_the_last_try(tmp_path):
     assert not (tmp_path / "one" / REASON).exists()
 
 
-def test_progress_is_written_now_and_then_and_survives_a_torn_file(tmp_path):
+def test_progress_is_written_rarely_and_a_torn_file_is_ignored(tmp_path):
     path = JobFiles(tmp_path / "a.json").progress
     assert read_progress(path) is None
     reporter = ProgressFile(path)
@@ -220,15 +220,15 @@ def test_the_table_names_every_job_that_runs():
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "words"),
     [
         ("ray://host:1", "'ray://host:1' is not a known engine"),
         ("dask://host", "has no port"),
         ("slurm:gpu", "'gpu' does not read OPTION=VALUE"),
     ],
 )
-def test_engines_that_are_not_there_are_refused(name, said):
-    with pytest.raises(UserError, match=said):
+def test_unknown_engines_are_refused(name, words):
+    with pytest.raises(UserError, match=words):
         check_engine(name)
 
 
@@ -243,14 +243,14 @@ def test_a_missing_library_is_named_with_its_extra(monkeypatch):
 
 def test_the_local_executor_of_submitit_runs_jobs(tmp_path):
     pytest.importorskip("submitit")
-    jobs = jobs_of(tmp_path, good={}, asked={"first": "ask"}, refused={"first": "refuse"})
+    jobs = jobs_of(tmp_path, good={}, lost={"first": "terminate"}, refused={"first": "refuse"})
     with open_engine("submitit-local:timeout_min=5", 1, tmp_path) as engine:
         states = run_jobs(jobs, engine, tmp_path / "jobs")
         assert [s.status for s in states] == ["done", "done", "failed"]
         assert [s.starts for s in states] == [1, 2, 1]
 
 
-def test_slurm_where_there_is_none_is_refused(tmp_path, monkeypatch):
+def test_slurm_is_refused_where_it_is_not_installed(tmp_path, monkeypatch):
     pytest.importorskip("submitit")
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(UserError, match="srun"), open_engine("slurm", 1, tmp_path):

@@ -1,4 +1,4 @@
-"""Sweeps vary the given fields, keep finished runs, name failures and stop together."""
+"""Sweeps vary fields, keep finished runs, name failures and stop all runs together."""
 
 import json
 import os
@@ -63,7 +63,7 @@ def test_photographs_without_truth_do_not_count(tmp_path):
     assert read_row(run, scene)["ev"] == pytest.approx(0, abs=1e-6)
 
 
-def test_the_printed_table_is_short_and_the_kept_one_says_what_columns_are():
+def test_the_printed_table_is_short_and_the_file_explains_its_columns():
     row = {"name": "a", "seed": 0, "status": "done", "seconds": 56.2, "gaussians": 300}
     row |= {"train_psnr": 25.0, "train_lpips": 0.1, "test_psnr_fitted": 21.0, "ev": 0.01}
     rows = [row, {**row, "seed": 1, "status": "failed", "reason": "no seeds"}]
@@ -92,7 +92,7 @@ def test_the_printed_table_is_short_and_the_kept_one_says_what_columns_are():
         ("image,exposure\n{}\n{},2\n", False),
     ],
 )
-def test_a_run_is_as_good_where_the_truth_is_not_whole(finished_run, tmp_path, rows, known):
+def test_an_incomplete_truth_does_not_spoil_a_row(finished_run, tmp_path, rows, known):
     (tmp_path / "truth").mkdir()
     views = read_photometry(finished_run / "photometry.json")["views"]
     text = rows.format(*[v["image"] for v in views if v["split"] == "train"])
@@ -110,14 +110,14 @@ def test_a_grid_has_every_combination():
 
 
 @pytest.mark.slow
-def test_a_sweep_keeps_what_is_done_and_names_what_failed(tmp_path):
+def test_a_sweep_keeps_finished_runs_and_names_failures(tmp_path):
     scene = make_scene(tmp_path / "scene")
     configs = {
         "good": SMALL,
         "bad": with_fields(p2gs_jax.preset("paper"), {"photometry.known": "exif"}),
     }
-    said = []
-    result = sweep(scene, tmp_path / "out", configs, seeds=[0, 1], report=said.append)
+    reports = []
+    result = sweep(scene, tmp_path / "out", configs, seeds=[0, 1], report=reports.append)
     status = [(r["name"], r["seed"], r["status"]) for r in result.rows]
     assert status[:2] == [("good", 0, "done"), ("good", 1, "done")]
     assert status[2:] == [("bad", 0, "failed"), ("bad", 1, "failed")]
@@ -126,16 +126,16 @@ def test_a_sweep_keeps_what_is_done_and_names_what_failed(tmp_path):
     assert good["train_psnr"] > 5
     metrics = json.loads((tmp_path / "out" / "good" / "seed_0" / "metrics.json").read_text())
     assert good["seconds"] == whole_run(metrics["seconds"]) > metrics["seconds"]["optimisation"]
-    assert said[0].endswith(f"{good['seconds']:.0f} s")
+    assert reports[0].endswith(f"{good['seconds']:.0f} s")
     assert "draws initial exposures" in result.rows[2]["reason"]
     assert json.loads((tmp_path / "out" / "sweep.json").read_text()) == result.rows
     table = (tmp_path / "out" / "sweep.md").read_text()
     assert "| good | 2 of 2 |" in table
     assert "bad, seed 0: failed" in table
     stamp = (tmp_path / "out" / "good" / "seed_0" / "metrics.json").stat().st_mtime_ns
-    again = sweep(scene, tmp_path / "out", {"good": SMALL}, seeds=[0, 1], report=said.append)
+    again = sweep(scene, tmp_path / "out", {"good": SMALL}, seeds=[0, 1], report=reports.append)
     assert [r["status"] for r in again.rows] == ["done", "done"]
-    assert said[-1].endswith("kept")
+    assert reports[-1].endswith("kept")
     assert (tmp_path / "out" / "good" / "seed_0" / "metrics.json").stat().st_mtime_ns == stamp
     other = {"good": with_fields(SMALL, {"train.steps": 11})}
     with pytest.raises(p2gs_jax.UserError, match="other options"):
@@ -187,7 +187,7 @@ preset = "paper"
         ("scene = 'x'\n[grid]\n'train.stepz' = [1]", "is not a configuration field"),
     ],
 )
-def test_a_wrong_file_says_what_is_wrong(tmp_path, refused, text, message):
+def test_wrong_sweep_files_are_refused_with_their_fault(tmp_path, refused, text, message):
     path = tmp_path / "s.toml"
     path.write_text(text)
     assert message in refused("sweep", path)
@@ -218,7 +218,7 @@ CONFIGS = {name: p2gs_jax.preset("robust") for name in ("a", "b", "c")}
 
 
 def runner(work):
-    """Return what an engine calls for a job: a function of its folder and of the stop file."""
+    """Return an engine's function of a job, which calls `work` with its folder and stop file."""
 
     def run(job_path):
         files = JobFiles(Path(job_path))
@@ -234,14 +234,14 @@ def finished(run, stop):
 
 
 def test_a_signal_leaves_a_table_and_the_same_sweep_goes_on(tmp_path):
-    all_begun = threading.Event()
+    started = threading.Event()
 
     def work(run, stop):
         if stop.exists():
             return "stopped", None
         if run.parent.name == "b":
-            # A signal that comes before a run was handed over finds it waiting.
-            assert all_begun.wait(60)
+            # Runs that the engine does not have yet would be waiting, not interrupted.
+            assert started.wait(60)
             os.kill(os.getpid(), signal.SIGTERM)
             while not stop.exists():
                 pass
@@ -249,7 +249,7 @@ def test_a_signal_leaves_a_table_and_the_same_sweep_goes_on(tmp_path):
         return finished(run, stop)
 
     with pytest.raises(Interrupted), interrupts.raised():
-        sweep("scene", tmp_path, CONFIGS, on_look=lambda states: all_begun.set(), run=runner(work))
+        sweep("scene", tmp_path, CONFIGS, on_look=lambda states: started.set(), run=runner(work))
     rows = json.loads((tmp_path / "sweep.json").read_text())
     assert [row["status"] for row in rows] == ["done", "interrupted", "interrupted"]
     assert not list(tmp_path.rglob(REASON))

@@ -10,7 +10,7 @@ from p2gs_jax.types import View
 
 
 def turned(yaw=0.0, center=(0.0, 0.0, 0.0), pitch=0.0, roll=0.0):
-    """Return world-to-camera of a camera in a world with y down; yaw turns right, in degrees."""
+    """Return a world-to-camera matrix, y down; angles in degrees, yaw to the right."""
     pose = Rotation.from_euler("YXZ", [yaw, pitch, roll], degrees=True).as_matrix()
     viewmat = np.eye(4)
     viewmat[:3, :3], viewmat[:3, 3] = pose.T, -pose.T @ np.asarray(center, float)
@@ -30,7 +30,7 @@ def view(name, viewmat, width=64, height=48):
 
 
 def directions(shot):
-    """Return world directions of a pinhole's pixels."""
+    """Return world directions through the pixels of a pinhole camera."""
     x, y = np.meshgrid(np.arange(shot.width) + 0.5, np.arange(shot.height) + 0.5)
     xy = (np.stack([x, y], -1) - shot.K[:2, 2]) / shot.K[[0, 1], [0, 1]]
     return np.concatenate([xy, np.ones_like(x)[..., None]], -1) @ shot.viewmat[:3, :3]
