@@ -1,4 +1,4 @@
-"""Pages of tests: a run folder to change, and what a page says, also in a browser."""
+"""Tools for tests of pages: copies of run folders, the contents of pages, checks in a browser."""
 
 import base64
 import html
@@ -44,7 +44,7 @@ HOSTILE += "\x1b\u202e\udcff.png"
 
 
 class Markup(html.parser.HTMLParser):
-    """What a page is made of: its elements with their attributes, and where these lead."""
+    """The elements of a page with the names of their attributes, and the targets of its links."""
 
     def __init__(self, text):
         super().__init__()

@@ -1,4 +1,4 @@
-"""`p2gs-jax compare`: one table."""
+"""`p2gs-jax compare`: tables of runs, on the terminal and in Markdown."""
 
 import re
 
@@ -11,7 +11,7 @@ from p2gs_jax.report.compare import compare_runs, to_markdown
 
 @pytest.fixture(scope="module")
 def runs(finished_run, tmp_path_factory):
-    """A run, and another of the same scene under other options with other results."""
+    """Return a run, and one of the same scene with other options and other results."""
     root = tmp_path_factory.mktemp("compared")
     first, second = (copy_run(finished_run, root / name) for name in ("plain", "other"))
 
@@ -49,13 +49,13 @@ def test_tables_hold_every_run_and_mark_the_best(runs):
         assert row(found, name).best == best.get(name, set())
     options = {r.name: r.cells for r in found.options}
     assert options == {"preset": ("robust", "paper"), "train.seed": ("0", "7")}
-    # Exposures have no common gauge: means are removed.
+    # Exposures are compared without their means, because runs have no common gauge.
     ((label, rms, views),) = found.apart
     assert (label, views) == ("other", 4)
     assert rms == pytest.approx(0.1, abs=1e-6)
 
 
-def test_command_and_markdown(runs, tmp_path, monkeypatch, succeeded):
+def test_the_command_prints_tables_and_writes_markdown(runs, tmp_path, monkeypatch, succeeded):
     out = tmp_path / "tables" / "compare.md"
     printed = succeeded("compare", *runs, "--out", out)
     assert all(words in printed for words in ("training PSNR", "train.seed", "* best"))
@@ -63,7 +63,7 @@ def test_command_and_markdown(runs, tmp_path, monkeypatch, succeeded):
     assert "| preset | robust | paper |" in table
     assert re.search(r"\| training PSNR, dB \| [\d.]+ \\\* \| [\d.]+ \|", table)
     assert "differ by 0.100 stops" in table
-    # No star is announced where scores do not compare.
+    # Scores of different scenes get no star.
     monkeypatch.setattr(compare, "_same_scene", lambda first, other: False)
     assert "* best" not in succeeded("compare", *runs, "--out", out)
 
@@ -71,7 +71,7 @@ def test_command_and_markdown(runs, tmp_path, monkeypatch, succeeded):
 def test_runs_of_different_scenes_get_a_table_and_a_sentence(runs, tmp_path):
     stranger = copy_run(runs[1], tmp_path / "stranger")
     edit(stranger / "config.json", lambda c: c.update(scene="/elsewhere/castle"))
-    # A moved scene is known by its photographs.
+    # A scene that was moved is recognised by its photographs.
     assert compare_runs([runs[0], stranger]).same_scene
     for file in (stranger / "renders").glob("*.photograph.png"):
         file.write_bytes((runs[0] / "renders" / file.name).read_bytes()[:100])
@@ -82,7 +82,7 @@ def test_runs_of_different_scenes_get_a_table_and_a_sentence(runs, tmp_path):
     assert all(r.best == frozenset() for r in found.scores)
 
 
-def test_an_unfinished_run_has_empty_cells_and_runs_of_one_name_are_told_apart(runs, tmp_path):
+def test_unfinished_runs_have_empty_cells_and_runs_of_one_name_separate_labels(runs, tmp_path):
     poor = copy_run(runs[1], tmp_path / "poor")
     (poor / "metrics.json").unlink()
     found = compare_runs([runs[0], poor])
@@ -94,6 +94,6 @@ def test_an_unfinished_run_has_empty_cells_and_runs_of_one_name_are_told_apart(r
     assert all(label.endswith("/plain") for label in labels)
 
 
-def test_one_run_is_not_enough(runs, refused):
+def test_a_single_run_is_refused(runs, refused):
     for argv in (["compare", runs[0]], ["compare"]):
         assert "to compare" in refused(*argv)

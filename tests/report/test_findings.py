@@ -1,4 +1,4 @@
-"""Warnings, summaries, charts and pictures say what a run says; seams are measured on a wall."""
+"""Warnings, summaries, charts and pictures of a report; seams are measured on a wall."""
 
 import copy
 import dataclasses
@@ -32,7 +32,7 @@ from p2gs_jax.types import Gaussians, Scene
 
 @pytest.fixture
 def run(finished_run):
-    """A run that nothing is wrong with."""
+    """Return a run that causes no warning."""
     files = copy.deepcopy(read_run(finished_run))
     files.metrics["train"]["psnr"] = 30.0
     files.metrics["test"]["exposure_fitted"].update(
@@ -97,27 +97,27 @@ WARNINGS = [
 
 
 @pytest.mark.parametrize(("change", "title", "words"), WARNINGS, ids=[w[1] for w in WARNINGS])
-def test_each_warning_appears_alone_and_names_what_it_means(run, change, title, words):
+def test_each_fault_causes_one_warning_with_its_numbers(run, change, title, words):
     change(run)
     found, names = dict(findings.run_warnings(run)), [v["image"] for v in run.train]
     assert set(found) == {title}
     assert all(word.format(*names) in found[title] for word in words)
 
 
-UNPROVEN = {
+HARMLESS = {
     "nothing": lambda run: None,
     "noise": lambda run: rising(run, slope=0, noise=3),
     "EXIF that agrees": lambda run: exif(run, off=0),
 }
 
 
-@pytest.mark.parametrize("change", UNPROVEN.values(), ids=UNPROVEN)
-def test_what_proves_nothing_gives_no_warning(run, change):
+@pytest.mark.parametrize("change", HARMLESS.values(), ids=HARMLESS)
+def test_noise_and_agreeing_exif_give_no_warning(run, change):
     change(run)
     assert dict(findings.run_warnings(run)) == {}
 
 
-def test_a_sentence_says_what_was_modelled(run):
+def test_a_sentence_states_the_photometric_model(run):
     model = findings.modelled(run)
     assert "an exposure per view under the sRGB tone curve" in model
     assert "the simplest model that predicts" in model
@@ -144,7 +144,7 @@ def test_charts_are_in_the_page_s_colours_and_missing_values_break_a_line():
 
 @pytest.fixture
 def drive(tmp_path):
-    """Return a function that makes a run folder of a drive from the metrics of its sections."""
+    """Return a function that makes the files of a drive's run from its metrics."""
     empty = RunFiles(tmp_path, tmp_path, None, {}, None, {}, None, [], (), (), ())
     return lambda **metrics: dataclasses.replace(empty, metrics=metrics)
 
@@ -168,7 +168,7 @@ def test_parts_and_depth_are_tables(drive):
         assert section(drive()) == ""
 
 
-def test_exposures_of_a_drive_are_a_line_a_camera_over_seconds(drive, monkeypatch):
+def test_exposures_of_a_drive_are_drawn_over_time_by_camera(drive, monkeypatch):
     cameras = ("front", "front_left", "front_right", "left", "right", "back", "roof")
     unknown = dict.fromkeys(("exposure", "exposure_ev", "exposure_fitted", "exif_ev", "gamma"))
     views = []
@@ -183,7 +183,7 @@ def test_exposures_of_a_drive_are_a_line_a_camera_over_seconds(drive, monkeypatc
     chart = exposure_section(run, {}).split("<details>")[0]
     assert all(f">{camera}<" in chart for camera in cameras)
     assert "seconds" in chart
-    # A photograph that tells no exposure is not one of 0 EV.
+    # A photograph without an exposure does not count as one of 0 EV.
     lost = {**views[0], **unknown, "image": "front/lost.png"}
     more = dataclasses.replace(run, photometry={"views": [*views, lost]})
     row, again = (
@@ -205,7 +205,7 @@ def wall(x):
 
 @pytest.fixture(scope="module")
 def wall_run(tmp_path_factory):
-    """A finished run whose Gaussians are the wall and whose exposures are right."""
+    """Return a finished run whose Gaussians are the wall and whose exposures are true."""
     root = tmp_path_factory.mktemp("wall")
     run = root / "run"
     run.mkdir()
@@ -243,7 +243,7 @@ def wall_run(tmp_path_factory):
     return run
 
 
-def test_pairs_a_stop_apart_meet_when_developed_alike_also_in_the_picture(wall_run):
+def test_seams_of_one_stop_vanish_at_one_exposure_also_in_the_picture(wall_run):
     found = measure_scene(read_run(wall_run), Silent())
     assert [(p.first, p.second) for p in found.seams] == [("0.png", "1.png"), ("1.png", "2.png")]
     for pair in found.seams:
@@ -258,7 +258,7 @@ def test_pairs_a_stop_apart_meet_when_developed_alike_also_in_the_picture(wall_r
         assert limits[0] <= step <= limits[1]
 
 
-def test_presets_with_corrections_have_no_seams_and_say_so(wall_run, tmp_path):
+def test_presets_with_corrections_have_a_note_instead_of_seams(wall_run, tmp_path):
     run = shutil.copytree(wall_run, tmp_path / "run")
     edit(run / "config.json", lambda c: c["fit"]["photometry"].update(appearance="affine"))
     np.save(run / "appearance.npy", np.zeros((3, 3, 4), np.float32))

@@ -1,4 +1,4 @@
-"""`p2gs-jax report`: everything on one page that needs nothing else, whatever the run lacks."""
+"""`p2gs-jax report`: one self-contained page, also for runs with missing or broken files."""
 
 import itertools
 import re
@@ -40,7 +40,7 @@ def page(run):
 
 @pytest.fixture(scope="module")
 def full_page(run, tmp_path_factory):
-    """A page with everything that a run can show, also what the small one has too little for."""
+    """Return a page with all elements, also those for which the small run has too little data."""
     files = read_run(run)
     files.photometry["model"] = "view_exposure_gamma"
     for i, view in enumerate(files.views):
@@ -70,7 +70,7 @@ def full_page(run, tmp_path_factory):
     return path
 
 
-def test_every_section_is_there_says_what_the_run_says_and_fetches_nothing(page, run):
+def test_every_section_has_the_values_of_the_run_and_the_page_fetches_nothing(page, run):
     assert headings(page) == HEADINGS
     links = re.findall(r"""(?:src|href)\s*=\s*["']?([^"'\s>]*)""", page)
     assert len(links) > 20
@@ -88,7 +88,7 @@ def test_every_section_is_there_says_what_the_run_says_and_fetches_nothing(page,
     assert "train.steps 60 2000" in text
 
 
-def test_pictures_are_the_run_s(page, run):
+def test_pictures_on_the_page_agree_with_the_files_of_the_run(page, run):
     shown, held_out = pictures(page), read_run(run).held_out
     assert len(held_out) == 2
     for files in held_out:
@@ -101,7 +101,7 @@ def test_pictures_are_the_run_s(page, run):
 
 
 @pytest.mark.parametrize("width", [300, 760, 1600])
-def test_in_a_browser(browser, full_page, width):
+def test_the_page_fits_into_a_browser_of_any_width(browser, full_page, width):
     found = check_in_a_browser(browser, full_page, width)
     assert found["headings"] == HEADINGS
     assert len(found["images"]) >= 8
@@ -118,7 +118,7 @@ def test_seams_are_shown_with_their_numbers(full_page, run):
         assert np.median(picture) == pytest.approx(level, abs=1)
 
 
-def test_without_rendering_or_the_scene_the_rest_is_there(run, tmp_path):
+def test_without_rendering_or_the_scene_all_sections_are_there(run, tmp_path):
     text = write_report(run, tmp_path / "quick.html", render=False).read_text()
     assert headings(text) == HEADINGS
     assert "without rendering" in words_of(text)
@@ -130,7 +130,7 @@ def test_without_rendering_or_the_scene_the_rest_is_there(run, tmp_path):
 
 
 @pytest.mark.parametrize("lost", ["metrics.json", "photometry.json", "log.jsonl", "radiance.ply"])
-def test_what_is_missing_is_reported_and_not_fatal(run, tmp_path, lost):
+def test_missing_files_are_reported_and_not_fatal(run, tmp_path, lost):
     poor = copy_run(run, tmp_path / "run")
     (poor / lost).unlink()
     page = write_report(poor, render=lost == "radiance.ply")
@@ -179,21 +179,21 @@ def test_names_are_text_never_markup(run, page, tmp_path):
     assert not set("\x1b\u202e") & set(text)
 
 
-def test_what_a_run_knows_is_drawn(full_page):
+def test_all_values_of_a_run_are_drawn(full_page):
     text = words_of(full_page.read_text())
     assert all(f" {label} " in text for label in ("recovered", "held-out view", "EXIF", "true"))
-    for said in (
+    for words in (
         *("RMS error 0.000 stops", "Crosses are EXIF", "EXIF disagrees with the pixels"),
         *("two standard errors, at most ±0.08 stops", "camera front", "camera rear"),
         *("gamma 2.10", "gamma 2.50"),
         *("images at 1/2 from step 250", "full-size images from step 500"),
     ):
-        assert said in text
+        assert words in text
     assert "all photographs" not in text
 
 
 @pytest.mark.parametrize("name", ["page.pdf", "page", "folder.html", "file/page.html"])
-def test_where_no_page_can_be_written(run, tmp_path, refused, name):
+def test_paths_that_cannot_hold_a_page_are_refused(run, tmp_path, refused, name):
     (tmp_path / "folder.html").mkdir()
     (tmp_path / "file").write_text("")
     printed = refused("report", run, "--no-render", "--out", tmp_path / name)

@@ -1,4 +1,4 @@
-"""Checkpoints return bit for bit, and no kill or broken file takes the last good one away."""
+"""Checkpoints are restored bit for bit; kills and broken files leave the last good one."""
 
 import random
 import subprocess
@@ -37,7 +37,7 @@ def biggest(folder):
     return max((p for p in folder.rglob("*") if p.is_file()), key=lambda p: p.stat().st_size)
 
 
-def test_exact_and_the_last_two_are_kept(tmp_path):
+def test_checkpoints_are_exact_and_the_last_two_are_kept(tmp_path):
     store = CheckpointStore(tmp_path / "c")
     assert store.latest_step() is None
     assert store.restore_latest(lambda meta: {}) is None
@@ -57,7 +57,7 @@ def test_exact_and_the_last_two_are_kept(tmp_path):
     assert store.latest_step() == 2
 
 
-def test_a_grown_population_is_rebuilt_from_the_values(tmp_path):
+def test_a_grown_population_is_restored_by_its_stored_capacity(tmp_path):
     grown = grow_state(state(20), 37)
     store = CheckpointStore(tmp_path / "c")
     store.save(7, grown, {"capacity": grown.params.gaussians.capacity})
@@ -69,7 +69,7 @@ def test_a_grown_population_is_rebuilt_from_the_values(tmp_path):
     assert found[0].params.photometry.parameterization == "linear"
 
 
-def test_unusual_leaves_and_values(tmp_path):
+def test_unusual_leaves_and_values_are_restored(tmp_path):
     odd = jnp.array([jnp.nan, -0.0, jnp.inf, 1e-42])
     tree = {"nan": odd, "none": None, "empty": jnp.zeros((0, 3)), "scalar": jnp.int32(7)}
     tree |= {"bool": jnp.array([True, False]), "bfloat16": jnp.ones((2, 2), jnp.bfloat16)}
@@ -115,23 +115,23 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES.keys())
-def test_a_broken_newest_falls_back_quietly(tmp_path, damage, capfd):
+def test_in_place_of_a_broken_checkpoint_the_one_before_it_is_restored(tmp_path, damage, capfd):
     store = CheckpointStore(tmp_path / "c")
     trees = {s: {"x": jnp.full(5000, float(s)), "y": jnp.full(300, s)} for s in (1, 2)}
     for s, tree in trees.items():
         store.save(s, tree, {"s": s})
     damage(tmp_path / "c" / "2")
     capfd.readouterr()
-    told = []
-    found = CheckpointStore(tmp_path / "c").restore_latest(lambda m: trees[1], told.append)
+    messages = []
+    found = CheckpointStore(tmp_path / "c").restore_latest(lambda m: trees[1], messages.append)
     assert found is not None
     assert_same(found[0], trees[1])
     assert found[1] == {"s": 1}
-    assert len(told) == 1
-    assert str(tmp_path / "c" / "2") in told[0]
+    assert len(messages) == 1
+    assert str(tmp_path / "c" / "2") in messages[0]
     damage(tmp_path / "c" / "1")
     with pytest.raises(UserError, match="c/1 cannot be read"):
-        store.restore_latest(lambda m: trees[1], told.append)
+        store.restore_latest(lambda m: trees[1], messages.append)
     assert capfd.readouterr() == ("", "")
 
 
@@ -162,13 +162,13 @@ def test_killed_at_any_moment_the_last_good_checkpoint_stays(tmp_path):
         written = [int(line) for line in child.stdout.read().split()]
         child.wait()
         store = CheckpointStore(folder)
-        told = []
-        found = store.restore_latest(lambda meta: like, told.append)
+        messages = []
+        found = store.restore_latest(lambda meta: like, messages.append)
         assert found is not None
         tree, meta = found
-        assert told == []
+        assert messages == []
         assert meta["step"] == store.latest_step() >= max(written, default=1)
         assert np.all(tree["x"] == meta["step"])
-    # What kills left is removed in the background; a save waits for that.
+    # Remains of killed processes are removed in the background; a save waits for this.
     store.save(meta["step"] + 1, tree, meta)
     assert not [p.name for p in folder.iterdir() if not p.name.isdecimal()]

@@ -1,4 +1,4 @@
-"""The files of a run folder come back as they were written, or are refused."""
+"""The files of a run folder are read back as they were written, or are refused."""
 
 import json
 from dataclasses import replace
@@ -41,7 +41,7 @@ JSON = ("ppisp", "luminance")
 
 
 @pytest.mark.parametrize("kind", ["affine", *JSON])
-def test_they_come_back_bit_for_bit(tmp_path, kind):
+def test_corrections_are_read_back_bit_for_bit(tmp_path, kind):
     path, saved = tmp_path / "file", learned(kind)
     path = path.with_suffix(".json" if kind in JSON else ".npy")
     write_appearance(path, saved, views())
@@ -50,13 +50,13 @@ def test_they_come_back_bit_for_bit(tmp_path, kind):
     jax.tree.map(np.testing.assert_array_equal, again, saved)
 
 
-def test_a_file_says_which_view_and_which_camera(tmp_path):
+def test_rows_of_corrections_are_found_by_view_and_camera(tmp_path):
     path, saved = tmp_path / "ppisp.json", learned("ppisp")
     write_appearance(path, saved, views())
-    said = json.loads(path.read_text())
-    assert said["views"]["2.png"]["camera"] == "right"
-    np.testing.assert_allclose(said["cameras"]["left"]["vignetting"], saved.vignettings[0])
-    # A fit that holds out other views reads its own rows.
+    content = json.loads(path.read_text())
+    assert content["views"]["2.png"]["camera"] == "right"
+    np.testing.assert_allclose(content["cameras"]["left"]["vignetting"], saved.vignettings[0])
+    # A fit that holds out other views reads the rows of its views.
     one = read_appearance(path, "ppisp", views()[2:])
     assert one.names == ("right",)
     np.testing.assert_array_equal(one.colors[0], saved.colors[2])
@@ -64,7 +64,7 @@ def test_a_file_says_which_view_and_which_camera(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["affine", *JSON])
-def test_what_cannot_belong_is_refused(tmp_path, kind):
+def test_broken_corrections_and_those_of_other_views_are_refused(tmp_path, kind):
     path = tmp_path / ("a.json" if kind in JSON else "a.npy")
     with pytest.raises(UserError, match="cannot be read"):
         read_appearance(path, kind, views())
@@ -92,7 +92,7 @@ def test_a_broken_scene_file_is_refused(tmp_path):
         broken.append(bytes(flipped))
     for data in broken:
         (tmp_path / SCENE_FILE).write_bytes(data)
-        # What the file says is no whole scene in any case.
+        # Even without damage the file does not hold a whole scene.
         with pytest.raises(UserError, match=SCENE_FILE):
             read_scene(tmp_path, tmp_path)
 
@@ -121,7 +121,7 @@ def problem():
         ("channel", ["red", "green", "blue"]),
     ],
 )
-def test_responses_of_cameras_and_channels_are_drawn_each(tmp_path, recwarn, problem, by, names):
+def test_every_response_of_a_camera_or_channel_is_drawn(tmp_path, recwarn, problem, by, names):
     form = Form("view_exposure")
     solution = fit_model(problem, form, fit_response(problem, Response("srgb"), form=form, by=by))
     assert [name for name, _, _ in curves_to_draw(solution)] == names

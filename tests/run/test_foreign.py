@@ -1,4 +1,4 @@
-"""Splats that another program trained on developed photographs, shown as photographs were."""
+"""Splats that another program trained on developed photographs get the calibrated exposures."""
 
 import json
 import shutil
@@ -17,14 +17,14 @@ from p2gs_jax.run.foreign import foreign_run
 from p2gs_jax.run.photometry_files import OF_VIEWS, write_photometry
 
 RADIANCE = np.array([0.1, 0.2, 0.05])
-# Exposures of two photographs and, in stops, of the developed ones; the third view is unknown.
+# Exposures of two photographs (the third has none), and of every developed one in EV.
 EXPOSURES, DEVELOPED_EV = (0.5, 2.0), 1.0
 BALANCE, VIGNETTING = (1.25, 1.0, 0.8), -0.5
 WIDTH, HEIGHT = 48, 40
 
 
 def walls(colors):
-    """Return opaque walls before all cameras with display colours; one lets 0.1 % through."""
+    """Return three walls with display colours before all cameras; each transmits 0.1 %."""
     means, scales = [(0, 0, 4), (0, 0, 5), (0, 0, 6)], (6, 6, -3)
     return gaussians_of(means, (1, 0, 0, 0), scales, 12, (np.reshape(colors, (1, 3)) - 0.5) / C0)
 
@@ -62,12 +62,12 @@ def trained(tmp_path_factory):
     return root
 
 
-def told(root):
+def options(root):
     return ("--photometry", root / "cal", "--scene", root / "scene")
 
 
-def test_a_photograph_is_shown_as_it_was_taken(succeeded, trained, tmp_path):
-    text = succeeded("render", trained / "splat.ply", *told(trained), "--out", tmp_path)
+def test_renders_have_the_exposure_and_vignetting_of_the_photographs(succeeded, trained, tmp_path):
+    text = succeeded("render", trained / "splat.ply", *options(trained), "--out", tmp_path)
     assert "1 view of unknown exposure (2.png)" in " ".join(text.split())
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     squared = ((x - WIDTH / 2) ** 2 + (y - HEIGHT / 2) ** 2) / ((WIDTH**2 + HEIGHT**2) / 4)
@@ -81,9 +81,9 @@ def test_a_photograph_is_shown_as_it_was_taken(succeeded, trained, tmp_path):
         np.testing.assert_allclose(linear[20, 24], RADIANCE, rtol=0.01)
 
 
-def test_gaussians_are_lifted_to_radiance_and_the_error_is_said(succeeded, trained, tmp_path):
+def test_gaussians_are_lifted_to_radiance_and_the_error_is_reported(succeeded, trained, tmp_path):
     argv = ("--format", "linear-ply", "--bake-steps", "0", "--out", tmp_path)
-    assert "Lifted" in succeeded("export", trained / "splat.ply", *told(trained), *argv)
+    assert "Lifted" in succeeded("export", trained / "splat.ply", *options(trained), *argv)
     linear = read_ply(tmp_path / "linear.ply")
     logs = np.broadcast_to(np.log(RADIANCE), (3, 3))
     np.testing.assert_allclose(C0 * np.asarray(linear.sh[:, 0]), logs, atol=1e-4)
@@ -98,7 +98,7 @@ def test_without_developed_photographs_colours_show_the_mean_exposure(trained, t
     assert run.scene.test_indices == (2,)
 
 
-def test_what_cannot_be_shown_is_refused(refused, trained, tmp_path):
+def test_invalid_splats_and_calibrations_of_other_scenes_are_refused(refused, trained, tmp_path):
     photometry(tmp_path / "other", ("a.png", "b.png", "c.png"), "1")
     write_radiance(tmp_path / "radiance.ply", walls(RADIANCE), activation="exp")
     vertices = b"element vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
@@ -119,7 +119,7 @@ def test_what_cannot_be_shown_is_refused(refused, trained, tmp_path):
     ):
         text = refused("render", splats, "--photometry", photos, "--scene", where)
         assert all(word in " ".join(text.split()) for word in words), text
-    metered = refused("export", good, *told(trained), "--format", "html", "--meter", "auto")
+    metered = refused("export", good, *options(trained), "--format", "html", "--meter", "auto")
     assert "--meter needs a run" in metered
     assert "add --scene" in refused("export", good, "--photometry", place, "--format", "exr")
     assert "`export` with --photometry" in " ".join(refused("render", good).split())

@@ -20,7 +20,7 @@ with locked(Path(sys.argv[1])):
 """
 
 
-def test_a_second_holder_is_refused_and_told_who_the_first_is(tmp_path):
+def test_a_second_holder_is_refused_with_the_process_of_the_first(tmp_path):
     require_free(tmp_path)
     with locked(tmp_path):
         for attempt in (require_free, lambda folder: locked(folder).__enter__()):
@@ -33,7 +33,7 @@ def test_a_second_holder_is_refused_and_told_who_the_first_is(tmp_path):
         pass
 
 
-def test_what_a_killed_process_had_begun_to_write_is_removed(tmp_path):
+def test_unfinished_files_of_killed_processes_are_removed(tmp_path):
     for name in (".writing-a.npz", "renders/.writing-b.png", ".writing-c/d", "blocks/.writing-e"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()
@@ -63,7 +63,7 @@ def test_a_killed_process_leaves_no_lock(tmp_path):
 
 
 @pytest.mark.parametrize("anew", [False, True])
-def test_a_folder_that_was_removed_underneath_is_named(tmp_path, anew):
+def test_a_folder_that_was_removed_during_a_run_is_named(tmp_path, anew):
     run = tmp_path / "run"
     run.mkdir()
 
@@ -73,7 +73,7 @@ def test_a_folder_that_was_removed_underneath_is_named(tmp_path, anew):
             if anew:
                 run.mkdir()
                 (run / NAME).write_text("1")
-            (run / "checkpoints" / "3").stat()  # what the run meets first
+            (run / "checkpoints" / "3").stat()  # the first access of the run
 
     with pytest.raises(FileNotFoundError), locked(tmp_path):
         (tmp_path / "nowhere").stat()  # other errors stay as they are

@@ -1,4 +1,4 @@
-"""Photographs as cameras write them, made byte by byte where no library writes them."""
+"""Photographs in the formats of cameras, byte by byte where no library writes them."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def write_dng(
 ) -> None:
     """Write the light of a scene as a sensor with an RGGB filter would have seen it.
 
-    The camera chose the white balance `chosen`, or that of the sensor.
+    `balance` is the sensor's white balance; the camera's is `chosen`, or the same.
     """
     h, w = light.shape[:2]
     camera = np.minimum(light / balance, 1)
@@ -64,8 +64,8 @@ def write_dng(
         tags[tag] = value
     file = io.BytesIO()
     Image.fromarray(data).save(file, "TIFF", tiffinfo=tags)
-    # Pillow calls it grey; it is a colour filter's.
-    grey, filtered = (struct.pack("<HHII", 262, 3, 1, what) for what in (1, 32803))
+    # Pillow tags the pixels as grey (1); they are of a colour filter array (32803).
+    grey, filtered = (struct.pack("<HHII", 262, 3, 1, kind) for kind in (1, 32803))
     path.write_bytes(file.getvalue().replace(grey, filtered))
 
 
@@ -75,10 +75,10 @@ def icc_profile(name: str, columns, curve: bytes) -> bytes:
     def xyz(values) -> bytes:
         return b"XYZ \0\0\0\0" + struct.pack(">3i", *(round(v * 65536) for v in values))
 
-    said = name.encode("utf-16-be")
-    mluc = b"mluc\0\0\0\0" + struct.pack(">II", 1, 12) + b"enUS" + struct.pack(">II", len(said), 28)
+    text = name.encode("utf-16-be")
+    mluc = b"mluc\0\0\0\0" + struct.pack(">II", 1, 12) + b"enUS" + struct.pack(">II", len(text), 28)
     tags = {
-        b"desc": mluc + said,
+        b"desc": mluc + text,
         b"wtpt": xyz((0.9642, 1.0, 0.8249)),
         **{key: xyz(c) for key, c in zip((b"rXYZ", b"gXYZ", b"bXYZ"), columns, strict=True)},
         **dict.fromkeys((b"rTRC", b"gTRC", b"bTRC"), curve),

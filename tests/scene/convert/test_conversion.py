@@ -70,7 +70,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "photos"
 
 
-def test_raw_is_linear_above_its_black_level(folder: Path) -> None:
+def test_raw_photographs_are_linear_above_their_black_level(folder: Path) -> None:
     light = 0.02 + 0.8 * patches((96, 64)) ** 2
     write_dng(folder / "a.dng", light, orientation=6)
     write_dng(folder / "b.dng", light / 4, orientation=1)
@@ -91,7 +91,7 @@ def test_raw_is_linear_above_its_black_level(folder: Path) -> None:
     assert records_of(result)[2]["saturated"] == 1
 
 
-def test_one_white_balance_for_all_raws_of_a_camera(folder: Path) -> None:
+def test_all_raw_photographs_of_a_camera_get_one_white_balance(folder: Path) -> None:
     # Light and sensor stay the same; only the camera's white balance changes.
     light = np.full((64, 96, 3), (0.2, 0.3, 0.25))
     for name, chosen in {"a": (2.0, 1, 1.5), "b": (2.2, 1, 1.4), "c": (1.6, 1, 1.8)}.items():
@@ -108,7 +108,7 @@ def test_one_white_balance_for_all_raws_of_a_camera(folder: Path) -> None:
     ("module", "name", "package"),
     [("rawpy", "a.dng", "p2gs-jax[raw]"), ("pillow_heif", "a.heic", "p2gs-jax[heic]")],
 )
-def test_missing_packages(folder: Path, monkeypatch, module: str, name: str, package: str) -> None:
+def test_missing_packages_are_named(folder: Path, monkeypatch, module, name, package) -> None:
     (folder / name).write_bytes(b"whatever")
     monkeypatch.setitem(sys.modules, module, None)
     with refused(name, f"pip install '{package}'"):
@@ -230,7 +230,7 @@ def test_exr_keeps_light_between_photographs(folder: Path) -> None:
     assert noted(result, "multiplied by 0.125")
 
 
-def test_exr_with_nan_alpha_and_chromaticities(folder: Path) -> None:
+def test_nan_alpha_and_chromaticities_of_exr_are_converted(folder: Path) -> None:
     grey = np.full((8, 8, 1), 0.3, np.float32)
     grey[0, 0], grey[0, 1], grey[0, 2] = np.nan, np.inf, -1
     write_exr(folder / "a.exr", grey, "Y", expTime=0.01, aperture=4.0, isoSpeed=100.0)
@@ -251,7 +251,7 @@ def test_exr_with_nan_alpha_and_chromaticities(folder: Path) -> None:
     assert light_of(c)[4, 4] == pytest.approx((0, 0.521, 0), abs=2e-3)
 
 
-def test_files_that_are_refused(folder: Path) -> None:
+def test_unsupported_and_broken_files_are_refused(folder: Path) -> None:
     def refuse(name: str, *words: str) -> None:
         with refused(*words):
             converted(folder)
@@ -284,7 +284,7 @@ def test_a_folder_of_several_formats_is_converted_once(folder: Path) -> None:
     assert light_of(converted(folder).paths[1])[32, 48, 1] == pytest.approx(0.6, abs=5e-3)
 
 
-def test_a_model_of_exr_photographs(tmp_path: Path) -> None:
+def test_a_colmap_model_of_exr_photographs_is_read(tmp_path: Path) -> None:
     root = tmp_path / "scene"
     model = write_tiny_model(root) / "images.txt"
     model.write_text(model.read_text().replace(".png", ".exr"))
@@ -343,7 +343,7 @@ PIXELS = (40 + 150 * patches()).astype(np.uint8)
 
 
 @pytest.mark.parametrize(("data", "name"), [(DISPLAY_P3, "Display P3"), (ADOBE_RGB, "Adobe RGB")])
-def test_colours_are_those_of_littlecms(data: bytes, name: str) -> None:
+def test_converted_colours_agree_with_littlecms(data: bytes, name: str) -> None:
     profile = read_profile(data)
     assert profile is not None
     assert profile.name.startswith(name)
@@ -396,7 +396,7 @@ def test_alpha_beside_a_profile_is_kept_and_grey_is_unchanged(tmp_path: Path) ->
     assert (store.stored(1)[0] == 77).all()
 
 
-def test_adobe_rgb_marked_by_exif_alone() -> None:
+def test_adobe_rgb_is_recognised_by_exif_alone() -> None:
     exif = Image.Exif()
     exif.get_ifd(0x8769)[0xA005] = {1: "R03"}
     data = io.BytesIO()

@@ -1,4 +1,4 @@
-"""Made drives of each format, to read and to change."""
+"""Synthetic drives of each format, to read and to change."""
 
 import shutil
 from pathlib import Path
@@ -16,25 +16,20 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.scene.drives import read_drive
 
 WRITERS = {
-    **{"argoverse": argoverse, "kitti_raw": kitti, "nuscenes": nuscenes},
-    **{
-        "kitti_tracking": kitti_tracking,
-        "pandaset": pandaset,
-        "waymo": waymo,
-        "drivestudio": drivestudio,
-    },
+    **{"argoverse": argoverse, "kitti_raw": kitti, "kitti_tracking": kitti_tracking},
+    **{"nuscenes": nuscenes, "pandaset": pandaset, "waymo": waymo, "drivestudio": drivestudio},
 }
 
 
 @pytest.fixture(scope="session")
 def write():
-    """Return a function that writes a drive of a format and returns its truth."""
+    """Return a function that writes a drive of a format and returns it with its truth."""
     return lambda name, root, **options: WRITERS[name].write(root, **options)
 
 
 @pytest.fixture(scope="session")
 def read():
-    """Return a function that reads the drive in a folder, of whatever format it is."""
+    """Return a function that reads the drive of any format in a folder."""
 
     def get(root, **choice):
         recording = read_drive(root, DataConfig(**choice), print)

@@ -57,7 +57,7 @@ def test_a_camera_whose_name_is_a_path_is_refused(drive, name):
         assemble(replace(drive, cameras=(drive.cameras[0], hostile)), PLAIN)
 
 
-def test_laser_points_are_told_apart_by_what_they_lie_on(drive):
+def test_laser_points_belong_to_moving_objects_or_the_static_scene(drive):
     scene = assemble(drive, PLAIN)
     # Points on the standing car have no object: it is a part of the static scene.
     assert (scene.lidar.objects == 0).sum() == 60 * FRAMES
@@ -113,7 +113,7 @@ def test_calibration_is_compared_with_the_photographs(drive):
         assemble(replace(drive, cameras=shifted), PLAIN)
 
 
-def test_missing_photographs_stop_or_are_counted(drive):
+def test_missing_photographs_are_refused_or_left_out_with_a_note(drive):
     drive.photographs[0].path.unlink()
     with refused(r"1 of the 12 images .*CAM_FRONT/000000.png"):
         assemble(drive, PLAIN)
@@ -135,13 +135,13 @@ def test_embedded_photographs_are_written_once(drive, tmp_path):
     assert scene.views[0].image_path.is_relative_to(tmp_path / "work")
 
 
-def test_frames_are_sliced_by_their_place_and_invalid_slices_are_refused():
+def test_frames_are_sliced_by_their_index_and_invalid_slices_are_refused():
     existing = [3, 4, 5, 7]
-    for asked, found in ((None, existing), ("1:3", [4, 5]), ("::2", [3, 5]), ("-1:", [7])):
-        assert chosen_frames(asked, existing) == found
-    for asked in ("3", "a:b", "1:2:3:4", "9:12", "::0"):
+    for choice, found in ((None, existing), ("1:3", [4, 5]), ("::2", [3, 5]), ("-1:", [7])):
+        assert chosen_frames(choice, existing) == found
+    for choice in ("3", "a:b", "1:2:3:4", "9:12", "::0"):
         with refused("--frames"):
-            chosen_frames(asked, existing)
+            chosen_frames(choice, existing)
 
 
 def test_seeds_are_dense_near_the_path_and_sparse_far_from_it():
@@ -170,15 +170,15 @@ def test_an_object_moves_if_it_leaves_its_first_place(xs, stated, moves):
     poses = np.tile(np.eye(4), (len(xs), 1, 1))
     poses[:, 0, 3] = xs
     boxes = [Box("a", "Car", (4, 2, 1.5), k, pose, stated) for k, pose in enumerate(poses)]
-    (thing,) = tracks(boxes)
-    assert thing.moving is moves
+    (found,) = tracks(boxes)
+    assert found.moving is moves
     # Boxes are sorted by time; the first of two boxes at one time counts.
     (again,) = tracks([*boxes[::-1], boxes[0]._replace(pose=9 * poses[0])])
     np.testing.assert_array_equal(again.poses, poses)
     assert again.size == (4.0, 2.0, 1.5)
 
 
-def test_points_of_a_fast_object_between_two_of_its_boxes_belong_to_it():
+def test_points_between_two_boxes_of_a_fast_object_belong_to_it():
     """At 2 Hz and 30 m/s boxes are 15 m apart."""
     times = np.arange(4) / 2
     poses = np.tile(np.eye(4), (4, 1, 1))

@@ -1,4 +1,4 @@
-"""Tables of drives: rows of large JSON lists, pickled tables with pandas as the oracle, Arrow."""
+"""Tables of drives: rows of large JSON lists, Arrow, and pickled tables, as pandas reads them."""
 
 import gzip
 import json
@@ -23,7 +23,7 @@ ROWS = [
 
 
 @pytest.mark.parametrize("style", [{}, {"indent": 4}, {"separators": (",", ":")}])
-def test_rows_are_found_in_the_text_or_decoded_one_after_the_other(tmp_path, style):
+def test_selected_rows_are_read_whatever_the_style_of_the_text(tmp_path, style):
     path = tmp_path / "table.json"
     path.write_text(json.dumps(ROWS, **style) + "\n")
     assert read_rows(path, {}) == ROWS
@@ -39,7 +39,7 @@ def test_rows_are_found_in_the_text_or_decoded_one_after_the_other(tmp_path, sty
 @pytest.mark.parametrize(
     "text", ["", "{}", "[1]", '[{"of": "x"', '[{"of": "x"},', "[" * 9999, "\udcff"]
 )
-def test_what_is_not_a_table_of_rows_is_named(tmp_path, text):
+def test_texts_that_are_not_tables_of_rows_are_refused(tmp_path, text):
     path = tmp_path / "table.json"
     path.write_text(text, errors="surrogateescape")
     for column in ("", "of"):
@@ -47,7 +47,7 @@ def test_what_is_not_a_table_of_rows_is_named(tmp_path, text):
             read_rows(path, {}, column, {"x"})
 
 
-def test_without_pyarrow_the_command_is_said(tmp_path, monkeypatch):
+def test_without_pyarrow_the_error_names_the_command_that_installs_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with refused(r"pip install 'p2gs-jax\[drives\]'"):
         read_feather(tmp_path / "annotations.feather", [])
@@ -74,7 +74,7 @@ VARIANTS = {
 
 @pytest.mark.parametrize("protocol", [3, 4, 5])
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_what_pandas_pickles(tmp_path, protocol, variant):
+def test_tables_that_pandas_pickled_are_read(tmp_path, protocol, variant):
     table = VARIANTS[variant]
     (tmp_path / "t.pkl").write_bytes(pickle.dumps(table, protocol=protocol))
     columns = read_pickled(tmp_path / "t.pkl")
@@ -111,7 +111,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize(("content", "words"), REFUSED.values(), ids=REFUSED)
-def test_what_is_not_a_table_is_refused_and_never_run(tmp_path, monkeypatch, content, words):
+def test_other_pickles_are_refused_and_never_executed(tmp_path, monkeypatch, content, words):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "00.pkl").write_bytes(content)
     with refused(words, "00.pkl"):

@@ -116,14 +116,14 @@ def test_drives_mask_the_car_and_runs_keep_the_mask(tmp_path, monkeypatch):
         assert mask[: H // 2].all()
         assert store.get(by_camera["back"])[1].all()
         store.close()
-    # The cached mask is read again.
+    # The mask is read from its cache: it cannot be computed here.
     monkeypatch.setattr("p2gs_jax.scene.drives.ego_mask.find_ego_mask", None)
     assert assemble(recording, DataConfig(frames="0:4"), tmp_path / "work").notes == scene.notes
     without = assemble(recording, DataConfig(ego_mask=False))
     assert all(view.ego_mask is None for view in without.views)
 
 
-def test_another_lens_is_not_answered_with_the_mask_of_the_last(tmp_path, monkeypatch):
+def test_a_cached_mask_is_not_used_for_another_lens(tmp_path, monkeypatch):
     lenses = []
 
     def found(camera, *_):

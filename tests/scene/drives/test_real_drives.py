@@ -19,7 +19,7 @@ def project(points, to_camera, K):
         return (local @ K.T)[:, :2] / local[:, 2:], local[:, 2]
 
 
-def test_laser_points_land_in_the_images_when_those_were_taken(shared_data, read):
+def test_laser_points_project_into_images_at_their_times(shared_data, read):
     drive = read(shared_data("nuscenes_one_frame"))
     assert drive.notes[0] == "scene.json counts 39 samples, but sample.json holds 1."
     points, times = drive.sweeps[0].read()
@@ -39,8 +39,8 @@ def test_laser_points_land_in_the_images_when_those_were_taken(shared_data, read
         assert photograph.time - passed == pytest.approx(0.002, abs=0.0006)
 
 
-def test_the_scanner_passed_boxes_when_it_is_said_to(shared_data, read):
-    """Points of the spinning scanner carry times; those in a box are of the box's time."""
+def test_boxes_have_the_times_at_which_the_scanner_passed_them(shared_data, read):
+    """Points of the spinning scanner have times; points in a box have the time of the box."""
     sequence, apart = read(shared_data("pandaset_002")), []
     for sweep in sequence.sweeps:
         table = read_pickled(sequence.root / f"lidar/{sweep.frame:02d}.pkl.gz")
@@ -76,16 +76,16 @@ def test_scans_agree_with_the_disparity_of_the_real_photographs(shared_data, rea
     assert recording.format == "kitti_raw"
     K = recording.cameras[0].K
     for sweep, still in zip(recording.sweeps, stills, strict=True):
-        taken = [p for p in recording.photographs if p.frame == sweep.frame]
-        xy, z = project(sweep.read().points, inverse(taken[0].pose), K)
+        pair = [p for p in recording.photographs if p.frame == sweep.frame]
+        xy, z = project(sweep.read().points, inverse(pair[0].pose), K)
         truth = cv2.imread(str(source / f"disp_occ_0/{still}.png"), cv2.IMREAD_UNCHANGED) / 256.0
         height, width = truth.shape
         inside = (z > 1) & (xy >= 0).all(1) & (xy < [width, height]).all(1)
         column, row = xy[inside].astype(int).T
         disparity = truth[row, column]
         known = disparity > 0
-        # The second camera stands where its projection says: disparities are those of the pair.
-        baseline = np.linalg.norm(taken[0].pose[:3, 3] - taken[1].pose[:3, 3])
+        # Cameras are where their projections state, so depths agree with disparities.
+        baseline = np.linalg.norm(pair[0].pose[:3, 3] - pair[1].pose[:3, 3])
         ratio = z[inside][known] / (K[0, 0] * baseline / disparity[known])
         assert len(ratio) > 1000
         assert np.median(ratio) == pytest.approx(1.0, abs=0.01)

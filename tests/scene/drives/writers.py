@@ -1,4 +1,4 @@
-"""What made drives of all formats share: how the car moves, what is about it, small photographs."""
+"""Shared by synthetic drives of all formats: motion and surroundings of the car, photographs."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 from p2gs_jax.scene.rigid import pose_of
 
 WIDTH, HEIGHT = 64, 48
-# Of every camera: fx, fy, cx, cy with pixel centres at +0.5.
+# Intrinsics of every camera, pixels: fx, fy, cx, cy with pixel centres at +0.5.
 K = (50, 51, 32, 24)
-# Boxes about the scanner, in axes x forward, y left: one ahead, one to the right.
+# Places of boxes about the scanner, m, x forward, y left: one ahead, one to the right.
 AHEAD, RIGHT = (12.0, 0.0), (0.0, -8.0)
-LENGTH, BREADTH, TALL = SIZE = (4.2, 1.8, 1.5)
+LENGTH, BREADTH, TALL = SIZE = (4.2, 1.8, 1.5)  # m
 
 
 def matrix(turn: Rotation, position) -> np.ndarray:
@@ -34,7 +34,7 @@ def car_at(seconds: float) -> np.ndarray:
     """Return car to world: 9 m/s along a bend, far from the world's origin."""
     yaw = 0.4 + 0.3 * seconds
     turn = Rotation.from_euler("ZYX", [yaw, 0.02, -0.01])
-    # A circle: at all times along the car's own x.
+    # On a circle about `centre` the velocity is along the car's x.
     centre, radius = np.array([1200.0, -700.0, 12.0]), 30.0
     return matrix(turn, centre + radius * np.array([np.sin(yaw), -np.cos(yaw), 0.0]))
 
@@ -50,12 +50,12 @@ def box(place, yaw: float, height: float = 0.8) -> np.ndarray:
 
 
 def beside(seconds: float, place, yaw: float = 0.0) -> np.ndarray:
-    """Return a box in the world at a place about SCANNER, given x forward, y left."""
+    """Return a box in the world at a place about SCANNER (x forward, y left)."""
     return car_at(seconds) @ SCANNER @ box((-place[1], place[0]), yaw, 0)
 
 
 def upright(pose: np.ndarray) -> np.ndarray:
-    """Return a pose without pitch and roll, which sets that annotate only a yaw cannot keep."""
+    """Return a pose without pitch and roll, for data sets that annotate only a yaw."""
     return box(pose[:2, 3], yaw_of(pose), pose[2, 3])
 
 
@@ -114,7 +114,7 @@ class Made(NamedTuple):
 
 
 def shots(azimuths: dict[str, float], lag: dict[str, float], ats, clock: float = 0.0) -> dict:
-    """Return the truth of photographs at times; each camera is triggered after its own lag."""
+    """Return the truth of photographs at times; cameras are triggered `lag` seconds later."""
     return {
         (name, k): (clock + at + lag[name], car_at(at + lag[name]) @ mounted(azimuths[name]))
         for name in lag
@@ -123,7 +123,7 @@ def shots(azimuths: dict[str, float], lag: dict[str, float], ats, clock: float =
 
 
 def tracks(ats, late: dict[str, float], box_at: Callable, clock: float = 0.0) -> dict:
-    """Return the truth of boxes at times, which the scanner passes so much later."""
+    """Return the truth of boxes at times; the scanner passes them `late` seconds later."""
     return {
         name: (clock + ats + late[name], np.array([box_at(at, place) for at in ats]))
         for name, place in (("ahead", AHEAD), ("right", RIGHT))

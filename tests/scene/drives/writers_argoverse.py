@@ -15,9 +15,9 @@ EXTRINSICS = Path("calibration/egovehicle_SE3_sensor.feather")
 BOXES = Path("annotations.feather")
 CAMERAS = {"ring_front_center": 0.0, "ring_front_left": 0.9, "ring_side_right": -1.6}
 GREY = "stereo_front_left"
-# Exposures are centred on the scanners' passing, every half turn.
+# Seconds from a half turn's start until the scanner passes a camera, which is then exposed.
 LAG = {"ring_front_center": 0.02, "ring_front_left": 0.008, "ring_side_right": 0.04}
-# Poses begin before the first sweep, and the reader's clock with them.
+# Poses, and thus the reader's clock, begin these seconds before the first sweep.
 BEFORE = 0.05
 
 
@@ -42,7 +42,7 @@ def box(place) -> np.ndarray:
 
 
 def write_boxes(log: Path, turns: int, **changes) -> None:
-    """Write things that keep their places beside the car, and one that stands in the world."""
+    """Write two boxes that move with the car, and one that stands in the world."""
     parked = w.car_at(0) @ box(w.AHEAD)
     local = {
         "ahead": [box(w.AHEAD)] * turns,
@@ -61,7 +61,7 @@ def write_boxes(log: Path, turns: int, **changes) -> None:
 
 
 def write(log: Path, frames=3) -> w.Made:
-    # At 100 Hz, with one moment told twice, a nanosecond apart, as in published logs.
+    # Poses at 100 Hz; one has a twin a nanosecond later, as in published logs.
     moments = sorted([-BEFORE + 0.01 * k for k in range(10 * frames + 10)] + [0.1 + 1e-9])
     poses = posed([w.car_at(t) for t in moments])
     write_table(log / POSES, timestamp_ns=[ns(t) for t in moments], **poses)
