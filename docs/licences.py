@@ -28,11 +28,11 @@ BUNDLED = {
 HEAD = """\
 # Licences
 
-This page lists what the package depends on, under which licences. The program itself is under
+This page lists the dependencies of the package and their licences. The program itself is under
 [Apache-2.0](../LICENSE) and is distributed without its dependencies: pip installs them, each under
 its licence. Whoever distributes both together, for example as a container image, must comply with
 all of these, and those marked **GPL** then apply to the whole. `python docs/licences.py` generates
-the page from what is installed; a test compares.
+the page from the installed packages, and a test checks that it is current.
 
 | package | needed by | licence | what its wheel carries |
 |---|---|---|---|
@@ -48,8 +48,8 @@ The tests compare PLY files with plyfile (GPL-3.0-or-later), which comes with th
 program neither imports nor requires it.
 """
 WHY = {
-    "av": "BSD itself, with x264 and x265 in its wheels; reads and writes videos, loaded only then",
-    "pillow-heif": "BSD itself, with x265 in its wheels; reads HEIC, only with the extra `heic`",
+    "av": "is under BSD-3-Clause, and its wheels contain x264 and x265. It reads and writes videos",
+    "pillow-heif": "is under BSD-3-Clause, and its wheels contain x265. It reads HEIC photographs",
 }
 
 
@@ -106,7 +106,7 @@ def page() -> str:
     for name, (needed, licence, carried) in rows().items():
         mark = " **GPL**" if is_gpl(licence) or is_gpl(carried) else ""
         lines.append(f"| {name} | {needed} | {licence}{mark} | {carried} |")
-    parts = "\n".join(f"- **{name}**: {why}." for name, why in WHY.items())
+    parts = "\n".join(f"- **{name}** {why}." for name, why in WHY.items())
     return HEAD + "\n".join(lines) + "\n" + TAIL.format(parts=parts)
 
 

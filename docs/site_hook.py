@@ -1,6 +1,6 @@
 """The documentation site: pages from outside docs/, and links that work there as on GitHub.
 
-Pages and pictures keep their places in the repository; on the site, what lies outside docs/ comes
+Pages and pictures keep their places in the repository; on the site, files from outside docs/ lie
 under project/. Links are written as the repository needs them and rewritten here. A link to a file
 or folder that the site does not show becomes plain text; one that leads nowhere is left, and
 `mkdocs build --strict` refuses it.
@@ -47,7 +47,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Let links lead to where the site has what they mean; GitHub's lists need no blank line."""
+    """Point links at the site's pages; add the blank line that MkDocs needs before a list."""
     uri = page.file.src_uri
     at = uri.removeprefix(PROJECT) if uri.startswith(PROJECT) else DOCS + uri
 
@@ -66,5 +66,5 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def _in_repository(page: str, target: str) -> str:
-    """Return what a page's link means, as a path from the repository's root."""
+    """Return the target of a page's link as a path from the repository's root."""
     return posixpath.normpath(posixpath.join(posixpath.dirname(page), target))
