@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 PATHS = ("views", "drive", "orbit")
 FPS = 24.0  # of a video, by default
 MOST_SHIFT = 100.0  # scene units
-# Files that --out cannot name.
-OTHER_FILES = (".mov", ".avi", ".mkv", ".webm", ".gif", ".png", ".jpg", ".exr", ".json")
+# Suffixes of files that are not written.
+OTHER_SUFFIXES = (".mov", ".avi", ".mkv", ".webm", ".gif", ".png", ".jpg", ".exr", ".json")
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class Render:
 
     run: RunOrSplats
     trajectory: str = "views"
-    """Camera path. views: the cameras of the scene; drive: a smooth path through the views of one
-    camera; orbit: a circle around the scene; FILE.json: a list of cameras (docs/rendering.md)."""
+    """Camera path. views: the scene's cameras; drive: a smooth path through one camera's views;
+    orbit: a circle or arc around the scene; FILE.json: a list of cameras (docs/rendering.md)."""
     out: Path | None = None
     """Folder for linear EXR and PNG files, or a video NAME.mp4 (default: below RUN/renders)."""
     split: Literal["all", "train", "test"] = "all"
@@ -169,7 +169,7 @@ def _check_picture(o: Render) -> None:
     check(valid, f"--trajectory {path!r} is not a valid trajectory", fix=fix)
     why = "--meter works neither with --panorama nor with --exposure-ev own"
     check(o.meter is None or not (o.panorama or ev == "own"), why, fix=one)
-    why = f"--exposure-ev {ev} is not a number of stops"
+    why = f"--exposure-ev must be from {-MOST_STOPS:g} to {MOST_STOPS:g} stops"
     check(not isinstance(ev, float | int) or abs(ev) <= MOST_STOPS, why, fix="write 0, 1 or -2.5")
     why = "--exposure-ev own is for views and drives, and not for panoramas"
     fix = "write a number of stops, or leave it out"
@@ -193,17 +193,17 @@ def _check_path(o: Render) -> None:
     fix = "choose one of them, or leave it out"
     valid = not o.panorama or path in ("views", "drive")
     check(valid, f"--panorama {needs} views and drive", fix=fix)
-    single = path in PATHS and not o.panorama
-    check(o.camera is None or single, "--camera is for single cameras of the scene", fix=leave)
+    why = "--camera works neither with --panorama nor with a FILE.json"
+    check(o.camera is None or (path in PATHS and not o.panorama), why, fix=leave)
     valid = o.split == "all" or path in PATHS
-    check(valid, "--split is for the cameras of the scene", fix=leave)
+    check(valid, "--split does not work with a FILE.json", fix=leave)
 
 
 def _check_file(o: Render) -> None:
     out = o.out
     if out is not None:
         why = f"--out {out}: {out.suffix} files are not written"
-        check(out.suffix.lower() not in OTHER_FILES, why, fix="name a folder, or NAME.mp4")
+        check(out.suffix.lower() not in OTHER_SUFFIXES, why, fix="name a folder, or NAME.mp4")
         kind = "a folder" if out.is_dir() else "a file"
         valid = not out.exists() or out.is_dir() != is_video(out)
         check(valid, f"--out {out} is {kind}", fix="choose another name")
