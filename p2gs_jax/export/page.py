@@ -24,7 +24,7 @@ from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.core.text import printable
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.page_scene import embedded_photographs, page_scene, rounded, uncorrected
-from p2gs_jax.export.page_splats import PageSplats, TruePicture, fit_into, linear_light, page_error
+from p2gs_jax.export.page_splats import PageSplats, RunPicture, fit_into, page_error, radiance_of
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run.read import Run
@@ -68,8 +68,8 @@ def write_page(
     pictures = []
     for i in map(int, evenly_spaced(len(scene.views), JUDGED)):
         camera, display = fitted.camera(i), uncorrected(fitted.own_display(i))
-        linear, name = linear_light(gaussians, camera, render), scene.views[i].name
-        pictures.append(TruePicture(name, camera, display, linear, develop(linear, display)))
+        linear, name = radiance_of(gaussians, camera, render), scene.views[i].name
+        pictures.append(RunPicture(name, camera, display, linear, develop(linear, display)))
     train = scene.train_indices
     weighed = [fitted.camera(train[k]) for k in evenly_spaced(len(train), WEIGHED)]
     embedded = embedded_photographs(fitted, photographs)

@@ -35,7 +35,7 @@ DARKEST_LEVEL = 1.0
 LEAST_ERROR = 1e-10
 
 
-class TruePicture(NamedTuple):
+class RunPicture(NamedTuple):
     """A view rendered with all Gaussians of the run: radiance and display values."""
 
     name: str
@@ -149,7 +149,7 @@ def weights(
 ) -> Float[np.ndarray, " n"]:
     """Return the sum of each Gaussian's blending weights over the pixels of all `cameras`.
 
-    If all radiance is 1, this is the derivative of the sum of all pixels by log radiance.
+    At radiance 1 it is the derivative of the sum of all pixels by the Gaussian's log radiance.
     """
     plain = replace(cfg, radiance="exp")
     alive = on_device(np.ones(gaussians.capacity), bool)
@@ -177,7 +177,7 @@ def weights(
 
 
 def _largest_that_fits(room: int, gaussians: Gaussians, order: np.ndarray) -> Packed | None:
-    """Return the first Gaussians in `order`, nearly as many as fit; None: hardly any fits."""
+    """Return the first Gaussians in `order`, nearly as many as fit; None: no attempt succeeded."""
     full = pack(gaussians)
     if len(full.data) <= room:
         return full
@@ -196,12 +196,12 @@ def _largest_that_fits(room: int, gaussians: Gaussians, order: np.ndarray) -> Pa
 
 
 def page_error(
-    gaussians: Gaussians, pictures: Sequence[TruePicture], render: RenderView
+    gaussians: Gaussians, pictures: Sequence[RunPicture], render: RenderView
 ) -> PageError:
     """Compare pictures of the page's Gaussians with one or more true pictures."""
     psnrs, stops = [], []
     for true in pictures:
-        linear = linear_light(gaussians, true.camera, render)
+        linear = radiance_of(gaussians, true.camera, render)
         display = develop(linear, true.transform)
         square = np.mean((display - true.display) ** 2, dtype=np.float64)
         psnrs.append(float(-10 * np.log10(max(square, LEAST_ERROR))))
@@ -220,12 +220,12 @@ def page_error(
     )
 
 
-def _stops(linear: Float32[np.ndarray, "h w 3"], true: TruePicture) -> Float[np.ndarray, " p"]:
+def _stops(linear: Float32[np.ndarray, "h w 3"], true: RunPicture) -> Float[np.ndarray, " p"]:
     lit = true.display.max(-1) >= DARKEST_LEVEL / 255
     page, run = (np.maximum(luminance(p[lit]), 1e-12) for p in (linear, true.linear))
     return np.abs(np.log2(page / run))
 
 
-def linear_light(g: Gaussians, camera: Camera, render: RenderView) -> Float32[np.ndarray, "h w 3"]:
-    """Return the picture of all Gaussians in a camera, linear radiance."""
+def radiance_of(g: Gaussians, camera: Camera, render: RenderView) -> Float32[np.ndarray, "h w 3"]:
+    """Return the linear radiance of all Gaussians in the picture of a camera."""
     return np.asarray(render(g, on_device(np.ones(g.capacity), bool), camera).linear)

@@ -46,9 +46,9 @@ def _choose(counting, sorting, splats: Splats2D, cfg: RenderConfig, *static):
 
 
 def longest_first(lengths: Int[Array, " n"]) -> Int[Array, " n"]:
-    """Return the indices of lengths, longest first; equal or very long lengths are by index."""
+    """Return the indices of lengths, longest first; equal lengths are in the order of indices."""
     bits = bits_for(lengths.shape[0])
-    limit = 2 ** (32 - bits) - 1
+    limit = 2 ** (32 - bits) - 1  # longer ones count as equal
     key = jnp.uint32(limit) - jnp.minimum(lengths, limit).astype(jnp.uint32)
     # The low bits hold the index, because a single operand sorts 5 times faster on CPUs.
     key = lax.sort(key << bits | jnp.arange(lengths.shape[0], dtype=jnp.uint32), is_stable=False)
@@ -85,7 +85,7 @@ def _count_by_sorting(
     return jnp.where(_too_many(entries), 2**30, jnp.sum(entries))
 
 
-def _smallest_exponent(factor, left, right, top, bottom):
+def _smallest_square(factor, left, right, top, bottom):
     """Return the smallest |factor (x, y)|^2 over each rectangle."""
     a11, a12, a22 = factor
     A, B, C = a11 * a11, a11 * a12, a12 * a12 + a22 * a22
@@ -140,7 +140,7 @@ def _bin_by_sorting(
     half_x, half_y = (tile_x - 1) / 2, (tile_y - 1) / 2
     dx, dy = col * tile_x + tile_x / 2 - mean_x, line * tile_y + tile_y / 2 - mean_y
     edges = dx - half_x, dx + half_x, dy - half_y, dy + half_y
-    smallest = _smallest_exponent((a11, a12, a22), *edges)
+    smallest = _smallest_square((a11, a12, a22), *edges)
     keep = (position < count) & (0.5 * smallest <= reach + REACH_MARGIN)
     tile_id = jnp.where(keep, (line * across_tiles + col).astype(jnp.int32), tile_count)
 

@@ -6,8 +6,8 @@ A subtitle holds the settings of one frame, or of one second in older models:
     ISO:100 Shutter:60 EV:0 Fnum:2.2                also Fnum:F2.2
     F/2.8, SS 206.14, ISO 150, EV 0
 
-The f-number may be multiplied by 100, and the shutter may lack its `1/`. Frames are found by time,
-because not every model writes a subtitle for each frame.
+The f-number may be multiplied by 100, and the shutter may lack its `1/`. A frame's settings
+are found by time, because not every model writes a subtitle for each frame.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _SHUTTER = re.compile(r"\b(?:Shutter\s*:|SS)\s*(?:1/)?(\d+(?:\.\d+)?)", re.IGNOR
 _F_NUMBER = re.compile(r"\b(?:Fnum\s*:\s*F?|F/)(\d+(?:\.\d+)?)", re.IGNORECASE)
 # A larger f-number was multiplied by 100.
 _LARGEST_F_NUMBER = 64
-# Times of subtitles are rounded: those up to this much after a frame's count for it, seconds.
+# Times are rounded: a subtitle that starts up to this many seconds after a frame belongs to it.
 _ROUNDED = 0.004
 
 
@@ -55,7 +55,7 @@ def read_shots(path: Path) -> list[Shot]:
     return sorted(shots, key=lambda shot: shot.time)
 
 
-def shot_at(shots: Sequence[Shot], time: float) -> ExifSettings:
+def settings_at(shots: Sequence[Shot], time: float) -> ExifSettings:
     """Return the settings of the frame at a time, seconds; `shots` must not be empty."""
     after = bisect_right(shots, time + _ROUNDED, key=lambda shot: shot.time)
     return shots[max(after - 1, 0)].settings

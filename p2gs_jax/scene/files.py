@@ -39,15 +39,15 @@ MASK_FOLDERS = ("masks", "mask", "dynamic_masks", "dynamic_mask")
 OTHER_FOLDERS = {*MASK_FOLDERS, "depth", "depths", "normal", "normals"}
 _MASK_NAME = re.compile(r"^(dynamic_)?masks?[._-](?=.)|(?<=.)[._-](dynamic_)?masks?$")
 _TWO_SUFFIXES = re.compile(r"\.(jpe?g|png)\.png$", re.IGNORECASE)
-# The farthest principal point from the middle of a photograph, as a fraction of its sides.
+# Largest distance of a principal point from the image centre, as a fraction of the sides.
 MOST_OFF = 0.25
 # Numbers from this size on count as infinite: float32 arithmetic may overflow.
 HUGE = 1e30
-_MOVED = "move it there, or name the folder of all photographs with --images"
+_MOVE_INSIDE = "move it there, or name the folder of all photographs with --images"
 # Pillow refuses larger pictures as an attack.
 MOST_PIXELS = 2 * (Image.MAX_IMAGE_PIXELS or 2**26)
 _MARKER = "finished"
-# The first bytes of a photograph, among which its XMP is searched.
+# Number of bytes at the start of a photograph in which its XMP is searched.
 _XMP_WITHIN = 2**18
 # Time between two progress messages, seconds.
 EVERY_S = 10.0
@@ -57,7 +57,7 @@ Report = Callable[[str], None]
 
 
 def list_images(folder: Path, *, recursive: bool = True) -> list[Path]:
-    """Return the photographs in a folder, which may be absent, sorted by their relative path.
+    """Return the photographs in a folder, sorted by relative path; none if it does not exist.
 
     Hidden files are left out, and so are masks (in a folder of masks, or named after a photograph),
     depth maps and normal maps.
@@ -166,7 +166,7 @@ def _stem(name: str) -> str:
     return (path.with_suffix("") if path.suffix in IMAGE_SUFFIXES else path).as_posix()
 
 
-def require_inside(name: PurePath, folder: Path, source: Path, fix: str = _MOVED) -> None:
+def require_inside(name: PurePath, folder: Path, source: Path, fix: str = _MOVE_INSIDE) -> None:
     """Raise UserError if a name in the file `source` leads out of the folder it is relative to.
 
     Symbolic links below the folder are followed: the owner of the folder made them.
@@ -228,7 +228,7 @@ def _size_in_header(path: Path) -> tuple[int, int]:
 def decode_grey(data: bytes, shrink: int) -> UInt8[np.ndarray, "h w"] | None:
     """Return the photograph in the bytes of a file, grey and not rotated; None: it is broken.
 
-    It is shrunk by 2 or 4, but at most by `shrink`: JPEG decodes faster then.
+    It is shrunk by 4, or by 2, if `shrink` is at least that: JPEG decodes faster then.
     """
     flags = {2: cv2.IMREAD_REDUCED_GRAYSCALE_2, 4: cv2.IMREAD_REDUCED_GRAYSCALE_4}
     flag = flags.get(2 ** min(int(np.log2(max(shrink, 1))), 2), cv2.IMREAD_GRAYSCALE)
@@ -238,7 +238,8 @@ def decode_grey(data: bytes, shrink: int) -> UInt8[np.ndarray, "h w"] | None:
 def is_panorama(path: Path) -> bool:
     """Return whether a photograph of the ratio 2:1 shows a whole sphere (equirectangular).
 
-    Its XMP states this, or its first and last columns are alike and its outer rows are uniform.
+    Its XMP states this. Or its first and last columns differ less than 2 times as much as
+    neighbours do, and its outer rows vary less than a tenth as much as the image.
     """
     width, height = image_size(path)
     if width != 2 * height:
@@ -293,15 +294,15 @@ def at_file_size(
     Raises UserError: the file is not an image, or has another aspect ratio than `source` states.
     """
     w, h = image_size(path)
-    if not same_shape((w, h), size):
+    if not same_aspect((w, h), size):
         why = f"is {w}x{h}, but {source} states {size[0]}x{size[1]}"
         fix = "use the photographs from which the model was made, neither cropped nor rotated"
         raise broken(f"wrong size: {path}", why, fix)
     return scale_intrinsics(K, w / size[0], h / size[1]).astype(np.float32), w, h
 
 
-def same_shape(a: tuple[int, int], b: tuple[int, int]) -> bool:
-    """Return whether two sizes have one aspect ratio; sides of `a` may be rounded by a pixel."""
+def same_aspect(a: tuple[int, int], b: tuple[int, int]) -> bool:
+    """Return whether two sizes have the same aspect; sides of `a` may be rounded by a pixel."""
     sides = np.array(a) / b, 1 / np.array(b)
     return bool((sides[0] - sides[1]).max() <= (sides[0] + sides[1]).min())
 

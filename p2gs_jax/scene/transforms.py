@@ -300,7 +300,7 @@ def _require_one_shape(views: Sequence[View], frames: Mapping[str, _Frame]) -> N
     for view in unsized:
         first = unsized[0]
         sizes = [(v.width, v.height) for v in (view, first)]
-        if not (files.same_shape(*sizes) or files.same_shape(*sizes[::-1])):
+        if not (files.same_aspect(*sizes) or files.same_aspect(*sizes[::-1])):
             why = f"is {view.width}x{view.height}, but {first.name} is {first.width}x"
             why += f"{first.height}, and {frames[view.name].source} gives them one lens"
             fix = "use the photographs that belong to the poses, neither cropped nor rotated, or "

@@ -31,7 +31,7 @@ from p2gs_jax.errors import UserError, broken
 from p2gs_jax.scene.convert import icc
 from p2gs_jax.scene.convert.convert import Converted, cache_of, write_png
 from p2gs_jax.scene.convert.readers import made_exif
-from p2gs_jax.scene.drone_srt import read_shots, shot_at, srt_beside
+from p2gs_jax.scene.drone_srt import read_shots, settings_at, srt_beside
 from p2gs_jax.scene.files import Report, cached_folder, file_fingerprints
 
 RECORD = "frames.json"
@@ -334,7 +334,7 @@ def _keep(path: Path, cfg: DataConfig, folder: Path, report: Report) -> dict[str
         if len(records) % 10 == 0:
             report(f"writing frames: {len(records)} of {len(kept)}")
         name = f"{frame.number:06d}.png"
-        exif = made_exif(shot_at(shots, frame.time)) if shots else None
+        exif = made_exif(settings_at(shots, frame.time)) if shots else None
         write_png(folder / name, frame.codes(), exif)
         transfers.add(frame.transfer)
         records.append({"file": name, "frame": frame.number, "time": round(frame.time, 6)})

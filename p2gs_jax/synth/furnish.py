@@ -193,7 +193,7 @@ def _trees(build: Builder) -> None:
             x = first + step * i + build.uniform(-0.8, 0.8)
             if t.CROSS_STREET[0] - 1.5 < x < t.CROSS_STREET[1] + 1.5 or x > 84.0:
                 continue
-            if build.stays_clear(x, 2.5):
+            if build.near_underpass(x, 2.5):
                 continue
             y = side * 6.7
             trunk, w = build.uniform(2.3, 2.9), build.uniform(0.11, 0.16)
@@ -218,7 +218,7 @@ def _cars(build: Builder) -> None:
     k = 0
     for side, centers in spots.items():
         for x in centers:
-            if not build.stays_clear(x, 3.5):
+            if not build.near_underpass(x, 3.5):
                 at = x + build.uniform(-0.4, 0.4)
                 _car(build, at, side * 4.45, side, _PAINTS[paints[k % 8]])
             k += 1
@@ -254,7 +254,7 @@ def _lamps(build: Builder) -> None:
     """Place street lamps, and traffic lights at the crossing that show red to the cameras."""
     for side, xs in ((1.0, (11.5, 39.0, 66.0)), (-1.0, (20.5, 52.0, 80.0))):
         for x in xs:
-            if build.stays_clear(x, 0.5):
+            if build.near_underpass(x, 0.5):
                 continue
             y, arm = side * 6.0, side * 4.3
             build.post((x, y), 0.06, 6.6, Material.METAL, STEEL)

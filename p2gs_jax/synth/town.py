@@ -49,7 +49,7 @@ class Town:
     """P primitives: boxes, then tapered boxes, then ellipsoids; columns as in `Solid`.
 
     `planes` are (n, d) of the tapered boxes' six faces: inside is n . p <= d, n unit. `seed` is
-    for the noise of textures, `underpass` its extent along x, m, or None.
+    for the noise of textures, `underpass` the extent of the underpass along x, m, or None.
     """
 
     n_boxes: int
@@ -117,8 +117,8 @@ class Builder:
         kind, lo, hi = 1 if top else kind, (x0, y0, z0), (x1, y1, z1)
         self.solids.append(Solid(kind, lo, hi, material, color, accent, params, top))
 
-    def stays_clear(self, x: float, reach: float) -> bool:
-        """Return whether nothing may be placed within `reach` m of x, because of the underpass."""
+    def near_underpass(self, x: float, reach: float) -> bool:
+        """Return whether x is within `reach` m of the underpass, where nothing is placed."""
         return self.clear is not None and (self.clear[0] - reach < x < self.clear[1] + reach)
 
     def post(
@@ -157,7 +157,7 @@ def _taper_planes(solid: Solid) -> np.ndarray:
 
 
 def pack(build: Builder, seed: int, light: Light, gloss: float = 1.0) -> Town:
-    """Return the town of all solids, ordered boxes, tapered boxes, ellipsoids."""
+    """Return the town of the placed solids: boxes, then tapered boxes, then ellipsoids."""
     solids = sorted(build.solids, key=lambda s: s.kind)
     tapered = [s for s in solids if s.kind == 1]
     names = ("lo", "hi", "color", "accent", "params")

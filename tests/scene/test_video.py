@@ -18,7 +18,7 @@ from p2gs_jax.core.numerics import srgb_decode
 from p2gs_jax.scene import find_scene, video
 from p2gs_jax.scene.convert.icc import PQ_WHITE, to_light
 from p2gs_jax.scene.convert.readers import exif_evs
-from p2gs_jax.scene.drone_srt import read_shots, shot_at
+from p2gs_jax.scene.drone_srt import read_shots, settings_at
 from p2gs_jax.scene.survey import survey
 
 COLOURS = np.array(
@@ -253,7 +253,7 @@ def test_subtitles_of_drones_state_the_exposures_of_frames(tmp_path: Path) -> No
             lines += [f"{k + 1}", f"00:00:0{seconds},{ms:03d} --> 00:00:09,000"]
             lines += [text.format(iso=iso, s=shutter), ""]
         subtitles.write_text("\n".join(lines))
-        shots = [shot_at(read_shots(subtitles), k / 30) for k in range(50)]
+        shots = [settings_at(read_shots(subtitles), k / 30) for k in range(50)]
         assert {shot.aperture for shot in shots} == {2.8}
         assert [(shot.iso, round(1 / shot.time)) for shot in shots] == frames + [frames[-1]] * 15
     found = read(film, tmp_path, every=10)

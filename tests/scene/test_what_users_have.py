@@ -25,7 +25,7 @@ from p2gs_jax.paths.files import near_scene
 from p2gs_jax.paths.shots import Shot
 from p2gs_jax.scene import ImageStore, find_scene
 from p2gs_jax.scene.cameras import name_cameras
-from p2gs_jax.scene.files import find_names, is_panorama, same_shape
+from p2gs_jax.scene.files import find_names, is_panorama, same_aspect
 from p2gs_jax.scene.rigid import require_axes
 from p2gs_jax.scene.visibility import share_in_view
 
@@ -141,9 +141,9 @@ def test_points_may_be_missing_or_in_a_ply(tmp_path):
 
 def test_a_crop_is_not_another_size():
     for size in ((5187, 3361), (1297, 840), (1296, 840), (648, 420), (10374, 6722), (5186, 3361)):
-        assert same_shape(size, (5187, 3361))
+        assert same_aspect(size, (5187, 3361))
     for size in ((5150, 3361), (5187, 3340), (1297, 835), (3361, 5187)):
-        assert not same_shape(size, (5187, 3361))
+        assert not same_aspect(size, (5187, 3361))
 
 
 def test_scenes_far_from_the_origin_keep_their_coordinates(tmp_path):

@@ -1,6 +1,6 @@
 """Waymo's recordings as drivestudio and EmerNeRF process them: photographs, text files and scans.
 
-    images/TTT_C.jpg               photographs; T is the frame (10 Hz), C the camera's number
+    images/TTT_C.jpg               photographs; T is the frame (10 Hz), C the camera from 0 (FRONT)
     intrinsics/C.txt               fx fy cx cy k1 k2 p1 p2 k3
     extrinsics/C.txt               camera to car; x forward, y left, z up, for both
     ego_pose/TTT.txt               car to world
@@ -43,7 +43,7 @@ _PHOTOGRAPH = re.compile(r"(\d+)_(\d)\.(?:jpg|png)")
 
 
 def read_drivestudio(root: Path, cfg: DataConfig) -> Recording:
-    """Read a processed segment; `root` may hold several segments; UserError: a file is broken."""
+    """Read a processed segment: `cfg.drive` of several in `root`; UserError: a file is broken."""
     root = tables.drive_folder(root, cfg.drive, MARKER)
     poses = tables.numbered(root / "ego_pose", (".txt",))
     cars = {frame: _pose(path) for frame, path in poses.items()}
@@ -88,7 +88,7 @@ def _pose(path: Path) -> Pose:
 
 
 def _mount(path: Path) -> Pose:
-    """Return the pose camera-to-car, with OpenCV's axes; UserError: the file has other axes."""
+    """Return camera-to-car with OpenCV's camera axes; UserError: the file's are not Waymo's."""
     mount = _pose(path)
     # Other data sets and programs write cameras with OpenCV's axes, whose z is not up.
     if mount[2, 2] < 0.5:
