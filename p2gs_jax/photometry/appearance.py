@@ -2,10 +2,10 @@
 
 `affine`: a 3x4 colour matrix per view (the 3DGS code's exposure compensation). `bilateral`: a grid
 of such matrices over the image and luminance (bilateral-guided radiance fields). `curve`: one
-increasing curve per view for all channels (similar to Luminance-GS). Their parameters are
-deviations: zeros change nothing. `ppisp` (`ppisp.py`) replaces the tone curve and also has
-parameters of cameras. `luminance` (`luminance.py`) maps photographs to an enhanced scene, as
-Luminance-GS does; its inverse maps renders to photographs.
+increasing curve per view for all channels. Their parameters are deviations: zeros change nothing.
+`ppisp` (`ppisp.py`) replaces the tone curve and also has parameters of cameras. `luminance`
+(`luminance.py`) maps photographs to an enhanced scene, as Luminance-GS does; its inverse maps
+renders to photographs.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def mean_correction(appearance: Corrections | None, camera: str | None = None) -
 
 
 def exposures_apart(params: Params) -> Params:
-    """Return a finished fit with PPISP's exposures moved to `Photometry`, as for other models."""
+    """Return parameters with PPISP's exposures moved to `Photometry`, as for other models."""
     if not isinstance(params.appearance, Ppisp):
         return params
     stops, photometry = params.appearance.exposures, params.photometry
@@ -128,7 +128,7 @@ def _bilateral(ldr: Float[Array, "h w 3"], grid: Float[Array, "12 d y x"]) -> Fl
     """Return values corrected by a grid, sliced by dense products with hat functions."""
     height, width, _ = ldr.shape
     levels, rows, columns = grid.shape[1:]
-    # In the order y, x, level, coefficient, which takes a third of the time of the grid's order.
+    # The order y, x, level, coefficient takes a third of the time of the grid's order.
     cells = grid.transpose(2, 3, 1, 0).reshape(rows, -1)
     up = (jnp.asarray(_hats(height, rows), ldr.dtype) @ cells).reshape(height, columns, -1)
     up = jnp.einsum("wx,hxk->hwk", jnp.asarray(_hats(width, columns), ldr.dtype), up)
@@ -146,7 +146,7 @@ def _hats(pixels: int, cells: int) -> np.ndarray:
 
 
 def regularisation(parameters: Corrections, kind: Appearance) -> Float[Array, ""] | None:
-    """Return mean squared differences of grid cells, summed over 3 axes; PPISP's terms; or None."""
+    """Return the penalty on differences of grid cells, or PPISP's terms; None: there are none."""
     if isinstance(parameters, Ppisp):
         return ppisp.regularisation_of(parameters)
     if isinstance(parameters, Luminance | Formation) or kind != "bilateral":

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from p2gs_jax.config import Level
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.photometry.adjustment.equations import SMALLEST_SCALE
-from p2gs_jax.photometry.adjustment.errors import side_by_side
+from p2gs_jax.photometry.adjustment.errors import clusters_of
 from p2gs_jax.photometry.adjustment.problem import Problem
 from p2gs_jax.photometry.adjustment.solve import (
     COMPARED,
@@ -114,7 +114,7 @@ class Search:
         self._problem, self._training, o = problem, training, problem.observations
         self._use, self._where = (~held).astype(np.float64), np.flatnonzero(held)
         self._views = o.views[self._where]
-        self._regions = side_by_side(o, problem.layout.row)[self._where]
+        self._regions = clusters_of(o, problem.layout.row)[self._where]
         self._predicted: dict[Choice, Predicted] = {}
         self._hopeless: set[Level | None] = set()
         self._fitted: dict[tuple[Form, Curve], Response | None] = {}

@@ -3,8 +3,8 @@
 Neighbouring points share texture, gloss and effects that are not modelled. Gloss, haze and moving
 shade cause the same error over a whole region of an image: it averages out between views, never
 within a view. If points counted as independent, standard errors were 2 times too small for
-photographs of known exposure, and 3 to 7 times for drives with simulated exposures (BUILD_NOTES,
-"The camera as it is").
+photographs of known exposure, and 3 to 7 times for drives with simulated shared errors
+(experiments/results/2026-11-22-camera-as-it-is.md).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from p2gs_jax.photometry.adjustment.parameters import EMPTY, Forward, Parameters
 from p2gs_jax.photometry.adjustment.solve import Balanced, Fit, one_thread
 from p2gs_jax.photometry.observations import Labels, Observations
 
-CANCELLED = 1e-6  # relative rounding error of a difference of equal numbers
+CANCELLED = 1e-6  # a smaller value along a unit direction is a rounding error
 # Least information of a determined direction, where each parameter's information is scaled to 1.
 # Rounding and `parameters.EMPTY` leave less.
 HELD = 1e-11
@@ -33,10 +33,10 @@ HELD = 1e-11
 DRAWS = 32
 # Side of the regions whose points form a cluster, units of half an image's diagonal. Errors over
 # standard errors of photographs of known exposure: 2.1 if points are independent, 1.6 with regions
-# of this size, and no better with larger ones (BUILD_NOTES, "The camera as it is").
+# of this size, no better with larger ones (experiments/results/2026-11-22-camera-as-it-is.md).
 REGION = 1 / 3
 SHARED_REGION = 2 / 3  # side of the regions that share an error, in the same units
-# Least number, and least effective number, of observations in a region for its shared error.
+# Least number, and least effective number, of a region's points or cells for its shared error.
 FEWEST, FEWEST_EFFECTIVE = 4, 3.0
 
 # Standard deviation of the change of light per doubling of a pixel's width on the surface, log
@@ -67,20 +67,20 @@ class Uncertainty(NamedTuple):
 
 
 def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncertainty:
-    """Return the robust covariance of all parameters: bread, meat, bread (Huber; White).
+    """Return the sandwich estimator of the covariance: bread, meat, bread (Huber; White).
 
     Residuals of the channels of an observation, of a point, and of its neighbours are not
-    independent: the meat is summed over clusters. Errors that regions of an image share are added,
-    and the effect of a change of light with the footprint, which drifts along a drive.
+    independent: the meat is summed over clusters. It includes errors that regions of an image
+    share, and light that changes with the footprint, a pixel's width on the surface.
     """
     layout = fit.model.layout
     clusters = observations.cells
     if clusters is None:
-        clusters = side_by_side(observations, layout.row)
+        clusters = clusters_of(observations, layout.row)
     scores = summed(fit.model, fit.theta, fit.at, fit.at.weight * fit.at.residual, clusters)
     if observations.positions is not None and len(layout.row):
         labels = regions(observations.positions, observations.views, SHARED_REGION)
-        # All points have the shared error, also those with small weights.
+        # `whole_points` gives some points small weights; they have the shared error, too.
         alike = weigh(fit.model, fit.theta, fit.at.weight, "geman_mcclure")
         parts = layout.row if observations.cells is None else clusters
         deviation = _shared_deviation(fit.model, alike, labels, parts)
@@ -148,7 +148,7 @@ def regions(
     return np.unique((views * np.int64(across) + x) * across + y, return_inverse=True)[1]
 
 
-def side_by_side(observations: Observations, row: Labels) -> Labels:
+def clusters_of(observations: Observations, row: Labels) -> Labels:
     """Return the cluster of each observation: the image region of its point in its first view.
 
     Without positions every point is a cluster. `row` is each observation's row in the adjustment.
