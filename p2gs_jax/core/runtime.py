@@ -23,9 +23,9 @@ from p2gs_jax.errors import UserError
 
 # Numbers of mallopt(3).
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD = -1, -2, -3
-# On 16 cores a step took 741 ms if XLA divided it, and 321, 337 and 666 ms if we divided the view
-# over 4, 8 and 16; on 2 cores both take equally long (experiments/results/2026-11-27-cores.md).
-WORTH_DIVIDING = 4
+# Cores that divide a view by default, if there are as many. A step on 16 cores (300,000 Gaussians)
+# took 741 ms undivided, 321 over 4; 2 gain nothing (experiments/results/2026-11-27-cores.md).
+DEFAULT_CORES = 4
 # Compile time, seconds, below which programs are not kept on disk.
 SHORTEST_S = 0.5
 # Size of the cache, bytes, above which the least recently used programs are removed.
@@ -40,7 +40,7 @@ def keep_freed_memory() -> bool:
     mallopt = _of_glibc("mallopt")
     if mallopt is None:
         return False
-    # Some versions of glibc reject the threshold 2**30 and accept 2**25. All settings are tried.
+    # No trimming, requests 64 MiB larger, mmap from 1 GiB, or from 32 MiB if glibc rejects it.
     settings = ((_M_TRIM_THRESHOLD, 2**31 - 1), (_M_TOP_PAD, 64 << 20))
     accepted = [mallopt(number, value) == 1 for number, value in settings]
     return any(mallopt(_M_MMAP_THRESHOLD, 1 << n) == 1 for n in (30, 25)) and all(accepted)
@@ -80,7 +80,7 @@ def use_cores(count: int | None = None) -> None:
 
     Raises:
         UserError: XLA_FLAGS sets the number of devices.
-        RuntimeError: JAX has already computed something.
+        RuntimeError: `count` is given, and JAX has already computed something.
     """
     stated = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
     if count is not None and stated:
@@ -88,7 +88,7 @@ def use_cores(count: int | None = None) -> None:
         raise UserError(why, fix="leave out either this flag or the number of cores (--threads)")
     if count is None and (stated or jax.config.values["jax_num_cpu_devices"] != -1):
         return
-    usual = WORTH_DIVIDING if available_cores() >= WORTH_DIVIDING else 1
+    usual = DEFAULT_CORES if available_cores() >= DEFAULT_CORES else 1
     try:
         jax.config.update("jax_num_cpu_devices", usual if count is None else count)
     except RuntimeError:

@@ -67,10 +67,9 @@ def sweep(
     Finished runs in `out` are kept, interrupted ones continue, and failed ones are tried again. A
     failure ends its run, but not the sweep. The table is written after every run.
 
-    Each of `seeds` replaces `train.seed`. `max_parallel` processes run at a time; the steps of a
-    process hardly use more than one core (BUILD_NOTES). The engine is one of
-    `jobs.engines.open_engine`. `report` receives a line per run. `on_look` and `run` are as for
-    `run_jobs`.
+    Each of `seeds` replaces `train.seed`. `max_parallel` processes run at a time; on one
+    machine they share its cores. The engine is one of `jobs.engines.open_engine`. `report` receives
+    a line per run. `on_look` and `run` are as for `run_jobs`.
 
     Raises:
         UserError: there is nothing to do, names would share a folder, a folder has other options,
@@ -230,7 +229,7 @@ MEANING = {
     "seconds": "duration of the whole run with compilation and evaluation, seconds",
     "radiance_stops": "RMS error of the radiance against the true HDR images, stops",
     "ev": "RMS error of the exposures against the true ones, stops, after one scale",
-    "ev_power": "RMS error of the exposures, stops, after one scale and the best power",
+    "ev_power": "RMS error of the exposures, stops, after one scale and one power common to all",
 }
 
 

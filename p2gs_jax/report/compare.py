@@ -1,4 +1,4 @@
-"""Several runs in one table, also as Markdown."""
+"""Scores and options of several runs side by side, also as Markdown."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ class TableRow(NamedTuple):
 class Comparison:
     """Several runs side by side, in the order of the command, each with a short unique label.
 
-    `remarks` are sentences on results that cannot be compared. Scores compare only if the scene is
-    the same. `options` holds the options that differ. `apart` has an entry for each later run
+    `remarks` are sentences on missing files and different scenes. Scores compare only if the scene
+    is the same. `options` holds the options that differ. `apart` has an entry for each later run
     with at least 2 views of the first: its label, the RMS difference of their exposures after
     removing the means (stops), and the number of common views.
     """
@@ -61,7 +61,7 @@ class Comparison:
         ]
 
 
-# Paths of the scores in `metrics.json`; the last part of a path determines the digits.
+# Paths of the scores in `metrics.json`; their last parts are the keys of `DIGITS` and `BETTER`.
 NUMBERS: dict[str, tuple[str, ...]] = {
     "Gaussians": ("counts", "gaussians"),
     "steps": ("counts", "steps"),
@@ -107,7 +107,7 @@ def compare_runs(folders: Sequence[str | Path]) -> Comparison:
 
 
 def _labels(folders: list[Path]) -> list[str]:
-    """Return the shortest ends of the paths that differ, all of the same depth."""
+    """Return the shortest distinct path ends of equal depth; equal paths get numbers."""
     parts = [folder.resolve().parts for folder in folders]
     for depth in range(1, max(map(len, parts)) + 1):
         names = ["/".join(p[-depth:]).replace("//", "/") for p in parts]

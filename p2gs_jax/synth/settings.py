@@ -1,4 +1,4 @@
-"""Options and image size of a data set, without numpy, so that `--help` is fast."""
+"""Options and image size of synthetic data sets; numpy is not imported: `--help` is fast."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ class Sensor:
     """The image formation of the cameras. The defaults are the paper's ISO-Var(4)."""
 
     iso_std: float = 4.0
-    """Standard deviation of the ISO about 8 (paper: 2 and 4); 0 is ISO-Const."""
+    """Standard deviation of the ISO, whose mean is 8 (paper: 2 and 4); 0 is ISO-Const."""
     curve: Curve = "srgb"
-    """Response; `filmic` bends it into an S before sRGB."""
+    """Response; `filmic` is an S-curve before the sRGB encoding."""
     curves: tuple[Curve, ...] = ()
-    """Responses of the cameras in turn, sorted by name; none: `curve` for all."""
+    """Responses that the cameras, in order of their names, get in turn; none: `curve` for all."""
     camera_gain_ev: float = 0.0
     """Standard deviation of a fixed gain per camera, stops."""
     drift_ev: float = 0.0

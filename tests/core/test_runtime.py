@@ -82,7 +82,7 @@ def run(**variables) -> str:
     )
     folder, cores = done.stdout.splitlines()
     stated = variables.get("CORES") or variables.get("JAX_NUM_CPU_DEVICES")
-    default = runtime.WORTH_DIVIDING
+    default = runtime.DEFAULT_CORES
     assert int(cores) == int(stated or (default if threads.available_cores() >= default else 1))
     return folder
 
