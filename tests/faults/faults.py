@@ -80,14 +80,14 @@ FAULTS = (
         "photometry/formation.py",
         "log_linear = log_pivot + (log_x - log_pivot) * (GAMMA_SRGB / gamma)",
         "log_linear = log_pivot + (log_x - log_pivot) * (gamma / GAMMA_SRGB)",
-        "properties/test_pir.py::test_5_inverse",
+        "properties/test_pir.py::test_the_tone_map_is_inverted_by_its_inverse",
     ),
     Fault(
         "sRGB without its toe",
         "photometry/formation.py",
         "toe = log_linear <= float(np.log(SRGB_LINEAR_END))",
         "toe = log_linear <= -1e9",
-        "properties/test_pir.py::test_5_inverse",
+        "properties/test_pir.py::test_the_tone_map_is_inverted_by_its_inverse",
     ),
     Fault(
         "recentring moves exposures but not radiance",
@@ -115,7 +115,7 @@ FAULTS = (
         "train/exposure_loss.py",
         "photometry.capture(pairs.views_i), photometry.capture(pairs.views_j)",
         "photometry.capture(pairs.views_j), photometry.capture(pairs.views_i)",
-        "properties/test_pir.py::test_11_observed_reading",
+        "properties/test_pir.py::test_the_loss_of_observed_colours_is_0_at_the_true_exposures",
     ),
     Fault(
         "over-bright predictions of saturated pixels are punished",
@@ -136,13 +136,13 @@ FAULTS = (
         "train/terms.py",
         "return weight * jnp.sum(absolute * mask[..., None]) / valid",
         "return weight * jnp.sum(jnp.abs(ldr - target)) / valid",
-        "properties/test_pir.py::test_17_masked_pixels_get_zero_gradient",
+        "properties/test_pir.py::test_masked_pixels_get_no_gradient",
     ),
     Fault(
         "the scale prior of the printed loss has another mean",
         "train/terms.py",
         '"exposure_scale": lambda p: jnp.mean((p.exposures - 1) ** 2)',
         '"exposure_scale": lambda p: jnp.mean((p.exposures - 2) ** 2)',
-        "properties/test_pir.py::test_12_closed_form_scale",
+        "properties/test_pir.py::test_the_scale_of_the_paper_s_regularisers_has_a_closed_form",
     ),
 )

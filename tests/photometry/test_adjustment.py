@@ -71,7 +71,7 @@ def test_saturation_must_be_masked():
     assert np.std(unmasked) > 2 * np.std(masked)
 
 
-def test_terms_of_many_cameras_are_products_with_their_matrix():
+def test_sparse_terms_agree_with_products_of_their_dense_matrix():
     """Every value depends on 7 of 1,023 parameters; 1,023^7 exceeds 64-bit integers."""
     rng, count, scaled, places = np.random.default_rng(0), 1023, 5, 40
     index = np.broadcast_to(np.arange(7), (300, 3, 7)).copy()
@@ -178,7 +178,7 @@ def test_the_fixed_point_minimises_the_robust_loss(loss):
     assert np.abs(gradient / curvature).max() < 1e-4
 
 
-def test_points_whose_views_differ_count_for_less():
+def test_points_that_change_between_views_count_for_less():
     """Half of the points are glossy: brighter by up to half a stop in later frames."""
     o = PLAIN
     glossy = np.random.default_rng(0).random(o.point_count) < 0.5

@@ -31,7 +31,7 @@ def test_exposures_of_a_street_are_recovered(noisy_street, tmp_path):
     assert max(c["codes"] for c in candidates) > 1
 
 
-def test_command_keeps_known_exposures(noisy_street, tmp_path, succeeded):
+def test_the_command_keeps_known_exposures(noisy_street, tmp_path, succeeded):
     truth = read_true_exposures(noisy_street)
     path = tmp_path / "known.csv"
     path.write_text("image,exposure\n" + "\n".join(f"{k},{5 * v}" for k, v in truth.items()))
@@ -57,8 +57,7 @@ def test_a_short_run_is_calibrated_from_its_depth(finished_run, tmp_path):
     run = p2gs_jax.load_run(finished_run)
     found = calibrate_run(finished_run, tmp_path / "out", run.cfg)
     saved = read_photometry(tmp_path / "out" / "photometry.json")["views"]
-    names = [run.scene.views[i].name for i in run.scene.train_indices]
-    assert [v["image"] for v in saved] == names
+    assert [v["image"] for v in saved] == [run.scene.views[i].name for i in run.scene.train_indices]
     assert all(v["exposure"] is None or v["exposure"] > 0 for v in saved)
     assert (tmp_path / "out" / "calibration.png").is_file()
     # Dense seeds lie on the surfaces: even a short run has depth to warp through.

@@ -48,8 +48,7 @@ def ball(tmp_path_factory):
     root = tmp_path_factory.mktemp("ball")
     write_ball(root, 12, "train")
     write_ball(root, 4, "test")
-    result = fit(root, root / "run", with_fields(preset("robust"), SHORT))
-    return result, load_run(root / "run")
+    return fit(root, root / "run", with_fields(preset("robust"), SHORT)), load_run(root / "run")
 
 
 def test_held_out_views_of_the_data_set_are_scored_over_the_background(ball):

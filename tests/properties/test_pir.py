@@ -43,7 +43,7 @@ def radiance(seed, n=64, low=-6.0, high=-0.5):
 @MODELS
 @FEW
 @given(seed=SEEDS, c=SCALES, e=st.floats(0.3, 1.2), gamma=GAMMAS)
-def test_1_scale_gauge(cfg, seed, c, e, gamma):
+def test_the_scale_gauge_leaves_photographs_unchanged(cfg, seed, c, e, gamma):
     """L -> cL, e -> e/c leaves LDR alone, away from the clamps."""
     L = radiance(seed)
     a = formation(L, Capture(jnp.float32(e), jnp.float32(gamma)), cfg)
@@ -54,7 +54,7 @@ def test_1_scale_gauge(cfg, seed, c, e, gamma):
 @pytest.mark.parametrize("cfg", [PAPER, dataclasses.replace(POWER, pivot=1.0), ROBUST])
 @FEW
 @given(seed=SEEDS, k=st.floats(0.5, 2.0), e=st.floats(0.3, 1.2))
-def test_2_power_gauge(cfg, seed, k, e):
+def test_the_power_gauge_leaves_photographs_unchanged(cfg, seed, k, e):
     """L -> L^k about the pivot, e -> e^k, gamma -> k gamma leaves LDR alone."""
     L, e, x0 = radiance(seed, low=-4.0), jnp.float32(e), cfg.pivot
     a = formation(L, Capture(e, jnp.float32(2.2)), cfg)
@@ -65,21 +65,19 @@ def test_2_power_gauge(cfg, seed, k, e):
 @functools.partial(jax.jit, static_argnums=4)
 @functools.partial(jax.grad, argnums=(0, 1, 2))
 def slopes(L, log_e, gamma, target, cfg):
-    ldr = formation(L, Capture(jnp.exp(log_e), gamma), cfg)
-    return jnp.sum((ldr - target) ** 2)
+    return jnp.sum((formation(L, Capture(jnp.exp(log_e), gamma), cfg) - target) ** 2)
 
 
 @MODELS
 @FEW
 @given(seed=SEEDS, gamma=GAMMAS)
-def test_3_and_4_gauges_in_the_gradient(cfg, seed, gamma):
+def test_losses_have_no_gradient_along_the_gauges(cfg, seed, gamma):
     """e dLoss/de = L dLoss/dL; and the power gauge's generator annihilates the loss."""
     L = radiance(seed, low=-4.0)
     target = radiance(seed + 1)
     log_e, gamma = jnp.float32(-0.2), jnp.float32(gamma)
     v_L, v_e, v_gamma = slopes(L, log_e, gamma, target, cfg)
-    radial = float(jnp.sum(L * v_L))
-    assert float(v_e) == pytest.approx(radial, rel=1e-5, abs=1e-6)
+    assert float(v_e) == pytest.approx(float(jnp.sum(L * v_L)), rel=1e-5, abs=1e-6)
     # d/dk of (L/x0)^k, e^k, k gamma at k = 1.
     log_L = jnp.log(L / cfg.pivot)
     generator = float(log_e * v_e) + float(jnp.sum(L * log_L * v_L)) + float(gamma * v_gamma)
@@ -90,7 +88,7 @@ def test_3_and_4_gauges_in_the_gradient(cfg, seed, gamma):
 @MODELS
 @FEW
 @given(seed=SEEDS, gamma=GAMMAS)
-def test_5_inverse(cfg, seed, gamma):
+def test_the_tone_map_is_inverted_by_its_inverse(cfg, seed, gamma):
     rng = np.random.default_rng(seed)
     x = jnp.asarray(np.exp(rng.uniform(np.log(2e-3), 0.0, 256)), jnp.float32)
     y = tone_map(x, jnp.float32(gamma), cfg)
@@ -103,7 +101,7 @@ def test_5_inverse(cfg, seed, gamma):
 @MODELS
 @FEW
 @given(gamma=GAMMAS, e=SCALES)
-def test_6_monotone(cfg, gamma, e):
+def test_formation_is_monotone_and_within_its_range(cfg, gamma, e):
     x = jnp.logspace(-7, 2, 400, dtype=jnp.float32)
     y = np.asarray(formation(x, Capture(jnp.float32(e), jnp.float32(gamma)), cfg))
     assert np.all(np.diff(y) >= -1e-7)
@@ -128,8 +126,7 @@ def observed(seed, cfg, noise_free=True, views=5, n=400):
     if not noise_free:
         I = [np.rint(a * 255) / 255 for a in I]
     rows = (i.astype(np.int32), j.astype(np.int32), np.ones(n, np.float32))
-    pairs = rel.ColorPairs(*(jnp.asarray(a) for a in (*I, *rows)))
-    return pairs, jax.tree.map(jnp.asarray, truth)
+    return rel.ColorPairs(*(jnp.asarray(a) for a in (*I, *rows))), jax.tree.map(jnp.asarray, truth)
 
 
 LOSS = LossConfig(relative_exposure=RelativeExposureConfig(1.0, "observed_ldr"))
@@ -138,7 +135,7 @@ LOSS = LossConfig(relative_exposure=RelativeExposureConfig(1.0, "observed_ldr"))
 @pytest.mark.parametrize("cfg", [ROBUST, POWER], ids=["robust", "power"])
 @FEW
 @given(seed=SEEDS, c=SCALES)
-def test_11_observed_reading(cfg, seed, c):
+def test_the_loss_of_observed_colours_is_0_at_the_true_exposures(cfg, seed, c):
     """Zero at the truth, small with 8 bits, and invariant to a common factor."""
     pairs, truth = observed(seed, cfg)
 
@@ -168,7 +165,7 @@ def pull(c, e):
 
 @FEW
 @given(seed=SEEDS)
-def test_12_closed_form_scale(seed):
+def test_the_scale_of_the_paper_s_regularisers_has_a_closed_form(seed):
     e = jnp.asarray(np.exp(np.random.default_rng(seed).normal(0, 0.5, 20)), jnp.float32)
     # docs/photometry.md, 3: the factor that the paper's weights pull all exposures to.
     m, v = jnp.mean(e), jnp.mean((e - jnp.mean(e)) ** 2)
@@ -183,8 +180,8 @@ def mean_rms(frames):
 
 @FEW
 @given(seed=SEEDS, c=SCALES)
-def test_15_and_16_his_and_luminance_of_videos(seed, c):
-    """One camera: the definition; two: frames of different cameras are never compared."""
+def test_his_and_luminance_of_videos_follow_their_definitions(seed, c):
+    """Scores of one camera follow the definition; frames of two cameras are not compared."""
     rng = np.random.default_rng(seed)
     video = rng.uniform(0, 1, (5, 6, 7, 3)).astype(np.float32)
     e = np.exp(rng.normal(0, 0.5, 5)).astype(np.float32)
@@ -221,7 +218,7 @@ def test_15_and_16_his_and_luminance_of_videos(seed, c):
 @pytest.mark.parametrize("censored", [True, False])
 @FEW
 @given(seed=SEEDS)
-def test_17_masked_pixels_get_zero_gradient(censored, seed):
+def test_masked_pixels_get_no_gradient(censored, seed):
     rng = np.random.default_rng(seed)
     mask = (rng.uniform(size=(24, 30)) > 0.3).astype(np.float32)
     target = jnp.asarray(rng.uniform(0, 1, (24, 30, 3)), jnp.float32)

@@ -38,8 +38,7 @@ def test_splats_follow_the_definition():
         g, cam = street(dtype=np.float64)
         viewmat = pose_of(rotation(np.array([1, 0.05, -0.1, 0.2])), (0.3, -0.2, 0.5))
         cam = dataclasses.replace(cam, viewmat=jnp.asarray(viewmat))
-        n = g.capacity
-        splats = jax.jit(lambda g: project(g, jnp.ones(n, bool), cam, CFG))(g)
+        splats = jax.jit(lambda g: project(g, jnp.ones(g.capacity, bool), cam, CFG))(g)
         splats, g, cam = jax.tree.map(np.asarray, (splats, g, cam))
     inside = (splats.means2d > 0).all(1) & (splats.means2d < [cam.width, cam.height]).all(1)
     rows = np.flatnonzero(splats.visible & inside)

@@ -82,7 +82,7 @@ def test_values_and_gradients_match_oracle(oracle, implementation, tile, stop):
 
 def test_the_lane_queue_computes_in_the_precision_of_its_input(oracle):
     v_expected, expected = oracle
-    # Nothing is left out and nothing approximated: what remains is rounding.
+    # Without the stop rule and the approximate exp only rounding remains.
     cfg = dataclasses.replace(CFG, implementation="xla", stop_error=None, exp_degree=None)
     with jax.enable_x64(True):
         v, r = slope(*street(dtype=np.float64), cfg)
@@ -168,8 +168,7 @@ def test_tile_lists_match_brute_force_and_overflow_is_reported(shown):
         assert np.all(np.diff(np.asarray(splats.depths)[listed]) >= 0)
         row, col = divmod(t, across)
         block = e[:, row * 8 : row * 8 + 8, col * 16 : col * 16 + 16]
-        needed = set(np.nonzero((block > np.log(1 / 255)).any((1, 2)))[0])
-        assert needed <= set(listed.tolist())
+        assert set(np.nonzero((block > np.log(1 / 255)).any((1, 2)))[0]) <= set(listed.tolist())
         assert len(set(listed.tolist())) == len(listed)
 
 
@@ -179,9 +178,8 @@ def test_the_background_shows_through(shown):
     with jax.enable_x64(True):
         exact = street(dtype=np.float64)
         lit = slope(*exact, ORACLE, few)[1]
-        unlit = dataclasses.replace(ORACLE, background=None)
         dark = jax.jit(render_linear, static_argnums=(3, 4))(
-            exact[0], few, exact[1], unlit, CAPACITY
+            exact[0], few, exact[1], dataclasses.replace(ORACLE, background=None), CAPACITY
         )
         through = (1 - lit.alpha)[..., None] * np.array(BEHIND)
         np.testing.assert_allclose(lit.linear, dark.linear + through, rtol=1e-12)

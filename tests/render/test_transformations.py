@@ -17,7 +17,7 @@ SCENE = street(2000, 64, 48, radius=3.0)
 ALIVE = jnp.ones(2000, bool)
 VIEWS = np.tile(np.eye(4, dtype=np.float32), (2, 1, 1))
 VIEWS[:, 0, 3] = [0.0, 0.2]
-# The capacity is large, because XLA compiles small constants and small loops differently.
+# The capacity is large: XLA compiles small constants and small loops differently.
 CAPACITY = 300_000
 
 

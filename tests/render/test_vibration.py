@@ -14,7 +14,7 @@ from p2gs_jax.render import visible
 from p2gs_jax.render.project import CYCLE, STILL, at_time
 from p2gs_jax.types import Placement, Vibration
 
-LIFE, PEAK = 0.4, 0.2
+LIFE, PEAK = 0.4, 0.2  # s
 CFG = RenderConfig(sh_degree=0)
 ALIVE = jnp.ones(1, bool)
 at, in_view = jax.jit(at_time), jax.jit(visible.in_view, static_argnums=3)

@@ -59,8 +59,7 @@ def test_checkpoints_are_exact_and_the_last_two_are_kept(tmp_path):
 
 def test_a_grown_population_is_restored_by_its_stored_capacity(tmp_path):
     grown = grow_state(state(20), 37)
-    store = CheckpointStore(tmp_path / "c")
-    store.save(7, grown, {"capacity": grown.params.gaussians.capacity})
+    CheckpointStore(tmp_path / "c").save(7, grown, {"capacity": grown.params.gaussians.capacity})
     found = CheckpointStore(tmp_path / "c").restore_latest(
         lambda meta: jax.eval_shape(lambda: grow_state(state(20), meta["capacity"]))
     )

@@ -101,7 +101,7 @@ DRIVE = make_drive(12, 400)
 PIVOT = 0.18
 
 
-def drawn(path, solution, cameras):
+def draws(path, solution, cameras):
     stated = np.full(len(cameras), np.nan)
     write_calibration_plot(path, solution, cameras=cameras, stated_ev=stated, pivot=PIVOT)
     return path.stat().st_size > 10_000
@@ -125,8 +125,8 @@ def test_every_response_of_a_camera_or_channel_is_drawn(tmp_path, recwarn, probl
     form = Form("view_exposure")
     solution = fit_model(problem, form, fit_response(problem, Response("srgb"), form=form, by=by))
     assert [name for name, _, _ in curves_to_draw(solution)] == names
-    assert drawn(tmp_path / "calibration.png", solution, [str(c) for c in DRIVE.cameras])
+    assert draws(tmp_path / "calibration.png", solution, [str(c) for c in DRIVE.cameras])
     # Names of cameras are not formulas.
     hostile = (r"$\nothing$", "\x1b[31m", "写")
-    assert drawn(tmp_path / "b.png", solution, [hostile[k % 3] for k in range(len(DRIVE.cameras))])
+    assert draws(tmp_path / "b.png", solution, [hostile[k % 3] for k in range(len(DRIVE.cameras))])
     assert not [str(w.message) for w in recwarn]

@@ -99,7 +99,7 @@ def cut(path: Path) -> None:
 
 
 class Made(NamedTuple):
-    """A drive, and the truth of what a reader should find in it; paths are below `root`."""
+    """A drive, and the truth that a reader should find in it; paths are below `root`."""
 
     root: Path
     # Time and camera to world, by camera and frame.
@@ -109,7 +109,7 @@ class Made(NamedTuple):
     tables: list[Path]  # without which the drive is not read
     optional: list[Path]  # tables that may be gone
     scans: list[Path] = []  # noqa: RUF012  # files of sweeps
-    error: Callable[[np.ndarray], np.ndarray] = off_landmarks  # from what was measured, m
+    error: Callable[[np.ndarray], np.ndarray] = off_landmarks  # of points from the truth, m
     count: int = 50  # points of a sweep
 
 
