@@ -43,7 +43,7 @@ class Drive(NamedTuple):
 def _on_image(
     azimuth: Float[np.ndarray, " p"], height: Float[np.ndarray, " p"]
 ) -> Float[np.ndarray, "p 2"]:
-    """Return where a pinhole sees directions, degrees to the left and up, inside its image."""
+    """Return positions, in half diagonals, of directions, in degrees to the left and up."""
     a, h = np.radians(azimuth), np.radians(height)
     half_width = np.tan(np.radians(HALF_WIDTH))
     # Directions HALF_HEIGHT up are inside even at the left and right edges.

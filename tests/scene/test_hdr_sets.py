@@ -1,4 +1,4 @@
-"""HDR sets and exposure brackets: the times and poses that are read are those that were written."""
+"""HDR sets and exposure brackets: times and poses are read as they were written."""
 
 import json
 from dataclasses import replace

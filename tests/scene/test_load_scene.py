@@ -360,6 +360,6 @@ def test_photographs_are_decoded_together_as_far_as_memory_goes():
     room = Room(100)
     with room.reserving(60), room.reserving(40):
         assert room._reserved == 100
-    with room.reserving(1000):  # one is always let in
+    with room.reserving(1000):  # a single photograph always has room
         assert room._reserved == 1000
     assert room._reserved == 0

@@ -50,7 +50,7 @@ def test_a_mask_covers_the_pixels_of_points_in_the_box(tmp_path, at, turn):
     view, box = view_at(tmp_path), thing(at, turn)
     mask, sampled = object_mask(view, [box], *WHOLE), by_points(view, box)
     assert mask.any()
-    # Pixels count where their centre is inside; points cover those that they touch.
+    # The mask has the pixels whose centre is inside; points mark every pixel that they touch.
     grown = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
     assert not (sampled & ~grown).any()
     # Near the camera there are gaps between points.

@@ -68,7 +68,7 @@ def test_a_list_of_the_user_wins(model):
     scene = split_by(model, {"train": train, "val": ["im 3.png"]})
     assert held_out(scene) == ["im 3.png"]
     assert len(scene.views) == 3
-    # Tools write empty lists for what they lack.
+    # Tools write empty lists for parts that they lack.
     assert held_out(split_by(model, {"test": [], "val": ["im 2.png"]})) == ["im 2.png"]
     scene = split_by(model, {"train": [f"im {k}.png" for k in range(4)], "test": []})
     assert held_out(scene) == []

@@ -1,4 +1,4 @@
-"""White balance is learned like exposures where it varies per view, and nowhere else."""
+"""White balance is learned like exposures if it varies per view, and only then."""
 
 import cv2
 import jax.numpy as jnp

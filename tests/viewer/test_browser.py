@@ -1,4 +1,4 @@
-"""The viewer in a real browser: it shows pictures, and a slider does what it claims."""
+"""The viewer in a real browser: it shows pictures, and controls change them."""
 
 import contextlib
 import os
@@ -34,25 +34,19 @@ def address(finished_run):
 
 @pytest.fixture
 def page(browser, address):
-    """Return the viewer's page with its first picture at rest; the page may log no error."""
+    """Return the viewer's page, at full size and at rest; it may log no error."""
     page = browser.new_page(viewport=SIZE, accept_downloads=True)
     page.set_default_timeout(1e3 * PATIENCE_S)
     wrong = []
     page.on("console", lambda m: wrong.append(m.text) if m.type == "error" else None)
     page.on("pageerror", lambda error: wrong.append(str(error)))
     page.goto(address)
-    at_rest(page)
+    full = "/640 x \\d+/.test(document.body.innerText)"
+    page.wait_for_function(f"{full} && !/compiling/.test(document.body.innerText)")
+    steady(page)
     yield page
     page.close()
     assert wrong == []
-
-
-def at_rest(page):
-    """Return the picture once it is at full size, nothing compiles and nothing changes."""
-    page.wait_for_function(
-        "/640 x \\d+/.test(document.body.innerText) && !/compiling/.test(document.body.innerText)"
-    )
-    return steady(page)
 
 
 def steady(page):
@@ -87,7 +81,7 @@ def picture(page):
 
 
 def until(page, holds):
-    """Return the picture as soon as something holds for it twice in a row."""
+    """Return the picture as soon as `holds` is true of it twice in a row."""
     end, before = time.monotonic() + PATIENCE_S, False
     while True:
         shown = picture(page)

@@ -51,7 +51,7 @@ def test_the_field_of_view_holds_a_whole_photograph(aspect):
     at = np.array([pixel(camera, corner) for corner in corners])
     assert at.min() > -1
     assert np.all(at.max(0) < np.array(size) + 1)
-    # It is as large as possible: it touches an edge.
+    # The photograph is as large as possible: it touches an edge.
     assert np.abs(np.concatenate([at, at - size])).min() < 1.5
 
 

@@ -144,7 +144,7 @@ def test_the_largest_ready_size_that_has_room_is_shown(setup, client, viewed):
     seen = client.wait_sharp(seen)
     assert shape(setup.pictures[-1]) == SIZES[-2]
     time.sleep(2 * REST_S)
-    assert len(setup.pictures) == seen  # it is not tried again and again
+    assert len(setup.pictures) == seen  # the refused size is not tried again
     setup.renderer.refused = set(SIZES)
     move(setup, client, 0.4)
     seen = client.wait_sharp(seen)

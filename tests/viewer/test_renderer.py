@@ -147,7 +147,7 @@ def ms(size, of, share):
     [
         (SIZES, None, 0.0, SIZES[0]),
         (SIZES, (640, 400), 1.0, SIZES[0]),  # of another window
-        # One step at a time, where the next is clearly fast enough.
+        # One step at a time, if the next size is clearly fast enough.
         (SIZES, SIZES[0], ms(SIZES[0], SIZES[1], ENLARGE_WITHIN - 0.01), SIZES[1]),
         (SIZES, SIZES[0], ms(SIZES[0], SIZES[1], ENLARGE_WITHIN + 0.01), SIZES[0]),
         (SIZES, SIZES[2], 0.1, SIZES[2]),

@@ -19,7 +19,7 @@ def mount(camera) -> np.ndarray:
 
 
 def text(values) -> str:
-    """Return what numpy.savetxt writes."""
+    """Return values in the format of numpy.savetxt."""
     return "".join(" ".join(f"{v:.18e}" for v in np.atleast_1d(row)) + "\n" for row in values)
 
 
