@@ -77,6 +77,7 @@ def around(azimuths, elevation=30.0, aside=0.0):
 
 
 def seen_from(focus, shots):
+    """Return the distances of cameras from a focus, and their azimuths about it, degrees."""
     away = np.stack([inverse(s.viewmat)[:3, 3] for s in shots]) - focus
     return np.linalg.norm(away, axis=1), np.rad2deg(np.arctan2(away[:, 0], away[:, 2]))
 

@@ -191,10 +191,10 @@ def test_the_regularisation_follows_the_published_formula():
 
 @pytest.mark.parametrize("parameterization", ["log", "linear"])
 def test_exposures_move_from_ppisp_to_the_photometry_and_photographs_stay(parameterization):
-    learned = replace(ppisp.identity(["a", "b"]), exposures=jnp.asarray([0.7, -1.2], jnp.float32))
+    start = replace(ppisp.identity(["a", "b"]), exposures=jnp.asarray([0.7, -1.2], jnp.float32))
     raw = (jnp.zeros(2),) * 2 if parameterization == "log" else (jnp.ones(2), jnp.full(2, 2.2))
     photometry = Photometry(*raw, parameterization)
-    before = Params(None, photometry, learned)  # pyright: ignore[reportArgumentType]
+    before = Params(None, photometry, start)  # pyright: ignore[reportArgumentType]
     after = exposures_apart(before)
     np.testing.assert_allclose(after.photometry.exposures, [2**0.7, 2**-1.2], rtol=1e-5)
     cfg, light = PhotometryConfig(curve="linear", appearance="ppisp"), 0.4 * PICTURE

@@ -28,8 +28,8 @@ from p2gs_jax.train.terms import PRIORS, variance
 from p2gs_jax.types import Capture, Gaussians, Params, Photometry
 
 HEIGHT, WIDTH = 12, 20
-DARK = ((-0.5, 0.2, -0.1),)
-EACH = ((-0.5, 0.2, -0.1), (-0.3, 0.0, 0.0), (-0.1, -0.2, 0.05))
+DARK = ((-0.5, 0.2, -0.1),)  # vignetting, the same for all channels
+EACH = ((-0.5, 0.2, -0.1), (-0.3, 0.0, 0.0), (-0.1, -0.2, 0.05))  # vignetting by channel
 BENT, OTHER = tuple(0.3 * np.sin(3 * KNOTS) - 0.1), tuple(0.2 * np.cos(4 * KNOTS))
 THIRD = tuple(0.1 - 0.2 * KNOTS)
 PAPER, PLAIN = preset("paper").photometry, PhotometryConfig()

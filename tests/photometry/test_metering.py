@@ -13,7 +13,7 @@ from p2gs_jax.run.photometry_files import read_metering, write_metering
 
 PICTURE = np.exp2(np.random.default_rng(0).normal(-3, 2, (40, 60, 1))) * np.ones(3)
 OPAQUE = np.ones((40, 60))
-# Views of different brightness; meters differ a little.
+# Log readings of views that differ in brightness; meters differ a little.
 _RNG = np.random.default_rng(0)
 TABLE = _RNG.normal(0, 0.8, (40, 1)) + _RNG.normal(0, 0.3, (40, len(METERS)))
 ROWS = [dict(zip(METERS, row, strict=True)) for row in TABLE.tolist()]

@@ -65,7 +65,7 @@ def test_a_short_run_is_calibrated_from_its_depth(finished_run, tmp_path):
     assert found.seconds["reading"] > 0.05
 
 
-def stack(folder, times, response=lambda x: x ** (1 / 2.2), seed=0, drift=None):
+def write_stack(folder, times, response=lambda x: x ** (1 / 2.2), seed=0, drift=None):
     """Write an HDR picture at exposures `times`; `drift(frame, linear)` is a factor on light."""
     rng = np.random.default_rng(seed)
     base = cv2.resize(rng.normal(0, 1, (12, 16, 1)), (320, 240), interpolation=cv2.INTER_CUBIC)
@@ -86,7 +86,7 @@ def s_curve(x):
 @pytest.mark.parametrize("response", [lambda x: x ** (1 / 2.2), s_curve])
 def test_exposures_of_a_stack_are_recovered(tmp_path, response):
     times = 2.0 ** np.arange(3, -4, -1)
-    stack(tmp_path / "s", times, response)
+    write_stack(tmp_path / "s", times, response)
     result = calibrate_stack(tmp_path / "s")
     use = result.details["signal"]
     assert use.sum() >= 6
@@ -97,7 +97,7 @@ def test_exposures_of_a_stack_are_recovered(tmp_path, response):
 
 def test_the_command_writes_the_calibration_of_a_stack(tmp_path, succeeded):
     times = 2.0 ** np.arange(2, -3, -1)
-    stack(tmp_path / "s", times)
+    write_stack(tmp_path / "s", times)
     listed = tmp_path / "times.csv"
     rows = (f"{i:02d}.png,{t}" for i, t in enumerate(times))
     listed.write_text("image,exposure_time_s\n" + "\n".join(rows))
@@ -123,14 +123,14 @@ def test_a_stack_with_local_tone_mapping_is_recognised(tmp_path):
         )
         return np.exp(0.25 * regions)[..., None]
 
-    stack(tmp_path / "s", 2.0 ** np.arange(3, -4, -1), drift=local)
+    write_stack(tmp_path / "s", 2.0 ** np.arange(3, -4, -1), drift=local)
     result = calibrate_stack(tmp_path / "s")
     assert not result.details["one_response"]
     assert any("One response does not explain" in m for m in result.messages)
 
 
 def test_stacks_of_several_sizes_or_with_broken_files_are_refused(tmp_path):
-    stack(tmp_path / "s", [1.0, 2.0])
+    write_stack(tmp_path / "s", [1.0, 2.0])
     cv2.imwrite(str(tmp_path / "s" / "zz.png"), np.zeros((10, 10, 3), np.uint8))
     with pytest.raises(UserError, match="give photographs of one size"):
         read_stack(tmp_path / "s")

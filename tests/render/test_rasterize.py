@@ -38,7 +38,7 @@ SLOPE = jax.jit(jax.grad(scalar, has_aux=True), static_argnums=3)
 
 
 def slope(g, cam, cfg=CFG, alive=None):
-    """Return the gradient of a weighted sum of all outputs, and these, on the host."""
+    """Return the gradient of a weighted sum of all outputs, and the outputs, as NumPy arrays."""
     alive = np.ones(g.capacity, bool) if alive is None else alive
     return jax.tree.map(np.asarray, SLOPE(g, alive, cam, cfg))
 

@@ -30,7 +30,7 @@ def placement(time):
     return Placement(jnp.zeros((0, 4, 4)), jnp.float32(time))
 
 
-def seen(time):
+def camera_at(time):
     return dataclasses.replace(camera(0, 64, 48, 50.0), objects=placement(time))
 
 
@@ -81,10 +81,10 @@ def test_gaussians_of_endless_life_stand_still_and_get_no_gradient():
 
 def test_far_from_its_peak_a_gaussian_is_out_of_view_with_finite_gradients():
     g = gaussian(life=1e-3)
-    assert [bool(in_view(g, ALIVE, seen(t), CFG)[0]) for t in (0.2, 0.9)] == [True, False]
+    assert [bool(in_view(g, ALIVE, camera_at(t), CFG)[0]) for t in (0.2, 0.9)] == [True, False]
 
     def total(g):
-        splats, radiance = visible.splat(g, ALIVE, seen(0.9), CFG)
+        splats, radiance = visible.splat(g, ALIVE, camera_at(0.9), CFG)
         return jnp.sum(splats.log_opacities) + jnp.sum(splats.means2d) + jnp.sum(radiance)
 
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(jax.jit(jax.grad(total))(g)))

@@ -29,7 +29,7 @@ def walls(colors):
     return gaussians_of(means, (1, 0, 0, 0), scales, 12, (np.reshape(colors, (1, 3)) - 0.5) / C0)
 
 
-def photometry(folder, names, camera):
+def write_calibration(folder, names, camera):
     def view(name, e, balance):
         values = {"image": name, "camera": camera, "exposure": e, "white_balance": balance}
         return {**dict.fromkeys(OF_VIEWS), **values, "gamma": None if e is None else 2.2}
@@ -52,7 +52,7 @@ def trained(tmp_path_factory):
     """Return a folder with a scene, a calibration that developed it, and splats."""
     root = tmp_path_factory.mktemp("foreign")
     make_scene(root / "scene", views=3, points=20, size=(WIDTH, HEIGHT))
-    photometry(root / "cal", ("0.png", "1.png", "2.png"), "1")
+    write_calibration(root / "cal", ("0.png", "1.png", "2.png"), "1")
     (root / "cal" / "developed").mkdir()
     evs = (*np.log2(EXPOSURES), "")
     rows = [f"{k}.png,1,{DEVELOPED_EV},{ev}\n" for k, ev in enumerate(evs)]
@@ -91,7 +91,7 @@ def test_gaussians_are_lifted_to_radiance_and_the_error_is_reported(succeeded, t
 
 
 def test_without_developed_photographs_colours_show_the_mean_exposure(trained, tmp_path):
-    photometry(tmp_path / "cal", ("0.png", "1.png", "2.png"), "1")
+    write_calibration(tmp_path / "cal", ("0.png", "1.png", "2.png"), "1")
     run = foreign_run(trained / "splat.ply", tmp_path / "cal", trained / "scene")
     sums = C0 * np.asarray(run.params.gaussians.sh[0, 0])
     np.testing.assert_allclose(sums, np.log(2**DEVELOPED_EV * RADIANCE), atol=1e-4)
@@ -99,27 +99,27 @@ def test_without_developed_photographs_colours_show_the_mean_exposure(trained, t
 
 
 def test_invalid_splats_and_calibrations_of_other_scenes_are_refused(refused, trained, tmp_path):
-    photometry(tmp_path / "other", ("a.png", "b.png", "c.png"), "1")
+    write_calibration(tmp_path / "other", ("a.png", "b.png", "c.png"), "1")
     write_radiance(tmp_path / "radiance.ply", walls(RADIANCE), activation="exp")
     vertices = b"element vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
     header = b"ply\nformat binary_little_endian 1.0\n" + vertices + b"end_header\n"
     (tmp_path / "points.ply").write_bytes(header + bytes(12))
-    good, place, scene = trained / "splat.ply", trained / "cal", trained / "scene"
-    shutil.copytree(place, tmp_path / "later")
+    good, cal, scene = trained / "splat.ply", trained / "cal", trained / "scene"
+    shutil.copytree(cal, tmp_path / "later")
     table = tmp_path / "later" / "developed" / "exposures.csv"
     table.write_text(table.read_text().replace("-1.0", "-0.9"))
     for splats, photos, where, words in (
-        (tmp_path / "points.ply", place, scene, ("not a valid PLY", "no field")),
-        (tmp_path / "radiance.ply", place, scene, ("holds the radiance of a run",)),
-        (scene / "images" / "0.png", place, scene, ("not a file of splats", ".compressed.ply")),
-        (tmp_path / "none.ply", place, scene, ("none.ply is not a file", "check the path")),
+        (tmp_path / "points.ply", cal, scene, ("not a valid PLY", "no field")),
+        (tmp_path / "radiance.ply", cal, scene, ("holds the radiance of a run",)),
+        (scene / "images" / "0.png", cal, scene, ("not a file of splats", ".compressed.ply")),
+        (tmp_path / "none.ply", cal, scene, ("none.ply is not a file", "check the path")),
         (good, tmp_path / "other", scene, ("none of the photographs", "0.png")),
         (good, tmp_path / "later", scene, ("exposures.csv and photometry.json", "--develop")),
-        (good, place, scene / "images", ("no COLMAP model", "developed")),
+        (good, cal, scene / "images", ("no COLMAP model", "developed")),
     ):
         text = refused("render", splats, "--photometry", photos, "--scene", where)
         assert all(word in " ".join(text.split()) for word in words), text
     metered = refused("export", good, *options(trained), "--format", "html", "--meter", "auto")
     assert "--meter needs a run" in metered
-    assert "add --scene" in refused("export", good, "--photometry", place, "--format", "exr")
+    assert "add --scene" in refused("export", good, "--photometry", cal, "--format", "exr")
     assert "`export` with --photometry" in " ".join(refused("render", good).split())

@@ -40,17 +40,17 @@ def car_at(seconds: float) -> np.ndarray:
 
 
 def mounted(azimuth: float, position=(1.5, 0.2, 1.6)) -> np.ndarray:
-    """Return camera to car, OpenCV axes, of a camera that looks in a direction."""
+    """Return camera to car (OpenCV axes) of a camera that looks along an azimuth of the car."""
     return matrix(Rotation.from_euler("z", azimuth) * Rotation.from_matrix(FORWARD), position)
 
 
 def box(place, yaw: float, height: float = 0.8) -> np.ndarray:
-    """Return a box about a scanner with axes x forward, y left."""
+    """Return the pose of a box about a scanner with axes x forward, y left."""
     return matrix(Rotation.from_euler("z", yaw), [*place, height])
 
 
 def beside(seconds: float, place, yaw: float = 0.0) -> np.ndarray:
-    """Return a box in the world at a place about SCANNER (x forward, y left)."""
+    """Return the pose of a box in the world at a place about SCANNER (x forward, y left)."""
     return car_at(seconds) @ SCANNER @ box((-place[1], place[0]), yaw, 0)
 
 
@@ -72,7 +72,7 @@ def applied(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def landmarks(count: int = 50) -> np.ndarray:
-    """Return places about the car, in the world."""
+    """Return points around the car, in the world."""
     rng = np.random.default_rng(3)
     return applied(car_at(0.5), rng.uniform([-30, -30, -1], [30, 30, 6], (count, 3)))
 
