@@ -58,7 +58,7 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope="session", autouse=True)
 def _signals_as_in_a_terminal():
-    """Let signals arrive that a shell in the background, or nohup, has told processes to ignore."""
+    """Restore signals that processes behind nohup, or of a shell in the background, ignore."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     for name in ("SIGTERM", "SIGHUP"):
         if hasattr(signal, name):

@@ -31,7 +31,7 @@ RENDER = RenderConfig(sh_degree=0, blur=0.3)
 
 
 class World(NamedTuple):
-    """A wall in the world, a box in its own frame, its track, and exposures by frame."""
+    """A wall in the world, a box in object coordinates, its track, and exposures by frame."""
 
     wall: Gaussians
     box: Gaussians

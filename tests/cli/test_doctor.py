@@ -96,7 +96,7 @@ def test_an_installation_without_pycolmap_can_fit(monkeypatch, capsys):
     assert "no    pip install pycolmap" in out
 
 
-def test_features_say_what_to_install(monkeypatch):
+def test_missing_features_name_their_extras(monkeypatch):
     monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda name: None)
     monkeypatch.setattr(doctor.shutil, "which", lambda name: None)
     found = {f.name: f for f in doctor.check_features(["pycolmap"])}

@@ -44,7 +44,7 @@ def test_help_fits_and_its_examples_can_be_parsed(shown, name):
         assert parse(words[1:])[0] == name
 
 
-def test_overview_names_every_command_once_and_in_order(shown):
+def test_the_overview_names_every_command_once_and_in_order(shown):
     code, text = shown("--help")
     assert code == 0
     assert not wide(text)
@@ -170,7 +170,7 @@ def test_nothing_is_imported_from_the_working_folder(hostile):
 
 
 @pytest.mark.parametrize("module", ["jax", "tyro", "cv2"])
-def test_a_broken_library_is_named_with_what_to_do(broken, tmp_path, module):
+def test_a_broken_library_is_named_with_a_remedy(broken, tmp_path, module):
     done = broken(module, "calibrate", str(tmp_path), "--out", str(tmp_path / "out"))
     assert done.returncode == 2
     assert "libfoo.so.1 is missing" in done.stderr

@@ -6,7 +6,7 @@ from p2gs_jax.cli import tables
 
 
 @pytest.mark.parametrize(("psnr", "viewer"), [(25.0, True), (15.6, False)])
-def test_headline_names_what_comes_next(psnr, viewer, tmp_path, monkeypatch, capsys):
+def test_the_headline_names_the_next_command(psnr, viewer, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(tables, "has_viewer", lambda: viewer)
     test = {"exposure_fitted": {"psnr": psnr, "per_view": {"a": {}, "b": {}}}}
     metrics = {"test": test, "counts": {"gaussians": 1000}, "seconds": {}}

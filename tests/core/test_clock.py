@@ -1,4 +1,4 @@
-"""Named seconds, and a budget that was not kept."""
+"""Seconds of stages, budgets that were exceeded, and progress without a terminal."""
 
 import io
 import time
@@ -29,13 +29,13 @@ SECONDS = {"starting": 2.0, "photometry": 12.0, "steps": 5.0, "evaluation": 10.0
 SECONDS |= {"total_until_evaluation": 21.0, "optimisation": 6.0, "evaluation_and_files": 13.0}
 
 
-def test_a_run_takes_what_comes_before_the_evaluation_and_it():
+def test_a_run_takes_the_seconds_before_and_of_its_evaluation():
     assert whole_run(SECONDS) == 34.0
     assert whole_run({}) is None
     assert whole_run({"total_until_evaluation": "long"}) is None
 
 
-def test_a_budget_that_was_exceeded_is_said_with_the_reasons():
+def test_an_exceeded_budget_is_reported_with_its_longest_stages():
     text = over_budget(5.0, SECONDS)
     assert text.startswith("The budget of 5 s was exceeded: the run took 34 s (photometry 12, ")
     assert "evaluation 10, steps 5" in text
@@ -44,7 +44,7 @@ def test_a_budget_that_was_exceeded_is_said_with_the_reasons():
     assert over_budget(29.0, SECONDS) is not None
 
 
-def test_progress_is_a_line_now_and_then_where_there_is_no_terminal(monkeypatch):
+def test_progress_without_a_terminal_is_a_line_every_few_seconds(monkeypatch):
     now = [100.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
     out = io.StringIO()

@@ -9,10 +9,9 @@ import pytest
 from p2gs_jax.core import runtime, threads
 
 SCRIPT = """
+import resource
 import numpy as np
 from p2gs_jax.core.runtime import keep_freed_memory, return_freed_memory
-
-import resource
 
 def resident_mb():
     pages = int(open("/proc/self/statm").read().split()[1])

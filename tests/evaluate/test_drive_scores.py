@@ -27,13 +27,13 @@ UP = np.array([0.0, 0.0, 1.0])
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """A drive between two walls; frames 0 and 4 are held out."""
+    """Return a drive between two walls; frames 0 and 4 are held out."""
     scene = assemble(make_recording(tmp_path_factory.mktemp("drive")), DataConfig(ego_mask=False))
     return dataclasses.replace(scene, views=assign_split(scene.views, 4))
 
 
 def corridor(camera):
-    """Depth and alpha of the two walls, the sky above 5 m and the road below."""
+    """Return depth and alpha of two walls up to 5 m, the road between them, and the sky."""
     height, width = camera.height, camera.width
     viewmat, K = np.asarray(camera.viewmat, np.float64), np.asarray(camera.K, np.float64)
     y, x = np.mgrid[:height, :width] + 0.5
@@ -53,7 +53,7 @@ ORIGIN = np.zeros(3)
 
 @pytest.fixture(scope="module")
 def metrics(scene):
-    """Metrics of a fit that shows both walls in one grey."""
+    """Return metrics of a fit that shows both walls in one grey."""
     global ORIGIN
     ORIGIN = np.array(scene.origin)
 
@@ -164,13 +164,14 @@ camera = functools.partial(splats.camera, width=SIZE, height=SIZE, focal=FOCAL)
 
 
 def radiance(x: float) -> np.ndarray:
-    """The plane at z = DEPTH as a camera at (x, 0, 0) sees it."""
+    """Return radiance of a textured plane at z = DEPTH in a camera at (x, 0, 0)."""
     v, u = (np.mgrid[:SIZE, :SIZE] + 0.5 - SIZE / 2) / FOCAL * DEPTH
     texture = 0.12 + 0.05 * np.sin(3 * (u + x)) + 0.04 * np.cos(4 * v)
     return np.stack([texture, 0.8 * texture, 1.1 * texture], -1).astype(np.float32)
 
 
 def photographed(x: float, exposure: float, gamma: float = 2.2, claimed: float | None = None):
+    """Return a photograph from x, whose transform states the exposure `claimed`."""
     ldr = np.rint(255 * develop(radiance(x), DisplayTransform(exposure, gamma, TONE))) / 255
     return seams.Photographed(
         ldr.astype(np.float32),

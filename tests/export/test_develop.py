@@ -1,4 +1,4 @@
-"""Developed photographs are those that one exposure, white balance and lens would have given."""
+"""Developed photographs look like photographs with one exposure, white balance and lens."""
 
 import csv
 import dataclasses
@@ -217,7 +217,7 @@ def test_the_model_stays_and_our_reader_and_colmap_read_it(tmp_path):
     assert all((out / "images" / image.name).is_file() for image in found.images.values())
 
 
-def test_developing_again_does_only_what_is_missing(varied):
+def test_a_second_development_writes_only_missing_files(varied):
     root, selection = varied
     _, out = run(root, selection, exposure=0.5)
     before = files_in(out)

@@ -151,7 +151,6 @@ def test_spz_follows_its_specification(tmp_path, with_gsply):
     data = gzip.decompress((tmp_path / "a.spz").read_bytes())
     magic, version, count, degree, bits, flags, _ = struct.unpack_from("<IIIBBBB", data)
     assert (magic, version, count, degree, flags) == (0x5053474E, 3, 50, 1, 0)
-    # Positions, alphas, colours, lengths, rotations, harmonics.
     places = 16 + np.cumsum([0, 9 * count, count, 3 * count, 3 * count, 4 * count, 9 * count])
     parts = [np.frombuffer(data[a:b], np.uint8) for a, b in itertools.pairwise(places)]
     assert places[-1] == len(data)
@@ -174,7 +173,7 @@ def test_spz_never_clips_positions():
         gsply_files.fractional_bits(np.array([[1e7, 0.0, 0.0]]))
 
 
-def test_without_its_package_the_error_names_what_to_install(tmp_path, monkeypatch):
+def test_without_gsply_the_error_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "gsply", None)
     for write in (gsply_files.write_spz, gsply_files.write_compressed_ply):
         with pytest.raises(UserError, match=r"pip install 'p2gs-jax\[spz\]'"):

@@ -132,7 +132,7 @@ def test_a_known_difference_has_its_known_error():
 
 
 @pytest.mark.slow
-def test_lifted_colours_show_in_linear_light_what_a_viewer_shows():
+def test_lifted_colours_look_in_linear_light_as_in_a_viewer():
     """Translucent Gaussians differ; refining brings them closer, in unseen views as well."""
     shown, render = bake(haze(), SRGB, "exp"), make_renderer(viewer_config(CFG))
     places = {f"{x:+.1f}": camera(x) for x in (-0.4, -0.2, 0.0, 0.2, 0.4)}

@@ -49,7 +49,7 @@ def look_up(image, x, y):
 
 
 def render(center, square, tilt, paint):
-    """Return radiance and depth of a plane z = BACK + tilt x, and of a square before it."""
+    """Return radiance and depth of a plane z = BACK + tilt x, and of a square in front of it."""
     z = (BACK + tilt * center[0] - center[2]) / (1 - tilt * RAYS[..., 0])
     place = center[:2] + RAYS * z[..., None]
     image = look_up(paint[0], place[..., 0], place[..., 1])
@@ -62,7 +62,7 @@ def render(center, square, tilt, paint):
 
 
 class World:
-    """A small scene on disk with its true depths."""
+    """A textured plane on disk and its true depths; views in `spoil` show other textures."""
 
     def __init__(self, path, *, square=False, tilt=0.0, exposures=None, spoil=(), change=None):
         path.mkdir(exist_ok=True)

@@ -23,7 +23,7 @@ from p2gs_jax.scene.visibility import unoccluded
 from p2gs_jax.types import Scene, Tracks
 
 
-def test_a_wall_hides_what_is_behind_it():
+def test_a_wall_hides_points_behind_it():
     rng = np.random.default_rng(0)
     wall = np.concatenate([rng.uniform(20, 60, (600, 2)), np.full((600, 1), 5.0)], 1)
     far = np.concatenate([rng.uniform(0, 100, (800, 2)), np.full((800, 1), 20.0)], 1)

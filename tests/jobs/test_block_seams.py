@@ -114,10 +114,7 @@ def test_the_remaining_step_is_measured_in_other_views(two_views, monkeypatch, r
     monkeypatch.setattr(
         measuring, "camera_of", lambda store, index: seen.append(index) or camera_of(store, index)
     )
-    values = {
-        "exp": (0.3, 0.3 + 0.2 * np.log(2)),
-        "linear": (0.5, 0.5 * 2**0.2 + 0.5 * (2**0.2 - 1)),
-    }
+    values = {"exp": (0.3, 0.3 + 0.2 * np.log(2)), "linear": (0.5, 2**0.2 - 0.5)}
     first, second = (wall(v) for v in values[radiance])
     cfg = RenderConfig(sh_degree=0, radiance=radiance)
     store = ImageStore(two_views.views, DataConfig())

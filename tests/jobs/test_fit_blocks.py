@@ -9,6 +9,7 @@ from test_cut import make_road
 from tiny_scene import make_scene
 
 import p2gs_jax
+from p2gs_jax.core.atomic import plain
 from p2gs_jax.core.progress import Silent
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.dense import coverage_of
@@ -43,8 +44,6 @@ def in_this_process(monkeypatch):
             if job.name in fail:
                 state = JobState(job.name, "failed", reason="the disk is full")
             else:
-                from p2gs_jax.core.atomic import plain
-
                 job.task(job.folder, json.loads(json.dumps(plain(job.arguments))), Silent())
             on_end(number, state)
             states.append(state)
