@@ -66,13 +66,12 @@ def test_the_camera_with_the_most_views_is_the_default():
         of_camera(shots, views, "front")
 
 
-def around(azimuths, elevation=30.0, aside=0.0):
-    """Return shots that look at FOCUS, or at a point aside of it, from azimuths in degrees."""
-    out, e = [], np.deg2rad(elevation)
+def around(azimuths):
+    """Return shots that look down by 30 degrees at FOCUS, from azimuths in degrees."""
+    out, e = [], np.deg2rad(30.0)
     for a in np.deg2rad(azimuths):
         offset = np.array([np.cos(e) * np.sin(a), -np.sin(e), np.cos(e) * np.cos(a)])
-        target = FOCUS + aside * np.array([np.cos(a), 0, -np.sin(a)])
-        out.append(shot(look_at(FOCUS + 5 * offset, target, UP)))
+        out.append(shot(look_at(FOCUS + 5 * offset, FOCUS, UP)))
     return out
 
 
@@ -130,12 +129,12 @@ MOUNTS = {
 }
 
 
-def photographs(steps=4, mounts=MOUNTS, leave_out=()):
+def photographs(mounts=MOUNTS, leave_out=()):
     """Return views of a vehicle on a curved road."""
     out = [
         view(f"{camera}/{k:06d}.png", mount @ turned(8 * k, (0.3 * k**2, 0, 2.0 * k)))
         for camera, mount in mounts.items()
-        for k in range(steps)
+        for k in range(4)
         if (camera, k) not in leave_out
     ]
     return sorted(out, key=lambda v: v.name)

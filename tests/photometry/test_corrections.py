@@ -213,13 +213,13 @@ def test_exposures_move_from_ppisp_to_the_photometry_and_photographs_stay(parame
 LEARNED = ("curve", "hidden", "hidden_bias", "out", "out_bias", "axes")
 
 
-def learned(size, dtype=jnp.float32) -> gs.Luminance:
+def learned(size) -> gs.Luminance:
     """Return parameters about the identity, with the statistics of noise."""
     rng = np.random.default_rng(1)
     start = gs.identity(2)
     moved = {n: getattr(start, n) + rng.normal(0, size, getattr(start, n).shape) for n in LEARNED}
     both = replace(start, **moved, statistics=rng.uniform(0, 1, (2, gs.STATISTICS)))
-    return jax.tree.map(lambda x: jnp.asarray(x, dtype), both)
+    return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), both)
 
 
 @pytest.mark.parametrize("size", [0.3, 3.0, 100.0])

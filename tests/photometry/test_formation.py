@@ -52,9 +52,9 @@ CONFIGS = pytest.mark.parametrize("cfg", [PLAIN, SHADED, BY_CAMERA, BY_CHANNEL])
 BALANCE = np.array([0.25, -0.05, -0.2], np.float32)
 
 
-def picture(seed=0, low=-6.0, high=-2.5):
-    rng = np.random.default_rng(seed)
-    return np.exp2(rng.uniform(low, high, (HEIGHT, WIDTH, 3))).astype(np.float32)
+def picture(seed=0):
+    stops = np.random.default_rng(seed).uniform(-6.0, -2.5, (HEIGHT, WIDTH, 3))
+    return np.exp2(stops).astype(np.float32)
 
 
 def capture(camera, exposure=1.7, gamma=2.0):

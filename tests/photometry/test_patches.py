@@ -26,13 +26,13 @@ class Road(ImageStore):
     K = np.array([[200.0, 0, 80], [0, 200, 20], [0, 0, 1]], np.float32)
     width, height, above, cell = 160, 110, 1.5, 0.02  # pixels, pixels, m, m
 
-    def __init__(self, contrast=0.35):
+    def __init__(self):
         rng, shape = np.random.default_rng(0), (2000, 500)
         across, along = np.fft.rfftfreq(shape[1]), np.fft.fftfreq(shape[0])
         frequency = np.hypot(along[:, None], across).clip(1 / 200)
         drawn = np.exp(2j * np.pi * rng.random(frequency.shape)) / frequency
         texture = np.fft.irfft2(drawn, s=shape)
-        light = 0.12 * np.exp(contrast * texture / texture.std())
+        light = 0.12 * np.exp(0.35 * texture / texture.std())
         sums = np.pad(light, ((1, 0), (1, 0))).cumsum(0).cumsum(1)
         places = np.arange(shape[0] + 1), np.arange(shape[1] + 1)
         self._integral = RegularGridInterpolator(places, sums)

@@ -19,12 +19,7 @@ from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.pipeline import fit as pipeline
 from p2gs_jax.pipeline import preflight
-from p2gs_jax.pipeline.preflight import (
-    MemoryNeeded,
-    check_run_dir,
-    memory_needed,
-    require_memory,
-)
+from p2gs_jax.pipeline.preflight import MemoryNeeded, check_run_dir, memory_needed, require_memory
 from p2gs_jax.pipeline.survey import load
 from p2gs_jax.render import selfcheck
 from p2gs_jax.render.selfcheck import SelfCheck, suited

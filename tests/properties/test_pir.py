@@ -35,9 +35,9 @@ tone_map = jax.jit(forming.tone_map, static_argnums=2)
 inverse_tone_map = jax.jit(forming.inverse_tone_map, static_argnums=2)
 
 
-def radiance(seed, n=64, low=-6.0, high=-0.5):
-    rng = np.random.default_rng(seed)
-    return jnp.asarray(np.exp2(rng.uniform(low, high, (n, 3))), jnp.float32)
+def radiance(seed, low=-6.0):
+    stops = np.random.default_rng(seed).uniform(low, -0.5, (64, 3))
+    return jnp.asarray(np.exp2(stops), jnp.float32)
 
 
 @MODELS

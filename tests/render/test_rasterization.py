@@ -18,16 +18,15 @@ WIDTH, HEIGHT = 48, 36
 BACK = np.array([[1.0, 0.5, 0.0], [2.0, 2.0, 2.0]], np.float32)
 
 
-def arguments(n=300, dtype=np.float32, seed=4):
+def arguments():
     """Return gsplat's arguments for a street in two cameras."""
-    rng = np.random.default_rng(seed)
-    g, cam = street(n=n, width=WIDTH, height=HEIGHT, degree=0, dtype=dtype)
+    g, cam = street(n=300, width=WIDTH, height=HEIGHT, degree=0)
     viewmats = np.tile(np.eye(4), (2, 1, 1))
     viewmats[1, 0, 3] = 0.3
     args = {"means": g.means, "quats": g.quats, "scales": jnp.exp(g.log_scales)}
     args |= {"opacities": jax.nn.sigmoid(g.opacity_logits), "Ks": jnp.tile(cam.K, (2, 1, 1))}
-    colors = jnp.asarray(np.exp(rng.normal(-1, 1, (n, 3))), dtype)
-    return args | {"colors": colors, "viewmats": jnp.asarray(viewmats, dtype)}
+    colors = np.exp(np.random.default_rng(4).normal(-1, 1, (300, 3)))
+    return args | {k: jnp.float32(v) for k, v in {"colors": colors, "viewmats": viewmats}.items()}
 
 
 def draw(args, **options):

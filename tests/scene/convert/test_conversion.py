@@ -71,7 +71,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_raw_photographs_are_linear_above_their_black_level(folder: Path) -> None:
-    light = 0.02 + 0.8 * patches((96, 64)) ** 2
+    light = 0.02 + 0.8 * patches() ** 2
     write_dng(folder / "a.dng", light, orientation=6)
     write_dng(folder / "b.dng", light / 4, orientation=1)
     write_dng(folder / "c.dng", np.full((64, 96, 3), 3.0))

@@ -71,10 +71,10 @@ def applied(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
     return points @ pose[:3, :3].T + pose[:3, 3]
 
 
-def landmarks(count: int = 50) -> np.ndarray:
+def landmarks() -> np.ndarray:
     """Return points around the car, in the world."""
     rng = np.random.default_rng(3)
-    return applied(car_at(0.5), rng.uniform([-30, -30, -1], [30, 30, 6], (count, 3)))
+    return applied(car_at(0.5), rng.uniform([-30, -30, -1], [30, 30, 6], (50, 3)))
 
 
 def off_landmarks(points: np.ndarray, origin=0.0) -> np.ndarray:
