@@ -100,6 +100,27 @@ def test_the_tone_map_is_inverted_by_its_inverse(cfg, seed, gamma):
 
 @MODELS
 @FEW
+@given(seed=SEEDS, gamma=GAMMAS, ratio=st.floats(0.5, 1.0))
+def test_photographs_of_one_radiance_differ_by_the_ratio_of_their_exposures(
+    cfg, seed, gamma, ratio
+):
+    """The Principle of Invariant Radiance (paper, Sec. 3.3), back in linear light."""
+    L, gamma = radiance(seed, low=-4.0), jnp.float32(gamma)
+    shown = [formation(L, Capture(jnp.float32(e), gamma), cfg) for e in (1.0, ratio)]
+    one, other = (np.asarray(inverse_tone_map(y, gamma, cfg)) for y in shown)
+    np.testing.assert_allclose(other / one, ratio, rtol=2e-5)
+
+
+@FEW
+@given(seed=SEEDS, gamma=GAMMAS)
+def test_the_derivative_of_the_tone_map_by_gamma_has_a_closed_form(seed, gamma):
+    x, gamma = radiance(seed), jnp.float32(gamma)
+    slope = jax.jvp(lambda g: tone_map(x, g, PAPER), (gamma,), (jnp.float32(1),))[1]
+    np.testing.assert_allclose(slope, -jnp.log(x) * x ** (1 / gamma) / gamma**2, rtol=1e-5)
+
+
+@MODELS
+@FEW
 @given(gamma=GAMMAS, e=SCALES)
 def test_formation_is_monotone_and_within_its_range(cfg, gamma, e):
     x = jnp.logspace(-7, 2, 400, dtype=jnp.float32)
