@@ -43,8 +43,8 @@ FAULTS = (
     Fault(
         "a segment begins with all the light of its tile",
         "render/rasterize_xla.py",
-        "extra_light = light[behind] - sum(",
-        "extra_light = light[behind] - 0 * sum(",
+        "extra_light = light[extra_tiles] - sum(",
+        "extra_light = light[extra_tiles] - 0 * sum(",
         ORACLE,
     ),
     Fault(
