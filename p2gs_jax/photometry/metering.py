@@ -146,7 +146,7 @@ class Metering:
         constant = self.constant.left_out_ev
         rules = [rule for rule in self.candidates if rule.meter is not None]
         if not rules:
-            return f"Metering: a rule needs {FEWEST_VIEWS} training views that can be metered."
+            return f"Metering: too few training views can be metered; a rule needs {FEWEST_VIEWS}."
         if constant < NEGLIGIBLE_EV:
             return f"Metering: exposures hardly vary ({constant:.2f} EV): constant."
         if self.rule.meter is None:
