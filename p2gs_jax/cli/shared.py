@@ -63,8 +63,11 @@ RENAMED = {
 }
 SCENE = "the scene's folder itself, without an option"
 # Our names for commands and options of 3DGS, gsplat and nerfstudio.
-COMMANDS_OF_OTHERS = {"train": "fit SCENE", "viewer": "view RUN", "metrics": "eval RUN"}
-COMMANDS_OF_OTHERS |= {"simple_trainer": "fit SCENE"}
+COMMANDS_OF_OTHERS = {
+    **dict.fromkeys(("train", "simple_trainer"), "fit SCENE"),
+    "viewer": "view RUN",
+    "metrics": "eval RUN",
+}
 OTHERS = {
     "--steps": "--iterations --iters --max-steps --max-num-iterations --num-iterations",
     "--gaussians": "--cap-max --max-gaussians --num-gaussians",

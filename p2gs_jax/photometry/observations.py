@@ -72,8 +72,8 @@ class Observations:
 
     def picked(self, pick: np.ndarray | slice) -> Observations:
         """Return some of the observations, by a mask or by rows."""
-        names = ("views", "points", "colors", "spread", "positions", "brightest", "cells")
-        names = (*names, "footprints")
+        names = ["views", "points", "colors", "spread"]
+        names += ["positions", "brightest", "cells", "footprints"]
         kept = {k: v[pick] for k in names if (v := getattr(self, k)) is not None}
         return replace(self, **kept)
 

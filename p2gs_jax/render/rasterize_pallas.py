@@ -25,7 +25,7 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plt
 
 from p2gs_jax.render.binning import longest_first
-from p2gs_jax.render.segments import cut, opaque
+from p2gs_jax.render.segments import brightest, cut, opaque, without_hidden
 from p2gs_jax.render.tiles import GEOMETRY, Plan, geometry_gradient
 
 # Number of entries whose rows are loaded together, forward and backward. The stop rule is evaluated
@@ -97,12 +97,12 @@ class _Tile:
         return jnp.where(exponent > plan.cutoff, alpha, 0.0)
 
 
-def _forward_kernel(rows, ids, tiles, starts, ends, order, brightest, *outputs, plan: Plan):
+def _forward_kernel(rows, ids, tiles, starts, ends, order, largest, *outputs, plan: Plan):
     *image, stops = outputs
     slot = order[pl.program_id(0)]
     pixels = _Tile(tiles[slot], plan)
     start, end = starts[slot], ends[slot]
-    brightest = brightest[0]
+    largest = largest[0]
 
     def body(state):
         position, _, transmittance, *channels = state
@@ -113,7 +113,7 @@ def _forward_kernel(rows, ids, tiles, starts, ends, order, brightest, *outputs, 
         position = jnp.minimum(position + UNROLL, end)
         done = position >= end
         if plan.cfg.stop_error is not None:
-            done = done | opaque(channels, transmittance, brightest, plan)
+            done = done | opaque(channels, transmittance, largest, plan)
         return position, done, transmittance, *channels
 
     blank = jnp.zeros(plan.pixels, jnp.float32)
@@ -165,7 +165,7 @@ def forward(rows, ids, offsets, plan: Plan):
     tiles, most = plan.tile_count, SEGMENTS_PER_LANE * plan.lanes
     most = most if tiles < FEW_TILES else 0
     segments = cut(offsets, most, plan.cfg.chunk)
-    brightest = jnp.maximum(jnp.max(rows[:, GEOMETRY : GEOMETRY + 3]), 1e-30)
+    largest = brightest(rows)
     options = {"compiler_params": _parameters(plan.pixels), "interpret": _interpreted()}
     *image, stops = pl.pallas_call(
         functools.partial(_forward_kernel, plan=plan),
@@ -181,7 +181,7 @@ def forward(rows, ids, offsets, plan: Plan):
         ids,
         *segments[:3],
         longest_first(segments.ends - segments.starts),
-        brightest[None],
+        largest[None],
     )
     if not most:
         return tuple(image), (segments, stops, ())
@@ -193,10 +193,7 @@ def forward(rows, ids, offsets, plan: Plan):
         **options,
     )(segments.firsts, *image)
     image, before = merged[: len(image)], merged[len(image) :]
-    if plan.cfg.stop_error is not None:
-        hidden = opaque(before[:-1], before[-1], brightest, plan)
-        stops = jnp.where(jnp.concatenate([jnp.zeros(tiles, bool), hidden]), segments.starts, stops)
-    return image, (segments, stops, before)
+    return image, (segments, without_hidden(stops, segments, before, largest, plan), before)
 
 
 def _row(values):

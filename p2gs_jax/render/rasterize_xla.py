@@ -30,7 +30,7 @@ from jaxtyping import Array, Float, Int
 
 from p2gs_jax.render.binning import longest_first
 from p2gs_jax.render.cores import cores, this_core
-from p2gs_jax.render.segments import Segments, cut, opaque
+from p2gs_jax.render.segments import Segments, brightest, cut, opaque, without_hidden
 from p2gs_jax.render.tiles import GEOMETRY, Plan, geometry_gradient
 from p2gs_jax.render.xla_cpu import compiled_loop, materialize
 
@@ -202,8 +202,7 @@ def forward(rows, ids_list, offsets, plan: Plan):
     local = plan.local_pixels()
     ids_list = _padded(ids_list, plan)
     slot = queue.first()
-    radiance = rows[:, GEOMETRY : GEOMETRY + 3]
-    brightest = jnp.maximum(jnp.max(radiance), 1e-30)
+    largest = brightest(rows)
 
     def body(state):
         turn, slot, position, fresh, sums, image, stops = state
@@ -221,7 +220,7 @@ def forward(rows, ids_list, offsets, plan: Plan):
         position = jnp.minimum(position + plan.cfg.chunk, end)
         done = position >= end
         if plan.cfg.stop_error is not None:
-            done = done | opaque(channels, transmittance, brightest, plan)
+            done = done | opaque(channels, transmittance, largest, plan)
         target = jnp.where(done, slot, slots + lanes)
         image = tuple(
             a.at[target].set(b, mode="drop", unique_indices=True)
@@ -242,11 +241,7 @@ def forward(rows, ids_list, offsets, plan: Plan):
     state = lax.while_loop(lambda s: jnp.any(s[1] < slots), body, state)
     composited, stops = tuple(a[:slots] for a in state[5]), state[6][:slots]
     image, before = merge(composited, segments.tiles[plan.tile_count :], segments.firsts[-1])
-    if plan.cfg.stop_error is not None:
-        hidden = opaque(before[:-1], before[-1], brightest, plan)
-        starts = segments.starts[plan.tile_count :]
-        stops = stops.at[plan.tile_count :].set(jnp.where(hidden, starts, stops[plan.tile_count :]))
-    return image, (segments, stops, before)
+    return image, (segments, without_hidden(stops, segments, before, largest, plan), before)
 
 
 def _prefixes(first, values, step, group: int):

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from p2gs_jax.render.tiles import Plan
+from p2gs_jax.render.tiles import GEOMETRY, Plan
 
 # Floor of a pixel's brightness in the stop rule, relative to the brightest splat
 # (RenderConfig.stop_error).
@@ -64,13 +64,40 @@ def cut(offsets: Int[Array, " t1"], most: int, unit: int) -> Segments:
     )
 
 
+def brightest(rows: Float[Array, "n1 row"]) -> Float[Array, ""]:
+    """Return the largest radiance of the splats."""
+    return jnp.maximum(jnp.max(rows[:, GEOMETRY : GEOMETRY + 3]), 1e-30)
+
+
 def opaque(
     channels: Sequence[Float[Array, "... p"]],
     transmittance: Float[Array, "... p"],
-    brightest: Array,
+    largest: Float[Array, ""],
     plan: Plan,
 ) -> Bool[Array, "..."]:
-    """Return whether entries behind can be left out (RenderConfig.stop_error)."""
-    so_far = functools.reduce(jnp.maximum, channels[:3]) / brightest
+    """Return whether entries behind can be left out (RenderConfig.stop_error).
+
+    `largest` is `brightest` of the splats.
+    """
+    so_far = functools.reduce(jnp.maximum, channels[:3]) / largest
     hidden = transmittance - (plan.cfg.stop_error or 0.0) * jnp.maximum(so_far, DARKEST)
     return jnp.max(hidden, -1) <= 0
+
+
+def without_hidden(
+    stops: Int[Array, " s"],
+    segments: Segments,
+    before: Sequence[Float[Array, "e p"]],
+    largest: Float[Array, ""],
+    plan: Plan,
+) -> Int[Array, " s"]:
+    """Return where segments stop: at their start if those before them are opaque.
+
+    `stops` are the positions without this rule; `before` holds the channels and transmittance
+    before each extra slot.
+    """
+    if plan.cfg.stop_error is None:
+        return stops
+    starts, extra = segments.starts[plan.tile_count :], stops[plan.tile_count :]
+    hidden = opaque(before[:-1], before[-1], largest, plan)
+    return stops.at[plan.tile_count :].set(jnp.where(hidden, starts, extra))

@@ -39,7 +39,7 @@ from p2gs_jax.train.divided import DividedStep
 from p2gs_jax.train.exposure_loss import ColorPairs
 from p2gs_jax.train.inputs import Inputs, TrainingViews, controls_at, inputs_at
 from p2gs_jax.train.optimizer import make_optimizer
-from p2gs_jax.train.records import Records, pause_between, record_of
+from p2gs_jax.train.records import Records, pause_between
 from p2gs_jax.train.schedule import RunClock
 from p2gs_jax.train.state import (
     FAULT_NONFINITE,
@@ -193,7 +193,7 @@ class Trainer:
             clock.tick(host)
             if reports:
                 alive, left_s = alive_in(state.population), clock.left(host, self.levels)
-                self.records.log(record_of(reports, host, alive, left_s))
+                self.records.log(reports, host, alive, left_s)
                 # From here on a signal waits until a checkpoint can be written.
                 self.signals.begin()
                 state = self._densified(state, host)

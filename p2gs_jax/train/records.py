@@ -24,32 +24,6 @@ from p2gs_jax.train.update import StepReport
 SHARE, LONGEST_PAUSE = 0.01, 20.0
 
 
-def record_of(
-    reports: Sequence[StepReport], host: HostState, gaussians: int, left_s: float | None
-) -> LogRecord:
-    """Return the log record of a burst of steps.
-
-    `reports` are the reports of its steps; `host` and `gaussians` are the counters and the
-    population after it. `left_s` is the estimated time of optimisation left, seconds; None: not
-    known yet.
-    """
-    reports = jax.device_get(list(reports))  # in one transfer, because each costs a round trip
-    last = reports[-1]
-    return LogRecord(
-        step=host.step,
-        progress=round(host.progress, 9),
-        loss=_mean(r.loss for r in reports),
-        psnr=_mean(r.psnr for r in reports),
-        gaussians=gaussians,
-        shrink=host.shrink,
-        entries=int(last.entries),
-        seconds=round(host.elapsed_s, 3),
-        step_seconds=round(host.step_s, 5),
-        left_s=None if left_s is None else round(left_s, 1),
-        terms={k: _mean(r.terms[k] for r in reports) for k in last.terms},
-    )
-
-
 def _mean(values) -> float:
     return float(np.mean([float(v) for v in values]))
 
@@ -108,10 +82,31 @@ class Records:
         write_text(self._log, "".join(json.dumps(line) + "\n" for line in kept))
         return state, host
 
-    def log(self, record: LogRecord) -> None:
-        """Append a record to the log, with the steps of the whole run, and pass it on."""
-        train = self.cfg.train
-        record = dataclasses.replace(record, steps=None if train.budget_s else train.steps)
+    def log(
+        self, reports: Sequence[StepReport], host: HostState, gaussians: int, left_s: float | None
+    ) -> None:
+        """Append the record of a burst of steps to the log, and pass it on.
+
+        `reports` are the reports of its steps; `host` and `gaussians` are the counters and the
+        population after it. `left_s` is the estimated time of optimisation left, seconds; None: not
+        known yet.
+        """
+        reports = jax.device_get(list(reports))  # in one transfer: each costs a round trip
+        last, train = reports[-1], self.cfg.train
+        record = LogRecord(
+            step=host.step,
+            progress=round(host.progress, 9),
+            loss=_mean(r.loss for r in reports),
+            psnr=_mean(r.psnr for r in reports),
+            gaussians=gaussians,
+            shrink=host.shrink,
+            entries=int(last.entries),
+            seconds=round(host.elapsed_s, 3),
+            step_seconds=round(host.step_s, 5),
+            left_s=None if left_s is None else round(left_s, 1),
+            terms={k: _mean(r.terms[k] for r in reports) for k in last.terms},
+            steps=None if train.budget_s else train.steps,
+        )
         append_jsonl(self._log, dataclasses.asdict(record))
         self.on_log(record)
 
