@@ -75,7 +75,7 @@ class ForeignRun(read.Run):
     ) -> ForeignRun:
         """Return the run with lifted Gaussians that are closer to the other program's pictures.
 
-        These pictures show display colours. The run has the error; `on_step` is that of `refine`.
+        These pictures show display colours. The run has the error; `refine` gets `on_step`.
         """
         cfg, developed, targets = self.cfg.render, self.developed, []
         render = make_renderer(bake.viewer_config(cfg))
