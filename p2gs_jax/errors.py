@@ -8,8 +8,8 @@ class UserError(Exception):
     """
 
     def __init__(self, message: str, *, fix: str | None = None):
-        super().__init__(message)
-        self.message = message
+        self.message = message.removesuffix(".") + "."
+        super().__init__(self.message)
         self.fix = fix
 
     def __str__(self) -> str:

@@ -201,7 +201,7 @@ def from_dict(values: Mapping[str, Any], kind: Any = FitConfig) -> Any:
     kinds = {f.name: f.default_factory for f in dataclasses.fields(kind)}
     unknown = sorted(set(values) - set(kinds))
     if unknown:
-        raise TypeError(f"unknown field(s) in {kind.__name__}: {', '.join(unknown)}")
+        raise TypeError(f"unknown fields in {kind.__name__}: {', '.join(unknown)}")
     made = {}
     for name, value in values.items():
         if dataclasses.is_dataclass(kinds[name]) != isinstance(value, dict):

@@ -123,7 +123,7 @@ def _photographs(fitted: Run, say: Callable[[str], None]) -> Photograph:
             return fitted.photograph(index)
         except UserError as error:
             if not missing:
-                say(f"Views without their photographs are NAME.png alone: {error.message}.")
+                say(f"Views without their photographs are NAME.png alone: {error.message}")
             missing.append(index)
             return None
 

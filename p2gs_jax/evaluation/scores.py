@@ -217,14 +217,11 @@ def notes_on_missing(metrics: dict[str, Any]) -> list[str]:
     """Return notes on views without scores or exposures, from the metrics of an evaluation."""
     out = []
     if hidden := metrics.get("hidden"):
-        out.append(
-            f"{len(hidden)} view(s) are completely hidden by their masks and have no scores "
-            f"({first_few(hidden)})."
-        )
+        out.append(f"Without scores, because masks hide the whole view: {first_few(hidden)}.")
     if unknown := metrics.get("exposures_unknown"):
         out.append(
-            f"{len(unknown)} photograph(s) are black or saturated everywhere: their exposures in "
-            f"photometry.json are meaningless ({first_few(unknown)})."
+            "Black or saturated everywhere, so exposures in photometry.json are meaningless: "
+            f"{first_few(unknown)}."
         )
     return out
 

@@ -143,8 +143,8 @@ class _Lab:
         """Return what users must know about exposures that were assumed."""
         names = [self.views[row].name for row in np.flatnonzero(~self.solved).tolist()]
         note = (
-            f"{len(names)} photograph(s) share too few points with others: they were developed "
-            f"with the mean exposure of their camera, which may be wrong: {first_few(names)}."
+            "Too few points in common with others: the mean exposure of the camera, which may be "
+            f"wrong, was used for {first_few(names)}."
         )
         return [note] if names else []
 

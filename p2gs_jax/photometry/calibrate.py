@@ -20,6 +20,7 @@ from jaxtyping import Bool
 
 from p2gs_jax.config import FitConfig, PhotometryConfig
 from p2gs_jax.core.streams import Stream, generator
+from p2gs_jax.core.text import count_of
 from p2gs_jax.photometry.adjustment.errors import SHARED_REGION, regions
 from p2gs_jax.photometry.adjustment.fit import fit_model
 from p2gs_jax.photometry.adjustment.problem import KnownExposures, Problem, make_problem
@@ -167,12 +168,13 @@ def _notes(problem: Problem, *, free: bool = True) -> tuple[str, ...]:
     """Return the note on gauges that known exposures fix; `free`: options do not set the power."""
     if problem.known is None:
         return ()
-    head = f"The exposures of {np.isfinite(problem.known.log_exposures).sum()} view(s) are known"
+    known = int(np.isfinite(problem.known.log_exposures).sum())
+    head = f"Known exposures ({count_of(known, 'view')})"
     if not problem.with_known_power.size:
-        return (f"{head}: they fix the scale. Two different ones would fix the curve's power.",)
+        return (f"{head} fix the scale. Two different ones would fix the curve's power.",)
     if free:
-        return (f"{head}, and fix the tone curve's power, which photographs do not determine.",)
-    return (f"{head}, and would fix the tone curve's power, which the options set.",)
+        return (f"{head} fix the tone curve's power, which photographs do not determine.",)
+    return (f"{head} would fix the tone curve's power, but the options set it.",)
 
 
 def _subset(observations: Observations, seed: int, most: int) -> Observations:

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from p2gs_jax.config import CameraFormation, Level, VignettingKind
 from p2gs_jax.core.numerics import LN2
+from p2gs_jax.core.text import count_of
 from p2gs_jax.photometry.models import ModelName
 from p2gs_jax.photometry.response import Response
 
@@ -95,7 +96,8 @@ class Agreement(NamedTuple):
     def sentence(self, source: str = "EXIF") -> str:
         """Return a sentence for the user."""
         if self.views < 2:
-            return f"{source} gives the exposure of {self.views} view(s): nothing to compare."
+            known = count_of(self.views, "view")
+            return f"{source} gives the exposure of {known}: nothing to compare."
         head = (
             f"{source} of {self.views} views: correlation {self.correlation:.3f}, slope "
             f"{self.slope:.2f}, RMS {self.rms_ev:.2f} EV."

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.special import fdtrc
 
 from p2gs_jax.core.numerics import LN2
+from p2gs_jax.core.text import count_of
 from p2gs_jax.photometry.adjustment.problem import Problem
 from p2gs_jax.photometry.observations import Observations, PerChannel, grouped
 from p2gs_jax.photometry.response import DARKEST, log_exposed
@@ -63,8 +64,8 @@ def place_warnings(
     head = ", ".join(f"{o.names[k] if o.names else f'row {k}'} {clear[k]:.2f}" for k in named[:6])
     return [
         "Not modelled: residuals depend on the position in the image, because of flare, shade, "
-        f"reflections or vignetting. In {len(clear)} of {len(tested)} training view(s), RMS in EV: "
-        f"{head}{', ...' if len(named) > 6 else ''}."
+        f"reflections or vignetting. In {len(clear)} of {count_of(len(tested), 'training view')}, "
+        f"RMS in EV: {head}{', ...' if len(named) > 6 else ''}."
     ]
 
 

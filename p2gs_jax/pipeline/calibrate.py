@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import no_empty_folders, write_json
 from p2gs_jax.core.progress import Reporter, Silent
+from p2gs_jax.core.text import count_of, first_few
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.develop import Developed, Development, develop_scene, places_of
 from p2gs_jax.export.poses import poses_of
@@ -325,13 +326,10 @@ def _stack_messages(views: tuple[View, ...], found: StackColors, local_ev: float
     out = []
     dark = [view.name for view, signal in zip(views, found.signal, strict=True) if not signal]
     if dark:
-        out.append(
-            f"{len(dark)} frame(s) carry little signal (black or saturated nearly everywhere): "
-            f"{', '.join(dark[:6])}."
-        )
+        out.append("Little signal, black or saturated nearly everywhere: " + first_few(dark) + ".")
     moved = np.abs(found.shifts).max()
     if moved > 0:
-        out.append(f"Frames were moved by up to {moved:.0f} pixel(s).")
+        out.append(f"Frames were moved by up to {count_of(moved, 'pixel')}.")
     if local_ev > LOCAL_EV:
         out.append(
             f"One response does not explain this stack: between frames, regions of equal "

@@ -122,8 +122,8 @@ def read_run(folder: Path, scene: Path | None = None) -> RunFiles:
         photometry = read_photometry(folder / "photometry.json")
     except UserError as error:
         exists = (folder / "photometry.json").exists()
-        reason = error.message if exists else "photometry.json is missing"
-        missing.append(f"The exposures cannot be displayed: {reason}.".replace("..", "."))
+        reason = error.message if exists else "photometry.json is missing."
+        missing.append(f"The exposures cannot be displayed: {reason}")
     log = _read_log(folder / "log.jsonl", missing)
     names = [] if photometry is None else [v["image"] for v in photometry["views"]]
     read = {path.name: saved, "metrics.json": metrics, "log.jsonl": log}

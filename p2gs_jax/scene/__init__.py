@@ -178,7 +178,7 @@ def _photographs_alone(root: Path, cfg: DataConfig) -> PhotographsAlone:
     if cfg.images is None:
         below = sorted(d.name for d in root.iterdir() if list_images(d, recursive=False))
         if below:
-            fix += f"; photographs are in its folder(s) {', '.join(below[:3])}"
+            fix += f"; photographs are in subfolders {', '.join(below[:3])}"
             fix += ": if each folder is a camera, add --data.images ."
     why = f"no scene in {root}: there is no COLMAP model (cameras, images and points3D as .bin or "
     why += ".txt, in sparse/0, sparse or the folder itself), no transforms.json or "

@@ -184,7 +184,7 @@ def test_a_resumed_run_may_change_only_its_evaluation(tmp_path):
     with pytest.raises(UserError, match=r"densify.method was mcmc, now adaptive\."):
         resume(cfg, "paper")
     cfg["render"]["colour"] = True
-    with pytest.raises(UserError, match=r"unknown field\(s\) in RenderConfig: colour"):
+    with pytest.raises(UserError, match="unknown fields in RenderConfig: colour"):
         resume(cfg, "paper")
 
 

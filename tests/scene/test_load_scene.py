@@ -56,7 +56,7 @@ def test_folders_of_cameras_are_a_scene_with_an_option(tmp_path):
     names = ["front/0.png", "left/0.png"]
     for name in names:
         write_image(tmp_path / name, size=(8, 8))
-    with refused("no scene in", "folder(s) front, left", "--data.images ."):
+    with refused("no scene in", "subfolders front, left", "--data.images ."):
         load_scene(tmp_path, CFG)
     found = find_scene(tmp_path, dataclasses.replace(CFG, images="."))
     assert isinstance(found, PhotographsAlone)

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Float32, Int
 
 from p2gs_jax.config import CameraFormation
 from p2gs_jax.core.numerics import LN2
+from p2gs_jax.core.text import count_of
 from p2gs_jax.photometry.adjustment.equations import weigh
 from p2gs_jax.photometry.adjustment.errors import Uncertainty, uncertainty
 from p2gs_jax.photometry.adjustment.parameters import Forward, Parameters
@@ -283,14 +284,15 @@ def _warnings(
         )
     if lost.any():
         out.append(
-            f"The standard errors of {lost.sum()} training view(s) are unknown: their connection "
-            f"to the others is lost in rounding ({_listed(np.flatnonzero(lost), names)})."
+            f"Standard errors are unknown for {count_of(lost.sum(), 'training view')}: the "
+            "connection to the others is lost in rounding "
+            f"({_listed(np.flatnonzero(lost), names)})."
         )
     few = np.flatnonzero(s.observations_per_view < MIN_OBSERVATIONS)
     if len(few):
         out.append(
-            f"{len(few)} training view(s) have fewer than {MIN_OBSERVATIONS} usable track "
-            f"observations; their exposures are uncertain ({_listed(few, names)})."
+            f"Fewer than {MIN_OBSERVATIONS} usable track observations make exposures uncertain in "
+            f"{count_of(len(few), 'training view')} ({_listed(few, names)})."
         )
     groups = len(set(s.component[active].tolist()))
     if groups > 1:
@@ -305,7 +307,7 @@ def _warnings(
         named = zip(("red", "green", "blue"), balance[worst], strict=True)
         channels = ", ".join(f"{name} {value:+.2f}" for name, value in named)
         out.append(
-            f"White balance changes: {len(tinted)} training view(s) are tinted against the others "
+            f"White balance changes in {count_of(len(tinted), 'training view')} against the others "
             f"({_listed(tinted, names)}; most of all {_listed([worst], names)}, by {channels} EV). "
             "The model does not include these changes."
         )

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from p2gs_jax.core.streams import Stream, generator
+from p2gs_jax.core.text import count_of
 from p2gs_jax.errors import broken
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.sources.sampling import sample
@@ -61,7 +62,7 @@ def read_stack(folder: Path) -> Stack:
     files = sorted(p for p in inner.iterdir() if p.suffix.lower() in SUFFIXES)
     if len(files) < 2:
         fix = "name a folder of photographs from one viewpoint at several exposures"
-        raise broken(inner, f"holds {len(files)} photograph(s); a stack needs two.", fix)
+        raise broken(inner, f"holds {count_of(len(files), 'photograph')}; a stack needs two.", fix)
     images = []
     for path in files:
         if (image := cv2.imread(str(path), cv2.IMREAD_COLOR)) is None:

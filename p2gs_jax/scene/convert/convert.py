@@ -25,6 +25,7 @@ from jaxtyping import UInt
 from PIL import ExifTags, Image
 
 from p2gs_jax.core.atomic import atomic_write, write_text
+from p2gs_jax.core.text import count_of
 from p2gs_jax.errors import broken
 from p2gs_jax.scene.convert import readers
 from p2gs_jax.scene.convert.icc import encode_16
@@ -167,8 +168,8 @@ def _without_twins(kinds: dict[Path, Kind]) -> tuple[dict[Path, Kind], list[str]
             dropped.update(path for path in files if path != best)
     if not dropped:
         return kinds, []
-    note = f"{len(dropped)} photograph(s) exist twice, as several kinds of file "
-    note += f"({min(dropped).name}, ...); one file is used for each photograph."
+    note = f"{count_of(len(dropped), 'second file')} of a photograph in another format "
+    note += f"({min(dropped).name}, ...) will not be read."
     return {path: kind for path, kind in kinds.items() if path not in dropped}, [note]
 
 

@@ -187,10 +187,10 @@ def match_kept(
     wanted = list(combinations(sorted(names), 2)) if pairs is None else list(pairs)
     with opened(database) as db:
         ids = {image.name: image.image_id for image in db.read_all_images()}
-        known = ((a, b) for a, b in wanted if a in ids and b in ids)
+        known = [(a, b) for a, b in wanted if a in ids and b in ids]
         left = [(a, b) for a, b in known if not db.exists_two_view_geometry(ids[a], ids[b])]
-    if len(left) < len(wanted):
-        report(f"matches of {len(wanted) - len(left)} image pairs come from an earlier run")
+    if len(left) < len(known):
+        report(f"matches of {len(known) - len(left)} image pairs come from an earlier run")
     progress = stage_progress(report, "matching", len(left), "image pairs")
     for start in range(0, len(left), PAIRS_AT_ONCE):
         match(database, left[start : start + PAIRS_AT_ONCE])

@@ -16,6 +16,7 @@ import pycolmap
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.atomic import write_json
+from p2gs_jax.core.text import count_of
 from p2gs_jax.errors import UserError, broken
 from p2gs_jax.scene import files
 from p2gs_jax.scene.cameras import parent_of
@@ -60,7 +61,7 @@ def load_images(
     """
     names = [path.relative_to(image_folder).as_posix() for path in paths]
     if len(paths) < 2:
-        why = f"holds {len(paths)} image(s); a reconstruction needs at least two"
+        why = f"holds {count_of(len(paths), 'image')}; a reconstruction needs at least two"
         fix = "add photographs of the same place from different positions"
         raise broken(image_folder, why, fix)
     groups: dict[tuple, list[str]] = defaultdict(list)
