@@ -6,7 +6,6 @@ Densities are over display values: densities over decoded values depend on the c
 from __future__ import annotations
 
 from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -15,7 +14,6 @@ from jaxtyping import Bool, Float
 
 from p2gs_jax.config import Level
 from p2gs_jax.core.numerics import LN2
-from p2gs_jax.core.threads import MOST_WORKERS, available_cores
 from p2gs_jax.photometry.adjustment.equations import SMALLEST_SCALE
 from p2gs_jax.photometry.adjustment.errors import clusters_of
 from p2gs_jax.photometry.adjustment.problem import Problem
@@ -24,7 +22,6 @@ from p2gs_jax.photometry.adjustment.solve import (
     Fit,
     fit_response,
     light_spread,
-    one_thread,
     solve_model,
 )
 from p2gs_jax.photometry.models import (
@@ -122,20 +119,16 @@ class Search:
         self._hopeless: set[Level | None] = set()
         self._fitted: dict[tuple[Form, Curve], Response | None] = {}
         # Spread of the light of one surface under sRGB, log units; None: each form solves it.
-        plain = Choice(EXPOSURES)
-        self.fits[plain] = self._solve(plain), Response()
-        self._spread: float | None = light_spread(self.fits[plain][0])
+        self._spread: float | None = light_spread(self._solve(Choice(EXPOSURES), Response()))
         self._spread_ev = self._spread / LN2
         curves, places = self._spread_ev >= SPLINE_SPREAD_EV, o.positions is not None
         if not curves and places:
             # Vignetting determines a curve at equal exposures: corners show surfaces darker.
-            shaded = Choice(EXPOSURES._replace(vignetting="camera"))
-            self.fits[shaded] = self._solve(shaded), Response()
-            spread = light_spread(self.fits[shaded][0]) / LN2
-            curves, self._spread = spread >= SHADED_SPREAD_EV, None
+            shaded = self._solve(Choice(EXPOSURES._replace(vignetting="camera")), Response())
+            curves, self._spread = light_spread(shaded) / LN2 >= SHADED_SPREAD_EV, None
         cameras = int(o.cameras.max(initial=0)) + 1
         self._scope = Scope(cameras, places, curves, known, problem.with_known_power.size > 0)
-        if not self._scope.allows(plain):
+        if not self._scope.allows(Choice(EXPOSURES)):
             self.fits.clear()
 
     def first(self) -> list[str]:
@@ -174,23 +167,15 @@ class Search:
 
     def _try(self, choices: Iterable[Choice]) -> bool:
         """Solve choices that are possible and not solved yet; return whether any was solved."""
-        wanted = [choice for choice in dict.fromkeys(choices) if self._is_open(choice)]
-        splines = [key for c in wanted if (key := _spline_of(c)) and key not in self._fitted]
-        # Without this context those of the threads would restore one another's number of threads.
-        with one_thread(), ThreadPoolExecutor(min(available_cores(), MOST_WORKERS)) as pool:
-            splines = list(dict.fromkeys(splines))
-            self._fitted |= zip(splines, list(pool.map(self._fit_spline, splines)), strict=True)
-            curves = ((choice, self._response(choice)) for choice in wanted)
-            solvable = {choice: response for choice, response in curves if response is not None}
-            # All begin near what was solved before, so that results do not depend on the cores.
-            fits = list(pool.map(self._solve, solvable))
-        self.fits |= zip(solvable, zip(fits, solvable.values(), strict=True), strict=True)
-        return bool(solvable)
-
-    def _is_open(self, choice: Choice) -> bool:
-        """Return whether a choice is possible and not solved yet."""
-        hopeless = MODELS[choice.form.model].exposure in self._hopeless
-        return choice not in self.fits and not hopeless and self._scope.allows(choice)
+        found = False
+        for choice in choices:
+            exposure = MODELS[choice.form.model].exposure
+            if choice in self.fits or exposure in self._hopeless or not self._scope.allows(choice):
+                continue
+            if (response := self._response(choice)) is not None:
+                self._solve(choice, response)
+                found = True
+        return found
 
     def _rule_out(self) -> None:
         """Rule out levels of exposure whose best candidate predicts much worse than the best."""
@@ -201,21 +186,21 @@ class Search:
         self._hopeless = {k for k, d in best.items() if d < max(best.values()) - HOPELESS}
 
     def _response(self, choice: Choice) -> Response | None:
-        """Return the curve of a choice; None: it has collapsed."""
-        key = _spline_of(choice)
-        return Response(choice.curve.base) if key is None else self._fitted[key]
+        """Return the curve of a choice, fitted with effects of cameras; None: it has collapsed."""
+        curve = choice.curve
+        if curve.splines is None:
+            return Response(curve.base)
+        form = choice.form._replace(model="view_exposure")
+        if (form, curve) not in self._fitted:
+            setup = {"form": form, "by": curve.splines, "spread": self._spread}
+            self._fitted[form, curve] = fit_response(self._training, Response(curve.base), **setup)
+        return self._fitted[form, curve]
 
-    def _fit_spline(self, key: tuple[Form, Curve]) -> Response | None:
-        """Fit a curve with splines beside a form; None: it has collapsed."""
-        form, curve = key
-        setup = {"form": form, "by": curve.splines, "spread": self._spread}
-        return fit_response(self._training, Response(curve.base), **setup)
-
-    def _solve(self, choice: Choice) -> Fit:
+    def _solve(self, choice: Choice, response: Response) -> Fit:
         """Solve a choice under its curve on the observations that are not held out."""
         setup = {"use": self._use, "tolerance": COMPARED, "near": self._nearest(choice)}
-        response = self._response(choice)
-        return solve_model(self._problem, choice.form, response, **setup)[0]
+        self.fits[choice] = solve_model(self._problem, choice.form, response, **setup)[0], response
+        return self.fits[choice][0]
 
     def _nearest(self, choice: Choice) -> Fit | None:
         """Return the solution of the most similar choice; exposures count most."""
@@ -254,16 +239,6 @@ class Search:
         difference = _largest_difference(best.errors - found.errors, self._views)
         fields = (self.fits[choice][1], self._parameters(choice), density)
         return Candidate(choice, *fields, deficits[0], max(errors), difference)
-
-
-def _spline_of(choice: Choice) -> tuple[Form, Curve] | None:
-    """Return a curve with splines and the form beside which it is fitted; None: no splines.
-
-    The form has the effects of cameras, but no gammas, which bend curves as well.
-    """
-    if choice.curve.splines is None:
-        return None
-    return choice.form._replace(model="view_exposure"), choice.curve
 
 
 def _predict(problem: Problem, fit: Fit, response: Response, held: np.ndarray) -> Predicted:

@@ -8,7 +8,6 @@ from solving import DRIVE, ISO4, PLAIN, adjust, problem_of, rms, select
 from synthetic_drive import make_drive, make_exposures, observe
 
 from p2gs_jax.evaluation.alignment import exposure_error
-from p2gs_jax.photometry import candidates
 from p2gs_jax.photometry.adjustment.problem import KnownExposures
 from p2gs_jax.photometry.adjustment.solve import fit_response
 from p2gs_jax.photometry.candidates import Candidate, choose
@@ -134,15 +133,6 @@ def test_the_simulated_variation_is_found(exposures, curve, gamma, model, respon
     assert any(r.startswith("Model kept:") for r in s.reasons)
     if exposures == "constant":
         assert any("too little to determine the shape" in r for r in s.reasons)
-
-
-def test_candidates_do_not_depend_on_the_number_of_cores(monkeypatch):
-    o = observe(SHORT, make_exposures(SHORT, "iso2"), curve="filmic")
-    found = []
-    for cores in (1, 3):
-        monkeypatch.setattr(candidates, "available_cores", lambda n=cores: n)
-        found.append([(c.choice, c.response, c.density) for c in select(o).candidates])
-    assert found[0] == found[1]
 
 
 @pytest.mark.parametrize(
