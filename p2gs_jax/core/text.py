@@ -1,12 +1,10 @@
-"""Text from outside, such as file names and JSON: safe in terminals, Markdown and pictures."""
+"""Text from outside, such as file names and JSON: safe in terminals and Markdown."""
 
 from __future__ import annotations
 
-import contextlib
 import json
 import re
-import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 # Control characters except tab and newline, surrogates, and marks of the direction of writing.
@@ -75,21 +73,3 @@ def markdown_table(names: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     lines = [[escaped(cell) for cell in row] for row in (names, *rows)]
     lines.insert(1, ["---", *["---:"] * (len(names) - 1)])
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
-@contextlib.contextmanager
-def names_as_they_are() -> Iterator[None]:
-    """Let matplotlib draw names unchanged: a context manager, or a decorator.
-
-    Text between dollars is not a formula. Letters that the font lacks are boxes in the picture,
-    without a warning in the terminal. The caller escapes control characters (`printable`).
-    """
-    # Imported here, because it is slow to load.
-    import matplotlib
-
-    with matplotlib.rc_context(), warnings.catch_warnings():
-        # Defaults, because matplotlib reads a `matplotlibrc` of the working folder.
-        matplotlib.rcdefaults()
-        matplotlib.rcParams["text.parse_math"] = False
-        warnings.filterwarnings("ignore", message="Glyph", category=UserWarning)
-        yield

@@ -21,7 +21,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullFormatter, StrMethodFormatter
 from scipy.ndimage import median_filter
 
-from p2gs_jax.core.text import names_as_they_are, printable
+from p2gs_jax.core.text import printable
+from p2gs_jax.run.plots import names_as_they_are
 
 # Width of the charts, CSS pixels; one point of matplotlib is one pixel.
 WIDTH = 860

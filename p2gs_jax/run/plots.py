@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import textwrap
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import cycle
 from pathlib import Path
@@ -17,7 +19,7 @@ from jaxtyping import Float
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.core.numerics import LN2
-from p2gs_jax.core.text import names_as_they_are, printable
+from p2gs_jax.core.text import printable
 from p2gs_jax.evaluation.scores import ViewResult
 from p2gs_jax.photometry.display import develop, usual_display
 from p2gs_jax.photometry.response import Response, log_exposed
@@ -41,6 +43,24 @@ CHANNELS = ("red", "green", "blue")
 MOST_CURVES = 12  # in the plot of a calibration
 # Number of letters that fit into the narrowest panel.
 TITLE_LETTERS = 36
+
+
+@contextlib.contextmanager
+def names_as_they_are() -> Iterator[None]:
+    """Let matplotlib draw names unchanged: a context manager, or a decorator.
+
+    Text between dollars is not a formula. Letters that the font lacks are boxes in the picture,
+    without a warning in the terminal. The caller escapes control characters (`printable`).
+    """
+    # Imported here, because it is slow to load.
+    import matplotlib
+
+    with matplotlib.rc_context(), warnings.catch_warnings():
+        # Defaults, because matplotlib reads a `matplotlibrc` of the working folder.
+        matplotlib.rcdefaults()
+        matplotlib.rcParams["text.parse_math"] = False
+        warnings.filterwarnings("ignore", message="Glyph", category=UserWarning)
+        yield
 
 
 @names_as_they_are()

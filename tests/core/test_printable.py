@@ -11,8 +11,9 @@ from rich.text import Text
 
 import p2gs_jax
 from p2gs_jax.core.progress import PlainConsole
-from p2gs_jax.core.text import markdown_table, names_as_they_are, printable
+from p2gs_jax.core.text import markdown_table, printable
 from p2gs_jax.jobs.job import ProgressFile
+from p2gs_jax.run.plots import names_as_they_are
 
 
 @pytest.mark.parametrize(
