@@ -30,7 +30,7 @@ from p2gs_jax.jobs.configs import read_sweep
 BLOCKS = [block for page in PAGES for block in blocks(page)]
 
 
-def testable(*languages):
+def blocks_to_run(*languages):
     """Return blocks of some languages that can be tested."""
     return [b for b in BLOCKS if b.language in languages and b.skip is None]
 
@@ -69,7 +69,7 @@ def test_every_block_has_a_language_that_is_tested():
     assert {block.language for block in BLOCKS} <= set(LANGUAGES)
 
 
-PYTHON_PAGES = sorted({b.page for b in testable("python")})
+PYTHON_PAGES = sorted({b.page for b in blocks_to_run("python")})
 # Pages with several whole fits.
 LONG_PAGES = ("api.md",)
 
@@ -84,7 +84,7 @@ LONG_PAGES = ("api.md",)
 def test_python_runs(page, folder, quick_presets):
     """Blocks of a page follow each other in one namespace."""
     namespace = {"__name__": "__main__"}
-    for block in testable("python"):
+    for block in blocks_to_run("python"):
         if block.page == page:
             padded = "\n" * (block.line - 1) + block.code  # so that tracebacks name the page's line
             exec(compile(padded, block.page, "exec"), namespace)
@@ -119,7 +119,7 @@ def run_of_notebook(words):
     assert stop.value.code == 0, words
 
 
-@each(testable("sh"))
+@each(blocks_to_run("sh"))
 def test_commands_can_be_parsed(block, tmp_path, monkeypatch):
     """Every argument can be parsed; nothing is run."""
     monkeypatch.chdir(tmp_path)
@@ -159,7 +159,7 @@ def check_ours(argv, where):
         options.checked()
 
 
-@each([b for b in testable("sh") if b.run])
+@each([b for b in blocks_to_run("sh") if b.run])
 def test_cheap_commands_run(block, folder, quick_presets):
     for words in commands(block.code):
         with pytest.raises(SystemExit) as stop:
@@ -167,14 +167,14 @@ def test_cheap_commands_run(block, folder, quick_presets):
         assert stop.value.code == 0, words
 
 
-@each(testable("toml"))
+@each(blocks_to_run("toml"))
 def test_sweep_files_are_read(block, tmp_path):
     path = tmp_path / "sweep.toml"
     path.write_text(block.code)
     assert read_sweep(path).configs
 
 
-@each(testable("json"))
+@each(blocks_to_run("json"))
 def test_json_can_be_parsed(block):
     json.loads(block.code)
 
