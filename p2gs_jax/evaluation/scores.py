@@ -217,11 +217,11 @@ def notes_on_missing(metrics: dict[str, Any]) -> list[str]:
     """Return notes on views without scores or exposures, from the metrics of an evaluation."""
     out = []
     if hidden := metrics.get("hidden"):
-        out.append(f"Without scores, because masks hide the whole view: {first_few(hidden)}.")
+        out.append(f"Masks hide every pixel of {first_few(hidden)}, so no score is known there.")
     if unknown := metrics.get("exposures_unknown"):
         out.append(
-            "Black or saturated everywhere, so exposures in photometry.json are meaningless: "
-            f"{first_few(unknown)}."
+            f"Exposures in photometry.json are meaningless for {first_few(unknown)}: all pixels "
+            "are black or saturated."
         )
     return out
 

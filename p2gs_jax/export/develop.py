@@ -143,8 +143,8 @@ class _Lab:
         """Return what users must know about exposures that were assumed."""
         names = [self.views[row].name for row in np.flatnonzero(~self.solved).tolist()]
         note = (
-            "Too few points in common with others: the mean exposure of the camera, which may be "
-            f"wrong, was used for {first_few(names)}."
+            f"The mean exposure of the camera was used for {first_few(names)} and may be wrong: "
+            "too few points are visible in other photographs as well."
         )
         return [note] if names else []
 

@@ -326,7 +326,7 @@ def _stack_messages(views: tuple[View, ...], found: StackColors, local_ev: float
     out = []
     dark = [view.name for view, signal in zip(views, found.signal, strict=True) if not signal]
     if dark:
-        out.append("Little signal, black or saturated nearly everywhere: " + first_few(dark) + ".")
+        out.append(f"Nearly all pixels are black or saturated in {first_few(dark)}.")
     moved = np.abs(found.shifts).max()
     if moved > 0:
         out.append(f"Frames were moved by up to {count_of(moved, 'pixel')}.")

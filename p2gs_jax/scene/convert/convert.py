@@ -168,8 +168,8 @@ def _without_twins(kinds: dict[Path, Kind]) -> tuple[dict[Path, Kind], list[str]
             dropped.update(path for path in files if path != best)
     if not dropped:
         return kinds, []
-    note = f"{count_of(len(dropped), 'second file')} of a photograph in another format "
-    note += f"({min(dropped).name}, ...) will not be read."
+    note = f"{count_of(len(dropped), 'file')} will not be read ({min(dropped).name}, ...), because "
+    note += "the same photograph exists in another format."
     return {path: kind for path, kind in kinds.items() if path not in dropped}, [note]
 
 

@@ -120,7 +120,7 @@ def test_raw_beside_jpeg_is_one_photograph(folder: Path, monkeypatch) -> None:
     write_image(folder / "a.jpg", 90, (96, 64))
     result = converted(folder)
     assert list(result.originals.values()) == [folder / "a.dng"]
-    assert noted(result, "1 second file of a photograph")
+    assert noted(result, "1 file will not be read (a.jpg, ...), because the same photograph")
     # The raw file's EXIF reaches the converted file.
     for file in (folder / "a.dng", *result.paths):
         assert exif_evs([file])[0] == pytest.approx(np.log2(1 / 250 * 400 / 2.8**2), abs=1e-3)
