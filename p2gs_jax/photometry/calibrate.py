@@ -220,8 +220,8 @@ def _chosen(
     used = options if problem.with_known_power.size else dataclasses.replace(options, known=None)
     small = used.problem(_subset(observations, seed, MOST_OBSERVATIONS))
     held = held_out(small.observations, seed)
-    training = used.problem(_subset(small.observations.picked(~held), seed, SPLINE_OBSERVATIONS))
-    search = Search(small, held, training, known=options.known_response is not None)
+    few = used.problem(_subset(small.observations.picked(~held), seed, SPLINE_OBSERVATIONS))
+    search = Search(small, held, few, known=options.known_response is not None)
     notes = search.first()
     if options.known_response is not None:
         notes = [

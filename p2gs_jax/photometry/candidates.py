@@ -14,8 +14,9 @@ from jaxtyping import Bool, Float
 
 from p2gs_jax.config import Level
 from p2gs_jax.core.numerics import LN2
-from p2gs_jax.photometry.adjustment.equations import SMALLEST_SCALE
+from p2gs_jax.photometry.adjustment.equations import SMALLEST_SCALE, predict
 from p2gs_jax.photometry.adjustment.errors import clusters_of
+from p2gs_jax.photometry.adjustment.parameters import Forward
 from p2gs_jax.photometry.adjustment.problem import Problem
 from p2gs_jax.photometry.adjustment.solve import (
     COMPARED,
@@ -104,17 +105,16 @@ class Predicted(NamedTuple):
 class Search:
     """Choices solved so far (`fits`), and how well they predict the observations `held` out.
 
-    Splines are fitted to `training`, a part of the others. If the curve is `known`, it is sRGB.
+    Splines are fitted to `few` of the others. If the curve is `known`, it is sRGB.
     """
 
     def __init__(
-        self, problem: Problem, held: Bool[np.ndarray, " o"], training: Problem, *, known: bool
+        self, problem: Problem, held: Bool[np.ndarray, " o"], few: Problem, *, known: bool
     ):
         self.fits: dict[Choice, tuple[Fit, Response]] = {}
-        self._problem, self._training, o = problem, training, problem.observations
-        self._use, self._where = (~held).astype(np.float64), np.flatnonzero(held)
-        self._views = o.views[self._where]
-        self._regions = clusters_of(o, problem.layout.row)[self._where]
+        self._problem, self._training, self._few = problem, problem.part(~held), few
+        o, self._held = problem.observations, held
+        self._views, self._regions = o.views[held], clusters_of(o, problem.layout.row)[held]
         self._predicted: dict[Choice, Predicted] = {}
         self._hopeless: set[Level | None] = set()
         self._fitted: dict[tuple[Form, Curve], Response | None] = {}
@@ -193,13 +193,13 @@ class Search:
         form = choice.form._replace(model="view_exposure")
         if (form, curve) not in self._fitted:
             setup = {"form": form, "by": curve.splines, "spread": self._spread}
-            self._fitted[form, curve] = fit_response(self._training, Response(curve.base), **setup)
+            self._fitted[form, curve] = fit_response(self._few, Response(curve.base), **setup)
         return self._fitted[form, curve]
 
     def _solve(self, choice: Choice, response: Response) -> Fit:
         """Solve a choice under its curve on the observations that are not held out."""
-        setup = {"use": self._use, "tolerance": COMPARED, "near": self._nearest(choice)}
-        self.fits[choice] = solve_model(self._problem, choice.form, response, **setup)[0], response
+        setup = {"tolerance": COMPARED, "near": self._nearest(choice)}
+        self.fits[choice] = solve_model(self._training, choice.form, response, **setup)[0], response
         return self.fits[choice][0]
 
     def _nearest(self, choice: Choice) -> Fit | None:
@@ -217,7 +217,7 @@ class Search:
         """Return a candidate for every solution, with the quality of its predictions."""
         for choice, fit in self.fits.items():
             if choice not in self._predicted:
-                self._predicted[choice] = _predict(self._problem, *fit, self._where)
+                self._predicted[choice] = _predict(self._problem, *fit, self._held)
         # A solution may predict no observation at all.
         density = {
             k: -np.inf if np.isnan(p.densities).all() else float(np.nanmean(p.densities))
@@ -241,18 +241,22 @@ class Search:
         return Candidate(choice, *fields, deficits[0], max(errors), difference)
 
 
-def _predict(problem: Problem, fit: Fit, response: Response, held: np.ndarray) -> Predicted:
-    """Return predictions of held-out rows.
+def _predict(
+    problem: Problem, fit: Fit, response: Response, held: Bool[np.ndarray, " o"]
+) -> Predicted:
+    """Return predictions of the observations `held` out; `fit` is the solution of the others.
 
     The noise model depends on the curve, but must not decide between curves. The noise under sRGB
     is therefore used for all, rescaled to the prediction errors in each range of brightness.
     """
-    o, layout = problem.observations, problem.layout
-    sigma, slope = (a[held] for a in o.decoded(response)[1:])
-    y, precision = o.colors[held], fit.at.precision[layout.row[held]]
+    o, weight = problem.observations, np.zeros(problem.usable.shape)
+    weight[~held] = fit.at.weight
+    model = Forward.of(problem, problem.usable, response, fit.model.unknowns)
+    residual, precision = predict(model, fit.theta, weight)
+    sigma, y, precision = model.sigma[held], o.colors[held], precision[problem.layout.row[held]]
     known = problem.usable[held] & (precision > 1e-3)
     a = fit.theta.a[o.views[held]][:, None]
-    error = fit.at.residual[held] / slope
+    error = residual[held] / model.slope[held]
     srgb_slope, noise = base_log(y, "srgb")[1], o.picked(held).decoded(Response())[1]
     # The radiance of a point is uncertain as well.
     of_point = 1 + a**2 / np.maximum(precision * sigma**2, 1e-9)

@@ -97,6 +97,18 @@ def test_sparse_terms_agree_with_products_of_their_dense_matrix():
     check(terms.scaled(by, scaled), np.where(first, by[:, :, None] * factor, factor))
 
 
+def test_accelerated_rounds_solve_a_slow_linear_iteration():
+    """Along the slowest direction 94 % of the error would otherwise be left after six rounds."""
+    rng, rounds = np.random.default_rng(0), []
+    axes, target = np.linalg.qr(rng.normal(size=(9, 9)))[0], rng.normal(size=9)
+    shrink = axes @ np.diag([0.99, 0.97, 0.6, *6 * [0.0]]) @ axes.T
+    vector = np.zeros(9)
+    for _ in range(6):
+        rounds.append((vector, (shrink - np.eye(9)) @ (vector - target)))
+        vector = solve.accelerated(rounds)
+    np.testing.assert_allclose(vector, target, rtol=0, atol=1e-6)
+
+
 def with_surfaces(o, frames, seed):
     """Return observations in which points of one surface change alike along the drive."""
     rng = np.random.default_rng(seed)

@@ -50,9 +50,7 @@ def weigh(model: Forward, theta: Parameters, weight: PerChannel, loss: Loss) -> 
     layout, z, sigma, slope = model.layout, model.z, model.sigma, model.slope
     if theta.c.size:
         z, sigma, slope = model.unknowns.splines.decode(model, theta.c)
-    a, b = theta.a[layout.views][:, None], theta.b[layout.views]
-    added = 0.0 if model.features is None else model.features.of(theta.k)
-    z_of_point = z - (b + a * added)
+    a, added, z_of_point = _of_points(model, theta, z)
     radiance, _ = _radiance(layout, a, z_of_point, weight)
     u = (z_of_point - a * radiance[layout.row]) / sigma
     scale = max(1.4826 * _median(model, np.abs(u)), SMALLEST_SCALE)
@@ -76,6 +74,27 @@ def weigh(model: Forward, theta: Parameters, weight: PerChannel, loss: Loss) -> 
     of_point = radiance[layout.row]
     fields = z_of_point - a * of_point, radiance, of_point + added, precision
     return Weighted(weight, sigma, slope, *fields, scale, curvature)
+
+
+def predict(
+    model: Forward, theta: Parameters, weight: PerChannel
+) -> tuple[PerChannel, Float[np.ndarray, "r 3"]]:
+    """Return residuals, and the precision of each row's radiance, under a fixed response.
+
+    The radiances come from `weight`, which is 0 for values that are held out.
+    """
+    a, _, z = _of_points(model, theta, model.z)
+    radiance, precision = _radiance(model.layout, a, z, weight)
+    return z - a * radiance[model.layout.row], precision
+
+
+def _of_points(model: Forward, theta: Parameters, z: PerChannel):
+    """Return a, features in log units, and the part of `z` that points explain."""
+    views = model.layout.views
+    a, added = theta.a[views][:, None], 0.0
+    if model.features is not None:
+        added = model.features.of(theta.k)
+    return a, added, z - (theta.b[views] + a * added)
 
 
 def _whole_points(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -63,6 +64,7 @@ class Terms:
     """
 
     groups: tuple[Alike, ...]
+    at: tuple[Int[np.ndarray, " t"], Int[np.ndarray, " t"]]  # value and parameter of every term
     count: int  # number of parameters
     values: int  # number of values
 
@@ -76,8 +78,11 @@ class Terms:
         order = np.lexsort(short.T)
         differs = (short[order[1:]] != short[order[:-1]]).any(1)
         groups = np.split(order, np.flatnonzero(differs) + 1)
-        alike = (Alike(g, index[g[0]], factor[g].T.copy()) for g in groups if len(g))
-        return cls(tuple(alike), count, len(index))
+        alike = tuple(Alike(g, index[g[0]], factor[g].T.copy()) for g in groups if len(g))
+        where = [np.tile(g.where, len(g.columns)) for g in alike]
+        columns = [np.repeat(g.columns, len(g.where)) for g in alike]
+        at = (np.concatenate([np.zeros(0, int), *part]) for part in (where, columns))
+        return cls(alike, (*at,), count, len(index))
 
     def of(self, parameters: Float[np.ndarray, " k"]) -> Float[np.ndarray, "o 3"]:
         """Return the sums at some parameters."""
@@ -94,17 +99,18 @@ class Terms:
             groups.append(Alike(where, columns, scaled))
         return replace(self, groups=tuple(groups))
 
+    @functools.cached_property
+    def _factors(self) -> Float[np.ndarray, " t"]:
+        """Factors of all terms, in the order of `at`."""
+        return np.concatenate([np.zeros(0), *(group.factors.ravel() for group in self.groups)])
+
     def sums(
         self, values: Float[np.ndarray, "o 3"], place: Int[np.ndarray, "o 3"], places: int
     ) -> Float[np.ndarray, "places k"]:
         """Return sums of values times factors by `place`, one of `places`, for each parameter."""
-        total, values, place = np.zeros((self.count + 1, places)), values.ravel(), place.ravel()
-        for where, columns, factors in self.groups:
-            here, weights = place[where], values[where]
-            for column, factor in zip(columns, factors, strict=True):
-                # `bincount` would visit all places for each of many groups.
-                np.add.at(total[column], here, weights * factor)
-        return total[:-1].T
+        (where, columns), width = self.at, self.count + 1
+        at, weights = place.ravel()[where] * width + columns, values.ravel()[where] * self._factors
+        return np.bincount(at, weights, places * width).reshape(places, width)[:, :-1]
 
     def total(self, values: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, " k"]:
         """Return the sum of values times factors for each parameter."""

@@ -8,7 +8,7 @@ start near enough for a loss that ignores large residuals.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,7 +21,13 @@ from jaxtyping import Float
 from p2gs_jax.config import ResponseKind
 from p2gs_jax.photometry.adjustment.equations import Loss, Weighted, normal_equations, weigh
 from p2gs_jax.photometry.adjustment.matrices import Matrix, is_small, whole
-from p2gs_jax.photometry.adjustment.parameters import Forward, Parameters, System, make_system
+from p2gs_jax.photometry.adjustment.parameters import (
+    Forward,
+    Parameters,
+    System,
+    Vector,
+    make_system,
+)
 from p2gs_jax.photometry.adjustment.problem import Problem
 from p2gs_jax.photometry.models import EXPOSURES, Form
 from p2gs_jax.photometry.response import Response, rises
@@ -29,8 +35,9 @@ from p2gs_jax.photometry.response import Response, rises
 # Number of rounds under the L1 loss, and largest number of rounds under both losses.
 L1_ROUNDS, MOST_ROUNDS = 4, 60
 A_RANGE = (0.3, 3.0)  # limits of a = 2.2 / gamma
-# Change of a parameter, log units, at which rounds end: for the result, and for comparisons.
-TOLERANCE, COMPARED = 1e-5, 5e-3
+# Largest change, log units, at which rounds end: of results, comparisons and fits of splines.
+TOLERANCE, COMPARED, OF_SPLINES = 1e-5, 2e-3, 5e-3
+MEMORY = 5  # number of earlier rounds that accelerate a round
 DAMPING = 1e-8  # damping of the balanced matrix, whose diagonal is 1
 GROUPS = 1000  # number of groups of neighbouring unknowns in the coarse system
 # Relative residual and number of iterations at which conjugate gradients end.
@@ -142,16 +149,18 @@ class Fit(NamedTuple):
     model: Forward  # the model
     normal: Matrix  # reduced normal matrix, without gauges and priors
     rounds: int  # number of iterations
-    moved: float  # largest change of a parameter in the last round, log units
+    moved: float  # largest change in the last round (`_step`), log units
     # Remaining change if it shrinks as in the last two rounds, log units; inf if it grew.
     left: float
     converged: bool  # `moved` is less than the tolerance
 
 
-def _step(
-    model: Forward, system: System, theta: Parameters, at: Weighted
-) -> tuple[Parameters, float]:
-    """Return the parameters after one Gauss-Newton step, and the largest change of a parameter."""
+def _step(model: Forward, system: System, theta: Parameters, at: Weighted) -> tuple[Vector, float]:
+    """Return a Gauss-Newton step, and its largest change.
+
+    It is the largest change of an exposure, a gamma, the light that cameras add, or a knot.
+    Coefficients of vignetting may change much where the light that they add hardly does.
+    """
     u, vector = system.unknowns, theta.vector()
     normal, right = normal_equations(model, theta, at, np.float32)
     normal = normal + system.priors.normal
@@ -163,11 +172,26 @@ def _step(
         normal = normal + smooth
         of_c = smooth[u.at.c, u.at.c].toarray() @ theta.c
         right = right - np.concatenate([np.zeros(u.at.c.start), of_c])
-    step = u.split(Balanced(normal, gauges, system.basis).solve(right))
-    new = Parameters(*(x + dx for x, dx in zip(theta, step, strict=True)))
-    new = new._replace(a=np.clip(new.a, *A_RANGE))
-    changes = zip(new, theta, strict=True)
-    return new, float(np.max([np.abs(x - y).max(initial=0.0) for x, y in changes]))
+    step = Balanced(normal, gauges, system.basis).solve(right)
+    step[u.at.a] = np.clip(theta.a + step[u.at.a], *A_RANGE) - theta.a
+    changes = u.split(step)
+    if model.features is not None:
+        changes = changes._replace(k=model.features.of(changes.k))
+    return step, max(float(np.abs(change).max(initial=0.0)) for change in changes)
+
+
+def accelerated(rounds: Sequence[tuple[Vector, Vector]]) -> Vector:
+    """Return the vector after the last of some rounds, given as vectors and steps.
+
+    Anderson's acceleration (Walker and Ni 2011): the combination of rounds with the shortest step.
+    """
+    vectors, steps = (np.array(part) for part in zip(*rounds, strict=True))
+    if len(rounds) == 1:
+        return vectors[0] + steps[0]
+    moves, changes = np.diff(vectors, axis=0).T, np.diff(steps, axis=0).T
+    size = np.maximum(np.linalg.norm(changes, axis=0), 1e-30)
+    share = np.linalg.lstsq(changes / size, steps[-1], rcond=1e-3)[0] / size
+    return vectors[-1] + steps[-1] - (moves + changes) @ share
 
 
 def solve(
@@ -175,16 +199,25 @@ def solve(
 ) -> Fit:
     """Adjust exposures, gammas, cameras and response to observations (float64).
 
-    Rounds end when the largest change of a parameter is below the tolerance, log units. `loss`
-    applies after the L1 rounds. A start `near` the solution of another form also needs L1 rounds:
-    that form may lack a parameter and have taken inliers for outliers.
+    Rounds end when the largest change (`_step`) is below the tolerance, log units. `loss` applies
+    after the L1 rounds. A start `near` the solution of another form also needs L1 rounds: that form
+    may lack a parameter and have taken inliers for outliers.
     """
     theta, weight = system.start if near is None else near, model.noise_weight
     moved, before, count = np.inf, np.inf, 0
+    rounds: list[tuple[Vector, Vector]] = []
     for count in range(1, MOST_ROUNDS + 1):
         at = weigh(model, theta, weight, "l1" if count <= L1_ROUNDS else loss)
         weight, before = at.weight, moved
-        theta, moved = _step(model, system, theta, at)
+        step, moved = _step(model, system, theta, at)
+        # Comparisons are accelerated. Results are not, because two plain rounds tell what is left.
+        # Neither the first rounds under a loss nor those before a long step predict the next one.
+        too_long = rounds and np.linalg.norm(step) > 2 * np.linalg.norm(rounds[-1][1])
+        if tolerance <= TOLERANCE or count <= L1_ROUNDS + 2 or too_long:
+            rounds = []
+        rounds = [*rounds[-MEMORY:], (theta.vector(), step)]
+        theta = system.unknowns.split(accelerated(rounds))
+        theta = theta._replace(a=np.clip(theta.a, *A_RANGE))
         # The first round under another loss does not predict the next one.
         if count > L1_ROUNDS + 1 and moved < tolerance:
             break
@@ -206,20 +239,18 @@ def solve_model(
     form: Form,
     response: Response,
     *,
-    use: Float[np.ndarray, " o"] | None = None,
     splines: ResponseKind | None = None,
     tolerance: float = TOLERANCE,
     loss: Loss = "geman_mcclure",
     near: Fit | None = None,
 ) -> tuple[Fit, System]:
-    """Solve one form under a response; `use` is 0 for observations that are held out.
+    """Solve one form under a response.
 
     `splines` over the response's base are solved as well (None: none). The tolerance and the loss
     are those of `solve`, which begins `near` the solution of another form or response.
     """
-    weight = problem.usable if use is None else problem.usable * use[:, None]
     system = make_system(problem, form, splines)
-    model = Forward.of(problem, weight, response, system.unknowns)
+    model = Forward.of(problem, problem.usable, response, system.unknowns)
     begin = None if near is None else system.near(near.theta, near.model.unknowns)
     with one_thread():
         return solve(model, system, tolerance, loss, begin), system
@@ -263,9 +294,9 @@ def fit_response(
     `form` has no gammas, because they bend curves as well. `spread` is `light_spread` under the
     base; None: it is computed.
     """
-    fit, system = solve_model(problem, form, base, splines=by, tolerance=COMPARED)
+    fit, system = solve_model(problem, form, base, splines=by, tolerance=OF_SPLINES)
     if spread is None:
-        spread = light_spread(solve_model(problem, form, base, tolerance=COMPARED)[0])
+        spread = light_spread(solve_model(problem, form, base, tolerance=OF_SPLINES)[0])
     splines = system.unknowns.splines.values(fit.theta.c)
     mean, *each = (tuple(map(float, values)) for values in (splines.mean(0), *splines))
     response = Response(base.base, mean, by, () if by == "all" else tuple(each))
