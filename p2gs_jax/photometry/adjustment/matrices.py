@@ -79,10 +79,10 @@ class Terms:
         differs = (short[order[1:]] != short[order[:-1]]).any(1)
         groups = np.split(order, np.flatnonzero(differs) + 1)
         alike = tuple(Alike(g, index[g[0]], factor[g].T.copy()) for g in groups if len(g))
-        where = [np.tile(g.where, len(g.columns)) for g in alike]
-        columns = [np.repeat(g.columns, len(g.where)) for g in alike]
-        at = (np.concatenate([np.zeros(0, int), *part]) for part in (where, columns))
-        return cls(alike, (*at,), count, len(index))
+        none = np.zeros(0, int)
+        where = np.concatenate([none, *(np.tile(g.where, len(g.columns)) for g in alike)])
+        columns = np.concatenate([none, *(np.repeat(g.columns, len(g.where)) for g in alike)])
+        return cls(alike, (where, columns), count, len(index))
 
     def of(self, parameters: Float[np.ndarray, " k"]) -> Float[np.ndarray, "o 3"]:
         """Return the sums at some parameters."""
