@@ -251,7 +251,7 @@ def _predict(
     """
     o, weight = problem.observations, np.zeros(problem.usable.shape)
     weight[~held] = fit.at.weight
-    model = Forward.of(problem, problem.usable, response, fit.model.unknowns)
+    model = Forward.of(problem, response, fit.model.unknowns)
     residual, precision = predict(model, fit.theta, weight)
     sigma, y, precision = model.sigma[held], o.colors[held], precision[problem.layout.row[held]]
     known = problem.usable[held] & (precision > 1e-3)

@@ -71,7 +71,7 @@ def explain(
     for pick, points, part in _blocks(problem):
         mine, usable = part.observations, part.usable
         # Exposures are fixed: a few rounds find each point's radiance and robust weights.
-        model = Forward.of(part, usable, response, fit.model.unknowns)
+        model = Forward.of(part, response, fit.model.unknowns)
         weight = model.noise_weight
         for loss in ("l1", "l1", "geman_mcclure", "geman_mcclure"):
             at = weigh(model, fit.theta, weight, loss)

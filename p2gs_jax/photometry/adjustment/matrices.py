@@ -64,7 +64,6 @@ class Terms:
     """
 
     groups: tuple[Alike, ...]
-    at: tuple[Int[np.ndarray, " t"], Int[np.ndarray, " t"]]  # value and parameter of every term
     count: int  # number of parameters
     values: int  # number of values
 
@@ -78,11 +77,8 @@ class Terms:
         order = np.lexsort(short.T)
         differs = (short[order[1:]] != short[order[:-1]]).any(1)
         groups = np.split(order, np.flatnonzero(differs) + 1)
-        alike = tuple(Alike(g, index[g[0]], factor[g].T.copy()) for g in groups if len(g))
-        none = np.zeros(0, int)
-        where = np.concatenate([none, *(np.tile(g.where, len(g.columns)) for g in alike)])
-        columns = np.concatenate([none, *(np.repeat(g.columns, len(g.where)) for g in alike)])
-        return cls(alike, (where, columns), count, len(index))
+        alike = (Alike(g, index[g[0]], factor[g].T.copy()) for g in groups if len(g))
+        return cls(tuple(alike), count, len(index))
 
     def of(self, parameters: Float[np.ndarray, " k"]) -> Float[np.ndarray, "o 3"]:
         """Return the sums at some parameters."""
@@ -100,16 +96,21 @@ class Terms:
         return replace(self, groups=tuple(groups))
 
     @functools.cached_property
-    def _factors(self) -> Float[np.ndarray, " t"]:
-        """Factors of all terms, in the order of `at`."""
-        return np.concatenate([np.zeros(0), *(group.factors.ravel() for group in self.groups)])
+    def _terms(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Value, parameter and factor of every term."""
+        where, columns, factors = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros(0)]
+        for group in self.groups:
+            where.append(np.tile(group.where, len(group.columns)))
+            columns.append(np.repeat(group.columns, len(group.where)))
+            factors.append(group.factors.ravel())
+        return np.concatenate(where), np.concatenate(columns), np.concatenate(factors)
 
     def sums(
         self, values: Float[np.ndarray, "o 3"], place: Int[np.ndarray, "o 3"], places: int
     ) -> Float[np.ndarray, "places k"]:
         """Return sums of values times factors by `place`, one of `places`, for each parameter."""
-        (where, columns), width = self.at, self.count + 1
-        at, weights = place.ravel()[where] * width + columns, values.ravel()[where] * self._factors
+        (where, columns, factors), width = self._terms, self.count + 1
+        at, weights = place.ravel()[where] * width + columns, values.ravel()[where] * factors
         return np.bincount(at, weights, places * width).reshape(places, width)[:, :-1]
 
     def total(self, values: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, " k"]:

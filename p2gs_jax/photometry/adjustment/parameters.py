@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from p2gs_jax.config import Level, ResponseKind, VignettingKind
 from p2gs_jax.core.numerics import LN2
@@ -227,7 +227,7 @@ class Forward(NamedTuple):
     layout: Layout
     z: PerChannel  # log exposed radiance under the base curve, relative to the pivot
     sigma: PerChannel  # its standard deviation
-    weight: PerChannel  # 1 used, 0 masked or held out
+    weight: PerChannel  # 1 used, 0 masked
     knot: Int[np.ndarray, "o 3"]  # left spline knot
     fraction: PerChannel  # fraction of the distance to the next knot
     slope: PerChannel  # dz/dy under the base curve
@@ -241,20 +241,14 @@ class Forward(NamedTuple):
         return self.weight / self.sigma**2
 
     @classmethod
-    def of(
-        cls,
-        problem: Problem,
-        weight: PerChannel | Bool[np.ndarray, "o 3"],
-        response: Response,
-        unknowns: Unknowns,
-    ) -> Forward:
+    def of(cls, problem: Problem, response: Response, unknowns: Unknowns) -> Forward:
         """Return the observations under a response, with the terms of the model."""
         layout, o = problem.layout, problem.observations
         features, splines = unknowns.features, unknowns.splines
         z, sigma, slope = o.decoded(response)
         knot, fraction = hat(np.asarray(o.colors, np.float64))
         group = spline_groups(splines.by, layout.cameras[layout.views], z.shape)
-        values = (z - problem.log_pivot, sigma, np.asarray(weight, np.float64))
+        values = (z - problem.log_pivot, sigma, problem.usable.astype(np.float64))
         index, factor = features.terms(layout)
         more = terms = Terms.of_index(index, factor, features.count) if features.count else None
         if splines.count:

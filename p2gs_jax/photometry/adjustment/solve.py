@@ -250,7 +250,7 @@ def solve_model(
     are those of `solve`, which begins `near` the solution of another form or response.
     """
     system = make_system(problem, form, splines)
-    model = Forward.of(problem, problem.usable, response, system.unknowns)
+    model = Forward.of(problem, response, system.unknowns)
     begin = None if near is None else system.near(near.theta, near.model.unknowns)
     with one_thread():
         return solve(model, system, tolerance, loss, begin), system
@@ -264,7 +264,7 @@ def with_free_curve(
     The splines of a response were fitted to the same observations and are uncertain as well.
     """
     system = make_system(problem, form, response.by)
-    model = Forward.of(problem, problem.usable, response, system.unknowns)
+    model = Forward.of(problem, response, system.unknowns)
     theta = fit.theta._replace(c=system.start.c)
     normal = normal_equations(model, theta, fit.at)[0]
     return fit._replace(model=model, theta=theta, normal=normal), system
