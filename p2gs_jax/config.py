@@ -247,9 +247,6 @@ class OptimizerConfig:
     """Rate of spherical harmonics of degree 0 (3DGS: 2.5e-3; ours: BUILD_NOTES, "Rates")."""
     sh_rest: float = 6e-3
     """Rate of spherical harmonics of degrees 1 to 3 (3DGS: 2.5e-3 / 20)."""
-    sh_decay: float | None = 0.3
-    """Decoupled weight decay of harmonics of degrees 1 to 3 (Loshchilov and Hutter 2019); None: no
-    decay (3DGS; ours: BUILD_NOTES, "Harmonics decay")."""
     opacities: float = 3e-1
     """Rate of the logits of opacities (3DGS: 5e-2)."""
     scales: float = 1.2e-1

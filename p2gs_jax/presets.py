@@ -45,7 +45,6 @@ PUBLISHED: Fields = {
     "optimizer.scales": 5e-3,
     "optimizer.sh_dc": 2.5e-3,
     "optimizer.sh_rest": 1.25e-4,
-    "optimizer.sh_decay": None,
     "optimizer.opacities": 5e-2,
     "optimizer.quats": 1e-3,
     "optimizer.final": 1.0,

@@ -188,7 +188,7 @@ def _advance(
         v_inputs=jax.tree.map(
             lambda g: g / views, visibility.take_rows(sums.gradient, listed, bands)
         ),
-        optimizer=optimizer,
+        adam=optimizer.gaussians,
         rates=rates.gaussians,
         noise=None if noise is None else exploring,
         owner=population.owner,

@@ -82,28 +82,17 @@ class Optimizer(NamedTuple):
 
     gaussians: Adam
     rest: Adam
-    sh_decay: float | None  # `OptimizerConfig.sh_decay`
 
     def init(self, params: Params) -> OptState:
         """Return the state before the first step."""
         rest = (params.photometry, params.appearance)
         return OptState(self.gaussians.init(params.gaussians), self.rest.init(rest))
 
-    def move(
-        self, grads: Gaussians, moments: AdamState, gaussians: Gaussians, rates: Gaussians
-    ) -> tuple[Gaussians, AdamState]:
-        """Return Gaussians and moments after an update; harmonics of degrees 1 to 3 decay."""
-        moved, moments = self.gaussians.update(grads, moments, gaussians, rates)
-        if self.sh_decay is None:
-            return moved, moments
-        kept = (1 - self.sh_decay * rates.sh).at[0].set(1.0)
-        return dataclasses.replace(moved, sh=moved.sh * kept), moments
-
 
 def make_optimizer(cfg: FitConfig) -> Optimizer:
     """Return the optimiser of a fit; exposures, gammas and corrections use Adam's default betas."""
     o = cfg.optimizer
-    return Optimizer(Adam(o.b1, o.b2, o.eps, by_row=True), Adam(eps=o.eps), o.sh_decay)
+    return Optimizer(Adam(o.b1, o.b2, o.eps, by_row=True), Adam(eps=o.eps))
 
 
 def means_rate(progress: Array, factor: Array, extent: float, cfg: FitConfig) -> Float[Array, ""]:

@@ -134,7 +134,7 @@ def advance(
             splat(block, on, frustum, cfg.render, controls.active_degree, owner)
         ),
         v_inputs=gradient.v_shown,
-        optimizer=optimizer,
+        adam=optimizer.gaussians,
         rates=rates.gaussians,
         noise=None if noise is None else exploring,
         owner=population.owner,
@@ -158,7 +158,7 @@ def update_listed(
     bands: int,
     inputs_of: Callable[[Gaussians, Bool[Array, " b"], Any], Any],
     v_inputs: Any,
-    optimizer: optimizers.Optimizer,
+    adam: optimizers.Adam,
     rates: Gaussians,
     noise: Callable[..., Float[Array, "b 3"]] | None,
     owner: Int[Array, " n"] | None = None,
@@ -188,7 +188,7 @@ def update_listed(
             take_rows(state.moments.mu, here, bands),
             take_rows(state.moments.nu, here, bands),
         )
-        moved, new = optimizer.move(grads, before, old, rates)
+        moved, new = adam.update(grads, before, old, rates)
         if noise is not None:
             moved = dataclasses.replace(moved, means=moved.means + noise(k, here, moved, live))
         where = jnp.where(healthy & jnp.all(finite), here, n)

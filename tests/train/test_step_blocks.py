@@ -31,8 +31,7 @@ COUNT, HIDDEN = 6000, 600
 PROGRESS, RATE = 0.3, 0.7
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
 PHOTOMETRY = ("raw_exposures", "raw_gammas")
-# Harmonics decay by more than the tolerance of an update.
-CFG = with_values(config(method=None), {"optimizer.sh_decay": 30.0})
+CFG = config(method=None)
 CONTROLS = Controls(np.float32(PROGRESS), np.int32(DEGREE), np.float32(RATE), np.uint32(0))
 
 
@@ -99,8 +98,6 @@ def test_one_step_is_an_adam_update_of_the_gradient_of_the_loss(made):
         old = rows_of(made.params.gaussians, name, made.seen)
         new = rows_of(state.params.gaussians, name, made.seen)
         expected = old - rate * rows_of(updates.gaussians, name, made.seen)
-        if name == "sh":
-            expected[:, 1:] *= 1 - o.sh_decay * rate[1:]
         np.testing.assert_allclose(new, expected, rtol=1e-6, atol=2e-3 * rate.max())
         assert np.abs(new - old).max() > 0.5 * rate.max(), name
     got, v = state.opt_state.rest.mu[0], made.gradient.photometry
