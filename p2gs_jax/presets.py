@@ -53,6 +53,7 @@ PUBLISHED: Fields = {
     "optimizer.gammas": 1e-2,
     "optimizer.photometry_final": 1.0,
     "optimizer.extent": "cameras",
+    "loss.near_depth": 0.0,
     "optimizer.b1": 0.9,
     "optimizer.b2": 0.999,
     "optimizer.visible_only": False,

@@ -187,7 +187,7 @@ class Optimiser:
         one (`larger`). Otherwise they are the most frequent choice, and the returned function
         compiles again for the choice of the scene.
         """
-        guess = larger or likely(found.cfg, kept, found.near)
+        guess = larger or likely(found.cfg, kept, found.scale)
 
         def begin(decisions: Decisions, curve_known: bool) -> None:
             start = expected(found, decisions)

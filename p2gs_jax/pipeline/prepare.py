@@ -76,7 +76,7 @@ def initialise(found: Survey, exposures: Exposures, reporter: Reporter | None = 
     reporter, scene, nodes = reporter or Silent(), found.scene, found.nodes
     decisions = exposures.decisions
     if exposures.radiance is None:
-        decisions = dataclasses.replace(decisions, near=found.near)
+        decisions = dataclasses.replace(decisions, **found.scale)
     cfg, views = decisions.resolve(found.cfg), scene.training_views
     photometry = jax.tree.map(on_device, exposures.photometry)
     added, shell = None, found.shell

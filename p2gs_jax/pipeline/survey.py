@@ -52,7 +52,7 @@ class Survey:
     vibrating: bool  # Gaussians move without boxes
     radius: float  # radius of the cameras
     extent: float  # unit of the rates of means
-    near: float | None  # closer near plane, if the one in `cfg` would cut the scene
+    scale: dict[str, float | None]  # decisions that follow from the depths of the scene
     coverage: Coverage  # extent of the scene in the views
     measured: list[Measured] | None  # depths of every training view for the loss
     dense: bool  # more seeds come from optical flow
@@ -121,8 +121,11 @@ def survey(
     _require_something_to_see(scene, fitted)
     radius = seeding.cameras_radius(scene.training_views, scene.points)
     depths = seen_depths(scene.points, scene.training_views)
-    near, extent = near_plane(near_depth(depths), cfg), extent_of_rates(radius, depths, cfg)
-    notes, init = scale_notes(scene, near, cfg, near_depth(depths)), _shell_options(store, cfg)
+    scale, extent = decided_scale(near_depth(depths), cfg), extent_of_rates(radius, depths, cfg)
+    notes, init = (
+        scale_notes(scene, scale["near"], cfg, near_depth(depths)),
+        _shell_options(store, cfg),
+    )
     seeds, thinned = _choose_points(scene, cfg)
     coverage = coverage_of(scene, cfg.data.max_width)
     dense = wants_dense(scene, coverage, cfg)
@@ -138,7 +141,7 @@ def survey(
         vibrating=vibrating,
         radius=radius,
         extent=extent,
-        near=near,
+        scale=scale,
         coverage=coverage,
         measured=measured_depths(scene, cfg),
         dense=dense,
@@ -211,6 +214,13 @@ def near_plane(depth: float | None, cfg: FitConfig) -> float | None:
     if depth is None or cfg.render.near <= NEAR_SHARE * depth:
         return None
     return float(f"{NEAR_SHARE * depth:.2g}")
+
+
+def decided_scale(depth: float | None, cfg: FitConfig) -> dict[str, float | None]:
+    """Return the decisions that follow from the depth of near points, by their names."""
+    given = cfg.loss.near_depth
+    rounded = None if depth is None else float(f"{depth:.2g}")
+    return {"near": near_plane(depth, cfg), "near_depth": rounded if given is None else given}
 
 
 def scale_notes(scene: Scene, near: float | None, cfg: FitConfig, depth: float | None) -> list[str]:

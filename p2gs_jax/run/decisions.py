@@ -9,6 +9,7 @@ decisions of its checkpoints.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -50,6 +51,7 @@ class Decisions:
     cameras: tuple[config.CameraFormation, ...] = ()
     # closer near plane, scene units, if the one in the options would cut the scene; or None
     near: float | None = None
+    near_depth: float | None = None  # depth below which gradients are scaled, scene units, or None
 
     @classmethod
     def as_given(cls, cfg: config.FitConfig) -> Decisions:
@@ -113,6 +115,7 @@ _PLACES = {
     "vignetting": "photometry.vignetting",
     "responses": "photometry.responses",
     "cameras": "photometry.cameras",
+    "near_depth": "loss.near_depth",
 }
 
 
@@ -159,10 +162,12 @@ def decide(cfg: config.FitConfig, selection: Selection | None, kept: Decisions |
     )
 
 
-def likely(cfg: config.FitConfig, kept: Decisions | None, near: float | None) -> Decisions | None:
+def likely(
+    cfg: config.FitConfig, kept: Decisions | None, scale: Mapping[str, float | None]
+) -> Decisions | None:
     """Return the most frequent decisions, to compile for them early; None: unpredictable.
 
-    `near` is the decided near plane, or None.
+    `scale` has the decisions that follow from the depths of the scene.
     """
     p, relative = cfg.photometry, cfg.loss.relative_exposure
     if p.known is not None or relative.weight is not None or cfg.densify.method != "mcmc":
@@ -171,7 +176,7 @@ def likely(cfg: config.FitConfig, kept: Decisions | None, near: float | None) ->
     camera_effects = p.start == "tracks" and (p.vignetting is not None or p.responses != "all")
     if kept is None and not p.select and camera_effects:
         return None
-    decided = dataclasses.replace(Decisions.as_given(cfg), near=near)
+    decided = dataclasses.replace(Decisions.as_given(cfg), **scale)
     if kept is not None:
         chosen = ("model", "curve", "spline", "white_balance", "vignetting", "responses", "cameras")
         return dataclasses.replace(decided, **{name: getattr(kept, name) for name in chosen})

@@ -212,13 +212,22 @@ def differentiate(
     return ImageGradient(
         loss,
         aux.terms,
-        differentiable(v_shown),
+        _without_floaters(differentiable(v_shown), shown[0].depths, cfg),
         tuple(v_rest),
         aux.render.count,
         aux.render.overflow,
         aux.render.visible,
         -10 * jnp.log10(jnp.maximum(mse, 1e-10)),
     )
+
+
+def _without_floaters(v_shown: tuple[Array, ...], depths: Float[Array, " v"], cfg: FitConfig):
+    """Scale the gradients of near Gaussians, which one view moves more than all others."""
+    near = cfg.loss.near_depth
+    if not near:
+        return v_shown
+    share = jnp.clip(depths / near, 0, 1) ** 2
+    return jax.tree.map(lambda v: v * share.reshape(-1, *[1] * (v.ndim - 1)), v_shown)
 
 
 def differentiable(shown: Shown) -> tuple[Array, ...]:

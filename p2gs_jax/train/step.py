@@ -40,7 +40,7 @@ OPTIONS_READ: dict[str, dict[str, Any]] = {
     "differentiate": {
         "render": None,
         "photometry": FORMATION_OPTIONS,
-        "loss": ("censored", "saturation"),
+        "loss": ("censored", "saturation", "near_depth"),
     },
     "advance": {
         "render": None,

@@ -9,6 +9,7 @@ from tiny_scene import make_scene
 from p2gs_jax.config import FitConfig
 from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.pipeline.survey import (
+    decided_scale,
     extent_of_rates,
     near_depth,
     near_plane,
@@ -67,6 +68,16 @@ def test_a_near_plane_that_cuts_nothing_stays(scene):
     assert near_plane(nearest(scene), cfg) is None
     assert near_plane(None, cfg) is None
     assert Decisions.as_given(cfg).resolve(cfg).render.near == 0.5
+
+
+def test_gradients_are_scaled_up_to_the_depth_of_near_points_or_as_the_options_say(scene):
+    depth, off = nearest(scene), with_fields(FitConfig(), {"loss.near_depth": 0.0})
+    decided = dataclasses.replace(
+        Decisions.as_given(FitConfig()), **decided_scale(depth, FitConfig())
+    )
+    assert decided.resolve(FitConfig()).loss.near_depth == pytest.approx(depth, rel=0.05)
+    assert decided_scale(depth, off)["near_depth"] == 0
+    assert decided_scale(None, FitConfig())["near_depth"] is None
 
 
 def test_points_that_no_view_shows_have_no_depth(scene):

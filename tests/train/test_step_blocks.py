@@ -31,7 +31,8 @@ COUNT, HIDDEN = 6000, 600
 PROGRESS, RATE = 0.3, 0.7
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
 PHOTOMETRY = ("raw_exposures", "raw_gammas")
-CFG = config(method=None)
+NEAR_DEPTH = 5.0  # of Gaussians from 3 to 8
+CFG = with_values(config(method=None), {"loss.near_depth": NEAR_DEPTH})
 CONTROLS = Controls(np.float32(PROGRESS), np.int32(DEGREE), np.float32(RATE), np.uint32(0))
 
 
@@ -61,6 +62,11 @@ def made():
 
     slope = jax.jit(jax.value_and_grad(objective, argnums=(0, 1)))
     loss, (gradient, probe) = jax.device_get(slope(params, jnp.zeros((COUNT, 2))))
+    R, t = batch.camera.viewmat[:3, :3], batch.camera.viewmat[:3, 3]
+    depths = np.asarray(params.gaussians.means @ R[2] + t[2])
+    share = np.clip(depths / NEAR_DEPTH, 0, 1) ** 2
+    near = jax.tree.map(lambda g: (g.T * share).T, (gradient.gaussians, probe))
+    gradient, probe = dataclasses.replace(gradient, gaussians=near[0]), near[1]
     tight = Capacity(64, BLOCK)
     overflowed = step(tight)
     fault = overflowed[0].fault

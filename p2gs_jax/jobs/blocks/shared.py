@@ -17,7 +17,7 @@ from p2gs_jax.gaussians.shell import Sphere, sphere_behind
 from p2gs_jax.jobs.blocks.cut import Cut, block_scene
 from p2gs_jax.photometry.parameters import point_radiance
 from p2gs_jax.pipeline.exposures import Exposures, solve_exposures
-from p2gs_jax.pipeline.survey import near_depth, near_plane, scale_notes, seen_depths
+from p2gs_jax.pipeline.survey import decided_scale, near_depth, scale_notes, seen_depths
 from p2gs_jax.run.decisions import Decisions, read_decisions, write_decisions
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Photometry, Scene
@@ -50,9 +50,9 @@ def solve_shared(
         raise UserError(why, fix="fit it without --blocks, or with a structure-from-motion model")
     views = scene.training_views
     depth = near_depth(seen_depths(scene.points, views))
-    near = near_plane(depth, cfg)
+    scale = decided_scale(depth, cfg)
     decisions = dataclasses.replace(
-        solved.decisions, freeze_until=1.0, log_exposure_mean=None, near=near
+        solved.decisions, freeze_until=1.0, log_exposure_mean=None, **scale
     )
     resolved = decisions.resolve(cfg)
     if scene.point_colors is None:
@@ -63,7 +63,7 @@ def solve_shared(
         decisions=decisions,
         observations=None,
         radiance=point_radiance(scene, solved.selection.solution, resolved),
-        notes=(*scale_notes(scene, near, cfg, depth), *solved.notes),
+        notes=(*scale_notes(scene, scale["near"], cfg, depth), *solved.notes),
     )
     radius = cameras_radius(views, scene.points)
     return Shared(scene, exposures, sphere_behind(views, scene.points, radius, cfg.init))
