@@ -231,7 +231,7 @@ class LossConfig:
     near_depth: float | None = None
     """Depth, scene units, below which gradients are scaled by the square of depth / near_depth, so
     that no floaters grow before a camera (Philip and Deschaintre 2023; ours: BUILD_NOTES,
-    "Floaters"). 0: never; None: in fits the depth of near points, otherwise never."""
+    "Floaters"). 0: never; None: in fits half the depth of near points, otherwise never."""
     relative_exposure: RelativeExposureConfig = field(default_factory=RelativeExposureConfig)
     """The relative-exposure loss."""
     regularizers: RegularizerConfig = field(default_factory=RegularizerConfig)

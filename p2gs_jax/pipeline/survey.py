@@ -33,6 +33,8 @@ from p2gs_jax.types import Measured, Scene, View
 
 # The near plane is at most this share of the depth of near points (this percentile of depths).
 NEAR_SHARE, NEAR_PERCENTILE = 0.2, 1.0
+# Gradients are scaled up to this share of the depth of near points: floaters gather before it.
+FREE_SHARE = 0.5
 # Percentile of depths that stands for near surfaces; many of the farther points are occluded.
 EXTENT_PERCENTILE = 10.0
 # Spacing of float32 at the cameras, as a share of the near depth, above which surfaces jitter.
@@ -219,8 +221,8 @@ def near_plane(depth: float | None, cfg: FitConfig) -> float | None:
 def decided_scale(depth: float | None, cfg: FitConfig) -> dict[str, float | None]:
     """Return the decisions that follow from the depth of near points, by their names."""
     given = cfg.loss.near_depth
-    rounded = None if depth is None else float(f"{depth:.2g}")
-    return {"near": near_plane(depth, cfg), "near_depth": rounded if given is None else given}
+    near = None if depth is None else float(f"{FREE_SHARE * depth:.2g}")
+    return {"near": near_plane(depth, cfg), "near_depth": near if given is None else given}
 
 
 def scale_notes(scene: Scene, near: float | None, cfg: FitConfig, depth: float | None) -> list[str]:

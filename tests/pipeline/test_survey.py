@@ -70,12 +70,12 @@ def test_a_near_plane_that_cuts_nothing_stays(scene):
     assert Decisions.as_given(cfg).resolve(cfg).render.near == 0.5
 
 
-def test_gradients_are_scaled_up_to_the_depth_of_near_points_or_as_the_options_say(scene):
+def test_gradients_are_scaled_up_to_half_the_depth_of_near_points_or_as_the_options_say(scene):
     depth, off = nearest(scene), with_fields(FitConfig(), {"loss.near_depth": 0.0})
     decided = dataclasses.replace(
         Decisions.as_given(FitConfig()), **decided_scale(depth, FitConfig())
     )
-    assert decided.resolve(FitConfig()).loss.near_depth == pytest.approx(depth, rel=0.05)
+    assert decided.resolve(FitConfig()).loss.near_depth == pytest.approx(depth / 2, rel=0.05)
     assert decided_scale(depth, off)["near_depth"] == 0
     assert decided_scale(None, FitConfig())["near_depth"] is None
 
