@@ -54,7 +54,7 @@ def test_without_solved_exposures_only_white_balance_per_view_remains():
     cfg = with_fields(FitConfig(), fields)
     decided = decide(cfg, None, None)
     assert (decided.white_balance, decided.vignetting) == ("view", None)
-    assert likely(cfg, None, None) == decided
+    assert likely(cfg, None, {}) == decided
     by_camera = with_fields(cfg, {"photometry.white_balance": "camera"})
     assert unsolved(Decisions.as_given(by_camera)).white_balance is None
 
