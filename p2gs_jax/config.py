@@ -229,7 +229,7 @@ class LossConfig:
     lidar: float | None = None
     """Weight of the error of log depth at LiDAR points (ours)."""
     near_depth: float | None = None
-    """Depth, scene units, below which gradients are scaled by the square of depth / near_depth, so
+    """Depth, scene units. Gradients of nearer Gaussians are scaled by (depth / near_depth)^2, so
     that no floaters grow before a camera (Philip and Deschaintre 2023; ours: BUILD_NOTES,
     "Floaters"). 0: never; None: in fits half the depth of near points, otherwise never."""
     relative_exposure: RelativeExposureConfig = field(default_factory=RelativeExposureConfig)

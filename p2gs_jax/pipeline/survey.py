@@ -123,11 +123,9 @@ def survey(
     _require_something_to_see(scene, fitted)
     radius = seeding.cameras_radius(scene.training_views, scene.points)
     depths = seen_depths(scene.points, scene.training_views)
-    scale, extent = decided_scale(near_depth(depths), cfg), extent_of_rates(radius, depths, cfg)
-    notes, init = (
-        scale_notes(scene, scale["near"], cfg, near_depth(depths)),
-        _shell_options(store, cfg),
-    )
+    depth, extent = near_depth(depths), extent_of_rates(radius, depths, cfg)
+    scale, init = decided_scale(depth, cfg), _shell_options(store, cfg)
+    notes = scale_notes(scene, scale["near"], cfg, depth)
     seeds, thinned = _choose_points(scene, cfg)
     coverage = coverage_of(scene, cfg.data.max_width)
     dense = wants_dense(scene, coverage, cfg)

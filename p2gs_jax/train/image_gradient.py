@@ -221,13 +221,15 @@ def differentiate(
     )
 
 
-def _without_floaters(v_shown: tuple[Array, ...], depths: Float[Array, " v"], cfg: FitConfig):
-    """Scale the gradients of near Gaussians, which one view moves more than all others."""
+def _without_floaters(
+    v_shown: tuple[Array, ...], depths: Float[Array, " v"], cfg: FitConfig
+) -> tuple[Array, ...]:
+    """Scale the gradients of near Gaussians down (`LossConfig.near_depth`)."""
     near = cfg.loss.near_depth
     if not near:
         return v_shown
     share = jnp.clip(depths / near, 0, 1) ** 2
-    return jax.tree.map(lambda v: v * share.reshape(-1, *[1] * (v.ndim - 1)), v_shown)
+    return tuple(v * share.reshape(-1, *[1] * (v.ndim - 1)) for v in v_shown)
 
 
 def differentiable(shown: Shown) -> tuple[Array, ...]:
