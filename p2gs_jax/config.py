@@ -230,7 +230,7 @@ class LossConfig:
     """Weight of the error of log depth at LiDAR points (ours)."""
     near_depth: float | None = None
     """Depth, scene units. Gradients of nearer Gaussians are scaled by (depth / near_depth)^2, so
-    that no floaters grow before a camera (Philip and Deschaintre 2023; ours: BUILD_NOTES,
+    that fewer floaters grow before a camera (Philip and Deschaintre 2023; ours: BUILD_NOTES,
     "Floaters"). 0: never; None: in fits half the depth of near points, otherwise never."""
     relative_exposure: RelativeExposureConfig = field(default_factory=RelativeExposureConfig)
     """The relative-exposure loss."""
