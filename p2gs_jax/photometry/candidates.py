@@ -119,13 +119,13 @@ class Search:
         self._hopeless: set[Level | None] = set()
         self._fitted: dict[tuple[Form, Curve], Response | None] = {}
         # Spread of the light of one surface under sRGB, log units; None: each form solves it.
-        self._spread: float | None = light_spread(self._solve(Choice(EXPOSURES), Response()))
+        self._spread: float | None = self._light_spread(EXPOSURES)
         self._spread_ev = self._spread / LN2
         curves, places = self._spread_ev >= SPLINE_SPREAD_EV, o.positions is not None
         if not curves and places:
             # Vignetting determines a curve at equal exposures: corners show surfaces darker.
-            shaded = self._solve(Choice(EXPOSURES._replace(vignetting="camera")), Response())
-            curves, self._spread = light_spread(shaded) / LN2 >= SHADED_SPREAD_EV, None
+            shaded = self._light_spread(EXPOSURES._replace(vignetting="camera"))
+            curves, self._spread = shaded / LN2 >= SHADED_SPREAD_EV, None
         cameras = int(o.cameras.max(initial=0)) + 1
         self._scope = Scope(cameras, places, curves, known, problem.with_known_power.size > 0)
         if not self._scope.allows(Choice(EXPOSURES)):
@@ -201,6 +201,11 @@ class Search:
         setup = {"tolerance": COMPARED, "near": self._nearest(choice)}
         self.fits[choice] = solve_model(self._training, choice.form, response, **setup)[0], response
         return self.fits[choice][0]
+
+    def _light_spread(self, form: Form) -> float:
+        """Return the spread of the light of one surface under sRGB, log units."""
+        fit = self._solve(Choice(form), Response())
+        return light_spread(fit.model, fit.theta)
 
     def _nearest(self, choice: Choice) -> Fit | None:
         """Return the solution of the most similar choice; exposures count most."""

@@ -87,7 +87,7 @@ def test_sparse_terms_agree_with_products_of_their_dense_matrix():
         at_places = (place.ravel() == np.arange(places)[:, None]) * values.ravel()
         close = functools.partial(np.testing.assert_allclose, rtol=0, atol=1e-11)
         close(terms.of(parameters), (dense @ parameters).reshape(300, 3))
-        close(terms.sums(values, place, places), at_places @ dense)
+        close(terms.sums(values, terms.at(place), places), at_places @ dense)
         close(terms.total(values), dense.T @ values.ravel())
         close(terms.products(values), dense.T @ (values.ravel()[:, None] * dense))
 

@@ -232,16 +232,18 @@ def _with_others(
 ) -> tuple[list[Entries], Float[np.ndarray, " k"]]:
     """Return the parts of k and c in the equations: entries, and their right side."""
     layout, u = model.layout, model.unknowns
-    place = 3 * layout.row[:, None] + np.arange(3)
-    through = terms.sums(coupled, place, 3 * layout.rows)
-    first = u.at.a.stop
-    parts = []
-    at_view = np.broadcast_to(layout.views[:, None], at.weight.shape)
+    through = terms.sums(coupled, model.at_rows, 3 * layout.rows)
+    first, parts = u.at.a.stop, []
+
+    def of_each(derivative: PerChannel) -> Float[np.ndarray, "v 3 k"]:
+        side = terms.sums(at.weight * derivative, model.at_views, 3 * u.views)
+        side -= layout.at_views(coupled * derivative) @ through
+        return side.reshape(u.views, 3, -1)
+
+    # The columns of b have the same derivative in different channels.
+    sides = [of_each(one.derivative) for one in per_view[u.channels - 1 :]]
     for x, one in enumerate(per_view):
-        acting = np.isin(np.arange(3), one.channels)
-        side = terms.sums(at.weight * one.derivative * acting, at_view, u.views)
-        mine = at_places(layout, coupled * one.derivative, layout.views, u.views, one.channels)
-        side -= mine @ through
+        side = sides[x // u.channels][:, one.channels].sum(1)
         across = block(x * u.views, first, side)
         parts += [across, Entries(across.columns, across.rows, across.values)]
     corner = terms.products(at.weight) - through.T @ through
@@ -254,20 +256,6 @@ def _with_others(
     return [*parts, block(first, first, corner)], pulled
 
 
-def at_places(
-    layout: Layout,
-    values: PerChannel,
-    places: Labels,
-    count: int,
-    channels: Sequence[int] = (0, 1, 2),
-) -> sp.csr_array:
-    """Return the matrix of values of channels at `places` (rows) and points: (count, 3 rows)."""
-    at = 3 * layout.row[:, None] + np.array(channels)
-    where = np.broadcast_to(places[:, None], at.shape)
-    shape = (count, 3 * layout.rows)
-    return sp.csr_array((values[:, channels].ravel(), (where.ravel(), at.ravel())), shape=shape)
-
-
 def summed(
     model: Forward, theta: Parameters, at: Weighted, values: PerChannel, places: Labels
 ) -> sp.csr_array:
@@ -278,7 +266,7 @@ def summed(
     at_views, shape = (places, layout.views), (count, u.views)
     per_view = [sp.csr_array((total, at_views), shape=shape) for total in totals]
     terms, place = others(model, theta), np.broadcast_to(places[:, None], values.shape)
-    more = None if terms is None else terms.sums(values, place, count)
+    more = None if terms is None else terms.sums(values, terms.at(place), count)
     return over_all(u, per_view, more)
 
 

@@ -210,13 +210,27 @@ def _shared_scores(
     layout, u = model.layout, model.unknowns
     coupled = equations.coupling(layout, theta, at)
     per_view = [
-        equations.at_places(layout, coupled * p.derivative, layout.views, u.views, p.channels).T
+        _at_places(layout, coupled * p.derivative, layout.views, u.views, p.channels).T
         for p in equations.of_views(model, at)
     ]
-    terms, place = equations.others(model, theta), 3 * layout.row[:, None] + np.arange(3)
-    more = None if terms is None else terms.sums(coupled, place, 3 * layout.rows)
+    terms = equations.others(model, theta)
+    more = None if terms is None else terms.sums(coupled, model.at_rows, 3 * layout.rows)
     size = np.broadcast_to(size, labels.shape)[:, None]
-    of_points = equations.at_places(layout, coupled * size, labels, int(labels.max(initial=-1)) + 1)
+    of_points = _at_places(layout, coupled * size, labels, int(labels.max(initial=-1)) + 1)
     return summed(model, theta, at, at.weight * size, labels) - of_points @ equations.over_all(
         u, per_view, more
     )
+
+
+def _at_places(
+    layout: Layout,
+    values: PerChannel,
+    places: Labels,
+    count: int,
+    channels: Sequence[int] = (0, 1, 2),
+) -> sp.csr_array:
+    """Return the matrix of values of channels at `places` (rows) and points: (count, 3 rows)."""
+    at = layout.row_channel[:, channels]
+    where = np.broadcast_to(places[:, None], at.shape)
+    shape = (count, 3 * layout.rows)
+    return sp.csr_array((values[:, channels].ravel(), (where.ravel(), at.ravel())), shape=shape)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -66,6 +65,11 @@ class Terms:
     groups: tuple[Alike, ...]
     count: int  # number of parameters
     values: int  # number of values
+    # Value and parameter of every term, in the order of the groups.
+    where: Int[np.ndarray, " t"]
+    columns: Int[np.ndarray, " t"]
+    # Row times width plus column of every product of two terms, in the order of the groups.
+    squares: Int[np.ndarray, " s"]
 
     @classmethod
     def of_index(
@@ -76,9 +80,19 @@ class Terms:
         short = index.astype(np.min_scalar_type(count))  # sorted faster
         order = np.lexsort(short.T)
         differs = (short[order[1:]] != short[order[:-1]]).any(1)
-        groups = np.split(order, np.flatnonzero(differs) + 1)
-        alike = (Alike(g, index[g[0]], factor[g].T.copy()) for g in groups if len(g))
-        return cls(tuple(alike), count, len(index))
+        rows = [g for g in np.split(order, np.flatnonzero(differs) + 1) if len(g)]
+        groups = tuple(Alike(g, index[g[0]], factor[g].T.copy()) for g in rows)
+        none = np.zeros(0, int)
+        return cls(
+            groups,
+            count,
+            len(index),
+            np.concatenate([none, *(np.tile(g.where, len(g.columns)) for g in groups)]),
+            np.concatenate([none, *(np.repeat(g.columns, len(g.where)) for g in groups)]),
+            np.concatenate(
+                [none, *(np.add.outer((count + 1) * c, c).ravel() for _, c, _ in groups)]
+            ),
+        )
 
     def of(self, parameters: Float[np.ndarray, " k"]) -> Float[np.ndarray, "o 3"]:
         """Return the sums at some parameters."""
@@ -95,23 +109,18 @@ class Terms:
             groups.append(Alike(where, columns, scaled))
         return replace(self, groups=tuple(groups))
 
-    @functools.cached_property
-    def _terms(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Value, parameter and factor of every term."""
-        where, columns, factors = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros(0)]
-        for group in self.groups:
-            where.append(np.tile(group.where, len(group.columns)))
-            columns.append(np.repeat(group.columns, len(group.where)))
-            factors.append(group.factors.ravel())
-        return np.concatenate(where), np.concatenate(columns), np.concatenate(factors)
+    def at(self, place: Int[np.ndarray, "o 3"]) -> Int[np.ndarray, " t"]:
+        """Return where `sums` adds every term if the values are at these places."""
+        return place.ravel()[self.where] * (self.count + 1) + self.columns
 
     def sums(
-        self, values: Float[np.ndarray, "o 3"], place: Int[np.ndarray, "o 3"], places: int
+        self, values: Float[np.ndarray, "o 3"], at: Int[np.ndarray, " t"], places: int
     ) -> Float[np.ndarray, "places k"]:
-        """Return sums of values times factors by `place`, one of `places`, for each parameter."""
-        (where, columns, factors), width = self._terms, self.count + 1
-        at, weights = place.ravel()[where] * width + columns, values.ravel()[where] * factors
-        return np.bincount(at, weights, places * width).reshape(places, width)[:, :-1]
+        """Return sums of values times factors at every one of `places`, for each parameter."""
+        factors = np.concatenate([np.zeros(0), *(group.factors.ravel() for group in self.groups)])
+        factors *= values.ravel()[self.where]
+        width = self.count + 1
+        return np.bincount(at, factors, places * width).reshape(places, width)[:, :-1]
 
     def total(self, values: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, " k"]:
         """Return the sum of values times factors for each parameter."""
@@ -122,11 +131,10 @@ class Terms:
 
     def products(self, values: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, "k k"]:
         """Return the sum of values times the outer products of factors."""
-        total, values = np.zeros((self.count + 1,) * 2), values.ravel()
-        for where, columns, factors in self.groups:
-            # A parameter may occur in several terms.
-            np.add.at(total, np.ix_(columns, columns), (factors * values[where]) @ factors.T)
-        return total[:-1, :-1]
+        width, values = self.count + 1, values.ravel()
+        each = [((f * values[where]) @ f.T).ravel() for where, _, f in self.groups]
+        total = np.bincount(self.squares, np.concatenate([np.zeros(0), *each]), width**2)
+        return total.reshape(width, width)[:-1, :-1]
 
 
 class Pairs:

@@ -234,6 +234,9 @@ class Forward(NamedTuple):
     group: Int[np.ndarray, "o 3"]  # row of the spline that decodes a value, if they are solved for
     features: Terms | None  # features at every value
     terms: Terms | None  # derivatives of predictions by k and c for a = 1
+    # Where `Terms.sums` adds every term, by row and by view, each with its channel.
+    at_rows: Int[np.ndarray, " t"]
+    at_views: Int[np.ndarray, " t"]
 
     @property
     def noise_weight(self) -> PerChannel:
@@ -256,7 +259,9 @@ class Forward(NamedTuple):
             index = np.concatenate([index, features.count + there], -1)
             factor = np.concatenate([factor, -steep], -1)
             terms = Terms.of_index(index, factor, features.count + splines.count)
-        return cls(unknowns, layout, *values, knot, fraction, slope, group, more, terms)
+        places = (layout.row_channel, layout.view_channel)
+        at = (np.zeros(0, int) if terms is None else terms.at(place) for place in places)
+        return cls(unknowns, layout, *values, knot, fraction, slope, group, more, terms, *at)
 
 
 @dataclass(frozen=True)

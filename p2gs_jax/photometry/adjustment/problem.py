@@ -55,6 +55,30 @@ class Layout:
         self.by_row = sp.csr_array((ones, at), shape=(self.rows, len(points)))
 
     @functools.cached_property
+    def row_channel(self) -> Int[np.ndarray, "o 3"]:
+        """Place of every value among the channels of all rows."""
+        return 3 * self.row[:, None] + np.arange(3)
+
+    @functools.cached_property
+    def view_channel(self) -> Int[np.ndarray, "o 3"]:
+        """Place of every value among the channels of all views."""
+        return 3 * self.views[:, None] + np.arange(3)
+
+    def at_views(self, values: Float[np.ndarray, "o 3"]) -> sp.csr_array:
+        """Return the matrix of values by view and channel, and by row and channel: (3 v, 3 r)."""
+        order, ends, columns = self._by_view
+        shape = (3 * self.view_count, 3 * self.rows)
+        return sp.csr_array((values.ravel()[order], columns, ends), shape=shape)
+
+    @functools.cached_property
+    def _by_view(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Order of values by view and channel, where each of these ends, and columns of rows."""
+        place = self.view_channel.ravel()
+        order = np.argsort(place, kind="stable")
+        ends = np.cumsum(np.bincount(place, minlength=3 * self.view_count))
+        return order, np.append(0, ends), self.row_channel.ravel()[order]
+
+    @functools.cached_property
     def pairs(self) -> Pairs:
         """Every pair of observations in a row once, including an observation with itself."""
         return Pairs(self.row, self.views, self.view_count)

@@ -34,6 +34,7 @@ from p2gs_jax.photometry.response import Response, rises
 
 # Number of rounds under the L1 loss, and largest number of rounds under both losses.
 L1_ROUNDS, MOST_ROUNDS = 4, 60
+SETTLING = 2  # number of rounds after which a loss no longer changes the course
 A_RANGE = (0.3, 3.0)  # limits of a = 2.2 / gamma
 # Largest change, log units, at which rounds end: of results, comparisons and fits of splines.
 TOLERANCE, COMPARED, OF_SPLINES = 1e-5, 2e-3, 5e-3
@@ -63,20 +64,23 @@ class Balanced:
     """A normal matrix plus that of `gauges`, along the columns of `basis`, scaled to diagonal 1."""
 
     def __init__(self, normal: Matrix, gauges: sp.csr_array, basis: sp.csr_array):
-        reduced, held = basis.T @ normal @ basis, sp.csr_array(gauges @ basis)
+        # The normal matrix is symmetric.
+        reduced, held = basis.T @ (basis.T @ normal).T, sp.csr_array(gauges @ basis)
         diagonal = reduced.diagonal() + held.power(2).sum(0)
         free = np.flatnonzero(diagonal > 1e-30)
         self._scale = 1 / np.sqrt(diagonal[free])
         self._directions = basis[:, free]
-        scaling = sp.diags_array(self._scale, format="csr")
-        matrix = scaling @ reduced[free][:, free] @ scaling
-        low_rank = held[:, free] @ scaling
+        low_rank = held[:, free].toarray() * self._scale
         if is_small(len(free)):
-            dense = whole(matrix) + (low_rank.T @ low_rank).toarray()
+            dense = whole(reduced)[np.ix_(free, free)] * self._scale[:, None]
+            dense *= self._scale
+            dense += low_rank.T @ low_rank
             dense[np.diag_indices_from(dense)] += DAMPING
             self._solve = functools.partial(np.linalg.solve, dense)
         else:
-            self._solve = _iterative(sp.csr_array(matrix), low_rank.toarray())
+            scaling = sp.diags_array(self._scale, format="csr")
+            matrix = scaling @ sp.csr_array(reduced)[free][:, free] @ scaling
+            self._solve = _iterative(sp.csr_array(matrix), low_rank)
 
     def solve(self, right: Float[np.ndarray, "d ..."]) -> Float[np.ndarray, "d ..."]:
         """Return the solution along the free directions."""
@@ -195,13 +199,19 @@ def accelerated(rounds: Sequence[tuple[Vector, Vector]]) -> Vector:
 
 
 def solve(
-    model: Forward, system: System, tolerance: float, loss: Loss, near: Parameters | None = None
+    model: Forward,
+    system: System,
+    tolerance: float,
+    loss: Loss,
+    near: Parameters | None = None,
+    hopeless: Callable[[Forward, Parameters], bool] | None = None,
 ) -> Fit:
     """Adjust exposures, gammas, cameras and response to observations (float64).
 
-    Rounds end when the largest change (`_step`) is below the tolerance, log units. `loss` applies
-    after the L1 rounds. A start `near` the solution of another form also needs L1 rounds: that form
-    may lack a parameter and have taken inliers for outliers.
+    Rounds end when the largest change (`_step`) is below the tolerance, log units, or when later
+    rounds are `hopeless`. `loss` applies after the L1 rounds. A start `near` the solution of
+    another form also needs L1 rounds: that form may lack a parameter and have taken inliers for
+    outliers.
     """
     theta, weight = system.start if near is None else near, model.noise_weight
     moved, before, count = np.inf, np.inf, 0
@@ -213,13 +223,15 @@ def solve(
         # Comparisons are accelerated. Results are not, because two plain rounds tell what is left.
         # Neither the first rounds under a loss nor those before a long step predict the next one.
         too_long = rounds and np.linalg.norm(step) > 2 * np.linalg.norm(rounds[-1][1])
-        if tolerance <= TOLERANCE or count <= L1_ROUNDS + 2 or too_long:
+        if tolerance <= TOLERANCE or count <= L1_ROUNDS + SETTLING or too_long:
             rounds = []
         rounds = [*rounds[-MEMORY:], (theta.vector(), step)]
         theta = system.unknowns.split(accelerated(rounds))
         theta = theta._replace(a=np.clip(theta.a, *A_RANGE))
         # The first round under another loss does not predict the next one.
         if count > L1_ROUNDS + 1 and moved < tolerance:
+            break
+        if hopeless is not None and count > L1_ROUNDS + SETTLING and hopeless(model, theta):
             break
     at = weigh(model, theta, weight, loss)
     return Fit(
@@ -243,17 +255,18 @@ def solve_model(
     tolerance: float = TOLERANCE,
     loss: Loss = "geman_mcclure",
     near: Fit | None = None,
+    hopeless: Callable[[Forward, Parameters], bool] | None = None,
 ) -> tuple[Fit, System]:
     """Solve one form under a response.
 
-    `splines` over the response's base are solved as well (None: none). The tolerance and the loss
-    are those of `solve`, which begins `near` the solution of another form or response.
+    `splines` over the response's base are solved as well (None: none). The tolerance, the loss and
+    `hopeless` are those of `solve`, which begins `near` the solution of another form or response.
     """
     system = make_system(problem, form, splines)
     model = Forward.of(problem, response, system.unknowns)
     begin = None if near is None else system.near(near.theta, near.model.unknowns)
     with one_thread():
-        return solve(model, system, tolerance, loss, begin), system
+        return solve(model, system, tolerance, loss, begin, hopeless), system
 
 
 def with_free_curve(
@@ -270,13 +283,13 @@ def with_free_curve(
     return fit._replace(model=model, theta=theta, normal=normal), system
 
 
-def light_spread(fit: Fit) -> float:
+def light_spread(model: Forward, theta: Parameters) -> float:
     """Return the spread of the light of one surface over views and positions in images.
 
     It is the standard deviation of exposures, white balance and vignetting, log units.
     """
-    added = 0.0 if fit.model.features is None else fit.model.features.of(fit.theta.k)
-    return float(np.hypot(np.std(fit.theta.b.mean(1)), np.std(added)))
+    added = 0.0 if model.features is None else model.features.of(theta.k)
+    return float(np.hypot(np.std(theta.b.mean(1)), np.std(added)))
 
 
 def fit_response(
@@ -294,13 +307,21 @@ def fit_response(
     `form` has no gammas, because they bend curves as well. `spread` is `light_spread` under the
     base; None: it is computed.
     """
-    fit, system = solve_model(problem, form, base, splines=by, tolerance=OF_SPLINES)
     if spread is None:
-        spread = light_spread(solve_model(problem, form, base, tolerance=OF_SPLINES)[0])
+        fit, _ = solve_model(problem, form, base, tolerance=OF_SPLINES)
+        spread = light_spread(fit.model, fit.theta)
+
+    def stretched(model: Forward, theta: Parameters) -> bool:
+        stretch = (light_spread(model, theta) + 1e-3) / (spread + 1e-3)
+        free = problem.with_known_power.size == 0
+        return free and not 1 / LARGEST_STRETCH < stretch < LARGEST_STRETCH
+
+    # A spline that has stretched exposures too far does not come back, but may creep for long.
+    setup = {"splines": by, "tolerance": OF_SPLINES, "hopeless": stretched}
+    fit, system = solve_model(problem, form, base, **setup)
+    if stretched(fit.model, fit.theta):
+        return None
     splines = system.unknowns.splines.values(fit.theta.c)
     mean, *each = (tuple(map(float, values)) for values in (splines.mean(0), *splines))
     response = Response(base.base, mean, by, () if by == "all" else tuple(each))
-    stretch = (light_spread(fit) + 1e-3) / (spread + 1e-3)
-    if not problem.with_known_power.size and not 1 / LARGEST_STRETCH < stretch < LARGEST_STRETCH:
-        return None
     return response if rises(response) else None
