@@ -163,6 +163,30 @@ def test_errors_of_exposures_include_the_uncertainty_of_a_fitted_curve():
     assert 1.05 < rms(adjust(o, response=curve).exposure_errors) / rms(without_curve) < 2
 
 
+def test_a_spline_that_stretches_exposures_too_far_ends_early_and_is_not_used():
+    problem = problem_of(observe(SMALL, ISO2, curve="filmic"))
+    fit, _ = solve.solve_model(problem, VIEW_EXPOSURE, Response(), splines="all", tolerance=5e-3)
+    early, _ = solve.solve_model(
+        problem, VIEW_EXPOSURE, Response(), splines="all", hopeless=lambda *_: True
+    )
+    assert early.rounds == solve.L1_ROUNDS + solve.SETTLING + 1 < fit.rounds
+    spread = solve.light_spread(fit.model, fit.theta)
+    assert solve.fit_response(problem, Response(), spread=spread) is not None
+    for stretch in (0.5, 2):
+        assert solve.fit_response(problem, Response(), spread=stretch * spread) is None
+
+
+def test_values_are_placed_by_view_and_row():
+    layout = problem_of().layout
+    values = np.random.default_rng(0).normal(size=(len(layout.row), 3))
+    dense = np.zeros((layout.view_count, 3, layout.rows, 3))
+    for channel in range(3):
+        at = (layout.views, channel, layout.row, channel)
+        np.add.at(dense, at, values[:, channel])
+    found = layout.at_views(values).toarray().reshape(dense.shape)
+    np.testing.assert_allclose(found, dense, rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize("loss", ["geman_mcclure", "whole_points"])
 def test_the_fixed_point_minimises_the_robust_loss(loss):
     fit, _ = solve.solve_model(problem_of(), Form("view_exposure_gamma"), Response(), loss=loss)

@@ -9,7 +9,7 @@ photographs of known exposure, and 3 to 7 times for drives with simulated shared
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,8 +21,9 @@ from p2gs_jax.photometry.adjustment import equations
 from p2gs_jax.photometry.adjustment.equations import Weighted, summed, weigh
 from p2gs_jax.photometry.adjustment.matrices import is_small, whole
 from p2gs_jax.photometry.adjustment.parameters import EMPTY, Forward, Parameters, System
+from p2gs_jax.photometry.adjustment.problem import Layout
 from p2gs_jax.photometry.adjustment.solve import Balanced, Fit, one_thread
-from p2gs_jax.photometry.observations import Labels, Observations
+from p2gs_jax.photometry.observations import Labels, Observations, PerChannel
 
 CANCELLED = 1e-6  # a smaller value along a unit direction is a rounding error
 # Least information of a determined direction, where each parameter's information is scaled to 1.
