@@ -125,7 +125,7 @@ def survey(
     depths = seen_depths(scene.points, scene.training_views)
     depth, extent = near_depth(depths), extent_of_rates(radius, depths, cfg)
     scale, init = decided_scale(depth, cfg), _shell_options(store, cfg)
-    notes = scale_notes(scene, scale["near"], cfg, depth)
+    notes = scale_notes(scene, cfg, depth)
     seeds, thinned = _choose_points(scene, cfg)
     coverage = coverage_of(scene, cfg.data.max_width)
     dense = wants_dense(scene, coverage, cfg)
@@ -209,10 +209,10 @@ def extent_of_rates(radius: float, depths: Float[np.ndarray, " n"], cfg: FitConf
     return min(radius, float(np.percentile(depths, EXTENT_PERCENTILE)))
 
 
-def near_plane(depth: float | None, cfg: FitConfig) -> float | None:
-    """Return a closer near plane if the one in `cfg` would cut the scene, or None."""
+def near_plane(depth: float | None, cfg: FitConfig) -> float:
+    """Return the near plane in `cfg`, or a closer one if that one would cut the scene."""
     if depth is None or cfg.render.near <= NEAR_SHARE * depth:
-        return None
+        return cfg.render.near
     return float(f"{NEAR_SHARE * depth:.2g}")
 
 
@@ -223,10 +223,10 @@ def decided_scale(depth: float | None, cfg: FitConfig) -> dict[str, float | None
     return {"near": near_plane(depth, cfg), "near_depth": near if given is None else given}
 
 
-def scale_notes(scene: Scene, near: float | None, cfg: FitConfig, depth: float | None) -> list[str]:
+def scale_notes(scene: Scene, cfg: FitConfig, depth: float | None) -> list[str]:
     """Return notes for the user on the scene's units and position."""
-    out = []
-    if near is not None:
+    out, near = [], near_plane(depth, cfg)
+    if near < cfg.render.near:
         out.append(
             f"The near plane is {near:g} scene units instead of {cfg.render.near:g}, which would "
             "cut off surfaces that the photographs show."

@@ -43,14 +43,13 @@ class Decisions:
     log_exposure_mean: float | None  # weight of the regulariser of the mean log exposure, or None
     exposure_rate: float  # learning rate of the exposures
     gamma_rate: float  # learning rate of the gammas
+    near: float  # near plane, scene units; a closer one if that in the options would cut the scene
     reasons: tuple[str, ...] = ()  # reasons for the model and the curve, in words
     white_balance: config.Level | None = None  # level of the white balance, or None
     vignetting: config.VignettingKind | None = None  # one per camera, or per channel of a camera
     responses: config.ResponseKind = "all"  # one response for all, or per camera or channel
     # vignetting and response of each physical camera, if any
     cameras: tuple[config.CameraFormation, ...] = ()
-    # closer near plane, scene units, if the one in the options would cut the scene; or None
-    near: float | None = None
     near_depth: float | None = None  # depth below which gradients are scaled, scene units, or None
 
     @classmethod
@@ -68,7 +67,7 @@ class Decisions:
         spline = values["spline"]
         kept = {f.name: values[f.name] for f in dataclasses.fields(cls)}
         kept["spline"] = None if spline is None else tuple(map(float, spline))
-        kept["cameras"] = camera_formations(values["cameras"])
+        kept["cameras"], kept["near"] = camera_formations(values["cameras"]), float(values["near"])
         return cls(**{**kept, "reasons": tuple(values["reasons"])})
 
     def to_dict(self) -> dict[str, Any]:
@@ -79,8 +78,6 @@ class Decisions:
         """Return the options of a fit: the user's options with these values filled in."""
         values = {place: getattr(self, name) for name, place in _PLACES.items()}
         values["photometry.select"] = False
-        if self.near is not None:
-            values["render.near"] = self.near
         return with_values(cfg, values)
 
     def require_same(self, saved: dict[str, Any], folder: Path) -> None:
@@ -115,6 +112,7 @@ _PLACES = {
     "vignetting": "photometry.vignetting",
     "responses": "photometry.responses",
     "cameras": "photometry.cameras",
+    "near": "render.near",
     "near_depth": "loss.near_depth",
 }
 

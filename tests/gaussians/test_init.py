@@ -78,7 +78,7 @@ def test_a_camera_far_from_all_others_counts_for_nothing_and_is_named(tmp_path):
     sphere, plain = (sphere_behind(v, points, 5.0, InitConfig()) for v in (views, views[:-1]))
     assert (sphere.radius, sphere.middle[0]) == (plain.radius, plain.middle[0])
     scene = Scene(tmp_path, "colmap", tuple(views), points, None)
-    (note,) = scale_notes(scene, None, FitConfig(), 5.0)
+    (note,) = scale_notes(scene, FitConfig(), 5.0)
     assert "1 of 10 cameras" in note
     assert "60000.0.png" in note
     # No camera is misplaced where a car waits, or one photograph is from farther away.

@@ -130,10 +130,15 @@ def test_a_saved_choice_is_solved_again_and_its_reasons_are_repeated(tmp_path, s
     )
     kept = kept_choice(cfg, RunFolder(tmp_path))
     assert kept == first.decisions
-    older = {k: v for k, v in first.decisions.to_dict().items() if k != "near"}
-    CheckpointStore(tmp_path / "older" / "checkpoints").save(3, {"a": np.zeros(2)}, {KEY: older})
-    with pytest.raises(UserError, match="another version: KeyError\\('near'\\)"):
-        kept_choice(cfg, RunFolder(tmp_path / "older"))
+    saved = first.decisions.to_dict()
+    del saved["near_depth"]
+    for name, older, why in (
+        ("lacks", saved, "KeyError\\('near_depth'\\)"),
+        ("none", {**saved, "near_depth": None, "near": None}, "TypeError"),
+    ):
+        CheckpointStore(tmp_path / name / "checkpoints").save(3, {"a": np.zeros(2)}, {KEY: older})
+        with pytest.raises(UserError, match=f"another version: {why}"):
+            kept_choice(cfg, RunFolder(tmp_path / name))
     again = prepared(loaded, cfg, kept)
     assert again.selection is not None
     assert again.selection.reasons == reasons

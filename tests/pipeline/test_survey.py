@@ -50,9 +50,9 @@ def test_the_near_plane_follows_scenes_that_it_would_cut(scene, factor):
     assert 3 * factor < depth < 3.5 * factor
     cfg = FitConfig()
     near = near_plane(depth, cfg)
-    notes = scale_notes(some, near, cfg, depth)
+    notes = scale_notes(some, cfg, depth)
     if factor >= 1:
-        assert near is None
+        assert near == cfg.render.near
         assert notes == []
         return
     assert near == pytest.approx(0.2 * depth, rel=0.1)
@@ -65,8 +65,8 @@ def test_the_near_plane_follows_scenes_that_it_would_cut(scene, factor):
 
 def test_a_near_plane_that_cuts_nothing_stays(scene):
     cfg = with_fields(FitConfig(), {"render.near": 0.5})
-    assert near_plane(nearest(scene), cfg) is None
-    assert near_plane(None, cfg) is None
+    assert near_plane(nearest(scene), cfg) == 0.5
+    assert near_plane(None, cfg) == 0.5
     assert Decisions.as_given(cfg).resolve(cfg).render.near == 0.5
 
 
@@ -90,7 +90,7 @@ def test_points_that_no_view_shows_have_no_depth(scene):
 def test_a_scene_far_from_the_origin_is_reported_as_coarse(scene):
     depth = nearest(scene)
     for offset, coarse in ((0.0, False), (1e3, False), (1e5, True)):
-        notes = scale_notes(scaled(scene, 1.0, offset), None, FitConfig(), depth)
+        notes = scale_notes(scaled(scene, 1.0, offset), FitConfig(), depth)
         assert bool(notes) == coarse
     assert "1e+05 scene units from the origin" in notes[0]
     assert "Subtract a common offset" in notes[0]

@@ -63,7 +63,7 @@ def solve_shared(
         decisions=decisions,
         observations=None,
         radiance=point_radiance(scene, solved.selection.solution, resolved),
-        notes=(*scale_notes(scene, scale["near"], cfg, depth), *solved.notes),
+        notes=(*scale_notes(scene, cfg, depth), *solved.notes),
     )
     radius = cameras_radius(views, scene.points)
     return Shared(scene, exposures, sphere_behind(views, scene.points, radius, cfg.init))
