@@ -2,7 +2,7 @@
 
 Models under different curves are compared by the expected log predictive density of held-out
 observations in display units. The choice is the simplest candidate within max(2 standard errors,
-0.015 nat) of the best; the best itself over-selects (docs/photometry.md, 5). A candidate whose
+0.0125 nat) of the best; the best itself over-selects (docs/photometry.md, 5). A candidate whose
 predictions differ invisibly from the best's counts as well: otherwise sharp, noise-free images get
 a gamma per view for differences of 0.01 stops. Curve and model are chosen together (BUILD_NOTES): a
 wrong curve that is fixed first, or a missing white balance, leads to a gamma per view.

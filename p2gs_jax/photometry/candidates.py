@@ -43,7 +43,7 @@ from p2gs_jax.photometry.response import BASES, Response, base_log
 SPLINE_SPREAD_EV, SHADED_SPREAD_EV = 0.2, 0.05
 HOPELESS = 1.0  # deficit, nat per observation, that no tone curve compensates
 MOST_COMPARED = 80  # largest number of choices that are compared
-STANDARD_ERRORS, SMALLEST_GAIN = 2.0, 0.015  # deficits up to these (the latter in nat) are excused
+STANDARD_ERRORS, SMALLEST_GAIN = 2.0, 0.0125  # deficits up to these (the latter in nat) are excused
 LARGEST_CHANCE = 0.25  # largest deficit that a standard error excuses, nat per observation
 # Predictions that differ by at most this in every view count as equal, 8-bit levels.
 INVISIBLE_DIFFERENCE = 1.0
