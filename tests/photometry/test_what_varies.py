@@ -205,7 +205,7 @@ def test_the_simplest_model_that_is_not_clearly_worse_wins():
         return Candidate(choice, Response(), parameters, density, deficit, error, difference)
 
     simple = candidate("constant", 0, -1.0, 0.5, 0.01)
-    middle = candidate("camera_exposure", 2, -0.51, 0.013, 0.001)
+    middle = candidate("camera_exposure", 2, -0.51, 0.012, 0.001)
     rich = candidate("view_exposure", 40, -0.5, 0.0, 0.0)
     assert choose([rich, simple, middle]) is middle
     # Two standard errors are allowed, if these exceed the smallest gain.
