@@ -87,11 +87,12 @@ def test_sparse_terms_agree_with_products_of_their_dense_matrix():
         at_places = (place.ravel() == np.arange(places)[:, None]) * values.ravel()
         close = functools.partial(np.testing.assert_allclose, rtol=0, atol=1e-11)
         close(terms.of(parameters), (dense @ parameters).reshape(300, 3))
-        close(terms.sums(values, terms.at(place), places), at_places @ dense)
+        for at in (terms.index.by_row, terms.index.by_view):
+            close(terms.sums(values, at, places), at_places @ dense)
         close(terms.total(values), dense.T @ values.ravel())
         close(terms.products(values), dense.T @ (values.ravel()[:, None] * dense))
 
-    terms = matrices.Terms.of_index(index, factor, count)
+    terms = matrices.Terms.of_index(index, factor, count, place, place)
     check(terms, factor)
     first = np.arange(7) < scaled
     check(terms.scaled(by, scaled), np.where(first, by[:, :, None] * factor, factor))

@@ -232,11 +232,11 @@ def _with_others(
 ) -> tuple[list[Entries], Float[np.ndarray, " k"]]:
     """Return the parts of k and c in the equations: entries, and their right side."""
     layout, u = model.layout, model.unknowns
-    through = terms.sums(coupled, model.at_rows, 3 * layout.rows)
+    through = terms.sums(coupled, terms.index.by_row, 3 * layout.rows)
     first, parts = u.at.a.stop, []
 
     def of_each(derivative: PerChannel) -> Float[np.ndarray, "v 3 k"]:
-        side = terms.sums(at.weight * derivative, model.at_views, 3 * u.views)
+        side = terms.sums(at.weight * derivative, terms.index.by_view, 3 * u.views)
         side -= layout.at_views(coupled * derivative) @ through
         return side.reshape(u.views, 3, -1)
 
@@ -266,7 +266,7 @@ def summed(
     at_views, shape = (places, layout.views), (count, u.views)
     per_view = [sp.csr_array((total, at_views), shape=shape) for total in totals]
     terms, place = others(model, theta), np.broadcast_to(places[:, None], values.shape)
-    more = None if terms is None else terms.sums(values, terms.at(place), count)
+    more = None if terms is None else terms.sums(values, terms.index.at(place), count)
     return over_all(u, per_view, more)
 
 

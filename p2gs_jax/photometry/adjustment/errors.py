@@ -215,7 +215,7 @@ def _shared_scores(
         for p in equations.of_views(model, at)
     ]
     terms = equations.others(model, theta)
-    more = None if terms is None else terms.sums(coupled, model.at_rows, 3 * layout.rows)
+    more = None if terms is None else terms.sums(coupled, terms.index.by_row, 3 * layout.rows)
     size = np.broadcast_to(size, labels.shape)[:, None]
     of_points = _at_places(layout, coupled * size, labels, int(labels.max(initial=-1)) + 1)
     return summed(model, theta, at, at.weight * size, labels) - of_points @ equations.over_all(

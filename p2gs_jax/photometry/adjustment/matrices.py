@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -56,6 +57,51 @@ class Alike(NamedTuple):
 
 
 @dataclass(frozen=True)
+class Index:
+    """Places of all terms, in the order of the groups; they are made when first needed."""
+
+    groups: tuple[Alike, ...]
+    count: int  # number of parameters
+    # Place of every value among the channels of all rows, and of all views.
+    row_channel: Int[np.ndarray, "o 3"]
+    view_channel: Int[np.ndarray, "o 3"]
+
+    def at(self, place: Int[np.ndarray, "o 3"]) -> Int[np.ndarray, " t"]:
+        """Return where `Terms.sums` adds every term if the values are at these places."""
+        return place.ravel()[self.where] * (self.count + 1) + self.columns
+
+    @functools.cached_property
+    def by_row(self) -> Int[np.ndarray, " t"]:
+        """Where `Terms.sums` adds every term by row and channel."""
+        return self.at(self.row_channel)
+
+    @functools.cached_property
+    def by_view(self) -> Int[np.ndarray, " t"]:
+        """Where `Terms.sums` adds every term by view and channel."""
+        return self.at(self.view_channel)
+
+    @functools.cached_property
+    def where(self) -> Int[np.ndarray, " t"]:
+        """Value of every term."""
+        return _joined([np.tile(g.where, len(g.columns)) for g in self.groups], int)
+
+    @functools.cached_property
+    def columns(self) -> Int[np.ndarray, " t"]:
+        """Parameter of every term."""
+        return _joined([np.repeat(g.columns, len(g.where)) for g in self.groups], int)
+
+    @functools.cached_property
+    def squares(self) -> Int[np.ndarray, " s"]:
+        """Place of every product of two terms in the flat matrix of their parameters."""
+        width = self.count + 1
+        return _joined([np.add.outer(width * g.columns, g.columns) for g in self.groups], int)
+
+
+def _joined(parts: list[np.ndarray], kind: type) -> np.ndarray:
+    return np.concatenate([np.zeros(0, kind), *(part.ravel() for part in parts)])
+
+
+@dataclass(frozen=True)
 class Terms:
     """Linear dependence of every value on parameters, in a fixed number of terms.
 
@@ -65,34 +111,25 @@ class Terms:
     groups: tuple[Alike, ...]
     count: int  # number of parameters
     values: int  # number of values
-    # Value and parameter of every term, in the order of the groups.
-    where: Int[np.ndarray, " t"]
-    columns: Int[np.ndarray, " t"]
-    # Row times width plus column of every product of two terms, in the order of the groups.
-    squares: Int[np.ndarray, " s"]
+    index: Index
 
     @classmethod
     def of_index(
-        cls, index: Int[np.ndarray, "o 3 m"], factor: Float[np.ndarray, "o 3 m"], count: int
+        cls,
+        index: Int[np.ndarray, "o 3 m"],
+        factor: Float[np.ndarray, "o 3 m"],
+        count: int,
+        row_channel: Int[np.ndarray, "o 3"],
+        view_channel: Int[np.ndarray, "o 3"],
     ) -> Terms:
         """Group values by the parameters of their terms; the index `count` stands for no term."""
         index, factor = (part.reshape(-1, part.shape[-1]) for part in (index, factor))
         short = index.astype(np.min_scalar_type(count))  # sorted faster
         order = np.lexsort(short.T)
         differs = (short[order[1:]] != short[order[:-1]]).any(1)
-        rows = [g for g in np.split(order, np.flatnonzero(differs) + 1) if len(g)]
-        groups = tuple(Alike(g, index[g[0]], factor[g].T.copy()) for g in rows)
-        none = np.zeros(0, int)
-        return cls(
-            groups,
-            count,
-            len(index),
-            np.concatenate([none, *(np.tile(g.where, len(g.columns)) for g in groups)]),
-            np.concatenate([none, *(np.repeat(g.columns, len(g.where)) for g in groups)]),
-            np.concatenate(
-                [none, *(np.add.outer((count + 1) * c, c).ravel() for _, c, _ in groups)]
-            ),
-        )
+        groups = np.split(order, np.flatnonzero(differs) + 1)
+        alike = tuple(Alike(g, index[g[0]], factor[g].T.copy()) for g in groups if len(g))
+        return cls(alike, count, len(index), Index(alike, count, row_channel, view_channel))
 
     def of(self, parameters: Float[np.ndarray, " k"]) -> Float[np.ndarray, "o 3"]:
         """Return the sums at some parameters."""
@@ -109,16 +146,12 @@ class Terms:
             groups.append(Alike(where, columns, scaled))
         return replace(self, groups=tuple(groups))
 
-    def at(self, place: Int[np.ndarray, "o 3"]) -> Int[np.ndarray, " t"]:
-        """Return where `sums` adds every term if the values are at these places."""
-        return place.ravel()[self.where] * (self.count + 1) + self.columns
-
     def sums(
         self, values: Float[np.ndarray, "o 3"], at: Int[np.ndarray, " t"], places: int
     ) -> Float[np.ndarray, "places k"]:
         """Return sums of values times factors at every one of `places`, for each parameter."""
-        factors = np.concatenate([np.zeros(0), *(group.factors.ravel() for group in self.groups)])
-        factors *= values.ravel()[self.where]
+        factors = _joined([group.factors for group in self.groups], float)
+        factors *= values.ravel()[self.index.where]
         width = self.count + 1
         return np.bincount(at, factors, places * width).reshape(places, width)[:, :-1]
 
@@ -132,8 +165,8 @@ class Terms:
     def products(self, values: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, "k k"]:
         """Return the sum of values times the outer products of factors."""
         width, values = self.count + 1, values.ravel()
-        each = [((f * values[where]) @ f.T).ravel() for where, _, f in self.groups]
-        total = np.bincount(self.squares, np.concatenate([np.zeros(0), *each]), width**2)
+        each = [(f * values[where]) @ f.T for where, _, f in self.groups]
+        total = np.bincount(self.index.squares, _joined(each, float), width**2)
         return total.reshape(width, width)[:-1, :-1]
 
 

@@ -234,9 +234,6 @@ class Forward(NamedTuple):
     group: Int[np.ndarray, "o 3"]  # row of the spline that decodes a value, if they are solved for
     features: Terms | None  # features at every value
     terms: Terms | None  # derivatives of predictions by k and c for a = 1
-    # Where `Terms.sums` adds every term, by row and by view, each with its channel.
-    at_rows: Int[np.ndarray, " t"]
-    at_views: Int[np.ndarray, " t"]
 
     @property
     def noise_weight(self) -> PerChannel:
@@ -253,15 +250,16 @@ class Forward(NamedTuple):
         group = spline_groups(splines.by, layout.cameras[layout.views], z.shape)
         values = (z - problem.log_pivot, sigma, problem.usable.astype(np.float64))
         index, factor = features.terms(layout)
-        more = terms = Terms.of_index(index, factor, features.count) if features.count else None
+        places, more = (layout.row_channel, layout.view_channel), None
+        if features.count:
+            more = Terms.of_index(index, factor, features.count, *places)
+        terms = more
         if splines.count:
             there, steep = splines.terms(knot, fraction, group)
             index = np.concatenate([index, features.count + there], -1)
             factor = np.concatenate([factor, -steep], -1)
-            terms = Terms.of_index(index, factor, features.count + splines.count)
-        places = (layout.row_channel, layout.view_channel)
-        at = (np.zeros(0, int) if terms is None else terms.at(place) for place in places)
-        return cls(unknowns, layout, *values, knot, fraction, slope, group, more, terms, *at)
+            terms = Terms.of_index(index, factor, features.count + splines.count, *places)
+        return cls(unknowns, layout, *values, knot, fraction, slope, group, more, terms)
 
 
 @dataclass(frozen=True)
