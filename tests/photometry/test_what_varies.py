@@ -208,6 +208,7 @@ def test_the_simplest_model_that_is_not_clearly_worse_wins():
     middle = candidate("camera_exposure", 2, -0.51, 0.012, 0.001)
     rich = candidate("view_exposure", 40, -0.5, 0.0, 0.0)
     assert choose([rich, simple, middle]) is middle
+    assert choose([rich, dataclasses.replace(middle, deficit=0.013)]) is rich
     # Two standard errors are allowed, if these exceed the smallest gain.
     noisy = candidate("constant", 0, -0.6, 0.1, 0.06)
     assert choose([rich, noisy, middle]) is noisy

@@ -9,7 +9,7 @@ photographs of known exposure, and 3 to 7 times for drives with simulated shared
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -21,9 +21,8 @@ from p2gs_jax.photometry.adjustment import equations
 from p2gs_jax.photometry.adjustment.equations import Weighted, summed, weigh
 from p2gs_jax.photometry.adjustment.matrices import is_small, whole
 from p2gs_jax.photometry.adjustment.parameters import EMPTY, Forward, Parameters, System
-from p2gs_jax.photometry.adjustment.problem import Layout
 from p2gs_jax.photometry.adjustment.solve import Balanced, Fit, one_thread
-from p2gs_jax.photometry.observations import Labels, Observations, PerChannel
+from p2gs_jax.photometry.observations import Labels, Observations
 
 CANCELLED = 1e-6  # a smaller value along a unit direction is a rounding error
 # Least information of a determined direction, where each parameter's information is scaled to 1.
@@ -210,28 +209,17 @@ def _shared_scores(
     """
     layout, u = model.layout, model.unknowns
     coupled = equations.coupling(layout, theta, at)
-    per_view = [
-        _at_places(layout, coupled * p.derivative, layout.views, u.views, p.channels).T
-        for p in equations.of_views(model, at)
-    ]
+    per_view = []
+    for one in equations.of_views(model, at):
+        matrix = layout.at_views(coupled * one.derivative)
+        first, *rest = (matrix[channel::3] for channel in one.channels)
+        per_view.append(sum(rest, first).T)
     terms = equations.others(model, theta)
     more = None if terms is None else terms.sums(coupled, terms.index.by_row, 3 * layout.rows)
     size = np.broadcast_to(size, labels.shape)[:, None]
-    of_points = _at_places(layout, coupled * size, labels, int(labels.max(initial=-1)) + 1)
+    shape = (int(labels.max(initial=-1)) + 1, 3 * layout.rows)
+    where = (np.repeat(labels, 3), layout.row_channel.ravel())
+    of_points = sp.csr_array(((coupled * size).ravel(), where), shape=shape)
     return summed(model, theta, at, at.weight * size, labels) - of_points @ equations.over_all(
         u, per_view, more
     )
-
-
-def _at_places(
-    layout: Layout,
-    values: PerChannel,
-    places: Labels,
-    count: int,
-    channels: Sequence[int] = (0, 1, 2),
-) -> sp.csr_array:
-    """Return the matrix of values of channels at `places` (rows) and points: (count, 3 rows)."""
-    at = layout.row_channel[:, channels]
-    where = np.broadcast_to(places[:, None], at.shape)
-    shape = (count, 3 * layout.rows)
-    return sp.csr_array((values[:, channels].ravel(), (where.ravel(), at.ravel())), shape=shape)

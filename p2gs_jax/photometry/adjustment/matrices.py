@@ -52,7 +52,7 @@ class Alike(NamedTuple):
     """Values that depend on the same parameters: their products are small and dense."""
 
     where: Int[np.ndarray, " n"]  # index among all values; channels of an observation in turn
-    columns: Int[np.ndarray, " m"]  # parameter of each term; `Terms.count` where there is no term
+    columns: Int[np.ndarray, " m"]  # parameter of each term; `Index.count` where there is no term
     factors: Float[np.ndarray, "m n"]  # factor of that parameter
 
 
@@ -109,7 +109,6 @@ class Terms:
     """
 
     groups: tuple[Alike, ...]
-    count: int  # number of parameters
     values: int  # number of values
     index: Index
 
@@ -129,7 +128,7 @@ class Terms:
         differs = (short[order[1:]] != short[order[:-1]]).any(1)
         groups = np.split(order, np.flatnonzero(differs) + 1)
         alike = tuple(Alike(g, index[g[0]], factor[g].T.copy()) for g in groups if len(g))
-        return cls(alike, count, len(index), Index(alike, count, row_channel, view_channel))
+        return cls(alike, len(index), Index(alike, count, row_channel, view_channel))
 
     def of(self, parameters: Float[np.ndarray, " k"]) -> Float[np.ndarray, "o 3"]:
         """Return the sums at some parameters."""
@@ -152,19 +151,19 @@ class Terms:
         """Return sums of values times factors at every one of `places`, for each parameter."""
         factors = _joined([group.factors for group in self.groups], float)
         factors *= values.ravel()[self.index.where]
-        width = self.count + 1
+        width = self.index.count + 1
         return np.bincount(at, factors, places * width).reshape(places, width)[:, :-1]
 
     def total(self, values: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, " k"]:
         """Return the sum of values times factors for each parameter."""
-        total, values = np.zeros(self.count + 1), values.ravel()
+        total, values = np.zeros(self.index.count + 1), values.ravel()
         for where, columns, factors in self.groups:
             np.add.at(total, columns, factors @ values[where])
         return total[:-1]
 
     def products(self, values: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, "k k"]:
         """Return the sum of values times the outer products of factors."""
-        width, values = self.count + 1, values.ravel()
+        width, values = self.index.count + 1, values.ravel()
         each = [(f * values[where]) @ f.T for where, _, f in self.groups]
         total = np.bincount(self.index.squares, _joined(each, float), width**2)
         return total.reshape(width, width)[:-1, :-1]
