@@ -83,10 +83,12 @@ class Synth:
     width: int = 480
     """Image width, pixels (paper: 1920); the height follows as 1300 / 1920 of it."""
     layout: Layout = "town"
-    """Layout of the town. town: an underpass, and another sun for every seed; matte: the same
-    without gloss; street: the demo's layout; long: streets one behind another."""
+    """Layout of the town. town: an underpass, and another sun for every seed; street: the demo's
+    layout; long: streets one behind another."""
+    matte: bool = False
+    """Surfaces have no gloss: every view sees the same radiance."""
     supersample: int | None = None
-    """Samples per pixel along each axis (default: 2; 8 for a matte town)."""
+    """Samples per pixel along each axis (default: 2, or 8 with --matte)."""
     points: int = 60_000
     """Number of seed points of the COLMAP model; points in only one view are dropped."""
     seed: int = 0

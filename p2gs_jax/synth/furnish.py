@@ -39,22 +39,25 @@ _PAINTS: list[Vec3] = [
 ]
 
 
-def build_town(seed: int = 0, layout: Layout = "street", reach: float = 0.0) -> Town:
+def build_town(
+    seed: int = 0, layout: Layout = "street", reach: float = 0.0, *, matte: bool = False
+) -> Town:
     """Return one street with a crossing, houses, trees, parked cars, lamps and signs.
 
-    `town` adds an underpass in deep shadow and draws the position of the sun. `matte` is the town
-    without gloss. `long` repeats streets over the length of the drive, `reach` m.
+    `town` adds an underpass in deep shadow and draws the position of the sun. `long` repeats
+    streets over the length of the drive, `reach` m. A `matte` town has no gloss.
     """
+    gloss = 0.0 if matte else 1.0
     if layout == "long":
         count = 1 + max(0, math.ceil((reach - t.STREET_END) / STREET_M))
-        return t.pack(_streets(seed, count), seed, _light(seed))
+        return t.pack(_streets(seed, count), seed, _light(seed), gloss)
     clear = None if layout == "street" else t.UNDERPASS
     build = Builder(generator(seed, SceneStream.BUILDINGS), clear)
     _furnish(build)
     if layout == "street":
-        return t.pack(build, seed, Light())
+        return t.pack(build, seed, Light(), gloss)
     _underpass(build)
-    return t.pack(build, seed, _light(seed), 0.0 if layout == "matte" else 1.0)
+    return t.pack(build, seed, _light(seed), gloss)
 
 
 def _furnish(build: Builder, *, closed: bool = True) -> None:

@@ -59,8 +59,8 @@ def paint(
 ) -> Surface:
     """Return the surface at the points that rays hit; `view` has their unit directions.
 
-    `index` is the row of the primitive, `town.size` for the ground; `footprint` is the width of a
-    pixel there, m.
+    `index` is the row of the primitive, `town.size` for the ground; `footprint` is the width of
+    two samples there, m.
     """
     material = jnp.asarray(np.append(town.material, Material.ROAD).astype(np.int32))[index]
     s = _point(town, p, view, index, material, footprint)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 Curve = Literal["srgb", "power", "filmic"]
-Layout = Literal["street", "town", "long", "matte"]
+Layout = Literal["street", "town", "long"]
 # Size of the paper's images, pixels.
 IMAGE_WIDTH, IMAGE_HEIGHT = 1920, 1300
 

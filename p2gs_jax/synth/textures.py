@@ -1,9 +1,10 @@
 """Building blocks of procedural textures: points on surfaces, noise, hashes, soft edges.
 
-Texture finer than a pixel becomes its mean: shapes are averaged over half a pixel (`slab`), and
-noise of zero mean fades (`detail`). All materials but leaves are linear in both, sums of disjoint
-shapes, so that their means are the same from every distance. Arrays are channel-first over R
-rays: points and colours are [3 R].
+Texture finer than a footprint, the width of two samples, becomes its mean: shapes are averaged over
+half of it (`slab`), and noise of zero mean fades (`detail`). With more than two samples a pixel,
+small pieces of a surface therefore look alike from different distances. All materials but leaves
+are linear in both, sums of disjoint shapes, so that their means are the same from every distance.
+Arrays are channel-first over R rays: points and colours are [3 R].
 """
 
 from __future__ import annotations
@@ -39,13 +40,13 @@ class Point(NamedTuple):
     use: Array
     random: Array
     row: Array  # of the primitive
-    footprint: Array  # a pixel's width on the surface, m
+    footprint: Array  # the width of two samples on the surface, m
     fine: Array  # [3 R] noise in [-1.25, 1.25], wavelength by material
     coarse: Array  # [3 R] noise in [-1, 1], which does not fade
     rough: Array  # [3 R] `fine` before it fades
 
     def bar(self, x: Array, half: Array | float) -> Array:
-        """Return the share of half a pixel about x where |x| < half; see `slab`."""
+        """Return the share of half a footprint about x where |x| < half; see `slab`."""
         return slab(x, half, self.footprint)
 
     def span(self, x: Array, low: Array | float, high: Array | float) -> Array:
@@ -66,12 +67,12 @@ class Point(NamedTuple):
 
 
 def detail(footprint: Array, wavelength: Array) -> Array:
-    """Return 1 where a wavelength spans 4 pixels or more, and less down to 0 at 1.5 pixels."""
+    """Return 1 where a wavelength spans 4 footprints or more, and less down to 0 at 1.5."""
     return jnp.clip((wavelength / footprint - 1.5) / 2.5, 0.0, 1.0)
 
 
 def slab(x: Array, half: Array | float, footprint: Array) -> Array:
-    """Return the share of |x| < half in a box about x that is half a pixel wide."""
+    """Return the share of |x| < half in a box about x that is half a footprint wide."""
     width = 0.5 * footprint + 1e-6
     return (jnp.clip(x + width / 2, -half, half) - jnp.clip(x - width / 2, -half, half)) / width
 

@@ -88,7 +88,7 @@ class Tracer:
             t, index = nearest_hit(town, origin[:, None], direction, seen)
             samples = supersample**2 * _TILE**2
             rays = direction[:, :samples], t[:samples], index[:samples]
-            linear = _radiance(town, origin, *rays, 1.0 / K[0, 0])
+            linear = _radiance(town, origin, *rays, 2 / max(supersample, 2) / K[0, 0])
             return linear.reshape(3, -1, _TILE, _TILE).mean(1), t[samples:].reshape(_TILE, _TILE)
 
         corners = _TILE * np.stack(np.meshgrid(np.arange(across), np.arange(down)), -1)
@@ -100,17 +100,17 @@ class Tracer:
 
 
 def _radiance(
-    town: Town, origin: Array, direction: Array, t: Array, index: Array, pixel_angle: Array
+    town: Town, origin: Array, direction: Array, t: Array, index: Array, detail_angle: Array
 ) -> Float[Array, "3 r"]:
     """Return the linear radiance that arrives at the origin [3] along rays [3 R].
 
-    Directions are not normalised; `t` [R] is the hit on a ray (inf: sky), `index` [R] its row. A
-    pixel is `pixel_angle` wide at unit camera z, and finer texture fades out.
+    Directions are not normalised; `t` [R] is the hit on a ray (inf: sky), `index` [R] its row.
+    Texture finer than `detail_angle` times camera z fades out.
     """
     hit = jnp.isfinite(t)
     p = origin[:, None] + jnp.where(hit, t, 1.0) * direction
     view = direction / jnp.sqrt(jnp.sum(direction**2, 0))
-    surface = paint(town, p, view, index, jnp.where(hit, t, 1.0) * pixel_angle)
+    surface = paint(town, p, view, index, jnp.where(hit, t, 1.0) * detail_angle)
     lit = _light(town, p, view, surface, hit)
     above = lax.cond(jnp.all(hit), jnp.zeros_like, lambda view: sky(town, view, clouds=True), view)
     return jnp.where(hit, lit, above)

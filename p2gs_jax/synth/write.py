@@ -53,6 +53,7 @@ def write_street(
     hold_out: int = 8,
     sensor: Sensor | None = None,
     layout: Layout = "street",
+    matte: bool = False,
     report: Callable[[str], None] = lambda line: None,
 ) -> Path:
     """Render a drive along the procedural street, write its scene folder and return the path.
@@ -64,24 +65,25 @@ def write_street(
         height: image height, pixels (paper: 1300).
         iso_std: standard deviation of the ISO (paper: 2 and 4); 0: ISO-Const; unless `sensor`.
         seed: seed of the town, the ISO and the points.
-        supersample: samples per pixel along each axis; the default is 8 for `matte`, else 2.
+        supersample: samples per pixel along each axis; by default 2, or 8 if `matte`.
         points: number of sampled seed points; points with one observation are dropped.
         hold_out: every n-th frame may be held out and gives no points; 0: all frames do.
         sensor: the image formation of the cameras.
-        layout: `town` adds an underpass and draws the sun; `matte` has no gloss; `long` no end.
+        layout: `town` adds an underpass and draws the sun; `long` has no end.
+        matte: whether surfaces have no gloss, so that every view sees the same radiance.
         report: receives lines on the progress.
 
     UserError: a parameter is not valid, or `out` is not free.
     """
     out, sensor = Path(out), sensor or Sensor(iso_std=iso_std)
-    supersample = (8 if layout == "matte" else 2) if supersample is None else supersample
+    supersample = (8 if matte else 2) if supersample is None else supersample
     options = {
         **{"seed": seed, "frames": frames, "width": width, "height": height},
-        **{"supersample": supersample, "step_m": step, "layout": layout},
+        **{"supersample": supersample, "step_m": step, "layout": layout, "matte": matte},
         **{"hold_out": hold_out, "points_sampled": points, "iso_std": sensor.iso_std},
     }
     _check(out, options)
-    town = build_town(seed, layout, frames * step)
+    town = build_town(seed, layout, frames * step, matte=matte)
     views, frame = _views(frames, width, height, step)
     shots = draw_shots(sensor, frames, len(MOUNTS), seed)
     with atomic_folder(out) as temporary:
