@@ -155,6 +155,16 @@ def test_standard_errors_have_the_size_of_the_errors(case, monkeypatch):
     assert 0.93 < rms(ratios) < 1.33
 
 
+def test_views_that_few_surfaces_determine_have_larger_errors():
+    o = PLAIN
+    o = dataclasses.replace(o, cells=o.points % 40)
+    fit, system = solve.solve_model(problem_of(o), VIEW_EXPOSURE, Response())
+    share = np.where(o.cells < 2, 1.0, 1e-3)[:, None]
+    two = fit._replace(at=fit.at._replace(weight=share * fit.at.weight))
+    assert uncertainty(fit, system, o).few.max() < 1.03
+    assert 1.3 < np.median(uncertainty(two, system, o).few) < 1.5
+
+
 def test_errors_of_exposures_include_the_uncertainty_of_a_fitted_curve():
     o = observe(SMALL, ISO2, curve="filmic")
     curve = solve.fit_response(problem_of(o), Response())
@@ -206,8 +216,8 @@ def test_the_fixed_point_minimises_the_robust_loss(loss):
             if loss == "geman_mcclure":
                 return 0.5 * jnp.sum(each)
             of_row = jnp.zeros(layout.rows).at[row].add(each) / 3 / fit.at.scale**2
-            weight = (prior + np.maximum(seen - 1, 0)) * 1.5 * fit.at.scale**2
-            return jnp.sum(weight * jnp.log(prior + of_row))
+            weight = (prior + np.maximum(seen - 1, 0)) ** 2 * 1.5 * fit.at.scale**2
+            return -jnp.sum(weight / (prior + of_row))
 
         gradient = np.asarray(jax.jit(jax.grad(total))(fit.theta.b[:, 0]))
         curvature = fit.normal.diagonal()[: len(gradient)]
@@ -227,7 +237,7 @@ def test_points_that_change_between_views_count_for_less():
     for loss in ("geman_mcclure", "whole_points"):
         fit, _ = solve.solve_model(problem, VIEW_EXPOSURE, Response(), loss=loss)
         errors[loss] = np.std(fit.theta.b[:, 0] / fit.theta.a - np.log(ISO4)) / np.log(2)
-    assert errors["whole_points"] < 0.85 * errors["geman_mcclure"], errors
+    assert errors["whole_points"] < 0.5 * errors["geman_mcclure"], errors
 
 
 def test_common_factor_order_and_names_do_not_matter():

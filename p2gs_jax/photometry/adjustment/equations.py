@@ -19,8 +19,8 @@ from p2gs_jax.photometry.observations import Labels, PerChannel
 
 Loss = Literal["l1", "geman_mcclure", "whole_points"]
 GEMAN_MCCLURE = 3.0  # width of the Geman-McClure loss in robust standard deviations
-# Weight of the prior of a point's spread, as a number of observations.
-PRIOR_SPREAD = 3.0
+# Weight of the prior of a point's mean loss, as a number of observations.
+PRIOR_SPREAD = 5.0
 SMALLEST_SCALE = 0.3  # lower bound of `Weighted.scale`
 MEDIAN_ROWS = 4096  # a median uses fewer than twice this many rows
 LEAST_BENT = 0.2  # least curvature of a point over its weight
@@ -100,19 +100,20 @@ def _of_points(model: Forward, theta: Parameters, z: PerChannel):
 def _whole_points(
     square: PerObservation, common: PerObservation, share: PerObservation, layout: Layout
 ) -> tuple[PerObservation, PerObservation]:
-    """Return weights and second derivatives if every point has a separate spread.
+    """Return weights and second derivatives if points are judged whole.
 
-    Gloss and silhouettes make all observations of a point uncertain, by different amounts for
-    different points. Their Geman-McClure losses therefore act as the squares in Student's t with a
-    scale per point. `share` is the used share of channels; the rest as for `_derivatives`.
+    Gloss, silhouettes and windows make all observations of a point uncertain, and bias them alike
+    along a drive. The sum of a point's Geman-McClure losses therefore has a Geman-McClure loss of
+    its own, with the width of its number of observations. `share` is the used share of channels;
+    the rest as for `_derivatives`.
     """
     alone, curved = _derivatives(square, common)
     bound = GEMAN_MCCLURE**2
     losses = layout.by_row @ (share * bound * square / (1 + square))
     # A point's radiance takes one degree of freedom.
     freedom = np.maximum(layout.by_row @ share - 1, 0)
-    of_row = ((PRIOR_SPREAD + freedom) / (PRIOR_SPREAD + losses))[layout.row]
-    along = 2 * share * bound * common * alone**2 / (PRIOR_SPREAD + losses[layout.row])
+    of_row = (((PRIOR_SPREAD + freedom) / (PRIOR_SPREAD + losses)) ** 2)[layout.row]
+    along = 4 * share * bound * common * alone**2 / (PRIOR_SPREAD + losses[layout.row])
     return alone * of_row, (curved - along) * of_row
 
 

@@ -40,8 +40,8 @@ SHARED_REGION = 2 / 3  # side of the regions that share an error, in the same un
 FEWEST, FEWEST_EFFECTIVE = 4, 3.0
 
 # Standard deviation of the change of light per doubling of a pixel's width on the surface, log
-# units; uniform points of a town of 600 m have this slope (BUILD_NOTES, "Error bars").
-FOOTPRINT = 6e-4
+# units. Towns with gloss and without it have 7e-4 and 2e-4 (BUILD_NOTES, "Error bars").
+FOOTPRINT = 4e-4
 
 # A linear function of changes of all parameters (columns) about the solution.
 LinearMap = Callable[[Parameters], Float[np.ndarray, "n c"]]
@@ -92,10 +92,12 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
         wide = fit.at.curvature * FOOTPRINT * observations.footprints
         one = _shared_scores(fit.model, fit.theta, fit.at, np.zeros_like(layout.row), wide)
         scores = sp.csr_array(sp.vstack([scores, one]))
-    seen = fit.model.weight.any(1)
-    # A view's exposure is a mean over its clusters and takes one degree of freedom.
-    pairs = np.unique(np.stack([layout.views[seen], clusters[seen]]), axis=1)[0]
-    count = np.maximum(np.bincount(pairs, minlength=layout.view_count), 2)
+    # A view's exposure is a mean over its clusters and takes one degree of freedom. Clusters of
+    # small weight count for less.
+    size, at = fit.at.weight.sum(1), (layout.views, clusters)
+    shares = sp.csr_array((size, at), shape=(layout.view_count, int(clusters.max(initial=-1)) + 1))
+    total, squares = shares.sum(1), (shares**2).sum(1)
+    count = np.maximum(total**2 / np.maximum(squares, EMPTY), 2)
     few = np.sqrt(count / (count - 1))
     prior = system.priors.normal + system.smooth(fit.normal)
     bread = fit.normal * fit.at.curvature + prior

@@ -25,7 +25,7 @@ from p2gs_jax.photometry.unmodelled import place_warnings
 from p2gs_jax.types import GAMMA_SRGB
 
 # Points per view for the solution; more are redundant (BUILD_NOTES, "Exposures from a part").
-PER_VIEW = 1000
+PER_VIEW = 2000
 # With thousands of views: largest number of their observations, least number of points per view.
 MOST_SOLVED, LEAST_PER_VIEW = 1_500_000, 200
 UNMODELLED_PER_VIEW = 2000  # points per view for the test of effects that are not modelled
