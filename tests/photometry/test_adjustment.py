@@ -206,7 +206,7 @@ def test_the_fixed_point_minimises_the_robust_loss(loss):
         row, views = layout.row, layout.views
         bound = (equations.GEMAN_MCCLURE * fit.at.scale) ** 2
         channels = rows.weight.sum(-1)
-        prior, seen = equations.PRIOR_SPREAD, layout.by_row @ (channels / 3)
+        prior, seen = equations.POINT_PRIOR, layout.by_row @ (channels / 3)
 
         def total(b):
             level = fit.at.radiance[row] * fit.theta.a[views][..., None]

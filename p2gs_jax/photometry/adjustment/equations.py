@@ -20,7 +20,7 @@ from p2gs_jax.photometry.observations import Labels, PerChannel
 Loss = Literal["l1", "geman_mcclure", "whole_points"]
 GEMAN_MCCLURE = 3.0  # width of the Geman-McClure loss in robust standard deviations
 # Weight of the prior of a point's mean loss, as a number of observations.
-PRIOR_SPREAD = 5.0
+POINT_PRIOR = 5.0
 SMALLEST_SCALE = 0.3  # lower bound of `Weighted.scale`
 MEDIAN_ROWS = 4096  # a median uses fewer than twice this many rows
 LEAST_BENT = 0.2  # least curvature of a point over its weight
@@ -103,17 +103,17 @@ def _whole_points(
     """Return weights and second derivatives if points are judged whole.
 
     Gloss, silhouettes and windows make all observations of a point uncertain, and bias them alike
-    along a drive. The sum of a point's Geman-McClure losses therefore has a Geman-McClure loss of
-    its own, with the width of its number of observations. `share` is the used share of channels;
-    the rest as for `_derivatives`.
+    along a drive. The sum of a point's Geman-McClure losses therefore has a Geman-McClure loss
+    itself, whose width grows with their number. `share` is the used share of channels; the rest as
+    for `_derivatives`.
     """
     alone, curved = _derivatives(square, common)
     bound = GEMAN_MCCLURE**2
     losses = layout.by_row @ (share * bound * square / (1 + square))
     # A point's radiance takes one degree of freedom.
     freedom = np.maximum(layout.by_row @ share - 1, 0)
-    of_row = (((PRIOR_SPREAD + freedom) / (PRIOR_SPREAD + losses)) ** 2)[layout.row]
-    along = 4 * share * bound * common * alone**2 / (PRIOR_SPREAD + losses[layout.row])
+    of_row = (((POINT_PRIOR + freedom) / (POINT_PRIOR + losses)) ** 2)[layout.row]
+    along = 4 * share * bound * common * alone**2 / (POINT_PRIOR + losses[layout.row])
     return alone * of_row, (curved - along) * of_row
 
 

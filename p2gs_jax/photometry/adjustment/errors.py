@@ -40,7 +40,7 @@ SHARED_REGION = 2 / 3  # side of the regions that share an error, in the same un
 FEWEST, FEWEST_EFFECTIVE = 4, 3.0
 
 # Standard deviation of the change of light per doubling of a pixel's width on the surface, log
-# units. Towns with gloss and without it have 7e-4 and 2e-4 (BUILD_NOTES, "Error bars").
+# units. A compromise between towns with gloss and without it (BUILD_NOTES, "Error bars").
 FOOTPRINT = 4e-4
 
 # A linear function of changes of all parameters (columns) about the solution.
@@ -92,12 +92,10 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
         wide = fit.at.curvature * FOOTPRINT * observations.footprints
         one = _shared_scores(fit.model, fit.theta, fit.at, np.zeros_like(layout.row), wide)
         scores = sp.csr_array(sp.vstack([scores, one]))
-    # A view's exposure is a mean over its clusters and takes one degree of freedom. Clusters of
-    # small weight count for less.
-    size, at = fit.at.weight.sum(1), (layout.views, clusters)
-    shares = sp.csr_array((size, at), shape=(layout.view_count, int(clusters.max(initial=-1)) + 1))
-    total, squares = shares.sum(1), (shares**2).sum(1)
-    count = np.maximum(total**2 / np.maximum(squares, EMPTY), 2)
+    # A view's exposure is a mean over its clusters and takes one degree of freedom.
+    shape = (layout.view_count, int(clusters.max(initial=-1)) + 1)
+    shares = sp.csr_array((fit.at.weight.sum(1), (layout.views, clusters)), shape=shape).tocoo()
+    count = np.maximum(_effective(shares.data, shares.coords[0], layout.view_count), 2)
     few = np.sqrt(count / (count - 1))
     prior = system.priors.normal + system.smooth(fit.normal)
     bread = fit.normal * fit.at.curvature + prior
@@ -183,7 +181,7 @@ def _shared_deviation(model: Forward, at: Weighted, labels: Labels, parts: Label
         return np.bincount(region, values, count)
 
     size, members = total(share), total((share > 0).astype(float))
-    effective = size**2 / np.maximum(total(share**2), EMPTY)
+    effective = _effective(share, region, count)
     good = (members >= FEWEST) & (effective >= FEWEST_EFFECTIVE)
     if not good.any():
         return 0.0
@@ -195,11 +193,18 @@ def _shared_deviation(model: Forward, at: Weighted, labels: Labels, parts: Label
     seen_by = np.bincount(layout.row[used])
     view = np.zeros(count, int)
     view[labels] = layout.views
-    # The effective number of regions of a view: unequal weights reduce it.
-    of_view, squares = (np.bincount(view, v, layout.view_count) for v in (size, size**2))
-    per_view = of_view[of_view > 0] ** 2 / squares[of_view > 0]
-    kept = (1 - 1 / np.mean(seen_by[seen_by > 0])) * (1 - 1 / max(np.mean(per_view), 2))
+    per_view = _effective(size, view, layout.view_count)
+    regions_seen = max(np.mean(per_view[per_view > 0]), 2)
+    kept = (1 - 1 / np.mean(seen_by[seen_by > 0])) * (1 - 1 / regions_seen)
     return float(np.sqrt(max(excess, 0.0) / kept))
+
+
+def _effective(
+    weights: Float[np.ndarray, " n"], labels: Labels, count: int
+) -> Float[np.ndarray, " c"]:
+    """Return the effective number of weights of each label: unequal weights reduce it."""
+    total, squares = (np.bincount(labels, w, count) for w in (weights, weights**2))
+    return total**2 / np.maximum(squares, EMPTY)
 
 
 def _shared_scores(

@@ -24,11 +24,11 @@ from p2gs_jax.photometry.solution import MIN_OBSERVATIONS, PhotometricSolution
 from p2gs_jax.photometry.unmodelled import place_warnings
 from p2gs_jax.types import GAMMA_SRGB
 
-# Points per view for the solution; more are redundant (BUILD_NOTES, "Exposures from a part").
+# Points per view for the solution, and for the test of effects that are not modelled; more gain
+# little (BUILD_NOTES, "Exposures from a part").
 PER_VIEW = 2000
 # With thousands of views: largest number of their observations, least number of points per view.
 MOST_SOLVED, LEAST_PER_VIEW = 1_500_000, 200
-UNMODELLED_PER_VIEW = 2000  # points per view for the test of effects that are not modelled
 # An observation is an outlier if its weight is below this share of its weight from noise alone.
 IGNORED = 0.25
 BLOCK = 1_000_000  # observations per block: 20 million at once take gigabytes
@@ -129,7 +129,7 @@ def solution_of(
     some_view[o.points[seen]] = o.views[seen]
     view_residual, tint = _per_view_ev(o.views, residual, used, o.view_count)
     cameras, corner_errors = _cameras(fit, response, covariance, o)
-    part = o.thinned(UNMODELLED_PER_VIEW, 0)
+    part = o.thinned(PER_VIEW, 0)
     solution = PhotometricSolution(
         model=form.model,
         response=response,
