@@ -53,7 +53,6 @@ _MAKE, _MODEL, _SERIAL, _LENS = 0x010F, 0x0110, 0xA431, 0xA434
 _RAW_SETTINGS = {"shutter_speed": _TIME, "aperture": _F_NUMBER, "iso_speed": _ISO}
 _RAW_SETTINGS |= {"focal_length": _FOCAL_LENGTH}
 _EXR_SETTINGS = {"expTime": _TIME, "aperture": _F_NUMBER, "isoSpeed": _ISO}
-_EXR_ERRORS = (RuntimeError, KeyError, OSError, ValueError)
 # Canon's CR3 holds the settings in its first bytes, this many at most.
 _RAW_HEADER = 2**18
 _AGAIN = "copy that photograph again, or remove it from the scene"
@@ -204,12 +203,6 @@ def read_raw(path: Path, balance: Balance | None) -> Picture:
         return Picture(light=light, exif=_raw_exif(path, raw))
 
 
-def read_raw_exif(path: Path) -> Image.Exif:
-    """Return the EXIF of a raw photograph; errors as in `read_facts`."""
-    with _raw(path) as raw:
-        return _raw_exif(path, raw)
-
-
 @contextmanager
 def _raw(path: Path) -> Iterator[Any]:
     try:
@@ -278,22 +271,14 @@ def _exr(path: Path, **how: bool) -> Iterator[Any]:
     try:
         with OpenEXR.File(str(path), **how) as file:
             yield file
-    except _EXR_ERRORS as error:
+    except (RuntimeError, KeyError, OSError, ValueError) as error:
         fix = "copy or render it again, or remove it"
         raise broken(path, f"is not a readable OpenEXR file: {error}.", fix) from None
 
 
-def exr_size(path: Path) -> tuple[int, int]:
-    """Return (width, height) of the data window; UserError: it is not a readable OpenEXR."""
+def _exr_header(path: Path) -> dict:
     with _exr(path, header_only=True) as file:
-        low, high = file.header()["dataWindow"]
-    return int(high[0] - low[0] + 1), int(high[1] - low[1] + 1)
-
-
-def read_exr_exif(path: Path) -> Image.Exif | None:
-    """Return the EXIF of an OpenEXR, from its standard attributes; errors as in `exr_size`."""
-    with _exr(path, header_only=True) as file:
-        return _exr_exif(dict(file.header()))
+        return dict(file.header())
 
 
 def read_exr(path: Path) -> Picture:
@@ -360,7 +345,10 @@ def size_of(path: Path) -> tuple[int, int] | None:
         pillow_heif(path)
     if kind == "raw":
         return read_facts(path).size
-    return exr_size(path) if kind == "exr" else None
+    if kind == "exr":
+        low, high = _exr_header(path)["dataWindow"]
+        return int(high[0] - low[0] + 1), int(high[1] - low[1] + 1)
+    return None
 
 
 @dataclass(frozen=True)
@@ -445,20 +433,26 @@ def _exif_tags(path: Path, *, after_pixels: bool = True) -> dict:
     kind = kind_of(path)
     # Pillow raises many kinds of errors on malformed EXIF (struct, Syntax, Value, OS, ...).
     try:
-        if kind in ("raw", "exr"):
+        if kind == "raw":
+            with _raw(path) as raw:
+                return _flat(_raw_exif(path, raw))
+        if kind == "exr":
+            exif = _exr_exif(_exr_header(path))
             # The length of an Exif with settings alone is 0: test for None.
-            exif = read_raw_exif(path) if kind == "raw" else read_exr_exif(path)
-            return {} if exif is None else {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
+            return {} if exif is None else _flat(exif)
         if kind == "heif":
             pillow_heif(path)
         with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
             # Pillow would decode a PNG to find EXIF after its pixels.
             if not after_pixels and image.format == "PNG" and "exif" not in image.info:
                 return {}
-            exif = image.getexif()
-            return {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
+            return _flat(image.getexif())
     except Exception:
         return {}
+
+
+def _flat(exif: Image.Exif) -> dict:
+    return {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
 
 
 def _finite(value: object) -> float | None:
