@@ -38,15 +38,10 @@ def assemble(
 ) -> Scene:
     """Return the scene of a recording: the chosen photographs, LiDAR points, tracked objects.
 
-    Seed points have no colours yet; there are no feature tracks.
-
-    Args:
-        cfg: chosen cameras and frames; whether photographs may be missing; use of LiDAR.
-        work_dir: embedded photographs are written below it; None: below the user's cache folder.
-        write_embedded: if False, embedded photographs get file names but are not written.
-
-    Raises:
-        UserError: a camera, frame or photograph is missing, or a camera name or sweep is invalid.
+    Seed points have no colours yet; there are no feature tracks. Embedded photographs are written
+    below `work_dir`, or the user's cache folder if it is None; with `write_embedded=False` they
+    only get file names. Raises UserError: a camera, frame or photograph is missing, or a camera
+    name or sweep is invalid.
     """
     for camera in recording.cameras:
         # The files of a view lie in a folder with the name of its camera.
@@ -62,21 +57,37 @@ def assemble(
     middle = centres.mean(0)
     origin = np.rint(middle) if np.abs(middle).max() > FARTHEST_ORIGIN else np.zeros(3)
     folder = cache_of(recording.root, None) if work_dir is None else work_dir / "photographs"
-    views = [
-        dataclasses.replace(
-            _view(p, cameras[p.camera], origin),
+    views = []
+    for p in photographs:
+        camera = cameras[p.camera]
+        view = View(
+            name=_name(p),
             image_path=_file_of(p, folder, write_embedded),
+            camera=camera.name,
+            viewmat=inverse(_moved(p.pose, origin)).astype(np.float32),
+            K=camera.K.astype(np.float32),
+            width=camera.width,
+            height=camera.height,
+            distortion=camera.distortion,
+            frame=p.frame,
+            time=p.time,
             ego_mask=masks.get(p.camera),
         )
-        for p in photographs
-    ]
+        views.append(view)
     things = recording.objects
     objects = tuple(dataclasses.replace(o, poses=_moved(o.poses, origin)) for o in things)
     lidar, lidar_notes = None, ["LiDAR measurements are not used (--data.no-lidar)."]
     if cfg.lidar:
         lidar, lidar_notes = _read_sweeps(recording, photographs, objects, origin, report)
-    points, seed_notes = _seeds(lidar, centres - origin)
-    notes += [*mask_notes, *lidar_notes, *seed_notes]
+    notes += [*mask_notes, *lidar_notes]
+    points = np.zeros((0, 3), np.float32)
+    if lidar is not None:
+        points, angle = seeds(lidar, centres - origin)
+        moving = np.mean(lidar.objects >= 0)
+        notes.append(
+            f"LiDAR: {len(lidar.points)} points, {moving:.1%} on moving objects; {len(points)} "
+            f"seeds at a spacing of {angle:.3f} times the distance from the cameras."
+        )
     return Scene(
         root=recording.root,
         format=recording.format,
@@ -98,9 +109,8 @@ def _chosen_photographs(
     if not every:
         fix = "name a folder that holds the photographs of the drive as well"
         raise UserError(f"{recording.root} holds no photograph with a pose", fix=fix)
-    frames = chosen_frames(cfg.frames, every)
-    among = set(frames)
-    chosen = [p for p in recording.photographs if p.frame in among and p.camera in names]
+    frames = set(chosen_frames(cfg.frames, every))
+    chosen = [p for p in recording.photographs if p.frame in frames and p.camera in names]
     if not chosen:
         why = f"{recording.root} has no photograph of the chosen cameras and frames"
         raise UserError(why, fix="name other --cameras, or leave out --frames")
@@ -108,14 +118,13 @@ def _chosen_photographs(
     existing = [p for p in chosen if p.embedded is not None or p.path.is_file()]
     missing = sorted({_name(p) for p in chosen} - {_name(p) for p in existing})
     notes = [*recording.notes, *files.check_missing(missing, len(chosen), recording.root, cfg)]
-    chosen = existing
-    counts = {name: sum(p.camera == name for p in chosen) for name in names}
+    counts = {name: sum(p.camera == name for p in existing) for name in names}
     few = [f"{name} {count}" for name, count in counts.items() if count < len(frames)]
     if few:
         notes.append(
             f"some cameras have fewer photographs than the {len(frames)} frames: {', '.join(few)}"
         )
-    return chosen, notes
+    return existing, notes
 
 
 def _at_size(camera: RigCamera, photographs: Sequence[Photograph], root: Path) -> RigCamera:
@@ -141,21 +150,6 @@ def _name(photograph: Photograph) -> str:
     return f"{photograph.camera}/{photograph.path.name}"
 
 
-def _view(photograph: Photograph, camera: RigCamera, origin: Float[np.ndarray, " 3"]) -> View:
-    return View(
-        name=_name(photograph),
-        image_path=photograph.path,
-        camera=camera.name,
-        viewmat=inverse(_moved(photograph.pose, origin)).astype(np.float32),
-        K=camera.K.astype(np.float32),
-        width=camera.width,
-        height=camera.height,
-        distortion=camera.distortion,
-        frame=photograph.frame,
-        time=photograph.time,
-    )
-
-
 def _moved(poses: Float64[np.ndarray, "*n 4 4"], origin: Float[np.ndarray, " 3"]):
     out = poses.copy()
     out[..., :3, 3] -= origin
@@ -172,18 +166,6 @@ def _file_of(photograph: Photograph, folder: Path, write_embedded: bool) -> Path
         with atomic_write(path) as temporary:
             temporary.write_bytes(photograph.embedded())
     return path
-
-
-def _seeds(lidar: Lidar | None, cameras: Float64[np.ndarray, "v 3"]):
-    """Return seeds [s 3] on static surfaces, float32, and notes."""
-    if lidar is None:
-        return np.zeros((0, 3), np.float32), []
-    points, angle = seeds(lidar, cameras)
-    moving = np.mean(lidar.objects >= 0)
-    return points, [
-        f"LiDAR: {len(lidar.points)} points, {moving:.1%} on moving objects; {len(points)} seeds "
-        f"at a spacing of {angle:.3f} times the distance from the cameras."
-    ]
 
 
 def _read_sweeps(
