@@ -172,19 +172,12 @@ def find_ego_mask(
 
 
 class Evidence(NamedTuple):
-    """Evidence at every pixel from all frames.
+    """Evidence at every pixel from all frames."""
 
-    Attributes:
-        stays: whether an edge is there in nearly all frames.
-        strength: gradient of this edge, natural logarithms per pixel.
-        car: evidence for the car, 0 to 1.
-        change: median change of the gradient.
-    """
-
-    stays: Bool[np.ndarray, "h w"]
-    strength: Float32[np.ndarray, "h w"]
-    car: Float32[np.ndarray, "h w"]
-    change: Float32[np.ndarray, "h w"]
+    stays: Bool[np.ndarray, "h w"]  # an edge is there in nearly all frames
+    strength: Float32[np.ndarray, "h w"]  # gradient of this edge, natural logarithms per pixel
+    car: Float32[np.ndarray, "h w"]  # evidence for the car, 0 to 1
+    change: Float32[np.ndarray, "h w"]  # median change of the gradient
 
 
 def expected_motion(

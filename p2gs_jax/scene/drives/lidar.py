@@ -23,10 +23,8 @@ MOST_SEEDS, FINEST_VOXEL, VOXEL_ANGLE, VOXEL_GROWTH = 200_000, 0.05, 0.01, 1.3
 def turned(azimuth: Float[np.ndarray, "*n"] | float, start: float) -> Float[np.ndarray, "*n"]:
     """Return the share of a turn, in [0, 1), after which a spinning scanner looks in a direction.
 
-    Args:
-        azimuth: directions, radians counterclockwise as seen from above; scanners on cars turn
-            clockwise.
-        start: direction in which the turn begins and ends, radians.
+    Directions are in radians counterclockwise as seen from above; scanners on cars turn clockwise.
+    The turn begins and ends at `start`.
     """
     return np.asarray(np.mod(start - azimuth, 2 * np.pi) / (2 * np.pi))
 

@@ -30,14 +30,11 @@ _EDGES = [(a, a | bit) for bit in (4, 2, 1) for a in range(8) if not a & bit]
 
 
 class Box(NamedTuple):
-    """One bounding box of an object, at one time.
+    """One bounding box of an object, at one time in seconds.
 
-    Attributes:
-        track: name of the object; `label` is its class.
-        size: length (x), width (y), height (z), metres.
-        time: seconds.
-        pose: box to world, the origin in the middle of the box.
-        moving: whether the object moves at this time, or None if the data set does not state it.
+    `track` is the name of the object, `label` its class. The size is length (x), width (y), height
+    (z) in metres; the pose is box to world, with the origin in the middle of the box. `moving`
+    states whether the object moves at this time; None: the data set does not state it.
     """
 
     track: str
@@ -65,8 +62,7 @@ def tracks(boxes: Iterable[Box]) -> tuple[TrackedObject, ...]:
         states = [box.moving for box in its_boxes if box.moving is not None]
         farthest = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1).max()
         moving = any(states) if states else bool(farthest > STANDS_WITHIN_M)
-        length, width, height = np.median([box.size for box in its_boxes], axis=0).tolist()
-        size = (length, width, height)
+        size = tuple(np.median([box.size for box in its_boxes], axis=0).tolist())
         objects.append(TrackedObject(name, its_boxes[0].label, size, times, poses, moving))
     return tuple(objects)
 
@@ -75,8 +71,7 @@ def tracks(boxes: Iterable[Box]) -> tuple[TrackedObject, ...]:
 class MovingObjects:
     """The objects that Gaussians belong to, in the order of `Population.owner`.
 
-    Attributes:
-        middle: middle of the drive, seconds (the zero of `Placement.time`); None: no vibration.
+    `middle` of the drive is in seconds (the zero of `Placement.time`); None: no vibration.
     """
 
     objects: tuple[TrackedObject, ...]

@@ -40,9 +40,8 @@ _AROUND = re.compile(r"(?:^|_)(?:camera|cam|ring)(?=_|$)")
 class RigCamera:
     """One camera of a car: its name in the data set, and its calibrated size, pixels.
 
-    Attributes:
-        K: intrinsics in pixels of the undistorted image, pixel centres at +0.5.
-        distortion: lens distortion that is removed on load, or None.
+    K is in pixels of the undistorted image, with pixel centres at +0.5. The distortion, if any, is
+    removed on load.
     """
 
     name: str
@@ -85,11 +84,9 @@ class Photograph:
 
 
 class SweepPoints(NamedTuple):
-    """The points of one LiDAR sweep.
+    """The points of one LiDAR sweep in the world, each at its measurement time, seconds.
 
-    Attributes:
-        points: world coordinates, each at its measurement time; NaN and inf are as in the file.
-        times: seconds; they are equal if the data set states one time for a sweep.
+    NaN and inf are as in the file. Times are equal if the data set states one for a sweep.
     """
 
     points: Float64[np.ndarray, "n 3"]

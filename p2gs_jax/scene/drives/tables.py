@@ -143,16 +143,9 @@ def read_rows(path: Path, needs: Kinds, column: str = "", among: Container[Any] 
     """Return rows of a large JSON list of objects; only the wanted rows are decoded.
 
     The tables of nuScenes have millions of rows. The rows of one drive are searched in the file,
-    which is not held in memory. Rows must not contain objects.
-
-    Args:
-        path: the table.
-        needs: columns that every returned row must have, and their types.
-        column: only rows whose text in this column is in `among` are returned; "": all rows.
-        among: wanted texts.
-
-    Raises:
-        UserError: the file is missing, not a list of objects, or cut off, or a row lacks a column.
+    which is not held in memory: rows whose text in `column` is in `among`, or all rows if `column`
+    is empty. Rows must not contain objects. UserError: the file is missing, not a list of objects,
+    or cut off, or a row lacks a column of `needs` or has another type there.
     """
     try:
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
