@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -346,19 +347,6 @@ def _keep(path: Path, cfg: DataConfig, folder: Path, report: Report) -> dict[str
     return {"known": known, "notes": notes, "frames": records}
 
 
-@dataclass(frozen=True)
-class Motion:
-    """The motion of a frame relative to the reference, in longer sides of the picture.
-
-    `displacement` is the median over corners, `parallax` the upper quartile of displacements after
-    the best rotation, and `tracked` the share of the reference's corners that are still tracked.
-    """
-
-    displacement: float
-    parallax: float
-    tracked: float
-
-
 def normalised(grey: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
     """Return a frame with fixed mean and contrast, so that exposure does not look like motion."""
     values = grey.astype(np.float32)
@@ -375,8 +363,8 @@ class Tracker:
         self._now, self._last = self._start, grey
         self._count = max(len(self._start), 1)
 
-    def follow(self, grey: UInt8[np.ndarray, "h w"]) -> Motion:
-        """Return the motion of the next frame, normalised like the reference."""
+    def follow(self, grey: UInt8[np.ndarray, "h w"]) -> float:
+        """Return motion / threshold of the next frame, normalised like the reference (1: due)."""
         if len(self._now) >= _FEWEST:
             ahead, found, _ = cv2.calcOpticalFlowPyrLK(
                 self._last, grey, self._now, np.empty_like(self._now)
@@ -391,11 +379,12 @@ class Tracker:
             self._start, self._now = self._start[good], ahead[good]
         self._last = grey
         if len(self._now) < _FEWEST:
-            return Motion(1.0, 1.0, 0.0)
+            return math.inf
         side = max(grey.shape)
         displacement = float(np.median(np.linalg.norm(self._now - self._start, axis=1))) / side
         parallax = _parallax(self._start, self._now, grey.shape)
-        return Motion(displacement, parallax, len(self._now) / self._count)
+        lost = 1 - len(self._now) / self._count
+        return max(parallax / PARALLAX, displacement / DISPLACEMENT, lost / LOST)
 
 
 def _parallax(
@@ -443,9 +432,7 @@ def choose_frames(frames: Iterable[tuple[int, UInt8[np.ndarray, "h w"]]]) -> lis
 
     def consider(tracker: Tracker, sharp: float, number: int, grey: np.ndarray) -> float:
         """Return motion / threshold of a frame (1: one is due); it may become a candidate."""
-        motion = tracker.follow(grey)
-        lost = (1 - motion.tracked) / LOST
-        share = max(motion.parallax / PARALLAX, motion.displacement / DISPLACEMENT, lost)
+        share = tracker.follow(grey)
         if share >= _CANDIDATE:
             waiting.append((sharp, number, grey))
         return share
