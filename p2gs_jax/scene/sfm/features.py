@@ -11,8 +11,8 @@ import json
 import shutil
 import sys
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import closing
 from itertools import combinations
 from pathlib import Path
 
@@ -57,14 +57,9 @@ def quiet_colmap() -> None:
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
 
 
-@contextmanager
-def opened(database: Path) -> Iterator[pycolmap.Database]:
+def opened(database: Path) -> closing[pycolmap.Database]:
     """Provide an open database, and close it at the end."""
-    db = pycolmap.Database.open(database)
-    try:
-        yield db
-    finally:
-        db.close()
+    return closing(pycolmap.Database.open(database))
 
 
 def extract(
@@ -172,8 +167,7 @@ def kept_features(
         for start in range(0, len(wanted), IMAGES_AT_ONCE):
             part = wanted[start : start + IMAGES_AT_ONCE]
             camera = next((known[name] for name in group if name in known), None)
-            mode = pycolmap.CameraMode.SINGLE
-            extract(database, image_folder, part, mode=mode, camera=camera)
+            extract(database, image_folder, part, mode=pycolmap.CameraMode.SINGLE, camera=camera)
             known |= _cameras(database)
             done += len(part)
             progress(done)
