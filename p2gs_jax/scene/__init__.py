@@ -128,7 +128,7 @@ def find_scene(
         return split_as_listed(scene, lists, allow_missing=cfg.allow_missing)
     if (root / "transforms.json").is_file() and cfg.format in (None, "transforms"):
         return transforms.load_transforms(root, root / "transforms.json", cfg)
-    if transforms.is_blender(root) and cfg.format in (None, "blender"):
+    if (root / "transforms_train.json").is_file() and cfg.format in (None, "blender"):
         return transforms.load_blender(root, cfg)
     if transforms.llff_table(root) and cfg.format in (None, "llff"):
         return transforms.load_llff(root, cfg)

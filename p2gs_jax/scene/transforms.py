@@ -67,11 +67,6 @@ class _Frame(NamedTuple):
     split: Split
 
 
-def is_blender(root: Path) -> bool:
-    """Return whether a folder has one transforms.json for each part of the split."""
-    return (root / "transforms_train.json").is_file()
-
-
 def load_transforms(root: Path, json_path: Path, cfg: DataConfig) -> Scene:
     """Read poses, intrinsics, and the seed points that the file may name; there are no tracks yet.
 
