@@ -93,8 +93,14 @@ def read_kitti_raw(root: Path, cfg: DataConfig) -> Recording:
     ]
     absent = len(forward) - len(sweeps)
     notes += tables.counted(absent, f"of {len(forward)} LiDAR sweeps are missing.")
-    objects, box_notes = _objects(root, forward, lengths, scanner)
-    notes += box_notes
+    labels, objects = root / "tracklet_labels.xml", ()
+    if labels.is_file():
+        boxes, empty = _tracklets(labels)
+        notes += tables.counted(empty, "tracklets have no boxes: they are left out.")
+        objects, more = in_world(boxes, forward, lengths, scanner)
+    else:
+        more = ["There are no boxes of moving objects (tracklet_labels.xml)."]
+    notes += more
     return Recording(root, "kitti_raw", cameras, photographs, sweeps, objects, notes)
 
 
@@ -248,22 +254,6 @@ def read_sweep(path: Path, forward_s: float, turn_s: float, scanner: Trajectory)
     at = passed(points, forward_s, turn_s, BACK)
     placed, _ = scanner.at(at)
     return SweepPoints(np.einsum("nij,nj->ni", placed[:, :3, :3], points) + placed[:, :3, 3], at)
-
-
-def _objects(
-    root: Path,
-    forward: Float64[np.ndarray, " f"],
-    lengths: Float64[np.ndarray, " f"],
-    scanner: Trajectory,
-) -> tuple[tuple[TrackedObject, ...], list[str]]:
-    """Return the tracklets in the world, and notes."""
-    path = root / "tracklet_labels.xml"
-    if not path.is_file():
-        return (), ["There are no boxes of moving objects (tracklet_labels.xml)."]
-    boxes, empty = _tracklets(path)
-    notes = tables.counted(empty, "tracklets have no boxes: they are left out.")
-    objects, more = in_world(boxes, forward, lengths, scanner)
-    return objects, notes + more
 
 
 def in_world(

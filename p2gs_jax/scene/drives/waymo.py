@@ -261,11 +261,8 @@ class _Scanner(NamedTuple):
 
 def _sweeps(segment: _Segment, cars: dict[int, Pose]) -> tuple[list[Sweep], list[str]]:
     """Return one sweep of all scanners together for each frame, and notes."""
-    images, scanners = segment.open("lidar"), _scanners(segment.open("lidar_calibration"))
-    poses = segment.open("lidar_pose") if segment.has("lidar_pose") else None
-    rows, posed = _rows(images), {} if poses is None else _rows(poses)
-    source = _Source(segment, images, poses, scanners, rows, posed)
-    turns = sorted({stamp for stamp, _ in rows})
+    source = _Source(segment)
+    turns = sorted({stamp for stamp, _ in source.rows})
     sweeps = [
         Sweep(
             segment.frame(stamp),
@@ -275,7 +272,7 @@ def _sweeps(segment: _Segment, cars: dict[int, Pose]) -> tuple[list[Sweep], list
         for stamp in turns
         if stamp in cars
     ]
-    unposed = sum((turn, UPPER) in rows and (turn, UPPER) not in posed for turn in turns)
+    unposed = sum(scanner == UPPER for _, scanner in source.rows.keys() - source.posed.keys())
     words = f"of {len(turns)} LiDAR turns lack lidar_pose: their points ignore the car's motion."
     notes = counted(unposed, words)
     words = "LiDAR sweeps have frames without a pose: they are left out."
@@ -303,15 +300,15 @@ def _scanners(table: ParquetTable) -> dict[int, _Scanner]:
     return found
 
 
-class _Source(NamedTuple):
+class _Source:
     """Tables for reading sweeps, and their rows by time stamp and scanner."""
 
-    segment: _Segment
-    images: ParquetTable
-    poses: ParquetTable | None
-    scanners: dict[int, _Scanner]
-    rows: dict[tuple[int, int], int]
-    posed: dict[tuple[int, int], int]
+    def __init__(self, segment: _Segment):
+        self.segment, self.images = segment, segment.open("lidar")
+        self.scanners = _scanners(segment.open("lidar_calibration"))
+        self.poses = segment.open("lidar_pose") if segment.has("lidar_pose") else None
+        self.rows = _rows(self.images)
+        self.posed = {} if self.poses is None else _rows(self.poses)
 
     def read(self, stamp: int, car: Pose) -> SweepPoints:
         """Return the points of the turn that begins at a time stamp.
