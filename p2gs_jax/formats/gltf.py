@@ -38,13 +38,24 @@ def write_gltf(path: Path, gaussians: Gaussians) -> int:
     columns = _attributes(half_turn(gaussians))
     data = [np.ascontiguousarray(c, "<f4").tobytes() for c in columns.values()]
     starts = np.cumsum([0, *map(len, data)]).tolist()
+    splats = {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+        "projection": "perspective",
+        "sortingMethod": "cameraDistance",
+    }
+    primitive = {
+        "mode": POINTS,
+        "attributes": {name: k for k, name in enumerate(columns)},
+        "extensions": {EXTENSION: splats},
+    }
     document = {
         "asset": {"version": "2.0", "generator": "p2gs-jax"},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "name": "splats"}],
-        "meshes": [{"primitives": [_primitive(list(columns))]}],
+        "meshes": [{"primitives": [primitive]}],
         "accessors": [_accessor(k, name, c) for k, (name, c) in enumerate(columns.items())],
         "bufferViews": [
             {"buffer": 0, "byteOffset": start, "byteLength": len(d), "target": ARRAY_BUFFER}
@@ -75,21 +86,6 @@ def _attributes(g: Gaussians) -> dict[str, Float32[np.ndarray, "n _"]]:
             name = f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{order}"
             columns[name] = sh[:, degree**2 + order]
     return {name: np.asarray(c, np.float32) for name, c in columns.items()}
-
-
-def _primitive(names: list[str]) -> dict[str, Any]:
-    return {
-        "mode": POINTS,
-        "attributes": {name: k for k, name in enumerate(names)},
-        "extensions": {
-            EXTENSION: {
-                "kernel": "ellipse",
-                "colorSpace": "srgb_rec709_display",
-                "projection": "perspective",
-                "sortingMethod": "cameraDistance",
-            }
-        },
-    }
 
 
 def _accessor(view: int, name: str, column: Float32[np.ndarray, "n k"]) -> dict[str, Any]:
