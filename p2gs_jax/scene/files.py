@@ -200,10 +200,7 @@ def image_size(path: Path) -> tuple[int, int]:
         str(path).encode()  # the files of a run hold names in UTF-8
     except UnicodeEncodeError:
         raise UserError(f"the name of {path} is not UTF-8", fix="rename it") from None
-    try:
-        width, height = size_of(path) or _size_in_header(path)
-    except Image.DecompressionBombError:
-        width, height = MOST_PIXELS, 2
+    width, height = size_of(path) or _size_in_header(path)
     if width * height > MOST_PIXELS:
         fix = "make the photographs smaller, or remove that one from the scene"
         raise broken(path, f"has more than {MOST_PIXELS / 1e6:.0f} million pixels", fix)
@@ -215,7 +212,7 @@ def _size_in_header(path: Path) -> tuple[int, int]:
         with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
             return image.size
     except Image.DecompressionBombError:
-        raise
+        return MOST_PIXELS, 2
     except Exception:  # PIL's error types are not a closed set
         pass
     with contextlib.suppress(cv2.error, OSError):

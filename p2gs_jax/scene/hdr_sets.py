@@ -126,13 +126,11 @@ def with_all_exposures(
         notes.append(f"{count} more photographs of the model's poses are named by {source.name}.")
     views = with_times([views[row] for row in order], times, source)
     tracks = _copied(scene.tracks, [sources[row] for row in order])
-    parts = [_PART.match(PurePosixPath(view.name).name) for view in views]
+    found = [_PART.match(PurePosixPath(view.name).name) for view in views]
+    parts = [part and part[1] for part in found]
     split_by = scene.split_by
-    if split_by is None and all(parts) and len({part[1] for part in parts if part}) == 2:
-        views = tuple(
-            replace(view, split="test" if part and part[1] == "test" else "train")
-            for view, part in zip(views, parts, strict=True)
-        )
+    if split_by is None and {*parts} == {"train", "test"}:
+        views = tuple(replace(v, split=part) for v, part in zip(views, parts, strict=True))
         split_by = "names that begin with train or test"
     notes = (*scene.notes, *notes)
     return replace(scene, views=views, tracks=tracks, notes=notes, split_by=split_by)
