@@ -205,8 +205,8 @@ def video_size(path: Path) -> tuple[int, int]:
 
 
 def no_frames(path: Path, count: int) -> UserError:
-    """Return the error for a video with `count` frames, which are too few."""
-    frames = "no frame" if count == 0 else "one frame" if count == 1 else f"{count} frames"
+    """Return the error for a video with `count` frames, 0 or 1."""
+    frames = "one frame" if count else "no frame"
     why = f"holds {frames}; a scene needs several from different positions."
     return broken(path, why, _SHORT)
 
@@ -259,10 +259,8 @@ def _signal(frame: av.VideoFrame) -> Float[np.ndarray, "h w 3"]:
     full = int(frame.color_range) == _FULL_RANGE or frame.format.name.startswith("yuvj")
     span = 2 if full else 1
     planar = frame.reformat(format="yuv444p16le", src_color_range=span, dst_color_range=span)
-    coded = planar.to_ndarray()
-    if coded.shape[0] == 3 and coded.shape[2] != 3:
-        coded = np.moveaxis(coded, 0, -1)
-    y, u, v = np.moveaxis(coded.astype(np.float32) / 256, -1, 0)
+    coded = planar.to_ndarray().astype(np.float32) / 256
+    y, u, v = np.moveaxis(coded, -1, 0)
     foot, luma, chroma = (0, 255, 255) if full else (16, 219, 224)
     y, u, v = (y - foot) / luma, (u - 128) / chroma, (v - 128) / chroma
     usual = 1 if min(frame.width, frame.height) >= _SMALLEST_HD else 5
