@@ -26,10 +26,10 @@ from jaxtyping import Float64, Int, Int64
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import broken
 from p2gs_jax.scene.drives import recording
-from p2gs_jax.scene.drives.objects import Box, Pose, tracks
+from p2gs_jax.scene.drives.objects import Box, tracks
 from p2gs_jax.scene.drives.tables import Columns, counted, drive_folder, numbered, read_feather
 from p2gs_jax.scene.lens import intrinsics
-from p2gs_jax.scene.rigid import from_quaternions
+from p2gs_jax.scene.rigid import Pose, from_quaternions
 from p2gs_jax.types import TrackedObject
 
 MARKER = POSES = "city_SE3_egovehicle.feather"
@@ -122,7 +122,6 @@ def _cameras(
 def _photographs(
     car: _Car, cameras: list[recording.RigCamera], files: dict[str, dict[int, Path]]
 ) -> tuple[list[recording.Photograph], list[str]]:
-    """Return photographs with poses, and notes."""
     if not cameras:
         return [], []
     path = car.log / EXTRINSICS

@@ -28,12 +28,12 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import broken
 from p2gs_jax.scene.drives import tables
 from p2gs_jax.scene.drives.lidar import passed
-from p2gs_jax.scene.drives.objects import Box, Pose, tracks
+from p2gs_jax.scene.drives.objects import Box, tracks
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
 from p2gs_jax.scene.drives.waymo import CAMERAS, OPENCV, TURN_S, TURN_START
 from p2gs_jax.scene.files import image_size, read_json
 from p2gs_jax.scene.lens import intrinsics, make_distortion
-from p2gs_jax.scene.rigid import inverse, rigid
+from p2gs_jax.scene.rigid import Pose, inverse, rigid
 from p2gs_jax.types import TrackedObject
 
 MARKER = "ego_pose/*.txt"
@@ -115,7 +115,6 @@ def _read_sweep(path: Path, car: Pose, time: float) -> SweepPoints:
 
 
 def _objects(path: Path, cars: dict[int, Pose]) -> tuple[tuple[TrackedObject, ...], list[str]]:
-    """Return the tracked objects in the world, and notes."""
     if not path.is_file():
         return (), [f"There are no boxes of moving objects ({BOXES})."]
     boxes, lost = [], 0

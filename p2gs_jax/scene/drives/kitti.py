@@ -26,7 +26,7 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import broken
 from p2gs_jax.scene.drives import tables
 from p2gs_jax.scene.drives.lidar import passed
-from p2gs_jax.scene.drives.objects import Box, Pose, tracks
+from p2gs_jax.scene.drives.objects import Box, tracks
 from p2gs_jax.scene.drives.recording import (
     Photograph,
     Recording,
@@ -36,7 +36,7 @@ from p2gs_jax.scene.drives.recording import (
     Trajectory,
 )
 from p2gs_jax.scene.files import image_size
-from p2gs_jax.scene.rigid import inverse, pose_of, rigid
+from p2gs_jax.scene.rigid import Pose, inverse, pose_of, rigid
 from p2gs_jax.types import TrackedObject
 
 MARKER = "oxts/data"

@@ -21,10 +21,10 @@ from scipy.spatial.transform import Rotation
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import broken
 from p2gs_jax.scene.drives import kitti, tables
-from p2gs_jax.scene.drives.objects import Box, Pose
+from p2gs_jax.scene.drives.objects import Box
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, Trajectory
 from p2gs_jax.scene.files import image_size
-from p2gs_jax.scene.rigid import inverse, pose_of, rigid
+from p2gs_jax.scene.rigid import Pose, inverse, pose_of, rigid
 
 MARKER = "oxts/[0-9]*.txt"
 SET = "training"

@@ -24,7 +24,7 @@ import numpy as np
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import broken
 from p2gs_jax.scene.drives.lidar import turned
-from p2gs_jax.scene.drives.objects import Box, Pose, tracks
+from p2gs_jax.scene.drives.objects import Box, tracks
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
 from p2gs_jax.scene.drives.tables import (
     Kinds,
@@ -36,7 +36,7 @@ from p2gs_jax.scene.drives.tables import (
     read_scan,
 )
 from p2gs_jax.scene.files import require_inside
-from p2gs_jax.scene.rigid import from_quaternion, inverse
+from p2gs_jax.scene.rigid import Pose, from_quaternion, inverse
 from p2gs_jax.types import TrackedObject
 
 MARKER = "v1.0-*/sample_data.json"
@@ -231,7 +231,6 @@ def _read_sweep(path: Path, pose: Pose, end: float) -> SweepPoints:
 
 
 def _objects(drive: _Drive) -> tuple[tuple[TrackedObject, ...], list[str]]:
-    """Return the tracked objects, and notes."""
     path = drive.path("sample_annotation")
     needs: Kinds = {**PLACED, "size": list, "sample_token": str}
     there = path.is_file()

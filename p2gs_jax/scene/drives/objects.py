@@ -12,11 +12,9 @@ from jaxtyping import Bool, Float, Float64
 
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.render.project import HIDDEN
-from p2gs_jax.scene.rigid import interpolated
+from p2gs_jax.scene.rigid import Pose, interpolated
 from p2gs_jax.types import Placement, Scene, TrackedObject, View
 
-# The matrix of a rigid pose.
-Pose = Float64[np.ndarray, "4 4"]
 # Boxes of parked cars jump by a few decimetres; an object that gets farther than this moves.
 STANDS_WITHIN_M = 1.0
 # The least depth at which boxes are drawn, scene units.

@@ -27,11 +27,11 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import broken
 from p2gs_jax.scene.drives import tables
 from p2gs_jax.scene.drives.lidar import turned
-from p2gs_jax.scene.drives.objects import Box, Pose, tracks
+from p2gs_jax.scene.drives.objects import Box, tracks
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
 from p2gs_jax.scene.files import image_size, read_json
 from p2gs_jax.scene.lens import intrinsics
-from p2gs_jax.scene.rigid import from_quaternion, inverse
+from p2gs_jax.scene.rigid import Pose, from_quaternion, inverse
 from p2gs_jax.types import TrackedObject
 
 MARKER = "camera/*/intrinsics.json"

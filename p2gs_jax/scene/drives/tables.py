@@ -351,7 +351,6 @@ def _columns(table: Any) -> dict[str, np.ndarray]:
 
 
 def _array(record: Any) -> np.ndarray:
-    """Return the array that a record stands for."""
     name = record.name if isinstance(record, _Record) else type(record).__name__
     if name == "_new_Index":
         kind, state = record.args

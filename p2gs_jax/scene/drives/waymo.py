@@ -37,11 +37,11 @@ from scipy.spatial.transform import Rotation
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import broken
 from p2gs_jax.scene.drives.lidar import turned
-from p2gs_jax.scene.drives.objects import Box, Pose, tracks
+from p2gs_jax.scene.drives.objects import Box, tracks
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
 from p2gs_jax.scene.drives.tables import ParquetTable, chosen_drive, counted
 from p2gs_jax.scene.lens import intrinsics, make_distortion
-from p2gs_jax.scene.rigid import LONGEST_BEYOND_S, pose_of, rigid
+from p2gs_jax.scene.rigid import LONGEST_BEYOND_S, Pose, pose_of, rigid
 from p2gs_jax.types import TrackedObject
 
 MARKER = "camera_image/*.parquet"
@@ -158,7 +158,6 @@ def _cameras(table: ParquetTable) -> tuple[list[RigCamera], dict[str, Pose]]:
 
 
 def _photographs(segment: _Segment, mounts: dict[str, Pose]) -> tuple[list[Photograph], list[str]]:
-    """Return photographs, and notes."""
     images = segment.images
     table = images.columns([STAMP, CAMERA, POSE_TIME, *MOTION, *SHUTTER, POSE])
     motion, stamps, times = table.stacked(MOTION), table.whole(STAMP), table.numbers(POSE_TIME)
