@@ -63,7 +63,6 @@ def write_ply(path: Path, gaussians: Gaussians, comments: Sequence[str]) -> int:
 
 
 def _columns(g: Gaussians, rows: slice) -> Float[np.ndarray, "k c"]:
-    """Return some Gaussians as rows of the table."""
     sh = g.sh[rows]
     count = len(sh)
     vibration = []

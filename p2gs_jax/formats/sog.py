@@ -34,10 +34,8 @@ LEAST_OPACITY = 0.5 / 255
 def read_sog(path: Path) -> Gaussians:
     """Read Gaussians with display colours, in the order of the file.
 
-    Raises:
-        OSError: the file or a texture cannot be read.
-        ValueError: the file is not a ZIP, has another version, or its parts disagree.
-        KeyError: a texture or a field of `meta.json` is missing.
+    OSError: the file or a texture cannot be read. ValueError: the file is not a ZIP, has another
+    version, or its parts disagree. KeyError: a texture or a field of `meta.json` is missing.
     """
     try:
         with zipfile.ZipFile(path) as file:

@@ -25,8 +25,7 @@ READERS: dict[str, Callable[[Path], Gaussians]] = {
 def read_splats(path: Path) -> Gaussians:
     """Read Gaussians in the axes of PLY.
 
-    Raises:
-        UserError: the file has another format or number of harmonics, holds radiance, or is broken.
+    UserError: the file has another format or number of harmonics, holds radiance, or is broken.
     """
     read = next((READERS[end] for end in READERS if path.name.lower().endswith(end)), None)
     if read is None:

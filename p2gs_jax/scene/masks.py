@@ -67,7 +67,6 @@ def find_masks(views: Sequence[View], root: Path) -> tuple[list[Path | None], di
 
 
 def _holds_masks(folder: Path) -> bool:
-    """Return whether a folder has the name of a folder of masks, in any case."""
     return folder.name.lower() in MASK_FOLDERS
 
 

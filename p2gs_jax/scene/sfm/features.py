@@ -125,7 +125,6 @@ def match(database: Path, pairs: Iterable[Pair] | None) -> None:
 
 
 def _rename(database: Path, characters: Mapping[int, int]) -> None:
-    """Replace characters in the names of the images in a database."""
     with opened(database) as db:
         for image in db.read_all_images():
             name = image.name.translate(characters)
