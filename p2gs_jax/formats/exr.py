@@ -17,10 +17,10 @@ from jaxtyping import Float, Float32
 from p2gs_jax.core.atomic import atomic_write
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.display import DisplayTransform
+from p2gs_jax.scene.convert.icc import BT709
 from p2gs_jax.scene.convert.readers import ExifSettings
 from p2gs_jax.types import Camera
 
-BT709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 HALF_MAX = 65504.0  # largest finite 16-bit float
 
 

@@ -9,15 +9,15 @@ import matplotlib
 import numpy as np
 from jaxtyping import Float, Float32
 
-# Weights of the BT.709 primaries in luminance; linear radiance has these primaries.
-WEIGHTS = (0.2126, 0.7152, 0.0722)
+from p2gs_jax.photometry.metering import BT709
+
 STOPS = (-6.0, 6.0)  # ends of the map of false colours, stops from its middle
 STOPS_MAP, DEPTH_MAP = "viridis", "cividis"
 
 
 def luminance(linear: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "..."]:
     """Return the luminance of linear BT.709 radiance."""
-    return np.asarray(linear) @ np.asarray(WEIGHTS, np.float32)
+    return np.asarray(linear) @ BT709.astype(np.float32)
 
 
 def stops(linear: Float[np.ndarray, "... 3"], middle: float) -> Float[np.ndarray, "..."]:

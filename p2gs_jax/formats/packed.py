@@ -63,8 +63,7 @@ def morton_order(means: Float32[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
     count = max(len(means), 1)
     code = np.zeros(len(means), np.int64)
     for axis in range(3):
-        rank = np.empty(len(means), np.int64)
-        rank[np.argsort(means[:, axis], kind="stable")] = np.arange(len(means))
+        rank = np.argsort(np.argsort(means[:, axis], kind="stable"))
         cell = rank * 1024 // count  # 10 bits
         for bit in range(10):
             code |= (cell >> bit & 1) << (3 * bit + axis)
