@@ -276,11 +276,6 @@ def _exr(path: Path, **how: bool) -> Iterator[Any]:
         raise broken(path, f"is not a readable OpenEXR file: {error}.", fix) from None
 
 
-def _exr_header(path: Path) -> dict:
-    with _exr(path, header_only=True) as file:
-        return dict(file.header())
-
-
 def read_exr(path: Path) -> Picture:
     """Return the light of an OpenEXR: channels R, G, B (even in a layer) or Y.
 
@@ -346,7 +341,8 @@ def size_of(path: Path) -> tuple[int, int] | None:
     if kind == "raw":
         return read_facts(path).size
     if kind == "exr":
-        low, high = _exr_header(path)["dataWindow"]
+        with _exr(path, header_only=True) as file:
+            low, high = file.header()["dataWindow"]
         return int(high[0] - low[0] + 1), int(high[1] - low[1] + 1)
     return None
 
@@ -437,7 +433,8 @@ def _exif_tags(path: Path, *, after_pixels: bool = True) -> dict:
             with _raw(path) as raw:
                 return _flat(_raw_exif(path, raw))
         if kind == "exr":
-            exif = _exr_exif(_exr_header(path))
+            with _exr(path, header_only=True) as file:
+                exif = _exr_exif(dict(file.header()))
             # The length of an Exif with settings alone is 0: test for None.
             return {} if exif is None else _flat(exif)
         if kind == "heif":
