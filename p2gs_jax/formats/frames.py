@@ -28,21 +28,16 @@ SMALLEST = 16
 
 @dataclass(frozen=True)
 class OutputFrame:
-    """A rendered picture: radiance without exposure, opacity, and display values in [0, 1].
+    """A rendered picture: radiance without exposure, opacity, and display values in [0, 1]."""
 
-    `name` is the path of its files in the output folder, without suffix. `transform` converts
-    `linear` to `ldr`; `depth` is camera z times alpha, scene units; `photograph` has the display
-    values of the photograph at this pose.
-    """
-
-    name: str
+    name: str  # the path of its files in the output folder, without suffix
     linear: Float32[np.ndarray, "h w 3"]
     alpha: Float32[np.ndarray, "h w"]
     ldr: Float32[np.ndarray, "h2 w2 3"]
-    transform: DisplayTransform
-    depth: Float32[np.ndarray, "h w"] | None = None
+    transform: DisplayTransform  # converts `linear` to `ldr`
+    depth: Float32[np.ndarray, "h w"] | None = None  # camera z times alpha, scene units
     camera: Camera | None = None
-    photograph: Float32[np.ndarray, "h3 w3 3"] | None = None
+    photograph: Float32[np.ndarray, "h3 w3 3"] | None = None  # display values, at this pose
 
 
 def to_uint8(ldr: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:

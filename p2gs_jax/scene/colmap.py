@@ -263,33 +263,26 @@ class CameraRecord(NamedTuple):
 
 
 class ImageRecord(NamedTuple):
-    """One entry of `images`, its name relative to the image folder.
+    """One entry of `images`; its pose is world-to-camera."""
 
-    The pose (quaternion wxyz, translation in scene units) is world-to-camera. `xy` are the
-    keypoints with a 3D point, in pixels with centres at +0.5; `point_ids` are the points' ids.
-    """
-
-    name: str
+    name: str  # relative to the image folder
     camera_id: int
-    qvec: Float[np.ndarray, " 4"]
-    tvec: Float[np.ndarray, " 3"]
-    xy: Float[np.ndarray, "n 2"]
-    point_ids: Int[np.ndarray, " n"]
+    qvec: Float[np.ndarray, " 4"]  # wxyz
+    tvec: Float[np.ndarray, " 3"]  # scene units
+    xy: Float[np.ndarray, "n 2"]  # keypoints with a 3D point, in pixels with centres at +0.5
+    point_ids: Int[np.ndarray, " n"]  # ids of these points
 
 
 class Model(NamedTuple):
-    """A COLMAP model: cameras by id, images in the file's order, ascending `point_ids`.
-
-    `xyz` is in scene units, `rgb` display-encoded, `kind` bin or txt. Points of a PLY have id -1.
-    """
+    """A COLMAP model."""
 
     folder: Path
-    kind: str
-    cameras: dict[int, CameraRecord]
-    images: tuple[ImageRecord, ...]
-    point_ids: Int[np.ndarray, " p"]
-    xyz: Float[np.ndarray, "p 3"]
-    rgb: UInt8[np.ndarray, "p 3"] | None
+    kind: str  # bin or txt
+    cameras: dict[int, CameraRecord]  # by id
+    images: tuple[ImageRecord, ...]  # in the file's order
+    point_ids: Int[np.ndarray, " p"]  # ascending; points of a PLY have id -1
+    xyz: Float[np.ndarray, "p 3"]  # scene units
+    rgb: UInt8[np.ndarray, "p 3"] | None  # display-encoded
 
     def file(self, stem: str) -> Path:
         """Return a file of the model, for messages."""

@@ -28,19 +28,15 @@ MOST_LABELS = 8
 
 @dataclass(frozen=True)
 class SurveyedCamera:
-    """One physical camera, or photographs of one size if their cameras are unknown.
-
-    Sizes and focal lengths are in pixels. `ego_mask` is the share of the picture that the car
-    covers, `ev` the range of log2(time ISO / N^2) in stops, up to a constant.
-    """
+    """One physical camera, or photographs of one size if their cameras are unknown."""
 
     name: str
     photographs: int
-    size: tuple[int, int]
-    focal: float | None = None
+    size: tuple[int, int]  # pixels
+    focal: float | None = None  # pixels
     lens: str = ""
-    ego_mask: float | None = None
-    ev: tuple[float, float] | None = None
+    ego_mask: float | None = None  # share of the picture that the car covers
+    ev: tuple[float, float] | None = None  # range of log2(time ISO / N^2), stops up to a constant
 
 
 @dataclass(frozen=True)

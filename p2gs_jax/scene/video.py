@@ -76,16 +76,12 @@ _FIRST = 6
 
 @dataclass(frozen=True)
 class Frame:
-    """A decoded frame, which `turn` counterclockwise quarter turns make upright.
+    """A decoded frame."""
 
-    Numbers count from 0 in display order, `time` is in seconds from the first frame, and
-    `pixel_aspect` is the ratio of width to height of a pixel.
-    """
-
-    number: int
-    time: float
-    turn: int
-    pixel_aspect: float
+    number: int  # from 0 on, in display order
+    time: float  # seconds from the first frame
+    turn: int  # number of counterclockwise quarter turns that make it upright
+    pixel_aspect: float  # ratio of width to height of a pixel
     _decoded: av.VideoFrame
 
     @property

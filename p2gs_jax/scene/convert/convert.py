@@ -64,17 +64,13 @@ _NO_ROOM = "free space on that disk, or name another --out"
 
 @dataclass(frozen=True)
 class Converted:
-    """Photographs that structure from motion can read, sorted, in `folder`.
-
-    `originals` are the user's files, by path relative to `folder`; `known` is the reason why the
-    tone curve of all photographs is known, or None.
-    """
+    """Photographs that structure from motion can read, sorted, in `folder`."""
 
     folder: Path
     paths: list[Path]
-    originals: Mapping[str, Path]
+    originals: Mapping[str, Path]  # the user's files, by path relative to `folder`
     notes: tuple[str, ...] = ()
-    known: str | None = None
+    known: str | None = None  # the reason why the tone curve of all photographs is known
 
 
 def convert_photographs(

@@ -152,16 +152,12 @@ def _code_points(nclx: dict | None, path: Path) -> tuple[int, icc.Transfer | Non
 
 @dataclass(frozen=True)
 class RawFacts:
-    """The metadata of a raw file; the size is in pixels, in the orientation of the sensor.
+    """The metadata of a raw file."""
 
-    `balance` are the camera's factors on red, green (1) and blue, None if they are not recorded.
-    `matrix` is False if LibRaw does not know the camera's colours: pixels keep its primaries.
-    """
-
-    size: tuple[int, int]
+    size: tuple[int, int]  # pixels, in the orientation of the sensor
     camera: str
-    balance: Balance | None
-    matrix: bool
+    balance: Balance | None  # the camera's factors on red, green (1) and blue, if recorded
+    matrix: bool  # False: LibRaw does not know the camera's colours, and pixels keep its primaries
 
 
 def read_facts(path: Path) -> RawFacts:

@@ -28,19 +28,14 @@ _EDGES = [(a, a | bit) for bit in (4, 2, 1) for a in range(8) if not a & bit]
 
 
 class Box(NamedTuple):
-    """One bounding box of an object, at one time in seconds.
+    """One bounding box of an object, at one time."""
 
-    `track` is the name of the object, `label` its class. The size is length (x), width (y), height
-    (z) in metres; the pose is box to world, with the origin in the middle of the box. `moving`
-    states whether the object moves at this time; None: the data set does not state it.
-    """
-
-    track: str
-    label: str
-    size: tuple[float, float, float]
-    time: float
-    pose: Pose
-    moving: bool | None = None
+    track: str  # name of the object
+    label: str  # its class
+    size: tuple[float, float, float]  # length (x), width (y), height (z), metres
+    time: float  # seconds
+    pose: Pose  # box to world, the origin in the middle of the box
+    moving: bool | None = None  # whether it moves then; None: the data set does not state it
 
 
 def tracks(boxes: Iterable[Box]) -> tuple[TrackedObject, ...]:
@@ -67,12 +62,10 @@ def tracks(boxes: Iterable[Box]) -> tuple[TrackedObject, ...]:
 
 @dataclass(frozen=True)
 class MovingObjects:
-    """The objects that Gaussians belong to, in the order of `Population.owner`.
-
-    `middle` of the drive is in seconds (the zero of `Placement.time`); None: no vibration.
-    """
+    """The objects that Gaussians belong to, in the order of `Population.owner`."""
 
     objects: tuple[TrackedObject, ...]
+    # The middle of the drive, seconds (the zero of `Placement.time`); None: no vibration.
     middle: float | None = None
 
     def __len__(self) -> int:

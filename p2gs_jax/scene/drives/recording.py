@@ -38,17 +38,13 @@ _AROUND = re.compile(r"(?:^|_)(?:camera|cam|ring)(?=_|$)")
 
 @dataclass(frozen=True)
 class RigCamera:
-    """One camera of a car: its name in the data set, and its calibrated size, pixels.
-
-    K is in pixels of the undistorted image, with pixel centres at +0.5. The distortion, if any, is
-    removed on load.
-    """
+    """One camera of a car: its name in the data set, and its calibrated size, pixels."""
 
     name: str
-    K: Float64[np.ndarray, "3 3"]
+    K: Float64[np.ndarray, "3 3"]  # in pixels of the undistorted image, pixel centres at +0.5
     width: int
     height: int
-    distortion: Distortion | None = None
+    distortion: Distortion | None = None  # is removed on load
 
 
 class Trajectory(NamedTuple):
@@ -65,22 +61,14 @@ class Trajectory(NamedTuple):
 
 @dataclass(frozen=True)
 class Photograph:
-    """One photograph and the pose of its camera.
-
-    Attributes:
-        frame: number of the moment in the drive, the same for all cameras.
-        time: seconds.
-        path: the file, or the name under which an embedded photograph is written.
-        pose: camera to world at `time`, OpenCV axes.
-        embedded: returns the bytes of an embedded photograph; None: there is a file.
-    """
+    """One photograph and the pose of its camera."""
 
     camera: str
-    frame: int
-    time: float
-    path: Path
-    pose: Float64[np.ndarray, "4 4"]
-    embedded: Callable[[], bytes] | None = None
+    frame: int  # number of the moment in the drive, the same for all cameras
+    time: float  # seconds
+    path: Path  # the file, or the name under which an embedded photograph is written
+    pose: Float64[np.ndarray, "4 4"]  # camera to world at `time`, OpenCV axes
+    embedded: Callable[[], bytes] | None = None  # returns the bytes; None: there is a file
 
 
 class SweepPoints(NamedTuple):
@@ -104,24 +92,15 @@ class Sweep:
 
 @dataclass(frozen=True)
 class Recording:
-    """One drive.
+    """One drive; photographs without a pose are counted in `notes` only."""
 
-    Attributes:
-        root: folder that the user named, or the folder of the chosen drive in it.
-        format: name of the reader (`DataConfig.format`).
-        cameras: all cameras of the car that have photographs.
-        photographs: in any order; photographs without a pose are counted in `notes` only.
-        sweeps: from all scanners, in the order of their times.
-        notes: sentences for the user, for example about entries that were left out.
-    """
-
-    root: Path
-    format: str
-    cameras: Sequence[RigCamera]
-    photographs: Sequence[Photograph]
-    sweeps: Sequence[Sweep] = ()
+    root: Path  # folder that the user named, or the folder of the chosen drive in it
+    format: str  # name of the reader (`DataConfig.format`)
+    cameras: Sequence[RigCamera]  # all cameras of the car that have photographs
+    photographs: Sequence[Photograph]  # in any order
+    sweeps: Sequence[Sweep] = ()  # from all scanners, in the order of their times
     objects: Sequence[TrackedObject] = ()
-    notes: Sequence[str] = ()
+    notes: Sequence[str] = ()  # sentences for the user, also about entries that were left out
 
 
 def short_name(camera: str) -> str:

@@ -249,12 +249,10 @@ def _objects(
 
 
 class _Scanner(NamedTuple):
-    """The pose of a scanner on the car, scanner to car, and its beams.
+    """The pose of a scanner on the car, and its beams."""
 
-    `beams` are rising inclinations, radians; two values are the ends of evenly spaced beams.
-    """
-
-    mount: Pose
+    mount: Pose  # scanner to car
+    # Rising inclinations, radians; two values are the ends of evenly spaced beams.
     beams: Float64[np.ndarray, " h"]
 
 
