@@ -60,18 +60,15 @@ _AGAIN = "copy that photograph again, or remove it from the scene"
 
 @dataclass(frozen=True)
 class Picture:
-    """A decoded photograph: display values (`codes`, `profile`) or light.
+    """A decoded photograph: display values (`codes`, `profile`) or light."""
 
-    The largest unsigned integer in `codes` stands for 1; channels are R G B (A) or one. Light is
-    linear in sRGB's primaries, `alpha` in [0, 1]. `invalid` counts pixels with NaN, stored as 0.
-    """
-
+    # The largest unsigned integer stands for 1; channels are R G B (A) or one.
     codes: UInt[np.ndarray, "h w c"] | None = None
-    light: Float32[np.ndarray, "h w 3"] | None = None
-    alpha: Float32[np.ndarray, "h w"] | None = None
+    light: Float32[np.ndarray, "h w 3"] | None = None  # linear in sRGB's primaries
+    alpha: Float32[np.ndarray, "h w"] | None = None  # in [0, 1]
     exif: Image.Exif | None = None
     profile: bytes | None = None
-    invalid: int = 0
+    invalid: int = 0  # number of pixels with NaN, stored as 0
 
 
 def kind_of(path: Path) -> Kind:

@@ -33,14 +33,11 @@ _ASPECT_TOLERANCE = 0.01
 
 @dataclass(frozen=True)
 class Decoded:
-    """A cached photograph: with its original bits, or with 16 bits if it was resampled.
+    """A cached photograph: with its original bits, or with 16 bits if it was resampled."""
 
-    The largest integer of `pixels` stands for 1.0; `valid` marks pixels that count. Only
-    photographs that are shown over a background have `alpha`; their pixels are premultiplied.
-    """
-
-    pixels: UInt[np.ndarray, "h w 3"]
-    valid: Bool[np.ndarray, "h w"]
+    pixels: UInt[np.ndarray, "h w 3"]  # the largest integer stands for 1.0
+    valid: Bool[np.ndarray, "h w"]  # pixels that count
+    # Only photographs that are shown over a background have it; their pixels are premultiplied.
     alpha: UInt[np.ndarray, "h w"] | None = None
 
     @property
