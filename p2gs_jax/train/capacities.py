@@ -96,15 +96,6 @@ def size_name(size: tuple[int, int]) -> str:
     return f"{size[0]}x{size[1]}"
 
 
-def cameras_by_size(views: TrainingViews, shrink: int) -> dict[tuple[int, int], list[Camera]]:
-    """Return the cameras of the level with this shrink factor, by image width and height."""
-    cameras: dict[tuple[int, int], list[Camera]] = {}
-    for index in range(len(views)):
-        camera = views.camera(index, shrink)
-        cameras.setdefault((camera.width, camera.height), []).append(camera)
-    return cameras
-
-
 def allocate(
     capacities: Mapping[str, Capacity],
     begun: Mapping[str, Capacity],
@@ -125,8 +116,11 @@ def allocate(
     gaussians, host_alive = jax.tree.map(np.asarray, (gaussians, alive))
     host_owner = None if owner is None else np.asarray(owner)
     for shrink in shrinks:
-        for size, cameras in cameras_by_size(views, shrink).items():
-            name = size_name(size)
+        by_size: dict[str, list[Camera]] = {}
+        for index in range(len(views)):
+            camera = views.camera(index, shrink)
+            by_size.setdefault(size_name((camera.width, camera.height)), []).append(camera)
+        for name, cameras in by_size.items():
             if name not in found:
                 capacity = capacity_for(gaussians, host_alive, cameras, limit, cfg, host_owner)
                 earlier = begun.get(name, capacity)

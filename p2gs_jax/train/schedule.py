@@ -160,12 +160,9 @@ class RunClock:
     def _passed(self, host: HostState) -> float:
         """Return the elapsed seconds, plus the time that the final work needs beyond its reserve.
 
-        The estimate assumes that evaluation is slowed down by the same factor as the steps.
+        The estimate assumes that evaluation is slowed down by the same factor as full-size steps.
         """
-        return host.elapsed_s + self._finish_s * (self._slowness(host) - 1)
-
-    def _slowness(self, host: HostState) -> float:
-        """Return the slowdown of full-size steps relative to the expected time, from 1 to 3."""
-        if host.shrink != 1 or host.step_s <= 0:
-            return 1.0
-        return min(max(host.step_s / self._full_step_s, 1.0), MOST_SLOWNESS)
+        slowness = 1.0
+        if host.shrink == 1 and host.step_s > 0:
+            slowness = min(max(host.step_s / self._full_step_s, 1.0), MOST_SLOWNESS)
+        return host.elapsed_s + self._finish_s * (slowness - 1)
