@@ -93,22 +93,19 @@ def _against_reference(
 ) -> dict[str, Any]:
     """Score renders against the reference photographs, which have one common exposure."""
     assert judge.reference is not None
-
-    def score(row: int, ldr) -> dict[str, Any]:
-        target, mask = judge.reference(row), judge.store.get(row)[1]  # pyright: ignore
-        return view_scores(judge.lpips_weights, ldr, target, mask)
-
     as_rendered, aligned, exposures = {}, {}, []
     for row in rows:
         radiance, name = light(row), judge.scene.views[row].name
         target, mask = judge.reference(row), judge.store.get(row)[1]
         assert target is not None
         exposures.append(radiance.fitted(target, mask).exposure)
-        as_rendered[name] = score(row, radiance.picture)
+        as_rendered[name] = view_scores(judge.lpips_weights, radiance.picture, target, mask)
     common = float(np.exp(np.median(np.log(exposures))))
     for row in rows:
         radiance, name = light(row), judge.scene.views[row].name
-        aligned[name] = score(row, radiance.under(replace(radiance.shown, exposure=common)))
+        target, mask = judge.reference(row), judge.store.get(row)[1]
+        ldr = radiance.under(replace(radiance.shown, exposure=common))
+        aligned[name] = view_scores(judge.lpips_weights, ldr, target, mask)
     return {
         "as_rendered": summary_of(as_rendered),
         "scale_aligned": {**summary_of(aligned), "exposure": common},

@@ -49,10 +49,9 @@ def load_reference(folder: str | Path, scene: Scene, cfg: FitConfig) -> Referenc
         why = f"{folder} holds no photograph with the name of a view (for example "
         why += f"{scene.views[0].name})."
         raise UserError(why, fix="name the reference photographs as the scene's images")
-    order = sorted(rows)
     # References are not cached: evaluation reads each only a few times.
-    store = ImageStore(tuple(rows[r] for r in order), dataclasses.replace(cfg.data, cache_mb=0))
-    where = {r: i for i, r in enumerate(order)}
+    store = ImageStore(tuple(rows.values()), dataclasses.replace(cfg.data, cache_mb=0))
+    where = {row: place for place, row in enumerate(rows)}
     return lambda row: store.get(where[row], 1)[0] if row in where else None
 
 
