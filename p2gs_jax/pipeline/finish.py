@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,7 +13,7 @@ from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.clock import Stopwatch, over_budget
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.core.runtime import return_freed_memory
-from p2gs_jax.evaluation.evaluate import Evaluation, evaluate
+from p2gs_jax.evaluation.evaluate import evaluate
 from p2gs_jax.evaluation.lpips import LpipsWeights
 from p2gs_jax.evaluation.references import Reference, find_radiance
 from p2gs_jax.evaluation.scores import ViewResult, is_drive, notes_on_missing
@@ -60,7 +59,19 @@ def finish(
     """
     return_freed_memory()
     watch, exposures = Stopwatch(), {}
+    solution = None if account.selection is None else account.selection.solution
     in_summary: dict[int, ViewResult | None] = dict.fromkeys(summary_rows(scene))
+
+    def keep(result: ViewResult) -> None:
+        """Write a held-out view and keep its exposure; keep the views of the summary."""
+        view = scene.views[result.index]
+        if view.split == "test":
+            exposures[result.index] = result.transform.exposure
+            with watch("files"):
+                write_view(folder.renders, view.name, result, store)
+        if result.index in in_summary:
+            in_summary[result.index] = result
+
     with watch("evaluation"):
         found = evaluate(
             params,
@@ -71,7 +82,7 @@ def finish(
             reference=truth,
             radiance=find_radiance(scene, store),
             lpips_weights=lpips_weights,
-            on_view=functools.partial(_keep, exposures, in_summary, scene, store, folder, watch),
+            on_view=keep,
             on_progress=lambda done, count: reporter.stage("Evaluating", done, count),
         )
     watch.add("evaluation", -watch.seconds.get("files", 0.0))  # the evaluation also writes views
@@ -87,14 +98,34 @@ def finish(
             moving=store.moving,
             fitted={r: e for r, e in exposures.items() if scene.views[r].name not in hidden},
             unknown=found.metrics.get("exposures_unknown", ()),
-            solution=None if account.selection is None else account.selection.solution,
+            solution=solution,
             shown=[result for result in in_summary.values() if result is not None],
             metering=found.metering,
             true_exposures=true_exposures,
             heading=heading(found.metrics, params, cfg),
             psnrs=_psnrs(found.metrics),
         )
-    metrics = found.metrics | _accounted(account, watch, scene, cfg, reporter, found)
+    seconds = {
+        **account.seconds,
+        **watch.seconds,
+        "evaluation_and_files": watch.seconds["evaluation"] + watch.seconds["files"],
+    }
+    metered = found.metering.sentence if found.metering.telling else None
+    late = over_budget(cfg.train.budget_s, seconds)
+    notes = [*notes_on_missing(found.metrics), *filter(None, (metered, late))]
+    account.notes.extend(notes)
+    for note in notes:
+        reporter.message(note)
+    steps = max(int(account.counts.get("steps", 0)), 1)
+    metrics = found.metrics | {
+        "split": scene.split_by,
+        "counts": account.counts,
+        "seconds": seconds,
+        "seconds_per_step": account.seconds.get("optimisation", 0.0) / steps,
+        "notes": account.notes,
+    }
+    if solution is not None:
+        metrics["photometry"] = solution.state
     check_lock()
     write_json(folder.metrics, metrics)
     return metrics
@@ -120,58 +151,6 @@ def _psnrs(metrics: Mapping[str, Any]) -> dict[str, float]:
     parts = (metrics["train"], metrics.get("test", {}).get("exposure_fitted", {}))
     rows = {name: row for part in parts for name, row in part.get("per_view", {}).items()}
     return {name: row["psnr"] for name, row in rows.items() if "psnr" in row}
-
-
-def _keep(
-    exposures: dict[int, float],
-    in_summary: dict[int, ViewResult | None],
-    scene: Scene,
-    store: ImageStore,
-    folder: RunFolder,
-    watch: Stopwatch,
-    result: ViewResult,
-) -> None:
-    """Write a held-out view and keep its exposure; keep the views of the summary."""
-    view = scene.views[result.index]
-    if view.split == "test":
-        exposures[result.index] = result.transform.exposure
-        with watch("files"):
-            write_view(folder.renders, view.name, result, store)
-    if result.index in in_summary:
-        in_summary[result.index] = result
-
-
-def _accounted(
-    account: Account,
-    watch: Stopwatch,
-    scene: Scene,
-    cfg: FitConfig,
-    reporter: Reporter,
-    found: Evaluation,
-) -> dict:
-    """Return the entries of `metrics.json` about the fit itself."""
-    seconds = {
-        **account.seconds,
-        **watch.seconds,
-        "evaluation_and_files": watch.seconds["evaluation"] + watch.seconds["files"],
-    }
-    metered = found.metering.sentence if found.metering.telling else None
-    late = over_budget(cfg.train.budget_s, seconds)
-    notes = [*notes_on_missing(found.metrics), *filter(None, (metered, late))]
-    account.notes.extend(notes)
-    for note in notes:
-        reporter.message(note)
-    steps = max(int(account.counts.get("steps", 0)), 1)
-    entries = {
-        "split": scene.split_by,
-        "counts": account.counts,
-        "seconds": seconds,
-        "seconds_per_step": account.seconds.get("optimisation", 0.0) / steps,
-        "notes": account.notes,
-    }
-    if account.selection is not None:
-        entries["photometry"] = account.selection.solution.state
-    return entries
 
 
 def seconds_to_finish(

@@ -120,7 +120,8 @@ def fit(
         with begun(folder, paths, cfg, start.decisions):
             spent_s = time.monotonic() - begin
             result = optimiser.run(start, resume=resume, spent_s=spent_s, finish_s=finish_s)
-        params, owner = fitted(result, start.scene, cfg)
+        params, owner = compact(result, start.scene)
+        params = centred(exposures_apart(params), cfg)
         lock.require()
         account = account_of(start, params, result, clock, begin)
         results = (params, start.scene, start.survey.store, start.cfg, folder, account, reporter)
@@ -260,12 +261,6 @@ def compact(result: TrainResult, scene: Scene | None = None) -> tuple[Params, np
     gaussians = jax.tree.map(lambda a: jax.device_put(np.asarray(a)[alive]), params.gaussians)
     owner = None if owner is None else owner[alive]
     return dataclasses.replace(params, gaussians=gaussians), owner
-
-
-def fitted(result: TrainResult, scene: Scene, cfg: FitConfig) -> tuple[Params, np.ndarray | None]:
-    """Return the results of a fit in their gauge, and the owner of each Gaussian."""
-    params, owner = compact(result, scene)
-    return centred(exposures_apart(params), cfg), owner
 
 
 def centred(params: Params, cfg: FitConfig) -> Params:
