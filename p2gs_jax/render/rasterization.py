@@ -88,18 +88,14 @@ def rasterization(
     options = size, cfg, capacity, sh_degree, render_mode != "RGB"
     rgb, alpha, depth, meta = _render(*arrays, *options)
     meta |= {"capacity": capacity, "width": width, "height": height}
-    return _channels(rgb, alpha[..., None], depth, backgrounds, render_mode), alpha[..., None], meta
-
-
-def _channels(rgb, alpha, depth, backgrounds, render_mode: str):
-    """Return the channels of a mode."""
+    alpha = alpha[..., None]
     if backgrounds is not None:
         rgb = rgb + (1 - alpha) * backgrounds[:, None, None]
     parts = [rgb] if render_mode.startswith("RGB") else []
     if depth is not None:
         expected = render_mode.endswith("ED")
         parts.append(depth[..., None] / (jnp.maximum(alpha, 1e-10) if expected else 1.0))
-    return jnp.concatenate(parts, -1)
+    return jnp.concatenate(parts, -1), alpha, meta
 
 
 def _for_each_camera(colors, count: int, cameras: int, sh_degree: int | None):
