@@ -70,7 +70,7 @@ def _entry(values: dict, index: int) -> Shot:
     unknown = sorted(set(values) - set(FIELDS))
     if unknown:
         raise ValueError(f"has an unknown field {unknown[0]!r} (known are {', '.join(FIELDS)})")
-    viewmat = checked_pose(_required(values, "viewmat"), "viewmat")
+    viewmat = checked_pose(_required(values, "viewmat"))
     K, name = checked_lens(_required(values, "K")), _name(values, index)
     shot = Shot(name, viewmat, K, _pixels(values, "width"), _pixels(values, "height"))
     more = {key: _number(values, key, *limits) for key, limits in LIMITS.items() if key in values}

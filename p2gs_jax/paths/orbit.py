@@ -132,8 +132,7 @@ def _around(focus, centers, up) -> Orbit:
     sway = np.pi if gaps[widest] < LARGEST_GAP else max(arc / 2, LEAST_SWAY)
     radius, elevation = np.median(distances), np.clip(np.median(heights), -HIGHEST, HIGHEST)
     numbers = radius, elevation, begin + arc / 2, sway
-    radius, elevation, middle, sway = map(float, numbers)
-    return Orbit(focus, up, forward, radius, elevation, middle, sway)
+    return Orbit(focus, up, forward, *map(float, numbers))
 
 
 def _median_depth(shot: Shot, points, centers) -> float:

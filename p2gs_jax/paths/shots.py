@@ -119,7 +119,7 @@ def make_camera(K: ArrayLike, viewmat: ArrayLike, width: int, height: int) -> Ca
             why = f"the camera's {name} {value!r} is not a whole number from 1 to {LARGEST}"
             raise UserError(f"{why}.", fix=fix)
     try:
-        lens, pose = checked_lens(K), checked_pose(viewmat, "viewmat")
+        lens, pose = checked_lens(K), checked_pose(viewmat)
     except ValueError as error:
         raise UserError(f"the camera {error}.", fix=fix) from None
     return Shot("", pose, lens, int(width), int(height)).camera()
@@ -148,10 +148,10 @@ def checked_lens(values: ArrayLike) -> Float[np.ndarray, "3 3"]:
     return K
 
 
-def checked_pose(values: ArrayLike, name: str) -> Pose:
-    """Return a pose with an orthonormal rotation; other values raise a ValueError."""
-    matrix = as_matrix(values, name, 4)
+def checked_pose(values: ArrayLike) -> Pose:
+    """Return a viewmat with an orthonormal rotation; other values raise a ValueError."""
+    matrix = as_matrix(values, "viewmat", 4)
     rotation = nearest_rotation(matrix[:3, :3], TOLERANCE)
     if rotation is None or not np.allclose(matrix[3], [0, 0, 0, 1], atol=TOLERANCE):
-        raise ValueError(f"has a {name} that is not a rotation and a translation")
+        raise ValueError("has a viewmat that is not a rotation and a translation")
     return pose_of(rotation, matrix[:3, 3])
