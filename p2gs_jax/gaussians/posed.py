@@ -31,8 +31,10 @@ def standing(gaussians: Gaussians, owner: Int[np.ndarray, " n"] | None) -> Gauss
     return gaussians if owner is None else chosen(gaussians, np.asarray(owner) < 0)
 
 
-def chosen(gaussians: Gaussians, which: Bool[np.ndarray, " n"]) -> Gaussians:
-    """Return the flagged Gaussians, in their order."""
+def chosen(
+    gaussians: Gaussians, which: Bool[np.ndarray, " n"] | Int[np.ndarray, " k"]
+) -> Gaussians:
+    """Return the Gaussians that are flagged, or in these rows, in their order."""
     return jax.tree.map(lambda a: on_device(np.asarray(a)[which]), gaussians)
 
 

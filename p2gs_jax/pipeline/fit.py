@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import jax
 import numpy as np
 from jax.sharding import Mesh
 
@@ -19,6 +18,7 @@ from p2gs_jax.core.atomic import no_empty_folders
 from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.errors import UserError
+from p2gs_jax.gaussians.posed import chosen
 from p2gs_jax.gaussians.seeds import reach
 from p2gs_jax.photometry.appearance import Formation, exposures_apart
 from p2gs_jax.photometry.calibrate import OnChosen, Selection
@@ -258,9 +258,8 @@ def compact(result: TrainResult, scene: Scene | None = None) -> tuple[Params, np
         away = np.linalg.norm(np.asarray(params.gaussians.means) - middle, axis=1)
         # The means of objects are relative to their boxes.
         alive = alive & ((away <= RUNAWAY * most) | (False if owner is None else owner >= 0))
-    gaussians = jax.tree.map(lambda a: jax.device_put(np.asarray(a)[alive]), params.gaussians)
     owner = None if owner is None else owner[alive]
-    return dataclasses.replace(params, gaussians=gaussians), owner
+    return dataclasses.replace(params, gaussians=chosen(params.gaussians, alive)), owner
 
 
 def centred(params: Params, cfg: FitConfig) -> Params:

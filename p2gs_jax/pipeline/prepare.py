@@ -18,7 +18,8 @@ from p2gs_jax.gaussians import seeds as seeding
 from p2gs_jax.gaussians.dense import DenseSeeds, dense_limit, dense_seeds, gaussians_of
 from p2gs_jax.gaussians.matching import Tones, rough_tones
 from p2gs_jax.gaussians.moving import Nodes, node_gaussians, nodes_radiance, with_vibration
-from p2gs_jax.gaussians.shell import Shell, find_shell, shell_gaussians
+from p2gs_jax.gaussians.posed import chosen
+from p2gs_jax.gaussians.shell import find_shell, shell_gaussians
 from p2gs_jax.photometry.calibrate import NUMBERS, Selection
 from p2gs_jax.photometry.parameters import initial_appearance, initial_photometry, point_radiance
 from p2gs_jax.pipeline.exposures import Exposures
@@ -103,7 +104,13 @@ def initialise(found: Survey, exposures: Exposures, reporter: Reporter | None = 
         colors = nodes_radiance(nodes, scene, found.fitted, photometry, cfg)
         gaussians, owner = _with_nodes(gaussians, nodes, colors, views, cfg)
     gaussians, owner, thinned = _bounded(gaussians, owner, found.cfg)
-    notes = _notes(found, exposures, added, shell, thinned)
+    notes = [*found.scene.notes, *found.scale_notes, *exposures.notes, *found.seed_notes]
+    notes += [] if nodes is None else nodes.notes
+    notes += [] if added is None else [added.note()]
+    notes += [] if shell is None else [shell.note()]
+    notes += thinned
+    if found.cfg.dynamics.method == "vibration" and not found.vibrating:
+        notes.append("Views have no times: the whole scene is fitted as static.")
     for note in notes:
         if not note.startswith(NUMBERS):
             reporter.message(note)
@@ -138,23 +145,6 @@ def _matched(found: Survey, exposures: Exposures, cfg: FitConfig, reporter: Repo
     )
 
 
-def _notes(
-    found: Survey,
-    exposures: Exposures,
-    added: DenseSeeds | None,
-    shell: Shell | None,
-    thinned: list[str],
-) -> list[str]:
-    notes = [*found.scene.notes, *found.scale_notes, *exposures.notes, *found.seed_notes]
-    notes += [] if found.nodes is None else found.nodes.notes
-    notes += [] if added is None else [added.note()]
-    notes += [] if shell is None else [shell.note()]
-    notes += thinned
-    if found.cfg.dynamics.method == "vibration" and not found.vibrating:
-        notes.append("Views have no times: the whole scene is fitted as static.")
-    return notes
-
-
 def _with_nodes(
     gaussians: Gaussians, nodes: Nodes, radiance: np.ndarray, views: list[View], cfg: FitConfig
 ) -> tuple[Gaussians, np.ndarray | None]:
@@ -175,5 +165,4 @@ def _bounded(
         return gaussians, owner, []
     kept = seeding.subsample(gaussians.capacity, bound, cfg.train.seed, Stream.SEED_GAUSSIANS)
     note = f"{gaussians.capacity} Gaussians were thinned to {bound} (--gaussians)."
-    gaussians = jax.tree.map(lambda a: on_device(np.asarray(a)[kept]), gaussians)
-    return gaussians, None if owner is None else owner[kept], [note]
+    return chosen(gaussians, kept), None if owner is None else owner[kept], [note]

@@ -123,9 +123,7 @@ def survey(
     _require_something_to_see(scene, fitted)
     radius = seeding.cameras_radius(scene.training_views, scene.points)
     depths = seen_depths(scene.points, scene.training_views)
-    depth, extent = near_depth(depths), extent_of_rates(radius, depths, cfg)
-    scale, init = decided_scale(depth, cfg), _shell_options(store, cfg)
-    notes = scale_notes(scene, cfg, depth)
+    depth, init = near_depth(depths), _shell_options(store, cfg)
     seeds, thinned = _choose_points(scene, cfg)
     coverage = coverage_of(scene, cfg.data.max_width)
     dense = wants_dense(scene, coverage, cfg)
@@ -140,8 +138,8 @@ def survey(
         nodes=nodes,
         vibrating=vibrating,
         radius=radius,
-        extent=extent,
-        scale=scale,
+        extent=extent_of_rates(radius, depths, cfg),
+        scale=decided_scale(depth, cfg),
         coverage=coverage,
         measured=measured_depths(scene, cfg),
         dense=dense,
@@ -150,7 +148,7 @@ def survey(
         sphere=sphere,
         # Dense seeds may cover directions in which there are no points.
         shell=None if dense else find_shell(views, scene.points, radius, init, sphere),
-        scale_notes=notes,
+        scale_notes=scale_notes(scene, cfg, depth),
         seed_notes=[*far_notes, *thinned],
     )
 
