@@ -13,7 +13,7 @@ from p2gs_jax.cli.render import FPS, Render
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.frames import OutputFrame
 from p2gs_jax.paths import pictures
-from p2gs_jax.paths.drive import PosePath, beside, beside_shots, drive, frame_count, interpolated
+from p2gs_jax.paths.drive import PosePath, beside, beside_shots, drive, interpolated
 from p2gs_jax.paths.orbit import find_orbit, orbit
 from p2gs_jax.paths.panorama import covering
 from p2gs_jax.paths.rig import find_rig
@@ -155,7 +155,7 @@ def panoramas_of(options: Render, fitted: Run) -> Job:
             fix = "use --trajectory views"
             raise UserError("A drive needs at least two time steps; the rig has one.", fix=fix)
         path = PosePath(rig.poses)
-        along = path.evenly(frame_count(len(rig.steps), options.frames))
+        along = path.evenly(options.frames)
         poses = path(along)
         times = interpolated(path.times, [step.time for step in rig.steps], along)
         if options.shift is not None:

@@ -44,14 +44,14 @@ class PosePath:
         """Return camera-to-world matrices at times."""
         return pose_of(self._rotations(times).as_matrix(), self._positions(times))
 
-    def evenly(self, frames: int) -> Float[np.ndarray, " n"]:
-        """Return `frames` equally spaced times from the first pose to the last."""
+    def evenly(self, frames: int | None) -> Float[np.ndarray, " n"]:
+        """Return equally spaced times of frames, from the first pose to the last.
+
+        `frames` of None gives `FRAMES_BETWEEN` frames from one pose to the next.
+        """
+        if frames is None:
+            frames = FRAMES_BETWEEN * (len(self.times) - 1) + 1
         return np.linspace(0.0, self.times[-1], frames)
-
-
-def frame_count(knots: int, frames: int | None) -> int:
-    """Return the number of frames of a path through `knots` poses."""
-    return FRAMES_BETWEEN * (knots - 1) + 1 if frames is None else frames
 
 
 def drive(knots: Sequence[Shot], frames: int | None = None) -> list[Shot]:
@@ -65,7 +65,7 @@ def drive(knots: Sequence[Shot], frames: int | None = None) -> list[Shot]:
         why = f"A drive needs at least two views of a camera, but this one has {len(knots)}."
         raise UserError(why, fix="choose another --camera or --split, or --trajectory orbit")
     path = PosePath(inverse(np.stack([s.viewmat for s in knots])))
-    times = path.evenly(frame_count(len(knots), frames))
+    times = path.evenly(frames)
     logs = [None if s.gamma is None else float(np.log(s.gamma)) for s in knots]
     columns = [s.exposure_ev for s in knots], logs, [s.time for s in knots]
     evs, logs, moments = (interpolated(path.times, values, times) for values in columns)
