@@ -23,7 +23,7 @@ from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.core.threads import map_in_order
 from p2gs_jax.gaussians.flow import DepthMap, Flows, depth_map, pixel_centers
 from p2gs_jax.gaussians.matching import MatchImages, Tones, neighbours, visibility
-from p2gs_jax.gaussians.population import Coverage, default_max_gaussians
+from p2gs_jax.gaussians.population import Coverage, seed_bound
 from p2gs_jax.gaussians.seeds import gaussians_from_points, neighbour_scales
 from p2gs_jax.photometry.formation import places
 from p2gs_jax.scene.pixels.store import ImageStore, size_at
@@ -328,14 +328,6 @@ def coverage_of(scene: Scene, max_width: int | None) -> Coverage:
     """Return the largest training view's pixels, and the mean share of the scene in a view."""
     sizes = [size_at(view, max_width) for view in scene.training_views]
     return Coverage(max(w * h for w, h in sizes), shown_share(scene.points, scene.training_views))
-
-
-def seed_bound(cfg: FitConfig, seeds: int, coverage: Coverage) -> int:
-    """Return the bound on the population of a fit with this number of seeds."""
-    limit = cfg.densify.max_gaussians
-    if isinstance(limit, int):
-        return limit
-    return default_max_gaussians(seeds, coverage, cfg.train)
 
 
 def dense_limit(cfg: FitConfig, seeds: int, coverage: Coverage) -> int:

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from p2gs_jax.config import TrainConfig
+from p2gs_jax.config import FitConfig, TrainConfig
 from p2gs_jax.types import Gaussians, Population
 
 # Opacity logit of empty slots: below every cutoff.
@@ -89,6 +89,12 @@ def default_max_gaussians(seeds: int, coverage: Coverage, train: TrainConfig) ->
         steps = train.budget_s / step_seconds(coverage.pixels)
     wanted = min(coverage.gaussians(steps), MOST_BY_DEFAULT)
     return max(int(1.25 * seeds), wanted, 1000)
+
+
+def seed_bound(cfg: FitConfig, seeds: int, coverage: Coverage) -> int:
+    """Return the bound on the population of a fit with this number of seeds."""
+    limit = cfg.densify.max_gaussians
+    return default_max_gaussians(seeds, coverage, cfg.train) if limit is None else limit
 
 
 def bucket_for(needed: int, current: int, limit: int | None) -> int:

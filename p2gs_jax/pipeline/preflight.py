@@ -22,8 +22,7 @@ from p2gs_jax.core.memory import left_to_process, ran_out, resident
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.lpips import LpipsWeights, read_lpips_weights
 from p2gs_jax.evaluation.references import Reference, check_reference, load_reference
-from p2gs_jax.gaussians.dense import seed_bound
-from p2gs_jax.gaussians.population import Coverage
+from p2gs_jax.gaussians.population import Coverage, seed_bound
 from p2gs_jax.presets import flat, to_dict
 from p2gs_jax.run.folder import RunFolder, require_free
 from p2gs_jax.run.read import read_config

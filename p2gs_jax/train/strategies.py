@@ -26,10 +26,10 @@ from p2gs_jax.gaussians.population import (
     Coverage,
     Outcome,
     bucket_for,
-    default_max_gaussians,
     empty_gaussians,
     empty_population,
     grow,
+    seed_bound,
 )
 from p2gs_jax.train.optimizer import AdamState, zero_moments, zero_opacity_moments
 from p2gs_jax.train.schedule import Levels, shrinks_left
@@ -127,10 +127,7 @@ class Mcmc:
 
     def start(self, seeds: int) -> Slots:
         """Return the bound, configured or chosen from the scene, and as many slots."""
-        limit = self.cfg.densify.max_gaussians
-        if limit is None:
-            limit = default_max_gaussians(seeds, self.coverage, self.cfg.train)
-        limit = max(limit, seeds)
+        limit = max(seed_bound(self.cfg, seeds, self.coverage), seeds)
         # Rounded up, so that a late change in the number of seeds needs no other program.
         return Slots(limit, -(-limit // SLOTS) * SLOTS)
 
