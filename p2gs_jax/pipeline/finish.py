@@ -163,10 +163,8 @@ def seconds_to_finish(
     """
     if cfg.train.budget_s is None:
         return 0.0
-    pixels = 0
-    for view in scene.views:
-        width, height = size_at(view, cfg.data.max_width)
-        pixels += width * height
+    sizes = [size_at(view, cfg.data.max_width) for view in scene.views]
+    pixels = sum(width * height for width, height in sizes)
     # Measured seconds per view and per pixel, and to compile (BUILD_NOTES, "Reserve for
     # evaluation").
     per_view, per_pixel = (0.13, 0.45e-6) if reference else (0.09, 0.25e-6)

@@ -2,11 +2,9 @@
 
 Each of B lanes owns one segment of a tile's list. In every iteration a lane composites the next C
 entries of its segment. When the segment ends, or all its pixels are opaque, the lane writes the
-result and gets the next segment, longest first. Long lists are cut into segments (`cut`), so that
-all lanes stay busy even if lists are uneven (BUILD_NOTES, "Full lanes"). Compositing is
-associative: the segments of a tile are composited independently and then merged. A segment of
-colour c and transmittance t before one of colour d gives c + t d. Padding wastes at most C entries
-per segment.
+result and gets the next segment, longest first. Long lists are cut into segments (segments.py), so
+that all lanes stay busy even if lists are uneven (BUILD_NOTES, "Full lanes"). Padding wastes at
+most C entries per segment.
 
 The exponential is a polynomial on [-0.7, 0], which is squared until its range reaches the cutoff
 (`exponent_scale`). tiles.py describes the rows.
