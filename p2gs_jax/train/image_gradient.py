@@ -129,23 +129,17 @@ def compared(
     capture = photometry.capture(batch.view_index)
     loss, formed = cfg.loss, cfg.photometry
     where = None if batch.size is None else pixel_places(render.alpha.shape, batch.size)
-    if batch.alpha is None:
-        target = Target(*decoded(batch), None, batch.measured)
-        matte, radiance = None, render.linear
-        display = formation(radiance, capture, formed, correction, where)
-        ldr, photographed = display, target.ldr
-    else:
+    alpha = None if batch.alpha is None else unit(batch.alpha)
+    target = Target(*decoded(batch), alpha, batch.measured)
+    matte, photographed = None, target.ldr
+    if alpha is not None:
         assert batch.backdrop is not None
-        pixels, alpha = unit(batch.ldr), unit(batch.alpha)
-        photograph = pixels + (1 - alpha[..., None]) * batch.backdrop
-        target = Target(photograph, batch.mask.astype(jnp.float32), alpha, batch.measured)
         matte = Matte(render.alpha, batch.backdrop)
-        radiance = uncovered(render.linear, matte)
-        display = formation(radiance, capture, formed, correction, where)
-        ldr = composited(display, matte)
-        seen = alpha[..., None] > LEAST_SEEN
-        photographed = jnp.where(seen, pixels / jnp.maximum(alpha, LEAST_SEEN)[..., None], 0.0)
-    judged = ldr
+        color = unit(batch.ldr) / jnp.maximum(alpha, LEAST_SEEN)[..., None]
+        photographed = jnp.where(alpha[..., None] > LEAST_SEEN, color, 0.0)
+    radiance = uncovered(render.linear, matte)
+    display = formation(radiance, capture, formed, correction, where)
+    judged = ldr = composited(display, matte)
     if loss.censored:
         judged = composited(censor(display, photographed, loss.saturation), matte)
     uncorrected = None
