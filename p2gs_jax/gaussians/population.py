@@ -97,12 +97,12 @@ def seed_bound(cfg: FitConfig, seeds: int, coverage: Coverage) -> int:
     return default_max_gaussians(seeds, coverage, cfg.train) if limit is None else limit
 
 
-def bucket_for(needed: int, current: int, limit: int | None) -> int:
-    """Return a capacity, grown by factors of about 1.5: at most `limit`, at least `needed`."""
+def bucket_for(needed: int, current: int) -> int:
+    """Return a capacity of at least `needed`, grown by factors of about 1.5."""
     capacity = current
     while capacity < needed:
         capacity = int(capacity * GROWTH_BUCKET) + 256
-    return capacity if limit is None else max(min(capacity, limit), needed)
+    return capacity
 
 
 def grow(tree, fill):

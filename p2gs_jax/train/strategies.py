@@ -201,7 +201,7 @@ class Adaptive:
         d, host = self.cfg, now.host
         proposal = _propose(gaussians, population, now.extent, host.reset_at > 0, cfg=d)
         before = gaussians.capacity
-        capacity = bucket_for(int(proposal.wanted), before, now.limit)
+        capacity = bucket_for(int(proposal.wanted), before)
         if now.limit is not None:
             capacity = min(capacity, max(now.limit, before))
         if capacity > before:
