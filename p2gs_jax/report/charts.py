@@ -130,21 +130,19 @@ def _font(match: re.Match[str]) -> str:
     return f"font-size: {match[1]}px" if match[1] else "font-family: inherit"
 
 
-def _legend(axes: Axes, labels: Sequence[str]) -> None:
-    """Draw a legend of the lines whose label is not empty, to the right of the axes."""
-    named = [
-        (line, printable(name)) for line, name in zip(axes.containers, labels, strict=True) if name
-    ]
-    if named:
-        handles, names = zip(*named, strict=True)
-        axes.legend(handles, names, loc="upper left", bbox_to_anchor=(1, 1))
-
-
 def _draw(axes: Axes, series: Sequence[Series], size: float) -> None:
-    """Draw curves with markers of `size` points; lines break where a value is missing."""
+    """Draw curves with markers of `size` points, and a legend of those that have a label.
+
+    Lines break where a value is missing.
+    """
+    named = {}
     for s in series:
-        axes.errorbar(s.x, s.y, s.error, **{"markersize": size, "linewidth": 1.5, **s.style})
-    _legend(axes, [s.label for s in series])
+        style = {"markersize": size, "linewidth": 1.5, **s.style}
+        line = axes.errorbar(s.x, s.y, s.error, **style)
+        if s.label:
+            named[line] = printable(s.label)
+    if named:
+        axes.legend(list(named), list(named.values()), loc="upper left", bbox_to_anchor=(1, 1))
 
 
 def panels_chart(
@@ -182,12 +180,10 @@ def training_chart(
     losses: dict[str, np.ndarray],
     gaussians: np.ndarray,
     marks: Sequence[float],
-    *,
-    label: str,
 ) -> str:
     """Return curves of PSNR (dB), losses (by name), and the number of Gaussians over the steps.
 
-    Dotted vertical lines are at the steps `marks`; `label` is the alternative text.
+    Dotted vertical lines are at the steps `marks`.
     """
     window = max(3, 2 * round(SMOOTHING * len(steps)) + 1)
 
@@ -216,4 +212,5 @@ def training_chart(
             for at in marks:
                 axes.axvline(at, color=MUTED, linewidth=1, linestyle=(0, (2, 3)))
 
+    label = "PSNR, loss and Gaussians over the steps of the run"
     return _chart(draw, label, rows=3, height=150, shared=False)

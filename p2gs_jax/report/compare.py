@@ -9,11 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from p2gs_jax.core.clock import whole_run
 from p2gs_jax.core.text import escaped, markdown_table
 from p2gs_jax.errors import UserError
+from p2gs_jax.evaluation.alignment import error_of_views
 from p2gs_jax.evaluation.renders_of_others import read_display
 from p2gs_jax.presets import flat
-from p2gs_jax.report.findings import DESCRIPTIONS, seconds_of, true_error
+from p2gs_jax.report.findings import DESCRIPTIONS
 from p2gs_jax.report.run_files import RunFiles, read_run
 from p2gs_jax.report.run_sections import option_text
 from p2gs_jax.synth.sensor import read_true_exposures
@@ -150,7 +152,7 @@ def _scores(runs: Sequence[RunFiles], same: bool) -> list[TableRow]:
         TableRow("model", tuple(DESCRIPTIONS.get(model, model) for model in models)),
         TableRow("tone curve", tuple(map(str, curves))),
         TableRow("training views", tuple(str(len(run.train) or "") for run in runs)),
-        *numbers("seconds, whole run", [seconds_of(run) for run in runs], "seconds"),
+        *numbers("seconds, whole run", [whole_run(run.part("seconds")) for run in runs], "seconds"),
     ]
     for name, path in NUMBERS.items():
         rows += numbers(name, [run.number(*path) for run in runs], path[-1])
@@ -159,7 +161,7 @@ def _scores(runs: Sequence[RunFiles], same: bool) -> list[TableRow]:
 
 def _true_error(run: RunFiles) -> float | None:
     try:
-        error = true_error(run, read_true_exposures(run.scene))
+        error = error_of_views(run.train, read_true_exposures(run.scene))
     except UserError:
         return None
     return None if error is None else error["ev"]

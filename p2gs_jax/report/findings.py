@@ -7,9 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from p2gs_jax.core.clock import whole_run
 from p2gs_jax.core.text import count_of
-from p2gs_jax.evaluation.alignment import ExposureError, error_of_views
 from p2gs_jax.photometry.models import MODELS
 from p2gs_jax.photometry.solution import NOTICEABLE_EV, Agreement, compare
 from p2gs_jax.report.run_files import RunFiles, number_at
@@ -46,14 +44,14 @@ def duration(seconds: float) -> str:
     return f"{minutes} min {rest} s" if minutes < 100 else f"{minutes // 60} h {minutes % 60} min"
 
 
+def cell(value: float | None, form: str) -> str:
+    """Return a number as the text of a table's cell, empty if it is missing or not finite."""
+    return format(value, form) if value is not None and np.isfinite(value) else ""
+
+
 def column(values: Iterable, missing: float = np.nan) -> np.ndarray:
     """Return numbers as an array, with `missing` in place of each None."""
     return np.array([missing if v is None else v for v in values], float)
-
-
-def seconds_of(run: RunFiles) -> float | None:
-    """Return the duration of the run, seconds, or None if it is unknown."""
-    return whole_run(run.part("seconds"))
 
 
 def modelled(run: RunFiles) -> str:
@@ -86,11 +84,6 @@ def exposure_span(run: RunFiles) -> float | None:
     """Return the stops between the darkest and the brightest training exposure."""
     values = [v["exposure_ev"] for v in run.train if v["exposure_ev"] is not None]
     return max(values) - min(values) if values else None
-
-
-def true_error(run: RunFiles, true_exposures: dict[str, float]) -> ExposureError | None:
-    """Return the error of the exposures against true ones by name; None if there are none."""
-    return error_of_views(run.train, true_exposures)
 
 
 def notes_of(run: RunFiles) -> list[str]:

@@ -117,21 +117,19 @@ def _measure_seams(run: Run, out: SceneMeasurements, reporter: Reporter) -> None
         return Photographed(ldr, mask, camera, depth, run.own_display(index))
 
     pairs = neighbouring_pairs(run.scene, MOST_PAIRS)
-    found: dict[tuple[int, int], Seam] = {}
+    found: dict[tuple[int, int], SeamPair] = {}
     for done, (i, j) in enumerate(pairs):
         reporter.stage("Measuring seams", done, len(pairs))
         seam = measure_seam(photographed(i), photographed(j), run.common_display(), run.cfg.loss)
         if seam is not None:
-            found[i, j] = seam
-    out.tried_pairs = len(pairs)
-    named = {(i, j): SeamPair(names[i], names[j], seam) for (i, j), seam in found.items()}
-    out.seams = tuple(named.values())
+            found[i, j] = SeamPair(names[i], names[j], seam)
+    out.tried_pairs, out.seams = len(pairs), tuple(found.values())
     if found:
-        enough = LEAST_OVERLAP * float(np.median([s.pixels for s in found.values()]))
-        good = [pair for pair, seam in found.items() if seam.pixels >= enough]
-        shown = max(good, key=lambda pair: found[pair].before_ev)
+        enough = LEAST_OVERLAP * float(np.median([pair.seam.pixels for pair in out.seams]))
+        good = [rows for rows, pair in found.items() if pair.seam.pixels >= enough]
+        shown = max(good, key=lambda rows: found[rows].seam.before_ev)
         first, second = map(photographed, shown)
-        out.shown = named[shown]
+        out.shown = found[shown]
         out.picture = seam_picture(first, second, run.common_display(), run.render)
 
 

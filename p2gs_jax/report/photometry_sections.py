@@ -11,14 +11,16 @@ import numpy as np
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.core.text import natural
 from p2gs_jax.errors import UserError
+from p2gs_jax.evaluation.alignment import error_of_views
 from p2gs_jax.photometry.formation import inverse_tone_map
 from p2gs_jax.presets import camera_formations
 from p2gs_jax.report import findings
 from p2gs_jax.report.charts import COLORS, DASHES, FIRST, INK, MUTED, SOURCES, Series, panels_chart
-from p2gs_jax.report.findings import against_exif, column, notes_of
+from p2gs_jax.report.findings import against_exif, cell, column, notes_of
 from p2gs_jax.report.page import figure, folded, listed, paragraph, table
 from p2gs_jax.report.run_files import RunFiles
 from p2gs_jax.run.photometry_files import CameraPhotometry, ViewPhotometry, with_formation_of
+from p2gs_jax.run.plots import CHANNELS, MARKERS
 from p2gs_jax.run.scene_file import read_times
 from p2gs_jax.scene.drives.recording import short_name
 from p2gs_jax.types import GAMMA_SRGB
@@ -26,12 +28,11 @@ from p2gs_jax.types import GAMMA_SRGB
 # More cameras than the first, or cameras with fewer views than the second, share one panel.
 MOST_PANELS, FEWEST_VIEWS = 6, 3
 MID_GREY = 0.18
-CHANNELS = ("red", "green", "blue")
 CHANNEL_COLORS = (1, 2, 0)  # indices in `COLORS`
 MARKED = [{"color": COLORS[k], "marker": m} for k, m in zip(CHANNEL_COLORS, "^os", strict=True)]
 SRGB: dict[str, Any] = {"color": INK, "linestyle": (0, (4, 4))}
-# Lines of the cameras of a drive, in turn.
-CAMERA_COLORS, CAMERA_MARKERS = (*COLORS, INK, MUTED), "osD^vPX*"
+# Colours of the cameras of a drive, in turn.
+CAMERA_COLORS = (*COLORS, INK, MUTED)
 STOPS = "exposure, stops from the mean"
 # Display values at which tone curves are drawn.
 VALUES = np.linspace(0.02, 1.0, 240)
@@ -104,10 +105,10 @@ def exposure_section(run: RunFiles, truth: dict[str, float]) -> str:
     more, rows = [name for name in stops([]) if name in ("EXIF", "true")], []
     for v, found, fitted, *others in zip(run.views, *stops(run.views).values(), strict=True):
         held_out = np.isfinite(fitted)
-        error = "held out" if held_out else _cell(v.get("exposure_ev_error"), ".3f")
-        ev = _cell(fitted if held_out else found, "+.2f")
-        stated = [_cell(value, "+.2f") for value in others]
-        rows.append([v["image"], v["camera"], ev, error, _cell(v["gamma"], ".2f"), *stated])
+        error = "held out" if held_out else cell(v.get("exposure_ev_error"), ".3f")
+        ev = cell(fitted if held_out else found, "+.2f")
+        stated = [cell(value, "+.2f") for value in others]
+        rows.append([v["image"], v["camera"], ev, error, cell(v["gamma"], ".2f"), *stated])
     names = ["photograph", "camera", "exposure, stops", "standard error, stops", "gamma", *more]
     numbers = table(names, rows, numbers=range(2, len(names)), tall=True)
     return body + folded("Every photograph in numbers", numbers)
@@ -134,10 +135,6 @@ def _stops_by_source(run: RunFiles, truth: dict[str, float]) -> Stops:
     return stops
 
 
-def _cell(value: float | None, form: str) -> str:
-    return format(value, form) if value is not None and np.isfinite(value) else ""
-
-
 def _errors(rows: list[ViewPhotometry]) -> np.ndarray:
     return column(v.get("exposure_ev_error") for v in rows)
 
@@ -151,7 +148,7 @@ def _true_stops(rows: list[ViewPhotometry], truth: dict[str, float]) -> np.ndarr
 def _over_time(run: RunFiles, times: dict[str, float], stops: Stops) -> str:
     """Return the exposures of a drive over its seconds, with one line per camera."""
     start, series = min(times.values()), []
-    styles = zip(cycle(CAMERA_COLORS), cycle(CAMERA_MARKERS), strict=False)
+    styles = zip(cycle(CAMERA_COLORS), cycle(MARKERS), strict=False)
     for name, (color, marker) in zip(run.cameras, styles, strict=False):
         rows = [v for v in run.views if v["camera"] == name and v["image"] in times]
         rows.sort(key=lambda v: times[v["image"]])
@@ -178,7 +175,7 @@ def _exposure_caption(run: RunFiles, truth: dict[str, float]) -> list[str]:
         out.append("Error bars are missing because no exposures were solved from shared points.")
     if any(v["split"] == "test" for v in run.views):
         out.append("Open diamonds are exposures fitted to held-out photographs after the run.")
-    agreement, error = against_exif(run), findings.true_error(run, truth)
+    agreement, error = against_exif(run), error_of_views(run.train, truth)
     if agreement is not None:
         out.append(f"Crosses are EXIF, shifted to one mean (RMS {agreement.rms_ev:.2f} stops).")
     if error is not None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from jaxtyping import Float, Float32
 
@@ -22,20 +20,10 @@ JPEG_QUALITY = 84
 GAIN = 4.0
 
 
-def spread(items: Sequence, most: int) -> list:
-    """Return at most `most` evenly spaced items, with the first and the last."""
-    return [items[i] for i in evenly_spaced(len(items), most)]
-
-
 def jpeg(ldr: Float[np.ndarray, "h w 3"], alt: str, longest: int = SMALL) -> str:
     """Return an `img` element of display values; NaN becomes black."""
     small = shrunk(np.nan_to_num(ldr).clip(0, 1), longest)
-    return picture(data_url("jpeg", small, JPEG_QUALITY), alt)
-
-
-def picture(url: str, alt: str) -> str:
-    """Return an `img` element."""
-    return f'<img src="{url}" alt="{text(alt)}">'
+    return f'<img src="{data_url("jpeg", small, JPEG_QUALITY)}" alt="{text(alt)}">'
 
 
 def signed_difference(
@@ -67,7 +55,8 @@ def held_out_section(run: RunFiles, most: int, problems: list[str]) -> str:
         return np.inf if score is None else score, name
 
     total, body, shown = len(run.held_out), "", 0
-    for files in spread(sorted(run.held_out, key=lambda h: rank(h.name)), most):
+    ranked = sorted(run.held_out, key=lambda h: rank(h.name))
+    for files in (ranked[k] for k in evenly_spaced(total, most)):
         try:
             photograph, render = read_display(files.photograph), read_display(files.render)
         except UserError as error:

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+from p2gs_jax.core.clock import whole_run
 from p2gs_jax.core.progress import Reporter, Silent
 from p2gs_jax.core.text import count_of
+from p2gs_jax.evaluation.alignment import error_of_views
 from p2gs_jax.report import findings, measurements, pictures
 from p2gs_jax.report import page as html
 from p2gs_jax.report import photometry_sections as photometry
@@ -77,7 +79,7 @@ def _key_numbers(
     run: RunFiles, measured: SceneMeasurements, found: list[RunWarning]
 ) -> Iterator[tuple[str, str, str]]:
     held_out, train = run.number("test", "exposure_fitted", "psnr"), run.number("train", "psnr")
-    error = findings.true_error(run, measured.true_exposures)
+    error = error_of_views(run.train, measured.true_exposures)
     for name, value, form, remark in (
         ("Held-out PSNR", held_out, "{:.1f} dB", "with the exposure fitted to each view"),
         ("Training PSNR", train, "{:.1f} dB", "with the exposure of each view"),
@@ -93,7 +95,7 @@ def _key_numbers(
     gaussians, steps = run.number("counts", "gaussians"), run.number("counts", "steps")
     if gaussians is not None:
         yield "Gaussians", f"{gaussians:,.0f}", "" if steps is None else f"{steps:,.0f} steps"
-    seconds = findings.seconds_of(run)
+    seconds = whole_run(run.part("seconds"))
     if seconds is not None:
         yield "Time", duration(seconds), "for the whole run"
     yield "Warnings", str(len(found)), "listed below" if found else "no check found a problem"

@@ -13,12 +13,12 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.scores import PROTOCOLS
 from p2gs_jax.presets import flat, preset, to_dict
 from p2gs_jax.report.charts import training_chart
-from p2gs_jax.report.findings import column, duration
+from p2gs_jax.report.findings import cell, column, duration
 from p2gs_jax.report.page import figure, folded, paragraph, table, text
 from p2gs_jax.report.run_files import RunFiles, number_at
 
 MOST_TERMS = 3  # terms of the loss in the chart
-SCORES = {"psnr": 2, "ssim": 4, "lpips": 4}  # digits behind the point
+SCORES = {"psnr": ".2f", "ssim": ".4f", "lpips": ".4f"}
 RADIANCE = {
     "pu21_psnr": "PU21 PSNR {:.2f} dB",
     "pu21_ssim": "PU21 SSIM {:.4f}",
@@ -32,13 +32,9 @@ SPLITS = {"all": "all", "held_out": "held out"}
 DEPTH = ("median_m", "median_relative", "within_10_percent", "missing")
 
 
-def _cell(value: float | None, digits: int) -> str:
-    return "" if value is None else f"{value:.{digits}f}"
-
-
 def _scores(run: RunFiles, *path: str) -> list[str]:
     """Return PSNR, SSIM and LPIPS at a path of `metrics.json`, each "" if it is missing."""
-    return [_cell(run.number(*path, name), digits) for name, digits in SCORES.items()]
+    return [cell(run.number(*path, name), form) for name, form in SCORES.items()]
 
 
 def _numbers(names: list[str], rows: list[list[str]], first: int, note: str = "") -> str:
@@ -130,9 +126,8 @@ def training_section(run: RunFiles) -> str:
     losses = {"loss": over_steps("loss")} | {n.replace("_", " "): values[n] for n in ranked}
     losses = {n: np.where(v > 0, v, np.nan) for n, v in losses.items()}
     steps, psnr, gaussians = (over_steps(name) for name in ("step", "psnr", "gaussians"))
-    marks, label = _marks(log), "PSNR, loss and Gaussians over the steps of the run"
-    at = [step for step, _ in marks]
-    chart = training_chart(steps, psnr, losses, gaussians, at, label=label)
+    marks = _marks(log)
+    chart = training_chart(steps, psnr, losses, gaussians, [step for step, _ in marks])
     caption = (
         "The numbers are from log.jsonl. Strong lines are running medians; the pale line has every "
         "entry. An entry is the mean of a few training views, some of which are harder to fit."
