@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from p2gs_jax import config
-from p2gs_jax.core.atomic import plain, readable, write_json
+from p2gs_jax.core.atomic import plain, readable
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.calibrate import Selection
@@ -115,11 +115,6 @@ _PLACES = {
     "near": "render.near",
     "near_depth": "loss.near_depth",
 }
-
-
-def write_decisions(path: Path, decisions: Decisions) -> None:
-    """Write `decisions.json`."""
-    write_json(path, decisions.to_dict())
 
 
 def read_decisions(path: Path) -> Decisions | None:

@@ -7,6 +7,7 @@ after a crash, but does not lock anything.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import shutil
 from collections.abc import Iterator, Mapping
@@ -16,11 +17,6 @@ from typing import Any
 from p2gs_jax.config import Appearance
 from p2gs_jax.core.atomic import naming, remove_begun
 from p2gs_jax.errors import UserError
-
-try:
-    import fcntl
-except ImportError:  # systems without flock have no lock
-    fcntl = None
 
 NAME = ".lock"  # file of the lock
 _FROM_RUN = "_from_run"
@@ -68,11 +64,7 @@ def remembered(key: str, path: Path | None, folder: Path) -> dict[str, str | Non
     if path is None:
         return {key: None}
     absolute = os.path.abspath(path)
-    try:
-        relative = os.path.relpath(absolute, os.path.abspath(folder))
-    except ValueError:  # on another drive
-        relative = None
-    return {key: absolute, key + _FROM_RUN: relative}
+    return {key: absolute, key + _FROM_RUN: os.path.relpath(absolute, os.path.abspath(folder))}
 
 
 def candidates(saved: Mapping[str, Any], key: str, folder: Path) -> list[Path]:
@@ -116,7 +108,7 @@ def locked(folder: Path) -> Iterator[RunLock]:
     Raises:
         UserError: another process holds the lock, or the folder was removed during a write.
     """
-    handle = None if fcntl is None else _acquire(folder)
+    handle = _acquire(folder)
     lock = RunLock(folder, handle)
     if handle is not None:
         remove_begun(folder, spare=NAME)
@@ -140,7 +132,7 @@ def require_free(folder: Path) -> None:
     Raises:
         UserError: the folder is locked.
     """
-    if fcntl is None or not (folder / NAME).is_file():
+    if not (folder / NAME).is_file():
         return
     with contextlib.suppress(FileNotFoundError, PermissionError):
         handle = os.open(folder / NAME, os.O_RDONLY)
@@ -171,7 +163,6 @@ def _acquire(folder: Path) -> int | None:
 
 def _lock(handle: int, folder: Path) -> bool:
     """Lock a file without waiting; return False if its file system does not support locks."""
-    assert fcntl is not None
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:

@@ -33,7 +33,6 @@ from p2gs_jax.types import Params, Photometry, Scene, View
 VERSION = 2  # of photometry.json
 AGAIN = "restore it from a copy, or run `p2gs-jax fit ... --resume` or `calibrate` again"
 
-
 # The file, and its rows; docs/files.md describes each number, and where it is null or absent.
 PhotometryFile = ViewPhotometry = CameraPhotometry = dict[str, Any]
 FIELDS = ("version", "model", "curve", "gauge", "mean", "cameras", "views")

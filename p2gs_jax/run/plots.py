@@ -111,7 +111,8 @@ def write_summary(
     found = np.log2(jax.tree.map(np.asarray, params.photometry).exposures)
     stated = {"EXIF": [v.exif_ev for v in train]}
     if true_exposures is not None:
-        stated = {"true": [_log2(true_exposures.get(v.name)) for v in train], **stated}
+        true = (true_exposures.get(v.name, 0.0) for v in train)
+        stated = {"true": [math.log2(e) if e > 0 else None for e in true], **stated}
     for rows, values, style, label in _lines(found, [v.camera for v in train], stated):
         axis.plot(rows, values, label=label or None, **style)
     axis.set_ylabel("exposure, EV\nfrom the mean", fontsize=TEXT_SIZE)
@@ -135,20 +136,11 @@ def _write_heading(figure: Any, heading: Sequence[str], width: float) -> None:
 
 
 def _title(view: View, psnrs: Mapping[str, float], width: float) -> str:
-    """Return the title of a view, cut to a width in inches."""
+    """Return the title of a view; if it does not fit into a width, inches, only its end."""
     score = f", {psnrs[view.name]:.1f} dB" if view.name in psnrs else ""
     split = "held out" if view.split == "test" else "training"
-    return printable(_shorten(f"{view.name} ({split}{score})", width))
-
-
-def _log2(value: float | None) -> float | None:
-    return math.log2(value) if value is not None and value > 0 else None
-
-
-def _shorten(name: str, inches: float) -> str:
-    """Return the end of a name that fits into a width."""
-    most = int(inches * 72 / (CHARACTER * TITLE_SIZE))
-    return name if len(name) <= most else "…" + name[1 - most :]
+    title, most = f"{view.name} ({split}{score})", int(width * 72 / (CHARACTER * TITLE_SIZE))
+    return printable(title if len(title) <= most else "…" + title[1 - most :])
 
 
 def _lines(exposures_ev, cameras: Sequence[str], stated: Mapping[str, Any]) -> list[tuple]:

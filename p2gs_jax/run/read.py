@@ -133,19 +133,15 @@ class Run:
         Raises:
             UserError: there are no moving objects.
         """
-        self._require_objects()
-        assert self.owner is not None
+        if self.owner is None:
+            fix = "leave the option out; drives with boxes have moving objects if they are fitted "
+            fix += "with --dynamics.method rigid"
+            raise UserError(f"{self.folder} has no moving object with Gaussians.", fix=fix)
         mine = self.owner >= 0
         return self._of(chosen(self.params.gaussians, mine), self.owner[mine])
 
     def _of(self, gaussians: Gaussians, owner: Int[np.ndarray, " n"] | None) -> Run:
         return replace(self, params=replace(self.params, gaussians=gaussians), owner=owner)
-
-    def _require_objects(self) -> None:
-        if self.owner is None:
-            fix = "leave the option out; drives with boxes have moving objects if they are fitted "
-            fix += "with --dynamics.method rigid"
-            raise UserError(f"{self.folder} has no moving object with Gaussians.", fix=fix)
 
     def as_of(self) -> Gaussians:
         """Return all Gaussians in world coordinates, moving objects in the middle of the drive."""
@@ -282,12 +278,10 @@ def load_run(folder: str | Path, scene: str | Path | None = None, *, snapshot: b
     owner, moving = read_objects(files.objects, found, gaussians.capacity)
     photometry_file = photometry_files.read_photometry(files.photometry)
     photometry = photometry_of(photometry_file, found, cfg, files.photometry)
-    kind, views = cfg.photometry.appearance, found.training_views
-    appearance = (
-        None
-        if kind is None
-        else photometry_files.read_appearance(files.appearance(kind), kind, views)
-    )
+    appearance, kind = None, cfg.photometry.appearance
+    if kind is not None:
+        path, views = files.appearance(kind), found.training_views
+        appearance = photometry_files.read_appearance(path, kind, views)
     return Run(
         files.root,
         Params(gaussians, photometry, appearance),

@@ -22,7 +22,7 @@ from p2gs_jax.photometry.metering import Metering
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.presets import to_dict as config_to_dict
 from p2gs_jax.render.project import at_time
-from p2gs_jax.run.decisions import Decisions, write_decisions
+from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.run.folder import RunFolder, remembered
 from p2gs_jax.run.photometry_files import write_appearance, write_fitted, write_metering
 from p2gs_jax.run.plots import write_summary
@@ -43,7 +43,7 @@ def write_start(
         "train.steps": cfg.train.steps,
         "train.budget_s": cfg.train.budget_s,
     }
-    write_decisions(folder.decisions, decisions)
+    write_json(folder.decisions, decisions.to_dict())
     write_json(
         folder.config,
         {

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from p2gs_jax.config import FitConfig
-from p2gs_jax.core.atomic import atomic_write, readable
+from p2gs_jax.core.atomic import atomic_write, readable, write_json
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.seeds import cameras_radius, photographed_radiance, with_colors
@@ -18,7 +18,7 @@ from p2gs_jax.jobs.blocks.cut import Cut, block_scene
 from p2gs_jax.photometry.parameters import point_radiance
 from p2gs_jax.pipeline.exposures import Exposures, solve_exposures
 from p2gs_jax.pipeline.survey import decided_scale, near_depth, scale_notes, seen_depths
-from p2gs_jax.run.decisions import Decisions, read_decisions, write_decisions
+from p2gs_jax.run.decisions import Decisions, read_decisions
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import Photometry, Scene
 
@@ -71,7 +71,7 @@ def solve_shared(
 
 def write_shared(folder: Path, shared: Shared) -> None:
     """Write the shared photometry of the blocks."""
-    write_decisions(folder / DECISIONS, shared.exposures.decisions)
+    write_json(folder / DECISIONS, shared.exposures.decisions.to_dict())
     p, colors = shared.exposures.photometry, shared.scene.point_colors
     arrays = {
         "exposures": p.raw_exposures,
