@@ -93,7 +93,8 @@ def sweep(
         write_text(out / TABLE_TEXT, to_markdown(rows))
 
     with locked(out):
-        left = [k for k, job in enumerate(jobs) if k in longer or not _metrics(job.folder).exists()]
+        done = [RunFolder(job.folder).metrics.exists() for job in jobs]
+        left = [k for k in range(len(jobs)) if k in longer or not done[k]]
         for number in sorted({*range(len(jobs))} - {*left}):
             record(number, None)
         if left:
@@ -129,10 +130,6 @@ def _planned(
             jobs.append(fit_job(f"{name}, seed {seed}", scene, folder, seeded, truth))
             rows.append({"name": name, "seed": seed, "run": str(folder), "status": "waiting"})
     return jobs, rows, longer
-
-
-def _metrics(run: Path) -> Path:
-    return RunFolder(run).metrics
 
 
 def _check(configs: Mapping[str, FitConfig], seeds: Sequence[int], max_parallel: int) -> None:
@@ -178,7 +175,7 @@ def _outcome(run: Path, scene: Path, state: JobState | None) -> dict[str, Any]:
     """Return the status of an ended run, with its columns or the reason of its failure."""
     if state is not None and state.status == "stopped":
         return {"status": "interrupted", "reason": "the same sweep continues it"}
-    if not _metrics(run).exists():
+    if not RunFolder(run).metrics.exists():
         return {"status": "failed", "reason": (state and state.reason) or read_reason(run)}
     try:
         return {"status": "done", **read_row(run, scene)}
@@ -235,7 +232,7 @@ MEANING = {
 
 def read_row(run: Path, scene: Path) -> dict[str, Any]:
     """Return the available columns of a finished run by name."""
-    metrics = parse_json(_metrics(run).read_text(encoding="utf-8"))
+    metrics = parse_json(RunFolder(run).metrics.read_text(encoding="utf-8"))
     row: dict[str, Any] = {}
     for column in COLUMNS:
         value = metrics

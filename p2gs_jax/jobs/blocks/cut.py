@@ -70,6 +70,9 @@ class Block:
         return np.linalg.norm(np.maximum(beyond, 0.0), axis=1)
 
 
+_PLANE = Block((-np.inf, -np.inf), (np.inf, np.inf))
+
+
 @dataclass(frozen=True)
 class Cut:
     """The blocks of a scene."""
@@ -132,7 +135,7 @@ def cut_scene(scene: Scene, count: int) -> Cut:
         fix = f"use --blocks {max(1, min(len(places) // FEWEST_VIEWS, distinct))} or fewer"
         raise UserError(why, fix=fix)
     cells = split(places, count)
-    margin = OVERLAP * min(_length(places[cell.holds(places)]) for cell in cells)
+    margin = OVERLAP * min(np.ptp(places[cell.holds(places)], axis=0).max() for cell in cells)
     inside = [cell.holds(ground.place(scene.points), margin) for cell in cells]
     blocks = []
     for cell, near in zip(cells, inside, strict=True):
@@ -154,12 +157,8 @@ def ground_of(centers: Float[np.ndarray, "v 3"]) -> Ground:
     return Ground(middle, (axes * signs[:, None])[:2])
 
 
-def split(places: Float[np.ndarray, "v 2"], count: int) -> list[Block]:
-    """Return cells with about equally many places; at least `count` places must differ."""
-    return _split(places, count, Block((-np.inf, -np.inf), (np.inf, np.inf)))
-
-
-def _split(places: Float[np.ndarray, "v 2"], count: int, cell: Block) -> list[Block]:
+def split(places: Float[np.ndarray, "v 2"], count: int, cell: Block = _PLANE) -> list[Block]:
+    """Divide a cell into cells with about equally many places; `count` or more must differ."""
     if count == 1:
         return [cell]
     less = count // 2
@@ -177,13 +176,9 @@ def _split(places: Float[np.ndarray, "v 2"], count: int, cell: Block) -> list[Bl
     lower[axis] = upper[axis] = edge
     near = places[:, axis] < edge
     return [
-        *_split(places[near], less, Block(cell.lower, (upper[0], upper[1]))),
-        *_split(places[~near], count - less, Block((lower[0], lower[1]), cell.upper)),
+        *split(places[near], less, Block(cell.lower, (upper[0], upper[1]))),
+        *split(places[~near], count - less, Block((lower[0], lower[1]), cell.upper)),
     ]
-
-
-def _length(places: Float[np.ndarray, "v 2"]) -> float:
-    return float(np.ptp(places, axis=0).max()) if len(places) else 0.0
 
 
 def seen_points(scene: Scene) -> list[Int[np.ndarray, " _"]]:
