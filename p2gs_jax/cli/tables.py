@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -24,6 +23,7 @@ from p2gs_jax.photometry.formation import corner
 from p2gs_jax.photometry.solution import WEAK_GAMMA, PhotometricSolution
 from p2gs_jax.pipeline.calibrate import Calibration
 from p2gs_jax.report.findings import duration
+from p2gs_jax.report.run_files import part_at
 
 # Columns of words; all others hold numbers.
 WORDS = ("views", "view", "camera", "protocol", "program", "lens", "configuration", "")
@@ -65,7 +65,8 @@ def print_headline(metrics: dict[str, Any], run: Path) -> None:
     """Print the main score of a fit, and the commands that come next."""
     facts, where = [], shlex.quote(str(run))
     for name in ("test_fitted", "train"):
-        part, fitted = _part(metrics, name), " (exposures fitted)" if name != "train" else ""
+        part = part_at(metrics, *PROTOCOLS[name].path)
+        fitted = " (exposures fitted)" if name != "train" else ""
         if "psnr" in part:
             views = count_of(len(part["per_view"]), "view") + fitted
             facts = [f"{PROTOCOLS[name].views.capitalize()} {part['psnr']:.1f} dB over {views}"]
@@ -82,16 +83,11 @@ def print_headline(metrics: dict[str, Any], run: Path) -> None:
     stdout().print("\n".join(lines), soft_wrap=True)
 
 
-def _part(metrics: dict[str, Any], name: str) -> dict[str, Any]:
-    """Return the part of metrics.json of a protocol; empty where there is none."""
-    return functools.reduce(lambda at, key: at.get(key, {}), PROTOCOLS[name].path, metrics)
-
-
 def print_metrics(metrics: dict[str, Any]) -> None:
     """Print all scores of a run, and its seconds."""
     console, rows = stdout(), []
-    for name, protocol in PROTOCOLS.items():
-        if "psnr" in (part := _part(metrics, name)):
+    for protocol in PROTOCOLS.values():
+        if "psnr" in (part := part_at(metrics, *protocol.path)):
             rows.append((protocol.views, protocol.shown, *scores(part)))
     columns = ("views", "protocol", "PSNR dB", "SSIM", "LPIPS")
     console.print(make_table(columns, rows, "How well it fits"))

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 
-from p2gs_jax.core.text import count_of
+from p2gs_jax.core.text import count_of, first_few
 from p2gs_jax.photometry.models import MODELS
 from p2gs_jax.photometry.solution import NOTICEABLE_EV, Agreement, compare
 from p2gs_jax.report.run_files import RunFiles, number_at
@@ -32,7 +32,6 @@ WEAK_EV = 0.1
 # Smallest rise of the PSNR between the last two tenths of a run that gives a warning, dB.
 STILL_RISING = 0.3
 FINISHED = 0.99  # runs that ended before this share of the schedule give a warning
-MOST_NAMES = 5  # names of views in a warning
 
 
 def duration(seconds: float) -> str:
@@ -111,7 +110,7 @@ class RunWarning(NamedTuple):
 def run_warnings(run: RunFiles) -> list[RunWarning]:
     """Return all warnings, the most serious first."""
     named = [
-        RunWarning(title, form.format(count=count_of(len(found), "view"), names=_named(found)))
+        RunWarning(title, form.format(count=count_of(len(found), "view"), names=first_few(found)))
         for title, found, form in _on_views(run)
         if found
     ]
@@ -123,12 +122,6 @@ def run_warnings(run: RunFiles) -> list[RunWarning]:
 ViewWarning = tuple[str, list[str], str]
 
 
-def _named(names: Sequence[str]) -> str:
-    """Return the first few names and the number of the others."""
-    rest = len(names) - MOST_NAMES
-    return ", ".join(names[:MOST_NAMES]) + (f" and {rest} more" if rest > 0 else "")
-
-
 def _worst(pairs: Iterable[tuple[str, float]], form: str) -> list[str]:
     """Return names with their numbers, from the largest absolute value on."""
     return [f"{name} {value:{form}}" for name, value in sorted(pairs, key=lambda p: -abs(p[1]))]
@@ -138,7 +131,7 @@ def _on_the_run(run: RunFiles) -> Iterator[RunWarning]:
     parts = [run.part("train", "per_view"), run.part("test", "exposure_fitted", "per_view")]
     broken = [n for part in parts for n, s in part.items() if number_at(s, "psnr") is None]
     steps = [int(r["step"]) for r in run.log if number_at(r, "loss") is None]
-    where = [f"the scores of {_named(broken)}"] if broken else []
+    where = [f"the scores of {first_few(broken)}"] if broken else []
     where += [f"the loss at step {steps[0]}"] if steps else []
     if where:
         yield RunWarning(
