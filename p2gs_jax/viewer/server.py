@@ -13,14 +13,12 @@ import hmac
 import http
 import io
 import ipaddress
-import os
 import secrets
 import socket
 import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from http.cookies import CookieError, SimpleCookie
 from typing import Any, NamedTuple
 from urllib.parse import parse_qs, urlsplit
@@ -89,7 +87,7 @@ def is_loopback(host: str) -> bool:
     return bool(host) and all(ipaddress.ip_address(a).is_loopback for a in addresses)
 
 
-@contextmanager
+@contextlib.contextmanager
 def guarded(guard: Guard) -> Iterator[None]:
     """Apply a guard to every server of `websockets` that starts in the `with` block."""
     with _STARTING:
@@ -158,8 +156,7 @@ def check_address(host: str, port: int) -> None:
         fix = "leave it out"
         raise UserError(f"--host {host!r} is not a valid address: {error}.", fix=fix) from None
     with socket.socket(family, kind, protocol) as probe:
-        if os.name == "posix":
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind(address)
         except OSError as error:
@@ -168,7 +165,7 @@ def check_address(host: str, port: int) -> None:
             raise UserError(why, fix=fix) from None
 
 
-@contextmanager
+@contextlib.contextmanager
 def open_viewer(
     run: Run, *, host: str, port: int, max_width: int, follower: Follower | None = None
 ) -> Iterator[str]:

@@ -20,7 +20,6 @@ class BrowserSession:
     """One browser's panel, camera, frusta and live picture."""
 
     def __init__(self, client: viser.ClientHandle, viewed: ViewedRun):
-        """Add the controls to the page and start rendering."""
         self._client, self._viewed = client, viewed
         self._panel = Panel(client.gui, viewed, self)
         self._live = LivePicture(client, viewed, self._panel)
