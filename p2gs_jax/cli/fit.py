@@ -293,7 +293,6 @@ class Inspect:
 
 
 def _camera_table(found: Survey):
-    """Return a table of the cameras, without empty columns."""
     from p2gs_jax.cli.tables import make_table
 
     columns = {

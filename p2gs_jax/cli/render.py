@@ -132,7 +132,6 @@ def _load(options: Render) -> Run:
 
 
 def _check_place(out: Path, overwrite: bool) -> None:
-    """Refuse to overwrite files without --overwrite."""
     occupied = out.is_file() or (out.is_dir() and any(out.iterdir()))
     if occupied and not overwrite:
         why = f"{out} exists already" if out.is_file() else f"{out} holds files already"

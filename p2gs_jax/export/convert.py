@@ -52,8 +52,6 @@ STEPS = 240  # least number of baking steps by default
 MEASURED = 60
 # Least median PSNR called close, dB: two scenes had 31 to 38 dB, without refinement 19 to 22 dB.
 CLOSE_DB = 30.0
-
-
 # The writer of each format with display colours, and its reader if the format rounds values.
 WRITERS: dict[str, tuple[Callable, Callable | None]] = {
     "spz": (gsply.write_spz, gsply.read_spz),
@@ -247,7 +245,6 @@ class DisplayFiles:
 
 
 def _spread(rows: Sequence[int]) -> list[int]:
-    """Return at most MEASURED of the rows, evenly spread."""
     return [rows[i] for i in evenly_spaced(len(rows), MEASURED)]
 
 

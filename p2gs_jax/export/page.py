@@ -35,16 +35,14 @@ JUDGED, WEIGHED = 12, 60
 MEGABYTE = 1_000_000
 # Bytes reserved for sentences and for the header of the Gaussians.
 RESERVE = 4000
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Page:
-    """A written page: its bytes, Gaussians, number of photographs, and sentences on its error."""
+    """A written page: its bytes, Gaussians, and sentences on its error."""
 
     size: int
     splats: PageSplats
-    photographs: int
     sentences: tuple[str, ...]
 
 
@@ -55,7 +53,7 @@ def write_page(
     *,
     size_mb: float,
     photographs: int = 0,
-    say: Say = lambda text: None,
+    say: Callable[[str], None] = lambda text: None,
 ) -> Page:
     """Write the page of at most `size_mb` million bytes.
 
@@ -82,7 +80,7 @@ def write_page(
     data |= {"splats": splats.packed.header, "about": [*sentences, *_fine_print(fitted)]}
     content = page_text(title, data, splats.packed.data)
     write_text(path, content)
-    return Page(len(content.encode()), splats, len(embedded), tuple(sentences))
+    return Page(len(content.encode()), splats, tuple(sentences))
 
 
 def page_text(title: str, scene: Mapping[str, Any], splats: bytes) -> str:

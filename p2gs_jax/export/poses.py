@@ -36,17 +36,11 @@ _BEFORE_NAME, _KEYPOINT = 64, 24
 
 @dataclass(frozen=True)
 class Poses:
-    """The pose files of a scene, and its photographs as these name them.
+    """The pose files of a scene, and its photographs as these name them."""
 
-    Attributes:
-        files: the files, by their place in the new folder.
-        stated: the name of each view's photograph in the files, by the name of the view.
-        base: subfolder of the new folder to which the names are relative.
-    """
-
-    files: Mapping[str, Path]
-    stated: Mapping[str, str]
-    base: str = "images"
+    files: Mapping[str, Path]  # by their place in the new folder
+    stated: Mapping[str, str]  # name of each view's photograph in the files, by the view's name
+    base: str = "images"  # subfolder of the new folder to which the names are relative
 
     def places(self, suffixes: Sequence[str], other: str) -> dict[str, str]:
         """Return the place of each view's photograph in the new folder.

@@ -1,4 +1,7 @@
-"""The pictures of a run folder, `summary.png` and `calibration.png`."""
+"""The pictures of a run folder, `summary.png` and `calibration.png`.
+
+Functions import matplotlib themselves, because it is slow to load.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +55,6 @@ def names_as_they_are() -> Iterator[None]:
     Text between dollars is not a formula. Letters that the font lacks are boxes in the picture,
     without a warning in the terminal. The caller escapes control characters (`printable`).
     """
-    # Imported here, because it is slow to load.
     import matplotlib
 
     with matplotlib.rc_context(), warnings.catch_warnings():
@@ -80,7 +82,6 @@ def write_summary(
     Renders are under the exposures of the views, and under one exposure for all. True exposures and
     PSNRs are by the name of the view; `heading` has the lines above the pictures.
     """
-    # Imported here, because it is slow to load.
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
@@ -184,7 +185,6 @@ def write_calibration_plot(
     Stated exposures (EXIF or a file) are shifted onto the recovered ones, NaN where unknown;
     `pivot` is the linear value that gammas do not change.
     """
-    # Imported here, because it is slow to load.
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 

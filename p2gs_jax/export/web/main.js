@@ -416,7 +416,7 @@ class Page {
     const camera = { R, c, lens: [lens.fx, lens.fy, lens.cx, lens.cy] };
     while (this.renderer.waiting) await new Promise((done) => setTimeout(done, 5));
     await this.renderer.sort(camera);
-    const target = this.renderer.target(this.renderer.gl.RGBA32F);
+    const target = this.renderer.target();
     this.renderer.render(camera, view.width, view.height, target);
     const frame = { scale: 1, width: view.width, height: view.height };
     if (!linear) this.renderer.develop(this.state.look, frame, target, this.renderer.measured);

@@ -33,8 +33,8 @@ class Renderer {
     this.photograph = this.texture(gl.TEXTURE_2D, gl.LINEAR);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, 1, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
     this.empty = gl.createVertexArray();
-    this.picture = this.target(gl.RGBA32F);
-    this.measured = this.target(gl.RGBA32F);
+    this.picture = this.target();
+    this.measured = this.target();
     if (this.order) this.setOrder(this.order);
   }
 
@@ -150,16 +150,16 @@ class Renderer {
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, image);
   }
 
-  target(format) {
+  target() {
     const { gl } = this;
     const texture = this.texture(gl.TEXTURE_2D, gl.NEAREST), buffer = gl.createFramebuffer();
-    return { texture, buffer, format, width: 0, height: 0 };
+    return { texture, buffer, width: 0, height: 0 };
   }
 
   resize(target, width, height) {
     const { gl } = this;
     if (target.width === width && target.height === height) return;
-    const [format, kind] = this.half ? [gl.RGBA16F, gl.HALF_FLOAT] : [target.format, gl.FLOAT];
+    const [format, kind] = this.half ? [gl.RGBA16F, gl.HALF_FLOAT] : [gl.RGBA32F, gl.FLOAT];
     gl.bindTexture(gl.TEXTURE_2D, target.texture);
     gl.texImage2D(gl.TEXTURE_2D, 0, format, width, height, 0, gl.RGBA, kind, null);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.buffer);
@@ -283,7 +283,6 @@ class Renderer {
     const shade = look.vignetting && look.camera >= 0 ? scene.tone.cameras[look.camera] : null;
     gl.uniformMatrix3fv(p.at.vignetting, false, vignettingOf(shade));
     gl.uniform3f(p.at.frame, frame.scale, frame.width, frame.height);
-    gl.uniform2f(p.at.frameCentre, frame.width / 2, frame.height / 2);
     gl.uniform1f(p.at.split, into ? 0 : look.split);
     gl.uniform1f(p.at.most, this.extended && look.hdr ? 16 : 1);
     gl.uniform3fv(p.at.stopColors, scene.stopColors.flat());

@@ -135,7 +135,6 @@ uniform vec3 tableFirst, tableStep;  // natural logarithms
 uniform ivec3 tableRow;
 uniform mat3 vignetting;        // a column of k1, k2, k3 for each channel
 uniform vec3 frame;             // photograph pixels per canvas pixel; the photograph's width and height
-uniform vec2 frameCentre;       // the middle of the canvas in the photograph, pixels
 uniform float split;            // share of the canvas that shows the photograph
 uniform float most;             // largest display value
 uniform vec3 stopColors[12];
@@ -190,8 +189,8 @@ vec3 develop(vec3 exposed) {
 void main() {
   vec2 at = gl_FragCoord.xy;
   if (mode != 3) at.y = canvasSize.y - at.y;  // row 0 of the canvas is at the bottom
-  vec2 inPhoto = (at - canvasSize / 2.0) * frame.x + frameCentre;
-  vec2 off = inPhoto - frame.yz / 2.0;
+  vec2 off = (at - canvasSize / 2.0) * frame.x;  // from the middle of the photograph
+  vec2 inPhoto = off + frame.yz / 2.0;
   float r2 = min(4.0 * dot(off, off) / dot(frame.yz, frame.yz), 1.0);
   vec3 exposed = light(at) * factors;
   if (vignetting != mat3(0.0)) exposed *= exp(vec3(r2, r2 * r2, r2 * r2 * r2) * vignetting);
