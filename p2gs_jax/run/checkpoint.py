@@ -67,11 +67,7 @@ class CheckpointStore:
             shutil.rmtree(self.folder / str(older))
 
     def read_meta(self, step: int) -> dict:
-        """Return the plain values saved with a checkpoint.
-
-        Raises:
-            UserError: the checkpoint cannot be read.
-        """
+        """Return the plain values saved with a checkpoint; UserError: it cannot be read."""
         return self._read(step)[0]
 
     def latest_meta(self) -> dict | None:

@@ -81,12 +81,9 @@ class Decisions:
         return with_values(cfg, values)
 
     def require_same(self, saved: dict[str, Any], folder: Path) -> None:
-        """Check that the checkpoints of a run, in `folder`, have the same decisions.
+        """Raise a UserError if the checkpoints of a run, in `folder`, have other decisions.
 
         Reasons may differ.
-
-        Raises:
-            UserError: a decision differs.
         """
         now = self.to_dict()
         del now["reasons"]
@@ -118,11 +115,7 @@ _PLACES = {
 
 
 def read_decisions(path: Path) -> Decisions | None:
-    """Read `decisions.json`; None if there is no such file.
-
-    Raises:
-        UserError: the file is broken.
-    """
+    """Read `decisions.json`; None: there is no such file; UserError: it is broken."""
     if not path.exists():
         return None
     fix = "restore it from a copy, or finish the fit again with --resume, which writes it"
@@ -216,8 +209,7 @@ def without_tracks(decided: Decisions) -> Decisions:
 def kept_choice(cfg: config.FitConfig, folder: RunFolder) -> Decisions | None:
     """Return the decisions in the checkpoints of a run; None: nothing was solved or saved.
 
-    Raises:
-        UserError: another version of the program wrote the checkpoints.
+    UserError: another version of the program wrote the checkpoints.
     """
     p = cfg.photometry
     camera_effects = p.vignetting is not None or p.responses != "all"

@@ -91,11 +91,7 @@ class RunLock:
         self.folder, self._handle = folder, handle
 
     def require(self) -> None:
-        """Check that the folder still exists and was not created again by another process.
-
-        Raises:
-            UserError: the folder was removed or replaced during the run.
-        """
+        """Raise a UserError if the folder was removed, or replaced by another process."""
         if self._handle is not None and not _is_at(self._handle, self.folder / NAME):
             why = f"{self.folder} was removed or replaced while the run was writing to it."
             raise UserError(why, fix="start again; the content of the folder is lost")
@@ -127,11 +123,7 @@ def locked(folder: Path) -> Iterator[RunLock]:
 
 
 def require_free(folder: Path) -> None:
-    """Check that no other process writes to a folder; nothing is written.
-
-    Raises:
-        UserError: the folder is locked.
-    """
+    """Raise a UserError if another process writes to a folder; nothing is written."""
     if not (folder / NAME).is_file():
         return
     with contextlib.suppress(FileNotFoundError, PermissionError):

@@ -49,11 +49,7 @@ def write_photometry(path: Path, **values: Any) -> None:
 
 
 def read_photometry(path: Path) -> PhotometryFile:
-    """Read `photometry.json`.
-
-    Raises:
-        UserError: the file cannot be read, lacks a field, or has another version.
-    """
+    """Read `photometry.json`; UserError: it is broken, lacks a field, or has another version."""
     with readable(path, AGAIN):
         data = parse_json(Path(path).read_text(encoding="utf-8"))
     if problem := _problem(data):
@@ -83,8 +79,7 @@ def _missing(data, fields: Sequence[str]) -> str | None:
 def with_formation_of(cfg: PhotometryConfig, saved: PhotometryFile) -> PhotometryConfig:
     """Return options with the image formation of a file; it has no learned corrections.
 
-    Raises:
-        UserError: the file has no valid tone curve, or a broken camera.
+    UserError: the file has no valid tone curve, or a broken camera.
     """
     curve, kinds = saved["curve"], ("vignetting", "splines")
     balanced = any(view.get("white_balance") is not None for view in saved["views"])
@@ -262,11 +257,7 @@ def write_metering(path: Path, metering: Metering) -> None:
 
 
 def read_metering(path: Path) -> Metering:
-    """Read `metering.json`.
-
-    Raises:
-        UserError: the file is missing or broken.
-    """
+    """Read `metering.json`; UserError: it is missing or broken."""
     with readable(path, "write it again with `p2gs-jax eval RUN`"):
         data = parse_json(path.read_text(encoding="utf-8"))
         readings = data["readings"]
@@ -333,8 +324,7 @@ def write_appearance(path: Path, learned: Corrections, views: Sequence[View]) ->
 def read_appearance(path: Path, kind: Appearance, views: Sequence[View]) -> Corrections:
     """Return the corrections of the training views from `write_appearance`.
 
-    Raises:
-        UserError: the file cannot be read, or belongs to other views.
+    UserError: the file cannot be read, or belongs to other views.
     """
     like: Any = identity(kind, [view.camera for view in views])
     layout = _LAYOUTS.get(type(like))

@@ -311,8 +311,7 @@ def photometry_of(
 ) -> Photometry:
     """Return exposures, gammas and white balances of the training views from a file's content.
 
-    Raises:
-        UserError: the file lacks those of a view.
+    UserError: the file lacks those of a view.
     """
     by_name = {v["image"]: v for v in saved["views"] if v["exposure"] is not None}
     train = [by_name[v.name] for v in scene.training_views if v.name in by_name]
@@ -336,11 +335,7 @@ def photometry_of(
 
 
 def read_config(path: Path) -> tuple[dict[str, Any], FitConfig]:
-    """Return `config.json` and the configuration in it.
-
-    Raises:
-        UserError: the file is broken, or of another version.
-    """
+    """Return `config.json` and its configuration; UserError: it is broken or of another version."""
     with readable(path, CONFIG_AGAIN):
         saved = parse_json(path.read_text(encoding="utf-8"))
     if not isinstance(saved, dict) or not isinstance(saved.get("fit"), dict):

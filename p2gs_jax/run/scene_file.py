@@ -80,10 +80,9 @@ def _view_row(view: View, folder: Path, base: Path) -> dict[str, Any]:
 
 
 def read_scene(folder: Path, root: Path) -> Scene:
-    """Return the scene of a run folder; the scene folder `root` need not exist any more.
+    """Return the scene of a run folder; UserError: its file is missing or broken.
 
-    Raises:
-        UserError: the file is missing or broken.
+    The scene folder `root` need not exist any more.
     """
     path, fix = folder / SCENE_FILE, "restore it from a copy, or fit again"
     if not path.is_file():
@@ -191,8 +190,7 @@ def read_objects(
 ) -> tuple[Int[np.ndarray, " n"] | None, MovingObjects | None]:
     """Return owners and objects from `write_objects` for `count` Gaussians; None: there are none.
 
-    Raises:
-        UserError: the file is broken, or belongs to another run.
+    UserError: the file is broken, or belongs to another run.
     """
     if not path.is_file():
         return None, None
