@@ -120,14 +120,15 @@ def _planned(
     """Return the jobs of all configurations and seeds, the first cells of their rows, and the
     numbers of finished runs that now have more steps or time."""
     jobs, rows, longer = [], [], set()
-    truth = None if reference is None else Path(reference)
+    truth = None if reference is None else str(Path(reference).absolute())
     for name, cfg in configs.items():
         for seed in seeds:
             seeded = with_fields(cfg, {"train.seed": seed})
             folder = out / slug(name) / f"seed_{seed}"
             if check_run_dir(folder, True, seeded):
                 longer.add(len(jobs))
-            jobs.append(fit_job(f"{name}, seed {seed}", scene, folder, seeded, truth))
+            arguments = {"scene": str(scene.absolute()), "reference": truth, "fit": to_dict(seeded)}
+            jobs.append(Job(f"{name}, seed {seed}", folder, fit_task, arguments))
             rows.append({"name": name, "seed": seed, "run": str(folder), "status": "waiting"})
     return jobs, rows, longer
 
@@ -145,18 +146,8 @@ def _check(configs: Mapping[str, FitConfig], seeds: Sequence[int], max_parallel:
         raise UserError(why, fix="give them names that differ in letters or digits")
 
 
-def fit_job(name: str, scene: Path, run: Path, cfg: FitConfig, reference: Path | None) -> Job:
-    """Return the job of a fit, which continues the run in its folder."""
-    arguments = {
-        "scene": str(scene.absolute()),
-        "reference": None if reference is None else str(reference.absolute()),
-        "fit": to_dict(cfg),
-    }
-    return Job(name, run, fit_task, arguments)
-
-
 def fit_task(folder: Path, arguments: dict[str, Any], reporter: Reporter) -> None:
-    """Start or continue a fit with the arguments of a `fit_job`; it raises the errors of `fit`."""
+    """Start or continue a fit with the arguments of a job; it raises the errors of `fit`."""
     use_compile_cache()
     tune_process()
     fit(

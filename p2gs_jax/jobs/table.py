@@ -42,7 +42,7 @@ def line_of(states: Sequence[JobState]) -> str:
 
 def _stage(state: JobState) -> str:
     if state.status == "failed":
-        return (state.reason or "").splitlines()[0] if state.reason else ""
+        return state.reason.splitlines()[0] if state.reason else ""
     if state.status != "running":
         return "started again" if state.status == "waiting" and state.starts > 1 else ""
     share = "" if state.progress is None else f"{state.progress:.0%} "
