@@ -14,7 +14,7 @@ import html
 import json
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from p2gs_jax.core.atomic import plain, write_text
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.core.text import printable
 from p2gs_jax.errors import UserError
-from p2gs_jax.export.page_scene import embedded_photographs, page_scene, rounded, uncorrected
+from p2gs_jax.export.page_scene import embedded_photographs, page_scene, rounded
 from p2gs_jax.export.page_splats import PageSplats, RunPicture, fit_into, page_error, radiance_of
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render.capacity import make_renderer
@@ -65,13 +65,14 @@ def write_page(
     say("Rendering true pictures")
     pictures = []
     for i in map(int, evenly_spaced(len(scene.views), JUDGED)):
-        camera, display = fitted.camera(i), uncorrected(fitted.own_display(i))
+        # The page cannot apply a learned correction.
+        camera, display = fitted.camera(i), replace(fitted.own_display(i), correction=None)
         linear, name = radiance_of(gaussians, camera, render), scene.views[i].name
         pictures.append(RunPicture(name, camera, display, linear, develop(linear, display)))
     train = scene.train_indices
     weighed = [fitted.camera(train[k]) for k in evenly_spaced(len(train), WEIGHED)]
     embedded = embedded_photographs(fitted, photographs)
-    data = page_scene(fitted, uncorrected(look), embedded)
+    data = page_scene(fitted, look, embedded)
     title = f"{fitted.folder.resolve().name}: linear light"
     most_bytes = _bytes_for_splats(int(size_mb * MEGABYTE), page_text(title, data, b""), size_mb)
     judge = functools.partial(page_error, pictures=pictures, render=render)

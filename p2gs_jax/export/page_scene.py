@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,11 +20,6 @@ STEPS = np.arange(-6, 6) + 0.5
 LONGEST, QUALITY = 960, 80
 # Significant digits of numbers in the page, enough for float32.
 DIGITS = 7
-
-
-def uncorrected(transform: DisplayTransform) -> DisplayTransform:
-    """Return the transform without a learned correction, which the page cannot apply."""
-    return replace(transform, correction=None)
 
 
 def page_scene(

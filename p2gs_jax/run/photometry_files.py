@@ -215,18 +215,17 @@ def _camera_rows(
     cameras: Sequence[CameraFormation], corner_errors: Float[np.ndarray, "c k"] | None
 ) -> list[CameraPhotometry]:
     """Return the `cameras` of the file, with standard errors of log V in the corners if known."""
-    known = corner_errors is not None and len(corner_errors) == len(cameras)
+    if corner_errors is None or len(corner_errors) != len(cameras):
+        corner_errors = np.zeros((len(cameras), 0))
     return [
         {
             "name": camera.name,
             "vignetting": [list(row) for row in camera.vignetting] or None,
             "corner": list(corner(camera)) or None,
-            "corner_ev_error": (corner_errors[i] / LN2).tolist() or None
-            if known and corner_errors is not None
-            else None,
+            "corner_ev_error": (errors / LN2).tolist() or None,
             "splines": [list(row) for row in camera.splines] or None,
         }
-        for i, camera in enumerate(cameras)
+        for camera, errors in zip(cameras, corner_errors, strict=True)
     ]
 
 

@@ -71,14 +71,9 @@ def browser_view(client: viser.ClientHandle) -> BrowserView:
     return BrowserView(camera.wxyz, camera.position, camera.fov, canvas)
 
 
-def viewmats_of(views: Sequence[View]) -> Float[np.ndarray, "v 4 4"]:
-    """Return the world-to-camera matrices of views."""
-    return np.stack([view.viewmat for view in views])
-
-
 def make_viewer_space(scene: Scene, points: Float[np.ndarray, "n 3"]) -> ViewerSpace:
     """Return the scale of a scene, which its points determine, and its up direction."""
-    viewmats = viewmats_of(scene.views)
+    viewmats = np.stack([view.viewmat for view in scene.views])
     every = max(1, len(viewmats) // 16)
     distance = np.median([distance_seen(m, points) for m in viewmats[::every]])
     up = rigid.up_direction(viewmats)
@@ -155,7 +150,8 @@ class Frusta:
 
         `on_click` is called with the row of a view whose frustum was clicked.
         """
-        self._positions = rigid.camera_centers(viewmats_of(views)) * space.unit
+        viewmats = np.stack([view.viewmat for view in views])
+        self._positions = rigid.camera_centers(viewmats) * space.unit
         self._visible = False
         self._near = np.zeros(len(views), bool)
         self._handles = []

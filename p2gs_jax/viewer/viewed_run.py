@@ -37,7 +37,7 @@ class ViewedRun:
         gaussians = at_time(run.as_of(), None)
         points = run.scene.points
         self._points = points if len(points) else np.asarray(gaussians.means)
-        self._centers = camera_centers(cameras.viewmats_of(run.scene.views))
+        self._centers = camera_centers(np.stack([view.viewmat for view in run.scene.views]))
         self.space = cameras.make_viewer_space(run.scene, self._points)
         # The distance of the points that a view sees by its row, scene units.
         views = run.scene.views
