@@ -82,10 +82,8 @@ class CheckpointStore:
     def restore(self, step: int, like: Tree) -> tuple[Tree, dict]:
         """Return the tree of a checkpoint, bit for bit in numpy arrays, and its plain values.
 
-        `like` has arrays or shapes, in the structure that was saved.
-
-        Raises:
-            UserError: the checkpoint cannot be read, or its structure differs from `like`.
+        `like` has arrays or shapes, in the structure that was saved. UserError: the checkpoint
+        cannot be read, or its structure differs from `like`.
         """
         meta, leaves = self._read(step, like)
         return jax.tree.unflatten(jax.tree.structure(like), leaves), meta
@@ -96,10 +94,7 @@ class CheckpointStore:
         """Return the newest readable checkpoint and its values, or None if there is none.
 
         `like` is called with the saved values, and returns the `like` of `restore`; `on_message`
-        receives messages on checkpoints that cannot be read.
-
-        Raises:
-            UserError: there are checkpoints and none can be read.
+        receives messages on checkpoints that cannot be read. UserError: none can be read.
         """
         last: UserError | None = None
         for step in reversed(saved_steps(self.folder)):

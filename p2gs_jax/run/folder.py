@@ -101,8 +101,7 @@ class RunLock:
 def locked(folder: Path) -> Iterator[RunLock]:
     """Hold the lock of an existing folder; incomplete files of a crash in it are removed.
 
-    Raises:
-        UserError: another process holds the lock, or the folder was removed during a write.
+    UserError: another process holds the lock, or the folder was removed during a write.
     """
     handle = _acquire(folder)
     lock = RunLock(folder, handle)

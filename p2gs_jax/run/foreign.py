@@ -98,8 +98,7 @@ class ForeignRun(read.Run):
 def load_run_or_splats(run: Path, scene: Path | None, photometry: Path | None) -> read.Run:
     """Return a finished run, or with `photometry` the splats of another program (`foreign_run`).
 
-    Raises:
-        UserError: see `load_run` and `foreign_run`; or splats come without a scene.
+    UserError: see `load_run` and `foreign_run`; or splats come without a scene.
     """
     if photometry is None:
         return read.load_run(run, scene)
@@ -166,10 +165,8 @@ def _with_known(
 def common_look(folder: Path, saved: photometry_files.PhotometryFile) -> DisplayTransform:
     """Return the look of the developed photographs of a calibration's folder.
 
-    If there are none, it is the mean exposure and gamma of its `photometry.json`.
-
-    Raises:
-        UserError: their table cannot be read, or another calibration developed them.
+    If there are none, it is the mean exposure and gamma of its `photometry.json`. UserError: their
+    table cannot be read, or another calibration developed them.
     """
     mean, path = saved["mean"], folder / DEVELOPED
     cfg = photometry_files.with_formation_of(PhotometryConfig(), saved)

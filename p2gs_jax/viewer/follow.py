@@ -36,10 +36,9 @@ class Follower:
         return False
 
     def first(self, say: Callable[[str], None]) -> Run:
-        """Return the run as soon as it can be shown; `say` receives a message about a wait.
+        """Return the run as soon as it can be shown; UserError: see `load_run`.
 
-        Raises:
-            UserError: see `load_run`.
+        `say` receives a message about a wait.
         """
         if self.goes_on:
             say("Waiting for the first steps of the fit ...")

@@ -394,10 +394,9 @@ class Page {
     this.frames = this.frames.filter((t) => now - t < 2);
     const { picture, half, extended } = this.renderer;
     const first = this.frames[0], speed = (this.frames.length - 1) / (now - first);
-    const rate = this.frames.length > 2 ? `${speed.toFixed(speed < 10 ? 1 : 0)} frames/s` : this.rate;
-    this.rate = rate;
+    if (this.frames.length > 2) this.rate = `${speed.toFixed(speed < 10 ? 1 : 0)} frames/s`;
     $("status").textContent = [`${this.splats.count.toLocaleString("en")} Gaussians`,
-      `${picture.width} × ${picture.height}`, rate, `${half ? 16 : 32}-bit light`,
+      `${picture.width} × ${picture.height}`, this.rate, `${half ? 16 : 32}-bit light`,
       extended ? "HDR display" : ""].filter(Boolean).join(" · ");
   }
 
