@@ -39,7 +39,6 @@ class Comparison:
     removing the means (stops), and the number of common views.
     """
 
-    runs: tuple[RunFiles, ...]
     labels: tuple[str, ...]
     remarks: tuple[str, ...]
     same_scene: bool
@@ -105,7 +104,7 @@ def compare_runs(folders: Sequence[str | Path]) -> Comparison:
         remarks.insert(0, remark)
     apart = tuple(_apart(runs, labels)) if same else ()
     scores, options = tuple(_scores(runs, same)), tuple(_options(runs))
-    return Comparison(runs, labels, tuple(remarks), same, scores, options, apart)
+    return Comparison(labels, tuple(remarks), same, scores, options, apart)
 
 
 def _labels(folders: list[Path]) -> list[str]:
