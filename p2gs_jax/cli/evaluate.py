@@ -133,7 +133,7 @@ def _kept(path: Path) -> dict[str, Any]:
     from p2gs_jax.core.text import parse_json
 
     try:
-        old = parse_json(path.read_text())
+        old = parse_json(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     return {k: v for k, v in old.items() if k not in UNJUDGED}

@@ -13,13 +13,13 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from p2gs_jax.config import Appearance, FitConfig, PhotometryConfig
-from p2gs_jax.formats.exr import BT709
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import EXPOSED_CEILING, EXPOSED_FLOOR
 from p2gs_jax.render.harmonics import C0, C1, C2, C3, LOG_RADIANCE_LIMIT, degree_of
 from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.run.photometry_files import PhotometryFile, ViewPhotometry
 from p2gs_jax.scene import ImageStore
+from p2gs_jax.scene.convert.icc import BT709
 from p2gs_jax.types import GAMMA_SRGB, Gaussians, Scene
 
 FORMAT, VERSION = "p2gs-jax linear Gaussians", 2

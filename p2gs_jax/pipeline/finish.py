@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import jax
 import numpy as np
 
 from p2gs_jax.config import FitConfig
@@ -139,7 +140,8 @@ def heading(metrics: Mapping[str, Any], params: Params, cfg: FitConfig) -> list[
         scores.insert(0, f"held-out views {test['psnr']:.1f} dB (exposures fitted)")
         psnr, worst = min((row["psnr"], name) for name, row in test["per_view"].items())
         lines = [f"Worst held-out view: {worst}, {psnr:.1f} dB."]
-    ev = np.log2(np.asarray(params.photometry.exposures, np.float64))
+    photometry = jax.tree.map(np.asarray, params.photometry)  # no program on a device
+    ev = np.log2(photometry.exposures.astype(np.float64))
     span = f"; exposures span {np.ptp(ev):.1f} stops" if np.ptp(ev) > 0 else ""
     form = Form(p.model, p.white_balance, p.vignetting)
     model = f"Model: {form.description}, {p.curve.replace('srgb', 'sRGB')} curve{span}."
