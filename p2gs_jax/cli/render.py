@@ -59,7 +59,8 @@ class Render:
     curve: Literal["run", "srgb", "power", "linear", "spline"] = "run"
     """Tone curve; run: the fitted one."""
     white_balance_of: str | None = None
-    """View whose white balance is used (default: the picture's view, or neutral)."""
+    """View whose white balance is used (default: that of a picture with its view's exposure, else
+    neutral)."""
     no_vignetting: bool = False
     """Leave out the vignetting of the run's cameras."""
     without_objects: bool = False

@@ -91,8 +91,9 @@ def read_kitti_raw(root: Path, cfg: DataConfig) -> Recording:
         for k, path in scans.items()
         if k < len(forward) and known[k]
     ]
-    absent = len(forward) - len(sweeps)
+    absent = len({*range(len(forward))} - {*scans})
     notes += tables.counted(absent, f"of {len(forward)} LiDAR sweeps are missing.")
+    notes += tables.counted(len(scans) - len(sweeps), tables.UNPLACED_SWEEPS)
     labels, objects = root / "tracklet_labels.xml", ()
     if labels.is_file():
         boxes, empty = _tracklets(labels)

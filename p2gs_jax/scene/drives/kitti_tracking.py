@@ -69,6 +69,7 @@ def read_kitti_tracking(root: Path, cfg: DataConfig) -> Recording:
     ]
     absent = len(times) - len(sweeps)
     notes += tables.counted(absent, f"of {len(times)} LiDAR sweeps are missing.")
+    notes += tables.counted(len(scans) - len(sweeps), tables.UNPLACED_SWEEPS)
     labels, objects = root / "label_02" / f"{name}.txt", ()
     if labels.is_file():
         lengths = np.full(len(times), kitti.TURN_S)

@@ -43,6 +43,9 @@ LISTED = 5
 _MOST_BYTES = 2**28
 
 
+UNPLACED_SWEEPS = "LiDAR sweeps have no time or pose: they are left out."  # for `counted`
+
+
 def counted(count: int, words: str) -> list[str]:
     """Return the note `COUNT WORDS`, or no note if the count is 0."""
     return [f"{count} {words}"] if count else []

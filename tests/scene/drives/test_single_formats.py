@@ -264,11 +264,21 @@ def test_what_kitti_lacks_is_counted(write, read, tmp_path):
         "4 of 8 frames have no GPS measurement.",
         "3 photographs of image_02 have no pose or time.",
         "image_03 has no photographs: it is left out.",
-        "4 of 8 LiDAR sweeps are missing.",
+        "1 of 8 LiDAR sweeps are missing.",
+        "3 LiDAR sweeps have no time or pose: they are left out.",
         "1 tracklets have no boxes: they are left out.",
         "2 boxes have frames without a LiDAR time: they are left out.",
     ]
     assert {p.frame for p in recording.photographs} == {0, 1, 2, 3, 4}
+
+
+def test_a_sweep_after_the_last_pose_of_a_tracking_sequence_is_counted(copied, read):
+    root = copied("kitti_tracking").root
+    scans = sorted(root.glob("training/velodyne/*/*.bin"))
+    shutil.copy(scans[0], scans[0].with_name("000099.bin"))
+    recording = read(root)
+    assert len(recording.sweeps) == len(scans)
+    assert "1 LiDAR sweeps have no time or pose: they are left out." in recording.notes
 
 
 def test_sizes_that_no_photograph_has_are_those_of_the_calibration(copied, read):
