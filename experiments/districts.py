@@ -46,7 +46,7 @@ class Size:
         return f"{3 * self.frames}x{self.width}_{self.steps}"
 
 
-FULL = Size(300, 2.0, 160, 100_000, 6_000, 4)
+FULL = Size(300, 2.0, 320, 200_000, 6_000, 4)
 QUICK = Size(30, 2.0, 96, 12_000, 400, 2)
 
 
@@ -67,13 +67,14 @@ def main() -> None:
             width=size.width,
             height=image_height(size.width),
             points=size.points,
-            supersample=3,
+            supersample=4,
             sensor=Sensor(iso_std=2.0),
             layout="long",
+            matte=True,
             report=lambda line: print(line, flush=True),
         )
-    one = fitted(town, folder / "one", size, [])
     blocks = fitted(town, folder / "blocks", size, ["--blocks", str(size.blocks)])
+    one = fitted(town, folder / "one", size, [])
     rows = [row("one fit", one), row(f"{size.blocks} blocks", blocks)]
     print(table(HEADER, rows))
     print(seams(blocks))
