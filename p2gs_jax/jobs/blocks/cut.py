@@ -135,7 +135,7 @@ def cut_scene(scene: Scene, count: int) -> Cut:
         fix = f"use --blocks {max(1, min(len(places) // FEWEST_VIEWS, distinct))} or fewer"
         raise UserError(why, fix=fix)
     cells = split(places, count)
-    margin = OVERLAP * min(np.ptp(places[cell.holds(places)], axis=0).max() for cell in cells)
+    margin = OVERLAP * min(_length(places[cell.holds(places)]) for cell in cells)
     inside = [cell.holds(ground.place(scene.points), margin) for cell in cells]
     blocks = []
     for cell, near in zip(cells, inside, strict=True):
@@ -179,6 +179,11 @@ def split(places: Float[np.ndarray, "v 2"], count: int, cell: Block = _PLANE) ->
         *split(places[near], less, Block(cell.lower, (upper[0], upper[1]))),
         *split(places[~near], count - less, Block((lower[0], lower[1]), cell.upper)),
     ]
+
+
+def _length(places: Float[np.ndarray, "v 2"]) -> float:
+    # Rounding can leave a cell without places.
+    return float(np.ptp(places, axis=0).max()) if len(places) else 0.0
 
 
 def seen_points(scene: Scene) -> list[Int[np.ndarray, " _"]]:
