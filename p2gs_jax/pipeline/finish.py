@@ -140,8 +140,8 @@ def heading(metrics: Mapping[str, Any], params: Params, cfg: FitConfig) -> list[
         scores.insert(0, f"held-out views {test['psnr']:.1f} dB (exposures fitted)")
         psnr, worst = min((row["psnr"], name) for name, row in test["per_view"].items())
         lines = [f"Worst held-out view: {worst}, {psnr:.1f} dB."]
-    photometry = jax.tree.map(np.asarray, params.photometry)  # no program on a device
-    ev = np.log2(photometry.exposures.astype(np.float64))
+    # NumPy computes exposures of host arrays, without a compiled program.
+    ev = np.log2(jax.tree.map(np.asarray, params.photometry).exposures)
     span = f"; exposures span {np.ptp(ev):.1f} stops" if np.ptp(ev) > 0 else ""
     form = Form(p.model, p.white_balance, p.vignetting)
     model = f"Model: {form.description}, {p.curve.replace('srgb', 'sRGB')} curve{span}."
