@@ -121,11 +121,7 @@ def find_scene(
         return transforms.load_transforms(root, root, cfg)
     model = find_model(root)
     if model is not None and cfg.format in (None, "colmap"):
-        scene = _read_colmap(root, model, cfg)
-        lists = lists_beside(model, root) if cfg.split is None and cfg.test_every else None
-        if lists is None:
-            return scene
-        return split_as_listed(scene, lists, allow_missing=cfg.allow_missing)
+        return _read_colmap(root, model, cfg)
     if (root / "transforms.json").is_file() and cfg.format in (None, "transforms"):
         return transforms.load_transforms(root, root / "transforms.json", cfg)
     if (root / "transforms_train.json").is_file() and cfg.format in (None, "blender"):
@@ -155,9 +151,13 @@ def _read_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
     source = root / (transforms.LLFF_FILES[0] if times else "exposure.json")
     if not times and source.is_file():
         times = exposure_times(source)
-    return (
+    scene = (
         with_all_exposures(scene, times, source, cfg) if times else with_raw_settings(root, scene)
     )
+    lists = lists_beside(folder, root) if cfg.split is None and cfg.test_every else None
+    if lists is None:
+        return scene
+    return split_as_listed(scene, lists, allow_missing=cfg.allow_missing)
 
 
 def _photographs_alone(root: Path, cfg: DataConfig) -> PhotographsAlone:

@@ -41,8 +41,13 @@ def test_every_nth_view_of_each_camera_is_held_out(tmp_path):
             assign_split(tuple(views), n)
 
 
-@pytest.mark.parametrize("folder", [".", "sparse/0"])
-def test_lists_beside_a_colmap_model_are_used(model, folder):
+@pytest.mark.parametrize("model_in", ["sparse/0", "colmap/sparse/0", "dense/0/sparse"])
+@pytest.mark.parametrize("folder", [".", "MODEL"])
+def test_lists_beside_a_colmap_model_are_used(model, model_in, folder):
+    (model / "sparse").rename(model / "was")
+    (model / model_in).parent.mkdir(parents=True)
+    (model / "was" / "0").rename(model / model_in)
+    folder = model_in if folder == "MODEL" else folder
     scene = load_scene(model, CFG)
     assert (held_out(scene), scene.split_by) == (["im 0.png"], "every 8th view of each camera")
     (model / folder / "test.txt").write_text("# held out\nim 1.png\n\nim 3\n")
