@@ -16,6 +16,7 @@ from jaxtyping import Float32
 from p2gs_jax.core.text import first_few
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.exr import read_exr
+from p2gs_jax.scene.files import files_below
 from p2gs_jax.types import Scene
 
 # Display values come first: if a program also writes radiance, they alone have its tone curve.
@@ -144,7 +145,7 @@ def find_renders(folder: str | Path, scene: Scene) -> OtherRenders:
 
 def _by_name(folder: Path) -> dict[str, Path]:
     """Return the pictures, except hidden ones, by relative path with a lower-case suffix."""
-    found = (p for p in sorted(folder.rglob("*")) if p.suffix.lower() in SUFFIXES and p.is_file())
+    found = (p for p in sorted(files_below(folder)) if p.suffix.lower() in SUFFIXES and p.is_file())
     return {
         p.relative_to(folder).with_suffix(p.suffix.lower()).as_posix(): p
         for p in found

@@ -64,7 +64,7 @@ def list_images(folder: Path, *, recursive: bool = True) -> list[Path]:
     """
     if not folder.is_dir():
         return []
-    files = folder.rglob("*") if recursive else folder.iterdir()
+    files = files_below(folder) if recursive else folder.iterdir()
     found = (p for p in files if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
     relative = (p.relative_to(folder) for p in found)
     visible = [p for p in relative if not any(part.startswith(".") for part in p.parts)]
@@ -73,6 +73,19 @@ def list_images(folder: Path, *, recursive: bool = True) -> list[Path]:
     photos = {name_without_mask(p.as_posix()) for p in outside if p not in named}
     masks = {p for p in named if name_without_mask(p.as_posix()) in photos or _always_mask(p.name)}
     return [folder / p for p in sorted({*outside} - masks, key=lambda p: p.as_posix())]
+
+
+def files_below(folder: Path, above: tuple[Path, ...] = ()) -> Iterator[Path]:
+    """Yield the files in a folder and its subfolders; links are followed, but not in a circle.
+
+    `above` holds the true paths of the folders that led here.
+    """
+    above = (*above, folder.resolve())
+    _, folders, names = next(os.walk(folder), ("", (), ()))
+    yield from (folder / name for name in names)
+    for below in (folder / name for name in folders):
+        if not any(path.is_relative_to(below.resolve()) for path in above):
+            yield from files_below(below, above)
 
 
 def named_as_mask(name: str) -> bool:

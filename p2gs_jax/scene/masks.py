@@ -15,7 +15,13 @@ from PIL import Image
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.text import first_few
 from p2gs_jax.errors import UserError, broken
-from p2gs_jax.scene.files import IMAGE_SUFFIXES, MASK_FOLDERS, name_without_mask, named_as_mask
+from p2gs_jax.scene.files import (
+    IMAGE_SUFFIXES,
+    MASK_FOLDERS,
+    files_below,
+    name_without_mask,
+    named_as_mask,
+)
 from p2gs_jax.types import Scene, View
 
 RANDOM = "random"
@@ -94,7 +100,7 @@ def _places(
 def _masks_in(folder: Path) -> dict[str, Path]:
     """Return the masks in a folder by `name_without_mask`; other files are left out."""
     all_masks = _holds_masks(folder)
-    files = folder.glob("**/*" if all_masks else "*")
+    files = files_below(folder) if all_masks else folder.glob("*")
     files = (p for p in files if p.suffix.lower() in IMAGE_SUFFIXES and p.name[0] != ".")
     files = (p for p in files if all_masks or named_as_mask(p.name))
     return {name_without_mask(p.relative_to(folder).as_posix()): p for p in sorted(files)[::-1]}

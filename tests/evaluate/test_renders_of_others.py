@@ -43,8 +43,11 @@ def test_numbered_renders_are_in_the_order_of_names(tmp_path):
     (tmp_path / "other").mkdir()
     for k, name in enumerate(("r_10.png", "r_2.png", "r_30.png")):
         cv2.imwrite(str(tmp_path / "other" / f"{k:05d}.PNG"), photograph(scene, name))
-    found = check_renders(find_renders(tmp_path / "other", scene), store)
-    assert judge_renders(found, judge(scene, store))["as_rendered"]["psnr"] > 100
+    (tmp_path / "linked").mkdir()
+    (tmp_path / "linked" / "here").symlink_to(tmp_path / "other")
+    for folder in ("other", "linked"):
+        found = check_renders(find_renders(tmp_path / folder, scene), store)
+        assert judge_renders(found, judge(scene, store))["as_rendered"]["psnr"] > 100
 
 
 def test_masked_pixels_do_not_count(tmp_path):

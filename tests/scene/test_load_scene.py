@@ -310,6 +310,22 @@ def test_masks_are_found_under_names_of_other_programs(tmp_path, place):
     assert [p.name for p in list_images(tmp_path / "images")] == ["im 0.png", "im 1.png"]
 
 
+def test_links_to_folders_are_followed_but_not_in_a_circle(tmp_path):
+    for name in ("images/0.png", "disk/front/1.png", "more/2.png", "masked/1.jpg"):
+        write_image(tmp_path / name)
+    links = {"images/a": "disk", "images/b": "disk/front", "images/up": "images"}
+    links |= {"disk/on": "more", "more/back": "disk", "masks/a/front": "masked"}
+    (tmp_path / "masks" / "a").mkdir(parents=True)
+    for link, target in links.items():
+        (tmp_path / link).symlink_to(tmp_path / target)
+    paths = list_images(tmp_path / "images")
+    names = [path.relative_to(tmp_path / "images").as_posix() for path in paths]
+    assert names == ["0.png", "a/front/1.png", "a/on/2.png", "b/1.png"]
+    views = (dataclasses.replace(make_view(paths[1]), name=names[1]),)
+    found, _ = attach_masks(Scene(tmp_path, "images", views, np.zeros((0, 3)), None))
+    assert found[0].mask_path == tmp_path / "masks/a/front/1.jpg"
+
+
 def test_masks_of_several_cameras_are_not_mixed_up(tmp_path):
     views = []
     for camera in ("a", "b"):
