@@ -52,8 +52,6 @@ def load_scene(
 
         if isinstance(found, Path):
             photographs = read_video(found, cfg, work_dir, report)
-            if cfg.matching == "auto":
-                cfg = dataclasses.replace(cfg, matching="sequence")
         else:
             out = None if work_dir is None else work_dir.parent
             if out is not None and out.resolve() in {path.parent.resolve() for path in found.paths}:
@@ -61,7 +59,8 @@ def load_scene(
                 raise UserError(why, fix="name another folder with --out")
             photographs = convert_photographs(*found, work_dir, report)
         folder, paths = photographs.folder, photographs.paths
-        scene = load_images(Path(root), folder, paths, cfg, work_dir, report)
+        auto = "sequence" if isinstance(found, Path) else "auto"
+        scene = load_images(Path(root), folder, paths, cfg, work_dir, report, auto)
         scene = with_originals(scene, photographs)
     else:
         scene = found

@@ -9,13 +9,14 @@ import shutil
 import numpy as np
 import pytest
 from PIL import Image
-from scene.helpers import refused, reprojection_errors, write_image
+from scene.helpers import refused, reprojection_errors, write_image, write_tiny_model
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene import find_scene, load_scene
 from p2gs_jax.scene.files import cached_folder
 from p2gs_jax.scene.rigid import require_axes
 from p2gs_jax.scene.sfm import features
+from p2gs_jax.scene.sfm import map as sfm_map
 from p2gs_jax.scene.sfm.features import kept_features, match_kept, pairs_by_name, pairs_by_pose
 from p2gs_jax.scene.sfm.map import agreement, reasons, sentence
 
@@ -57,6 +58,21 @@ def test_photographs_that_do_not_register_or_open_are_refused(tmp_path):
     (tmp_path / "0.png").write_bytes(b"nothing")
     with refused(r"cannot decode the image .*0.png"):
         load_scene(tmp_path, CFG)
+
+
+def test_another_choice_of_pairs_maps_anew(tmp_path, monkeypatch):
+    model, built = write_tiny_model(tmp_path), []
+
+    def build(folder, *given):
+        built.append(given[-2])
+        shutil.copytree(model, folder / "model")
+        (folder / sfm_map.REASONS).write_text("{}")
+
+    monkeypatch.setattr(sfm_map, "_build", build)
+    for matching in ("auto", "auto", "sequence", "sequence", "all"):
+        cfg = dataclasses.replace(CFG, format="images", matching=matching)
+        load_scene(tmp_path, cfg, tmp_path / "run" / "work")
+    assert built == [None, [("im 0.png", "im 1.png")], None]
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from p2gs_jax.config import DataConfig
+from p2gs_jax.config import DataConfig, Matching
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.text import count_of
 from p2gs_jax.errors import UserError, broken
@@ -52,11 +52,13 @@ def load_images(
     cfg: DataConfig,
     work_dir: Path | None,
     report: files.Report,
+    auto: Matching = "auto",
 ) -> Scene:
     """Run COLMAP's structure from motion on the photographs in a folder; read the largest model.
 
     `work_dir` caches the model in `sfm/`, for the same photographs, and features and matches in
-    `features/`, also if photographs are added. Raises UserError: there are fewer than two
+    `features/`, also if photographs are added. `auto` selects the pairs if the user does not.
+    Raises UserError: there are fewer than two
     photographs, one is not an image, or none is registered.
     """
     names = [path.relative_to(image_folder).as_posix() for path in paths]
@@ -75,10 +77,13 @@ def load_images(
     }
     if cfg.camera_by != "auto":
         key["camera_by"] = cfg.camera_by
+    if cfg.matching != "auto":
+        key["matching"] = cfg.matching
+    pairs = features.pairs_by_name(names, auto if cfg.matching == "auto" else cfg.matching)
 
     def build(folder: Path) -> None:
         kept = (folder if work_dir is None else work_dir) / FEATURES
-        _build(folder, kept, image_folder, groups, cfg, report)
+        _build(folder, kept, image_folder, groups, pairs, report)
 
     with files.cached_folder(work_dir, "sfm", key, build) as folder:
         images = str(image_folder.resolve())
@@ -100,7 +105,7 @@ def _build(
     kept: Path,
     image_folder: Path,
     groups: Mapping[tuple, Sequence[str]],
-    cfg: DataConfig,
+    pairs: Sequence[features.Pair] | None,
     report: files.Report,
 ) -> None:
     """Write the largest model to a folder, and the reasons why photographs are not in it.
@@ -110,7 +115,7 @@ def _build(
     quiet_colmap()
     names = [name for group in groups.values() for name in group]
     database = features.kept_features(kept, image_folder, groups, report)
-    features.match_kept(database, names, features.pairs_by_name(names, cfg.matching), report)
+    features.match_kept(database, names, pairs, report)
     models_folder = folder / "models"
     models_folder.mkdir()
     registered, progress = 2, files.stage_progress(report, "mapping", len(names), "images")
