@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import sys
 import threading
 from collections.abc import Iterator, Sequence
@@ -29,6 +30,8 @@ _ROWS = 256  # rows of a photograph that are converted at once
 BYTES_PER_PIXEL, SHARE = 40, 0.5
 # The largest relative difference between the aspect ratios of a mask and its photograph.
 _ASPECT_TOLERANCE = 0.01
+# The header of a PGM or PPM: its kind, width, height and largest value.
+_PNM = re.compile(rb"P([2356])" + rb"(?:\s|#.*\n)+(\d+)" * 3)
 
 
 @dataclass(frozen=True)
@@ -226,7 +229,18 @@ def _read_raster(path: Path, *, colours: bool = False) -> np.ndarray:
         raw = cv2.imdecode(np.frombuffer(data, np.uint8), as_stored)
     if raw is None or not _complete(path, data):
         raise undecodable(path)
+    if header := _PNM.match(data):
+        raw = _full_range(raw, int(header[1]), int(header[4]))
     return with_profile_applied(data, raw) if colours else raw
+
+
+def _full_range(raw: UInt[np.ndarray, "..."], kind: int, white: int) -> UInt[np.ndarray, "..."]:
+    """Return the pixels of a PGM or PPM with the largest integer instead of `white`."""
+    most = np.iinfo(raw.dtype).max
+    # OpenCV does this for 8 bits written as text.
+    if white in (0, most) or (kind <= 3 and most == 255):
+        return raw
+    return np.rint(np.minimum(raw, white) * (most / white)).astype(raw.dtype)
 
 
 def _complete(path: Path, data: bytes) -> bool:

@@ -46,6 +46,17 @@ def test_rgb_order_exact_values_grey_and_alpha(tmp_path, dtype, channels):
     assert np.array_equal(mask, opaque)
 
 
+@pytest.mark.parametrize("white", [1, 100, 255, 1023, 65535])
+@pytest.mark.parametrize("kind", ["P2", "P3", "P5", "P6"])
+def test_the_header_of_a_pgm_or_ppm_states_white(tmp_path, kind, white):
+    values = np.array([white // 3, 0, white][: 3 if kind in ("P3", "P6") else 1])
+    stored = values.astype(">u2" if white > 255 else "u1").tobytes()
+    content = stored if kind > "P3" else " ".join(map(str, values)).encode() + b"\n"
+    (tmp_path / "a.ppm").write_bytes(f"{kind} 1 # wide\n1\n{white}\n".encode() + content)
+    ldr, _ = store_of(make_view(tmp_path / "a.ppm", size=(1, 1))).get(0)
+    np.testing.assert_allclose(ldr[0, 0] - values / white, 0, atol=1 / 255 if white < 256 else 1e-4)
+
+
 def test_sizes_and_intrinsics(tmp_path):
     view = make_view(tmp_path / "a.png", size=(1000, 751))
     assert size_at(view, None) == size_at(view, 2000) == (1000, 751)
