@@ -142,7 +142,7 @@ def has_alpha(path: Path) -> bool:
         return False
     try:
         with Image.open(path) as image:
-            return image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
+            return image.mode in ("RGBA", "LA", "La", "PA") or "transparency" in image.info
     except Exception:  # PIL's error types are not a closed set; decoding reports the error
         return False
 

@@ -20,6 +20,7 @@ from p2gs_jax.errors import broken
 from p2gs_jax.scene.convert.icc import with_profile_applied
 from p2gs_jax.scene.files import image_size, undecodable
 from p2gs_jax.scene.lens import undistortion_maps
+from p2gs_jax.scene.masks import has_alpha
 from p2gs_jax.types import View
 
 _FULL = 0.999  # a resampled pixel is valid only if all pixels that it mixes are valid
@@ -30,6 +31,8 @@ _ROWS = 256  # rows of a photograph that are converted at once
 BYTES_PER_PIXEL, SHARE = 40, 0.5
 # The largest relative difference between the aspect ratios of a mask and its photograph.
 _ASPECT_TOLERANCE = 0.01
+# TIFF's tag for the meaning of the fourth channel; its colours are multiplied by associated alpha.
+_EXTRA_SAMPLES, _ASSOCIATED = 338, (1,)
 # The header of a PGM or PPM: its kind, width, height and largest value.
 _PNM = re.compile(rb"P([2356])" + rb"(?:\s|#.*\n)+(\d+)" * 3)
 
@@ -231,6 +234,9 @@ def _read_raster(path: Path, *, colours: bool = False) -> np.ndarray:
         raise undecodable(path)
     if header := _PNM.match(data):
         raw = _full_range(raw, int(header[1]), int(header[4]))
+    of_tiff = data[:2] in (b"II", b"MM") and raw.ndim == 3 and raw.shape[2] == 4
+    if of_tiff or (raw.ndim == 2 and has_alpha(path)):
+        raw = _with_alpha(path, raw)
     return with_profile_applied(data, raw) if colours else raw
 
 
@@ -241,6 +247,34 @@ def _full_range(raw: UInt[np.ndarray, "..."], kind: int, white: int) -> UInt[np.
     if white in (0, most) or (kind <= 3 and most == 255):
         return raw
     return np.rint(np.minimum(raw, white) * (most / white)).astype(raw.dtype)
+
+
+def _with_alpha(path: Path, raw: UInt[np.ndarray, "..."]) -> UInt[np.ndarray, "h w c"]:
+    """Return the pixels of a grey image or a TIFF with its alpha, by which they are not multiplied.
+
+    OpenCV drops the alpha of grey images, multiplies TIFF of 8 bits by theirs, and returns any
+    fourth channel of a TIFF. Raises UserError: Pillow cannot read the alpha.
+    """
+    if not has_alpha(path):
+        return raw[..., :3]
+    try:
+        most = np.iinfo(raw.dtype).max
+        with Image.open(path) as image:
+            clear = image.info.get("transparency")
+            if clear is not None:  # the grey value of transparent pixels
+                return np.dstack([raw, np.where(raw == clear, 0, most).astype(raw.dtype)])
+            if raw.dtype == np.uint8:
+                pixels = np.asarray(image.convert("LA" if image.mode in ("LA", "La") else "RGBA"))
+                if pixels.shape[:2] != raw.shape[:2]:  # Pillow does not turn every TIFF
+                    raise ValueError(pixels.shape)
+                return pixels if pixels.shape[2] == 2 else cv2.cvtColor(pixels, cv2.COLOR_RGBA2BGRA)
+            multiplied = image.tag_v2.get(_EXTRA_SAMPLES) == _ASSOCIATED
+    except (AttributeError, OSError, ValueError):
+        raise undecodable(path) from None
+    if multiplied:
+        colours = raw[..., :3] / np.maximum(raw[..., 3:], 1) * most
+        raw = np.dstack([np.minimum(np.rint(colours), most).astype(raw.dtype), raw[..., 3]])
+    return raw
 
 
 def _complete(path: Path, data: bytes) -> bool:

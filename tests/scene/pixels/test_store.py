@@ -5,6 +5,7 @@ import dataclasses
 import errno
 import os
 import shutil
+import struct
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
@@ -13,11 +14,13 @@ from unittest.mock import Mock
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 from scene.helpers import make_view, refused
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene import ImageStore, size_at
 from p2gs_jax.scene.lens import undistort_points
+from p2gs_jax.scene.masks import has_alpha
 from p2gs_jax.scene.pixels import cache, decode
 from p2gs_jax.scene.pixels import store as store_module
 from p2gs_jax.scene.pixels.store import decoded_into
@@ -44,6 +47,44 @@ def test_rgb_order_exact_values_grey_and_alpha(tmp_path, dtype, channels):
     assert np.array_equal(ldr, colours.astype(np.float32) / top)
     opaque = raw[..., 3] >= top / 2 if channels == (4,) else np.ones((48, 64))
     assert np.array_equal(mask, opaque)
+
+
+def tiff(pixels, meaning):
+    """Return a TIFF whose fourth channel has this meaning: 1 is associated alpha, 2 straight."""
+    height, width = pixels.shape[:2]
+    tags = {256: width, 257: height, 258: 134, 259: 1, 262: 2, 273: 142, 277: 4, 278: height}
+    tags |= {279: pixels.nbytes, 338: meaning}
+    rows = (struct.pack("<HHII", t, 3, 4 if t == 258 else 1, v) for t, v in tags.items())
+    head = struct.pack("<4sIH", b"II*\0", 8, len(tags)) + b"".join(rows) + bytes(4)
+    return head + struct.pack("<4H", *[8 * pixels.itemsize] * 4) + pixels.tobytes()
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_colours_of_a_tiff_are_not_multiplied_by_its_alpha(tmp_path, dtype):
+    most, path = np.iinfo(dtype).max, tmp_path / "a.tif"
+    straight = (np.array([200, 100, 50, 128]) / 255 * most).astype(dtype)
+    associated = np.append(straight[:3] * (straight[3] / most), straight[3]).astype(dtype)
+    for pixel, meaning in ((straight, 2), (associated, 1), (straight, 0)):
+        path.write_bytes(tiff(np.tile(pixel, (30, 40, 1)), meaning))
+        pixels, _, alpha = decode.stored(make_view(path, size=(40, 30)))
+        np.testing.assert_allclose(pixels[0, 0] / most, [200 / 255, 100 / 255, 50 / 255], atol=0.01)
+        assert (None if alpha is None else alpha[0, 0]) == (straight[3] if meaning else None)
+        assert has_alpha(path) == (alpha is not None)
+
+
+@pytest.mark.parametrize(
+    ("name", "mode"), [("a.png", "L"), ("a.png", "I;16"), ("a.png", "1"), ("a.tif", "LA")]
+)
+def test_alpha_of_grey_photographs_is_read(tmp_path, name, mode):
+    image = Image.fromarray(np.tile(np.uint8([[0, 255]]), (4, 4)))
+    image = image.convert(mode)
+    if mode == "LA":
+        image.putalpha(image.getchannel("L"))
+    image.save(tmp_path / name, transparency=0)
+    assert has_alpha(tmp_path / name)
+    _, valid, alpha = decode.stored(make_view(tmp_path / name, size=(8, 4)))
+    assert np.array_equal(valid, np.tile([[False, True]], (4, 4)))
+    assert alpha is not None
 
 
 @pytest.mark.parametrize("white", [1, 100, 255, 1023, 65535])
