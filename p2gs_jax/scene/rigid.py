@@ -79,6 +79,24 @@ def rigid(rotation: Rotation3, position: Vector3, source: Path, what: str) -> Po
     return pose_of(nearest, position)
 
 
+def require_last_row(matrix: Pose, source: Path, what: str) -> None:
+    """Raise UserError if the last row of a finite pose is not 0 0 0 1: it may be transposed."""
+    last = [0, 0, 0, 1]
+    if not np.allclose(matrix[3], last, atol=0.01):
+        fix = "write 0 0 0 1 there"
+        if np.allclose(matrix[:, 3], last, atol=0.01):
+            fix = "transpose the matrices"
+        row = " ".join(f"{value:g}" for value in matrix[3])
+        raise broken(f"{source}:", f"the last row of {what} is {row}, not 0 0 0 1", fix)
+
+
+def rigid_matrix(matrix: Pose, source: Path, what: str) -> Pose:
+    """Return a 4x4 matrix with the nearest exact rotation; errors as in `rigid`."""
+    pose = rigid(matrix[:3, :3], matrix[:3, 3], source, what)
+    require_last_row(matrix, source, f"the pose of {what}")
+    return pose
+
+
 def from_quaternions(
     wxyz: Float[np.ndarray, "n 4"], positions: Float[np.ndarray, "n 3"], source: Path, what: str
 ) -> Poses:

@@ -35,7 +35,13 @@ from p2gs_jax.scene.colmap import CUT, IMAGE_FOLDERS
 from p2gs_jax.scene.files import HUGE, at_file_size, require_inside
 from p2gs_jax.scene.hdr_sets import by_pose, exposure_times, with_times
 from p2gs_jax.scene.lens import intrinsics, make_distortion
-from p2gs_jax.scene.rigid import nearest_rotation, off_origin, pose_of, require_axes
+from p2gs_jax.scene.rigid import (
+    nearest_rotation,
+    off_origin,
+    pose_of,
+    require_axes,
+    require_last_row,
+)
 from p2gs_jax.scene.seeds import read_points
 from p2gs_jax.scene.split import lists_in, split_as_listed
 from p2gs_jax.scene.visibility import share_in_view
@@ -364,12 +370,14 @@ def _view(frame: _Frame, folder: Path, name: str) -> tuple[View, bool]:
         raise broken(f"{path}:", f"the mask {mask_path} of {name} does not exist", FIX)
     matrix_name = f"the transform_matrix of {name}"
     try:
-        c2w = np.array(values.get("transform_matrix"), np.float64)[:3]
-    except (TypeError, ValueError, IndexError):
+        c2w = np.array(values.get("transform_matrix"), np.float64)
+    except (TypeError, ValueError):
         c2w = np.zeros(0)
-    if c2w.shape != (3, 4) or not (np.abs(c2w) < HUGE).all():
+    if c2w.shape not in ((3, 4), (4, 4)) or not (np.abs(c2w) < HUGE).all():
         raise broken(f"{path}:", f"{matrix_name} is not a finite 4x4 matrix", FIX)
-    viewmat = _viewmat(c2w * _OPENGL_SIGNS, path, matrix_name, FIX)
+    if len(c2w) == 4:
+        require_last_row(c2w, path, matrix_name)
+    viewmat = _viewmat(c2w[:3] * _OPENGL_SIGNS, path, matrix_name, FIX)
     # Photographs with the same size and lens come from one camera.
     camera = f"{values.get('w')} {values.get('h')} {np.round(K, 3).tolist()} {distortion}"
     view = View(name, image_path, camera, viewmat, K, width, height, distortion, mask_path)

@@ -66,6 +66,7 @@ def test_frames_override_cameras_follow_folders_and_other_sizes_are_rescaled(tmp
 
 
 SINGULAR = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]]
+ACROSS = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [1, 2, 3, 1]]
 NAN = (np.eye(4) * np.nan).tolist()
 POSE = "transform_matrix of a.png"
 
@@ -79,6 +80,7 @@ POSE = "transform_matrix of a.png"
         ({"frames": [{"file_path": "images/a.png"}]}, POSE),
         ({"frames": frames("images/a.png", transform_matrix=NAN)}, f"{POSE} is not a finite"),
         ({"frames": frames("images/a.png", transform_matrix=SINGULAR)}, "not a rotation and a tr"),
+        ({"frames": frames("images/a.png", transform_matrix=ACROSS)}, "is 1 2 3 1.*\n.*transpose"),
         ({"frames": frames("images/a.png", "./images/a.png")}, "a.png more than once"),
         ({"frames": frames("images/a.png", mask_path="m.png")}, "mask .*m.png of a.png"),
         ({"fl_x": 1e300}, "fl_x of a.png is 1e[+]300, not a number"),

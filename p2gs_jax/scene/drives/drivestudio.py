@@ -33,7 +33,7 @@ from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sw
 from p2gs_jax.scene.drives.waymo import CAMERAS, OPENCV, TURN_S, TURN_START
 from p2gs_jax.scene.files import image_size, read_json
 from p2gs_jax.scene.lens import intrinsics, make_distortion
-from p2gs_jax.scene.rigid import Pose, inverse, rigid
+from p2gs_jax.scene.rigid import Pose, inverse, rigid_matrix
 from p2gs_jax.types import TrackedObject
 
 MARKER = "ego_pose/*.txt"
@@ -83,8 +83,7 @@ def _numbers(path: Path, count: int) -> np.ndarray:
 
 
 def _pose(path: Path) -> Pose:
-    matrix = _numbers(path, 16).reshape(4, 4)
-    return rigid(matrix[:3, :3], matrix[:3, 3], path, "this file")
+    return rigid_matrix(_numbers(path, 16).reshape(4, 4), path, "this file")
 
 
 def _mount(path: Path) -> Pose:
@@ -124,7 +123,7 @@ def _objects(path: Path, cars: dict[int, Pose]) -> tuple[tuple[TrackedObject, ..
             rows = zip(kept["frame_idx"], kept["obj_to_world"], kept["box_size"], strict=True)
             for frame, matrix, size in rows:
                 pose = np.array(matrix, np.float64).reshape(4, 4)
-                pose = rigid(pose[:3, :3], pose[:3, 3], path, f"the box of {thing['id']}")
+                pose = rigid_matrix(pose, path, f"the box of {thing['id']}")
                 size = tables.box_size(size, path)
                 if frame not in cars:
                     lost += 1

@@ -41,7 +41,7 @@ from p2gs_jax.scene.drives.objects import Box, tracks
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
 from p2gs_jax.scene.drives.tables import ParquetTable, chosen_drive, counted
 from p2gs_jax.scene.lens import intrinsics, make_distortion
-from p2gs_jax.scene.rigid import LONGEST_BEYOND_S, Pose, pose_of, rigid
+from p2gs_jax.scene.rigid import LONGEST_BEYOND_S, Pose, pose_of, rigid_matrix
 from p2gs_jax.types import TrackedObject
 
 MARKER = "camera_image/*.parquet"
@@ -137,7 +137,7 @@ def _transform(values: Any, path: Path, what: str) -> Pose:
     matrix = np.full((4, 4), np.nan)
     if values is not None and len(values) == matrix.size:
         matrix = np.array(values, np.float64).reshape(4, 4)
-    return rigid(matrix[:3, :3], matrix[:3, 3], path, what)
+    return rigid_matrix(matrix, path, what)
 
 
 def _cameras(table: ParquetTable) -> tuple[list[RigCamera], dict[str, Pose]]:

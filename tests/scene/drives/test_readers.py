@@ -157,6 +157,8 @@ BENT = {**NO_HEADING, "heading": dict.fromkeys("wxyz", 1)}
 OXTS, SHOTS = (f"{kitti.DRIVE}/{part}" for part in ("oxts/data/0000000000.txt", "image_03"))
 TRACKLETS = kitti.BOXES
 
+ACROSS = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 1, 2, 3, 1]  # a transposed matrix
+LAID = drivestudio.instance("a", [np.reshape(ACROSS, (4, 4))])
 FLAT = drivestudio.instance("a", [np.eye(4)])
 FLAT["frame_annotations"]["box_size"] = [[1, 0, 1]]
 
@@ -194,6 +196,7 @@ REFUSED = {
     ],
     "waymo": [
         (LENSES, every(**{MOUNT: [2.0] * 16}), "the pose of FRONT is not a rotation"),
+        (LENSES, every(**{MOUNT: ACROSS}), "last row of the pose of FRONT is 1 2 3 1, not 0 0 0 1"),
         (LENSES, first(**{FOCAL: 0.0}), "the lens of FRONT"),
         (LENSES, every(**{FOCAL: "50"}), "does not hold numbers"),
         (LENSES, every(**{"key.camera_name": 8}), "has no camera SIDE_RIGHT"),
@@ -212,11 +215,13 @@ REFUSED = {
     ],
     "drivestudio": [
         ("ego_pose/000.txt", given("1 2 3"), "should be 16 finite"),
+        ("ego_pose/000.txt", given(" ".join(map(str, ACROSS))), "this file is 1 2 3 1, not 0 0 0"),
         ("extrinsics/0.txt", given(drivestudio.text(np.diag([1, 1, 2, 1]))), "not a rotation"),
         ("extrinsics/0.txt", given(drivestudio.text(mounted(0.0))), "an upright camera of Waymo"),
         ("intrinsics/0.txt", given("0 1 2 3 4 5 6 7 8"), "two focal lengths"),
         (drivestudio.BOXES, lambda held: [], "is not a table of boxes"),
         (drivestudio.BOXES, lambda held: {"0": {"id": "a"}}, "is not a table of boxes"),
+        (drivestudio.BOXES, lambda held: {"0": LAID}, "of the box of a is 1 2 3 1, not 0 0 0 1"),
         (drivestudio.BOXES, lambda held: {"0": FLAT}, "side of 0"),
     ],
     "kitti_tracking": [
