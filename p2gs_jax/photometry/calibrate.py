@@ -20,7 +20,7 @@ from jaxtyping import Bool
 
 from p2gs_jax.config import FitConfig, PhotometryConfig
 from p2gs_jax.core.streams import Stream, generator
-from p2gs_jax.core.text import count_of
+from p2gs_jax.core.text import count_of, first_few
 from p2gs_jax.photometry.adjustment.errors import SHARED_REGION, regions
 from p2gs_jax.photometry.adjustment.fit import fit_model
 from p2gs_jax.photometry.adjustment.problem import KnownExposures, Problem, make_problem
@@ -30,7 +30,7 @@ from p2gs_jax.photometry.models import MODELS, Curve, Form
 from p2gs_jax.photometry.observations import COARSEST, Observations
 from p2gs_jax.photometry.response import BASES, Response
 from p2gs_jax.photometry.solution import PhotometricSolution
-from p2gs_jax.scene.exposures import read_known_exposures
+from p2gs_jax.scene.exposures import read_known_exposures, without_view
 from p2gs_jax.types import Scene
 
 # Points of each view to which a curve is fitted if the options give its kind.
@@ -87,7 +87,8 @@ def options_of(cfg: FitConfig, scene: Scene) -> CalibrationOptions:
     known = None
     if p.known is not None:
         values = read_known_exposures(p.known, scene.training_views, scene.views)
-        known = KnownExposures(values, p.known_deviation_ev)
+        unused = without_view(p.known, scene.views)
+        known = KnownExposures(values, p.known_deviation_ev, unused)
     return CalibrationOptions(
         black=cfg.loss.black,
         saturation=cfg.loss.saturation,
@@ -125,14 +126,16 @@ def calibrate_observations(
         selection = _by_one_response(options.problem(observations))
     else:
         selection = _fixed(observations, options, *options.choice)
-    coarse = observations.too_coarse
-    if not coarse:
-        return selection
-    note = (
-        f"{coarse} of {coarse + len(observations.points)} observations were left out: their pixels "
-        f"are more than {COARSEST:g} times as wide on the surface as those of the closest view."
-    )
-    return dataclasses.replace(selection, reasons=(note, *selection.reasons))
+    coarse, notes = observations.too_coarse, []
+    if coarse:
+        notes.append(
+            f"{coarse} of {coarse + len(observations.points)} observations were left out: their "
+            f"pixels are more than {COARSEST:g} times as wide on the surface as those of the "
+            "closest view."
+        )
+    if options.known is not None and (unused := options.known.unused):
+        notes.append(f"{len(unused)} known exposures belong to no view: {first_few(unused)}.")
+    return dataclasses.replace(selection, reasons=(*notes, *selection.reasons))
 
 
 def _fixed(

@@ -44,6 +44,13 @@ def read_known_exposures(
     return values
 
 
+def without_view(source: str, views: Sequence[View]) -> tuple[str, ...]:
+    """Return the names in the CSV file `source` that mean no view; none for `exif`."""
+    row_of = row_finder(views, source)
+    names = () if source == "exif" else _read(Path(source))
+    return tuple(name for name in names if row_of(name) is None)
+
+
 def _by_view(table: dict[str, float], views: Sequence[View], source: str) -> dict[str, float]:
     """Return the values in a table of any names by the full names of their views."""
     row_of, out = row_finder(views, source), dict[str, float]()

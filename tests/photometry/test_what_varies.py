@@ -165,8 +165,9 @@ def test_known_exposures_that_differ_tell_the_power_of_the_curve(known, cameras)
 
 def test_known_exposures_that_are_alike_fix_the_scale_only():
     truth = make_exposures(SHORT, "constant")
-    o, known = observe(SHORT, truth), KnownExposures(np.full(len(truth), 0.5))
-    s = select(o, known=known)
+    o, values = observe(SHORT, truth), np.full(len(truth), 0.5)
+    s = select(o, known=KnownExposures(values, unused=("z.png",)))
+    assert s.reasons[0] == "1 known exposures belong to no view: z.png."
     note = f"Known exposures ({len(truth)} views) fix the scale. Two different ones would"
     assert any(r.startswith(note) for r in s.reasons)
     assert s.solution.model == "constant"

@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 from scene.helpers import make_view, refused
 
+from p2gs_jax.config import FitConfig, PhotometryConfig
+from p2gs_jax.photometry.calibrate import options_of
 from p2gs_jax.scene.exposures import check_source, read_known_exposures
+from p2gs_jax.types import Scene
 
 
 def views(*names, exif=None):
@@ -53,6 +56,18 @@ def test_names_match_whole_or_by_their_end_and_never_several_views(tmp_path):
     # A whole name is not the end of another.
     both = views("a.png", "cam0/a.png")
     np.testing.assert_allclose(read_known_exposures(str(path), both) / np.log(2), [1, np.nan])
+
+
+def test_rows_that_name_no_view_are_counted(tmp_path):
+    path = tmp_path / "e.csv"
+    path.write_text("image,ev\nfront/a.png,1\nb,2\nc.png,3\n")
+    held_out = dataclasses.replace(views("b.png")[0], split="test")
+    points = np.zeros((0, 3), np.float32)
+    scene = Scene(tmp_path, "images", (*views("front/a.png"), held_out), points, None)
+    cfg = FitConfig(photometry=PhotometryConfig(known=str(path)))
+    known = options_of(cfg, scene).known
+    assert known is not None
+    assert known.unused == ("c.png",)
 
 
 def test_exposures_of_exif_are_read():

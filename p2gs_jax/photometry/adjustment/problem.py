@@ -23,6 +23,7 @@ class KnownExposures:
 
     log_exposures: Float[np.ndarray, " v"]  # natural logarithm; NaN where unknown
     deviation_ev: float = 0.0  # standard deviation, stops; 0 fixes the values
+    unused: tuple[str, ...] = ()  # names in the source that mean no view
 
 
 class Layout:
