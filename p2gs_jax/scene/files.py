@@ -242,7 +242,9 @@ def decode_grey(data: bytes, shrink: int) -> UInt8[np.ndarray, "h w"] | None:
     """
     flags = {2: cv2.IMREAD_REDUCED_GRAYSCALE_2, 4: cv2.IMREAD_REDUCED_GRAYSCALE_4}
     flag = flags.get(2 ** min(int(np.log2(max(shrink, 1))), 2), cv2.IMREAD_GRAYSCALE)
-    return cv2.imdecode(np.frombuffer(data, np.uint8), flag | cv2.IMREAD_IGNORE_ORIENTATION)
+    with contextlib.suppress(cv2.error):  # OpenCV raises it for an empty file
+        return cv2.imdecode(np.frombuffer(data, np.uint8), flag | cv2.IMREAD_IGNORE_ORIENTATION)
+    return None
 
 
 def is_panorama(path: Path) -> bool:

@@ -108,8 +108,9 @@ def _cached_mask(
         poses = np.array([p.pose for p in shots]).reshape(-1, 4, 4)
         mask = find_ego_mask(camera, pictures, poses, up)
         if mask is not None:
+            _, data = cv2.imencode(".png", mask.astype(np.uint8) * 255)
             with atomic_write(folder / "car.png") as temporary:
-                cv2.imwrite(str(temporary), mask.astype(np.uint8) * 255)
+                temporary.write_bytes(data.tobytes())
 
     stamps = [(p.path.name, p.frame, 0 if p.embedded else p.path.stat().st_mtime_ns) for p in shots]
     places = [np.round(p.pose, 6).tolist() for p in shots]

@@ -1,9 +1,15 @@
 """The ego mask covers the car in pictures of a passing road, and nothing else."""
 
 import dataclasses
+import errno
+import os
+from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
+import pytest
+from scene.helpers import refused
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.run.scene_file import read_scene, write_scene
@@ -121,6 +127,22 @@ def test_drives_mask_the_car_and_runs_keep_the_mask(tmp_path, monkeypatch):
     assert assemble(recording, DataConfig(frames="0:4"), tmp_path / "work").notes == scene.notes
     without = assemble(recording, DataConfig(ego_mask=False))
     assert all(view.ego_mask is None for view in without.views)
+
+
+def test_an_empty_photograph_and_a_disk_without_room_are_named(tmp_path, monkeypatch):
+    path = tmp_path / "0.png"
+    path.touch()
+    shot = Photograph("front", 0, 0.0, path, np.eye(4))
+    drive = Recording(tmp_path, "pandaset", (CAMERA,), (shot,))
+    with refused("cannot decode the image", "0.png (0 bytes)"):
+        ego_mask.find_ego_masks(drive, ["front"], None, print)
+    cv2.imwrite(str(path), np.zeros((H, W), np.uint8))
+    monkeypatch.setattr(ego_mask, "find_ego_mask", lambda *_: np.zeros((2, 2), bool))
+    full = Mock(side_effect=OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
+    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr(cv2, "imwrite", lambda *_: False)
+    with pytest.raises(OSError, match=r"No space .*car\.png"):
+        ego_mask.find_ego_masks(drive, ["front"], None, print)
 
 
 def test_a_cached_mask_is_not_used_for_another_lens(tmp_path, monkeypatch):
