@@ -34,14 +34,11 @@ LEAST_OPACITY = 0.5 / 255
 def read_sog(path: Path) -> Gaussians:
     """Read Gaussians with display colours, in the order of the file.
 
-    OSError: the file or a texture cannot be read. ValueError: the file is not a ZIP, has another
-    version, or its parts disagree. KeyError: a texture or a field of `meta.json` is missing.
+    ValueError: the file has another version, or its parts disagree. A damaged file raises many
+    kinds of errors.
     """
-    try:
-        with zipfile.ZipFile(path) as file:
-            return _read(file)
-    except (zipfile.BadZipFile, TypeError, IndexError, AttributeError) as error:
-        raise ValueError(str(error)) from error
+    with zipfile.ZipFile(path) as file:
+        return _read(file)
 
 
 def _read(file: zipfile.ZipFile) -> Gaussians:

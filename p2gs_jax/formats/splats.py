@@ -40,6 +40,8 @@ def read_splats(path: Path) -> Gaussians:
         found = read(path)
         degree_of(found.sh.shape[1])
         return found
-    except (OSError, ValueError, KeyError) as error:
-        why = str(error).strip("'\"").rstrip(".")
+    except UserError:
+        raise
+    except Exception as error:  # a damaged file raises many kinds of errors
+        why = (str(error) or type(error).__name__).strip("'\"").rstrip(".")
         raise UserError(f"{path} is not readable as splats: {why}.", fix=AGAIN) from error

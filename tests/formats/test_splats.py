@@ -263,9 +263,27 @@ def test_sog_is_read_as_its_specification_says(tmp_path):
     entries = (np.arange(8 * 3) + first) % 256
     np.testing.assert_allclose(g.sh[:, 1:], entries.reshape(3, 8, 3) / 64 - 2)
     sog(tmp_path / "old.sog", quats, version=1)
-    (tmp_path / "torn.sog").write_bytes((tmp_path / "a.sog").read_bytes()[:900])
-    for name in ("old", "torn"):
-        with pytest.raises(UserError, match=r"(its version is 1|zip)"):
+    whole = (tmp_path / "a.sog").read_bytes()
+    (tmp_path / "torn.sog").write_bytes(whole[:900])
+    with zipfile.ZipFile(tmp_path / "bad.sog", "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr("meta.json", "{}" * 99)
+    packed = bytearray((tmp_path / "bad.sog").read_bytes())
+    packed[39:42] = b"\xff" * 3  # where the compressed data begin
+    (tmp_path / "bad.sog").write_bytes(packed)
+    # Bytes of the last entry of the directory: its flags (1: encrypted), and its method.
+    entry = whole.rindex(b"PK\1\2")
+    for name, at, value in (("locked", 8, 1), ("method", 10, 99)):
+        changed = bytearray(whole)
+        changed[entry + at] = value
+        (tmp_path / f"{name}.sog").write_bytes(changed)
+    for name, why in (
+        ("old", "its version is 1"),
+        ("torn", "zip"),
+        ("bad", "decompressing"),
+        ("locked", "encrypted"),
+        ("method", "not supported"),
+    ):
+        with pytest.raises(UserError, match=why):
             read_splats(tmp_path / f"{name}.sog")
 
 
