@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import glob
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +14,8 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.radiance import Truth
 from p2gs_jax.formats.exr import read_exr
+from p2gs_jax.scene.convert.readers import CONVERTED_SUFFIXES
+from p2gs_jax.scene.files import IMAGE_SUFFIXES, image_size
 from p2gs_jax.scene.hdr_sets import true_radiance
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 from p2gs_jax.types import Scene
@@ -35,16 +38,28 @@ def load_reference(folder: str | Path, scene: Scene, cfg: FitConfig) -> Referenc
     """Return a function from a view's row to its photograph under the common exposure, or None.
 
     Raises:
-        UserError: the folder does not exist or holds no photograph of any view.
+        UserError: the folder does not exist or holds no photograph of any view, or a file there
+            has another size than the view or is of a kind that is read only in scenes.
     """
     folder = Path(folder)
     check_reference(folder)
     rows = {}
     for row, view in enumerate(scene.views):
-        named = [folder / view.name, *sorted(folder.glob(str(Path(view.name).with_suffix(".*"))))]
-        found = next((p for p in named if p.is_file()), None)
-        if found is not None:
-            rows[row] = dataclasses.replace(view, image_path=found, mask_path=None)
+        alike = glob.escape(Path(view.name).with_suffix("").as_posix()) + ".*"
+        named = [folder / view.name, *sorted(folder.glob(alike))]
+        named = [p for p in named if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file()]
+        found = min(named, key=lambda p: p.suffix.lower() in CONVERTED_SUFFIXES, default=None)
+        if found is None:
+            continue
+        if found.suffix.lower() in CONVERTED_SUFFIXES:
+            why = f"--reference: {found} is neither PNG nor JPEG nor TIFF."
+            raise UserError(why, fix="give --reference copies as PNG, with 8 or 16 bits")
+        (width, height), size = image_size(found), (view.width, view.height)
+        if (width, height) != size:
+            why = f"--reference: {found} has {width}x{height} pixels, but the photograph of the "
+            why += f"scene {size[0]}x{size[1]}."
+            raise UserError(why, fix="give --reference photographs at the size of the scene's")
+        rows[row] = dataclasses.replace(view, image_path=found, mask_path=None)
     if not rows:
         why = f"{folder} holds no photograph with the name of a view (for example "
         why += f"{scene.views[0].name})."

@@ -13,6 +13,7 @@ A name is the view's name, or any end of the path of its photograph, with or wit
 from __future__ import annotations
 
 import dataclasses
+import glob
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
@@ -230,4 +231,6 @@ def _lines(path: Path) -> tuple[str, ...]:
 def _exists_without_pose(name: str, views: Sequence[View]) -> bool:
     """Return whether a photograph without a pose exists under this name."""
     path = image_folder_of(views[0]) / plain_name(name)
-    return path.is_file() or (path.parent.is_dir() and any(path.parent.glob(f"{path.name}.*")))
+    return path.is_file() or (
+        path.parent.is_dir() and any(path.parent.glob(glob.escape(path.name) + ".*"))
+    )

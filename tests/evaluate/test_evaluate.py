@@ -16,8 +16,10 @@ from p2gs_jax.cli.tables import print_metrics
 from p2gs_jax.config import FitConfig, LossConfig
 from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.core.threads import MOST_WORKERS, map_in_order
+from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.evaluate import evaluate
 from p2gs_jax.evaluation.lpips import lpips
+from p2gs_jax.evaluation.references import load_reference
 from p2gs_jax.evaluation.scores import notes_on_missing, psnr, tells_exposure
 from p2gs_jax.run.read import load_run
 from p2gs_jax.scene.pixels.store import ImageStore
@@ -93,6 +95,23 @@ def test_radiance_and_references_are_compared_in_a_second_pass(scene):
     for part in (found["radiance"], found["reference"]["scale_aligned"]):
         assert len(part["per_view"]) == 3
         assert {"train", "test"} <= set(part)
+
+
+def test_references_of_another_size_or_kind_are_refused_before_a_fit(tmp_path):
+    (tmp_path / "scene").mkdir()
+    scene = noise_scene(tmp_path / "scene", ("[0].png", "1.png"), ("2.png",))
+    picture = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
+    # A JPEG may stand for a PNG, also if its name holds characters of patterns.
+    cv2.imwrite(str(tmp_path / "[0].jpg"), picture)
+    reference = load_reference(tmp_path, scene, FitConfig())
+    assert reference(1) is None
+    np.testing.assert_allclose(reference(0), 90 / 255, atol=0.01)
+    (tmp_path / "1.exr").touch()
+    with pytest.raises(UserError, match=r"--reference: .*1\.exr is neither PNG"):
+        load_reference(tmp_path, scene, FitConfig())
+    cv2.imwrite(str(tmp_path / "1.png"), picture[:20])
+    with pytest.raises(UserError, match=r"--reference: .*1\.png has 40x20 pixels, but .* 40x34"):
+        load_reference(tmp_path, scene, FitConfig())
 
 
 SIZE = (20, 30)

@@ -101,11 +101,11 @@ def test_broken_lists_are_refused(model, text, message):
 
 
 def test_photographs_that_colmap_did_not_register_are_only_noted(model):
-    write_rgba(model / "images" / "lost.png")
-    (model / "test.txt").write_text("im 1.png\nlost.png\n")
+    write_rgba(model / "images" / "lost [1].png")
+    (model / "test.txt").write_text("im 1.png\nlost [1]\n")
     scene = load_scene(model, CFG)
     assert held_out(scene) == ["im 1.png"]
-    assert "lists 1 photographs that are not views of the scene: lost.png" in scene.notes[-1]
+    assert "lists 1 photographs that are not views of the scene: lost [1]" in scene.notes[-1]
 
 
 def studio(root, **extra):
