@@ -27,7 +27,14 @@ from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import broken
 from p2gs_jax.scene.drives import recording
 from p2gs_jax.scene.drives.objects import Box, tracks
-from p2gs_jax.scene.drives.tables import Columns, counted, drive_folder, numbered, read_feather
+from p2gs_jax.scene.drives.tables import (
+    PHOTOGRAPHS,
+    Columns,
+    counted,
+    drive_folder,
+    numbered,
+    read_feather,
+)
 from p2gs_jax.scene.lens import intrinsics
 from p2gs_jax.scene.rigid import Pose, from_quaternions
 from p2gs_jax.types import TrackedObject
@@ -95,7 +102,7 @@ def _cameras(
     table = read_feather(path, [*LENS, "sensor_name"])
     lenses = dict(zip(map(str, table["sensor_name"]), table.stacked(LENS), strict=True))
     folders = sorted((log / "sensors" / "cameras").glob("*/"))
-    found = {f.name: files for f in folders if (files := numbered(f, (".jpg", ".png")))}
+    found = {f.name: files for f in folders if (files := numbered(f, PHOTOGRAPHS))}
     notes = []
     grey = [name for name in found if name.startswith(GREY)]
     if grey and not any(GREY in name for name in cfg.cameras):

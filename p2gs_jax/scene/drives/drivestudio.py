@@ -39,7 +39,7 @@ from p2gs_jax.types import TrackedObject
 MARKER = "ego_pose/*.txt"
 COLUMNS = 14
 BOXES = "instances/instances_info.json"
-_PHOTOGRAPH = re.compile(r"(\d+)_(\d)\.(?:jpg|png)")
+_PHOTOGRAPH = re.compile(r"(\d+)_(\d)\.(?:jpe?g|png)", re.IGNORECASE)
 
 
 def read_drivestudio(root: Path, cfg: DataConfig) -> Recording:
@@ -68,6 +68,7 @@ def read_drivestudio(root: Path, cfg: DataConfig) -> Recording:
         for frame, path in scans.items()
         if frame in cars
     ]
+    notes += tables.counted(len(scans) - len(sweeps), tables.UNPLACED_SWEEPS)
     objects, box_notes = _objects(root / BOXES, cars)
     notes += box_notes
     return Recording(root, "drivestudio", cameras, photographs, sweeps, objects, notes)

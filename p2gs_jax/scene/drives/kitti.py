@@ -43,7 +43,6 @@ MARKER = "oxts/data"
 EARTH_RADIUS_M = 6378137.0
 CALIBRATION = "calib_cam_to_cam.txt"
 GREY = ("image_00", "image_01")
-PHOTOGRAPHS = (".png", ".jpg", ".jpeg")
 # The time of a turn of the scanner, seconds, if no file states its start and end.
 TURN_S = 0.1
 # The scanner turns clockwise from its back (x forward, y left), and triggers the cameras when it
@@ -70,7 +69,7 @@ def read_kitti_raw(root: Path, cfg: DataConfig) -> Recording:
     to_car = inverse(imu_to_velo) @ inverse(velo_to_cam) @ inverse(rectified)
     cameras, photographs = [], []
     for folder in sorted(root.glob("image_0[0-3]")):
-        files = tables.numbered(folder / "data", PHOTOGRAPHS)
+        files = tables.numbered(folder / "data", tables.PHOTOGRAPHS)
         if not files:
             notes.append(f"{folder.name} has no photographs: it is left out.")
             continue

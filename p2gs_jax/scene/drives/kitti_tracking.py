@@ -49,7 +49,7 @@ def read_kitti_tracking(root: Path, cfg: DataConfig) -> Recording:
     scanner = Trajectory(times, car.poses @ inverse(imu_to_velo))
     cameras, photographs, notes = [], [], []
     for folder in sorted(root.glob(f"image_0[0-3]/{name}")):
-        files, camera = tables.numbered(folder, kitti.PHOTOGRAPHS), folder.parent.name
+        files, camera = tables.numbered(folder, tables.PHOTOGRAPHS), folder.parent.name
         if not files:
             notes.append(f"{camera} has no photographs: it is left out.")
             continue

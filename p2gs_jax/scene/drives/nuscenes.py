@@ -70,7 +70,7 @@ def read_nuscenes(root: Path, cfg: DataConfig) -> Recording:
     if claimed not in (None, count):
         notes.insert(0, f"scene.json counts {claimed} samples, but sample.json holds {count}.")
     notes += counted(left_out, "photographs have no pose in ego_pose.json: they are left out.")
-    notes += counted(absent, "LiDAR sweeps of the keyframes are missing, or have no pose.")
+    notes += counted(absent, "LiDAR sweeps have no pose, or are missing from a keyframe.")
     return Recording(root, "nuscenes", cameras, photographs, sweeps, objects, notes)
 
 
@@ -210,12 +210,12 @@ def _camera(drive: _Drive, row: Row) -> RigCamera:
 
 
 def _sweeps(drive: _Drive) -> tuple[list[Sweep], int]:
-    """Return LiDAR sweeps, and the number of missing sweeps of keyframes."""
+    """Return LiDAR sweeps, and the number without a pose, or missing from a keyframe."""
     sweeps, absent = [], 0
     for row in drive.of("lidar"):
         path, pose = drive.file(row), drive.pose(row)
         if pose is None or not path.is_file():
-            absent += row["is_key_frame"]
+            absent += row["is_key_frame"] or path.is_file()
             continue
         frame, time = drive.moments[row["sample_token"]], drive.seconds(row["timestamp"])
         sweeps.append(Sweep(frame, time, partial(_read_sweep, path, pose, time)))

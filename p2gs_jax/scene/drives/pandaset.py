@@ -53,7 +53,7 @@ def read_pandaset(root: Path, cfg: DataConfig) -> Recording:
     root = tables.drive_folder(root, cfg.drive, MARKER)
     cameras, photographs, notes = [], [], []
     for folder in sorted(p.parent for p in root.glob(MARKER)):
-        files = tables.numbered(folder, (".jpg", ".png"))
+        files = tables.numbered(folder, tables.PHOTOGRAPHS)
         if not files:
             notes.append(f"{folder.name} has no photographs: it is left out.")
             continue

@@ -43,6 +43,7 @@ LISTED = 5
 _MOST_BYTES = 2**28
 
 
+PHOTOGRAPHS = (".jpg", ".jpeg", ".png")  # suffixes for `numbered`
 UNPLACED_SWEEPS = "LiDAR sweeps have no time or pose: they are left out."  # for `counted`
 
 
@@ -131,12 +132,13 @@ def finite_numbers(
 def numbered(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
     """Return the files of a folder whose names are a number and a suffix, by rising number.
 
-    The folder may be absent. Suffixes include dots (".pkl.gz"); the first suffix that fits counts.
+    The folder may be absent. Suffixes include dots (".pkl.gz") and fit in any case; the first that
+    fits counts.
     """
     found: dict[int, Path] = {}
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
-        stems = (path.name.removesuffix(suffix) for suffix in suffixes)
-        stem = next((stem for stem in stems if stem != path.name), "")
+        name = path.name.lower()
+        stem = next((name.removesuffix(end) for end in suffixes if name.endswith(end)), "")
         if stem.isdecimal():
             found.setdefault(int(stem), path)
     return dict(sorted(found.items()))

@@ -55,8 +55,10 @@ def test_what_nuscenes_lacks_is_counted(copied, read):
         "scene.json counts 39 samples, but sample.json holds 3.",
         "3 boxes in sample_annotation.json belong to no instance: they are left out.",
         "3 photographs have no pose in ego_pose.json: they are left out.",
-        "1 LiDAR sweeps of the keyframes are missing, or have no pose.",
+        "1 LiDAR sweeps have no pose, or are missing from a keyframe.",
     ]
+    edit(root, "ego_pose", lambda rows: [r for r in rows if "LIDAR" not in r["token"]])
+    assert "5 LiDAR sweeps have no pose, or are missing from a keyframe." in read(root).notes
     edit(root, "sample_annotation", lambda rows: [])
     assert any("holds no box" in note for note in read(root).notes)
 
@@ -272,13 +274,29 @@ def test_what_kitti_lacks_is_counted(write, read, tmp_path):
     assert {p.frame for p in recording.photographs} == {0, 1, 2, 3, 4}
 
 
-def test_a_sweep_after_the_last_pose_of_a_tracking_sequence_is_counted(copied, read):
-    root = copied("kitti_tracking").root
-    scans = sorted(root.glob("training/velodyne/*/*.bin"))
+@pytest.mark.parametrize(
+    ("name", "places"),
+    [("kitti_tracking", "training/velodyne/*/*.bin"), ("drivestudio", "lidar/*.bin")],
+)
+def test_a_sweep_after_the_last_pose_is_counted(copied, read, name, places):
+    root = copied(name).root
+    scans = sorted(root.glob(places))
     shutil.copy(scans[0], scans[0].with_name("000099.bin"))
     recording = read(root)
     assert len(recording.sweeps) == len(scans)
     assert "1 LiDAR sweeps have no time or pose: they are left out." in recording.notes
+
+
+@pytest.mark.parametrize(
+    "name", ["argoverse", "drivestudio", "kitti_raw", "kitti_tracking", "pandaset"]
+)
+def test_suffixes_of_photographs_may_differ(copied, read, name):
+    made = copied(name)
+    for path in [*made.root.rglob("*.jpg"), *made.root.rglob("*.png")]:
+        path.rename(path.with_suffix(".JPEG"))
+    photographs = read(made.root).photographs
+    assert {(p.camera, p.frame) for p in photographs} == made.photographs.keys()
+    assert all(p.path.is_file() for p in photographs)
 
 
 def test_sizes_that_no_photograph_has_are_those_of_the_calibration(copied, read):
