@@ -183,6 +183,17 @@ def test_white_is_white_and_coded_primaries_are_brought_to_srgb(folder: Path, de
     np.testing.assert_allclose(white, 255, atol=0.01)
 
 
+@pytest.mark.parametrize(("transfer", "light"), [(16, 0.0938), (18, 0.0840)], ids=["PQ", "HLG"])
+def test_an_avif_coded_in_hlg_or_pq_is_light(folder: Path, transfer: int, light: float) -> None:
+    save(folder / "a.avif", np.full((64, 96, 3), 128, np.uint8))
+    before, mark, after = (folder / "a.avif").read_bytes().partition(b"colrnclx")
+    coded = before + mark + bytes([0, 1, 0, transfer]) + after[4:]
+    (folder / "a.avif").write_bytes(coded)
+    result = converted(folder)
+    assert result.known == "AVIF"
+    np.testing.assert_allclose(light_of(result.paths[0]), light, rtol=0.01)
+
+
 def tiff(tags: dict) -> bytes:
     exif = Image.Exif()
     exif.update(tags)
