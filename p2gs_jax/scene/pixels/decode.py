@@ -33,6 +33,8 @@ BYTES_PER_PIXEL, SHARE = 40, 0.5
 _ASPECT_TOLERANCE = 0.01
 # TIFF's tag for the meaning of the fourth channel; its colours are multiplied by associated alpha.
 _EXTRA_SAMPLES, _ASSOCIATED = 338, (1,)
+# The tag for the order of channels.
+_PLANES, _SEPARATE = 284, 2
 # The header of a PGM or PPM: its kind, width, height and largest value.
 _PNM = re.compile(rb"P([2356])" + rb"(?:\s|#.*\n)+(\d+)" * 3)
 
@@ -234,8 +236,10 @@ def _read_raster(path: Path, *, colours: bool = False) -> np.ndarray:
         raise undecodable(path)
     if header := _PNM.match(data):
         raw = _full_range(raw, int(header[1]), int(header[4]))
-    of_tiff = data[:2] in (b"II", b"MM") and raw.ndim == 3 and raw.shape[2] == 4
-    if of_tiff or (raw.ndim == 2 and has_alpha(path)):
+    of_tiff = data[:2] in (b"II", b"MM") and raw.ndim == 3
+    if of_tiff and raw.dtype == np.uint16:
+        _require_interleaved(path)
+    if (of_tiff and raw.shape[2] == 4) or (raw.ndim == 2 and has_alpha(path)):
         raw = _with_alpha(path, raw)
     return with_profile_applied(data, raw) if colours else raw
 
@@ -247,6 +251,14 @@ def _full_range(raw: UInt[np.ndarray, "..."], kind: int, white: int) -> UInt[np.
     if white in (0, most) or (kind <= 3 and most == 255):
         return raw
     return np.rint(np.minimum(raw, white) * (most / white)).astype(raw.dtype)
+
+
+def _require_interleaved(path: Path) -> None:
+    """Raise UserError for a TIFF of separate planes: with 16 bits, OpenCV repeats the first one."""
+    with contextlib.suppress(OSError), Image.open(path) as image:
+        if getattr(image, "tag_v2", {}).get(_PLANES) == _SEPARATE:
+            why = "is a TIFF of 16 bits with separate planes, which are not read"
+            raise broken(path, why, "export it with interleaved channels, or as PNG")
 
 
 def _with_alpha(path: Path, raw: UInt[np.ndarray, "..."]) -> UInt[np.ndarray, "h w c"]:

@@ -49,11 +49,11 @@ def test_rgb_order_exact_values_grey_and_alpha(tmp_path, dtype, channels):
     assert np.array_equal(mask, opaque)
 
 
-def tiff(pixels, meaning):
+def tiff(pixels, meaning, planes=1):
     """Return a TIFF whose fourth channel has this meaning: 1 is associated alpha, 2 straight."""
     height, width = pixels.shape[:2]
-    tags = {256: width, 257: height, 258: 134, 259: 1, 262: 2, 273: 142, 277: 4, 278: height}
-    tags |= {279: pixels.nbytes, 338: meaning}
+    tags = {256: width, 257: height, 258: 146, 259: 1, 262: 2, 273: 154, 277: 4, 278: height}
+    tags |= {279: pixels.nbytes, 284: planes, 338: meaning}
     rows = (struct.pack("<HHII", t, 3, 4 if t == 258 else 1, v) for t, v in tags.items())
     head = struct.pack("<4sIH", b"II*\0", 8, len(tags)) + b"".join(rows) + bytes(4)
     return head + struct.pack("<4H", *[8 * pixels.itemsize] * 4) + pixels.tobytes()
@@ -70,6 +70,11 @@ def test_colours_of_a_tiff_are_not_multiplied_by_its_alpha(tmp_path, dtype):
         np.testing.assert_allclose(pixels[0, 0] / most, [200 / 255, 100 / 255, 50 / 255], atol=0.01)
         assert (None if alpha is None else alpha[0, 0]) == (straight[3] if meaning else None)
         assert has_alpha(path) == (alpha is not None)
+    # OpenCV reads the first of separate planes only.
+    if dtype == np.uint16:
+        path.write_bytes(tiff(np.zeros((1, 1, 4), dtype), 2, planes=2))
+        with refused("a.tif is a TIFF of 16 bits with separate planes"):
+            decode.stored(make_view(path, size=(1, 1)))
 
 
 @pytest.mark.parametrize(
