@@ -280,8 +280,8 @@ def _with_alpha(path: Path, raw: UInt[np.ndarray, "..."]) -> UInt[np.ndarray, "h
                 if pixels.shape[:2] != raw.shape[:2]:  # Pillow does not turn every TIFF
                     raise ValueError(pixels.shape)
                 return pixels if pixels.shape[2] == 2 else cv2.cvtColor(pixels, cv2.COLOR_RGBA2BGRA)
-            multiplied = image.tag_v2.get(_EXTRA_SAMPLES) == _ASSOCIATED
-    except (AttributeError, OSError, ValueError):
+            multiplied = getattr(image, "tag_v2", {}).get(_EXTRA_SAMPLES) == _ASSOCIATED
+    except (OSError, ValueError):
         raise undecodable(path) from None
     if multiplied:
         colours = raw[..., :3] / np.maximum(raw[..., 3:], 1) * most
