@@ -28,7 +28,6 @@ def write_exr(
     path: Path,
     linear: Float32[np.ndarray, "h w 3"],
     *,
-    half: bool = True,
     depth: Float32[np.ndarray, "h w"] | None = None,
     alpha: Float32[np.ndarray, "h w"] | None = None,
     transform: DisplayTransform | None = None,
@@ -38,13 +37,12 @@ def write_exr(
 ) -> None:
     """Write linear radiance, without exposure applied; docs/exports.md lists the header.
 
-    With `half` colours and `alpha` (channel A) are 16-bit floats, unless a colour would overflow.
+    Colours and `alpha` (channel A) are 16-bit floats, unless a colour would overflow.
     `depth` is camera z times alpha; channel Z holds expected depth as 32-bit floats. The header
     describes `transform`, `camera` and the EXIF settings `shot`.
     """
     linear = np.asarray(linear, np.float32)
-    as_half = half and bool(np.all(np.abs(linear) <= HALF_MAX))
-    pixel = np.float16 if as_half else np.float32
+    pixel = np.float16 if np.all(np.abs(linear) <= HALF_MAX) else np.float32
     header: dict = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,

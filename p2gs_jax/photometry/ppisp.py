@@ -14,6 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 from jaxtyping import Float, Int
 
 from p2gs_jax.core.numerics import on_device, unit_clip
@@ -196,17 +197,11 @@ def regularisation_of(parameters: Ppisp) -> Float[Array, ""]:
     weighted sum is 0 at the identity.
     """
     vignettings, responses = parameters.vignettings, parameters.responses
-    moved = offsets(parameters.colors).mean(axis=0)
+    bright, moved = parameters.exposures.mean(), offsets(parameters.colors).mean(axis=0)
     return (
-        EXPOSURE * _huber(parameters.exposures.mean(), EXPOSURE_DELTA)
-        + COLOR * _huber(moved, COLOR_DELTA).mean()
+        EXPOSURE * optax.huber_loss(bright, delta=EXPOSURE_DELTA) / EXPOSURE_DELTA
+        + COLOR * optax.huber_loss(moved, delta=COLOR_DELTA).mean() / COLOR_DELTA
         + CHANNELS * (vignettings.var(axis=1).mean() + responses.var(axis=1).mean())
         + CENTRE * (vignettings[..., :2] ** 2).sum(-1).mean()
         + BRIGHTENING * jnp.maximum(vignettings[..., 2:], 0.0).mean()
     )
-
-
-def _huber(x: Float[Array, "..."], delta: float) -> Float[Array, "..."]:
-    """Return |x| - delta / 2, or x^2 / (2 delta) within delta of 0."""
-    size = jnp.abs(x)
-    return jnp.where(size < delta, 0.5 * x**2 / delta, size - 0.5 * delta)

@@ -43,8 +43,8 @@ class Margins(NamedTuple):
 # rendered again at once.
 PICTURES = Margins(1.2, 1.1)
 # Viewer: a few typical views are counted, and the user may go anywhere. After an overflow the
-# viewer shows a smaller picture until another program is compiled.
-ANYWHERE = Margins(1.5, 1.5)
+# viewer shows a smaller picture until another program is compiled. Ratio to the length needed.
+ANYWHERE = 1.5
 # Training: splats widen before they converge, and an overflow compiles the largest program of a
 # fit.
 TRAINING = Margins(1.5, 1.5)

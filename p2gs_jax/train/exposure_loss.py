@@ -11,6 +11,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import optax
 from jaxtyping import Float, Int
 
 from p2gs_jax.config import FitConfig, LossConfig, PhotometryConfig
@@ -60,25 +61,21 @@ def usable(colors: Float[Array, "m 3"], cfg: LossConfig) -> Float[Array, "m 3"]:
     return ((colors > cfg.black) & (colors < cfg.saturation)).astype(colors.dtype)
 
 
-def huber(x: Float[Array, "..."], delta: float) -> Float[Array, "..."]:
-    """Return the Huber loss, with slope 1 in its tails."""
-    a = jnp.abs(x)
-    return jnp.where(a < delta, 0.5 * a * a / delta, a - 0.5 * delta)
-
-
 def observed_ldr(
     pairs: ColorPairs, photometry: Photometry, loss: LossConfig, cfg: PhotometryConfig
 ) -> Float[Array, ""]:
     """Return the mean of Huber(T_j(alpha T_i^-1(I_i(u))) - I_j(w(u))) over valid pairs.
 
     One point is at u and at w(u). This is the principle of invariant radiance in display units, and
-    scale-invariant. The error of values that are near black or saturated counts as zero.
+    scale-invariant. The error of values that are near black or saturated counts as zero. The Huber
+    loss has slope 1 in its tails.
     """
     capture_i, capture_j = photometry.capture(pairs.views_i), photometry.capture(pairs.views_j)
     radiance = inverse_formation(pairs.colors_i, capture_i, cfg, pairs.positions_i)
     predicted = gain(radiance.shape, capture_j, cfg, pairs.positions_j) * radiance
     display = tone_map(predicted, capture_j.gamma[:, None], cfg, capture_j.camera)
-    error = huber(display - pairs.colors_j, loss.relative_exposure.huber_delta)
+    delta = loss.relative_exposure.huber_delta
+    error = optax.huber_loss(display, pairs.colors_j, delta=delta) / delta
     weight = usable(pairs.colors_i, loss) * usable(pairs.colors_j, loss) * pairs.valid[:, None]
     fewest = FEWEST_VALID * pairs.valid.size
     return jnp.sum(weight * error) / jnp.maximum(jnp.sum(pairs.valid), fewest)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
+import optax
 from jaxtyping import Float
 
 from p2gs_jax.config import FitConfig
@@ -39,9 +40,9 @@ def lidar_loss(
     alpha, depth = alpha[row, column], depth[row, column]
     known = (measured.depths > 0) & (alpha > LEAST_ALPHA) & (depth > 0)
     expected = jnp.where(known, depth, 1.0) / jnp.where(known, alpha, 1.0)
-    error = jnp.abs(jnp.log(expected) - jnp.log(jnp.where(known, measured.depths, 1.0)))
-    huber = jnp.where(error < CLIP, 0.5 * error**2 / CLIP, error - 0.5 * CLIP)
-    return jnp.sum(jnp.where(known, huber, 0.0)) / jnp.maximum(jnp.sum(known), 1)
+    true = jnp.where(known, measured.depths, 1.0)
+    error = optax.huber_loss(jnp.log(expected), jnp.log(true), delta=CLIP) / CLIP
+    return jnp.sum(jnp.where(known, error, 0.0)) / jnp.maximum(jnp.sum(known), 1)
 
 
 def measured_depths(scene: Scene, cfg: FitConfig) -> list[Measured] | None:

@@ -158,7 +158,7 @@ class Renderer:
         self._on_change()
         scene, cameras = self._scene, [probe(size) for probe in self._probes]
         counts = [int(capacity.count_needed(*scene, c, cfg=self._cfg)) for c in cameras]
-        entries = capacity.bucket(max(needed, *counts), capacity.ANYWHERE.first)
+        entries = capacity.bucket(max(needed, *counts), capacity.ANYWHERE)
         static = {"cfg": self._cfg, "capacity": entries}
         run = capacity.compiled_renderer().lower(*scene, cameras[0], **static).compile()
         with self._one_frame:

@@ -131,10 +131,7 @@ def _sweeps(root: Path) -> tuple[list[Sweep], list[str]]:
     sweeps = [Sweep(k, float(times[k]), partial(_read_sweep, path)) for k, path in timed.items()]
     absent = len(times) - len(timed)
     notes = tables.counted(absent, f"of {len(times)} LiDAR sweeps are missing.")
-    notes += tables.counted(
-        len(files) - len(timed), "LiDAR sweeps have no time: they are left out."
-    )
-    return sweeps, notes
+    return sweeps, notes + tables.counted(len(files) - len(timed), tables.UNPLACED_SWEEPS)
 
 
 def _read_sweep(path: Path) -> SweepPoints:
