@@ -89,6 +89,8 @@ def claims(published: Mapping[str, Any], rows: Mapping[Key, Mapping[str, Any]]) 
             ours = fmean(row["figures"][claim["figure"]] for row in found)
             theirs = fmean(known[scene]["psnr"] for scene in scenes)
             result = f"{abs(ours - theirs):.2f} dB {'ahead' if ours > theirs else 'behind'}"
+            if abs(ours - theirs) < claim.get("known_to", 0):
+                result = f"level ({ours - theirs:+.2f} dB)"
             cells += [[f"{claim['claim']}: {result}", f"{ours:.2f} (`{method}`, {steps:,} steps)"]]
             cells[-1] += [f"{theirs:.2f} ({claim['theirs']})", claim["protocol"], claim["differs"]]
             cells[-1] += ["<br>".join(f"`{row['command']}`" for row in found)]
