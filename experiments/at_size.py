@@ -68,11 +68,11 @@ COLUMNS = (
     ("EV error", "ev", 4),
     ("radiance, novel, mu law, dB", "mu_law_novel", 2),
 )
-HEAD = """The columns "photographs" compare views under the mean exposure and gamma of the training views, as
-in the paper. The columns "ISO 8" compare with photographs of the same views at one exposure without
-noise, after one scale for all. The radiance is compared with the true one by the mu law (mu = 5000),
-after one scale for all; methods that splat display values have none. The printed method blurs splats
-by 0.3 pixels^2, every other method by 0.05 pixels^2.
+HEAD = """The columns "photographs" compare views under the mean exposure and gamma of the training
+views, as in the paper. The columns "ISO 8" compare with photographs of the same views at one
+exposure without noise, after one scale for all. The radiance is compared with the true one by the
+mu law (mu = 5000), after one scale for all; methods that splat display values have none. The
+printed method blurs splats by 0.3 pixels^2, every other method by 0.05 pixels^2.
 
 """
 

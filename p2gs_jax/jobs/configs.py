@@ -16,7 +16,15 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.errors import UserError
 from p2gs_jax.presets import preset, with_values
 
-KEYS = ("scene", "reference", "out", "preset", "seeds", "max_parallel", "set", "grid", "case")
+TEXT, NUMBER, TABLE = "write text in quotes", "write a whole number", "write it as a table"
+# Keys of a sweep file: the type of each value, and the remedy if it has another.
+KEYS = {
+    **dict.fromkeys(("scene", "reference", "out", "preset"), (str, TEXT)),
+    "seeds": (list, "write whole numbers, as in [0, 1, 2]"),
+    "max_parallel": (int, NUMBER),
+    **dict.fromkeys(("set", "grid"), (dict, TABLE)),
+    "case": (list, "write [[case]] above each configuration"),
+}
 
 
 def with_fields(cfg: FitConfig, fields: Mapping[str, Any]) -> FitConfig:
@@ -145,19 +153,14 @@ def read_sweep(path: Path) -> SweepFile:
             valid.
     """
     data = _parsed(Path(path))
-    seeds, parallel = data.get("seeds", [0]), data.get("max_parallel", 1)
-    if not isinstance(seeds, list) or not all(type(s) is int for s in seeds):
-        raise UserError(f"{path}: seeds = {seeds!r}.", fix="write whole numbers, as in [0, 1, 2]")
-    if type(parallel) is not int:
-        raise UserError(f"{path}: max_parallel = {parallel!r}.", fix="write a whole number")
     folder, reference = Path(path).parent, data.get("reference")
     return SweepFile(
         scene=folder / data["scene"],
         out=folder / data.get("out", Path(path).stem),
         configs=_configs(data, path),
-        seeds=tuple(seeds),
+        seeds=tuple(data.get("seeds", [0])),
         reference=None if reference is None else folder / reference,
-        max_parallel=parallel,
+        max_parallel=data.get("max_parallel", 1),
     )
 
 
@@ -175,6 +178,15 @@ def _parsed(path: Path) -> dict[str, Any]:
         raise UserError(f"{path}: unknown key {unknown[0]!r}.", fix=f"known: {', '.join(KEYS)}")
     if "scene" not in data:
         raise UserError(f"{path} does not name a scene.", fix='add scene = "FOLDER"')
+    for key, value in data.items():
+        kind, fix = KEYS[key]
+        items = {"seeds": int, "case": dict}.get(key)
+        if type(value) is not kind or (items and any(type(item) is not items for item in value)):
+            raise UserError(f"{path}: {key} = {value!r} is not valid.", fix=fix)
+    for name, values in data.get("grid", {}).items():
+        if not isinstance(values, list):
+            fix = f'write the name in quotes and its values as a list: "{name}" = [VALUE, ...]'
+            raise UserError(f"{path}: [grid] {name} = {values!r} is not a list.", fix=fix)
     return data
 
 

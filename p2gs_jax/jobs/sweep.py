@@ -25,7 +25,7 @@ from p2gs_jax.jobs.job import Job, JobState, read_reason, slug
 from p2gs_jax.jobs.run import Runner, run_jobs
 from p2gs_jax.jobs.worker import run_in_process
 from p2gs_jax.pipeline.fit import fit
-from p2gs_jax.pipeline.preflight import check_run_dir
+from p2gs_jax.pipeline.preflight import Paths, check_run_dir, check_sources
 from p2gs_jax.presets import from_dict, to_dict
 from p2gs_jax.run.folder import RunFolder, locked
 from p2gs_jax.synth.sensor import read_true_exposures
@@ -125,6 +125,7 @@ def _planned(
         for seed in seeds:
             seeded = with_fields(cfg, {"train.seed": seed})
             folder = out / slug(name) / f"seed_{seed}"
+            check_sources(Paths.of(scene, folder, reference))
             if check_run_dir(folder, True, seeded):
                 longer.add(len(jobs))
             arguments = {"scene": str(scene.absolute()), "reference": truth, "fit": to_dict(seeded)}
@@ -166,7 +167,9 @@ def _outcome(run: Path, scene: Path, state: JobState | None) -> dict[str, Any]:
     """Return the status of an ended run, with its columns or the reason of its failure."""
     if state is not None and state.status == "stopped":
         return {"status": "interrupted", "reason": "the same sweep continues it"}
-    if not RunFolder(run).metrics.exists():
+    # A continuation that failed leaves the scores of the shorter run.
+    failed = state is not None and state.status == "failed"
+    if failed or not RunFolder(run).metrics.exists():
         return {"status": "failed", "reason": (state and state.reason) or read_reason(run)}
     try:
         return {"status": "done", **read_row(run, scene)}

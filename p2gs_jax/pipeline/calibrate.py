@@ -40,6 +40,7 @@ from p2gs_jax.photometry.sources.points import has_tracks, rendered_colors, surf
 from p2gs_jax.photometry.sources.stack import SATURATED, StackColors, read_stack, stack_colors
 from p2gs_jax.photometry.unmodelled import LOCAL_EV, regional_ev
 from p2gs_jax.presets import require_config
+from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.run.photometry_files import write_solution
 from p2gs_jax.run.plots import write_calibration_plot
 from p2gs_jax.run.read import load_run
@@ -143,6 +144,7 @@ def calibrate(
     reporter, out, begin = reporter or Silent(), Path(out), time.monotonic()
     for source in (cfg.photometry.known, compare_with):
         check_source(source)
+    _require_no_run(out)
     reporter.stage("Reading the scene")
     with no_empty_folders(out):
         scene = load_scene(Path(scene_dir), cfg.data, out / "cache", reporter.message)
@@ -190,6 +192,7 @@ def calibrate_run(
             its views do not overlap.
     """
     begin, reporter = time.monotonic(), reporter or Silent()
+    _require_no_run(Path(out))
     requested, run = require_config(cfg), load_run(run_dir, scene)
     cfg = dataclasses.replace(run.cfg, photometry=requested.photometry)
     run.require_photographs(run.scene.train_indices)
@@ -261,6 +264,12 @@ def solved(
     )
 
 
+def _require_no_run(out: Path) -> None:
+    if RunFolder(out).config.exists():
+        why = f"{out} holds a run, whose photometry.json would be replaced."
+        raise UserError(why, fix="name another folder with --out")
+
+
 def _row(candidate: Candidate) -> dict[str, Any]:
     """Return the entry of a candidate in `calibration.json`."""
     form = candidate.form
@@ -297,6 +306,8 @@ def calibrate_stack(
     """
     cfg, begin, reporter = require_config(cfg), time.monotonic(), reporter or Silent()
     p, seed = cfg.photometry, cfg.train.seed
+    if out is not None:
+        _require_no_run(Path(out))
     check_source(compare_with)
     stack, known = read_stack(Path(folder)), None
     if p.known is not None:

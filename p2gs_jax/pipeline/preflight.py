@@ -24,7 +24,7 @@ from p2gs_jax.evaluation.lpips import LpipsWeights, read_lpips_weights
 from p2gs_jax.evaluation.references import Reference, check_reference, load_reference
 from p2gs_jax.gaussians.population import Coverage, seed_bound
 from p2gs_jax.presets import flat, to_dict
-from p2gs_jax.run.folder import RunFolder, require_free
+from p2gs_jax.run.folder import RunFolder, find, require_free
 from p2gs_jax.run.read import read_config
 from p2gs_jax.scene.exposures import check_source, read_known_exposures
 from p2gs_jax.scene.pixels.store import size_at
@@ -65,6 +65,7 @@ def preflight(cfg: FitConfig, paths: Paths, *, resume: bool = False) -> LpipsWei
     require_free(paths.run)
     check_options(cfg)
     check_run_dir(paths.run, resume, cfg)
+    check_sources(paths)
     check_source(cfg.photometry.known)
     check_reference(paths.reference)
     name = cfg.evaluation.lpips_weights
@@ -151,6 +152,23 @@ def check_run_dir(run_dir: Path, resume: bool, cfg: FitConfig) -> bool:
         fix += "another folder with --out"
         raise UserError(f"{run_dir} was begun with other options: {'; '.join(other[:6])}.", fix=fix)
     return bool(longer)
+
+
+def check_sources(paths: Paths) -> None:
+    """Check that a run is continued with the scene and the reference that it was begun with.
+
+    Raises:
+        UserError: it was begun with others. Folders that have moved are not compared.
+    """
+    path = RunFolder(paths.run).config
+    saved = read_config(path)[0] if path.exists() else None
+    for key, now in (("scene", paths.scene), ("reference", paths.reference)):
+        was = None if saved is None else find(saved, key, paths.run)
+        if saved is None or (was and now and not (was.exists() and now.exists())):
+            continue
+        if was != now and not (was and now and was.samefile(now)):
+            why = f"{paths.run} was begun with the {key} {was}, now {now}."
+            raise UserError(why, fix=f"name that {key}, or another folder with --out")
 
 
 class MemoryNeeded(NamedTuple):

@@ -68,6 +68,8 @@ WRONG = [
     ("fit gaps --out run", "--allow-missing"),
     ("calibrate nowhere --out run --static", "name the folder of the photographs"),
     ("calibrate castle --out run --static", "several exposures"),
+    ("calibrate castle --out begun", "photometry.json would be replaced"),
+    ("calibrate castle --out begun --static", "photometry.json would be replaced"),
     ("calibrate castle --out run --static --max-width 99", "leave out --max-width"),
     ("calibrate castle --out run --data.test-every 3", "have no effect here"),
     ("calibrate castle --out run --densify.method mcmc", "--densify.method"),

@@ -18,8 +18,10 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.jobs.configs import grid, read_sweep, with_fields
 from p2gs_jax.jobs.job import REASON, JobFiles, read_job
 from p2gs_jax.jobs.sweep import SweepResult, brief, failures, read_row, sweep, to_markdown
-from p2gs_jax.run.folder import locked
+from p2gs_jax.run.decisions import Decisions
+from p2gs_jax.run.folder import RunFolder, locked
 from p2gs_jax.run.photometry_files import read_photometry
+from p2gs_jax.run.write import write_start
 
 BASE = p2gs_jax.preset("robust")
 FIELDS = {"train.steps": 12, "train.coarse_to_fine": []}
@@ -185,6 +187,13 @@ preset = "paper"
         ("scene = 'x'\nseeds = 3", "write whole numbers"),
         ("scene = 'x'\npreset = 'best'", "no preset 'best'"),
         ("scene = 'x'\n[grid]\n'train.stepz' = [1]", "is not a configuration field"),
+        ("scene = 5", "scene = 5 is not valid"),
+        ("scene = 'x'\nset = 5", "write it as a table"),
+        ("scene = 'x'\ngrid = []", "write it as a table"),
+        ("scene = 'x'\n[grid]\n'photometry.curve' = 'srgb'", "is not a list"),
+        ("scene = 'x'\n[grid]\ntrain.steps = [600]", "write the name in quotes"),
+        ("scene = 'x'\n[case]\npreset = 'paper'", "write [[case]]"),
+        ("scene = 'x'\nmax_parallel = true", "write a whole number"),
     ],
 )
 def test_wrong_sweep_files_are_refused_with_their_fault(tmp_path, refused, text, message):
@@ -255,6 +264,19 @@ def test_a_signal_leaves_a_table_and_the_same_sweep_goes_on(tmp_path):
     assert not list(tmp_path.rglob(REASON))
     rows = sweep("scene", tmp_path, CONFIGS, run=runner(finished)).rows
     assert [row["status"] for row in rows] == ["done"] * 3
+
+
+def test_a_continuation_that_fails_does_not_count_as_done(tmp_path):
+    sweep("scene", tmp_path, {"a": BASE}, run=runner(finished))
+    cfg = with_fields(BASE, {"train.steps": BASE.train.steps + 1})
+    folder = tmp_path / "a" / "seed_0"
+    write_start(RunFolder(folder), tmp_path, None, BASE, Decisions.as_given(BASE))
+    failing = runner(lambda run, stop: ("failed", "no scene"))
+    (row,) = sweep(tmp_path, tmp_path, {"a": cfg}, run=failing).rows
+    assert (row["status"], row["reason"]) == ("failed", "no scene")
+    for scene, reference in ((folder, None), (tmp_path, folder)):
+        with pytest.raises(UserError, match=r"was begun with the (scene|reference) "):
+            sweep(scene, tmp_path, {"a": BASE}, reference=reference, run=runner(finished))
 
 
 def test_a_run_with_broken_files_fails_alone(tmp_path):
