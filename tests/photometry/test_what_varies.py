@@ -51,6 +51,24 @@ def test_a_white_balance_per_camera_goes_with_gammas_per_view():
     assert np.std(s.gammas - gammas) < 0.04
 
 
+def test_black_views_have_the_parameters_of_their_cameras_and_do_not_move_them():
+    gammas, black = np.array([2.0, 2.2, 2.45])[DRIVE.cameras], [1, 4, 15]
+    light = np.exp(OF_CAMERA[DRIVE.cameras]) * make_exposures(DRIVE, "cameras")[:, None]
+    o = observe(DRIVE, light, curve="power", gammas=gammas, pivot=0.18)
+    colors = np.where(np.isin(o.views, black)[:, None], 0.0, o.colors)
+    form = Form("camera_exposure_gamma", "camera")
+    s = adjust(dataclasses.replace(o, colors=colors), form, Response("power"))
+    assert np.isinf(s.exposure_errors[black]).all()
+    exposures, tint = np.log(light).mean(1), of_balance(np.log(light))
+    assert np.ptp(s.gammas - gammas) < 0.05
+    assert np.ptp(s.log_exposures - exposures) < 0.02
+    assert np.abs(s.white_balance - tint).max() < 0.01
+    # Radiance has the colours of this white balance.
+    colour = np.nanmedian(s.point_log_radiance - np.log(DRIVE.radiance), axis=0)
+    shift = (np.log(light) - s.white_balance).mean(0)
+    assert np.ptp(colour - shift) < 0.01
+
+
 @pytest.mark.parametrize("kind", ["camera", "channel"])
 def test_corners_are_solved_for_each_camera(kind):
     lost = LOST if kind == "camera" else LOST * [1.0, 0.7, 0.4]

@@ -17,7 +17,7 @@ from p2gs_jax.photometry.adjustment.errors import Uncertainty, uncertainty
 from p2gs_jax.photometry.adjustment.parameters import Forward, Parameters
 from p2gs_jax.photometry.adjustment.problem import Problem
 from p2gs_jax.photometry.adjustment.solve import Fit, solve_model, with_free_curve
-from p2gs_jax.photometry.models import Form, ModelName
+from p2gs_jax.photometry.models import MODELS, Form, ModelName
 from p2gs_jax.photometry.observations import Labels, Observations, PerChannel, grouped
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.solution import MIN_OBSERVATIONS, PhotometricSolution
@@ -117,13 +117,14 @@ def solution_of(
     seen = used.any(1)
     per_view = np.bincount(o.views[seen], minlength=o.view_count)
     active, free = per_view > 0, np.ones(o.view_count, bool)
+    component = problem.tied(MODELS[form.model].exposure)
     if problem.known is not None:
         fixed = np.isfinite(problem.known.log_exposures)
-        free = ~np.isin(problem.component, np.unique(problem.component[fixed]))
+        free = ~np.isin(component, np.unique(component[fixed]))
         active = active | fixed
     # Known exposures fix the mean exposure of a component, but not its mean colour.
-    scale, color = _Gauge(problem.component, active & free), _Gauge(problem.component, active)
-    exposures, shifts, lost = _exposures(fit, covariance, active, scale, color)
+    gauges = _Gauge(component, active & free), _Gauge(problem.tied(form.white_balance), active)
+    exposures, shifts, lost = _exposures(fit, form, covariance, active, *gauges)
     # Radiances of points shift inversely, by the shift of one of their views.
     some_view = np.zeros(o.point_count, int)
     some_view[o.points[seen]] = o.views[seen]
@@ -135,7 +136,7 @@ def solution_of(
         response=response,
         **exposures,
         observations_per_view=per_view,
-        component=problem.component,
+        component=component,
         point_log_radiance=log_radiance + shifts[some_view] + problem.log_pivot,
         residual_ev=_spread_ev(residual[used]) if used.any() else 0.0,
         view_residual_ev=view_residual,
@@ -157,13 +158,16 @@ def solution_of(
 
 
 def _exposures(
-    fit: Fit, covariance: Uncertainty, active: Bool[np.ndarray, " v"], scale: _Gauge, color: _Gauge
+    fit: Fit,
+    form: Form,
+    covariance: Uncertainty,
+    active: Bool[np.ndarray, " v"],
+    scale: _Gauge,
+    color: _Gauge,
 ) -> tuple[dict[str, np.ndarray], Float[np.ndarray, "v x"], Bool[np.ndarray, " v"]]:
     """Return exposures, gammas, white balance and errors; gauge shifts; views without errors."""
     a, light = fit.theta.a, fit.theta.b / fit.theta.a[:, None]
     h, balance = light.mean(1), light - light.mean(1, keepdims=True)
-    shift = scale.shift(h)
-    shifts = shift[:, None] + color.shift(balance)
     features, cameras = fit.model.unknowns.features, fit.model.layout.cameras
 
     def of_light(change: Parameters):
@@ -171,6 +175,12 @@ def _exposures(
 
     def of_cameras(k: Float[np.ndarray, "k c"]) -> Float[np.ndarray, "v 3 c"]:
         return np.stack([features.balance_of(column) for column in k.T], -1)[cameras]
+
+    if features.balance:
+        balance = balance + of_cameras(fit.theta.k[:, None])[..., 0]
+    balance = np.broadcast_to(balance, (len(h), 3))
+    shift = scale.shift(h)
+    shifts = shift[:, None] + color.shift(balance)
 
     def of_balance(change: Parameters):
         moved = of_light(change)
@@ -185,15 +195,15 @@ def _exposures(
     balance_errors = factor[:, None] * covariance.of(of_balance).reshape(-1, 3)
     lost = active & ~(np.isfinite(h_errors) & np.isfinite(a_errors))
     determined = active & ~lost
-    if features.balance:
-        balance = balance + of_cameras(fit.theta.k[:, None])[..., 0]
-    balance = color.centred(np.broadcast_to(balance, (len(h), 3)))
+    # A view without observations has the parameters of its camera, if the camera determines them.
+    solved = active | (MODELS[form.model].exposure == "camera")
+    tinted = active | (form.white_balance == "camera")
     found = {
-        "log_exposures": np.where(active, h - shift, 0.0),
+        "log_exposures": np.where(solved, h - shift, 0.0),
         "exposure_errors": np.where(determined, h_errors, np.inf),
-        "gammas": np.where(active, GAMMA_SRGB / a, GAMMA_SRGB),
+        "gammas": GAMMA_SRGB / a,
         "gamma_errors": np.where(determined, GAMMA_SRGB / a / a * a_errors, np.inf),
-        "white_balance": np.where(active[:, None], balance, 0.0),
+        "white_balance": np.where(tinted[:, None], color.centred(balance), 0.0),
         "white_balance_errors": np.where(determined[:, None], balance_errors, np.inf),
     }
     return found, shifts, lost

@@ -355,7 +355,7 @@ def make_system(problem: Problem, form: Form, splines: ResponseKind | None = Non
     return System(
         unknowns=unknowns,
         basis=sp.csr_array(basis),
-        anchors=_anchors(problem, unknowns, log_exposure, precision),
+        anchors=_anchors(problem, form, unknowns, precision),
         priors=_priors(unknowns, log_exposure, precision, of_gammas),
         start=Parameters(start, np.ones(views), *more),
         smoothness=_smoothness(unknowns.splines),
@@ -371,8 +371,8 @@ def _directions(level: Level | None, cameras: np.ndarray) -> sp.csr_array:
     return sp.csr_array((np.ones(len(views)), (views, column)))
 
 
-def _anchors(problem: Problem, u: Unknowns, log_exposure, precision) -> Held:
-    """Return the gauges: scale, power and colour of each group of views that share points."""
+def _anchors(problem: Problem, form: Form, u: Unknowns, precision) -> Held:
+    """Return the gauges: scale, colour and power of each group of tied views."""
     rows, targets = [sp.csr_array((0, u.count))], []
 
     def hold(index, weights, target=0.0) -> None:
@@ -381,10 +381,10 @@ def _anchors(problem: Problem, u: Unknowns, log_exposure, precision) -> Held:
         rows.append(sp.csr_array(row[None]))
         targets.append(target)
 
-    for label in np.unique(problem.component):
-        members = np.flatnonzero(problem.component == label)
-        share, known = 1 / len(members), precision[members] > 0
-        if not known.any():
+    model = MODELS[form.model]
+    for members in _groups(problem.tied(model.exposure)):
+        share = 1 / len(members)
+        if not (precision[members] > 0).any():
             for channel in range(u.channels):
                 hold(channel * u.views + members, share)
         elif u.channels == 3:
@@ -392,13 +392,15 @@ def _anchors(problem: Problem, u: Unknowns, log_exposure, precision) -> Held:
             for channel in (0, 2):
                 both = np.concatenate([channel * u.views + members, u.views + members])
                 hold(both, np.repeat([share, -share], len(members)))
-        if label not in problem.with_known_power:
-            hold(u.at.a.start + members, share, 1.0)
+    for members in _groups(problem.tied(model.gamma)):
+        if not np.isin(problem.component[members], problem.with_known_power).any():
+            hold(u.at.a.start + members, 1 / len(members), 1.0)
     if u.features.balance:
-        views_of = np.bincount(problem.observations.cameras, minlength=u.features.cameras)
-        for direction in range(u.features.balance_count // u.features.cameras):
-            at = u.at.k.start + direction * u.features.cameras + np.arange(u.features.cameras)
-            hold(at, views_of / views_of.sum())
+        for members in _groups(problem.tied("camera")):
+            views_of = np.bincount(problem.observations.cameras[members])
+            for direction in range(u.features.balance_count // u.features.cameras):
+                at = u.at.k.start + direction * u.features.cameras + np.arange(len(views_of))
+                hold(at, views_of / len(members))
     powers = u.at.c.start + u.splines.powers
     if u.splines.by == "channel" and u.channels == 3:
         # Photographs do not determine the power of a channel with separate exposures.
@@ -409,6 +411,10 @@ def _anchors(problem: Problem, u: Unknowns, log_exposure, precision) -> Held:
     elif powers.size and not u.splines.power:
         hold(powers, 1 / u.splines.groups)
     return Held(sp.csr_array(sp.vstack(rows)), np.array(targets), np.ones(len(targets)))
+
+
+def _groups(labels: Int[np.ndarray, " v"]) -> list[Int[np.ndarray, " m"]]:
+    return [np.flatnonzero(labels == label) for label in np.unique(labels)]
 
 
 def _priors(u: Unknowns, log_exposure, precision, of_gammas) -> Held:

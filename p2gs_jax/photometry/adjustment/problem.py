@@ -8,7 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Int
+from scipy.sparse.csgraph import connected_components
 
+from p2gs_jax.config import Level
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.photometry.adjustment.matrices import Pairs
 from p2gs_jax.photometry.observations import Observations
@@ -110,6 +112,19 @@ class Problem:
         stops, label = self.known.log_exposures[known] / LN2, self.component[known]
         least = max(TELLING_EV, self.known.deviation_ev)
         return np.array([k for k in np.unique(label) if np.ptp(stops[label == k]) >= least], int)
+
+    def tied(self, level: Level | None) -> Int[np.ndarray, " v"]:
+        """Return a label per view; views with equal labels share a gauge of a parameter.
+
+        A parameter of a camera ties all its views, also those that share no point with the others.
+        """
+        if level != "camera":
+            return self.component
+        label, cameras = self.component, self.observations.cameras
+        first = int(label.max(initial=-1)) + 1
+        size = first + int(cameras.max(initial=-1)) + 1
+        edges = sp.csr_array((np.ones(len(label)), (label, first + cameras)), shape=(size, size))
+        return connected_components(edges, directed=False)[1][label]
 
     def part(self, pick: np.ndarray | slice) -> Problem:
         """Return some of the observations, chosen by a mask or their rows."""
