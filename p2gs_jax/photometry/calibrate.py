@@ -41,9 +41,12 @@ MOST_OBSERVATIONS = 40_000
 SPLINE_OBSERVATIONS = 12_000  # a curve has few parameters, and its basis is the most expensive
 
 OnChosen = Callable[[Form, Response], None]
-# Beginning of the note with the numbers of a choice, and the gain, nat, from which it is clear.
+# Beginning of the note with the numbers of a choice. A gain from CLEARLY on, nat, counts as clear.
 NUMBERS = "Held-out log-likelihood per observation beside the model kept (0.01 is little, 1 a lot)"
 CLEARLY = 0.1
+
+
+COLLAPSED = "A fitted tone curve collapsed: {} is used without a spline."
 
 
 @dataclass(frozen=True)
@@ -58,8 +61,8 @@ class CalibrationOptions:
     # Model and curve: chosen on held-out colours, an exposure per view under one fitted response
     # (stacks), or fixed. A fixed `Curve` is a kind of curve, whose splines are fitted.
     choice: Literal["held_out", "one_response"] | tuple[Form, Response | Curve] = "held_out"
-    # Kind of photographs that are light encoded as sRGB (`Scene.known_response`): no other curve is
-    # compared. None: the camera's tone curve is unknown.
+    # Name of the kind of photographs, if all hold light encoded as sRGB (`Scene.known_response`):
+    # then only sRGB is compared. None: the tone curve is unknown.
     known_response: str | None = None
 
     def problem(self, observations: Observations) -> Problem:
@@ -131,7 +134,7 @@ def calibrate_observations(
         notes.append(
             f"{coarse} of {coarse + len(observations.points)} observations were left out: their "
             f"pixels are more than {COARSEST:g} times as wide on the surface as those of the "
-            "closest view."
+            "finest view."
         )
     if options.known is not None and (unused := options.known.unused):
         notes.append(f"{len(unused)} known exposures belong to no view: {first_few(unused)}.")
@@ -143,14 +146,14 @@ def _fixed(
 ) -> Selection:
     """Solve a form under a response, or under a kind of curve whose splines are fitted."""
     problem = options.problem(observations)
-    notes = _notes(problem, free=isinstance(curve, Curve) or MODELS[form.model].gamma is not None)
+    collapsed, free = (), MODELS[form.model].gamma is not None
     if isinstance(curve, Curve):
         few = problem.part(observations.thinned(RESPONSE_PER_VIEW, options.seed))
         base, beside = Response(curve.base), form._replace(model="view_exposure")
         fitted = fit_response(few, base, form=beside, by=curve.splines or "all")
-        if fitted is None:
-            notes += (f"A fitted response collapsed: {curve.base} is used without a spline.",)
-        curve = fitted or base
+        collapsed = () if fitted else (COLLAPSED.format(base.name),)
+        curve, free = fitted or base, free or fitted is not None
+    notes = (*_notes(problem, free=free), *collapsed)
     return Selection(fit_model(problem, form, curve), (), notes)
 
 
@@ -162,8 +165,8 @@ def _by_one_response(problem: Problem) -> Selection:
     fitted = [fit_response(problem, Response(base)) for base in BASES]
     solutions = [fit_model(problem, "view_exposure", r) for r in fitted if r is not None]
     if not solutions:
-        collapsed = "A fitted response collapsed: sRGB is used without a spline."
-        return Selection(fit_model(problem, "view_exposure"), (), (collapsed,))
+        notes = (*_notes(problem, free=False), COLLAPSED.format(Response().name))
+        return Selection(fit_model(problem, "view_exposure"), (), notes)
     return Selection(min(solutions, key=lambda s: s.residual_ev), (), _notes(problem))
 
 
@@ -206,11 +209,11 @@ def held_out(o: Observations, seed: int) -> Bool[np.ndarray, " o"]:
     region = regions(o.positions, o.views, SHARED_REGION)
     view_of = np.zeros(int(region.max(initial=-1)) + 1, int)
     view_of[region] = o.views
-    # Hold out a share of every view's regions: at least one, if two remain.
+    # Hold out a share of every view's regions; a view with one region keeps it.
     order = np.lexsort((rng.random(len(view_of)), view_of))
     count, first = np.bincount(view_of), np.searchsorted(view_of[order], view_of)
     rank = np.argsort(order) - first
-    most = np.maximum(np.rint(HELD_OUT * count), count >= 3)
+    most = np.rint(HELD_OUT * count)
     return (rank < most[view_of])[region]
 
 

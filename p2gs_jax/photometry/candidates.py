@@ -43,7 +43,8 @@ from p2gs_jax.photometry.response import BASES, Response, base_log
 SPLINE_SPREAD_EV, SHADED_SPREAD_EV = 0.2, 0.05
 HOPELESS = 1.0  # deficit, nat per observation, that no tone curve compensates
 MOST_COMPARED = 80  # largest number of choices that are compared
-STANDARD_ERRORS, SMALLEST_GAIN = 2.0, 0.0125  # deficits up to these (the latter in nat) are excused
+# A deficit is excused up to this number of standard errors, or up to this gain, nat.
+STANDARD_ERRORS, SMALLEST_GAIN = 2.0, 0.0125
 LARGEST_CHANCE = 0.25  # largest deficit that a standard error excuses, nat per observation
 # Predictions that differ by at most this in every view count as equal, 8-bit levels.
 INVISIBLE_DIFFERENCE = 1.0
@@ -88,7 +89,10 @@ class Candidate:
 
 
 def choose(candidates: list[Candidate]) -> Candidate:
-    """Return the simplest candidate that is not clearly worse than the best."""
+    """Return the simplest candidate that is not clearly worse than the best.
+
+    A candidate that is as simple and predicts better is returned instead.
+    """
     simplest = min((c for c in candidates if c.good), key=lambda c: c.parameters)
     # Among equally simple candidates the density decides.
     as_simple = [c for c in candidates if c.parameters <= simplest.parameters]

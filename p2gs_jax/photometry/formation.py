@@ -114,7 +114,8 @@ def gain(
 ) -> Any:
     """Return e W V, the factor that broadcasts against radiance (paper, eq. 4: only e).
 
-    `capture` is of the view, or of every single pixel; `positions` belong to single pixels.
+    `capture` holds the parameters of the view, or of every single pixel; `positions` belong to
+    single pixels.
     Raises ValueError: vignetting is modelled, and positions of single pixels are missing.
     """
     e = _by_pixel(capture.exposure)
@@ -196,9 +197,9 @@ def formation(
 ) -> Values:
     """Return T(e W V L), the display values of radiance `linear`.
 
-    With a `correction` of the view's display values, the radiance is an image. `capture` is of
-    the view, or of every single pixel; single pixels need `positions` if vignetting is modelled
-    (see `gain`).
+    With a `correction` of the view's display values, the radiance is an image. `capture` holds the
+    parameters of the view, or of every single pixel. Single pixels need `positions` if vignetting
+    is modelled (see `gain`).
     """
     ldr: Any = linear
     if isinstance(correction, Formation):

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.core.numerics import LN2
+from p2gs_jax.photometry.formation import squared_radii
 
 WORDS: dict[str, str] = {  # the meters, and their names in text
     "log_average": "log average",
@@ -44,20 +45,22 @@ NEGLIGIBLE_EV = 0.05  # exposures that vary by less, stops, count as constant
 
 
 def meter(linear: Float[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"]) -> dict[str, float]:
-    """Return readings of premultiplied radiance, natural logs; NaN if too little is opaque."""
+    """Return readings of premultiplied radiance, natural logs.
+
+    They are NaN if too little is opaque, or all is black.
+    """
     step = max(1, int(np.sqrt(alpha.size / PIXELS)))
     weight = np.asarray(alpha[::step, ::step], np.float64)
     light = np.asarray(linear[::step, ::step], np.float64) @ BT709
     seen = (weight > 0) & np.isfinite(light)
     if weight[seen].sum() < LEAST_SEEN * weight.size:
         return dict.fromkeys(METERS, float("nan"))
-    height, width = weight.shape
-    y, x = np.mgrid[:height, :width] + 0.5
-    squared = ((x - width / 2) ** 2 + (y - height / 2) ** 2) / ((width**2 + height**2) / 4)
-    central = (weight * np.exp(-squared / (2 * CENTRE**2)))[seen]
+    central = (weight * np.exp(-squared_radii(*weight.shape) / (2 * CENTRE**2)))[seen]
     weight, light = weight[seen], np.maximum(light[seen] / weight[seen], 0.0)
-    floor = max(DARKEST * float(np.average(light, weights=weight)), np.finfo(float).tiny)
-    light = np.maximum(light, floor)
+    mean = float(np.average(light, weights=weight))
+    if not mean > 0:
+        return dict.fromkeys(METERS, float("nan"))
+    light = np.maximum(light, DARKEST * mean)
     logs = np.log(light)
     order = np.argsort(light)
     below = np.cumsum(weight[order])
@@ -102,7 +105,7 @@ class Metering:
 
     @property
     def constant(self) -> Rule:
-        """The rule without a meter: the geometric mean of the training exposures."""
+        """The rule without a meter: the geometric mean of the exposures of metered views."""
         return next(rule for rule in self.candidates if rule.meter is None)
 
     def exposure_ev(self, readings: Readings, of: ExposureOf = "auto") -> float:
@@ -124,9 +127,10 @@ class Metering:
     def exposure(self, readings: Readings, of: ExposureOf = "auto") -> float:
         """Return the exposure of a picture, a factor on radiance.
 
-        NaN readings give the geometric mean. `auto` follows `rule`; `log_average` and `centre`
-        expose that average to mid-grey; `highlights` exposes the 99th percentile to just below
-        white; `protected` is `log_average`, or `highlights` where the former would clip highlights.
+        NaN readings give the geometric mean of metered views. `auto` follows `rule`; `log_average`
+        and `centre` expose that average to mid-grey; `highlights` exposes the 99th percentile to
+        just below white; `protected` is `log_average`, or `highlights` where the former would clip
+        highlights.
         """
         return float(np.exp(self._log_exposure(readings, of)))
 

@@ -21,11 +21,12 @@ from p2gs_jax.types import Array
 
 Base = Literal["srgb", "power"]
 BASES: tuple[Base, ...] = get_args(Base)
-# Knots, display values. Splines are 0 at the knots HELD, which fixes scale and power.
+# Knots, display values. A single spline is 0 at both knots HELD, which fixes scale and power. Each
+# of several splines is 0 at the first only, because their powers differ.
 _PERCENT = [2, 5, 8, 12, 16, 21, 26, 32, 38, 44, 50, 56, 62, 68, 74, 80, 86, 90, 94, 98]
 KNOTS = np.array(_PERCENT) / 100
 HELD = (6, 16)
-# Knots that are solved for: of one spline, and of each of several, whose powers differ.
+# Free knots of a single spline, and of each of several.
 FREE = tuple(k for k in range(len(KNOTS)) if k not in HELD)
 FREE_OF_EACH = tuple(k for k in range(len(KNOTS)) if k != HELD[0])
 DARKEST = 0.5 / 255  # darkest display value that is decoded: half an 8-bit code
@@ -48,7 +49,7 @@ class Response:
     """A response: one for all photographs, or one for each camera or channel."""
 
     base: Base = "srgb"  # curve that splines are added to
-    # Values of log exposure added at `KNOTS`, or None; where several are, their mean.
+    # Log exposure added at `KNOTS`; with several splines, their mean. None: there is no spline.
     spline: Spline | None = None
     by: ResponseKind = "all"  # one spline for all, or one for each camera or channel
     # Splines of the cameras, or of red, green and blue; empty where there is one for all.

@@ -29,7 +29,8 @@ class PhotometricSolution:
 
     model: ModelName  # exposures and gammas that vary
     response: Response  # base curve and spline
-    # Natural logarithm; mean 0 over each component without known exposures.
+    # Natural logarithm; mean 0 over the observed views of a component without known exposures. A
+    # view without observations has that of its camera, or 0 if it varies per view.
     log_exposures: PerView
     # Standard errors of `log_exposures` (robust, gauge fixed); inf where unobserved or unknown.
     exposure_errors: PerView
@@ -53,7 +54,7 @@ class PhotometricSolution:
     warnings: tuple[str, ...]  # warnings for the user
     white_balance_level: Level | None  # level of the white balance; None: it does not vary
     # Log factors on red, green, blue beside the exposure: their mean is 0 in every view and over
-    # the views of a component. They are 0 if white balance does not vary.
+    # the observed views of a component. They are 0 if white balance does not vary.
     white_balance: Float[np.ndarray, "v 3"]
     white_balance_errors: Float[np.ndarray, "v 3"]  # standard errors, as `exposure_errors`
     vignetting: VignettingKind | None  # per camera, or per camera and channel
@@ -98,10 +99,9 @@ class Agreement(NamedTuple):
         if self.views < 2:
             known = count_of(self.views, "view")
             return f"{source} gives the exposure of {known}: nothing to compare."
-        head = (
-            f"{source} of {self.views} views: correlation {self.correlation:.3f}, slope "
-            f"{self.slope:.2f}, RMS {self.rms_ev:.2f} EV."
-        )
+        fit = f"correlation {self.correlation:.3f}, slope {self.slope:.2f}, "
+        fit = "" if np.isnan(self.slope) else fit
+        head = f"{source} of {self.views} views: {fit}RMS {self.rms_ev:.2f} EV."
         count = int(self.disagrees.sum())
         if not count:
             return head + f" {source} and the pixels agree within {NOTICEABLE_EV:g} EV."

@@ -90,7 +90,7 @@ def _fit_surface(flat: Values, places: Float[np.ndarray, "n 2"]) -> tuple[float,
     n, (x, y) = np.bincount(block), places.T
     terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], 1)
     free = len(n) - terms.shape[1]
-    if len(n) < FEWEST_BLOCKS or free < FEWEST_BLOCKS // 2:
+    if len(n) < FEWEST_BLOCKS:
         return float("nan"), 1.0
     means = np.stack([np.bincount(block, c) / n for c in (flat, *terms.T)], 1)
     # The weight of a block saturates with its count, because errors are shared inside a block.

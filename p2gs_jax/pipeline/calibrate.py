@@ -335,12 +335,17 @@ def calibrate_stack(
 def _stack_messages(views: tuple[View, ...], found: StackColors, local_ev: float) -> list[str]:
     """Return notes on dark frames, on moved frames, and on local tone mapping."""
     out = []
-    dark = [view.name for view, signal in zip(views, found.signal, strict=True) if not signal]
+    dark, astray = (
+        [view.name for view, of in zip(views, flags, strict=True) if of]
+        for flags in (~found.signal, found.astray)
+    )
     if dark:
         out.append(f"Nearly all pixels are black or saturated in {first_few(dark)}.")
     moved = np.abs(found.shifts).max()
     if moved > 0:
         out.append(f"Frames were moved by up to {count_of(moved, 'pixel')}.")
+    if astray:
+        out.append(f"The camera moved too far to align {first_few(astray)} with the frame before.")
     if local_ev > LOCAL_EV:
         out.append(
             f"One response does not explain this stack: between frames, regions of equal "

@@ -41,8 +41,9 @@ def test_meters_follow_the_light_and_nothing_else():
     assert found["centre_log_average"] > found["log_average"] + 0.1
 
 
-def test_a_transparent_render_has_no_reading_and_gets_the_mean_exposure():
-    found = meter(np.zeros((40, 60, 3)), np.zeros((40, 60)))
+@pytest.mark.parametrize("alpha", [0.0, 1.0])
+def test_transparent_and_black_renders_have_no_reading_and_get_the_mean_exposure(alpha):
+    found = meter(np.zeros((40, 60, 3)), np.full((40, 60), alpha))
     assert np.isnan(list(found.values())).all()
     logs = 0.7 - READ["average"]
     assert fit(logs).exposure_ev(found) == pytest.approx(logs.mean() / LN2)

@@ -11,7 +11,7 @@ import p2gs_jax
 from p2gs_jax import calibrate, calibrate_run, calibrate_stack
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.alignment import exposure_error
-from p2gs_jax.photometry.sources.stack import read_stack
+from p2gs_jax.photometry.sources.stack import read_stack, stack_colors
 from p2gs_jax.run.photometry_files import read_photometry
 from p2gs_jax.synth.sensor import read_true_exposures
 
@@ -113,6 +113,16 @@ def test_the_command_writes_the_calibration_of_a_stack(tmp_path, succeeded):
     assert details["one_response"]
     assert any("times.csv of" in m for m in details["messages"])
     assert (out / "calibration.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("moved", [10, 24])
+def test_a_moved_frame_is_aligned_or_reported(tmp_path, moved):
+    write_stack(tmp_path, [1.0, 1.4, 2.0])
+    path = sorted(tmp_path.glob("*.png"))[1]
+    cv2.imwrite(str(path), np.roll(cv2.imread(str(path)), moved, axis=1))
+    found = stack_colors(read_stack(tmp_path), 0)
+    assert found.astray.tolist() == ([False] * 3 if moved == 10 else [False, True, True])
+    assert moved > 10 or found.shifts.tolist() == [[0, 0], [-moved, 0], [0, 0]]
 
 
 def test_a_stack_with_local_tone_mapping_is_recognised(tmp_path):

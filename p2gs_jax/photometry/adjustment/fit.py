@@ -84,8 +84,7 @@ def explain(
             radiance[points] = np.where(precision > 0, total / precision, np.nan)
         of_exposure = at.residual / fit.theta.a[mine.views][:, None]
         residual[pick] = np.where(usable, of_exposure, 0.0)
-        ideal = 1 / mine.decoded(response)[1] ** 2
-        ignored += int(((at.weight < IGNORED * ideal) & usable).sum())
+        ignored += int((at.weight < IGNORED * model.noise_weight).sum())
     return radiance, residual, ignored / max(int(problem.usable.sum()), 1)
 
 
@@ -301,14 +300,14 @@ def _warnings(
     few = np.flatnonzero(s.observations_per_view < MIN_OBSERVATIONS)
     if len(few):
         out.append(
-            f"Fewer than {MIN_OBSERVATIONS} usable track observations make exposures uncertain in "
-            f"{count_of(len(few), 'training view')} ({_listed(few, names)})."
+            f"Fewer than {MIN_OBSERVATIONS} usable observations of shared points make exposures "
+            f"uncertain in {count_of(len(few), 'training view')} ({_listed(few, names)})."
         )
     groups = len(set(s.component[active].tolist()))
     if groups > 1:
         out.append(
-            f"The tracks fall into {groups} groups of views that share no point: exposures can "
-            "be compared only inside a group."
+            f"The views fall into {groups} groups that share no point: exposures can be compared "
+            "only inside a group."
         )
     off = np.nan_to_num(np.abs(balance).max(1))
     tinted = np.flatnonzero(off > NOTICEABLE_BALANCE_EV)

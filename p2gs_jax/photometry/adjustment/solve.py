@@ -286,7 +286,8 @@ def with_free_curve(
 def light_spread(model: Forward, theta: Parameters) -> float:
     """Return the spread of the light of one surface over views and positions in images.
 
-    It is the standard deviation of exposures, white balance and vignetting, log units.
+    It combines the standard deviations of exposures (white balance per view is averaged out) and of
+    the light that cameras add, log units.
     """
     added = 0.0 if model.features is None else model.features.of(theta.k)
     return float(np.hypot(np.std(theta.b.mean(1)), np.std(added)))

@@ -88,8 +88,8 @@ def rendered_colors(
     scene: Scene,
     store: ImageStore,
     cfg: RenderConfig,
-    seed: int = 0,
-    on_view: OnView = None,
+    seed: int,
+    on_view: OnView,
 ) -> Observations:
     """Sample pixels of each training view, chosen by `seed`, in training views that show them.
 

@@ -26,7 +26,7 @@ from p2gs_jax.types import Scene, View
 POSITION_DEVIATION = 1 / 6
 # Factor on this deviation for positions from calibration or rendered depth.
 PROJECTED_UNCERTAINTY = 2.0
-# Side of the cells of a scene with shared errors, over the median distance of observed points.
+# Side of a cell, whose points share errors, as a share of the median distance of observed points.
 # Errors over standard errors in a town of 100 frames: 2.5 by image regions; in cells 1.9 at side
 # 0.1, 1.5 at 0.25, 1.7 at 0.5. A matte plane and a short town have 0.9 by both. If cells are too
 # few to compare, their sides are halved.
@@ -196,7 +196,7 @@ def point_colors(
         view_count=len(views),
         point_count=len(surfaces.points),
         cameras=np.unique(cameras, return_inverse=True)[1],
-        too_coarse=int(sum((~kept).sum() for kept in keep)),
+        too_coarse=int(sum((~k & (s > 0)).sum() for k, s in zip(keep, scales, strict=True))),
         names=tuple(view.name for view in views),
         positions=positions,
         brightest=brightest,

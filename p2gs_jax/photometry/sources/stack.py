@@ -25,8 +25,8 @@ ABOVE_BLACK = 8 / 255  # least distance of a signal from the black level, displa
 # A spike in the histogram is the black level if it is below this 8-bit value and holds this share.
 BLACKEST, SPIKE = 40, 0.3
 SIGNAL = 0.15  # least share of pixels with signal in a useful frame
-# Shifts beyond this many pixels are errors of the alignment.
-LARGEST_SHIFT = 7
+# Frames are searched for shifts of up to 2^SHIFT_BITS - 1 pixels; a larger one ends at this bound.
+SHIFT_BITS = 4
 SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"}
 
 Image = UInt8[np.ndarray, "h w 3"]
@@ -49,6 +49,7 @@ class StackColors(NamedTuple):
     shifts: Float[np.ndarray, "v 2"]  # moves (x, y) of each frame to fit the first, pixels
     black: float  # display value up to which pixels count as black
     signal: Bool[np.ndarray, " v"]  # frames in which enough pixels are neither black nor saturated
+    astray: Bool[np.ndarray, " v"]  # frames that moved too far to be aligned with the one before
 
 
 def read_stack(folder: Path) -> Stack:
@@ -80,22 +81,21 @@ def read_stack(folder: Path) -> Stack:
     return Stack(tuple(views), images, ~grown)
 
 
-def align(images: list[Image]) -> Float[np.ndarray, "v 2"]:
-    """Return the shifts (x, y) that align each frame with the first, pixels.
+def align(images: list[Image]) -> tuple[Float[np.ndarray, "v 2"], Bool[np.ndarray, " v"]]:
+    """Return the shifts (x, y) that align each frame with the first, pixels; frames without one.
 
     They are sums of shifts between successive frames. Median threshold bitmaps do not depend on
     exposure. Mostly black or white frames give random shifts, which are ignored.
     """
-    matcher = cv2.createAlignMTB(3)
+    matcher = cv2.createAlignMTB(SHIFT_BITS)
     gray = [cv2.cvtColor(i, cv2.COLOR_RGB2GRAY) for i in images]
-    shifts = np.zeros((len(images), 2))
+    shifts, astray = np.zeros((len(images), 2)), np.zeros(len(images), bool)
     for k in range(1, len(images)):
         step = np.array(matcher.calculateShift(gray[k - 1], gray[k]), float)
         useful = all(25 < np.median(g) < 230 for g in (gray[k - 1], gray[k]))
-        if not useful or np.abs(step).max() > LARGEST_SHIFT:
-            step = np.zeros(2)
-        shifts[k] = shifts[k - 1] + step
-    return shifts
+        astray[k] = useful and np.abs(step).max() >= 2**SHIFT_BITS - 1
+        shifts[k] = shifts[k - 1] + (step if useful and not astray[k] else 0)
+    return shifts, astray
 
 
 def black_level(stack: Stack) -> float:
@@ -135,9 +135,9 @@ def choose_points(stack: Stack, black: float, seed: int) -> Float[np.ndarray, "p
     return np.stack([x[chosen], y[chosen]], 1) + 0.5
 
 
-def stack_colors(stack: Stack, seed: int = 0) -> StackColors:
+def stack_colors(stack: Stack, seed: int) -> StackColors:
     """Align a stack, choose points (drawn by `seed`) and sample every frame there."""
-    shifts = align(stack.images)
+    shifts, astray = align(stack.images)
     black = black_level(stack)
     xy = choose_points(stack, black, seed)
     pixels = (image[stack.valid] for image in stack.images)
@@ -159,4 +159,4 @@ def stack_colors(stack: Stack, seed: int = 0) -> StackColors:
         names=tuple(v.name for v in stack.views),
         brightest=np.concatenate([s.brightest for s in found]),
     )
-    return StackColors(observations, xy, shifts, black, np.array(lit))
+    return StackColors(observations, xy, shifts, black, np.array(lit), astray)
