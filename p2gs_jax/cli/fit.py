@@ -322,6 +322,7 @@ def checked(cfg: FitConfig) -> FitConfig:
         fix=DURATIONS,
     )
     check(train.steps >= 1, "--steps must be at least 1")
+    check(train.seed >= 0, "--seed must be at least 0")
     check(train.batch >= 1, "--train.batch must be at least 1")
     check(not isinstance(most, int) or most >= 1, "--gaussians must be at least 1")
     why = "--render.background must be linear radiance, three numbers that are not negative"

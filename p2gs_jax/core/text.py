@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
+from pathlib import PurePosixPath
 from typing import Any
 
 # Control characters except tab and newline, surrogates, and marks of the direction of writing.
@@ -34,6 +36,16 @@ def as_clock(seconds: float) -> str:
     minutes, rest = divmod(max(int(seconds), 0), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def stems(names: Sequence[str]) -> list[str]:
+    """Return names of files without suffix, or as `a-jpg` if another differs only by suffix."""
+    bare = [PurePosixPath(name).with_suffix("").as_posix() for name in names]
+    times = Counter(bare)
+    return [
+        stem if times[stem] == 1 else f"{stem}-{PurePosixPath(name).suffix[1:]}"
+        for name, stem in zip(names, bare, strict=True)
+    ]
 
 
 def natural(text: str) -> tuple[list[int | str], str]:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from p2gs_jax.core.text import first_few
+from p2gs_jax.core.text import first_few, stems
 from p2gs_jax.errors import UserError
 from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.scene.files import files_below
@@ -118,9 +118,10 @@ def find_renders(folder: str | Path, scene: Scene) -> OtherRenders:
         why = "the run has no held-out views, on which renders are compared."
         raise UserError(why, fix="fit with --test-every 8")
     names, named = {row: scene.views[row].name for row in scene.test_indices}, _by_name(folder)
+    all_stems = stems([view.name for view in scene.views])
     files: dict[int, Path] = {}
-    for row, name in names.items():
-        stem = Path(name).with_suffix("").as_posix()
+    for row in names:
+        stem = all_stems[row]
         found = [stem + suffix for suffix in (".render.png", *SUFFIXES) if stem + suffix in named]
         if found:
             files[row] = named[found[0]]

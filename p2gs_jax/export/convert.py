@@ -15,6 +15,7 @@ import numpy as np
 from p2gs_jax.core.atomic import atomic_folder, write_json
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.core.progress import Reporter
+from p2gs_jax.core.text import stems
 from p2gs_jax.errors import UserError
 from p2gs_jax.export.folders import Program, write_folder
 from p2gs_jax.export.page import MEGABYTE, write_page
@@ -161,12 +162,12 @@ def _other_trainer(name: Program, place: Path, fitted: Run, reporter: Reporter) 
 def _exr(place: Path, fitted: Run, reporter: Reporter) -> str:
     views = fitted.scene.views
     with atomic_folder(place) as temporary:
-        for index, view in enumerate(views):
+        for index, stem in enumerate(stems([view.name for view in views])):
             camera = camera_of(fitted.store, index)
-            result, path = fitted.render(camera), (temporary / view.name).with_suffix(".exr")
+            result, path = fitted.render(camera), temporary / f"{stem}.exr"
             linear, depth, alpha = map(np.asarray, (result.linear, result.depth, result.alpha))
             write = functools.partial(write_exr, depth=depth, alpha=alpha, camera=camera)
-            shot = read_exif_settings(view.image_path)
+            shot = read_exif_settings(views[index].image_path)
             write(path, linear, transform=fitted.own_display(index), shot=shot)
             reporter.stage("Rendering", index + 1, len(views))
     return f"{len(views)} linear renders"

@@ -8,14 +8,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import PurePosixPath
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from p2gs_jax.core.text import natural
+from p2gs_jax.core.text import natural, stems
 from p2gs_jax.errors import UserError
 from p2gs_jax.scene.lens import scale_intrinsics
 from p2gs_jax.scene.pixels.store import camera_at
@@ -73,10 +72,9 @@ class Shot:
 
 def view_shots(views: Sequence[View], max_width: int | None = None) -> list[Shot]:
     """Return a shot for every view of a scene, in order, at most `max_width` pixels wide."""
-    out = []
-    for row, view in enumerate(views):
+    out, names = [], stems([view.name for view in views])
+    for row, (view, name) in enumerate(zip(views, names, strict=True)):
         K, width, height = camera_at(view, max_width)
-        name = PurePosixPath(view.name).with_suffix("").as_posix()
         viewmat, K = np.asarray(view.viewmat, np.float64), np.asarray(K, np.float64)
         out.append(Shot(name, viewmat, K, width, height, view=row, time=view.time))
     return out

@@ -14,6 +14,7 @@ from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.clock import Stopwatch, over_budget
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.core.runtime import return_freed_memory
+from p2gs_jax.core.text import stems
 from p2gs_jax.evaluation.evaluate import evaluate
 from p2gs_jax.evaluation.lpips import LpipsWeights
 from p2gs_jax.evaluation.references import Reference, find_radiance
@@ -62,6 +63,7 @@ def finish(
     watch, exposures = Stopwatch(), {}
     solution = None if account.selection is None else account.selection.solution
     in_summary: dict[int, ViewResult | None] = dict.fromkeys(summary_rows(scene))
+    names = stems([view.name for view in scene.views])
 
     def keep(result: ViewResult) -> None:
         """Write a held-out view and keep its exposure; keep the views of the summary."""
@@ -69,7 +71,7 @@ def finish(
         if view.split == "test":
             exposures[result.index] = result.transform.exposure
             with watch("files"):
-                write_view(folder.renders, view.name, result, store)
+                write_view(folder.renders, names[result.index], result, store)
         if result.index in in_summary:
             in_summary[result.index] = result
 

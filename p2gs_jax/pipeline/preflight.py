@@ -9,6 +9,7 @@ pixels of a view are in the device's memory, which is not estimated.
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +28,9 @@ from p2gs_jax.presets import flat, to_dict
 from p2gs_jax.run.folder import RunFolder, find, require_free
 from p2gs_jax.run.read import read_config
 from p2gs_jax.scene.exposures import check_source, read_known_exposures
+from p2gs_jax.scene.masks import background_color
 from p2gs_jax.scene.pixels.store import size_at
+from p2gs_jax.scene.split import EVERY, check_every, read_split
 from p2gs_jax.types import Scene
 
 # Bytes of programs and libraries, and for each parameter, pixel of a view and decoded pixel.
@@ -36,6 +39,18 @@ PARAMETER_BYTES = 37  # with moments, gradient and the copies of a densification
 PIXEL_BYTES = 650
 DECODED_BYTES = 7
 OPTIONS = "--gaussians, --max-width or --data.cache-mb"
+# Smallest and largest values of whole numbers that no other check bounds; None: there is no bound.
+BOUNDS = {
+    "train.seed": (0, None),
+    "train.log_every": (1, None),
+    "render.sh_degree": (0, 3),
+    "render.tile": (1, None),
+    "render.chunk": (1, None),
+    "render.pixels_in_flight": (1, None),
+    "init.max_seeds": (0, None),
+    "init.shell_count": (1, None),
+    "data.cache_mb": (0, None),
+}
 
 
 @dataclass(frozen=True)
@@ -68,6 +83,10 @@ def preflight(cfg: FitConfig, paths: Paths, *, resume: bool = False) -> LpipsWei
     check_sources(paths)
     check_source(cfg.photometry.known)
     check_reference(paths.reference)
+    background_color(cfg.data)
+    check_every(cfg.data.test_every)
+    if cfg.data.split not in (None, EVERY):
+        read_split(Path(cfg.data.split))
     name = cfg.evaluation.lpips_weights
     return None if name is None else read_lpips_weights(name)
 
@@ -92,12 +111,21 @@ def check_scene(
 
 
 def check_options(cfg: FitConfig) -> None:
-    """Check the options that depend on each other.
+    """Check numbers, and the options that depend on each other.
 
     Raises:
-        UserError: the spread is not in [0, 1), the initial exposures contradict known exposures or
-            the curve, or the appearance contradicts the curve.
+        UserError: a number is not finite or out of its range, the initial exposures contradict
+            known exposures or the curve, or the appearance contradicts the curve.
     """
+    for name, value in flat(to_dict(cfg)).items():
+        option, (least, most) = f"--{name.replace('_', '-')}", BOUNDS.get(name, (None, None))
+        for number in value if isinstance(value, tuple | list) else (value,):
+            if isinstance(number, float) and not math.isfinite(number):
+                raise UserError(f"{option} {number} is not a finite number.")
+            if least is not None and number < least:
+                raise UserError(f"{option} must be at least {least}.")
+            if most is not None and number > most:
+                raise UserError(f"{option} must be at most {most}.")
     p, share = cfg.photometry, cfg.densify.spread
     curved, random = p.curve != "linear", "--photometry.curve linear --photometry.start random"
     if not 0 <= share < 1:

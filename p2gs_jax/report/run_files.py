@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import read_jsonl
-from p2gs_jax.core.text import parse_json
+from p2gs_jax.core.text import parse_json, stems
 from p2gs_jax.errors import UserError
 from p2gs_jax.presets import from_dict
 from p2gs_jax.run.folder import find
@@ -158,7 +158,7 @@ def _read_log(path: Path, missing: list[str]) -> list[dict[str, Any]]:
 
 def _find_held_out(folder: Path, names: list[str]) -> tuple[HeldOutFiles, ...]:
     """Return the held-out views that `fit` wrote into `renders/`; `names` has all views."""
-    whole = {str(Path(name).with_suffix("")): name for name in names}
+    whole = dict(zip(stems(names), names, strict=True))
     out = []
     for render in sorted(folder.rglob("*.render.png")):
         stem = render.name.removesuffix(".render.png")

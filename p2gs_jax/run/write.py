@@ -126,9 +126,9 @@ def write_run(
         write_summary(folder.summary, shown, params, scene, cfg, true_exposures, **words)
 
 
-def write_view(folder: Path, name: str, result: ViewResult, store: ImageStore) -> None:
-    """Write one view as EXR and PNG, and its photograph as PNG, under the photograph's name."""
-    stem, camera = Path(name).with_suffix("").as_posix(), camera_of(store, result.index)
+def write_view(folder: Path, stem: str, result: ViewResult, store: ImageStore) -> None:
+    """Write one view as EXR and PNG, and its photograph as PNG; `stem` begins their names."""
+    camera = camera_of(store, result.index)
     images = (result.linear, result.alpha, result.ldr, result.transform, result.depth)
     write_frame(folder, OutputFrame(stem, *images, camera, result.photograph))
 

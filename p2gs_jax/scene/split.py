@@ -59,6 +59,13 @@ def split_scene(scene: Scene, cfg: DataConfig) -> Scene:
     return dataclasses.replace(scene, views=views, split_by=by)
 
 
+def check_every(test_every: int) -> None:
+    """Raise UserError: every n-th view cannot be held out, because n is negative or 1."""
+    if test_every < 0 or test_every == 1:
+        why = f"--test-every {test_every} would hold out every view or none."
+        raise UserError(why, fix="use 0 (hold out none) or a number from 2 on; 8 is usual")
+
+
 def assign_split(views: tuple[View, ...], test_every: int) -> tuple[View, ...]:
     """Return the views with `split` set, in their order.
 
@@ -67,9 +74,7 @@ def assign_split(views: tuple[View, ...], test_every: int) -> tuple[View, ...]:
     scene are `test`. No view is held out if n is 0, or if its camera would have no training view.
     Raises UserError: n is negative, or 1.
     """
-    if test_every < 0 or test_every == 1:
-        why = f"cannot hold out every n-th view with n = {test_every}"
-        raise UserError(why, fix="use 0 (hold out none) or a number from 2 on; 8 is usual")
+    check_every(test_every)
     test: set[int] = set()
     if test_every:
         by_camera: dict[str, list[int]] = defaultdict(list)

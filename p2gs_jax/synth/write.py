@@ -159,6 +159,9 @@ def _check(out: Path, options: dict[str, Any]) -> None:
         why += f"and an ISO spread of {std} cannot be rendered."
         fix = "use at least 1 frame, 16x16 pixels, 1 sample, and a spread of 0 or more"
         raise UserError(why, fix=fix)
+    if options["seed"] < 0 or options["points_sampled"] < 1:
+        why = f"seed {options['seed']} and {options['points_sampled']} seed points cannot be used."
+        raise UserError(why, fix="use a seed of 0 or more, and at least 1 point")
     _require_free(out)
     length = (frames - 1) * step
     if options["layout"] != "long" and length > STREET_END:

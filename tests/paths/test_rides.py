@@ -66,6 +66,11 @@ def test_the_camera_with_the_most_views_is_the_default():
         of_camera(shots, views, "front")
 
 
+def test_photographs_that_differ_only_by_suffix_have_different_shots():
+    views = [view(name, np.eye(4)) for name in ("a/1.jpg", "a/1.png", "a/2.png")]
+    assert [s.name for s in view_shots(views)] == ["a/1-jpg", "a/1-png", "a/2"]
+
+
 def around(azimuths):
     """Return shots that look down by 30 degrees at FOCUS, from azimuths in degrees."""
     out, e = [], np.deg2rad(30.0)
