@@ -87,7 +87,7 @@ class Render:
         from p2gs_jax.cli.frames import panoramas_of, shots_of
         from p2gs_jax.cli.tables import stdout
         from p2gs_jax.core.progress import TerminalReporter
-        from p2gs_jax.formats.frames import open_frames
+        from p2gs_jax.formats.frames import open_frames, remove_frame
         from p2gs_jax.paths.files import near_scene, read_cameras, write_cameras
 
         begin = time.monotonic()
@@ -98,6 +98,11 @@ class Render:
         cameras = None if cameras is None else near_scene(cameras, fitted.scene.origin)
         out = self.out or fitted.folder / "renders" / _default_name(self, fitted.scene)
         _check_place(out, self.overwrite)
+        # An earlier render may have had more frames. The path of this one may be its file.
+        if (out / "cameras.json").is_file():
+            for shot in read_cameras(out / "cameras.json"):
+                remove_frame(out, shot.name)
+            (out / "cameras.json").unlink()
         with TerminalReporter() as reporter:
             job = (
                 panoramas_of(self, fitted)

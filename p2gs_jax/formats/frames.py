@@ -53,6 +53,12 @@ def write_png(path: Path, ldr: Float32[np.ndarray, "h w 3"]) -> None:
             raise OSError(f"{path} could not be written")
 
 
+def remove_frame(folder: Path, name: str) -> None:
+    """Remove the files that `write_frame` wrote for a frame of this name, if there are any."""
+    for suffix in (".exr", ".png", ".render.png", ".photograph.png"):
+        (folder / f"{name}{suffix}").unlink(missing_ok=True)
+
+
 def write_frame(folder: Path, frame: OutputFrame) -> None:
     """Write NAME.exr, and NAME.png or, with a photograph, `.render.png` and `.photograph.png`."""
     stem = folder / frame.name

@@ -62,7 +62,7 @@ def split_scene(scene: Scene, cfg: DataConfig) -> Scene:
 def check_every(test_every: int) -> None:
     """Raise UserError: every n-th view cannot be held out, because n is negative or 1."""
     if test_every < 0 or test_every == 1:
-        why = f"--test-every {test_every} would hold out every view or none."
+        why = f"--test-every {test_every} is not valid."
         raise UserError(why, fix="use 0 (hold out none) or a number from 2 on; 8 is usual")
 
 

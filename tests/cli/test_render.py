@@ -140,13 +140,17 @@ def test_wrong_options_are_refused_and_nothing_is_written(refused, run_copy, opt
 
 
 def test_frames_are_replaced_only_with_overwrite(refused, rendered, run_copy, tmp_path):
-    argv = (run_copy, "--trajectory", "drive", "--frames", 2, "--width", 64, "--out", tmp_path)
-    rendered(*argv)
+    argv = (run_copy, "--trajectory", "drive", "--width", 64, "--out", tmp_path)
+    rendered(*argv, "--frames", 3)
+    (tmp_path / "notes").touch()
     before = [p.stat().st_mtime_ns for p in tmp_path.iterdir()]
     assert "--overwrite" in refused("render", *argv)
     assert [p.stat().st_mtime_ns for p in tmp_path.iterdir()] == before
-    assert "2 frames in" in rendered(*argv, "--overwrite")
+    assert "2 frames in" in rendered(*argv, "--frames", 2, "--overwrite")
     assert [p.stat().st_mtime_ns for p in tmp_path.iterdir()] != before
+    # The third frame is gone, other files stay.
+    assert len(list(tmp_path.glob("*.png"))) == len(list(tmp_path.glob("*.exr"))) == 2
+    assert (tmp_path / "notes").exists()
 
 
 def test_a_folder_in_place_of_a_video_is_kept(refused, run_copy, tmp_path):
