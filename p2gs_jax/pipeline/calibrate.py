@@ -39,6 +39,7 @@ from p2gs_jax.photometry.solution import Agreement, PhotometricSolution, compare
 from p2gs_jax.photometry.sources.points import has_tracks, rendered_colors, surface_colors
 from p2gs_jax.photometry.sources.stack import SATURATED, StackColors, read_stack, stack_colors
 from p2gs_jax.photometry.unmodelled import LOCAL_EV, regional_ev
+from p2gs_jax.pipeline.preflight import check_choice
 from p2gs_jax.presets import require_config
 from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.run.photometry_files import write_solution
@@ -140,6 +141,7 @@ def calibrate(
         UserError: a fault that the user can fix.
     """
     cfg = require_config(cfg)
+    check_choice(cfg.photometry)
     cfg = dataclasses.replace(cfg, data=dataclasses.replace(cfg.data, test_every=0))
     reporter, out, begin = reporter or Silent(), Path(out), time.monotonic()
     for source in (cfg.photometry.known, compare_with):
@@ -193,7 +195,9 @@ def calibrate_run(
     """
     begin, reporter = time.monotonic(), reporter or Silent()
     _require_no_run(Path(out))
-    requested, run = require_config(cfg), load_run(run_dir, scene)
+    requested = require_config(cfg)
+    check_choice(requested.photometry)
+    run = load_run(run_dir, scene)
     cfg = dataclasses.replace(run.cfg, photometry=requested.photometry)
     run.require_photographs(run.scene.train_indices)
     # Only static Gaussians: a moving surface point is elsewhere in another view.

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import jax
 
-from p2gs_jax.config import FitConfig
+from p2gs_jax.config import FitConfig, PhotometryConfig
 from p2gs_jax.core.atomic import plain
 from p2gs_jax.core.memory import left_to_process, ran_out, resident
 from p2gs_jax.errors import UserError
@@ -39,6 +39,8 @@ PARAMETER_BYTES = 37  # with moments, gradient and the copies of a densification
 PIXEL_BYTES = 650
 DECODED_BYTES = 7
 OPTIONS = "--gaussians, --max-width or --data.cache-mb"
+# Options of `PhotometryConfig` that `select` replaces.
+CHOSEN = ("model", "curve", "spline", "white_balance", "vignetting", "responses")
 # Smallest and largest values of whole numbers that no other check bounds; None: there is no bound.
 BOUNDS = {
     "train.seed": (0, None),
@@ -145,6 +147,17 @@ def check_options(cfg: FitConfig) -> None:
         why = "the curve 'linear' splats display values; it does not combine with solved exposures."
         fix = "add --photometry.start random, or use the preset ppisp or one of 3dgs*"
         raise UserError(why, fix=fix)
+    check_choice(p)
+
+
+def check_choice(photometry: PhotometryConfig) -> None:
+    """Raise UserError: an option sets what held-out colours would choose instead."""
+    usual = PhotometryConfig()
+    given = [name for name in CHOSEN if getattr(photometry, name) != getattr(usual, name)]
+    if photometry.select and photometry.start == "tracks" and given:
+        option = f"--photometry.{given[0].replace('_', '-')}"
+        why = f"{option} has no effect: held-out colours choose the model and the curve."
+        raise UserError(why, fix=f"add --photometry.no-select, or leave out {option}")
 
 
 def check_run_dir(run_dir: Path, resume: bool, cfg: FitConfig) -> bool:

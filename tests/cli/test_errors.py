@@ -33,6 +33,8 @@ WRONG = [
     ("fit castle --out run --rendr.tile 8 8", "--render.tile"),
     ("fit castle --out run --steps many", "'many' is not a whole number"),
     ("fit castle --out run --steps 0", "--steps must be"),
+    ("fit castle --out run --photometry.curve power", "add --photometry.no-select"),
+    ("calibrate castle --out run --photometry.white-balance view", "add --photometry.no-select"),
     ("fit nowhere --out run --test-every 1", "--test-every"),
     ("fit nowhere --out run --split none.txt", "correct the option --split"),
     ("fit nowhere --out run --background puce", "--background 0.5,0.5,0.5"),
