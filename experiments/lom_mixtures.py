@@ -193,6 +193,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=600)
     parser.add_argument("--budget-min", type=float, help="equal minutes as well")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--rate", type=float, help="of learned corrections (default: the preset's)")
     args = parser.parse_args()
     if args.out.resolve().is_relative_to(Path(__file__).resolve().parents[1]):
         raise SystemExit("--out is inside this project, where no picture of these scenes may be.")
@@ -210,6 +211,12 @@ def main() -> None:
         for name, train in budgets.items():
             out = args.out / "runs" / scene.name / name
             under = configs(args.methods, seed=args.seed, **train)
+            if args.rate:
+                fields = {"optimizer.appearance": args.rate}
+                under = {
+                    f"{method}, rate {args.rate:g}": p2gs_jax.with_fields(cfg, fields)
+                    for method, cfg in under.items()
+                }
             rows, shown = measure(scene, out, under)
             rows.insert(0, of_calibrate)
             tables[f"{scene.name}/{name}"] = rows

@@ -154,10 +154,10 @@ class Fit:
 
 @dataclass(frozen=True, kw_only=True)
 class Calibrate:
-    """Solve exposures and tone curves alone, in seconds.
+    """Solve exposures and tone curves alone, without Gaussians.
 
-    They follow from the colours of shared points, without splatting, and have standard errors. The
-    command prints a table and writes photometry.json; open calibration.png first.
+    They follow from the colours of shared points, and have standard errors. The command prints a
+    table and writes photometry.json; open calibration.png first.
 
         p2gs-jax calibrate castle --out photometry
         p2gs-jax calibrate castle --out photometry --known-exposures exif
@@ -269,7 +269,7 @@ class Inspect:
         p2gs-jax inspect drive --cameras front front_left --frames 0:40
     """
 
-    SHORT_NAMES: ClassVar = ("drive", "cameras", "frames")
+    SHORT_NAMES: ClassVar = ("images", "drive", "cameras", "frames")
     scene: Annotated[Path, tyro.conf.Positional]
     """Scene, as for `fit`."""
     data: DataConfig = field(default_factory=DataConfig)

@@ -1,4 +1,4 @@
-"""Photometry without splatting: exposures, gammas and tone curve in seconds.
+"""Photometry without splatting: exposures, gammas and tone curve.
 
 Observations come from the tracks of a scene, through the rendered depth of a finished run, or from
 a stack of exposures of one fixed viewpoint; `solved` processes all of them.
@@ -46,7 +46,12 @@ from p2gs_jax.run.photometry_files import write_solution
 from p2gs_jax.run.plots import write_calibration_plot
 from p2gs_jax.run.read import load_run
 from p2gs_jax.scene import load_scene
-from p2gs_jax.scene.exposures import check_source, read_known_exposures, stated_ev
+from p2gs_jax.scene.exposures import (
+    check_source,
+    read_known_exposures,
+    stated_ev,
+    without_view,
+)
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import View
 
@@ -316,7 +321,8 @@ def calibrate_stack(
     stack, known = read_stack(Path(folder)), None
     if p.known is not None:
         values = read_known_exposures(p.known, list(stack.views))
-        known = KnownExposures(values, p.known_deviation_ev)
+        unused = without_view(p.known, stack.views)
+        known = KnownExposures(values, p.known_deviation_ev, unused)
     found = stack_colors(stack, seed)
     options = CalibrationOptions(found.black, SATURATED, STACK_PIVOT, known, seed, "one_response")
     arguments = (stack.views, found.observations, options, cfg, begin, compare_with, reporter)
