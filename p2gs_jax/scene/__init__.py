@@ -105,10 +105,31 @@ def find_scene(
 ) -> Scene | Recording | PhotographsAlone | Path:
     """Return the scene of a folder in the order of `load_scene`, without long computations.
 
-    A Path names a video. Raises UserError: there is no scene, or a file is broken; the message
-    names the file.
+    A Path names a video. Raises UserError: there is no scene, a file is broken, or an option has no
+    effect on such a scene; the message names the file.
     """
-    root = Path(root)
+    found = _found(Path(root), cfg, report)
+    drive, video = isinstance(found, Recording), isinstance(found, Path)
+    without_cameras = video or isinstance(found, PhotographsAlone)
+    for kind, is_this, names in (
+        ("a drive", drive, ("drive", "cameras", "frames", "lidar", "ego_mask")),
+        ("a video", video, ("every", "max_frames")),
+        ("a video or photographs without cameras", without_cameras, ("matching",)),
+        ("a scene of photographs", not (drive or video), ("images",)),
+    ):
+        given = [name for name in names if getattr(cfg, name) != getattr(DataConfig(), name)]
+        if given and not is_this:
+            option = given[0].replace("_", "-")
+            raise UserError(
+                f"{root} is not {kind}, which --data.{option} is for.", fix="leave it out"
+            )
+    return found
+
+
+def _found(
+    root: Path, cfg: DataConfig, report: Report
+) -> Scene | Recording | PhotographsAlone | Path:
+    """Return the scene of a folder, whatever the options of other kinds of scenes."""
     if not root.exists():
         raise broken(root, "does not exist", "check the path of the scene")
     if root.is_file():
