@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from p2gs_jax.config import FitConfig
-from p2gs_jax.core.atomic import write_json
+from p2gs_jax.core.atomic import no_empty_folders, write_json
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.alignment import ExposureError, exposure_error
@@ -58,16 +58,19 @@ def run_demo(
     if RunFolder(run_dir).metrics.exists():
         fix = f"open {run_dir}, delete {out}, or name another folder with --out"
         raise UserError(f"{out} holds a finished demo.", fix=fix)
-    out.mkdir(parents=True, exist_ok=True)
     made: dict[str, Any] = {"frames": frames, "width": width, "iso_std": iso_std, "seed": seed}
-    with locked(out):
+    with no_empty_folders(out), locked(out):
         require_free(run_dir)
         for folder in (street, run_dir):
             shutil.rmtree(folder, ignore_errors=True)
         write_json(marker, made)
         height = image_height(width, multiple=4)
         reporter.stage("Making the street")
-        write_street(street, height=height, **made)
+        try:
+            write_street(street, height=height, **made)
+        except UserError:
+            marker.unlink()
+            raise
         reporter.message(f"Made a street: 3 cameras, {frames} frames each, {width}x{height}.")
         truth, reference = read_true_exposures(street), street / "reference"
         options = {"reference": reference, "reporter": reporter, "true_exposures": truth}

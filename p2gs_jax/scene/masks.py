@@ -132,7 +132,7 @@ def background_color(cfg: DataConfig) -> Float32[np.ndarray, " 3"]:
         color = np.zeros(0, np.float32)
     if color.shape != (3,) or not ((color >= 0) & (color <= 1)).all():
         fix = "use white, black, random, or display values from 0 to 1: --background 0.5,0.5,0.5"
-        raise UserError(f"--background {cfg.background} is not a valid colour", fix=fix)
+        raise UserError(f"--background {cfg.background} is not a valid colour.", fix=fix)
     return color
 
 

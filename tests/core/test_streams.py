@@ -20,7 +20,7 @@ from p2gs_jax.core.streams import (
 
 PACKAGE = Path(p2gs_jax.__file__).parent
 # Modules with one generator for everything: toy data, an export's order.
-ALONE = ("core/streams.py", "synth/drive", "gaussians/bake.py")
+ALONE = ("core/streams.py", "gaussians/bake.py")
 
 
 def test_every_stream_has_one_user():

@@ -1,3 +1,5 @@
+"""Camera files are read back as they were written, and wrong entries are named."""
+
 import json
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""Panoramas of rigs: every pixel comes from the camera that looks there."""
+
 from dataclasses import replace
 
 import numpy as np

@@ -58,11 +58,11 @@ def test_a_short_run_is_calibrated_from_its_depth(finished_run, tmp_path):
     found = calibrate_run(finished_run, tmp_path / "out", run.cfg)
     saved = read_photometry(tmp_path / "out" / "photometry.json")["views"]
     assert [v["image"] for v in saved] == [run.scene.views[i].name for i in run.scene.train_indices]
-    assert all(v["exposure"] is None or v["exposure"] > 0 for v in saved)
+    assert all(v["exposure"] > 0 for v in saved)
     assert (tmp_path / "out" / "calibration.png").is_file()
     # Dense seeds lie on the surfaces: even a short run has depth to warp through.
     assert found.observations > 1000
-    assert found.seconds["reading"] > 0.05
+    assert set(found.seconds) == {"reading", "adjustment"}
 
 
 def write_stack(folder, times, response=lambda x: x ** (1 / 2.2), drift=None):
