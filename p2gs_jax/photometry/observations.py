@@ -50,7 +50,7 @@ class Observations:
         return z, deviation(y, slope, self.spread, response.base), slope
 
     def usable(self, black: float, saturation: float) -> Bool[np.ndarray, "o 3"]:
-        """Return the mask of values neither black nor saturated, of points with two such views.
+        """Return the mask of values neither black nor saturated, of points observed so twice.
 
         Both bounds are display values. A mean with a saturated pixel is too dark, and exposures
         then drift along a drive, so it counts as saturated (BUILD_NOTES, "Clipped patches").

@@ -199,7 +199,12 @@ def write_solution(
     write_photometry(
         path,
         model=s.model,
-        curve={"name": s.response.curve, "pivot": pivot, "spline": s.response.spline},
+        curve={
+            "name": s.response.curve,
+            "base": s.response.base,
+            "pivot": pivot,
+            "spline": s.response.spline,
+        },
         gauge=gauge,
         mean={
             "exposure": float(e.mean()) if e.size else 1.0,

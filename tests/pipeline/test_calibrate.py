@@ -108,6 +108,7 @@ def test_the_command_writes_the_calibration_of_a_stack(tmp_path, succeeded):
     saved = read_photometry(out / "photometry.json")
     assert [v["image"] for v in saved["views"]] == [f"{i:02d}.png" for i in range(len(times))]
     assert "stretched together" in saved["gauge"]
+    assert saved["curve"]["base"] in ("srgb", "power")
     assert "nan" not in text
     details = json.loads((out / "calibration.json").read_text())
     assert details["one_response"]
