@@ -134,7 +134,7 @@ def calibrate_observations(
         notes.append(
             f"{coarse} of {coarse + len(observations.points)} observations were left out: their "
             f"pixels are more than {COARSEST:g} times as wide on the surface as those of the "
-            "finest view."
+            "finest view, or their points lie behind the camera."
         )
     if options.known is not None and (unused := options.known.unused):
         notes.append(f"{len(unused)} known exposures belong to no view: {first_few(unused)}.")

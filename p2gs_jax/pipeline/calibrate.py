@@ -315,6 +315,7 @@ def calibrate_stack(
     """
     cfg, begin, reporter = require_config(cfg), time.monotonic(), reporter or Silent()
     p, seed = cfg.photometry, cfg.train.seed
+    check_choice(p)
     if out is not None:
         _require_no_run(Path(out))
     check_source(compare_with)

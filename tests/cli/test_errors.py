@@ -83,6 +83,7 @@ WRONG = [
     ("calibrate castle --out run --static", "several exposures"),
     ("calibrate castle --out begun", "photometry.json would be replaced"),
     ("calibrate castle --out begun --static", "photometry.json would be replaced"),
+    ("calibrate castle --out run --static --photometry.curve power", "--photometry.no-select"),
     ("calibrate castle --out run --static --max-width 99", "leave out --max-width"),
     ("calibrate castle --out run --data.test-every 3", "have no effect here"),
     ("calibrate castle --out run --densify.method mcmc", "--densify.method"),

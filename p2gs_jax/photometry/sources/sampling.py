@@ -196,7 +196,7 @@ def point_colors(
         view_count=len(views),
         point_count=len(surfaces.points),
         cameras=np.unique(cameras, return_inverse=True)[1],
-        too_coarse=int(sum((~k & (s > 0)).sum() for k, s in zip(keep, scales, strict=True))),
+        too_coarse=int(sum((~kept).sum() for kept in keep)),
         names=tuple(view.name for view in views),
         positions=positions,
         brightest=brightest,
