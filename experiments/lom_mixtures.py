@@ -211,12 +211,9 @@ def main() -> None:
         for name, train in budgets.items():
             out = args.out / "runs" / scene.name / name
             under = configs(args.methods, seed=args.seed, **train)
-            if args.rate:
-                fields = {"optimizer.appearance": args.rate}
-                under = {
-                    f"{method}, rate {args.rate:g}": p2gs_jax.with_fields(cfg, fields)
-                    for method, cfg in under.items()
-                }
+            if rate := args.rate:
+                new = {"optimizer.appearance": rate}
+                under = {f"{m}, {rate:g}": p2gs_jax.with_fields(c, new) for m, c in under.items()}
             rows, shown = measure(scene, out, under)
             rows.insert(0, of_calibrate)
             tables[f"{scene.name}/{name}"] = rows
