@@ -79,6 +79,8 @@ WRONG = [
     ("fit castle --out run --frames 0:4", "is not a drive, which --data.frames is for"),
     ("fit castle --out run --every 5", "is not a video, which --data.every is for"),
     ("inspect gaps --data.matching all", "which --data.matching is for"),
+    ("inspect castle --data.format colmap", "leave out --data.format"),
+    ("sweep empty", "name a TOML file"),
     ("calibrate nowhere --out run --static", "name the folder of the photographs"),
     ("calibrate castle --out run --static", "several exposures"),
     ("calibrate castle --out begun", "photometry.json would be replaced"),
