@@ -98,11 +98,6 @@ class Render:
         cameras = None if cameras is None else near_scene(cameras, fitted.scene.origin)
         out = self.out or fitted.folder / "renders" / _default_name(self, fitted.scene)
         _check_place(out, self.overwrite)
-        # An earlier render may have had more frames. The path of this one may be its file.
-        if (out / "cameras.json").is_file():
-            for shot in read_cameras(out / "cameras.json"):
-                remove_frame(out, shot.name)
-            (out / "cameras.json").unlink()
         with TerminalReporter() as reporter:
             job = (
                 panoramas_of(self, fitted)
@@ -111,6 +106,11 @@ class Render:
             )
             for note in (*fitted.notes, *job.notes):
                 reporter.message(note)
+            # An earlier render may have had more frames.
+            if (out / "cameras.json").is_file():
+                for shot in read_cameras(out / "cameras.json"):
+                    remove_frame(out, shot.name)
+                (out / "cameras.json").unlink()
             reporter.stage("Rendering", 0, job.count)
             with open_frames(out, job.size, self.fps or FPS) as write:
                 for done, frame in enumerate(job.frames):

@@ -25,6 +25,7 @@ from p2gs_jax.evaluation.lpips import LpipsWeights, read_lpips_weights
 from p2gs_jax.evaluation.references import Reference, check_reference, load_reference
 from p2gs_jax.gaussians.population import Coverage, seed_bound
 from p2gs_jax.presets import flat, to_dict
+from p2gs_jax.run.decisions import CHOSEN
 from p2gs_jax.run.folder import RunFolder, find, require_free
 from p2gs_jax.run.read import read_config
 from p2gs_jax.scene.exposures import check_source, read_known_exposures
@@ -39,8 +40,6 @@ PARAMETER_BYTES = 37  # with moments, gradient and the copies of a densification
 PIXEL_BYTES = 650
 DECODED_BYTES = 7
 OPTIONS = "--gaussians, --max-width or --data.cache-mb"
-# Options of `PhotometryConfig` that `select` replaces.
-CHOSEN = ("model", "curve", "spline", "white_balance", "vignetting", "responses")
 # Smallest and largest values of whole numbers that no other check bounds; None: there is no bound.
 BOUNDS = {
     "train.seed": (0, None),
@@ -202,12 +201,14 @@ def check_sources(paths: Paths) -> None:
         UserError: it was begun with others. Folders that have moved are not compared.
     """
     path = RunFolder(paths.run).config
-    saved = read_config(path)[0] if path.exists() else None
+    if not path.exists():
+        return
+    saved = read_config(path)[0]
     for key, now in (("scene", paths.scene), ("reference", paths.reference)):
-        was = None if saved is None else find(saved, key, paths.run)
-        if saved is None or (was and now and not (was.exists() and now.exists())):
-            continue
-        if was != now and not (was and now and was.samefile(now)):
+        was = find(saved, key, paths.run)
+        both = was is not None and now is not None
+        moved = both and not (was.exists() and now.exists())
+        if was != now and not moved and not (both and was.samefile(now)):
             why = f"{paths.run} was begun with the {key} {was}, now {now}."
             raise UserError(why, fix=f"name that {key}, or another folder with --out")
 

@@ -30,6 +30,8 @@ from p2gs_jax.run.folder import RunFolder
 KEY = "decided"
 # Factor on the rates of exposures and gammas if none were solved (docs/photometry.md, 4).
 FROM_NOTHING = 10.0
+# Options of `PhotometryConfig` that `select` replaces.
+CHOSEN = ("model", "curve", "spline", "white_balance", "vignetting", "responses")
 
 
 @dataclass(frozen=True)
@@ -164,8 +166,8 @@ def likely(
         return None
     decided = dataclasses.replace(Decisions.as_given(cfg), **scale)
     if kept is not None:
-        chosen = ("model", "curve", "spline", "white_balance", "vignetting", "responses", "cameras")
-        return dataclasses.replace(decided, **{name: getattr(kept, name) for name in chosen})
+        solved = (*CHOSEN, "cameras")
+        return dataclasses.replace(decided, **{name: getattr(kept, name) for name in solved})
     if p.start != "tracks":
         return unsolved(decided)
     if p.select:

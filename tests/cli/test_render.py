@@ -146,6 +146,8 @@ def test_frames_are_replaced_only_with_overwrite(refused, rendered, run_copy, tm
     before = [p.stat().st_mtime_ns for p in tmp_path.iterdir()]
     assert "--overwrite" in refused("render", *argv)
     assert [p.stat().st_mtime_ns for p in tmp_path.iterdir()] == before
+    refused("render", *argv, "--camera", "none", "--overwrite")
+    assert [p.stat().st_mtime_ns for p in tmp_path.iterdir()] == before
     assert "2 frames in" in rendered(*argv, "--frames", 2, "--overwrite")
     assert [p.stat().st_mtime_ns for p in tmp_path.iterdir()] != before
     # The third frame is gone, other files stay.

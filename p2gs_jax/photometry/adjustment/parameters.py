@@ -382,7 +382,7 @@ def _anchors(problem: Problem, form: Form, u: Unknowns, precision) -> Held:
         targets.append(target)
 
     model = MODELS[form.model]
-    for members in _groups(problem.tied(model.exposure)):
+    for members in problem.groups(model.exposure):
         share = 1 / len(members)
         if not (precision[members] > 0).any():
             for channel in range(u.channels):
@@ -392,11 +392,11 @@ def _anchors(problem: Problem, form: Form, u: Unknowns, precision) -> Held:
             for channel in (0, 2):
                 both = np.concatenate([channel * u.views + members, u.views + members])
                 hold(both, np.repeat([share, -share], len(members)))
-    for members in _groups(problem.tied(model.gamma)):
+    for members in problem.groups(model.gamma):
         if not np.isin(problem.component[members], problem.with_known_power).any():
             hold(u.at.a.start + members, 1 / len(members), 1.0)
     if u.features.balance:
-        for members in _groups(problem.tied("camera")):
+        for members in problem.groups("camera"):
             views_of = np.bincount(problem.observations.cameras[members])
             for direction in range(u.features.balance_count // u.features.cameras):
                 at = u.at.k.start + direction * u.features.cameras + np.arange(len(views_of))
@@ -411,10 +411,6 @@ def _anchors(problem: Problem, form: Form, u: Unknowns, precision) -> Held:
     elif powers.size and not u.splines.power:
         hold(powers, 1 / u.splines.groups)
     return Held(sp.csr_array(sp.vstack(rows)), np.array(targets), np.ones(len(targets)))
-
-
-def _groups(labels: Int[np.ndarray, " v"]) -> list[Int[np.ndarray, " m"]]:
-    return [np.flatnonzero(labels == label) for label in np.unique(labels)]
 
 
 def _priors(u: Unknowns, log_exposure, precision, of_gammas) -> Held:

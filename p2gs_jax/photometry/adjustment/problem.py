@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from p2gs_jax.config import Level
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.photometry.adjustment.matrices import Pairs
-from p2gs_jax.photometry.observations import Observations
+from p2gs_jax.photometry.observations import Observations, grouped
 
 LONGEST_ROW = 16  # largest number of observations of a row
 TELLING_EV = 0.1  # least difference of known exposures that fixes the power of a curve, stops
@@ -125,6 +125,12 @@ class Problem:
         size = first + int(cameras.max(initial=-1)) + 1
         edges = sp.csr_array((np.ones(len(label)), (label, first + cameras)), shape=(size, size))
         return connected_components(edges, directed=False)[1][label]
+
+    def groups(self, level: Level | None) -> list[np.ndarray]:
+        """Return the views of each label of `tied`."""
+        labels = self.tied(level)
+        found = grouped(labels, int(labels.max(initial=-1)) + 1)
+        return [members for members in found if len(members)]
 
     def part(self, pick: np.ndarray | slice) -> Problem:
         """Return some of the observations, chosen by a mask or their rows."""

@@ -82,7 +82,7 @@ def read_stack(folder: Path) -> Stack:
 
 
 def align(images: list[Image]) -> tuple[Float[np.ndarray, "v 2"], Bool[np.ndarray, " v"]]:
-    """Return the shifts (x, y) that align each frame with the first, pixels; frames without one.
+    """Return shifts (x, y), pixels, that align frames with the first; which moved too far.
 
     They are sums of shifts between successive frames. Median threshold bitmaps do not depend on
     exposure. Mostly black or white frames give random shifts, which are ignored.

@@ -58,8 +58,8 @@ def load_images(
 
     `work_dir` caches the model in `sfm/`, for the same photographs, and features and matches in
     `features/`, also if photographs are added. `auto` selects the pairs if the user does not.
-    Raises UserError: there are fewer than two
-    photographs, one is not an image, or none is registered.
+    Raises UserError: there are fewer than two photographs, one is not an image, or none is
+    registered.
     """
     names = [path.relative_to(image_folder).as_posix() for path in paths]
     if len(paths) < 2:
