@@ -206,9 +206,11 @@ def check_sources(paths: Paths) -> None:
     saved = read_config(path)[0]
     for key, now in (("scene", paths.scene), ("reference", paths.reference)):
         was = find(saved, key, paths.run)
-        both = was is not None and now is not None
-        moved = both and not (was.exists() and now.exists())
-        if was != now and not moved and not (both and was.samefile(now)):
+        if was is None or now is None:
+            same = was is now
+        else:
+            same = not (was.exists() and now.exists()) or was.samefile(now)
+        if not same:
             why = f"{paths.run} was begun with the {key} {was}, now {now}."
             raise UserError(why, fix=f"name that {key}, or another folder with --out")
 
