@@ -1,8 +1,9 @@
 """Corrections of display values per view, as published baselines learn them beside the splats.
 
-`affine`: a 3x4 colour matrix per view (the 3DGS code's exposure compensation). `bilateral`: a grid
-of such matrices over the image and luminance (bilateral-guided radiance fields). `curve`: one
-increasing curve per view for all channels. Their parameters are deviations: zeros change nothing.
+`affine`: a 3x4 colour matrix per view and the clipping of photographs (the 3DGS code's exposure
+compensation). `bilateral`: a grid of such matrices over the image and luminance (bilateral-guided
+radiance fields). `curve`: one increasing curve per view for all channels. Their parameters are
+deviations: zeros change nothing.
 `ppisp` (`ppisp.py`) replaces the tone curve and also has parameters of cameras. `luminance`
 (`luminance.py`) maps photographs to an enhanced scene, as Luminance-GS does; its inverse maps
 renders to photographs.
@@ -20,7 +21,7 @@ from jax import lax
 from jaxtyping import Float, Int
 
 from p2gs_jax.config import Appearance
-from p2gs_jax.core.numerics import LN2, on_device
+from p2gs_jax.core.numerics import LN2, on_device, unit_clip
 from p2gs_jax.photometry import luminance, ppisp
 from p2gs_jax.photometry.luminance import Curves, Luminance
 from p2gs_jax.photometry.ppisp import OneView, Ppisp
@@ -111,7 +112,7 @@ def corrected(
         # Gradients reach the Gaussians only; the curves are learned from photographs.
         return luminance.as_photographed(ldr, lax.stop_gradient(parameters))
     if kind == "affine":
-        return ldr + ldr @ parameters[:, :3].T + parameters[:, 3]
+        return unit_clip(ldr + ldr @ parameters[:, :3].T + parameters[:, 3])
     return _curve(ldr, parameters) if kind == "curve" else _bilateral(ldr, parameters)
 
 

@@ -47,6 +47,17 @@ def test_the_identity_changes_nothing(kind):
     np.testing.assert_allclose(jax.jit(gs.pseudo_curve)(jnp.zeros(3)), even, atol=2.1e-3)
 
 
+def test_a_colour_matrix_is_learned_only_where_photographs_are_not_clipped():
+    def total(ldr):
+        return corrected(ldr, noisy("affine", 0.05), "affine").sum()
+
+    bright, between, dark = (np.full((1, 1, 3), value) for value in (2.0, 0.5, -1.0))
+    assert total(bright) == pytest.approx(3.0)
+    assert total(dark) == pytest.approx(0.0)
+    slopes = [np.abs(jax.grad(total)(jnp.asarray(x))).max() for x in (bright, between, dark)]
+    assert slopes == [0.0, pytest.approx(1.0, abs=0.2), 0.0]
+
+
 def test_a_bilateral_grid_is_sliced_trilinearly():
     grid = noisy("bilateral")
     height, width, _ = IMAGE.shape
