@@ -15,6 +15,7 @@ import tyro
 from p2gs_jax.cli.shared import DURATIONS, SHORT, check, require_viewer
 from p2gs_jax.config import DataConfig, FitConfig, PresetName
 from p2gs_jax.core.text import count_of
+from p2gs_jax.presets import flat, preset, to_dict
 
 if TYPE_CHECKING:
     from p2gs_jax.scene.survey import Survey
@@ -166,7 +167,7 @@ class Calibrate:
     """
 
     SHORT_NAMES: ClassVar = (
-        *("max_width", "known_exposures", "exposure_sigma", "images", "drive", "cameras"),
+        *("known_exposures", "exposure_sigma", "images", "drive", "cameras"),
         *("frames", "every", "max_frames", "camera_by"),
     )
     # The fields of the configuration that are options.
@@ -237,16 +238,20 @@ class Calibrate:
 
     def checked(self) -> FitConfig:
         """Return the configuration; raise a UserError if a value is not valid."""
-        scene, is_run, data, usual = self.scene, self.is_run, self.config.data, FitConfig().data
-        no_data_options = data == usual
-        why = "--data.test-every and --data.split have no effect here"
-        fix = "leave them out: every photograph is calibrated"
-        check((data.test_every, data.split) == (usual.test_every, usual.split), why, fix=fix)
-        cfg, leave_out = checked(self.config), "leave out --max-width, --images and --data options"
-        why = "--static reads every photograph of the folder at its own size"
-        check(no_data_options or not self.static, why, fix=leave_out)
-        why = f"{scene} is a finished run, whose image size and folder cannot change"
-        check(no_data_options or not is_run, why, fix=leave_out)
+        scene, is_run, cfg = self.scene, self.is_run, checked(self.config)
+        given, usual = (flat(to_dict(c)) for c in (cfg, preset(self.preset)))
+        whole = ("data.test_every", "data.split", "data.max_width", "data.cache_mb")
+        of_stack = "--static reads all photographs of the folder, and finds their limits"
+        of_run = f"{scene} is a finished run, which keeps its photographs, limits and seed"
+        for applies, why, unread in (
+            (self.static, of_stack, ("data.", "loss.", "photometry.pivot")),
+            (is_run, of_run, ("data.", "loss.", "train.seed")),
+            (True, "every photograph is calibrated, and read once at its full size", whole),
+        ):
+            changed = [k for k in given if k.startswith(unread) and given[k] != usual[k]]
+            options = " and ".join(f"--{name.replace('_', '-')}" for name in changed)
+            fix = f"leave out {options}, which would have no effect"
+            check(not (applies and changed), why, fix=fix)
         develops, ev = self.develop is not None, self.exposure_ev
         why = "--exposure-ev and --no-masks have no effect without --develop"
         check(develops or (ev == 0 and self.masks), why, fix="add --develop 8bit, 16bit or exr")

@@ -244,7 +244,7 @@ class Search:
         found = self._predicted[choice]
         # Errors are correlated within a view and within a region of an image.
         lower, labels = best.densities - found.densities, (self._views, self._regions)
-        deficits, errors = zip(*(_mean_deficit(lower, of) for of in labels), strict=True)
+        deficits, errors = zip(*(mean_deficit(lower, of) for of in labels), strict=True)
         difference = _largest_difference(best.errors - found.errors, self._views)
         fields = (self.fits[choice][1], self._parameters(choice), density)
         return Candidate(choice, *fields, deficits[0], max(errors), difference)
@@ -299,11 +299,11 @@ def _largest_difference(difference: Float[np.ndarray, "h 3"], views: Labels) -> 
     return float(255 * np.sqrt((squares / np.maximum(counts, 1)).max(initial=0.0)))
 
 
-def _mean_deficit(difference: np.ndarray, labels: Labels) -> tuple[float, float]:
+def mean_deficit(difference: np.ndarray, labels: Labels) -> tuple[float, float]:
     """Return the mean of finite values, and its standard error over views or regions."""
     known, count = np.isfinite(difference), int(labels.max(initial=-1)) + 1
     if not known.any():
         return 0.0, np.inf
-    sums = np.bincount(labels[known], difference[known], count)
-    error = sums.std() * np.sqrt(count) / known.sum()
-    return float(difference[known].mean()), float(error)
+    mean = difference[known].mean()
+    sums = np.bincount(labels[known], difference[known] - mean, count)
+    return float(mean), float(np.linalg.norm(sums) / known.sum())

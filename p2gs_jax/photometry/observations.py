@@ -56,10 +56,13 @@ class Observations:
         then drift along a drive, so it counts as saturated (BUILD_NOTES, "Clipped patches").
         """
         brightest = self.colors if self.brightest is None else self.brightest
-        keep = (self.colors > black) & (brightest < saturation)
+        return self.shared((self.colors > black) & (brightest < saturation))
+
+    def shared(self, keep: Bool[np.ndarray, "o 3"]) -> Bool[np.ndarray, "o 3"]:
+        """Return the mask `keep`, without the points that it leaves in a single observation."""
         seen = keep.any(1)
-        shared = np.bincount(self.points[seen], minlength=self.point_count)[self.points] >= 2
-        return keep & (seen & shared)[:, None]
+        twice = np.bincount(self.points[seen], minlength=self.point_count)[self.points] >= 2
+        return keep & twice[:, None]
 
     def components(self, usable: Bool[np.ndarray, "o 3"]) -> Int[np.ndarray, " v"]:
         """Return a label per view; views with different labels cannot be compared."""

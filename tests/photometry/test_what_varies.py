@@ -10,7 +10,7 @@ from synthetic_drive import make_drive, make_exposures, observe
 from p2gs_jax.evaluation.alignment import exposure_error
 from p2gs_jax.photometry.adjustment.problem import KnownExposures
 from p2gs_jax.photometry.adjustment.solve import fit_response
-from p2gs_jax.photometry.candidates import Candidate, choose
+from p2gs_jax.photometry.candidates import Candidate, choose, mean_deficit
 from p2gs_jax.photometry.models import Choice, Curve, Form, Scope, neighbours, parameter_count
 from p2gs_jax.photometry.response import FREE, HELD, Response, log_exposed
 
@@ -234,6 +234,25 @@ def test_the_simplest_model_that_is_not_clearly_worse_wins():
     # A difference that nobody can see does not count, however sure it is.
     unseen = candidate("constant", 0, -0.9, 0.4, 0.01, 0.8)
     assert choose([rich, unseen, middle]).parameters == 0
+
+
+def test_a_deficit_that_is_equal_everywhere_is_certain():
+    views = np.repeat(np.arange(40), np.tile([10, 50, 100, 20], 10))
+    assert mean_deficit(np.full(len(views), 0.02), views) == pytest.approx((0.02, 0.0))
+    # Errors that differ between views only leave one number for each view.
+    rng = np.random.default_rng(0)
+    drawn = np.array([mean_deficit(rng.normal(2, 1, 40)[views], views) for _ in range(500)])
+    assert rms(drawn[:, 1]) == pytest.approx(drawn[:, 0].std(), rel=0.15)
+
+
+def test_values_whose_partners_are_held_out_are_not_used():
+    problem = problem_of()
+    held = np.arange(len(problem.usable)) % 2 == 0
+    kept = problem.part(~held)
+    alone = np.bincount(kept.observations.points)[kept.observations.points] == 1
+    assert alone.any()
+    assert problem.usable[~held][alone].any()
+    assert not kept.usable[alone].any()
 
 
 def test_sharp_images_do_not_earn_parameters_for_invisible_differences():

@@ -135,7 +135,7 @@ class Problem:
     def part(self, pick: np.ndarray | slice) -> Problem:
         """Return some of the observations, chosen by a mask or their rows."""
         some = self.observations.picked(pick)
-        return replace(self, observations=some, usable=self.usable[pick])
+        return replace(self, observations=some, usable=some.shared(self.usable[pick]))
 
 
 def make_problem(
