@@ -25,7 +25,7 @@ from p2gs_jax.jobs.job import Job, JobState, read_reason, slug
 from p2gs_jax.jobs.run import Runner, run_jobs
 from p2gs_jax.jobs.worker import run_in_process
 from p2gs_jax.pipeline.fit import fit
-from p2gs_jax.pipeline.preflight import Paths, check_run_dir, check_sources
+from p2gs_jax.pipeline.preflight import Paths, check_options, check_run_dir, check_sources
 from p2gs_jax.presets import from_dict, to_dict
 from p2gs_jax.run.folder import RunFolder, locked
 from p2gs_jax.synth.sensor import read_true_exposures
@@ -124,6 +124,7 @@ def _planned(
     for name, cfg in configs.items():
         for seed in seeds:
             seeded = with_fields(cfg, {"train.seed": seed})
+            check_options(seeded)
             folder = out / slug(name) / f"seed_{seed}"
             check_sources(Paths.of(scene, folder, reference))
             if check_run_dir(folder, True, seeded):

@@ -33,8 +33,8 @@ BYTES_PER_PIXEL, SHARE = 40, 0.5
 _ASPECT_TOLERANCE = 0.01
 # TIFF's tag for the meaning of the fourth channel; its colours are multiplied by associated alpha.
 _EXTRA_SAMPLES, _ASSOCIATED = 338, (1,)
-# The tag for the order of channels.
-_PLANES, _SEPARATE = 284, 2
+# The tags for the order of channels, and for how a photograph is shown: as stored (1), or turned.
+_PLANES, _SEPARATE, _ORIENTATION = 284, 2, 274
 # The header of a PGM or PPM: its kind, width, height and largest value.
 _PNM = re.compile(rb"P([2356])" + rb"(?:\s|#.*\n)+(\d+)" * 3)
 
@@ -236,10 +236,10 @@ def _read_raster(path: Path, *, colours: bool = False) -> np.ndarray:
         raise undecodable(path)
     if header := _PNM.match(data):
         raw = _full_range(raw, int(header[1]), int(header[4]))
-    of_tiff = data[:2] in (b"II", b"MM") and raw.ndim == 3
-    if of_tiff and raw.dtype == np.uint16:
-        _require_interleaved(path)
-    if (of_tiff and raw.shape[2] == 4) or (raw.ndim == 2 and has_alpha(path)):
+    of_tiff = data[:2] in (b"II", b"MM")
+    if of_tiff:
+        _require_plain(path, raw)
+    if (of_tiff and raw.shape[2:] == (4,)) or (raw.ndim == 2 and has_alpha(path)):
         raw = _with_alpha(path, raw)
     return with_profile_applied(data, raw) if colours else raw
 
@@ -253,12 +253,19 @@ def _full_range(raw: UInt[np.ndarray, "..."], kind: int, white: int) -> UInt[np.
     return np.rint(np.minimum(raw, white) * (most / white)).astype(raw.dtype)
 
 
-def _require_interleaved(path: Path) -> None:
-    """Raise UserError for a TIFF of separate planes: with 16 bits, OpenCV repeats the first one."""
+def _require_plain(path: Path, raw: UInt[np.ndarray, "..."]) -> None:
+    """Raise UserError for a TIFF that OpenCV turns, though poses belong to the stored pixels, or of
+    separate planes, of which OpenCV repeats the first one if they have 16 bits."""
+    planes, orientation = None, 1
     with contextlib.suppress(OSError), Image.open(path) as image:
-        if getattr(image, "tag_v2", {}).get(_PLANES) == _SEPARATE:
-            why = "is a TIFF of 16 bits with separate planes, which are not read"
-            raise broken(path, why, "export it with interleaved channels, or as PNG")
+        tags = getattr(image, "tag_v2", {})
+        planes, orientation = tags.get(_PLANES), tags.get(_ORIENTATION, 1)
+    if planes == _SEPARATE and raw.dtype == np.uint16 and raw.ndim == 3:
+        why = "is a TIFF of 16 bits with separate planes, which are not read"
+        raise broken(path, why, "export it with interleaved channels, or as PNG")
+    if orientation != 1:
+        why = "is a TIFF with an orientation, so that its stored pixels are turned"
+        raise broken(path, why, "export it as PNG without rotation")
 
 
 def _with_alpha(path: Path, raw: UInt[np.ndarray, "..."]) -> UInt[np.ndarray, "h w c"]:

@@ -77,6 +77,14 @@ def test_colours_of_a_tiff_are_not_multiplied_by_its_alpha(tmp_path, dtype):
             decode.stored(make_view(path, size=(1, 1)))
 
 
+@pytest.mark.parametrize("turned", [3, 6])
+def test_a_tiff_that_opencv_turns_is_refused(tmp_path, turned):
+    # Poses belong to the stored pixels, as those of JPEG.
+    Image.new("RGB", (8, 4)).save(tmp_path / "a.tif", tiffinfo={274: turned})
+    with refused("a.tif is a TIFF with an orientation"):
+        decode.stored(make_view(tmp_path / "a.tif", size=(8, 4)))
+
+
 @pytest.mark.parametrize(
     ("name", "mode"), [("a.png", "L"), ("a.png", "I;16"), ("a.png", "1"), ("a.tif", "LA")]
 )
