@@ -25,7 +25,7 @@ from p2gs_jax.jobs.job import Job, JobState, read_reason, slug
 from p2gs_jax.jobs.run import Runner, run_jobs
 from p2gs_jax.jobs.worker import run_in_process
 from p2gs_jax.pipeline.fit import fit
-from p2gs_jax.pipeline.preflight import Paths, check_options, check_run_dir, check_sources
+from p2gs_jax.pipeline.preflight import Paths, check_run_dir, check_sources
 from p2gs_jax.presets import from_dict, to_dict
 from p2gs_jax.run.folder import RunFolder, locked
 from p2gs_jax.synth.sensor import read_true_exposures
@@ -124,7 +124,6 @@ def _planned(
     for name, cfg in configs.items():
         for seed in seeds:
             seeded = with_fields(cfg, {"train.seed": seed})
-            check_options(seeded)
             folder = out / slug(name) / f"seed_{seed}"
             check_sources(Paths.of(scene, folder, reference))
             if check_run_dir(folder, True, seeded):
@@ -139,6 +138,8 @@ def _check(configs: Mapping[str, FitConfig], seeds: Sequence[int], max_parallel:
     if not configs or not seeds:
         fix = "see docs/api.md for an example"
         raise UserError("a sweep needs at least one configuration and one seed.", fix=fix)
+    if min(seeds) < 0:
+        raise UserError(f"a sweep has the seed {min(seeds)}.", fix="use whole numbers from 0 on")
     if max_parallel < 1:
         raise UserError(f"max_parallel = {max_parallel} is too small.", fix="use at least 1")
     folders = [slug(name) for name in configs]
