@@ -1,12 +1,11 @@
 """Corrections of display values per view, as published baselines learn them beside the splats.
 
-`affine`: a 3x4 colour matrix per view and the clipping of photographs (the 3DGS code's exposure
+`affine`: a 3x4 colour matrix per view, with results clipped to [0, 1] (the 3DGS code's exposure
 compensation). `bilateral`: a grid of such matrices over the image and luminance (bilateral-guided
 radiance fields). `curve`: one increasing curve per view for all channels. Their parameters are
-deviations: zeros change nothing.
-`ppisp` (`ppisp.py`) replaces the tone curve and also has parameters of cameras. `luminance`
-(`luminance.py`) maps photographs to an enhanced scene, as Luminance-GS does; its inverse maps
-renders to photographs.
+deviations: zeros change no value from 0 to 1. `ppisp` (`ppisp.py`) replaces the tone curve and also
+has parameters of cameras. `luminance` (`luminance.py`) maps photographs to an enhanced scene, as
+Luminance-GS does; its inverse maps renders to photographs.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ CURVE_PIECES = 16
 
 
 def identity(kind: Appearance, cameras: Sequence[str]) -> Corrections:
-    """Return parameters that change nothing (`ppisp` clips at 1); `cameras` has one per view."""
+    """Return parameters that change no value from 0 to 1; `cameras` has one per view."""
     if kind == "ppisp":
         return ppisp.identity(cameras)
     if kind == "luminance":
