@@ -139,8 +139,7 @@ def preset(name: PresetName) -> FitConfig:
 def require_config(cfg: FitConfig | None) -> FitConfig:
     """Return the configuration, or `robust` for None.
 
-    Raises:
-        UserError: `cfg` is something else, such as the name of a preset.
+    Raises UserError: `cfg` is something else, such as the name of a preset.
     """
     if cfg is None:
         return FitConfig()
@@ -196,8 +195,7 @@ def flat(options: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 def from_dict(values: Mapping[str, Any], kind: Any = FitConfig) -> Any:
     """Rebuild a configuration, or a record of one, from `to_dict`'s result.
 
-    Raises:
-        TypeError: a field is unknown to this version, or a group of fields is not an object.
+    Raises TypeError: a field is unknown to this version, or a group of fields is not an object.
     """
     kinds = {f.name: f.default_factory for f in dataclasses.fields(kind)}
     unknown = sorted(set(values) - set(kinds))
@@ -218,8 +216,7 @@ def from_dict(values: Mapping[str, Any], kind: Any = FitConfig) -> Any:
 def camera_formations(values: Sequence[dict]) -> tuple[CameraFormation, ...]:
     """Rebuild cameras from the result of `dataclasses.asdict`, also after JSON.
 
-    Raises:
-        KeyError, TypeError, ValueError: a field is missing or of another type.
+    Raises KeyError, TypeError or ValueError: a field is missing or of another type.
     """
     return tuple(
         CameraFormation(

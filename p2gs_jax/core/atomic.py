@@ -32,11 +32,7 @@ _PART = 1 << 20  # bytes
 
 @contextlib.contextmanager
 def readable(path: Path, fix: str) -> Iterator[None]:
-    """Turn errors from a broken file in a `with` block into one error for the user.
-
-    Raises:
-        UserError: the file is missing or broken; `fix` is the remedy.
-    """
+    """Turn errors from a missing or broken file, in a `with` block, into a UserError with `fix`."""
     try:
         yield
     except (*BROKEN_ARRAYS, AttributeError) as error:
@@ -50,10 +46,8 @@ def naming(path: Path, *, begun: Path | None = None, size: int = _PART) -> Itera
 
     Writers of images, checkpoints and tables report a full disk in many forms, from `False` to a
     page of C++. To find the system's error, `size` more bytes are written to the incomplete file
-    `begun`, or without it to a new file beside `path`.
-
-    Raises:
-        OSError: the system's error, with `filename`. Other errors pass unchanged.
+    `begun`, or without it to a new file beside `path`. Raises OSError: the system's error, with
+    `filename`. Other errors pass unchanged.
     """
     try:
         yield
@@ -88,10 +82,8 @@ def atomic_write(path: Path, *, durable: bool = True) -> Iterator[Path]:
 
     The folder of `path` is created. The temporary name keeps the suffix, for writers that choose a
     format by it. With `durable` the file is on the disk before it replaces `path`, so that no power
-    failure leaves a part of it. Otherwise its reader must check it.
-
-    Raises:
-        OSError: the file cannot be written; `filename` names it for every writer.
+    failure leaves a part of it. Otherwise its reader must check it. Raises OSError: the file cannot
+    be written; `filename` names it for every writer.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -233,8 +225,7 @@ def _mend(file) -> bytes:
 def read_jsonl(path: Path) -> list[dict]:
     """Return the records of a JSON-lines file; a last line torn by a kill is left out.
 
-    Raises:
-        UserError: another line is not valid JSON.
+    Raises UserError: another line is not valid JSON.
     """
     try:
         lines = Path(path).read_bytes().rstrip(b"\n").split(b"\n")

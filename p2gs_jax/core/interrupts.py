@@ -34,11 +34,7 @@ def exit_code(error: KeyboardInterrupt) -> int:
 
 
 def raised() -> contextlib.AbstractContextManager[None]:
-    """Let signals that end a program raise `Interrupted` within a `with` block.
-
-    Raises:
-        Interrupted: such a signal came.
-    """
+    """Let signals that end a program raise `Interrupted` within a `with` block."""
     return _handled_by(_raise)
 
 
@@ -57,11 +53,7 @@ class Held:
         self._holding = True
 
     def deliver(self) -> None:
-        """Raise the waiting signal, if there is one.
-
-        Raises:
-            Interrupted: a signal has arrived.
-        """
+        """Raise the waiting signal as `Interrupted`, if there is one."""
         if self.arrived is not None:
             number, self.arrived = self.arrived, None
             raise Interrupted(number)
@@ -77,10 +69,8 @@ class Held:
 def held() -> Iterator[Held]:
     """Hold the signals, after `Held.begin`, until the end of a `with` block.
 
-    A second signal raises at once. A signal that still waits is raised at the end of the block.
-
-    Raises:
-        Interrupted: a signal was delivered.
+    A second signal raises `Interrupted` at once. A signal that still waits raises it at the end of
+    the block.
     """
     waiting = Held()
     with _handled_by(waiting._handle):

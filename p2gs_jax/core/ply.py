@@ -57,10 +57,8 @@ class Header(NamedTuple):
 def parse_header(head: bytes, size: int) -> Header:
     """Return the header of a file of `size` bytes, whose first bytes are `head`.
 
-    Comments and obj_info are ignored. An element with more than `size` rows is an error.
-
-    Raises:
-        ValueError: `head` is not a valid header (PlyError), or is not ASCII.
+    Comments and obj_info are ignored. An element with more than `size` rows is an error. Raises
+    ValueError: `head` is not a valid header (PlyError), or is not ASCII.
     """
     magic = re.match(rb"ply(\r\n|\n|\r)", head)
     if magic is None:
@@ -98,10 +96,7 @@ def header_of(name: str, row: np.dtype, count: int, comments: Sequence[str] = ()
     """Return the header of a file with one element; its rows follow in NumPy's layout.
 
     `row` has little-endian fields without gaps. A header is ASCII: other characters of comments are
-    escaped.
-
-    Raises:
-        KeyError: PLY has no type for a field.
+    escaped. Raises KeyError: PLY has no type for a field.
     """
     lines = [
         "ply",
@@ -118,8 +113,7 @@ def header_of(name: str, row: np.dtype, count: int, comments: Sequence[str] = ()
 def refusing(path: Path, content: str, *, fix: str) -> Iterator[None]:
     """Turn errors in a `with` block into a UserError: `path` is not a valid PLY of `content`.
 
-    Raises:
-        UserError: the file cannot be read, is not a PLY, or lacks a property.
+    Such a file cannot be read, is not a PLY, or lacks a property.
     """
     try:
         yield
@@ -132,12 +126,8 @@ def read_table(path: Path, name: str) -> np.ndarray:
     """Return the rows of an element: a field for each property.
 
     Binary rows are memory-mapped. Later elements are also checked for missing rows, up to the first
-    one with lists.
-
-    Raises:
-        OSError: the file cannot be read.
-        ValueError: the file is not a PLY, is truncated, or lacks the element; or that element or
-            an earlier one has lists.
+    one with lists. Raises OSError: the file cannot be read. Raises ValueError: the file is not a
+    PLY, is truncated, or lacks the element; or that element or an earlier one has lists.
     """
     with path.open("rb") as file:
         if not path.stat().st_size:

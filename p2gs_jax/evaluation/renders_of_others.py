@@ -55,10 +55,8 @@ class OtherRenders:
         """Return the render of a view, which must have a size of (width, height) pixels.
 
         With `over` the photographs are over a background: radiance must then have an opacity.
-
-        Raises:
-            UserError: the file cannot be read, has another size, lacks an opacity, or holds values
-                that are not finite.
+        Raises UserError: the file cannot be read, has another size, lacks an opacity, or holds
+        values that are not finite.
         """
         path = self.files[row]
         linear, alpha = path.suffix.lower() == ".exr", None
@@ -106,10 +104,8 @@ def find_renders(folder: str | Path, scene: Scene) -> OtherRenders:
     """Return the files of a folder that show held-out views.
 
     Pictures have the names of views, or are numbered in the order of names of held-out views.
-
-    Raises:
-        UserError: there are no held-out views, the folder is absent or holds no render, or the
-            number of numbered renders is not the number of held-out views.
+    Raises UserError: there are no held-out views, the folder is absent or holds no render, or the
+    number of numbered renders is not the number of held-out views.
     """
     folder = Path(folder)
     if not folder.is_dir():

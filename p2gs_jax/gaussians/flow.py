@@ -222,11 +222,9 @@ def _fuse(inverse, precision):
 def plane_fit(inverse: Float[np.ndarray, "h w"], valid: Bool[np.ndarray, "h w"]):
     """Fit a plane to the valid inverse depths around every pixel.
 
-    On a plane, inverse depth is linear in the pixel position.
-
-    Returns:
-        Inverse depth of the plane at the pixel; its slope per pixel [h w 2]; whether the window
-        lies in the plane; the share of the window that is valid.
+    On a plane, inverse depth is linear in the pixel position. Returns the inverse depth of the
+    plane at the pixel; its slope per pixel [h w 2]; whether the window lies in the plane; the share
+    of the window that is valid.
     """
     height, width = inverse.shape
     w = valid.astype(np.float64)

@@ -34,10 +34,8 @@ def run_jobs(
     `folder` is for job files, progress and output; all machines must share it. The engine calls
     `run` for each job file. `on_look` is called with all states every LOOK_S, or sooner. `on_end`
     is called in this thread with the number of an ended job, and again if a signal interrupts it.
-
-    Raises:
-        KeyboardInterrupt: a signal arrived; all running jobs have stopped as well. The same call
-            continues them.
+    Raises KeyboardInterrupt: a signal arrived; all running jobs have stopped as well. The same call
+    continues them.
     """
     folder = folder.absolute()
     folder.mkdir(parents=True, exist_ok=True)

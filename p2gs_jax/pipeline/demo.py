@@ -45,11 +45,8 @@ def run_demo(
 
     The demo writes `out/street` and `out/run`, also over a demo that was interrupted. Each of 3
     cameras takes `frames` photographs, `width` pixels wide. Their ISO has the mean 8 and the
-    standard deviation `iso_std`.
-
-    Raises:
-        UserError: `out` holds a finished demo or files that the demo did not make, or another
-            program writes to it.
+    standard deviation `iso_std`. Raises UserError: `out` holds a finished demo or files that the
+    demo did not make, or another program writes to it.
     """
     street, run_dir = out / "street", out / "run"
     marker = out / "demo.json"

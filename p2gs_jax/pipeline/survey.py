@@ -75,8 +75,8 @@ def load(
 ) -> Scene:
     """Read a scene of any known format and check that it can be fitted.
 
-    Raises:
-        UserError: the scene cannot be read, or has fewer than two training views or no seed points.
+    Raises UserError: the scene cannot be read, or has fewer than two training views or no seed
+    points.
     """
     reporter, begin = reporter or Silent(), time.monotonic()
     reporter.stage("Reading the scene")

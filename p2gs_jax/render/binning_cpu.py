@@ -147,9 +147,8 @@ def depth_order(depths: Float[Array, " n"], visible: Bool[Array, " n"]) -> Int[A
 def _expand(firsts, lengths, used, capacity: int):
     """Expand the first `used` ranges; range i gives `lengths[i]` values from firsts[i] upwards.
 
-    Returns:
-        The number of values, up to MOST_ENTRIES; the first `capacity` values; and the range of
-        each. Both arrays are longer than `capacity` by one write.
+    Return the number of values, up to MOST_ENTRIES; the first `capacity` values; and the range of
+    each. Both arrays are longer than `capacity` by one write.
     """
 
     @compiled_loop

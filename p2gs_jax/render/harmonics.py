@@ -37,11 +37,7 @@ def coefficient_count(degree: int) -> int:
 
 
 def degree_of(count: int) -> int:
-    """Return the degree that has `count` coefficients.
-
-    Raises:
-        ValueError: `count` is not 1, 4, 9 or 16.
-    """
+    """Return the degree that has `count` coefficients; ValueError: `count` is not 1, 4, 9 or 16."""
     degree = {coefficient_count(d): d for d in range(MAX_DEGREE + 1)}.get(count)
     if degree is None:
         raise ValueError(f"{count} is not a valid number of spherical-harmonics coefficients")

@@ -99,11 +99,7 @@ def rasterization(
 
 
 def _for_each_camera(colors, count: int, cameras: int, sh_degree: int | None):
-    """Return colours (c n 3), or the coefficients in use (c n k 3).
-
-    Raises:
-        ValueError: the shape is not valid.
-    """
+    """Return colours (c n 3), or coefficients in use (c n k 3); ValueError: another shape."""
     kept, shape = colors, (count, 3)
     if sh_degree is not None:
         bands = coefficient_count(sh_degree)
@@ -156,11 +152,7 @@ def _entries(gaussians, colors, viewmats, Ks, size, cfg, sh_degree):
 
 
 def _measured(arrays: tuple, size: tuple[int, int], cfg: RenderConfig, degree: int | None) -> int:
-    """Return a capacity that fits these cameras, with a margin.
-
-    Raises:
-        ValueError: the values are traced, inside `jax.jit`.
-    """
+    """Return a capacity for these cameras, with a margin; ValueError: traced values (`jax.jit`)."""
     fixed: tuple = jax.lax.stop_gradient(arrays)
     try:
         needed = int(jnp.max(_entries(*fixed, size, cfg, degree)))

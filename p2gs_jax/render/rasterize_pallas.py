@@ -152,10 +152,8 @@ def forward(rows, ids, offsets, plan: Plan):
     """Return the channels of the image and the transmittance, [T P] each, and the residuals.
 
     The residuals are the segments, the position where each stopped [S], and the channels and
-    transmittance before every segment except the first of a tile; none if no list is cut.
-
-    Raises:
-        ValueError: the number of pixels of a tile is not a power of two.
+    transmittance before every segment except the first of a tile; none if no list is cut. Raises
+    ValueError: the number of pixels of a tile is not a power of two.
     """
     if plan.pixels & (plan.pixels - 1):
         raise ValueError(

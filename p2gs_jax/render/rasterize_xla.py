@@ -256,9 +256,8 @@ def _prefixes(first, values, step, group: int):
 def _through(entries: _Entries, v_out, transmittance, remaining, within, plan: Plan, always):
     """Follow light through the next entries of every lane; `within` numbers entries of a group.
 
-    Returns:
-        Weights and gradients by the exponents, [B C P]; transmittance and remaining light behind
-        the entries, [B P].
+    Return weights and gradients by the exponents, [B C P]; transmittance and remaining light behind
+    the entries, [B P].
     """
     alpha, row = entries.alpha, entries.rows
     lanes, chunk, pixels = alpha.shape

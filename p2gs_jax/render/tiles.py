@@ -212,10 +212,8 @@ def rasterize(
     Radiance must be >= 0; the background is black. `cfg.implementation` is `reference` (dense, any
     precision, without a tile list), `xla` (lane queue), `pallas` (a GPU block per tile), or None
     for the fastest on this device. The tile list must be complete. Without `with_depth` the depth
-    is None, which saves about 5 % of the work.
-
-    Raises:
-        ValueError: the implementation does not exist, or it needs a tile list.
+    is None, which saves about 5 % of the work. Raises ValueError: the implementation does not
+    exist, or it needs a tile list.
     """
     # The GPU kernels support single precision only.
     name = cfg.implementation or (fastest_here() if radiance.dtype == jnp.float32 else "xla")

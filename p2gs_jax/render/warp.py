@@ -27,8 +27,7 @@ class Warp(NamedTuple):
 def surface_depth(render: Render, opaque: float = OPAQUE) -> Float[Array, "h w"]:
     """Return the expected depth at pixels whose alpha is above `opaque`, and 0 elsewhere.
 
-    Raises:
-        ValueError: the render has no depth.
+    Raises ValueError: the render has no depth.
     """
     if render.depth is None:
         raise ValueError("the warp needs depth: render with with_depth=True")

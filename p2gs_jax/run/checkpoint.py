@@ -43,11 +43,9 @@ class CheckpointStore:
         """Write a checkpoint; an interruption does not change the previous ones.
 
         An existing checkpoint is not written again. The tree is any pytree of arrays: None and
-        static fields come from `like` in `restore`. In `meta`, arrays become plain values.
-
-        Raises:
-            TypeError: `meta` holds something else.
-            OSError: the checkpoint cannot be written, for example because the disk is full.
+        static fields come from `like` in `restore`. In `meta`, arrays become plain values. Raises
+        TypeError: `meta` holds something else. Raises OSError: the checkpoint cannot be written,
+        for example because the disk is full.
         """
         if step in saved_steps(self.folder):
             return

@@ -63,8 +63,7 @@ class Decisions:
     def from_dict(cls, values: dict[str, Any]) -> Decisions:
         """Return decisions from the result of `to_dict`, also after JSON.
 
-        Raises:
-            KeyError, TypeError: a value is missing or of another type.
+        Raises KeyError or TypeError: a value is missing or of another type.
         """
         spline = values["spline"]
         kept = {f.name: values[f.name] for f in dataclasses.fields(cls)}

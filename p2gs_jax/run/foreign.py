@@ -113,10 +113,8 @@ def foreign_run(splats: str | Path, photometry: str | Path, scene: str | Path) -
 
     `photometry` is the folder that `calibrate --develop` wrote, and `scene` the scene that was
     calibrated. Splats must be in the coordinates of the scene. Views without a known exposure have
-    the mean, as held-out views.
-
-    Raises:
-        UserError: a file is missing or broken, or the calibration is of another scene.
+    the mean, as held-out views. Raises UserError: a file is missing or broken, or the calibration
+    is of another scene.
     """
     splats, folder, data = Path(splats), Path(photometry), DataConfig(test_every=0)
     path = folder / "photometry.json"

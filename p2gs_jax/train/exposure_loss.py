@@ -92,10 +92,8 @@ def relative_exposure_loss(
     """Return the configured form of the loss, unweighted.
 
     `linear` is the render of the first of the `views`; `pairs` are colours of the same points in
-    two views, for the form `observed_ldr`.
-
-    Raises:
-        ValueError: the form needs `pairs`, which are None.
+    two views, for the form `observed_ldr`. Raises ValueError: the form needs `pairs`, which are
+    None.
     """
     if loss.relative_exposure.form == "observed_ldr":
         if pairs is None:
@@ -108,8 +106,7 @@ def relative_exposure_loss(
 def color_pairs(tracks: Observations | None, cfg: FitConfig) -> ColorPairs | None:
     """Return pairs of colours of one point in two views; None if the loss uses none.
 
-    Raises:
-        UserError: the loss needs pairs, and the scene has no tracks.
+    Raises UserError: the loss needs pairs, and the scene has no tracks.
     """
     relative = cfg.loss.relative_exposure
     if relative.weight is None or relative.form != "observed_ldr":

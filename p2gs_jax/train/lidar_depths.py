@@ -49,10 +49,8 @@ def measured_depths(scene: Scene, cfg: FitConfig) -> list[Measured] | None:
     """Return the measured depths of every training view; None if the loss needs none.
 
     A view uses static points measured within `NEAR_S` of it, or else up to `NEAR_S` / 4 after the
-    nearest in time. Points behind a nearer point or a moving object are left out.
-
-    Raises:
-        UserError: the loss needs measurements, and the scene has none.
+    nearest in time. Points behind a nearer point or a moving object are left out. Raises UserError:
+    the loss needs measurements, and the scene has none.
     """
     if cfg.loss.lidar is None:
         return None

@@ -136,12 +136,9 @@ class Trainer:
 
         `alive` flags the Gaussians that exist; `owner` is the moving object of each Gaussian. A
         time budget loses `spent_s` seconds used before the run. It also reserves `finish_s` seconds
-        for evaluation and export, as measured on an unloaded machine.
-
-        Raises:
-            DivergenceError: a loss term or gradient is not finite.
-            UserError: no Gaussian is left, or no checkpoint can be resumed.
-            Interrupted: a signal ended the run; a checkpoint is written first.
+        for evaluation and export, as measured on an unloaded machine. Raises DivergenceError: a
+        loss term or gradient is not finite. Raises UserError: no Gaussian is left, or no checkpoint
+        can be resumed. Raises Interrupted: a signal ended the run; a checkpoint is written first.
         """
         self.slots = strategies.started(self.densification, int(np.sum(np.asarray(alive))))
         state = initial_state(params, alive, self.optimizer, self.slots.slots, owner)
@@ -225,10 +222,8 @@ class Trainer:
         """Dispatch steps up to the next log record, then read the fault; return completed reports.
 
         After an overflow, the steps that changed nothing do not count, and the capacity grows. The
-        state is donated, and the counters of `host` change.
-
-        Raises:
-            DivergenceError: a loss term or gradient is not finite.
+        state is donated, and the counters of `host` change. Raises DivergenceError: a loss term or
+        gradient is not finite.
         """
         shrink = schedule.shrink_at(host.progress, self.levels)
         if shrink != host.shrink:

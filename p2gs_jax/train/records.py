@@ -122,10 +122,8 @@ class Records:
     def restore(self, template: FitState) -> tuple[FitState, HostState] | None:
         """Return the newest readable checkpoint, and delete newer ones; None: there is none.
 
-        `template` is a state of the same structure with any number of slots.
-
-        Raises:
-            UserError: no existing checkpoint is readable, or the scene leads to other options.
+        `template` is a state of the same structure with any number of slots. Raises UserError: no
+        existing checkpoint is readable, or the scene leads to other options.
         """
         found = self._store.restore_latest(
             lambda meta: shapes_of(template, meta["gaussian_capacity"]), self.on_message

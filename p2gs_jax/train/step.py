@@ -245,9 +245,9 @@ class StepPrograms:
     the present level runs. Levels and populations share programs of equal arguments. So do the
     steps before and after the exposures are known.
 
-    Attributes:
-        capacities: capacities by the name of the image size, from before the exposures are known.
-        waited_s: seconds spent waiting for compilation; they do not count as time of steps.
+    `capacities` holds capacities by the name of the image size, from before the exposures are
+    known. `waited_s` counts the seconds spent waiting for compilation; they do not count as time of
+    steps.
     """
 
     def __init__(self):

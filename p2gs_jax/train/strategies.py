@@ -257,10 +257,7 @@ def densified(
     """Return the state after a densification; moments of new Gaussians are zero.
 
     The state is donated, and the counters of `host` change. `on_message` reports the first time
-    that Gaussians find no free slot.
-
-    Raises:
-        UserError: no Gaussian is left.
+    that Gaussians find no free slot. Raises UserError: no Gaussian is left.
     """
     key = compiled_key(device_seed(cfg.train.seed), np.int32(host.step))
     pause, reset_at = interval(cfg.densify, host), host.reset_at
