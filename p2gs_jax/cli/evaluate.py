@@ -111,7 +111,6 @@ def _judged(
     metrics: dict[str, Any],
     on_progress: Callable[[int, int], None],
 ) -> dict[str, Any]:
-    """Return the content of `against.json` (docs/files.md)."""
     from p2gs_jax.evaluation.against import judge_renders, scores_of_run
 
     programs = {}

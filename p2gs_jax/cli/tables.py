@@ -136,7 +136,6 @@ def print_calibration(result: Calibration, out: Path) -> None:
 
 
 def _print_solution(result: Calibration, more: Mapping[str, list[str]]) -> None:
-    """Print exposures with their standard errors, the notes, and each camera's vignetting."""
     console, columns = stdout(), {**_exposure_columns(result), **more}
     rows = zip(*columns.values(), strict=True)
     console.print(

@@ -236,7 +236,6 @@ class _Views:
         self._samples: dict[int, np.ndarray] = {}
 
     def add(self, found: _Judged) -> None:
-        """Add a view."""
         result, judge = found.result, self._judge
         view, index = judge.scene.views[result.index], result.index
         tells = scoring.tells_exposure(result.photograph, found.mask, judge.cfg.loss)

@@ -237,7 +237,6 @@ class DisplayFiles:
         return self._error(self.baked)
 
     def _error(self, gaussians: Gaussians) -> dict:
-        """Return the baking error of Gaussians by split."""
         self.reporter.stage("Measuring")
         scene, render = self.fitted.scene, self.fitted.cfg.render
         splits = {"train": scene.train_indices, "test": scene.test_indices}

@@ -144,7 +144,6 @@ class Flows:
         self.between = lru_cache(KEPT_FLOWS)(self._flow)
 
     def _flow(self, i: int, j: int) -> Float32[np.ndarray, "h w 2"]:
-        """Return the flow from a training view to another."""
         view, other = self.images[i], self.images[j]
         first, second = at_common_exposure(view, other)
         # The initial flow is the projection of the interpolated depth, or 0.

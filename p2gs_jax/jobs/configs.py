@@ -66,7 +66,6 @@ def _require_field(record: Any, name: str, whole: str) -> None:
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Return whether a value has the type of a configuration field."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin is typing.Literal:
         return value in args
@@ -84,7 +83,6 @@ def _fits(value: Any, hint: Any) -> bool:
 
 
 def _allowed(hint: Any) -> str:
-    """Return the values that a field allows, in words."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin is typing.Literal:
         return ", ".join(repr(a) for a in args)

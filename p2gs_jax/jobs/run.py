@@ -79,8 +79,6 @@ def run_jobs(
 
 
 class _Watched:
-    """A job on an engine."""
-
     def __init__(self, job: records.Job, files: records.JobFiles, run: Runner):
         self.job, self.files, self.run = job, files, run
         self.state = records.JobState(job.name)
@@ -88,7 +86,6 @@ class _Watched:
         self._since: float | None = None
 
     def begin(self, engine: Executor) -> None:
-        """Submit the job to an engine."""
         self.state.starts += 1
         self.state.doing, self.state.progress = "", None
         self.files.progress.unlink(missing_ok=True)

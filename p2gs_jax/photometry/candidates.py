@@ -236,7 +236,6 @@ class Search:
         return [self._candidate(choice, d, best) for choice, d in density.items()]
 
     def _parameters(self, choice: Choice) -> int:
-        """Return the number of free parameters of a choice."""
         levels = (self._scope.cameras, self._problem.observations.view_count)
         return parameter_count(choice.form, choice.curve.splines, *levels, self._scope.power)
 

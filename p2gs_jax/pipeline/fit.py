@@ -140,7 +140,6 @@ def _prepared(
     clock: Stopwatch,
     reporter: Reporter,
 ) -> Prepared:
-    """Solve the exposures of a scene and initialise its Gaussians."""
     render, note = suited(cfg.render)
     cfg = dataclasses.replace(cfg, render=render)
     with clock("photometry"):

@@ -129,7 +129,6 @@ def initialise(found: Survey, exposures: Exposures, reporter: Reporter | None = 
 
 
 def _matched(found: Survey, exposures: Exposures, cfg: FitConfig, reporter: Reporter) -> DenseSeeds:
-    """Return seeds from matching photographs."""
     scene = found.scene
     color = Tones.of(exposures.photometry, cfg.photometry)
     rough = rough_tones(exposures.observations, len(scene.training_views))

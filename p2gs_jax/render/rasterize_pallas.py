@@ -87,7 +87,6 @@ class _Tile:
         return a11 * dx + a12 * dy, a22 * dy, dx, dy
 
     def alpha(self, row, center):
-        """Return the alphas of one entry at the pixels."""
         plan = self.plan
         a11, a12, a22, log_opacity = row[2:GEOMETRY]
         u = center[0] + a11 * self.x + a12 * self.y

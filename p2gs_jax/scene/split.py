@@ -234,7 +234,6 @@ def _lines(path: Path) -> tuple[str, ...]:
 
 
 def _exists_without_pose(name: str, views: Sequence[View]) -> bool:
-    """Return whether a photograph without a pose exists under this name."""
     path = image_folder_of(views[0]) / plain_name(name)
     return path.is_file() or (
         path.parent.is_dir() and any(path.parent.glob(glob.escape(path.name) + ".*"))

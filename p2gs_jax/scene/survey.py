@@ -97,7 +97,6 @@ def _camera(name: str, views: Sequence[View]) -> SurveyedCamera:
 
 
 def _drive_facts(scene: Scene, found: Recording, cfg: DataConfig) -> list[str]:
-    """Return sentences on the frames, the distance and the boxes of a drive."""
     frames = len(chosen_frames(cfg.frames, sorted({p.frame for p in found.photographs})))
     by_camera = _by_camera(scene)
     centers = camera_centers(np.stack([v.viewmat for v in max(by_camera.values(), key=len)]))

@@ -96,7 +96,6 @@ def _light(seed: int) -> Light:
 
 
 def _pavements(build: Builder) -> None:
-    """Place both pavements, cut by the side street."""
     first, last = t.CROSS_STREET
     grey = (0.34, 0.33, 0.31)
     for side in (-1.0, 1.0):
@@ -175,7 +174,6 @@ def _vista(build: Builder) -> None:
 
 
 def _underpass(build: Builder) -> None:
-    """Place a house across the street on two thick walls: the drive has 14 m of shadow."""
     (x0, x1), side, low = t.UNDERPASS, t.FACADE_LINE + 0.5, t.UNDERPASS_HEIGHT
     wall, trim = (0.55, 0.47, 0.38), (0.70, 0.66, 0.57)
     stone = {"accent": trim, "style": 2.0}
@@ -190,7 +188,6 @@ def _underpass(build: Builder) -> None:
 
 
 def _trees(build: Builder) -> None:
-    """Place trees along both kerbs: a trunk and a few ellipsoids of leaves."""
     for side, first, step in ((1.0, 5.0, 10.5), (-1.0, 14.5, 11.5)):
         for i in range(7):
             x = first + step * i + build.uniform(-0.8, 0.8)
@@ -215,7 +212,6 @@ def _trees(build: Builder) -> None:
 
 
 def _cars(build: Builder) -> None:
-    """Place parked cars on both sides."""
     spots = {-1.0: (13.0, 45.5, 51.5, 64.0, 70.5), 1.0: (7.5, 14.5, 21.0, 43.5, 50.0, 62.5, 76.0)}
     paints = list(build.rng.permutation(len(_PAINTS)))
     k = 0

@@ -353,7 +353,6 @@ def _masonry(s: Point, u: Array, z: Array, seed: int) -> Array:
 
 
 def _tiles(s: Point, seed: int) -> Array:
-    """Return the albedo of roof tiles in rows."""
     along_y = jnp.abs(s.normal[0]) > jnp.abs(s.normal[1])
     u = jnp.where(along_y, s.p[1], s.p[0])
     row = jnp.floor(s.p[2] / 0.28)
@@ -364,13 +363,11 @@ def _tiles(s: Point, seed: int) -> Array:
 
 
 def _awning(s: Point) -> Array:
-    """Return the albedo of stripes in two colours."""
     stripe = s.grid(s.p[0], 0.6, 0.15)
     return (s.color + stripe * (s.accent - s.color)) * (1.0 + 0.08 * s.fine[0])
 
 
 def _car_body(s: Point) -> Array:
-    """Return the albedo of paint with seams, arches, handles, plates, lights and bumpers."""
     middle = (s.lo + s.hi) / 2
     ahead = jnp.where(s.style == 0.0, 1.0, s.style)  # the style is the direction along x, 1 or -1
     u = (s.p[0] - middle[0]) * ahead
@@ -413,7 +410,6 @@ def _car_glass(s: Point) -> tuple[Array, Array, Array]:
 
 
 def _wheel(s: Point) -> Array:
-    """Return the albedo of a tyre about a rim of five spokes."""
     middle = (s.lo + s.hi) / 2
     x, z = s.p[0] - middle[0], s.p[2] - middle[2]
     radius = jnp.sqrt(x**2 + z**2)

@@ -341,7 +341,6 @@ class Trainer:
                 expect(self.programs, state)  # needed soon after the first step
 
     def _key(self, state: FitState, inputs: Inputs, host: HostState, shrink: int) -> Key:
-        """Return the sizes and types for which a step of a level is compiled."""
         batch, cfg = inputs.batch, self.cfg
         degree = schedule.highest_degree(shrink, self.levels, cfg.train, cfg.render.sh_degree)
         optional = (batch.measured, batch.alpha, batch.camera.objects, inputs.partner.pairs)

@@ -225,7 +225,6 @@ class _Gauge:
         return (self._mean @ flat)[self._component].reshape(values.shape)
 
     def centred(self, values: Float[np.ndarray, "v ..."]) -> Float[np.ndarray, "v ..."]:
-        """Return the values minus the means of their components."""
         return values - self.shift(values)
 
 

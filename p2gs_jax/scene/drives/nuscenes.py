@@ -127,7 +127,6 @@ class _Drive:
         return (timestamp - self.start) * 1e-6
 
     def sensor(self, row: Row) -> _Sensor:
-        """Return the sensor that recorded a row of sample_data."""
         token = row["calibrated_sensor_token"]
         if token not in self._sensors:
             why = f"has no sensor {token}, which recorded {row['filename']}"

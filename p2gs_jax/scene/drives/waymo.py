@@ -249,8 +249,6 @@ def _objects(
 
 
 class _Scanner(NamedTuple):
-    """The pose of a scanner on the car, and its beams."""
-
     mount: Pose  # scanner to car
     # Rising inclinations, radians; two values are the ends of evenly spaced beams.
     beams: Float64[np.ndarray, " h"]
