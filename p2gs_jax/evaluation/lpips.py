@@ -75,7 +75,7 @@ NETWORKS = {
 class LpipsWeights(eqx.Module):
     """A network with its weights."""
 
-    network: Network = eqx.field(static=True)  # the network
+    network: Network = eqx.field(static=True)
     kernels: tuple[Float[Array, "kh kw i o"], ...]  # of each convolution, in order
     biases: tuple[Float[Array, " o"], ...]  # of each convolution, in order
     # weight of each channel in the comparison after each block

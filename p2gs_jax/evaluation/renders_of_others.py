@@ -36,7 +36,7 @@ class OtherRenders:
     """The files of a folder that show held-out views, by row of the view."""
 
     folder: Path
-    layout: str  # description of the layout
+    layout: str
     files: dict[int, Path]
     missing: tuple[str, ...] = ()  # names of held-out views without a file
 

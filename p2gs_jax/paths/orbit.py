@@ -55,7 +55,6 @@ def orbit(circle: Orbit, shots: Sequence[Shot], frames: int | None = None) -> li
     turn = 2 * np.pi * np.arange(count) / count
     swing = turn if circle.sway >= np.pi else circle.sway * np.sin(turn)
     K, width, height = common_lens(shots)
-    # All frames have the time of the middle shot.
     time = shots[len(shots) // 2].time
     poses = [look_at(circle.center(a), circle.focus, circle.up) for a in circle.middle + swing]
     return [Shot(f"{k:05d}", pose, K, width, height, time=time) for k, pose in enumerate(poses)]

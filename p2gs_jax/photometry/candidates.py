@@ -58,7 +58,7 @@ class Candidate:
     """One form under one curve."""
 
     choice: Choice  # form and kind of curve
-    response: Response  # the curve
+    response: Response
     parameters: int  # number of free parameters, without gauges
     density: float  # mean held-out log density, nat per observation
     deficit: float  # density of the best candidate minus this one, nat per observation

@@ -49,9 +49,9 @@ class Luminance(eqx.Module):
 
     curve: Float[Array, " k"]  # curve of all photographs
     hidden: Float[Array, "s n"]  # weights from statistics to the hidden layer
-    hidden_bias: Float[Array, " n"]  # biases of the hidden layer
+    hidden_bias: Float[Array, " n"]
     out: Float[Array, "n o"]  # weights to the curve's biases and the pseudo curve's shape
-    out_bias: Float[Array, " o"]  # biases of the output
+    out_bias: Float[Array, " o"]
     axes: Float[Array, "v 5"]  # raw axes of each view
     statistics: Float[Array, "v s"]  # statistics of each photograph; not learned
 

@@ -29,8 +29,8 @@ class Observations:
     points: Labels  # row of the point
     colors: PerChannel  # in [0, 1]
     spread: PerChannel  # standard deviation of `colors` from misplacement and blur
-    view_count: int  # number of views
-    point_count: int  # number of points
+    view_count: int
+    point_count: int
     cameras: Int[np.ndarray, " v"]  # physical camera of each view, 0, 1, ...
     too_coarse: int = 0  # number of observations left out for their scale (`COARSEST`)
     names: tuple[str, ...] = ()  # names of the views; empty: their rows

@@ -34,7 +34,7 @@ class PhotometricSolution:
     log_exposures: PerView
     # Standard errors of `log_exposures` (robust, gauge fixed); inf where unobserved or unknown.
     exposure_errors: PerView
-    gammas: PerView  # gamma of each view
+    gammas: PerView
     gamma_errors: PerView  # standard errors; 0 where gamma is not modelled, inf as above
     observations_per_view: Int[np.ndarray, " v"]  # number of usable observations
     # Label of each view: views with equal labels share a scale, others cannot be compared.
@@ -51,7 +51,7 @@ class PhotometricSolution:
     moved: float  # largest change of a parameter in the last iteration, log units
     converged: bool  # `moved` is below the tolerance
     unknown_errors: int  # number of views with data or a known exposure, but no standard errors
-    warnings: tuple[str, ...]  # warnings for the user
+    warnings: tuple[str, ...]
     white_balance_level: Level | None  # level of the white balance; None: it does not vary
     # Log factors on red, green, blue beside the exposure: their mean is 0 in every view and over
     # the observed views of a component. They are 0 if white balance does not vary.

@@ -64,7 +64,7 @@ class FitResult:
     params: Params  # the fit, live Gaussians only
     scene: Scene  # the fitted scene
     metrics: dict  # content of `metrics.json`
-    run_dir: Path  # the run folder
+    run_dir: Path
     selection: Selection | None  # result of the bundle adjustment, or None
     decisions: Decisions  # values that the scene decided
 

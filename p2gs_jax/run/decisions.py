@@ -38,7 +38,7 @@ CHOSEN = ("model", "curve", "spline", "white_balance", "vignetting", "responses"
 class Decisions:
     """Values that the options leave to the scene."""
 
-    model: config.PhotometricModel  # photometric model
+    model: config.PhotometricModel
     curve: Literal["power", "srgb", "spline", "linear"]  # base of the tone curve
     spline: tuple[float, ...] | None  # its correction, or None
     freeze_until: float  # share of the run in which exposures and gammas are fixed

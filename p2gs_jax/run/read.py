@@ -44,7 +44,7 @@ CONFIG_AGAIN = (
 class Run:
     """A finished run."""
 
-    folder: Path  # the run folder
+    folder: Path
     params: Params  # the fit
     # options of the fit: those of the user with decisions filled in
     cfg: FitConfig
@@ -55,7 +55,7 @@ class Run:
     photometry: photometry_files.PhotometryFile
     # moving object of each Gaussian, -1: none; None: nothing moves
     owner: Int[np.ndarray, " n"] | None = None
-    moving: MovingObjects | None = None  # the moving objects
+    moving: MovingObjects | None = None
     notes: tuple[str, ...] = ()  # notes for the user on what was read
     # error of Gaussians that were lifted from display colours (run/foreign.py), or None
     lifting_error: dict[str, Any] | None = None

@@ -286,7 +286,7 @@ class System(NamedTuple):
     unknowns: Unknowns
     basis: sp.csr_array  # columns are the free directions
     anchors: Held  # the gauges; their precisions are relative (`gauges`)
-    priors: Held  # the priors
+    priors: Held
     start: Parameters  # initial parameters; h is its prior mean
     smoothness: Float[np.ndarray, "k k"]  # matrix of the quadratic form that keeps splines smooth
 

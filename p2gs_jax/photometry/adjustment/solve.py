@@ -148,9 +148,9 @@ def _iterative(sparse: sp.csr_array, low_rank: Float[np.ndarray, "g n"]):
 class Fit(NamedTuple):
     """A solution and the input of its standard errors."""
 
-    theta: Parameters  # the parameters
+    theta: Parameters
     at: Weighted  # residuals and weights at the parameters
-    model: Forward  # the model
+    model: Forward
     normal: Matrix  # reduced normal matrix, without gauges and priors
     rounds: int  # number of iterations
     moved: float  # largest change in the last round (`_step`), log units
