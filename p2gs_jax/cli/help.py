@@ -114,10 +114,7 @@ def _number_rule(
 
 
 def _brief(kind: type, default: Any) -> Iterator[constructors.StructFieldSpec]:
-    """Yield a command's options, with the short names in place of the whole configuration.
-
-    Groups of options are left out.
-    """
+    """Yield a command's options without groups; short names replace the whole configuration."""
     for spec in _fields(kind, default, {}):
         if not isinstance(spec.default, FitConfig | DataConfig):
             if not dataclasses.is_dataclass(spec.default):

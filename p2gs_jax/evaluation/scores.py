@@ -170,10 +170,7 @@ def is_drive(scene: Scene) -> bool:
 
 
 def parts_of(mask: Float32[np.ndarray, "h w"], moving: Bool[np.ndarray, "h w"]) -> Masks:
-    """Return masks by name, without those that have too few pixels.
-
-    `moving` marks the pixels in boxes of moving objects.
-    """
+    """Return masks by name, if not too small; `moving` marks pixels in boxes of moving objects."""
     masks = {"whole": mask, "static": mask * ~moving, "moving": mask * moving}
     return {k: m.astype(np.float32) for k, m in masks.items() if m.sum() >= FEWEST_PIXELS}
 

@@ -113,10 +113,7 @@ def rotation_matrices(quats: Float[Array, "n 4"]) -> list[list[Float[Array, " n"
 
 
 def rotated(R: list[list[Float[Array, " n"]]], local: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """Return vectors, given along principal axes, in world coordinates.
-
-    `R` is from `rotation_matrices`.
-    """
+    """Return vectors along principal axes in world coordinates; `R` is from `rotation_matrices`."""
     return jnp.stack([sum(R[i][j] * local[:, j] for j in range(3)) for i in range(3)], -1)
 
 

@@ -82,10 +82,7 @@ class Decisions:
         return with_values(cfg, values)
 
     def require_same(self, saved: dict[str, Any], folder: Path) -> None:
-        """Raise a UserError if the checkpoints of a run, in `folder`, have other decisions.
-
-        Reasons may differ.
-        """
+        """Raise UserError if checkpoints in `folder` have other decisions; reasons may differ."""
         now = self.to_dict()
         del now["reasons"]
         other = [f"{k} was {saved.get(k)}, now {v}" for k, v in now.items() if saved.get(k) != v]

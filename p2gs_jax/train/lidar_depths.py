@@ -29,10 +29,7 @@ NEAR_S = 1.0
 def lidar_loss(
     alpha: Float[Array, "h w"], depth: Float[Array, "h w"] | None, measured: Measured
 ) -> Float[Array, ""]:
-    """Return the mean Huber error of log depth at the measured pixels.
-
-    `depth` is premultiplied by `alpha`, as in `Render`.
-    """
+    """Return the mean Huber error of log depth where measured; `depth` is multiplied by `alpha`."""
     assert depth is not None
     height, width = alpha.shape
     column = jnp.clip((measured.places[:, 0] * width).astype(jnp.int32), 0, width - 1)

@@ -73,10 +73,7 @@ def compiled(name: str, **static: Any) -> Any:
 
 @functools.cache
 def compiled_over(kind: type[MeshStep], name: str, *, mesh: Mesh, **static: Any) -> Any:
-    """Return a program of a step, divided over the devices of a mesh, jitted.
-
-    Its arguments may be host arrays.
-    """
+    """Return a jitted program of a step on the devices of a mesh; arguments may be host arrays."""
     body, in_specs, out_specs = kind.programs[name]
     on_each = functools.partial(body, **static)
     shardings = jax.tree.map(

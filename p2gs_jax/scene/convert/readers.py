@@ -77,10 +77,7 @@ def kind_of(path: Path) -> Kind:
 
 
 def pillow_heif(path: Path) -> Any:
-    """Return the library that reads HEIC, and register it with Pillow.
-
-    Raises UserError: pillow-heif is not installed.
-    """
+    """Return the library that reads HEIC, registered with Pillow; UserError: it is absent."""
     try:
         import pillow_heif
     except ImportError:

@@ -280,10 +280,7 @@ def in_world(
 
 
 def _tracklets(path: Path) -> tuple[list[Box], int]:
-    """Return boxes (as in `in_world`), and the number of tracklets without boxes.
-
-    UserError: the file is broken.
-    """
+    """Return boxes (`in_world`) and the number of tracklets without any; UserError: broken file."""
     try:
         root = ElementTree.parse(path).getroot()
     except ElementTree.ParseError as error:

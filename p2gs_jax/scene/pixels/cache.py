@@ -68,10 +68,7 @@ class PixelFiles:
         return Decoded(*fields) if fields[1].shape == (key.height, key.width) else None
 
     def write(self, key: Key, photograph: Decoded) -> Decoded:
-        """Write a photograph, and return it mapped.
-
-        Raises UserError: the disk is full, or cannot be written.
-        """
+        """Write a photograph and return it mapped; UserError: the disk is full or not writable."""
         arrays = {name: array for name, array in vars(photograph).items() if array is not None}
         kind = np.dtype([(name, array.dtype, array.shape) for name, array in arrays.items()])
         header: dict[str, Any] = {"fortran_order": False, "shape": (1,)}
