@@ -3,9 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 
+from p2gs_jax import Camera, DisplayTransform, Gaussians
 from p2gs_jax.config import PhotometryConfig
-from p2gs_jax.photometry.display import DisplayTransform
-from p2gs_jax.types import Camera, Gaussians
 
 SRGB = DisplayTransform(1.0, 2.2, PhotometryConfig())
 

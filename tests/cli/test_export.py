@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 
+from p2gs_jax import develop, load_run
 from p2gs_jax.cli import main
 from p2gs_jax.formats.ply import read_ply
-from p2gs_jax.photometry.display import develop
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run import read
-from p2gs_jax.run.read import load_run
 from p2gs_jax.scene.pixels.store import camera_of
 
 C0 = 0.28209479177387814

@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 from tiny_scene import make_scene
 
+from p2gs_jax import UserError, load_run, load_scene
 from p2gs_jax.config import DataConfig
-from p2gs_jax.errors import UserError
 from p2gs_jax.run.folder import candidates, find, remembered
-from p2gs_jax.run.read import load_run
 from p2gs_jax.run.scene_file import SCENE_FILE, read_scene, write_scene
-from p2gs_jax.scene import load_scene
 
 
 @pytest.fixture

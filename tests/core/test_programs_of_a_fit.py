@@ -5,15 +5,12 @@ import pytest
 from compile_counter import CompileCounter
 from tiny_scene import make_scene, prepared
 
-from p2gs_jax.config import FitConfig
+from p2gs_jax import FitConfig, calibrate, load_run, with_fields
 from p2gs_jax.core.progress import Silent
-from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.photometry.parameters import recentre
-from p2gs_jax.pipeline.calibrate import calibrate
 from p2gs_jax.pipeline.finish import Account, finish
 from p2gs_jax.pipeline.survey import load
 from p2gs_jax.run.folder import RunFolder
-from p2gs_jax.run.read import load_run
 
 
 @pytest.fixture(scope="module")

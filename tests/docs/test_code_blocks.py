@@ -21,11 +21,10 @@ import pytest
 from pages import LANGUAGES, PAGES, ROOT, blocks, commands, prose
 from tiny_scene import make_scene
 
-from p2gs_jax import config
+from p2gs_jax import config, read_sweep
 from p2gs_jax.cli import main
 from p2gs_jax.cli.fit import Calibrate, Fit, checked
 from p2gs_jax.cli.parser import COMMANDS, RENAMED, parse
-from p2gs_jax.jobs.configs import read_sweep
 
 BLOCKS = [block for page in PAGES for block in blocks(page)]
 

@@ -10,12 +10,11 @@ import splats
 from made_drive import FAR, SPEED, WALL, make_recording
 from splats import random_splats
 
+from p2gs_jax import DisplayTransform, develop, evaluate
 from p2gs_jax.config import DataConfig, FitConfig, LossConfig, PhotometryConfig
 from p2gs_jax.core.atomic import plain
 from p2gs_jax.evaluation import drives, seams
-from p2gs_jax.evaluation.evaluate import evaluate
 from p2gs_jax.evaluation.scores import mean_of_parts, parts_of, region_scores
-from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.scene.drives.assemble import assemble
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.rigid import headings

@@ -12,18 +12,15 @@ from lpips_files import made_weights
 from splats import random_splats
 from tiny_scene import noise_scene
 
+from p2gs_jax import Params, Photometry, Render, UserError, evaluate, load_run
 from p2gs_jax.cli.tables import print_metrics
 from p2gs_jax.config import FitConfig, LossConfig
 from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.core.threads import MOST_WORKERS, map_in_order
-from p2gs_jax.errors import UserError
-from p2gs_jax.evaluation.evaluate import evaluate
 from p2gs_jax.evaluation.lpips import lpips
 from p2gs_jax.evaluation.references import load_reference
 from p2gs_jax.evaluation.scores import notes_on_missing, psnr, tells_exposure
-from p2gs_jax.run.read import load_run
 from p2gs_jax.scene.pixels.store import ImageStore
-from p2gs_jax.types import Params, Photometry, Render
 
 HEIGHT, WIDTH = 34, 40
 

@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 from tiny_scene import noise_scene
 
-from p2gs_jax.config import FitConfig
-from p2gs_jax.errors import UserError
+from p2gs_jax import FitConfig, Params, Photometry, UserError
 from p2gs_jax.evaluation.against import check_renders, judge_renders
 from p2gs_jax.evaluation.evaluate import Judge
 from p2gs_jax.evaluation.renders_of_others import find_renders
 from p2gs_jax.scene.pixels.store import ImageStore
-from p2gs_jax.types import Params, Photometry
 
 SIZE = (40, 34)
 

@@ -14,10 +14,10 @@ import pytest
 from PIL import Image
 from tiny_scene import make_scene, noise_scene
 
+from p2gs_jax import UserError, preset
 from p2gs_jax.config import CameraFormation, DataConfig
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.core.progress import Silent
-from p2gs_jax.errors import UserError
 from p2gs_jax.export.develop import Development, develop_scene
 from p2gs_jax.export.poses import poses_of
 from p2gs_jax.formats.exr import read_exr
@@ -25,7 +25,6 @@ from p2gs_jax.photometry.calibrate import Selection
 from p2gs_jax.photometry.formation import formation
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.solution import PhotometricSolution
-from p2gs_jax.presets import preset
 from p2gs_jax.run.decisions import decide
 from p2gs_jax.scene import find_scene, with_masks_and_split
 from p2gs_jax.scene.exposures import read_known_exposures

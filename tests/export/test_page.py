@@ -8,14 +8,13 @@ import jax
 import numpy as np
 import pytest
 
+from p2gs_jax import UserError, load_run
 from p2gs_jax.core.numerics import on_device
-from p2gs_jax.errors import UserError
 from p2gs_jax.export.page import MEGABYTE, RESERVE, page_text, write_page
 from p2gs_jax.export.page_scene import embedded_photographs, page_scene
 from p2gs_jax.export.page_splats import ever_drawn, fit_into, weights
 from p2gs_jax.render import project
 from p2gs_jax.render.tiles import rasterize_reference
-from p2gs_jax.run.read import load_run
 
 HOSTILE = '</script><script>window.hacked=1</script><img src=x onerror="hacked=1">{{scene}}'
 

@@ -8,10 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from p2gs_jax import develop, load_run
 from p2gs_jax.export.page import write_page
 from p2gs_jax.export.page_scene import embedded_photographs
-from p2gs_jax.photometry.display import develop
-from p2gs_jax.run.read import load_run
 
 # Browsers wait more than they compute.
 pytestmark = pytest.mark.slow

@@ -8,15 +8,13 @@ import OpenEXR
 import pytest
 from scipy.spatial.transform import Rotation
 
+from p2gs_jax import Camera, DisplayTransform, UserError
 from p2gs_jax.config import CameraFormation, PhotometryConfig
-from p2gs_jax.errors import UserError
 from p2gs_jax.formats.exr import read_exr, write_exr
 from p2gs_jax.formats.false_color import depth_color, false_color, luminance, stops
 from p2gs_jax.formats.frames import open_video, write_png
-from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.scene.convert.readers import ExifSettings
 from p2gs_jax.scene.rigid import pose_of
-from p2gs_jax.types import Camera
 
 WIDTH, HEIGHT = 90, 70
 

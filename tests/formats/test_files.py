@@ -10,16 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from p2gs_jax.config import FitConfig
+from p2gs_jax import DisplayTransform, FitConfig, Params, Photometry, UserError
 from p2gs_jax.core import atomic
 from p2gs_jax.core.atomic import append_jsonl, atomic_folder, atomic_write, read_jsonl, write_json
-from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.scores import ViewResult
-from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.pipeline.finish import heading
 from p2gs_jax.run.photometry_files import read_photometry, write_photometry
 from p2gs_jax.run.plots import write_summary
-from p2gs_jax.types import Params, Photometry
 
 
 def test_a_failure_leaves_the_old_file_or_folder_and_success_replaces_it(tmp_path):

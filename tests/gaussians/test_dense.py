@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scene.helpers import make_view
 
+from p2gs_jax import Scene, preset
 from p2gs_jax.config import DataConfig, DensifyConfig, FitConfig
 from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.gaussians.dense import MATCH_SIDE, coverage_of, dense_limit, dense_seeds, wants_dense
@@ -21,9 +22,7 @@ from p2gs_jax.gaussians.matching import (
 )
 from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.photometry.observations import Observations
-from p2gs_jax.presets import preset
 from p2gs_jax.scene.pixels.store import ImageStore
-from p2gs_jax.types import Scene
 
 WIDTH, HEIGHT, FOCAL = 192, 144, 180.0
 CENTERS = np.array([[0, 0, 0], [0.4, 0, 0], [-0.4, 0.1, 0], [0.1, 0.4, 0], [0, -0.4, 0.1]])

@@ -9,6 +9,7 @@ import pytest
 from scene.helpers import make_view
 from tiny_scene import make_scene, prepared
 
+from p2gs_jax import Camera, Scene, preset, with_fields
 from p2gs_jax.config import FitConfig, InitConfig
 from p2gs_jax.gaussians.seeds import (
     cameras_radius,
@@ -18,11 +19,8 @@ from p2gs_jax.gaussians.seeds import (
     within_reach,
 )
 from p2gs_jax.gaussians.shell import find_shell, sphere_behind
-from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.pipeline.survey import load, scale_notes
-from p2gs_jax.presets import preset
 from p2gs_jax.render import view_radiance
-from p2gs_jax.types import Camera, Scene
 
 
 def view(x=0.0):

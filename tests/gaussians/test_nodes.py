@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from moving_box import FRAMES, INTERVAL, SIZE, drive_format, make_world, write_photographs
 
+from p2gs_jax import Photometry, with_fields
 from p2gs_jax.config import DataConfig, DynamicsConfig, FitConfig
 from p2gs_jax.gaussians.moving import (
     OPACITY,
@@ -17,11 +18,9 @@ from p2gs_jax.gaussians.moving import (
     with_vibration,
 )
 from p2gs_jax.gaussians.posed import standing
-from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.photometry.parameters import initial_photometry
 from p2gs_jax.render.project import STILL
 from p2gs_jax.scene import ImageStore, drives, load_scene
-from p2gs_jax.types import Photometry
 
 CFG = DynamicsConfig()
 VIBRATING = with_fields(FitConfig(), {"dynamics.method": "vibration", "dynamics.vibrating": 500})

@@ -8,16 +8,14 @@ import numpy as np
 import pytest
 from scene.helpers import make_view
 
+from p2gs_jax import exposure_error, load_scene, preset
 from p2gs_jax.core.numerics import srgb_decode, srgb_encode
-from p2gs_jax.evaluation.alignment import exposure_error
 from p2gs_jax.photometry.calibrate import calibrate_observations, options_of
 from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.sources.points import MOST_PER_POINT, projected_colors, track_colors
 from p2gs_jax.photometry.sources.sampling import sample
-from p2gs_jax.presets import preset
-from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.visibility import unoccluded
 from p2gs_jax.types import Scene, Tracks

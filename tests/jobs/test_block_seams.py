@@ -8,14 +8,13 @@ import pytest
 from scene.helpers import make_view
 from splats import gaussians_of
 
+from p2gs_jax import Scene, UserError
 from p2gs_jax.config import DataConfig, RenderConfig
-from p2gs_jax.errors import UserError
 from p2gs_jax.jobs.blocks import seams as measuring
 from p2gs_jax.jobs.blocks.cut import OVERLAP, Block, Cut, Ground
 from p2gs_jax.jobs.blocks.seams import INWARDS, level_seams, measure_seams, merge_cores, shifts
 from p2gs_jax.render.harmonics import C0
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
-from p2gs_jax.types import Scene
 
 GROUND = Ground(np.zeros(3), np.eye(3)[:2])
 INF = np.inf

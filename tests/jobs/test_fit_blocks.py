@@ -9,9 +9,9 @@ from test_cut import make_road
 from tiny_scene import make_scene
 
 import p2gs_jax
+from p2gs_jax import UserError, with_fields
 from p2gs_jax.core.atomic import plain
 from p2gs_jax.core.progress import Silent
-from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.dense import coverage_of
 from p2gs_jax.gaussians.population import default_max_gaussians
 from p2gs_jax.jobs.blocks import fit as module
@@ -20,7 +20,6 @@ from p2gs_jax.jobs.blocks.block import block_config
 from p2gs_jax.jobs.blocks.cut import cut_scene
 from p2gs_jax.jobs.blocks.plan import check_options, read_plan, write_plan
 from p2gs_jax.jobs.blocks.shared import read_shared, solve_shared
-from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.jobs.job import JobState
 from p2gs_jax.pipeline.survey import load
 from p2gs_jax.scene.pixels.store import ImageStore

@@ -10,12 +10,11 @@ import pytest
 from tiny_scene import make_scene
 
 import p2gs_jax
+from p2gs_jax import UserError, grid, read_sweep, with_fields
 from p2gs_jax.cli import main
 from p2gs_jax.core import interrupts
 from p2gs_jax.core.clock import whole_run
 from p2gs_jax.core.interrupts import Interrupted
-from p2gs_jax.errors import UserError
-from p2gs_jax.jobs.configs import grid, read_sweep, with_fields
 from p2gs_jax.jobs.job import REASON, JobFiles, read_job
 from p2gs_jax.jobs.sweep import SweepResult, brief, failures, read_row, sweep, to_markdown
 from p2gs_jax.run.decisions import Decisions

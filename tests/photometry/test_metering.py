@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
+from p2gs_jax import DisplayTransform, UserError, develop
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.core.numerics import LN2
-from p2gs_jax.errors import UserError
-from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import exposed_at
 from p2gs_jax.photometry.metering import METERS, adapted, fit_metering, meter
 from p2gs_jax.run.photometry_files import read_metering, write_metering

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 import p2gs_jax
-from p2gs_jax import calibrate, calibrate_run, calibrate_stack
-from p2gs_jax.errors import UserError
-from p2gs_jax.evaluation.alignment import exposure_error
+from p2gs_jax import UserError, calibrate, calibrate_run, calibrate_stack, exposure_error
 from p2gs_jax.photometry.sources.stack import read_stack, stack_colors
 from p2gs_jax.run.photometry_files import read_photometry
 from p2gs_jax.synth.sensor import read_true_exposures

@@ -8,14 +8,11 @@ import numpy as np
 import pytest
 from scene.helpers import around, blender
 
-from p2gs_jax import load_run, with_fields
-from p2gs_jax.errors import UserError
+from p2gs_jax import UserError, fit, load_run, preset, with_fields
 from p2gs_jax.evaluation.against import check_renders, judge_renders
 from p2gs_jax.evaluation.evaluate import Judge
 from p2gs_jax.evaluation.renders_of_others import find_renders
 from p2gs_jax.formats.exr import read_exr, write_exr
-from p2gs_jax.pipeline.fit import fit
-from p2gs_jax.presets import preset
 
 SIZE, COLOR = 48, np.array([0.8, 0.3, 0.2])
 

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from moving_box import SIZE, drive_format, pose_at, write_photographs
 
-from p2gs_jax import FitConfig, UserError, fit, load_run, make_camera, with_fields
+from p2gs_jax import FitConfig, UserError, develop, fit, load_run, make_camera, with_fields
 from p2gs_jax.core.atomic import read_jsonl
 from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.formats.ply import read_ply
-from p2gs_jax.photometry.display import develop
 from p2gs_jax.render.project import STILL, at_time
 from p2gs_jax.run.checkpoint import saved_steps
 from p2gs_jax.run.scene_file import read_objects

@@ -13,10 +13,8 @@ from jax.errors import JaxRuntimeError
 from tiny_scene import make_scene, prepared
 
 import p2gs_jax
-from p2gs_jax.config import FitConfig, RenderConfig
-from p2gs_jax.errors import DivergenceError, UserError
+from p2gs_jax import DivergenceError, FitConfig, RenderConfig, UserError, with_fields
 from p2gs_jax.gaussians.population import Coverage
-from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.pipeline import fit as pipeline
 from p2gs_jax.pipeline import preflight
 from p2gs_jax.pipeline.preflight import MemoryNeeded, check_run_dir, memory_needed, require_memory

@@ -6,13 +6,12 @@ import signal
 import numpy as np
 import pytest
 
-from p2gs_jax import fit
+from p2gs_jax import fit, load_run
 from p2gs_jax.core.interrupts import Interrupted
 from p2gs_jax.core.progress import Reporter
 from p2gs_jax.pipeline import snapshots
 from p2gs_jax.presets import from_dict
 from p2gs_jax.run.folder import RunFolder
-from p2gs_jax.run.read import load_run
 from p2gs_jax.viewer.follow import Follower
 
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from tiny_scene import make_scene
 
-from p2gs_jax.config import FitConfig
-from p2gs_jax.jobs.configs import with_fields
+from p2gs_jax import FitConfig, Scene, load_scene, with_fields
 from p2gs_jax.pipeline.survey import (
     decided_scale,
     extent_of_rates,
@@ -17,8 +16,6 @@ from p2gs_jax.pipeline.survey import (
     seen_depths,
 )
 from p2gs_jax.run.decisions import Decisions
-from p2gs_jax.scene import load_scene
-from p2gs_jax.types import Scene
 
 
 @pytest.fixture(scope="module")

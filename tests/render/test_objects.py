@@ -9,9 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from splats import random_splats
 
-from p2gs_jax.config import RenderConfig
+from p2gs_jax import RenderConfig, required_capacity
 from p2gs_jax.gaussians.posed import posed
-from p2gs_jax.render import required_capacity
 from p2gs_jax.render import visible as visibility
 from p2gs_jax.render.project import HIDDEN, camera_of_each
 from p2gs_jax.render.visible import BLOCK, compact, splat

@@ -10,12 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from splats import gaussians_of
 
-from p2gs_jax.config import RenderConfig
+from p2gs_jax import Camera, Gaussians, RenderConfig
 from p2gs_jax.render import bin_tiles, project, required_capacity
 from p2gs_jax.render.capacity import SMALLEST, bucket, until_it_fits
 from p2gs_jax.render.visible import compact, in_view
 from p2gs_jax.train.capacities import count_view
-from p2gs_jax.types import Camera, Gaussians
 
 COUNT, WIDTH, HEIGHT = 300, 80, 56
 # Every Gaussian in each of 5 x 7 tiles.

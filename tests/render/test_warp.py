@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 import splats
 
-from p2gs_jax.config import RenderConfig
+from p2gs_jax import Render, RenderConfig
 from p2gs_jax.render import view_radiance
 from p2gs_jax.render import warp as warping
-from p2gs_jax.types import Render
 
 WIDTH, HEIGHT = 24, 16
 Y, X = np.mgrid[:HEIGHT, :WIDTH] + 0.5

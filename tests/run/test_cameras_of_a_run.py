@@ -9,14 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
+from p2gs_jax import UserError, develop, load_run
 from p2gs_jax.config import CameraFormation, FitConfig
-from p2gs_jax.errors import UserError
 from p2gs_jax.formats.exr import read_exr
-from p2gs_jax.photometry.display import develop
 from p2gs_jax.presets import from_dict, to_dict
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.run.photometry_files import read_photometry
-from p2gs_jax.run.read import load_run
 from p2gs_jax.viewer.settings import common_settings, display_of, settings_of_view
 
 CAMERAS = (

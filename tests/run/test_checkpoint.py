@@ -12,12 +12,10 @@ import optax
 import pytest
 from splats import random_splats
 
-from p2gs_jax.config import FitConfig
-from p2gs_jax.errors import UserError
+from p2gs_jax import FitConfig, Params, Photometry, UserError
 from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.train.optimizer import make_optimizer
 from p2gs_jax.train.state import grow_state, initial_state
-from p2gs_jax.types import Params, Photometry
 
 
 def state(capacity, seed=0):

@@ -11,16 +11,15 @@ import pytest
 from PIL import Image
 from scipy.ndimage import map_coordinates
 
+from p2gs_jax import UserError, write_street
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.numerics import srgb_decode, srgb_encode
-from p2gs_jax.errors import UserError
 from p2gs_jax.scene.colmap import load_colmap
 from p2gs_jax.synth.furnish import STREET_M, build_town
 from p2gs_jax.synth.rig import MOUNTS, camera_viewmat, carla_rotation, drive, intrinsics
 from p2gs_jax.synth.sensor import draw_shots, photograph, read_true_exposures, write_true_exposures
 from p2gs_jax.synth.settings import Sensor, image_height
 from p2gs_jax.synth.town import Material
-from p2gs_jax.synth.write import write_street
 
 # The options of the fixture `noisy_street`.
 SIZE = {"frames": 5, "width": 192, "height": 128, "points": 6000}

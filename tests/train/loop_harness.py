@@ -6,11 +6,10 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from p2gs_jax.config import FitConfig
+from p2gs_jax import FitConfig, with_fields
 from p2gs_jax.core.atomic import read_jsonl
 from p2gs_jax.core.numerics import on_host
 from p2gs_jax.gaussians.population import Coverage
-from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.train import loop

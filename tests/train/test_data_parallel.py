@@ -8,9 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from p2gs_jax.config import FitConfig
-from p2gs_jax.errors import UserError
-from p2gs_jax.jobs.configs import with_fields
+from p2gs_jax import FitConfig, UserError, with_fields
 from p2gs_jax.train.data_parallel import mesh_of, with_a_view_each
 from p2gs_jax.train.state import FAULT_OVERFLOW
 

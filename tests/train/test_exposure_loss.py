@@ -7,19 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from p2gs_jax.config import (
-    CameraFormation,
-    FitConfig,
-    LossConfig,
-    PhotometryConfig,
-    RelativeExposureConfig,
-)
+from p2gs_jax import FitConfig, Photometry
+from p2gs_jax.config import CameraFormation, LossConfig, PhotometryConfig, RelativeExposureConfig
 from p2gs_jax.photometry import formation as forming
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import KNOTS
 from p2gs_jax.train import exposure_loss as rel
 from p2gs_jax.train.exposure_loss import color_pairs
-from p2gs_jax.types import Photometry
 
 WIDTH, HEIGHT = 48, 32
 # Jitted: eager calls would compile every operation.

@@ -8,14 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_scene import make_scene
 
+from p2gs_jax import load_scene, loss_terms
 from p2gs_jax.config import CameraFormation, DataConfig, FitConfig, PhotometryConfig
 from p2gs_jax.render.capacity import MOST_CANVASES, canvases
-from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.train import inputs
 from p2gs_jax.train.image_gradient import compared, decoded
 from p2gs_jax.train.inputs import TrainingViews, batches_of, stacked
-from p2gs_jax.train.terms import loss_terms
 from p2gs_jax.types import Batch, Camera, Photometry, Render
 
 

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from loop_harness import SHORT, Harness, Programs, signalled
 
+from p2gs_jax import DivergenceError, UserError, with_fields
 from p2gs_jax.core.interrupts import Interrupted
 from p2gs_jax.core.progress import LogRecord
-from p2gs_jax.errors import DivergenceError, UserError
-from p2gs_jax.jobs.configs import with_fields
 
 BUDGET = with_fields(SHORT, {"train.budget_s": 60.0})
 LEVELS = with_fields(SHORT, {"train.coarse_to_fine": [0.33]})

@@ -10,11 +10,9 @@ import pytest
 from noise_views import DEGREE, EXTENT, config, start, view
 
 import p2gs_jax
-from p2gs_jax.config import FitConfig
-from p2gs_jax.errors import DivergenceError
+from p2gs_jax import DivergenceError, FitConfig, loss_terms
 from p2gs_jax.render.visible import splat
 from p2gs_jax.train.image_gradient import image_loss
-from p2gs_jax.train.terms import loss_terms
 
 CFG = config()
 

@@ -8,13 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from p2gs_jax import DisplayTransform, develop, loss_terms, preset
 from p2gs_jax.config import FitConfig, LossConfig, PhotometryConfig
 from p2gs_jax.evaluation.alignment import fit_exposure
-from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import formation
-from p2gs_jax.presets import preset
 from p2gs_jax.train.image_gradient import compared
-from p2gs_jax.train.terms import loss_terms
 from p2gs_jax.types import Batch, Camera, Capture, Photometry, Render
 
 RNG = np.random.default_rng(0)

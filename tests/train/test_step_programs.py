@@ -7,9 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from p2gs_jax.config import FitConfig
-from p2gs_jax.jobs.configs import with_fields
-from p2gs_jax.presets import preset
+from p2gs_jax import FitConfig, preset, with_fields
 from p2gs_jax.render.capacity import Capacity
 from p2gs_jax.train.optimizer import make_optimizer
 from p2gs_jax.train.step import PROGRAMS, Key, Step, StepPrograms

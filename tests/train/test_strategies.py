@@ -6,15 +6,12 @@ import numpy as np
 import pytest
 from splats import random_splats
 
-from p2gs_jax.config import FitConfig
-from p2gs_jax.errors import UserError
+from p2gs_jax import FitConfig, Params, Photometry, UserError, with_fields
 from p2gs_jax.gaussians.population import Coverage, default_max_gaussians
-from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.train import strategies
 from p2gs_jax.train.optimizer import make_optimizer
 from p2gs_jax.train.state import HostState, alive_in, initial_state
 from p2gs_jax.train.strategies import SLOTS, Adaptive, Mcmc, Slots
-from p2gs_jax.types import Params, Photometry
 
 SEEDS, COVERAGE = 50, Coverage(400 * 300, 1.0)
 DEFAULT = default_max_gaussians(SEEDS, COVERAGE, FitConfig().train)

@@ -6,14 +6,11 @@ import numpy as np
 import pytest
 from tiny_scene import make_scene
 
-from p2gs_jax.config import FitConfig
-from p2gs_jax.jobs.configs import with_fields
+from p2gs_jax import FitConfig, Gaussians, Params, Photometry, load_run, with_fields
 from p2gs_jax.photometry.formation import corner, squared_radii
 from p2gs_jax.run.decisions import Decisions, decide, likely, unsolved
-from p2gs_jax.run.read import load_run
 from p2gs_jax.train.optimizer import learning_rates
 from p2gs_jax.train.update import _recentered
-from p2gs_jax.types import Gaussians, Params, Photometry
 
 GAUSSIANS = Gaussians(
     jnp.zeros((4, 3)), jnp.ones((4, 4)), jnp.zeros((4, 3)), jnp.zeros(4), jnp.zeros((4, 1, 3))

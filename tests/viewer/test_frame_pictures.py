@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from p2gs_jax import Camera, DisplayTransform, develop
 from p2gs_jax.config import CameraFormation, PhotometryConfig
 from p2gs_jax.formats.false_color import depth_color, false_color, luminance
-from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.photometry.formation import squared_radii
-from p2gs_jax.types import Camera
 from p2gs_jax.viewer import pictures
 
 TRANSFORM = DisplayTransform(2.0, 2.2, PhotometryConfig())

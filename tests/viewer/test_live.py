@@ -14,9 +14,8 @@ pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 import viser
 from viewer_stubs import CANVAS, SIZES, Client, FakeRenderer, Panel
 
+from p2gs_jax import UserError, load_run
 from p2gs_jax.core.atomic import read_jsonl
-from p2gs_jax.errors import UserError
-from p2gs_jax.run.read import load_run
 from p2gs_jax.scene.pixels.store import camera_of
 from p2gs_jax.viewer import live as live_module
 from p2gs_jax.viewer import panel as panels

@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 from splats import random_splats
 
-from p2gs_jax.config import RenderConfig
-from p2gs_jax.errors import UserError
+from p2gs_jax import Camera, RenderConfig, UserError
 from p2gs_jax.render.capacity import make_renderer
-from p2gs_jax.types import Camera
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 

@@ -19,9 +19,8 @@ from scene.drives import writers_waymo as waymo
 from scene.drives.writers import HEIGHT, WIDTH, K, cut, mounted
 from scene.helpers import refused
 
+from p2gs_jax import UserError, load_scene
 from p2gs_jax.config import DataConfig
-from p2gs_jax.errors import UserError
-from p2gs_jax.scene import load_scene
 from p2gs_jax.scene.drives import FORMATS
 
 EVERY = pytest.mark.parametrize("name", FORMATS)
