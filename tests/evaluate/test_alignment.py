@@ -8,15 +8,6 @@ import pytest
 
 from p2gs_jax.config import PhotometryConfig
 from p2gs_jax.evaluation import alignment, radiance
-from p2gs_jax.evaluation.radiance import (
-    Alignment,
-    delta_e_itp,
-    mu_law,
-    mu_law_psnr,
-    pu21_encode,
-    pu21_psnr,
-    sampled,
-)
 from p2gs_jax.photometry.formation import display, formation
 from p2gs_jax.types import Capture
 
@@ -90,16 +81,16 @@ def image(seed=0):
 
 
 def scores(linear, truth, brightest=1e9):
-    aligned = Alignment.of([sampled(linear, truth, EVERYWHERE, 2)] * 2, brightest)
+    aligned = radiance.Alignment.of([radiance.sampled(linear, truth, EVERYWHERE, 2)] * 2, brightest)
     rows = {name: aligned.scores(linear, truth, EVERYWHERE) for name in "ab"}
     return aligned.summary(rows, {"a": "train", "b": "test"})
 
 
 def test_pu21_has_its_published_values():
     # The published encoding maps 100 cd/m^2 to 256 and its darkest value to 0.
-    assert pu21_encode(np.array(100.0)) == pytest.approx(256, abs=0.5)
-    assert pu21_encode(np.array(0.005)) == pytest.approx(0, abs=1e-3)
-    assert np.all(np.diff(pu21_encode(np.geomspace(0.005, 1e4, 200))) > 0)
+    assert radiance.pu21_encode(np.array(100.0)) == pytest.approx(256, abs=0.5)
+    assert radiance.pu21_encode(np.array(0.005)) == pytest.approx(0, abs=1e-3)
+    assert np.all(np.diff(radiance.pu21_encode(np.geomspace(0.005, 1e4, 200))) > 0)
 
 
 @pytest.mark.parametrize(("c", "power"), [(0.05, 1.0), (20.0, 1.0), (1.0, 0.8)])
@@ -137,17 +128,17 @@ def test_errors_are_in_stops_and_pixels_count_by_their_true_radiance():
 def test_the_number_of_aligned_samples_is_bounded(monkeypatch):
     monkeypatch.setattr(radiance, "MOST_ALIGNED", 1000)
     truth = image()
-    samples = [sampled(truth / 2, truth, EVERYWHERE, 10) for _ in range(10)]
+    samples = [radiance.sampled(truth / 2, truth, EVERYWHERE, 10) for _ in range(10)]
     assert 1000 <= sum(sample.shape[1] for sample in samples) <= 2 * 1000
-    assert Alignment.of(samples, 1e9).scale == pytest.approx(2, rel=1e-6)
+    assert radiance.Alignment.of(samples, 1e9).scale == pytest.approx(2, rel=1e-6)
 
 
 def test_perceptual_scores_notice_a_change_of_hue():
     truth = image()
-    assert delta_e_itp(truth, truth, EVERYWHERE, 1.0) == pytest.approx(0, abs=1e-9)
+    assert radiance.delta_e_itp(truth, truth, EVERYWHERE, 1.0) == pytest.approx(0, abs=1e-9)
     red = truth * [1.2, 1.0, 0.9]
-    assert delta_e_itp(red, truth, EVERYWHERE, 1.0) > 3
-    assert pu21_psnr(red, truth, EVERYWHERE, 1.0) < 40
+    assert radiance.delta_e_itp(red, truth, EVERYWHERE, 1.0) > 3
+    assert radiance.pu21_psnr(red, truth, EVERYWHERE, 1.0) < 40
 
 
 TRUTH = np.random.default_rng(0).uniform(0.1, 4.0, (8, 10, 3))
@@ -155,26 +146,26 @@ SOME = np.ones((8, 10), bool)
 
 
 def test_scores_without_valid_pixels_are_nan():
-    assert np.isnan(mu_law_psnr(TRUTH, TRUTH, ~SOME))
-    assert np.isnan(mu_law_psnr(TRUTH, 0 * TRUTH, SOME))
+    assert np.isnan(radiance.mu_law_psnr(TRUTH, TRUTH, ~SOME))
+    assert np.isnan(radiance.mu_law_psnr(TRUTH, 0 * TRUTH, SOME))
     none = np.zeros((24, 32), bool)
-    aligned = Alignment.of([sampled(image(), image(), none, 1)], 1.0)
+    aligned = radiance.Alignment.of([radiance.sampled(image(), image(), none, 1)], 1.0)
     assert np.isnan(aligned.scores(image(), image(), none)["stops_rms"])
 
 
 def test_mu_law_psnr_has_its_known_value_without_masked_pixels():
-    assert mu_law(np.array([0.0, 1.0, 7.0, -1.0])) == pytest.approx([0, 1, 1, 0])
-    assert (np.diff(mu_law(np.linspace(0, 1, 100))) > 0).all()
-    assert mu_law(np.array(0.01)) == pytest.approx(np.log(51) / np.log(5001))
+    assert radiance.mu_law(np.array([0.0, 1.0, 7.0, -1.0])) == pytest.approx([0, 1, 1, 0])
+    assert (np.diff(radiance.mu_law(np.linspace(0, 1, 100))) > 0).all()
+    assert radiance.mu_law(np.array(0.01)) == pytest.approx(np.log(51) / np.log(5001))
     brightest = TRUTH.max()
-    low = mu_law(TRUTH / brightest) - 0.1
+    low = radiance.mu_law(TRUTH / brightest) - 0.1
     linear = (np.exp(low * np.log1p(5000.0)) - 1) / 5000.0 * brightest
     assert (low > 0).all()
-    assert mu_law_psnr(linear, TRUTH, SOME) == pytest.approx(20.0, abs=1e-6)
+    assert radiance.mu_law_psnr(linear, TRUTH, SOME) == pytest.approx(20.0, abs=1e-6)
     mask = SOME.copy()
     mask[0, 0] = False
     wrong, truth = TRUTH * 0.9, TRUTH.copy()
-    before = mu_law_psnr(wrong, truth, mask)
+    before = radiance.mu_law_psnr(wrong, truth, mask)
     wrong[0, 0], truth[0, 0] = 1e6, 1e4
-    assert mu_law_psnr(wrong, truth, mask) == before
-    assert before < mu_law_psnr(TRUTH, TRUTH, SOME)
+    assert radiance.mu_law_psnr(wrong, truth, mask) == before
+    assert before < radiance.mu_law_psnr(TRUTH, TRUTH, SOME)

@@ -8,17 +8,7 @@ import pytest
 from splats import SRGB, camera, haze, random_splats
 
 from p2gs_jax.config import PhotometryConfig, RenderConfig
-from p2gs_jax.gaussians.bake import (
-    Target,
-    bake,
-    baking_error,
-    display_sh,
-    displayed_target,
-    lift,
-    refine,
-    true_target,
-    viewer_config,
-)
+from p2gs_jax.gaussians import bake
 from p2gs_jax.photometry.display import DisplayTransform, develop
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.render.harmonics import C0, basis
@@ -32,13 +22,13 @@ def tone(x):
 
 def test_colours_are_exact_for_degree_0_and_close_for_3():
     sh = np.asarray(random_splats(degree=0).sh)
-    shown = display_sh(sh, tone, "exp")
+    shown = bake.display_sh(sh, tone, "exp")
     np.testing.assert_allclose(C0 * shown[:, 0] + 0.5, tone(np.exp(C0 * sh[:, 0])), atol=1e-5)
-    clamped = C0 * display_sh(sh, lambda x: 9 * x - 1, "linear")[:, 0] + 0.5
+    clamped = C0 * bake.display_sh(sh, lambda x: 9 * x - 1, "linear")[:, 0] + 0.5
     assert -1e-6 < clamped.min() < clamped.max() < 1 + 1e-6
     mild = np.asarray(random_splats(degree=3).sh) * 0.1
     mild[:, 0] -= 3
-    shown = display_sh(mild, tone, "exp")
+    shown = bake.display_sh(mild, tone, "exp")
     d = np.array([0.36, 0.48, 0.8])
     table = np.array([float(b[0]) for b in basis(tuple(jnp.asarray(d[:, None], jnp.float32)), 3)])
     expected = tone(np.exp(np.einsum("k,nkc->nc", table, mild)))
@@ -55,7 +45,7 @@ def test_corrections_by_position_in_the_image_are_left_out():
     )
     assert matrix.without_place() is matrix
     g = random_splats(degree=0)
-    shown = bake(g, matrix, "exp").sh
+    shown = bake.bake(g, matrix, "exp").sh
     plain = develop(np.exp(C0 * np.asarray(g.sh[:, 0])), replace(matrix, correction=None))
     np.testing.assert_allclose(
         C0 * shown[:, 0] + 0.5,
@@ -68,7 +58,7 @@ def test_corrections_by_position_in_the_image_are_left_out():
 def targets():
     render = make_renderer(CFG)
     views = {f"{x:+.1f}": camera(x) for x in (-0.4, -0.2, 0.0, 0.2, 0.4)}
-    return [true_target(name, haze(), c, SRGB, render) for name, c in views.items()]
+    return [bake.true_target(name, haze(), c, SRGB, render) for name, c in views.items()]
 
 
 def test_the_true_picture_is_composited_in_light_and_then_developed(targets):
@@ -82,12 +72,12 @@ def test_the_true_picture_is_composited_in_light_and_then_developed(targets):
 def test_refining_brings_viewers_closer_to_unseen_views_as_well(targets):
     """Also over white; a Gaussian that no view shows stays as it is."""
     seen, unseen = [targets[i] for i in (0, 2, 4)], [targets[i] for i in (1, 3)]
-    plain = bake(haze(), SRGB, "exp")
+    plain = bake.bake(haze(), SRGB, "exp")
     plain = replace(plain, means=plain.means.at[0, 2].set(-3.0))
-    refined = refine(plain, seen, CFG, steps=60)
-    assert baking_error(plain, [], CFG) is None
+    refined = bake.refine(plain, seen, CFG, steps=60)
+    assert bake.baking_error(plain, [], CFG) is None
     for views in (seen, unseen):
-        before, after = (baking_error(g, views, CFG) for g in (plain, refined))
+        before, after = (bake.baking_error(g, views, CFG) for g in (plain, refined))
         errors = {name: view["psnr"] for name, view in before["per_view"].items()}
         assert before["worst_view"] == min(errors, key=errors.get)
         assert before["views"] == len(errors) == len(views)
@@ -109,13 +99,13 @@ def test_a_wall_that_is_dark_by_transparency_becomes_opaque():
     """A translucent black wall looks opaque over black, and not over white."""
     wall, logits = haze(), jnp.full(120, -100.0, jnp.float32).at[-1].set(0.0)
     wall = replace(wall, opacity_logits=logits, sh=wall.sh - 60.0)
-    target = true_target("wall", wall, camera(), SRGB, make_renderer(CFG))
+    target = bake.true_target("wall", wall, camera(), SRGB, make_renderer(CFG))
     assert target.picture.max() == 0
-    plain = bake(wall, SRGB, "exp")
-    assert refine(plain, [target], CFG, steps=0) is plain
-    assert refine(plain, [], CFG, steps=9) is plain
-    refined = refine(plain, [target], CFG, steps=40)
-    before, after = (baking_error(g, [target], CFG) for g in (plain, refined))
+    plain = bake.bake(wall, SRGB, "exp")
+    assert bake.refine(plain, [target], CFG, steps=0) is plain
+    assert bake.refine(plain, [], CFG, steps=9) is plain
+    refined = bake.refine(plain, [target], CFG, steps=40)
+    before, after = (bake.baking_error(g, [target], CFG) for g in (plain, refined))
     assert before["psnr_worst"] > 60
     assert after["psnr_worst"] > 35
     assert before["psnr_on_white_median"] < 8
@@ -123,9 +113,10 @@ def test_a_wall_that_is_dark_by_transparency_becomes_opaque():
 
 
 def test_a_known_difference_has_its_known_error():
-    nothing = replace(bake(haze(), SRGB, "exp"), opacity_logits=jnp.full(120, -100.0))
+    nothing = replace(bake.bake(haze(), SRGB, "exp"), opacity_logits=jnp.full(120, -100.0))
     picture = np.full((32, 40, 3), 51, np.uint8)
-    error = baking_error(nothing, [Target("grey", camera(), picture)], CFG)["per_view"]["grey"]
+    target = bake.Target("grey", camera(), picture)
+    error = bake.baking_error(nothing, [target], CFG)["per_view"]["grey"]
     assert error["psnr"] == pytest.approx(20 * np.log10(5))
     assert error["mean_codes"] == error["max_codes"] == 51
     assert error["psnr_on_white"] == pytest.approx(20 * np.log10(5 / 4))
@@ -134,12 +125,12 @@ def test_a_known_difference_has_its_known_error():
 @pytest.mark.slow
 def test_lifted_colours_look_in_linear_light_as_in_a_viewer():
     """Translucent Gaussians differ; refining brings them closer, in unseen views as well."""
-    shown, render = bake(haze(), SRGB, "exp"), make_renderer(viewer_config(CFG))
+    shown, render = bake.bake(haze(), SRGB, "exp"), make_renderer(bake.viewer_config(CFG))
     places = {f"{x:+.1f}": camera(x) for x in (-0.4, -0.2, 0.0, 0.2, 0.4)}
-    views = [displayed_target(name, shown, c, render) for name, c in places.items()]
-    plain = lift(shown, SRGB)
-    refined = refine(plain, views[::2], CFG, steps=60, shown=SRGB)
+    views = [bake.displayed_target(name, shown, c, render) for name, c in places.items()]
+    plain = bake.lift(shown, SRGB)
+    refined = bake.refine(plain, views[::2], CFG, steps=60, shown=SRGB)
     for part in (views[::2], views[1::2]):
-        before, after = (baking_error(g, part, CFG, SRGB) for g in (plain, refined))
+        before, after = (bake.baking_error(g, part, CFG, SRGB) for g in (plain, refined))
         assert after["psnr_worst"] > before["psnr_worst"] + 3
         assert after["mean_codes"] < before["mean_codes"]

@@ -10,16 +10,9 @@ from scene.helpers import make_view
 from p2gs_jax import Scene, preset
 from p2gs_jax.config import DataConfig, DensifyConfig, FitConfig
 from p2gs_jax.core.numerics import srgb_encode
+from p2gs_jax.gaussians import matching
 from p2gs_jax.gaussians.dense import MATCH_SIDE, coverage_of, dense_limit, dense_seeds, wants_dense
 from p2gs_jax.gaussians.flow import Flows, depth_map
-from p2gs_jax.gaussians.matching import (
-    MatchImages,
-    Tones,
-    at_common_exposure,
-    neighbours,
-    rough_tones,
-    visibility,
-)
 from p2gs_jax.gaussians.population import Coverage
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.scene.pixels.store import ImageStore
@@ -81,13 +74,15 @@ class World:
         colors = np.full((len(points), 3), 128, np.uint8)
         self.scene = Scene(path, "test", tuple(views), points, colors)
         self.store = ImageStore(views, DataConfig())
-        self.tones = Tones(np.log(exposures), np.full(len(views), 2.2))
+        self.tones = matching.Tones(np.log(exposures), np.full(len(views), 2.2))
 
     def depth(self, row=0):
         cfg = FitConfig().loss
         side, tones = MATCH_SIDE, self.tones
-        images = MatchImages(self.scene, self.store, tones, side, cfg.black, cfg.saturation)
-        flows = Flows(images, self.scene.points, visibility(self.scene, 0))
+        images = matching.MatchImages(
+            self.scene, self.store, tones, side, cfg.black, cfg.saturation
+        )
+        flows = Flows(images, self.scene.points, matching.visibility(self.scene, 0))
         found = depth_map(flows, row, [k for k in range(len(CENTERS)) if k != row])
         return found, np.abs(1 / np.maximum(found.inverse, 1e-9) / self.depths[row] - 1)
 
@@ -131,8 +126,8 @@ def test_wrong_matches_are_refused(tmp_path):
 def test_exposures_do_not_matter_once_they_are_solved(tmp_path):
     same = World(tmp_path / "even")
     other = World(tmp_path / "mixed", exposures=[1.0, 0.5, 2.0, 0.5, 2.0])
-    images = MatchImages(other.scene, other.store, other.tones, MATCH_SIDE, 0.02, 0.98)
-    first, second = at_common_exposure(images[0], images[2])
+    images = matching.MatchImages(other.scene, other.store, other.tones, MATCH_SIDE, 0.02, 0.98)
+    first, second = matching.at_common_exposure(images[0], images[2])
     assert abs(float(first.mean()) - float(second.mean())) < 6
     assert first.std() > 20
     a, b = same.depth()[0], other.depth()[0]
@@ -196,10 +191,12 @@ def test_existing_seeds_have_precedence(plane):
 
 def test_neighbours_prefer_similar_exposures(plane):
     scene, even = plane.scene, np.zeros(len(CENTERS))
-    near = neighbours(scene, visibility(scene, 0), even, 2)
+    near = matching.neighbours(scene, matching.visibility(scene, 0), even, 2)
     assert all(len(n) == 2 and k not in n for k, n in enumerate(near))
     # The first two only differ from the rest in their exposure.
-    near = neighbours(scene, visibility(scene, 0), np.array([3.0, 3.0, -3.0, -3.0, -3.0]), 2)
+    near = matching.neighbours(
+        scene, matching.visibility(scene, 0), np.array([3.0, 3.0, -3.0, -3.0, -3.0]), 2
+    )
     assert near[0][0] == 1
     assert near[1][0] == 0
 
@@ -211,9 +208,9 @@ def test_rough_tones_find_the_factors():
     views, points = (g.ravel() for g in np.meshgrid(np.arange(8), np.arange(300)))
     colors = srgb_encode(np.minimum(radiance[points] * np.exp(log_exposures[views])[:, None], 1))
     tracks = Observations(views, points, colors, 0 * colors, 8, 300, np.zeros(8, int))
-    found = rough_tones(tracks, 8).log_exposures
+    found = matching.rough_tones(tracks, 8).log_exposures
     np.testing.assert_allclose(found, log_exposures - log_exposures.mean(), atol=0.05)
-    assert not rough_tones(None, 8).log_exposures.any()
+    assert not matching.rough_tones(None, 8).log_exposures.any()
 
 
 def with_seeds(cfg, **changes):

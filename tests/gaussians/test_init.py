@@ -11,13 +11,7 @@ from tiny_scene import make_scene, prepared
 
 from p2gs_jax import Camera, Scene, preset, with_fields
 from p2gs_jax.config import FitConfig, InitConfig
-from p2gs_jax.gaussians.seeds import (
-    cameras_radius,
-    gaussians_from_points,
-    misplaced,
-    reach,
-    within_reach,
-)
+from p2gs_jax.gaussians import seeds
 from p2gs_jax.gaussians.shell import find_shell, sphere_behind
 from p2gs_jax.pipeline.survey import load, scale_notes
 from p2gs_jax.render import view_radiance
@@ -62,7 +56,7 @@ def test_seeds_carry_their_radiance(name):
     rng = np.random.default_rng(0)
     points = rng.normal(0, 1, (100, 3)).astype(np.float32) + np.array([0, 0, 6], np.float32)
     radiance = np.exp(rng.normal(-1, 1, (100, 3))).astype(np.float32)
-    g = gaussians_from_points(points, radiance, [view(0.0), view(1.0)], cfg)
+    g = seeds.gaussians_from_points(points, radiance, [view(0.0), view(1.0)], cfg)
     cam = Camera(jnp.eye(4), jnp.eye(3), 8, 8)
     np.testing.assert_allclose(view_radiance(g, cam, cfg.render), radiance, rtol=1e-4, atol=1e-5)
     assert np.all(np.isfinite(g.log_scales))
@@ -71,8 +65,8 @@ def test_seeds_carry_their_radiance(name):
 def test_a_camera_far_from_all_others_counts_for_nothing_and_is_named(tmp_path):
     views = [view(x) for x in (*np.linspace(0, 10, 9), 6e4)]
     points = street_points(ground_only=True)
-    assert misplaced(views, points).tolist() == [False] * 9 + [True]
-    assert cameras_radius(views, points) == cameras_radius(views[:-1], points)
+    assert seeds.misplaced(views, points).tolist() == [False] * 9 + [True]
+    assert seeds.cameras_radius(views, points) == seeds.cameras_radius(views[:-1], points)
     sphere, plain = (sphere_behind(v, points, 5.0, InitConfig()) for v in (views, views[:-1]))
     assert (sphere.radius, sphere.middle[0]) == (plain.radius, plain.middle[0])
     scene = Scene(tmp_path, "colmap", tuple(views), points, None)
@@ -81,17 +75,18 @@ def test_a_camera_far_from_all_others_counts_for_nothing_and_is_named(tmp_path):
     assert "60000.0.png" in note
     # No camera is misplaced where a car waits, or one photograph is from farther away.
     for xs in ([0.0] * 50 + [1.0, 40.0, 90.0], [*range(9), 100.0]):
-        assert not misplaced([view(x) for x in xs], points).any()
+        assert not seeds.misplaced([view(x) for x in xs], points).any()
 
 
 def test_seeds_out_of_reach_are_brought_nearer(tmp_path):
     views, points = [view(0.0), view(2.0)], street_points(ground_only=True)
     scene = Scene(tmp_path, "colmap", tuple(views), points, None)
-    assert within_reach(scene) == (scene, [])
+    assert seeds.within_reach(scene) == (scene, [])
     far = np.array([[0, 0, 2e5], [1e8, 0, 0]], np.float32)
-    nearer, (note,) = within_reach(dataclasses.replace(scene, points=np.concatenate([points, far])))
+    more = dataclasses.replace(scene, points=np.concatenate([points, far]))
+    nearer, (note,) = seeds.within_reach(more)
     assert "2 of 4002 seed points" in note
-    middle, most = reach(views, points)
+    middle, most = seeds.reach(views, points)
     away = np.linalg.norm(nearer.points[-2:] - middle, axis=1)
     np.testing.assert_allclose(away, most, rtol=0.01)
     np.testing.assert_array_equal(nearer.points[:-2], points)

@@ -8,15 +8,7 @@ from moving_box import FRAMES, INTERVAL, SIZE, drive_format, make_world, write_p
 
 from p2gs_jax import Photometry, with_fields
 from p2gs_jax.config import DataConfig, DynamicsConfig, FitConfig
-from p2gs_jax.gaussians.moving import (
-    OPACITY,
-    clock_of,
-    find_nodes,
-    node_gaussians,
-    nodes_radiance,
-    vibrates,
-    with_vibration,
-)
+from p2gs_jax.gaussians import moving
 from p2gs_jax.gaussians.posed import standing
 from p2gs_jax.photometry.parameters import initial_photometry
 from p2gs_jax.render.project import STILL
@@ -35,7 +27,7 @@ def scene(made_once):
 
 
 def test_laser_points_of_all_sweeps_meet_in_the_box(scene):
-    nodes = find_nodes(scene, dataclasses.replace(CFG, few_points=1, voxel=0.02))
+    nodes = moving.find_nodes(scene, dataclasses.replace(CFG, few_points=1, voxel=0.02))
     assert [o.name for o in nodes.moving.objects] == ["box-1"]
     assert not nodes.left
     assert set(nodes.owner) == {0}
@@ -55,14 +47,14 @@ def test_laser_points_of_all_sweeps_meet_in_the_box(scene):
 
 def test_boxes_with_few_points_are_filled_and_noted(scene):
     few = dataclasses.replace(scene.lidar, objects=np.full(len(scene.lidar.objects), -1))
-    nodes = find_nodes(dataclasses.replace(scene, lidar=None), CFG)
+    nodes = moving.find_nodes(dataclasses.replace(scene, lidar=None), CFG)
     assert len(nodes.points) == pytest.approx(CFG.few_points, rel=0.2)
     # The points lie on all sides but the bottom.
     half = np.array(SIZE) / 2
     assert np.isclose(np.abs(nodes.points), half).any(1).all()
     assert not np.isclose(nodes.points[:, 2], -half[2]).any()
     assert "1 of them have few laser points" in nodes.notes[0]
-    left = find_nodes(dataclasses.replace(scene, lidar=few), CFG)
+    left = moving.find_nodes(dataclasses.replace(scene, lidar=few), CFG)
     assert [o.name for o in left.left] == ["box-1"]
     assert "1 are seen too little" in left.notes[0]
     assert not len(left.points)
@@ -74,14 +66,15 @@ def test_objects_that_few_views_show_are_left_to_the_mask(scene):
     )
     scene = dataclasses.replace(scene, views=views)
     for least, left in ((CFG.least_views, 0), (5, 1)):
-        assert len(find_nodes(scene, dataclasses.replace(CFG, least_views=least)).left) == left
+        found = moving.find_nodes(scene, dataclasses.replace(CFG, least_views=least))
+        assert len(found.left) == left
 
 
 def test_other_methods_and_scenes_in_which_nothing_moves_have_no_nodes(scene):
     for method in ("mask", "off"):
-        assert find_nodes(scene, dataclasses.replace(CFG, method=method)) is None
+        assert moving.find_nodes(scene, dataclasses.replace(CFG, method=method)) is None
     for objects in ((), tuple(dataclasses.replace(o, moving=False) for o in scene.objects)):
-        assert find_nodes(dataclasses.replace(scene, objects=objects), CFG) is None
+        assert moving.find_nodes(dataclasses.replace(scene, objects=objects), CFG) is None
 
 
 def timeless(scene):
@@ -90,7 +83,7 @@ def timeless(scene):
 
 
 def test_moving_objects_are_masked_if_views_have_no_times(scene):
-    nodes = find_nodes(timeless(scene), CFG)
+    nodes = moving.find_nodes(timeless(scene), CFG)
     assert len(nodes.left) == 1
     assert "no times" in nodes.notes[0]
 
@@ -98,11 +91,12 @@ def test_moving_objects_are_masked_if_views_have_no_times(scene):
 def test_points_get_the_colours_that_photographs_show(scene):
     """The colours are radiance: exposures of frames, over 1.6 stops, do not change them."""
     cfg = with_fields(FitConfig(), {"photometry.model": "view_exposure"})
-    nodes = find_nodes(scene, CFG)
+    nodes = moving.find_nodes(scene, CFG)
     start = initial_photometry(None, [v.camera for v in scene.training_views], cfg)
     logs = np.log(make_world().exposures)[[v.frame for v in scene.training_views]]
     photometry = Photometry(logs.astype(np.float32), np.asarray(start.raw_gammas), "log")
-    radiance = nodes_radiance(nodes, scene, ImageStore(scene.views, cfg.data), photometry, cfg)
+    store = ImageStore(scene.views, cfg.data)
+    radiance = moving.nodes_radiance(nodes, scene, store, photometry, cfg)
     checks = np.floor(nodes.points / 0.4 + 1e-6).astype(int).sum(1) % 2 == 1
     within = np.abs(nodes.points / 0.4 - np.rint(nodes.points / 0.4)).min(1) > 0.2
     towards = nodes.points[:, 1] < -0.55
@@ -112,7 +106,7 @@ def test_points_get_the_colours_that_photographs_show(scene):
     assert yellow[0] > 2.5 * yellow[2]
     assert blue[2] == pytest.approx(0.45, abs=0.15)
     assert blue[2] > 2 * blue[0]
-    g = node_gaussians(nodes, radiance, scene.training_views, cfg)
+    g = moving.node_gaussians(nodes, radiance, scene.training_views, cfg)
     assert g.capacity == len(nodes.points)
     np.testing.assert_allclose(g.means, nodes.points, atol=1e-6)
     assert 0.01 < np.median(np.exp(np.asarray(g.log_scales))) < 0.2
@@ -124,7 +118,7 @@ def rows(values):
 
 def test_vibrating_gaussians_begin_at_laser_points_and_their_times(scene):
     still = make_world().wall
-    g = with_vibration(still, scene, VIBRATING)
+    g = moving.with_vibration(still, scene, VIBRATING)
     n, moves = still.capacity, g.vibration
     assert g.capacity == n + 500
     np.testing.assert_array_equal(g.means[:n], still.means)
@@ -133,9 +127,9 @@ def test_vibrating_gaussians_begin_at_laser_points_and_their_times(scene):
     np.testing.assert_allclose(
         np.exp(moves.log_lives[n:]), VIBRATING.dynamics.vibration_life, rtol=1e-5
     )
-    np.testing.assert_allclose(1 / (1 + np.exp(-g.opacity_logits[n:])), OPACITY, rtol=1e-5)
+    np.testing.assert_allclose(1 / (1 + np.exp(-g.opacity_logits[n:])), moving.OPACITY, rtol=1e-5)
     assert not np.any(moves.velocities)
-    times = np.asarray(moves.peaks[n:]) + clock_of(scene).middle
+    times = np.asarray(moves.peaks[n:]) + moving.clock_of(scene).middle
     for point, time in list(zip(np.asarray(g.means[n:]), times, strict=True))[::50]:
         (row,) = np.flatnonzero((scene.lidar.points == point).all(1))
         assert scene.lidar.times[row] == pytest.approx(time, abs=1e-5)
@@ -148,7 +142,7 @@ def test_vibrating_gaussians_begin_at_laser_points_and_their_times(scene):
 
 def test_without_laser_points_they_begin_at_static_gaussians_at_random_times(scene):
     still = make_world().wall
-    g = with_vibration(still, dataclasses.replace(scene, lidar=None), VIBRATING)
+    g = moving.with_vibration(still, dataclasses.replace(scene, lidar=None), VIBRATING)
     n = still.capacity
     assert g.capacity == n + 500
     assert rows(g.means[n:]) <= rows(g.means[:n])
@@ -158,6 +152,6 @@ def test_without_laser_points_they_begin_at_static_gaussians_at_random_times(sce
 
 
 def test_gaussians_vibrate_only_by_request_and_if_views_have_times(scene):
-    assert vibrates(scene, VIBRATING)
-    assert not vibrates(scene, FitConfig())
-    assert not vibrates(timeless(scene), VIBRATING)
+    assert moving.vibrates(scene, VIBRATING)
+    assert not moving.vibrates(scene, FitConfig())
+    assert not moving.vibrates(timeless(scene), VIBRATING)

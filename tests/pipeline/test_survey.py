@@ -7,14 +7,7 @@ import pytest
 from tiny_scene import make_scene
 
 from p2gs_jax import FitConfig, Scene, load_scene, with_fields
-from p2gs_jax.pipeline.survey import (
-    decided_scale,
-    extent_of_rates,
-    near_depth,
-    near_plane,
-    scale_notes,
-    seen_depths,
-)
+from p2gs_jax.pipeline import survey
 from p2gs_jax.run.decisions import Decisions
 
 
@@ -36,7 +29,7 @@ def scaled(scene, factor, offset=0.0):
 
 
 def nearest(scene):
-    return near_depth(seen_depths(scene.points, scene.training_views))
+    return survey.near_depth(survey.seen_depths(scene.points, scene.training_views))
 
 
 @pytest.mark.parametrize("factor", [1e-6, 1e-3, 1.0, 1e3])
@@ -46,8 +39,8 @@ def test_the_near_plane_follows_scenes_that_it_would_cut(scene, factor):
     assert depth == pytest.approx(factor * nearest(scene), rel=1e-3)
     assert 3 * factor < depth < 3.5 * factor
     cfg = FitConfig()
-    near = near_plane(depth, cfg)
-    notes = scale_notes(some, cfg, depth)
+    near = survey.near_plane(depth, cfg)
+    notes = survey.scale_notes(some, cfg, depth)
     if factor >= 1:
         assert near == cfg.render.near
         assert notes == []
@@ -62,32 +55,32 @@ def test_the_near_plane_follows_scenes_that_it_would_cut(scene, factor):
 
 def test_a_near_plane_that_cuts_nothing_stays(scene):
     cfg = with_fields(FitConfig(), {"render.near": 0.5})
-    assert near_plane(nearest(scene), cfg) == 0.5
-    assert near_plane(None, cfg) == 0.5
+    assert survey.near_plane(nearest(scene), cfg) == 0.5
+    assert survey.near_plane(None, cfg) == 0.5
     assert Decisions.as_given(cfg).resolve(cfg).render.near == 0.5
 
 
 def test_gradients_are_scaled_up_to_half_the_depth_of_near_points_or_as_the_options_say(scene):
     depth, off = nearest(scene), with_fields(FitConfig(), {"loss.near_depth": 0.0})
     decided = dataclasses.replace(
-        Decisions.as_given(FitConfig()), **decided_scale(depth, FitConfig())
+        Decisions.as_given(FitConfig()), **survey.decided_scale(depth, FitConfig())
     )
     assert decided.resolve(FitConfig()).loss.near_depth == pytest.approx(depth / 2, rel=0.05)
-    assert decided_scale(depth, off)["near_depth"] == 0
-    assert decided_scale(None, FitConfig())["near_depth"] is None
+    assert survey.decided_scale(depth, off)["near_depth"] == 0
+    assert survey.decided_scale(None, FitConfig())["near_depth"] is None
 
 
 def test_points_that_no_view_shows_have_no_depth(scene):
     for points in (-scene.points, scene.points[:0]):
-        depths = seen_depths(points, scene.training_views)
-        assert near_depth(depths) is None
-        assert extent_of_rates(300.0, depths, FitConfig()) == 300.0
+        depths = survey.seen_depths(points, scene.training_views)
+        assert survey.near_depth(depths) is None
+        assert survey.extent_of_rates(300.0, depths, FitConfig()) == 300.0
 
 
 def test_a_scene_far_from_the_origin_is_reported_as_coarse(scene):
     depth = nearest(scene)
     for offset, coarse in ((0.0, False), (1e3, False), (1e5, True)):
-        notes = scale_notes(scaled(scene, 1.0, offset), FitConfig(), depth)
+        notes = survey.scale_notes(scaled(scene, 1.0, offset), FitConfig(), depth)
         assert bool(notes) == coarse
     assert "1e+05 scene units from the origin" in notes[0]
     assert "Subtract a common offset" in notes[0]
@@ -100,13 +93,13 @@ def test_learning_rates_do_not_grow_with_the_length_of_a_drive(scene):
         dataclasses.replace(view, viewmat=_moved(view.viewmat, by)) for by in far for view in views
     ]
     street = np.concatenate([points + by for by in far]).astype(np.float32)
-    narrow, wide = seen_depths(points, views), seen_depths(street, drive)
-    short = extent_of_rates(300.0, narrow, cfg)
+    narrow, wide = survey.seen_depths(points, views), survey.seen_depths(street, drive)
+    short = survey.extent_of_rates(300.0, narrow, cfg)
     assert 3 < short < 6
-    assert extent_of_rates(300.0, wide, cfg) == pytest.approx(short, rel=0.2)
-    assert extent_of_rates(0.5, narrow, cfg) == 0.5
+    assert survey.extent_of_rates(300.0, wide, cfg) == pytest.approx(short, rel=0.2)
+    assert survey.extent_of_rates(0.5, narrow, cfg) == 0.5
     cameras = with_fields(cfg, {"optimizer.extent": "cameras"})
-    assert extent_of_rates(300.0, wide, cameras) == 300.0
+    assert survey.extent_of_rates(300.0, wide, cameras) == 300.0
 
 
 def _moved(viewmat, by):

@@ -5,15 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scene.helpers import (
-    around,
-    blender,
-    make_view,
-    refused,
-    reprojection_errors,
-    write_image,
-    write_tiny_model,
-)
+from scene import helpers
 from scene.test_transforms import held_out, rows, write_llff
 from scipy.spatial.transform import Rotation
 
@@ -45,12 +37,12 @@ def radiance_of(scene):
 def write_synthetic(root):
     """Write HDR-NeRF's layout with two poses to train on and one held out."""
     root.mkdir()
-    poses = around(3)
+    poses = helpers.around(3)
     for part, of_part in (("train", poses[:2]), ("test", poses[2:])):
-        data = blender(of_part, part)
+        data = helpers.blender(of_part, part)
         names = [f"{frame['file_path']}_{e}.png" for frame in data["frames"] for e in range(3)]
         for name in names:
-            write_image(root / name)
+            helpers.write_image(root / name)
         for k in range(len(of_part)):
             write_truth(root / f"{part}_hdr" / f"hdr_{k:03d}.exr", k + 1.5)
         times = dict(zip(names, TIMES * len(of_part), strict=True))
@@ -61,13 +53,13 @@ def write_synthetic(root):
 
 def write_poses(root, numbers=("train_000", "train_001", "test_000")):
     """Write a COLMAP model of one exposure for each pose, and photographs of all; return names."""
-    images = write_tiny_model(root, n=len(numbers)) / "images.txt"
+    images = helpers.write_tiny_model(root, n=len(numbers)) / "images.txt"
     text = images.read_text()
     for k, number in enumerate(numbers):
         (root / "images" / f"im {k}.png").unlink()
         text = text.replace(f"im {k}.png", f"{number}_1.png")
         for e in range(3):
-            write_image(root / "images" / f"{number}_{e}.png")
+            helpers.write_image(root / "images" / f"{number}_{e}.png")
     images.write_text(text)
     return [f"{number}_{e}.png" for number in numbers for e in range(3)]
 
@@ -98,8 +90,8 @@ def test_models_of_one_exposure_get_the_others_of_each_pose(tmp_path):
     assert [view.name for view in scene.views] == sorted(names)
     assert [view.exif_ev for view in scene.views] == [-2.0, 0.0, 2.0] * 3
     assert held_out(scene) == names[6:]
-    assert reprojection_errors(scene).shape == (9,)
-    assert reprojection_errors(scene).max() < 1e-5
+    assert helpers.reprojection_errors(scene).shape == (9,)
+    assert helpers.reprojection_errors(scene).max() < 1e-5
     assert radiance_of(scene) == [7.0] * 3 + [None] * 6
     # HDR-GS has HDR-NeRF's table instead, and other names.
     root = tmp_path / "hdr_gs"
@@ -114,9 +106,9 @@ def test_models_of_one_exposure_get_the_others_of_each_pose(tmp_path):
 
 
 def test_settings_of_raw_photographs_are_read(tmp_path):
-    write_tiny_model(tmp_path)
+    helpers.write_tiny_model(tmp_path)
     for k, shutter in enumerate(("1/8", "1/2")):
-        write_image(tmp_path / "raw" / f"im {k}.png")
+        helpers.write_image(tmp_path / "raw" / f"im {k}.png")
         settings = [{"ShutterSpeed": shutter, "ISO": 400, "FNumber": 2.0}]
         (tmp_path / "raw" / f"im {k}.json").write_text(json.dumps(settings))
     scene = find_scene(tmp_path, CFG)
@@ -124,7 +116,7 @@ def test_settings_of_raw_photographs_are_read(tmp_path):
     assert "exposures of 2 photographs" in scene.notes[-1]
     assert find_scene(tmp_path, DataConfig(images="raw")).views[0].image_path.parent.name == "raw"
     (tmp_path / "raw" / "im 1.json").write_text('[{"ShutterSpeed": -1}]')
-    with refused("im 1.json states an impossible ShutterSpeed"):
+    with helpers.refused("im 1.json states an impossible ShutterSpeed"):
         find_scene(tmp_path, CFG)
 
 
@@ -140,7 +132,7 @@ def test_settings_of_raw_photographs_are_read(tmp_path):
 def test_broken_files_of_exposures_are_refused(tmp_path, content, message):
     write_poses(tmp_path / "a")
     (tmp_path / "a" / "exposure.json").write_text(content)
-    with refused(message):
+    with helpers.refused(message):
         find_scene(tmp_path / "a", CFG)
 
 
@@ -154,14 +146,16 @@ def test_brackets_of_tables_are_held_out_whole(tmp_path):
     assert scene.split_by == "every 2nd bracket of each camera"
     for broken, why in ((table[:5], "has 5 rows, but"), (table[:, 1:], "holds 9x17 numbers, not")):
         np.save(path, broken)
-        with refused(f"poses_bounds_exps.npy {why}"):
+        with helpers.refused(f"poses_bounds_exps.npy {why}"):
             find_scene(tmp_path, CFG)
 
 
 def views_of(path, *shots, end=20.0):
     """Return views of shots (name, x, exposure in EV), and of two more places."""
     shots = (*shots, ("y", end / 2, None), ("z", end, None))
-    views = [(replace(make_view(path, at=(x, 0, 0)), exif_ev=ev), name) for name, x, ev in shots]
+    views = [
+        (replace(helpers.make_view(path, at=(x, 0, 0)), exif_ev=ev), name) for name, x, ev in shots
+    ]
     return tuple(replace(view, name=f"{name}.png") for view, name in views)
 
 
@@ -202,5 +196,5 @@ def test_other_photographs_are_not_brackets(tmp_path, shots):
 
 def test_brackets_of_photographs_alone_are_found_by_names(tmp_path):
     for name in ("a_-2EV", "a_0EV", "a_+2EV", "b_-2EV", "b_0EV", "c"):
-        write_image(tmp_path / f"{name}.png")
+        helpers.write_image(tmp_path / f"{name}.png")
     assert survey(tmp_path, CFG).sentences[0] == "2 brackets of 2 to 3 exposures."

@@ -8,14 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from PIL import Image
-from scene.helpers import (
-    around,
-    make_view,
-    refused,
-    reprojection_errors,
-    write_image,
-    write_tiny_model,
-)
+from scene import helpers
 from scene.test_split import write_ply
 from scene.test_transforms import LENS, OPENGL, frames, rows, write, write_llff
 
@@ -41,7 +34,7 @@ UTM = np.array([451_234.5, 5_212_345.25, 300.0])
     ],
 )
 def test_models_in_other_folders_are_read(tmp_path, place):
-    write_tiny_model(tmp_path)
+    helpers.write_tiny_model(tmp_path)
     (tmp_path / "sparse" / "0").rename(tmp_path / "model")
     (tmp_path / "sparse").rmdir()
     (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
@@ -52,18 +45,18 @@ def test_models_in_other_folders_are_read(tmp_path, place):
 
 
 def test_an_undistorted_model_uses_the_photographs_of_its_size(tmp_path):
-    write_tiny_model(tmp_path / "dense" / "0")
+    helpers.write_tiny_model(tmp_path / "dense" / "0")
     (tmp_path / "dense" / "0" / "sparse" / "0").rename(tmp_path / "dense" / "0" / "model")
     for k in range(2):
-        write_image(tmp_path / "images" / f"im {k}.png", size=(80, 60))
+        helpers.write_image(tmp_path / "images" / f"im {k}.png", size=(80, 60))
     view = find_scene(tmp_path, CFG).views[0]
     assert view.image_path == tmp_path / "dense" / "0" / "images" / "im 0.png"
 
 
 @pytest.mark.parametrize("inside", ["", "colmap"])
 def test_the_largest_of_several_models_is_used(tmp_path, inside):
-    write_tiny_model(tmp_path, n=1)
-    write_tiny_model(tmp_path / "other", n=5)
+    helpers.write_tiny_model(tmp_path, n=1)
+    helpers.write_tiny_model(tmp_path / "other", n=5)
     shutil.move(tmp_path / "other" / "sparse" / "0", tmp_path / "sparse" / "1")
     shutil.copytree(tmp_path / "other" / "images", tmp_path / "images", dirs_exist_ok=True)
     if inside:
@@ -88,33 +81,33 @@ def test_the_largest_of_several_models_is_used(tmp_path, inside):
 )
 def test_names_that_are_nearly_right_match(tmp_path, names, files):
     for file in filter(None, files):
-        write_image(tmp_path / file)
+        helpers.write_image(tmp_path / file)
     expected = {n: f for n, f in zip(names, files, strict=False) if f is not None}
     assert find_names(names, tmp_path) == expected
 
 
 def test_a_note_or_an_error_names_the_nearest_file(tmp_path):
-    images = write_tiny_model(tmp_path) / "images.txt"
+    images = helpers.write_tiny_model(tmp_path) / "images.txt"
     images.write_text(images.read_text().replace("im 0.png", "IM 0.JPG"))
     scene = find_scene(tmp_path, CFG)
     assert "im 0.png for IM 0.JPG" in scene.notes[0]
-    assert reprojection_errors(scene).max() < 1e-5
+    assert helpers.reprojection_errors(scene).max() < 1e-5
     images.write_text(images.read_text().replace("IM 0.JPG", "img-0.png"))
-    with refused("1 of the 2 images", "holds 2 images; the nearest name is im 0.png"):
+    with helpers.refused("1 of the 2 images", "holds 2 images; the nearest name is im 0.png"):
         find_scene(tmp_path, CFG)
 
 
 def test_a_folder_of_smaller_images_keeps_the_folders_of_cameras(tmp_path):
     path = write(tmp_path, {**LENS, "frames": frames("images/cam0/a.png")}, names=())
     for folder in ("images/cam0", "images_2/cam0"):
-        write_image(tmp_path / folder / "a.png")
+        helpers.write_image(tmp_path / folder / "a.png")
     for cfg in (CFG, DataConfig(images="images_2")):
         (view,) = find_scene(path, cfg).views
         assert (view.name, view.camera) == ("cam0/a.png", "cam0")
 
 
 def test_byte_order_marks_and_missing_lines_are_accepted(tmp_path):
-    model = write_tiny_model(tmp_path)
+    model = helpers.write_tiny_model(tmp_path)
     images = model / "images.txt"
     # Tools that export only poses leave out the second line of every image.
     images.write_text("".join(images.read_text().splitlines(keepends=True)[::2]))
@@ -128,7 +121,7 @@ def test_byte_order_marks_and_missing_lines_are_accepted(tmp_path):
 
 
 def test_points_may_be_missing_or_in_a_ply(tmp_path):
-    model = write_tiny_model(tmp_path)
+    model = helpers.write_tiny_model(tmp_path)
     (model / "points3D.txt").unlink()
     scene = find_scene(tmp_path, CFG)
     assert (len(scene.points), scene.tracks) == (0, None)
@@ -147,7 +140,7 @@ def test_a_crop_is_not_another_size():
 
 
 def test_scenes_far_from_the_origin_keep_their_coordinates(tmp_path):
-    poses, names = around(6), [f"images/{k}.png" for k in range(6)]
+    poses, names = helpers.around(6), [f"images/{k}.png" for k in range(6)]
     poses[:, :3, 3] += UTM
     listed = [
         frames(n)[0] | {"transform_matrix": p.tolist()} for n, p in zip(names, poses, strict=True)
@@ -175,8 +168,8 @@ def test_scenes_far_from_the_origin_keep_their_coordinates(tmp_path):
 
 
 def test_paths_of_cameras_follow_the_scene():
-    near = [Shot("a", np.linalg.inv(pose), np.eye(3), 8, 6) for pose in around(3)]
-    poses = around(3)
+    near = [Shot("a", np.linalg.inv(pose), np.eye(3), 8, 6) for pose in helpers.around(3)]
+    poses = helpers.around(3)
     poses[:, :3, 3] += UTM
     far = [Shot("a", np.linalg.inv(pose), np.eye(3), 8, 6) for pose in poses]
     for shots in (near, far):
@@ -186,7 +179,7 @@ def test_paths_of_cameras_follow_the_scene():
 
 def test_poses_in_other_axes_are_refused(tmp_path):
     def views(change):
-        view, poses = make_view(tmp_path / "0.png"), map(change, around(6))
+        view, poses = helpers.make_view(tmp_path / "0.png"), map(change, helpers.around(6))
         return [replace(view, viewmat=np.linalg.inv(pose @ OPENGL)) for pose in poses]
 
     points = np.random.default_rng(0).normal(0, 0.3, (200, 3))
@@ -196,7 +189,7 @@ def test_poses_in_other_axes_are_refused(tmp_path):
         (lambda pose: pose @ OPENGL, "OpenCV's axes instead of OpenGL's"),
         (lambda pose: np.linalg.inv(pose @ OPENGL), "world-to-camera instead of camera-to-world"),
     ):
-        with refused("a.json has poses that contradict the photographs", words):
+        with helpers.refused("a.json has poses that contradict the photographs", words):
             require_axes(views(change), agreeing, "a.json")
     # Poses that agree in no axes are not refused.
     require_axes(views(lambda pose: pose), lambda views: 0.0, "a.json")
@@ -210,16 +203,18 @@ def test_pictures_of_a_whole_sphere_are_refused_with_a_remedy(tmp_path):
     for k, picture in enumerate([flat, flat.T, sphere]):
         Image.fromarray(picture.astype(np.uint8)).save(tmp_path / f"{k}.jpg", quality=95)
     assert [is_panorama(tmp_path / f"{k}.jpg") for k in range(3)] == [False, False, True]
-    with refused("2.jpg shows a whole sphere", "cut the panoramas into pinhole photographs"):
+    with helpers.refused(
+        "2.jpg shows a whole sphere", "cut the panoramas into pinhole photographs"
+    ):
         find_scene(tmp_path, CFG)
     data = (tmp_path / "0.jpg").read_bytes()
     mark = b"\xff\xe1\x00\x38<GPano:ProjectionType>equirectangular</GPano:Projection>"
     (tmp_path / "2.jpg").write_bytes(data[:2] + mark.ljust(58) + data[2:])
-    with refused("2.jpg shows a whole sphere"):
+    with helpers.refused("2.jpg shows a whole sphere"):
         find_scene(tmp_path, CFG)
     for path in tmp_path.iterdir():
         path.rename(tmp_path / "a.insv")
-    with refused("no scene in", "name the video itself"):
+    with helpers.refused("no scene in", "name the video itself"):
         find_scene(tmp_path, CFG)
 
 
@@ -240,7 +235,7 @@ def views_of(tmp_path, *names, exif=None, models="111111"):
         if exif is not None:
             kept[0x0110] = exif[k]
         Image.new("RGB", (8, 8)).save(path, exif=kept)
-        out.append(replace(make_view(path, size=(8, 8)), name=name, camera=camera))
+        out.append(replace(helpers.make_view(path, size=(8, 8)), name=name, camera=camera))
     return out
 
 
@@ -284,17 +279,17 @@ def test_exposures_of_hdr_nerf_and_held_out_frames_are_read(tmp_path):
     scene = find_scene(root, CFG)
     assert [view.exif_ev for view in scene.views] == [-2.0, 0.0, 2.0, 0.0]
     # HDR-GS puts a COLMAP model beside the file of exposures.
-    write_tiny_model(tmp_path / "gs", n=4)
+    helpers.write_tiny_model(tmp_path / "gs", n=4)
     shutil.copy(root / "poses_bounds_exps.npy", tmp_path / "gs")
     scene = find_scene(tmp_path / "gs", CFG)
     assert scene.format == "colmap"
     assert [view.exif_ev for view in scene.views] == [-2.0, 0.0, 2.0, 0.0]
     np.save(root / "poses_bounds_exps.npy", np.c_[rows(), [1, 1, 0, 1]])
-    with refused("row 2 has the impossible exposure 0"):
+    with helpers.refused("row 2 has the impossible exposure 0"):
         find_scene(root, CFG)
     data = {**LENS, "frames": frames("images/a.png"), "test_frames": frames("images/b.png")}
     scene = find_scene(write(tmp_path, data), CFG)
     assert [view.split for view in scene.views] == ["train", "test"]
     assert scene.split_by == "transforms.json (test_frames)"
-    with refused('no list "test_frames"'):
+    with helpers.refused('no list "test_frames"'):
         find_scene(write(tmp_path, data | {"test_frames": 3}), CFG)

@@ -13,17 +13,7 @@ from p2gs_jax.render.capacity import make_renderer
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 
-from p2gs_jax.viewer import renderer as module
-from p2gs_jax.viewer.renderer import (
-    ENLARGE_WITHIN,
-    SHRINK_BEYOND,
-    TARGET_MS,
-    Renderer,
-    compilation_order,
-    full_size,
-    next_size,
-    render_sizes,
-)
+from p2gs_jax.viewer import renderer as renderers
 
 CFG = RenderConfig(sh_degree=0)
 SIZE, LARGE = (64, 48), (160, 120)
@@ -52,7 +42,7 @@ def made(monkeypatch):
     def make(scene, z=0.0, alive=True):
         changed = threading.Event()
         used = jnp.full(scene.capacity, alive)
-        out = Renderer(scene, used, CFG, [lambda size: camera(size, z)], changed.set)
+        out = renderers.Renderer(scene, used, CFG, [lambda size: camera(size, z)], changed.set)
         every.append(out)
         return out, changed
 
@@ -109,7 +99,7 @@ def test_a_view_that_overflows_comes_as_soon_as_there_is_room(made):
 def test_a_view_to_save_waits_for_its_program(made, monkeypatch):
     renderer, _ = made(gaussians(scale=-0.5), z=-100.0)
     assert float(renderer.render_now(camera(LARGE)).alpha.max()) > 0.5
-    monkeypatch.setattr(module, "MOST_ENTRIES", 5000)
+    monkeypatch.setattr(renderers, "MOST_ENTRIES", 5000)
     with pytest.raises(UserError, match="memory"):
         renderer.render_now(camera(LARGE))
 
@@ -123,21 +113,21 @@ def test_a_size_that_cannot_be_compiled_is_reported_and_the_next_one_is_compiled
 
 
 def test_sizes_rise_to_the_canvas_itself_up_to_a_width():
-    assert full_size((1280, 800), 1920) == (1280, 800)
-    assert full_size((3840, 2160), 1920) == (1920, 1080)
-    assert full_size((0, 0), 1920) == (1, 1)
+    assert renderers.full_size((1280, 800), 1920) == (1280, 800)
+    assert renderers.full_size((3840, 2160), 1920) == (1920, 1080)
+    assert renderers.full_size((0, 0), 1920) == (1, 1)
     for canvas in ((1280, 800), (1920, 950), (600, 1000), (200, 150), (1, 1)):
-        sizes = render_sizes(canvas)
+        sizes = renderers.render_sizes(canvas)
         areas = [w * h for w, h in sizes]
         assert areas == sorted(set(areas))
         assert sizes[-1] == canvas
-        assert set(compilation_order(sizes)) == set(sizes)
+        assert set(renderers.compilation_order(sizes)) == set(sizes)
         assert all(w % 8 == h % 8 == 0 for w, h in sizes[:-1])
 
 
 def ms(size, of, share):
     """Return the time, ms, of a frame at which one of size `of` takes a share of the target."""
-    return share * TARGET_MS * size[0] * size[1] / (of[0] * of[1])
+    return share * renderers.TARGET_MS * size[0] * size[1] / (of[0] * of[1])
 
 
 @pytest.mark.parametrize(
@@ -146,12 +136,12 @@ def ms(size, of, share):
         (SIZES, None, 0.0, SIZES[0]),
         (SIZES, (640, 400), 1.0, SIZES[0]),  # of another window
         # One step at a time, if the next size is clearly fast enough.
-        (SIZES, SIZES[0], ms(SIZES[0], SIZES[1], ENLARGE_WITHIN - 0.01), SIZES[1]),
-        (SIZES, SIZES[0], ms(SIZES[0], SIZES[1], ENLARGE_WITHIN + 0.01), SIZES[0]),
+        (SIZES, SIZES[0], ms(SIZES[0], SIZES[1], renderers.ENLARGE_WITHIN - 0.01), SIZES[1]),
+        (SIZES, SIZES[0], ms(SIZES[0], SIZES[1], renderers.ENLARGE_WITHIN + 0.01), SIZES[0]),
         (SIZES, SIZES[2], 0.1, SIZES[2]),
         # A size is kept until it is clearly too slow, and left for the largest that keeps up.
-        (SIZES, SIZES[2], (SHRINK_BEYOND - 0.01) * TARGET_MS, SIZES[2]),
-        (SIZES, SIZES[2], 2 * TARGET_MS, SIZES[1]),
+        (SIZES, SIZES[2], (renderers.SHRINK_BEYOND - 0.01) * renderers.TARGET_MS, SIZES[2]),
+        (SIZES, SIZES[2], 2 * renderers.TARGET_MS, SIZES[1]),
         # Only compiled sizes are chosen; those of another window serve until then.
         (SIZES[1:2], SIZES[1], 0.1, SIZES[1]),
         ((), None, 0.0, None),
@@ -159,4 +149,4 @@ def ms(size, of, share):
     ],
 )
 def test_the_next_size_keeps_up(ready, current, took, wanted):
-    assert next_size(SIZES, ready, current, took) == wanted
+    assert renderers.next_size(SIZES, ready, current, took) == wanted

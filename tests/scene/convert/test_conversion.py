@@ -12,15 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image, ImageCms, features
-from scene.convert.made import (
-    ADOBE_RGB,
-    DISPLAY_P3,
-    patches,
-    save_heic,
-    settings,
-    write_dng,
-    write_exr,
-)
+from scene.convert import made
 from scene.helpers import make_view, refused, write_image, write_tiny_model
 
 from p2gs_jax.config import DataConfig, FitConfig
@@ -71,10 +63,10 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_raw_photographs_are_linear_above_their_black_level(folder: Path) -> None:
-    light = 0.02 + 0.8 * patches() ** 2
-    write_dng(folder / "a.dng", light, orientation=6)
-    write_dng(folder / "b.dng", light / 4, orientation=1)
-    write_dng(folder / "c.dng", np.full((64, 96, 3), 3.0))
+    light = 0.02 + 0.8 * made.patches() ** 2
+    made.write_dng(folder / "a.dng", light, orientation=6)
+    made.write_dng(folder / "b.dng", light / 4, orientation=1)
+    made.write_dng(folder / "c.dng", np.full((64, 96, 3), 3.0))
     result = converted(folder)
     assert result.known == "camera raw"
     bright, dark, white = (light_of(path) for path in result.paths)
@@ -95,7 +87,7 @@ def test_all_raw_photographs_of_a_camera_get_one_white_balance(folder: Path) -> 
     # Light and sensor stay the same; only the camera's white balance changes.
     light = np.full((64, 96, 3), (0.2, 0.3, 0.25))
     for name, chosen in {"a": (2.0, 1, 1.5), "b": (2.2, 1, 1.4), "c": (1.6, 1, 1.8)}.items():
-        write_dng(folder / f"{name}.dng", light, chosen=chosen)
+        made.write_dng(folder / f"{name}.dng", light, chosen=chosen)
     result = converted(folder)
     colours = [light_of(path)[32, 48] for path in result.paths]
     np.testing.assert_allclose(colours, np.broadcast_to((0.2, 0.3, 0.25), (3, 3)), atol=2e-3)
@@ -116,7 +108,7 @@ def test_missing_packages_are_named(folder: Path, monkeypatch, module, name, pac
 
 
 def test_raw_beside_jpeg_is_one_photograph(folder: Path, monkeypatch) -> None:
-    write_dng(folder / "a.dng", GREY, time=(1, 250), iso=400)
+    made.write_dng(folder / "a.dng", GREY, time=(1, 250), iso=400)
     write_image(folder / "a.jpg", 90, (96, 64))
     result = converted(folder)
     assert list(result.originals.values()) == [folder / "a.dng"]
@@ -135,7 +127,7 @@ def test_raw_beside_jpeg_is_one_photograph(folder: Path, monkeypatch) -> None:
 
 def save(path: Path, pixels: np.ndarray, **options) -> None:
     if path.suffix == ".heic":
-        save_heic(path, pixels, **options)
+        made.save_heic(path, pixels, **options)
         return
     if not features.check(path.suffix[1:]):
         pytest.skip(f"this Pillow does not support {path.suffix}")
@@ -145,8 +137,8 @@ def save(path: Path, pixels: np.ndarray, **options) -> None:
 
 @pytest.mark.parametrize("kind", ["heic", "avif", "webp"])
 def test_display_values_profile_and_settings_are_kept(folder: Path, kind: str) -> None:
-    pixels, file = (40 + 150 * patches()).astype(np.uint8), folder / f"a.{kind}"
-    save(file, pixels, exif=settings().tobytes(), icc_profile=DISPLAY_P3)
+    pixels, file = (40 + 150 * made.patches()).astype(np.uint8), folder / f"a.{kind}"
+    save(file, pixels, exif=made.settings().tobytes(), icc_profile=made.DISPLAY_P3)
     assert image_size(file) == (96, 64)
     result = converted(folder)
     assert result.known is None  # the tone curve of a phone is unknown
@@ -154,7 +146,7 @@ def test_display_values_profile_and_settings_are_kept(folder: Path, kind: str) -
     assert stored(path).dtype == np.uint8
     assert np.abs(stored(path).astype(int) - pixels).max() <= 4
     with Image.open(path) as image:
-        assert image.info["icc_profile"] == DISPLAY_P3
+        assert image.info["icc_profile"] == made.DISPLAY_P3
     for one in (path, file):
         assert exif_evs([one])[0] == pytest.approx(np.log2(200 / 60 / 2.8**2), abs=1e-3)
     file.write_bytes(file.read_bytes()[: 300 if kind == "avif" else -60])
@@ -164,7 +156,7 @@ def test_display_values_profile_and_settings_are_kept(folder: Path, kind: str) -
 
 def test_ten_bit_heic_keeps_its_precision(folder: Path) -> None:
     ramp = np.linspace(20_000, 22_000, 96).astype(np.uint16)
-    save_heic(folder / "a.heic", np.broadcast_to(ramp[None, :, None], (64, 96, 3)))
+    made.save_heic(folder / "a.heic", np.broadcast_to(ramp[None, :, None], (64, 96, 3)))
     codes = stored(converted(folder).paths[0])
     assert codes.dtype == np.uint16
     assert len(np.unique(codes[32, :, 1])) > 25  # 8 bits have 8 levels here
@@ -177,7 +169,7 @@ def test_white_is_white_and_coded_primaries_are_brought_to_srgb(folder: Path, de
         pixels = np.full((64, 96, 3), np.array(colour) * (top // 255), kind)
         # Display P3 by code points, without an ICC profile.
         coded = {"color_primaries": 12, "transfer_characteristics": 13, "matrix_coefficients": 6}
-        save_heic(folder / f"{name}.heic", pixels, full_range_flag=1, **coded)
+        made.save_heic(folder / f"{name}.heic", pixels, full_range_flag=1, **coded)
     green, white = (stored(path)[32, 48] / 257 for path in converted(folder).paths)
     np.testing.assert_allclose(green, (0, 203, 11), atol=3)
     np.testing.assert_allclose(white, 255, atol=0.01)
@@ -227,9 +219,9 @@ def test_cameras_are_named_in_raw_files_of_every_maker(kind: str) -> None:
 
 
 def test_exr_keeps_light_between_photographs(folder: Path) -> None:
-    light = (0.001 + 6 * patches() ** 3).astype(np.float32)
-    write_exr(folder / "a.exr", light)
-    write_exr(folder / "b.exr", light / 8)
+    light = (0.001 + 6 * made.patches() ** 3).astype(np.float32)
+    made.write_exr(folder / "a.exr", light)
+    made.write_exr(folder / "b.exr", light / 8)
     assert image_size(folder / "a.exr") == (96, 64)
     result = converted(folder)
     assert result.known == "linear EXR"
@@ -244,12 +236,12 @@ def test_exr_keeps_light_between_photographs(folder: Path) -> None:
 def test_nan_alpha_and_chromaticities_of_exr_are_converted(folder: Path) -> None:
     grey = np.full((8, 8, 1), 0.3, np.float32)
     grey[0, 0], grey[0, 1], grey[0, 2] = np.nan, np.inf, -1
-    write_exr(folder / "a.exr", grey, "Y", expTime=0.01, aperture=4.0, isoSpeed=100.0)
+    made.write_exr(folder / "a.exr", grey, "Y", expTime=0.01, aperture=4.0, isoSpeed=100.0)
     clear = np.full((8, 8, 4), 0.5, np.float32) * (0.6, 0.6, 0.6, 1)
-    write_exr(folder / "b.exr", clear.astype(np.float32), "RGBA")
+    made.write_exr(folder / "b.exr", clear.astype(np.float32), "RGBA")
     p3 = (0.68, 0.32, 0.265, 0.69, 0.15, 0.06, 0.3127, 0.329)
     green = np.broadcast_to(np.array([0, 0.5, 0], np.float32), (8, 8, 3))
-    write_exr(folder / "c.exr", green, chromaticities=p3)
+    made.write_exr(folder / "c.exr", green, chromaticities=p3)
     result = converted(folder)
     a, b, c = result.paths
     assert light_of(a)[4, 4] == pytest.approx(0.3, abs=1e-4)
@@ -272,9 +264,9 @@ def test_unsupported_and_broken_files_are_refused(folder: Path) -> None:
     refuse("a.nef", r"does not support .*a\.nef", "DNG Converter")
     (folder / "a.exr").write_bytes(b"\x76\x2f\x31\x01 and nothing")
     refuse("a.exr", r"a\.exr is not a readable OpenEXR")
-    write_exr(folder / "b.exr", np.ones((8, 8, 1), np.float32), "Z")
+    made.write_exr(folder / "b.exr", np.ones((8, 8, 1), np.float32), "Z")
     refuse("b.exr", "has the channels Z")
-    write_dng(folder / "a.dng", GREY)
+    made.write_dng(folder / "a.dng", GREY)
     data = (folder / "a.dng").read_bytes()
     (folder / "a.dng").write_bytes(data[: len(data) // 2])
     refuse("a.dng", r"a\.dng")
@@ -282,7 +274,7 @@ def test_unsupported_and_broken_files_are_refused(folder: Path) -> None:
 
 def test_a_folder_of_several_formats_is_converted_once(folder: Path) -> None:
     (folder / "sub").mkdir()
-    write_dng(folder / "sub" / "a.dng", GREY)
+    made.write_dng(folder / "sub" / "a.dng", GREY)
     write_image(folder / "b.jpg", 90, (96, 64))
     result = converted(folder)
     assert [p.relative_to(result.folder).as_posix() for p in result.paths] == ["b.jpg", "sub/a.png"]
@@ -291,7 +283,7 @@ def test_a_folder_of_several_formats_is_converted_once(folder: Path) -> None:
     assert noted(result, "of several kinds (1 ")
     before = result.paths[1].stat().st_mtime_ns
     assert converted(folder).paths[1].stat().st_mtime_ns == before
-    write_dng(folder / "sub" / "a.dng", 2 * GREY)
+    made.write_dng(folder / "sub" / "a.dng", 2 * GREY)
     assert light_of(converted(folder).paths[1])[32, 48, 1] == pytest.approx(0.6, abs=5e-3)
 
 
@@ -303,7 +295,7 @@ def test_a_colmap_model_of_exr_photographs_is_read(tmp_path: Path) -> None:
         path.unlink()
     (root / "masks").mkdir()
     for k in range(2):
-        write_exr(root / "images" / f"im {k}.exr", LIGHT / (1 + k), expTime=0.01, aperture=2.0)
+        made.write_exr(root / "images" / f"im {k}.exr", LIGHT / (1 + k), expTime=0.01, aperture=2.0)
         cv2.imwrite(str(root / "masks" / f"im {k}.png"), np.eye(30, 40, dtype=np.uint8) * 255)
     assert survey(root, CFG).photographs == 2
     scene = load_scene(root, CFG, tmp_path / "work")
@@ -330,7 +322,7 @@ def test_views_keep_the_names_and_masks_of_the_originals(tmp_path: Path) -> None
     root = tmp_path / "scene"
     folder, masks = root / "images", [root / "masks" / name for name in ("a.png", "b.png")]
     write_image(folder / "a.jpg", 90, (96, 64))
-    write_dng(folder / "b.dng", GREY)
+    made.write_dng(folder / "b.dng", GREY)
     for mask in masks:
         write_image(mask, 255, (96, 64))
     paths = [folder / "a.jpg", folder / "b.dng"]
@@ -349,11 +341,13 @@ def test_views_keep_the_names_and_masks_of_the_originals(tmp_path: Path) -> None
 
 
 SRGB = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
-TABLES = DISPLAY_P3.replace(b"rXYZ", b"A2B0")
-PIXELS = (40 + 150 * patches()).astype(np.uint8)
+TABLES = made.DISPLAY_P3.replace(b"rXYZ", b"A2B0")
+PIXELS = (40 + 150 * made.patches()).astype(np.uint8)
 
 
-@pytest.mark.parametrize(("data", "name"), [(DISPLAY_P3, "Display P3"), (ADOBE_RGB, "Adobe RGB")])
+@pytest.mark.parametrize(
+    ("data", "name"), [(made.DISPLAY_P3, "Display P3"), (made.ADOBE_RGB, "Adobe RGB")]
+)
 def test_converted_colours_agree_with_littlecms(data: bytes, name: str) -> None:
     profile = read_profile(data)
     assert profile is not None
@@ -375,19 +369,19 @@ def test_converted_colours_agree_with_littlecms(data: bytes, name: str) -> None:
 
 
 def test_srgb_and_broken_profiles_change_nothing() -> None:
-    for data in (SRGB, b"", DISPLAY_P3[:200]):
+    for data in (SRGB, b"", made.DISPLAY_P3[:200]):
         assert read_profile(data) is None
 
 
 def test_a_store_converts_colours_and_notes_say_so(tmp_path: Path) -> None:
-    profiles = {"a.png": None, "b.png": DISPLAY_P3, "c.png": TABLES}
+    profiles = {"a.png": None, "b.png": made.DISPLAY_P3, "c.png": TABLES}
     views = [make_view(tmp_path / name, size=(96, 64)) for name in profiles]
     for view, data in zip(views, profiles.values(), strict=True):
         Image.fromarray(PIXELS).save(view.image_path, **({"icc_profile": data} if data else {}))
     kept, changed, tabulated = (ImageStore(views, DataConfig()).stored(k)[0] for k in range(3))
     assert kept.dtype == np.uint8  # photographs without conversion stay 8-bit
     assert changed.dtype == np.uint16
-    profile = read_profile(DISPLAY_P3)
+    profile = read_profile(made.DISPLAY_P3)
     assert profile is not None
     np.testing.assert_array_equal(changed, to_srgb(PIXELS, profile))
     np.testing.assert_array_equal(tabulated, PIXELS)
@@ -399,7 +393,7 @@ def test_a_store_converts_colours_and_notes_say_so(tmp_path: Path) -> None:
 def test_alpha_beside_a_profile_is_kept_and_grey_is_unchanged(tmp_path: Path) -> None:
     pixels = np.full((8, 8, 4), 100, np.uint8)
     pixels[:, :4, 3], pixels[:, 4:, 3] = 255, 0
-    Image.fromarray(pixels).save(tmp_path / "a.png", icc_profile=DISPLAY_P3)
+    Image.fromarray(pixels).save(tmp_path / "a.png", icc_profile=made.DISPLAY_P3)
     write_image(tmp_path / "g.png", 77, (8, 8))
     views = [make_view(tmp_path / name, size=(8, 8)) for name in ("a.png", "g.png")]
     store = ImageStore(views, DataConfig())
@@ -416,7 +410,7 @@ def test_adobe_rgb_is_recognised_by_exif_alone() -> None:
         profile = profile_of(image)
     assert profile is not None
     assert profile.name == adobe_rgb().name
-    icc = read_profile(ADOBE_RGB)
+    icc = read_profile(made.ADOBE_RGB)
     assert icc is not None
     assert icc.matrix is not None
     assert adobe_rgb().matrix == pytest.approx(icc.matrix, abs=2e-3)
