@@ -1,6 +1,5 @@
 """Shared fixtures; real data is used where it lies beside the checkout and skipped elsewhere."""
 
-import collections
 import gc
 import importlib.metadata
 import os
@@ -78,19 +77,6 @@ def _forget_programs():
 
         jax.clear_caches()
         gc.collect()
-
-
-def pytest_terminal_summary(terminalreporter):
-    """Print the seconds of set-up, tests and tear-down by folder."""
-    seconds: dict[str, float] = collections.Counter()
-    for reports in terminalreporter.stats.values():
-        for report in reports:
-            if hasattr(report, "duration") and hasattr(report, "nodeid"):
-                seconds[report.nodeid.split("::")[0].rsplit("/", 1)[0]] += report.duration
-    if sum(seconds.values()) > 10:
-        terminalreporter.section("seconds by folder")
-        for folder, spent in sorted(seconds.items(), key=lambda item: -item[1]):
-            terminalreporter.write_line(f"{spent:7.1f}  {folder}")
 
 
 # Programs of tests run once or twice: XLA compiles them with the least effort. The bench

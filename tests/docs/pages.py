@@ -3,7 +3,6 @@
 The language of a block decides its test. Directives are comments right above the block:
 
     <!-- test: skip (why) -->               it cannot run here
-    <!-- test: run -->                      run these commands (sh), not only parse them
     <!-- test: write "300.0" as "2.0" -->   so that it ends soon; can be repeated
 """
 
@@ -33,7 +32,6 @@ class Block(NamedTuple):
     language: str
     code: str
     skip: str | None
-    run: bool
 
     @property
     def name(self) -> str:
@@ -68,11 +66,9 @@ def _block(page: Path, line: int, language: str, lines: list[str], directives: l
             skip = match[1]
         elif (match := WRITE.fullmatch(text)) and match[1] in code:
             code = code.replace(match[1], match[2])
-        elif text != "run":
-            raise ValueError(
-                f"{page}:{line}: {text!r} cannot be understood, or is not in the block"
-            )
-    return Block(page, line, language, code, skip, "run" in directives)
+        else:
+            raise ValueError(f"{page}:{line}: {text!r} is not a directive, or is not in the block")
+    return Block(page, line, language, code, skip)
 
 
 def commands(code: str) -> list[list[str]]:

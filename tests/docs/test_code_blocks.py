@@ -158,14 +158,6 @@ def check_ours(argv, where):
         options.checked()
 
 
-@each([b for b in blocks_to_run("sh") if b.run])
-def test_cheap_commands_run(block, folder, quick_presets):
-    for words in commands(block.code):
-        with pytest.raises(SystemExit) as stop:
-            main(words[1:])
-        assert stop.value.code == 0, words
-
-
 @each(blocks_to_run("toml"))
 def test_sweep_files_are_read(block, tmp_path):
     path = tmp_path / "sweep.toml"
