@@ -2,8 +2,10 @@
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from p2gs_jax import initialise, solve_exposures, survey
+from p2gs_jax.run.photometry_files import OF_VIEWS, write_photometry
 from p2gs_jax.types import Scene, View
 
 
@@ -48,6 +50,31 @@ def make_scene(root, views=6, points=150, size=(112, 100), seed=0):
         rows.append(f"{p + 1} {xyz[p, 0]} {xyz[p, 1]} {xyz[p, 2]} {rgb} 0.5 {pairs}")
     (model / "points3D.txt").write_text("\n".join(rows) + "\n")
     return root
+
+
+def rewrite(root, suffix, write, folder=""):
+    """Give the photographs of a scene another format; `write` gets a path and an image."""
+    listed = root / "sparse" / "0" / "images.txt"
+    text = listed.read_text()
+    (root / "images" / folder).mkdir(exist_ok=True)
+    for path in sorted((root / "images").glob("*.png")):
+        target = root / "images" / folder / f"{path.stem}{suffix}"
+        with Image.open(path) as image:
+            write(target, image)
+        if target != path:
+            path.unlink()
+        text = text.replace(path.name, f"{folder}{target.name}")
+    listed.write_text(text)
+    return root
+
+
+def write_solved(path, views, curve="srgb", **fields):
+    """Write a photometry.json; what a view lacks is null."""
+    fields = {"model": "view_exposure", "gauge": "", **fields}
+    fields.setdefault("mean", {"exposure": 1.25, "exposure_geometric": 1.0, "gamma": 2.2})
+    views = [dict.fromkeys(OF_VIEWS) | view for view in views]
+    curve = {"name": curve, "pivot": 0.18, "spline": None}
+    write_photometry(path, views=views, curve=curve, **fields)
 
 
 def prepared(scene, cfg, kept=None):

@@ -31,14 +31,14 @@ def scene(tmp_path_factory):
     return dataclasses.replace(scene, views=assign_split(scene.views, 4))
 
 
-def corridor(camera):
+def corridor(camera, origin):
     """Return depth and alpha of two walls up to 5 m, the road between them, and the sky."""
     height, width = camera.height, camera.width
     viewmat, K = np.asarray(camera.viewmat, np.float64), np.asarray(camera.K, np.float64)
     y, x = np.mgrid[:height, :width] + 0.5
     local = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], -1)
     rays = local @ viewmat[:3, :3]
-    center = -viewmat[:3, :3].T @ viewmat[:3, 3] + ORIGIN - FAR
+    center = -viewmat[:3, :3].T @ viewmat[:3, 3] + origin - FAR
     with np.errstate(divide="ignore"):
         to_wall = np.where(rays[..., 1] > 0, WALL - center[1], -WALL - center[1]) / rays[..., 1]
         to_road = np.where(rays[..., 2] < 0, -center[2] / rays[..., 2], np.inf)
@@ -47,17 +47,12 @@ def corridor(camera):
     return np.where(sky, 0, depth).astype(np.float32), (~sky).astype(np.float32)
 
 
-ORIGIN = np.zeros(3)
-
-
 @pytest.fixture(scope="module")
 def metrics(scene):
     """Return metrics of a fit that shows both walls in one grey."""
-    global ORIGIN
-    ORIGIN = np.array(scene.origin)
 
     def render(gaussians, alive, camera, *args):
-        depth, alpha = corridor(camera)
+        depth, alpha = corridor(camera, np.array(scene.origin))
         arrays = map(jnp.asarray, (0.16 * np.ones((*depth.shape, 3), np.float32), alpha, depth))
         return Render(*arrays, jnp.int32(0), jnp.bool_(False), alive)
 

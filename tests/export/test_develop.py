@@ -12,7 +12,7 @@ import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
-from tiny_scene import make_scene, noise_scene
+from tiny_scene import make_scene, noise_scene, rewrite
 
 from p2gs_jax import UserError, preset
 from p2gs_jax.config import CameraFormation, DataConfig
@@ -81,17 +81,12 @@ def seen_as(selection, row=None):
 
 def scene_of(root, selection, suffix=".png", folder=""):
     """Write a COLMAP scene whose photographs show the radiance; names may have a folder."""
-    make_scene(root)
-    (root / "images" / folder).mkdir(exist_ok=True)
-    listed = root / "sparse" / "0" / "images.txt"
-    text = listed.read_text()
-    for row in range(6):
-        (root / "images" / f"{row}.png").unlink()
-        codes = np.rint(255 * seen_as(selection, row)).astype(np.uint8)
-        Image.fromarray(codes).save(root / "images" / f"{folder}{row}{suffix}", quality=100)
-        text = text.replace(f" {row}.png", f" {folder}{row}{suffix}")
-    listed.write_text(text)
-    return root
+
+    def write(path, _):
+        codes = np.rint(255 * seen_as(selection, int(path.stem))).astype(np.uint8)
+        Image.fromarray(codes).save(path, quality=100)
+
+    return rewrite(make_scene(root), suffix, write, folder)
 
 
 def read(root):

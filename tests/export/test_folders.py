@@ -10,7 +10,7 @@ from PIL import Image
 from plyfile import PlyData
 from scene.convert.made import DISPLAY_P3, save_heic, write_exr
 from splats import random_splats
-from tiny_scene import make_scene, noise_scene
+from tiny_scene import make_scene, noise_scene, rewrite
 
 from p2gs_jax.config import DataConfig, FitConfig, PhotometryConfig, RenderConfig
 from p2gs_jax.core.atomic import write_json
@@ -44,22 +44,6 @@ def export(root, cfg, program="colmap"):
     store = ImageStore(scene.views, cfg)
     write_folder(program, root / "out", scene, store, rows(scene))
     return scene, store, load_scene(root / "out", DataConfig())
-
-
-def rewrite(root, suffix, write, folder=""):
-    """Give the photographs of a scene another format; `write` gets a path and an image."""
-    listed = root / "sparse" / "0" / "images.txt"
-    text = listed.read_text()
-    (root / "images" / folder).mkdir(exist_ok=True)
-    for path in sorted((root / "images").glob("*.png")):
-        target = root / "images" / folder / f"{path.stem}{suffix}"
-        with Image.open(path) as image:
-            write(target, image)
-        if target != path:
-            path.unlink()
-        text = text.replace(path.name, f"{folder}{target.name}")
-    listed.write_text(text)
-    return root
 
 
 @pytest.fixture(scope="module")

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tiny_scene import write_solved
 
 from p2gs_jax.export.trainers import write_for
-from p2gs_jax.run.photometry_files import OF_VIEWS, write_photometry
 from p2gs_jax.types import View
 
 EXPOSURES = {"a.png": 0.5, "b.png": 3.0}
@@ -16,14 +16,10 @@ VIEWS = [View(n, Path(n), "0", np.eye(4), np.eye(3, dtype="f4"), 30, 20) for n i
 
 
 def photometry(path, curve, gammas=(GAMMA, GAMMA)):
-    views = [
-        {**dict.fromkeys(OF_VIEWS), "image": n, "camera": "0"}
-        | {"exposure": e, "gamma": gamma, "white_balance": BALANCE}
-        for (n, e), gamma in zip(EXPOSURES.items(), gammas, strict=True)
-    ]
-    curve = {"name": curve, "pivot": PIVOT, "spline": None}
+    names, common = ("image", "exposure", "gamma"), {"camera": "0", "white_balance": BALANCE}
+    rows = zip(EXPOSURES, EXPOSURES.values(), gammas, strict=True)
     mean = {"exposure": 1.75, "exposure_geometric": 1.5**0.5, "gamma": GAMMA}
-    write_photometry(path, model="view_exposure", curve=curve, gauge="", mean=mean, views=views)
+    write_solved(path, [common | dict(zip(names, r, strict=True)) for r in rows], curve, mean=mean)
 
 
 @pytest.mark.parametrize(("curve", "power"), [("power", 1 / 2.2), ("linear", 1.0)])

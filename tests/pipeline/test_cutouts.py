@@ -1,12 +1,11 @@
 """A fit of photographs with alpha, from the folder to the scores."""
 
-import json
 import shutil
 
 import cv2
 import numpy as np
 import pytest
-from scene.helpers import around, blender
+from scene.helpers import write_blender
 
 from p2gs_jax import UserError, fit, load_run, preset, with_fields
 from p2gs_jax.evaluation.against import check_renders, judge_renders
@@ -17,11 +16,8 @@ from p2gs_jax.formats.exr import read_exr, write_exr
 SIZE, COLOR = 48, np.array([0.8, 0.3, 0.2])
 
 
-def write_ball(root, count, part):
-    """Write views of a ball of one colour and radius 1 at the origin, from a distance of 4."""
-    data = blender(around(count), part, angle=0.7)
-    (root / part).mkdir(parents=True)
-    (root / f"transforms_{part}.json").write_text(json.dumps(data))
+def write_ball(path):
+    """Write a view of a ball of one colour and radius 1 at the origin, from a distance of 4."""
     fine = 4 * SIZE
     focal = 0.5 * fine / np.tan(0.35)
     y, x = np.mgrid[:fine, :fine] + 0.5 - fine / 2
@@ -29,9 +25,7 @@ def write_ball(root, count, part):
     inside = np.sin(np.arctan(np.hypot(x, y) / focal)) < 0.25
     alpha = inside.reshape(SIZE, 4, SIZE, 4).mean((1, 3))
     rgba = np.concatenate([np.broadcast_to(COLOR, (SIZE, SIZE, 3)), alpha[..., None]], 2)
-    image = np.rint(255 * rgba).astype(np.uint8)[..., [2, 1, 0, 3]]
-    for k in range(count):
-        assert cv2.imwrite(str(root / part / f"r_{k}.png"), image)
+    assert cv2.imwrite(str(path), np.rint(255 * rgba).astype(np.uint8)[..., [2, 1, 0, 3]])
 
 
 SHORT = {"data.background": "0.1,0.9,0.1", "init.dense": "off", "densify.max_gaussians": 600}
@@ -42,9 +36,7 @@ SHORT |= {"render.sh_degree": 0, "render.pixels_in_flight": 2048}
 @pytest.fixture(scope="module")
 def ball(tmp_path_factory):
     """Return result and run of a short fit of a ball over green, from random seeds."""
-    root = tmp_path_factory.mktemp("ball")
-    write_ball(root, 12, "train")
-    write_ball(root, 4, "test")
+    root = write_blender(tmp_path_factory.mktemp("ball"), write_ball, train=12, test=4)
     return fit(root, root / "run", with_fields(preset("robust"), SHORT)), load_run(root / "run")
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from page_tools import edit
 from scene.helpers import make_view
+from tiny_scene import write_solved
 
 from p2gs_jax.config import DataConfig, FitConfig, RenderConfig
 from p2gs_jax.core.numerics import srgb_encode
@@ -24,7 +25,6 @@ from p2gs_jax.report.run_files import RunFiles, read_run
 from p2gs_jax.report.run_sections import depth_section, parts_section
 from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.run.folder import RunFolder
-from p2gs_jax.run.photometry_files import write_photometry
 from p2gs_jax.run.scene_file import write_scene
 from p2gs_jax.run.write import write_start
 from p2gs_jax.types import Gaussians, Scene
@@ -231,15 +231,7 @@ def wall_run(tmp_path_factory):
     )
     write_radiance(run / "radiance.ply", gaussians, activation="exp")
     common = {"camera": "0", "gamma": 2.2, "split": "train"}
-    common |= dict.fromkeys(("exif_ev", "exposure_fitted"))
-    write_photometry(
-        run / "photometry.json",
-        model="view_exposure",
-        curve={"name": "srgb", "pivot": 0.18, "spline": None},
-        gauge="known",
-        mean={"exposure": 1.2, "exposure_geometric": 1.0, "gamma": 2.2},
-        views=[common | row for row in rows],
-    )
+    write_solved(run / "photometry.json", [common | row for row in rows], gauge="known")
     return run
 
 

@@ -7,14 +7,13 @@ import cv2
 import numpy as np
 import pytest
 from splats import gaussians_of
-from tiny_scene import make_scene
+from tiny_scene import make_scene, write_solved
 
 from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.formats.exr import read_exr
 from p2gs_jax.formats.ply import read_ply, write_ply, write_radiance
 from p2gs_jax.render.harmonics import C0
 from p2gs_jax.run.foreign import foreign_run
-from p2gs_jax.run.photometry_files import OF_VIEWS, write_photometry
 
 RADIANCE = np.array([0.1, 0.2, 0.05])
 # Exposures of two photographs (the third has none), and of every developed one in EV.
@@ -30,21 +29,15 @@ def walls(colors):
 
 
 def write_calibration(folder, names, camera):
-    def view(name, e, balance):
-        values = {"image": name, "camera": camera, "exposure": e, "white_balance": balance}
-        return {**dict.fromkeys(OF_VIEWS), **values, "gamma": None if e is None else 2.2}
-
-    rows = zip(names, (*EXPOSURES, None), ((1, 1, 1), BALANCE, None), strict=True)
+    keys, captures = ("exposure", "white_balance", "gamma"), [(EXPOSURES[0], (1, 1, 1), 2.2)]
+    captures += [(EXPOSURES[1], BALANCE, 2.2), (None, None, None)]
+    views = [
+        {"image": name, "camera": camera, **dict(zip(keys, capture, strict=True))}
+        for name, capture in zip(names, captures, strict=True)
+    ]
+    cameras = [{"name": camera, "vignetting": [[VIGNETTING, 0.0, 0.0]], "splines": None}]
     folder.mkdir()
-    write_photometry(
-        folder / "photometry.json",
-        model="view_exposure",
-        curve={"name": "srgb", "pivot": 0.18, "spline": None},
-        gauge="",
-        mean={"exposure": 1.25, "exposure_geometric": 1.0, "gamma": 2.2},
-        views=[view(*row) for row in rows],
-        cameras=[{"name": camera, "vignetting": [[VIGNETTING, 0.0, 0.0]], "splines": None}],
-    )
+    write_solved(folder / "photometry.json", views, cameras=cameras)
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -117,3 +118,14 @@ def blender(poses: np.ndarray, part: str, angle: float = 0.7) -> dict:
         for k, pose in enumerate(poses)
     ]
     return {"camera_angle_x": angle, "frames": frames}
+
+
+def write_blender(root: Path, write=write_rgba, **counts: int) -> Path:
+    """Write such a scene of cameras around the origin; `write` gets each photograph's path."""
+    for part, count in {"train": 6, "test": 3, "val": 0, **counts}.items():
+        if count:
+            (root / part).mkdir(parents=True, exist_ok=True)
+            (root / f"transforms_{part}.json").write_text(json.dumps(blender(around(count), part)))
+        for k in range(count):
+            write(root / part / f"r_{k}.png")
+    return root

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 from report.page_tools import edit
-from scene.helpers import around, blender, refused, write_image, write_rgba, write_tiny_model
+from scene import helpers
+from scene.helpers import refused, write_blender, write_image, write_rgba
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.scene import find_scene, load_scene, with_masks_and_split
@@ -124,7 +125,7 @@ def test_two_photographs_are_triangulated(tmp_path):
 @pytest.mark.parametrize("key", ["images.txt", "file_path", "mask_path", "ply_file_path"])
 def test_names_that_leave_the_scene_are_refused(tmp_path, key):
     scene, name = tmp_path / "scene", "a/../../../secret.png"
-    images = write_tiny_model(scene) / "images.txt"
+    images = helpers.write_tiny_model(scene) / "images.txt"
     # This file exists, but outside the scene, and no reader opens it.
     (tmp_path / "secret.png").write_text("secret")
     if key == "images.txt":
@@ -163,16 +164,6 @@ def test_a_name_that_is_not_utf_8_is_refused(tmp_path):
         file.write(data)
     with refused("is not UTF-8"):
         load_scene(tmp_path, CFG)
-
-
-def write_blender(root, **counts):
-    for part, count in {"train": 6, "test": 3, "val": 0, **counts}.items():
-        if count:
-            root.mkdir(exist_ok=True)
-            (root / f"transforms_{part}.json").write_text(json.dumps(blender(around(count), part)))
-        for k in range(count):
-            write_rgba(root / part / f"r_{k}.png")
-    return root
 
 
 def held_out(scene):
@@ -226,7 +217,7 @@ def test_options_replace_the_split_and_depths_follow_from_cameras(tmp_path):
     assert len(held_out(every)) == 3
     near, far = depth_range(every.training_views)
     assert 1.5 < near < 4 < far < 6.5
-    data = blender(around(6) @ np.diag([-1.0, 1.0, -1.0, 1.0]), "train")
+    data = helpers.blender(helpers.around(6) @ np.diag([-1.0, 1.0, -1.0, 1.0]), "train")
     (tmp_path / "transforms_train.json").write_text(json.dumps(data))
     near, far = depth_range(load_blender(tmp_path, CFG).training_views)
     assert (near, far) == (pytest.approx(1.73, rel=0.1), pytest.approx(34.6, rel=0.1))
@@ -251,7 +242,7 @@ def test_broken_parts_of_a_split_are_refused(tmp_path):
 def rows(count=4, focal=50.0):
     """Return the rows of LLFF's table for cameras on a ring."""
     out = []
-    for pose in around(count):
+    for pose in helpers.around(count):
         # OpenGL's right, up, backwards; LLFF's down, right, backwards.
         right, up, back = pose[:3, :3].T
         matrix = np.stack([-up, right, back, pose[:3, 3], [30, 40, focal]], 1)
@@ -269,7 +260,7 @@ def write_llff(root, table, count=4, size=(40, 30), folder="images"):
 def test_llff_axes_and_lens_are_converted(tmp_path):
     scene = find_scene(write_llff(tmp_path, rows()), CFG)
     assert (scene.format, scene.depths) == ("llff", (2.0, 6.0))
-    for view, pose in zip(scene.views, around(4), strict=True):
+    for view, pose in zip(scene.views, helpers.around(4), strict=True):
         assert np.allclose(view.viewmat, np.linalg.inv(pose @ OPENGL), atol=1e-6)
         assert np.allclose(view.K, [[50, 0, 20], [0, 50, 15], [0, 0, 1]])
     # The middle of the ring lies in the middle of every picture, four units ahead.

@@ -3,12 +3,14 @@
 from dataclasses import replace
 
 import jax.numpy as jnp
+import matplotlib
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax import Camera, DisplayTransform, develop
 from p2gs_jax.config import CameraFormation, PhotometryConfig
+from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.formats.false_color import depth_color, false_color, luminance
 from p2gs_jax.photometry.formation import squared_radii
 from p2gs_jax.viewer import pictures
@@ -24,6 +26,10 @@ def camera(width=40, height=24, focal=50.0, rotation=(0, 0, 0), K=None):
     if K is None:
         K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     return Camera(jnp.asarray(viewmat), jnp.asarray(K), width, height)
+
+
+def map_of(name, values):
+    return matplotlib.colormaps[name](np.rint(255 * values.clip(0, 1)).astype(int))[..., :3]
 
 
 def test_every_mode_shows_its_picture():
@@ -42,6 +48,17 @@ def test_every_mode_shows_its_picture():
     for mode, picture in wanted.items():
         found = pictures.picture_of(frame, mode, TRANSFORM, depth_limits=limits)
         np.testing.assert_array_equal(found, picture)
+    # An exposure of 2 and the sRGB curve; maps of stops from mid-grey, and of 1 / depth.
+    light, solid = linear @ np.array([0.2126, 0.7152, 0.0722]), alpha > 0.5
+    stops = (np.floor(np.clip(np.log2(2 * light / 0.18), -6, 5.9)) + 6.5) / 12
+    near = (1 / np.where(solid, depth / alpha, 9) - 1 / 9) / (1 / 2 - 1 / 9)
+    by_hand = {
+        "display": srgb_encode(2 * linear),
+        "depth": map_of("cividis", near) * solid[..., None],
+        "stops": map_of("viridis", stops),
+    }
+    for mode, picture in by_hand.items():
+        np.testing.assert_allclose(wanted[mode], picture, atol=1e-5)
     # Stops count at the exposure of the transform.
     brighter = pictures.picture_of(frame, "stops", replace(TRANSFORM, exposure=4.0))
     twice = pictures.picture_of(replace(frame, linear=2 * frame.linear), "stops", TRANSFORM)
