@@ -11,7 +11,6 @@ import pytest
 from p2gs_jax.cli.experiments import Synth
 from p2gs_jax.cli.shared import parse_duration
 from p2gs_jax.errors import UserError
-from p2gs_jax.pipeline.preflight import check_run_dir
 from p2gs_jax.presets import preset, to_dict
 from p2gs_jax.run.folder import locked
 
@@ -55,6 +54,8 @@ WRONG = [
     ("fit castle --out run --blocks 2 --jobs 0", "--jobs must be at least 1"),
     ("fit castle --out run --blocks 2 --devices 2", "on one device"),
     ("fit castle --out run --blocks 2 --threads 2", "leave out --devices and --threads"),
+    ("fit castle --out run --view --blocks 2", "RUN/blocks/0"),
+    ("fit castle --out run --port 9000", "without --view"),
     ("fit castle --out run --threads 0", "--threads 0 is not a number of cores"),
     ("fit castle --out run --blocks 2 --engine ray", "'ray' is not a known engine"),
     ("fit castle --out run --blocks 2 --preset 3dgs", "learns them"),
@@ -82,6 +83,9 @@ WRONG = [
     ("inspect castle --data.format colmap", "leave out --data.format"),
     ("sweep empty", "name a TOML file"),
     ("calibrate nowhere --out run --static", "name the folder of the photographs"),
+    ("calibrate castle --out run --static --develop 8bit", "--static"),
+    ("calibrate castle --out run --exposure-ev 1", "without --develop"),
+    ("calibrate castle --out run --no-masks", "without --develop"),
     ("calibrate castle --out run --static", "several exposures"),
     ("calibrate castle --out begun", "photometry.json would be replaced"),
     ("calibrate castle --out begun --static", "photometry.json would be replaced"),
@@ -101,8 +105,11 @@ WRONG = [
     ("eval torn", "--resume"),
     ("demo --frames 0", "at least 1 frame"),
     ("demo --out castle", "other files"),
+    ("demo --out done", "holds a finished demo"),
     ("synth file.txt", "name another folder"),
     ("synth new --seed -1", "use a seed of 0 or more"),
+    ("compare", "to compare"),
+    ("compare castle", "to compare"),
     ("sweep none.toml", "docs/api.md"),
     ("sweep file.txt", "is not valid TOML"),
     ("doctor --skip-selftest", "--skip-self-test"),
@@ -120,19 +127,14 @@ def test_a_demo_is_not_replaced_while_it_runs(tmp_path, run_command):
         assert (tmp_path / "street").is_dir()
 
 
-def test_a_finished_demo_is_kept(tmp_path, refused):
-    (tmp_path / "run").mkdir()
-    for path in (tmp_path / "demo.json", tmp_path / "run" / "metrics.json"):
-        path.touch()
-    assert "holds a finished demo" in refused("demo", "--out", tmp_path)
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """Return a folder with the scenes, runs and files that WRONG names, each with its fault."""
     root = tmp_path_factory.mktemp("wrong")
-    for name in ("castle", "junk", "empty", "begun", "other", "torn", "gaps/images"):
+    for name in ("castle", "junk", "empty", "begun", "other", "torn", "gaps/images", "done/run"):
         (root / name).mkdir(parents=True)
+    for name in ("demo.json", "run/metrics.json"):
+        (root / "done" / name).touch()
     for name in ("castle", "gaps/images"):
         cv2.imwrite(str(root / name / "000.png"), np.full((30, 40, 3), 60, np.uint8))
     pose = {"transform_matrix": np.eye(4).tolist()}
@@ -186,27 +188,6 @@ def test_damaged_runs_end_with_a_remedy(refused, tmp_path, finished_run, name, c
     text = refused("eval", tmp_path / "run")
     assert name in text
     assert remedy in text
-
-
-def test_a_resumed_run_may_change_only_its_evaluation(tmp_path):
-    def resume(cfg, name="robust"):
-        (tmp_path / "config.json").write_text(json.dumps({"scene": "s", "fit": cfg}))
-        check_run_dir(tmp_path, True, preset(name))
-
-    cfg = to_dict(preset("robust"))
-    resume(cfg | {"evaluation": {"lpips_weights": "alex"}})
-    cfg["evaluation"] = {"lpips_weights": "alex"}
-    cfg["train"]["seed"] = 7
-    with pytest.raises(UserError, match=r"train\.seed") as error:
-        resume(cfg)
-    assert "evaluation" not in str(error.value)
-    cfg = to_dict(preset("paper"))
-    cfg["densify"]["method"] = "mcmc"
-    with pytest.raises(UserError, match=r"densify.method was mcmc, now adaptive\."):
-        resume(cfg, "paper")
-    cfg["render"]["colour"] = True
-    with pytest.raises(UserError, match="unknown fields in RenderConfig: colour"):
-        resume(cfg, "paper")
 
 
 def test_a_file_that_cannot_grow_is_named(refused, tmp_path, monkeypatch):

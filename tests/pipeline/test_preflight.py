@@ -195,20 +195,28 @@ def test_a_full_disk_is_exit_2_before_anything_is_fitted(
 
 
 def test_a_run_may_only_become_longer(tmp_path):
-    cfg = with_fields(FitConfig(), {"train.steps": 60, "train.budget_s": 60.0})
+    fields = {"train.steps": 60, "train.budget_s": 60.0, "evaluation.lpips_weights": "alex"}
+    cfg = with_fields(FitConfig(), fields)
     write_start(RunFolder(tmp_path), tmp_path, None, cfg, Decisions.as_given(cfg))
     for name, value in {"steps": 61, "budget_s": 90.0}.items():
         assert check_run_dir(tmp_path, True, with_fields(cfg, {f"train.{name}": value}))
-    # Options of memory may change.
-    assert not check_run_dir(tmp_path, True, with_fields(cfg, {"data.cache_mb": 17}))
-    for name, value in {"steps": 59, "budget_s": 30.0, "seed": 7}.items():
-        with pytest.raises(UserError, match=f"train.{name} was"):
-            check_run_dir(tmp_path, True, with_fields(cfg, {f"train.{name}": value}))
+    # Options of memory and of the evaluation may change.
+    free = with_fields(cfg, {"data.cache_mb": 17, "evaluation.lpips_weights": None})
+    assert not check_run_dir(tmp_path, True, free)
+    wrong = {"train.steps": (60, 59), "train.budget_s": (60.0, 30.0), "train.seed": (0, 7)}
+    wrong["densify.method"] = ("mcmc", "adaptive")
+    for name, (before, now) in wrong.items():
+        with pytest.raises(UserError, match=rf"options: {name} was {before}, now {now}\."):
+            check_run_dir(tmp_path, True, with_fields(free, {name: now}))
     for before, now in ((60.0, None), (None, 60.0)):
         cfg = with_fields(cfg, {"train.budget_s": before})
         write_start(RunFolder(tmp_path), tmp_path, None, cfg, Decisions.as_given(cfg))
         with pytest.raises(UserError, match=r"train\.budget_s was"):
             check_run_dir(tmp_path, True, with_fields(cfg, {"train.budget_s": now}))
+    path = RunFolder(tmp_path).config
+    path.write_text(path.read_text().replace('"render": {', '"render": {"colour": true, '))
+    with pytest.raises(UserError, match="unknown fields in RenderConfig: colour"):
+        check_run_dir(tmp_path, True, cfg)
 
 
 GB = 1e9

@@ -92,8 +92,3 @@ def test_unfinished_runs_have_empty_cells_and_runs_of_one_name_separate_labels(r
     labels = compare_runs([runs[0], copy_run(runs[0], tmp_path / "plain")]).labels
     assert len(set(labels)) == 2
     assert all(label.endswith("/plain") for label in labels)
-
-
-def test_a_single_run_is_refused(runs, refused):
-    for argv in (["compare", runs[0]], ["compare"]):
-        assert "to compare" in refused(*argv)

@@ -49,11 +49,6 @@ def test_wrong_options_are_refused_by_name(refused, tmp_path, options, named):
     assert named in refused("view", tmp_path, "--port", "0", *options)
 
 
-def test_fit_refuses_a_port_without_view_and_a_view_of_blocks(refused, tmp_path):
-    assert "without --view" in refused("fit", tmp_path, "--port", "9000")
-    assert "RUN/blocks/0" in refused("fit", tmp_path, "--view", "--blocks", "2")
-
-
 def test_a_busy_port_is_refused(refused, tmp_path):
     with socket.socket() as busy:
         busy.bind(("127.0.0.1", 0))

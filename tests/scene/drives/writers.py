@@ -30,6 +30,10 @@ inv = np.linalg.inv
 SCANNER = matrix(Rotation.from_euler("z", -np.pi / 2), [0.9, 0, 1.8])
 
 
+# OpenCV's axes in those of a camera with x forward, y left, z up.
+OPENCV = matrix(Rotation.from_matrix(FORWARD), [0, 0, 0])
+
+
 def car_at(seconds: float) -> np.ndarray:
     """Return car to world: 9 m/s along a bend, far from the world's origin."""
     yaw = 0.4 + 0.3 * seconds

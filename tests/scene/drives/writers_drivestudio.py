@@ -5,26 +5,16 @@ from pathlib import Path
 
 import numpy as np
 from scene.drives import writers as w
-from scipy.spatial.transform import Rotation
+from scene.drives import writers_waymo as waymo
 
-AZIMUTHS = {0: 0.0, 1: 0.8}
 NAMES = {0: "FRONT", 1: "FRONT_LEFT"}
 TURN = 0.1  # seconds of a scanner's turn
 BOXES = Path("instances/instances_info.json")
 
 
-def mount(camera) -> np.ndarray:
-    """Return camera to car, both with x forward, y left, z up."""
-    return w.matrix(Rotation.from_euler("z", AZIMUTHS[camera]), [1.5, 0.1, 2.1])
-
-
 def text(values) -> str:
     """Return values in the format of numpy.savetxt."""
     return "".join(" ".join(f"{v:.18e}" for v in np.atleast_1d(row)) + "\n" for row in values)
-
-
-def box(place) -> np.ndarray:
-    return w.box(place, 0.2)
 
 
 def instance(track, poses) -> dict:
@@ -38,14 +28,14 @@ def instance(track, poses) -> dict:
 
 def write(root: Path, frames=3) -> w.Made:
     ats = TURN * np.arange(frames)
-    for camera in AZIMUTHS:
+    for camera in NAMES:
         lens = [50.0, 51.0, 32.0, 24.0, 0.05, -0.02, 1e-3, -1e-3, 0.0]
         w.write_bytes(root / f"intrinsics/{camera}.txt", text(lens))
-        w.write_bytes(root / f"extrinsics/{camera}.txt", text(mount(camera)))
+        w.write_bytes(root / f"extrinsics/{camera}.txt", text(waymo.mount(camera + 1)))
     for k, at in enumerate(ats):
         car = w.car_at(at)
         w.write_bytes(root / f"ego_pose/{k:03d}.txt", text(car))
-        for camera in AZIMUTHS:
+        for camera in NAMES:
             w.write_bytes(root / f"images/{k:03d}_{camera}.jpg", w.jpeg(10 * k + camera))
         rows = np.zeros((len(w.landmarks()), 14), "<f4")
         rows[:, :3] = [1.43, 0, 2.18]
@@ -53,22 +43,21 @@ def write(root: Path, frames=3) -> w.Made:
         w.write_bytes(root / f"lidar/{k:03d}.bin", rows.tobytes())
     cars = [w.car_at(at) for at in ats]
     moving = {"ahead": w.AHEAD, "right": w.RIGHT}
-    things = {name: [car @ box(place) for car in cars] for name, place in moving.items()}
-    things["parked"] = [cars[0] @ box(w.AHEAD)] * frames
+    things = {name: [car @ waymo.box(place) for car in cars] for name, place in moving.items()}
+    things["parked"] = [cars[0] @ waymo.box(w.AHEAD)] * frames
     table = {str(k): instance(*item) for k, item in enumerate(things.items())}
     w.write_bytes(root / BOXES, json.dumps(table))
-    opencv = w.matrix(Rotation.from_matrix(w.FORWARD), [0, 0, 0])
     return w.Made(
         root=root,
         photographs={
-            (NAMES[c], k): (at, w.car_at(at) @ mount(c) @ opencv)
-            for c in AZIMUTHS
+            (NAMES[c], k): (at, w.car_at(at) @ waymo.mount(c + 1) @ w.OPENCV)
+            for c in NAMES
             for k, at in enumerate(ats)
         },
         sweeps=list(ats),
         # The scanner looks forward in the middle of its turn.
         boxes=w.tracks(
-            ats, {"ahead": 0.0, "right": 0.25 * TURN}, lambda t, p: w.car_at(t) @ box(p)
+            ats, {"ahead": 0.0, "right": 0.25 * TURN}, lambda t, p: w.car_at(t) @ waymo.box(p)
         ),
         tables=[Path(f"{name}/0.txt") for name in ("intrinsics", "extrinsics")],
         optional=[BOXES, Path("ego_pose/001.txt")],

@@ -64,6 +64,16 @@ def local_when_passed(place: np.ndarray, forward: float) -> np.ndarray:
     return local[:3]
 
 
+PICTURE = cv2.imencode(".png", np.full((w.HEIGHT, w.WIDTH, 3), 90, np.uint8))[1].tobytes()
+
+
+def scan(forward: float) -> bytes:
+    """Return the file of a sweep of the landmarks."""
+    places = w.landmarks() - w.car_at(0)[:3, 3]
+    seen = np.array([local_when_passed(place, forward) for place in places])
+    return np.column_stack([seen, np.ones(len(seen))]).astype("<f4").tobytes()
+
+
 def write_stamps(path: Path, times) -> None:
     stamps = [START + np.timedelta64(round(t * 1e9), "ns") for t in times]
     w.write_bytes(path, "".join(f"{stamp}\n".replace("T", " ") for stamp in stamps))
@@ -124,19 +134,16 @@ def write(root: Path, frames=3) -> w.Made:
     w.write_bytes(date / "calib_velo_to_cam.txt", rigid(VELO_TO_CAM))
     w.write_bytes(date / "calib_imu_to_velo.txt", rigid(IMU_TO_VELO))
     ats = 0.1 * np.arange(frames)
-    forward, places = ats + SCANNED, w.landmarks() - w.car_at(0)[:3, 3]
+    forward = ats + SCANNED
     for name, lag in {"oxts": 0.0, "velodyne_points": SCANNED, **LAG}.items():
         write_stamps(drive / name / "timestamps.txt", ats + lag)
     write_stamps(drive / "velodyne_points/timestamps_start.txt", forward - TURN / 2)
     write_stamps(drive / "velodyne_points/timestamps_end.txt", forward + TURN / 2)
-    picture = cv2.imencode(".png", np.full((w.HEIGHT, w.WIDTH, 3), 90, np.uint8))[1].tobytes()
     for k, at in enumerate(ats):
         w.write_bytes(drive / f"oxts/data/{k:010d}.txt", oxts(at))
         for name in LAG:
-            w.write_bytes(drive / f"{name}/data/{k:010d}.png", picture)
-        seen = np.array([local_when_passed(place, forward[k]) for place in places])
-        scan = np.column_stack([seen, np.ones(len(seen))]).astype("<f4")
-        w.write_bytes(drive / f"velodyne_points/data/{k:010d}.bin", scan.tobytes())
+            w.write_bytes(drive / f"{name}/data/{k:010d}.png", PICTURE)
+        w.write_bytes(drive / f"velodyne_points/data/{k:010d}.bin", scan(forward[k]))
     parked = scanner(SCANNED) @ box(w.AHEAD)
     yaw, moving = np.radians(20), {"ahead": w.AHEAD, "right": w.RIGHT}
     things = {name: [[*place, -1.25, yaw]] * frames for name, place in moving.items()}

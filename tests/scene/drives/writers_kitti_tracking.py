@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 from scene.drives import writers as w
 from scene.drives import writers_kitti as raw
@@ -38,14 +37,11 @@ def write(root: Path, frames=3) -> w.Made:
     lines += [f"Tr_imu_velo {raw.numbers(raw.IMU_TO_VELO[:3])}"]
     w.write_bytes(root / CALIBRATION, "\n".join(lines) + "\n")
     w.write_bytes(root / OXTS, "".join(map(raw.oxts, ats)))
-    picture = cv2.imencode(".png", np.full((w.HEIGHT, w.WIDTH, 3), 90, np.uint8))[1].tobytes()
-    places, parked, labels = w.landmarks() - w.car_at(0)[:3, 3], raw.scanner(0) @ box(w.AHEAD), ""
+    parked, labels = raw.scanner(0) @ box(w.AHEAD), ""
     for k, at in enumerate(ats):
         for name in raw.LAG:
-            w.write_bytes(root / SET / f"{name}/{SEQUENCE}/{k:06d}.png", picture)
-        seen = np.array([raw.local_when_passed(place, at) for place in places])
-        scan = np.column_stack([seen, np.ones(len(seen))]).astype("<f4")
-        w.write_bytes(root / SET / f"velodyne/{SEQUENCE}/{k:06d}.bin", scan.tobytes())
+            w.write_bytes(root / SET / f"{name}/{SEQUENCE}/{k:06d}.png", raw.PICTURE)
+        w.write_bytes(root / SET / f"velodyne/{SEQUENCE}/{k:06d}.bin", raw.scan(at))
         labels += label(k, 0, "ahead", [*w.AHEAD, -0.5]) + label(k, 1, "right", [*w.RIGHT, -0.5])
         labels += label(k, 2, "parked", raw.local_when_passed(parked[:3, 3], at))
         labels += f"{k} -1 DontCare -1 -1 -10 1 2 3 4 -1 -1 -1 -1000 -1000 -1000 -10\n"

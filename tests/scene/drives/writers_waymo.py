@@ -179,14 +179,13 @@ def write(root: Path, frames=3, segment=SEGMENT) -> w.Made:
     boxes += [box_row(k, "parked", w.inv(car) @ parked) for k, car in enumerate(cars)]
     write_rows(root, "lidar_box", boxes, segment)
     write_lidar(root, frames, segment)
-    opencv = w.matrix(Rotation.from_matrix(w.FORWARD), [0, 0, 0])
     middles = {(c, k): 0.1 * k + 0.05 - 0.002 * c for c in NAMES for k in range(frames)}
     begins, late = TURN * np.arange(frames), {"ahead": 0.5 * TURN, "right": 0.75 * TURN}
     components = ("camera_image", "camera_calibration", "lidar_calibration")
     return w.Made(
         root=root,
         photographs={
-            (NAMES[c], k): (t, w.car_at(t) @ mount(c) @ opencv) for (c, k), t in middles.items()
+            (NAMES[c], k): (t, w.car_at(t) @ mount(c) @ w.OPENCV) for (c, k), t in middles.items()
         },
         sweeps=list(begins + TURN / 2),
         error=off_walls,
