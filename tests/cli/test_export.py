@@ -18,7 +18,7 @@ from p2gs_jax.run import read
 from p2gs_jax.scene.pixels.store import camera_of
 
 C0 = 0.28209479177387814
-SPZ = ("spz",) if find_spec("gsply") else ()
+SPZ = ("spz", "compressed.ply") if find_spec("gsply") else ()
 STEPS = ("--bake-steps", "12")
 
 
@@ -26,7 +26,8 @@ STEPS = ("--bake-steps", "12")
 def exported(finished_run, tmp_path_factory):
     """Return a run and a folder with every format whose package is installed."""
     out = tmp_path_factory.mktemp("exports")
-    formats = ("linear-ply", "display-ply", *SPZ, "colmap", "exr", "gltf", "nerfstudio")
+    formats = ("linear-ply", "display-ply", *(k.replace(".", "-") for k in SPZ))
+    formats += ("colmap", "exr", "gltf", "nerfstudio")
     argv = ["export", str(finished_run), "--format", *formats, "--out", str(out), *STEPS]
     with pytest.raises(SystemExit) as stop:
         main(argv)
@@ -103,6 +104,10 @@ def test_exposure_and_curve_change_the_display_colours(exported, finished_run, s
     assert "close to the true ones (at least 30 dB)" in " ".join(text.split())
     assert saved["exposure_ev_from_mean"] == pytest.approx(-4, abs=1e-5)
     assert dark.mean() < plain.mean() - 0.05
+    _, saved, _ = base("metered", "--meter", "log_average", "--exposure-ev", "1")
+    fitted = load_run(finished_run)
+    typical = fitted.metering.typical_exposure("log_average") / fitted.mean.exposure_geometric
+    assert saved["exposure_ev_from_mean"] == pytest.approx(1 + np.log2(typical), abs=1e-5)
     linear, saved, _ = base("linear", "--curve", "linear", "--gamma", "2.2")
     assert (saved["curve"], saved["gamma"]) == ("linear", 2.2)
     assert linear.mean() < plain.mean() - 0.05

@@ -28,6 +28,7 @@ from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.run.decisions import decide
 from p2gs_jax.scene import find_scene, with_masks_and_split
 from p2gs_jax.scene.exposures import read_known_exposures
+from p2gs_jax.scene.masks import with_alpha
 from p2gs_jax.types import Capture, Scene
 
 CFG = preset("robust")
@@ -94,7 +95,7 @@ def read(root):
     cfg = DataConfig(test_every=0)
     found = find_scene(root, cfg)
     assert isinstance(found, Scene)
-    return with_masks_and_split(found, cfg)
+    return with_alpha(with_masks_and_split(found, cfg), cfg)
 
 
 def run(root, selection, **options):
@@ -169,6 +170,20 @@ def test_masks_hide_pixels_that_the_originals_lost(varied):
     run(root, selection, masks=False)
     np.testing.assert_array_equal(mask_in(out / "masks" / "5.png.png"), MASK)
     assert mask_in(out / "masks" / "0.png.png").all()
+
+
+def test_photographs_with_alpha_keep_it_and_have_the_same_colours(tmp_path):
+    selection, alpha = selection_of(**VARIED), np.tile(np.arange(112, dtype=np.uint8), (100, 1))
+    plain, clear = (scene_of(tmp_path / name, selection) for name in ("plain", "clear"))
+    for path in (clear / "images").iterdir():
+        image = Image.open(path)
+        image.putalpha(Image.fromarray(alpha))
+        image.save(path)
+    (_, opaque), (_, out) = (run(root, selection) for root in (plain, clear))
+    for row in range(6):
+        found = codes_in(out / "images" / f"{row}.png")
+        np.testing.assert_array_equal(found[..., 0], alpha)
+        np.testing.assert_array_equal(found[..., 1:], codes_in(opaque / "images" / f"{row}.png"))
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])

@@ -15,7 +15,7 @@ from scene.made_videos import HLG, PQ, room, turn, write_video
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.numerics import srgb_decode
-from p2gs_jax.scene import find_scene, video
+from p2gs_jax.scene import find_scene, load_scene, video
 from p2gs_jax.scene.convert.icc import PQ_WHITE, to_light
 from p2gs_jax.scene.convert.readers import exif_evs
 from p2gs_jax.scene.drone_srt import read_shots, settings_at
@@ -264,6 +264,16 @@ def test_subtitles_of_drones_state_the_exposures_of_frames(tmp_path: Path) -> No
     found = read(film, tmp_path, every=10)
     assert found.notes[1] == "The exposures of the frames are not in DJI_0001.SRT."
     assert exif_evs(found.paths) == [None] * 5
+
+
+def test_cameras_of_a_video_are_found(tmp_path: Path) -> None:
+    write_video(tmp_path / "walk.mp4", [room(place) for place in WALK[::10]])
+    scene = load_scene(tmp_path / "walk.mp4", DataConfig(every=1, test_every=0), tmp_path / "work")
+    assert [view.name for view in scene.views] == [f"{n:06d}.png" for n in range(5)]
+    assert scene.notes[0].startswith("5 of 5 frames of the video are used")
+    centres = np.array([-v.viewmat[:3, :3].T @ v.viewmat[:3, 3] for v in scene.views])
+    steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    np.testing.assert_allclose(steps, steps.mean(), rtol=0.05)
 
 
 def test_one_frame_or_no_motion_is_refused_and_half_a_file_is_read(tmp_path: Path) -> None:
