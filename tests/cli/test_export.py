@@ -11,7 +11,7 @@ import pytest
 from plyfile import PlyData
 
 from p2gs_jax import develop, load_run
-from p2gs_jax.cli import main
+from p2gs_jax.cli.parser import parse
 from p2gs_jax.formats.ply import read_ply
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.run import read
@@ -19,7 +19,6 @@ from p2gs_jax.scene.pixels.store import camera_of
 
 C0 = 0.28209479177387814
 SPZ = ("spz", "compressed.ply") if find_spec("gsply") else ()
-STEPS = ("--bake-steps", "12")
 
 
 @pytest.fixture(scope="module")
@@ -28,10 +27,8 @@ def exported(finished_run, tmp_path_factory):
     out = tmp_path_factory.mktemp("exports")
     formats = ("linear-ply", "display-ply", *(k.replace(".", "-") for k in SPZ))
     formats += ("colmap", "exr", "gltf", "nerfstudio")
-    argv = ["export", str(finished_run), "--format", *formats, "--out", str(out), *STEPS]
-    with pytest.raises(SystemExit) as stop:
-        main(argv)
-    assert stop.value.code == 0
+    argv = ["export", finished_run, "--format", *formats, "--out", out, "--bake-steps", 12]
+    assert parse([str(a) for a in argv])[1].execute() == 0
     return load_run(finished_run), out
 
 

@@ -69,16 +69,11 @@ def test_every_block_has_a_language_that_is_tested():
 
 
 PYTHON_PAGES = sorted({b.page for b in blocks_to_run("python")})
-# Pages with several whole fits.
-LONG_PAGES = ("api.md",)
+LONG = {"api.md": pytest.mark.slow}  # several whole fits
 
 
 @pytest.mark.parametrize(
-    "page",
-    [
-        pytest.param(p, id=p.name, marks=pytest.mark.slow if p.name in LONG_PAGES else ())
-        for p in PYTHON_PAGES
-    ],
+    "page", [pytest.param(p, id=p.name, marks=LONG.get(p.name, ())) for p in PYTHON_PAGES]
 )
 def test_python_runs(page, folder, quick_presets):
     """Blocks of a page follow each other in one namespace."""

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from page_tools import edit
 from scene.helpers import make_view
+from splats import gaussians_of
 from tiny_scene import write_solved
 
 from p2gs_jax.config import DataConfig, FitConfig, RenderConfig
@@ -27,7 +28,7 @@ from p2gs_jax.run.decisions import Decisions
 from p2gs_jax.run.folder import RunFolder
 from p2gs_jax.run.scene_file import write_scene
 from p2gs_jax.run.write import write_start
-from p2gs_jax.types import Gaussians, Scene
+from p2gs_jax.types import Scene
 
 
 @pytest.fixture
@@ -217,18 +218,12 @@ def wall_run(tmp_path_factory):
         rows.append({"image": path.name, "exposure": e, "exposure_ev": float(np.log2(e))})
     across, up = np.meshgrid(np.linspace(-3, 3, 40), np.linspace(-2, 2, 28))
     points = np.stack([across, up, np.full_like(up, WALL)], -1).reshape(-1, 3).astype(np.float32)
-    n = len(points)
     cfg = FitConfig(data=DataConfig(test_every=0), render=RenderConfig(sh_degree=0))
     decisions = replace(Decisions.as_given(cfg), model="view_exposure")
     write_start(RunFolder(run), root, None, cfg, decisions)
-    write_scene(run, Scene(root, "colmap", tuple(views), points, np.zeros((n, 3), np.uint8)))
-    gaussians = Gaussians(
-        points,
-        np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
-        np.tile(np.log(np.float32([0.2, 0.2, 0.01])), (n, 1)),
-        np.full(n, 4, np.float32),
-        np.zeros((n, 1, 3), np.float32),
-    )
+    write_scene(run, Scene(root, "colmap", tuple(views), points, np.zeros(points.shape, np.uint8)))
+    log_scales = np.log([0.2, 0.2, 0.01])
+    gaussians = gaussians_of(points, [1, 0, 0, 0], log_scales, 4.0, np.zeros((1, 3)))
     write_radiance(run / "radiance.ply", gaussians, activation="exp")
     common = {"camera": "0", "gamma": 2.2, "split": "train"}
     write_solved(run / "photometry.json", [common | row for row in rows], gauge="known")

@@ -57,16 +57,12 @@ def test_a_run_is_read_back_with_its_cameras(camera_run):
     assert run.common_display().vignetting == ()
 
 
-def _without_balance(saved):
-    [view for view in saved["views"] if view["split"] == "train"][1]["white_balance"] = None
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         (lambda saved: saved.update(version=3), "version is 3"),
         (lambda saved: saved.pop("cameras"), "cameras missing"),
-        (_without_balance, "lacks the white balance"),
+        (lambda saved: saved["views"][2].update(white_balance=None), "lacks the white balance"),
     ],
 )
 def test_a_file_that_does_not_fit_is_refused(camera_run, tmp_path, change, words):

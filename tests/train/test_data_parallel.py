@@ -67,8 +67,7 @@ def test_one_view_on_one_device_needs_no_mesh():
 
 
 @pytest.mark.parametrize(
-    ("devices", "batch", "words"),
-    [(1000, 1, "not between 1 and"), (1, 0, "--train.batch is 0")],
+    ("devices", "batch", "words"), [(1000, 1, "not between 1 and"), (1, 0, "--train.batch is 0")]
 )
 def test_wrong_numbers_of_devices_or_views_are_refused(devices, batch, words):
     with pytest.raises(UserError, match=words) as refused:

@@ -4,17 +4,16 @@ import cv2
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from splats import gaussians_of
 from tiny_scene import make_scene
 
-from p2gs_jax import FitConfig, Gaussians, Params, Photometry, load_run, with_fields
+from p2gs_jax import FitConfig, Params, Photometry, load_run, with_fields
 from p2gs_jax.photometry.formation import corner, squared_radii
 from p2gs_jax.run.decisions import Decisions, decide, likely, unsolved
 from p2gs_jax.train.optimizer import learning_rates
 from p2gs_jax.train.update import _recentered
 
-GAUSSIANS = Gaussians(
-    jnp.zeros((4, 3)), jnp.ones((4, 4)), jnp.zeros((4, 3)), jnp.zeros(4), jnp.zeros((4, 1, 3))
-)
+GAUSSIANS = gaussians_of(np.zeros((4, 3)), 1.0, 0.0, 0.0, np.zeros((1, 3)))
 
 
 def params(balance):
