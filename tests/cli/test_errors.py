@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from p2gs_jax.cli.experiments import Synth
-from p2gs_jax.cli.shared import parse_duration
+from p2gs_jax.cli.shared import has_viewer, parse_duration
 from p2gs_jax.errors import UserError
 from p2gs_jax.presets import preset, to_dict
 from p2gs_jax.run.folder import locked
@@ -54,7 +54,7 @@ WRONG = [
     ("fit castle --out run --blocks 2 --jobs 0", "--jobs must be at least 1"),
     ("fit castle --out run --blocks 2 --devices 2", "on one device"),
     ("fit castle --out run --blocks 2 --threads 2", "leave out --devices and --threads"),
-    ("fit castle --out run --view --blocks 2", "RUN/blocks/0"),
+    *[("fit castle --out run --view --blocks 2", "RUN/blocks/0")] * has_viewer(),
     ("fit castle --out run --port 9000", "without --view"),
     ("fit castle --out run --threads 0", "--threads 0 is not a number of cores"),
     ("fit castle --out run --blocks 2 --engine ray", "'ray' is not a known engine"),
