@@ -9,8 +9,8 @@ from typing import Annotated
 
 import tyro
 
-from p2gs_jax.cli.fit import checked
 from p2gs_jax.config import PresetName
+from p2gs_jax.options import check_values
 from p2gs_jax.presets import preset
 from p2gs_jax.synth.settings import Layout, Sensor
 
@@ -50,7 +50,8 @@ class Demo:
         use_cores()
         cfg = preset(self.preset)
         train = dataclasses.replace(cfg.train, budget_s=self.budget, seed=self.seed)
-        cfg = checked(dataclasses.replace(cfg, train=train))
+        cfg = dataclasses.replace(cfg, train=train)
+        check_values(cfg)
         with TerminalReporter() as reporter:
             street = {"frames": self.frames, "width": self.width, "iso_std": self.iso_std}
             result = run_demo(self.out, cfg, seed=self.seed, reporter=reporter, **street)

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 
-from p2gs_jax.cli.shared import DURATIONS, SHORT, check, require_viewer
+from p2gs_jax.cli.shared import check, require_viewer
 from p2gs_jax.config import DataConfig, FitConfig, PresetName
 from p2gs_jax.core.text import count_of
+from p2gs_jax.options import SHORT
 from p2gs_jax.presets import flat, preset, to_dict
 
 if TYPE_CHECKING:
@@ -91,7 +92,7 @@ class Fit:
         from p2gs_jax.train.data_parallel import with_a_view_each
 
         self._check()
-        cfg, out, cluster = checked(self.config), self.run_folder(), self.cluster
+        cfg, out, cluster = self.config, self.run_folder(), self.cluster
         if cluster.blocks is None:
             use_cores(self.threads)
         with WatchedReporter(out, self.port) if self.view else TerminalReporter() as reporter:
@@ -238,7 +239,7 @@ class Calibrate:
 
     def checked(self) -> FitConfig:
         """Return the configuration; raise a UserError if a value is not valid."""
-        scene, is_run, cfg = self.scene, self.is_run, checked(self.config)
+        scene, is_run, cfg = self.scene, self.is_run, self.config
         given, usual = (flat(to_dict(c)) for c in (cfg, preset(self.preset)))
         whole = ("data.test_every", "data.split", "data.max_width", "data.cache_mb")
         of_stack = "--static reads all photographs of the folder, and finds their limits"
@@ -311,29 +312,3 @@ def _camera_table(found: Survey):
     }
     shown = {name: cells for name, cells in columns.items() if any(cells)}
     return make_table(tuple(shown), zip(*shown.values(), strict=True), plain=True)
-
-
-def checked(cfg: FitConfig) -> FitConfig:
-    """Return the configuration; raise a UserError if a value is not valid."""
-    data, train, photometry = cfg.data, cfg.train, cfg.photometry
-    most, background = cfg.densify.max_gaussians, cfg.render.background
-    check(data.max_width is None or data.max_width >= 16, "--max-width must be at least 16 pixels")
-    check(data.every is None or data.every >= 1, "--every must be at least 1")
-    check(data.max_frames >= 2, "--max-frames must be at least 2")
-    check(data.test_every >= 0, "--test-every must be at least 0")
-    check(
-        train.budget_s is None or train.budget_s > 0,
-        "--budget must be longer than 0 s",
-        fix=DURATIONS,
-    )
-    check(train.steps >= 1, "--steps must be at least 1")
-    check(train.seed >= 0, "--seed must be at least 0")
-    check(train.batch >= 1, "--train.batch must be at least 1")
-    check(not isinstance(most, int) or most >= 1, "--gaussians must be at least 1")
-    why = "--render.background must be linear radiance, three numbers that are not negative"
-    check(all(math.isfinite(x) and x >= 0 for x in background or ()), why)
-    check(photometry.known_deviation_ev >= 0, "--exposure-sigma must be at least 0 stops")
-    why = "--exposure-sigma has no effect without --known-exposures"
-    fix = "add --known-exposures FILE, or exif"
-    check(photometry.known_deviation_ev == 0 or photometry.known is not None, why, fix=fix)
-    return cfg

@@ -22,8 +22,9 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 import tyro
 from tyro import constructors
 
-from p2gs_jax.cli.shared import SHORT, parse_duration
+from p2gs_jax.cli.shared import parse_duration
 from p2gs_jax.config import DataConfig, FitConfig
+from p2gs_jax.options import SHORT
 
 PLACEHOLDERS = {int: "N", float: "X", str: "TEXT", Path: "PATH"}
 EXAMPLE = "p2gs-jax "

@@ -1,4 +1,4 @@
-"""Types, parsers, short names and checks of options that several commands have."""
+"""Types, parsers and checks of options that several commands have."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 import tyro
 
 from p2gs_jax.errors import UserError
+from p2gs_jax.options import DURATIONS
 
 MeteringRule = Literal["auto", "log_average", "centre", "highlights", "protected"]
 RunPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(help="Run folder.")]
@@ -27,30 +28,6 @@ PhotometryFolder = Annotated[
     Path | None,
     tyro.conf.arg(metavar="DIR", help="Output of `calibrate --develop`, for splats trained on it."),
 ]
-# Short names of fields of the configuration: the field, and the placeholder of its value. A command
-# that has any lists them as `SHORT_NAMES`.
-SHORT = {
-    "budget": ("train.budget_s", "TIME"),
-    "max_width": ("data.max_width", "N"),
-    "steps": ("train.steps", "N"),
-    "gaussians": ("densify.max_gaussians", "N"),
-    "test_every": ("data.test_every", "N"),
-    "split": ("data.split", "FILE|every"),
-    "background": ("data.background", "COLOR"),
-    "images": ("data.images", "DIR"),
-    "camera_by": ("data.camera_by", None),
-    "allow_missing": ("data.allow_missing", None),
-    "drive": ("data.drive", "NAME"),
-    "cameras": ("data.cameras", "NAME"),
-    "frames": ("data.frames", "SLICE"),
-    "every": ("data.every", "N"),
-    "max_frames": ("data.max_frames", "N"),
-    "known_exposures": ("photometry.known", "FILE|exif"),
-    "exposure_sigma": ("photometry.known_deviation_ev", "STOPS"),
-    "lpips_weights": ("evaluation.lpips_weights", "alex|vgg"),
-    "seed": ("train.seed", "N"),
-}
-DURATIONS = "write 90s, 5m or 1h30m"
 # Earlier names of our commands and options; they are still understood.
 RENAMED = {
     "scene": "inspect",

@@ -26,6 +26,7 @@ from p2gs_jax.export.develop import Developed, Development, develop_scene, place
 from p2gs_jax.export.poses import poses_of
 from p2gs_jax.formats.frames import notebook_html
 from p2gs_jax.gaussians.posed import standing
+from p2gs_jax.options import check_values
 from p2gs_jax.photometry.adjustment.problem import KnownExposures
 from p2gs_jax.photometry.calibrate import (
     CalibrationOptions,
@@ -146,6 +147,7 @@ def calibrate(
         UserError: a fault that the user can fix.
     """
     cfg = require_config(cfg)
+    check_values(cfg)
     check_choice(cfg.photometry)
     cfg = dataclasses.replace(cfg, data=dataclasses.replace(cfg.data, test_every=0))
     reporter, out, begin = reporter or Silent(), Path(out), time.monotonic()
@@ -201,6 +203,7 @@ def calibrate_run(
     begin, reporter = time.monotonic(), reporter or Silent()
     _require_no_run(Path(out))
     requested = require_config(cfg)
+    check_values(requested)
     check_choice(requested.photometry)
     run = load_run(run_dir, scene)
     cfg = dataclasses.replace(run.cfg, photometry=requested.photometry)
@@ -315,6 +318,7 @@ def calibrate_stack(
     """
     cfg, begin, reporter = require_config(cfg), time.monotonic(), reporter or Silent()
     p, seed = cfg.photometry, cfg.train.seed
+    check_values(cfg)
     check_choice(p)
     if out is not None:
         _require_no_run(Path(out))

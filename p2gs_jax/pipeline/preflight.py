@@ -9,7 +9,6 @@ pixels of a view are in the device's memory, which is not estimated.
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +23,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.lpips import LpipsWeights, read_lpips_weights
 from p2gs_jax.evaluation.references import Reference, check_reference, load_reference
 from p2gs_jax.gaussians.population import Coverage, seed_bound
+from p2gs_jax.options import check_values
 from p2gs_jax.presets import flat, to_dict
 from p2gs_jax.run.decisions import CHOSEN
 from p2gs_jax.run.folder import RunFolder, find, require_free
@@ -40,18 +40,6 @@ PARAMETER_BYTES = 37  # with moments, gradient and the copies of a densification
 PIXEL_BYTES = 650
 DECODED_BYTES = 7
 OPTIONS = "--gaussians, --max-width or --data.cache-mb"
-# Smallest and largest values of whole numbers that no other check bounds; None: there is no bound.
-BOUNDS = {
-    "train.seed": (0, None),
-    "train.log_every": (1, None),
-    "render.sh_degree": (0, 3),
-    "render.tile": (1, None),
-    "render.chunk": (1, None),
-    "render.pixels_in_flight": (1, None),
-    "init.max_seeds": (0, None),
-    "init.shell_count": (1, None),
-    "data.cache_mb": (0, None),
-}
 
 
 @dataclass(frozen=True)
@@ -79,6 +67,7 @@ def preflight(cfg: FitConfig, paths: Paths, *, resume: bool = False) -> LpipsWei
             folder holds another run or is in use.
     """
     require_free(paths.run)
+    check_values(cfg)
     check_options(cfg)
     check_run_dir(paths.run, resume, cfg)
     check_sources(paths)
@@ -112,21 +101,12 @@ def check_scene(
 
 
 def check_options(cfg: FitConfig) -> None:
-    """Check numbers, and the options that depend on each other.
+    """Check the options that depend on each other.
 
     Raises:
-        UserError: a number is not finite or out of its range, the initial exposures contradict
-            known exposures or the curve, or the appearance contradicts the curve.
+        UserError: the initial exposures contradict known exposures or the curve, or the appearance
+            contradicts the curve.
     """
-    for name, value in flat(to_dict(cfg)).items():
-        option, (least, most) = f"--{name.replace('_', '-')}", BOUNDS.get(name, (None, None))
-        for number in value if isinstance(value, tuple | list) else (value,):
-            if isinstance(number, float) and not math.isfinite(number):
-                raise UserError(f"{option} {number} is not a finite number.")
-            if least is not None and number < least:
-                raise UserError(f"{option} must be at least {least}.")
-            if most is not None and number > most:
-                raise UserError(f"{option} must be at most {most}.")
     p, share = cfg.photometry, cfg.densify.spread
     curved, random = p.curve != "linear", "--photometry.curve linear --photometry.start random"
     if not 0 <= share < 1:

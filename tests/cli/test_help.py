@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from p2gs_jax.cli.parser import COMMANDS, GROUPS, parse
-from p2gs_jax.cli.shared import SHORT
+from p2gs_jax.options import SHORT
 
 HEAVY = ("jax", "numpy", "cv2", "equinox", "rich")
 

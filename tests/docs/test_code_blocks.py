@@ -23,8 +23,9 @@ from tiny_scene import make_scene
 
 from p2gs_jax import config, read_sweep
 from p2gs_jax.cli import main
-from p2gs_jax.cli.fit import Calibrate, Fit, checked
+from p2gs_jax.cli.fit import Calibrate, Fit
 from p2gs_jax.cli.parser import COMMANDS, RENAMED, parse
+from p2gs_jax.options import check_values
 
 BLOCKS = [block for page in PAGES for block in blocks(page)]
 
@@ -148,7 +149,7 @@ def check_ours(argv, where):
         return
     assert name in COMMANDS
     if isinstance(options, Fit):
-        checked(options.config)
+        check_values(options.config)
     if isinstance(options, Calibrate):
         options.checked()
 

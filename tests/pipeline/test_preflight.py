@@ -54,6 +54,25 @@ def test_a_refused_option_does_not_lock_the_folder(tmp_path, scene, refused, opt
     check_run_dir(run, False, FitConfig())
 
 
+@pytest.mark.parametrize("command", [p2gs_jax.fit, p2gs_jax.calibrate])
+@pytest.mark.parametrize(
+    ("field", "value", "words"),
+    [
+        ("data.max_width", 1, "--max-width must be at least 16"),
+        ("data.max_frames", 1, "--max-frames must be at least 2"),
+        ("data.every", 0, "--every must be at least 1"),
+        ("train.batch", 0, "--train.batch must be at least 1"),
+        ("train.budget_s", -1.0, "--budget must be longer than 0 s"),
+        ("densify.max_gaussians", 0, "--gaussians must be at least 1"),
+        ("photometry.known_deviation_ev", 0.1, "add --known-exposures FILE"),
+    ],
+)
+def test_functions_refuse_what_commands_refuse(tmp_path, scene, command, field, value, words):
+    with pytest.raises(UserError) as refused:
+        command(scene, tmp_path / "out", with_fields(FitConfig(), {field: value}))
+    assert words in str(refused.value)
+
+
 @pytest.mark.parametrize("checkpoint", [False, True])
 @pytest.mark.parametrize(
     ("error", "words"),

@@ -1,0 +1,80 @@
+"""Options of the configuration: their short names on the command line, and their valid values."""
+
+from __future__ import annotations
+
+import math
+
+from p2gs_jax.config import FitConfig
+from p2gs_jax.errors import UserError
+from p2gs_jax.presets import flat, to_dict
+
+# Short names of fields: the field, and the placeholder of its value. A command that has any lists
+# them as `SHORT_NAMES`.
+SHORT = {
+    "budget": ("train.budget_s", "TIME"),
+    "max_width": ("data.max_width", "N"),
+    "steps": ("train.steps", "N"),
+    "gaussians": ("densify.max_gaussians", "N"),
+    "test_every": ("data.test_every", "N"),
+    "split": ("data.split", "FILE|every"),
+    "background": ("data.background", "COLOR"),
+    "images": ("data.images", "DIR"),
+    "camera_by": ("data.camera_by", None),
+    "allow_missing": ("data.allow_missing", None),
+    "drive": ("data.drive", "NAME"),
+    "cameras": ("data.cameras", "NAME"),
+    "frames": ("data.frames", "SLICE"),
+    "every": ("data.every", "N"),
+    "max_frames": ("data.max_frames", "N"),
+    "known_exposures": ("photometry.known", "FILE|exif"),
+    "exposure_sigma": ("photometry.known_deviation_ev", "STOPS"),
+    "lpips_weights": ("evaluation.lpips_weights", "alex|vgg"),
+    "seed": ("train.seed", "N"),
+}
+DURATIONS = "write 90s, 5m or 1h30m"
+# Smallest and largest values of numbers that no other check bounds; None: there is no bound.
+BOUNDS = {
+    "data.max_width": (16, None),
+    "data.every": (1, None),
+    "data.max_frames": (2, None),
+    "data.cache_mb": (0, None),
+    "train.steps": (1, None),
+    "train.seed": (0, None),
+    "train.batch": (1, None),
+    "train.log_every": (1, None),
+    "render.sh_degree": (0, 3),
+    "render.background": (0, None),
+    "render.tile": (1, None),
+    "render.chunk": (1, None),
+    "render.pixels_in_flight": (1, None),
+    "init.max_seeds": (0, None),
+    "init.shell_count": (1, None),
+    "densify.max_gaussians": (1, None),
+    "photometry.known_deviation_ev": (0, None),
+}
+
+
+def check_values(cfg: FitConfig) -> None:
+    """Check each number by itself, and that a deviation belongs to known exposures.
+
+    Raises:
+        UserError: a number is not finite or out of its range, or nothing deviates.
+    """
+    short = {field: name for name, (field, _) in SHORT.items()}
+    for name, value in flat(to_dict(cfg)).items():
+        option = f"--{short.get(name, name).replace('_', '-')}"
+        least, most = BOUNDS.get(name, (None, None))
+        for number in value if isinstance(value, tuple | list) else (value,):
+            if not isinstance(number, int | float):
+                continue
+            if not math.isfinite(number):
+                raise UserError(f"{option} {number} is not a finite number.")
+            if least is not None and number < least:
+                raise UserError(f"{option} must be at least {least}.")
+            if most is not None and number > most:
+                raise UserError(f"{option} must be at most {most}.")
+    if cfg.train.budget_s is not None and cfg.train.budget_s <= 0:
+        raise UserError("--budget must be longer than 0 s.", fix=DURATIONS)
+    if cfg.photometry.known_deviation_ev > 0 and cfg.photometry.known is None:
+        why = "--exposure-sigma has no effect without --known-exposures."
+        raise UserError(why, fix="add --known-exposures FILE, or exif")
