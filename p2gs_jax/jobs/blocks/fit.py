@@ -124,7 +124,7 @@ def _cut(
         if isinstance(count, str):
             count = plan.fewest_blocks(scene, cfg, request.parallel)
         if count == 1:
-            reporter.message("One block: the whole scene fits into memory.")
+            reporter.message("One block: the scene is fitted as a whole.")
             return None
         cut = cut_scene(scene, count)
     # Other machines have other memory.
