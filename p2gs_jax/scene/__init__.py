@@ -6,8 +6,9 @@ import dataclasses
 from pathlib import Path
 from typing import NamedTuple
 
-from p2gs_jax.config import DataConfig
+from p2gs_jax.config import DataConfig, FitConfig
 from p2gs_jax.errors import UserError, broken
+from p2gs_jax.options import check_values
 from p2gs_jax.scene import transforms
 from p2gs_jax.scene.colmap import CUT, find_deeper_model, find_model, load_colmap
 from p2gs_jax.scene.convert.convert import convert_photographs, converted_views, with_originals
@@ -41,8 +42,10 @@ def load_scene(
     cameras of photographs and videos. Poses without points get triangulated points, or random ones
     if fewer than `FEWEST` are found. Views are sorted by name. `work_dir`, in the folder of
     results, keeps long computations for a resume. Raises UserError: there is no scene, a file is
-    broken, or results would be written among photographs; the message names the file.
+    broken, or results would be written among photographs (the message names the file); or a number
+    in `cfg` is out of its range.
     """
+    check_values(FitConfig(data=cfg))
     found = find_scene(root, cfg, report)
     if isinstance(found, Recording):
         scene = assemble(found, cfg, work_dir, report)

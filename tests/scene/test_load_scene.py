@@ -45,6 +45,13 @@ def test_a_folder_without_a_scene_is_refused(tmp_path):
         load_scene(tmp_path / "notes.txt", CFG)
 
 
+@pytest.mark.parametrize("field", ["every", "max_frames", "max_width"])
+def test_numbers_out_of_range_are_refused(tmp_path, field):
+    root = write_tiny_model(tmp_path).parents[1]
+    with refused(f"--{field.replace('_', '-')} must be at least"):
+        load_scene(root, DataConfig(**{field: 0}))
+
+
 def test_results_among_photographs_alone_are_refused(tmp_path):
     write_image(tmp_path / "0.png")
     with refused("holds the photographs"):
