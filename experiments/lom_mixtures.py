@@ -1,6 +1,7 @@
 """One LOM scene photographed in several exposures: each method fitted to the mixture.
 
-python experiments/lom_mixtures.py LOM_SCENE... [--groups low high] [--budget-min 3] --out DIR
+python experiments/lom_mixtures.py LOM_SCENE... [--groups low high] [--budget-min 3]
+    [--rates RATE...] --out DIR
 
 Every view draws one of the groups of exposures (`mixtures.py`), and the views of the authors'
 `transforms_test.json` are held out. All methods are fitted to this mixture for equal steps and,
@@ -11,10 +12,11 @@ with --budget-min, for equal minutes. The table has
 - the same under one common exposure. One transform serves all views: the mean of a method's
   parameters per view (exposure, gamma, white balance, colour correction) over the training views of
   the group `high`. No held-out or reference photograph is used;
-- the spread of solved exposures within each group (0.1 EV in truth, see above), from `calibrate`
-  and after the fit;
 - PSNR of held-out views as photographed: with a fitted exposure, and with everything fitted that
   the method has per view (dark photographs score high because they are dark).
+
+With --rates, each method has the rate of corrections that is best on training views: every eighth
+of them is held out in other fits, and judged like the authors' held-out views.
 
 No photograph of these scenes may be in this project: keep --out outside of it.
 """
@@ -22,22 +24,14 @@ No photograph of these scenes may be in this project: keep --out outside of it.
 from __future__ import annotations
 
 import argparse
-import json
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from judging import common_display, configs, contact_sheet, found_by, measured, to_markdown
-from mixtures import (
-    GROUPS,
-    REFERENCE,
-    read_groups,
-    spread_by_group,
-    their_test_views,
-    write_mixture,
-)
+from judging import common_display, configs, contact_sheet, measured, to_markdown
+from mixtures import GROUPS, REFERENCE, read_groups, their_test_views, write_mixture
 
 import p2gs_jax
 from p2gs_jax.config import FitConfig
@@ -49,6 +43,14 @@ from p2gs_jax.evaluation.scores import psnr
 METHODS = ("robust", "ppisp", "ppisp_solved", "3dgs", "3dgs_affine", "3dgs_bilateral")
 # Contact sheet: methods shown between the photograph and the reference, and held-out views.
 SHOWN, SHEET_ROWS = ("robust", "3dgs_affine"), 3
+COLUMNS = (
+    ("bright, exposure per view, dB", "per_view", 2),
+    ("bright, one exposure, dB", "common", 2),
+    ("as photographed, exposure fitted, dB", "own_exposure", 2),
+    ("as photographed, all fitted, dB", "own_all", 2),
+    ("steps", "steps", 0),
+    ("seconds of steps", "seconds", 0),
+)
 
 
 # ------------------------------------------------------------------ the common exposure
@@ -104,28 +106,6 @@ def under_common_exposure(run: p2gs_jax.Run, groups: dict[str, str]) -> Common:
 # ------------------------------------------------------------------ rows
 
 
-def calibrated(scene: Path, out: Path) -> dict[str, Any]:
-    """Return the row of `calibrate`: exposures without any fit."""
-    if not (out / "photometry.json").is_file():
-        p2gs_jax.calibrate(scene, out)
-    views = json.loads((out / "photometry.json").read_text())["views"]
-    evs = {v["image"]: v["exposure_ev"] for v in views if v["exposure_ev"] is not None}
-    return {"method": "calibrate", **_keyed(spread_by_group(evs, read_groups(scene)))}
-
-
-def _keyed(spread: dict[str, float]) -> dict[str, float]:
-    return {f"spread_{group}": ev for group, ev in spread.items()}
-
-
-def spreads(run: p2gs_jax.Run, groups: dict[str, str]) -> dict[str, float]:
-    """Return the spread within every group, EV; empty if a run does not have exposures."""
-    evs = found_by(run).exposures_ev
-    if evs is None:
-        return {}
-    names = (view.name for view in run.scene.training_views)
-    return spread_by_group(dict(zip(names, evs, strict=True)), groups)
-
-
 def measure(
     scene: Path, out: Path, under: dict[str, FitConfig]
 ) -> tuple[list[dict[str, Any]], dict[str, Common]]:
@@ -136,7 +116,6 @@ def measure(
         common = shown[method] = under_common_exposure(run, groups)
         test = metrics["test"]
         return {
-            **_keyed(spreads(run, groups)),
             "own_exposure": test["exposure_fitted"]["psnr"],
             # There where a view has more than an exposure.
             "own_all": test.get("photometry_fitted", test["exposure_fitted"])["psnr"],
@@ -149,20 +128,39 @@ def measure(
     return measured(scene, out, under, judge), shown
 
 
+def at_best_rates(
+    scene: Path, out: Path, under: dict[str, FitConfig], rates: Sequence[float], theirs: list[str]
+) -> tuple[dict[str, FitConfig], str]:
+    """Return the methods at their best rates, and the table of all rates.
+
+    Args:
+        scene: a mixture.
+        out: folder of the fits.
+        under: methods.
+        rates: that are tried; the best has the largest PSNR under one exposure.
+        theirs: held-out views of the authors, which are neither fitted nor judged.
+    """
+    groups = read_groups(scene)
+    views = [f"{view}.JPG" for view in groups if view not in theirs]
+    held = views[::8]
+    split = {"train": sorted({*views} - {*held}), "test": held}
+    write_json(out.with_suffix(".split.json"), split)
+    tried = {
+        f"{m}, {rate:g}": p2gs_jax.with_fields(
+            c, {"optimizer.appearance": rate, "data.split": str(out.with_suffix(".split.json"))}
+        )
+        for m, c in under.items()
+        for rate in rates
+    }
+    rows, _ = measure(scene, out, tried)
+    scores, best = {row["method"]: row.get("common", 0.0) for row in rows}, {}
+    for method, cfg in under.items():
+        rate = max(rates, key=lambda rate: scores[f"{method}, {rate:g}"])
+        best[f"{method}, {rate:g}"] = p2gs_jax.with_fields(cfg, {"optimizer.appearance": rate})
+    return best, to_markdown(rows, COLUMNS)
+
+
 # ------------------------------------------------------------------ what is written
-
-
-def columns(groups: Sequence[str]) -> list[tuple[str, str, int]]:
-    """Return the columns of the table of a mixture."""
-    return [
-        ("bright, exposure per view, dB", "per_view", 2),
-        ("bright, one exposure, dB", "common", 2),
-        *((f"spread {group}, EV", f"spread_{group}", 3) for group in groups),
-        ("as photographed, exposure fitted, dB", "own_exposure", 2),
-        ("as photographed, all fitted, dB", "own_all", 2),
-        ("steps", "steps", 0),
-        ("seconds of steps", "seconds", 0),
-    ]
 
 
 def write_sheet(path: Path, scene: Path, shown: dict[str, Common]) -> None:
@@ -193,7 +191,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=600)
     parser.add_argument("--budget-min", type=float, help="equal minutes as well")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--rate", type=float, help="of learned corrections (default: the preset's)")
+    parser.add_argument("--rates", type=float, nargs="+", help="of corrections that are tried")
     args = parser.parse_args()
     if args.out.resolve().is_relative_to(Path(__file__).resolve().parents[1]):
         raise SystemExit("--out is inside this project, where no picture of these scenes may be.")
@@ -207,17 +205,16 @@ def main() -> None:
         scene = args.out / f"{lom.name}_{'_'.join(args.groups)}"
         if not scene.exists():
             write_mixture(lom, scene, args.groups, their_test_views(lom))
-        of_calibrate = calibrated(scene, args.out / "calibrations" / scene.name)
         for name, train in budgets.items():
             out = args.out / "runs" / scene.name / name
             under = configs(args.methods, seed=args.seed, **train)
-            if rate := args.rate:
-                new = {"optimizer.appearance": rate}
-                under = {f"{m}, {rate:g}": p2gs_jax.with_fields(c, new) for m, c in under.items()}
+            if args.rates:
+                of_rates = out.with_name(f"{name}_rates"), under, args.rates
+                under, tried = at_best_rates(scene, *of_rates, their_test_views(lom))
+                text.append(f"### {scene.name}, {name}, training views at each rate\n\n{tried}")
             rows, shown = measure(scene, out, under)
-            rows.insert(0, of_calibrate)
             tables[f"{scene.name}/{name}"] = rows
-            text.append(f"### {scene.name}, {name}\n\n{to_markdown(rows, columns(args.groups))}")
+            text.append(f"### {scene.name}, {name}\n\n{to_markdown(rows, COLUMNS)}")
             print(text[-1], flush=True)
             kept = {m: shown[m] for m in SHOWN if m in shown}
             if kept:

@@ -70,14 +70,6 @@ def read_groups(scene: Path) -> dict[str, str]:
     return json.loads(path.read_text()) if path.is_file() else {}
 
 
-def spread_by_group(
-    exposures_ev: Mapping[str, float], groups: Mapping[str, str]
-) -> dict[str, float]:
-    """Return the standard deviation of exposures within every group, EV."""
-    found = _by_group(exposures_ev, groups)
-    return {group: float(np.std(evs)) for group, evs in found.items()}
-
-
 def within_groups_ev(photometry: Mapping[str, Any], groups: Mapping[str, str]) -> float | None:
     """Return the RMS distance of exposures from the means of their groups, EV.
 
@@ -87,15 +79,9 @@ def within_groups_ev(photometry: Mapping[str, Any], groups: Mapping[str, str]) -
     """
     views = photometry.get("views", ())
     evs = {v["image"]: v["exposure_ev"] for v in views if v["exposure_ev"] is not None}
-    off = [ev - np.mean(g) for g in _by_group(evs, groups).values() for ev in g]
-    return float(np.sqrt(np.mean(np.square(off)))) if off else None
-
-
-def _by_group(
-    exposures_ev: Mapping[str, float], groups: Mapping[str, str]
-) -> dict[str, list[float]]:
     found: dict[str, list[float]] = {}
-    for name, ev in exposures_ev.items():
+    for name, ev in evs.items():
         if (group := groups.get(Path(name).stem)) is not None:
             found.setdefault(group, []).append(ev)
-    return found
+    off = [ev - np.mean(group) for group in found.values() for ev in group]
+    return float(np.sqrt(np.mean(np.square(off)))) if off else None
