@@ -55,10 +55,10 @@ BOUNDS = {
 
 
 def check_values(cfg: FitConfig) -> None:
-    """Check each number by itself, and that a deviation belongs to known exposures.
+    """Check each number by itself, and that a deviation comes with known exposures.
 
     Raises:
-        UserError: a number is not finite or out of its range, or nothing deviates.
+        UserError: a number is not finite or out of its range, or no known exposures are named.
     """
     short = {field: name for name, (field, _) in SHORT.items()}
     for name, value in flat(to_dict(cfg)).items():
