@@ -143,11 +143,11 @@ def at_best_rates(
     groups = read_groups(scene)
     views = [f"{view}.JPG" for view in groups if view not in theirs]
     held = views[::8]
-    split = {"train": sorted({*views} - {*held}), "test": held}
-    write_json(out.with_suffix(".split.json"), split)
+    split = out.with_name(f"{out.name}.json")
+    write_json(split, {"train": sorted({*views} - {*held}), "test": held})
     tried = {
         f"{m}, {rate:g}": p2gs_jax.with_fields(
-            c, {"optimizer.appearance": rate, "data.split": str(out.with_suffix(".split.json"))}
+            c, {"optimizer.appearance": rate, "data.split": str(split)}
         )
         for m, c in under.items()
         for rate in rates

@@ -58,7 +58,7 @@ def check_values(cfg: FitConfig) -> None:
     """Check each number by itself, and that a deviation comes with known exposures.
 
     Raises:
-        UserError: a number is not finite or out of its range, or no known exposures are named.
+        UserError: a number is not finite or out of its range, or a deviation comes without them.
     """
     short = {field: name for name, (field, _) in SHORT.items()}
     for name, value in flat(to_dict(cfg)).items():
