@@ -42,10 +42,9 @@ def stems(names: Sequence[str]) -> list[str]:
     """Return names of files without suffix, or as `a-jpg` if another differs only by suffix."""
     bare = [PurePosixPath(name).with_suffix("").as_posix() for name in names]
     times = Counter(bare)
-    return [
-        stem if times[stem] == 1 else f"{stem}-{PurePosixPath(name).suffix[1:]}"
-        for name, stem in zip(names, bare, strict=True)
-    ]
+    whole = [f"{b}-{PurePosixPath(name).suffix[1:]}" for b, name in zip(bare, names, strict=True)]
+    out = [b if times[b] == 1 else w for b, w in zip(bare, whole, strict=True)]
+    return out if len(set(out)) == len(out) else whole  # equal: `a.jpg`, `a.png` and `a-jpg.png`
 
 
 def natural(text: str) -> tuple[list[int | str], str]:

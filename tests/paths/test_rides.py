@@ -69,6 +69,8 @@ def test_the_camera_with_the_most_views_is_the_default():
 def test_photographs_that_differ_only_by_suffix_have_different_shots():
     views = [view(name, np.eye(4)) for name in ("a/1.jpg", "a/1.png", "a/2.png")]
     assert [s.name for s in view_shots(views)] == ["a/1-jpg", "a/1-png", "a/2"]
+    views.append(view("a/1-jpg.png", np.eye(4)))
+    assert [s.name for s in view_shots(views)] == ["a/1-jpg", "a/1-png", "a/2-png", "a/1-jpg-png"]
 
 
 def around(azimuths):
