@@ -73,11 +73,11 @@ def scores(label: str, path: Sequence[str], names: str = "SSIM PSNR LPIPS") -> t
 
 # Waymo: FPS on its GPU, SSIM, PSNR, HIS, Std-Luminance.
 PAPER_1 = {
-    "photographs": ".096 / .041 (HIS / Std)",
-    "3DGS": "146 / .928 / 33.62 / .102 / .041",
-    "3DGS + AT": "145 / .927 / 31.45 / .097 / .035",
-    "Luminance-GS": "- / .863 / 17.68 / .497 / .047",
-    PRINTED: "90 / .939 / 31.02 / .092 / .034",
+    "photographs": "0.096 / 0.041 (HIS / Std)",
+    "3DGS": "146 / 0.928 / 33.62 / 0.102 / 0.041",
+    "3DGS + AT": "145 / 0.927 / 31.45 / 0.097 / 0.035",
+    "Luminance-GS": "- / 0.863 / 17.68 / 0.497 / 0.047",
+    PRINTED: "90 / 0.939 / 31.02 / 0.092 / 0.034",
 }
 QUALITY = (
     *scores("own", ("train",), "PSNR"),
@@ -137,10 +137,10 @@ def reconstruction(runs: Runs, fps: dict[str, float]) -> str:
 
 # Waymo: SSIM, PSNR, LPIPS.
 PAPER_2 = {
-    "3DGS": ".893 / 30.39 / .258",
-    "3DGS + AT": ".890 / 28.89 / .263",
-    "Luminance-GS": ".630 / 16.44 / .427",
-    PRINTED: ".896 / 28.34 / .246",
+    "3DGS": "0.893 / 30.39 / 0.258",
+    "3DGS + AT": "0.890 / 28.89 / 0.263",
+    "Luminance-GS": "0.630 / 16.44 / 0.427",
+    PRINTED: "0.896 / 28.34 / 0.246",
 }
 PROTOCOLS = {
     "mean": ("test", "averaged"),

@@ -273,7 +273,7 @@ def write(
         markdown += "\nNot finished:\n\n" + "".join(f"- {line}\n" for line in runs.failures)
     o.folder.mkdir(parents=True, exist_ok=True)
     rows = [
-        {"method": m, "iso_std": s, "town": t, "run": str(runs.folders[m, s, t]), **_scalars(v)}
+        {"method": m, "iso_std": s, "town": t, **_scalars(v)}
         for (m, s, t), v in runs.metrics.items()
     ]
     payload = {"stamp": said, "rows": rows, "configs": runs.configs, **(extra or {})}
