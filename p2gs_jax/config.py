@@ -177,7 +177,8 @@ class PhotometryConfig:
     """Learned correction of display values per view: a colour matrix (3DGS), a bilateral grid, a
     `curve`, a whole camera (`ppisp`) or an enhancing curve (`luminance`)."""
     freeze_until: float = 0.6
-    """Fraction of the run that keeps exposures from tracks fixed (ours: docs/photometry.md, 4)."""
+    """Fraction of the run that keeps uncertain exposures from tracks fixed; those with standard
+    errors of at most 0.05 EV stay fixed throughout (ours: docs/photometry.md, 4)."""
 
 
 @dataclass(frozen=True)

@@ -137,13 +137,13 @@ def decide(cfg: config.FitConfig, selection: Selection | None, kept: Decisions |
         reasons=tuple(selection.reasons),
         cameras=s.cameras if kept is None else kept.cameras,
     )
-    if cfg.photometry.known is None:
-        return decided
-    # Known exposures that are fixed are not learned, and no regulariser changes their mean.
-    fixed = cfg.photometry.known_deviation_ev == 0
-    return dataclasses.replace(
-        decided, log_exposure_mean=None, freeze_until=1.0 if fixed else decided.freeze_until
-    )
+    # Learning shakes exposures by 0.004 EV, so those that are known better stay (BUILD_NOTES).
+    p, fixed = cfg.photometry, s.certain
+    if p.known is not None:
+        # No regulariser changes the mean of known exposures.
+        decided = dataclasses.replace(decided, log_exposure_mean=None)
+        fixed = fixed or p.known_deviation_ev == 0
+    return dataclasses.replace(decided, freeze_until=1.0 if fixed else decided.freeze_until)
 
 
 def likely(
@@ -162,10 +162,11 @@ def likely(
         return None
     decided = dataclasses.replace(Decisions.as_given(cfg), **scale)
     if kept is not None:
-        solved = (*CHOSEN, "cameras")
+        solved = (*CHOSEN, "cameras", "freeze_until")
         return dataclasses.replace(decided, **{name: getattr(kept, name) for name in solved})
     if p.start != "tracks":
         return unsolved(decided)
+    decided = dataclasses.replace(decided, freeze_until=1.0)
     if p.select:
         return dataclasses.replace(
             decided, model="view_exposure", white_balance=None, vignetting=None, responses="all"
