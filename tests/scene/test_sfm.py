@@ -86,6 +86,22 @@ def folder(noisy_street, tmp_path):
     return tmp_path / "photos"
 
 
+def test_the_same_photographs_give_the_same_inliers(folder, tmp_path):
+    names = [f"IMG ({k}).png" for k in range(5)]
+    database = kept_features(tmp_path / "features", folder, {("one",): names}, print)
+
+    def inliers(pairs):
+        with features.opened(database) as db:
+            db.clear_two_view_geometries()
+        features.match(database, pairs)
+        with features.opened(database) as db:
+            return [g.inlier_matches.tolist() for g in db.read_two_view_geometries()[1]]
+
+    pairs = list(itertools.combinations(names, 2))
+    assert inliers(None) == inliers(None)
+    assert inliers(pairs) == inliers(pairs)
+
+
 def test_only_new_photographs_are_processed_and_matches_judge_poses(noisy_street, folder, tmp_path):
     def names_in(database):
         with features.opened(database) as db:

@@ -108,9 +108,11 @@ def extract(
 
 def match(database: Path, pairs: Iterable[Pair] | None) -> None:
     """Match the features of pairs of images, by name, on the CPU; None matches every pair."""
-    cpu = pycolmap.Device.cpu
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = 0  # -1, the default, gives other inliers in each run
+    how = {"verification_options": verification, "device": pycolmap.Device.cpu}
     if pairs is None:
-        pycolmap.match_exhaustive(database, device=cpu)
+        pycolmap.match_exhaustive(database, **how)
         return
     listing = database.with_name("pairs.txt")
     lines = (f"{a.translate(_ESCAPED)} {b.translate(_ESCAPED)}\n" for a, b in pairs)
@@ -119,7 +121,7 @@ def match(database: Path, pairs: Iterable[Pair] | None) -> None:
     options.match_list_path = listing
     _rename(database, _ESCAPED)
     try:
-        pycolmap.match_image_pairs(database, pairing_options=options, device=cpu)
+        pycolmap.match_image_pairs(database, pairing_options=options, **how)
     finally:
         _rename(database, _UNESCAPED)
 
