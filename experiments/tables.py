@@ -281,10 +281,6 @@ def ablations() -> dict[str, FitConfig]:
         "robust, no bundle adjustment, L_exp on photographs": (learned, on_photographs),
         "robust, no selection (gamma per view)": (robust, GIVEN),
         "robust, no selection, pivot at white": (robust, GIVEN | {"photometry.pivot": 1.0}),
-        "robust, e and gamma not in logarithms (no gauge projection)": (
-            robust,
-            {"photometry.parameterization": "linear"},
-        ),
         "robust, linear radiance": (robust, linear),
         "robust, not censored": (robust, {"loss.censored": False}),
         "robust, no D-SSIM": (robust, {"loss.dssim_weight": None}),
