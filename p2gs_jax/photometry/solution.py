@@ -68,7 +68,7 @@ class PhotometricSolution:
     @property
     def certain(self) -> bool:
         """Whether all exposures can be compared, with standard errors of at most CERTAIN_EV."""
-        known = (self.exposure_errors <= CERTAIN_EV * np.log(2)).all()
+        known = (self.exposure_errors_ev <= CERTAIN_EV).all()
         return bool(known) and len(set(self.component.tolist())) == 1
 
     @property
