@@ -21,7 +21,7 @@ COLMAP_LENSES: tuple[ColmapLens, ...] = get_args(ColmapLens)
 # Lenses are inverted by a table of `_TABLE` angles and `_POLISHING` Newton steps. The iterations of
 # OpenCV and COLMAP do not converge for strong rational lenses (2026-11-29: k6 = -0.25).
 _TABLE, _POLISHING = 4096, 3
-_MOST_ROUNDS, _CONVERGED = 20, 1e-10  # of tangential terms; the last change, focal lengths
+_MOST_ROUNDS, _CONVERGED = 100, 1e-10  # of tangential terms; the last change, focal lengths
 # A ray that COLMAP projects farther than this from the point is wrong, pixels.
 _MISSED = 0.01
 # The largest distance from the principal point, focal lengths; terms below this there count as 0.

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scene.helpers import write_tiny_model
 from scene.test_transforms import LENS, frames, write
@@ -45,6 +45,7 @@ lenses = st.one_of(radial.map(Distortion), fisheye.map(lambda c: Distortion(c, "
 
 @settings(max_examples=100, deadline=None)
 @given(lenses)
+@example(Distortion((-0.0625, -0.140625, 0.0, 0.001953125, 0.1171875, 0.0, 0.21875, 0.046875)))
 def test_undistortion_inverts_the_lens(lens):
     wide = lens.model == "fisheye"
     X = rays(0.98 * min(_fold_radius(lens), 15.0) if wide else 0.9 * min(_fold_radius(lens), 1.3))
