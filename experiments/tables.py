@@ -51,7 +51,6 @@ from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.photometry.models import MODELS
 from p2gs_jax.presets import preset
 from p2gs_jax.render.capacity import make_renderer
-from p2gs_jax.run.decisions import Decisions, without_tracks
 from p2gs_jax.run.read import load_run
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
 
@@ -261,8 +260,7 @@ COLUMNS_4 = (
 def ablations() -> dict[str, FitConfig]:
     """Return robust and the printed method, each without one part at a time."""
     robust, paper = preset("robust"), preset("paper")
-    given = with_fields(robust, LEARNED)
-    learned = without_tracks(Decisions.as_given(given)).resolve(given)
+    learned = with_fields(robust, LEARNED)
     reg = "loss.regularizers."
     no_gauge = {f"{reg}log_exposure_mean": None, f"{reg}gamma_mean_variance": None}
     on_photographs = {

@@ -170,15 +170,13 @@ class PhotometryConfig:
     parameterization: Literal["log", "linear"] = "log"
     """Parameters of the optimiser: logarithms (ours), or e and gamma themselves (paper)."""
     start: Literal["tracks", "random"] = "tracks"
-    """Initial exposures: bundle adjustment over the tracks (ours), or N(1, 0.05^2) (paper)."""
+    """Exposures and gammas: solved by bundle adjustment over the tracks and then fixed (ours), or
+    N(1, 0.05^2) and 2.2 at first and learned (paper)."""
     start_std: float = 0.05
     """Standard deviation of the random start (paper, Exposure modeling)."""
     appearance: Appearance | None = None
     """Learned correction of display values per view: a colour matrix (3DGS), a bilateral grid, a
     `curve`, a whole camera (`ppisp`) or an enhancing curve (`luminance`)."""
-    freeze_until: float = 0.6
-    """Fraction of the run that keeps uncertain exposures from tracks fixed; those with standard
-    errors of at most 0.05 EV stay fixed throughout (ours: docs/photometry.md, 4)."""
 
 
 @dataclass(frozen=True)
@@ -258,10 +256,10 @@ class OptimizerConfig:
     """Rate of the logarithms of scales (3DGS: 5e-3)."""
     quats: float = 6e-3
     """Rate of the quaternions (3DGS: 1e-3)."""
-    exposures: float = 1e-3
-    """Rate of the raw exposures (ours: docs/photometry.md, 4); 10 times higher without tracks."""
-    gammas: float = 1e-4
-    """Rate of the raw gammas; 10 times higher without tracks (ours)."""
+    exposures: float = 1e-2
+    """Rate of the raw exposures where they are learned (ours: docs/photometry.md, 4)."""
+    gammas: float = 1e-3
+    """Rate of the raw gammas where they are learned (ours)."""
     appearance: float = 1e-2
     """Rate of the corrections of display values (3DGS's exposure compensation: 1e-2); lower rates
     suit hundreds of similar views (docs/baselines.md, "Learning rates of corrections")."""

@@ -27,7 +27,6 @@ PAPER: Fields = {
     "photometry.clamp": True,
     "photometry.parameterization": "linear",
     "photometry.start": "random",
-    "photometry.freeze_until": 0.0,
     "loss.censored": False,
     "loss.relative_exposure.weight": 0.01,
     "loss.regularizers.exposure_scale": 0.01,
@@ -49,7 +48,6 @@ PUBLISHED: Fields = {
     "optimizer.quats": 1e-3,
     "optimizer.final": 1.0,
     "optimizer.full_rate_updates": None,
-    "optimizer.exposures": 1e-2,
     "optimizer.gammas": 1e-2,
     "optimizer.photometry_final": 1.0,
     "optimizer.extent": "cameras",
@@ -72,7 +70,6 @@ DISPLAY: Fields = {
     "photometry.curve": "linear",
     "photometry.start": "random",
     "photometry.start_std": 0.0,
-    "photometry.freeze_until": 0.0,
     "loss.censored": False,
 }
 # DISPLAY with the schedule, renderer and budget of `robust`. Rates of colours are 4 times the best
@@ -80,7 +77,6 @@ DISPLAY: Fields = {
 LDR: Fields = DISPLAY | {
     "optimizer.sh_dc": 2e-2,
     "optimizer.sh_rest": 1e-3,
-    "optimizer.exposures": 1e-2,
 }
 PRESETS: dict[PresetName, Fields] = {
     "robust": {},

@@ -26,7 +26,7 @@ LEAST_EXPOSURE = 0.1  # lower bound of random exposures
 def initial_photometry(
     solution: PhotometricSolution | None, cameras: Sequence[str], cfg: FitConfig
 ) -> Photometry:
-    """Return the start: a solution, or gamma 2.2 with exposures that are random (paper) or 1.
+    """Return the start: a solution, or gamma 2.2 with random exposures (paper).
 
     `cameras` has the camera of every training view.
     """
@@ -34,11 +34,9 @@ def initial_photometry(
     p = cfg.photometry
     if solution is not None:
         log_exposures = np.asarray(solution.log_exposures)
-    elif p.start == "random":
+    else:
         draws = generator(cfg.train.seed, Stream.START_EXPOSURES).normal(1.0, p.start_std, count)
         log_exposures = np.log(np.maximum(draws, LEAST_EXPOSURE))
-    else:
-        log_exposures = np.zeros(count)
     gammas = np.full(count, GAMMA_SRGB) if solution is None else solution.gammas
     if p.parameterization == "log":
         exposures, gammas = log_exposures, np.log(gammas / GAMMA_SRGB)

@@ -15,7 +15,6 @@ from p2gs_jax.photometry.models import ModelName
 from p2gs_jax.photometry.response import Response
 
 MIN_OBSERVATIONS = 15  # exposures of views with fewer usable observations are uncertain
-CERTAIN_EV = 0.05  # exposures with larger standard errors, stops, are learned further
 WEAK_GAMMA = 0.1  # gammas with a larger standard error are only roughly known
 # A view disagrees if its gap exceeds this and 3 standard errors.
 NOTICEABLE_EV = 0.2
@@ -64,12 +63,6 @@ class PhotometricSolution:
     cameras: tuple[CameraFormation, ...]
     # Standard errors of log V in the corner, per camera and row of `vignetting`.
     corner_errors: Float[np.ndarray, "c k"]
-
-    @property
-    def certain(self) -> bool:
-        """Whether all exposures can be compared, with standard errors of at most CERTAIN_EV."""
-        known = (self.exposure_errors_ev <= CERTAIN_EV).all()
-        return bool(known) and len(set(self.component.tolist())) == 1
 
     @property
     def state(self) -> dict[str, Any]:

@@ -28,8 +28,6 @@ from p2gs_jax.run.folder import RunFolder
 
 # Key of the decisions in the metadata of checkpoints.
 KEY = "decided"
-# Factor on the rates of exposures and gammas if none were solved (docs/photometry.md, 4).
-FROM_NOTHING = 10.0
 # Options of `PhotometryConfig` that `select` replaces.
 CHOSEN = ("model", "curve", "spline", "white_balance", "vignetting", "responses")
 
@@ -41,10 +39,8 @@ class Decisions:
     model: config.PhotometricModel
     curve: Literal["power", "srgb", "spline", "linear"]  # base of the tone curve
     spline: tuple[float, ...] | None  # its correction, or None
-    freeze_until: float  # share of the run in which exposures and gammas are fixed
-    log_exposure_mean: float | None  # weight of the regulariser of the mean log exposure, or None
-    exposure_rate: float  # learning rate of the exposures
-    gamma_rate: float  # learning rate of the gammas
+    start: Literal["tracks", "random"]  # whether exposures and gammas are solved, or learned
+    start_std: float  # standard deviation of the initial exposures, if they are learned
     near: float  # near plane, scene units; a closer one if that in the options would cut the scene
     reasons: tuple[str, ...] = ()  # reasons for the model and the curve, in words
     white_balance: config.Level | None = None  # level of the white balance, or None
@@ -99,10 +95,8 @@ _PLACES = {
     "model": "photometry.model",
     "curve": "photometry.curve",
     "spline": "photometry.spline",
-    "freeze_until": "photometry.freeze_until",
-    "log_exposure_mean": "loss.regularizers.log_exposure_mean",
-    "exposure_rate": "optimizer.exposures",
-    "gamma_rate": "optimizer.gammas",
+    "start": "photometry.start",
+    "start_std": "photometry.start_std",
     "white_balance": "photometry.white_balance",
     "vignetting": "photometry.vignetting",
     "responses": "photometry.responses",
@@ -128,22 +122,14 @@ def decide(cfg: config.FitConfig, selection: Selection | None, kept: Decisions |
     """
     decided = Decisions.as_given(cfg)
     if selection is None:
-        decided = unsolved(decided)
-        return without_tracks(decided) if cfg.photometry.start == "tracks" else decided
+        return unsolved(decided)
     s = selection.solution
     form = Form(s.model, s.white_balance_level, s.vignetting)
-    decided = dataclasses.replace(
+    return dataclasses.replace(
         with_choice(decided, form, s.response),
         reasons=tuple(selection.reasons),
         cameras=s.cameras if kept is None else kept.cameras,
     )
-    # Learning shakes exposures by 0.004 EV, so those that are known better stay (BUILD_NOTES).
-    p, fixed = cfg.photometry, s.certain
-    if p.known is not None:
-        # No regulariser changes the mean of known exposures.
-        decided = dataclasses.replace(decided, log_exposure_mean=None)
-        fixed = fixed or p.known_deviation_ev == 0
-    return dataclasses.replace(decided, freeze_until=1.0 if fixed else decided.freeze_until)
 
 
 def likely(
@@ -162,11 +148,10 @@ def likely(
         return None
     decided = dataclasses.replace(Decisions.as_given(cfg), **scale)
     if kept is not None:
-        solved = (*CHOSEN, "cameras", "freeze_until")
+        solved = (*CHOSEN, "cameras", "start", "start_std")
         return dataclasses.replace(decided, **{name: getattr(kept, name) for name in solved})
     if p.start != "tracks":
         return unsolved(decided)
-    decided = dataclasses.replace(decided, freeze_until=1.0)
     if p.select:
         return dataclasses.replace(
             decided, model="view_exposure", white_balance=None, vignetting=None, responses="all"
@@ -188,20 +173,18 @@ def with_choice(decided: Decisions, form: Form, response: Response) -> Decisions
 
 
 def unsolved(decided: Decisions) -> Decisions:
-    """Return the decisions without a solution; a white balance per view can still be learned."""
+    """Return the decisions without a solution: exposures are learned, and start at 1 if not random.
+
+    A white balance per view is learned as well.
+    """
     by_view = decided.white_balance == "view"
     return dataclasses.replace(
-        decided, white_balance="view" if by_view else None, vignetting=None, responses="all"
-    )
-
-
-def without_tracks(decided: Decisions) -> Decisions:
-    """Return the decisions without solved exposures: they are learned fast from the first step."""
-    return dataclasses.replace(
         decided,
-        freeze_until=0.0,
-        exposure_rate=FROM_NOTHING * decided.exposure_rate,
-        gamma_rate=FROM_NOTHING * decided.gamma_rate,
+        start="random",
+        start_std=decided.start_std if decided.start == "random" else 0.0,
+        white_balance="view" if by_view else None,
+        vignetting=None,
+        responses="all",
     )
 
 

@@ -106,15 +106,11 @@ def means_rate(progress: Array, factor: Array, extent: float, cfg: FitConfig) ->
 def photometry_gate(progress: Array, cfg: FitConfig) -> Float[Array, ""]:
     """Return the factor on the learning rates of exposure, white balance and gamma.
 
-    It is 0 while they are frozen, then decays. Only a start from tracks is frozen, because other
-    starts must move from the first step.
+    It is 0 if they are solved; otherwise it decays.
     """
-    frozen = cfg.photometry.freeze_until if cfg.photometry.start == "tracks" else 0.0
-    if frozen >= 1.0:
+    if cfg.photometry.start == "tracks":
         return jnp.zeros(())
-    along = (progress - frozen) / (1.0 - frozen)
-    factor = cfg.optimizer.photometry_final ** jnp.clip(along, 0.0, 1.0)
-    return jnp.where(along >= 0, factor, 0.0)
+    return jnp.asarray(cfg.optimizer.photometry_final**progress)
 
 
 def appearance_rate(progress: Array, cfg: FitConfig) -> Float[Array, ""]:

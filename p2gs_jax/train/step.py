@@ -45,7 +45,7 @@ OPTIONS_READ: dict[str, dict[str, Any]] = {
     "advance": {
         "render": None,
         "optimizer": None,
-        "photometry": ("model", "start", "freeze_until", "white_balance"),
+        "photometry": ("model", "start", "white_balance"),
         "loss": {"regularizers": ("log_exposure_mean",)},
     },
 }

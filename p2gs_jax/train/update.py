@@ -266,7 +266,12 @@ def finished(
 
 
 def _recentered(photometry: Photometry, cfg: FitConfig) -> Photometry:
-    """Fix the scale gauges: mean log e = 0 and mean log W = 0 (docs/photometry.md, 2, 4)."""
+    """Fix the scale gauges: mean log e = 0 and mean log W = 0 (docs/photometry.md, 2, 4).
+
+    Solved photometry stays as it is.
+    """
+    if cfg.photometry.start == "tracks":
+        return photometry
     balance = photometry.raw_white_balance
     if balance is not None:
         balance = balance - jnp.mean(balance, 0)

@@ -7,15 +7,12 @@ import pytest
 from solving import DRIVE, ISO4, PLAIN, adjust, problem_of, rms, select
 from synthetic_drive import make_drive, make_exposures, observe
 
-from p2gs_jax.config import FitConfig
 from p2gs_jax.evaluation.alignment import exposure_error
 from p2gs_jax.photometry.adjustment.problem import KnownExposures
 from p2gs_jax.photometry.adjustment.solve import fit_response
-from p2gs_jax.photometry.calibrate import Selection
 from p2gs_jax.photometry.candidates import Candidate, choose, mean_deficit
 from p2gs_jax.photometry.models import Choice, Curve, Form, Scope, neighbours, parameter_count
 from p2gs_jax.photometry.response import FREE, HELD, Response, log_exposed
-from p2gs_jax.run.decisions import decide, likely
 
 # Log factors on red, green, blue: dark photographs are bluer; cameras differ.
 DARK = np.where(np.median(ISO4) > ISO4, 1.0, -1.0)[:, None] * [-0.06, -0.06, 0.12]
@@ -210,22 +207,6 @@ def test_equal_exposures_stay_equal_where_corners_tell_the_curve():
     o = observe(drive, make_exposures(drive, "constant"), curve="filmic", corner_loss=LOST)
     s = select(o).solution
     assert (s.model, s.vignetting) == ("constant", "camera")
-
-
-def test_only_exposures_that_are_known_well_stay_as_solved():
-    cfg, solved = FitConfig(), adjust()
-
-    def freeze(**changed):
-        selection = Selection(dataclasses.replace(solved, **changed), (), ())
-        return decide(cfg, selection, None).freeze_until
-
-    guess = likely(cfg, None, {})
-    assert guess is not None
-    assert freeze() == guess.freeze_until == 1.0
-    for error in (0.06 * np.log(2), np.inf):
-        errors = np.where(np.arange(len(ISO4)) == 3, error, solved.exposure_errors)
-        assert freeze(exposure_errors=errors) == cfg.photometry.freeze_until < 1
-    assert freeze(component=np.arange(len(ISO4)) % 2) < 1
 
 
 @pytest.mark.filterwarnings("error")

@@ -133,11 +133,11 @@ def test_a_level_has_a_new_pace_and_the_log_names_the_level_of_its_steps(harness
 def test_a_resumed_run_refuses_other_decisions_of_the_scene(harness):
     harness.run(SHORT)
     assert harness.run(SHORT, resume=True)[0].host.step == 100
-    other = with_fields(SHORT, {"photometry.curve": "power", "photometry.freeze_until": 0.0})
+    other = with_fields(SHORT, {"photometry.curve": "power", "photometry.start": "random"})
     with pytest.raises(UserError) as error:
         harness.run(other, resume=True)
     assert "curve was srgb, now power" in error.value.message
-    assert "freeze_until was 0.6, now 0.0" in error.value.message
+    assert "start was tracks, now random" in error.value.message
     assert "restore the scene" in str(error.value.fix)
 
 

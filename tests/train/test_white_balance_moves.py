@@ -21,24 +21,27 @@ def params(balance):
 
 
 @pytest.mark.parametrize("level", ["view", "camera"])
-@pytest.mark.parametrize("progress", [0.3, 0.9])
-def test_only_white_balance_per_view_has_the_rate_of_exposures(level, progress):
-    cfg = with_fields(FitConfig(), {"photometry.white_balance": level})
+@pytest.mark.parametrize("start", ["tracks", "random"])
+def test_only_white_balance_per_view_has_the_rate_of_learned_exposures(level, start):
+    cfg = with_fields(FitConfig(), {"photometry.white_balance": level, "photometry.start": start})
     like = params(jnp.zeros((2, 3)))
-    found = learning_rates(jnp.float32(progress), jnp.float32(1), 1.0, like, cfg, 1).photometry
-    moves = level == "view" and progress > cfg.photometry.freeze_until
+    found = learning_rates(jnp.float32(0.3), jnp.float32(1), 1.0, like, cfg, 1).photometry
+    assert (float(found.raw_exposures) > 0) == (start == "random")
+    moves = level == "view" and start == "random"
     expected = float(found.raw_exposures) if moves else 0.0
     assert float(found.raw_white_balance) == expected
     assert (expected > 0) == moves
-    plain = learning_rates(jnp.float32(progress), jnp.float32(1), 1.0, params(None), FitConfig(), 1)
+    plain = learning_rates(jnp.float32(0.3), jnp.float32(1), 1.0, params(None), FitConfig(), 1)
     assert plain.photometry.raw_white_balance is None
 
 
 def test_the_mean_white_balance_of_every_channel_stays_0():
     raw = np.random.default_rng(0).normal(0.3, 0.2, (5, 3)).astype(np.float32)
     photometry = Photometry(jnp.ones(5), jnp.zeros(5), "log", jnp.asarray(raw))
+    assert _recentered(photometry, FitConfig()) is photometry  # solved
     for weight in (0.01, None):
-        cfg = with_fields(FitConfig(), {"loss.regularizers.log_exposure_mean": weight})
+        fields = {"photometry.start": "random", "loss.regularizers.log_exposure_mean": weight}
+        cfg = with_fields(FitConfig(), fields)
         found = _recentered(photometry, cfg)
         np.testing.assert_allclose(np.mean(found.raw_white_balance, 0), 0, atol=1e-6)
         assert (float(jnp.mean(found.raw_exposures)) == 0) == (weight is not None)
@@ -77,7 +80,6 @@ def test_a_fit_finds_white_balance_and_vignetting(tmp_path, run_command):
         *("--densify.max-gaussians", 400, "--render.sh-degree", 1, "--init.shell", "off"),
         *("--train.coarse-to-fine", "--photometry.no-select", "--photometry.curve", "power"),
         *("--photometry.white-balance", "view", "--photometry.vignetting", "camera"),
-        *("--photometry.freeze-until", 0.0),
     ]
     assert run_command(*argv)[0] == 0
     run = load_run(tmp_path / "run")

@@ -51,9 +51,7 @@ def solve_shared(
     views = scene.training_views
     depth = near_depth(seen_depths(scene.points, views))
     scale = decided_scale(depth, cfg)
-    decisions = dataclasses.replace(
-        solved.decisions, freeze_until=1.0, log_exposure_mean=None, **scale
-    )
+    decisions = dataclasses.replace(solved.decisions, **scale)
     resolved = decisions.resolve(cfg)
     if scene.point_colors is None:
         scene = with_colors(scene, photographed_radiance(scene, still, solved.photometry, resolved))
