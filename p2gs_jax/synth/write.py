@@ -54,6 +54,7 @@ def write_street(
     sensor: Sensor | None = None,
     layout: Layout = "street",
     matte: bool = False,
+    render: Callable[[DriveViews], Iterator[tuple[np.ndarray, np.ndarray]]] | None = None,
     report: Callable[[str], None] = lambda line: None,
 ) -> Path:
     """Render a drive along the procedural street, write its scene folder and return the path.
@@ -71,6 +72,7 @@ def write_street(
         sensor: the image formation of the cameras.
         layout: `town` adds an underpass and draws the sun; `long` has no end.
         matte: whether surfaces have no gloss, so that every view sees the same radiance.
+        render: another renderer; yields radiance (half or single) and camera z of every view.
         report: receives lines on the progress.
 
     UserError: a parameter is not valid, or `out` is not free.
@@ -88,7 +90,7 @@ def write_street(
     shots = draw_shots(sensor, frames, len(MOUNTS), seed)
     with atomic_folder(out) as temporary:
         report(f"rendering {len(views.names)} views of a street with {town.size} primitives")
-        rendered = _render_all(town, views, supersample)
+        rendered = render(views) if render else _render_all(town, views, supersample)
         photographs, depths = _photograph(temporary, views, rendered, shots, sensor, seed, report)
         held = (frame % hold_out == 0) if hold_out and frames > 1 else np.zeros(len(frame), bool)
         xyz, rgb = sample_seeds(views, photographs, depths, ~held, points, seed)

@@ -198,6 +198,19 @@ def test_impossible_drives_are_refused(street, tmp_path, options, words):
         write_street(street)
 
 
+def test_photographs_can_come_from_another_renderer(tmp_path):
+    def wall(views):
+        for row in range(len(views.names)):
+            yield np.full((64, 96, 3), 0.1 + 0.01 * row, np.float32), np.full((64, 96), 10.0)
+
+    size = {"frames": 2, "width": 96, "height": 64, "points": 50, "hold_out": 0}
+    scene = write_street(tmp_path / "scene", render=wall, **size)
+    exposures = read_true_exposures(scene)
+    for row, name in enumerate(sorted(exposures)):
+        expected = photograph(np.full((64, 96, 3), 0.1 + 0.01 * row, np.float32), exposures[name])
+        np.testing.assert_array_equal(read_png(scene / "images" / name), expected)
+
+
 def test_the_card_and_the_table_hold_seed_and_sensor(street, tmp_path):
     card = json.loads((street / "dataset.json").read_text())
     assert (card["seed"], card["sensor"]["iso_std"]) == (SIZE["seed"], 4.0)
