@@ -46,6 +46,8 @@ MOST_COMPARED = 80  # largest number of choices that are compared
 # A deficit is excused up to this number of standard errors, or up to this gain, nat.
 STANDARD_ERRORS, SMALLEST_GAIN = 2.0, 0.0125
 LARGEST_CHANCE = 0.25  # largest deficit that a standard error excuses, nat per observation
+# Least gain of a gamma per view, nat: gloss gains 0.02, real gammas gain 0.27 (BUILD_NOTES).
+GAMMA_GAIN = 0.05
 # Predictions that differ by at most this in every view count as equal, 8-bit levels.
 INVISIBLE_DIFFERENCE = 1.0
 # The predictive density is a mixture, so that outliers do not decide: share, deviation (log).
@@ -232,6 +234,10 @@ class Search:
             k: -np.inf if np.isnan(p.densities).all() else float(np.nanmean(p.densities))
             for k, p in self._predicted.items()
         }
+        gammas = {k: MODELS[k.form.model].gamma == "view" for k in density}
+        others = max((d for k, d in density.items() if not gammas[k]), default=-np.inf)
+        if max(density.values()) < others + GAMMA_GAIN:
+            density = {k: d for k, d in density.items() if not gammas[k]}
         best = self._predicted[max(density, key=lambda k: density[k])]
         return [self._candidate(choice, d, best) for choice, d in density.items()]
 

@@ -209,6 +209,15 @@ def test_equal_exposures_stay_equal_where_corners_tell_the_curve():
     assert (s.model, s.vignetting) == ("constant", "camera")
 
 
+@pytest.mark.parametrize(
+    ("spread", "model"), [(0.05, "view_exposure"), (0.15, "view_exposure_gamma")]
+)
+def test_a_gamma_per_view_must_gain_more_than_gloss_does(spread, model):
+    gammas = np.random.default_rng(1).normal(2.2, spread, len(ISO4))
+    s = select(observe(DRIVE, ISO4, curve="power", gammas=gammas, pivot=0.18))
+    assert s.solution.model == model
+
+
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("value", [0.0, 1.0])
 def test_black_and_saturated_photographs_give_a_model_without_known_exposures(value):
