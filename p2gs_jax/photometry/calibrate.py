@@ -240,7 +240,7 @@ def _chosen(
     candidates = sorted(search.judged(), key=lambda c: -c.density)
     if loose := sum(not f.converged for f, _ in search.fits.values()):
         notes.append(
-            f"{loose} of the {len(candidates)} models compared had not converged after "
+            f"{loose} of the {len(search.fits)} models compared had not converged after "
             f"{MOST_ROUNDS} rounds; their state after these rounds was compared."
         )
     solution = fit_model(problem, chosen.form, chosen.response)

@@ -225,7 +225,10 @@ class Search:
         return self.fits[max(self.fits, key=common)][0] if self.fits else None
 
     def judged(self) -> list[Candidate]:
-        """Return a candidate for every solution, with the quality of its predictions."""
+        """Return a candidate for every solution, with the quality of its predictions.
+
+        Solutions with a gamma per view are left out if the best of them gains too little.
+        """
         for choice, fit in self.fits.items():
             if choice not in self._predicted:
                 self._predicted[choice] = _predict(self._problem, *fit, self._held)
