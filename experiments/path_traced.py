@@ -1,4 +1,4 @@
-"""A street from another renderer: what would our towns have in common with the code they judge?
+"""A street that Mitsuba renders, because our towns come from a tracer of ours.
 
 pip install mitsuba==3.5.2 && python experiments/path_traced.py OUT [--matte]
 
@@ -46,9 +46,9 @@ def main() -> None:
         gain = MEDIAN / np.median(rendered[0][0])
         return ((linear * gain, depth) for linear, depth in rendered)
 
+    options = {"frames": 30, "seed": 1, "points": 12_000, "matte": args.matte, "render": render}
     for std in (0.0, 2.0, 4.0):
-        folder = args.out / f"iso{std:g}"
-        write_street(folder, frames=30, iso_std=std, seed=1, points=12_000, render=render)
+        write_street(args.out / f"iso{std:g}", iso_std=std, **options)
 
 
 def view(mi: Any, scene: Any, views: DriveViews, row: int) -> tuple[np.ndarray, np.ndarray]:
