@@ -68,7 +68,6 @@ def rigid(rotation: Rotation3, position: Vector3, source: Path, what: str) -> Po
     `source` and `what` name the file and the object of the pose in messages. Raises UserError: the
     pose is not finite, or not a rotation.
     """
-    rotation, position = np.asarray(rotation, np.float64), np.asarray(position, np.float64)
     finite = np.isfinite(rotation).all() and np.isfinite(position).all()
     nearest = nearest_rotation(rotation, ORTHOGONAL) if finite else None
     if nearest is None:
@@ -104,7 +103,6 @@ def from_quaternions(
 
     Raises UserError: the length of a quaternion is not 1 to within 0.01, or a number is not finite.
     """
-    wxyz = np.asarray(wxyz, np.float64)
     bad = ~(np.abs(np.linalg.norm(wxyz, axis=1) - 1) < 1e-2) | ~np.isfinite(positions).all(1)
     if bad.any():
         name = f"{what} number {np.argmax(bad) + 1}"
@@ -118,8 +116,7 @@ def from_quaternion(
     wxyz: Float[np.ndarray, " 4"], position: Vector3, source: Path, what: str
 ) -> Pose:
     """Return the matrix of one quaternion and a position; errors as in `from_quaternions`."""
-    wxyz = np.asarray(wxyz, np.float64)
-    if wxyz.shape != (4,) or not abs(np.linalg.norm(wxyz) - 1) < 1e-2:
+    if not abs(np.linalg.norm(wxyz) - 1) < 1e-2:
         raise broken(f"{source}:", f"the rotation of {what} is not a unit quaternion")
     rotation = Rotation.from_quat(wxyz, scalar_first=True)
     return rigid(rotation.as_matrix(), position, source, what)
