@@ -16,7 +16,7 @@ from p2gs_jax.errors import UserError, broken
 from p2gs_jax.scene import files
 from p2gs_jax.scene.convert.convert import cache_of
 from p2gs_jax.scene.drives.ego_mask import find_ego_masks
-from p2gs_jax.scene.drives.lidar import MOST_MEASURED, owners, seeds, thinned
+from p2gs_jax.scene.drives.lidar import MOST_MEASURED, owners, seeds
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, short_name
 from p2gs_jax.scene.drives.tables import counted
 from p2gs_jax.scene.rigid import inverse
@@ -192,8 +192,10 @@ def _read_sweeps(
         finite = np.isfinite(local).all(1)
         invalid += int((~finite).sum())
         local, at = local[finite], np.asarray(at, np.float64)[finite]
-        part = thinned(Lidar(local, at, np.full(len(local), -1, np.int32)), most_each, rng)
-        parts.append((part.points, part.times, owners(part.points, part.times, objects)))
+        if len(local) > most_each:
+            kept = np.sort(rng.choice(len(local), most_each, replace=False))
+            local, at = local[kept], at[kept]
+        parts.append((local, at, owners(local, at, objects)))
     notes = counted(invalid, "LiDAR points are not finite numbers and are left out.")
     return Lidar(*map(np.concatenate, zip(*parts, strict=True))), notes
 

@@ -76,14 +76,6 @@ def owners(
     return found
 
 
-def thinned(lidar: Lidar, most: int, rng: np.random.Generator) -> Lidar:
-    """Return at most `most` measurements, drawn with equal probability."""
-    if len(lidar.points) <= most:
-        return lidar
-    keep = np.sort(rng.choice(len(lidar.points), most, replace=False))
-    return Lidar(lidar.points[keep], lidar.times[keep], lidar.objects[keep])
-
-
 def seeds(
     lidar: Lidar, cameras: Float[np.ndarray, "v 3"], most: int = MOST_SEEDS
 ) -> tuple[Float32[np.ndarray, "s 3"], float]:
