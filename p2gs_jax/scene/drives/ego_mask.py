@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 from scipy.sparse import coo_array, csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
@@ -78,7 +78,7 @@ def find_ego_masks(
     for name in names:
         photographs = [p for p in recording.photographs if p.camera == name]
         existing = [p for p in photographs if p.embedded is not None or p.path.is_file()]
-        spread = spread_over_distance(sorted(existing, key=lambda p: p.frame), MOST_LOOKED_AT)
+        spread = spread_over_distance(sorted(existing, key=lambda p: p.frame))
         mask = _cached_mask(cameras[name], spread, up, work_dir)
         if mask is None:
             undecided.append(name)
@@ -133,8 +133,8 @@ def _picture(photograph: Photograph, camera: RigCamera) -> UInt8[np.ndarray, "h 
     return cv2.resize(picture, (WIDTH, height), interpolation=cv2.INTER_AREA)
 
 
-def spread_over_distance(photographs: Sequence[Photograph], most: int) -> list[Photograph]:
-    """Return at most `most` photographs of one camera, given in the order of time.
+def spread_over_distance(photographs: Sequence[Photograph]) -> list[Photograph]:
+    """Return at most `MOST_LOOKED_AT` photographs of one camera, given in the order of time.
 
     They are spread evenly over the distance, not over time: cars wait.
     """
@@ -145,7 +145,7 @@ def spread_over_distance(photographs: Sequence[Photograph], most: int) -> list[P
     turned = np.einsum("nij,nij->n", poses[1:, :3, :3], poses[:-1, :3, :3])
     steps += TURN_AS_DISTANCE * np.arccos(np.clip((turned - 1) / 2, -1, 1))
     distance = np.concatenate([[0.0], np.cumsum(steps)])
-    stops = np.linspace(0, distance[-1], most)
+    stops = np.linspace(0, distance[-1], MOST_LOOKED_AT)
     rows = sorted({int(np.abs(distance - stop).argmin()) for stop in stops})
     return [photographs[row] for row in rows]
 
@@ -165,7 +165,7 @@ def find_ego_mask(
         return None
     height = pictures.shape[1]
     K = scale_intrinsics(camera.K, WIDTH / camera.width, height / camera.height)
-    motion = expected_motion(poses, up, K, camera.distortion, WIDTH, height)
+    motion = expected_motion(poses, up, K, camera.distortion, height)
     # The sum counts how often the world has moved at each pixel.
     if np.minimum(np.linalg.norm(motion, axis=-1) / APART, 1).sum(0).max() < FEWEST:
         return None
@@ -186,15 +186,14 @@ def expected_motion(
     up: Float[np.ndarray, " 3"],
     K: Float[np.ndarray, "3 3"],
     distortion: Distortion | None,
-    width: int,
     height: int,
 ) -> Float32[np.ndarray, "n-1 h w 2"]:
     """Return the motion of the farthest visible surface between frames, pixels.
 
     Poses are camera to world, in the order of the frames; `up` is a unit vector away from the road;
-    K is in pixels of the undistorted image of that size.
+    K is in pixels of the undistorted image, which has `WIDTH` columns and `height` rows.
     """
-    columns = np.arange(_MOTION_STEP / 2, width, _MOTION_STEP)
+    columns = np.arange(_MOTION_STEP / 2, WIDTH, _MOTION_STEP)
     rows = np.arange(_MOTION_STEP / 2, height, _MOTION_STEP)
     xs, ys = np.meshgrid(columns, rows)
     straight = undistort_points(np.stack([xs, ys], -1).reshape(-1, 2), K, distortion)
@@ -218,7 +217,7 @@ def expected_motion(
         moved = local[..., :2] / z * focal + centre - straight
         moved = np.einsum("hwij,hwj->hwi", back, moved)
         moved[~valid] = 0
-        out.append(cv2.resize(moved.astype(np.float32), (width, height)))
+        out.append(cv2.resize(moved.astype(np.float32), (WIDTH, height)))
     return np.array(out)
 
 
@@ -291,10 +290,10 @@ def _minimal_cut(gain: np.ndarray, passage: np.ndarray) -> Bool[np.ndarray, "h w
 def _solid_parts(found: Bool[np.ndarray, "h w"], evidence: Evidence) -> Bool[np.ndarray, "h w"]:
     """Return parts that are wide, touch the border, and end within 2 pixels of edges that stay."""
     opened = _morphology(found, cv2.MORPH_OPEN, NARROWEST)
-    parts, count = _labelled(opened)
+    count, parts = cv2.connectedComponents(opened.astype(np.uint8), connectivity=4)
     near = cv2.dilate(evidence.stays.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     kept = np.zeros_like(found)
-    for number in range(1, count + 1):
+    for number in range(1, count):  # 0 numbers the other pixels
         part = parts == number
         at_border = part[[0, -1]].any() or part[:, [0, -1]].any()
         if not at_border or part.mean() < LEAST_SHARE:
@@ -309,15 +308,9 @@ def _solid_parts(found: Bool[np.ndarray, "h w"], evidence: Evidence) -> Bool[np.
             kept |= part
     closed = _morphology(kept, cv2.MORPH_CLOSE, GAP)
     # Holes are filled, even those that only the lower border closes.
-    holes, _ = _labelled(~closed)
+    _, holes = cv2.connectedComponents((~closed).astype(np.uint8), connectivity=4)
     around = np.unique(np.concatenate([holes[0], holes[:, 0], holes[:, -1]]))
     return ~np.isin(holes, around[around > 0])
-
-
-def _labelled(mask: Bool[np.ndarray, "h w"]) -> tuple[Int[np.ndarray, "h w"], int]:
-    """Return the number of each pixel's connected part, 0 outside, and how many there are."""
-    count, parts = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
-    return parts, count - 1
 
 
 def _morphology(mask: Bool[np.ndarray, "h w"], kind: int, side: int) -> Bool[np.ndarray, "h w"]:
