@@ -6,6 +6,7 @@ import zlib
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from PIL import Image
 from scene.helpers import make_view, refused, write_image, write_rgba, write_tiny_model
@@ -294,7 +295,7 @@ def test_any_name_can_be_matched_with_any_other(tmp_path):
     features.quiet_colmap()
     database = features.kept_features(tmp_path / "kept", tmp_path, {(): names}, print)
     features.match_kept(database, names, [(names[0], names[1]), (names[2], names[3])], print)
-    with features.opened(database) as db:
+    with pycolmap.Database.open(database) as db:
         assert {image.name for image in db.read_all_images()} == {*names}
         assert db.num_verified_image_pairs() == 2
 

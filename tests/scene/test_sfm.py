@@ -7,6 +7,7 @@ import os
 import shutil
 
 import numpy as np
+import pycolmap
 import pytest
 from PIL import Image
 from scene.helpers import refused, reprojection_errors, write_image, write_tiny_model
@@ -91,10 +92,10 @@ def test_the_same_photographs_give_the_same_inliers(folder, tmp_path):
     database = kept_features(tmp_path / "features", folder, {("one",): names}, print)
 
     def inliers(pairs):
-        with features.opened(database) as db:
+        with pycolmap.Database.open(database) as db:
             db.clear_two_view_geometries()
         features.match(database, pairs)
-        with features.opened(database) as db:
+        with pycolmap.Database.open(database) as db:
             return [g.inlier_matches.tolist() for g in db.read_two_view_geometries()[1]]
 
     pairs = list(itertools.combinations(names, 2))
@@ -104,7 +105,7 @@ def test_the_same_photographs_give_the_same_inliers(folder, tmp_path):
 
 def test_only_new_photographs_are_processed_and_matches_judge_poses(noisy_street, folder, tmp_path):
     def names_in(database):
-        with features.opened(database) as db:
+        with pycolmap.Database.open(database) as db:
             return {i.name: (i.camera_id, i.image_id) for i in db.read_all_images()}
 
     log, names, keep = [], [f"IMG ({k}).png" for k in range(5)], tmp_path / "features"

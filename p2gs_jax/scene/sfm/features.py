@@ -12,7 +12,6 @@ import shutil
 import sys
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import closing
 from itertools import combinations
 from pathlib import Path
 
@@ -55,11 +54,6 @@ Pair = tuple[str, str]
 def quiet_colmap() -> None:
     """Set COLMAP's log to errors only, without progress."""
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
-
-
-def opened(database: Path) -> closing[pycolmap.Database]:
-    """Provide an open database, and close it at the end."""
-    return closing(pycolmap.Database.open(database))
 
 
 def extract(
@@ -127,7 +121,7 @@ def match(database: Path, pairs: Iterable[Pair] | None) -> None:
 
 
 def _rename(database: Path, characters: Mapping[int, int]) -> None:
-    with opened(database) as db:
+    with pycolmap.Database.open(database) as db:
         for image in db.read_all_images():
             name = image.name.translate(characters)
             if name != image.name:
@@ -180,7 +174,7 @@ def match_kept(
 ) -> None:
     """Match those pairs (None: all pairs) that the database does not have yet."""
     wanted = list(combinations(sorted(names), 2)) if pairs is None else list(pairs)
-    with opened(database) as db:
+    with pycolmap.Database.open(database) as db:
         ids = {image.name: image.image_id for image in db.read_all_images()}
         known = [(a, b) for a, b in wanted if a in ids and b in ids]
         left = [(a, b) for a, b in known if not db.exists_two_view_geometry(ids[a], ids[b])]
@@ -208,7 +202,7 @@ def _cameras(database: Path) -> dict[str, int]:
     """Return the camera id of every photograph with features."""
     if not database.is_file():
         return {}
-    with opened(database) as db:
+    with pycolmap.Database.open(database) as db:
         images = (image for image in db.read_all_images() if db.exists_keypoints(image.image_id))
         return {image.name: image.camera_id for image in images}
 

@@ -25,7 +25,6 @@ from p2gs_jax.scene.convert.readers import read_exif_camera
 from p2gs_jax.scene.lens import undistort_points
 from p2gs_jax.scene.rigid import require_axes
 from p2gs_jax.scene.sfm import features
-from p2gs_jax.scene.sfm.features import opened, quiet_colmap
 from p2gs_jax.types import Scene, View
 
 FEATURES, REASONS = "features", "left_out.json"
@@ -112,7 +111,7 @@ def _build(
 
     The features are cached in `kept`.
     """
-    quiet_colmap()
+    features.quiet_colmap()
     names = [name for group in groups.values() for name in group]
     database = features.kept_features(kept, image_folder, groups, report)
     features.match_kept(database, names, pairs, report)
@@ -151,7 +150,7 @@ def reasons(
     if not left:
         return {}
     partners: dict[str, dict[str, int]] = defaultdict(dict)
-    with opened(database) as db:
+    with pycolmap.Database.open(database) as db:
         images = {image.image_id: image.name for image in db.read_all_images()}
         found = {name: db.num_keypoints_for_image(i) for i, name in images.items()}
         pairs, counts = db.read_two_view_geometry_num_inliers()
@@ -222,7 +221,7 @@ def triangulate(
 
 
 def _triangulate(folder: Path, views: Sequence[View], root: Path, report: files.Report) -> None:
-    quiet_colmap()
+    features.quiet_colmap()
     names = [view.name for view in views]
     image_folder = _image_folder(views, folder)
     database = folder / "database.db"
@@ -260,7 +259,7 @@ def _set_cameras(database: Path, views: Sequence[View]) -> pycolmap.Reconstructi
     """Overwrite COLMAP's guessed cameras in the database; return a model of the known poses."""
     known = {view.name: view for view in views}
     reconstruction = pycolmap.Reconstruction()
-    with opened(database) as db:
+    with pycolmap.Database.open(database) as db:
         for image in db.read_all_images():
             view = known[image.name]
             camera = camera_of(view, image.camera_id)
@@ -280,7 +279,7 @@ def agreement(database: Path, views: Sequence[View]) -> float:
     """
     known = {view.name: view for view in views}
     near: list[np.ndarray] = []
-    with opened(database) as db:
+    with pycolmap.Database.open(database) as db:
         views_of = {image.image_id: known[image.name] for image in db.read_all_images()}
         rays = {i: _rays(view, db.read_keypoints(i)[:, :2]) for i, view in views_of.items()}
         for pair, found in zip(*db.read_two_view_geometries(), strict=True):
