@@ -22,7 +22,7 @@ from PIL import Image, ImageCms
 
 from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 
-Transfer = Literal["linear", "hlg", "pq"]
+Transfer = Literal["hlg", "pq"]
 
 PQ_WHITE = 1000.0
 """Luminance that becomes 1, cd/m^2: the peak of phones and most masters. Above it, PQ saturates."""
@@ -65,11 +65,9 @@ def to_light(signal: Float[np.ndarray, "..."], transfer: Transfer) -> Float[np.n
     x = np.clip(signal, 0.0, 1.0)
     if transfer == "hlg":
         return np.where(x <= 0.5, x * x / 3, (np.exp((x - _HLG_C) / _HLG_A) + _HLG_B) / 12)
-    if transfer == "pq":
-        root = x ** (1 / _M2)
-        light = (np.maximum(root - _C1, 0) / (_C2 - _C3 * root)) ** (1 / _M1)
-        return np.minimum(light * (10000 / PQ_WHITE), 1.0)
-    return x
+    root = x ** (1 / _M2)
+    light = (np.maximum(root - _C1, 0) / (_C2 - _C3 * root)) ** (1 / _M1)
+    return np.minimum(light * (10000 / PQ_WHITE), 1.0)
 
 
 def rgb_to_xyz(primaries: Primaries) -> Float[np.ndarray, "3 3"]:
