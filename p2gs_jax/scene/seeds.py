@@ -114,10 +114,8 @@ def depth_range(views: Sequence[View]) -> tuple[float, float]:
     return APART[0] * extent, APART[1] * extent
 
 
-def common_points(
-    views: Sequence[View], near: float, far: float, count: int = COUNT
-) -> Float32[np.ndarray, "p 3"]:
-    """Return at most `count` points that many views see, drawn uniformly in pixels and 1 / depth.
+def common_points(views: Sequence[View], near: float, far: float) -> Float32[np.ndarray, "p 3"]:
+    """Return at most `COUNT` points that many views see, drawn uniformly in pixels and 1 / depth.
 
     Depths are between `near` and `far`, scene units.
     """
@@ -131,12 +129,12 @@ def common_points(
     best, found = 0, 0
     for _ in range(_ROUNDS):
         # Points are drawn in front of random views.
-        rows = rng.integers(len(views), size=count)
-        share = rng.random((count, 2))
-        depth = 1 / rng.uniform(1 / far, 1 / near, count)
+        rows = rng.integers(len(views), size=COUNT)
+        share = rng.random((COUNT, 2))
+        depth = 1 / rng.uniform(1 / far, 1 / near, COUNT)
         K = Ks[rows]
         xy = (share * sizes[rows] - K[:, :2, 2]) / np.stack([K[:, 0, 0], K[:, 1, 1]], 1)
-        local = np.concatenate([xy, np.ones((count, 1))], 1) * depth[:, None]
+        local = np.concatenate([xy, np.ones((COUNT, 1))], 1) * depth[:, None]
         poses = viewmats[rows]
         points = np.einsum("nji,nj->ni", poses[:, :3, :3], local - poses[:, :3, 3])
         seen = np.zeros(len(points), int)
@@ -146,6 +144,6 @@ def common_points(
         chosen = points[seen >= COMMON * best]
         kept.append(chosen)
         found += len(chosen)
-        if found >= count:
+        if found >= COUNT:
             break
-    return np.concatenate(kept)[:count].astype(np.float32)
+    return np.concatenate(kept)[:COUNT].astype(np.float32)
