@@ -95,12 +95,12 @@ class ImageStore:
                 shutil.rmtree(folder, ignore_errors=True)
         self._photographs = _DecodedPhotographs(self.views, limit, files, folder)
         self._placements: dict[int, Placement] = {}
-        self._objects, self._margin = _moving(objects), MARGIN
+        self._objects, self._margin = tuple(objects), MARGIN
         self._outlines: dict[int, list[np.ndarray]] = {}
 
     def leaving_out(self, objects: Sequence[TrackedObject], margin: float = MARGIN) -> ImageStore:
         """Return a store of the same photographs without the boxes of these moving objects."""
-        return self._with(_objects=_moving(objects), _margin=margin, _outlines={})
+        return self._with(_objects=tuple(objects), _margin=margin, _outlines={})
 
     @property
     def backdrop_values(self) -> tuple[float, float, float] | None:
@@ -211,10 +211,6 @@ class ImageStore:
         other = copy.copy(self)
         vars(other).update(changed)
         return other
-
-
-def _moving(objects: Sequence[TrackedObject]) -> tuple[TrackedObject, ...]:
-    return tuple(thing for thing in objects if thing.moving)
 
 
 def camera_of(store: ImageStore, index: int, shrink: float | int = 1.0) -> Camera:
