@@ -162,7 +162,6 @@ def _file_of(photograph: Photograph, folder: Path, write_embedded: bool) -> Path
         return photograph.path
     path = folder / photograph.camera / photograph.path.name
     if write_embedded and not path.is_file():
-        path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as temporary:
             temporary.write_bytes(photograph.embedded())
     return path

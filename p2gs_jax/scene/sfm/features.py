@@ -146,7 +146,6 @@ def kept_features(
     database = folder / DATABASE
     if not _continues(folder / RECORD, record):
         shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / RECORD, record)
     names = [name for group in groups.values() for name in group]
     if database.is_file():
