@@ -106,30 +106,22 @@ def stitch(
 ) -> Float32[np.ndarray, "h w c"]:
     """Reproject images to a cylinder: each pixel from the camera that sees it closest to its axis.
 
-    Images have at most 4 channels, and their cameras a common centre; unseen pixels are 0. Raises a
-    ValueError if an image has another size than its camera.
+    Images have at most 4 channels, and their cameras a common centre; unseen pixels are 0.
     """
     rays = cylinder.rays()
     out = np.zeros((*rays.shape[:2], images[0].shape[2]), np.float32)
     best = np.full(rays.shape[:2], -np.inf)
-    for k, (image, shot) in enumerate(zip(images, shots, strict=True)):
-        if image.shape[:2] != (shot.height, shot.width):
-            raise ValueError(f"image {k} has the size {image.shape[:2]}, unlike its camera")
+    for image, shot in zip(images, shots, strict=True):
         local = rays @ shot.viewmat[:3, :3].T
         xy, inside = shot.project(local)
         cosine = local[..., 2] / np.maximum(np.linalg.norm(local, axis=-1), 1e-12)
         better = inside & (cosine > best)
-        out[better] = _sample(image, (xy - 0.5).astype(np.float32))[better]
+        # OpenCV has pixel centres at integers.
+        x, y = np.moveaxis((xy - 0.5).astype(np.float32), -1, 0)
+        values = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        out[better] = values.reshape(out.shape)[better]
         best[better] = cosine[better]
     return out
-
-
-def _sample(image: np.ndarray, at: Float32[np.ndarray, "h w 2"]) -> np.ndarray:
-    """Interpolate at positions in the convention of OpenCV, with pixel centres at integers."""
-    values = np.ascontiguousarray(image, np.float32)
-    x, y = np.ascontiguousarray(at[..., 0]), np.ascontiguousarray(at[..., 1])
-    out = cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return out.reshape(*at.shape[:2], *image.shape[2:])
 
 
 def slices(cylinder: Cylinder) -> list[Shot]:
