@@ -31,10 +31,6 @@ _WRITTEN = {np.dtype(f"<{code}"): name for code, name in zip(_CODES, _NAMES, str
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
-class PlyError(ValueError):
-    """A fault in the content of a file."""
-
-
 class Element(NamedTuple):
     """A table as declared in a header; columns are NumPy's types, "" for lists."""
 
@@ -58,15 +54,15 @@ def parse_header(head: bytes, size: int) -> Header:
     """Return the header of a file of `size` bytes, whose first bytes are `head`.
 
     Comments and obj_info are ignored. An element with more than `size` rows is an error. Raises
-    ValueError: `head` is not a valid header (PlyError), or is not ASCII.
+    ValueError: `head` is not a valid header, or is not ASCII.
     """
     magic = re.match(rb"ply(\r\n|\n|\r)", head)
     if magic is None:
-        raise PlyError("its first line is not 'ply'")
+        raise ValueError("its first line is not 'ply'")
     newline = magic[1]
     end = re.search(newline + rb"[ \t]*end_header[ \t]*" + newline, head)
     if end is None:
-        raise PlyError("it has no line 'end_header'")
+        raise ValueError("it has no line 'end_header'")
     lines = head[magic.end() : end.start()].decode("ascii").split(newline.decode())
     order, elements, columns = "", dict[str, Element](), dict[str, str]()
     for number, line in enumerate(lines, 2):
@@ -77,7 +73,7 @@ def parse_header(head: bytes, size: int) -> Header:
                 order = _ORDERS[kind]
             case ["element", name, count] if order and name not in elements and count.isdecimal():
                 if int(count) > size:
-                    raise PlyError(f"it announces {count[:18]} rows but has only {size} bytes")
+                    raise ValueError(f"it announces {count[:18]} rows but has only {size} bytes")
                 columns = {}
                 elements[name] = Element(int(count), columns)
             case ["property", kind, name] if elements and name not in columns and kind in _TYPES:
@@ -86,9 +82,9 @@ def parse_header(head: bytes, size: int) -> Header:
                 columns[name] = ""
             case _:
                 place = f"line {number} of its header, {line[:80]!r}"
-                raise PlyError(f"{place}, is unknown, misplaced or there twice")
+                raise ValueError(f"{place}, is unknown, misplaced or there twice")
     if not order:
-        raise PlyError("its header states no format")
+        raise ValueError("its header states no format")
     return Header(order, elements, end.end())
 
 
@@ -131,18 +127,18 @@ def read_table(path: Path, name: str) -> np.ndarray:
     """
     with path.open("rb") as file:
         if not path.stat().st_size:
-            raise PlyError("it is empty")
+            raise ValueError("it is empty")
         # The map lives as long as rows that refer to it.
         data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         header = parse_header(data[:MOST_HEADER], len(data))
         if name not in header.elements:
-            raise PlyError(f"it has no element {name!r}")
+            raise ValueError(f"it has no element {name!r}")
         file.seek(header.size)
         lines, at, found = io.TextIOWrapper(file, "ascii"), header.size, None
         for here, (count, columns) in header.elements.items():
             if "" in columns.values():
                 if found is None:
-                    raise PlyError(f"its element {here!r} has lists, which are not read")
+                    raise ValueError(f"its element {here!r} has lists, which are not read")
                 break
             row = np.dtype(list(columns.items()))
             if header.order == "=":
@@ -152,7 +148,7 @@ def read_table(path: Path, name: str) -> np.ndarray:
                 rows = np.ndarray(whole, row, data, at)
                 at += whole * row.itemsize
             if len(rows) < count:
-                raise PlyError(f"it ends before the last of its {count} rows of {here!r}")
+                raise ValueError(f"it ends before the last of its {count} rows of {here!r}")
             found = rows if here == name else found
         assert found is not None
         return found
