@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -31,7 +31,6 @@ from p2gs_jax.photometry.response import DARKEST, by_camera
 from p2gs_jax.types import Array, Capture, Params, Photometry
 
 Curve = Literal["power", "srgb", "spline", "linear"]
-CURVES: tuple[Curve, ...] = get_args(Curve)
 
 Balance = tuple[float, float, float]
 Pixels = Float[Array, "... 3"] | Float[np.ndarray, "... 3"]

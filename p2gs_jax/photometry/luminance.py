@@ -100,11 +100,6 @@ def axes_of(raw: Float[Array, " 5"]) -> Float[Array, "3 3"]:
     return rows / jnp.linalg.norm(rows, axis=-1, keepdims=True)
 
 
-def spans(axes: Float[Array, "3 3"]) -> tuple[Float[Array, " 3"], Float[Array, " 3"]]:
-    """Return the least and the largest coordinate along each axis of colours in [0, 1]."""
-    return jnp.minimum(axes, 0).sum(-1), jnp.maximum(axes, 0).sum(-1)
-
-
 def enhanced(ldr: Float[Array, "*p 3"], view: Curves) -> Float[Array, "*p 3"]:
     """Return the enhanced display values of a photograph."""
 
@@ -132,7 +127,8 @@ def as_photographed(ldr: Float[Array, "*p 3"], view: Curves) -> Float[Array, "*p
 
 def _along_axes(ldr, axes, change):
     """Return colours after `change` of their axis coordinates, which are scaled to [0, 1]."""
-    low, high = spans(axes)
+    # The least and the largest coordinate of colours in [0, 1] along each axis.
+    low, high = jnp.minimum(axes, 0).sum(-1), jnp.maximum(axes, 0).sum(-1)
     along = (ldr @ axes.T - low) / (high - low)
     return (change(along) * (high - low) + low) @ axes
 
