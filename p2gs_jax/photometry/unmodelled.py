@@ -9,7 +9,7 @@ shows local tone mapping.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.special import fdtrc
 
 from p2gs_jax.core.numerics import LN2
@@ -86,7 +86,6 @@ def _fit_surface(flat: Values, places: Float[np.ndarray, "n 2"]) -> tuple[float,
     Return its RMS in the units of `flat`, and the p-value; NaN and 1 if there are too few blocks.
     """
     block = np.unique(np.floor(places * BLOCKS).astype(int), axis=0, return_inverse=True)[1]
-    block: Int[np.ndarray, " n"] = block.reshape(-1)
     n, (x, y) = np.bincount(block), places.T
     terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], 1)
     free = len(n) - terms.shape[1]

@@ -95,9 +95,7 @@ class Features:
         return np.concatenate([none, *index], -1), np.concatenate([none, *factor], -1)
 
     def balance_of(self, k: Float[np.ndarray, " k"]) -> Float[np.ndarray, "c 3"]:
-        """Return the log factors of each camera on the channels."""
-        if not self.balance:
-            return np.zeros((self.cameras, 3))
+        """Return the log factors of each camera on the channels; there must be a balance."""
         return k[: self.balance_count].reshape(len(CHROMA), self.cameras).T @ CHROMA
 
     def vignetting_of(self, k: Float[np.ndarray, " k"]) -> Float[np.ndarray, "c j p"]:
