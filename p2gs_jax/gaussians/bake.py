@@ -143,8 +143,7 @@ def refitted(
 
 def viewer_config(cfg: RenderConfig) -> RenderConfig:
     """Return the options of an ordinary 3DGS viewer: display colours max(0, sh + 1/2)."""
-    standard = {"radiance": "linear", "blur": VIEWER_BLUR}
-    return replace(cfg, **standard, background=None)
+    return replace(cfg, radiance="linear", blur=VIEWER_BLUR, background=None)
 
 
 def refine(
@@ -180,7 +179,9 @@ def refine(
         def loss(trained):
             current = replace(gaussians, **trained)
             result = render_linear(current, _all(current), camera, cfg, capacity, with_depth=False)
-            display = _over(result, background, shown)
+            display = _over(result, background)
+            if shown is not None:
+                display = formation(display, shown.capture, shown.formation)
             return jnp.mean((display - picture / 255.0) ** 2), result
 
         (_, result), gradient = jax.value_and_grad(loss, has_aux=True)(trained)
@@ -242,11 +243,8 @@ def baking_error(
     }
 
 
-def _over(
-    render: Render, background: Float[Array, " 3"], shown: DisplayTransform | None = None
-) -> Float[Array, "h w 3"]:
-    over = render.linear + (1 - render.alpha)[..., None] * background
-    return over if shown is None else formation(over, shown.capture, shown.formation)
+def _over(render: Render, background: Float[Array, " 3"]) -> Float[Array, "h w 3"]:
+    return render.linear + (1 - render.alpha)[..., None] * background
 
 
 def _difference(target: Target, render: Render, shown: DisplayTransform | None) -> dict[str, float]:
