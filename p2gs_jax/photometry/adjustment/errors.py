@@ -39,9 +39,9 @@ SHARED_REGION = 2 / 3  # side of the regions that share an error, in the same un
 # Least number, and least effective number, of a region's points or cells for its shared error.
 FEWEST, FEWEST_EFFECTIVE = 4, 3.0
 
-# Standard deviation of the change of light per doubling of a pixel's width on the surface, log
-# units. A compromise between towns with gloss and without it (BUILD_NOTES, "Error bars").
-FOOTPRINT = 4e-4
+# Standard deviation between clusters of the change of light per doubling of a pixel's width on the
+# surface, log units: 0.001 to 0.0018 in towns (BUILD_NOTES, "Error bars").
+FOOTPRINT = 1e-3
 
 # A linear function of changes of all parameters (columns) about the solution.
 LinearMap = Callable[[Parameters], Float[np.ndarray, "n c"]]
@@ -71,7 +71,8 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
 
     Residuals of the channels of an observation, of a point, and of its neighbours are not
     independent: the meat is summed over clusters. It includes errors that regions of an image
-    share, and light that changes with the footprint, a pixel's width on the surface.
+    share, and light that changes with the footprint, a pixel's width on the surface, in every
+    cluster by another slope.
     """
     layout = fit.model.layout
     clusters = observations.cells
@@ -90,8 +91,8 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
     if observations.footprints is not None and len(layout.row):
         # A change of the data acts through the second derivative of the loss.
         wide = fit.at.curvature * FOOTPRINT * observations.footprints
-        one = _shared_scores(fit.model, fit.theta, fit.at, np.zeros_like(layout.row), wide)
-        scores = sp.csr_array(sp.vstack([scores, one]))
+        slopes = _shared_scores(fit.model, fit.theta, fit.at, clusters, wide)
+        scores = sp.csr_array(sp.vstack([scores, slopes]))
     # A view's exposure is a mean over its clusters and takes one degree of freedom.
     shape = (layout.view_count, int(clusters.max(initial=-1)) + 1)
     shares = sp.csr_array((fit.at.weight.sum(1), (layout.views, clusters)), shape=shape).tocoo()
