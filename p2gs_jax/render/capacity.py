@@ -28,7 +28,7 @@ STEP = 1.25  # ratio of consecutive list lengths
 SMALLEST = 4096  # entries
 
 Result = TypeVar("Result")
-# Renders one view: (gaussians, alive, camera, owner=None), the arguments of `render_linear`.
+# Renders one view: (gaussians, alive, camera), the arguments of `render_linear`.
 RenderView = Callable[..., Render]
 
 
@@ -165,20 +165,14 @@ def make_renderer(
 ) -> RenderView:
     """Return a function that renders one view, and grows its tile lists after an overflow.
 
-    `owners` is the default of its argument `owner`. Views of the image `sizes` are rendered on
+    `owners` are the moving objects of the Gaussians. Views of the image `sizes` are rendered on
     their `canvases`, views of other sizes on their exact size.
     """
-    default_owner = None if owners is None else on_device(owners, np.int32)
+    owner = None if owners is None else on_device(owners, np.int32)
     canvas_of = canvases(sizes)
     capacities: dict[tuple[int, int], int] = {}
 
-    def render_view(
-        gaussians: Gaussians,
-        alive: Bool[Array, " n"],
-        camera: Camera,
-        owner: Int[Array, " n"] | None = None,
-    ) -> Render:
-        owner = default_owner if owner is None else owner
+    def render_view(gaussians: Gaussians, alive: Bool[Array, " n"], camera: Camera) -> Render:
         width, height = camera.width, camera.height
         size = canvas_of.get((width, height), (width, height))
         camera = dataclasses.replace(camera, width=size[0], height=size[1])
