@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from p2gs_jax.core.numerics import LN2
-from p2gs_jax.evaluation.scores import ssim
+from p2gs_jax.evaluation.ssim import ssim
 
 Truth = Callable[[int], Float[np.ndarray, "h w 3"] | None]  # true radiance by row of the view
 

@@ -18,8 +18,7 @@ from jaxtyping import Array, Bool, Float, Float32
 from p2gs_jax.config import LossConfig
 from p2gs_jax.core.text import first_few
 from p2gs_jax.evaluation.lpips import LpipsWeights, lpips
-from p2gs_jax.evaluation.ssim import ssim as _ssim
-from p2gs_jax.evaluation.ssim import ssim_map
+from p2gs_jax.evaluation.ssim import ssim, ssim_map
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.photometry.formation import eotf
 from p2gs_jax.scene.drives.objects import object_mask
@@ -34,8 +33,6 @@ FEWEST_PIXELS = 64
 FEWEST_TELLING = 1e-3
 
 Masks = Mapping[str, Float32[np.ndarray, "h w"]]
-
-ssim = jax.jit(_ssim)
 
 
 class Protocol(NamedTuple):

@@ -144,6 +144,7 @@ def one_less_ssim(ldr: Image, target: Image, mask: Float[Array, "h w"]) -> Float
     return _masked_sum(x, y, mask) / jnp.maximum(3 * jnp.sum(mask), 1.0)
 
 
+@jax.jit
 def ssim(ldr: Image, target: Image, mask: Float[Array, "h w"]) -> Float[Array, ""]:
     """Return the mean SSIM over valid pixels, 1 without any; invalid ones are made black."""
     return 1 - one_less_ssim(ldr, target, mask)
