@@ -228,10 +228,7 @@ class _Views:
         }
         # Names of views without scores, and of photographs with unknown exposures.
         self._unknown: dict[str, list[str]] = {"hidden": [], "exposures_unknown": []}
-        # Readings of training views by name, rows of these views, and readings of held-out views.
-        self._readings: dict[str, Readings] = {}
-        self._metered_rows: list[int] = []
-        self._held_out: dict[int, Readings] = {}
+        self._readings: dict[int, Readings] = {}
         self._scales: dict[int, float] = {}
         self._samples: dict[int, np.ndarray] = {}
 
@@ -251,11 +248,7 @@ class _Views:
             self._samples[index] = found.sample
         if found.scale is not None:
             self._scales[index] = found.scale
-        if view.split == "train":
-            self._metered_rows.append(judge.row_of[index])
-            self._readings[view.name] = found.readings
-        else:
-            self._held_out[index] = found.readings
+        self._readings[index] = found.readings
         self._depths.add(result, found.mask)
         exposure = result.transform.exposure
         self._videos["per_view"].add(view.camera, result.ldr, exposure)
@@ -280,9 +273,12 @@ class _Views:
         if rows["all"]:
             metrics["test"]["photometry_fitted"] = scoring.summary_of(rows["all"])
         logs, gamma = np.log(np.asarray(exposures, float)), judge.mean.gamma
-        names, readings = list(self._readings), list(self._readings.values())
+        trained = [index for index in self._readings if index in judge.row_of]
         metering = fit_metering(
-            names, readings, logs[self._metered_rows], exposed_at(BELOW_WHITE, gamma, tone)
+            [judge.scene.views[index].name for index in trained],
+            [self._readings[index] for index in trained],
+            logs[[judge.row_of[index] for index in trained]],
+            exposed_at(BELOW_WHITE, gamma, tone),
         )
         metrics["consistency"] = {name: video.summary() for name, video in self._videos.items()}
         exposed = exposed_at(judge.cfg.loss.saturation, gamma, tone)
@@ -301,7 +297,8 @@ class _Views:
         if self._scales:
             scale = float(np.exp(np.median(np.log(list(self._scales.values())))))
             common = {"averaged": judge.mean.exposure, "scale_aligned": scale}
-        metered = self._held_out if metering.rule.meter is not None else {}
+        held_out = [index for index in self._readings if index not in judge.row_of]
+        metered = held_out if metering.rule.meter is not None else []
         aligned = None
         if self._samples:
             aligned = Alignment.of(list(self._samples.values()), brightest)
@@ -311,7 +308,7 @@ class _Views:
             rendered, found = self._render(camera_of(judge.store, index)), {}
             linear, alpha = np.asarray(rendered.linear), np.asarray(rendered.alpha)
             if index in metered:
-                exposure = metering.exposure(metered[index])
+                exposure = metering.exposure(self._readings[index])
                 ldr = display.develop(
                     linear, replace(judge.usual(index), exposure=exposure), alpha=alpha
                 )
