@@ -68,7 +68,7 @@ def depth_errors(
     view: View,
     depth: Float32[np.ndarray, "h w"],
     alpha: Float32[np.ndarray, "h w"],
-    mask: Float32[np.ndarray, "h w"] | None = None,
+    mask: Float32[np.ndarray, "h w"],
 ) -> DepthErrors:
     """Return the errors of rendered depth against the LiDAR points near the view's time.
 
@@ -81,9 +81,8 @@ def depth_errors(
     xy, z = project_points(points, view)
     kept = np.flatnonzero(unoccluded(xy, z, view.width, view.height))
     at = np.floor(xy[kept]).astype(int)
-    if mask is not None:
-        counted = mask[at[:, 1], at[:, 0]] > 0
-        kept, at = kept[counted], at[counted]
+    counted = mask[at[:, 1], at[:, 0]] > 0
+    kept, at = kept[counted], at[counted]
     if len(kept) > MOST_POINTS:
         spread = np.linspace(0, len(kept) - 1, MOST_POINTS).astype(int)
         kept, at = kept[spread], at[spread]

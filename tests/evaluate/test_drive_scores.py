@@ -108,14 +108,14 @@ def test_depth_without_a_surface_has_an_infinite_error():
     K = np.array([[10.0, 0, 8], [0, 10, 6], [0, 0, 1]], np.float32)
     view = View("a", None, "a", np.eye(4, dtype=np.float32), K, 16, 12, time=0.01)
     nothing = np.zeros((12, 16), np.float32)
-    found = drives.depth_errors(lidar, (), view, nothing, nothing)
+    found = drives.depth_errors(lidar, (), view, nothing, nothing, nothing + 1)
     assert np.isinf(found.error).all()
     assert drives.summary([found])["static"]["missing"] == 1.0
-    right = drives.depth_errors(lidar, (), view, nothing + 5.2, nothing + 1)
+    right = drives.depth_errors(lidar, (), view, nothing + 5.2, nothing + 1, nothing + 1)
     assert drives.summary([right])["static"]["median_m"] == pytest.approx(0.2, abs=1e-5)
     assert drives.summary([right])["static"]["median_relative"] == pytest.approx(0.04, abs=1e-5)
     assert not len(
-        drives.depth_errors(lidar, (), dataclasses.replace(view, time=1.0), nothing, nothing)[0]
+        drives.depth_errors(lidar, (), dataclasses.replace(view, time=1.0), *[nothing + 1] * 3)[0]
     )
     assert drives.summary([]) == {}
     assert not len(drives.depth_errors(lidar, (), view, nothing, nothing, nothing).error)
