@@ -46,7 +46,6 @@ FEW_TILES, SEGMENTS_PER_LANE = 512, 16
 
 def exponent_scale(alpha_cutoff: float) -> float:
     """Return ln 2: alpha = 2^e, because the hardware computes powers of two."""
-    del alpha_cutoff
     return float(np.log(2.0))
 
 
