@@ -137,8 +137,7 @@ def _check_names(fitted: Run) -> None:
 def _linear_ply(ply: Path, fitted: Run) -> str:
     g, kind = at_time(fitted.as_of(), None), fitted.cfg.photometry.appearance
     sidecar = ply.with_suffix(".json")
-    activation = fitted.cfg.render.radiance
-    count = write_radiance(ply, g, activation=activation)
+    count = write_radiance(ply, g, activation=fitted.cfg.render.radiance)
     content = linear_sidecar(g, fitted.cfg, fitted.scene, fitted.store, fitted.photometry)
     if fitted.lifting_error is not None:
         content["lifting_error"] = fitted.lifting_error
