@@ -18,13 +18,11 @@ from jaxtyping import Array, Bool, Float, Float32
 from p2gs_jax.config import LossConfig
 from p2gs_jax.core.text import first_few
 from p2gs_jax.evaluation.lpips import LpipsWeights, lpips
-from p2gs_jax.evaluation.ssim import ssim, ssim_map
+from p2gs_jax.evaluation.ssim import Image, ssim, ssim_map
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.photometry.formation import eotf
 from p2gs_jax.scene.drives.objects import object_mask
 from p2gs_jax.types import LUMINANCE, Scene
-
-Image = Float[Array, "h w 3"]
 
 PARTS = ("whole", "static", "moving")
 # Parts with fewer pixels have no scores.
