@@ -186,9 +186,7 @@ def _largest_that_fits(room: int, gaussians: Gaussians, order: np.ndarray) -> Pa
     for _ in range(ATTEMPTS):
         if keep < LEAST_SHARE * count:
             return None
-        mask = np.zeros(count, bool)
-        mask[order[:keep]] = True
-        packed = pack(chosen(gaussians, mask))
+        packed = pack(chosen(gaussians, np.sort(order[:keep])))
         if len(packed.data) <= room:
             return packed
         keep = int(keep * room / len(packed.data) * MARGIN)
