@@ -8,7 +8,6 @@ explicit: it needs three blurs after the four blurs of the loss, and autodiff wo
 
 from __future__ import annotations
 
-import functools
 from typing import NamedTuple
 
 import jax
@@ -24,13 +23,9 @@ Image = Float[Array, "h w 3"]
 
 WINDOW, SIGMA = 11, 1.5  # pixels
 C1, C2 = 0.01**2, 0.03**2
-
-
-@functools.cache
-def _kernel() -> tuple[float, ...]:
-    offsets = np.arange(WINDOW) - WINDOW // 2
-    kernel = np.exp(-(offsets**2) / (2 * SIGMA**2))
-    return tuple(float(k) for k in kernel / kernel.sum())
+_GAUSSIAN = np.exp(-((np.arange(WINDOW) - WINDOW // 2) ** 2) / (2 * SIGMA**2))
+# Weights along one axis of the window.
+KERNEL = (_GAUSSIAN / _GAUSSIAN.sum()).tolist()
 
 
 def _blur(maps: Float[Array, "m h w"], always: Bool[Array, ""]) -> Float[Array, "m h w"]:
@@ -38,7 +33,7 @@ def _blur(maps: Float[Array, "m h w"], always: Bool[Array, ""]) -> Float[Array, 
     height, width = maps.shape[-2:]
     margin = WINDOW // 2
     padded = materialize(always, lambda: jnp.pad(maps, ((0, 0), (margin,) * 2, (margin,) * 2)))
-    weights = list(enumerate(_kernel()))
+    weights = list(enumerate(KERNEL))
     across = materialize(
         always, lambda: jnp.asarray(sum(k * padded[:, :, i : i + width] for i, k in weights))
     )
