@@ -144,7 +144,6 @@ class Capacity(NamedTuple):
 
 
 count_needed = jax.jit(required_capacity, static_argnames="cfg")
-"""`required_capacity`, compiled."""
 
 
 @functools.cache
