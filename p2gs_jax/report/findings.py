@@ -117,11 +117,6 @@ def run_warnings(run: RunFiles) -> list[RunWarning]:
     return [*_on_the_run(run), *named, *_on_more_to_gain(run)]
 
 
-# A warning about views: its title, their names from the worst on, and its text with placeholders
-# for `{count}` and `{names}`.
-ViewWarning = tuple[str, list[str], str]
-
-
 def _worst(pairs: Iterable[tuple[str, float]], form: str) -> list[str]:
     """Return names with their numbers, from the largest absolute value on."""
     return [f"{name} {value:{form}}" for name, value in sorted(pairs, key=lambda p: -abs(p[1]))]
@@ -161,7 +156,8 @@ def _on_the_run(run: RunFiles) -> Iterator[RunWarning]:
         )
 
 
-def _on_views(run: RunFiles) -> Iterator[ViewWarning]:
+def _on_views(run: RunFiles) -> Iterator[tuple[str, list[str], str]]:
+    """Yield titles, names of views, the worst first, and texts with `{count}` and `{names}`."""
     yield (
         "Views without an exposure",
         [v["image"] for v in run.train if v["exposure"] is None],

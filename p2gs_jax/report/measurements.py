@@ -50,11 +50,6 @@ class SeamPair:
     second: str
     seam: Seam
 
-    @property
-    def name(self) -> str:
-        """Both names without suffixes."""
-        return f"{without_suffix(self.first)} – {without_suffix(self.second)}"
-
 
 @dataclass
 class SceneMeasurements:
@@ -162,9 +157,10 @@ def seam_section(measured: SceneMeasurements) -> str:
     if measured.picture is not None and measured.shown is not None:
         body += _seam_picture(measured.shown, measured.picture)
     heads = ["pair", *(head for _, head, _ in COLUMNS)]
-    rows = [
-        [p.name, *(format(getattr(p.seam, name), form) for name, _, form in COLUMNS)] for p in seams
-    ]
+    rows = []
+    for p in seams:
+        numbers = [format(getattr(p.seam, name), form) for name, _, form in COLUMNS]
+        rows.append([f"{without_suffix(p.first)} – {without_suffix(p.second)}", *numbers])
     note = (
         "The numbers are median absolute differences over all pixels that both photographs show "
         "according to the rendered depth. Saturated and black pixels do not count."
