@@ -57,11 +57,8 @@ class Panel:
 
     def __init__(self, gui: viser.GuiApi, viewed: ViewedRun, actions: BrowserSession):
         """Add the controls to the page of a client; they call `actions`."""
-        run = viewed.run
         self._gui, self._viewed, self._actions = gui, viewed, actions
-        self._names = [view.name for view in run.scene.views]
-        start = common_settings(run)
-        self._view: int | None = start.view
+        self._names = [view.name for view in viewed.run.scene.views]
         self._status = gui.add_html(note("starting ..."))
         self._training = gui.add_folder("Training", visible=False)
         with self._training:  # a sentence and charts
@@ -73,7 +70,7 @@ class Panel:
             self._add_camera()
         with gui.add_folder("Save", expand_by_default=False):
             self._add_save()
-        self.put(start)
+        self.put(common_settings(viewed.run))
 
     def _slider(
         self, name: str, low: float, high: float, step: float, start: float, **more: Any
@@ -81,8 +78,8 @@ class Panel:
         more = {"marks": (), "hint": HINTS.get(name), **more}
         return self._gui.add_slider(name, low, high, step, start, **more)
 
-    def _dropdown(self, name: str, options: list[str], **more: Any) -> viser.GuiDropdownHandle:
-        return self._gui.add_dropdown(name, options, hint=HINTS.get(name), **more)
+    def _dropdown(self, name: str, options: list[str]) -> viser.GuiDropdownHandle:
+        return self._gui.add_dropdown(name, options, hint=HINTS.get(name))
 
     def _checkbox(self, name: str, start: bool, **more: Any) -> viser.GuiInputHandle[bool]:
         return self._gui.add_checkbox(name, start, hint=HINTS.get(name), **more)
@@ -127,10 +124,9 @@ class Panel:
         self._go_to = self._dropdown("Go to", [NOWHERE, *self._names])
         steps = gui.add_button_group("", ["previous", "next"])
         self.locked = self._checkbox("Lock exposure", False)
-        fov = self._slider("FOV", 5.0, 150.0, 0.5, 60.0)
+        self._fov = self._slider("FOV", 5.0, 150.0, 0.5, 60.0)
         cameras = self._checkbox("Cameras", False)
         legend = gui.add_html(exposure_legend(min(evs), max(evs)), visible=False)
-        self._fov = fov
 
         def choose(name: str) -> None:
             if (index := self._index(name)) is not None:
@@ -147,7 +143,7 @@ class Panel:
 
         self._when_chosen(self._go_to, choose)
         steps.on_click(lambda event: step(event.target.value))
-        self._when_chosen(fov, actions.set_fov)
+        self._when_chosen(self._fov, actions.set_fov)
         self._when_chosen(cameras, show)
 
     def _add_save(self) -> None:

@@ -114,7 +114,7 @@ def split_picture(
     left[:, line:] = False
     out[left] = photograph.ldr[left]
     if first < line < last:
-        out[:, max(line - 1, 0) : line + 1] = LINE
+        out[:, line - 1 : line + 1] = LINE
     return out
 
 

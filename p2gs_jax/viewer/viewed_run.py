@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache, partial
+from functools import partial
 
 import numpy as np
 
@@ -39,11 +39,6 @@ class ViewedRun:
         self._points = points if len(points) else np.asarray(gaussians.means)
         self._centers = camera_centers(np.stack([view.viewmat for view in run.scene.views]))
         self.space = cameras.make_viewer_space(run.scene, self._points)
-        # The distance of the points that a view sees by its row, scene units.
-        views = run.scene.views
-        self.distance = cache(
-            lambda index: cameras.distance_seen(views[index].viewmat, self._points)
-        )
         probes = evenly_spaced(len(run.scene.views), PROBES)
         self.renderer = Renderer(
             gaussians,
@@ -98,4 +93,5 @@ class ViewedRun:
         """
         view = self.run.scene.views[index]
         fov = cameras.fov_that_holds(view, aspect)
-        return cameras.pose_of(view.viewmat, self.space, distance=self.distance(index), fov=fov)
+        distance = cameras.distance_seen(view.viewmat, self._points)
+        return cameras.pose_of(view.viewmat, self.space, distance=distance, fov=fov)
