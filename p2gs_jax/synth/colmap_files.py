@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, UInt8
+from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax.core.streams import SceneStream, generator
@@ -126,11 +127,7 @@ def _observe_seeds(
         u, v = np.round(xy[row].T - 0.5, 6)
         inside = (local[:, 2] > 0.05) & (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
         u, v = np.where(inside, u, 0.0), np.where(inside, v, 0.0)
-        i, j = np.minimum(u.astype(int), width - 2), np.minimum(v.astype(int), height - 2)
-        a, b = u - i, v - j
         inverse = 1.0 / depths[row].astype(np.float64)
-        top = (1 - a) * inverse[j, i] + a * inverse[j, i + 1]
-        bottom = (1 - a) * inverse[j + 1, i] + a * inverse[j + 1, i + 1]
-        interpolated = (1 - b) * top + b * bottom
+        interpolated = map_coordinates(inverse, (v, u), order=1)
         seen[row] = inside & (np.abs(interpolated * z - 1.0) < _DEPTH_TOLERANCE)
     return xy, seen
