@@ -175,7 +175,7 @@ def _check(out: Path, options: dict[str, Any]) -> None:
 
 def _require_free(out: Path) -> None:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise UserError(f"{out} exists and is not an empty folder", fix="name another folder")
+        raise UserError(f"{out} exists and is not an empty folder.", fix="name another folder")
 
 
 def _render_all(
