@@ -39,9 +39,9 @@ class Eval:
 
     def execute(self) -> int:
         """Evaluate the run and rewrite its metrics; options replace the run's options."""
-        from p2gs_jax.cli.tables import print_against, print_metrics, stdout
+        from p2gs_jax.cli.tables import print_against, print_metrics
         from p2gs_jax.core.atomic import write_json
-        from p2gs_jax.core.progress import TerminalReporter
+        from p2gs_jax.core.progress import PlainConsole, TerminalReporter
         from p2gs_jax.evaluation.against import check_renders
         from p2gs_jax.evaluation.evaluate import Judge, evaluate
         from p2gs_jax.evaluation.lpips import read_lpips_weights
@@ -87,7 +87,7 @@ class Eval:
         metrics = _kept(folder.metrics) | metrics
         write_json(folder.metrics, metrics)
         print_metrics(metrics)
-        stdout().print(f"Results: {folder.metrics}", soft_wrap=True)
+        PlainConsole().print(f"Results: {folder.metrics}", soft_wrap=True)
         if others:
             write_json(folder.against, beside)
             remarks = [renders.remark for renders in others.values() if renders.remark]

@@ -42,8 +42,8 @@ class Demo:
 
     def execute(self) -> int:
         """Make a street, fit it, and compare the recovered exposures with the true ones."""
-        from p2gs_jax.cli.tables import print_headline, stdout
-        from p2gs_jax.core.progress import TerminalReporter
+        from p2gs_jax.cli.tables import print_headline
+        from p2gs_jax.core.progress import PlainConsole, TerminalReporter
         from p2gs_jax.core.runtime import use_cores
         from p2gs_jax.pipeline.demo import run_demo
 
@@ -56,7 +56,7 @@ class Demo:
             street = {"frames": self.frames, "width": self.width, "iso_std": self.iso_std}
             result = run_demo(self.out, cfg, seed=self.seed, reporter=reporter, **street)
         true, found = zip(*result.rows, strict=True)
-        stdout().print(
+        PlainConsole().print(
             f"Exposures of {len(true)} views, EV from their mean: true {min(true):+.2f} to "
             f"{max(true):+.2f}, recovered {min(found):+.2f} to {max(found):+.2f}, error "
             f"{result.error['ev']:.3f} RMS and at most {result.error['ev_max']:.3f}."
@@ -99,8 +99,7 @@ class Synth:
         """Make the data set."""
         import time
 
-        from p2gs_jax.cli.tables import stdout
-        from p2gs_jax.core.progress import TerminalReporter
+        from p2gs_jax.core.progress import PlainConsole, TerminalReporter
         from p2gs_jax.synth.settings import image_height
         from p2gs_jax.synth.write import write_street
 
@@ -111,7 +110,7 @@ class Synth:
             height, report = image_height(self.width), reporter.message
             write_street(out, height=height, report=report, **options)
         seconds = time.monotonic() - begin
-        stdout().print(f"{out}, in {seconds:.0f} s. Next: p2gs-jax fit {out}")
+        PlainConsole().print(f"{out}, in {seconds:.0f} s. Next: p2gs-jax fit {out}")
         return 0
 
 
@@ -138,13 +137,13 @@ class Sweep:
         """Run the sweep and print its table; return 1 if a run is not finished."""
         from functools import partial
 
-        from p2gs_jax.cli.tables import make_table, stdout
-        from p2gs_jax.core.progress import TerminalReporter
+        from p2gs_jax.cli.tables import make_table
+        from p2gs_jax.core.progress import PlainConsole, TerminalReporter
         from p2gs_jax.jobs.configs import read_sweep
         from p2gs_jax.jobs.sweep import brief, failures, sweep
         from p2gs_jax.jobs.table import show
 
-        console, wanted = stdout(), dict(vars(read_sweep(self.file)))
+        console, wanted = PlainConsole(), dict(vars(read_sweep(self.file)))
         options = {"out": self.out, "max_parallel": self.jobs}
         wanted |= {name: value for name, value in options.items() if value is not None}
         with TerminalReporter() as reporter:

@@ -62,8 +62,7 @@ class Export:
 
     def execute(self) -> int:
         """Write every requested format."""
-        from p2gs_jax.cli.tables import stdout
-        from p2gs_jax.core.progress import TerminalReporter
+        from p2gs_jax.core.progress import PlainConsole, TerminalReporter
         from p2gs_jax.export.convert import STEPS, convert, require_packages
         from p2gs_jax.run.foreign import ForeignRun, load_run_or_splats
 
@@ -94,7 +93,7 @@ class Export:
                 reporter=reporter,
             )
             for path, text, seconds in written:
-                stdout().print(f"{path}: {text} ({seconds:.1f} s)", soft_wrap=True)
+                PlainConsole().print(f"{path}: {text} ({seconds:.1f} s)", soft_wrap=True)
         return 0
 
 

@@ -206,8 +206,8 @@ class Calibrate:
 
     def execute(self) -> int:
         """Solve the photometry alone; print it as a table."""
-        from p2gs_jax.cli.tables import print_calibration, stdout
-        from p2gs_jax.core.progress import TerminalReporter
+        from p2gs_jax.cli.tables import print_calibration
+        from p2gs_jax.core.progress import PlainConsole, TerminalReporter
         from p2gs_jax.export.develop import Development
         from p2gs_jax.export.trainers import write_for
         from p2gs_jax.pipeline.calibrate import calibrate, calibrate_run, calibrate_stack
@@ -229,7 +229,7 @@ class Calibrate:
         print_calibration(found, out)
         if self.write_for:
             for sentence in write_for(self.write_for, out, found.views):
-                stdout().print(sentence, soft_wrap=True)
+                PlainConsole().print(sentence, soft_wrap=True)
         return 0
 
     @property
@@ -282,14 +282,13 @@ class Inspect:
 
     def execute(self) -> int:
         """Print the contents of the scene."""
-        from p2gs_jax.cli.tables import stdout
-        from p2gs_jax.core.progress import TerminalReporter
+        from p2gs_jax.core.progress import PlainConsole, TerminalReporter
         from p2gs_jax.scene.survey import survey
 
         with TerminalReporter() as reporter:
             reporter.stage("Reading the scene")
             found = survey(self.scene, self.data, reporter.message)
-        console, cameras = stdout(), count_of(len(found.cameras), "camera")
+        console, cameras = PlainConsole(), count_of(len(found.cameras), "camera")
         photographs = count_of(found.photographs, "photograph")
         console.print(f"{self.scene} ({found.format}): {photographs} of {cameras}.", soft_wrap=True)
         console.print(_camera_table(found))

@@ -32,7 +32,7 @@ class View:
 
     def execute(self) -> int:
         """Show the run in the browser until Ctrl-C."""
-        from p2gs_jax.cli.tables import stdout
+        from p2gs_jax.core.progress import PlainConsole
 
         require_viewer()
         import jax
@@ -42,7 +42,7 @@ class View:
 
         check(self.max_width >= 64, "--max-width must be at least 64")
         check_address(self.host, self.port)
-        say = partial(stdout().print, soft_wrap=True)
+        say = partial(PlainConsole().print, soft_wrap=True)
         follower = Follower(self.run, self.scene, with_fit=self.with_fit)
         if goes_on := follower.goes_on:
             jax.config.update("jax_platforms", "cpu")  # the fit uses the GPU's memory
@@ -68,8 +68,7 @@ class Report:
 
     def execute(self) -> int:
         """Write the page; return 1 if a file of the run is broken."""
-        from p2gs_jax.cli.tables import stdout
-        from p2gs_jax.core.progress import TerminalReporter
+        from p2gs_jax.core.progress import PlainConsole, TerminalReporter
         from p2gs_jax.report.report import write_report
         from p2gs_jax.report.run_files import read_run
 
@@ -80,7 +79,7 @@ class Report:
             found = read_run(self.run, self.scene)
             for sentence in found.missing:
                 reporter.message(sentence)
-        stdout().print(f"{page} ({page.stat().st_size / 2**20:.1f} MB)")
+        PlainConsole().print(f"{page} ({page.stat().st_size / 2**20:.1f} MB)")
         return 1 if found.broken else 0
 
 
@@ -98,11 +97,12 @@ class Compare:
 
     def execute(self) -> int:
         """Print the runs side by side, and write the file."""
-        from p2gs_jax.cli.tables import make_table, stdout
+        from p2gs_jax.cli.tables import make_table
         from p2gs_jax.core.atomic import write_text
+        from p2gs_jax.core.progress import PlainConsole
         from p2gs_jax.report.compare import compare_runs, starred, to_markdown
 
-        found, console = compare_runs(self.runs), stdout()
+        found, console = compare_runs(self.runs), PlainConsole()
         for remark in found.remarks:
             console.print(remark)
         for title, rows in found.tables.items():

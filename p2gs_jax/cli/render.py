@@ -85,8 +85,7 @@ class Render:
         import time
 
         from p2gs_jax.cli.frames import panoramas_of, shots_of
-        from p2gs_jax.cli.tables import stdout
-        from p2gs_jax.core.progress import TerminalReporter
+        from p2gs_jax.core.progress import PlainConsole, TerminalReporter
         from p2gs_jax.formats.frames import open_frames, remove_frame
         from p2gs_jax.paths.files import near_scene, read_cameras, write_cameras
 
@@ -119,7 +118,7 @@ class Render:
             if job.shots and not is_video(out):
                 write_cameras(out / "cameras.json", job.shots)
         count, seconds = count_of(job.count, "frame"), time.monotonic() - begin
-        stdout().print(f"{count} in {seconds:.1f} s: {out}", soft_wrap=True)
+        PlainConsole().print(f"{count} in {seconds:.1f} s: {out}", soft_wrap=True)
         return 0
 
 

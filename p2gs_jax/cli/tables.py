@@ -1,4 +1,4 @@
-"""The tables and sentences that commands print as their results."""
+"""The tables and sentences that commands print as their results, on stdout."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from rich.box import HEAVY_HEAD, SIMPLE
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
@@ -32,11 +31,6 @@ LOW_DB = 20.0
 VERDICT_ON_LOW = (
     "This is low: fit for longer (--budget), or read docs/quickstart.md, When something goes wrong."
 )
-
-
-def stdout() -> Console:
-    """Return the console for results; progress and messages go to stderr."""
-    return PlainConsole()
 
 
 def make_table(
@@ -80,12 +74,12 @@ def print_headline(metrics: dict[str, Any], run: Path) -> None:
         lines.insert(1, VERDICT_ON_LOW)
     lines += [f"  p2gs-jax {command.format(where)}" for command in next_ones]
     lines.append(f"Run folder: {run} (open {run / 'summary.png'} first)")
-    stdout().print("\n".join(lines), soft_wrap=True)
+    PlainConsole().print("\n".join(lines), soft_wrap=True)
 
 
 def print_metrics(metrics: dict[str, Any]) -> None:
     """Print all scores of a run, and its seconds."""
-    console, rows = stdout(), []
+    console, rows = PlainConsole(), []
     for protocol in PROTOCOLS.values():
         if "psnr" in (part := part_at(metrics, *protocol.path)):
             rows.append((protocol.views, protocol.shown, *scores(part)))
@@ -132,11 +126,11 @@ def print_calibration(result: Calibration, out: Path) -> None:
         at = f"at {done.exposure_ev:+.2f} EV, {done.written} of them written now"
         lines = [*done.messages, lines[0], f"Developed: {count} {at}.", lines[1]]
         lines.append(f"Scene for other trainers: {done.folder} ({page} shows what was done)")
-    stdout().print("\n".join(lines), soft_wrap=done is not None)
+    PlainConsole().print("\n".join(lines), soft_wrap=done is not None)
 
 
 def _print_solution(result: Calibration, more: Mapping[str, list[str]]) -> None:
-    console, columns = stdout(), {**_exposure_columns(result), **more}
+    console, columns = PlainConsole(), {**_exposure_columns(result), **more}
     rows = zip(*columns.values(), strict=True)
     console.print(
         make_table(tuple(columns), rows, "Exposures in stops from their mean", plain=True)
@@ -227,7 +221,7 @@ def print_against(
             rows.append((label, f"reference, {protocols[name]}", len(part["per_view"]), part))
     columns = ("program", "protocol", "views", "PSNR dB", "SSIM", "LPIPS")
     cells = [(who, how, str(views), *scores(part)) for who, how, views, part in rows]
-    console = stdout()
+    console = PlainConsole()
     console.print(make_table(columns, cells, "Held-out views, beside other programs"))
     for remark in remarks:
         console.print(remark)
