@@ -81,11 +81,10 @@ def slug(name: str) -> str:
 
 
 def write_job(folder: Path, job: Job) -> JobFiles:
-    """Write a job file into an absolute folder, and remove old progress."""
+    """Write a job file into an absolute folder."""
     files = JobFiles(folder / f"{slug(job.name)}.json")
     task, place = f"{job.task.__module__}:{job.task.__qualname__}", str(job.folder.absolute())
     write_json(files.path, {"task": task, "folder": place, "arguments": job.arguments})
-    files.progress.unlink(missing_ok=True)
     return files
 
 
