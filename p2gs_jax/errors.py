@@ -13,7 +13,6 @@ class UserError(Exception):
         self.fix = fix
 
     def __str__(self) -> str:
-        """Return the message followed by the remedy."""
         return self.message if self.fix is None else f"{self.message}\n  To fix it: {self.fix}"
 
 

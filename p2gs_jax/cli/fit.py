@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from p2gs_jax.scene.survey import Survey
 
 Preset = Annotated[PresetName, tyro.conf.arg(metavar="NAME")]
-DevelopedExposure = Annotated[
-    float | Literal["highlights"], tyro.conf.arg(metavar="STOPS|highlights")
-]
 Config = Annotated[FitConfig, tyro.conf.arg(name="")]
 
 
@@ -190,7 +187,9 @@ class Calibrate:
     develop: Literal["8bit", "16bit", "exr"] | None = None
     """Also write DIR/developed: the scene for other trainers, its photographs at one exposure and
     white balance, without vignetting (docs/exports.md)."""
-    exposure_ev: DevelopedExposure = 0.0
+    exposure_ev: Annotated[
+        float | Literal["highlights"], tyro.conf.arg(metavar="STOPS|highlights")
+    ] = 0.0
     """Exposure of developed photographs: stops from the mean exposure; highlights: the largest
     exposure that keeps the highlights of every photograph."""
     masks: bool = True

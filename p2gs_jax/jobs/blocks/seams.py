@@ -72,7 +72,8 @@ def measure_seams(
     for pair in cut.neighbours():
         first, second = (cut.blocks[k] for k in pair)
         both = sorted(set(first.views) & set(second.views))[which]
-        renderers = [_rendering(fitted[k], cfg) for k in pair]
+        fits = [fitted[k] for k in pair]
+        renderers = [partial(make_renderer(cfg), g, jax.numpy.ones(g.capacity, bool)) for g in fits]
         rows = (scene.train_indices[both[k]] for k in evenly_spaced(len(both), MOST_VIEWS))
         found = [_compared(camera_of(store, index), cut, pair, renderers) for index in rows]
         found = [parts for parts in found if len(parts[0]) >= FEWEST_PIXELS]
@@ -83,10 +84,6 @@ def measure_seams(
         medians = (float(np.median(x)) for x in (ratio, np.abs(ratio), depth, np.abs(depth)))
         seams.append(Seam(pair, len(found), len(ratio), *medians))
     return seams
-
-
-def _rendering(gaussians: Gaussians, cfg: RenderConfig) -> Callable[[Camera], Render]:
-    return partial(make_renderer(cfg), gaussians, jax.numpy.ones(gaussians.capacity, bool))
 
 
 def _compared(
