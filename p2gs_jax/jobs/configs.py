@@ -33,9 +33,7 @@ def with_fields(cfg: FitConfig, fields: Mapping[str, Any]) -> FitConfig:
     Raises a UserError if a field (such as `loss.relative_exposure.weight`) does not exist, or if
     its value is not valid.
     """
-    for name, value in fields.items():
-        cfg = with_values(cfg, {name: _checked(cfg, name, value)})
-    return cfg
+    return with_values(cfg, {name: _checked(cfg, name, value) for name, value in fields.items()})
 
 
 def _checked(cfg: FitConfig, whole: str, value: Any) -> Any:

@@ -108,8 +108,7 @@ def _submitit(kind: str, options: dict[str, int | str], folder: Path) -> Iterato
     new = tempfile.mkdtemp(prefix="submitit-", dir=folder)
     os.environ.update(environment())  # submitit starts `python -m`
     try:
-        executor = _executor(new, cluster, options)
-        with _Submitit(executor) as jobs:
+        with _Submitit(_executor(new, cluster, options)) as jobs:
             yield jobs
     finally:
         os.environ.clear()

@@ -117,11 +117,10 @@ def _fit(
         with begun(folder, Paths(Path(root), folder.root), cfg, prepared.decisions):
             result = optimiser.run(prepared, resume=True)
     params, _ = compact(result)
-    count = params.gaussians.capacity
     reporter.stage("Writing files")
     write_radiance(folder.radiance, params.gaussians, activation=cfg.render.radiance)
     counts = {
-        "gaussians": count,
+        "gaussians": params.gaussians.capacity,
         "seed_points": len(block.scene.points),
         "seed_points_outside": len(block.scene.points) - inside,
         "train_views": len(block.scene.views),
