@@ -49,11 +49,15 @@ def _checked(cfg: FitConfig, whole: str, value: Any) -> Any:
     _require_field(record, last, whole)
     hint = typing.get_type_hints(type(record))[last]
     value = tuple(value) if isinstance(value, list) else value
-    if isinstance(value, int) and not isinstance(value, bool) and not _fits(value, hint):
-        value = float(value)
+    if not _fits(value, hint):
+        value = tuple(map(_float, value)) if isinstance(value, tuple) else _float(value)
     if not _fits(value, hint):
         raise UserError(f"{whole} = {value!r} is not valid.", fix=f"write {_allowed(hint)}")
     return value
+
+
+def _float(value: Any) -> Any:
+    return float(value) if type(value) is int else value
 
 
 def _require_field(record: Any, name: str, whole: str) -> None:
@@ -86,6 +90,8 @@ def _allowed(hint: Any) -> str:
         return ", ".join(repr(a) for a in args)
     if origin in (typing.Union, types.UnionType):
         return " or ".join(_allowed(a) for a in args)
+    if origin is tuple:
+        return f"[{', '.join('...' if a is Ellipsis else _allowed(a) for a in args)}]"
     if hint is type(None):
         return '"none"'
     return hint.__name__ if isinstance(hint, type) and not args else str(hint)

@@ -29,10 +29,10 @@ SMALL = with_fields(BASE, FIELDS | {"densify.max_gaussians": 300, "render.sh_deg
 
 def test_fields_are_replaced_by_their_dotted_names():
     fields = {"loss.relative_exposure.weight": 1, "photometry.select": False}
-    cfg = with_fields(BASE, fields | {"train.coarse_to_fine": [0.5], "data.max_width": None})
+    cfg = with_fields(BASE, fields | {"train.coarse_to_fine": [0.5, 1], "data.max_width": None})
     assert cfg.loss.relative_exposure.weight == 1.0
     assert isinstance(cfg.loss.relative_exposure.weight, float)
-    assert cfg.train.coarse_to_fine == (0.5,)
+    assert list(map(repr, cfg.train.coarse_to_fine)) == ["0.5", "1.0"]
     assert not cfg.photometry.select
     assert cfg.optimizer == BASE.optimizer
 
@@ -44,6 +44,7 @@ def test_fields_are_replaced_by_their_dotted_names():
         ("train.steps.more", 1, "leave out the names"),
         ("train.steps", 1.5, "is not valid"),
         ("photometry.curve", "cubic", "'srgb'"),
+        ("render.background", [1, "x", 0], r"write \[float, float, float\]"),
         ("photometry.select", 1, "is not valid"),
     ],
 )
