@@ -71,8 +71,8 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
 
     Residuals of the channels of an observation, of a point, and of its neighbours are not
     independent: the meat is summed over clusters. It includes errors that regions of an image
-    share, and light that changes with the footprint, a pixel's width on the surface, in every
-    cluster by another slope.
+    share. It also includes light that changes with the footprint, a pixel's width on the surface;
+    every cluster has another slope.
     """
     layout = fit.model.layout
     clusters = observations.cells
