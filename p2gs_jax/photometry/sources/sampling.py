@@ -31,7 +31,7 @@ PROJECTED_UNCERTAINTY = 2.0
 # few to compare, their sides are halved.
 CELL, FEWEST_CELLS, MOST_HALVINGS = 0.25, 64, 4
 # Number of pixels above which freed memory is returned after a photograph: 0.4 GB with 12
-# megapixels. With 2 megapixels it is little, and requesting it again took a quarter of the time.
+# megapixels. With 2 megapixels, requesting memory again took a quarter of the time.
 LARGE = 4_000_000
 
 
