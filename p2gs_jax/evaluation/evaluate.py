@@ -228,7 +228,7 @@ class _Views:
         }
         # Names of views without scores, and of photographs with unknown exposures.
         self._unknown: dict[str, list[str]] = {"hidden": [], "exposures_unknown": []}
-        self._readings: dict[int, Readings] = {}
+        self._readings: dict[int, Readings] = {}  # by row of the view
         self._scales: dict[int, float] = {}
         self._samples: dict[int, np.ndarray] = {}
 
@@ -297,8 +297,8 @@ class _Views:
         if self._scales:
             scale = float(np.exp(np.median(np.log(list(self._scales.values())))))
             common = {"averaged": judge.mean.exposure, "scale_aligned": scale}
-        held_out = [index for index in self._readings if index not in judge.row_of]
-        metered = held_out if metering.rule.meter is not None else []
+        held_out = set(self._readings) - set(judge.row_of)
+        metered = held_out if metering.rule.meter is not None else set()
         aligned = None
         if self._samples:
             aligned = Alignment.of(list(self._samples.values()), brightest)

@@ -106,12 +106,15 @@ def stitch(
 ) -> Float32[np.ndarray, "h w c"]:
     """Reproject images to a cylinder: each pixel from the camera that sees it closest to its axis.
 
-    Images have at most 4 channels, and their cameras a common centre; unseen pixels are 0.
+    Images have at most 4 channels, and their cameras a common centre; unseen pixels are 0. Raises a
+    ValueError if an image has another size than its camera.
     """
     rays = cylinder.rays()
     out = np.zeros((*rays.shape[:2], images[0].shape[2]), np.float32)
     best = np.full(rays.shape[:2], -np.inf)
-    for image, shot in zip(images, shots, strict=True):
+    for k, (image, shot) in enumerate(zip(images, shots, strict=True)):
+        if image.shape[:2] != (shot.height, shot.width):
+            raise ValueError(f"image {k} has the size {image.shape[:2]}, unlike its camera")
         local = rays @ shot.viewmat[:3, :3].T
         xy, inside = shot.project(local)
         cosine = local[..., 2] / np.maximum(np.linalg.norm(local, axis=-1), 1e-12)

@@ -84,14 +84,18 @@ class Candidate:
         chance = min(STANDARD_ERRORS * self.deficit_error, LARGEST_CHANCE)
         return self.deficit <= max(chance, SMALLEST_GAIN)
 
+    @property
+    def good(self) -> bool:
+        """Whether it is not clearly worse than the best, or the difference is invisible."""
+        return self.likely or self.difference <= INVISIBLE_DIFFERENCE
+
 
 def choose(candidates: list[Candidate]) -> Candidate:
-    """Return the simplest candidate that is not clearly worse than the best, or not visibly.
+    """Return the simplest candidate that is not clearly worse than the best.
 
     A candidate that is as simple and predicts better is returned instead.
     """
-    good = [c for c in candidates if c.likely or c.difference <= INVISIBLE_DIFFERENCE]
-    simplest = min(good, key=lambda c: c.parameters)
+    simplest = min((c for c in candidates if c.good), key=lambda c: c.parameters)
     # Among equally simple candidates the density decides.
     as_simple = [c for c in candidates if c.parameters <= simplest.parameters]
     return max(as_simple, key=lambda c: c.density)

@@ -123,8 +123,7 @@ class Scope(NamedTuple):
         """Return whether a choice differs from simpler ones and can be solved.
 
         With one physical camera, "per camera" means "for all". A common gamma is then a gauge,
-        unless known exposures fix the power of an unknown curve without a spline. If they fix it,
-        exposures are per view, and a power is free or the curve is known.
+        unless known exposures fix the power of an unknown curve without a spline.
         """
         form, by = choice.form, choice.curve.splines
         exposure, gamma, _ = MODELS[form.model]
@@ -136,8 +135,13 @@ class Scope(NamedTuple):
             and (choice.curve == Curve() or not self.known)
             and (by is None or self.curves)
             and (form.vignetting is None or self.places)
-            and (not self.power or (exposure == "view" and bool(gamma or by or self.known)))
+            and (not self.power or self._free(choice))
         )
+
+    def _free(self, choice: Choice) -> bool:
+        """Return whether exposures are per view, and a power is free or the curve is known."""
+        varies, by = MODELS[choice.form.model], choice.curve.splines
+        return varies.exposure == "view" and bool(varies.gamma or by or self.known)
 
 
 def neighbours(choice: Choice, scope: Scope) -> list[Choice]:

@@ -239,6 +239,11 @@ def _tile_rows(box: Boxes, tile_y: int):
     return first, jnp.where(box.visible, last - first + 1, 0)
 
 
+def _image_row(row: Int[Array, " m"]) -> Int[Array, " m"]:
+    """Return the row of tiles in the image for each row of this core."""
+    return row * cores() + this_core() if cores() > 1 else row
+
+
 def count_entries(splats: Splats2D, width: int, height: int, cfg: RenderConfig) -> Int[Array, ""]:
     """Return the tile-list capacity that a view needs: the larger number of rows and of entries."""
     box = boxes(splats, width, height, cfg)
@@ -246,8 +251,7 @@ def count_entries(splats: Splats2D, width: int, height: int, cfg: RenderConfig) 
     first, rows = _tile_rows(box, cfg.tile[1])
 
     def body(k, total):
-        row = (first + k) * cores() + this_core()
-        lengths = _span(ellipses, row, width, cfg.tile)[1]
+        lengths = _span(ellipses, _image_row(first + k), width, cfg.tile)[1]
         here = jnp.sum(jnp.where(k < rows, lengths, 0).astype(jnp.float32))
         # Each step is exact below 2^24 and the sum saturates.
         return jnp.minimum(total + here.astype(jnp.int32), MOST_ENTRIES)
@@ -298,8 +302,7 @@ def _solve_rows(row, owner, order, ellipses: _Ellipses, used, width: int, tile: 
         ids = order[lax.dynamic_slice(owner, here, (size,))]
         block = table.at[ids].get(mode="promise_in_bounds")
         part = _Ellipses(*(block[:, i] for i in range(len(_Ellipses._fields))))
-        in_image = lax.dynamic_slice(row, here, (size,)) * cores() + this_core()
-        first, lengths = _span(part, in_image, width, tile)
+        first, lengths = _span(part, _image_row(lax.dynamic_slice(row, here, (size,))), width, tile)
         return tuple(
             lax.dynamic_update_slice(a, b, here)
             for a, b in zip(state, (ids, first, lengths), strict=True)

@@ -213,7 +213,7 @@ def rasterize(
     precision, without a tile list), `xla` (lane queue), `pallas` (a GPU block per tile), or None
     for the fastest on this device. The tile list must be complete. Without `with_depth` the depth
     is None, which saves about 5 % of the work. Raises ValueError: the implementation does not
-    exist.
+    exist, or it needs a tile list.
     """
     # The GPU kernels support single precision only.
     name = cfg.implementation or (fastest_here() if radiance.dtype == jnp.float32 else "xla")
@@ -222,7 +222,8 @@ def rasterize(
         return linear, alpha, depth if with_depth else None
     if name not in ("xla", "pallas"):
         raise ValueError(f"{name!r} is not a valid rasterizer: choose reference, xla or pallas")
-    assert tiles is not None
+    if tiles is None:
+        raise ValueError(f"the {name} rasterizer needs a tile list: pass bin_tiles(...)")
     across, down = grid_size(width, height, cfg.tile)
     down = -(-down // cores())
     pixels, scale = cfg.tile[0] * cfg.tile[1], _module(name).exponent_scale(cfg.alpha_cutoff)

@@ -114,9 +114,8 @@ def test_depth_without_a_surface_has_an_infinite_error():
     right = drives.depth_errors(lidar, (), view, nothing + 5.2, nothing + 1, nothing + 1)
     assert drives.summary([right])["static"]["median_m"] == pytest.approx(0.2, abs=1e-5)
     assert drives.summary([right])["static"]["median_relative"] == pytest.approx(0.04, abs=1e-5)
-    assert not len(
-        drives.depth_errors(lidar, (), dataclasses.replace(view, time=1.0), *[nothing + 1] * 3)[0]
-    )
+    later = dataclasses.replace(view, time=1.0)
+    assert not len(drives.depth_errors(lidar, (), later, nothing, nothing, nothing + 1)[0])
     assert drives.summary([]) == {}
     assert not len(drives.depth_errors(lidar, (), view, nothing, nothing, nothing).error)
 

@@ -93,26 +93,27 @@ def _within(
 
 def _neighbours(image: np.ndarray, x: np.ndarray, y: np.ndarray, extreme: np.ufunc) -> np.ndarray:
     """Return the `extreme` of the 3x3 values around pixels, without a copy of the photograph."""
-    height, width = image.shape[:2]
-    flat = image.reshape(height * width, *image.shape[2:])
     found = image[y, x]
     for down, right in itertools.product((-1, 0, 1), repeat=2):
-        rows, columns = np.clip(y + down, 0, height - 1), np.clip(x + right, 0, width - 1)
-        extreme(found, flat.take(rows * width + columns, axis=0), out=found)
+        extreme(found, _pixels(image, x + right, y + down), out=found)
     return found
+
+
+def _pixels(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return values at pixels; positions beyond the border have those at the border."""
+    height, width = image.shape[:2]
+    rows = np.clip(y, 0, height - 1) * width + np.clip(x, 0, width - 1)
+    return image.reshape(height * width, *image.shape[2:]).take(rows, axis=0)
 
 
 def _between(ldr: Float32[np.ndarray, "h w 3"], position: np.ndarray) -> np.ndarray:
     """Return linear values between pixels, at positions [g a b 2]."""
-    height, width = ldr.shape[:2]
-    flat, corner = ldr.reshape(-1, 3), np.floor(position).astype(int)
-    x, y = np.moveaxis(position - corner, -1, 0)[..., None]
+    corner = np.floor(position).astype(int)
+    x, y = np.moveaxis((position - corner).astype(np.float32), -1, 0)[..., None]
     linear = np.zeros((*position.shape[:3], 3), np.float32)
     for down, right in itertools.product((0, 1), repeat=2):
-        columns = np.clip(corner[..., 0] + right, 0, width - 1)
-        rows = np.clip(corner[..., 1] + down, 0, height - 1)
         share = (x if right else 1 - x) * (y if down else 1 - y)
-        linear += share.astype(np.float32) * srgb_decode(flat.take(rows * width + columns, axis=0))
+        linear += share * srgb_decode(_pixels(ldr, corner[..., 0] + right, corner[..., 1] + down))
     return linear
 
 
