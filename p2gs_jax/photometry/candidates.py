@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from p2gs_jax.config import Level
 from p2gs_jax.core.numerics import LN2
-from p2gs_jax.photometry.adjustment.equations import SMALLEST_SCALE, predict
+from p2gs_jax.photometry.adjustment.equations import predict
 from p2gs_jax.photometry.adjustment.errors import clusters_of
 from p2gs_jax.photometry.adjustment.parameters import Forward
 from p2gs_jax.photometry.adjustment.problem import Problem
@@ -53,6 +53,7 @@ INVISIBLE_DIFFERENCE = 1.0
 # The predictive density is a mixture, so that outliers do not decide: share, deviation (log).
 OUTLIERS, OUTLIER_DEVIATION = 0.1, 1.2
 RANGES = 8  # number of ranges of brightness, equal in count, in which prediction errors are scaled
+SMALLEST_ERROR = 0.3  # lower bound of these scales, in units of the stated errors
 
 
 @dataclass(frozen=True)
@@ -283,7 +284,7 @@ def _predict(
         at = np.where(known, np.searchsorted(ranges, y), -1)
         for mine in (at == k for k in np.unique(at[known])):
             scale = 1.4826 * np.median(np.abs(error[mine]) / np.sqrt(variance[mine]))
-            variance[mine] *= max(scale, SMALLEST_SCALE) ** 2
+            variance[mine] *= max(scale, SMALLEST_ERROR) ** 2
 
     def normal(v):
         return -0.5 * error**2 / v - 0.5 * np.log(2 * np.pi * v)

@@ -30,7 +30,7 @@ ISO2 = make_exposures(SMALL, "iso2")
 def test_exposures_are_recovered(outliers, limit):
     s = adjust(observe(DRIVE, ISO4, outliers=outliers))
     assert ev(s) < limit
-    assert abs(s.log_exposures.mean()) < 1e-9
+    assert abs(s.log_exposures.mean()) < 0.0025
     assert s.warnings == ()
     assert abs(s.outliers - outliers) < 0.05
     known = np.isfinite(s.point_log_radiance).all(1)
@@ -241,6 +241,17 @@ def test_points_that_change_between_views_count_for_less():
         fit, _ = solve.solve_model(problem, VIEW_EXPOSURE, Response(), loss=loss)
         errors[loss] = np.std(fit.theta.b[:, 0] / fit.theta.a - np.log(ISO4)) / np.log(2)
     assert errors["whole_points"] < 0.5 * errors["geman_mcclure"], errors
+
+
+def test_small_errors_stand_out_where_colours_are_better_than_stated():
+    """A third of the values are brighter by up to 0.05 stops in later frames; stated is 0.02."""
+    ideal = observe(DRIVE, ISO4, bits=None, noise=0.0)
+    off = np.random.default_rng(0).random(len(ideal.points)) < 0.3
+    frames = ideal.view_count // 3
+    stops = np.where(off, 0.05 * (ideal.views % frames) / frames, 0.0)[:, None]
+    brighter = srgb_encode(np.minimum(srgb_decode(ideal.colors) * np.exp2(stops), 1.0))
+    stated = np.full_like(brighter, 0.02)
+    assert ev(adjust(dataclasses.replace(ideal, colors=brighter, spread=stated))) < 0.0025
 
 
 def test_common_factor_order_and_names_do_not_matter():

@@ -21,7 +21,8 @@ Loss = Literal["l1", "geman_mcclure", "whole_points"]
 GEMAN_MCCLURE = 3.0  # width of the Geman-McClure loss in robust standard deviations
 # Weight of the prior of a point's mean loss, as a number of observations.
 POINT_PRIOR = 5.0
-SMALLEST_SCALE = 0.3  # lower bound of `Weighted.scale`
+# Lower bound of `Weighted.scale`. Towns have 0.1 to 0.3; a bound of 0.3 kept too many outliers.
+SMALLEST_SCALE = 0.1
 MEDIAN_ROWS = 4096  # a median uses fewer than twice this many rows
 LEAST_BENT = 0.2  # least curvature of a point over its weight
 

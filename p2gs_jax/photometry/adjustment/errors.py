@@ -40,8 +40,8 @@ SHARED_REGION = 2 / 3  # side of the regions that share an error, in the same un
 FEWEST, FEWEST_EFFECTIVE = 4, 3.0
 
 # Standard deviation between clusters of the change of light per doubling of a pixel's width on the
-# surface, log units: 0.001 to 0.0018 in towns (BUILD_NOTES, "Error bars").
-FOOTPRINT = 1e-3
+# surface, log units; chosen on towns (BUILD_NOTES, "Error bars").
+FOOTPRINT = 8e-4
 
 # A linear function of changes of all parameters (columns) about the solution.
 LinearMap = Callable[[Parameters], Float[np.ndarray, "n c"]]
