@@ -40,17 +40,30 @@ def photographed(X: np.ndarray, lens: Distortion) -> np.ndarray:
     return cv2.projectPoints(X, ZERO, ZERO, K, c)[0][:, 0]
 
 
+def growth(X: np.ndarray, lens: Distortion) -> np.ndarray:
+    """Return the growth of areas from rays to the photograph; it is negative where a lens folds."""
+    step = 1e-5 * np.eye(3)[:2, None]
+    apart = [photographed(X + s, lens) - photographed(X - s, lens) for s in step]
+    return np.linalg.det(np.stack(apart, -1) / (2e-5 * np.diag(K)[:2, None]))
+
+
 lenses = st.one_of(radial.map(Distortion), fisheye.map(lambda c: Distortion(c, "fisheye")))
 
 
 @settings(max_examples=100, deadline=None)
 @given(lenses)
 @example(Distortion((-0.0625, -0.140625, 0.0, 0.001953125, 0.1171875, 0.0, 0.21875, 0.046875)))
+@example(Distortion((0.0, -0.09375, 0.0, 0.001953125, 0.171875, 0.25, 0.296875, 0.171875)))
 def test_undistortion_inverts_the_lens(lens):
     wide = lens.model == "fisheye"
     X = rays(0.98 * min(_fold_radius(lens), 15.0) if wide else 0.9 * min(_fold_radius(lens), 1.3))
-    found = undistort_points(photographed(X, lens), K, lens)
-    np.testing.assert_allclose(found, (X @ K.T)[:, :2], rtol=2e-5, atol=0.02)
+    shown = photographed(X, lens)
+    found = undistort_points(shown, K, lens)
+    again = np.c_[(found - K[:2, 2]) / np.diag(K)[:2], np.ones(len(found))]
+    np.testing.assert_allclose(photographed(again, lens), shown, atol=0.02)
+    # Tangential terms fold nearly flat lenses: several rays then show the same pixel.
+    clear = wide | (growth(X, lens) > 0.05)
+    np.testing.assert_allclose(found[clear], (X @ K.T)[clear, :2], rtol=2e-5, atol=0.02)
 
 
 def test_beyond_the_fold_and_90_degrees_of_a_fisheye_there_is_no_ray():
