@@ -27,7 +27,7 @@ from p2gs_jax.types import GAMMA_SRGB
 # Points per view for the solution, and for the test of effects that are not modelled; more gain
 # little (BUILD_NOTES, "Exposures from a part").
 PER_VIEW = 4000
-# With thousands of views: largest number of their observations, least number of points per view.
+# With many views: largest number of their observations, least number of points per view.
 MOST_SOLVED, LEAST_PER_VIEW = 3_000_000, 200
 # An observation is an outlier if its weight is below this share of its weight from noise alone.
 IGNORED = 0.25
