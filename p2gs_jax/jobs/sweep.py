@@ -25,7 +25,7 @@ from p2gs_jax.jobs.job import Job, JobState, read_reason, slug
 from p2gs_jax.jobs.run import Runner, run_jobs
 from p2gs_jax.jobs.worker import run_in_process
 from p2gs_jax.pipeline.fit import fit
-from p2gs_jax.pipeline.preflight import Paths, check_run_dir, check_sources
+from p2gs_jax.pipeline.preflight import Paths, check_run_dir, preflight
 from p2gs_jax.presets import from_dict, to_dict
 from p2gs_jax.run.folder import RunFolder, locked
 from p2gs_jax.synth.sensor import read_true_exposures
@@ -72,8 +72,8 @@ def sweep(
     a line per run. `on_look` and `run` are as for `run_jobs`.
 
     Raises:
-        UserError: there is nothing to do, names would share a folder, a folder has other options,
-            another sweep is writing to it, or the engine does not exist.
+        UserError: there is nothing to do, names would share a folder, options are not valid, a
+            folder has other options, another sweep is writing to it, or the engine does not exist.
         Interrupted: a signal arrived; running fits write their checkpoints first.
     """
     scene, out = Path(scene), Path(out)
@@ -125,7 +125,10 @@ def _planned(
         for seed in seeds:
             seeded = with_fields(cfg, {"train.seed": seed})
             folder = out / slug(name) / f"seed_{seed}"
-            check_sources(Paths.of(scene, folder, reference))
+            try:
+                preflight(seeded, Paths.of(scene, folder, reference), resume=True)
+            except UserError as error:
+                raise UserError(f"{name}: {error.message}", fix=error.fix) from error
             if check_run_dir(folder, True, seeded):
                 longer.add(len(jobs))
             arguments = {"scene": str(scene.absolute()), "reference": truth, "fit": to_dict(seeded)}

@@ -111,12 +111,20 @@ def test_a_grid_has_every_combination():
     assert configs["weight None, sh_degree 0"].render.sh_degree == 0
 
 
+def test_a_contradiction_of_options_ends_a_sweep_before_its_first_fit(tmp_path):
+    scene = make_scene(tmp_path / "scene")
+    bad = with_fields(p2gs_jax.preset("paper"), {"photometry.known": "exif"})
+    with pytest.raises(p2gs_jax.UserError, match="bad: .*draws initial exposures"):
+        sweep(scene, tmp_path / "out", {"good": SMALL, "bad": bad})
+    assert not list((tmp_path / "out").iterdir())
+
+
 @pytest.mark.slow
 def test_a_sweep_keeps_finished_runs_and_names_failures(tmp_path):
     scene = make_scene(tmp_path / "scene")
     configs = {
         "good": SMALL,
-        "bad": with_fields(p2gs_jax.preset("paper"), {"photometry.known": "exif"}),
+        "bad": with_fields(SMALL, {"photometry.known": "exif"}),
     }
     reports = []
     result = sweep(scene, tmp_path / "out", configs, seeds=[0, 1], report=reports.append)
@@ -129,7 +137,7 @@ def test_a_sweep_keeps_finished_runs_and_names_failures(tmp_path):
     metrics = json.loads((tmp_path / "out" / "good" / "seed_0" / "metrics.json").read_text())
     assert good["seconds"] == whole_run(metrics["seconds"]) > metrics["seconds"]["optimisation"]
     assert reports[0].endswith(f"{good['seconds']:.0f} s")
-    assert "draws initial exposures" in result.rows[2]["reason"]
+    assert "no photograph carries an exposure time" in result.rows[2]["reason"]
     assert json.loads((tmp_path / "out" / "sweep.json").read_text()) == result.rows
     table = (tmp_path / "out" / "sweep.md").read_text()
     assert "| good | 2 of 2 |" in table
