@@ -114,9 +114,12 @@ def display_transform(fitted: Run, options: Export) -> DisplayTransform:
 
 def check_export(args: Export) -> None:
     """Raise a UserError for values out of range and options without effect."""
+    from p2gs_jax.paths.files import MOST_STOPS
+
     ev, gamma, size = args.exposure_ev, args.gamma, args.size_mb
     check(bool(args.format), "--format needs a format", fix=f"choose from {', '.join(FORMATS)}")
-    check(ev is None or abs(ev) <= 32, "--exposure-ev must be from -32 to 32 stops")
+    why = f"--exposure-ev must be from {-MOST_STOPS:g} to {MOST_STOPS:g} stops"
+    check(ev is None or abs(ev) <= MOST_STOPS, why)
     check(gamma is None or (math.isfinite(gamma) and gamma > 0), "--gamma must be positive")
     check(args.bake_steps is None or args.bake_steps >= 0, "--bake-steps must be at least 0")
     check(size is None or (math.isfinite(size) and size > 0), "--size-mb must be positive")

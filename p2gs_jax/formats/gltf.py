@@ -17,6 +17,7 @@ from jaxtyping import Float32
 from scipy.special import expit
 
 from p2gs_jax.core.atomic import atomic_write
+from p2gs_jax.errors import UserError
 from p2gs_jax.formats.ply import unit_quats
 from p2gs_jax.gaussians.posed import half_turn
 from p2gs_jax.render.harmonics import degree_of
@@ -31,10 +32,11 @@ MAGIC, VERSION, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 def write_gltf(path: Path, gaussians: Gaussians) -> int:
     """Write Gaussians with display colours and COLMAP's axes as `.glb`; return their number.
 
-    Raises ValueError: there are no Gaussians, because glTF forbids an empty accessor.
+    Raises UserError: there are no Gaussians, because glTF forbids an empty accessor.
     """
     if gaussians.capacity == 0:
-        raise ValueError("glTF cannot hold an empty accessor")
+        fix = "choose another format"
+        raise UserError("glTF cannot hold a scene without static Gaussians.", fix=fix)
     columns = _attributes(half_turn(gaussians))
     data = [np.ascontiguousarray(c, "<f4").tobytes() for c in columns.values()]
     starts = np.cumsum([0, *map(len, data)]).tolist()
