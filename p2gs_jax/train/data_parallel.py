@@ -80,8 +80,6 @@ def mesh_of(cfg: FitConfig, devices: Count = 1) -> Mesh | None:
         UserError: JAX sees fewer devices, or the batch is not a multiple of their number.
     """
     count, batch = _counted(devices), cfg.train.batch
-    if batch < 1:
-        raise UserError(f"--train.batch is {batch}, but it must be positive.", fix="give 1 or more")
     if batch == 1 and count == 1:
         return mesh_of_cores()
     if batch % count:

@@ -114,7 +114,7 @@ def test_a_grid_has_every_combination():
 def test_a_contradiction_of_options_ends_a_sweep_before_its_first_fit(tmp_path):
     scene = make_scene(tmp_path / "scene")
     bad = with_fields(p2gs_jax.preset("paper"), {"photometry.known": "exif"})
-    with pytest.raises(p2gs_jax.UserError, match="bad: .*draws initial exposures"):
+    with pytest.raises(p2gs_jax.UserError, match=r"bad: .*draws initial exposures"):
         sweep(scene, tmp_path / "out", {"good": SMALL, "bad": bad})
     assert not list((tmp_path / "out").iterdir())
 

@@ -66,10 +66,7 @@ def test_one_view_on_one_device_needs_no_mesh():
     assert mesh_of(with_fields(FitConfig(), {"train.batch": 3})).size == 1
 
 
-@pytest.mark.parametrize(
-    ("devices", "batch", "words"), [(1000, 1, "not between 1 and"), (1, 0, "--train.batch is 0")]
-)
-def test_wrong_numbers_of_devices_or_views_are_refused(devices, batch, words):
-    with pytest.raises(UserError, match=words) as refused:
-        mesh_of(with_fields(FitConfig(), {"train.batch": batch}), devices)
+def test_more_devices_than_there_are_are_refused():
+    with pytest.raises(UserError, match="not between 1 and") as refused:
+        mesh_of(FitConfig(), 1000)
     assert refused.value.fix
