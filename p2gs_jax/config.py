@@ -79,7 +79,7 @@ class DataConfig:
     allow_missing: bool = False
     """Skip frames whose image file is missing; otherwise the command stops."""
     cache_mb: int = 2048
-    """Memory for decoded photographs, MB; larger sets go into a temporary file."""
+    """Memory for decoded photographs, MB; larger sets go into files in the run's cache/pixels."""
 
 
 @dataclass(frozen=True)
