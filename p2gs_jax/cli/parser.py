@@ -20,7 +20,7 @@ from p2gs_jax.cli.export import Export
 from p2gs_jax.cli.fit import Calibrate, Fit, Inspect
 from p2gs_jax.cli.pages import Compare, Report, View
 from p2gs_jax.cli.render import Render
-from p2gs_jax.cli.shared import COMMANDS_OF_OTHERS, RENAMED, check_option_names
+from p2gs_jax.cli.shared import COMMANDS_OF_OTHERS, check_option_names
 from p2gs_jax.core.text import printable
 from p2gs_jax.errors import UserError
 from p2gs_jax.presets import preset
@@ -52,7 +52,6 @@ def parse(argv: list[str]) -> tuple[str, Any]:
         UserError: there is no such command or preset, or the option is another program's.
         SystemExit: 0 after requested help or version, 2 without a command or with invalid options.
     """
-    argv = _with_new_names(argv)
     first = argv[0] if argv else ""
     if first in HELP or first in (HELP_ALL, ""):
         _print_and_exit(help_text.overview(GROUPS), 0 if first else 2)
@@ -63,19 +62,6 @@ def parse(argv: list[str]) -> tuple[str, Any]:
     if first not in COMMANDS:
         raise _unknown(first)
     return first, _options(first, argv[1:])
-
-
-def _with_new_names(argv: list[str]) -> list[str]:
-    """Return words with current names of commands and options; print a hint for each old name."""
-    out = []
-    for k, word in enumerate(argv):
-        old, equals, value = word.partition("=")
-        new = RENAMED.get(old.replace("_", "-")) if k == 0 or old.startswith("--") else None
-        if new is not None:
-            print(f"p2gs-jax: {old} is now called {new}.", file=sys.stderr)
-            word = new + equals + value
-        out.append(word)
-    return out
 
 
 def _options(name: str, argv: list[str]) -> Any:

@@ -28,16 +28,6 @@ PhotometryFolder = Annotated[
     Path | None,
     tyro.conf.arg(metavar="DIR", help="Output of `calibrate --develop`, for splats trained on it."),
 ]
-# Earlier names of our commands and options; they are still understood.
-RENAMED = {
-    "scene": "inspect",
-    "--exposure-of": "--meter",
-    "--path": "--trajectory",
-    "--known-deviation-ev": "--exposure-sigma",
-    "--max-parallel": "--jobs",
-    "--data.own-car": "--data.ego-mask",
-    "--data.no-own-car": "--data.no-ego-mask",
-}
 SCENE = "the scene's folder itself, without an option"
 # Our names for commands and options of 3DGS, gsplat and nerfstudio.
 COMMANDS_OF_OTHERS = {
@@ -64,20 +54,12 @@ INSTALL_VIEWER = "pip install 'p2gs-jax[viewer]'"
 
 
 def parse_duration(text: str) -> float:
-    """Return the seconds of `90`, `90s`, `5m`, `1h30m` or `1h30`; UserError: anything else.
-
-    A last number below 60 without a unit counts the next smaller unit: `1h30` is 1 h 30 min.
-    """
+    """Return the seconds of `90`, `90s`, `5m` or `1h30m`; UserError: anything else."""
     number = r"([0-9]{1,9}(?:\.[0-9]+)?)"
     match = re.fullmatch(rf"(?:{number}h)?(?:{number}m)?(?:{number}s)?|{number}", text.strip())
-    short = re.fullmatch(r"(?:([0-9]{1,9})h)?(?:([0-9]{1,9})m)?([0-5]?[0-9])", text.strip())
-    if match is not None and match.group():
-        hours, minutes, seconds, bare = (float(n or 0) for n in match.groups())
-    elif short is not None:
-        hours, minutes, bare = (float(n or 0) for n in short.groups())
-        seconds, minutes, bare = (bare, minutes, 0) if short.group(2) else (0, bare, 0)
-    else:
+    if match is None or not match.group():
         raise UserError(f"{text!r} is not a valid duration.", fix=DURATIONS)
+    hours, minutes, seconds, bare = (float(n or 0) for n in match.groups())
     return 3600 * hours + 60 * minutes + seconds + bare
 
 

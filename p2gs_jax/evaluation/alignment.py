@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any, TypedDict
 
 import jax
@@ -14,9 +15,11 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from p2gs_jax.config import PhotometryConfig
+from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.appearance import Correction
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.photometry.formation import Matte, composited, display, formation, uncovered
+from p2gs_jax.synth.sensor import read_true_exposures
 from p2gs_jax.types import Capture
 
 # Stops on each side and steps of the coarse search; golden steps. LOM `low` is 6.6 stops dark.
@@ -74,6 +77,17 @@ def error_of_views(
     pairs = [(v["exposure"], truth.get(v["image"])) for v in views if v["exposure"] is not None]
     known = [(a, b) for a, b in pairs if b is not None and a > 0 and b > 0]
     return None if len(known) < 2 else exposure_error(*np.array(known).T)
+
+
+def true_error(scene: Path, views: Iterable[Mapping[str, Any]]) -> ExposureError | None:
+    """Return the errors of exposures of `photometry.json`; None if the scene has no readable truth.
+
+    A run is valid without it.
+    """
+    try:
+        return error_of_views(views, read_true_exposures(scene))
+    except UserError:
+        return None
 
 
 @functools.partial(jax.jit, static_argnames="cfg")

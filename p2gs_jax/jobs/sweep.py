@@ -17,7 +17,7 @@ from p2gs_jax.core.progress import Reporter
 from p2gs_jax.core.runtime import tune_process, use_compile_cache
 from p2gs_jax.core.text import escaped, markdown_table, parse_json
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluation.alignment import error_of_views
+from p2gs_jax.evaluation.alignment import true_error
 from p2gs_jax.evaluation.scores import PROTOCOLS
 from p2gs_jax.jobs.configs import with_fields
 from p2gs_jax.jobs.engines import LOCAL, check_engine, open_engine
@@ -28,7 +28,6 @@ from p2gs_jax.pipeline.fit import fit
 from p2gs_jax.pipeline.preflight import Paths, check_run_dir, preflight
 from p2gs_jax.presets import from_dict, to_dict
 from p2gs_jax.run.folder import RunFolder, locked
-from p2gs_jax.synth.sensor import read_true_exposures
 
 TABLE, TABLE_TEXT, JOBS = "sweep.json", "sweep.md", "jobs"
 
@@ -241,20 +240,10 @@ def read_row(run: Path, scene: Path) -> dict[str, Any]:
             row[column.name] = value
     seconds = metrics.get("seconds")
     total = whole_run(seconds) if isinstance(seconds, Mapping) else None
-    return row | ({} if total is None else {"seconds": total}) | _exposures(run, scene)
-
-
-def _exposures(run: Path, scene: Path) -> dict[str, float]:
-    """Return the errors of the exposures if the scene has true ones."""
-    try:
-        truth = read_true_exposures(scene)
-    except UserError:
-        truth = {}  # the run is valid without them
-    if not truth:
-        return {}
     views = parse_json((run / "photometry.json").read_text(encoding="utf-8"))["views"]
-    error = error_of_views(views, truth)
-    return {} if error is None else {"ev": error["ev"], "ev_power": error["ev_scale_power"]}
+    if (error := true_error(scene, views)) is not None:
+        row |= {"ev": error["ev"], "ev_power": error["ev_scale_power"]}
+    return row | ({} if total is None else {"seconds": total})
 
 
 def brief(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[str]]]:

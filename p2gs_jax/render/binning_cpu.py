@@ -112,20 +112,6 @@ def _place(keys, rows, values, starts, used):
     return lax.fori_loop(0, used, body, (starts, jnp.zeros_like(keys)))[1]
 
 
-@compiled_loop
-def _place_indirect(digits, order, starts):
-    """Return `order` stably sorted by the digits of the elements that it lists."""
-
-    def body(i, state):
-        cursor, out = state
-        index = _at(order, i)
-        digit = _at(digits, index)
-        cursor = _put(cursor, _at(cursor, digit) + 1, digit)
-        return cursor, _put(out, index, _at(cursor, digit) - 1)
-
-    return lax.fori_loop(0, order.shape[0], body, (starts, jnp.zeros_like(order)))[1]
-
-
 def depth_order(depths: Float[Array, " n"], visible: Bool[Array, " n"]) -> Int[Array, " n"]:
     """Return an exact, stable argsort of positive float32 depths, with invisible ones last."""
     keys, span = depth_keys(depths, visible)
@@ -135,7 +121,8 @@ def depth_order(depths: Float[Array, " n"], visible: Bool[Array, " n"]) -> Int[A
 
         def sort(digits=digits, order=order):
             counts = jnp.zeros(2**DIGIT_BITS, jnp.int32).at[digits].add(1, mode="drop")
-            return _place_indirect(digits, order, jnp.cumsum(counts) - counts)
+            rows = jnp.arange(len(order), dtype=jnp.int32)
+            return _place(digits[order], rows, order, jnp.cumsum(counts) - counts, len(order))
 
         if shift == 0:
             order = sort()

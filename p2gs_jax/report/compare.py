@@ -12,13 +12,12 @@ import numpy as np
 from p2gs_jax.core.clock import whole_run
 from p2gs_jax.core.text import escaped, markdown_table
 from p2gs_jax.errors import UserError
-from p2gs_jax.evaluation.alignment import error_of_views
+from p2gs_jax.evaluation.alignment import true_error
 from p2gs_jax.evaluation.renders_of_others import read_display
 from p2gs_jax.presets import flat
 from p2gs_jax.report.findings import DESCRIPTIONS
 from p2gs_jax.report.run_files import RunFiles, read_run
 from p2gs_jax.report.run_sections import option_text
-from p2gs_jax.synth.sensor import read_true_exposures
 
 
 class TableRow(NamedTuple):
@@ -155,15 +154,9 @@ def _scores(runs: Sequence[RunFiles], same: bool) -> list[TableRow]:
     ]
     for name, path in NUMBERS.items():
         rows += numbers(name, [run.number(*path) for run in runs], path[-1])
-    return rows + numbers("exposure error, RMS, stops", [_true_error(run) for run in runs], "ev")
-
-
-def _true_error(run: RunFiles) -> float | None:
-    try:
-        error = error_of_views(run.train, read_true_exposures(run.scene))
-    except UserError:
-        return None
-    return None if error is None else error["ev"]
+    found = (true_error(run.scene, run.train) for run in runs)
+    errors = [None if error is None else error["ev"] for error in found]
+    return rows + numbers("exposure error, RMS, stops", errors, "ev")
 
 
 def _options(runs: Sequence[RunFiles]) -> list[TableRow]:

@@ -105,21 +105,11 @@ def from_quaternions(
     """
     bad = ~(np.abs(np.linalg.norm(wxyz, axis=1) - 1) < 1e-2) | ~np.isfinite(positions).all(1)
     if bad.any():
-        name = f"{what} number {np.argmax(bad) + 1}"
+        name = what if len(bad) == 1 else f"{what} number {np.argmax(bad) + 1}"
         raise broken(f"{source}:", f"{name} is not a unit quaternion and position")
     if not len(wxyz):
         return np.zeros((0, 4, 4))
     return pose_of(Rotation.from_quat(wxyz, scalar_first=True).as_matrix(), positions)
-
-
-def from_quaternion(
-    wxyz: Float[np.ndarray, " 4"], position: Vector3, source: Path, what: str
-) -> Pose:
-    """Return the matrix of one quaternion and a position; errors as in `from_quaternions`."""
-    if not abs(np.linalg.norm(wxyz) - 1) < 1e-2:
-        raise broken(f"{source}:", f"the rotation of {what} is not a unit quaternion")
-    rotation = Rotation.from_quat(wxyz, scalar_first=True)
-    return rigid(rotation.as_matrix(), position, source, what)
 
 
 def pose_of(

@@ -200,8 +200,9 @@ def test_a_file_that_cannot_grow_is_named(refused, tmp_path, monkeypatch):
 
 def test_durations_are_parsed_or_refused():
     right = {"90": 90, "90s": 90, "5m": 300, "1h30m": 5400, "1m30s": 90, "1.5h": 5400, "0.5": 0.5}
-    right |= {"1h30": 5400, "2h15": 8100, "1h05": 3900, "5m30": 330, "1h2m3": 3723, "1h30s": 3630}
+    right |= {"1h2m3s": 3723, "1h30s": 3630}
     assert {text: parse_duration(text) for text in right} == right
-    for text in ("", "m", "-5m", "5 minutes", "1h90", "1h30.5", "1.5h30", "30s5", "1:30", "1e3"):
+    wrong = ("", "m", "-5m", "5 minutes", "1h30", "5m30", "1.5h30", "30s5", "1:30", "1e3")
+    for text in wrong:
         with pytest.raises(UserError):
             parse_duration(text)

@@ -113,11 +113,7 @@ def test_short_and_long_names_set_the_same_field(which):
         assert getattr(getattr(cfg, group), field) == VALUES.get(name, ("64", 64))[1], name
 
 
-def test_old_names_are_read_with_a_hint_and_the_last_spelling_counts(capsys):
-    name, _ = parse(["scene", "drive"])
-    _, options = parse(["render", "run", "--path=orbit", "--exposure_of", "auto"])
-    assert (name, options.trajectory, options.meter) == ("inspect", "orbit", "auto")
-    assert capsys.readouterr().err.count("is now called") == 3
+def test_the_last_spelling_of_an_option_counts():
     _, options = parse(["fit", "a", "--max-width", "64", "--data.max-width", "32"])
     assert options.config.data.max_width == 32
 

@@ -24,7 +24,7 @@ from tiny_scene import make_scene
 from p2gs_jax import config, read_sweep
 from p2gs_jax.cli import main
 from p2gs_jax.cli.fit import Calibrate, Fit
-from p2gs_jax.cli.parser import COMMANDS, RENAMED, parse
+from p2gs_jax.cli.parser import COMMANDS, parse
 from p2gs_jax.options import check_values
 
 BLOCKS = [block for page in PAGES for block in blocks(page)]
@@ -139,7 +139,7 @@ def check_command(words, where):
 
 
 def check_ours(argv, where):
-    if len(argv) == 1 and argv[0] in (*COMMANDS, *RENAMED):  # the text names a command alone
+    if len(argv) == 1 and argv[0] in COMMANDS:  # the text names a command alone
         return
     try:
         name, options = parse(argv)
@@ -195,6 +195,6 @@ def test_options_in_the_text_exist(page, options):
         if span.startswith("p2gs-jax ") and "..." not in span and "COMMAND" not in span:
             check_command(span.split(), page.name)
         for option in re.findall(r"(?<!\S)--[a-z][\w.-]*", span):
-            known = option.replace("*", "") in options | OTHERS | set(RENAMED)
+            known = option.replace("*", "") in options | OTHERS
             group = option.endswith(".") and any(o.startswith(option) for o in options)
             assert known or group, f"{page.name} speaks of {option}, which does not exist"

@@ -36,7 +36,7 @@ from p2gs_jax.scene.drives.tables import (
     read_scan,
 )
 from p2gs_jax.scene.files import require_inside
-from p2gs_jax.scene.rigid import Pose, from_quaternion, inverse
+from p2gs_jax.scene.rigid import Pose, from_quaternions, inverse
 from p2gs_jax.types import TrackedObject
 
 MARKER = "v1.0-*/sample_data.json"
@@ -167,7 +167,7 @@ def _pose(row: Row, path: Path) -> Pose:
     token = row["token"]
     wxyz = finite_numbers(row["rotation"], path, f"the rotation of {token}", 4)
     position = finite_numbers(row["translation"], path, f"the translation of {token}", 3)
-    return from_quaternion(wxyz, position, path, token)
+    return from_quaternions(wxyz[None], position[None], path, token)[0]
 
 
 def _photographs(drive: _Drive) -> tuple[list[Photograph], list[RigCamera], int]:

@@ -31,7 +31,7 @@ from p2gs_jax.scene.drives.objects import Box, tracks
 from p2gs_jax.scene.drives.recording import Photograph, Recording, RigCamera, Sweep, SweepPoints
 from p2gs_jax.scene.files import image_size, read_json
 from p2gs_jax.scene.lens import intrinsics
-from p2gs_jax.scene.rigid import Pose, from_quaternion, inverse
+from p2gs_jax.scene.rigid import Pose, from_quaternions, inverse
 from p2gs_jax.types import TrackedObject
 
 MARKER = "camera/*/intrinsics.json"
@@ -114,7 +114,7 @@ def _pose(entry: Any, path: Path, frame: int) -> Pose:
         position = tables.finite_numbers((entry["position"][k] for k in "xyz"), path, frame_name)
     except (KeyError, TypeError):
         raise broken(f"{path}:", f"the pose of {frame_name} lacks position or heading") from None
-    return from_quaternion(wxyz, position, path, frame_name)
+    return from_quaternions(wxyz[None], position[None], path, frame_name)[0]
 
 
 def _sweep_times(root: Path) -> Float64[np.ndarray, " k"]:

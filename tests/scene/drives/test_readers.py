@@ -206,7 +206,7 @@ REFUSED = {
     "pandaset": [
         (FRONT / "poses.json", lambda held: {}, "is not a list"),
         (FRONT / "poses.json", lambda held: [NO_HEADING], "the pose of frame 0 lacks"),
-        (FRONT / "poses.json", lambda held: [BENT], "the rotation of frame 0 is not a unit"),
+        (FRONT / "poses.json", lambda held: [BENT], "frame 0 is not a unit"),
         (FRONT / "intrinsics.json", lambda held: {"fx": 60}, "lacks"),
         (FRONT / "timestamps.json", lambda held: ["now", "a", "b"], "entry 0 should be finite"),
         (CUBOIDS, lambda rows: [{"uuid": "a"}], "no column 'position.x'"),
