@@ -241,8 +241,11 @@ def solved(
     """Solve the photometry of some views, and compare it with stated exposures.
 
     Reading began at `begin` (`time.monotonic`); `gauge` describes what fixes the scale if `cfg`
-    names no known exposures. Views without `signal` are not compared.
+    names no known exposures. Views without `signal` are not compared. UserError: there is one view.
     """
+    if len(views) < 2:
+        why = f"there is only {views[0].name}; the exposures of photographs are compared."
+        raise UserError(why, fix="add photographs of the same surfaces")
     sampled = time.monotonic()
     reporter.stage("Photometric bundle adjustment")
     selection = calibrate_observations(observations, options)

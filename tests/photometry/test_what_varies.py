@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from solving import DRIVE, ISO4, PLAIN, adjust, problem_of, rms, select
+from solving import DRIVE, ISO4, PLAIN, adjust, ev, problem_of, rms, select
 from synthetic_drive import make_drive, make_exposures, observe
 
 from p2gs_jax.evaluation.alignment import exposure_error
@@ -262,6 +262,15 @@ def test_values_whose_partners_are_held_out_are_not_used():
     assert alone.any()
     assert problem.usable[~held][alone].any()
     assert not kept.usable[alone].any()
+
+
+def test_points_that_are_seen_twice_tell_what_varies():
+    order = np.argsort(PLAIN.points, kind="stable")
+    sorted_points = PLAIN.points[order]
+    rank = np.arange(len(order)) - np.searchsorted(sorted_points, sorted_points)
+    found = select(PLAIN.picked(np.sort(order[rank < 2]))).solution
+    assert found.model == "view_exposure"
+    assert ev(found) < 0.05
 
 
 def test_sharp_images_do_not_earn_parameters_for_invisible_differences():
