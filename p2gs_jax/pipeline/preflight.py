@@ -24,6 +24,7 @@ from p2gs_jax.evaluation.lpips import LpipsWeights, read_lpips_weights
 from p2gs_jax.evaluation.references import Reference, check_reference, load_reference
 from p2gs_jax.gaussians.population import Coverage, seed_bound
 from p2gs_jax.options import check_values
+from p2gs_jax.photometry.response import KNOTS
 from p2gs_jax.presets import flat, to_dict
 from p2gs_jax.run.decisions import CHOSEN
 from p2gs_jax.run.folder import RunFolder, find, require_free
@@ -122,6 +123,9 @@ def check_options(cfg: FitConfig) -> None:
     if p.appearance == "luminance" and curved:
         why = f"Luminance-GS corrects display values; it does not combine with curve {p.curve!r}."
         raise UserError(why, fix=f"use --preset luminance_gs, or add {random}")
+    if p.curve == "spline" and p.spline is None and p.start != "tracks":
+        why = "the curve 'spline' has no values, because --photometry.start is random."
+        raise UserError(why, fix="add --photometry.start tracks, or --photometry.spline VALUES")
     if not curved and p.start == "tracks":
         why = "the curve 'linear' splats display values; it does not combine with solved exposures."
         fix = "add --photometry.start random, or use the preset ppisp or one of 3dgs*"
@@ -130,8 +134,11 @@ def check_options(cfg: FitConfig) -> None:
 
 
 def check_choice(photometry: PhotometryConfig) -> None:
-    """Raise UserError: an option sets what held-out colours would choose instead."""
-    usual = PhotometryConfig()
+    """Raise UserError: an option sets what held-out colours choose, or a spline lacks values."""
+    usual, spline = PhotometryConfig(), photometry.spline
+    if spline is not None and len(spline) != len(KNOTS):
+        why = f"--photometry.spline has {len(spline)} values, and not {len(KNOTS)}."
+        raise UserError(why, fix="give one for each knot (photometry/response.py)")
     given = [name for name in CHOSEN if getattr(photometry, name) != getattr(usual, name)]
     if photometry.select and photometry.start == "tracks" and given:
         option = f"--photometry.{given[0].replace('_', '-')}"

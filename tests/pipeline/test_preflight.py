@@ -38,6 +38,7 @@ def scene(tmp_path_factory):
     [
         (("--preset", "paper", "--known-exposures", "KNOWN"), "draws initial exposures"),
         (("--preset", "ppisp", "--photometry.curve", "srgb"), "a whole camera"),
+        (("--preset", "paper", "--photometry.curve", "spline"), "'spline' has no values"),
         (("--known-exposures", "KNOWN"), "names none of the"),
         (("--known-exposures", "exif"), "carries an exposure time"),
     ],
@@ -65,6 +66,7 @@ def test_a_refused_option_does_not_lock_the_folder(tmp_path, scene, refused, opt
         ("train.budget_s", -1.0, "--budget must be longer than 0 s"),
         ("densify.max_gaussians", 0, "--gaussians must be at least 1"),
         ("photometry.known_deviation_ev", 0.1, "add --known-exposures FILE"),
+        ("photometry.spline", (1.0, 2.0), "--photometry.spline has 2 values, and not 20"),
     ],
 )
 def test_functions_refuse_what_commands_refuse(tmp_path, scene, command, field, value, words):
