@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -117,9 +118,9 @@ def fit(
         start.cfg = dataclasses.replace(start.cfg, train=cfg.train)
         lock.require()
         finish_s = seconds_to_finish(scene, cfg, weights, reference=truth is not None)
-        with begun(folder, paths, cfg, start.decisions):
-            spent_s = time.monotonic() - begin
-            result = optimiser.run(start, resume=resume, spent_s=spent_s, finish_s=finish_s)
+        with begun(folder, paths, cfg, start.decisions) as write:
+            times = {"spent_s": time.monotonic() - begin, "finish_s": finish_s}
+            result = optimiser.run(start, write, resume=resume, **times)
         params, owner = compact(result, start.scene)
         params = centred(exposures_apart(params), cfg)
         lock.require()
@@ -205,17 +206,24 @@ class Optimiser:
         return chosen
 
     def run(
-        self, start: Prepared, *, resume: bool = False, spent_s: float = 0.0, finish_s: float = 0.0
+        self,
+        start: Prepared,
+        write: Callable[[], None],
+        *,
+        resume: bool = False,
+        spent_s: float = 0.0,
+        finish_s: float = 0.0,
     ) -> TrainResult:
         """Run the optimisation, from the start or from the newest checkpoint.
 
-        Messages of the steps are added to the notes of `start`. `spent_s` seconds of the budget
-        have passed, and `finish_s` seconds are reserved for evaluation and files.
+        `write` is called before the first step, once a checkpoint is read. Messages of the steps
+        are added to the notes of `start`. `spent_s` seconds of the budget have passed, and
+        `finish_s` seconds are reserved for evaluation and files.
         """
         alive = np.ones(start.params.gaussians.capacity, bool)
         params, times = self._custom.among(start.params), {"spent_s": spent_s, "finish_s": finish_s}
         trainer = self._trainer(start, self._reporter)
-        return trainer.run(params, alive, start.owner, resume=resume, **times)
+        return trainer.run(params, alive, start.owner, on_begin=write, resume=resume, **times)
 
     def _trainer(self, start: Prepared, reporter: Reporter) -> Trainer:
         def note(text: str) -> None:
@@ -294,15 +302,17 @@ def account_of(
 
 
 @contextlib.contextmanager
-def begun(folder: RunFolder, paths: Paths, cfg: FitConfig, decisions: Decisions) -> Iterator[None]:
-    """Write the start of a run; remove it if the steps fail before the first checkpoint.
+def begun(
+    folder: RunFolder, paths: Paths, cfg: FitConfig, decisions: Decisions
+) -> Iterator[Callable[[], None]]:
+    """Yield what writes the start of a run; remove it if steps fail before the first checkpoint.
 
     Such a run leaves no files that could be continued or would have to be overwritten.
     """
-    write_start(folder, paths.scene, paths.reference, cfg, decisions)
+    places = (folder, paths.scene, paths.reference)
     try:
         with memory_named():
-            yield
+            yield functools.partial(write_start, *places, cfg, decisions)
     except UserError:
         if not saved_steps(folder.checkpoints):
             for path in (folder.config, folder.decisions):

@@ -130,7 +130,7 @@ class CheckpointStore:
         except BROKEN_ARRAYS as error:
             reason = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
             why = f"The checkpoint {self.folder / str(step)} cannot be read ({reason})."
-            fix = "remove that folder, or start again without --resume"
+            fix = "put a copy in its place, or start again in another folder with --out"
             raise UserError(why, fix=fix) from error
 
     def _check_structure(self, step: int, table: dict[str, list], like) -> None:
@@ -144,7 +144,7 @@ class CheckpointStore:
             why = f"The checkpoint {self.folder / str(step)} belongs to another version or "
             why += f"configuration: {name} is {found}, not {expected}."
             fix = "resume with the version and the configuration of the run, or start again "
-            fix += "without --resume"
+            fix += "in another folder with --out"
             raise UserError(why, fix=fix)
 
 

@@ -128,17 +128,19 @@ class Trainer:
         alive,
         owner=None,
         *,
+        on_begin: Callable[[], None] = lambda: None,
         resume: bool = False,
         spent_s: float = 0.0,
         finish_s: float = 0.0,
     ) -> TrainResult:
         """Optimise until the run is complete, from initial parameters or the newest checkpoint.
 
-        `alive` flags the Gaussians that exist; `owner` is the moving object of each Gaussian. A
-        time budget loses `spent_s` seconds used before the run. It also reserves `finish_s` seconds
-        for evaluation and export, as measured on an unloaded machine. Raises DivergenceError: a
-        loss term or gradient is not finite. Raises UserError: no Gaussian is left, or no checkpoint
-        can be resumed. Raises Interrupted: a signal ended the run; a checkpoint is written first.
+        `alive` flags the Gaussians that exist; `owner` is the moving object of each Gaussian.
+        `on_begin` is called before the first step, once a checkpoint is read. A time budget loses
+        `spent_s` seconds used before the run. It also reserves `finish_s` seconds for evaluation
+        and export, as measured on an unloaded machine. Raises DivergenceError: a loss term or
+        gradient is not finite. Raises UserError: no Gaussian is left, or no checkpoint can be
+        resumed. Raises Interrupted: a signal ended the run; a checkpoint is written first.
         """
         self.slots = strategies.started(self.densification, int(np.sum(np.asarray(alive))))
         state = initial_state(params, alive, self.optimizer, self.slots.slots, owner)
@@ -146,6 +148,7 @@ class Trainer:
         planned = float(train.budget_s or train.steps)
         host = HostState(planned=planned, pace=1.0 / max(train.steps, 1))
         state, host = self.records.begin(state, planned, resume) or (state, host)
+        on_begin()
         # A resumed run with a longer plan may need more slots than its checkpoint has.
         state = grow_state(state, self.step.slots(self.slots.slots))
         # On GPUs the host limits the speed of short steps, which says nothing about evaluation.

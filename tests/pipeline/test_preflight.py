@@ -90,7 +90,8 @@ def test_a_failed_fit_keeps_its_folder_only_if_it_has_a_checkpoint(
     run = tmp_path / "run"
     start = SimpleNamespace(cfg=FitConfig(), decisions=Decisions.as_given(FitConfig()))
 
-    def fail(*args, **kwargs):
+    def fail(self, start, write, **kwargs):
+        write()
         if checkpoint:
             CheckpointStore(run / "checkpoints").save(3, {"a": np.zeros(2)}, {})
         raise error
@@ -204,6 +205,19 @@ def test_a_fit_from_files_is_that_from_memory(finished_run, tmp_path, succeeded,
     assert (run / "radiance.ply").read_bytes() == (finished_run / "radiance.ply").read_bytes()
     assert set(decoded.values()) == {1}
     assert not (run / "cache" / "pixels").exists()
+
+
+def test_a_run_stays_as_it_is_if_its_checkpoints_cannot_be_read(finished_run, tmp_path, refused):
+    run, scene = tmp_path / "run", finished_run.parent / "scene"
+    shutil.copytree(finished_run, run)
+    for path in run.glob("checkpoints/*/state.npz"):
+        content = bytearray(path.read_bytes())
+        content[len(content) // 2] ^= 4
+        path.write_bytes(content)
+    files = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    text = refused("fit", scene, "--out", run, *FIT, "--steps", "70", "--resume")
+    assert "cannot be read" in text
+    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == files
 
 
 def test_a_full_disk_is_exit_2_before_anything_is_fitted(

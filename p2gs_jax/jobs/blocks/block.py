@@ -114,8 +114,8 @@ def _fit(
             optimiser.expect(found, larger=block.exposures.decisions)
         with clock("seeds"):
             prepared = initialise(found, block.exposures, reporter)
-        with begun(folder, Paths(Path(root), folder.root), cfg, prepared.decisions):
-            result = optimiser.run(prepared, resume=True)
+        with begun(folder, Paths(Path(root), folder.root), cfg, prepared.decisions) as write:
+            result = optimiser.run(prepared, write, resume=True)
     params, _ = compact(result)
     reporter.stage("Writing files")
     write_radiance(folder.radiance, params.gaussians, activation=cfg.render.radiance)
