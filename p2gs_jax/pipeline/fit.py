@@ -34,6 +34,7 @@ from p2gs_jax.pipeline.preflight import (
     check_scene,
     memory_named,
     preflight,
+    require_checkpoint,
 )
 from p2gs_jax.pipeline.prepare import Prepared, expected, initialise
 from p2gs_jax.pipeline.snapshots import Snapshots
@@ -109,6 +110,8 @@ def fit(
     pixels = decoded_into(folder.pixels)
     with no_empty_folders(paths.run), locked(paths.run) as lock, pixels, memory_named(), optimiser:
         check_run_dir(paths.run, resume, cfg)  # another run may have ended in the meantime
+        if resume and folder.metrics.exists():
+            require_checkpoint(folder)
         scene = load(paths.scene, paths.run, cfg, reporter, clock)
         truth = check_scene(scene, cfg, paths, weights)
         kept = kept_choice(cfg, folder) if resume else None

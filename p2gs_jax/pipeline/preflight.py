@@ -26,6 +26,7 @@ from p2gs_jax.gaussians.population import Coverage, seed_bound
 from p2gs_jax.options import check_values
 from p2gs_jax.photometry.response import KNOTS
 from p2gs_jax.presets import flat, to_dict
+from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import CHOSEN
 from p2gs_jax.run.folder import RunFolder, find, require_free
 from p2gs_jax.run.read import read_config
@@ -179,6 +180,14 @@ def check_run_dir(run_dir: Path, resume: bool, cfg: FitConfig) -> bool:
         fix += "another folder with --out"
         raise UserError(f"{run_dir} was begun with other options: {'; '.join(other[:6])}.", fix=fix)
     return bool(longer)
+
+
+def require_checkpoint(folder: RunFolder) -> None:
+    """Raise UserError: there is no readable checkpoint from which a finished run could continue."""
+    if CheckpointStore(folder.checkpoints).latest_meta() is None:
+        why = f"{folder.checkpoints} holds no readable checkpoint, so --resume would begin the "
+        why += "finished run anew."
+        raise UserError(why, fix="name another folder with --out")
 
 
 def check_sources(paths: Paths) -> None:

@@ -220,6 +220,17 @@ def test_a_run_stays_as_it_is_if_its_checkpoints_cannot_be_read(finished_run, tm
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == files
 
 
+def test_a_finished_run_without_checkpoints_is_not_begun_anew(finished_run, tmp_path, refused):
+    run, scene = tmp_path / "run", finished_run.parent / "scene"
+    shutil.copytree(finished_run, run, ignore=shutil.ignore_patterns("checkpoints"))
+    text = refused("fit", scene, "--out", run, *FIT, "--resume")
+    assert f"{run}/checkpoints holds no readable checkpoint" in " ".join(text.split())
+    # Neither is it cut into blocks.
+    text = refused("fit", scene, "--out", run, *FIT, "--resume", "--blocks", "2")
+    assert f"{run}/blocks/0/checkpoints holds no readable checkpoint" in " ".join(text.split())
+    assert (run / "metrics.json").exists()
+
+
 def test_a_full_disk_is_exit_2_before_anything_is_fitted(
     finished_run, tmp_path, refused, monkeypatch
 ):

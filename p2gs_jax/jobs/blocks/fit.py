@@ -89,15 +89,19 @@ def fit_blocks(
     weights = preflight.preflight(cfg, paths, resume=resume)
     begin = time.monotonic()
     with no_empty_folders(paths.run), locked(paths.run) as lock:
-        if check_run_dir(paths.run, resume, cfg):
-            # Finished blocks continue as well, even if this process ends before they start.
-            for finished in (paths.run / BLOCKS).glob("*/metrics.json"):
-                finished.unlink()
+        longer = check_run_dir(paths.run, resume, cfg)
         scene = load(paths.scene, paths.run, cfg, reporter)
         plan.check_scene(scene, cfg)
         truth = preflight.check_scene(scene, cfg, paths, weights)
         cut = _cut(scene, cfg, request, paths.run / BLOCKS, reporter)
         if cut is not None:
+            folders = [RunFolder(paths.run / BLOCKS / str(k)) for k in range(len(cut.blocks))]
+            for block in folders if resume and RunFolder(paths.run).metrics.exists() else ():
+                if longer or not block.metrics.exists():
+                    preflight.require_checkpoint(block)
+            for block in folders if longer else ():
+                # Finished blocks continue as well, even if this process ends before they start.
+                block.metrics.unlink(missing_ok=True)
             whole = _Blocks(paths, cfg, request, cut, lock, reporter, on_look)
             with decoded_into(whole.folder.pixels):
                 return whole.fit(scene, truth, weights, begin, true_exposures)
