@@ -18,7 +18,6 @@ from p2gs_jax.config import FitConfig
 from p2gs_jax.core.atomic import no_empty_folders
 from p2gs_jax.core.clock import Stopwatch
 from p2gs_jax.core.progress import Reporter, Silent
-from p2gs_jax.errors import UserError
 from p2gs_jax.gaussians.posed import chosen
 from p2gs_jax.gaussians.seeds import reach
 from p2gs_jax.photometry.appearance import Formation, exposures_apart
@@ -316,7 +315,7 @@ def begun(
     try:
         with memory_named():
             yield functools.partial(write_start, *places, cfg, decisions)
-    except UserError:
+    except Exception:
         if not saved_steps(folder.checkpoints):
             for path in (folder.config, folder.decisions):
                 path.unlink(missing_ok=True)

@@ -1,6 +1,7 @@
 """A refused fit leaves its folder to the next command; memory is estimated before a fit."""
 
 import dataclasses
+import errno
 import shutil
 from collections import Counter
 from types import SimpleNamespace
@@ -81,6 +82,7 @@ def test_functions_refuse_what_commands_refuse(tmp_path, scene, command, field, 
     [
         (DivergenceError("Step 1: no.", fix="lower the learning rates"), "Step 1: no."),
         (MemoryError(), "memory ran out"),
+        (OSError(errno.ENOSPC, "No space left on device"), "No space left"),
         (JaxRuntimeError("RESOURCE_EXHAUSTED: 9 bytes\nat f"), "--gaussians"),
     ],
 )
