@@ -38,6 +38,14 @@ def raised() -> contextlib.AbstractContextManager[None]:
     return _handled_by(_raise)
 
 
+def install_again() -> None:
+    """Install the handlers that Python knows again, after a library has replaced them unseen."""
+    if threading.current_thread() is threading.main_thread():
+        for number in SIGNALS:
+            if (handler := signal.getsignal(number)) is not None:
+                signal.signal(number, handler)
+
+
 class Held:
     """Signals that wait until the program has reached a point from which it can continue.
 

@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float
 from PIL import ExifTags, Image
 
 from p2gs_jax.core.atomic import atomic_folder, atomic_write, write_json, write_text
+from p2gs_jax.core.colmap import pycolmap
 from p2gs_jax.core.ply import header_of
 from p2gs_jax.photometry.observations import grouped
 from p2gs_jax.run.photometry_files import ViewPhotometry

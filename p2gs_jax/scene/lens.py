@@ -116,7 +116,7 @@ def undistortion_maps(
 
 def colmap_camera(K: Float[np.ndarray, "3 3"], distortion: Distortion) -> Any:
     """Return pycolmap's camera with K and one of COLMAP's lenses; it has no size."""
-    import pycolmap  # scenes with other lenses do not need it
+    from p2gs_jax.core.colmap import pycolmap  # scenes with other lenses do not need it
 
     (fx, _, cx), (_, fy, cy), _ = np.asarray(K, np.float64)
     params = [fx, fy, cx, cy, *distortion.coefficients]

@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 
 import pytest
@@ -72,6 +74,25 @@ def test_handlers_of_other_programs_stay():
             assert waiting.arrived is None
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+CHILD = """
+import os, signal, time
+from p2gs_jax.core import interrupts
+try:
+    with interrupts.raised():
+        import p2gs_jax.scene.sfm.map
+        import p2gs_jax.export.folders
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(5)
+except interrupts.Interrupted:
+    print("raised")
+"""
+
+
+def test_the_handlers_stay_when_pycolmap_is_imported():
+    done = subprocess.run([sys.executable, "-c", CHILD], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "raised\n", "")
 
 
 def test_other_threads_set_no_handlers():

@@ -16,11 +16,11 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float
 
 from p2gs_jax.config import Matching
 from p2gs_jax.core.atomic import write_json
+from p2gs_jax.core.colmap import pycolmap
 from p2gs_jax.core.memory import left_to_process
 from p2gs_jax.core.text import natural
 from p2gs_jax.core.threads import available_cores

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 
 from p2gs_jax.config import DataConfig, Matching
 from p2gs_jax.core.atomic import write_json
+from p2gs_jax.core.colmap import pycolmap
 from p2gs_jax.core.text import count_of
 from p2gs_jax.errors import UserError, broken
 from p2gs_jax.scene import files
