@@ -1,9 +1,8 @@
 """pycolmap under Python's handlers of signals: its import replaces the handler of SIGTERM."""
 
-import pycolmap
-
 from p2gs_jax.core import interrupts
 
-__all__ = ["pycolmap"]
+with interrupts.kept():
+    import pycolmap
 
-interrupts.install_again()
+__all__ = ["pycolmap"]

@@ -6,13 +6,18 @@ Outside the main thread Python delivers no signals, and these functions have no 
 
 from __future__ import annotations
 
+import _thread
 import contextlib
 import signal
+import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from types import FrameType
+from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+AGAIN_S = 0.1  # after which a signal is sent again that could not end the program
 
 
 class Interrupted(KeyboardInterrupt):
@@ -34,16 +39,28 @@ def exit_code(error: KeyboardInterrupt) -> int:
 
 
 def raised() -> contextlib.AbstractContextManager[None]:
-    """Let signals that end a program raise `Interrupted` within a `with` block."""
+    """Let signals that end a program raise `Interrupted` within a `with` block.
+
+    An import is completed first.
+    """
     return _handled_by(_raise)
 
 
-def install_again() -> None:
-    """Install the handlers that Python knows again, after a library has replaced them unseen."""
-    if threading.current_thread() is threading.main_thread():
+@contextlib.contextmanager
+def kept() -> Iterator[None]:
+    """Install Python's handlers again after a `with` block in which a library replaces them.
+
+    Signals to this thread wait until then.
+    """
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    try:
+        yield
+    finally:
         for number in SIGNALS:
-            if (handler := signal.getsignal(number)) is not None:
+            handler = signal.getsignal(number)
+            if threading.current_thread() is threading.main_thread() and handler is not None:
                 signal.signal(number, handler)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 class Held:
@@ -67,10 +84,12 @@ class Held:
             raise Interrupted(number)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        # A second signal ends the program at once.
-        if not self._holding or self.arrived is not None:
-            raise Interrupted(number)
-        self.arrived = number
+        if not self._holding:
+            _raise(number, frame)
+        elif self.arrived is not None:
+            raise Interrupted(number)  # a second signal ends the program at once
+        else:
+            self.arrived = number
 
 
 @contextlib.contextmanager
@@ -87,15 +106,38 @@ def held() -> Iterator[Held]:
 
 
 def _raise(number: int, frame: FrameType | None) -> None:
+    # Libraries turn an exception during their import into another one, or drop it.
+    while frame is not None:
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+            return _send_later(number)
+        frame = frame.f_back
     raise Interrupted(number)
+
+
+def _send_later(number: int) -> None:
+    def send() -> None:
+        time.sleep(AGAIN_S)
+        signal.pthread_kill(threading.main_thread().ident or 0, number)
+
+    # A handler may interrupt the start of a `threading.Thread`, and must not wait for its lock.
+    _thread.start_new_thread(send, ())
 
 
 @contextlib.contextmanager
 def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
-    before = {}
+    before, report = {}, sys.unraisablehook
+
+    def dropped(unraisable: Any) -> None:
+        # Python drops exceptions in callbacks of garbage collection; JAX has one.
+        if isinstance(unraisable.exc_value, Interrupted):
+            _send_later(unraisable.exc_value.number)
+        else:
+            report(unraisable)
+
     if threading.current_thread() is threading.main_thread():
         replaced = (signal.SIG_DFL, signal.default_int_handler, _raise)
         before = {n: signal.getsignal(n) for n in SIGNALS if signal.getsignal(n) in replaced}
+        sys.unraisablehook = dropped
     for number in before:
         signal.signal(number, handler)
     try:
@@ -103,3 +145,5 @@ def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[No
     finally:
         for number, former in before.items():
             signal.signal(number, former)
+        if sys.unraisablehook is dropped:
+            sys.unraisablehook = report

@@ -1,10 +1,13 @@
 """Signals that end a program raise `Interrupted`, at once or when the program can continue."""
 
+import gc
+import importlib
 import os
 import signal
 import subprocess
 import sys
 import threading
+import time
 
 import pytest
 
@@ -63,6 +66,41 @@ def test_a_held_signal_waits_until_the_program_can_be_continued(
         work()
     assert trace == [TERM, "end of the block"][:reached]
     assert stop.value.number == raised
+
+
+def test_a_signal_that_garbage_collection_drops_is_sent_again():
+    sent = []
+
+    def callback(phase, info):
+        if not sent:
+            sent.append(phase)
+            send()
+
+    def work():
+        gc.callbacks.append(callback)
+        try:
+            gc.collect()
+            time.sleep(5)
+        finally:
+            gc.callbacks.remove(callback)
+
+    with pytest.raises(interrupts.Interrupted), interrupts.raised():
+        work()
+
+
+def test_a_signal_waits_for_the_end_of_an_import(tmp_path, monkeypatch):
+    code = "import os\ntry:\n    os.kill(os.getpid(), 15)\n"
+    code += "except BaseException as error:\n    raise ImportError from error\ncomplete = True\n"
+    (tmp_path / "signalled_module.py").write_text(code)
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def work():
+        importlib.import_module("signalled_module")
+        time.sleep(5)
+
+    with pytest.raises(interrupts.Interrupted), interrupts.raised():
+        work()
+    assert sys.modules.pop("signalled_module").complete
 
 
 def test_handlers_of_other_programs_stay():
