@@ -24,14 +24,12 @@ from p2gs_jax.core.atomic import readable
 from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.core.streams import SceneStream, generator
 from p2gs_jax.errors import UserError
-from p2gs_jax.synth.settings import Curve, Sensor
+from p2gs_jax.synth.settings import MOST_LOST, Curve, Sensor
 
 ISO_REFERENCE, ISO_MINIMUM = 8, 1
 # Variances of photon noise per unit of exposed radiance, and of read noise.
 SHOT_NOISE, READ_NOISE = 2e-4, 1e-6
 DRIFT_PERIODS = 1.3  # of the automatic exposure in a drive
-# Largest share of the light that a drawn lens loses in its corners.
-MOST_LOST = 0.8
 FILE = Path("truth", "exposures.csv")
 COLUMNS = (
     *("image", "camera", "iso", "exposure", "exposure_ev"),

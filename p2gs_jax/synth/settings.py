@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
+
+from p2gs_jax.errors import UserError
 
 Curve = Literal["srgb", "power", "filmic"]
 Layout = Literal["street", "town", "long"]
 # Size of the paper's images, pixels.
 IMAGE_WIDTH, IMAGE_HEIGHT = 1920, 1300
+# Largest share of the light that a lens loses in its corners.
+MOST_LOST = 0.8
 
 
 def image_height(width: int, *, multiple: int = 1) -> int:
@@ -42,3 +47,26 @@ class Sensor:
     """Standard deviation of each channel's gain per photograph, stops."""
     noise: float = 0.0
     """Factor on photon and read noise; 1: a small sensor in daylight."""
+
+
+# Smallest and largest values of the numbers of a Sensor.
+BOUNDS = {
+    "iso_std": (0, 1000),
+    "camera_gain_ev": (0, 10),
+    "drift_ev": (0, 10),
+    "compensation_ev": (-20, 20),
+    "vignetting": (0, MOST_LOST),
+    "vignetting_spread": (0, 1),
+    "white_balance_ev": (0, 10),
+    "white_balance_drift_ev": (0, 10),
+    "noise": (0, 1000),
+}
+
+
+def check_sensor(sensor: Sensor, prefix: str) -> None:
+    """Raise UserError if a number is not finite or out of its range; its option has a prefix."""
+    for name, (least, most) in BOUNDS.items():
+        value = getattr(sensor, name)
+        if not (math.isfinite(value) and least <= value <= most):
+            option = f"{prefix}{name.replace('_', '-')}"
+            raise UserError(f"{option} is {value}, but must be from {least} to {most}.")

@@ -32,7 +32,7 @@ from p2gs_jax.synth.colmap_files import DriveViews, sample_seeds, write_seeds
 from p2gs_jax.synth.furnish import build_town
 from p2gs_jax.synth.rig import MOUNTS, camera_viewmat, drive, intrinsics
 from p2gs_jax.synth.sensor import ISO_REFERENCE, Shots, draw_shots, photograph, write_true_exposures
-from p2gs_jax.synth.settings import Layout, Sensor
+from p2gs_jax.synth.settings import Layout, Sensor, check_sensor
 from p2gs_jax.synth.town import STREET_END, Town
 from p2gs_jax.synth.tracer import Tracer
 
@@ -77,7 +77,9 @@ def write_street(
 
     UserError: a parameter is not valid, or `out` is not free.
     """
+    prefix = "--" if sensor is None else "--sensor."
     out, sensor = Path(out), sensor or Sensor(iso_std=iso_std)
+    check_sensor(sensor, prefix)
     supersample = (8 if matte else 2) if supersample is None else supersample
     options = {
         **{"seed": seed, "frames": frames, "width": width, "height": height},
@@ -153,14 +155,13 @@ def _photograph(
 
 
 def _check(out: Path, options: dict[str, Any]) -> None:
-    frames, width, height, samples, std, step = (
-        options[name] for name in ("frames", "width", "height", "supersample", "iso_std", "step_m")
+    frames, width, height, samples, step = (
+        options[name] for name in ("frames", "width", "height", "supersample", "step_m")
     )
-    if frames < 1 or width < 16 or height < 16 or std < 0 or samples < 1:
+    if frames < 1 or width < 16 or height < 16 or samples < 1:
         why = f"{frames} frames of {width}x{height} pixels with {samples} samples along each axis "
-        why += f"and an ISO spread of {std} cannot be rendered."
-        fix = "use at least 1 frame, 16x16 pixels, 1 sample, and a spread of 0 or more"
-        raise UserError(why, fix=fix)
+        why += "cannot be rendered."
+        raise UserError(why, fix="use at least 1 frame, 16x16 pixels and 1 sample")
     if options["seed"] < 0 or options["points_sampled"] < 1:
         why = f"seed {options['seed']} and {options['points_sampled']} seed points cannot be used."
         raise UserError(why, fix="use a seed of 0 or more, and at least 1 point")
