@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 from typing import Any
+
+from p2gs_jax.errors import broken
 
 # Control characters except tab and newline, surrogates, and marks of the direction of writing.
 _HIDDEN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -67,6 +70,24 @@ def parse_json(text: str) -> Any:
         raise json.JSONDecodeError("nested too deeply", text, 0) from None
     except ValueError as error:
         raise json.JSONDecodeError(str(error), text, 0) from None
+
+
+def read_csv(
+    path: Path, lines: Iterable[str]
+) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
+    """Return the columns of the table in a file, and its rows by column with their line numbers.
+
+    Raises UserError: a row has more fields than the header. Raises csv.Error: see `csv.reader`.
+    """
+    reader, rows = csv.reader(lines), []
+    names = [name.strip() for name in next((row for row in reader if row), [])]
+    for fields in reader:
+        if any(fields[len(names) :]):
+            why = f"has {len(fields)} fields, the header {len(names)}"
+            raise broken(f"{path}, line {reader.line_num}:", why, "write decimal points")
+        if fields:
+            rows.append((reader.line_num, dict(zip(names, fields, strict=False))))
+    return names, rows
 
 
 # The most frequent characters with a meaning in Markdown, or in HTML within it.

@@ -6,7 +6,6 @@ exposure. `photometry.json` of the same folder has the exposure of every origina
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property
@@ -18,7 +17,7 @@ import numpy as np
 from p2gs_jax.config import DataConfig, FitConfig, PhotometryConfig, RenderConfig
 from p2gs_jax.core.atomic import readable
 from p2gs_jax.core.numerics import evenly_spaced, on_device
-from p2gs_jax.core.text import count_of, first_few
+from p2gs_jax.core.text import count_of, first_few, read_csv
 from p2gs_jax.errors import UserError, broken
 from p2gs_jax.formats.splats import read_splats
 from p2gs_jax.gaussians import bake
@@ -172,7 +171,8 @@ def common_look(folder: Path, saved: photometry_files.PhotometryFile) -> Display
     if path.is_file():
         fix = "repeat `p2gs-jax calibrate ... --develop`"
         with readable(path, fix):
-            rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+            lines = path.read_text(encoding="utf-8").splitlines()
+            rows = [row for _, row in read_csv(path, lines)[1]]
             row, exposures = rows[0], [view["exposure"] for view in saved["views"]]
             known = [(r["original_ev"], e) for r, e in zip(rows, exposures, strict=True) if e]
             common = replace(common, exposure=2.0 ** float(row["ev"]))

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.core.numerics import LN2
+from p2gs_jax.core.text import read_csv
 from p2gs_jax.errors import UserError, broken
 from p2gs_jax.types import View
 
@@ -122,12 +123,8 @@ def _read(path: Path) -> dict[str, float]:
         fix = "name a CSV file with the columns image and ev, or exif"
         raise broken(path, why, fix) from error
     lines = ["" if line.startswith("#") else line.strip() for line in text.splitlines()]
-    first = next((k for k, line in enumerate(lines) if line), 0)
-    reader = csv.DictReader(lines[first:])
     try:
-        names = [n.strip() for n in reader.fieldnames or []]
-        reader.fieldnames = names
-        rows = [(first + reader.line_num, row) for row in reader]
+        names, rows = read_csv(path, lines)
     except csv.Error as error:
         raise broken(path, f"is not a CSV file: {error}.", "write it again") from None
     kind = next((n for n in KINDS if n in names), None)
@@ -137,7 +134,7 @@ def _read(path: Path) -> dict[str, float]:
         raise broken(path, why, f"it needs `image` and one of {', '.join(KINDS)}")
     out = {}
     for number, row in rows:
-        if not (text := row[kind] or "").strip():
+        if not (text := row.get(kind, "")).strip():
             continue
         try:
             value = float(text)
@@ -150,7 +147,7 @@ def _read(path: Path) -> dict[str, float]:
         if not np.isfinite(log):
             fix = "write a finite number, above 0 for exposures"
             raise broken(f"{path}, line {number}:", f"{kind} is {text!r}.", fix)
-        if out.setdefault(image := (row[name] or "").strip(), log) != log:
+        if out.setdefault(image := row.get(name, "").strip(), log) != log:
             fix = "keep only one of its lines"
             raise broken(f"{path}, line {number}:", f"{image} has two exposures", fix)
     return out

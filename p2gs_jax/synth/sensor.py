@@ -23,6 +23,7 @@ from jaxtyping import Float, Int, UInt8
 from p2gs_jax.core.atomic import readable
 from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.core.streams import SceneStream, generator
+from p2gs_jax.core.text import read_csv
 from p2gs_jax.errors import UserError
 from p2gs_jax.synth.settings import MOST_LOST, Curve, Sensor
 
@@ -160,7 +161,7 @@ def write_true_exposures(root: Path, names: Sequence[str], shots: Shots) -> None
 def read_true_exposures(root: Path) -> dict[str, float]:
     """Return true exposures by image name; empty if the scene folder has no such file.
 
-    Raises UserError: the file lacks a column, or a value is not a number.
+    Raises UserError: the file lacks a column, a row has too many fields, or a value is not a number.
     """
     path = root / FILE
     if not path.is_file():
@@ -169,4 +170,4 @@ def read_true_exposures(root: Path) -> dict[str, float]:
         readable(path, "correct or remove the file: only the evaluation uses it"),
         path.open(newline="", encoding="utf-8-sig") as file,
     ):
-        return {row["image"]: float(row["exposure"]) for row in csv.DictReader(file)}
+        return {row["image"]: float(row["exposure"]) for _, row in read_csv(path, file)[1]}
