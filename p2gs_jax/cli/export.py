@@ -114,7 +114,7 @@ def display_transform(fitted: Run, options: Export) -> DisplayTransform:
 
 def check_export(args: Export) -> None:
     """Raise a UserError for values out of range and options without effect."""
-    from p2gs_jax.paths.files import MOST_STOPS
+    from p2gs_jax.options import MOST_STOPS
 
     ev, gamma, size = args.exposure_ev, args.gamma, args.size_mb
     check(bool(args.format), "--format needs a format", fix=f"choose from {', '.join(FORMATS)}")

@@ -165,7 +165,8 @@ def _default_name(options: Render, scene: Scene) -> str:
 
 
 def _check_picture(o: Render) -> None:
-    from p2gs_jax.paths.files import LARGEST, MOST_STOPS
+    from p2gs_jax.options import MOST_STOPS
+    from p2gs_jax.paths.files import LARGEST
 
     path, ev, one = o.trajectory, o.exposure_ev, "leave one of them out"
     valid = path in PATHS or path.lower().endswith(".json")

@@ -13,11 +13,11 @@ import numpy as np
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
+from p2gs_jax.options import MOST_STOPS
 from p2gs_jax.paths.shots import LARGEST, Shot, checked_lens, checked_pose
 from p2gs_jax.scene.rigid import camera_centers, pose_of
 
 FIELDS = ("name", "viewmat", "K", "width", "height", "exposure_ev", "gamma", "time")
-MOST_STOPS = 60.0  # from the mean exposure, up or down
 # Smallest and largest values of optional fields; exposures in stops, times in seconds.
 LIMITS = {"exposure_ev": (-MOST_STOPS, MOST_STOPS), "gamma": (1e-3, 1e3)}
 LIMITS["time"] = (-math.inf, math.inf)

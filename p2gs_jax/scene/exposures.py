@@ -13,6 +13,7 @@ from jaxtyping import Float
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.core.text import read_csv
 from p2gs_jax.errors import UserError, broken
+from p2gs_jax.options import MOST_STOPS
 from p2gs_jax.types import View
 
 KINDS = ("ev", "exposure", "rel_exposure_ev", "exposure_time_s")
@@ -150,4 +151,9 @@ def _read(path: Path) -> dict[str, float]:
         if out.setdefault(image := row.get(name, "").strip(), log) != log:
             fix = "keep only one of its lines"
             raise broken(f"{path}, line {number}:", f"{image} has two exposures", fix)
+    mean = float(np.mean([*out.values()])) if out else 0.0
+    image = max(out, key=lambda image: abs(out[image] - mean), default="")
+    if image and abs(stops := (out[image] - mean) / LN2) > MOST_STOPS:
+        why = f"the exposure of {image} is {stops:+g} stops from the mean"
+        raise broken(f"{path}:", why, f"write exposures within {MOST_STOPS:g} stops of the mean")
     return out

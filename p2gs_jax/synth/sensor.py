@@ -161,7 +161,7 @@ def write_true_exposures(root: Path, names: Sequence[str], shots: Shots) -> None
 def read_true_exposures(root: Path) -> dict[str, float]:
     """Return true exposures by image name; empty if the scene folder has no such file.
 
-    Raises UserError: the file lacks a column, a row has too many fields, or a value is not a number.
+    Raises UserError: the file lacks a column, a row is too long, or a value is not a number.
     """
     path = root / FILE
     if not path.is_file():

@@ -82,6 +82,7 @@ def test_exposures_of_exif_are_read():
     [
         ("image,value\na.png,1\n", "columns image, value"),
         ("image,exposure\na.png,-1\n", "line 2"),
+        ("image,ev\na.png,0\nb.png,2000\nc.png,1\n", "exposure of b.png is [+]1333 stops from"),
         ("image,ev\na.png,0,5\n", "e.csv, line 2: has 3 fields, the header 2"),
         ("# by hand\n\nimage,exposure\n\na.png,-1\n", "line 5"),
         ("image,exposure\nother.png,1\n", "names none of the 1"),
