@@ -51,6 +51,7 @@ from p2gs_jax.scene.exposures import (
     check_source,
     read_known_exposures,
     stated_ev,
+    strangers,
     without_view,
 )
 from p2gs_jax.scene.pixels.store import ImageStore
@@ -174,7 +175,8 @@ def calibrate(
             scene, store, cfg.train.seed, lambda i, n: reporter.stage("Sampling colours", i, n)
         )
     options, views = options_of(cfg, scene), scene.training_views
-    found = solved(views, observations, options, cfg, begin, compare_with, reporter, scene.notes)
+    notes = (*scene.notes, *strangers(compare_with, scene.views))
+    found = solved(views, observations, options, cfg, begin, compare_with, reporter, notes)
     found.write(out)
     if develop is None or poses is None:
         return found
@@ -220,7 +222,8 @@ def calibrate_run(
     if not len(observations.views):
         fix = "fit longer, or calibrate from the scene's tracks"
         raise UserError(f"{run.folder}: no pixel of one view is visible in another.", fix=fix)
-    options, views, notes = options_of(cfg, run.scene), run.scene.training_views, run.scene.notes
+    options, views = options_of(cfg, run.scene), run.scene.training_views
+    notes = (*run.scene.notes, *strangers(compare_with, run.scene.views))
     found = solved(views, observations, options, cfg, begin, compare_with, reporter, notes)
     return found.write(Path(out))
 
@@ -334,7 +337,8 @@ def calibrate_stack(
     found = stack_colors(stack, seed)
     options = CalibrationOptions(found.black, SATURATED, STACK_PIVOT, known, seed, "one_response")
     arguments = (stack.views, found.observations, options, cfg, begin, compare_with, reporter)
-    result = solved(*arguments, gauge=STACK_GAUGE, signal=found.signal)
+    notes = strangers(compare_with, stack.views)
+    result = solved(*arguments, notes, gauge=STACK_GAUGE, signal=found.signal)
     of_frames = (result.solution, found.xy, stack.valid.shape, found.signal)
     local_ev = regional_ev(options.problem(found.observations), *of_frames)
     details = {

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from p2gs_jax.core.numerics import LN2
-from p2gs_jax.core.text import read_csv
+from p2gs_jax.core.text import first_few, read_csv
 from p2gs_jax.errors import UserError, broken
 from p2gs_jax.options import MOST_STOPS
 from p2gs_jax.types import View
@@ -51,6 +51,13 @@ def without_view(source: str, views: Sequence[View]) -> tuple[str, ...]:
     row_of = row_finder(views, source)
     names = () if source == "exif" else _read(Path(source))
     return tuple(name for name in names if row_of(name) is None)
+
+
+def strangers(source: str | None, views: Sequence[View]) -> list[str]:
+    """Return a note if names in a source of `stated_ev` mean no view."""
+    names = () if source is None else without_view(source, views)
+    few = f"{len(names)} exposures of {source} belong to no view: {first_few(names)}."
+    return [few] if names else []
 
 
 def _by_view(table: dict[str, float], views: Sequence[View], source: str) -> dict[str, float]:

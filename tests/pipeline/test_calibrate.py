@@ -98,7 +98,7 @@ def test_the_command_writes_the_calibration_of_a_stack(tmp_path, succeeded):
     write_stack(tmp_path / "s", times)
     listed = tmp_path / "times.csv"
     rows = (f"{i:02d}.png,{t}" for i, t in enumerate(times))
-    listed.write_text("image,exposure_time_s\n" + "\n".join(rows))
+    listed.write_text("image,exposure_time_s\nnosuch.png,1\n" + "\n".join(rows))
     out = tmp_path / "out"
     argv = ("calibrate", tmp_path / "s", "--static", "--out", out)
     text = succeeded(*argv, "--compare-with", listed)
@@ -111,6 +111,7 @@ def test_the_command_writes_the_calibration_of_a_stack(tmp_path, succeeded):
     details = json.loads((out / "calibration.json").read_text())
     assert details["one_response"]
     assert any("times.csv of" in m for m in details["messages"])
+    assert f"1 exposures of {listed} belong to no view: nosuch.png." in details["messages"]
     assert (out / "calibration.png").stat().st_size > 10_000
 
 
