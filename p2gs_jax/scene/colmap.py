@@ -309,7 +309,7 @@ def read_model(folder: Path) -> Model:
         raise broken(not_file, "is not a file", _FIX_FILES)
     complete = [ext for ext in parts if {*absent[ext]} <= {parts[ext][2]}]
     if not complete:
-        ext = "txt" if (folder / "cameras.txt").is_file() else "bin"
+        ext = min(absent, key=lambda ext: len(absent[ext]))
         why = f"{', '.join(map(str, absent[ext]))} does not exist"
         raise broken("incomplete COLMAP model:", why, _FIX_FILES)
     ext = min(complete, key=lambda ext: len(absent[ext]))

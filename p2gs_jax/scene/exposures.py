@@ -20,22 +20,25 @@ KINDS = ("ev", "exposure", "rel_exposure_ev", "exposure_time_s")
 
 
 def read_known_exposures(
-    source: str, views: Sequence[View], among: Sequence[View] = ()
+    source: str,
+    views: Sequence[View],
+    among: Sequence[View] = (),
+    option: str = "--known-exposures",
 ) -> Float[np.ndarray, " v"]:
     """Return natural logarithms of known exposures of views, and NaN for unknown ones.
 
     The source is `exif` (EXIF, or exposures that the data set states), or a CSV file with a column
     `image` or `file` (the view's name, or any end of its path) and one of `ev`, `rel_exposure_ev`
     (stops), `exposure` (linear, > 0) or `exposure_time_s` (seconds). Names in the file may mean any
-    view in `among` (all views of the scene; by default `views`). Raises UserError: the source
-    cannot be used, names none of the views, or a name is ambiguous.
+    view in `among` (all views of the scene; by default `views`). Raises UserError with the `option`
+    in its remedy: the source cannot be used, names none of the views, or a name is ambiguous.
     """
     if source == "exif":
         values = _exif_ev(views) * LN2
         if not np.isfinite(values).any():
             why = "no photograph carries an exposure time or ISO in its EXIF, and the data set "
             why += "states no exposures."
-            raise UserError(why, fix="give a CSV file to --known-exposures, or leave it out")
+            raise UserError(why, fix=f"give a CSV file to {option}, or leave it out")
         return values
     table = _by_view(_read(Path(source)), among or views, source)
     values = np.array([table.get(view.name, np.nan) for view in views], float)
@@ -115,7 +118,7 @@ def stated_ev(source: str | None, views: Sequence[View]) -> Float[np.ndarray, " 
     """Return exposures in stops up to a constant, or NaN; the source None stands for EXIF."""
     if source is None:
         return _exif_ev(views)
-    return read_known_exposures(source, views) / LN2
+    return read_known_exposures(source, views, option="--compare-with") / LN2
 
 
 def _exif_ev(views: Sequence[View]) -> Float[np.ndarray, " v"]:

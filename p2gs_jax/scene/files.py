@@ -291,7 +291,7 @@ def check_missing(
         near = f"; the nearest name is {nearest[0]}" if nearest else ""
         message += f"; {folder} holds {len(files)} images{near}"
     if not cfg.allow_missing:
-        fix = "add them, name their folder with --images, or skip them with --allow-missing"
+        fix = "add them, name their folder with --images, or skip them with --data.allow-missing"
         raise UserError(message, fix=fix)
     if len(missing) == total:
         raise UserError(message, fix="point --images at the folder that holds them")

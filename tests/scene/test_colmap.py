@@ -54,6 +54,13 @@ def test_damaged_binary_files_are_named(shared_data, tmp_path, stem):
         load_scene(tmp_path, CFG)
 
 
+def test_missing_files_of_a_text_model_are_named(tmp_path):
+    file = write_tiny_model(tmp_path) / "cameras.txt"
+    file.unlink()
+    with refused(f"incomplete COLMAP model: {file} does not exist"):
+        load_scene(tmp_path, CFG)
+
+
 def test_text_models_and_names_with_blanks_are_read(tmp_path):
     thinned = "9 0.1 0.2 4 10 20 30 0.5\n8 0 0 4 10 20 30 0.5\n"
     write_tiny_model(tmp_path / "other_tool", points=thinned)

@@ -9,7 +9,7 @@ from scene.helpers import make_view, refused
 
 from p2gs_jax.config import FitConfig, PhotometryConfig
 from p2gs_jax.photometry.calibrate import options_of
-from p2gs_jax.scene.exposures import check_source, read_known_exposures
+from p2gs_jax.scene.exposures import check_source, read_known_exposures, stated_ev
 from p2gs_jax.types import Scene
 
 
@@ -73,8 +73,12 @@ def test_rows_that_name_no_view_are_counted(tmp_path):
 def test_exposures_of_exif_are_read():
     found = read_known_exposures("exif", [*views("a", exif=1.5), *views("b")])
     np.testing.assert_allclose(found / np.log(2), [1.5, np.nan])
-    with refused("EXIF"):
-        read_known_exposures("exif", views("a"))
+    for read, option in (
+        (read_known_exposures, "--known-exposures"),
+        (stated_ev, "--compare-with"),
+    ):
+        with refused("EXIF", f"give a CSV file to {option}"):
+            read("exif", views("a"))
 
 
 @pytest.mark.parametrize(
