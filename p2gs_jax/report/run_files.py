@@ -102,7 +102,7 @@ def number_at(values: Any, *path: str) -> float | None:
 
 
 def read_run(folder: Path, scene: Path | None = None) -> RunFiles:
-    """Read all files of a run folder; UserError: the folder has no run.
+    """Read all files of a run folder; UserError: the folder has no run, or `scene` is missing.
 
     `scene` is the current folder of the scene (None: the folder that the fit read).
     """
@@ -110,6 +110,9 @@ def read_run(folder: Path, scene: Path | None = None) -> RunFiles:
     if not path.is_file():
         fix = "name the folder that was given to `p2gs-jax fit --out`"
         raise UserError(f"{folder} is not a run folder: {path.name} is missing.", fix=fix)
+    if scene is not None and not scene.exists():
+        fix = "name the folder of the run's scene with --scene"
+        raise UserError(f"{scene} does not exist.", fix=fix)
     missing: list[str] = []
     saved = _read_object(path, "the configuration", missing)
     options, cfg, photometry = part_at(saved, "fit"), None, None
