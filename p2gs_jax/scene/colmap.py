@@ -21,6 +21,7 @@ from jaxtyping import Float, Int, UInt8
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import DataConfig
+from p2gs_jax.core.text import count_of
 from p2gs_jax.errors import UserError, broken
 from p2gs_jax.scene import files
 from p2gs_jax.scene.cameras import name_cameras
@@ -161,6 +162,11 @@ def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
         used = f"used the model {folder} with {len(model.images)} photographs, the largest"
         notes.append(f"{used}; the models beside it ({', '.join(others)}) are not used")
     tracks = tracks_of(model, views)
+    seen = np.concatenate([image.point_ids for image in model.images])
+    lost = int((~np.isin(seen, model.point_ids)).sum())
+    if lost and (model.point_ids >= 0).any():
+        why = f"{count_of(lost, 'observation')} in {source.name} are left out: "
+        notes.append(f"{why}{model.file('points3D').name} lacks their points")
     named = name_cameras(views, cfg.camera_by)
     return off_origin(Scene(root, "colmap", named, model.xyz, model.rgb, tracks, tuple(notes)))
 

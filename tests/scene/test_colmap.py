@@ -66,6 +66,8 @@ def test_text_models_and_names_with_blanks_are_read(tmp_path):
     write_tiny_model(tmp_path / "other_tool", points=thinned)
     scene = load_scene(tmp_path / "other_tool", CFG)
     assert (len(scene.points), len(scene.tracks.xy)) == (2, 0)
+    note = "2 observations in images.txt are left out: points3D.txt lacks their points"
+    assert scene.notes == (note,)
     write_tiny_model(tmp_path)
     scene = load_scene(tmp_path, CFG)
     assert [v.name for v in scene.views] == ["im 0.png", "im 1.png"]
@@ -99,7 +101,7 @@ def test_missing_images_are_listed_or_skipped(tmp_path):
     write_tiny_model(tmp_path, n=10)
     for i in range(7):
         (tmp_path / "images" / f"im {i}.png").unlink()
-    with refused("7 of the 10 images", "im 4.png and 2 more; ", "--allow-missing"):
+    with refused("7 of the 10 images", "im 4.png and 2 more; ", "--data.allow-missing"):
         load_scene(tmp_path, CFG)
     scene = load_scene(tmp_path, DataConfig(allow_missing=True))
     assert [v.name for v in scene.views] == ["im 7.png", "im 8.png", "im 9.png"]
