@@ -24,6 +24,8 @@ from p2gs_jax.types import Camera
 QUALITY = "16"
 # Least width and height of a video after rounding, pixels.
 SMALLEST = 16
+# Of the files of a frame.
+SUFFIXES = (".exr", ".png", ".render.png", ".photograph.png")
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ def write_png(path: Path, ldr: Float32[np.ndarray, "h w 3"]) -> None:
 
 def remove_frame(folder: Path, name: str) -> None:
     """Remove the files that `write_frame` wrote for a frame of this name, if there are any."""
-    for suffix in (".exr", ".png", ".render.png", ".photograph.png"):
+    for suffix in SUFFIXES:
         (folder / f"{name}{suffix}").unlink(missing_ok=True)
 
 

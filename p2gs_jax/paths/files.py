@@ -13,6 +13,7 @@ import numpy as np
 from p2gs_jax.core.atomic import write_json
 from p2gs_jax.core.text import parse_json
 from p2gs_jax.errors import UserError
+from p2gs_jax.formats.frames import SUFFIXES
 from p2gs_jax.options import MOST_STOPS
 from p2gs_jax.paths.shots import LARGEST, Shot, checked_lens, checked_pose
 from p2gs_jax.scene.rigid import camera_centers, pose_of
@@ -54,6 +55,13 @@ def read_cameras(path: Path) -> list[Shot]:
             why = f"{path}: cameras {first} and {index} have the same name {shot.name!r}."
             raise UserError(why, fix="name every picture differently, or leave the names out")
         shots[shot.name] = shot
+    written = {f"{name}{suffix}": name for name in shots for suffix in SUFFIXES}
+    for index, name in enumerate(shots):
+        above = map(str, PurePosixPath(name).parents)
+        inside = next((written[folder] for folder in above if folder in written), None)
+        if inside is not None:
+            why = f"{path}: camera {index} has the name {name!r}, whose folder is a file of the "
+            raise UserError(f"{why}camera {inside!r}.", fix=_FIX)
     return list(shots.values())
 
 
@@ -102,6 +110,6 @@ def _number(values: dict, key: str, low: float, high: float) -> float:
 def _name(values: dict, index: int) -> str:
     name = values.get("name", f"{index:05d}")
     parts = PurePosixPath(name).parts if isinstance(name, str) else ()
-    if not parts or ".." in parts or PurePosixPath(name).is_absolute() or "\\" in name:
+    if not parts or ".." in parts or PurePosixPath(name).is_absolute() or {"\\", "\0"} & {*name}:
         raise ValueError(f"has the name {name!r}, which is not a file within the output folder")
     return name

@@ -53,7 +53,7 @@ WRONG = {
     "height": ("height", ..., "48", 1e300),
     "gamma": ("gamma", 0),
     "exposure_ev": ("exposure_ev", "bright", 5000),
-    "name": ("name", "../../etc", "/a", 3),
+    "name": ("name", "../../etc", "/a", "a\0b", 3),
 }
 CASES = [(field, value, words) for words, (field, *some) in WRONG.items() for value in some]
 
@@ -78,3 +78,6 @@ def test_invalid_and_missing_files_and_equal_names_are_refused(tmp_path):
     twice = [{**GOOD, "name": "x"}, GOOD, {**GOOD, "name": "x"}]
     with pytest.raises(UserError, match="0 and 2"):
         read_cameras(save(tmp_path / "c.json", twice))
+    nested = [{**GOOD, "name": name} for name in ("a", "a.png/b")]
+    with pytest.raises(UserError, match=r"camera 1 has the name 'a\.png/b', whose"):
+        read_cameras(save(tmp_path / "c.json", nested))
