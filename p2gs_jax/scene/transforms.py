@@ -365,7 +365,9 @@ def _view(frame: _Frame, folder: Path, name: str) -> tuple[View, bool]:
         raise broken(f"{path}:", f"{why} of its {size[0]}x{size[1]} pixels", fix)
     K, width, height = at_file_size(image_path, K, size, path)
     mask = values.get("mask_path")
-    mask_path = _beside(path, mask) if isinstance(mask, str) and mask else None
+    if not isinstance(mask, str | None):
+        raise broken(f"{path}:", f"the mask_path of {name} is {mask!r}, not a name", FIX)
+    mask_path = _beside(path, mask) if mask else None
     if mask_path is not None and not mask_path.is_file():
         raise broken(f"{path}:", f"the mask {mask_path} of {name} does not exist", FIX)
     matrix_name = f"the transform_matrix of {name}"

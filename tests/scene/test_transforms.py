@@ -84,6 +84,7 @@ POSE = "transform_matrix of a.png"
         ({"frames": frames("images/a.png", transform_matrix=ACROSS)}, "is 1 2 3 1.*\n.*transpose"),
         ({"frames": frames("images/a.png", "./images/a.png")}, "a.png more than once"),
         ({"frames": frames("images/a.png", mask_path="m.png")}, "mask .*m.png of a.png"),
+        ({"frames": frames("images/a.png", mask_path=7)}, "mask_path of a.png is 7, not a name"),
         ({"fl_x": 1e300}, "fl_x of a.png is 1e[+]300, not a number"),
         ({"fl_x": 0}, "no focal length for a.png"),
         ({"w": "wide"}, "impossible size"),
