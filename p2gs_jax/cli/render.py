@@ -123,7 +123,7 @@ class Render:
 
 
 def _load(options: Render) -> Run:
-    """Return the run; UserError: it has no such object, curve or white balance."""
+    """Return the run; UserError: it has no such object, curve, white balance or vignetting."""
     from p2gs_jax.run.foreign import load_run_or_splats
 
     fitted = load_run_or_splats(options.run, options.scene, options.photometry)
@@ -131,6 +131,10 @@ def _load(options: Render) -> Run:
         fitted.common_display(0.0).with_curve("spline")
     if options.white_balance_of is not None:
         fitted.white_balance_of(options.white_balance_of)
+    p = fitted.cfg.photometry
+    bare = not any(camera.vignetting for camera in p.cameras) and p.appearance is None
+    why = f"{fitted.folder} has no vignetting that --no-vignetting could leave out"
+    check(not (options.no_vignetting and bare), why, fix="leave the option out")
     if options.without_objects:
         return fitted.without_objects()
     return fitted.only_objects() if options.only_objects else fitted

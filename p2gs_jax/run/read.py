@@ -119,7 +119,8 @@ class Run:
         return notebook_html(rows, files.summary)
 
     def without_objects(self) -> Run:
-        """Return the run without moving objects."""
+        """Return the run without moving objects; UserError: there are none."""
+        self._require_objects()
         return self._of(standing(self.params.gaussians, self.owner), None)
 
     def over_black(self) -> Run:
@@ -133,12 +134,15 @@ class Run:
         Raises:
             UserError: there are no moving objects.
         """
+        owner = self._require_objects()
+        return self._of(chosen(self.params.gaussians, owner >= 0), owner[owner >= 0])
+
+    def _require_objects(self) -> Int[np.ndarray, " n"]:
         if self.owner is None:
             fix = "leave the option out; drives with boxes have moving objects if they are fitted "
             fix += "with --dynamics.method rigid"
             raise UserError(f"{self.folder} has no moving object with Gaussians.", fix=fix)
-        mine = self.owner >= 0
-        return self._of(chosen(self.params.gaussians, mine), self.owner[mine])
+        return self.owner
 
     def _of(self, gaussians: Gaussians, owner: Int[np.ndarray, " n"] | None) -> Run:
         return replace(self, params=replace(self.params, gaussians=gaussians), owner=owner)

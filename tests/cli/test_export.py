@@ -127,6 +127,7 @@ def test_exposure_and_curve_change_the_display_colours(exported, finished_run, s
         ("--format html --photographs -1", "--photographs"),
         ("--format html --bake-steps 3", "--bake-steps"),
         ("--format exr --photographs 3", "--photographs"),
+        ("--format exr --without-objects", "no moving object"),
     ],
 )
 def test_wrong_options_are_refused(finished_run, refused, tmp_path, options, words):

@@ -120,6 +120,8 @@ def test_a_drive_can_be_metered(rendered, run_copy, tmp_path):
         ("--meter auto --exposure-ev own", "--meter"),
         ("--meter best", "--meter"),
         ("--without-objects --only-objects", "--without-objects"),
+        ("--without-objects", "no moving object"),
+        ("--no-vignetting", "no vignetting"),
         ("--panorama", "one camera"),
         ("--panorama --trajectory orbit", "--panorama"),
         ("--camera front", "'front'"),

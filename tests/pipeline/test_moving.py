@@ -110,8 +110,10 @@ def test_only_objects(run):
     inside = object_mask(run.scene.views[4], run.scene.objects, camera.width, camera.height, 0.4)
     assert alpha[inside].max() > 0.5
     assert alpha[~inside].mean() < 0.02
-    with pytest.raises(UserError, match="no moving object"):
-        dataclasses.replace(run, owner=None, moving=None).only_objects()
+    still = dataclasses.replace(run, owner=None, moving=None)
+    for refused in (still.only_objects, still.without_objects):
+        with pytest.raises(UserError, match="no moving object"):
+            refused()
 
 
 def test_the_command_renders_what_moves(run, tmp_path, succeeded, refused):
