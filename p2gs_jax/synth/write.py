@@ -25,7 +25,7 @@ import numpy as np
 import OpenEXR
 from PIL import Image
 
-from p2gs_jax.core.atomic import atomic_folder
+from p2gs_jax.core.atomic import atomic_folder, naming
 from p2gs_jax.core.streams import SceneStream, generator
 from p2gs_jax.errors import UserError
 from p2gs_jax.synth.colmap_files import DriveViews, sample_seeds, write_seeds
@@ -75,7 +75,7 @@ def write_street(
         render: another renderer; yields radiance (half or single) and camera z of every view.
         report: receives lines on the progress.
 
-    UserError: a parameter is not valid, or `out` is not free.
+    UserError: a parameter is not valid, or `out` is not free. OSError names `out`.
     """
     prefix = "--" if sensor is None else "--sensor."
     out, sensor = Path(out), sensor or Sensor(iso_std=iso_std)
@@ -90,7 +90,7 @@ def write_street(
     town = build_town(seed, layout, frames * step, matte=matte)
     views, frame = _views(frames, width, height, step)
     shots = draw_shots(sensor, frames, len(MOUNTS), seed)
-    with atomic_folder(out) as temporary:
+    with atomic_folder(out) as temporary, naming(out):
         report(f"rendering {len(views.names)} views of a street with {town.size} primitives")
         rendered = render(views) if render else _render_all(town, views, supersample)
         photographs, depths = _photograph(temporary, views, rendered, shots, sensor, seed, report)

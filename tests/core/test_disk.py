@@ -10,6 +10,7 @@ import pytest
 from p2gs_jax.core.atomic import append_jsonl, atomic_write, naming, read_jsonl, write_text
 from p2gs_jax.formats.exr import write_exr
 from p2gs_jax.formats.frames import write_png
+from p2gs_jax.synth.write import write_street
 
 
 @contextlib.contextmanager
@@ -41,6 +42,14 @@ def test_a_write_to_a_full_disk_names_its_file(tmp_path, name):
     assert error.value.filename == str(path)
     assert [p.name for p in tmp_path.iterdir()] == [name]
     assert path.read_text() == "before"
+
+
+def test_a_synthetic_scene_on_a_full_disk_names_its_folder(tmp_path):
+    out = tmp_path / "town"
+    with room_for(2048), pytest.raises(OSError, match=r".") as error:
+        write_street(out, frames=1, width=48, height=32, points=50)
+    assert (error.value.errno, error.value.filename) == (errno.EFBIG, str(out))
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_log_on_a_full_disk_is_named_and_mended(tmp_path):
