@@ -24,7 +24,7 @@ from p2gs_jax.types import Camera
 QUALITY = "16"
 # Least width and height of a video after rounding, pixels.
 SMALLEST = 16
-# Of the files of a frame.
+# Suffixes of the files of a frame.
 SUFFIXES = (".exr", ".png", ".render.png", ".photograph.png")
 
 

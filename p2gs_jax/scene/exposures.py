@@ -59,8 +59,8 @@ def without_view(source: str, views: Sequence[View]) -> tuple[str, ...]:
 def strangers(source: str | None, views: Sequence[View]) -> list[str]:
     """Return a note if names in a source of `stated_ev` mean no view."""
     names = () if source is None else without_view(source, views)
-    few = f"{len(names)} exposures of {source} belong to no view: {first_few(names)}."
-    return [few] if names else []
+    note = f"{len(names)} exposures of {source} belong to no view: {first_few(names)}."
+    return [note] if names else []
 
 
 def _by_view(table: dict[str, float], views: Sequence[View], source: str) -> dict[str, float]:
