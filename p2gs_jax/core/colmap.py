@@ -1,4 +1,4 @@
-"""pycolmap under Python's handlers of signals: its import replaces the handler of SIGTERM."""
+"""The import of pycolmap, which replaces the handler of SIGTERM: Python's handlers stay."""
 
 from p2gs_jax.core import interrupts
 
