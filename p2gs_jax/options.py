@@ -31,7 +31,7 @@ SHORT = {
     "lpips_weights": ("evaluation.lpips_weights", "alex|vgg"),
     "seed": ("train.seed", "N"),
 }
-MOST_STOPS = 60.0  # of an exposure from the mean exposure, up or down
+MOST_STOPS = 60.0  # largest distance of an exposure from the mean exposure
 DURATIONS = "write 90s, 5m or 1h30m"
 # Smallest and largest values of numbers that no other check bounds; None: there is no bound.
 BOUNDS = {

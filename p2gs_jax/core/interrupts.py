@@ -17,7 +17,7 @@ from types import FrameType
 from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-AGAIN_S = 0.1  # after which a signal is sent again that could not end the program
+AGAIN_S = 0.1  # seconds until a signal that could not end the program is sent again
 
 
 class Interrupted(KeyboardInterrupt):

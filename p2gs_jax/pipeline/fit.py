@@ -307,7 +307,7 @@ def account_of(
 def begun(
     folder: RunFolder, paths: Paths, cfg: FitConfig, decisions: Decisions
 ) -> Iterator[Callable[[], None]]:
-    """Yield what writes the start of a run; remove it if steps fail before the first checkpoint.
+    """Yield a function that writes the start of a run, which a failure before a checkpoint removes.
 
     Such a run leaves no files that could be continued or would have to be overwritten.
     """

@@ -64,7 +64,7 @@ BOUNDS = {
 
 
 def check_sensor(sensor: Sensor, prefix: str) -> None:
-    """Raise UserError if a number is not finite or out of its range; its option has a prefix."""
+    """Raise UserError: a number is not finite or out of range; `prefix` begins its option."""
     for name, (least, most) in BOUNDS.items():
         value = getattr(sensor, name)
         if not (math.isfinite(value) and least <= value <= most):

@@ -66,7 +66,7 @@ def test_one_view_on_one_device_needs_no_mesh():
     assert mesh_of(with_fields(FitConfig(), {"train.batch": 3})).size == 1
 
 
-def test_more_devices_than_there_are_are_refused():
+def test_too_many_devices_are_refused():
     with pytest.raises(UserError, match="not between 1 and") as refused:
         mesh_of(FitConfig(), 1000)
     assert refused.value.fix
