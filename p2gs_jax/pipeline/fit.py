@@ -52,7 +52,7 @@ from p2gs_jax.train.make_step import AS_CONFIGURED, Custom
 from p2gs_jax.train.step import StepPrograms
 from p2gs_jax.train.strategies import Strategy
 from p2gs_jax.train.terms import LossTerm
-from p2gs_jax.types import Params, Scene
+from p2gs_jax.types import Params, Scene, View
 
 # Gaussians farther away than this many times the reach of the scene are not visible in any view.
 RUNAWAY = 10.0
@@ -120,7 +120,7 @@ def fit(
         start.cfg = dataclasses.replace(start.cfg, train=cfg.train)
         lock.require()
         finish_s = seconds_to_finish(scene, cfg, weights, reference=truth is not None)
-        with begun(folder, paths, cfg, start.decisions) as write:
+        with begun(folder, paths, cfg, start.decisions, scene.views) as write:
             times = {"spent_s": time.monotonic() - begin, "finish_s": finish_s}
             result = optimiser.run(start, write, resume=resume, **times)
         params, owner = compact(result, start.scene)
@@ -305,7 +305,11 @@ def account_of(
 
 @contextlib.contextmanager
 def begun(
-    folder: RunFolder, paths: Paths, cfg: FitConfig, decisions: Decisions
+    folder: RunFolder,
+    paths: Paths,
+    cfg: FitConfig,
+    decisions: Decisions,
+    views: Sequence[View],
 ) -> Iterator[Callable[[], None]]:
     """Yield a function that writes the start of a run, which a failure before a checkpoint removes.
 
@@ -314,7 +318,7 @@ def begun(
     places = (folder, paths.scene, paths.reference)
     try:
         with memory_named():
-            yield functools.partial(write_start, *places, cfg, decisions)
+            yield functools.partial(write_start, *places, cfg, decisions, views)
     except Exception:
         if not saved_steps(folder.checkpoints):
             for path in (folder.config, folder.decisions):

@@ -31,6 +31,7 @@ from p2gs_jax.run.decisions import CHOSEN
 from p2gs_jax.run.folder import RunFolder, find, require_free
 from p2gs_jax.run.read import read_config
 from p2gs_jax.scene.exposures import check_source, read_known_exposures
+from p2gs_jax.scene.files import recognition_key
 from p2gs_jax.scene.masks import background_color
 from p2gs_jax.scene.pixels.store import size_at
 from p2gs_jax.scene.split import EVERY, check_every, read_split
@@ -92,9 +93,15 @@ def check_scene(
         The photographs under one common exposure, if there are any.
 
     Raises:
-        UserError: the options do not suit the views.
+        UserError: the options do not suit the views, or the run began with other photographs.
     """
-    training = scene.training_views
+    training, begun = scene.training_views, RunFolder(paths.run).config
+    now = recognition_key(scene.views)
+    if begun.exists() and read_config(begun)[0].get("photographs") != now:
+        why = f"{paths.run} was begun with other photographs than {paths.scene} holds now: names "
+        why += "or file sizes differ."
+        fix = "restore them as they were, or name another folder with --out"
+        raise UserError(why, fix=fix)
     if lpips_weights is not None:
         lpips_weights.require_sizes(scene.views, cfg.data.max_width)
     if cfg.photometry.known is not None:

@@ -28,16 +28,25 @@ from p2gs_jax.run.photometry_files import write_appearance, write_fitted, write_
 from p2gs_jax.run.plots import write_summary
 from p2gs_jax.run.scene_file import write_objects, write_scene
 from p2gs_jax.scene.drives.objects import MovingObjects
+from p2gs_jax.scene.files import recognition_key
 from p2gs_jax.scene.pixels.store import ImageStore, camera_of
-from p2gs_jax.types import Params, Scene
+from p2gs_jax.types import Params, Scene, View
 
 SUMMARY_VIEWS = 4
 
 
 def write_start(
-    folder: RunFolder, scene: Path, reference: Path | None, cfg: FitConfig, decisions: Decisions
+    folder: RunFolder,
+    scene: Path,
+    reference: Path | None,
+    cfg: FitConfig,
+    decisions: Decisions,
+    views: Sequence[View],
 ) -> None:
-    """Write options and decisions, and remove `metrics.json`: the run is then unfinished."""
+    """Write options and decisions, and remove `metrics.json`: the run is then unfinished.
+
+    `views` are those of the scene.
+    """
     folder.metrics.unlink(missing_ok=True)
     begun = first_plan(folder) or {
         "train.steps": cfg.train.steps,
@@ -50,6 +59,7 @@ def write_start(
             "begun": begun,
             **remembered("scene", scene, folder.root),
             **remembered("reference", reference, folder.root),
+            "photographs": recognition_key(views),
             "fit": config_to_dict(cfg),
         },
     )
@@ -97,7 +107,7 @@ def write_run(
         folder = RunFolder(Path(folder))
     folder.root.mkdir(parents=True, exist_ok=True)
     if decisions is not None:
-        write_start(folder, scene.root, None, cfg, decisions)
+        write_start(folder, scene.root, None, cfg, decisions, scene.views)
     if moving is not None and (owner is not None or moving.middle is not None):
         write_objects(folder.objects, owner, moving, scene)
     write_radiance(folder.radiance, params.gaussians, activation=cfg.render.radiance)

@@ -30,6 +30,7 @@ from p2gs_jax.core.text import as_clock, first_few, parse_json
 from p2gs_jax.errors import UserError, broken
 from p2gs_jax.scene.convert.readers import CONVERTED_SUFFIXES, size_of
 from p2gs_jax.scene.lens import scale_intrinsics
+from p2gs_jax.types import View
 
 IMAGE_SUFFIXES = CONVERTED_SUFFIXES | {".jpg", ".jpeg", ".jfif", ".jp2", ".png", ".tif", ".tiff"}
 IMAGE_SUFFIXES |= {".bmp", ".pgm", ".ppm"}
@@ -355,6 +356,16 @@ def file_fingerprints(paths: Sequence[Path]) -> list[tuple[str, int, int]]:
     """Return (path, size in bytes, modification time in ns) of every file."""
     stats = [(path, path.stat()) for path in paths]
     return [(str(path.resolve()), stat.st_size, stat.st_mtime_ns) for path, stat in stats]
+
+
+def recognition_key(views: Iterable[View]) -> str:
+    """Return a hash of the names and file sizes of photographs and masks; copies have the same."""
+    files = [(view.name, view.image_path, view.mask_path) for view in views]
+    sizes = [
+        (name, *(p.stat().st_size if p and p.exists() else None for p in paths))
+        for name, *paths in files
+    ]
+    return hashlib.sha256(repr(sizes).encode()).hexdigest()[:16]
 
 
 def stage_progress(report: Report, stage: str, total: int, unit: str) -> Callable[[int], None]:

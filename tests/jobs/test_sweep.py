@@ -282,7 +282,7 @@ def test_a_continuation_that_fails_does_not_count_as_done(tmp_path):
     sweep("scene", tmp_path, {"a": BASE}, run=runner(finished))
     cfg = with_fields(BASE, {"train.steps": BASE.train.steps + 1})
     folder = tmp_path / "a" / "seed_0"
-    write_start(RunFolder(folder), tmp_path, None, BASE, Decisions.as_given(BASE))
+    write_start(RunFolder(folder), tmp_path, None, BASE, Decisions.as_given(BASE), ())
     failing = runner(lambda run, stop: ("failed", "no scene"))
     (row,) = sweep(tmp_path, tmp_path, {"a": cfg}, run=failing).rows
     assert (row["status"], row["reason"]) == ("failed", "no scene")

@@ -2,6 +2,7 @@
 
 import dataclasses
 import errno
+import json
 import shutil
 from collections import Counter
 from types import SimpleNamespace
@@ -74,6 +75,20 @@ def test_functions_refuse_what_commands_refuse(tmp_path, scene, command, field, 
     with pytest.raises(UserError) as refused:
         command(scene, tmp_path / "out", with_fields(FitConfig(), {field: value}))
     assert words in str(refused.value)
+
+
+def test_a_run_is_not_continued_with_other_photographs(finished_run, tmp_path, refused):
+    run, scene = tmp_path / "run", tmp_path / "scene"
+    shutil.copytree(finished_run, run)
+    shutil.copytree(finished_run.parent / "scene", scene)
+    saved = json.loads((run / "config.json").read_text()) | {"scene": str(scene)}
+    (run / "config.json").write_text(json.dumps(saved))
+    first, second = sorted((scene / "images").iterdir())[:2]
+    shutil.copy(second, first)
+    files = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    text = refused("fit", scene, "--out", run, *FIT, "--steps", "70", "--resume")
+    assert "begun with other photographs" in text
+    assert files == {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
 
 
 @pytest.mark.parametrize("checkpoint", [False, True])
@@ -245,7 +260,7 @@ def test_a_full_disk_is_exit_2_before_anything_is_fitted(
 def test_a_run_may_only_become_longer(tmp_path):
     fields = {"train.steps": 60, "train.budget_s": 60.0, "evaluation.lpips_weights": "alex"}
     cfg = with_fields(FitConfig(), fields)
-    write_start(RunFolder(tmp_path), tmp_path, None, cfg, Decisions.as_given(cfg))
+    write_start(RunFolder(tmp_path), tmp_path, None, cfg, Decisions.as_given(cfg), ())
     for name, value in {"steps": 61, "budget_s": 90.0}.items():
         assert check_run_dir(tmp_path, True, with_fields(cfg, {f"train.{name}": value}))
     # Options of memory and of the evaluation may change.
@@ -258,7 +273,7 @@ def test_a_run_may_only_become_longer(tmp_path):
             check_run_dir(tmp_path, True, with_fields(free, {name: now}))
     for before, now in ((60.0, None), (None, 60.0)):
         cfg = with_fields(cfg, {"train.budget_s": before})
-        write_start(RunFolder(tmp_path), tmp_path, None, cfg, Decisions.as_given(cfg))
+        write_start(RunFolder(tmp_path), tmp_path, None, cfg, Decisions.as_given(cfg), ())
         with pytest.raises(UserError, match=r"train\.budget_s was"):
             check_run_dir(tmp_path, True, with_fields(cfg, {"train.budget_s": now}))
     path = RunFolder(tmp_path).config

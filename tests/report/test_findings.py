@@ -220,7 +220,7 @@ def wall_run(tmp_path_factory):
     points = np.stack([across, up, np.full_like(up, WALL)], -1).reshape(-1, 3).astype(np.float32)
     cfg = FitConfig(data=DataConfig(test_every=0), render=RenderConfig(sh_degree=0))
     decisions = replace(Decisions.as_given(cfg), model="view_exposure")
-    write_start(RunFolder(run), root, None, cfg, decisions)
+    write_start(RunFolder(run), root, None, cfg, decisions, views)
     write_scene(run, Scene(root, "colmap", tuple(views), points, np.zeros(points.shape, np.uint8)))
     log_scales = np.log([0.2, 0.2, 0.01])
     gaussians = gaussians_of(points, [1, 0, 0, 0], log_scales, 4.0, np.zeros((1, 3)))

@@ -114,7 +114,8 @@ def _fit(
             optimiser.expect(found, larger=block.exposures.decisions)
         with clock("seeds"):
             prepared = initialise(found, block.exposures, reporter)
-        with begun(folder, Paths(Path(root), folder.root), cfg, prepared.decisions) as write:
+        paths, views = Paths(Path(root), folder.root), block.scene.views
+        with begun(folder, paths, cfg, prepared.decisions, views) as write:
             result = optimiser.run(prepared, write, resume=True)
     params, _ = compact(result)
     reporter.stage("Writing files")

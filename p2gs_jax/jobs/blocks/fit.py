@@ -235,7 +235,8 @@ class _Blocks:
                 self.reporter.message(note)
         self.lock.require()
         found, paths = solved.exposures, self.paths
-        write_start(self.folder, paths.scene, paths.reference, self.cfg, found.decisions)
+        start = self.folder, paths.scene, paths.reference, self.cfg, found.decisions, scene.views
+        write_start(*start)
         if (self.blocks / shared.ARRAYS).exists():
             # The exposures of finished blocks must stay exactly the same.
             before = shared.read_shared(self.blocks, scene, self.cfg)
