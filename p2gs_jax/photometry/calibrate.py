@@ -201,7 +201,8 @@ def held_out(o: Observations, seed: int) -> Bool[np.ndarray, " o"]:
     """Return the mask of observations to hold out: whole regions of images, which share errors.
 
     Single observations would be predicted by neighbours with the same error. Parameters that
-    explain such errors would then win (BUILD_NOTES, "Whole regions").
+    explain such errors would then win (BUILD_NOTES, "Whole regions"). They are held out only where
+    every view has a single region.
     """
     rng = generator(seed, Stream.HELD_OUT)
     if o.positions is None:
@@ -214,7 +215,9 @@ def held_out(o: Observations, seed: int) -> Bool[np.ndarray, " o"]:
     count, first = np.bincount(view_of), np.searchsorted(view_of[order], view_of)
     rank = np.argsort(order) - first
     most = np.rint(HELD_OUT * count)
-    return (rank < most[view_of])[region]
+    held = (rank < most[view_of])[region]
+    # Without a view of two regions nothing would be judged, and the simplest model would win.
+    return held if held.any() else rng.permutation(len(held)) < HELD_OUT * len(held)
 
 
 def _chosen(
