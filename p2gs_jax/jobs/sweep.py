@@ -71,7 +71,7 @@ def sweep(
     a line per run. `on_look` and `run` are as for `run_jobs`.
 
     Raises:
-        UserError: there is nothing to do, names would share a folder, options are not valid, a
+        UserError: there is nothing to do, names or seeds share a folder, options are not valid, a
             folder has other options, another sweep is writing to it, or the engine does not exist.
         Interrupted: a signal arrived; running fits write their checkpoints first.
     """
@@ -142,6 +142,9 @@ def _check(configs: Mapping[str, FitConfig], seeds: Sequence[int], max_parallel:
         raise UserError("a sweep needs at least one configuration and one seed.", fix=fix)
     if min(seeds) < 0:
         raise UserError(f"a sweep has the seed {min(seeds)}.", fix="use whole numbers from 0 on")
+    if len(set(seeds)) < len(seeds):
+        why = f"a sweep has a seed twice ({', '.join(map(str, seeds))}); both runs would be one."
+        raise UserError(why, fix="name every seed once")
     if max_parallel < 1:
         raise UserError(f"max_parallel = {max_parallel} is too small.", fix="use at least 1")
     folders = [slug(name) for name in configs]

@@ -196,6 +196,7 @@ preset = "paper"
         ("scene = 'x'\npreset = 'best'", "no preset 'best'"),
         ("scene = 'x'\n[grid]\n'train.stepz' = [1]", "is not a configuration field"),
         ("scene = 'x'\nseeds = [0, -1]", "use whole numbers from 0 on"),
+        ("scene = 'x'\nseeds = [0, 1, 0]", "name every seed once"),
         ("scene = 'x'\nseeds = []", "at least one configuration and one seed"),
         ("scene = 'x'\n[[case]]\nname = 'a'\n[[case]]\nname = 'a'", "a different name"),
         ("scene = 5", "scene = 5 is not valid"),
