@@ -29,6 +29,7 @@ from p2gs_jax.gaussians import bake as baking
 from p2gs_jax.photometry.display import DisplayTransform
 from p2gs_jax.render.capacity import make_renderer
 from p2gs_jax.render.project import at_time
+from p2gs_jax.run.folder import require_folder
 from p2gs_jax.run.photometry_files import write_appearance
 from p2gs_jax.run.read import Run
 from p2gs_jax.scene.convert.readers import read_exif_settings
@@ -117,8 +118,7 @@ def convert(
 
 
 def _check_places(folder: Path, places: Sequence[Path], overwrite: bool) -> None:
-    if folder.exists() and not folder.is_dir():
-        raise UserError(f"{folder} is a file.", fix="name a folder with --out")
+    require_folder(folder)
     existing = [path for path in places if path.exists()]
     if existing and not overwrite:
         fix = "add --overwrite to replace it, or name another folder with --out"

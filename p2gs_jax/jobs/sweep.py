@@ -27,7 +27,7 @@ from p2gs_jax.jobs.worker import run_in_process
 from p2gs_jax.pipeline.fit import fit
 from p2gs_jax.pipeline.preflight import Paths, check_run_dir, preflight
 from p2gs_jax.presets import from_dict, to_dict
-from p2gs_jax.run.folder import RunFolder, locked
+from p2gs_jax.run.folder import RunFolder, locked, require_folder
 
 TABLE, TABLE_TEXT, JOBS = "sweep.json", "sweep.md", "jobs"
 
@@ -72,12 +72,14 @@ def sweep(
 
     Raises:
         UserError: there is nothing to do, names or seeds share a folder, options are not valid, a
-            folder has other options, another sweep is writing to it, or the engine does not exist.
+            folder has other options, `out` is a file or another sweep writes to it, or the engine
+            does not exist.
         Interrupted: a signal arrived; running fits write their checkpoints first.
     """
     scene, out = Path(scene), Path(out)
     _check(configs, seeds, max_parallel)
     check_engine(engine)
+    require_folder(out)
     out.mkdir(parents=True, exist_ok=True)
     jobs, rows, longer = _planned(scene, out, configs, seeds, reference)
 

@@ -6,10 +6,11 @@ a stack of exposures of one fixed viewpoint; `solved` processes all of them.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,7 +43,7 @@ from p2gs_jax.photometry.sources.stack import SATURATED, StackColors, read_stack
 from p2gs_jax.photometry.unmodelled import LOCAL_EV, regional_ev
 from p2gs_jax.pipeline.preflight import check_choice
 from p2gs_jax.presets import require_config
-from p2gs_jax.run.folder import RunFolder
+from p2gs_jax.run.folder import RunFolder, locked, require_folder
 from p2gs_jax.run.photometry_files import write_solution
 from p2gs_jax.run.plots import write_calibration_plot
 from p2gs_jax.run.read import load_run
@@ -145,7 +146,7 @@ def calibrate(
     folder `developed` gets the photographs at one exposure, for other trainers.
 
     Raises:
-        UserError: a fault that the user can fix.
+        UserError: a fault that the user can fix, such as another process that writes to `out`.
     """
     cfg = require_config(cfg)
     check_values(cfg)
@@ -154,9 +155,8 @@ def calibrate(
     reporter, out, begin = reporter or Silent(), Path(out), time.monotonic()
     for source in (cfg.photometry.known, compare_with):
         check_source(source)
-    _require_no_run(out)
     reporter.stage("Reading the scene")
-    with no_empty_folders(out):
+    with _held(out):
         scene = load_scene(Path(scene_dir), cfg.data, out / "cache", reporter.message)
         poses = None
         if develop is not None:
@@ -174,14 +174,14 @@ def calibrate(
         observations = surface_colors(
             scene, store, cfg.train.seed, lambda i, n: reporter.stage("Sampling colours", i, n)
         )
-    options, views = options_of(cfg, scene), scene.training_views
-    notes = (*scene.notes, *strangers(compare_with, scene.views))
-    found = solved(views, observations, options, cfg, begin, compare_with, reporter, notes)
-    found.write(out)
-    if develop is None or poses is None:
-        return found
-    done = develop_scene(scene, poses, out, cfg, found.selection, develop, reporter)
-    return dataclasses.replace(found, developed=done)
+        options, views = options_of(cfg, scene), scene.training_views
+        notes = (*scene.notes, *strangers(compare_with, scene.views))
+        found = solved(views, observations, options, cfg, begin, compare_with, reporter, notes)
+        found.write(out)
+        if develop is None or poses is None:
+            return found
+        done = develop_scene(scene, poses, out, cfg, found.selection, develop, reporter)
+        return dataclasses.replace(found, developed=done)
 
 
 def calibrate_run(
@@ -199,33 +199,33 @@ def calibrate_run(
     the run. `scene` is as for `load_run`, the other arguments are as for `calibrate`.
 
     Raises:
-        UserError: see `load_run`; or the photographs are missing, no pixel of the fit is opaque, or
-            its views do not overlap.
+        UserError: see `load_run`; or the photographs are missing, no pixel of the fit is opaque,
+            its views do not overlap, or `out` holds a run or is in use.
     """
     begin, reporter = time.monotonic(), reporter or Silent()
-    _require_no_run(Path(out))
     requested = require_config(cfg)
     check_values(requested)
     check_choice(requested.photometry)
-    run = load_run(run_dir, scene)
-    cfg = dataclasses.replace(run.cfg, photometry=requested.photometry)
-    run.require_photographs(run.scene.train_indices)
-    # Only static Gaussians: a moving surface point is elsewhere in another view.
-    observations = rendered_colors(
-        standing(run.params.gaussians, run.owner),
-        run.scene,
-        run.store.leaving_out(run.scene.objects),
-        cfg.render,
-        cfg.train.seed,
-        lambda i, n: reporter.stage("Rendering depth", i, n),
-    )
-    if not len(observations.views):
-        fix = "fit longer, or calibrate from the scene's tracks"
-        raise UserError(f"{run.folder}: no pixel of one view is visible in another.", fix=fix)
-    options, views = options_of(cfg, run.scene), run.scene.training_views
-    notes = (*run.scene.notes, *strangers(compare_with, run.scene.views))
-    found = solved(views, observations, options, cfg, begin, compare_with, reporter, notes)
-    return found.write(Path(out))
+    with _held(Path(out)):
+        run = load_run(run_dir, scene)
+        cfg = dataclasses.replace(run.cfg, photometry=requested.photometry)
+        run.require_photographs(run.scene.train_indices)
+        # Only static Gaussians: a moving surface point is elsewhere in another view.
+        observations = rendered_colors(
+            standing(run.params.gaussians, run.owner),
+            run.scene,
+            run.store.leaving_out(run.scene.objects),
+            cfg.render,
+            cfg.train.seed,
+            lambda i, n: reporter.stage("Rendering depth", i, n),
+        )
+        if not len(observations.views):
+            fix = "fit longer, or calibrate from the scene's tracks"
+            raise UserError(f"{run.folder}: no pixel of one view is visible in another.", fix=fix)
+        options, views = options_of(cfg, run.scene), run.scene.training_views
+        notes = (*run.scene.notes, *strangers(compare_with, run.scene.views))
+        found = solved(views, observations, options, cfg, begin, compare_with, reporter, notes)
+        return found.write(Path(out))
 
 
 def solved(
@@ -282,10 +282,18 @@ def solved(
     )
 
 
-def _require_no_run(out: Path) -> None:
+@contextlib.contextmanager
+def _held(out: Path) -> Iterator[None]:
+    """Create the folder of a calibration, and hold its lock in a `with` block.
+
+    UserError: it is a file or holds a run, or another process writes to it.
+    """
+    require_folder(out)
     if RunFolder(out).config.exists():
         why = f"{out} holds a run, whose photometry.json would be replaced."
         raise UserError(why, fix="name another folder with --out")
+    with no_empty_folders(out), locked(out):
+        yield
 
 
 def _row(candidate: Candidate) -> dict[str, Any]:
@@ -320,38 +328,39 @@ def calibrate_stack(
     positions. Without `out` nothing is written; see `calibrate`.
 
     Raises:
-        UserError: see `read_stack` and `read_known_exposures`.
+        UserError: see `read_stack` and `read_known_exposures`; or `out` holds a run or is in use.
     """
     cfg, begin, reporter = require_config(cfg), time.monotonic(), reporter or Silent()
     p, seed = cfg.photometry, cfg.train.seed
     check_values(cfg)
     check_choice(p)
-    if out is not None:
-        _require_no_run(Path(out))
     check_source(compare_with)
-    stack, known = read_stack(Path(folder)), None
-    if p.known is not None:
-        values = read_known_exposures(p.known, list(stack.views))
-        unused = without_view(p.known, stack.views)
-        known = KnownExposures(values, p.known_deviation_ev, unused)
-    found = stack_colors(stack, seed)
-    options = CalibrationOptions(found.black, SATURATED, STACK_PIVOT, known, seed, "one_response")
-    arguments = (stack.views, found.observations, options, cfg, begin, compare_with, reporter)
-    notes = strangers(compare_with, stack.views)
-    result = solved(*arguments, notes, gauge=STACK_GAUGE, signal=found.signal)
-    of_frames = (result.solution, found.xy, stack.valid.shape, found.signal)
-    local_ev = regional_ev(options.problem(found.observations), *of_frames)
-    details = {
-        "signal": found.signal,
-        "shifts": found.shifts,
-        "black": found.black,
-        "one_response": local_ev <= LOCAL_EV,
-        "local_ev": local_ev,
-    }
-    messages = (*result.messages, *_stack_messages(stack.views, found, local_ev))
-    details = {**result.details, **details}
-    result = dataclasses.replace(result, messages=messages, details=details)
-    return result if out is None else result.write(Path(out))
+    with contextlib.nullcontext() if out is None else _held(Path(out)):
+        stack, known = read_stack(Path(folder)), None
+        if p.known is not None:
+            values = read_known_exposures(p.known, list(stack.views))
+            unused = without_view(p.known, stack.views)
+            known = KnownExposures(values, p.known_deviation_ev, unused)
+        found = stack_colors(stack, seed)
+        options = CalibrationOptions(
+            found.black, SATURATED, STACK_PIVOT, known, seed, "one_response"
+        )
+        arguments = (stack.views, found.observations, options, cfg, begin, compare_with, reporter)
+        notes = strangers(compare_with, stack.views)
+        result = solved(*arguments, notes, gauge=STACK_GAUGE, signal=found.signal)
+        of_frames = (result.solution, found.xy, stack.valid.shape, found.signal)
+        local_ev = regional_ev(options.problem(found.observations), *of_frames)
+        details = {
+            "signal": found.signal,
+            "shifts": found.shifts,
+            "black": found.black,
+            "one_response": local_ev <= LOCAL_EV,
+            "local_ev": local_ev,
+        }
+        messages = (*result.messages, *_stack_messages(stack.views, found, local_ev))
+        details = {**result.details, **details}
+        result = dataclasses.replace(result, messages=messages, details=details)
+        return result if out is None else result.write(Path(out))
 
 
 def _stack_messages(views: tuple[View, ...], found: StackColors, local_ev: float) -> list[str]:

@@ -15,7 +15,7 @@ from p2gs_jax.core.progress import Reporter
 from p2gs_jax.errors import UserError
 from p2gs_jax.evaluation.alignment import ExposureError, exposure_error
 from p2gs_jax.pipeline.fit import fit
-from p2gs_jax.run.folder import RunFolder, locked, require_free
+from p2gs_jax.run.folder import RunFolder, locked, require_folder, require_free
 from p2gs_jax.synth.sensor import read_true_exposures
 from p2gs_jax.synth.settings import image_height
 from p2gs_jax.synth.write import write_street
@@ -45,11 +45,12 @@ def run_demo(
 
     The demo writes `out/street` and `out/run`, also over a demo that was interrupted. Each of 3
     cameras takes `frames` photographs, `width` pixels wide. Their ISO has the mean 8 and the
-    standard deviation `iso_std`. Raises UserError: `out` holds a finished demo or files that the
-    demo did not make, or another program writes to it.
+    standard deviation `iso_std`. Raises UserError: `out` is a file, holds a finished demo
+    or files that the demo did not make, or another program writes to it.
     """
     street, run_dir = out / "street", out / "run"
     marker = out / "demo.json"
+    require_folder(out)
     if out.exists() and any(out.iterdir()) and not marker.exists():
         raise UserError(f"{out} holds other files.", fix="name another folder with --out")
     if RunFolder(run_dir).metrics.exists():

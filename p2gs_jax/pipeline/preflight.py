@@ -28,7 +28,7 @@ from p2gs_jax.photometry.response import KNOTS
 from p2gs_jax.presets import flat, to_dict
 from p2gs_jax.run.checkpoint import CheckpointStore
 from p2gs_jax.run.decisions import CHOSEN
-from p2gs_jax.run.folder import RunFolder, find, require_free
+from p2gs_jax.run.folder import RunFolder, find, require_folder, require_free
 from p2gs_jax.run.read import read_config
 from p2gs_jax.scene.exposures import check_source, read_known_exposures
 from p2gs_jax.scene.files import recognition_key
@@ -167,8 +167,7 @@ def check_run_dir(run_dir: Path, resume: bool, cfg: FitConfig) -> bool:
         UserError: the path is not a folder, holds a run and `resume` is not set, or holds a run
             with other options.
     """
-    if run_dir.exists() and not run_dir.is_dir():
-        raise UserError(f"{run_dir} is a file.", fix="name a folder with --out")
+    require_folder(run_dir)
     path = RunFolder(run_dir).config
     if not path.exists():
         return False

@@ -121,6 +121,12 @@ def locked(folder: Path) -> Iterator[RunLock]:
             os.close(handle)
 
 
+def require_folder(path: Path) -> None:
+    """Raise a UserError if a file lies where results need a folder."""
+    if path.exists() and not path.is_dir():
+        raise UserError(f"{path} is a file.", fix="name a folder with --out")
+
+
 def require_free(folder: Path) -> None:
     """Raise a UserError if another process writes to a folder; nothing is written."""
     if not (folder / NAME).is_file():

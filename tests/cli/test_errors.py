@@ -88,6 +88,9 @@ WRONG = [
     ("calibrate castle --out run --exposure-ev 1", "without --develop"),
     ("calibrate castle --out run --no-masks", "without --develop"),
     ("calibrate castle --out run --static", "several exposures"),
+    ("calibrate castle --out file.txt", "file.txt is a file.\n  To fix it: name a folder with"),
+    ("sweep sweep.toml --out file.txt", "file.txt is a file.\n  To fix it: name a folder with"),
+    ("demo --out file.txt", "file.txt is a file.\n  To fix it: name a folder with"),
     ("calibrate castle --out begun", "photometry.json would be replaced"),
     ("calibrate castle --out begun --static", "photometry.json would be replaced"),
     ("calibrate castle --out run --static --photometry.curve power", "--photometry.no-select"),
@@ -151,6 +154,7 @@ def folder(tmp_path_factory):
     for name in ("a.jpg", "b.jpg"):
         (root / "junk" / name).write_text("not a photograph")
     (root / "file.txt").write_text("a: [letter]")
+    (root / "sweep.toml").write_text("scene = 'castle'")
     (root / "begun" / "config.json").write_text("{}")
     (root / "torn" / "config.json").write_text('{"scene": "s", "fi')
     cfg = to_dict(preset("robust"))

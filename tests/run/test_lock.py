@@ -7,6 +7,7 @@ import sys
 
 import pytest
 
+import p2gs_jax
 from p2gs_jax.errors import UserError
 from p2gs_jax.run.folder import NAME, locked, require_free
 
@@ -83,12 +84,14 @@ def test_a_folder_that_was_removed_during_a_run_is_named(tmp_path, anew):
     assert run.exists() == anew
 
 
-def test_a_fit_into_a_folder_in_use_is_refused(tmp_path, refused):
+def test_a_fit_or_calibration_into_a_folder_in_use_is_refused(tmp_path, refused):
     (tmp_path / "scene").mkdir()
     run = tmp_path / "run"
     run.mkdir()
     with locked(run):
-        for options in ((), ("--resume",)):
-            text = refused("fit", tmp_path / "scene", "--out", run, *options)
+        for command in ("fit", "fit --resume", "calibrate", "calibrate --static"):
+            text = refused(*command.split(), tmp_path / "scene", "--out", run)
             assert f"process {os.getpid()}" in text
+        with pytest.raises(UserError, match=f"process {os.getpid()}"):
+            p2gs_jax.calibrate_run("nowhere", run)
         assert [p.name for p in run.iterdir()] == [NAME]
