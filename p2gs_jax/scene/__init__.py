@@ -56,10 +56,8 @@ def load_scene(
         if isinstance(found, Path):
             photographs = read_video(found, cfg, work_dir, report)
         else:
-            out = None if work_dir is None else work_dir.parent
-            if out is not None and out.resolve() in {path.parent.resolve() for path in found.paths}:
-                why = f"--out {out} holds the photographs, and pictures of results would join them."
-                raise UserError(why, fix="name another folder with --out")
+            if work_dir is not None:
+                _check_apart(work_dir.parent, found, _searches_below(found.folder, root, cfg))
             photographs = convert_photographs(*found, work_dir, report)
         folder, paths = photographs.folder, photographs.paths
         auto = "sequence" if isinstance(found, Path) else "auto"
@@ -79,6 +77,16 @@ def load_scene(
         if len(scene.points) < FEWEST:
             scene = with_random_seeds(scene)
     return scene
+
+
+def _check_apart(out: Path, found: PhotographsAlone, below: bool) -> None:
+    """Raise UserError if results would be found as photographs, `below` also in subfolders."""
+    holding = {path.resolve() for path in (found.folder, *(p.parent for p in found.paths))}
+    place = out.resolve()
+    if not holding.isdisjoint((place, *place.parents) if below else (place,)):
+        why = f"--out {out} holds the photographs or lies among them, and pictures of results "
+        why += "would join them."
+        raise UserError(why, fix="name another folder with --out")
 
 
 def with_masks_and_split(scene: Scene, cfg: DataConfig) -> Scene:
@@ -186,9 +194,7 @@ def _read_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
 def _photographs_alone(root: Path, cfg: DataConfig) -> PhotographsAlone:
     folders = [root / cfg.images] if cfg.images is not None else [root / "images", root]
     for folder in folders:
-        # Subfolders of the root may hold masks or results of other runs: they are searched only if
-        # the user names the root.
-        paths = list_images(folder, recursive=folder != root or cfg.images is not None)
+        paths = list_images(folder, recursive=_searches_below(folder, root, cfg))
         for path in paths:
             if is_panorama(path):
                 raise broken(path, "shows a whole sphere, and is not a pinhole photograph", CUT)
@@ -208,3 +214,12 @@ def _photographs_alone(root: Path, cfg: DataConfig) -> PhotographsAlone:
     why += "transforms_train.json, no poses_bounds.npy, no drive of a known data set, and no "
     why += f"photographs (looked in {looked})"
     raise UserError(why, fix=fix)
+
+
+def _searches_below(folder: Path, root: Path, cfg: DataConfig) -> bool:
+    """Return whether photographs are searched in subfolders too.
+
+    Subfolders of the root may hold masks or results of other runs: they are searched only if the
+    user names the root.
+    """
+    return folder != Path(root) or cfg.images is not None

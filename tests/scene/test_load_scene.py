@@ -60,6 +60,21 @@ def test_results_among_photographs_alone_are_refused(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["0.png"]
 
 
+def test_results_below_searched_photographs_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("p2gs_jax.scene.convert_photographs", lambda *_: pytest.fail("apart"))
+    write_image(tmp_path / "alone" / "0.png")
+    write_image(tmp_path / "images" / "front" / "0.png")
+    (tmp_path / "link").symlink_to(tmp_path / "images")
+    for run in ("images/run", "images/front/a/run", "link/run"):
+        with refused("among them"):
+            load_scene(tmp_path, CFG, tmp_path / run / "cache")
+    with refused("among them"):
+        load_scene(tmp_path, dataclasses.replace(CFG, images="."), tmp_path / "run" / "cache")
+    for root, run in (("", "run"), ("", "../run"), ("alone", "alone/run")):
+        with pytest.raises(pytest.fail.Exception, match="apart"):
+            load_scene(tmp_path / root, CFG, tmp_path / run / "cache")
+
+
 def test_folders_of_cameras_are_a_scene_with_an_option(tmp_path):
     names = ["front/0.png", "left/0.png"]
     for name in names:
