@@ -61,7 +61,7 @@ def list_images(folder: Path, *, recursive: bool = True) -> list[Path]:
     """Return the photographs in a folder, sorted by relative path; none if it does not exist.
 
     Hidden files are left out, and so are masks (in a folder of masks, or named after a photograph),
-    depth maps and normal maps.
+    depth maps and normal maps. Raises OSError: a folder cannot be read.
     """
     if not folder.is_dir():
         return []
@@ -79,14 +79,15 @@ def list_images(folder: Path, *, recursive: bool = True) -> list[Path]:
 def files_below(folder: Path, above: tuple[Path, ...] = ()) -> Iterator[Path]:
     """Yield the files in a folder and its subfolders; links are followed, but not in a circle.
 
-    `above` holds the true paths of the folders that led here.
+    `above` holds the true paths of the folders that led here. Raises OSError: a folder cannot be
+    read; `filename` names it.
     """
     above = (*above, folder.resolve())
-    _, folders, names = next(os.walk(folder), ("", (), ()))
-    yield from (folder / name for name in names)
-    for below in (folder / name for name in folders):
-        if not any(path.is_relative_to(below.resolve()) for path in above):
-            yield from files_below(below, above)
+    for path in folder.iterdir():
+        if not path.is_dir():
+            yield path
+        elif not any(place.is_relative_to(path.resolve()) for place in above):
+            yield from files_below(path, above)
 
 
 def named_as_mask(name: str) -> bool:
@@ -209,6 +210,7 @@ def image_size(path: Path) -> tuple[int, int]:
     """Return (width, height) as stored, before any EXIF rotation.
 
     Raises UserError: it is not an image, or too large; its name is not UTF-8; a package is missing.
+    Raises OSError: it may not be read.
     """
     try:
         str(path).encode()  # the files of a run hold names in UTF-8
@@ -268,8 +270,10 @@ def is_panorama(path: Path) -> bool:
 
 
 def undecodable(path: Path) -> UserError:
-    """Return the error for a file that is not a readable image."""
+    """Return the error for a file that is not an image; OSError: it may not be read."""
     size = path.stat().st_size if path.is_file() else 0
+    if size:
+        path.open("rb").close()
     fix = "copy or export that photograph again, or remove it from the scene"
     return broken("cannot decode the image", f"{path} ({size} bytes)", fix)
 

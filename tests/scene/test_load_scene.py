@@ -1,6 +1,10 @@
 """Detection of formats, EXIF, masks, alpha, names of files, and sizes of pictures."""
 
+import builtins
 import dataclasses
+import errno
+import io
+import os
 import struct
 import zlib
 
@@ -347,6 +351,28 @@ def test_links_to_folders_are_followed_but_not_in_a_circle(tmp_path):
     views = (dataclasses.replace(make_view(paths[1]), name=names[1]),)
     found, _ = attach_masks(Scene(tmp_path, "images", views, np.zeros((0, 3)), None))
     assert found[0].mask_path == tmp_path / "masks/a/front/1.jpg"
+
+
+@pytest.mark.parametrize("name", ["front", "front/1.png"])
+def test_folders_and_photographs_that_may_not_be_read_are_named(tmp_path, monkeypatch, name):
+    for k in range(2):
+        write_image(tmp_path / "images" / "front" / f"{k}.png")
+    denied = tmp_path / "images" / name
+
+    def as_for_others(function):  # tests run as root, who may read everything
+        def call(path, *more, **options):
+            if path == denied or path == str(denied):
+                raise PermissionError(errno.EACCES, "Permission denied", str(path))
+            return function(path, *more, **options)
+
+        return call
+
+    for module, function in ((os, "listdir"), (os, "scandir"), (io, "open"), (builtins, "open")):
+        monkeypatch.setattr(module, function, as_for_others(getattr(module, function)))
+    monkeypatch.setattr(np, "fromfile", as_for_others(np.fromfile))
+    with pytest.raises(PermissionError) as error:
+        [image_size(path) for path in list_images(tmp_path / "images")]
+    assert error.value.filename == str(denied)
 
 
 def test_masks_of_several_cameras_are_not_mixed_up(tmp_path):
