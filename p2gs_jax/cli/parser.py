@@ -49,7 +49,8 @@ def parse(argv: list[str]) -> tuple[str, Any]:
     """Return the command's name and its options.
 
     Raises:
-        UserError: there is no such command or preset, or the option is another program's.
+        UserError: there is no such command or preset, an argument is empty, or the option is
+            another program's.
         SystemExit: 0 after requested help or version, 2 without a command or with invalid options.
     """
     first = argv[0] if argv else ""
@@ -68,6 +69,11 @@ def _options(name: str, argv: list[str]) -> Any:
     kind = COMMANDS[name]
     names = (*(f.name for f in dataclasses.fields(kind)), *getattr(kind, "SHORT_NAMES", ()))
     check_option_names(name, argv, {f"--{n.replace('_', '-')}" for n in names})
+    for before, word in itertools.pairwise((name, *argv)):
+        # Python takes an empty path, often an unset variable of a shell, for the current folder.
+        if not word or (word.startswith("--") and word.endswith("=")):
+            why = f"the argument after {word or before} is empty."
+            raise UserError(why, fix="name a file or folder, or write . for the current folder")
     whole = HELP_ALL in argv
     brief = not whole and any(a in HELP for a in argv)
     if brief or whole:

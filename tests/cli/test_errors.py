@@ -178,6 +178,18 @@ def test_wrong_command_lines_end_with_a_remedy(refused, folder, monkeypatch, wor
 
 
 @pytest.mark.parametrize(
+    "words", ["inspect _", "calibrate _ --out run", "fit castle --out _", "fit castle --out=_"]
+)
+def test_an_empty_path_is_not_the_current_folder(refused, folder, monkeypatch, words):
+    monkeypatch.chdir(folder)
+    before = contents(folder)
+    text = refused(*(word.replace("_", "") for word in words.split()))
+    assert "is empty." in text
+    assert "write . for the current folder" in text
+    assert contents(folder) == before
+
+
+@pytest.mark.parametrize(
     ("name", "content", "remedy"),
     [
         ("radiance.ply", 500, "restore it from a copy"),
