@@ -60,13 +60,13 @@ def main(argv: list[str] | None = None) -> None:
         else:
             raise
     except KeyboardInterrupt as error:
-        print(f"p2gs-jax: interrupted{_CONTINUED.get(command, '')}", file=sys.stderr)
+        notes = getattr(error, "__notes__", [_CONTINUED.get(command, "")])
+        print(f"p2gs-jax: interrupted{''.join(notes)}", file=sys.stderr)
         code = interrupts.exit_code(error)
     sys.exit(code)
 
 
 _CONTINUED = {
-    "fit": "; --resume continues from the last checkpoint",
     "sweep": "; the same command continues it",
     "demo": "; the same command begins it again",
 }

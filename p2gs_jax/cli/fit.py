@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import glob
 import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
@@ -86,13 +88,17 @@ class Fit:
         from p2gs_jax.core.progress import TerminalReporter
         from p2gs_jax.core.runtime import use_cores
         from p2gs_jax.pipeline.fit import fit
+        from p2gs_jax.run.folder import RunFolder
         from p2gs_jax.train.data_parallel import with_a_view_each
 
         self._check()
         cfg, out, cluster = self.config, self.run_folder(), self.cluster
         if cluster.blocks is None:
             use_cores(self.threads)
-        with WatchedReporter(out, self.port) if self.view else TerminalReporter() as reporter:
+        shown = WatchedReporter(out, self.port) if self.view else TerminalReporter()
+        with _naming_checkpoint(out), shown as reporter:
+            if self.resume and not RunFolder(out).config.exists():
+                reporter.message(f"{out} holds no run to continue: a new one begins.")
             common = {"reference": self.reference, "resume": self.resume, "reporter": reporter}
             if cluster.blocks is None:
                 # The budget includes the start of Python, whose duration is about its CPU time.
@@ -149,6 +155,21 @@ class Fit:
         check(count is None or (devices == 1 and self.threads is None), why, fix=fix)
         valid = not isinstance(devices, int) or devices >= 1
         check(valid, f"--devices {devices} is not a number of devices", fix=f"{write} all")
+
+
+@contextlib.contextmanager
+def _naming_checkpoint(out: Path) -> Iterator[None]:
+    """Note at an interruption that --resume continues, if the run or a block has a checkpoint."""
+    from p2gs_jax.run.checkpoint import saved_steps
+    from p2gs_jax.run.folder import RunFolder
+
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        folders = map(RunFolder, (out, *out.glob("blocks/*")))
+        if any(saved_steps(folder.checkpoints) for folder in folders):
+            error.add_note("; --resume continues from the last checkpoint")
+        raise
 
 
 @dataclass(frozen=True, kw_only=True)

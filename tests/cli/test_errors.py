@@ -3,6 +3,7 @@
 import errno
 import json
 import shutil
+import signal
 
 import cv2
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 from p2gs_jax.cli.experiments import Synth
 from p2gs_jax.cli.shared import has_viewer, parse_duration
+from p2gs_jax.core.interrupts import Interrupted
 from p2gs_jax.errors import UserError
 from p2gs_jax.presets import preset, to_dict
 from p2gs_jax.run.folder import locked
@@ -219,6 +221,21 @@ def test_a_file_that_cannot_grow_is_named(refused, tmp_path, monkeypatch):
 
     monkeypatch.setattr(Synth, "execute", run)
     assert "out.json: File too large" in refused("synth", tmp_path / "new")
+
+
+@pytest.mark.parametrize("place", ["checkpoints/5", "blocks/0/checkpoints/5", None])
+def test_an_interrupted_fit_names_resume_only_with_a_checkpoint(
+    tmp_path, run_command, monkeypatch, place
+):
+    def fit(*paths, **options):
+        if place is not None:
+            (tmp_path / place).mkdir(parents=True)
+        raise Interrupted(signal.SIGINT)
+
+    monkeypatch.setattr("p2gs_jax.pipeline.fit.fit", fit)
+    code, text = run_command("fit", "castle", "--out", tmp_path, "--resume")
+    assert (code, "--resume continues" in text) == (130, place is not None)
+    assert "holds no run to continue: a new one begins." in " ".join(text.split())
 
 
 def test_durations_are_parsed_or_refused():
