@@ -47,7 +47,7 @@ from p2gs_jax.run.folder import RunFolder, locked, require_folder
 from p2gs_jax.run.photometry_files import write_solution
 from p2gs_jax.run.plots import write_calibration_plot
 from p2gs_jax.run.read import load_run
-from p2gs_jax.scene import load_scene
+from p2gs_jax.scene import PhotographsAlone, check_apart, load_scene
 from p2gs_jax.scene.exposures import (
     check_source,
     read_known_exposures,
@@ -328,7 +328,8 @@ def calibrate_stack(
     positions. Without `out` nothing is written; see `calibrate`.
 
     Raises:
-        UserError: see `read_stack` and `read_known_exposures`; or `out` holds a run or is in use.
+        UserError: see `read_stack` and `read_known_exposures`; or `out` holds the photographs or a
+            run, or is in use.
     """
     cfg, begin, reporter = require_config(cfg), time.monotonic(), reporter or Silent()
     p, seed = cfg.photometry, cfg.train.seed
@@ -337,6 +338,9 @@ def calibrate_stack(
     check_source(compare_with)
     with contextlib.nullcontext() if out is None else _held(Path(out)):
         stack, known = read_stack(Path(folder)), None
+        if out is not None:
+            paths = [view.image_path for view in stack.views]
+            check_apart(Path(out), PhotographsAlone(paths[0].parent, paths))
         if p.known is not None:
             values = read_known_exposures(p.known, list(stack.views))
             unused = without_view(p.known, stack.views)

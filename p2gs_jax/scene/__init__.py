@@ -57,7 +57,7 @@ def load_scene(
             photographs = read_video(found, cfg, work_dir, report)
         else:
             if work_dir is not None:
-                _check_apart(work_dir.parent, found, _searches_below(found.folder, root, cfg))
+                check_apart(work_dir.parent, found, _searches_below(found.folder, root, cfg))
             photographs = convert_photographs(*found, work_dir, report)
         folder, paths = photographs.folder, photographs.paths
         auto = "sequence" if isinstance(found, Path) else "auto"
@@ -79,7 +79,7 @@ def load_scene(
     return scene
 
 
-def _check_apart(out: Path, found: PhotographsAlone, below: bool) -> None:
+def check_apart(out: Path, found: PhotographsAlone, below: bool = False) -> None:
     """Raise UserError if results would be found as photographs, `below` also in subfolders."""
     holding = {path.resolve() for path in (found.folder, *(p.parent for p in found.paths))}
     place = out.resolve()

@@ -139,6 +139,13 @@ def test_a_stack_with_local_tone_mapping_is_recognised(tmp_path):
     assert any("One response does not explain" in m for m in result.messages)
 
 
+def test_results_among_the_photographs_of_a_stack_are_refused(tmp_path):
+    write_stack(tmp_path / "images", [1.0, 2.0])
+    with pytest.raises(UserError, match="holds the photographs"):
+        calibrate_stack(tmp_path, tmp_path / "images")
+    assert len(list((tmp_path / "images").iterdir())) == 2
+
+
 def test_stacks_of_several_sizes_or_with_broken_files_are_refused(tmp_path):
     write_stack(tmp_path / "s", [1.0, 2.0])
     cv2.imwrite(str(tmp_path / "s" / "zz.png"), np.zeros((10, 10, 3), np.uint8))
