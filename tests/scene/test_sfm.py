@@ -48,7 +48,7 @@ def test_photographs_alone_with_a_stranger_are_mapped_and_cached(shared_data, tm
     assert again.notes == scene.notes
 
 
-def test_photographs_that_do_not_register_or_open_are_refused(tmp_path):
+def test_photographs_that_do_not_register_or_open_are_refused(tmp_path, capfd):
     write_image(tmp_path / "0.png")
     with refused("holds 1 image"):
         load_scene(tmp_path, CFG)
@@ -56,6 +56,7 @@ def test_photographs_that_do_not_register_or_open_are_refused(tmp_path):
         write_image(tmp_path / f"{i}.png", 40 * i, (64, 48))
     with refused(r"none of the 3 images.*no features", "overlap"):
         load_scene(tmp_path, CFG)
+    assert "sfm.cc" not in capfd.readouterr().err, "COLMAP's own log"
     (tmp_path / "0.png").write_bytes(b"nothing")
     with refused(r"cannot decode the image .*0.png"):
         load_scene(tmp_path, CFG)

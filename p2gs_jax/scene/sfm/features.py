@@ -52,8 +52,8 @@ Pair = tuple[str, str]
 
 
 def quiet_colmap() -> None:
-    """Set COLMAP's log to errors only, without progress."""
-    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
+    """Silence COLMAP's log: the messages of this package name its failures with their reasons."""
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
 
 
 def extract(
