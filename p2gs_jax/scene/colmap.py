@@ -21,7 +21,7 @@ from jaxtyping import Float, Int, UInt8
 from scipy.spatial.transform import Rotation
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.core.text import count_of
+from p2gs_jax.core.text import count_of, first_few
 from p2gs_jax.errors import UserError, broken
 from p2gs_jax.scene import files
 from p2gs_jax.scene.cameras import name_cameras
@@ -73,14 +73,18 @@ def find_model(root: Path) -> Path | None:
     """Return the folder of a scene's COLMAP model, or None.
 
     It is `sparse/0`, `sparse`, the root, or a folder below `sparse`. Numbered models are parts that
-    COLMAP could not join; the part with most photographs is used.
+    COLMAP could not join; the part with most photographs is used. Raises UserError: folders below
+    `sparse` hold several models that are not such parts.
     """
     usual = (root / "sparse" / "0", root / "sparse", root)
     return _largest(next((f for f in usual if is_model(f)), None) or _first_below(root / "sparse"))
 
 
 def find_deeper_model(root: Path) -> Path | None:
-    """Return a model up to four folders below a scene, such as `colmap/sparse/0`, or None."""
+    """Return a model up to four folders below a scene, such as `colmap/sparse/0`, or None.
+
+    Raises UserError: there are several that are not numbered parts of one, as of several scenes.
+    """
     return _largest(_first_below(root))
 
 
@@ -89,9 +93,14 @@ def _first_below(root: Path) -> Path | None:
         images = (f for f in root.glob("*/" * depth + "images.*") if f.suffix in (".bin", ".txt"))
         folders = {f.parent for f in images if f.with_stem("cameras").is_file()}
         found = [folder for folder in folders if not _is_of_run(folder, root)]
+        # 3DGS keeps the original of an undistorted model in a folder of this name.
+        found = [f for f in found if "distorted" not in f.relative_to(root).parts] or found
+        apart = sorted({str(f.parent if f.name.isdecimal() else f) for f in found})
+        if len(apart) > 1:
+            why = f"holds several COLMAP models: {first_few(apart)}"
+            raise broken(root, why, "name the folder of one scene, or that of its model")
         if found:
-            # 3DGS keeps the original of an undistorted model in a folder of this name.
-            return min(found, key=lambda f: ("distorted" in f.parts, f.as_posix()))
+            return min(found)
     return None
 
 

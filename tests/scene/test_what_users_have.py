@@ -44,6 +44,15 @@ def test_models_in_other_folders_are_read(tmp_path, place):
     assert place in scene.notes[-1]
 
 
+def test_a_folder_of_several_scenes_is_refused(tmp_path):
+    helpers.write_tiny_model(tmp_path / "b")
+    helpers.write_tiny_model(tmp_path / "distorted")
+    assert find_scene(tmp_path, CFG).views[0].image_path.is_relative_to(tmp_path / "b")
+    helpers.write_tiny_model(tmp_path / "a")
+    with helpers.refused(f"{tmp_path}/a/sparse, {tmp_path}/b/sparse", "folder of one scene"):
+        find_scene(tmp_path, CFG)
+
+
 def test_an_undistorted_model_uses_the_photographs_of_its_size(tmp_path):
     helpers.write_tiny_model(tmp_path / "dense" / "0")
     (tmp_path / "dense" / "0" / "sparse" / "0").rename(tmp_path / "dense" / "0" / "model")
