@@ -133,7 +133,7 @@ def find_names(names: Iterable[str], folder: Path) -> dict[str, str]:
     """Return the file below a folder for each name; names without such a file are left out.
 
     The file may differ in case, Unicode form or suffix, or lie in another subfolder, if it is the
-    only such file and no other name fits it.
+    only such file and no other name fits it. The longest common end of their paths decides.
     """
     found = {name: name for name in names if (folder / name).is_file()}
     left = [name for name in dict.fromkeys(names) if name not in found]
@@ -148,7 +148,8 @@ def alike_names(names: Iterable[str], files: Collection[str]) -> dict[str, str]:
     """
     found: dict[str, str] = {}
     left = list(dict.fromkeys(names))
-    for alike in (str, _folded, _stem, lambda name: _folded(PurePath(name).name)):
+    deepest = max((name.count("/") + 1 for name in left), default=0)
+    for alike in (str, _folded, _stem, *map(_end_of, range(deepest, 0, -1))):
         there: dict[str, list[str]] = defaultdict(list)
         rest = set(files) - set(found.values())
         for file in sorted(rest, key=lambda f: (not f.endswith(".png"), f)):
@@ -173,6 +174,11 @@ def nearly_named(files: Mapping[str, str], source: str) -> list[str]:
 
 def _folded(name: str) -> str:
     return unicodedata.normalize("NFC", name).casefold()
+
+
+def _end_of(count: int) -> Callable[[str], str]:
+    """Return the function from a name to the last parts of its path, case-folded."""
+    return lambda name: "/".join(_folded(name).split("/")[-count:])
 
 
 def _stem(name: str) -> str:

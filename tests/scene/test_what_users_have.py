@@ -86,6 +86,7 @@ def test_the_largest_of_several_models_is_used(tmp_path, inside):
         (["left/a.png", "left/b.png"], ["a.png", "b.png"]),
         (["a.jpg", "a.png"], [None, "a.png"]),
         (["left/a.png", "right/a.png"], [None, None, "a.png"]),
+        (["C:/d/left/a.png", "C:/d/right/a.png"], ["left/a.png", "right/a.png"]),
     ],
 )
 def test_names_that_are_nearly_right_match(tmp_path, names, files):
