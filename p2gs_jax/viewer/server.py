@@ -13,6 +13,7 @@ import hmac
 import http
 import io
 import ipaddress
+import logging
 import secrets
 import socket
 import threading
@@ -90,6 +91,8 @@ def is_loopback(host: str) -> bool:
 @contextlib.contextmanager
 def guarded(guard: Guard) -> Iterator[None]:
     """Apply a guard to every server of `websockets` that starts in the `with` block."""
+    # A message that viser cannot read ends its connection; `websockets` also prints a traceback.
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     with _STARTING:
         serve = websocket_server.serve
 
@@ -108,7 +111,10 @@ def _hook(guard: Guard, inner: Hook | None) -> Hook:
         refusal = guard.refusal(request)
         if refusal is not None:
             return connection.respond(http.HTTPStatus.FORBIDDEN, refusal + "\n")
-        answer = None if inner is None else inner(connection, request)
+        try:
+            answer = None if inner is None else inner(connection, request)
+        except OSError:  # the path is too long for the name of a file
+            return connection.respond(http.HTTPStatus.NOT_FOUND, "This page does not exist.\n")
         if answer is not None and guard.token is not None:
             cookie = f"{_cookie(request)}={guard.token}"
             answer.headers["Set-Cookie"] = f"{cookie}; HttpOnly; SameSite=Strict"

@@ -162,6 +162,18 @@ def test_requests_from_other_sites_and_for_other_host_names_are_refused(servers)
         assert get(servers[0], Host=host, Origin=f"http://{host}")[0] == 403
 
 
+def test_what_viser_cannot_read_ends_one_connection_or_is_not_found(servers, caplog):
+    address = f"ws://127.0.0.1:{servers[0].get_port()}"
+    for message in (b"garbage", "text"):
+        with websockets.sync.client.connect(address, subprotocols=[PROTOCOL]) as channel:
+            channel.send(message)
+            with pytest.raises(websockets.ConnectionClosedError):
+                list(channel)
+    assert not caplog.records
+    assert get(servers[0], "/" + "a" * 300)[0] == 404
+    assert connects(servers[0])
+
+
 def test_other_machines_need_the_token(servers):
     server = servers[1]
     for path in ("/", "/?token=", "/?token=wrong", "/?token=secre", "/index.html", "/?t=secret"):
