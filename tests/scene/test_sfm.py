@@ -5,6 +5,7 @@ import functools
 import itertools
 import os
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -57,6 +58,9 @@ def test_photographs_that_do_not_register_or_open_are_refused(tmp_path, capfd):
     with refused(r"none of the 3 images.*no features", "overlap"):
         load_scene(tmp_path, CFG)
     assert "sfm.cc" not in capfd.readouterr().err, "COLMAP's own log"
+    with refused("none of the 3 images of walk.mp4"):
+        frames = sorted(tmp_path.iterdir())
+        sfm_map.load_images(Path("walk.mp4"), tmp_path, frames, CFG, None, print)
     (tmp_path / "0.png").write_bytes(b"nothing")
     with refused(r"cannot decode the image .*0.png"):
         load_scene(tmp_path, CFG)

@@ -94,9 +94,11 @@ def read_heif(path: Path) -> Picture:
     Raises UserError: the library is missing, or the file is broken.
     """
     try:
-        if kind_of(path) == "heif":
+        heif = pillow_heif(path) if kind_of(path) == "heif" else None
+        # Some programs give a JPEG this suffix.
+        if heif is not None and heif.is_supported(path):
             # Pillow's opener does not support 16 bits.
-            image = pillow_heif(path).open_heif(path, convert_hdr_to_8bit=False)
+            image = heif.open_heif(path, convert_hdr_to_8bit=False)
             pixels = np.asarray(image)
         else:
             with Image.open(path) as image:
@@ -106,7 +108,7 @@ def read_heif(path: Path) -> Picture:
     except UserError:
         raise
     except Exception as error:  # decoding is lazy, and the libraries raise errors of many kinds
-        raise broken(path, f"cannot be decoded: {error}.", _AGAIN) from None
+        raise broken(path, f"cannot be decoded: {str(error).strip().rstrip('.')}", _AGAIN) from None
     exif = Image.Exif()
     try:
         exif.load(info.get("exif") or b"")

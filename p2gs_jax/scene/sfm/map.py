@@ -64,7 +64,7 @@ def load_images(
     if len(paths) < 2:
         why = f"holds {count_of(len(paths), 'image')}; a reconstruction needs at least two"
         fix = "add photographs of the same place from different positions"
-        raise broken(image_folder, why, fix)
+        raise broken(root, why, fix)
     groups: dict[tuple, list[str]] = defaultdict(list)
     for path, name in zip(paths, names, strict=True):
         exif = read_exif_camera(path, zoom=True) if cfg.camera_by in ("auto", "exif") else ""
@@ -82,7 +82,7 @@ def load_images(
 
     def build(folder: Path) -> None:
         kept = (folder if work_dir is None else work_dir) / FEATURES
-        _build(folder, kept, image_folder, groups, pairs, report)
+        _build(folder, kept, root, image_folder, groups, pairs, report)
 
     with files.cached_folder(work_dir, "sfm", key, build) as folder:
         images = str(image_folder.resolve())
@@ -102,6 +102,7 @@ def load_images(
 def _build(
     folder: Path,
     kept: Path,
+    root: Path,
     image_folder: Path,
     groups: Mapping[tuple, Sequence[str]],
     pairs: Sequence[features.Pair] | None,
@@ -109,7 +110,7 @@ def _build(
 ) -> None:
     """Write the largest model to a folder, and the reasons why photographs are not in it.
 
-    The features are cached in `kept`.
+    The features are cached in `kept`; messages name `root`.
     """
     features.quiet_colmap()
     names = [name for group in groups.values() for name in group]
@@ -132,7 +133,7 @@ def _build(
     models = sorted(found, key=lambda m: (m.num_reg_images(), m.num_points3D()), reverse=True)
     why = reasons(database, names, models)
     if not models:
-        none = f"none of the {len(names)} images in {image_folder} could be registered"
+        none = f"none of the {len(names)} images of {root} could be registered"
         raise UserError(f"{none}: {sentence(why)}", fix=_ADVICE)
     (folder / "model").mkdir()
     models[0].write(folder / "model")

@@ -154,6 +154,11 @@ def test_display_values_profile_and_settings_are_kept(folder: Path, kind: str) -
         converted(folder)
 
 
+def test_a_jpeg_that_is_named_heic_is_read(folder: Path) -> None:
+    Image.new("RGB", (40, 32)).save(folder / "a.heic", "jpeg")
+    assert stored(converted(folder).paths[0]).shape == (32, 40, 3)
+
+
 def test_ten_bit_heic_keeps_its_precision(folder: Path) -> None:
     ramp = np.linspace(20_000, 22_000, 96).astype(np.uint16)
     made.save_heic(folder / "a.heic", np.broadcast_to(ramp[None, :, None], (64, 96, 3)))
@@ -266,6 +271,9 @@ def test_unsupported_and_broken_files_are_refused(folder: Path) -> None:
     refuse("a.exr", r"a\.exr is not a readable OpenEXR")
     made.write_exr(folder / "b.exr", np.ones((8, 8, 1), np.float32), "Z")
     refuse("b.exr", "has the channels Z")
+    made.save_heic(folder / "a.heic", np.full((64, 64, 3), 90, np.uint8))
+    (folder / "a.heic").write_bytes((folder / "a.heic").read_bytes()[:-9])
+    refuse("a.heic", r"a\.heic cannot be decoded: .*[^.\s]\.\n", "copy that photograph again")
     made.write_dng(folder / "a.dng", GREY)
     data = (folder / "a.dng").read_bytes()
     (folder / "a.dng").write_bytes(data[: len(data) // 2])
