@@ -91,6 +91,11 @@ def with_random_seeds(scene: Scene) -> Scene:
     note = f"{why}: {len(points)} seeds were drawn at random where the cameras "
     note += f"look, at depths of {near:.3g} to {far:.3g}."
     notes = (*scene.notes, note)
+    if len(views) > 1 and np.allclose([v.viewmat for v in views], views[0].viewmat):
+        same = f"All {len(views)} training views of {scene.root} have the same pose, so that "
+        same += "depths are unknown: correct the poses, or use `calibrate --static` if the camera "
+        same += "did not move."
+        notes = (*notes, same)
     unseen = {"point_colors": None, "tracks": None, "random_seeds": True}
     return dataclasses.replace(scene, points=points, notes=notes, **unseen)
 

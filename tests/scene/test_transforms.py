@@ -209,6 +209,15 @@ def test_the_split_of_the_data_set_wins_and_random_seeds_follow(tmp_path, monkey
     assert (local[:, 2] > 0).all()
 
 
+def test_poses_that_are_all_equal_are_noted(tmp_path):
+    path = write_blender(tmp_path) / "transforms_train.json"
+    data = helpers.blender(np.repeat(helpers.around(1), 6, axis=0), "train")
+    path.write_text(json.dumps(data))
+    note = load_scene(tmp_path, CFG).notes[-1]
+    assert f"All 6 training views of {tmp_path} have the same pose" in note
+    assert "`calibrate --static`" in note
+
+
 def test_options_replace_the_split_and_depths_follow_from_cameras(tmp_path):
     write_blender(tmp_path)
     cfg = DataConfig(split="every", test_every=3)
