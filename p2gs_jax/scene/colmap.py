@@ -176,6 +176,10 @@ def load_colmap(root: Path, folder: Path, cfg: DataConfig) -> Scene:
     if lost and (model.point_ids >= 0).any():
         why = f"{count_of(lost, 'observation')} in {source.name} are left out: "
         notes.append(f"{why}{model.file('points3D').name} lacks their points")
+    known = len(seen) - lost
+    if tracks is not None and len(tracks.xy) < known / 2:
+        note = f"only {len(tracks.xy):,} of {count_of(known, 'observation')} lie where the lenses "
+        notes.append(f"{note}in {model.file('cameras')} are valid: check their distortion")
     named = name_cameras(views, cfg.camera_by)
     return off_origin(Scene(root, "colmap", named, model.xyz, model.rgb, tracks, tuple(notes)))
 

@@ -123,6 +123,12 @@ def test_smaller_images_rescale_the_cameras(tmp_path):
     assert "rescaled" in scene.notes[0]
 
 
+def test_observations_outside_of_a_lens_are_counted(tmp_path):
+    model = write_tiny_model(tmp_path, cameras="1 SIMPLE_RADIAL 40 30 50 20 15 -500\n")
+    (note,) = load_scene(tmp_path, CFG).notes
+    assert f"only 0 of 2 observations lie where the lenses in {model / 'cameras.txt'}" in note
+
+
 def test_an_option_names_the_folder_of_images(tmp_path):
     write_tiny_model(tmp_path)
     (tmp_path / "images").rename(tmp_path / "photos")
