@@ -36,6 +36,7 @@ from p2gs_jax.types import Scene
 # Points of each view to which a curve is fitted if the options give its kind.
 RESPONSE_PER_VIEW = 200
 HELD_OUT = 0.4  # share of each view's regions that is held out
+JUDGED = 0.05  # least share of observations that is held out and predicted by others
 # Candidates are compared on at most this many observations; the choice is solved on all.
 MOST_OBSERVATIONS = 40_000
 SPLINE_OBSERVATIONS = 12_000  # a curve has few parameters, and its basis is the most expensive
@@ -202,7 +203,8 @@ def held_out(o: Observations, seed: int) -> Bool[np.ndarray, " o"]:
 
     Single observations would be predicted by neighbours with the same error. Parameters that
     explain such errors would then win (BUILD_NOTES, "Whole regions"). They are held out only where
-    every view has a single region.
+    regions would leave hardly anything to judge: views have one region, or the same points are held
+    out in all views. The simplest model would win there.
     """
     rng = generator(seed, Stream.HELD_OUT)
     if o.positions is None:
@@ -216,8 +218,10 @@ def held_out(o: Observations, seed: int) -> Bool[np.ndarray, " o"]:
     rank = np.argsort(order) - first
     most = np.rint(HELD_OUT * count)
     held = (rank < most[view_of])[region]
-    # Without a view of two regions nothing would be judged, and the simplest model would win.
-    return held if held.any() else rng.permutation(len(held)) < HELD_OUT * len(held)
+    judged = held & np.isin(o.points, o.points[~held])
+    if judged.sum() > JUDGED * len(held):
+        return held
+    return rng.permutation(len(held)) < HELD_OUT * len(held)
 
 
 def _chosen(

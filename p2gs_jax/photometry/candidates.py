@@ -270,13 +270,11 @@ def _predict(
     o, weight = problem.observations, np.zeros(problem.usable.shape)
     weight[~held] = fit.at.weight
     model = Forward.of(problem, response, fit.model.unknowns)
-    row = problem.layout.row[held]
-    residual, precision = predict(model, fit.theta, weight)
-    if not precision[row].any():
-        # Points seen twice leave one observation each, which the fit does not use.
-        weight[~held] = model.noise_weight[~held]
-        residual, precision = predict(model, fit.theta, weight)
-    sigma, y, precision = model.sigma[held], o.colors[held], precision[row]
+    row, (_, precision) = problem.layout.row, predict(model, fit.theta, weight)
+    # The lone observation that is left of a point predicts, although the fit does not use it.
+    lone = (precision[row] == 0) & ~held[:, None]
+    residual, precision = predict(model, fit.theta, np.where(lone, model.noise_weight, weight))
+    sigma, y, precision = model.sigma[held], o.colors[held], precision[row[held]]
     known = problem.usable[held] & (precision > 1e-3)
     a = fit.theta.a[o.views[held]][:, None]
     error = residual[held] / model.slope[held]

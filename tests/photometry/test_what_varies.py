@@ -277,6 +277,16 @@ def test_points_that_are_seen_twice_tell_what_varies():
         assert ev(found) < 0.05
 
 
+def test_sixty_points_in_three_photographs_tell_what_varies():
+    views = [27, 30, 32]
+    seen = PLAIN.picked(np.isin(PLAIN.views, views))
+    shared = np.flatnonzero(np.bincount(seen.points) > 1)
+    points = np.random.default_rng(6).choice(shared, 60, replace=False)
+    found = select(seen.picked(np.isin(seen.points, points))).solution
+    assert found.model == "view_exposure"
+    assert exposure_error(np.exp(found.log_exposures[views]), ISO4[views])["ev"] < 0.03
+
+
 def test_sharp_images_do_not_earn_parameters_for_invisible_differences():
     """Noise-free, many observations, exposures a hundredth of a stop apart."""
     drive = make_drive(10, 2500, 1)
