@@ -36,7 +36,7 @@ from p2gs_jax.types import Scene
 # Points of each view to which a curve is fitted if the options give its kind.
 RESPONSE_PER_VIEW = 200
 HELD_OUT = 0.4  # share of each view's regions that is held out
-JUDGED = 0.05  # least share of observations that is held out and predicted by others
+JUDGED = 0.05  # least share of observations that are held out and have a partner left
 # Candidates are compared on at most this many observations; the choice is solved on all.
 MOST_OBSERVATIONS = 40_000
 SPLINE_OBSERVATIONS = 12_000  # a curve has few parameters, and its basis is the most expensive

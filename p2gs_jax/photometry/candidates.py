@@ -270,9 +270,9 @@ def _predict(
     o, weight = problem.observations, np.zeros(problem.usable.shape)
     weight[~held] = fit.at.weight
     model = Forward.of(problem, response, fit.model.unknowns)
-    row, (_, precision) = problem.layout.row, predict(model, fit.theta, weight)
+    row = problem.layout.row
     # The lone observation that is left of a point predicts, although the fit does not use it.
-    lone = (precision[row] == 0) & ~held[:, None]
+    lone = ((problem.layout.by_row @ weight)[row] == 0) & ~held[:, None]
     residual, precision = predict(model, fit.theta, np.where(lone, model.noise_weight, weight))
     sigma, y, precision = model.sigma[held], o.colors[held], precision[row[held]]
     known = problem.usable[held] & (precision > 1e-3)

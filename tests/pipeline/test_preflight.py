@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from jax.errors import JaxRuntimeError
+from run.test_checkpoint import flip
 from tiny_scene import make_scene, prepared
 
 import p2gs_jax
@@ -228,9 +229,7 @@ def test_a_run_stays_as_it_is_if_its_checkpoints_cannot_be_read(finished_run, tm
     run, scene = tmp_path / "run", finished_run.parent / "scene"
     shutil.copytree(finished_run, run)
     for path in run.glob("checkpoints/*/state.npz"):
-        content = bytearray(path.read_bytes())
-        content[len(content) // 2] ^= 4
-        path.write_bytes(content)
+        flip(path)
     files = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     text = refused("fit", scene, "--out", run, *FIT, "--steps", "70", "--resume")
     assert "cannot be read" in text
