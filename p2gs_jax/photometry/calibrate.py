@@ -28,7 +28,7 @@ from p2gs_jax.photometry.adjustment.solve import MOST_ROUNDS, fit_response
 from p2gs_jax.photometry.candidates import Candidate, Search
 from p2gs_jax.photometry.models import MODELS, Curve, Form
 from p2gs_jax.photometry.observations import COARSEST, Observations
-from p2gs_jax.photometry.response import BASES, Response
+from p2gs_jax.photometry.response import BASES, KNOTS, MIDDLE, Response
 from p2gs_jax.photometry.solution import PhotometricSolution
 from p2gs_jax.scene.exposures import read_known_exposures, without_view
 from p2gs_jax.types import Scene
@@ -139,6 +139,13 @@ def calibrate_observations(
         )
     if options.known is not None and (unused := options.known.unused):
         notes.append(f"{len(unused)} known exposures belong to no view: {first_few(unused)}.")
+    response = selection.solution.response
+    if options.known is None and response.splines and response.by == "camera":
+        notes.append(
+            "Each camera has a separate tone curve, whose scale photographs do not determine: two "
+            "cameras count as equally exposed where they show one radiance with a display value "
+            f"of {KNOTS[MIDDLE]:g}."
+        )
     return dataclasses.replace(selection, reasons=(*notes, *selection.reasons))
 
 

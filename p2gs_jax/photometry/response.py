@@ -22,13 +22,14 @@ from p2gs_jax.types import Array
 Base = Literal["srgb", "power"]
 BASES: tuple[Base, ...] = get_args(Base)
 # Knots, display values. A single spline is 0 at both knots HELD, which fixes scale and power. Each
-# of several splines is 0 at the first only, because their powers differ.
+# of several splines has a scale of its own, which photographs do not determine: it is 0 at MIDDLE,
+# mid-grey. The mean of their changes between the knots HELD is 0.
 _PERCENT = [2, 5, 8, 12, 16, 21, 26, 32, 38, 44, 50, 56, 62, 68, 74, 80, 86, 90, 94, 98]
 KNOTS = np.array(_PERCENT) / 100
-HELD = (6, 16)
+HELD, MIDDLE = (6, 16), 9
 # Free knots of a single spline, and of each of several.
 FREE = tuple(k for k in range(len(KNOTS)) if k not in HELD)
-FREE_OF_EACH = tuple(k for k in range(len(KNOTS)) if k != HELD[0])
+FREE_OF_EACH = tuple(k for k in range(len(KNOTS)) if k != MIDDLE)
 DARKEST = 0.5 / 255  # darkest display value that is decoded: half an 8-bit code
 # Noise model: 8-bit quantisation; photon (per light) and read noise, variances of linear values;
 # and a floor, deviation in log units, for texture, gloss and interpolation.

@@ -12,7 +12,8 @@ from p2gs_jax.photometry.adjustment.problem import KnownExposures
 from p2gs_jax.photometry.adjustment.solve import fit_response
 from p2gs_jax.photometry.candidates import Candidate, choose, mean_deficit
 from p2gs_jax.photometry.models import Choice, Curve, Form, Scope, neighbours, parameter_count
-from p2gs_jax.photometry.response import FREE, HELD, Response, log_exposed
+from p2gs_jax.photometry.response import FREE, HELD, KNOTS, MIDDLE, Response, base_log, log_exposed
+from p2gs_jax.synth.sensor import encode
 
 # Log factors on red, green, blue: dark photographs are bluer; cameras differ.
 DARK = np.where(np.median(ISO4) > ISO4, 1.0, -1.0)[:, None] * [-0.06, -0.06, 0.12]
@@ -95,6 +96,30 @@ def test_each_camera_may_have_a_separate_response():
     assert np.ptp((first - third) - (first - third).mean()) < 0.5 * np.ptp(first - bent)
     s = adjust(o, "view_exposure", found)
     assert [c.splines for c in s.cameras] == [(spline,) for spline in found.splines]
+    # Photographs do not determine the scale of a camera: its exposures hold for mid-grey.
+    np.testing.assert_allclose(np.array(found.splines)[:, MIDDLE], 0, atol=1e-3)
+    grid = np.geomspace(0.05, 0.5, 200)
+    grey = np.interp(KNOTS[MIDDLE], encode(grid, "filmic"), grid)
+    scale = np.log(grey) - base_log(KNOTS[MIDDLE], "srgb")[0]
+    truth = np.log(make_exposures(drive, "iso4"))
+    off = s.log_exposures - truth + np.where(drive.cameras == 1, scale, 0.0)
+    assert np.std(off) < 0.03 < abs(scale)
+
+
+@pytest.mark.parametrize("deviation_ev", [0.0, 0.2])
+@pytest.mark.parametrize(("by", "first"), [("all", "filmic"), ("camera", "srgb")])
+def test_known_exposures_tell_power_and_scales_of_fitted_curves(by, first, deviation_ev):
+    drive = make_drive(12, 1000)
+    truth = make_exposures(drive, "iso4") ** 1.1
+    curves = np.array([[first] * 3, ["filmic"] * 3, [first] * 3])
+    o = observe(drive, truth, curve=curves, outliers=0.02)
+    noise = np.random.default_rng(0).normal(size=len(truth)) * deviation_ev * np.log(2)
+    known = KnownExposures(np.log(truth) + noise, deviation_ev)
+    found = fit_response(problem_of(o, known=known), Response(), by=by)
+    assert found is not None
+    s = adjust(o, "view_exposure", found, known=known)
+    assert np.std(s.log_exposures - np.log(truth)) < 0.04
+    assert s.residual_ev < 0.08
 
 
 def test_with_a_white_balance_per_view_channels_have_no_separate_powers():
@@ -104,7 +129,8 @@ def test_with_a_white_balance_per_view_channels_have_no_separate_powers():
     form = Form("view_exposure", "view")
     response = fit_response(problem_of(o), Response(), form=form, by="channel")
     assert response is not None
-    np.testing.assert_allclose(np.array(response.splines)[:, HELD[1]], 0, atol=1e-3)
+    low, high = np.array(response.splines)[:, HELD].T
+    np.testing.assert_allclose(high - low, 0, atol=1e-3)
     assert rms(adjust(o, form, response).white_balance - of_balance(DARK)) / np.log(2) < 0.02
     apart = parameter_count(form, "channel", 3, 36) - parameter_count(form, None, 3, 36)
     assert apart == 3 * len(FREE)

@@ -123,9 +123,10 @@ class Splines:
         return self.groups * len(self.free)
 
     @property
-    def powers(self) -> np.ndarray:
-        """Parameters of the power of each spline, if powers are solved for."""
-        return np.flatnonzero(np.tile(self.free == HELD[1], self.groups))
+    def powers(self) -> Int[np.ndarray, "g 2"]:
+        """Parameters whose difference is the power of each spline, if powers are solved for."""
+        ends = [np.flatnonzero(np.tile(self.free == knot, self.groups)) for knot in HELD]
+        return np.stack(ends, 1)
 
     def values(self, c: Float[np.ndarray, " k"]) -> Float[np.ndarray, "g n"]:
         """Return the splines at all knots."""
@@ -402,12 +403,14 @@ def _anchors(problem: Problem, form: Form, u: Unknowns, precision) -> Held:
     powers = u.at.c.start + u.splines.powers
     if u.splines.by == "channel" and u.channels == 3:
         # Photographs do not determine the power of a channel with separate exposures.
-        alone = [([power], [1.0]) for power in powers]
-        alike = [([one, other], [1.0, -1.0]) for one, other in itertools.pairwise(powers)]
+        alone = [(power, [-1.0, 1.0]) for power in powers]
+        alike = [
+            (np.concatenate(pair), [-1.0, 1.0, 1.0, -1.0]) for pair in itertools.pairwise(powers)
+        ]
         for index, weights in alike if u.splines.power else alone:
             hold(index, weights)
     elif powers.size and not u.splines.power:
-        hold(powers, 1 / u.splines.groups)
+        hold(powers, [-1 / u.splines.groups, 1 / u.splines.groups])
     return Held(sp.csr_array(sp.vstack(rows)), np.array(targets), np.ones(len(targets)))
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,9 +20,11 @@ import threadpoolctl
 from jaxtyping import Float
 
 from p2gs_jax.config import ResponseKind
+from p2gs_jax.core.numerics import LN2
 from p2gs_jax.photometry.adjustment.equations import Loss, Weighted, normal_equations, weigh
 from p2gs_jax.photometry.adjustment.matrices import Matrix, is_small, whole
 from p2gs_jax.photometry.adjustment.parameters import (
+    A_PRIOR,
     Forward,
     Parameters,
     System,
@@ -30,7 +33,7 @@ from p2gs_jax.photometry.adjustment.parameters import (
 )
 from p2gs_jax.photometry.adjustment.problem import Problem
 from p2gs_jax.photometry.models import EXPOSURES, Form
-from p2gs_jax.photometry.response import Response, rises
+from p2gs_jax.photometry.response import KNOTS, Response, base_log, rises
 
 # Number of rounds under the L1 loss, and largest number of rounds under both losses.
 L1_ROUNDS, MOST_ROUNDS = 4, 60
@@ -46,6 +49,9 @@ PRECISION, MOST_ITERATIONS = 1e-7, 2000
 MOST_UNHELD = 8  # largest number of undetermined directions that are found in large systems
 # Largest factor by which a spline may change the spread of exposures (the power gauge allows any).
 LARGEST_STRETCH = 1.6
+# Standard deviations of solved exposures beside known ones, and of changes of a curve that follow
+# from known exposures: of scales, and of a power that these do not tell; log units.
+SOLVED, FREE_SCALE, FIXED_POWER = 1e-3, 10.0, 1e-6
 
 
 _libraries = functools.cache(threadpoolctl.ThreadpoolController)
@@ -293,6 +299,40 @@ def light_spread(model: Forward, theta: Parameters) -> float:
     return float(np.hypot(np.std(theta.b.mean(1)), np.std(added)))
 
 
+def _in_known_units(
+    splines: Float[np.ndarray, "g n"],
+    log_exposures: Float[np.ndarray, " v"],
+    problem: Problem,
+    base: Response,
+    by: ResponseKind,
+) -> Float[np.ndarray, "g n"]:
+    """Return splines with the power, and the scales of cameras, that known exposures tell.
+
+    `log_exposures` are those under `splines`. The power is about 1, as gammas are about 2.2, and 1
+    where known exposures hardly differ.
+    """
+    known, o = problem.known, problem.observations
+    assert known is not None
+    cameras = len(splines) if by == "camera" else 0
+    rows = np.hstack(
+        [
+            log_exposures[:, None],
+            o.cameras[:, None] == np.arange(cameras),
+            problem.component[:, None] == np.unique(problem.component),
+        ]
+    )
+    some = np.isfinite(known.log_exposures)
+    deviation = np.hypot(known.deviation_ev * LN2, SOLVED)
+    # Changes of the power and the scales. Each component has a scale anyway: it is free.
+    priors = np.full(rows.shape[1], FREE_SCALE)
+    priors[0] = A_PRIOR if problem.with_known_power.size else FIXED_POWER
+    left = np.vstack([rows[some] / deviation, np.diag(1 / priors)])
+    right = np.append((known.log_exposures - log_exposures)[some] / deviation, 0 * priors)
+    power, *scales = np.linalg.lstsq(left, right, rcond=None)[0]
+    of_splines = np.resize(scales[:cameras] or 0.0, len(splines))[:, None]
+    return (1 + power) * splines + power * base_log(KNOTS, base.base)[0] + of_splines
+
+
 def fit_response(
     problem: Problem,
     base: Response,
@@ -306,16 +346,17 @@ def fit_response(
     None if a spline collapsed: it falls somewhere, is flat over mid tones, or changes the spread of
     exposures by more than LARGEST_STRETCH, which photographs do not determine (the power gauge).
     `form` has no gammas, because they bend curves as well. `spread` is `light_spread` under the
-    base; None: it is computed.
+    base; None: it is computed. Known exposures set power and scales at the end: beside millions of
+    pixels, whose noise is not known exactly, they would not hold a power.
     """
+    known, problem = problem, replace(problem, known=None)
     if spread is None:
         fit, _ = solve_model(problem, form, base, tolerance=OF_SPLINES)
         spread = light_spread(fit.model, fit.theta)
 
     def stretched(model: Forward, theta: Parameters) -> bool:
         stretch = (light_spread(model, theta) + 1e-3) / (spread + 1e-3)
-        free = problem.with_known_power.size == 0
-        return free and not 1 / LARGEST_STRETCH < stretch < LARGEST_STRETCH
+        return not 1 / LARGEST_STRETCH < stretch < LARGEST_STRETCH
 
     # A spline that has stretched exposures too far does not come back, but may creep for long.
     setup = {"splines": by, "tolerance": OF_SPLINES, "hopeless": stretched}
@@ -323,6 +364,8 @@ def fit_response(
     if stretched(fit.model, fit.theta):
         return None
     splines = system.unknowns.splines.values(fit.theta.c)
+    if known.known is not None:
+        splines = _in_known_units(splines, fit.theta.b.mean(1), known, base, by)
     mean, *each = (tuple(map(float, values)) for values in (splines.mean(0), *splines))
     response = Response(base.base, mean, by, () if by == "all" else tuple(each))
     return response if rises(response) else None
