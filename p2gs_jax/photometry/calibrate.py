@@ -1,9 +1,9 @@
 """From observations of any source to exposures, under the simplest model that suffices.
 
 Models under different curves are compared by the expected log predictive density of held-out
-observations in display units. The choice is the simplest candidate within max(2 standard errors,
-0.0125 nat) of the best; the best itself over-selects (docs/photometry.md, 5). A candidate whose
-predictions differ invisibly from the best's counts as well: otherwise sharp, noise-free images get
+observations in display units. The choice is the simplest candidate within 2 standard errors of the
+best; the best itself over-selects (docs/photometry.md, 5). A candidate within 0.0125 nat, or whose
+predictions differ invisibly, counts as well unless its exposures differ: otherwise sharp images get
 a gamma per view for differences of 0.01 stops. Curve and model are chosen together (BUILD_NOTES): a
 wrong curve that is fixed first, or a missing white balance, leads to a gamma per view.
 """

@@ -6,7 +6,7 @@ Densities are over display values: densities over decoded values depend on the c
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float
 from p2gs_jax.config import Level
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.photometry.adjustment.equations import predict
-from p2gs_jax.photometry.adjustment.errors import clusters_of
-from p2gs_jax.photometry.adjustment.parameters import Forward
+from p2gs_jax.photometry.adjustment.errors import clusters_of, uncertainty
+from p2gs_jax.photometry.adjustment.parameters import Forward, Parameters, make_system
 from p2gs_jax.photometry.adjustment.problem import Problem
 from p2gs_jax.photometry.adjustment.solve import (
     COMPARED,
@@ -50,6 +50,9 @@ LARGEST_CHANCE = 0.25  # largest deficit that a standard error excuses, nat per 
 GAMMA_GAIN = 0.05
 # Predictions that differ by at most this in every view count as equal, 8-bit levels.
 INVISIBLE_DIFFERENCE = 1.0
+# Exposures that differ by at most this count as equal, in units of their errors, which are at least
+# SMALLEST_ERROR_EV: vignetting that nobody sees moved cameras by 16 times their errors.
+MOST_MOVED, SMALLEST_ERROR_EV = 3.0, 0.0025
 # The predictive density is a mixture, so that outliers do not decide: share, deviation (log).
 OUTLIERS, OUTLIER_DEVIATION = 0.1, 1.2
 RANGES = 8  # number of ranges of brightness, equal in count, in which prediction errors are scaled
@@ -68,6 +71,8 @@ class Candidate:
     deficit_error: float  # standard error of the deficit, over views or regions of images
     # RMS difference from the best's predictions in the view with the largest RMS, 8-bit levels.
     difference: float
+    # RMS difference from the exposures of the best under the same curve, in units of their errors.
+    moved: float
 
     @property
     def form(self) -> Form:
@@ -81,14 +86,18 @@ class Candidate:
 
     @property
     def likely(self) -> bool:
-        """Whether this candidate predicts about as well as the best."""
-        chance = min(STANDARD_ERRORS * self.deficit_error, LARGEST_CHANCE)
-        return self.deficit <= max(chance, SMALLEST_GAIN)
+        """Whether chance explains that this candidate predicts worse than the best."""
+        return self.deficit <= min(STANDARD_ERRORS * self.deficit_error, LARGEST_CHANCE)
+
+    @property
+    def close(self) -> bool:
+        """Whether its predictions are nearly as good as the best's, or look like them."""
+        return self.deficit <= SMALLEST_GAIN or self.difference <= INVISIBLE_DIFFERENCE
 
     @property
     def good(self) -> bool:
-        """Whether it is not clearly worse than the best, or the difference is invisible."""
-        return self.likely or self.difference <= INVISIBLE_DIFFERENCE
+        """Whether it is not clearly worse than the best, or the difference does not matter."""
+        return self.likely or (self.close and self.moved <= MOST_MOVED)
 
 
 def choose(candidates: list[Candidate]) -> Candidate:
@@ -123,6 +132,7 @@ class Search:
         o, self._held = problem.observations, held
         self._views, self._regions = o.views[held], clusters_of(o, problem.layout.row)[held]
         self._predicted: dict[Choice, Predicted] = {}
+        self._errors: dict[Choice, np.ndarray] = {}  # of log exposures, for the best choices
         self._hopeless: set[Level | None] = set()
         self._fitted: dict[tuple[Form, Curve], Response | None] = {}
         # Spread of the light of one surface under sRGB, log units; None: each form solves it.
@@ -233,30 +243,56 @@ class Search:
         for choice, fit in self.fits.items():
             if choice not in self._predicted:
                 self._predicted[choice] = _predict(self._problem, *fit, self._held)
-        # A solution may predict no observation at all.
-        density = {
-            k: -np.inf if np.isnan(p.densities).all() else float(np.nanmean(p.densities))
-            for k, p in self._predicted.items()
-        }
+        density = {choice: self._density(choice) for choice in self._predicted}
         gammas = {k: MODELS[k.form.model].gamma == "view" for k in density}
         others = max((d for k, d in density.items() if not gammas[k]), default=-np.inf)
         if max(density.values()) < others + GAMMA_GAIN:
             density = {k: d for k, d in density.items() if not gammas[k]}
-        best = self._predicted[max(density, key=lambda k: density[k])]
+        best = max(density, key=lambda k: density[k])
         return [self._candidate(choice, d, best) for choice, d in density.items()]
+
+    def _density(self, choice: Choice) -> float:
+        """Return the mean log density; a solution may predict no observation at all."""
+        densities = self._predicted[choice].densities
+        return -np.inf if np.isnan(densities).all() else float(np.nanmean(densities))
 
     def _parameters(self, choice: Choice) -> int:
         levels = (self._scope.cameras, self._problem.observations.view_count)
         return parameter_count(choice.form, choice.curve.splines, *levels, self._scope.power)
 
-    def _candidate(self, choice: Choice, density: float, best: Predicted) -> Candidate:
-        found = self._predicted[choice]
+    def _candidate(self, choice: Choice, density: float, of_best: Choice) -> Candidate:
+        found, best = self._predicted[choice], self._predicted[of_best]
         # Errors are correlated within a view and within a region of an image.
         lower, labels = best.densities - found.densities, (self._views, self._regions)
         deficits, errors = zip(*(mean_deficit(lower, of) for of in labels), strict=True)
         difference = _largest_difference(best.errors - found.errors, self._views)
         fields = (self.fits[choice][1], self._parameters(choice), density)
-        return Candidate(choice, *fields, deficits[0], max(errors), difference)
+        candidate = Candidate(choice, *fields, deficits[0], max(errors), difference, 0.0)
+        if candidate.likely or not candidate.close:
+            return candidate
+        alike = [c for c in self._predicted if c.curve == choice.curve]
+        return replace(candidate, moved=self._moved(choice, max(alike, key=self._density)))
+
+    def _moved(self, choice: Choice, best: Choice) -> float:
+        """Return the RMS difference of exposures from the best's, in units of their errors."""
+        mine, fit = self.fits[choice][0], self.fits[best][0]
+        change = _centred(mine.theta.b.mean(1) / mine.theta.a - fit.theta.b.mean(1) / fit.theta.a)
+
+        def log_exposures(moved: Parameters) -> Float[np.ndarray, "v c"]:
+            return _centred(moved.b.mean(1) / fit.theta.a[:, None])
+
+        if best not in self._errors:
+            system = make_system(self._training, best.form)
+            found = uncertainty(fit, system, self._training.observations)
+            self._errors[best] = found.of(log_exposures)
+        errors = self._errors[best]
+        known = np.isfinite(errors)
+        units = change[known] / np.maximum(errors[known], SMALLEST_ERROR_EV * LN2)
+        return float(np.sqrt(np.mean(units**2))) if known.any() else 0.0
+
+
+def _centred(values: Float[np.ndarray, "v ..."]) -> Float[np.ndarray, "v ..."]:
+    return values - values.mean(0)
 
 
 def _predict(

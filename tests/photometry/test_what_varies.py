@@ -254,9 +254,9 @@ def test_black_and_saturated_photographs_give_a_model_without_known_exposures(va
 
 
 def test_the_simplest_model_that_is_not_clearly_worse_wins():
-    def candidate(model, parameters, density, deficit, error, difference=9.0):
+    def candidate(model, parameters, density, deficit, error, difference=9.0, moved=0.0):
         choice = Choice(Form(model))
-        return Candidate(choice, Response(), parameters, density, deficit, error, difference)
+        return Candidate(choice, Response(), parameters, density, deficit, error, difference, moved)
 
     simple = candidate("constant", 0, -1.0, 0.5, 0.01)
     middle = candidate("camera_exposure", 2, -0.51, 0.012, 0.001)
@@ -269,6 +269,18 @@ def test_the_simplest_model_that_is_not_clearly_worse_wins():
     # A difference that nobody can see does not count, however sure it is.
     unseen = candidate("constant", 0, -0.9, 0.4, 0.01, 0.8)
     assert choose([rich, unseen, middle]).parameters == 0
+    # Exposures that move count, too.
+    moved = candidate("constant", 0, -0.9, 0.4, 0.01, 0.8, 5.0)
+    assert choose([rich, moved, middle]) is middle
+
+
+def test_vignetting_that_nobody_sees_is_found_if_it_moves_exposures():
+    lost = np.array([[0.05], [0.0], [0.02]]) * [1.0, 1.0, 1.0]
+    drive = make_drive(16, 1500)
+    truth = make_exposures(drive, "cameras")
+    s = select(observe(drive, truth, corner_loss=lost, texture=0.005, outliers=0.0)).solution
+    assert s.vignetting == "camera"
+    assert ev(s, truth) < 0.004  # 0.012 without vignetting
 
 
 def test_a_deficit_that_is_equal_everywhere_is_certain():
