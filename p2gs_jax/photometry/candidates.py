@@ -243,35 +243,36 @@ class Search:
         for choice, fit in self.fits.items():
             if choice not in self._predicted:
                 self._predicted[choice] = _predict(self._problem, *fit, self._held)
-        density = {choice: self._density(choice) for choice in self._predicted}
+        # A solution may predict no observation at all.
+        density = {
+            k: -np.inf if np.isnan(p.densities).all() else float(np.nanmean(p.densities))
+            for k, p in self._predicted.items()
+        }
         gammas = {k: MODELS[k.form.model].gamma == "view" for k in density}
         others = max((d for k, d in density.items() if not gammas[k]), default=-np.inf)
         if max(density.values()) < others + GAMMA_GAIN:
             density = {k: d for k, d in density.items() if not gammas[k]}
-        best = max(density, key=lambda k: density[k])
-        return [self._candidate(choice, d, best) for choice, d in density.items()]
-
-    def _density(self, choice: Choice) -> float:
-        """Return the mean log density; a solution may predict no observation at all."""
-        densities = self._predicted[choice].densities
-        return -np.inf if np.isnan(densities).all() else float(np.nanmean(densities))
+        return [self._candidate(choice, density) for choice in density]
 
     def _parameters(self, choice: Choice) -> int:
         levels = (self._scope.cameras, self._problem.observations.view_count)
         return parameter_count(choice.form, choice.curve.splines, *levels, self._scope.power)
 
-    def _candidate(self, choice: Choice, density: float, of_best: Choice) -> Candidate:
-        found, best = self._predicted[choice], self._predicted[of_best]
+    def _candidate(self, choice: Choice, density: dict[Choice, float]) -> Candidate:
+        found, best = (
+            self._predicted[choice],
+            self._predicted[max(density, key=density.__getitem__)],
+        )
         # Errors are correlated within a view and within a region of an image.
         lower, labels = best.densities - found.densities, (self._views, self._regions)
         deficits, errors = zip(*(mean_deficit(lower, of) for of in labels), strict=True)
         difference = _largest_difference(best.errors - found.errors, self._views)
-        fields = (self.fits[choice][1], self._parameters(choice), density)
+        fields = (self.fits[choice][1], self._parameters(choice), density[choice])
         candidate = Candidate(choice, *fields, deficits[0], max(errors), difference, 0.0)
         if candidate.likely or not candidate.close:
             return candidate
-        alike = [c for c in self._predicted if c.curve == choice.curve]
-        return replace(candidate, moved=self._moved(choice, max(alike, key=self._density)))
+        alike = (c for c in density if c.curve == choice.curve)
+        return replace(candidate, moved=self._moved(choice, max(alike, key=density.__getitem__)))
 
     def _moved(self, choice: Choice, best: Choice) -> float:
         """Return the RMS difference of exposures from the best's, in units of their errors."""

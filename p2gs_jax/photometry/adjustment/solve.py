@@ -329,8 +329,8 @@ def _in_known_units(
     left = np.vstack([rows[some] / deviation, np.diag(1 / priors)])
     right = np.append((known.log_exposures - log_exposures)[some] / deviation, 0 * priors)
     power, *scales = np.linalg.lstsq(left, right, rcond=None)[0]
-    of_splines = np.resize(scales[:cameras] or 0.0, len(splines))[:, None]
-    return (1 + power) * splines + power * base_log(KNOTS, base.base)[0] + of_splines
+    of_cameras = np.array(scales[:cameras] or [0.0])[:, None]
+    return (1 + power) * splines + power * base_log(KNOTS, base.base)[0] + of_cameras
 
 
 def fit_response(
