@@ -71,7 +71,8 @@ class Candidate:
     deficit_error: float  # standard error of the deficit, over views or regions of images
     # RMS difference from the best's predictions in the view with the largest RMS, 8-bit levels.
     difference: float
-    # RMS difference from the exposures of the best under the same curve, in units of their errors.
+    # RMS difference from the exposures of the best under the same curve, in units of their errors;
+    # 0 if it is not needed.
     moved: float
 
     @property
@@ -144,7 +145,8 @@ class Search:
             shaded = self._light_spread(EXPOSURES._replace(vignetting="camera"))
             curves, self._spread = shaded / LN2 >= SHADED_SPREAD_EV, None
         cameras = int(o.cameras.max(initial=0)) + 1
-        self._scope = Scope(cameras, places, curves, known, problem.with_known_power.size > 0)
+        power, each = problem.with_known_power.size > 0, self._spread_within() >= SPLINE_SPREAD_EV
+        self._scope = Scope(cameras, places, curves, known, power, each)
         if not self._scope.allows(Choice(EXPOSURES)):
             self.fits.clear()
 
@@ -224,6 +226,15 @@ class Search:
         fit = self._solve(Choice(form), Response())
         return light_spread(fit.model, fit.theta)
 
+    def _spread_within(self) -> float:
+        """Return the spread of exposures within cameras under sRGB, stops."""
+        light, cameras = (
+            self.fits[Choice(EXPOSURES)][0].theta.b.mean(1),
+            self._problem.layout.cameras,
+        )
+        means = np.bincount(cameras, light) / np.maximum(np.bincount(cameras), 1)
+        return float(np.std(light - means[cameras])) / LN2
+
     def _nearest(self, choice: Choice) -> Fit | None:
         """Return the solution of the most similar choice; exposures count most."""
         exposure = MODELS[choice.form.model].exposure
@@ -269,7 +280,8 @@ class Search:
         difference = _largest_difference(best.errors - found.errors, self._views)
         fields = (self.fits[choice][1], self._parameters(choice), density[choice])
         candidate = Candidate(choice, *fields, deficits[0], max(errors), difference, 0.0)
-        if candidate.likely or not candidate.close:
+        # Splines of different forms have different powers.
+        if candidate.likely or not candidate.close or choice.curve.splines:
             return candidate
         alike = (c for c in density if c.curve == choice.curve)
         return replace(candidate, moved=self._moved(choice, max(alike, key=density.__getitem__)))

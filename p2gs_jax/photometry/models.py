@@ -118,6 +118,7 @@ class Scope(NamedTuple):
     curves: bool  # exposures differ enough to determine a curve
     known: bool = False  # the curve is known to be sRGB, and no other is compared
     power: bool = False  # known exposures fix the power of the curve
+    each: bool = True  # exposures differ enough within cameras to determine a curve for each
 
     def allows(self, choice: Choice) -> bool:
         """Return whether a choice differs from simpler ones and can be solved.
@@ -134,6 +135,7 @@ class Scope(NamedTuple):
             and (form.white_balance != "view" or exposure == "view")
             and (choice.curve == Curve() or not self.known)
             and (by is None or self.curves)
+            and (by != "camera" or self.each)
             and (form.vignetting is None or self.places)
             and (not self.power or self._free(choice))
         )

@@ -148,6 +148,11 @@ def test_neighbours_are_choices_one_step_apart():
     } <= set(near)
     assert not {plain, Choice(Form("view_exposure"), Curve("srgb", "camera"))} & set(near)
     assert all(plain in neighbours(choice, scope) for choice in near)
+    alike = scope._replace(each=False)
+    assert not any(
+        curve.splines == "camera"
+        for _, curve in neighbours(Choice(Form("view_exposure"), Curve("srgb", "all")), alike)
+    )
     apart = neighbours(Choice(Form("camera_exposure")), scope)
     assert Choice(Form("camera_exposure", "view")) not in apart
     for form, curve in neighbours(plain, Scope(cameras=1, places=False, curves=False)):
