@@ -38,7 +38,8 @@ from p2gs_jax.photometry.models import (
 from p2gs_jax.photometry.observations import Labels
 from p2gs_jax.photometry.response import BASES, Response, base_log
 
-# Least spread of exposures, or of vignetted light, from which a response is fitted, stops.
+# Least spread of exposures, or of vignetted light, from which a response is fitted, stops. For a
+# response of each camera, the second is also the least spread within cameras.
 # The spread of light is 0.02 without vignetting, and 0.1 where corners lose 30 %.
 SPLINE_SPREAD_EV, SHADED_SPREAD_EV = 0.2, 0.05
 HOPELESS = 1.0  # deficit, nat per observation, that no tone curve compensates
@@ -145,7 +146,7 @@ class Search:
             shaded = self._light_spread(EXPOSURES._replace(vignetting="camera"))
             curves, self._spread = shaded / LN2 >= SHADED_SPREAD_EV, None
         cameras = int(o.cameras.max(initial=0)) + 1
-        power, each = problem.with_known_power.size > 0, self._spread_within() >= SPLINE_SPREAD_EV
+        power, each = problem.with_known_power.size > 0, self._spread_within() >= SHADED_SPREAD_EV
         self._scope = Scope(cameras, places, curves, known, power, each)
         if not self._scope.allows(Choice(EXPOSURES)):
             self.fits.clear()
