@@ -229,10 +229,8 @@ class Search:
 
     def _spread_within(self) -> float:
         """Return the spread of exposures within cameras under sRGB, stops."""
-        light, cameras = (
-            self.fits[Choice(EXPOSURES)][0].theta.b.mean(1),
-            self._problem.layout.cameras,
-        )
+        light = self.fits[Choice(EXPOSURES)][0].theta.b.mean(1)
+        cameras = self._problem.layout.cameras
         means = np.bincount(cameras, light) / np.maximum(np.bincount(cameras), 1)
         return float(np.std(light - means[cameras])) / LN2
 
@@ -271,10 +269,8 @@ class Search:
         return parameter_count(choice.form, choice.curve.splines, *levels, self._scope.power)
 
     def _candidate(self, choice: Choice, density: dict[Choice, float]) -> Candidate:
-        found, best = (
-            self._predicted[choice],
-            self._predicted[max(density, key=density.__getitem__)],
-        )
+        found = self._predicted[choice]
+        best = self._predicted[max(density, key=density.__getitem__)]
         # Errors are correlated within a view and within a region of an image.
         lower, labels = best.densities - found.densities, (self._views, self._regions)
         deficits, errors = zip(*(mean_deficit(lower, of) for of in labels), strict=True)

@@ -274,7 +274,7 @@ def test_the_simplest_model_that_is_not_clearly_worse_wins():
     # A difference that nobody can see does not count, however sure it is.
     unseen = candidate("constant", 0, -0.9, 0.4, 0.01, 0.8)
     assert choose([rich, unseen, middle]).parameters == 0
-    # Exposures that move count, too.
+    # A difference between exposures counts.
     moved = candidate("constant", 0, -0.9, 0.4, 0.01, 0.8, 5.0)
     assert choose([rich, moved, middle]) is middle
 
