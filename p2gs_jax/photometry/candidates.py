@@ -105,12 +105,9 @@ class Candidate:
 def choose(candidates: list[Candidate]) -> Candidate:
     """Return the simplest candidate that is not clearly worse than the best.
 
-    A candidate that is as simple and predicts better is returned instead.
+    Among equally simple ones the density decides.
     """
-    simplest = min((c for c in candidates if c.good), key=lambda c: c.parameters)
-    # Among equally simple candidates the density decides.
-    as_simple = [c for c in candidates if c.parameters <= simplest.parameters]
-    return max(as_simple, key=lambda c: c.density)
+    return min((c for c in candidates if c.good), key=lambda c: (c.parameters, -c.density))
 
 
 class Predicted(NamedTuple):
