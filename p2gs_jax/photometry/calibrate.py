@@ -19,14 +19,21 @@ import numpy as np
 from jaxtyping import Bool
 
 from p2gs_jax.config import FitConfig, PhotometryConfig
+from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.core.text import count_of, first_few
+from p2gs_jax.photometry.adjustment.equations import GEMAN_MCCLURE
 from p2gs_jax.photometry.adjustment.errors import SHARED_REGION, regions
 from p2gs_jax.photometry.adjustment.fit import fit_model
 from p2gs_jax.photometry.adjustment.problem import KnownExposures, Problem, make_problem
-from p2gs_jax.photometry.adjustment.solve import MOST_ROUNDS, fit_response
+from p2gs_jax.photometry.adjustment.solve import (
+    COMPARED,
+    MOST_ROUNDS,
+    fit_response,
+    solve_model,
+)
 from p2gs_jax.photometry.candidates import Candidate, Search
-from p2gs_jax.photometry.models import MODELS, Curve, Form
+from p2gs_jax.photometry.models import EXPOSURES, MODELS, Curve, Form
 from p2gs_jax.photometry.observations import COARSEST, Observations
 from p2gs_jax.photometry.response import BASES, KNOTS, MIDDLE, Response
 from p2gs_jax.photometry.solution import PhotometricSolution
@@ -124,6 +131,8 @@ def calibrate_observations(
     on_chosen: OnChosen = lambda form, response: None,
 ) -> Selection:
     """Choose a model and solve it; `on_chosen` is called in between, if held-out colours decide."""
+    if options.choice != "one_response":
+        observations = _expected(observations, options)
     if options.choice == "held_out":
         selection = _chosen(observations, options, on_chosen)
     elif options.choice == "one_response":
@@ -147,6 +156,17 @@ def calibrate_observations(
             f"of {KNOTS[MIDDLE]:g}."
         )
     return dataclasses.replace(selection, reasons=(*notes, *selection.reasons))
+
+
+def _expected(observations: Observations, options: CalibrationOptions) -> Observations:
+    """Return observations with the display values that all views of each point predict."""
+    problem = dataclasses.replace(options, known=None).problem(observations)
+    fit = solve_model(problem, EXPOSURES, Response(), tolerance=COMPARED)[0]
+    light = np.exp(problem.log_pivot + fit.model.z - fit.at.residual)
+    alike = np.abs(fit.at.residual) < GEMAN_MCCLURE * fit.at.scale * fit.at.sigma
+    known = alike & (fit.at.precision[problem.layout.row] > 0)
+    expected = np.where(known, srgb_encode(light), observations.colors)
+    return dataclasses.replace(observations, expected=np.float32(expected))
 
 
 def _fixed(

@@ -19,6 +19,8 @@ PerChannel = Float[np.ndarray, "o 3"]
 # Largest width of a pixel on the surface, relative to the finest view of the point. Coarser views
 # mix neighbouring surfaces and are left out (BUILD_NOTES, "The same patch").
 COARSEST = 3.0
+# Least share of a view's observations that are used although noise is clipped at black.
+FEWEST_USED = 0.05
 
 
 @dataclass(frozen=True)
@@ -42,21 +44,38 @@ class Observations:
     cells: Labels | None = None
     # Log2 of a pixel's width on the surface, up to a constant; None: unknown.
     footprints: Float[np.ndarray, " o"] | None = None
+    # Display values of each view from which noise is not clipped at black; None: unknown.
+    unclipped: Float[np.ndarray, "v 3"] | None = None
+    # `colors` as all views of each point predict them; None: unknown.
+    expected: PerChannel | None = None
 
     def decoded(self, response: Response) -> tuple[PerChannel, PerChannel, PerChannel]:
         """Return log exposed radiance z, its standard deviation by the noise model, and dz/dy."""
         y = np.asarray(self.colors, np.float64)
-        z, slope = log_exposed(y, response, self.cameras[self.views])
-        return z, deviation(y, slope, self.spread, response.base), slope
+        # Weights from observed values would favour noise that brightens.
+        shown = y if self.expected is None else self.expected
+        pair = (log_exposed(v, response, self.cameras[self.views]) for v in (y, shown))
+        (z, slope), (_, there) = pair
+        return z, deviation(shown, there, self.spread, response.base), slope
 
     def usable(self, black: float, saturation: float) -> Bool[np.ndarray, "o 3"]:
         """Return the mask of values neither black nor saturated, of points observed so twice.
 
         Both bounds are display values. A mean with a saturated pixel is too dark, and exposures
-        then drift along a drive, so it counts as saturated (BUILD_NOTES, "Clipped patches").
+        then drift along a drive, so it counts as saturated (BUILD_NOTES, "Clipped patches"). A mean
+        with noise that is clipped at black is too bright. Expected values decide where that is:
+        observed ones would select the patches that noise brightens.
         """
         brightest = self.colors if self.brightest is None else self.brightest
-        return self.shared((self.colors > black) & (brightest < saturation))
+        keep = (self.colors > black) & (brightest < saturation)
+        if self.expected is None or self.unclipped is None:
+            return self.shared(keep)
+        dark = np.zeros((self.view_count, 3))
+        for view, mine in enumerate(grouped(self.views, self.view_count)):
+            if len(mine):
+                most = np.quantile(self.expected[mine], 1 - FEWEST_USED, axis=0)
+                dark[view] = np.minimum(self.unclipped[view], most)
+        return self.shared(keep & (self.expected >= dark[self.views]))
 
     def shared(self, keep: Bool[np.ndarray, "o 3"]) -> Bool[np.ndarray, "o 3"]:
         """Return the mask `keep`, without the points that it leaves in a single observation."""
@@ -76,7 +95,7 @@ class Observations:
     def picked(self, pick: np.ndarray | slice) -> Observations:
         """Return some of the observations, by a mask or by rows."""
         names = ["views", "points", "colors", "spread"]
-        names += ["positions", "brightest", "cells", "footprints"]
+        names += ["positions", "brightest", "cells", "footprints", "expected"]
         kept = {k: v[pick] for k in names if (v := getattr(self, k)) is not None}
         return replace(self, **kept)
 

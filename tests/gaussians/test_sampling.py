@@ -15,7 +15,7 @@ from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.sources.points import MOST_PER_POINT, projected_colors, track_colors
-from p2gs_jax.photometry.sources.sampling import sample
+from p2gs_jax.photometry.sources.sampling import sample, unclipped_from
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.visibility import unoccluded
 from p2gs_jax.types import Scene, Tracks
@@ -117,6 +117,34 @@ def test_exposures_are_right_where_a_surface_has_highlights():
         assert usable.mean() > 0.5
     few = observations.picked(np.arange(7))
     np.testing.assert_array_equal(few.brightest, observations.brightest[:7])
+
+
+def test_exposures_are_right_where_noise_is_clipped_at_black():
+    """Noise below black becomes black, so that means of dark pixels are too bright."""
+    rng = np.random.default_rng(0)
+    radiance = np.kron(0.2 * np.exp(rng.standard_normal((40, 40))), np.ones((6, 6)))[..., None]
+    xy = 6 * (np.argwhere(np.ones((40, 40)))[:, ::-1] + 0.5)
+    mask, gains = np.ones((240, 240), np.float32), np.array([1.0, 1 / 16, 1 / 32, 1 / 64])
+    shown = []
+    for light in (g * np.repeat(radiance, 3, 2) for g in gains):
+        noise = 3 * np.sqrt(2e-4 * light + 1e-6) * rng.standard_normal(light.shape)
+        shown.append(np.float32(np.rint(255 * srgb_encode(light + noise)) / 255))
+    seen, count = [sample(photo, mask, xy) for photo in shown], len(xy)
+    parts = (np.concatenate([getattr(s, n) for s in seen]) for n in ("colors", "spread"))
+    rows = (np.repeat(np.arange(4), count), np.tile(np.arange(count), 4))
+    unclipped = np.array([unclipped_from(photo, mask) for photo in shown])
+    # Twice the noise is 26 of 255. Hardly any block of the last one is so bright.
+    assert np.all((255 * unclipped[1:3] > 26) & (255 * unclipped[1:3] < 40))
+    assert np.all(unclipped[[0, 3]] == [[0.0], [1.0]])
+    assert not unclipped_from(np.repeat(srgb_encode(radiance), 3, 2), mask).any()
+    observations = Observations(*rows, *parts, 4, count, np.zeros(4, int), unclipped=unclipped)
+    options = dataclasses.replace(options_of(CFG, seen_from([1.0, 2.0])), choice=CHOICE)
+    for kept, least, most in (
+        (observations, 0.0, 0.01),
+        (dataclasses.replace(observations, unclipped=None), 0.02, np.inf),
+    ):
+        found = calibrate_observations(kept, options).solution.log_exposures
+        assert least <= exposure_error(np.exp(found), gains)["ev"] < most
 
 
 def test_samples_sit_at_pixel_centres():

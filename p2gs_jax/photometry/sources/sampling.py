@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
@@ -33,6 +34,9 @@ CELL, FEWEST_CELLS, MOST_HALVINGS = 0.25, 64, 4
 # Number of pixels above which freed memory is returned after a photograph: 0.4 GB with 12
 # megapixels. With 2 megapixels, requesting memory again took a quarter of the time.
 LARGE = 4_000_000
+# Noise is clipped at black where blocks of one mean have at least this share of black pixels: side
+# of a block, pixels; least number of blocks. Normal noise has this share at twice its deviation.
+CLIPPED, BLOCK, BLOCKS = 0.02, 4, 20
 
 
 class Samples(NamedTuple):
@@ -150,6 +154,7 @@ def point_colors(
     wrong = patches.two_sided(surfaces, points, views)
     surfaces = surfaces._replace(normals=np.where(wrong[:, None], np.nan, surfaces.normals))
     moments, keep, scales = _at_one_scale(surfaces, points, views)
+    unclipped = np.zeros((len(views), 3), np.float32)
 
     def read(row: int):
         mine, centres = points[row][keep[row]], xy[row][keep[row]]
@@ -157,6 +162,7 @@ def point_colors(
         deviation = POSITION_DEVIATION * np.sqrt(12 * patches.smallest_moments(views[row].width))
         ldr, mask = store.whole(scene.train_indices[row])
         found = sample_patches(ldr, mask, grids, len(mine), deviation)
+        unclipped[row] = unclipped_from(ldr, mask)
         good = found.valid
         at = places(centres[good], *mask.shape[::-1]).astype(np.float32)
         wide = -np.log2(scales[row][keep[row]][good]).astype(np.float32)
@@ -192,7 +198,32 @@ def point_colors(
         camera_names=tuple(sorted(set(cameras))),
         cells=_cells(surfaces.points, of_point, of_view, views),
         footprints=footprints,
+        unclipped=unclipped,
     )
+
+
+def unclipped_from(
+    ldr: Float32[np.ndarray, "h w 3"], mask: Float32[np.ndarray, "h w"]
+) -> Float[np.ndarray, " 3"]:
+    """Return the display value of each channel from which noise is not clipped at black.
+
+    It is the smallest mean of blocks that have hardly any black pixel, or 1 if there is none.
+    """
+    height, width = (max(n // BLOCK, 1) for n in mask.shape)
+    images = (ldr, np.where(ldr > 0, 0, 255).astype(np.uint8), mask)
+    means, black, whole = (
+        cv2.resize(v, (width, height), interpolation=cv2.INTER_AREA) for v in images
+    )
+    means, black = means[whole > 0.99], black[whole > 0.99]
+    found = np.zeros(3)
+    for channel in range(3):
+        code = np.rint(255 * means[:, channel]).astype(int)
+        count, clipped = np.bincount(code), np.bincount(code, black[:, channel] / 255)
+        told = np.flatnonzero(count >= BLOCKS)
+        good = clipped[told] < CLIPPED * count[told]
+        if not good[:1].all():
+            found[channel] = told[good.argmax()] / 255 if good.any() else 1.0
+    return found
 
 
 def _cells(
