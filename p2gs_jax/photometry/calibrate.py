@@ -22,9 +22,10 @@ from p2gs_jax.config import FitConfig, PhotometryConfig
 from p2gs_jax.core.numerics import srgb_encode
 from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.core.text import count_of, first_few
-from p2gs_jax.photometry.adjustment.equations import GEMAN_MCCLURE
+from p2gs_jax.photometry.adjustment.equations import GEMAN_MCCLURE, weigh
 from p2gs_jax.photometry.adjustment.errors import SHARED_REGION, regions
 from p2gs_jax.photometry.adjustment.fit import fit_model
+from p2gs_jax.photometry.adjustment.parameters import Forward
 from p2gs_jax.photometry.adjustment.problem import KnownExposures, Problem, make_problem
 from p2gs_jax.photometry.adjustment.solve import (
     COMPARED,
@@ -159,12 +160,19 @@ def calibrate_observations(
 
 
 def _expected(observations: Observations, options: CalibrationOptions) -> Observations:
-    """Return observations with the display values that all views of each point predict."""
-    problem = dataclasses.replace(options, known=None).problem(observations)
-    fit = solve_model(problem, EXPOSURES, Response(), tolerance=COMPARED)[0]
-    light = np.exp(problem.log_pivot + fit.model.z - fit.at.residual)
-    alike = np.abs(fit.at.residual) < GEMAN_MCCLURE * fit.at.scale * fit.at.sigma
-    known = alike & (fit.at.precision[problem.layout.row] > 0)
+    """Return observations with the display values that all views of each point predict.
+
+    Outliers keep theirs: they differ by more than noise.
+    """
+    free = dataclasses.replace(options, known=None)
+    few = free.problem(_subset(observations, options.seed, MOST_OBSERVATIONS))
+    fit, system = solve_model(few, EXPOSURES, Response(), tolerance=COMPARED)
+    problem = free.problem(observations)
+    model = Forward.of(problem, Response(), system.unknowns)
+    at = weigh(model, fit.theta, model.noise_weight, "l1")
+    light = np.exp(problem.log_pivot + model.z - at.residual)
+    alike = np.abs(at.residual) < GEMAN_MCCLURE * at.scale * at.sigma
+    known = alike & (at.precision[problem.layout.row] > 0)
     expected = np.where(known, srgb_encode(light), observations.colors)
     return dataclasses.replace(observations, expected=np.float32(expected))
 
