@@ -277,6 +277,9 @@ def test_the_simplest_model_that_is_not_clearly_worse_wins():
     # A difference between exposures counts.
     moved = candidate("constant", 0, -0.9, 0.4, 0.01, 0.8, 5.0)
     assert choose([rich, moved, middle]) is middle
+    # It counts against a model that predicts better than another one as simple.
+    better = candidate("camera_exposure", 2, -0.505, 0.005, 0.001, 0.8, 5.0)
+    assert choose([rich, better, middle]) is middle
 
 
 def test_vignetting_that_nobody_sees_is_found_if_it_moves_exposures():
