@@ -75,10 +75,7 @@ DISPLAY: Fields = {
 # DISPLAY with the schedule, renderer and budget of `robust`. Rates of colours are 4 times the best
 # of three (results/2026-11-21-photometry-on-street.md); the factor 4 was not measured
 # (BUILD_NOTES, "Rates").
-LDR: Fields = DISPLAY | {
-    "optimizer.sh_dc": 2e-2,
-    "optimizer.sh_rest": 1e-3,
-}
+LDR: Fields = DISPLAY | {"optimizer.sh_dc": 2e-2, "optimizer.sh_rest": 1e-3}
 PRESETS: dict[PresetName, Fields] = {
     "robust": {},
     "paper": PAPER | PUBLISHED,

@@ -27,12 +27,7 @@ from p2gs_jax.photometry.adjustment.errors import SHARED_REGION, regions
 from p2gs_jax.photometry.adjustment.fit import fit_model
 from p2gs_jax.photometry.adjustment.parameters import Forward
 from p2gs_jax.photometry.adjustment.problem import KnownExposures, Problem, make_problem
-from p2gs_jax.photometry.adjustment.solve import (
-    COMPARED,
-    MOST_ROUNDS,
-    fit_response,
-    solve_model,
-)
+from p2gs_jax.photometry.adjustment.solve import COMPARED, MOST_ROUNDS, fit_response, solve_model
 from p2gs_jax.photometry.candidates import Candidate, Search
 from p2gs_jax.photometry.models import EXPOSURES, MODELS, Curve, Form
 from p2gs_jax.photometry.observations import COARSEST, Observations

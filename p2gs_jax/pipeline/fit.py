@@ -305,11 +305,7 @@ def account_of(
 
 @contextlib.contextmanager
 def begun(
-    folder: RunFolder,
-    paths: Paths,
-    cfg: FitConfig,
-    decisions: Decisions,
-    views: Sequence[View],
+    folder: RunFolder, paths: Paths, cfg: FitConfig, decisions: Decisions, views: Sequence[View]
 ) -> Iterator[Callable[[], None]]:
     """Yield a function that writes the start of a run, which a failure before a checkpoint removes.
 

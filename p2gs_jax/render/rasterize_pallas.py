@@ -165,20 +165,11 @@ def forward(rows, ids, offsets, plan: Plan):
     options = {"compiler_params": _parameters(plan.pixels), "interpret": _interpreted()}
     *image, stops = pl.pallas_call(
         functools.partial(_forward_kernel, plan=plan),
-        out_shape=(
-            *_images(tiles + most, plan),
-            jax.ShapeDtypeStruct((tiles + most,), jnp.int32),
-        ),
+        out_shape=(*_images(tiles + most, plan), jax.ShapeDtypeStruct((tiles + most,), jnp.int32)),
         grid=(tiles + most,),
         name="composite_tiles",
         **options,
-    )(
-        rows,
-        ids,
-        *segments[:3],
-        longest_first(segments.ends - segments.starts),
-        largest[None],
-    )
+    )(rows, ids, *segments[:3], longest_first(segments.ends - segments.starts), largest[None])
     if not most:
         return tuple(image), (segments, stops, ())
     merged = pl.pallas_call(

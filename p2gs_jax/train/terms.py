@@ -146,12 +146,7 @@ def censor(ldr: Image, target: Image, saturation: float) -> Image:
     return jnp.where(agrees, target, ldr)
 
 
-def absolute_error(
-    ldr: Image,
-    target: Image,
-    mask: Layer,
-    weight: float = 1.0,
-) -> Float[Array, ""]:
+def absolute_error(ldr: Image, target: Image, mask: Layer, weight: float = 1.0) -> Float[Array, ""]:
     """Return the weighted mean absolute difference over valid pixels; 0 without valid pixels."""
     valid = jnp.maximum(3 * jnp.sum(mask), 1.0)
     absolute = jnp.where(mask[..., None] > 0, jnp.abs(ldr - target), 0.0)
@@ -159,10 +154,7 @@ def absolute_error(
 
 
 def photometric_loss(
-    ldr: Image,
-    target: Image,
-    mask: Layer,
-    cfg: LossConfig,
+    ldr: Image, target: Image, mask: Layer, cfg: LossConfig
 ) -> dict[str, Float[Array, ""]]:
     """Return the weighted terms `l1` and `dssim` (paper, eq. 8), censored with `cfg.censored`.
 
@@ -210,11 +202,7 @@ PRIORS: dict[str, Callable[[Photometry], Float[Array, ""]]] = {
 
 
 def enhanced_loss(
-    rendered: Image,
-    photograph: Image,
-    mask: Layer,
-    curves: Curves,
-    cfg: LossConfig,
+    rendered: Image, photograph: Image, mask: Layer, curves: Curves, cfg: LossConfig
 ) -> Float[Array, ""]:
     """Return the weighted photometric loss of a render against the enhanced photograph."""
     compared = photometric_loss(rendered, enhanced(photograph, curves), mask, cfg)
