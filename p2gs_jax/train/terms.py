@@ -134,6 +134,10 @@ def loss_terms(
 
 
 # ------------------------------------------------------------- photographs against renders
+#
+# The photometric loss (paper, eq. 8) is a weighted sum of the absolute error and the dissimilarity.
+# Predictions may exceed 1; with `LossConfig.censored` they are censored first. Pixels of mask 0 get
+# exactly zero gradient.
 
 
 def censor(ldr: Image, target: Image, saturation: float) -> Image:
@@ -151,22 +155,6 @@ def absolute_error(ldr: Image, target: Image, mask: Layer, weight: float = 1.0) 
     valid = jnp.maximum(3 * jnp.sum(mask), 1.0)
     absolute = jnp.where(mask[..., None] > 0, jnp.abs(ldr - target), 0.0)
     return weight * jnp.sum(absolute * mask[..., None]) / valid
-
-
-def photometric_loss(
-    ldr: Image, target: Image, mask: Layer, cfg: LossConfig
-) -> dict[str, Float[Array, ""]]:
-    """Return the weighted terms `l1` and `dssim` (paper, eq. 8), censored with `cfg.censored`.
-
-    The prediction `ldr` may exceed 1. Pixels of mask 0 get exactly zero gradient.
-    """
-    if cfg.censored:
-        ldr = censor(ldr, target, cfg.saturation)
-    weight = cfg.dssim_weight
-    terms = {"l1": absolute_error(ldr, target, mask, 1 - (weight or 0.0))}
-    if weight is not None:
-        terms["dssim"] = weight * dissimilarity(ldr, target, mask)
-    return terms
 
 
 def dissimilarity(ldr: Image, target: Image, mask: Layer) -> Float[Array, ""]:
@@ -205,8 +193,13 @@ def enhanced_loss(
     rendered: Image, photograph: Image, mask: Layer, curves: Curves, cfg: LossConfig
 ) -> Float[Array, ""]:
     """Return the weighted photometric loss of a render against the enhanced photograph."""
-    compared = photometric_loss(rendered, enhanced(photograph, curves), mask, cfg)
-    return ENHANCED * sum(compared.values(), jnp.zeros(()))
+    target, weight = enhanced(photograph, curves), cfg.dssim_weight
+    if cfg.censored:
+        rendered = censor(rendered, target, cfg.saturation)
+    loss = absolute_error(rendered, target, mask, 1 - (weight or 0.0))
+    if weight is not None:
+        loss = loss + weight * dissimilarity(rendered, target, mask)
+    return ENHANCED * loss
 
 
 def curve_prior(curves: Curves, photograph: Image, mask: Layer) -> Float[Array, ""]:

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from photometric import photometric_loss
 
 from p2gs_jax.config import LossConfig, PhotometryConfig, RelativeExposureConfig
 from p2gs_jax.evaluation.scores import VideoScores
 from p2gs_jax.photometry import formation as forming
 from p2gs_jax.presets import preset
 from p2gs_jax.train import exposure_loss as rel
-from p2gs_jax.train.terms import PRIORS, photometric_loss
+from p2gs_jax.train.terms import PRIORS
 from p2gs_jax.types import LUMINANCE, Capture, Photometry
 
 PAPER = PhotometryConfig(curve="power", pivot=1.0, clamp=True, parameterization="linear")

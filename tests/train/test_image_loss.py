@@ -5,10 +5,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from photometric import photometric_loss
 
 from p2gs_jax.config import LossConfig
 from p2gs_jax.evaluation import ssim
-from p2gs_jax.train.terms import photometric_loss
 
 
 def pair(shape=(20, 31), dtype=np.float64, seed=0):
