@@ -20,7 +20,6 @@ from jaxtyping import Array, Bool, Int
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import on_device
 from p2gs_jax.render import render_linear, required_capacity
-from p2gs_jax.render.visible import whole_blocks
 from p2gs_jax.render.xla_cpu import compiler_options
 from p2gs_jax.types import Camera, Gaussians, Render
 
@@ -53,8 +52,6 @@ TRAINING_VISIBLE = Margins(1.1, 1.2)
 # Largest number of canvas sizes of a scene; smaller numbers are used if that pads less than this
 # share of the pixels.
 MOST_CANVASES, LEAST_PADDING = 3, 0.01
-# Tile lists of training are at least this long, whatever the count.
-ENTRIES_PER_GAUSSIAN, FEWEST_ENTRIES = 4, 16_384
 
 
 def canvases(sizes: Iterable[tuple[int, int]]) -> dict[tuple[int, int], tuple[int, int]]:
@@ -116,21 +113,6 @@ class Capacity(NamedTuple):
 
     entries: int  # of the tile list
     visible: int  # Gaussians that one view may show
-
-    @classmethod
-    def allocate(cls, entries: int, visible: int, growth: float, limit: int) -> Capacity:
-        """Return the capacity that suffices for all views of one image size until the run ends.
-
-        `entries` and `visible` are the largest counts of a view now. The population may still grow
-        by the factor `growth`, at most to `limit`. A view then shows the same share of the
-        population, and denser Gaussians are smaller.
-        """
-        wanted = int(visible * TRAINING_VISIBLE.first * growth)
-        lists = int(TRAINING.first * entries * growth**0.5)
-        return cls(
-            bucket(max(lists, ENTRIES_PER_GAUSSIAN * wanted, FEWEST_ENTRIES)),
-            min(whole_blocks(wanted), whole_blocks(limit)),
-        )
 
     def holds(self, other: Capacity) -> bool:
         """Return whether every view that fits the other capacity fits this one."""

@@ -15,14 +15,16 @@ from jaxtyping import Bool, Int
 from p2gs_jax.config import RenderConfig
 from p2gs_jax.core.numerics import evenly_spaced
 from p2gs_jax.gaussians.posed import rotations
-from p2gs_jax.render.capacity import Capacity
+from p2gs_jax.render.capacity import TRAINING, TRAINING_VISIBLE, Capacity, bucket
 from p2gs_jax.render.project import LOG_SCALE_RANGE, TANGENT_LIMIT, at_time, camera_of_each
-from p2gs_jax.render.visible import in_view
+from p2gs_jax.render.visible import in_view, whole_blocks
 from p2gs_jax.train.inputs import TrainingViews
 from p2gs_jax.types import Array, Camera, Gaussians
 
 # Largest number of views that are counted per image size, evenly spaced.
 SAMPLED_VIEWS = 32
+# Tile lists of training are at least this long, whatever the count.
+ENTRIES_PER_GAUSSIAN, FEWEST_ENTRIES = 4, 16_384
 
 
 def count_view(
@@ -79,13 +81,18 @@ def capacity_for(
     """Return a capacity that should suffice for all views of one image size until the run ends.
 
     At most SAMPLED_VIEWS cameras are counted. `limit` is the largest later population; the estimate
-    assumes that a view's share of the Gaussians stays constant.
+    assumes that a view's share of the Gaussians stays constant, and that denser ones are smaller.
     """
     picks = evenly_spaced(len(cameras), SAMPLED_VIEWS)
     counts = [count_view(gaussians, alive, cameras[i], cfg, owner) for i in picks]
     entries, visible = (max(c[k] for c in counts) for k in (0, 1))
     growth = max(max(limit, 1) / max(int(alive.sum()), 1), 1.0)
-    return Capacity.allocate(entries, visible, growth, limit)
+    wanted = int(visible * TRAINING_VISIBLE.first * growth)
+    lists = int(TRAINING.first * entries * growth**0.5)
+    return Capacity(
+        bucket(max(lists, ENTRIES_PER_GAUSSIAN * wanted, FEWEST_ENTRIES)),
+        min(whole_blocks(wanted), whole_blocks(limit)),
+    )
 
 
 Capacities = dict[str, Capacity]  # capacity of a view by the name of its image size
