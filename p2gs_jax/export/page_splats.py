@@ -155,7 +155,7 @@ def weights(
     alive = on_device(np.ones(gaussians.capacity), bool)
     sh = on_device(np.zeros((gaussians.capacity, 1, 3)))
     needed = max(int(count_needed(gaussians, alive, camera, cfg=plain)) for camera in cameras)
-    capacity, total = bucket(needed, PICTURES.first), np.zeros(gaussians.capacity)
+    capacity, total = bucket(needed, PICTURES), np.zeros(gaussians.capacity)
 
     @functools.partial(jax.jit, static_argnames="capacity", compiler_options=compiler_options())
     def gradient(g: Gaussians, camera: Camera, *, capacity: int) -> tuple[Array, Array, Array]:

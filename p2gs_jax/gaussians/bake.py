@@ -169,7 +169,7 @@ def refine(
     cfg, optimizer = cfg if shown else viewer_config(cfg), optax.scale_by_adam(eps=1e-15)
     alive = _all(gaussians)
     needed = max(int(count_needed(gaussians, alive, t.camera, cfg=cfg)) for t in targets)
-    capacity = bucket(needed, PICTURES.first)
+    capacity = bucket(needed, PICTURES)
     bands = jnp.full((gaussians.sh.shape[1], 1), BANDS_RATE).at[0].set(COLOR_RATE)
     rates = {"sh": bands, "opacity_logits": OPACITY_RATE}
 

@@ -30,25 +30,18 @@ Result = TypeVar("Result")
 # Renders one view: (gaussians, alive, camera), the arguments of `render_linear`.
 RenderView = Callable[..., Render]
 
-
-class Margins(NamedTuple):
-    """Ratios of a list's length to the length needed, at first and after an overflow."""
-
-    first: float
-    grown: float
-
-
+# Ratios of a list's length to the length needed, at first and (GROWN) after an overflow.
 # Pictures on demand: the first view of a size is counted exactly, and a view that needs more is
 # rendered again at once.
-PICTURES = Margins(1.2, 1.1)
+PICTURES, PICTURES_GROWN = 1.2, 1.1
 # Viewer: a few typical views are counted, and the user may go anywhere. After an overflow the
-# viewer shows a smaller picture until another program is compiled. Ratio to the length needed.
+# viewer shows a smaller picture until another program is compiled.
 ANYWHERE = 1.5
-# Training: splats widen before they converge, and an overflow compiles the largest program of a
-# fit.
-TRAINING = Margins(1.5, 1.5)
+# Training, both at first and after an overflow: splats widen before they converge, and an overflow
+# compiles the largest program of a fit.
+TRAINING = 1.5
 # Gaussians that a training view shows: only views between the sampled ones may show more.
-TRAINING_VISIBLE = Margins(1.1, 1.2)
+TRAINING_VISIBLE, VISIBLE_GROWN = 1.1, 1.2
 # Largest number of canvas sizes of a scene; smaller numbers are used if that pads less than this
 # share of the pixels.
 MOST_CANVASES, LEAST_PADDING = 3, 0.01
@@ -100,12 +93,12 @@ def until_it_fits(
         result, needed, overflow = draw(entries)
         if not bool(overflow):
             return result, entries
-        entries = _grown(entries, int(needed), PICTURES)
+        entries = _grown(entries, int(needed), PICTURES_GROWN)
 
 
-def _grown(length: int, needed: int, margins: Margins) -> int:
+def _grown(length: int, needed: int, margin: float) -> int:
     """Return a longer length if the list was too short, else the same."""
-    return length if needed <= length else bucket(needed, margins.grown)
+    return length if needed <= length else bucket(needed, margin)
 
 
 class Capacity(NamedTuple):
@@ -121,7 +114,7 @@ class Capacity(NamedTuple):
     def grown(self, entries: int, visible: int) -> Capacity:
         """Return a capacity that fits a view with these counts; only a size too small grows."""
         return Capacity(
-            _grown(self.entries, entries, TRAINING), _grown(self.visible, visible, TRAINING_VISIBLE)
+            _grown(self.entries, entries, TRAINING), _grown(self.visible, visible, VISIBLE_GROWN)
         )
 
 
@@ -159,7 +152,7 @@ def make_renderer(
         camera = dataclasses.replace(camera, width=size[0], height=size[1])
         if size not in capacities:
             needed = int(count_needed(gaussians, alive, camera, cfg=cfg, owner=owner))
-            capacities[size] = bucket(needed, PICTURES.first)
+            capacities[size] = bucket(needed, PICTURES)
 
         def draw(entries: int) -> tuple[Render, Array, Array]:
             render = compiled_renderer()

@@ -161,4 +161,4 @@ def _measured(arrays: tuple, size: tuple[int, int], cfg: RenderConfig, degree: i
             "the capacity of the tile list cannot be measured inside jax.jit: pass capacity=, "
             'such as meta["capacity"] of a call outside of jax.jit'
         ) from error
-    return bucket(needed, PICTURES.first)
+    return bucket(needed, PICTURES)

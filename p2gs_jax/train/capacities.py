@@ -87,8 +87,8 @@ def capacity_for(
     counts = [count_view(gaussians, alive, cameras[i], cfg, owner) for i in picks]
     entries, visible = (max(c[k] for c in counts) for k in (0, 1))
     growth = max(max(limit, 1) / max(int(alive.sum()), 1), 1.0)
-    wanted = int(visible * TRAINING_VISIBLE.first * growth)
-    lists = int(TRAINING.first * entries * growth**0.5)
+    wanted = int(visible * TRAINING_VISIBLE * growth)
+    lists = int(TRAINING * entries * growth**0.5)
     return Capacity(
         bucket(max(lists, ENTRIES_PER_GAUSSIAN * wanted, FEWEST_ENTRIES)),
         min(whole_blocks(wanted), whole_blocks(limit)),
