@@ -39,7 +39,7 @@ from p2gs_jax.train.divided import DividedStep
 from p2gs_jax.train.exposure_loss import ColorPairs
 from p2gs_jax.train.inputs import Inputs, TrainingViews, controls_at, inputs_at
 from p2gs_jax.train.optimizer import make_optimizer
-from p2gs_jax.train.records import Records, pause_between
+from p2gs_jax.train.records import Records
 from p2gs_jax.train.schedule import RunClock
 from p2gs_jax.train.state import (
     FAULT_NONFINITE,
@@ -61,6 +61,9 @@ NEARLY_DONE = 0.99  # progress from which on a note about an early end is left o
 MAX_BURST = 50  # views
 # Weight of a new measurement in the running mean of the seconds per view.
 PACE_SHARE = 0.3
+# Share of a run's time that writing checkpoints may take, and the longest pause between them as a
+# multiple of `train.checkpoint_every_s`.
+SAVING_SHARE, LONGEST_PAUSE = 0.01, 20.0
 
 
 @dataclass(frozen=True)
@@ -211,7 +214,8 @@ class Trainer:
                 self._save(self.step.whole(state), host)
                 clock.tick(host)
                 saved = host.elapsed_s
-                pause = pause_between(every_s, saved - save_began)
+                pause = (saved - save_began) / SAVING_SHARE
+                pause = max(every_s, min(pause, LONGEST_PAUSE * every_s))
             self.look(functools.partial(self.step.whole, state), signal is not None)
             if signal is not None:
                 self.on_message(

@@ -19,22 +19,9 @@ from p2gs_jax.run.decisions import KEY, Decisions
 from p2gs_jax.train.state import FitState, HostState, shapes_of
 from p2gs_jax.train.update import StepReport
 
-# Share of a run's time that writing checkpoints may take, and the longest pause between them as a
-# multiple of `train.checkpoint_every_s`.
-SHARE, LONGEST_PAUSE = 0.01, 20.0
-
 
 def _mean(values) -> float:
     return float(np.mean([float(v) for v in values]))
-
-
-def pause_between(every_s: float, took_s: float) -> float:
-    """Return the seconds between a checkpoint and the next checkpoint.
-
-    `every_s` is the option `train.checkpoint_every_s`; `took_s` is the time that writing the last
-    checkpoint took, seconds.
-    """
-    return max(every_s, min(took_s / SHARE, LONGEST_PAUSE * every_s))
 
 
 class Records:
