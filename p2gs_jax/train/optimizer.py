@@ -103,16 +103,6 @@ def means_rate(progress: Array, factor: Array, extent: float, cfg: FitConfig) ->
     return factor * extent * o.means * (o.means_final / o.means) ** progress
 
 
-def photometry_gate(progress: Array, cfg: FitConfig) -> Float[Array, ""]:
-    """Return the factor on the learning rates of exposure, white balance and gamma.
-
-    It is 0 if they are solved; otherwise it decays.
-    """
-    if cfg.photometry.start == "tracks":
-        return jnp.zeros(())
-    return jnp.asarray(cfg.optimizer.photometry_final**progress)
-
-
 def appearance_rate(progress: Array, cfg: FitConfig) -> Float[Array, ""]:
     """Return the learning rate of corrections: it rises during a warm-up, then decays."""
     o = cfg.optimizer
@@ -137,7 +127,9 @@ def learning_rates(
     decay = factor * final
     # Colours keep their full learning rates in long fits (BUILD_NOTES, "Length").
     sh = jnp.full((bands, 1), o.sh_rest).at[0].set(o.sh_dc) * final
-    gate = photometry_gate(progress, cfg)
+    # Exposure, white balance and gamma stay if they are solved; otherwise their rates decay.
+    solved = cfg.photometry.start == "tracks"
+    gate = jnp.zeros(()) if solved else o.photometry_final**progress
     varies = MODELS[cfg.photometry.model]
     # The order is that of the fields.
     of_gaussians = [means_rate(progress, factor, extent, cfg), o.quats * decay, o.scales * decay]
@@ -165,14 +157,10 @@ def grow_moments(opt_state: OptState, empty: Gaussians) -> OptState:
 def zero_moments(opt_state: OptState, where: Bool[Array, " n"]) -> OptState:
     """Set the moments and counts of the flagged slots to zero."""
 
-    def zero(moment: Gaussians) -> Gaussians:
-        return jax.tree.map(
-            lambda a: jnp.where(where.reshape((-1,) + (1,) * (a.ndim - 1)), 0.0, a), moment
-        )
+    def zero(a: Array) -> Array:
+        return jnp.where(where.reshape((-1,) + (1,) * (a.ndim - 1)), 0, a)
 
-    adam = opt_state.gaussians
-    counts = jnp.where(where, 0, adam.counts)
-    return opt_state._replace(gaussians=AdamState(counts, zero(adam.mu), zero(adam.nu)))
+    return opt_state._replace(gaussians=jax.tree.map(zero, opt_state.gaussians))
 
 
 def zero_opacity_moments(opt_state: OptState) -> OptState:
