@@ -174,9 +174,7 @@ def _advance(
         return shaped_noise(normal, moved, on, noise_rate)
 
     updated = update_listed(
-        gaussians,
-        state.opt_state.gaussians,
-        alive,
+        state,
         listed,
         count,
         healthy,
@@ -189,7 +187,6 @@ def _advance(
         adam=optimizer.gaussians,
         rates=rates.gaussians,
         noise=None if noise is None else exploring,
-        owner=population.owner,
     )
     if noise is None:
         population = dataclasses.replace(

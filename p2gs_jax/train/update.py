@@ -123,9 +123,7 @@ def advance(
         return exploration_noise(jax.random.fold_in(key, block), moved, on, noise_rate)
 
     updated = update_listed(
-        gaussians,
-        state.opt_state.gaussians,
-        population.alive,
+        state,
         ids,
         count,
         healthy,
@@ -137,7 +135,6 @@ def advance(
         adam=optimizer.gaussians,
         rates=rates.gaussians,
         noise=None if noise is None else exploring,
-        owner=population.owner,
     )
     updated = updated._replace(finite=all_true(updated.finite))
     if noise is None:
@@ -148,9 +145,7 @@ def advance(
 
 
 def update_listed(
-    gaussians: Gaussians,
-    moments: optimizers.AdamState,
-    alive: Bool[Array, " n"],
+    state: FitState,
     ids: Int[Array, " v"],
     count: Int[Array, ""],
     healthy: Bool[Array, ""],
@@ -161,7 +156,6 @@ def update_listed(
     adam: optimizers.Adam,
     rates: Gaussians,
     noise: Callable[..., Float[Array, "b 3"]] | None,
-    owner: Int[Array, " n"] | None = None,
 ) -> Updated:
     """Move the listed Gaussians by one step; nothing is written unless the step is `healthy`.
 
@@ -171,38 +165,39 @@ def update_listed(
         inputs_of: (Gaussians, alive, owner) of a block -> the differentiable inputs of the image.
         v_inputs: gradient of the loss by these inputs, for the whole list.
         noise: (number of the block, ids, Gaussians, alive) -> noise on their means; or None.
-        owner: moving object of each Gaussian, or None.
     """
+    gaussians, population = state.params.gaussians, state.population
     n, size = gaussians.capacity, block_size(ids.shape[0])
 
-    def body(k, state: Updated) -> Updated:
+    def body(k, updated: Updated) -> Updated:
         here = slice_of(ids, k, size)
-        live = alive.at[here].get(mode="fill", fill_value=False)
-        owners = owners_at(owner, here)
-        old = take_rows(state.gaussians, here, bands)
+        live = population.alive.at[here].get(mode="fill", fill_value=False)
+        owners = owners_at(population.owner, here)
+        old = take_rows(updated.gaussians, here, bands)
         _, pull = jax.vjp(lambda block: inputs_of(block, live, owners), old)
         (grads,) = pull(slice_of(v_inputs, k, size))
         finite = jnp.stack([jnp.all(jnp.isfinite(g)) for g in jax.tree.leaves(grads)])
         before = optimizers.AdamState(
-            state.moments.counts.at[here].get(mode="clip"),
-            take_rows(state.moments.mu, here, bands),
-            take_rows(state.moments.nu, here, bands),
+            updated.moments.counts.at[here].get(mode="clip"),
+            take_rows(updated.moments.mu, here, bands),
+            take_rows(updated.moments.nu, here, bands),
         )
         moved, new = adam.update(grads, before, old, rates)
         if noise is not None:
             moved = dataclasses.replace(moved, means=moved.means + noise(k, here, moved, live))
         where = jnp.where(healthy & jnp.all(finite), here, n)
         return Updated(
-            put_rows(state.gaussians, where, moved),
+            put_rows(updated.gaussians, where, moved),
             optimizers.AdamState(
-                state.moments.counts.at[where].set(new.counts, mode="drop", unique_indices=True),
-                put_rows(state.moments.mu, where, new.mu),
-                put_rows(state.moments.nu, where, new.nu),
+                updated.moments.counts.at[where].set(new.counts, mode="drop", unique_indices=True),
+                put_rows(updated.moments.mu, where, new.mu),
+                put_rows(updated.moments.nu, where, new.nu),
             ),
-            state.finite & finite,
+            updated.finite & finite,
         )
 
-    start = Updated(gaussians, moments, jnp.ones(len(jax.tree.leaves(gaussians)), bool))
+    finite = jnp.ones(len(jax.tree.leaves(gaussians)), bool)
+    start = Updated(gaussians, state.opt_state.gaussians, finite)
     return over_blocks(body, count, ids.shape[0], start)
 
 
