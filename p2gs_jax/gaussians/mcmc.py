@@ -110,22 +110,16 @@ def _apart(
 
 
 def exploration_noise(
-    key: PRNGKeyArray, gaussians: Gaussians, alive: Bool[Array, " n"], rate: Float[Array, ""]
+    normal: Float[Array, "n 3"],
+    gaussians: Gaussians,
+    alive: Bool[Array, " n"],
+    rate: Float[Array, ""],
 ) -> Float[Array, "n 3"]:
     """Return the noise to add to the means after a step, scene units.
 
-    The noise, a normal vector times each Gaussian's covariance, moves only nearly transparent
+    The noise, a `normal` vector times each Gaussian's covariance, moves only nearly transparent
     Gaussians. `rate` is the noise scale times the learning rate of the means.
     """
-    # Always float32, so that the random numbers are equal in any precision.
-    normal = jax.random.normal(key, gaussians.means.shape, jnp.float32)
-    return shaped_noise(normal, gaussians, alive, rate)
-
-
-def shaped_noise(
-    normal: Float[Array, "n 3"], gaussians: Gaussians, alive: Bool[Array, " n"], rate
-) -> Float[Array, "n 3"]:
-    """Return the noise made from independent normal numbers; see `exploration_noise`."""
     gate = jax.nn.sigmoid(NOISE_STEEPNESS * (NOISE_OPACITY - opacities(gaussians)))
     R = rotation_matrices(gaussians.quats)
     variance = jnp.exp(2 * gaussians.log_scales)

@@ -23,7 +23,7 @@ from jaxtyping import Float, Int
 from p2gs_jax.config import FitConfig
 from p2gs_jax.core.streams import noise_key
 from p2gs_jax.errors import UserError
-from p2gs_jax.gaussians.mcmc import shaped_noise
+from p2gs_jax.gaussians.mcmc import exploration_noise
 from p2gs_jax.render import visible as visibility
 from p2gs_jax.render.harmonics import coefficient_count
 from p2gs_jax.train import image_gradient
@@ -171,7 +171,7 @@ def _advance(
         # The key depends on the Gaussian, so the noise does not depend on the rest of the list.
         keys = jax.vmap(functools.partial(jax.random.fold_in, key))(rows)
         normal = jax.vmap(lambda k: jax.random.normal(k, (3,)))(keys)
-        return shaped_noise(normal, moved, on, noise_rate)
+        return exploration_noise(normal, moved, on, noise_rate)
 
     updated = update_listed(
         state,

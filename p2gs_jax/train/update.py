@@ -120,7 +120,10 @@ def advance(
     noise_rate = (noise or 0.0) * optimizers.means_rate(progress, rate, extent, cfg)
 
     def exploring(block, _, moved, on):
-        return exploration_noise(jax.random.fold_in(key, block), moved, on, noise_rate)
+        # Always float32, so that the random numbers are equal in any precision.
+        block_key = jax.random.fold_in(key, block)
+        normal = jax.random.normal(block_key, moved.means.shape, jnp.float32)
+        return exploration_noise(normal, moved, on, noise_rate)
 
     updated = update_listed(
         state,

@@ -187,12 +187,13 @@ def test_noise_moves_only_transparent_gaussians_and_has_their_shape():
         log_scales=jnp.tile(jnp.log(jnp.array([[0.5, 0.1, 0.02]])), (2000, 1)),
     )
     alive = jnp.arange(2000) < 1500
-    noise = np.asarray(exploration_noise(jax.random.key(0), g, alive, jnp.float32(1.0)))
+    normal = jax.random.normal(jax.random.key(0), (2000, 3))
+    noise = np.asarray(exploration_noise(normal, g, alive, jnp.float32(1.0)))
     assert not noise[1500:].any()
     spread = noise[:1500].std(0)
     np.testing.assert_allclose(spread / spread[0], [1, 0.04, 0.0016], rtol=0.15)
     solid = dataclasses.replace(g, opacity_logits=jnp.full((2000,), 2.0))
-    quiet = exploration_noise(jax.random.key(0), solid, alive, jnp.float32(1.0))
+    quiet = exploration_noise(normal, solid, alive, jnp.float32(1.0))
     assert float(jnp.abs(quiet).max()) < 1e-6
 
 
