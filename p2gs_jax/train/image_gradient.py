@@ -34,14 +34,6 @@ class Listed(NamedTuple):
     shown: Shown  # splats and radiance of the listed Gaussians
 
 
-class LossAux(NamedTuple):
-    """Results of a view besides the loss."""
-
-    terms: dict[str, Float[Array, ""]]
-    render: Render
-    ldr: Float[Array, "h w 3"]  # the unclamped display image
-
-
 class ImageGradient(NamedTuple):
     """The loss of a view and its gradients."""
 
@@ -158,8 +150,8 @@ def image_loss(
     cfg: FitConfig,
     terms: Mapping[str, LossTerm],
     capacity: int,
-) -> tuple[Float[Array, ""], LossAux]:
-    """Return the loss of one view and its terms.
+) -> tuple[Float[Array, ""], tuple[dict[str, Float[Array, ""]], Render, Float[Array, "h w 3"]]]:
+    """Return the loss of one view, and its terms by name, render and unclamped display image.
 
     `shown` holds splats and radiance in the view; `photometry` and `appearance` belong to all
     views; `capacity` is the length of the tile list.
@@ -179,7 +171,7 @@ def image_loss(
     )
     found = {name: term(rendered, target, aux) for name, term in terms.items()}
     values = {name: value for name, value in found.items() if value is not None}
-    return jax.tree.reduce(jnp.add, values), LossAux(values, render, rendered.ldr)
+    return jax.tree.reduce(jnp.add, values), (values, render, rendered.ldr)
 
 
 def differentiate(
@@ -197,20 +189,20 @@ def differentiate(
 
     For the arguments see `image_loss`.
     """
-    (loss, aux), (v_shown, *v_rest) = jax.value_and_grad(
+    (loss, (values, render, ldr)), (v_shown, *v_rest) = jax.value_and_grad(
         image_loss, argnums=(0, 1, 2), has_aux=True, allow_int=True
     )(shown, photometry, appearance, batch, partner, cfg, dict(terms), capacity)
     photograph, mask = decoded(batch)
-    squared = mask[..., None] * (jnp.clip(aux.ldr, 0, 1) - photograph) ** 2
+    squared = mask[..., None] * (jnp.clip(ldr, 0, 1) - photograph) ** 2
     mse = jnp.sum(squared) / jnp.maximum(3 * jnp.sum(mask), 1)
     return ImageGradient(
         loss,
-        aux.terms,
+        values,
         _without_floaters(differentiable(v_shown), shown[0].depths, cfg),
         tuple(v_rest),
-        aux.render.count,
-        aux.render.overflow,
-        aux.render.visible,
+        render.count,
+        render.overflow,
+        render.visible,
         -10 * jnp.log10(jnp.maximum(mse, 1e-10)),
     )
 

@@ -80,11 +80,11 @@ def test_terms_are_added_removed_and_summed_under_their_names(made):
         views = params.photometry, params.appearance
         return image_loss(shown, *views, batch, partner, CFG, terms, 2**15)
 
-    expected, aux = loss(params)
+    expected, (values, *_) = loss(params)
     assert float(report.loss) == pytest.approx(float(expected), rel=1e-5)
-    for name, value in aux.terms.items():
+    for name, value in values.items():
         assert float(report.terms[name]) == pytest.approx(float(value), rel=1e-5), name
-    assert float(aux.terms["deep"]) > 0
+    assert float(values["deep"]) > 0
     assert int(state.step) == 1
 
 
