@@ -26,7 +26,7 @@ from p2gs_jax.photometry.adjustment.equations import GEMAN_MCCLURE, weigh
 from p2gs_jax.photometry.adjustment.errors import SHARED_REGION, regions
 from p2gs_jax.photometry.adjustment.fit import fit_model
 from p2gs_jax.photometry.adjustment.parameters import Forward
-from p2gs_jax.photometry.adjustment.problem import KnownExposures, Problem, make_problem
+from p2gs_jax.photometry.adjustment.problem import KnownExposures, Problem
 from p2gs_jax.photometry.adjustment.solve import COMPARED, MOST_ROUNDS, fit_response, solve_model
 from p2gs_jax.photometry.candidates import Candidate, Search
 from p2gs_jax.photometry.models import EXPOSURES, MODELS, Curve, Form
@@ -71,8 +71,9 @@ class CalibrationOptions:
 
     def problem(self, observations: Observations) -> Problem:
         """Return the observations prepared for the adjustment."""
-        limits = {"black": self.black, "saturation": self.saturation, "pivot": self.pivot}
-        return make_problem(observations, **limits, known=self.known)
+        usable = observations.usable(self.black, self.saturation)
+        component = observations.components(usable)
+        return Problem(observations, usable, component, float(np.log(self.pivot)), self.known)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ from synthetic_drive import make_drive, make_exposures, observe
 
 from p2gs_jax.evaluation.alignment import exposure_error
 from p2gs_jax.photometry.adjustment.fit import fit_model
-from p2gs_jax.photometry.adjustment.problem import make_problem
 from p2gs_jax.photometry.calibrate import CalibrationOptions, calibrate_observations
 
 LIMITS = {"black": 4 / 255, "saturation": 250 / 255, "pivot": 0.18}
@@ -15,7 +14,7 @@ PLAIN = observe(DRIVE, ISO4)
 
 
 def problem_of(observations=PLAIN, **more):
-    return make_problem(observations, **{**LIMITS, **more})
+    return CalibrationOptions(**{**LIMITS, **more}).problem(observations)
 
 
 def adjust(observations=PLAIN, form="view_exposure", response=None, **more):

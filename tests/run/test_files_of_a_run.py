@@ -12,9 +12,9 @@ from synthetic_drive import make_drive, make_exposures, observe
 
 from p2gs_jax.errors import UserError
 from p2gs_jax.photometry.adjustment.fit import fit_model
-from p2gs_jax.photometry.adjustment.problem import make_problem
 from p2gs_jax.photometry.adjustment.solve import fit_response
 from p2gs_jax.photometry.appearance import identity
+from p2gs_jax.photometry.calibrate import CalibrationOptions
 from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.run.photometry_files import read_appearance, write_appearance
@@ -110,7 +110,8 @@ def draws(path, solution, cameras):
 @pytest.fixture(scope="module")
 def problem():
     gains = np.repeat(make_exposures(DRIVE, "iso4")[:, None], 3, 1)
-    return make_problem(observe(DRIVE, gains), black=4 / 255, saturation=250 / 255, pivot=PIVOT)
+    options = CalibrationOptions(black=4 / 255, saturation=250 / 255, pivot=PIVOT)
+    return options.problem(observe(DRIVE, gains))
 
 
 @pytest.mark.parametrize(

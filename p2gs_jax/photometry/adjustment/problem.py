@@ -136,17 +136,3 @@ class Problem:
         """Return some of the observations, chosen by a mask or their rows."""
         some = self.observations.picked(pick)
         return replace(self, observations=some, usable=some.shared(self.usable[pick]))
-
-
-def make_problem(
-    observations: Observations,
-    *,
-    black: float,
-    saturation: float,
-    pivot: float,
-    known: KnownExposures | None = None,
-) -> Problem:
-    """Prepare observations; `black` and `saturation` are the limits of `Observations.usable`."""
-    usable = observations.usable(black, saturation)
-    component = observations.components(usable)
-    return Problem(observations, usable, component, float(np.log(pivot)), known)
