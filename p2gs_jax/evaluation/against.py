@@ -57,10 +57,11 @@ def judge_renders(
     def judged(row: int) -> tuple[dict[str, Any], dict[str, Any]]:
         photograph, mask = judge.store.get(row)
         score = judge.scorer(row, photograph, mask)
-        radiance = light(row, judge.usual(row))
-        fitted = radiance.fitted(photograph, still_mask(judge.scene, row, mask))
-        plain = score(radiance.picture)
-        return plain, {**score(radiance.under(fitted)), "exposure": fitted.exposure}
+        linear, shown, picture, alpha = light(row, judge.usual(row))
+        still = still_mask(judge.scene, row, mask)
+        fitted = with_fitted_exposure(shown, linear, photograph, still, alpha)
+        ldr = develop(linear, fitted, alpha=alpha)
+        return score(picture), {**score(ldr), "exposure": fitted.exposure}
 
     rows = sorted(found.files)
     as_rendered, exposure_fitted = {}, {}
@@ -88,16 +89,16 @@ def _against_reference(
     assert judge.reference is not None
     as_rendered, aligned, exposures = {}, {}, []
     for row in rows:
-        radiance, name = light(row), judge.scene.views[row].name
+        (linear, shown, picture, alpha), name = light(row), judge.scene.views[row].name
         target, mask = judge.reference(row), judge.store.get(row)[1]
         assert target is not None
-        exposures.append(radiance.fitted(target, mask).exposure)
-        as_rendered[name] = view_scores(judge.lpips_weights, radiance.picture, target, mask)
+        exposures.append(with_fitted_exposure(shown, linear, target, mask, alpha).exposure)
+        as_rendered[name] = view_scores(judge.lpips_weights, picture, target, mask)
     common = float(np.exp(np.median(np.log(exposures))))
     for row in rows:
-        radiance, name = light(row), judge.scene.views[row].name
+        (linear, shown, _, alpha), name = light(row), judge.scene.views[row].name
         target, mask = judge.reference(row), judge.store.get(row)[1]
-        ldr = radiance.under(replace(radiance.shown, exposure=common))
+        ldr = develop(linear, replace(shown, exposure=common), alpha=alpha)
         aligned[name] = view_scores(judge.lpips_weights, ldr, target, mask)
     return {
         "as_rendered": summary_of(as_rendered),
@@ -119,16 +120,6 @@ class Light(NamedTuple):
     shown: DisplayTransform  # transform from the radiance to the picture
     picture: Float32[np.ndarray, "h w 3"]  # display values
     alpha: Float32[np.ndarray, "h w"] | None  # opacity over the backdrop; None: no backdrop
-
-    def fitted(
-        self, photograph: Float32[np.ndarray, "h w 3"], mask: Float32[np.ndarray, "h w"]
-    ) -> DisplayTransform:
-        """Return the display transform with the exposure that fits a photograph best."""
-        return with_fitted_exposure(self.shown, self.linear, photograph, mask, self.alpha)
-
-    def under(self, shown: DisplayTransform) -> Float32[np.ndarray, "h w 3"]:
-        """Return the picture under a display transform."""
-        return develop(self.linear, shown, alpha=self.alpha)
 
 
 def light_of(rendered: Rendered, shown: DisplayTransform, store: ImageStore, row: int) -> Light:
