@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Float, Float32
 
 from p2gs_jax.paths.shots import Pose, Shot
 from p2gs_jax.scene.rigid import pose_of
@@ -76,7 +76,12 @@ def covering(shots: Iterable[Shot], viewmat: Pose) -> Cylinder:
     covered = np.any([s.project(rays @ s.viewmat[:3, :3].T)[1] for s in shots], axis=0)
     counts = covered.sum(0)
     good = counts >= FULL_COLUMN * counts.max()
-    start, count = (0, around) if counts.all() else _without_largest_gap(good)
+    start, count = 0, around
+    if not (counts.all() or good.all()):
+        seen = np.flatnonzero(good)
+        gaps = np.diff(seen, append=seen[0] + around) - 1
+        widest = int(np.argmax(gaps))
+        start, count = int(seen[(widest + 1) % len(seen)]), int(around - gaps[widest])
     columns = (start + np.arange(count)) % around
     rows = covered[:, columns[good[columns]]].all(1)
     if not rows.any():
@@ -89,16 +94,6 @@ def covering(shots: Iterable[Shot], viewmat: Pose) -> Cylinder:
     left = probe.left + (start + cut) / probe.focal
     width = max(1, round((count - 2 * cut) / probe.focal * focal))
     return Cylinder(viewmat, focal, left, top, width, max(1, round((bottom - top) * focal)))
-
-
-def _without_largest_gap(good: Bool[np.ndarray, " n"]) -> tuple[int, int]:
-    """Return start and length of the circular range without the longest run of False."""
-    rows = np.flatnonzero(good)
-    gaps = np.diff(np.append(rows, rows[0] + len(good))) - 1
-    widest = int(np.argmax(gaps))
-    if gaps[widest] == 0:
-        return 0, len(good)
-    return int(rows[(widest + 1) % len(rows)]), int(len(good) - gaps[widest])
 
 
 def stitch(

@@ -62,14 +62,11 @@ def meter(linear: Float[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"]) -
         return dict.fromkeys(METERS, float("nan"))
     light = np.maximum(light, DARKEST * mean)
     logs = np.log(light)
-    order = np.argsort(light)
-    below = np.cumsum(weight[order])
-    top = order[np.searchsorted(below, HIGHLIGHT / 100 * below[-1])]
     return {
         "log_average": float(np.average(logs, weights=weight)),
         "average": float(np.log(np.average(light, weights=weight))),
         "centre_log_average": float(np.average(logs, weights=central)),
-        "highlights": float(logs[top]),
+        "highlights": float(np.percentile(logs, HIGHLIGHT, weights=weight, method="inverted_cdf")),
     }
 
 

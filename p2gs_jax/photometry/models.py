@@ -129,6 +129,8 @@ class Scope(NamedTuple):
         form, by = choice.form, choice.curve.splines
         exposure, gamma, _ = MODELS[form.model]
         fixed = self.power and by is None and not self.known
+        # Exposures are per view, and a power is free or the curve is known.
+        free = exposure == "view" and bool(gamma or by or self.known)
         levels = (exposure, None if fixed else gamma, form.white_balance, by)
         return (
             (self.cameras > 1 or "camera" not in levels)
@@ -137,13 +139,8 @@ class Scope(NamedTuple):
             and (by is None or self.curves)
             and (by != "camera" or self.each)
             and (form.vignetting is None or self.places)
-            and (not self.power or self._free(choice))
+            and (not self.power or free)
         )
-
-    def _free(self, choice: Choice) -> bool:
-        """Return whether exposures are per view, and a power is free or the curve is known."""
-        varies, by = MODELS[choice.form.model], choice.curve.splines
-        return varies.exposure == "view" and bool(varies.gamma or by or self.known)
 
 
 def neighbours(choice: Choice, scope: Scope) -> list[Choice]:
