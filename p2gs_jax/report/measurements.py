@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -42,28 +42,19 @@ COLUMNS = (
 )
 
 
-@dataclass(frozen=True)
-class SeamPair:
-    """A seam between two views, by their names."""
-
-    first: str
-    second: str
-    seam: Seam
-
-
 @dataclass
 class SceneMeasurements:
     """Measurements on the scene; `missing` holds sentences on those that failed.
 
-    True exposures are by name of the view, if the scene has them. Seams are in the order of the
-    views; `tried_pairs` counts the compared pairs (None: nothing was measured). `picture` shows the
-    pair `shown`, which has the widest seam.
+    True exposures are by name of the view, if the scene has them. Seams are by the names of their
+    two views, in the order of the views; `tried_pairs` counts the compared pairs (None: nothing was
+    measured). `picture` shows the pair `shown`, which has the widest seam.
     """
 
     true_exposures: dict[str, float] = field(default_factory=dict)
-    seams: tuple[SeamPair, ...] = ()
+    seams: dict[tuple[str, str], Seam] = field(default_factory=dict)
     tried_pairs: int | None = None
-    shown: SeamPair | None = None
+    shown: tuple[str, str] | None = None
     picture: SeamPicture | None = None
     missing: tuple[str, ...] = ()
 
@@ -112,26 +103,27 @@ def _measure_seams(run: Run, out: SceneMeasurements, reporter: Reporter) -> None
         return Photographed(ldr, mask, camera, depth, run.own_display(index))
 
     pairs = neighbouring_pairs(run.scene, MOST_PAIRS)
-    found: dict[tuple[int, int], SeamPair] = {}
+    found: dict[tuple[int, int], Seam] = {}
     for done, (i, j) in enumerate(pairs):
         reporter.stage("Measuring seams", done, len(pairs))
         seam = measure_seam(photographed(i), photographed(j), run.common_display(), run.cfg.loss)
         if seam is not None:
-            found[i, j] = SeamPair(names[i], names[j], seam)
-    out.tried_pairs, out.seams = len(pairs), tuple(found.values())
+            found[i, j] = seam
+    out.tried_pairs = len(pairs)
+    out.seams = {(names[i], names[j]): seam for (i, j), seam in found.items()}
     if found:
-        enough = LEAST_OVERLAP * float(np.median([pair.seam.pixels for pair in out.seams]))
-        good = [rows for rows, pair in found.items() if pair.seam.pixels >= enough]
-        shown = max(good, key=lambda rows: found[rows].seam.before_ev)
-        first, second = map(photographed, shown)
-        out.shown = found[shown]
-        out.picture = seam_picture(first, second, run.common_display(), run.render)
+        enough = LEAST_OVERLAP * float(np.median([seam.pixels for seam in found.values()]))
+        good = [rows for rows, seam in found.items() if seam.pixels >= enough]
+        i, j = max(good, key=lambda rows: found[rows].before_ev)
+        out.shown = names[i], names[j]
+        both = photographed(i), photographed(j)
+        out.picture = seam_picture(*both, run.common_display(), run.render)
 
 
-def seam_medians(seams: Sequence[SeamPair]) -> tuple[float, float]:
+def seam_medians(seams: Iterable[Seam]) -> tuple[float, float]:
     """Return the medians over pairs of `before_ev` and `after_ev`, stops."""
-    before = float(np.median([p.seam.before_ev for p in seams]))
-    return before, float(np.median([p.seam.after_ev for p in seams]))
+    before, after = np.median([(seam.before_ev, seam.after_ev) for seam in seams], 0)
+    return float(before), float(after)
 
 
 def seam_section(measured: SceneMeasurements) -> str:
@@ -144,8 +136,8 @@ def seam_section(measured: SceneMeasurements) -> str:
             f"{measured.tried_pairs} pairs of training views share enough points, but no pair shows"
             " enough of the same unsaturated surface for a comparison."
         )
-    before, after = seam_medians(seams)
-    step = float(np.median([abs(p.seam.step_ev) for p in seams]))
+    before, after = seam_medians(seams.values())
+    step = float(np.median([abs(seam.step_ev) for seam in seams.values()]))
     shown = f"{step:.2f}" if step >= 0.005 else "less than 0.01"
     pairs = "1 pair" if len(seams) == 1 else f"{len(seams)} pairs"
     body = paragraph(
@@ -155,12 +147,12 @@ def seam_section(measured: SceneMeasurements) -> str:
         f"{shown} stops. The rest is misaligned texture, gloss, and effects outside the model."
     )
     if measured.picture is not None and measured.shown is not None:
-        body += _seam_picture(measured.shown, measured.picture)
+        body += _seam_picture(measured.shown, seams[measured.shown], measured.picture)
     heads = ["pair", *(head for _, head, _ in COLUMNS)]
     rows = []
-    for p in seams:
-        numbers = [format(getattr(p.seam, name), form) for name, _, form in COLUMNS]
-        rows.append([f"{without_suffix(p.first)} – {without_suffix(p.second)}", *numbers])
+    for names, seam in seams.items():
+        numbers = [format(getattr(seam, name), form) for name, _, form in COLUMNS]
+        rows.append([" – ".join(map(without_suffix, names)), *numbers])
     note = (
         "The numbers are median absolute differences over all pixels that both photographs show "
         "according to the rendered depth. Saturated and black pixels do not count."
@@ -168,17 +160,16 @@ def seam_section(measured: SceneMeasurements) -> str:
     return body + table(heads, rows, numbers=range(1, 7), tall=True) + paragraph(note, "note")
 
 
-def _seam_picture(pair: SeamPair, picture: SeamPicture) -> str:
-    names = [without_suffix(pair.first), without_suffix(pair.second)]
-    left, right = names if picture.left_first else names[::-1]
+def _seam_picture(names: tuple[str, str], seam: Seam, picture: SeamPicture) -> str:
+    left, right = map(without_suffix, names if picture.left_first else names[::-1])
     cells = [
         (
             jpeg(image, f"{left} beside {right}, {kind}", LARGE),
             f"{kind.capitalize()}: a difference of {ev:.2f} stops, or {codes:.0f} 8-bit levels",
         )
         for image, kind, ev, codes in (
-            (picture.before, "as recorded", pair.seam.before_ev, pair.seam.before_codes),
-            (picture.after, "at one exposure", pair.seam.after_ev, pair.seam.after_codes),
+            (picture.before, "as recorded", seam.before_ev, seam.before_codes),
+            (picture.after, "at one exposure", seam.after_ev, seam.after_codes),
         )
     ]
     caption = (

@@ -89,7 +89,7 @@ def _key_numbers(
         if value is not None:
             yield name, form.format(value), remark
     if measured.seams:
-        before, after = measurements.seam_medians(measured.seams)
+        before, after = measurements.seam_medians(measured.seams.values())
         pairs = count_of(len(measured.seams), "pair")
         yield "Seams", f"{before:.2f} → {after:.2f} stops", f"before and after, median of {pairs}"
     gaussians, steps = run.number("counts", "gaussians"), run.number("counts", "steps")

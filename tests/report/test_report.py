@@ -18,7 +18,7 @@ from page_tools import (
 )
 
 from p2gs_jax.evaluation.seams import Seam, SeamPicture
-from p2gs_jax.report.measurements import SceneMeasurements, SeamPair
+from p2gs_jax.report.measurements import SceneMeasurements
 from p2gs_jax.report.report import report_page, write_report
 from p2gs_jax.report.run_files import read_run
 
@@ -54,15 +54,14 @@ def full_page(run, tmp_path_factory):
         for i in range(1, 101)
     ]
     names = [v["image"] for v in files.train]
-    pairs = tuple(
-        SeamPair(a, b, Seam(1.25, 0.07, 40.0, 2.5, 0.01, 900)) for a, b in itertools.pairwise(names)
-    )
+    seam = Seam(1.25, 0.07, 40.0, 2.5, 0.01, 900)
+    seams = dict.fromkeys(itertools.pairwise(names), seam)
     dark, light = np.full((40, 60, 3), 0.25, np.float32), np.full((40, 60, 3), 0.75, np.float32)
     scene = SceneMeasurements(
         true_exposures={v["image"]: 3 * (v["exposure"] or 1) for v in files.views},
-        seams=pairs,
-        tried_pairs=len(pairs),
-        shown=pairs[0],
+        seams=seams,
+        tried_pairs=len(seams),
+        shown=next(iter(seams)),
         picture=SeamPicture(dark, light, left_first=False),
     )
     path = tmp_path_factory.mktemp("full") / "report.html"
