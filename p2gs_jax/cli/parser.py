@@ -48,10 +48,9 @@ HELP, HELP_ALL, VERSION = ("-h", "--help"), "--help-all", ("-V", "--version")
 def parse(argv: list[str]) -> tuple[str, Any]:
     """Return the command's name and its options.
 
-    Raises:
-        UserError: there is no such command or preset, an argument is empty, or the option is
-            another program's.
-        SystemExit: 0 after requested help or version, 2 without a command or with invalid options.
+    UserError: there is no such command or preset, an argument is empty, or the option is another
+    program's. SystemExit: 0 after requested help or version, 2 without a command or with invalid
+    options.
     """
     first = argv[0] if argv else ""
     if first in HELP or first in (HELP_ALL, ""):

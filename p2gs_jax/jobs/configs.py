@@ -148,11 +148,8 @@ def read_sweep(path: Path) -> SweepFile:
         preset = "paper"
         "densify.max_gaussians" = 30000
 
-    TOML has no null: "none" stands for it.
-
-    Raises:
-        UserError: the file is missing or not TOML, a key or a field is unknown, or a value is not
-            valid.
+    TOML has no null: "none" stands for it. UserError: the file is missing or not TOML, a key or a
+    field is unknown, or a value is not valid.
     """
     data = _parsed(Path(path))
     folder, reference = Path(path).parent, data.get("reference")

@@ -143,10 +143,8 @@ def calibrate(
     The scene has any format that `load_scene` reads. The options of data, photometry and the
     thresholds of the loss in `cfg` (default `robust`) apply. The result is compared with stated
     exposures from `exif` or a CSV file, by default those in EXIF, if any. With `develop`, the
-    folder `developed` gets the photographs at one exposure, for other trainers.
-
-    Raises:
-        UserError: a fault that the user can fix, such as another process that writes to `out`.
+    folder `developed` gets the photographs at one exposure, for other trainers. UserError: a fault
+    that the user can fix, such as another process that writes to `out`.
     """
     cfg = require_config(cfg)
     check_values(cfg)
@@ -197,10 +195,8 @@ def calibrate_run(
 
     The run is not changed. The photometric options of `cfg` (default `robust`) apply, not those of
     the run. `scene` is as for `load_run`, the other arguments are as for `calibrate`.
-
-    Raises:
-        UserError: see `load_run`; or the photographs are missing, no pixel of the fit is opaque,
-            its views do not overlap, or `out` holds a run or is in use.
+    UserError: see `load_run`; or the photographs are missing, no pixel of the fit is opaque, its
+    views do not overlap, or `out` holds a run or is in use.
     """
     begin, reporter = time.monotonic(), reporter or Silent()
     requested = require_config(cfg)
@@ -326,10 +322,8 @@ def calibrate_stack(
     can be stretched together. The mid tones of the standard curves fix this power gauge. The
     photometry of `cfg` (default `robust`) names known exposures, and its seed draws the sampled
     positions. Without `out` nothing is written; see `calibrate`.
-
-    Raises:
-        UserError: see `read_stack` and `read_known_exposures`; or `out` holds the photographs or a
-            run, or is in use.
+    UserError: see `read_stack` and `read_known_exposures`; or `out` holds the photographs or a
+    run, or is in use.
     """
     cfg, begin, reporter = require_config(cfg), time.monotonic(), reporter or Silent()
     p, seed = cfg.photometry, cfg.train.seed

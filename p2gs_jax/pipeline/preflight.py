@@ -62,12 +62,9 @@ class Paths:
 def preflight(cfg: FitConfig, paths: Paths, *, resume: bool = False) -> LpipsWeights | None:
     """Check the options and the folders, without the scene; nothing is written.
 
-    Returns:
-        The weights of LPIPS, if the options name them.
-
-    Raises:
-        UserError: options contradict each other, a file that they name cannot be used, or the run
-            folder holds another run or is in use.
+    The result is the weights of LPIPS, if the options name them. UserError: options contradict
+    each other, a file that they name cannot be used, or the run folder holds another run or is in
+    use.
     """
     require_free(paths.run)
     check_values(cfg)
@@ -89,11 +86,8 @@ def check_scene(
 ) -> Reference | None:
     """Check that options suit the scene, before exposures are solved; nothing is written.
 
-    Returns:
-        The photographs under one common exposure, if there are any.
-
-    Raises:
-        UserError: the options do not suit the views, or the run began with other photographs.
+    The result is the photographs under one common exposure, if there are any. UserError: the
+    options do not suit the views, or the run began with other photographs.
     """
     training, begun = scene.training_views, RunFolder(paths.run).config
     now = recognition_key(scene.views)
@@ -112,9 +106,8 @@ def check_scene(
 def check_options(cfg: FitConfig) -> None:
     """Check the options that depend on each other.
 
-    Raises:
-        UserError: the initial exposures contradict known exposures or the curve, or the appearance
-            contradicts the curve.
+    UserError: the initial exposures contradict known exposures or the curve, or the appearance
+    contradicts the curve.
     """
     p, share = cfg.photometry, cfg.densify.spread
     curved, random = p.curve != "linear", "--photometry.curve linear --photometry.start random"
@@ -158,14 +151,9 @@ def check_run_dir(run_dir: Path, resume: bool, cfg: FitConfig) -> bool:
     """Check that the folder holds no run, or with `resume` a run under the same options.
 
     Options of the evaluation and the memory for photographs may differ: they do not change the fit.
-    Steps and budget may be larger.
-
-    Returns:
-        Whether steps or budget are larger than when the run began.
-
-    Raises:
-        UserError: the path is not a folder, holds a run and `resume` is not set, or holds a run
-            with other options.
+    Steps and budget may be larger; the result is whether they are larger than when the run began.
+    UserError: the path is not a folder, holds a run and `resume` is not set, or holds a run with
+    other options.
     """
     require_folder(run_dir)
     path = RunFolder(run_dir).config
@@ -199,8 +187,7 @@ def require_checkpoint(folder: RunFolder) -> None:
 def check_sources(paths: Paths) -> None:
     """Check that a run is continued with the scene and the reference that it was begun with.
 
-    Raises:
-        UserError: it was begun with others. Folders that have moved are not compared.
+    UserError: it was begun with others. Folders that have moved are not compared.
     """
     path = RunFolder(paths.run).config
     if not path.exists():
@@ -249,11 +236,7 @@ def memory_needed(scene: Scene, cfg: FitConfig, coverage: Coverage) -> MemoryNee
 
 
 def require_memory(needed: MemoryNeeded) -> None:
-    """Check that the memory of a fit is available.
-
-    Raises:
-        UserError: the fit needs more memory than there is; the message names options that help.
-    """
+    """Raise UserError, which names options that help, if a fit needs more memory than there is."""
     left = left_to_process()
     if left is None or needed.total <= left + resident():
         return
@@ -270,8 +253,7 @@ def require_memory(needed: MemoryNeeded) -> None:
 def memory_named() -> Iterator[None]:
     """Turn an error about memory in a `with` block into one that names the remedy.
 
-    Raises:
-        UserError: memory ran out. Other errors pass unchanged.
+    UserError: memory ran out. Other errors pass unchanged.
     """
     try:
         yield

@@ -105,10 +105,8 @@ def survey(
     """Survey a scene before its exposures are known.
 
     The folder `pixels` is for decoded photographs that do not fit into memory. If a larger scene
-    contains this one, the shell lies on the `sphere` of the larger scene.
-
-    Raises:
-        UserError: memory does not suffice, masks hide all pixels, or there are two backgrounds.
+    contains this one, the shell lies on the `sphere` of the larger scene. UserError: memory does
+    not suffice, masks hide all pixels, or there are two backgrounds.
     """
     scene, far_notes = seeding.within_reach(scene)
     nodes, vibrating = find_nodes(scene, cfg.dynamics), vibrates(scene, cfg)

@@ -129,11 +129,7 @@ class Run:
         return replace(self, cfg=replace(self.cfg, render=render))
 
     def only_objects(self) -> Run:
-        """Return the run with moving objects only.
-
-        Raises:
-            UserError: there are no moving objects.
-        """
+        """Return the run with moving objects only; UserError: there are none."""
         owner = self._require_objects()
         return self._of(chosen(self.params.gaussians, owner >= 0), owner[owner >= 0])
 
@@ -154,17 +150,12 @@ class Run:
     def photograph(self, index: int) -> Float32[np.ndarray, "h w 3"]:
         """Return the photograph of a row of `scene.views` at the size of the fit, display values.
 
-        Raises:
-            UserError: the photograph is missing or broken.
+        UserError: the photograph is missing or broken.
         """
         return self.store.get(index)[0]
 
     def require_photographs(self, indices: Sequence[int] | None = None) -> None:
-        """Check that the photographs of some rows of `scene.views` exist; None: of all rows.
-
-        Raises:
-            UserError: a photograph is missing.
-        """
+        """Raise UserError if photographs of these rows of `scene.views` are missing; None: all."""
         rows = range(len(self.scene.views)) if indices is None else indices
         lost = [p for p in (self.scene.views[i].image_path for i in rows) if not p.is_file()]
         if not lost:
@@ -214,8 +205,7 @@ class Run:
     def white_balance_of(self, name: str) -> tuple[float, float, float]:
         """Return the log factors of a view's white balance, by its name in the scene.
 
-        Raises:
-            UserError: there is no such view, or white balance is not modelled.
+        UserError: there is no such view, or white balance is not modelled.
         """
         names = [view.name for view in self.scene.views]
         if name not in names:
@@ -257,10 +247,8 @@ def load_run(folder: str | Path, scene: str | Path | None = None, *, snapshot: b
     Photographs are read when they are needed, and most methods work without them. `scene` is the
     folder of the scene; None: its path during the fit, absolute or relative to the run. `snapshot`
     reads the newest one of an unfinished run: empty slots are transparent, and it has no metering.
-
-    Raises:
-        UserError: the folder is not a run, is unfinished or damaged, or is of a version that this
-            one cannot read; or `scene` does not exist.
+    UserError: the folder is not a run, is unfinished or damaged, or is of a version that this one
+    cannot read; or `scene` does not exist.
     """
     files = RunFolder(Path(folder))
     if snapshot:
