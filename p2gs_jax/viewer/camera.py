@@ -7,7 +7,6 @@ vertical field of view instead of K, and with lengths in viewer units.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -49,26 +48,11 @@ class Pose(NamedTuple):
     fov: float
 
 
-@dataclass(frozen=True)
-class BrowserView:
-    """The camera of a browser, and the size of its canvas, pixels."""
-
-    wxyz: Float[np.ndarray, " 4"]
-    position: Float[np.ndarray, " 3"]
-    fov: float
-    canvas: Size
-
-    @property
-    def aspect(self) -> float:
-        """Width / height of the canvas."""
-        return self.canvas[0] / self.canvas[1]
-
-
-def browser_view(client: viser.ClientHandle) -> BrowserView:
-    """Return the newest camera of a browser."""
+def browser_view(client: viser.ClientHandle) -> tuple[Pose, Size]:
+    """Return the newest camera of a browser, and the size of its canvas."""
     camera = client.camera
-    canvas = max(camera.image_width, 1), max(camera.image_height, 1)
-    return BrowserView(camera.wxyz, camera.position, camera.fov, canvas)
+    pose = Pose(camera.wxyz, camera.position, camera.look_at, camera.fov)
+    return pose, (max(camera.image_width, 1), max(camera.image_height, 1))
 
 
 def make_viewer_space(scene: Scene, points: Float[np.ndarray, "n 3"]) -> ViewerSpace:
@@ -106,18 +90,16 @@ def pose_of(
     return Pose(wxyz, position, look_at, fov)
 
 
-def camera_of_browser(
-    view: BrowserView | Pose, aspect: float, size: Size, space: ViewerSpace
-) -> Camera:
+def camera_of_browser(pose: Pose, aspect: float, size: Size, space: ViewerSpace) -> Camera:
     """Return our camera for a browser's, for a canvas with `aspect` = width / height.
 
     `size` is the size of the render; pixels are not square if its aspect differs.
     """
-    rotation = Rotation.from_quat(np.asarray(view.wxyz, float), scalar_first=True).as_matrix()
-    position = np.asarray(view.position, float) / space.unit
+    rotation = Rotation.from_quat(np.asarray(pose.wxyz, float), scalar_first=True).as_matrix()
+    position = np.asarray(pose.position, float) / space.unit
     viewmat = rigid.pose_of(rotation.T, -rotation.T @ position)
     width, height = size
-    tangent = np.tan(np.clip(view.fov, SMALLEST_FOV, LARGEST_FOV) / 2)
+    tangent = np.tan(np.clip(pose.fov, SMALLEST_FOV, LARGEST_FOV) / 2)
     focal = width / (2 * tangent * aspect), height / (2 * tangent)
     K = np.array([[focal[0], 0, width / 2], [0, focal[1], height / 2], [0, 0, 1]])
     return Camera(jnp.asarray(viewmat, jnp.float32), jnp.asarray(K, jnp.float32), width, height)

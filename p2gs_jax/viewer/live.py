@@ -25,7 +25,7 @@ from p2gs_jax.errors import UserError
 from p2gs_jax.scene.pixels.store import camera_of
 from p2gs_jax.types import Camera
 from p2gs_jax.viewer import pictures
-from p2gs_jax.viewer.camera import BrowserView, Size, browser_view, camera_of_browser
+from p2gs_jax.viewer.camera import Pose, Size, browser_view, camera_of_browser
 from p2gs_jax.viewer.panel import Panel
 from p2gs_jax.viewer.renderer import compilation_order, full_size, next_size, render_sizes
 from p2gs_jax.viewer.settings import Settings, display_of
@@ -178,8 +178,9 @@ class LivePicture:
                 report(self._client, "An error occurred", error)
 
     def _draw(self, request: Request, settings: Settings) -> None:
-        begin, view, at_rest = time.perf_counter(), browser_view(self._client), request == "rest"
-        sizes = render_sizes(full_size(view.canvas, self._viewed.max_width))
+        begin, at_rest = time.perf_counter(), request == "rest"
+        pose, canvas = browser_view(self._client)
+        sizes = render_sizes(full_size(canvas, self._viewed.max_width))
         ready, size = self._viewed.renderer.ready, None
         if request == "camera":
             self._stale = True
@@ -192,7 +193,7 @@ class LivePicture:
         if at_rest and fits and self._sharp:
             return
         if size is not None and not fits:
-            self._render(view, size, ready)
+            self._render(pose, canvas, size, ready)
         if self._frame is None:
             return
         if at_rest:  # new limits in every frame would flicker
@@ -206,18 +207,18 @@ class LivePicture:
             self._last_ms = milliseconds
         self._update_status()
 
-    def _render(self, view: BrowserView, size: Size, ready: frozenset[Size]) -> None:
+    def _render(self, pose: Pose, canvas: Size, size: Size, ready: frozenset[Size]) -> None:
         """Render the largest size up to `size` whose tile lists have room for the view."""
         smaller = (s for s in ready if s[0] * s[1] < size[0] * size[1])
         for candidate in (size, *sorted(smaller, reverse=True)):
-            frame = self._viewed.renderer.render(self.camera(view, candidate))
+            frame = self._viewed.renderer.render(self.camera(pose, canvas, candidate))
             if frame is not None:
                 self._frame, self._stale = frame, False
                 return
 
-    def camera(self, view: BrowserView, size: Size) -> Camera:
+    def camera(self, pose: Pose, canvas: Size, size: Size) -> Camera:
         """Return the camera that renders the view of a browser."""
-        return camera_of_browser(view, view.aspect, size, self._viewed.space)
+        return camera_of_browser(pose, canvas[0] / canvas[1], size, self._viewed.space)
 
     def _show(self, frame: pictures.RenderedFrame, settings: Settings, *, sharp: bool) -> None:
         # At 1920 x 1080 pixels cv2 takes 1 ms, NumPy 32 ms.

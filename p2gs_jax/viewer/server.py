@@ -241,7 +241,7 @@ def _set_up_server(
     # Even without its button, any page could ask viser to publish the run through its relay.
     server.request_share_url = lambda verbose=True: None
     server.scene.set_up_direction(viewed.space.up)
-    start = viewed.pose(viewed.first_view, LIKELY_CANVAS[0] / LIKELY_CANVAS[1])
+    start = viewed.pose(viewed.first_view, LIKELY_CANVAS)
     camera = server.initial_camera
     camera.position, camera.look_at, camera.fov = start.position, start.look_at, start.fov
     lock = threading.Lock()

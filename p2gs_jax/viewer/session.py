@@ -26,7 +26,7 @@ class BrowserSession:
         self._frusta: Frusta | None = None
         self._one_at_a_time = threading.Lock()
         client.camera.on_update(self._camera_moved)
-        pose = viewed.pose(viewed.first_view, browser_view(client).aspect)
+        pose = viewed.pose(viewed.first_view, browser_view(client)[1])
         self._panel.put_view(viewed.first_view, float(np.rad2deg(pose.fov)))
         self._move(pose)
         self._live.start()
@@ -61,7 +61,7 @@ class BrowserSession:
     def mode_changed(self) -> None:
         """Show another mode; for `split`, go to the nearest photograph first."""
         if self._panel.settings().mode == "split":
-            camera = self._live.camera(browser_view(self._client), (64, 64))
+            camera = self._live.camera(*browser_view(self._client), (64, 64))
             here = self._viewed.view_at(camera)
             self.go_to(self._viewed.nearest_view(camera) if here is None else here)
         self._live.post("camera")
@@ -75,7 +75,7 @@ class BrowserSession:
 
     def go_to(self, index: int) -> None:
         """Move to the camera of a view, and use its display settings unless they are locked."""
-        pose = self._viewed.pose(index, browser_view(self._client).aspect)
+        pose = self._viewed.pose(index, browser_view(self._client)[1])
         self._panel.put_view(index, float(np.rad2deg(pose.fov)))
         if not self._panel.locked.value:
             self.take_display_of(index)
@@ -102,12 +102,12 @@ class BrowserSession:
 
     def save(self, kind: str, width: int) -> None:
         """Send the view to the browser as a file (`png` or `exr`), rendered at `width` pixels."""
-        view, settings = browser_view(self._client), self._panel.settings()
-        run, size = self._viewed.run, (width, max(1, round(width / view.aspect)))
+        (pose, canvas), settings = browser_view(self._client), self._panel.settings()
+        run, size = self._viewed.run, (width, max(1, round(width / (canvas[0] / canvas[1]))))
         text = f"Rendering {size[0]} x {size[1]} pixels ..."
         notice = self._client.add_notification("Saving", text, loading=True)
         try:
-            frame = self._viewed.renderer.render_now(self._live.camera(view, size))
+            frame = self._viewed.renderer.render_now(self._live.camera(pose, canvas, size))
             if kind == "exr":
                 content = exr_bytes(frame, display_of(run, settings).without_place())
             else:

@@ -59,8 +59,8 @@ class ViewedRun:
             listener()
 
     def _probe(self, index: int, size: cameras.Size) -> Camera:
-        aspect = size[0] / size[1]
-        return cameras.camera_of_browser(self.pose(index, aspect), aspect, size, self.space)
+        pose, aspect = self.pose(index, size), size[0] / size[1]
+        return cameras.camera_of_browser(pose, aspect, size, self.space)
 
     def view_at(self, camera: Camera) -> int | None:
         """Return the row of the view at the position of a camera, or None."""
@@ -86,12 +86,9 @@ class ViewedRun:
         """The row of the first training view, from which a browser starts."""
         return self.run.scene.train_indices[0]
 
-    def pose(self, index: int, aspect: float) -> cameras.Pose:
-        """Return the browser's camera for a row of `scene.views`.
-
-        It shows the whole photograph on a canvas with `aspect` = width / height.
-        """
+    def pose(self, index: int, canvas: cameras.Size) -> cameras.Pose:
+        """Return the browser's camera that shows the whole photograph of a row of `scene.views`."""
         view = self.run.scene.views[index]
-        fov = cameras.fov_that_holds(view, aspect)
+        fov = cameras.fov_that_holds(view, canvas[0] / canvas[1])
         distance = cameras.distance_seen(view.viewmat, self._points)
         return cameras.pose_of(view.viewmat, self.space, distance=distance, fov=fov)

@@ -259,7 +259,7 @@ def session(viewed, client, monkeypatch):
     panel = Panel(replace(common_settings(viewed.run), exposure_ev=1.0))
     monkeypatch.setattr(sessions, "Panel", lambda gui, viewed, actions: panel)
     out = BrowserSession(client, viewed)
-    out._move(viewed.pose(1, CANVAS[0] / CANVAS[1]))
+    out._move(viewed.pose(1, CANVAS))
     yield out
     out.stop()
 

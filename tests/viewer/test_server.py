@@ -213,7 +213,7 @@ def test_the_session_of_a_browser_that_disconnects_stops_once(monkeypatch):
     server.on_client_connect = lambda call: setattr(served, "connect", call)
     server.on_client_disconnect = lambda call: setattr(served, "disconnect", call)
     pose = SimpleNamespace(position=np.zeros(3), look_at=np.ones(3), fov=1.0)
-    space, view = SimpleNamespace(up="+z"), lambda view, aspect: pose
+    space, view = SimpleNamespace(up="+z"), lambda view, canvas: pose
     viewed = SimpleNamespace(space=space, first_view=0, pose=view)
     module._set_up_server(server, viewed, served.sessions)
     clients = [SimpleNamespace(client_id=k) for k in range(3)]

@@ -45,7 +45,8 @@ class Client:
         self.scene = SimpleNamespace(set_background_image=self.show)
         place = {"wxyz": np.array([1.0, 0, 0, 0]), "position": np.zeros(3), "fov": 0.9}
         size = {"image_width": CANVAS[0], "image_height": CANVAS[1]}
-        self.camera = SimpleNamespace(on_update=lambda call: None, **place, **size)
+        more = {"look_at": np.array([0.0, 0, 1]), "on_update": lambda call: None}
+        self.camera = SimpleNamespace(**place, **size, **more)
         self.gui, self.atomic, self.flush = None, contextlib.nullcontext, lambda: None
 
     def keep(self, where, item):
