@@ -53,26 +53,14 @@ class JobState:
     seconds: float = 0.0  # since its first progress in this call
 
 
-@dataclass(frozen=True)
 class JobFiles:
     """The files of a job. They lie beside those of other jobs, not in the folder of results."""
 
-    path: Path  # the job file
-
-    @property
-    def progress(self) -> Path:
-        """The progress of the job."""
-        return self.path.with_suffix(".progress")
-
-    @property
-    def output(self) -> Path:
-        """The output of its process."""
-        return self.path.with_suffix(".log")
-
-    @property
-    def stop(self) -> Path:
-        """The file that asks all jobs beside it to stop."""
-        return self.path.with_name("stop")
+    def __init__(self, path: Path):
+        self.path = path  # the job file
+        self.progress = path.with_suffix(".progress")  # the progress of the job
+        self.output = path.with_suffix(".log")  # the output of its process
+        self.stop = path.with_name("stop")  # the file that asks all jobs beside it to stop
 
 
 def slug(name: str) -> str:
