@@ -30,6 +30,14 @@ from p2gs_jax.run.folder import RunFolder
 KEY = "decided"
 # Options of `PhotometryConfig` that `select` replaces.
 CHOSEN = ("model", "curve", "spline", "white_balance", "vignetting", "responses")
+# All decisions about options of `PhotometryConfig`; they have the names of these.
+_SOLVED = (*CHOSEN, "cameras", "start", "start_std")
+# Options that the scene decides, by the names of the decisions.
+_PLACES = {
+    **{name: f"photometry.{name}" for name in _SOLVED},
+    "near": "render.near",
+    "near_depth": "loss.near_depth",
+}
 
 
 @dataclass(frozen=True)
@@ -90,22 +98,6 @@ class Decisions:
             raise UserError(why, fix=fix)
 
 
-# Options that the scene decides, by the names of the decisions.
-_PLACES = {
-    "model": "photometry.model",
-    "curve": "photometry.curve",
-    "spline": "photometry.spline",
-    "start": "photometry.start",
-    "start_std": "photometry.start_std",
-    "white_balance": "photometry.white_balance",
-    "vignetting": "photometry.vignetting",
-    "responses": "photometry.responses",
-    "cameras": "photometry.cameras",
-    "near": "render.near",
-    "near_depth": "loss.near_depth",
-}
-
-
 def read_decisions(path: Path) -> Decisions | None:
     """Read `decisions.json`; None: there is no such file; UserError: it is broken."""
     if not path.exists():
@@ -148,8 +140,7 @@ def likely(
         return None
     decided = dataclasses.replace(Decisions.as_given(cfg), **scale)
     if kept is not None:
-        solved = (*CHOSEN, "cameras", "start", "start_std")
-        return dataclasses.replace(decided, **{name: getattr(kept, name) for name in solved})
+        return dataclasses.replace(decided, **{name: getattr(kept, name) for name in _SOLVED})
     if p.start != "tracks":
         return unsolved(decided)
     if p.select:
