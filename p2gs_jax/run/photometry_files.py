@@ -140,32 +140,23 @@ def write_fitted(
     )
 
 
-def _row(view: View, split: str, exposure, ev, gamma, balance=None) -> ViewPhotometry:
-    """Return the row of a view with the fields that all views have."""
-    return {
-        "image": view.name,
-        "camera": view.camera,
-        "exposure": exposure,
-        "exposure_ev": ev,
-        "gamma": gamma,
-        "exif_ev": view.exif_ev,
-        "split": split,
-        "exposure_fitted": None,
-        "white_balance": balance,
-        "white_balance_ev_error": None,
-    }
+def _row(view: View, split: str) -> ViewPhotometry:
+    """Return the row of a view with the fields that all views have; None where they are unknown."""
+    row = dict.fromkeys((*OF_VIEWS, "white_balance", "white_balance_ev_error"))
+    known = {"image": view.name, "camera": view.camera, "exif_ev": view.exif_ev, "split": split}
+    return row | known
 
 
 def _fitted_row(
     params: Params, view: View, k: int | None, solution: PhotometricSolution | None, unknown: bool
 ) -> ViewPhotometry:
     """Return the row of a view of a fit; `k` is its row in `Photometry`, None if held out."""
-    row = _row(view, view.split, None, None, None)
+    row = _row(view, view.split)
     if k is not None:
         host: Photometry = jax.tree.map(np.asarray, params.photometry)
         e, balance = float(host.exposures[k]), host.white_balance
-        balance = None if balance is None else np.exp(balance[k]).tolist()
-        row = _row(view, view.split, e, float(np.log2(e)), float(host.gammas[k]), balance)
+        row |= {"exposure": e, "exposure_ev": float(np.log2(e)), "gamma": float(host.gammas[k])}
+        row["white_balance"] = None if balance is None else np.exp(balance[k]).tolist()
     if unknown:
         row["exposure_unknown"] = True
     if k is not None and solution is not None and np.isfinite(solution.exposure_errors[k]):
@@ -192,7 +183,8 @@ def write_solution(
         found = (np.exp(s.log_exposures[i]), s.exposures_ev[i], s.gammas[i])
         errors = (s.exposure_errors_ev[i], s.gamma_errors[i])
         values = [float(v) if solved[i] else None for v in (*found, *errors)]
-        row = _row(view, "train", *values[:3])
+        row = _row(view, "train")
+        row["exposure"], row["exposure_ev"], row["gamma"] = values[:3]
         row["exposure_ev_error"], row["gamma_error"] = values[3:]
         row["white_balance"], row["white_balance_ev_error"] = _balance(s, i)
         rows.append(row)
