@@ -38,15 +38,15 @@ def with_fields(cfg: FitConfig, fields: Mapping[str, Any]) -> FitConfig:
 
 def _checked(cfg: FitConfig, whole: str, value: Any) -> Any:
     """Return a value with the type of the field: lists become tuples, integers floats if needed."""
-    record: Any = cfg
-    *groups, last = whole.split(".")
-    for name in groups:
-        _require_field(record, name, whole)
-        record = getattr(record, name)
-        if not dataclasses.is_dataclass(record):
-            fix = f"{name!r} is a value: leave out the names after it"
-            raise UserError(f"{whole!r} is not a configuration field.", fix=fix)
-    _require_field(record, last, whole)
+    record, last, found = None, "", cfg
+    why = f"{whole!r} is not a configuration field."
+    for name in whole.split("."):
+        if not dataclasses.is_dataclass(found):
+            raise UserError(why, fix=f"{last!r} is a value: leave out the names after it")
+        names = [f.name for f in dataclasses.fields(found)]
+        if name not in names:
+            raise UserError(why, fix=f"instead of {name!r} use one of: {', '.join(names)}")
+        record, last, found = found, name, getattr(found, name)
     hint = typing.get_type_hints(type(record))[last]
     value = tuple(value) if isinstance(value, list) else value
     if not _fits(value, hint):
@@ -58,13 +58,6 @@ def _checked(cfg: FitConfig, whole: str, value: Any) -> Any:
 
 def _float(value: Any) -> Any:
     return float(value) if type(value) is int else value
-
-
-def _require_field(record: Any, name: str, whole: str) -> None:
-    names = [f.name for f in dataclasses.fields(record)]
-    if name not in names:
-        fix = f"instead of {name!r} use one of: {', '.join(names)}"
-        raise UserError(f"{whole!r} is not a configuration field.", fix=fix)
 
 
 def _fits(value: Any, hint: Any) -> bool:
