@@ -61,6 +61,6 @@ def make_recording(root, cameras=("front", "left", "back", "right"), frames=8):
         return SweepPoints(points, np.full(len(points), PERIOD * frame))
 
     rig = [RigCamera(name, K, WIDTH, HEIGHT) for name in cameras]
-    sweeps = [Sweep(k, PERIOD * k, lambda k=k: read(k)) for k in range(frames)]
+    sweeps = [Sweep(PERIOD * k, lambda k=k: read(k)) for k in range(frames)]
     cars = (tracked_car(frames), tracked_car(frames, moving=False))
     return Recording(root, "pandaset", rig, photographs, sweeps, cars)

@@ -127,7 +127,7 @@ def recording(root: Path) -> Recording:
         found = found + rng.normal(0, 0.01, found.shape)
         return SweepPoints(found.astype(np.float64), np.full(len(found), time))
 
-    sweeps = tuple(Sweep(f, f * INTERVAL, lambda f=f: sweep(f)) for f in range(FRAMES))
+    sweeps = tuple(Sweep(f * INTERVAL, lambda f=f: sweep(f)) for f in range(FRAMES))
     return Recording(root, "pandaset", cameras, photographs(root), sweeps, (world.track,))
 
 

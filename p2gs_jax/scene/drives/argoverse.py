@@ -21,7 +21,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64, Int, Int64
+from jaxtyping import Float64, Int64
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import broken
@@ -83,12 +83,6 @@ class _Car:
         """Return time stamps in seconds since the first pose."""
         return (stamps - self.start) * 1e-9
 
-    def frames(self, stamps: Int64[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-        """Return the frames that are nearest to time stamps."""
-        if not len(self.moments):
-            return np.zeros(len(stamps), int)
-        return np.abs(stamps[:, None] - self.moments).argmin(1)
-
 
 def _poses(table: Columns, what: str) -> Float64[np.ndarray, "n 4 4"]:
     return from_quaternions(table.stacked(QUATERNION), table.stacked(POSITION), table.path, what)
@@ -139,7 +133,8 @@ def _photographs(
         if name not in mounts:
             raise broken(path, f"has no pose of {name}")
         stamps = np.array(list(files[name]), np.int64)
-        times, frames = car.seconds(stamps), car.frames(stamps)
+        times = car.seconds(stamps)
+        frames = np.abs(stamps[:, None] - car.moments).argmin(1)  # the nearest ones
         poses, covered = car.trajectory.at(times)
         unplaced += int((~covered).sum())
         for k in np.flatnonzero(covered):
@@ -153,12 +148,10 @@ def _photographs(
 def _sweeps(car: _Car) -> tuple[list[recording.Sweep], list[str]]:
     files = numbered(car.log / "sensors" / "lidar", (".feather",))
     stamps = np.array(list(files), np.int64)
-    times, frames = car.seconds(stamps), car.frames(stamps)
+    times = car.seconds(stamps)
     poses, known = car.trajectory.at(times)
     sweeps = [
-        recording.Sweep(
-            int(frames[k]), float(times[k]), partial(_read_sweep, path, poses[k], times[k])
-        )
+        recording.Sweep(float(times[k]), partial(_read_sweep, path, poses[k], times[k]))
         for k, path in enumerate(files.values())
         if known[k]
     ]

@@ -64,7 +64,7 @@ def read_drivestudio(root: Path, cfg: DataConfig) -> Recording:
         notes += tables.counted(unplaced, f"photographs of {camera.name} have no pose.")
     scans = tables.numbered(root / "lidar", (".bin",))
     sweeps = [
-        Sweep(frame, _time(frame), partial(_read_sweep, path, cars[frame], _time(frame)))
+        Sweep(_time(frame), partial(_read_sweep, path, cars[frame], _time(frame)))
         for frame, path in scans.items()
         if frame in cars
     ]

@@ -86,7 +86,7 @@ def read_kitti_raw(root: Path, cfg: DataConfig) -> Recording:
     scans = tables.numbered(root / "velodyne_points" / "data", (".bin",))
     known = scanner.at(forward)[1] if len(forward) else forward
     sweeps = [
-        Sweep(k, float(forward[k]), partial(read_sweep, path, forward[k], lengths[k], scanner))
+        Sweep(float(forward[k]), partial(read_sweep, path, forward[k], lengths[k], scanner))
         for k, path in scans.items()
         if k < len(forward) and known[k]
     ]

@@ -63,7 +63,7 @@ def read_kitti_tracking(root: Path, cfg: DataConfig) -> Recording:
         notes += tables.counted(unplaced, f"photographs of {camera} have no pose.")
     scans = tables.numbered(root / "velodyne" / name, (".bin",))
     sweeps = [
-        Sweep(k, times[k], partial(kitti.read_sweep, path, times[k], kitti.TURN_S, scanner))
+        Sweep(times[k], partial(kitti.read_sweep, path, times[k], kitti.TURN_S, scanner))
         for k, path in scans.items()
         if k < len(times)
     ]

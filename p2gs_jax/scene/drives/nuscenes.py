@@ -216,8 +216,8 @@ def _sweeps(drive: _Drive) -> tuple[list[Sweep], int]:
         if pose is None or not path.is_file():
             absent += row["is_key_frame"] or path.is_file()
             continue
-        frame, time = drive.moments[row["sample_token"]], drive.seconds(row["timestamp"])
-        sweeps.append(Sweep(frame, time, partial(_read_sweep, path, pose, time)))
+        time = drive.seconds(row["timestamp"])
+        sweeps.append(Sweep(time, partial(_read_sweep, path, pose, time)))
     return sweeps, absent
 
 

@@ -128,7 +128,7 @@ def _sweeps(root: Path) -> tuple[list[Sweep], list[str]]:
         return [], []
     times = _sweep_times(root)
     timed = {frame: path for frame, path in files.items() if frame < len(times)}
-    sweeps = [Sweep(k, float(times[k]), partial(_read_sweep, path)) for k, path in timed.items()]
+    sweeps = [Sweep(float(times[k]), partial(_read_sweep, path)) for k, path in timed.items()]
     absent = len(times) - len(timed)
     notes = tables.counted(absent, f"of {len(times)} LiDAR sweeps are missing.")
     return sweeps, notes + tables.counted(len(files) - len(timed), tables.UNPLACED_SWEEPS)

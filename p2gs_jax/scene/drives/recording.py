@@ -85,7 +85,6 @@ class SweepPoints(NamedTuple):
 class Sweep:
     """A LiDAR sweep; `time` is in seconds; `read` raises UserError if the file is broken."""
 
-    frame: int
     time: float
     read: Callable[[], SweepPoints]
 

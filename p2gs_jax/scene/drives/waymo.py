@@ -101,14 +101,15 @@ def read_waymo(root: Path, cfg: DataConfig) -> Recording:
 
 
 class _Segment:
-    """The files of a segment, the time stamps of its frames, and its clock."""
+    """The files of a segment, and its clock."""
 
     def __init__(self, root: Path, name: str):
         self.root, self.name = root, name
         self.images = self.open("camera_image")
-        self._stamps = np.unique(self.images.columns([STAMP]).whole(STAMP))
-        if not len(self._stamps):
+        stamps = self.images.columns([STAMP]).whole(STAMP)
+        if not len(stamps):
             raise broken(self.images.path, "holds no photograph")
+        self._start = stamps.min()
 
     def path(self, component: str) -> Path:
         return self.root / component / f"{self.name}.parquet"
@@ -119,13 +120,9 @@ class _Segment:
     def open(self, component: str) -> ParquetTable:
         return ParquetTable(self.path(component))
 
-    def frame(self, stamp: int) -> int:
-        """Return the frame nearest to a time stamp, microseconds."""
-        return int(np.abs(self._stamps - stamp).argmin())
-
     def seconds(self, stamp: float) -> float:
         """Return a time stamp, microseconds, in seconds since the first frame."""
-        return float(stamp - self._stamps[0]) * 1e-6
+        return float(stamp - self._start) * 1e-6
 
 
 def _name(names: tuple[str, ...], number: int) -> str:
@@ -162,6 +159,7 @@ def _photographs(segment: _Segment, mounts: dict[str, Pose]) -> tuple[list[Photo
     table = images.columns([STAMP, CAMERA, POSE_TIME, *MOTION, *SHUTTER, POSE])
     motion, stamps, times = table.stacked(MOTION), table.whole(STAMP), table.numbers(POSE_TIME)
     trigger, done = map(table.numbers, SHUTTER)
+    _, frames = np.unique(stamps, return_inverse=True)
     photographs, unplaced = [], 0
     for row, number in enumerate(table.whole(CAMERA)):
         name, stamp, posed = _name(CAMERAS, number), int(stamps[row]), float(times[row])
@@ -178,7 +176,7 @@ def _photographs(segment: _Segment, mounts: dict[str, Pose]) -> tuple[list[Photo
         photographs.append(
             Photograph(
                 camera=name,
-                frame=segment.frame(stamp),
+                frame=int(frames[row]),
                 time=segment.seconds(posed * 1e6) + lag,
                 path=Path(f"{stamp}.jpg"),
                 pose=_moved(car, motion[row], lag) @ mounts[name],
@@ -259,11 +257,7 @@ def _sweeps(segment: _Segment, cars: dict[int, Pose]) -> tuple[list[Sweep], list
     source = _Source(segment)
     turns = sorted({stamp for stamp, _ in source.rows})
     sweeps = [
-        Sweep(
-            segment.frame(stamp),
-            segment.seconds(stamp) + TURN_S / 2,
-            partial(source.read, stamp, cars[stamp]),
-        )
+        Sweep(segment.seconds(stamp) + TURN_S / 2, partial(source.read, stamp, cars[stamp]))
         for stamp in turns
         if stamp in cars
     ]

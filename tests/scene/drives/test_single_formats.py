@@ -79,7 +79,7 @@ def test_the_grey_pair_is_read_by_request_and_photographs_are_not_undistorted(ke
     assert not any("stereo" in note for note in drive.notes)
     # The published photographs are undistorted, although the tables have distortion terms.
     assert {camera.distortion for camera in drive.cameras} == {None}
-    assert [sweep.frame for sweep in drive.sweeps] == [0, 2, 4]
+    assert len(drive.sweeps) == 3
 
 
 def test_what_argoverse_lacks_is_counted(copied, read):
