@@ -47,14 +47,7 @@ from p2gs_jax.run.folder import RunFolder, locked, require_folder
 from p2gs_jax.run.photometry_files import write_solution
 from p2gs_jax.run.plots import write_calibration_plot
 from p2gs_jax.run.read import load_run
-from p2gs_jax.scene import PhotographsAlone, check_apart, load_scene
-from p2gs_jax.scene.exposures import (
-    check_source,
-    read_known_exposures,
-    stated_ev,
-    strangers,
-    without_view,
-)
+from p2gs_jax.scene import PhotographsAlone, check_apart, exposures, load_scene
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.types import View
 
@@ -152,7 +145,7 @@ def calibrate(
     cfg = dataclasses.replace(cfg, data=dataclasses.replace(cfg.data, test_every=0))
     reporter, out, begin = reporter or Silent(), Path(out), time.monotonic()
     for source in (cfg.photometry.known, compare_with):
-        check_source(source)
+        exposures.check_source(source)
     reporter.stage("Reading the scene")
     with _held(out):
         scene = load_scene(Path(scene_dir), cfg.data, out / "cache", reporter.message)
@@ -173,7 +166,7 @@ def calibrate(
             scene, store, cfg.train.seed, lambda i, n: reporter.stage("Sampling colours", i, n)
         )
         options, views = options_of(cfg, scene), scene.training_views
-        notes = (*scene.notes, *strangers(compare_with, scene.views))
+        notes = (*scene.notes, *exposures.strangers(compare_with, scene.views))
         found = solved(views, observations, options, cfg, begin, compare_with, reporter, notes)
         found.write(out)
         if develop is None or poses is None:
@@ -219,7 +212,7 @@ def calibrate_run(
             fix = "fit longer, or calibrate from the scene's tracks"
             raise UserError(f"{run.folder}: no pixel of one view is visible in another.", fix=fix)
         options, views = options_of(cfg, run.scene), run.scene.training_views
-        notes = (*run.scene.notes, *strangers(compare_with, run.scene.views))
+        notes = (*run.scene.notes, *exposures.strangers(compare_with, run.scene.views))
         found = solved(views, observations, options, cfg, begin, compare_with, reporter, notes)
         return found.write(Path(out))
 
@@ -250,7 +243,7 @@ def solved(
     selection = calibrate_observations(observations, options)
     seconds = {"reading": sampled - begin, "adjustment": time.monotonic() - sampled}
     s, known = selection.solution, cfg.photometry.known
-    stated = stated_ev(compare_with, list(views))
+    stated = exposures.stated_ev(compare_with, list(views))
     agreement = compare(s.exposures_ev, np.where(signal, s.exposure_errors_ev, np.inf), stated)
     messages = [*notes, *selection.reasons, *s.warnings]
     if agreement.views:
@@ -329,22 +322,22 @@ def calibrate_stack(
     p, seed = cfg.photometry, cfg.train.seed
     check_values(cfg)
     check_choice(p)
-    check_source(compare_with)
+    exposures.check_source(compare_with)
     with contextlib.nullcontext() if out is None else _held(Path(out)):
         stack, known = read_stack(Path(folder)), None
         if out is not None:
             paths = [view.image_path for view in stack.views]
             check_apart(Path(out), PhotographsAlone(paths[0].parent, paths))
         if p.known is not None:
-            values = read_known_exposures(p.known, list(stack.views))
-            unused = without_view(p.known, stack.views)
+            values = exposures.read_known_exposures(p.known, list(stack.views))
+            unused = exposures.without_view(p.known, stack.views)
             known = KnownExposures(values, p.known_deviation_ev, unused)
         found = stack_colors(stack, seed)
         options = CalibrationOptions(
             found.black, SATURATED, STACK_PIVOT, known, seed, "one_response"
         )
         arguments = (stack.views, found.observations, options, cfg, begin, compare_with, reporter)
-        notes = strangers(compare_with, stack.views)
+        notes = exposures.strangers(compare_with, stack.views)
         result = solved(*arguments, notes, gauge=STACK_GAUGE, signal=found.signal)
         of_frames = (result.solution, found.xy, stack.valid.shape, found.signal)
         local_ev = regional_ev(options.problem(found.observations), *of_frames)

@@ -25,16 +25,10 @@ from p2gs_jax.photometry.calibrate import OnChosen, Selection
 from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.parameters import recentre
 from p2gs_jax.photometry.response import Response
+from p2gs_jax.pipeline import preflight
 from p2gs_jax.pipeline.exposures import solve_exposures
 from p2gs_jax.pipeline.finish import Account, finish, seconds_to_finish
-from p2gs_jax.pipeline.preflight import (
-    Paths,
-    check_run_dir,
-    check_scene,
-    memory_named,
-    preflight,
-    require_checkpoint,
-)
+from p2gs_jax.pipeline.preflight import Paths, check_run_dir, memory_named
 from p2gs_jax.pipeline.prepare import Prepared, expected, initialise
 from p2gs_jax.pipeline.snapshots import Snapshots
 from p2gs_jax.pipeline.survey import Survey, load, survey
@@ -102,7 +96,7 @@ def fit(
     cfg, reporter = require_config(cfg), reporter or Silent()
     paths = Paths.of(scene_dir, run_dir, reference)
     folder, begin = RunFolder(paths.run), time.monotonic() - spent_s
-    weights = preflight(cfg, paths, resume=resume)
+    weights = preflight.preflight(cfg, paths, resume=resume)
     clock = Stopwatch({"starting": spent_s} if spent_s else {})
     mesh, custom = mesh_of(cfg, devices), Custom(terms, formation, strategy)
     optimiser = Optimiser(folder, reporter, mesh, custom)
@@ -110,9 +104,9 @@ def fit(
     with no_empty_folders(paths.run), locked(paths.run) as lock, pixels, memory_named(), optimiser:
         check_run_dir(paths.run, resume, cfg)  # another run may have ended in the meantime
         if resume and folder.metrics.exists():
-            require_checkpoint(folder)
+            preflight.require_checkpoint(folder)
         scene = load(paths.scene, paths.run, cfg, reporter, clock)
-        truth = check_scene(scene, cfg, paths, weights)
+        truth = preflight.check_scene(scene, cfg, paths, weights)
         kept = kept_choice(cfg, folder) if resume else None
         # A resumed run is prepared with the steps and the budget of its first start.
         options = with_values(cfg, first_plan(folder))

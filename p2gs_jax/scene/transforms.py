@@ -29,19 +29,12 @@ from jaxtyping import Float, Float64
 from p2gs_jax.config import DataConfig
 from p2gs_jax.core.atomic import BROKEN_ARRAYS
 from p2gs_jax.errors import broken
-from p2gs_jax.scene import files
+from p2gs_jax.scene import files, rigid
 from p2gs_jax.scene.cameras import name_cameras, numbered
 from p2gs_jax.scene.colmap import CUT, IMAGE_FOLDERS
 from p2gs_jax.scene.files import HUGE, at_file_size, require_inside
 from p2gs_jax.scene.hdr_sets import by_pose, exposure_times, with_times
 from p2gs_jax.scene.lens import intrinsics, make_distortion
-from p2gs_jax.scene.rigid import (
-    nearest_rotation,
-    off_origin,
-    pose_of,
-    require_axes,
-    require_last_row,
-)
 from p2gs_jax.scene.seeds import read_points
 from p2gs_jax.scene.split import lists_in, split_as_listed
 from p2gs_jax.scene.visibility import share_in_view
@@ -96,8 +89,8 @@ def load_transforms(root: Path, json_path: Path, cfg: DataConfig) -> Scene:
         if not len(points):
             note = f"{name} holds no points: the scene is read as if the file were not named."
             scene = replace(scene, notes=(*scene.notes, note))
-        require_axes(scene.views, lambda views: share_in_view(points, views), json_path)
-    scene = off_origin(scene)
+        rigid.require_axes(scene.views, lambda views: share_in_view(points, views), json_path)
+    scene = rigid.off_origin(scene)
     lists = lists_in(json_path, data, _LISTS)
     if lists is None or cfg.split is not None or not cfg.test_every:
         return scene
@@ -131,7 +124,7 @@ def load_blender(root: Path, cfg: DataConfig) -> Scene:
         for frame in frames
         for name in poses.get(frame.path.as_posix(), [frame.path.as_posix()])
     ]
-    scene = off_origin(_assembled(root, "blender", frames, cfg))
+    scene = rigid.off_origin(_assembled(root, "blender", frames, cfg))
     for path, path_times in times.items():
         scene = replace(scene, views=with_times(scene.views, path_times, path))
     return scene if test is None else replace(scene, split_by=test.name)
@@ -165,7 +158,7 @@ def load_llff(root: Path, cfg: DataConfig) -> Scene:
     bounds = (float(rows[:, 15].min()), float(rows[:, 16].max()))
     views = name_cameras(numbered(views), cfg.camera_by)
     scene = _scene(root, "llff", views, files.rescaled(resized, path.name))
-    return replace(off_origin(scene), depths=bounds)
+    return replace(rigid.off_origin(scene), depths=bounds)
 
 
 def llff_table(root: Path) -> Path | None:
@@ -203,11 +196,11 @@ def _viewmat(
     pose: Float64[np.ndarray, "3 4"], path: Path, what: str, fix: str
 ) -> Float[np.ndarray, "4 4"]:
     """Return the world-to-camera matrix of a camera-to-world pose, both with OpenCV axes."""
-    nearest = nearest_rotation(pose[:, :3])
+    nearest = rigid.nearest_rotation(pose[:, :3])
     if nearest is None:
         raise broken(f"{path}:", f"{what} is not a rotation and a translation", fix)
     rotation = np.ascontiguousarray(nearest.T)
-    return pose_of(rotation, -rotation @ pose[:, 3])
+    return rigid.pose_of(rotation, -rotation @ pose[:, 3])
 
 
 def _read_llff(path: Path) -> Float64[np.ndarray, "v c"]:
@@ -378,7 +371,7 @@ def _view(frame: _Frame, folder: Path, name: str) -> tuple[View, bool]:
     if c2w.shape not in ((3, 4), (4, 4)) or not (np.abs(c2w) < HUGE).all():
         raise broken(f"{path}:", f"{matrix_name} is not a finite 4x4 matrix", FIX)
     if len(c2w) == 4:
-        require_last_row(c2w, path, matrix_name)
+        rigid.require_last_row(c2w, path, matrix_name)
     viewmat = _viewmat(c2w[:3] * _OPENGL_SIGNS, path, matrix_name, FIX)
     # Photographs with the same size and lens come from one camera.
     camera = f"{values.get('w')} {values.get('h')} {np.round(K, 3).tolist()} {distortion}"

@@ -25,16 +25,8 @@ from jaxtyping import Float64, Int64
 
 from p2gs_jax.config import DataConfig
 from p2gs_jax.errors import broken
-from p2gs_jax.scene.drives import recording
+from p2gs_jax.scene.drives import recording, tables
 from p2gs_jax.scene.drives.objects import Box, tracks
-from p2gs_jax.scene.drives.tables import (
-    PHOTOGRAPHS,
-    Columns,
-    counted,
-    drive_folder,
-    numbered,
-    read_feather,
-)
 from p2gs_jax.scene.lens import intrinsics
 from p2gs_jax.scene.rigid import Pose, from_quaternions
 from p2gs_jax.types import TrackedObject
@@ -53,7 +45,7 @@ GREY = "stereo"
 
 def read_argoverse(root: Path, cfg: DataConfig) -> recording.Recording:
     """Read a log, the stereo pair only if `cfg.cameras` names it; UserError: a table is broken."""
-    log = drive_folder(root, cfg.drive, MARKER)
+    log = tables.drive_folder(root, cfg.drive, MARKER)
     cameras, files, notes = _cameras(log, cfg)
     # The camera with most photographs defines the frames. Sweeps cannot: cameras trigger twice in a
     # turn of the scanners.
@@ -71,7 +63,7 @@ class _Car:
 
     def __init__(self, log: Path, moments: Int64[np.ndarray, " m"]):
         path = log / POSES
-        table = read_feather(path, [STAMP, *QUATERNION, *POSITION])
+        table = tables.read_feather(path, [STAMP, *QUATERNION, *POSITION])
         stamps = table.whole(STAMP)
         if not len(stamps):
             raise broken(path, "holds no pose")
@@ -84,7 +76,7 @@ class _Car:
         return (stamps - self.start) * 1e-9
 
 
-def _poses(table: Columns, what: str) -> Float64[np.ndarray, "n 4 4"]:
+def _poses(table: tables.Columns, what: str) -> Float64[np.ndarray, "n 4 4"]:
     return from_quaternions(table.stacked(QUATERNION), table.stacked(POSITION), table.path, what)
 
 
@@ -93,10 +85,10 @@ def _cameras(
 ) -> tuple[list[recording.RigCamera], dict[str, dict[int, Path]], list[str]]:
     """Return cameras with photographs, the photographs by time stamp, and notes."""
     path = log / INTRINSICS
-    table = read_feather(path, [*LENS, "sensor_name"])
+    table = tables.read_feather(path, [*LENS, "sensor_name"])
     lenses = dict(zip(map(str, table["sensor_name"]), table.stacked(LENS), strict=True))
     folders = sorted((log / "sensors" / "cameras").glob("*/"))
-    found = {f.name: files for f in folders if (files := numbered(f, PHOTOGRAPHS))}
+    found = {f.name: files for f in folders if (files := tables.numbered(f, tables.PHOTOGRAPHS))}
     notes = []
     grey = [name for name in found if name.startswith(GREY)]
     if grey and not any(GREY in name for name in cfg.cameras):
@@ -126,7 +118,7 @@ def _photographs(
     if not cameras:
         return [], []
     path = car.log / EXTRINSICS
-    table = read_feather(path, [*QUATERNION, *POSITION, "sensor_name"])
+    table = tables.read_feather(path, [*QUATERNION, *POSITION, "sensor_name"])
     mounts = dict(zip(map(str, table["sensor_name"]), _poses(table, "sensor"), strict=True))
     photographs, unplaced = [], 0
     for name in (camera.name for camera in cameras):
@@ -142,11 +134,12 @@ def _photographs(
             photographs.append(
                 recording.Photograph(name, int(frames[k]), float(times[k]), file, pose)
             )
-    return photographs, counted(unplaced, f"photographs are outside {POSES}: they are left out.")
+    notes = tables.counted(unplaced, f"photographs are outside {POSES}: they are left out.")
+    return photographs, notes
 
 
 def _sweeps(car: _Car) -> tuple[list[recording.Sweep], list[str]]:
-    files = numbered(car.log / "sensors" / "lidar", (".feather",))
+    files = tables.numbered(car.log / "sensors" / "lidar", (".feather",))
     stamps = np.array(list(files), np.int64)
     times = car.seconds(stamps)
     poses, known = car.trajectory.at(times)
@@ -155,11 +148,11 @@ def _sweeps(car: _Car) -> tuple[list[recording.Sweep], list[str]]:
         for k, path in enumerate(files.values())
         if known[k]
     ]
-    return sweeps, counted(int((~known).sum()), f"LiDAR sweeps are outside {POSES}.")
+    return sweeps, tables.counted(int((~known).sum()), f"LiDAR sweeps are outside {POSES}.")
 
 
 def _read_sweep(path: Path, pose: Pose, start: float) -> recording.SweepPoints:
-    table = read_feather(path, ["x", "y", "z", "offset_ns"])
+    table = tables.read_feather(path, ["x", "y", "z", "offset_ns"])
     times = start + table.numbers("offset_ns") * 1e-9
     return recording.SweepPoints(table.stacked("xyz") @ pose[:3, :3].T + pose[:3, 3], times)
 
@@ -169,7 +162,7 @@ def _objects(car: _Car) -> tuple[tuple[TrackedObject, ...], list[str]]:
     if not path.is_file():
         return (), [f"{path.name} is missing: moving objects are not known."]
     columns = [STAMP, *SIZE, *QUATERNION, *POSITION, "track_uuid", "category"]
-    table = read_feather(path, columns)
+    table = tables.read_feather(path, columns)
     times, size = car.seconds(table.whole(STAMP)), table.stacked(SIZE)
     if not (size > 0).all():
         raise broken(f"{path}:", "a box has no size")
@@ -181,6 +174,6 @@ def _objects(car: _Car) -> tuple[tuple[TrackedObject, ...], list[str]]:
         Box(str(names[k]), str(labels[k]), tuple(size[k]), float(times[k]), poses[k])
         for k in np.flatnonzero(known & named)
     ]
-    notes = counted(int((~named).sum()), "boxes belong to no track: they are left out.")
-    notes += counted(int((~known).sum()), f"boxes are outside {POSES}: they are left out.")
+    notes = tables.counted(int((~named).sum()), "boxes belong to no track: they are left out.")
+    notes += tables.counted(int((~known).sum()), f"boxes are outside {POSES}: they are left out.")
     return tracks(boxes), notes
