@@ -97,8 +97,15 @@ def undistortion_maps(
     shifted[:2, 2] -= 0.5
     lens = np.array(distortion.coefficients)
     size = (width, height)
+    x = (np.arange(width) - shifted[0, 2]) / shifted[0, 0]
+    y = (np.arange(height) - shifted[1, 2]) / shifted[1, 1]
     if distortion.model in COLMAP_LENSES:
-        map_x, map_y = _colmap_maps(shifted, distortion, width, height)
+        camera, rays = colmap_camera(shifted, distortion), np.ones((width, 3))
+        rays[:, 0] = x
+        map_x, map_y = np.empty((2, height, width), np.float32)
+        for row in range(height):
+            rays[:, 1] = y[row]
+            map_x[row], map_y[row] = camera.img_from_cam(rays).T
     elif distortion.model == "fisheye":
         map_x, map_y = cv2.fisheye.initUndistortRectifyMap(
             shifted, lens, np.eye(3), shifted, size, cv2.CV_32FC1
@@ -107,8 +114,6 @@ def undistortion_maps(
         map_x, map_y = cv2.initUndistortRectifyMap(shifted, lens, None, shifted, size, cv2.CV_32FC1)
     limit = _fold_radius(distortion)
     if np.isfinite(limit):
-        x = (np.arange(width) - shifted[0, 2]) / shifted[0, 0]
-        y = (np.arange(height) - shifted[1, 2]) / shifted[1, 1]
         folded = x[None, :] ** 2 + y[:, None] ** 2 >= limit**2
         map_x[folded] = map_y[folded] = -10.0
     return map_x, map_y
@@ -121,19 +126,6 @@ def colmap_camera(K: Float[np.ndarray, "3 3"], distortion: Distortion) -> Any:
     (fx, _, cx), (_, fy, cy), _ = np.asarray(K, np.float64)
     params = [fx, fy, cx, cy, *distortion.coefficients]
     return pycolmap.Camera(model=distortion.model, width=0, height=0, params=params)
-
-
-def _colmap_maps(
-    K: Float[np.ndarray, "3 3"], distortion: Distortion, width: int, height: int
-) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-    """Return `undistortion_maps` of COLMAP's lenses; K has pixel centres at integers."""
-    camera, maps = colmap_camera(K, distortion), np.empty((2, height, width), np.float32)
-    rays = np.ones((width, 3))
-    rays[:, 0] = (np.arange(width) - K[0, 2]) / K[0, 0]
-    for row in range(height):
-        rays[:, 1] = (row - K[1, 2]) / K[1, 1]
-        maps[:, row] = camera.img_from_cam(rays).T
-    return maps[0], maps[1]
 
 
 def _profile(distortion: Distortion) -> tuple[Polynomial, Polynomial, float]:
