@@ -45,8 +45,7 @@ class PixelFiles:
     def __init__(self, folder: Path, views: Sequence[View]):
         """Open a folder, and remove files that no photograph can use."""
         self.folder = folder
-        ego_hashes: dict[int, str] = {}
-        self._names = tuple(_digest(view, ego_hashes) for view in views)
+        self._names = tuple(map(_digest, views))
         self.locks = tuple(threading.Lock() for _ in views)
         known = {f"{name}.px" for name in self._names}
         # Unfinished files of a killed run have other names and are removed as well.
@@ -109,18 +108,11 @@ def file_bytes(view: View, size: tuple[int, int]) -> int:
     return size[0] * size[1] * (samples * (2 if resamples(view, size) else 1) + 1)
 
 
-def _digest(view: View, ego_hashes: dict[int, str]) -> str:
-    """Return a hash of everything, except the size, that the pixels of a view depend on.
-
-    `ego_hashes` caches the hashes of ego masks, which many views share, by identity.
-    """
-    ego_hash = ""
-    if view.ego_mask is not None:
-        identity = id(view.ego_mask)
-        if identity not in ego_hashes:
-            packed = np.packbits(view.ego_mask).tobytes()
-            ego_hashes[identity] = f"{view.ego_mask.shape} {hashlib.sha256(packed).hexdigest()}"
-        ego_hash = ego_hashes[identity]
+def _digest(view: View) -> str:
+    """Return a hash of everything, except the size, that the pixels of a view depend on."""
+    ego_hash, ego = "", view.ego_mask
+    if ego is not None:
+        ego_hash = f"{ego.shape} {hashlib.sha256(np.packbits(ego).tobytes()).hexdigest()}"
     lens = None if view.distortion is None else (view.distortion, view.K.tolist())
     files = [path and _fingerprint(path) for path in (view.image_path, view.mask_path)]
     parts = (_VERSION, *files, (view.width, view.height, view.alpha), lens, ego_hash)
