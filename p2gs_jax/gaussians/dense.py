@@ -27,7 +27,7 @@ from p2gs_jax.gaussians.population import Coverage, seed_bound
 from p2gs_jax.gaussians.seeds import gaussians_from_points, neighbour_scales
 from p2gs_jax.photometry.formation import places
 from p2gs_jax.scene.pixels.store import ImageStore, size_at
-from p2gs_jax.scene.visibility import shown_share
+from p2gs_jax.scene.visibility import share_in_view
 from p2gs_jax.types import Gaussians, Scene, View
 
 # Two neighbours must agree on a depth, so at least three views are needed.
@@ -326,8 +326,11 @@ def gaussians_of(
 
 def coverage_of(scene: Scene, max_width: int | None) -> Coverage:
     """Return the largest training view's pixels, and the mean share of the scene in a view."""
-    sizes = [size_at(view, max_width) for view in scene.training_views]
-    return Coverage(max(w * h for w, h in sizes), shown_share(scene.points, scene.training_views))
+    views = scene.training_views
+    sizes = [size_at(view, max_width) for view in views]
+    # All views together show the whole scene.
+    share = max(share_in_view(scene.points, views), 1 / len(views))
+    return Coverage(max(w * h for w, h in sizes), share)
 
 
 def dense_limit(cfg: FitConfig, seeds: int, coverage: Coverage) -> int:

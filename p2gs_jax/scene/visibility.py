@@ -28,21 +28,13 @@ def in_frame(
 
 
 def share_in_view(points: Float[np.ndarray, "p 3"], views: Sequence[View]) -> float:
-    """Return the mean share of points inside a view's image, for a sample of points and views."""
+    """Return the mean share of points in a view's image, over samples of both; 1 without points."""
     if not len(points):
         return 1.0
     sample = points[:: max(1, len(points) // SHARE_POINTS)]
     views_used = [views[row] for row in evenly_spaced(len(views), SHARE_VIEWS)]
     seen = (in_frame(*project_points(sample, view), view.width, view.height) for view in views_used)
     return float(np.mean([inside.mean() for inside in seen]))
-
-
-def shown_share(points: Float[np.ndarray, "p 3"], views: Sequence[View]) -> float:
-    """Return the mean share of points in a view's frustum; 1 without points.
-
-    It is at least 1 / (number of views), because all views together show the whole scene.
-    """
-    return max(share_in_view(points, views), 1 / len(views))
 
 
 def unoccluded(

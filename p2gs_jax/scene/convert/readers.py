@@ -120,7 +120,14 @@ def read_heif(path: Path) -> Picture:
         # Codes of 10 and 12 bits come shifted: the largest one must become white.
         white = pixels.max(initial=0) | (2**16 - 2 ** (16 - int(info.get("bit_depth", 16))))
         pixels = np.rint(pixels * (65535 / white)).astype(np.uint16)
-    coded, transfer = _code_points(info.get("nclx_profile"), path)
+    # The colour box holds the primaries (ITU-T H.273; 0: unknown) and the transfer function.
+    if nclx := info.get("nclx_profile"):
+        names = ("color_primaries", "transfer_characteristics")
+        coded, code = (int(nclx.get(name, 0)) for name in names)
+    else:  # Pillow does not report the box
+        _, found, data = path.read_bytes().partition(b"colrnclx")
+        coded, code = struct.unpack(">HH", data[:4].ljust(4, b"\0")) if found else (0, 0)
+    transfer = icc.TRANSFERS.get(code)
     if transfer is None:
         profile = info.get("icc_profile")
         coded_space = None if profile or pixels.shape[2] < 3 else icc.coded_profile(coded)
@@ -130,20 +137,6 @@ def read_heif(path: Path) -> Picture:
     primaries = icc.PRIMARIES.get(coded, icc.BT709)
     light = np.broadcast_to(light, (*light.shape[:2], 3)) @ icc.to_srgb_matrix(primaries).T
     return Picture(light=light.astype(np.float32), exif=exif)
-
-
-def _code_points(nclx: dict | None, path: Path) -> tuple[int, icc.Transfer | None]:
-    """Return the primaries of a HEIC or AVIF (ITU-T H.273; 0: unknown) and its transfer function.
-
-    They are in the file's colour box, `nclx`, which Pillow does not report.
-    """
-    if nclx:
-        names = ("color_primaries", "transfer_characteristics")
-        primaries, transfer = (int(nclx.get(name, 0)) for name in names)
-    else:
-        _, found, data = path.read_bytes().partition(b"colrnclx")
-        primaries, transfer = struct.unpack(">HH", data[:4].ljust(4, b"\0")) if found else (0, 0)
-    return primaries, icc.TRANSFERS.get(transfer)
 
 
 @dataclass(frozen=True)

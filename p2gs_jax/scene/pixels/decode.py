@@ -235,22 +235,16 @@ def _read_raster(path: Path, *, colours: bool = False) -> np.ndarray:
     if raw is None or not _complete(path, data):
         raise undecodable(path)
     if header := _PNM.match(data):
-        raw = _full_range(raw, int(header[1]), int(header[4]))
+        kind, white, most = int(header[1]), int(header[4]), 2 ** (8 * raw.itemsize) - 1
+        # White becomes the largest integer; OpenCV does this for 8 bits written as text.
+        if white not in (0, most) and (kind > 3 or most != 255):
+            raw = np.rint(np.minimum(raw, white) * (most / white)).astype(raw.dtype)
     of_tiff = data[:2] in (b"II", b"MM")
     if of_tiff:
         _require_plain(path, raw)
     if (of_tiff and raw.shape[2:] == (4,)) or (raw.ndim == 2 and has_alpha(path)):
         raw = _with_alpha(path, raw)
     return with_profile_applied(data, raw) if colours else raw
-
-
-def _full_range(raw: UInt[np.ndarray, "..."], kind: int, white: int) -> UInt[np.ndarray, "..."]:
-    """Return the pixels of a PGM or PPM with the largest integer instead of `white`."""
-    most = np.iinfo(raw.dtype).max
-    # OpenCV does this for 8 bits written as text.
-    if white in (0, most) or (kind <= 3 and most == 255):
-        return raw
-    return np.rint(np.minimum(raw, white) * (most / white)).astype(raw.dtype)
 
 
 def _require_plain(path: Path, raw: UInt[np.ndarray, "..."]) -> None:
