@@ -83,17 +83,12 @@ def chosen_drive(wanted: str | None, there: Sequence[str], root: Path) -> str:
     raise UserError(message, fix="name one of them: --drive NAME")
 
 
-def missing_file(path: Path) -> UserError:
-    """Return the error for a missing file that a drive needs."""
-    return UserError(f"{path} does not exist", fix=UNPACK)
-
-
 def read_lines(path: Path) -> list[str]:
     """Return the lines of a text; UserError: it is missing."""
     try:
         return path.read_text("utf-8-sig", "replace").rstrip().splitlines()
     except FileNotFoundError:
-        raise missing_file(path) from None
+        raise broken(path, "does not exist", UNPACK) from None
 
 
 def read_scan(path: Path, columns: int, what: str) -> Float32[np.ndarray, "n c"]:
@@ -162,7 +157,7 @@ def read_rows(path: Path, needs: Kinds, column: str = "", among: Container[Any] 
             every = "" if column else text[:].decode("utf-8-sig")
             rows = list(_found(text, column, among)) if column else parse_json(every)
     except FileNotFoundError:
-        raise missing_file(path) from None
+        raise broken(path, "does not exist", UNPACK) from None
     except (ValueError, RecursionError) as error:
         raise broken(path, f"is not a valid table: {error}") from None
     for row in rows:
@@ -267,7 +262,7 @@ def _reading(path: Path) -> Iterator[None]:
         why = "Argoverse 2 and Waymo write Arrow's files, and pyarrow is not installed"
         raise UserError(why, fix="pip install 'p2gs-jax[drives]'") from None
     if not path.is_file():
-        raise missing_file(path)
+        raise broken(path, "does not exist", UNPACK)
     try:
         yield
     except (OSError, ValueError, pyarrow.ArrowException) as error:
@@ -322,7 +317,7 @@ def read_pickled(path: Path) -> Columns:
                 raise ValueError(f"it unpacks to more than {_MOST_BYTES >> 20} MiB")
         return Columns(_columns(_Records(io.BytesIO(content)).load()), path)
     except FileNotFoundError:
-        raise missing_file(path) from None
+        raise broken(path, "does not exist", UNPACK) from None
     # A damaged pickle may raise any error.
     except Exception as error:
         fix = "get the file again; tables are pickled pandas DataFrames of numbers and texts"
