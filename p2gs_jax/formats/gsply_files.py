@@ -81,13 +81,10 @@ def write_spz(path: Path, gaussians: Gaussians) -> int:
 
     Raises UserError: a position does not fit the format.
     """
-    require_gsply()
-    from gsply.spz import write_spz as write
-
-    g = half_turn(gaussians)
+    gsply, g = require_gsply(), half_turn(gaussians)
     bits = fractional_bits(np.asarray(g.means))
     with atomic_write(path) as temporary:
-        write(temporary, _to_gsply(g), version=3, fractional_bits=bits)
+        gsply.write_spz(temporary, _to_gsply(g), version=3, fractional_bits=bits)
     return g.capacity
 
 
@@ -106,11 +103,9 @@ def fractional_bits(means: np.ndarray) -> int:
 
 def read_spz(path: Path) -> Gaussians:
     """Read Gaussians, with axes right, down, forward; UserError: the file cannot be read."""
-    require_gsply()
-    from gsply.spz import read_spz as read
-
+    gsply = require_gsply()
     try:
-        data = read(path)
+        data = gsply.read_spz(path)
     except (OSError, ValueError) as error:
         raise UserError(f"{path} is not a readable SPZ: {error}") from error
     return half_turn(_from_gsply(data))
