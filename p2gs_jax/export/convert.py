@@ -137,7 +137,7 @@ def _check_names(fitted: Run) -> None:
 def _linear_ply(ply: Path, fitted: Run) -> str:
     g, kind = at_time(fitted.as_of(), None), fitted.cfg.photometry.appearance
     sidecar = ply.with_suffix(".json")
-    count = write_radiance(ply, g, activation=fitted.cfg.render.radiance)
+    write_radiance(ply, g, activation=fitted.cfg.render.radiance)
     content = linear_sidecar(g, fitted.cfg, fitted.scene, fitted.store, fitted.photometry)
     if fitted.lifting_error is not None:
         content["lifting_error"] = fitted.lifting_error
@@ -145,7 +145,7 @@ def _linear_ply(ply: Path, fitted: Run) -> str:
     if kind is not None:
         views = fitted.scene.training_views
         write_appearance(ply.parent / corrections_name(kind), fitted.params.appearance, views)
-    return f"{count} Gaussians of linear radiance; {sidecar.name} describes their fields"
+    return f"{g.capacity} Gaussians of linear radiance; {sidecar.name} describes their fields"
 
 
 def _other_trainer(name: Program, place: Path, fitted: Run, reporter: Reporter) -> str:

@@ -29,8 +29,8 @@ KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}  # by number of components
 MAGIC, VERSION, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 2, 0x4E4F534A, 0x004E4942  # of GLB
 
 
-def write_gltf(path: Path, gaussians: Gaussians) -> int:
-    """Write Gaussians with display colours and COLMAP's axes as `.glb`; return their number.
+def write_gltf(path: Path, gaussians: Gaussians) -> None:
+    """Write Gaussians with display colours and COLMAP's axes as `.glb`.
 
     Raises UserError: there are no Gaussians, because glTF forbids an empty accessor.
     """
@@ -72,7 +72,6 @@ def write_gltf(path: Path, gaussians: Gaussians) -> int:
         file.write(struct.pack("<III", MAGIC, VERSION, size))
         file.write(struct.pack("<II", len(text), JSON_CHUNK) + text)
         file.write(struct.pack("<II", starts[-1], BINARY_CHUNK) + b"".join(data))
-    return gaussians.capacity
 
 
 def _attributes(g: Gaussians) -> dict[str, Float32[np.ndarray, "n _"]]:

@@ -58,12 +58,11 @@ def _from_gsply(data: Any) -> Gaussians:
     return Gaussians(*map(on_device, parts))
 
 
-def write_compressed_ply(path: Path, gaussians: Gaussians) -> int:
-    """Write Gaussians with display colours into a file `.compressed.ply`; return their number."""
+def write_compressed_ply(path: Path, gaussians: Gaussians) -> None:
+    """Write Gaussians with display colours into a file `.compressed.ply`."""
     content = require_gsply().compress_to_bytes(_to_gsply(gaussians))
     with atomic_write(path) as temporary:
         temporary.write_bytes(content)
-    return gaussians.capacity
 
 
 def read_compressed_ply(path: Path) -> Gaussians:
@@ -76,16 +75,12 @@ def read_compressed_ply(path: Path) -> Gaussians:
     return _from_gsply(data)
 
 
-def write_spz(path: Path, gaussians: Gaussians) -> int:
-    """Write Gaussians with display colours; return their number.
-
-    Raises UserError: a position does not fit the format.
-    """
+def write_spz(path: Path, gaussians: Gaussians) -> None:
+    """Write Gaussians with display colours; UserError: a position does not fit the format."""
     gsply, g = require_gsply(), half_turn(gaussians)
     bits = fractional_bits(np.asarray(g.means))
     with atomic_write(path) as temporary:
         gsply.write_spz(temporary, _to_gsply(g), version=3, fractional_bits=bits)
-    return g.capacity
 
 
 def fractional_bits(means: np.ndarray) -> int:

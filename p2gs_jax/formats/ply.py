@@ -47,8 +47,8 @@ def unit_quats(gaussians: Gaussians) -> Float[np.ndarray, "n 4"]:
     return quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)
 
 
-def write_ply(path: Path, gaussians: Gaussians, comments: Sequence[str]) -> int:
-    """Write Gaussians without conversion; return their number.
+def write_ply(path: Path, gaussians: Gaussians, comments: Sequence[str]) -> None:
+    """Write Gaussians without conversion.
 
     `comments` become lines of the header, with all characters except ASCII escaped.
     """
@@ -59,7 +59,6 @@ def write_ply(path: Path, gaussians: Gaussians, comments: Sequence[str]) -> int:
         file.write(header_of("vertex", row, g.capacity, comments))
         for first in range(0, g.capacity, CHUNK):
             file.write(_columns(g, slice(first, first + CHUNK)).tobytes())
-    return g.capacity
 
 
 def _columns(g: Gaussians, rows: slice) -> Float[np.ndarray, "k c"]:
@@ -83,10 +82,9 @@ def _columns(g: Gaussians, rows: slice) -> Float[np.ndarray, "k c"]:
     return np.concatenate(columns, axis=1).astype("<f4")
 
 
-def write_radiance(path: Path, gaussians: Gaussians, *, activation: RadianceKind) -> int:
-    """Write Gaussians with their linear coefficients; return their number."""
-    kind = f"p2gs-jax: radiance activation {activation}"
-    return write_ply(path, gaussians, [LINEAR, kind])
+def write_radiance(path: Path, gaussians: Gaussians, *, activation: RadianceKind) -> None:
+    """Write Gaussians with their linear coefficients."""
+    write_ply(path, gaussians, [LINEAR, f"p2gs-jax: radiance activation {activation}"])
 
 
 RESTORE = "restore it from a copy, or write it again with `p2gs-jax fit ... --resume`"

@@ -44,10 +44,10 @@ def require_pxr() -> tuple[Any, ...]:
     return tuple(found)
 
 
-def write_usd(path: Path, gaussians: Gaussians, cameras: Mapping[str, Camera]) -> int:
+def write_usd(path: Path, gaussians: Gaussians, cameras: Mapping[str, Camera]) -> None:
     """Write Gaussians with display colours, and cameras by the names of their photographs.
 
-    Both have COLMAP's axes. Returns the number of Gaussians.
+    Both have COLMAP's axes.
     """
     _, Usd, UsdGeom, UsdVol, Vt = require_pxr()
     g = half_turn(gaussians)
@@ -81,7 +81,6 @@ def write_usd(path: Path, gaussians: Gaussians, cameras: Mapping[str, Camera]) -
         for index, (name, camera) in enumerate(cameras.items()):
             _define_camera(stage, f"{CAMERAS}/view_{index:04d}", name, camera)
         stage.GetRootLayer().Save()
-    return gaussians.capacity
 
 
 def _extent(means: np.ndarray, scales: np.ndarray) -> np.ndarray:
