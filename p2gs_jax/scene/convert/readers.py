@@ -49,10 +49,9 @@ _SENSITIVITIES = (_ISO, 0x8833, 0x8832, 0x8831)
 # APEX values (log2, stops) from this size on are broken.
 _SHUTTER_SPEED, _APERTURE, _LARGEST_APEX = 0x9201, 0x9202, 32.0
 _MAKE, _MODEL, _SERIAL, _LENS = 0x010F, 0x0110, 0xA431, 0xA434
-# Attributes of LibRaw, and OpenEXR's standard attributes.
+# Attributes of LibRaw.
 _RAW_SETTINGS = {"shutter_speed": _TIME, "aperture": _F_NUMBER, "iso_speed": _ISO}
 _RAW_SETTINGS |= {"focal_length": _FOCAL_LENGTH}
-_EXR_SETTINGS = {"expTime": _TIME, "aperture": _F_NUMBER, "isoSpeed": _ISO}
 # Canon's CR3 holds the settings in its first bytes, this many at most.
 _RAW_HEADER = 2**18
 _AGAIN = "copy that photograph again, or remove it from the scene"
@@ -295,17 +294,15 @@ def read_exr(path: Path) -> Picture:
 
 
 def _exr_exif(header: dict) -> Image.Exif | None:
-    shot = {tag: float(header[key]) for key, tag in _EXR_SETTINGS.items() if header.get(key)}
-    return _exif_of(shot)
+    names = ("expTime", "aperture", "isoSpeed")  # OpenEXR's standard attributes
+    time, aperture, iso = (float(header[n]) if header.get(n) else None for n in names)
+    return made_exif(ExifSettings(time, aperture, iso))
 
 
 def made_exif(settings: ExifSettings) -> Image.Exif | None:
     """Return EXIF with time, f-number and ISO, or None if all are unknown."""
     named = {_TIME: settings.time, _F_NUMBER: settings.aperture, _ISO: settings.iso}
-    return _exif_of({tag: value for tag, value in named.items() if value is not None})
-
-
-def _exif_of(shot: dict[int, float]) -> Image.Exif | None:
+    shot = {tag: value for tag, value in named.items() if value is not None}
     if not shot:
         return None
     if _ISO in shot:
