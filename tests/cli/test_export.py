@@ -110,31 +110,6 @@ def test_exposure_and_curve_change_the_display_colours(exported, finished_run, s
     assert linear.mean() < plain.mean() - 0.05
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ("--format obj", "obj"),
-        ("", "format"),
-        ("--format gltf --exposure-ev bright", "exposure-ev"),
-        ("--format gltf --exposure-ev 99", "--exposure-ev"),
-        ("--format gltf --gamma 0", "--gamma"),
-        ("--format gltf --bake-steps -1", "--bake-steps"),
-        ("--format gltf --curve spline", "no spline"),
-        ("--format gltf --curve wavy", "wavy"),
-        ("--format exr colmap --gamma 2", "--gamma has no effect"),
-        ("--format exr --size-mb 2", "--size-mb has no effect"),
-        ("--format html --size-mb 0", "--size-mb"),
-        ("--format html --photographs -1", "--photographs"),
-        ("--format html --bake-steps 3", "--bake-steps"),
-        ("--format exr --photographs 3", "--photographs"),
-        ("--format exr --without-objects", "no moving object"),
-    ],
-)
-def test_wrong_options_are_refused(finished_run, refused, tmp_path, options, words):
-    assert words in refused("export", finished_run, *options.split(), "--out", tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
 def test_files_are_replaced_only_with_overwrite_and_exports_lie_in_the_run(
     finished_run, succeeded, refused, tmp_path
 ):

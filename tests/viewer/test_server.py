@@ -36,19 +36,6 @@ def test_without_viser_the_error_says_how_to_install_it(refused, monkeypatch, tm
         assert "pip install 'p2gs-jax[viewer]'" in refused(*words)
 
 
-@pytest.mark.parametrize(
-    ("options", "named"),
-    [
-        ((), "config.json"),
-        (("--port", "70000"), "--port"),
-        (("--host", "no.such.host.invalid"), "--host"),
-        (("--max-width", "3"), "--max-width"),
-    ],
-)
-def test_wrong_options_are_refused_by_name(refused, tmp_path, options, named):
-    assert named in refused("view", tmp_path, "--port", "0", *options)
-
-
 def test_a_busy_port_is_refused(refused, tmp_path):
     with socket.socket() as busy:
         busy.bind(("127.0.0.1", 0))
