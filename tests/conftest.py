@@ -5,6 +5,7 @@ import importlib.metadata
 import os
 import shutil
 import signal
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -167,6 +168,22 @@ def _ending_with(status):
 
 
 succeeded, refused = _ending_with(0), _ending_with(2)
+
+
+@pytest.fixture(scope="session")
+def python():
+    """Return a function that runs Python to its end, which must have a status, and returns it.
+
+    `more` are variables beside those of the environment.
+    """
+
+    def run(*argv, status=0, env=None, cwd=None, **more):
+        command, env = [sys.executable, *map(str, argv)], dict(env or os.environ) | more
+        done = subprocess.run(command, env=env, cwd=cwd, capture_output=True, text=True)
+        assert done.returncode == status, done.stdout + done.stderr
+        return done
+
+    return run
 
 
 @pytest.fixture(scope="session")

@@ -2,8 +2,6 @@
 
 import ast
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -13,13 +11,12 @@ import p2gs_jax
 from p2gs_jax import UserError
 
 
-def test_everything_public_is_listed_before_it_is_imported():
+def test_everything_public_is_listed_before_it_is_imported(python):
     child = (
         "import json, sys, p2gs_jax\n"
         "print(json.dumps([sorted(dir(p2gs_jax)), 'jax' in sys.modules]))"
     )
-    done = subprocess.run([sys.executable, "-c", child], capture_output=True, text=True, check=True)
-    listed, heavy = json.loads(done.stdout)
+    listed, heavy = json.loads(python("-c", child).stdout)
     assert set(p2gs_jax.__all__) <= set(listed)
     assert not heavy
     for name in p2gs_jax.__all__:

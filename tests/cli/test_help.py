@@ -3,8 +3,6 @@
 import os
 import re
 import shlex
-import subprocess
-import sys
 from datetime import date
 from pathlib import Path
 
@@ -128,47 +126,41 @@ def test_a_run_folder_has_the_name_of_the_scene_and_the_date(tmp_path, monkeypat
     assert parse(["fit", "castle", "--resume"])[1].run_folder().name.endswith("-2")
 
 
-def test_help_imports_nothing_heavy():
+def test_help_imports_nothing_heavy(python):
     child = (
         "import sys\nfrom p2gs_jax.cli import main\n"
         "for argv in (['--help'], ['fit', '--help-all'], ['synth', '--help']):\n"
         "    try:\n        main(argv)\n    except SystemExit:\n        pass\n"
         f"print([m for m in {HEAVY!r} if m in sys.modules], file=sys.stderr)"
     )
-    done = subprocess.run([sys.executable, "-c", child], capture_output=True, text=True, check=True)
+    done = python("-c", child)
     assert done.stderr.strip() == "[]"
     assert done.stdout.count("usage: p2gs-jax") >= 3
 
 
 @pytest.fixture
-def broken(tmp_path):
+def broken(tmp_path, python):
     """Return a function that runs p2gs-jax with a library that raises when imported."""
 
-    def run(module, *argv):
+    def run(module, *argv, status):
         (tmp_path / f"{module}.py").write_text("raise ImportError('libfoo.so.1 is missing')")
         path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
-        argv = [sys.executable, "-m", "p2gs_jax.cli", *argv]
-        env = os.environ | {"PYTHONPATH": path}
-        return subprocess.run(argv, env=env, capture_output=True, text=True)
+        return python("-m", "p2gs_jax.cli", *argv, status=status, PYTHONPATH=path)
 
     return run
 
 
-def test_nothing_is_imported_from_the_working_folder(hostile):
+def test_nothing_is_imported_from_the_working_folder(python, hostile):
     """`python -m` alone searches the working folder, which often is the scene."""
-    argv, root = [sys.executable, "-m", "p2gs_jax.cli"], str(Path(__file__).parents[2])
-    env = os.environ | {"PYTHONPATH": root}
-    argv += ["calibrate", ".", "--out", "new"]
-    done = subprocess.run(argv, env=env, capture_output=True, text=True)
-    assert done.returncode == 2, done.stderr
+    argv, root = ("calibrate", ".", "--out", "new"), str(Path(__file__).parents[2])
+    done = python("-m", "p2gs_jax.cli", *argv, status=2, PYTHONPATH=root)
     assert "no scene in ." in done.stderr
     assert not hostile.exists()
 
 
 @pytest.mark.parametrize("module", ["jax", "tyro", "cv2"])
 def test_a_broken_library_is_named_with_a_remedy(broken, tmp_path, module):
-    done = broken(module, "calibrate", str(tmp_path), "--out", str(tmp_path / "out"))
-    assert done.returncode == 2
+    done = broken(module, "calibrate", tmp_path, "--out", tmp_path / "out", status=2)
     assert "libfoo.so.1 is missing" in done.stderr
     assert "p2gs-jax doctor" in done.stderr
     assert "Traceback" not in done.stderr
@@ -176,8 +168,7 @@ def test_a_broken_library_is_named_with_a_remedy(broken, tmp_path, module):
 
 @pytest.mark.parametrize("module", ["jax", pytest.param("tyro", marks=pytest.mark.slow)])
 def test_doctor_survives_a_broken_library(broken, module):
-    done = broken(module, "doctor", "--skip-self-test")
-    assert done.returncode == 1, done.stderr
+    done = broken(module, "doctor", "--skip-self-test", status=1)
     assert "libfoo.so.1 is missing" in done.stdout
     assert "Traceback" not in done.stderr + done.stdout
     assert "force-reinstall" in done.stdout

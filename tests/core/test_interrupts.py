@@ -4,7 +4,6 @@ import gc
 import importlib
 import os
 import signal
-import subprocess
 import sys
 import threading
 import time
@@ -128,9 +127,9 @@ except interrupts.Interrupted:
 """
 
 
-def test_the_handlers_stay_when_pycolmap_is_imported():
-    done = subprocess.run([sys.executable, "-c", CHILD], capture_output=True, text=True)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "raised\n", "")
+def test_the_handlers_stay_when_pycolmap_is_imported(python):
+    done = python("-c", CHILD)
+    assert (done.stdout, done.stderr) == ("raised\n", "")
 
 
 def test_other_threads_set_no_handlers():

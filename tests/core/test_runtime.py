@@ -1,7 +1,6 @@
 """Memory that a process keeps or returns, compiled programs on disk, and its number of cores."""
 
 import os
-import subprocess
 import sys
 
 import pytest
@@ -30,11 +29,8 @@ print(kept, resident_mb() - begin, last.sum())
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="glibc only")
-def test_freed_memory_is_kept_until_it_is_handed_back():
-    done = subprocess.run(
-        [sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=True, timeout=60
-    )
-    kept, left, total = map(float, done.stdout.split())
+def test_freed_memory_is_kept_until_it_is_handed_back(python):
+    kept, left, total = map(float, python("-c", SCRIPT).stdout.split())
     assert total == 2**21
     assert kept > 300
     assert left < 40
@@ -70,15 +66,9 @@ print(jax.device_count())
 """
 
 
-def run(**variables) -> str:
+def run(python, **variables) -> str:
     kept = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
-    done = subprocess.run(
-        [sys.executable, "-c", CHILD],
-        env=kept | {"JAX_PLATFORMS": "cpu"} | variables,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    done = python("-c", CHILD, env=kept, JAX_PLATFORMS="cpu", **variables)
     folder, cores = done.stdout.splitlines()
     stated = variables.get("CORES") or variables.get("JAX_NUM_CPU_DEVICES")
     default = runtime.DEFAULT_CORES
@@ -86,16 +76,16 @@ def run(**variables) -> str:
     return folder
 
 
-def test_compiled_programs_are_cached_in_a_writable_folder(tmp_path):
-    assert run(XDG_CACHE_HOME=str(tmp_path)).startswith(str(tmp_path / "p2gs-jax"))
+def test_compiled_programs_are_cached_in_a_writable_folder(python, tmp_path):
+    assert run(python, XDG_CACHE_HOME=str(tmp_path)).startswith(str(tmp_path / "p2gs-jax"))
     assert list((tmp_path / "p2gs-jax").rglob("*-cache"))
     chosen = str(tmp_path / "chosen")
     set_otherwise = {"JAX_COMPILATION_CACHE_DIR": chosen, "JAX_NUM_CPU_DEVICES": "2", "CORES": "3"}
-    assert run(XDG_CACHE_HOME=str(tmp_path / "xdg"), **set_otherwise) == chosen
+    assert run(python, XDG_CACHE_HOME=str(tmp_path / "xdg"), **set_otherwise) == chosen
     assert not (tmp_path / "xdg").exists()
     (tmp_path / "file").write_text("in the way")
     # A number of cores in the environment stays as well.
-    assert run(XDG_CACHE_HOME=str(tmp_path / "file"), JAX_NUM_CPU_DEVICES="1") == "None"
+    assert run(python, XDG_CACHE_HOME=str(tmp_path / "file"), JAX_NUM_CPU_DEVICES="1") == "None"
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,6 @@
 """Each deliberate fault, planted in a copy of the package, fails the test that has to notice it."""
 
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -126,15 +123,13 @@ def test_the_fault_fits_the_code(file, caught_by, right, wrong):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("file", "caught_by", "right", "wrong"), FAULTS.values(), ids=FAULTS)
-def test_the_fault_is_noticed(file, caught_by, right, wrong, tmp_path):
+def test_the_fault_is_noticed(file, caught_by, right, wrong, tmp_path, python):
     for name in ("p2gs_jax", "tests"):
         shutil.copytree(ROOT / name, tmp_path / name)
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
     path = tmp_path / "p2gs_jax" / file
     text = path.read_text(encoding="utf-8")
     path.write_text(text.replace(right, wrong), encoding="utf-8")
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-n", "0", f"tests/{caught_by}"]
-    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    argv = ("-m", "pytest", "-q", "-x", "-n", "0", f"tests/{caught_by}")
     # With any other status pytest itself could not run.
-    assert done.returncode == FAILED, done.stdout + done.stderr
+    python(*argv, status=FAILED, cwd=tmp_path, PYTHONPATH=str(tmp_path))

@@ -2,8 +2,6 @@
 
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -16,18 +14,10 @@ HERE = Path(__file__).parent
 
 
 @pytest.fixture(scope="module")
-def found():
-    paths = [*map(str, (HERE, HERE.parent)), os.environ.get("PYTHONPATH", "")]
-    env = {"PYTHONPATH": os.pathsep.join(paths), "JAX_PLATFORMS": "cpu"}
-    env["JAX_NUM_CPU_DEVICES"] = "4"
-    done = subprocess.run(
-        [sys.executable, str(HERE / "data_parallel_worker.py")],
-        env=os.environ | env,
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+def found(python):
+    path = os.pathsep.join([str(HERE), str(HERE.parent), os.environ.get("PYTHONPATH", "")])
+    env = {"PYTHONPATH": path, "JAX_PLATFORMS": "cpu", "JAX_NUM_CPU_DEVICES": "4"}
+    return json.loads(python(HERE / "data_parallel_worker.py", **env).stdout)
 
 
 @pytest.mark.slow
