@@ -1,7 +1,5 @@
 """A drive past a wall, in front of which a box crosses: photographs, laser points and a track."""
 
-from __future__ import annotations
-
 import itertools
 from pathlib import Path
 from typing import NamedTuple

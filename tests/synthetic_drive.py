@@ -7,8 +7,6 @@ may also tint the light, darken the corners and respond in different ways. Vigne
 cosine-fourth law, so that no fitted polynomial in r^2 is exactly right.
 """
 
-from __future__ import annotations
-
 from typing import Literal, NamedTuple
 
 import numpy as np

@@ -6,8 +6,6 @@ The language of a block decides its test. Directives are comments right above th
     <!-- test: write "300.0" as "2.0" -->   so that it ends soon; can be repeated
 """
 
-from __future__ import annotations
-
 import re
 import shlex
 from pathlib import Path

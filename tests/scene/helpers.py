@@ -1,7 +1,5 @@
 """Small scenes made on disk, and the reprojection errors by which readers are judged."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Videos made with PyAV; rotations, which it cannot write, are patched into the file."""
 
-from __future__ import annotations
-
 import functools
 import struct
 from collections.abc import Iterable, Sequence

@@ -1,7 +1,5 @@
 """Videos: colours, rotation, the choice of frames, their files, and subtitles of drones."""
 
-from __future__ import annotations
-
 import functools
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Photographs in the formats of cameras, byte by byte where no library writes them."""
 
-from __future__ import annotations
-
 import io
 import struct
 from pathlib import Path

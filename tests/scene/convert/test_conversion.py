@@ -1,7 +1,5 @@
 """HEIC, raw and linear photographs and colour profiles, from the file to the store's pixels."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import json

@@ -1,7 +1,5 @@
 """Shared by synthetic drives of all formats: motion and surroundings of the car, photographs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
