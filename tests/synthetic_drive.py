@@ -23,6 +23,7 @@ CAMERA_NAMES = ("front", "right", "left")
 HALF_WIDTH, HALF_HEIGHT = 30.0, 21.0  # degrees of the field of view
 NEAREST, FARTHEST = 3.0, 45.0  # distances of visible points
 LONGEST_TRACK, SHORTEST_TRACK = 30, 3  # observations
+MATCHED = 0.6  # share of the visible points
 # Extent, in half diagonals, of errors that neighbouring points share; waves that form them.
 NEIGHBOURHOOD, WAVES = 0.2, 16
 
@@ -38,9 +39,7 @@ class Drive(NamedTuple):
     positions: Float[np.ndarray, "o 2"]  # x right, y down, from the centre in half diagonals
 
 
-def _on_image(
-    azimuth: Float[np.ndarray, " p"], height: Float[np.ndarray, " p"]
-) -> Float[np.ndarray, "p 2"]:
+def _on_image(azimuth: np.ndarray, height: np.ndarray) -> Float[np.ndarray, "p 2"]:
     """Return positions, in half diagonals, of directions, in degrees to the left and up."""
     a, h = np.radians(azimuth), np.radians(height)
     half_width = np.tan(np.radians(HALF_WIDTH))
@@ -50,11 +49,8 @@ def _on_image(
     return places / np.hypot(half_width, half_height)
 
 
-def make_drive(frames: int = 20, points: int = 1200, seed: int = 0, seen: float = 0.6) -> Drive:
-    """Return visibility and radiance of a random street, without points seen less than three times.
-
-    `seen` is the chance that a visible point was matched.
-    """
+def make_drive(frames: int, points: int, seed: int = 0) -> Drive:
+    """Return visibility and radiance of a random street; points are seen at least three times."""
     rng = np.random.default_rng(seed)
     sky, road = points // 8, points // 4
     facade = points - sky - road
@@ -71,7 +67,7 @@ def make_drive(frames: int = 20, points: int = 1200, seed: int = 0, seen: float 
         distance = np.concatenate([distance, np.full(sky, 10.0)])
         for camera, yaw in enumerate(YAWS):
             inside = (np.abs(azimuth - yaw) < HALF_WIDTH) & (np.abs(height) < HALF_HEIGHT)
-            inside &= (distance > NEAREST) & (distance < FARTHEST) & (rng.random(points) < seen)
+            inside &= (distance > NEAREST) & (distance < FARTHEST) & (rng.random(points) < MATCHED)
             found = np.flatnonzero(inside)
             views.append(np.full(len(found), camera * frames + frame))
             ids.append(found)
@@ -142,7 +138,7 @@ def observe(
         exposed = exposed * falloff(radius, corner_loss[drive.cameras[v]])
     exposed = exposed * np.exp(noise * texture * rng.standard_normal((len(p), 1)))
     if shared_texture:
-        common = smooth_errors(v, drive.positions, len(drive.cameras), (seed, 1))
+        common = smooth_errors(drive, (seed, 1))
         exposed = exposed * np.exp(shared_texture * common[:, None])
     shot = np.sqrt(SHOT_NOISE * exposed + READ_NOISE)
     exposed = np.maximum(exposed + noise * shot * rng.standard_normal(exposed.shape), 0)
@@ -158,9 +154,7 @@ def observe(
     return Observations(views=v, points=p, colors=ldr, spread=np.zeros_like(ldr), **known)
 
 
-def falloff(
-    radius: Float[np.ndarray, "..."], corner_loss: Float[np.ndarray, "..."] | float
-) -> Float[np.ndarray, "..."]:
+def falloff(radius: np.ndarray, corner_loss: np.ndarray) -> np.ndarray:
     """Return the share of the light that arrives: cos^4 of the angle to the axis.
 
     The radius is 1 in the corners of the image, where a share in [0, 1) is lost.
@@ -169,9 +163,7 @@ def falloff(
     return (1 + ((1 - corner_loss) ** -0.5 - 1) * radius**2) ** -2.0
 
 
-def encode_by(
-    exposed: Float[np.ndarray, "o 3"], curve: Curves, cameras: Int[np.ndarray, " o"]
-) -> Float[np.ndarray, "o 3"]:
+def encode_by(exposed: Float[np.ndarray, "o 3"], curve: Curves, cameras: np.ndarray) -> np.ndarray:
     """Return display values of exposed radiance; curves broadcast to (cameras, 3)."""
     if isinstance(curve, str):
         return encode(exposed, curve)
@@ -182,21 +174,16 @@ def encode_by(
     return out
 
 
-def smooth_errors(
-    views: Int[np.ndarray, " o"],
-    positions: Float[np.ndarray, "o 2"],
-    view_count: int,
-    seed: tuple[int, ...],
-) -> Float[np.ndarray, " o"]:
+def smooth_errors(drive: Drive, seed: tuple[int, ...]) -> Float[np.ndarray, " o"]:
     """Return errors of variance 1 that vary smoothly over each image and differ between images.
 
     Sums of random waves approach a Gaussian process with the covariance
     exp(-d^2 / (2 NEIGHBOURHOOD^2)) (Rahimi and Recht 2007).
     """
-    rng = np.random.default_rng(seed)
+    rng, views = np.random.default_rng(seed), drive.views
     total = np.zeros(len(views))
     for _ in range(WAVES):
-        wave = rng.standard_normal((view_count, 2)) / NEIGHBOURHOOD
-        phase = rng.uniform(0, 2 * np.pi, view_count)
-        total += np.cos((wave[views] * positions).sum(1) + phase[views])
+        wave = rng.standard_normal((len(drive.cameras), 2)) / NEIGHBOURHOOD
+        phase = rng.uniform(0, 2 * np.pi, len(drive.cameras))
+        total += np.cos((wave[views] * drive.positions).sum(1) + phase[views])
     return total * np.sqrt(2 / WAVES)
