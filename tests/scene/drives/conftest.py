@@ -1,24 +1,15 @@
 """Synthetic drives of each format, to read and to change."""
 
 import shutil
+from importlib import import_module
 from pathlib import Path
 
 import pytest
-from scene.drives import writers_argoverse as argoverse
-from scene.drives import writers_drivestudio as drivestudio
-from scene.drives import writers_kitti as kitti
-from scene.drives import writers_kitti_tracking as kitti_tracking
-from scene.drives import writers_nuscenes as nuscenes
-from scene.drives import writers_pandaset as pandaset
-from scene.drives import writers_waymo as waymo
 
 from p2gs_jax.config import DataConfig
-from p2gs_jax.scene.drives import read_drive
+from p2gs_jax.scene.drives import FORMATS, read_drive
 
-WRITERS = {
-    **{"argoverse": argoverse, "kitti_raw": kitti, "kitti_tracking": kitti_tracking},
-    **{"nuscenes": nuscenes, "pandaset": pandaset, "waymo": waymo, "drivestudio": drivestudio},
-}
+WRITERS = {n: import_module(f"scene.drives.writers_{n.removesuffix('_raw')}") for n in FORMATS}
 
 
 @pytest.fixture(scope="session")
