@@ -40,16 +40,6 @@ def store_of(root, **options):
     return ImageStore(load_scene(root, cfg).views, cfg)
 
 
-def test_a_folder_without_a_scene_is_refused(tmp_path):
-    with refused("no scene in", str(tmp_path), "COLMAP", "transforms.json", "photographs"):
-        load_scene(tmp_path, CFG)
-    with refused("does not exist"):
-        load_scene(tmp_path / "nowhere", CFG)
-    (tmp_path / "notes.txt").write_bytes(b"")
-    with refused(r"notes.txt is neither"):
-        load_scene(tmp_path / "notes.txt", CFG)
-
-
 @pytest.mark.parametrize("field", ["every", "max_frames", "max_width"])
 def test_numbers_out_of_range_are_refused(tmp_path, field):
     root = write_tiny_model(tmp_path).parents[1]
