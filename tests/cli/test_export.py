@@ -72,10 +72,12 @@ def test_the_baking_error_is_written_and_right(exported):
         assert 10 < saved["baking_error"]["train"]["psnr_median"] < 60
 
 
-def test_the_colmap_folder_can_be_calibrated(exported, succeeded, tmp_path):
+@pytest.mark.parametrize("model", ["", "--photometry.no-select --photometry.model view_exposure"])
+def test_the_colmap_folder_can_be_calibrated(exported, succeeded, tmp_path, model):
     fitted, out = exported
-    known = out / "colmap" / "exposures.csv"
-    succeeded("calibrate", out / "colmap", "--out", tmp_path / "c", "--known-exposures", known)
+    known = ("--known-exposures", out / "colmap" / "exposures.csv")
+    argv = ("calibrate", out / "colmap", "--out", tmp_path / "c", *known, *model.split())
+    assert "Results: " in succeeded(*argv)
     found = json.loads((tmp_path / "c" / "photometry.json").read_text())["views"]
     e = {v["image"]: v["exposure"] for v in found}
     for v in fitted.photometry["views"]:

@@ -29,18 +29,6 @@ def test_exposures_of_a_street_are_recovered(noisy_street, tmp_path):
     assert max(c["codes"] for c in candidates) > 1
 
 
-def test_the_command_keeps_known_exposures(noisy_street, tmp_path, succeeded):
-    truth = read_true_exposures(noisy_street)
-    path = tmp_path / "known.csv"
-    path.write_text("image,exposure\n" + "\n".join(f"{k},{5 * v}" for k, v in truth.items()))
-    argv = ("calibrate", noisy_street, "--out", tmp_path / "out", "--known-exposures", path)
-    # `test_exposures_of_a_street_are_recovered` selects a model; here it is fixed.
-    text = succeeded(*argv, "--photometry.no-select", "--photometry.model", "view_exposure")
-    assert "Results: " in text
-    for view in read_photometry(tmp_path / "out" / "photometry.json")["views"]:
-        assert view["exposure"] == pytest.approx(5 * truth[view["image"]], rel=1e-3)
-
-
 def test_a_photograph_whose_exif_and_pixels_disagree_is_reported(shared_data, tmp_path):
     root = shared_data("sceaux_castle")
     fixed = {"photometry.select": False, "photometry.model": "view_exposure"}
