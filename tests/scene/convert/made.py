@@ -16,6 +16,7 @@ _XYZ_TO_CAMERA = (
     *(-0.9692660, 1.8760108, 0.0415560),
     *(0.0556434, -0.2040259, 1.0572252),
 )
+_BALANCE = (2.0, 1.0, 1.5)  # the sensor's white balance
 DISPLAY_P3_XYZ = (
     (0.51512, 0.2412, -0.00105),
     (0.29198, 0.69225, 0.04189),
@@ -32,23 +33,19 @@ def write_dng(
     path: Path,
     light: np.ndarray,
     *,
-    balance: tuple[float, float, float] = (2.0, 1.0, 1.5),
-    chosen: tuple[float, float, float] | None = None,
+    chosen: tuple[float, float, float] = _BALANCE,
     orientation: int = 1,
     time: tuple[int, int] = (1, 60),
     iso: int = 200,
 ) -> None:
-    """Write the light of a scene as a sensor with an RGGB filter would have seen it.
-
-    `balance` is the sensor's white balance; the camera's is `chosen`, or the same.
-    """
+    """Write light as an RGGB sensor sees it; `chosen` is the camera's white balance."""
     h, w = light.shape[:2]
-    camera = np.minimum(light / balance, 1)
+    camera = np.minimum(light / _BALANCE, 1)
     channel = np.array([[0, 1], [1, 2]])[np.indices((h, w))[0] % 2, np.indices((h, w))[1] % 2]
     seen = np.take_along_axis(camera, channel[..., None], 2)[..., 0]
     data = np.rint(512 + seen * (16383 - 512)).astype("<u2")
     fraction = TiffImagePlugin.IFDRational
-    neutral = [fraction(round(1e6 / b), 1_000_000) for b in chosen or balance]
+    neutral = [fraction(round(1e6 / b), 1_000_000) for b in chosen]
     matrix = [fraction(round(v * 1e6), 1_000_000) for v in _XYZ_TO_CAMERA]
     shot = {33434: fraction(*time), 33437: 2.8, 34855: iso, 37386: 50.0}
     tags = TiffImagePlugin.ImageFileDirectory_v2()
