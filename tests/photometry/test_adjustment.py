@@ -243,6 +243,37 @@ def test_points_that_change_between_views_count_for_less():
     assert errors["whole_points"] < 0.5 * errors["geman_mcclure"], errors
 
 
+def test_a_shining_wall_with_half_of_the_points_does_not_outvote_the_others():
+    """Half of the points lie in one of 30 cells; what a view sees of a cell is brighter alike."""
+    rng, o = np.random.default_rng(0), PLAIN
+    cell = np.where(rng.random(o.point_count) < 0.5, 0, rng.integers(1, 30, o.point_count))[
+        o.points
+    ]
+    stops = rng.normal(0, 0.1, (o.view_count, 30))[o.views, cell]
+    shown = srgb_decode(o.colors) * np.exp2(stops)[:, None]
+    shining = dataclasses.replace(o, colors=srgb_encode(np.minimum(shown, 1.0)))
+    found = dataclasses.replace(shining, cells=cell)
+    assert ev(adjust(found)) < 0.6 * ev(adjust(shining))
+
+
+@pytest.mark.parametrize("deviation", [0.0, 0.03])
+def test_weights_of_cells_follow_from_the_variance_of_their_means(deviation):
+    rng, o = np.random.default_rng(0), PLAIN
+    cell = np.minimum(rng.geometric(0.2, o.point_count), 8)[o.points] - 1
+    layout = problem_of(dataclasses.replace(o, cells=cell)).layout
+    alike = deviation * rng.choice([-1, 1], (o.view_count, 8))[o.views, cell]
+    residual = np.repeat((0.1 * rng.normal(size=len(cell)) + alike)[:, None], 3, 1)
+    factors = equations._whole_cells(np.ones_like(residual), residual, layout)
+    ratios = []
+    for c in range(8):
+        size = np.bincount(o.views[cell == c]).astype(float)
+        typical = (size**2).sum() / size.sum()
+        expected = 0.1**2 / (0.1**2 + typical * deviation**2)
+        ratios.append(factors[cell == c] / expected)
+    np.testing.assert_allclose(np.concatenate(ratios), 1, atol=0.35)
+    assert abs(np.mean([ratio[0] for ratio in ratios]) - 1) < 0.12
+
+
 def test_small_errors_stand_out_where_colours_are_better_than_stated():
     """A third of the values are brighter by up to 0.05 stops in later frames; stated is 0.02."""
     ideal = observe(DRIVE, ISO4, bits=None, noise=0.0)

@@ -21,6 +21,8 @@ Loss = Literal["l1", "geman_mcclure", "whole_points"]
 GEMAN_MCCLURE = 3.0  # width of the Geman-McClure loss in robust standard deviations
 # Weight of the prior of a point's mean loss, as a number of observations.
 POINT_PRIOR = 5.0
+# Weight of the variance that all cells have in that of one cell, as a number of views.
+CELL_PRIOR = 30.0
 # Lower bound of `Weighted.scale`. Towns have 0.1 to 0.3; a bound of 0.3 kept too many outliers.
 SMALLEST_SCALE = 0.1
 MEDIAN_ROWS = 4096  # a median uses fewer than twice this many rows
@@ -73,6 +75,10 @@ def weigh(model: Forward, theta: Parameters, weight: PerChannel, loss: Loss) -> 
     weight = model.weight / sigma**2 * factor
     radiance, precision = _radiance(layout, a, z_of_point, weight)
     of_point = radiance[layout.row]
+    if loss == "whole_points" and layout.cells is not None:
+        # All observations of a point get one factor, which leaves its radiance as it is.
+        weight = weight * _whole_cells(weight, z_of_point - a * of_point, layout)[:, None]
+        precision = layout.by_row @ (weight * a**2)
     fields = z_of_point - a * of_point, radiance, of_point + added, precision
     return Weighted(weight, sigma, slope, *fields, scale, curvature)
 
@@ -116,6 +122,34 @@ def _whole_points(
     of_row = (((POINT_PRIOR + freedom) / (POINT_PRIOR + losses)) ** 2)[layout.row]
     along = 4 * share * bound * common * alone**2 / (POINT_PRIOR + losses[layout.row])
     return alone * of_row, (curved - along) * of_row
+
+
+def _whole_cells(weight: PerChannel, residual: PerChannel, layout: Layout) -> PerObservation:
+    """Return factors on weights if cells of the scene are judged whole.
+
+    Gloss, shade and misplacement cause an error that is common to all that a view sees of a cell.
+    Its variance is that of means over such parts beyond what the noise within parts explains. The
+    precision of a mean is then size / (noise + size variance) instead of size / noise. Every cell
+    has one factor, the ratio of both at its typical size.
+    """
+    part, cell = layout.parts
+    each, pull = weight.sum(1), (weight * residual).sum(1)
+    size, count = np.bincount(part, each), np.bincount(part, each > 0)
+    mean = np.bincount(part, pull) / np.maximum(size, EMPTY)
+    within = each @ (pull / np.maximum(each, EMPTY) - mean[part]) ** 2
+    noise = within / max(np.maximum(count - 1, 0).sum(), 1) + EMPTY
+
+    def of_cells(values) -> Float[np.ndarray, " c"]:
+        return np.bincount(cell, values)
+
+    whole, views = of_cells(size), np.maximum(of_cells(count > 0) - 1, 0)
+    typical = of_cells(size**2) / np.maximum(whole, EMPTY)
+    # Expected values of `excess` are variance times `share` (DerSimonian and Laird 1986).
+    excess, share = of_cells(size * mean**2) - noise * views, np.maximum(whole - typical, 0)
+    common = max(excess.sum() / max(share.sum(), EMPTY), 0)
+    prior = CELL_PRIOR * share / np.maximum(views, 1)
+    variance = np.maximum(excess + common * prior, 0) / np.maximum(share + prior, EMPTY)
+    return (noise / (noise + typical * variance))[layout.cells]
 
 
 def _curvature(

@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from p2gs_jax.config import Level
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.photometry.adjustment.matrices import Pairs
-from p2gs_jax.photometry.observations import Observations, grouped
+from p2gs_jax.photometry.observations import Labels, Observations, grouped
 
 LONGEST_ROW = 16  # largest number of observations of a row
 TELLING_EV = 0.1  # least difference of known exposures that fixes the power of a curve, stops
@@ -40,6 +40,7 @@ class Layout:
         points, places = np.asarray(observations.points), observations.positions
         self.views, self.view_count = np.asarray(observations.views), observations.view_count
         self.cameras, self.radius2 = np.asarray(observations.cameras), np.zeros(len(points))
+        self.cells = observations.cells
         if places is not None:
             self.radius2 = (places.astype(float) ** 2).sum(1)
         lengths = np.bincount(points, minlength=observations.point_count)
@@ -80,6 +81,14 @@ class Layout:
         order = np.argsort(place, kind="stable")
         ends = np.cumsum(np.bincount(place, minlength=3 * self.view_count))
         return order, np.append(0, ends), self.row_channel.ravel()[order]
+
+    @functools.cached_property
+    def parts(self) -> tuple[Labels, Labels]:
+        """Part of each observation, which is all that a view sees of a cell; cell of each part."""
+        assert self.cells is not None
+        codes = self.cells * np.int64(self.view_count) + self.views
+        found, part = np.unique(codes, return_inverse=True)
+        return part, found // self.view_count
 
     @functools.cached_property
     def pairs(self) -> Pairs:

@@ -1,8 +1,8 @@
 """Iteratively reweighted least squares: four rounds under an L1 loss, then Geman-McClure's loss.
 
-The second loss acts on single observations or whole points (`equations.py`). With 0 / 10 / 30 %
-of outliers the error is 0.005 / 0.006 / 0.007 EV (docs/photometry.md, 4). The L1 rounds bring the
-start near enough for a loss that ignores large residuals.
+The second loss acts on single observations, or on whole points and cells (`equations.py`). With
+0 / 10 / 30 % of outliers the error is 0.005 / 0.006 / 0.007 EV (docs/photometry.md, 4). The L1
+rounds bring the start near enough for a loss that ignores large residuals.
 """
 
 from __future__ import annotations
