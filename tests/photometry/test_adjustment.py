@@ -246,9 +246,8 @@ def test_points_that_change_between_views_count_for_less():
 def test_a_shining_wall_with_half_of_the_points_does_not_outvote_the_others():
     """Half of the points lie in one of 30 cells; what a view sees of a cell is brighter alike."""
     rng, o = np.random.default_rng(0), PLAIN
-    cell = np.where(rng.random(o.point_count) < 0.5, 0, rng.integers(1, 30, o.point_count))[
-        o.points
-    ]
+    cell = rng.integers(1, 30, o.point_count)
+    cell = np.where(rng.random(o.point_count) < 0.5, 0, cell)[o.points]
     stops = rng.normal(0, 0.1, (o.view_count, 30))[o.views, cell]
     shown = srgb_decode(o.colors) * np.exp2(stops)[:, None]
     shining = dataclasses.replace(o, colors=srgb_encode(np.minimum(shown, 1.0)))

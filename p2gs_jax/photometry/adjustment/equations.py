@@ -21,7 +21,8 @@ Loss = Literal["l1", "geman_mcclure", "whole_points"]
 GEMAN_MCCLURE = 3.0  # width of the Geman-McClure loss in robust standard deviations
 # Weight of the prior of a point's mean loss, as a number of observations.
 POINT_PRIOR = 5.0
-# Weight of the variance that all cells have in that of one cell, as a number of views.
+# Weight of the variance that all cells have in that of one cell, as a number of views. With 3 or 10
+# cells are chosen whose errors agree by chance, and standard errors are too small.
 CELL_PRIOR = 30.0
 # Lower bound of `Weighted.scale`. Towns have 0.1 to 0.3; a bound of 0.3 kept too many outliers.
 SMALLEST_SCALE = 0.1
