@@ -30,7 +30,7 @@ from p2gs_jax.run.folder import RunFolder
 KEY = "decided"
 # Options of `PhotometryConfig` that `select` replaces.
 CHOSEN = ("model", "curve", "spline", "white_balance", "vignetting", "responses")
-# All decisions about options of `PhotometryConfig`; they have the names of these.
+# Decisions about options of `PhotometryConfig`, under the names of these options.
 _SOLVED = (*CHOSEN, "cameras", "start", "start_std")
 # Options that the scene decides, by the names of the decisions.
 _PLACES = {

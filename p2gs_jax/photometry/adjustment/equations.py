@@ -21,8 +21,8 @@ Loss = Literal["l1", "geman_mcclure", "whole_points"]
 GEMAN_MCCLURE = 3.0  # width of the Geman-McClure loss in robust standard deviations
 # Weight of the prior of a point's mean loss, as a number of observations.
 POINT_PRIOR = 5.0
-# Weight of the variance that all cells have in that of one cell, as a number of views. With 3 or 10
-# cells are chosen whose errors agree by chance, and standard errors are too small.
+# Weight of the variance of all cells in that of one cell, as a number of views. Smaller numbers
+# favour cells whose errors agree by chance, and standard errors become too small.
 CELL_PRIOR = 30.0
 # Lower bound of `Weighted.scale`. Towns have 0.1 to 0.3; a bound of 0.3 kept too many outliers.
 SMALLEST_SCALE = 0.1
@@ -128,10 +128,10 @@ def _whole_points(
 def _whole_cells(weight: PerChannel, residual: PerChannel, layout: Layout) -> PerObservation:
     """Return factors on weights if cells of the scene are judged whole.
 
-    Gloss, shade and misplacement cause an error that is common to all that a view sees of a cell.
-    Its variance is that of means over such parts beyond what the noise within parts explains. The
-    precision of a mean is then size / (noise + size variance) instead of size / noise. Every cell
-    has one factor, the ratio of both at its typical size.
+    A part is all that one view sees of a cell. Gloss, shade and misplacement cause an error that is
+    common to a part. The variance of this error is how much the means of parts vary beyond the
+    noise within parts. A mean then has the precision size / (noise + size variance) instead of
+    size / noise. A cell's factor is the ratio of both at the typical size of its parts.
     """
     part, cell = layout.parts
     each, pull = weight.sum(1), (weight * residual).sum(1)
