@@ -43,7 +43,10 @@ def make_table(
     """Return a table; `plain` draws few lines."""
     out = Table(title=title, title_justify="left", box=SIMPLE if plain else HEAVY_HEAD)
     for name in columns:
-        out.add_column(Text(name), justify="left" if name in WORDS else "right")
+        words = name in WORDS
+        out.add_column(
+            Text(name), "left" if words else "right", no_wrap=not words, overflow="fold"
+        )
     for row in rows:
         out.add_row(*map(Text, row))
     return out
@@ -154,32 +157,33 @@ def _exposure_columns(result: Calibration) -> dict[str, list[str]]:
     known, has_stated, wrong = np.isfinite(errors), np.isfinite(stated), result.agreement.disagrees
     rows = range(len(views))
     columns = {"view": [v.name for v in views]}
-    if len({v.camera for v in views}) > 1:
+    if len({v.camera for v in views}) > 1 and not all(v.name.startswith(v.camera) for v in views):
         columns["camera"] = [v.camera for v in views]
     columns["exposure"] = [
-        f"{s.exposures_ev[i]:+.2f} +- {errors[i]:.2f}" if known[i] else "unknown" for i in rows
+        f"{s.exposures_ev[i]:+.3f} +- {errors[i]:.3f}" if known[i] else "unknown" for i in rows
     ]
     if has_stated.any():
-        columns["stated"] = [f"{stated[i]:+.2f}" if has_stated[i] else "" for i in rows]
+        columns["stated"] = [f"{stated[i]:+.3f}" if has_stated[i] else "" for i in rows]
         columns["gap"] = [
-            f"{gaps[i]:+.2f}{' !' if wrong[i] else ''}" if np.isfinite(gaps[i]) else ""
+            f"{gaps[i]:+.3f}{' !' if wrong[i] else ''}" if np.isfinite(gaps[i]) else ""
             for i in rows
         ]
     return columns
 
 
 def _tone_columns(result: Calibration) -> dict[str, list[str]]:
-    """Return gammas and white balances with standard errors, and residuals in stops."""
-    s, rows = result.solution, range(len(result.views))
+    """Return what was solved beside exposures, with standard errors, and residuals in stops."""
+    s, rows, columns = result.solution, range(len(result.views)), {}
     known = np.isfinite(s.exposure_errors)
-    gammas = [
-        f"{s.gammas[i]:.2f}"
-        + (f" +- {s.gamma_errors[i]:.2f}" if known[i] and s.gamma_errors[i] > 0 else "")
-        + (" (weak)" if known[i] and s.gamma_errors[i] > WEAK_GAMMA else "")
-        for i in rows
-    ]
+    if (s.gamma_errors[known] > 0).any():
+        columns["gamma"] = [
+            f"{s.gammas[i]:.2f}"
+            + (f" +- {s.gamma_errors[i]:.2f}" if known[i] and s.gamma_errors[i] > 0 else "")
+            + (" (weak)" if known[i] and s.gamma_errors[i] > WEAK_GAMMA else "")
+            for i in rows
+        ]
     residuals = [f"{s.view_residual_ev[i]:.2f}" if known[i] else "" for i in rows]
-    return {"gamma": gammas, **_balance_column(s), "residual": residuals}
+    return {**columns, **_balance_column(s), "residual": residuals}
 
 
 def _balance_column(s: PhotometricSolution) -> dict[str, list[str]]:

@@ -9,12 +9,13 @@ import pytest
 
 import p2gs_jax
 from p2gs_jax import UserError, calibrate, calibrate_run, calibrate_stack, exposure_error
+from p2gs_jax.cli.tables import print_calibration
 from p2gs_jax.photometry.sources.stack import read_stack, stack_colors
 from p2gs_jax.run.photometry_files import read_photometry
 from p2gs_jax.synth.sensor import read_true_exposures
 
 
-def test_exposures_of_a_street_are_recovered(noisy_street, tmp_path):
+def test_exposures_of_a_street_are_recovered(noisy_street, tmp_path, capsys):
     result = calibrate(noisy_street, tmp_path / "out")
     saved = read_photometry(tmp_path / "out" / "photometry.json")
     truth = read_true_exposures(noisy_street)
@@ -27,6 +28,11 @@ def test_exposures_of_a_street_are_recovered(noisy_street, tmp_path):
     candidates = json.loads((tmp_path / "out" / "calibration.json").read_text())["candidates"]
     assert candidates[0]["codes"] == 0
     assert max(c["codes"] for c in candidates) > 1
+    # A view is one line of 80 characters, with its whole name.
+    print_calibration(result, tmp_path / "out")
+    printed = [row for line in capsys.readouterr().out.splitlines() if (row := line.split())]
+    shown = {row[0]: float(row[1]) for row in printed if row[0] in truth and row[2] == "+-"}
+    assert shown == {v["image"]: round(v["exposure_ev"], 3) for v in saved["views"]}
 
 
 def test_a_photograph_whose_exif_and_pixels_disagree_is_reported(shared_data, tmp_path):
