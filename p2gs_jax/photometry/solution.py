@@ -101,7 +101,7 @@ class Agreement(NamedTuple):
             return f"{source} gives the exposure of {known}: nothing to compare."
         fit = f"correlation {self.correlation:.3f}, slope {self.slope:.2f}, "
         fit = "" if np.isnan(self.slope) else fit
-        head = f"{source} of {self.views} views: {fit}RMS {self.rms_ev:.2f} EV."
+        head = f"{source} of {self.views} views: {fit}RMS {self.rms_ev:.3f} EV."
         count = int(self.disagrees.sum())
         if not count:
             return head + f" {source} and the pixels agree within {NOTICEABLE_EV:g} EV."
