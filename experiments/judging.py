@@ -93,21 +93,21 @@ def to_markdown(rows: Sequence[dict[str, Any]], columns: Sequence[tuple[str, str
 
 
 def contact_sheet(path: Path, rows: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]]) -> None:
-    """Write pictures of one size in rows.
+    """Write rows of pictures of one size to a PNG file.
 
-    Args:
-        path: PNG file.
-        rows: of each its title, and its pictures, display values, with what they are.
+    A row is a title and its pictures; a picture is a name and display values.
     """
     file, parts = Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf", []
     for title, columns in rows:
-        texts, pictures = zip(*columns, strict=True)
-        image = np.concatenate(pictures, axis=1)
-        font = ImageFont.truetype(file, max(11, image.shape[1] // 60))
-        head = Image.new("RGB", (image.shape[1], round(1.7 * font.size)), "white")
-        text = f"{title}: {'; '.join(texts)}"
-        ImageDraw.Draw(head).text((2, head.height / 2), text, (30, 30, 30), font, anchor="lm")
-        parts += [np.asarray(head), to_uint8(image)]
+        image = np.concatenate([picture for _, picture in columns], axis=1)
+        font = ImageFont.truetype(file, max(11, image.shape[1] // 75))
+        size = image.shape[1], round(1.7 * font.size)
+        head, foot = (Image.new("RGB", size, "white") for _ in range(2))
+        ImageDraw.Draw(head).text((2, size[1] / 2), title, "black", font, anchor="lm")
+        for k, (name, picture) in enumerate(columns):
+            middle = (k + 0.5) * picture.shape[1], size[1] / 2
+            ImageDraw.Draw(foot).text(middle, name, "gray", font, anchor="mm")
+        parts += [np.asarray(head), to_uint8(image), np.asarray(foot)]
     write_png(path, np.concatenate(parts).astype(np.float32) / 255)
 
 
