@@ -44,9 +44,7 @@ def make_table(
     out = Table(title=title, title_justify="left", box=SIMPLE if plain else HEAVY_HEAD)
     for name in columns:
         words = name in WORDS
-        out.add_column(
-            Text(name), "left" if words else "right", no_wrap=not words, overflow="fold"
-        )
+        out.add_column(Text(name), "left" if words else "right", no_wrap=not words, overflow="fold")
     for row in rows:
         out.add_row(*map(Text, row))
     return out

@@ -352,6 +352,14 @@ def test_pixels_outvote_a_wrong_but_uncertain_prior():
     assert np.all(prior.exposure_errors < 0.5 * np.log(2))
 
 
+def test_noise_of_known_exposures_does_not_change_the_power():
+    truth = np.log(ISO4) - np.log(ISO4).mean()
+    noise = np.random.default_rng(0).normal(0, 0.3 * np.log(2), len(truth))
+    noise -= noise.mean() + truth * (noise @ truth) / (truth @ truth)
+    s = adjust(form="view_exposure_camera_gamma", known=KnownExposures(truth + noise, 0.3))
+    assert np.polyfit(truth, s.log_exposures, 1)[0] == pytest.approx(1, abs=0.01)
+
+
 def test_long_tracks_are_split_and_lose_little():
     drive = make_drive(20, 600)
     truth = make_exposures(drive, "iso2")

@@ -20,7 +20,7 @@ from p2gs_jax.core.streams import Stream, generator
 from p2gs_jax.photometry.adjustment import equations
 from p2gs_jax.photometry.adjustment.equations import Weighted, summed, weigh
 from p2gs_jax.photometry.adjustment.matrices import is_small, whole
-from p2gs_jax.photometry.adjustment.parameters import EMPTY, Forward, Parameters, System
+from p2gs_jax.photometry.adjustment.parameters import EMPTY, Forward, Held, Parameters, System
 from p2gs_jax.photometry.adjustment.solve import Balanced, Fit, one_thread
 from p2gs_jax.photometry.observations import Labels, Observations
 
@@ -98,11 +98,12 @@ def uncertainty(fit: Fit, system: System, observations: Observations) -> Uncerta
     shares = sp.csr_array((fit.at.weight.sum(1), (layout.views, clusters)), shape=shape).tocoo()
     count = np.maximum(_effective(shares.data, shares.coords[0], layout.view_count), 2)
     few = np.sqrt(count / (count - 1))
-    prior = system.priors.normal + system.smooth(fit.normal)
+    priors = system.priors_at(fit.theta)
+    prior = priors.normal + system.smooth(fit.normal)
     bread = fit.normal * fit.at.curvature + prior
     gauges = system.gauges(bread)[1]
     if not is_small(system.basis.shape[1]):  # pyright: ignore
-        drawn = _drawn(Balanced(bread, gauges, system.basis), scores, system)
+        drawn = _drawn(Balanced(bread, gauges, system.basis), scores, priors)
         return Uncertainty(*drawn, few, system.unknowns.split)
     # A prior is an observation with variance 1 / precision: its meat equals its bread.
     meat = scores.T @ scores + prior
@@ -127,11 +128,10 @@ def _sandwich(bread, meat, basis) -> tuple[Float[np.ndarray, "d r"], Float[np.nd
 
 
 def _drawn(
-    bread: Balanced, scores, system: System
+    bread: Balanced, scores, priors: Held
 ) -> tuple[Float[np.ndarray, "d r"], Float[np.ndarray, "d k"]]:
     """Return solutions for clusters and priors with random signs (wild bootstrap)."""
     rng = generator(0, Stream.SCORE_SIGNS)
-    priors = system.priors
     counts = (scores.shape[0], len(priors.targets))
     of_clusters, of_priors = (rng.choice([-1.0, 1.0], (n, DRAWS)) for n in counts)
     right = scores.T @ of_clusters

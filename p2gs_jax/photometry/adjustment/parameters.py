@@ -285,8 +285,10 @@ class System(NamedTuple):
     unknowns: Unknowns
     basis: sp.csr_array  # columns are the free directions
     anchors: Held  # the gauges; their precisions are relative (`gauges`)
-    priors: Held
-    start: Parameters  # initial parameters; h is its prior mean
+    priors: Held  # of gammas and vignetting
+    # Inverse variance of each known log exposure, which is that of `start`; 0 where unknown.
+    known: Float[np.ndarray, " v"]
+    start: Parameters  # initial parameters
     smoothness: Float[np.ndarray, "k k"]  # matrix of the quadratic form that keeps splines smooth
 
     def near(self, theta: Parameters, of: Unknowns) -> Parameters:
@@ -303,6 +305,22 @@ class System(NamedTuple):
         a = start.a + a
         same = of.features == mine.features
         return Parameters((start.b + b) * a[:, None], a, theta.k if same else start.k, start.c)
+
+    def priors_at(self, theta: Parameters) -> Held:
+        """Return all priors; those of known exposures h = b / a are linearised."""
+        u, views = self.unknowns, np.flatnonzero(self.known)
+        a = theta.a[views]
+        h = theta.b[views].mean(1) / a
+        values = np.concatenate([np.tile(1 / (u.channels * a), u.channels), -h / a])
+        columns = np.concatenate([c * u.views + views for c in range(u.channels)])
+        columns = np.append(columns, u.at.a.start + views)
+        where = np.tile(np.arange(len(views)), u.channels + 1), columns
+        rows = sp.csr_array((values, where), shape=(len(views), u.count))
+        return Held(
+            sp.csr_array(sp.vstack([rows, self.priors.rows])),
+            np.append(self.start.b[views, 0] - h, self.priors.targets),
+            np.append(self.known[views], self.priors.precisions),
+        )
 
     def gauges(self, normal: Matrix) -> tuple[float, sp.csr_array]:
         """Return the strength of gauges, by the exposures' information, and rows times its root.
@@ -355,7 +373,8 @@ def make_system(problem: Problem, form: Form, splines: ResponseKind | None = Non
         unknowns=unknowns,
         basis=sp.csr_array(basis),
         anchors=_anchors(problem, form, unknowns, precision),
-        priors=_priors(unknowns, log_exposure, precision, of_gammas),
+        priors=_priors(unknowns, of_gammas),
+        known=precision,
         start=Parameters(start, np.ones(views), *more),
         smoothness=_smoothness(unknowns.splines),
     )
@@ -414,25 +433,16 @@ def _anchors(problem: Problem, form: Form, u: Unknowns, precision) -> Held:
     return Held(sp.csr_array(sp.vstack(rows)), np.array(targets), np.ones(len(targets)))
 
 
-def _priors(u: Unknowns, log_exposure, precision, of_gammas) -> Held:
-    """Return the priors: exposures (b - a mu = 0 for h = mu), gammas and vignetting."""
-    fixed = np.flatnonzero(precision > 0)
-    at = np.arange(len(fixed))
-    b = [(np.full(len(fixed), 1 / u.channels), c * u.views + fixed) for c in range(u.channels)]
-    b.append((-log_exposure[fixed], u.at.a.start + fixed))
-    values, columns = (np.concatenate(part) for part in zip(*b, strict=True))
-    exposures = sp.csr_array(
-        (values, (np.tile(at, u.channels + 1), columns)), shape=(len(fixed), u.count)
-    )
+def _priors(u: Unknowns, of_gammas) -> Held:
     every = sp.csr_array(sp.eye_array(u.count))
     of_gammas = of_gammas if u.gammas else of_gammas[:0]
     gammas = u.at.a.start + np.arange(len(of_gammas))
     lenses = np.arange(u.at.k.start + u.features.balance_count, u.at.k.stop)
     of_lenses = np.full(len(lenses), 1 / VIGNETTING_PRIOR**2)
     return Held(
-        sp.csr_array(sp.vstack([exposures, every[gammas], every[lenses]])),
-        np.repeat([0.0, 1.0, 0.0], [len(fixed), len(gammas), len(lenses)]),
-        np.concatenate([precision[fixed], of_gammas, of_lenses]),
+        sp.csr_array(sp.vstack([every[gammas], every[lenses]])),
+        np.repeat([1.0, 0.0], [len(gammas), len(lenses)]),
+        np.concatenate([of_gammas, of_lenses]),
     )
 
 

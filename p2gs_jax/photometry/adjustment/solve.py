@@ -173,9 +173,10 @@ def _step(model: Forward, system: System, theta: Parameters, at: Weighted) -> tu
     """
     u, vector = system.unknowns, theta.vector()
     normal, right = normal_equations(model, theta, at, np.float32)
-    normal = normal + system.priors.normal
+    priors = system.priors_at(theta)
+    normal = normal + priors.normal
     strength, gauges = system.gauges(normal)
-    right = right + system.priors.pull(vector)
+    right = right + priors.pull(vector)
     right = right + strength * system.anchors.pull(vector)
     if theta.c.size:
         smooth = system.smooth(normal)
