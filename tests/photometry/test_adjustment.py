@@ -342,6 +342,17 @@ def test_known_exposures_are_kept_and_set_the_gauge():
     np.testing.assert_allclose(s.log_exposures[:6], known[:6], atol=1e-3)
     # The others follow in the same units, without alignment.
     assert rms(s.log_exposures - np.log(truth)) / np.log(2) < 0.02
+    assert s.warnings == ()
+
+
+@pytest.mark.parametrize("deviation_ev", [0.0, 0.1])
+def test_known_exposures_that_pixels_contradict_are_named(deviation_ev):
+    wrong = np.log(ISO4)
+    wrong[4] += np.log(2)
+    s = adjust(known=KnownExposures(wrong, deviation_ev))
+    warning = next(w for w in s.warnings if "disagree" in w)
+    assert "in 1 training view (row 4; most of all row 4, by +" in warning
+    assert float(warning.split("by +")[1].split()[0]) == pytest.approx(1, abs=0.1)
 
 
 def test_pixels_outvote_a_wrong_but_uncertain_prior():

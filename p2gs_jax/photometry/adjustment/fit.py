@@ -15,12 +15,12 @@ from p2gs_jax.core.text import count_of
 from p2gs_jax.photometry.adjustment.equations import weigh
 from p2gs_jax.photometry.adjustment.errors import Uncertainty, uncertainty
 from p2gs_jax.photometry.adjustment.parameters import Forward, Parameters
-from p2gs_jax.photometry.adjustment.problem import Problem
+from p2gs_jax.photometry.adjustment.problem import KnownExposures, Problem
 from p2gs_jax.photometry.adjustment.solve import Fit, solve_model, with_free_curve
 from p2gs_jax.photometry.models import MODELS, Form, ModelName
 from p2gs_jax.photometry.observations import Labels, Observations, PerChannel, grouped
 from p2gs_jax.photometry.response import Response
-from p2gs_jax.photometry.solution import MIN_OBSERVATIONS, PhotometricSolution
+from p2gs_jax.photometry.solution import MIN_OBSERVATIONS, PhotometricSolution, compare
 from p2gs_jax.photometry.unmodelled import place_warnings
 from p2gs_jax.types import GAMMA_SRGB
 
@@ -127,7 +127,7 @@ def solution_of(
     # Radiances of points shift inversely, by the shift of one of their views.
     some_view = np.zeros(o.point_count, int)
     some_view[o.points[seen]] = o.views[seen]
-    view_residual, tint = _per_view_ev(o.views, residual, used, o.view_count)
+    view_residual, tint, level = _per_view_ev(o.views, residual, used, o.view_count)
     cameras, corner_errors = _cameras(fit, response, covariance, o)
     part = o.thinned(PER_VIEW, 0)
     solution = PhotometricSolution(
@@ -152,6 +152,8 @@ def solution_of(
         corner_errors=corner_errors,
     )
     warnings = _warnings(fit, solution, lost, active, o.names)
+    if problem.known is not None:
+        warnings += _contradictions(problem.known, solution.exposures_ev + level, o.names)
     warnings += place_warnings(o.picked(part), residual[part] / LN2, used[part])
     return replace(solution, warnings=tuple(warnings))
 
@@ -259,17 +261,18 @@ def _spread_ev(residual: Float[np.ndarray, " n"]) -> float:
 
 def _per_view_ev(
     views: Labels, residual: PerChannel, used: Bool[np.ndarray, "o 3"], count: int
-) -> tuple[Float[np.ndarray, " v"], Float[np.ndarray, "v 3"]]:
-    """Return the residual spread of every view and its colour balance, stops; NaN: unobserved."""
-    spread, balance = np.full(count, np.nan), np.full((count, 3), np.nan)
+) -> tuple[Float[np.ndarray, " v"], Float[np.ndarray, "v 3"], Float[np.ndarray, " v"]]:
+    """Return residuals of every view, stops: spread, colour balance, level; NaN: unobserved."""
+    spread, balance, level = (np.full(shape, np.nan) for shape in (count, (count, 3), count))
     for view, mine in enumerate(grouped(views, count)):
         seen = used[mine]
         if seen.any():
             spread[view] = _spread_ev(residual[mine][seen])
         if (seen.sum(0) >= MIN_OBSERVATIONS).all():
             medians = np.array([np.median(residual[mine, c][seen[:, c]]) for c in range(3)])
-            balance[view] = (medians - np.mean(medians)) / LN2
-    return spread, balance
+            level[view] = np.mean(medians) / LN2
+            balance[view] = medians / LN2 - level[view]
+    return spread, balance, level
 
 
 def _warnings(
@@ -320,6 +323,23 @@ def _warnings(
             "The model does not include these changes."
         )
     return out
+
+
+def _contradictions(
+    known: KnownExposures, seen_ev: Float[np.ndarray, " v"], names: Sequence[str]
+) -> list[str]:
+    """Return a warning if known exposures differ from those that pixels ask for (`seen_ev`)."""
+    deviations = np.where(np.isfinite(seen_ev), known.deviation_ev, np.inf)
+    agreement = compare(seen_ev, deviations, known.log_exposures / LN2)
+    rows = np.flatnonzero(agreement.disagrees)
+    if not len(rows):
+        return []
+    worst = int(np.nanargmax(np.abs(agreement.gap_ev)))
+    return [
+        f"Known exposures disagree with the pixels in {count_of(len(rows), 'training view')} "
+        f"({_listed(rows, names)}; most of all {_listed([worst], names)}, by "
+        f"{-agreement.gap_ev[worst]:+.2f} EV). Check them, or state their standard deviation."
+    ]
 
 
 def _listed(rows: Sequence[int] | Labels, names: Sequence[str]) -> str:
