@@ -17,8 +17,9 @@ Labels = Int[np.ndarray, " o"]
 PerChannel = Float[np.ndarray, "o 3"]
 
 # Largest width of a pixel on the surface, relative to the finest view of the point. Coarser views
-# mix neighbouring surfaces and are left out (BUILD_NOTES, "The same patch").
-COARSEST = 3.0
+# mix neighbouring surfaces and are left out (BUILD_NOTES, "The same patch"). The second limit holds
+# for points that tie views which would share too few points, as photographs of two resolutions do.
+COARSEST, COARSEST_TIE = 3.0, 9.0
 # Least share of a view's observations that are used although noise is clipped at black.
 FEWEST_USED = 0.05
 
@@ -86,11 +87,7 @@ class Observations:
     def components(self, usable: Bool[np.ndarray, "o 3"]) -> Int[np.ndarray, " v"]:
         """Return a label per view; views with different labels cannot be compared."""
         seen = usable.any(1)
-        size = self.view_count + self.point_count
-        ends = (self.views[seen], self.view_count + self.points[seen])
-        edges = sp.csr_array((np.ones(int(seen.sum()), np.int8), ends), shape=(size, size))
-        labels = connected_components(edges, directed=False)[1][: self.view_count]
-        return np.unique(labels, return_inverse=True)[1]
+        return components(self.views[seen], self.points[seen], self.view_count, self.point_count)
 
     def picked(self, pick: np.ndarray | slice) -> Observations:
         """Return some of the observations, by a mask or by rows."""
@@ -112,6 +109,17 @@ class Observations:
         kept = np.zeros(self.point_count, bool)
         kept[self.points[order[rank < per_view]]] = True
         return kept[self.points]
+
+
+def components(
+    views: Labels, points: Labels, view_count: int, point_count: int
+) -> Int[np.ndarray, " v"]:
+    """Return a label 0, 1, ... per view; views with different labels share no point."""
+    size = view_count + point_count
+    ends = (views, view_count + points)
+    edges = sp.csr_array((np.ones(len(views), np.int8), ends), shape=(size, size))
+    labels = connected_components(edges, directed=False)[1][:view_count]
+    return np.unique(labels, return_inverse=True)[1]
 
 
 def grouped(labels: Labels, count: int) -> list[Int[np.ndarray, " _"]]:

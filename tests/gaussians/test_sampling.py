@@ -67,16 +67,18 @@ class Grey(ImageStore):
         return np.full((40, 60, 3), 0.5, np.float32), np.ones((40, 60), np.float32)
 
 
-def seen_from(distances):
-    """Return a scene of one point and a view at every distance; a negative one is behind it."""
+def seen_from(distances, points=1):
+    """Return a scene with a view at every distance of a place; a negative one is behind it."""
     views = [
         make_view(Path(f"{k}.png"), f=50.0, at=(0, 0, -distance), size=(60, 40))
         for k, distance in enumerate(distances)
     ]
-    count = len(distances)
-    tracks = Tracks(np.arange(count), np.zeros(count, int), np.full((count, 2), 20.0, np.float32))
-    points = np.zeros((1, 3), np.float32)
-    return Scene(Path("."), "made", tuple(views), points, np.zeros((1, 3), np.uint8), tracks)
+    count = len(distances) * points
+    of_view, of_point = np.divmod(np.arange(count), points)
+    tracks = Tracks(of_view, of_point, np.full((count, 2), 20.0, np.float32))
+    where = np.zeros((points, 3), np.float32)
+    where[:, :2] = 1e-3 * np.stack(np.divmod(np.arange(points), 8), 1)
+    return Scene(Path("."), "made", tuple(views), where, np.zeros((points, 3), np.uint8), tracks)
 
 
 @pytest.mark.parametrize(
@@ -91,6 +93,13 @@ def test_observations_from_too_far_away_are_left_out_and_counted(distances, kept
     found = track_colors(seen_from(distances), Grey())
     assert found.views.tolist() == kept
     assert found.too_coarse == left_out
+
+
+def test_coarse_views_are_kept_if_nothing_else_ties_them():
+    """Photographs of two resolutions would share no point, and their exposures be unknown."""
+    found = track_colors(seen_from([2.0, 2.1, 10.0, 10.5, 40.0], points=32), Grey())
+    assert np.bincount(found.views).tolist() == [32] * 4
+    assert found.too_coarse == 32
 
 
 def test_exposures_are_right_where_a_surface_has_highlights():

@@ -14,7 +14,13 @@ from p2gs_jax.core.numerics import srgb_decode, srgb_encode
 from p2gs_jax.core.runtime import return_freed_memory
 from p2gs_jax.core.threads import map_in_order
 from p2gs_jax.photometry.formation import places
-from p2gs_jax.photometry.observations import COARSEST, Labels, Observations
+from p2gs_jax.photometry.observations import (
+    COARSEST,
+    COARSEST_TIE,
+    Labels,
+    Observations,
+    components,
+)
 from p2gs_jax.photometry.sources import patches
 from p2gs_jax.photometry.sources.patches import Grid, Surfaces, Symmetric
 from p2gs_jax.scene.pixels.store import ImageStore
@@ -31,6 +37,8 @@ PROJECTED_UNCERTAINTY = 2.0
 # 0.1, 1.5 at 0.25, 1.7 at 0.5. A matte plane and a short town have 0.9 by both. If cells are too
 # few to compare, their sides are halved.
 CELL, FEWEST_CELLS, MOST_HALVINGS = 0.25, 64, 4
+# Views are tied if most of so many parts of the points tie them.
+PARTS = 16
 # Number of pixels above which freed memory is returned after a photograph: 0.4 GB with 12
 # megapixels. With 2 megapixels, requesting memory again took a quarter of the time.
 LARGE = 4_000_000
@@ -261,8 +269,9 @@ def _at_one_scale(
     finest = np.zeros(len(surfaces.points))
     for mine, scale in zip(points, scales, strict=True):
         np.maximum.at(finest, mine, scale)
+    coarsest = _coarsest(points, scales, finest)
     keep = [
-        (scale > 0) & (COARSEST * scale >= finest[mine])
+        (scale > 0) & (coarsest[mine] * scale >= finest[mine])
         for mine, scale in zip(points, scales, strict=True)
     ]
     moments = np.zeros((len(surfaces.points), 3))
@@ -274,3 +283,26 @@ def _at_one_scale(
         former = np.where(new[:, None], here, moments[sampled])
         moments[sampled] = patches.joined(former, here)
     return moments, keep, scales
+
+
+def _coarsest(
+    points: list[Int[np.ndarray, " _"]],
+    scales: list[np.ndarray],
+    finest: Float[np.ndarray, " p"],
+) -> Float[np.ndarray, " p"]:
+    """Return how much coarser than its finest view a view of each point may be."""
+    of_view = np.repeat(np.arange(len(points)), [len(mine) for mine in points])
+    of_point, scale = np.concatenate(points), np.concatenate(scales)
+    far = (scale > 0) & (COARSEST_TIE * scale >= finest[of_point])
+    of_view, of_point, scale = of_view[far], of_point[far], scale[far]
+    near = COARSEST * scale >= finest[of_point]
+    apart = np.zeros(len(finest), int)
+    for part in range(PARTS):
+        mine, size = of_point % PARTS == part, (len(points), len(finest))
+        labels = components(of_view[mine & near], of_point[mine & near], *size)
+        if labels.max() > components(of_view[mine], of_point[mine], *size).max():
+            least, most = np.full(len(finest), len(points)), np.full(len(finest), -1)
+            np.minimum.at(least, of_point, labels[of_view])
+            np.maximum.at(most, of_point, labels[of_view])
+            apart += least < most
+    return np.where(2 * apart > PARTS, COARSEST_TIE, COARSEST)
