@@ -143,6 +143,14 @@ def calibrate_observations(
             f"pixels are more than {COARSEST:g} times as wide on the surface as those of the "
             "finest view, or their points lie behind the camera."
         )
+    if observations.black_borders is not None and observations.black_borders.any():
+        rows = np.flatnonzero(observations.black_borders)
+        named = first_few([observations.names[row] for row in rows])
+        notes.append(
+            f"The edges of {count_of(len(rows), 'training view')} are black ({named}), as "
+            "undistortion and stabilisation leave them, and a fit shows them: add masks "
+            "(docs/quickstart.md)."
+        )
     if options.known is not None and (unused := options.known.unused):
         notes.append(f"{len(unused)} known exposures belong to no view: {first_few(unused)}.")
     response = selection.solution.response

@@ -47,6 +47,7 @@ class Observations:
     footprints: Float[np.ndarray, " o"] | None = None
     # Display values of each view from which noise is not clipped at black; None: unknown.
     unclipped: Float[np.ndarray, "v 3"] | None = None
+    black_borders: Bool[np.ndarray, " v"] | None = None  # whether the edge of a view is black
     # `colors` as all views of each point predict them; None: unknown.
     expected: PerChannel | None = None
 

@@ -15,7 +15,7 @@ from p2gs_jax.photometry.models import Form
 from p2gs_jax.photometry.observations import Observations
 from p2gs_jax.photometry.response import Response
 from p2gs_jax.photometry.sources.points import MOST_PER_POINT, projected_colors, track_colors
-from p2gs_jax.photometry.sources.sampling import sample, unclipped_from
+from p2gs_jax.photometry.sources.sampling import has_black_border, sample, unclipped_from
 from p2gs_jax.scene.pixels.store import ImageStore
 from p2gs_jax.scene.visibility import unoccluded
 from p2gs_jax.types import Scene, Tracks
@@ -46,11 +46,16 @@ def test_exposures_need_no_tracks_and_left_out_points_are_counted(noisy_street, 
     scene = load_scene(noisy_street, CFG.data, tmp_path, lambda text: None)
     scene = dataclasses.replace(scene, tracks=None)
     observations = projected_colors(scene, ImageStore(scene.views, CFG.data))
-    observations = dataclasses.replace(observations, too_coarse=7)
+    assert observations.black_borders is not None
+    assert not observations.black_borders.any()
+    bordered = np.arange(observations.view_count) == 1
+    observations = dataclasses.replace(observations, too_coarse=7, black_borders=bordered)
     assert np.bincount(observations.points).max() <= MOST_PER_POINT
     options = dataclasses.replace(options_of(CFG, scene), choice=CHOICE)
     found = calibrate_observations(observations, options)
     assert found.reasons[0].startswith("7 of ")
+    note = f"The edges of 1 training view are black ({observations.names[1]}), as"
+    assert found.reasons[1].startswith(note)
     with (noisy_street / "truth" / "exposures.csv").open(newline="") as file:
         truth = {r["image"]: float(r["exposure"]) for r in csv.DictReader(file)}
     expected = np.array([truth[scene.views[i].name] for i in scene.train_indices])
@@ -100,6 +105,16 @@ def test_coarse_views_are_kept_if_nothing_else_ties_them():
     found = track_colors(seen_from([2.0, 2.1, 10.0, 10.5, 40.0], points=32), Grey())
     assert np.bincount(found.views).tolist() == [32] * 4
     assert found.too_coarse == 32
+
+
+def test_black_borders_are_told_from_dark_photographs():
+    lit, night = np.full((2, 40, 60, 3), 0.3, np.float32)
+    mask = np.ones((40, 60), np.float32)
+    lit[:, :3], night[:] = 1 / 255, 1 / 255
+    assert has_black_border(lit, mask)
+    mask[:, :3] = 0
+    assert not has_black_border(lit, mask)
+    assert not has_black_border(night, np.ones((40, 60), np.float32))
 
 
 def test_exposures_are_right_where_a_surface_has_highlights():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -45,6 +45,9 @@ LARGE = 4_000_000
 # Noise is clipped at black where blocks of one mean have at least this share of black pixels: side
 # of a block, pixels; least number of blocks. Normal noise has this share at twice its deviation.
 CLIPPED, BLOCK, BLOCKS = 0.02, 4, 20
+# A border is black if at least this share of the outermost pixels is, at most the second share in
+# the middle of the photograph, and at most this display value counts as black.
+EDGE, MIDDLE, BLACK = 0.1, 0.01, 2 / 255
 
 
 class Samples(NamedTuple):
@@ -162,7 +165,7 @@ def point_colors(
     wrong = patches.two_sided(surfaces, points, views)
     surfaces = surfaces._replace(normals=np.where(wrong[:, None], np.nan, surfaces.normals))
     moments, keep, scales = _at_one_scale(surfaces, points, views)
-    unclipped = np.zeros((len(views), 3), np.float32)
+    unclipped, bordered = np.zeros((len(views), 3), np.float32), np.zeros(len(views), bool)
 
     def read(row: int):
         mine, centres = points[row][keep[row]], xy[row][keep[row]]
@@ -170,7 +173,7 @@ def point_colors(
         deviation = POSITION_DEVIATION * np.sqrt(12 * patches.smallest_moments(views[row].width))
         ldr, mask = store.whole(scene.train_indices[row])
         found = sample_patches(ldr, mask, grids, len(mine), deviation)
-        unclipped[row] = unclipped_from(ldr, mask)
+        unclipped[row], bordered[row] = unclipped_from(ldr, mask), has_black_border(ldr, mask)
         good = found.valid
         at = places(centres[good], *mask.shape[::-1]).astype(np.float32)
         wide = -np.log2(scales[row][keep[row]][good]).astype(np.float32)
@@ -207,7 +210,20 @@ def point_colors(
         cells=_cells(surfaces.points, of_point, of_view, views),
         footprints=footprints,
         unclipped=unclipped,
+        black_borders=bordered,
     )
+
+
+def has_black_border(ldr: Float32[np.ndarray, "h w 3"], mask: Float32[np.ndarray, "h w"]) -> bool:
+    """Return whether the edge of a photograph is black, as undistortion leaves it."""
+
+    def black(at: Any) -> np.ndarray:
+        return (ldr[at] <= BLACK).all(-1) & (mask[at] > 0)
+
+    height, width = mask.shape
+    edges = np.concatenate([black(at) for at in (0, -1, np.s_[:, 0], np.s_[:, -1])])
+    middle = np.s_[height // 4 : height - height // 4, width // 4 : width - width // 4]
+    return bool(edges.mean() >= EDGE and black(middle).mean() <= MIDDLE)
 
 
 def unclipped_from(
