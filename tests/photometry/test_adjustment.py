@@ -355,6 +355,14 @@ def test_known_exposures_that_pixels_contradict_are_named(deviation_ev):
     assert float(warning.split("by +")[1].split()[0]) == pytest.approx(1, abs=0.1)
 
 
+@pytest.mark.parametrize("factor", [-1.0, 4.0])
+def test_fixed_exposures_are_kept_where_gammas_reach_their_bounds(factor):
+    known = factor * np.log(ISO4)
+    s = adjust(form="view_exposure_camera_gamma", known=KnownExposures(known))
+    np.testing.assert_allclose(s.log_exposures, known, atol=1e-3)
+    assert any("disagree with the pixels" in w for w in s.warnings)
+
+
 def test_pixels_outvote_a_wrong_but_uncertain_prior():
     wrong = np.log(ISO4) + np.random.default_rng(0).normal(0, 0.3, len(ISO4))
     assert ev(adjust(known=KnownExposures(wrong, 0.0))) > 0.3

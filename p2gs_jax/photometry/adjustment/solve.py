@@ -184,8 +184,14 @@ def _step(model: Forward, system: System, theta: Parameters, at: Weighted) -> tu
         of_c = smooth[u.at.c, u.at.c].toarray() @ theta.c
         right = right - np.concatenate([np.zeros(u.at.c.start), of_c])
     step = Balanced(normal, gauges, system.basis).solve(right)
-    step[u.at.a] = np.clip(theta.a + step[u.at.a], *A_RANGE) - theta.a
     changes = u.split(step)
+    new = np.clip(theta.a + changes.a, *A_RANGE)
+    # Where a gamma reaches its bound, the exposure h = b / a still changes as found.
+    h, bound = theta.b / theta.a[:, None], (new != theta.a + changes.a)[:, None]
+    moved = (changes.b - h * changes.a[:, None]) / theta.a[:, None]
+    b = np.where(bound, (h + moved) * new[:, None] - theta.b, changes.b)
+    changes = changes._replace(b=b, a=new - theta.a)
+    step = changes.vector()
     if model.features is not None:
         changes = changes._replace(k=model.features.of(changes.k))
     return step, max(float(np.abs(change).max(initial=0.0)) for change in changes)
