@@ -43,8 +43,8 @@ def make_table(
     """Return a table; `plain` draws few lines."""
     out = Table(title=title, title_justify="left", box=SIMPLE if plain else HEAVY_HEAD)
     for name in columns:
-        words = name in WORDS
-        out.add_column(Text(name), "left" if words else "right", no_wrap=not words, overflow="fold")
+        words, justify = name in WORDS, "left" if name in WORDS else "right"
+        out.add_column(Text(name), justify=justify, no_wrap=not words, overflow="fold")
     for row in rows:
         out.add_row(*map(Text, row))
     return out

@@ -37,7 +37,8 @@ PROJECTED_UNCERTAINTY = 2.0
 # 0.1, 1.5 at 0.25, 1.7 at 0.5. A matte plane and a short town have 0.9 by both. If cells are too
 # few to compare, their sides are halved.
 CELL, FEWEST_CELLS, MOST_HALVINGS = 0.25, 64, 4
-# Views are tied if most of so many parts of the points tie them.
+# Number of parts into which points are divided. Views are tied if they are in most of these parts:
+# a few points do not tie them.
 PARTS = 16
 # Number of pixels above which freed memory is returned after a photograph: 0.4 GB with 12
 # megapixels. With 2 megapixels, requesting memory again took a quarter of the time.
@@ -306,7 +307,10 @@ def _coarsest(
     scales: list[np.ndarray],
     finest: Float[np.ndarray, " p"],
 ) -> Float[np.ndarray, " p"]:
-    """Return how much coarser than its finest view a view of each point may be."""
+    """Return how much coarser than its finest view a view of each point may be.
+
+    It is COARSEST_TIE for points that tie views which COARSEST would leave apart, else COARSEST.
+    """
     of_view = np.repeat(np.arange(len(points)), [len(mine) for mine in points])
     of_point, scale = np.concatenate(points), np.concatenate(scales)
     far = (scale > 0) & (COARSEST_TIE * scale >= finest[of_point])
