@@ -338,7 +338,8 @@ def _contradictions(
     return [
         f"Known exposures disagree with the pixels in {count_of(len(rows), 'training view')} "
         f"({_listed(rows, names)}; most of all {_listed([worst], names)}, by "
-        f"{-agreement.gap_ev[worst]:+.2f} EV). Check them, or state their standard deviation."
+        f"{-agreement.gap_ev[worst]:+.2f} EV). Check them, or state their deviation "
+        "(--exposure-sigma)."
     ]
 
 
