@@ -379,6 +379,13 @@ def test_noise_of_known_exposures_does_not_change_the_power():
     assert np.polyfit(truth, s.log_exposures, 1)[0] == pytest.approx(1, abs=0.01)
 
 
+@pytest.mark.parametrize("form", ["view_exposure_camera_gamma", "view_exposure_gamma"])
+def test_known_exposures_outvote_the_prior_of_gammas(form):
+    how = {"curve": "power", "gammas": np.full(len(ISO4), 2.66), "pivot": 0.18}
+    s = adjust(observe(DRIVE, ISO4, **how), form, known=KnownExposures(np.log(ISO4), 0.1))
+    assert np.polyfit(np.log(ISO4), s.log_exposures, 1)[0] == pytest.approx(1, abs=0.04)
+
+
 def test_long_tracks_are_split_and_lose_little():
     drive = make_drive(20, 600)
     truth = make_exposures(drive, "iso2")

@@ -363,17 +363,20 @@ def make_system(problem: Problem, form: Form, splines: ResponseKind | None = Non
         fixed = np.isfinite(known.log_exposures)
         log_exposure = np.where(fixed, known.log_exposures, 0.0)
         precision = fixed / (max(known.deviation_ev, FIXED_EV) * LN2) ** 2
-    of_gammas = np.full(views, 1 / A_PRIOR**2)
-    if model.gamma == "camera" and problem.with_known_power.size:
-        # The prior of a camera counts once, not in each view.
-        of_gammas /= np.bincount(cameras)[cameras]
+    of_gammas, followed = np.full(views, 1 / A_PRIOR**2), np.zeros(0, int)
+    if problem.with_known_power.size:
+        # No gauge holds the power: a prior that counts in each view would outvote known exposures.
+        alike = cameras if model.gamma == "camera" else problem.component
+        of_gammas /= np.bincount(alike)[alike]
+        if model.gamma == "view":
+            followed = np.flatnonzero(np.diff(alike) == 0)
     start = np.repeat(log_exposure[:, None], unknowns.channels, 1)
     more = (np.zeros(terms.count) for terms in (unknowns.features, unknowns.splines))
     return System(
         unknowns=unknowns,
         basis=sp.csr_array(basis),
         anchors=_anchors(problem, form, unknowns, precision),
-        priors=_priors(unknowns, of_gammas),
+        priors=_priors(unknowns, of_gammas, followed),
         known=precision,
         start=Parameters(start, np.ones(views), *more),
         smoothness=_smoothness(unknowns.splines),
@@ -433,16 +436,18 @@ def _anchors(problem: Problem, form: Form, u: Unknowns, precision) -> Held:
     return Held(sp.csr_array(sp.vstack(rows)), np.array(targets), np.ones(len(targets)))
 
 
-def _priors(u: Unknowns, of_gammas) -> Held:
+def _priors(u: Unknowns, of_gammas, followed) -> Held:
+    """Return priors of gammas, of changes from `followed` views to the next, and of vignetting."""
     every = sp.csr_array(sp.eye_array(u.count))
     of_gammas = of_gammas if u.gammas else of_gammas[:0]
     gammas = u.at.a.start + np.arange(len(of_gammas))
+    before = u.at.a.start + followed
     lenses = np.arange(u.at.k.start + u.features.balance_count, u.at.k.stop)
     of_lenses = np.full(len(lenses), 1 / VIGNETTING_PRIOR**2)
     return Held(
-        sp.csr_array(sp.vstack([every[gammas], every[lenses]])),
-        np.repeat([1.0, 0.0], [len(gammas), len(lenses)]),
-        np.concatenate([of_gammas, of_lenses]),
+        sp.csr_array(sp.vstack([every[gammas], every[before + 1] - every[before], every[lenses]])),
+        np.repeat([1.0, 0.0], [len(gammas), len(followed) + len(lenses)]),
+        np.concatenate([of_gammas, np.full(len(followed), 1 / A_PRIOR**2 / 2), of_lenses]),
     )
 
 
