@@ -43,7 +43,8 @@ def make_table(
     """Return a table; `plain` draws few lines."""
     out = Table(title=title, title_justify="left", box=SIMPLE if plain else HEAVY_HEAD)
     for name in columns:
-        words, justify = name in WORDS, "left" if name in WORDS else "right"
+        words = name in WORDS
+        justify = "left" if words else "right"
         out.add_column(Text(name), justify=justify, no_wrap=not words, overflow="fold")
     for row in rows:
         out.add_row(*map(Text, row))
@@ -155,7 +156,8 @@ def _exposure_columns(result: Calibration) -> dict[str, list[str]]:
     known, has_stated, wrong = np.isfinite(errors), np.isfinite(stated), result.agreement.disagrees
     rows = range(len(views))
     columns = {"view": [v.name for v in views]}
-    if len({v.camera for v in views}) > 1 and not all(v.name.startswith(v.camera) for v in views):
+    named = all(v.name.startswith(f"{v.camera}/") for v in views)
+    if not named and len({v.camera for v in views}) > 1:
         columns["camera"] = [v.camera for v in views]
     columns["exposure"] = [
         f"{s.exposures_ev[i]:+.3f} +- {errors[i]:.3f}" if known[i] else "unknown" for i in rows

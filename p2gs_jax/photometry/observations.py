@@ -115,7 +115,7 @@ class Observations:
 def components(
     views: Labels, points: Labels, view_count: int, point_count: int
 ) -> Int[np.ndarray, " v"]:
-    """Return a label 0, 1, ... per view; views with different labels share no point."""
+    """Return a label 0, 1, ... per view; no chain of shared points ties different labels."""
     size = view_count + point_count
     ends = (views, view_count + points)
     edges = sp.csr_array((np.ones(len(views), np.int8), ends), shape=(size, size))

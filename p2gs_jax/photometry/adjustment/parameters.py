@@ -309,6 +309,8 @@ class System(NamedTuple):
     def priors_at(self, theta: Parameters) -> Held:
         """Return all priors; those of known exposures h = b / a are linearised."""
         u, views = self.unknowns, np.flatnonzero(self.known)
+        if not len(views):
+            return self.priors
         a = theta.a[views]
         h = theta.b[views].mean(1) / a
         values = np.concatenate([np.tile(1 / (u.channels * a), u.channels), -h / a])
@@ -441,13 +443,14 @@ def _priors(u: Unknowns, of_gammas, followed) -> Held:
     every = sp.csr_array(sp.eye_array(u.count))
     of_gammas = of_gammas if u.gammas else of_gammas[:0]
     gammas = u.at.a.start + np.arange(len(of_gammas))
-    before = u.at.a.start + followed
+    # The change between two gammas has twice the variance of one.
+    before, of_changes = u.at.a.start + followed, np.full(len(followed), 0.5 / A_PRIOR**2)
     lenses = np.arange(u.at.k.start + u.features.balance_count, u.at.k.stop)
     of_lenses = np.full(len(lenses), 1 / VIGNETTING_PRIOR**2)
     return Held(
         sp.csr_array(sp.vstack([every[gammas], every[before + 1] - every[before], every[lenses]])),
         np.repeat([1.0, 0.0], [len(gammas), len(followed) + len(lenses)]),
-        np.concatenate([of_gammas, np.full(len(followed), 1 / A_PRIOR**2 / 2), of_lenses]),
+        np.concatenate([of_gammas, of_changes, of_lenses]),
     )
 
 

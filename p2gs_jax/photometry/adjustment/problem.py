@@ -8,12 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Int
-from scipy.sparse.csgraph import connected_components
 
 from p2gs_jax.config import Level
 from p2gs_jax.core.numerics import LN2
 from p2gs_jax.photometry.adjustment.matrices import Pairs
-from p2gs_jax.photometry.observations import Labels, Observations, grouped
+from p2gs_jax.photometry.observations import Labels, Observations, components, grouped
 
 LONGEST_ROW = 16  # largest number of observations of a row
 TELLING_EV = 0.1  # least difference of known exposures that fixes the power of a curve, stops
@@ -130,10 +129,8 @@ class Problem:
         if level != "camera":
             return self.component
         label, cameras = self.component, self.observations.cameras
-        first = int(label.max(initial=-1)) + 1
-        size = first + int(cameras.max(initial=-1)) + 1
-        edges = sp.csr_array((np.ones(len(label)), (label, first + cameras)), shape=(size, size))
-        return connected_components(edges, directed=False)[1][label]
+        counts = (int(each.max(initial=-1)) + 1 for each in (label, cameras))
+        return components(label, cameras, *counts)[label]
 
     def groups(self, level: Level | None) -> list[np.ndarray]:
         """Return the views of each label of `tied`."""

@@ -316,11 +316,15 @@ def _coarsest(
     far = (scale > 0) & (COARSEST_TIE * scale >= finest[of_point])
     of_view, of_point, scale = of_view[far], of_point[far], scale[far]
     near = COARSEST * scale >= finest[of_point]
-    apart = np.zeros(len(finest), int)
+    apart, counts = np.zeros(len(finest), int), (len(points), len(finest))
+
+    def labelled(pick):
+        return components(of_view[pick], of_point[pick], *counts)
+
     for part in range(PARTS):
-        mine, size = of_point % PARTS == part, (len(points), len(finest))
-        labels = components(of_view[mine & near], of_point[mine & near], *size)
-        if labels.max() > components(of_view[mine], of_point[mine], *size).max():
+        mine = of_point % PARTS == part
+        labels = labelled(mine & near)
+        if labels.any() and labels.max() > labelled(mine).max():
             least, most = np.full(len(finest), len(points)), np.full(len(finest), -1)
             np.minimum.at(least, of_point, labels[of_view])
             np.maximum.at(most, of_point, labels[of_view])
