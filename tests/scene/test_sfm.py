@@ -108,6 +108,18 @@ def test_the_same_photographs_give_the_same_inliers(folder, tmp_path):
     assert inliers(pairs) == inliers(pairs)
 
 
+def test_a_dark_photograph_has_nearly_as_many_features_as_a_bright_one(folder, tmp_path):
+    with Image.open(folder / "IMG (0).png") as bright:
+        bright.point(lambda value: value // 12).save(folder / "dark.png")
+    names = ["IMG (0).png", "dark.png"]
+    database = kept_features(tmp_path / "features", folder, {("one",): names}, print)
+    with pycolmap.Database.open(database) as db:
+        images = {image.name: image for image in db.read_all_images()}
+        bright, dark = (db.num_keypoints_for_image(images[n].image_id) for n in names)
+    assert dark > 0.6 * bright > 100
+    assert images["dark.png"].camera_id == images["IMG (0).png"].camera_id
+
+
 def test_only_new_photographs_are_processed_and_matches_judge_poses(noisy_street, folder, tmp_path):
     def names_in(database):
         with pycolmap.Database.open(database) as db:

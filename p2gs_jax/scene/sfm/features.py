@@ -15,6 +15,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
 
+import cv2
 import numpy as np
 from jaxtyping import Float
 
@@ -32,6 +33,10 @@ from p2gs_jax.scene.rigid import camera_centers
 
 MAX_IMAGE_SIZE = 1600  # longer side for SIFT, pixels
 MAX_FEATURES = 4096  # of one image
+# Contrast of a photograph, the standard deviation of grey 8-bit values, below which SIFT's
+# threshold falls in proportion, by halvings and at most by this number of them. On mixtures of
+# exposures (LOM sofa) 33 of 33 photographs register instead of 18.
+CONTRAST, MOST_HALVINGS = 60, 4
 EXHAUSTIVE_LIMIT = 60
 """Every pair of up to this number of images is matched."""
 DATABASE, RECORD = "database.db", "photographs.json"
@@ -68,8 +73,8 @@ def extract(
     """Detect SIFT features of images on the CPU and store them in a new or an existing database.
 
     `mode` states how images share cameras; `camera` is the id, in the database, of one camera for
-    all images. With `enlarge`, features are also found at twice the size. Raises UserError: COLMAP
-    failed.
+    all images. With `enlarge`, features are also found at twice the size. In images of little
+    contrast, such as dark ones, weaker features count. Raises UserError: COLMAP failed.
     """
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = MAX_IMAGE_SIZE
@@ -81,23 +86,37 @@ def extract(
     most_threads = int(SHARE * (left_to_process() or sys.maxsize)) // (BYTES_PER_PIXEL * largest)
     if most_threads < available_cores():
         options.num_threads = max(1, most_threads)
-    reader = pycolmap.ImageReaderOptions()
-    if camera is not None:
-        reader.existing_camera_id = camera
-    try:
-        pycolmap.extract_features(
-            database,
-            image_folder,
-            image_names=list(names),
-            camera_mode=mode,
-            reader_options=reader,
-            extraction_options=options,
-            device=pycolmap.Device.cpu,
-        )
-    except (RuntimeError, ValueError, OSError) as error:
-        why = f"COLMAP could not extract features in {image_folder}: {error}."
-        fix = "find an image there that does not open, and remove or replace it"
-        raise UserError(why, fix=fix) from error
+    reader, threshold = pycolmap.ImageReaderOptions(), options.sift.peak_threshold
+    halvings = [_halvings(image_folder / name) for name in names]
+    for each in sorted({*halvings}):
+        part = [name for name, k in zip(names, halvings, strict=True) if k == each]
+        options.sift.peak_threshold = threshold * 0.5**each
+        if camera is not None:
+            reader.existing_camera_id = camera
+        try:
+            pycolmap.extract_features(
+                database,
+                image_folder,
+                image_names=part,
+                camera_mode=mode,
+                reader_options=reader,
+                extraction_options=options,
+                device=pycolmap.Device.cpu,
+            )
+        except (RuntimeError, ValueError, OSError) as error:
+            why = f"COLMAP could not extract features in {image_folder}: {error}."
+            fix = "find an image there that does not open, and remove or replace it"
+            raise UserError(why, fix=fix) from error
+        if mode == pycolmap.CameraMode.SINGLE:
+            camera = _cameras(database).get(part[0], camera)
+
+
+def _halvings(path: Path) -> int:
+    """Return how often SIFT's threshold is halved for an image, by its contrast."""
+    gray = cv2.imread(str(path), cv2.IMREAD_REDUCED_GRAYSCALE_2)
+    contrast = 0.0 if gray is None else float(gray.std())
+    lower = np.log2(CONTRAST / contrast) if contrast > 0 else 0.0
+    return int(np.clip(np.rint(lower), 0, MOST_HALVINGS))
 
 
 def match(database: Path, pairs: Iterable[Pair] | None) -> None:
@@ -141,7 +160,7 @@ def kept_features(
         fingerprints = file_fingerprints([image_folder / name for name in group])
         for name, (_, size, changed) in zip(group, fingerprints, strict=True):
             files[name] = [size, changed, str(key)]
-    options = [pycolmap.__version__, MAX_IMAGE_SIZE, MAX_FEATURES]
+    options = [pycolmap.__version__, MAX_IMAGE_SIZE, MAX_FEATURES, CONTRAST, MOST_HALVINGS]
     record = {"options": options, "files": files}
     database = folder / DATABASE
     if not _continues(folder / RECORD, record):
