@@ -248,7 +248,7 @@ class Calibrate:
                 write_development(out, found.developed)
         print_calibration(found, out)
         if self.write_for:
-            for sentence in write_for(self.write_for, out, found.views):
+            for sentence in write_for(self.write_for, out, found.views, scene):
                 PlainConsole().print(sentence, soft_wrap=True)
         return 0
 

@@ -163,6 +163,8 @@ def _default_name(options: Render, scene: Scene) -> str:
             name += "_" + options.camera.replace("/", "_")
     if options.shift:
         name += f"_{abs(options.shift):g}_{'left' if options.shift > 0 else 'right'}"
+    if options.without_objects or options.only_objects:
+        name += "_without_objects" if options.without_objects else "_only_objects"
     if options.panorama:
         name = "panorama" if name == "all" else f"{name}_panorama"
     return f"{name}_views" if name in {Path(v.name).parts[0] for v in scene.views} else name

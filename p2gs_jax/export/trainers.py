@@ -6,6 +6,7 @@ docs/exports.md explains how to pass each file to its program.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,14 +18,17 @@ from p2gs_jax.run.photometry_files import PhotometryFile, read_photometry
 from p2gs_jax.types import GAMMA_SRGB, View
 
 
-def write_for(trainers: Sequence[str], folder: Path, views: Sequence[View]) -> list[str]:
+def write_for(
+    trainers: Sequence[str], folder: Path, views: Sequence[View], scene: Path
+) -> list[str]:
     """Write the files of some trainers beside the `photometry.json` of a calibration.
 
-    `views` are the calibrated photographs. Returns a sentence on each file, or the reason why it
-    is not written: the program cannot express this photometry.
+    `views` are the calibrated photographs of `scene`, a folder or a JSON file. Returns a sentence
+    on each file, or the reason why it is not written: the program cannot express this photometry.
     """
     saved = read_photometry(folder / "photometry.json")
-    writers = {"ppisp": _ppisp, "3dgs": _3dgs, "nerfstudio": _nerfstudio}
+    base = scene.parent if scene.suffix.lower() == ".json" else scene
+    writers = {"ppisp": _ppisp, "3dgs": _3dgs, "nerfstudio": partial(_nerfstudio, base=base)}
     return [writers[name](folder, saved, views) for name in dict.fromkeys(trainers)]
 
 
@@ -80,12 +84,20 @@ def _3dgs(folder: Path, saved: PhotometryFile, views: Sequence[View]) -> str:
     return f"{path}: matrices of 3DGS, from the common exposure to that of each photograph."
 
 
-def _nerfstudio(folder: Path, saved: PhotometryFile, views: Sequence[View]) -> str:
-    """Write the photometry of every photograph as fields of a frame of `transforms.json`."""
+def _nerfstudio(folder: Path, saved: PhotometryFile, views: Sequence[View], *, base: Path) -> str:
+    """Write the photometry of every photograph as fields of a frame of `transforms.json`.
+
+    A `file_path` is relative to `base`, or the name of a view whose photograph lies elsewhere.
+    """
     path, fields = folder / "frames.json", ("exposure_ev", "gamma", "white_balance")
     rows = {row["image"]: row for row in saved["views"]}
+
+    def file_path(view: View) -> str:
+        path, root = view.image_path.resolve(), base.resolve()
+        return path.relative_to(root).as_posix() if path.is_relative_to(root) else view.name
+
     frames = [
-        {"file_path": view.name, **{name: rows[view.name][name] for name in fields}}
+        {"file_path": file_path(view), **{name: rows[view.name][name] for name in fields}}
         for view in views
     ]
     write_json(path, {"frames": frames})

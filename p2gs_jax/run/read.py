@@ -119,8 +119,9 @@ class Run:
         return notebook_html(rows, files.summary)
 
     def without_objects(self) -> Run:
-        """Return the run without moving objects; UserError: there are none."""
-        self._require_objects()
+        """Return the run without moving objects and vibrating Gaussians; UserError: has neither."""
+        if self.params.gaussians.vibration is None:
+            self._require_objects()
         return self._of(standing(self.params.gaussians, self.owner), None)
 
     def over_black(self) -> Run:

@@ -12,7 +12,10 @@ from p2gs_jax.types import View
 
 EXPOSURES = {"a.png": 0.5, "b.png": 3.0}
 BALANCE, GAMMA, PIVOT = (1.1, 1.0, 1 / 1.1), 2.4, 0.18
-VIEWS = [View(n, Path(n), "0", np.eye(4), np.eye(3, dtype="f4"), 30, 20) for n in EXPOSURES]
+VIEWS = [
+    View(n, Path("scene/images", n), "0", np.eye(4), np.eye(3, dtype="f4"), 30, 20)
+    for n in EXPOSURES
+]
 
 
 def photometry(path, curve, gammas=(GAMMA, GAMMA)):
@@ -25,7 +28,7 @@ def photometry(path, curve, gammas=(GAMMA, GAMMA)):
 @pytest.mark.parametrize(("curve", "power"), [("power", 1 / 2.2), ("linear", 1.0)])
 def test_matrices_of_3dgs_turn_the_common_picture_into_each_photograph(tmp_path, curve, power):
     photometry(tmp_path / "photometry.json", curve)
-    assert "exposure.json" in write_for(["3dgs"], tmp_path, VIEWS)[0]
+    assert "exposure.json" in write_for(["3dgs"], tmp_path, VIEWS, Path("scene"))[0]
     light = np.random.default_rng(0).uniform(0.01, 0.2, (50, 3))
 
     def developed(gains):
@@ -41,13 +44,13 @@ def test_matrices_of_3dgs_turn_the_common_picture_into_each_photograph(tmp_path,
 @pytest.mark.parametrize(("curve", "gammas"), [("srgb", (2.2, 2.2)), ("power", (2.2, 2.3))])
 def test_no_matrix_is_written_for_other_curves_and_gammas(tmp_path, curve, gammas):
     photometry(tmp_path / "photometry.json", curve, gammas)
-    assert "is not written" in write_for(["3dgs"], tmp_path, VIEWS)[0]
+    assert "is not written" in write_for(["3dgs"], tmp_path, VIEWS, Path("scene"))[0]
     assert not (tmp_path / "exposure.json").exists()
 
 
 def test_values_of_ppisp_have_its_names_and_shapes(tmp_path):
     photometry(tmp_path / "photometry.json", "srgb")
-    assert "8-bit codes" in write_for(["ppisp", "ppisp"], tmp_path, VIEWS)[0]
+    assert "8-bit codes" in write_for(["ppisp", "ppisp"], tmp_path, VIEWS, Path("scene"))[0]
     saved = json.loads((tmp_path / "ppisp_start.json").read_text())
     names = ("exposure_params", "vignetting_params", "color_params", "crf_params")
     assert [np.shape(saved[n]) for n in names] == [(2,), (1, 3, 5), (2, 8), (1, 3, 4)]
@@ -57,7 +60,7 @@ def test_values_of_ppisp_have_its_names_and_shapes(tmp_path):
 
 def test_frames_of_nerfstudio_have_their_exposures(tmp_path):
     photometry(tmp_path / "photometry.json", "srgb")
-    assert "frames.json" in write_for(["nerfstudio"], tmp_path, VIEWS)[0]
+    assert "frames.json" in write_for(["nerfstudio"], tmp_path, VIEWS, Path("scene"))[0]
     first, _ = json.loads((tmp_path / "frames.json").read_text())["frames"]
-    assert first["file_path"] == "a.png"
+    assert first["file_path"] == "images/a.png"
     assert (first["gamma"], first["white_balance"]) == (GAMMA, list(BALANCE))

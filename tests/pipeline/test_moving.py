@@ -202,6 +202,10 @@ def test_gaussians_that_vibrate_are_shown_at_the_time_of_each_view(fitted):
     np.testing.assert_allclose(stored, shown, atol=2e-3)
     later = np.asarray(run.render(run.camera(index), run.scene.views[index].time + 0.5).linear)
     assert np.abs(later - shown).max() > 0.02
+    empty = run.without_objects()
+    assert empty.params.gaussians.capacity == still.sum()
+    without = np.asarray(empty.render(empty.camera(index)).linear)
+    assert np.abs(without - shown).max() > 0.02
     # Files for other programs are of one moment.
     assert read_ply(run.folder / "splats.ply").vibration is None
     assert at_time(run.as_of(), None).vibration is None
