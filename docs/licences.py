@@ -16,7 +16,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = Path(__file__).with_name("licences.md")
 # Extras that a user installs; the others are for work on the program itself.
-EXTRAS = ("viewer", "spz", "drives", "heic", "raw", "lpips", "cuda")
+EXTRAS = ("viewer", "spz", "usd", "drives", "heic", "raw", "lpips", "dask", "slurm", "cuda")
 # What wheels carry beside their own code, where it asks for more than to be named.
 BUNDLED = {
     "av": "FFmpeg with x264 and x265: GPL-2.0-or-later",

@@ -25,9 +25,8 @@ says how rows are made and which systems were not run. The machine is that of
 [the records](results/README.md) unless a row names another.
 
 Splats are blurred by 0.05 pixels^2 unless the row names another blur. Until commit 057bc06
-(2026-11-25) the default was the blur of 3DGS, 0.3 pixels^2. The row of `3dgs` on
-nerf_fox needs `--render.blur 0.3` to be repeated. It and clean lego at 800 pixels are older than
-commit 05f3698 (2026-11-26); until then long fits slowed the learning of colours as well
+(2026-11-25) the default was the blur of 3DGS, 0.3 pixels^2. Rows of clean lego at 800 pixels are
+older than commit 05f3698 (2026-11-26); until then long fits slowed the learning of colours as well
 ([length](results/2026-11-25-length.md)).
 """
 AT_SIZE = HERE.parent / "at_size.json"

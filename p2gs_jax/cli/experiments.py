@@ -54,14 +54,16 @@ class Demo:
         check_values(cfg)
         with TerminalReporter() as reporter:
             street = {"frames": self.frames, "width": self.width, "iso_std": self.iso_std}
-            result = run_demo(self.out, cfg, seed=self.seed, reporter=reporter, **street)
-        true, found = zip(*result.rows, strict=True)
+            rows, error, metrics = run_demo(
+                self.out, cfg, seed=self.seed, reporter=reporter, **street
+            )
+        true, found = zip(*rows, strict=True)
         PlainConsole().print(
             f"Exposures of {len(true)} views, EV from their mean: true {min(true):+.2f} to "
             f"{max(true):+.2f}, recovered {min(found):+.2f} to {max(found):+.2f}, error "
-            f"{result.error['ev']:.3f} RMS and at most {result.error['ev_max']:.3f}."
+            f"{error['ev']:.3f} RMS and at most {error['ev_max']:.3f}."
         )
-        print_headline(result.metrics, result.run_dir)
+        print_headline(metrics, self.out / "run")
         return 0
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,16 +20,6 @@ from p2gs_jax.synth.settings import image_height
 from p2gs_jax.synth.write import write_street
 
 
-@dataclass(frozen=True)
-class DemoResult:
-    """Result of the demo; `rows` are (true, recovered) exposures, stops relative to their mean."""
-
-    rows: list[tuple[float, float]]
-    error: ExposureError
-    metrics: dict
-    run_dir: Path
-
-
 def run_demo(
     out: Path,
     cfg: FitConfig,
@@ -40,13 +29,14 @@ def run_demo(
     iso_std: float,
     seed: int,
     reporter: Reporter,
-) -> DemoResult:
+) -> tuple[list[tuple[float, float]], ExposureError, dict]:
     """Make a street, fit it and compare the exposures.
 
     The demo writes `out/street` and `out/run`, also over a demo that was interrupted. Each of 3
     cameras takes `frames` photographs, `width` pixels wide. Their ISO has the mean 8 and the
-    standard deviation `iso_std`. Raises UserError: `out` is a file, holds a finished demo
-    or files that the demo did not make, or another program writes to it.
+    standard deviation `iso_std`. Returns (true, recovered) exposures in stops from their means,
+    the error of the recovered ones, and the metrics. Raises UserError: `out` is a file, holds a
+    finished demo or files that the demo did not make, or another program writes to it.
     """
     street, run_dir = out / "street", out / "run"
     marker = out / "demo.json"
@@ -80,4 +70,4 @@ def run_demo(
     rows = list(zip(true_ev.tolist(), recovered_ev.tolist(), strict=True))
     result.metrics["exposures"] = dict(error)
     write_json(run_dir / "metrics.json", result.metrics)
-    return DemoResult(rows, error, result.metrics, run_dir)
+    return rows, error, result.metrics

@@ -60,7 +60,9 @@ def test_the_reference_has_every_public_name():
         assert hasattr(importlib.import_module(module), name), f"{module} has no {name}"
 
 
-FIELD = re.compile(r"`((?:data|render|photometry|loss|optimizer|densify|init|train)\.[\w.]+)`")
+FIELD = re.compile(
+    r"`((?:data|render|photometry|loss|optimizer|densify|dynamics|init|train)\.[\w.]+)`"
+)
 
 
 def test_the_paper_map_has_every_equation_and_names_fields_that_exist():
