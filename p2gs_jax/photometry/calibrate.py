@@ -39,6 +39,7 @@ from p2gs_jax.types import Scene
 # Points of each view to which a curve is fitted if the options give its kind.
 RESPONSE_PER_VIEW = 200
 HELD_OUT = 0.4  # share of each view's regions that is held out
+LEAST_KEPT = 0.2  # share of pixels; a note reports masks that keep less, as inverted masks do
 JUDGED = 0.05  # least share of observations that are held out and have a partner left
 # Candidates are compared on at most this many observations; the choice is solved on all.
 MOST_OBSERVATIONS = 40_000
@@ -151,6 +152,13 @@ def calibrate_observations(
             "undistortion and stabilisation leave them, and a fit shows them: add masks "
             "(docs/quickstart.md)."
         )
+    if observations.kept_by_mask is not None:
+        kept = observations.kept_by_mask[np.isfinite(observations.kept_by_mask)]
+        rule = "A mask hides pixels that are 0 (docs/scenes.md)."
+        if len(kept) and kept.min() == 1:
+            notes.append(f"Masks of {count_of(len(kept), 'training view')} hide nothing. {rule}")
+        elif len(kept) and (share := float(np.median(kept))) < LEAST_KEPT:
+            notes.append(f"Masks keep only {share:.0%} of the pixels (median of views). {rule}")
     if options.known is not None and (unused := options.known.unused):
         notes.append(f"{len(unused)} known exposures belong to no view: {first_few(unused)}.")
     response = selection.solution.response

@@ -48,6 +48,8 @@ class Observations:
     # Display values of each view from which noise is not clipped at black; None: unknown.
     unclipped: Float[np.ndarray, "v 3"] | None = None
     black_borders: Bool[np.ndarray, " v"] | None = None  # whether the edge of a view is black
+    # Share of a view's pixels that its mask keeps; NaN: it has no mask file. None: unknown.
+    kept_by_mask: Float[np.ndarray, " v"] | None = None
     # `colors` as all views of each point predict them; None: unknown.
     expected: PerChannel | None = None
 

@@ -4,6 +4,7 @@ import csv
 import dataclasses
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scene.helpers import make_view
@@ -44,18 +45,29 @@ CFG, CHOICE = preset("robust"), (Form("view_exposure"), Response())
 
 def test_exposures_need_no_tracks_and_left_out_points_are_counted(noisy_street, tmp_path):
     scene = load_scene(noisy_street, CFG.data, tmp_path, lambda text: None)
-    scene = dataclasses.replace(scene, tracks=None)
+    views, index = list(scene.views), scene.train_indices[1]
+    half = np.tile(np.uint8(255), (views[index].height, views[index].width))
+    half[: len(half) // 2] = 0
+    assert cv2.imwrite(str(tmp_path / "half.png"), half)
+    views[index] = dataclasses.replace(views[index], mask_path=tmp_path / "half.png")
+    scene = dataclasses.replace(scene, tracks=None, views=tuple(views))
     observations = projected_colors(scene, ImageStore(scene.views, CFG.data))
     assert observations.black_borders is not None
     assert not observations.black_borders.any()
     bordered = np.arange(observations.view_count) == 1
-    observations = dataclasses.replace(observations, too_coarse=7, black_borders=bordered)
+    np.testing.assert_array_equal(observations.kept_by_mask, np.where(bordered, 0.5, np.nan))
+    faults = {"black_borders": bordered, "kept_by_mask": np.where(bordered, 0.03, np.nan)}
+    observations = dataclasses.replace(observations, too_coarse=7, **faults)
     assert np.bincount(observations.points).max() <= MOST_PER_POINT
     options = dataclasses.replace(options_of(CFG, scene), choice=CHOICE)
     found = calibrate_observations(observations, options)
     assert found.reasons[0].startswith("7 of ")
     note = f"The edges of 1 training view are black ({observations.names[1]}), as"
     assert found.reasons[1].startswith(note)
+    assert found.reasons[2].startswith("Masks keep only 3% of the pixels")
+    faults["kept_by_mask"] = np.where(bordered, 1.0, np.nan)
+    found = calibrate_observations(dataclasses.replace(observations, **faults), options)
+    assert found.reasons[2].startswith("Masks of 1 training view hide nothing.")
     with (noisy_street / "truth" / "exposures.csv").open(newline="") as file:
         truth = {r["image"]: float(r["exposure"]) for r in csv.DictReader(file)}
     expected = np.array([truth[scene.views[i].name] for i in scene.train_indices])

@@ -167,6 +167,7 @@ def point_colors(
     surfaces = surfaces._replace(normals=np.where(wrong[:, None], np.nan, surfaces.normals))
     moments, keep, scales = _at_one_scale(surfaces, points, views)
     unclipped, bordered = np.zeros((len(views), 3), np.float32), np.zeros(len(views), bool)
+    kept_by_mask = np.full(len(views), np.nan)
 
     def read(row: int):
         mine, centres = points[row][keep[row]], xy[row][keep[row]]
@@ -175,6 +176,8 @@ def point_colors(
         ldr, mask = store.whole(scene.train_indices[row])
         found = sample_patches(ldr, mask, grids, len(mine), deviation)
         unclipped[row], bordered[row] = unclipped_from(ldr, mask), has_black_border(ldr, mask)
+        if views[row].mask_path is not None:
+            kept_by_mask[row] = mask.mean()
         good = found.valid
         at = places(centres[good], *mask.shape[::-1]).astype(np.float32)
         wide = -np.log2(scales[row][keep[row]][good]).astype(np.float32)
@@ -212,6 +215,7 @@ def point_colors(
         footprints=footprints,
         unclipped=unclipped,
         black_borders=bordered,
+        kept_by_mask=kept_by_mask,
     )
 
 
